@@ -33,33 +33,33 @@ unit: .venv/.installed-tests
 accuracy: accuracy-rows accuracy-joint accuracy-calibration  ## the three below: tables of docs/results/ (hours)
 
 accuracy-rows: .venv/.installed-tests  ## argmax, edge and likelihood beside the genie
-	$(BIN)/python -m tests.reference.accuracy
+	$(BIN)/python -m tests.reference.tables.accuracy
 accuracy-joint: .venv/.installed-tests  ## joint beside what is asked, its prior; fog meter's error bars
-	$(BIN)/python -m tests.reference.joint_accuracy --estimators joint
-	$(BIN)/python -m tests.reference.moving --rows 128
-	$(BIN)/python -m tests.reference.fog_coverage
+	$(BIN)/python -m tests.reference.tables.joint_accuracy --estimators joint
+	$(BIN)/python -m tests.reference.tables.moving --rows 128
+	$(BIN)/python -m tests.reference.tables.fog_coverage
 PICTURES := ../shared/calibration-images
 accuracy-calibration: .venv/.installed-tests  ## corners of drawn boards; cameras from real chessboards, where there are any
-	$(BIN)/python -m tests.reference.corner_accuracy
+	$(BIN)/python -m tests.reference.boards.corner_accuracy
 	@test -d $(PICTURES) || echo "no chessboards in $(PICTURES): left out"
-	@test ! -d $(PICTURES) || $(BIN)/python -m tests.reference.chessboards --folder $(PICTURES)
+	@test ! -d $(PICTURES) || $(BIN)/python -m tests.reference.boards.chessboards --folder $(PICTURES)
 
-# Without tests.campaigns.guard_false_trips, which burns all processors: nothing else could be measured beside it.
+# Without tests.campaigns.devices.guard_false_trips, which burns all processors: nothing else could be measured beside it.
 campaign: campaign-devices campaign-guard campaign-recording campaign-simulation campaign-calibration campaign-kernel
 campaign:  ## the six below: what is tried at random (many hours)
 
 SEQUENCES ?= 10000
 campaign-devices: .venv/.installed-tests  ## SEQUENCES of faults on the wire of every driver; sweeps without markers
 	for driver in cobolt obis prawndo helios lasercube spb_usb spad512s; do \
-		$(BIN)/python -m tests.campaigns.$${driver}_faults --sequences $(SEQUENCES) || exit; \
+		$(BIN)/python -m tests.campaigns.devices.$${driver}_faults --sequences $(SEQUENCES) || exit; \
 	done
-	$(BIN)/python -m tests.campaigns.blanking
+	$(BIN)/python -m tests.campaigns.devices.blanking
 campaign-guard: .venv/.installed-tests  ## blows to scans: how long the laser shines after them
-	$(BIN)/python -m tests.campaigns.guard_kill
+	$(BIN)/python -m tests.campaigns.devices.guard_kill
 campaign-recording: .venv/.installed-tests  ## recordings killed and damaged, and depth from them
-	$(BIN)/python -m tests.campaigns.recording_kill
-	$(BIN)/python -m tests.campaigns.recording_corruptions --sequences 100000
-	$(BIN)/python -m tests.campaigns.recording_depth --sequences 1000
+	$(BIN)/python -m tests.campaigns.recording.kill
+	$(BIN)/python -m tests.campaigns.recording.corruptions --sequences 100000
+	$(BIN)/python -m tests.campaigns.recording.depth --sequences 1000
 campaign-simulation: .venv/.installed-tests  ## effects left out against the full model; statistics of photon bits
 	$(BIN)/python -m tests.campaigns.effect_ablation
 	$(BIN)/python -m tests.campaigns.photon_bits
@@ -68,15 +68,15 @@ RIGS ?= 500
 TRIALS ?= 30
 campaign-calibration: .venv/.installed-tests  ## RIGS calibrated, TRIALS of deliberate mistakes; a second simulator; the guide
 	short=0; \
-	$(BIN)/python -m tests.campaigns.calibration_rigs --rigs $(RIGS) || short=1; \
-	$(BIN)/python -m tests.campaigns.calibration_mistakes --trials $(TRIALS) || short=1; \
-	$(BIN)/python -m tests.campaigns.calibration_fits || short=1; \
-	$(BIN)/python -m tests.campaigns.calibration_guided || short=1; \
+	$(BIN)/python -m tests.campaigns.calibration.rigs --rigs $(RIGS) || short=1; \
+	$(BIN)/python -m tests.campaigns.calibration.mistakes --trials $(TRIALS) || short=1; \
+	$(BIN)/python -m tests.campaigns.calibration.fits || short=1; \
+	$(BIN)/python -m tests.campaigns.calibration.guided || short=1; \
 	exit $$short
 campaign-kernel: .venv/.installed-tests  ## drivers through real kernels; hardware in the loop, on an idle machine
-	$(BIN)/python -m tests.campaigns.kernel_usb
-	$(BIN)/python -m tests.campaigns.kernel_serial
-	$(BIN)/python -m tests.campaigns.hil_swaps
+	$(BIN)/python -m tests.campaigns.kernel.usb
+	$(BIN)/python -m tests.campaigns.kernel.serial
+	$(BIN)/python -m tests.campaigns.devices.hil_swaps
 
 .venv/.created:
 	@test -n "$(PYTHON)" || { echo "error: no python3 found; install Python 3.11 or newer, or call make PYTHON=/path/to/python" >&2; exit 2; }

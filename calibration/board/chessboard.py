@@ -2,7 +2,7 @@
 
 OpenCV finds the grid that it is asked for in any larger print, and now and then in a smaller one, with corners that are
 none. So a grid counts as the board only where its print has as many corners as the board, no fewer and no more, as far
-as the picture shows (lattice.py). Measured by tests/reference/chessboard_extent.py.
+as the picture shows (lattice.py). Measured by tests/reference/boards/chessboard_extent.py.
 """
 
 import itertools

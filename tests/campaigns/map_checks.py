@@ -19,9 +19,9 @@ from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
-from rig.estimators import LEARNING
 
 from rig.count.map_checks import SURE
+from rig.estimate.registry import LEARNING
 from tests.reference.adapter import reconstructor_of, volume_of, windowed
 from tests.reference.geometry import Geometry
 from tests.reference.made_scenes import pane_scene, thin_scene

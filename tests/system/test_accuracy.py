@@ -1,7 +1,7 @@
 """Accuracy of `rig reconstruct` on cubes that another program made, beside a genie that is told everything.
 
 Limits: mean stripe error of `likelihood` without filter at most 1.3 times the genie's, below 0.6 px at K = 10 at the
-report's working point, at most 5 % missing. The full table: `python -m tests.reference.accuracy`.
+report's working point, at most 5 % missing. The full table: `python -m tests.reference.tables.accuracy`.
 """
 
 from __future__ import annotations
@@ -15,10 +15,10 @@ from typing import Any
 import numpy as np
 import pytest
 
-from tests.reference.accuracy import RIGS
 from tests.reference.genie import Genie
 from tests.reference.geometry import Geometry
 from tests.reference.scene import Scene, load_scene, procedural_scene
+from tests.reference.tables.accuracy import RIGS
 from tests.reference.working_point import POINTS, WorkingPoint, score
 
 RIG = Path(sys.executable).with_name("rig.exe" if sys.platform == "win32" else "rig")

@@ -1,7 +1,7 @@
 """Accuracy of `joint` on scenes that need no data: few exposures, thin objects, a smooth wall, honest confidence.
 
 Limits are a little beyond the worst that these maps gave with seeds 1 to 9, closer than what is asked of prepared
-scenes. The full account, beside what is asked: `python -m tests.reference.joint_accuracy`.
+scenes. The full account, beside what is asked: `python -m tests.reference.tables.joint_accuracy`.
 """
 
 from __future__ import annotations
@@ -13,9 +13,9 @@ import pytest
 
 from rig.geometry.stripe_table import StripeTable
 from tests.reference.adapter import reconstructor_of, volume_of
-from tests.reference.answers import Answers, calibration_error
 from tests.reference.made_scenes import smooth_scene, thin_scene
 from tests.reference.scene import procedural_scene
+from tests.reference.tables.answers import Answers, calibration_error
 from tests.reference.working_point import POINTS, WorkingPoint, at_stripe
 
 ROWS, WIDTH = 96, 512

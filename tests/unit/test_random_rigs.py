@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 
 from calibration.depth_error import command_at
-from tests.reference.random_rigs import BOARD, COMMAND_REACH, random_poses, random_rig
+from tests.reference.boards.random_rigs import BOARD, COMMAND_REACH, random_poses, random_rig
 
 
 @pytest.mark.parametrize("seed", range(6))

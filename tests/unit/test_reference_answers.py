@@ -5,8 +5,8 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from tests.reference.answers import Answers, averaged_pixels, calibration_error, pooled, reliability
-from tests.reference.asked import Measured, findings
+from tests.reference.tables.answers import Answers, averaged_pixels, calibration_error, pooled, reliability
+from tests.reference.tables.asked import Measured, findings
 
 
 def answers(errors: list[float], confidence: float = 0.9) -> Answers:

@@ -1,6 +1,6 @@
 """Pytest plugin: serial devices are emulated behind a kernel's USB serial driver instead of on pseudo terminals.
 
-Within the guest of `tests.campaigns.kernel_serial`: -p tests.wire.kernel_serial_ports. `SerialServer.plug` then has
+Within the guest of `tests.campaigns.kernel.serial`: -p tests.wire.kernel_serial_ports. `SerialServer.plug` then has
 QEMU plug in an FTDI chip, whose far end is a virtio port of the guest, and `unplug` has it pulled out.
 """
 

@@ -4,8 +4,8 @@ from concurrent.futures import ThreadPoolExecutor
 
 import pytest
 
-from tests.campaigns import cobolt_faults, obis_faults
-from tests.campaigns.laser_sequences import Subject, campaign
+from tests.campaigns.devices import cobolt_faults, obis_faults
+from tests.campaigns.devices.laser_sequences import Subject, campaign
 
 
 @pytest.mark.parametrize("subject", [cobolt_faults.SUBJECT, obis_faults.SUBJECT], ids=["cobolt", "obis"])

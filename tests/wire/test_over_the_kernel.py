@@ -1,6 +1,6 @@
 """The drivers through a real kernel's USB stack: the bodies that umockdev runs, and what only a kernel does.
 
-Needs root and a kernel with vhci-hcd; `python -m tests.campaigns.kernel_usb` boots one that has it.
+Needs root and a kernel with vhci-hcd; `python -m tests.campaigns.kernel.usb` boots one that has it.
 """
 
 from collections.abc import Callable, Iterator

@@ -1,8 +1,8 @@
-"""A short fault campaign of the PrawnDO; the long one is `python -m tests.campaigns.prawndo_faults`."""
+"""A short fault campaign of the PrawnDO; the long one is `python -m tests.campaigns.devices.prawndo_faults`."""
 
 from concurrent.futures import ThreadPoolExecutor
 
-from tests.campaigns.prawndo_faults import one
+from tests.campaigns.devices.prawndo_faults import one
 
 
 def test_every_fault_sequence_ends_right_or_in_a_typed_error() -> None:

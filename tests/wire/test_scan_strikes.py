@@ -1,6 +1,6 @@
 """A blow of each sort to a real scan over emulated wires, in a process of its own: light is what is measured.
 
-Hundreds of each: `python -m tests.campaigns.guard_kill`.
+Hundreds of each: `python -m tests.campaigns.devices.guard_kill`.
 """
 
 from collections.abc import Iterator

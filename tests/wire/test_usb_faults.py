@@ -4,7 +4,7 @@ from collections.abc import Callable
 
 import pytest
 
-from tests.campaigns import helios_faults, lasercube_faults, spad512s_faults, spb_usb_faults
+from tests.campaigns.devices import helios_faults, lasercube_faults, spad512s_faults, spb_usb_faults
 from tests.campaigns.outcomes import Ending, campaign
 
 

@@ -32,7 +32,7 @@ Arrays are float32 (rows, columns), numbers of neighbours int16. Source of the c
 fitted by maximum likelihood to random cluttered scenes of a second simulator, K = 1 to 30 in air and fog, all answers
 counted. A and G are chosen on random scenes of the tests' simulator: fitted ones believe stripes too little where there
 is no doubt about haze. H, DARKER, CLEARLY and AT_END are chosen by the likelihood of random scenes that are open to the
-sky in part (`tests.reference.open_scenes`): larger ones take too much from dim stripes in clear air.
+sky in part (`tests.reference.tables.open_scenes`): larger ones take too much from dim stripes in clear air.
 """
 
 import math

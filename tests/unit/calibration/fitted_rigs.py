@@ -5,7 +5,7 @@ import numpy as np
 from calibration.model.camera import Camera
 from calibration.rig_fit.fit import fit_rig
 from calibration.rig_fit.result import RigFit
-from tests.reference.calibration_data import BOARD, Seen, TrueRig, random_views
+from tests.reference.boards.calibration_data import BOARD, Seen, TrueRig, random_views
 
 SIZE = (512, 512)
 SEEN = Seen(passages=200, passage=1e-3, corner_px=0.04)

@@ -10,8 +10,8 @@ import pytest
 from calibration.camera_fit import fit_camera
 from calibration.errors import CalibrationError, Degenerate
 from calibration.views import Corners, View
-from tests.reference.board_pictures import CHARUCO, DISTORTION, SIZE, corners_px, pose
-from tests.reference.chessboards import FOLDER, pairs
+from tests.reference.boards.board_pictures import CHARUCO, DISTORTION, SIZE, corners_px, pose
+from tests.reference.boards.chessboards import FOLDER, pairs
 
 TRUE = dict(zip(("fx", "fy", "cx", "cy"), (380.0, 379.0, 162.0, 117.0), strict=True))
 SD_PX = 0.05

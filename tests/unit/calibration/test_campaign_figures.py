@@ -5,9 +5,9 @@ from collections import Counter
 import numpy as np
 import pytest
 
-from tests.campaigns import calibration_fits, calibration_mistakes, rig_figures
-from tests.campaigns.asked import Figure, exit_code, shortfalls
-from tests.campaigns.rig_figures import SCANNED, Compared
+from tests.campaigns.calibration import fits, mistakes, rig_figures
+from tests.campaigns.calibration.asked import Figure, exit_code, shortfalls
+from tests.campaigns.calibration.rig_figures import SCANNED, Compared
 
 
 def test_figures_within_their_limits_and_on_them_are_no_shortfall(capsys: pytest.CaptureFixture[str]) -> None:
@@ -49,10 +49,10 @@ def test_rigs_are_judged_by_error_interval_and_added_pixels(compared: list[Compa
 
 def test_rigs_of_the_second_simulator_are_judged_by_error_and_interval() -> None:
     good = np.array([1.0, 1.1, 0.9]), np.array([0.95, 0.96, 0.94])
-    assert not shortfalls(calibration_fits.figures(*good))
-    assert len(shortfalls(calibration_fits.figures(1.4 * good[0], good[1]))) == 1
-    assert len(shortfalls(calibration_fits.figures(good[0], good[1] - 0.03))) == 1
-    assert len(shortfalls(calibration_fits.figures(np.array([]), np.array([])))) == 2
+    assert not shortfalls(fits.figures(*good))
+    assert len(shortfalls(fits.figures(1.4 * good[0], good[1]))) == 1
+    assert len(shortfalls(fits.figures(good[0], good[1] - 0.03))) == 1
+    assert len(shortfalls(fits.figures(np.array([]), np.array([])))) == 2
 
 
 def test_a_mistake_that_is_named_in_fewer_than_nine_of_ten_trials_falls_short() -> None:
@@ -61,5 +61,5 @@ def test_a_mistake_that_is_named_in_fewer_than_nine_of_ten_trials_falls_short() 
         "not_locked": Counter({"exposure-not-locked": 25, "moved-rig": 5}),
         "no_mistake": Counter({"passed": 29, "too-few-poses": 1}),
     }
-    (line,) = shortfalls(calibration_mistakes.figures(table))
+    (line,) = shortfalls(mistakes.figures(table))
     assert line == ("share of trials in which not_locked is 'exposure-not-locked' is 0.8333, asked for are 0.9 to 1")

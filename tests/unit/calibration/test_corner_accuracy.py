@@ -2,7 +2,7 @@
 
 import numpy as np
 
-from tests.reference.corner_accuracy import figures
+from tests.reference.boards.corner_accuracy import figures
 
 
 def test_a_method_that_found_nothing_has_a_row_that_says_so() -> None:

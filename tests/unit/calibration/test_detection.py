@@ -8,8 +8,8 @@ from calibration.board.board import BLACK, WHITE, Board
 from calibration.board.detect import find_corners, repaired
 from calibration.errors import Degenerate
 from calibration.views import BoardPose
-from tests.reference.board_pictures import CHARUCO, CHESSBOARD, SIZE, albedo, corners_px, exposed, pose
-from tests.reference.chessboards import FOLDER
+from tests.reference.boards.board_pictures import CHARUCO, CHESSBOARD, SIZE, albedo, corners_px, exposed, pose
+from tests.reference.boards.chessboards import FOLDER
 
 TURNED = pose(CHARUCO, 0.9, (0.03, -0.02), (0.35, -0.3, 0.1))
 FRAMES = 5000

@@ -7,7 +7,7 @@ import numpy as np
 from calibration.guide import Forecast
 from calibration.rig_fit.fit import fit_rig
 from calibration.views import BoardPose
-from tests.reference.calibration_data import BOARD, Seen, TrueRig, random_pose, random_views, seen_view
+from tests.reference.boards.calibration_data import BOARD, Seen, TrueRig, random_pose, random_views, seen_view
 
 RIG = TrueRig(lens=(-0.1, 0.03, 5e-4, -3e-4, 0.0), angle=(0.09, 0.53, 0.02))
 SEEN = Seen(passages=300, passage=5e-4, corner_px=0.04)

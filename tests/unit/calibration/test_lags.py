@@ -17,8 +17,8 @@ from calibration.sync.lag_fit import SyncFit, fit_sync
 from calibration.sync.transfer import known_row_delay, with_lags
 from calibration.verdict import Asked
 from calibration.views import Passages, View
-from tests.reference.calibration_data import BOARD, Seen, TrueRig, random_pose, random_views, seen_view
-from tests.reference.fitted_depth import depth_errors
+from tests.reference.boards.calibration_data import BOARD, Seen, TrueRig, random_pose, random_views, seen_view
+from tests.reference.boards.fitted_depth import depth_errors
 
 SIZE = (512, 512)
 LAG = Lag(1.5e-4, 2.5e-4)

@@ -5,7 +5,7 @@ import pytest
 
 from calibration.board.drawing import fit_map
 from calibration.board.lattice import known_lattice
-from tests.reference.board_pictures import CHESSBOARD, albedo, corners_px, exposed, pose
+from tests.reference.boards.board_pictures import CHESSBOARD, albedo, corners_px, exposed, pose
 
 STANDS = pose(CHESSBOARD, 0.9, (0, 0), (0.2, -0.3, 0.1))
 

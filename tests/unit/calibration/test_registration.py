@@ -7,7 +7,7 @@ from calibration.board.board import Board
 from calibration.board.detect import find_corners
 from calibration.board.drawing import Drawing
 from sim_backend.scenes.board import ShownBoard, board_scene
-from tests.reference.random_rigs import BOARD, random_poses, random_rig
+from tests.reference.boards.random_rigs import BOARD, random_poses, random_rig
 
 MOST_RMS_PX = 0.0014
 """0.0008 and 0.0012 here, most of it the drawn picture's own; drawn half as finely for the comparison 0.0017."""

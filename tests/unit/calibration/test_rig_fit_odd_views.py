@@ -11,8 +11,8 @@ from calibration.diagnosis.rig import judge_fit
 from calibration.rig_fit import misfit
 from calibration.rig_fit.fit import fit_rig
 from calibration.views import Passages
-from tests.reference.calibration_data import BOARD, points_at, random_pose, rotation, seen_view
-from tests.reference.fitted_depth import depth_errors
+from tests.reference.boards.calibration_data import BOARD, points_at, random_pose, rotation, seen_view
+from tests.reference.boards.fitted_depth import depth_errors
 from tests.unit.calibration.fitted_rigs import EXACT, RIG, SEEN, SIZE, fitted, true_camera
 
 

@@ -11,7 +11,7 @@ from calibration.model.scanner import PivotScanner
 from calibration.rig_fit.rows import Rows, Terms
 from calibration.rig_fit.state import first_state, sighting
 from calibration.views import BoardPose
-from tests.reference.calibration_data import BOARD, Seen, TrueRig, rotation, seen_view
+from tests.reference.boards.calibration_data import BOARD, Seen, TrueRig, rotation, seen_view
 
 LENSES = {
     5: [-0.15, 0.05, 1e-3, -8e-4, 0.02],

@@ -16,7 +16,7 @@ from calibration.errors import Degenerate
 from calibration.rig_fit.fit import fit_rig
 from calibration.verdict import Asked, Verdict, unguided
 from calibration.views import BoardPose, Corners, View
-from tests.reference.calibration_data import BOARD, Seen, TrueRig, random_views
+from tests.reference.boards.calibration_data import BOARD, Seen, TrueRig, random_views
 
 ASKED = Asked(accuracy_m=0.014, at_m=5.0, stated_baseline_m=0.3)
 VIEWS = ViewEvidence(shown=12, used=12, coverage=0.8, room_flux=0.2)

@@ -6,8 +6,8 @@ import numpy as np
 
 from calibration.diagnosis.rig import judge_fit
 from calibration.rig_fit.fit import fit_rig
-from tests.reference.calibration_data import BOARD, Seen, TrueRig, random_pose, random_rig, seen_view
-from tests.reference.fitted_depth import depth_errors
+from tests.reference.boards.calibration_data import BOARD, Seen, TrueRig, random_pose, random_rig, seen_view
+from tests.reference.boards.fitted_depth import depth_errors
 
 SIZE = (512, 512)
 RIG = TrueRig(lens=(-0.1, 0.03, 5e-4, -3e-4, 0.0), angle=(0.09, 0.53))

@@ -5,7 +5,7 @@ import pytest
 
 from sim_backend.effects.catalogue import CATALOGUE
 from sim_backend.effects.halo import halo_share
-from tests.reference.path_traced import FOLDER, fog, radiance, traced_fog
+from tests.reference.tables.path_traced import FOLDER, fog, radiance, traced_fog
 from tests.unit.sim.rigs import effect_rate, rig, setting, wall
 
 HALO = next(entry for entry in CATALOGUE if entry.name == "halo")
@@ -82,7 +82,7 @@ def test_traced_rows_in_isotropic_fog(tau: float) -> None:
 @pytest.mark.parametrize(("tau", "low", "high"), [(0.5, 0.08, 0.13), (1.0, 0.18, 0.32), (2.0, 0.35, 0.46)])
 def test_the_pedestal_behind_the_stripe(tau: float, low: float, high: float) -> None:
     """Fog alone: a black wall; 10 px before the stripe."""
-    from tests.reference import path_traced
+    from tests.reference.tables import path_traced
 
     was, path_traced.ALBEDO = path_traced.ALBEDO, 0.0
     try:

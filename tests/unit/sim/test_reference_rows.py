@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 
-from tests.reference.path_traced import (
+from tests.reference.tables.path_traced import (
     BEFORE,
     FOLDER,
     PEAK,

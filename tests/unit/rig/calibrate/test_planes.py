@@ -17,7 +17,7 @@ from rig.calibrate import planes as planes_run
 from rig.calibrate import views as taking
 from rig.calibrate.planes import Guide
 from rig.calibrate.views import FixedPoses
-from tests.reference.calibration_data import BOARD, Seen, TrueRig, random_views
+from tests.reference.boards.calibration_data import BOARD, Seen, TrueRig, random_views
 
 SIZE = (512, 512)
 RIG = TrueRig(lens=(-0.1, 0.03, 5e-4, -3e-4, 0.0))

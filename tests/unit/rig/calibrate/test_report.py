@@ -18,7 +18,7 @@ from calibration.verdict import Reason, Verdict
 from calibration.views import View
 from rig.calibrate.report import planes_report
 from rig.calibrate.report_page import ReportSection, in_mm_with_sign, measured, page, paragraph, subject, table
-from tests.reference import calibration_data as data
+from tests.reference.boards import calibration_data as data
 
 
 @cache

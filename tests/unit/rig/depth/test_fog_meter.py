@@ -11,8 +11,8 @@ from rig.depth.fog_meter import CLEAR, FogEstimate, fit_fog, read_fog
 from rig.estimate.row.em import lines_of, next_lattice
 from rig.estimate.row.model import BINS, RowModel
 from rig.geometry.stripe_table import StripeTable
-from tests.reference.fog_coverage import veil
 from tests.reference.geometry import Geometry
+from tests.reference.tables.fog_coverage import veil
 from tests.reference.working_point import Light, WorkingPoint
 from tests.unit.small_maps import RIGS, Sweep, geometry_of, street, volume_of
 

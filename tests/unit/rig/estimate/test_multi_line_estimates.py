@@ -2,8 +2,8 @@
 
 import numpy as np
 
-from tests.reference.multi_line import COLUMNS, Lines, measure, working_point
 from tests.reference.scene import procedural_scene
+from tests.reference.tables.multi_line import COLUMNS, Lines, measure, working_point
 
 EXPOSURES = 20
 

@@ -7,7 +7,7 @@ import pytest
 
 from drivers.recorded import contents, reader
 from tests.campaigns.outcomes import campaign
-from tests.campaigns.recording_corruptions import make_sequence
+from tests.campaigns.recording.corruptions import make_sequence
 
 
 @pytest.fixture(autouse=True)

@@ -23,7 +23,7 @@ from rig.errors import RecordingError
 from rig.recording import segment as segment_module
 from rig.recording.segment import PAGE_BYTES, OpenSegment, paged
 from rig.recording.writer import RESERVE_FILE, SYNC_INTERVAL_S, Recording
-from tests.campaigns.recording_strikes import HEIGHT, WIDTH, Striker, blocks_of
+from tests.campaigns.recording.strikes import HEIGHT, WIDTH, Striker, blocks_of
 
 BLOCKS = blocks_of(0, 0)
 SIZES = [paged(BlockLayout(block.n_frames, WIDTH, HEIGHT).block_bytes) for block in BLOCKS]

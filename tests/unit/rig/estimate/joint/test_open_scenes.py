@@ -7,7 +7,7 @@ import pytest
 
 from rig.estimate.joint.joint import Joint
 from tests.reference.geometry import Geometry
-from tests.reference.open_scenes import SKY_M, OpenPoint, figures
+from tests.reference.tables.open_scenes import SKY_M, OpenPoint, figures
 from tests.reference.working_point import POINTS
 from tests.unit.small_maps import geometry_of, street, volume_of
 

@@ -13,8 +13,8 @@ from rig.estimate.registry import recalling
 from rig.estimate.row.model import RowModel
 from rig.geometry.stripe_table import StripeTable
 from rig.threads import RowWorkers
-from tests.reference.moving import Disc, measure
 from tests.reference.scene import procedural_scene
+from tests.reference.tables.moving import Disc, measure
 from tests.unit.small_maps import simulated
 
 WORKERS = RowWorkers(2)

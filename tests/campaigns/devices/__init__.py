@@ -1,0 +1,1 @@
+"""Drivers, scans and the guard under random faults on emulated wires."""

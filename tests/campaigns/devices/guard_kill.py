@@ -1,0 +1,88 @@
+"""Blows to real scans at random moments: how long there was light after them, and whether any fell on a mirror at rest.
+
+python -m tests.campaigns.devices.guard_kill --kills 1000 --others 100 --seed 1
+
+Each blow has a scan of its own, `rig scan` with real drivers over pseudo terminals and libusb, and emulated devices
+that outlive it (tests/wire/scan_rig.py). Light is emission AND gate. Passes where light is gone after 100 ms at the
+99.9th percentile and never there after 500 ms, for each sort of blow (500 ms where the gate hears nothing any more),
+where emission is off after 1 s wherever the laser's port still answers, no light ever fell on a mirror at rest, and
+applications that lived ended with code 3 and a line that says why.
+"""
+
+import argparse
+import functools
+import sys
+from concurrent.futures import ProcessPoolExecutor
+from multiprocessing import get_context
+
+import numpy as np
+
+from tests.wire.scan_rig import Applications, ScanFailedError
+from tests.wire.scan_strikes import SCAN_STRIKES, ScanOutcome, strike_scan, trouble_of
+
+KILL = "application killed"
+LASERS = ("obis", "cobolt")
+
+
+@functools.cache
+def applications() -> Applications:
+    """Of this process; it ends with it."""
+    return Applications()
+
+
+def blow(name: str, laser: str, share: float) -> ScanOutcome | str:
+    """One, in a process of the pool; what was said where the scan did not come to light."""
+    try:
+        return strike_scan(applications(), name, laser, share)
+    except ScanFailedError as error:
+        return str(error)
+
+
+def main() -> int:
+    """Run the campaign; 1 where a limit was broken."""
+    parser = argparse.ArgumentParser(description=__doc__)
+    parser.add_argument("--kills", type=int, default=1000)
+    parser.add_argument("--others", type=int, default=100, help="blows of each other sort")
+    parser.add_argument("--only", nargs="*", choices=[*SCAN_STRIKES], default=[*SCAN_STRIKES])
+    parser.add_argument("--lasers", nargs="*", choices=LASERS, default=LASERS)
+    parser.add_argument("--seed", type=int, default=1)
+    parser.add_argument("--jobs", type=int, default=2)
+    options = parser.parse_args()
+    random = np.random.default_rng(options.seed)
+    passed = True
+    with ProcessPoolExecutor(options.jobs, get_context("spawn")) as pool:
+        for name in options.only:
+            count = options.kills if name == KILL else options.others
+            lasers = [options.lasers[i % len(options.lasers)] for i in range(count)]
+            outcomes = list(pool.map(blow, [name] * count, lasers, random.random(count).tolist()))
+            passed &= _report(name, outcomes)
+    return 0 if passed else 1
+
+
+def _report(name: str, outcomes: list[ScanOutcome | str]) -> bool:
+    for outcome in outcomes:
+        if isinstance(outcome, str):
+            print(f"{name}: no blow, {outcome}", flush=True)
+    struck = [outcome for outcome in outcomes if not isinstance(outcome, str) and not outcome.over]
+    if not struck:
+        return True
+    made = SCAN_STRIKES[name]
+    light_s = np.array([outcome.light_s for outcome in struck])
+    emission_s = np.array([outcome.emission_s for outcome in struck])
+    late = float(np.percentile(light_s, 99.9))
+    troubles = [trouble for outcome in struck for trouble in trouble_of(name, outcome)]
+    if late > made.light_s:
+        troubles.append(f"light after {1e3 * late:.0f} ms")
+    dark = f"emission {1e3 * emission_s.max():.0f} ms (most)" if made.laser_answers else "emission of a lost port"
+    print(
+        f"{name}: {len(struck)} blows, {sum(outcome.was_lit for outcome in struck)} while lit; light "
+        f"{1e3 * np.median(light_s):.0f} ms (median), {1e3 * late:.0f} ms (99.9 %), {1e3 * light_s.max():.0f} ms "
+        f"(most); {dark}; at rest {1e3 * max(outcome.rest_s for outcome in struck):.1f} ms: "
+        + ("; ".join(["WRONG", *troubles]) if troubles else "right"),
+        flush=True,
+    )
+    return not troubles
+
+
+if __name__ == "__main__":
+    sys.exit(main())

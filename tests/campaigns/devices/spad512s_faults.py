@@ -1,0 +1,83 @@
+"""Random faults on the wire of a SPAD512S: every sequence ends in right frames or in one of our errors, in time.
+
+    python -m tests.campaigns.devices.spad512s_faults --sequences 10000 --seed 1
+
+Bits do not flip on this wire: TCP carries checksums of its own, and the vendor's stream has nothing to find a flipped
+pixel by. All else strikes: pieces that come late, split, merged, cut, twice or never, stalls, hangs, the program's end.
+"""
+
+import random
+import sys
+import time
+from fractions import Fraction
+
+import numpy as np
+from numpy.typing import NDArray
+
+from drivers.interfaces import SpadRequest
+from drivers.ring import BlockRing
+from drivers.spads.spad512s import Spad512s, Spad512sConfig
+from drivers.spads.spad512s_line import Deadlines
+from sim_backend.wire.firmware.spad512s import Spad512sModel
+from sim_backend.wire.serve.tcp import TcpServer
+from sim_backend.wire.serve.wire_server import Fault, FaultSchedule
+from tests.campaigns.outcomes import Ending, ending, run
+
+KINDS = tuple(kind for kind in Fault if kind is not Fault.CORRUPTED)
+REQUEST = SpadRequest(Fraction(50_000), 20e-6, "burst", block_frames=2)
+DEADLINES = Deadlines(open_s=0.5, calibration_s=0.5, answer_s=0.5, stop_s=0.5)
+FILL_S = 0.8
+DEADLINE_S = 5.0
+"""Every wait once, and a machine that is busy with other sequences."""
+
+
+def _frames(first: int, start_s: float, period_s: float, n: int) -> NDArray[np.uint8]:
+    """Frames that all differ, and none is dark: the number of the frame in every word."""
+    words = np.arange(first + 1, first + 1 + n, dtype="<u8")[:, None] * np.uint64(0x9E3779B97F4A7C15)
+    return np.repeat(words, 512 * 8, axis=1).reshape(n, 512, 8).view(np.uint8)
+
+
+def sequence(seed: int) -> Ending:
+    """How one sequence ended, and what was wrong with that, if anything."""
+    rng = random.Random(seed)
+    schedule = FaultSchedule(
+        seed,
+        rng.choice((0.1, 0.5, 1.0)),
+        KINDS,
+        skip=rng.randrange(12),
+        most=rng.randrange(1, 4),
+        late_s=0.05,
+        stall_s=0.3,
+    )
+    n_frames = rng.randrange(1, 13)
+    model = Spad512sModel(_frames, glued_done=rng.random() < 0.5, calibration_s=rng.choice((0.0, 0.0, 0.02)))
+    if rng.random() < 0.2:
+        model.fail_at_byte = rng.randrange(n_frames * 32_768)
+
+    def act() -> Ending:
+        with TcpServer(model, faults=schedule) as server:
+            return _take(server, n_frames)
+
+    return ending(act, time.monotonic, DEADLINE_S)
+
+
+def _take(server: TcpServer, n_frames: int) -> Ending:
+    """Open, take one run, judge it."""
+    with Spad512s(Spad512sConfig(), server.endpoint, DEADLINES) as device:
+        timing = device.configure(REQUEST)
+        ring = BlockRing(16, timing.stride)
+        reader = ring.reader("campaign")
+        device.start(n_frames)
+        while device.fill(ring, FILL_S):
+            pass
+        ring.finish()
+        taken = [(block.frame_numbers, block.bits) for block in reader]
+        numbers = np.concatenate([numbers for numbers, _ in taken])
+        if numbers.tolist() != list(range(n_frames)) or device.counters.delivered != n_frames:
+            return "complete", f"frames {numbers.tolist()} of {n_frames}"
+        right = all(np.array_equal(bits, _frames(int(first[0]), 0, 0, len(first))) for first, bits in taken)
+        return "complete", None if right else "a wrong frame in a run without an error"
+
+
+if __name__ == "__main__":
+    sys.exit(run(sequence, __doc__, workers=8))

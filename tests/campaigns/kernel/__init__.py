@@ -1,0 +1,1 @@
+"""Drivers through real Linux kernels in virtual machines."""

@@ -1,0 +1,162 @@
+"""Several light planes at once on the yardstick: what they cost in accuracy and bring in time.
+
+    python -m tests.reference.tables.multi_line --scenes cones --points clear,report --lines 1,2,4,8 --markdown table.md
+
+A map of N columns by L lines takes N / L places of the mirror, each exposed K times; the frames of a place serve L
+columns. Every line has its own stripe and haze, each with 1 / L of the light ('shared') or all of it ('each'); ambient
+light is there once. Sensor time is that of the lit frames at 100 kHz.
+"""
+
+from __future__ import annotations
+
+import argparse
+import sys
+from collections.abc import Iterator, Sequence
+from concurrent.futures import ThreadPoolExecutor
+from dataclasses import dataclass, replace
+from itertools import product
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from tests.reference.adapter import reconstructor_of, volume_of
+from tests.reference.geometry import Geometry
+from tests.reference.scene import Scene, load_scene, procedural_scene, scene_names
+from tests.reference.working_point import POINTS, THREADS, WorkingPoint, score
+
+FRAME_MS = 0.01
+COLUMNS = 496
+ROWS = 128
+"""The middle ones of a scene: enough to learn from."""
+
+
+@dataclass(frozen=True, slots=True)
+class Lines:
+    """So many planes at once, `power`: shared or each; columns places apart are lit together."""
+
+    lines: int
+    power: str
+
+    @property
+    def share(self) -> float:
+        """Of a single line's light that each one has."""
+        return 1 / self.lines if self.power == "shared" else 1.0
+
+    def counts(
+        self, point: WorkingPoint, x0: NDArray[np.int32], window: int, exposures: int, seed: int
+    ) -> NDArray[np.unsignedinteger]:
+        """Counts (columns, H, window) of the pixels from x0 on; those lit together are of the same frames."""
+        g = point.geometry
+        out = np.zeros((g.columns, g.height, window), np.uint8 if exposures <= 255 else np.uint16)
+
+        def draw(place: int) -> None:
+            seen = self.counts_at(point, place, exposures, seed)
+            for c in self.together(place):
+                part = seen[:, x0[c] : x0[c] + window]
+                out[c, :, : part.shape[1]] = part
+
+        with ThreadPoolExecutor(THREADS) as pool:
+            list(pool.map(draw, range(COLUMNS // self.lines)))
+        return out
+
+    def counts_at(self, point: WorkingPoint, place: int, exposures: int, seed: int) -> NDArray[np.integer]:
+        """Counts (H, W) of the frames of a place of the mirror."""
+        flux = point.ambient.copy()
+        for c in self.together(place):
+            flux += self.share * (point.flux_of_column(c) - point.ambient)
+        return np.random.default_rng([seed, place]).binomial(exposures, -np.expm1(-flux))
+
+    def together(self, place: int) -> range:
+        """Columns that are lit there."""
+        return range(place, COLUMNS, COLUMNS // self.lines)
+
+    @property
+    def grid(self) -> Any:
+        """The project's account of what is lit together."""
+        from rig.geometry.line_grid import LineGrid
+
+        line, place = np.divmod(np.arange(COLUMNS, dtype=np.int32), np.int32(COLUMNS // self.lines))
+        return LineGrid((0.0,) * self.lines, 1.0, line, place)
+
+
+def dark_frames(point: WorkingPoint, lines: Lines, exposures: int, seed: int) -> dict[str, Any]:
+    """Dark frames as a scan has them, a twentieth of the lit ones."""
+    n = max(1, COLUMNS // lines.lines * exposures // 20)
+    counts = np.random.default_rng([seed, COLUMNS]).binomial(n, -np.expm1(-point.ambient))
+    return {"dark_counts": counts.astype(np.uint32), "n_dark": n}
+
+
+def working_point(scene: Scene, point: str) -> WorkingPoint:
+    """The middle rows of a scene in the light of a point, seen in `COLUMNS` columns."""
+    cut = scene.crop(min(ROWS, scene.shape[0]), scene.shape[1])
+    height, width = cut.shape
+    return WorkingPoint(cut, POINTS[point], Geometry.build(width=width, height=height, columns=COLUMNS))
+
+
+def measure(
+    point: WorkingPoint, lines: Lines, exposures: int, estimators: Sequence[str], *, seed: int = 1, told: bool = True
+) -> Iterator[tuple[str, dict[str, float]]]:
+    """Figures of one map by estimator. told: whether it knows that there are other lines."""
+    counts: NDArray[np.unsignedinteger] | None = None
+    for estimator in estimators:
+        reconstructor = reconstructor_of(point, estimator, lines=lines.grid if lines.lines > 1 and told else None)
+        geometry = reconstructor.geometry
+        if counts is None:
+            counts = lines.counts(point, geometry.x0, geometry.window, exposures, seed)
+        volume = replace(volume_of(reconstructor, counts, exposures), **dark_frames(point, lines, exposures, seed))
+        stripe = reconstructor.map(volume).stripe
+        scored = point.trusted & np.isfinite(point.truth())
+        figures = score(stripe.x_px, point.truth(), point.trusted)
+        yield estimator, {**figures, "confidence": float(stripe.confidence[scored].mean())}
+
+
+TITLES = ("scene", "point", "power", "lines", "K", "lit ms", "overlap", "estimator", "mean abs px", "median px",
+          "within 1 px", "confidence")  # fmt: skip
+
+
+def main(arguments: Sequence[str] | None = None) -> int:
+    """Print the table, and write it where asked."""
+    from rig.geometry.line_grid import window_overlap
+
+    parser = argparse.ArgumentParser(
+        prog="python -m tests.reference.tables.multi_line", description=__doc__.splitlines()[0]
+    )
+    parser.add_argument("--scenes", default="procedural", help=f"procedural, {', '.join(scene_names())}")
+    parser.add_argument("--points", default="clear,report,dense")
+    parser.add_argument("--power", default="shared,each")
+    parser.add_argument("--lines", default="1,2,4,8")
+    parser.add_argument("--exposures", default="1,10", help="of one line; others take them and as many frames a map")
+    parser.add_argument("--estimators", default="likelihood,joint")
+    parser.add_argument("--markdown", type=Path)
+    options = parser.parse_args(arguments)
+    table = ["| " + " | ".join(TITLES) + " |\n" + "|---" * len(TITLES) + "|\n"]
+    print(table[0], end="")
+    base = [int(k) for k in options.exposures.split(",")]
+    for name in options.scenes.split(","):
+        scene = procedural_scene() if name == "procedural" else load_scene(name)
+        if scene is None:
+            parser.error(f"scene {name!r} is absent; present: {', '.join([*scene_names(), 'procedural'])}")
+        for kind, power, count in product(
+            options.points.split(","), options.power.split(","), options.lines.split(",")
+        ):
+            lines = Lines(int(count), power)
+            if lines.lines == 1 and power != options.power.split(",")[0]:
+                continue
+            point = working_point(scene, kind)
+            overlap = window_overlap(lines.grid, reconstructor_of(point, "argmax").geometry)
+            for k in sorted({*base, *(lines.lines * k for k in base)}):
+                lit_ms = COLUMNS // lines.lines * k * FRAME_MS
+                for estimator, f in measure(point, lines, k, options.estimators.split(",")):
+                    told = name, kind, power, count, k, f"{lit_ms:.1f}", f"{overlap:.2f}", estimator
+                    found = (f[figure] for figure in ("mean_abs_charged", "median_abs", "within_1px", "confidence"))
+                    table.append("| " + " | ".join([*map(str, told), *(f"{one:.3f}" for one in found)]) + " |\n")
+                    print(table[-1], end="", flush=True)
+    if options.markdown:
+        options.markdown.write_text("".join(table))
+    return 0
+
+
+if __name__ == "__main__":
+    sys.exit(main())
