@@ -4,6 +4,7 @@ Counting + `likelihood`, window 128, 10 exposures, by frames per block and threa
 100 kHz; waking a thread takes tens of microseconds of it.
 """
 
+import argparse
 import os
 import time
 
@@ -21,6 +22,7 @@ ROUNDS = 5
 
 def main() -> None:
     """Print thousands of frames a second, medians over rounds in which every size is measured in turn."""
+    argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter).parse_args()
     cores = os.cpu_count() or 1
     with RowWorkers(cores) as all_cores:
         frames = window_frames(128, all_cores)

@@ -17,6 +17,7 @@ numbers that LLVM knows are fetched anew for every vector, so they are arguments
 ones, since fewer of its rounds are under way at a time; float32 halves the haze's time and all memory. Bands of fewer
 rows, for the sake of the caches, gained 10 % on a busy machine and lost as much on an idle one."""
 
+import argparse
 import os
 import time
 from collections.abc import Callable
@@ -110,6 +111,7 @@ class _Case:
 
 def main() -> None:
     """Print the rows."""
+    argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter).parse_args()
     with progress():
         report = measure_simulator()
     simulator_table(report)

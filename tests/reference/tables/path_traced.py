@@ -7,6 +7,7 @@ beside the rows). The tracer's `single` is the direct stripe and single scatteri
 are medians along the row: rare bright paths are outliers of the tracer.
 """
 
+import argparse
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -115,4 +116,5 @@ def table(taus: tuple[float, ...] = (0.5, 1.0)) -> str:
 
 
 if __name__ == "__main__":
+    argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter).parse_args()
     print(table())
