@@ -50,10 +50,9 @@ campaign:  ## the six below: what is tried at random (many hours)
 
 SEQUENCES ?= 10000
 campaign-devices: .venv/.installed-tests  ## SEQUENCES of faults on the wire of every driver; sweeps without markers
-	for driver in cobolt obis prawndo helios lasercube spb_usb spad512s; do \
-		$(BIN)/python -m tests.campaigns.devices.$${driver}_faults --sequences $(SEQUENCES) || exit; \
+	for driver in cobolt obis prawndo helios lasercube spb-usb spad512s blanking; do \
+		$(BIN)/python -m tests.campaigns.devices.faults $${driver} --sequences $(SEQUENCES) || exit; \
 	done
-	$(BIN)/python -m tests.campaigns.devices.blanking
 campaign-guard: .venv/.installed-tests  ## blows to scans: how long the laser shines after them
 	$(BIN)/python -m tests.campaigns.devices.guard_kill
 campaign-recording: .venv/.installed-tests  ## recordings killed and damaged, and depth from them

@@ -1,14 +1,8 @@
 """Random bursts of frames without markers: bound right, flagged or refused, never silently wrong.
 
-    python -m tests.campaigns.devices.blanking --bursts 1000 --seed 1
-
 A map counts as silently wrong where it says that it is synchronised and a frame of it is more than 0.15 column from
 where the mirror was, or on a column without light, or dark with light.
 """
-
-import argparse
-import logging
-from collections import Counter
 
 import numpy as np
 
@@ -16,13 +10,14 @@ from drivers.errors import DeviceFault
 from rig.count.bind import FrameBinder
 from rig.count.volume import BIN_DARK
 from rig.errors import PlanError
+from tests.campaigns.outcomes import Ending
 from tests.unit.rig.count.light import blanked_plan, see
 
 WRONG_COLUMNS = 0.15
 
 
-def burst(seed: int) -> tuple[Counter[str], float]:
-    """What became of one random burst, and the largest error of its synchronised maps in columns."""
+def sequence(seed: int) -> Ending:
+    """How the maps of one random burst ended; worst: the largest error of its synchronised maps in columns."""
     rng = np.random.default_rng(seed)
     exposures, maps = int(rng.choice([1, 2, 5, 10, 20, 50])), int(rng.integers(1, 4))
     first = rng.uniform(-0.4, 0.2)
@@ -35,7 +30,7 @@ def burst(seed: int) -> tuple[Counter[str], float]:
             command_range=ends if rng.integers(2) else ends[::-1],
         )
     except PlanError:
-        return Counter(no_plan=1), 0.0
+        return Ending(["no plan"])
     seen = see(
         plan,
         maps,
@@ -54,7 +49,7 @@ def burst(seed: int) -> tuple[Counter[str], float]:
         begin = int(rng.integers(len(seen.ones) - 60))
         seen = seen.without(range(begin, begin + int(rng.integers(1, 50))))
         lost = []
-    binder, said, worst = FrameBinder(plan), Counter[str](), 0.0
+    binder, ends, worst = FrameBinder(plan), [], 0.0
     low, high = plan.command_range
     truth = (seen.mirror - low) / ((high - low) / plan.columns) - 0.5
     parts, clocks = [], []
@@ -64,36 +59,14 @@ def burst(seed: int) -> tuple[Counter[str], float]:
             clocks += closed
             parts.append((block.frame_numbers, bound.sweep, bound.column, bound.bins))
     except DeviceFault:
-        return Counter(refused=1), 0.0
+        return Ending(["refused"])
     frame, sweep, column, bins = (np.concatenate(part) for part in zip(*parts, strict=True))
     for clock in clocks[:maps]:
         here = sweep == clock.sweep
         lit, dark = here & (bins >= 0), here & (bins == BIN_DARK)
         error = float(np.abs(column[lit] - truth[frame[lit]]).max(initial=0))
         wrong = error > WRONG_COLUMNS or (seen.share[frame[lit]] < 0.99).any() or seen.share[frame[dark]].any()
-        said["flagged" if not clock.synchronised else "silently wrong" if wrong else "right"] += 1
+        ends.append("flagged" if not clock.synchronised else "silently wrong" if wrong else "right")
         if clock.synchronised:
             worst = max(worst, error)
-    return said, worst
-
-
-def main() -> None:
-    """Run and print the counts."""
-    parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
-    parser.add_argument("--bursts", type=int, default=1000)
-    parser.add_argument("--seed", type=int, default=1)
-    arguments = parser.parse_args()
-    logging.disable(logging.CRITICAL)
-    total, worst = Counter[str](), 0.0
-    for i in range(arguments.bursts):
-        said, error = burst(arguments.seed * 1_000_000 + i)
-        total += said
-        worst = max(worst, error)
-        if said["silently wrong"]:
-            print(f"burst {arguments.seed * 1_000_000 + i}: silently wrong, {error:.3f} columns", flush=True)
-    counts = ", ".join(f"{count} {what}" for what, count in sorted(total.items()))
-    print(f"{arguments.bursts} bursts: {counts}; largest error of a synchronised map {worst:.3f} columns")
-
-
-if __name__ == "__main__":
-    main()
+    return Ending(ends, f"silently wrong, {worst:.3f} columns" if "silently wrong" in ends else None, worst)

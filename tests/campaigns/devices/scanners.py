@@ -11,9 +11,11 @@ from collections.abc import Callable
 from dataclasses import dataclass
 
 import numpy as np
+from numpy.typing import NDArray
 
 from drivers.clock import VirtualClock
 from drivers.interfaces import MARKER_LINE, MARKER_SCAN, BeamScanner, ScanWaveform
+from sim_backend.wire.firmware import helios, lasercube
 from sim_backend.wire.firmware.dac_model import DacHistory, DacModel
 from sim_backend.wire.serve.wire_server import Fault, FaultSchedule
 from tests.campaigns.outcomes import Ending, ending
@@ -52,7 +54,16 @@ def wave(device: BeamScanner) -> ScanWaveform:
     return ScanWaveform(-0.5 * np.cos(2 * np.pi * at / POINTS), markers, device.point_clock(RATE_HZ))
 
 
-def scanner_sequence(subject: Subject, seed: int) -> Ending:
+DRIVE = 1.01 / 4095
+"""A step of the converters."""
+HELIOS = Subject("helios", helios.HeliosModel, {"frame": "20 ms"}, helios.BLUE, helios.GREEN, helios.RED, DRIVE)
+LASERCUBE = Subject(
+    "lasercube", lasercube.LaserCubeModel, {"buffer": "20 ms", "colours": "markers"},
+    lasercube.BLUE, lasercube.GREEN, lasercube.PLAYING, DRIVE,
+)  # fmt: skip
+
+
+def sequence(subject: Subject, seed: int) -> Ending:
     """How one sequence ended, and what was wrong with that, if anything."""
     rng = random.Random(seed)
     probability = rng.choice((0.003, 0.01, 0.05, 0.3))
@@ -66,13 +77,14 @@ def scanner_sequence(subject: Subject, seed: int) -> Ending:
     before = threading.excepthook
     threading.excepthook = lambda what: foreign.append(f"in a thread: {what.exc_type.__name__}: {what.exc_value}")
     try:
-        end, wrong = ending(lambda: _judged(subject, rng, plugged, model.history), plugged.now_s, DEADLINE_S)
+        ended = ending(lambda: _judged(subject, rng, plugged, model.history), plugged.now_s, DEADLINE_S)
     finally:
         threading.excepthook = before
-    return end, foreign[0] if foreign else wrong
+    struck = [fault.value for fault in schedule.struck]
+    return ended._replace(wrong=foreign[0] if foreign else ended.wrong, struck=struck)
 
 
-def _judged(subject: Subject, rng: random.Random, plugged: Plugged, history: DacHistory) -> Ending:
+def _judged(subject: Subject, rng: random.Random, plugged: Plugged, history: DacHistory) -> str:
     with open_scanner(subject.kind, plugged.bus, plugged.clock, **subject.config) as device:
         for _ in range(rng.randrange(1, 3)):
             repeats = rng.randrange(3, 8)
@@ -84,55 +96,54 @@ def _judged(subject: Subject, rng: random.Random, plugged: Plugged, history: Dac
             if stopped:
                 time.sleep(rng.random() * 0.003)
                 device.stop()
-            elif not _wait(device):
-                return "hang", "the run does not end"
+            else:
+                _wait(device)
             fault = device.status.fault
             if fault is not None:
-                return "fault", None if "\n" not in fault else "a fault of several lines"
-            wrong = _compare(subject, history, waveform, repeats, float(clock), began_s, plugged.now_s(), stopped)
-            if wrong is not None:
-                return "complete", wrong
+                assert "\n" not in fault, "a fault of several lines"
+                return "fault"
+            put_out = Played(subject, history, float(clock), began_s, plugged.now_s())
+            put_out.require(waveform, repeats, stopped=stopped)
             if rng.random() < 0.5:
                 device.park()
-    return "complete", None
+    return "complete"
 
 
-def _wait(device: BeamScanner) -> bool:
+def _wait(device: BeamScanner) -> None:
     end = time.monotonic() + HANG_S
     while device.status.moving:
-        if time.monotonic() > end:
-            return False
+        assert time.monotonic() < end, "the run does not end"
         time.sleep(0.0005)
-    return True
 
 
-def _compare(
-    subject: Subject,
-    history: DacHistory,
-    waveform: ScanWaveform,
-    repeats: int,
-    rate_hz: float,
-    began_s: float,
-    now_s: float,
-    stopped: bool,
-) -> str | None:
-    """What is wrong with the lit points that came out."""
-    starts = history.rising(subject.scan, began_s, now_s + 1)
-    if stopped and not len(starts):
-        return None
-    if not stopped and len(starts) != repeats:
-        return f"{len(starts)} of {repeats} scans came out"
-    lines = (history.rising(subject.line, began_s, now_s + 1) - starts[0]) * rate_hz
-    if np.abs(lines - np.arange(len(lines)) * LINE_POINTS).max(initial=0) > 0.01:
-        return "line markers came at other points"
-    # A brake may begin right behind the last marker.
-    at = np.arange(round(lines[-1]) + 1 if stopped else repeats * POINTS)
-    times = starts[0] + (at + 0.5) / rate_hz
-    lit = history.level(subject.lit, times) > 0
-    if not stopped and not lit.all():
-        return f"only {int(lit.sum())} of {len(lit)} points came out"
-    if (np.diff(lit.astype(np.int8)) > 0).any():
-        return "the light went out and came again"
-    out = history.command(times)[lit]
-    error = np.abs(out - np.tile(waveform.command, repeats)[at][lit]).max(initial=0)
-    return f"the mirror was off by {error:g}" if error > subject.tolerance else None
+@dataclass(frozen=True)
+class Played:
+    """A DAC's record of one run."""
+
+    subject: Subject
+    history: DacHistory
+    rate_hz: float
+    began_s: float
+    ended_s: float
+
+    def require(self, waveform: ScanWaveform, repeats: int, *, stopped: bool) -> None:
+        """AssertionError where the lit points are not the waveform, up to where it was stopped."""
+        starts = self._rising(self.subject.scan)
+        if stopped and not len(starts):
+            return
+        assert stopped or len(starts) == repeats, f"{len(starts)} of {repeats} scans came out"
+        lines = (self._rising(self.subject.line) - starts[0]) * self.rate_hz
+        off = np.abs(lines - np.arange(len(lines)) * LINE_POINTS).max(initial=0)
+        assert off <= 0.01, "line markers came at other points"
+        # A brake may begin right behind the last marker.
+        at = np.arange(round(lines[-1]) + 1 if stopped else repeats * POINTS)
+        times = starts[0] + (at + 0.5) / self.rate_hz
+        lit = self.history.level(self.subject.lit, times) > 0
+        assert stopped or lit.all(), f"only {int(lit.sum())} of {len(lit)} points came out"
+        assert not (np.diff(lit.astype(np.int8)) > 0).any(), "the light went out and came again"
+        out = self.history.command(times)[lit]
+        error = np.abs(out - np.tile(waveform.command, repeats)[at][lit]).max(initial=0)
+        assert error <= self.subject.tolerance, f"the mirror was off by {error:g}"
+
+    def _rising(self, line: int) -> NDArray[np.float64]:
+        return self.history.rising(line, self.began_s, self.ended_s + 1)

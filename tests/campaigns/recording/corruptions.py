@@ -15,7 +15,6 @@ and such wounds beside; they are repaired, and only what holds of any repair is 
 """
 
 import atexit
-import logging
 import shutil
 import struct
 import tempfile
@@ -38,7 +37,7 @@ from rig.recording.compress import compress
 from rig.recording.repair import repair
 from rig.recording.verify import Integrity, verify
 from rig.run_folder.manifest import MANIFEST, read_manifest
-from tests.campaigns.outcomes import Ending, ending, run
+from tests.campaigns.outcomes import Ending, ending, options, run
 from tests.unit.rig.recording.forging import (
     HEADER_FIELDS,
     TRAILER_FIELDS,
@@ -305,13 +304,13 @@ def make_sequence(root: Path) -> Callable[[int], Ending]:
         for name, data in files.items():
             (folder / name).write_bytes(data)
 
-        def act() -> Ending:
+        def act() -> str:
             if forged:
-                return f"forged: {salvage(folder)}", None
+                return f"forged: {salvage(folder)}"
             outcome = judge(folder, pristine)
             if seed % REPAIRED == 0:
                 mend(folder, pristine)
-            return f"{outcome} ({', '.join(sorted(kinds))})" if len(kinds) == 1 else f"{outcome} (several)", None
+            return f"{outcome} ({', '.join(kinds) if len(kinds) == 1 else 'several'})"
 
         try:
             return ending(act, time.monotonic, DEADLINE_S)
@@ -341,5 +340,5 @@ def scratch_folder() -> Path:
 
 
 if __name__ == "__main__":
-    logging.disable(logging.CRITICAL)
-    raise SystemExit(run(make_sequence(scratch_folder()), __doc__))
+    asked = options(__doc__).parse_args()
+    raise SystemExit(run(make_sequence(scratch_folder()), asked))

@@ -6,7 +6,6 @@ The wounds are those of `corruptions`, with plan and calibration among the files
 one, or missing, under the verdict 'complete'; anything raised but an error of ours; more than `DEADLINE_S`.
 """
 
-import logging
 import shutil
 import time
 from collections.abc import Callable
@@ -20,7 +19,7 @@ from rig import api
 from rig.errors import RigError
 from rig.recording.inputs import PLAN_FILE
 from rig.run_folder.summary import RunVerdict
-from tests.campaigns.outcomes import Ending, ending, run
+from tests.campaigns.outcomes import Ending, ending, options, run
 from tests.campaigns.recording.corruptions import scratch_folder, wound
 from tests.system.small_rig import config, write_rig
 
@@ -53,17 +52,17 @@ def make_sequence(root: Path) -> Callable[[int], Ending]:
         for name, data_ in struck.items():
             (case / name).write_bytes(data_)
 
-        def act() -> Ending:
+        def act() -> str:
             try:
                 summary = api.reconstruct(case, out=case / "again").summary
             except RigError as error:
-                return type(error).__name__, None
+                return type(error).__name__
             if summary.verdict is not RunVerdict.COMPLETE:
-                return summary.verdict.value, None
+                return summary.verdict.value
             found = _depth(case / "again")
             assert len(found) == len(wanted), f"{len(found)} maps of {len(wanted)}, and nobody says so"
             assert all(np.array_equal(a, b, equal_nan=True) for a, b in zip(found, wanted, strict=True)), "wrong depth"
-            return "the same maps", None
+            return "the same maps"
 
         try:
             return ending(act, time.monotonic, DEADLINE_S)
@@ -78,5 +77,5 @@ def _depth(folder: Path) -> list[NDArray[np.float32]]:
 
 
 if __name__ == "__main__":
-    logging.disable(logging.CRITICAL)
-    raise SystemExit(run(make_sequence(scratch_folder()), __doc__))
+    asked = options(__doc__).parse_args()
+    raise SystemExit(run(make_sequence(scratch_folder()), asked))

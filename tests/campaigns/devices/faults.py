@@ -1,0 +1,46 @@
+"""Random faults on the wire of a driver: every sequence ends right or in one of our errors, in time.
+
+    python -m tests.campaigns.devices.faults obis --sequences 10000 --seed 1
+
+What is tried, and what is right, is said by the module of each driver. `blanking` has no wire: it takes sweeps of a
+SPAD without markers.
+"""
+
+import sys
+from collections.abc import Callable, Mapping
+from concurrent.futures import ProcessPoolExecutor
+from functools import partial
+
+from tests.campaigns.devices import blanking, lasers, prawndo, scanners, spad512s, spb_usb
+from tests.campaigns.outcomes import Ending, options, run
+
+SEQUENCES: Mapping[str, Callable[[int], Ending]] = {
+    "obis": partial(lasers.sequence, lasers.OBIS),
+    "cobolt": partial(lasers.sequence, lasers.COBOLT),
+    "prawndo": prawndo.sequence,
+    "helios": partial(scanners.sequence, scanners.HELIOS),
+    "lasercube": partial(scanners.sequence, scanners.LASERCUBE),
+    "spb-usb": spb_usb.sequence,
+    "spad512s": spad512s.sequence,
+    "blanking": blanking.sequence,
+}
+WATCHED = {
+    "obis": "longest verb, s",
+    "cobolt": "longest verb, s",
+    "prawndo": "longest verb, s",
+    "blanking": "largest error of a synchronised map, columns",
+}
+"""Their worst figure; of the others it is the time of the longest sequence."""
+
+
+def main() -> int:
+    """1 where a sequence ended wrong."""
+    parser = options(__doc__, workers=8)  # most sequences wait most of the time
+    parser.add_argument("driver", choices=SEQUENCES)
+    asked = parser.parse_args()
+    watched = WATCHED.get(asked.driver, "longest sequence, s")
+    return run(SEQUENCES[asked.driver], asked, ProcessPoolExecutor, watched)
+
+
+if __name__ == "__main__":
+    sys.exit(main())

@@ -1,0 +1,30 @@
+"""Short fault campaigns on the wire of every driver; the long ones are `python -m tests.campaigns.devices.faults`."""
+
+from concurrent.futures import ThreadPoolExecutor
+
+import pytest
+
+from tests.campaigns.devices.faults import SEQUENCES
+from tests.campaigns.outcomes import campaign
+
+
+@pytest.mark.parametrize(
+    ("driver", "sequences", "workers", "right", "least_right"),
+    [
+        ("cobolt", 50, 8, "done", 100),
+        ("obis", 50, 8, "done", 100),
+        ("prawndo", 50, 5, "done", 100),
+        ("helios", 60, 1, "complete", 1),
+        ("lasercube", 50, 1, "complete", 1),
+        ("spad512s", 20, 20, "complete", 1),
+        ("spb-usb", 50, 25, "complete", 1),
+    ],
+)
+def test_every_sequence_ends_right_or_in_one_of_our_errors(
+    driver: str, sequences: int, workers: int, right: str, least_right: int
+) -> None:
+    outcomes = campaign(SEQUENCES[driver], range(sequences), ThreadPoolExecutor(workers))
+    assert outcomes.wrong == []
+    assert outcomes.ends[right] >= least_right
+    assert len(outcomes.ends) > 2
+    assert outcomes.struck.total() > sequences / 3
