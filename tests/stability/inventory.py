@@ -1,7 +1,8 @@
-"""Which public numeric functions there are, and by what each is held to its whole domain.
+"""Which public numeric functions there are, and which tests hold each to its whole domain.
 
-A test says with `@covers("calibration.model.light_sheet:depth")` whose domain it goes through; what needs no such
-test is in `EXCUSED` with the reason. `test_inventory.py` fails where a function of `SCOPE` is in neither.
+A test says with `@covers(depth)` whose domain it goes through. A file of unit tests says below its imports
+`covers(depth, RowModel, kernels)` of a function, the methods of a class or all that a module has, where it compares
+them with an independent reference. `test_inventory.py` fails where a function of `SCOPE` is covered by neither.
 """
 
 import ast
@@ -38,8 +39,8 @@ EXAMPLES = settings(
 Test = TypeVar("Test", bound=Callable[..., object])
 
 
-def covers(*names: str) -> Callable[[Test], Test]:
-    """Says which functions ("module:Name" or "module:Class.name") a test takes through their domain."""
+def covers(*things: object) -> Callable[[Test], Test]:
+    """Says which functions, methods, classes or modules a test takes through their domain; changes nothing."""
 
     def unchanged(test: Test) -> Test:
         return test
@@ -58,13 +59,30 @@ def public_functions() -> Iterator[str]:
 
 
 def covered() -> set[str]:
-    """What the tests of this folder say they cover; read from their source, so that none of them has to be run."""
+    """What the tests say they cover, as "module:Class.name"; read from their source, so that none has to be run."""
     found = set()
-    for path in Path(__file__).parent.glob("test_*.py"):
-        for node in ast.walk(ast.parse(path.read_text(encoding="utf-8"))):
+    for path in [*ROOT.glob("tests/stability/test_*.py"), *ROOT.glob("tests/unit/**/test_*.py")]:
+        tree = ast.parse(path.read_text(encoding="utf-8"))
+        imported = {
+            alias.asname or alias.name: (node.module, alias.name)
+            for node in tree.body
+            if isinstance(node, ast.ImportFrom)
+            for alias in node.names
+        }
+        for node in ast.walk(tree):
             if isinstance(node, ast.Call) and isinstance(node.func, ast.Name) and node.func.id == "covers":
-                found |= {ast.literal_eval(name) for name in node.args}
+                for thing in node.args:
+                    first, *rest = ast.unparse(thing).split(".")
+                    module, name = imported[first]
+                    found.add(f"{module}:{'.'.join([name, *rest])}")
     return found
+
+
+def covering(name: str) -> set[str]:
+    """What covers a function "module:Class.name": itself, its class or its module, as `covered` writes them."""
+    module, _, inner = name.partition(":")
+    package, _, last = module.rpartition(".")
+    return {name, f"{module}:{inner.partition('.')[0]}", f"{package}:{last}"}
 
 
 def _numeric(body: list[ast.stmt], of: str = "") -> Iterator[str]:

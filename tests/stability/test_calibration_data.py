@@ -37,7 +37,7 @@ def sweeps(draw: st.DrawFn) -> SweepCounts:
     return SweepCounts(counts, n_frames, command, np.zeros(columns, np.int32), width)
 
 
-@covers("calibration.passages.find:find_passages", "calibration.passages.flux_picture:flux_picture")
+@covers(find_passages, flux_picture)
 @EXAMPLES
 @given(sweeps(), st.sampled_from([1, -1]))
 def test_passages_and_pictures_of_any_counts(sweep: SweepCounts, direction: int) -> None:
@@ -50,7 +50,7 @@ def test_passages_and_pictures_of_any_counts(sweep: SweepCounts, direction: int)
     assert not np.isinf(picture).any()
 
 
-@covers("calibration.board.detect:find_corners")
+@covers(find_corners)
 @EXAMPLES
 @given(SEEDS, st.sampled_from([0.0, 1e-9, 1.0, 1e6]), st.booleans())
 def test_pictures_without_a_board(seed: int, scale: float, holes: bool) -> None:
@@ -83,7 +83,7 @@ def views(draw: st.DrawFn) -> list[View]:
     return shown
 
 
-@covers("calibration.camera_fit:fit_camera", "calibration.rig_fit.fit:fit_rig")
+@covers(fit_camera, fit_rig)
 @EXAMPLES
 @given(views())
 def test_views_that_no_rig_shows_are_refused_or_fitted_with_finite_numbers(shown: list[View]) -> None:

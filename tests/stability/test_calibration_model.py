@@ -7,11 +7,12 @@ import numpy as np
 from hypothesis import assume, given
 from hypothesis import strategies as st
 
+from calibration import depth_error
 from calibration.depth_error import command_at, depth_jacobian, depth_sd_m, depth_uncertainty, explained
 from calibration.errors import CalibrationError
 from calibration.model.camera import Camera
-from calibration.model.light_sheet import NEARLY_PARALLEL, fan_origin, light_sheets
-from calibration.model.parameters import parameters, with_parameters
+from calibration.model.light_sheet import NEARLY_PARALLEL, LightSheets, fan_origin, light_sheets
+from calibration.model.parameters import changed_camera, parameters, with_parameters
 from calibration.model.rig_model import Covariance, Lag, RigModel
 from calibration.model.scanner import PivotScanner, PlaneTable
 from tests.stability.exactly import relative
@@ -32,10 +33,7 @@ def mirror(**changes) -> PivotScanner:
     return PivotScanner(**given_ | changes)
 
 
-@covers(
-    "calibration.model.light_sheet:light_sheets", "calibration.model.light_sheet:LightSheets.*",
-    "calibration.model.light_sheet:fan_origin", "calibration.model.scanner:PivotScanner.turned",
-)  # fmt: skip
+@covers(light_sheets, LightSheets, fan_origin, PivotScanner.turned)
 @EXAMPLES
 @given(
     point=st.tuples(METRES, METRES, METRES), axis=st.tuples(ANY, ANY, ANY), normal=st.tuples(ANY, ANY, ANY),
@@ -65,7 +63,7 @@ def test_bowed_sheets_of_any_numbers_give_depth_or_none(
     assert np.all(np.abs(sheets.distance_m(points))[met] <= 1e-9 * size[met])
 
 
-@covers("calibration.model.light_sheet:LightSheets.depth")
+@covers(LightSheets.depth)
 def test_depth_on_a_bowed_sheet_is_exact(worst) -> None:
     bow, point, terms = 0.03, (-0.3, 0.01, 0.02), (0.1, 0.4)
     phi, way = np.meshgrid(np.linspace(-0.5, 0.5, 7), np.linspace(0.5, 9, 5))
@@ -89,7 +87,7 @@ def test_depth_on_a_bowed_sheet_is_exact(worst) -> None:
     worst("depth on a bowed sheet, rays 1 to 30 degrees off it", "light traced in 50 digits", errors, 1e-13)
 
 
-@covers("calibration.model.rig_model:RigModel.sheets", "calibration.model.rig_model:RigModel.mirror_command")
+@covers(RigModel.sheets, RigModel.mirror_command)
 @EXAMPLES
 @given(lag=st.floats(0, 1), delay=st.floats(-1e-3, 1e-3), row=st.floats(0, 1e4), velocity=st.floats(-1e5, 1e5))
 def test_the_mirror_is_behind_by_lag_and_row(lag, delay, row, velocity) -> None:
@@ -99,10 +97,7 @@ def test_the_mirror_is_behind_by_lag_and_row(lag, delay, row, velocity) -> None:
     assert np.array_equal(model.sheets([0.1, 0.2]).planes, model.planes([0.1, 0.2]))
 
 
-@covers(
-    "calibration.model.parameters:parameters", "calibration.model.parameters:with_parameters",
-    "calibration.model.parameters:changed_camera",
-)  # fmt: skip
+@covers(parameters, with_parameters, changed_camera)
 @EXAMPLES
 @given(changes=st.dictionaries(st.sampled_from(["fx", "k1", "axis_turn_1", "axis_turn_2", "axis_shift_2", "angle_1",
        "angle_3", "offset_0", "cone", "bow", "lag_forward", "row_delay"]), ANY | st.floats(-0.1, 0.1)))  # fmt: skip
@@ -118,7 +113,7 @@ def test_changed_models_are_models_or_refused(changes) -> None:
     assert np.abs(np.linalg.norm(changed.planes([-1, 0, 1])[:, :3], axis=1) - 1).max() < 1e-12
 
 
-@covers("calibration.depth_error:*", "calibration.model.rig_model:Covariance.of")
+@covers(depth_error, Covariance.of)
 @EXAMPLES
 @given(
     seed=st.integers(0, 10**6), scale=st.sampled_from([0.0, 1e-12, 1e-3, 1e3]), depth_m=st.floats(1e-3, 1e4),

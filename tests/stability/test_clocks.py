@@ -11,10 +11,11 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from drivers.clock import NS_PER_S, VirtualClock
-from drivers.frames import frame_bytes, packed_row_bytes
+from drivers.frames import FrameBlock, frame_bytes, packed_row_bytes
 from drivers.replay.pace import Pace, ReplayClock
 from drivers.units import DIMENSIONS, format_quantity, parse_exact, parse_quantity
 from rig.count.bind import FrameBinder
+from rig.count.bind_kernels import walk
 from rig.count.blanking import MarkerLine
 from tests.stability.inventory import EXAMPLES, covers
 from tests.unit.rig.count.streams import plan_of, scan, stream_of
@@ -29,9 +30,7 @@ RATES = (
 )
 
 
-@covers(
-    "drivers.clock:VirtualClock.now_ns", "drivers.clock:VirtualClock.sleep", "drivers.clock:VirtualClock.advance_to_ns"
-)
+@covers(VirtualClock.now_ns, VirtualClock.sleep, VirtualClock.advance_to_ns)
 @EXAMPLES
 @given(start=st.integers(0, 2**63), steps=st.lists(st.floats(-1.0, 1e6), max_size=20), to=st.integers(0, 2**64))
 def test_virtual_time_never_runs_back_and_keeps_its_nanoseconds(start, steps, to) -> None:
@@ -45,10 +44,7 @@ def test_virtual_time_never_runs_back_and_keeps_its_nanoseconds(start, steps, to
     assert clock.now_ns() == max(before, to)
 
 
-@covers(
-    "drivers.replay.pace:Pace.speed", "drivers.replay.pace:Pace.most_frames", "drivers.replay.pace:Pace.wait",
-    "drivers.replay.pace:Pace.hold",
-)  # fmt: skip
+@covers(Pace.speed, Pace.most_frames, Pace.wait, Pace.hold)
 @EXAMPLES
 @given(
     uptime_s=st.integers(0, 10**9), speed=st.sampled_from([1e-4, 1.0, 1e4]), ahead_s=st.floats(0, 1),
@@ -69,7 +65,7 @@ def test_a_replay_keeps_its_pace_after_any_time_of_running(uptime_s, speed, ahea
     assert 0 <= report.held_s <= min(late_s, held_s) + 1e-6
 
 
-@covers("drivers.replay.pace:Pace.wait")
+@covers(Pace.wait)
 def test_the_spread_of_lateness_is_not_lost_behind_its_mean(worst) -> None:
     clock = VirtualClock()
     pace = Pace(ReplayClock(1.0), clock)
@@ -82,7 +78,7 @@ def test_the_spread_of_lateness_is_not_lost_behind_its_mean(worst) -> None:
     worst("standard deviation of lateness, mean 10^6 s", "exact", pace.report.late_sd_s / exact - 1, 1e-3)
 
 
-@covers("drivers.units:parse_quantity", "drivers.units:parse_exact", "drivers.units:format_quantity")
+@covers(parse_quantity, parse_exact, format_quantity)
 @EXAMPLES
 @given(value=st.floats(allow_nan=False, allow_infinity=False), dimension=st.sampled_from(sorted(DIMENSIONS)))
 def test_every_finite_number_is_written_and_read_back_to_the_bit(value, dimension) -> None:
@@ -91,7 +87,7 @@ def test_every_finite_number_is_written_and_read_back_to_the_bit(value, dimensio
     assert float(parse_exact(text, dimension)) == value
 
 
-@covers("drivers.frames:packed_row_bytes", "drivers.frames:frame_bytes")
+@covers(packed_row_bytes, frame_bytes)
 @EXAMPLES
 @given(width=st.integers(1, 2**20), height=st.integers(1, 2**20))
 def test_frames_hold_their_pixels_in_whole_words(width, height) -> None:
@@ -109,7 +105,7 @@ def places(blocks, plan, t0_ticks=None):
     return columns, [clock for closed in clocks for clock in closed]
 
 
-@covers("rig.count.bind_kernels:walk", "drivers.frames:FrameBlock.*")
+@covers(walk, FrameBlock)
 @pytest.mark.parametrize("bidirectional", [False, True])
 def test_frames_are_bound_alike_in_the_first_second_and_after_two_days(bidirectional) -> None:
     plan = plan_of(scan(columns=24, exposures=5, bidirectional=bidirectional))
@@ -137,7 +133,7 @@ def test_frames_are_bound_alike_in_the_first_second_and_after_two_days(bidirecti
     assert moved[-1].start_ticks[-1] == blocks[-1].start_ticks[-1] + ticks
 
 
-@covers("rig.count.bind_kernels:walk")
+@covers(walk)
 def test_a_run_that_has_gone_on_for_two_days_still_places_its_frames(worst) -> None:
     """Frames of one run 48 hours after its first one: sweep numbers beyond 2^16, units of time beyond 2^52."""
     plan = plan_of(scan(columns=24, exposures=5))
@@ -170,7 +166,7 @@ def test_a_run_that_has_gone_on_for_two_days_still_places_its_frames(worst) -> N
     worst("column of a frame after 48 hours", "first second", late[2][on] - early[2][on], 1e-9)
 
 
-@covers("rig.count.blanking:MarkerLine.fit", "rig.count.blanking:MarkerLine.add")
+@covers(MarkerLine.fit, MarkerLine.add)
 def test_the_line_of_two_days_of_markers_is_exact(worst) -> None:
     line, period = MarkerLine(), 5500.123456789
     index = np.concatenate([np.arange(20), np.arange(3_000_000, 3_000_020)])

@@ -6,11 +6,16 @@ from functools import cache
 import numpy as np
 import pytest
 
+from rig.estimate import registry
+from rig.estimate.joint import second_return_blocks, second_returns
 from rig.estimate.median import median_filter
 from rig.estimate.registry import ESTIMATORS, create_estimator
 from rig.geometry.windows import uncalibrated_geometry
 from tests.reference.geometry import Geometry
+from tests.stability.inventory import covers
 from tests.unit.small_maps import RIGS, geometry_of, simulated, volume_of
+
+covers(registry, second_returns, second_return_blocks)
 
 ROWS, COLUMNS = 12, 24
 

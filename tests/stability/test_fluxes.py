@@ -15,6 +15,7 @@ from rig.estimate.row.likelihood import (
     FLOOR,
     FLUX_MAX,
     FLUX_MIN,
+    add_evidence,
     cell_of,
     logit_table,
     mode_of,
@@ -22,7 +23,7 @@ from rig.estimate.row.likelihood import (
     row_posterior,
     row_scores,
 )
-from rig.estimate.row.model import EXTINCTION_MAX_PER_M, fine_profiles, fit_haze, line_profile, stripe_scale
+from rig.estimate.row.model import EXTINCTION_MAX_PER_M, RowModel, fine_profiles, fit_haze, line_profile, stripe_scale
 from rig.estimate.search.inputs import EXPOSURE_PARTS, count_fluxes
 from tests.stability.exactly import relative
 from tests.stability.inventory import EXAMPLES, covers
@@ -35,7 +36,7 @@ def exact_flux(n, k):
     return mpmath.log((k + mpmath.mpf("0.5")) / (k - n + mpmath.mpf("0.5")))
 
 
-@covers("rig.estimate.row.em:flux", "rig.estimate.search.inputs:count_fluxes")
+@covers(flux, count_fluxes)
 def test_fluxes_of_counts_are_exact_from_no_counts_to_all_ones(worst) -> None:
     for k in EXPOSURES:
         n = np.unique(np.round(np.concatenate([[0, 1, k - 1, k], np.geomspace(1, k, 25)])))
@@ -54,7 +55,7 @@ def test_fluxes_of_counts_are_exact_from_no_counts_to_all_ones(worst) -> None:
     )
 
 
-@covers("rig.estimate.row.likelihood:logit_table", "rig.estimate.row.likelihood:cell_of")
+@covers(logit_table, cell_of)
 def test_what_a_count_says_is_exact_at_every_flux(worst) -> None:
     """p' lies within floor / 2 of 0 and of 1 at the ends: neither logarithm may cancel."""
     cells = np.unique(np.linspace(0, TABLE.shape[1] - 1, 300).astype(int))
@@ -91,7 +92,7 @@ def sums(length: int, k: int, seed: int = 1):
     return edge, np.concatenate([[0], np.cumsum(taps[0].astype(float) - taps[1].astype(float))]), taps, score
 
 
-@covers("rig.estimate.row.likelihood:row_scores", "rig.estimate.row.likelihood:add_evidence")
+@covers(row_scores, add_evidence)
 @pytest.mark.parametrize("length", [512, 100_000])
 def test_sums_along_a_row_are_as_good_as_in_float64(length, worst) -> None:
     for k in (1, 10, 10**6):
@@ -101,11 +102,7 @@ def test_sums_along_a_row_are_as_good_as_in_float64(length, worst) -> None:
         worst(f"running sum of {length} terms, float32 out", "float64", np.abs(edge - exact) / scale, 1e-7)
 
 
-@covers(
-    "rig.estimate.row.likelihood:row_posterior",
-    "rig.estimate.row.likelihood:none_prior",
-    "rig.estimate.row.likelihood:mode_of",
-)
+@covers(row_posterior, none_prior, mode_of)
 @EXAMPLES
 @given(
     k=st.sampled_from(EXPOSURES), level=st.sampled_from([0.0, 1e-6, 0.5, 1.0]), length=st.integers(1, 200),
@@ -145,7 +142,7 @@ def test_posteriors_are_probabilities_for_any_counts(k, level, length, light, di
 ROW = st.lists(st.integers(0, 1000), min_size=1, max_size=40)
 
 
-@covers("rig.estimate.argmax_edge:sub_pixel")
+@covers(sub_pixel)
 @EXAMPLES
 @given(row=ROW, at=st.integers(0, 39), scale=st.sampled_from([1.0, 2.0**-40, 2.0**40]))
 def test_sub_pixel_offsets_stay_in_the_pixel_and_turn_round_with_the_row(row, at, scale) -> None:
@@ -158,7 +155,7 @@ def test_sub_pixel_offsets_stay_in_the_pixel_and_turn_round_with_the_row(row, at
         assert offset == 0
 
 
-@covers("rig.estimate.argmax_edge:sub_pixel")
+@covers(sub_pixel)
 def test_flat_tops_have_the_offset_of_their_middle() -> None:
     assert sub_pixel(np.array([2.0, 5, 5, 2]), 1, 4) == 0.5
     assert sub_pixel(np.array([2.0, 5, 5, 2]), 2, 4) == -0.5
@@ -167,7 +164,7 @@ def test_flat_tops_have_the_offset_of_their_middle() -> None:
     assert sub_pixel(np.array([1.0, 1e6, 1]), 1, 3) == 0
 
 
-@covers("rig.estimate.argmax_edge:peak_confidence")
+@covers(peak_confidence)
 def test_confidence_of_a_peak_is_exact_up_to_a_million_exposures(worst) -> None:
     def exact(peak, rest, k, length):
         half = mpmath.mpf("0.5")
@@ -199,7 +196,7 @@ def test_confidence_of_a_peak_is_exact_up_to_a_million_exposures(worst) -> None:
                 )
 
 
-@covers("rig.estimate.argmax_edge:peak_confidence")
+@covers(peak_confidence)
 @EXAMPLES
 @given(row=ROW, at=st.integers(0, 39), more=st.integers(0, 10**6))
 def test_confidences_are_probabilities(row, at, more) -> None:
@@ -209,7 +206,7 @@ def test_confidences_are_probabilities(row, at, more) -> None:
     assert rest >= 0
 
 
-@covers("rig.estimate.row.model:fit_haze")
+@covers(fit_haze)
 @EXAMPLES
 @given(
     near=st.floats(0.05, 2000), ratio=st.floats(1.01, 50), extinction=st.floats(0, 50), level=st.floats(1e-12, 1e3),
@@ -225,7 +222,7 @@ def test_haze_of_any_density_and_distance_has_a_finite_fit_or_none(near, ratio, 
         assert fit.extinction_sd_per_m >= 0
 
 
-@covers("rig.estimate.row.model:fit_haze")
+@covers(fit_haze)
 @pytest.mark.parametrize("extinction", [0.0, 1e-3, 0.13, 4.0])
 def test_noise_free_haze_gives_its_extinction_back(extinction, worst) -> None:
     path = np.linspace(0.8, 9, 64)
@@ -235,7 +232,7 @@ def test_noise_free_haze_gives_its_extinction_back(extinction, worst) -> None:
     worst("extinction of noise-free haze, 0 to 4 /m", "exact", fit.extinction_per_m - extinction, 1e-6)
 
 
-@covers("rig.estimate.row.model:stripe_scale", "rig.estimate.row.model:RowModel.path_m")
+@covers(stripe_scale, RowModel.path_m)
 @EXAMPLES
 @given(near=st.floats(1e-3, 1e3), ratio=st.floats(1.0, 1e4), extinction=st.floats(0, 50))
 def test_stripe_scales_are_finite_and_fall_with_distance(near, ratio, extinction) -> None:
@@ -244,7 +241,7 @@ def test_stripe_scales_are_finite_and_fall_with_distance(near, ratio, extinction
     assert np.all(np.diff(scale) <= 0)
 
 
-@covers("rig.estimate.row.model:line_profile", "rig.estimate.row.model:fine_profiles")
+@covers(line_profile, fine_profiles)
 @pytest.mark.parametrize("sigma_px", [0.05, 0.25, 0.6, 2.4])
 def test_line_profiles_are_exact_and_whole(sigma_px, worst) -> None:
     def share(distance, sigma):

@@ -4,13 +4,14 @@ import numpy as np
 import pytest
 
 from rig.depth.fog_meter import FogEstimate, fit_fog, read_fog
+from rig.depth.kernels import add_clear_rows
 from rig.geometry.stripe_table import StripeTable
 from tests.reference.working_point import Light
 from tests.stability.inventory import covers
 from tests.unit.rig.depth.test_fog_meter import PATH_M, state_of, stripes_of, sums, swept
 
 
-@covers("rig.depth.fog_meter:fit_fog")
+@covers(fit_fog)
 @pytest.mark.parametrize("exposures", [60.0, 1e4, 1e9])
 @pytest.mark.parametrize("extinction", [0.0, 0.02, 1.0, 30.0])
 @pytest.mark.parametrize("haze", [0.0, 1e-6, 0.3, 100.0])
@@ -22,7 +23,7 @@ def test_any_light_has_a_finite_fit(exposures, extinction, haze, ambient) -> Non
     assert np.all(np.diag(fit.covariance) >= 0)
 
 
-@covers("rig.depth.fog_meter:fit_fog")
+@covers(fit_fog)
 def test_exact_light_is_found_again_exactly(worst) -> None:
     for extinction, haze, rest in ((0.02, 0.1, 0.0), (0.2, 0.3, 0.3), (0.8, 1.0, 0.1)):
         fit = fit_fog(sums(extinction, haze, rest, 0.02, 1e7), PATH_M)
@@ -36,7 +37,7 @@ def test_exact_light_is_found_again_exactly(worst) -> None:
         worst("extinction, haze and rest of exact sums", "what they were made of", found / expected - 1, 1e-3)
 
 
-@covers("rig.depth.fog_meter:fit_fog")
+@covers(fit_fog)
 def test_sums_that_are_all_zeros_all_ones_or_nowhere() -> None:
     made = sums()
     for share in (0.0, 1.0):
@@ -53,7 +54,7 @@ def test_sums_that_are_all_zeros_all_ones_or_nowhere() -> None:
     assert np.isfinite(fit_fog(few, PATH_M).covariance).all()
 
 
-@covers("rig.depth.kernels:add_clear_rows")
+@covers(add_clear_rows)
 @pytest.mark.parametrize("level", [0, 1, 5])
 def test_pictures_without_any_contrast_have_no_fog(level) -> None:
     sweep = swept(Light(), 5)

@@ -8,7 +8,7 @@ from hypothesis import strategies as st
 from numpy.polynomial import Polynomial
 
 from calibration.errors import CalibrationError
-from calibration.model.camera import TERM_COUNTS, Camera, LensModel
+from calibration.model.camera import TERM_COUNTS, Camera, Forward, LensModel
 from tests.stability.exactly import relative
 from tests.stability.inventory import EXAMPLES, covers
 
@@ -50,7 +50,7 @@ def first_fold(k1: float, k2: float, k3: float, k4: float, k5: float, k6: float)
     return float(np.sqrt(real.min(initial=np.inf)))
 
 
-@covers("calibration.model.camera:LensModel.valid", "calibration.model.camera:LensModel.distort")
+@covers(LensModel.valid, LensModel.distort)
 @EXAMPLES
 @given(radial=RADIAL)
 def test_past_the_first_fold_nothing_is_seen(radial) -> None:
@@ -66,7 +66,7 @@ def test_past_the_first_fold_nothing_is_seen(radial) -> None:
     np.testing.assert_array_equal(np.isfinite(x) & np.isfinite(y), r < fold)
 
 
-@covers("calibration.model.camera:LensModel.undistort", "calibration.model.camera:LensModel.distort")
+@covers(LensModel.undistort, LensModel.distort)
 @EXAMPLES
 @given(terms=LENS)
 def test_what_is_seen_leads_back_to_its_ray(terms) -> None:
@@ -90,11 +90,14 @@ def test_what_is_seen_leads_back_to_its_ray(terms) -> None:
 
 
 @covers(
-    "calibration.model.camera:Camera.tangents", "calibration.model.camera:Camera.tangents_at",
-    "calibration.model.camera:Camera.project", "calibration.model.camera:Camera.tangent_slopes",
-    "calibration.model.camera:LensModel.undistort_slope",
-    "calibration.model.camera:LensModel.forward", "calibration.model.camera:Forward.determinant",
-)  # fmt: skip
+    Camera.tangents,
+    Camera.tangents_at,
+    Camera.project,
+    Camera.tangent_slopes,
+    LensModel.undistort_slope,
+    LensModel.forward,
+    Forward.determinant,
+)
 @EXAMPLES
 @given(
     terms=st.lists(ANY, min_size=14, max_size=14), count=st.sampled_from((0, *TERM_COUNTS)),
@@ -114,7 +117,7 @@ def test_cameras_of_any_numbers_see_a_finite_ray_or_none(terms, count, focal, x,
     assert np.isnan(pairs[2][0][1])  # behind the camera
 
 
-@covers("calibration.model.camera:LensModel.forward", "calibration.model.camera:LensModel.undistort")
+@covers(LensModel.forward, LensModel.undistort)
 @pytest.mark.parametrize(
     "terms",
     [[-0.35, 0.1, 0.001, -0.002, 0.01], [-0.3, 0.1, 0.001, 0.001, 0, 0.1, 0.1, 0, 0.01, 0.02, -0.01, 0.01]],

@@ -8,10 +8,19 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
+from sim_backend.effects.airlight import Airlight
+from sim_backend.effects.ambient import Ambient
 from sim_backend.effects.catalogue import CATALOGUE
-from sim_backend.frames.flux import FluxModel
+from sim_backend.effects.dark_counts import DarkCounts, dark_rates
+from sim_backend.effects.fog import Haze
+from sim_backend.effects.forward_blur import ForwardBlur
+from sim_backend.effects.rain import RainDrops
+from sim_backend.effects.snow import SnowFlakes
+from sim_backend.effects.stripe import Stripe
+from sim_backend.frames.flux import FluxModel, hold_s
 from sim_backend.light.optics import Line, Optics, Sensor, ambient_irradiance, detections_per_radiance
-from sim_backend.light.sheet import empty_sheet
+from sim_backend.light.sheet import LightSheet, empty_sheet, span_bounds, trace_rows
+from sim_backend.light.view import CameraView
 from sim_backend.scenes.medium import henyey_greenstein
 from sim_backend.scenes.surfaces import checked
 from tests.stability.exactly import relative
@@ -23,7 +32,7 @@ DEPTHS = (1e-300, 1e-12, 0.01, 1.0, 10.0, 50.0)
 """Optical depths, one way, of the wall."""
 
 
-@covers("sim_backend.scenes.medium:henyey_greenstein")
+@covers(henyey_greenstein)
 def test_phase_functions_are_exact_also_at_their_peak(worst) -> None:
     cosine, g = np.meshgrid(
         [-1.0, -0.999999, -0.3, 0.0, 0.5, 0.9999999, 1.0], [-0.999999, -0.5, 0.0, 1e-9, 0.85, 0.999999]
@@ -56,11 +65,7 @@ def closed_forms(setup, extinction: float, plane: np.ndarray, row: int):
     return x, [m(setup.gain) * h for h in haze], m(setup.gain) * power * FOCAL_PX
 
 
-@covers(
-    "sim_backend.effects.stripe:Stripe.add",
-    "sim_backend.effects.fog:Haze.add",
-    "sim_backend.light.view:CameraView.sheet",
-)
+@covers(Stripe.add, Haze.add, CameraView.sheet)
 @pytest.mark.parametrize("depth", [0.0, *DEPTHS])
 def test_stripe_and_haze_follow_beer_and_lambert_to_optical_depth_50(depth, worst) -> None:
     extinction = depth / WALL_M
@@ -96,14 +101,11 @@ SCENE = st.fixed_dictionaries(
 )
 
 
+@covers(FluxModel, hold_s, empty_sheet, CameraView)
 @covers(
-    "sim_backend.frames.flux:FluxModel.*",
-    "sim_backend.frames.flux:hold_s",
-    "sim_backend.light.sheet:empty_sheet",
-    "sim_backend.light.view:CameraView.*",
+    Airlight.rate, Ambient.rate, Haze.add, DarkCounts.rate, dark_rates, ForwardBlur.add, RainDrops.add, SnowFlakes.add
 )
-@covers("sim_backend.effects.*:*.rate", "sim_backend.effects.*:*.add", "sim_backend.effects.dark_counts:dark_rates")
-@covers("sim_backend.light.sheet:trace_rows", "sim_backend.light.sheet:span_bounds")
+@covers(trace_rows, span_bounds)
 @EXAMPLES
 @given(
     scene=SCENE, baseline=st.sampled_from([-0.3, 1e-9, 1e-3, 0.3, 30.0]), command=st.floats(-1, 1),
@@ -126,7 +128,7 @@ def test_the_light_of_every_scene_is_finite_and_never_negative(
     assert np.all(flux >= 0)
 
 
-@covers("sim_backend.light.sheet:empty_sheet")
+@covers(empty_sheet)
 def test_a_sheet_through_the_camera_is_seen_by_nobody() -> None:
     model = rig(size=(8, 24))
     setup = setting(model, wall(model, (0.0, 0.0, 1.0), 3.0), medium={"extinction": "0.1 /m"})
@@ -137,7 +139,7 @@ def test_a_sheet_through_the_camera_is_seen_by_nobody() -> None:
         assert not effect_rate(setup, name, plane).any()
 
 
-@covers("sim_backend.light.sheet:LightSheet.touch")
+@covers(LightSheet.touch)
 @EXAMPLES
 @given(
     bow=st.floats(-0.2, 0.2), baseline=st.sampled_from([-0.3, 0.0, 1e-9, 0.3]), command=st.floats(-1, 1),
@@ -156,7 +158,7 @@ def test_planes_that_touch_a_bowed_sheet_are_planes_wherever_they_are_touched(bo
     assert np.allclose(sheet.inverse[seen] * sheet.offset_m[seen, None], sheet.normal[seen], atol=1e-12)
 
 
-@covers("sim_backend.light.optics:detections_per_radiance", "sim_backend.light.optics:ambient_irradiance")
+@covers(detections_per_radiance, ambient_irradiance)
 def test_radiometry_is_exact(worst) -> None:
     optics, sensor, line = Optics(), Sensor(), Line()
 

@@ -40,7 +40,7 @@ def light(position=20.0, stripe=1.0, sigma_px=0.6, haze=0.0, dark=1e-4, pixels=4
     return RowLight(behind + haze, behind, np.ones(pixels), position, stripe, sigma_px, 0.0, pixels - 1.0)
 
 
-@covers("rig.tradeoff.limits:chernoff_exponent")
+@covers(chernoff_exponent)
 def test_chernoff_exponents_of_any_two_pixels(worst) -> None:
     one, two = (np.array(each) for each in zip(*((a, b) for a in FLUXES for b in FLUXES if a != b), strict=True))
     got = chernoff_exponent(one[:, None], two[:, None])
@@ -48,7 +48,7 @@ def test_chernoff_exponents_of_any_two_pixels(worst) -> None:
     np.testing.assert_allclose(got, chernoff_exponent(two[:, None], one[:, None]), rtol=1e-12)
 
 
-@covers("rig.tradeoff.limits:chernoff_exponent")
+@covers(chernoff_exponent)
 def test_chernoff_exponents_of_pixels_nearly_alike(worst) -> None:
     """Differences that cancel in p and in q: C falls with their square."""
     base, step = np.meshgrid([1e-9, 1e-3, 0.3, 3.0, 30.0], [1e-1, 1e-3, 1e-6, 1e-9])
@@ -59,7 +59,7 @@ def test_chernoff_exponents_of_pixels_nearly_alike(worst) -> None:
     assert np.all(chernoff_exponent(one[:, None], one[:, None]) == 0)
 
 
-@covers("rig.tradeoff.limits:chernoff_exponent")
+@covers(chernoff_exponent)
 def test_exponents_of_a_swap_are_those_of_the_closed_form() -> None:
     """Two pixels trade places: C = -2 log(sqrt(ps pb) + sqrt(qs qb)), 0.223 for (.5, .1) and 0.292 for (.8, .3)."""
     for ps, pb, expected in ((0.5, 0.1, 0.223), (0.8, 0.3, 0.292)):
@@ -69,7 +69,7 @@ def test_exponents_of_a_swap_are_those_of_the_closed_form() -> None:
         assert got == pytest.approx(expected, abs=5e-4)
 
 
-@covers("rig.tradeoff.row_light:pixel_share", "rig.tradeoff.limits:log_fired")
+@covers(pixel_share, log_fired)
 def test_shares_of_a_line_far_out_in_its_flanks(worst) -> None:
     away, sigma = (a.ravel() for a in np.meshgrid([0.0, 0.3, 0.5, 1.0, 2.5, 4.0], [0.2, 0.6, 3.0, 100.0]))
     inside = away < 8 * sigma + 0.5
@@ -85,11 +85,7 @@ def test_shares_of_a_line_far_out_in_its_flanks(worst) -> None:
     worst("log of the chance to fire", "mpmath, 50 digits", off / np.maximum(np.abs(log_fired(flux)), 1.0), 1e-15)
 
 
-@covers(
-    "rig.tradeoff.limits:position_information",
-    "rig.tradeoff.limits:position_sd_px",
-    "rig.tradeoff.row_light:RowLight.flux",
-)
+@covers(position_information, position_sd_px, RowLight.flux)
 def test_information_of_any_stripe(worst) -> None:
     cases = [
         (position, stripe, sigma, haze, dark)
@@ -116,7 +112,7 @@ def test_information_of_any_stripe(worst) -> None:
     worst("Fisher information of the position", "mpmath, 50 digits", relative(got, exact, *np.array(cases).T), 1e-12)
 
 
-@covers("rig.tradeoff.limits:position_information", "rig.tradeoff.limits:position_sd_px")
+@covers(position_information, position_sd_px)
 def test_a_saturated_pair_on_a_pixel_border_says_nothing() -> None:
     """Both always fire, wherever within them the line lies; its flanks, a hundred sigma off, are empty."""
     pair = light(position=20.5, stripe=1e6, sigma_px=0.01, dark=1e-9)
@@ -128,12 +124,7 @@ def test_a_saturated_pair_on_a_pixel_border_says_nothing() -> None:
     assert np.all(errors < 0.1)
 
 
-@covers(
-    "rig.tradeoff.limits:bayes_errors",
-    "rig.tradeoff.limits:limits",
-    "rig.tradeoff.limits:least_exponent",
-    "rig.tradeoff.row_light:RowLight.*",
-)
+@covers(bayes_errors, limits, least_exponent, RowLight)
 @pytest.mark.parametrize("stripe", [1e-12, 1.0, 1e4])
 @pytest.mark.parametrize("sigma_px", [0.05, 0.6, 10.0])
 @pytest.mark.parametrize(("haze", "dark"), [(0.0, FLUX_MIN), (0.0, 1e-3), (50.0, 1e-3), (0.1, 500.0)])
@@ -147,14 +138,14 @@ def test_limits_are_finite_for_any_light(stripe, sigma_px, haze, dark) -> None:
         assert found.position_sd_px >= 0
 
 
-@covers("rig.tradeoff.limits:least_exponent")
+@covers(least_exponent)
 def test_rows_of_a_single_pixel_have_no_rivals() -> None:
     only = RowLight(np.array([0.1]), np.array([0.1]), np.ones(1), 0.0, 1.0, 0.6, 0.0, 0.0)
     assert least_exponent(only) == np.inf
     assert np.all(bayes_errors(only, [1, 10], 5, np.random.default_rng(1)) <= 0.5)
 
 
-@covers("rig.tradeoff.limits:limits")
+@covers(limits)
 def test_no_rows_have_no_limit() -> None:
     with pytest.raises(ValueError, match="at least one row"):
         limits([], [1])

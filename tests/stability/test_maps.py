@@ -12,14 +12,17 @@ from calibration.errors import CalibrationError
 from calibration.model.camera import Camera
 from calibration.model.rig_model import RigModel
 from calibration.model.scanner import PlaneTable
-from rig.count.volume import BIN_DARK, CountVolume, SweepCounter, SweepLayout, SweepTally
+from rig.count.volume import BIN_DARK, CountVolume, FrameTally, SweepCounter, SweepLayout, SweepTally, with_room
 from rig.depth.depth import depth_map
+from rig.depth.kernels import fill_rows
 from rig.errors import UsageError
+from rig.estimate.argmax_edge import peak_rows
 from rig.estimate.median import median_filter
 from rig.estimate.registry import ESTIMATORS, create_estimator
 from rig.estimate.row.ambient import ambient_map, hot_pixels
+from rig.geometry.kernels import row_windows
 from rig.geometry.stripe_table import MISSING_PX, StripeTable, charged_errors, depth_errors, stripe_errors
-from rig.geometry.windows import sweep_geometry, uncalibrated_geometry
+from rig.geometry.windows import SweepGeometry, sweep_geometry, uncalibrated_geometry
 from rig.threads import RowWorkers
 from tests.stability.inventory import EXAMPLES, covers
 from tests.unit.small_maps import rows_of, simulated, volume_of
@@ -27,9 +30,7 @@ from tests.unit.small_maps import rows_of, simulated, volume_of
 NAN = st.just(np.nan)
 
 
-@covers(
-    "rig.geometry.windows:sweep_geometry", "rig.geometry.windows:SweepGeometry.*", "rig.geometry.kernels:row_windows"
-)
+@covers(sweep_geometry, SweepGeometry, row_windows)
 @EXAMPLES
 @given(
     focal=st.sampled_from([1.0, 60.0, 6e4]), k1=st.sampled_from([-2.0, -0.3, 0.0, 0.5]), width=st.integers(1, 130),
@@ -63,7 +64,7 @@ def test_windows_hold_what_lies_in_the_depth_range_and_nothing_else(
     assert np.all(w[inside] >= (1 / (near * ratio) - slack)[inside])
 
 
-@covers("rig.geometry.windows:uncalibrated_geometry")
+@covers(uncalibrated_geometry)
 @EXAMPLES
 @given(rows=st.integers(1, 4), width=st.integers(1, 200), columns=st.integers(1, 4))
 def test_without_a_model_the_whole_row_is_searched(rows, width, columns) -> None:
@@ -73,12 +74,7 @@ def test_without_a_model_the_whole_row_is_searched(rows, width, columns) -> None
     assert np.isfinite(geometry.reference_px()).all()
 
 
-@covers(
-    "rig.depth.depth:depth_map",
-    "rig.depth.kernels:fill_rows",
-    "rig.geometry.stripe_table:StripeTable.*",
-    "rig.estimate.median:median_filter",
-)
+@covers(depth_map, fill_rows, StripeTable, median_filter)
 @EXAMPLES
 @given(
     seed=st.integers(0, 10**6),
@@ -107,11 +103,7 @@ def test_depth_lies_in_the_depth_range_or_there_is_none(seed, spread, missing, s
     assert np.isnan(depth_map(empty, geometry, 0.5)).all()
 
 
-@covers(
-    "rig.geometry.stripe_table:stripe_errors",
-    "rig.geometry.stripe_table:depth_errors",
-    "rig.geometry.stripe_table:charged_errors",
-)
+@covers(stripe_errors, depth_errors, charged_errors)
 @EXAMPLES
 @given(
     x=st.lists(st.floats(-(2.0**99), 2.0**99, width=32) | NAN, min_size=4, max_size=4),
@@ -129,10 +121,7 @@ def test_scores_are_numbers_or_none(x, true) -> None:
         assert 0 <= scores["within_1px"] <= 1 - scores["missing"] + 1e-12
 
 
-@covers(
-    "rig.count.volume:SweepCounter.*", "rig.count.volume:SweepTally.*", "rig.count.volume:SweepLayout.*",
-    "rig.count.volume:FrameTally.*", "rig.count.volume:CountVolume.*", "rig.count.volume:with_room",
-)  # fmt: skip
+@covers(SweepCounter, SweepTally, SweepLayout, FrameTally, CountVolume, with_room)
 def test_a_million_exposures_are_counted_to_the_last_one(worst) -> None:
     layout = SweepLayout(columns=2, rows=1, width=64, x0=np.zeros(2, np.int32), window=64, exposures=10**6)
     counter = SweepCounter(layout, RowWorkers(1))
@@ -159,7 +148,7 @@ def test_a_million_exposures_are_counted_to_the_last_one(worst) -> None:
     assert list(nothing.bound_column()) == [0, 1]
 
 
-@covers("rig.estimate.row.ambient:ambient_map", "rig.estimate.row.ambient:hot_pixels")
+@covers(ambient_map, hot_pixels)
 @EXAMPLES
 @given(
     k=st.sampled_from([1, 10, 10**6]), level=st.sampled_from([0.0, 1e-6, 0.3, 1.0]),
@@ -189,7 +178,7 @@ def test_ambient_light_is_a_finite_flux_for_any_counts(k, level, n_dark, dark, q
 EVERY = pytest.mark.parametrize("name", ESTIMATORS)
 
 
-@covers("rig.estimate.argmax_edge:peak_rows")
+@covers(peak_rows)
 @EVERY
 @pytest.mark.parametrize("level", [0, 1])
 def test_a_million_exposures_of_nothing_or_all_ones(name, level) -> None:

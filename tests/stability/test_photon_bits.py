@@ -8,6 +8,7 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 
+from sim_backend import random_numbers
 from sim_backend.frames.photon_kernels import CHANCE, LEVELS, NEVER, Levels, draw_frames, new_levels, set_levels
 from sim_backend.light.line import edge, edge_sum
 from sim_backend.random_numbers import HALVING, ROUGHLY, one_minus_exp_minus, power_of_half, roughly_one_minus_exp_minus
@@ -15,6 +16,8 @@ from tests.campaigns.photon_bits import PROBABILITIES, chi_square, correlations,
 from tests.stability.conftest import Worst
 from tests.stability.exactly import relative
 from tests.stability.inventory import covers
+
+covers(random_numbers)
 
 DOUBLE, SINGLE = HALVING[np.float64], HALVING[np.float32]
 
@@ -73,7 +76,7 @@ def _levels(flux: float, rows: int) -> tuple[NDArray[np.float64], Levels]:
     return steady, levels
 
 
-@covers("sim_backend.frames.photon_kernels:set_levels", "sim_backend.frames.photon_kernels:new_levels")
+@covers(set_levels, new_levels)
 @pytest.mark.parametrize("flux", [0.0, 1e-300, 1e-15, 1e-12, 1e-6, 1e-3, 1.0, 10.0, 34.0, 37.0, 700.0, 1e3, 1e300])
 def test_every_flux_has_a_level_that_drawing_anew_completes(flux: float) -> None:
     level = NEVER - int(_levels(flux, 1)[1][0][0, 0, 0])
@@ -84,7 +87,7 @@ def test_every_flux_has_a_level_that_drawing_anew_completes(flux: float) -> None
         assert 0 <= share <= 1
 
 
-@covers("sim_backend.frames.photon_kernels:draw_frames")
+@covers(draw_frames)
 def test_frames_past_all_counters_are_drawn_and_differ() -> None:
     steady, levels = _levels(0.7, 4)
     seen = []

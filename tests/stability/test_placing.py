@@ -10,6 +10,7 @@ from hypothesis import strategies as st
 
 from rig.errors import UsageError
 from rig.estimate.joint.labels.grid import far_ends, label_grid
+from rig.estimate.joint.place import places
 from rig.estimate.joint.place.place import amplitudes_of, line_width, new_places, place, profile_table
 from rig.estimate.row.inputs import state_of, sweep_of
 from rig.estimate.row.model import pixel_shares
@@ -25,7 +26,7 @@ GEOMETRIES = {rig: geometry_of(Geometry.build(width=WIDTH, height=ROWS, columns=
 WORKERS = RowWorkers(1)
 
 
-@covers("rig.estimate.row.model:pixel_shares", "rig.estimate.joint.place.place:profile_table")
+@covers(pixel_shares, profile_table)
 def test_shares_of_a_line_are_those_of_a_gaussian_however_narrow_or_wide(worst) -> None:
     distance = np.array([-60.0, -3.0, -0.5, 0.0, 0.25, 0.5, 1.0, 7.0])
     with mpmath.workdps(50):
@@ -40,7 +41,7 @@ def test_shares_of_a_line_are_those_of_a_gaussian_however_narrow_or_wide(worst) 
             assert np.all((table[:, 0] >= 0) & (table[:, 0].sum(axis=1, keepdims=True) <= 1 + 1e-6))
 
 
-@covers("rig.estimate.joint.labels.grid:far_ends")
+@covers(far_ends)
 @EXAMPLES
 @given(
     rig=st.sampled_from(list(RIGS)), near=st.floats(1e-3, 1e3), ratio=st.floats(1.001, 1e6),
@@ -62,7 +63,7 @@ def test_far_ends_are_numbers_where_anything_is_searched_and_nowhere_else(rig, n
     assert np.all((grid.side * (grid.x_far - nearest))[asked] * 2 < grid.stripes)
 
 
-@covers("rig.estimate.joint.place.place*:*")
+@covers(place, places)
 @EXAMPLES
 @given(
     rig=st.sampled_from(list(RIGS)), exposures=st.sampled_from([1, 10, 255, 10**6]),

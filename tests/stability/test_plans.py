@@ -16,11 +16,23 @@ from drivers.interfaces import LEVEL_BACKWARD, ScanWaveform
 from drivers.scanners.galvo import brake, ramp
 from rig.count.blanking import PatternSearch, PatternShape, detection_probability
 from rig.errors import PlanError
+from rig.plan import waveform
 from rig.plan.calibration_reach import require_speed
+from rig.plan.compile import compile_plan, path_demand
 from rig.plan.describe import rounded
 from rig.plan.gate_pulses import sync_program
-from rig.plan.mirror_path import MirrorLimits, mirrored, narrowed, sweep_path
-from rig.plan.scan_plan import ScanPlan
+from rig.plan.mirror_path import (
+    MirrorLimits,
+    PathDemand,
+    PathSegment,
+    SweepPath,
+    find_path,
+    mirrored,
+    narrowed,
+    sweep_path,
+)
+from rig.plan.scan_plan import Blanking, ScanPlan, blanking_for, column_command
+from rig.plan.waveform import moving_windows, window_widths
 from sim_backend.mirror_motion import Playing, Resting
 from tests.stability.inventory import EXAMPLES, covers
 from tests.unit.rig.count.light import blanked_plan
@@ -34,7 +46,7 @@ LIMITS = st.builds(
 RATE = st.floats(1e3, 1e5)
 
 
-@covers("drivers.scanners.galvo:ramp")
+@covers(ramp)
 @EXAMPLES
 @given(start=COMMAND, end=COMMAND, limits=LIMITS, rate=RATE)
 def test_ramps_end_where_they_should_within_limits(start, end, limits, rate) -> None:
@@ -49,7 +61,7 @@ def test_ramps_end_where_they_should_within_limits(start, end, limits, rate) -> 
     assert np.all(steps * np.sign(end - start) >= -1e-15)
 
 
-@covers("drivers.scanners.galvo:brake")
+@covers(brake)
 @EXAMPLES
 @given(at=COMMAND, velocity=st.floats(-1e5, 1e5) | st.sampled_from([0.0, 5e-324, -1e-300]), limits=LIMITS, rate=RATE)
 def test_brakes_come_to_rest_inside_the_range(at, velocity, limits, rate) -> None:
@@ -61,11 +73,7 @@ def test_brakes_come_to_rest_inside_the_range(at, velocity, limits, rate) -> Non
     assert np.all(np.diff(steps) <= 1e-12)
 
 
-@covers(
-    "rig.plan.mirror_path:PathSegment.command", "rig.plan.mirror_path:SweepPath.command",
-    "rig.plan.mirror_path:SweepPath.rms_acceleration", "rig.plan.mirror_path:MirrorLimits.*",
-    "rig.plan.mirror_path:sweep_path",
-)  # fmt: skip
+@covers(PathSegment.command, SweepPath.command, SweepPath.rms_acceleration, MirrorLimits, sweep_path)
 @EXAMPLES
 @given(
     edges=st.tuples(COMMAND, COMMAND), lit_s=st.fractions(Fraction(1, 10**4), Fraction(1, 4)),
@@ -92,7 +100,7 @@ def test_sweeps_are_smooth_and_lit_at_constant_velocity(
     assert np.isfinite(path.rms_acceleration)
 
 
-@covers("rig.plan.mirror_path:narrowed")
+@covers(narrowed)
 @EXAMPLES
 @given(edges=st.tuples(COMMAND, COMMAND), share=st.floats(0, 1), low=COMMAND, high=COMMAND)
 def test_narrowed_ranges_lie_inside_the_scanner_s(edges, share, low, high) -> None:
@@ -123,7 +131,7 @@ def plans(draw):
         raise
 
 
-@covers("rig.plan.calibration_reach:require_speed")
+@covers(require_speed)
 @EXAMPLES
 @given(
     speed=st.floats(0, 1e6), ends=st.lists(st.floats(0, 1e6), min_size=2, max_size=2), exposures=st.integers(1, 10**6)
@@ -144,15 +152,7 @@ def test_a_speed_that_was_not_calibrated_comes_with_exposures_that_can_be_scanne
 
 
 @covers(
-    "rig.plan.scan_plan:ScanPlan.*",
-    "rig.plan.scan_plan:column_command",
-    "rig.plan.mirror_path:PathDemand.*",
-    "rig.plan.mirror_path:find_path",
-    "rig.plan.gate_pulses:sync_program",
-    "rig.plan.compile:compile_plan",
-    "rig.plan.compile:path_demand",
-    "rig.plan.waveform:*",
-    "rig.plan.waveform:window_widths",
+    ScanPlan, column_command, PathDemand, find_path, sync_program, compile_plan, path_demand, waveform, window_widths
 )
 @EXAMPLES
 @given(plan=plans())
@@ -186,14 +186,14 @@ def test_plans_are_exact_in_time_and_finite_in_all_their_figures(plan) -> None:
     assert not plan.window_x0(np.zeros(2, np.uint32), np.zeros(2, np.int64), np.array([-1, 0])).any() or plan.windows
 
 
-@covers("rig.plan.describe:rounded")
+@covers(rounded)
 @EXAMPLES
 @given(value=st.floats(1e-12, 1e12))
 def test_figures_for_people_keep_four_digits(value) -> None:
     assert float(rounded(value)) == pytest.approx(value, rel=1e-3)
 
 
-@covers("rig.plan.scan_plan:Blanking.*", "rig.plan.scan_plan:blanking_for", "rig.plan.waveform:moving_windows")
+@covers(Blanking, blanking_for, moving_windows)
 @pytest.mark.parametrize("exposures", [4, 40, 300])
 def test_blanking_patterns_lie_before_the_lit_part_in_order(exposures) -> None:
     plan = blanked_plan(exposures=exposures)
@@ -209,10 +209,7 @@ def test_blanking_patterns_lie_before_the_lit_part_in_order(exposures) -> None:
 SHAPE = PatternShape(np.array([[0.0, 1.3], [2.6, 6.5], [7.8, 9.1], [11.7, 13.0], [15.6, 19.5]]), 0.9)
 
 
-@covers(
-    "rig.count.blanking:PatternSearch.*", "rig.count.blanking:PatternShape.*",
-    "rig.count.blanking:detection_probability",
-)  # fmt: skip
+@covers(PatternSearch, PatternShape, detection_probability)
 @EXAMPLES
 @given(
     level=st.sampled_from([0.0, 1e-3, 100.0, 262_144.0]), bright=st.sampled_from([0.0, 1.0, 500.0, 1e5]),
@@ -241,7 +238,7 @@ def test_patterns_are_found_or_not_but_never_with_a_warning(level, bright, place
         assert found.place == pytest.approx(place, abs=0.1)
 
 
-@covers("sim_backend.mirror_motion:Playing.*", "sim_backend.mirror_motion:Resting.*")
+@covers(Playing, Resting)
 @EXAMPLES
 @given(
     points=st.integers(1, 20), repeats=st.integers(1, 10**6), start=st.floats(0, 2e5), rate=st.floats(1e3, 1e5),

@@ -35,7 +35,7 @@ def rays_about(plane: np.ndarray, sines: np.ndarray) -> tuple[np.ndarray, np.nda
     return u, v
 
 
-@covers("calibration.model.light_sheet:depth", "calibration.model.light_sheet:inverse_depth")
+@covers(depth, inverse_depth)
 def test_depth_keeps_nine_digits_wherever_it_is_given(worst) -> None:
     rng = np.random.default_rng(1)
     for side in (-1, 1):
@@ -59,7 +59,7 @@ def test_depth_keeps_nine_digits_wherever_it_is_given(worst) -> None:
         )
 
 
-@covers("calibration.model.light_sheet:depth", "calibration.model.light_sheet:inverse_depth")
+@covers(depth, inverse_depth)
 @EXAMPLES
 @given(u=ANY, v=ANY, normal=st.tuples(METRES, METRES, METRES), offset=METRES | st.floats(-1e-5, 1e-5))
 def test_there_is_no_huge_no_negative_and_no_infinite_depth(u, v, normal, offset) -> None:
@@ -74,7 +74,7 @@ def test_there_is_no_huge_no_negative_and_no_infinite_depth(u, v, normal, offset
         assert np.isnan(inverse)
 
 
-@covers("calibration.model.light_sheet:depth")
+@covers(depth)
 @pytest.mark.parametrize(
     ("u", "plane"),
     [
@@ -92,7 +92,7 @@ def test_what_meets_nowhere_has_no_depth(u, plane) -> None:
     assert np.isnan(depth(u, 0.0, plane))
 
 
-@covers("calibration.model.light_sheet:depth")
+@covers(depth)
 def test_the_scanner_s_own_axis_is_at_its_depth() -> None:
     pivot = np.array([-0.1, 0.0, 0.5])
     planes = PivotScanner(pivot, np.array([0, 1.0, 0]), np.array([1.0, 0, 0]), np.array([0, 0.3])).planes(
@@ -101,7 +101,7 @@ def test_the_scanner_s_own_axis_is_at_its_depth() -> None:
     assert depth(-0.2, 0.0, planes) == pytest.approx(np.full(21, 0.5), rel=1e-12)
 
 
-@covers("calibration.model.light_sheet:depth_slope", "calibration.model.light_sheet:near_side")
+@covers(depth_slope, near_side)
 @EXAMPLES
 @given(u=TANGENT, v=TANGENT, normal=st.tuples(METRES, METRES, METRES), offset=METRES | st.floats(-1e-5, 1e-5))
 def test_slopes_are_finite_or_none_and_agree_with_the_near_side(u, v, normal, offset) -> None:
@@ -114,7 +114,7 @@ def test_slopes_are_finite_or_none_and_agree_with_the_near_side(u, v, normal, of
         assert side == -np.sign(slope)  # near points lie where depth falls
 
 
-@covers("calibration.model.light_sheet:depth_slope")
+@covers(depth_slope)
 def test_depth_slopes_keep_nine_digits(worst) -> None:
     plane = np.array([0.9, 0.1, -0.4, -0.3])
     plane[:3] /= np.linalg.norm(plane[:3])
@@ -133,7 +133,7 @@ def test_depth_slopes_keep_nine_digits(worst) -> None:
     )
 
 
-@covers("calibration.model.scanner:PlaneTable.planes", "calibration.model.scanner:PlaneTable.command_range")
+@covers(PlaneTable.planes, PlaneTable.command_range)
 @EXAMPLES
 @given(
     rows=st.lists(st.tuples(ANY, ANY, ANY, ANY), min_size=1, max_size=5),
@@ -150,7 +150,7 @@ def test_plane_tables_of_any_numbers_give_unit_planes_or_say_why_not(rows, share
     assert np.abs(np.linalg.norm(planes[:, :3], axis=1) - 1).max() < 1e-15
 
 
-@covers("calibration.model.scanner:PlaneTable.planes")
+@covers(PlaneTable.planes)
 @pytest.mark.parametrize("scale", [5e-300, 1e-200, 1.0, 1e200])
 def test_normals_of_any_length_are_the_same_plane(scale) -> None:
     row = np.array([[0.5, 0.25, -0.125, 0.375]])
@@ -158,7 +158,7 @@ def test_normals_of_any_length_are_the_same_plane(scale) -> None:
     assert table.planes(0.0) == pytest.approx(PlaneTable(np.zeros(1), row).planes(0.0), rel=1e-15)
 
 
-@covers("calibration.model.scanner:PivotScanner.planes", "calibration.model.rig_model:RigModel.planes")
+@covers(PivotScanner.planes, RigModel.planes)
 @EXAMPLES
 @given(
     point=st.tuples(METRES, METRES, METRES),
@@ -178,7 +178,7 @@ def test_pivot_scanners_of_any_numbers_give_unit_planes_or_say_why_not(point, ax
     assert np.abs(np.linalg.norm(planes[:, :3], axis=1) - 1).max() < 1e-12
 
 
-@covers("calibration.model.scanner:PivotScanner.planes")
+@covers(PivotScanner.planes)
 def test_pivoted_planes_are_exact(worst) -> None:
     point, terms = np.array([-0.3, 0.01, 0.02]), np.array([0.09, 0.38, 0.01])
     scanner = PivotScanner(point, np.array([0, 1.0, 0]), np.array([1.0, 0, 0]), terms)
@@ -198,7 +198,7 @@ def test_pivoted_planes_are_exact(worst) -> None:
         worst("planes of a turning mirror", "mpmath, 50 digits", relative(planes[:, i], of, at), 1e-13)
 
 
-@covers("calibration.model.rig_model:RigModel.check_speed", "calibration.model.rig_model:RigModel.check_sensor")
+@covers(RigModel.check_speed, RigModel.check_sensor)
 def test_a_model_of_no_baseline_is_refused_where_depth_is_asked_for() -> None:
     planes = np.array([[1.0, 0, -0.1, 1e-9], [1.0, 0, -0.2, 1e-9]])
     model = RigModel(CAMERA, PlaneTable(np.arange(2.0), planes), speed_range_per_s=(1.0, 2.0))

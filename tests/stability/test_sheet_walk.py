@@ -18,7 +18,7 @@ def _traced(maps: tuple[Array, Array, Array], bounds: Array, plane: Array) -> tu
     return found
 
 
-@covers("sim_backend.light.sheet:span_bounds", "sim_backend.light.sheet:trace_rows")
+@covers(span_bounds, trace_rows)
 @given(
     seed=st.integers(0, 2**32 - 1),
     plane=st.tuples(*[st.floats(-5, 5)] * 3),

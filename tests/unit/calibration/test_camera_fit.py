@@ -7,11 +7,16 @@ import cv2
 import numpy as np
 import pytest
 
+from calibration import camera_fit
 from calibration.camera_fit import fit_camera
+from calibration.diagnosis import camera
 from calibration.errors import CalibrationError, Degenerate
 from calibration.views import Corners, View
 from tests.reference.boards.board_pictures import CHARUCO, DISTORTION, SIZE, corners_px, pose
 from tests.reference.boards.chessboards import FOLDER, pairs
+from tests.stability.inventory import covers
+
+covers(camera_fit, camera)
 
 TRUE = dict(zip(("fx", "fy", "cx", "cy"), (380.0, 379.0, 162.0, 117.0), strict=True))
 SD_PX = 0.05

@@ -7,6 +7,7 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 
+from calibration import check
 from calibration.board.board import Board
 from calibration.check import check_angle, check_boards
 from calibration.errors import Degenerate
@@ -15,6 +16,9 @@ from calibration.model.parameters import with_parameters
 from calibration.model.rig_model import Covariance, Lag, RigModel
 from calibration.model.scanner import PivotScanner
 from calibration.views import BoardPose, Corners, Passages, View
+from tests.stability.inventory import covers
+
+covers(check)
 
 Array = NDArray[np.float64]
 

@@ -4,12 +4,17 @@ import cv2
 import numpy as np
 import pytest
 
+from calibration import views
+from calibration.board import board, detect, drawing, lattice, markers, registration
 from calibration.board.board import BLACK, WHITE, Board
 from calibration.board.detect import find_corners, repaired
 from calibration.errors import Degenerate
 from calibration.views import BoardPose
 from tests.reference.boards.board_pictures import CHARUCO, CHESSBOARD, SIZE, albedo, corners_px, exposed, pose
 from tests.reference.boards.chessboards import FOLDER
+from tests.stability.inventory import covers
+
+covers(board, drawing, detect, markers, lattice, registration, views)
 
 TURNED = pose(CHARUCO, 0.9, (0.03, -0.02), (0.35, -0.3, 0.1))
 FRAMES = 5000

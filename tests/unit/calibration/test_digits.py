@@ -4,7 +4,11 @@ from math import inf, nan
 
 import pytest
 
+from calibration import errors
 from calibration.errors import condition_text, digits, in_mm, mm
+from tests.stability.inventory import covers
+
+covers(errors)
 
 
 @pytest.mark.parametrize(

@@ -5,10 +5,14 @@ import math
 import numpy as np
 import pytest
 
+from calibration import guide
 from calibration.board.board import load_board
 from calibration.guide import candidates, next_pose, rough_camera, sequence
 from calibration.model.camera import Camera
 from calibration.views import BoardPose
+from tests.stability.inventory import covers
+
+covers(guide)
 
 BOARD = load_board()
 DEPTH_RANGE_M = (0.4, 8.0)

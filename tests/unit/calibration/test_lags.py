@@ -6,19 +6,25 @@ from functools import cache
 import numpy as np
 import pytest
 
+from calibration.diagnosis import rules
 from calibration.diagnosis.rig import judge_fit, judge_sync
 from calibration.diagnosis.rules import lag_lack
 from calibration.errors import CalibrationError, Degenerate
+from calibration.model import parameters
 from calibration.model.parameters import SWEPT, alike_speeds, lag_groups, untold
 from calibration.model.rig_model import Covariance, Lag
 from calibration.rig_fit.fit import fit_rig
 from calibration.rig_fit.result import RigFit
+from calibration.sync import transfer
 from calibration.sync.lag_fit import SyncFit, fit_sync
 from calibration.sync.transfer import known_row_delay, with_lags
 from calibration.verdict import Asked
 from calibration.views import Passages, View
 from tests.reference.boards.calibration_data import BOARD, Seen, TrueRig, random_pose, random_views, seen_view
 from tests.reference.boards.fitted_depth import depth_errors
+from tests.stability.inventory import covers
+
+covers(parameters, rules, transfer)
 
 SIZE = (512, 512)
 LAG = Lag(1.5e-4, 2.5e-4)

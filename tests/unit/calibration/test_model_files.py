@@ -19,7 +19,11 @@ from calibration import (
     load_rig_model,
     save_rig_model,
 )
+from calibration.files import problems, sections
+from tests.stability.inventory import covers
 from tests.unit.calibration.cameras import MATRIX, camera
+
+covers(sections, problems)
 
 BUNDLED = Path(__file__).parents[3] / "config" / "simulated-rig.yaml"
 HEAD = "format: spadrig-calibration\nversion: 1\n"

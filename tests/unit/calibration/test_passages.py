@@ -5,10 +5,16 @@ import numpy as np
 import pytest
 
 from calibration.passages import find as finding
+from calibration.passages import fit, flux_picture
+from calibration.passages import light as light_module
 from calibration.passages.find import SweepCounts, evenly, find_passages
 from calibration.passages.fit import fit_passages
 from calibration.passages.light import LineShape, light
+from calibration.sync import shared_pixels
+from tests.stability.inventory import covers
 from tests.unit.calibration.passed_lines import Light, passed, sweep_of, true_at
+
+covers(light_module, fit, finding, flux_picture, shared_pixels)
 
 CASES = {
     "clear": (Light(0.6, 4.0), 10, 0.9),

@@ -8,6 +8,7 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 
+from calibration import pixel_map
 from calibration.errors import CalibrationError
 from calibration.pixel_map import (
     FALSE_ALARM,
@@ -25,6 +26,9 @@ from calibration.pixel_map import (
     pixel_drift,
     save_pixels,
 )
+from tests.stability.inventory import covers
+
+covers(pixel_map)
 
 EXPOSURE_S = 1e-5
 SHAPE = (256, 256)

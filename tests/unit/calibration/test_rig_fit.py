@@ -7,11 +7,15 @@ import pytest
 
 from calibration.guide import Forecast
 from calibration.model.rig_model import Covariance
+from calibration.rig_fit import misfit, noise, result, rows, solve, start, state
 from calibration.rig_fit.fit import fit_rig
 from calibration.rig_fit.result import RigFit
 from tests.reference.boards.calibration_data import BOARD, Seen, TrueRig, random_pose, random_rig, rotation, seen_view
 from tests.reference.boards.fitted_depth import depth_errors
+from tests.stability.inventory import covers
 from tests.unit.calibration.fitted_rigs import EXACT, RIG, SEEN, SIZE, fitted, true_camera
+
+covers(start, rows, solve, state, noise, misfit, result)
 
 
 def kept(fit: RigFit) -> set[str]:

@@ -4,8 +4,12 @@ import numpy as np
 import pytest
 
 from calibration.errors import Degenerate
+from calibration.sync import gate_fit, lag_fit
 from calibration.sync.lag_fit import fit_sync
 from calibration.views import Passages
+from tests.stability.inventory import covers
+
+covers(lag_fit, gate_fit)
 
 LAG_S = {1: 2.1e-4, -1: 1.6e-4}
 SD = 6e-4

@@ -6,7 +6,9 @@ from math import nan, radians
 import numpy as np
 import pytest
 
+from calibration import verdict
 from calibration.board.board import Board
+from calibration.diagnosis import evidence, rig, view_shifts
 from calibration.diagnosis.evidence import PoseEvidence, ViewEvidence, pose_evidence, view_evidence
 from calibration.diagnosis.rig import judge_fit
 from calibration.diagnosis.rules import FitEvidence, judge, judge_refusal
@@ -17,6 +19,9 @@ from calibration.rig_fit.fit import fit_rig
 from calibration.verdict import Asked, Verdict, unguided
 from calibration.views import BoardPose, Corners, View
 from tests.reference.boards.calibration_data import BOARD, Seen, TrueRig, random_views
+from tests.stability.inventory import covers
+
+covers(evidence, verdict, rig, view_shifts)
 
 ASKED = Asked(accuracy_m=0.014, at_m=5.0, stated_baseline_m=0.3)
 VIEWS = ViewEvidence(shown=12, used=12, coverage=0.8, room_flux=0.2)

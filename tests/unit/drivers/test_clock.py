@@ -3,6 +3,10 @@
 import threading
 
 from drivers.clock import Clock, SystemClock, VirtualClock
+from drivers.replay.pace import Pace
+from tests.stability.inventory import covers
+
+covers(SystemClock, Pace.wait_for_step)
 
 
 def test_both_clocks_are_clocks() -> None:

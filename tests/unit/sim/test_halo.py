@@ -3,10 +3,14 @@
 import numpy as np
 import pytest
 
+from sim_backend.effects import halo
 from sim_backend.effects.catalogue import CATALOGUE
 from sim_backend.effects.halo import halo_share
 from tests.reference.tables.path_traced import FOLDER, fog, radiance, traced_fog
+from tests.stability.inventory import covers
 from tests.unit.sim.rigs import effect_rate, rig, setting, wall
+
+covers(halo)
 
 HALO = next(entry for entry in CATALOGUE if entry.name == "halo")
 

@@ -8,6 +8,9 @@ from drivers.registry import Surroundings
 from sim_backend.devices.scanner import SimulatedScannerConfig, create
 from sim_backend.mirror_motion import JITTER_HOLD_S, Jitter
 from sim_backend.world import KIND, WorldConfig
+from tests.stability.inventory import covers
+
+covers(Jitter)
 
 
 def test_it_is_gaussian_white_and_of_the_size_asked_for() -> None:

@@ -6,10 +6,14 @@ import pytest
 from drivers.clock import VirtualClock
 from drivers.errors import DeviceError
 from drivers.registry import Surroundings
+from sim_backend.light import line
 from sim_backend.light.line import line_width, sigma_px
 from sim_backend.light.optics import Line, Optics, Sensor
 from sim_backend.world import KIND, WorldConfig
+from tests.stability.inventory import covers
 from tests.unit.sim.rigs import effect_rate, rig, setting, wall
+
+covers(line)
 
 
 def _sigma(optics: Optics, line: Line, depth_m: float) -> float:

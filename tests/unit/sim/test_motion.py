@@ -6,6 +6,7 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 
+from sim_backend.effects import motion
 from sim_backend.effects.motion import HOLD_S, MovingSurfaces, shifted
 from sim_backend.effects.setting import FrameTimes, Setting
 from sim_backend.effects.stripe import Stripe
@@ -15,7 +16,10 @@ from sim_backend.light.optics import Line
 from sim_backend.light.view import make_view
 from sim_backend.scenes.scene import SceneFile
 from sim_backend.scenes.surfaces import Surfaces
+from tests.stability.inventory import covers
 from tests.unit.sim.rigs import Array, rig, setting, wall
+
+covers(motion)
 
 
 def _moving(velocity: tuple[float, float, float], normal: tuple[float, float, float]) -> Setting:

@@ -6,6 +6,7 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 
+from sim_backend.effects import particles
 from sim_backend.effects.particles import MOST, Particles, find_pixel, make_particles, share
 from sim_backend.effects.rain import RainDrops
 from sim_backend.effects.setting import Setting
@@ -13,7 +14,10 @@ from sim_backend.effects.snow import SnowFlakes
 from sim_backend.light.optics import Line
 from sim_backend.scenes.medium import Rain
 from sim_backend.scenes.surfaces import Surfaces
+from tests.stability.inventory import covers
 from tests.unit.sim.rigs import pixel_solid_angle, rig, setting, wall
+
+covers(particles)
 
 CONE = np.array([[-0.5, 1.0], [-0.4, 0.8]])
 RAIN = Rain.model_validate({"rate": "20 mm/h", "wind": "1 m/s"})

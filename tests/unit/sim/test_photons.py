@@ -7,7 +7,8 @@ import pytest
 from numpy.typing import NDArray
 
 from sim_backend.effects.setting import FrameTimes, Words
-from sim_backend.frames.flux import FluxModel
+from sim_backend.frames import photon_kernels, photons
+from sim_backend.frames.flux import CommandGrid, FluxModel, column_grid, fine_grid
 from sim_backend.frames.photon_kernels import (
     CHANCE,
     LEVELS,
@@ -20,7 +21,10 @@ from sim_backend.frames.photon_kernels import (
 )
 from sim_backend.frames.photons import PhotonSource
 from sim_backend.random_numbers import PLACE, frame_key
+from tests.stability.inventory import covers
 from tests.unit.sim.rigs import rig, setting, wall
+
+covers(CommandGrid.hold, column_grid, fine_grid, photon_kernels, photons)
 
 TIMES = FrameTimes(1e-5, 1e-5)
 

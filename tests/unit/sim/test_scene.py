@@ -15,12 +15,18 @@ from drivers.errors import DeviceError
 from drivers.registry import Surroundings
 from sim_backend.effects.catalogue import CATALOGUE, Entry
 from sim_backend.light.optics import Line, Optics, Sensor, ambient_irradiance, detections_per_radiance
+from sim_backend.light.view import make_view
+from sim_backend.scenes import scene
+from sim_backend.scenes.medium import Medium
 from sim_backend.scenes.prepared import load_folder, prepare
 from sim_backend.scenes.scene import SceneFile, bundled_scenes, load_scene, load_surfaces, with_fog
 from sim_backend.scenes.street import street
 from sim_backend.world import KIND, WorldConfig
+from tests.stability.inventory import covers
 from tests.system.small_rig import calibration
 from tests.unit.sim.rigs import rig
+
+covers(make_view, scene, Medium)
 
 SCENES = Path(__file__).parents[4] / "shared" / "scenes"
 

@@ -5,12 +5,16 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
+from sim_backend.effects import speckle
 from sim_backend.effects.speckle import Speckle, gamma_of, grains
 from sim_backend.effects.stripe import Stripe
 from sim_backend.light.line import ONE_LINE
 from sim_backend.light.optics import Line, Optics, Sensor
 from sim_backend.random_numbers import frame_key
+from tests.stability.inventory import covers
 from tests.unit.sim.rigs import Array, rig, setting, wall
+
+covers(speckle)
 
 
 @pytest.mark.parametrize("shape", [1.0, 2.5, 43.0])

@@ -3,7 +3,11 @@
 import numpy as np
 import pytest
 
+from sim_backend.effects import stripe
+from tests.stability.inventory import covers
 from tests.unit.sim.rigs import effect_rate, pixel_solid_angle, rig, setting, wall
+
+covers(stripe)
 
 EXTINCTION = 0.1
 FOG = {"medium": {"extinction": f"{EXTINCTION} /m"}}

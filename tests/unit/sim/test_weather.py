@@ -4,8 +4,12 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 
+from sim_backend.scenes import medium
 from sim_backend.scenes.medium import Rain, Snow
 from sim_backend.scenes.scene import SceneFile
+from tests.stability.inventory import covers
+
+covers(medium)
 
 DIAMETER_MM = np.linspace(0, 40, 400_001)
 

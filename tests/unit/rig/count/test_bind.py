@@ -9,10 +9,15 @@ from hypothesis import strategies as st
 from calibration.model.rig_model import Lag
 from drivers.errors import ProtocolError
 from drivers.frames import SUBFRAME_SHIFT, Mark
+from rig.count import sweeps
 from rig.count.bind import FrameBinder, SweepClock
+from rig.count.bind_kernels import cover
 from rig.count.volume import BIN_DARK, BIN_UNUSABLE
 from rig.errors import PlanError
+from tests.stability.inventory import covers
 from tests.unit.rig.count.streams import Stream, plan_of, scan, scanner_limits, stand_still, stream_of
+
+covers(cover, sweeps)
 
 
 def bind(plan, blocks):

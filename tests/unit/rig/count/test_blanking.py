@@ -9,14 +9,18 @@ import pytest
 
 from drivers.errors import DeviceFault
 from drivers.interfaces import OUT_GATE, BurstMode
+from rig.count import blanking
 from rig.count.bind import FrameBinder
 from rig.count.blanking import PatternSearch, PatternShape, detection_probability
 from rig.count.volume import BIN_DARK
 from rig.errors import PlanError
 from rig.plan.gate_pulses import sync_program
 from rig.plan.scan_plan import CODE, Blanking
+from tests.stability.inventory import covers
 from tests.unit.rig.count.light import blanked_plan, see
 from tests.unit.rig.count.streams import SPAD, plan_of, scan
+
+covers(blanking)
 
 
 def bind(plan, blocks):

@@ -15,6 +15,9 @@ from rig.errors import UsageError
 from rig.recording import cube as cube_module
 from rig.recording.cube import ArrayFrames, column_commands, count_map, open_cube
 from rig.threads import RowWorkers
+from tests.stability.inventory import covers
+
+covers(cube_module)
 
 
 def plan(columns: int, exposures: int) -> CubePlan:

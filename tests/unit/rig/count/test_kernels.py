@@ -7,9 +7,13 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
+from rig.count import kernels
 from rig.count.kernels import CHUNK, PLANES, add_frames, add_runs, new_planes, planes_for
 from rig.count.lane_order import PAIRS, pixel_order
 from rig.simd.vectors import LANES
+from tests.stability.inventory import covers
+
+covers(kernels)
 
 WORD = 64
 BYTES = 8

@@ -4,6 +4,7 @@ import numba
 import numpy as np
 import pytest
 
+from rig.count import lane_order
 from rig.count.lane_order import (
     PAD,
     PAIRS,
@@ -18,6 +19,9 @@ from rig.count.lane_order import (
     sum_counts,
     write_counts,
 )
+from tests.stability.inventory import covers
+
+covers(lane_order)
 
 PLANE_BYTES = 256
 

@@ -8,10 +8,12 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from calibration.model.rig_model import Lag
+from rig.count import line_counter
 from rig.count.line_counter import LineCounter
 from rig.count.volume import BIN_DARK, BIN_UNUSABLE, SweepCounter, SweepLayout
 from rig.depth.depth import share_claims
 from rig.errors import PlanError
+from rig.geometry import line_grid as line_grid_module
 from rig.geometry.line_grid import LineGrid, line_grid, window_overlap
 from rig.geometry.stripe_table import StripeTable
 from rig.geometry.windows import sweep_geometry
@@ -21,8 +23,11 @@ from rig.plan.describe import plan_text
 from rig.plan.scan_plan import ScanPlan
 from rig.recording.inputs import from_plain, to_plain
 from rig.threads import RowWorkers
+from tests.stability.inventory import covers
 from tests.unit.rig.count.streams import NO_LAG, SPAD, plan_of, rig_model, scan, scanner_limits, timer_clock
 from tests.unit.rig.count.test_volume import packed, stream
+
+covers(line_grid_module, line_counter)
 
 OFFSETS = (-0.3, -0.1, 0.1, 0.3)
 

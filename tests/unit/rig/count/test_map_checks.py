@@ -5,9 +5,13 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
+from rig.count import map_check_kernels, map_checks
 from rig.count.map_checks import POINTS, MapChecks, check_points
 from rig.geometry.stripe_table import StripeTable
+from tests.stability.inventory import covers
 from tests.unit.small_maps import simulated, volume_of
+
+covers(map_checks, map_check_kernels)
 
 ROWS, COLUMNS = 64, 160
 

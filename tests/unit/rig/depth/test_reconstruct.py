@@ -6,12 +6,16 @@ import numpy as np
 import pytest
 
 from rig.depth.reconstruct import MapResult, Reconstructor
+from rig.depth.warm_up import warm_up
 from rig.errors import UsageError
 from rig.estimate.search import online_learning as lessons
 from tests.reference.geometry import DEPTH_RANGE_M, Geometry
 from tests.reference.scene import Scene
 from tests.reference.working_point import Light, WorkingPoint
+from tests.stability.inventory import covers
 from tests.unit.small_maps import Sweep, geometry_of, rig_model, simulated, volume_of
+
+covers(Reconstructor, warm_up)
 
 
 def reconstructor(sweep, **options) -> Reconstructor:

@@ -9,10 +9,15 @@ from calibration import Camera, Lag, PivotScanner, RigModel
 from rig.count.volume import CountVolume
 from rig.depth.depth import depth_map
 from rig.depth.reconstruct import Reconstructor
+from rig.geometry import bent_light as bent_light_module
+from rig.geometry import kernels
 from rig.geometry.bent_light import bent_light
 from rig.geometry.stripe_table import StripeTable
 from rig.geometry.windows import SweepGeometry, sweep_geometry
+from tests.stability.inventory import covers
 from tests.unit.calibration.fans import Fan
+
+covers(bent_light_module, kernels)
 
 ROWS, WIDTH, COLUMNS = 96, 512, 300
 RANGE_M = (1.0, 8.0)

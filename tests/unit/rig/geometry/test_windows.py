@@ -11,8 +11,9 @@ from calibration.model.rig_model import RigModel
 from calibration.model.scanner import PlaneTable
 from rig.errors import UsageError
 from rig.geometry.kernels import row_windows
-from rig.geometry.windows import MARGIN_PX, sweep_geometry, uncalibrated_geometry
+from rig.geometry.windows import MARGIN_PX, evenly_spread, sweep_geometry, uncalibrated_geometry
 from tests.reference.geometry import Geometry
+from tests.stability.inventory import covers
 from tests.unit.small_maps import RIGS, geometry_of, rig_model
 
 sides = st.sampled_from([-1.0, 1.0])
@@ -184,3 +185,17 @@ def test_one_row_is_a_sensor_and_one_column_is_none():
     assert geometry_of(Geometry.build(width=300, height=1, columns=20)).rows == 1
     with pytest.raises(UsageError, match="no column meets the picture"):
         geometry_of(Geometry.build(width=1, height=30, columns=20))
+
+
+@covers(evenly_spread)
+@pytest.mark.parametrize(("n", "most"), [(0, 5), (1, 5), (5, 5), (6, 5), (512, 100), (10**9, 1000)])
+def test_spread_indices_are_in_range_in_order_and_leave_no_gap(n, most):
+    pick = evenly_spread(n, most)
+    assert len(pick) <= most
+    assert np.all(np.diff(pick) > 0)
+    if n:
+        assert pick[0] >= 0
+        assert pick[-1] < n
+        assert np.diff(pick, prepend=-1, append=n).max() <= 2 * max(n / most, 1)
+    if n <= most:
+        assert len(pick) == n

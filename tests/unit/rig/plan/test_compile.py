@@ -19,11 +19,15 @@ from drivers.interfaces import (
 )
 from drivers.interfaces.scanner import check_waveform
 from rig.errors import PlanError
-from rig.plan.calibration_reach import require_speed
+from rig.plan.calibration_reach import model_problems, require_speed
 from rig.plan.compile import compile_plan, spad_request
 from rig.plan.describe import plan_text
 from rig.plan.gate_pulses import sync_program
+from rig.plan.mirror_path import remedy
+from tests.stability.inventory import covers
 from tests.unit.rig.count.streams import SPAD, plan_of, rig_model, scan, scanner_limits, timer_clock
+
+covers(remedy, model_problems)
 
 GALVO = scanner_limits(
     velocity_per_s=500, acceleration_per_s2=2e6, step=0.2, rms_duty=0.5, max_points=20_000, point_rate_hz=(2e3, 65_535)

@@ -22,9 +22,13 @@ from rig.count.volume import BIN_DARK, BIN_UNUSABLE
 from rig.devices.open import open_rig
 from rig.devices.prepare import prepare
 from rig.errors import PlanError
+from rig.plan import describe
 from rig.plan.compile import compile_plan, spad_request
 from rig.plan.describe import plan_text
+from tests.stability.inventory import covers
 from tests.unit.rig.count.streams import NO_LAG, SPAD, scan, scanner_limits, stream_of, timer_clock
+
+covers(describe)
 
 WIDTH, HEIGHT = 512, 4
 WIDE = dataclasses.replace(SPAD, width=WIDTH, height=HEIGHT)

@@ -2,7 +2,11 @@ import mpmath
 import numpy as np
 import pytest
 
+from rig.tradeoff import rows
 from rig.tradeoff.rows import BLOCK_COLUMNS, BLOCK_ROWS, blocks_interval, blocks_of, repeats_interval, t_quantile
+from tests.stability.inventory import covers
+
+covers(rows)
 
 
 @pytest.mark.parametrize("freedom", [1, 2, 3, 4, 5, 6, 9, 20, 999])

@@ -7,9 +7,13 @@ import pytest
 
 from rig.config.overrides import configure
 from rig.errors import UsageError
+from rig.tradeoff import row_light as row_light_module
 from rig.tradeoff.limits import limits
 from rig.tradeoff.row_light import RowLight, row_light, scene_lights
+from tests.stability.inventory import covers
 from tests.unit.small_maps import Sweep, simulated
+
+covers(row_light_module)
 
 
 @cache

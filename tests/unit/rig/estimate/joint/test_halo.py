@@ -7,8 +7,10 @@ from functools import cache
 import numpy as np
 import pytest
 
+from rig.estimate.joint import halo
 from rig.estimate.joint.halo import bright_lines, learn_next_halo, solve
 from rig.estimate.joint.joint import Joint
+from rig.estimate.joint.labels import halo_rows
 from rig.estimate.joint.labels.cost_rows import EXCLUDED
 from rig.estimate.joint.labels.costs import _lights, costs_of
 from rig.estimate.joint.labels.grid import PER_PX, label_grid
@@ -16,14 +18,18 @@ from rig.estimate.joint.labels.halo_rows import BLOCK_PX
 from rig.estimate.joint.lesson import add_quiet
 from rig.estimate.joint.place.places import most_shown
 from rig.estimate.joint.tables import tables_of
+from rig.estimate.row import inputs
 from rig.estimate.row.inputs import halo_shares, over_bins, row_buffers, row_fluxes, state_of, sweep_of
 from rig.estimate.row.likelihood import FLOOR
 from rig.estimate.row.model import BINS, HALO_NODES, HALO_REACHES_PX, RowModel, pixel_shares
 from rig.estimate.search.online_learning import LearningSetting
 from rig.simd.vectors import LANES
 from rig.threads import RowWorkers
+from tests.stability.inventory import covers
 from tests.unit.rig.estimate.joint.test_label_volume import known_model
 from tests.unit.small_maps import simulated
+
+covers(halo, halo_rows, inputs)
 
 WORKERS = RowWorkers(1)
 HALO = np.tile(np.array([0.0, 1.0, 0.0, 1.5, 0.0], np.float32), (HALO_NODES, 1))
@@ -130,10 +136,10 @@ def test_pixels_without_a_ray_are_not_quiet():
     signal, confidence = np.where(there, 0.3, 0).astype(np.float32), there.astype(np.float32)
     shares = halo_shares(model, g.width)
     found = {}
-    for name, halo in (("halo", shares), ("none", shares[:, :0])):
+    for name, share in (("halo", shares), ("none", shares[:, :0])):
         quiet = found[name] = np.zeros((2, g.rows, g.width))
         add_quiet(
-            volume.counts, volume.n_frames, sweep_of(g), state_of(model), halo, x_px, signal, confidence, 1, np.inf, 0,
+            volume.counts, volume.n_frames, sweep_of(g), state_of(model), share, x_px, signal, confidence, 1, np.inf, 0,
             g.rows, quiet,
         )  # fmt: skip
         assert not quiet[:, :, cut:].any()

@@ -6,6 +6,7 @@ from functools import cache
 import numpy as np
 import pytest
 
+from rig.estimate.joint import confidence, lesson
 from rig.estimate.joint.joint import Joint
 from rig.estimate.joint.labels.grid import PER_PX, label_grid
 from rig.estimate.registry import create_estimator, recalling
@@ -14,7 +15,10 @@ from rig.geometry.stripe_table import StripeTable
 from tests.reference.geometry import Geometry
 from tests.reference.scene import Scene
 from tests.reference.working_point import POINTS, WorkingPoint
+from tests.stability.inventory import covers
 from tests.unit.small_maps import geometry_of, simulated, street, volume_of
+
+covers(confidence, lesson)
 
 
 @cache

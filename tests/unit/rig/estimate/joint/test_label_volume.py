@@ -8,6 +8,7 @@ import numpy as np
 import pytest
 
 from rig.count.volume import CountVolume
+from rig.estimate.joint.labels import cost_rows, costs, grid, tables
 from rig.estimate.joint.labels.cost_rows import COST_LIMIT, EXCLUDED
 from rig.estimate.joint.labels.costs import QUARTILES, SHARP, _lights, costs_of
 from rig.estimate.joint.labels.grid import PER_PX, label_grid
@@ -16,7 +17,10 @@ from rig.estimate.row.inputs import row_buffers, row_fluxes, state_of, sweep_of
 from rig.estimate.row.likelihood import FLOOR
 from rig.estimate.row.model import BINS, RowModel, pixel_shares, stripe_scale
 from rig.threads import RowWorkers
+from tests.stability.inventory import covers
 from tests.unit.small_maps import simulated, volume_of
+
+covers(grid, tables, costs, cost_rows)
 
 WORKERS = RowWorkers(1)
 ROWS, COLUMNS = 20, 48

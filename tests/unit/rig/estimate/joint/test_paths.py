@@ -3,9 +3,13 @@
 import numpy as np
 import pytest
 
+from rig.estimate.joint import paths, vote, winner
 from rig.estimate.joint.paths import Penalties, along_columns, along_rows
 from rig.estimate.joint.winner import LabelAnswers, answer_settings, new_answer
 from rig.threads import RowWorkers
+from tests.stability.inventory import covers
+
+covers(paths, winner, vote)
 
 PENALTIES = Penalties()
 

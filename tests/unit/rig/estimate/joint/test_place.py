@@ -7,6 +7,8 @@ import numpy as np
 import pytest
 
 from rig.estimate.joint.labels.grid import label_grid
+from rig.estimate.joint.place import light, pool, score
+from rig.estimate.joint.place import place as place_module
 from rig.estimate.joint.place.place import (
     ENOUGH,
     LESSON_REACHES,
@@ -23,8 +25,11 @@ from rig.estimate.row.model import pixel_shares
 from rig.geometry.stripe_table import StripeTable
 from rig.threads import RowWorkers
 from tests.reference.geometry import Geometry
+from tests.stability.inventory import covers
 from tests.unit.rig.estimate.joint.test_label_volume import known_model
 from tests.unit.small_maps import RIGS, geometry_of, volume_of
+
+covers(light, score, pool, place_module)
 
 WORKERS = RowWorkers(1)
 ROWS, COLUMNS = 24, 48

@@ -6,6 +6,7 @@ from functools import cache
 import numpy as np
 import pytest
 
+from rig.estimate.joint import temporal
 from rig.estimate.joint.joint import Joint
 from rig.estimate.joint.labels.grid import label_grid
 from rig.estimate.joint.temporal import FREE, MOST, SLOPE, TemporalPrior
@@ -15,7 +16,10 @@ from rig.geometry.stripe_table import StripeTable
 from rig.threads import RowWorkers
 from tests.reference.scene import procedural_scene
 from tests.reference.tables.moving import Disc, measure
+from tests.stability.inventory import covers
 from tests.unit.small_maps import simulated
+
+covers(temporal)
 
 WORKERS = RowWorkers(2)
 ROWS, COLUMNS = 32, 96

@@ -5,12 +5,16 @@ from functools import cache
 import numpy as np
 import pytest
 
+from rig.estimate.row import em, em_kernels
 from rig.estimate.row.ambient import ambient_map
 from rig.estimate.row.em import FADE, flux, lattice, learn_first, learn_next, lines_of, next_lattice
 from rig.estimate.row.model import BINS, RowModel, fit_haze, stripe_scale
 from rig.threads import RowWorkers
 from tests.reference.geometry import Geometry
+from tests.stability.inventory import covers
 from tests.unit.small_maps import RIGS, geometry_of, simulated, volume_of
+
+covers(em, em_kernels, RowModel)
 
 WORKERS = RowWorkers(1)
 PATH_M = 1.0 / np.linspace(0.08, 1.1, BINS)

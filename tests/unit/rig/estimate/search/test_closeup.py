@@ -8,6 +8,7 @@ import pytest
 
 from rig.estimate.row.likelihood import FLOOR, LABEL_PX, LABELS, logit_table
 from rig.estimate.row.model import fine_profiles
+from rig.estimate.search import closeup
 from rig.estimate.search.closeup import (
     LEVELS,
     LOWEST_OCTAVE,
@@ -23,6 +24,9 @@ from rig.simd.functions import lift_to_powers, powers
 from rig.simd.memory import address_of, load_float32, load_int16, read_int16, store_float32, store_int16, write_byte
 from rig.simd.shuffles import largest_of_rows, store_folded, totals_of_rows
 from rig.simd.vectors import LANES
+from tests.stability.inventory import covers
+
+covers(closeup)
 
 TABLE = logit_table()
 AMBIENT, SHARE = 0.004, 0.1

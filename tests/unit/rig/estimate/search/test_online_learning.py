@@ -13,8 +13,11 @@ from rig.estimate.search import online_learning as lessons
 from rig.estimate.search.online_learning import LAG_FRAMES, LEAST_SURE, TEACH_FRAMES, LearningSetting, OnlineLearner
 from rig.geometry.stripe_table import StripeTable
 from rig.threads import RowWorkers
+from tests.stability.inventory import covers
 from tests.unit.rig.estimate.joint.test_label_volume import known_model
 from tests.unit.small_maps import simulated
+
+covers(lessons)
 
 WORKERS = RowWorkers(1)
 GEOMETRY = simulated().geometry

@@ -13,7 +13,9 @@ from rig.estimate.row.em import lines_of
 from rig.estimate.row.inputs import judge_line, row_buffers, row_fluxes, state_of, sweep_of
 from rig.estimate.row.likelihood import mode_of
 from rig.estimate.row.model import RowModel, line_profile, stripe_scale
+from rig.estimate.search import inputs, rows, stream, tables
 from rig.estimate.search import prepare as judging
+from rig.estimate.search import scores as scores_module
 from rig.estimate.search.inputs import desk_of
 from rig.estimate.search.prepare import SCORE_LIMIT, judge_of, nothing_found, stripes_of
 from rig.estimate.search.rows import table_for
@@ -23,7 +25,10 @@ from rig.estimate.search.tables import BATCH, search_in, search_memory
 from rig.simd.memory import read_int16
 from rig.threads import RowWorkers
 from tests.reference.geometry import Geometry
+from tests.stability.inventory import covers
 from tests.unit.small_maps import geometry_of, simulated, volume_of
+
+covers(scores_module, rows, tables, inputs, judging, stream)
 
 RIGS = ("left", "right", "turned")
 LIGHTS = ("report", "dense", "clear")

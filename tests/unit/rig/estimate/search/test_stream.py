@@ -7,13 +7,17 @@ import numpy as np
 import pytest
 
 from rig.count.volume import BIN_DARK, BIN_UNUSABLE, BYTE_EXPOSURES, CountVolume, SweepCounter, SweepLayout
+from rig.estimate import likelihood
 from rig.estimate.likelihood import Likelihood
 from rig.estimate.row.model import RowModel
 from rig.estimate.search import online_learning as lessons
 from rig.estimate.search.stream import ColumnJudge, SearchedSweep
 from rig.geometry.windows import uncalibrated_geometry
 from rig.threads import RowWorkers
+from tests.stability.inventory import covers
 from tests.unit.small_maps import Sweep, simulated
+
+covers(likelihood)
 
 ROWS, COLUMNS = 72, 30
 """Rows are several chunks of whole frames, the last one shorter."""
