@@ -103,7 +103,7 @@ def error_from(message: list[str]) -> DeviceError:
 
 def plain_ports(ports: Mapping[str, Any]) -> dict[str, str]:
     """Emulated ports by name, without those that exist in this process's memory only."""
-    return {name: port.address for name, port in ports.items() if port.usb_backend is None}
+    return {name: port.address for name, port in ports.items() if port.usb_backend is None and port.serial_port is None}
 
 
 _FRAME, _WAITED = struct.Struct("<q"), struct.Struct("<d")

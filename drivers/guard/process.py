@@ -399,8 +399,8 @@ class Rescue:
         than one.
         """
         place, off = self._off[slot]
-        address = place().address
-        port = _once_free(lambda: SerialPort(slot, address))
+        endpoint = place()
+        port = _once_free(lambda: SerialPort(slot, endpoint))
         try:
             for _ in range(OFF_TIMES):
                 port.write(off)

@@ -90,7 +90,7 @@ def open_laser(
 
     make: what messages call it. `DeviceNotFound` where nothing of that make answers; what `identify` raises.
     """
-    port = SerialPort(f"{make} laser", resolve(config.port, surroundings.ports).address, tap=surroundings.tap)
+    port = SerialPort(f"{make} laser", resolve(config.port, surroundings.ports), surroundings.tap)
     try:
         line = Dialogue(f"{make} laser", port, framing, surroundings.clock, timing)
         try:

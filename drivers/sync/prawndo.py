@@ -13,7 +13,6 @@ is how a held pulse looks at the scan marker. Pulses that the board would play o
 """
 
 import logging
-import time
 from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Annotated, Literal
@@ -170,7 +169,7 @@ class PrawnDo(SyncSource):
         super().__init__("PrawnDO")
         self._config = config
         self._confirmed = False
-        port = SerialPort(self.name, resolve(config.port, surroundings.ports).address, tap=surroundings.tap)
+        port = SerialPort(self.name, resolve(config.port, surroundings.ports), surroundings.tap)
         self._line = PrawnDoLine(self.name, port, timing)
         try:
             self._line.connect(max(MAX_WORDS.values()))
@@ -261,7 +260,7 @@ class PrawnDo(SyncSource):
             self._line.command(f"clk 0 {INTERNAL_HZ}")
         else:
             self._line.command(f"clk 1 {round(wanted_hz)}")  # says ok whether there is a clock or not
-            time.sleep(_CLOCK_CHANGE_S)
+            self._line.clock.sleep(_CLOCK_CHANGE_S)
         self._check_clock()
         lines = self._line.transact("frq")
         found = [line for line in lines if line.startswith("clk_sys = ") and line.endswith("kHz")]

@@ -7,11 +7,11 @@ never. What decides about light is asked twice. Lowering the outputs overtakes a
 
 import logging
 import threading
-import time
 from collections.abc import Callable
 from dataclasses import dataclass
 from typing import TypeVar
 
+from drivers.clock import NS_PER_S
 from drivers.errors import DeviceError, DeviceFault, DeviceTimeout, ProtocolError
 from drivers.transports.serial_port import SerialPort
 
@@ -58,6 +58,8 @@ class PrawnDoLine:
     def __init__(self, name: str, port: SerialPort, timing: PrawnDoTiming) -> None:
         self._name = name
         self._port = port
+        self.clock = port.clock
+        """The clock of its deadlines."""
         self._timing = timing
         self.lock = threading.RLock()
         """Hold it around commands that belong together."""
@@ -142,7 +144,7 @@ class PrawnDoLine:
             self._gate_first.clear()
 
     def _lower_surely(self) -> None:
-        ends_at = time.monotonic() + self._timing.lower_s
+        ends_at = self._now_s() + self._timing.lower_s
         while True:
             try:
                 if self._try_to_lower():
@@ -150,7 +152,7 @@ class PrawnDoLine:
                 trouble: DeviceError = DeviceFault(f"{self._name}: its outputs do not go low")
             except (DeviceTimeout, ProtocolError) as error:
                 trouble = error
-            if time.monotonic() > ends_at:
+            if self._now_s() > ends_at:
                 raise trouble
             self._port.write(_LOWER)
 
@@ -232,7 +234,7 @@ class PrawnDoLine:
         self, done: Callable[[list[str]], bool], before: str | None, deadline_s: float, urgent: bool
     ) -> list[str]:
         """The lines that follow the one with `before` (None: all), up to and with the one that makes it `done`."""
-        ends_at = time.monotonic() + deadline_s
+        ends_at = self._now_s() + deadline_s
         lines: list[str] = []
         begun = before is None
         while True:
@@ -254,10 +256,13 @@ class PrawnDoLine:
                 self._last_heard = self._port.read_line(_CRLF, _SLICE_S).decode("latin-1").strip()
                 return self._last_heard
             except DeviceTimeout:
-                if time.monotonic() >= ends_at:
+                if self._now_s() >= ends_at:
                     raise DeviceTimeout(
                         f"{self._name} did not answer within {deadline_s:g} s on {self._port.path}; check its cable"
                     ) from None
+
+    def _now_s(self) -> float:
+        return self.clock.now_ns() / NS_PER_S
 
     def _token(self) -> str:
         """A line that is no command and that no other line contains."""

@@ -1,8 +1,9 @@
 """The address of a device: a real one, or one that an emulating world created in this process."""
 
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 from pathlib import Path
+from typing import Any
 
 from drivers.errors import DeviceNotFound
 
@@ -20,6 +21,9 @@ class Endpoint:
     address: str
     usb_backend: object | None = None
     """The `usb.backend.IBackend` that serves an emulated USB device; None: libusb."""
+    serial_port: Callable[[], Any] | None = None
+    """Opens an emulated serial port, which is like a `serial.Serial` with a `clock` on which it waits; None: pyserial
+    opens the address."""
 
 
 def resolve(port: str, ports: Mapping[str, Endpoint]) -> Endpoint:

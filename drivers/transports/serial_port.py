@@ -1,7 +1,8 @@
 """A serial port with a deadline on every call, and one typed error for each way in which it can fail.
 
 Wraps pyserial. What a lost port raises there depends on the call (SerialException, a bare OSError or termios.error), so
-all of them are caught around every call. Deadlines are in the host's time: pyserial waits in no other.
+all of them are caught around every call. Deadlines are in the host's time, since pyserial waits in no other; an
+emulated port (`Endpoint.serial_port`) brings the clock that it waits on.
 
 Its network ports are refused: a write to `rfc2217://` has no deadline, nobody but a reader learns that it is lost, and
 `socket://` leaks its connection where that was reset (pyserial 3.5). A bridge to a local port has neither fault.
@@ -9,13 +10,14 @@ Its network ports are refused: a write to `rfc2217://` has no deadline, nobody b
 
 import errno
 import select
-import time
 from collections.abc import Iterator
 from contextlib import contextmanager, suppress
+from typing import Any
 
 import serial
 from serial.tools import list_ports
 
+from drivers.clock import NS_PER_S, Clock, SystemClock
 from drivers.errors import (
     DeviceBusy,
     DeviceDisconnected,
@@ -25,7 +27,7 @@ from drivers.errors import (
     DeviceTimeout,
     ProtocolError,
 )
-from drivers.transports.endpoints import UDEV_RULES
+from drivers.transports.endpoints import UDEV_RULES, Endpoint
 from drivers.transports.tap import IN, OUT, Tap
 
 try:
@@ -53,17 +55,19 @@ class SerialPort:
     Not thread-safe: a driver that is polled from several threads locks around a whole command and reply.
     """
 
-    def __init__(self, name: str, address: str, tap: Tap | None = None) -> None:
+    def __init__(self, name: str, endpoint: Endpoint, tap: Tap | None = None) -> None:
         """Open the port. name: the device's name in messages. tap: told of all that passes.
 
-        address: a path or COM port, "serial=ABC" (serial number of the USB device) or "usb=VVVV:PPPP" (hexadecimal
+        Addresses: a path or COM port, "serial=ABC" (serial number of the USB device) or "usb=VVVV:PPPP" (hexadecimal
         vendor and product, the only one attached). Raises `DeviceNotFound`, `DevicePermission` or `DeviceBusy`.
         """
         self._name = name
-        self._path = _find(name, address)
+        self._path = _find(name, endpoint.address)
         self._received = bytearray()
         self._tap = tap
-        self._port = self._open()
+        self._port = self._open(endpoint)
+        self.clock: Clock = SystemClock() if endpoint.serial_port is None else self._port.clock
+        """The clock of its deadlines."""
 
     @property
     def path(self) -> str:
@@ -95,7 +99,7 @@ class SerialPort:
 
     def read_line(self, terminator: bytes, deadline_s: float) -> bytes:
         """The next line without its terminator. `DeviceTimeout` after `deadline_s`: what came is kept for the next."""
-        ends_at = time.monotonic() + deadline_s
+        ends_at = self._now_s() + deadline_s
         searched = 0
         while (end := self._received.find(terminator, searched)) < 0:
             if len(self._received) > _MAX_LINE_BYTES:
@@ -114,11 +118,11 @@ class SerialPort:
 
     def drain(self, quiet_s: float, deadline_s: float) -> bytes:
         """Drop all that comes until the line is quiet for `quiet_s`, at most for `deadline_s`; returns what it was."""
-        ends_at = time.monotonic() + deadline_s
-        quiet_at = time.monotonic() + quiet_s
-        while time.monotonic() < min(quiet_at, ends_at):
+        ends_at = self._now_s() + deadline_s
+        quiet_at = self._now_s() + quiet_s
+        while self._now_s() < min(quiet_at, ends_at):
             if self._receive_some():
-                quiet_at = time.monotonic() + quiet_s
+                quiet_at = self._now_s() + quiet_s
         return self._take(len(self._received), 0)
 
     def close(self) -> None:
@@ -126,13 +130,15 @@ class SerialPort:
         with suppress(*_FOREIGN):  # the port is gone, and with it all that could be given back
             self._port.close()
 
-    def _open(self) -> serial.Serial:
+    def _open(self, endpoint: Endpoint) -> Any:
         if "://" in self._path:
             raise DeviceNotFound(
                 f"{self._name}: port {self._path} is on the network; make a local one of it (socat PTY,raw,link=PATH "
                 "TCP:HOST:PORT) and write its path"
             )
         try:
+            if endpoint.serial_port is not None:
+                return endpoint.serial_port()
             return serial.Serial(self._path, _BAUD, timeout=_SLICE_S, write_timeout=_WRITE_S, exclusive=True)
         except _FOREIGN as error:
             raise self._refused(error) from None
@@ -154,7 +160,7 @@ class SerialPort:
         """Wait for bytes; DeviceTimeout past the deadline."""
         if self._receive_some():
             return
-        if time.monotonic() >= ends_at:
+        if self._now_s() >= ends_at:
             raise DeviceTimeout(
                 f"{self._name} did not send a whole line within {deadline_s:g} s on {self._path} "
                 f"({len(self._received)} bytes came); check its power and cable"
@@ -166,6 +172,9 @@ class SerialPort:
         self._note(IN, data)
         self._received += data
         return bool(data)
+
+    def _now_s(self) -> float:
+        return self.clock.now_ns() / NS_PER_S
 
     def _note(self, direction: str, data: bytes) -> None:
         if self._tap is not None:

@@ -163,8 +163,8 @@ class _RecordedServer(SerialServer):
         super().__init__(model, clock=clock, baud=_BAUD)
         self._recorded = model
 
-    def _turn(self, master: int) -> None:
-        super()._turn(master)
+    def _turn(self) -> None:
+        super()._turn()
         if self._recorded.diverged:
             self.unplug()
 

@@ -5,13 +5,14 @@ from contextlib import AbstractContextManager, contextmanager
 from pathlib import Path
 from typing import Any
 
+from drivers.clock import VirtualClock
 from drivers.guard import Guard
 from drivers.interfaces import SyncSource
 from drivers.lasers.obis import ObisConfig
 from drivers.sync.prawndo import PrawnDoConfig
 from sim_backend.wire.firmware.obis import ObisModel
+from sim_backend.wire.serve.serial import SerialServer
 from tests.conformance.cases import LaserCase, SyncCase
-from tests.wire.lasers import wire
 from tests.wire.syncs import Board, board
 
 
@@ -32,7 +33,7 @@ def emulated_prawndo(folder: Path) -> Iterator[SyncCase]:
 @contextmanager
 def guarded_prawndo(folder: Path) -> Iterator[SyncCase]:
     config = PrawnDoConfig(port="emulated:sync")
-    with board() as wired, Guard(sync=config, ports={"sync": wired.server.endpoint}) as guard:
+    with board(terminal=True) as wired, Guard(sync=config, ports={"sync": wired.server.endpoint}) as guard:
         yield case(wired, guard.sync)
 
 
@@ -40,8 +41,9 @@ def guarded_prawndo(folder: Path) -> Iterator[SyncCase]:
 def guarded_obis(folder: Path) -> Iterator[LaserCase]:
     model = ObisModel(cdrh_delay_s=0.2)
     config = ObisConfig.model_validate({"port": "emulated:laser", "max_power": "80 mW"})
-    with wire(model) as (_, surroundings), Guard(laser=config, ports=surroundings.ports) as guard:
-        yield LaserCase(guard.laser, surroundings.clock, lambda: model.emitting)
+    clock = VirtualClock()
+    with SerialServer(model, clock=clock) as server, Guard(laser=config, ports={"laser": server.endpoint}) as guard:
+        yield LaserCase(guard.laser, clock, lambda: model.emitting)
 
 
 EMULATED_SYNCS: dict[str, Callable[[Path], AbstractContextManager[Any]]] = {

@@ -15,6 +15,7 @@ import pytest
 from serial.tools import list_ports
 
 from sim_backend.wire.serve.serial import SerialServer
+from tests.wire import lasers, syncs
 
 WIRES = ("wire0", "wire1")
 """Serial ports there can be at a time, and the virtio ports at their far ends."""
@@ -112,6 +113,7 @@ def pytest_configure(config: pytest.Config) -> None:
                 os.read(server._master, 65_536)
         server._ending.wait(0.001)
 
+    lasers.SerialWire = syncs.SerialWire = SerialServer  # type: ignore[attr-defined, misc, assignment]
     SerialServer._rest = rest  # type: ignore[method-assign]
     SerialServer.plug = plug  # type: ignore[method-assign]
     SerialServer.unplug = unplug  # type: ignore[method-assign]

@@ -2,7 +2,7 @@
 
 import threading
 import time
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from typing import Any
 
@@ -17,24 +17,27 @@ from drivers.lasers.obis import ObisConfig
 from drivers.lasers.obis import create as create_obis
 from drivers.registry import Surroundings
 from drivers.transports.dialogue import LineTiming
-from sim_backend.wire.serve.serial import SerialModel, SerialServer
+from sim_backend.wire.serve.serial import SerialModel, SerialServer, SerialWire
 from sim_backend.wire.serve.wire_server import FaultSchedule
 
+PATIENCE_S = 60.0
+"""Longest wait for what comes for sure, however much else the machine has to do."""
 QUICK_COBOLT = LineTiming(gap_s=0.1, reply_s=0.15, quiet_s=0.02, drain_s=0.1)
-"""For virtual time, in which the gap costs nothing: replies come within milliseconds."""
+"""Replies come within milliseconds of the wire's virtual time."""
 QUICK_OBIS = LineTiming(reply_s=0.15, quiet_s=0.02, drain_s=0.1)
 
 
-def around(clock: Clock, server: SerialServer) -> Surroundings:
+def around(clock: Clock, server: SerialWire | SerialServer) -> Surroundings:
     return Surroundings(clock, None, 0, {"laser": server.endpoint})
 
 
 @contextmanager
 def wire(
-    model: SerialModel, *, clock: Clock | None = None, baud: int = 1_000_000, faults: FaultSchedule | None = None
-) -> Iterator[tuple[SerialServer, Surroundings]]:
+    model: SerialModel, *, clock: Clock | None = None, faults: FaultSchedule | None = None
+) -> Iterator[tuple[SerialWire, Surroundings]]:
+    """A wire within this process, on virtual time."""
     clock = clock or VirtualClock()
-    with SerialServer(model, clock=clock, baud=baud, faults=faults) as server:
+    with SerialWire(model, clock=clock, baud=1_000_000, faults=faults) as server:
         yield server, around(clock, server)
 
 
@@ -61,23 +64,30 @@ def bring_up(laser: LineLaser, clock: Clock, power_w: float = 0.05) -> None:
     pytest.fail("no emission")
 
 
-@contextmanager
-def arming(laser: LineLaser) -> Iterator[list[DeviceError]]:
-    """`arm` is under way on another thread inside the block and over behind it; the list has what it raised."""
-    raised: list[DeviceError] = []
+def eventually(happened: Callable[[], object]) -> None:
+    """Wait until something has happened on another thread or in another process."""
+    ends_at = time.monotonic() + PATIENCE_S
+    while not happened():
+        assert time.monotonic() < ends_at, "it does not happen"
+        time.sleep(0.002)
 
-    def arm() -> None:
-        try:
-            laser.arm(0.05)
-        except DeviceError as error:
-            raised.append(error)
 
-    thread = threading.Thread(target=arm)
-    thread.start()
-    time.sleep(0.3)
-    yield raised
-    thread.join(5.0)
-    assert not thread.is_alive()
+def overtaken_arm(laser: LineLaser, model: Any, said: bytes) -> DeviceError:
+    """What `arm` ends with where another thread pauses the laser once `said` has come to it."""
+    receive, pausing = model.receive, threading.Thread(target=laser.pause)
+
+    def listen(data: bytes, now_s: float) -> bytes:
+        answer: bytes = receive(data, now_s)
+        if said in data and pausing.ident is None:
+            pausing.start()
+            eventually(lambda: laser._stopped)  # type: ignore[attr-defined]
+        return answer
+
+    model.receive = listen
+    with pytest.raises(DeviceError) as raised:
+        laser.arm(0.05)
+    pausing.join(PATIENCE_S)
+    return raised.value
 
 
 class Silent:

@@ -8,8 +8,9 @@ from drivers.clock import NS_PER_S, VirtualClock
 from drivers.interfaces import OUT_GATE, Pulse
 from drivers.registry import Surroundings
 from drivers.sync.prawndo import PrawnDo, PrawnDoConfig, create
+from drivers.sync.prawndo_line import USUAL_TIMING, PrawnDoTiming
 from sim_backend.wire.firmware.prawndo import PrawnDoModel, TriggerLine
-from sim_backend.wire.serve.serial import SerialServer
+from sim_backend.wire.serve.serial import SerialServer, SerialWire
 from sim_backend.wire.serve.wire_server import FaultSchedule
 
 USB_BAUD = 8_000_000
@@ -18,13 +19,14 @@ SWEEP = (Pulse(0, None), Pulse(0, 1e-3), Pulse(OUT_GATE, 5e-3), Pulse(0, 1e-5))
 
 
 class Board:
-    """A PrawnDO on its wire, in virtual time, with a trigger input."""
+    """A PrawnDO with a trigger input, in virtual time. terminal: on a pseudo terminal, for a guard's process."""
 
-    def __init__(self, faults: FaultSchedule | None = None, **settings: Any) -> None:
+    def __init__(self, faults: FaultSchedule | None = None, *, terminal: bool = False, **settings: Any) -> None:
         self.clock = VirtualClock()
         self.trigger = TriggerLine()
         self.model = PrawnDoModel(self.trigger, **settings)
-        self.server = SerialServer(self.model, clock=self.clock, baud=USB_BAUD, faults=faults)
+        served = SerialServer if terminal else SerialWire
+        self.server: SerialServer | SerialWire = served(self.model, clock=self.clock, baud=USB_BAUD, faults=faults)
 
     @property
     def now_s(self) -> float:
@@ -36,9 +38,9 @@ class Board:
             self.model.advance(self.now_s)
             return self.model.outputs_at(self.now_s)
 
-    def open(self, **config: Any) -> PrawnDo:
+    def open(self, timing: PrawnDoTiming = USUAL_TIMING, **config: Any) -> PrawnDo:
         made = PrawnDoConfig.model_validate({"port": "emulated:sync", **config})
-        return create(made, Surroundings(self.clock, None, 0, {"sync": self.server.endpoint}))
+        return create(made, Surroundings(self.clock, None, 0, {"sync": self.server.endpoint}), timing)
 
 
 @contextmanager

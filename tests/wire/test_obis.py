@@ -1,11 +1,8 @@
 """The OBIS driver through real pyserial against a model of its firmware: bytes of docs/reference/hardware.md, and every
 trap."""
 
-import time
-
 import pytest
 
-from drivers.clock import SystemClock
 from drivers.errors import (
     DeviceFault,
     DeviceNotFound,
@@ -18,7 +15,8 @@ from drivers.errors import (
 from drivers.guard import Guard
 from drivers.lasers.obis import ERRORS, FAULTS, ObisConfig
 from sim_backend.wire.firmware.obis import ObisModel
-from tests.wire.lasers import arming, bring_up, now_s, open_obis, wire
+from sim_backend.wire.serve.serial import SerialServer
+from tests.wire.lasers import bring_up, eventually, now_s, open_obis, overtaken_arm, wire
 
 HANDSHAKES = (True, False)
 
@@ -168,10 +166,9 @@ def test_trap_a_deferred_on_of_somebody_else_counts_as_emission_and_a_pause_ends
 
 def test_a_pause_from_another_thread_ends_the_wait_for_the_warm_up() -> None:
     model = ObisModel(warm_up_s=60.0)
-    with wire(model, clock=SystemClock()) as (_, surroundings), open_obis(surroundings) as laser:
-        with arming(laser) as raised:
-            laser.pause()
-        assert isinstance(raised[0], WrongState)
+    with wire(model) as (_, surroundings), open_obis(surroundings) as laser:
+        assert isinstance(overtaken_arm(laser, model, b"SYST:STAT?"), WrongState)
+        assert "SOUR:AM:STAT ON" not in model.commands
         assert not model.state_on
 
 
@@ -306,16 +303,13 @@ def test_a_flipped_bit_in_a_temperature_ends_nothing() -> None:
 
 def test_the_guard_ends_the_light_of_a_laser_that_gets_too_warm() -> None:
     model = ObisModel(cdrh_delay_s=0.0)
-    with wire(model, clock=SystemClock()) as (server, _):
+    with SerialServer(model, baud=1_000_000) as server:  # the guard is a process of its own
         config = ObisConfig.model_validate({"port": "emulated:laser", "max_power": "80 mW"})
         with Guard(laser=config, ports={"laser": server.endpoint}) as guard:
             guard.laser.arm(0.05)
             assert model.emitting
             model.base_c = 55.0
-            ends_at = time.monotonic() + 5.0
-            while guard.failure is None or model.emitting:
-                assert time.monotonic() < ends_at
-                time.sleep(0.02)
+            eventually(lambda: guard.failure is not None and not model.emitting)
             assert isinstance(guard.failure, DeviceFault)
             assert "base plate at 55 C, outside 10 to 50 C" in str(guard.failure)
 

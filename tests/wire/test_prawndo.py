@@ -1,7 +1,6 @@
 """The PrawnDO: golden bytes of docs/reference/hardware.md, and a test named after each of its traps."""
 
 import threading
-import time
 
 import pytest
 
@@ -18,7 +17,9 @@ from drivers.errors import (
 )
 from drivers.interfaces import HOLD_S, OUT_FRAME, OUT_GATE, OUT_MARKER, Pulse
 from drivers.sync.prawndo import ProgramLimits, compile_program, most_repeats
+from drivers.sync.prawndo_line import PrawnDoTiming
 from sim_backend.wire.firmware.prawndo import PrawnDoModel, TriggerLine
+from tests.wire.lasers import PATIENCE_S, Silent, eventually
 from tests.wire.syncs import SWEEP, board
 
 # The emulator, against bytes written by hand from docs/reference/hardware.md
@@ -340,23 +341,25 @@ def test_trap_a_board_that_lost_power_greets_and_has_forgotten_its_program() -> 
 
 
 def test_the_gate_goes_low_at_once_beside_a_question_that_is_not_answered() -> None:
-    with board() as wire, wire.open() as device:
+    patient = PrawnDoTiming(PATIENCE_S, PATIENCE_S, PATIENCE_S, PATIENCE_S)
+    with board(terminal=True) as wire, wire.open(patient) as device:
         device.program([Pulse(OUT_GATE, 30.0)], 1)
         device.run()
         wire.clock.sleep(0.1)
         wire.server.hang()
         failures: list[BaseException] = []
+        said = device._line._serial_number
 
         def ask() -> None:
             try:
                 _ = device.status
             except DeviceError as error:
                 failures.append(error)
+                wire.server.resume()
 
         asking = threading.Thread(target=ask)
         asking.start()
-        time.sleep(0.05)
-        threading.Timer(0.05, wire.server.resume).start()
+        eventually(lambda: device._line._serial_number > said)
         device.gate_low()
         asking.join()
         assert wire.pins == 0
@@ -369,19 +372,17 @@ def test_a_board_that_does_not_answer_is_no_low_gate() -> None:
         device.program([Pulse(OUT_GATE, 30.0)], 1)
         device.run()
         wire.server.hang()
-        begun = time.monotonic()
+        begun_s = wire.now_s
         with pytest.raises(DeviceTimeout, match="did not answer"):
             device.gate_low()
-        assert time.monotonic() - begun < 2
+        assert wire.now_s - begun_s < 2
         wire.server.resume()
         device.close()
 
 
 def test_debug_noise_and_blank_lines_do_not_confuse_it() -> None:
     with board() as wire, wire.open() as device:
-        with wire.server.lock:
-            wire.model._unasked += b"\r\nhwstart: 0\r\n"
-        time.sleep(0.05)
+        wire.model._unasked += b"\r\nhwstart: 0\r\n"
         assert device.status.outputs == 0
 
 
@@ -402,7 +403,6 @@ def test_a_board_that_is_unplugged() -> None:
     with board() as wire:
         device = wire.open()
         wire.server.unplug()
-        time.sleep(0.05)
         assert device.port_lost
         for verb in (lambda: device.status, device.abort, lambda: device.program(SWEEP, 1)):
             with pytest.raises(DeviceDisconnected, match="plug it in again"):
@@ -419,12 +419,9 @@ def test_firmware_that_is_too_old() -> None:
 
 
 def test_a_device_that_is_no_prawndo() -> None:
-    class Laser:
+    class Laser(Silent):
         def receive(self, data: bytes, now_s: float) -> bytes:
             return b"Syntax error: illegal command\r\n" * data.count(b"\n")
-
-        def tick(self, now_s: float) -> bytes:
-            return b""
 
     with board() as wire:
         wire.server.model = Laser()

@@ -1,7 +1,6 @@
 """What every laser on a serial line does, whatever its make: limits, identity, lost ports, faults on the wire."""
 
 import threading
-import time
 from collections.abc import Callable
 from dataclasses import dataclass
 from functools import partial
@@ -10,7 +9,6 @@ from typing import Any
 import pytest
 from pydantic import ValidationError
 
-from drivers.clock import SystemClock
 from drivers.errors import DeviceBusy, DeviceDisconnected, DeviceError, DeviceNotFound, DeviceTimeout, LimitExceeded
 from drivers.interfaces import LineLaser
 from drivers.lasers import cobolt as cobolt_framing
@@ -18,14 +16,15 @@ from drivers.lasers import obis as obis_framing
 from drivers.lasers.cobolt import CoboltConfig
 from drivers.lasers.obis import ObisConfig
 from drivers.lasers.serial_laser import SerialLaserConfig
-from drivers.transports.endpoints import Endpoint
+from drivers.transports.dialogue import FairLock
 from rig.config.files import load_config
 from rig.devices.open import open_rig
 from rig.errors import DevicesError
 from sim_backend.wire.firmware.cobolt import CoboltModel
 from sim_backend.wire.firmware.obis import ObisModel
+from sim_backend.wire.serve.serial import SerialServer
 from sim_backend.wire.serve.wire_server import Fault, FaultScript
-from tests.wire.lasers import Babble, Silent, around, bring_up, now_s, open_cobolt, open_obis, wire
+from tests.wire.lasers import Babble, Silent, bring_up, eventually, now_s, open_cobolt, open_obis, wire
 
 
 @dataclass(frozen=True)
@@ -88,16 +87,17 @@ def test_a_port_where_none_of_the_make_answers_is_one_line_and_given_back(make: 
 
 
 def test_no_emulated_port_of_that_name() -> None:
-    with wire(CoboltModel()) as (server, surroundings):
-        with pytest.raises(DeviceNotFound, match="choose one of: laser"):
-            open_cobolt(surroundings, port="emulated:lesar")
-        assert around(surroundings.clock, server).ports == {"laser": Endpoint(server.path)}
+    with (
+        wire(CoboltModel()) as (_, surroundings),
+        pytest.raises(DeviceNotFound, match="choose one of: laser"),
+    ):
+        open_cobolt(surroundings, port="emulated:lesar")
 
 
 def test_the_application_pauses_a_laser_found_emitting_and_refuses_the_scan() -> None:
     model = ObisModel()
     model.shine(0.06)
-    with wire(model, clock=SystemClock()) as (server, _):  # the guard's process has no other time
+    with SerialServer(model) as server:  # the guard is a process of its own
         laser = {"kind": "obis", "port": server.path, "max_power": "50 mW"}
         config = load_config("simulated", {"laser": laser})
         with pytest.raises(DevicesError, match="found emitting and has been paused"), open_rig(config):
@@ -143,20 +143,19 @@ def test_a_firmware_that_hangs_is_a_timeout_within_its_deadline(make: Make) -> N
         laser = make.open(surroundings)
         bring_up(laser, surroundings.clock)
         server.hang()
-        began = time.monotonic()
+        began_s = now_s(surroundings.clock)
         with pytest.raises(DeviceTimeout):
             laser.pause()
-        assert time.monotonic() - began < 5.0
+        assert now_s(surroundings.clock) - began_s < 5.0
         server.resume()
         laser.pause()
         assert not model.emitting
         laser.close()
 
 
-def test_a_pause_is_not_held_up_by_a_thread_that_polls() -> None:
-    dark_at: list[float] = []
-    model = ObisModel(on_emission=lambda emits, _: None if emits else dark_at.append(time.monotonic()))
-    with wire(model, clock=SystemClock()) as (_, surroundings), open_obis(surroundings) as laser:
+def test_a_pause_comes_through_beside_a_thread_that_polls() -> None:
+    model = ObisModel()
+    with wire(model) as (_, surroundings), open_obis(surroundings) as laser:
         model.shine(0.05)
         ending = threading.Event()
 
@@ -166,13 +165,27 @@ def test_a_pause_is_not_held_up_by_a_thread_that_polls() -> None:
 
         thread = threading.Thread(target=poll)
         thread.start()
-        time.sleep(0.2)
-        began = time.monotonic()
         laser.pause()
         ending.set()
         thread.join()
         assert not model.emitting
-        assert dark_at[0] - began < 1.0
+
+
+def test_the_line_goes_to_who_waits_before_who_had_it_last() -> None:
+    lock, order = FairLock(), []
+
+    def wait() -> None:
+        with lock:
+            order.append("who waited")
+
+    thread = threading.Thread(target=wait)
+    with lock:
+        thread.start()
+        eventually(lock._turn.locked)
+    with lock:
+        order.append("who had it")
+    thread.join()
+    assert order == ["who waited", "who had it"]
 
 
 @each_make

@@ -1,7 +1,9 @@
-"""Serial ports: deadlines kept, every failure one typed line, through the real pyserial on a pseudo terminal."""
+"""Serial ports: deadlines kept, every failure one typed line, emulated and with pyserial on a pseudo terminal.
+
+Deadlines are looked at on the emulated port, which keeps virtual time.
+"""
 
 import errno
-import time
 from collections.abc import Callable, Iterator
 from types import SimpleNamespace
 
@@ -9,6 +11,7 @@ import pytest
 import serial
 from serial.tools import list_ports
 
+from drivers.clock import VirtualClock
 from drivers.errors import (
     DeviceBusy,
     DeviceDisconnected,
@@ -19,31 +22,45 @@ from drivers.errors import (
 )
 from drivers.transports.endpoints import Endpoint, resolve
 from drivers.transports.serial_port import SerialPort
-from sim_backend.wire.serve.serial import SerialServer
+from sim_backend.wire.serve.serial import SerialServer, SerialWire
 from sim_backend.wire.serve.wire_server import Fault, FaultSchedule, FaultScript
+from tests.wire.lasers import PATIENCE_S, Silent, now_s
 
 
-class Echo:
-    """Answers each line with itself in brackets; `n:` with n bytes."""
+class Echo(Silent):
+    """Answers each line with itself in brackets."""
 
     def receive(self, data: bytes, now_s: float) -> bytes:
         return b"".join(b"[" + line + b"]\r\n" for line in data.split(b"\n") if line)
 
-    def tick(self, now_s: float) -> bytes:
-        return b""
+
+Server = SerialServer | SerialWire
 
 
-@pytest.fixture
-def server() -> Iterator[SerialServer]:
-    with SerialServer(Echo(), baud=1_000_000) as served:
+@pytest.fixture(params=[SerialWire, SerialServer], ids=["emulated", "pseudo terminal"])
+def server(request: pytest.FixtureRequest) -> Iterator[Server]:
+    clock = VirtualClock() if request.param is SerialWire else None
+    with request.param(Echo(), clock=clock, baud=1_000_000) as served:
         yield served
 
 
 @pytest.fixture
-def port(server: SerialServer) -> Iterator[SerialPort]:
-    opened = SerialPort("echo", server.path)
+def port(server: Server) -> Iterator[SerialPort]:
+    opened = SerialPort("echo", server.endpoint)
     yield opened
     opened.close()
+
+
+@pytest.fixture
+def clock() -> VirtualClock:
+    return VirtualClock()
+
+
+@pytest.fixture
+def virtual(clock: VirtualClock) -> Iterator[SerialPort]:
+    """A port on virtual time."""
+    with SerialWire(Echo(), clock=clock, baud=9600) as wire:
+        yield SerialPort("echo", wire.endpoint)
 
 
 def one_line(error: BaseException) -> str:
@@ -55,47 +72,52 @@ def one_line(error: BaseException) -> str:
 
 def test_lines_come_as_sent(port: SerialPort) -> None:
     port.write(b"ab\n")
-    assert port.read_line(b"\r\n", 1.0) == b"[ab]"
+    assert port.read_line(b"\r\n", PATIENCE_S) == b"[ab]"
     port.write(b"cd\n")
-    assert port.read_line(b"]", 1.0) == b"[cd"
-    assert port.read_line(b"\n", 1.0) == b"\r"
+    assert port.read_line(b"]", PATIENCE_S) == b"[cd"
+    assert port.read_line(b"\n", PATIENCE_S) == b"\r"
 
 
-def test_a_reply_that_does_not_come_is_a_timeout_at_the_deadline(port: SerialPort) -> None:
-    began = time.monotonic()
+def test_a_reply_that_does_not_come_is_a_timeout_at_the_deadline(virtual: SerialPort, clock: VirtualClock) -> None:
     with pytest.raises(DeviceTimeout, match=r"0\.2 s"):
-        port.read_line(b"\n", 0.2)
-    assert 0.15 < time.monotonic() - began < 1.0
+        virtual.read_line(b"\n", 0.2)
+    assert now_s(clock) == pytest.approx(0.2, abs=0.03)
 
 
-def test_what_came_before_a_timeout_is_kept_until_the_input_is_reset(port: SerialPort) -> None:
-    port.write(b"ab\n")
+def test_what_came_before_a_timeout_is_kept_until_the_input_is_reset(virtual: SerialPort) -> None:
+    virtual.write(b"ab\n")
     with pytest.raises(DeviceTimeout, match="6 bytes came"):
-        port.read_line(b"!", 0.2)
-    assert port.read_line(b"\r\n", 0.1) == b"[ab]"
-    port.write(b"cd\n")
+        virtual.read_line(b"!", 0.2)
+    assert virtual.read_line(b"\r\n", 0.1) == b"[ab]"
+    virtual.write(b"cd\n")
     with pytest.raises(DeviceTimeout):
-        port.read_line(b"!", 0.2)
-    port.reset_input()
+        virtual.read_line(b"!", 0.2)
+    virtual.reset_input()
     with pytest.raises(DeviceTimeout, match="0 bytes came"):
-        port.read_line(b"\n", 0.05)
+        virtual.read_line(b"\n", 0.05)
 
 
-def test_noise_without_an_end_is_a_protocol_error(port: SerialPort) -> None:
-    port._received += bytes(70_000)
+def test_noise_without_an_end_is_a_protocol_error(virtual: SerialPort) -> None:
+    virtual._received += bytes(70_000)
     with pytest.raises(ProtocolError, match="noise"):
-        port.read_line(b"\n", 0.1)
+        virtual.read_line(b"\n", 0.1)
+
+
+def test_replies_leave_at_ten_bits_a_character(virtual: SerialPort, clock: VirtualClock) -> None:
+    virtual.write(b"x" * 95 + b"\n")
+    virtual.read_line(b"\n", 2.0)
+    assert now_s(clock) == pytest.approx(99 * 10 / 9600, rel=0.05)
 
 
 def test_an_absent_port_is_one_line() -> None:
     with pytest.raises(DeviceNotFound) as refused:
-        SerialPort("laser", "/dev/ttyNOWHERE")
+        SerialPort("laser", Endpoint("/dev/ttyNOWHERE"))
     assert "/dev/ttyNOWHERE" in one_line(refused.value)
 
 
-def test_a_busy_port_is_one_line(server: SerialServer, port: SerialPort) -> None:
+def test_a_busy_port_is_one_line(server: Server, port: SerialPort) -> None:
     with pytest.raises(DeviceBusy) as refused:
-        SerialPort("laser", server.path)
+        SerialPort("laser", server.endpoint)
     assert "held by another program" in one_line(refused.value)
 
 
@@ -105,53 +127,57 @@ def test_a_forbidden_port_names_the_udev_rules(monkeypatch: pytest.MonkeyPatch) 
 
     monkeypatch.setattr(serial, "Serial", forbidden)
     with pytest.raises(DevicePermission) as refused:
-        SerialPort("laser", "/dev/ttyUSB0")
+        SerialPort("laser", Endpoint("/dev/ttyUSB0"))
     assert "config/udev/70-spadrig.rules" in one_line(refused.value)
 
 
 def test_a_file_that_is_no_port_is_refused() -> None:
     with pytest.raises(DeviceNotFound, match="cannot be opened as a serial port") as refused:
-        SerialPort("laser", "/dev/null")
+        SerialPort("laser", Endpoint("/dev/null"))
     one_line(refused.value)
 
 
-def calls(port: SerialPort) -> list[Callable[[], object]]:
-    return [
-        lambda: port.write(b"x\n"),
-        lambda: port.read_line(b"\n", 0.3),
-        port.reset_input,
-        lambda: port.drain(0.1, 0.3),
-    ]
+CALLS: dict[str, Callable[[SerialPort], object]] = {
+    "write": lambda port: port.write(b"x\n"),
+    "read a line": lambda port: port.read_line(b"\n", 0.3),
+    "reset": SerialPort.reset_input,
+    "drain": lambda port: port.drain(0.1, 0.3),
+}
+each_call = pytest.mark.parametrize("call", CALLS.values(), ids=CALLS)
 
 
-@pytest.mark.parametrize("call", range(4))
-def test_an_unplugged_port_is_lost_whatever_is_called(server: SerialServer, port: SerialPort, call: int) -> None:
+@each_call
+def test_an_unplugged_port_is_lost_whatever_is_called(
+    server: Server, port: SerialPort, call: Callable[[SerialPort], object]
+) -> None:
+    assert not port.lost
     server.unplug()
+    assert port.lost
     with pytest.raises(DeviceDisconnected) as lost:
-        calls(port)[call]()
+        call(port)
     assert "is lost" in one_line(lost.value)
 
 
-@pytest.mark.parametrize("call", range(4))
-def test_a_port_that_was_closed_under_a_call_is_lost(port: SerialPort, call: int) -> None:
+@each_call
+def test_a_port_that_was_closed_under_a_call_is_lost(port: SerialPort, call: Callable[[SerialPort], object]) -> None:
     port.close()
     port.close()
     with pytest.raises(DeviceDisconnected):
-        calls(port)[call]()
+        call(port)
 
 
-def test_a_device_that_was_plugged_in_again_is_opened_again(server: SerialServer, port: SerialPort) -> None:
+def test_a_device_that_was_plugged_in_again_is_opened_again(server: Server, port: SerialPort) -> None:
     server.unplug()
     with pytest.raises(DeviceNotFound):
-        SerialPort("echo", server.path)
+        SerialPort("echo", server.endpoint)
     server.plug()
-    again = SerialPort("echo", server.path)
+    again = SerialPort("echo", server.endpoint)
     again.write(b"ab\n")
-    assert again.read_line(b"\r\n", 1.0) == b"[ab]"
+    assert again.read_line(b"\r\n", PATIENCE_S) == b"[ab]"
     again.close()
 
 
-def test_a_device_that_takes_nothing_is_a_timeout(server: SerialServer, port: SerialPort) -> None:
+def test_a_device_that_takes_nothing_is_a_timeout(server: Server, port: SerialPort) -> None:
     server.hang()
     with pytest.raises(DeviceTimeout, match="took no data"):
         port.write(bytes(100_000))
@@ -161,31 +187,32 @@ def attached(*ports: tuple[str, str | None, int | None, int | None]) -> list[Sim
     return [SimpleNamespace(device=d, serial_number=s, vid=v, pid=p) for d, s, v, p in ports]
 
 
-def test_a_port_is_found_by_serial_number_and_by_product(server: SerialServer, monkeypatch: pytest.MonkeyPatch) -> None:
-    listed = attached(("/dev/ttyS0", None, None, None), (server.path, "A1", 0x2E8A, 0xA))
-    monkeypatch.setattr(list_ports, "comports", lambda: listed)
-    for address in ("serial=A1", "usb=2E8A:000a"):
-        found = SerialPort("box", address)
-        assert found.path == server.path
-        found.close()
+def test_a_port_is_found_by_serial_number_and_by_product(monkeypatch: pytest.MonkeyPatch) -> None:
+    with SerialServer(Echo()) as server:
+        listed = attached(("/dev/ttyS0", None, None, None), (server.path, "A1", 0x2E8A, 0xA))
+        monkeypatch.setattr(list_ports, "comports", lambda: listed)
+        for address in ("serial=A1", "usb=2E8A:000a"):
+            found = SerialPort("box", Endpoint(address))
+            assert found.path == server.path
+            found.close()
     with pytest.raises(DeviceNotFound, match=r"no serial port with serial=B2; attached: .*serial=A1"):
-        SerialPort("box", "serial=B2")
+        SerialPort("box", Endpoint("serial=B2"))
 
 
 def test_two_equal_devices_ask_for_the_serial_number_or_the_port(monkeypatch: pytest.MonkeyPatch) -> None:
     listed = attached(("/dev/ttyACM0", "A1", 0x2E8A, 0xA), ("/dev/ttyACM1", "A1", 0x2E8A, 0xA))
     monkeypatch.setattr(list_ports, "comports", lambda: listed)
     with pytest.raises(DeviceNotFound, match=r"2 serial ports .*ttyACM0, /dev/ttyACM1.*give serial=") as refused:
-        SerialPort("box", "usb=2e8a:000a")
+        SerialPort("box", Endpoint("usb=2e8a:000a"))
     one_line(refused.value)
     with pytest.raises(DeviceNotFound, match="give the port's path"):
-        SerialPort("box", "serial=A1")
+        SerialPort("box", Endpoint("serial=A1"))
 
 
 @pytest.mark.parametrize("address", ["rfc2217://127.0.0.1:2217", "socket://127.0.0.1:2217"])
 def test_a_port_on_the_network_is_refused_with_a_way_to_make_it_a_local_one(address: str) -> None:
     with pytest.raises(DeviceNotFound, match="socat") as refused:
-        SerialPort("laser", address)
+        SerialPort("laser", Endpoint(address))
     one_line(refused.value)
 
 
@@ -199,16 +226,6 @@ def test_emulated_ports_are_looked_up_and_real_ones_are_not() -> None:
         resolve("emulated:laser", {})
 
 
-def test_replies_leave_at_ten_bits_a_character() -> None:
-    with SerialServer(Echo(), baud=9600) as server:
-        port = SerialPort("echo", server.path)
-        began = time.monotonic()
-        port.write(b"x" * 95 + b"\n")
-        port.read_line(b"\n", 2.0)
-        assert 0.09 < time.monotonic() - began < 0.5  # 99 characters at 960 a second
-        port.close()
-
-
 @pytest.mark.parametrize(
     ("fault", "arrives"),
     [
@@ -220,14 +237,13 @@ def test_replies_leave_at_ten_bits_a_character() -> None:
         (Fault.STALL, b"[a]\r\n[b]\r\n"),
     ],
 )
-def test_each_fault_does_to_the_first_reply_what_it_says(fault: Fault, arrives: bytes) -> None:
-    with SerialServer(Echo(), baud=1_000_000, faults=FaultScript(fault, late_s=0.1, stall_s=0.2)) as server:
-        port = SerialPort("echo", server.path)
+def test_each_fault_does_to_the_first_reply_what_it_says(fault: Fault, arrives: bytes, clock: VirtualClock) -> None:
+    with SerialWire(Echo(), clock=clock, faults=FaultScript(fault, late_s=0.1, stall_s=0.2)) as wire:
+        port = SerialPort("echo", wire.endpoint)
         port.write(b"a\n")
-        time.sleep(0.05)
+        clock.sleep(0.05)
         port.write(b"b\n")
         assert port.drain(0.4, 2.0) == arrives
-        port.close()
 
 
 def test_corrupted_and_truncated_replies_differ_from_what_was_sent() -> None:

@@ -1,25 +1,35 @@
-"""Serves a model of a serial device on a pseudo terminal: the real driver opens it with the real pyserial.
+"""Serial lines to a model of a device: `SerialWire` within this process, `SerialServer` on a pseudo terminal.
 
-Replies leave at 10 bits a character, in the host's time, as through a UART (a virtual COM port is faster, and no driver
-may depend on that). A pseudo terminal ignores the baud rate. The path is a link that survives unplugging and plugging
-in again.
+Replies leave at 10 bits a character, as through a UART (a virtual COM port is faster, and no driver may depend on
+that). A `SerialWire` takes the place of pyserial and keeps the time of its clock: a test on virtual time says the same
+on any machine, however much else that has to do. A pseudo terminal is opened by the real pyserial, from any process,
+and keeps the host's time; it ignores the baud rate. Its path is a link that survives unplugging and plugging in again.
 """
 
+import errno
 import os
 import select
 import tempfile
 import threading
-import time
 import tty
+from abc import abstractmethod
 from pathlib import Path
 from typing import Protocol
 
-from drivers.clock import Clock
+import serial
+
+from drivers.clock import NS_PER_S, Clock
 from drivers.transports.endpoints import Endpoint
-from sim_backend.wire.serve.wire_server import FaultSchedule, WireServer
+from sim_backend.wire.serve.wire_server import FaultSchedule, Wire, WireServer
 
 BITS_PER_CHARACTER = 10
 """8N1: a start bit, eight data bits, a stop bit."""
+MOST_UNHEARD_BYTES = 4096
+"""Bytes that a port keeps for a device that hangs, as a pseudo terminal does."""
+PORT_WRITE_S = 1.0
+"""Time after which an emulated port gives up a write."""
+PORT_SLICE_S = 0.02
+"""Longest wait of one read of an emulated port."""
 _TURN_S = 0.001
 """One turn of the serving thread while bytes are on their way."""
 _IDLE_S = 0.01
@@ -38,8 +48,176 @@ class SerialModel(Protocol):
         ...
 
 
-class SerialServer(WireServer[SerialModel]):
-    """A serial device."""
+class _SerialLine(Wire[SerialModel]):
+    """The line itself, wherever it leads: it takes what came, lets the model answer and sends what is due."""
+
+    _characters_per_s: float
+
+    def _turn(self) -> None:
+        """Take what came, let the model answer, send what is due."""
+        now_s = self._now_s()
+        self._reply(self.model.tick(now_s))
+        data = self._take()
+        if data:
+            self._reply(self.model.receive(data, now_s))
+        self._send_due()
+
+    def _queue(self, at: float, data: bytes) -> None:
+        """No faster than the line carries them."""
+        super()._queue(at, data)
+        self._free_at += len(data) / self._characters_per_s
+
+    def _send_due(self) -> None:
+        now = self._wire_s()
+        while self._outbox and self._outbox[0][0] <= now:
+            starts_at, data = self._outbox.popleft()
+            n_due = max(1, int((now - starts_at) * self._characters_per_s))
+            sent = self._send(data[:n_due])
+            if sent < len(data):
+                self._outbox.appendleft((starts_at + sent / self._characters_per_s, data[sent:]))
+                return
+
+    @abstractmethod
+    def _take(self) -> bytes:
+        """The bytes that the host has sent."""
+
+    @abstractmethod
+    def _send(self, data: bytes) -> int:
+        """Give bytes to the host; returns how many it took."""
+
+
+class SerialWire(_SerialLine):
+    """A serial device within this process, whose ports wait on the clock of its model, where time may be virtual."""
+
+    def __init__(
+        self,
+        model: SerialModel,
+        *,
+        clock: Clock | None = None,
+        baud: int = 115_200,
+        faults: FaultSchedule | None = None,
+    ) -> None:
+        super().__init__(model, clock, faults)
+        self._characters_per_s = baud / BITS_PER_CHARACTER
+        self._plugged = False
+        self._port: EmulatedPort | None = None
+        self._from_host = bytearray()
+
+    @property
+    def path(self) -> str:
+        """Name of the port in messages."""
+        return f"/dev/emulated-{id(self):x}"
+
+    @property
+    def endpoint(self) -> Endpoint:
+        """The endpoint that opens such ports."""
+        return Endpoint(self.path, serial_port=self._open)
+
+    def plug(self) -> None:
+        """Put the cable in."""
+        self._plugged = True
+
+    def unplug(self) -> None:
+        """Pull the cable."""
+        with self.lock:
+            self._plugged = False
+            self._outbox.clear()
+            self._from_host.clear()
+            if self._port is not None:
+                self._port.hang_up()
+                self._port = None
+
+    def _open(self) -> "EmulatedPort":
+        with self.lock:
+            if not self._plugged:
+                raise serial.SerialException(errno.ENOENT, f"could not open port {self.path}")
+            if self._port is not None:
+                raise serial.SerialException(errno.EBUSY, f"could not lock port {self.path}")
+            self._port = EmulatedPort(self, self._clock)
+            return self._port
+
+    def exchange(self, port: "EmulatedPort", data: bytes = b"") -> None:
+        """Let the device act, now and on what its host has to say. SerialException where the port is lost."""
+        with self.lock:
+            if self._port is not port:
+                raise serial.SerialException(errno.EIO, "the cable was pulled or the port closed")
+            if self._hung and data and len(self._from_host) + len(data) > MOST_UNHEARD_BYTES:
+                self._clock.sleep(PORT_WRITE_S)
+                raise serial.SerialTimeoutException("write timeout")
+            self._from_host += data
+            if not self._hung:
+                self._turn()
+
+    def release(self, port: "EmulatedPort") -> None:
+        """Take a port back from its host."""
+        with self.lock:
+            if self._port is port:
+                self._port = None
+                self._outbox.clear()
+
+    def _take(self) -> bytes:
+        data = bytes(self._from_host)
+        self._from_host.clear()
+        return data
+
+    def _send(self, data: bytes) -> int:
+        if self._port is not None:
+            self._port.received += data
+        return len(data)
+
+
+class EmulatedPort:
+    """The host's end of a `SerialWire`: what drivers use of `serial.Serial`."""
+
+    def __init__(self, wire: SerialWire, clock: Clock) -> None:
+        self.clock = clock
+        self.received = bytearray()
+        """Bytes that came and were not read yet."""
+        self._wire = wire
+        self._hung_up = False
+        self._end, self._far_end = os.pipe()
+
+    @property
+    def in_waiting(self) -> int:
+        """Number of bytes that can be read now."""
+        self._wire.exchange(self)
+        return len(self.received)
+
+    def read(self, size: int) -> bytes:
+        """At most `size` bytes; none after one slice of waiting."""
+        ends_ns = self.clock.now_ns() + round(PORT_SLICE_S * NS_PER_S)
+        while not self.in_waiting and self.clock.now_ns() < ends_ns:
+            self.clock.sleep(_TURN_S)
+        with self._wire.lock:
+            data = bytes(self.received[:size])
+            del self.received[:size]
+        return data
+
+    def write(self, data: bytes) -> None:
+        """Send all of it."""
+        self._wire.exchange(self, data)
+
+    def fileno(self) -> int:
+        """A file descriptor that hangs up with the cable."""
+        return self._end
+
+    def hang_up(self) -> None:
+        """Act as a port whose cable is pulled."""
+        if not self._hung_up:
+            self._hung_up = True
+            os.close(self._far_end)
+
+    def close(self) -> None:
+        """Give the port back; again: nothing happens."""
+        self._wire.release(self)
+        self.hang_up()
+        if self._end >= 0:
+            os.close(self._end)
+            self._end = -1
+
+
+class SerialServer(_SerialLine, WireServer[SerialModel]):
+    """A serial device on a pseudo terminal."""
 
     def __init__(
         self,
@@ -104,7 +282,7 @@ class SerialServer(WireServer[SerialModel]):
             with self.lock:
                 master = None if self._hung else self._master
                 if master is not None:
-                    self._turn(master)
+                    self._turn()
                 wait_s = _TURN_S if self._outbox else _IDLE_S
             if master is None:
                 self._rest()
@@ -123,37 +301,16 @@ class SerialServer(WireServer[SerialModel]):
             if self._wake_in in readable:
                 os.read(self._wake_in, 64)
 
-    def _turn(self, master: int) -> None:
-        """Take what came, let the model answer, send what is due."""
-        now_s = self._now_s()
-        self._reply(self.model.tick(now_s))
+    def _take(self) -> bytes:
         try:
-            data = os.read(master, 4096)
+            return b"" if self._master is None else os.read(self._master, 4096)
         except OSError:
-            data = b""  # nothing there, or nobody has the port open
-        if data:
-            self._reply(self.model.receive(data, now_s))
-        if self._master is not None:  # a fault may just have unplugged it
-            self._send_due(self._master)
+            return b""  # nothing there, or nobody has the port open
 
-    def _queue(self, at: float, data: bytes) -> None:
-        """No faster than the line carries them."""
-        super()._queue(at, data)
-        self._free_at += len(data) / self._characters_per_s
-
-    def _send_due(self, master: int) -> None:
-        now = time.monotonic()
-        while self._outbox and self._outbox[0][0] <= now:
-            starts_at, data = self._outbox.popleft()
-            n_due = max(1, int((now - starts_at) * self._characters_per_s))
-            sent = self._send(master, data[:n_due])
-            if sent < len(data):
-                self._outbox.appendleft((starts_at + sent / self._characters_per_s, data[sent:]))
-                return
-
-    def _send(self, master: int, data: bytes) -> int:
+    def _send(self, data: bytes) -> int:
+        assert self._master is not None, "nothing is on its way of what is not plugged in"
         try:
-            return os.write(master, data)
+            return os.write(self._master, data)
         except BlockingIOError:
             return 0  # nobody reads: the terminal's buffer is full
         except OSError:

@@ -6,7 +6,6 @@ One client at a time, as vendors' programs have it: while one is served nobody l
 import select
 import socket
 import struct
-import time
 from contextlib import suppress
 from typing import Protocol
 
@@ -132,9 +131,9 @@ class TcpServer(WireServer[TcpModel]):
         """Send what is due; ask the model for more only when all is sent, as a program blocks in its own send."""
         if self._client is None:
             return False
-        if not self._outbox and time.monotonic() >= self._free_at:
+        if not self._outbox and self._wire_s() >= self._free_at:
             self._reply(self.model.send(CHUNK_BYTES, now_s))
-        now, moved = time.monotonic(), False
+        now, moved = self._wire_s(), False
         while self._client is not None and self._outbox and self._outbox[0][0] <= now:
             due_at, data = self._outbox.popleft()
             sent = self._send(data)

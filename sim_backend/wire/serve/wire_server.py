@@ -1,4 +1,4 @@
-"""The base of servers of a model: a thread, a cable that can be pulled, firmware that can hang, and faults that strike.
+"""The base of emulated wires to a model: a cable that can be pulled, firmware that can hang, and faults that strike.
 
 Faults are the things that can go wrong on a wire: late, split, merged, cut, corrupt, repeated or lost replies, stalls,
 unplugging, hangs. One seeded schedule decides, reply by reply, which fault strikes; the transports (serial, TCP, USB)
@@ -12,7 +12,6 @@ from collections import deque
 from collections.abc import Sequence
 from dataclasses import dataclass
 from enum import Enum
-from types import TracebackType
 from typing import Generic, Self, TypeVar
 
 import numpy as np
@@ -147,11 +146,10 @@ class FaultScript(FaultSchedule):
 Model = TypeVar("Model")
 
 
-class WireServer(ABC, Generic[Model]):
+class Wire(ABC, Generic[Model]):
     """A device on a wire of its own, from entering the `with` block (or `start`) to leaving it (`close`).
 
-    The model's time comes from a clock, so that a warm-up of minutes costs a test nothing; what is on the wire is late
-    in the host's time.
+    The model's time comes from a clock, so that a warm-up of minutes costs a test nothing.
     """
 
     def __init__(self, model: Model, clock: Clock | None, faults: FaultSchedule | None) -> None:
@@ -164,8 +162,6 @@ class WireServer(ABC, Generic[Model]):
         self._free_at = 0.0
         """Time at which the next reply may leave: they leave in order."""
         self._hung = False
-        self._ending = threading.Event()
-        self._thread = threading.Thread(target=self._serve, name=type(self).__name__, daemon=True)
 
     @property
     @abstractmethod
@@ -173,25 +169,19 @@ class WireServer(ABC, Generic[Model]):
         """The endpoint at which a host finds the device while it is plugged in, for `Surroundings.ports`."""
 
     def start(self) -> Self:
-        """Plug it in and serve it on a thread of its own."""
+        """Plug it in."""
         self.plug()
-        self._thread.start()
         return self
 
     def close(self) -> None:
         """Unplug it for good; again: nothing happens."""
-        self._ending.set()
-        if self._thread.ident is not None:
-            self._thread.join()
         self.unplug()
 
     def __enter__(self) -> Self:
-        """The server, serving."""
+        """The wire, in use."""
         return self.start()
 
-    def __exit__(
-        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
-    ) -> None:
+    def __exit__(self, *_: object) -> None:
         """Close."""
         self.close()
 
@@ -214,19 +204,19 @@ class WireServer(ABC, Generic[Model]):
         with self.lock:
             self._hung = False
 
-    @abstractmethod
-    def _serve(self) -> None:
-        """The thread, until `_ending` is set."""
-
     def _now_s(self) -> float:
         """The model's time."""
         return self._clock.now_ns() / NS_PER_S
+
+    def _wire_s(self) -> float:
+        """The time in which replies travel."""
+        return self._now_s()
 
     def _reply(self, reply: bytes) -> None:
         """Queue what the model says, as the faults would have it."""
         if not reply:
             return
-        now = time.monotonic()
+        now = self._wire_s()
         if self.faults is None:
             self._queue(now, reply)
             return
@@ -244,3 +234,32 @@ class WireServer(ABC, Generic[Model]):
     def _queue(self, at: float, data: bytes) -> None:
         self._free_at = max(self._free_at, at)
         self._outbox.append((self._free_at, data))
+
+
+class WireServer(Wire[Model]):
+    """A device that a thread serves on a wire of the operating system's, on which replies travel in the host's time."""
+
+    def __init__(self, model: Model, clock: Clock | None, faults: FaultSchedule | None) -> None:
+        super().__init__(model, clock, faults)
+        self._ending = threading.Event()
+        self._thread = threading.Thread(target=self._serve, name=type(self).__name__, daemon=True)
+
+    def start(self) -> Self:
+        """Plug it in and serve it on a thread of its own."""
+        super().start()
+        self._thread.start()
+        return self
+
+    def close(self) -> None:
+        """Unplug it for good; again: nothing happens."""
+        self._ending.set()
+        if self._thread.ident is not None:
+            self._thread.join()
+        super().close()
+
+    @abstractmethod
+    def _serve(self) -> None:
+        """The thread, until `_ending` is set."""
+
+    def _wire_s(self) -> float:
+        return time.monotonic()
