@@ -7,11 +7,11 @@ PING comes for `heartbeat`. Pings are sent by `fill`, between two blocks: a sour
 
 import logging
 import threading
-import time
 from typing import Annotated, Literal
 
 from pydantic import Field
 
+from drivers.clock import NS_PER_S, Clock
 from drivers.errors import DeviceError, DeviceFault, DeviceTimeout, LimitExceeded
 from drivers.frames import frame_bytes
 from drivers.interfaces import SpadArray, SpadCounters, SpadHealth, SpadInfo, SpadRequest, SpadTiming
@@ -72,14 +72,15 @@ class SpbUsbConfig(KindConfig):
 class SpbUsb(SpadArray):
     """An SPB1 SPAD over an open link."""
 
-    def __init__(self, config: SpbUsbConfig, link: BulkLink, tap: Tap | None = None) -> None:
+    def __init__(self, config: SpbUsbConfig, link: BulkLink, clock: Clock, tap: Tap | None = None) -> None:
         """Check who is there and, where asked for, its test pattern. The link is closed with the device.
 
-        tap: told of its control traffic.
+        clock: of its deadlines, that on which the link waits. tap: told of its control traffic.
         """
         super().__init__(link.label)
         self._config = config
         self._link = link
+        self._clock = clock
         self._wiring = wiring = WIRINGS[config.chip]
         self._busy = threading.Lock()
         """Held while the link is in use, so that `stop` waits for `fill`."""
@@ -91,7 +92,7 @@ class SpbUsb(SpadArray):
         try:
             wiring.open_session(link)
             ack_in = wiring.ack_in if wiring.ack_in in link.endpoints else None
-            self._control = ControlChannel(link, wiring.command_out, ack_in, wiring.stream_in, tap)
+            self._control = ControlChannel(link, wiring.command_out, ack_in, wiring.stream_in, clock, tap)
             self._control.on_wait = self._note_wait
             self._identity = identify(self._control, self.name)
             if config.test_pattern:
@@ -161,7 +162,7 @@ class SpbUsb(SpadArray):
             )
             self._receiver = BlockReceiver(self._link, self._wiring.stream_in, armed, self.name)
             self._counters = SpadCounters(0, 0, 0, 0, 0)
-            self._pinged_at = self._heard_at = time.monotonic()
+            self._pinged_at = self._heard_at = self._now_s()
             self._waited_s = 0.0
 
     def _do_fill(self, ring: BlockRing, timeout_s: float) -> bool:
@@ -178,18 +179,18 @@ class SpbUsb(SpadArray):
                 raise
 
     def _fill(self, receiver: BlockReceiver, ring: BlockRing, timeout_s: float) -> bool:
-        ends_at = time.monotonic() + timeout_s
+        ends_at = self._now_s() + timeout_s
         took = Took.NOTHING
         while took is not Took.FRAMES and not receiver.ended:
             self._ping_when_due(receiver)
-            asked_at = time.monotonic()
+            asked_at = self._now_s()
             try:
                 took = receiver.take(ring, min(_SLICE_S, max(0.0, ends_at - asked_at)))
             finally:
                 self._count(receiver)
             if self._halt.is_set():
                 return False
-            now = time.monotonic()
+            now = self._now_s()
             if took is Took.FRAMES:
                 self._waited_s = 0.0
             else:
@@ -216,16 +217,19 @@ class SpbUsb(SpadArray):
         if self.on_wait is not None:
             self.on_wait(self._waited_s)
 
+    def _now_s(self) -> float:
+        return self._clock.now_ns() / NS_PER_S
+
     def _has_ended(self) -> bool:
         """Whether the device runs no more: then its last block got lost."""
-        self._heard_at = time.monotonic()
+        self._heard_at = self._now_s()
         return self._control.has_acks and self._control.read(Register.STATE) not in (
             SensorState.RUNNING,
             SensorState.DRAINING,
         )
 
     def _ping_when_due(self, receiver: BlockReceiver) -> None:
-        now = time.monotonic()
+        now = self._now_s()
         if now - self._pinged_at >= self._config.heartbeat / _PINGS_PER_HEARTBEAT:
             self._pinged_at = now
             self._control.ping(max(0, receiver.next_frame - 1) & 0xFFFFFFFF)
@@ -267,8 +271,8 @@ class SpbUsb(SpadArray):
         exposed: int | None = None
         try:
             self._control.send_in_run(Op.ABORT)
-            ends_at = time.monotonic() + _STOP_S
-            while not receiver.drain(_SLICE_S) and time.monotonic() < ends_at:
+            ends_at = self._now_s() + _STOP_S
+            while not receiver.drain(_SLICE_S) and self._now_s() < ends_at:
                 pass
         except DeviceError as error:
             _log.warning("%s: while ending the run: %s", self.name, error)
@@ -299,7 +303,8 @@ def open_link(config: SpbUsbConfig, endpoint: Endpoint) -> BulkLink:
 
 def create(config: SpbUsbConfig, surroundings: Surroundings) -> SpbUsb:
     """The SPAD at the config's port."""
-    return SpbUsb(config, open_link(config, resolve(config.port, surroundings.ports)), surroundings.tap)
+    link = open_link(config, resolve(config.port, surroundings.ports))
+    return SpbUsb(config, link, surroundings.clock, surroundings.tap)
 
 
 KIND = Kind(config=SpbUsbConfig, create=create)

@@ -9,7 +9,7 @@ gear, so the product string must fit too.
 """
 
 import struct
-import time
+from collections.abc import Callable
 from dataclasses import dataclass
 from fractions import Fraction
 from typing import Literal
@@ -178,7 +178,7 @@ def require_order(
     write_length(control, n)
     control.send(Op.START)
     try:
-        block = parse_block(_read_block(link, stream_in, stride), check_payload=True)
+        block = parse_block(_read_block(link, stream_in, stride, control.now_s), check_payload=True)
     except CorruptBlock as error:
         raise ProtocolError(f"{name}: the test pattern came damaged ({error}); check cable and firmware") from None
     finally:
@@ -191,10 +191,10 @@ def require_order(
         raise ProtocolError(f"{name}: the test pattern differs; bits or rows come in another order: wrong firmware?")
 
 
-def _read_block(link: BulkLink, stream_in: int, stride: int) -> NDArray[np.uint8]:
-    ends_at = time.monotonic() + _PATTERN_S
+def _read_block(link: BulkLink, stream_in: int, stride: int, now_s: Callable[[], float]) -> NDArray[np.uint8]:
+    ends_at = now_s() + _PATTERN_S
     got = b""
-    while len(got) < stride and time.monotonic() < ends_at:
+    while len(got) < stride and now_s() < ends_at:
         got += link.read(stream_in, stride - len(got), _PATTERN_S)
     return np.frombuffer(got, np.uint8)
 

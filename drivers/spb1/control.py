@@ -5,7 +5,6 @@ acknowledged with 16 bytes, in order: on an IN endpoint of their own, or as payl
 """
 
 import struct
-import time
 from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass
 from enum import IntEnum, IntFlag
@@ -13,6 +12,7 @@ from typing import Final
 
 import numpy as np
 
+from drivers.clock import NS_PER_S, Clock
 from drivers.errors import CorruptBlock, DeviceFault, DeviceTimeout, ProtocolError
 from drivers.spb1.layout import REGISTER_ACK
 from drivers.spb1.reader import read_control, read_header
@@ -216,9 +216,10 @@ class ControlChannel:
     """
 
     def __init__(
-        self, link: BulkLink, command_out: int, ack_in: int | None, stream_in: int, tap: Tap | None = None
+        self, link: BulkLink, command_out: int, ack_in: int | None, stream_in: int, clock: Clock, tap: Tap | None
     ) -> None:
         self._link = link
+        self._clock = clock
         self._tap = tap
         self._command_out = command_out
         self._ack_in = ack_in
@@ -227,6 +228,10 @@ class ControlChannel:
         self._received: list[Ack] = []
         self.on_wait: Callable[[float], None] | None = None
         """Called for each piece of a wait in vain, with its seconds."""
+
+    def now_s(self) -> float:
+        """The time on the clock of its deadlines."""
+        return self._clock.now_ns() / NS_PER_S
 
     @property
     def has_acks(self) -> bool:
@@ -288,8 +293,8 @@ class ControlChannel:
 
     def drain(self) -> None:
         """Drop what lies ready on the stream. `ProtocolError` where it does not end."""
-        ends_at = time.monotonic() + _DRAIN_S
-        while time.monotonic() < ends_at:
+        ends_at = self.now_s() + _DRAIN_S
+        while self.now_s() < ends_at:
             try:
                 self._link.read(self._stream_in, _DRAIN_BYTES, _QUIET_S)
             except DeviceTimeout:
@@ -316,7 +321,7 @@ class ControlChannel:
             commands = [self._command(*request) for request in requests[at : at + _AT_ONCE]]
             self._received.clear()  # late answers to what was given up
             self._tell(commands)
-            ends_at = time.monotonic() + _ANSWER_S
+            ends_at = self.now_s() + _ANSWER_S
             for command in commands:
                 ack = self._answer(command, ends_at)
                 require_ok(self._link.label, command, ack)
@@ -330,7 +335,7 @@ class ControlChannel:
                 ack = self._received.pop(0)
                 if (ack.request_id, ack.op) == (command.request_id, command.op):
                     return ack
-            left_s = ends_at - time.monotonic()
+            left_s = ends_at - self.now_s()
             if left_s <= 0:
                 raise DeviceTimeout(
                     f"{self._link.label} did not acknowledge {Op(command.op).name} within {_ANSWER_S:g} s; "

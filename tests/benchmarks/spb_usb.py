@@ -47,7 +47,7 @@ def client(sort: str, seconds: float) -> dict[str, float]:
     ctypes.CDLL(None).prctl(_PR_SET_TIMERSLACK, 1, 0, 0, 0)
     config = SpbUsbConfig(reads="plain" if sort == "plain" else "queued", test_pattern=False)
     link = open_link(config, Endpoint("usb"))
-    with SpbUsb(config, link) as device:
+    with SpbUsb(config, link, SystemClock()) as device:
         timing = device.configure(SpadRequest(Fraction(100_000), 1e-5, "stream", FRAMES))
         assert timing.stride <= STRIDE
         if sort in ("raw", "raw ring"):

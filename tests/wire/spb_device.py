@@ -7,7 +7,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from drivers.clock import SystemClock
+from drivers.clock import VirtualClock
 from drivers.frames import FrameBlock, Mark
 from drivers.interfaces import SpadRequest, SpadTiming
 from drivers.spads.spb_usb import SpbUsb, SpbUsbConfig, open_link
@@ -15,6 +15,7 @@ from drivers.transports.endpoints import Endpoint
 from sim_backend.wire.firmware.spb_usb import SpbUsbModel
 from sim_backend.wire.firmware.spb_usb_run import Span
 from sim_backend.wire.serve.usb import EmulatedUsb
+from tests.wire.lasers import PATIENCE_S
 from tests.wire.spads import take_run
 
 WIDTH, HEIGHT = 128, 24
@@ -77,8 +78,8 @@ def model(**settings: Any) -> SpbUsbModel:
 
 
 def opened(device: SpbUsbModel, **config: Any) -> SpbUsb:
-    """The driver, on a bus of its own."""
-    bus = EmulatedUsb(SystemClock())
+    """The driver, on a bus of its own, in virtual time."""
+    bus = EmulatedUsb(VirtualClock())
     bus.plug(device)
     return on_bus(bus, chip=device.chip, **config)
 
@@ -86,14 +87,14 @@ def opened(device: SpbUsbModel, **config: Any) -> SpbUsb:
 def on_bus(bus: EmulatedUsb, port: str = "usb", **config: Any) -> SpbUsb:
     """The driver of the device at a port of a bus."""
     made = SpbUsbConfig(port=port, **config)
-    return SpbUsb(made, open_link(made, Endpoint(port, bus)))
+    return SpbUsb(made, open_link(made, Endpoint(port, bus)), bus._clock)
 
 
 def take(
     device: SpbUsb, n_frames: int, request: SpadRequest = REQUEST, ring_slots: int = 400
 ) -> tuple[SpadTiming, list[FrameBlock]]:
     """One run to its end; all blocks are still in the ring."""
-    return take_run(device, n_frames, request, ring_slots, timeout_s=2.0)
+    return take_run(device, n_frames, request, ring_slots, timeout_s=PATIENCE_S)
 
 
 def require_right(blocks: Iterable[FrameBlock]) -> list[int]:

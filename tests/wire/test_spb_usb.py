@@ -1,7 +1,6 @@
 """The SPB1 driver over USB against an emulated device: control plane, watchdog, both chips."""
 
 import struct
-import time
 import zlib
 from dataclasses import replace
 from fractions import Fraction
@@ -9,7 +8,7 @@ from fractions import Fraction
 import numpy as np
 import pytest
 
-from drivers.clock import SystemClock
+from drivers.clock import VirtualClock
 from drivers.errors import (
     DeviceDisconnected,
     DeviceError,
@@ -137,7 +136,7 @@ def test_an_fx3_that_does_not_speak_spb1_is_not_found() -> None:
 
 
 def test_absent_forbidden_and_two_equal_devices_are_one_line_each() -> None:
-    bus = EmulatedUsb(SystemClock())
+    bus = EmulatedUsb(VirtualClock())
     with pytest.raises(DeviceNotFound, match="04b4:00f1"):
         on_bus(bus)
     attached = bus.plug(model(serial="A"))
@@ -176,7 +175,7 @@ def test_a_wrong_order_of_bits_or_rows_is_found_when_opening(order: str) -> None
 
 
 def test_a_device_found_running_is_aborted_first() -> None:
-    bus = EmulatedUsb(SystemClock())
+    bus = EmulatedUsb(VirtualClock())
     device = model()
     bus.plug(device)
     first = on_bus(bus)
@@ -242,9 +241,9 @@ def test_heartbeats_between_slow_frames_are_no_frames_and_pings_go_on() -> None:
     device = model(paced=True)
     with opened(device, heartbeat="200 ms") as spad:
         slow = replace(REQUEST, frame_rate_hz=Fraction(50), exposure_s=0.01, block_frames=10)
-        begun = time.monotonic()
+        begun_s = spad._now_s()
         _, blocks = take(spad, 30, slow)
-        assert time.monotonic() - begun >= 0.5
+        assert spad._now_s() - begun_s >= 0.5
         assert require_right(blocks) == list(range(30))
         assert len(device.pings) >= 5
         assert device.pings == sorted(device.pings)
@@ -257,7 +256,7 @@ def test_a_host_that_falls_silent_ends_the_run_with_the_gate_low() -> None:
         ring = BlockRing(8, timing.stride)
         spad.start(None)
         assert device.gate_allowed
-        time.sleep(0.15)  # a hung program sends no pings
+        spad._clock.sleep(0.15)  # a hung program sends no pings
         with pytest.raises(DeviceFault, match=r"heard nothing of this program for 0\.05 s, dropped its gate"):  # noqa: PT012
             while spad.fill(ring, 1.0):
                 pass
@@ -286,7 +285,7 @@ def test_stop_aborts_with_the_gate_low_and_counts_what_was_exposed() -> None:
 
 
 def test_a_firmware_that_hangs_is_a_timeout_and_unplugging_a_disconnection() -> None:
-    bus = EmulatedUsb(SystemClock())
+    bus = EmulatedUsb(VirtualClock())
     device = model()
     attached = bus.plug(device)
     with on_bus(bus) as spad:
