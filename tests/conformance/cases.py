@@ -17,11 +17,12 @@ class SpadCase:
 
 @dataclass(frozen=True)
 class ScannerCase:
-    """A scanner, open. `turning` tells whether the mirror really moves, also after the device was closed."""
+    """A scanner, open. `turning` tells whether the mirror really moves, also after the device was closed. `let_pass`
+    lets so many seconds pass for it."""
 
     device: BeamScanner
-    clock: Clock
     turning: Callable[[], bool]
+    let_pass: Callable[[float], None]
 
 
 @dataclass(frozen=True)

@@ -84,7 +84,7 @@ def simulated_scanner(folder: Path) -> Iterator[ScannerCase]:
     surroundings = simulated_surroundings(folder)
     bench = surroundings.world.bench  # type: ignore[union-attr]
     with simulated("scanner", surroundings) as device:
-        yield ScannerCase(device, surroundings.clock, bench.moving)
+        yield ScannerCase(device, bench.moving, surroundings.clock.sleep)
 
 
 @contextmanager

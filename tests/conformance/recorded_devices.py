@@ -19,7 +19,7 @@ def stand_in(slot: str, clock: VirtualClock) -> Any:
 def recorded_scanner(folder: Path) -> Iterator[ScannerCase]:
     clock = VirtualClock()
     with stand_in("scanner", clock) as device:
-        yield ScannerCase(device, clock, lambda: device._do_status().moving)
+        yield ScannerCase(device, lambda: device._do_status().moving, clock.sleep)
 
 
 @contextmanager

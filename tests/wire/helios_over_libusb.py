@@ -17,7 +17,8 @@ from drivers.interfaces import MARKER_SCAN, BeamScanner, ScanWaveform
 from drivers.registry import Surroundings, lookup
 from sim_backend.wire.firmware.helios import BLUE, HeliosModel
 from tests.wire.bodies import ServesProcesses
-from tests.wire.scanners import GALVO, PATIENCE_S
+from tests.wire.lasers import eventually
+from tests.wire.scanners import GALVO
 
 COMMAND = [sys.executable, "-m", "tests.wire.helios_over_libusb"]
 TOLERANCE_S = 1e-6
@@ -50,7 +51,9 @@ def main() -> None:
 def a_run_is_played_and_parked(bus: ServesProcesses) -> None:
     model = HeliosModel()
     bus.plug(model)
-    done = subprocess.run(COMMAND, env=bus.environment(), capture_output=True, text=True, timeout=60, check=False)
+    done = subprocess.run(
+        COMMAND, env=bus.environment(), capture_output=True, text=True, timeout=PATIENCE_S, check=False
+    )
     assert done.returncode == 0, done.stderr
     assert json.loads(done.stdout) == {"clock_hz": 20_000.0, "fault": None, "position": PARK}
     scans = model.history.rising(BLUE, 0, 1e12)
@@ -69,13 +72,9 @@ def kill_9_stops_the_mirror_through_alternate_0(bus: ServesProcesses) -> None:
     with subprocess.Popen([*COMMAND, "endless"], env=bus.environment(), stdout=subprocess.PIPE, text=True) as client:
         assert client.stdout is not None
         assert client.stdout.readline() == "scanning\n"
-        time.sleep(0.2)
-        assert moving()
+        eventually(moving)
         client.kill()
-    end = time.monotonic() + PATIENCE_S
-    while moving():
-        assert time.monotonic() < end
-        time.sleep(0.01)
+    eventually(lambda: not moving())
     assert model.played < 100  # stopped, not played to the end of its repeats
 
 

@@ -1,6 +1,5 @@
 """Emulated scanners for tests: a bus, a model on it, the driver opened the way the application opens it; a waveform."""
 
-import time
 from collections.abc import Iterator
 from contextlib import contextmanager
 from dataclasses import dataclass
@@ -17,9 +16,9 @@ from sim_backend.wire.firmware.helios import HeliosModel
 from sim_backend.wire.firmware.lasercube import LaserCubeModel
 from sim_backend.wire.serve.usb import EmulatedUsb
 from sim_backend.wire.serve.usb_model import AttachedDevice, Stall, UsbModel
+from tests.wire.lasers import eventually
 
 GALVO = {"max_velocity": "2000 /s", "max_acceleration": "2e6 /s2"}
-PATIENCE_S = 20.0
 LATE_S = 0.2
 
 
@@ -71,10 +70,7 @@ def cosine(device: BeamScanner, points: int = 6000, rate_hz: float = 25_000.0) -
 
 def finish(device: BeamScanner) -> None:
     """Wait for the end of a run whose own thread moves the virtual clock."""
-    end = time.monotonic() + PATIENCE_S
-    while device.status.moving:
-        assert time.monotonic() < end, "the run does not end"
-        time.sleep(0.001)
+    eventually(lambda: not device.status.moving)
 
 
 @dataclass(frozen=True)

@@ -6,7 +6,7 @@ from collections.abc import Callable
 import pytest
 import usb.core
 
-from drivers.clock import SystemClock
+from drivers.clock import SystemClock, VirtualClock
 from drivers.errors import (
     DeviceBusy,
     DeviceDisconnected,
@@ -27,7 +27,7 @@ from tests.wire.usb_bodies import BODIES, LOOPBACK
 
 @pytest.mark.parametrize("body", BODIES, ids=lambda body: body.__name__)
 def test_over_the_emulated_backend(body: Callable[[object | None], None]) -> None:
-    bus = EmulatedUsb(SystemClock())
+    bus = EmulatedUsb(VirtualClock())
     bus.plug(LoopbackModel())
     body(bus)
 
@@ -48,7 +48,7 @@ def test_over_libusb(body: Callable[[object | None], None], over_libusb: dict[st
 
 
 def bus_of(*serials: str | None) -> EmulatedUsb:
-    bus = EmulatedUsb(SystemClock())
+    bus = EmulatedUsb(VirtualClock())
     for serial in serials:
         bus.plug(LoopbackModel(serial))
     return bus
@@ -77,7 +77,7 @@ def test_two_equal_devices_without_serials_ask_for_the_path() -> None:
 
 @pytest.mark.parametrize("address", ["usb", "usb:serial=LOOP1"])
 def test_no_permission_names_the_udev_rule(address: str) -> None:
-    bus = EmulatedUsb(SystemClock())
+    bus = EmulatedUsb(VirtualClock())
     bus.plug(LoopbackModel()).denied = True
     with pytest.raises(DevicePermission, match=r"config/udev/70-spadrig\.rules"):
         open_device(LOOPBACK, address, {0: 1}, bus)
@@ -97,7 +97,7 @@ def test_what_is_no_usb_address_is_refused_with_the_forms(address: str) -> None:
 
 
 def test_a_device_plugged_in_again_is_found_again() -> None:
-    bus = EmulatedUsb(SystemClock())
+    bus = EmulatedUsb(VirtualClock())
     first = bus.plug(LoopbackModel())
     open_device(LOOPBACK, "usb", {0: 1}, bus).close()
     bus.unplug(first)
@@ -107,7 +107,7 @@ def test_a_device_plugged_in_again_is_found_again() -> None:
 
 
 def test_giving_a_device_back_returns_it_to_alternate_setting_0() -> None:
-    bus = EmulatedUsb(SystemClock())
+    bus = EmulatedUsb(VirtualClock())
     model = LoopbackModel()
     bus.plug(model)
     with open_device(LOOPBACK, "usb", {0: 1}, bus):
