@@ -51,9 +51,7 @@ def main() -> None:
 def a_run_is_played_and_parked(bus: ServesProcesses) -> None:
     model = HeliosModel()
     bus.plug(model)
-    done = subprocess.run(
-        COMMAND, env=bus.environment(), capture_output=True, text=True, timeout=PATIENCE_S, check=False
-    )
+    done = subprocess.run(COMMAND, env=bus.environment(), capture_output=True, text=True, timeout=60, check=False)
     assert done.returncode == 0, done.stderr
     assert json.loads(done.stdout) == {"clock_hz": 20_000.0, "fault": None, "position": PARK}
     scans = model.history.rising(BLUE, 0, 1e12)
