@@ -38,12 +38,8 @@ SIGN_OF_LIFE_S = 0.05
 """Time between the guard's own signs of life."""
 POLL_S = 1.0
 """Time between questions to an armed laser about interlock and faults (docs/reference/hardware.md: at 1 Hz or more)."""
-CHECK_S = 0.05
-"""Time for the gate to say whether its program has ended, before it is taken for still running."""
 END_CHECK_S = 0.2
 """Time between questions whether the gate's program has ended, while an application at work is late with its frames."""
-HELP_ITSELF_S = 0.5
-"""Time for an application that lives but takes no frames to make its rig safe, before it is killed."""
 GATE_FIRST_S = 0.1
 """Longest time that a kill waits for the low gate: a mirror whose program dies must not be lit."""
 GIVE_UP_S = 10.0
@@ -215,7 +211,7 @@ class GuardProcess:
         if stopped or sync is None or (self._check_until is not None and now > self._check_until):
             self._trip_application(trouble, stopped)
         elif self._check_until is None:
-            self._check_until = now + CHECK_S
+            self._check_until = now + self._watch.limits.check_s
             sync.urgent.do(lambda: self._check_end(sync, trouble), first=True)
 
     def _check_end(self, sync: Owned, trouble: str) -> None:
@@ -249,7 +245,7 @@ class GuardProcess:
     def _trip_application(self, trouble: str, stopped: bool) -> None:
         self._safe_asked = False
         if self._trip(DeviceTimeout(f"the guard took the light: the application {trouble}")):
-            self._kill_at = time.monotonic() + (GATE_FIRST_S if stopped else HELP_ITSELF_S)
+            self._kill_at = time.monotonic() + (GATE_FIRST_S if stopped else self._watch.limits.help_itself_s)
 
     def _poll_laser(self, now: float) -> None:
         laser = self._owned.get("laser")

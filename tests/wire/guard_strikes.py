@@ -13,6 +13,7 @@ from typing import Any
 
 from drivers.guard import GuardLimits
 from tests.wire.guarded_rig import GuardedRig, guarded_rig
+from tests.wire.lasers import PATIENCE_S, eventually
 
 GONE_S = 0.1
 """Light has to be gone after this, at the 99.9th percentile..."""
@@ -22,7 +23,9 @@ EMISSION_S = 1.0
 """Emission is off after this where the laser's port still answers."""
 BUSY_S = GuardLimits().busy_within_s + 0.5
 """The same for an application that is at work: it might only be slow."""
-START_S = 30.0
+START_S = 120.0
+DARK_S = 0.3
+"""A laser that is dark for so long stays dark."""
 
 
 class ScanFailedError(Exception):
@@ -56,11 +59,11 @@ STRIKES = {
 
 @dataclass(frozen=True)
 class Outcome:
-    """What came of it. light_s: to the last light; emitted: emission after `emission_s`; code: the application's."""
+    """What came of it. light_s, emission_s: to the last light, and to the end of emission; code: the application's."""
 
     was_lit: bool
     light_s: float
-    emitted: bool
+    emission_s: float
     code: int | None
     output: str
 
@@ -107,12 +110,11 @@ def _strike(made: Strike, moment_s: float, rig: GuardedRig, application: "subpro
     was_lit = rig.light
     at = time.monotonic()
     made.blow(rig, application, guard)
-    time.sleep(made.emission_s + 0.05)
+    eventually(lambda: rig.emission.dark_for(DARK_S))  # what is being switched on when the blow comes is switched off
     with rig.sync.lock, rig.laser.lock:
-        light_s, emitted = rig.light_after(at), rig.emission.at(at + made.emission_s)
-    output = ""
+        light_s, emission_s = rig.light_after(at), max(rig.emission.times[-1] - at, 0.0)
     try:
-        output = application.communicate(timeout=5)[0]
+        output = application.communicate(timeout=PATIENCE_S)[0]
     except subprocess.TimeoutExpired:
         output = "still running"
-    return Outcome(was_lit, light_s, emitted, application.returncode, output)
+    return Outcome(was_lit, light_s, emission_s, application.returncode, output)

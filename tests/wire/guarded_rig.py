@@ -35,6 +35,10 @@ class Line:
         self.times.append(at_s)
         self.levels.append(level)
 
+    def dark_for(self, seconds: float) -> bool:
+        """Whether it has been low for so long."""
+        return not self.levels[-1] and time.monotonic() - self.times[-1] >= seconds
+
     def at(self, at_s: float) -> bool:
         return self.levels[bisect.bisect_right(self.times, at_s) - 1]
 

@@ -36,8 +36,7 @@ COLUMNS, EXPOSURES = 20, 12
 STILL_S = 1e-3
 """A mirror whose drive did not change for so long rests; a galvo needs about as long to come to rest."""
 STEP_S = 5e-5
-START_S = 60.0
-FIRST_LIGHT_S = 60.0
+FIRST_LIGHT_S = 120.0
 """A Cobolt takes ten commands a second, and may warm up."""
 
 

@@ -18,7 +18,7 @@ from multiprocessing import get_context
 import numpy as np
 
 from tests.wire.scan_rig import Applications, ScanFailedError
-from tests.wire.scan_strikes import SCAN_STRIKES, ScanOutcome, strike_scan, trouble_of
+from tests.wire.scan_strikes import SCAN_STRIKES, ScanOutcome, lateness_of, strike_scan, trouble_of
 
 KILL = "application killed"
 LASERS = ("obis", "cobolt")
@@ -70,7 +70,7 @@ def _report(name: str, outcomes: list[ScanOutcome | str]) -> bool:
     light_s = np.array([outcome.light_s for outcome in struck])
     emission_s = np.array([outcome.emission_s for outcome in struck])
     late = float(np.percentile(light_s, 99.9))
-    troubles = [trouble for outcome in struck for trouble in trouble_of(name, outcome)]
+    troubles = [trouble for outcome in struck for trouble in lateness_of(name, outcome) + trouble_of(name, outcome)]
     if late > made.light_s:
         troubles.append(f"light after {1e3 * late:.0f} ms")
     dark = f"emission {1e3 * emission_s.max():.0f} ms (most)" if made.laser_answers else "emission of a lost port"
