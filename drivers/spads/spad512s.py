@@ -161,8 +161,6 @@ ROW_BYTES = COLUMNS // 8
 TICK_HZ = 100_000_000
 """Nominal: the vendor's stream carries no time. Where it does not divide the period, a multiple of the frame rate."""
 TICKS_PER_FRAME = 1024
-LISTENS_AGAIN_S = 1.0
-"""Time that a program which serves one client may take to listen again once that one has left."""
 _TEMPERATURES = ("master FPGA", "slave FPGA", "board", "chip")
 """Names of the temperatures that `R` reports first, in its order."""
 _US_SLACK = 1e-6
@@ -195,7 +193,8 @@ class Spad512s(SpadArray):
     ) -> None:
         super().__init__("SPAD512S")
         self._config = config
-        self._line = Spad512sLine(self.name, endpoint.address, deadlines or Deadlines(), tap)
+        self._deadlines = deadlines or Deadlines()
+        self._line = Spad512sLine(self.name, endpoint.address, self._deadlines, tap)
         self._busy = threading.Lock()
         """Held while the line is in use, so that `stop` waits for `fill`."""
         self._halt = threading.Event()
@@ -301,7 +300,7 @@ class Spad512s(SpadArray):
 
     def _connect_again(self) -> Spad512sIdentity:
         """Connect again: the program serves one client, and listens again a moment after that one has left."""
-        ends_at = time.monotonic() + LISTENS_AGAIN_S
+        ends_at = time.monotonic() + self._deadlines.listens_s
         while True:
             try:
                 return self._line.connect()

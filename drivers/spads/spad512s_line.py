@@ -39,6 +39,8 @@ class Deadlines:
     answer_s: float = 5.0
     stop_s: float = 1.0
     """A run that still sends so long after STOP is left by closing the connection."""
+    listens_s: float = 1.0
+    """A program that serves one client may take so long to listen again once that one has left."""
 
 
 @dataclass(frozen=True, slots=True)

@@ -13,10 +13,12 @@ from numpy.typing import NDArray
 
 from drivers.interfaces import SpadRequest, WindowTable
 from drivers.spads.spad512s import Spad512s, Spad512sConfig
+from drivers.spads.spad512s_line import Deadlines
 from sim_backend.wire.firmware.spad512s import Spad512sModel
 from sim_backend.wire.firmware.spb_usb import SpbUsbModel
 from sim_backend.wire.serve.tcp import TcpServer
 from tests.conformance.cases import SpadCase
+from tests.wire.lasers import PATIENCE_S
 from tests.wire.spb_device import HEIGHT, REQUEST, WIDTH, TiledSource, model, opened
 
 _NOISE = np.random.default_rng(1).integers(0, 256, (64, 512, 64), dtype=np.uint8)
@@ -31,7 +33,8 @@ def _frames(first: int, start_s: float, period_s: float, n: int) -> NDArray[np.u
 
 @contextmanager
 def spad512s(folder: Path) -> Iterator[SpadCase]:
-    with TcpServer(Spad512sModel(_frames)) as server, Spad512s(Spad512sConfig(), server.endpoint) as device:
+    patient = Deadlines(open_s=PATIENCE_S, answer_s=PATIENCE_S, listens_s=PATIENCE_S)
+    with TcpServer(Spad512sModel(_frames)) as server, Spad512s(Spad512sConfig(), server.endpoint, patient) as device:
         yield SpadCase(device, SpadRequest(Fraction(50_000), 20e-6, "burst", block_frames=32))
 
 

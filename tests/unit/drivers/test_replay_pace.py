@@ -83,7 +83,7 @@ def test_a_halt_ends_every_wait() -> None:
     timer = threading.Timer(0.05, steps.halt)
     timer.start()
     begun_s = time.monotonic()
-    assert not steps.wait_for_step(30.0)
-    assert time.monotonic() - begun_s < 10
+    assert not steps.wait_for_step(600.0)
+    assert time.monotonic() - begun_s < 60
     timer.join()
     assert not steps.wait(0.0, 1.0)
