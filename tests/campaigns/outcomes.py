@@ -2,7 +2,6 @@
 
 import argparse
 import logging
-import time
 from collections import Counter
 from collections.abc import Callable, Sequence
 from concurrent.futures import Executor, ThreadPoolExecutor
@@ -57,10 +56,11 @@ def ending(act: Callable[[], str], now_s: Callable[[], float], deadline_s: float
 
 
 class Verbs:
-    """Verbs of one sequence, each with so much time."""
+    """Verbs of one sequence, each with so much time on a clock."""
 
-    def __init__(self, deadline_s: float) -> None:
+    def __init__(self, deadline_s: float, now_s: Callable[[], float]) -> None:
         self._deadline_s = deadline_s
+        self._now_s = now_s
         self._ends: list[str] = []
         self._longest_s = 0.0
 
@@ -71,7 +71,7 @@ class Verbs:
             act()
             return DONE
 
-        (end,), wrong, took_s, _ = ending(done, time.monotonic, self._deadline_s)
+        (end,), wrong, took_s, _ = ending(done, self._now_s, self._deadline_s)
         self._ends.append(end)
         self._longest_s = max(self._longest_s, took_s)
         assert wrong is None, f"{name}: {wrong}"

@@ -30,7 +30,7 @@ ERRORS = {"guard killed": "GuardLost", "gate unplugged, powered on": "DeviceDisc
 
 @pytest.fixture(scope="module")
 def outcomes() -> Iterator[dict[str, "Future[Outcome]"]]:
-    """Every blow at a random moment, four scans at a time. How soon it is dark: `tests.campaigns.devices.guard_blows`."""
+    """Every blow at a random moment, four scans at a time; `tests.campaigns.devices.guard_blows` says how soon."""
     random = np.random.default_rng(4)
     with ThreadPoolExecutor(4) as pool:
         yield {

@@ -7,7 +7,6 @@ checksums; it must not make a verb do wrong.
 """
 
 import random
-import time
 from collections.abc import Callable
 from dataclasses import dataclass
 from typing import Protocol, cast
@@ -19,28 +18,17 @@ from drivers.registry import Surroundings
 from drivers.transports.dialogue import LineTiming
 from sim_backend.wire.firmware.cobolt import CoboltModel, Family
 from sim_backend.wire.firmware.obis import ObisModel
-from sim_backend.wire.serve.serial import SerialModel, SerialServer
+from sim_backend.wire.serve.serial import SerialModel, SerialWire
 from sim_backend.wire.serve.wire_server import Fault, FaultSchedule
 from tests.campaigns.outcomes import Ending, Verbs
 
 LIMIT_W = 0.08
 DEADLINE_S = 10.0
-"""For one verb at the campaign's timing (30 ms for a reply), on a machine that does other things as well."""
+"""Of virtual time, for one verb at the campaign's timing (30 ms for a reply)."""
 LATE_S = 0.05
 STALL_S = 0.06
 GAP_S = 0.1
-REAL_GAP_S = 0.004
-"""A real gap would be too long for thousands of sequences: it is mostly virtual time."""
 TIMES = {"reply_s": 0.03, "quiet_s": 0.01, "drain_s": 0.05}
-
-
-class GapClock(VirtualClock):
-    """Virtual time, but for the gap between commands: the line is really quiet for a while, as the laser's is."""
-
-    def sleep(self, seconds: float) -> None:
-        super().sleep(seconds)
-        if 0 < seconds <= GAP_S:
-            time.sleep(REAL_GAP_S)
 
 
 class LaserModel(SerialModel, Protocol):
@@ -85,18 +73,18 @@ class Sequence:
     """One sequence: open, a few verbs, close, with the cable pulled and the firmware hanging now and then."""
 
     def __init__(self, subject: Subject, seed: int) -> None:
-        self._verb = Verbs(DEADLINE_S)
+        self._clock = VirtualClock()
+        self._verb = Verbs(DEADLINE_S, lambda: self._clock.now_ns() * 1e-9)
         self._subject = subject
         self._rng = random.Random(seed)
         self._model = subject.make(self._rng)
-        self._clock = GapClock()
         kinds = self._rng.choice((tuple(Fault), tuple(Fault), (self._rng.choice(tuple(Fault)),)))
         probability = self._rng.choice((0.02, 0.1, 0.3))
         skip = self._rng.choice((0, 15, 40))
         self._faults = FaultSchedule(
             seed, probability, kinds, skip=skip, most=self._rng.randrange(1, 8), late_s=LATE_S, stall_s=STALL_S
         )
-        self._server = SerialServer(self._model, clock=self._clock, baud=1_000_000, faults=self._faults)
+        self._server = SerialWire(self._model, clock=self._clock, baud=1_000_000, faults=self._faults)
         self._laser: LineLaser | None = None
 
     def run(self) -> Ending:

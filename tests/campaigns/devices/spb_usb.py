@@ -6,11 +6,10 @@ but right frames, and counters that add up to what the device exposed.
 """
 
 import random
-import time
 from collections.abc import Callable, Iterable
 from fractions import Fraction
 
-from drivers.clock import SystemClock
+from drivers.clock import NS_PER_S, VirtualClock
 from drivers.errors import DeviceTimeout
 from drivers.frames import FrameBlock
 from drivers.interfaces import SpadRequest
@@ -106,12 +105,13 @@ def sequence(seed: int) -> Ending:
     device = FaultyModel(
         rng, rng.choice((0.02, 0.1, 0.5)), rng.randrange(1, 8), chip=chip, acks=rng.choice(("endpoint", "stream"))
     )
-    ended = ending(lambda: _open_and_run(device, rng), time.monotonic, DEADLINE_S)
+    clock = VirtualClock()
+    ended = ending(lambda: _open_and_run(device, rng, clock), lambda: clock.now_ns() / NS_PER_S, DEADLINE_S)
     return ended._replace(struck=device.struck)
 
 
-def _open_and_run(device: FaultyModel, rng: random.Random) -> str:
-    bus = EmulatedUsb(SystemClock())
+def _open_and_run(device: FaultyModel, rng: random.Random, clock: VirtualClock) -> str:
+    bus = EmulatedUsb(clock)
     attached = bus.plug(device)
     with on_bus(bus, chip=device.chip, test_pattern=rng.random() < 0.3) as spad:
         for _ in range(2):
