@@ -23,6 +23,7 @@ from rig.api.tradeoff import tradeoff
 from rig.config.bundled import bundled_rigs, bundled_scenes
 from rig.config.overrides import MAX_SEED, SIMULATED, Config, PathLike, configure
 from rig.plan.describe import plan_text
+from rig.requests import ReconstructRequest, ReplayRequest, ScanRequest, TradeoffRequest
 from rig.scan.run import RunResult
 
 __all__ = [
@@ -30,7 +31,11 @@ __all__ = [
     "SIMULATED",
     "Config",
     "PathLike",
+    "ReconstructRequest",
+    "ReplayRequest",
     "RunResult",
+    "ScanRequest",
+    "TradeoffRequest",
     "bench",
     "bundled_rigs",
     "bundled_scenes",

@@ -1,14 +1,13 @@
 """The call that tries settings on a simulated rig: `tradeoff`."""
 
-from collections.abc import Sequence
 from dataclasses import replace
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 from rig.config.models import RigConfig
 from rig.config.overrides import MAX_SEED, SIMULATED, Config, configure
 from rig.errors import UsageError
 from rig.progress import Progress
-from rig.scan.run import OutFolder
+from rig.requests import TradeoffRequest
 
 if TYPE_CHECKING:
     from rig.tradeoff.trials import Tradeoff
@@ -19,35 +18,16 @@ EXPOSURES = (1, 3, 10)
 
 def tradeoff(
     config: Config = SIMULATED,
+    request: TradeoffRequest | None = None,
     *,
-    scenes: Sequence[str] = (),
-    fogs: Sequence[str] = (),
-    exposures: Sequence[int] = (),
-    lines: Sequence[int] = (),
-    estimators: Sequence[str] = (),
-    filters: Sequence[str] = (),
-    repeat: int = 1,
-    seed: int = 0,
-    limits: bool = True,
-    time_budget: str | None = None,
-    error: str | None = None,
-    of: str = "sensor",
-    accept_calibration: bool = False,
-    out: OutFolder = None,
     progress: Progress | None = None,
+    **changes: Any,
 ) -> "Tradeoff":
     """Scan a simulated rig with all combinations of settings and score them by the world's truth (`rig tradeoff`).
 
-    scenes: as in `configure`. fogs: visibilities such as '20 m', or 'clear'. lines: numbers of lines at once. Where one
-      of these is empty, the config decides.
-    exposures: exposures per column; empty is EXPOSURES.
-    estimators: empty is all but argmax. filters: empty is all.
-    repeat: scans of each setting, with seeds from `seed` on.
-    limits: compare each error with the least that the light of the scene allows; takes some seconds each.
-    time_budget, error: ask which setting to use within a time such as '5 ms', or for an error such as '0.1 px'.
-    of: whose time counts, 'sensor' or 'compute'.
-    accept_calibration: as in `scan`, judged for the rig with the number of lines that its config has.
-    out: folder to write; None writes nothing.
+    request, changes: what is asked for, as a `TradeoffRequest` or by the names of its fields:
+      `tradeoff(exposures=(1, 3), time_budget="20 ms")`. A calibration is judged for the rig with the number of lines
+      that its config has.
     progress: called with frames done and frames to do.
 
     Raises UsageError, one line per problem. An interrupt ends it after the last whole row, with verdict 'aborted'.
@@ -61,23 +41,29 @@ def tradeoff(
     from rig.tradeoff.files import write_files
     from rig.tradeoff.trials import Trial, Trials, require_methods, run_tradeoff
 
+    request = replace(request or TradeoffRequest(), **changes)
     loaded = configure(config)
     problems = _of_rig(loaded)
-    estimators = estimators or [name for name in ESTIMATORS if name != "argmax"]
-    filters = filters or FILTERS
-    problems += require_methods(estimators, filters)
-    if loaded.estimate.temporal_prior and set(estimators) != {"joint"}:
+    request = replace(
+        request,
+        exposures=request.exposures or EXPOSURES,
+        estimators=request.estimators or [name for name in ESTIMATORS if name != "argmax"],
+        filters=request.filters or FILTERS,
+    )
+    problems += require_methods(request.estimators, request.filters)
+    if loaded.estimate.temporal_prior and set(request.estimators) != {"joint"}:
         problems.append(
             f"{loaded.name} has estimate.temporal_prior, which is for joint alone; leave it out of the config or try "
             "--estimators joint"
         )
-    if repeat < 1:
-        problems.append(f"repeat is {repeat}; it must be at least 1")
-    if not 0 <= seed <= MAX_SEED - repeat:
-        problems.append(f"seed is {seed}; it must be 0 or more and at most {MAX_SEED - repeat}")
+    if request.repeat < 1:
+        problems.append(f"repeat is {request.repeat}; it must be at least 1")
+    most_seed = MAX_SEED - request.repeat
+    if not 0 <= request.seed <= most_seed:
+        problems.append(f"seed is {request.seed}; it must be 0 or more and at most {most_seed}")
     wish = None
     try:
-        wish = wish_of(time_budget, error, of)
+        wish = wish_of(request.time_budget, request.error, request.of)
     except UsageError as wrong:
         problems += wrong.problems
     if problems:
@@ -87,33 +73,23 @@ def tradeoff(
         tried = configure(config, scene=trial.scene, fog=trial.fog, exposures=trial.exposures)
         return tried if trial.lines is None else with_lines(tried, trial.lines)
 
-    trials = Trials(
-        config_of,
-        scenes or (None,),
-        fogs or (None,),
-        exposures or EXPOSURES,
-        lines or (None,),
-        estimators,
-        filters,
-        repeat,
-        seed,
-        limits,
-    )
+    trials = Trials(config_of, request)
     trials.require_plans()  # before a folder is claimed
     with open_rig(config_of(trials.first())) as rig:
-        accepted = accepted_by(calibration_use(rig, accept=accept_calibration))
+        accepted = accepted_by(calibration_use(rig, accept=request.accept_calibration))
 
     def run() -> "Tradeoff":
         return replace(run_tradeoff(trials, wish, progress), accepted_calibration=accepted)
 
-    if out is None:
+    if request.out is None:
         return run()
-    with RunFolder(out) as folder:
+    with RunFolder(request.out) as folder:
         done = run()
         chosen = None
         if done.answer is not None and done.answer.fits:
             setting = done.answer.setting
-            trial = Trial(trials.scenes[0], trials.fogs[0], setting.exposures, setting.lines if lines else None)
+            lines = setting.lines if request.lines else None
+            trial = trials.first()._replace(exposures=setting.exposures, lines=lines)
             chosen = configure(config_of(trial), estimator=setting.estimator, filter=setting.filter)  # type: ignore[arg-type]
         return write_files(folder, done, chosen)
 

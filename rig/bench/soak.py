@@ -39,9 +39,9 @@ from rig.errors import UsageError
 from rig.plan.scan_plan import ScanPlan
 from rig.recording.writer import Recording
 from rig.run_folder.summary import PipelineStats
-from rig.scan.acquisition import Acquisition, ScanProgress, told_of
+from rig.scan.acquisition import Acquisition, AcquisitionRequest
 from rig.scan.counting import MakesMaps
-from rig.scan.monitor import MonitorView
+from rig.scan.monitor import Listeners, MonitorView, ScanProgress
 from rig.scan.pipeline import Overload, require_policy
 
 LEAD_FRAMES = 200
@@ -338,8 +338,8 @@ def _recorded(rig: OpenRig, plan: ScanPlan) -> Loop:
     with tempfile.TemporaryDirectory(prefix="spadrig-bench-") as folder:
         maker = _reconstructor(rig, plan, "argmax", 1)
         with closing(Recording(Path(folder))) as recording:
-            acquired = Acquisition(rig, plan, timing, sweeps, maker, recording=recording, on_progress=told_of(None))
-            for _ in acquired.run():
+            request = AcquisitionRequest(maps=sweeps, recording=recording)
+            for _ in Acquisition(rig, plan, timing, maker, request).run():
                 pass
         files = (np.memmap(Path(folder) / name, np.uint8, "r") for name in recording.files)
         items = (item for file in files for item in walk_blocks(file, None, check_payload=False))
@@ -371,10 +371,10 @@ def _run(
         if progress is not None:
             progress(done.frames, done.frames_planned)
 
-    acquisition = Acquisition(
-        rig, plan, timing, maps, _SlowMaker(_reconstructor(rig, plan, "likelihood", threads), options.slow_s),
-        policy=options.policy, first_alone=True, learns=True, watch=_look, on_progress=told_of(tell),
-    )  # fmt: skip
+    maker = _SlowMaker(_reconstructor(rig, plan, "likelihood", threads), options.slow_s)
+    listeners = Listeners(live=tell, monitor=_look)
+    request = AcquisitionRequest(maps=maps, policy=options.policy, first_alone=True, learns=True, listeners=listeners)
+    acquisition = Acquisition(rig, plan, timing, maker, request)
     expected = received = lost = made = worked_off = 0
     compute_s = 0.0
     ended_by: str | None = None

@@ -16,7 +16,8 @@ from rig.devices.open import OpenRig, open_rig
 from rig.devices.prepare import prepare
 from rig.estimate.registry import ESTIMATORS
 from rig.progress import tell_stage
-from rig.scan.acquisition import Acquisition, ScanProgress, told_of
+from rig.scan.acquisition import Acquisition, AcquisitionRequest
+from rig.scan.monitor import Listeners, ScanProgress
 
 ENOUGH_FRAMES = 1000
 """Simulated frames, the first columns of a sweep among them."""
@@ -53,7 +54,8 @@ def _simulate(rig: OpenRig) -> None:
         if done.frames >= ENOUGH_FRAMES:
             raise _EnoughError
 
-    running = Acquisition(rig, plan, timing, 1, maker, on_progress=told_of(enough)).run()
+    request = AcquisitionRequest(maps=1, listeners=Listeners(live=enough))
+    running = Acquisition(rig, plan, timing, maker, request).run()
     with closing(running):
         try:
             for _ in running:

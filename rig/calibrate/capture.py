@@ -44,10 +44,12 @@ from rig.plan.scan_plan import Leg, ScanPlan
 from rig.progress import tell_stage
 from rig.recording.inputs import read_plan
 from rig.recording.replay import ReplayOptions, replay_config
+from rig.requests import RunRequest
 from rig.run_folder.manifest import read_manifest
 from rig.run_folder.summary import MapTally
+from rig.scan.monitor import Listeners
 from rig.scan.run import OutFolder, Run
-from rig.scan.scan import ScanOptions, run_scan
+from rig.scan.scan import run_scan
 
 MOST_LAG_S = 5e-4
 """Seconds; longest lag that is allowed for: small galvos follow their command within 100 to 300 us."""
@@ -97,7 +99,7 @@ def capture_view(
     for known in (None, config.calibration):
         try:
             with open_rig(settings.model_copy(update={"calibration": known}), seed=seed) as rig:
-                return _captured(rig, name, board, 2 if bidirectional else 1, seed, defects, out)
+                return _captured(rig, name, board, 2 if bidirectional else 1, defects, out)
         except PlanError:
             if known == config.calibration:
                 raise
@@ -111,7 +113,7 @@ def capture_recorded(run: Path, name: str, board: Board | None, *, defects: NDAr
         config = config.model_copy(update={"calibration": None})
     maps = int((read_manifest(run) or {}).get("maps") or 1)
     with open_rig(config) as rig:
-        return _captured(rig, name, board, min(maps, MOST_SWEEPS), 0, defects, None)
+        return _captured(rig, name, board, min(maps, MOST_SWEEPS), defects, None)
 
 
 def _settings(config: RigConfig, exposures: int | None, *, bidirectional: bool) -> RigConfig:
@@ -135,14 +137,13 @@ def _captured(
     name: str,
     board: Board | None,
     maps: int,
-    seed: int,
     defects: NDArray[np.bool_] | None,
     out: OutFolder,
 ) -> Capture:
     # A simulated world is not asked for the truth, nor to hold its light within columns: it moves as the mirror does.
     rig = replace(rig, world=None)
     plan, _ = prepare(rig)
-    sweeps = _sweeps(rig, maps, seed, out)
+    sweeps = _sweeps(rig, maps, out)
     counts = tuple(_sweep_counts(sweep, plan) for sweep in sweeps)
     picture = flux_picture(counts)
     bad = np.zeros(picture.shape, np.bool_) if defects is None else defects
@@ -161,14 +162,14 @@ def _captured(
     return Capture(View(name, corners, passages, picture), refused, identity_of(rig))
 
 
-def _sweeps(rig: OpenRig, maps: int, seed: int, out: OutFolder) -> list[SweepData]:
+def _sweeps(rig: OpenRig, maps: int, out: OutFolder) -> list[SweepData]:
     """Count the sweeps of a scan. An interrupt is raised again, once the rig is safe."""
     found: list[SweepData] = []
     scan, estimate = rig.config.scan, rig.config.estimate
     tally = MapTally(scan.columns, scan.exposures, estimate.estimator, estimate.filter)
-    options = ScanOptions(record=out is not None, sweeps=found.append, accept_calibration=True)
-    with Run(out, tally, record=out is not None) as run:
-        result = run_scan(rig, run, maps, seed, options)
+    request = RunRequest(maps=maps, record=out is not None, accept_calibration=True)
+    with Run(out, tally, record=request.record) as run:
+        result = run_scan(rig, run, request, Listeners(sweeps=found.append))
     result.uninterrupted()
     return found
 

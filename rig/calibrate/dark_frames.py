@@ -27,11 +27,12 @@ from rig.errors import UsageError
 from rig.geometry.windows import WORD_PX
 from rig.progress import Progress, counted
 from rig.recording.inputs import read_plan
+from rig.requests import RunRequest
 from rig.run_folder.summary import MapTally
-from rig.scan.acquisition import ScanProgress
+from rig.scan.monitor import Listeners, ScanProgress
 from rig.scan.pipeline import JOIN_S
 from rig.scan.run import Run
-from rig.scan.scan import ScanOptions, run_scan
+from rig.scan.scan import run_scan
 from rig.scan.source import Source, blocks
 from rig.threads import RowWorkers
 
@@ -129,9 +130,9 @@ def take_sweeps(rig: OpenRig, maps: int | None = None, progress: Progress | None
         if progress is not None:
             progress(now.frames, now.frames_planned)
 
-    options = ScanOptions(sweeps=sums.add, accept_calibration=True, live=live)
     with Run(None, MapTally(scan.columns, scan.exposures, "argmax", "none")) as run:
-        run_scan(rig, run, maps, 0, options).uninterrupted()
+        request = RunRequest(maps=maps, accept_calibration=True)
+        run_scan(rig, run, request, Listeners(sweeps=sums.add, live=live)).uninterrupted()
     if sums.tally is None:
         raise UsageError(f"{rig.spad.name} gave no sweep with dark frames in one piece; scan again")
     return sums

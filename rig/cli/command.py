@@ -5,16 +5,20 @@ Options that several commands have are defined here too.
 
 import errno
 import functools
+import inspect
 import os
 import sys
 from collections.abc import Callable, Mapping, Sequence
+from dataclasses import Field
 from datetime import datetime
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any, ParamSpec
 
 import typer
 
-from rig.cli.completion import estimator_names, filter_names, one_of, rig_names, scene_names
+from rig.cli.completion import estimator_names, filter_names, one_of, rig_names, scene_names, some_of
+from rig.errors import UsageError
+from rig.requests import options_of
 
 if TYPE_CHECKING:
     from rig.recording.segment import Space
@@ -46,31 +50,10 @@ SceneOption = Annotated[
         autocompletion=one_of(scene_names),
     ),
 ]
-EstimatorOption = Annotated[
-    str | None,
-    typer.Option(
-        "--estimator",
-        help="argmax, edge, likelihood or joint",
-        show_default=False,
-        autocompletion=one_of(estimator_names),
-    ),
-]
-FilterOption = Annotated[
-    str | None,
-    typer.Option("--filter", help="none or median (5 x 5)", show_default=False, autocompletion=one_of(filter_names)),
-]
-ConfidenceOption = Annotated[
-    float | None,
-    typer.Option("--min-confidence", help="answers below this do not enter the depth map", show_default=False),
-]
 OutOption = Annotated[
     Path | None, typer.Option("--out", help="folder to write, new or empty", show_default="runs/DATE-TIME")
 ]
-RecordOption = Annotated[bool, typer.Option("--record", help="write the frames into the folder too")]
 ArmOption = Annotated[bool, typer.Option("--arm", help="let a real laser shine: the beam path is clear")]
-AcceptOption = Annotated[
-    bool, typer.Option("--accept-calibration", help="use a calibration of another rig, failed or too old, all the same")
-]
 JsonOption = Annotated[bool, typer.Option("--json", help="print exactly one JSON object to stdout, errors too")]
 
 
@@ -92,6 +75,83 @@ def command(function: Callable[P, int | None]) -> Callable[P, None]:
         raise typer.Exit(code or 0)
 
     return wrapped
+
+
+def split_option(option: str, given: list[str] | None) -> list[str]:
+    """Split an option that may be given several times and with commas. UsageError where it names nothing."""
+    parts = (part.strip() for value in given or () for part in value.split(","))
+    named = list(dict.fromkeys(part for part in parts if part))
+    if given and not named:
+        raise UsageError(f"{option} is empty; name one or several with commas between them, or leave {option} out")
+    return named
+
+
+def whole_numbers(option: str, given: list[str] | None) -> list[int]:
+    """Split an option as `split_option` does, into whole numbers. UsageError for anything else."""
+    parts = split_option(option, given)
+    wrong = [part for part in parts if not part.isdecimal()]
+    if wrong:
+        raise UsageError(f"{option} has {wrong[0]!r}, which is no whole number; write e.g. {option} 1,3,10")
+    return [int(part) for part in parts]
+
+
+_NAMES = {"scene": scene_names, "estimator": estimator_names, "filter": filter_names, "config": rig_names}
+"""Names that a shell completes, by the field of a request."""
+_MANY = {Sequence[str]: split_option, Sequence[int]: whole_numbers}
+"""How options that may be given several times and with commas are read, by the type of their field."""
+
+
+def asks(request: type[Any]) -> Callable[[Callable[..., int]], Callable[..., int]]:
+    """Give a command an option for each field of a request; it gets them together, as its argument `request`.
+
+    A field that the command has an option of its own for is left to it.
+    """
+
+    def decorate(function: Callable[..., int]) -> Callable[..., int]:
+        plain = inspect.signature(function).parameters
+        asked = [each for each in options_of(request) if each.name not in plain]
+        given = [_parameter(each) for each in asked]
+
+        @functools.wraps(function)
+        def filled(**values: Any) -> int:
+            read = {each.name: _read(each, values.pop(each.name)) for each in asked}
+            return function(request=request(**read), **values)
+
+        shown: list[inspect.Parameter] = []
+        for name, parameter in plain.items():
+            shown += given if name == "request" else [parameter.replace(kind=inspect.Parameter.KEYWORD_ONLY)]
+        filled.__signature__ = inspect.Signature(shown)  # type: ignore[attr-defined]
+        return filled
+
+    return decorate
+
+
+def _option_name(field: "Field[Any]") -> str:
+    return f"--{(field.metadata['name'] or field.name).replace('_', '-')}"
+
+
+def _parameter(field: "Field[Any]") -> inspect.Parameter:
+    """The parameter of a command that typer makes the option of a field from."""
+    told, name, many = field.metadata, _option_name(field), field.type in _MANY
+    names = _NAMES.get(field.name.removesuffix("s"))
+    option = typer.Option(
+        name if field.default is not True and field.type != bool | None else f"{name}/--no-{name[2:]}",
+        help=told["about"],
+        show_default="runs/DATE-TIME" if field.name == "out" else told["unset"] or field.default is not None,
+        min=told["least"],
+        autocompletion=None if names is None else (some_of if many else one_of)(names),
+    )
+    kind = list[str] | None if many else told["read_as"] or field.type
+    default = None if many else field.default
+    return inspect.Parameter(
+        field.name, inspect.Parameter.KEYWORD_ONLY, default=default, annotation=Annotated[kind, option]
+    )
+
+
+def _read(field: "Field[Any]", value: Any) -> Any:
+    if field.name == "out" and value is None:
+        return default_out()
+    return _MANY[field.type](_option_name(field), value) if field.type in _MANY else value
 
 
 def refused_file(error: BaseException) -> str | None:
@@ -161,28 +221,6 @@ def print_json(content: Mapping[str, Any]) -> None:
 def say_space(space: "Space") -> None:
     """Say how much room a recording will take on the disk, before it begins."""
     say(f"recording: {space}")
-
-
-def split_option(option: str, given: list[str] | None) -> list[str]:
-    """Split an option that may be given several times and with commas. UsageError where it names nothing."""
-    from rig.errors import UsageError
-
-    parts = (part.strip() for value in given or () for part in value.split(","))
-    named = list(dict.fromkeys(part for part in parts if part))
-    if given and not named:
-        raise UsageError(f"{option} is empty; name one or several with commas between them, or leave {option} out")
-    return named
-
-
-def whole_numbers(option: str, given: list[str] | None) -> list[int]:
-    """Split an option as `split_option` does, into whole numbers. UsageError for anything else."""
-    from rig.errors import UsageError
-
-    parts = split_option(option, given)
-    wrong = [part for part in parts if not part.isdecimal()]
-    if wrong:
-        raise UsageError(f"{option} has {wrong[0]!r}, which is no whole number; write e.g. {option} 1,3,10")
-    return [int(part) for part in parts]
 
 
 def default_out() -> Path:

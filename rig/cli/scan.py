@@ -1,29 +1,24 @@
 """Commands that make depth maps, and one on what to expect of a scene: `rig scan`, `reconstruct`, `effects`."""
 
+from dataclasses import replace
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Any
+from typing import TYPE_CHECKING, Annotated
 
 import typer
 
 from rig.cli.command import (
-    AcceptOption,
-    ArmOption,
-    ConfidenceOption,
     ConfigArgument,
-    EstimatorOption,
-    FilterOption,
     JsonOption,
-    OutOption,
-    RecordOption,
     SceneOption,
+    asks,
     command,
-    default_out,
     print_json,
     report,
     say_space,
 )
 from rig.cli.completion import one_of, rig_names
 from rig.cli.progress import progress
+from rig.requests import ReconstructRequest, ScanRequest
 
 if TYPE_CHECKING:
     from rig.plan.scan_plan import ScanPlan
@@ -38,68 +33,22 @@ def register(app: typer.Typer) -> None:
 
 
 @command
+@asks(ScanRequest)
 def scan_command(
+    request: ScanRequest,
     config: ConfigArgument = "simulated",
-    scene: SceneOption = None,
-    maps: Annotated[int, typer.Option("--maps", help="depth maps to take")] = 1,
-    exposures: Annotated[
-        int | None, typer.Option("--exposures", help="frames per column (K)", show_default=False)
-    ] = None,
-    estimator: EstimatorOption = None,
-    filter: FilterOption = None,
-    min_confidence: ConfidenceOption = None,
-    temporal_prior: Annotated[
-        bool | None,
-        typer.Option(
-            "--temporal-prior/--no-temporal-prior",
-            help="joint: hold each map to the last one a little",
-            show_default=False,
-        ),
-    ] = None,
-    seed: Annotated[int, typer.Option("--seed", help="of everything simulated")] = 0,
-    save: Annotated[str, typer.Option("--save", help="maps to write: all, last or every N")] = "all",
-    out: OutOption = None,
-    record: RecordOption = False,
-    on_overload: Annotated[
-        str, typer.Option("--on-overload", help="frames come too fast: abort, drop (and count) or block (wait)")
-    ] = "abort",
-    arm: ArmOption = False,
-    accept_calibration: AcceptOption = False,
     dry_run: Annotated[bool, typer.Option("--dry-run", help="compile and print the plan; nothing moves")] = False,
     as_json: JsonOption = False,
 ) -> int:
     """Acquire and reconstruct depth maps."""
     from rig import api
 
-    options: dict[str, Any] = {
-        "scene": scene,
-        "exposures": exposures,
-        "estimator": estimator,
-        "filter": filter,
-        "min_confidence": min_confidence,
-        "temporal_prior": temporal_prior,
-    }
-    out = default_out() if out is None else out
     if dry_run:
-        checked: dict[str, Any] = {"maps": maps, "seed": seed, "save": save, "on_overload": on_overload}
-        checked |= {"out": out, "record": record, "accept_calibration": accept_calibration}
         spaces: list[Space] = []
-        plan = api.plan_scan(config, on_space=spaces.append, **checked, **options)
+        plan = api.plan_scan(config, request, on_space=spaces.append)
         return _show_plan(plan, spaces[0] if spaces else None, as_json)
     with progress():
-        result = api.scan(
-            config,
-            maps=maps,
-            seed=seed,
-            save=save,
-            arm=arm,
-            out=out,
-            record=record,
-            on_overload=on_overload,
-            on_space=say_space,
-            accept_calibration=accept_calibration,
-            **options,
-        )
+        result = api.scan(config, request, on_space=say_space)
     return report(result, as_json)
 
 
@@ -117,7 +66,9 @@ def _show_plan(plan: "ScanPlan", space: "Space | None", as_json: bool) -> int:
 
 
 @command
+@asks(ReconstructRequest)
 def reconstruct_command(
+    request: ReconstructRequest,
     source: Annotated[
         Path,
         typer.Argument(
@@ -131,20 +82,13 @@ def reconstruct_command(
     calibration: Annotated[
         Path | None, typer.Option("--calibration", help="calibration.yaml", show_default="the recording's own")
     ] = None,
-    estimator: EstimatorOption = None,
-    filter: FilterOption = None,
-    min_confidence: ConfidenceOption = None,
-    accept_calibration: AcceptOption = False,
     as_json: JsonOption = False,
 ) -> int:
     """Make depth maps from a recording, from imported frames or from a packed .npy cube of them."""
     from rig import api
 
-    # Names that are none are refused by the call, which knows which there are.
-    options: dict[str, Any] = {"estimator": estimator, "filter": filter, "min_confidence": min_confidence}
-    options["accept_calibration"] = accept_calibration
     with progress():
-        result = api.reconstruct(source, plan, calibration, out=out, **options)
+        result = api.reconstruct(source, plan, calibration, replace(request, out=out))
     return report(result, as_json)
 
 

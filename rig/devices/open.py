@@ -42,6 +42,8 @@ class OpenRig:
     model: RigModel | None
     guard: Guard | None = None
     """The process that owns the ports of a real laser and its gate."""
+    seed: int = 0
+    """Of everything simulated."""
 
 
 @runtime_checkable
@@ -137,7 +139,7 @@ def _open(config: RigConfig, seed: int, tap: TapFile | None, stack: ExitStack) -
         raise DevicesError("\n".join(devices))
     assert surroundings is not None, "else there is trouble"
     clock, world = surroundings.clock, surroundings.world
-    return OpenRig(config=config, clock=clock, world=world, model=model, guard=guard, **opened)
+    return OpenRig(config=config, clock=clock, world=world, model=model, guard=guard, seed=seed, **opened)
 
 
 def _create_surroundings(config: RigConfig, seed: int, stack: ExitStack, problems: list[str]) -> Surroundings | None:

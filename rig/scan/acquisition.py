@@ -7,7 +7,7 @@ rig is made safe, on the caller's thread; what is in the ring by then is still c
 import logging
 import math
 from collections.abc import Callable, Generator, Iterator
-from dataclasses import dataclass, fields
+from dataclasses import dataclass, fields, replace
 from fractions import Fraction
 
 from drivers.clock import Clock, VirtualClock
@@ -15,7 +15,7 @@ from drivers.errors import DeviceFault, DeviceTimeout
 from drivers.guard import GuardLimits
 from drivers.interfaces import SpadCounters, SpadTiming
 from drivers.transports.endpoints import EMULATED_PREFIX
-from rig.count.sweeps import SweepAssembler, SweepData, SweepStart
+from rig.count.sweeps import SweepAssembler, SweepStart
 from rig.count.volume import SweepLayout
 from rig.depth.fog_meter import FogEstimate
 from rig.devices.open import OpenRig
@@ -23,13 +23,12 @@ from rig.devices.prepare import lead_s, most_sweeps, require_memory, spare_lead_
 from rig.errors import DevicesError
 from rig.plan.gate_pulses import sync_program
 from rig.plan.scan_plan import ScanPlan
-from rig.progress import tell_stage
-from rig.recording.replay import ENDLESS, PlaysRecording
+from rig.recording.replay import PlaysRecording
 from rig.recording.writer import Recording
 from rig.run_folder.summary import PipelineStats
 from rig.scan.counting import AcquiredMap, MakesMaps
-from rig.scan.monitor import Watch
-from rig.scan.pipeline import JOIN_S, Overload, Pipeline, require_policy, ring_for
+from rig.scan.monitor import NOBODY, Listeners, ScanProgress
+from rig.scan.pipeline import JOIN_S, Overload, Pipeline, PipelineRequest, require_policy, ring_for
 
 _log = logging.getLogger(__name__)
 
@@ -41,99 +40,53 @@ TELL_S = 0.1
 """Time from one report of progress to the next."""
 
 
-@dataclass(frozen=True, slots=True)
-class ScanProgress:
-    """Progress of a run, told several times a second and at its end.
+@dataclass(frozen=True, slots=True, kw_only=True)
+class AcquisitionRequest:
+    """An acquisition of `maps` maps.
 
-    frames: frames received, at most frames_planned, which the plan takes from the first scan marker to the last.
-    lost: frames lost by the SPAD's own count.
-    sweeps: sweeps counted, of `maps`.
-    stages: what each stage has done so far.
-    fog: estimate from the newest map; None before the first.
-    stage: 'rendering' where frames are simulated, otherwise 'scanning' or 'replaying'; 'learning' while the estimator
-      learns from the first map, 'estimating' while another map is made.
+    policy: for frames that come too fast.
+    first_alone: take the first map with a start of its own, so that a SPAD that cannot wait stands still while the
+      estimator learns from that map.
+    learns: whether the estimator learns from the first map.
+    groups: sweeps of each start, where the scan is not free to choose. starts: the sweep that each start begins with.
+    silence_s: a SPAD that sends nothing for this long, with the ring empty, has failed.
+    recording: takes every block; None records nothing.
+    listeners: told of what is going on.
     """
 
-    frames: int
-    frames_planned: int
-    lost: int
-    sweeps: int
     maps: int
-    stages: PipelineStats
-    fog: FogEstimate | None = None
-    stage: str = "scanning"
-
-
-def told_of(live: Callable[[ScanProgress], None] | None) -> Callable[[ScanProgress], None]:
-    """A callback that tells `rig.progress` and `live` how far a scan is."""
-
-    def both(now: ScanProgress) -> None:
-        notes = [f"{now.sweeps} of {now.maps} maps counted"] if 1 < now.maps < ENDLESS else []
-        notes += [f"{now.lost} lost"] if now.lost else []
-        notes += [] if now.fog is None or not now.fog.brief() else [now.fog.brief()]
-        planned = now.frames_planned if now.maps < ENDLESS else None
-        tell_stage(now.stage, now.frames, planned, "frames", ", ".join(notes))
-        if live is not None:
-            live(now)
-
-    return both
+    policy: Overload = Overload.ABORT
+    first_alone: bool = False
+    learns: bool = False
+    groups: Iterator[int] | None = None
+    starts: Iterator[SweepStart] | None = None
+    silence_s: float = SILENCE_S
+    recording: Recording | None = None
+    listeners: Listeners = NOBODY
 
 
 class Acquisition:
-    """A scan of `maps` maps with an open rig, a plan and the SPAD's timing from `rig.devices.prepare`.
-
-    Iterate once over `run()`.
+    """A scan with an open rig, and with the plan and timing that `rig.devices.prepare` gave. Iterate once over `run()`.
 
     maker: makes the maps, on the counting thread.
-    first_alone: take the first map with a start of its own, so that a SPAD that cannot wait stands still while the
-      estimator learns from that map.
-    learns: whether `maker` learns from its first map.
-    groups: sweeps of each start, where the scan is not free to choose. starts: the sweep that each start begins with.
-    recording, watch: for the recorder and the monitor; None for none.
-    on_progress: called on the caller's thread. on_sweep: as in `Mapping`.
 
-    Raises UsageError where the SPAD cannot do what `policy` asks.
+    Raises UsageError where the SPAD cannot do what the policy asks, PlanError where its memory is too small for a map.
     """
 
     def __init__(
-        self,
-        rig: OpenRig,
-        plan: ScanPlan,
-        timing: SpadTiming,
-        maps: int,
-        maker: MakesMaps,
-        *,
-        policy: Overload = Overload.ABORT,
-        first_alone: bool = False,
-        learns: bool = False,
-        groups: Iterator[int] | None = None,
-        starts: Iterator[SweepStart] | None = None,
-        recording: Recording | None = None,
-        watch: Watch | None = None,
-        on_progress: Callable[[ScanProgress], None] | None = None,
-        on_sweep: Callable[[SweepData], None] | None = None,
-        silence_s: float = SILENCE_S,
+        self, rig: OpenRig, plan: ScanPlan, timing: SpadTiming, maker: MakesMaps, request: AcquisitionRequest
     ) -> None:
-        if maps < 1:
-            raise ValueError(f"{maps} maps; ask for at least 1")
-        require_policy(policy, rig.spad.info)
+        if request.maps < 1:
+            raise ValueError(f"{request.maps} maps; ask for at least 1")
+        require_policy(request.policy, rig.spad.info)
+        if request.groups is None:
+            require_memory(rig, plan)
         self._rig = rig
         self._plan = plan
-        self._groups = groups
-        self._starts = starts
-        if groups is None:
-            require_memory(rig, plan)
         self._timing = timing
-        self._maps = maps
         self._maker = maker
-        self._policy = policy
-        self._first_alone = first_alone
-        self._learns = learns
-        self._recording = recording
-        self._watch = watch
-        self._on_progress = on_progress
-        self._on_sweep = on_sweep
-        self._silence_s = silence_s
+        self._asked = request
+        self._listeners = request.listeners
         self._pipeline: Pipeline | None = None
         self._stats_before = PipelineStats()
         self._counters_before = SpadCounters(0, 0, 0, 0, 0)
@@ -163,9 +116,9 @@ class Acquisition:
             SweepLayout(plan.columns, plan.rows, plan.width, plan.x0, plan.window, plan.exposures, plan.used_px)
         )
         done = 0
-        while done < self._maps:
+        while done < self._asked.maps:
             group = self._group(done)
-            start = None if self._starts is None else next(self._starts)
+            start = None if self._asked.starts is None else next(self._asked.starts)
             assembler = SweepAssembler(plan, counter, group, done, start)
             counter.reset()
             yield from self._run_group(assembler, group, done)
@@ -173,11 +126,11 @@ class Acquisition:
 
     def _group(self, done: int) -> int:
         """Sweeps of the next start: as many as the SPAD's memory holds in a burst and the sync source's program."""
-        if self._groups is not None:
-            return min(self._maps - done, next(self._groups))
-        if self._first_alone and done == 0:
+        if self._asked.groups is not None:
+            return min(self._asked.maps - done, next(self._asked.groups))
+        if self._asked.first_alone and done == 0:
             return 1
-        left, most = self._maps - done, most_sweeps(self._rig, self._plan)
+        left, most = self._asked.maps - done, most_sweeps(self._rig, self._plan)
         return left if most is None else min(left, most)
 
     def _burst_frames(self, sweeps: int) -> int | None:
@@ -195,23 +148,19 @@ class Acquisition:
                 f"{float(plan.point_rate_hz):g}; compile the plan anew"
             )
         rig.sync.program(*sync_program(plan, sweeps))
+        asked = self._asked
+        ring = ring_for(asked.policy, rig.spad.info, plan, self._timing, keeps_time=asked.groups is not None)
         pipeline = Pipeline(
             rig.spad,
-            ring_for(self._policy, rig.spad.info, plan, self._timing, keeps_time=self._groups is not None),
-            assembler,
-            sweeps,
-            self._maker,
-            self._silence_s,
-            recording=self._recording,
-            watch=self._watch,
+            ring,
+            PipelineRequest(assembler, sweeps, self._maker, asked.silence_s, asked.recording, self._listeners),
             on_frame=None if rig.guard is None else rig.guard.beat,
-            on_sweep=self._on_sweep,
         )
         if rig.guard is not None:
             rig.guard.expect(self._guard_limits(sweeps))
             rig.spad.on_wait = rig.guard.wait
-        if self._recording is not None:
-            self._recording.begin(sweeps)
+        if asked.recording is not None:
+            asked.recording.begin(sweeps)
         trouble: list[str] = []
         try:
             try:
@@ -273,7 +222,7 @@ class Acquisition:
     def _end_group(self, pipeline: Pipeline, assembler: SweepAssembler) -> None:
         pipeline.close()
         if pipeline.monitor_lost:
-            self._watch = None
+            self._listeners = replace(self._listeners, monitor=None)
         if self._pipeline is not None:
             self._counters_before, self._stats_before = self.counters, self.stages
             self._pipeline = None
@@ -286,20 +235,18 @@ class Acquisition:
             raise DeviceFault(fault)
 
     def _tell(self, assembler: SweepAssembler, done: int) -> None:
-        if self._on_progress is None:
-            return
-        planned = self._frames_before + math.ceil(self._plan.frames_for(self._maps - done))
+        planned = self._frames_before + math.ceil(self._plan.frames_for(self._asked.maps - done))
         frames, sweeps = min(self._frames_before + assembler.frames_seen, planned), done + assembler.sweeps_done
         stages = self.stages
         lost = self.counters.lost
         lost = stages.dropped_frames if lost is None else lost
-        self._on_progress(
-            ScanProgress(frames, planned, lost, sweeps, self._maps, stages, self._fog, self._stage(sweeps))
+        self._listeners.tell(
+            ScanProgress(frames, planned, lost, sweeps, self._asked.maps, stages, self._fog, self._stage(sweeps))
         )
 
     def _stage(self, sweeps: int) -> str:
         if self._pipeline is not None and self._pipeline.estimating:
-            return "learning" if self._learns and sweeps == 1 else "estimating"
+            return "learning" if self._asked.learns and sweeps == 1 else "estimating"
         if isinstance(self._rig.spad, PlaysRecording):
             return "replaying"
         return "rendering" if isinstance(self._rig.clock, VirtualClock) else "scanning"

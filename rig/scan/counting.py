@@ -1,6 +1,6 @@
 """The counting thread: blocks in, maps out. It alone counts and estimates, one sweep after the other.
 
-`Mapping` is the thread, `MapQueue` the bounded queue from it to the caller, which also says when the stream is over.
+`MapQueue` is the bounded queue from it to the caller, which also says when the stream is over.
 """
 
 import threading
@@ -120,7 +120,7 @@ class MakesMaps(Protocol):
         ...
 
 
-class Mapping:
+class CountingThread:
     """Thread that counts the blocks of one start of the SPAD and estimates each sweep where it ends.
 
     A sweep is estimated before any frame behind it is counted.

@@ -1,8 +1,9 @@
-"""The monitor: shows the newest frames to a callback, at most ten times a second, and never holds anybody up.
+"""What a run tells while it goes on: its progress, and to a monitor its newest frames.
 
-It has an optional place in the ring, copies what it shows and gives the block back before the callback sees it. A
-callback that is slow sees fewer blocks, one that raises is told of once and called no more, one that hangs is left
-behind at the end of the run. Summing 16 frames of 512 x 512 takes 3 to 10 ms.
+`Listeners` are the callbacks. The monitor is a thread that shows the newest frames at most ten times a second and
+never holds anybody up. It has an optional place in the ring, copies what it shows and gives the block back before the
+callback sees it. A callback that is slow sees fewer blocks, one that raises is told of once and called no more, one
+that hangs is left behind at the end of the run. Summing 16 frames of 512 x 512 takes 3 to 10 ms.
 """
 
 import logging
@@ -16,6 +17,11 @@ from numpy.typing import NDArray
 
 from drivers.frames import FrameBlock
 from drivers.ring import RingReader
+from rig.count.sweeps import SweepData
+from rig.depth.fog_meter import FogEstimate
+from rig.progress import tell_stage
+from rig.recording.replay import ENDLESS
+from rig.recording.segment import Space
 from rig.run_folder.summary import PipelineStats
 from rig.threads import StageThread
 
@@ -47,17 +53,73 @@ class MonitorView:
         return profile
 
 
-Watch = Callable[[MonitorView], None]
+MonitorCallback = Callable[[MonitorView], None]
+
+
+@dataclass(frozen=True, slots=True)
+class ScanProgress:
+    """Progress of a run, told several times a second and at its end.
+
+    frames: frames received, at most frames_planned, which the plan takes from the first scan marker to the last.
+    lost: frames lost by the SPAD's own count.
+    sweeps: sweeps counted, of `maps`.
+    stages: what each stage has done so far.
+    fog: estimate from the newest map; None before the first.
+    stage: 'rendering' where frames are simulated, otherwise 'scanning' or 'replaying'; 'learning' while the estimator
+      learns from the first map, 'estimating' while another map is made.
+    """
+
+    frames: int
+    frames_planned: int
+    lost: int
+    sweeps: int
+    maps: int
+    stages: PipelineStats
+    fog: FogEstimate | None = None
+    stage: str = "scanning"
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Listeners:
+    """Callbacks of a run; None is nobody.
+
+    live: called with the progress several times a second, on the caller's thread.
+    monitor: called with the newest frames, on a thread of its own.
+    sweeps: called with each counted sweep before its map is made, on the counting thread.
+    on_space: called with the room that a recording will take, before anything moves, once it is known to fit.
+    """
+
+    live: Callable[[ScanProgress], None] | None = None
+    monitor: MonitorCallback | None = None
+    sweeps: Callable[[SweepData], None] | None = None
+    on_space: Callable[[Space], None] | None = None
+
+    def tell(self, now: ScanProgress) -> None:
+        """Tell `rig.progress` and `live` how far a scan is."""
+        notes = [f"{now.sweeps} of {now.maps} maps counted"] if 1 < now.maps < ENDLESS else []
+        notes += [f"{now.lost} lost"] if now.lost else []
+        notes += [] if now.fog is None or not now.fog.brief() else [now.fog.brief()]
+        planned = now.frames_planned if now.maps < ENDLESS else None
+        tell_stage(now.stage, now.frames, planned, "frames", ", ".join(notes))
+        if self.live is not None:
+            self.live(now)
+
+
+NOBODY = Listeners()
 
 
 class Monitor:
-    """Thread that shows the blocks of one start of the SPAD to `watch`. stats: gives the figures to show with them."""
+    """Thread that shows the blocks of one start of the SPAD to `callback`, with the figures that `stats` gives."""
 
     def __init__(
-        self, reader: RingReader, watch: Watch, stats: Callable[[], PipelineStats], interval_s: float = INTERVAL_S
+        self,
+        reader: RingReader,
+        callback: MonitorCallback,
+        stats: Callable[[], PipelineStats],
+        interval_s: float = INTERVAL_S,
     ) -> None:
         self._reader = reader
-        self._watch = watch
+        self._callback = callback
         self._stats = stats
         self._interval_s = interval_s
         self._over = threading.Event()
@@ -105,7 +167,7 @@ class Monitor:
         first, frames = block.header.first_frame, min(block.n_frames, MOST_FRAMES)
         counts = sum_image(block, frames)
         self._reader.release()
-        self._watch(MonitorView(first, frames, counts, self._stats()))
+        self._callback(MonitorView(first, frames, counts, self._stats()))
         self.updates += 1
         return True
 

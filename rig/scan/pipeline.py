@@ -9,17 +9,18 @@ that the policy asks for.
 """
 
 from collections.abc import Callable
+from dataclasses import dataclass
 from enum import StrEnum
 
 from drivers.interfaces import SpadArray, SpadInfo, SpadTiming
 from drivers.ring import BlockRing, OnFull
-from rig.count.sweeps import MOST_UNDER_WAY, SweepAssembler, SweepData
+from rig.count.sweeps import MOST_UNDER_WAY, SweepAssembler
 from rig.errors import RecordingError, UsageError
 from rig.plan.scan_plan import ScanPlan
 from rig.recording.writer import WRITERS, Recorder, Recording
 from rig.run_folder.summary import PipelineStats
-from rig.scan.counting import AcquiredMap, MakesMaps, Mapping, MapQueue
-from rig.scan.monitor import Monitor, Watch
+from rig.scan.counting import AcquiredMap, CountingThread, MakesMaps, MapQueue
+from rig.scan.monitor import NOBODY, Listeners, Monitor
 from rig.scan.source import Source
 
 MAPS_AHEAD = 2
@@ -34,48 +35,57 @@ MONITOR_S = 0.5
 """Longest wait for the monitor's callback at the end."""
 
 
+@dataclass(frozen=True, slots=True)
+class PipelineRequest:
+    """The work of one start of the SPAD.
+
+    assembler: takes `sweeps` sweeps. maker: makes their maps, on the counting thread. silence_s: longest silence of the
+    SPAD. recording: takes every block; None is no recorder.
+    """
+
+    assembler: SweepAssembler
+    sweeps: int
+    maker: MakesMaps
+    silence_s: float
+    recording: Recording | None = None
+    listeners: Listeners = NOBODY
+
+
 class Pipeline:
     """The threads of one start of the SPAD: source -> ring -> {counting + estimation, recorder, monitor} -> maps.
 
-    assembler: takes `sweeps` sweeps. maker: makes their maps, on the counting thread. recording, watch: None for no
-    recorder and no monitor. on_sweep: as in `Mapping`.
+    on_frame: as in `Source`.
     """
 
     def __init__(
         self,
         spad: SpadArray,
         ring: BlockRing,
-        assembler: SweepAssembler,
-        sweeps: int,
-        maker: MakesMaps,
-        silence_s: float,
-        *,
-        recording: Recording | None = None,
-        watch: Watch | None = None,
+        request: PipelineRequest,
         on_frame: Callable[[int], None] | None = None,
-        on_sweep: Callable[[SweepData], None] | None = None,
     ) -> None:
         self._ring = ring
         self._queue = MapQueue(MAPS_AHEAD)
-        self._source = Source(spad, ring, silence_s, self._queue.end_stream, on_frame)
-        self._mapping = Mapping(
+        self._source = Source(spad, ring, request.silence_s, self._queue.end_stream, on_frame)
+        recording, monitor = request.recording, request.listeners.monitor
+        self._counting = CountingThread(
             ring.reader("counting", holds=max(1, min(MOST_UNDER_WAY, ring.slots // 4))),
-            assembler,
-            sweeps,
-            maker,
+            request.assembler,
+            request.sweeps,
+            request.maker,
             self._queue,
             self._source,
-            silence_s,
+            request.silence_s,
             on_complete=self._complete,
-            on_sweep=on_sweep,
+            on_sweep=request.listeners.sweeps,
         )
         self._recorder: Recorder | None = None
         if recording is not None:
             reader = ring.reader("recorder", holds=max(1, min(WRITERS, ring.slots // 4)))
             self._recorder = Recorder(reader, recording, self._queue.end_stream)
         self._monitor: Monitor | None = None
-        if watch is not None:
-            self._monitor = Monitor(ring.reader("monitor", required=False), watch, self.stats)
+        if monitor is not None:
+            self._monitor = Monitor(ring.reader("monitor", required=False), monitor, self.stats)
         self.monitor_lost = False
         """Whether the monitor's callback raised or was left behind: it must not be called again."""
 
@@ -92,11 +102,11 @@ class Pipeline:
     @property
     def estimating(self) -> bool:
         """Whether a map is being made just now. May be asked on any thread."""
-        return self._mapping.estimating
+        return self._counting.estimating
 
     def stats(self) -> PipelineStats:
         """The figures of this moment. May be asked on any thread."""
-        ring, mapping, recorder, monitor = self._ring, self._mapping, self._recorder, self._monitor
+        ring, counting, recorder, monitor = self._ring, self._counting, self._recorder, self._monitor
         return PipelineStats(
             source_fill_s=self._source.fill_s,
             source_wait_s=ring.waited_s,
@@ -105,9 +115,9 @@ class Pipeline:
             ring_high_water=ring.high_water,
             dropped_blocks=ring.dropped_blocks,
             dropped_frames=ring.dropped_frames,
-            counting_s=mapping.counting_s,
-            estimation_s=mapping.estimation_s,
-            map_wait_s=mapping.wait_s,
+            counting_s=counting.counting_s,
+            estimation_s=counting.estimation_s,
+            map_wait_s=counting.wait_s,
             map_queue=self._queue.room,
             map_queue_high_water=self._queue.high_water,
             recorder_s=None if recorder is None else recorder.busy_s,
@@ -119,7 +129,7 @@ class Pipeline:
 
     def start(self) -> None:
         """Start all threads, the source last."""
-        self._mapping.start()
+        self._counting.start()
         if self._recorder is not None:
             self._recorder.start()
         if self._monitor is not None:
@@ -152,7 +162,7 @@ class Pipeline:
             )
         if recorder is not None and recorder.error is not None:
             return recorder.error
-        return self._mapping.error
+        return self._counting.error
 
     def close(self) -> None:
         """End all threads, whatever they are doing. Maps not taken are gone; what is left in the ring is recorded."""
@@ -161,7 +171,7 @@ class Pipeline:
             self._queue.close()
             if self._monitor is not None:
                 self.monitor_lost = not self._monitor.end(MONITOR_S) or self._monitor.failed
-            self._mapping.join(LEAVE_S)
+            self._counting.join(LEAVE_S)
         finally:  # a second Ctrl-C ends the wait for an estimate, not for what was received
             if self._recorder is not None:
                 self._recorder.join(DRAIN_S)

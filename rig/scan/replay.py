@@ -13,15 +13,17 @@ from rig.config.models import RigConfig
 from rig.devices.open import open_rig
 from rig.errors import DivergedError, RigError
 from rig.recording.replay import RECORDED, pace_of
+from rig.requests import RunRequest
 from rig.scan.control_check import SWAP_TOLERANCE_S, ControlCheck, check_control
+from rig.scan.monitor import Listeners
 from rig.scan.run import Run, RunResult
-from rig.scan.scan import ScanOptions, run_scan
+from rig.scan.scan import run_scan
 
 Steps = Callable[[Pace], None]
 
 
 def play(
-    config: RigConfig, recording: Path, run: Run, maps: int | None, options: ScanOptions, steps: Steps | None
+    config: RigConfig, recording: Path, run: Run, request: RunRequest, listeners: Listeners, steps: Steps | None
 ) -> RunResult:
     """Play a recording with the rig of `replay_config`; `run` takes the maps.
 
@@ -32,7 +34,7 @@ def play(
     compared = bool(drivers) and (recording / CONTROL_FILE).exists()
     with ExitStack() as stack:
         tap: TapFile | None = None
-        if options.record:
+        if request.record:
             tap = run.start_tap()
         elif compared:
             folder = stack.enter_context(tempfile.TemporaryDirectory(prefix="spadrig-control-"))
@@ -42,14 +44,14 @@ def play(
                 pace = pace_of(rig.spad)
                 if steps is not None:
                     steps(pace)
-                result = run_scan(rig, run, maps, 0, options)
+                result = run_scan(rig, run, request, listeners)
         except (DeviceError, RigError) as error:
             if tap is not None and compared:
                 _require_no_difference(recording, tap, drivers, error)
             raise
         if tap is None or not compared:
             return result
-        timed = pace.speed == 1.0 and maps is None
+        timed = pace.speed == 1.0 and request.maps is None
         check = _check(recording, tap, drivers, SWAP_TOLERANCE_S if timed else None)
     if check.problems:
         raise _diverged(check.problems, result.folder)

@@ -5,14 +5,14 @@
 
 import logging
 import os
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from contextlib import closing
-from dataclasses import asdict, dataclass
+from dataclasses import asdict
 from typing import Any
 
 from drivers.errors import DeviceError
 from drivers.interfaces import SpadTiming, SweepTruth
-from rig.count.sweeps import SweepAccount, SweepData
+from rig.count.sweeps import SweepAccount
 from rig.depth.reconstruct import Reconstructor
 from rig.depth.warm_up import warm_binding, warm_up
 from rig.devices.calibration_use import accepted_by, calibration_use, identity_of, rig_content
@@ -26,53 +26,29 @@ from rig.plan.scan_plan import ScanPlan
 from rig.progress import tell_stage
 from rig.recording.inputs import to_plain, write_inputs
 from rig.recording.replay import Replayed
-from rig.recording.segment import Space, map_bytes, recording_bytes
-from rig.recording.writer import Recording
-from rig.scan.acquisition import SILENCE_S, Acquisition, ScanProgress, told_of
-from rig.scan.monitor import Watch
+from rig.recording.segment import map_bytes, recording_bytes
+from rig.requests import RunRequest
+from rig.scan.acquisition import SILENCE_S, Acquisition, AcquisitionRequest
+from rig.scan.monitor import NOBODY, Listeners
 from rig.scan.pipeline import FEWEST_SLOTS, Overload, require_policy
 from rig.scan.run import Run, RunResult, frames_of, frames_that_came, sweep_content, synchronisation_of, verdict_of
 
 _log = logging.getLogger(__name__)
-OnSpace = Callable[[Space], None]
-"""A callback that gets the room a recording will take, before anything moves, once it is known to fit."""
 
 
-@dataclass(frozen=True, slots=True)
-class ScanOptions:
-    """Options of a scan apart from its config.
-
-    policy: for frames that come too fast.
-    record: keep the frames; needs a run with a folder.
-    watch: a monitor's callback, called on a thread of its own.
-    live: called with the progress several times a second, on the caller's thread.
-    sweeps: called with each counted sweep before its map is made, on the counting thread.
-    accept_calibration: use a foreign or stale calibration too, see `rig.devices.calibration_use`.
-    on_space: called with the room that the recording will take.
-    """
-
-    policy: Overload = Overload.ABORT
-    record: bool = False
-    watch: Watch | None = None
-    live: Callable[[ScanProgress], None] | None = None
-    sweeps: Callable[[SweepData], None] | None = None
-    accept_calibration: bool = False
-    on_space: OnSpace | None = None
-
-
-def run_scan(rig: OpenRig, run: Run, maps: int | None, seed: int, options: ScanOptions | None = None) -> RunResult:
+def run_scan(rig: OpenRig, run: Run, request: RunRequest, listeners: Listeners = NOBODY) -> RunResult:
     """Scan with an open rig; `run` takes the maps.
 
-    maps: number of maps; None is all that a recording holds which takes the SPAD's place.
-    seed: the one that the rig was opened with, for the manifest.
+    request: its `maps` (None is all that a recording holds which takes the SPAD's place), `on_overload`, `record` and
+      `accept_calibration`; the rest has served to open the rig and to make `run`.
 
     An interrupt ends the scan after its last whole map, with verdict 'aborted'. So does an error, which is raised again
     once the whole maps and the recording are safe; where there is neither, nothing is left.
     """
-    options = options or ScanOptions()
-    require_policy(options.policy, rig.spad.info)
+    policy, maps = Overload.parse(request.on_overload), request.maps
+    require_policy(policy, rig.spad.info)
     here = identity_of(rig)
-    calibration = calibration_use(rig, accept=options.accept_calibration, here=here)
+    calibration = calibration_use(rig, accept=request.accept_calibration, here=here)
     plan, timing = prepare(rig)
     replayed = Replayed.of(rig.spad, plan, maps)
     maps = maps or 1 if replayed is None else replayed.maps
@@ -92,32 +68,29 @@ def run_scan(rig: OpenRig, run: Run, maps: int | None, seed: int, options: ScanO
         "calibration": None if calibration is None else calibration.content(),
         "rig": rig_content(here),
         "devices": devices_content(rig, plan, timing),
-        "seed": seed,
+        "seed": rig.seed,
         "maps": maps,
-        "on_overload": options.policy.value,
+        "on_overload": policy.value,
     }
     recording = None
-    if options.record:
+    if request.record:
         starts = None if replayed is None else replayed.starts_for(maps)
         space = run.space(*recorded_bytes(rig, plan, timing, maps, starts), maps)
-        recording = _recording(rig, run, plan, manifest, space, options.on_space)
-    acquisition = Acquisition(
-        rig,
-        plan,
-        timing,
-        maps,
-        reconstructor,
+        recording = run.start_recording(manifest, lambda folder: write_inputs(folder, plan, rig.model), space)
+        if listeners.on_space is not None:
+            listeners.on_space(space)
+    asked = AcquisitionRequest(
+        maps=maps,
+        policy=policy,
         first_alone=_first_alone(rig),
-        groups=None if replayed is None else replayed.groups(),
-        on_sweep=options.sweeps,
-        policy=options.policy,
-        starts=None if replayed is None else replayed.starts(),
-        recording=recording,
-        watch=options.watch,
         learns=estimate.estimator in LEARNING and not recalled,
-        on_progress=told_of(options.live),
+        groups=None if replayed is None else replayed.groups(),
+        starts=None if replayed is None else replayed.starts(),
         silence_s=SILENCE_S if replayed is None else replayed.silence_s,
+        recording=recording,
+        listeners=listeners,
     )
+    acquisition = Acquisition(rig, plan, timing, reconstructor, asked)
     sweeps: list[SweepAccount] = []
     ended_by: BaseException | None = None
     try:
@@ -175,16 +148,6 @@ def recorded_bytes(
 def _first_alone(rig: OpenRig) -> bool:
     """Whether the first map gets a start of its own: a live stream cannot stand still while its map is learned from."""
     return rig.config.estimate.estimator in LEARNING and not rig.spad.info.can_wait
-
-
-def _recording(
-    rig: OpenRig, run: Run, plan: ScanPlan, manifest: dict[str, Any], space: Space, on_space: OnSpace | None
-) -> Recording:
-    """Begin the recording of a scan in the run's folder, with all that is known before the first frame."""
-    recording = run.start_recording(manifest, lambda folder: write_inputs(folder, plan, rig.model), space)
-    if on_space is not None:
-        on_space(space)
-    return recording
 
 
 def make_reconstructor(rig: OpenRig, plan: ScanPlan, threads: int, learned: Sequence[Learned] = ()) -> Reconstructor:

@@ -222,6 +222,7 @@ def _trial(config: RigConfig, columns: int, names: list[str]) -> Array:
     An interrupt is raised again.
     """
     from rig.devices.open import open_rig
+    from rig.requests import RunRequest
     from rig.run_folder.summary import MapTally
     from rig.scan.run import Run
     from rig.scan.scan import run_scan
@@ -232,7 +233,7 @@ def _trial(config: RigConfig, columns: int, names: list[str]) -> Array:
     settings = config.model_copy(update={"world": world, "scan": short})
     tally = MapTally(columns, short.exposures, settings.estimate.estimator, settings.estimate.filter)
     with Run(None, tally) as run, open_rig(settings) as rig:
-        result = run_scan(rig, run, 1, 0).uninterrupted()
+        result = run_scan(rig, run, RunRequest()).uninterrupted()
     last, truth = result.last, result.truth
     assert last is not None, "one map was asked for"
     assert truth is not None, "worlds know it"

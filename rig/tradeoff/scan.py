@@ -26,7 +26,8 @@ from rig.estimate.registry import LEARNING
 from rig.geometry.stripe_table import StripeTable
 from rig.geometry.windows import WORD_PX
 from rig.plan.scan_plan import ScanPlan
-from rig.scan.acquisition import Acquisition, told_of
+from rig.scan.acquisition import Acquisition, AcquisitionRequest
+from rig.scan.monitor import Listeners
 from rig.scan.scan import make_reconstructor
 from rig.tradeoff.rows import MapScore, score_map
 
@@ -170,9 +171,10 @@ def score_methods(
                 warm_up(estimator, filter, plan.exposures, dark=True)
         warm_binding(plan)
         maker = ManyMakers({name: _maker(rig, plan, name) for name in estimators}, filters)
-        told = told_of(None if on_frames is None else lambda done: on_frames(done.frames, done.frames_planned))
+        live = None if on_frames is None else lambda now: on_frames(now.frames, now.frames_planned)
         learns = not LEARNING.isdisjoint(estimators)
-        running = Acquisition(rig, plan, timing, MAPS, maker, learns=learns, on_progress=told).run()
+        request = AcquisitionRequest(maps=MAPS, learns=learns, listeners=Listeners(live=live))
+        running = Acquisition(rig, plan, timing, maker, request).run()
         with closing(running):
             last = [found for found in running][-1]
         truth = rig.world.truth(plan.line_commands(last.column), plan.velocity_per_s(last.sweep.direction))

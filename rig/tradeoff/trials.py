@@ -10,6 +10,7 @@ from rig.config.models import RigConfig
 from rig.errors import UsageError
 from rig.estimate.registry import ESTIMATORS, FILTERS
 from rig.progress import Progress, part, tell_stage
+from rig.requests import TradeoffRequest
 from rig.tradeoff.choice import Choice, Wish, advice, choose
 from rig.tradeoff.limits import SceneLimits
 from rig.tradeoff.rows import MapScore, TradeoffRow, TrialSetting, row_of, with_fronts
@@ -31,24 +32,18 @@ class Trial(NamedTuple):
 class Trials:
     """Settings to try: every scene in every fog, with every number of exposures and lines, estimator and filter.
 
-    config_of: makes the config of a trial. repeat: scans of each, with seeds `seed`, `seed` + 1 and so on. limits:
-    whether errors are compared with the statistical limit.
+    config_of: makes the config of a trial. asked: the settings, with at least one number of exposures, estimator and
+    filter.
     """
 
     config_of: Callable[[Trial], RigConfig]
-    scenes: Sequence[str | None]
-    fogs: Sequence[str | None]
-    exposures: Sequence[int]
-    lines: Sequence[int | None]
-    estimators: Sequence[str]
-    filters: Sequence[str]
-    repeat: int
-    seed: int
-    limits: bool
+    asked: TradeoffRequest
 
     def __iter__(self) -> Iterator[Trial]:
         """Give every trial once; its repeats are scans of their own."""
-        return starmap(Trial, product(self.scenes, self.fogs, self.exposures, self.lines))
+        asked = self.asked
+        scenes, fogs, lines = asked.scenes or (None,), asked.fogs or (None,), asked.lines or (None,)
+        return starmap(Trial, product(scenes, fogs, asked.exposures, lines))
 
     def first(self) -> Trial:
         """The first trial, with the lines that the config has."""
@@ -60,7 +55,7 @@ class Trials:
 
     def require_plans(self) -> None:
         """Raise UsageError with all problems of such scans; the fewest and the most exposures are tried everywhere."""
-        ends = {min(self.exposures), max(self.exposures)}
+        ends = {min(self.asked.exposures), max(self.asked.exposures)}
         configs = self.configs()
         _all_or_problems(
             [trial for trial in self if trial.exposures in ends], lambda trial: require_plan(configs[trial])
@@ -136,7 +131,7 @@ def run_tradeoff(trials: Trials, wish: Wish | None, progress: Progress | None = 
     done = with_fronts(rows)
     return Tradeoff(
         rows=done,
-        ci95_by="repeats" if trials.repeat > 1 else "blocks of a map",
+        ci95_by="repeats" if trials.asked.repeat > 1 else "blocks of a map",
         wish=wish,
         answer=None if wish is None else choose(done, wish),
         verdict=verdict,
@@ -155,16 +150,16 @@ def require_methods(estimators: Sequence[str], filters: Sequence[str]) -> list[s
 
 def _rows(trials: Trials, progress: Progress | None) -> Iterator[list[TradeoffRow]]:
     """Give the rows of one trial after the other."""
-    configs = trials.configs()
-    bar = _Bar(progress, trials.repeat * sum(map(_frames_of, configs.values())))
-    limits = SceneLimits(trials.exposures)
-    scans = len(configs) * trials.repeat
+    configs, asked = trials.configs(), trials.asked
+    bar = _Bar(progress, asked.repeat * sum(map(_frames_of, configs.values())))
+    limits = SceneLimits(asked.exposures)
+    scans = len(configs) * asked.repeat
     numbers = count(1)
     for trial, config in configs.items():
         scores: dict[Method, list[MapScore]] = {}
-        for seed in range(trials.seed, trials.seed + trials.repeat):
+        for seed in range(asked.seed, asked.seed + asked.repeat):
             with part(f"scan {next(numbers)} of {scans}"):
-                found = score_methods(config, trials.estimators, trials.filters, seed, bar.within(_frames_of(config)))
+                found = score_methods(config, asked.estimators, asked.filters, seed, bar.within(_frames_of(config)))
             for method, score in found.items():
                 scores.setdefault(method, []).append(score)
             bar.add(_frames_of(config))
@@ -174,9 +169,9 @@ def _rows(trials: Trials, progress: Progress | None) -> Iterator[list[TradeoffRo
             row_of(scene, trial.fog, TrialSetting(*method, trial.exposures, lines), each)
             for method, each in scores.items()
         ]
-        if trials.limits:
+        if asked.limits:
             tell_stage("finding what the light allows")
-        yield limits.beside(rows, config) if trials.limits else rows
+        yield limits.beside(rows, config) if asked.limits else rows
 
 
 def _frames_of(config: RigConfig) -> int:

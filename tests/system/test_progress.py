@@ -9,7 +9,7 @@ import pytest
 
 from rig import api
 from rig.cli.tables import effects_table
-from rig.scan.acquisition import ScanProgress
+from rig.scan.monitor import ScanProgress
 from tests.system.conftest import Rig
 
 

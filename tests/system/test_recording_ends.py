@@ -16,7 +16,7 @@ from rig.depth.reconstruct import MapResult, Reconstructor
 from rig.recording.writer import Recorder
 from rig.run_folder.folder import RunFolder
 from rig.scan.acquisition import Acquisition
-from rig.scan.counting import AcquiredMap, Mapping, MapQueue
+from rig.scan.counting import AcquiredMap, CountingThread, MapQueue
 from tests.system.conftest import Rig
 
 SCAN = ("--maps", 20, "--record", "--out", "run")
@@ -144,14 +144,14 @@ def test_a_second_ctrl_c_still_waits_for_what_was_received(
     interrupt_while_estimating(1, monkeypatch)
     join, joined = Recorder.join, []
 
-    def again(self: Mapping, timeout_s: float) -> bool:
+    def again(self: CountingThread, timeout_s: float) -> bool:
         raise KeyboardInterrupt
 
     def noted(self: Recorder, timeout_s: float) -> bool:
         joined.append(join(self, timeout_s))
         return joined[-1]
 
-    monkeypatch.setattr(Mapping, "join", again)
+    monkeypatch.setattr(CountingThread, "join", again)
     monkeypatch.setattr(Recorder, "join", noted)
     assert rig("scan", small, *SCAN).code == 4
     assert joined == [True]

@@ -18,7 +18,6 @@ from rig import api
 from rig.errors import DamagedRecordingError, UsageError
 from rig.run_folder.manifest import read_manifest, sealed_text
 from rig.scan import scan as scanning
-from rig.scan.acquisition import Acquisition
 from tests.system.conftest import Rig
 from tests.system.small_rig import config, write_rig
 
@@ -42,7 +41,7 @@ def learned(tmp_path_factory: pytest.TempPathFactory) -> Path:
 def lossy(tmp_path_factory: pytest.TempPathFactory) -> Path:
     """Maps with gaps, from two starts of the SPAD."""
     with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(scanning, "Acquisition", lambda *a, **k: Acquisition(*a, **{**k, "first_alone": True}))
+        patch.setattr(scanning, "_first_alone", lambda rig: True)
         return scan_of(tmp_path_factory.mktemp("lossy"), "argmax", 3, loss_probability=0.01)
 
 

@@ -13,7 +13,7 @@ from rig.devices import open as session
 from rig.devices.open import open_rig
 from rig.devices.prepare import HOLD_EXPOSURES, prepare
 from rig.errors import DevicesError, UsageError
-from rig.scan.acquisition import Acquisition
+from rig.scan.acquisition import Acquisition, AcquisitionRequest
 from tests.unit.rig.scan.fakes import FakeMaker
 
 SMALL = {"scan.columns": 8, "scan.exposures": 2, "scan.command_range": [-0.1, 0.1]}
@@ -109,7 +109,8 @@ def test_the_simulated_rig_scans_both_ways_and_the_same_frames_with_the_same_see
             assert isinstance(rig.clock, VirtualClock)
             plan, timing = prepare(rig)
             maker = FakeMaker()
-            runs.append((maker.volumes, [found.sweep for found in Acquisition(rig, plan, timing, 2, maker).run()]))
+            acquired = Acquisition(rig, plan, timing, maker, AcquisitionRequest(maps=2))
+            runs.append((maker.volumes, [found.sweep for found in acquired.run()]))
             assert not rig.laser.status.emission
             assert rig.sync.status.outputs == 0
             assert not rig.scanner.status.moving
@@ -127,7 +128,7 @@ def test_lost_frames_of_the_simulated_spad_are_gaps():
     config = load_config("simulated", {**SMALL, "spad.lost_frames": [150, 151, 160]})
     with open_rig(config) as rig:
         plan, timing = prepare(rig)
-        (found,) = Acquisition(rig, plan, timing, 1, FakeMaker()).run()
+        (found,) = Acquisition(rig, plan, timing, FakeMaker(), AcquisitionRequest(maps=1)).run()
     sweep = found.sweep
     assert sweep.gaps == ((150, 151), (160, 160))
     assert sweep.frames.lost == 3

@@ -16,7 +16,8 @@ from rig.count.volume import SweepCounter
 from rig.depth.reconstruct import FogEstimate, MapResult
 from rig.devices.open import OpenRig
 from rig.geometry.stripe_table import StripeTable
-from rig.scan.acquisition import Acquisition
+from rig.scan.acquisition import Acquisition, AcquisitionRequest
+from rig.scan.monitor import Listeners
 from rig.threads import RowWorkers
 from tests.unit.rig.count.streams import SPAD, scan
 
@@ -197,8 +198,9 @@ def acquisition(rig, plan, maps, maker=None, **options):
     """An acquisition with the fakes, and little patience with silence."""
     period = int(100_000_000 / plan.frame_rate_hz)
     timing = SpadTiming(Fraction(100_000_000), period, period, STRIDE)
-    options = {"silence_s": 0.2, **options}
-    return Acquisition(rig, plan, timing, maps, maker or FakeMaker(), **options)
+    listeners = Listeners(**{name: options.pop(name) for name in ("live", "monitor") if name in options})
+    request = AcquisitionRequest(maps=maps, listeners=listeners, **{"silence_s": 0.2, **options})
+    return Acquisition(rig, plan, timing, maker or FakeMaker(), request)
 
 
 def wait_until(condition):

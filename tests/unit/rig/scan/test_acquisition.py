@@ -77,7 +77,7 @@ def test_an_interrupt_while_maps_are_awaited_makes_the_rig_safe():
 
     rig, log = fake_rig(PLAN, [stream_of(PLAN, 5, lag=LAG)])
     with pytest.raises(KeyboardInterrupt):
-        list(acquisition(rig, PLAN, 5, on_progress=told).run())
+        list(acquisition(rig, PLAN, 5, live=told).run())
     assert log == START + STOP
 
 
@@ -190,7 +190,7 @@ def test_a_stream_that_ends_without_the_closing_marker_is_an_error():
 def test_progress_is_told_on_the_way_and_at_the_end():
     told = []
     rig, _ = fake_rig(PLAN, [stream_of(PLAN, 2, lag=LAG)], size=16)
-    list(acquisition(rig, PLAN, 2, on_progress=told.append).run())
+    list(acquisition(rig, PLAN, 2, live=told.append).run())
     assert [p.frames for p in told] == sorted(p.frames for p in told)
     assert told[-1].sweeps == told[-1].maps == 2
     assert told[-1].lost == 0
@@ -200,7 +200,7 @@ def test_progress_is_told_on_the_way_and_at_the_end():
 def test_progress_ends_with_the_frames_planned_and_is_never_above_them():
     told = []
     rig, _ = fake_rig(PLAN, [stream_of(PLAN, 2, lag=LAG)], size=1000)  # the last block goes on behind the last marker
-    list(acquisition(rig, PLAN, 2, on_progress=told.append).run())
+    list(acquisition(rig, PLAN, 2, live=told.append).run())
     assert all(p.frames <= p.frames_planned for p in told)
     assert {p.frames_planned for p in told} == {math.ceil(PLAN.frames_for(2))}
     assert told[-1].frames == told[-1].frames_planned
@@ -220,7 +220,7 @@ def test_progress_names_the_stage_that_the_run_is_at(learns):
 
     rig, _ = fake_rig(PLAN, [stream_of(PLAN, 2, lag=LAG)], size=16, behaviour=lambda seq: seq or wait_to_be_told(seq))
     maker = FakeMaker(lambda index: (wait_to_be_told(index), wait_to_be_told(index)))
-    list(acquisition(rig, PLAN, 2, maker, learns=learns, on_progress=told, silence_s=PATIENCE_S).run())
+    list(acquisition(rig, PLAN, 2, maker, learns=learns, live=told, silence_s=PATIENCE_S).run())
     assert list(dict.fromkeys(stages)) == ["rendering", *["learning"] * learns, "estimating"]
 
 

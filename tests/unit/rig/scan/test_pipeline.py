@@ -98,7 +98,7 @@ def test_drop_counts_every_frame_it_drops_and_goes_on():
     rig, log = rig_of(can_wait=False)
     maker = stalled_maker(rig, N_BLOCKS // 2)
     told = []
-    acquired = acquisition(rig, PLAN, MAPS, maker, policy=Overload.DROP, on_progress=told.append)
+    acquired = acquisition(rig, PLAN, MAPS, maker, policy=Overload.DROP, live=told.append)
     maps = list(acquired.run())
     received, lost = accounted(maps)
     stages, counters = acquired.stages, acquired.counters
@@ -306,7 +306,7 @@ def test_a_recording_that_cannot_be_begun_is_refused(tmp_path):
 def test_the_monitor_sees_the_newest_block_small(tmp_path):
     rig, _ = rig_of()
     views = []
-    acquired = acquisition(rig, PLAN, MAPS, watch=views.append)
+    acquired = acquisition(rig, PLAN, MAPS, monitor=views.append)
     list(acquired.run())
     stages = acquired.stages
     assert len(views) == stages.monitor_updates >= 1
@@ -343,7 +343,7 @@ def test_a_monitor_that_raises_is_told_of_once_and_called_no_more(caplog):
         seen.append(view)
         raise ValueError("no window to draw in")
 
-    maps = list(acquisition(paced(rig), PLAN, 4, watch=watch, first_alone=True).run())
+    maps = list(acquisition(paced(rig), PLAN, 4, monitor=watch, first_alone=True).run())
     assert len(maps) == 4
     assert len(seen) == 1
     assert [record.levelno for record in caplog.records] == [logging.WARNING]
@@ -353,7 +353,7 @@ def test_a_monitor_that_raises_is_told_of_once_and_called_no_more(caplog):
 def test_a_monitor_that_hangs_costs_nothing_and_is_left_behind_with_a_warning(caplog):
     rig, log = rig_of()
     release, seen = threading.Event(), []
-    acquired = acquisition(rig, PLAN, MAPS, watch=lambda view: (seen.append(view), release.wait(PATIENCE_S)))
+    acquired = acquisition(rig, PLAN, MAPS, monitor=lambda view: (seen.append(view), release.wait(PATIENCE_S)))
     maps = list(acquired.run())
     assert (len(maps), accounted(maps)[1]) == (MAPS, 0)
     assert len(seen) == 1
@@ -396,8 +396,8 @@ def run_with_failure(stage, n, error, policy=Overload.ABORT, folder=None, can_wa
         maker,
         policy=policy,
         recording=recording,
-        watch=fail if stage == "monitor" else lambda view: None,
-        on_progress=fail if stage == "progress" else None,
+        monitor=fail if stage == "monitor" else lambda view: None,
+        live=fail if stage == "progress" else None,
     )
     maps, run = [], acquired.run()
     try:

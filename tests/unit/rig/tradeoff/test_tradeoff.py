@@ -17,6 +17,7 @@ from rig.count.volume import BIN_DARK, SweepCounter, SweepLayout
 from rig.depth.reconstruct import FogEstimate, MapResult
 from rig.errors import UsageError
 from rig.geometry.stripe_table import StripeTable
+from rig.requests import TradeoffRequest
 from rig.threads import RowWorkers
 from rig.tradeoff.choice import Wish, advice, choose, wish_of
 from rig.tradeoff.files import csv_text, tradeoff_svg
@@ -186,15 +187,7 @@ def test_what_is_kept_of_frames_counts_as_the_frames_do():
 def test_an_interrupt_leaves_the_rows_that_are_whole(monkeypatch, whole):
     trials = Trials(
         lambda trial: load_config("simulated", {"scan.exposures": trial.exposures}),
-        [None],
-        ["clear"],
-        [1, 3, 10],
-        [None],
-        ["edge"],
-        ["none"],
-        repeat=1,
-        seed=0,
-        limits=False,
+        TradeoffRequest(fogs=["clear"], exposures=[1, 3, 10], estimators=["edge"], filters=["none"], limits=False),
     )
     done = iter(range(whole))
 

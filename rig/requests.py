@@ -1,0 +1,132 @@
+"""What a user may ask for: one frozen dataclass a command, which the command line fills and `rig.api` takes.
+
+A field is declared here and nowhere else: its type, its default and a phrase that says what it is. `rig scan --help`
+prints the phrase, `help(ScanRequest)` has it for Python; `rig/cli/command.py` makes an option of each field.
+"""
+
+import inspect
+import os
+from collections.abc import Sequence
+from dataclasses import Field, dataclass, field, fields
+from pathlib import Path
+from typing import Any, TypeVar
+
+Default = TypeVar("Default")
+Request = TypeVar("Request")
+
+
+def option(
+    default: Default, about: str, *, unset: str = "", name: str = "", read_as: Any = None, least: int | None = None
+) -> Default:
+    """Declare a field of a request.
+
+    about: a phrase that says what it is. unset: the value that holds where none is given, in words.
+    name: of the command line's option, where it is not the field's. read_as: the type that the command line reads,
+    where it is not the field's. least: the smallest value.
+    """
+    told = {"about": about, "unset": unset, "name": name, "read_as": read_as, "least": least}
+    return field(default=default, metadata=told)
+
+
+def options_of(request: type) -> "list[Field[Any]]":
+    """The fields of a request in the order of its help: those of its own before those that it inherits."""
+    by_name = {each.name: each for each in fields(request)}
+    names = (name for part in request.__mro__ for name in inspect.get_annotations(part))
+    return [by_name[name] for name in dict.fromkeys(names)]
+
+
+def described(request: type[Request]) -> type[Request]:
+    """Complete the docstring of a request by a line for each field."""
+    told = [(each, each.metadata["unset"] or each.default) for each in options_of(request)]
+    lines = [f"{each.name}: {each.metadata['about']} (default: {default})." for each, default in told]
+    request.__doc__ = "\n".join([request.__doc__ or "", "", *lines])
+    return request
+
+
+@described
+@dataclass(frozen=True, slots=True, kw_only=True)
+class ReconstructRequest:
+    """Depth maps of frames that exist (`rig reconstruct`)."""
+
+    estimator: str | None = option(
+        None, "argmax, edge, likelihood or joint", unset="as configured or recorded, else likelihood"
+    )
+    filter: str | None = option(None, "none or median (5 x 5)", unset="as configured or recorded, else none")
+    min_confidence: float | None = option(
+        None, "answers below this do not enter the depth map", unset="as configured or recorded, else 0.5"
+    )
+    accept_calibration: bool = option(False, "use a calibration of another rig, failed or too old, all the same")
+    out: str | os.PathLike[str] | None = option(
+        None, "folder to write, new or empty", unset="nothing is written", read_as=Path | None
+    )
+
+
+@described
+@dataclass(frozen=True, slots=True, kw_only=True)
+class RunRequest(ReconstructRequest):
+    """A run with open devices."""
+
+    maps: int | None = option(1, "depth maps to take")
+    save: str | None = option(None, "maps to write: all, last or every N", unset="all")
+    record: bool = option(False, "write the frames into the folder too")
+    on_overload: str = option("abort", "where frames come too fast: abort, drop (and count) or block (wait)")
+    arm: bool = option(False, "let a real laser shine: the beam path is clear")
+
+
+@described
+@dataclass(frozen=True, slots=True, kw_only=True)
+class ScanRequest(RunRequest):
+    """A scan with a rig (`rig scan`)."""
+
+    scene: str | None = option(None, "a bundled scene, a scene file or a folder (simulated rigs)", unset="the config's")
+    exposures: int | None = option(None, "frames per column (K)", unset="the config's")
+    temporal_prior: bool | None = option(
+        None, "joint: hold each map to the last one a little", unset="as the config says"
+    )
+    seed: int = option(0, "seed of everything simulated")
+
+
+@described
+@dataclass(frozen=True, slots=True, kw_only=True)
+class ReplayRequest(RunRequest):
+    """A recording that is played through the live stack (`rig replay`)."""
+
+    clock: str = option("realtime", "realtime, max, x4 or x0.1, or step (Enter: one sweep more)")
+    loop: bool = option(False, "play it again and again, until Ctrl-C or --maps")
+    maps: int | None = option(None, "depth maps to make", unset="all")
+    config: Any = option(
+        None,
+        "a rig whose scanner, laser and sync source take part, like hil",
+        unset="they are recorded too",
+        read_as=str | None,
+    )
+    against_recording: bool = option(False, "the recorded drivers take part, against what was answered then")
+    threads: int | None = option(None, "threads that count and estimate", unset="as recorded")
+    block_frames: int | None = option(None, "most frames of a block", unset="5 ms", least=1)
+    save: str | None = option(None, "maps to write: all, last or every N", unset="all, with --loop last")
+    on_overload: str = option("abort", "where frames come too fast: abort and block wait, drop counts them")
+
+
+@described
+@dataclass(frozen=True, slots=True, kw_only=True)
+class TradeoffRequest:
+    """Scans of a simulated rig with all combinations of some settings (`rig tradeoff`)."""
+
+    scenes: Sequence[str] = option((), "scenes, separated by commas", unset="the config's", name="scene")
+    fogs: Sequence[str] = option((), "visibilities, or clear: 20m,50m,clear", unset="the scene's", name="fog")
+    exposures: Sequence[int] = option((), "frames per column (K)", unset="1,3,10")
+    lines: Sequence[int] = option((), "lines at once", unset="the config's")
+    estimators: Sequence[str] = option(
+        (), "of argmax, edge, likelihood, joint, by commas", unset="edge,likelihood,joint"
+    )
+    filters: Sequence[str] = option((), "of none, median (5 x 5), by commas", unset="none,median")
+    repeat: int = option(1, "scans of each, for the confidence intervals")
+    seed: int = option(0, "seed of the first of them")
+    limits: bool = option(True, "compare with the statistical limit of the scene's light")
+    time_budget: str | None = option(None, "'5 ms': what has the least error in it", unset="not asked")
+    error: str | None = option(None, "'0.1 px': what takes the least time for it", unset="not asked")
+    of: str = option("sensor", "whose time these mean: sensor or compute")
+    accept_calibration: bool = option(False, "use a calibration of another rig, failed or too old, all the same")
+    out: str | os.PathLike[str] | None = option(
+        None, "folder to write, new or empty", unset="nothing is written", read_as=Path | None
+    )
