@@ -8,6 +8,7 @@ import inspect
 import os
 from collections.abc import Sequence
 from dataclasses import Field, dataclass, field, fields
+from fractions import Fraction
 from pathlib import Path
 from typing import Any, TypeVar
 
@@ -123,10 +124,59 @@ class TradeoffRequest:
     repeat: int = option(1, "scans of each, for the confidence intervals")
     seed: int = option(0, "seed of the first of them")
     limits: bool = option(True, "compare with the statistical limit of the scene's light")
-    time_budget: str | None = option(None, "'5 ms': what has the least error in it", unset="not asked")
-    error: str | None = option(None, "'0.1 px': what takes the least time for it", unset="not asked")
+    time_budget: str | None = option(None, "'5 ms': what has the least error in it")
+    error: str | None = option(None, "'0.1 px': what takes the least time for it")
     of: str = option("sensor", "whose time these mean: sensor or compute")
     accept_calibration: bool = option(False, "use a calibration of another rig, failed or too old, all the same")
     out: str | os.PathLike[str] | None = option(
         None, "folder to write, new or empty", unset="nothing is written", read_as=Path | None
     )
+
+
+@described
+@dataclass(frozen=True, slots=True, kw_only=True)
+class CutRequest:
+    """A part of a recording (`rig cut`): exactly one of `maps`, `frames` and `time`."""
+
+    maps: str | None = option(None, "A:B, maps A to before B, from 0")
+    frames: str | None = option(None, "A:B, frames A to before B")
+    time: str | None = option(None, "A:B, seconds A to B from the first frame")
+    start: int = option(0, "of --frames and --time: which start of the SPAD, from 0")
+
+
+@described
+@dataclass(frozen=True, slots=True, kw_only=True)
+class ImportRequest:
+    """How frames in another program's files are read (`rig import`)."""
+
+    form: str | None = option(
+        None,
+        "pi-imaging: packed or sparse; swissspad2: half or full; photoncube: packed",
+        unset="as the file looks; half",
+    )
+    frame_rate: str | Fraction | None = option(
+        None, 'such as "97.7 kHz"; hertz as a fraction', unset="not known", read_as=str | None
+    )
+    turn_deg: int | None = option(
+        None,
+        "turn frames counter-clockwise by 0, 90, 180 or 270 degrees",
+        unset="90 for pi-imaging, as its driver does, else 0",
+        name="rotate",
+    )
+    rows: int | None = option(None, "pi-imaging: 512, or 1024 of the 1M sensor", unset="512")
+
+
+@described
+@dataclass(frozen=True, slots=True, kw_only=True)
+class ExportRequest:
+    """Pictures and films of a run (`rig export`)."""
+
+    view: str | None = option(
+        None,
+        "png, mp4: depth, intensity or frames (sums of recorded frames)",
+        unset="the first of them that there is",
+    )
+    frames_per_picture: int | None = option(
+        None, "frames summed for a picture of view frames", unset="100", name="frames"
+    )
+    pictures_per_s: float | None = option(None, "pictures of a film a second", unset="25", name="fps")

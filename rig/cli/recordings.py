@@ -5,8 +5,9 @@ from typing import TYPE_CHECKING, Annotated
 
 import typer
 
-from rig.cli.command import JsonOption, command, print_json, say
+from rig.cli.command import JsonOption, asks, command, print_json, say
 from rig.cli.progress import progress
+from rig.requests import CutRequest, ExportRequest, ImportRequest
 
 if TYPE_CHECKING:
     from rig.recording.open import RecordingInfo
@@ -70,27 +71,18 @@ def info_command(run: RunArgument, as_json: JsonOption = False) -> int:
     return 0
 
 
+@asks(CutRequest)
 def cut_command(
+    request: CutRequest,
     run: RunArgument,
     out: Annotated[Path, typer.Option("--out", help="folder to write, new or empty", show_default=False)],
-    maps: Annotated[
-        str | None, typer.Option("--maps", metavar="A:B", help="maps A to before B, from 0", show_default=False)
-    ] = None,
-    frames: Annotated[
-        str | None, typer.Option("--frames", metavar="A:B", help="frames A to before B", show_default=False)
-    ] = None,
-    time: Annotated[
-        str | None,
-        typer.Option("--time", metavar="A:B", help="seconds A to B from the first frame", show_default=False),
-    ] = None,
-    start: Annotated[int, typer.Option("--start", help="of --frames and --time: which start of the SPAD, from 0")] = 0,
     as_json: JsonOption = False,
 ) -> int:
     """Write a part of a recording to a folder of its own, with all that is needed to reconstruct it."""
     from rig import api
 
     with progress(compiles=False):
-        content = api.cut(run, out, maps=maps, frames=frames, time=time, start=start)
+        content = api.cut(run, out, request)
     if as_json:
         print_json({"out": str(out), "recording": content["recording"], "cut": content["cut"]})
     else:
@@ -164,7 +156,9 @@ def register_exchange(app: typer.Typer) -> None:
 
 
 @command
+@asks(ImportRequest)
 def import_command(
+    request: ImportRequest,
     kind: Annotated[
         str, typer.Argument(metavar="KIND", help="pi-imaging, swissspad2 or photoncube", show_default=False)
     ],
@@ -172,37 +166,13 @@ def import_command(
         list[Path], typer.Argument(metavar="FILES", help="files in order, or folders of them", show_default=False)
     ],
     out: Annotated[Path, typer.Option("--out", help="folder to write, new or empty", show_default=False)],
-    form: Annotated[
-        str | None,
-        typer.Option(
-            "--form",
-            help="pi-imaging: packed or sparse; swissspad2: half or full; photoncube: packed",
-            show_default="as the file looks; half",
-        ),
-    ] = None,
-    frame_rate: Annotated[
-        str | None,
-        typer.Option("--frame-rate", metavar="RATE", help='such as "97.7 kHz"', show_default="not known"),
-    ] = None,
-    rotate: Annotated[
-        int | None,
-        typer.Option(
-            "--rotate",
-            metavar="DEGREES",
-            help="turn frames counter-clockwise by 0, 90, 180 or 270",
-            show_default="90 for pi-imaging, as its driver does, else 0",
-        ),
-    ] = None,
-    rows: Annotated[
-        int | None, typer.Option("--rows", help="pi-imaging: 512, or 1024 of the 1M sensor", show_default="512")
-    ] = None,
     as_json: JsonOption = False,
 ) -> int:
     """Make a recording from the frames in another program's files."""
     from rig import api
 
     with progress(compiles=False):
-        result = api.import_frames(kind, files, out, form=form, frame_rate=frame_rate, turn_deg=rotate, rows=rows)
+        result = api.import_frames(kind, files, out, request)
     for hint in result.hints:
         say(f"warning: {hint}")
     if as_json:
@@ -216,31 +186,21 @@ def import_command(
 
 
 @command
+@asks(ExportRequest)
 def export_command(
+    request: ExportRequest,
     run: Annotated[Path, typer.Argument(metavar="RUN", help="folder of a run", show_default=False)],
     kind: Annotated[str, typer.Argument(metavar="KIND", help="npy, hdf5, ply, png or mp4", show_default=False)],
     out: Annotated[
         Path | None, typer.Option("--out", help="folder to write, new or empty", show_default="RUN-KIND")
     ] = None,
-    view: Annotated[
-        str | None,
-        typer.Option(
-            "--view",
-            help="png, mp4: depth, intensity or frames (sums of recorded frames)",
-            show_default="the first of them that there is",
-        ),
-    ] = None,
-    frames: Annotated[
-        int | None, typer.Option("--frames", help="frames summed for a picture of view frames", show_default="100")
-    ] = None,
-    fps: Annotated[float | None, typer.Option("--fps", help="pictures of a film a second", show_default="25")] = None,
     as_json: JsonOption = False,
 ) -> int:
     """Write a run in a form that other programs read."""
     from rig import api
 
     with progress(compiles=False):
-        result = api.export_run(run, kind, out=out, view=view, frames_per_picture=frames, pictures_per_s=fps)
+        result = api.export_run(run, kind, request, out=out)
     for line in result.damage:
         say(f"warning: {line}")
     if as_json:

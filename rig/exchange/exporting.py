@@ -19,6 +19,7 @@ from rig.exchange.pictures import VIEWS, Picture, View
 from rig.progress import Progress, counted
 from rig.recording.inputs import read_model, reconstruct_line
 from rig.recording.open import SEGMENTS, require_recording
+from rig.requests import ExportRequest
 from rig.run_folder.folder import RunFolder
 from rig.run_folder.manifest import read_manifest
 
@@ -28,20 +29,6 @@ PICTURE_KINDS: Final = ("png", "mp4")
 """Kinds that show a view."""
 FILMS_PER_S: Final = 25.0
 FRAMES_PER_PICTURE: Final = 100
-
-
-@dataclass(frozen=True, slots=True)
-class ExportOptions:
-    """Options of pictures and films (png, mp4).
-
-    view: depth, intensity or frames; None is the first of these that the run has.
-    frames_per_picture: frames summed for one picture of frames; None is FRAMES_PER_PICTURE.
-    pictures_per_s: rate of a film; None is FILMS_PER_S.
-    """
-
-    view: str | None = None
-    frames_per_picture: int | None = None
-    pictures_per_s: float | None = None
 
 
 @dataclass(frozen=True, slots=True)
@@ -72,20 +59,19 @@ class ExportResult:
 def export_run(
     run: str | os.PathLike[str],
     kind: str,
-    out: str | os.PathLike[str] | None = None,
-    options: ExportOptions | None = None,
+    out: str | os.PathLike[str] | None,
+    request: ExportRequest,
     progress: Progress | None = None,
 ) -> ExportResult:
     """Write `run` in another form to a new folder: `out`, or RUN-KIND beside the run; it appears whole or not at all.
 
     Raises UsageError where the run has nothing of that kind, or h5py is not installed.
     """
-    options = options or ExportOptions()
     run = Path(run)
-    _check(run, kind, options)
+    _check(run, kind, request)
     target = Path(out) if out is not None else run.absolute().with_name(f"{run.absolute().name}-{kind}")
     with RunFolder(target) as folder:
-        export = _Export(run, folder, options, progress)
+        export = _Export(run, folder, request, progress)
         try:
             getattr(export, f"write_{kind}")()
         except OSError as error:
@@ -103,10 +89,10 @@ def export_run(
 class _Export:
     """An export under way: a method for each kind."""
 
-    def __init__(self, run: Path, folder: RunFolder, options: ExportOptions, progress: Progress | None) -> None:
-        self._run, self._folder, self._options = run, folder, options
+    def __init__(self, run: Path, folder: RunFolder, request: ExportRequest, progress: Progress | None) -> None:
+        self._run, self._folder, self._asked = run, folder, request
         self._told = counted("writing", "frames", progress)
-        self._frames_per_picture = options.frames_per_picture or FRAMES_PER_PICTURE
+        self._frames_per_picture = request.frames_per_picture or FRAMES_PER_PICTURE
         self._maps = MapFiles(run)
         self.log: FrameLog | None = None
         self.n_maps = self.n_frames = 0
@@ -147,7 +133,7 @@ class _Export:
         """Write a film."""
         view = self._view()
         film = self._folder.place(f"{view}.mp4")
-        self._count(view, pictures.write_mp4(self._pictures(view), film, self._options.pictures_per_s or FILMS_PER_S))
+        self._count(view, pictures.write_mp4(self._pictures(view), film, self._asked.pictures_per_s or FILMS_PER_S))
 
     @property
     def _recorded(self) -> bool:
@@ -182,15 +168,13 @@ class _Export:
             "intensity": bool(self._maps.files("intensity", ".png")),
             "frames": self._recorded,
         }
-        view = next(
-            (one for one in VIEWS if one == self._options.view or (not self._options.view and there[one])), None
-        )
+        view = next((one for one in VIEWS if one == self._asked.view or (not self._asked.view and there[one])), None)
         if view == "frames" and not there[view]:
             require_recording(self._run)
         if view is None or not there[view]:
             what = f"no {view}" if view else "nothing to show"
             raise UsageError(f"{self._run} holds {what}; {self._make_maps()}")
-        if self._options.frames_per_picture and view != "frames":
+        if self._asked.frames_per_picture and view != "frames":
             raise UsageError(f"pictures of {view} sum no frames; name --view frames, or leave --frames out")
         return view
 
@@ -215,7 +199,7 @@ class _Export:
             )
 
 
-def _check(run: Path, kind: str, options: ExportOptions) -> None:
+def _check(run: Path, kind: str, request: ExportRequest) -> None:
     problems = []
     known = kind in EXPORT_KINDS
     pictureless, filmless = known and kind not in PICTURE_KINDS, known and kind != "mp4"
@@ -223,11 +207,11 @@ def _check(run: Path, kind: str, options: ExportOptions) -> None:
         problems.append(f"export kind {kind!r} is unknown; choose one of {', '.join(EXPORT_KINDS)}")
     if not run.exists():
         problems.append(f"{run} does not exist; name the folder of a run")
-    if options.view is not None and options.view not in VIEWS:
-        problems.append(f"view {options.view!r} is unknown; choose one of {', '.join(VIEWS)}")
-    elif options.view is not None and pictureless:
-        problems.append(f"view {options.view!r} is of pictures, {kind} has none; export png or mp4, or leave it out")
-    summed, per_s = options.frames_per_picture, options.pictures_per_s
+    if request.view is not None and request.view not in VIEWS:
+        problems.append(f"view {request.view!r} is unknown; choose one of {', '.join(VIEWS)}")
+    elif request.view is not None and pictureless:
+        problems.append(f"view {request.view!r} is of pictures, {kind} has none; export png or mp4, or leave it out")
+    summed, per_s = request.frames_per_picture, request.pictures_per_s
     if summed is not None and pictureless:
         problems.append(
             f"--frames {summed} are summed for pictures, {kind} has none; export png or mp4, or leave it out"

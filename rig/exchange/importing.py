@@ -20,11 +20,13 @@ from calibration.errors import digits
 from drivers.frames import FRAME_RECORD, BlockFlag, BlockHeader, FrameBlock, frame_bytes, packed_row_bytes
 from drivers.spads.orientation import QuarterTurn, turn_packed, turned_size
 from drivers.spb1 import BlockLayout, frames_per_block
+from drivers.units import parse_exact
 from rig.errors import UsageError
 from rig.exchange import photoncube, pi_imaging, swissspad2
 from rig.exchange.foreign import ForeignFrames, gather
 from rig.progress import Progress, counted
 from rig.recording.writer import Recording
+from rig.requests import ImportRequest
 from rig.run_folder.folder import RunFolder
 from rig.run_folder.manifest import MANIFEST
 from rig.scan.run import versions
@@ -67,44 +69,31 @@ class ImportResult:
         return {name: getattr(self, name) for name in self.__slots__}
 
 
-@dataclass(frozen=True, slots=True)
-class ImportOptions:
-    """Options of reading foreign files.
-
-    form: packed or sparse (pi-imaging), half or full (swissspad2), packed (photoncube); None is as seen from the file,
-      or half.
-    frame_rate: None where it is not known.
-    turn_deg: counter-clockwise; None is 90 for pi-imaging, otherwise 0.
-    rows: of the sensor, pi-imaging only; None is 512.
-    """
-
-    form: str | None = None
-    frame_rate: Fraction | None = None
-    turn_deg: int | None = None
-    rows: int | None = None
-
-
 def import_frames(
     kind: str,
     files: Iterable[str | os.PathLike[str]],
     out: str | os.PathLike[str],
-    options: ImportOptions | None = None,
+    request: ImportRequest,
     progress: Progress | None = None,
 ) -> ImportResult:
     """Write the frames of `files` to a new run folder `out`; it appears whole or not at all.
 
     Raises UsageError, a line per problem, for files or options that cannot be used.
     """
-    options = options or ImportOptions()
-    turn = _checked_turn(kind, options)
+    asked = request.frame_rate
+    try:
+        given = parse_exact(asked, "frequency") if isinstance(asked, str) else asked
+    except ValueError as error:
+        raise UsageError(f"frame rate {error}") from None
+    turn = _checked_turn(kind, request)
     sources = gather(files, _SUFFIXES[kind])
-    foreign = _opened(kind, sources, options)
+    foreign = _opened(kind, sources, request)
     if turn and (foreign.width % 8 or foreign.height % 8):
         raise UsageError(
             f"frames of {foreign.width} x {foreign.height} pixels cannot be turned, sizes that are no multiples of 8 "
             "stay as they are; import with --rotate 0"
         )
-    rate = foreign.frame_rate if options.frame_rate is None else options.frame_rate
+    rate = foreign.frame_rate if given is None else given
     if rate is not None and not _MIN_RATE_HZ <= rate <= _MAX_TICK_HZ:
         raise UsageError(f"frame rate {float(rate):g} Hz is outside {_MIN_RATE_HZ} to {_MAX_TICK_HZ} Hz")
     width, height = turned_size(foreign.width, foreign.height, turn)
@@ -151,34 +140,34 @@ def import_frames(
     )  # fmt: skip
 
 
-def _checked_turn(kind: str, options: ImportOptions) -> QuarterTurn:
+def _checked_turn(kind: str, request: ImportRequest) -> QuarterTurn:
     """Check that all options fit the kind, and return the quarter turn."""
     if kind not in IMPORT_KINDS:
         raise UsageError(f"import kind {kind!r} is unknown; choose one of {', '.join(IMPORT_KINDS)}")
     problems = []
-    if options.form is not None and options.form not in _FORMS[kind]:
+    if request.form is not None and request.form not in _FORMS[kind]:
         known = f"choose {' or '.join(_FORMS[kind])}, or leave --form out"
-        problems.append(f"{kind} has no form {options.form!r}; {known}")
-    turn = _UPRIGHT_DEG.get(kind, 0) if options.turn_deg is None else options.turn_deg
+        problems.append(f"{kind} has no form {request.form!r}; {known}")
+    turn = _UPRIGHT_DEG.get(kind, 0) if request.turn_deg is None else request.turn_deg
     turns = get_args(QuarterTurn)
     if turn not in turns:
         problems.append(f"frames cannot be turned by {turn} degrees; choose one of {', '.join(map(str, turns))}")
-    if options.rows is not None and kind != "pi-imaging":
-        problems.append(f"rows is {options.rows}, but {kind} files say their size themselves; leave --rows out")
-    elif options.rows is not None and options.rows not in (512, 1024):
-        problems.append(f"rows is {options.rows}; a SPAD512S has 512, its 1M flavour 1024")
+    if request.rows is not None and kind != "pi-imaging":
+        problems.append(f"rows is {request.rows}, but {kind} files say their size themselves; leave --rows out")
+    elif request.rows is not None and request.rows not in (512, 1024):
+        problems.append(f"rows is {request.rows}; a SPAD512S has 512, its 1M flavour 1024")
     if problems:
         raise UsageError.of(problems)
     return next(one for one in turns if one == turn)
 
 
-def _opened(kind: str, sources: list[Path], options: ImportOptions) -> ForeignFrames:
+def _opened(kind: str, sources: list[Path], request: ImportRequest) -> ForeignFrames:
     if kind == "pi-imaging":
-        form = next((form for form in get_args(pi_imaging.Form) if form == options.form), None)
-        return pi_imaging.open_pi_imaging(sources, form, options.rows or pi_imaging.ROWS)
+        form = next((form for form in get_args(pi_imaging.Form) if form == request.form), None)
+        return pi_imaging.open_pi_imaging(sources, form, request.rows or pi_imaging.ROWS)
     if kind == "swissspad2":
-        return swissspad2.open_swissspad2(sources, "full" if options.form == "full" else "half")
-    return photoncube.open_photoncube(sources, packed=options.form == "packed")
+        return swissspad2.open_swissspad2(sources, "full" if request.form == "full" else "half")
+    return photoncube.open_photoncube(sources, packed=request.form == "packed")
 
 
 def _turned(foreign: ForeignFrames, turn: QuarterTurn) -> Iterator[NDArray[np.uint8]]:
