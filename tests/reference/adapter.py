@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 import tempfile
+import time
+from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
@@ -19,26 +21,30 @@ def reconstruct(
     exposures: int,
     *,
     estimator: str = "likelihood",
-    filter: str = "none",
+    filters: Sequence[str] = ("none",),
     threads: int = 2,
-) -> Any:
-    """The project's MapResult of one map of counts (columns, H, W); it reads the calibration from a file."""
-    reconstructor = reconstructor_of(point, estimator, filter, threads)
-    geometry = reconstructor.geometry
-    part = windowed(counts, geometry.x0, geometry.window)
-    return reconstructor.map(volume_of(reconstructor, part, exposures))
+) -> list[Any]:
+    """The project's MapResult of one map of counts (columns, H, W) with each filter, estimated once."""
+    maker = reconstructor_of(point, estimator, threads=threads)
+    volume = volume_of(maker, windowed(counts, maker.geometry.x0, maker.geometry.window), exposures)
+    begun = time.perf_counter()
+    stripe = maker.estimator.estimate(volume, maker.geometry)
+    estimate_s = time.perf_counter() - begun
+    return [maker.complete(stripe, volume, filter, estimate_s) for filter in filters]
 
 
 def reconstructor_of(
     point: WorkingPoint,
     estimator: str,
-    filter: str = "none",
+    *,
     threads: int = 2,
     lines: Any = None,
-    *,
     temporal_prior: bool = False,
 ) -> Any:
-    """The project's Reconstructor for the rig of a working point; it has learned nothing yet. lines: a LineGrid."""
+    """The project's Reconstructor for the rig of a working point, whose calibration it reads from a file.
+
+    It has learned nothing yet. lines: a LineGrid.
+    """
     from calibration.files.rig_file import load_rig_model
     from rig.depth.reconstruct import Reconstructor
 
@@ -46,7 +52,7 @@ def reconstructor_of(
         model = load_rig_model(point.write_calibration(Path(folder)))
     commands = np.arange(point.geometry.columns, dtype=np.float64)
     return Reconstructor(
-        model, commands, DEPTH_RANGE_M, estimator=estimator, filter=filter, min_confidence=0.5, threads=threads,
+        model, commands, DEPTH_RANGE_M, estimator=estimator, filter="none", min_confidence=0.5, threads=threads,
         lines=lines, temporal_prior=temporal_prior,
     )  # fmt: skip
 

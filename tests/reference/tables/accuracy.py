@@ -8,19 +8,18 @@ estimator's mean error over the genie's, both without filter. Several seeds are 
 
 from __future__ import annotations
 
-import argparse
 import sys
 import time
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, replace
-from pathlib import Path
 
 import numpy as np
+from numpy.typing import NDArray
 
 from tests.reference.adapter import reconstruct
 from tests.reference.genie import Genie
 from tests.reference.geometry import Geometry
-from tests.reference.scene import Scene, load_scene, procedural_scene, scene_names
+from tests.reference.tables.printed import Table, parser_of, scenes_asked
 from tests.reference.working_point import POINTS, WorkingPoint, score
 
 ESTIMATORS = ("argmax", "edge", "likelihood")
@@ -31,89 +30,58 @@ RIGS = {
     "rectified": {},
     "turned": {"side": "right", "roll_deg": 3.0, "k1": -0.35, "axis_tilt_z_deg": 2.0, "axis_tilt_x_deg": 3.0},
 }
-FIGURES = ("mean_abs", "median_abs", "within_1px", "missing", "mean_abs_rounded", "mean_abs_charged")
-
-
-@dataclass(frozen=True, slots=True)
-class Line:
-    """One row of the table: figures of one estimator on one scene, point and number of exposures."""
-
-    point: str
-    scene: str
-    exposures: int
-    estimator: str
-    figures: dict[str, float]
-    ratio: float
-    seconds: float
-
-
-def measure(
-    scene: Scene,
-    point_name: str,
-    exposures: int,
-    *,
-    seeds: Sequence[int] = (1,),
-    rig: str = "rectified",
-    row_step: int = 1,
-    estimators: Sequence[str] = ESTIMATORS,
-    filters: Sequence[str] = FILTERS,
-    cosine: bool = False,
-    fine: bool = False,
-    columns: int = 500,
-) -> Iterator[Line]:
-    """Lines of the genie, then of every estimator; `row_step` thins the rows that are scored (and the genie's work)."""
-    height, width = scene.shape
-    geometry = Geometry.build(width=width, height=height, columns=columns, **RIGS[rig])  # type: ignore[arg-type]
-    point = WorkingPoint(scene, replace(POINTS[point_name], cosine=cosine), geometry)
-    rows = slice(None, None, row_step)
-    truth, trusted = point.truth()[rows], point.trusted[rows]
-    gathered: dict[str, list[dict[str, float]]] = {}
-    seconds: dict[str, float] = {}
-    for seed in seeds:
-        counts = point.counts(exposures, seed)
-        genies = {"genie": Genie(), **({"genie (quarter px)": FINE_GENIE} if fine else {})}
-        for name, genie in genies.items():
-            begun = time.perf_counter()
-            x = genie.estimate(point, counts, exposures, rows)[rows]
-            seconds[name] = time.perf_counter() - begun
-            gathered.setdefault(name, []).append(score(x, truth, trusted))
-        for estimator in estimators:
-            for filtered in filters:
-                name = estimator if filtered == "none" else f"{estimator} + {filtered}"
-                result = reconstruct(point, counts, exposures, estimator=estimator, filter=filtered)
-                seconds[name] = result.compute_s
-                gathered.setdefault(name, []).append(score(result.stripe.x_px[rows], truth, trusted))
-    reference = float(np.mean([one["mean_abs"] for one in gathered["genie"]]))
-    for name, scores in gathered.items():
-        figures = {figure: float(np.mean([one[figure] for one in scores])) for figure in FIGURES}
-        yield Line(point_name, scene.name, exposures, name, figures, figures["mean_abs"] / reference, seconds[name])
-
-
 TITLES = (
     "point", "scene", "K", "estimator", "mean abs px", "ratio to genie", "median px", "within 1 px", "missing",
     "rounded px", "s",
 )  # fmt: skip
-HEADER = "| " + " | ".join(TITLES) + " |\n" + "|---" * len(TITLES) + "|\n"
 
 
-def as_markdown(line: Line) -> str:
-    """One table row."""
-    f = line.figures
-    return (
-        f"| {line.point} | {line.scene} | {line.exposures} | {line.estimator} | {f['mean_abs']:.3f} | {line.ratio:.2f} "
-        f"| {f['median_abs']:.3f} | {f['within_1px']:.3f} | {f['missing']:.3f} | {f['mean_abs_rounded']:.3f} "
-        f"| {line.seconds:.2f} |\n"
-    )
+@dataclass(frozen=True, slots=True)
+class Measurement:
+    """Estimators and filters to measure on every `row_step`-th row. genies: by name; `genie` is among them."""
+
+    estimators: Sequence[str] = ESTIMATORS
+    filters: Sequence[str] = FILTERS
+    genies: dict[str, Genie] | None = None
+    row_step: int = 1
+
+    def of(
+        self, point: WorkingPoint, counts: NDArray[np.unsignedinteger], exposures: int
+    ) -> Iterator[tuple[str, str, dict[str, float], float]]:
+        """Estimator, filter, figures and seconds of one map of counts (columns, H, W), the genies' first."""
+        rows = slice(None, None, self.row_step)
+        truth, trusted = point.truth()[rows], point.trusted[rows]
+        for name, genie in (self.genies or {}).items():
+            begun = time.perf_counter()
+            x = genie.estimate(point, counts, exposures, rows)[rows]
+            yield name, "none", score(x, truth, trusted), time.perf_counter() - begun
+        for estimator in self.estimators:
+            results = reconstruct(point, counts, exposures, estimator=estimator, filters=self.filters)
+            for filter, result in zip(self.filters, results, strict=True):
+                yield estimator, filter, score(result.stripe.x_px[rows], truth, trusted), result.compute_s
+
+    def means(self, point: WorkingPoint, exposures: int, seeds: int) -> Iterator[tuple[str, dict[str, float], float]]:
+        """Name, mean figures and seconds of every estimator and filter over maps of so many seeds."""
+        gathered: dict[str, list[dict[str, float]]] = {}
+        seconds: dict[str, float] = {}
+        for seed in range(1, seeds + 1):
+            for estimator, filter, figures, took_s in self.of(point, point.counts(exposures, seed), exposures):
+                name = named(estimator, filter)
+                gathered.setdefault(name, []).append(figures)
+                seconds[name] = took_s
+        for name, found in gathered.items():
+            yield name, {figure: float(np.mean([one[figure] for one in found])) for figure in found[0]}, seconds[name]
+
+
+def named(estimator: str, filter: str) -> str:
+    """An estimator with its filter, in words."""
+    return estimator if filter == "none" else f"{estimator} + {filter}"
 
 
 def main(arguments: Sequence[str] | None = None) -> int:
     """Print the table, and write it where asked."""
-    parser = argparse.ArgumentParser(
-        prog="python -m tests.reference.tables.accuracy", description=__doc__.splitlines()[0]
-    )
-    parser.add_argument("--scenes", help="comma-separated; 'procedural' is the built-in one; default: all prepared")
+    parser = parser_of("tests.reference.tables.accuracy", __doc__, points="report,dense,clear")
     parser.add_argument("--exposures", help="comma-separated; default depends on the point")
-    parser.add_argument("--points", default="report,dense,clear", help=f"of {', '.join(POINTS)}")
     parser.add_argument("--seeds", type=int, default=1, help="number of seeds averaged")
     parser.add_argument("--rig", choices=sorted(RIGS), default="rectified")
     parser.add_argument("--estimators", default=",".join(ESTIMATORS))
@@ -121,27 +89,27 @@ def main(arguments: Sequence[str] | None = None) -> int:
     parser.add_argument("--row-step", type=int, default=1, help="score every n-th row only")
     parser.add_argument("--cosine", action="store_true", help="stripe with the cosine of the camera's side")
     parser.add_argument("--fine", action="store_true", help="also a genie with quarter-pixel labels")
-    parser.add_argument("--markdown", type=Path, help="file for the table")
     options = parser.parse_args(arguments)
-    names = options.scenes.split(",") if options.scenes else list(scene_names()) or ["procedural"]
-    table = [HEADER]
-    print(HEADER, end="")
-    for point in options.points.split(","):
-        chosen = options.exposures.split(",") if options.exposures else DEFAULT_EXPOSURES[point]
-        for name in names:
-            scene = procedural_scene() if name == "procedural" else load_scene(name)
-            if scene is None:
-                parser.error(f"scene {name!r} is absent; present: {', '.join([*scene_names(), 'procedural'])}")
+    genies = {"genie": Genie(), **({"genie (quarter px)": FINE_GENIE} if options.fine else {})}
+    estimators = [name for name in options.estimators.split(",") if name]
+    measurement = Measurement(estimators, options.filters.split(","), genies, options.row_step)
+    scenes = scenes_asked(parser, options.scenes)
+    table = Table(TITLES)
+    for name in options.points.split(","):
+        chosen = options.exposures.split(",") if options.exposures else DEFAULT_EXPOSURES[name]
+        for scene in scenes:
+            height, width = scene.shape
+            geometry = Geometry.build(width=width, height=height, **RIGS[options.rig])  # type: ignore[arg-type]
+            point = WorkingPoint(scene, replace(POINTS[name], cosine=options.cosine), geometry)
             for exposures in map(int, chosen):
-                for line in measure(
-                    scene, point, exposures, seeds=range(1, options.seeds + 1), rig=options.rig,
-                    row_step=options.row_step, estimators=[e for e in options.estimators.split(",") if e],
-                    filters=options.filters.split(","), cosine=options.cosine, fine=options.fine,
-                ):  # fmt: skip
-                    table.append(as_markdown(line))
-                    print(table[-1], end="", flush=True)
-                if options.markdown:
-                    options.markdown.write_text("".join(table))
+                reference = np.nan
+                for estimator, f, seconds in measurement.means(point, exposures, options.seeds):
+                    if estimator == "genie":
+                        reference = f["mean_abs"]
+                    figures = [f"{f[key]:.3f}" for key in ("median_abs", "within_1px", "missing", "mean_abs_rounded")]
+                    found = f"{f['mean_abs']:.3f}", f"{f['mean_abs'] / reference:.2f}", *figures, f"{seconds:.2f}"
+                    table.add([name, scene.name, exposures, estimator, *found])
+                table.write(options.markdown)
     return 0
 
 

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Any
 
 import numpy as np
@@ -44,7 +44,7 @@ class Answers:
 
     def over(self, wanted: NDArray[np.bool_]) -> Answers:
         """The same with other stripes scored."""
-        return Answers(self.error_px, self.confidence, wanted, self.lit, self.empty, self.seconds)
+        return replace(self, scored=wanted)
 
     @property
     def errors(self) -> NDArray[np.float64]:
@@ -87,14 +87,9 @@ class Answers:
 
 def pooled(answers: Sequence[Answers]) -> Answers:
     """Answers of several maps as one; seconds: their mean."""
-    return Answers(
-        np.concatenate([one.error_px for one in answers]),
-        np.concatenate([one.confidence for one in answers]),
-        np.concatenate([one.scored for one in answers]),
-        np.concatenate([one.lit for one in answers]),
-        np.concatenate([one.empty for one in answers]),
-        float(np.mean([one.seconds for one in answers])),
-    )
+    arrays = ("error_px", "confidence", "scored", "lit", "empty")
+    joined = [np.concatenate([getattr(one, name) for one in answers]) for name in arrays]
+    return Answers(*joined, seconds=float(np.mean([one.seconds for one in answers])))
 
 
 def reliability(confidence: NDArray[np.float64], right: NDArray[np.bool_]) -> NDArray[np.float64]:

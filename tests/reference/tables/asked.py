@@ -2,18 +2,18 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator, Sequence
-from dataclasses import dataclass, field
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from dataclasses import dataclass, field, replace
+from operator import attrgetter
 
 import numpy as np
 
 from tests.reference.tables.answers import Answers, calibration_error, pooled
 
-REPORT_PX = {1: (0.4, 0.5), 3: (0.25, 0.35), 10: (0.14, 0.25), 20: (0.10, 0.15)}
-"""Most mean error over scenes, and on the worst of them, by exposures."""
 MISSING = 0.05
 BOUND_TIMES = 1.5
 CALIBRATION = 0.03
+HOT_TIMES = 1.05
 THIN_WITHIN = 0.8
 """Of the stripes on a thin object, the share within 1 px from which it counts as still there (our own figure)."""
 
@@ -45,164 +45,125 @@ class Finding:
 
 Group = dict[str, Measured]
 """What one estimator gave at one point and number of exposures, by scene."""
+Groups = dict[tuple[str, int], Group]
+
+ANY = 0
+"""Any number of exposures."""
+BAD: Mapping[str, Callable[[float], float]] = {"at most": lambda x: x, "at least": lambda x: -x, "within": abs}
+"""How bad a value is, by the sense of its limits."""
+
+
+@dataclass(frozen=True, slots=True)
+class Asked:
+    """A figure of the answers on each scene. limits: of the mean over scenes and of the worst one, by exposures."""
+
+    what: str
+    figure: Callable[[Answers], float]
+    limits: Mapping[int, tuple[float | None, float | None]]
+    sense: str = "at most"
+
+    def finding(self, k: int, estimator: str, group: Group, values: Mapping[str, float]) -> Finding:
+        """The figure's values by scene beside its limits. An error counts only where few answers are missing."""
+        bad = BAD[self.sense]
+        worst = max(values, key=lambda name: bad(values[name]))
+        mean = float(np.mean(list(values.values())))
+        most, most_worst = self.limits.get(k, self.limits.get(ANY, (None, None)))
+        holds = (most is None or bad(mean) <= bad(most)) and (most_worst is None or bad(values[worst]) <= most_worst)
+        if self.sense == "at most":
+            holds = holds and all(one.answers.missing <= MISSING for one in group.values())
+        text = ", worst ".join(f"{limit:g}" for limit in (most, most_worst) if limit is not None)
+        shown = f"{values[worst]:{'+' if self.sense == 'within' else ''}.3f} ({worst})"
+        asked = text if self.sense == "at most" or not text else f"{self.sense} {text}"
+        return _finding(self.what, k, estimator, asked, mean, shown, holds if text else None)
+
+
+MEAN, WITHIN, BIAS = attrgetter("mean_px"), attrgetter("within"), attrgetter("bias_px")
+OF_POINTS: Mapping[str, Sequence[Asked]] = {
+    "report": (
+        Asked("mean error, px", MEAN, {1: (0.4, 0.5), 3: (0.25, 0.35), 10: (0.14, 0.25), 20: (0.10, 0.15)}),
+        Asked("within 1 px", WITHIN, {3: (0.97, None)}, "at least"),
+    ),
+    "dense": (Asked("mean error, px", MEAN, {3: (0.5, None)}),),
+    "clear": (
+        Asked("mean error, px, all stripes", lambda a: a.over(a.lit).mean_px, {1: (0.8, None)}),
+        Asked("mean error, px, all trusted", MEAN, {1: (0.8, None)}),
+        Asked("mean error, px, 95 % most confident of all", lambda a: a.over(a.lit).surest(0.95), {1: (0.15, None)}),
+        Asked("mean error, px, 95 % most confident of trusted", lambda a: a.surest(0.95), {1: (0.15, None)}),
+    ),
+    "halo": (
+        Asked("mean error, px", MEAN, {5: (1.0, None)}),
+        Asked("bias, px", BIAS, {ANY: (None, 0.1)}, "within"),
+    ),
+}
+OVER_NO_HALO = Asked("halo: bias over that without halo, px", BIAS, {ANY: (None, 0.1)}, "within")
 
 
 def findings(measured: Sequence[Measured]) -> list[Finding]:
     """Everything asked that these answers can tell, estimator after estimator."""
     out: list[Finding] = []
     for estimator in dict.fromkeys(one.estimator for one in measured):
-        groups: dict[tuple[str, int], Group] = {}
+        groups: Groups = {}
         for one in measured:
             if one.estimator == estimator:
                 groups.setdefault((one.point, one.exposures), {})[one.scene] = one
-        for what in (_report, _dense, _clear, _halo, _hot, _extras, _calibration):
+        groups = dict(sorted(groups.items()))
+        for what in (_of_points, _compared, _extras, _calibration):
             out.extend(what(estimator, groups))
     return out
 
 
-Groups = dict[tuple[str, int], Group]
+def _of_points(estimator: str, groups: Groups) -> Iterator[Finding]:
+    for point, of_point in OF_POINTS.items():
+        for (name, k), group in groups.items():
+            for asked in of_point if name == point else ():
+                values = {scene: asked.figure(one.answers) for scene, one in group.items()}
+                found = asked.finding(k, estimator, group, values)
+                yield replace(found, what=f"{point}: {found.what}")
 
 
-def _report(estimator: str, groups: Groups) -> Iterator[Finding]:
-    for (point, k), group in sorted(groups.items()):
-        if point == "report":
-            asked = REPORT_PX.get(k)
-            yield _most("report: mean error, px", k, estimator, group, lambda a: a.mean_px, asked)
-            least = 0.97 if k == 3 else None
-            yield _least("report: within 1 px", k, estimator, _by_scene(group, lambda a: a.within), least)
-
-
-def _dense(estimator: str, groups: Groups) -> Iterator[Finding]:
-    for (point, k), group in sorted(groups.items()):
-        if point == "dense":
-            yield _most(
-                "dense: mean error, px", k, estimator, group, lambda a: a.mean_px, (0.5, None) if k == 3 else None
-            )
-
-
-def _clear(estimator: str, groups: Groups) -> Iterator[Finding]:
-    for (point, k), group in sorted(groups.items()):
-        if point != "clear":
+def _compared(estimator: str, groups: Groups) -> Iterator[Finding]:
+    """What a halo and hot pixels change."""
+    for (point, k), group in groups.items():
+        other = groups.get(({"halo": "halo-less", "hot": "report"}.get(point, ""), k), {})
+        shared = [name for name in group if name in other]
+        if not shared:
             continue
-        most, most_sure = ((0.8, None), (0.15, None)) if k == 1 else (None, None)
-        name = "clear: mean error, px, "
-        yield _most(name + "all stripes", k, estimator, group, lambda a: a.over(a.lit).mean_px, most)
-        yield _most(name + "all trusted", k, estimator, group, lambda a: a.mean_px, most)
-        surest = "95 % most confident of "
-        yield _most(name + surest + "all", k, estimator, group, lambda a: a.over(a.lit).surest(0.95), most_sure)
-        yield _most(name + surest + "trusted", k, estimator, group, lambda a: a.surest(0.95), most_sure)
-
-
-def _halo(estimator: str, groups: Groups) -> Iterator[Finding]:
-    for (point, k), group in sorted(groups.items()):
-        if point != "halo":
+        if point == "halo":
+            added = {name: group[name].answers.bias_px - other[name].answers.bias_px for name in shared}
+            yield OVER_NO_HALO.finding(k, estimator, group, added)
             continue
-        yield _most("halo: mean error, px", k, estimator, group, lambda a: a.mean_px, (1.0, None) if k == 5 else None)
-        bias = _by_scene(group, lambda a: a.bias_px)
-        yield _bias("halo: bias, px", k, estimator, bias)
-        without = groups.get(("halo-less", k), {})
-        if shared := [name for name in bias if name in without]:
-            there = {name: bias[name] - without[name].answers.bias_px for name in shared}
-            yield _bias("halo: bias over that without halo, px", k, estimator, there)
-
-
-def _hot(estimator: str, groups: Groups) -> Iterator[Finding]:
-    for (point, k), group in sorted(groups.items()):
-        if point != "hot":
-            continue
-        clean = groups.get(("report", k), {})
-        if shared := [name for name in group if name in clean]:
-            mean = [float(np.mean([g[n].answers.mean_px for n in shared])) for g in (group, clean)]
-            ratios = {n: group[n].answers.mean_px / clean[n].answers.mean_px for n in shared}
-            worst = max(ratios, key=ratios.__getitem__)
-            yield _finding(
-                "hot pixels 1 %: error over that without", k, estimator, "at most 1.05", mean[0] / mean[1],
-                f"{ratios[worst]:.3f} ({worst})", mean[0] / mean[1] <= 1.05,
-            )  # fmt: skip
+        ratios = {name: group[name].answers.mean_px / other[name].answers.mean_px for name in shared}
+        hot, clean = (float(np.mean([each[name].answers.mean_px for name in shared])) for each in (group, other))
+        worst = max(ratios, key=ratios.__getitem__)
+        yield _finding(
+            "hot pixels 1 %: error over that without", k, estimator, f"at most {HOT_TIMES}", hot / clean,
+            f"{ratios[worst]:.3f} ({worst})", hot / clean <= HOT_TIMES,
+        )  # fmt: skip
 
 
 def _extras(estimator: str, groups: Groups) -> Iterator[Finding]:
-    for (point, k), group in sorted(groups.items()):
+    for (point, k), group in groups.items():
         for one in group.values():
             of = f"{point}, {one.scene}" if one.scene != point else point
             for name, value in one.extras.items():
+                asked, holds = "", None
                 if "times the bound" in name:
-                    yield _finding(
-                        f"{of}: {name}", k, estimator, f"at most {BOUND_TIMES}", value, "", value <= BOUND_TIMES
-                    )
+                    asked, holds = f"at most {BOUND_TIMES}", value <= BOUND_TIMES
                 elif name.startswith(("pole", "fence")):
-                    yield _finding(
-                        f"{of}: {name}", k, estimator, f"at least {THIN_WITHIN}", value, "", value >= THIN_WITHIN
-                    )
-                else:
-                    yield _finding(f"{of}: {name}", k, estimator, "", value, "", None)
+                    asked, holds = f"at least {THIN_WITHIN}", value >= THIN_WITHIN
+                yield _finding(f"{of}: {name}", k, estimator, asked, value, "", holds)
 
 
 def _calibration(estimator: str, groups: Groups) -> Iterator[Finding]:
-    everything: list[Answers] = []
-    for (point, k), group in sorted(groups.items()):
-        answers = pooled([one.answers for one in group.values()])
-        everything.append(answers)
-        yield from _calibration_errors(point, str(k), estimator, answers)
-    if everything:
-        yield from _calibration_errors("all points", "", estimator, pooled(everything))
-
-
-def _calibration_errors(what: str, k: str, estimator: str, answers: Answers) -> Iterator[Finding]:
     """Over the scored stripes, and with answers where there is no stripe counted as wrong."""
-    for empty, name in ((False, "stripes"), (True, "stripes and rows without")):
-        value = calibration_error(*answers.claims(empty=empty))
-        holds = value < CALIBRATION
-        yield _finding(f"{what}: calibration error, {name}", k, estimator, f"below {CALIBRATION}", value, "", holds)
-
-
-def _by_scene(group: Group, figure: Callable[[Answers], float]) -> dict[str, float]:
-    return {name: figure(one.answers) for name, one in group.items()}
-
-
-def _most(
-    what: str,
-    k: int,
-    estimator: str,
-    group: Group,
-    figure: Callable[[Answers], float],
-    asked: tuple[float, float | None] | None,
-) -> Finding:
-    """A figure that is to stay below limits in the mean and on the worst scene, with at most 5 % missing."""
-    values = _by_scene(group, figure)
-    worst = max(values, key=values.__getitem__)
-    mean = float(np.mean(list(values.values())))
-    holds = None
-    text = ""
-    if asked is not None:
-        most, most_worst = asked
-        text = f"{most:g}" if most_worst is None else f"{most:g}, worst {most_worst:g}"
-        holds = mean <= most and (most_worst is None or values[worst] <= most_worst)
-        holds = holds and all(one.answers.missing <= MISSING for one in group.values())
-    return _finding(what, k, estimator, text, mean, f"{values[worst]:.3f} ({worst})", holds)
-
-
-def _least(what: str, k: int, estimator: str, values: dict[str, float], asked: float | None) -> Finding:
-    worst = min(values, key=values.__getitem__)
-    mean = float(np.mean(list(values.values())))
-    holds = None if asked is None else mean >= asked
-    return _finding(
-        what,
-        k,
-        estimator,
-        "" if asked is None else f"at least {asked:g}",
-        mean,
-        f"{values[worst]:.3f} ({worst})",
-        holds,
-    )
-
-
-def _bias(what: str, k: int, estimator: str, values: dict[str, float]) -> Finding:
-    worst = max(values, key=lambda name: abs(values[name]))
-    mean = float(np.mean(list(values.values())))
-    return _finding(
-        what, k, estimator, "within 0.1", mean, f"{values[worst]:+.3f} ({worst})", abs(values[worst]) <= 0.1
-    )
+    of_groups = {key: pooled([one.answers for one in group.values()]) for key, group in groups.items()}
+    everything = [(point, str(k), answers) for (point, k), answers in of_groups.items()]
+    everything.append(("all points", "", pooled(list(of_groups.values()))))
+    for what, exposures, answers in everything:
+        for empty, name in ((False, "stripes"), (True, "stripes and rows without")):
+            value = calibration_error(*answers.claims(empty=empty))
+            told = f"{what}: calibration error, {name}"
+            yield _finding(told, exposures, estimator, f"below {CALIBRATION}", value, "", value < CALIBRATION)
 
 
 def _finding(

@@ -17,7 +17,8 @@ from rig.depth.fog_meter import VISIBILITY_CONTRAST
 from tests.reference import kernels
 from tests.reference.adapter import reconstruct
 from tests.reference.geometry import Geometry
-from tests.reference.scene import Scene, load_scene, procedural_scene, scene_names
+from tests.reference.scene import Scene
+from tests.reference.tables.printed import scenes_asked
 from tests.reference.working_point import Light, WorkingPoint
 
 SENSORS = ((64, 128), (128, 250), (96, 160), (48, 96))
@@ -76,7 +77,7 @@ def run(scene: Scene, light: Light, exposures: int, sensor: tuple[int, int], see
     rows, columns = sensor
     part = scene.crop(rows, scene.shape[1])
     point = WorkingPoint(part, light, Geometry.build(width=scene.shape[1], height=rows, columns=columns))
-    result = reconstruct(point, point.counts(exposures, seed), exposures)
+    (result,) = reconstruct(point, point.counts(exposures, seed), exposures)
     thin = VISIBILITY_CONTRAST / light.extinction_per_m
     truths = (light.extinction_per_m, thin, light.ambient, veil(point, result.stripe.confidence > 0.85))
     return {
@@ -93,7 +94,7 @@ def main(arguments: Sequence[str] | None = None, out: Callable[[str], None] = pr
     parser.add_argument("--runs", type=int, default=40)
     parser.add_argument("--seed", type=int, default=1)
     options = parser.parse_args(arguments)
-    scenes = [scene for name in scene_names() if (scene := load_scene(name)) is not None] or [procedural_scene()]
+    scenes = scenes_asked(parser, None)
     pulls: dict[str, list[float]] = {name: [] for name in FIGURES}
     for i, (light, exposures) in zip(range(options.runs), lights(options.seed), strict=False):
         scene, sensor = scenes[i % len(scenes)], SENSORS[i % len(SENSORS)]

@@ -12,11 +12,10 @@ pixels, those on the `disc`, those `uncovered`, where the line stood on somethin
 
 from __future__ import annotations
 
-import argparse
 import sys
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, replace
-from pathlib import Path
+from itertools import product
 from typing import Any
 
 import numpy as np
@@ -24,9 +23,9 @@ from numpy.typing import NDArray
 
 from tests.reference.adapter import reconstructor_of, volume_of
 from tests.reference.geometry import FOCAL_PX
-from tests.reference.scene import TRUSTED_REACH_PX, Scene, load_scene, procedural_scene, scene_names
+from tests.reference.scene import TRUSTED_REACH_PX, Scene
 from tests.reference.tables.answers import Answers, calibration_error, pooled
-from tests.reference.tables.joint_accuracy import as_row, head
+from tests.reference.tables.printed import Table, parser_of, scenes_asked
 from tests.reference.working_point import POINTS, WorkingPoint, at_stripe
 
 PARTS = ("all", "disc", "uncovered", "still")
@@ -130,47 +129,32 @@ DISCS = {
 TITLES = ("scene", "moves", "K", *(f"{part}: without, with" for part in PARTS), "within 1 px", "calibration")
 
 
-def row_of(name: str, moves: str, exposures: int, both: tuple[Moved, Moved]) -> str:
-    """A line of the table."""
+def row_of(name: str, moves: str, exposures: int, both: tuple[Moved, Moved]) -> list[object]:
+    """Cells of a line of the table."""
     cells = [
         "-" if not both[0].parts[part].any() else ", ".join(f"{one.mean_px(part):.3f}" for one in both)
         for part in PARTS
     ]
     within = ", ".join(f"{one.within('all'):.4f}" for one in both)
     calibration = ", ".join(f"{calibration_error(*one.answers.over(one.parts['all']).claims()):.3f}" for one in both)
-    return as_row([name, moves, exposures, *cells, within, calibration])
+    return [name, moves, exposures, *cells, within, calibration]
 
 
 def main(arguments: Sequence[str] | None = None) -> int:
     """Print the table."""
-    parser = argparse.ArgumentParser(
-        prog="python -m tests.reference.tables.moving", description=__doc__.splitlines()[0]
-    )
-    parser.add_argument("--scenes", help="comma-separated; 'procedural' is the built-in one; default: all prepared")
+    parser = parser_of("tests.reference.tables.moving", __doc__)
     parser.add_argument("--moves", default=",".join(DISCS), help=f"of {', '.join(DISCS)}")
     parser.add_argument("--exposures", default="1,3")
     parser.add_argument("--point", default="report", choices=POINTS)
     parser.add_argument("--maps", type=int, default=4)
     parser.add_argument("--rows", type=int, help="middle rows of the scenes")
-    parser.add_argument("--markdown", type=Path, help="file for the table")
     options = parser.parse_args(arguments)
-    names = options.scenes.split(",") if options.scenes else scene_names() or ("procedural",)
-    text = head(TITLES)
-    print(text, end="")
-    for name in names:
-        scene = procedural_scene() if name == "procedural" else load_scene(name)
-        if scene is None:
-            parser.error(f"scene {name!r} is absent; present: {', '.join([*scene_names(), 'procedural'])}")
-        scene = scene if options.rows is None else scene.crop(options.rows, scene.shape[1])
-        for moves in options.moves.split(","):
-            for exposures in map(int, options.exposures.split(",")):
-                row = row_of(
-                    name, moves, exposures, measure(scene, DISCS[moves], exposures, options.maps, options.point)
-                )
-                text += row
-                print(row, end="", flush=True)
-    if options.markdown:
-        options.markdown.write_text(text)
+    scenes = scenes_asked(parser, options.scenes, options.rows)
+    table = Table(TITLES)
+    for scene, moves, k in product(scenes, options.moves.split(","), map(int, options.exposures.split(","))):
+        both = measure(scene, DISCS[moves], k, options.maps, options.point)
+        table.add(row_of(scene.name, moves, k, both))
+    table.write(options.markdown)
     return 0
 
 

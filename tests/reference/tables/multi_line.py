@@ -9,13 +9,11 @@ light is there once. Sensor time is that of the lit frames at 100 kHz.
 
 from __future__ import annotations
 
-import argparse
 import sys
 from collections.abc import Iterator, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass, replace
 from itertools import product
-from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -23,7 +21,8 @@ from numpy.typing import NDArray
 
 from tests.reference.adapter import reconstructor_of, volume_of
 from tests.reference.geometry import Geometry
-from tests.reference.scene import Scene, load_scene, procedural_scene, scene_names
+from tests.reference.scene import Scene
+from tests.reference.tables.printed import Table, parser_of, scenes_asked
 from tests.reference.working_point import POINTS, THREADS, WorkingPoint, score
 
 FRAME_MS = 0.01
@@ -120,41 +119,29 @@ def main(arguments: Sequence[str] | None = None) -> int:
     """Print the table, and write it where asked."""
     from rig.geometry.line_grid import window_overlap
 
-    parser = argparse.ArgumentParser(
-        prog="python -m tests.reference.tables.multi_line", description=__doc__.splitlines()[0]
-    )
-    parser.add_argument("--scenes", default="procedural", help=f"procedural, {', '.join(scene_names())}")
-    parser.add_argument("--points", default="clear,report,dense")
+    parser = parser_of("tests.reference.tables.multi_line", __doc__, points="clear,report,dense")
+    parser.set_defaults(scenes="procedural")
     parser.add_argument("--power", default="shared,each")
     parser.add_argument("--lines", default="1,2,4,8")
     parser.add_argument("--exposures", default="1,10", help="of one line; others take them and as many frames a map")
     parser.add_argument("--estimators", default="likelihood,joint")
-    parser.add_argument("--markdown", type=Path)
     options = parser.parse_args(arguments)
-    table = ["| " + " | ".join(TITLES) + " |\n" + "|---" * len(TITLES) + "|\n"]
-    print(table[0], end="")
+    table = Table(TITLES)
     base = [int(k) for k in options.exposures.split(",")]
-    for name in options.scenes.split(","):
-        scene = procedural_scene() if name == "procedural" else load_scene(name)
-        if scene is None:
-            parser.error(f"scene {name!r} is absent; present: {', '.join([*scene_names(), 'procedural'])}")
-        for kind, power, count in product(
-            options.points.split(","), options.power.split(","), options.lines.split(",")
-        ):
-            lines = Lines(int(count), power)
-            if lines.lines == 1 and power != options.power.split(",")[0]:
-                continue
-            point = working_point(scene, kind)
-            overlap = window_overlap(lines.grid, reconstructor_of(point, "argmax").geometry)
-            for k in sorted({*base, *(lines.lines * k for k in base)}):
-                lit_ms = COLUMNS // lines.lines * k * FRAME_MS
-                for estimator, f in measure(point, lines, k, options.estimators.split(",")):
-                    told = name, kind, power, count, k, f"{lit_ms:.1f}", f"{overlap:.2f}", estimator
-                    found = (f[figure] for figure in ("mean_abs_charged", "median_abs", "within_1px", "confidence"))
-                    table.append("| " + " | ".join([*map(str, told), *(f"{one:.3f}" for one in found)]) + " |\n")
-                    print(table[-1], end="", flush=True)
-    if options.markdown:
-        options.markdown.write_text("".join(table))
+    powers, scenes = options.power.split(","), scenes_asked(parser, options.scenes)
+    for scene, kind, power, count in product(scenes, options.points.split(","), powers, options.lines.split(",")):
+        lines = Lines(int(count), power)
+        if lines.lines == 1 and power != powers[0]:
+            continue
+        point = working_point(scene, kind)
+        overlap = window_overlap(lines.grid, reconstructor_of(point, "argmax").geometry)
+        for k in sorted({*base, *(lines.lines * k for k in base)}):
+            lit_ms = COLUMNS // lines.lines * k * FRAME_MS
+            for estimator, f in measure(point, lines, k, options.estimators.split(",")):
+                told = scene.name, kind, power, count, k, f"{lit_ms:.1f}", f"{overlap:.2f}", estimator
+                found = (f[figure] for figure in ("mean_abs_charged", "median_abs", "within_1px", "confidence"))
+                table.add([*told, *(f"{one:.3f}" for one in found)])
+    table.write(options.markdown)
     return 0
 
 

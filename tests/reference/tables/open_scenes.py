@@ -91,10 +91,9 @@ def main(arguments: Sequence[str] | None = None) -> int:
         scene = opened(random_scene(number, ROWS), number)
         for name in options.points.split(","):
             point, exposures = OpenPoint(scene, drawn_light(name, rng)), int(rng.choice([1, 3, 10, 20]))
-            table = reconstruct(
-                point, point.counts(exposures, number), exposures, estimator="joint", threads=options.threads
-            ).stripe
-            row = figures(table.confidence, table.x_px, point)
+            counts = point.counts(exposures, number)
+            (result,) = reconstruct(point, counts, exposures, estimator="joint", threads=options.threads)
+            row = figures(result.stripe.confidence, result.stripe.x_px, point)
             seen.setdefault(name, []).append(row)
             print(number, name, exposures, "|", *(f"{value:.3f}" for value in row), flush=True)
     for name, rows in seen.items():

@@ -12,24 +12,27 @@ printed.
 
 from __future__ import annotations
 
-import argparse
 import json
 import sys
-import time
 from collections.abc import Collection, Iterator, Sequence
 from dataclasses import asdict, dataclass
+from html import escape
+from itertools import product
 from pathlib import Path
 from statistics import fmean
 
+import cv2
 import numpy as np
+from numpy.typing import NDArray
 
 from rig.estimate.registry import ESTIMATORS, FILTERS
-from rig.run_folder.charts import ChartMark, Drawable, Panel, Series, chart_svg
+from rig.run_folder.charts import INK, ChartMark, Drawable, Panel, Series, chart_svg
 from rig.tradeoff.files import colour_of
-from tests.reference.adapter import reconstructor_of, volume_of, windowed
-from tests.reference.scene import Scene, load_scene, procedural_scene, scene_names
-from tests.reference.tables.mosaics import PLACE_PX, Mosaic
-from tests.reference.working_point import CLEAR, DENSE, POINTS, REPORT, WorkingPoint, score
+from tests.reference.adapter import reconstruct
+from tests.reference.scene import Scene
+from tests.reference.tables.accuracy import Measurement, named
+from tests.reference.tables.printed import parser_of, scenes_asked
+from tests.reference.working_point import CLEAR, DENSE, POINTS, REPORT, WorkingPoint
 
 COLUMNS, FRAME_RATE_HZ = 500, 100_000
 EXPOSURES = (1, 3, 5, 10, 20)
@@ -39,6 +42,13 @@ CLAIMS = (ChartMark((10, 1.0), "report: < 1 px"), ChartMark((20, 0.1), "report: 
 SHARE = "within_1px"
 ROW = 250
 """Image row of figures 3 and 4."""
+
+COLOURS = 24
+"""Steps between the nearest and the farthest depth."""
+SIDE_PX = 246
+"""Side of a mosaic."""
+PLACE_PX = (SIDE_PX + 24, SIDE_PX + 50)
+"""Width and height that it takes with its words."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -64,28 +74,17 @@ def measure(
     known: Collection[tuple[str, str, int, str]] = (),
 ) -> Iterator[Figure]:
     """Every combination, one map each, which the estimator learns from as well; but for those that are known."""
-    for point_name in points:
-        for scene in scenes:
-            point = WorkingPoint(scene, POINTS[point_name])
-            truth, trusted = point.truth(), point.trusted
-            for k in exposures:
-                wanted = [name for name in estimators if (point_name, scene.name, k, name) not in known]
-                counts = point.counts(k, SEED) if wanted else None
-                for estimator in wanted:
-                    maker = reconstructor_of(point, estimator)
-                    assert counts is not None, "drawn where any is wanted"
-                    part = windowed(counts, maker.geometry.x0, maker.geometry.window)
-                    volume = volume_of(maker, part, k)
-                    begun = time.perf_counter()
-                    stripe = maker.estimator.estimate(volume, maker.geometry)
-                    estimate_s = time.perf_counter() - begun
-                    for filter in FILTERS:
-                        result = maker.complete(stripe, volume, filter, estimate_s)
-                        found = score(result.stripe.x_px, truth, trusted)
-                        yield Figure(
-                            point_name, scene.name, k, estimator, filter, found["mean_abs_charged"],
-                            found["within_1px"], found["mean_abs_rounded"], result.compute_s,
-                        )  # fmt: skip
+    for point_name, scene in product(points, scenes):
+        point = WorkingPoint(scene, POINTS[point_name])
+        for k in exposures:
+            wanted = [name for name in estimators if (point_name, scene.name, k, name) not in known]
+            if not wanted:
+                continue
+            for estimator, filter, found, compute_s in Measurement(wanted, FILTERS).of(point, point.counts(k, SEED), k):
+                yield Figure(
+                    point_name, scene.name, k, estimator, filter, found["mean_abs_charged"],
+                    found["within_1px"], found["mean_abs_rounded"], compute_s,
+                )  # fmt: skip
 
 
 def figure_3(scene: Scene) -> str:
@@ -95,13 +94,8 @@ def figure_3(scene: Scene) -> str:
         point = WorkingPoint(scene, light)
         column, x = _column_of(point)
         flux = point.flux_of_column(column)[ROW]
-        shown = slice(max(0, round(x) - 130), round(x) + 40)
-        points = list(zip(range(shown.start, shown.stop), map(float, flux[shown]), strict=True))
-        series = Series("expected photons", colour_of("likelihood"), points, marker=False, step=True)
-        at = ChartMark((x, float(flux[round(x)])), "stripe")
-        panels.append(
-            Panel(name, "pixel of the row", "photons an exposure", [series], x_log=False, y_log=False, marks=[at])
-        )
+        series = Series("expected photons", colour_of("likelihood"), _around(x, flux), marker=False, step=True)
+        panels.append(_row_panel(name, "photons an exposure", [series], (x, float(flux[round(x)]))))
     return chart_svg(panels, title=f"One image row of scene {scene.name}: haze, step and stripe", across=3)
 
 
@@ -110,19 +104,15 @@ def figure_4(scene: Scene) -> str:
     point = WorkingPoint(scene, REPORT)
     column, x = _column_of(point)
     expected = -np.expm1(-point.flux_of_column(column)[ROW])
-    shown = slice(max(0, round(x) - 130), round(x) + 40)
     panels = []
     for k in (1, 10, 100):
         share = point.counts(k, SEED)[column, ROW] / k
         curves = [
-            Series("detected", colour_of("edge"), _points(shown, share), marker=False, step=True),
-            Series("expected", colour_of("likelihood"), _points(shown, expected), marker=False),
+            Series("detected", colour_of("edge"), _around(x, share), marker=False, step=True),
+            Series("expected", colour_of("likelihood"), _around(x, expected), marker=False),
         ]
         title = f"{k} exposure{'s' * (k > 1)}"
-        mark = ChartMark((x, float(expected[round(x)])), "stripe")
-        panels.append(
-            Panel(title, "pixel of the row", "share of exposures", curves, x_log=False, y_log=False, marks=[mark])
-        )
+        panels.append(_row_panel(title, "share of exposures", curves, (x, float(expected[round(x)]))))
     return chart_svg(panels, title="The same row, detected in the fog of the report (0.05 /m)", across=3)
 
 
@@ -136,11 +126,8 @@ def figure_6(scene: Scene) -> str:
         (1, "edge", "median"), (10, "edge", "none"), (10, "edge", "median"),
         (1, "joint", "none"), (10, "joint", "none"),
     ):  # fmt: skip
-        maker = reconstructor_of(point, estimator, filter)
-        part = windowed(point.counts(k, SEED), maker.geometry.x0, maker.geometry.window)
-        depth_m = maker.map(volume_of(maker, part, k)).depth_m
-        filtered = "" if filter == "none" else f" + {filter}"
-        panels.append(Mosaic(f"{estimator}{filtered}, {k} exposure{'s' * (k > 1)}", depth_m, limits))
+        (result,) = reconstruct(point, point.counts(k, SEED), k, estimator=estimator, filters=(filter,))
+        panels.append(Mosaic(f"{named(estimator, filter)}, {k} exposure{'s' * (k > 1)}", result.depth_m, limits))
     notes = [f"Scene {scene.name} in the fog of the report (0.05 /m); answers of confidence 0.5 and more enter a map."]
     return chart_svg(panels, title="Depth maps", across=3, notes=notes, panel_px=PLACE_PX)
 
@@ -190,7 +177,7 @@ def figure_9(figures: Sequence[Figure]) -> str:
 
 def claims_table(figures: Sequence[Figure]) -> str:
     """The report's claims and ours, as Markdown."""
-    lines = ["| K | maps/s | the report | " + " | ".join(_named(*method) for method in _methods(figures)) + " |"]
+    lines = ["| K | maps/s | the report | " + " | ".join(named(*method) for method in _methods(figures)) + " |"]
     lines.append("|---" * (3 + len(_methods(figures))) + "|")
     claims = {1: "cannot do", 10: "< 1 px", 20: "about 0.1 px"}
     for k in sorted({figure.exposures for figure in figures if figure.point == "report"}):
@@ -209,10 +196,6 @@ def _methods(figures: Sequence[Figure]) -> list[tuple[str, str]]:
         {(figure.estimator, figure.filter) for figure in figures},
         key=lambda m: (ESTIMATORS.index(m[0]), m[1] != "none"),
     )
-
-
-def _named(estimator: str, filter: str) -> str:
-    return estimator if filter == "none" else f"{estimator} + {filter}"
 
 
 def _curves(figures: Sequence[Figure], value: str = "mean_px") -> Iterator[Series]:
@@ -236,8 +219,14 @@ def _scenes(figures: Sequence[Figure]) -> str:
     return ", ".join(sorted({figure.scene for figure in figures}))
 
 
-def _points(shown: slice, values: np.ndarray) -> list[tuple[float, float]]:
-    return list(zip(range(shown.start, shown.stop), map(float, values[shown]), strict=True))
+def _around(x: float, values: np.ndarray) -> list[tuple[float, float]]:
+    """Points of the pixels of a row around x."""
+    return list(enumerate(map(float, values)))[max(0, round(x) - 130) : round(x) + 40]
+
+
+def _row_panel(title: str, light: str, curves: Sequence[Series], stripe: tuple[float, float]) -> Panel:
+    marks = [ChartMark(stripe, "stripe")]
+    return Panel(title, "pixel of the row", light, curves, x_log=False, y_log=False, marks=marks)
 
 
 def _column_of(point: WorkingPoint) -> tuple[int, float]:
@@ -248,34 +237,86 @@ def _column_of(point: WorkingPoint) -> tuple[int, float]:
     return column, float(point.x_true[ROW, column])
 
 
+@dataclass(frozen=True, slots=True)
+class Mosaic:
+    """A depth map (rows, width) in metres, NaN where there is none, as `cells` x `cells` cells; limits: near, far."""
+
+    title: str
+    depth_m: NDArray[np.floating]
+    limits: tuple[float, float]
+    cells: int = 73
+
+    @property
+    def legend(self) -> Sequence[Series]:
+        """Nothing to explain."""
+        return ()
+
+    def svg(self) -> str:
+        """The mosaic in a place of a chart, depth in words below it."""
+        near, far = self.limits
+        steps = self._steps()
+        scale = SIDE_PX / self.cells
+        left = 16
+        paths = [
+            f'<path d="{_runs(steps == step)}" stroke="{_colour(step)}"/>'
+            for step in range(COLOURS)
+            if (steps == step).any()
+        ]
+        return (
+            f'<text x="{left}" y="18" font-weight="bold" fill="{INK}">{escape(self.title)}</text>'
+            f'<g transform="translate({left} 28) scale({scale:.3f})" fill="none" stroke-width="1.1">'
+            f'<path d="M0 0h{self.cells}v{self.cells}h-{self.cells}z" fill="#111" stroke="none"/>{"".join(paths)}</g>'
+            f'<text x="{left}" y="{SIDE_PX + 41}" font-size="10" fill="{INK}">red {near:.1f} m, blue {far:.1f} m, '
+            "black: no answer</text>"
+        )
+
+    def _steps(self) -> NDArray[np.int64]:
+        """Colour of each cell, -1 where most of it has no depth: the depth in its middle rank."""
+        rows, width = (part // self.cells for part in self.depth_m.shape)
+        used = self.depth_m[: rows * self.cells, : width * self.cells]
+        parts = used.reshape(self.cells, rows, self.cells, width).swapaxes(1, 2).reshape(self.cells, self.cells, -1)
+        ranked = np.sort(parts, axis=2)  # NaN last
+        known = np.isfinite(parts).sum(axis=2)
+        middle = np.take_along_axis(ranked, np.maximum(known - 1, 0)[..., None] // 2, axis=2)[..., 0]
+        near, far = self.limits
+        step = np.clip((middle - near) / (far - near) * COLOURS, 0, COLOURS - 1)
+        return np.where(known * 2 > rows * width, np.nan_to_num(step), -1).astype(np.int64)
+
+
+def _runs(mask: NDArray[np.bool_]) -> str:
+    parts = []
+    for y, row in enumerate(mask):
+        ends = np.flatnonzero(np.diff(np.concatenate([[0], row.astype(np.int8), [0]])))
+        parts += [f"M{a} {y}.5h{b - a}.1" for a, b in zip(ends[::2], ends[1::2], strict=True)]
+    return "".join(parts)
+
+
+def _colour(step: int) -> str:
+    level = np.array([[round(20 + 225 * (1 - (step + 0.5) / COLOURS))]], np.uint8)
+    blue, green, red = (int(part) for part in cv2.applyColorMap(level, cv2.COLORMAP_TURBO)[0, 0])
+    return f"#{red:02x}{green:02x}{blue:02x}"
+
+
 def main(arguments: Sequence[str] | None = None) -> int:
     """Measure, draw and print."""
-    parser = argparse.ArgumentParser(
-        prog="python -m tests.reference.tables.report_figures", description=__doc__.splitlines()[0]
-    )
+    parser = parser_of("tests.reference.tables.report_figures", __doc__, points="report,dense,clear")
     parser.add_argument("--out", type=Path, required=True, help="folder for the SVG files")
-    parser.add_argument("--scenes", help="comma-separated; 'procedural' is the built-in one; default: all prepared")
-    parser.add_argument("--points", default="report,dense,clear")
     parser.add_argument("--exposures", default=",".join(map(str, EXPOSURES)))
     parser.add_argument("--estimators", default=",".join(ESTIMATORS))
     parser.add_argument("--measured", type=Path, help="file of measurements: read where it is there, else written")
     options = parser.parse_args(arguments)
-    names = options.scenes.split(",") if options.scenes else list(scene_names()) or ["procedural"]
-    scenes = [procedural_scene() if name == "procedural" else load_scene(name) for name in names]
-    found = [scene for scene in scenes if scene is not None]
-    if len(found) < len(scenes):
-        parser.error(f"a scene of {options.scenes} is absent; present: {', '.join([*scene_names(), 'procedural'])}")
+    scenes = scenes_asked(parser, options.scenes)
     options.out.mkdir(parents=True, exist_ok=True)
     kept: Path | None = options.measured
     figures = [] if kept is None or not kept.exists() else [Figure(**one) for one in json.loads(kept.read_text())]
     known = {(figure.point, figure.scene, figure.exposures, figure.estimator) for figure in figures}
     exposures = [int(k) for k in options.exposures.split(",")]
-    for figure in measure(found, options.points.split(","), exposures, options.estimators.split(","), known):
+    for figure in measure(scenes, options.points.split(","), exposures, options.estimators.split(","), known):
         figures.append(figure)
         print(figure, file=sys.stderr, flush=True)
         if kept is not None and figure.filter == FILTERS[-1]:
             kept.write_text(json.dumps([asdict(one) for one in figures]))
-    first = next((scene for scene in found if scene.name == "cones"), found[0])
+    first = next((scene for scene in scenes if scene.name == "cones"), scenes[0])
     drawn = {
         "3-row": figure_3(first),
         "4-exposures": figure_4(first),
@@ -286,7 +327,10 @@ def main(arguments: Sequence[str] | None = None) -> int:
     }
     for name, text in drawn.items():
         (options.out / f"report-{name}.svg").write_text(text)
-    print(claims_table(figures))
+    table = claims_table(figures)
+    print(table)
+    if options.markdown is not None:
+        options.markdown.write_text(table + "\n")
     return 0
 
 
