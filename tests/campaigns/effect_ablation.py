@@ -24,6 +24,7 @@ import yaml
 from rig import api
 from rig.config.models import RigConfig
 from rig.geometry.stripe_table import MISSING_PX, charged_errors
+from tests.reference.tables.printed import Table
 
 AIR = {"medium": {"fog": {"visibility": "300 km"}}}
 """Molecules alone."""
@@ -64,21 +65,19 @@ class Ablation:
         """Whether the bound holds."""
         return abs(fmean(self.difference_px)) <= self.bound_px
 
-    def __str__(self) -> str:
+    def cells(self) -> tuple[str, ...]:
         """A row of the table."""
         sd = stdev(self.difference_px) / len(self.difference_px) ** 0.5 if len(self.difference_px) > 1 else 0.0
         return (
-            f"| {self.scene} | {', '.join(self.left_out) or 'nothing'} | {self.bound_px:.2g} "
-            f"| {fmean(self.difference_px):+.5f} +- {sd:.5f} | {self.full_us:.1f} | {self.planned_us:.1f} "
-            f"| {1 - self.planned_us / self.full_us:.1%} |"
-        )
+            self.scene, ", ".join(self.left_out) or "nothing", f"{self.bound_px:.2g}",
+            f"{fmean(self.difference_px):+.5f} +- {sd:.5f}", f"{self.full_us:.1f}", f"{self.planned_us:.1f}",
+            f"{1 - self.planned_us / self.full_us:.1%}",
+        )  # fmt: skip
 
 
-HEADER = (
-    "| scene | left out | bound, px | difference of the mean error, px | us per frame, full | planned | saved |\n"
-    + "|---" * 7
-    + "|"
-)
+TITLES = (
+    "scene", "left out", "bound, px", "difference of the mean error, px", "us per frame, full", "planned", "saved",
+)  # fmt: skip
 
 
 def ablations(config: RigConfig, folder: Path, seeds: Sequence[int]) -> Iterator[Ablation]:
@@ -126,11 +125,11 @@ def main() -> int:
     asked = parser.parse_args()
     config = api.configure()
     config = config.model_copy(update={"scan": config.scan.model_copy(update={"columns": asked.columns})})
-    print(HEADER)
+    table = Table(TITLES)
     wrong = 0
     with TemporaryDirectory() as folder:
         for ablation in ablations(config, Path(folder), range(asked.seeds)):
-            print(ablation, flush=True)
+            table.add(ablation.cells())
             wrong += not ablation.within
     return 1 if wrong else 0
 

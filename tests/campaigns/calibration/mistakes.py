@@ -14,20 +14,25 @@ import sys
 from collections import Counter, defaultdict
 from collections.abc import Callable, Mapping, Sequence
 from concurrent.futures import ProcessPoolExecutor
-from dataclasses import replace
+from dataclasses import dataclass, replace
 
 import cv2
 import numpy as np
 from numpy.typing import NDArray
 
 from calibration.board.board import Board
+from calibration.board.detect import find_corners
 from calibration.diagnosis.evidence import baseline_m
+from calibration.diagnosis.rig import judge_fit, judge_refused
+from calibration.errors import Degenerate
 from calibration.model.scanner import PivotScanner
+from calibration.rig_fit.fit import fit_rig
 from calibration.views import BoardPose, View
 from sim_backend.scenes.board import ShownBoard
 from tests.campaigns.calibration.asked import NAMED, Figure, exit_code
-from tests.campaigns.calibration.board_capture import set_up
-from tests.campaigns.calibration.board_session import BOTH_WAYS, PASSED, Session
+from tests.campaigns.calibration.board_capture import HOT_PER_S, Stand, SweepAsked, set_up, take_sweeps
+from tests.campaigns.calibration.rig_figures import CALIBRATED
+from tests.campaigns.calibration.rigs import OTHER_SPEED, room_picture, view_of
 from tests.reference.boards.random_rigs import BOARD, random_pose, random_poses, random_rig
 
 Array = NDArray[np.float64]
@@ -35,6 +40,57 @@ Array = NDArray[np.float64]
 POSES = 8
 FAR_BOARD = Board("chessboard", (8, 6), 0.08)
 """Found where markers are too small to be read."""
+BOTH_WAYS = tuple(SweepAsked(CALIBRATED, direction) for direction in (1, -1))
+TWO_SPEEDS = (*BOTH_WAYS, *(SweepAsked(OTHER_SPEED, direction) for direction in (1, -1)))
+PASSED = "passed"
+
+
+@dataclass(frozen=True, slots=True)
+class Session:
+    """A rig and a person with a board. rng: of all that is random."""
+
+    stand: Stand
+    rng: np.random.Generator
+
+    def views(
+        self, poses: Sequence[BoardPose], board: Board = BOARD, sweeps: Sequence[SweepAsked] = BOTH_WAYS
+    ) -> list[View]:
+        """The board at several poses, at two speeds at the first one."""
+        views = []
+        for i, pose in enumerate(poses):
+            speeds = TWO_SPEEDS if i == 0 and sweeps is BOTH_WAYS else sweeps
+            taken = take_sweeps(self.stand, [ShownBoard(board, pose)], speeds, self.rng)
+            views.append(view_of(f"{i:03d}", self.stand, taken, board))
+        return views
+
+    def pose(self, **how: object) -> BoardPose:
+        """A random one."""
+        return random_pose(self.rng, self.stand.rig.model.camera, BOARD, **how)  # type: ignore[arg-type]
+
+    def distance_m(self, board: Board, seen_px: tuple[float, float]) -> tuple[float, float]:
+        """Between which distances the board's width is seen at these sizes in pixels."""
+        focal = float(self.stand.rig.model.camera.matrix[0, 0])
+        return focal * board.size_m[0] / seen_px[1], focal * board.size_m[0] / seen_px[0]
+
+    def named(self, views: Sequence[View], board: Board = BOARD, stated_baseline_m: float | None = None) -> str:
+        """What is named first."""
+        camera = self.stand.rig.model.camera
+        size = (camera.width, camera.height)
+        try:
+            fit = fit_rig(views, board, size)
+        except Degenerate as refused:
+            return judge_refused(refused, views, board, size).codes[0]
+        verdict = judge_fit(fit, views, stated_baseline_m=stated_baseline_m).verdict
+        return PASSED if verdict.passed else verdict.codes[0]
+
+    def refused(self, shown: Sequence[ShownBoard]) -> str:
+        """Why there are no corners in a view of these boards."""
+        picture = room_picture(self.stand, take_sweeps(self.stand, shown, BOTH_WAYS, self.rng))
+        try:
+            find_corners(picture, BOARD, self.stand.dark_per_s > HOT_PER_S)
+        except Degenerate as refused:
+            return refused.reason
+        return PASSED
 
 
 def few_poses(session: Session, good: list[View]) -> str:
