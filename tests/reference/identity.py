@@ -30,7 +30,7 @@ import h5py
 import numpy as np
 import yaml
 
-from tests.reference.identity_cases import CASES, SEED, write_board_rig, write_case, write_cube
+from tests.reference.identity_cases import BOARD, CASES, SEED, write_case, write_cube
 
 Hashes = dict[str, str]
 """By file, or file:member."""
@@ -103,7 +103,7 @@ def make(folder: Path, jobs: int) -> None:
         config = write_case(case, folder / name / "rig")
         commands.append((scan_options(name, config), folder / name / "run"))
     write_cube(folder / "cube")
-    board = write_board_rig(folder / "board" / "rig")
+    board = write_case(BOARD, folder / "board" / "rig")
     commands.append((planes_options(board), folder / "board" / "planes"))
     with ThreadPoolExecutor(jobs) as pool:
         for code, told in pool.map(lambda each: rig(*each[0], "--out", each[1]), commands):
@@ -114,7 +114,7 @@ def make(folder: Path, jobs: int) -> None:
 def scan_options(name: str, config: Path) -> tuple[object, ...]:
     """Words of the command that records a case."""
     case = CASES[name]
-    return ("scan", config, "--record", "--maps", case.maps, "--seed", SEED, *case.options)
+    return ("scan", config, "--record", "--maps", case.maps, "--seed", SEED)
 
 
 def planes_options(board: Path) -> tuple[object, ...]:
