@@ -10,9 +10,7 @@ _MOST_DIGITS: Final = 20
 
 
 def parse_json(text: str | bytes) -> Any:
-    """The content of a JSON text. ValueError, one line, where the text is no JSON or goes beyond what this program
-    takes.
-    """
+    """The content of a JSON text. ValueError, one line, where it is no JSON or goes beyond what this program takes."""
     try:
         content = json.loads(text, parse_int=_whole)
     except RecursionError:

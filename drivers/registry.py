@@ -30,9 +30,7 @@ class KindConfig(BaseModel):
 
 @dataclass(frozen=True, slots=True)
 class Surroundings:
-    """The things a device is created with. Real devices take clock and ports; simulated ones share the world and the
-    seed.
-    """
+    """The things a device is created with. Real devices take clock and ports, simulated ones world and seed."""
 
     clock: Clock
     world: World | None

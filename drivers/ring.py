@@ -13,7 +13,6 @@ import time
 from collections import deque
 from collections.abc import Iterator
 from enum import Enum
-from types import TracebackType
 from typing import Self
 
 import numpy as np
@@ -251,9 +250,7 @@ class RingReader:
         """The reader itself."""
         return self
 
-    def __exit__(
-        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
-    ) -> None:
+    def __exit__(self, *_: object) -> None:
         """Close."""
         self.close()
 

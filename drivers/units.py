@@ -116,9 +116,7 @@ def parse_quantity(text: object, dimension: str) -> float:
 
 
 def parse_exact(text: object, dimension: str) -> Fraction:
-    """Parse a quantity as `parse_quantity` does, but exactly, with nothing rounded; takes a fraction too ("100000/3
-    Hz").
-    """
+    """Parse a quantity as `parse_quantity` does, but with nothing rounded; takes a fraction too ("100000/3 Hz")."""
     known = DIMENSIONS[dimension]
     like = f'write the {known.name} with a unit, like "{known.example}"'
     if not isinstance(text, str):

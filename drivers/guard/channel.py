@@ -140,9 +140,7 @@ class Heartbeat:
 
     @property
     def waited_s(self) -> float:
-        """Seconds for which the source thread has asked the SPAD in vain since its last frames, by its own last
-        word.
-        """
+        """Seconds for which the source thread says that it has asked the SPAD in vain since its last frames."""
         return float(_WAITED.unpack_from(self._page, _FRAME.size)[0])
 
     @waited_s.setter

@@ -16,8 +16,7 @@ import time
 from collections.abc import Mapping, Sequence
 from dataclasses import asdict
 from pathlib import Path
-from types import TracebackType
-from typing import Any, Protocol, Self
+from typing import Any, Self
 
 from drivers.errors import DeviceError, DeviceTimeout, GuardLost
 from drivers.guard.channel import Channel, Heartbeat, Message, error_from, plain_ports
@@ -29,23 +28,10 @@ from drivers.transports.endpoints import Endpoint
 from drivers.transports.tap import TapFile
 
 
-class Asks(Protocol):
-    """The part of the guard that a proxy device uses."""
-
-    def ask(self, slot: str, verb: str, *arguments: Any) -> Any:
-        """Have the guard do a verb; returns its result, raises its error, or `GuardLost`."""
-        ...
-
-    @property
-    def lost(self) -> bool:
-        """Whether there is no guard any more."""
-        ...
-
-
 class GuardedLaser(LineLaser):
     """A laser whose port the guard owns."""
 
-    def __init__(self, guard: Asks, about: dict[str, Any]) -> None:
+    def __init__(self, guard: "Guard", about: dict[str, Any]) -> None:
         super().__init__(about["name"])
         self._guard = guard
         self._identity = str(about["identity"])
@@ -84,7 +70,7 @@ class GuardedLaser(LineLaser):
 class GuardedSync(SyncSource):
     """A sync source whose port the guard owns."""
 
-    def __init__(self, guard: Asks, about: dict[str, Any]) -> None:
+    def __init__(self, guard: "Guard", about: dict[str, Any]) -> None:
         super().__init__(about["name"])
         self._guard = guard
         self._identity = str(about["identity"])
@@ -307,9 +293,7 @@ class Guard:
         """The guard, at work."""
         return self
 
-    def __exit__(
-        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
-    ) -> None:
+    def __exit__(self, *_: object) -> None:
         """Close, whatever happened."""
         self.close()
 

@@ -23,9 +23,7 @@ Job = Callable[[], object]
 
 
 class Lane:
-    """A thread that does jobs one after the other. Jobs must not raise. The thread is a daemon: a job that hangs in a
-    driver does not keep the process alive.
-    """
+    """A thread that does jobs, which must not raise, one after the other. A daemon: none keeps the process alive."""
 
     def __init__(self, name: str) -> None:
         self._jobs: queue.PriorityQueue[tuple[int, int, Job]] = queue.PriorityQueue()
@@ -148,9 +146,7 @@ class Owned:
         return self.unsafe and not self.trying and time.monotonic() >= self._next_try
 
     def try_safe(self) -> None:
-        """Try once to make the device safe. Gate: all outputs low. Laser: paused, then disarmed if it was armed. On a
-        lane.
-        """
+        """Try once to make the device safe: all outputs low, or paused and, if it was armed, disarmed. On a lane."""
         try:
             if self.port_lost:
                 self._reopen()
@@ -187,7 +183,5 @@ class Owned:
             self.armed = False
 
     def _reopen(self) -> None:
-        """Open the device again after its port was lost: it may have been plugged in anew. DeviceError while it is
-        not.
-        """
+        """Open the device again after its port was lost. DeviceError while it is not plugged in again."""
         self.device = self._create()

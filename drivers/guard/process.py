@@ -255,9 +255,7 @@ class GuardProcess:
         laser.lane.do(lambda: self._ask_laser(laser))
 
     def _ask_laser(self, laser: Owned) -> None:
-        """Ask the laser about interlock and faults. A single answer that is missing or garbled is asked for again. Runs
-        on the laser's lane.
-        """
+        """Ask the laser, on its lane, about interlock and faults; again where an answer is missing or garbled."""
         device: LineLaser = laser.device
         for attempt in range(2):
             try:
@@ -321,9 +319,7 @@ class GuardProcess:
 
 
 def _told(error: Exception) -> list[str]:
-    """The error as the application is told it; one that is no device's is a fault of the guard, with all there is to
-    know.
-    """
+    """The error as the application is told it; one that is no device's is logged: it is a fault of the guard."""
     if not isinstance(error, DeviceError):
         _log.exception("guard")
     return error_message(error)
@@ -391,9 +387,7 @@ class Rescue:
             _log.error("%s: %s", slot, error)
 
     def _switch_off(self, slot: str) -> None:
-        """Switch the emission off before anything is asked: opening a laser that takes ten commands a second takes more
-        than one.
-        """
+        """Switch the emission off before anything is asked: opening a slow laser takes more than a second."""
         place, off = self._off[slot]
         endpoint = place()
         port = _once_free(lambda: SerialPort(slot, endpoint))

@@ -3,7 +3,6 @@
 import logging
 from abc import ABC, abstractmethod
 from enum import Enum
-from types import TracebackType
 from typing import Self
 
 from drivers.errors import WrongState
@@ -82,9 +81,7 @@ class Device(ABC):
         self._require("enter", *OPEN_STATES)
         return self
 
-    def __exit__(
-        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
-    ) -> None:
+    def __exit__(self, *_: object) -> None:
         """Close, whatever happened."""
         self.close()
 

@@ -28,9 +28,7 @@ _ROUNDING = 1e-6
 
 @dataclass(frozen=True, slots=True)
 class ScannerLimits:
-    """Limits of what the mirror can follow. Commands are the normalised drive, -1 to 1 being the full range of the
-    DAC.
-    """
+    """Limits of what the mirror can follow. Commands are normalised: -1 to 1 is the full range of the DAC."""
 
     command_range: tuple[float, float]
     """Smallest and largest command."""

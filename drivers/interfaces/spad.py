@@ -189,9 +189,7 @@ class SpadCounters:
 
 @dataclass(frozen=True, slots=True)
 class SpadHealth:
-    """The sensor's own measurements of itself. A value that it does not measure is None, or missing from the
-    mapping.
-    """
+    """The sensor's own measurements of itself. A value that it does not measure is None, or missing."""
 
     temperatures_c: Mapping[str, float] = field(default_factory=dict)
     """Temperatures by the place where each is measured."""

@@ -394,9 +394,7 @@ def _dialect(line: Dialogue, model: str) -> Dialect:
 
 
 def _off(config: CoboltConfig) -> bytes:
-    """Bytes that switch off. No line end before them: an empty command may count as one, and what follows within 0.1 s
-    is not heeded.
-    """
+    """Bytes that switch off. An empty command before them might count, and nothing is heeded for 0.1 s behind it."""
     return b"l0\r"
 
 

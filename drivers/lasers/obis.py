@@ -68,9 +68,7 @@ ERRORS = {
 
 
 class ObisFraming:
-    """The form of an OBIS's commands and replies. channel: slot of the laser in a Remote; None: it is on the port
-    itself.
-    """
+    """The form of an OBIS's commands and replies. channel: its slot in a Remote; None: it is on the port itself."""
 
     def __init__(self, channel: int | None) -> None:
         self._suffix = "" if channel is None else str(channel)
@@ -231,9 +229,7 @@ class ObisLaser(SerialLaser):
         self._armed = True
 
     def _prepare(self) -> None:
-        """Switch off, and set up the laser so that nothing but the gate governs the light, at no later power-up
-        either.
-        """
+        """Switch off, and set up the laser so that nothing but the gate governs the light, now and after power-up."""
         line = self._line
         self._switch_off()
         line.tell_and_check("SYST:CDRH ON", "SYST:CDRH?", SWITCH, "ON".__eq__)

@@ -36,9 +36,7 @@ class Word:
 
 @dataclass(frozen=True, slots=True)
 class Spoken:
-    """The commands that went to the devices of a rig. commands: by device. scans: the buffers of each scan that was
-    run.
-    """
+    """The commands that went to a rig, by device, and the buffers of points of each scan that was run."""
 
     commands: dict[str, list[Word]]
     scans: list[list[Word]]

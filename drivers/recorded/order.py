@@ -104,9 +104,7 @@ def _rising(run: Entries, told: Entries) -> Ints:
 
 
 def _agreeing(seq: Ints, first: Ints, t0: Ints, n_frames: Ints) -> Ints:
-    """Number of neighbours with which each block agrees, int64 (n,): the least of those by its number, frames and
-    ticks.
-    """
+    """Number of neighbours, int64 (n,), with which each block agrees in its number, its frames and its ticks."""
     place = np.arange(len(seq))
     steps = np.diff(first)
     per_frame = float(np.median(np.diff(t0)[steps > 0] / steps[steps > 0])) if (steps > 0).any() else 0.0

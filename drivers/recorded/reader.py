@@ -180,9 +180,7 @@ class RunRecording:
         return runs
 
     def _header(self, entries: Entries) -> BlockHeader | None:
-        """A header that agrees in size and clock with most of several sound blocks' headers; None where no block is
-        sound.
-        """
+        """A header of the size and clock that most of several sound blocks have; None where no block is sound."""
         headers: list[BlockHeader] = []
         for at in _spread(len(entries)):
             with suppress(ProtocolError):

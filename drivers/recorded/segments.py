@@ -16,7 +16,7 @@ import struct
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import Any, Final, Protocol
+from typing import Any, Final
 
 import numpy as np
 from numpy.typing import NDArray
@@ -159,27 +159,6 @@ PACKED_SUFFIX: Final = ".zst"
 NO_SEGMENT: Final = "holds no recording (frames-000000.spb); name the folder of a run taken with --record"
 
 
-class SegmentReader(Protocol):
-    """A segment, plain or compressed."""
-
-    path: Path
-    number: int
-    size: int
-    """Bytes of the plain segment."""
-
-    def at(self, offset: int, length: int) -> Bytes:
-        """Bytes from `offset` on, fewer at the end; valid as long as somebody holds them. CorruptBlock: unreadable."""
-        ...
-
-    def walk(self, start: int, end: int, *, check_payload: bool) -> Iterator[Placed | Damage]:
-        """Blocks and damage between two offsets."""
-        ...
-
-    def expect(self, offset: int, length: int) -> None:
-        """Announce that so many bytes will be read soon."""
-        ...
-
-
 class PlainSegment:
     """A segment as it was recorded, mapped into memory."""
 
@@ -195,7 +174,7 @@ class PlainSegment:
         self._bytes: Bytes = np.frombuffer(self._map or b"", np.uint8)
 
     def at(self, offset: int, length: int) -> Bytes:
-        """Bytes from `offset` on, over the file's memory."""
+        """Bytes from `offset` on, fewer at the end, over the file's memory; valid as long as somebody holds them."""
         return self._bytes[offset : offset + length]
 
     def walk(self, start: int, end: int, *, check_payload: bool) -> Iterator[Placed | Damage]:
@@ -203,7 +182,7 @@ class PlainSegment:
         return _shifted(self._bytes[start:end], start, check_payload)
 
     def expect(self, offset: int, length: int) -> None:
-        """Let the system read ahead."""
+        """Announce that so many bytes will be read soon: the system reads ahead."""
         if self._map is not None and hasattr(mmap, "MADV_WILLNEED") and offset < self.size:
             begin = offset - offset % mmap.PAGESIZE
             self._map.madvise(mmap.MADV_WILLNEED, begin, min(length + offset - begin, self.size - begin))
@@ -220,7 +199,7 @@ class PackedSegment:
         self.size = self._table.size
 
     def at(self, offset: int, length: int) -> Bytes:
-        """The bytes, unpacked."""
+        """Bytes from `offset` on, fewer at the end, unpacked. CorruptBlock where they cannot be."""
         parts = []
         for frame in self._table.frames_at(offset, offset + length):
             data = self._unpacked(frame)
@@ -240,12 +219,16 @@ class PackedSegment:
             yield from _shifted(data[max(0, start - begin) : end - begin], max(start, begin), check_payload)
 
     def expect(self, offset: int, length: int) -> None:
-        """Let the system read ahead."""
+        """Announce that so many bytes will be read soon."""
         for frame in self._table.frames_at(offset, offset + 1):
             self._file.expect(*self._table.packed_place(frame))
 
     def _unpacked(self, frame: int) -> Bytes:
         return unpack_frame(self._file.at(*self._table.packed_place(frame)), self._table.frame_bytes(frame))
+
+
+SegmentReader = PlainSegment | PackedSegment
+"""A segment by its number and its `size`, in plain bytes."""
 
 
 def open_segments(path: Path) -> list[SegmentReader]:

@@ -30,9 +30,7 @@ _NO_WAVE = ScanWaveform(np.zeros(1), np.zeros(1, np.uint8), Fraction(1))
 
 @dataclass(frozen=True, slots=True, eq=False)
 class PointSlice:
-    """A slice of points. command: float64 (n,). markers: uint8 (n,). lit: bool (n,), part of the waveform, not of a
-    ramp.
-    """
+    """Points: command float64 (n,), markers uint8 (n,), lit bool (n,), which is part of the waveform and no ramp."""
 
     command: NDArray[np.float64]
     markers: NDArray[np.uint8]
@@ -165,9 +163,7 @@ class RunPlayer:
         return ScannerStatus(moving=moving, fault=fault, position=None if moving else self.position)
 
     def rest(self) -> float:
-        """Wait for a run that is ending; returns where the mirror rests. After a fault nobody knows that, so the device
-        is halted.
-        """
+        """Wait for a run that is ending; returns where the mirror rests, after a fault by halting the device."""
         self.join()
         if self.position is None:
             self.position = self._halt()

@@ -185,9 +185,7 @@ class HeliosLink:
         self._clock.sleep(_AFTER_STOP_S)
 
     def close(self) -> None:
-        """Stop, take the shutter pin low (the firmware never lowers it), go back to 'disabled', and give the USB device
-        back.
-        """
+        """Stop, take the shutter pin low (the firmware never does), go back to 'disabled', give the device back."""
         try:
             self.stop()
             self._send(_SHUTTER, 0)

@@ -298,9 +298,7 @@ class LaserCubeConfig(GalvoConfig):
 
 
 class LaserCubeDac:
-    """A LaserCube as a `Dac`. Nobody can ask where its mirror stands when it is opened: the first run begins at the
-    centre.
-    """
+    """A LaserCube as a `Dac`. It cannot tell where its mirror stands: the first run begins at the centre."""
 
     closes_at: float | None = None
 

@@ -258,9 +258,7 @@ class Spad512s(SpadArray):
         return self._timing
 
     def _check_period(self, request: SpadRequest, exposure_us: int) -> None:
-        """Check the period: running free, a frame follows the other once it is exposed and the one before is read
-        out.
-        """
+        """Check that, running free, a frame begins once the one before is exposed and the one before that read out."""
         if self._config.trigger == "external":
             return
         period_s = max(Fraction(exposure_us, 1_000_000), 1 / self._info.max_frame_rate_hz)
@@ -285,9 +283,7 @@ class Spad512s(SpadArray):
             self._line.tell(f"I,1,{self._exposure_us},{n_frames},{external},1,0,1\n")
 
     def _connect_where_lost(self) -> None:
-        """Connect again after the program was restarted, or left by hanging up. DeviceFault where another device
-        answers now.
-        """
+        """Connect again after the program was restarted or left. DeviceFault where another device answers now."""
         if self._line.is_open:
             return
         again, before = self._connect_again().master_serial, self._identity.master_serial

@@ -34,7 +34,7 @@ from drivers.transports.bulk_link import BulkLink, PlainLink
 from drivers.transports.endpoints import Endpoint, resolve
 from drivers.transports.queued_link import QueuedLink
 from drivers.transports.tap import Tap
-from drivers.transports.usb_device import UsbDevice, find_device
+from drivers.transports.usb_device import find_device
 from drivers.units import Seconds
 
 _log = logging.getLogger(__name__)
@@ -210,9 +210,7 @@ class SpbUsb(SpadArray):
         return False
 
     def _note_wait(self, seconds: float) -> None:
-        """Note how long the device was asked in vain. A thread that comes late finds what is there: only waiting itself
-        counts.
-        """
+        """Note for how long the device was asked in vain: the waiting itself, not how late this thread comes."""
         self._waited_s += seconds
         if self.on_wait is not None:
             self.on_wait(self._waited_s)
@@ -232,7 +230,7 @@ class SpbUsb(SpadArray):
         now = self._now_s()
         if now - self._pinged_at >= self._config.heartbeat / _PINGS_PER_HEARTBEAT:
             self._pinged_at = now
-            self._control.ping(max(0, receiver.next_frame - 1) & 0xFFFFFFFF)
+            self._control.send_in_run(Op.PING, max(0, receiver.next_frame - 1) & 0xFFFFFFFF)
 
     def _count(self, receiver: BlockReceiver, exposed: int | None = None) -> None:
         seen = receiver.next_frame if exposed is None else max(exposed, receiver.next_frame)
@@ -296,9 +294,8 @@ def open_link(config: SpbUsbConfig, endpoint: Endpoint) -> BulkLink:
     """The link to the device at an endpoint. An emulator's own backend can do plain reads only."""
     wiring = WIRINGS[config.chip]
     listing = find_device(wiring.usb, endpoint.address, endpoint.usb_backend)
-    if config.reads == "queued" and endpoint.usb_backend is None:
-        return QueuedLink(listing, LABEL, wiring.interfaces)
-    return PlainLink(UsbDevice(listing, LABEL, dict.fromkeys(wiring.interfaces, 0)))
+    queued = config.reads == "queued" and endpoint.usb_backend is None
+    return (QueuedLink if queued else PlainLink)(listing, LABEL, wiring.interfaces)
 
 
 def create(config: SpbUsbConfig, surroundings: Surroundings) -> SpbUsb:

@@ -51,9 +51,7 @@ class SensorIdentity:
 
 
 def identify(control: ControlChannel, name: str) -> SensorIdentity:
-    """Read the identity registers. `DeviceNotFound` where the device does not speak SPB1, `DeviceFault` where it speaks
-    another version.
-    """
+    """Read the identity registers. `DeviceNotFound`: it does not speak SPB1. `DeviceFault`: another version."""
     # A program that died may have left a run behind, which would drown the answers.
     control.forget_run()
     try:
@@ -223,9 +221,7 @@ class Wiring:
     """Whether the chip streams only within a session that is opened by commands."""
 
     def open_session(self, link: BulkLink) -> None:
-        """Tell the FT601 to stream, which it does not before; data of a session that was not closed is cleared
-        first.
-        """
+        """Clear what a session left that was not closed, then tell the FT601 to stream."""
         if not self.has_session:
             return
         found = len(link.control_in(0xC0, _CONFIG_REQUEST, 1, 0, _CONFIG_BYTES, 1.0))
@@ -241,9 +237,7 @@ class Wiring:
                 self._tell(link, command)
 
     def _tell(self, link: BulkLink, command: int) -> None:
-        """Send a session command to each pipe in use: touching others disturbs the session (LeechCore pull requests 80
-        and 81).
-        """
+        """Send a session command to the pipes in use; others disturb the session (LeechCore pull requests 80, 81)."""
         for pipe in sorted({self.stream_in, self.ack_in} & link.endpoints):
             length = _STREAM_BYTES if command == _STREAM else 0
             link.write(_SESSION_OUT, _COMMAND.pack(0, pipe, command, 0, length, 0, 0), 1.0)

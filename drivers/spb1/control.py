@@ -273,14 +273,8 @@ class ControlChannel:
         """Send one command. `DeviceFault` where the device refuses it."""
         return self._ask([(op, 0, value)])[0]
 
-    def ping(self, value: int) -> None:
-        """Say that this program is alive, in a run."""
-        self.send_in_run(Op.PING, value)
-
     def send_in_run(self, op: Op, value: int = 0) -> None:
-        """Send one command while the stream runs: the answer is waited for only where it does not come in the
-        stream.
-        """
+        """Send one command while the stream runs; its answer is waited for unless it comes in the stream."""
         if self._ack_in is not None:
             self.send(op, value)
         else:

@@ -85,9 +85,7 @@ class BlockLayout:
 
 
 def frames_per_block(stride: int, width: int, height: int) -> int:
-    """Number of frames of width x height that fit into a stride. ValueError where the stride is bad or holds no
-    frame.
-    """
+    """Number of frames that fit into a stride. ValueError where the stride is bad or holds no frame."""
     check_stride(stride)
     one = BlockLayout(1, width, height)
     room = stride - HEADER_BYTES - TRAILER_BYTES

@@ -12,7 +12,7 @@ import logging
 from collections import deque
 from dataclasses import dataclass, replace
 from enum import Enum
-from typing import Any, Protocol
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -22,10 +22,9 @@ from drivers.frames import BlockFlag, FrameBlock, packed_row_bytes
 from drivers.ring import BlockRing
 from drivers.spb1.layout import ALIGN, HEADER_BYTES, MAGIC
 from drivers.spb1.reader import HeaderFields, read_frames, read_header
+from drivers.transports.bulk_link import Buffer, BulkLink
 
 _log = logging.getLogger(__name__)
-
-Buffer = NDArray[np.uint8]
 
 QUEUE_BYTES = 8 << 20
 """Reads in flight hold about so much, 20 ms of the fastest link: what a busy host may be late by. Half of what Linux
@@ -38,22 +37,6 @@ _LAST, _LOST_BEFORE, _FORCED_LOW = (
 """Plain numbers: arithmetic with flags takes microseconds, ten times a block."""
 _ROOMY_RING = 8
 """Number of slots from which on two reads are kept in flight even where the ring is full."""
-
-
-class Reads(Protocol):
-    """Queued reads of one endpoint, done in order; a `BulkLink` has them."""
-
-    def submit(self, endpoint: int, buffer: Buffer) -> bool:
-        """Queue a read of the whole buffer. False where the system takes no more of them."""
-        ...
-
-    def reap(self, timeout_s: float) -> tuple[Buffer, int] | None:
-        """The oldest one once it is over, and its bytes."""
-        ...
-
-    def cancel(self) -> None:
-        """End all."""
-        ...
 
 
 @dataclass(frozen=True, slots=True)
@@ -91,7 +74,7 @@ class _Item:
 class BlockReceiver:
     """The stream of one run. For one thread."""
 
-    def __init__(self, reads: Reads, endpoint: int, armed: Armed, label: str) -> None:
+    def __init__(self, link: BulkLink, endpoint: int, armed: Armed, label: str) -> None:
         self.delivered = 0
         self.next_frame = 0
         """Number of the frame behind the last one that is known to have been exposed."""
@@ -102,7 +85,7 @@ class BlockReceiver:
         """Whether the run's last block came."""
         self.gate_forced_low = False
         """Whether the device's watchdog ended the run."""
-        self._reads = reads
+        self._link = link
         self._endpoint = endpoint
         self._armed = armed
         self._label = label
@@ -124,7 +107,7 @@ class BlockReceiver:
         """Wait for the next read and deal with it. May raise what `ring.mark_overflow` raises, frames counted."""
         self._ring = ring
         self._top_up(ring)
-        reaped = self._reads.reap(timeout_s)
+        reaped = self._link.reap(timeout_s)
         if reaped is None:
             return Took.NOTHING
         item = self._items.popleft()
@@ -137,7 +120,7 @@ class BlockReceiver:
         """Read on without publishing, for at most one wait of `timeout_s`; True once the last block came."""
         if not self._items:
             self._submit(self._spare(), slot=False)
-        reaped = self._reads.reap(timeout_s)
+        reaped = self._link.reap(timeout_s)
         if reaped is not None:
             item = self._items.popleft()
             try:
@@ -151,7 +134,7 @@ class BlockReceiver:
 
     def close(self) -> None:
         """Give up the reads in flight and give their slots back."""
-        self._reads.cancel()
+        self._link.cancel()
         if self._held is not None:
             self._items.append(_Item(self._held, slot=True))
             self._held = None
@@ -177,7 +160,7 @@ class BlockReceiver:
                 self._depth = len(self._items)  # the system takes no more; asking again would only cost time
 
     def _submit(self, buffer: Buffer, *, slot: bool, use: bool = True) -> bool:
-        if not self._reads.submit(self._endpoint, buffer):
+        if not self._link.submit(self._endpoint, buffer):
             if not slot:
                 self._spares.append(buffer)
             return False

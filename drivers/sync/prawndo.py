@@ -98,9 +98,7 @@ def _cycles(index: int, pulse: Pulse, board: ProgramLimits) -> int:
 
 
 def _check_waits(period: NDArray[np.void], repeats: int, board: ProgramLimits) -> None:
-    """Check that between two waits the program plays longer than a scan marker: else one marker would end both (pitfall
-    1).
-    """
+    """Check that the program plays longer between two waits than a scan marker, which else ends both (pitfall 1)."""
     waits = np.flatnonzero(period["cycles"] == 0)
     if len(waits) == 0:
         return

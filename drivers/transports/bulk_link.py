@@ -16,7 +16,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from drivers.errors import DeviceTimeout
-from drivers.transports.usb_device import UsbDevice
+from drivers.transports.usb_device import UsbDevice, UsbListing
 
 Buffer = NDArray[np.uint8]
 
@@ -25,8 +25,11 @@ class BulkLink(Protocol):
     """The abilities that a streaming driver needs of its device."""
 
     label: str
-    endpoints: frozenset[int]
-    """Addresses of the claimed interfaces' endpoints; bit 7 set = IN."""
+
+    @property
+    def endpoints(self) -> frozenset[int]:
+        """Addresses of the claimed interfaces' endpoints; bit 7 set = IN."""
+        ...
 
     def write(self, endpoint: int, data: bytes, timeout_s: float) -> None:
         """One OUT transfer. `DeviceTimeout` where not all of it went out."""
@@ -59,30 +62,15 @@ class BulkLink(Protocol):
         ...
 
 
-class PlainLink:
+class PlainLink(UsbDevice):
     """A streaming USB device read through pyusb, one piece after the other."""
 
-    def __init__(self, device: UsbDevice) -> None:
-        self.label = device.label
-        self.endpoints = frozenset(device.endpoints())
-        self._device = device
+    def __init__(self, listing: UsbListing, label: str, interfaces: tuple[int, ...]) -> None:
+        """Open the device of a listing and claim its interfaces."""
+        super().__init__(listing, label, dict.fromkeys(interfaces, 0))
         self._queue: deque[tuple[int, Buffer]] = deque()
         self._scratch = array.array("B")
         self._got = 0
-
-    def write(self, endpoint: int, data: bytes, timeout_s: float) -> None:
-        """See `BulkLink`."""
-        self._device.write(endpoint, data, timeout_s)
-
-    def read(self, endpoint: int, size: int, timeout_s: float) -> bytes:
-        """See `BulkLink`."""
-        return self._device.read(endpoint, size, timeout_s)
-
-    def control_in(
-        self, request_type: int, request: int, value: int, index: int, length: int, timeout_s: float
-    ) -> bytes:
-        """See `BulkLink`."""
-        return self._device.control_in(request_type, request, value, index, length, timeout_s)
 
     def submit(self, endpoint: int, buffer: Buffer) -> bool:
         """Remember the buffer for `reap`."""
@@ -98,7 +86,7 @@ class PlainLink:
         if len(self._scratch) != left:
             self._scratch = array.array("B", bytes(left))
         try:
-            n = self._device.read_into(endpoint, self._scratch, timeout_s)
+            n = self.read_into(endpoint, self._scratch, timeout_s)
         except DeviceTimeout:
             return None
         buffer[self._got : self._got + n] = np.frombuffer(self._scratch, np.uint8)[:n]
@@ -114,8 +102,3 @@ class PlainLink:
         """Forget what is queued."""
         self._queue.clear()
         self._got = 0
-
-    def close(self) -> None:
-        """Give the device back."""
-        self.cancel()
-        self._device.close()

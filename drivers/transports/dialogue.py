@@ -13,7 +13,6 @@ import re
 import threading
 from collections.abc import Callable
 from dataclasses import dataclass
-from types import TracebackType
 from typing import Protocol
 
 from drivers.clock import NS_PER_S, Clock
@@ -22,9 +21,7 @@ from drivers.transports.serial_port import SerialPort
 
 
 class FairLock:
-    """A lock for `with` that serves threads in turn: whoever waits gets it before the thread that had it last; not
-    re-entrant.
-    """
+    """A lock for `with`, not re-entrant: whoever waits gets it before the thread that had it last."""
 
     def __init__(self) -> None:
         self._turn = threading.Lock()
@@ -35,9 +32,7 @@ class FairLock:
         with self._turn:
             self._held.acquire()
 
-    def __exit__(
-        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
-    ) -> None:
+    def __exit__(self, *_: object) -> None:
         """Give it to whoever waits."""
         self._held.release()
 
@@ -149,9 +144,7 @@ class Dialogue:
         return float(self.ask(command, NUMBER))
 
     def ask_surely(self, command: str, form: re.Pattern[str]) -> str:
-        """Ask until two replies in a row agree. For answers that are kept, or that end a scan: nothing else guards
-        against a flipped bit.
-        """
+        """Ask until two replies in a row agree: nothing else guards an answer that is kept against a flipped bit."""
         last = self.ask(command, form)
         for _ in range(_ATTEMPTS):
             reply = self.ask(command, form)

@@ -29,9 +29,7 @@ _Lines = SimpleQueue[bytes | threading.Event | None]
 
 @dataclass(frozen=True, slots=True)
 class TapFile:
-    """The file to which taps write, and the time that counts as 0 (`time.monotonic_ns`). Its two fields can be handed
-    to another process.
-    """
+    """The file to which taps write, and the time that counts as 0 (`time.monotonic_ns`); for any process."""
 
     path: str
     start_ns: int
@@ -125,9 +123,7 @@ class Passed:
 
 
 def read_taps(file: Path) -> list[Passed]:
-    """Everything that passed, in order of time; a torn last line is left out. `ProtocolError` for a file that is no
-    tap's.
-    """
+    """Everything that passed, in order of time, but for a torn last line. `ProtocolError` for another sort of file."""
     *lines, _ = file.read_bytes().split(b"\n")
     found = []
     for number, line in enumerate(lines, 1):

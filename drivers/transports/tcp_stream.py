@@ -37,11 +37,6 @@ class TcpStream:
         with suppress(OSError):  # a hint: commands are single small packets
             self._socket.setsockopt(socket.IPPROTO_TCP, socket.TCP_NODELAY, 1)
 
-    @property
-    def address(self) -> str:
-        """The address that it is connected to."""
-        return self._address
-
     def send(self, data: bytes, deadline_s: float) -> None:
         """Send all of `data`. `DeviceTimeout` where the other side takes none for so long, `DeviceDisconnected`."""
         ends_at = time.monotonic() + deadline_s
@@ -59,9 +54,7 @@ class TcpStream:
         return bytes(buffer[: self.receive_into(memoryview(buffer), deadline_s)])
 
     def receive_into(self, view: memoryview, deadline_s: float) -> int:
-        """Receive into `view` (bytes, not empty); returns the number of bytes, 0 past the deadline.
-        `DeviceDisconnected`.
-        """
+        """Receive bytes into `view`; returns their number, 0 past the deadline. `DeviceDisconnected`."""
         ends_at = time.monotonic() + deadline_s
         while True:
             with self._translated():
@@ -104,9 +97,7 @@ class TcpStream:
 
     @contextmanager
     def _translated(self) -> Iterator[None]:
-        """Raise our error for everything that a socket raises about an open connection: it means that the connection is
-        gone.
-        """
+        """Raise our error for all that a socket raises about an open connection: it means that this is gone."""
         try:
             yield
         except (OSError, ValueError) as error:

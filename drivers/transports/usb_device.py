@@ -83,9 +83,7 @@ def usb_failure(
 
 @dataclass(frozen=True, slots=True)
 class UsbId:
-    """The ids by which a device is found. Vendors share numbers: one of `product_names`, if any, must be part of the
-    product string.
-    """
+    """The ids of a sort of device. Vendors share numbers: one of `product_names` must be part of its product string."""
 
     label: str
     vendor: int
@@ -101,7 +99,6 @@ class UsbListing:
     product: int
     path: str
     serial: str | None
-    manufacturer: str | None
     product_name: str | None
     handle: Any = field(repr=False, compare=False, default=None)
 
@@ -210,16 +207,12 @@ class UsbDevice:
             reply = self._device.ctrl_transfer(request_type, request, value, index, length, milliseconds(timeout_s))
         return bytes(reply)
 
-    def endpoints(self) -> tuple[int, ...]:
+    @property
+    def endpoints(self) -> frozenset[int]:
         """Addresses of all endpoints in the active configuration; bit 7 set = IN."""
         with translated(self.label):
             interfaces = list(self._device.get_active_configuration())
-        return tuple(endpoint.bEndpointAddress for interface in interfaces for endpoint in interface)
-
-    def clear_halt(self, endpoint: int) -> None:
-        """Make a stalled endpoint work again."""
-        with translated(self.label, endpoint):
-            self._device.clear_halt(endpoint)
+        return frozenset(endpoint.bEndpointAddress for interface in interfaces for endpoint in interface)
 
     def close(self) -> None:
         """Give the interfaces and the device back; again: nothing happens. Raises nothing: the device may be gone."""
@@ -292,16 +285,13 @@ def _matcher(address: str) -> Callable[[UsbListing], bool]:
 
 def _listing(device: Any) -> UsbListing:
     ports = device.port_numbers or (device.address or 0,)
-    serial, maker, product = (
-        _string(device, index) for index in (device.iSerialNumber, device.iManufacturer, device.iProduct)
-    )
+    serial, product = (_string(device, index) for index in (device.iSerialNumber, device.iProduct))
     usb.util.dispose_resources(device)  # asking for strings opened it
     return UsbListing(
         vendor=device.idVendor,
         product=device.idProduct,
         path=f"{device.bus}-{'.'.join(str(port) for port in ports)}",
         serial=serial,
-        manufacturer=maker,
         product_name=product,
         handle=device,
     )

@@ -3,12 +3,15 @@
 import json
 import threading
 import time
+from fractions import Fraction
 
 import numpy as np
 import pytest
 
 from drivers.spb1.control import Op
 from rig import api
+from rig.config.overrides import configure
+from rig.devices import prepare
 from sim_backend.wire.emulated_world import KEPT_S, EmulatedWorld
 
 TRUE_EXTINCTION_PER_M = 0.087
@@ -33,8 +36,17 @@ def worlds(monkeypatch):
     return seen
 
 
-def test_a_scan_over_emulated_wires_ends_in_a_depth_map_through_fog(tmp_path, worlds):
-    result = api.scan("lab-emulated", out=tmp_path / "run")
+def test_a_scan_over_emulated_wires_ends_in_a_depth_map_through_fog(tmp_path, worlds, monkeypatch):
+    """Slower than the bundled rig, so that a host with much else to do starts the scanner within the burst."""
+    monkeypatch.setattr(prepare, "HOST_LEAD_S", 0.8)
+    usual = configure("lab-emulated")
+    slow = usual.model_copy(
+        update={
+            "scan": usual.scan.model_copy(update={"frame_rate": Fraction(20_000), "power": 10e-3}),
+            "scanner": usual.scanner.model_copy(update={"frame": 0.5, "max_point_rate": 8e3}),
+        }
+    )
+    result = api.scan(slow, out=tmp_path / "run")
     summary = json.loads((tmp_path / "run" / "summary.json").read_text())
     assert summary["verdict"] == "complete"
     frames = summary["frames"]
