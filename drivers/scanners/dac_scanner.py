@@ -42,24 +42,24 @@ class PointSlice:
 
 
 class PointSource:
-    """Gives the points of a run in order: `repeats` of a waveform, or (None) the way alone. One thread."""
+    """Gives the points of a run in order: the way from rest at `position` to `end`, then `repeats` of a waveform that
+    begins there. One thread.
+    """
 
     def __init__(
         self,
-        way: NDArray[np.float64],
-        waveform: ScanWaveform | None,
-        repeats: int,
-        *,
         position: float,
+        end: float,
         limits: ScannerLimits,
         rate_hz: float,
+        waveform: ScanWaveform = _NO_WAVE,
+        repeats: int = 0,
     ) -> None:
-        """Use `scan_from` and `park_from`. `position` is where the mirror rests now, `way` leads on from there."""
         self._limits = limits
         self._rate_hz = rate_hz
-        self._wave = _NO_WAVE if waveform is None else waveform
-        self._way = way
-        self._end = len(way) + repeats * len(self._wave.command)
+        self._wave = waveform
+        self._way = ramp(position, end, limits, rate_hz)
+        self._end = len(self._way) + repeats * len(waveform.command)
         self._at = 0
         self._before = self.last = position
         self._former = 0, position, position
@@ -108,20 +108,6 @@ class PointSource:
             self.last = float(command[-1])
 
 
-def scan_from(
-    position: float, waveform: ScanWaveform, repeats: int, limits: ScannerLimits, rate_hz: float
-) -> PointSource:
-    """Points from rest at `position` to the waveform's first point, and the waveform."""
-    way = ramp(position, float(waveform.command[0]), limits, rate_hz)
-    return PointSource(way, waveform, repeats, position=position, limits=limits, rate_hz=rate_hz)
-
-
-def park_from(position: float, end: float, limits: ScannerLimits, rate_hz: float) -> PointSource:
-    """Points from rest at `position` to rest at `end`; none where that is the same."""
-    way = ramp(position, end, limits, rate_hz)
-    return PointSource(way, None, 0, position=position, limits=limits, rate_hz=rate_hz)
-
-
 _log = logging.getLogger(__name__)
 
 
@@ -137,83 +123,6 @@ class DacRun(Protocol):
     def feed(self, stopping: threading.Event) -> None:
         """Send the rest; returns when the mirror rests. Brakes once `stopping` is set."""
         ...
-
-
-class RunPlayer:
-    """One run at a time. `halt` ends whatever the device plays, in an emergency, and returns where the mirror rests."""
-
-    def __init__(self, name: str, halt: Callable[[], float], position: float) -> None:
-        self._name = name
-        self._halt = halt
-        self.position: float | None = position
-        """Command at which the mirror rests; None: it is moving, or its place is unknown after a fault."""
-        self._stopping = threading.Event()
-        self._thread: threading.Thread | None = None
-        self.error: DeviceError | None = None
-        """The error that ended the last run early; None: it ended by itself or was stopped."""
-
-    def status(self, ask: Callable[[], None]) -> ScannerStatus:
-        """The status; `ask` raises where the device at rest does not answer."""
-        moving = self._thread is not None and self._thread.is_alive()
-        if isinstance(self.error, DeviceDisconnected):
-            raise self.error
-        if not moving and self.error is None:
-            ask()
-        fault = None if self.error is None else str(self.error)
-        return ScannerStatus(moving=moving, fault=fault, position=None if moving else self.position)
-
-    def rest(self) -> float:
-        """Wait for a run that is ending; returns where the mirror rests, after a fault by halting the device."""
-        self.join()
-        if self.position is None:
-            self.position = self._halt()
-        return self.position
-
-    def start(self, run: DacRun) -> None:
-        """Begin, and leave the rest to a thread."""
-        self.error = None
-        self._begin(run)
-        self._thread = threading.Thread(target=self._feed, args=(run,), name=self._name, daemon=True)
-        self._thread.start()
-
-    def play(self, run: DacRun) -> None:
-        """Play a run to its end. A run without points is none."""
-        if run.source.left:
-            self._begin(run)
-            run.feed(self._stopping)
-            self.position = run.source.last
-
-    def stop(self) -> None:
-        """Let the run brake; returns when the mirror rests."""
-        self._stopping.set()
-        self.rest()
-
-    def end(self) -> None:
-        """End the thread before the device is closed: nothing talks to it afterwards."""
-        self._stopping.set()
-        self.join()
-
-    def join(self) -> None:
-        """Wait for the thread. Several may."""
-        thread = self._thread
-        if thread is not None:
-            thread.join()
-            if self._thread is thread:
-                self._thread = None
-
-    def _begin(self, run: DacRun) -> None:
-        self._stopping.clear()
-        self.position = None
-        run.begin()
-
-    def _feed(self, run: DacRun) -> None:
-        """Feed the device, in the thread. `status` tells of what fails here, which ends the run."""
-        try:
-            run.feed(self._stopping)
-            self.position = run.source.last
-        except DeviceError as error:
-            self.error = error
-            _log.error("%s", error)
 
 
 class Dac(Protocol):
@@ -258,8 +167,13 @@ class DacScanner(BeamScanner):
         self._dac = dac
         self._park = config.park
         self._limits = config.limits(dac.highest_rate_hz)
-        self._player = RunPlayer(dac.name, dac.halt, position=0.0)
         self._loaded: tuple[ScanWaveform, int] | None = None
+        self._position: float | None = 0.0
+        """Command at which the mirror rests; None: it is moving, or its place is unknown after a fault."""
+        self._stopping = threading.Event()
+        self._thread: threading.Thread | None = None
+        self._error: DeviceError | None = None
+        """The error that ended the last run early; None: it ended by itself or was stopped."""
 
     @property
     def identity(self) -> str:
@@ -277,32 +191,45 @@ class DacScanner(BeamScanner):
         return self._limits
 
     def _do_status(self) -> ScannerStatus:
-        return self._player.status(self._dac.check)
+        moving = self._thread is not None and self._thread.is_alive()
+        if isinstance(self._error, DeviceDisconnected):
+            raise self._error
+        if not moving and self._error is None:
+            self._dac.check()
+        fault = None if self._error is None else str(self._error)
+        return ScannerStatus(moving=moving, fault=fault, position=None if moving else self._position)
 
     def _do_point_clock(self, requested_hz: float) -> Fraction:
         return self._dac.point_clock(requested_hz, *self._limits.point_rate_hz)
 
     def _do_load(self, waveform: ScanWaveform, repeats: int, clock_hz: Fraction) -> None:
-        self._player.join()
+        self._join()
         self._loaded = (ScanWaveform(waveform.command.copy(), waveform.markers.copy(), clock_hz), repeats)
 
     def _do_start(self) -> None:
         assert self._loaded is not None, "the interface starts loaded scanners only"
         waveform, repeats = self._loaded
         clock_hz = waveform.point_rate_hz
-        source = scan_from(self._player.rest(), waveform, repeats, self._limits, float(clock_hz))
-        self._player.start(self._dac.run(source, clock_hz))
+        first = float(waveform.command[0])
+        source = PointSource(self._rest(), first, self._limits, float(clock_hz), waveform, repeats)
+        run = self._dac.run(source, clock_hz)
+        self._error = None
+        self._begin(run)
+        self._thread = threading.Thread(target=self._feed, args=(run,), name=self.name, daemon=True)
+        self._thread.start()
 
     def _do_stop(self) -> None:
-        self._player.stop()
+        self._stopping.set()
+        self._rest()
 
     def _do_park(self) -> None:
         self._go(self._park)
 
     def _do_close(self) -> None:
-        self._player.end()  # nobody talks while the device is given back
+        self._stopping.set()
+        self._join()  # nobody talks while the device is given back
         try:
-            if self._dac.closes_at is not None and self._player.position is not None:
+            if self._dac.closes_at is not None and self._position is not None:
                 self._go(self._dac.closes_at)
         finally:
             self._dac.close()
@@ -310,8 +237,40 @@ class DacScanner(BeamScanner):
     def _go(self, command: float) -> None:
         """Bring the mirror to rest at `command`, as fast as the board plays."""
         clock_hz = self._do_point_clock(self._limits.point_rate_hz[1])
-        source = park_from(self._player.rest(), command, self._limits, float(clock_hz))
-        self._player.play(self._dac.run(source, clock_hz))
+        run = self._dac.run(PointSource(self._rest(), command, self._limits, float(clock_hz)), clock_hz)
+        if run.source.left:
+            self._begin(run)
+            run.feed(self._stopping)
+            self._position = run.source.last
+
+    def _begin(self, run: DacRun) -> None:
+        self._stopping.clear()
+        self._position = None
+        run.begin()
+
+    def _feed(self, run: DacRun) -> None:
+        """Feed the device, in the thread. `status` tells of what fails here, which ends the run."""
+        try:
+            run.feed(self._stopping)
+            self._position = run.source.last
+        except DeviceError as error:
+            self._error = error
+            _log.error("%s", error)
+
+    def _rest(self) -> float:
+        """Wait for a run that is ending; returns where the mirror rests, after a fault by halting the device."""
+        self._join()
+        if self._position is None:
+            self._position = self._dac.halt()
+        return self._position
+
+    def _join(self) -> None:
+        """Wait for the thread. Several may."""
+        thread = self._thread
+        if thread is not None:
+            thread.join()
+            if self._thread is thread:
+                self._thread = None
 
 
 def open_scanner(

@@ -142,12 +142,31 @@ _AFTER_STOP_S = 0.15
 """Wait after STOP: frames within 100 ms of it are refused."""
 
 
-class HeliosLink:
-    """The commands of a Helios, one at a time. Any thread."""
+class HeliosConfig(GalvoConfig):
+    """Config of a Helios and of the galvo behind it."""
 
-    def __init__(self, link: UsbDevice, clock: Clock) -> None:
+    kind: Literal["helios"] = "helios"
+    name: str | None = None
+    """Name stored in the device; another one is refused."""
+    max_point_rate: Annotated[Hertz, Field(gt=LOWEST_RATE_HZ, le=MOST_PPS)] = 65535.0
+    """Most points per second. Lower it where the host's USB is busy: 40 kHz leaves a margin."""
+    frame: Annotated[Seconds, Field(ge=0.01, le=0.5)] = 0.06
+    """Length of one frame: the host may be late by as much, and a stop takes twice as long."""
+
+
+class HeliosDac:
+    """A Helios as a `Dac`: its commands, one at a time. Any thread.
+
+    STOP and the alternate setting without endpoints leave the mirror at the centre.
+    """
+
+    closes_at: float | None = 0.0
+
+    def __init__(self, config: HeliosConfig, link: UsbDevice, clock: Clock) -> None:
         """Wait until the firmware is enabled, drop old replies, learn version and name."""
         self.name = link.label
+        self.highest_rate_hz = config.max_point_rate
+        self._config = config
         self._link = link
         self._clock = clock
         self._lock = threading.RLock()
@@ -159,6 +178,27 @@ class HeliosLink:
         self.firmware: int = version
         self._send(_SDK_VERSION, _OUR_SDK_VERSION)
         self.stored_name = self._ask(_NAME, 0x85, 1).split(b"\0")[0].decode("ascii", "replace")
+        self.serial = self.stored_name or None
+        self.identity = f"{self.name}, {self.stored_name!r}, firmware {self.firmware}"
+
+    def point_clock(self, requested_hz: float, low_hz: float, high_hz: float) -> Fraction:
+        """The rate nearest to the requested one that the divider of the board's timer can make."""
+        return nearest_rate(requested_hz, low_hz, high_hz)
+
+    def run(self, source: PointSource, clock_hz: Fraction) -> "HeliosRun":
+        """See `Dac`."""
+        config = self._config
+        return HeliosRun(self, self._clock, source, clock_hz, frame_s=config.frame, axis=config.axis)
+
+    def check(self) -> None:
+        """Check that the board answers; DeviceTimeout where it is asked twice in vain."""
+        if self.free() is None and self.free() is None:
+            raise DeviceTimeout(f"{self.name}: gives no status; unplug it and plug it in again")
+
+    def halt(self) -> float:
+        """Send STOP: the mirror is at the centre then, in one jump."""
+        self.stop()
+        return 0.0
 
     def free(self) -> bool | None:
         """Whether a frame can be sent; None where the device gave no proper status, which means no as well."""
@@ -232,7 +272,7 @@ class HeliosRun:
     """One run: `begin`, then `feed`. Every wait has an end: at most two frames and two seconds."""
 
     def __init__(
-        self, link: HeliosLink, clock: Clock, source: PointSource, clock_hz: Fraction, *, frame_s: float, axis: str
+        self, link: HeliosDac, clock: Clock, source: PointSource, clock_hz: Fraction, *, frame_s: float, axis: str
     ) -> None:
         self.source = source
         self._link = link
@@ -372,66 +412,16 @@ _log = logging.getLogger(__name__)
 _TESTED_FIRMWARE = 6
 
 
-class HeliosConfig(GalvoConfig):
-    """Config of a Helios and of the galvo behind it."""
-
-    kind: Literal["helios"] = "helios"
-    name: str | None = None
-    """Name stored in the device; another one is refused."""
-    max_point_rate: Annotated[Hertz, Field(gt=LOWEST_RATE_HZ, le=MOST_PPS)] = 65535.0
-    """Most points per second. Lower it where the host's USB is busy: 40 kHz leaves a margin."""
-    frame: Annotated[Seconds, Field(ge=0.01, le=0.5)] = 0.06
-    """Length of one frame: the host may be late by as much, and a stop takes twice as long."""
-
-
-class HeliosDac:
-    """A Helios as a `Dac`. STOP and the alternate setting without endpoints leave the mirror at the centre."""
-
-    closes_at: float | None = 0.0
-
-    def __init__(self, config: HeliosConfig, link: HeliosLink, clock: Clock) -> None:
-        self.name = link.name
-        self.identity = f"{link.name}, {link.stored_name!r}, firmware {link.firmware}"
-        self.serial = link.stored_name or None
-        self.highest_rate_hz = config.max_point_rate
-        self._config = config
-        self._link = link
-        self._clock = clock
-
-    def point_clock(self, requested_hz: float, low_hz: float, high_hz: float) -> Fraction:
-        """The rate nearest to the requested one that the divider of the board's timer can make."""
-        return nearest_rate(requested_hz, low_hz, high_hz)
-
-    def run(self, source: PointSource, clock_hz: Fraction) -> HeliosRun:
-        """See `Dac`."""
-        config = self._config
-        return HeliosRun(self._link, self._clock, source, clock_hz, frame_s=config.frame, axis=config.axis)
-
-    def check(self) -> None:
-        """Check that the board answers; DeviceTimeout where it is asked twice in vain."""
-        if self._link.free() is None and self._link.free() is None:
-            raise DeviceTimeout(f"{self.name}: gives no status; unplug it and plug it in again")
-
-    def halt(self) -> float:
-        """Send STOP: the mirror is at the centre then, in one jump."""
-        self._link.stop()
-        return 0.0
-
-    def close(self) -> None:
-        """See `HeliosLink.close`."""
-        self._link.close()
-
-
 def create(config: HeliosConfig, surroundings: Surroundings) -> DacScanner:
     """Open the Helios at the config's port."""
 
     def identify(usb: UsbDevice) -> HeliosDac:
-        link = HeliosLink(usb, surroundings.clock)
-        if link.firmware < _TESTED_FIRMWARE:
-            _log.warning("%s: firmware %d is older than the tested %d", link.name, link.firmware, _TESTED_FIRMWARE)
-        if config.name not in (None, link.stored_name):
-            raise DeviceNotFound(f"{link.name}: its name is {link.stored_name!r}, not {config.name!r}; correct port")
-        return HeliosDac(config, link, surroundings.clock)
+        dac = HeliosDac(config, usb, surroundings.clock)
+        if dac.firmware < _TESTED_FIRMWARE:
+            _log.warning("%s: firmware %d is older than the tested %d", dac.name, dac.firmware, _TESTED_FIRMWARE)
+        if config.name not in (None, dac.stored_name):
+            raise DeviceNotFound(f"{dac.name}: its name is {dac.stored_name!r}, not {config.name!r}; correct port")
+        return dac
 
     return open_scanner(HELIOS, {INTERFACE: ENABLED}, config, surroundings, identify)
 

@@ -61,28 +61,68 @@ _SAMPLES_S = 0.5
 _DRAIN_S = 0.005
 
 
-class LaserCubeLink:
-    """The commands of a LaserCube, one at a time. Any thread."""
+class LaserCubeConfig(GalvoConfig):
+    """Config of a LaserCube and of its galvo."""
 
-    def __init__(self, link: UsbDevice, clock: Clock) -> None:
+    kind: Literal["lasercube"] = "lasercube"
+    colours: Literal["dark", "markers"] = "dark"
+    """Use of the colour outputs. markers: its lasers are unplugged and the outputs lead to the marker inputs. dark:
+    never enabled."""
+    max_point_rate: Annotated[Hertz, Field(gt=LOWEST_RATE_HZ, le=100_000)] = 30_000.0
+    """Most points per second; the device may allow less."""
+    buffer: Annotated[Seconds, Field(ge=0.01, le=0.5)] = 0.06
+    """Duration of the samples queued in the device: the host may be late by as much, and a stop takes as long."""
+
+
+class LaserCubeDac:
+    """A LaserCube as a `Dac`: its commands, one at a time. Any thread.
+
+    It cannot tell where its mirror stands: the first run begins at the centre.
+    """
+
+    closes_at: float | None = None
+
+    def __init__(self, config: LaserCubeConfig, link: UsbDevice, clock: Clock) -> None:
         """Switch the output off, empty the ring, and ask the device about itself."""
         self.name = link.label
         self.serial = link.listing.serial
         self.clock = clock
+        self._config = config
         self._link = link
         self._lock = threading.RLock()
         self._out_of_step = True
         """A reply came late, or an older program left one: what is read next may answer an older question."""
         self.safe()
         self.firmware = (self._number(_MAJOR, 1), self._number(_MINOR, 1))
-        self.highest_rate_hz = self._number(_MAX_RATE)
+        self.identity = f"{self.name}, firmware {self.firmware[0]}.{self.firmware[1]}"
+        most_hz = self._number(_MAX_RATE)
+        self.highest_rate_hz = min(config.max_point_rate, float(most_hz))
         self.ring_points = self._number(_RING_SIZE)
         scale = (self._number(_DAC_MIN), self._number(_DAC_MAX))
-        if scale != (0, _FULL_SCALE) or self.ring_points < 8 * SAMPLES_PER_TRANSFER or self.highest_rate_hz == 0:
+        if scale != (0, _FULL_SCALE) or self.ring_points < 8 * SAMPLES_PER_TRANSFER or most_hz == 0:
             raise ProtocolError(
                 f"{self.name}: says range {scale[0]} to {scale[1]}, {self.ring_points} samples of buffer, "
-                f"{self.highest_rate_hz} Hz at most; this is no LaserCube firmware"
+                f"{most_hz} Hz at most; this is no LaserCube firmware"
             )
+
+    def point_clock(self, requested_hz: float, low_hz: float, high_hz: float) -> Fraction:
+        """The nearest whole number of Hz, which is all that the device can be told; a run reads it back."""
+        return Fraction(min(max(round(requested_hz), int(low_hz)), int(high_hz)))
+
+    def run(self, source: PointSource, clock_hz: Fraction) -> "LaserCubeRun":
+        """See `Dac`."""
+        config = self._config
+        markers = config.colours == "markers"
+        return LaserCubeRun(self, source, int(clock_hz), buffer_s=config.buffer, axis=config.axis, markers=markers)
+
+    def check(self) -> None:
+        """Check that the board answers; any question will do."""
+        self.queued()
+
+    def halt(self) -> float:
+        """Clear the ring. Where that leaves the mirror nobody knows: the next run goes to the centre in one jump."""
+        self.safe()
+        return 0.0
 
     def safe(self) -> None:
         """Switch the colours off, then leave nothing to play."""
@@ -183,7 +223,7 @@ class LaserCubeRun:
     """One run: `begin`, then `feed`. Every wait has an end: the queued samples and a second."""
 
     def __init__(
-        self, link: LaserCubeLink, source: PointSource, rate_hz: int, *, buffer_s: float, axis: str, markers: bool
+        self, link: LaserCubeDac, source: PointSource, rate_hz: int, *, buffer_s: float, axis: str, markers: bool
     ) -> None:
         self.source = source
         self._link = link
@@ -284,63 +324,11 @@ class LaserCubeRun:
         return self._link.clock.now_ns() / NS_PER_S
 
 
-class LaserCubeConfig(GalvoConfig):
-    """Config of a LaserCube and of its galvo."""
-
-    kind: Literal["lasercube"] = "lasercube"
-    colours: Literal["dark", "markers"] = "dark"
-    """Use of the colour outputs. markers: its lasers are unplugged and the outputs lead to the marker inputs. dark:
-    never enabled."""
-    max_point_rate: Annotated[Hertz, Field(gt=LOWEST_RATE_HZ, le=100_000)] = 30_000.0
-    """Most points per second; the device may allow less."""
-    buffer: Annotated[Seconds, Field(ge=0.01, le=0.5)] = 0.06
-    """Duration of the samples queued in the device: the host may be late by as much, and a stop takes as long."""
-
-
-class LaserCubeDac:
-    """A LaserCube as a `Dac`. It cannot tell where its mirror stands: the first run begins at the centre."""
-
-    closes_at: float | None = None
-
-    def __init__(self, config: LaserCubeConfig, link: LaserCubeLink) -> None:
-        self.name = link.name
-        self.identity = f"{link.name}, firmware {link.firmware[0]}.{link.firmware[1]}"
-        self.serial = link.serial
-        self.highest_rate_hz = min(config.max_point_rate, float(link.highest_rate_hz))
-        self._config = config
-        self._link = link
-
-    def point_clock(self, requested_hz: float, low_hz: float, high_hz: float) -> Fraction:
-        """The nearest whole number of Hz, which is all that the device can be told; a run reads it back."""
-        return Fraction(min(max(round(requested_hz), int(low_hz)), int(high_hz)))
-
-    def run(self, source: PointSource, clock_hz: Fraction) -> LaserCubeRun:
-        """See `Dac`."""
-        config = self._config
-        markers = config.colours == "markers"
-        return LaserCubeRun(
-            self._link, source, int(clock_hz), buffer_s=config.buffer, axis=config.axis, markers=markers
-        )
-
-    def check(self) -> None:
-        """Check that the board answers; any question will do."""
-        self._link.queued()
-
-    def halt(self) -> float:
-        """Clear the ring. Where that leaves the mirror nobody knows: the next run goes to the centre in one jump."""
-        self._link.safe()
-        return 0.0
-
-    def close(self) -> None:
-        """See `LaserCubeLink.close`."""
-        self._link.close()
-
-
 def create(config: LaserCubeConfig, surroundings: Surroundings) -> DacScanner:
     """Open the LaserCube at the config's port."""
 
     def identify(usb: UsbDevice) -> LaserCubeDac:
-        return LaserCubeDac(config, LaserCubeLink(usb, surroundings.clock))
+        return LaserCubeDac(config, usb, surroundings.clock)
 
     return open_scanner(LASERCUBE, ALTERNATES, config, surroundings, identify)
 

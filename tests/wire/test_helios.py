@@ -165,7 +165,7 @@ def test_old_replies_are_drained_before_the_first_question() -> None:
 
     model.set_interface = with_leftovers  # type: ignore[method-assign]
     with opened("helios", model, VirtualClock()) as (device, _):
-        assert device._dac._link.firmware == 6  # type: ignore[attr-defined]
+        assert device._dac.firmware == 6  # type: ignore[attr-defined]
 
 
 @pytest.mark.parametrize("junk", [b"\x84\x06\x00\x00\x00", b"\x83", b"\x83\x02", b"\x00\x01", b"\x83\x01\x00"])

@@ -142,7 +142,7 @@ def test_a_reply_left_by_another_program_is_dropped() -> None:
     model = LaserCubeModel()
     model.leave_reply(bytes(64))
     with opened("lasercube", model, VirtualClock()) as (device, _):
-        assert device._dac._link.firmware == (0, 12)  # type: ignore[attr-defined]
+        assert device._dac.firmware == (0, 12)  # type: ignore[attr-defined]
 
 
 def test_a_lasershark_with_the_same_numbers_is_not_taken_for_one() -> None:

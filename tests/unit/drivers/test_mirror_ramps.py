@@ -10,7 +10,7 @@ from hypothesis import strategies as st
 
 from drivers.interfaces import MARKER_LINE, MARKER_SCAN, ScannerLimits, ScanWaveform
 from drivers.interfaces.scanner import check_waveform
-from drivers.scanners.dac_scanner import park_from, scan_from
+from drivers.scanners.dac_scanner import PointSource
 from drivers.scanners.galvo import brake, ramp
 
 RATE_HZ = 25_000.0
@@ -63,7 +63,7 @@ def test_slices_put_together_are_the_way_and_the_repeats(position: float, repeat
     at = np.arange(97)
     wave = ScanWaveform(0.3 * np.sin(2 * math.pi * at / 97), np.full(97, MARKER_LINE, np.uint8), Fraction(RATE_HZ))
     wave.markers[0] = MARKER_SCAN
-    source = scan_from(position, wave, repeats, LIMITS, RATE_HZ)
+    source = PointSource(position, float(wave.command[0]), LIMITS, RATE_HZ, wave, repeats)
     total, taken = source.left, []
     for most in (*slices, total):
         taken.append(source.take(most))
@@ -81,7 +81,7 @@ def test_slices_put_together_are_the_way_and_the_repeats(position: float, repeat
 def test_a_stop_goes_on_from_where_the_run_was(taken: int) -> None:
     command = -0.3 * np.cos(2 * math.pi * np.arange(500) / 500)
     wave = ScanWaveform(command, np.zeros(500, np.uint8), Fraction(RATE_HZ))
-    source = scan_from(-0.3, wave, 3, LIMITS, RATE_HZ)
+    source = PointSource(-0.3, -0.3, LIMITS, RATE_HZ, wave, 3)
     before = source.take(taken)
     source.stop()
     after = source.take(10_000)
@@ -91,4 +91,4 @@ def test_a_stop_goes_on_from_where_the_run_was(taken: int) -> None:
 
 
 def test_parking_where_it_stands_needs_no_points() -> None:
-    assert park_from(0.5, 0.5, LIMITS, RATE_HZ).left == 0
+    assert PointSource(0.5, 0.5, LIMITS, RATE_HZ).left == 0
