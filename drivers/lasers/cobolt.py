@@ -18,10 +18,11 @@ reply may take a second (0.1 s is too little: python-microscope issue 234).
 
 import logging
 import re
+from abc import ABC, abstractmethod
 from collections.abc import Callable
 from contextlib import suppress
 from functools import partial
-from typing import Literal, Protocol
+from typing import Literal
 
 from drivers.errors import DeviceError, DeviceFault, ProtocolError
 from drivers.interfaces import LaserLimits, LaserStatus
@@ -71,44 +72,66 @@ _POWER_STEP_W = 1e-4
 """The finest power that every model keeps: 0.1 mW."""
 
 
-class Dialect(Protocol):
+class Dialect(ABC):
     """The commands of one language of the laser that the driver uses. All methods raise the errors of `Dialogue`."""
 
     family: str
+    _modulated: str
+    """The mode in which an input governs the light."""
+    _digital: str
+    _analog: str
+    """Questions whether the TTL input, and the analog one, govern the light."""
+    _power: tuple[str, str]
+    """Command and question of the power under the gate, in milliwatts."""
 
+    def __init__(self, line: Dialogue) -> None:
+        self._line = line
+
+    @abstractmethod
     def mode(self) -> str:
         """The mode as the laser calls it."""
-        ...
 
     def input_mode(self, mode: str) -> str:
-        """The control of the light in this mode: "digital" under the gate; in every other mode light shines without the
-        gate.
-        """
-        ...
+        """The control of the light in this mode: only "digital" keeps it under the gate."""
+        if mode != self._modulated:
+            return self._unmodulated(mode)
+        digital, analog = self._line.ask_flag(self._digital), self._line.ask_flag(self._analog)
+        if digital and not analog:
+            return "digital"
+        return "mixed" if digital else "analog" if analog else "modulation without input"
 
+    @abstractmethod
     def gate(self) -> None:
         """Let the TTL input, and nothing else, govern the light. Read back; to be called in the dark."""
-        ...
 
     def set_power(self, power_w: float) -> None:
         """Set the power while the gate is high. Read back."""
-        ...
+        command, question = self._power
+        power_mw = power_w * 1e3
+        slack_mw = max(0.01 * power_mw, _POWER_STEP_W * 1e3 / 2)
+        self._line.tell_and_check(
+            f"{command} {power_mw:.4f}", question, NUMBER, lambda reply: abs(float(reply) - power_mw) <= slack_mw
+        )
 
+    @abstractmethod
     def power_w(self, mode: str) -> float | None:
         """The power that the laser is set to in this mode. None: set by current, it cannot say."""
-        ...
 
+    @abstractmethod
     def darken(self) -> None:
         """Leave no light in any mode that knows a power, at once and without the key."""
-        ...
 
+    @abstractmethod
     def brighten(self) -> None:
         """End what `darken` did besides the power."""
-        ...
 
+    @abstractmethod
     def waits_for_key(self) -> bool:
         """Whether the laser starts only once its key is turned off and on."""
-        ...
+
+    @abstractmethod
+    def _unmodulated(self, mode: str) -> str:
+        """Name of a mode in which no input governs the light."""
 
 
 def classify(model: str) -> str:
@@ -122,34 +145,22 @@ def classify(model: str) -> str:
     return "unknown"
 
 
-class MldDialect:
+class MldDialect(Dialect):
     """The language of 06-MLD: `slmp`, `sdmes`, `em`."""
 
     family = "06-MLD"
-    _MODES = ("constant current", "constant power")
-
-    def __init__(self, line: Dialogue) -> None:
-        self._line = line
+    _modulated, _digital, _analog = "2", "gdmes?", "games?"
+    _power = "slmp", "glmp?"
 
     def mode(self) -> str:
         """The answer to `gam?`: 0 constant current, 1 constant power, 2 modulation."""
         return self._line.ask("gam?", re.compile("[012]"))
-
-    def input_mode(self, mode: str) -> str:
-        """The input by which the light is modulated, from `gdmes?` and `games?`."""
-        if mode != "2":
-            return self._MODES[int(mode)]
-        return _inputs(self._line.ask_flag("gdmes?"), self._line.ask_flag("games?"))
 
     def gate(self) -> None:
         """Set digital modulation on, analog off, and modulation mode."""
         self._line.tell_and_check("sdmes 1", "gdmes?", FLAG, "1".__eq__)
         self._line.tell_and_check("sames 0", "games?", FLAG, "0".__eq__)
         self._line.tell_and_check("em", "gam?", COUNT, "2".__eq__)
-
-    def set_power(self, power_w: float) -> None:
-        """Set the power; `slmp` takes milliwatts."""
-        self._power_mw(power_w * 1e3)
 
     def power_w(self, mode: str) -> float | None:
         """The power set, in W: `glmp?` answers in milliwatts, `p?` in watts."""
@@ -159,7 +170,7 @@ class MldDialect:
 
     def darken(self) -> None:
         """Set powers to 0, that of the present mode first: this may be an emergency."""
-        self._power_mw(0.0)
+        self.set_power(0.0)
         self._line.tell("p 0")
 
     def brighten(self) -> None:
@@ -169,28 +180,20 @@ class MldDialect:
         """Whether `gom?` is 1."""
         return self._line.ask("gom?", COUNT) == "1"
 
-    def _power_mw(self, power_mw: float) -> None:
-        self._line.tell_and_check(f"slmp {power_mw:.4f}", "glmp?", NUMBER, _near(power_mw))
+    def _unmodulated(self, mode: str) -> str:
+        return ("constant current", "constant power")[int(mode)]
 
 
-class ScpiDialect:
+class ScpiDialect(Dialect):
     """The newer 06-01 language: `laser:runmode`, `las:paus`."""
 
     family = "06-01"
-    _POWER = "laser:powermodulation:power:setpoint"
-
-    def __init__(self, line: Dialogue) -> None:
-        self._line = line
+    _modulated, _digital, _analog = "powermodulation", "las:pm:dig:ena?", "las:pm:ana:ena?"
+    _power = "laser:powermodulation:power:setpoint", "laser:powermodulation:power:setpoint?"
 
     def mode(self) -> str:
         """The run mode."""
         return self._line.ask("laser:runmode?", WORD).lower()
-
-    def input_mode(self, mode: str) -> str:
-        """The input by which the light is modulated, from the inputs that are on."""
-        if mode != "powermodulation":
-            return mode
-        return _inputs(self._line.ask_flag("las:pm:dig:ena?"), self._line.ask_flag("las:pm:ana:ena?"))
 
     def gate(self) -> None:
         """Set the external modulator and nothing else: as "command" it follows `!e` and `!d` without ever replying."""
@@ -199,20 +202,15 @@ class ScpiDialect:
         self._line.tell("laser:pm:dig:modulator external")
         self._line.tell_and_check("laser:runmode PowerModulation", "laser:runmode?", WORD, _is_modulation)
 
-    def set_power(self, power_w: float) -> None:
-        """Set the power, in milliwatts on the wire."""
-        self._power_mw(power_w * 1e3)
-
     def power_w(self, mode: str) -> float | None:
         """The power set, in W; milliwatts on the wire, in both modes that know a power."""
-        if mode == "powermodulation":
-            return self._line.ask_number(f"{self._POWER}?") * 1e-3
-        return self._line.ask_number("laser:cp:power:setpoint?") * 1e-3 if mode == "constantpower" else None
+        questions = {self._modulated: self._power[1], "constantpower": "laser:cp:power:setpoint?"}
+        return self._line.ask_number(questions[mode]) * 1e-3 if mode in questions else None
 
     def darken(self) -> None:
         """Blank at once by `las:paus 1`; the powers of 0 tell the next program so."""
         self._line.tell("las:paus 1")
-        self._power_mw(0.0)
+        self.set_power(0.0)
         self._line.tell("laser:cp:power:setpoint 0")
 
     def brighten(self) -> None:
@@ -223,24 +221,8 @@ class ScpiDialect:
         """Whether `state?` is AutostartWaitingForKeyOn."""
         return "waitingforkey" in self._line.ask("state?", WORD).lower()
 
-    def _power_mw(self, power_mw: float) -> None:
-        self._line.tell_and_check(f"{self._POWER} {power_mw:.4f}", f"{self._POWER}?", NUMBER, _near(power_mw))
-
-
-def _inputs(digital: bool, analog: bool) -> str:
-    if digital and not analog:
-        return "digital"
-    return "mixed" if digital else "analog" if analog else "modulation without input"
-
-
-class _near:  # noqa: N801 - reads as what it says
-    """Whether a power read back in milliwatts is the one that was set."""
-
-    def __init__(self, power_mw: float) -> None:
-        self._power_mw = power_mw
-
-    def __call__(self, reply: str) -> bool:
-        return abs(float(reply) - self._power_mw) <= max(0.01 * self._power_mw, _POWER_STEP_W * 1e3 / 2)
+    def _unmodulated(self, mode: str) -> str:
+        return mode
 
 
 def _is_modulation(reply: str) -> bool:

@@ -98,9 +98,17 @@ class PrawnDoLine:
                 ) from None
             self._free_wedged(most_words)
 
-    def transact(self, command: str) -> list[str]:
-        """Send a command; returns the lines of its answer, without blank ones."""
-        return self._transact(command, self._timing.reply_s, urgent=False)
+    def transact(self, command: str, deadline_s: float | None = None, *, urgent: bool = False) -> list[str]:
+        """Send a command; returns the lines of its answer, without blank ones.
+
+        urgent: it does not give way to low outputs, as it is on the way to them.
+        """
+        deadline_s = self._timing.reply_s if deadline_s is None else deadline_s
+        with self.lock:
+            self._pay_debt()
+            before, after = self._token(), self._token()
+            self._port.write(f"{before}\n{command}\n{after}\n".encode())
+            return self._until(lambda lines: bool(lines) and after in lines[-1], before, deadline_s, urgent)[:-1]
 
     def command(self, command: str) -> None:
         """Send a command that answers `ok`. `DeviceFault` for any other answer."""
@@ -108,13 +116,20 @@ class PrawnDoLine:
         if lines != ["ok"]:
             raise DeviceFault(f"{self._name}: {command} was answered {lines}, not ok")
 
-    def run_status(self) -> tuple[int, bool]:
+    def run_status(self, deadline_s: float | None = None, *, urgent: bool = False) -> tuple[int, bool]:
         """`run-status`, and whether the external clock is in use."""
-        return self._run_status(self._timing.reply_s, urgent=False)
 
-    def pins(self) -> int:
+        def parse(line: str) -> tuple[int, bool]:
+            run, clock = (part.split(":") for part in line.split(" "))
+            if run[0] != "run-status" or clock[0] != "clock-status" or int(run[1]) not in range(7):
+                raise ValueError(line)
+            return int(run[1]), {"0": False, "1": True}[clock[1]]
+
+        return self._ask_twice("sts", parse, deadline_s, urgent)
+
+    def pins(self, deadline_s: float | None = None, *, urgent: bool = False) -> int:
         """Levels of the outputs; only in a state of `IDLE`."""
-        return self._pins(self._timing.reply_s, urgent=False)
+        return self._ask_twice("gto", lambda line: int(line, 16), deadline_s, urgent)
 
     def load(self, payload: bytes) -> None:
         """Replace the program by these words of six bytes. `DeviceFault` for any answer but `ok` (pitfall 2)."""
@@ -159,11 +174,11 @@ class PrawnDoLine:
     def _try_to_lower(self) -> bool:
         """One round; each question has its own round trip, in which the board's second core does what it was told."""
         hasty_s = self._timing.hasty_s
-        self._transact("abt", hasty_s, urgent=True)
-        if self._run_status(hasty_s, urgent=True)[0] not in IDLE:
+        self.transact("abt", hasty_s, urgent=True)
+        if self.run_status(hasty_s, urgent=True)[0] not in IDLE:
             return False
-        self._transact("man 0", hasty_s, urgent=True)
-        return self._pins(hasty_s, urgent=True) == 0 and self._run_status(hasty_s, urgent=True)[0] in IDLE
+        self.transact("man 0", hasty_s, urgent=True)
+        return self.pins(hasty_s, urgent=True) == 0 and self.run_status(hasty_s, urgent=True)[0] in IDLE
 
     def _free_wedged(self, most_words: int) -> None:
         """Free a board that a program which another host never finished sending keeps from hearing commands: give it
@@ -177,7 +192,7 @@ class PrawnDoLine:
         for _ in range(BYTES_PER_WORD * most_words // len(piece) + 2):
             self._port.write(piece + b"\n")
             try:
-                self._transact("sts", 2 * self._timing.hasty_s, urgent=False)
+                self.transact("sts", 2 * self._timing.hasty_s)
             except (DeviceTimeout, ProtocolError):
                 continue
             self.lower()
@@ -199,21 +214,9 @@ class PrawnDoLine:
         lines = self._until(lambda lines: after in lines[-1], None, self._timing.load_s, urgent=False)
         return lines[:-1]
 
-    def _run_status(self, deadline_s: float, urgent: bool) -> tuple[int, bool]:
-        def parse(line: str) -> tuple[int, bool]:
-            run, clock = (part.split(":") for part in line.split(" "))
-            if run[0] != "run-status" or clock[0] != "clock-status" or int(run[1]) not in range(7):
-                raise ValueError(line)
-            return int(run[1]), {"0": False, "1": True}[clock[1]]
-
-        return self._ask_twice("sts", parse, deadline_s, urgent)
-
-    def _pins(self, deadline_s: float, urgent: bool) -> int:
-        return self._ask_twice("gto", lambda line: int(line, 16), deadline_s, urgent)
-
-    def _ask_twice(self, command: str, parse: Callable[[str], _T], deadline_s: float, urgent: bool) -> _T:
+    def _ask_twice(self, command: str, parse: Callable[[str], _T], deadline_s: float | None, urgent: bool) -> _T:
         """Ask until two answers in a row agree: a flipped bit makes a low gate of a high one."""
-        lines = self._transact(f"{command}\n{command}", deadline_s, urgent)
+        lines = self.transact(f"{command}\n{command}", deadline_s, urgent=urgent)
         try:
             first, second = (parse(line) for line in lines)
         except (ValueError, KeyError):
@@ -221,14 +224,6 @@ class PrawnDoLine:
         if first != second:
             raise ProtocolError(f"{self._name}: {command} was answered {lines}, which differ; check the cable")
         return first
-
-    def _transact(self, command: str, deadline_s: float, urgent: bool) -> list[str]:
-        """Send a command; returns the lines of its answer, without blank ones."""
-        with self.lock:
-            self._pay_debt()
-            before, after = self._token(), self._token()
-            self._port.write(f"{before}\n{command}\n{after}\n".encode())
-            return self._until(lambda lines: bool(lines) and after in lines[-1], before, deadline_s, urgent)[:-1]
 
     def _until(
         self, done: Callable[[list[str]], bool], before: str | None, deadline_s: float, urgent: bool
