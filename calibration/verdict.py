@@ -20,7 +20,7 @@ AT_M: Final = 5.0
 
 
 @dataclass(frozen=True, slots=True)
-class Asked:
+class AccuracyGoal:
     """The quality asked of a calibration: sd of depth at a distance; the baseline where somebody has measured it."""
 
     accuracy_m: float

@@ -180,3 +180,105 @@ class ExportRequest:
         None, "frames summed for a picture of view frames", unset="100", name="frames"
     )
     pictures_per_s: float | None = option(None, "pictures of a film a second", unset="25", name="fps")
+
+
+@described
+@dataclass(frozen=True, slots=True, kw_only=True)
+class CalibrationRequest:
+    """A calibration with a rig, or with frames that one has taken."""
+
+    seed: int = option(0, "seed of everything simulated")
+    arm: bool = option(False, "let a real laser shine: the beam path is clear")
+    out: str | os.PathLike[str] | None = option(
+        None, "folder to write, new or empty", unset="nothing is written", read_as=Path | None
+    )
+
+
+@described
+@dataclass(frozen=True, slots=True, kw_only=True)
+class PixelsRequest(CalibrationRequest):
+    """A map of hot, dead and noisy pixels (`rig calibrate pixels`)."""
+
+    frames: int | None = option(None, "dark ones", unset="as many as the limit of hot pixels needs")
+    lit: str | os.PathLike[str] | None = option(
+        None, "a recorded run whose lit frames tell dead pixels", unset="none", read_as=Path | None
+    )
+    light: bool = option(False, "take lit frames now")
+    against: str | os.PathLike[str] | None = option(
+        None, "an older map, for the drift", unset="the one beside the rig's calibration", read_as=Path | None
+    )
+
+
+@described
+@dataclass(frozen=True, slots=True, kw_only=True)
+class BoardRequest(CalibrationRequest):
+    """A calibration with views of a board."""
+
+    board: str | os.PathLike[str] | None = option(
+        None, "what is printed on the board: its YAML file", unset="the bundled", read_as=Path | None
+    )
+    poses: int = option(12, "of the board, shown to a live rig")
+    scene: str | None = option(None, "of a simulated rig, with a board", unset="its own, else board")
+
+
+@described
+@dataclass(frozen=True, slots=True, kw_only=True)
+class CameraRequest(BoardRequest):
+    """A calibration of the camera alone (`rig calibrate camera`)."""
+
+    terms: int = option(5, "of the lens model, as OpenCV counts them: 0, 4, 5, 8, 12 or 14")
+
+
+@described
+@dataclass(frozen=True, slots=True, kw_only=True)
+class PlanesRequest(BoardRequest):
+    """A calibration of camera, light planes and lag together (`rig calibrate planes`)."""
+
+    guided: bool = option(False, "ask for the poses that help most, until it is enough or all poses were shown")
+    calibration: str | os.PathLike[str] | None = option(
+        None, "one to start from; its defects are kept", unset="none", read_as=Path | None
+    )
+    camera: str | os.PathLike[str] | None = option(
+        None, "camera.yaml of `calibrate camera`, made of other views", unset="none", read_as=Path | None
+    )
+    stated_baseline: str | None = option(None, "camera to mirror as measured: '300 mm'", unset="not known")
+    accuracy: str | None = option(
+        None, "depth error (standard deviation) that is good enough: '10 mm'", unset="that of 0.1 pixels"
+    )
+    at: str = option("5 m", "distance at which it counts")
+    exposures: Sequence[int] = option((), "frames per column, by turns: 3,10,20", unset="0.3 to 2 x the config's")
+    accept_calibration: bool = option(False, "use a --camera whose verdict failed all the same")
+
+
+@described
+@dataclass(frozen=True, slots=True, kw_only=True)
+class SyncRequest(CalibrationRequest):
+    """A measurement of the mirror's lag and the rows' delay (`rig calibrate sync`)."""
+
+    calibration: str | os.PathLike[str] | None = option(
+        None, "the lags go into a copy of it", unset="the rig's own", read_as=Path | None
+    )
+    accuracy: str | None = option(
+        None, "depth error (standard deviation) that is good enough: '10 mm'", unset="that of 0.1 pixels"
+    )
+    at: str = option("5 m", "distance at which it counts")
+    exposures: Sequence[int] = option((), "frames per column, by turns: 3,10,20", unset="0.3 to 2 x the config's")
+    scene: str | None = option(None, "of a simulated rig, with a board", unset="its own, else board")
+
+
+@described
+@dataclass(frozen=True, slots=True, kw_only=True)
+class CheckRequest(BoardRequest):
+    """A check of a calibration by a board that it was not made with (`rig calibrate check`)."""
+
+    poses: int = option(1, "of the board, shown to a live rig; 2 or more for an angle")
+    calibration: str | os.PathLike[str] | None = option(
+        None, "what to check", unset="the rig's own", read_as=Path | None
+    )
+    angle: str | None = option(
+        None, "between the boards of the first two views, as stated: '30 deg'", unset="not known"
+    )
+    accuracy: str | None = option(
+        None, "depth error (standard deviation) that is good enough: '10 mm'", unset="that of 0.1 pixels"
+    )
+    at: str = option("5 m", "distance at which it counts")

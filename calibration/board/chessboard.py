@@ -14,7 +14,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from calibration.board.board import Board
-from calibration.board.lattice import FORMS, Gray, Lattice, Sighting, as_form, known_lattice
+from calibration.board.lattice import FORMS, Gray, Lattice, MatchedPoints, as_form, known_lattice
 
 Array = NDArray[np.float64]
 
@@ -22,10 +22,10 @@ _SMALLEST_PARTS = ((4, 4), (3, 3))
 """Inner corners of a chessboard that count as a part of one; small ones are more often found where none is."""
 _FORMS_FOR_PARTS = ((1, 0.0), (1, 1.5), (2, 0.8))
 """(enlargement, smoothing), as FORMS: quick ones, since a part is looked for where the whole was not found."""
-_NOTHING = Sighting(np.zeros((0, 2)), np.zeros((0, 2)), 0)
+_NOTHING = MatchedPoints(np.zeros((0, 2)), np.zeros((0, 2)), 0)
 
 
-def find_chessboard(shown: Gray, board: Board) -> Sighting:
+def find_chessboard(shown: Gray, board: Board) -> MatchedPoints:
     """The chessboard's inner corners, the first one at the board's top left as far as that can be told; or what else
     there is: a part of it, or another chessboard.
     """
@@ -79,12 +79,12 @@ def _whole_chessboard(form: Gray, grid: tuple[int, int]) -> Array | None:
     return np.asarray(corners, np.float64).reshape(grid[1], grid[0], 2) if found else None
 
 
-def _found(lattice: Lattice, shown: Gray, board: Board, form: tuple[int, float]) -> Sighting:
+def _found(lattice: Lattice, shown: Gray, board: Board, form: tuple[int, float]) -> MatchedPoints:
     """The board, whole; another one alike is looked for where it does not hide it."""
     px = lattice.px if lattice.grid == board.grid else lattice.px.transpose(1, 0, 2)
     px, mirrored = _from_top_left(px, shown, board)
     points = board.corners_m[:, :2]
-    sighting = Sighting(points, px.reshape(-1, 2), len(points), mirrored)
+    sighting = MatchedPoints(points, px.reshape(-1, 2), len(points), mirrored)
     if not mirrored and not _top_left_is_black(px, shown):
         return replace(sighting, other="a chessboard whose corner squares are white, not black")
     hidden = shown.copy()
@@ -109,7 +109,7 @@ def _may_be(lattice: Lattice, board: Board) -> bool:
     )
 
 
-def _unlike(lattice: Lattice, board: Board) -> Sighting:
+def _unlike(lattice: Lattice, board: Board) -> MatchedPoints:
     """A part of the board, or another one."""
     count = lattice.px.size // 2
     if _may_be(lattice, board):

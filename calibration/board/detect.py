@@ -14,7 +14,7 @@ from numpy.typing import NDArray
 from calibration.board.board import Board
 from calibration.board.chessboard import find_chessboard
 from calibration.board.drawing import BoardMap, Drawing, fit_map
-from calibration.board.lattice import Sighting, find_markers, gray
+from calibration.board.lattice import MatchedPoints, find_markers, gray
 from calibration.board.markers import contradiction
 from calibration.board.registration import OWN, SUBPIXELS, WIDE, register, sides_px
 from calibration.errors import Degenerate
@@ -97,14 +97,14 @@ def find_corners(picture: NDArray[np.generic], board: Board, defects: NDArray[np
     return Corners(ids[order], px[order], sd[order])
 
 
-def _map_of(sighting: Sighting, board: Board) -> BoardMap | None:
+def _map_of(sighting: MatchedPoints, board: Board) -> BoardMap | None:
     if len(sighting.points_m) < 4:
         return None
     found = fit_map(sighting.points_m, sighting.px, _MAP_OUTLIER_SQUARES * sighting.square_px(board), board.size_m)
     return None if found is None else found[0]
 
 
-def _another(sighting: Sighting, board: Board) -> bool:
+def _another(sighting: MatchedPoints, board: Board) -> bool:
     """True where points off the best board lie on a second one."""
     limit = _MAP_OUTLIER_SQUARES * sighting.square_px(board)
     found = fit_map(sighting.points_m, sighting.px, limit, board.size_m)
@@ -118,7 +118,7 @@ def _another(sighting: Sighting, board: Board) -> bool:
 
 
 def _refined(
-    values: NDArray[np.float32], board: Board, rough: BoardMap, sighting: Sighting
+    values: NDArray[np.float32], board: Board, rough: BoardMap, sighting: MatchedPoints
 ) -> tuple[NDArray[np.int32], Array, Array]:
     """Find all corners that the picture shows: around the rough map first, then, growing, around the map through those
     found; last, each on pixels of its own.
@@ -162,7 +162,7 @@ def _wrong(how: str) -> Degenerate:
     )
 
 
-def _not_found(sighting: Sighting, board: Board) -> Degenerate:
+def _not_found(sighting: MatchedPoints, board: Board) -> Degenerate:
     whole = len(board.charuco().getIds()) if board.kind == "charuco" else len(board.corners_m)
     what = "markers" if board.kind == "charuco" else "corners"
     if sighting.part is not None:

@@ -216,7 +216,7 @@ _DARKEST, _BRIGHTEST = 0.5, 99.5
 
 
 @dataclass(frozen=True, slots=True, eq=False)
-class Sighting:
+class MatchedPoints:
     """Points of the board (n, 2) in metres and where they are seen, (n, 2) raw pixels, about half a pixel.
 
     count: markers or corners read. chessboards: how many are in the picture. part: corners along (x, y) of what may be
@@ -246,13 +246,13 @@ def gray(values: NDArray[np.float32]) -> Gray:
     return np.asarray(np.clip((values - low) * (255 / span), 0, 255), np.uint8)
 
 
-def find_markers(shown: Gray, board: Board) -> Sighting:
+def find_markers(shown: Gray, board: Board) -> MatchedPoints:
     """The board's markers; `mirrored` where the mirror image of the picture shows more of them."""
     best = _most_markers(shown, board)
     if best.count <= 0.25 * len(board.charuco().getIds()):
         flipped = _most_markers(np.ascontiguousarray(shown[:, ::-1]), board)
         if flipped.count > 2 * best.count + 2:
-            return Sighting(flipped.points_m, flipped.px, flipped.count, mirrored=True)
+            return MatchedPoints(flipped.points_m, flipped.px, flipped.count, mirrored=True)
     return best
 
 
@@ -264,14 +264,14 @@ def as_form(shown: Gray, scale: int, smooth: float) -> Gray:
     return np.asarray(cv2.resize(smoothed, None, fx=scale, fy=scale, interpolation=cv2.INTER_CUBIC), np.uint8)
 
 
-def _most_markers(shown: Gray, board: Board) -> Sighting:
+def _most_markers(shown: Gray, board: Board) -> MatchedPoints:
     charuco = board.charuco()
     places = {
         int(marker): np.asarray(points, np.float64)[:, :2]
         for marker, points in zip(np.ravel(charuco.getIds()), charuco.getObjPoints(), strict=True)
     }
     detector = cv2.aruco.ArucoDetector(charuco.getDictionary())
-    best, most = Sighting(np.zeros((0, 2)), np.zeros((0, 2)), 0), (0, 0)
+    best, most = MatchedPoints(np.zeros((0, 2)), np.zeros((0, 2)), 0), (0, 0)
     for scale, smooth in FORMS:
         corners, found, _ = detector.detectMarkers(as_form(shown, scale, smooth))
         if found is None:
@@ -282,7 +282,7 @@ def _most_markers(shown: Gray, board: Board) -> Sighting:
         if (int(known.sum()), len(ids)) > most:
             most = int(known.sum()), len(ids)
             points = np.array([places[marker] for marker in ids[known].tolist()]).reshape(-1, 2)
-            best = Sighting(points, px[known].reshape(-1, 2), most[0], markers=Markers(ids, px))
+            best = MatchedPoints(points, px[known].reshape(-1, 2), most[0], markers=Markers(ids, px))
         if best.count >= _ENOUGH * len(places):
             break
     return best

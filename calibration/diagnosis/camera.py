@@ -22,7 +22,7 @@ from calibration.errors import digits, mm
 from calibration.model.camera import Camera
 from calibration.model.parameters import changed_camera
 from calibration.model.rig_model import Covariance
-from calibration.verdict import SIGMAS, WORST_TIMES, Asked, Reason, Verdict, more_poses, unguided
+from calibration.verdict import SIGMAS, WORST_TIMES, AccuracyGoal, Reason, Verdict, more_poses, unguided
 from calibration.views import View
 
 Array = NDArray[np.float64]
@@ -110,7 +110,7 @@ _AGAIN = "calibrate again"
 
 def judge_check(
     boards: Sequence[CheckedBoard],
-    asked: Asked,
+    asked: AccuracyGoal,
     board_width_m: float,
     angle: CheckedAngle | None = None,
     stated_angle_rad: float | None = None,
@@ -147,7 +147,7 @@ def _flatness(board: CheckedBoard, bearable_m: float) -> list[Reason]:
     return [Reason("not-flat", text, board.flatness_rms_m, max(bearable_m, board.expected_m), step)]
 
 
-def _scale(board: CheckedBoard, asked: Asked) -> list[Reason]:
+def _scale(board: CheckedBoard, asked: AccuracyGoal) -> list[Reason]:
     limit = max(SIGMAS * board.scale_sd, asked.accuracy_m / asked.at_m)
     if abs(board.scale - 1) <= limit:
         return []

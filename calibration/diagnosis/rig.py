@@ -29,7 +29,7 @@ from calibration.model.rig_model import RigModel
 from calibration.rig_fit.result import RigFit
 from calibration.rig_fit.state import shows_line, usable
 from calibration.sync.lag_fit import SyncFit
-from calibration.verdict import AT_M, Asked, Reason, Verdict, unguided
+from calibration.verdict import AT_M, AccuracyGoal, Reason, Verdict, unguided
 from calibration.views import View
 
 ACCURACY_PX: Final = 0.1
@@ -39,11 +39,11 @@ _WORST_PERCENT = 95
 
 
 @dataclass(frozen=True, slots=True, eq=False)
-class Judged:
+class JudgedRig:
     """A verdict and what it was made of."""
 
     verdict: Verdict
-    asked: Asked
+    asked: AccuracyGoal
     evidence: FitEvidence
     waves: SweepWaves
     residuals: tuple[SweepResidual, ...]
@@ -54,11 +54,11 @@ class Judged:
 
 def goal(
     worth: Sensitivity, accuracy_m: float | None, at_m: float = AT_M, stated_baseline_m: float | None = None
-) -> Asked:
+) -> AccuracyGoal:
     """The accuracy that a calibration is held to. accuracy_m: sd of depth at `at_m`, for which `worth` is; None: that
     of ACCURACY_PX.
     """
-    return Asked(ACCURACY_PX * worth.per_pixel_m if accuracy_m is None else accuracy_m, at_m, stated_baseline_m)
+    return AccuracyGoal(ACCURACY_PX * worth.per_pixel_m if accuracy_m is None else accuracy_m, at_m, stated_baseline_m)
 
 
 def judge_fit(
@@ -68,7 +68,7 @@ def judge_fit(
     at_m: float = AT_M,
     accuracy_m: float | None = None,
     stated_baseline_m: float | None = None,
-) -> Judged:
+) -> JudgedRig:
     """Judge a fit of `views`. accuracy_m: sd of depth at `at_m` that is good enough; None: that of ACCURACY_PX.
 
     Raises CalibrationError where the line does not reach that distance.
@@ -104,7 +104,7 @@ def judge_fit(
         velocities_per_s=tuple(model.provenance[SWEPT]),
     )
     seen = view_evidence(views, (model.camera.width, model.camera.height), len(fit.used), fit.outliers)
-    return Judged(judge(seen, evidence, asked), asked, evidence, waves, residuals, shifts, uncertainty, worth)
+    return JudgedRig(judge(seen, evidence, asked), asked, evidence, waves, residuals, shifts, uncertainty, worth)
 
 
 def judge_refused(
@@ -135,7 +135,9 @@ def _baseline(model: RigModel) -> tuple[float, float]:
 _STILL = "check that nothing moved between the sweeps, or calibrate at the speed of your scans"
 
 
-def judge_sync(fit: SyncFit, model: RigModel | None, asked: Asked | None, changed: Reason | None = None) -> Verdict:
+def judge_sync(
+    fit: SyncFit, model: RigModel | None, asked: AccuracyGoal | None, changed: Reason | None = None
+) -> Verdict:
     """Judge a fit. model, asked: of the rig, None where nothing tells what a lag is worth in depth. changed: why the
     model cannot be right with these lags."""
     found = []

@@ -23,7 +23,7 @@ from typing import Final
 from calibration.diagnosis.evidence import PoseEvidence, ViewEvidence, data_lack, hiding
 from calibration.errors import Degenerate, mm
 from calibration.model.parameters import lag_groups, one_speed
-from calibration.verdict import SIGMAS, WORST_TIMES, Asked, Reason, Verdict, more_poses, reason_for
+from calibration.verdict import SIGMAS, WORST_TIMES, AccuracyGoal, Reason, Verdict, more_poses, reason_for
 
 _SPEEDS = "scan both ways (scan.bidirectional), at two speeds or more (scan.exposures)"
 
@@ -83,7 +83,7 @@ class FitEvidence:
     velocities_per_s: tuple[float, ...] = ()
 
 
-def judge(views: ViewEvidence, fit: FitEvidence, asked: Asked) -> Verdict:
+def judge(views: ViewEvidence, fit: FitEvidence, asked: AccuracyGoal) -> Verdict:
     """The verdict on a fitted rig model."""
     imprecise = not (fit.expected_m <= asked.accuracy_m and fit.worst_m <= WORST_TIMES * asked.accuracy_m)
     reasons = [*hiding(views, fit.poses), *_contradictions(fit, asked, imprecise)]
@@ -124,7 +124,7 @@ _SEEN_AT_ONCE = ("no-board", "wrong-board", "board-half-out", "mirrored", "two-b
 """Faults of single views that leave too few to be used."""
 
 
-def _contradictions(fit: FitEvidence, asked: Asked, imprecise: bool) -> list[Reason]:
+def _contradictions(fit: FitEvidence, asked: AccuracyGoal, imprecise: bool) -> list[Reason]:
     """Reasons that no one rig can have made. Sweeps of one view that differ tell waves from a rig that moved in
     between.
 
@@ -155,7 +155,7 @@ def _contradictions(fit: FitEvidence, asked: Asked, imprecise: bool) -> list[Rea
     return found
 
 
-def _scale(fit: FitEvidence, asked: Asked) -> list[Reason]:
+def _scale(fit: FitEvidence, asked: AccuracyGoal) -> list[Reason]:
     stated = asked.stated_baseline_m
     if stated is None or not math.isfinite(fit.baseline_m):
         return []

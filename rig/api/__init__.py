@@ -23,18 +23,33 @@ from rig.api.tradeoff import tradeoff
 from rig.config.bundled import bundled_rigs, bundled_scenes
 from rig.config.overrides import MAX_SEED, SIMULATED, Config, PathLike, configure
 from rig.plan.describe import plan_text
-from rig.requests import ReconstructRequest, ReplayRequest, ScanRequest, TradeoffRequest
+from rig.requests import (
+    CameraRequest,
+    CheckRequest,
+    PixelsRequest,
+    PlanesRequest,
+    ReconstructRequest,
+    ReplayRequest,
+    ScanRequest,
+    SyncRequest,
+    TradeoffRequest,
+)
 from rig.scan.run import RunResult
 
 __all__ = [
     "MAX_SEED",
     "SIMULATED",
+    "CameraRequest",
+    "CheckRequest",
     "Config",
     "PathLike",
+    "PixelsRequest",
+    "PlanesRequest",
     "ReconstructRequest",
     "ReplayRequest",
     "RunResult",
     "ScanRequest",
+    "SyncRequest",
     "TradeoffRequest",
     "bench",
     "bundled_rigs",

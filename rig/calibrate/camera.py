@@ -1,6 +1,5 @@
 """`rig calibrate camera`: calibrates the camera alone, from views of a board or from picture files."""
 
-from dataclasses import dataclass
 from datetime import UTC, datetime
 from typing import Any
 
@@ -11,60 +10,58 @@ from calibration.camera_fit import CameraFit, fit_camera
 from calibration.diagnosis.camera import ACCURACY_PX, JudgedCamera, judge_camera
 from calibration.errors import Degenerate, condition_text, digits
 from calibration.files.camera_file import camera_content, camera_file_text, corners_digest
+from calibration.model.camera import TERM_COUNTS
 from calibration.verdict import AT_M
-from rig.calibrate.capture import Ask, Tell, require_live
-from rig.calibrate.planes import POSES
+from rig.calibrate.capture import AskPerson, TellLine, require_live
 from rig.calibrate.report import camera_report
 from rig.calibrate.report_page import subject
 from rig.calibrate.session import CalibrationResult, Session, named
-from rig.calibrate.sources import ViewSources
-from rig.calibrate.views import Live, Taken, good_poses, refusal, require_poses, take_kept, take_live
+from rig.calibrate.sources import SourcesLike, read_board, si_values, sort_sources
+from rig.calibrate.views import (
+    LiveViewOptions,
+    ViewCollection,
+    good_poses,
+    refusal,
+    require_poses,
+    take_kept,
+    take_live,
+)
+from rig.errors import UsageError
 from rig.progress import tell_stage
-from rig.scan.run import OutFolder, versions
+from rig.requests import CameraRequest
+from rig.scan.run import versions
 
 CAMERA_FILE = "camera.yaml"
 FEWEST_VIEWS = 3
 """Fewest views of a camera: with fewer, one view takes up whatever is wrong with the other."""
 
 
-@dataclass(frozen=True, slots=True)
-class CameraAsked:
-    """Request for a calibration of the camera.
-
-    poses: of a live rig. terms: number of terms of the lens model, as OpenCV counts them.
-    """
-
-    poses: int = POSES
-    terms: int = 5
-    seed: int = 0
-    arm: bool = False
-
-
 def run_camera(
-    sources: ViewSources,
-    board: Board,
-    asked: CameraAsked,
-    *,
-    out: OutFolder = None,
-    ask: Ask | None = None,
-    tell: Tell | None = None,
+    sources: SourcesLike, request: CameraRequest, *, ask: AskPerson | None = None, tell: TellLine | None = None
 ) -> CalibrationResult:
     """Calibrate the camera; camera.yaml (`calibration.files.camera_file`) can be given to a calibration of the planes.
 
     Raises Degenerate where the views make no camera; its notes say why, root cause first.
     """
-    live, photons = sources.live, not sources.pictures
-    require_live(live, ask, asked.arm)
-    with Session(out, board) as session:
-        taken = Taken(session, tell)
-        take_kept(taken, sources, board)
+    si_values(request)
+    if request.terms not in (0, *TERM_COUNTS):
+        known = ", ".join(map(str, TERM_COUNTS))
+        raise UsageError(f"terms is {request.terms}; OpenCV's lens models have 0, {known}")
+    found = sort_sources(sources, pictures=True, scene=request.scene)
+    board = read_board(request.board)
+    live, photons = found.live, not found.pictures
+    require_live(live, ask, request.arm)
+    with Session(request.out, board) as session:
+        taken = ViewCollection(session, tell)
+        take_kept(taken, found, board)
         if live is not None:
-            require_poses(taken, asked.poses)
-            choose = good_poses(live, board, asked.poses, AT_M, asked.seed, len(taken.views))
-            take_live(taken, Live(live, asked.poses, choose, ask, seed=asked.seed, arm=asked.arm, line=False), board)
+            require_poses(taken, request.poses)
+            choose = good_poses(live, board, request.poses, AT_M, request.seed, len(taken.views))
+            options = LiveViewOptions(live, request.poses, choose, ask, seed=request.seed, arm=request.arm, line=False)
+            take_live(taken, options, board)
         tell_stage("fitting", len(taken.views), unit="views")
         try:
-            fit = _fitted(taken, board, asked.terms)
+            fit = _fitted(taken, board, request.terms)
         except Degenerate as refused:
             raise refusal(refused, taken, board, photons=photons, line=False) from refused
         judged = judge_camera(fit, taken.views, board, photons=photons)
@@ -80,7 +77,7 @@ def run_camera(
         return CalibrationResult(judged.verdict, judged.line(), figures, summary, None, session.path)
 
 
-def _fitted(taken: Taken, board: Board, terms: int) -> CameraFit:
+def _fitted(taken: ViewCollection, board: Board, terms: int) -> CameraFit:
     """Fit the camera; Degenerate where it would hang on so few views that they cannot contradict each other."""
     fit = fit_camera(taken.views, board, taken.size, distortion_terms=terms)
     if len(fit.kept) < FEWEST_VIEWS:
@@ -93,7 +90,7 @@ def _fitted(taken: Taken, board: Board, terms: int) -> CameraFit:
     return fit
 
 
-def _summary(fit: CameraFit, judged: JudgedCamera, taken: Taken) -> dict[str, Any]:
+def _summary(fit: CameraFit, judged: JudgedCamera, taken: ViewCollection) -> dict[str, Any]:
     return {
         "verdict": judged.verdict.as_json(),
         "views": {
@@ -112,7 +109,7 @@ def _summary(fit: CameraFit, judged: JudgedCamera, taken: Taken) -> dict[str, An
     }
 
 
-def _figures(fit: CameraFit, judged: JudgedCamera, taken: Taken) -> list[tuple[str, str]]:
+def _figures(fit: CameraFit, judged: JudgedCamera, taken: ViewCollection) -> list[tuple[str, str]]:
     matrix, sd, refused = fit.camera.matrix, fit.sd, tuple(taken.refused)
     terms = ", ".join(digits(term, 4) for term in fit.camera.distortion) or "none"
     return [

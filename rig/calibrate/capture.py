@@ -11,8 +11,8 @@ no board was found. The first half millisecond of a sweep is left out: the mirro
 accelerating then.
 
 `shown` gets the board where it is wanted: a person is asked to hold it there, or the simulated world moves it.
-`SpeedTurns` scans the poses by turns at several exposures per column, so that the mirror is seen at several speeds. A
-speed that the rig cannot do is left out. Where one does not show the line on the board, the pose is scanned again at
+`SpeedRotation` scans the poses by turns at several exposures per column, so that the mirror is seen at several speeds.
+A speed that the rig cannot do is left out. Where one does not show the line on the board, the pose is scanned again at
 the slowest, before the board is moved; a speed that never showed the line where the slowest did is left out too.
 """
 
@@ -209,9 +209,9 @@ def _corners(
         return None, error
 
 
-Tell = Callable[[str], None]
+TellLine = Callable[[str], None]
 """A callback that takes a line for people."""
-Ask = Callable[[str], None]
+AskPerson = Callable[[str], None]
 """A callback that has the board moved as a text says and returns once it is done; KeyboardInterrupt ends the session.
 """
 
@@ -231,7 +231,7 @@ def with_board_pose(config: RigConfig, pose: BoardPose) -> RigConfig:
     return parse_config(content)
 
 
-def require_live(config: RigConfig | None, ask: Ask | None, arm: bool) -> None:
+def require_live(config: RigConfig | None, ask: AskPerson | None, arm: bool) -> None:
     """Raise UsageError where a live rig may not shine, or nobody is there to move its board; None is no live rig."""
     if config is None:
         return
@@ -245,7 +245,7 @@ def require_live(config: RigConfig | None, ask: Ask | None, arm: bool) -> None:
         raise UsageError.of(problems)
 
 
-def shown(config: RigConfig, what: str, pose: Candidate, ask: Ask | None, tell: Tell | None) -> RigConfig:
+def shown(config: RigConfig, what: str, pose: Candidate, ask: AskPerson | None, tell: TellLine | None) -> RigConfig:
     """Get the board to the next pose, which `what` describes, and return the config to capture it with."""
     if world_moves_board(config):
         if tell is not None:
@@ -261,10 +261,10 @@ Scan = Callable[[int | None], Capture]
 """
 
 
-class SpeedTurns:
+class SpeedRotation:
     """Takes the views at several speeds by turns."""
 
-    def __init__(self, exposures: Sequence[int], sees: Callable[[Capture], bool], tell: Tell | None = None) -> None:
+    def __init__(self, exposures: Sequence[int], sees: Callable[[Capture], bool], tell: TellLine | None = None) -> None:
         """Prepare the turns.
 
         exposures: per column, by turns; empty is the config's. sees: whether a capture has what it was taken for.

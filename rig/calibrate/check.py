@@ -2,14 +2,12 @@
 
 import math
 from collections.abc import Sequence
-from dataclasses import dataclass
 from datetime import UTC, datetime
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 
-from calibration.board.board import Board
 from calibration.check import CheckedAngle, CheckedBoard, check_angle, check_boards
 from calibration.depth_error import DepthUncertainty, depth_uncertainty, sensitivity
 from calibration.diagnosis.camera import judge_check
@@ -18,86 +16,70 @@ from calibration.errors import Degenerate, mm
 from calibration.files.camera_file import CORNERS, corners_digest
 from calibration.files.rig_file import load_rig_model
 from calibration.model.rig_model import RigModel
-from calibration.verdict import AT_M, Asked, Verdict
+from calibration.verdict import AccuracyGoal, Verdict
 from calibration.views import View
-from rig.calibrate.capture import Ask, Tell, require_live
+from rig.calibrate.capture import AskPerson, TellLine, require_live
 from rig.calibrate.report import check_report
 from rig.calibrate.report_page import subject
 from rig.calibrate.session import CalibrationResult, Session, true_errors, truth_content
-from rig.calibrate.sources import ViewSources
-from rig.calibrate.views import Live, Taken, good_poses, note_views, take_kept, take_live
+from rig.calibrate.sources import SourcesLike, read_board, si_values, sort_sources
+from rig.calibrate.views import LiveViewOptions, ViewCollection, good_poses, note_views, take_kept, take_live
 from rig.devices.calibration_use import note_check
 from rig.errors import UsageError
 from rig.progress import tell_stage
-from rig.scan.run import OutFolder, versions
+from rig.requests import CheckRequest
+from rig.scan.run import versions
 
 NO_COVARIANCE = "the calibration has no covariance: nothing tells what depth error to expect"
 SEED_APART = 1 << 20
 """Offset of a check's seeds from a calibration's: a simulated rig then shows other poses and other photons."""
 
 
-@dataclass(frozen=True, slots=True)
-class CheckAsked:
-    """Request for a check.
-
-    poses: of a live rig. angle_rad: stated angle between the boards of the first two views; None where nobody states
-      one.
-    accuracy_m: standard deviation of depth at `at_m` that is good enough; None is what a tenth of a pixel costs there.
-    """
-
-    poses: int = 1
-    accuracy_m: float | None = None
-    at_m: float = AT_M
-    angle_rad: float | None = None
-    seed: int = 0
-    arm: bool = False
-
-
 def run_check(
-    sources: ViewSources,
-    board: Board,
-    calibration: Path | None,
-    asked: CheckAsked,
-    *,
-    out: OutFolder = None,
-    ask: Ask | None = None,
-    tell: Tell | None = None,
+    sources: SourcesLike, request: CheckRequest, *, ask: AskPerson | None = None, tell: TellLine | None = None
 ) -> CalibrationResult:
     """Check a calibration and note the result beside its file, if the calibration says of which rig it is.
 
-    calibration: its file; None is that of the live rig.
     Raises Degenerate where the board was not scanned, UsageError where there is no calibration, or one made of these
     very views.
     """
-    live = sources.live
-    file = calibration or (None if live is None else live.calibration)
+    values = si_values(request)
+    stated_rad = values.pop("angle_rad", None)
+    found, board = sort_sources(sources, scene=request.scene), read_board(request.board)
+    live = found.live
+    file = Path(request.calibration) if request.calibration is not None else None if live is None else live.calibration
     if file is None:
         raise UsageError("there is no calibration to check; name one with --calibration")
     model = load_rig_model(file)
-    poses = max(asked.poses, 2 if asked.angle_rad is not None else 1)
-    require_live(live, ask, asked.arm)
-    worth = sensitivity(model, asked.at_m)
-    wanted = goal(worth, asked.accuracy_m, asked.at_m)
-    with Session(out, board) as session:
-        taken = Taken(session, tell)
-        take_kept(taken, sources, board, model.defects)
+    views_needed = 1 if stated_rad is None else 2
+    require_live(live, ask, request.arm)
+    wanted = goal(sensitivity(model, values["at_m"]), **values)
+    with Session(request.out, board) as session:
+        taken = ViewCollection(session, tell)
+        take_kept(taken, found, board, model.defects)
         _require_others(taken.views, model)
         if live is not None:
-            seed = asked.seed + SEED_APART
-            choose = good_poses(live, board, poses, asked.at_m, seed)
-            take_live(taken, Live(live, poses, choose, ask, (), seed, asked.arm, model.defects), board)
-        views = _with_board(taken, 1 if asked.angle_rad is None else 2)
+            seed, poses = request.seed + SEED_APART, max(request.poses, views_needed)
+            choose = good_poses(live, board, poses, wanted.at_m, seed)
+            options = LiveViewOptions(live, poses, choose, ask, seed=seed, arm=request.arm, defects=model.defects)
+            take_live(taken, options, board)
+        views = _with_board(taken, views_needed)
         model.check_sensor(*taken.size)
         tell_stage("judging", len(views), unit="views")
         boards = check_boards(model, views, board)
-        angle = None if asked.angle_rad is None else check_angle(model, views[0], views[1], board)
-        verdict = judge_check(boards, wanted, board.size_m[0], angle, asked.angle_rad)
-        uncertainty = None if model.covariance is None else depth_uncertainty(model, asked.at_m)
+        angle = None if stated_rad is None else check_angle(model, views[0], views[1], board)
+        verdict = judge_check(boards, wanted, board.size_m[0], angle, stated_rad)
+        uncertainty = None if model.covariance is None else depth_uncertainty(model, wanted.at_m)
         line = NO_COVARIANCE if uncertainty is None else uncertainty.line()
-        truth = None if live is None else true_errors(model, live, asked.at_m)
+        truth = None if live is None else true_errors(model, live, wanted.at_m)
         summary = {
             "command": "check",
-            **_summary(verdict, boards, angle, asked, wanted, uncertainty, file),
+            "verdict": verdict.as_json(),
+            "calibration": str(file),
+            **_summary(boards, wanted, uncertainty),
+            "angle": None
+            if angle is None
+            else {"rad": angle.angle_rad, "sd_rad": angle.sd_rad, "stated_rad": stated_rad},
             "scans_refuse_it": bool(_consequence(verdict, model, file)),
             "truth": None if truth is None else truth_content(truth),
             "versions": versions(),
@@ -122,7 +104,7 @@ def _require_others(views: Sequence[View], model: RigModel) -> None:
         )
 
 
-def _with_board(taken: Taken, least: int) -> list[View]:
+def _with_board(taken: ViewCollection, least: int) -> list[View]:
     """The views that show the board. Degenerate, with the trouble of each view, where they are too few."""
     views = [view for view in taken.views if view.corners is not None]
     if len(views) < least:
@@ -135,17 +117,9 @@ def _with_board(taken: Taken, least: int) -> list[View]:
 
 
 def _summary(
-    verdict: Verdict,
-    boards: Sequence[CheckedBoard],
-    angle: CheckedAngle | None,
-    asked: CheckAsked,
-    wanted: Asked,
-    uncertainty: DepthUncertainty | None,
-    file: Path,
+    boards: Sequence[CheckedBoard], wanted: AccuracyGoal, uncertainty: DepthUncertainty | None
 ) -> dict[str, Any]:
     return {
-        "verdict": verdict.as_json(),
-        "calibration": str(file),
         "boards": [
             {
                 "view": board.name,
@@ -161,9 +135,6 @@ def _summary(
             }
             for board in boards
         ],
-        "angle": None
-        if angle is None
-        else {"rad": angle.angle_rad, "sd_rad": angle.sd_rad, "stated_rad": asked.angle_rad},
         "depth_error": {
             "at_m": wanted.at_m,
             "asked_m": wanted.accuracy_m,

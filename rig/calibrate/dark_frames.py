@@ -82,7 +82,6 @@ def take_dark(
     rig: OpenRig,
     frames: int,
     *,
-    spread_s: float = SPREAD_S,
     progress: Progress | None = None,
     covered: Callable[[], None] | None = None,
 ) -> tuple[DarkTally, float]:
@@ -104,7 +103,7 @@ def take_dark(
     counter = SweepCounter(_layout(info.height, info.width), workers)
     tally = DarkTally((info.height, info.width))
     starts = math.ceil(frames / per_start)
-    rest_s = max(0.0, (spread_s - frames / float(request.frame_rate_hz)) / max(starts - 1, 1))
+    rest_s = max(0.0, (SPREAD_S - frames / float(request.frame_rate_hz)) / max(starts - 1, 1))
     told = counted("taking dark frames", "frames", progress)
     for start in range(starts):
         if start:

@@ -36,16 +36,17 @@ from calibration.pixel_map import (
 )
 from calibration.verdict import Reason, Verdict
 from drivers.recorded.segments import segment_files
-from rig.calibrate.dark_frames import SPREAD_S, Sums, recorded_exposure_s, take_dark, take_sweeps
+from rig.calibrate.dark_frames import Sums, recorded_exposure_s, take_dark, take_sweeps
 from rig.calibrate.report import dark_rate_picture, pixel_page
 from rig.calibrate.session import EXIT_NOT_TRUSTWORTHY
 from rig.config.models import RigConfig
-from rig.config.overrides import SIMULATED, Config, PathLike, configure
+from rig.config.overrides import Config, PathLike, configure
 from rig.devices.calibration_use import carry_notes, note_check
 from rig.devices.open import OpenRig, open_rig, require_simulated_or_armed
 from rig.errors import UsageError
 from rig.progress import Progress
 from rig.recording.replay import ReplayOptions, replay_config
+from rig.requests import PixelsRequest
 from rig.run_folder.folder import RunFolder
 from rig.run_folder.pictures import png_bytes
 
@@ -125,13 +126,13 @@ class PixelResult:
         return content
 
 
-def pixel_verdict(pixels: PixelMap, drift: PixelDrift | None, leak: float, signal: float) -> Verdict:
+def pixel_verdict(pixels: PixelMap, drift: PixelDrift | None, leak: float) -> Verdict:
     """Judge whether map and drift may be believed; the root cause comes first."""
     reasons = []
     if leak > MOST_LEAK:
         said = f"the rates of neighbouring pixels correlate by {leak:.2f}, in the dark by {MOST_LEAK:g} at most"
         reasons.append(Reason("room-light", said, leak, MOST_LEAK, "cover the lens and start again"))
-    least = frames_for(float(hot_flux(signal, 0.0)), WORST_PRECISION)
+    least = frames_for(float(hot_flux(SIGNAL, 0.0)), WORST_PRECISION)
     if pixels.frames < least:
         said = f"{pixels.frames} dark frames cannot tell hot pixels, at least {least} can"
         reasons.append(Reason("too-few-frames", said, pixels.frames, least, "take more frames"))
@@ -188,17 +189,9 @@ LIT_FRAMES: Final = 100
 
 
 def run_pixels(
-    source: Config = SIMULATED,
+    source: Config,
+    request: PixelsRequest,
     *,
-    frames: int | None = None,
-    lit: PathLike | None = None,
-    light: bool = False,
-    arm: bool = False,
-    against: PathLike | None = None,
-    signal: float = SIGNAL,
-    spread_s: float = SPREAD_S,
-    seed: int = 0,
-    out: PathLike | None = None,
     progress: Progress | None = None,
     covered: Callable[[], None] | None = None,
 ) -> PixelResult:
@@ -206,44 +199,36 @@ def run_pixels(
 
     source: a rig, whose SPAD then takes frames in the dark; or the folder of a recorded run, whose dark and lit frames
       are taken.
-    frames: number of dark frames; None is as many as the limit of hot pixels needs.
-    spread_s: seconds over which they are spread, at least.
-    lit: a recorded run whose lit frames tell dead pixels.
-    light: have the rig take such frames now, a few maps, which needs `arm` where light is real.
-    against: an older pixels.npz or its folder; None is the one beside the config's calibration.
-    signal: photons per pixel and exposure of the weakest stripes, which sets the limit.
     covered: called where a person has to cover the lens.
     Raises UsageError, DeviceError.
     """
-    recorded = _recorded(source)
+    recorded, frames = _recorded(source), request.frames
     config = _quick(replay_config(recorded, ReplayOptions(), None, {}) if recorded else configure(source))
-    problems = [] if not light or recorded else require_simulated_or_armed(config, arm)
-    if not 0 < signal < 10:
-        problems.append(f"signal is {signal:g} photons per pixel and exposure; it must be above 0 and below 10")
+    problems = [] if not request.light or recorded else require_simulated_or_armed(config, request.arm)
     if frames is not None and frames < 1:
         problems.append(f"frames is {frames}; it must be at least 1")
     if problems:
         raise UsageError.of(problems)
-    last = _last(against, config, recorded)
-    folder = None if out is None else RunFolder(out)
+    last = _last(request.against, config, recorded)
+    folder = None if request.out is None else RunFolder(request.out)
     try:
-        lit_sums = None if lit is None else _recorded_sums(Path(lit), progress)[1]
+        lit_sums = None if request.lit is None else _recorded_sums(Path(request.lit), progress)[1]
         if recorded:
             tally, own, sensor = _recorded_sums(recorded, progress)
             lit_sums, exposure_s = lit_sums or own, recorded_exposure_s(recorded)
         else:
-            if light:
-                with open_rig(config, seed=seed) as rig:
+            if request.light:
+                with open_rig(config, seed=request.seed) as rig:
                     lit_sums = take_sweeps(rig, math.ceil(LIT_FRAMES / config.scan.exposures), progress).lit
-            with open_rig(config, seed=seed) as rig:
+            with open_rig(config, seed=request.seed) as rig:
                 sensor = _sensor(rig)
-                wanted = frames or frames_for(float(hot_flux(signal, 0.0)))
-                tally, exposure_s = take_dark(rig, wanted, spread_s=spread_s, progress=progress, covered=covered)
-        found = _version(judge_pixels(tally, exposure_s, lit=lit_sums, signal=signal), last, sensor)
+                wanted = frames or frames_for(float(hot_flux(SIGNAL, 0.0)))
+                tally, exposure_s = take_dark(rig, wanted, progress=progress, covered=covered)
+        found = _version(judge_pixels(tally, exposure_s, lit=lit_sums), last, sensor)
         drift = None if last is None else _drift(last.pixels, found.pixels)
         leak = 0.0 if recorded else light_leak(found.pixels)
-        result = PixelResult(found, drift, last, pixel_verdict(found.pixels, drift, leak, signal), leak)
-        if against is None and drift is not None:
+        result = PixelResult(found, drift, last, pixel_verdict(found.pixels, drift, leak), leak)
+        if request.against is None and drift is not None:
             _note(config, drift)
         return result if folder is None else _written(result, folder, None if recorded else config.calibration)
     finally:

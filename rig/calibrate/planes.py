@@ -1,39 +1,49 @@
 """`rig calibrate planes`: calibrates the whole rig, camera, mirror and lag together, from views of a board.
 
-In the guided mode (`Guide`) the rig is fitted after each view, and the pose is asked for that lowers the expected error
-most.
+In the guided mode (`PoseGuide`) the rig is fitted after each view, and the pose is asked for that lowers the expected
+error most.
 """
 
-from collections.abc import Callable, Sequence
-from dataclasses import asdict, dataclass, replace
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import asdict, replace
 from datetime import UTC, datetime
 from functools import partial
+from pathlib import Path
 from typing import Any
 
 import numpy as np
 
 from calibration.board.board import Board
 from calibration.depth_error import DepthErrors
-from calibration.diagnosis.rig import Judged, judge_fit
+from calibration.diagnosis.rig import JudgedRig, judge_fit
 from calibration.errors import CalibrationError, Degenerate, condition_text, mm
 from calibration.files.camera_file import CORNERS, KnownCamera, corners_digest
+from calibration.files.rig_file import load_rig_model
 from calibration.guide import Advice, Forecast, candidates, next_pose
 from calibration.model.rig_model import Identity, RigModel
 from calibration.rig_fit.fit import fit_rig
 from calibration.rig_fit.result import RigFit
-from calibration.verdict import AT_M
 from calibration.views import View
-from rig.calibrate.capture import Ask, Tell, require_live
+from rig.calibrate.capture import AskPerson, TellLine, require_live
 from rig.calibrate.report import planes_report
 from rig.calibrate.report_page import subject
 from rig.calibrate.session import CalibrationResult, Session, named, true_errors, truth_content
-from rig.calibrate.sources import CameraUse, ViewSources
-from rig.calibrate.views import FixedPoses, Live, Taken, good_poses, refusal, require_poses, take_kept, take_live
+from rig.calibrate.sources import CameraUse, SourcesLike, camera_use, read_board, si_values, sort_sources
+from rig.calibrate.views import (
+    FixedPoses,
+    LiveViewOptions,
+    ViewCollection,
+    good_poses,
+    refusal,
+    require_poses,
+    take_kept,
+    take_live,
+)
 from rig.config.models import RigConfig
 from rig.progress import tell_stage
-from rig.scan.run import OutFolder, versions
+from rig.requests import PlanesRequest
+from rig.scan.run import versions
 
-POSES = 12
 SPEEDS = ((1.0, 1), (0.3, 2), (2.0, 4))
 """Exposures per column by turns: factors of the config's, and the least number for each.
 
@@ -42,65 +52,48 @@ the line in bright light only, so that it is tried only where it is the config's
 """
 
 
-@dataclass(frozen=True, slots=True)
-class PlanesAsked:
-    """Request for a calibration of the planes.
-
-    poses: of a live rig; the most of them where guided.
-    accuracy_m: standard deviation of depth at `at_m` that is good enough; None is what a tenth of a pixel costs there.
-    stated_baseline_m: as somebody measured it; None where nobody has.
-    exposures: per column, by turns; empty is SPEEDS times the config's.
-    """
-
-    poses: int = POSES
-    guided: bool = False
-    accuracy_m: float | None = None
-    at_m: float = AT_M
-    stated_baseline_m: float | None = None
-    exposures: tuple[int, ...] = ()
-    seed: int = 0
-    arm: bool = False
-
-
 def run_planes(
-    sources: ViewSources,
-    board: Board,
-    asked: PlanesAsked,
-    *,
-    base: RigModel | None = None,
-    camera: CameraUse | None = None,
-    out: OutFolder = None,
-    ask: Ask | None = None,
-    tell: Tell | None = None,
+    sources: SourcesLike, request: PlanesRequest, *, ask: AskPerson | None = None, tell: TellLine | None = None
 ) -> CalibrationResult:
-    """Calibrate the planes from the sources.
+    """Calibrate the planes from the sources; the defective pixels of `request.calibration` are kept.
 
-    base: a model to start from, whose defective pixels are kept.
-    camera: what other views say of the camera.
     ask: gets a person to move the board. tell: gets a line about each view.
     Raises Degenerate where the views make no calibration; its notes say why, root cause first.
     """
-    live, known = sources.live, None if camera is None else camera.known
-    require_live(live, ask, asked.arm)
-    with Session(out, board) as session:
-        taken = Taken(session, tell, () if known is None else known.views)
+    values = si_values(request)
+    found = sort_sources(sources, scene=request.scene)
+    camera = None if request.camera is None else camera_use(Path(request.camera), accept=request.accept_calibration)
+    board = read_board(request.board)
+    base = None if request.calibration is None else load_rig_model(request.calibration)
+    live, known = found.live, None if camera is None else camera.known
+    require_live(live, ask, request.arm)
+    with Session(request.out, board) as session:
+        taken = ViewCollection(session, tell, () if known is None else known.views)
         defects = None if base is None else base.defects
-        take_kept(taken, sources, board, defects)
+        take_kept(taken, found, board, defects)
         if live is not None:
-            require_poses(taken, asked.poses)
-            start = good_poses(live, board, asked.poses, asked.at_m, asked.seed, len(taken.views))
-            fit_and_judge = partial(_fit, taken, board, base, known), partial(_judged, taken, asked)
-            guide = Guide(start, board, live.scan.depth_range, taken, *fit_and_judge, tell)
-            exposures = asked.exposures or speeds_of(live)
-            choose = guide if asked.guided else start
-            take_live(taken, Live(live, asked.poses, choose, ask, exposures, asked.seed, asked.arm, defects), board)
+            require_poses(taken, request.poses)
+            start = good_poses(live, board, request.poses, values["at_m"], request.seed, len(taken.views))
+            fit_and_judge = partial(_fit, taken, board, base, known), partial(_judged, taken, values)
+            guide = PoseGuide(start, board, live.scan.depth_range, taken, *fit_and_judge)
+            options = LiveViewOptions(
+                live,
+                request.poses,
+                guide if request.guided else start,
+                ask,
+                exposures=request.exposures or speeds_of(live),
+                seed=request.seed,
+                arm=request.arm,
+                defects=defects,
+            )
+            take_live(taken, options, board)
         fit = _fitted(taken, board, base, known)
-        judged = _judged(taken, asked, fit)
+        judged = _judged(taken, values, fit)
         told = () if known is None else known.views
         digests = sorted({*told, *(corners_digest(view) for view in taken.views if view.name in fit.views)})
         model = _signed(fit, judged, taken.identity, digests, camera)
         tell_stage("writing the report")
-        truth = None if live is None else true_errors(model, live, asked.at_m)
+        truth = None if live is None else true_errors(model, live, values["at_m"])
         line = judged.uncertainty.line()
         summary = {
             "command": "planes",
@@ -121,7 +114,7 @@ def speeds_of(live: RigConfig) -> tuple[int, ...]:
     return tuple(dict.fromkeys(max(least, round(times * live.scan.exposures)) for times, least in SPEEDS))
 
 
-def _fit(taken: Taken, board: Board, base: RigModel | None, camera: KnownCamera | None) -> RigFit:
+def _fit(taken: ViewCollection, board: Board, base: RigModel | None, camera: KnownCamera | None) -> RigFit:
     """Fit the rig to the views so far, with all that is known from elsewhere."""
     tell_stage("fitting", len(taken.views), unit="views")
     return fit_rig(
@@ -134,14 +127,13 @@ def _fit(taken: Taken, board: Board, base: RigModel | None, camera: KnownCamera 
     )
 
 
-def _judged(taken: Taken, asked: PlanesAsked, fit: RigFit) -> Judged:
+def _judged(taken: ViewCollection, values: Mapping[str, float], fit: RigFit) -> JudgedRig:
+    """Judge the fit by the accuracy asked for. values: `si_values` of the request."""
     tell_stage("judging")
-    return judge_fit(
-        fit, taken.views, at_m=asked.at_m, accuracy_m=asked.accuracy_m, stated_baseline_m=asked.stated_baseline_m
-    )
+    return judge_fit(fit, taken.views, **values)
 
 
-def _fitted(taken: Taken, board: Board, base: RigModel | None, camera: KnownCamera | None) -> RigFit:
+def _fitted(taken: ViewCollection, board: Board, base: RigModel | None, camera: KnownCamera | None) -> RigFit:
     try:
         return _fit(taken, board, base, camera)
     except CalibrationError as error:
@@ -150,7 +142,7 @@ def _fitted(taken: Taken, board: Board, base: RigModel | None, camera: KnownCame
 
 
 def _signed(
-    fit: RigFit, judged: Judged, identity: Identity | None, digests: list[str], camera: CameraUse | None
+    fit: RigFit, judged: JudgedRig, identity: Identity | None, digests: list[str], camera: CameraUse | None
 ) -> RigModel:
     """The model with its verdict, its rig, and the digests of its corners, which must not be used to check it."""
     verdict = judged.verdict
@@ -180,7 +172,7 @@ def _accepted(camera: CameraUse | None) -> dict[str, list[str]]:
     return {"accepted_calibration": [str(each) for each in camera.accepted]} if camera and camera.accepted else {}
 
 
-def _summary(fit: RigFit, judged: Judged, taken: Taken) -> dict[str, Any]:
+def _summary(fit: RigFit, judged: JudgedRig, taken: ViewCollection) -> dict[str, Any]:
     evidence, uncertainty = judged.evidence, judged.uncertainty
     return {
         "verdict": judged.verdict.as_json(),
@@ -218,7 +210,9 @@ def _summary(fit: RigFit, judged: Judged, taken: Taken) -> dict[str, Any]:
     }
 
 
-def _figures(fit: RigFit, judged: Judged, truth: DepthErrors | None, camera: CameraUse | None) -> list[tuple[str, str]]:
+def _figures(
+    fit: RigFit, judged: JudgedRig, truth: DepthErrors | None, camera: CameraUse | None
+) -> list[tuple[str, str]]:
     evidence, matrix = judged.evidence, fit.model.camera.matrix
     lag = fit.model.lag_s
     asked = judged.asked
@@ -246,12 +240,12 @@ START_POSES = 3
 """Number of poses that are shown before anything is fitted."""
 
 
-class Guide:
+class PoseGuide:
     """Chooses poses by how much they lower the expected error, until the accuracy asked for is expected."""
 
     def __init__(
-        self, start: FixedPoses, board: Board, depth_range_m: tuple[float, float], taken: Taken,
-        fit: Callable[[], RigFit], judge: Callable[[RigFit], Judged], tell: Tell | None,
+        self, start: FixedPoses, board: Board, depth_range_m: tuple[float, float], taken: ViewCollection,
+        fit: Callable[[], RigFit], judge: Callable[[RigFit], JudgedRig],
     ) -> None:  # fmt: skip
         """Prepare the guide.
 
@@ -264,7 +258,6 @@ class Guide:
         self._taken = taken
         self._fitted = fit
         self._judged = judge
-        self._tell = tell
         self._asked: set[tuple[float, tuple[int, int], tuple[int, int]]] = set()
 
     def next(self, views: Sequence[View]) -> Advice | None:
@@ -276,8 +269,7 @@ class Guide:
         fit, judged = told
         at_m = judged.asked.at_m
         now_m = judged.evidence.expected_m
-        if self._tell is not None:
-            self._tell(f"expected error {judged.uncertainty.line()}; asked {mm(judged.asked.accuracy_m)}")
+        self._taken.say(f"expected error {judged.uncertainty.line()}; asked {mm(judged.asked.accuracy_m)}")
         if judged.verdict.passed:
             return None
         choices = [
@@ -292,7 +284,7 @@ class Guide:
         self._asked.add((chosen.fill, chosen.place, chosen.tilt))  # a board that was not found there will not be again
         return advice
 
-    def _told(self) -> tuple[RigFit, Judged] | None:
+    def _told(self) -> tuple[RigFit, JudgedRig] | None:
         """Fit and judge the views so far; None where they make no model yet, or its line misses the distance asked."""
         try:
             fit = self._fitted()

@@ -14,7 +14,7 @@ from calibration.camera_fit import CameraFit
 from calibration.check import CheckedBoard
 from calibration.depth_error import DepthUncertainty
 from calibration.diagnosis.camera import JudgedCamera
-from calibration.diagnosis.rig import Judged
+from calibration.diagnosis.rig import JudgedRig
 from calibration.errors import digits, in_mm, mm
 from calibration.model.camera import Camera
 from calibration.pixel_map import PixelDrift, PixelMap, PixelVersion
@@ -43,7 +43,7 @@ Figures = Sequence[tuple[str, str]]
 
 
 def planes_report(
-    fit: RigFit, views: Sequence[View], judged: Judged, line: str, figures: Figures, about: Figures = ()
+    fit: RigFit, views: Sequence[View], judged: JudgedRig, line: str, figures: Figures, about: Figures = ()
 ) -> str:
     """Report on a calibration of camera and planes. about: rows of `subject`, as in the other reports."""
     by_name = {view.name: view for view in views}
@@ -70,7 +70,7 @@ def camera_sections(camera: Camera, views: Sequence[View], residuals_px: Sequenc
     ]
 
 
-def planes_section(judged: Judged) -> ReportSection:
+def planes_section(judged: JudgedRig) -> ReportSection:
     """Section with the residuals of the planes."""
     chart = plane_residuals(judged.waves, judged.residuals, judged.sensitivity.per_command_m, judged.asked.at_m)
     return ReportSection("Residuals of the planes", chart)
@@ -170,7 +170,7 @@ def pose_words(pose: BoardPose, board: Board) -> tuple[str, str]:
     return f"{middle[2]:.2f}", f"{tilt:.0f}"
 
 
-def _views_section(fit: RigFit, judged: Judged) -> ReportSection:
+def _views_section(fit: RigFit, judged: JudgedRig) -> ReportSection:
     rows = []
     worth = judged.sensitivity.per_command_m
     shifts = {one.name: one.shift for one in judged.shifts}

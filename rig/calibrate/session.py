@@ -40,7 +40,7 @@ from rig.errors import UsageError
 from rig.run_folder.folder import RunFolder
 from rig.scan.run import OutFolder
 
-Made = tuple[Path, RigModel]
+LoadedCalibration = tuple[Path, RigModel]
 """A calibration: its file, and what it holds."""
 
 RIG_FILE = "rig.json"
@@ -116,7 +116,7 @@ class Session:
             self._folder.write_text(name, text)
 
     def finish(
-        self, summary: dict[str, Any], report: str, model: RigModel | None, made_from: Made | None = None
+        self, summary: dict[str, Any], report: str, model: RigModel | None, made_from: LoadedCalibration | None = None
     ) -> Path | None:
         """Write what was made of the views; returns the calibration's file, None where there is none.
 

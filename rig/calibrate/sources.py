@@ -17,17 +17,20 @@ from rig.config.models import RigConfig
 from rig.config.overrides import SIMULATED, Config, PathLike, configure, seed_problems
 from rig.devices.calibration_use import Refusal, check_content, failed_verdict, require_accepted
 from rig.errors import UsageError
+from rig.requests import CalibrationRequest
 from rig.run_folder.manifest import MANIFEST
 
 if TYPE_CHECKING:
     from calibration.board.board import Board
-    from calibration.model.rig_model import RigModel
 
 VIEWS = "views"
 """Folder of a session that holds its views."""
 PICTURES = (".png", ".jpg", ".jpeg", ".tif", ".tiff", ".bmp")
 BOARD_SCENE = "board"
 """Scene that a simulated rig is shown where its own has no board."""
+
+
+SourcesLike = Config | Sequence[Config]
 
 
 @dataclass(frozen=True, slots=True)
@@ -44,7 +47,7 @@ class ViewSources:
     notes: tuple[str, ...] = ()
 
 
-def sort_sources(sources: Sequence[Config], *, pictures: bool = False, scene: str | None = None) -> ViewSources:
+def sort_sources(sources: SourcesLike, *, pictures: bool = False, scene: str | None = None) -> ViewSources:
     """Tell what each source is; without any it is the bundled simulated rig.
 
     scene: of a simulated rig; None is its own or, where that has no board, the bundled one with a board. Raises
@@ -56,6 +59,8 @@ def sort_sources(sources: Sequence[Config], *, pictures: bool = False, scene: st
     found: list[Path] = []
     problems: list[str] = []
     notes: list[str] = []
+    if isinstance(sources, RigConfig | str | os.PathLike):
+        sources = [sources]
     for source in sources or (SIMULATED,):
         path = None if isinstance(source, RigConfig) else Path(source)
         if path is not None and path.is_dir():
@@ -117,14 +122,6 @@ def _live(source: Config, scene: str | None, notes: list[str]) -> RigConfig:
     return configure(loaded, scene=BOARD_SCENE)
 
 
-SourcesLike = Config | Sequence[Config]
-
-
-def listed(sources: SourcesLike) -> Sequence[Config]:
-    """The sources as a sequence, for a single one as well."""
-    return [sources] if isinstance(sources, RigConfig | str | os.PathLike) else list(sources)
-
-
 def read_board(file: PathLike | None) -> "Board":
     """Read a board's file; None is the bundled board. Raises CalibrationError."""
     from calibration.board.board import BUNDLED_BOARD, load_board
@@ -132,38 +129,40 @@ def read_board(file: PathLike | None) -> "Board":
     return load_board(BUNDLED_BOARD if file is None else file)
 
 
-def read_base(file: PathLike | None) -> "RigModel | None":
-    """Read the calibration to start from; None without one. Raises CalibrationError."""
-    from calibration.files.rig_file import load_rig_model
+_QUANTITIES = {
+    "accuracy": ("accuracy_m", "length"),
+    "at": ("at_m", "length"),
+    "stated_baseline": ("stated_baseline_m", "length"),
+    "angle": ("angle_rad", "angle"),
+}
+"""Fields of requests that are texts with a unit: their name in SI units, and their dimension."""
 
-    return None if file is None else load_rig_model(file)
 
+def si_values(request: CalibrationRequest) -> dict[str, float]:
+    """The quantities that a request states, in SI units: `accuracy_m`, `at_m`, `stated_baseline_m`, `angle_rad`.
 
-def problems_of(poses: int | None, seed: int, exposures: Sequence[int] = ()) -> list[str]:
-    """Problems with numbers that several calls take."""
+    UsageError, a line per problem, for those that are none and for numbers that cannot be.
+    """
+    exposures, poses = getattr(request, "exposures", ()), getattr(request, "poses", 1)
     problems = [f"exposures has {k}; it must be at least 1" for k in exposures if k < 1]
-    if poses is not None and poses < 1:
+    if poses < 1:
         problems.append(f"poses is {poses}; it must be at least 1")
-    return problems + seed_problems(seed)
-
-
-def quantity(problems: list[str], name: str, text: str | None, dimension: str) -> float | None:
-    """The number above 0 that a text means, in SI units; a mistake in it is added to `problems`."""
-    if text is None:
-        return None
-    try:
-        value = parse_quantity(text, dimension)
-    except ValueError as error:
-        problems.append(f"{name}: {error}")
-        return None
-    if not value > 0:
-        problems.append(f"{name} is {text}; it must be above 0")
-    return value
-
-
-def length_m(problems: list[str], name: str, text: str | None) -> float | None:
-    """The metres that a text means; a mistake in it is added to `problems`."""
-    return quantity(problems, name, text, "length")
+    problems += seed_problems(request.seed)
+    values: dict[str, float] = {}
+    for field, (name, dimension) in _QUANTITIES.items():
+        text = getattr(request, field, None)
+        if text is None:
+            continue
+        try:
+            values[name] = parse_quantity(text, dimension)
+        except ValueError as error:
+            problems.append(f"{field}: {error}")
+            continue
+        if not values[name] > 0:
+            problems.append(f"{field} is {text}; it must be above 0")
+    if problems:
+        raise UsageError.of(problems)
+    return values
 
 
 @dataclass(frozen=True, slots=True)

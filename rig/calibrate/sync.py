@@ -29,22 +29,23 @@ from calibration.model.rig_model import RigModel
 from calibration.sync.gate_fit import Edge, edge_time, fit_edge
 from calibration.sync.lag_fit import SyncFit, fit_sync
 from calibration.sync.transfer import known_row_delay, with_lags
-from calibration.verdict import AT_M, Verdict
+from calibration.verdict import Verdict
 from drivers.frames import FrameBlock
 from drivers.recorded import RunRecording
-from rig.calibrate.capture import Tell, capture_view
+from rig.calibrate.capture import TellLine, capture_view
 from rig.calibrate.planes import speeds_of
 from rig.calibrate.report import sync_report
 from rig.calibrate.report_page import subject
-from rig.calibrate.session import CalibrationResult, Made, Session, true_model
-from rig.calibrate.sources import ViewSources
-from rig.calibrate.views import Taken, take_kept
+from rig.calibrate.session import CalibrationResult, LoadedCalibration, Session, true_model
+from rig.calibrate.sources import SourcesLike, si_values, sort_sources
+from rig.calibrate.views import ViewCollection, take_kept
 from rig.config.models import RigConfig
 from rig.count.bind import FrameBinder
 from rig.plan.scan_plan import ScanPlan
 from rig.progress import part, tell_stage
 from rig.recording.inputs import read_plan
-from rig.scan.run import OutFolder, versions
+from rig.requests import SyncRequest
+from rig.scan.run import versions
 
 Array = NDArray[np.float64]
 
@@ -93,45 +94,25 @@ class GateDelay:
         return math.hypot(self.opens_sd_s, self.closes_sd_s) / 2
 
 
-@dataclass(frozen=True, slots=True)
-class SyncAsked:
-    """Request for a measurement of the lags.
+def run_sync(sources: SourcesLike, request: SyncRequest, *, tell: TellLine | None = None) -> CalibrationResult:
+    """Measure the lags. They go into a copy of the live rig's model, or of the one that is named; without one only the
+    figures are written.
 
-    exposures: per column, one speed each; empty is those of `speeds_of`. accuracy_m, at_m: as in `PlanesAsked`.
-    """
-
-    exposures: tuple[int, ...] = ()
-    accuracy_m: float | None = None
-    at_m: float = AT_M
-    seed: int = 0
-    arm: bool = False
-
-
-def run_sync(
-    sources: ViewSources,
-    asked: SyncAsked,
-    *,
-    calibration: Path | None = None,
-    out: OutFolder = None,
-    tell: Tell | None = None,
-) -> CalibrationResult:
-    """Measure the lags.
-
-    calibration: file of the model that they go into; None is that of the live rig, and without one only the figures are
-    written.
     Raises Degenerate where the sweeps cannot tell, CalibrationError where the file cannot be read or its line does not
     reach the distance asked.
     """
-    live = sources.live
-    made_from = _own(live) if calibration is None else (calibration, load_rig_model(calibration))
+    values = si_values(request)
+    found, file = sort_sources(sources, scene=request.scene), request.calibration
+    live = found.live
+    made_from = _own(live) if file is None else (Path(file), load_rig_model(file))
     base = None if made_from is None else made_from[1]
-    wanted = None if base is None else goal(sensitivity(base, asked.at_m), asked.accuracy_m, asked.at_m)
-    with Session(out) as session:
-        taken = Taken(session, tell)
-        take_kept(taken, sources, None)
-        gates = [gate_delay(run) for run in sources.recorded]
+    wanted = None if base is None else goal(sensitivity(base, values["at_m"]), **values)
+    with Session(request.out) as session:
+        taken = ViewCollection(session, tell)
+        take_kept(taken, found, None)
+        gates = [gate_delay(run) for run in found.recorded]
         if live is not None:
-            gates.append(_scanned(live, asked, taken))
+            gates.append(_scanned(live, request, taken))
         gate = min((one for one in gates if one is not None and one.sd_s > 0), key=lambda one: one.sd_s, default=None)
         tell_stage("fitting", len(taken.views), unit="views")
         fit = _fitted(taken, base)
@@ -147,22 +128,22 @@ def run_sync(
         return CalibrationResult(verdict, line, figures, summary, model, session.path, written)
 
 
-def _scanned(live: RigConfig, asked: SyncAsked, taken: Taken) -> GateDelay | None:
+def _scanned(live: RigConfig, request: SyncRequest, taken: ViewCollection) -> GateDelay | None:
     """Scan at every speed; the gate's delay comes from the fastest sweeps, which are recorded for it."""
-    speeds = asked.exposures or speeds_of(live)
+    speeds = request.exposures or speeds_of(live)
     gate = None
     with TemporaryDirectory() as scratch:
         for at, exposures in enumerate(speeds):
             run = Path(scratch) / "run" if exposures == min(speeds) else None
-            name, seed = f"{exposures} exposures", asked.seed + at
+            name, seed = f"{exposures} exposures", request.seed + at
             with part(f"speed {at + 1} of {len(speeds)}"):
-                capture = capture_view(live, name, None, seed=seed, exposures=exposures, arm=asked.arm, out=run)
+                capture = capture_view(live, name, None, seed=seed, exposures=exposures, arm=request.arm, out=run)
             taken.add_capture(capture)
             gate = gate if run is None else gate_delay(run)
     return gate
 
 
-def _fitted(taken: Taken, base: RigModel | None) -> SyncFit:
+def _fitted(taken: ViewCollection, base: RigModel | None) -> SyncFit:
     known = (0.0, 0.0) if base is None else known_row_delay(base)
     try:
         return fit_sync([sweep for view in taken.views for sweep in view.passages], *known)
@@ -170,7 +151,7 @@ def _fitted(taken: Taken, base: RigModel | None) -> SyncFit:
         raise Degenerate(refused.reason, f"{refused.reason}: {refused}") from refused
 
 
-def _own(live: RigConfig | None) -> Made | None:
+def _own(live: RigConfig | None) -> LoadedCalibration | None:
     if live is None or live.calibration is None:
         return None
     try:

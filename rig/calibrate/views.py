@@ -1,8 +1,8 @@
 """Takes views from all sources: kept as they come, none of them twice, all of one rig.
 
-`Taken` collects them. `take_live` takes them with a live rig, pose by pose, as `Live` says; `take_kept` takes those of
-earlier sessions, recorded runs and pictures. `told` and `refusal` are the messages about views, and about views that
-make no calibration.
+`ViewCollection` holds them. `take_live` takes them with a live rig, pose by pose, as `LiveViewOptions` says;
+`take_kept` takes those of earlier sessions, recorded runs and pictures. `told` and `refusal` are the messages about
+views, and about views that make no calibration.
 """
 
 import math
@@ -29,7 +29,7 @@ from calibration.model.camera import Camera
 from calibration.model.rig_model import Identity
 from calibration.rig_fit.state import FEWEST_PASSAGES, shows_line
 from calibration.views import View
-from rig.calibrate.capture import Ask, Capture, SpeedTurns, Tell, capture_recorded, capture_view, shown
+from rig.calibrate.capture import AskPerson, Capture, SpeedRotation, TellLine, capture_recorded, capture_view, shown
 from rig.calibrate.session import BOARD_FILE, Session, load_views, session_board, session_rig
 from rig.calibrate.sources import VIEWS, ViewSources
 from rig.config.models import RigConfig
@@ -39,14 +39,14 @@ from rig.errors import UsageError
 from rig.progress import part, tell_stage
 
 
-class Taken:
+class ViewCollection:
     """The views taken so far.
 
     views: all of them. refused: the reasons why some have no corners, by the view's name. identity: of the rig; None
     where it is not known.
     """
 
-    def __init__(self, session: Session, tell: Tell | None = None, of_camera: Collection[str] = ()) -> None:
+    def __init__(self, session: Session, tell: TellLine | None = None, of_camera: Collection[str] = ()) -> None:
         """Begin without views.
 
         session: keeps the views. tell: gets a line about each. of_camera: `corners_digest` of the views that a camera
@@ -159,7 +159,7 @@ class FixedPoses:
         return self.poses[len(views)] if len(views) < len(self.poses) else None
 
 
-def require_poses(taken: Taken, poses: int) -> None:
+def require_poses(taken: ViewCollection, poses: int) -> None:
     """Raise UsageError where so many poses, with the views taken already, are too few whatever they show."""
     there = sum(view.corners is not None for view in taken.views)
     if there + poses < FEWEST_POSES:
@@ -194,7 +194,7 @@ def first_camera(config: RigConfig) -> Camera:
 
 
 @dataclass(frozen=True, slots=True)
-class Live:
+class LiveViewOptions:
     """Settings of `take_live`: views with a live rig.
 
     poses: number of good views wanted. choose: chooses the poses. ask: gets a person to move the board.
@@ -207,7 +207,7 @@ class Live:
     config: RigConfig
     poses: int
     choose: ChoosesPoses
-    ask: Ask | None = None
+    ask: AskPerson | None = None
     exposures: Sequence[int] = ()
     seed: int = 0
     arm: bool = False
@@ -219,10 +219,10 @@ class Live:
         return capture.refused is None and (not self.line or shows_line(capture.view))
 
 
-def take_live(taken: Taken, live: Live, board: Board) -> None:
+def take_live(taken: ViewCollection, live: LiveViewOptions, board: Board) -> None:
     """Take views of a board that is moved from pose to pose."""
     good, seen, reasons = 0, list[View](), list[str]()
-    speeds = SpeedTurns(live.exposures, live.sees, taken.tell)
+    speeds = SpeedRotation(live.exposures, live.sees, taken.tell)
     while good < live.poses and len(seen) < live.poses + math.ceil(MISSED_SHARE * live.poses):
         advice = live.choose.next(seen)
         if advice is None:
@@ -241,7 +241,9 @@ def take_live(taken: Taken, live: Live, board: Board) -> None:
             return
 
 
-def _scan(taken: Taken, live: Live, config: RigConfig, board: Board, exposures: int | None) -> Capture:
+def _scan(
+    taken: ViewCollection, live: LiveViewOptions, config: RigConfig, board: Board, exposures: int | None
+) -> Capture:
     """Take one view of the board where it is."""
     at = len(taken.views)
     return capture_view(
@@ -250,7 +252,7 @@ def _scan(taken: Taken, live: Live, config: RigConfig, board: Board, exposures: 
 
 
 def take_kept(
-    taken: Taken, sources: ViewSources, board: Board | None, defects: NDArray[np.bool_] | None = None
+    taken: ViewCollection, sources: ViewSources, board: Board | None, defects: NDArray[np.bool_] | None = None
 ) -> None:
     """Take the views that need no live rig.
 
@@ -309,7 +311,9 @@ def _pictured(file: Path, board: Board | None) -> tuple[View, Degenerate | None]
         return View(file.name, None, (), picture), error
 
 
-def refusal(refused: Degenerate, taken: Taken, board: Board, *, photons: bool = True, line: bool = True) -> Degenerate:
+def refusal(
+    refused: Degenerate, taken: ViewCollection, board: Board, *, photons: bool = True, line: bool = True
+) -> Degenerate:
     """The error for views that make no calibration: its root cause.
 
     Its notes are what the fit said, the other reasons, and the trouble of single views unless that was told when they
@@ -329,13 +333,13 @@ def refusal(refused: Degenerate, taken: Taken, board: Board, *, photons: bool = 
     return error
 
 
-def note_views(error: Degenerate, taken: Taken) -> None:
+def note_views(error: Degenerate, taken: ViewCollection) -> None:
     """Add the trouble of single views as notes, unless it was told when they were taken."""
     for name, why in taken.refused.items() if taken.tell is None else ():
         error.add_note(f"view {name}: {why}")
 
 
-def _of_views(refused: Degenerate, taken: Taken) -> Degenerate:
+def _of_views(refused: Degenerate, taken: ViewCollection) -> Degenerate:
     """The reason why most views have no board, where that is why there is no model; otherwise the error as it is."""
     if refused.reason != "no-board" or not taken.refused:
         return refused

@@ -14,7 +14,8 @@ from calibration.files.rig_file import load_rig_model, save_rig_model
 from calibration.pixel_map import frames_for, hot_flux, load_pixels
 from drivers.interfaces import SpadRequest
 from rig import api
-from rig.calibrate.pixels import PixelResult, run_pixels
+from rig.api import calibrate_pixels
+from rig.calibrate.pixels import PixelResult
 from rig.errors import UsageError
 from sim_backend.devices.spad import SimulatedSpad
 from sim_backend.effects.dark_counts import dark_rates
@@ -45,7 +46,7 @@ def mapped(tmp_path_factory: pytest.TempPathFactory) -> tuple[Path, PixelResult]
     """The rig's config, and its pixels mapped with lit frames too."""
     folder = tmp_path_factory.mktemp("pixels")
     file = rig_of(folder / "rig")
-    return file, run_pixels(file, light=True, seed=3, out=folder / "out")
+    return file, calibrate_pixels(file, light=True, seed=3, out=folder / "out")
 
 
 def test_hot_and_dead_pixels_and_dark_rates_are_those_of_the_sensor(mapped: tuple[Path, PixelResult]) -> None:
@@ -94,7 +95,7 @@ def test_the_folder_holds_the_map_the_calibration_and_the_report(mapped: tuple[P
 def test_the_next_map_knows_the_last_one_and_says_what_changed(mapped: tuple[Path, PixelResult]) -> None:
     file, first = mapped
     assert first.folder is not None
-    again = run_pixels(file, seed=4, against=first.folder)
+    again = calibrate_pixels(file, seed=4, against=first.folder)
     assert again.found.version == 2
     assert again.found.parent == first.found.id
     assert again.drift is not None
@@ -107,7 +108,7 @@ def test_the_next_map_knows_the_last_one_and_says_what_changed(mapped: tuple[Pat
 def test_a_recorded_run_gives_its_dark_and_lit_frames(tmp_path: Path) -> None:
     file = rig_of(tmp_path / "rig")
     api.scan(file, maps=4, exposures=20, seed=1, record=True, out=tmp_path / "run")
-    result = run_pixels(tmp_path / "run", out=tmp_path / "out")
+    result = calibrate_pixels(tmp_path / "run", out=tmp_path / "out")
     rate, stuck, dead = truth()
     pixels = result.found.pixels
     assert pixels.dead is not None
@@ -121,7 +122,7 @@ def test_a_recorded_run_gives_its_dark_and_lit_frames(tmp_path: Path) -> None:
 
 
 def test_too_few_frames_are_said_to_be_too_few(tmp_path: Path) -> None:
-    result = run_pixels(rig_of(tmp_path / "rig"), frames=64)
+    result = calibrate_pixels(rig_of(tmp_path / "rig"), frames=64)
     assert result.verdict.codes == ("too-few-frames",)
     assert result.exit_code == 1
 
@@ -130,7 +131,7 @@ def test_the_default_map_to_compare_with_lies_beside_the_calibration_and_a_bad_d
     tmp_path: Path,
 ) -> None:
     file = rig_of(tmp_path / "rig")
-    first = run_pixels(file, out=tmp_path / "out")
+    first = calibrate_pixels(file, out=tmp_path / "out")
     assert first.folder is not None
     assert first.drift is None
     for name in ("pixels.npz", "calibration.yaml", "calibration-defects.npy", "calibration-dark-rate.npy"):
@@ -139,7 +140,7 @@ def test_the_default_map_to_compare_with_lies_beside_the_calibration_and_a_bad_d
     content["world"]["sensor"] = {**SENSOR, "pixel_seed": 8}  # somebody put in another sensor
     content["calibration"] = "calibration.yaml"
     changed = write_rig(tmp_path / "rig", content)
-    second = run_pixels(changed)
+    second = calibrate_pixels(changed)
     assert second.found.version == 2
     assert second.verdict.codes[0] == "other-sensor"
     with pytest.raises(UsageError, match=r"'rig calibrate pixels' of .* failed \(other-sensor"):
@@ -163,33 +164,31 @@ def test_no_light_is_let_out_and_nothing_moves(tmp_path: Path, monkeypatch: pyte
         return configure(self, request)
 
     monkeypatch.setattr(SimulatedSpad, "_do_configure", noted)
-    run_pixels(rig_of(tmp_path / "rig"), frames=320)
+    calibrate_pixels(rig_of(tmp_path / "rig"), frames=320)
     assert [request.window for request in asked] == [None]
 
 
 def test_a_slow_link_gets_the_frames_at_the_rate_it_carries(tmp_path: Path) -> None:
     content = config()
     content["spad"]["link"] = "5 MB/s"
-    result = run_pixels(write_rig(tmp_path / "rig", content), frames=640)
+    result = calibrate_pixels(write_rig(tmp_path / "rig", content), frames=640)
     assert result.found.pixels.frames == 640
     assert result.found.pixels.exposure_s == pytest.approx(1e-5, rel=1e-3)
 
 
 def test_what_cannot_be_is_said_before_anything_is_opened(tmp_path: Path, mapped: tuple[Path, PixelResult]) -> None:
     file = mapped[0]
-    with pytest.raises(UsageError, match="signal is 0"):
-        run_pixels(file, signal=0.0)
     with pytest.raises(UsageError, match="frames is 0"):
-        run_pixels(file, frames=0)
+        calibrate_pixels(file, frames=0)
     with pytest.raises(UsageError, match="cannot read"):
-        run_pixels(file, against=tmp_path / "none.npz")
+        calibrate_pixels(file, against=tmp_path / "none.npz")
 
 
 @pytest.fixture(scope="module")
 def worse(tmp_path_factory: pytest.TempPathFactory) -> tuple[Path, NDArray[np.bool_]]:
     """A folder with the rig of a sensor that has many defects, and those that were found."""
     folder = tmp_path_factory.mktemp("defects")
-    result = run_pixels(rig_of(folder, **MANY), frames=3200, light=True)
+    result = calibrate_pixels(rig_of(folder, **MANY), frames=3200, light=True)
     return folder, result.found.pixels.defects
 
 

@@ -18,7 +18,7 @@ from calibration.rig_fit.result import RigFit
 from calibration.sync import transfer
 from calibration.sync.lag_fit import SyncFit, fit_sync
 from calibration.sync.transfer import known_row_delay, with_lags
-from calibration.verdict import Asked
+from calibration.verdict import AccuracyGoal
 from calibration.views import Passages, View
 from tests.reference.boards.calibration_data import BOARD, Seen, TrueRig, random_pose, random_views, seen_view
 from tests.reference.boards.fitted_depth import depth_errors
@@ -157,7 +157,7 @@ def test_lags_that_changed_leave_planes_alone_that_had_told_them_apart() -> None
     model, reason = with_lags(together.model, changed)
     assert reason is not None
     assert reason.code == "changed-lag"
-    assert judge_sync(changed, model, Asked(0.05), reason).codes == ("changed-lag",)
+    assert judge_sync(changed, model, AccuracyGoal(0.05), reason).codes == ("changed-lag",)
     model, reason = with_lags(replace(together.model, provenance={}), changed)
     assert reason is not None
     assert reason.code == "lags-together"

@@ -16,14 +16,14 @@ from calibration.diagnosis.sweep_waves import SweepResidual, sweep_waves
 from calibration.diagnosis.view_shifts import ViewShift, common_shift, counted, last_before_move
 from calibration.errors import Degenerate
 from calibration.rig_fit.fit import fit_rig
-from calibration.verdict import Asked, Verdict, unguided
+from calibration.verdict import AccuracyGoal, Verdict, unguided
 from calibration.views import BoardPose, Corners, View
 from tests.reference.boards.calibration_data import BOARD, Seen, TrueRig, random_views
 from tests.stability.inventory import covers
 
 covers(evidence, verdict, rig, view_shifts)
 
-ASKED = Asked(accuracy_m=0.014, at_m=5.0, stated_baseline_m=0.3)
+ASKED = AccuracyGoal(accuracy_m=0.014, at_m=5.0, stated_baseline_m=0.3)
 VIEWS = ViewEvidence(shown=12, used=12, coverage=0.8, room_flux=0.2)
 FIT = FitEvidence(
     PoseEvidence(tilt_rad=radians(60), distance_m=1.6, board_rad=0.35),

@@ -5,7 +5,7 @@ from typing import Any
 
 import pytest
 
-from rig.calibrate.capture import SpeedTurns
+from rig.calibrate.capture import SpeedRotation
 from rig.calibrate.planes import speeds_of
 from rig.errors import PlanError
 
@@ -21,7 +21,7 @@ def taken(exposures: tuple[int, ...], least: int, poses: int, *, most: int = 99)
         scanned.append(at)
         return SimpleNamespace(refused=None, seen=at is None or at >= least)
 
-    turns = SpeedTurns(exposures, _seen, told.append)
+    turns = SpeedRotation(exposures, _seen, told.append)
     for pose in range(poses):
         turns.capture(pose, scan)
     return scanned, told

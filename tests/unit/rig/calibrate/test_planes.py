@@ -15,7 +15,7 @@ from calibration.model.rig_model import Covariance
 from calibration.rig_fit.fit import fit_rig
 from rig.calibrate import planes as planes_run
 from rig.calibrate import views as taking
-from rig.calibrate.planes import Guide
+from rig.calibrate.planes import PoseGuide
 from rig.calibrate.views import FixedPoses
 from tests.reference.boards.calibration_data import BOARD, Seen, TrueRig, random_views
 
@@ -28,13 +28,13 @@ def test_a_camera_that_is_known_counts_in_what_the_guide_expects() -> None:
     known = Covariance(names, np.diag([0.05] * 4 + [1e-4] * 5) ** 2)
     lens = Camera(*SIZE, np.array([[600, 0, 255.5], [0, 600, 255.5], [0, 0, 1.0]]), np.array(RIG.lens))
     views = random_views(np.random.default_rng(4), RIG, 3, Seen(passages=150))
-    taken = SimpleNamespace(views=views, size=SIZE)
-    asked = planes_run.PlanesAsked(accuracy_m=1e-4)
+    taken = SimpleNamespace(views=views, size=SIZE, say=lambda line: None)
+    asked = {"accuracy_m": 1e-4, "at_m": 5.0}
     before = []
     for camera in (None, KnownCamera(lens, known, frozenset())):
         fit = partial(planes_run._fit, taken, BOARD, None, camera)
         judge = partial(planes_run._judged, taken, asked)
-        advice = Guide(FixedPoses(()), BOARD, (0.5, 4.0), taken, fit, judge, None).next(views)
+        advice = PoseGuide(FixedPoses(()), BOARD, (0.5, 4.0), taken, fit, judge).next(views)
         assert advice is not None
         before.append(advice.before_m)
     told = fit_rig(views, BOARD, SIZE, camera=lens, known=known)
@@ -55,11 +55,11 @@ def test_a_later_session_shows_the_poses_that_follow(monkeypatch: pytest.MonkeyP
 
 def test_a_fit_whose_line_misses_the_distance_asked_does_not_end_the_session() -> None:
     views = random_views(np.random.default_rng(4), RIG, 3, Seen(passages=150))
-    taken = SimpleNamespace(views=views, size=SIZE)
-    asked = planes_run.PlanesAsked(at_m=0.05)
+    taken = SimpleNamespace(views=views, size=SIZE, say=lambda line: None)
+    asked = {"at_m": 0.05}
     fit, judge = partial(planes_run._fit, taken, BOARD, None, None), partial(planes_run._judged, taken, asked)
     with pytest.raises(CalibrationError, match="does not reach"):
         judge(fit())
     lens = Camera(*SIZE, np.array([[600, 0, 255.5], [0, 600, 255.5], [0, 0, 1.0]]), np.zeros(5))
     poses = [Advice(choice, 0.05) for choice in candidates(lens, BOARD, (0.5, 4.0))[:4]]
-    assert Guide(FixedPoses(poses), BOARD, (0.5, 4.0), taken, fit, judge, None).next(views) is poses[3]
+    assert PoseGuide(FixedPoses(poses), BOARD, (0.5, 4.0), taken, fit, judge).next(views) is poses[3]

@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 
 from calibration.board.board import Board
-from calibration.diagnosis.rig import Judged, judge_fit
+from calibration.diagnosis.rig import JudgedRig, judge_fit
 from calibration.model.rig_model import Identity
 from calibration.rig_fit.fit import fit_rig
 from calibration.rig_fit.result import RigFit
@@ -30,12 +30,12 @@ def _fitted() -> tuple[list[View], RigFit]:
 
 
 @pytest.fixture(name="judged")
-def _judged() -> Judged:
+def _judged() -> JudgedRig:
     views, fit = _fitted()
     return judge_fit(fit, views, stated_baseline_m=0.3)
 
 
-def test_the_report_of_planes_shows_text_first_then_the_four_pictures(judged: Judged) -> None:
+def test_the_report_of_planes_shows_text_first_then_the_four_pictures(judged: JudgedRig) -> None:
     views, fit = _fitted()
     html = planes_report(fit, views, judged, judged.uncertainty.line(), [("baseline", "300 mm")])
     text = html[: html.index("<img")]
@@ -49,7 +49,7 @@ def test_the_report_of_planes_shows_text_first_then_the_four_pictures(judged: Ju
     assert not re.search(r'(src|href)="(?!data:)', html)
 
 
-def test_a_failed_verdict_leads_with_its_root_cause(judged: Judged) -> None:
+def test_a_failed_verdict_leads_with_its_root_cause(judged: JudgedRig) -> None:
     views, fit = _fitted()
     reasons = (
         Reason("moved-rig", "views contradict each other", 0.2, 0.01, "calibrate again"),
@@ -59,7 +59,7 @@ def test_a_failed_verdict_leads_with_its_root_cause(judged: Judged) -> None:
     assert html.index("FAILED") < html.index("moved-rig") < html.index("poor-coverage") < html.index("<img")
 
 
-def test_a_report_says_what_it_is_of(judged: Judged) -> None:
+def test_a_report_says_what_it_is_of(judged: JudgedRig) -> None:
     views, fit = _fitted()
     rig = Identity("1f", "", "lab", {"spad": "spb-usb", "scanner": "helios"}, {"spad": "SN-0042"})
     board = Board("charuco", (9, 7), 0.06, 0.047, "DICT_4X4_50")
@@ -94,7 +94,7 @@ def test_terms_of_the_model_have_units_and_the_digits_that_are_known() -> None:
     assert "<td>us</td>" in terms
 
 
-def test_the_shift_of_a_view_says_which_way_it_goes(judged: Judged) -> None:
+def test_the_shift_of_a_view_says_which_way_it_goes(judged: JudgedRig) -> None:
     assert [in_mm_with_sign(length_m) for length_m in (0.00314, -0.00314, 0.0, np.nan)] == ["+3.14", "-3.14", "0", "-"]
     views, fit = _fitted()
     first, second, *others = judged.shifts
@@ -120,6 +120,6 @@ def test_columns_of_numbers_stand_to_the_right() -> None:
     assert "<th>why</th>" in html
 
 
-def test_a_model_of_the_right_rig_is_found(judged: Judged) -> None:
+def test_a_model_of_the_right_rig_is_found(judged: JudgedRig) -> None:
     assert judged.evidence.baseline_m == pytest.approx(0.3, abs=6 * judged.evidence.baseline_sd_m)
     assert judged.evidence.expected_m < judged.asked.accuracy_m

@@ -13,7 +13,7 @@ from calibration.guide import Advice
 from calibration.views import Corners, Passages, View
 from rig.calibrate import views as taking
 from rig.calibrate.session import Session
-from rig.calibrate.views import FixedPoses, Live, Taken, take_live
+from rig.calibrate.views import FixedPoses, LiveViewOptions, ViewCollection, take_live
 from rig.errors import UsageError
 
 
@@ -24,7 +24,7 @@ def shown(
     *,
     line: bool = True,
     of_camera: Collection[str] = (),
-) -> tuple[Taken, list[str]]:
+) -> tuple[ViewCollection, list[str]]:
     """What was taken of four poses wanted, and said of them."""
     rng = np.random.default_rng(1)
 
@@ -41,10 +41,10 @@ def shown(
     told: list[str] = []
     config: Any = None
     candidate: Any = None
-    taken = Taken(Session(None), told.append, of_camera)
+    taken = ViewCollection(Session(None), told.append, of_camera)
     choose = FixedPoses([Advice(candidate, 5.0)] * 9)
     board: Any = None
-    take_live(taken, Live(config, 4, choose, exposures=(3, 6), line=line), board)
+    take_live(taken, LiveViewOptions(config, 4, choose, exposures=(3, 6), line=line), board)
     return taken, told
 
 
@@ -64,7 +64,7 @@ def test_a_view_that_the_camera_was_made_of_is_refused_before_the_next_is_shown(
 ) -> None:
     first, second, *_ = shown(monkeypatch)[0].views
     told: list[str] = []
-    monkeypatch.setattr(Taken, "say", lambda self, line: told.append(line))
+    monkeypatch.setattr(ViewCollection, "say", lambda self, line: told.append(line))
     with pytest.raises(UsageError, match=r"001 holds a view that the camera was made of; .* another --seed"):
         shown(monkeypatch, of_camera={corners_digest(second)})
     assert len(told) == 1
