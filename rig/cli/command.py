@@ -53,7 +53,6 @@ SceneOption = Annotated[
 OutOption = Annotated[
     Path | None, typer.Option("--out", help="folder to write, new or empty", show_default="runs/DATE-TIME")
 ]
-ArmOption = Annotated[bool, typer.Option("--arm", help="let a real laser shine: the beam path is clear")]
 JsonOption = Annotated[bool, typer.Option("--json", help="print exactly one JSON object to stdout, errors too")]
 
 
