@@ -104,7 +104,7 @@ class ReplayRequest(RunRequest):
     against_recording: bool = option(False, "the recorded drivers take part, against what was answered then")
     threads: int | None = option(None, "threads that count and estimate", unset="as recorded")
     block_frames: int | None = option(None, "most frames of a block", unset="5 ms", least=1)
-    save: str | None = option(None, "maps to write: all, last or every N", unset="all, with --loop last")
+    save: str | None = option(None, "maps to write: all, last or every N", unset="all, of the command with --loop last")
     on_overload: str = option("abort", "where frames come too fast: abort and block wait, drop counts them")
 
 

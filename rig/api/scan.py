@@ -130,8 +130,6 @@ def replay(
     from rig.scan.replay import play
 
     request = replace(request or ReplayRequest(), **changes)
-    if request.save is None and request.loop:
-        request = replace(request, save="last")
     played = ReplayOptions(request.clock, request.loop, request.block_frames)
     others = None if request.config is None else configure(request.config)
     estimate = _chosen(request, "estimator", "filter", "min_confidence", "threads")

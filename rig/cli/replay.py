@@ -4,6 +4,7 @@ import os
 import select
 import sys
 import threading
+from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
 
@@ -35,6 +36,8 @@ def replay_command(
     """Play a recording through the live stack, at any clock."""
     from rig import api
 
+    if request.loop and request.save is None:
+        request = replace(request, save="last")
     steps = _step_by_keys if request.clock == "step" else None
     with progress():
         result = api.replay(run, request, on_space=say_space, steps=steps)

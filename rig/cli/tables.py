@@ -4,14 +4,12 @@ import sys
 import textwrap
 from collections.abc import Callable, Iterable, Sequence
 from itertools import groupby
-from pathlib import Path
-from typing import Protocol
+from typing import TYPE_CHECKING
 
 from rich.console import Console
 from rich.table import Table
 
 from calibration.errors import digits
-from calibration.verdict import Verdict
 from drivers.replay.pace import PaceReport
 from rig.bench.frames import COLUMNS
 from rig.bench.soak import SoakReport
@@ -21,6 +19,10 @@ from rig.scan.run import RunResult
 from rig.tradeoff.effects import Effect, Flux, SceneEffects
 from rig.tradeoff.rows import TradeoffRow
 from rig.tradeoff.trials import Tradeoff
+
+if TYPE_CHECKING:
+    from rig.calibrate.pixels import PixelResult
+    from rig.calibrate.session import CalibrationResult
 
 WIDE = 300
 """Characters of a line that goes to a file or a pipe; no line here is as long."""
@@ -400,30 +402,7 @@ def _figure(value: float | None, digits: int = 3) -> str:
     return "-" if value is None else f"{value:.{digits}g}"
 
 
-class Printable(Protocol):
-    """A result of any of the calibrate commands."""
-
-    @property
-    def verdict(self) -> Verdict:
-        """Whether it may be used."""
-        ...
-
-    @property
-    def folder(self) -> Path | None:
-        """Folder that everything was written to; None where nothing was."""
-        ...
-
-    @property
-    def calibration(self) -> Path | None:
-        """The calibration's file."""
-        ...
-
-    def rows(self) -> list[tuple[str, str]]:
-        """Figures by name."""
-        ...
-
-
-def print_result(result: Printable, line: str = "") -> None:
+def print_result(result: "CalibrationResult | PixelResult", line: str = "") -> None:
     """Print the verdict and its reasons, the one line, the figures and the files to stdout."""
     table = Table.grid(padding=(0, 2))
     table.add_column(style="bold")

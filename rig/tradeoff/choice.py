@@ -65,10 +65,8 @@ class Choice:
     def as_json(self) -> dict[str, Any]:
         """Return it as plain values."""
         wish = {"time_budget_ms": self.wish.time_ms, "error_px": self.wish.error_px, "of": self.wish.of}
-        return {"asked": wish, "fits": self.fits, **asdict(self.setting), **self._times()}
-
-    def _times(self) -> dict[str, float]:
-        return {"mean_abs_px": self.mean_abs_px, "sensor_ms": self.sensor_ms, "compute_ms": self.compute_ms}
+        figures = {name: getattr(self, name) for name in ("mean_abs_px", "sensor_ms", "compute_ms")}
+        return {"asked": wish, "fits": self.fits, **asdict(self.setting), **figures}
 
 
 def wish_of(time_budget: str | None, error: str | None, of: str) -> Wish | None:

@@ -10,7 +10,7 @@ correlated, since filters and coupled estimators share them out; so whole blocks
 
 import math
 import statistics
-from collections.abc import Callable, Iterable, Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import asdict, dataclass, replace
 from typing import Any, Literal
 
@@ -196,18 +196,12 @@ def _fronts(rows: Sequence[TradeoffRow], time_ms: Callable[[TradeoffRow], float]
     found: set[int] = set()
     for place in dict.fromkeys((row.scene, row.fog) for row in rows):
         here = [i for i, row in enumerate(rows) if (row.scene, row.fog) == place and row.counts]
-        found |= {i for i, least in _least_so_far(here, rows, time_ms) if least}
+        best = math.inf
+        for i in sorted(here, key=lambda i: (time_ms(rows[i]), rows[i].mean_abs_px)):
+            if rows[i].mean_abs_px < best:
+                found.add(i)
+                best = rows[i].mean_abs_px
     return found
-
-
-def _least_so_far(
-    here: Iterable[int], rows: Sequence[TradeoffRow], time_ms: Callable[[TradeoffRow], float]
-) -> Iterable[tuple[int, bool]]:
-    """Give each row by rising time, and whether it has less error than all before it."""
-    best = float("inf")
-    for i in sorted(here, key=lambda i: (time_ms(rows[i]), rows[i].mean_abs_px)):
-        yield i, rows[i].mean_abs_px < best
-        best = min(best, rows[i].mean_abs_px)
 
 
 BLOCK_ROWS, BLOCK_COLUMNS = 32, 25

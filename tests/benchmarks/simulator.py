@@ -7,15 +7,7 @@ Whole frames of the simulated rig's camera at its exposure and power. Per scene 
 
 and once, for the scenes of light that it knows, `simulator-numpy-ready` and `-fresh`: the same in whole-array numpy,
 one random number for every pixel. Figures are medians over rounds in which all rows are measured in turn.
-
-What made them what they are (one core, 512 x 512, us a frame drawn): bit planes against random words of SplitMix64 93;
-16-bit levels against AES counters of five rounds 25; ties of the two found by a second comparison 20, by pixels drawn
-anew 16; the highest level kept as a mask 14; the counter from a table and the comparison turned round, so that both
-take their operands from memory, 12: 31 instructions for 64 pixels where there were 45. And of a new column's light: a
-function that is handed arrays for every row costs 0.5 to 1 us a row in counted references, so rows are loops within;
-numbers that LLVM knows are fetched anew for every vector, so they are arguments; one long loop is slower than two short
-ones, since fewer of its rounds are under way at a time; float32 halves the haze's time and all memory. Bands of fewer
-rows, for the sake of the caches, gained 10 % on a busy machine and lost as much on an idle one."""
+"""
 
 import argparse
 import os
