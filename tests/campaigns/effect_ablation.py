@@ -1,4 +1,4 @@
-"""What the planner leaves out against the full model: by how much the stripe error differs, and what time that saves.
+"""The planned effects against the full model: difference of the stripe error, and time that it saves.
 
     python -m tests.campaigns.effect_ablation --seeds 5
 

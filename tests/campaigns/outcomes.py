@@ -17,7 +17,7 @@ DONE = "done"
 
 
 class Ending(NamedTuple):
-    """How a sequence, or each of its verbs, ended, and what was wrong with that, if anything.
+    """Ends of a sequence or of its verbs, and what was wrong with them, if anything.
 
     worst: the figure that its campaign watches, such as the longest verb; struck: faults on the way.
     """
@@ -30,7 +30,7 @@ class Ending(NamedTuple):
 
 @dataclass
 class Outcomes:
-    """How many sequences ended, and those that ended wrong: (seed, why)."""
+    """Ends of many sequences, faults that struck, and those that ended wrong: (seed, why)."""
 
     ends: Counter[str] = field(default_factory=Counter)
     struck: Counter[str] = field(default_factory=Counter)
@@ -78,7 +78,7 @@ class Verbs:
         return end == DONE
 
     def ending(self, act: Callable[[], object]) -> Ending:
-        """How the sequence that `act` makes of these verbs ended: wrong where one did, or anything is raised."""
+        """Run the sequence that `act` makes of these verbs: wrong where one of them is, or anything is raised."""
         wrong = None
         try:
             act()

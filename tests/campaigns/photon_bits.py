@@ -36,7 +36,7 @@ MOST_SIGMAS = 4.5
 
 @dataclass(frozen=True, slots=True)
 class Counts:
-    """How often pixels of each p fired, and of how many bits."""
+    """Ones of the pixels of each p, and of how many bits."""
 
     p: Array
     ones: NDArray[np.int64]

@@ -34,8 +34,10 @@ LEFT_OUT_NATS = 14.0  # a hypothesis this far below the best after the first pas
 
 @dataclass(frozen=True, slots=True)
 class Genie:
-    """What is assumed: `labels` hypotheses per pixel (1: integer), `mean_reach` labels on each side in the refinement,
-    `albedo_bins` of the histogram (logarithmic), `profile_reach`: px of the stripe on each side."""
+    """A genie of `labels` hypotheses per pixel (1: integer), refined over `mean_reach` labels on each side.
+
+    albedo_bins: of the histogram (logarithmic); profile_reach: px of the stripe on each side.
+    """
 
     labels: int = 1
     mean_reach: int = 2

@@ -211,7 +211,7 @@ def made_by(*words: object) -> Hashes:
 
 
 def scanned(*words: object) -> Hashes:
-    """As `made_by`, with the plan, and the frames up to the marker that closes the last sweep of each start.
+    """Hashes as of `made_by`, with the plan, and the frames up to the marker that closes the last sweep of each start.
 
     How many frames are recorded behind that marker depends on the moment at which the devices are stopped.
     """

@@ -24,7 +24,7 @@ _MEAN_PER_DRAW = 20.0  # counts are drawn in parts so that exp(-mean) stays far 
 
 
 class Optics(NamedTuple):
-    """What is the same for all stripes: rays (H, W), planes (columns, 4), where the light comes from, medium, sensor.
+    """Quantities that all stripes share: rays (H, W), planes (columns, 4), where the light comes from, medium, sensor.
 
     ambient: (H, W), with the dark counts of each pixel. halo_px: reaches of the halo's two exponentials.
     """
@@ -41,7 +41,7 @@ class Optics(NamedTuple):
 
 
 class Ends(NamedTuple):
-    """Where the sheet ends and what it leaves there, arrays (H, columns); photons per exposure, 0 where nothing.
+    """Ends of the sheet and the light that it leaves there, arrays (H, columns); photons per exposure, 0 where nothing.
 
     halo: its total over both sides; pedestal: per pixel just behind the end; second: stripe of a nearer surface that
     light passes.
@@ -74,7 +74,7 @@ def stream_of(seed, column, row):  # type: ignore[no-untyped-def]
 
 @numba.njit(cache=True, nogil=True)
 def find_stripes(u, v, depth, strength, planes, scanner, extinction, c0, c1, x_true, x_end, stripe):  # type: ignore[no-untyped-def]
-    """Where the sheet ends on each row: fills x_true, x_end, stripe (H, columns) for columns c0..c1.
+    """Find where the sheet ends on each row: fills x_true, x_end, stripe (H, columns) for columns c0..c1.
 
     `strength` (H, W): albedo, times the cosine where wanted. x_true: sub-pixel stripe, NaN where none. x_end: where
     the haze ends (beyond the picture where it never does). stripe: strength / Z^2 * extinction, 0 where none.

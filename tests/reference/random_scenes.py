@@ -50,7 +50,7 @@ def _background(rng: np.random.Generator, x: Array, y: Array) -> Array:
 
 
 def _object(rng: np.random.Generator, x: Array, y: Array) -> tuple[NDArray[np.bool_], Array]:
-    """Where an object is, and its depth in metres everywhere."""
+    """Mask of an object, and its depth in metres everywhere."""
     height, width = x.shape
     centre_x, centre_y = rng.uniform(0, width), rng.uniform(0, height)
     size = np.exp(rng.uniform(np.log(8), np.log(130), 2))

@@ -8,6 +8,7 @@ from __future__ import annotations
 
 from dataclasses import dataclass, replace
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -93,14 +94,14 @@ def procedural_scene(height: int = 512, width: int = 512, seed: int = 0) -> Scen
 
 
 def away_from_steps(depth_m: NDArray[np.float64]) -> NDArray[np.bool_]:
-    """Where no depth step is within 2 px (H, W)."""
-    near, far = depth_m.copy(), depth_m.copy()
-    reach = TRUSTED_REACH_PX
-    padded = np.pad(depth_m, reach, mode="edge")
-    height, width = depth_m.shape
-    for dy in range(2 * reach + 1):
-        for dx in range(2 * reach + 1):
-            part = padded[dy : dy + height, dx : dx + width]
-            near, far = np.minimum(near, part), np.maximum(far, part)
+    """Mask (H, W) of the pixels without a depth step within 2 px."""
+    around = surroundings(depth_m)
     # a slope may change the depth over 5 px by more than one step of 2 %
-    return np.asarray(far / near - 1 < TRUSTED_STEP * (2 * reach + 1))
+    return np.asarray(around.max(axis=(2, 3)) / around.min(axis=(2, 3)) - 1 < TRUSTED_STEP * around.shape[2])
+
+
+def surroundings(values: NDArray[Any]) -> NDArray[Any]:
+    """Values (H, W, 5, 5) within 2 px of each pixel; beyond the border it repeats."""
+    reach = TRUSTED_REACH_PX
+    side = 2 * reach + 1
+    return np.lib.stride_tricks.sliding_window_view(np.pad(values, reach, mode="edge"), (side, side))

@@ -223,7 +223,7 @@ class WorkingPoint:
 
     @property
     def optics(self) -> kernels.Optics:
-        """What the kernels take of rig and medium."""
+        """Rig and medium for the kernels."""
         g, light = self.geometry, self.light
         return kernels.Optics(
             g.u, g.v, g.planes, g.scanner_m, light.extinction_per_m, self.haze_scale, self.ambient, light.sigma_px,
@@ -232,7 +232,7 @@ class WorkingPoint:
 
     @property
     def ends(self) -> kernels.Ends:
-        """What the kernels take of stripes."""
+        """Stripes for the kernels."""
         return kernels.Ends(self.x_true, self.x_end, self.stripe, self.halo, self.pedestal, self.x_second, self.second)
 
 

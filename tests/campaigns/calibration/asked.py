@@ -6,11 +6,11 @@ from collections.abc import Iterable
 from typing import NamedTuple
 
 RATIO = (0.8, 1.3)
-"""Of actual depth errors to stated standard deviations."""
+"""Ratio of actual depth errors to stated standard deviations."""
 INSIDE = (0.93, 0.97)
 """Share of the stated 95 % intervals that hold the truth."""
 ADDED_PX = (0.0, 0.1)
-"""What an estimated model may add to a scan's error."""
+"""Pixels that an estimated model may add to a scan's error."""
 NAMED = (0.9, 1.0)
 """Share of the trials in which a deliberate mistake is named."""
 

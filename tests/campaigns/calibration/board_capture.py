@@ -33,7 +33,7 @@ FRAME_S = 1e-5
 COLUMNS = 800
 """Over the mirror's whole range: about a pixel each."""
 WALL_M, BEHIND_M = 4.0, 0.5
-"""How far away the wall is, and at least behind the boards."""
+"""Distance of the wall, and its least distance behind the boards."""
 SPARE_COLUMNS = 10
 HOT_PER_S = 500.0
 """Dark counts above which a calibration of the pixels calls one defective."""
@@ -41,7 +41,7 @@ BATCH = 256
 
 
 def speed(exposures: int) -> float:
-    """Of the command, per second, with so many frames to a column."""
+    """Speed of the command, per second, with so many frames to a column."""
     return 2 * COMMAND_REACH / (COLUMNS * exposures * FRAME_S)
 
 
@@ -56,7 +56,7 @@ class SweepAsked:
 
     @property
     def speed_per_s(self) -> float:
-        """Of the command, above 0."""
+        """Speed of the command, above 0."""
         return speed(self.exposures)
 
 

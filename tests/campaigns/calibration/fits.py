@@ -81,7 +81,7 @@ def main() -> int:
 
 
 def figures(ratio: np.ndarray, inside: np.ndarray) -> list[Figure]:
-    """What is asked for. ratio, inside (rigs,): actual to predicted error, share of the intervals with the truth."""
+    """Figures beside what is asked for. ratio (rigs,): actual to predicted error; inside: intervals with the truth."""
     none = np.nan
     return [
         Figure("actual to predicted depth error (median of the rigs)", np.median(ratio) if len(ratio) else none, RATIO),

@@ -27,7 +27,7 @@ START, MOST = 3, 9
 """Poses before there is a forecast, and in all."""
 CHOICES = 48
 SPEEDS = (1.0, 1 / 0.3, 0.5)
-"""As `rig calibrate planes` sweeps by turns, in units of the config's."""
+"""Speeds at which `rig calibrate planes` sweeps by turns, in units of the config's."""
 
 
 class Step(NamedTuple):

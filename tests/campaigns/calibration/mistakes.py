@@ -73,7 +73,7 @@ class Session:
         return focal * board.size_m[0] / seen_px[1], focal * board.size_m[0] / seen_px[0]
 
     def named(self, views: Sequence[View], board: Board = BOARD, stated_baseline_m: float | None = None) -> str:
-        """What is named first."""
+        """The reason that the verdict on these views names first."""
         camera = self.stand.rig.model.camera
         size = (camera.width, camera.height)
         try:
@@ -84,7 +84,7 @@ class Session:
         return PASSED if verdict.passed else verdict.codes[0]
 
     def refused(self, shown: Sequence[ShownBoard]) -> str:
-        """Why there are no corners in a view of these boards."""
+        """The reason why there are no corners in a view of these boards."""
         picture = room_picture(self.stand, take_sweeps(self.stand, shown, BOTH_WAYS, self.rng))
         try:
             find_corners(picture, BOARD, self.stand.dark_per_s > HOT_PER_S)
@@ -207,7 +207,7 @@ def mirrored(session: Session, good: list[View]) -> str:
 
 
 def two_boards(session: Session, good: list[View]) -> str:
-    """The same print twice, side by side."""
+    """One print twice, side by side."""
     away = session.distance_m(BOARD, (170, 200))
     sides = [session.pose(cell=cell, distance_m=away, tilt_rad=0.2) for cell in (4, 11)]
     return session.refused([ShownBoard(BOARD, pose) for pose in sides])
@@ -244,13 +244,13 @@ MISTAKES: dict[Callable[[Session, list[View]], str], str] = {
     two_boards: "two-boards",
     another_board: "wrong-board",
 }
-"""What each is called."""
+"""Mistakes, each with the word that the verdict should name it by."""
 OF_ONE_VIEW = (no_board, half_out, mirrored, two_boards, another_board)
 """Those that need no good views."""
 
 
 def trial(seed: int, only: Sequence[str]) -> dict[str, str]:
-    """What every mistake was called with one random rig."""
+    """Names that every mistake got with one random rig."""
     begin = Session(set_up(random_rig(np.random.default_rng(seed))), np.random.default_rng([seed, 0]))
     made = [mistake for mistake in MISTAKES if not only or mistake.__name__ in only]
     good: list[View] = []
@@ -263,7 +263,7 @@ def trial(seed: int, only: Sequence[str]) -> dict[str, str]:
 
 
 def figures(table: Mapping[str, Counter[str]]) -> list[Figure]:
-    """What is asked for. table: how often each mistake that was made was called what."""
+    """Figures beside what is asked for. table: how often each mistake that was made was called what."""
     names = {mistake.__name__: wanted for mistake, wanted in MISTAKES.items()}
     return [
         Figure(f"share of trials in which {name} is '{names[name]}'", codes[names[name]] / codes.total(), NAMED)

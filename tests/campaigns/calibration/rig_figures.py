@@ -41,7 +41,7 @@ class Compared:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Outcome:
-    """What became of a rig. trouble: why there is no model, '' where there is one."""
+    """Calibration of a rig. trouble: why there is no model, '' where there is one."""
 
     seed: int
     seconds: float
@@ -117,12 +117,12 @@ def median_ratio(z: Array) -> float:
 
 
 def added_px(compared: Iterable[Compared], exposures: int) -> Array:
-    """What each model adds to a scan's error, each way."""
+    """Pixels that each model adds to a scan's error, each way."""
     return np.array([c.added_px[exposures, direction] for c in compared for direction in (1, -1)])
 
 
 def figures(compared: Sequence[Compared]) -> list[Figure]:
-    """What is asked for."""
+    """Figures beside what is asked for."""
     z = in_sds(compared)
     inside = float(np.mean(np.abs(z) < SURE)) if len(z) else np.nan
     return [

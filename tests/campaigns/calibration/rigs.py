@@ -53,7 +53,7 @@ from tests.reference.boards.random_rigs import BOARD, random_poses, random_rig
 Array = NDArray[np.float64]
 
 PIXELS = 500
-"""Of a sweep that are looked at for passages."""
+"""Pixels of a sweep that are looked at for passages."""
 SLOW_EVERY, OTHER_SPEED = 4, 3
 OFF_LINE = 8
 """Columns on either side of the line that do not count for the picture."""
@@ -72,7 +72,7 @@ def view_of(name: str, stand: Stand, taken: Sequence[SweepTaken], board: Board) 
 
 
 def room_picture(stand: Stand, taken: Sequence[SweepTaken]) -> NDArray[np.float32]:
-    """What the room's light shows (rows, width), photons per exposure, NaN outside the window: as
+    """Picture in the room's light (rows, width), photons per exposure, NaN outside the window: as
     `calibration.passages.flux_picture` has it but for its care of windows that move."""
     ones, frames = np.zeros(taken[0].volume.counts.shape[1:], np.int64), 0
     for sweep in taken:

@@ -17,7 +17,7 @@ WRONG_COLUMNS = 0.15
 
 
 def sequence(seed: int) -> Ending:
-    """How the maps of one random burst ended; worst: the largest error of its synchronised maps in columns."""
+    """Ends of the maps of one random burst; worst: the largest error of its synchronised maps in columns."""
     rng = np.random.default_rng(seed)
     exposures, maps = int(rng.choice([1, 2, 5, 10, 20, 50])), int(rng.integers(1, 4))
     first = rng.uniform(-0.4, 0.2)

@@ -18,10 +18,10 @@ import time
 from tests.wire.scan_rig import Applications, ScanFailedError, applications, scan_bench
 
 MAPS = 500
-"""Of one scan: a quarter of a minute where the emulated devices keep up."""
+"""Maps of one scan: a quarter of a minute where the emulated devices keep up."""
 PATIENCE_S = 300.0
 TRIPPED = ("guard: ", "the laser guard hangs")
-"""What is said where the guard took the light, or was itself taken for dead."""
+"""Words where the guard took the light, or was itself taken for dead."""
 BURN = "while True: pass"
 WRITE = """
 import os, sys

@@ -26,7 +26,7 @@ LASERS = ("obis", "cobolt")
 
 @functools.cache
 def applications() -> Applications:
-    """Of this process; it ends with it."""
+    """Applications of this process; they end with it."""
     return Applications()
 
 

@@ -24,7 +24,7 @@ from tests.campaigns.outcomes import Ending, Verbs
 
 LIMIT_W = 0.08
 DEADLINE_S = 10.0
-"""Of virtual time, for one verb at the campaign's timing (30 ms for a reply)."""
+"""Virtual time for one verb at the campaign's timing (30 ms for a reply)."""
 LATE_S = 0.05
 STALL_S = 0.06
 GAP_S = 0.1
@@ -32,7 +32,7 @@ TIMES = {"reply_s": 0.03, "quiet_s": 0.01, "drain_s": 0.05}
 
 
 class LaserModel(SerialModel, Protocol):
-    """What the campaign looks at: the laser itself."""
+    """A laser as the campaign looks at it, from outside."""
 
     interlock_open: bool
     fault: int
@@ -88,7 +88,7 @@ class Sequence:
         self._laser: LineLaser | None = None
 
     def run(self) -> Ending:
-        """How it ended."""
+        """Run it; how it ended."""
         with self._server:
             ended = self._verb.ending(self._some_verbs)
         return ended._replace(struck=[fault.value for fault in self._faults.struck])
@@ -168,7 +168,7 @@ class Sequence:
 
 
 def sequence(subject: Subject, seed: int) -> Ending:
-    """How one sequence ended, and what was wrong with that, if anything."""
+    """One sequence, run: how it ended, and what was wrong with that, if anything."""
     return Sequence(subject, seed).run()
 
 
@@ -176,7 +176,7 @@ class Cobolt(CoboltModel):
     """A Cobolt that tells what the campaign asks."""
 
     def told_power_w(self) -> float:
-        """Of its mode."""
+        """The power of its mode."""
         return self.modulation_power_w if self.mode == "modulation" else self.constant_power_w
 
     def is_off(self) -> bool:

@@ -17,7 +17,7 @@ from tests.wire.syncs import Board
 
 TIMING = PrawnDoTiming(reply_s=0.06, hasty_s=0.03, lower_s=0.15, load_s=0.3)
 DEADLINE_S = 5.0
-"""Of virtual time, for one verb at this timing, freeing a board that swallows 180 kB included."""
+"""Virtual time for one verb at this timing, freeing a board that swallows 180 kB included."""
 LATE_S = 0.08
 STALL_S = 0.1
 VERBS = 6
@@ -112,5 +112,5 @@ class Sequence:
 
 
 def sequence(seed: int) -> Ending:
-    """How one sequence ended, and what was wrong with that, if anything."""
+    """One sequence, run: how it ended, and what was wrong with that, if anything."""
     return Sequence(seed).run()

@@ -24,9 +24,9 @@ from tests.wire.usb.faulty_usb import FaultyUsb
 
 POINTS, LINE_POINTS, RATE_HZ = 700, 50, 25_000.0
 DEADLINE_S = 30.0
-"""Of virtual time, for a whole sequence: some ten verbs, each of which may wait for two frames and two seconds."""
+"""Virtual time for a whole sequence: some ten verbs, each of which may wait for two frames and two seconds."""
 HANG_S = 60.0
-"""Of real time."""
+"""Real time."""
 
 
 @dataclass(frozen=True)
@@ -64,7 +64,7 @@ LASERCUBE = Subject(
 
 
 def sequence(subject: Subject, seed: int) -> Ending:
-    """How one sequence ended, and what was wrong with that, if anything."""
+    """One sequence, run: how it ended, and what was wrong with that, if anything."""
     rng = random.Random(seed)
     probability = rng.choice((0.003, 0.01, 0.05, 0.3))
     schedule = FaultSchedule(

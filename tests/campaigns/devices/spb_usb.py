@@ -49,7 +49,7 @@ class FaultyModel(SpbUsbModel):
         return kind
 
     def _damage(self, block: memoryview) -> Iterable[bytes | memoryview]:
-        """What becomes of a block of the stream."""
+        """Pieces that a block of the stream comes in, perhaps damaged."""
         held, self._held = self._held, []
         kind = self._strikes(("flip", "cut", "lost", "twice", "swapped", "zeros", "burst of flips"))
         data = bytearray(block)
@@ -99,7 +99,7 @@ class FaultyModel(SpbUsbModel):
 
 
 def sequence(seed: int) -> Ending:
-    """How one sequence ended, and what was wrong with that, if anything."""
+    """One sequence, run: how it ended, and what was wrong with that, if anything."""
     rng = random.Random(seed)
     chip = rng.choice(("fx3", "ft601"))
     device = FaultyModel(
@@ -134,7 +134,7 @@ def _open_and_run(device: FaultyModel, rng: random.Random, clock: VirtualClock) 
 
 
 def _fill_to_the_end(spad: SpbUsb, ring: BlockRing, between: Callable[[], object]) -> None:
-    """As the application does: two silences in a row are the end."""
+    """Fill as the application does: two silences in a row are the end."""
     silences = 0
     while True:
         between()

@@ -1,4 +1,4 @@
-"""Tests as the only process of a virtual machine: the guest's half of `kernel_usb` and `kernel_serial`.
+"""Tests as the only process of a virtual machine: the guest's half of `usb` and `serial`.
 
     python -m tests.campaigns.kernel.guest PYTEST_ARGUMENT... end     as process 1
 

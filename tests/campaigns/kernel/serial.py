@@ -28,7 +28,7 @@ TESTS = (
     "tests/wire/test_prawndo.py",
 )
 LEFT_OUT = "not simulated and not replay and not takes_nothing"
-"""What is not on a wire; and a device that takes nothing: an adapter takes all in its place."""
+"""Devices that are not on a wire; and a device that takes nothing: an adapter takes all in its place."""
 WITHIN_S = 3600.0
 
 

@@ -29,7 +29,7 @@ WIDTH, HEIGHT = 256, 64
 MOST_FRAMES = 120
 """Blocks of 2 to 250 KB."""
 BLOCKS = 60
-"""Of each start."""
+"""Blocks of each start."""
 STARTS = 2
 SEGMENT_BYTES = 2 << 20
 STRIDE = 1 << 18
@@ -40,7 +40,7 @@ AFTER = 1.1
 
 @dataclass(frozen=True, slots=True)
 class Outcome:
-    """What was left. counted: blocks that the process said were whole; found: those there after the repair."""
+    """Remains of a recording. counted: blocks that the process said were whole; found: those there after the repair."""
 
     folder: Path
     counted: int
@@ -49,7 +49,7 @@ class Outcome:
 
 
 def blocks_of(seed: int, run: int) -> list[FrameBlock]:
-    """What the source makes in one start, known by its seed."""
+    """Blocks that the source makes in one start, known by its seed."""
     random = np.random.default_rng((seed, run))
     pool = random.integers(0, 256, STRIDE + BLOCKS, np.uint8)
     first, made = 0, []
@@ -140,7 +140,7 @@ class Striker:
         return Outcome(folder, counted, found, wrong)
 
     def _whole_s(self) -> float:
-        """How long a recording takes that nobody kills."""
+        """Time of a recording that nobody kills."""
         self._started(0)[0].join()  # the first process of all also imports everything
         process, note, folder = self._started(1)
         self._wait_until(1, note, process)

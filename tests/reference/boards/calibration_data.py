@@ -61,7 +61,7 @@ class TrueRig:
         return seen
 
     def off(self, command: Array, points: Array) -> Array:
-        """How far points lie off the sheet of light at a command."""
+        """Distances of points from the sheet of light at a command."""
         turn = np.polynomial.polynomial.polyval(command, self.angle)[..., None]
         other = np.cross(self.axis, self.across)
         normal = np.cos(self.cone) * (np.cos(turn) * self.across + np.sin(turn) * other) + np.sin(self.cone) * self.axis
@@ -92,14 +92,14 @@ class TrueRig:
         return self.mirror_at(points) + velocity * (lag - self.row_delay * y)
 
     def moved(self, shift: Array, turn: Array) -> TrueRig:
-        """The same camera with its scanner shifted (m) and turned (rad)."""
+        """A rig of the same camera with its scanner shifted (m) and turned (rad)."""
         turned = rotation(turn)
         return replace(self, point=self.point + shift, axis=turned @ self.axis, across=turned @ self.across)
 
 
 @dataclass(frozen=True)
 class Seen:
-    """How well things are seen. factor: of the passages' errors to their stated sd. wave: (amplitude, turns over the
+    """Errors of what is seen. factor: of the passages' errors to their stated sd. wave: (amplitude, turns over the
     sweep) of an exposure that is not locked.
     """
 
@@ -205,7 +205,7 @@ def _shaken(rng: np.random.Generator, command: Array, velocity: float) -> Array:
 def random_views(
     rng: np.random.Generator, rig: TrueRig, poses: int, seen: Seen, velocities: tuple[float, ...] = (35.2, -35.2)
 ) -> list[View]:
-    """As many views."""
+    """Views of so many random poses."""
     shown = [random_pose(rng, rig) for _ in range(poses)]
     return [seen_view(rng, rig, *pose, seen, velocities, f"{i:03d}") for i, pose in enumerate(shown)]
 

@@ -1,4 +1,4 @@
-"""How surely a chessboard is told from one with other numbers of squares, on real pictures and on drawn ones.
+"""Chessboards told from those with other numbers of squares: how often, on real pictures and on drawn ones.
 
     python -m tests.reference.boards.chessboard_extent [--folder ../shared/calibration-images] [--every 1] [--poses 12]
 
@@ -38,7 +38,7 @@ def found_as(picture: NDArray[np.generic], board: Board) -> str:
 
 
 def tried(picture: NDArray[np.generic], squares: tuple[int, int]) -> dict[str, Counter[str]]:
-    """What a picture of a board of so many squares is found as, with the right file and with others."""
+    """Counts of the answers to a picture of a board of so many squares, with the right file and with others."""
     found: dict[str, Counter[str]] = {"right": Counter(), "fewer": Counter(), "more": Counter()}
     for more in ((0, 0), *OTHERS):
         asked = squares[0] + more[0], squares[1] + more[1]

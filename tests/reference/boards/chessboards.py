@@ -40,7 +40,7 @@ def opencv_rms(views: list[View], size: tuple[int, int]) -> tuple[float, float]:
 
 
 def subpixel(views: list[View], folder: Path, half: int) -> list[View]:
-    """The same corners, moved by cv2.cornerSubPix with windows of half width `half`."""
+    """The corners as moved by cv2.cornerSubPix with windows of half width `half`."""
     found = []
     for view in views:
         picture = cv2.imread(str(folder / f"{view.name}.jpg"), cv2.IMREAD_GRAYSCALE)

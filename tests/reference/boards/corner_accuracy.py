@@ -1,4 +1,4 @@
-"""How good corners are in pictures of few photons: ours, cv2.cornerSubPix and OpenCV's ChArUco detector.
+"""Errors of corners in pictures of few photons: ours, cv2.cornerSubPix and OpenCV's ChArUco detector.
 
     python -m tests.reference.boards.corner_accuracy [--poses 20]
 

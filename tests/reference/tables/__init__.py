@@ -1,1 +1,1 @@
-"""What an estimator makes of the yardstick's counts: programs that print a table, and what they share."""
+"""Programs that print a table of what estimators make of the yardstick's counts, and what they share."""

@@ -1,4 +1,4 @@
-"""What an estimator answered where the truth is known, and the figures that are asked of it."""
+"""Answers of an estimator where the truth is known, and the figures that are asked of it."""
 
 from __future__ import annotations
 
@@ -43,7 +43,7 @@ class Answers:
         return cls(error, confidence.ravel(), scored, lit.ravel(), ~lit.ravel(), result.compute_s)
 
     def over(self, wanted: NDArray[np.bool_]) -> Answers:
-        """The same with other stripes scored."""
+        """These answers with other stripes scored."""
         return replace(self, scored=wanted)
 
     @property
@@ -109,7 +109,7 @@ def calibration_error(confidence: NDArray[np.float64], right: NDArray[np.bool_])
 
 
 def averaged_pixels(error_px: NDArray[np.float64], reach: int) -> float:
-    """How many independent answers one answer is worth: sum of the correlation of errors (rows, columns) over lags.
+    """Number of independent answers that one is worth: sum of the correlation of errors (rows, columns) over lags.
 
     A linear filter that averages unbiased answers of unit variance with weights w has variance sum w^2, and its errors'
     covariances add up to (sum w)^2 = 1: the sum of correlations is 1 / sum w^2. NaN are left out; lags up to `reach`.

@@ -15,7 +15,7 @@ BOUND_TIMES = 1.5
 CALIBRATION = 0.03
 HOT_TIMES = 1.05
 THIN_WITHIN = 0.8
-"""Of the stripes on a thin object, the share within 1 px from which it counts as still there (our own figure)."""
+"""Share of the stripes on a thin object within 1 px from which it counts as still there (our own figure)."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -44,13 +44,13 @@ class Finding:
 
 
 Group = dict[str, Measured]
-"""What one estimator gave at one point and number of exposures, by scene."""
+"""Answers of one estimator at one point and number of exposures, by scene."""
 Groups = dict[tuple[str, int], Group]
 
 ANY = 0
 """Any number of exposures."""
 BAD: Mapping[str, Callable[[float], float]] = {"at most": lambda x: x, "at least": lambda x: -x, "within": abs}
-"""How bad a value is, by the sense of its limits."""
+"""Badness of a value, by the sense of its limits."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -122,7 +122,7 @@ def _of_points(estimator: str, groups: Groups) -> Iterator[Finding]:
 
 
 def _compared(estimator: str, groups: Groups) -> Iterator[Finding]:
-    """What a halo and hot pixels change."""
+    """Findings about answers with and without a halo or hot pixels."""
     for (point, k), group in groups.items():
         other = groups.get(({"halo": "halo-less", "hot": "report"}.get(point, ""), k), {})
         shared = [name for name in group if name in other]

@@ -1,4 +1,4 @@
-"""How often the fog meter's error bars hold the truth: runs over scenes, extinctions, hazes, ambient light and K.
+"""Share of the fog meter's error bars that hold the truth: runs over scenes, extinctions, hazes, ambient light and K.
 
     python -m tests.reference.tables.fog_coverage --runs 40
 
@@ -8,7 +8,7 @@ Each run is a small sensor of its own, estimated from its counts alone. Prints a
 from __future__ import annotations
 
 import argparse
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -67,7 +67,7 @@ def veil(point: WorkingPoint, seen: np.ndarray) -> float:
 
 
 def sd_of(name: str) -> str:
-    """What a reading calls a figure's standard deviation: extinction_sd_per_m, visibility_sd_m."""
+    """Name of a figure's standard deviation in a reading: extinction_sd_per_m, visibility_sd_m."""
     quantity, unit = name.split("_", 1)
     return f"{quantity}_sd_{unit}"
 
@@ -86,7 +86,7 @@ def run(scene: Scene, light: Light, exposures: int, sensor: tuple[int, int], see
     }
 
 
-def main(arguments: Sequence[str] | None = None, out: Callable[[str], None] = print) -> int:
+def main(arguments: Sequence[str] | None = None) -> int:
     """Print the table."""
     parser = argparse.ArgumentParser(
         prog="python -m tests.reference.tables.fog_coverage", description=__doc__.splitlines()[0]
@@ -106,10 +106,10 @@ def main(arguments: Sequence[str] | None = None, out: Callable[[str], None] = pr
             else:
                 pulls[name].append(reading.pull)
                 shown.append(f"{name} {reading.truth:.4f}: {reading.value:.4f} +- {reading.sd:.4f}")
-        out("; ".join(shown))
+        print("; ".join(shown), flush=True)
     for name, each in pulls.items():
         size = np.abs(each)
-        out(
+        print(
             f"{name}: {len(each)} of {options.runs} resolved, {np.mean(size <= 1):.0%} within 1 sd, "
             f"{np.mean(size <= SD_OF_95):.0%} in 95 %, mean pull {np.mean(each):+.2f}"
         )

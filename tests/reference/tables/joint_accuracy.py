@@ -1,4 +1,4 @@
-"""What is asked of the accuracy of `joint`, and what it gives: one table, over the prepared scenes.
+"""Accuracy of `joint` beside what is asked of it: one table, over the prepared scenes.
 
     python -m tests.reference.tables.joint_accuracy --markdown table.md
     python -m tests.reference.tables.joint_accuracy --scenes cones --points report,hot --rows 128 --row-step 2
@@ -43,7 +43,7 @@ EXPOSURES: dict[str, tuple[int, ...]] = {
 
 @dataclass(frozen=True, slots=True)
 class Campaign:
-    """How much is measured."""
+    """Extent of what is measured."""
 
     scenes: Sequence[Scene]
     estimators: tuple[str, ...]

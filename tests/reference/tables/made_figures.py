@@ -71,7 +71,7 @@ def _thin(world: WorkingPoint, stripe: Any) -> dict[str, float]:
 
 
 def _second(world: WorkingPoint, stripe: Any) -> dict[str, float]:
-    """How often both surfaces are found where there are two, and how often a second one is where there is none."""
+    """Shares of places with two surfaces where both are found, and of others where a second one is."""
     x = np.stack([stripe.x_px, getattr(stripe, "x2_px", np.full_like(stripe.x_px, np.nan))])
     two = np.asarray(np.isfinite(world.x_second) & np.isfinite(world.x_true))
     one = np.isfinite(world.x_true) & ~two & world.trusted

@@ -1,4 +1,4 @@
-"""What the temporal prior of `joint` gains on scenes that stand still, and whether it harms where something moves.
+"""Gain from the temporal prior of `joint` on scenes that stand still, and its harm where something moves.
 
     python -m tests.reference.tables.moving --scenes cones,art --rows 128 --maps 4 --markdown table.md
 
@@ -23,7 +23,7 @@ from numpy.typing import NDArray
 
 from tests.reference.adapter import reconstructor_of, volume_of
 from tests.reference.geometry import FOCAL_PX
-from tests.reference.scene import TRUSTED_REACH_PX, Scene
+from tests.reference.scene import Scene, surroundings
 from tests.reference.tables.answers import Answers, calibration_error, pooled
 from tests.reference.tables.printed import Table, parser_of, scenes_asked
 from tests.reference.working_point import POINTS, WorkingPoint, at_stripe
@@ -59,10 +59,8 @@ class Disc:
 
 def _near_edges(mask: NDArray[np.bool_]) -> NDArray[np.bool_]:
     """Pixels that have both kinds within reach."""
-    reach = TRUSTED_REACH_PX
-    padded = np.pad(mask, reach, mode="edge")
-    windows = np.lib.stride_tricks.sliding_window_view(padded, (2 * reach + 1, 2 * reach + 1))
-    return np.asarray(windows.any(axis=(2, 3)) & ~windows.all(axis=(2, 3)))
+    around = surroundings(mask)
+    return np.asarray(around.any(axis=(2, 3)) & ~around.all(axis=(2, 3)))
 
 
 @dataclass(frozen=True, slots=True)

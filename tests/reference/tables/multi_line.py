@@ -40,7 +40,7 @@ class Lines:
 
     @property
     def share(self) -> float:
-        """Of a single line's light that each one has."""
+        """Share of a single line's light that each one has."""
         return 1 / self.lines if self.power == "shared" else 1.0
 
     def counts(

@@ -44,7 +44,7 @@ def traced_fog(tau: float) -> NDArray[np.void]:
 
 
 def fog(tau: float) -> dict[str, object]:
-    """The same fog as a scene's medium."""
+    """The tracer's fog as a scene's medium."""
     return {"extinction": f"{tau / DISTANCE_M} /m", "scattering_share": SCATTERING_SHARE, "phase": "isotropic"}
 
 
@@ -82,7 +82,7 @@ def decay(row: Array) -> float:
 
 @dataclass(frozen=True, slots=True)
 class Figures:
-    """What a row shows: its level before the stripe over that of single scattering, behind over before, its decay."""
+    """Figures of a row: its level before the stripe over that of single scattering, behind over before, its decay."""
 
     before: float
     behind: float
@@ -90,13 +90,13 @@ class Figures:
 
 
 def figures(row: Array, tau: float) -> Figures:
-    """Of a row in the fog of optical depth tau."""
+    """Figures of a row in the fog of optical depth tau."""
     haze, before = radiance("fog", medium=fog(tau)), float(np.median(row[BEFORE]))
     return Figures(before / float(np.median(haze[BEFORE])), float(np.median(row[BEHIND])) / before, decay(row))
 
 
 def table(taus: tuple[float, ...] = (0.5, 1.0)) -> str:
-    """What single scattering lacks, in Markdown."""
+    """Table of what single scattering lacks, in Markdown."""
     lines = [
         "| optical depth | row | level before the stripe, single scattering = 1 | level behind it, before = 1 "
         "| decay, extinction = 1 |",
