@@ -18,7 +18,6 @@ import atexit
 import shutil
 import struct
 import tempfile
-import threading
 import time
 from collections.abc import Callable
 from contextlib import suppress
@@ -53,6 +52,8 @@ FORGED = 3
 """One of so many sequences gets false numbers with the right checksums."""
 REPAIRED = 5
 """One of so many sequences is repaired afterwards."""
+ODDS = (0.5, 0.2, 0.2, 0.1)
+"""Of a plain recording, one with frames lost, a compressed one, and one that is both."""
 
 Frames = dict[tuple[int, int], bytes]
 """Record, time and pixels of each frame, by run and number, in order."""
@@ -281,16 +282,11 @@ def salvage(folder: Path) -> str:
 
 def make_sequence(root: Path) -> Callable[[int], Ending]:
     """A sequence for `tests.campaigns.outcomes.run`, working below `root`."""
-    made = [
-        Pristine(root / f"pristine-{i}", lost=bool(i & 1), packed=bool(i & 2))
-        for i in range(4 if _can_compress() else 2)
-    ]
-    names = iter(range(2**62))
-    lock = threading.Lock()
+    made = [Pristine(root / f"pristine-{i}", lost=bool(i & 1), packed=bool(i & 2)) for i in range(len(ODDS))]
 
     def sequence(seed: int) -> Ending:
         rng = np.random.default_rng(seed)
-        pristine = made[int(rng.choice(len(made), p=_ODDS[len(made)]))]
+        pristine = made[int(rng.choice(len(made), p=ODDS))]
         files = dict(pristine.files)
         wounds = int(rng.choice([1, 2, 3], p=[0.8, 0.15, 0.05]))
         forged = seed % FORGED == 0 and not any(name.endswith(".zst") for name in files)
@@ -298,13 +294,8 @@ def make_sequence(root: Path) -> Callable[[int], Ending]:
             kinds = {forge(files, rng) for _ in range(wounds)} | {wound(files, rng) for _ in range(wounds - 1)}
         else:
             kinds = {wound(files, rng) for _ in range(wounds)}
-        with lock:
-            folder = root / f"case-{next(names)}"
-        folder.mkdir()
-        for name, data in files.items():
-            (folder / name).write_bytes(data)
 
-        def act() -> str:
+        def act(folder: Path) -> str:
             if forged:
                 return f"forged: {salvage(folder)}"
             outcome = judge(folder, pristine)
@@ -312,23 +303,18 @@ def make_sequence(root: Path) -> Callable[[int], Ending]:
                 mend(folder, pristine)
             return f"{outcome} ({', '.join(kinds) if len(kinds) == 1 else 'several'})"
 
-        try:
-            return ending(act, time.monotonic, DEADLINE_S)
-        finally:
-            shutil.rmtree(folder)
+        return ending_with(files, root, act, DEADLINE_S)
 
     return sequence
 
 
-_ODDS = {2: [0.6, 0.4], 4: [0.5, 0.2, 0.2, 0.1]}
-
-
-def _can_compress() -> bool:
-    try:
-        import zstandard  # noqa: F401
-    except ImportError:
-        return False
-    return True
+def ending_with(files: dict[str, bytes], root: Path, act: Callable[[Path], str], deadline_s: float) -> Ending:
+    """The ending of what is done with these files, in a folder below root that is gone afterwards."""
+    with tempfile.TemporaryDirectory(dir=root) as name:
+        folder = Path(name)
+        for file, data in files.items():
+            (folder / file).write_bytes(data)
+        return ending(lambda: act(folder), time.monotonic, deadline_s)
 
 
 def scratch_folder() -> Path:

@@ -6,8 +6,6 @@ The wounds are those of `corruptions`, with plan and calibration among the files
 one, or missing, under the verdict 'complete'; anything raised but an error of ours; more than `DEADLINE_S`.
 """
 
-import shutil
-import time
 from collections.abc import Callable
 from pathlib import Path
 
@@ -19,8 +17,8 @@ from rig import api
 from rig.errors import RigError
 from rig.recording.inputs import PLAN_FILE
 from rig.run_folder.summary import RunVerdict
-from tests.campaigns.outcomes import Ending, ending, options, run
-from tests.campaigns.recording.corruptions import scratch_folder, wound
+from tests.campaigns.outcomes import Ending, options, run
+from tests.campaigns.recording.corruptions import ending_with, scratch_folder, wound
 from tests.system.small_rig import config, write_rig
 
 DEADLINE_S = 60.0
@@ -47,12 +45,8 @@ def make_sequence(root: Path) -> Callable[[int], Ending]:
             struck[name] = bytes(data)
         else:
             wound(struck, rng)
-        case = root / "case"
-        case.mkdir()
-        for name, data_ in struck.items():
-            (case / name).write_bytes(data_)
 
-        def act() -> str:
+        def act(case: Path) -> str:
             try:
                 summary = api.reconstruct(case, out=case / "again").summary
             except RigError as error:
@@ -64,10 +58,7 @@ def make_sequence(root: Path) -> Callable[[int], Ending]:
             assert all(np.array_equal(a, b, equal_nan=True) for a, b in zip(found, wanted, strict=True)), "wrong depth"
             return "the same maps"
 
-        try:
-            return ending(act, time.monotonic, DEADLINE_S)
-        finally:
-            shutil.rmtree(case)
+        return ending_with(struck, root, act, DEADLINE_S)
 
     return sequence
 
