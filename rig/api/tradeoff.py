@@ -32,7 +32,7 @@ def tradeoff(
 
     Raises UsageError, one line per problem. An interrupt ends it after the last whole row, with verdict 'aborted'.
     """
-    from rig.config.models import with_lines
+    from rig.config.overrides import with_lines
     from rig.devices.calibration_use import accepted_by, calibration_use
     from rig.devices.open import open_rig
     from rig.estimate.registry import ESTIMATORS, FILTERS

@@ -270,25 +270,3 @@ def line_problems(offsets: Sequence[float], columns: int, command_range: tuple[f
         elif apart < LEAST_FRESH * span:
             problems.append(f"{told}: most of it would be lit twice; narrow it to {apart:g}")
     return problems
-
-
-def with_lines(config: "RigConfig", lines: int, power: LinePower = "shared") -> "RigConfig":
-    """The config of this rig and field with so many evenly spaced lines; the mirror sweeps the share left to it.
-
-    config: of one line. Columns are rounded down to a multiple of `lines`. Raises UsageError where that cannot be.
-    """
-    from rig.config.files import parse_config
-    from rig.errors import UsageError
-
-    if len(config.line_offsets) > 1:
-        raise UsageError(f"{config.name} has {len(config.line_offsets)} lines already; name a config with one")
-    if not 1 <= lines <= MOST_LINES:
-        raise UsageError(f"lines is {lines}; it must be 1 to {MOST_LINES}")
-    first, last = config.scan.command_range
-    pitch, middle = (last - first) / lines, (first + last) / 2
-    offsets = sorted((line - (lines - 1) / 2) * pitch for line in range(lines))
-    content = config.model_dump(mode="json")
-    content["scan"]["columns"] = max(1, config.scan.columns // lines) * lines
-    if lines > 1:
-        content["scan"]["command_range"] = [middle - pitch / 2, middle + pitch / 2]
-    return parse_config({**content, "line_offsets": offsets if lines > 1 else [0.0], "line_power": power})

@@ -21,9 +21,9 @@ from typing import Any, Final, Protocol, runtime_checkable
 from calibration.files.rig_file import CALIBRATION_FILE
 from calibration.model.rig_model import Identity, RigModel
 from drivers.json_text import parse_json
+from drivers.replay.spad import ReplaySpad
 from rig.devices.open import OpenRig
 from rig.errors import UsageError
-from rig.recording.replay import PlaysRecording
 from rig.run_folder.manifest import read_manifest
 
 NEXT: Final = "calibrate again, or add --accept-calibration to use it all the same"
@@ -84,7 +84,7 @@ def identity_of(rig: OpenRig) -> Identity:
 
     A rig that plays a recording has the identity of the rig that was recorded.
     """
-    if isinstance(rig.spad, PlaysRecording):
+    if isinstance(rig.spad, ReplaySpad):
         return recorded_identity(rig.spad.recording.path)
     config, info = rig.config, rig.spad.info
     scanner = config.scanner
@@ -136,7 +136,7 @@ def calibration_use(rig: OpenRig, *, accept: bool = False, here: Identity | None
         return None
     here = here or identity_of(rig)
     found = refusals(rig.model, rig.config.calibration, here, rig.config.calibration_max_age)
-    before = _accepted_before(rig) if isinstance(rig.spad, PlaysRecording) else frozenset[str]()
+    before = _accepted_before(rig) if isinstance(rig.spad, ReplaySpad) else frozenset[str]()
     return _used(rig.model, rig.config.calibration, found, frozenset(r.code for r in found) if accept else before)
 
 
@@ -226,7 +226,7 @@ def _date(text: str) -> datetime | None:
 
 def _accepted_before(rig: OpenRig) -> frozenset[str]:
     """Codes of the reasons that were accepted for a recording's own calibration when it was taken."""
-    assert isinstance(rig.spad, PlaysRecording)
+    assert isinstance(rig.spad, ReplaySpad)
     run = rig.spad.recording.path
     if rig.config.calibration is None or rig.config.calibration.resolve() != (run / CALIBRATION_FILE).resolve():
         return frozenset()

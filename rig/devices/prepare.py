@@ -12,13 +12,14 @@ from numpy.typing import NDArray
 
 from drivers.clock import VirtualClock
 from drivers.interfaces import SpadTiming
+from drivers.replay.spad import ReplaySpad
 from rig.config.models import ScanConfig
 from rig.devices.open import OpenRig
 from rig.errors import PlanError
 from rig.plan.compile import compile_plan, spad_request
 from rig.plan.gate_pulses import sync_program
 from rig.plan.scan_plan import ScanPlan
-from rig.recording.replay import PlaysRecording, replay_plan
+from rig.recording.replay import replay_plan
 
 HOLD_EXPOSURES = 10
 """Exposures per column from which simulated light is held within columns; with fewer, within parts of columns."""
@@ -45,7 +46,7 @@ class PlansEffects(Protocol):
 def prepare(rig: OpenRig) -> tuple[ScanPlan, SpadTiming]:
     """Compile the plan and configure the SPAD for it; nothing moves and no light leaves."""
     scan = rig.config.scan
-    if isinstance(rig.spad, PlaysRecording):  # what was scanned is bound by the plan that it was scanned with
+    if isinstance(rig.spad, ReplaySpad):  # what was scanned is bound by the plan that it was scanned with
         return replay_plan(rig.spad, rig.spad.recording, scan, rig.model)
     most_w = rig.laser.limits.max_power_w
     if scan.power is not None and scan.power > most_w:

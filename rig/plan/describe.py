@@ -77,22 +77,17 @@ def _link(plan: ScanPlan) -> str:
     return f"{text}, windows of {plan.windows.width_px} pixels up to {rounded(plan.windows_hz / 1e3)} kHz"
 
 
+_TIMING = (
+    "columns", "exposures", "frame_rate_hz", "exposure_s", "point_rate_hz", "sweep_s", "frames_per_sweep",
+    "dark_fraction", "map_rate_hz", "command_range", "speed_per_s", "depth_range_m", "columns_per_marker",
+)  # fmt: skip
+_OF_LEG = ("direction", "lag_s", "gate_open_s", "gate_close_s")
+
+
 def plan_content(plan: ScanPlan) -> dict[str, Any]:
     """Describe a plan for the manifest and for programs."""
     return {
-        "columns": plan.columns,
-        "exposures": plan.exposures,
-        "frame_rate_hz": plan.frame_rate_hz,
-        "exposure_s": plan.exposure_s,
-        "point_rate_hz": plan.point_rate_hz,
-        "sweep_s": plan.sweep_s,
-        "frames_per_sweep": plan.frames_per_sweep,
-        "dark_fraction": plan.dark_fraction,
-        "map_rate_hz": plan.map_rate_hz,
-        "command_range": plan.command_range,
-        "speed_per_s": plan.speed_per_s,
-        "depth_range_m": plan.depth_range_m,
-        "columns_per_marker": plan.columns_per_marker,
+        **{name: getattr(plan, name) for name in _TIMING},
         "window_px": plan.window,
         "mode": plan.mode,
         "windowed": plan.windowed,
@@ -102,15 +97,7 @@ def plan_content(plan: ScanPlan) -> dict[str, Any]:
         "full_frames_hz": plan.full_frames_hz,
         "windows_px": None if plan.windows is None else plan.windows.width_px,
         "windows_hz": plan.windows_hz,
-        "legs": [
-            {
-                "direction": leg.direction,
-                "lag_s": leg.lag_s,
-                "gate_open_s": leg.gate_open_s,
-                "gate_close_s": leg.gate_close_s,
-            }
-            for leg in plan.legs
-        ],
+        "legs": [{name: getattr(leg, name) for name in _OF_LEG} for leg in plan.legs],
     }
 
 

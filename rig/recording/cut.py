@@ -4,7 +4,6 @@ Frames keep their run and number, so that maps of a part are bound and named as 
 its maps again comes along: plan, calibration, learned states and, where it was known, the truth.
 """
 
-import json
 import math
 import re
 import shutil
@@ -19,7 +18,7 @@ from rig.progress import tell_stage
 from rig.recording.open import MapSpan, fitted_ratio, manifest_or_none, map_spans, open_recording
 from rig.recording.writer import Recording
 from rig.run_folder.folder import RunFolder
-from rig.run_folder.manifest import MANIFEST, UNFINISHED, require_inputs, require_plain_sweeps
+from rig.run_folder.manifest import MANIFEST, UNFINISHED, manifest_crc32, require_inputs, require_plain_sweeps
 from rig.run_folder.summary import RunVerdict
 
 OF_MAPS: Final = ("learned", "truth")
@@ -177,7 +176,7 @@ def _manifest(
         "recording": recording,
         "gaps": lost,
         "cut": {
-            "of_id": _seal_of(manifest),
+            "of_id": manifest_crc32(manifest),
             "maps": [before + first_map, before + end_map],
             "frames": [[part.run.header.run_id, part.first_frame, part.end_frame] for part in parts],
             "clock_ratios": [_clock_ratio(manifest, part, i == 0) for i, part in enumerate(parts)],
@@ -207,12 +206,6 @@ def _clock_ratio(manifest: dict[str, Any], part: Part, is_first: bool) -> float:
     known = (manifest.get("cut") or {}).get("clock_ratios") or []
     ratio = float(known[part.run.number]) if part.run.number < len(known) else 1.0
     return fitted_ratio(ratio, sweeps[: part.first_map] if is_first else ())
-
-
-def _seal_of(manifest: dict[str, Any]) -> int:
-    from rig.run_folder.manifest import SEAL, sealed_text
-
-    return int(json.loads(sealed_text(json.dumps(manifest)))[SEAL])
 
 
 def _copy_inputs(folder: Path, out: Path, manifest: dict[str, Any], maps: Sequence[int]) -> None:

@@ -19,7 +19,7 @@ from drivers.recorded.contents import INDEX_FILE, index_header, round_up_to_page
 from drivers.recorded.segments import PACKED_SUFFIX, PlainSegment, SegmentReader
 from rig.errors import RecordingError, UsageError
 from rig.recording.check import SoundBlock
-from rig.recording.verify import Examined, Verification, examine, verify
+from rig.recording.verify import Examination, Verification, examine, verify
 from rig.recording.writer import RESERVE_FILE
 from rig.run_folder.folder import is_held, sync_folder
 from rig.run_folder.manifest import MANIFEST, UNFINISHED, device_counters, ended_early, sealed_text
@@ -65,7 +65,7 @@ def repair(folder: Path) -> Repair:
     return Repair(done, verify(folder))
 
 
-def _put_in_order(found: Examined, done: list[str]) -> bool:
+def _put_in_order(found: Examination, done: list[str]) -> bool:
     """Rename segments so that their numbers rise with the frames in them; return whether that was necessary."""
     segments = {segment.number: segment.path for segment in found.segments}
     numbers = list(dict.fromkeys(found.entries["segment"].tolist()))  # entries are in the order of their frames
@@ -81,7 +81,7 @@ def _put_in_order(found: Examined, done: list[str]) -> bool:
     return True
 
 
-def _blocks_in(segment: SegmentReader, found: Examined) -> list[Range]:
+def _blocks_in(segment: SegmentReader, found: Examination) -> list[Range]:
     """Ranges of the sound blocks of a segment, in order."""
     mine = found.entries[found.entries["segment"] == segment.number]
     begin = np.sort(mine, order="offset")
@@ -169,7 +169,7 @@ def _keep(segment: SegmentReader, pieces: list[Range], torn: Path) -> None:
         os.fsync(copy.fileno())
 
 
-def _write_index(folder: Path, found: Examined, done: list[str]) -> None:
+def _write_index(folder: Path, found: Examination, done: list[str]) -> None:
     data = index_header() + np.sort(found.entries, order=["segment", "offset"]).tobytes()
     file = folder / INDEX_FILE
     if file.exists() and file.read_bytes() == data:
@@ -178,7 +178,7 @@ def _write_index(folder: Path, found: Examined, done: list[str]) -> None:
     done.append(f"{INDEX_FILE} written anew, of {len(found.entries)} blocks")
 
 
-def _write_manifest(folder: Path, found: Examined, done: list[str]) -> None:
+def _write_manifest(folder: Path, found: Examination, done: list[str]) -> None:
     manifest = found.manifest
     if manifest is None:
         damaged = folder / MANIFEST
@@ -219,7 +219,7 @@ def _verdict(manifest: dict[str, Any], recording: dict[str, Any], missing: list[
     return RunVerdict.ABORTED if manifest["verdict"] == UNFINISHED else str(manifest["verdict"])
 
 
-def _recording(found: Examined) -> dict[str, Any]:
+def _recording(found: Examination) -> dict[str, Any]:
     """Describe the recording as `Recording.content` does; its starts only where the manifest does not have them."""
     with_blocks = set(found.entries["segment"].tolist())
     content: dict[str, Any] = {
@@ -233,7 +233,7 @@ def _recording(found: Examined) -> dict[str, Any]:
     return content
 
 
-def _start(found: Examined, run: list[SoundBlock]) -> dict[str, int]:
+def _start(found: Examination, run: list[SoundBlock]) -> dict[str, int]:
     """Fields of `rig.recording.writer.Start`: whole sweeps of a run, as its blocks tell, and its first segment."""
     mine = found.entries[found.entries["run_id"] == run[0].run_id]
     return {"sweeps": max(0, run[-1].last_sweep - max(1, run[0].sweep)), "segment": int(mine["segment"].min())}

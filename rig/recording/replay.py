@@ -2,15 +2,15 @@
 
 Frames are bound by the plan that they were taken with (`plan.yaml`), never by one compiled anew, and each start of the
 SPAD is played as one: so a map is made of the very same frames in the very same order, at any clock. `replay_config`
-makes the rig that plays, `Replayed` tells a run what it needs to know of the recording.
+makes the rig that plays, `ReplaySource` tells a run what it needs to know of the recording.
 """
 
 import itertools
 import zipfile
-from collections.abc import Collection, Iterator, Sequence
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import Any, Protocol, runtime_checkable
+from typing import Any
 
 import numpy as np
 
@@ -20,6 +20,7 @@ from calibration.model.rig_model import RigModel
 from drivers.interfaces import SpadArray, SpadTiming, SweepTruth
 from drivers.recorded import RecordedRun, RunRecording
 from drivers.replay.pace import Pace, PaceReport, ReplayClock
+from drivers.replay.spad import ReplaySpad
 from rig.config.files import parse_config
 from rig.config.models import EstimateConfig, RigConfig, ScanConfig
 from rig.count.sweeps import Gap, SweepAccount, SweepStart
@@ -54,30 +55,6 @@ ENDLESS = 1_000_000_000
 """Number of maps that stands for a loop without end."""
 RECORDED = ("scanner", "laser", "sync")
 """Slots whose devices a recording can play as well."""
-
-
-@runtime_checkable
-class PlaysRecording(Protocol):
-    """A SPAD that gives the frames of a recording."""
-
-    @property
-    def recording(self) -> RunRecording:
-        """The recording that is played."""
-        ...
-
-    @property
-    def pace(self) -> Pace:
-        """The clock that says when frames come due."""
-        ...
-
-    @property
-    def loops(self) -> bool:
-        """Whether it begins again after the last start."""
-        ...
-
-    def leave_out(self, runs: Collection[int]) -> None:
-        """Leave these starts out of the play, by their numbers."""
-        ...
 
 
 @dataclass(frozen=True, slots=True)
@@ -183,10 +160,10 @@ def _require_frames_of(plan: ScanPlan, recording: RunRecording) -> None:
             )
 
 
-class Replayed:
+class ReplaySource:
     """Facts about a recording for the run that plays it. maps: how many the run will take."""
 
-    def __init__(self, spad: PlaysRecording, plan: ScanPlan, maps: int | None) -> None:
+    def __init__(self, spad: ReplaySpad, plan: ScanPlan, maps: int | None) -> None:
         self._spad = spad
         self._shapes = (plan.rows, plan.columns), (plan.rows, plan.width)
         self._all = maps is None
@@ -205,9 +182,9 @@ class Replayed:
         self.maps: int = maps or (ENDLESS if spad.loops else there)
 
     @classmethod
-    def of(cls, spad: SpadArray, plan: ScanPlan, maps: int | None) -> "Replayed | None":
+    def of(cls, spad: SpadArray, plan: ScanPlan, maps: int | None) -> "ReplaySource | None":
         """Make it for a SPAD that plays a recording; None for any other. UsageError where there are too few maps."""
-        return cls(spad, plan, maps) if isinstance(spad, PlaysRecording) else None
+        return cls(spad, plan, maps) if isinstance(spad, ReplaySpad) else None
 
     @property
     def report(self) -> PaceReport:
@@ -271,7 +248,7 @@ class Replayed:
 
 def pace_of(spad: SpadArray) -> Pace:
     """The clock of a SPAD that plays a recording, which takes steps."""
-    assert isinstance(spad, PlaysRecording), "opened from a config of `replay_config`"
+    assert isinstance(spad, ReplaySpad), "opened from a config of `replay_config`"
     return spad.pace
 
 

@@ -86,7 +86,7 @@ class Verification:
 
 
 @dataclass(frozen=True, slots=True)
-class Examined:
+class Examination:
     """All that can be known of a recording. runs: the sound blocks of each run, in order of their frames."""
 
     segments: list[SegmentReader]
@@ -126,7 +126,7 @@ def verify(folder: Path) -> Verification:
     )
 
 
-def examine(folder: Path) -> Examined:
+def examine(folder: Path) -> Examination:
     """Find out everything that `verify` and `repair` need to know. UsageError where there is no recording."""
     require_recording(folder)
     try:
@@ -155,7 +155,7 @@ def examine(folder: Path) -> Examined:
         problems += _against_manifest(manifest, segments, contents, runs, joined)
     if manifest is not None:
         problems += inputs_problems(folder, manifest)
-    return Examined(segments, contents, runs, joined, manifest, problems)
+    return Examination(segments, contents, runs, joined, manifest, problems)
 
 
 def _runs(contents: Contents, sound: Sequence[SoundBlock], problems: list[str]) -> list[list[SoundBlock]]:
@@ -231,7 +231,7 @@ def _against_manifest(
     return problems + absurd
 
 
-def _verdict(found: Examined) -> Integrity:
+def _verdict(found: Examination) -> Integrity:
     if found.problems or not found.runs:
         return Integrity.DAMAGED
     manifest = found.manifest

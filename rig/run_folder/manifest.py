@@ -105,7 +105,7 @@ class _Manifest(_Part):
 def sealed_text(text: str) -> str:
     """Add the seal to a manifest in strict JSON."""
     content = json.loads(text)
-    return json.dumps({**content, SEAL: _crc32(content)}, indent=1, ensure_ascii=False)
+    return json.dumps({**content, SEAL: manifest_crc32(content)}, indent=1, ensure_ascii=False)
 
 
 def read_manifest(folder: Path) -> dict[str, Any] | None:
@@ -120,7 +120,7 @@ def read_manifest(folder: Path) -> dict[str, Any] | None:
         content = parse_json(raw)
     except ValueError as error:
         raise DamagedRecordingError(f"{MANIFEST} is no JSON any more: {str(error).splitlines()[0]}; {_NEXT}") from None
-    if not isinstance(content, dict) or content.get(SEAL) != _crc32(content):
+    if not isinstance(content, dict) or content.get(SEAL) != manifest_crc32(content):
         raise DamagedRecordingError(f"{MANIFEST} is not as it was written, its checksum does not fit; {_NEXT}")
     try:
         _Manifest.model_validate(content)
@@ -199,7 +199,8 @@ def require_inputs(folder: Path, manifest: Mapping[str, Any]) -> None:
         raise DamagedRecordingError("\n".join(f"{line}; take it from a copy of the recording" for line in problems))
 
 
-def _crc32(content: Mapping[str, Any]) -> int:
+def manifest_crc32(content: Mapping[str, Any]) -> int:
+    """CRC-32 of a manifest, with or without its seal."""
     bare = {key: value for key, value in content.items() if key != SEAL}
     return zlib.crc32(json.dumps(bare, sort_keys=True, separators=(",", ":")).encode())
 

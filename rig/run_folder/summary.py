@@ -158,19 +158,8 @@ class Summary:
         """Return the summary as plain values; `truth` only where it is known, some only for a scan or a replay."""
         content = asdict(self)
         content["verdict"] = self.verdict.value
-        if self.truth is None:
-            del content["truth"]
-        if self.stages is None:
-            del content["stages"]
-        if self.sync is None:
-            del content["sync"]
-        if self.replay is None:
-            del content["replay"]
-        if not self.verdict_reasons:
-            del content["verdict_reasons"]
-        if not self.accepted_calibration:
-            del content["accepted_calibration"]
-        return content
+        optional = ("truth", "stages", "sync", "replay", "verdict_reasons", "accepted_calibration")
+        return {name: value for name, value in content.items() if value or name not in optional}
 
 
 class _OfMap(NamedTuple):

@@ -14,6 +14,7 @@ from drivers.clock import Clock, VirtualClock
 from drivers.errors import DeviceFault, DeviceTimeout
 from drivers.guard import GuardLimits
 from drivers.interfaces import SpadCounters, SpadTiming
+from drivers.replay.spad import ReplaySpad
 from drivers.transports.endpoints import EMULATED_PREFIX
 from rig.count.sweeps import SweepAssembler, SweepStart
 from rig.count.volume import SweepLayout
@@ -23,7 +24,6 @@ from rig.devices.prepare import lead_s, most_sweeps, require_memory, spare_lead_
 from rig.errors import DevicesError
 from rig.plan.gate_pulses import sync_program
 from rig.plan.scan_plan import ScanPlan
-from rig.recording.replay import PlaysRecording
 from rig.recording.writer import Recording
 from rig.run_folder.summary import PipelineStats
 from rig.scan.counting import AcquiredMap, MakesMaps
@@ -247,7 +247,7 @@ class Acquisition:
     def _stage(self, sweeps: int) -> str:
         if self._pipeline is not None and self._pipeline.estimating:
             return "learning" if self._asked.learns and sweeps == 1 else "estimating"
-        if isinstance(self._rig.spad, PlaysRecording):
+        if isinstance(self._rig.spad, ReplaySpad):
             return "replaying"
         return "rendering" if isinstance(self._rig.clock, VirtualClock) else "scanning"
 

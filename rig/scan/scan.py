@@ -25,7 +25,7 @@ from rig.plan.describe import plan_content
 from rig.plan.scan_plan import ScanPlan
 from rig.progress import tell_stage
 from rig.recording.inputs import to_plain, write_inputs
-from rig.recording.replay import Replayed
+from rig.recording.replay import ReplaySource
 from rig.recording.segment import map_bytes, recording_bytes
 from rig.requests import RunRequest
 from rig.scan.acquisition import SILENCE_S, Acquisition, AcquisitionRequest
@@ -50,7 +50,7 @@ def run_scan(rig: OpenRig, run: Run, request: RunRequest, listeners: Listeners =
     here = identity_of(rig)
     calibration = calibration_use(rig, accept=request.accept_calibration, here=here)
     plan, timing = prepare(rig)
-    replayed = Replayed.of(rig.spad, plan, maps)
+    replayed = ReplaySource.of(rig.spad, plan, maps)
     maps = maps or 1 if replayed is None else replayed.maps
     threads = rig.config.estimate.threads or os.cpu_count() or 1
     recalled = () if replayed is None else replayed.learned(rig.config.estimate, rig.model)
@@ -174,7 +174,7 @@ def _collect(
     plan: ScanPlan,
     run: Run,
     sweeps: list[SweepAccount],
-    replayed: Replayed | None,
+    replayed: ReplaySource | None,
 ) -> None:
     running = acquisition.run()
     with closing(running):

@@ -9,7 +9,7 @@ import yaml
 
 from rig import api
 from rig.config.files import load_config
-from rig.config.models import with_lines
+from rig.config.overrides import with_lines
 from tests.system import small_rig
 from tests.system.conftest import Rig
 

@@ -3,7 +3,8 @@
 import pytest
 
 from rig.config.files import load_config, parse_config
-from rig.config.models import line_problems, with_lines
+from rig.config.models import line_problems
+from rig.config.overrides import with_lines
 from rig.errors import UsageError
 
 SIMULATED = load_config("simulated")
