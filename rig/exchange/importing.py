@@ -6,12 +6,12 @@ frame rate no clock (`frame_period_ticks` 0, one tick a frame). The pixels are t
 
 import os
 import shutil
-from collections.abc import Iterable, Iterator, Sequence
+from collections.abc import Iterable, Iterator
 from dataclasses import dataclass
 from fractions import Fraction
 from itertools import pairwise
 from pathlib import Path
-from typing import Any, Final, Literal, get_args
+from typing import Any, Final, Literal, NamedTuple, get_args
 
 import numpy as np
 from numpy.typing import NDArray
@@ -34,14 +34,20 @@ from rig.scan.run import versions
 ImportKind = Literal["pi-imaging", "swissspad2", "photoncube"]
 IMPORT_KINDS: Final[tuple[ImportKind, ...]] = get_args(ImportKind)
 
-_SUFFIXES: Final = {"pi-imaging": ".bin", "swissspad2": ".bin", "photoncube": ".npy"}
-_FORMS: Final[dict[str, tuple[str, ...]]] = {
-    "pi-imaging": pi_imaging.FORMS,
-    "swissspad2": swissspad2.FORMS,
-    "photoncube": photoncube.FORMS,
+
+class _Kind(NamedTuple):
+    """A kind of foreign files. upright_deg: the turn that makes their frames upright."""
+
+    suffix: str
+    forms: tuple[str, ...]
+    upright_deg: QuarterTurn = 0
+
+
+_KINDS: Final = {
+    "pi-imaging": _Kind(".bin", pi_imaging.FORMS, 90),  # as the vendor's samples and the driver (`rotation`) turn them
+    "swissspad2": _Kind(".bin", swissspad2.FORMS),
+    "photoncube": _Kind(".npy", photoncube.FORMS),
 }
-_UPRIGHT_DEG: Final[dict[str, QuarterTurn]] = {"pi-imaging": 90}
-"""Turns that make frames upright: the vendor's samples turn by 90 degrees, and so does the driver (`rotation`)."""
 _RUN_ID: Final = 1
 _BLOCK_BYTES: Final = 1 << 20
 _MAX_TICK_HZ: Final = 0xFFFFFFFF
@@ -86,7 +92,7 @@ def import_frames(
     except ValueError as error:
         raise UsageError(f"frame rate {error}") from None
     turn = _checked_turn(kind, request)
-    sources = gather(files, _SUFFIXES[kind])
+    sources = gather(files, _KINDS[kind].suffix)
     foreign = _opened(kind, sources, request)
     if turn and (foreign.width % 8 or foreign.height % 8):
         raise UsageError(
@@ -97,9 +103,8 @@ def import_frames(
     if rate is not None and not _MIN_RATE_HZ <= rate <= _MAX_TICK_HZ:
         raise UsageError(f"frame rate {float(rate):g} Hz is outside {_MIN_RATE_HZ} to {_MAX_TICK_HZ} Hz")
     width, height = turned_size(foreign.width, foreign.height, turn)
-    clock = _clock(rate)
     ranges = foreign.ranges or ((0, foreign.n_frames),)
-    gaps = _gaps(ranges)
+    gaps = tuple((first + n, after - 1) for (first, n), (after, _) in pairwise(ranges))
     with RunFolder(out) as folder:
         expected = foreign.n_frames * frame_bytes(width, height)
         scratch = folder.place("")
@@ -107,7 +112,7 @@ def import_frames(
         recording = Recording(scratch, expected_bytes=expected)
         try:
             done, told = 0, counted("reading", "frames", progress)
-            for block in _blocks(_turned(foreign, turn), width, height, ranges, clock):
+            for block in _blocks(_turned(foreign, turn), width, height, ranges, rate):
                 recording.append(block)
                 done += block.n_frames
                 told(done, foreign.n_frames)
@@ -145,10 +150,10 @@ def _checked_turn(kind: str, request: ImportRequest) -> QuarterTurn:
     if kind not in IMPORT_KINDS:
         raise UsageError(f"import kind {kind!r} is unknown; choose one of {', '.join(IMPORT_KINDS)}")
     problems = []
-    if request.form is not None and request.form not in _FORMS[kind]:
-        known = f"choose {' or '.join(_FORMS[kind])}, or leave --form out"
-        problems.append(f"{kind} has no form {request.form!r}; {known}")
-    turn = _UPRIGHT_DEG.get(kind, 0) if request.turn_deg is None else request.turn_deg
+    forms = _KINDS[kind].forms
+    if request.form is not None and request.form not in forms:
+        problems.append(f"{kind} has no form {request.form!r}; choose {' or '.join(forms)}, or leave --form out")
+    turn = _KINDS[kind].upright_deg if request.turn_deg is None else request.turn_deg
     turns = get_args(QuarterTurn)
     if turn not in turns:
         problems.append(f"frames cannot be turned by {turn} degrees; choose one of {', '.join(map(str, turns))}")
@@ -185,27 +190,24 @@ def _turned(foreign: ForeignFrames, turn: QuarterTurn) -> Iterator[NDArray[np.ui
         yield bits
 
 
-@dataclass(frozen=True, slots=True)
-class _Clock:
-    tick_hz: Fraction
-    period_ticks: int
-    """Ticks of the clock from one frame to the next; 0 where it is not known."""
-    ticks_per_frame: int
-
-
-def _clock(rate: Fraction | None) -> _Clock:
-    """The clock with the finest tick that a block's header can say, at most 1000 a frame."""
+def _clock(rate: Fraction | None) -> tuple[Fraction, int]:
+    """The frequency of the finest tick that a block's header can say, and ticks a frame, at most 1000."""
     if rate is None:
-        return _Clock(Fraction(1), 0, 1)
+        return Fraction(1), 1
     rate = rate.limit_denominator(_MAX_TICK_HZ // max(1, -(-rate.numerator // rate.denominator)))
     ticks = next((n for n in (1000, 100, 10) if (rate * n).numerator <= _MAX_TICK_HZ), 1)
-    return _Clock(rate * ticks, ticks, ticks)
+    return rate * ticks, ticks
 
 
 def _blocks(
-    chunks: Iterable[NDArray[np.uint8]], width: int, height: int, ranges: Iterable[tuple[int, int]], clock: _Clock
+    chunks: Iterable[NDArray[np.uint8]],
+    width: int,
+    height: int,
+    ranges: Iterable[tuple[int, int]],
+    rate: Fraction | None,
 ) -> Iterator[FrameBlock]:
     """Make blocks of consecutive frames; the first and the last one are marked as such."""
+    tick_hz, ticks = _clock(rate)
     stride = max(_BLOCK_BYTES, BlockLayout(1, width, height).min_stride)
     most = frames_per_block(stride, width, height)
     left = [[first, n] for first, n in ranges]
@@ -226,20 +228,15 @@ def _blocks(
             if not left:
                 flags |= BlockFlag.LAST
             records = np.zeros(take, FRAME_RECORD)
-            records["ticks"] = np.arange(take) * clock.ticks_per_frame
+            records["ticks"] = np.arange(take) * ticks
             header = BlockHeader(
-                flags, _RUN_ID, seq, first, first * clock.ticks_per_frame, lost_before, clock.tick_hz,
-                clock.period_ticks, clock.ticks_per_frame, 0, 1, width, height, width, height,
+                flags, _RUN_ID, seq, first, first * ticks, lost_before, tick_hz,
+                0 if rate is None else ticks, ticks, 0, 1, width, height, width, height,
             )  # fmt: skip
             yield FrameBlock(header, records, bits[at : at + take])
             at += take
             expected = first + take
             seq += 1
-
-
-def _gaps(ranges: Sequence[tuple[int, int]]) -> tuple[tuple[int, int], ...]:
-    """[first, last] of the numbers between `ranges`."""
-    return tuple((first + n, after - 1) for (first, n), (after, _) in pairwise(ranges))
 
 
 def _require_space(folder: Path, size: int) -> None:

@@ -21,7 +21,7 @@ from drivers.recorded.segments import SegmentReader
 from drivers.spb1 import HEADER_BYTES, TRAILER_BYTES, BlockLayout, Placed
 from drivers.spb1.layout import TRAILER
 from rig.progress import tell_stage
-from rig.run_folder.manifest import device_counters, ended_early
+from rig.run_folder.manifest import RunGap, device_counters, ended_early
 
 CHECKING: Final = "checking every block"
 """Name of the stage."""
@@ -79,10 +79,6 @@ def check_segments(segments: Sequence[SegmentReader]) -> tuple[list[SoundBlock],
                 found.append(each)
                 tell_stage(CHECKING, done, len(segments), "segments")
     return [block for blocks, _ in found for block in blocks], [line for _, lines in found for line in lines]
-
-
-RunGap = tuple[int, int, int]
-"""Number of the run, and first and last frame that are missing."""
 
 
 def merged_gaps(gaps: Iterable[RunGap]) -> list[RunGap]:

@@ -28,6 +28,7 @@ from calibration.model.rig_model import RigModel
 from calibration.model.scanner import PlaneTable
 from drivers.recorded import RecordedRun, RunRecording
 from rig.config.models import CubePlan
+from rig.count.sweeps import Gap
 from rig.count.volume import Counter, FrameTally
 from rig.errors import UsageError
 from rig.recording.open import open_recording
@@ -39,8 +40,6 @@ RATE_TOLERANCE: Final = 1e-3
 
 Piece = tuple[int, NDArray[np.uint8]]
 """Number of the first frame, and uint8 (n, height, ceil(width/8) or more) of this frame and those that follow it."""
-Gap = tuple[int, int]
-"""First and last number of frames that are missing."""
 
 
 class Frames(Protocol):

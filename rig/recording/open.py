@@ -23,13 +23,12 @@ from drivers.recorded import RecordedRun, RunRecording
 from drivers.recorded.segments import PACKED_SUFFIX, segment_files
 from rig.config.models import EstimateConfig
 from rig.count.bind import MAX_RESIDUAL_COLUMNS
-from rig.count.sweeps import SweepStart
+from rig.count.sweeps import Gap, SweepStart
 from rig.errors import DamagedRecordingError, UsageError
 from rig.estimate.registry import LEARNING
 from rig.estimate.row.model import RowModel
 from rig.plan.scan_plan import MAX_CLOCK_ERROR
-from rig.recording.check import RunGap
-from rig.run_folder.manifest import MANIFEST, ended_before_last_map, is_cut_short, known_missing, read_manifest
+from rig.run_folder.manifest import MANIFEST, RunGap, ended_before_last_map, is_cut_short, known_missing, read_manifest
 
 SEGMENTS: Final = "frames-*.spb"
 """Pattern of the files that the frames of a recording lie in."""
@@ -142,7 +141,7 @@ def _sweep_begins(recording: RunRecording, run: RecordedRun) -> Iterator[tuple[i
         if block is None or block.n_frames == 0:
             continue
         counts = _markers_seen(block)
-        before = counts[0] if i == 0 and not _marked_first(block) else seen
+        before = counts[0] if i == 0 and not _begins_sweep(block) else seen
         for at in np.flatnonzero(np.diff(counts, prepend=before) > 0):
             yield int(counts[at]), block.header.first_frame + int(at)
         seen = int(counts[-1])
@@ -154,7 +153,7 @@ def _markers_seen(block: FrameBlock) -> np.ndarray[Any, np.dtype[np.int64]]:
     return sweep + ((block.records["sweep"].astype(np.int64) - sweep) & 0xFFFF)
 
 
-def _marked_first(block: FrameBlock) -> bool:
+def _begins_sweep(block: FrameBlock) -> bool:
     """Whether the first frame of a block has a scan marker of its own."""
     return bool(int(block.records["marks"][0]) & Mark.SCAN)
 
@@ -166,6 +165,7 @@ class RunInfo:
     gaps: number of missing pieces between its frames and, as a repair found, at its ends. lost: frames in these.
     width, height: pixels of a frame; sensor_width, sensor_height: of the sensor.
     first_map, end_map: its maps, from the first to before the end; None where it has none.
+    duration_s: from the first frame to the end of the last one; without a frame period, to the last block's start.
     """
 
     run_id: int
@@ -249,11 +249,12 @@ def _is_there(span: MapSpan, run: RecordedRun, manifest: dict[str, Any]) -> bool
     return begin >= run.first_frame and span.end_frame < run.end_frame
 
 
-def _run_info(run: RecordedRun, maps: list[int], known: list[tuple[int, int]]) -> RunInfo:
-    header = run.header
+def _run_info(run: RecordedRun, maps: list[int], known: list[Gap]) -> RunInfo:
+    header, entries = run.header, run.entries
     ends = {gap for gap in known if gap[1] < run.first_frame or gap[0] >= run.end_frame}
     gaps = [*run.gaps(), *ends]
     period = header.frame_period_ticks
+    last_tick = int(entries["t0_ticks"][-1]) + int(entries["n_frames"][-1]) * period
     return RunInfo(
         run_id=header.run_id,
         first_frame=run.first_frame,
@@ -266,17 +267,10 @@ def _run_info(run: RecordedRun, maps: list[int], known: list[tuple[int, int]]) -
         sensor_width=header.sensor_width,
         sensor_height=header.sensor_height,
         frame_rate_hz=float(header.tick_hz / period) if period else None,
-        duration_s=_duration_s(run),
+        duration_s=float((last_tick - int(entries["t0_ticks"][0])) / header.tick_hz),
         first_map=maps[0] if maps else None,
         end_map=maps[-1] + 1 if maps else None,
     )
-
-
-def _duration_s(run: RecordedRun) -> float:
-    """Seconds from the first frame to the end of the last one; without a frame period, to the last block's start."""
-    entries, header = run.entries, run.header
-    last = int(entries["n_frames"][-1]) * header.frame_period_ticks
-    return float((int(entries["t0_ticks"][-1]) - int(entries["t0_ticks"][0]) + last) / header.tick_hz)
 
 
 def end_block(recording: RunRecording, run: RecordedRun, *, last: bool) -> FrameBlock | None:
@@ -360,5 +354,4 @@ def _first_sweep(recording: RunRecording, run: RecordedRun) -> int:
         raise DamagedRecordingError(
             f"{recording.path}: no block of start {run.number} is sound; take it from the whole"
         )
-    begins = bool(int(block.records["marks"][0]) & Mark.SCAN)
-    return block.header.sweep - begins
+    return block.header.sweep - _begins_sweep(block)

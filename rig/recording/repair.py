@@ -21,7 +21,7 @@ from rig.errors import RecordingError, UsageError
 from rig.recording.check import SoundBlock
 from rig.recording.verify import Examination, Verification, examine, verify
 from rig.recording.writer import RESERVE_FILE
-from rig.run_folder.folder import is_held, sync_folder
+from rig.run_folder.folder import is_held, replace_file, sync_folder
 from rig.run_folder.manifest import MANIFEST, UNFINISHED, device_counters, ended_early, sealed_text
 from rig.run_folder.summary import RunVerdict
 
@@ -174,7 +174,7 @@ def _write_index(folder: Path, found: Examination, done: list[str]) -> None:
     file = folder / INDEX_FILE
     if file.exists() and file.read_bytes() == data:
         return
-    _replace(file, data)
+    replace_file(file, data)
     done.append(f"{INDEX_FILE} written anew, of {len(found.entries)} blocks")
 
 
@@ -209,7 +209,7 @@ def _write_manifest(folder: Path, found: Examination, done: list[str]) -> None:
     }
     if "counters" in manifest:  # they are of what was recorded, not of what is left of it
         content["counters_when_recorded"] = manifest["counters"]
-    _replace(folder / MANIFEST, (sealed_text(json.dumps(content)) + "\n").encode())
+    replace_file(folder / MANIFEST, (sealed_text(json.dumps(content)) + "\n").encode())
 
 
 def _verdict(manifest: dict[str, Any], recording: dict[str, Any], missing: list[Any]) -> str:
@@ -237,13 +237,3 @@ def _start(found: Examination, run: list[SoundBlock]) -> dict[str, int]:
     """Fields of `rig.recording.writer.Start`: whole sweeps of a run, as its blocks tell, and its first segment."""
     mine = found.entries[found.entries["run_id"] == run[0].run_id]
     return {"sweeps": max(0, run[-1].last_sweep - max(1, run[0].sweep)), "segment": int(mine["segment"].min())}
-
-
-def _replace(file: Path, data: bytes) -> None:
-    """Write a file in one step: it is there as a whole, or as it was."""
-    scratch = file.with_name(f"{file.name}.part")
-    with scratch.open("wb") as stream:
-        stream.write(data)
-        stream.flush()
-        os.fsync(stream.fileno())
-    scratch.replace(file)

@@ -28,7 +28,7 @@ from rig.errors import DamagedRecordingError, UsageError
 from rig.estimate.registry import Learned
 from rig.plan.compile import spad_request
 from rig.plan.scan_plan import ScanPlan
-from rig.recording.check import RunGap, merged_gaps
+from rig.recording.check import merged_gaps
 from rig.recording.inputs import PLAN_FILE, read_plan
 from rig.recording.open import (
     end_block,
@@ -41,6 +41,7 @@ from rig.recording.open import (
 )
 from rig.run_folder.manifest import (
     MANIFEST,
+    RunGap,
     ended_before_last_map,
     is_cut_short,
     read_manifest,

@@ -22,7 +22,6 @@ from rig.progress import tell_stage
 from rig.recording.check import (
     CHECKING,
     Continuity,
-    RunGap,
     SoundBlock,
     check_segments,
     continuity,
@@ -33,6 +32,7 @@ from rig.recording.open import require_recording
 from rig.run_folder.manifest import (
     MANIFEST,
     UNFINISHED,
+    RunGap,
     device_counters,
     ended_early,
     inputs_problems,

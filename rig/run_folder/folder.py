@@ -7,7 +7,7 @@
 Everything is written beside the folder under a hidden name and moved in one step at the end; the folder of a recording
 is there from the start and grows in place. `RunFolder` does this, and `SavePolicy` says which maps are written.
 
-The rest is for recordings too: `sync_file` and `sync_folder` make files survive a loss of power, and `hold` and
+The rest is for recordings too: what `replace_file` and `sync_folder` wrote survives a loss of power, and `hold` and
 `is_held` tell whether somebody is still recording into a folder.
 """
 
@@ -110,12 +110,9 @@ class RunFolder:
         """Write `name` (manifest.json, summary.json) as strict JSON; a reader sees the old file or the new one."""
         text = json_text(content)
         text = sealed_text(text) if name == MANIFEST else text
-        self._write({f"{name}.part": (text + "\n").encode()})
         file = self.place(name)
         try:
-            if self._in_place:
-                sync_file(file.with_name(f"{name}.part"))
-            file.with_name(f"{name}.part").replace(file)
+            replace_file(file, (text + "\n").encode())
             if self._in_place:
                 sync_folder(file.parent)
         except OSError as error:
@@ -318,13 +315,17 @@ def is_held(file: Path) -> bool:
     return False
 
 
-def sync_file(path: Path) -> None:
-    """Make sure that what was written to a file survives a loss of power. Raises OSError."""
-    fd = os.open(path, os.O_RDWR)
+def replace_file(file: Path, data: bytes) -> None:
+    """Write a file in one step: whatever ends the program, it is there as a whole, or as it was. Raises OSError."""
+    scratch = file.with_name(f"{file.name}.part")
     try:
-        os.fsync(fd)
+        with scratch.open("wb") as stream:
+            stream.write(data)
+            stream.flush()
+            os.fsync(stream.fileno())
+        scratch.replace(file)
     finally:
-        os.close(fd)
+        scratch.unlink(missing_ok=True)
 
 
 def sync_folder(path: Path) -> None:

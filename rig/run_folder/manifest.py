@@ -22,14 +22,13 @@ UNFINISHED: Final = "recording"
 MOST_RUN_FRAMES: Final = 1 << 48
 """Most frames that a run can have: 80 years at 100 kHz."""
 _PIECE_BYTES: Final = 1 << 20
-
-
 _NEXT: Final = "'rig repair' writes a new one"
 
 Count = Annotated[int, Field(ge=0, lt=MOST_RUN_FRAMES)]
 Section = dict[str, Any] | None
 Frames = Annotated[list[int], Field(min_length=3, max_length=3)]
-"""Number of the run, first and last frame."""
+RunGap = tuple[int, int, int]
+"""Number of the run, and first and last frame that are missing."""
 
 
 class _Part(BaseModel):
@@ -154,8 +153,8 @@ def ended_before_last_map(manifest: Mapping[str, Any]) -> bool:
     return len(manifest.get("sweeps") or []) < sum(int(start["sweeps"]) for start in starts)
 
 
-def known_missing(manifest: Mapping[str, Any] | None) -> list[tuple[int, int, int]] | None:
-    """Frames that a repair found missing, (number of the run, first, last frame); None where there was no repair."""
+def known_missing(manifest: Mapping[str, Any] | None) -> list[RunGap] | None:
+    """Frames that a repair found missing; None where there was no repair."""
     if manifest is None or "repaired" not in manifest:
         return None
     return [(int(run), int(first), int(last)) for run, first, last in manifest.get("missing") or []]

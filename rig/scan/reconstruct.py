@@ -4,13 +4,14 @@ import os
 import time
 
 from rig.config.models import EstimateConfig
+from rig.count.sweeps import Gap
 from rig.count.volume import SweepLayout
 from rig.depth.reconstruct import Reconstructor
 from rig.depth.warm_up import warm_up
 from rig.devices.calibration_use import CalibrationUse, accepted_by
 from rig.estimate.registry import LEARNING
 from rig.progress import Progress, counted, tell_stage
-from rig.recording.cube import Cube, Gap, column_commands, count_map
+from rig.recording.cube import Cube, column_commands, count_map
 from rig.run_folder.summary import MapTally, RunFrames, RunVerdict
 from rig.scan.run import OutFolder, Run, RunResult
 
