@@ -54,19 +54,14 @@ class FrameLog:
 
     def columns(self) -> dict[str, NDArray[Any]]:
         """Arrays (frames,): number, run, ticks and the fields of the records."""
-        header = self.header
         records = np.concatenate(self._records)
-        runs = np.repeat(np.array(self._runs, np.uint16), [len(part) for part in self._records])
+        ticks = np.concatenate(self._ticks)
         return {
             "number": np.concatenate(self._numbers),
-            "run": runs,
-            "ticks": np.concatenate(self._ticks),
-            "marks": records["marks"],
-            "x0": records["x0"],
-            "y0": records["y0"],
-            "line": records["line"],
-            "sweep": records["sweep"],
-            "time_s": (np.concatenate(self._ticks) / float(header.tick_hz)),
+            "run": np.repeat(np.array(self._runs, np.uint16), [len(part) for part in self._records]),
+            "ticks": ticks,
+            **{name: records[name] for name in ("marks", "x0", "y0", "line", "sweep")},
+            "time_s": ticks / float(self.header.tick_hz),
         }
 
     def ranges(self) -> Ranges:

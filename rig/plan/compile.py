@@ -170,12 +170,7 @@ def _plan(
         window=window,
         rows=info.height,
         width=info.width,
-        mode="stream",
-        burst_frames=None,
-        readout_bytes_per_s=None,
         link_bytes_per_s=info.stream.bytes_per_s if info.stream is not None else None,
-        windows=None,
-        windowed=False,
         blanking=blanking,
         lines=lines,
     )

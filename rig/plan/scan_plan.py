@@ -135,12 +135,12 @@ class ScanPlan:
     window: int
     rows: int
     width: int
-    mode: SpadMode
-    burst_frames: int | None
-    readout_bytes_per_s: float | None
-    link_bytes_per_s: float | None
-    windows: WindowTable | None
-    windowed: bool
+    mode: SpadMode = "stream"
+    burst_frames: int | None = None
+    readout_bytes_per_s: float | None = None
+    link_bytes_per_s: float | None = None
+    windows: WindowTable | None = None
+    windowed: bool = False
     blanking: Blanking | None = None
     lines: LineGrid | None = field(default=None, metadata={"since": "several lines"})
 

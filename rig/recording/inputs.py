@@ -38,17 +38,12 @@ MOST_PIXELS: Final = 0xFFFF
 
 def write_inputs(folder: Path, plan: ScanPlan, model: RigModel | None) -> None:
     """Write the compiled plan, every number of it, and the calibration, where there is one. Raises OSError."""
-    write_plan(folder / PLAN_FILE, plan)
-    if model is not None:
-        save_rig_model(model, folder / CALIBRATION_FILE)
-
-
-def write_plan(file: Path, plan: ScanPlan) -> None:
-    """Write a compiled plan, every number of it. Raises OSError."""
     content = {"format": PLAN_FORMAT, "version": PLAN_VERSION, "plan": to_plain(plan)}
     dumper = getattr(yaml, "CSafeDumper", yaml.SafeDumper)
     text = yaml.dump(content, Dumper=dumper, sort_keys=False, default_flow_style=None, width=120)
-    file.write_text(text, encoding="utf-8")
+    (folder / PLAN_FILE).write_text(text, encoding="utf-8")
+    if model is not None:
+        save_rig_model(model, folder / CALIBRATION_FILE)
 
 
 def read_plan(folder: Path, name: str = PLAN_FILE) -> ScanPlan:

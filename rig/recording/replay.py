@@ -19,7 +19,7 @@ from calibration.files.rig_file import CALIBRATION_FILE
 from calibration.model.rig_model import RigModel
 from drivers.interfaces import SpadArray, SpadTiming, SweepTruth
 from drivers.recorded import RecordedRun, RunRecording
-from drivers.replay.pace import Pace, PaceReport, ReplayClock
+from drivers.replay.pace import PaceReport, ReplayClock
 from drivers.replay.spad import ReplaySpad
 from rig.config.files import parse_config
 from rig.config.models import EstimateConfig, RigConfig, ScanConfig
@@ -245,12 +245,6 @@ class ReplaySource:
                     lost.append((first, min(begin, last + 1) - 1))
                 first = max(first, end)
         return lost
-
-
-def pace_of(spad: SpadArray) -> Pace:
-    """The clock of a SPAD that plays a recording, which takes steps."""
-    assert isinstance(spad, ReplaySpad), "opened from a config of `replay_config`"
-    return spad.pace
 
 
 @dataclass(frozen=True, slots=True)

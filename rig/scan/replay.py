@@ -8,11 +8,12 @@ from pathlib import Path
 
 from drivers.errors import DeviceError
 from drivers.replay.pace import Pace
+from drivers.replay.spad import ReplaySpad
 from drivers.transports.tap import CONTROL_FILE, TapFile
 from rig.config.models import RigConfig
 from rig.devices.open import open_rig
 from rig.errors import DivergedError, RigError
-from rig.recording.replay import RECORDED, pace_of
+from rig.recording.replay import RECORDED
 from rig.requests import RunRequest
 from rig.scan.control_check import SWAP_TOLERANCE_S, ControlCheck, check_control
 from rig.scan.monitor import Listeners
@@ -41,7 +42,8 @@ def play(
             tap = TapFile.begin(Path(folder) / CONTROL_FILE)
         try:
             with open_rig(config, tap=tap) as rig:
-                pace = pace_of(rig.spad)
+                assert isinstance(rig.spad, ReplaySpad), "as `replay_config` says"
+                pace = rig.spad.pace
                 if steps is not None:
                     steps(pace)
                 result = run_scan(rig, run, request, listeners)
