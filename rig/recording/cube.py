@@ -18,7 +18,7 @@ from collections.abc import Iterator
 from dataclasses import dataclass
 from itertools import permutations
 from pathlib import Path
-from typing import Any, BinaryIO, Final, Protocol
+from typing import Any, BinaryIO, Final
 
 import numpy as np
 from numpy.typing import NDArray
@@ -40,14 +40,6 @@ RATE_TOLERANCE: Final = 1e-3
 
 Piece = tuple[int, NDArray[np.uint8]]
 """Number of the first frame, and uint8 (n, height, ceil(width/8) or more) of this frame and those that follow it."""
-
-
-class Frames(Protocol):
-    """Source of a cube's frames."""
-
-    def between(self, first: int, end: int, step: int) -> Iterator[Piece]:
-        """Give the frames that exist from number `first` to before `end`, at most `step` at a time."""
-        ...
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -81,7 +73,7 @@ class Cube:
     """Checked frames of whole maps. first_frame: number of the first map's first frame. maps: whole sweeps."""
 
     path: Path
-    frames: Frames
+    frames: ArrayFrames | RecordedFrames
     plan: CubePlan
     width: int
     height: int
@@ -101,7 +93,7 @@ def open_cube(path: str | os.PathLike[str], plan: CubePlan, model: RigModel) -> 
     """
     file = Path(path)
     camera = model.camera
-    frames: Frames
+    frames: ArrayFrames | RecordedFrames
     if file.is_dir():
         recording = open_recording(file)
         run = recording.runs[0]

@@ -14,7 +14,7 @@ import os
 import shutil
 import threading
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import Any, Final
 
@@ -216,8 +216,7 @@ class Space:
 
     def content(self) -> dict[str, Any]:
         """Return it as plain values."""
-        sizes = {name: getattr(self, name) for name in ("recording_bytes", "map_bytes", "free_bytes")}
-        return {"folder": str(self.folder), **sizes}
+        return {**asdict(self), "folder": str(self.folder)}
 
     def __str__(self) -> str:
         """Say that there is enough room, for people."""
