@@ -1,11 +1,13 @@
 """Runs the command line inside the test's own process."""
 
+import shutil
 from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path
 
 import pytest
 
+from rig import api
 from rig.cli.main import main
 from tests.system.small_rig import write_rig
 
@@ -44,6 +46,20 @@ def rig(capsys: pytest.CaptureFixture[str], tmp_path: Path, monkeypatch: pytest.
         return Ran(ended.value.code, printed.out, printed.err)
 
     return run
+
+
+@pytest.fixture(scope="session")
+def scanned(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """Folder of two maps of the small rig with their recording, which stays as it is."""
+    folder = tmp_path_factory.mktemp("scanned")
+    api.scan(write_rig(folder / "rig"), maps=2, out=folder / "run", record=True)
+    return folder / "run"
+
+
+@pytest.fixture
+def run(scanned: Path, tmp_path: Path) -> Path:
+    """A copy of it of the test's own."""
+    return Path(shutil.copytree(scanned, tmp_path / "run"))
 
 
 @pytest.fixture

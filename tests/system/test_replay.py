@@ -57,6 +57,16 @@ def arrays(run: Path) -> dict[str, bytes]:
     return found
 
 
+def with_manifest(run: Path, copy: Path, change: Callable[[dict[str, Any]], None]) -> Path:
+    """A copy of a run whose manifest was changed and sealed again."""
+    shutil.copytree(run, copy)
+    manifest = read_manifest(copy)
+    assert manifest is not None
+    change(manifest)
+    (copy / "manifest.json").write_text(sealed_text(json.dumps(manifest)))
+    return copy
+
+
 @pytest.mark.parametrize(
     "options",
     [
@@ -107,16 +117,16 @@ def test_another_estimator_can_be_tried_on_the_same_frames(learned: Path) -> Non
 
 @pytest.mark.parametrize("why", ["killed", "disk full"])
 def test_a_recording_that_was_cut_short_gives_its_whole_maps(learned: Path, tmp_path: Path, why: str) -> None:
-    run = tmp_path / "torn"
-    shutil.copytree(learned, run)
-    manifest = read_manifest(run)
-    assert manifest is not None
-    if why == "killed":
-        bare = {key: value for key, value in manifest.items() if key not in ("sweeps", "gaps", "counters")}
-        manifest = {**bare, "verdict": "recording"}
-    else:  # whose maps went on to be made of what was in the ring
-        manifest = {**manifest, "verdict": "aborted", "recording": {**manifest["recording"], "failed": "no space"}}
-    (run / "manifest.json").write_text(sealed_text(json.dumps(manifest)))
+    def change(manifest: dict[str, Any]) -> None:
+        if why == "killed":
+            manifest["verdict"] = "recording"
+            for key in ("sweeps", "gaps", "counters"):
+                del manifest[key]
+        else:  # whose maps went on to be made of what was in the ring
+            manifest["verdict"] = "aborted"
+            manifest["recording"]["failed"] = "no space"
+
+    run = with_manifest(learned, tmp_path / "torn", change)
     (segment,) = run.glob("frames-*.spb")
     in_the_third = next(entry for entry in RunRecording(run).runs[0].entries if entry["sweep"] == 3)
     os.truncate(segment, int(in_the_third["offset"]) + 5000)
@@ -124,16 +134,6 @@ def test_a_recording_that_was_cut_short_gives_its_whole_maps(learned: Path, tmp_
     result = api.replay(run, clock="max", out=tmp_path / "again")
     assert result.summary.maps == 2
     assert arrays(tmp_path / "again").items() < arrays(learned).items()
-
-
-def with_manifest(run: Path, copy: Path, change: Callable[[dict[str, Any]], None]) -> Path:
-    """A copy of a run whose manifest was changed and sealed again."""
-    shutil.copytree(run, copy)
-    manifest = read_manifest(copy)
-    assert manifest is not None
-    change(manifest)
-    (copy / "manifest.json").write_text(sealed_text(json.dumps(manifest)))
-    return copy
 
 
 def test_recordings_of_versions_that_knew_passes_are_played_or_refused_in_a_sentence(

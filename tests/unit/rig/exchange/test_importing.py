@@ -18,6 +18,7 @@ from drivers.ring import BlockRing
 from rig.api import import_frames
 from rig.errors import UsageError
 from rig.exchange import swissspad2
+from rig.exchange.importing import ImportResult
 from tests.unit.rig.exchange.foreign_files import (
     Frames,
     pi_packed,
@@ -43,6 +44,14 @@ def blocks_of(folder: Path) -> list[FrameBlock]:
 
 def frames_of(folder: Path) -> Frames:
     return np.concatenate([np.unpackbits(b.bits, axis=2, count=b.header.width) for b in blocks_of(folder)]).astype(bool)
+
+
+def import_cube(folder: Path, array: np.ndarray, beside: object = None, **options: object) -> ImportResult:
+    """Import a cube as numpy writes it; beside: what its sidecar says."""
+    np.save(folder / "frames.npy", array)
+    if beside is not None:
+        (folder / "frames.json").write_text(json.dumps(beside))
+    return import_frames("photoncube", [folder / "frames.npy"], folder / "run", **options)  # type: ignore[arg-type]
 
 
 def test_pi_imaging_frames_are_turned_upright(tmp_path: Path) -> None:
@@ -81,17 +90,11 @@ def test_a_file_that_could_be_either_is_asked_about(tmp_path: Path) -> None:
     assert np.array_equal(frames_of(tmp_path / "run"), dark)
 
 
-def test_swissspad2_half_array(tmp_path: Path) -> None:
-    frames = some_frames(5, 256, 512)
-    (tmp_path / "RAW00000.bin").write_bytes(swissspad2_half(frames))
-    import_frames("swissspad2", [tmp_path], tmp_path / "run")
-    assert np.array_equal(frames_of(tmp_path / "run"), frames)
-
-
-def test_swissspad2_full_array(tmp_path: Path) -> None:
-    frames = some_frames(4, 512, 512)
-    (tmp_path / "RAW00000.bin").write_bytes(swissspad2_full(frames))
-    import_frames("swissspad2", [tmp_path], tmp_path / "run", form="full")
+@pytest.mark.parametrize(("form", "rows", "raw"), [(None, 256, swissspad2_half), ("full", 512, swissspad2_full)])
+def test_swissspad2_pixels_are_where_the_camera_saw_them(tmp_path: Path, form, rows, raw) -> None:
+    frames = some_frames(5, rows, 512)
+    (tmp_path / "RAW00000.bin").write_bytes(raw(frames))
+    import_frames("swissspad2", [tmp_path], tmp_path / "run", form=form)
     assert np.array_equal(frames_of(tmp_path / "run"), frames)
 
 
@@ -125,16 +128,14 @@ def test_full_frames_read_as_halves_are_noticed() -> None:
 
 def test_a_photon_cube_of_any_width_keeps_its_clock_and_numbers(tmp_path: Path) -> None:
     frames = some_frames(9, 3, 21)
-    np.save(tmp_path / "frames.npy", np.packbits(frames, axis=2) | np.array([0, 0, 7], np.uint8))  # no pixels: cleared
     sidecar = {
         "format": "spadrig-frames",
         "width": 21,
         "clock": {"tick_hz": [97_700_000, 1], "frame_period_ticks": 1000},
         "ranges": [[1, 0, 4], [1, 6, 5]],
     }
-    (tmp_path / "frames.json").write_text(json.dumps(sidecar))
-    result = import_frames("photoncube", [tmp_path / "frames.npy"], tmp_path / "run")
-    assert result.gaps == ((4, 5),)
+    dirty = np.packbits(frames, axis=2) | np.array([0, 0, 7], np.uint8)  # no pixels: cleared
+    assert import_cube(tmp_path, dirty, sidecar).gaps == ((4, 5),)
     first, second = blocks_of(tmp_path / "run")
     assert (first.header.first_frame, second.header.first_frame, second.header.lost_before) == (0, 6, 2)
     assert second.header.flags == BlockFlag.LAST | BlockFlag.LOST_BEFORE
@@ -150,10 +151,8 @@ def test_whatever_stands_beside_a_cube_its_pixels_are_taken_or_refused(
 ) -> None:
     folder = tmp_path_factory.mktemp("beside")
     frames = some_frames(3, 2, 16)
-    np.save(folder / "frames.npy", np.packbits(frames, axis=2))
-    (folder / "frames.json").write_text(json.dumps({"format": "spadrig-frames", "width": 16, **content}))
     try:
-        import_frames("photoncube", [folder / "frames.npy"], folder / "run")
+        import_cube(folder, np.packbits(frames, axis=2), {"format": "spadrig-frames", "width": 16, **content})
     except UsageError:
         return
     width = content.get("width", 16)
@@ -162,15 +161,13 @@ def test_whatever_stands_beside_a_cube_its_pixels_are_taken_or_refused(
 
 @pytest.mark.parametrize("rate", [Fraction(0), Fraction(1, 10**12), Fraction(2**32)])
 def test_a_frame_rate_that_no_block_can_say_is_refused(tmp_path: Path, rate: Fraction) -> None:
-    np.save(tmp_path / "frames.npy", np.zeros((2, 4, 2), np.uint8))
     with pytest.raises(UsageError, match="frame rate"):
-        import_frames("photoncube", [tmp_path / "frames.npy"], tmp_path / "run", frame_rate=rate)
+        import_cube(tmp_path, np.zeros((2, 4, 2), np.uint8), frame_rate=rate)
 
 
 def test_a_photon_cube_with_one_channel_is_that_channel(tmp_path: Path) -> None:
     frames = some_frames(2, 4, 16)
-    np.save(tmp_path / "frames.npy", np.packbits(frames, axis=2)[..., None])
-    import_frames("photoncube", [tmp_path / "frames.npy"], tmp_path / "run", frame_rate=Fraction(100_000, 3))
+    import_cube(tmp_path, np.packbits(frames, axis=2)[..., None], frame_rate=Fraction(100_000, 3))
     assert np.array_equal(frames_of(tmp_path / "run"), frames)
     header = blocks_of(tmp_path / "run")[0].header
     assert header.tick_hz / header.frame_period_ticks == Fraction(100_000, 3)
@@ -178,9 +175,8 @@ def test_a_photon_cube_with_one_channel_is_that_channel(tmp_path: Path) -> None:
 
 def test_an_imported_recording_plays_as_a_spad(tmp_path: Path) -> None:
     frames = some_frames(40, 6, 64)
-    np.save(tmp_path / "frames.npy", np.packbits(frames, axis=2))
     rate = Fraction(97_700)
-    import_frames("photoncube", [tmp_path / "frames.npy"], tmp_path / "run", frame_rate=rate)
+    import_cube(tmp_path, np.packbits(frames, axis=2), frame_rate=rate)
     kind = lookup("spad", "replay")
     config = kind.config.model_validate({"kind": "replay", "recording": tmp_path / "run", "clock": "max"})
     with kind.create(config, Surroundings(SystemClock(), None, 0)) as spad:
@@ -195,9 +191,7 @@ def test_an_imported_recording_plays_as_a_spad(tmp_path: Path) -> None:
 
 
 def test_without_a_frame_rate_there_is_no_clock(tmp_path: Path) -> None:
-    np.save(tmp_path / "frames.npy", np.zeros((2, 4, 2), np.uint8))
-    result = import_frames("photoncube", [tmp_path / "frames.npy"], tmp_path / "run")
-    assert result.frame_rate_hz is None
+    assert import_cube(tmp_path, np.zeros((2, 4, 2), np.uint8)).frame_rate_hz is None
     assert blocks_of(tmp_path / "run")[0].header.frame_period_ticks == 0
 
 
@@ -211,9 +205,8 @@ def test_without_a_frame_rate_there_is_no_clock(tmp_path: Path) -> None:
     ],
 )
 def test_what_is_no_photon_cube_is_refused(tmp_path: Path, array: np.ndarray, why: str) -> None:
-    np.save(tmp_path / "frames.npy", array)
     with pytest.raises(UsageError, match=why):
-        import_frames("photoncube", [tmp_path / "frames.npy"], tmp_path / "run")
+        import_cube(tmp_path, array)
     assert not (tmp_path / "run").exists()
 
 
@@ -226,10 +219,9 @@ def test_what_is_no_photon_cube_is_refused(tmp_path: Path, array: np.ndarray, wh
     ],
 )
 def test_visionsim_says_how_a_cube_is_packed(tmp_path: Path, transforms: dict[str, object], why: str) -> None:
-    np.save(tmp_path / "frames.npy", np.zeros((2, 4, 2), np.uint8))
     (tmp_path / "transforms.json").write_text(json.dumps({**transforms, "file_path": "frames.npy"}))
     with pytest.raises(UsageError, match=why):
-        import_frames("photoncube", [tmp_path / "frames.npy"], tmp_path / "run")
+        import_cube(tmp_path, np.zeros((2, 4, 2), np.uint8))
 
 
 @pytest.mark.parametrize("kind", ["pi-imaging", "swissspad2"])
@@ -262,24 +254,20 @@ def test_options_that_cannot_be_are_refused(tmp_path: Path, kind: str, options: 
 
 def test_a_cube_that_looks_unpacked_is_refused_until_it_is_said_to_be_packed(tmp_path: Path) -> None:
     frames = some_frames(40, 6, 16)
-    np.save(tmp_path / "frames.npy", frames.astype(np.uint8))
     with pytest.raises(UsageError, match=r"0 and 1 only.*numpy\.packbits\(frames, axis=2\).*--form packed"):
-        import_frames("photoncube", [tmp_path / "frames.npy"], tmp_path / "run")
+        import_cube(tmp_path, frames.astype(np.uint8))
     assert not (tmp_path / "run").exists()
-    result = import_frames("photoncube", [tmp_path / "frames.npy"], tmp_path / "run", form="packed")
-    assert result.width == 128
+    assert import_cube(tmp_path, frames.astype(np.uint8), form="packed").width == 128
     assert np.array_equal(frames_of(tmp_path / "run"), np.unpackbits(frames.astype(np.uint8), axis=2).astype(bool))
 
 
 def test_frames_of_few_photons_that_a_file_beside_them_tells_of_are_packed(tmp_path: Path) -> None:
-    np.save(tmp_path / "frames.npy", np.ones((3, 4, 2), np.uint8))
-    (tmp_path / "frames.json").write_text(json.dumps({"format": "spadrig-frames", "width": 16}))
-    assert import_frames("photoncube", [tmp_path / "frames.npy"], tmp_path / "run").width == 16
+    beside = {"format": "spadrig-frames", "width": 16}
+    assert import_cube(tmp_path, np.ones((3, 4, 2), np.uint8), beside).width == 16
 
 
 def test_dark_frames_are_packed(tmp_path: Path) -> None:
-    np.save(tmp_path / "frames.npy", np.zeros((3, 4, 2), np.uint8))
-    assert import_frames("photoncube", [tmp_path / "frames.npy"], tmp_path / "run").width == 16
+    assert import_cube(tmp_path, np.zeros((3, 4, 2), np.uint8)).width == 16
 
 
 @pytest.mark.parametrize(
@@ -287,7 +275,6 @@ def test_dark_frames_are_packed(tmp_path: Path) -> None:
     [(bool, "packbits(frames, axis=2)"), (np.int64, "packbits(frames, axis=2)"), (float, "packbits(frames != 0, axis")],
 )
 def test_frames_of_another_type_are_told_how_to_pack(tmp_path: Path, dtype: type, line: str) -> None:
-    np.save(tmp_path / "frames.npy", some_frames(3, 4, 16).astype(dtype))
     with pytest.raises(UsageError) as refused:
-        import_frames("photoncube", [tmp_path / "frames.npy"], tmp_path / "run")
+        import_cube(tmp_path, some_frames(3, 4, 16).astype(dtype))
     assert f"make it with numpy.{line}" in str(refused.value)

@@ -191,9 +191,8 @@ def test_the_refusal_names_a_rate_that_the_link_carries(bytes_per_s, exposures, 
 
 def test_the_refusal_names_frames_windows_and_link():
     made = "27.2 MB/s of full frames, 11.2 MB/s of moving windows of 192 pixels"
-    with pytest.raises(PlanError, match=f"100 kHz makes {made}; the link of the test SPAD carries 5 MB/s; lower frame"):
-        plan_of(scan(depth_range=["2 m", "4 m"]), spad=linked(5e6))
-    with pytest.raises(PlanError, match=r"lower frame_rate to 44\.642 kHz or narrow depth_range"):
+    then = r"lower frame_rate to 44\.642 kHz or narrow depth_range"
+    with pytest.raises(PlanError, match=f"100 kHz makes {made}; the link of the test SPAD carries 5 MB/s; {then}"):
         plan_of(scan(depth_range=["2 m", "4 m"]), spad=linked(5e6))
     with pytest.raises(PlanError, match="carries 0 MB/s; use a SPAD that streams"):
         plan_of(scan(), spad=dataclasses.replace(WIDE, stream=None))
@@ -285,13 +284,9 @@ def test_a_window_that_is_not_to_be_trusted_is_not_used_wherever_it_claims_to_li
 @pytest.mark.parametrize("width", [64, 320, 576])
 def test_a_block_of_another_width_is_refused_in_a_line(moving, width):
     plan, stream, x0 = moving
-    ours = plan.windows.width_px
-    with pytest.raises(ProtocolError) as caught:
+    said = f"frames of {width} x 4 pixels, the plan is for {plan.windows.width_px} x 4 or 512 x 4; configure the SPAD"
+    with pytest.raises(ProtocolError, match=rf"\A.*{said}.*\Z"):
         counted(plan, blocks_of(plan, stream, width, x0))
-    assert f"frames of {width} x 4 pixels, the plan is for {ours} x 4 or 512 x 4; configure the SPAD" in str(
-        caught.value
-    )
-    assert "\n" not in str(caught.value)
 
 
 @pytest.mark.parametrize("wrong", [32, 512 - 64, 65_472])

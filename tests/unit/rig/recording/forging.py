@@ -7,38 +7,17 @@ from typing import Any, Final
 
 import numpy as np
 
+from drivers.frames import FRAME_RECORD
 from drivers.recorded.contents import HEADER_BYTES as INDEX_HEADER_BYTES
 from drivers.recorded.contents import INDEX_FILE, INDEX_RECORD
 from drivers.spb1.layout import CRC, HEADER, HEADER_BYTES, TRAILER, TRAILER_BYTES
 
 HEADER_FIELDS: Final = [
-    "magic",
-    "version",
-    "header_len",
-    "flags",
-    "bits_per_px",
-    "payload_type",
-    "run_id",
-    "block_seq",
-    "first_frame",
-    "t0_ticks",
-    "lost_before",
-    "tick_hz",
-    "tick_hz_den",
-    "frame_period_ticks",
-    "exposure_ticks",
-    "sweep",
-    "n_frames",
-    "frame_step",
-    "width",
-    "height",
-    "sensor_width",
-    "sensor_height",
-    "payload_len",
-    "pixels_offset",
-    "reserved",
+    "magic", "version", "header_len", "flags", "bits_per_px", "payload_type", "run_id", "block_seq", "first_frame",
+    "t0_ticks", "lost_before", "tick_hz", "tick_hz_den", "frame_period_ticks", "exposure_ticks", "sweep", "n_frames",
+    "frame_step", "width", "height", "sensor_width", "sensor_height", "payload_len", "pixels_offset", "reserved",
     "header_crc",
-]
+]  # fmt: skip
 TRAILER_FIELDS: Final = ["magic", "status", "block_seq", "valid_payload_len", "payload_crc", "frames_lost", "crc"]
 MOST: Final = {"B": 2**8 - 1, "H": 2**16 - 1, "I": 2**32 - 1, "Q": 2**64 - 1}
 
@@ -68,8 +47,6 @@ def forge_trailer(data: bytearray, at: int, **values: int) -> None:
 
 def forge_payload(data: bytearray, at: int, change: Any) -> None:
     """Change the records of the block at `at` by `change(records)`, with the payload's checksum made anew."""
-    from drivers.frames import FRAME_RECORD
-
     fields = dict(zip(HEADER_FIELDS, HEADER.unpack_from(data, at), strict=True))
     records = np.frombuffer(data, FRAME_RECORD, fields["n_frames"], at + HEADER_BYTES).copy()
     change(records)

@@ -18,6 +18,10 @@ SEGMENT_BYTES = 40_000
 """A handful of blocks to a segment."""
 
 
+Runs = list[list[FrameBlock]]
+"""The blocks of each start of a SPAD."""
+
+
 def run_blocks(lost: Sequence[int] = (), run_id: int = 1, seed: int = 0, maps: int = MAPS) -> list[FrameBlock]:
     """The blocks of one start of a SPAD, `maps` maps long."""
     blocks = stream_of(plan_of(scan()), maps).blocks(iter([BLOCK_FRAMES] * 1000), lost, seed)
@@ -45,15 +49,26 @@ def record(folder: Path, runs: Sequence[Sequence[FrameBlock]], **manifest: Any) 
     return folder
 
 
-def read(recording: RunRecording) -> list[list[FrameBlock]]:
+def flip(file: Path, at: int) -> None:
+    """Change a bit of a file."""
+    data = bytearray(file.read_bytes())
+    data[at] ^= 1
+    file.write_bytes(data)
+
+
+def read(recording: RunRecording) -> Runs:
     """All blocks of each run."""
     return [list(recording.blocks(run)) for run in recording.runs]
 
 
-def same(block: FrameBlock, other: FrameBlock) -> bool:
-    """Whether two blocks are the same to the last bit."""
-    return (
-        block.header == other.header
-        and block.records.tobytes() == other.records.tobytes()
-        and block.bits.tobytes() == other.bits.tobytes()
-    )
+def assert_same(found: Sequence[FrameBlock], others: Sequence[FrameBlock]) -> None:
+    """Blocks are the same to the last bit."""
+    for block, other in zip(found, others, strict=True):
+        assert block.header == other.header
+        assert (block.records.tobytes(), block.bits.tobytes()) == (other.records.tobytes(), other.bits.tobytes())
+
+
+def assert_all_there(recording: RunRecording, runs: Runs) -> None:
+    """A recording gives the very blocks of these starts."""
+    for found, written in zip(read(recording), runs, strict=True):
+        assert_same(found, written)

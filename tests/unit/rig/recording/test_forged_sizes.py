@@ -54,6 +54,12 @@ def forged(folder: Path, change: Callable[[int, FrameBlock], dict[str, Any]], **
     return folder
 
 
+@pytest.fixture(scope="module", autouse=True)
+def _compiled(tmp_path_factory: pytest.TempPathFactory) -> None:
+    """Kernels are there before memory is traced, under which they compile many times slower."""
+    reconstruct(forged(tmp_path_factory.mktemp("sound") / "run", lambda i, _: {}))
+
+
 @pytest.mark.parametrize("command", [info, verify, repair])
 def test_a_run_number_of_the_index_takes_no_memory(tmp_path: Path, command: Callable[[Path], object]) -> None:
     index = record(tmp_path, [run_blocks()]) / INDEX_FILE

@@ -19,11 +19,11 @@ from rig.recording.repair import repair
 from rig.recording.verify import Integrity, verify
 from rig.run_folder.manifest import read_manifest
 from tests.unit.rig.count.streams import plan_of, scan, stream_of
-from tests.unit.rig.recording.recorded import MAPS, read, record, run_blocks, same
+from tests.unit.rig.recording.recorded import MAPS, Runs, assert_all_there, assert_same, flip, read, record, run_blocks
 
 
 @pytest.fixture(scope="module")
-def runs() -> list[list[FrameBlock]]:
+def runs() -> Runs:
     return [run_blocks(run_id=1), run_blocks(lost=range(140, 145), run_id=2, seed=1)]
 
 
@@ -33,15 +33,8 @@ def true_spans() -> list[MapSpan]:
 
 
 def sweeps() -> list[dict[str, float]]:
-    return [
-        {
-            "first_frame": span.first_frame,
-            "end_frame": span.end_frame,
-            "clock_error": (i + 1) * 1e-5,
-            "residual_columns": 0.01,
-        }
-        for i, span in enumerate(true_spans())
-    ]
+    frames = [{"first_frame": span.first_frame, "end_frame": span.end_frame} for span in true_spans()]
+    return [{**of, "clock_error": (i + 1) * 1e-5, "residual_columns": 0.01} for i, of in enumerate(frames)]
 
 
 def frames_in(recording: RunRecording, run: int, first: int, end: int) -> tuple[list[int], bytes]:
@@ -51,14 +44,14 @@ def frames_in(recording: RunRecording, run: int, first: int, end: int) -> tuple[
 
 
 @pytest.mark.parametrize("stated", [True, False])
-def test_maps_are_found_by_manifest_and_by_markers(tmp_path: Path, runs: list[list[FrameBlock]], stated: bool) -> None:
+def test_maps_are_found_by_manifest_and_by_markers(tmp_path: Path, runs: Runs, stated: bool) -> None:
     folder = record(tmp_path, runs, **({"sweeps": sweeps()} if stated else {}))
     assert map_spans(RunRecording(folder), read_manifest(folder)) == true_spans()
 
 
 @pytest.mark.parametrize("known", [{"recording": {"failed": "full", "starts": []}}, {"repaired": ["its end"]}])
 def test_maps_that_were_made_of_frames_behind_the_end_are_not_in_a_recording_cut_short(
-    tmp_path: Path, runs: list[list[FrameBlock]], known: dict[str, object]
+    tmp_path: Path, runs: Runs, known: dict[str, object]
 ) -> None:
     short = [runs[0], runs[1][: len(runs[1]) * 2 // 3]]
     folder = record(tmp_path / "short", short, sweeps=sweeps(), **known)
@@ -68,7 +61,7 @@ def test_maps_that_were_made_of_frames_behind_the_end_are_not_in_a_recording_cut
     assert map_spans(RunRecording(folder), read_manifest(folder)) == true_spans()
 
 
-def test_info_tells_what_there_is(tmp_path: Path, runs: list[list[FrameBlock]]) -> None:
+def test_info_tells_what_there_is(tmp_path: Path, runs: Runs) -> None:
     found = info(record(tmp_path, runs, config={"name": "small"}, devices={"spad": {"name": "SPAD 7"}}))
     assert (found.maps, found.config, found.devices) == (2 * MAPS, "small", {"spad": "SPAD 7"})
     assert [(run.run_id, run.first_map, run.end_map, run.gaps) for run in found.runs] == [(1, 0, 3, 0), (2, 3, 6, 1)]
@@ -76,7 +69,7 @@ def test_info_tells_what_there_is(tmp_path: Path, runs: list[list[FrameBlock]]) 
     assert found.as_json()["folder"] == str(tmp_path)
 
 
-def test_maps_are_cut_out_with_their_closing_marker(tmp_path: Path, runs: list[list[FrameBlock]]) -> None:
+def test_maps_are_cut_out_with_their_closing_marker(tmp_path: Path, runs: Runs) -> None:
     folder = record(tmp_path / "run", runs, sweeps=sweeps(), maps=6, inputs={"plan.yaml": 0})
     (folder / "plan.yaml").write_bytes(b"")
     (folder / "learned").mkdir()
@@ -112,9 +105,7 @@ def test_maps_are_cut_out_with_their_closing_marker(tmp_path: Path, runs: list[l
         ({"time": "0.0025:"}, 250, 10_000),
     ],
 )
-def test_frames_and_times_are_cut_out(
-    tmp_path: Path, runs: list[list[FrameBlock]], asked: dict[str, str], first: int, end: int
-) -> None:
+def test_frames_and_times_are_cut_out(tmp_path: Path, runs: Runs, asked: dict[str, str], first: int, end: int) -> None:
     folder = record(tmp_path / "run", runs)
     cut(folder, tmp_path / "part", run=1, **asked)
     part = RunRecording(tmp_path / "part")
@@ -122,14 +113,14 @@ def test_frames_and_times_are_cut_out(
     assert not verify(tmp_path / "part").problems
 
 
-def test_frames_are_found_by_their_time(tmp_path: Path, runs: list[list[FrameBlock]]) -> None:
+def test_frames_are_found_by_their_time(tmp_path: Path, runs: Runs) -> None:
     run = RunRecording(record(tmp_path, runs)).runs[1]
     times_s = (-1.0, 0.0, 0.4e-5, 1e-5, 1.001e-5, 1.39e-3, 1.42e-3, 1.45e-3, 1e9, float("inf"))
     last = run.end_frame
     assert [run.frame_at(time_s) for time_s in times_s] == [0, 0, 1, 1, 2, 139, 142, 145, last, last]  # 142 is lost
 
 
-def test_a_part_is_over_and_has_its_own_verdict(tmp_path: Path, runs: list[list[FrameBlock]]) -> None:
+def test_a_part_is_over_and_has_its_own_verdict(tmp_path: Path, runs: Runs) -> None:
     folder = record(tmp_path / "run", runs, verdict="gaps")
     assert cut(folder, tmp_path / "without", frames=":20")["verdict"] == "complete"
     assert cut(folder, tmp_path / "with", frames="100:200", run=1)["verdict"] == "gaps"
@@ -138,9 +129,7 @@ def test_a_part_is_over_and_has_its_own_verdict(tmp_path: Path, runs: list[list[
     assert verify(tmp_path / "part").verdict is Integrity.INTACT
 
 
-def test_what_a_repair_found_missing_is_known_to_be_missing_in_a_part(
-    tmp_path: Path, runs: list[list[FrameBlock]]
-) -> None:
+def test_what_a_repair_found_missing_is_known_to_be_missing_in_a_part(tmp_path: Path, runs: Runs) -> None:
     folder = record(tmp_path / "run", [runs[0], [*runs[1][:2], *runs[1][3:]]])
     repair(folder)
     cut(folder, tmp_path / "around", frames="10:100", run=1)
@@ -151,9 +140,7 @@ def test_what_a_repair_found_missing_is_known_to_be_missing_in_a_part(
 
 
 @pytest.mark.parametrize("what", ["lost", "changed"])
-def test_nothing_is_cut_without_the_plan_that_it_was_taken_with(
-    tmp_path: Path, runs: list[list[FrameBlock]], what: str
-) -> None:
+def test_nothing_is_cut_without_the_plan_that_it_was_taken_with(tmp_path: Path, runs: Runs, what: str) -> None:
     folder = record(tmp_path / "run", runs, inputs={"plan.yaml": 0})
     if what == "changed":
         (folder / "plan.yaml").write_bytes(b"other")
@@ -162,7 +149,7 @@ def test_nothing_is_cut_without_the_plan_that_it_was_taken_with(
     assert not (tmp_path / "part").exists()
 
 
-def test_maps_cannot_be_cut_where_there_are_no_markers(tmp_path: Path, runs: list[list[FrameBlock]]) -> None:
+def test_maps_cannot_be_cut_where_there_are_no_markers(tmp_path: Path, runs: Runs) -> None:
     def unmarked(block: FrameBlock) -> FrameBlock:
         records = block.records.copy()
         records["marks"] = records["sweep"] = records["line"] = 0
@@ -189,20 +176,16 @@ def test_maps_cannot_be_cut_where_there_are_no_markers(tmp_path: Path, runs: lis
         ({"frames": "9" * 30 + ":"}, "holds no frame"),
     ],
 )
-def test_what_is_not_there_is_not_cut(
-    tmp_path: Path, runs: list[list[FrameBlock]], asked: dict[str, object], words: str
-) -> None:
+def test_what_is_not_there_is_not_cut(tmp_path: Path, runs: Runs, asked: dict[str, object], words: str) -> None:
     folder = record(tmp_path / "run", runs)
     with pytest.raises(UsageError, match=words):
         cut(folder, tmp_path / "part", **asked)  # type: ignore[arg-type]
     assert not (tmp_path / "part").exists()
 
 
-def test_a_damaged_recording_is_not_cut(tmp_path: Path, runs: list[list[FrameBlock]]) -> None:
+def test_a_damaged_recording_is_not_cut(tmp_path: Path, runs: Runs) -> None:
     folder = record(tmp_path / "run", runs)
-    data = bytearray((folder / "frames-000000.spb").read_bytes())
-    data[500] ^= 1
-    (folder / "frames-000000.spb").write_bytes(data)
+    flip(folder / "frames-000000.spb", 500)
     with pytest.raises(DamagedRecordingError, match="repair"):
         cut(folder, tmp_path / "part", maps="0:2")
     assert not (tmp_path / "part").exists()
@@ -213,7 +196,7 @@ class TestCompressed:
     def _zstandard(self) -> None:
         pytest.importorskip("zstandard", reason="pip install '.[compress]'")
 
-    def test_every_frame_is_read_by_the_same_index(self, tmp_path: Path, runs: list[list[FrameBlock]]) -> None:
+    def test_every_frame_is_read_by_the_same_index(self, tmp_path: Path, runs: Runs) -> None:
         folder = record(tmp_path, runs)
         index = (folder / INDEX_FILE).read_bytes()
         plain = sum(file.stat().st_size for file in folder.glob("frames-*.spb"))
@@ -222,15 +205,14 @@ class TestCompressed:
         assert made.bytes_after < plain
         recording = RunRecording(folder)
         assert recording.problems == []
-        for found, written in zip(read(recording), runs, strict=True):
-            assert all(same(a, b) for a, b in zip(found, written, strict=True))
+        assert_all_there(recording, runs)
         assert frames_in(recording, 1, 30, 50)[0] == list(range(30, 50))
         assert (folder / INDEX_FILE).read_bytes() == index
         assert verify(folder).verdict is Integrity.GAPS
         assert repair(folder).done == []
         assert compress(folder).bytes_before == plain
 
-    def test_any_zstd_gives_the_plain_segment_back(self, tmp_path: Path, runs: list[list[FrameBlock]]) -> None:
+    def test_any_zstd_gives_the_plain_segment_back(self, tmp_path: Path, runs: Runs) -> None:
         import zstandard
 
         folder = record(tmp_path, runs)
@@ -243,21 +225,14 @@ class TestCompressed:
             assert subprocess.run(["zstd", "-dc", packed], capture_output=True, check=True).stdout == plain
 
     @pytest.mark.parametrize("what", ["table", "frame"])
-    def test_damage_costs_what_it_hit(self, tmp_path: Path, runs: list[list[FrameBlock]], what: str) -> None:
+    def test_damage_costs_what_it_hit(self, tmp_path: Path, runs: Runs, what: str) -> None:
         folder = record(tmp_path, runs)
         compress(folder)
-        file = folder / "frames-000000.spb.zst"
-        data = bytearray(file.read_bytes())
-        data[-2 if what == "table" else 40] ^= 1
-        file.write_bytes(data)
-        found = read(RunRecording(folder))
-        lost = 0 if what == "table" else 1
-        assert all(same(a, b) for a, b in zip(found[0], runs[0][lost:], strict=True))
+        flip(folder / "frames-000000.spb.zst", -2 if what == "table" else 40)
+        assert_same(read(RunRecording(folder))[0], runs[0][0 if what == "table" else 1 :])
         assert verify(folder).verdict is (Integrity.GAPS if what == "table" else Integrity.DAMAGED)
 
-    def test_a_recording_that_is_not_whole_is_not_compressed(
-        self, tmp_path: Path, runs: list[list[FrameBlock]]
-    ) -> None:
+    def test_a_recording_that_is_not_whole_is_not_compressed(self, tmp_path: Path, runs: Runs) -> None:
         folder = record(tmp_path, runs, verdict="recording")
         with pytest.raises(DamagedRecordingError, match="not over"):
             compress(folder)
@@ -268,7 +243,7 @@ class TestCompressed:
 
 
 def test_without_the_package_the_command_to_install_it_is_told(
-    tmp_path: Path, runs: list[list[FrameBlock]], monkeypatch: pytest.MonkeyPatch
+    tmp_path: Path, runs: Runs, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setitem(sys.modules, "zstandard", None)
     with pytest.raises(

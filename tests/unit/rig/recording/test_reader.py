@@ -6,28 +6,20 @@ import numpy as np
 import pytest
 
 from drivers.errors import DeviceNotFound, ProtocolError
-from drivers.frames import FrameBlock
 from drivers.recorded import INDEX_FILE, RunRecording, reader
 from drivers.recorded.contents import HEADER_BYTES, RECORD_BYTES
 from rig.recording.repair import repair
 from rig.recording.verify import Integrity
-from tests.unit.rig.recording.recorded import read, record, run_blocks, same
+from tests.unit.rig.recording.recorded import Runs, assert_all_there, flip, read, record, run_blocks
 
 
 @pytest.fixture(scope="module")
-def runs() -> list[list[FrameBlock]]:
+def runs() -> Runs:
     return [run_blocks(run_id=1), run_blocks(lost=range(40, 45), run_id=2, seed=1)]
 
 
-def assert_all_there(recording: RunRecording, runs: list[list[FrameBlock]]) -> None:
-    for found, written in zip(read(recording), runs, strict=True):
-        assert all(same(a, b) for a, b in zip(found, written, strict=True))
-
-
 @pytest.mark.parametrize("ahead", [0, 10_000, reader.READ_AHEAD_BYTES])
-def test_what_was_recorded_is_read(
-    tmp_path: Path, runs: list[list[FrameBlock]], ahead: int, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_what_was_recorded_is_read(tmp_path: Path, runs: Runs, ahead: int, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(reader, "READ_AHEAD_BYTES", ahead)
     recording = RunRecording(record(tmp_path, runs))
     assert_all_there(recording, runs)
@@ -36,26 +28,22 @@ def test_what_was_recorded_is_read(
     assert [run.gaps() for run in recording.runs] == [[], [(40, 44)]]
 
 
-def test_any_frames_can_be_read(tmp_path: Path, runs: list[list[FrameBlock]]) -> None:
+def test_any_frames_can_be_read(tmp_path: Path, runs: Runs) -> None:
     recording = RunRecording(record(tmp_path, runs))
     run = recording.runs[1]
     for first, end in ((0, 1), (37, 47), (20, 90), (run.end_frame - 3, run.end_frame + 5)):
         blocks = list(recording.blocks(run, first, end))
         whole = [block for block in runs[1] if block.header.first_frame < end]
-        for name, of in (
-            ("bits", lambda b: b.bits),
-            ("ticks", lambda b: b.start_ticks),
-            ("sweep", lambda b: b.records["sweep"]),
-        ):
-            every = np.concatenate([of(block) for block in whole])
-            numbers = np.concatenate([block.frame_numbers for block in whole])
-            wanted = every[(numbers >= first) & (numbers < end)]
-            assert np.array_equal(np.concatenate([of(block) for block in blocks]), wanted), name
+        numbers = np.concatenate([block.frame_numbers for block in whole])
+        wanted = (numbers >= first) & (numbers < end)
+        for of in (lambda b: b.bits, lambda b: b.start_ticks, lambda b: b.records["sweep"]):
+            every, found = (np.concatenate([of(block) for block in these]) for these in (whole, blocks))
+            assert np.array_equal(found, every[wanted])
         assert [block.header.sweep & 0xFFFF for block in blocks] == [int(block.records["sweep"][0]) for block in blocks]
 
 
 @pytest.mark.parametrize("what", ["lost", "no header", "torn", "a record less", "damaged record", "of another"])
-def test_blocks_are_found_whatever_became_of_the_index(tmp_path: Path, runs: list[list[FrameBlock]], what: str) -> None:
+def test_blocks_are_found_whatever_became_of_the_index(tmp_path: Path, runs: Runs, what: str) -> None:
     folder = record(tmp_path / "run", runs)
     index = folder / INDEX_FILE
     data = bytearray(index.read_bytes())
@@ -78,12 +66,9 @@ def test_blocks_are_found_whatever_became_of_the_index(tmp_path: Path, runs: lis
     assert recording.problems
 
 
-def test_a_damaged_block_is_a_gap_and_said(tmp_path: Path, runs: list[list[FrameBlock]]) -> None:
+def test_a_damaged_block_is_a_gap_and_said(tmp_path: Path, runs: Runs) -> None:
     folder = record(tmp_path, runs)
-    file = folder / "frames-000000.spb"
-    data = bytearray(file.read_bytes())
-    data[4096 + 500] ^= 0x10
-    file.write_bytes(data)
+    flip(folder / "frames-000000.spb", 4096 + 500)
     recording = RunRecording(folder)
     found = read(recording)[0]
     assert [block.header.block_seq for block in found] == [0, *range(2, len(runs[0]))]
@@ -91,7 +76,7 @@ def test_a_damaged_block_is_a_gap_and_said(tmp_path: Path, runs: list[list[Frame
     assert recording.problems[0].startswith("frames-000000.spb, byte 4096: payload of block 1: CRC is ")
 
 
-def test_swapped_segments_are_put_in_order(tmp_path: Path, runs: list[list[FrameBlock]]) -> None:
+def test_swapped_segments_are_put_in_order(tmp_path: Path, runs: Runs) -> None:
     folder = record(tmp_path, runs)
     first, last = folder / "frames-000000.spb", sorted(folder.glob("frames-*.spb"))[-1]
     one, other = first.read_bytes(), last.read_bytes()
@@ -105,7 +90,7 @@ def test_swapped_segments_are_put_in_order(tmp_path: Path, runs: list[list[Frame
     assert_all_there(RunRecording(folder), runs)
 
 
-def test_starts_stay_in_order_when_index_records_are_swapped(tmp_path: Path, runs: list[list[FrameBlock]]) -> None:
+def test_starts_stay_in_order_when_index_records_are_swapped(tmp_path: Path, runs: Runs) -> None:
     folder = record(tmp_path, runs)
     data = (folder / INDEX_FILE).read_bytes()
     middle = HEADER_BYTES + len(runs[0]) * RECORD_BYTES
@@ -123,7 +108,7 @@ def test_a_folder_without_a_recording_is_said(tmp_path: Path) -> None:
         RunRecording(tmp_path)
 
 
-def test_a_start_of_which_no_block_is_sound_is_said(tmp_path: Path, runs: list[list[FrameBlock]]) -> None:
+def test_a_start_of_which_no_block_is_sound_is_said(tmp_path: Path, runs: Runs) -> None:
     folder = record(tmp_path, runs)
     first = {entry["segment"] for entry in RunRecording(folder).runs[0].entries}
     for number in first:
@@ -136,7 +121,7 @@ def test_a_start_of_which_no_block_is_sound_is_said(tmp_path: Path, runs: list[l
     assert recording.problems == [f"run 1: none of its {len(runs[0])} blocks is sound"]
 
 
-def test_blocks_that_all_moved_are_found(tmp_path: Path, runs: list[list[FrameBlock]]) -> None:
+def test_blocks_that_all_moved_are_found(tmp_path: Path, runs: Runs) -> None:
     folder = record(tmp_path, runs)
     file = folder / "frames-000000.spb"
     file.write_bytes(bytes(1024) + file.read_bytes())

@@ -1,40 +1,34 @@
 """`verify` and `repair`: damage is found and told, what is sound is kept, and a repaired recording stays as it is."""
 
 import json
+import re
 import sys
 from pathlib import Path
 
 import numpy as np
 import pytest
 
-from drivers.frames import FrameBlock
 from drivers.recorded import INDEX_FILE, RunRecording
 from rig.errors import DamagedRecordingError, UsageError
 from rig.recording.repair import repair
 from rig.recording.verify import Integrity, verify
 from rig.recording.writer import Recording
 from rig.run_folder.manifest import MANIFEST, read_manifest, sealed_text
-from tests.unit.rig.recording.recorded import read, record, run_blocks, same
+from tests.unit.rig.recording.recorded import Runs, assert_same, flip, read, record, run_blocks
 
 FIRST = "frames-000000.spb"
 
 
 @pytest.fixture(scope="module")
-def runs() -> list[list[FrameBlock]]:
+def runs() -> Runs:
     return [run_blocks(run_id=1), run_blocks(run_id=2, seed=1)]
-
-
-def change(file: Path, at: int, xor: int = 1) -> None:
-    data = bytearray(file.read_bytes())
-    data[at] ^= xor
-    file.write_bytes(data)
 
 
 def files_of(folder: Path) -> dict[str, bytes]:
     return {file.name: file.read_bytes() for file in sorted(folder.iterdir())}
 
 
-def test_an_intact_recording_is_intact_and_repair_leaves_it(tmp_path: Path, runs: list[list[FrameBlock]]) -> None:
+def test_an_intact_recording_is_intact_and_repair_leaves_it(tmp_path: Path, runs: Runs) -> None:
     folder = record(tmp_path, runs)
     found = verify(folder)
     assert (found.verdict, found.exit_code, found.problems) == (Integrity.INTACT, 0, [])
@@ -50,7 +44,7 @@ def test_frames_that_the_device_lost_are_gaps(tmp_path: Path) -> None:
     assert (found.gaps, found.lost, found.problems) == ([(0, 0, 1), (0, 40, 44)], 7, [])
 
 
-def test_frames_that_only_the_recording_lost_are_damage(tmp_path: Path, runs: list[list[FrameBlock]]) -> None:
+def test_frames_that_only_the_recording_lost_are_damage(tmp_path: Path, runs: Runs) -> None:
     found = verify(record(tmp_path, [[*runs[0][:2], *runs[0][3:]]]))
     assert found.verdict is Integrity.DAMAGED
     assert "run 0: frames 32 to 47 are missing, of which the device lost 0" in found.problems
@@ -66,7 +60,7 @@ def test_counts_of_the_device_are_compared(tmp_path: Path, key: str) -> None:
     assert found.problems[0].startswith("the device ")
 
 
-def test_a_changed_manifest_or_calibration_is_found(tmp_path: Path, runs: list[list[FrameBlock]]) -> None:
+def test_a_changed_manifest_or_calibration_is_found(tmp_path: Path, runs: Runs) -> None:
     folder = record(tmp_path, runs, config={"depth_range": ["1 m", "8 m"]}, inputs={"plan.yaml": 1})
     (folder / "plan.yaml").write_text("columns: 20")
     assert verify(folder).problems == ["plan.yaml is not as it was written, its checksum does not fit"]
@@ -79,7 +73,7 @@ def test_a_changed_manifest_or_calibration_is_found(tmp_path: Path, runs: list[l
     assert read_manifest(folder) is not None
 
 
-def test_a_killed_run_is_repaired(tmp_path: Path, runs: list[list[FrameBlock]]) -> None:
+def test_a_killed_run_is_repaired(tmp_path: Path, runs: Runs) -> None:
     folder = record(tmp_path, runs[:1], verdict="recording", counters=None, recording={"starts": []})
     assert verify(folder).verdict is Integrity.UNFINISHED
     last = sorted(folder.glob("frames-*.spb"))[-1]
@@ -100,9 +94,7 @@ def test_a_killed_run_is_repaired(tmp_path: Path, runs: list[list[FrameBlock]]) 
     assert files_of(folder) == before
 
 
-def test_a_recording_that_ended_before_its_run_says_why_until_it_is_repaired(
-    tmp_path: Path, runs: list[list[FrameBlock]]
-) -> None:
+def test_a_recording_that_ended_before_its_run_says_why_until_it_is_repaired(tmp_path: Path, runs: Runs) -> None:
     full = "No space left on device"
     delivered = sum(block.n_frames for block in runs[0]) + 100
     folder = record(tmp_path, runs[:1], verdict="aborted", counters={"delivered": delivered, "lost": 0})
@@ -118,15 +110,15 @@ def test_a_recording_that_ended_before_its_run_says_why_until_it_is_repaired(
 
 
 def test_more_frames_than_the_device_delivered_are_damage_however_the_recording_ended(
-    tmp_path: Path, runs: list[list[FrameBlock]]
+    tmp_path: Path, runs: Runs
 ) -> None:
     folder = record(tmp_path, runs[:1], counters={"delivered": 1, "lost": 0}, recording={"failed": "full"})
     assert verify(folder).verdict is Integrity.DAMAGED
 
 
-def test_one_file_of_a_recording_is_refused_and_left(tmp_path: Path, runs: list[list[FrameBlock]]) -> None:
+def test_one_file_of_a_recording_is_refused_and_left(tmp_path: Path, runs: Runs) -> None:
     folder = record(tmp_path, runs)
-    change(folder / FIRST, 4096 + 500)
+    flip(folder / FIRST, 4096 + 500)
     before = files_of(folder)
     for act in (verify, repair):
         with pytest.raises(UsageError, match="is a file; name the folder"):
@@ -134,10 +126,10 @@ def test_one_file_of_a_recording_is_refused_and_left(tmp_path: Path, runs: list[
     assert files_of(folder) == before
 
 
-def test_damage_in_the_middle_becomes_a_gap(tmp_path: Path, runs: list[list[FrameBlock]]) -> None:
+def test_damage_in_the_middle_becomes_a_gap(tmp_path: Path, runs: Runs) -> None:
     folder = record(tmp_path, runs)
     whole = (folder / FIRST).read_bytes()
-    change(folder / FIRST, 4096 + 500)
+    flip(folder / FIRST, 4096 + 500)
     assert verify(folder).verdict is Integrity.DAMAGED
     done = repair(folder)
     assert (done.after.verdict, done.after.gaps) == (Integrity.GAPS, [(0, 16, 31)])
@@ -146,17 +138,17 @@ def test_damage_in_the_middle_becomes_a_gap(tmp_path: Path, runs: list[list[Fram
     assert np.count_nonzero(kept != np.frombuffer(whole, np.uint8)[4096 : 4096 + len(kept)]) == 1
     recording = RunRecording(folder)
     assert recording.problems == []
-    assert all(same(a, b) for a, b in zip(read(recording)[0], [runs[0][0], *runs[0][2:]], strict=True))
+    assert_same(read(recording)[0], [runs[0][0], *runs[0][2:]])
 
 
 @pytest.mark.parametrize("what", ["lost", "damaged"])
-def test_a_lost_manifest_is_written_anew(tmp_path: Path, runs: list[list[FrameBlock]], what: str) -> None:
+def test_a_lost_manifest_is_written_anew(tmp_path: Path, runs: Runs, what: str) -> None:
     folder = record(tmp_path, runs)
     starts = json.loads((folder / MANIFEST).read_text())["recording"]["starts"]
     if what == "lost":
         (folder / MANIFEST).unlink()
     else:
-        change(folder / MANIFEST, 30)
+        flip(folder / MANIFEST, 30)
     assert verify(folder).verdict is Integrity.DAMAGED
     done = repair(folder)
     assert done.after.verdict is Integrity.INTACT
@@ -167,7 +159,7 @@ def test_a_lost_manifest_is_written_anew(tmp_path: Path, runs: list[list[FrameBl
     assert (folder / "manifest.damaged.json").exists() == (what == "damaged")
 
 
-def test_blocks_that_come_twice_or_swapped_are_put_right(tmp_path: Path, runs: list[list[FrameBlock]]) -> None:
+def test_blocks_that_come_twice_or_swapped_are_put_right(tmp_path: Path, runs: Runs) -> None:
     folder = record(tmp_path, runs)
     data = bytearray((folder / FIRST).read_bytes())
     data[4096:8192], data[8192:12288] = data[8192:12288], data[4096:8192]
@@ -175,12 +167,11 @@ def test_blocks_that_come_twice_or_swapped_are_put_right(tmp_path: Path, runs: l
     assert verify(folder).verdict is Integrity.DAMAGED
     done = repair(folder)
     assert done.after.verdict is Integrity.INTACT, done
-    recording = RunRecording(folder)
-    assert all(same(a, b) for a, b in zip(read(recording)[0], runs[0], strict=True))
+    assert_same(read(RunRecording(folder))[0], runs[0])
 
 
 @pytest.mark.skipif(sys.platform == "win32", reason="Windows itself keeps others away")
-def test_a_run_that_is_still_recording_is_not_repaired(tmp_path: Path, runs: list[list[FrameBlock]]) -> None:
+def test_a_run_that_is_still_recording_is_not_repaired(tmp_path: Path, runs: Runs) -> None:
     recording = Recording(tmp_path, expected_bytes=100_000)
     recording.append(runs[0][0])
     with pytest.raises(UsageError, match="still being recorded"):
@@ -189,10 +180,27 @@ def test_a_run_that_is_still_recording_is_not_repaired(tmp_path: Path, runs: lis
     assert repair(tmp_path).after.frames == runs[0][0].n_frames
 
 
-def test_a_folder_without_a_recording_is_refused(tmp_path: Path) -> None:
+@pytest.mark.parametrize(
+    ("files", "said"),
+    [
+        ([], "is an empty folder: no frames-*.spb; name the folder of a run taken with --record"),
+        (["a/notes.txt"], "is a folder without a recording: no frames-*.spb; name"),
+        (["frames.npy"], "no frames-*.spb, but .npy files; if these are frames, 'rig import photoncube"),
+        (["RAW00000.bin"], "'rig import swissspad2 (or pi-imaging)"),
+        (["manifest.json"], "the frames of this run were not recorded; take it again with 'rig scan --record'"),
+        (["first/frames-000000.spb", "second/frames-000000.spb"], "first or another of 2 in it"),
+        (["one/frames-000000.spb"], "of its own; name"),
+        (None, "does not exist; name the folder of a run"),
+    ],
+    ids=str,
+)
+def test_a_folder_without_a_recording_is_called_what_it_is(tmp_path: Path, files: list[str] | None, said: str) -> None:
+    for file in files or ():
+        (tmp_path / file).parent.mkdir(exist_ok=True)
+        (tmp_path / file).touch()
     for act in (verify, repair):
-        with pytest.raises(UsageError, match="no frames-"):
-            act(tmp_path)
+        with pytest.raises(UsageError, match=re.escape(said)):
+            act(tmp_path / "absent" if files is None else tmp_path)
 
 
 def test_a_seal_holds_for_any_json() -> None:

@@ -23,28 +23,28 @@ from tests.unit.rig.recording.forging import (
     forge_trailer,
     most_of,
 )
-from tests.unit.rig.recording.recorded import read, record, run_blocks
+from tests.unit.rig.recording.recorded import Runs, flip, read, record, run_blocks
 
-PAGE = 4096
-"""Each block of these recordings takes one."""
-
+MIDDLE = 9
+"""Number of a block amid those of a start."""
+Files = dict[str, bytes]
 Place = tuple[Path, int]
 """A segment and where in it a block begins."""
 
 
 @pytest.fixture(scope="module")
-def runs() -> list[list[FrameBlock]]:
+def runs() -> Runs:
     return [run_blocks(run_id=1), run_blocks(run_id=2, lost=range(100, 103), seed=1)]
 
 
 @pytest.fixture(scope="module")
-def pristine(runs: list[list[FrameBlock]], tmp_path_factory: pytest.TempPathFactory) -> dict[str, bytes]:
+def pristine(runs: Runs, tmp_path_factory: pytest.TempPathFactory) -> Files:
     """The files of a sound recording: writing one through to the disk takes long."""
     folder = record(tmp_path_factory.mktemp("pristine"), runs)
     return {file.name: file.read_bytes() for file in folder.iterdir()}
 
 
-def copied(pristine: dict[str, bytes], folder: Path) -> Path:
+def copied(pristine: Files, folder: Path) -> Path:
     folder.mkdir(exist_ok=True)
     for name, data in pristine.items():
         (folder / name).write_bytes(data)
@@ -70,6 +70,10 @@ def forge(place: Place, change: Callable[[bytearray, int], None]) -> None:
     place[0].write_bytes(data)
 
 
+def damage(place: Place) -> None:
+    flip(place[0], place[1] + 300)
+
+
 def content(blocks: list[FrameBlock]) -> set[tuple[int, int, bytes]]:
     return {
         (block.header.run_id, number, bits.tobytes())
@@ -78,7 +82,7 @@ def content(blocks: list[FrameBlock]) -> set[tuple[int, int, bytes]]:
     }
 
 
-def salvaged(folder: Path, runs: list[list[FrameBlock]], lost: FrameBlock | None) -> Verification:
+def salvaged(folder: Path, runs: Runs, lost: FrameBlock | None) -> Verification:
     """Repair; AssertionError where anything but the frames of one block is gone, or `verify` is not content."""
     after = repair(folder).after
     assert after.problems == []
@@ -105,12 +109,11 @@ def values_of(name: str, old: int) -> list[int]:
     return sorted(value for value in values if 0 <= value <= most and value != old)
 
 
-@pytest.mark.parametrize("where", ["first", "middle", "second last", "last"])
+@pytest.mark.parametrize("number", [0, MIDDLE, -2, -1])
 @pytest.mark.parametrize("name", [name for name in HEADER_FIELDS if name not in ("magic", "header_crc")])
 def test_a_forged_header_costs_its_block_alone(
-    tmp_path: Path, pristine: dict[str, bytes], runs: list[list[FrameBlock]], name: str, where: str
+    tmp_path: Path, pristine: Files, runs: Runs, name: str, number: int
 ) -> None:
-    number = {"first": 0, "middle": len(runs[0]) // 2, "second last": -2, "last": -1}[where]
     folder = copied(pristine, tmp_path / "whole")
     file, at = places(folder, 0)[number]
     old = HEADER.unpack_from(file.read_bytes(), at)[HEADER_FIELDS.index(name)]
@@ -123,7 +126,7 @@ def test_a_forged_header_costs_its_block_alone(
 @pytest.mark.parametrize("index", ["there", "lost"])
 @pytest.mark.parametrize("name", ["block_seq", "first_frame", "t0_ticks", "sweep", "run_id", "lost_before", "height"])
 def test_a_forged_header_in_the_middle_costs_its_block_alone_without_an_index_too(
-    tmp_path: Path, pristine: dict[str, bytes], runs: list[list[FrameBlock]], name: str, index: str
+    tmp_path: Path, pristine: Files, runs: Runs, name: str, index: str
 ) -> None:
     number = 3
     for value in (0, 1, 2**15, 2**16 - 1):
@@ -134,12 +137,11 @@ def test_a_forged_header_in_the_middle_costs_its_block_alone_without_an_index_to
         salvaged(folder, runs, runs[1][number])
 
 
-@pytest.mark.parametrize("where", ["first", "middle", "last"])
+@pytest.mark.parametrize("number", [0, MIDDLE, -1])
 @pytest.mark.parametrize("name", [name for name in TRAILER_FIELDS if name not in ("magic", "crc")])
 def test_a_forged_trailer_costs_its_block_alone(
-    tmp_path: Path, pristine: dict[str, bytes], runs: list[list[FrameBlock]], name: str, where: str
+    tmp_path: Path, pristine: Files, runs: Runs, name: str, number: int
 ) -> None:
-    number = {"first": 0, "middle": len(runs[0]) // 2, "last": -1}[where]
     most = most_of(TRAILER, TRAILER_FIELDS, name)
     for value in (0, 1, 700, most // 2, most):
         folder = copied(pristine, tmp_path / f"{value}")
@@ -153,7 +155,7 @@ def test_a_forged_trailer_costs_its_block_alone(
 @pytest.mark.parametrize("where", [0, 4, -1])
 @pytest.mark.parametrize("name", ["marks", "ticks", "x0", "y0", "line", "sweep"])
 def test_forged_records_of_frames_cost_their_block_at_most(
-    tmp_path: Path, pristine: dict[str, bytes], runs: list[list[FrameBlock]], name: str, where: int
+    tmp_path: Path, pristine: Files, runs: Runs, name: str, where: int
 ) -> None:
     def change(records: np.ndarray) -> None:  # type: ignore[type-arg]
         records[name][frames] = value
@@ -168,7 +170,7 @@ def test_forged_records_of_frames_cost_their_block_at_most(
 @pytest.mark.parametrize("payload_type", [REGISTER_ACK, IDLE])
 @pytest.mark.parametrize("size", [0, 1, 3000, 4000, 40_000, 2**31, 2**32 - 1])
 def test_a_control_block_with_a_strange_size_costs_itself(
-    tmp_path: Path, pristine: dict[str, bytes], runs: list[list[FrameBlock]], payload_type: int, size: int
+    tmp_path: Path, pristine: Files, runs: Runs, payload_type: int, size: int
 ) -> None:
     for number in (0, 3, -1):
         folder = copied(pristine, tmp_path / f"{number}")
@@ -181,9 +183,7 @@ def test_a_control_block_with_a_strange_size_costs_itself(
     "name",
     ["segment", "flags", "offset", "length", "run_id", "block_seq", "first_frame", "n_frames", "sweep", "t0_ticks"],
 )
-def test_a_forged_record_of_the_index_costs_nothing(
-    tmp_path: Path, pristine: dict[str, bytes], runs: list[list[FrameBlock]], name: str
-) -> None:
+def test_a_forged_record_of_the_index_costs_nothing(tmp_path: Path, pristine: Files, runs: Runs, name: str) -> None:
     for number in (0, 4, -1):
         for value in (0, 2, 3, 17, 4096, 65_536, 2**31):
             folder = copied(pristine, tmp_path / f"{number}-{value}")
@@ -195,11 +195,11 @@ def test_a_forged_record_of_the_index_costs_nothing(
             assert after.lost == 3
 
 
-def test_blocks_that_were_cut_away_at_either_end_are_gaps(tmp_path: Path, runs: list[list[FrameBlock]]) -> None:
+def test_blocks_that_were_cut_away_at_either_end_are_gaps(tmp_path: Path, runs: Runs) -> None:
     for number in (0, -1):
         folder = record(tmp_path / f"{number}", runs[:1])
         block = runs[0][number]
-        forge(places(folder, 0)[number], lambda data, at: data.__setitem__(at + 500, data[at + 500] ^ 1))
+        damage(places(folder, 0)[number])
         after = salvaged(folder, runs[:1], block)
         first, last = block.header.first_frame, block.header.first_frame + block.n_frames - 1
         assert after.gaps == [(0, first, last)]
@@ -210,13 +210,11 @@ def test_blocks_that_were_cut_away_at_either_end_are_gaps(tmp_path: Path, runs: 
 
 @pytest.mark.parametrize("index", ["there", "lost"])
 @pytest.mark.parametrize("end", ["first", "last"])
-def test_what_is_gone_at_an_end_of_a_part_is_a_gap(
-    tmp_path: Path, runs: list[list[FrameBlock]], end: str, index: str
-) -> None:
+def test_what_is_gone_at_an_end_of_a_part_is_a_gap(tmp_path: Path, runs: Runs, end: str, index: str) -> None:
     cut(record(tmp_path / "run", runs), tmp_path / "part", frames="20:120")
     part = tmp_path / "part"
     number = 0 if end == "first" else -1
-    forge(places(part, 0)[number], lambda data, at: data.__setitem__(at + 300, data[at + 300] ^ 1))
+    damage(places(part, 0)[number])
     if index == "lost":
         (part / INDEX_FILE).unlink()
     after = repair(part).after
@@ -227,11 +225,9 @@ def test_what_is_gone_at_an_end_of_a_part_is_a_gap(
     assert verify(part) == after
 
 
-def test_a_last_block_is_known_to_be_gone_by_what_the_device_delivered(
-    tmp_path: Path, runs: list[list[FrameBlock]]
-) -> None:
+def test_a_last_block_is_known_to_be_gone_by_what_the_device_delivered(tmp_path: Path, runs: Runs) -> None:
     folder = record(tmp_path, runs[:1])
-    forge(places(folder, 0)[-1], lambda data, at: data.__setitem__(at + 500, data[at + 500] ^ 1))
+    damage(places(folder, 0)[-1])
     (folder / INDEX_FILE).unlink()
     after = repair(folder).after
     last = runs[0][-1]
@@ -239,9 +235,7 @@ def test_a_last_block_is_known_to_be_gone_by_what_the_device_delivered(
 
 
 @pytest.mark.parametrize("counters", [{"delivered": -5, "lost": 0}, {"lost": 2**60}, {"delivered": 1e300}])
-def test_counters_that_cannot_be_are_left_out_and_said(
-    tmp_path: Path, runs: list[list[FrameBlock]], counters: dict[str, float]
-) -> None:
+def test_counters_that_cannot_be_are_left_out_and_said(tmp_path: Path, runs: Runs, counters: dict[str, float]) -> None:
     folder = record(tmp_path, runs, counters=counters)
     assert any("which cannot be" in line for line in verify(folder).problems)
     done = repair(folder)
@@ -250,16 +244,15 @@ def test_counters_that_cannot_be_are_left_out_and_said(
     assert "counters" not in (read_manifest(folder) or {})
 
 
-def test_a_damaged_compressed_segment_is_unpacked_and_kept(tmp_path: Path, runs: list[list[FrameBlock]]) -> None:
+def test_a_damaged_compressed_segment_is_unpacked_and_kept(tmp_path: Path, runs: Runs) -> None:
     pytest.importorskip("zstandard", reason="pip install 'spadrig[compress]'")
     from rig.recording.compress import compress
 
     folder = record(tmp_path, runs)
     compress(folder)
     file = folder / "frames-000000.spb.zst"
-    damaged = bytearray(file.read_bytes())
-    damaged[40] ^= 1
-    file.write_bytes(damaged)
+    flip(file, 40)
+    damaged = file.read_bytes()
     after = salvaged(folder, runs, runs[0][0])
     assert after.gaps[0] == (0, 0, 15)
     assert (folder / "frames-000000.torn.zst").read_bytes() == damaged

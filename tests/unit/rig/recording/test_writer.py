@@ -2,7 +2,7 @@
 
 import errno
 import os
-import time
+import threading
 import zlib
 from collections.abc import Callable
 from concurrent.futures import wait
@@ -22,7 +22,7 @@ from drivers.spb1 import BlockLayout, block_parts, parse_block, walk_blocks
 from rig.errors import RecordingError
 from rig.recording import segment as segment_module
 from rig.recording.segment import PAGE_BYTES, OpenSegment, paged
-from rig.recording.writer import RESERVE_FILE, SYNC_INTERVAL_S, Recording
+from rig.recording.writer import RESERVE_FILE, Recording
 from tests.campaigns.recording.strikes import HEIGHT, WIDTH, Striker, blocks_of
 
 BLOCKS = blocks_of(0, 0)
@@ -104,10 +104,17 @@ def test_what_was_recorded_is_synced_in_time_blocks_before_index(
     monkeypatch.setattr(segment_module, "_sync_data", partial(noted, sync))
     monkeypatch.setattr(os, "fsync", partial(noted, fsync))
     recording = Recording(tmp_path)
-    recording.also_sync(lambda: order.append("companion"))
+    synced = threading.Semaphore(0)
+
+    def companion() -> None:
+        order.append("companion")
+        synced.release()
+
+    recording.also_sync(companion)
     order.clear()
     recording.append(BLOCKS[0])
-    time.sleep(2 * SYNC_INTERVAL_S)
+    for _ in range(3):  # the first of them may have begun before
+        assert synced.acquire(timeout=60)
     names = [Path(one).name for one in order]
     begin = names.index(segment_name(0), names.index(tmp_path.name) + 1)
     assert names[begin : begin + 3] == [segment_name(0), INDEX_FILE, "companion"]
@@ -119,14 +126,17 @@ def test_what_was_recorded_is_synced_in_time_blocks_before_index(
 def test_all_blocks_before_one_that_could_not_be_written_count_and_none_behind_it(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, slow: int, submitted: int
 ) -> None:
-    write = OpenSegment.write
+    write, through = OpenSegment.write, threading.Semaphore(0)
 
     def failing(self: OpenSegment, block: FrameBlock, *others: object) -> None:
         if block.header.block_seq == slow:
-            time.sleep(0.05)  # the other writers are through by then
-        if block.header.block_seq == 7:
-            raise OSError(errno.EIO, "Input/output error")
-        write(self, block, *others)  # type: ignore[arg-type]
+            assert all(through.acquire(timeout=60) for _ in range(submitted - 1))
+        try:
+            if block.header.block_seq == 7:
+                raise OSError(errno.EIO, "Input/output error")
+            write(self, block, *others)  # type: ignore[arg-type]
+        finally:
+            through.release()
 
     monkeypatch.setattr(OpenSegment, "write", failing)
     recording = Recording(tmp_path, expected_bytes=sum(SIZES))
