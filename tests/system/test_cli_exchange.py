@@ -50,18 +50,3 @@ def test_foreign_frames_become_a_recording_that_verifies(rig: Rig, tmp_path: Pat
         assert verified.code == 0, verified.out + verified.err
     assert rig("export", "pi", "npy").code == 0
     assert np.load("pi-npy/frames.npy").shape == (3, 512, 64)
-
-
-def test_what_cannot_be_ends_with_code_2_and_writes_nothing(rig: Rig, tmp_path: Path) -> None:
-    (tmp_path / "short.bin").write_bytes(bytes(100))
-    for arguments in (
-        ("import", "swissspad2", tmp_path / "short.bin", "--out", "new"),
-        ("import", "photoncube", tmp_path / "absent.npy", "--out", "new"),
-        ("import", "photoncube", tmp_path, "--out", "new"),
-        ("export", tmp_path / "absent", "npy", "--out", "new"),
-        ("export", tmp_path, "png", "--out", "new"),
-    ):
-        ran = rig(*arguments)
-        assert ran.code == 2
-        assert len(ran.problems) == 1
-        assert not Path("new").exists()

@@ -154,6 +154,7 @@ def test_a_plan_or_option_that_does_not_fit_is_one_line(
 
 def test_missing_options_are_one_line(rig: Rig, wall: Path) -> None:
     refused(rig("reconstruct", wall / "cube.npy"), "--out")
+    refused(rig("reconstruct", wall / "cube.npy", "--out", "r"), "--plan and --calibration")
     refused(rig("reconstruct", "cubes.npy", "--out", "r"), "cubes.npy does not exist")
     (wall / "torn.npy").write_bytes((wall / "cube.npy").read_bytes()[:5000])
     refused(reconstruct(rig, wall, cube="torn.npy"), "is no whole .npy file")

@@ -70,21 +70,6 @@ def test_a_recording_can_be_reconstructed_otherwise(rig: Rig, small: Path) -> No
     assert np.nanmedian(near) == pytest.approx(np.nanmedian(depth) / 2, rel=0.1)
 
 
-def test_what_does_not_fit_a_recording_is_refused(rig: Rig, small: Path) -> None:
-    assert rig("scan", small, "--record", "--out", "run").code == 0
-    (Path("run") / "plan.yaml").rename("plan.yaml")
-    np.save("cube.npy", np.zeros((4, 8, 2), np.uint8))
-    for arguments, said in (
-        (("run",), "plan.yaml"),
-        (("run", "--plan", "plan.yaml"), "leave --plan out"),
-        (("cube.npy",), "--plan and --calibration"),
-    ):
-        ran = rig("reconstruct", *arguments, "--out", "out")
-        assert (ran.code, len(ran.problems)) == (2, 1)
-        assert said in ran.problems[0]
-    assert not Path("out").exists()
-
-
 def test_the_folder_of_a_recording_says_what_it_is_before_the_first_frame(
     rig: Rig, small: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:

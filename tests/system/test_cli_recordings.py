@@ -64,18 +64,6 @@ def test_the_maps_of_a_part_come_out_as_in_the_whole(rig: Rig, tmp_path: Path, e
             assert (again / name.format(made)).read_bytes() == (whole / name.format(was)).read_bytes()
 
 
-def test_mistakes_are_one_line(rig: Rig, run: Path, tmp_path: Path) -> None:
-    for arguments in (
-        ("verify", tmp_path),
-        ("repair", tmp_path / "nowhere"),
-        ("info", tmp_path),
-        ("cut", run, "--out", tmp_path / "part"),
-        ("cut", run, "--maps", "7", "--out", tmp_path / "part"),
-    ):
-        ran = rig(*arguments)
-        assert (ran.code, len(ran.problems), ran.err.count("\n")) == (2, 1, 1)
-
-
 def commands_of(folder: Path) -> list[tuple[object, ...]]:
     """All that take the folder of a recording."""
     return [
