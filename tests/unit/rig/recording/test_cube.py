@@ -153,6 +153,8 @@ WHOLE, ARCHIVE = bytes_of(np.save, PACKED), bytes_of(np.savez, a=PACKED, b=PACKE
         (PACKED[:5], "has 5 frames; 2 columns x 3 exposures need 6 a map"),
         (PACKED[:, :, :12], "the calibration's 100 x 24 sensor needs (frames, 24, 13)"),
         (PACKED[:, :, 0], "needs (frames, 24, 13)"),
+        (PACKED[0, 0, 0], "use the calibration made with this sensor"),
+        (PACKED.astype(complex), "use the calibration made with this sensor"),
         (UNPACKED[0], "make it with numpy.packbits(frames[None], axis=2)"),
         (3 * UNPACKED, "sums of several exposures are no frames"),
         (b"columns: 3", "is no whole .npy file"),
@@ -164,7 +166,7 @@ WHOLE, ARCHIVE = bytes_of(np.save, PACKED), bytes_of(np.savez, a=PACKED, b=PACKE
         (bytes_of(np.save, np.array([{}, []], object), allow_pickle=True), "holds Python objects of shape (2,)"),
         (None, "No such file or directory; check the path"),
     ],
-    ids=range(14),
+    ids=range(16),
 )
 def test_a_file_that_is_no_cube_is_told_why(tmp_path: Path, content: np.ndarray | bytes | None, said: str) -> None:
     if content is not None:
