@@ -102,7 +102,7 @@ def test_fewer_maps_are_the_first_ones_and_more_need_a_loop(lossy: Path, tmp_pat
     assert two.items() < arrays(lossy).items()
     with pytest.raises(UsageError, match=r"--maps is 4, .* holds 3; .*--loop"):
         api.replay(lossy, clock="max", maps=4)
-    api.replay(lossy, clock="max", loop=True, maps=5, out=tmp_path / "five")
+    api.replay(lossy, clock="max", loop=True, maps=5, save="all", out=tmp_path / "five")
     first = {name: data for name, data in arrays(tmp_path / "five").items() if "/00000" in name}
     assert first["depth/000003/"] == first["depth/000000/"]
     assert first["depth/000004/"] == first["depth/000001/"]
