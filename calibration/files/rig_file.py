@@ -111,18 +111,18 @@ def _build(parsed: CalibrationFile, folder: Path) -> RigModel:
             raise CalibrationError(
                 f"dark_rate {parsed.dark_rate} holds {dark_rate.dtype}; it must be float32, counts/s"
             )
-    speed = parsed.speed_range_per_s
+    speed, identity = parsed.speed_range_per_s, parsed.identity
     model = RigModel(
         camera=build_camera(parsed.camera),
         scanner=_build_scanner(parsed, folder),
-        lag_s=Lag(parsed.lag_s.forward, parsed.lag_s.backward),
+        lag_s=Lag(**parsed.lag_s.model_dump()),
         speed_range_per_s=None if speed is None else (speed[0], speed[1]),
         source_m=None if parsed.source_m is None else np.array(parsed.source_m, dtype=np.float64),
         defects=defects,
         provenance=parsed.provenance.model_dump(exclude_unset=True),
         dark_rate_per_s=dark_rate,
         covariance=_build_covariance(parsed, folder),
-        identity=_build_identity(parsed),
+        identity=None if identity is None else Identity(**identity.model_dump() | {"reasons": tuple(identity.reasons)}),
         **{name: getattr(parsed, name) for name in _PLAIN},
     )
     if model.covariance is not None:
@@ -148,11 +148,6 @@ def _build_covariance(parsed: CalibrationFile, folder: Path) -> Covariance | Non
     return Covariance(tuple(section.names), matrix)
 
 
-def _build_identity(parsed: CalibrationFile) -> Identity | None:
-    section = parsed.identity
-    return None if section is None else Identity(**section.model_dump() | {"reasons": tuple(section.reasons)})
-
-
 def _build_scanner(parsed: CalibrationFile, folder: Path) -> Scanner:
     if parsed.planes is not None:
         rows = _plane_rows(parsed.planes, folder)
@@ -163,16 +158,7 @@ def _build_scanner(parsed: CalibrationFile, folder: Path) -> Scanner:
         return PlaneTable(command=np.array(table.command, dtype=np.float64), rows=_plane_rows(table.planes, folder))
     pivot = parsed.scanner.pivot
     assert pivot is not None  # ScannerSection admits exactly one of the two
-    return PivotScanner(
-        axis_point_m=np.array(pivot.axis_point_m),
-        axis_direction=np.array(pivot.axis_direction),
-        zero_normal=np.array(pivot.zero_normal),
-        angle_rad=np.array(pivot.angle_rad),
-        command_range=(pivot.command_range[0], pivot.command_range[1]),
-        offset_m=np.array(pivot.offset_m, dtype=np.float64),
-        cone_rad=pivot.cone_rad,
-        bow_per_rad=pivot.bow_per_rad,
-    )
+    return PivotScanner(**pivot.model_dump())
 
 
 def _plane_rows(planes: PlaneRows, folder: Path) -> NDArray[np.float64]:
@@ -204,17 +190,8 @@ def _scanner_content(scanner: Scanner) -> dict[str, Any]:
     if isinstance(scanner, PlaneTable):
         return {"table": {"command": scanner.command.tolist(), "planes": scanner.rows.tolist()}}
     if isinstance(scanner, PivotScanner):
-        pivot: dict[str, Any] = {
-            "axis_point_m": scanner.axis_point_m.tolist(),
-            "axis_direction": scanner.axis_direction.tolist(),
-            "zero_normal": scanner.zero_normal.tolist(),
-            "angle_rad": scanner.angle_rad.tolist(),
-            "command_range": list(scanner.command_range),
-        }
-        if scanner.offset_m.size:
-            pivot["offset_m"] = scanner.offset_m.tolist()
-        pivot |= {name: float(getattr(scanner, name)) for name in ("cone_rad", "bow_per_rad") if getattr(scanner, name)}
-        return {"pivot": pivot}
+        pivot = {name: np.asarray(value).tolist() for name, value in asdict(scanner).items()}
+        return {"pivot": {name: value for name, value in pivot.items() if value not in ([], 0.0)}}
     raise CalibrationError(f"a scanner of type {type(scanner).__name__} has no form in a calibration file")
 
 

@@ -38,7 +38,6 @@ def fit_rig(
     hold_camera: bool = False,
     known: Covariance | None = None,
     start: RigModel | None = None,
-    distortion_terms: int = 5,
 ) -> RigFit:
     """Fit a rig to views of a board; size: (width, height) of the picture.
 
@@ -52,7 +51,7 @@ def fit_rig(
     if not shown:
         check_views(views, ())
     camera = camera.camera if isinstance(camera, CameraFit) else camera
-    camera = _first_camera(shown, board, size, camera, start, distortion_terms)
+    camera = _first_camera(shown, board, size, camera, start)
     poses = [_pose_of(view, board, camera) for view in shown]
     sightings = tuple(sighting(view, board, camera, pose) for view, pose in zip(shown, poses, strict=True))
     check_views(views, sightings)
@@ -83,17 +82,12 @@ def fit_rig(
 
 
 def _first_camera(
-    views: Sequence[View],
-    board: Board,
-    size: tuple[int, int],
-    camera: Camera | None,
-    start: RigModel | None,
-    terms: int,
+    views: Sequence[View], board: Board, size: tuple[int, int], camera: Camera | None, start: RigModel | None
 ) -> Camera:
     if camera is None and start is not None:
         camera = start.camera
     if camera is None:
-        camera = fit_camera(views, board, size, distortion_terms=terms).camera
+        camera = fit_camera(views, board, size).camera
     if (camera.width, camera.height) != size:
         raise CalibrationError(
             f"camera is one of {camera.width} x {camera.height} pixels, the pictures have {size[0]} x {size[1]}; give "

@@ -21,6 +21,7 @@ from numpy.typing import NDArray
 from calibration.model.camera import Camera, LensModel
 from calibration.model.light_sheet import fan_origin
 from calibration.model.parameters import AXIS, DISTORTION, MATRIX, TIMES
+from calibration.model.rig_model import RigModel
 from calibration.model.scanner import PivotScanner
 from calibration.views import BoardPose
 
@@ -167,10 +168,14 @@ def ray_columns(camera: Camera, terms: Terms, u: Array, v: Array, by_u: Array, b
 
 
 def passage_rows(
-    camera: Camera, terms: Terms, scanner: PivotScanner, source_m: Array | None, timing: Array, pose: BoardPose,
-    rays: Array, command: Array, y_px: Array, velocity_per_s: Array,
+    model: RigModel, terms: Terms, timing: Array, pose: BoardPose, rays: Array, command: Array, y_px: Array,
+    velocity_per_s: Array,
 ) -> Rows:  # fmt: skip
-    """Rows of passages with the rays (2, m) of their pixels; residuals in units of the command."""
+    """Rows of passages with the rays (2, m) of their pixels; residuals in units of the command.
+
+    timing: (3,) lags up and down and row delay, in place of the model's.
+    """
+    assert isinstance(model.scanner, PivotScanner)
     u, v = rays
     ray = np.stack([u, v, np.ones_like(u)], axis=-1)
     board = pose.matrix[:, 2]
@@ -178,10 +183,10 @@ def passage_rows(
     depth = (board @ pose.position_m) / facing
     points = depth[:, None] * ray
     mirror = mirror_command(timing, command, y_px, velocity_per_s)
-    sheet = sheet_rows(scanner, source_m, points, mirror, y_px, velocity_per_s)
+    sheet = sheet_rows(model.scanner, model.source_m, points, mirror, y_px, velocity_per_s)
     slant = np.sum(sheet.normal * ray, axis=1) / facing
     by_ray = depth[:, None] * (sheet.normal - slant[:, None] * board)
-    shared = np.hstack([ray_columns(camera, terms, u, v, by_ray[:, 0], by_ray[:, 1]), sheet.columns])
+    shared = np.hstack([ray_columns(model.camera, terms, u, v, by_ray[:, 0], by_ray[:, 1]), sheet.columns])
     turned = slant[:, None] * np.cross(board, pose.position_m - points)
     moved = slant[:, None] * board
     each = sheet.per_command[:, None]

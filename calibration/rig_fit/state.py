@@ -149,11 +149,10 @@ class RigState:
 
     def rows(self, view: int, seen: Sighting, terms: Terms) -> tuple[Rows, Rows]:
         """Residuals and derivatives of one view: of its corners (pixels) and of its passages (command units)."""
-        camera, pose = self.model.camera, self.poses[view]
-        corners = corner_rows(camera, terms, pose, seen.corners_m, seen.corner_px)
+        pose = self.poses[view]
+        corners = corner_rows(self.model.camera, terms, pose, seen.corners_m, seen.corner_px)
         passages = passage_rows(
-            camera, terms, self.scanner, self.model.source_m, self.timing, pose, self.rays[view], seen.command,
-            seen.y_px, seen.velocity_per_s,
+            self.model, terms, self.timing, pose, self.rays[view], seen.command, seen.y_px, seen.velocity_per_s,
         )  # fmt: skip
         return corners, passages
 

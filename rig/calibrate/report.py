@@ -48,9 +48,10 @@ def planes_report(
     """Report on a calibration of camera and planes. about: rows of `subject`, as in the other reports."""
     by_name = {view.name: view for view in views}
     used = [by_name[name] for name in fit.views]
+    planes = plane_residuals(judged.waves, judged.residuals, judged.sensitivity.per_command_m, judged.asked.at_m)
     sections = [
         *camera_sections(fit.model.camera, used, fit.corner_residual_px),
-        planes_section(judged),
+        ReportSection("Residuals of the planes", planes),
         uncertainty_section(judged.uncertainty),
         _views_section(fit, judged),
         _decisions_section(fit),
@@ -68,12 +69,6 @@ def camera_sections(camera: Camera, views: Sequence[View], residuals_px: Sequenc
         ReportSection("Coverage", picture(coverage, "Corners of all views, each named at its first corner.")),
         ReportSection("Residuals of the corners", picture(arrows, f"Drawn {times} times longer than they are.")),
     ]
-
-
-def planes_section(judged: JudgedRig) -> ReportSection:
-    """Section with the residuals of the planes."""
-    chart = plane_residuals(judged.waves, judged.residuals, judged.sensitivity.per_command_m, judged.asked.at_m)
-    return ReportSection("Residuals of the planes", chart)
 
 
 def uncertainty_section(uncertainty: DepthUncertainty) -> ReportSection:
@@ -222,10 +217,14 @@ def dark_rate_picture(pixels: PixelMap) -> NDArray[np.uint8]:
     return coloured
 
 
-def pixel_sections(
-    pixels: PixelMap, drift: PixelDrift | None = None, against: PixelVersion | None = None
-) -> list[ReportSection]:
-    """Sections with the map, the distribution of the rates beside the older one, and what changed."""
+def pixel_page(
+    pixels: PixelMap,
+    rows: Sequence[tuple[str, str]],
+    verdict: Verdict,
+    drift: PixelDrift | None,
+    against: PixelVersion | None,
+) -> str:
+    """Report on a map of the pixels: the map, the distribution of the rates beside the older one, and what changed."""
     middle = pixels.ordinary_per_s
     fastest = float(np.nanmax(pixels.rate_per_s))
     caption = f"Dark rate of each pixel, {digits(middle / 3)} to {digits(fastest)} counts/s on a logarithmic scale."
@@ -234,14 +233,15 @@ def pixel_sections(
         ReportSection("Distribution", rate_chart(pixels, None if against is None else against.pixels)),
     ]
     if drift is not None:
-        rows = [
+        changes = [
             (what, ", ".join(f"({row}, {x})" for row, x in places[:_MOST_LISTED].tolist()) or "none")
             for what, places in (("became hot", drift.became_hot), ("became dead", drift.became_dead),
                                  ("recovered", drift.recovered))
         ]  # fmt: skip
         said = paragraph(f"Row and column of up to {_MOST_LISTED} pixels each.", small=True)
-        sections.append(ReportSection("Changed since the last map", table(("", ""), rows) + said))
-    return sections
+        sections.append(ReportSection("Changed since the last map", table(("", ""), changes) + said))
+    line = f"{int(pixels.defects.sum())} of {pixels.defects.size} pixels are not to be used."
+    return page("Pixels", verdict, line, rows, sections)
 
 
 def rate_chart(pixels: PixelMap, older: PixelMap | None = None) -> str:
@@ -264,15 +264,3 @@ def rate_chart(pixels: PixelMap, older: PixelMap | None = None) -> str:
     series.append(Series("hot from here on", _LIMIT, [(limit, 1.0), (limit, tallest)], dashed=True, marker=False))
     panel = Panel("", "dark rate, counts/s", "pixels", series)
     return chart_svg([panel], title="Pixels by dark rate", across=1)
-
-
-def pixel_page(
-    pixels: PixelMap,
-    rows: Sequence[tuple[str, str]],
-    verdict: Verdict,
-    drift: PixelDrift | None,
-    against: PixelVersion | None,
-) -> str:
-    """Report on a map of the pixels."""
-    line = f"{int(pixels.defects.sum())} of {pixels.defects.size} pixels are not to be used."
-    return page("Pixels", verdict, line, rows, pixel_sections(pixels, drift, against))

@@ -12,7 +12,7 @@ from one frame to the next makes these fewer, by as much as the frame after the 
 
 import math
 from collections.abc import Sequence
-from dataclasses import dataclass, replace
+from dataclasses import asdict, dataclass, replace
 from datetime import UTC, datetime
 from pathlib import Path
 from tempfile import TemporaryDirectory
@@ -203,16 +203,7 @@ def _summary(fit: SyncFit, gate: GateDelay | None, verdict: Verdict, truth: RigM
         "chi2": fit.chi2,
         "freedom": fit.dof,
         "noise": fit.noise,
-        "sweeps": [
-            {
-                "direction": sweep.direction,
-                "speed_per_s": sweep.speed_per_s,
-                "lag_s": sweep.lag_s,
-                "sd_s": sweep.sd_s,
-                "passages": sweep.passages,
-            }
-            for sweep in fit.sweeps
-        ],
+        "sweeps": [asdict(sweep) for sweep in fit.sweeps],
         "truth": None if truth is None else {"lag_s": truth.lag_s._asdict(), "row_delay_s": truth.row_delay_s},
     }
 
