@@ -36,12 +36,11 @@ LEFT_OUT_NATS = 14.0  # a hypothesis this far below the best after the first pas
 class Genie:
     """A genie of `labels` hypotheses per pixel (1: integer), refined over `mean_reach` labels on each side.
 
-    albedo_bins: of the histogram (logarithmic); profile_reach: px of the stripe on each side.
+    profile_reach: px of the stripe on each side.
     """
 
     labels: int = 1
     mean_reach: int = 2
-    albedo_bins: int = ALBEDO_BINS
     profile_reach: int = 2
 
     def estimate(
@@ -49,7 +48,7 @@ class Genie:
     ) -> NDArray[np.float32]:
         """Stripe position (H, columns) in px from counts (columns, H, W); NaN off `rows` or with an empty window."""
         g, light = point.geometry, point.light
-        strengths, weights = albedo_histogram(point, self.albedo_bins)
+        strengths, weights = albedo_histogram(point, ALBEDO_BINS)
         x_est = np.full((g.height, g.columns), np.nan, np.float32)
         wanted = np.arange(g.height)[rows]
         table = log_expm1_table()

@@ -253,20 +253,20 @@ def dark_map(light: Light, shape: tuple[int, int]) -> NDArray[np.float64]:
     return np.asarray(light.ambient * times)
 
 
-def mean_free_haze(geometry: Geometry, extinction_per_m: float, depth_m: float = HAZE_REFERENCE_M) -> float:
-    """Mean over rows and columns of the unscaled haze at `depth_m`, where that point of the sheet is in the picture."""
+def mean_free_haze(geometry: Geometry, extinction_per_m: float) -> float:
+    """Mean over rows and columns of the unscaled haze at 1.5 m, where that point of the sheet is in the picture."""
     total, number = 0.0, 0
     for c in range(geometry.columns):
-        gap = geometry.inverse_depth(c) - 1 / depth_m
+        gap = geometry.inverse_depth(c) - 1 / HAZE_REFERENCE_M
         x = np.abs(gap).argmin(axis=1)
         rows = np.flatnonzero((gap.min(axis=1) < 0) & (gap.max(axis=1) > 0))
         for y in rows:
             total += kernels.haze_at(
-                geometry.u[y, x[y]], geometry.v[y, x[y]], 1 / depth_m, geometry.scanner_m, extinction_per_m
+                geometry.u[y, x[y]], geometry.v[y, x[y]], 1 / HAZE_REFERENCE_M, geometry.scanner_m, extinction_per_m
             )
         number += rows.size
     if number == 0:
-        raise ValueError(f"no plane passes the picture at z = {depth_m:g} m")
+        raise ValueError(f"no plane passes the picture at z = {HAZE_REFERENCE_M:g} m")
     return total / number
 
 
