@@ -289,8 +289,8 @@ def soak(options: SoakOptions, progress: Callable[[int, int], None] | None = Non
     """
     if not (options.seconds > 0 and options.slow_s >= 0):
         raise UsageError(f"a soak of {options.seconds:g} s, slowed by {options.slow_s:g} s; ask for more than 0 s")
-    with _looped_rig(options) as (rig, plan, spad), _quiet_sweeps():
-        return _run(rig, plan, spad, options, progress)
+    with _looped_rig(options) as (rig, spad), _quiet_sweeps():
+        return _run(rig, spad, options, progress)
 
 
 @contextmanager
@@ -306,8 +306,8 @@ def _quiet_sweeps() -> Iterator[None]:
 
 
 @contextmanager
-def _looped_rig(options: SoakOptions) -> Iterator[tuple[OpenRig, ScanPlan, LoopedSpad]]:
-    """The simulated rig, its plan, and in its SPAD's place one that plays what that recorded."""
+def _looped_rig(options: SoakOptions) -> Iterator[tuple[OpenRig, LoopedSpad]]:
+    """The simulated rig, and in its SPAD's place one that plays what that recorded."""
     # Clocks that agree to the last bit: the loop then closes without a jump.
     settings: dict[str, object] = {"scanner.clock_error": "0 ppm", "scan.depth_range": DEPTH_RANGE}
     if options.window:
@@ -316,11 +316,8 @@ def _looped_rig(options: SoakOptions) -> Iterator[tuple[OpenRig, ScanPlan, Loope
         info = replace(rig.spad.info, model="looped", can_wait=False)
         require_policy(options.policy, info)
         plan, timing = prepare(rig)
-        spad = LoopedSpad(_recorded(rig, plan), info, timing)
-        looped = replace(rig, spad=spad)
-        plan, _ = prepare(looped)
-        with spad:
-            yield looped, plan, spad
+        with LoopedSpad(_recorded(rig, plan, timing), info, timing) as spad:
+            yield replace(rig, spad=spad), spad
 
 
 def _window_bytes_per_s(settings: dict[str, object]) -> float:
@@ -330,9 +327,8 @@ def _window_bytes_per_s(settings: dict[str, object]) -> float:
     return LINK_MARGIN * float(plan.frame_rate_hz) * frame_bytes(plan.windows.width_px, plan.rows)
 
 
-def _recorded(rig: OpenRig, plan: ScanPlan) -> Loop:
+def _recorded(rig: OpenRig, plan: ScanPlan, timing: SpadTiming) -> Loop:
     """Sweeps of the simulated rig that end where they began, to the frame."""
-    _, timing = prepare(rig)
     whole = plan.frames_per_sweep.denominator
     sweeps = math.ceil(math.ceil(LOOP_S / float(plan.sweep_s)) / whole) * whole
     with tempfile.TemporaryDirectory(prefix="spadrig-bench-") as folder:
@@ -354,13 +350,9 @@ def _reconstructor(rig: OpenRig, plan: ScanPlan, estimator: str, threads: int) -
 
 
 def _run(
-    rig: OpenRig,
-    plan: ScanPlan,
-    spad: LoopedSpad,
-    options: SoakOptions,
-    progress: Callable[[int, int], None] | None,
+    rig: OpenRig, spad: LoopedSpad, options: SoakOptions, progress: Callable[[int, int], None] | None
 ) -> SoakReport:
-    _, timing = prepare(rig)
+    plan, timing = prepare(rig)
     maps = max(2, 1 + math.ceil(options.seconds / float(plan.sweep_s)))  # the first one is taken alone
     threads = options.threads or os.cpu_count() or 1
     warm_up("likelihood", "none", plan.exposures, dark=True)

@@ -41,18 +41,6 @@ ConfigArgument = Annotated[
         autocompletion=one_of(rig_names),
     ),
 ]
-SceneOption = Annotated[
-    str | None,
-    typer.Option(
-        "--scene",
-        help="a bundled scene, a scene file or a folder (simulated rigs)",
-        show_default=False,
-        autocompletion=one_of(scene_names),
-    ),
-]
-OutOption = Annotated[
-    Path | None, typer.Option("--out", help="folder to write, new or empty", show_default="runs/DATE-TIME")
-]
 JsonOption = Annotated[bool, typer.Option("--json", help="print exactly one JSON object to stdout, errors too")]
 
 

@@ -9,14 +9,13 @@ import typer
 from rig.cli.command import (
     ConfigArgument,
     JsonOption,
-    SceneOption,
     asks,
     command,
     print_json,
     report,
     say_space,
 )
-from rig.cli.completion import one_of, rig_names
+from rig.cli.completion import one_of, rig_names, scene_names
 from rig.cli.progress import progress
 from rig.requests import ReconstructRequest, ScanRequest
 
@@ -105,7 +104,15 @@ def effects_command(
             autocompletion=one_of(rig_names),
         ),
     ] = None,
-    scene: SceneOption = None,
+    scene: Annotated[
+        str | None,
+        typer.Option(
+            "--scene",
+            help="a bundled scene, a scene file or a folder",
+            show_default="the config's",
+            autocompletion=one_of(scene_names),
+        ),
+    ] = None,
     trials: Annotated[
         bool, typer.Option(help="measure by how much each effect changes the stripe error, in short scans")
     ] = True,

@@ -68,9 +68,20 @@ def test_a_calibration_that_says_nothing_of_its_rig_is_used_unchecked(tmp_path: 
     assert manifest(tmp_path / "run")["calibration"]["check"] == "unchecked"
 
 
-def test_other_settings_of_the_scan_need_no_other_calibration(tmp_path: Path) -> None:
-    scan = {"columns": 60, "exposures": 6, "command_range": [-0.5, 0.5], "bidirectional": True, "power": "10 mW"}
-    api.scan(calibrated(tmp_path, scan=scan, laser={"max_power": "20 mW"}, name="by another name"))
+OTHER_SCAN = {"columns": 60, "exposures": 6, "command_range": [-0.5, 0.5], "bidirectional": True, "power": "10 mW"}
+
+
+@pytest.mark.parametrize(
+    ("change", "sections"),
+    [
+        (lambda identity: identity, {"scan": OTHER_SCAN, "laser": {"max_power": "20 mW"}, "name": "by another name"}),
+        (dated(20), {"calibration_max_age": "30 d"}),
+        (lambda identity: replace(identity, serials={"scanner": "SIM-MIRROR-0001"}), {}),
+    ],
+    ids=["other settings of the scan", "within its age", "a device without serial number"],
+)
+def test_a_calibration_is_used_with(tmp_path: Path, change: Change, sections: dict[str, Any]) -> None:
+    api.scan(calibrated(tmp_path, change, **sections))
 
 
 @pytest.mark.parametrize(
@@ -168,10 +179,6 @@ def test_views_of_one_rig_are_told_from_those_of_another() -> None:
     assert not same_rig(mine, replace(mine, serials={}))
 
 
-def test_a_calibration_within_its_age_is_used(tmp_path: Path) -> None:
-    api.scan(calibrated(tmp_path, dated(20), calibration_max_age="30 d"))
-
-
 def test_all_that_is_wrong_is_said_at_once(tmp_path: Path) -> None:
     rig = calibrated(tmp_path, failed, spad={"serial": "A"}, scanner={"serial": "B"})
     with pytest.raises(UsageError) as refused:
@@ -257,8 +264,3 @@ def test_doctor_says_whether_the_calibration_is_of_this_rig(tmp_path: Path) -> N
         found = {finding.name: finding for finding in examine(api.configure(rig), tmp_path)}["calibration"]
         assert found.ok is ok
         assert says in found.text
-
-
-def test_devices_without_a_serial_number_are_not_compared_by_it(tmp_path: Path) -> None:
-    rig = calibrated(tmp_path, lambda identity: replace(identity, serials={"scanner": "SIM-MIRROR-0001"}))
-    api.scan(rig)
