@@ -53,7 +53,7 @@ class JudgedRig:
 
 
 def goal(
-    worth: Sensitivity, accuracy_m: float | None, at_m: float = AT_M, stated_baseline_m: float | None = None
+    worth: Sensitivity, accuracy_m: float | None = None, at_m: float = AT_M, stated_baseline_m: float | None = None
 ) -> AccuracyGoal:
     """The accuracy that a calibration is held to. accuracy_m: sd of depth at `at_m`, for which `worth` is; None: that
     of ACCURACY_PX.
