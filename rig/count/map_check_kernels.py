@@ -6,7 +6,11 @@ With n ones of a pixel in K frames and r its usual rate, a line of counts k is t
 
 and the light in common with a partner at pixel distance s is sum over j of e_0(j) (sum of e_k over j + s - LAGS_PX to
 j + s + LAGS_PX, less the mean of the same BESIDE_PX to either side). Smoothness is the sum of products of neighbouring
-pixels. Lines are int32 (3, points, window), results float64 (points, 3 + orders).
+pixels. Lines are int32 (partners, points, window), results float64 (points, 3 + orders).
+
+Light of all widths, haze above all, is compared by sums of BIN_PX of z, less the line's mean of z:
+
+    a_k(i) = sum over bin i of (z - mean of z),    shared(partner, o) = sum over points and i of a_0(i) a_k(i + s + o)
 """
 
 from typing import Final
@@ -17,6 +21,10 @@ from numpy.typing import NDArray
 
 from rig.geometry.windows import MARGIN_PX, WORD_PX
 
+BIN_PX: Final = 4
+"""Pixels that `follow_lines` adds up: light of all widths is compared, and lines are known no better."""
+SPAN: Final = 26
+"""Bins to either side of the expected place at which light is looked for."""
 LAGS_PX: Final = 2
 """Pixels by which a surface may lean between the lines that are compared."""
 
@@ -53,10 +61,10 @@ def compare_lines(
 ) -> None:
     """Compare points first..last-1; out: (points, 3 + orders).
 
-    lines: (3, points, window) counts of each point's line and its two partners; exposures, row, column: (3, points).
-    shift: (2, points), pixels from a stripe of the line to the partner's. usual: (rows, width), mean ones per exposure
-    of each pixel over the sweep, NaN where it is not to be used; least: what a lower one counts as. orders: (orders,
-    WORD_PX), pixels of each word.
+    lines: (3, points, window) counts of each point's line and its first two partners; exposures, row, column: (3 or
+    more, points). shift: (2 or more, points), pixels from a stripe of the line to the partner's. usual: (rows, width),
+    mean ones per exposure of each pixel over the sweep, NaN where it is not to be used; least: what a lower one counts
+    as. orders: (orders, WORD_PX), pixels of each word.
 
     Out come the light in common with each partner and by how much the sum of products of neighbouring pixels grows when
     they are taken in each order. Light in common is a product of line-shaped excess over what is usual for each pixel,
@@ -121,3 +129,88 @@ def compare_lines(
             for j in range(window - 1):
                 grows += pixels[1, j] * pixels[1, j + 1] - pixels[0, j] * pixels[0, j + 1]
             out[i, 3 + order] = grows
+
+
+@numba.njit(cache=True, nogil=True)
+def follow_lines(
+    lines: NDArray[np.int32],
+    exposures: NDArray[np.int32],
+    row: NDArray[np.int32],
+    column: NDArray[np.int32],
+    shift: NDArray[np.int32],
+    x0: NDArray[np.int32],
+    x_lo: NDArray[np.int32],
+    x_hi: NDArray[np.int32],
+    usual: NDArray[np.float32],
+    weight: NDArray[np.float32],
+    rows: NDArray[np.float64],
+    shared: NDArray[np.float64],
+    noise: NDArray[np.float64],
+) -> None:
+    """Add up what points have in common with their partners, by how far from the expected place it is.
+
+    lines to x_hi: as for `compare_lines`. usual, weight: (rows, width), mean ones r per exposure of each pixel over the
+    sweep and 1 / sqrt(r); both 0 where a pixel is not to be used. rows: (partner columns, 5), light in common with the
+    next row, 2 bins to either side of where it is expected, of those points whose partner column has frames. shared:
+    (partner columns, 2 SPAN + 1), that with the partner column, from SPAN bins short of where the planes put it to as
+    many beyond. noise: (partner columns,), the variance of each of these sums.
+    """
+    window = lines.shape[2]
+    bins = window // BIN_PX
+    margin = bins + SPAN
+    z = np.zeros(window)
+    light = np.zeros((lines.shape[0], bins + 2 * margin))  # with room for every place that is looked at
+    power = np.zeros(lines.shape[0])
+    for i in range(lines.shape[1]):
+        for k in range(lines.shape[0]):
+            light[k] = 0.0
+            power[k] = 0.0
+            if exposures[k, i] == 0:
+                continue
+            y, c = row[k, i], column[k, i]
+            low = max(x_lo[y, c] - MARGIN_PX, x0[c], 0) - x0[c]
+            high = min(x_hi[y, c] + MARGIN_PX, x0[c] + window - 1, usual.shape[1] - 1) - x0[c]
+            scale, total, known = 1.0 / np.sqrt(exposures[k, i]), 0.0, 0
+            for j in range(low, high + 1):
+                x = x0[c] + j
+                z[j] = (lines[k, i, j] - exposures[k, i] * usual[y, x]) * weight[y, x] * scale
+                total += z[j]
+                known += weight[y, x] > 0.0
+            mean = total / max(known, 1)
+            for j in range(low, high + 1):
+                if weight[y, x0[c] + j] > 0.0:
+                    light[k, margin + j // BIN_PX] += z[j] - mean
+            for b in range(margin, margin + bins):
+                power[k] += light[k, b] * light[k, b]
+        for partner in range(rows.shape[0]):
+            k = partner + 2
+            if exposures[0, i] == 0 or exposures[1, i] == 0 or exposures[k, i] == 0:
+                continue
+            noise[partner] += power[0] * power[k] / bins
+            _add_products(light[0], light[1], margin, _in_bins(shift[0, i]), rows[partner])
+            to = _in_bins(shift[k - 1, i] + x0[column[0, i]] - x0[column[k, i]])
+            # Along the motion, whichever way that is.
+            _add_products(
+                light[0], light[k], margin, to, shared[partner] if shift[k - 1, i] >= 0 else shared[partner, ::-1]
+            )
+
+
+@numba.njit(inline="always")
+def _in_bins(px):  # type: ignore[no-untyped-def]
+    return int(np.floor(px / BIN_PX + 0.5))
+
+
+@numba.njit
+def _add_products(a, b, margin, to, out):  # type: ignore[no-untyped-def]
+    """Add to out[o + reach] the sum over i of a(i) b(i + to + o), for o from -reach to reach.
+
+    a, b: lines between margins of zeros.
+    """
+    reach = out.shape[0] // 2
+    bins = a.shape[0] - 2 * margin
+    if abs(to) > bins:
+        return
+    for i in range(margin, margin + bins):
+        if a[i] != 0.0:
+            for o in range(out.shape[0]):
+                out[o] += a[i] * b[i + to + o - reach]

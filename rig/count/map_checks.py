@@ -1,12 +1,12 @@
 """Does a map's own light bear it out? Checks of counts and answers that no scene fails, whatever it looks like.
 
-They ask a few thousand points, each a row and column with two partners: the next row, and the column by whose time the
-line has moved about six pixels. A stripe is seen in all three, at places that the planes tell, and no noise is.
+They ask a few thousand points, each a row and column with partners: the next row, and four columns by whose times the
+line has moved 8 to 64 px. A stripe is seen at all of them, at places that the planes tell, and no noise is.
 
 - Pixels of a row: light falls on neighbours alike, so that no other order of the pixels is smoother than the right one.
 - Rows: a line of light stands where it stands on the next row.
 - Frames: those of one column show the line in one place, pixel by pixel, as two rows do.
-- Columns: it moves from column to column as the planes do.
+- Columns: it moves from column to column as the planes do; so does all other light of the sweep, haze above all.
 - Answers of estimators that know their confidence: an answer that is sure, 0.9 for one place of some 150, rests on
   seven nats. At most 7 x 7 lines have a say in it, so that each brings a seventh at least, which is a mean of half a
   standard deviation: so much more light must stand at the answers than behind them, on lines that did not give them.
@@ -32,8 +32,13 @@ VOLUME_POINTS: Final = 8192
 """Points of a sweep whose counts are kept."""
 FEWEST_POINTS: Final = 128
 """Points below which a check says nothing."""
-APART_PX: Final = 6.0
-"""The line's motion between a point's column and its partner: more than the line is wide."""
+APART_PX: Final = (8.0, 16.0, 32.0, 64.0)
+"""The line's motion from a point's column to its partners: the least is more than the line is wide, the greatest as
+much as haze is."""
+NEAREST: Final = 3
+"""A point's own line, that of the next row and that of the nearest partner column: where narrow light is looked for."""
+FOLLOWED: Final = 256
+"""Points whose light of all widths is followed through the columns: haze is bright."""
 LIMIT: Final = 4.0
 """Standard deviations: one false alarm in 30 000 checks."""
 FEWEST_ROWS: Final = 24
@@ -41,6 +46,12 @@ FEWEST_ROWS: Final = 24
 LEAST_FOLLOWING: Final = 0.25
 """Least light in common with the other column, over that with the next row. Scenes have 0.8 and more, clutter such as
 fences half of it; columns that do not follow one another have none."""
+MOST_AMISS: Final = -0.45
+"""Light in common with the partner columns at the best of all wrong places, less that at the best of those where the
+planes put it, over that with the next row; the sum over the four partners. Maps have -0.65 in dense fog, whose haze is
+wider than the line moves, to -3 in clear air; shuffled or reversed columns have -0.4 to 2."""
+LUCK: Final = 2.5
+"""Standard deviations by which the best of some fifty wrong places stands out where there is noise alone."""
 SATURATED: Final = 0.99
 """Share of ones among all pixels and frames from which on a map is full."""
 LEAST_WIDTH_PX: Final = 32
@@ -66,9 +77,10 @@ ORDERS: Final = {
 
 
 class Points(NamedTuple):
-    """Rows and columns that are looked at, with their partners: on the next row, and a few columns on.
+    """Rows and columns that are looked at, with their partners: on the next row, and APART_PX on.
 
-    row, column: int32 (3, points). shift: int32 (2, points), pixels from a stripe to the partner's, on one surface.
+    row, column: int32 (2 + partner columns, points). shift: int32 (1 + partner columns, points), pixels from a stripe
+    to the partner's, on one surface.
     """
 
     row: NDArray[np.int32]
@@ -82,14 +94,16 @@ def check_points(geometry: SweepGeometry, most: int = POINTS) -> Points:
     steps = np.abs(np.diff(reference, axis=1))
     step_px = float(np.median(steps)) if steps.size else 0.0
     columns = geometry.columns
-    apart = min(max(round(APART_PX / step_px), 1), max(columns - 1, 1)) if step_px > 0 else 1
+    most_apart = max(columns // 4, 1)
+    apart = [min(max(round(px / step_px), 1), most_apart) if step_px > 0 else 1 for px in APART_PX]
     searched = geometry.x_lo <= geometry.x_hi
-    y, c = np.nonzero(searched[:-1, : columns - apart] & searched[1:, : columns - apart] & searched[:-1, apart:])
+    inner = columns - apart[-1]
+    both = searched[:-1, :inner] & searched[1:, :inner]
+    y, c = np.nonzero(both & np.logical_and.reduce([searched[:-1, n : n + inner] for n in apart]))
     pick = evenly_spread(len(y), most)
     y, c = y[pick], c[pick]
-    here = reference[y, c]
-    shift = np.rint([reference[y + 1, c] - here, reference[y, c + apart] - here])
-    row, column = np.stack([y, y + 1, y]), np.stack([c, c, c + apart])
+    row, column = np.stack([y, y + 1, *[y] * len(apart)]), np.stack([c, c, *(c + n for n in apart)])
+    shift = np.rint(reference[row[1:], column[1:]] - reference[y, c])
     return Points(row.astype(np.int32), column.astype(np.int32), shift.astype(np.int32))
 
 
@@ -105,6 +119,8 @@ class MapChecks:
         self._calibrated = calibrated
         # On a sensor hardly wider than the line, light cannot be seen to move.
         self._follows = calibrated and geometry.width >= LEAST_WIDTH_PX
+        # Beside a line another one stands where this one moves to.
+        self._alone = geometry.others is None
         self._knows = knows
         self._points: dict[int, Points] = {}
         self._orders = _orders()
@@ -139,7 +155,7 @@ class MapChecks:
     def _of_counts(
         self, counts: "_Counts", usual: NDArray[np.float32], least: float, stripe: StripeTable
     ) -> str | None:
-        lit = np.flatnonzero((counts.exposures > 0).all(axis=0))
+        lit = counts.lit()
         if len(lit) < FEWEST_POINTS:
             return None
         few = lit[:: max(len(lit) // POINTS, 1)]
@@ -171,7 +187,10 @@ class MapChecks:
                 "frames of one column show light in different places; check the order of the frames (all exposures of "
                 "a column, then the next column), and columns and exposures of the plan"
             )
-        if self._follows and _deviations(LEAST_FOLLOWING * rows - columns) > LIMIT:
+        if self._follows and (
+            _deviations(LEAST_FOLLOWING * rows - columns) > LIMIT
+            or (self._alone and self._amiss(counts, few, usual, least))
+        ):
             return (
                 "columns do not follow one another: from column to column the line does not move as the calibration's "
                 "planes do; check the order of the frames (all exposures of a column, then the next column), columns "
@@ -188,16 +207,45 @@ class MapChecks:
         geometry, points = self._geometry, counts.points
         out = np.zeros((len(chosen), 3 + len(self._orders)))
         compare_lines(
-            counts.lines(chosen), counts.exposures[:, chosen], points.row[:, chosen], points.column[:, chosen],
+            counts.lines(chosen, NEAREST), counts.exposures[:, chosen], points.row[:, chosen], points.column[:, chosen],
             points.shift[:, chosen], geometry.x0, geometry.x_lo, geometry.x_hi, usual,
             least, self._orders, 0, len(chosen), out,
         )  # fmt: skip
         return out
 
+    def _amiss(self, counts: "_Counts", chosen: NDArray[np.int64], usual: NDArray[np.float32], least: float) -> bool:
+        """Whether light of all widths moves from column to column otherwise than the planes do."""
+        from rig.count.map_check_kernels import BIN_PX, SPAN, follow_lines
+
+        geometry, points = self._geometry, counts.points
+        partners = len(APART_PX)
+        chosen = chosen[:: max(len(chosen) // FOLLOWED, 1)]
+        rows, shared, noise = np.zeros((partners, 5)), np.zeros((partners, 2 * SPAN + 1)), np.zeros(partners)
+        moved_px = np.abs(np.median(points.shift[1:, chosen], axis=1))
+        if moved_px[-1] < APART_PX[-2]:
+            return False  # too narrow a sweep for haze to be told from what stands still
+        used = np.isfinite(usual)
+        weight = np.where(used, 1.0 / np.sqrt(np.maximum(usual, np.float32(least))), np.float32(0.0))
+        follow_lines(
+            counts.lines(chosen, len(points.row)), counts.exposures[:, chosen], points.row[:, chosen],
+            points.column[:, chosen], points.shift[:, chosen], geometry.x0, geometry.x_lo, geometry.x_hi,
+            np.where(used, usual, np.float32(0.0)), weight, rows, shared, noise,
+        )  # fmt: skip
+        with_row, deviation = rows.max(axis=1), np.sqrt(noise)
+        if (with_row <= LIMIT * deviation).any():
+            return False
+        away = np.abs(np.arange(-SPAN, SPAN + 1))
+        expected = away <= np.maximum(0.5 * moved_px / BIN_PX, 1.0)[:, None]
+        amiss = np.where(expected, -np.inf, shared).max(axis=1) - np.where(expected, shared, -np.inf).max(axis=1)
+        deviation /= with_row
+        by_luck = LUCK * deviation.sum() + LIMIT * np.sqrt(2.0 * np.sum(deviation**2))
+        return bool((amiss / with_row).sum() - by_luck > MOST_AMISS)
+
     def _sure(self, counts: "_Counts", stripe: StripeTable) -> tuple[int, NDArray[np.int64]]:
         """Number of groups that the sure answers go into, and the points they are at."""
         y, c = counts.points.row[0], counts.points.column[0]
-        sure = np.flatnonzero((stripe.confidence[y, c] >= SURE) & (counts.exposures > 0).all(axis=0))
+        lit = counts.lit()
+        sure = lit[stripe.confidence[y[lit], c[lit]] >= SURE]
         return min(len(sure) // FEWEST_POINTS, GROUPS), sure
 
     def _of_answers(self, counts: "_Counts", stripe: StripeTable) -> str | None:
@@ -255,11 +303,15 @@ class _Counts:
         np.add.at(steps, np.minimum(geometry.x0 + geometry.window, len(steps) - 1), -n_frames)
         return np.asarray(np.cumsum(steps)[: geometry.width])
 
-    def lines(self, chosen: NDArray[np.int64]) -> NDArray[np.int32]:
-        """Whole lines of chosen points and their partners, (3, chosen, window)."""
+    def lit(self) -> NDArray[np.int64]:
+        """Points that have frames, as their NEAREST partners have."""
+        return np.flatnonzero((self.exposures[:NEAREST] > 0).all(axis=0))
+
+    def lines(self, chosen: NDArray[np.int64], most: int) -> NDArray[np.int32]:
+        """Whole lines of chosen points and their first partners, (most, chosen, window)."""
         if not self.of_volume:
-            return np.ascontiguousarray(self._sweep.checked[:, chosen], np.int32)
-        found = self._sweep.counts[self.points.column[:, chosen], self.points.row[:, chosen]]
+            return np.ascontiguousarray(self._sweep.checked[:most, chosen], np.int32)
+        found = self._sweep.counts[self.points.column[:most, chosen], self.points.row[:most, chosen]]
         return np.ascontiguousarray(found, np.int32)
 
     def mean(

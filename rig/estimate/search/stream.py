@@ -249,7 +249,7 @@ class SearchedSweep(FrameTally):
 
     stripe: the stripe table. light: uint32 (rows, width), counts summed over the columns. quiet: float64 (2, rows,
     width), ones and exposures of pixels while clearly behind a stripe. lines: what the learning reads. checked: int32
-    (3, points, window), counts of the `check_points`.
+    (partners, points, window), counts of the `check_points`.
     """
 
     stripe: StripeTable
@@ -274,7 +274,7 @@ class ColumnJudge:
         self._judge = judge
         self._workers = workers
         self._lines = next_lattice(geometry)
-        points = check_points(geometry)
+        points = self._points = check_points(geometry)
         rows, columns = (
             np.concatenate([lines, of_points.ravel()])
             for lines, of_points in zip(self._lines, (points.row, points.column), strict=True)
@@ -341,7 +341,7 @@ class ColumnJudge:
             light=pixel_order(found.light, layout.width).astype(np.uint32),
             quiet=quiet_of(found, layout.width),
             lines=Lines(found.lines[of_lattice], rows, columns, tally.n_frames[columns], *alone),
-            checked=found.lines[of_points].reshape(3, -1, layout.window),
+            checked=found.lines[of_points].reshape(*self._points.row.shape, layout.window),
         )  # fmt: skip
 
     def _judge_block(
