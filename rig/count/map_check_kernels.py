@@ -153,7 +153,7 @@ def follow_lines(
     sweep and 1 / sqrt(r); both 0 where a pixel is not to be used. rows: (partner columns, 5), light in common with the
     next row, 2 bins to either side of where it is expected, of those points whose partner column has frames. shared:
     (partner columns, 2 SPAN + 1), that with the partner column, from SPAN bins short of where the planes put it to as
-    many beyond. noise: (partner columns,), the variance of each of these sums.
+    many beyond. noise: (partner columns,), the variance of each of these sums by the noise of photons.
     """
     window = lines.shape[2]
     bins = window // BIN_PX
@@ -186,7 +186,8 @@ def follow_lines(
             k = partner + 2
             if exposures[0, i] == 0 or exposures[1, i] == 0 or exposures[k, i] == 0:
                 continue
-            noise[partner] += power[0] * power[k] / bins
+            # Each bin is light and noise: light times noise either way, and noise times noise.
+            noise[partner] += BIN_PX * max(power[0] + power[k] - BIN_PX * bins, BIN_PX * bins)
             _add_products(light[0], light[1], margin, _in_bins(shift[0, i]), rows[partner])
             to = _in_bins(shift[k - 1, i] + x0[column[0, i]] - x0[column[k, i]])
             # Along the motion, whichever way that is.

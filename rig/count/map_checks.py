@@ -15,6 +15,7 @@ Every limit is in standard deviations, taken from the points themselves, or foll
 too few for it a check says nothing.
 """
 
+from collections.abc import Iterator
 from typing import Any, Final, NamedTuple
 
 import numpy as np
@@ -38,7 +39,7 @@ much as haze is."""
 NEAREST: Final = 3
 """A point's own line, that of the next row and that of the nearest partner column: where narrow light is looked for."""
 FOLLOWED: Final = 256
-"""Points whose light of all widths is followed through the columns: haze is bright."""
+"""Points whose light of all widths is followed through the columns first; twice as many while that leaves it open."""
 LIMIT: Final = 4.0
 """Standard deviations: one false alarm in 30 000 checks."""
 FEWEST_ROWS: Final = 24
@@ -50,8 +51,10 @@ MOST_AMISS: Final = -0.45
 """Light in common with the partner columns at the best of all wrong places, less that at the best of those where the
 planes put it, over that with the next row; the sum over the four partners. Maps have -0.65 in dense fog, whose haze is
 wider than the line moves, to -3 in clear air; shuffled or reversed columns have -0.4 to 2."""
-LUCK: Final = 2.5
-"""Standard deviations by which the best of some fifty wrong places stands out where there is noise alone."""
+LEAST_LIGHT: Final = 12.0
+"""Light in common with the next row, in standard deviations, below which nothing is said of where it moves to."""
+MARGIN: Final = 3.5
+"""Standard deviations of a map's sum that it has to be above MOST_AMISS."""
 SATURATED: Final = 0.99
 """Share of ones among all pixels and frames from which on a map is full."""
 LEAST_WIDTH_PX: Final = 32
@@ -189,7 +192,7 @@ class MapChecks:
             )
         if self._follows and (
             _deviations(LEAST_FOLLOWING * rows - columns) > LIMIT
-            or (self._alone and self._amiss(counts, few, usual, least))
+            or (self._alone and self._amiss(counts, lit, usual, least))
         ):
             return (
                 "columns do not follow one another: from column to column the line does not move as the calibration's "
@@ -214,32 +217,35 @@ class MapChecks:
         return out
 
     def _amiss(self, counts: "_Counts", chosen: NDArray[np.int64], usual: NDArray[np.float32], least: float) -> bool:
-        """Whether light of all widths moves from column to column otherwise than the planes do."""
+        """Whether light of all widths moves from column to column otherwise than the planes do; False where open."""
         from rig.count.map_check_kernels import BIN_PX, SPAN, follow_lines
 
         geometry, points = self._geometry, counts.points
         partners = len(APART_PX)
-        chosen = chosen[:: max(len(chosen) // FOLLOWED, 1)]
         rows, shared, noise = np.zeros((partners, 5)), np.zeros((partners, 2 * SPAN + 1)), np.zeros(partners)
         moved_px = np.abs(np.median(points.shift[1:, chosen], axis=1))
         if moved_px[-1] < APART_PX[-2]:
             return False  # too narrow a sweep for haze to be told from what stands still
+        expected = np.abs(np.arange(-SPAN, SPAN + 1)) <= np.maximum(0.5 * moved_px / BIN_PX, 1.0)[:, None]
         used = np.isfinite(usual)
         weight = np.where(used, 1.0 / np.sqrt(np.maximum(usual, np.float32(least))), np.float32(0.0))
-        follow_lines(
-            counts.lines(chosen, len(points.row)), counts.exposures[:, chosen], points.row[:, chosen],
-            points.column[:, chosen], points.shift[:, chosen], geometry.x0, geometry.x_lo, geometry.x_hi,
-            np.where(used, usual, np.float32(0.0)), weight, rows, shared, noise,
-        )  # fmt: skip
-        with_row, deviation = rows.max(axis=1), np.sqrt(noise)
-        if (with_row <= LIMIT * deviation).any():
-            return False
-        away = np.abs(np.arange(-SPAN, SPAN + 1))
-        expected = away <= np.maximum(0.5 * moved_px / BIN_PX, 1.0)[:, None]
-        amiss = np.where(expected, -np.inf, shared).max(axis=1) - np.where(expected, shared, -np.inf).max(axis=1)
-        deviation /= with_row
-        by_luck = LUCK * deviation.sum() + LIMIT * np.sqrt(2.0 * np.sum(deviation**2))
-        return bool((amiss / with_row).sum() - by_luck > MOST_AMISS)
+        usual = np.where(used, usual, np.float32(0.0))
+        for part in _ever_more(chosen, FOLLOWED):
+            follow_lines(
+                counts.lines(part, len(points.row)), counts.exposures[:, part], points.row[:, part],
+                points.column[:, part], points.shift[:, part], geometry.x0, geometry.x_lo, geometry.x_hi,
+                usual, weight, rows, shared, noise,
+            )  # fmt: skip
+            with_row, deviation = rows.max(axis=1), np.sqrt(noise)
+            if (with_row < LEAST_LIGHT * deviation).any():
+                continue
+            wrong, right = (np.where(where, shared, -np.inf).max(axis=1) for where in (~expected, expected))
+            amiss = float(((wrong - right) / with_row).sum())
+            if amiss <= MOST_AMISS:
+                return False
+            if amiss - MARGIN * float(np.sqrt(2.0 * np.sum((deviation / with_row) ** 2))) > MOST_AMISS:
+                return True
+        return False
 
     def _sure(self, counts: "_Counts", stripe: StripeTable) -> tuple[int, NDArray[np.int64]]:
         """Number of groups that the sure answers go into, and the points they are at."""
@@ -331,6 +337,15 @@ class _Counts:
             ones = self._sweep.checked[partner][chosen[:, None], at]
         mean = ones.mean(axis=1) / self.exposures[partner, chosen]
         return np.where(inside.all(axis=1), mean, np.nan)
+
+
+def _ever_more(chosen: NDArray[np.int64], first: int) -> Iterator[NDArray[np.int64]]:
+    """Parts of evenly spread points, each as many as all before it, the first at least `first`."""
+    step = 1 << max((len(chosen) // first).bit_length() - 1, 0)
+    yield chosen[::step]
+    while step > 1:
+        step //= 2
+        yield chosen[step :: 2 * step]
 
 
 def _deviations(values: Array) -> float:
