@@ -3,8 +3,35 @@
 from collections.abc import Callable
 from dataclasses import dataclass
 
+import pytest
+
 from drivers.clock import Clock
-from drivers.interfaces import BeamScanner, LineLaser, SpadArray, SpadRequest, SyncSource, World
+from drivers.errors import WrongState
+from drivers.interfaces import BeamScanner, Device, DeviceState, LineLaser, SpadArray, SpadRequest, SyncSource, World
+
+
+def require_final(device: Device, *verbs: Callable[[], object]) -> None:
+    """Assert that closing is final: no verb is possible any more, and closing again does nothing."""
+    device.close()
+    device.close()
+    assert device.state is DeviceState.CLOSED
+    for verb in (*verbs, device.__enter__):
+        with pytest.raises(WrongState, match="close"):
+            verb()
+
+
+def leave_with_an_error(device: Device, work: Callable[[], object]) -> None:
+    """Work within the device's block and fail there; assert that the error comes through and the device is closed."""
+
+    def fail() -> None:
+        with device as entered:
+            assert entered is device
+            work()
+            raise RuntimeError("on the way")
+
+    with pytest.raises(RuntimeError, match="on the way"):
+        fail()
+    assert device.state is DeviceState.CLOSED
 
 
 @dataclass(frozen=True)

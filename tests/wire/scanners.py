@@ -73,6 +73,13 @@ def finish(device: BeamScanner) -> None:
     eventually(lambda: not device.status.moving)
 
 
+def play(device: BeamScanner, repeats: int) -> None:
+    """So many repeats of the cosine, to their end."""
+    device.load(cosine(device), repeats)
+    device.start()
+    finish(device)
+
+
 @dataclass(frozen=True)
 class Plugged:
     """A model on a bus of its own."""
@@ -100,7 +107,10 @@ def open_scanner(kind: str, bus: EmulatedUsb, clock: Clock, **config: Any) -> Be
 
 
 @contextmanager
-def opened(kind: str, model: UsbModel, clock: Clock, **config: Any) -> Iterator[tuple[BeamScanner, Plugged]]:
-    plugged = plug(model, clock)
-    with open_scanner(kind, plugged.bus, clock, **config) as scanner:
+def opened(
+    kind: str, model: UsbModel, clock: Clock | None = None, **config: Any
+) -> Iterator[tuple[BeamScanner, Plugged]]:
+    """The driver of a model on a bus of its own, in virtual time."""
+    plugged = plug(model, clock or VirtualClock())
+    with open_scanner(kind, plugged.bus, plugged.clock, **config) as scanner:
         yield scanner, plugged

@@ -20,6 +20,7 @@ from drivers.transports.endpoints import Endpoint
 from drivers.transports.queued_link import QueuedLink
 from tests.wire.bodies import report
 from tests.wire.lasers import PATIENCE_S
+from tests.wire.spads import begin, finish
 from tests.wire.spb_device import REQUEST, require_right, take
 
 CHIP = sys.argv[1] if len(sys.argv) > 1 else "fx3"
@@ -38,25 +39,20 @@ def queued_reads_bring_every_frame() -> None:
     with opened("queued") as device:
         assert isinstance(device._link, QueuedLink)
         for _ in range(3):
-            _, blocks = take(device, 1000)
+            blocks = take(device, 1000)
             assert require_right(blocks) == list(range(1000))
 
 
 def plain_reads_bring_every_frame() -> None:
     with opened("plain") as device:
-        _, blocks = take(device, 1000)
+        blocks = take(device, 1000)
         assert require_right(blocks) == list(range(1000))
 
 
 def blocks_lie_where_libusb_wrote_them() -> None:
     with opened("queued") as device:
-        timing = device.configure(REQUEST)
-        ring = BlockRing(16, timing.stride)
-        reader = ring.reader("test")
-        device.start(64)
-        while device.fill(ring, PATIENCE_S):
-            pass
-        ring.finish()
+        ring, reader = begin(device, REQUEST, 64, 16)
+        finish(device, ring)
         for block in reader:
             assert np.shares_memory(block.bits, ring._memory)
 
@@ -71,7 +67,7 @@ def stopping_with_reads_in_flight_leaves_the_device_ready() -> None:
                 device.fill(ring, PATIENCE_S)
             device.stop()
             assert len(ring._free) == ring.slots
-        _, blocks = take(device, 100)
+        blocks = take(device, 100)
         assert require_right(blocks) == list(range(100))
 
 
@@ -95,7 +91,7 @@ def the_kernels_16_mb_grant_fewer_reads() -> None:
         granted = [device._link.submit(device._wiring.stream_in, buffer) for buffer in buffers]
         assert granted == [True] * 15 + [False] * 5
         device._link.cancel()
-        _, blocks = take(device, 100)
+        blocks = take(device, 100)
         assert require_right(blocks) == list(range(100))
 
 
@@ -103,7 +99,7 @@ def windows_follow_the_line_markers() -> None:
     window = WindowTable(64, (np.array([0, 64], np.int32),))
     request = SpadRequest(REQUEST.frame_rate_hz, REQUEST.exposure_s, "stream", 16, window)
     with opened("queued") as device:
-        _, blocks = take(device, 40, request)
+        blocks = take(device, 40, request)
         x0 = np.concatenate([block.records["x0"] for block in blocks])
         assert (x0[:10] == 0).all()
         assert (x0[10:] == 64).all()

@@ -9,13 +9,12 @@ from numpy.typing import NDArray
 
 from drivers.clock import VirtualClock
 from drivers.frames import FrameBlock, Mark
-from drivers.interfaces import SpadRequest, SpadTiming
+from drivers.interfaces import SpadRequest
 from drivers.spads.spb_usb import SpbUsb, SpbUsbConfig, open_link
 from drivers.transports.endpoints import Endpoint
 from sim_backend.wire.firmware.spb_usb import SpbUsbModel
 from sim_backend.wire.firmware.spb_usb_run import Span
 from sim_backend.wire.serve.usb import EmulatedUsb
-from tests.wire.lasers import PATIENCE_S
 from tests.wire.spads import take_run
 
 WIDTH, HEIGHT = 128, 24
@@ -90,11 +89,9 @@ def on_bus(bus: EmulatedUsb, port: str = "usb", **config: Any) -> SpbUsb:
     return SpbUsb(made, open_link(made, Endpoint(port, bus)), bus._clock)
 
 
-def take(
-    device: SpbUsb, n_frames: int, request: SpadRequest = REQUEST, ring_slots: int = 400
-) -> tuple[SpadTiming, list[FrameBlock]]:
+def take(device: SpbUsb, n_frames: int, request: SpadRequest = REQUEST) -> list[FrameBlock]:
     """One run to its end; all blocks are still in the ring."""
-    return take_run(device, n_frames, request, ring_slots, timeout_s=PATIENCE_S)
+    return take_run(device, n_frames, request, 400)
 
 
 def require_right(blocks: Iterable[FrameBlock]) -> list[int]:

@@ -10,7 +10,17 @@ from drivers.clock import VirtualClock
 from drivers.errors import DeviceBusy, DeviceDisconnected, DeviceError, DeviceNotFound, DevicePermission, DeviceTimeout
 from sim_backend.wire.firmware.dac_model import DAC_STEPS
 from sim_backend.wire.serve.usb import EmulatedUsb
-from tests.wire.scanners import HeliosRecorder, LaserCubeRecorder, Recording, cosine, finish, open_scanner, opened, plug
+from tests.wire.scanners import (
+    HeliosRecorder,
+    LaserCubeRecorder,
+    Recording,
+    cosine,
+    finish,
+    open_scanner,
+    opened,
+    play,
+    plug,
+)
 
 STEP = 2 / DAC_STEPS
 
@@ -67,7 +77,7 @@ def test_steps_and_accelerations_stay_within_the_limits_from_start_to_close(kind
 @over_both
 def test_a_stop_brakes_and_leaves_the_mirror_where_the_driver_says(kind: Kind) -> None:
     model = kind.board()
-    with opened(kind.name, model, VirtualClock()) as (device, plugged):
+    with opened(kind.name, model) as (device, plugged):
         device.load(cosine(device), 1000)
         device.start()
         device.stop()
@@ -82,9 +92,7 @@ def test_a_host_that_was_busy_too_long_ends_the_run_with_a_fault(kind: Kind) -> 
     clock = VirtualClock()
     model = kind.board(clock, kind.late)
     with opened(kind.name, model, clock) as (device, _):
-        device.load(cosine(device), 100)
-        device.start()
-        finish(device)
+        play(device, 100)
         fault = device.status.fault
         assert fault is not None
         assert "ran dry" in fault or "lost or played late" in fault
@@ -130,7 +138,7 @@ def test_unplugging_during_a_run_is_a_disconnection(kind: Kind) -> None:
 @over_both
 def test_nobody_talks_while_the_device_is_given_back(kind: Kind) -> None:
     model = kind.board()
-    with opened(kind.name, model, VirtualClock()) as (device, _):
+    with opened(kind.name, model) as (device, _):
         device.load(cosine(device), 1000)
         device.start()
     ends = [index for index, (_, endpoint, _) in enumerate(model.log) if endpoint == model.points_endpoint]

@@ -21,7 +21,7 @@ from sim_backend.wire.serve.usb import EmulatedUsb
 from sim_backend.wire.serve.usb_model import Answer
 from tests.wire import helios_over_libusb
 from tests.wire.bodies import ServesProcesses
-from tests.wire.scanners import HeliosRecorder, cosine, finish, open_scanner, opened, plug
+from tests.wire.scanners import HeliosRecorder, cosine, finish, open_scanner, opened, play, plug
 from tests.wire.usb.umockdev import UmockdevBus, missing
 
 TOLERANCE_S = 1e-6
@@ -54,20 +54,20 @@ def test_a_frame_is_the_bytes_of_the_manual() -> None:
     ],
 )
 def test_the_point_clock_is_the_real_one_not_the_asked_one(asked: float, true: Fraction) -> None:
-    with opened("helios", HeliosModel(), VirtualClock()) as (device, _):
+    with opened("helios", HeliosModel()) as (device, _):
         clock = device.point_clock(asked)
         assert abs(clock - asked) <= abs(true - asked)
         assert 112_000_000 % clock.numerator == 0 or (112_000_000 / clock).denominator == 1
 
 
 def test_10_khz_is_unreachable() -> None:
-    with opened("helios", HeliosModel(), VirtualClock()) as (device, _):
+    with opened("helios", HeliosModel()) as (device, _):
         assert device.point_clock(10_000) != 10_000
 
 
 def test_the_exact_25_khz_is_asked_for_as_25001() -> None:
     model = HeliosRecorder()
-    with opened("helios", model, VirtualClock()) as (device, _):
+    with opened("helios", model) as (device, _):
         wave = cosine(device)
         assert device.load(wave, 1) == 25_000
         device.start()
@@ -97,7 +97,7 @@ def test_a_frame_of_45_mod_64_points_never_completes_in_the_firmware() -> None:
 @pytest.mark.parametrize("points", [45, 109, 1499, 1500, 1501, 1502, 1545, 2989, 3001, 4500])
 def test_no_frame_is_45_mod_64_points_long(points: int) -> None:
     model = HeliosRecorder()
-    with opened("helios", model, VirtualClock()) as (device, _):
+    with opened("helios", model) as (device, _):
         rate = device.point_clock(25_000)
         # Flat and at the centre, where the mirror stands: no way to the first point changes the length.
         device.load(ScanWaveform(np.zeros(points), np.zeros(points, np.uint8), rate), 1)
@@ -124,10 +124,8 @@ def test_slices_are_sendable_and_only_the_last_is_short() -> None:
 
 def test_single_is_set_in_every_frame_and_start_in_the_first_of_a_run() -> None:
     model = HeliosRecorder()
-    with opened("helios", model, VirtualClock()) as (device, _):
-        device.load(cosine(device), 2)
-        device.start()
-        finish(device)
+    with opened("helios", model) as (device, _):
+        play(device, 2)
         flags = [frame[-1] for frame in model.sent(FRAMES)]
         assert flags == [3] + [2] * (len(flags) - 1)
         assert len(flags) > 5
@@ -148,7 +146,7 @@ def test_a_dead_host_leaves_a_mirror_that_stands_after_two_frames() -> None:
 
 def test_the_alternate_setting_is_1_while_open_and_0_after_close() -> None:
     model = HeliosRecorder()
-    with opened("helios", model, VirtualClock()):
+    with opened("helios", model):
         pass
     settings = [data[0] for _, endpoint, data in model.log if endpoint == -1]
     assert (settings[0], settings[-1]) == (1, 0)
@@ -164,14 +162,14 @@ def test_old_replies_are_drained_before_the_first_question() -> None:
             model.leave_reply(b"\x84\x01\x00\x00\x00")
 
     model.set_interface = with_leftovers  # type: ignore[method-assign]
-    with opened("helios", model, VirtualClock()) as (device, _):
+    with opened("helios", model) as (device, _):
         assert device._dac.firmware == 6  # type: ignore[attr-defined]
 
 
 @pytest.mark.parametrize("junk", [b"\x84\x06\x00\x00\x00", b"\x83", b"\x83\x02", b"\x00\x01", b"\x83\x01\x00"])
 def test_any_other_reply_than_83_01_is_not_ready(junk: bytes) -> None:
     model = HeliosRecorder()
-    with opened("helios", model, VirtualClock()) as (device, _):
+    with opened("helios", model) as (device, _):
         device.load(cosine(device), 1)
         model.leave_reply(junk)
         before = len(model.sent(FRAMES))
@@ -185,7 +183,7 @@ def test_any_other_reply_than_83_01_is_not_ready(junk: bytes) -> None:
 
 def test_a_frame_that_the_device_drops_in_silence_is_a_fault() -> None:
     model = HeliosModel()
-    with opened("helios", model, VirtualClock()) as (device, _):
+    with opened("helios", model) as (device, _):
         device.load(cosine(device), 100)
         model.drop_next = 1
         device.start()
@@ -210,7 +208,7 @@ def test_a_frame_is_taken_only_behind_a_status_question_since_a_refused_one_disa
 
 def test_frames_hold_at_most_4095_points_however_long_they_may_last() -> None:
     model = HeliosRecorder()
-    with opened("helios", model, VirtualClock(), frame="500 ms") as (device, _):
+    with opened("helios", model, frame="500 ms") as (device, _):
         device.load(cosine(device, 20_000, 50_000), 1)
         device.start()
         finish(device)
@@ -230,7 +228,7 @@ def test_replies_may_take_longer_than_the_vendors_16_ms() -> None:
         def inp(self, endpoint: int, length: int, now_s: float) -> Answer:
             return super().inp(endpoint, length, now_s) if now_s - self.asked_s > 0.09 else None
 
-    with opened("helios", Slow(), VirtualClock()) as (device, _):
+    with opened("helios", Slow()) as (device, _):
         assert not device.status.moving
 
 
@@ -244,7 +242,7 @@ def test_the_version_is_asked_for_twice_since_a_first_answer_may_get_lost() -> N
             self.forgot = True
 
     model = Forgetful()
-    with opened("helios", model, VirtualClock()):
+    with opened("helios", model):
         assert [command[0] for command in model.sent(COMMANDS)[:3]] == [0x04, 0x04, 0x07]
 
 
@@ -252,9 +250,7 @@ def test_frames_wait_150_ms_after_stop_since_the_firmware_refuses_them_for_100()
     clock = VirtualClock()
     model = HeliosRecorder(clock, late=3)
     with opened("helios", model, clock) as (device, _):
-        device.load(cosine(device), 100)
-        device.start()
-        finish(device)
+        play(device, 100)
         device.stop()
         device.start()
         finish_at = len(model.sent(FRAMES))
@@ -268,7 +264,7 @@ def test_frames_wait_150_ms_after_stop_since_the_firmware_refuses_them_for_100()
 
 def test_the_shutter_is_never_opened_and_only_known_opcodes_are_sent() -> None:
     model = HeliosRecorder()
-    with opened("helios", model, VirtualClock()) as (device, _):
+    with opened("helios", model) as (device, _):
         device.load(cosine(device), 2)
         device.start()
         device.stop()
@@ -282,7 +278,7 @@ def test_the_shutter_is_never_opened_and_only_known_opcodes_are_sent() -> None:
 
 def test_close_stops_waits_lowers_the_shutter_and_leaves_alternate_0() -> None:
     model = HeliosRecorder()
-    with opened("helios", model, VirtualClock()) as (device, _):
+    with opened("helios", model) as (device, _):
         device.load(cosine(device), 1000)
         device.start()
     end = model.log[-3:]
@@ -310,7 +306,7 @@ def test_giving_the_interface_back_stops_the_mirror_as_when_the_process_is_kille
 @pytest.mark.parametrize("rate", [6, 999, 65_536, 1e6])
 def test_rates_that_the_firmware_would_clamp_are_refused(rate: float) -> None:
     with (
-        opened("helios", HeliosModel(), VirtualClock()) as (device, _),
+        opened("helios", HeliosModel()) as (device, _),
         pytest.raises(LimitExceeded, match=re.escape(f"{rate:g}")),
     ):
         device.point_clock(rate)
@@ -382,7 +378,7 @@ def test_a_foreign_firmware_is_one_line(reply: bytes) -> None:
 
 
 def test_an_old_firmware_is_a_warning(caplog: pytest.LogCaptureFixture) -> None:
-    with caplog.at_level(logging.WARNING), opened("helios", HeliosModel(version=5), VirtualClock()):
+    with caplog.at_level(logging.WARNING), opened("helios", HeliosModel(version=5)):
         assert "firmware 5 is older than the tested 6" in caplog.text
 
 
@@ -409,10 +405,8 @@ def test_a_config_that_cannot_be_is_refused(config: dict[str, object]) -> None:
 
 def test_slices_follow_each_other() -> None:
     model = HeliosModel()
-    with opened("helios", model, VirtualClock()) as (device, _):
-        device.load(cosine(device), 5)
-        device.start()
-        finish(device)
+    with opened("helios", model) as (device, _):
+        play(device, 5)
         for one, following in pairwise(list(model.history._played)):
             assert following.start_s == one.end_s
 

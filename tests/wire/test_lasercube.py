@@ -10,7 +10,7 @@ from drivers.scanners.dac_scanner import PointSlice
 from drivers.scanners.lasercube import encode
 from sim_backend.wire.firmware.lasercube import BLUE, COMMANDS, GREEN, RED, SAMPLES, LaserCubeModel
 from sim_backend.wire.serve.usb_model import Stall
-from tests.wire.scanners import LaserCubeRecorder, cosine, finish, open_scanner, opened, plug
+from tests.wire.scanners import LaserCubeRecorder, cosine, finish, open_scanner, opened, play, plug
 
 
 def test_samples_are_the_bytes_of_the_manual() -> None:
@@ -22,19 +22,19 @@ def test_samples_are_the_bytes_of_the_manual() -> None:
 
 def test_opening_turns_the_output_off_and_empties_the_ring_before_anything_else() -> None:
     model = LaserCubeRecorder()
-    with opened("lasercube", model, VirtualClock()):
+    with opened("lasercube", model):
         assert model.sent(COMMANDS)[:2] == [b"\x80\x00", b"\x8d\x00"]
 
 
 def test_samples_go_to_alternate_setting_1_of_the_second_interface() -> None:
     model = LaserCubeRecorder()
-    with opened("lasercube", model, VirtualClock()):
+    with opened("lasercube", model):
         assert model.sent(-1) == [b"\x00", b"\x01"]
 
 
 def test_close_turns_the_output_off_and_empties_the_ring() -> None:
     model = LaserCubeRecorder()
-    with opened("lasercube", model, VirtualClock(), colours="markers") as (device, _):
+    with opened("lasercube", model, colours="markers") as (device, _):
         device.load(cosine(device), 100)
         device.start()
     assert model.sent(COMMANDS)[-2:] == [b"\x80\x00", b"\x8d\x00"]
@@ -43,17 +43,15 @@ def test_close_turns_the_output_off_and_empties_the_ring() -> None:
 
 def test_the_rate_is_set_as_four_bytes_and_read_back() -> None:
     model = LaserCubeRecorder()
-    with opened("lasercube", model, VirtualClock()) as (device, _):
-        device.load(cosine(device), 1)
-        device.start()
-        finish(device)
+    with opened("lasercube", model) as (device, _):
+        play(device, 1)
         at = model.sent(COMMANDS).index(b"\x82\xa8\x61\x00\x00")
         assert model.sent(COMMANDS)[at + 1] == b"\x83"
 
 
 def test_another_rate_than_the_asked_one_is_a_fault() -> None:
     model = LaserCubeModel()
-    with opened("lasercube", model, VirtualClock()) as (device, _):
+    with opened("lasercube", model) as (device, _):
         device.load(cosine(device), 1)
         model.rate_offset_hz = 3
         with pytest.raises(DeviceFault, match="25003 Hz instead of 25000 Hz"):
@@ -63,19 +61,15 @@ def test_another_rate_than_the_asked_one_is_a_fault() -> None:
 
 def test_transfers_hold_at_most_64_samples() -> None:
     model = LaserCubeRecorder()
-    with opened("lasercube", model, VirtualClock()) as (device, _):
-        device.load(cosine(device), 2)
-        device.start()
-        finish(device)
+    with opened("lasercube", model) as (device, _):
+        play(device, 2)
         assert max(len(data) for data in model.sent(SAMPLES)) == 512
 
 
 def test_its_own_lasers_stay_dark_unless_the_config_says_where_the_colours_lead() -> None:
     clock, model = VirtualClock(), LaserCubeRecorder()
     with opened("lasercube", model, clock) as (device, plugged):
-        device.load(cosine(device), 2)
-        device.start()
-        finish(device)
+        play(device, 2)
         assert b"\x80\x01" not in model.sent(COMMANDS)
         assert all(not any(data[at : at + 4]) for data in model.sent(SAMPLES) for at in range(0, len(data), 8))
         assert not len(model.history.rising(GREEN, 0, plugged.now_s()))
@@ -108,10 +102,8 @@ def test_a_lost_transfer_is_a_fault() -> None:
                 return len(data)
             return super().out(endpoint, data, now_s)
 
-    with opened("lasercube", Lossy(), VirtualClock()) as (device, _):
-        device.load(cosine(device), 100)
-        device.start()
-        finish(device)
+    with opened("lasercube", Lossy()) as (device, _):
+        play(device, 100)
         fault = device.status.fault
         assert fault is not None
         assert "lost" in fault
@@ -130,7 +122,7 @@ def test_the_reply_s_first_byte_does_not_matter_but_its_second_does() -> None:
             return b"\x77" + bytes(reply)[1:] if isinstance(reply, bytes) else None
 
     model = Odd()
-    with opened("lasercube", model, VirtualClock()) as (device, _):
+    with opened("lasercube", model) as (device, _):
         assert not device.status.moving
         model.code = 9
         with pytest.raises(DeviceFault, match="code 9"):
@@ -141,7 +133,7 @@ def test_the_reply_s_first_byte_does_not_matter_but_its_second_does() -> None:
 def test_a_reply_left_by_another_program_is_dropped() -> None:
     model = LaserCubeModel()
     model.leave_reply(bytes(64))
-    with opened("lasercube", model, VirtualClock()) as (device, _):
+    with opened("lasercube", model) as (device, _):
         assert device._dac.firmware == (0, 12)  # type: ignore[attr-defined]
 
 
@@ -160,7 +152,7 @@ def test_a_foreign_firmware_is_one_line() -> None:
 
 def test_the_device_s_own_highest_rate_is_a_limit() -> None:
     with (
-        opened("lasercube", LaserCubeModel(highest_rate_hz=20_000), VirtualClock()) as (device, _),
+        opened("lasercube", LaserCubeModel(highest_rate_hz=20_000)) as (device, _),
         pytest.raises(LimitExceeded, match="20000"),
     ):
         device.point_clock(25_000)

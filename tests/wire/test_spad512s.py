@@ -34,7 +34,7 @@ from drivers.transports.tap import CONTROL_FILE, IN, OUT, TapFile, read_taps
 from sim_backend.wire.firmware.spad512s import Spad512sModel
 from sim_backend.wire.serve.tcp import TcpServer
 from tests.wire.lasers import PATIENCE_S
-from tests.wire.spads import take_run
+from tests.wire.spads import begin, finish, take_run
 
 FRAME_BYTES = 32_768
 PATIENT = Deadlines(open_s=PATIENCE_S, answer_s=PATIENCE_S, listens_s=PATIENCE_S)
@@ -67,7 +67,7 @@ def connected(model: Spad512sModel, **config: Any) -> Iterator[tuple[Spad512s, T
 
 
 def take(device: Spad512s, n_frames: int) -> list[FrameBlock]:
-    return take_run(device, n_frames, REQUEST, ring_slots=64, timeout_s=PATIENCE_S)[1]
+    return take_run(device, n_frames, REQUEST, 64)
 
 
 @contextmanager
@@ -201,10 +201,7 @@ def test_trap_error_text_is_never_taken_for_pixels(at_byte: int) -> None:
     model = Spad512sModel(noise)
     with connected(model) as (device, _):
         model.fail_at_byte = at_byte
-        timing = device.configure(REQUEST)
-        ring = BlockRing(8, timing.stride)
-        reader = ring.reader("test")
-        device.start(64)
+        ring, reader = begin(device, REQUEST, 64, 8)
         with pytest.raises(DeviceFault, match="ERROR"):  # noqa: PT012
             while device.fill(ring, PATIENCE_S):
                 pass
@@ -387,12 +384,7 @@ def test_a_program_that_ends_or_hangs_within_a_run_is_said_so() -> None:
 
 def test_a_ring_that_does_not_wait_loses_counted_blocks() -> None:
     with connected(Spad512sModel(noise)) as (device, _):
-        timing = device.configure(REQUEST)
-        ring = BlockRing(2, timing.stride, on_full=OnFull.DROP)
-        reader = ring.reader("test")
-        device.start(160)
-        while device.fill(ring, PATIENCE_S):
-            pass
-        ring.finish()
+        ring, reader = begin(device, REQUEST, 160, 2, OnFull.DROP)
+        finish(device, ring)
         assert len(list(reader)) == 2
         assert (device.counters.delivered, device.counters.lost, ring.dropped_frames) == (32, 128, 128)

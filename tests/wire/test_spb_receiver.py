@@ -11,6 +11,7 @@ import pytest
 from drivers.errors import RingOverflow, WrongState
 from drivers.frames import BlockFlag, BlockStatus
 from drivers.ring import BlockRing, OnFull
+from tests.wire.spads import begin, finish
 from tests.wire.spb_device import REQUEST, model, nth, opened, require_right, take
 
 
@@ -29,7 +30,7 @@ def test_a_flipped_bit_anywhere_in_a_block_refuses_that_block_only(at: int) -> N
     device = model()
     with opened(device) as spad:
         device.mangle = nth(3, flipped(at))
-        _, blocks = take(spad, 160)
+        blocks = take(spad, 160)
         assert require_right(blocks) == [*range(48), *range(64, 160)]
         counters = spad.counters
         assert (counters.exposed, counters.delivered, counters.lost, counters.crc_errors) == (160, 144, 16, 1)
@@ -42,7 +43,7 @@ def test_a_block_cut_short_shifts_the_stream_and_is_resynchronised(keep: int) ->
     device = model()
     with opened(device) as spad:
         device.mangle = nth(4, lambda block: (bytes(block[:keep]),))
-        _, blocks = take(spad, 3000)
+        blocks = take(spad, 3000)
         numbers = require_right(blocks)
         counters = spad.counters
         assert numbers[:64] == list(range(64))
@@ -57,7 +58,7 @@ def test_extra_bytes_between_blocks_are_resynchronised() -> None:
     device = model()
     with opened(device) as spad:
         device.mangle = nth(4, lambda block: (bytes(2048), bytes(block)))
-        _, blocks = take(spad, 3000)
+        blocks = take(spad, 3000)
         require_right(blocks)
         assert spad.counters.resyncs == 1
 
@@ -66,7 +67,7 @@ def test_repeated_and_swapped_blocks_are_refused() -> None:
     device = model()
     with opened(device) as spad:
         device.mangle = nth(4, lambda block: (bytes(block), bytes(block)))
-        _, blocks = take(spad, 160)
+        blocks = take(spad, 160)
         assert require_right(blocks) == list(range(160))
         assert spad.counters.crc_errors == 1
 
@@ -87,7 +88,7 @@ def test_a_sound_block_of_another_geometry_is_refused() -> None:
     device = model()
     with opened(device) as spad:
         device.mangle = nth(2, resealed(sensor=(76, "<H", 256)))
-        _, blocks = take(spad, 160)
+        blocks = take(spad, 160)
         assert require_right(blocks) == [*range(32), *range(48, 160)]
 
 
@@ -95,7 +96,7 @@ def test_a_block_of_another_run_is_passed_over() -> None:
     device = model()
     with opened(device) as spad:
         device.mangle = nth(0, resealed(run=(14, "<H", 9999)))
-        _, blocks = take(spad, 160)
+        blocks = take(spad, 160)
         assert require_right(blocks) == list(range(16, 160))
         assert spad.counters.lost == 16
 
@@ -105,7 +106,7 @@ def test_a_run_whose_last_block_is_lost_ends_with_the_devices_own_count() -> Non
     with opened(device) as spad:
         device.mangle = nth(9, lambda block: ())
         begun_s = spad._now_s()
-        _, blocks = take(spad, 160)
+        blocks = take(spad, 160)
         assert spad._now_s() - begun_s < 1.5
         assert require_right(blocks) == list(range(144))
         assert (spad.counters.exposed, spad.counters.lost) == (160, 16)
@@ -114,14 +115,9 @@ def test_a_run_whose_last_block_is_lost_ends_with_the_devices_own_count() -> Non
 def test_frames_lost_inside_the_device_are_a_gap() -> None:
     device = model()
     with opened(device) as spad:
-        timing = spad.configure(REQUEST)
-        ring = BlockRing(50, timing.stride)
-        reader = ring.reader("test")
-        spad.start(160)
+        ring, reader = begin(spad, REQUEST, 160)
         device.lose_next(5)
-        while spad.fill(ring, 1.0):
-            pass
-        ring.finish()
+        finish(spad, ring)
         blocks = list(reader)
         assert require_right(blocks) == list(range(5, 160))
         assert blocks[0].header.flags & BlockFlag.MEMORY_OVERFLOW
@@ -153,7 +149,7 @@ def test_a_truncated_block_counts_for_its_whole_frames() -> None:
     device = model()
     with opened(device) as spad:
         device.mangle = nth(1, cut)
-        _, blocks = take(spad, 64)
+        blocks = take(spad, 64)
         assert require_right(blocks) == [*range(21), *range(32, 64)]
         assert spad.counters.lost == 11
 
@@ -190,13 +186,8 @@ def test_a_reader_that_keeps_up_loses_nothing_however_short_the_ring(slots: int)
 
 def test_a_full_ring_drops_counted_blocks_and_the_device_does_not_starve() -> None:
     with opened(model()) as spad:
-        timing = spad.configure(REQUEST)
-        ring = BlockRing(3, timing.stride, on_full=OnFull.DROP)
-        reader = ring.reader("test")
-        spad.start(160)
-        while spad.fill(ring, 1.0):
-            pass
-        ring.finish()
+        ring, reader = begin(spad, REQUEST, 160, 3, OnFull.DROP)
+        finish(spad, ring)
         assert require_right(list(reader)) == list(range(48))
         assert (spad.counters.delivered, spad.counters.lost, ring.dropped_frames) == (48, 112, 112)
 
@@ -220,12 +211,7 @@ def test_a_system_that_grants_few_reads_gets_few(slots: int) -> None:
         link = spad._link
         submit = link.submit
         link.submit = lambda endpoint, buffer: len(link._queue) < 2 and submit(endpoint, buffer)  # type: ignore[method-assign]
-        timing = spad.configure(REQUEST)
-        ring = BlockRing(slots, timing.stride, on_full=OnFull.DROP)
-        reader = ring.reader("test")
-        spad.start(160)
-        while spad.fill(ring, 1.0):
-            pass
-        ring.finish()
+        ring, reader = begin(spad, REQUEST, 160, slots, OnFull.DROP)
+        finish(spad, ring)
         assert require_right(list(reader)) == list(range(min(160, 16 * slots)))
         assert not ring._claimed

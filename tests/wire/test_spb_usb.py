@@ -183,7 +183,7 @@ def test_a_device_found_running_is_aborted_first() -> None:
     first.start(None)
     first._link.close()  # the program dies
     with on_bus(bus) as again:
-        _, blocks = take(again, 50)
+        blocks = take(again, 50)
         assert require_right(blocks) == list(range(50))
 
 
@@ -194,7 +194,7 @@ def test_a_rate_off_the_ticks_is_refused_with_the_nearest() -> None:
 
 def test_blocks_are_as_long_as_the_stride_allows() -> None:
     with opened(model(max_stride=4096)) as spad:
-        _, blocks = take(spad, 40)
+        blocks = take(spad, 40)
         assert max(block.n_frames for block in blocks) == 9
         assert require_right(blocks) == list(range(40))
 
@@ -207,7 +207,7 @@ def test_blocks_are_as_long_as_the_stride_allows() -> None:
 def test_both_chips_bring_every_frame_with_its_record(chip: str, acks: str) -> None:
     with opened(model(chip=chip, acks=acks)) as spad:
         for n_frames in (1000, 7):
-            _, blocks = take(spad, n_frames)
+            blocks = take(spad, n_frames)
             assert require_right(blocks) == list(range(n_frames))
         assert spad.counters.exposed == spad.counters.delivered == 7
         marks = np.concatenate([block.records["marks"] for block in blocks])
@@ -216,7 +216,7 @@ def test_both_chips_bring_every_frame_with_its_record(chip: str, acks: str) -> N
 
 def test_a_burst_is_read_out_behind_the_exposure() -> None:
     with opened(model(paced=True)) as spad:
-        _, blocks = take(spad, 500, replace(REQUEST, mode="burst"))
+        blocks = take(spad, 500, replace(REQUEST, mode="burst"))
         assert require_right(blocks) == list(range(500))
         assert all(block.header.flags & BlockFlag.BURST for block in blocks)
 
@@ -226,7 +226,7 @@ def test_windows_move_with_the_line_markers_of_the_stream() -> None:
         64, tuple(np.array([64 * ((i + s) % 2) for i in range(SWEEP_FRAMES // LINE_FRAMES)], np.int32) for s in (0, 1))
     )
     with opened(model()) as spad:
-        _, blocks = take(spad, 3 * SWEEP_FRAMES, replace(REQUEST, window=window))
+        blocks = take(spad, 3 * SWEEP_FRAMES, replace(REQUEST, window=window))
         records = np.concatenate([block.records for block in blocks])
         expected = window.x0_of(records["marks"], records["line"], records["sweep"].astype(np.int64) - 1)
         assert np.array_equal(records["x0"], expected)
@@ -242,7 +242,7 @@ def test_heartbeats_between_slow_frames_are_no_frames_and_pings_go_on() -> None:
     with opened(device, heartbeat="200 ms") as spad:
         slow = replace(REQUEST, frame_rate_hz=Fraction(50), exposure_s=0.01, block_frames=10)
         begun_s = spad._now_s()
-        _, blocks = take(spad, 30, slow)
+        blocks = take(spad, 30, slow)
         assert spad._now_s() - begun_s >= 0.5
         assert require_right(blocks) == list(range(30))
         assert len(device.pings) >= 5
@@ -263,7 +263,7 @@ def test_a_host_that_falls_silent_ends_the_run_with_the_gate_low() -> None:
         assert not device.gate_allowed
         assert device.state is SensorState.ARMED
         spad.stop()
-        _, blocks = take(spad, 20)
+        blocks = take(spad, 20)
         assert require_right(blocks) == list(range(20))
 
 
