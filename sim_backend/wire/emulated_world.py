@@ -35,7 +35,7 @@ from sim_backend.wire.firmware.obis import ObisModel
 from sim_backend.wire.firmware.prawndo import PrawnDoModel
 from sim_backend.wire.firmware.spad512s import Spad512sModel
 from sim_backend.wire.firmware.spb_usb import SpbUsbModel
-from sim_backend.wire.firmware.spb_usb_run import Span
+from sim_backend.wire.firmware.spb_usb_run import Span, SpbUsbBoard
 from sim_backend.wire.serve.serial import SerialServer
 from sim_backend.wire.serve.tcp import TcpServer
 from sim_backend.wire.serve.usb import EmulatedUsb
@@ -101,7 +101,7 @@ class EmulatedWorld(SimulatedWorld):
         self.sync = PrawnDoModel(self._scan_marker, board=PICO_2)
         self.scanner = HeliosModel(clock_error=config.scanner_clock_error)
         self._frames = WorldFrames(self)
-        self.spad = SpbUsbModel(self._frames, width, rows, paced=True, fifo_frames=KEPT_FRAMES)
+        self.spad = SpbUsbModel(self._frames, SpbUsbBoard(width, rows, paced=True, fifo_frames=KEPT_FRAMES))
         bus = bus or EmulatedUsb(clock)
         self.scanner_plug = bus.plug(self.scanner)
         self.spad_plug = bus.plug(self.spad)

@@ -31,6 +31,7 @@ from drivers.spb1.control import Op, Register
 from drivers.transports.endpoints import Endpoint
 from drivers.transports.queued_link import QueuedLink
 from sim_backend.wire.firmware.spb_usb import SpbUsbModel
+from sim_backend.wire.firmware.spb_usb_run import SpbUsbBoard
 from tests.wire.spb_device import TiledSource
 from tests.wire.usb.umockdev import UmockdevBus, missing
 
@@ -123,7 +124,7 @@ def _result(taken: int, begun: float, cpu: float) -> dict[str, float]:
 def measure(rounds: int, seconds: float) -> dict[str, dict[str, float]]:
     """Medians over the rounds, by client."""
     results: dict[str, list[dict[str, float]]] = {sort: [] for sort in CLIENTS}
-    device = SpbUsbModel(TiledSource(), 512, 512, payload_crc=False, link_bytes_per_s=4_000_000_000)
+    device = SpbUsbModel(TiledSource(), SpbUsbBoard(512, 512, payload_crc=False, link_bytes_per_s=4_000_000_000))
     with UmockdevBus(SystemClock()) as bus:
         bus.plug(device)
         for _ in range(rounds):

@@ -16,6 +16,7 @@ from drivers.spads.spad512s import Spad512s, Spad512sConfig
 from drivers.spads.spad512s_line import Deadlines
 from sim_backend.wire.firmware.spad512s import Spad512sModel
 from sim_backend.wire.firmware.spb_usb import SpbUsbModel
+from sim_backend.wire.firmware.spb_usb_run import SpbUsbBoard
 from sim_backend.wire.serve.tcp import TcpServer
 from tests.conformance.cases import SpadCase
 from tests.wire.lasers import PATIENCE_S
@@ -40,7 +41,7 @@ def spad512s(folder: Path) -> Iterator[SpadCase]:
 
 @contextmanager
 def spb_usb(folder: Path, request: SpadRequest = REQUEST, **settings: Any) -> Iterator[SpadCase]:
-    with opened(SpbUsbModel(TiledSource(), WIDTH, HEIGHT, **settings)) as device:
+    with opened(SpbUsbModel(TiledSource(), SpbUsbBoard(WIDTH, HEIGHT, **settings))) as device:
         yield SpadCase(device, request)
 
 

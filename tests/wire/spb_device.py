@@ -13,7 +13,7 @@ from drivers.interfaces import SpadRequest
 from drivers.spads.spb_usb import SpbUsb, SpbUsbConfig, open_link
 from drivers.transports.endpoints import Endpoint
 from sim_backend.wire.firmware.spb_usb import SpbUsbModel
-from sim_backend.wire.firmware.spb_usb_run import Span
+from sim_backend.wire.firmware.spb_usb_run import Span, SpbUsbBoard
 from sim_backend.wire.serve.usb import EmulatedUsb
 from tests.wire.spads import take_run
 
@@ -73,7 +73,7 @@ class TiledSource:
 
 def model(**settings: Any) -> SpbUsbModel:
     """A small device with numbered frames."""
-    return SpbUsbModel(NumberedSource(), WIDTH, HEIGHT, **settings)
+    return SpbUsbModel(NumberedSource(), SpbUsbBoard(WIDTH, HEIGHT, **settings))
 
 
 def opened(device: SpbUsbModel, **config: Any) -> SpbUsb:

@@ -24,6 +24,7 @@ from drivers.interfaces import WindowTable
 from drivers.ring import BlockRing
 from drivers.spb1.control import Ack, AckStatus, Command, Feature, Op, Register, SensorState, pattern_row, read_acks
 from sim_backend.wire.firmware.spb_usb import SpbUsbModel
+from sim_backend.wire.firmware.spb_usb_run import SpbUsbBoard
 from sim_backend.wire.serve.usb import EmulatedUsb
 from tests.wire.spb_device import (
     HEIGHT,
@@ -68,7 +69,7 @@ def test_golden_bytes_of_the_ft601_session_which_leaves_pipes_not_in_use_alone()
             seen.append(data)
             return super()._session(data)
 
-    opened(Spy(NumberedSource(), WIDTH, HEIGHT, chip="ft601", acks="stream")).close()
+    opened(Spy(NumberedSource(), SpbUsbBoard(WIDTH, HEIGHT, chip="ft601", acks="stream"))).close()
     head = [data[:6].hex(" ") for data in seen]
     assert head == ["00 00 00 00 82 03", "00 00 00 00 82 02", "00 00 00 00 82 00", "00 00 00 00 82 03"]
     assert all(len(data) == 20 for data in seen)
@@ -118,7 +119,7 @@ def test_a_flipped_bit_in_an_answer_without_a_checksum_is_noticed() -> None:
                 value ^= self.left + 1  # another one each time
             return status, value
 
-    device = Flipping(NumberedSource(), WIDTH, HEIGHT)
+    device = Flipping(NumberedSource(), SpbUsbBoard(WIDTH, HEIGHT))
     with opened(device) as spad:
         device.left = 1
         take(spad, 20)

@@ -54,7 +54,6 @@ class CoboltModel:
         model: str | None = None,
         serial: str = "16328",
         firmware: str = "4.1.3",
-        max_power_w: float = 0.1,
         autostart: bool = True,
         warm_up_s: float = 3.0,
         junk: bytes = b"",
@@ -65,7 +64,7 @@ class CoboltModel:
         self.model = MODELS[family] if model is None else model
         self.serial = serial
         self.firmware = firmware
-        self.max_power_w = max_power_w
+        self.max_power_w = 0.1
         self.autostart = autostart
         self.warm_up_s = warm_up_s
         self.junk = junk

@@ -8,7 +8,7 @@ second channel, else in the stream). A pure state machine: what the sensor sees 
 import struct
 from collections import deque
 from collections.abc import Callable, Iterable
-from typing import Final, Literal
+from typing import Final
 
 from drivers.frames import BlockFlag, BlockStatus
 from drivers.spb1.control import (
@@ -17,7 +17,6 @@ from drivers.spb1.control import (
     COMMAND_MAGIC,
     Ack,
     AckStatus,
-    Feature,
     Op,
     Register,
     SensorState,
@@ -29,7 +28,7 @@ from sim_backend.wire.firmware.spb_usb_run import (
     Chip,
     EmulatedRun,
     FrameSource,
-    RunSettings,
+    SpbUsbBoard,
     device_spec,
     registers_at_power_up,
 )
@@ -40,34 +39,10 @@ FT601_CONFIG_BYTES: Final = 152
 
 
 class SpbUsbModel(UsbModel):
-    """The device. paced: frames come when they are exposed; else as fast as the host takes them.
+    """The device. mangle: what becomes of each block of the stream on its way (damage for tests)."""
 
-    fifo_frames: frames that wait for the host before new ones are lost. mangle: what becomes of each block of the
-    stream on its way (damage for tests). acks: on an endpoint of their own, or in the stream.
-    """
-
-    def __init__(
-        self,
-        source: FrameSource,
-        width: int,
-        height: int,
-        *,
-        chip: Chip = "fx3",
-        acks: Literal["endpoint", "stream"] = "endpoint",
-        serial: str | None = "SPB-0001",
-        product_name: str = "SPB1 SPAD",
-        paced: bool = False,
-        fifo_frames: int = 10_000,
-        payload_crc: bool = True,
-        tick_hz: int = 100_000_000,
-        min_period_ticks: int = 1000,
-        ddr_bytes: int = 1 << 30,
-        max_stride: int = 1 << 20,
-        link_bytes_per_s: int = 400_000_000,
-        protocol: int = 0x0100,
-        features: Feature = ~Feature.EXTERNAL_TRIGGER,
-    ) -> None:
-        self.chip: Chip = chip
+    def __init__(self, source: FrameSource, board: SpbUsbBoard) -> None:
+        self.chip: Chip = board.chip
         self.mangle: Callable[[memoryview], Iterable[bytes | memoryview]] | None = None
         self.gate_allowed = True
         """The FPGA's own gate line: low from the moment the watchdog strikes or a run is aborted until the next START.
@@ -77,24 +52,13 @@ class SpbUsbModel(UsbModel):
         self.pings: list[int] = []
         self.commands: list[tuple[int, int, int]] = []
         """Every command but PING: (op, address, value)."""
-        self.spec = device_spec(chip, acks, serial, product_name)
+        self.spec = device_spec(board.chip, board.acks, board.serial, board.product_name)
         self._source = source
-        self._board = RunSettings(width, height, tick_hz, paced, fifo_frames, payload_crc)
-        self._acks_in_stream = acks == "stream"
-        self._registers = registers_at_power_up(
-            width,
-            height,
-            serial or "",
-            tick_hz,
-            min_period_ticks,
-            ddr_bytes,
-            max_stride,
-            link_bytes_per_s,
-            protocol,
-            features,
-        )
-        self._max_stride = max_stride
-        self._min_period = min_period_ticks
+        self._board = board
+        self._acks_in_stream = board.acks == "stream"
+        self._registers = registers_at_power_up(board)
+        self._max_stride = board.max_stride
+        self._min_period = board.min_period_ticks
         self._window_entries = self._registers[Register.WINDOW_ENTRIES]
         self._state = SensorState.IDLE
         self._run: EmulatedRun | None = None
@@ -103,7 +67,7 @@ class SpbUsbModel(UsbModel):
         self._acks: deque[bytes] = deque()
         self._queue: deque[memoryview] = deque()
         self._memory = BlockMemory()
-        self._session_open = chip == "fx3"
+        self._session_open = board.chip == "fx3"
 
     @property
     def state(self) -> SensorState:

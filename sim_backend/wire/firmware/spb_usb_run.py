@@ -52,16 +52,45 @@ class FrameSource(Protocol):
         ...
 
 
+Chip = Literal["fx3", "ft601"]
+
+
 @dataclass(frozen=True, slots=True)
-class RunSettings:
-    """Settings that hold for all runs. Options as of `SpbUsbModel`."""
+class SpbUsbBoard:
+    """The board that is emulated: its sensor, its chip and its abilities."""
 
     width: int
+    """Pixels of a row."""
     height: int
-    tick_hz: int
-    paced: bool
-    fifo_frames: int
-    payload_crc: bool
+    """Rows of the sensor."""
+    chip: Chip = "fx3"
+    """USB chip."""
+    acks: Literal["endpoint", "stream"] = "endpoint"
+    """Way of the acknowledgements: an endpoint of their own, or the stream."""
+    serial: str | None = "SPB-0001"
+    """Serial number; None: it has none."""
+    product_name: str = "SPB1 SPAD"
+    """Product string by which drivers find it."""
+    paced: bool = False
+    """Frames come when they are exposed; else as fast as the host takes them."""
+    fifo_frames: int = 10_000
+    """Frames that wait for the host before new ones are lost."""
+    payload_crc: bool = True
+    """Blocks carry the CRC of their payload."""
+    tick_hz: int = 100_000_000
+    """Rate of the tick counter."""
+    min_period_ticks: int = 1000
+    """Shortest frame period."""
+    ddr_bytes: int = 1 << 30
+    """Memory for bursts."""
+    max_stride: int = 1 << 20
+    """Largest stride of a block in bytes."""
+    link_bytes_per_s: int = 400_000_000
+    """Rate that the link carries, as the board states it."""
+    protocol: int = 0x0100
+    """Version of SPB1 that it speaks: major << 8 | minor."""
+    features: Feature = ~Feature.EXTERNAL_TRIGGER
+    """Abilities that it states."""
 
 
 class BlockMemory:
@@ -93,7 +122,7 @@ class EmulatedRun:
 
     def __init__(
         self,
-        board: RunSettings,
+        board: SpbUsbBoard,
         source: FrameSource,
         registers: Mapping[int, int],
         run_id: int,
@@ -239,8 +268,6 @@ def _draw_pattern(bits: NDArray[np.uint8], first_frame: int, width: int) -> None
             image[row] = np.frombuffer(pattern_row(row, frame, width), np.uint8)
 
 
-Chip = Literal["fx3", "ft601"]
-
 _PACKET = 1024
 WRITABLE: Final = frozenset(
     (
@@ -276,38 +303,27 @@ def device_spec(chip: Chip, acks: str, serial: str | None, product_name: str) ->
     return DeviceSpec(0x0403, 0x601F, "FTDI", product_name, serial, "super", alternates)
 
 
-def registers_at_power_up(
-    width: int,
-    height: int,
-    serial: str,
-    tick_hz: int,
-    min_period_ticks: int,
-    ddr_bytes: int,
-    max_stride: int,
-    link_bytes_per_s: int,
-    protocol: int,
-    features: Feature,
-) -> dict[int, int]:
+def registers_at_power_up(board: SpbUsbBoard) -> dict[int, int]:
     """The registers by address; those that nobody wrote yet are 0."""
     registers = dict.fromkeys(WRITABLE, 0)
     registers |= {
         Register.MAGIC: IDENTITY_MAGIC,
-        Register.PROTOCOL: protocol,
-        Register.SENSOR_SIZE: width | height << 16,
-        Register.TICK_HZ: tick_hz,
+        Register.PROTOCOL: board.protocol,
+        Register.SENSOR_SIZE: board.width | board.height << 16,
+        Register.TICK_HZ: board.tick_hz,
         Register.TICK_HZ_DEN: 1,
-        Register.DDR_BYTES: ddr_bytes & 0xFFFFFFFF,
-        Register.DDR_BYTES + 4: ddr_bytes >> 32,
-        Register.MAX_STRIDE: max_stride,
-        Register.FEATURES: int(features) & 0x3F,
+        Register.DDR_BYTES: board.ddr_bytes & 0xFFFFFFFF,
+        Register.DDR_BYTES + 4: board.ddr_bytes >> 32,
+        Register.MAX_STRIDE: board.max_stride,
+        Register.FEATURES: int(board.features) & 0x3F,
         Register.ROI_STEP_PX: 64,
-        Register.MIN_PERIOD_TICKS: min_period_ticks,
-        Register.LINK_BYTES_PER_S: link_bytes_per_s,
+        Register.MIN_PERIOD_TICKS: board.min_period_ticks,
+        Register.LINK_BYTES_PER_S: board.link_bytes_per_s,
         Register.WINDOW_ENTRIES: 4096,
         Register.FIFO_HIGH_WATER: 0,
-        Register.STRIDE: max_stride,
+        Register.STRIDE: board.max_stride,
     }
-    for register, text in ((Register.MODEL, "emulated SPB1"), (Register.SERIAL, serial)):
+    for register, text in ((Register.MODEL, "emulated SPB1"), (Register.SERIAL, board.serial or "")):
         raw = text.encode().ljust(TEXT_BYTES, b"\0")
         for at in range(0, TEXT_BYTES, 4):
             registers[register + at] = int.from_bytes(raw[at : at + 4], "little")

@@ -16,6 +16,7 @@ from drivers.interfaces import SpadRequest
 from drivers.ring import BlockRing
 from drivers.spads.spb_usb import SpbUsb
 from sim_backend.wire.firmware.spb_usb import SpbUsbModel
+from sim_backend.wire.firmware.spb_usb_run import SpbUsbBoard
 from sim_backend.wire.serve.usb import EmulatedUsb
 from sim_backend.wire.serve.usb_model import STALL, Answer
 from tests.campaigns.outcomes import Ending, ending
@@ -30,7 +31,7 @@ class FaultyModel(SpbUsbModel):
     """A device whose every transfer may go wrong, from the moment `armed` is set."""
 
     def __init__(self, rng: random.Random, probability: float, most: int, **settings: object) -> None:
-        super().__init__(NumberedSource(), WIDTH, HEIGHT, **settings)  # type: ignore[arg-type]
+        super().__init__(NumberedSource(), SpbUsbBoard(WIDTH, HEIGHT, **settings))  # type: ignore[arg-type]
         self._rng = rng
         self._probability = probability
         self._left = most
