@@ -1,12 +1,13 @@
 """Reads and writes of lanes and numbers in memory that is named by its address, and arrays that begin at a cache line.
 
 Addresses instead of arrays: numba counts references to every array that a compiled function is handed, and on the way
-through the functions of one image row that takes many times as long as the work itself. Whoever takes an address
-(`address_of`) keeps the array alive and the index inside it; nothing here checks. A vector of 32 bytes in an array that
-begins at a cache line (`aligned_zeros`) never lies across two lines, which would be read twice.
+through the functions of one image row that takes many times as long as the work itself. So a caller makes a named tuple
+of arrays, keeps it alive and hands over its `pointers`; inside a kernel there is `address_of`. Nothing here checks that
+an index lies inside the array. A vector of 32 bytes in an array that begins at a cache line (`aligned_zeros`) never
+lies across two lines, which would be read twice.
 """
 
-from typing import Any, Final
+from typing import Any, Final, TypeVar
 
 import numba
 import numpy as np
@@ -19,10 +20,27 @@ from rig.simd.vectors import BLOCK, BYTES, FLOAT32, FOUR, INT16, LANES, VectorCo
 _I8, _I16, _I32, _I64, _F32 = ir.IntType(8), ir.IntType(16), ir.IntType(32), ir.IntType(64), ir.FloatType()
 
 
+Arrays = TypeVar("Arrays", bound=tuple[Any, ...])
+
+
+def pointers(arrays: Arrays) -> Arrays:
+    """The same named tuple for kernels: the address of each array in its place, numbers as they are.
+
+    Tuples within it become pointers too. Arrays must be C-contiguous, and the caller keeps them alive.
+    """
+    return type(arrays)(*map(_pointer_to, arrays))
+
+
+def _pointer_to(value: Any) -> Any:
+    if isinstance(value, np.ndarray):
+        return value.ctypes.data
+    return pointers(value) if isinstance(value, tuple) else value
+
+
 @numba.njit(inline="always")
 def address_of(array):  # type: ignore[no-untyped-def]
-    """Address of an array's first element."""
-    return array.ctypes.data
+    """Address of an array's first element, signed: sums of signed and unsigned numbers would be floats."""
+    return np.int64(array.ctypes.data)
 
 
 def _pointer(builder: Any, address: Any, index: Any, element: Any, whole: Any) -> Any:

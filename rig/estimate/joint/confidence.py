@@ -42,24 +42,19 @@ import numba
 import numpy as np
 from numpy.typing import NDArray
 
-from rig.estimate.joint.labels.tables import signed_address
 from rig.estimate.joint.place.places import LIGHT_PX, Places
 from rig.estimate.joint.place.pool import COPIED_ROWS, MARGIN, SAME_PX, with_margin
 from rig.estimate.joint.winner import UNITS, LabelAnswers
 from rig.estimate.row.model import RowModel
 from rig.geometry.stripe_table import StripeTable
 from rig.simd.functions import error_function, exponential, logarithm
-from rig.simd.memory import copy_floats, load_float32, load_int16, store_float32, store_int16
+from rig.simd.memory import address_of, copy_floats, load_float32, store_float32
 from rig.simd.vectors import (
     LANES,
     larger_float,
     smaller_float,
     square_root,
-    to_float32,
-    to_int16,
-    where_small,
     zero_float32,
-    zero_int16,
 )
 from rig.threads import RowWorkers
 
@@ -71,7 +66,6 @@ OPPOSITE: Final = 2, 4
 """Rows and columns to the neighbours that lie opposite each other."""
 ASKED: Final = 4 * len(OPPOSITE)
 """Pairs of opposite neighbours: along rows, columns and both diagonals."""
-_ANYWHERE: Final = np.float32(1e6)
 
 
 class Neighbours(NamedTuple):
@@ -117,76 +111,81 @@ def count_neighbours(distance: NDArray[np.float32], first_row: int, last_row: in
     for band in range(first_row, last_row, COPIED_ROWS):
         end = min(band + COPIED_ROWS, last_row)
         copy = with_margin(distance, band, end)
-        at, to, width = signed_address(copy), signed_address(out.number), copy.shape[1]
         for y in range(band, end):
-            _count_row(at, (y - band + MARGIN) * width + LANES, width, to, (y + AROUND) * width + LANES)
-        copy[:1] = 0.0  # kept alive up to here: only the address is used above
+            _count_row(copy, y - band + MARGIN, out.number[y + AROUND, LANES:])
 
 
 @numba.njit(cache=True, nogil=True)
-def _count_row(distance: int, here: int, width: int, number: int, there: int) -> None:
-    """Count a row's neighbours; elements of distances from `here` on, of numbers from `there` on, both at addresses."""
-    one = zero_float32() + np.float32(1.0)
-    for c in range(0, width - 2 * LANES, LANES):
-        own, same = load_float32(distance, here + c), zero_float32()
-        for away in range(-NEIGHBOURS, NEIGHBOURS + 1):
-            line = here + c + away * width
-            for i in range(line - NEIGHBOURS, line + NEIGHBOURS + 1):
-                same = same + where_small(one, load_float32(distance, i) - own, SAME_PX)
-        store_int16(number, there + c, to_int16(same))
+def _count_row(distance: NDArray[np.float32], row: int, number: NDArray[np.int16]) -> None:
+    """Count the neighbours in a row of a copy `with_margin`."""
+    columns = distance.shape[1] - 2 * LANES
+    own = distance[row, LANES:]
+    number[:columns] = 0
+    for line in range(row - NEIGHBOURS, row + NEIGHBOURS + 1):
+        for left in range(LANES - NEIGHBOURS, LANES + NEIGHBOURS + 1):
+            near = distance[line, left:]
+            for c in range(columns):
+                number[c] += np.int16(abs(near[c] - own[c]) <= SAME_PX)
 
 
 @numba.njit(cache=True, nogil=True)
-def agreement_row(number: int, width: int, y: int, line: int, out: int) -> None:
-    """Pairs that agree around each answer of row y, float32 to `out`.
+def agreement_row(number: NDArray[np.int16], y: int, line: NDArray[np.int16], out: NDArray[np.float32]) -> None:
+    """Write the pairs that agree around each answer of row y.
 
-    All but numbers addresses: number and its width as in `Neighbours`; line: int16 (width,), whose margins are 0.
+    number: as in `Neighbours`; line: as wide, room whose margins are 0.
     """
-    for c in range(0, width - 2 * LANES, LANES):
-        pairs = zero_int16()
-        for row in range(y, y + 2 * AROUND + 1):
-            pairs = pairs + load_int16(number, row * width + LANES + c)
-        store_int16(line, LANES + c, pairs)
-    for c in range(0, width - 2 * LANES, LANES):
-        pairs = zero_int16()
-        for i in range(c - AROUND, c + AROUND + 1):
-            pairs = pairs + load_int16(line, LANES + i)
-        store_float32(out, c, to_float32(pairs))
+    columns = number.shape[1] - 2 * LANES
+    own = line[LANES:]
+    own[:columns] = 0
+    for row in range(y, y + 2 * AROUND + 1):
+        near = number[row, LANES:]
+        for c in range(columns):
+            own[c] += near[c]
+    out[:columns] = 0.0
+    for left in range(LANES - AROUND, LANES + AROUND + 1):
+        near = line[left:]
+        for c in range(columns):
+            out[c] += np.float32(near[c])
 
 
 @numba.njit(cache=True, nogil=True)
-def apart_row(placed: int, width: int, here: int, out: int) -> None:
-    """Pairs of opposite neighbours whose mean is not within SAME_PX of the answer between them, float32 to `out`.
+def apart_row(placed: NDArray[np.float32], row: int, out: NDArray[np.float32]) -> None:
+    """Write the pairs of opposite neighbours whose mean is not within SAME_PX of the answer between them.
 
-    placed: address of a copy `with_margin` of final distances, width wide; here: the row's first answer in it.
+    placed: a copy `with_margin` of final distances; row: of the copy.
     """
-    one, half = zero_float32() + np.float32(1.0), np.float32(0.5)
-    for c in range(0, width - 2 * LANES, LANES):
-        own, apart = load_float32(placed, here + c), zero_float32()
-        for step in OPPOSITE:
-            for away in (1, width - 1, width, width + 1):
-                before, behind = here + c - step * away, here + c + step * away
-                off = (load_float32(placed, before) + load_float32(placed, behind)) * half - own
-                apart = apart + where_small(one, off, _ANYWHERE) - where_small(one, off, SAME_PX)
-        store_float32(out, c, apart)
+    columns, half = placed.shape[1] - 2 * LANES, np.float32(0.5)
+    own = placed[row, LANES:]
+    out[:columns] = 0.0
+    for step in OPPOSITE:
+        for down, right in ((0, step), (step, -step), (step, 0), (step, step)):
+            before, behind = placed[row - down, LANES - right :], placed[row + down, LANES + right :]
+            for c in range(columns):
+                off = abs((before[c] + behind[c]) * half - own[c])
+                # NaN where one of them is missing.
+                out[c] += np.float32(off > SAME_PX)
 
 
 @numba.njit(cache=True, nogil=True)
-def light_row(at: tuple[int, int], width: int, here: int, out: int, apart: int) -> None:
-    """Write numbers of 3 x 3 neighbours on the surface of each answer of a row, and `apart` further on their light.
+def light_row(
+    distance: NDArray[np.float32], light: NDArray[np.float32], row: int, number: NDArray[np.float32],
+    total: NDArray[np.float32],
+) -> None:  # fmt: skip
+    """Write numbers of 3 x 3 neighbours on the surface of each answer of a row, and their light.
 
-    at: addresses of distances and light, copies `with_margin`, width wide; here: the row's first answer in them.
+    distance, light: copies `with_margin`; row: of theirs.
     """
-    one = zero_float32() + np.float32(1.0)
-    for c in range(0, width - 2 * LANES, LANES):
-        own, number, total = load_float32(at[0], here + c), zero_float32(), zero_float32()
-        for line in range(here + c - width, here + c + width + 1, width):
-            for i in range(line - 1, line + 2):
-                off = load_float32(at[0], i) - own
-                number = number + where_small(one, off, SAME_PX)
-                total = total + where_small(load_float32(at[1], i), off, SAME_PX)
-        store_float32(out, c, number)
-        store_float32(out, apart + c, total)
+    columns, nothing = distance.shape[1] - 2 * LANES, np.float32(0.0)
+    own = distance[row, LANES:]
+    number[:columns], total[:columns] = 0.0, 0.0
+    for line in range(row - 1, row + 2):
+        for left in range(LANES - 1, LANES + 2):
+            near, value = distance[line, left:], light[line, left:]
+            for c in range(columns):
+                number[c] += np.float32(abs(near[c] - own[c]) <= SAME_PX)
+            for c in range(columns):
+                more = value[c]
+                total[c] += more if abs(near[c] - own[c]) <= SAME_PX else nothing
 
 
 Float32 = NDArray[np.float32]
@@ -257,15 +256,15 @@ def confidences(
     scales, lights, hazes, rests = places.scale, places.light, places.haze, places.rest
     number, margins, columns = neighbours.number, answer.margin, x_px.shape[1]
     # An odd number of cache lines: one line of numbers after the other does not push the others out of the cache.
-    width, wide = (-(-columns // LANES) | 1) * LANES, number.shape[1]
-    lines, pairs = np.zeros((_LINES, width), np.float32), np.zeros(wide, np.int16)
-    at, to_number, to_pairs = signed_address(lines), signed_address(number), signed_address(pairs)
+    width = (-(-columns // LANES) | 1) * LANES
+    lines, pairs = np.zeros((_LINES, width), np.float32), np.zeros(number.shape[1], np.int16)
+    at = address_of(lines)
     sources = (
-        (signed_address(sd_px), _SD), (signed_address(scales), _SCALE), (signed_address(lights), _LIGHT),
-        (signed_address(hazes), _HAZE), (signed_address(rests), _REST), (signed_address(neighbours.pairs), _ALL),
+        (address_of(sd_px), _SD), (address_of(scales), _SCALE), (address_of(lights), _LIGHT),
+        (address_of(hazes), _HAZE), (address_of(rests), _REST), (address_of(neighbours.pairs), _ALL),
     )  # fmt: skip
     targets = (
-        (signed_address(confidence), _CONFIDENCE), (signed_address(signal), _LIGHT), (signed_address(haze), _HAZE),
+        (address_of(confidence), _CONFIDENCE), (address_of(signal), _LIGHT), (address_of(haze), _HAZE),
     )  # fmt: skip
     for c in range(columns):
         lines[_FRAMES, c] = max(n_frames[c], 1)
@@ -273,13 +272,13 @@ def confidences(
         end = min(band + COPIED_ROWS, last_row)
         distance, light = with_margin(places.distance, band, end), with_margin(lights, band, end)
         placed = with_margin(places.placed, band, end)
-        around = signed_address(distance), signed_address(light)
         for y in range(band, end):
-            agreement_row(to_number, wide, y, to_pairs, at + 4 * _PAIRS * width)
-            here = (y - band + MARGIN) * wide + LANES
-            light_row(around, wide, here, at + 4 * _LIT * width, width)
-            apart_row(signed_address(placed), wide, here, at + 4 * _APART * width)
-            copy_floats(around[0] + 4 * here, at + 4 * _OFF * width, columns)
+            row = y - band + MARGIN
+            agreement_row(number, y, pairs, lines[_PAIRS])
+            light_row(distance, light, row, lines[_LIT], lines[_LIGHT_SUM])
+            apart_row(placed, row, lines[_APART])
+            for c in range(columns):
+                lines[_OFF, c] = distance[row, LANES + c]
             for source, line in sources:
                 copy_floats(source + 4 * columns * y, at + 4 * line * width, columns)
             for c in range(columns):
@@ -291,9 +290,7 @@ def confidences(
                 if np.isnan(x_px[y, c]):
                     confidence[y, c] = 0.0
                     signal[y, c] = haze[y, c] = sd_px[y, c] = nothing
-        distance[:1] = light[:1] = placed[:1] = 0.0
-    # Keeps the arrays alive up to here: numba would free those of which only the address is still used.
-    lines[:1], pairs[:1] = 0.0, 0
+    lines[:1] = 0.0  # kept alive up to here: numba would free what only its address still uses
 
 
 @numba.njit(cache=True, nogil=True)

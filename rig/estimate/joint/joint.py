@@ -21,13 +21,13 @@ from rig.estimate.joint.halo import bright_lines, learn_first_halo, learn_next_h
 from rig.estimate.joint.labels.costs import BAND_ROWS
 from rig.estimate.joint.labels.grid import LabelGrid
 from rig.estimate.joint.lesson import add_quiet, fill_trust, read_positions
-from rig.estimate.joint.paths import Penalties, along_columns, along_rows
+from rig.estimate.joint.paths import CHUNK, Penalties, along_columns, along_rows
 from rig.estimate.joint.place.place import amplitudes_of, line_width, place, weigh_light
 from rig.estimate.joint.second_returns import second_returns
 from rig.estimate.joint.tables import JointTables, Memory, grid_of, memory_for, tables_of
 from rig.estimate.joint.temporal import TemporalPrior
 from rig.estimate.joint.vote import NEIGHBOURS_PX, collect, vote
-from rig.estimate.joint.winner import answer_settings
+from rig.estimate.joint.winner import answer_settings, new_readout
 from rig.estimate.row.ambient import ambient_map
 from rig.estimate.row.em import learn_again, lines_of, next_lattice
 from rig.estimate.row.inputs import state_of
@@ -35,6 +35,7 @@ from rig.estimate.row.model import RowModel
 from rig.estimate.search.online_learning import LearningSetting, OnlineLearner, Seen, first_model
 from rig.geometry.stripe_table import StripeTable
 from rig.geometry.windows import SweepGeometry
+from rig.simd.memory import pointers
 from rig.threads import RowWorkers
 
 FIRST_ROUNDS = 3
@@ -141,14 +142,16 @@ class Joint:
 
         def tie_rows(first: int, last: int) -> None:
             # Rows that share tables: those are fetched once, and costs are tied along rows while the cache has them.
+            room = tables.costs.room()
             for band in range(first, last, BAND_ROWS):
                 end = min(band + BAND_ROWS, last)
-                tables.costs.fill(volume, band, end, memory.cost)
+                tables.costs.fill(volume, band, end, room, memory.cost)
                 self._prior.add(volume, band, end, memory.cost)
                 along_rows(memory.cost, memory.message, penalties, band, end)
 
         def tie_columns(first: int, last: int) -> None:
-            along_columns(memory.cost, memory.message, penalties, settings, first, last, memory.answer)
+            desk = new_readout(settings, memory.answer, CHUNK, grid.labels)
+            along_columns(memory.cost, memory.message, penalties, first, last, pointers(desk))
 
         x_px = np.empty((rows, columns), np.float32)
 

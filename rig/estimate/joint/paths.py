@@ -23,12 +23,8 @@ from numpy.typing import NDArray
 from rig.estimate.joint.winner import (
     LARGEST,
     VECTOR,
-    AnswerSettings,
-    LabelAnswers,
-    ReadoutPointers,
+    Readout,
     answer_columns,
-    desk_memory,
-    desk_of,
     fetch_answers,
 )
 from rig.simd.memory import address_of, load_bytes, prefetch, read_byte, store_bytes, write_byte
@@ -37,7 +33,7 @@ from rig.simd.vectors import add_saturated_unsigned, smaller_unsigned, smallest_
 _SIDE: Final = 2 * VECTOR
 """Bytes before and behind the labels of a path, whole cache lines: labels beyond the ends, and its least L."""
 _LEAST_AT: Final = -VECTOR
-_CHUNK: Final = 16
+CHUNK: Final = 16
 """Columns that go down and up together: enough that none waits for its own last step, few enough for the caches."""
 _AHEAD: Final = 3
 """Rows ahead of which memory is asked for: each lies on a page of its own, which the processor does not foresee."""
@@ -197,8 +193,8 @@ def _go_down(
     cost: int, message: int, rows: int, row_bytes: int, labels: int, columns: int, penalties: Penalties, paths: int
 ) -> None:
     """Add the messages from above to those of some columns; cost, message, paths: addresses."""
-    before, after = paths, paths + _CHUNK * (labels + 2 * _SIDE)
-    _begin(paths, _CHUNK, labels)
+    before, after = paths, paths + CHUNK * (labels + 2 * _SIDE)
+    _begin(paths, CHUNK, labels)
     for _ in range(rows):
         _step_down(before, after, cost, message, labels, columns, _AHEAD * row_bytes, penalties)
         before, after = after, before
@@ -208,13 +204,13 @@ def _go_down(
 @numba.njit(cache=True, nogil=True)
 def _go_up(
     cost: int, message: int, rows: int, row_bytes: int, columns: int, penalties: Penalties, paths: int, pixel: int,
-    desk: ReadoutPointers,
+    desk: Readout,
 ) -> None:  # fmt: skip
     """Totals of some columns and their answers, from the last row on; pixel: place of the first among the answers."""
     labels = desk.labels
     width = row_bytes // labels
-    before, after = paths, paths + _CHUNK * (labels + 2 * _SIDE)
-    _begin(paths, _CHUNK, labels)
+    before, after = paths, paths + CHUNK * (labels + 2 * _SIDE)
+    _begin(paths, CHUNK, labels)
     for row in range(rows - 1, -1, -1):
         costs, messages, here = cost + row * row_bytes, message + row * row_bytes, pixel + row * width
         fetch_answers(here - _AHEAD * width, columns, desk)
@@ -229,22 +225,20 @@ def along_columns(
     cost: NDArray[np.uint8],
     message: NDArray[np.uint8],
     penalties: Penalties,
-    settings: AnswerSettings,
     first_column: int,
     last_column: int,
-    out: LabelAnswers,
+    desk: Readout,
 ) -> None:
-    """The answers of columns first_column..last_column-1, from what `along_rows` left in all rows of message.
+    """Answer columns first_column..last_column-1, from what `along_rows` left in all rows of message.
 
-    Adds the messages from above to message.
+    Adds the messages from above to message. desk: pointers to the `Readout` of CHUNK columns.
     """
     rows, columns, labels = cost.shape
-    memory, desk_bytes = _path_memory(_CHUNK, labels), desk_memory(settings, _CHUNK, labels)
-    desk = desk_of(settings, out, desk_bytes, _CHUNK, labels)
+    memory = _path_memory(CHUNK, labels)
     paths, row_bytes = _paths_in(memory), columns * labels
-    for column in range(first_column, last_column, _CHUNK):
-        count, at = min(_CHUNK, last_column - column), column * labels
+    for column in range(first_column, last_column, CHUNK):
+        count, at = min(CHUNK, last_column - column), column * labels
         costs, messages = address_of(cost) + at, address_of(message) + at
         _go_down(costs, messages, rows, row_bytes, labels, count, penalties, paths)
         _go_up(costs, messages, rows, row_bytes, count, penalties, paths, column, desk)
-    memory[:1] = desk_bytes[:1] = 0  # kept alive up to here: only the address is used above
+    memory[:1] = 0  # kept alive up to here: only the address is used above

@@ -16,11 +16,11 @@ import numba
 import numpy as np
 from numpy.typing import NDArray
 
-from rig.estimate.joint.labels.tables import signed_address
 from rig.estimate.row.inputs import RowState, Sweep, flux_between, line_light, others_at, profile_place, with_rays
 from rig.estimate.row.likelihood import FLUX_MAX
 from rig.simd.memory import (
     CACHE_LINE,
+    address_of,
     load_counts,
     load_float32,
     prefetch,
@@ -199,13 +199,13 @@ def sum_blocks(
     lines, limits = np.zeros((BLOCK**2, FIELDS), np.int64), np.zeros((BLOCK**2, LIMITS), np.float32)
     ends, frames, order = np.zeros(BLOCK, np.int64), np.zeros(BLOCK, np.float32), _IN_ORDER
     seen = _Map(
-        signed_address(x_px), signed_address(place), signed_address(x0), signed_address(n_frames),
-        signed_address(counts), signed_address(still) + 4 * LANES, rows, columns, counts.shape[2], sweep.u.shape[1],
+        address_of(x_px), address_of(place), address_of(x0), address_of(n_frames),
+        address_of(counts), address_of(still) + 4 * LANES, rows, columns, counts.shape[2], sweep.u.shape[1],
         counts.itemsize, pixels,
     )  # fmt: skip
-    table = LineTable(signed_address(lines), signed_address(limits), signed_address(ends), signed_address(frames),
-                  signed_address(order))  # fmt: skip
-    clear_at, to_ones, to_expected = signed_address(clear), signed_address(out.ones), signed_address(out.expected)
+    table = LineTable(address_of(lines), address_of(limits), address_of(ends), address_of(frames),
+                  address_of(order))  # fmt: skip
+    clear_at, to_ones, to_expected = address_of(clear), address_of(out.ones), address_of(out.expected)
     group = -1
     for by in range(first_block, last_block):
         known, group = group == by // HAZE_BLOCKS, by // HAZE_BLOCKS
@@ -308,7 +308,7 @@ def _copy_lines(
         for p in range(place[y, c, PLACE_BEGIN], place[y, c, PLACE_END]):
             spare[0, i, p] = counts[c, y, start + p - x0[c]]
             spare[1, i, p] = still[LANES + y * width + start + p]
-        lines[i, SEEN], lines[i, STILL] = signed_address(spare[0, i]), signed_address(spare[1, i])
+        lines[i, SEEN], lines[i, STILL] = address_of(spare[0, i]), address_of(spare[1, i])
 
 
 @numba.njit(cache=True, nogil=True)

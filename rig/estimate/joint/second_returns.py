@@ -23,11 +23,10 @@ from numpy.typing import NDArray
 from rig.count.volume import CountVolume
 from rig.estimate.joint.labels.costs import hot_in_bands
 from rig.estimate.joint.labels.grid import PER_PX, LabelGrid
-from rig.estimate.joint.labels.tables import signed_address
 from rig.estimate.joint.place.pool import pool_row, with_margin
 from rig.estimate.joint.second_return_blocks import BLOCK, HAZE_STEP, LEFT_OUT, Blocks, line_places, sum_blocks
 from rig.estimate.row.inputs import RowState, Sweep, fluxes_at, line_light, with_rays
-from rig.simd.memory import aligned_zeros, load_float32, store_float32
+from rig.simd.memory import address_of, aligned_zeros, load_float32, store_float32
 from rig.simd.vectors import LANES, larger_float, largest_float, square_root, zero_float32
 from rig.threads import RowWorkers, Work
 
@@ -85,9 +84,9 @@ def find_candidates(blocks: Blocks, reach: int, side: int, first_block: int, las
     rows, columns, pixels = blocks.ones.shape
     three = np.zeros((2, columns, pixels), np.float32)
     nine, above = np.zeros((2, pixels + 2 * _AROUND), np.float32), np.empty(pixels, np.float32)
-    room, excess, row = signed_address(nine), signed_address(above), 4 * pixels * columns
-    of_three, of_nine = signed_address(three), room + 4 * _AROUND
-    ones, expected = signed_address(blocks.ones), signed_address(blocks.expected)
+    room, excess, row = address_of(nine), address_of(above), 4 * pixels * columns
+    of_three, of_nine = address_of(three), room + 4 * _AROUND
+    ones, expected = address_of(blocks.ones), address_of(blocks.expected)
     for by in range(first_block, last_block):
         lines = max(by - 1, 0), min(by + 2, rows)
         _add_lines(ones + row * lines[0], row, lines[1] - lines[0], pixels * columns, of_three)

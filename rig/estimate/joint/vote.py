@@ -18,17 +18,15 @@ import numba
 import numpy as np
 from numpy.typing import NDArray
 
-from rig.estimate.joint.labels.tables import signed_address
 from rig.estimate.joint.winner import LabelAnswers
 from rig.simd.memory import (
     load_float32,
     load_int16,
-    load_widened,
+    pointers,
     prefetch,
     read_byte,
     read_float32,
     read_int16,
-    store_float32,
     store_int16,
     write_byte,
     write_float32,
@@ -68,19 +66,10 @@ def collect(answer: LabelAnswers, first_column: int, last_column: int, out: Ball
     """The ballots of columns first_column..last_column-1."""
     # Local names: each use of the tuple itself in the loop would count references to all of its arrays.
     labels, margins, label, whole, votes = answer.label, answer.margin, out.label, out.whole, out.votes
-    at_label, at_margin, to_label = signed_address(labels), signed_address(margins), signed_address(label)
-    to_whole, to_votes, half = signed_address(whole), signed_address(votes), np.float32(0.5)
-    (rows, columns), width = labels.shape, label.shape[1]
-    for y in range(rows):
-        for c in range(first_column, last_column - LANES + 1, LANES):
-            here, there = y * columns + c, (y + REACH) * width + REACH + c
-            own = load_float32(at_label, here)
-            store_float32(to_label, there, own)
-            store_int16(to_whole, there, to_int16(own + half))
-            store_int16(to_votes, there, load_widened(at_margin, here) >> np.int16(SHARE_BITS))
-        for c in range(last_column - (last_column - first_column) % LANES, last_column):
+    for y in range(labels.shape[0]):
+        for c in range(first_column, last_column):
             label[y + REACH, c + REACH] = labels[y, c]
-            whole[y + REACH, c + REACH] = np.int16(labels[y, c] + half)
+            whole[y + REACH, c + REACH] = np.int16(labels[y, c] + np.float32(0.5))
             votes[y + REACH, c + REACH] = margins[y, c] >> SHARE_BITS
 
 
@@ -98,27 +87,23 @@ _CANDIDATES: Final = 5
 
 
 class _Hall(NamedTuple):
-    """Addresses of what a vote reads and writes, and the elements from row to row.
+    """What a vote reads and writes, handed over as pointers.
 
     elected: int16 (width,), of a row's answers first the candidate, then the label. against: int16 (candidates, LANES).
-    share: float32 (width,), 1 over the columns that vote.
+    share: float32 (width,), 1 over the columns that vote. width: of the ballots.
     """
 
-    label: int
-    whole: int
-    votes: int
+    ballots: Ballots
+    cost: NDArray[np.uint8]
+    answer: LabelAnswers
+    elected: NDArray[np.int16]
+    against: NDArray[np.int16]
+    share: NDArray[np.float32]
     width: int
-    cost: int
-    labels: int
-    to_label: int
-    to_margin: int
     columns: int
-    elected: int
-    against: int
-    share: int
+    labels: int
 
 
-@numba.njit(cache=True, nogil=True)
 def vote(ballots: Ballots, cost: NDArray[np.uint8], first_row: int, last_row: int, answer: LabelAnswers) -> None:
     """Mend the answers of rows first_row..last_row-1; cost: (rows, columns, labels), C-contiguous.
 
@@ -126,19 +111,18 @@ def vote(ballots: Ballots, cost: NDArray[np.uint8], first_row: int, last_row: in
     """
     rows, columns, labels = cost.shape
     width = ballots.label.shape[1]
-    memory, elected = np.zeros((_CANDIDATES, LANES), np.int16), np.zeros(width, np.int16)
-    share = np.zeros(width, np.float32)
-    hall = _Hall(
-        signed_address(ballots.label), signed_address(ballots.whole), signed_address(ballots.votes), width,
-        signed_address(cost), labels, signed_address(answer.label), signed_address(answer.margin), columns,
-        signed_address(elected), signed_address(memory), signed_address(share),
-    )  # fmt: skip
-    for c in range(columns):
-        share[c] = 1.0 / (min(c + REACH, columns - 1) - max(c - REACH, 0) + 1)
+    elected, against = np.zeros(width, np.int16), np.zeros((_CANDIDATES, LANES), np.int16)
+    c, share = np.arange(columns), np.zeros(width, np.float32)
+    share[:columns] = 1.0 / (np.minimum(c + REACH, columns - 1) - np.maximum(c - REACH, 0) + 1)
+    hall = _Hall(ballots, cost, answer, elected, against, share, width, columns, labels)
+    _vote_rows(pointers(hall), rows, first_row, last_row)
+
+
+@numba.njit(cache=True, nogil=True)
+def _vote_rows(hall: _Hall, rows: int, first_row: int, last_row: int) -> None:
     for y in range(first_row, last_row):
         _elect_row(hall, y)
         _settle_row(hall, y, min(y + REACH, rows - 1) - max(y - REACH, 0) + 1)
-    memory[0, 0] = elected[0] = share[0] = 0  # kept alive up to here: only the address is used above
 
 
 @numba.njit(cache=True, nogil=True)
@@ -146,10 +130,10 @@ def _elect_row(hall: _Hall, y: int) -> None:
     """Elect the candidate that the neighbours of each answer of row y are for."""
     line = (y + REACH) * hall.width + REACH
     for c in range(0, hall.columns, LANES):
-        weak = _weak_lanes(hall.votes, line + c, hall.columns - c)
+        weak = _weak_lanes(hall.ballots.votes, line + c, hall.columns - c)
         if weak == 0:
             continue
-        _count_votes(hall.whole, hall.votes, line + c, hall.width, hall.against)
+        _count_votes(hall.ballots.whole, hall.ballots.votes, line + c, hall.width, hall.against)
         best = _elect(hall.against)
         store_int16(hall.elected, c, best)
         moved = weak & ~np.int64(equal_mask(best, np.int16(0)))
@@ -158,8 +142,8 @@ def _elect_row(hall: _Hall, y: int) -> None:
             moved &= moved - 1
             own = hall.cost + (y * hall.columns + c + i) * hall.labels
             other = line + c + i + _step(hall.width, read_int16(hall.elected, c + i))
-            prefetch(own + read_int16(hall.whole, line + c + i))
-            prefetch(own + read_int16(hall.whole, other))
+            prefetch(own + read_int16(hall.ballots.whole, line + c + i))
+            prefetch(own + read_int16(hall.ballots.whole, other))
 
 
 @numba.njit(cache=True, nogil=True)
@@ -168,22 +152,22 @@ def _settle_row(hall: _Hall, y: int, high: int) -> None:
     line, down = (y + REACH) * hall.width + REACH, np.float32(1.0 / high)
     for c in range(0, hall.columns, LANES):
         pixel, at = y * hall.columns + c, line + c
-        weak = _weak_lanes(hall.votes, at, hall.columns - c)
+        weak = _weak_lanes(hall.ballots.votes, at, hall.columns - c)
         if weak == 0:
             continue
         best = load_int16(hall.elected, c)
         moved = weak & ~np.int64(equal_mask(best, np.int16(0)))
         store_int16(hall.against, 0, best)
-        store_int16(hall.elected, c, load_int16(hall.whole, at))
+        store_int16(hall.elected, c, load_int16(hall.ballots.whole, at))
         while moved != 0:
             i = np.int64(lowest_bit(np.uint32(moved)))
             moved &= moved - 1
             own, other = hall.cost + (pixel + i) * hall.labels, at + i + _step(hall.width, read_int16(hall.against, i))
-            label, least = read_int16(hall.whole, other), read_byte(own, read_int16(hall.whole, at + i))
+            label, least = read_int16(hall.ballots.whole, other), read_byte(own, read_int16(hall.ballots.whole, at + i))
             if np.int64(read_byte(own, label)) <= np.int64(least) + OBJECTION:
                 write_int16(hall.elected, c + i, label)
-                write_float32(hall.to_label, pixel + i, read_float32(hall.label, other))
-        _count_support(hall.whole, hall.votes, at, hall.width, hall.elected + 2 * c, hall.against)
+                write_float32(hall.answer.label, pixel + i, read_float32(hall.ballots.label, other))
+        _count_support(hall.ballots.whole, hall.ballots.votes, at, hall.width, hall.elected + 2 * c, hall.against)
         support = to_float32(larger(load_int16(hall.against, 0), np.int16(0)) * np.int16(SHARE))
         # Half a unit more: a whole quotient stays one, whatever the rounding.
         share = (support + np.float32(0.5)) * (load_float32(hall.share, c) * down)
@@ -191,7 +175,7 @@ def _settle_row(hall: _Hall, y: int, high: int) -> None:
         while weak != 0:
             i = np.int64(lowest_bit(np.uint32(weak)))
             weak &= weak - 1
-            write_byte(hall.to_margin, pixel + i, np.uint8(read_int16(hall.against, i)))
+            write_byte(hall.answer.margin, pixel + i, np.uint8(read_int16(hall.against, i)))
 
 
 @numba.njit(forceinline=True)

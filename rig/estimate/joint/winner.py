@@ -6,8 +6,7 @@ With S(l) the totals of a pixel (uint8, LARGEST where a label is excluded) and l
     margin = min of S(l) over |l - l*| >= MARGIN_FROM  -  S(l*)
 
 r is REACH, or less where labels on either side are excluded. label is float32, margin uint8, (rows, columns). Some
-columns of a row are read at a time, in short rounds over the columns, so that while one waits others go on. All arrays
-come by their addresses, see `rig.simd.memory`.
+columns of a row are read at a time, in short rounds over the columns, so that while one waits others go on.
 """
 
 from typing import Final, NamedTuple
@@ -17,7 +16,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from rig.simd.memory import (
-    address_of,
+    aligned_zeros,
     load_block,
     load_bytes,
     load_four,
@@ -103,66 +102,48 @@ def answer_settings(stripes: int, beta: float = 0.5) -> AnswerSettings:
 _BLOCK: Final = BLOCK.count
 
 
-class Fields(NamedTuple):
-    """Addresses of the arrays of `LabelAnswers`."""
+class Readout(NamedTuple):
+    """What columns are answered with, handed over as `pointers`; its arrays are one thread's.
 
-    label: int
-    margin: int
-
-
-class ColumnAnswers(NamedTuple):
-    """Addresses of what was found in each column: label, int32; its total, uint8; moments, float32 (POWERS,)."""
-
-    label: int
-    total: int
-    moments: int
-
-
-class ReadoutPointers(NamedTuple):
-    """Numbers (labels, end, size) and addresses that columns are answered with.
-
-    totals: uint8, `size` bytes from column to column, at least a vector of LARGEST before and behind each. end: labels
-    up to the end of the last block with stripes. hidden: uint8 (labels,), LARGEST where there is no stripe. The tables
-    are those of `AnswerSettings`.
+    end: labels up to the end of the last block with stripes; size: bytes from the totals of a column to the next.
+    around: uint8, totals of the columns, with a vector of LARGEST at least before and behind each; totals: address of
+    the first one's. hidden: uint8 (labels,), LARGEST where there is no stripe. Of each column: least_label: int32, of
+    the least total; least: uint8, that total; moments: float32 (columns, POWERS).
     """
 
+    settings: AnswerSettings
+    answer: LabelAnswers
     labels: int
     end: int
     size: int
     totals: int
-    hidden: int
-    weights: int
-    powers: int
-    reach: int
-    near: int
-    winner: ColumnAnswers
-    answer: Fields
+    around: NDArray[np.uint8]
+    hidden: NDArray[np.uint8]
+    least_label: NDArray[np.int32]
+    least: NDArray[np.uint8]
+    moments: NDArray[np.float32]
 
 
-@numba.njit(cache=True, nogil=True)
-def desk_memory(settings: AnswerSettings, columns: int, labels: int) -> NDArray[np.uint8]:
-    """Memory that `desk_of` hands out for so many columns; must live as long as its addresses are used."""
-    memory = np.full(labels + columns * (labels + 2 * _BLOCK) + 2 * VECTOR, LARGEST, np.uint8)
-    memory[: settings.stripes] = 0
-    return memory
-
-
-@numba.njit(cache=True, nogil=True)
-def desk_of(
-    settings: AnswerSettings, out: LabelAnswers, memory: NDArray[np.uint8], columns: int, labels: int
-) -> ReadoutPointers:
-    """Addresses for so many columns; totals begin at a multiple of their vectors."""
-    hidden = address_of(memory)
-    totals = -(-(hidden + labels) // VECTOR) * VECTOR + VECTOR
+def new_readout(settings: AnswerSettings, answer: LabelAnswers, columns: int, labels: int) -> Readout:
+    """Room to answer so many columns at a time."""
     size = -(-labels // _BLOCK) * _BLOCK + 2 * VECTOR
-    moments = totals + columns * size - VECTOR
-    rest = moments + 4 * POWERS * columns
-    return ReadoutPointers(
-        labels, -(-settings.stripes // _BLOCK) * _BLOCK, size, totals, hidden,
-        address_of(settings.weights), address_of(settings.powers), address_of(settings.reach),
-        address_of(settings.near), ColumnAnswers(rest, rest + 4 * columns, moments),
-        Fields(address_of(out.label), address_of(out.margin)),
-    )  # fmt: skip
+    around = aligned_zeros((columns * size + VECTOR,), np.uint8)
+    around[:] = LARGEST
+    hidden = aligned_zeros((labels,), np.uint8)
+    hidden[settings.stripes :] = LARGEST
+    return Readout(
+        settings=settings,
+        answer=answer,
+        labels=labels,
+        end=-(-settings.stripes // _BLOCK) * _BLOCK,
+        size=size,
+        totals=around.ctypes.data + VECTOR,
+        around=around,
+        hidden=hidden,
+        least_label=aligned_zeros((columns,), np.int32),
+        least=aligned_zeros((columns,), np.uint8),
+        moments=aligned_zeros((columns, POWERS), np.float32),
+    )
 
 
 @numba.njit(forceinline=True)
@@ -183,48 +164,48 @@ def _find_winners(columns, desk):  # type: ignore[no-untyped-def]
         for block in range(desk.end - _BLOCK, -1, -_BLOCK):
             place = first_equal(load_block(totals, block), least)
             label = block + place if place < _BLOCK else label
-        write_int32(desk.winner.label, c, np.int32(label))
-        write_byte(desk.winner.total, c, least)
+        write_int32(desk.least_label, c, np.int32(label))
+        write_byte(desk.least, c, least)
 
 
 @numba.njit(forceinline=True)
 def _weigh(columns, desk):  # type: ignore[no-untyped-def]
     """Sums of weight times each power over the labels around the winners, as far as both sides have some."""
-    found = desk.winner
+    settings = desk.settings
     for c in range(columns):
-        around = desk.totals + c * desk.size + read_int32(found.label, c)
+        around = desk.totals + c * desk.size + read_int32(desk.least_label, c)
         excluded = np.int64(equal_bytes(load_bytes(around, -MIDDLE), LARGEST)) >> (MIDDLE - REACH)
-        reach = np.int64(read_byte(desk.reach, excluded & ((1 << TAPS) - 1)))
-        powers = desk.powers + 4 * POWERS * (TAPS * reach + REACH)
-        weights = desk.weights - 4 * np.int64(read_byte(found.total, c))
+        reach = np.int64(read_byte(settings.reach, excluded & ((1 << TAPS) - 1)))
+        powers = settings.powers + 4 * POWERS * (TAPS * reach + REACH)
+        weights = settings.weights - 4 * np.int64(read_byte(desk.least, c))
         below, above = load_four(powers, 0) * read_float32(weights, np.int64(read_byte(around, 0))), zero_four()
         for k in range(1, REACH + 1):
             below = below + load_four(powers, -POWERS * k) * read_float32(weights, np.int64(read_byte(around, -k)))
             above = above + load_four(powers, POWERS * k) * read_float32(weights, np.int64(read_byte(around, k)))
-        store_four(found.moments, POWERS * c, below + above)
+        store_four(desk.moments, POWERS * c, below + above)
 
 
 @numba.njit(forceinline=True)
 def _hide_winners(columns, desk):  # type: ignore[no-untyped-def]
     """Take the winners, and what does not count for the margin, out of the totals."""
-    near = load_bytes(desk.near, 0)
+    near = load_bytes(desk.settings.near, 0)
     for c in range(columns):
-        around = desk.totals + c * desk.size + read_int32(desk.winner.label, c)
+        around = desk.totals + c * desk.size + read_int32(desk.least_label, c)
         store_bytes(around, -MIDDLE, load_bytes(around, -MIDDLE) | near)
 
 
 @numba.njit(forceinline=True)
 def _write_answers(pixel, columns, desk):  # type: ignore[no-untyped-def]
-    answer, found = desk.answer, desk.winner
+    answer = desk.answer
     for c in range(columns):
-        mean = read_float32(found.moments, POWERS * c + 1) / read_float32(found.moments, POWERS * c)
-        write_float32(answer.label, pixel + c, np.float32(read_int32(found.label, c)) + mean)
+        mean = read_float32(desk.moments, POWERS * c + 1) / read_float32(desk.moments, POWERS * c)
+        write_float32(answer.label, pixel + c, np.float32(read_int32(desk.least_label, c)) + mean)
         rival = _least_of(desk.totals + c * desk.size, desk)
-        write_byte(answer.margin, pixel + c, np.uint8(rival - read_byte(found.total, c)))
+        write_byte(answer.margin, pixel + c, np.uint8(rival - read_byte(desk.least, c)))
 
 
 @numba.njit(cache=True, nogil=True, error_model="numpy")
-def answer_columns(pixel: int, columns: int, desk: ReadoutPointers) -> None:
+def answer_columns(pixel: int, columns: int, desk: Readout) -> None:
     """Answer columns from their totals, which are overwritten; pixel: place of the first one's answer."""
     _find_winners(columns, desk)
     _weigh(columns, desk)

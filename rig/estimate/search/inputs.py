@@ -5,13 +5,12 @@ The search is a fast form of `rig.estimate.row.likelihood`, see `rig.estimate.se
 
 from typing import Final, NamedTuple
 
-import numba
 import numpy as np
 from numpy.typing import NDArray
 
 from rig.estimate.search.closeup import Closeup
 from rig.estimate.search.tables import ScreenTables
-from rig.simd.memory import address_of
+from rig.simd.memory import pointers
 
 COUNT_LIMIT: Final = 63
 """Largest count the search works with; counts of more exposures are halved until they fit."""
@@ -46,9 +45,9 @@ class SearchTables(NamedTuple):
     hot_start: NDArray[np.int32]
     hot_at: NDArray[np.int16]
     hot_place: NDArray[np.int32]
-    nominal: float
-    faintest: float
-    brightest: float
+    nominal: np.float32
+    faintest: np.float32
+    brightest: np.float32
     reach: int
     shift: int
     close_shift: int
@@ -80,85 +79,46 @@ class RowAnswers(NamedTuple):
 
 
 class SearchPointers(NamedTuple):
-    """SearchTables, RowAnswers and a thread's memory as addresses and sizes; `rig.simd.memory` says why addresses."""
+    """Pointers (`rig.simd.memory.pointers`) to tables, answers and a thread's memory, with the sizes of their arrays.
 
+    bands, taps: tables of a column, and pairs that a table has taps for; weight_pairs: the same of the close-up.
+    lanes: of the window, sum_lanes: of the sums over the picture. limit_rows: of `limits`. ambient: that of the
+    tables where they have it (several_lines), else of the bands, ambient_px wide.
+    """
+
+    judge: SearchTables
+    found: RowAnswers
     memory: int
     lanes: int
-    columns: int
-    rows: int
     bands: int
     taps: int
-    edge: int
-    tap: int
-    position: int
-    slope: int
-    lane: int
-    none: int
-    neutral: int
-    before: int
-    scale: int
-    first: int
-    last: int
-    weight: int
-    weight_constant: int
     weight_pairs: int
-    label: int
-    square: int
-    x0: int
-    limits: int
+    sum_lanes: int
     limit_rows: int
     ambient: int
     ambient_px: int
     several_lines: bool
-    hot_start: int
-    hot_at: int
-    hot_place: int
-    flux: int
-    stripe: int
-    quiet: int
-    quiet_exposures: int
-    light: int
-    quiet_sum: int
-    light_sum: int
-    sum_lanes: int
-    lines: int
-    line_start: int
-    line_row: int
-    band_rows: int
-    window: int
-    reach: int
-    shift: int
-    close_shift: int
-    most: int
-    quiet_step: int
-    near_is_left: bool
-    nominal: np.float32
-    faintest: np.float32
-    brightest: np.float32
 
 
-@numba.njit(cache=True, nogil=True)
-def desk_of(judge: SearchTables, found: RowAnswers, memory: NDArray[np.uint8]) -> SearchPointers:
-    """Addresses of everything; the arrays must outlive it. memory: of a thread, see `search_memory`."""
-    tables, closeup = judge.tables, judge.closeup
+def pointers_of(judge: SearchTables, found: RowAnswers, memory: NDArray[np.uint8]) -> SearchPointers:
+    """Pointers to everything; the arrays must outlive them. memory: of a thread, see `search_memory`."""
+    tables = judge.tables
     several_lines = tables.ambient.shape[0] > 0
-    ambient = address_of(tables.ambient) if several_lines else address_of(judge.ambient)
+    ambient = tables.ambient if several_lines else judge.ambient
     return SearchPointers(
-        address_of(memory), tables.lane.shape[2], judge.x0.shape[0], judge.rows, tables.lane.shape[1],
-        tables.tap.shape[4], address_of(tables.edge), address_of(tables.tap), address_of(tables.position),
-        address_of(tables.slope), address_of(tables.lane), address_of(tables.none), address_of(tables.neutral),
-        address_of(tables.before), address_of(tables.scale), address_of(tables.first), address_of(tables.last),
-        address_of(closeup.weight), address_of(closeup.constant), closeup.weight.shape[3],
-        address_of(closeup.label), address_of(closeup.square), address_of(judge.x0), address_of(judge.limits),
-        judge.limits.shape[2], ambient, judge.ambient.shape[1], several_lines, address_of(judge.hot_start),
-        address_of(judge.hot_at), address_of(judge.hot_place),
-        address_of(judge.flux), address_of(found.stripe), address_of(found.quiet_here),
-        address_of(found.quiet_exposures), address_of(found.light_here), address_of(found.quiet),
-        address_of(found.light), found.light.shape[2],
-        address_of(found.lines), address_of(found.line_start), address_of(found.line_row), judge.band_rows,
-        judge.window, judge.reach, judge.shift, judge.close_shift, judge.most, judge.quiet_step, judge.near_is_left,
-        np.float32(judge.nominal), np.float32(judge.faintest), np.float32(judge.brightest),
-    )  # fmt: skip
+        judge=pointers(judge),
+        found=pointers(found),
+        memory=memory.ctypes.data,
+        lanes=tables.lane.shape[2],
+        bands=tables.lane.shape[1],
+        taps=tables.tap.shape[4],
+        weight_pairs=judge.closeup.weight.shape[3],
+        sum_lanes=found.light.shape[2],
+        limit_rows=judge.limits.shape[2],
+        ambient=ambient.ctypes.data,
+        ambient_px=judge.ambient.shape[1],
+        several_lines=several_lines,
+    )
 
 
 def count_fluxes() -> NDArray[np.float32]:

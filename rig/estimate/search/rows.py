@@ -79,54 +79,55 @@ def _fetch_ahead(desk: SearchPointers, pixels: int, table: int) -> None:
 
     It is the next column's.
     """
-    taps = 2 * SCREENS * desk.taps * pixels
+    tables, taps = desk.judge.tables, 2 * SCREENS * desk.taps * pixels
     for at in range(0, taps, CACHE_LINE):
-        prefetch(desk.tap + taps * table + at)
+        prefetch(tables.tap + taps * table + at)
     for at in range(0, pixels, CACHE_LINE):
-        prefetch(desk.edge + pixels * table + at)
+        prefetch(tables.edge + pixels * table + at)
     for at in range(0, 4 * pixels, CACHE_LINE):
         here = 4 * pixels * table + at
-        prefetch(desk.position + here)
-        prefetch(desk.before + here)
-        prefetch(desk.scale + here)
-        prefetch(desk.neutral + here)
+        prefetch(tables.position + here)
+        prefetch(tables.before + here)
+        prefetch(tables.scale + here)
+        prefetch(tables.neutral + here)
 
 
 @numba.njit(forceinline=True)
 def table_for(desk: SearchPointers, search: Search, c: int, b: int, exposures: float) -> ScreenTable:
     """Make the table of column c and band b ready for columns of so many exposures."""
+    judge, tables = desk.judge, desk.judge.tables
     pixels, table = STEPS * search.lanes, c * desk.bands + b
-    constant = desk.position + 2 * SCREENS * pixels * table
-    if exposures != desk.nominal:
-        slope = desk.slope + 2 * SCREENS * pixels * table
-        fit_positions(constant, slope, SCREENS * pixels, exposures - desk.nominal, search.constant)
+    constant = tables.position + 2 * SCREENS * pixels * table
+    if exposures != judge.nominal:
+        slope = tables.slope + 2 * SCREENS * pixels * table
+        fit_positions(constant, slope, SCREENS * pixels, exposures - judge.nominal, search.constant)
         constant = search.constant
     _fetch_ahead(desk, pixels, table + desk.bands)
-    none = desk.none + 4 * NONE * table
+    none = tables.none + 4 * NONE * table
     fit_lanes(
-        desk.lane + 4 * search.lanes * table, exposures, max(read_float32(none, 2), np.float32(OUTSIDE)),
+        tables.lane + 4 * search.lanes * table, exposures, max(read_float32(none, 2), np.float32(OUTSIDE)),
         np.int64(read_float32(none, 3)), np.int64(read_float32(none, 4)), search,
     )  # fmt: skip
-    x0, neutral = np.int64(read_int32(desk.x0, c)), desk.neutral + 4 * pixels * table
-    band_end = min((b + 1) * desk.band_rows, desk.rows)
-    if _hot_of_row(desk, x0, b * desk.band_rows) < _hot_of_row(desk, x0, band_end):
-        _neutral_counts(neutral, exposures, c, desk.window, search.neutral)
+    x0, neutral = np.int64(read_int32(judge.x0, c)), tables.neutral + 4 * pixels * table
+    band_end = min((b + 1) * judge.band_rows, judge.rows)
+    if _hot_of_row(desk, x0, b * judge.band_rows) < _hot_of_row(desk, x0, band_end):
+        _neutral_counts(neutral, exposures, c, judge.window, search.neutral)
     lowest = np.float32(OUTSIDE)
     ambient = pixels * table if desk.several_lines else b * desk.ambient_px + x0
     all_right = max(read_float32(none, 0) + np.float32(START), lowest)
     return ScreenTable(
-        desk.edge + pixels * table, desk.tap + 2 * SCREENS * desk.taps * pixels * table, constant,
-        desk.before + 4 * pixels * table, desk.scale + 4 * pixels * table,
+        tables.edge + pixels * table, tables.tap + 2 * SCREENS * desk.taps * pixels * table, constant,
+        tables.before + 4 * pixels * table, tables.scale + 4 * pixels * table,
         desk.ambient + 4 * ambient, np.int16(all_right),
         np.int16(max(read_float32(none, 1), lowest)),
-        read_int32(desk.first, table) <= read_int32(desk.last, table),
+        read_int32(tables.first, table) <= read_int32(tables.last, table),
     )  # fmt: skip
 
 
 @numba.njit(forceinline=True)
 def _hot_of_row(desk, x0, y):  # type: ignore[no-untyped-def]
     """The first hot pixel of row y, and where those before it end, among all of windows that begin at x0."""
-    return np.int64(read_int32(desk.hot_start, (x0 // WORD_PX) * (desk.rows + 1) + y))
+    return np.int64(read_int32(desk.judge.hot_start, (x0 // WORD_PX) * (desk.judge.rows + 1) + y))
 
 
 @numba.njit(cache=True, nogil=True)
@@ -144,9 +145,9 @@ def _mute_hot(desk, search, first, rows, x0):  # type: ignore[no-untyped-def]
     """Give the hot pixels of the batch's rows counts that speak for no position; their own are kept in `muted`."""
     n, begin = search.n - first * search.n_bytes, _hot_of_row(desk, x0, first)
     for h in range(begin, _hot_of_row(desk, x0, first + rows)):
-        place = read_int32(desk.hot_place, h)
+        place = read_int32(desk.judge.hot_place, h)
         write_byte(search.muted, h - begin, read_byte(n, place))
-        write_byte(n, place, read_byte(search.neutral, read_int16(desk.hot_at, h)))
+        write_byte(n, place, read_byte(search.neutral, read_int16(desk.judge.hot_at, h)))
 
 
 @numba.njit(forceinline=True)
@@ -154,7 +155,7 @@ def _unmute_hot(desk, search, first, rows, x0):  # type: ignore[no-untyped-def]
     """Give the hot pixels their counts back: the ambient light is learned from what was counted."""
     n, begin = search.n - first * search.n_bytes, _hot_of_row(desk, x0, first)
     for h in range(begin, _hot_of_row(desk, x0, first + rows)):
-        write_byte(n, read_int32(desk.hot_place, h), read_byte(search.muted, h - begin))
+        write_byte(n, read_int32(desk.judge.hot_place, h), read_byte(search.muted, h - begin))
 
 
 @numba.njit(forceinline=True)
@@ -167,24 +168,24 @@ def judge_rows(
     """
     if not table.searched:
         return
-    _mute_hot(desk, search, first, rows, np.int64(read_int32(desk.x0, c)))
+    _mute_hot(desk, search, first, rows, np.int64(read_int32(desk.judge.x0, c)))
     # Each part for all rows before the next: one row's parts wait for one another, different rows' do not.
     score_rows(table, desk.taps - 1, search, rows)
-    find_best(search, rows, desk.shift)
-    add_likelihoods(table, search, rows, desk.window, desk.shift)
-    stripe = desk.stripe + 4 * (FIELDS * desk.rows * c + first)
-    certainty = certainties(table, search, desk.shift)
-    _answer(certainty, stripe + 4 * desk.rows, rows, search)
+    find_best(search, rows, desk.judge.shift)
+    add_likelihoods(table, search, rows, desk.judge.window, desk.judge.shift)
+    stripe = desk.found.stripe + 4 * (FIELDS * desk.judge.rows * c + first)
+    certainty = certainties(table, search, desk.judge.shift)
+    _answer(certainty, stripe + 4 * desk.judge.rows, rows, search)
     _measure_light(desk, search, table, first, rows, c, exposures, stripe)
     # The close-up knows one level behind the stripe for all columns; other lines' haze makes it as many as there are.
     if exposures <= FEW_EXPOSURES or desk.several_lines:
         _place_by_neighbours(desk, search, rows, c, stripe)
     else:
         _look_closely(desk, search, rows, c, exposures, stripe)
-    if c % desk.quiet_step == 0:
-        _unmute_hot(desk, search, first, rows, np.int64(read_int32(desk.x0, c)))
+    if c % desk.judge.quiet_step == 0:
+        _unmute_hot(desk, search, first, rows, np.int64(read_int32(desk.judge.x0, c)))
         for r in range(rows):
-            if read_float32(stripe, desk.rows + r) > QUIET:
+            if read_float32(stripe, desk.judge.rows + r) > QUIET:
                 n, x = search.n + r * search.n_bytes, np.int64(read_int16(search.x, r))
                 _learn_quiet(desk, search.lanes, n, first + r, c, x, exposures)
 
@@ -204,26 +205,26 @@ def _answer(lanes, to, rows, search):  # type: ignore[no-untyped-def]
 @numba.njit(forceinline=True)
 def _measure_light(desk, search, table, first, rows, c, exposures, stripe):  # type: ignore[no-untyped-def]
     """Signal and haze of the batch's rows, from row `first` of the picture on, for answers and close-up."""
-    limits = desk.limits + 4 * desk.limit_rows * c
+    limits = desk.judge.limits + 4 * desk.limit_rows * c
     low, high = load_int16(limits, first), load_int16(limits, desk.limit_rows + first)
     store_int16(search.x, 0, smaller(larger(load_int16(search.x, 0), low), high))
     # The usual reach as a constant: its loop is unrolled.
-    if desk.reach == SIGNAL_REACH_PX:
+    if desk.judge.reach == SIGNAL_REACH_PX:
         _read_light(desk, search, table, rows, exposures, SIGNAL_REACH_PX)
     else:
-        _read_light(desk, search, table, rows, exposures, desk.reach)
+        _read_light(desk, search, table, rows, exposures, desk.judge.reach)
     before, ambient = load_float32(search.before, 0), load_float32(search.ambient, 0)
     scale = load_float32(search.scale, 0)
-    light = load_float32(search.light, 0) - (before + ambient) * np.float32(desk.reach + 0.5)
-    signal = smaller_float(larger_float(light, scale * desk.faintest), scale * desk.brightest)
+    light = load_float32(search.light, 0) - (before + ambient) * np.float32(desk.judge.reach + 0.5)
+    signal = smaller_float(larger_float(light, scale * desk.judge.faintest), scale * desk.judge.brightest)
     store_int16(search.levels, 0, levels_of(before, signal))
-    _answer(signal, stripe + 12 * desk.rows, rows, search)
-    _answer(larger_float(before - ambient, np.float32(0.0)), stripe + 16 * desk.rows, rows, search)
+    _answer(signal, stripe + 12 * desk.judge.rows, rows, search)
+    _answer(larger_float(before - ambient, np.float32(0.0)), stripe + 16 * desk.judge.rows, rows, search)
 
 
 @numba.njit(forceinline=True)
 def _read_light(desk, search, table, rows, exposures, reach):  # type: ignore[no-untyped-def]
-    flux = desk.flux + 4 * (COUNT_LIMIT + 2) * np.int64(EXPOSURE_PARTS * exposures)
+    flux = desk.judge.flux + 4 * (COUNT_LIMIT + 2) * np.int64(EXPOSURE_PARTS * exposures)
     for r in range(rows):
         n, x = search.n + r * search.n_bytes, np.int64(read_int16(search.x, r))
         light = np.float32(0.0)
@@ -239,15 +240,15 @@ def _read_light(desk, search, table, rows, exposures, reach):  # type: ignore[no
 def _place_by_neighbours(desk, search, rows, c, stripe):  # type: ignore[no-untyped-def]
     """Place the lines of the batch's rows by the scores beside the best ones, and write the answers."""
     lift = load_int16(search.lift, 0)
-    own = powers_in_order(load_int16(search.best, 0), lift, desk.shift)
-    left = powers_in_order(load_int16(search.left, 0), lift, desk.shift)
-    right = powers_in_order(load_int16(search.right, 0), lift, desk.shift)
+    own = powers_in_order(load_int16(search.best, 0), lift, desk.judge.shift)
+    left = powers_in_order(load_int16(search.left, 0), lift, desk.judge.shift)
+    right = powers_in_order(load_int16(search.right, 0), lift, desk.judge.shift)
     beside = left + right
     # Labels a pixel apart instead of a quarter.
     offset, sd = offsets(larger_float(own + beside, NOTHING), right - left, beside, 1.0)
-    x = to_float32(load_int16(search.x, 0)) + np.float32(read_int32(desk.x0, c))
+    x = to_float32(load_int16(search.x, 0)) + np.float32(read_int32(desk.judge.x0, c))
     _answer(x + offset, stripe, rows, search)
-    _answer(sd, stripe + 8 * desk.rows, rows, search)
+    _answer(sd, stripe + 8 * desk.judge.rows, rows, search)
 
 
 @numba.njit(forceinline=True)
@@ -258,49 +259,51 @@ def _look_closely(desk, search, rows, c, exposures, stripe):  # type: ignore[no-
         _compare_labels(desk, search, rows, exposures, USUAL_PAIRS)
     else:
         _compare_labels(desk, search, rows, exposures, desk.weight_pairs)
-    lift = lift_to_powers(largest_of_rows(search.label), desk.close_shift)
+    lift = lift_to_powers(largest_of_rows(search.label), desk.judge.close_shift)
     store_int16(search.lift, 0, lift)
     for r in range(rows):
-        likelihood = powers(load_int16(search.label, r * LANES), read_int16(search.lift, r), desk.close_shift)
+        likelihood = powers(load_int16(search.label, r * LANES), read_int16(search.lift, r), desk.judge.close_shift)
         store_folded(search.mass, r, likelihood)
-        store_folded(search.moment, r, likelihood * load_float32(desk.label, 0))
-        store_folded(search.square, r, likelihood * load_float32(desk.square, 0))
+        store_folded(search.moment, r, likelihood * load_float32(desk.judge.closeup.label, 0))
+        store_folded(search.square, r, likelihood * load_float32(desk.judge.closeup.square, 0))
     mass, moment, square = (totals_of_rows(search.mass), totals_of_rows(search.moment), totals_of_rows(search.square))
     offset, sd = offsets(mass, moment, square, LABEL_PX)
-    x = to_float32(load_int16(search.x, 0)) + np.float32(read_int32(desk.x0, c))
+    x = to_float32(load_int16(search.x, 0)) + np.float32(read_int32(desk.judge.x0, c))
     _answer(x + offset, stripe, rows, search)
-    _answer(sd, stripe + 8 * desk.rows, rows, search)
+    _answer(sd, stripe + 8 * desk.judge.rows, rows, search)
 
 
 @numba.njit(forceinline=True)
 def _compare_labels(desk, search, rows, exposures, pairs):  # type: ignore[no-untyped-def]
+    closeup = desk.judge.closeup
     for r in range(rows):
         x, levels = np.int64(read_int16(search.x, r)), np.int64(read_int16(search.levels, r))
-        weight, constant = desk.weight + 4 * LANES * pairs * levels, desk.weight_constant + 4 * LANES * levels
+        weight, constant = closeup.weight + 4 * LANES * pairs * levels, closeup.constant + 4 * LANES * levels
         store_int16(search.label, r * LANES, label_scores(search, r, x, exposures, weight, constant, pairs))
 
 
 @numba.njit(cache=True, nogil=True)
 def _learn_quiet(desk: SearchPointers, lanes: int, n: int, y: int, c: int, x: int, exposures: float) -> None:
     """Add the whole lanes behind the stripe at stored pixel x to the quiet counts."""
-    limits = desk.limits + 4 * desk.limit_rows * c
+    judge = desk.judge
+    limits = judge.limits + 4 * desk.limit_rows * c
     if read_int16(limits, y) > read_int16(limits, desk.limit_rows + y):
         return
-    begin, end = 0, desk.window // STEPS
-    if desk.near_is_left:
-        begin = ((x + desk.reach + 1) >> 3) + 1
+    begin, end = 0, judge.window // STEPS
+    if judge.near_is_left:
+        begin = ((x + judge.reach + 1) >> 3) + 1
     else:
-        end = (x - desk.reach) >> 3
+        end = (x - judge.reach) >> 3
     if begin >= end:
         return
-    sums = desk.quiet + 2 * PAIRS * lanes * y
+    sums = desk.found.quiet_here + 2 * PAIRS * lanes * y
     for v in range(0, lanes, LANES):
         quiet = as_bytes(lanes_between(begin - v, end - v))
         for q in range(PAIRS):
             at = 2 * (q * lanes + v)
             counts = load_bytes(n, q * pair_bytes(lanes) + 2 * (PAD + v)) & quiet
             store_bytes(sums, at, load_bytes(sums, at) + counts)
-    steps = desk.quiet_exposures + 4 * (y * (desk.sum_lanes + 1) + np.int64(read_int32(desk.x0, c)) // STEPS)
+    steps = desk.found.quiet_exposures + 4 * (y * (desk.sum_lanes + 1) + np.int64(read_int32(judge.x0, c)) // STEPS)
     parts = np.int32(EXPOSURE_PARTS * exposures)
     write_int32(steps, begin, read_int32(steps, begin) + parts)
     write_int32(steps, end, read_int32(steps, end) - parts)

@@ -32,7 +32,7 @@ from rig.count.map_checks import check_points
 from rig.count.volume import BYTE_FRAMES, CountVolume, FrameTally, SweepLayout, SweepTally
 from rig.estimate.row.em import next_lattice
 from rig.estimate.row.inputs import Lines
-from rig.estimate.search.inputs import RowAnswers, SearchPointers, SearchTables, desk_of
+from rig.estimate.search.inputs import RowAnswers, SearchPointers, SearchTables, pointers_of
 from rig.estimate.search.prepare import clear_found, nothing_found, quiet_of, stripes_of
 from rig.estimate.search.rows import halvings, judge_rows, keep_line, table_for
 from rig.estimate.search.tables import BATCH, search_in, search_memory
@@ -74,8 +74,8 @@ def _move_window(by, row_words, n, planes):  # type: ignore[no-untyped-def]
 @numba.njit(cache=True, nogil=True)
 def carry_sums(desk: SearchPointers, x0: int, first_row: int, last_row: int) -> None:
     """Add the light of the window that began at x0 to the picture's, and begin anew."""
-    _carry(desk.light, desk.lanes, desk.light_sum, desk.sum_lanes, x0 // STEPS, first_row, last_row)
-    _carry(desk.quiet, desk.lanes, desk.quiet_sum, desk.sum_lanes, x0 // STEPS, first_row, last_row)
+    _carry(desk.found.light_here, desk.lanes, desk.found.light, desk.sum_lanes, x0 // STEPS, first_row, last_row)
+    _carry(desk.found.quiet_here, desk.lanes, desk.found.quiet, desk.sum_lanes, x0 // STEPS, first_row, last_row)
 
 
 @numba.njit(cache=True, nogil=True)
@@ -101,35 +101,35 @@ def _finish(desk, state, planes, row_bytes, first_row, last_row):  # type: ignor
 @numba.njit(forceinline=True)
 def _finish_rows(desk, search, state, planes, row_bytes, first_row, last_row):  # type: ignore[no-untyped-def]
     """Do the work of `_finish` in a thread's buffers."""
-    c, k = state.column, state.frames
-    halved = halvings(k, desk.most)
+    judge, found, c, k = desk.judge, desk.found, state.column, state.frames
+    halved = halvings(k, judge.most)
     exposures = np.float32(k / 2.0**halved)
     n, lanes = search.n, search.lanes
     n_planes = planes_for(k)
-    x0 = np.int64(read_int32(desk.x0, c))
+    x0 = np.int64(read_int32(judge.x0, c))
     at = (x0 // WORD_PX - state.first_word) * WORD_BYTES
     if x0 != state.sums_x0 or state.summed + k > SUM_LIMIT:
         carry_sums(desk, state.sums_x0, first_row, last_row)
-    light = desk.light + 2 * PAIRS * lanes * first_row
-    line, last_line = np.int64(read_int32(desk.line_start, c)), np.int64(read_int32(desk.line_start, c + 1))
-    while line < last_line and read_int32(desk.line_row, line) < first_row:
+    light = found.light_here + 2 * PAIRS * lanes * first_row
+    line, last_line = np.int64(read_int32(found.line_start, c)), np.int64(read_int32(found.line_start, c + 1))
+    while line < last_line and read_int32(found.line_row, line) < first_row:
         line += 1
-    for band in range(first_row // desk.band_rows, (last_row - 1) // desk.band_rows + 1):
+    for band in range(first_row // judge.band_rows, (last_row - 1) // judge.band_rows + 1):
         table = table_for(desk, search, c, band, exposures)
-        end = min(last_row, (band + 1) * desk.band_rows)
-        for y in range(max(first_row, band * desk.band_rows), end, BATCH):
+        end = min(last_row, (band + 1) * judge.band_rows)
+        for y in range(max(first_row, band * judge.band_rows), end, BATCH):
             rows = min(BATCH, end - y)
             for r in range(0, rows, 2):
                 # The partner of an odd last row is never looked at; behind the last counters there are some spare ones.
                 to = n + r * search.n_bytes
-                read_planes(planes, at, at + row_bytes, CHUNK * WORD_BYTES, n_planes, desk.window, to, lanes)
+                read_planes(planes, at, at + row_bytes, CHUNK * WORD_BYTES, n_planes, judge.window, to, lanes)
                 at += 2 * row_bytes
             for r in range(rows):
                 counts = n + r * search.n_bytes
                 sum_counts(counts, lanes, light)
                 light += 2 * PAIRS * lanes
-                while line < last_line and read_int32(desk.line_row, line) == y + r:
-                    keep_line(counts, lanes, desk.window, desk.lines + 4 * desk.window * line)
+                while line < last_line and read_int32(found.line_row, line) == y + r:
+                    keep_line(counts, lanes, judge.window, found.lines + 4 * judge.window * line)
                     line += 1
                 if halved:
                     halve_counts(counts, lanes, halved)
@@ -157,7 +157,7 @@ def search_frames(
     first_word: (n,) of each frame's window; row_words: words of a row; end: the sweep ends here, nothing stays open;
     desk: with a thread's own memory; planes: see `new_planes`. Only chunks first_chunk..last_chunk-1 are touched.
     """
-    rows = desk.rows
+    rows = desk.judge.rows
     frame = rows * row_words
     chunk_rows = rows_of_chunk(row_words)
     counted = address_of(planes)
@@ -196,7 +196,7 @@ def _after(state: OpenColumn, desk: SearchPointers, column: int, first_word: int
     """The next column, opened after `state` was finished."""
     if state.column < 0:
         return OpenColumn(column, first_word, 0, state.sums_x0, state.summed)
-    x0 = np.int64(read_int32(desk.x0, state.column))
+    x0 = np.int64(read_int32(desk.judge.x0, state.column))
     carried = x0 != state.sums_x0 or state.summed + state.frames > SUM_LIMIT
     return OpenColumn(column, first_word, 0, x0, state.frames + (0 if carried else state.summed))
 
@@ -205,34 +205,28 @@ def _after(state: OpenColumn, desk: SearchPointers, column: int, first_word: int
 def search_counts(
     counts: NDArray[np.unsignedinteger],
     n_frames: NDArray[np.int32],
-    judge: SearchTables,
-    memory: NDArray[np.uint8],
-    found: RowAnswers,
+    desk: SearchPointers,
     first_row: int,
     last_row: int,
 ) -> None:
-    """Judge rows first_row..last_row-1 of counts (columns, rows, window); no light and no lines are kept.
-
-    memory: see `search_memory`.
-    """
-    desk = desk_of(judge, found, memory)
-    search = search_in(desk.memory, desk.lanes)
+    """Judge rows first_row..last_row-1 of counts (columns, rows, window); no light and no lines are kept."""
+    judge, search = desk.judge, search_in(desk.memory, desk.lanes)
     sums_x0, pending = np.int64(0), 0
     for c in range(counts.shape[0]):
         k = n_frames[c]
         if k == 0:
             continue
-        x0 = np.int64(judge.x0[c])
-        halved = halvings(k, desk.most)
+        x0 = np.int64(read_int32(judge.x0, c))
+        halved = halvings(k, judge.most)
         if x0 != sums_x0 or pending + (k >> halved) + 1 > SUM_LIMIT:
             carry_sums(desk, sums_x0, first_row, last_row)
             sums_x0, pending = x0, 0
         pending += (k >> halved) + 1
         exposures = np.float32(k / 2.0**halved)
-        for band in range(first_row // desk.band_rows, (last_row - 1) // desk.band_rows + 1):
+        for band in range(first_row // judge.band_rows, (last_row - 1) // judge.band_rows + 1):
             table = table_for(desk, search, c, band, exposures)
-            end = min(last_row, (band + 1) * desk.band_rows)
-            for y in range(max(first_row, band * desk.band_rows), end, BATCH):
+            end = min(last_row, (band + 1) * judge.band_rows)
+            for y in range(max(first_row, band * judge.band_rows), end, BATCH):
                 rows = min(BATCH, end - y)
                 for r in range(rows):
                     read_counts(counts[c, y + r], halved, search.n + r * search.n_bytes, search.lanes, c)
@@ -373,7 +367,7 @@ class ColumnJudge:
         if first not in self._benches:
             self._benches[first] = search_memory(padded_lanes(self._layout.window))
         if first not in self._desks:
-            self._desks[first] = desk_of(self._judge, self._found, self._benches[first])
+            self._desks[first] = pointers_of(self._judge, self._found, self._benches[first])
         return self._desks[first]
 
     def _opened(self) -> OpenColumn:
@@ -389,7 +383,7 @@ def search_volume(
 
     def work(first: int, last: int) -> None:
         memory = search_memory(padded_lanes(geometry.window))
-        search_counts(volume.counts, volume.n_frames, judge, memory, found, first, last)
+        search_counts(volume.counts, volume.n_frames, pointers_of(judge, found, memory), first, last)
 
     workers.over(geometry.rows, work)
     return stripes_of(found, judge, workers), quiet_of(found, geometry.width)

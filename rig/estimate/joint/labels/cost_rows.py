@@ -14,7 +14,7 @@ for the usual width of the line. tests/unit/rig/estimate/joint/test_label_volume
 log-likelihoods written out in numpy.
 """
 
-from typing import Any, Final
+from typing import Any, Final, NamedTuple
 
 import numba
 import numpy as np
@@ -33,21 +33,20 @@ from rig.estimate.joint.labels.grid import (
     VARIANT,
     VARIANTS,
 )
-from rig.estimate.joint.labels.halo_rows import HaloTables, fit_halo, halo_at, halo_rows
+from rig.estimate.joint.labels.halo_rows import HaloRoom, HaloTables, fit_halo, halo_rows, new_halo_room
 from rig.estimate.joint.labels.tables import (
     BATCH,
     POSITION,
     SUMS_FROM,
-    At,
     Buffers,
     Fitted,
     LabelTables,
     Ways,
-    buffers_at,
-    signed_address,
+    new_buffers,
 )
 from rig.simd.memory import (
     CACHE_LINE,
+    address_of,
     load_bytes,
     load_float32,
     load_int16,
@@ -131,7 +130,7 @@ def read_bytes(
 
 
 @numba.njit(cache=True, nogil=True)
-def mend_rows(at: At, places: int, y: int, per_nat: float, side: int, b: Buffers, batch: int) -> None:
+def mend_rows(at: LabelTables, places: int, y: int, per_nat: float, side: int, b: Buffers, batch: int) -> None:
     """Give pixels that the table weighs, but that the row lacks, or that are hot, a count that says nothing.
 
     y: row of the first; per_nat: units times exposures.
@@ -166,7 +165,7 @@ def _neutral(at, i, p, per_nat):  # type: ignore[no-untyped-def]
 
 
 @numba.njit(cache=True, nogil=True)
-def sum_edges(at: At, fitted: Fitted, b: Buffers, batch: int) -> None:
+def sum_edges(at: LabelTables, fitted: Fitted, b: Buffers, batch: int) -> None:
     """Fill sums, as far as there are labels."""
     pixels = at.pixels
     for r in range(batch):
@@ -208,7 +207,7 @@ def _score_row(sums, n, tap, constant, score, vectors, taps):  # type: ignore[no
 
 
 @numba.njit(cache=True, nogil=True)
-def score_rows(at: At, constants: int, which: int, taps: int, b: Buffers, batch: int) -> None:
+def score_rows(at: LabelTables, constants: int, which: int, taps: int, b: Buffers, batch: int) -> None:
     """Fill score and top; constants: address of those of positions, which: of the number of each row among them.
 
     taps: pixels around a position.
@@ -231,7 +230,7 @@ def score_rows(at: At, constants: int, which: int, taps: int, b: Buffers, batch:
 
 
 @numba.njit(cache=True, nogil=True)
-def cost_rows(at: At, ways: Ways, b: Buffers, batch: int) -> None:
+def cost_rows(at: LabelTables, ways: Ways, b: Buffers, batch: int) -> None:
     """Fill cost of all that may be a label."""
     half = (1 << ways.down) >> 1
     for r in range(batch):
@@ -271,13 +270,17 @@ _LIMIT: Final = np.float32(HIGHEST)
 _TO_UNSIGNED: Final = np.float32(32768.5)
 
 
-@numba.njit(cache=True, nogil=True)
-def room_for(tables: LabelTables, halo: HaloTables, labels: int) -> NDArray[np.uint8]:
-    """Memory that `fill_costs` and `fit_tables` work in."""
-    _, size = buffers_at(0, tables.edge.shape[1], tables.tap.shape[1], labels)
-    if halo.weight.size > 0:
-        _, size = halo_at(halo, size, tables.constant[:1].size)
-    return np.zeros(size + CACHE_LINE, np.uint8)
+class CostRoom(NamedTuple):
+    """What `fill_costs` and `fit_tables` read and work in, handed over as `pointers`."""
+
+    at: LabelTables
+    halo: HaloRoom
+    buffers: Buffers
+
+
+def room_for(tables: LabelTables, halo: HaloTables, labels: int) -> CostRoom:
+    """The tables with buffers for one thread."""
+    return CostRoom(tables, new_halo_room(halo, tables.constants), new_buffers(tables, labels))
 
 
 @numba.njit(cache=True, nogil=True)
@@ -287,34 +290,25 @@ def fill_costs(
     x0: NDArray[np.int32],
     place: NDArray[np.int16],
     tables: LabelTables,
-    halo: HaloTables,
-    hot_start: NDArray[np.int32],
-    hot_x: NDArray[np.int16],
+    room: CostRoom,
     ways: Ways,
     first_row: int,
     last_row: int,
-    memory: NDArray[np.uint8],
     out: NDArray[np.uint8],
 ) -> None:
     """Costs of rows first_row..last_row-1, see `Costs.fill` in `rig.estimate.joint.labels.costs`.
 
-    hot_x: hot pixels, those of row y from hot_start[y] to hot_start[y + 1]. memory: of `room_for`, kept by the caller,
-    since what is known by its address alone would be freed in here.
+    room: pointers to the tables and a thread's buffers.
     """
-    pixels, vectors, labels = tables.edge.shape[1], tables.tap.shape[1], out.shape[2]
-    begin = signed_address(memory)
-    b, end_of_buffers = buffers_at(begin + -begin % CACHE_LINE, pixels, vectors, labels)
-    around, _ = halo_at(halo, end_of_buffers, tables.constant[:1].size)
+    at, around, b, labels = room.at, room.halo, room.buffers, out.shape[2]
     rows, columns, band_rows = out.shape[0], out.shape[1], ways.band_rows
-    at = _at(tables, hot_start, hot_x)
-    usually = _usually(tables)
-    room = Fitted(b.constant, b.edge)
-    place_at, out_at, counts_at = signed_address(place), signed_address(out), signed_address(counts)
+    usually, unusually = Fitted(at.fitted_constant, at.fitted_edge), Fitted(b.constant, b.edge)
+    place_at, out_at, counts_at = address_of(place), address_of(out), address_of(counts)
     window, in_bytes = counts.shape[2], counts.itemsize == 1
     # Pixels beyond the last vector of any table and its taps belong to no label; only halos weigh them.
-    read = pixels
-    if halo.weight.size == 0 and tables.used.size > 0:
-        read = min(pixels, -(-(FAR_PX + LANES * int(tables.used.max()) + ways.reach) // LANES) * LANES)
+    read = at.pixels
+    if around.blocks == 0 and tables.used.size > 0:
+        read = min(read, -(-(FAR_PX + LANES * int(tables.used.max()) + ways.reach) // LANES) * LANES)
     write_int32(b.table, 0, np.int32(-1))
     write_int32(b.shown, 0, np.int32(-1))
     for band in range(first_row // band_rows, -(-last_row // band_rows)):
@@ -325,7 +319,7 @@ def fill_costs(
             times = _times(exposures, ways)
             per_nat = ways.units * exposures * times / 2.0 ** (COUNT_BITS - ways.bits)
             usual = exposures == ways.exposures
-            fitted = usually if usual else room
+            fitted = usually if usual else unusually
             for variant in range(VARIANTS):
                 i = int(tables.at[band, c, variant]) if exposures > 0 else -1
                 write_int32(b.table, 1 + variant, np.int32(i))
@@ -334,7 +328,7 @@ def fill_costs(
                 if c + 1 < columns and tables.at[band, c + 1, variant] >= 0:
                     _fetch_table(at, int(tables.at[band, c + 1, variant]), usually)
             column = band * columns + c
-            if halo.weight.size > 0:
+            if around.blocks > 0:
                 fit_halo(around, column, per_nat)
             for y in range(top, end, BATCH):
                 batch = min(BATCH, end - y)
@@ -360,7 +354,7 @@ def fill_costs(
                 if mend:
                     mend_rows(at, places, y, per_nat, ways.side, b, batch)
                 sum_edges(at, fitted, b, batch)
-                if halo.weight.size > 0:
+                if around.blocks > 0:
                     halo_rows(around, column, at, fitted, b, batch)
                     score_rows(at, around.constant, around.which, 2 * ways.reach + 1, b, batch)
                 else:
@@ -390,7 +384,7 @@ def _fetch(begin, size):  # type: ignore[no-untyped-def]
 
 
 @numba.njit(cache=True, nogil=True)
-def _fetch_table(at: At, i: int, fitted: Fitted) -> None:
+def _fetch_table(at: LabelTables, i: int, fitted: Fitted) -> None:
     _fetch(at.tap + 2 * i * at.taps, 2 * at.taps)
     _fetch(at.edge + 2 * i * at.pixels, 2 * at.pixels)
     _fetch(fitted.constant + 2 * i * at.constants, 2 * at.constants)
@@ -398,22 +392,15 @@ def _fetch_table(at: At, i: int, fitted: Fitted) -> None:
 
 
 @numba.njit(cache=True, nogil=True)
-def fit_tables(tables: LabelTables, ways: Ways, first: int, last: int, memory: NDArray[np.uint8]) -> None:
-    """Fill the fitted parts of tables first..last-1, which are for the usual number of exposures."""
-    at = _at(tables, tables.span, tables.span)
-    fitted = _usually(tables)
+def fit_tables(room: CostRoom, ways: Ways, first: int, last: int) -> None:
+    """Fill the fitted parts of tables first..last-1, which are for the usual number of exposures; room: pointers."""
+    fitted = Fitted(room.at.fitted_constant, room.at.fitted_edge)
     for i in range(first, last):
-        _fit_table(at, i, i, ways.units * ways.exposures, fitted, signed_address(memory))
-
-
-@numba.njit(forceinline=True)
-def _usually(tables):  # type: ignore[no-untyped-def]
-    """Addresses of the parts of the tables that are fitted to the usual number of exposures."""
-    return Fitted(signed_address(tables.fitted_constant), signed_address(tables.fitted_edge))
+        _fit_table(room.at, i, i, ways.units * ways.exposures, fitted, room.buffers.through)
 
 
 @numba.njit(cache=True, nogil=True)
-def _fit_table(at: At, i: int, j: int, per_nat: float, to: Fitted, through: int) -> None:
+def _fit_table(at: LabelTables, i: int, j: int, per_nat: float, to: Fitted, through: int) -> None:
     """Constants of table i for a number of exposures, as number j; per_nat: units times exposures."""
     source, constant = at.constant + 4 * i * at.constants, to.constant + 2 * j * at.constants
     for k in range(0, at.constants, LANES):
@@ -425,15 +412,6 @@ def _fit_table(at: At, i: int, j: int, per_nat: float, to: Fitted, through: int)
         store_int16(through, LANES + k, _rounded(load_float32(source, k) * np.float32(per_nat)))
     for k in range(0, at.pixels, LANES):
         store_int16(edge, k, load_int16(through, LANES + k) - load_int16(through, LANES - 1 + k))
-
-
-@numba.njit(forceinline=True)
-def _at(tables, hot_start, hot_x):  # type: ignore[no-untyped-def]
-    return At(
-        signed_address(tables.edge), signed_address(tables.edge_sum), tables.edge.shape[1], signed_address(tables.tap),
-        tables.tap[:1].size, signed_address(tables.constant), tables.constant[:1].size,
-        signed_address(tables.span), signed_address(tables.used), signed_address(hot_start), signed_address(hot_x),
-    )  # fmt: skip
 
 
 @numba.njit(forceinline=True)

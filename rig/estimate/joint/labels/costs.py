@@ -19,7 +19,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from rig.count.volume import CountVolume
-from rig.estimate.joint.labels.cost_rows import fill_costs, fit_tables, room_for
+from rig.estimate.joint.labels.cost_rows import CostRoom, fill_costs, fit_tables, room_for
 from rig.estimate.joint.labels.grid import FAR_PX, FRACTIONS, PHASES, VARIANTS, LabelGrid, label_pixels, places_of
 from rig.estimate.joint.labels.halo_rows import BLOCK_PX, HaloTables, fill_halo, halo_tables
 from rig.estimate.joint.labels.tables import LIGHTS, LabelTables, Ways, fill_tables, mark_rows, number_tables
@@ -38,7 +38,7 @@ from rig.estimate.row.likelihood import FLUX_MAX, cell_of
 from rig.estimate.row.model import RowModel, pixel_shares
 from rig.estimate.search.prepare import HOT_FACTOR, HOT_FLUX
 from rig.geometry.windows import MARGIN_PX, SweepGeometry
-from rig.simd.memory import aligned_zeros
+from rig.simd.memory import aligned_zeros, pointers
 from rig.simd.vectors import LANES
 from rig.threads import RowWorkers
 
@@ -74,22 +74,23 @@ class Costs:
     tables: LabelTables
     halo: HaloTables
     place: NDArray[np.int16]
-    hot_start: NDArray[np.int32]
-    hot_x: NDArray[np.int16]
     ways: Ways
     units_per_nat: float
 
-    def fill(self, volume: CountVolume, first: int, last: int, out: NDArray[np.uint8]) -> None:
+    def room(self) -> CostRoom:
+        """Room for one thread to fill costs in, one band of rows after the other."""
+        return room_for(self.tables, self.halo, self.grid.labels)
+
+    def fill(self, volume: CountVolume, first: int, last: int, room: CostRoom, out: NDArray[np.uint8]) -> None:
         """Write the costs of rows first..last-1 to out, uint8 (rows, columns, labels) of all rows.
 
         Cost: by how much a label is less likely than the best one of that row and column (of all that the band has), at
         most COST_LIMIT; EXCLUDED where it cannot be. Rows without frames, or with nothing to search, cost 0 everywhere.
-        Best called with 16 rows or more at a time; threads may fill different rows at once.
+        Best called with 16 rows or more at a time; threads may fill different rows at once, each in its own room.
         """
-        memory = room_for(self.tables, self.halo, self.grid.labels)
         fill_costs(
-            volume.counts, volume.n_frames, volume.x0, self.place, self.tables, self.halo, self.hot_start, self.hot_x,
-            self.ways, first, last, memory, out,
+            volume.counts, volume.n_frames, volume.x0, self.place, self.tables, pointers(room), self.ways, first, last,
+            out,
         )  # fmt: skip
 
 
@@ -102,8 +103,8 @@ def costs_of(model: RowModel, geometry: SweepGeometry, grid: LabelGrid, exposure
     place = places_of(sweep, grid)
     bands = -(-geometry.rows // BAND_ROWS)
     at = np.empty((bands, geometry.columns, VARIANTS), np.int32)
-    tables = _empty_tables(at, number_tables(place, BAND_ROWS, at), grid, 2 * reach + 1)
     ambient, hot = model.ambient, hot_in_bands(model.ambient)
+    tables = _empty_tables(at, number_tables(place, BAND_ROWS, at), grid, 2 * reach + 1, hot)
     distance = np.arange(-reach, reach + 1) - (np.arange(FRACTIONS)[:, None] - FRACTIONS // 2) / FRACTIONS
     shares = pixel_shares(model.line_sigma_px, distance)
     beside = np.ascontiguousarray(halo_shares(model, BLOCK_PX // 2 + 1)[:, -1])
@@ -112,21 +113,9 @@ def costs_of(model: RowModel, geometry: SweepGeometry, grid: LabelGrid, exposure
 
     def work(first: int, last: int) -> None:
         fill_tables(
-            sweep,
-            dark,
-            place,
-            ambient,
-            hot,
-            light,
-            shares,
-            beside,
-            ways.units * scale,
-            TAPS_LIMIT * scale / ways.most,
-            BAND_ROWS,
-            first,
-            last,
-            tables,
-        )
+            sweep, dark, place, ambient, hot, light, shares, beside, ways.units * scale, TAPS_LIMIT * scale / ways.most,
+            BAND_ROWS, first, last, tables,
+        )  # fmt: skip
 
     workers.over(bands, work)
     halo = halo_tables(tables, bool(model.halo.any()))
@@ -142,13 +131,12 @@ def costs_of(model: RowModel, geometry: SweepGeometry, grid: LabelGrid, exposure
         workers.over(bands, around)
 
     def fit(first: int, last: int) -> None:
-        fit_tables(tables, ways, first, last, room_for(tables, halo, grid.labels))
+        room = room_for(tables, halo, grid.labels)
+        fit_tables(pointers(room), ways, first, last)
 
     workers.over(len(tables.span), fit)
     mark_rows(place, hot, grid.side, BAND_ROWS, tables)
-    y, x = np.nonzero(hot)
-    hot_start = np.searchsorted(y, np.arange(geometry.rows + 1)).astype(np.int32)
-    return Costs(grid, tables, halo, place, hot_start, x.astype(np.int16), ways, units_per_nat)
+    return Costs(grid, tables, halo, place, ways, units_per_nat)
 
 
 def _ways(
@@ -195,7 +183,10 @@ def _largest(sweep: Sweep, state: RowState, row: RowBuffers, light: float) -> tu
     return rise, gain
 
 
-def _empty_tables(at: NDArray[np.int32], tables: int, grid: LabelGrid, taps: int) -> LabelTables:
+def _empty_tables(
+    at: NDArray[np.int32], tables: int, grid: LabelGrid, taps: int, hot: NDArray[np.bool_]
+) -> LabelTables:
+    y, x = np.nonzero(hot)
     vectors = -(-label_pixels(grid) // LANES)
     pixels = -(-(FAR_PX + label_pixels(grid) + MARGIN_PX) // LANES) * LANES
     return LabelTables(
@@ -208,6 +199,11 @@ def _empty_tables(at: NDArray[np.int32], tables: int, grid: LabelGrid, taps: int
         used=np.zeros(tables, np.int16),
         fitted_constant=aligned_zeros((tables, vectors, PHASES, LIGHTS, LANES), np.int16),
         fitted_edge=aligned_zeros((tables, pixels), np.int16),
+        hot_start=np.searchsorted(y, np.arange(len(hot) + 1)).astype(np.int32),
+        hot_x=x.astype(np.int16),
+        pixels=pixels,
+        taps=vectors * taps * PHASES * LIGHTS * LANES,
+        constants=vectors * PHASES * LIGHTS * LANES,
     )
 
 

@@ -20,12 +20,10 @@ from rig.estimate.joint.labels.tables import (
     LIGHTS,
     POSITION,
     WEIGHT_LIMIT,
-    At,
     Buffers,
     Fitted,
     LabelTables,
     mean_ambient,
-    signed_address,
 )
 from rig.estimate.row.inputs import Float32, RowState, Sweep, row_buffers, row_fluxes
 from rig.estimate.row.likelihood import FLUX_MAX, FLUX_MIN, cell_of
@@ -37,7 +35,6 @@ from rig.simd.memory import (
     read_int32,
     store_int16,
     write_int16,
-    write_int32,
 )
 from rig.simd.vectors import LANES, add_saturated, larger_float, scaled, smaller, smaller_float, to_int16, zero_int16
 
@@ -168,58 +165,54 @@ _POSSIBLE: Final = np.int16(28000)
 """Constants of positions without a label lie below the negative of this, others above."""
 
 
-class HaloAt(NamedTuple):
-    """Addresses, for `rig.simd.memory`, and numbers of elements: tables, see there, and room.
+class HaloRoom(NamedTuple):
+    """The tables with their numbers of blocks and places, and room for a column and a batch of rows, int16 unless said.
 
-    fitted: constants of all places for a column's exposures; mean: counts of blocks; level: evidence of the halo
-    for a stripe at each place; constant: of the positions, of each row of a batch; which: int32, its number there.
+    fitted: (LIGHTS, places), constants of all places for a column's exposures; mean: (blocks,), counts of blocks;
+    level: (LIGHTS, places), evidence of the halo for a stripe at each place; constant: of the positions, of each row of
+    a batch; which: int32 (BATCH,), its number there.
     """
 
-    weight: int
-    per_column: int
-    constants: int
-    ramp: int
+    tables: HaloTables
     blocks: int
     places: int
-    fitted: int
-    mean: int
-    level: int
-    constant: int
-    which: int
+    fitted: NDArray[np.int16]
+    mean: NDArray[np.int16]
+    level: NDArray[np.int16]
+    constant: NDArray[np.int16]
+    which: NDArray[np.int32]
 
 
-@numba.njit(forceinline=True)
-def halo_at(tables, begin, constants):  # type: ignore[no-untyped-def]
-    """Addresses of tables and room, the room from `begin` on, and where it ends; constants: of positions of a row."""
-    blocks, places = tables.weight.shape[2], tables.weight.shape[4]
-    mean = begin + 2 * LIGHTS * places
-    level = mean + 2 * (blocks + LANES)
-    constant = level + 2 * LIGHTS * places
-    which = constant + 2 * BATCH * constants
-    at = HaloAt(
-        signed_address(tables.weight), blocks * LIGHTS * places, signed_address(tables.constant),
-        signed_address(tables.ramp), blocks, places, begin, mean, level, constant, which,
-    )  # fmt: skip
-    return at, which + 4 * BATCH
+def new_halo_room(halo: HaloTables, constants: int) -> HaloRoom:
+    """Room for rows of so many constants of positions."""
+    blocks, places = halo.weight.shape[2], halo.weight.shape[4]
+    return HaloRoom(
+        tables=halo,
+        blocks=blocks,
+        places=places,
+        fitted=aligned_zeros((LIGHTS, places), np.int16),
+        mean=aligned_zeros((blocks,), np.int16),
+        level=aligned_zeros((LIGHTS, places), np.int16),
+        constant=aligned_zeros((BATCH if blocks else 0, constants), np.int16),
+        which=np.arange(BATCH, dtype=np.int32),
+    )
 
 
 @numba.njit(cache=True, nogil=True)
-def fit_halo(halo: HaloAt, column: int, per_nat: float) -> None:
-    """Fill fitted for a column's exposures, and which; column: its number in its band, per_nat: units x exposures."""
+def fit_halo(halo: HaloRoom, column: int, per_nat: float) -> None:
+    """Fill fitted for a column's exposures; column: its number among all bands', per_nat: units x exposures."""
     numbers = LIGHTS * halo.places
     for j in range(0, numbers, LANES):
-        nats = load_float32(halo.constants + 4 * column * numbers, j) * np.float32(per_nat)
+        nats = load_float32(halo.tables.constant + 4 * column * numbers, j) * np.float32(per_nat)
         nats = larger_float(smaller_float(nats, _LIMIT), -_LIMIT)
         store_int16(halo.fitted, j, to_int16(nats + _TO_UNSIGNED) + np.int16(-32768))
-    for r in range(BATCH):
-        write_int32(halo.which, r, np.int32(r))
 
 
 @numba.njit(cache=True, nogil=True)
-def halo_rows(halo: HaloAt, column: int, at: At, fitted: Fitted, b: Buffers, batch: int) -> None:
+def halo_rows(halo: HaloRoom, column: int, at: LabelTables, fitted: Fitted, b: Buffers, batch: int) -> None:
     """Fill constant: the constants of the rows' tables plus the evidence of the halo."""
     vectors = b.score_row // (PHASES * LANES)
-    weights = halo.weight + 2 * column * halo.per_column
+    weights = halo.tables.weight + 2 * column * halo.blocks * LIGHTS * halo.places
     for r in range(batch):
         i = read_int32(b.here, r)
         if i < 0:
@@ -245,7 +238,7 @@ def halo_rows(halo: HaloAt, column: int, at: At, fitted: Fitted, b: Buffers, bat
                 second = zero_int16() + read_int16(halo.level, place + 1)
                 third = zero_int16() + read_int16(halo.level, place + 2)
                 for phase in range(PHASES):
-                    ramp = halo.ramp + 2 * 3 * LANES * phase
+                    ramp = halo.tables.ramp + 2 * 3 * LANES * phase
                     says = scaled(first, load_int16(ramp, 0)) + scaled(second, load_int16(ramp, LANES))
                     says = says + scaled(third, load_int16(ramp, 2 * LANES))
                     j = v * POSITION + (phase * LIGHTS + m) * LANES

@@ -1,4 +1,4 @@
-"""Tables of the label costs, per column, band of rows and variant, and the addresses of tables and buffers.
+"""Tables of the label costs, per column, band of rows and variant, and the buffers to work in.
 
 They hold the terms of `rig.estimate.row.likelihood`, relative to 'everything is before the stripe': with p'_B and p'_E
 of a pixel before and behind the stripe, p'_S of one that it lights,
@@ -39,7 +39,7 @@ from rig.estimate.joint.labels.grid import (
 )
 from rig.estimate.row.inputs import RowState, Sweep, row_buffers, row_fluxes
 from rig.estimate.row.likelihood import FLUX_MAX, FLUX_MIN, cell_of
-from rig.simd.memory import CACHE_LINE, address_of
+from rig.simd.memory import CACHE_LINE, aligned_zeros
 from rig.simd.vectors import LANES
 
 LIGHTS: Final = 2
@@ -65,6 +65,8 @@ class LabelTables(NamedTuple):
     used: int16 (tables,), vectors up to the last one that holds a label of any row.
     fitted_constant, fitted_edge: int16, units of constant and of each pixel's share of edge_sum, for the usual number
     of exposures.
+    hot_x: int16, x of hot pixels, those of row y from hot_start[y] to hot_start[y + 1], int32.
+    pixels, taps, constants: numbers of edge, tap and constant that a table has.
     """
 
     at: NDArray[np.int32]
@@ -76,6 +78,11 @@ class LabelTables(NamedTuple):
     used: NDArray[np.int16]
     fitted_constant: NDArray[np.int16]
     fitted_edge: NDArray[np.int16]
+    hot_start: NDArray[np.int32]
+    hot_x: NDArray[np.int16]
+    pixels: int
+    taps: int
+    constants: int
 
 
 @numba.njit(cache=True, nogil=True)
@@ -306,22 +313,6 @@ class Ways(NamedTuple):
     band_rows: int
 
 
-class At(NamedTuple):
-    """Addresses of the arrays of `LabelTables` and of hot pixels, and the elements from table to table."""
-
-    edge: int
-    edge_sum: int
-    pixels: int
-    tap: int
-    taps: int
-    constant: int
-    constants: int
-    span: int
-    used: int
-    hot_start: int
-    hot_x: int
-
-
 class Fitted(NamedTuple):
     """Addresses of constants and edges at a number of exposures, int16: of all tables, or of a column's variants."""
 
@@ -330,63 +321,62 @@ class Fitted(NamedTuple):
 
 
 class Buffers(NamedTuple):
-    """Addresses; of BATCH rows, int16 unless said, with the elements from row to row.
+    """Room for BATCH rows, int16 (BATCH, n_row or the like) unless said.
 
     n: counts of pixels from far to near; sums: score of a change at each pixel from SUMS_FROM on, the first one BASE;
-    score: of pixel and phase; top: largest ones of some lanes each, later of all.
-    cost: bytes of labels, from that of the first pixel's phase 0 on. Of all rows: mask: bytes, EXCLUDED or 0 for each
-    label; constant: of positions, edge: of pixels, for each variant; through: room for sums. As
-    int32, table: of variants from -1 on, -1 where there is none; here: of each row of the batch, fitted: place of it in
-    `Fitted`; shown: labels that the mask is for, from and up to. labels: how many there are.
+    score: of pixel and phase; top: largest ones of some lanes each, later of all. cost: uint8, of labels, from that of
+    the first pixel's phase 0 on.
+    Of all rows: mask: uint8 (labels,), EXCLUDED or 0; constant: of positions, edge: of pixels, for each variant;
+    through: sums on the way to edge. int32: table: of variants from -1 on, -1 where there is none; here: that of each
+    row of the batch; fitted: place of it in `Fitted`; shown: labels that the mask is for, from and up to.
     """
 
-    n: int
+    n: NDArray[np.int16]
+    sums: NDArray[np.int16]
+    score: NDArray[np.int16]
+    top: NDArray[np.int16]
+    cost: NDArray[np.uint8]
+    mask: NDArray[np.uint8]
+    constant: NDArray[np.int16]
+    edge: NDArray[np.int16]
+    through: NDArray[np.int16]
+    table: NDArray[np.int32]
+    here: NDArray[np.int32]
+    fitted: NDArray[np.int32]
+    shown: NDArray[np.int32]
     n_row: int
-    sums: int
-    score: int
     score_row: int
-    top: int
-    cost: int
     cost_row: int
-    mask: int
-    constant: int
-    edge: int
-    through: int
-    table: int
-    here: int
-    fitted: int
-    shown: int
     labels: int
 
 
-@numba.njit(forceinline=True)
-def buffers_at(begin, pixels, vectors, labels):  # type: ignore[no-untyped-def]
-    """The buffers from an address on, and where they end."""
+def new_buffers(tables: LabelTables, labels: int) -> Buffers:
+    """Buffers for so many labels, each beginning at a cache line."""
+    pixels, vectors = tables.pixels, tables.tap.shape[1]
     n_row = _whole(max(pixels, FAR_PX + vectors * LANES + LANES) + LANES)
     score_row = vectors * PHASES * LANES
     cost_row = _whole(max(labels, score_row) + 2 * 2 * LANES)
-    sums = begin + 2 * BATCH * n_row
-    score = sums + 2 * BATCH * n_row
-    top = score + 2 * BATCH * score_row
-    cost = top + 2 * BATCH * LANES
-    mask = cost + BATCH * cost_row
-    constant = mask + _whole(labels)
-    edge = constant + 2 * VARIANTS * vectors * POSITION
-    through = edge + 2 * VARIANTS * pixels
-    table = through + 2 * (pixels + 2 * LANES)
-    here = table + 4 * (VARIANTS + 1)
-    buffers = Buffers(begin, n_row, sums, score, score_row, top, cost, cost_row, mask, constant, edge,
-                       through, table, here, here + 4 * BATCH, here + 8 * BATCH, labels)  # fmt: skip
-    return buffers, here + 4 * (2 * BATCH + 2)
+    return Buffers(
+        n=aligned_zeros((BATCH, n_row), np.int16),
+        sums=aligned_zeros((BATCH, n_row), np.int16),
+        score=aligned_zeros((BATCH, score_row), np.int16),
+        top=aligned_zeros((BATCH, LANES), np.int16),
+        cost=aligned_zeros((BATCH, cost_row), np.uint8),
+        mask=aligned_zeros((labels,), np.uint8),
+        constant=aligned_zeros((VARIANTS, tables.constants), np.int16),
+        edge=aligned_zeros((VARIANTS, pixels), np.int16),
+        through=aligned_zeros((pixels + 2 * LANES,), np.int16),
+        table=aligned_zeros((VARIANTS + 1,), np.int32),
+        here=aligned_zeros((BATCH,), np.int32),
+        fitted=aligned_zeros((BATCH,), np.int32),
+        shown=aligned_zeros((2,), np.int32),
+        n_row=n_row,
+        score_row=score_row,
+        cost_row=cost_row,
+        labels=labels,
+    )
 
 
-@numba.njit(forceinline=True)
-def signed_address(array):  # type: ignore[no-untyped-def]
-    """Address of an array's first element, signed: sums of both kinds would be floats."""
-    return np.int64(address_of(array))
-
-
-@numba.njit(inline="always")
-def _whole(number):  # type: ignore[no-untyped-def]
+def _whole(number: int) -> int:
     """The next multiple of a cache line's bytes."""
     return -(-number // CACHE_LINE) * CACHE_LINE

@@ -16,7 +16,6 @@ import numba
 import numpy as np
 from numpy.typing import NDArray
 
-from rig.estimate.joint.labels.tables import signed_address
 from rig.estimate.joint.place.places import (
     BLIND_FLUX,
     LIGHT_PX,
@@ -33,6 +32,7 @@ from rig.estimate.row.likelihood import FLUX_MAX, FLUX_MIN
 from rig.simd.functions import logarithm
 from rig.simd.memory import (
     CACHE_LINE,
+    address_of,
     copy_floats,
     load_float32,
     prefetch,
@@ -81,17 +81,17 @@ def measure_light(
     )
     # Addresses: threads that count references to the same array wait for one another.
     at, spare_at, bins_at, taps_at = (
-        signed_address(lines),
-        signed_address(spare),
-        signed_address(bins),
-        signed_address(taps),
+        address_of(lines),
+        address_of(spare),
+        address_of(bins),
+        address_of(taps),
     )
-    ambient_at, bin_at = signed_address(ambient_places), signed_address(bin_places)
-    at_x, at_x0 = signed_address(x_px), signed_address(sweep.x0)
-    at_u, at_v, ambient = signed_address(sweep.u), signed_address(sweep.v), signed_address(state.ambient)
-    at_lo, at_hi, around_at = signed_address(sweep.x_lo), signed_address(sweep.x_hi), signed_address(around)
-    found = (signed_address(out.light), signed_address(out.scale), signed_address(out.haze), signed_address(out.rest),
-             signed_address(out.glow))  # fmt: skip
+    ambient_at, bin_at = address_of(ambient_places), address_of(bin_places)
+    at_x, at_x0 = address_of(x_px), address_of(sweep.x0)
+    at_u, at_v, ambient = address_of(sweep.u), address_of(sweep.v), address_of(state.ambient)
+    at_lo, at_hi, around_at = address_of(sweep.x_lo), address_of(sweep.x_hi), address_of(around)
+    found = (address_of(out.light), address_of(out.scale), address_of(out.haze), address_of(out.rest),
+             address_of(out.glow))  # fmt: skip
     ambient_places[:], bin_places[:], lines[_PX] = spare_at + 4 * EIGHT * (width - 1), bins_at, 1.0
     for c in range(columns):
         lines[_PX, c], lines[_PY, c], lines[_PZ, c] = sweep.plane[c, 0], sweep.plane[c, 1], sweep.plane[c, 2]

@@ -20,9 +20,8 @@ import numba
 import numpy as np
 from numpy.typing import NDArray
 
-from rig.estimate.joint.labels.tables import signed_address
 from rig.estimate.row.inputs import RowState, Sweep, fluxes_at, line_light
-from rig.simd.memory import prefetch, read_float32, read_int64, write_float32, write_int64
+from rig.simd.memory import address_of, prefetch, read_float32, read_int64, write_float32, write_int64
 from rig.simd.shuffles import EIGHT, spread_eights
 from rig.simd.vectors import LANES
 
@@ -159,7 +158,7 @@ def fetch_counts(
     """
     columns, rows, window = counts.shape
     size, column = counts.itemsize, rows * window * counts.itemsize
-    source, to = signed_address(counts), signed_address(around)
+    source, to = address_of(counts), address_of(around)
     for top in range(first_row, last_row, _TILE):
         for left in range(0, columns, _TILE):
             for c in range(left, min(left + _TILE, columns)):

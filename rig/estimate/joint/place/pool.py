@@ -23,9 +23,8 @@ import numba
 import numpy as np
 from numpy.typing import NDArray
 
-from rig.estimate.joint.labels.tables import signed_address
 from rig.estimate.joint.place.places import Places
-from rig.simd.memory import copy_floats, load_float32, store_float32
+from rig.simd.memory import address_of, copy_floats, load_float32, store_float32
 from rig.simd.vectors import (
     LANES,
     larger_float,
@@ -56,7 +55,7 @@ def with_margin(array: Float32, first_row: int, last_row: int) -> Float32:
     top, end = max(first_row - MARGIN, 0), min(last_row + MARGIN, rows)
     width = (-(-columns // LANES) + 2) * LANES
     copy, nowhere = np.empty((last_row - first_row + 2 * MARGIN, width), np.float32), np.float32(np.nan)
-    source, to = signed_address(array), signed_address(copy)
+    source, to = address_of(array), address_of(copy)
     for y in range(first_row - MARGIN, last_row + MARGIN):
         line = copy[y - first_row + MARGIN]
         if top <= y < end:
@@ -75,8 +74,8 @@ def pool_row(distance: Float32, first: Float32, second: Float32, y: int, reach: 
     a number of columns that is a multiple of LANES.
     """
     sums[:] = 0.0
-    at = signed_address(distance), signed_address(first), signed_address(second)
-    widen_row(at, distance.shape[1], y, -1, reach, np.inf, signed_address(sums))
+    at = address_of(distance), address_of(first), address_of(second)
+    widen_row(at, distance.shape[1], y, -1, reach, np.inf, address_of(sums))
 
 
 @numba.njit(cache=True, nogil=True)
@@ -116,9 +115,9 @@ def pool_amplitude(
     reach: int, faintest: float, brightest: float, first_row: int, last_row: int, places: Places
 ) -> None:
     """Fill amplitude: brightness of each stripe over that of its scale, pooled over neighbours, between two limits."""
-    amplitude, columns = signed_address(places.amplitude), places.amplitude.shape[1]
+    amplitude, columns = address_of(places.amplitude), places.amplitude.shape[1]
     sums = np.empty((2, -(-columns // LANES) * LANES), np.float32)
-    at, width = signed_address(sums), sums.shape[1]
+    at, width = address_of(sums), sums.shape[1]
     for band in range(first_row, last_row, COPIED_ROWS):
         end = min(band + COPIED_ROWS, last_row)
         distance = with_margin(places.distance, band, end)
@@ -143,12 +142,12 @@ def pool_places(
     columns = moved.shape[1]
     # Two sums, by how far to move, and the standard deviation, negative where it is not known yet.
     lines = np.empty((4, -(-columns // LANES) * LANES), np.float32)
-    to, to_moved, to_sd = signed_address(lines), signed_address(moved), signed_address(sd)
+    to, to_moved, to_sd = address_of(lines), address_of(moved), address_of(sd)
     for band in range(first_row, last_row, COPIED_ROWS):
         end = min(band + COPIED_ROWS, last_row)
         distance = with_margin(places.distance, band, end)
         score, known = with_margin(places.score, band, end), with_margin(places.known, band, end)
-        at, width = (signed_address(distance), signed_address(score), signed_address(known)), distance.shape[1]
+        at, width = (address_of(distance), address_of(score), address_of(known)), distance.shape[1]
         for y in range(band, end):
             lines[:3], lines[3] = 0.0, -1.0
             lines[1, columns:] = np.inf  # nothing to look for beyond the last column
@@ -207,13 +206,13 @@ def join_pairs(
     rows and columns to the neighbours, at most MARGIN. enough: 1/px^2, from which on a stripe stays where it is.
     """
     columns = distance.shape[1]
-    to_distance, to_sd = signed_address(out_distance), signed_address(out_sd_px)
+    to_distance, to_sd = address_of(out_distance), address_of(out_sd_px)
     lines = np.empty((2, (-(-columns // LANES) + 2) * LANES), np.float32)
-    at = signed_address(lines)
+    at = address_of(lines)
     for band in range(first_row, last_row, COPIED_ROWS):
         end = min(band + COPIED_ROWS, last_row)
         places, sds = with_margin(distance, band, end), with_margin(sd_px, band, end)
-        around, width = (signed_address(places), signed_address(sds)), places.shape[1]
+        around, width = (address_of(places), address_of(sds)), places.shape[1]
         for y in range(band, end):
             _join_row(around, width, (y - band + MARGIN) * width + LANES, step, share, 1.0 / enough, at)
             copy_floats(at, to_distance + 4 * columns * y, columns)

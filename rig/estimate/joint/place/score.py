@@ -16,7 +16,6 @@ import numba
 import numpy as np
 from numpy.typing import NDArray
 
-from rig.estimate.joint.labels.tables import signed_address
 from rig.estimate.joint.place.places import (
     MOST_FLUX,
     REACH_PX,
@@ -29,6 +28,7 @@ from rig.estimate.joint.place.places import (
 )
 from rig.estimate.row.inputs import RowState, Sweep
 from rig.simd.memory import (
+    address_of,
     copy_floats,
     load_float32,
     read_float32,
@@ -79,20 +79,20 @@ def score_places(
     ambient_places, share_places = np.empty(width, np.int64), np.empty(width, np.int64)
     # Addresses: threads that count references to the same array wait for one another.
     at, spare_at, taps_at, all_shares = (
-        signed_address(lines),
-        signed_address(spare),
-        signed_address(taps),
-        signed_address(shares),
+        address_of(lines),
+        address_of(spare),
+        address_of(taps),
+        address_of(shares),
     )
     ambient_at, shares_at, ambient = (
-        signed_address(ambient_places),
-        signed_address(share_places),
-        signed_address(state.ambient),
+        address_of(ambient_places),
+        address_of(share_places),
+        address_of(state.ambient),
     )
-    at_x, at_x0 = signed_address(x_px), signed_address(sweep.x0)
-    around_at, to_score, to_known = signed_address(around), signed_address(out.score), signed_address(out.known)
-    known = (signed_address(out.amplitude), signed_address(out.scale), signed_address(out.glow),
-             signed_address(out.haze), signed_address(out.rest), signed_address(out.distance))  # fmt: skip
+    at_x, at_x0 = address_of(x_px), address_of(sweep.x0)
+    around_at, to_score, to_known = address_of(around), address_of(out.score), address_of(out.known)
+    known = (address_of(out.amplitude), address_of(out.scale), address_of(out.glow),
+             address_of(out.haze), address_of(out.rest), address_of(out.distance))  # fmt: skip
     ambient_places[:], share_places[:] = spare_at + 4 * EIGHT * (width - 1), all_shares
     for y in range(first_row, last_row):
         for c in range(columns):

@@ -16,7 +16,6 @@ from rig.estimate.joint.confidence import (
     pairs_to_ask,
     stripe_table,
 )
-from rig.estimate.joint.labels.tables import signed_address
 from rig.estimate.joint.place.place import new_places
 from rig.estimate.joint.place.pool import SAME_PX
 from rig.estimate.joint.winner import UNITS, new_answer
@@ -65,7 +64,7 @@ def test_neighbours_and_the_pairs_around_are_counted_as_they_are():
     line, pairs = np.zeros(width, np.int16), np.zeros(width, np.float32)
     box = np.pad(expected, AROUND)
     for y in (0, 2, ROWS // 2, ROWS - 1):
-        agreement_row(signed_address(there.number), width, y, signed_address(line), signed_address(pairs))
+        agreement_row(there.number, y, line, pairs)
         rows = box[y : y + 2 * AROUND + 1].sum(axis=0)
         np.testing.assert_array_equal(pairs[:COLUMNS], np.convolve(rows, np.ones(2 * AROUND + 1), "valid"))
 
@@ -88,7 +87,7 @@ def test_all_pairs_of_a_wall_agree_up_to_its_border_and_to_what_is_not_there(cas
     width = there.number.shape[1]
     line, pairs = np.zeros(width, np.int16), np.zeros(width, np.float32)
     for y in range(ROWS):
-        agreement_row(signed_address(there.number), width, y, signed_address(line), signed_address(pairs))
+        agreement_row(there.number, y, line, pairs)
         np.testing.assert_array_equal(pairs[:COLUMNS][here[y]], there.pairs[y, here[y]])
 
 

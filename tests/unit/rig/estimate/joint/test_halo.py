@@ -60,7 +60,7 @@ def test_costs_are_those_of_a_stripe_with_its_halo(apart):
     model = replace(model, amplitude=model.amplitude * np.array([1 / apart, 1 / apart, apart, apart], np.float32))
     costs = costs_of(model, geometry, label_grid(geometry), 10, WORKERS)
     out = np.zeros((geometry.rows, geometry.columns, costs.grid.labels), np.uint8)
-    costs.fill(volume, 0, geometry.rows, out)
+    costs.fill(volume, 0, geometry.rows, costs.room(), out)
     off = []
     for c in range(4, 44, 5):
         row = row_fluxes(sweep_of(geometry), state_of(model), row_buffers(geometry.window, 1), y, c)

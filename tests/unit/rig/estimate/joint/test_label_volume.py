@@ -56,7 +56,7 @@ def filled(model, geometry, volume, exposures, pieces=1):
     out = np.full((geometry.rows, geometry.columns, grid.labels), 7, np.uint8)
     edges = np.linspace(0, geometry.rows, pieces + 1).astype(int)
     for first, last in pairwise(edges):
-        costs.fill(volume, first, last, out)
+        costs.fill(volume, first, last, costs.room(), out)
     return out, costs
 
 

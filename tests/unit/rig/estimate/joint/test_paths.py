@@ -4,8 +4,9 @@ import numpy as np
 import pytest
 
 from rig.estimate.joint import paths, vote, winner
-from rig.estimate.joint.paths import Penalties, along_columns, along_rows
-from rig.estimate.joint.winner import LabelAnswers, answer_settings, new_answer
+from rig.estimate.joint.paths import CHUNK, Penalties, along_columns, along_rows
+from rig.estimate.joint.winner import LabelAnswers, answer_settings, new_answer, new_readout
+from rig.simd.memory import pointers
 from rig.threads import RowWorkers
 from tests.stability.inventory import covers
 
@@ -73,7 +74,12 @@ def aggregated(cost, settings, threads=1, penalties=PENALTIES):
     with RowWorkers(threads) as workers:
         workers.over(cost.shape[0], lambda a, b: along_rows(cost, message, penalties, a, b))
         horizontal = message.copy()
-        workers.over(cost.shape[1], lambda a, b: along_columns(cost, message, penalties, settings, a, b, out))
+
+        def columns(first, last):
+            desk = new_readout(settings, out, CHUNK, cost.shape[2])
+            along_columns(cost, message, penalties, first, last, pointers(desk))
+
+        workers.over(cost.shape[1], columns)
     return horizontal, message, out
 
 

@@ -16,7 +16,7 @@ from rig.estimate.row.model import RowModel, line_profile, stripe_scale
 from rig.estimate.search import inputs, rows, stream, tables
 from rig.estimate.search import prepare as judging
 from rig.estimate.search import scores as scores_module
-from rig.estimate.search.inputs import desk_of
+from rig.estimate.search.inputs import pointers_of
 from rig.estimate.search.prepare import SCORE_LIMIT, judge_of, nothing_found, stripes_of
 from rig.estimate.search.rows import table_for
 from rig.estimate.search.scores import START, score_rows
@@ -53,7 +53,7 @@ def searched(volume, geometry, learned, exposures=None):
     judge = judge_of(learned, geometry, exposures, WORKERS, dark=False)
     found = nothing_found(geometry, None)
     bench = search_memory(padded_lanes(geometry.window))
-    search_counts(volume.counts, volume.n_frames, judge, bench, found, 0, geometry.rows)
+    search_counts(volume.counts, volume.n_frames, pointers_of(judge, found, bench), 0, geometry.rows)
     table = stripes_of(found, judge, WORKERS)
     return np.stack([table.x_px, table.confidence, table.x_sd_px, table.signal, table.haze])
 
@@ -180,7 +180,7 @@ def scores(judge, c, band, counts, exposures):
     tables = judge.tables
     lanes = tables.lane.shape[2]
     bench, found = search_memory(lanes), nothing_found(simulated().geometry, None)
-    desk = desk_of(judge, found, bench)
+    desk = pointers_of(judge, found, bench)
     raw, lane, constant = (np.zeros(n, np.int16) for n in (len(counts) * STEPS * lanes, lanes, 2 * STEPS * lanes))
     compiled_scores(desk, c, band, counts, np.float32(exposures), raw.reshape(len(counts), -1), lane, constant)
 
