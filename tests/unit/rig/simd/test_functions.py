@@ -1,4 +1,4 @@
-"""Powers, logarithms and the error function of lanes against numbers, and what is fetched or chosen lane by lane."""
+"""Powers, logarithms and the error function of lanes against numbers; likelihoods from scores."""
 
 import math
 
@@ -6,10 +6,18 @@ import numba
 import numpy as np
 import pytest
 
-from rig.simd.functions import error_function, exponential, logarithm
-from rig.simd.memory import address_of, load_counts, load_float32, store_float32
-from rig.simd.shuffles import EIGHT, fetch_eights, spread_eights
-from rig.simd.vectors import LANES, largest_float, smallest_float, where_below
+from rig.simd.functions import (
+    BIAS,
+    MEAN_EXCESS,
+    error_function,
+    exponential,
+    lift_to_powers,
+    logarithm,
+    powers,
+    powers_in_order,
+)
+from rig.simd.memory import address_of, load_float32, load_int16, read_int16, store_float32, store_int16
+from rig.simd.vectors import LANES, UNPACKED
 
 
 @numba.njit
@@ -37,35 +45,41 @@ def test_powers_of_lanes_are_those_of_numbers():
 
 
 @numba.njit
-def eights(places, counts, fetched, behind, spread):
-    fetch_eights(address_of(places), 0, address_of(fetched))
-    fetch_eights(address_of(places), 4 * 3, address_of(behind))
-    spread_eights(address_of(counts), address_of(spread))
+def likelihoods(scores, best, shift, out, unpacked, lift):
+    lifts = lift_to_powers(load_int16(address_of(best), 0), shift)
+    store_int16(address_of(lift), 0, lifts)
+    store_float32(address_of(out), 0, powers_in_order(load_int16(address_of(scores), 0), lifts, shift))
+    one = read_int16(address_of(lift), 0)
+    store_float32(address_of(unpacked), 0, powers(load_int16(address_of(scores), 0), one, shift))
 
 
-def test_eight_numbers_of_each_place_are_turned_into_lanes():
-    rng = np.random.default_rng(1)
-    numbers, counts = rng.random(200).astype(np.float32), rng.integers(0, 256, (LANES, EIGHT), np.uint8)
-    at = rng.integers(0, 189, LANES)
-    fetched, behind, spread = np.empty((3, EIGHT, LANES), np.float32)
-    eights(numbers.ctypes.data + 4 * at, counts, fetched, behind, spread)
-    np.testing.assert_array_equal(fetched, [numbers[at + d] for d in range(EIGHT)])
-    np.testing.assert_array_equal(behind, [numbers[at + 3 + d] for d in range(EIGHT)])
-    np.testing.assert_array_equal(spread, counts.T)
+def answers(scores, best, shift):
+    out, unpacked = np.empty((2, LANES), np.float32)
+    lift = np.empty(LANES, np.int16)
+    likelihoods(np.asarray(scores, np.int16), np.full(LANES, best, np.int16), shift, out, unpacked, lift)
+    np.testing.assert_array_equal(out[list(UNPACKED)], unpacked)
+    return out
 
 
-@numba.njit
-def choose(a, limits, counts, out):
-    values, limit = load_float32(address_of(a), 0), load_float32(address_of(limits), 0)
-    store_float32(address_of(out), 0, where_below(values, limit, values, limit))
-    store_float32(address_of(out), LANES, load_counts(address_of(counts), 1))
-    return smallest_float(values), largest_float(values)
+@pytest.mark.parametrize("shift", range(7))
+@pytest.mark.parametrize("best", [-32768, -32767, -31752, -30736, -17000, -1, 0, 1, 12345, 32767])
+def test_the_best_score_counts_and_what_lies_far_below_does_not(best, shift):
+    octave = 128 >> shift
+    below = np.maximum(best - octave * np.array([0, 1, 2, 10, 60, 200, *[300] * 10]), -32768)
+    found = answers(below, best, shift)
+    assert np.isfinite(found).all()
+    assert found[0] > 0 or best < -32700
+    reached = below == best - octave * np.array([0, 1, 2, 10, 60, 200, *[300] * 10])
+    # Exact at whole octaves, where the range of 16 bits does not end first.
+    if best - (int(BIAS) >> shift) >= -32767:
+        assert found[0] > 0
+        np.testing.assert_allclose(found[:5][reached[:5]] / found[0], 0.5 ** np.array([0, 1, 2, 10, 60])[reached[:5]])
+        assert not found[5:][reached[5:]].any()
 
 
-@pytest.mark.parametrize("seed", [0, 1])
-def test_lanes_are_chosen_and_their_ends_found(seed):
-    rng = np.random.default_rng(seed)
-    a, limits = rng.normal(size=(2, LANES)).astype(np.float32)
-    counts, out = rng.integers(0, 256, LANES + 1, np.uint8), np.empty((2, LANES), np.float32)
-    assert choose(a, limits, counts, out) == (a.min(), a.max())
-    np.testing.assert_array_equal(out, [np.minimum(a, limits), counts[1:]])
+def test_between_octaves_terms_are_too_large_by_the_mean_that_is_said():
+    units = np.arange(128)
+    terms = np.concatenate([answers(1000 + units[i : i + LANES], 1128, 0) for i in range(0, 128, LANES)])
+    excess = terms / terms[0] / 2 ** (units / 128)
+    assert excess.max() < 1.0615
+    assert excess.mean() == pytest.approx(MEAN_EXCESS, rel=1e-3)

@@ -1,0 +1,361 @@
+"""Every operation on lanes against numpy, on numbers at and around the limits of the type."""
+
+from typing import NamedTuple
+
+import numba
+import numpy as np
+import pytest
+
+from rig.simd import memory, shuffles, vectors
+from rig.simd.memory import address_of, load_block, load_bytes, load_float32, load_int16
+from rig.simd.shuffles import EIGHT, FOLDED
+from rig.simd.vectors import LANES, UNPACKED
+
+INT16, BYTES, FLOAT = (
+    (load_int16, memory.store_int16),
+    (load_bytes, memory.store_bytes),
+    (load_float32, memory.store_float32),
+)
+SIZES = {INT16: (np.int16, LANES), BYTES: (np.uint8, 2 * LANES), FLOAT: (np.float32, LANES)}
+EDGES = np.array([-32768, -32767, -20000, -256, -1, 0, 1, 2, 127, 128, 255, 256, 12345, 32000, 32766, 32767], np.int16)
+
+
+def samples(kind):
+    """Pairs of operands, (count,) each."""
+    dtype, count = SIZES[kind]
+    rng = np.random.default_rng(1)
+    if kind is INT16:
+        yield EDGES, EDGES[::-1].copy()
+        yield EDGES, EDGES
+    for _ in range(20):
+        if kind is FLOAT:
+            yield tuple(rng.normal(0, 100, (2, count)).astype(dtype))
+        else:
+            yield tuple(rng.integers(np.iinfo(dtype).min, np.iinfo(dtype).max + 1, (2, count)).astype(dtype))
+
+
+def wide(a):
+    return a.astype(np.int64)
+
+
+def saturated(wide):
+    return np.clip(wide, -32768, 32767)
+
+
+def upper_half(a):
+    return a.view(np.uint32) >> 16
+
+
+def number_of(patterns):
+    return (patterns.view(np.uint16).astype(np.uint32) << 16).view(np.float32)
+
+
+def by_turns(a, b):
+    return np.stack([a, b], axis=1).ravel()
+
+
+OPERATIONS = {
+    "sum": (INT16, INT16, lambda a, b: a + b, lambda a, b: wide(a) + b),
+    "difference": (INT16, INT16, lambda a, b: a - b, lambda a, b: wide(a) - b),
+    "product": (INT16, INT16, lambda a, b: a * b, lambda a, b: wide(a) * b),
+    "and": (INT16, INT16, lambda a, b: a & b, lambda a, b: a & b),
+    "or": (INT16, INT16, lambda a, b: a | b, lambda a, b: a | b),
+    "saturated sum": (INT16, INT16, lambda a, b: vectors.add_saturated(a, b), lambda a, b: saturated(wide(a) + b)),
+    "saturated difference": (
+        INT16, INT16, lambda a, b: vectors.sub_saturated(a, b), lambda a, b: saturated(wide(a) - b),
+    ),
+    "larger": (INT16, INT16, lambda a, b: vectors.larger(a, b), np.maximum),
+    "smaller": (INT16, INT16, lambda a, b: vectors.smaller(a, b), np.minimum),
+    "shift right": (INT16, INT16, lambda a, b: a >> 5, lambda a, b: a.view(np.uint16) >> 5),
+    "shift left": (INT16, INT16, lambda a, b: a << 3, lambda a, b: wide(a) << 3),
+    "with a number": (INT16, INT16, lambda a, b: (a & 0x55) + 7, lambda a, b: (a & 0x55) + 7),
+    "scaled": (INT16, INT16, lambda a, b: vectors.scaled(a, b), lambda a, b: (wide(a) * b + (1 << 14)) >> 15),
+    "reversed": (INT16, INT16, lambda a, b: shuffles.reversed_lanes(a), lambda a, b: a[::-1]),
+    "last everywhere": (INT16, INT16, lambda a, b: shuffles.last_everywhere(a), lambda a, b: 0 * a + a[-1]),
+    "one lane up": (INT16, INT16, lambda a, b: shuffles.up_1(a), lambda a, b: np.append(0, a[:-1])),
+    "running sum": (
+        # Of numbers small enough: saturated sums go by the order of their steps.
+        INT16, INT16, lambda a, b: shuffles.running_sum(a & 0x7FF), lambda a, b: saturated(np.cumsum(wide(a) & 0x7FF)),
+    ),
+    "no lanes": (INT16, INT16, lambda a, b: vectors.zero_int16(), lambda a, b: 0 * a),
+    "bytes of lanes": (INT16, BYTES, lambda a, b: vectors.as_bytes(a), lambda a, b: a.view(np.uint8)),
+    "numbers of lanes": (INT16, FLOAT, lambda a, b: vectors.to_float32(a), lambda a, b: a),
+    "numbers of patterns": (INT16, FLOAT, lambda a, b: vectors.from_bfloat16(a), lambda a, b: number_of(a)),
+    "unpacked numbers": (
+        INT16, FLOAT, lambda a, b: vectors.from_bfloat16_unpacked(a), lambda a, b: number_of(a)[list(UNPACKED)],
+    ),
+    "sum of bytes": (BYTES, BYTES, lambda a, b: a + b, lambda a, b: a + b),
+    "shifted bytes": (BYTES, BYTES, lambda a, b: (a >> 3) & 0x55, lambda a, b: (a >> 3) & 0x55),
+    "mixed bytes": (BYTES, BYTES, lambda a, b: (a & 0xAA) | (b << 2), lambda a, b: (a & 0xAA) | (b << 2)),
+    "first rows": (
+        BYTES, BYTES, lambda a, b: shuffles.first_row_pairs(a, b), lambda a, b: by_turns(a[:LANES], b[:LANES]),
+    ),
+    "second rows": (
+        BYTES, BYTES, lambda a, b: shuffles.second_row_pairs(a, b), lambda a, b: by_turns(a[LANES:], b[LANES:]),
+    ),
+    "unsigned sum": (
+        BYTES, BYTES, lambda a, b: vectors.add_saturated_unsigned(a, b), lambda a, b: np.minimum(wide(a) + b, 255),
+    ),
+    "unsigned difference": (
+        BYTES, BYTES, lambda a, b: vectors.sub_saturated_unsigned(a, b), lambda a, b: np.maximum(wide(a) - b, 0),
+    ),
+    "smaller unsigned": (BYTES, BYTES, lambda a, b: vectors.smaller_unsigned(a, b), np.minimum),
+    "smaller than a number": (
+        BYTES, BYTES, lambda a, b: vectors.smaller_unsigned(a, 200), lambda a, b: np.minimum(a, 200),
+    ),
+    "no bytes": (BYTES, BYTES, lambda a, b: vectors.zero_bytes(), lambda a, b: 0 * a),
+    "arithmetic": (
+        FLOAT, FLOAT, lambda a, b: vectors.larger_float(a, b) + a * b - b, lambda a, b: np.maximum(a, b) + a * b - b,
+    ),
+    "smaller float": (FLOAT, FLOAT, lambda a, b: vectors.smaller_float(a, b), np.minimum),
+    "quotient": (FLOAT, FLOAT, lambda a, b: a / (b * b + np.float32(1.0)), lambda a, b: a / (b * b + 1.0)),
+    "root": (FLOAT, FLOAT, lambda a, b: vectors.square_root(a * a), lambda a, b: np.abs(a)),
+    "no numbers": (FLOAT, FLOAT, lambda a, b: vectors.zero_float32(), lambda a, b: 0 * a),
+    "where small": (
+        FLOAT, FLOAT, lambda a, b: vectors.where_small(a, b, np.float32(50.0)), lambda a, b: a * (np.abs(b) <= 50),
+    ),
+    "where below": (FLOAT, FLOAT, lambda a, b: vectors.where_below(a, b, a, b), np.minimum),
+    "whole numbers": (FLOAT, INT16, lambda a, b: vectors.to_int16(a), lambda a, b: np.trunc(a)),
+    "patterns of numbers": (FLOAT, INT16, lambda a, b: vectors.to_bfloat16(a), lambda a, b: upper_half(a)),
+}  # fmt: skip
+
+
+def applied(kind, to, operation, a, b):
+    """The result of an operation on two arrays; lanes cannot leave a kernel."""
+    (load, _), (_, store), compiled = kind, to, numba.njit(operation)
+
+    @numba.njit
+    def kernel(a, b, out):
+        store(address_of(out), 0, compiled(load(address_of(a), 0), load(address_of(b), 0)))
+
+    dtype, count = SIZES[to]
+    out = [np.empty(count, dtype) for _ in a]
+    for one, other, result in zip(a, b, out, strict=True):
+        kernel(one, other, result)
+    return out
+
+
+@pytest.mark.parametrize("name", OPERATIONS)
+def test_lanes_do_what_numpy_does(name):
+    kind, to, operation, wanted = OPERATIONS[name]
+    a, b = zip(*samples(kind), strict=True)
+    for one, other, found in zip(a, b, applied(kind, to, operation, a, b), strict=True):
+        with np.errstate(invalid="ignore"):
+            right = np.asarray(wanted(one, other))
+        if kind is FLOAT and to is FLOAT:
+            np.testing.assert_allclose(found, right, rtol=1e-5, atol=1e-2)
+        else:
+            # Plain sums and products wrap round as 16 bits do.
+            np.testing.assert_array_equal(found, right.astype(found.dtype))
+
+
+@pytest.mark.parametrize("sign", [-1, 1])
+def test_running_sums_stop_at_the_limits(sign):
+    a = np.full(LANES, sign * 5000, np.int16)
+    (found,) = applied(INT16, INT16, lambda a, b: shuffles.running_sum(a), [a], [a])
+    np.testing.assert_array_equal(found, saturated(np.cumsum(wide(a))))
+
+
+@pytest.mark.parametrize("one_instruction", [True, False])
+def test_products_of_pairs_are_added_and_stop_at_the_limits(one_instruction, monkeypatch):
+    if one_instruction and not vectors._has_avx2():
+        pytest.skip("this processor has no AVX2")
+    monkeypatch.setattr(vectors, "_has_avx2", lambda: one_instruction)
+    rng = np.random.default_rng(2)
+    counts = [rng.integers(0, largest + 1, 2 * LANES).astype(np.uint8) for largest in (1, 64, 255)]
+    weights = rng.integers(-128, 128, (3, 2 * LANES)).astype(np.int8)
+    weights[:, :4] = 127, 127, -128, -128
+    for n, largest in zip(counts, (1, 64, 255), strict=True):
+        n[:4] = largest
+    found = applied(BYTES, INT16, lambda a, b: vectors.dot_pairs(a, b), counts, weights.view(np.uint8))
+    for n, w, pairs in zip(counts, weights, found, strict=True):
+        np.testing.assert_array_equal(pairs, saturated((n.astype(int) * w).reshape(LANES, 2).sum(axis=1)))
+
+
+def bits(places):
+    return sum(1 << int(i) for i in places)
+
+
+def first_of(places, none):
+    return places[0] if len(places) else none
+
+
+@numba.njit
+def found_in_lanes(a, number):
+    mask = shuffles.equal_mask(load_int16(address_of(a), 0), number)
+    return mask, shuffles.lowest_bit(mask), shuffles.last_lane(load_int16(address_of(a), 0))
+
+
+@numba.njit
+def found_in_bytes(a, number):
+    one, block = load_bytes(address_of(a), 0), load_block(address_of(a), 0)
+    places = shuffles.equal_bytes(one, number), shuffles.first_equal(block, number)
+    return *places, vectors.smallest_byte(one), vectors.smallest_byte(block)
+
+
+@numba.njit
+def ends_of(a):
+    return vectors.smallest_float(load_float32(address_of(a), 0)), vectors.largest_float(load_float32(address_of(a), 0))
+
+
+def test_numbers_are_found_among_lanes_and_bytes():
+    for a, b in samples(INT16):
+        for number in (a[3], a[15], b[0]):
+            equal = np.flatnonzero(a == number)
+            assert found_in_lanes(a, number) == (bits(equal), first_of(equal, 32), a[-1])
+    for a, _ in samples(FLOAT):
+        assert ends_of(a) == (a.min(), a.max())
+    for seed in range(20):
+        a = np.random.default_rng(seed).integers(0, 256, 8 * LANES).astype(np.uint8) | np.uint8(seed)
+        for number in (a[0], a[70], a[127], np.uint8(0)):
+            equal, some = np.flatnonzero(a == number), a[: 2 * LANES]
+            wanted = bits(equal[equal < 2 * LANES]), first_of(equal, 8 * LANES), some.min(), a.min()
+            assert found_in_bytes(a, number) == wanted
+
+
+@numba.njit
+def read_and_written(source, out):
+    memory.write_int16(address_of(out), 0, memory.read_int16(address_of(source), 5))
+    memory.write_int32(address_of(out), 1, memory.read_int32(address_of(source), 4))
+    memory.write_int64(address_of(out), 1, memory.read_int64(address_of(source), 2))
+    memory.write_float32(address_of(out), 5, memory.read_float32(address_of(source), 1))
+    memory.write_byte(address_of(out), 30, memory.read_byte(address_of(source), 9))
+
+
+def numbers_moved(source):
+    out = np.zeros(64, np.uint8)
+    for begin, end, at in ((0, 2, 10), (4, 8, 16), (8, 16, 16), (20, 24, 4), (30, 31, 9)):
+        out[begin:end] = source[at : at + end - begin]
+    return out
+
+
+@numba.njit
+def two_rows(source, out):
+    memory.store_bytes(address_of(out), 0, memory.load_two_rows(address_of(source), 3, 40))
+
+
+@numba.njit
+def widened(source, out):
+    memory.store_int16(address_of(out), 0, memory.load_widened(address_of(source), 3))
+
+
+@numba.njit
+def counts(source, out):
+    memory.store_float32(address_of(out), 0, memory.load_counts(address_of(source), 1))
+
+
+@numba.njit
+def added_bytes(source, out):
+    memory.add_bytes(address_of(out), 3, load_bytes(address_of(source), 0))
+
+
+@numba.njit
+def four(source, out):
+    by = vectors.zero_four() + memory.load_four(address_of(source), 2) * np.float32(0.25)
+    memory.store_four(address_of(out), 1, by)
+
+
+@numba.njit
+def spread(source, out):
+    shuffles.spread_eights(address_of(source), address_of(out))
+
+
+@numba.njit
+def fetched(source, out):
+    places = np.arange(LANES) * 3 % 40 * 4 + address_of(source)
+    shuffles.fetch_eights(address_of(places), 4 * 3, address_of(out))
+    places[0] = 0  # kept alive up to here: only the address is used above
+
+
+@numba.njit
+def largest(source, out):
+    memory.store_int16(address_of(out), 0, shuffles.largest_of_rows(address_of(source)))
+
+
+@numba.njit
+def totals(source, out):
+    folded = np.empty((LANES, FOLDED), np.float32)
+    for r in range(LANES):
+        shuffles.store_folded(address_of(folded), r, load_float32(address_of(source), r * LANES))
+    memory.store_float32(address_of(out), 0, shuffles.totals_of_rows(address_of(folded)))
+    folded[0] = 0.0  # kept alive up to here: only the address is used above
+
+
+@numba.njit
+def equal_steps(source, out):
+    out[0] = shuffles.equal_bits(address_of(source), 5, 7, np.int16(2))
+
+
+RNG = np.random.default_rng(4)
+SOME_BYTES = RNG.integers(0, 256, 128).astype(np.uint8)
+FLOATS, FEW = RNG.normal(0, 10, 256).astype(np.float32), RNG.integers(0, 4, 100).astype(np.int16)
+ROWS = RNG.integers(-32768, 32768, 256).astype(np.int16)
+MOVES = [
+    (read_and_written, SOME_BYTES, np.zeros(64, np.uint8), numbers_moved),
+    (two_rows, SOME_BYTES, np.zeros(32, np.uint8), lambda a: np.r_[a[3:19], a[40:56]]),
+    (widened, SOME_BYTES, np.zeros(16, np.int16), lambda a: a[3:19]),
+    (counts, SOME_BYTES, np.zeros(16, np.float32), lambda a: a[1:17]),
+    (added_bytes, SOME_BYTES, np.full(40, 10**6, np.int32), lambda a: 10**6 + np.pad(a[:32].astype(int), (3, 5))),
+    (spread, SOME_BYTES, np.zeros(128, np.float32), lambda a: a.reshape(LANES, EIGHT).T.ravel()),
+    (four, FLOATS, np.zeros(8, np.float32), lambda a: np.pad(a[2:6] / 4, (1, 3))),
+    (
+        fetched, FLOATS, np.zeros(128, np.float32),
+        lambda a: a[np.arange(LANES) * 3 % 40 + 3 + np.arange(EIGHT)[:, None]].ravel(),
+    ),
+    (largest, ROWS, np.zeros(16, np.int16), lambda a: a.reshape(LANES, LANES).max(axis=1)),
+    (totals, FLOATS, np.zeros(16, np.float32), lambda a: a.reshape(LANES, LANES).sum(axis=1)),
+    (equal_steps, FEW, np.zeros(1, np.int64), lambda a: [bits(np.flatnonzero(a[5:61:7] == 2))]),
+]  # fmt: skip
+
+
+@pytest.mark.parametrize(("kernel", "source", "out", "wanted"), MOVES, ids=lambda a: getattr(a, "__name__", ""))
+def test_numbers_are_read_and_written_where_they_are_said_to_be(kernel, source, out, wanted):
+    kernel(source, out := out.copy())
+    exact = kernel is not totals
+    np.testing.assert_allclose(out, wanted(source), rtol=0 if exact else 1e-5, atol=0 if exact else 1e-4)
+
+
+@pytest.mark.parametrize(("first", "end"), [(0, 16), (-20, 40), (3, 4), (5, 5), (7, 2), (16, 20), (-5, 0), (15, 16)])
+def test_lanes_between(first, end):
+    out = np.empty(LANES, np.int16)
+    mask_between(first, end, out)
+    inside = (np.arange(LANES) >= first) & (np.arange(LANES) < end)
+    np.testing.assert_array_equal(out, np.where(inside, -1, 0))
+
+
+@numba.njit
+def mask_between(first, end, out):
+    memory.store_int16(address_of(out), 0, shuffles.lanes_between(first, end))
+
+
+@pytest.mark.parametrize("number", [0, 1, LANES - 1, LANES, LANES + 3, 5 * LANES])
+def test_copies_are_as_long_as_asked(number):
+    source, to = np.arange(1.0, 100.0, dtype=np.float32), np.zeros(99, np.float32)
+    memory.copy_floats(source.ctypes.data, to.ctypes.data, number)
+    np.testing.assert_array_equal(to[:number], source[:number])
+    assert not to[number:].any()
+
+
+class Some(NamedTuple):
+    numbers: np.ndarray
+    times: int
+
+
+class Both(NamedTuple):
+    some: Some
+    out: np.ndarray
+
+
+@numba.njit
+def multiplied(both):
+    for i in range(3):
+        memory.write_int16(both.out, i, np.int16(memory.read_int16(both.some.numbers, i) * both.some.times))
+
+
+def test_kernels_read_and_write_a_named_tuple_of_arrays_by_its_pointers():
+    both = Both(Some(np.array([1, 2, 3], np.int16), 5), np.zeros(3, np.int16))
+    given = memory.pointers(both)
+    assert type(given) is Both
+    assert given.some.times == 5
+    multiplied(given)
+    np.testing.assert_array_equal(both.out, [5, 10, 15])
