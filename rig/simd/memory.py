@@ -24,7 +24,7 @@ Arrays = TypeVar("Arrays", bound=tuple[Any, ...])
 
 
 def pointers(arrays: Arrays) -> Arrays:
-    """The same named tuple for kernels: the address of each array in its place, numbers as they are.
+    """A named tuple of arrays and numbers as kernels take it: with the address of each array in its place.
 
     Tuples within it become pointers too. Arrays must be C-contiguous, and the caller keeps them alive.
     """

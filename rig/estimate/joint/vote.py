@@ -87,7 +87,7 @@ _CANDIDATES: Final = 5
 
 
 class _Hall(NamedTuple):
-    """What a vote reads and writes, handed over as pointers.
+    """Arrays that a vote reads and writes; kernels get `pointers` to them.
 
     elected: int16 (width,), of a row's answers first the candidate, then the label. against: int16 (candidates, LANES).
     share: float32 (width,), 1 over the columns that vote. width: of the ballots.

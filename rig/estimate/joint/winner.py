@@ -103,7 +103,7 @@ _BLOCK: Final = BLOCK.count
 
 
 class Readout(NamedTuple):
-    """What columns are answered with, handed over as `pointers`; its arrays are one thread's.
+    """Arrays and sizes that columns are answered with, of one thread; kernels get `pointers` to them.
 
     end: labels up to the end of the last block with stripes; size: bytes from the totals of a column to the next.
     around: uint8, totals of the columns, with a vector of LARGEST at least before and behind each; totals: address of

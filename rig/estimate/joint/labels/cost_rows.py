@@ -271,7 +271,7 @@ _TO_UNSIGNED: Final = np.float32(32768.5)
 
 
 class CostRoom(NamedTuple):
-    """What `fill_costs` and `fit_tables` read and work in, handed over as `pointers`."""
+    """Tables and buffers of `fill_costs` and `fit_tables`, which get `pointers` to them."""
 
     at: LabelTables
     halo: HaloRoom
