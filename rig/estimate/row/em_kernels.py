@@ -60,45 +60,24 @@ def learn_rows(
                 levels[row.cell[j], 12] += row.posterior[j]
                 levels[row.cell[j], 13] += (1.0 - none) / (last - first + 1)
         if none < 0.5:
+            where = lines.row[i], lines.column[i], lines.exposures[i]
             _learn_levels(
-                sweep,
-                state,
-                row,
-                lines.row[i],
-                lines.column[i],
-                lines.exposures[i],
-                length,
-                first,
-                last,
-                start,
-                none,
-                hot_flux,
-                levels,
-                rows_seen,
-                columns_seen,
+                sweep, state, row, where, (length, first, last, start), none, hot_flux, levels, rows_seen, columns_seen
             )
     return total
 
 
 @numba.njit(cache=True, nogil=True)
 def _learn_levels(
-    sweep: Sweep,
-    state: RowState,
-    row: RowBuffers,
-    y: int,
-    c: int,
-    k: int,
-    length: int,
-    first: int,
-    last: int,
-    start: int,
-    none: float,
-    hot_flux: float,
-    levels: NDArray[np.float64],
-    rows_seen: NDArray[np.float64],
+    sweep: Sweep, state: RowState, row: RowBuffers, where: tuple[int, int, int], span: tuple[int, int, int, int],
+    none: float, hot_flux: float, levels: NDArray[np.float64], rows_seen: NDArray[np.float64],
     columns_seen: NDArray[np.float64],
-) -> None:
-    """Add one row's pixels to the levels before and behind the stripe."""
+) -> None:  # fmt: skip
+    """Add one row's pixels to the levels before and behind the stripe.
+
+    where: row, column and exposures; span: what `row_fluxes` says of it.
+    """
+    (y, c, k), (length, first, last, start) = where, span
     step = 1 if sweep.near_is_left else -1
     reach = state.psi.shape[0]
     # Doubtful rows would teach the level behind the stripe their own guess; haze before it is plentiful anyway.

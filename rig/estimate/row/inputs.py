@@ -311,17 +311,9 @@ def judge_line(
         _heed_neighbours(row, first, last, (lines.x_px[i] - start) * step, lines.trust[i])
     prior = none_prior(sweep.w_near, sweep.w_far, row.w[first], row.w[last], state.none_weight)
     none, evidence = row_posterior(
-        row.score,
-        row.edge,
-        length,
-        first,
-        last,
-        state.log_weight,
-        row.log_prior,
-        prior,
-        row.posterior,
+        row.score, row.edge, length, first, last, state.log_weight, row.log_prior, prior, row.posterior,
         row.by_amplitude,
-    )
+    )  # fmt: skip
     for t in range(length):
         evidence += row.taps[1, t]
     return length, first, last, start, none, prior[0] + prior[1] - 2.0 * prior[2], evidence

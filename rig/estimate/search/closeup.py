@@ -1,7 +1,7 @@
-"""Close look at the best position of a row, compiled: where within the pixel the line lies, and how bright it is.
+"""Close look at the best position of a row, compiled: a fast form of `rig.estimate.row.likelihood`, tested against it.
 
-A fast form of the likelihood of `rig.estimate.row.likelihood` for LABELS lines LABEL_PX apart, one label to a lane of a
-vector. With L and R the flux left and right of the line, s its light and f_i,t its share in pixel t at label i,
+It tells where within the pixel the line lies, from LABELS lines LABEL_PX apart, one label to a lane of a vector. With L
+and R the flux left and right of the line, s its light and f_i,t its share in pixel t at label i,
 
     score_i = K constant_i + sum over t of n_t weight_i,t,   from flux_i,t = share L + (1 - share) R + s f_i,t
 

@@ -1,8 +1,8 @@
 """Makes the tables of the search along a row, per column and band of rows, from a model and a geometry.
 
-The search is a fast form of `rig.estimate.row.likelihood`. Here it is decided how many rows share a table
-(`rows_of_band`), into how fine units likelihood is divided so that no 16-bit sum runs over, and how often counts are
-halved (`judge_of`); tests/unit/rig/estimate/search/test_prepare.py checks those bounds.
+The search is a fast form of `rig.estimate.row.likelihood`, tested against it. Here it is decided how many rows share a
+table (`rows_of_band`), into how fine units likelihood is divided so that no 16-bit sum runs over, and how often counts
+are halved (`judge_of`); tests/unit/rig/estimate/search/test_prepare.py checks those bounds.
 """
 
 from typing import Any

@@ -1,9 +1,9 @@
-"""Estimate of image rows, compiled: score every position, look closely at the best, and note what the row teaches.
+"""Estimate of image rows, compiled: a fast form of `rig.estimate.row.likelihood`, tested against it.
 
-A fast form of `rig.estimate.row.likelihood`: BATCH rows of one column go together through 16-bit scores
-(`rig.estimate.search.scores`, tables of `rig.estimate.search.tables`), with SCREENS amplitudes instead of all, one
-table for a band of rows and counts of 6 bits. Answers are float32 (FIELDS, rows) per column (`RowAnswers`).
-tests/unit/rig/estimate/search/test_rows.py holds it against the exact form.
+Every position is scored, the best looked at closely, and what the row teaches noted. BATCH rows of one column go
+together through 16-bit scores (`rig.estimate.search.scores`, tables of `rig.estimate.search.tables`), with SCREENS
+amplitudes instead of all, one table for a band of rows and counts of 6 bits. Answers are float32 (FIELDS, rows) per
+column (`RowAnswers`). tests/unit/rig/estimate/search/test_rows.py holds it against the exact form.
 
 `judge_rows` serves frames as they come and counts of whole sweeps (`rig.estimate.search.stream`): the answers are the
 same bit for bit.

@@ -1,6 +1,6 @@
-"""Scores of every position of a row at once, compiled, and the best one with how sure it is.
+"""Scores of all positions of a row, compiled: a fast form of `rig.estimate.row.likelihood`, tested against it.
 
-A fast form of the log-likelihood of `rig.estimate.row.likelihood`, less that of 'everything is right of the stripe':
+Log-likelihoods less that of 'everything is right of the stripe', the best one, and how sure it is:
 
     score_m(x) = K constant_m(x) + sum over pixels left of x of n edge + sum over pixels t around x of n_t tap_m,t(x)
 

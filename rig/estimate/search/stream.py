@@ -1,7 +1,7 @@
-"""Counting and judging of a sweep's columns while its frames come in, and of a sweep that is counted already.
+"""A sweep judged while its frames come in, by the fast form of `rig.estimate.row.likelihood` that is tested against it.
 
-A fast form of `rig.estimate.row.likelihood`, see `rig.estimate.search.rows`; that judging on the way gives the very
-bits of judging afterwards is tested in tests/unit/rig/estimate/search/test_stream.py.
+That form is `rig.estimate.search.rows`; tests/unit/rig/estimate/search/test_stream.py holds that judging on the way
+gives the very bits of judging a sweep that is counted already.
 
 `ColumnJudge` is the counter of `likelihood`: it judges each column as soon as it is complete and keeps no counts of it.
 Rows are worked through in chunks, so that counts never leave the cache. A chunk's counters, uint64 bit planes

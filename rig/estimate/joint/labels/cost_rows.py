@@ -1,7 +1,7 @@
-"""Label costs of a batch of rows, compiled: counts read, edges summed, positions scored, costs written.
+"""Label costs of a batch of rows, compiled: a fast form of `rig.estimate.row.likelihood`, tested against it.
 
-A fast form of `rig.estimate.row.likelihood` in saturating int16, LANES pixels to a vector. Against 'everything is
-before the stripe', with weights and constants of `rig.estimate.joint.labels.tables` in units,
+Counts are read, edges summed, positions scored and costs written in saturating int16, LANES pixels to a vector. Against
+'everything is before the stripe', with weights and constants of `rig.estimate.joint.labels.tables` in units,
 
     sums(p)  = sum over pixels p' < p of (n edge + constant edge)        evidence of all pixels behind
     score(x) = sums + max over LIGHTS of (constant + sum over taps n tap)

@@ -1,7 +1,7 @@
-"""Cost of every label on every row of every column: how much less likely it makes the counts than the best label does.
+"""Cost of every label on every row and column: a fast form of `rig.estimate.row.likelihood`, tested against it.
 
-A fast form of `rig.estimate.row.likelihood`: with the line's profile at the label's own eighth of a pixel, LIGHTS
-amplitudes, and tables that the rows of a band share (`rig.estimate.joint.labels.tables`),
+It tells how much less likely a label makes the counts than the best one does: with the line's profile at the label's
+own eighth of a pixel, LIGHTS amplitudes, and tables that the rows of a band share (`rig.estimate.joint.labels.tables`),
 
     cost(l) = units_per_nat (max log-likelihood - log-likelihood(l)),   uint8 (rows, columns, labels), <= COST_LIMIT
     units_per_nat = UNITS / (1 + K / SHARP) for K exposures

@@ -1,11 +1,11 @@
-"""The halo's part of the label costs, compiled: tables over blocks of pixels, and their share in each row's constants.
+"""The halo's part of the label costs, compiled: a fast form of `rig.estimate.row.likelihood`, tested against it.
 
-A fast form of `rig.estimate.row.likelihood` with the halo of `rig.estimate.row.inputs` in every hypothesis. The tables
-of `rig.estimate.joint.labels.tables` take the halo for as bright everywhere as it is at the stripe, which is right
-where the stripe's place is decided. The difference elsewhere varies slowly with the stripe's place and from pixel to
-pixel. So it is tabled for stripes BLOCK_PX apart, with straight lines in between, and for the mean counts of blocks of
-as many pixels (`HaloTables`: int16 weights, float32 constants in nats per exposure).
-tests/unit/rig/estimate/joint/test_halo.py holds the costs against those of a stripe with its halo, pixel by pixel.
+The halo of `rig.estimate.row.inputs` is in every hypothesis. The tables of `rig.estimate.joint.labels.tables` take the
+halo for as bright everywhere as it is at the stripe, which is right where the stripe's place is decided. The difference
+elsewhere varies slowly with the stripe's place and from pixel to pixel. So it is tabled for stripes BLOCK_PX apart,
+with straight lines in between, and for the mean counts of blocks of as many pixels (`HaloTables`: int16 weights,
+float32 constants in nats per exposure). tests/unit/rig/estimate/joint/test_halo.py holds the costs against those of a
+stripe with its halo, pixel by pixel.
 """
 
 from typing import Final, NamedTuple

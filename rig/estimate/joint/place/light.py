@@ -74,18 +74,10 @@ def measure_light(
     # An odd number of cache lines: one line of numbers after the other does not push the others out of the cache.
     width = (-(-columns // LANES) | 1) * LANES
     lines, spare = np.zeros((_FIELDS, width), np.float32), np.full((width, EIGHT), MOST_FLUX, np.float32)
-    taps, ambient_places, bin_places = (
-        np.zeros((2, EIGHT, LANES), np.float32),
-        np.empty(width, np.int64),
-        np.empty(width, np.int64),
-    )
+    taps = np.zeros((2, EIGHT, LANES), np.float32)
+    ambient_places, bin_places = np.empty(width, np.int64), np.empty(width, np.int64)
     # Addresses: threads that count references to the same array wait for one another.
-    at, spare_at, bins_at, taps_at = (
-        address_of(lines),
-        address_of(spare),
-        address_of(bins),
-        address_of(taps),
-    )
+    at, spare_at, bins_at, taps_at = address_of(lines), address_of(spare), address_of(bins), address_of(taps)
     ambient_at, bin_at = address_of(ambient_places), address_of(bin_places)
     at_x, at_x0 = address_of(x_px), address_of(sweep.x0)
     at_u, at_v, ambient = address_of(sweep.u), address_of(sweep.v), address_of(state.ambient)
@@ -168,21 +160,16 @@ def _measure(at: int, width: int, taps: int, ambient: int, bins: int) -> None:
     inverse = one / (frames + half)
     dark, shown, light = one, none, none
     for d in range(REACH_PX - LIGHT_PX, REACH_PX + LIGHT_PX + 1):
-        own, unlit = (
-            load_float32(near, d * LANES),
-            larger_float(frames - load_float32(taps, d * LANES), np.float32(0.0)),
-        )
+        own = load_float32(near, d * LANES)
+        unlit = larger_float(frames - load_float32(taps, d * LANES), np.float32(0.0))
         shows = where_small(one, own, _SHOWS)
         dark = dark * ((unlit + half) * inverse * shows + (one - shows))
         shown, light = shown + shows, light - where_small(own, own, _SHOWS)
     own = load_float32(near, REACH_PX * LANES)
     own = where_small(own, own, _SHOWS)
     fetch_eights(bins, 0, near)
-    part, paths, others = (
-        load_float32(at, _PART * width),
-        load_float32(at, _PATHS * width),
-        load_float32(at, _OTHERS * width),
-    )
+    part, paths = load_float32(at, _PART * width), load_float32(at, _PATHS * width)
+    others = load_float32(at, _OTHERS * width)
     before = _flux(own + paths * (load_float32(near, 0) + part * load_float32(near, 4 * LANES)), others)
     behind = _flux(own + paths * (load_float32(near, LANES) + part * load_float32(near, 5 * LANES)), others)
     halo = load_float32(near, 3 * LANES) + part * load_float32(near, 7 * LANES)

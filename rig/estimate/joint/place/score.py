@@ -78,17 +78,9 @@ def score_places(
     taps = np.zeros((4, EIGHT, LANES), np.float32)
     ambient_places, share_places = np.empty(width, np.int64), np.empty(width, np.int64)
     # Addresses: threads that count references to the same array wait for one another.
-    at, spare_at, taps_at, all_shares = (
-        address_of(lines),
-        address_of(spare),
-        address_of(taps),
-        address_of(shares),
-    )
-    ambient_at, shares_at, ambient = (
-        address_of(ambient_places),
-        address_of(share_places),
-        address_of(state.ambient),
-    )
+    at, spare_at, taps_at, all_shares = address_of(lines), address_of(spare), address_of(taps), address_of(shares)
+    ambient_at, shares_at = address_of(ambient_places), address_of(share_places)
+    ambient = address_of(state.ambient)
     at_x, at_x0 = address_of(x_px), address_of(sweep.x0)
     around_at, to_score, to_known = address_of(around), address_of(out.score), address_of(out.known)
     known = (address_of(out.amplitude), address_of(out.scale), address_of(out.glow),
@@ -132,10 +124,8 @@ def _score(
     fetch_eights(ambient, 0, own)
     fetch_eights(shares, 0, share)
     fetch_eights(shares, 4 * EIGHT, growth)
-    frames, light = (
-        load_float32(at, _FRAMES * width),
-        load_float32(of[_AMPLITUDE], here) * load_float32(of[_SCALE], here),
-    )
+    frames = load_float32(at, _FRAMES * width)
+    light = load_float32(of[_AMPLITUDE], here) * load_float32(of[_SCALE], here)
     # Around its middle the halo is level.
     halo = light * load_float32(of[_GLOW], here)
     before, behind = load_float32(of[_HAZE], here) + halo, load_float32(of[_REST], here) + halo
