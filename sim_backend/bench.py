@@ -15,14 +15,14 @@ from calibration.model.rig_model import Lag
 from drivers.clock import NS_PER_S, Clock
 from drivers.interfaces import MARKER_LINE, MARKER_SCAN, Pulse, ScanWaveform
 from sim_backend.gate_program import GateProgram, gate_shares
-from sim_backend.mirror_motion import Jitter, Playing, Resting, ScannerMotion
+from sim_backend.mirror_motion import Idle, Jitter, Playing, ScannerMotion
 
 Array = NDArray[np.float64]
 
 
 @dataclass(frozen=True, slots=True, eq=False)
-class Happening:
-    """Events during n frames.
+class BenchState:
+    """State of the bench during n frames.
 
     mirror: (n,) mirror position, as a command, in the middle of each exposure. velocity_per_s: (n,) of it, NaN = not
     known. share: (n,) part of the exposure with the gate high. edge: (n,) bool, the gate changed during the exposure.
@@ -49,7 +49,7 @@ class Bench:
         self.lag = lag
         self._epoch_ns = clock.now_ns()
         self._lock = threading.RLock()
-        self._motion: ScannerMotion = Resting(0.0)
+        self._motion: ScannerMotion = Idle(0.0)
         self._program: GateProgram | None = None
         self._aborted = False
         self._power_w = 0.0
@@ -73,7 +73,7 @@ class Bench:
     def rest(self, command: float) -> None:
         """Stop the mirror now, at a command."""
         with self._lock:
-            self._motion = Resting(command)
+            self._motion = Idle(command)
 
     def moving(self) -> bool:
         """Whether a waveform is being played."""
@@ -122,14 +122,14 @@ class Bench:
                 return "stopped", word
             return ("waiting" if self._program.waiting else "running"), word
 
-    def during(self, start_s: Array, exposure_s: float, period_s: float) -> Happening:
-        """Events during frames that start at start_s (n,), ascending, one period apart."""
+    def during(self, start_s: Array, exposure_s: float, period_s: float) -> BenchState:
+        """State during frames that start at start_s (n,), ascending, one period apart."""
         until_s = float(start_s[-1]) + period_s
         with self._lock:
             motion = self._motion
             share, edge = self._gate(start_s, exposure_s, until_s)
             first, last = motion.mirror(start_s), motion.mirror(start_s + exposure_s)
-            return Happening(
+            return BenchState(
                 mirror=motion.mirror(start_s + 0.5 * exposure_s),
                 velocity_per_s=(last - first) / exposure_s,
                 share=share,

@@ -68,7 +68,7 @@ def plan_effects(
 ) -> tuple[EffectPlan, FluxModel]:
     """The plan, and the model with the effects that it keeps. planes: (n, 4), of mirror positions over the range."""
     calls = {entry: entry.called(setting) for entry in CATALOGUE}
-    candidates = [entry for entry, (called, _) in calls.items() if called and is_wanted(entry.name, wanted)]
+    candidates = [entry for entry, (called, _) in calls.items() if called and is_active(entry.name, wanted)]
     changes: dict[str, float] = {}
     left_out: set[str] = set()
     total = 0.0
@@ -86,7 +86,7 @@ def plan_effects(
     return EffectPlan(planned_for, decisions, total), model
 
 
-def is_wanted(name: str, wanted: Wanted) -> bool:
+def is_active(name: str, wanted: Wanted) -> bool:
     """Whether an effect is to be run where the scene calls for it."""
     return wanted in ("planned", "all") or name in wanted
 
@@ -95,7 +95,7 @@ def _decision(
     entry: Entry, call: tuple[bool, str], wanted: Wanted, changes: dict[str, float], left_out: Collection[str]
 ) -> EffectDecision:
     called, why = call
-    if called and not is_wanted(entry.name, wanted):
+    if called and not is_active(entry.name, wanted):
         return EffectDecision(entry, False, "not among the world's effects")
     bound = min(1.0, changes[entry.name]) if entry.name in changes else None
     if entry.name in left_out:

@@ -71,7 +71,7 @@ class ScannerMotion(Protocol):
 
 
 @dataclass(frozen=True, slots=True)
-class Resting:
+class Idle:
     """A mirror that stands still."""
 
     command: float

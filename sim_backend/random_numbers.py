@@ -1,12 +1,12 @@
 """Random bits and exponentials for compiled kernels.
 
 Random bits are counters enciphered by rounds of AES, which processors have instructions for. Counter-based numbers need
-no state and no order (Salmon, Moraes, Dror, Shaw, "Parallel random numbers: as easy as 1, 2, 3", SC 2011). `enciphered`
-is their ARS-5, which passes BigCrush there: five rounds whose keys step by a Weyl sequence (the last one mixes columns
-like the others, a bijection). Its 128 bits are the key of a few rows of a frame, under which `drawn_word` enciphers the
-numbers of blocks of 8 pixels with three rounds more. Block numbers of one key differ in a few bytes, which two rounds
-spread over all 16; after the third, bytes of two blocks agree as often as chance would have it, within 1e-7. For single
-numbers that follow from a seed and a place there is SplitMix64 (Steele, Lea, Flood 2014).
+no state and no order (Salmon, Moraes, Dror, Shaw, "Parallel random numbers: as easy as 1, 2, 3", SC 2011).
+`counter_bits` is their ARS-5, which passes BigCrush there: five rounds whose keys step by a Weyl sequence (the last one
+mixes columns like the others, a bijection). Its 128 bits are the key of a few rows of a frame, under which `drawn_word`
+enciphers the numbers of blocks of 8 pixels with three rounds more. Block numbers of one key differ in a few bytes,
+which two rounds spread over all 16; after the third, bytes of two blocks agree as often as chance would have it, within
+1e-7. For single numbers that follow from a seed and a place there is SplitMix64 (Steele, Lea, Flood 2014).
 
 One AES round of 256 bits takes one cycle on x86 with VAES, two with AES-NI or on 64-bit ARM. Elsewhere it is table
 look-ups: the same bits, many times as slow. Everything here is for code compiled with `numba.njit`.
@@ -14,8 +14,8 @@ look-ups: the same bits, many times as slow. Everything here is for code compile
 Exponentials are straight-line, so that loops over them become vector instructions; libm's are calls. With k = round(t)
 and f = k - t, |f| <= 1/2:  2^-t = 2^-k 2^f, the latter by its Taylor series. Relative error against 50 digits:
 `power_of_half` 3e-13 (series to f^10) and what rounding t brings, `one_minus_exp_minus` 4e-16 (to r^13, with r = f ln 2
-in two parts). `roughly_one_minus_exp_minus` is for where six digits will do, in float32. The numbers that loops need
-come as a tuple that the kernel's caller hands over (`HALVING`, `ROUGHLY`): constants that it knows LLVM fetches anew
+in two parts). `one_minus_exp_minus_32` is for where six digits will do, in float32. The numbers that loops need come
+as a tuple that the kernel's caller hands over (`HALVING`, `ROUGHLY`): constants that it knows LLVM fetches anew
 for every vector, 24 of 59 instructions of a loop over `power_of_half`.
 """
 
@@ -165,8 +165,8 @@ _KEY: Any = types.UniTuple(types.uint64, 2)  # type: ignore[no-untyped-call]
 
 
 @_intrinsic
-def enciphered(typing: Any, key_low: Any, key_high: Any, low: Any, high: Any) -> _Code:
-    """enciphered(key_low, key_high, low, high): 128 random bits of a counter, as two uint64, low half first."""
+def counter_bits(typing: Any, key_low: Any, key_high: Any, low: Any, high: Any) -> _Code:
+    """counter_bits(key_low, key_high, low, high): 128 random bits of a counter, as two uint64, low half first."""
 
     def code(context: Any, builder: Any, signature: Any, args: Any) -> Any:
         key = _vector(builder, _BLOCK, args[:2])
@@ -233,8 +233,8 @@ def drawn_word(typing: Any, key: Any, blocks: Any, levels: Any) -> _Code:
 
 
 @_intrinsic
-def sure_word(typing: Any, levels: Any) -> _Code:
-    """sure_word(levels): bits of the pixels of a word whose level is the lowest, -32768; levels as in `drawn_word`."""
+def full_word(typing: Any, levels: Any) -> _Code:
+    """full_word(levels): bits of the pixels of a word whose level is the lowest, -32768; levels as in `drawn_word`."""
 
     def code(context: Any, builder: Any, signature: Any, args: Any) -> Any:
         lowest = ir.Constant(_PIXELS, [-0x8000] * _VECTOR_PX)
@@ -303,7 +303,7 @@ HALVING: Final[dict[Any, tuple[Any, ...]]] = {
 series."""
 _SERIES_32 = (1 / math.factorial(n) for n in (0, 2, 3, 4, 5, 6))
 ROUGHLY: Final = tuple(map(np.float32, (80.0, LOG2_E, _ROUNDER_32, math.log(2), *_SERIES_32)))
-"""Constants of `roughly_one_minus_exp_minus`: largest t, scale, rounder, ln 2, series without its linear term;
+"""Constants of `one_minus_exp_minus_32`: largest t, scale, rounder, ln 2, series without its linear term;
 float32."""
 
 
@@ -349,7 +349,7 @@ def one_minus_exp_minus(t):  # type: ignore[no-untyped-def]
 
 
 @numba.njit(inline="always", error_model="numpy")
-def roughly_one_minus_exp_minus(t, roughly):  # type: ignore[no-untyped-def]
+def one_minus_exp_minus_32(t, roughly):  # type: ignore[no-untyped-def]
     """1 - exp(-t) of a float32 t >= 0 as float32, within 3e-7; roughly: `ROUGHLY`."""
     largest, log2_e, rounder, ln2, one, d2, d3, d4, d5, d6 = roughly
     t = min(t, largest)

@@ -16,8 +16,8 @@ from drivers.errors import DeviceError
 from drivers.interfaces import SweepTruth
 from drivers.registry import Kind, KindConfig, Surroundings
 from drivers.units import parse_quantity
-from sim_backend.bench import Bench, Happening
-from sim_backend.effect_planner import MOST, SAMPLED_COLUMNS, EffectPlan, Wanted, is_wanted, plan_effects
+from sim_backend.bench import Bench, BenchState
+from sim_backend.effect_planner import MOST, SAMPLED_COLUMNS, EffectPlan, Wanted, is_active, plan_effects
 from sim_backend.effects.catalogue import CATALOGUE
 from sim_backend.effects.setting import FrameTimes, PlannedFor, Setting
 from sim_backend.frames.flux import ROUNDING, FluxModel, column_grid, fine_grid
@@ -92,7 +92,7 @@ class WorldConfig(KindConfig):
     """Columns in which the flux is held, for use without an application that says `hold_columns`."""
 
     @property
-    def holds_board(self) -> bool:
+    def has_board(self) -> bool:
         """Whether there is a calibration board in the scene. DeviceError where the scene cannot be read."""
         return bool(load_scene(self.scene)[0].boards)
 
@@ -124,7 +124,7 @@ class SimulatedWorld:
         """Depth, albedo and where they are trusted; the truth behind `truth`."""
         gain = detections_per_radiance(config.optics, config.sensor, config.line)
         motion = None
-        if self.scene.motion is not None and is_wanted("motion", config.effects):
+        if self.scene.motion is not None and is_active("motion", config.effects):
             from sim_backend.effects.motion import MovingSurfaces
 
             motion = MovingSurfaces(self.scene.motion.velocity)
@@ -200,19 +200,19 @@ class SimulatedWorld:
         To be called before the SPAD is configured; for good.
         """
         kept = [entry for entry in CATALOGUE if entry.name in DARK_EFFECTS or entry.kind == "bits"]
-        wanted = [e for e in kept if e.called(self.setting)[0] and is_wanted(e.name, self.config.effects)]
+        wanted = [e for e in kept if e.called(self.setting)[0] and is_active(e.name, self.config.effects)]
         self._planned = self._plan()[0], FluxModel(self.setting, wanted)
 
-    def held(self, happening: Happening, period_s: float) -> Array:
+    def mirror_positions(self, state: BenchState, period_s: float) -> Array:
         """Mirror positions whose light n frames see, one period apart, (n,): those of the columns, with the mirror's
         jitter; or, where rows are exposed one after the other, (n, 2) of the first and the last row. NaN past the ends
         of the grid.
         """
         low, high = self.model.scanner.command_range
-        first = self.grid.hold(happening.mirror, happening.velocity_per_s * period_s) + happening.jitter
+        first = self.grid.hold(state.mirror, state.velocity_per_s * period_s) + state.jitter
         if self.model.row_delay_s == 0:
             return np.clip(first, low, high)
-        later = np.rint(happening.velocity_per_s * self._frame_delay_s / ROUNDING) * ROUNDING
+        later = np.rint(state.velocity_per_s * self._frame_delay_s / ROUNDING) * ROUNDING
         return np.clip(np.stack([first, first + np.nan_to_num(later)], axis=-1), low, high)
 
     @property

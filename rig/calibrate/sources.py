@@ -115,7 +115,7 @@ def _live(source: Config, scene: str | None, notes: list[str]) -> RigConfig:
     world = loaded.world
     if scene is not None or world is None or "board_pose" not in type(world).model_fields:
         return loaded
-    if getattr(world, "holds_board", False):
+    if getattr(world, "has_board", False):
         return loaded
     own = getattr(world, "scene", "its own")
     notes.append(f"scene {own!r} of {loaded.name} has no board: the bundled scene {BOARD_SCENE!r} is shown instead")

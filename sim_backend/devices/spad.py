@@ -34,7 +34,7 @@ from drivers.registry import Kind, KindConfig, Surroundings
 from drivers.ring import BlockRing
 from drivers.spb1 import BlockLayout, block_views, seal_block
 from drivers.units import BytesPerSecond, ExactHertz, Ppm
-from sim_backend.bench import Happening
+from sim_backend.bench import BenchState
 from sim_backend.devices.place import note_effect, world_of
 from sim_backend.effects.setting import FrameTimes
 from sim_backend.frames.photon_kernels import dropped_frames
@@ -87,20 +87,18 @@ class MarkerInputs:
         self.line = 0
         self.sweep = 0
 
-    def record(self, happening: Happening, start_s: Array, period_s: float, records: NDArray[np.void]) -> int:
+    def record(self, state: BenchState, start_s: Array, period_s: float, records: NDArray[np.void]) -> int:
         """Fill marks, line and sweep of consecutive frames that start at start_s (n,), about one period apart.
 
         Returns the scan markers since START at the first of them, which the records' own counters cut to 16 bits.
         """
         marks = np.zeros(len(start_s), np.int64)
-        marks[happening.edge] |= Mark.GATE_EDGE
-        marks[~happening.edge & (happening.share > 0)] |= Mark.GATE_HIGH
-        marks[happening.backward] |= Mark.BACKWARD
+        marks[state.edge] |= Mark.GATE_EDGE
+        marks[~state.edge & (state.share > 0)] |= Mark.GATE_HIGH
+        marks[state.backward] |= Mark.BACKWARD
         lines = np.full(len(start_s), self.line, np.int64)
         sweeps = np.full(len(start_s), self.sweep, np.int64)
-        events = [(float(t), 0, Mark.SCAN) for t in happening.scan_s] + [
-            (float(t), 1, Mark.LINE) for t in happening.line_s
-        ]
+        events = [(float(t), 0, Mark.SCAN) for t in state.scan_s] + [(float(t), 1, Mark.LINE) for t in state.line_s]
         first = self.sweep
         for time_s, _, mark in sorted(events):
             frame = max(int(np.searchsorted(start_s, time_s, side="right")) - 1, 0)
@@ -320,12 +318,12 @@ class SimulatedSpad(SpadArray):
 
     def _pass_over(self, n: int) -> float:
         """Expose n frames that get lost: time passes and markers count. Returns the seconds they took."""
-        start_s, happening = self._frames(n)
-        self._markers.record(happening, start_s, self._period_s, np.zeros(n, FRAME_RECORD))
+        start_s, state = self._frames(n)
+        self._markers.record(state, start_s, self._period_s, np.zeros(n, FRAME_RECORD))
         if any(effect.reads_before for effect in self._world.flux_model.bit_effects):
             # The next frame depends on the last of these, whether anybody gets to see it or not.
             unseen = np.empty((1, self._info.height, self._layout(1).row_bytes), np.uint8)
-            self._draw(happening, start_s, np.zeros(n, np.int32), unseen, first=n - 1)
+            self._draw(state, start_s, np.zeros(n, np.int32), unseen, first=n - 1)
         self._advance(n, lost=n)
         self._just_lost = True
         return n * self._period_s
@@ -343,12 +341,12 @@ class SimulatedSpad(SpadArray):
             return
         layout = self._layout(n)
         records, bits = block_views(buffer, layout)
-        start_s, happening = self._frames(n)
-        sweep = self._markers.record(happening, start_s, self._period_s, records)
+        start_s, state = self._frames(n)
+        sweep = self._markers.record(state, start_s, self._period_s, records)
         x0 = windows_at(self._window, sweep, records)
         records["ticks"] = np.arange(n, dtype=np.uint32) * np.uint32(self._timing.frame_period_ticks)
         records["x0"], records["y0"] = x0, 0
-        self._draw(happening, start_s, x0, bits)
+        self._draw(state, start_s, x0, bits)
         self._link.repeat(self._next_frame, records, bits)
         header = self._header(sweep, n)
         block = seal_block(buffer, header, layout, frames_lost=header.lost_before, payload_crc=True)
@@ -359,7 +357,7 @@ class SimulatedSpad(SpadArray):
 
     def _draw(
         self,
-        happening: Happening,
+        state: BenchState,
         start_s: NDArray[np.float64],
         x0: NDArray[np.int32],
         bits: NDArray[np.uint8],
@@ -367,7 +365,7 @@ class SimulatedSpad(SpadArray):
     ) -> None:
         """Draw the next frames, without the first few, into `bits`."""
         assert self._photons is not None, "configured before started"
-        held, power_w = self._world.held(happening, self._period_s), happening.power_w * happening.share
+        held, power_w = self._world.mirror_positions(state, self._period_s), state.power_w * state.share
         number = self._first_draw + self._next_frame + first
         self._photons.expose(number, held[first:], power_w[first:], x0[first:], bits, start_s[first:])
 
@@ -410,13 +408,13 @@ class SimulatedSpad(SpadArray):
             sensor_height=self._info.height,
         )
 
-    def _frames(self, n: int) -> tuple[NDArray[np.float64], Happening]:
+    def _frames(self, n: int) -> tuple[NDArray[np.float64], BenchState]:
         """Start of each of the next n frames in seconds of the bench, and what happens during them."""
         period_ticks = self._timing.frame_period_ticks
         start_s = self._ticks.times_s(self._next_frame * period_ticks, period_ticks, n + 1)
         self._end_s = float(start_s[n])
-        happening = self._world.bench.during(start_s[:n], self._exposure_s, self._end_s - float(start_s[n - 1]))
-        return start_s[:n], happening
+        state = self._world.bench.during(start_s[:n], self._exposure_s, self._end_s - float(start_s[n - 1]))
+        return start_s[:n], state
 
 
 def create(config: SimulatedSpadConfig, surroundings: Surroundings) -> SimulatedSpad:

@@ -29,14 +29,14 @@ from sim_backend.random_numbers import (
     ROUGHLY,
     WORD_PX,
     block_numbers,
+    counter_bits,
     drawn_word,
-    enciphered,
     frame_key,
+    full_word,
     mixed_word,
     one_minus_exp_minus,
+    one_minus_exp_minus_32,
     place_levels,
-    roughly_one_minus_exp_minus,
-    sure_word,
 )
 
 LEVELS = 2**16
@@ -141,12 +141,12 @@ def _set_levels(
         for i in range(min(last * WORD_PX, width) - first * WORD_PX):
             x = start + np.uint64(i)
             flux = rate[row, x] * factor + steady[row, x]
-            level = offset - slope * roughly_one_minus_exp_minus(flux, roughly)
+            level = offset - slope * one_minus_exp_minus_32(flux, roughly)
             values[x] = np.int16(np.int32(min(max(level, least), largest)))
         for k in range(first, last):
             place = to_levels + (y * words + k) * _WORD_BYTES
             place_levels(from_values + k * _WORD_BYTES, place)
-            sure[y, k] = sure_word(place)
+            sure[y, k] = full_word(place)
 
 
 @numba.njit(cache=True, nogil=True, error_model="numpy")
@@ -180,7 +180,7 @@ def draw_frames(
         for group in range(first_row // _KEY_ROWS, (last_row - 1) // _KEY_ROWS + 1):
             for f in range(first, min(first + _TOGETHER, frames)):
                 first_k = np.uint64(first_word[f])
-                group_key = enciphered(key[0], key[1], np.uint64(first_frame + f), np.uint64(group))
+                group_key = counter_bits(key[0], key[1], np.uint64(first_frame + f), np.uint64(group))
                 for y in range(max(first_row, group * _KEY_ROWS), min(last_row, (group + 1) * _KEY_ROWS)):
                     row_bits = np.uint64(y % _KEY_ROWS << _ROW_SHIFT)
                     row_key = group_key[0] ^ row_bits, group_key[1] ^ row_bits
@@ -215,11 +215,11 @@ def _draw_anew(
     for f in range(len(words)):
         # Strips of rows have streams of their own, so that a thread need not go through other threads' rows.
         for strip in range(first_row // _STRIP_ROWS, (last_row - 1) // _STRIP_ROWS + 1):
-            stream = enciphered(key[0], key[1], np.uint64(first_frame + f), _ANEW + np.uint64(strip))
+            stream = counter_bits(key[0], key[1], np.uint64(first_frame + f), _ANEW + np.uint64(strip))
             end = min(last_row, (strip + 1) * _STRIP_ROWS) * row_px
             at, number = strip * _STRIP_ROWS * row_px - 1, np.uint64(0)
             while True:
-                skip, drawn = enciphered(stream[0], stream[1], number, np.uint64(0))
+                skip, drawn = counter_bits(stream[0], stream[1], number, np.uint64(0))
                 number += np.uint64(1)
                 at += 1 + int(math.log((float(skip >> _S11) + 1.0) * _UNIT) * _PER_SKIP)
                 if at >= end:

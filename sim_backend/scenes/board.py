@@ -17,7 +17,7 @@ from calibration.board.board import BUNDLED_BOARD, Board, load_board
 from calibration.errors import CalibrationError
 from calibration.views import BoardPose
 from drivers.errors import DeviceError
-from sim_backend.scenes.scene import BoardShown
+from sim_backend.scenes.scene import SceneBoard
 from sim_backend.scenes.surfaces import Surfaces, checked
 
 Array = NDArray[np.float64]
@@ -36,14 +36,14 @@ WALL_ALBEDO = 0.5
 
 
 @dataclass(frozen=True, slots=True, eq=False)
-class ShownBoard:
+class BoardAtPose:
     """A board held at a pose. mirrored: printed the wrong way round."""
 
     board: Board
     pose: BoardPose
     mirrored: bool = False
 
-    def seen(self, u: Array, v: Array) -> tuple[Array, Array]:
+    def trace(self, u: Array, v: Array) -> tuple[Array, Array]:
         """(depth in metres, albedo) along rays (u, v); albedo NaN where a ray misses the board or meets its back."""
         turn, position = self.pose.matrix, np.asarray(self.pose.position_m, np.float64)
         with np.errstate(all="ignore"):
@@ -56,11 +56,11 @@ class ShownBoard:
         return z, self.board.albedo_at(np.where(met, x, np.nan), np.where(met, y, np.nan))
 
 
-def load_boards(shown: Sequence[BoardShown], folder: Path) -> list[ShownBoard]:
+def load_boards(shown: Sequence[SceneBoard], folder: Path) -> list[BoardAtPose]:
     """The boards of a scene file whose paths start at `folder`. DeviceError where a board's file is no board's."""
     try:
         return [
-            ShownBoard(
+            BoardAtPose(
                 load_board(BUNDLED_BOARD if one.file is None else folder / Path(one.file).expanduser()),
                 BoardPose(np.array(one.rotation), np.array(one.position)),
                 one.mirrored,
@@ -71,12 +71,12 @@ def load_boards(shown: Sequence[BoardShown], folder: Path) -> list[ShownBoard]:
         raise DeviceError(f"scene's {error}") from error
 
 
-def board_scene(u: Array, v: Array, boards: Sequence[ShownBoard], wall_m: float) -> Surfaces:
+def board_scene(u: Array, v: Array, boards: Sequence[BoardAtPose], wall_m: float) -> Surfaces:
     """The boards, the nearer ones in front, before a wall `wall_m` away, for a camera of rays (u, v), (rows, width)."""
     depth, albedo = np.full(u.shape, wall_m), np.full(u.shape, WALL_ALBEDO)
     slopes = [(np.gradient(tangent, axis=1), np.gradient(tangent, axis=0)) for tangent in (u, v)]
     for shown in sorted(boards, key=lambda one: -float(one.pose.position_m[2])):
-        z, centre = shown.seen(u, v)
+        z, centre = shown.trace(u, v)
         inside = ~np.isnan(centre) & (z < depth)
         depth[inside] = z[inside]
         near = _grown(inside)
@@ -85,13 +85,13 @@ def board_scene(u: Array, v: Array, boards: Sequence[ShownBoard], wall_m: float)
     return checked("board", depth, albedo, np.ones(u.shape, bool), u.shape)
 
 
-def _over_area(shown: ShownBoard, u: Array, v: Array, slopes: list[tuple[Array, Array]]) -> tuple[Array, Array]:
+def _over_area(shown: BoardAtPose, u: Array, v: Array, slopes: list[tuple[Array, Array]]) -> tuple[Array, Array]:
     """Share of each pixel's area that the board covers, and the board's albedo times that share; all (n,)."""
     (u_x, u_y), (v_x, v_y) = ([np.nan_to_num(slope) for slope in pair] for pair in slopes)
     place = np.random.default_rng(0).random((2, u.size))  # of the lattice in each pixel; the same in every picture
 
     def albedo(at: NDArray[np.intp], along: Array, down: Array) -> Array:
-        return shown.seen(u[at] + along * u_x[at] + down * u_y[at], v[at] + along * v_x[at] + down * v_y[at])[1]
+        return shown.trace(u[at] + along * u_x[at] + down * u_y[at], v[at] + along * v_x[at] + down * v_y[at])[1]
 
     def ray(at: NDArray[np.intp], number: int) -> Array:
         along, down = (place[0, at] + number / RAYS) % 1 - 0.5, (place[1, at] + number * TURNS / RAYS) % 1 - 0.5

@@ -57,7 +57,7 @@ class BoardPlace(SceneSection):
     """Position of the top left corner of the board's squares: x right, y down, z away from the camera."""
 
 
-class BoardShown(BoardPlace):
+class SceneBoard(BoardPlace):
     """A calibration board in the scene."""
 
     file: str | None = None
@@ -70,7 +70,7 @@ class SceneFile(SceneSection):
     """A whole scene file."""
 
     surfaces: str = Field(default="street", examples=["street"])
-    board: BoardShown | tuple[BoardShown, ...] = Field(
+    board: SceneBoard | tuple[SceneBoard, ...] = Field(
         default=(), examples=["{rotation: [20 deg, 0 deg, 0 deg], position: [-30 cm, -20 cm, 1.5 m]}"]
     )
     """Boards in front of the wall where `surfaces` is `board`."""
@@ -91,9 +91,9 @@ class SceneFile(SceneSection):
         return self
 
     @property
-    def boards(self) -> tuple[BoardShown, ...]:
+    def boards(self) -> tuple[SceneBoard, ...]:
         """All boards of the scene."""
-        return (self.board,) if isinstance(self.board, BoardShown) else self.board
+        return (self.board,) if isinstance(self.board, SceneBoard) else self.board
 
     @property
     def illuminance_lux(self) -> float:

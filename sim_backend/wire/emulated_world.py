@@ -23,7 +23,7 @@ from drivers.frames import FRAME_RECORD, packed_row_bytes
 from drivers.interfaces import OUT_GATE
 from drivers.registry import Kind, Surroundings
 from drivers.transports.endpoints import Endpoint
-from sim_backend.bench import Happening
+from sim_backend.bench import BenchState
 from sim_backend.devices.spad import MarkerInputs, windows_at
 from sim_backend.effects.setting import FrameTimes
 from sim_backend.frames.flux import FluxModel
@@ -54,7 +54,7 @@ KEPT_FRAMES = 1_000_000_000
 """Most frames that wait for the host."""
 
 
-class TakesDevices(Protocol):
+class UsbBus(Protocol):
     """A USB bus, in this process or for other ones."""
 
     def plug(self, model: UsbModel) -> AttachedDevice:
@@ -80,7 +80,7 @@ class EmulatedWorld(SimulatedWorld):
     """One scene and the devices that look at it, plugged in from its creation to `close`."""
 
     def __init__(
-        self, config: EmulatedWorldConfig, surroundings: Surroundings, bus: TakesDevices | None = None
+        self, config: EmulatedWorldConfig, surroundings: Surroundings, bus: UsbBus | None = None
     ) -> None:
         """DeviceError where the geometry or the scene cannot be used.
 
@@ -146,7 +146,7 @@ class EmulatedWorld(SimulatedWorld):
         with closing(self.photon_source(FrameTimes(1e-5, 1e-5))) as source:
             source.expose(0, held, power_w, x0, bits, np.zeros(1))
 
-    def during(self, start_s: Array, exposure_s: float, period_s: float) -> tuple[Happening, Array]:
+    def during(self, start_s: Array, exposure_s: float, period_s: float) -> tuple[BenchState, Array]:
         """Events during frames that start at start_s (n,), ascending, one period apart, and the laser's power.
 
         Times are the host's; power_w (n,) of each exposure's middle.
@@ -167,7 +167,7 @@ class EmulatedWorld(SimulatedWorld):
         share, edge = gate_shares(times, words, start_s, exposure_s)
         power_w = self._power(middle)
         unknown = np.full(len(mirror), np.nan)  # of the DAC's stairs
-        return Happening(mirror, unknown, share, edge, backward, line_s, scan_s, float(power_w[0])), power_w
+        return BenchState(mirror, unknown, share, edge, backward, line_s, scan_s, float(power_w[0])), power_w
 
     def light(self, from_s: float, until_s: float) -> list[tuple[float, float]]:
         """(start, end) of every time with light in [from_s, until_s], ascending: emission AND gate.
@@ -238,14 +238,14 @@ class WorldFrames:
     def expose(self, span: Span, records: NDArray[np.void], bits: NDArray[np.uint8] | None) -> int:
         """See `FrameSource`."""
         start_s: Array = span.start_s + np.arange(span.n, dtype=np.float64) * span.period_s
-        happening, power_w = self._world.during(start_s, span.exposure_s, span.period_s)
-        sweep = self._markers.record(happening, start_s, span.period_s, records)
+        state, power_w = self._world.during(start_s, span.exposure_s, span.period_s)
+        sweep = self._markers.record(state, start_s, span.period_s, records)
         x0 = windows_at(span.window, sweep, records)
         records["x0"] = x0
         if bits is not None:
-            held = self._world.held(happening, span.period_s)
+            held = self._world.mirror_positions(state, span.period_s)
             source = self._source(FrameTimes(span.exposure_s, span.period_s))
-            source.expose(span.first_frame, held, power_w * happening.share, x0, bits, start_s)
+            source.expose(span.first_frame, held, power_w * state.share, x0, bits, start_s)
         return sweep
 
     def whole(self, first_frame: int, start_s: float, period_s: float, n: int) -> NDArray[np.uint8]:

@@ -48,7 +48,7 @@ class Exchange:
         """The bytes sent without the tokens' numbers."""
         return _TOKEN.sub(b"#00000000", self.sent)
 
-    def answer_to(self, sent: bytes) -> bytes:
+    def reply_to(self, sent: bytes) -> bytes:
         """The answer, with the tokens of what was sent now."""
         answer = self.answer
         for old, new in zip(_TOKEN.findall(self.sent), _TOKEN.findall(sent), strict=True):
@@ -111,9 +111,9 @@ class RecordedModel:
         exchange, index = max(whole, key=lambda one: len(one[0].form))
         sent, self._heard = self._heard[: len(exchange.form)], self._heard[len(exchange.form) :]
         if index < 0:
-            return self._answered(exchange.form, now_s).answer_to(sent)
+            return self._answered(exchange.form, now_s).reply_to(sent)
         self._at, self._since_s = index, now_s
-        return exchange.answer_to(sent)
+        return exchange.reply_to(sent)
 
     def _ahead(self) -> list[int]:
         """Commands that may come: the next one, or, since drivers make sure, the last ones again or skipped."""

@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 from sim_backend import random_numbers
 from sim_backend.frames.photon_kernels import CHANCE, LEVELS, NEVER, Levels, draw_frames, new_levels, set_levels
 from sim_backend.light.line import edge, edge_sum
-from sim_backend.random_numbers import HALVING, ROUGHLY, one_minus_exp_minus, power_of_half, roughly_one_minus_exp_minus
+from sim_backend.random_numbers import HALVING, ROUGHLY, one_minus_exp_minus, one_minus_exp_minus_32, power_of_half
 from tests.campaigns.photon_bits import PROBABILITIES, chi_square, correlations, draw
 from tests.stability.conftest import Worst
 from tests.stability.exactly import relative
@@ -39,7 +39,7 @@ def _miss(t):  # type: ignore[no-untyped-def]
 
 @numba.njit
 def _roughly(t):  # type: ignore[no-untyped-def]
-    return roughly_one_minus_exp_minus(np.float32(t), ROUGHLY)
+    return one_minus_exp_minus_32(np.float32(t), ROUGHLY)
 
 
 def test_exponentials_of_kernels_hold_their_stated_errors(worst: Worst) -> None:

@@ -23,7 +23,7 @@ from sim_backend.frames.photons import PhotonSource
 from sim_backend.light.optics import Line, Optics, Sensor, detections_per_radiance
 from sim_backend.light.view import make_view
 from sim_backend.mirror_motion import Jitter
-from sim_backend.scenes.board import ShownBoard, board_scene
+from sim_backend.scenes.board import BoardAtPose, board_scene
 from sim_backend.scenes.scene import SceneFile
 from tests.reference.boards.random_rigs import COMMAND_REACH, RandomRig
 
@@ -91,7 +91,7 @@ def set_up(rig: RandomRig) -> Stand:
 
 
 def take_sweeps(
-    stand: Stand, shown: Sequence[ShownBoard], sweeps: Sequence[SweepAsked], rng: np.random.Generator
+    stand: Stand, shown: Sequence[BoardAtPose], sweeps: Sequence[SweepAsked], rng: np.random.Generator
 ) -> list[SweepTaken]:
     """Sweep the line over the boards."""
     rig, camera = stand.rig, stand.rig.model.camera

@@ -28,7 +28,7 @@ from calibration.errors import Degenerate
 from calibration.model.scanner import PivotScanner
 from calibration.rig_fit.fit import fit_rig
 from calibration.views import BoardPose, View
-from sim_backend.scenes.board import ShownBoard
+from sim_backend.scenes.board import BoardAtPose
 from tests.campaigns.calibration.asked import NAMED, Figure, exit_code
 from tests.campaigns.calibration.board_capture import HOT_PER_S, Stand, SweepAsked, set_up, take_sweeps
 from tests.campaigns.calibration.rig_figures import CALIBRATED
@@ -184,7 +184,7 @@ def no_board(session: Session, good: list[View]) -> str:
     pose = session.pose()
     turned = cv2.Rodrigues(pose.matrix @ np.diag([-1.0, 1.0, -1.0]))[0]
     back = BoardPose(np.asarray(turned, np.float64).ravel(), pose.position_m)
-    return session.refused([ShownBoard(BOARD, back)])
+    return session.refused([BoardAtPose(BOARD, back)])
 
 
 def half_out(session: Session, good: list[View]) -> str:
@@ -198,19 +198,19 @@ def half_out(session: Session, good: list[View]) -> str:
         pose = replace(pose, position_m=pose.position_m + 0.01 * direction)
         x, y = camera.project(pose.to_camera(BOARD.corners_m))
         seen = float(np.mean((x > 3) & (x < camera.width - 4) & (y > 3) & (y < camera.height - 4)))
-    return session.refused([ShownBoard(BOARD, pose)])
+    return session.refused([BoardAtPose(BOARD, pose)])
 
 
 def mirrored(session: Session, good: list[View]) -> str:
     """A print the wrong way round."""
-    return session.refused([ShownBoard(BOARD, session.pose(cell=int(session.rng.integers(16))), mirrored=True)])
+    return session.refused([BoardAtPose(BOARD, session.pose(cell=int(session.rng.integers(16))), mirrored=True)])
 
 
 def two_boards(session: Session, good: list[View]) -> str:
     """One print twice, side by side."""
     away = session.distance_m(BOARD, (170, 200))
     sides = [session.pose(cell=cell, distance_m=away, tilt_rad=0.2) for cell in (4, 11)]
-    return session.refused([ShownBoard(BOARD, pose) for pose in sides])
+    return session.refused([BoardAtPose(BOARD, pose) for pose in sides])
 
 
 def another_board(session: Session, good: list[View]) -> str:
@@ -218,7 +218,7 @@ def another_board(session: Session, good: list[View]) -> str:
     squares = [(9, 6), (7, 6), (10, 7), (6, 4), (6, 8), (8, 5), (8, 8)][int(session.rng.integers(7))]
     other = replace(BOARD, squares=squares)
     pose = random_pose(session.rng, session.stand.rig.model.camera, other, cell=int(session.rng.integers(16)))
-    return session.refused([ShownBoard(other, pose)])
+    return session.refused([BoardAtPose(other, pose)])
 
 
 def no_mistake(session: Session, good: list[View]) -> str:

@@ -36,7 +36,7 @@ from calibration.views import Passages, View
 from rig.calibrate.session import load_views, save_view
 from sim_backend.effects.dark_counts import dark_rates
 from sim_backend.light.optics import Sensor
-from sim_backend.scenes.board import ShownBoard
+from sim_backend.scenes.board import BoardAtPose
 from tests.campaigns.calibration.asked import exit_code
 from tests.campaigns.calibration.board_capture import (
     FRAME_S,
@@ -99,7 +99,7 @@ def views_of(stand: Stand, board: Board, poses: int, rng: np.random.Generator) -
     for i, pose in enumerate(random_poses(rng, stand.rig.model.camera, board, poses)):
         speeds = [CALIBRATED, OTHER_SPEED] if i % SLOW_EVERY == 0 else [CALIBRATED]
         sweeps = [SweepAsked(exposures, direction) for exposures in speeds for direction in (1, -1)]
-        views.append(view_of(f"{i:03d}", stand, take_sweeps(stand, [ShownBoard(board, pose)], sweeps, rng), board))
+        views.append(view_of(f"{i:03d}", stand, take_sweeps(stand, [BoardAtPose(board, pose)], sweeps, rng), board))
     return views
 
 

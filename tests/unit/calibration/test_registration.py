@@ -6,7 +6,7 @@ import pytest
 from calibration.board.board import Board
 from calibration.board.detect import find_corners
 from calibration.board.drawing import Drawing
-from sim_backend.scenes.board import ShownBoard, board_scene
+from sim_backend.scenes.board import BoardAtPose, board_scene
 from tests.reference.boards.random_rigs import BOARD, random_poses, random_rig
 
 MOST_RMS_PX = 0.0014
@@ -21,7 +21,7 @@ def test_corners_without_noise_lie_within_a_thousandth_of_a_pixel(seed: int) -> 
     rays = camera.tangents()
     off = []
     for pose in random_poses(rng, camera, BOARD, 2):
-        picture = 0.05 * board_scene(*rays, [ShownBoard(BOARD, pose)], 4.0).albedo
+        picture = 0.05 * board_scene(*rays, [BoardAtPose(BOARD, pose)], 4.0).albedo
         found = find_corners(picture.astype(np.float32), BOARD)
         assert len(found.ids) == len(BOARD.corners_m)
         off.append(found.px - np.stack(camera.project(pose.to_camera(BOARD.corners_m[found.ids])), axis=-1))

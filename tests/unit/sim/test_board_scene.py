@@ -13,7 +13,7 @@ from calibration.views import BoardPose
 from drivers.clock import VirtualClock
 from drivers.errors import DeviceError
 from drivers.registry import Surroundings
-from sim_backend.scenes.board import WALL_ALBEDO, ShownBoard, board_scene
+from sim_backend.scenes.board import WALL_ALBEDO, BoardAtPose, board_scene
 from sim_backend.scenes.scene import SceneFile, load_scene
 from sim_backend.world import KIND, SimulatedWorld, WorldConfig
 from tests.system.small_rig import calibration
@@ -25,11 +25,11 @@ BOARD = Board("charuco", (6, 4), 0.08, 0.06, "DICT_4X4_50")
 POSE = BoardPose(np.array([0.3, -0.4, 0.1]), np.array([-0.25, -0.12, 1.1]))
 
 
-def _mean_albedo(shown: ShownBoard, x_px: Array, y_px: Array, samples: int) -> Array:
+def _mean_albedo(shown: BoardAtPose, x_px: Array, y_px: Array, samples: int) -> Array:
     """Of pixels (n,), from rays through the lens itself; NaN where the board is left."""
     step = (np.arange(samples) + 0.5) / samples - 0.5
     u, v = MODEL.camera.tangents_at(x_px[:, None, None] + step, y_px[:, None, None] + step[:, None])
-    return np.asarray(shown.seen(u, v)[1].mean(axis=(1, 2)))
+    return np.asarray(shown.trace(u, v)[1].mean(axis=(1, 2)))
 
 
 MODEL = rig(size=(128, 192), focal_px=300.0, k1=-0.2)
@@ -37,7 +37,7 @@ U, V = MODEL.camera.tangents()
 
 
 def test_the_boards_points_lie_on_its_plane_and_the_wall_behind_it() -> None:
-    seen = board_scene(U, V, [ShownBoard(BOARD, POSE)], wall_m=3.0)
+    seen = board_scene(U, V, [BoardAtPose(BOARD, POSE)], wall_m=3.0)
     normal = POSE.matrix[:, 2]
     points = seen.depth_m[..., None] * np.stack([U, V, np.ones_like(U)], axis=-1)
     off = points @ normal - normal @ POSE.position_m
@@ -49,7 +49,7 @@ def test_the_boards_points_lie_on_its_plane_and_the_wall_behind_it() -> None:
 
 
 def test_a_pixel_sees_the_mean_print_over_its_area() -> None:
-    shown = ShownBoard(BOARD, POSE)
+    shown = BoardAtPose(BOARD, POSE)
     seen = board_scene(U, V, [shown], wall_m=3.0)
     edge = (seen.depth_m < 2.9) & (seen.albedo > BLACK + 0.01) & (seen.albedo < WHITE - 0.01)
     for pixels, most in ((seen.depth_m < 2.9, 4e-3), (edge, 8e-3)):
@@ -64,14 +64,14 @@ def test_a_pixel_sees_the_mean_print_over_its_area() -> None:
 
 
 def test_an_edge_of_the_paper_is_shared_with_the_wall() -> None:
-    seen = board_scene(U, V, [ShownBoard(BOARD, POSE)], wall_m=3.0)
+    seen = board_scene(U, V, [BoardAtPose(BOARD, POSE)], wall_m=3.0)
     between = (seen.albedo > WALL_ALBEDO + 0.02) & (seen.albedo < WHITE - 0.02)
     assert np.any(between & (seen.depth_m == 3.0))
 
 
 def test_the_nearer_board_is_in_front() -> None:
-    far = ShownBoard(BOARD, BoardPose(np.zeros(3), np.array([-0.2, -0.1, 2.0])))
-    near = ShownBoard(BOARD, BoardPose(np.zeros(3), np.array([0.0, -0.1, 1.0])))
+    far = BoardAtPose(BOARD, BoardPose(np.zeros(3), np.array([-0.2, -0.1, 2.0])))
+    near = BoardAtPose(BOARD, BoardPose(np.zeros(3), np.array([0.0, -0.1, 1.0])))
     both = board_scene(U, V, [near, far], wall_m=3.0)
     alone = board_scene(U, V, [near], wall_m=3.0)
     there = alone.depth_m < 2.9
@@ -83,14 +83,14 @@ def test_a_mirrored_board_is_the_other_way_round() -> None:
     flat = BoardPose(np.zeros(3), np.array([-BOARD.size_m[0] / 2, -BOARD.size_m[1] / 2, 1.2]))
     straight = rig(size=(128, 192), focal_px=300.0)
     u, v = straight.camera.tangents()
-    right, wrong = (board_scene(u, v, [ShownBoard(BOARD, flat, mirrored=m)], 3.0) for m in (False, True))
+    right, wrong = (board_scene(u, v, [BoardAtPose(BOARD, flat, mirrored=m)], 3.0) for m in (False, True))
     assert np.abs(right.albedo - wrong.albedo[:, ::-1]).max() < 0.1  # the rays through a pixel are not mirrored
     assert not np.array_equal(right.albedo, wrong.albedo)
 
 
 def test_a_board_seen_from_behind_is_not_there() -> None:
     turned = BoardPose(np.array([0.0, np.pi, 0.0]), np.array([0.2, -0.1, 1.0]))
-    assert np.all(board_scene(U, V, [ShownBoard(BOARD, turned)], wall_m=3.0).depth_m == 3.0)
+    assert np.all(board_scene(U, V, [BoardAtPose(BOARD, turned)], wall_m=3.0).depth_m == 3.0)
 
 
 def _world(tmp_path: Path, **config: Any) -> SimulatedWorld:

@@ -36,11 +36,11 @@ def test_frames_see_the_mirror_where_it_shakes_to_within_its_range() -> None:
     scanner = create(SimulatedScannerConfig(jitter=0.01), Surroundings(VirtualClock(), world, 3))
     world.hold_columns(np.linspace(-0.8, 0.8, 5))
     world.bench.rest(0.4)
-    happening = world.bench.during(np.arange(1000) * 1e-5, 1e-5, 1e-5)
-    held = world.held(happening, 1e-5)
+    state = world.bench.during(np.arange(1000) * 1e-5, 1e-5, 1e-5)
+    held = world.mirror_positions(state, 1e-5)
     assert held.std() == pytest.approx(0.01, rel=0.3)
     assert held.mean() == pytest.approx(0.4, abs=5e-3)
     assert "0.01" in world.setting.devices["galvo jitter"]
     world.bench.rest(world.model.scanner.command_range[1])
-    assert np.nanmax(world.held(world.bench.during(np.arange(1000) * 1e-5, 1e-5, 1e-5), 1e-5)) <= 1.0
+    assert np.nanmax(world.mirror_positions(world.bench.during(np.arange(1000) * 1e-5, 1e-5, 1e-5), 1e-5)) <= 1.0
     scanner.close()

@@ -11,7 +11,7 @@ from numba import types
 from numba.extending import intrinsic
 
 from sim_backend import random_numbers as random_lanes
-from sim_backend.random_numbers import PLACE, block_numbers, drawn_word, enciphered, place_levels, sure_word
+from sim_backend.random_numbers import PLACE, block_numbers, counter_bits, drawn_word, full_word, place_levels
 
 START_OF_ROUND = 0x193DE3BEA0F4E22B9AC68D2AE9F84808
 ROUND_KEY = 0xA0FAFE1788542CB123A339392A6C7605
@@ -75,7 +75,7 @@ def test_the_round_for_arm_compiles() -> None:
 
 def test_numbers_without_instructions_are_the_same(monkeypatch: pytest.MonkeyPatch) -> None:
     def both(seed, row, levels, blocks):  # type: ignore[no-untyped-def]
-        key = enciphered(seed, seed, np.uint64(7), row)
+        key = counter_bits(seed, seed, np.uint64(7), row)
         return key, drawn_word(key, blocks.ctypes.data, levels.ctypes.data)
 
     args = np.uint64(5), np.uint64(9), np.full(64, 12000, np.int16), block_numbers(4)[3]
@@ -90,7 +90,7 @@ def _words(values, key, blocks, levels, words):  # type: ignore[no-untyped-def]
     for i in range(len(words)):
         block = blocks.ctypes.data + i % len(blocks) * blocks.shape[1] * 8
         drawn = drawn_word((key, np.uint64(i // len(blocks))), block, levels.ctypes.data)
-        words[i] = drawn | sure_word(levels.ctypes.data)
+        words[i] = drawn | full_word(levels.ctypes.data)
 
 
 def test_levels_belong_to_pixels_in_packbits_order() -> None:
