@@ -1,1 +1,1 @@
-"""Effects on the light between laser and sensor, one file each; one that no scene calls for is not imported."""
+"""Effects on the light between laser and sensor; a module that no scene calls for is not imported."""

@@ -27,7 +27,7 @@ import numba
 import numpy as np
 from numpy.typing import NDArray
 
-from sim_backend.effects.rare_bits import bit_of, log_miss, next_hit
+from sim_backend.effects.sensor_bits import bit_of, log_miss, next_hit
 from sim_backend.effects.setting import FrameTimes, Setting, Words
 from sim_backend.random_numbers import WORD_PX, frame_key
 
@@ -81,31 +81,24 @@ def _carry_over(
     for f in range(len(words) - 1, -1, -1):
         frame = np.uint64(first_frame + f)
         earlier = words[f - 1] if f > 0 else before
-        _clear(words[f], earlier, width, frame_key(seed ^ _BLIND, frame), blind)
-        _set(words[f], earlier, width, frame_key(seed ^ _AFTER, frame), after)
+        _carry_bits(words[f], earlier, width, frame_key(seed ^ _BLIND, frame), blind, False)
+        _carry_bits(words[f], earlier, width, frame_key(seed ^ _AFTER, frame), after, True)
 
 
 @numba.njit(cache=True, nogil=True, error_model="numpy")
-def _clear(now: NDArray[np.uint64], earlier: NDArray[np.uint64], width: int, key: np.uint64, log_miss: float) -> None:
-    """Clear each bit (rows, words) that is 1 in the earlier frame, with the probability that log_miss says."""
+def _carry_bits(
+    now: NDArray[np.uint64], earlier: NDArray[np.uint64], width: int, key: np.uint64, log_miss: float, lit: bool
+) -> None:
+    """Set (lit) or clear each bit (rows, words) that is 1 in the earlier frame, with the chance that log_miss says."""
     draw = 0
     place = next_hit(-1.0, key, draw, log_miss)
     while place < len(now) * width:
         y = int(place) // width
         x = int(place) - y * width
-        now[y, x // WORD_PX] &= ~(earlier[y, x // WORD_PX] & bit_of(x))
-        draw += 1
-        place = next_hit(place, key, draw, log_miss)
-
-
-@numba.njit(cache=True, nogil=True, error_model="numpy")
-def _set(now: NDArray[np.uint64], earlier: NDArray[np.uint64], width: int, key: np.uint64, log_miss: float) -> None:
-    """Set each bit (rows, words) that is 1 in the earlier frame, with the probability that log_miss says."""
-    draw = 0
-    place = next_hit(-1.0, key, draw, log_miss)
-    while place < len(now) * width:
-        y = int(place) // width
-        x = int(place) - y * width
-        now[y, x // WORD_PX] |= earlier[y, x // WORD_PX] & bit_of(x)
+        bit = earlier[y, x // WORD_PX] & bit_of(x)
+        if lit:
+            now[y, x // WORD_PX] |= bit
+        else:
+            now[y, x // WORD_PX] &= ~bit
         draw += 1
         place = next_hit(place, key, draw, log_miss)

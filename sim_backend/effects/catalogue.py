@@ -18,7 +18,7 @@ gain, which hold its code."""
 
 @dataclass(frozen=True, slots=True)
 class Entry:
-    """One effect: its name, what it acts on, its class as module:name ("" where it is worked in elsewhere), and the
+    """One effect: its name, what it acts on, what makes it as module:name ("" where it is worked in elsewhere), and the
     rule that calls for it.
 
     `called(setting)` gives yes or no and the reason in words. `changes(setting, planned_for)`, in closed form: the
@@ -33,7 +33,7 @@ class Entry:
     changes: Callable[[Setting, PlannedFor], float] | None = None
 
     def load(self) -> Callable[..., Any]:
-        """The effect's class, imported now."""
+        """What makes the effect of a `Setting`, imported now."""
         module, _, name = self.code.partition(":")
         loaded: Callable[..., Any] = getattr(import_module(module), name)
         return loaded
@@ -203,18 +203,18 @@ CATALOGUE = (
     Entry("fog", "laser", "sim_backend.effects.fog:Haze", _fog),
     Entry("forward blur", "laser", "sim_backend.effects.forward_blur:ForwardBlur", _forward_blur),
     Entry("halo", "laser", "sim_backend.effects.halo:Halo", _halo),
-    Entry("rain", "laser", "sim_backend.effects.rain:RainDrops", _rain),
-    Entry("snow", "laser", "sim_backend.effects.snow:SnowFlakes", _snow),
+    Entry("rain", "laser", "sim_backend.effects.particles:rain_drops", _rain),
+    Entry("snow", "laser", "sim_backend.effects.particles:snow_flakes", _snow),
     Entry("motion", "laser", "sim_backend.effects.motion:Motion", _motion),
     Entry("inter-reflection", "within", "", _between_surfaces),
     Entry("ambient", "steady", "sim_backend.effects.ambient:Ambient", _ambient, _ambient_changes),
-    Entry("airlight", "steady", "sim_backend.effects.airlight:Airlight", _airlight, _ambient_changes),
+    Entry("airlight", "steady", "sim_backend.effects.ambient:Airlight", _airlight, _ambient_changes),
     Entry("dark counts", "steady", "sim_backend.effects.dark_counts:DarkCounts", _dark_counts),
     Entry("quantum efficiency and fill factor", "within", "", _efficiency),
     # The one that reads the frame before is the first on the bits: those are then the photons' own.
     Entry("afterpulsing and dead time", "bits", "sim_backend.effects.afterpulsing:Afterpulsing", _afterpulsing),
-    Entry("crosstalk", "bits", "sim_backend.effects.crosstalk:Crosstalk", _crosstalk, _crosstalk_changes),
-    Entry("hot and dead pixels", "bits", "sim_backend.effects.defects:Defects", _defects, _defects_change),
-    Entry("bit errors", "bits", "sim_backend.effects.bit_errors:BitErrors", _bit_errors, _bit_errors_change),
+    Entry("crosstalk", "bits", "sim_backend.effects.sensor_bits:Crosstalk", _crosstalk, _crosstalk_changes),
+    Entry("hot and dead pixels", "bits", "sim_backend.effects.sensor_bits:Defects", _defects, _defects_change),
+    Entry("bit errors", "bits", "sim_backend.effects.sensor_bits:BitErrors", _bit_errors, _bit_errors_change),
     *(Entry(name, "within", "", _of_device(name)) for name in DEVICES_OWN),
 )

@@ -1,4 +1,11 @@
-"""Drops and flakes as single bright points where they cross the sheet: the common part of rain and snow.
+"""Rain and snow: drops and flakes flash up where they cross the sheet, and have fallen on by the next sweep.
+
+Called for by `rain: {rate: 20 mm/h}` and `snow: {rate: 2 mm/h}`; sizes, extinction and fall speed are in
+`sim_backend.scenes.medium`. There are density x thickness x area of them in the sheet (drops at 20 mm/h and 2 mm: 7 per
+m^2), bright as 1/z^3; what rain takes out of the beam, next to nothing below 20 m, is in the extinction of stripe and
+haze. A flake is taken as a diffuse sphere of albedo 0.9 and 4.5 times its melted cross-section: seen from the side it
+is lit from, it sends 8/3 of the mean of all directions back, at equal melted diameter eight times as much light as a
+drop.
 
 A particle at X in a sheet of Gaussian thickness, s = n.X - d off its middle, gets J/r N(s; thickness/4) W/m^2 with
 J = P/fan, sends back that times its `back_m2_per_sr`, and is seen as a point of this intensity: a pixel of solid angle
@@ -150,6 +157,8 @@ FAINTEST_MM, FAINTEST_AT_M = 0.5, 8.0
 MARGIN = 0.02
 """Tangent by which the cone is wider than the picture, on each side."""
 DEPTH_STEPS = 4096
+_RAIN, _SNOW = 1, 2
+"""Streams of the scene's seed, so that drops and flakes lie in different places."""
 
 
 class Precipitation(Protocol):
@@ -211,6 +220,8 @@ def make_particles(what: Precipitation, cone: Array, farthest_m: float, rng: np.
 class ParticleLight:
     """The light that particles in a sheet send back."""
 
+    hold_s = HOLD_S
+
     def __init__(self, setting: Setting, what: Precipitation, rng: np.random.Generator) -> None:
         view = setting.view
         self._view = view
@@ -240,6 +251,18 @@ class ParticleLight:
             last_row,
             rate,
         )
+
+
+def rain_drops(setting: Setting) -> ParticleLight:
+    """The drops of a scene in which it rains."""
+    assert setting.scene.rain is not None, "called for by scenes with rain only"
+    return ParticleLight(setting, setting.scene.rain, np.random.default_rng([setting.scene.seed, _RAIN]))
+
+
+def snow_flakes(setting: Setting) -> ParticleLight:
+    """The flakes of a scene in which it snows."""
+    assert setting.scene.snow is not None, "called for by scenes with snow only"
+    return ParticleLight(setting, setting.scene.snow, np.random.default_rng([setting.scene.seed, _SNOW]))
 
 
 def _density(sizes: Sizes, depth_m: Array, faintest: float) -> Array:

@@ -8,14 +8,11 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from sim_backend.effects.airlight import Airlight
-from sim_backend.effects.ambient import Ambient
+from sim_backend.effects.ambient import Airlight, Ambient
 from sim_backend.effects.catalogue import CATALOGUE
 from sim_backend.effects.dark_counts import DarkCounts, dark_rates
 from sim_backend.effects.fog import Haze
 from sim_backend.effects.forward_blur import ForwardBlur
-from sim_backend.effects.rain import RainDrops
-from sim_backend.effects.snow import SnowFlakes
 from sim_backend.effects.stripe import Stripe
 from sim_backend.frames.flux import FluxModel, hold_s
 from sim_backend.light.optics import Line, Optics, Sensor, ambient_irradiance, detections_per_radiance
@@ -102,9 +99,7 @@ SCENE = st.fixed_dictionaries(
 
 
 @covers(FluxModel, hold_s, empty_sheet, CameraView)
-@covers(
-    Airlight.rate, Ambient.rate, Haze.add, DarkCounts.rate, dark_rates, ForwardBlur.add, RainDrops.add, SnowFlakes.add
-)
+@covers(Airlight.rate, Ambient.rate, Haze.add, DarkCounts.rate, dark_rates, ForwardBlur.add)
 @covers(trace_rows, span_bounds)
 @EXAMPLES
 @given(

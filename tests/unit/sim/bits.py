@@ -3,7 +3,7 @@
 import numpy as np
 from numpy.typing import NDArray
 
-from sim_backend.effects.rare_bits import packed
+from sim_backend.effects.sensor_bits import packed
 from sim_backend.effects.setting import BitEffect, FrameTimes, Setting
 from sim_backend.light.optics import Sensor
 from tests.unit.sim.rigs import rig, setting, wall

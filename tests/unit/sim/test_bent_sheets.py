@@ -80,11 +80,11 @@ def test_frames_have_the_light_of_late_rows_and_bowed_sheets() -> None:
 
 
 def test_drops_lie_on_the_sheet_that_their_row_sees() -> None:
-    from sim_backend.effects.rain import RainDrops
+    from sim_backend.effects.particles import rain_drops
 
     _, model = bent(bow=0.0)
     setup = setting(model, wall(model, (0, 0, 1), 2.0), rain={"rate": "50 mm/h"})
-    effect, first = RainDrops(setup), traced(model, np.array([COMMAND]))
+    effect, first = rain_drops(setup), traced(model, np.array([COMMAND]))
     late = traced(model, np.array([[COMMAND, COMMAND]]))
     alike, of_rows = np.zeros((64, 96)), np.zeros((64, 96))
     effect.add(first, 0, 64, alike)

@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 
-from sim_backend.effects.bit_errors import BitErrors
+from sim_backend.effects.sensor_bits import BitErrors
 from tests.unit.sim.bits import ROWS, WIDTH, acted_on, assert_count, random_bits, sensor_setting
 
 

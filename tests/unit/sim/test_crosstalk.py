@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 
-from sim_backend.effects.crosstalk import Crosstalk
+from sim_backend.effects.sensor_bits import Crosstalk
 from tests.unit.sim.bits import ROWS, WIDTH, Bits, acted_on, assert_count, random_bits, sensor_setting
 
 

@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 from pydantic import ValidationError
 
-from sim_backend.effects.defects import Defects
+from sim_backend.effects.sensor_bits import Defects
 from sim_backend.light.optics import Sensor
 from tests.unit.sim.bits import ROWS, WIDTH, Bits, acted_on, assert_count, random_bits, sensor_setting
 

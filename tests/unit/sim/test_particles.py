@@ -1,5 +1,6 @@
 """Drops and flakes: how many are in the sheet, what one sends back, and that a time says where they are."""
 
+from collections.abc import Callable
 from itertools import pairwise
 
 import numpy as np
@@ -7,10 +8,17 @@ import pytest
 from numpy.typing import NDArray
 
 from sim_backend.effects import particles
-from sim_backend.effects.particles import MOST, Particles, find_pixel, make_particles, share
-from sim_backend.effects.rain import RainDrops
+from sim_backend.effects.particles import (
+    MOST,
+    ParticleLight,
+    Particles,
+    find_pixel,
+    make_particles,
+    rain_drops,
+    share,
+    snow_flakes,
+)
 from sim_backend.effects.setting import Setting
-from sim_backend.effects.snow import SnowFlakes
 from sim_backend.light.optics import Line
 from sim_backend.scenes.medium import Rain
 from sim_backend.scenes.surfaces import Surfaces
@@ -72,10 +80,10 @@ def test_a_drop_sends_back_what_falls_on_it(fall: float) -> None:
     line = Line(thickness="4 mm", spread="2 mrad")  # type: ignore[arg-type]
     rain = {"rain": {"rate": "20 mm/h"}, "medium": {"extinction": "0.2 /m"}}
     setup = setting(model, wall(model, (0.0, 0.0, 1.0), 3.0), line=line, **rain)
-    effect, plane = RainDrops(setup), model.planes(0.4)
+    effect, plane = rain_drops(setup), model.planes(0.4)
     z, v, aside_m = 1.0, 0.03, 5e-4
     u = (plane[3] + aside_m - plane[1] * v * z - plane[2] * z) / (plane[0] * z)
-    effect.light.particles = _one(z, u, v, fall)
+    effect.particles = _one(z, u, v, fall)
     rate = np.zeros((64, 96))
     effect.add(setup.view.sheet(plane), 0, 64, rate)
     point = np.array([u, v, 1.0]) * z
@@ -110,15 +118,15 @@ def test_drops_behind_a_surface_are_not_lit() -> None:
     for z, lit in ((1.2, (True, True)), (2.0, (True, False)), (3.5, (False, False))):
         u = (plane[3] - plane[2] * z) / (plane[0] * z)
         for scene, seen in zip((setup, near), lit, strict=True):
-            effect = RainDrops(scene)
-            effect.light.particles = _one(z, u, 0.0)
+            effect = rain_drops(scene)
+            effect.particles = _one(z, u, 0.0)
             rate = np.zeros((64, 96))
             effect.add(scene.view.sheet(plane), 0, 64, rate)
             assert (rate.sum() > 0) == seen
 
 
-@pytest.mark.parametrize("effect", [RainDrops, SnowFlakes])
-def test_a_time_says_where_they_are_whatever_the_rows(effect: type[RainDrops] | type[SnowFlakes]) -> None:
+@pytest.mark.parametrize("effect", [rain_drops, snow_flakes])
+def test_a_time_says_where_they_are_whatever_the_rows(effect: Callable[[Setting], ParticleLight]) -> None:
     setup = _wet()
     plane = rig().planes(0.3)
 
@@ -145,7 +153,7 @@ def test_nothing_falls_in_front_of_a_camera_without_picture() -> None:
     sky = Surfaces(np.full_like(surfaces.depth_m, np.inf), surfaces.albedo, surfaces.trusted)
     setup = setting(model, sky, rain={"rate": "20 mm/h"})
     rate = np.zeros((64, 96))
-    effect = RainDrops(setup)
+    effect = rain_drops(setup)
     effect.add(setup.view.sheet(model.planes(0.3)), 0, 64, rate)
     assert rate.sum() > 0  # lit in front of open sky
     effect.add(setup.view.sheet(np.array([1.0, 0.0, 0.0, 0.0])), 0, 64, np.zeros((64, 96)))  # edge-on: no error

@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 
-from sim_backend.effects import afterpulsing, bit_errors, crosstalk, defects, rare_bits, setting
+from sim_backend.effects import afterpulsing, sensor_bits, setting
 from sim_backend.effects.setting import FrameTimes, Setting
 from sim_backend.frames.flux import FluxModel
 from sim_backend.frames.photons import PhotonSource
@@ -12,7 +12,7 @@ from tests.stability.inventory import covers
 from tests.unit.sim.bits import ROWS, WIDTH, sensor_setting
 from tests.unit.sim.rigs import rig
 
-covers(afterpulsing, bit_errors, crosstalk, defects, rare_bits, setting)
+covers(afterpulsing, sensor_bits, setting)
 
 TIMES = FrameTimes(exposure_s=1e-6, period_s=1e-6)
 FRAMES, FIRST = 40, 100
