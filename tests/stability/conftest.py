@@ -5,7 +5,10 @@ from collections.abc import Callable
 import numpy as np
 import pytest
 
+from tests.stability.exactly import relative
+
 Worst = Callable[[str, str, object, float], None]
+Digits = Callable[..., None]
 _PROPERTY = "largest error"
 
 
@@ -17,6 +20,19 @@ def worst(record_property) -> Worst:
         largest = float(np.max(np.abs(np.asarray(errors, np.float64)), initial=0.0))
         record_property(_PROPERTY, [what, against, largest, limit])
         assert largest <= limit, f"{what}: {largest:.3g} off {against}, more than {limit:g}"
+
+    return note
+
+
+@pytest.fixture
+def digits(worst: Worst) -> Digits:
+    """digits(what, limit, values, of, *arguments): hold the relative errors of values below the limit.
+
+    of: a function of the arguments for mpmath, evaluated with 50 digits, element by element.
+    """
+
+    def note(what: str, limit: float, values: object, of: Callable[..., object], *arguments: object) -> None:
+        worst(what, "mpmath, 50 digits", relative(values, of, *arguments), limit)
 
     return note
 

@@ -25,7 +25,6 @@ from rig.estimate.row.likelihood import (
 )
 from rig.estimate.row.model import EXTINCTION_MAX_PER_M, RowModel, fine_profiles, fit_haze, line_profile, stripe_scale
 from rig.estimate.search.inputs import EXPOSURE_PARTS, count_fluxes
-from tests.stability.exactly import relative
 from tests.stability.inventory import EXAMPLES, covers
 
 EXPOSURES = (1, 2, 10, 255, 65_535, 10**6)
@@ -37,26 +36,21 @@ def exact_flux(n, k):
 
 
 @covers(flux, count_fluxes)
-def test_fluxes_of_counts_are_exact_from_no_counts_to_all_ones(worst) -> None:
+def test_fluxes_of_counts_are_exact_from_no_counts_to_all_ones(digits) -> None:
     for k in EXPOSURES:
         n = np.unique(np.round(np.concatenate([[0, 1, k - 1, k], np.geomspace(1, k, 25)])))
         for of in (flux, _flux):
             got = [of(float(a), float(k)) for a in n]
-            worst("photons from counts, K = 1 to 10^6", "mpmath, 50 digits", relative(got, exact_flux, n, k), 1e-14)
+            digits("photons from counts, K = 1 to 10^6", 1e-14, got, exact_flux, n, k)
     assert flux(0.0, 0.0) == 0.0
     table = count_fluxes()
     assert np.isfinite(table).all()
     k, n = np.array([1, 10, 63]), np.array([1, 3, 63])
-    worst(
-        "photons from counts, table in float32",
-        "mpmath, 50 digits",
-        relative(table[EXPOSURE_PARTS * k, n], exact_flux, n, k),
-        1e-7,
-    )
+    digits("photons from counts, table in float32", 1e-7, table[EXPOSURE_PARTS * k, n], exact_flux, n, k)
 
 
 @covers(logit_table, cell_of)
-def test_what_a_count_says_is_exact_at_every_flux(worst) -> None:
+def test_what_a_count_says_is_exact_at_every_flux(worst, digits) -> None:
     """p' lies within floor / 2 of 0 and of 1 at the ends: neither logarithm may cancel."""
     cells = np.unique(np.linspace(0, TABLE.shape[1] - 1, 300).astype(int))
     middle = np.ldexp(1 + ((cells & 255) + 0.5) / 256, (cells >> CELL_BITS) + EXPONENT_LOW)
@@ -72,34 +66,33 @@ def test_what_a_count_says_is_exact_at_every_flux(worst) -> None:
     logit = np.array([float(mpmath.log(lit(x)) - mpmath.log(dark(x))) for x in middle])
     step = np.abs(TABLE[0, cells] - logit) / np.maximum(np.abs(logit), 1.0)
     worst("logit of p, flux 5e-7 to 256", "mpmath, 50 digits", step, 1e-7)
-    off = relative(TABLE[1, cells], lambda x: mpmath.log(dark(x)), middle)
-    worst("log(1 - p), flux 5e-7 to 256", "mpmath, 50 digits", off, 1e-7)
+    digits("log(1 - p), flux 5e-7 to 256", 1e-7, TABLE[1, cells], lambda x: mpmath.log(dark(x)), middle)
     assert cell_of(FLUX_MIN) == 0
     assert cell_of(FLUX_MAX) == ((EXPONENT_HIGH - EXPONENT_LOW) << CELL_BITS) - 1
 
 
-def sums(length: int, k: int, seed: int = 1):
-    """Scores of a row of `length` pixels in K exposures, and the edge scores added up in float64 from its own taps."""
-    rng = np.random.default_rng(seed)
-    before, behind = np.full(length, 0.08, np.float32), np.full(length, 0.03, np.float32)
-    n = rng.binomial(k, -np.expm1(-0.05), length).astype(np.float32)
-    psi, amplitude = line_profile(0.6), np.array([0.5, 3.0], np.float32)
-    taps, edge = np.empty((3, length), np.float32), np.empty(length + 1, np.float32)
-    score = np.empty((2, length), np.float32)
+def scored(n, k, before, behind, amplitude):
+    """Taps, edge scores and scores of a row of counts in K exposures, lit `before` and `behind` the stripe."""
+    length = len(n)
+    taps, edge, score = (np.empty(shape, np.float32) for shape in ((3, length), length + 1, (len(amplitude), length)))
+    light = (np.full(length, flux, np.float32) for flux in (before, behind))
     row_scores(
-        n, np.float32(k), before, behind, np.ones(length, np.float32), length, amplitude, psi, TABLE, taps, edge, score
-    )
-    return edge, np.concatenate([[0], np.cumsum(taps[0].astype(float) - taps[1].astype(float))]), taps, score
+        n, np.float32(k), *light, np.ones(length, np.float32), length, amplitude, line_profile(0.6), TABLE, taps, edge,
+        score,
+    )  # fmt: skip
+    return taps, edge, score
 
 
 @covers(row_scores, add_evidence)
 @pytest.mark.parametrize("length", [512, 100_000])
 def test_sums_along_a_row_are_as_good_as_in_float64(length, worst) -> None:
+    rng = np.random.default_rng(1)
     for k in (1, 10, 10**6):
-        edge, exact, _, score = sums(length, k)
+        n = rng.binomial(k, -np.expm1(-0.05), length).astype(np.float32)
+        taps, edge, score = scored(n, k, 0.08, 0.03, np.array([0.5, 3.0], np.float32))
+        exact = np.concatenate([[0], np.cumsum(taps[0].astype(float) - taps[1].astype(float))])
         assert np.isfinite(score).all()
-        scale = np.abs(exact).max()
-        worst(f"running sum of {length} terms, float32 out", "float64", np.abs(edge - exact) / scale, 1e-7)
+        worst(f"running sum of {length} terms, float32 out", "float64", (edge - exact) / np.abs(exact).max(), 1e-7)
 
 
 @covers(row_posterior, none_prior, mode_of)
@@ -111,17 +104,7 @@ def test_sums_along_a_row_are_as_good_as_in_float64(length, worst) -> None:
 )  # fmt: skip
 def test_posteriors_are_probabilities_for_any_counts(k, level, length, light, dim, window, none_weight, seed) -> None:
     n = np.random.default_rng(seed).binomial(k, level, length).astype(np.float32)
-    before, behind = (np.full(length, f, np.float32) for f in (max(light, dim), min(light, dim)))
-    amplitude = np.geomspace(0.03, 30, 4).astype(np.float32)
-    taps, edge, score = (
-        np.empty((3, length), np.float32),
-        np.empty(length + 1, np.float32),
-        np.empty((4, length), np.float32),
-    )
-    row_scores(
-        n, np.float32(k), before, behind, np.ones(length, np.float32), length, amplitude, line_profile(0.6), TABLE,
-        taps, edge, score,
-    )  # fmt: skip
+    _, edge, score = scored(n, k, max(light, dim), min(light, dim), np.geomspace(0.03, 30, 4).astype(np.float32))
     first, last = sorted(int(w * (length - 1)) for w in window)
     none = none_prior(1.0, 0.1, 0.9, 0.2, none_weight)
     assert 0 < sum(none) < 1
@@ -165,7 +148,7 @@ def test_flat_tops_have_the_offset_of_their_middle() -> None:
 
 
 @covers(peak_confidence)
-def test_confidence_of_a_peak_is_exact_up_to_a_million_exposures(worst) -> None:
+def test_confidence_of_a_peak_is_exact_up_to_a_million_exposures(digits) -> None:
     def exact(peak, rest, k, length):
         half = mpmath.mpf("0.5")
         p, q = (peak + half) / (k + 1), (k - peak + half) / (k + 1)
@@ -188,12 +171,7 @@ def test_confidence_of_a_peak_is_exact_up_to_a_million_exposures(worst) -> None:
                 got, mean = peak_confidence(n, n, float(k), 4, 9)
                 assert mean == pytest.approx(rest)
                 # exp() makes an absolute error of the exponent, of up to 60, a relative one of the answer
-                worst(
-                    "confidence of a peak, K = 1 to 10^6",
-                    "mpmath, 50 digits",
-                    relative(got, exact, peak, rest, k, 9),
-                    1e-8,
-                )
+                digits("confidence of a peak, K = 1 to 10^6", 1e-8, got, exact, peak, rest, k, 9)
 
 
 @covers(peak_confidence)

@@ -20,7 +20,6 @@ from sim_backend.light.sheet import LightSheet, empty_sheet, span_bounds, trace_
 from sim_backend.light.view import CameraView
 from sim_backend.scenes.medium import henyey_greenstein
 from sim_backend.scenes.surfaces import checked
-from tests.stability.exactly import relative
 from tests.stability.inventory import EXAMPLES, covers
 from tests.unit.sim.rigs import effect_rate, rig, setting, wall
 
@@ -30,7 +29,7 @@ DEPTHS = (1e-300, 1e-12, 0.01, 1.0, 10.0, 50.0)
 
 
 @covers(henyey_greenstein)
-def test_phase_functions_are_exact_also_at_their_peak(worst) -> None:
+def test_phase_functions_are_exact_also_at_their_peak(digits) -> None:
     cosine, g = np.meshgrid(
         [-1.0, -0.999999, -0.3, 0.0, 0.5, 0.9999999, 1.0], [-0.999999, -0.5, 0.0, 1e-9, 0.85, 0.999999]
     )
@@ -39,7 +38,7 @@ def test_phase_functions_are_exact_also_at_their_peak(worst) -> None:
         return (1 - g * g) / (4 * mpmath.pi * (1 + g * g - 2 * g * c) ** mpmath.mpf("1.5"))
 
     got = np.vectorize(henyey_greenstein)(cosine, g)
-    worst("Henyey-Greenstein, g to +-0.999999", "mpmath, 50 digits", relative(got, exact, cosine, g), 1e-9)
+    digits("Henyey-Greenstein, g to +-0.999999", 1e-9, got, exact, cosine, g)
 
 
 def closed_forms(setup, extinction: float, plane: np.ndarray, row: int):
@@ -100,7 +99,6 @@ SCENE = st.fixed_dictionaries(
 
 @covers(FluxModel, hold_s, empty_sheet, CameraView)
 @covers(Airlight.rate, Ambient.rate, Haze.add, DarkCounts.rate, dark_rates, ForwardBlur.add)
-@covers(trace_rows, span_bounds)
 @EXAMPLES
 @given(
     scene=SCENE, baseline=st.sampled_from([-0.3, 1e-9, 1e-3, 0.3, 30.0]), command=st.floats(-1, 1),
@@ -154,7 +152,7 @@ def test_planes_that_touch_a_bowed_sheet_are_planes_wherever_they_are_touched(bo
 
 
 @covers(detections_per_radiance, ambient_irradiance)
-def test_radiometry_is_exact(worst) -> None:
+def test_radiometry_is_exact(digits) -> None:
     optics, sensor, line = Optics(), Sensor(), Line()
 
     def exact(_):
@@ -165,10 +163,31 @@ def test_radiometry_is_exact(worst) -> None:
         )
         return share * area * mpmath.mpf(line.wavelength) / (h * c)
 
-    worst(
-        "detections per radiance",
-        "mpmath, 50 digits",
-        relative(detections_per_radiance(optics, sensor, line), exact, 0),
-        1e-14,
-    )
+    digits("detections per radiance", 1e-14, detections_per_radiance(optics, sensor, line), exact, 0)
     assert ambient_irradiance(0.0, optics) == 0
+
+
+@covers(span_bounds, trace_rows)
+@EXAMPLES
+@given(
+    seed=st.integers(0, 2**32 - 1), plane=st.tuples(*[st.floats(-5, 5)] * 3), edge=st.integers(0, 40), sky=st.booleans()
+)
+def test_passing_spans_at_once_finds_what_pixel_by_pixel_is_found(seed, plane, edge, sky) -> None:
+    rng, rows, width = np.random.default_rng(seed), 12, 150
+    u, v = np.meshgrid(np.linspace(-0.5, 0.5, width), np.linspace(-0.3, 0.3, rows))
+    bend = 1 + rng.uniform(-0.3, 0.3) * (u * u + v * v)
+    u, v = u * bend, v * bend
+    u[:, :edge] = v[:, :edge] = np.nan
+    surface = np.repeat(rng.uniform(0, 3, (rows, 6)), width // 6, axis=1) + rng.uniform(0, 0.1, (rows, width))
+    surface[:, 60:90] *= not sky
+    bounds = span_bounds(u, v, surface)
+    none_passed = bounds.copy()
+    none_passed[:, :, 4] = np.inf
+
+    def walked(bounds):
+        found = np.zeros(rows), np.zeros(rows), np.zeros(rows, np.int64), np.zeros(rows, np.int64)
+        trace_rows(u, v, surface, bounds, np.array(plane)[None], 0, rows, *found)
+        return found
+
+    for passed, each in zip(walked(bounds), walked(none_passed), strict=True):
+        np.testing.assert_array_equal(passed, each)

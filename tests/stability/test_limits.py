@@ -14,7 +14,6 @@ from rig.tradeoff.limits import (
     position_sd_px,
 )
 from rig.tradeoff.row_light import FLUX_MIN, RowLight, pixel_share
-from tests.stability.exactly import relative
 from tests.stability.inventory import covers
 
 FLUXES = (FLUX_MIN, 1e-30, 1e-9, 1e-4, 0.1, 1.0, 30.0, 800.0, 1e6)
@@ -41,21 +40,21 @@ def light(position=20.0, stripe=1.0, sigma_px=0.6, haze=0.0, dark=1e-4, pixels=4
 
 
 @covers(chernoff_exponent)
-def test_chernoff_exponents_of_any_two_pixels(worst) -> None:
+def test_chernoff_exponents_of_any_two_pixels(digits) -> None:
     one, two = (np.array(each) for each in zip(*((a, b) for a in FLUXES for b in FLUXES if a != b), strict=True))
     got = chernoff_exponent(one[:, None], two[:, None])
-    worst("Chernoff exponent, flux 1e-300 to 1e6", "mpmath, 50 digits", relative(got, exact_exponent, one, two), 1e-12)
+    digits("Chernoff exponent, flux 1e-300 to 1e6", 1e-12, got, exact_exponent, one, two)
     np.testing.assert_allclose(got, chernoff_exponent(two[:, None], one[:, None]), rtol=1e-12)
 
 
 @covers(chernoff_exponent)
-def test_chernoff_exponents_of_pixels_nearly_alike(worst) -> None:
+def test_chernoff_exponents_of_pixels_nearly_alike(digits) -> None:
     """Differences that cancel in p and in q: C falls with their square."""
     base, step = np.meshgrid([1e-9, 1e-3, 0.3, 3.0, 30.0], [1e-1, 1e-3, 1e-6, 1e-9])
     one = base.ravel()
     two = one * (1 + step.ravel())
     got = chernoff_exponent(one[:, None], two[:, None])
-    worst("Chernoff exponent of fluxes alike", "mpmath, 50 digits", relative(got, exact_exponent, one, two), 1e-12)
+    digits("Chernoff exponent of fluxes alike", 1e-12, got, exact_exponent, one, two)
     assert np.all(chernoff_exponent(one[:, None], one[:, None]) == 0)
 
 
@@ -70,7 +69,7 @@ def test_exponents_of_a_swap_are_those_of_the_closed_form() -> None:
 
 
 @covers(pixel_share, log_fired)
-def test_shares_of_a_line_far_out_in_its_flanks(worst) -> None:
+def test_shares_of_a_line_far_out_in_its_flanks(worst, digits) -> None:
     away, sigma = (a.ravel() for a in np.meshgrid([0.0, 0.3, 0.5, 1.0, 2.5, 4.0], [0.2, 0.6, 3.0, 100.0]))
     inside = away < 8 * sigma + 0.5
     away, sigma = away[inside], sigma[inside]
@@ -79,14 +78,14 @@ def test_shares_of_a_line_far_out_in_its_flanks(worst) -> None:
     def exact(a, s):
         return (mpmath.erfc((a - 0.5) / s / mpmath.sqrt(2)) - mpmath.erfc((a + 0.5) / s / mpmath.sqrt(2))) / 2
 
-    worst("share of a Gaussian in a pixel", "mpmath, 50 digits", relative(got, exact, away, sigma), 1e-12)
+    digits("share of a Gaussian in a pixel", 1e-12, got, exact, away, sigma)
     flux = np.geomspace(1e-300, 1e3, 60)
     off = np.abs(log_fired(flux) - [float(mpmath.log(-mpmath.expm1(-mpmath.mpf(x)))) for x in flux])
     worst("log of the chance to fire", "mpmath, 50 digits", off / np.maximum(np.abs(log_fired(flux)), 1.0), 1e-15)
 
 
 @covers(position_information, position_sd_px, RowLight.flux)
-def test_information_of_any_stripe(worst) -> None:
+def test_information_of_any_stripe(digits) -> None:
     cases = [
         (position, stripe, sigma, haze, dark)
         for position in (20.0, 20.3, 20.5)
@@ -109,7 +108,7 @@ def test_information_of_any_stripe(worst) -> None:
         return total
 
     got = [position_information(light(p, s, g, h, d)) for p, s, g, h, d in cases]
-    worst("Fisher information of the position", "mpmath, 50 digits", relative(got, exact, *np.array(cases).T), 1e-12)
+    digits("Fisher information of the position", 1e-12, got, exact, *np.array(cases).T)
 
 
 @covers(position_information, position_sd_px)

@@ -13,7 +13,6 @@ from calibration.model.rig_model import RigModel
 from calibration.model.scanner import PivotScanner, PlaneTable
 from rig.errors import UsageError
 from rig.geometry.windows import sweep_geometry
-from tests.stability.exactly import relative
 from tests.stability.inventory import EXAMPLES, covers
 
 TANGENT = st.floats(-20, 20)
@@ -36,7 +35,7 @@ def rays_about(plane: np.ndarray, sines: np.ndarray) -> tuple[np.ndarray, np.nda
 
 
 @covers(depth, inverse_depth)
-def test_depth_keeps_nine_digits_wherever_it_is_given(worst) -> None:
+def test_depth_keeps_nine_digits_wherever_it_is_given(digits) -> None:
     rng = np.random.default_rng(1)
     for side in (-1, 1):
         normal = rng.normal([2, 0, 0], 0.5, 3)
@@ -48,15 +47,9 @@ def test_depth_keeps_nine_digits_wherever_it_is_given(worst) -> None:
         given_ = np.isfinite(z)
         assert given_[np.abs(sines) > 1.01 * NEARLY_PARALLEL].all()
         assert not given_[np.abs(sines) < 0.99 * NEARLY_PARALLEL].any()
-        errors = relative(z[given_], exact_depth, u[given_], v[given_], *plane)
-        worst("depth, sine of ray and plane 1e-6 to 0.9", "mpmath, 50 digits", errors, 1e-9)
+        digits("depth, sine of ray and plane 1e-6 to 0.9", 1e-9, z[given_], exact_depth, u[given_], v[given_], *plane)
         across = given_ & (np.abs(sines) > 0.01)
-        worst(
-            "depth, sine above 0.01",
-            "mpmath, 50 digits",
-            relative(z[across], exact_depth, u[across], v[across], *plane),
-            1e-13,
-        )
+        digits("depth, sine above 0.01", 1e-13, z[across], exact_depth, u[across], v[across], *plane)
 
 
 @covers(depth, inverse_depth)
@@ -115,7 +108,7 @@ def test_slopes_are_finite_or_none_and_agree_with_the_near_side(u, v, normal, of
 
 
 @covers(depth_slope)
-def test_depth_slopes_keep_nine_digits(worst) -> None:
+def test_depth_slopes_keep_nine_digits(digits) -> None:
     plane = np.array([0.9, 0.1, -0.4, -0.3])
     plane[:3] /= np.linalg.norm(plane[:3])
     u, v = rays_about(plane, -np.geomspace(1e-4, 0.5, 60))
@@ -125,12 +118,7 @@ def test_depth_slopes_keep_nine_digits(worst) -> None:
         return -(d / (nx * u + ny * v + nz) ** 2) * (nx * du + ny * dv)
 
     slope = depth_slope(u, v, plane, CAMERA)
-    worst(
-        "slope of depth along a row, sine above 1e-4",
-        "mpmath, 50 digits",
-        relative(slope, exact, u, v, *lens, *plane),
-        1e-11,
-    )
+    digits("slope of depth along a row, sine above 1e-4", 1e-11, slope, exact, u, v, *lens, *plane)
 
 
 @covers(PlaneTable.planes, PlaneTable.command_range)
@@ -179,7 +167,7 @@ def test_pivot_scanners_of_any_numbers_give_unit_planes_or_say_why_not(point, ax
 
 
 @covers(PivotScanner.planes)
-def test_pivoted_planes_are_exact(worst) -> None:
+def test_pivoted_planes_are_exact(digits) -> None:
     point, terms = np.array([-0.3, 0.01, 0.02]), np.array([0.09, 0.38, 0.01])
     scanner = PivotScanner(point, np.array([0, 1.0, 0]), np.array([1.0, 0, 0]), terms)
     at = np.linspace(-1, 1, 41)
@@ -195,7 +183,7 @@ def test_pivoted_planes_are_exact(worst) -> None:
         3: lambda c: turned(c, mpmath.cos) * float(point[0]) - turned(c, mpmath.sin) * float(point[2]),
     }
     for i, of in exact.items():
-        worst("planes of a turning mirror", "mpmath, 50 digits", relative(planes[:, i], of, at), 1e-13)
+        digits("planes of a turning mirror", 1e-13, planes[:, i], of, at)
 
 
 @covers(RigModel.check_speed, RigModel.check_sensor)

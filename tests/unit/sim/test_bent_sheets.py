@@ -6,16 +6,13 @@ import numpy as np
 import pytest
 
 from calibration.model.rig_model import RigModel
-from drivers.clock import VirtualClock
-from drivers.registry import Surroundings
-from sim_backend.effects.setting import FrameTimes
+from sim_backend.effects.particles import rain_drops
 from sim_backend.frames.flux import FluxModel
-from sim_backend.frames.photons import PhotonSource
 from sim_backend.light.line import ONE_LINE
 from sim_backend.light.sheet import LightSheet
-from sim_backend.world import DEFAULT_GEOMETRY, SimulatedWorld, WorldConfig
+from sim_backend.world import DEFAULT_GEOMETRY
 from tests.unit.calibration.fans import Fan
-from tests.unit.sim.rigs import rig, setting, wall
+from tests.unit.sim.rigs import deviations, drawn, made_world, rig, setting, wall
 
 BOW, ROLL = 0.03, 0.08
 COMMAND, LATER = 0.15, 0.02
@@ -63,25 +60,20 @@ def test_frames_have_the_light_of_late_rows_and_bowed_sheets() -> None:
     setup = setting(model, wall(model, (0, 0, 1), 2.0), **FOG)
     flux, n = FluxModel(setup), 2000
     held = np.tile([COMMAND, COMMAND + LATER], (n, 1))
-    source = PhotonSource(flux, model.sheets, FrameTimes(1e-5, 1e-5), 9, 2)
-    bits = np.zeros((n, 64, 16), np.uint8)
-    source.expose(0, held, np.full(n, 0.02), np.zeros(n, np.int32), bits, np.zeros(n))
-    source.close()
+    bits = drawn(flux, model.sheets, held, 0.02)
     counts = np.unpackbits(bits, axis=-1)[:, :, :96].sum(axis=0, dtype=np.int64)
     ((sheet,),) = ONE_LINE.sheets(model.sheets, held[:1], 64, [0.0])
     setup.view.trace(sheet, 0, 64)
     rate = np.zeros((64, 96))
     flux.add_sheet(sheet, 0, 64, rate)
-    p = -np.expm1(-1e-5 * (flux.steady_per_s + 0.02 * rate))
-    z = (counts - n * p) / np.sqrt(n * p * (1 - p) + 1e-3)
+    flux_each = 1e-5 * (flux.steady_per_s + 0.02 * rate)
+    z = deviations(counts, n, flux_each)
     assert np.abs(z).max() < 6
-    assert np.std(z[p > 0.01]) == pytest.approx(1, abs=0.06)
-    assert p.max() > 0.1
+    assert np.std(z[flux_each > 0.01]) == pytest.approx(1, abs=0.06)
+    assert flux_each.max() > 0.1
 
 
 def test_drops_lie_on_the_sheet_that_their_row_sees() -> None:
-    from sim_backend.effects.particles import rain_drops
-
     _, model = bent(bow=0.0)
     setup = setting(model, wall(model, (0, 0, 1), 2.0), rain={"rate": "50 mm/h"})
     effect, first = rain_drops(setup), traced(model, np.array([COMMAND]))
@@ -102,10 +94,7 @@ def test_the_world_says_that_light_is_bent_and_where_late_rows_see_it(tmp_path) 
     file.write_text(
         text.replace("    command_range:", "    bow_per_rad: 0.01\n    command_range:") + "row_delay_s: 2e-8\n"
     )
-    world, plain = (
-        SimulatedWorld(WorldConfig(geometry=str(of)), Surroundings(VirtualClock(), None, 0))
-        for of in (file, DEFAULT_GEOMETRY)
-    )
+    world, plain = (made_world(geometry=str(of)) for of in (file, DEFAULT_GEOMETRY))
     on, plain_on = ({d.entry.name for d in of.effect_plan.decisions if d.on} for of in (world, plain))
     assert on - plain_on == {"sheet bow", "row delay"}
     assert plain_on < on

@@ -10,14 +10,12 @@ from numpy.typing import NDArray
 
 from calibration.board.board import BLACK, WHITE, Board
 from calibration.views import BoardPose
-from drivers.clock import VirtualClock
 from drivers.errors import DeviceError
-from drivers.registry import Surroundings
 from sim_backend.scenes.board import WALL_ALBEDO, BoardAtPose, board_scene
-from sim_backend.scenes.scene import SceneFile, load_scene
-from sim_backend.world import KIND, SimulatedWorld, WorldConfig
+from sim_backend.scenes.scene import SceneFile
+from sim_backend.world import SimulatedWorld
 from tests.system.small_rig import calibration
-from tests.unit.sim.rigs import rig
+from tests.unit.sim.rigs import made_world, rig
 
 Array = NDArray[np.float64]
 
@@ -96,14 +94,12 @@ def test_a_board_seen_from_behind_is_not_there() -> None:
 def _world(tmp_path: Path, **config: Any) -> SimulatedWorld:
     geometry = tmp_path / "rig.yaml"
     geometry.write_text(yaml.safe_dump(calibration()))
-    made = WorldConfig(geometry=str(geometry), **config)
-    world = KIND.create(made, Surroundings(VirtualClock(), None, 0))
-    assert isinstance(world, SimulatedWorld)
-    return world
+    return made_world(geometry=str(geometry), **config)
 
 
 def test_the_bundled_board_can_be_moved(tmp_path: Path) -> None:
     still = _world(tmp_path, scene="board")
+    assert (still.scene.illuminance_lux, still.scene.extinction_per_m) == (30, 0)  # a dimmed lab
     near = _world(
         tmp_path,
         scene="board",
@@ -144,9 +140,3 @@ def test_scene_files_show_several_boards_from_files_of_their_own(tmp_path: Path)
 def test_half_a_board_is_refused(content: dict[str, Any]) -> None:
     with pytest.raises(ValueError, match="board"):
         SceneFile.model_validate(content)
-
-
-def test_the_bundled_scene_is_a_dimmed_lab() -> None:
-    scene, _ = load_scene("board")
-    assert scene.illuminance_lux == 30
-    assert scene.extinction_per_m == 0

@@ -8,16 +8,14 @@ import numpy as np
 import pytest
 from pydantic import ValidationError
 
-from drivers.clock import VirtualClock
-from drivers.registry import Surroundings
 from sim_backend import effect_planner
 from sim_backend.effect_planner import MOST, MOST_CHANGED, EffectDecision, EffectPlan, _changed, plan_effects
 from sim_backend.effects.catalogue import CATALOGUE, Entry
 from sim_backend.effects.setting import PlannedFor, Setting
 from sim_backend.frames.flux import FluxModel
 from sim_backend.light.optics import Sensor
-from sim_backend.world import KIND, WorldConfig
-from tests.unit.sim.rigs import rig, setting, wall
+from sim_backend.world import WorldConfig
+from tests.unit.sim.rigs import made_world, rig, setting, wall
 
 MODEL = rig()
 PLANES = MODEL.planes(np.linspace(-0.6, 0.9, 9))
@@ -126,7 +124,7 @@ def test_an_effect_that_is_none_is_refused() -> None:
 def test_what_is_sampled_bounds_the_whole_street(name: str, tmp_path: Path) -> None:
     """All rows of a hundred columns, against twice the mean over a few."""
     (tmp_path / "haze.yaml").write_text("surfaces: street\nmedium: {fog: {visibility: 20 km}}\n")
-    world = KIND.create(WorldConfig(scene=str(tmp_path / "haze.yaml")), Surroundings(VirtualClock(), None, 0))
+    world = made_world(scene=str(tmp_path / "haze.yaml"))
     world.plan_for(0.05, 1e-5, 9)
     found = _decisions(world.effect_plan)[name].changes
     model, view = FluxModel(world.setting), world.setting.view
@@ -145,7 +143,7 @@ def test_what_is_sampled_bounds_the_whole_street(name: str, tmp_path: Path) -> N
 
 
 def test_a_world_plans_for_the_scan_that_it_is_told_of() -> None:
-    world = KIND.create(WorldConfig(scene="street-clear"), Surroundings(VirtualClock(), None, 0))
+    world = made_world(scene="street-clear")
     assert world.effect_plan.planned_for == MOST
     world.plan_for(0.02, 1e-5, 10)
     assert world.effect_plan.planned_for == PlannedFor(0.02, pytest.approx(1.1e-4), 11)  # a column can get one more

@@ -83,9 +83,3 @@ def test_open_sky_has_no_stripe() -> None:
     back = wall(model, (0.0, 0.0, 1.0), 4.0)
     sky = Surfaces(np.full_like(back.depth_m, np.inf), back.albedo, back.trusted)
     assert np.all(np.isnan(setting(model, sky).view.sheet(model.planes(0.0)).x_stripe_px))
-
-
-def test_a_sheet_through_the_camera_is_not_seen() -> None:
-    model = rig()
-    view = setting(model, wall(model, (0, 0, 1), 2.0)).view
-    assert np.all(np.isnan(view.sheet(np.array([1.0, 0.0, 0.0, 0.0])).x_stripe_px))

@@ -3,15 +3,12 @@
 import numpy as np
 import pytest
 
-from drivers.clock import VirtualClock
 from drivers.errors import DeviceError
-from drivers.registry import Surroundings
 from sim_backend.light import line
 from sim_backend.light.line import line_width, sigma_px
 from sim_backend.light.optics import Line, Optics, Sensor
-from sim_backend.world import KIND, WorldConfig
 from tests.stability.inventory import covers
-from tests.unit.sim.rigs import effect_rate, rig, setting, wall
+from tests.unit.sim.rigs import effect_rate, made_world, rig, setting, wall
 
 covers(line)
 
@@ -66,4 +63,4 @@ def test_a_focus_within_the_focal_length_is_refused(focus: str) -> None:
 
 def test_a_world_refuses_such_a_focus_before_anything_is_planned() -> None:
     with pytest.raises(DeviceError, match=r"optics\.focus is 5 mm"):
-        KIND.create(WorldConfig.model_validate({"optics": {"focus": "5 mm"}}), Surroundings(VirtualClock(), None, 0))
+        made_world(optics={"focus": "5 mm"})

@@ -1,10 +1,66 @@
-"""Phase functions and what a scene's medium says."""
+"""What a scene's medium and weather say: phase functions, sizes of drops and flakes against published values."""
 
 import numpy as np
 import pytest
+from numpy.typing import NDArray
 from pydantic import ValidationError
 
-from sim_backend.scenes.medium import Medium, henyey_greenstein
+from sim_backend.scenes import medium
+from sim_backend.scenes.medium import Medium, Rain, Snow, henyey_greenstein
+from sim_backend.scenes.scene import SceneFile
+from tests.stability.inventory import covers
+
+covers(medium)
+
+DIAMETER_MM = np.linspace(0, 40, 400_001)
+
+
+def _integral(values: NDArray[np.float64]) -> float:
+    return float(np.sum(0.5 * (values[1:] + values[:-1])) * DIAMETER_MM[1])
+
+
+@pytest.mark.parametrize("rate", [1.0, 5.0, 20.0, 100.0])
+def test_rain_is_marshall_and_palmers(rate: float) -> None:
+    rain = Rain.model_validate({"rate": f"{rate} mm/h"})
+    number = 8000 * np.exp(-4.1 * rate**-0.21 * DIAMETER_MM)
+    assert rain.sizes.density_per_m3() == pytest.approx(_integral(number), rel=1e-6)
+    assert rain.extinction_per_m == pytest.approx(2 * _integral(number * np.pi / 4 * DIAMETER_MM**2) * 1e-6, rel=1e-6)
+    assert rain.extinction_per_m == pytest.approx(3.65e-4 * rate**0.63, rel=2e-3)
+    water_mm_per_h = _integral(number * np.pi / 6 * DIAMETER_MM**3 * rain.fall_m_per_s(DIAMETER_MM)) * 1e-9 * 3.6e6
+    assert water_mm_per_h == pytest.approx(rate, rel=0.2)
+
+
+@pytest.mark.parametrize("rate", [0.5, 2.0, 5.0])
+def test_snow_is_gunn_and_marshalls(rate: float) -> None:
+    snow = Snow.model_validate({"rate": f"{rate} mm/h"})
+    number = 3800 * rate**-0.87 * np.exp(-2.55 * rate**-0.48 * DIAMETER_MM)
+    assert snow.sizes.density_per_m3(1.0) == pytest.approx(_integral(np.where(DIAMETER_MM >= 1, number, 0)), rel=1e-3)
+    assert 1e-3 < snow.extinction_per_m < 2e-2
+    assert 0.5 < snow.fall_m_per_s(np.array([0.5]))[0] < snow.fall_m_per_s(np.array([4.0]))[0] < 2
+    water_mm_per_h = _integral(number * np.pi / 6 * DIAMETER_MM**3 * snow.fall_m_per_s(DIAMETER_MM)) * 1e-9 * 3.6e6
+    assert water_mm_per_h == pytest.approx(rate, rel=0.4)
+
+
+def test_a_drop_falls_as_fast_as_measured_and_fine_drizzle_does_not_rise() -> None:
+    rain = Rain.model_validate({"rate": "5 mm/h"})
+    speed = rain.fall_m_per_s(np.array([0.05, 1.0, 2.0, 5.0]))
+    assert speed == pytest.approx([0.0, 4.0, 6.5, 9.1], abs=0.1)  # Gunn and Kinzer 1949: 4.0, 6.5, 9.1 m/s
+
+
+def test_what_is_in_the_air_adds_up() -> None:
+    scene = SceneFile.model_validate(
+        {
+            "medium": {"extinction": "0.1 /m", "forward_share": 0.5},
+            "rain": {"rate": "20 mm/h"},
+            "snow": {"rate": "1 mm/h"},
+        }
+    )
+    assert scene.rain is not None
+    assert scene.snow is not None
+    rest = scene.rain.extinction_per_m + scene.snow.extinction_per_m
+    assert scene.extinction_per_m == pytest.approx(0.1 + rest)
+    assert scene.diffuse_extinction_per_m == pytest.approx(0.05 + rest)
+    assert SceneFile().extinction_per_m == 0
 
 
 @pytest.mark.parametrize("g", [-0.5, 0.0, 0.65, 0.85, 0.9])

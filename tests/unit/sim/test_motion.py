@@ -8,16 +8,15 @@ from numpy.typing import NDArray
 
 from sim_backend.effects import motion
 from sim_backend.effects.motion import HOLD_S, MovingSurfaces, shifted
-from sim_backend.effects.setting import FrameTimes, Setting
+from sim_backend.effects.setting import Setting
 from sim_backend.effects.stripe import Stripe
 from sim_backend.frames.flux import FluxModel
-from sim_backend.frames.photons import PhotonSource
 from sim_backend.light.optics import Line
 from sim_backend.light.view import make_view
 from sim_backend.scenes.scene import SceneFile
 from sim_backend.scenes.surfaces import Surfaces
 from tests.stability.inventory import covers
-from tests.unit.sim.rigs import Array, rig, setting, wall
+from tests.unit.sim.rigs import Array, drawn, rig, setting, wall
 
 covers(motion)
 
@@ -95,21 +94,13 @@ def test_frames_of_a_moving_scene_do_not_depend_on_blocks_or_threads() -> None:
     surfaces = wall(model, (0.2, 0.0, 1.0), 2.0)
     motion = {"velocity": ["1 m/s", "0 m/s", "-20 m/s"]}
     still = setting(model, surfaces, line=Line(speckle=True), rain={"rate": "100 mm/h"}, motion=motion)
-    frames, times = 230, FrameTimes(1e-5, 1e-5)
-    time_s = 0.3 + np.arange(frames) * 1e-5
-    held, power, x0 = np.repeat([0.1, 0.12, 0.14], [100, 100, 30]), np.full(frames, 0.05), np.zeros(frames, np.int32)
+    held, time_s = np.repeat([0.1, 0.12, 0.14], [100, 100, 30]), 0.3 + np.arange(230) * 1e-5
 
-    def drawn(block: int, threads: int) -> NDArray[np.uint8]:
+    def frames(block: int, threads: int) -> NDArray[np.uint8]:
         moving = replace(still, view=make_view(model, surfaces, MovingSurfaces((1.0, 0.0, -20.0))))
-        source = PhotonSource(FluxModel(moving), model.sheets, times, 5, threads)
-        bits = np.zeros((frames, 64, 16), np.uint8)
-        for a in range(0, frames, block):
-            part = slice(a, a + block)
-            source.expose(a, held[part], power[part], x0[part], bits[part], time_s[part])
-        source.close()
-        return bits
+        return drawn(FluxModel(moving), model.sheets, held, 0.05, time_s=time_s, block=block, threads=threads)
 
-    whole = drawn(frames, 1)
-    assert np.array_equal(whole, drawn(7, 3))
+    whole = frames(230, 1)
+    assert np.array_equal(whole, frames(7, 3))
     early, late = (np.unpackbits(whole[part], axis=2).sum(axis=(0, 1)) for part in (slice(0, 50), slice(180, 230)))
     assert np.argmax(early) != np.argmax(late)

@@ -3,35 +3,27 @@
 import numpy as np
 import pytest
 
-from drivers.clock import VirtualClock
-from drivers.registry import Surroundings
-from sim_backend.effects.setting import FrameTimes
 from sim_backend.frames.flux import FluxModel
-from sim_backend.frames.photons import PhotonSource
 from sim_backend.light.line import ONE_LINE, LineFan, line_fan
-from sim_backend.world import SimulatedWorld, WorldConfig
-from tests.unit.sim.rigs import rig, setting, wall
+from sim_backend.light.optics import Line
+from tests.unit.sim.rigs import deviations, drawn, made_world, rig, setting, wall
 
-TIMES = FrameTimes(1e-5, 1e-5)
+EXPOSURE_S = 1e-5
 OFFSETS = (-0.4, 0.1, 0.5)
 FOG = {"medium": {"extinction": "0.2 /m"}}
 
 
 def frames(flux, model, fan, n=12, power_w=0.05, threads=2):
-    source = PhotonSource(flux, model.sheets, TIMES, 9, threads, fan, model.scanner.command_range)
-    bits = np.zeros((n, 64, 16), np.uint8)
-    try:
-        source.expose(0, np.full(n, 0.2), np.full(n, power_w), np.zeros(n, np.int32), bits, np.zeros(n))
-    finally:
-        source.close()
+    limits = model.scanner.command_range
+    bits = drawn(flux, model.sheets, np.full(n, 0.2), power_w, threads=threads, fan=fan, limits=limits)
     return np.unpackbits(bits, axis=-1)[:, :, :96]
 
 
 def mean_flux(model, flux, share):
     """Flux of the three lines at command 0.2, summed by hand."""
-    whole = TIMES.exposure_s * flux.steady_per_s
+    whole = EXPOSURE_S * flux.steady_per_s
     for plane in model.planes(0.2 + np.array(OFFSETS)):
-        whole = whole + flux.flux(plane, TIMES.exposure_s, share * 0.05) - TIMES.exposure_s * flux.steady_per_s
+        whole = whole + flux.flux(plane, EXPOSURE_S, share * 0.05) - EXPOSURE_S * flux.steady_per_s
     return whole
 
 
@@ -41,8 +33,7 @@ def test_a_frame_has_the_light_of_all_lines_and_the_ambient_light_once(shared, s
     setup = setting(model, wall(model, (0, 0, 1), 3.0), ambient={"illuminance": "2000 lux"}, **FOG)
     flux, n = FluxModel(setup), 3000
     counts = frames(flux, model, line_fan(OFFSETS, shared=shared), n).sum(axis=0, dtype=np.int64)
-    p = -np.expm1(-mean_flux(model, flux, share))
-    z = (counts - n * p) / np.sqrt(n * p * (1 - p) + 1e-3)
+    z = deviations(counts, n, mean_flux(model, flux, share))
     assert np.abs(z).max() < 6
     assert np.sqrt((z**2).mean()) == pytest.approx(1, abs=0.05)
 
@@ -72,18 +63,15 @@ def test_a_line_past_the_range_goes_nowhere():
 
 
 def test_speckle_of_one_line_leaves_the_others_alone():
-    from sim_backend.light.optics import Line
-
     model = rig()
     setup = setting(model, wall(model, (0, 0, 1), 3.0), line=Line(speckle=True))
     flux, n = FluxModel(setup), 3000
     counts = frames(flux, model, line_fan(OFFSETS, shared=False), n).sum(axis=0, dtype=np.int64)
-    p = -np.expm1(-mean_flux(model, flux, 1.0))
-    assert np.abs((counts - n * p) / np.sqrt(n * p * (1 - p) + 1e-3)).max() < 6
+    assert np.abs(deviations(counts, n, mean_flux(model, flux, 1.0))).max() < 6
 
 
 def test_the_world_plans_its_effects_for_the_light_of_all_lines_and_tells_their_flux():
-    world = SimulatedWorld(WorldConfig(scene="street-dense-fog", effects="all"), Surroundings(VirtualClock(), None, 0))
+    world = made_world(scene="street-dense-fog", effects="all")
     one = {name: part.copy() for name, part in world.flux_row(200, 0.1, 0.05, 1e-5).items()}
     world.project_lines([-0.2, 0.3], shared=True)
     two = world.flux_row(200, 0.1, 0.05, 1e-5)

@@ -19,14 +19,12 @@ from sim_backend.frames.photon_kernels import (
     new_levels,
     set_levels,
 )
-from sim_backend.frames.photons import PhotonSource
+from sim_backend.light.line import SheetsOf
 from sim_backend.random_numbers import PLACE, frame_key
 from tests.stability.inventory import covers
-from tests.unit.sim.rigs import rig, setting, wall
+from tests.unit.sim.rigs import drawn, rig, setting, wall
 
 covers(CommandGrid.hold, column_grid, fine_grid, photon_kernels, photons)
-
-TIMES = FrameTimes(1e-5, 1e-5)
 
 
 def _levels(flux: NDArray[np.float64]) -> Levels:
@@ -47,36 +45,21 @@ def _draw(flux: NDArray[np.float64], frames: int, seed: int = 3, first: int = 0)
     return np.unpackbits(words.view(np.uint8).reshape(frames, len(flux), -1), axis=-1)
 
 
-def test_what_is_drawn_anew_makes_every_probability_exact() -> None:
-    rng = np.random.default_rng(5)
-    flux = np.exp(rng.uniform(-42, 4, (50, 100)))
-    flux[0, :3] = 0.0, 1e3, 1e300
-    stored, sure = _levels(flux)
-    level = NEVER - stored[:, :, list(PLACE)].reshape(50, 128).astype(np.float64)
-    assert np.all(level[:, 100:] == 0)
-    level[level == LEVELS - 1] = LEVELS
-    assert np.array_equal(np.unpackbits(sure.view(np.uint8), axis=1), level == LEVELS)
-    p = -np.expm1(-flux)
-    share = (p - (1 - CHANCE) * level[:, :100] / LEVELS) / CHANCE
-    assert share.min() >= 0
-    assert share.max() <= 1
-    assert level[0, :3].tolist() == [0, LEVELS, LEVELS]
-    assert share[0, :3].tolist() == [0, 1, 1]
-
-
-def test_so_it_does_under_the_laser_when_lit_words_come_and_go() -> None:
+def test_what_is_drawn_anew_makes_every_probability_exact_while_lit_words_come_and_go() -> None:
     rng = np.random.default_rng(7)
-    steady_per_s, exposure_s, power_w = np.exp(rng.uniform(-5, 14, (6, 200))), 1e-5, 0.05
+    steady_per_s, exposure_s, power_w = np.exp(rng.uniform(-30, 14, (6, 200))), 1e-5, 0.05
     dark = _levels(exposure_s * steady_per_s)
     levels, lit = new_levels(6, 4), np.ones((6, 4), bool)
     for first, last in ((0, 200), (70, 120), (130, 131), (0, 0), (10, 199)):
         rate = np.zeros((6, 200), np.float32)
         rate[:, first:last] = np.exp(rng.uniform(-10, 18, (6, last - first)))
         set_levels((exposure_s * steady_per_s).astype(np.float32), rate, exposure_s * power_w, 0, 6, dark, lit, levels)
-        level = NEVER - levels[0][:, :, list(PLACE)].reshape(6, 256)[:, :200].astype(np.float64)
+        level = NEVER - levels[0][:, :, list(PLACE)].reshape(6, 256).astype(np.float64)
+        assert np.all(level[:, 200:] == 0)
         level[level == LEVELS - 1] = LEVELS
+        assert np.array_equal(np.unpackbits(levels[1].view(np.uint8), axis=1), level == LEVELS)
         p = -np.expm1(-exposure_s * (steady_per_s + power_w * rate.astype(np.float64)))
-        share = (p - (1 - CHANCE) * level / LEVELS) / CHANCE
+        share = (p - (1 - CHANCE) * level[:, :200] / LEVELS) / CHANCE
         assert share.min() >= 0
         assert share.max() <= 1
         assert lit.any() == (last > first)
@@ -129,7 +112,7 @@ class _Carries:
         words |= np.concatenate([before[None], words[:-1]])
 
 
-def _model(size: tuple[int, int], sensor: bool) -> tuple[FluxModel, PhotonSource]:
+def _model(size: tuple[int, int], sensor: bool) -> tuple[FluxModel, SheetsOf]:
     model = rig(size=size)
     flux = FluxModel(setting(model, wall(model, (0.1, 0, 1), 2.0), medium={"extinction": "0.1 /m"}))
     if sensor:
@@ -141,34 +124,18 @@ def _model(size: tuple[int, int], sensor: bool) -> tuple[FluxModel, PhotonSource
 @pytest.mark.parametrize("threads", [1, 2, 3])
 @pytest.mark.parametrize("block", [1, 7, 40])
 def test_bits_do_not_depend_on_block_size_or_threads(threads: int, block: int, sensor: bool) -> None:
-    flux, sheets = _model((21, 70), sensor)
-
-    def frames(block: int, threads: int) -> NDArray[np.uint8]:
-        source = PhotonSource(flux, sheets, TIMES, 9, threads)
-        held = np.repeat([np.nan, 0.1, 0.2, 0.1, np.nan], 8)
-        power = np.full(40, 0.5)
-        power[11], power[20:23] = 0.2, 0.0
-        bits, time_s = np.full((40, 21, 16), 255, np.uint8), np.arange(40) * 1e-5
-        for first in range(0, 40, block):
-            part = slice(first, first + block)
-            x0 = np.zeros(len(bits[part]), np.int32)
-            source.expose(100 + first, held[part], power[part], x0, bits[part], time_s[part])
-        source.close()
-        return bits
-
-    assert np.array_equal(frames(block, threads), frames(40, 1))
+    held, power, time_s = np.repeat([np.nan, 0.1, 0.2, 0.1, np.nan], 8), np.full(40, 0.5), np.arange(40) * 1e-5
+    power[11], power[20:23] = 0.2, 0.0
+    args = *_model((21, 70), sensor), held, power
+    cut = drawn(*args, first=100, time_s=time_s, block=block, threads=threads)
+    assert np.array_equal(cut, drawn(*args, first=100, time_s=time_s, threads=1))
 
 
 @pytest.mark.parametrize("sensor", [False, True], ids=["photons", "sensor"])
 def test_a_window_has_the_very_bits_of_the_whole_frame(sensor: bool) -> None:
-    flux, sheets = _model((9, 200), sensor)
-    held, power = np.repeat([np.nan, 0.1, 0.2], 4), np.full(12, 0.5)
+    args = *_model((9, 200), sensor), np.repeat([np.nan, 0.1, 0.2], 4), 0.5
     x0 = np.array([0, 64, 128, 0] * 3, np.int32)
-    source = PhotonSource(flux, sheets, TIMES, 9, 2)
-    whole, window = np.empty((12, 9, 32), np.uint8), np.empty((12, 9, 16), np.uint8)
-    source.expose(7, held, power, np.zeros(12, np.int32), whole, np.zeros(12))
-    source.expose(7, held, power, x0, window, np.zeros(12))
-    source.close()
+    whole, window = drawn(*args, first=7), drawn(*args, first=7, x0=x0, window_px=128)
     assert whole.any()
     for frame in range(12):
         at = x0[frame] // 8
@@ -187,18 +154,8 @@ def test_light_that_moves_is_made_anew_at_each_step_of_its_time_whatever_the_blo
             rate[first_row:last_row] += sheet.time_s * 1e9
 
     flux.laser = {"moves": Moves()}
-    times = np.arange(12) * 1e-5 + 6e-5
-    both = []
-    for block in (12, 5):
-        source, bits = PhotonSource(flux, sheets, TIMES, 9, 1), np.zeros((12, 9, 8), np.uint8)
-        for first in range(0, 12, block):
-            n = len(bits[first : first + block])
-            part = slice(first, first + n)
-            lit = np.full(n, 0.1), np.full(n, 0.5), np.zeros(n, np.int32)
-            source.expose(first, *lit, bits[part], times[part])
-        source.close()
-        both.append(bits)
-    assert np.array_equal(*both)
+    args, times = (flux, sheets, np.full(12, 0.1), 0.5), np.arange(12) * 1e-5 + 6e-5
+    assert np.array_equal(*(drawn(*args, time_s=times, block=block, threads=1) for block in (12, 5)))
     np.testing.assert_allclose(seen, 2 * [6e-5, 9e-5, 12e-5, 15e-5], rtol=1e-12)
 
 
