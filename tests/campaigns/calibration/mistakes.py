@@ -59,7 +59,7 @@ class Session:
         views = []
         for i, pose in enumerate(poses):
             speeds = TWO_SPEEDS if i == 0 and sweeps is BOTH_WAYS else sweeps
-            taken = take_sweeps(self.stand, [ShownBoard(board, pose)], speeds, self.rng)
+            taken = take_sweeps(self.stand, [BoardAtPose(board, pose)], speeds, self.rng)
             views.append(view_of(f"{i:03d}", self.stand, taken, board))
         return views
 
@@ -83,7 +83,7 @@ class Session:
         verdict = judge_fit(fit, views, stated_baseline_m=stated_baseline_m).verdict
         return PASSED if verdict.passed else verdict.codes[0]
 
-    def refused(self, shown: Sequence[ShownBoard]) -> str:
+    def refused(self, shown: Sequence[BoardAtPose]) -> str:
         """The reason why there are no corners in a view of these boards."""
         picture = room_picture(self.stand, take_sweeps(self.stand, shown, BOTH_WAYS, self.rng))
         try:
