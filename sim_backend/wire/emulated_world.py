@@ -79,9 +79,7 @@ class EmulatedWorldConfig(WorldConfig):
 class EmulatedWorld(SimulatedWorld):
     """One scene and the devices that look at it, plugged in from its creation to `close`."""
 
-    def __init__(
-        self, config: EmulatedWorldConfig, surroundings: Surroundings, bus: UsbBus | None = None
-    ) -> None:
+    def __init__(self, config: EmulatedWorldConfig, surroundings: Surroundings, bus: UsbBus | None = None) -> None:
         """DeviceError where the geometry or the scene cannot be used.
 
         bus: where the USB devices are plugged in, and who closes it is its maker; by default one within this process.
