@@ -294,7 +294,7 @@ def test_giving_the_interface_back_stops_the_mirror_as_when_the_process_is_kille
     clock, model = VirtualClock(), HeliosModel()
     plugged = plug(model, clock)
     device = open_scanner("helios", plugged.bus, clock)
-    device.load(cosine(device), 10)
+    device.load(cosine(device), 10**9)
     device.start()
     for owner in list(plugged.attached._claims.values()):
         plugged.attached.close(owner)
