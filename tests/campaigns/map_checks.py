@@ -2,10 +2,12 @@
 
     python -m tests.campaigns.map_checks --maps 120
     python -m tests.campaigns.map_checks --maps 12 --estimator joint --seed 1
+    python -m tests.campaigns.map_checks --maps 12 --estimator likelihood --stream
 
 Each map is 64 rows of a scene (prepared, made or random) under a working point, 250 columns. It is judged as it is and
 with each fault of FAULTS. With `argmax` the checks of counts are asked alone; an estimator that knows its confidence is
-asked for its answers too, and what is `right` says how many of the sure ones are.
+asked for its answers too, and what is `right` says how many of the sure ones are. With --stream the checks get what
+is kept of a sweep that is judged as its frames come: the lines of 512 points.
 """
 
 from __future__ import annotations
@@ -15,12 +17,13 @@ import sys
 from collections import Counter, defaultdict
 from collections.abc import Callable, Sequence
 from dataclasses import replace
+from types import SimpleNamespace
 from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
-from rig.count.map_checks import SURE
+from rig.count.map_checks import SURE, MapChecks, check_points
 from rig.estimate.registry import LEARNING
 from tests.reference.adapter import reconstructor_of, volume_of, windowed
 from tests.reference.geometry import Geometry
@@ -94,7 +97,7 @@ def _scene(rng: np.random.Generator) -> Scene:
     return Scene(whole.name, depth, albedo, trusted, pane)
 
 
-def _one(seed: int, estimator: str, exposures: int) -> tuple[str, dict[str, tuple[str, ...]], float]:
+def _one(seed: int, estimator: str, exposures: int, stream: bool) -> tuple[str, dict[str, tuple[str, ...]], float]:
     """What a map is, what speaks against it and its faulty kin, and the share of its sure answers that are right."""
     rng = np.random.default_rng([seed, 79])
     light, rig, scene = str(rng.choice(list(POINTS))), str(rng.choice(list(RIGS))), _scene(rng)
@@ -110,8 +113,14 @@ def _one(seed: int, estimator: str, exposures: int) -> tuple[str, dict[str, tupl
             maker = reconstructor_of(point, estimator)
         seen = counts if change is None else change(counts, exposures, rng)
         part = windowed(seen, maker.geometry.x0, maker.geometry.window)
-        result = maker.map(volume_of(maker, part, exposures))
+        volume = volume_of(maker, part, exposures)
+        result = maker.map(volume)
         doubts[fault] = result.doubts
+        if stream:
+            points = check_points(maker.geometry)
+            kept = SimpleNamespace(n_frames=volume.n_frames, checked=volume.counts[points.column, points.row])
+            checks = MapChecks(maker.geometry, calibrated=True, knows=estimator in LEARNING)
+            doubts[fault] = checks.doubts(kept, volume.intensity(), result.stripe)
         if change is None:
             sure = result.stripe.confidence >= SURE
             error = np.abs(result.stripe.x_px - point.truth())
@@ -125,12 +134,13 @@ def main(arguments: Sequence[str] | None = None) -> int:
     parser.add_argument("--maps", type=int, default=120)
     parser.add_argument("--estimator", default="argmax")
     parser.add_argument("--seed", type=int, default=0)
+    parser.add_argument("--stream", action="store_true", help="judge by the lines that a stream keeps")
     asked = parser.parse_args(arguments)
     maps: defaultdict[str, Counter[int]] = defaultdict(Counter)
     found: defaultdict[str, Counter[int]] = defaultdict(Counter)
     for index in range(asked.maps):
         exposures = EXPOSURES[index % len(EXPOSURES)]
-        what, doubts, right = _one(asked.seed * 100_000 + index, asked.estimator, exposures)
+        what, doubts, right = _one(asked.seed * 100_000 + index, asked.estimator, exposures, asked.stream)
         for fault, reasons in doubts.items():
             maps[fault][exposures] += 1
             found[fault][exposures] += bool(reasons)
