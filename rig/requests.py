@@ -1,4 +1,4 @@
-"""What a user may ask for: one frozen dataclass a command, which the command line fills and `rig.api` takes.
+"""Requests of a user: one frozen dataclass a command, which the command line fills and `rig.api` takes.
 
 A field is declared here and nowhere else: its type, its default and a phrase that says what it is. `rig scan --help`
 prints the phrase, `help(ScanRequest)` has it for Python; `rig/cli/command.py` makes an option of each field.
@@ -147,7 +147,7 @@ class CutRequest:
 @described
 @dataclass(frozen=True, slots=True, kw_only=True)
 class ImportRequest:
-    """How frames in another program's files are read (`rig import`)."""
+    """A reading of frames in another program's files (`rig import`)."""
 
     form: str | None = option(
         None,

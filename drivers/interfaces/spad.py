@@ -138,7 +138,7 @@ class SpadInfo:
     markers: bool
     """Whether frame records carry the markers of scanner and gate."""
     trigger_modes: tuple[str, ...]
-    """What may start an exposure: "free" (one follows the other), "external" (a pulse on the trigger input)."""
+    """Start of an exposure: "free" (one follows the other), "external" (a pulse on the trigger input)."""
     can_wait: bool = False
     """Whether it can stand still while the ring is full, as a simulation on virtual time does; a sensor cannot."""
 

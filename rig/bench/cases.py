@@ -1,4 +1,4 @@
-"""What `rig bench` measures: every stage at every window, number of exposures and of threads."""
+"""The measurements of `rig bench`: every stage at every window, number of exposures and of threads."""
 
 from dataclasses import dataclass
 from pathlib import Path
@@ -42,14 +42,14 @@ WINDOW = 128
 """Window of the rows that are not measured at every one."""
 FEW_EXPOSURES = (1, 10)
 LEARN_EXPOSURES = 10
-"""What is learned of the light does not depend on the exposures of a column, so that it is learned once a window."""
+"""Exposures of the sweep that is learned from, once a window: the light does not depend on them."""
 READ_BYTES = 256 * 2**20
 """Memory that is read for its bandwidth: far more than any cache holds."""
 
 
 @dataclass(frozen=True, slots=True)
 class Extent:
-    """How much is measured.
+    """Amount of work that is measured.
 
     moment_s, count_moment_s: of each row in each of the `rounds`, those of `count` being fast. latency_s: of the stream
     for the latency. frames_bytes, read_bytes: memory of the frames of each window, and for the plain read. map_rows,

@@ -1,4 +1,4 @@
-"""How long after a column's last frame its estimate is there.
+"""Time from a column's last frame until its estimate is there.
 
 A source thread copies blocks of 5 ms into the ring and publishes each when its last frame has been exposed, at
 100 kHz. The other thread takes them from the ring and judges them with the workers it was given; where a sweep ends it
@@ -47,7 +47,7 @@ def recording_of(frames: BenchFrames) -> tuple[NDArray[np.uint8], int]:
 
 
 def header_of(seq: int, frames: int, width: int) -> BlockHeader:
-    """Of block number `seq`, with `frames` frames of the bench's sensor in it as in all others."""
+    """The header of block number `seq`, of `frames` frames of the bench's sensor as all others."""
     first = seq * frames
     return BlockHeader(
         flags=BlockFlag(0), run_id=1, block_seq=seq, first_frame=first, t0_ticks=first * PERIOD_TICKS, lost_before=0,
@@ -104,9 +104,9 @@ def measure_latency(
     column = bins.astype(np.float64)
     x0 = np.full(BLOCK_FRAMES, frames.geometry.x0[0], np.int32)
     judged = np.zeros(n_blocks)
-    """When all columns but the last one of each block were judged."""
+    """Time at which all columns but the last one of each block were judged."""
     ended = np.zeros(n_blocks)
-    """When a block's last column was."""
+    """Time at which a block's last column was judged."""
     counter = ColumnJudge(layout, frames.geometry, judge, workers)
     source.start()
     for i, block in enumerate(reader):

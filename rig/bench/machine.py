@@ -1,4 +1,4 @@
-"""What a benchmark was measured on."""
+"""The machine that a benchmark was measured on."""
 
 import os
 import platform

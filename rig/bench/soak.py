@@ -84,7 +84,7 @@ class LoopedSpad(SpadArray):
         self._run_id = 0
         self._lead = min(LEAD_FRAMES, len(loop.records) // (2 * loop.sweeps))
         self.late_max_s = 0.0
-        """How far the latest block was behind its own time: the source, too, needs its share of the processor."""
+        """Delay of the latest block against its own time: the source, too, needs its share of the processor."""
 
     @property
     def info(self) -> SpadInfo:
@@ -216,7 +216,7 @@ class SoakFrames:
 
 @dataclass(frozen=True, slots=True)
 class SoakReport:
-    """What a soak found.
+    """Findings of a soak.
 
     seconds: of stream played. maps: of maps_planned. times_real_time: time that the frames received took over that in
     which they were bound, counted and made maps of, without the first map. resident_*: memory of the process when a
@@ -242,7 +242,7 @@ class SoakReport:
 
     @property
     def exit_code(self) -> int:
-        """As of a scan: 3 where the stream was ended by the ring, 1 where frames were lost or do not add up."""
+        """The exit code, as of a scan: 3 where the stream was ended by the ring, 1 where frames were lost or do not add up."""
         if self.ended_by is not None:
             return EXIT_DEVICE
         return int(self.frames.lost > 0 or not self.frames.agree)

@@ -81,7 +81,7 @@ class WorkingPoint:
 
 @dataclass(frozen=True, slots=True)
 class SpeedReport:
-    """What `rig bench` found."""
+    """Findings of `rig bench`."""
 
     machine: dict[str, Any]
     memory_read_gb_per_s: float
@@ -91,7 +91,7 @@ class SpeedReport:
 
     @property
     def working_points(self) -> tuple[WorkingPoint, ...]:
-        """Of each estimator at each number of exposures that whole sweeps were measured with, on all threads."""
+        """The working point of each estimator at each number of exposures of whole sweeps, on all threads."""
         most = max(row.threads for row in self.rows)
         return tuple(
             WorkingPoint(

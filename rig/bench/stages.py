@@ -59,7 +59,7 @@ NUMPY_PIECE = 20
 
 @dataclass(frozen=True, slots=True)
 class StripeError:
-    """How far estimates are from the truth, over rows x columns; missing: share without an estimate."""
+    """Distance of estimates from the truth, over rows x columns; missing: share without an estimate."""
 
     mean_abs_px: float
     median_abs_px: float
@@ -85,7 +85,7 @@ Stage = Callable[[float], Measured]
 
 
 class Walk:
-    """Where in the frames the next measurement begins, so that none finds its frames in a cache."""
+    """Places in the frames at which measurements begin in turn, so that none finds its frames in a cache."""
 
     def __init__(self, places: int) -> None:
         self._places = places
@@ -226,7 +226,7 @@ def from_memory(frames: BenchFrames, walk: Walk) -> Iterator[tuple[int, Bits]]:
 def from_file(
     path: Path, stride: int, *, check_payload: bool
 ) -> Callable[[BenchFrames, Walk], Iterator[tuple[int, Bits]]]:
-    """The same from a recording."""
+    """A source of the same blocks that reads them from a recording."""
 
     def blocks(frames: BenchFrames, walk: Walk) -> Iterator[tuple[int, Bits]]:
         # Copy-on-write: kernels are compiled for memory that may be written.
@@ -262,7 +262,7 @@ def _search_error(sweep: SearchedSweep, frames: BenchFrames, places: list[int], 
 
 
 def stripe_error(difference: NDArray[np.float32]) -> StripeError:
-    """Of differences from the truth, NaN where there is no estimate."""
+    """The error of stripes by their differences from the truth, NaN where there is no estimate."""
     found = np.abs(difference[np.isfinite(difference)])
     if not len(found):
         return StripeError(float("nan"), float("nan"), 1.0)
@@ -276,11 +276,11 @@ SGBM_BLOCK_PX = 3
 PAIRS = 5
 """Maps of `joint` and of StereoSGBM, made by turns, that a quotient is the median of, each round."""
 SGBM_STEPS = 16
-"""Of OpenCV's disparities to the pixel."""
+"""Steps of OpenCV's disparities to the pixel."""
 
 
 def learn_joint(surface: BenchSurface, exposures: int, threads: int) -> RowModel:
-    """What `joint` learns from a first sweep of the surface, as in a scan."""
+    """State that `joint` learns from a first sweep of the surface, as in a scan."""
     joint = Joint(threads)
     with RowWorkers(threads) as workers:
         volume = count_surface(surface, surface.frames(exposures, workers), exposures, workers)

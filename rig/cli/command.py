@@ -85,7 +85,7 @@ def whole_numbers(option: str, given: list[str] | None) -> list[int]:
 _NAMES = {"scene": scene_names, "estimator": estimator_names, "filter": filter_names, "config": rig_names}
 """Names that a shell completes, by the field of a request."""
 _MANY = {Sequence[str]: split_option, Sequence[int]: whole_numbers}
-"""How options that may be given several times and with commas are read, by the type of their field."""
+"""Readers of options that may be given several times and with commas, by the type of their field."""
 
 
 def asks(request: type[Any]) -> Callable[[Callable[..., int]], Callable[..., int]]:

@@ -43,7 +43,7 @@ class OpenRig:
     guard: Guard | None = None
     """The process that owns the ports of a real laser and its gate."""
     seed: int = 0
-    """Of everything simulated."""
+    """Seed of everything simulated."""
 
 
 @runtime_checkable

@@ -1,4 +1,4 @@
-"""What a run tells while it goes on: its progress, and to a monitor its newest frames.
+"""News of a run while it goes on: its progress, and for a monitor its newest frames.
 
 `Listeners` are the callbacks. The monitor is a thread that shows the newest frames at most ten times a second and
 never holds anybody up. It has an optional place in the ring, copies what it shows and gives the block back before the

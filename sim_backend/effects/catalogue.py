@@ -33,7 +33,7 @@ class Entry:
     changes: Callable[[Setting, PlannedFor], float] | None = None
 
     def load(self) -> Callable[..., Any]:
-        """What makes the effect of a `Setting`, imported now."""
+        """The factory of a `Setting`'s effect, imported now."""
         module, _, name = self.code.partition(":")
         loaded: Callable[..., Any] = getattr(import_module(module), name)
         return loaded

@@ -1,4 +1,4 @@
-"""What a sensor does to the bits of one frame: crosstalk, hot and dead pixels, errors of the read-out.
+"""Faults that a sensor adds to the bits of one frame: crosstalk, hot and dead pixels, errors of the read-out.
 
 Rare random events are drawn exactly by the gaps between them: they cost what they are, not what the pixels are. Where
 each of the places 0, 1, 2, ... is hit with probability p, as many as
