@@ -124,7 +124,7 @@ class FrameBlock:
     records: NDArray[np.void]
     bits: NDArray[np.uint8]
     status: int = BlockStatus.OK
-    """How the block ended, a `BlockStatus`."""
+    """End of the block, a `BlockStatus`."""
 
     @property
     def n_frames(self) -> int:

@@ -242,7 +242,7 @@ class SoakReport:
 
     @property
     def exit_code(self) -> int:
-        """The exit code, as of a scan: 3 where the stream was ended by the ring, 1 where frames were lost or do not add up."""
+        """The exit code, as of a scan: 3 where the ring ended the stream, 1 where frames were lost or do not add up."""
         if self.ended_by is not None:
             return EXIT_DEVICE
         return int(self.frames.lost > 0 or not self.frames.agree)
