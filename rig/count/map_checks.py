@@ -1,7 +1,7 @@
 """Does a map's own light bear it out? Checks of counts and answers that no scene fails, whatever it looks like.
 
 They ask a few thousand points, each a row and column with partners: the next row, and four columns by whose times the
-line has moved 8 to 64 px. A stripe is seen at all of them, at places that the planes tell, and no noise is.
+line has moved 6 to 64 px. A stripe is seen at all of them, at places that the planes tell, and no noise is.
 
 - Pixels of a row: light falls on neighbours alike, so that no other order of the pixels is smoother than the right one.
 - Rows: a line of light stands where it stands on the next row.
@@ -33,7 +33,7 @@ VOLUME_POINTS: Final = 8192
 """Points of a sweep whose counts are kept."""
 FEWEST_POINTS: Final = 128
 """Points below which a check says nothing."""
-APART_PX: Final = (8.0, 16.0, 32.0, 64.0)
+APART_PX: Final = (6.0, 16.0, 32.0, 64.0)
 """The line's motion from a point's column to its partners: the least is more than the line is wide, the greatest as
 much as haze is."""
 NEAREST: Final = 3
