@@ -29,6 +29,11 @@ def option(
     return field(default=default, metadata=told)
 
 
+def path_option(about: str, unset: str) -> str | os.PathLike[str] | None:
+    """Declare a field that holds a file or folder, None where none is given."""
+    return option(None, about, unset=unset, read_as=Path | None)
+
+
 def options_of(request: type) -> "list[Field[Any]]":
     """The fields of a request in the order of its help: those of its own before those that it inherits."""
     by_name = {each.name: each for each in fields(request)}
@@ -44,6 +49,34 @@ def described(request: type[Request]) -> type[Request]:
     return request
 
 
+# Fields that several requests have.
+
+
+def _out() -> str | os.PathLike[str] | None:
+    return path_option("folder to write, new or empty", "nothing is written")
+
+
+def _accept_calibration() -> bool:
+    return option(False, "use a calibration of another rig, failed or too old, all the same")
+
+
+def _accuracy() -> str | None:
+    about = "depth error (standard deviation) that is good enough: '10 mm'"
+    return option(None, about, unset="that of 0.1 pixels")
+
+
+def _at() -> str:
+    return option("5 m", "distance at which it counts")
+
+
+def _exposures_by_turns() -> Sequence[int]:
+    return option((), "frames per column, by turns: 3,10,20", unset="0.3 to 2 x the config's")
+
+
+def _board_scene() -> str | None:
+    return option(None, "of a simulated rig, with a board", unset="its own, else board")
+
+
 @described
 @dataclass(frozen=True, slots=True, kw_only=True)
 class ReconstructRequest:
@@ -56,10 +89,8 @@ class ReconstructRequest:
     min_confidence: float | None = option(
         None, "answers below this do not enter the depth map", unset="as configured or recorded, else 0.5"
     )
-    accept_calibration: bool = option(False, "use a calibration of another rig, failed or too old, all the same")
-    out: str | os.PathLike[str] | None = option(
-        None, "folder to write, new or empty", unset="nothing is written", read_as=Path | None
-    )
+    accept_calibration: bool = _accept_calibration()
+    out: str | os.PathLike[str] | None = _out()
 
 
 @described
@@ -127,10 +158,8 @@ class TradeoffRequest:
     time_budget: str | None = option(None, "'5 ms': what has the least error in it")
     error: str | None = option(None, "'0.1 px': what takes the least time for it")
     of: str = option("sensor", "whose time these mean: sensor or compute")
-    accept_calibration: bool = option(False, "use a calibration of another rig, failed or too old, all the same")
-    out: str | os.PathLike[str] | None = option(
-        None, "folder to write, new or empty", unset="nothing is written", read_as=Path | None
-    )
+    accept_calibration: bool = _accept_calibration()
+    out: str | os.PathLike[str] | None = _out()
 
 
 @described
@@ -189,9 +218,7 @@ class CalibrationRequest:
 
     seed: int = option(0, "seed of everything simulated")
     arm: bool = option(False, "let a real laser shine: the beam path is clear")
-    out: str | os.PathLike[str] | None = option(
-        None, "folder to write, new or empty", unset="nothing is written", read_as=Path | None
-    )
+    out: str | os.PathLike[str] | None = _out()
 
 
 @described
@@ -200,12 +227,10 @@ class PixelsRequest(CalibrationRequest):
     """A map of hot, dead and noisy pixels (`rig calibrate pixels`)."""
 
     frames: int | None = option(None, "dark ones", unset="as many as the limit of hot pixels needs")
-    lit: str | os.PathLike[str] | None = option(
-        None, "a recorded run whose lit frames tell dead pixels", unset="none", read_as=Path | None
-    )
+    lit: str | os.PathLike[str] | None = path_option("a recorded run whose lit frames tell dead pixels", "none")
     light: bool = option(False, "take lit frames now")
-    against: str | os.PathLike[str] | None = option(
-        None, "an older map, for the drift", unset="the one beside the rig's calibration", read_as=Path | None
+    against: str | os.PathLike[str] | None = path_option(
+        "an older map, for the drift", "the one beside the rig's calibration"
     )
 
 
@@ -214,11 +239,9 @@ class PixelsRequest(CalibrationRequest):
 class BoardRequest(CalibrationRequest):
     """A calibration with views of a board."""
 
-    board: str | os.PathLike[str] | None = option(
-        None, "what is printed on the board: its YAML file", unset="the bundled", read_as=Path | None
-    )
+    board: str | os.PathLike[str] | None = path_option("what is printed on the board: its YAML file", "the bundled")
     poses: int = option(12, "of the board, shown to a live rig")
-    scene: str | None = option(None, "of a simulated rig, with a board", unset="its own, else board")
+    scene: str | None = _board_scene()
 
 
 @described
@@ -235,18 +258,14 @@ class PlanesRequest(BoardRequest):
     """A calibration of camera, light planes and lag together (`rig calibrate planes`)."""
 
     guided: bool = option(False, "ask for the poses that help most, until it is enough or all poses were shown")
-    calibration: str | os.PathLike[str] | None = option(
-        None, "one to start from; its defects are kept", unset="none", read_as=Path | None
-    )
-    camera: str | os.PathLike[str] | None = option(
-        None, "camera.yaml of `calibrate camera`, made of other views", unset="none", read_as=Path | None
+    calibration: str | os.PathLike[str] | None = path_option("one to start from; its defects are kept", "none")
+    camera: str | os.PathLike[str] | None = path_option(
+        "camera.yaml of `calibrate camera`, made of other views", "none"
     )
     stated_baseline: str | None = option(None, "camera to mirror as measured: '300 mm'", unset="not known")
-    accuracy: str | None = option(
-        None, "depth error (standard deviation) that is good enough: '10 mm'", unset="that of 0.1 pixels"
-    )
-    at: str = option("5 m", "distance at which it counts")
-    exposures: Sequence[int] = option((), "frames per column, by turns: 3,10,20", unset="0.3 to 2 x the config's")
+    accuracy: str | None = _accuracy()
+    at: str = _at()
+    exposures: Sequence[int] = _exposures_by_turns()
     accept_calibration: bool = option(False, "use a --camera whose verdict failed all the same")
 
 
@@ -255,15 +274,11 @@ class PlanesRequest(BoardRequest):
 class SyncRequest(CalibrationRequest):
     """A measurement of the mirror's lag and the rows' delay (`rig calibrate sync`)."""
 
-    calibration: str | os.PathLike[str] | None = option(
-        None, "the lags go into a copy of it", unset="the rig's own", read_as=Path | None
-    )
-    accuracy: str | None = option(
-        None, "depth error (standard deviation) that is good enough: '10 mm'", unset="that of 0.1 pixels"
-    )
-    at: str = option("5 m", "distance at which it counts")
-    exposures: Sequence[int] = option((), "frames per column, by turns: 3,10,20", unset="0.3 to 2 x the config's")
-    scene: str | None = option(None, "of a simulated rig, with a board", unset="its own, else board")
+    calibration: str | os.PathLike[str] | None = path_option("the lags go into a copy of it", "the rig's own")
+    accuracy: str | None = _accuracy()
+    at: str = _at()
+    exposures: Sequence[int] = _exposures_by_turns()
+    scene: str | None = _board_scene()
 
 
 @described
@@ -272,13 +287,9 @@ class CheckRequest(BoardRequest):
     """A check of a calibration by a board that it was not made with (`rig calibrate check`)."""
 
     poses: int = option(1, "of the board, shown to a live rig; 2 or more for an angle")
-    calibration: str | os.PathLike[str] | None = option(
-        None, "what to check", unset="the rig's own", read_as=Path | None
-    )
+    calibration: str | os.PathLike[str] | None = path_option("what to check", "the rig's own")
     angle: str | None = option(
         None, "between the boards of the first two views, as stated: '30 deg'", unset="not known"
     )
-    accuracy: str | None = option(
-        None, "depth error (standard deviation) that is good enough: '10 mm'", unset="that of 0.1 pixels"
-    )
-    at: str = option("5 m", "distance at which it counts")
+    accuracy: str | None = _accuracy()
+    at: str = _at()
