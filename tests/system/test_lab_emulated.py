@@ -36,29 +36,46 @@ def worlds(monkeypatch):
     return seen
 
 
-def test_a_scan_over_emulated_wires_ends_in_a_depth_map_through_fog(tmp_path, worlds, monkeypatch):
-    """Slower than the bundled rig, so that a host with much else to do starts the scanner within the burst."""
+@pytest.fixture
+def scan_slowly(tmp_path, monkeypatch):
+    """A scan slower than the bundled rig's, so that a host with much else to do starts the scanner within the burst."""
     monkeypatch.setattr(prepare, "HOST_LEAD_S", 0.8)
-    usual = configure("lab-emulated")
-    slow = usual.model_copy(
-        update={
-            "scan": usual.scan.model_copy(update={"frame_rate": Fraction(20_000), "power": 10e-3}),
-            "scanner": usual.scanner.model_copy(update={"frame": 0.5, "max_point_rate": 8e3}),
-        }
-    )
-    result = api.scan(slow, out=tmp_path / "run")
-    summary = json.loads((tmp_path / "run" / "summary.json").read_text())
+
+    def scan(name, **changes):
+        usual = configure(name)
+        scanner = usual.scanner.model_copy(update={"frame": 0.5, "max_point_rate": 8e3})
+        slow = usual.model_copy(update={"scan": usual.scan.model_copy(update=changes), "scanner": scanner})
+        api.scan(slow, out=tmp_path / "run")
+        return json.loads((tmp_path / "run" / "summary.json").read_text())
+
+    return scan
+
+
+def test_a_scan_over_emulated_wires_ends_in_a_depth_map_through_fog(scan_slowly, worlds):
+    summary = scan_slowly("lab-emulated", frame_rate=Fraction(20_000), power=10e-3)
     assert summary["verdict"] == "complete"
     frames = summary["frames"]
     assert frames["lost"] == 0
     assert frames["expected"] == frames["received"]
     assert summary["truth"]["stripe_error_px"]["median_abs"] < 0.25
     assert summary["fog"]["extinction_per_m"] == pytest.approx(TRUE_EXTINCTION_PER_M, abs=0.02)
-    assert result.folder == tmp_path / "run"
     ((world, ended_s),) = worlds
     # What is known of the light is forgotten by frames, not by time: a slow machine may estimate for long after them.
     assert world.light(ended_s - 60 * KEPT_S, ended_s)
     assert not [thread for thread in threading.enumerate() if thread.name.startswith("photons")]
+
+
+def test_a_scan_with_a_spad_without_markers_ends_in_a_depth_map(scan_slowly):
+    summary = scan_slowly("lab-spad512s-emulated", frame_rate=Fraction(6250), power=12e-3)
+    assert summary["verdict"] == "complete"
+    assert summary["frames"]["lost"] == 0
+    assert summary["frames"]["lit"] == pytest.approx(1200, abs=3)
+    assert summary["truth"]["stripe_error_px"]["median_abs"] < 0.35
+    sync = summary["sync"]
+    assert sync["by"] == "blanking pattern"
+    assert sync["detection_probability"] > 0.999
+    assert sync["residual_columns"] < 0.05
+    assert sync["clock_error"] == pytest.approx(20e-6, abs=5e-5)  # the emulated scanner's, as configured
 
 
 def test_a_dry_run_opens_every_device_and_neither_moves_nor_shines(worlds):
