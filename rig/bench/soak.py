@@ -30,6 +30,7 @@ from drivers.ring import BlockRing
 from drivers.spb1 import BlockLayout, block_views, walk_blocks
 from rig.bench.machine import machine
 from rig.config.files import load_config
+from rig.config.models import EstimateConfig
 from rig.count.volume import Counter, FrameTally, SweepLayout
 from rig.depth.reconstruct import MapResult, Reconstructor
 from rig.depth.warm_up import warm_up
@@ -332,7 +333,7 @@ def _recorded(rig: OpenRig, plan: ScanPlan, timing: SpadTiming) -> Loop:
     whole = plan.frames_per_sweep.denominator
     sweeps = math.ceil(math.ceil(LOOP_S / float(plan.sweep_s)) / whole) * whole
     with tempfile.TemporaryDirectory(prefix="spadrig-bench-") as folder:
-        maker = _reconstructor(rig, plan, "argmax", 1)
+        maker = _reconstructor(rig, plan, EstimateConfig(estimator="argmax", threads=1))
         with closing(Recording(Path(folder))) as recording:
             request = AcquisitionRequest(maps=sweeps, recording=recording)
             for _ in Acquisition(rig, plan, timing, maker, request).run():
@@ -342,11 +343,8 @@ def _recorded(rig: OpenRig, plan: ScanPlan, timing: SpadTiming) -> Loop:
         return Loop.of((item for item in items if isinstance(item, FrameBlock)), sweeps)
 
 
-def _reconstructor(rig: OpenRig, plan: ScanPlan, estimator: str, threads: int) -> Reconstructor:
-    return Reconstructor(
-        rig.model, plan.commands, plan.depth_range_m, sensor=(plan.rows, plan.width), estimator=estimator,
-        threads=threads,
-    )  # fmt: skip
+def _reconstructor(rig: OpenRig, plan: ScanPlan, estimate: EstimateConfig) -> Reconstructor:
+    return Reconstructor(rig.model, plan.commands, plan.depth_range_m, estimate, sensor=(plan.rows, plan.width))
 
 
 def _run(
@@ -354,7 +352,6 @@ def _run(
 ) -> SoakReport:
     plan, timing = prepare(rig)
     maps = max(2, 1 + math.ceil(options.seconds / float(plan.sweep_s)))  # the first one is taken alone
-    threads = options.threads or os.cpu_count() or 1
     warm_up("likelihood", "none", plan.exposures, dark=True)
     resident: list[int] = []
     settled = 0
@@ -363,7 +360,8 @@ def _run(
         if progress is not None:
             progress(done.frames, done.frames_planned)
 
-    maker = _SlowMaker(_reconstructor(rig, plan, "likelihood", threads), options.slow_s)
+    estimate = EstimateConfig(estimator="likelihood", threads=options.threads)
+    maker = _SlowMaker(_reconstructor(rig, plan, estimate), options.slow_s)
     listeners = Listeners(live=tell, monitor=_look)
     request = AcquisitionRequest(maps=maps, policy=options.policy, first_alone=True, learns=True, listeners=listeners)
     acquisition = Acquisition(rig, plan, timing, maker, request)

@@ -9,7 +9,7 @@ from contextlib import closing
 import numpy as np
 
 from rig.bench.speed import warm_bench
-from rig.config.models import RigConfig
+from rig.config.models import EstimateConfig, RigConfig
 from rig.depth.reconstruct import Reconstructor
 from rig.depth.warm_up import warm_up
 from rig.devices.open import OpenRig, open_rig
@@ -46,9 +46,8 @@ class _EnoughError(Exception):
 def _simulate(rig: OpenRig) -> None:
     """Let the world make the frames of a scan's beginning, bind and count them, and tell the truth of two columns."""
     plan, timing = prepare(rig)
-    maker = Reconstructor(
-        rig.model, plan.commands, plan.depth_range_m, sensor=(plan.rows, plan.width), estimator="argmax", threads=1
-    )
+    estimate = EstimateConfig(estimator="argmax", threads=1)
+    maker = Reconstructor(rig.model, plan.commands, plan.depth_range_m, estimate, sensor=(plan.rows, plan.width))
 
     def enough(done: ScanProgress) -> None:
         if done.frames >= ENOUGH_FRAMES:

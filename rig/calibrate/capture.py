@@ -31,6 +31,7 @@ from calibration.model.rig_model import Identity
 from calibration.passages.find import SweepCounts, find_passages
 from calibration.passages.flux_picture import board_pixels, even_pixels, flux_picture
 from calibration.views import BoardPose, Corners, Passages, View
+from drivers.interfaces import SpadTiming
 from drivers.units import format_quantity
 from rig.config.files import parse_config
 from rig.config.models import RigConfig
@@ -142,8 +143,8 @@ def _captured(
 ) -> Capture:
     # A simulated world is not asked for the truth, nor to hold its light within columns: it moves as the mirror does.
     rig = replace(rig, world=None)
-    plan, _ = prepare(rig)
-    sweeps = _sweeps(rig, maps, out)
+    plan, timing = prepare(rig)
+    sweeps = _sweeps(rig, plan, timing, maps, out)
     counts = tuple(_sweep_counts(sweep, plan) for sweep in sweeps)
     picture = flux_picture(counts)
     bad = np.zeros(picture.shape, np.bool_) if defects is None else defects
@@ -162,14 +163,14 @@ def _captured(
     return Capture(View(name, corners, passages, picture), refused, identity_of(rig))
 
 
-def _sweeps(rig: OpenRig, maps: int, out: OutFolder) -> list[SweepData]:
+def _sweeps(rig: OpenRig, plan: ScanPlan, timing: SpadTiming, maps: int, out: OutFolder) -> list[SweepData]:
     """Count the sweeps of a scan. An interrupt is raised again, once the rig is safe."""
     found: list[SweepData] = []
     scan, estimate = rig.config.scan, rig.config.estimate
     tally = MapTally(scan.columns, scan.exposures, estimate.estimator, estimate.filter)
     request = RunRequest(maps=maps, record=out is not None, accept_calibration=True)
     with Run(out, tally, record=request.record) as run:
-        result = run_scan(rig, run, request, Listeners(sweeps=found.append))
+        result = run_scan(rig, run, request, Listeners(sweeps=found.append), (plan, timing))
     result.uninterrupted()
     return found
 

@@ -36,6 +36,12 @@ stands still, 0.4 at two frames a column for one that moves by 5 px in it."""
 
 
 @numba.njit(inline="always")
+def _searched(x_lo, x_hi, x0, window, width):  # type: ignore[no-untyped-def]
+    """First and last stored pixel of a line that is searched, with the margin to its sides."""
+    return max(x_lo - MARGIN_PX, x0, 0) - x0, min(x_hi + MARGIN_PX, x0 + window - 1, width - 1) - x0
+
+
+@numba.njit(inline="always")
 def _around(total, j):  # type: ignore[no-untyped-def]
     """Sum of the pixels up to LAGS_PX from pixel j; total: of all those before each, and of all."""
     last = total.shape[0] - 1
@@ -80,8 +86,7 @@ def compare_lines(
     for i in range(first, last):
         for k in range(3):
             y, c = row[k, i], column[k, i]
-            low = max(x_lo[y, c] - MARGIN_PX, x0[c], 0) - x0[c]
-            high = min(x_hi[y, c] + MARGIN_PX, x0[c] + window - 1, usual.shape[1] - 1) - x0[c]
+            low, high = _searched(x_lo[y, c], x_hi[y, c], x0[c], window, usual.shape[1])
             for j in range(window):
                 excess = 0.0
                 if low <= j <= high and not np.isnan(usual[y, x0[c] + j]):
@@ -131,7 +136,35 @@ def compare_lines(
             out[i, 3 + order] = grows
 
 
-@numba.njit(cache=True, nogil=True)
+@numba.njit(inline="always")
+def _in_bins(px):  # type: ignore[no-untyped-def]
+    return int(np.floor(px / BIN_PX + 0.5))
+
+
+@numba.njit
+def _add_products(a, b, margin, to, out):  # type: ignore[no-untyped-def]
+    """Add to out[o + reach] the sum over i of a(i) b(i + to + o), for o from -reach to reach.
+
+    a, b: lines between margins of zeros.
+    """
+    reach = out.shape[0] // 2
+    bins = a.shape[0] - 2 * margin
+    if abs(to) > bins:
+        return
+    for i in range(margin, margin + bins):
+        if a[i] != 0.0:
+            for o in range(out.shape[0]):
+                out[o] += a[i] * b[i + to + o - reach]
+
+
+_I, _F, _D = numba.int32[:, :], numba.float32[:, :], numba.float64[:, :]
+
+
+# Compiled when it is imported: only a wide sweep asks for it, which is too late for a stream.
+@numba.njit(
+    (numba.int32[:, :, ::1], _I, _I, _I, _I, numba.int32[:], _I, _I, _F, _F, _D, _D, numba.float64[:]),
+    cache=True, nogil=True,
+)  # fmt: skip
 def follow_lines(
     lines: NDArray[np.int32],
     exposures: NDArray[np.int32],
@@ -168,8 +201,7 @@ def follow_lines(
             if exposures[k, i] == 0:
                 continue
             y, c = row[k, i], column[k, i]
-            low = max(x_lo[y, c] - MARGIN_PX, x0[c], 0) - x0[c]
-            high = min(x_hi[y, c] + MARGIN_PX, x0[c] + window - 1, usual.shape[1] - 1) - x0[c]
+            low, high = _searched(x_lo[y, c], x_hi[y, c], x0[c], window, usual.shape[1])
             scale, total, known = 1.0 / np.sqrt(exposures[k, i]), 0.0, 0
             for j in range(low, high + 1):
                 x = x0[c] + j
@@ -194,24 +226,3 @@ def follow_lines(
             _add_products(
                 light[0], light[k], margin, to, shared[partner] if shift[k - 1, i] >= 0 else shared[partner, ::-1]
             )
-
-
-@numba.njit(inline="always")
-def _in_bins(px):  # type: ignore[no-untyped-def]
-    return int(np.floor(px / BIN_PX + 0.5))
-
-
-@numba.njit
-def _add_products(a, b, margin, to, out):  # type: ignore[no-untyped-def]
-    """Add to out[o + reach] the sum over i of a(i) b(i + to + o), for o from -reach to reach.
-
-    a, b: lines between margins of zeros.
-    """
-    reach = out.shape[0] // 2
-    bins = a.shape[0] - 2 * margin
-    if abs(to) > bins:
-        return
-    for i in range(margin, margin + bins):
-        if a[i] != 0.0:
-            for o in range(out.shape[0]):
-                out[o] += a[i] * b[i + to + o - reach]

@@ -36,6 +36,8 @@ FEWEST_POINTS: Final = 128
 APART_PX: Final = (6.0, 16.0, 32.0, 64.0)
 """The line's motion from a point's column to its partners: the least is more than the line is wide, the greatest as
 much as haze is."""
+MOST_APART: Final = (1 / 16, 1 / 6, 1 / 6, 1 / 6)
+"""Share of a sweep's columns that lie at most between a point and each partner: what is farther is another surface."""
 NEAREST: Final = 3
 """A point's own line, that of the next row and that of the nearest partner column: where narrow light is looked for."""
 FOLLOWED: Final = 256
@@ -91,19 +93,20 @@ class Points(NamedTuple):
     shift: NDArray[np.int32]
 
 
-def check_points(geometry: SweepGeometry, most: int = POINTS) -> Points:
-    """Up to `most` points spread evenly over the map; none where no column has a partner."""
+def check_points(geometry: SweepGeometry, points: int = POINTS) -> Points:
+    """Up to `points` points spread evenly over the map; none where no column has a partner."""
     reference = geometry.reference_px()
     steps = np.abs(np.diff(reference, axis=1))
     step_px = float(np.median(steps)) if steps.size else 0.0
     columns = geometry.columns
-    most_apart = max(columns // 4, 1)
-    apart = [min(max(round(px / step_px), 1), most_apart) if step_px > 0 else 1 for px in APART_PX]
+    most = [int(share * columns) for share in MOST_APART]
+    wanted = [round(px / step_px) if step_px > 0 else 1 for px in APART_PX]
+    apart = [max(min(each), 1) for each in zip(wanted, most, strict=True)]
     searched = geometry.x_lo <= geometry.x_hi
     inner = columns - apart[-1]
     both = searched[:-1, :inner] & searched[1:, :inner]
     y, c = np.nonzero(both & np.logical_and.reduce([searched[:-1, n : n + inner] for n in apart]))
-    pick = evenly_spread(len(y), most)
+    pick = evenly_spread(len(y), points)
     y, c = y[pick], c[pick]
     row, column = np.stack([y, y + 1, *[y] * len(apart)]), np.stack([c, c, *(c + n for n in apart)])
     shift = np.rint(reference[row[1:], column[1:]] - reference[y, c])
@@ -224,7 +227,7 @@ class MapChecks:
         partners = len(APART_PX)
         rows, shared, noise = np.zeros((partners, 5)), np.zeros((partners, 2 * SPAN + 1)), np.zeros(partners)
         moved_px = np.abs(np.median(points.shift[1:, chosen], axis=1))
-        if moved_px[-1] < APART_PX[-2]:
+        if moved_px[-1] < 0.75 * APART_PX[-1]:
             return False  # too narrow a sweep for haze to be told from what stands still
         expected = np.abs(np.arange(-SPAN, SPAN + 1)) <= np.maximum(0.5 * moved_px / BIN_PX, 1.0)[:, None]
         used = np.isfinite(usual)

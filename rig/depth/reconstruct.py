@@ -1,5 +1,6 @@
 """From the counts of a sweep to its map: stripe table, depth map, intensity, fog and doubts."""
 
+import os
 import time
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
@@ -9,13 +10,14 @@ import numpy as np
 from numpy.typing import NDArray
 
 from calibration.model.rig_model import RigModel
+from rig.config.models import EstimateConfig
 from rig.count.line_counter import LineCounter
 from rig.count.map_checks import MapChecks
 from rig.count.volume import Counter, FrameTally, SweepLayout
 from rig.depth.depth import depth_map, share_claims
 from rig.depth.fog_meter import FogEstimate, read_fog
 from rig.errors import UsageError
-from rig.estimate.registry import COUPLED, ESTIMATORS, FILTERS, LEARNING, Learned, create_estimator, recalling
+from rig.estimate.registry import COUPLED, LEARNING, Learned, create_estimator, recalling
 from rig.geometry.line_grid import LineGrid
 from rig.geometry.stripe_table import StripeTable
 from rig.geometry.windows import SweepGeometry, sweep_geometry, uncalibrated_geometry
@@ -42,9 +44,9 @@ class MapResult:
 class Reconstructor:
     """Turns counted sweeps into maps, one after the other; estimators that learn carry their state from map to map.
 
-    model: rig model, None for an uncalibrated rig (stripes only). column_commands: (columns,) mirror command of each
-    column's centre. estimator, filter: of ESTIMATORS and FILTERS. lines: which line lights which column where there are
-    several. temporal_prior: of `joint`, see `EstimateConfig`. Raises UsageError for what does not fit.
+    model: rig model, None for an uncalibrated rig (stripes only), whose sensor (rows, width) must be given.
+    column_commands: (columns,) mirror command of each column's centre. learned: states of earlier maps to use.
+    lines: which line lights which column where there are several. Raises UsageError without model and sensor.
     """
 
     def __init__(
@@ -52,31 +54,25 @@ class Reconstructor:
         model: RigModel | None,
         column_commands: Sequence[float] | NDArray[np.float64],
         depth_range_m: tuple[float, float],
+        estimate: EstimateConfig,
         *,
         sensor: tuple[int, int] | None = None,
-        estimator: str = "likelihood",
-        filter: str = "none",
-        min_confidence: float = 0.5,
-        threads: int = 2,
         learned: Sequence[Learned] = (),
         lines: LineGrid | None = None,
-        temporal_prior: bool = False,
     ) -> None:
-        if estimator not in ESTIMATORS:
-            raise UsageError(f"estimator {estimator!r} is unknown; choose one of {', '.join(ESTIMATORS)}")
-        if filter not in FILTERS:
-            raise UsageError(f"filter {filter!r} is unknown; choose one of {', '.join(FILTERS)}")
         self._model = model
         self._commands = np.asarray(column_commands, dtype=np.float64)
-        self._min_confidence = min_confidence
-        self._filter = filter
-        self._coupled = estimator in COUPLED
+        self._min_confidence = estimate.min_confidence
+        self._filter = estimate.filter
+        self._coupled = estimate.estimator in COUPLED
         self._lines = lines
+        threads = estimate.threads or os.cpu_count() or 1
         self._workers = RowWorkers(threads)
+        prior = estimate.temporal_prior
         if learned:
-            self.estimator = recalling(estimator, learned, threads, temporal_prior=temporal_prior)
+            self.estimator = recalling(estimate.estimator, learned, threads, temporal_prior=prior)
         else:
-            self.estimator = create_estimator(estimator, threads, temporal_prior=temporal_prior)
+            self.estimator = create_estimator(estimate.estimator, threads, temporal_prior=prior)
         if model is not None:
             self.geometry = sweep_geometry(model, self._commands, depth_range_m)
             if lines is not None:
@@ -85,7 +81,7 @@ class Reconstructor:
             self.geometry = uncalibrated_geometry(*sensor, len(self._commands))
         else:
             raise UsageError("without a calibration the sensor size (rows, width) must be given")
-        self._checks = MapChecks(self.geometry, calibrated=model is not None, knows=estimator in LEARNING)
+        self._checks = MapChecks(self.geometry, calibrated=model is not None, knows=estimate.estimator in LEARNING)
 
     def counter(self, layout: SweepLayout) -> Counter:
         """A counter whose sweeps `map` takes, one after the other and each before frames of the next are added."""

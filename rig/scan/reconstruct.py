@@ -1,6 +1,5 @@
 """Makes depth maps of a bare cube of frames, map by map."""
 
-import os
 import time
 
 from rig.config.models import EstimateConfig
@@ -24,16 +23,7 @@ def reconstruct_cube(
     An interrupt ends the run after its last whole map, with verdict 'aborted'.
     """
     plan, model = cube.plan, calibration.model
-    threads = estimate.threads or os.cpu_count() or 1
-    reconstructor = Reconstructor(
-        model,
-        column_commands(plan),
-        plan.depth_range,
-        estimator=estimate.estimator,
-        filter=estimate.filter,
-        min_confidence=estimate.min_confidence,
-        threads=threads,
-    )
+    reconstructor = Reconstructor(model, column_commands(plan), plan.depth_range, estimate)
     warm_up(estimate.estimator, estimate.filter, plan.exposures, dark=False)
     geometry = reconstructor.geometry
     tally = MapTally(plan.columns, plan.exposures, estimate.estimator, estimate.filter)

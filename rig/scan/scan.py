@@ -4,7 +4,6 @@
 """
 
 import logging
-import os
 from collections.abc import Sequence
 from contextlib import closing
 from dataclasses import asdict
@@ -36,11 +35,18 @@ from rig.scan.run import Run, RunResult, frames_of, frames_that_came, sweep_cont
 _log = logging.getLogger(__name__)
 
 
-def run_scan(rig: OpenRig, run: Run, request: RunRequest, listeners: Listeners = NOBODY) -> RunResult:
+def run_scan(
+    rig: OpenRig,
+    run: Run,
+    request: RunRequest,
+    listeners: Listeners = NOBODY,
+    prepared: tuple[ScanPlan, SpadTiming] | None = None,
+) -> RunResult:
     """Scan with an open rig; `run` takes the maps.
 
     request: its `maps` (None is all that a recording holds which takes the SPAD's place), `on_overload`, `record` and
       `accept_calibration`; the rest has served to open the rig and to make `run`.
+    prepared: what `prepare` gave for this rig, where the caller has called it.
 
     An interrupt ends the scan after its last whole map, with verdict 'aborted'. So does an error, which is raised again
     once the whole maps and the recording are safe; where there is neither, nothing is left.
@@ -49,12 +55,11 @@ def run_scan(rig: OpenRig, run: Run, request: RunRequest, listeners: Listeners =
     require_policy(policy, rig.spad.info)
     here = identity_of(rig)
     calibration = calibration_use(rig, accept=request.accept_calibration, here=here)
-    plan, timing = prepare(rig)
+    plan, timing = prepared or prepare(rig)
     replayed = ReplaySource.of(rig.spad, plan, maps)
     maps = maps or 1 if replayed is None else replayed.maps
-    threads = rig.config.estimate.threads or os.cpu_count() or 1
     recalled = () if replayed is None else replayed.learned(rig.config.estimate, rig.model)
-    reconstructor = make_reconstructor(rig, plan, threads, recalled)
+    reconstructor = make_reconstructor(rig, plan, recalled)
     geometry = reconstructor.geometry
     run.rays = geometry.rays if rig.model is not None else None
 
@@ -150,21 +155,11 @@ def _first_alone(rig: OpenRig) -> bool:
     return rig.config.estimate.estimator in LEARNING and not rig.spad.info.can_wait
 
 
-def make_reconstructor(rig: OpenRig, plan: ScanPlan, threads: int, learned: Sequence[Learned] = ()) -> Reconstructor:
+def make_reconstructor(rig: OpenRig, plan: ScanPlan, learned: Sequence[Learned] = ()) -> Reconstructor:
     """Make the reconstructor for the maps of a plan, as the config says."""
-    estimate = rig.config.estimate
+    estimate, sensor = rig.config.estimate, (plan.rows, plan.width)
     return Reconstructor(
-        rig.model,
-        plan.commands,
-        plan.depth_range_m,
-        sensor=(plan.rows, plan.width),
-        estimator=estimate.estimator,
-        filter=estimate.filter,
-        min_confidence=estimate.min_confidence,
-        threads=threads,
-        learned=learned,
-        lines=plan.lines,
-        temporal_prior=estimate.temporal_prior,
+        rig.model, plan.commands, plan.depth_range_m, estimate, sensor=sensor, learned=learned, lines=plan.lines
     )
 
 

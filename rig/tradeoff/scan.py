@@ -5,7 +5,6 @@ that times are those of the work alone, as on a rig whose frames are not compute
 that the plan uses are kept, as a SPAD that sends windows would send them. `score_methods` does it.
 """
 
-import os
 import statistics
 import time
 from collections.abc import Callable, Mapping, Sequence
@@ -203,4 +202,4 @@ def require_plan(config: RigConfig) -> None:
 def _maker(rig: OpenRig, plan: ScanPlan, estimator: str) -> Reconstructor:
     estimate = rig.config.estimate.model_copy(update={"estimator": estimator})
     config = rig.config.model_copy(update={"estimate": estimate})
-    return make_reconstructor(replace(rig, config=config), plan, estimate.threads or os.cpu_count() or 1)
+    return make_reconstructor(replace(rig, config=config), plan)

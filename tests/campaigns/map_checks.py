@@ -39,6 +39,7 @@ RIGS: dict[str, dict[str, Any]] = {
     "left": {},
     "right": {"side": "right"},
     "turned": {"side": "right", "roll_deg": 3.0, "k1": -0.35, "axis_tilt_z_deg": 2.0, "axis_tilt_x_deg": 3.0},
+    "narrow": {},  # a third of the others' sweep, as finely
 }
 EXPOSURES = (1, 3, 10, 20)
 
@@ -102,6 +103,9 @@ def _one(seed: int, estimator: str, exposures: int, stream: bool) -> tuple[str, 
     rng = np.random.default_rng([seed, 79])
     light, rig, scene = str(rng.choice(list(POINTS))), str(rng.choice(list(RIGS))), _scene(rng)
     geometry = Geometry.build(width=512, height=ROWS, columns=COLUMNS, **RIGS[rig])
+    if rig == "narrow":
+        planes = Geometry.build(width=512, height=ROWS, columns=3 * COLUMNS).planes
+        geometry = replace(geometry, planes=planes[COLUMNS : 2 * COLUMNS])
     point = WorkingPoint(scene, POINTS[light], geometry)
     counts = point.counts(exposures, seed)
     doubts: dict[str, tuple[str, ...]] = {}

@@ -46,15 +46,16 @@ def reconstructor_of(
     It has learned nothing yet. lines: a LineGrid.
     """
     from calibration.files.rig_file import load_rig_model
+    from rig.config.models import EstimateConfig
     from rig.depth.reconstruct import Reconstructor
 
     with tempfile.TemporaryDirectory() as folder:
         model = load_rig_model(point.write_calibration(Path(folder)))
     commands = np.arange(point.geometry.columns, dtype=np.float64)
-    return Reconstructor(
-        model, commands, DEPTH_RANGE_M, estimator=estimator, filter="none", min_confidence=0.5, threads=threads,
-        lines=lines, temporal_prior=temporal_prior,
-    )  # fmt: skip
+    estimate = EstimateConfig(
+        estimator=estimator, filter="none", min_confidence=0.5, threads=threads, temporal_prior=temporal_prior
+    )
+    return Reconstructor(model, commands, DEPTH_RANGE_M, estimate, lines=lines)
 
 
 def volume_of(reconstructor: Any, counts: NDArray[np.unsignedinteger], exposures: int) -> Any:

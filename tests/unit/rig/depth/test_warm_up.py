@@ -1,6 +1,7 @@
 """What is compiled before a laser is armed: the frames of a scan must find nothing left to compile."""
 
 from rig.config.files import load_config
+from rig.config.models import EstimateConfig
 from rig.count import bind_kernels as binding_kernels
 from rig.depth.warm_up import warm_binding
 from rig.devices.open import open_rig
@@ -16,6 +17,7 @@ def test_binding_compiles_nothing_more_behind_it():
         warm_binding(plan)
         made = [len(kernel.signatures) for kernel in (binding_kernels.walk, binding_kernels.cover)]
         assert min(made) >= 1
-        maker = Reconstructor(rig.model, plan.commands, plan.depth_range_m, estimator="argmax", threads=1)
+        estimate = EstimateConfig(estimator="argmax", threads=1)
+        maker = Reconstructor(rig.model, plan.commands, plan.depth_range_m, estimate)
         list(Acquisition(rig, plan, timing, maker, AcquisitionRequest(maps=1)).run())
         assert made == [len(kernel.signatures) for kernel in (binding_kernels.walk, binding_kernels.cover)]

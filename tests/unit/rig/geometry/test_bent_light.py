@@ -6,6 +6,7 @@ import numpy as np
 import pytest
 
 from calibration import Camera, Lag, PivotScanner, RigModel
+from rig.config.models import EstimateConfig
 from rig.count.volume import CountVolume
 from rig.depth.depth import depth_map
 from rig.depth.reconstruct import Reconstructor
@@ -162,7 +163,7 @@ def test_a_map_is_made_of_the_sweep_s_own_commands_and_direction(velocity: float
     shifted = COMMANDS + 0.3 * (COMMANDS[1] - COMMANDS[0])  # bound 0.3 columns beside their centres
     stripes = seen_stripes(fan, model, np.array([ROWS - 1]), 3.0, velocity, shifted)
     stripes[:, -1] = np.nan  # there is no command beyond the last column's
-    maker = Reconstructor(model, COMMANDS, RANGE_M, estimator="argmax", threads=1)
+    maker = Reconstructor(model, COMMANDS, RANGE_M, EstimateConfig(estimator="argmax", threads=1))
     geometry = maker.geometry
     counts = CountVolume(
         n_frames=np.full(COLUMNS, 10, np.int32), column=np.arange(COLUMNS) + 0.3, dark_counts=None, n_dark=0,
