@@ -27,7 +27,7 @@ house: .venv/.installed-tests
 # Files of tests go to the workers whole: what they prepare once is prepared once.
 WORKERS ?= 4
 unit: .venv/.installed-tests
-	$(BIN)/pytest -n $(WORKERS) --dist loadfile
+	$(BIN)/pytest -n $(WORKERS) --dist loadfile --durations=25
 
 # Over the scenes of ../shared/scenes or, where there are none, the built-in one.
 accuracy: accuracy-rows accuracy-joint accuracy-calibration  ## the three below: tables of docs/results/ (hours)
