@@ -7,31 +7,34 @@ import pytest
 
 from drivers.clock import Clock
 from drivers.errors import WrongState
-from drivers.interfaces import BeamScanner, Device, DeviceState, LineLaser, SpadArray, SpadRequest, SyncSource, World
+from drivers.frames import FrameBlock
+from drivers.interfaces import (
+    BeamScanner,
+    Device,
+    DeviceState,
+    LineLaser,
+    SpadArray,
+    SpadCounters,
+    SpadRequest,
+    SpadTiming,
+    SyncSource,
+    World,
+)
+from drivers.ring import BlockRing
+
+TIMEOUT_S = 60.0
 
 
 def require_final(device: Device, *verbs: Callable[[], object]) -> None:
-    """Assert that closing is final: no verb is possible any more, and closing again does nothing."""
-    device.close()
+    """Leave the device's block by an error; assert that this closed it for good: no verb is possible any more."""
+    with pytest.raises(RuntimeError, match="on the way"), device as entered:  # noqa: PT012
+        assert entered is device
+        raise RuntimeError("on the way")
     device.close()
     assert device.state is DeviceState.CLOSED
     for verb in (*verbs, device.__enter__):
         with pytest.raises(WrongState, match="close"):
             verb()
-
-
-def leave_with_an_error(device: Device, work: Callable[[], object]) -> None:
-    """Work within the device's block and fail there; assert that the error comes through and the device is closed."""
-
-    def fail() -> None:
-        with device as entered:
-            assert entered is device
-            work()
-            raise RuntimeError("on the way")
-
-    with pytest.raises(RuntimeError, match="on the way"):
-        fail()
-    assert device.state is DeviceState.CLOSED
 
 
 @dataclass(frozen=True)
@@ -40,6 +43,28 @@ class SpadCase:
 
     device: SpadArray
     request: SpadRequest
+
+
+@dataclass(frozen=True)
+class Taken:
+    """A run of a SPAD array that is over: its blocks, all still in the ring, and the counters behind it."""
+
+    case: SpadCase
+    timing: SpadTiming
+    ring: BlockRing
+    blocks: list[FrameBlock]
+    counters: SpadCounters
+
+
+def run(case: SpadCase, timing: SpadTiming, n_frames: int) -> tuple[BlockRing, list[FrameBlock]]:
+    """One run to its end, in a ring that takes it all, however short the device makes its blocks after a loss."""
+    ring = BlockRing(2 * n_frames // case.request.block_frames + n_frames // 8, timing.stride)
+    reader = ring.reader("test")
+    case.device.start(n_frames)
+    while case.device.fill(ring, TIMEOUT_S):
+        assert case.device.state is DeviceState.RUNNING
+    ring.finish()
+    return ring, list(reader)
 
 
 @dataclass(frozen=True)

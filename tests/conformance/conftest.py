@@ -3,8 +3,8 @@
 A new device is added here and nowhere else: it then has to behave like all the others.
 """
 
-from collections.abc import Callable, Iterator
-from contextlib import AbstractContextManager, contextmanager
+from collections.abc import Iterator
+from contextlib import contextmanager
 from dataclasses import replace
 from fractions import Fraction
 from pathlib import Path
@@ -16,13 +16,9 @@ import pytest
 from drivers.clock import VirtualClock
 from drivers.interfaces import MARKER_SCAN, ScanWaveform, SpadRequest, WindowTable
 from drivers.registry import Surroundings, lookup
-from tests.conformance.cases import LaserCase, ScannerCase, SpadCase, SyncCase, WorldCase
-from tests.conformance.emulated_lasers import EMULATED_LASERS
-from tests.conformance.emulated_scanners import EMULATED_SCANNERS
-from tests.conformance.emulated_spads import EMULATED_SPADS
-from tests.conformance.emulated_syncs import EMULATED_SYNCS, GUARDED_LASERS
-from tests.conformance.recorded_devices import recorded_laser, recorded_scanner, recorded_sync
-from tests.conformance.replayed_spads import replayed_spads
+from tests.conformance.cases import LaserCase, ScannerCase, SpadCase, SyncCase, Taken, WorldCase, run
+from tests.conformance.devices import LASERS, SCANNERS, SYNCS, Factory
+from tests.conformance.spads import EMULATED, N_FRAMES, replayed_spads
 
 ROWS, WIDTH = 24, 100
 """A small camera, its width no multiple of 64."""
@@ -120,24 +116,13 @@ def simulated_world(folder: Path) -> Iterator[WorldCase]:
     yield WorldCase(world, ROWS, WIDTH)
 
 
-Factory = Callable[[Path], AbstractContextManager[Any]]
-
 SPADS: dict[str, Factory] = {
     "simulated": simulated_spad,
     "simulated, lossy": simulated_lossy_spad,
     "simulated, windows": simulated_window_spad,
-    **EMULATED_SPADS,
-    **replayed_spads(simulated_spad, simulated_lossy_spad, simulated_window_spad, EMULATED_SPADS["spb-usb, burst"]),
+    **EMULATED,
+    **replayed_spads(simulated_spad, simulated_lossy_spad, simulated_window_spad),
 }
-SCANNERS: dict[str, Factory] = {"simulated": simulated_scanner, "replay": recorded_scanner, **EMULATED_SCANNERS}
-LASERS: dict[str, Factory] = {
-    "simulated": simulated_laser,
-    "replay": recorded_laser,
-    **EMULATED_LASERS,
-    **GUARDED_LASERS,
-}
-SYNCS: dict[str, Factory] = {"simulated": simulated_sync, "replay": recorded_sync, **EMULATED_SYNCS}
-WORLDS: dict[str, Factory] = {"simulated": simulated_world}
 
 
 def over(factories: dict[str, Factory]) -> Any:
@@ -151,8 +136,17 @@ def over(factories: dict[str, Factory]) -> Any:
     return case
 
 
+@pytest.fixture(scope="module", params=SPADS.values(), ids=SPADS.keys())
+def taken(request: pytest.FixtureRequest, tmp_path_factory: pytest.TempPathFactory) -> Iterator[Taken]:
+    """One run of each SPAD array to its end, its blocks all still in the ring."""
+    with request.param(tmp_path_factory.mktemp("taken")) as case:
+        timing = case.device.configure(case.request)
+        ring, blocks = run(case, timing, N_FRAMES)
+        yield Taken(case, timing, ring, blocks, case.device.counters)
+
+
 spad = over(SPADS)
-scanner = over(SCANNERS)
-laser = over(LASERS)
-sync = over(SYNCS)
-world = over(WORLDS)
+scanner = over({"simulated": simulated_scanner, **SCANNERS})
+laser = over({"simulated": simulated_laser, **LASERS})
+sync = over({"simulated": simulated_sync, **SYNCS})
+world = over({"simulated": simulated_world})

@@ -1,10 +1,12 @@
 """Every sync source: no light while waiting, the program as written, all outputs low at every end."""
 
+import math
+
 import pytest
 
 from drivers.errors import LimitExceeded, WrongState
 from drivers.interfaces import OUT_FRAME, OUT_GATE, OUT_MARKER, DeviceState, Pulse
-from tests.conformance.cases import SyncCase, leave_with_an_error, require_final
+from tests.conformance.cases import SyncCase, require_final
 
 STEP_S = 0.01
 """Long against the delays of a host, so that the suite can look at each word."""
@@ -51,44 +53,31 @@ def test_verbs_out_of_order_are_refused_and_say_what_to_call(sync: SyncCase) -> 
     device.program(SWEEP, 1)
 
 
-@pytest.mark.parametrize("outputs", [OUT_GATE, OUT_GATE | OUT_MARKER, OUT_GATE | OUT_FRAME | OUT_MARKER])
-def test_a_word_that_waits_with_the_gate_high_is_refused(sync: SyncCase, outputs: int) -> None:
-    with pytest.raises(LimitExceeded, match=rf"word 1 waits with the gate high \(0x{outputs:x}\)"):
-        sync.device.program([Pulse(0, STEP_S), Pulse(outputs, None)], 1)
-    assert sync.device.state is DeviceState.READY
+def test_what_no_source_may_play_is_refused_and_replaces_nothing(sync: SyncCase) -> None:
+    device, resolution_s = sync.device, sync.device.resolution_s
+    lit, short = Pulse(OUT_GATE, STEP_S), Pulse(OUT_GATE, 0.4 * resolution_s)
+    all_high = OUT_GATE | OUT_FRAME | OUT_MARKER
+    refused: list[tuple[list[Pulse], int, str]] = [
+        ([], 1, "0 words"),
+        ([lit], 0, "0 repeats"),
+        *(([Pulse(outputs, STEP_S)], 1, "0x0 to 0x7") for outputs in (8, -1)),
+        *(([lit, Pulse(0, duration_s)], 1, "word 1 lasts") for duration_s in (0.0, -1.0, math.nan, math.inf)),
+        ([lit, short], 1, f"{0.4 * resolution_s:g} s, under the resolution {resolution_s:g} s"),
+        *(([lit, Pulse(outputs, None)], 1, rf"word 1 waits .*\(0x{outputs:x}\)") for outputs in (OUT_GATE, all_high)),
+    ]
+
+    def refuse_all() -> None:
+        for pulses, repeats, said in refused:
+            with pytest.raises(LimitExceeded, match=said):
+                device.program(pulses, repeats)
+
+    refuse_all()
+    assert device.state is DeviceState.READY
     assert sync.pins() == 0
-
-
-@pytest.mark.parametrize("duration_s", [0.0, -1.0, float("nan"), float("inf")])
-def test_a_duration_that_is_none_is_refused(sync: SyncCase, duration_s: float) -> None:
-    with pytest.raises(LimitExceeded, match="word 0"):
-        sync.device.program([Pulse(0, duration_s)], 1)
-
-
-def test_a_duration_below_the_resolution_is_refused_with_value_and_limit(sync: SyncCase) -> None:
-    resolution_s = sync.device.resolution_s
-    with pytest.raises(LimitExceeded) as refused:
-        sync.device.program([Pulse(0, STEP_S), Pulse(OUT_GATE, 0.4 * resolution_s)], 1)
-    assert f"{0.4 * resolution_s:g}" in str(refused.value)
-    assert f"{resolution_s:g}" in str(refused.value)
-
-
-def test_no_words_no_repeats_and_unknown_outputs_are_refused(sync: SyncCase) -> None:
-    with pytest.raises(LimitExceeded, match="0 words"):
-        sync.device.program([], 1)
-    with pytest.raises(LimitExceeded, match="0 repeats"):
-        sync.device.program(SWEEP, 0)
-    for outputs in (8, -1):
-        with pytest.raises(LimitExceeded, match="0x0 to 0x7"):
-            sync.device.program([Pulse(outputs, STEP_S)], 1)
-
-
-def test_a_program_that_was_refused_does_not_replace_the_one_that_was_taken(sync: SyncCase) -> None:
-    sync.device.program(SWEEP, 1)
-    with pytest.raises(LimitExceeded):
-        sync.device.program([], 1)
-    sync.device.run()
-    assert sync.device.status.state == sync.waiting
+    device.program(SWEEP, 1)
+    refuse_all()
+    device.run()
+    assert device.status.state == sync.waiting
 
 
 def test_loading_a_program_plays_nothing(sync: SyncCase) -> None:
@@ -182,14 +171,9 @@ def test_gate_low_is_low_until_the_next_run(sync: SyncCase) -> None:
     running(sync)
 
 
-def test_close_is_final_leaves_all_outputs_low_and_may_be_called_twice(sync: SyncCase) -> None:
+def test_it_closes_for_good_with_all_outputs_low_whatever_happened(sync: SyncCase) -> None:
     device = sync.device
     running(sync)
     verbs = (device.run, device.gate_low, device.abort, lambda: device.status)
     require_final(device, lambda: device.program(SWEEP, 1), *verbs)
-    assert sync.pins() == 0
-
-
-def test_leaving_the_with_block_leaves_all_outputs_low_whatever_happened(sync: SyncCase) -> None:
-    leave_with_an_error(sync.device, lambda: running(sync))
     assert sync.pins() == 0

@@ -4,6 +4,7 @@ import math
 from collections.abc import Callable, Sequence
 from dataclasses import replace
 from fractions import Fraction
+from typing import Any
 
 import numpy as np
 import pytest
@@ -231,6 +232,42 @@ def test_windows_off_the_grid_or_in_a_burst_are_refused_under_the_name_of_the_de
     with pytest.raises(LimitExceeded, match="cam: windows in mode 'burst'"):
         spad.configure(replace(STREAM, mode="burst", window=HALF))
     assert spad.state is DeviceState.READY
+
+
+@pytest.mark.parametrize(
+    ("wrong", "said"),
+    [
+        *(({"frame_rate_hz": Fraction(hz)}, f"rate {float(hz):g} Hz is outside 0 to 100000 Hz") for hz in (2e5, 0, -1)),
+        *(
+            ({"exposure_s": seconds}, f"exposure {seconds:g} s is outside 0 to the frame period 1e-05 s")
+            for seconds in (1.01e-5, 0.0, -1e-6, math.nan)
+        ),
+        ({"block_frames": 0}, "blocks of 0 frames"),
+    ],
+)
+def test_a_request_beyond_the_limits_is_refused_with_value_and_limit(wrong: dict[str, Any], said: str) -> None:
+    spad = SmallMemorySpad()
+    with pytest.raises(LimitExceeded, match=f"cam: .*{said}"):
+        spad.configure(replace(BURST, **wrong))
+    assert spad.state is DeviceState.READY
+
+
+def test_verbs_of_a_spad_out_of_order_are_refused_and_say_what_to_call() -> None:
+    spad, ring = SmallMemorySpad(), BlockRing(1, 1024)
+    spad.stop()
+    with pytest.raises(WrongState, match="configure"):
+        spad.start(10)
+    spad.configure(BURST)
+    with pytest.raises(WrongState, match="start"):
+        spad.fill(ring, 0.1)
+    with pytest.raises(LimitExceeded, match="start of 0 frames"):
+        spad.start(0)
+    spad.start(10)
+    for verb in (lambda: spad.configure(BURST), lambda: spad.start(10)):
+        with pytest.raises(WrongState, match="stop"):
+            verb()
+    spad.stop()
+    assert spad.state is DeviceState.CONFIGURED
 
 
 def test_a_run_goes_on_after_an_error_until_it_is_stopped() -> None:

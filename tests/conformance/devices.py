@@ -1,0 +1,124 @@
+"""Lasers, scanners and sync sources besides the simulated ones, in virtual time: real drivers on emulated wires,
+directly and guarded, and the stand-ins of a recording.
+
+A scanner's run has a thread that moves the clock on as fast as it can; where nothing runs, the test does.
+"""
+
+from collections.abc import Callable, Iterator
+from contextlib import AbstractContextManager, contextmanager
+from functools import partial
+from pathlib import Path
+from typing import Any
+
+from drivers.clock import VirtualClock
+from drivers.guard import Guard
+from drivers.interfaces import SyncSource
+from drivers.lasers.obis import ObisConfig
+from drivers.registry import Surroundings, lookup
+from drivers.sync.prawndo import PrawnDoConfig
+from sim_backend.wire.firmware.cobolt import CoboltModel
+from sim_backend.wire.firmware.dac_model import DacModel
+from sim_backend.wire.firmware.helios import HeliosModel
+from sim_backend.wire.firmware.lasercube import LaserCubeModel
+from sim_backend.wire.firmware.obis import ObisModel
+from sim_backend.wire.serve.serial import SerialServer
+from tests.conformance.cases import LaserCase, ScannerCase, SyncCase
+from tests.wire.lasers import eventually, open_cobolt, open_obis, wire
+from tests.wire.scanners import opened
+from tests.wire.syncs import Board, board
+
+Factory = Callable[[Path], AbstractContextManager[Any]]
+
+
+@contextmanager
+def cobolt(folder: Path, **settings: Any) -> Iterator[LaserCase]:
+    model = CoboltModel(**settings)
+    with wire(model) as (_, surroundings), open_cobolt(surroundings) as device:
+        yield LaserCase(device, surroundings.clock, lambda: model.emitting)
+        assert not model.forbidden
+
+
+@contextmanager
+def obis(folder: Path, *, channel: int | None = None, **settings: Any) -> Iterator[LaserCase]:
+    model = ObisModel(channel=channel, cdrh_delay_s=0.5, **settings)
+    with wire(model) as (_, surroundings), open_obis(surroundings, channel=channel) as device:
+        yield LaserCase(device, surroundings.clock, lambda: model.emitting)
+        assert not model.forbidden
+
+
+@contextmanager
+def guarded_obis(folder: Path) -> Iterator[LaserCase]:
+    model = ObisModel(cdrh_delay_s=0.2)
+    config = ObisConfig.model_validate({"port": "emulated:laser", "max_power": "80 mW"})
+    clock = VirtualClock()
+    with SerialServer(model, clock=clock) as server, Guard(laser=config, ports={"laser": server.endpoint}) as guard:
+        yield LaserCase(guard.laser, clock, lambda: model.emitting)
+
+
+@contextmanager
+def emulated_scanner(folder: Path, kind: str, make: Callable[[], DacModel]) -> Iterator[ScannerCase]:
+    clock, model = VirtualClock(), make()
+    with opened(kind, model, clock) as (device, plugged):
+
+        def let_pass(seconds: float) -> None:
+            ends_s = plugged.now_s() + seconds
+            eventually(lambda: not device.status.moving or plugged.now_s() >= ends_s)
+            clock.sleep(ends_s - plugged.now_s())
+
+        yield ScannerCase(device, lambda: model.moving(plugged.now_s()), let_pass)
+
+
+def _on_board(board: Board, device: SyncSource) -> SyncCase:
+    def trigger() -> None:
+        board.trigger.pulse(board.now_s + 1e-6, 10e-6)
+        board.clock.sleep(2e-6)
+
+    return SyncCase(device, board.clock, trigger, lambda: board.pins, tells_waiting=False)
+
+
+@contextmanager
+def emulated_prawndo(folder: Path) -> Iterator[SyncCase]:
+    with board() as wired, wired.open() as device:
+        yield _on_board(wired, device)
+
+
+@contextmanager
+def guarded_prawndo(folder: Path) -> Iterator[SyncCase]:
+    config = PrawnDoConfig(port="emulated:sync")
+    with board(terminal=True) as wired, Guard(sync=config, ports={"sync": wired.server.endpoint}) as guard:
+        yield _on_board(wired, guard.sync)
+
+
+@contextmanager
+def stand_in(folder: Path, slot: str) -> Iterator[LaserCase | ScannerCase | SyncCase]:
+    clock, kind = VirtualClock(), lookup(slot, "replay")
+    with kind.create(kind.config(kind="replay"), Surroundings(clock, None, 0)) as device:
+        if slot == "laser":
+            yield LaserCase(device, clock, lambda: device._do_status().emission)
+        elif slot == "scanner":
+            yield ScannerCase(device, lambda: device._do_status().moving, clock.sleep)
+        else:
+            yield SyncCase(device, clock, lambda: None, lambda: 0, plays=False)
+
+
+LASERS: dict[str, Factory] = {
+    "replay": partial(stand_in, slot="laser"),
+    "cobolt 06-MLD": cobolt,
+    "cobolt 06-MLD without autostart": partial(cobolt, autostart=False),
+    "cobolt 06-01": partial(cobolt, family="06-01"),
+    "obis": obis,
+    "obis without handshake": partial(obis, handshake=False),
+    "obis, cold": partial(obis, warm_up_s=3.0),
+    "obis behind a remote": partial(obis, channel=2),
+    "obis, guarded": guarded_obis,
+}
+SCANNERS: dict[str, Factory] = {
+    "replay": partial(stand_in, slot="scanner"),
+    "helios, emulated": partial(emulated_scanner, kind="helios", make=HeliosModel),
+    "lasercube, emulated": partial(emulated_scanner, kind="lasercube", make=LaserCubeModel),
+}
+SYNCS: dict[str, Factory] = {
+    "replay": partial(stand_in, slot="sync"),
+    "prawndo": emulated_prawndo,
+    "prawndo, guarded": guarded_prawndo,
+}
