@@ -2,63 +2,62 @@
 
 import struct
 import zlib
+from fractions import Fraction
+
+from drivers.frames import BlockFlag, BlockHeader
+
+HEADER_FIELDS: dict[str, tuple[int, str, int | bytes]] = {
+    "magic": (0, "4s", b"SPB1"),
+    "version": (4, "H", 0x0100),
+    "header_len": (6, "H", 96),
+    "flags": (8, "I", 0),
+    "bits_per_px": (12, "B", 1),
+    "payload_type": (13, "B", 0),
+    "run_id": (14, "H", 7),
+    "block_seq": (16, "Q", 3),
+    "first_frame": (24, "Q", 1000),
+    "t0_ticks": (32, "Q", 123_456_789),
+    "lost_before": (40, "Q", 2),
+    "tick_hz": (48, "I", 100_000_000),
+    "tick_hz_den": (52, "I", 1),
+    "frame_period_ticks": (56, "I", 1000),
+    "exposure_ticks": (60, "I", 900),
+    "sweep": (64, "I", 70_000),
+    "n_frames": (68, "H", 3),
+    "frame_step": (70, "H", 1),
+    "width": (72, "H", 12),
+    "height": (74, "H", 2),
+    "sensor_width": (76, "H", 16),
+    "sensor_height": (78, "H", 4),
+    "payload_len": (80, "I", 96 + 48),
+    "pixels_offset": (84, "I", 192),
+}
+"""Offset in the wire layout, format, and value of the golden block."""
+GOLDEN_HEADER = BlockHeader(
+    flags=BlockFlag(0),
+    run_id=7,
+    block_seq=3,
+    first_frame=1000,
+    t0_ticks=123_456_789,
+    lost_before=2,
+    tick_hz=Fraction(100_000_000),
+    frame_period_ticks=1000,
+    exposure_ticks=900,
+    sweep=70_000,
+    frame_step=1,
+    width=12,
+    height=2,
+    sensor_width=16,
+    sensor_height=4,
+)
 
 
-def header_bytes(
-    *,
-    magic: bytes = b"SPB1",
-    version: int = 0x0100,
-    header_len: int = 96,
-    flags: int = 0,
-    bits_per_px: int = 1,
-    payload_type: int = 0,
-    run_id: int = 7,
-    block_seq: int = 3,
-    first_frame: int = 1000,
-    t0_ticks: int = 123_456_789,
-    lost_before: int = 2,
-    tick_hz: int = 100_000_000,
-    tick_hz_den: int = 1,
-    frame_period_ticks: int = 1000,
-    exposure_ticks: int = 900,
-    sweep: int = 70_000,
-    n_frames: int = 3,
-    frame_step: int = 1,
-    width: int = 12,
-    height: int = 2,
-    sensor_width: int = 16,
-    sensor_height: int = 4,
-    payload_len: int = 96 + 48,
-    pixels_offset: int = 192,
-    crc: int | None = None,
-) -> bytes:
-    """The 96 bytes of a header, field by field at the offsets of the wire layout."""
+def header_bytes(*, crc: int | None = None, **changed: int | bytes) -> bytes:
+    """The 96 bytes of the golden header, some fields changed."""
     raw = bytearray(96)
-    raw[0:4] = magic
-    struct.pack_into("<H", raw, 4, version)
-    struct.pack_into("<H", raw, 6, header_len)
-    struct.pack_into("<I", raw, 8, flags)
-    raw[12] = bits_per_px
-    raw[13] = payload_type
-    struct.pack_into("<H", raw, 14, run_id)
-    struct.pack_into("<Q", raw, 16, block_seq)
-    struct.pack_into("<Q", raw, 24, first_frame)
-    struct.pack_into("<Q", raw, 32, t0_ticks)
-    struct.pack_into("<Q", raw, 40, lost_before)
-    struct.pack_into("<I", raw, 48, tick_hz)
-    struct.pack_into("<I", raw, 52, tick_hz_den)
-    struct.pack_into("<I", raw, 56, frame_period_ticks)
-    struct.pack_into("<I", raw, 60, exposure_ticks)
-    struct.pack_into("<I", raw, 64, sweep)
-    struct.pack_into("<H", raw, 68, n_frames)
-    struct.pack_into("<H", raw, 70, frame_step)
-    struct.pack_into("<H", raw, 72, width)
-    struct.pack_into("<H", raw, 74, height)
-    struct.pack_into("<H", raw, 76, sensor_width)
-    struct.pack_into("<H", raw, 78, sensor_height)
-    struct.pack_into("<I", raw, 80, payload_len)
-    struct.pack_into("<I", raw, 84, pixels_offset)
-    struct.pack_into("<I", raw, 88, 0)
+    for name, (offset, form, value) in HEADER_FIELDS.items():
+        struct.pack_into("<" + form, raw, offset, changed.pop(name, value))
+    assert not changed
     struct.pack_into("<I", raw, 92, zlib.crc32(raw[:92]) if crc is None else crc)
     return bytes(raw)
 
@@ -91,7 +90,7 @@ def trailer_bytes(
     return body + struct.pack("<I", zlib.crc32(body))
 
 
-def golden_block() -> bytes:
-    """Block 3 of run 7: frames 1000-1002, 12x2 windows, in a stride of 1024."""
-    block = header_bytes() + PAYLOAD + trailer_bytes()
+def golden_block(**changed: int) -> bytes:
+    """Block 3 of run 7: frames 1000-1002, 12x2 windows, in a stride of 1024; some fields of its header changed."""
+    block = header_bytes(**changed) + PAYLOAD + trailer_bytes(block_seq=changed.get("block_seq", 3))
     return block + bytes(1024 - len(block))

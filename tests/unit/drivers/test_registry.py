@@ -19,32 +19,26 @@ LAMP = Kind(LampConfig, lambda config, surroundings: (config.watts, surroundings
 NO_KIND = object()
 
 
-@pytest.fixture
+INSTALLED = (
+    *(("lamp", "LAMP"), ("broken", "NO_KIND"), ("arc", "LAMP")),
+    *(("twice", "LAMP"), ("twice", "NO_KIND"), ("same", "LAMP"), ("same", "LAMP")),
+)
+
+
+@pytest.fixture(autouse=True)
 def installed(monkeypatch: pytest.MonkeyPatch) -> None:
     def entry_points(group: str) -> list[EntryPoint]:
-        known = {
-            "spadrig.laser": [
-                ("lamp", "LAMP"),
-                ("broken", "NO_KIND"),
-                ("arc", "LAMP"),
-                ("twice", "LAMP"),
-                ("twice", "NO_KIND"),
-                ("same", "LAMP"),
-                ("same", "LAMP"),
-            ]
-        }
-        return [EntryPoint(name, f"{__name__}:{value}", group) for name, value in known.get(group, [])]
+        known = INSTALLED if group == "spadrig.laser" else ()
+        return [EntryPoint(name, f"{__name__}:{value}", group) for name, value in known]
 
     monkeypatch.setattr(registry, "entry_points", entry_points)
 
 
-@pytest.mark.usefixtures("installed")
 def test_kinds_are_listed_once_and_sorted() -> None:
     assert kinds("laser") == ("arc", "broken", "lamp", "same", "twice")
     assert kinds("spad") == ()
 
 
-@pytest.mark.usefixtures("installed")
 def test_a_kind_is_found_and_creates_its_device() -> None:
     kind = lookup("laser", "lamp")
     device = kind.create(kind.config(kind="lamp", watts=3), Surroundings(VirtualClock(), None, seed=4))
@@ -52,20 +46,18 @@ def test_a_kind_is_found_and_creates_its_device() -> None:
     assert lookup("laser", "same") is kind
 
 
-@pytest.mark.usefixtures("installed")
-def test_an_unknown_kind_lists_the_choices() -> None:
-    with pytest.raises(UnknownKind, match=r"laser: unknown kind 'lmap'; choose one of: arc, broken, lamp, same, twice"):
-        lookup("laser", "lmap")
-    with pytest.raises(UnknownKind, match="none installed"):
-        lookup("spad", "lamp")
-
-
-@pytest.mark.usefixtures("installed")
-def test_an_entry_that_cannot_be_used_is_refused() -> None:
-    with pytest.raises(UnknownKind, match=r"no drivers.registry.Kind"):
-        lookup("laser", "broken")
-    with pytest.raises(UnknownKind, match="offered twice"):
-        lookup("laser", "twice")
+@pytest.mark.parametrize(
+    ("slot", "kind", "said"),
+    [
+        ("laser", "lmap", "laser: unknown kind 'lmap'; choose one of: arc, broken, lamp, same, twice"),
+        ("spad", "lamp", "none installed"),
+        ("laser", "broken", r"no drivers\.registry\.Kind"),
+        ("laser", "twice", "offered twice"),
+    ],
+)
+def test_a_kind_that_is_unknown_or_cannot_be_used_is_refused(slot: str, kind: str, said: str) -> None:
+    with pytest.raises(UnknownKind, match=said):
+        lookup(slot, kind)
 
 
 def test_a_slot_no_rig_has_is_a_mistake_of_the_program() -> None:

@@ -12,12 +12,13 @@ import pytest
 
 from drivers.clock import VirtualClock
 from drivers.errors import DeviceFault, DeviceNotFound, LimitExceeded
-from drivers.frames import BlockFlag, BlockHeader, FrameBlock, Mark
+from drivers.frames import BlockFlag, FrameBlock, Mark
 from drivers.interfaces import SpadRequest, WindowTable
 from drivers.registry import Surroundings
 from drivers.replay.spad import KIND, ReplaySpad, ReplaySpadConfig
 from drivers.ring import BlockRing, OnFull
 from drivers.spb1 import BlockLayout, block_parts, block_views, seal_block
+from tests.unit.drivers.spb1_bytes import GOLDEN_HEADER
 
 WIDTH, HEIGHT = 96, 4
 PERIOD = 1000
@@ -35,24 +36,22 @@ def block(run_id: int, seq: int, first: int, n: int, lost: int, **header_fields:
     records["marks"] = np.where(np.isin(numbers, SCANS), int(Mark.SCAN), 0)
     records["sweep"] = (70_000 + np.searchsorted(SCANS, numbers, "right")) & 0xFFFF
     bits[:, 0, 0], bits[:, 1, 0] = numbers, run_id
-    header = BlockHeader(
+    header = replace(
+        GOLDEN_HEADER,
         flags=BlockFlag.FIRST if seq == 0 else BlockFlag(0),
         run_id=run_id,
         block_seq=seq,
         first_frame=first,
         t0_ticks=10**12 + first * PERIOD,
         lost_before=lost,
-        tick_hz=Fraction(100_000_000),
-        frame_period_ticks=PERIOD,
-        exposure_ticks=900,
         sweep=70_000 + int(np.searchsorted(SCANS, first, "right")),
-        frame_step=1,
         width=WIDTH,
         height=HEIGHT,
         sensor_width=WIDTH,
         sensor_height=HEIGHT,
+        **header_fields,
     )
-    return seal_block(buffer, replace(header, **header_fields), layout, frames_lost=lost, payload_crc=True)
+    return seal_block(buffer, header, layout, frames_lost=lost, payload_crc=True)
 
 
 def two_starts() -> list[FrameBlock]:

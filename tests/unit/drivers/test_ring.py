@@ -3,7 +3,7 @@
 import random
 import threading
 import time
-from fractions import Fraction
+from dataclasses import replace
 
 import numpy as np
 import pytest
@@ -11,8 +11,9 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from drivers.errors import DeviceFault, DeviceTimeout, RingOverflow, WrongState
-from drivers.frames import FRAME_RECORD, BlockFlag, BlockHeader, FrameBlock
+from drivers.frames import FRAME_RECORD, FrameBlock
 from drivers.ring import BlockRing, OnFull, RingReader
+from tests.unit.drivers.spb1_bytes import GOLDEN_HEADER
 
 STRIDE = 4096
 
@@ -20,7 +21,7 @@ STRIDE = 4096
 def block_in(memory: np.ndarray, seq: int) -> FrameBlock:
     """A block that lies in `memory` and whose bytes are all `seq`."""
     memory[:] = seq % 251
-    header = BlockHeader(BlockFlag(0), 1, seq, seq, 0, 0, Fraction(1), 1, 1, 0, 1, 64, 8, 64, 8)
+    header = replace(GOLDEN_HEADER, block_seq=seq, first_frame=seq)
     return FrameBlock(header, np.zeros(1, FRAME_RECORD), memory[:64].reshape(1, 8, 8))
 
 
@@ -87,24 +88,18 @@ def test_a_reader_may_hold_the_newest_blocks_for_work_that_is_under_way() -> Non
     assert ring.claim(0) is None
 
 
-def test_a_reader_cannot_hold_more_than_there_is() -> None:
-    ring = BlockRing(3, STRIDE)
-    with pytest.raises(ValueError, match="holds 4 of 3 slots"):
-        ring.reader("count", holds=4)
-    ring.reader("monitor", required=False)
-    with pytest.raises(ValueError, match="holds 3 of 3 slots"):
+def test_readers_that_could_hold_every_slot_and_a_ring_of_nothing_are_refused() -> None:
+    for slots, stride in ((0, 1), (1, 0), (-1, 4096)):
+        with pytest.raises(ValueError, match="at least 1"):
+            BlockRing(slots, stride)
+    ring = BlockRing(2, STRIDE)
+    with pytest.raises(ValueError, match="holds 3 of 2 slots"):
         ring.reader("count", holds=3)
-
-
-def test_the_last_frame_is_that_of_the_last_block_even_if_it_was_dropped() -> None:
-    ring = BlockRing(2, STRIDE, on_full=OnFull.DROP)
-    ring.reader("slow")
-    assert ring.last_frame == -1
-    put(ring, 0)
-    put(ring, 1)
-    assert ring.last_frame == 1
-    ring.mark_overflow(5)
-    assert ring.last_frame == 6
+    ring.reader("monitor", required=False)
+    with pytest.raises(ValueError, match="holds 2 of 2 slots"):
+        ring.reader("count", holds=2)
+    with pytest.raises(ValueError, match="make the ring longer"):
+        ring.reader("two", required=False)
 
 
 def test_several_slots_are_claimed_ahead_and_published_in_order() -> None:
@@ -118,7 +113,11 @@ def test_several_slots_are_claimed_ahead_and_published_in_order() -> None:
     assert [sequence(reader.next(0)) for _ in range(3)] == [0, 1, 2]
 
 
-def test_a_discarded_slot_is_free_again_and_nobody_sees_it() -> None:
+def test_a_slot_that_is_discarded_or_that_nobody_reads_is_free_again() -> None:
+    ring = BlockRing(1, STRIDE)
+    for seq in range(3):
+        put(ring, seq)
+    assert ring.high_water == 0
     ring = BlockRing(1, STRIDE)
     reader = ring.reader("count")
     assert ring.claim(0) is not None
@@ -126,13 +125,6 @@ def test_a_discarded_slot_is_free_again_and_nobody_sees_it() -> None:
     put(ring, 5)
     assert sequence(reader.next(0)) == 5
     assert ring.high_water == 1
-
-
-def test_without_readers_nothing_piles_up() -> None:
-    ring = BlockRing(1, STRIDE)
-    for seq in range(3):
-        put(ring, seq)
-    assert ring.high_water == 0
 
 
 def test_an_optional_reader_gets_the_newest_block_and_counts_the_others() -> None:
@@ -159,13 +151,6 @@ def test_an_optional_reader_holds_one_slot_and_never_the_last_one() -> None:
         monitor.next(0)
     put(ring, 20)
     assert sequence(monitor.next(0)) == 20
-
-
-def test_optional_readers_that_could_hold_every_slot_are_refused() -> None:
-    ring = BlockRing(2, STRIDE)
-    ring.reader("one", required=False)
-    with pytest.raises(ValueError, match="make the ring longer"):
-        ring.reader("two", required=False)
 
 
 def test_a_reader_that_closes_holds_nobody_up() -> None:
@@ -213,12 +198,16 @@ def test_a_ring_that_does_not_wait_answers_at_once(on_full: OnFull) -> None:
     assert sequence(reader.next(0)) == 0
 
 
-def test_dropped_blocks_are_counted_and_the_run_goes_on() -> None:
-    ring = BlockRing(1, STRIDE, on_full=OnFull.DROP)
+def test_dropped_blocks_are_counted_with_their_frames_and_the_run_goes_on() -> None:
+    ring = BlockRing(2, STRIDE, on_full=OnFull.DROP)
+    assert ring.last_frame == -1
+    put(ring, 0)
+    put(ring, 1)
+    assert ring.last_frame == 1
     ring.mark_overflow(64)
     ring.mark_overflow(10)
-    assert (ring.dropped_blocks, ring.dropped_frames) == (2, 74)
-    put(ring, 0)
+    assert (ring.dropped_blocks, ring.dropped_frames, ring.last_frame) == (2, 74, 75)
+    put(ring, 76)
 
 
 def test_where_no_frame_may_be_lost_the_first_dropped_block_ends_the_run_and_says_what_to_do() -> None:
@@ -244,19 +233,6 @@ def test_the_time_that_a_source_waits_is_measured_and_its_wait_can_be_ended() ->
     assert ring.waited_s < 60
 
 
-def test_a_reader_may_give_its_block_back_before_it_asks_for_the_next() -> None:
-    ring = BlockRing(1, STRIDE)
-    reader = ring.reader("count")
-    put(ring, 0)
-    reader.next(0)
-    assert ring.full
-    reader.release()
-    reader.release()
-    assert not ring.full
-    put(ring, 1)
-    assert sequence(reader.next(0)) == 1
-
-
 def test_verbs_out_of_order_are_refused() -> None:
     ring = BlockRing(1, STRIDE)
     with pytest.raises(WrongState, match="without a claimed slot"):
@@ -275,30 +251,18 @@ def test_verbs_out_of_order_are_refused() -> None:
             late()
 
 
-@pytest.mark.parametrize(("slots", "stride"), [(0, 1), (1, 0), (-1, 4096)])
-def test_a_ring_of_nothing_is_refused(slots: int, stride: int) -> None:
-    with pytest.raises(ValueError, match="at least 1"):
-        BlockRing(slots, stride)
-
-
-def test_a_source_waits_for_a_slot_that_comes_free() -> None:
+def test_a_source_waits_for_a_slot_that_comes_free_and_a_reader_wakes_up_at_the_end() -> None:
     ring = BlockRing(1, STRIDE)
-    reader = ring.reader("count")
+    reader, last = ring.reader("count"), ring.reader("last")
     put(ring, 0)
     reader.next(0)
-    later = threading.Timer(0.02, reader.close)
-    later.start()
+    last.next(0)
+    last.release()
+    threading.Timer(0.02, reader.close).start()
     assert ring.claim(60) is not None
-    later.join()
-
-
-def test_a_reader_wakes_up_at_the_end() -> None:
-    ring = BlockRing(1, STRIDE)
-    reader = ring.reader("count")
-    later = threading.Timer(0.02, ring.finish)
-    later.start()
-    assert reader.next() is None
-    later.join()
+    ring.discard()
+    threading.Timer(0.02, ring.finish).start()
+    assert last.next() is None
 
 
 @settings(max_examples=25, deadline=None)

@@ -1,6 +1,6 @@
 """SPB1 under random geometry and random damage: nothing wrong is ever delivered, nothing sound is ever missed."""
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from fractions import Fraction
 
 import numpy as np
@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 from drivers.errors import UnsupportedBlock
 from drivers.frames import BlockFlag, BlockHeader, FrameBlock
 from drivers.spb1 import ALIGN, BlockLayout, Damage, block_views, frames_per_block, parse_block, seal_block, walk_blocks
-from tests.unit.drivers.spb1_bytes import PAYLOAD, golden_block, header_bytes, trailer_bytes
+from tests.unit.drivers.spb1_bytes import GOLDEN_HEADER, golden_block
 
 FEW = settings(max_examples=150, deadline=None)
 
@@ -24,18 +24,15 @@ def written_block(layout: BlockLayout, stride: int, seq: int, rng: np.random.Gen
     packed = np.packbits(rng.random((layout.n_frames, layout.height, layout.width)) < 0.3, axis=2)
     bits[:] = 0
     bits[:, :, : packed.shape[2]] = packed
-    header = BlockHeader(
+    header = replace(
+        GOLDEN_HEADER,
         flags=BlockFlag.FIRST if seq == 0 else BlockFlag(0),
-        run_id=9,
         block_seq=seq,
         first_frame=seq * 1000,
         t0_ticks=int(rng.integers(0, 2**62)),
         lost_before=int(rng.integers(0, 2**62)),
         tick_hz=Fraction(int(rng.integers(1, 2**32)), int(rng.integers(1, 2**32))),
-        frame_period_ticks=1000,
-        exposure_ticks=900,
         sweep=seq,
-        frame_step=1,
         width=layout.width,
         height=layout.height,
         sensor_width=65_535,
@@ -197,48 +194,43 @@ def test_noise_gives_no_block(noise: bytes, known_stride: bool) -> None:
     assert sum(item.length for item in damage) <= len(noise)
 
 
-def gold(**fields: int) -> bytes:
-    block = header_bytes(**fields) + PAYLOAD + trailer_bytes(block_seq=fields.get("block_seq", 3))  # type: ignore[arg-type]
-    return block + bytes(1024 - len(block))
-
-
 def test_damage_says_where_and_why() -> None:
-    raw = golden_block() + bytes(2048) + gold(block_seq=5)
-    items = list(walk_blocks(np.frombuffer(raw, np.uint8), 1024, check_payload=True))
-    assert items[1] == Damage(1024, 2048, "no block: starts with 0x00000000, not 0x53504231 (SPB1)")
-    assert [item.header.block_seq for item in items if isinstance(item, FrameBlock)] == [3, 5]
-
-
-def test_a_damaged_payload_is_one_damage_of_one_block() -> None:
     hurt = bytearray(golden_block())
     hurt[200] ^= 1
-    raw = gold(block_seq=2) + hurt + gold(block_seq=4)
-    for stride in (1024, None):
-        blocks, damage = walked(np.frombuffer(raw, np.uint8), stride)
-        assert [block.header.block_seq for block in blocks] == [2, 4]
-        assert [(item.offset, item.length) for item in damage] == [(1024, 1024)]
+    raw = golden_block(block_seq=2) + hurt + golden_block(block_seq=4) + bytes(2048) + golden_block(block_seq=5)
+    blocks, damage = walked(np.frombuffer(raw, np.uint8), 1024)
+    assert [block.header.block_seq for block in blocks] == [2, 4, 5]
+    assert [(item.offset, item.length, item.reason.split(":")[0]) for item in damage] == [
+        (1024, 1024, "payload of block 3"),
+        (3072, 2048, "no block"),
+    ]
+    blocks, damage = walked(np.frombuffer(raw, np.uint8), None)  # zeros are padding then
+    assert [block.header.block_seq for block in blocks] == [2, 4, 5]
+    assert [(item.offset, item.length) for item in damage] == [(1024, 1024)]
 
 
 def test_a_block_that_comes_twice_is_delivered_once() -> None:
-    raw = golden_block() * 2 + gold(block_seq=2) + gold(block_seq=4)
+    raw = golden_block() * 2 + golden_block(block_seq=2) + golden_block(block_seq=4)
     blocks, damage = walked(np.frombuffer(raw, np.uint8), 1024)
     assert [block.header.block_seq for block in blocks] == [3, 4]
     assert [item.offset for item in damage] == [1024, 2048]
     assert damage[0].reason == "block 3 of run 7 comes after block 3"
 
 
-def test_another_run_counts_its_blocks_anew() -> None:
-    raw = golden_block() + gold(run_id=8, block_seq=0)
-    blocks, damage = walked(np.frombuffer(raw, np.uint8), None)
-    assert [(block.header.run_id, block.header.block_seq) for block in blocks] == [(7, 3), (8, 0)]
-    assert damage == []
-
-
-@pytest.mark.parametrize("payload_type", [0x7E, 0x7F])
-def test_control_blocks_are_passed_over(payload_type: int) -> None:
-    raw = golden_block() + gold(payload_type=payload_type, tick_hz=0) + gold(block_seq=4)
+@pytest.mark.parametrize(
+    ("between", "numbers"),
+    [
+        ({"run_id": 8, "block_seq": 0}, [(7, 3), (8, 0), (7, 4)]),  # another run counts its blocks anew
+        ({"payload_type": 0x7E, "tick_hz": 0}, [(7, 3), (7, 4)]),  # control blocks are passed over
+        ({"payload_type": 0x7F, "tick_hz": 0}, [(7, 3), (7, 4)]),
+    ],
+)
+def test_a_block_of_another_run_and_control_blocks_are_no_damage(
+    between: dict[str, int], numbers: list[tuple[int, int]]
+) -> None:
+    raw = golden_block() + golden_block(**between) + golden_block(block_seq=4)
     blocks, damage = walked(np.frombuffer(raw, np.uint8), 1024)
-    assert [block.header.block_seq for block in blocks] == [3, 4]
+    assert [(block.header.run_id, block.header.block_seq) for block in blocks] == numbers
     assert damage == []
 
 
@@ -247,7 +239,7 @@ def test_control_blocks_are_passed_over(payload_type: int) -> None:
 )
 def test_a_stream_of_another_sort_is_refused(fields: dict[str, int]) -> None:
     with pytest.raises(UnsupportedBlock):
-        walked(np.frombuffer(golden_block() + gold(**fields), np.uint8), 1024)
+        walked(np.frombuffer(golden_block() + golden_block(**fields), np.uint8), 1024)
 
 
 def test_a_payload_that_holds_a_block_is_no_place_to_start_from_while_the_outer_block_is_sound() -> None:

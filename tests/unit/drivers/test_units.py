@@ -74,32 +74,19 @@ def test_a_quantity_is_read_in_si_correctly_rounded(text: str, dimension: str, v
     assert parse_quantity(text, dimension) == value
 
 
-@pytest.mark.parametrize("bare", [1e-5, 10, 0, True, None, [10, "us"], "10", "1e-5"])
-def test_a_bare_number_is_refused_with_an_example(bare: object) -> None:
-    with pytest.raises(ValueError, match="10 us") as refused:
-        parse_quantity(bare, "time")
+@pytest.mark.parametrize(
+    "text",
+    [
+        *(1e-5, 10, 0, True, None, [10, "us"], "10", "1e-5"),  # without a unit
+        *("nan s", "inf s", "-inf s", "1e400 s", "1e9999 s", "1e-400 s", "1/0 s", "", "s", "ten s"),
+        *("1 m", "1 Hz", "1 S", "1 us us", "1 us 2", "1,5 us", "1 2 us", "1us/2", "0x10 s", "١ s"),
+        "1" * 100_000 + " s",  # refused at once
+    ],
+)
+def test_what_is_no_time_is_refused_in_one_short_line(text: object) -> None:
+    with pytest.raises(ValueError, match=r'like "10 us"|no unit of time; use s, ms|64-bit floats') as refused:
+        parse_quantity(text, "time")
     assert "\n" not in str(refused.value)
-
-
-@pytest.mark.parametrize(
-    "text", ["nan s", "inf s", "-inf s", "1e400 s", "1e9999 s", "1e-400 s", "1/0 s", "", "s", "ten s"]
-)
-def test_what_is_no_finite_number_is_refused(text: str) -> None:
-    with pytest.raises(ValueError, match=r"s"):
-        parse_quantity(text, "time")
-
-
-@pytest.mark.parametrize(
-    "text", ["1 m", "1 Hz", "1 S", "1 us us", "1 us 2", "1,5 us", "1 2 us", "1us/2", "0x10 s", "١ s"]
-)
-def test_another_dimension_or_stray_text_is_refused(text: str) -> None:
-    with pytest.raises(ValueError, match=r"time|number"):
-        parse_quantity(text, "time")
-
-
-def test_an_endless_text_is_refused_at_once_and_shown_shortened() -> None:
-    with pytest.raises(ValueError, match="no number") as refused:
-        parse_quantity("1" * 100_000 + " s", "time")
     assert len(str(refused.value)) < 150
 
 
@@ -110,15 +97,10 @@ def test_an_exact_frequency_stays_exact() -> None:
 
 
 @settings(deadline=None)  # a busy machine is no failure
-@given(FINITE, DIMENSION)
-def test_a_float_written_as_text_reads_back_to_the_same_float(value: float, dimension: str) -> None:
+@given(FINITE, st.fractions(max_denominator=10**9), DIMENSION)
+def test_a_number_written_as_text_reads_back_exactly(value: float, fraction: Fraction, dimension: str) -> None:
     assert parse_quantity(format_quantity(value, dimension), dimension) == value
-
-
-@settings(deadline=None)  # a busy machine is no failure
-@given(st.fractions(max_denominator=10**9), DIMENSION)
-def test_a_fraction_written_as_text_reads_back_exactly(value: Fraction, dimension: str) -> None:
-    assert parse_exact(format_quantity(value, dimension), dimension) == value
+    assert parse_exact(format_quantity(fraction, dimension), dimension) == fraction
 
 
 @settings(deadline=None)  # a busy machine is no failure
