@@ -26,11 +26,11 @@ from drivers.errors import (
 )
 from drivers.frames import BlockFlag, FrameBlock
 from drivers.interfaces import SpadRequest
-from drivers.ring import BlockRing, OnFull
+from drivers.ring import OnFull
 from drivers.spads.spad512s import Spad512s, Spad512sConfig
 from drivers.spads.spad512s_line import Deadlines
 from drivers.transports.endpoints import Endpoint
-from drivers.transports.tap import CONTROL_FILE, IN, OUT, TapFile, read_taps
+from drivers.transports.tap import CONTROL_FILE, IN, OUT, Tap, TapFile, read_taps
 from sim_backend.wire.firmware.spad512s import Spad512sModel
 from sim_backend.wire.serve.tcp import TcpServer
 from tests.wire.lasers import PATIENCE_S
@@ -100,34 +100,31 @@ def scripted(*turns: tuple[bytes, bytes]) -> Iterator[tuple[str, list[bytes]]]:
 INFO = b"M1\nS1\n2.0\n1.0\n1.0\n512\n1\n1\n1\n"
 
 
-def test_trap_bits_come_most_significant_first_and_frames_lie_on_their_side() -> None:
+@contextmanager
+def answering(n_frames: int, answer: bytes, tap: Tap | None = None) -> Iterator[Spad512s]:
+    """A device that answers one run of n frames with these very bytes."""
+    script = ((b"D", INFO), (b"PU,0", b"ok"), (f"I,1,20,{n_frames},0,1,0,1\n".encode(), answer))
+    with scripted(*script) as (address, heard), Spad512s(Spad512sConfig(), Endpoint(address), PATIENT, tap) as device:
+        yield device
+        assert heard == [command for command, _ in script]
+
+
+def test_trap_bits_come_most_significant_first_and_frames_lie_on_their_side(tmp_path: Path) -> None:
     # One bit at the right end of the sensor's row 0: the corner that a quarter turn to the left takes to the top left.
     pixels = bytearray(2 * FRAME_BYTES)
     pixels[63] = 0x01
     pixels[FRAME_BYTES + 511 * 64] = 0x80  # frame 1: left end of the last row, which comes to the bottom right
-    script = (
-        (b"D", INFO),
-        (b"PU,0", b"ok"),
-        (b"I,1,20,2,0,1,0,1\n", bytes(pixels) + b"DONE"),
-    )
-    with scripted(*script) as (address, heard), Spad512s(Spad512sConfig(), Endpoint(address), PATIENT) as device:
+    tap = TapFile.begin(tmp_path / CONTROL_FILE).tap("spad")
+    with answering(2, bytes(pixels) + b"DONE", tap) as device:
         (block,) = take(device, 2)
-        assert heard == [turn[0] for turn in script]
     image = np.unpackbits(block.bits, axis=2)
     assert np.argwhere(image[0]).tolist() == [[0, 0]]
     assert np.argwhere(image[1]).tolist() == [[511, 511]]
     assert block.header.flags == BlockFlag.FIRST | BlockFlag.LAST | BlockFlag.BURST
     assert not block.records["marks"].any()
-
-
-def test_commands_and_answers_are_tapped_and_pixels_are_not(tmp_path: Path) -> None:
-    tap = TapFile.begin(tmp_path / CONTROL_FILE).tap("spad")
-    script = ((b"D", INFO), (b"PU,0", b"ok"), (b"I,1,20,2,0,1,0,1\n", bytes(2 * FRAME_BYTES) + b"DONE"))
-    with scripted(*script) as (address, _), Spad512s(Spad512sConfig(), Endpoint(address), PATIENT, tap) as device:
-        take(device, 2)
-    tap.flush()
+    tap.flush()  # commands and answers are tapped, pixels are not
     passed = read_taps(tmp_path / CONTROL_FILE)
-    assert [one.data for one in passed if one.direction == OUT] == [command for command, _ in script]
+    assert [one.data for one in passed if one.direction == OUT] == [b"D", b"PU,0", b"I,1,20,2,0,1,0,1\n"]
     assert INFO in [one.data for one in passed if one.direction == IN]
     assert sum(len(one.data) for one in passed) < 500
 
@@ -202,35 +199,21 @@ def test_trap_error_text_is_never_taken_for_pixels(at_byte: int) -> None:
     with connected(model) as (device, _):
         model.fail_at_byte = at_byte
         ring, reader = begin(device, REQUEST, 64, 8)
-        with pytest.raises(DeviceFault, match="ERROR"):  # noqa: PT012
-            while device.fill(ring, PATIENCE_S):
-                pass
+        with pytest.raises(DeviceFault, match="ERROR"):
+            finish(device, ring)
         ring.finish()
         for block in reader:
             assert np.array_equal(block.bits, noise(block.header.first_frame, 0, 0, block.n_frames))
 
 
-def test_trap_error_at_the_very_end_of_a_run_of_the_right_length() -> None:
-    pixels = np.zeros(FRAME_BYTES, np.uint8)
-    pixels[-6:] = np.frombuffer(b" ERROR"[:6], np.uint8)
-    with (
-        scripted((b"D", INFO), (b"PU,0", b"ok"), (b"I,1,20,1,0,1,0,1\n", pixels.tobytes()[4:] + b" too hot ERROR")) as (
-            address,
-            _,
-        ),
-        Spad512s(Spad512sConfig(), Endpoint(address), PATIENT) as device,
-        pytest.raises(DeviceFault, match="too hot ERROR"),
-    ):
-        take(device, 1)
-
-
-def test_something_else_than_done_behind_the_pixels_is_refused() -> None:
-    answer = bytes(FRAME_BYTES) + b"DON"
-    with (
-        scripted((b"D", INFO), (b"PU,0", b"ok"), (b"I,1,20,1,0,1,0,1\n", answer + b"X")) as (address, _),
-        Spad512s(Spad512sConfig(), Endpoint(address), PATIENT) as device,
-        pytest.raises(ProtocolError, match="not DONE"),
-    ):
+@pytest.mark.parametrize(
+    ("behind", "sort", "said"),
+    [(b" ERROR too hot ERROR", DeviceFault, "too hot ERROR"), (bytes(6) + b"DONX", ProtocolError, "not DONE")],
+)
+def test_trap_error_or_anything_but_done_at_the_end_of_the_right_length(
+    behind: bytes, sort: type[DeviceError], said: str
+) -> None:
+    with answering(1, bytes(FRAME_BYTES - 6) + behind) as device, pytest.raises(sort, match=said):
         take(device, 1)
 
 
@@ -255,7 +238,7 @@ def test_trap_done_glued_to_text_answers() -> None:
         assert len(take(device, 16)) == 1
 
 
-def test_trap_commands_are_never_pipelined() -> None:
+def test_trap_commands_are_never_pipelined_and_pile_up_goes_before_every_run() -> None:
     class Strict(Spad512sModel):
         early = False
 
@@ -267,58 +250,47 @@ def test_trap_commands_are_never_pipelined() -> None:
     with connected(model) as (device, _):
         _ = device.health
         take(device, 16)
+        take(device, 1)  # each run has a PU of its own
         _ = device.health
     assert not model.early
-    assert model.commands == ["D", "R", "V", "PU,0", "I,1,20,16,0,1,0,1", "R", "V"]
+    runs = ["PU,0", "I,1,20,16,0,1,0,1", "PU,0", "I,1,20,1,0,1,0,1"]
+    assert model.commands == ["D", "R", "V", *runs, "R", "V"]
 
 
-def test_trap_pile_up_goes_before_every_run() -> None:
-    model = Spad512sModel(noise)
-    with connected(model) as (device, _):
-        take(device, 1)
-        take(device, 1)
-        assert [command[:2] for command in model.commands] == ["D", "PU", "I,", "PU", "I,"]
-
-
-def test_trap_one_client_the_second_is_refused() -> None:
+def test_trap_a_second_client_and_a_unit_without_intensity_imaging_are_refused() -> None:
     with (
         connected(Spad512sModel(noise)) as (_, server),
         pytest.raises(DeviceNotFound, match="refuses the connection"),
     ):
         Spad512s(Spad512sConfig(), server.endpoint)
-
-
-def test_a_server_that_hangs_up_at_once_is_busy() -> None:
-    listener = socket.create_server(("127.0.0.1", 0))
-    thread = threading.Thread(target=lambda: listener.accept()[0].close(), daemon=True)
-    thread.start()
-    with listener, pytest.raises(DeviceBusy, match="it serves one client"):
-        Spad512s(Spad512sConfig(), Endpoint(f"127.0.0.1:{listener.getsockname()[1]}"))
-    thread.join(PATIENCE_S)
-
-
-def test_wrong_addresses_and_wrong_programs_are_one_line_each() -> None:
-    with socket.create_server(("127.0.0.1", 0)) as free:
-        unused = f"127.0.0.1:{free.getsockname()[1]}"
-    cases: list[tuple[str, type[DeviceError], str]] = [
-        (unused, DeviceNotFound, "start the program"),
-        ("127.0.0.1", DeviceNotFound, "host:port"),
-        ("127.0.0.1:99999", DeviceNotFound, "host:port"),
-    ]
-    for address, sort, words in cases:
-        with pytest.raises(sort, match=words) as refused:
-            Spad512s(Spad512sConfig(), Endpoint(address), PATIENT)
-        assert "\n" not in str(refused.value)
-
-
-def test_a_silent_program_is_a_timeout() -> None:
-    with socket.create_server(("127.0.0.1", 0)) as listener, pytest.raises(DeviceTimeout, match="nothing greets"):
-        Spad512s(Spad512sConfig(), Endpoint(f"127.0.0.1:{listener.getsockname()[1]}"), Deadlines(open_s=0.1))
-
-
-def test_trap_a_unit_without_intensity_imaging_is_refused() -> None:
     with TcpServer(Spad512sModel(noise, intensity=False)) as server, pytest.raises(DeviceFault, match="not enabled"):
         Spad512s(Spad512sConfig(), server.endpoint)
+
+
+@pytest.mark.parametrize(
+    ("sort", "said", "hangs_up"), [(DeviceBusy, "it serves one client", True), (DeviceTimeout, "nothing greets", False)]
+)
+def test_a_server_that_hangs_up_at_once_is_busy_and_a_silent_one_a_timeout(
+    sort: type[DeviceError], said: str, hangs_up: bool
+) -> None:
+    with socket.create_server(("127.0.0.1", 0)) as listener:
+        if hangs_up:
+            threading.Thread(target=lambda: listener.accept()[0].close(), daemon=True).start()
+        with pytest.raises(sort, match=said):
+            Spad512s(
+                Spad512sConfig(),
+                Endpoint(f"127.0.0.1:{listener.getsockname()[1]}"),
+                Deadlines(open_s=PATIENCE_S if hangs_up else 0.1),
+            )
+
+
+def test_wrong_addresses_are_one_line_each() -> None:
+    with socket.create_server(("127.0.0.1", 0)) as free:
+        unused = f"127.0.0.1:{free.getsockname()[1]}"
+    for address, said in ((unused, "start the program"), ("127.0.0.1", "host:port"), ("127.0.0.1:99999", "host:port")):
+        with pytest.raises(DeviceNotFound, match=said) as refused:
+            Spad512s(Spad512sConfig(), Endpoint(address), PATIENT)
+        assert "\n" not in str(refused.value)
 
 
 def test_the_1m_flavour_has_1024_rows_and_lies_on_its_side() -> None:
@@ -348,10 +320,8 @@ def test_a_rate_that_does_not_follow_from_the_exposure_is_refused_or_triggered()
 
 @pytest.mark.parametrize("heeds_stop", [True, False])
 def test_trap_a_stop_may_not_be_heeded_and_the_device_is_ready_for_the_next_run(heeds_stop: bool) -> None:
-    with connected(Spad512sModel(noise, heeds_stop=heeds_stop, paced=not heeds_stop)) as (device, server):
-        timing = device.configure(REQUEST)
-        ring = BlockRing(4, timing.stride)
-        device.start(10_000)
+    with connected(Spad512sModel(noise, heeds_stop=heeds_stop, paced=not heeds_stop)) as (device, _):
+        ring, _ = begin(device, REQUEST, 10_000, 4)
         device.fill(ring, PATIENCE_S)
         with pytest.raises(WrongState, match="health is not possible while running"):
             _ = device.health
@@ -359,14 +329,11 @@ def test_trap_a_stop_may_not_be_heeded_and_the_device_is_ready_for_the_next_run(
         counters = device.counters
         assert (counters.delivered, counters.lost) == (16, 10_000 - 16)
         assert len(take(device, 32)) == 2
-        assert server.model is not None
 
 
 def test_a_program_that_ends_or_hangs_within_a_run_is_said_so() -> None:
     with connected(Spad512sModel(noise, paced=True)) as (device, server):
-        timing = device.configure(REQUEST)
-        ring = BlockRing(4, timing.stride)
-        device.start(10_000)
+        ring, _ = begin(device, REQUEST, 10_000, 4)
         device.fill(ring, PATIENCE_S)
         server.hang()
         with pytest.raises(DeviceTimeout, match="sent nothing"):  # noqa: PT012

@@ -4,6 +4,7 @@ import struct
 import zlib
 from dataclasses import replace
 from fractions import Fraction
+from typing import Any
 
 import numpy as np
 import pytest
@@ -21,11 +22,11 @@ from drivers.errors import (
 )
 from drivers.frames import BlockFlag, Mark
 from drivers.interfaces import WindowTable
-from drivers.ring import BlockRing
 from drivers.spb1.control import Ack, AckStatus, Command, Feature, Op, Register, SensorState, pattern_row, read_acks
 from sim_backend.wire.firmware.spb_usb import SpbUsbModel
 from sim_backend.wire.firmware.spb_usb_run import SpbUsbBoard
 from sim_backend.wire.serve.usb import EmulatedUsb
+from tests.wire.spads import begin, finish
 from tests.wire.spb_device import (
     HEIGHT,
     LINE_FRAMES,
@@ -93,19 +94,19 @@ def test_what_is_written_before_a_run() -> None:
     [
         ({"product_name": "FX3 camera"}, DeviceNotFound, "no USB device|none is attached"),
         ({"protocol": 0x0200}, DeviceFault, r"speaks SPB1 2\.0, this driver 1\.x"),
+        ({"magic": 0x12345678}, DeviceNotFound, "identity 0x12345678 is not SPB1"),
+        ({"deaf": True}, DeviceNotFound, "does not speak SPB1"),
     ],
 )
-def test_the_wrong_firmware_is_one_line(settings: dict[str, object], sort: type[DeviceError], words: str) -> None:
+def test_the_wrong_firmware_is_one_line(settings: dict[str, Any], sort: type[DeviceError], words: str) -> None:
+    deaf, magic = settings.pop("deaf", False), settings.pop("magic", None)
+    device = model(**settings)
+    device.deaf = deaf
+    if magic is not None:
+        device._registers[Register.MAGIC] = magic
     with pytest.raises(sort, match=words) as refused:
-        opened(model(**settings))
-    assert "\n" not in str(refused.value)
-
-
-def test_another_board_with_the_same_ids_and_name_is_told_by_its_identity_register() -> None:
-    device = model()
-    device._registers[Register.MAGIC] = 0x12345678
-    with pytest.raises(DeviceNotFound, match="identity 0x12345678 is not SPB1"):
         opened(device)
+    assert "\n" not in str(refused.value)
 
 
 def test_a_flipped_bit_in_an_answer_without_a_checksum_is_noticed() -> None:
@@ -127,13 +128,6 @@ def test_a_flipped_bit_in_an_answer_without_a_checksum_is_noticed() -> None:
         device.left = 100
         with pytest.raises(ProtocolError, match="two answers to the same question differ"):
             take(spad, 20)
-
-
-def test_an_fx3_that_does_not_speak_spb1_is_not_found() -> None:
-    device = model()
-    device.deaf = True
-    with pytest.raises(DeviceNotFound, match="does not speak SPB1"):
-        opened(device)
 
 
 def test_absent_forbidden_and_two_equal_devices_are_one_line_each() -> None:
@@ -184,8 +178,7 @@ def test_a_device_found_running_is_aborted_first() -> None:
     first.start(None)
     first._link.close()  # the program dies
     with on_bus(bus) as again:
-        blocks = take(again, 50)
-        assert require_right(blocks) == list(range(50))
+        assert require_right(take(again, 50)) == list(range(50))
 
 
 def test_a_rate_off_the_ticks_is_refused_with_the_nearest() -> None:
@@ -253,27 +246,21 @@ def test_heartbeats_between_slow_frames_are_no_frames_and_pings_go_on() -> None:
 def test_a_host_that_falls_silent_ends_the_run_with_the_gate_low() -> None:
     device = model(paced=True)
     with opened(device, heartbeat="50 ms") as spad:
-        timing = spad.configure(REQUEST)
-        ring = BlockRing(8, timing.stride)
-        spad.start(None)
+        ring, _ = begin(spad, REQUEST, None, 8)
         assert device.gate_allowed
         spad._clock.sleep(0.15)  # a hung program sends no pings
-        with pytest.raises(DeviceFault, match=r"heard nothing of this program for 0\.05 s, dropped its gate"):  # noqa: PT012
-            while spad.fill(ring, 1.0):
-                pass
+        with pytest.raises(DeviceFault, match=r"heard nothing of this program for 0\.05 s, dropped its gate"):
+            finish(spad, ring)
         assert not device.gate_allowed
         assert device.state is SensorState.ARMED
         spad.stop()
-        blocks = take(spad, 20)
-        assert require_right(blocks) == list(range(20))
+        assert require_right(take(spad, 20)) == list(range(20))
 
 
 def test_stop_aborts_with_the_gate_low_and_counts_what_was_exposed() -> None:
     device = model()
     with opened(device) as spad:
-        timing = spad.configure(REQUEST)
-        ring = BlockRing(50, timing.stride)
-        spad.start(None)
+        ring, _ = begin(spad, REQUEST, None)
         for _ in range(5):
             assert spad.fill(ring, 1.0)
         spad.stop()
@@ -290,9 +277,7 @@ def test_a_firmware_that_hangs_is_a_timeout_and_unplugging_a_disconnection() -> 
     device = model()
     attached = bus.plug(device)
     with on_bus(bus) as spad:
-        timing = spad.configure(REQUEST)
-        ring = BlockRing(50, timing.stride)
-        spad.start(None)
+        ring, _ = begin(spad, REQUEST, None)
         spad.fill(ring, 1.0)
         device.deaf = True
         with pytest.raises(DeviceTimeout):  # noqa: PT012
@@ -300,9 +285,8 @@ def test_a_firmware_that_hangs_is_a_timeout_and_unplugging_a_disconnection() -> 
                 pass
         device.deaf = False
         bus.unplug(attached)
-        with pytest.raises(DeviceDisconnected):  # noqa: PT012
-            while spad.fill(ring, 0.5):
-                pass
+        with pytest.raises(DeviceDisconnected):
+            finish(spad, ring)
         assert spad.counters.delivered > 0
         spad.stop()
     bus.plug(model())
