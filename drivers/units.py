@@ -196,7 +196,7 @@ class _Text:
     dimension: str
     exact: bool = False
 
-    def written(self, value: float) -> str:
+    def written(self, value: float | Fraction) -> str:
         """A number of such a field as it is written in a file."""
         return format_quantity(value, self.dimension)
 
@@ -205,10 +205,7 @@ class _Text:
             value = parse_quantity(text, self.dimension)  # also bounds what is taken as an exact value
             return parse_exact(text, self.dimension) if self.exact else value
 
-        def serialise(value: float | Fraction) -> str:
-            return format_quantity(value, self.dimension)
-
-        serialization = core_schema.plain_serializer_function_ser_schema(serialise, when_used="json")
+        serialization = core_schema.plain_serializer_function_ser_schema(self.written, when_used="json")
         return core_schema.no_info_plain_validator_function(parse, serialization=serialization)
 
     def __get_pydantic_json_schema__(self, schema: CoreSchema, handler: GetJsonSchemaHandler) -> dict[str, Any]:

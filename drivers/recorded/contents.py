@@ -124,13 +124,11 @@ MOST_COUNTED: Final = 2**63 - 2**32
 class Contents:
     """entries: the blocks in the order of their frames, run after run. problems: a line for each thing that is wrong.
 
-    indexed: whether the index told where they are. told: its sound records, in the order of places, whether what they
-    tell of is there or not.
+    told: the sound records of the index, in the order of places, whether what they tell of is there or not.
     """
 
     entries: Entries
     problems: list[str] = field(default_factory=list)
-    indexed: bool = True
     told: Entries = field(default_factory=lambda: np.empty(0, INDEX_RECORD))
 
 
@@ -157,7 +155,7 @@ def find_blocks(segments: Sequence[SegmentReader], folder: Path) -> Contents:
     entries, in_place = in_order(np.concatenate(parts), told, problems, folder=folder.is_dir())
     if not (indexed or in_place):
         problems.append("the blocks do not lie in the order of their frames")
-    return Contents(entries, problems, indexed, told)
+    return Contents(entries, problems, told)
 
 
 def read_entry(segment: SegmentReader, entry: Any) -> FrameBlock:

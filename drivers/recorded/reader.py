@@ -98,7 +98,6 @@ class RunRecording:
         self._segments = {segment.number: segment for segment in open_segments(path)}
         found = find_blocks(list(self._segments.values()), path)
         self.problems = found.problems
-        self.indexed = found.indexed
         self.runs = self._runs_of(found.entries)
         for problem in self.problems:
             _log.warning("%s: %s", path, problem)

@@ -71,17 +71,9 @@ class FrameTable:
         first = int(np.searchsorted(self.plain, start, "right")) - 1
         return range(first, int(np.searchsorted(self.plain, min(end, self.size), "left")))
 
-    def start(self, frame: int) -> int:
-        """Plain offset at which a frame begins."""
-        return int(self.plain[frame])
-
-    def frame_bytes(self, frame: int) -> int:
-        """Plain bytes of a frame."""
-        return int(self.plain[frame + 1] - self.plain[frame])
-
-    def packed_place(self, frame: int) -> tuple[int, int]:
-        """Offset and length of a frame in the file."""
-        return int(self.packed[frame]), int(self.packed[frame + 1] - self.packed[frame])
+    def places(self, frame: int) -> tuple[int, int, int, int]:
+        """Where a frame begins and ends in the file, and in the plain segment."""
+        return (*self.packed[frame : frame + 2].tolist(), *self.plain[frame : frame + 2].tolist())
 
 
 def table_bytes(sizes: Sequence[tuple[int, int]]) -> bytes:
@@ -202,15 +194,14 @@ class PackedSegment:
         """Bytes from `offset` on, fewer at the end, unpacked. CorruptBlock where they cannot be."""
         parts = []
         for frame in self._table.frames_at(offset, offset + length):
-            data = self._unpacked(frame)
-            start = self._table.start(frame)
-            parts.append(data[max(0, offset - start) : offset + length - start])
+            _, _, start, _ = self._table.places(frame)
+            parts.append(self._unpacked(frame)[max(0, offset - start) : offset + length - start])
         return parts[0] if len(parts) == 1 else np.concatenate([np.empty(0, np.uint8), *parts])
 
     def walk(self, start: int, end: int, *, check_payload: bool) -> Iterator[Placed | Damage]:
         """Blocks and damage between two offsets, at the beginnings of which there are frames of the compression."""
         for frame in self._table.frames_at(start, end):
-            begin, stop = self._table.start(frame), self._table.start(frame + 1)
+            _, _, begin, stop = self._table.places(frame)
             try:
                 data = self._unpacked(frame)
             except CorruptBlock as error:
@@ -221,10 +212,12 @@ class PackedSegment:
     def expect(self, offset: int, length: int) -> None:
         """Announce that so many bytes will be read soon."""
         for frame in self._table.frames_at(offset, offset + 1):
-            self._file.expect(*self._table.packed_place(frame))
+            begin, end, _, _ = self._table.places(frame)
+            self._file.expect(begin, end - begin)
 
     def _unpacked(self, frame: int) -> Bytes:
-        return unpack_frame(self._file.at(*self._table.packed_place(frame)), self._table.frame_bytes(frame))
+        begin, end, start, stop = self._table.places(frame)
+        return unpack_frame(self._file.at(begin, end - begin), stop - start)
 
 
 SegmentReader = PlainSegment | PackedSegment

@@ -64,12 +64,14 @@ class Pace:
     """Lets blocks pass when they are due. `wait` belongs to the source thread, `step`, `run_on` and `halt` to any."""
 
     def __init__(self, what: ReplayClock, clock: Clock) -> None:
-        self._what = what
+        self.speed = what.speed
+        """Recorded seconds per second; None: as fast as frames are taken."""
         self._clock = clock
         self._changed = threading.Condition()
         self._steps = 0
         self._run_on = not what.steps
-        self._halted = False
+        self.halted = False
+        """Whether the run was stopped."""
         self.closed = False
         """Whether nothing will ever wait again."""
         self._origin_ns = 0
@@ -84,27 +86,17 @@ class Pace:
         return PaceReport(late.blocks, late.mean, sd_s, late.most, self._held_ns / NS_PER_S)
 
     @property
-    def speed(self) -> float | None:
-        """Recorded seconds per second; None: as fast as frames are taken."""
-        return self._what.speed
-
-    @property
     def stepping(self) -> bool:
         """Whether frames wait for somebody's word."""
         return not self._run_on
 
-    @property
-    def halted(self) -> bool:
-        """Whether the run was stopped."""
-        return self._halted
-
     def most_frames(self, period_s: Fraction) -> float:
         """Frames that a block may have at most, so that one comes every now and then at a slow clock too."""
-        return math.inf if self._what.speed is None else max(1.0, _PIECE_S * self._what.speed / float(period_s))
+        return math.inf if self.speed is None else max(1.0, _PIECE_S * self.speed / float(period_s))
 
     def start(self) -> None:
         """Begin a run now."""
-        self._halted = False
+        self.halted = False
         self._origin_ns = self._clock.now_ns()
 
     def step(self) -> None:
@@ -122,39 +114,39 @@ class Pace:
     def halt(self) -> None:
         """End the run: `wait` returns."""
         with self._changed:
-            self._halted = True
+            self.halted = True
             self._changed.notify_all()
 
     def wait_for_step(self, timeout_s: float) -> bool:
         """Take a step; False where none came in time or the run was stopped."""
         with self._changed:
-            self._changed.wait_for(lambda: self._steps > 0 or self._run_on or self._halted, timeout_s)
-            if self._halted or not (self._run_on or self._steps):
+            self._changed.wait_for(lambda: self._steps > 0 or self._run_on or self.halted, timeout_s)
+            if self.halted or not (self._run_on or self._steps):
                 return False
             self._steps -= not self._run_on
             return True
 
     def hold(self, due_s: float, waited_s: float) -> None:
         """Note that a full ring held up for `waited_s` a block that was due `due_s` after the run's start."""
-        if self._what.speed is None:
+        if self.speed is None:
             return
-        late_ns = self._clock.now_ns() - self._due_ns(due_s, self._what.speed)
+        late_ns = self._clock.now_ns() - self._due_ns(due_s, self.speed)
         held_ns = max(0, min(round(waited_s * NS_PER_S), late_ns))
         self._origin_ns += held_ns
         self._held_ns += held_ns
 
     def wait(self, due_s: float, timeout_s: float) -> bool:
         """Wait until what is due `due_s` (recorded time) after the run's start; False where that is not in time."""
-        if self._what.speed is None:
-            return not self._halted
-        at_ns = self._due_ns(due_s, self._what.speed)
+        if self.speed is None:
+            return not self.halted
+        at_ns = self._due_ns(due_s, self.speed)
         ends_ns = self._clock.now_ns() + round(timeout_s * NS_PER_S)
         # Whole nanoseconds: in seconds a clock that has long been running would never quite get there.
-        while not self._halted and (left_ns := at_ns - self._clock.now_ns()) > 0:
+        while not self.halted and (left_ns := at_ns - self._clock.now_ns()) > 0:
             if self._clock.now_ns() >= ends_ns:
                 return False
             self._clock.sleep(min(left_ns / NS_PER_S, _SLICE_S))
-        if self._halted:
+        if self.halted:
             return False
         self._late_s.note(max(0, self._clock.now_ns() - at_ns) / NS_PER_S)
         return True

@@ -232,7 +232,10 @@ class ReplaySpad(SpadArray):
     def __init__(self, config: ReplaySpadConfig, recording: RunRecording, clock: Clock) -> None:
         super().__init__(f"replay of {recording.path.name}")
         self._config = config
-        self._recording = recording
+        self.recording = recording
+        """The recording that is played."""
+        self.loops = config.loop
+        """Whether it begins again behind the last start."""
         self.pace = Pace(ReplayClock.parse(config.clock), clock)
         self._info = recorded_info(recording)
         self._played = 0
@@ -246,22 +249,12 @@ class ReplaySpad(SpadArray):
         """The SPAD that took the frames; only that a recording can wait."""
         return self._info
 
-    @property
-    def recording(self) -> RunRecording:
-        """The recording that is played."""
-        return self._recording
-
-    @property
-    def loops(self) -> bool:
-        """Whether it begins again behind the last start."""
-        return self._config.loop
-
     def leave_out(self, runs: Collection[int]) -> None:
         """Do not play these starts, by their numbers."""
-        self._runs = [run for run in self._recording.runs if run.number not in runs]
+        self._runs = [run for run in self.recording.runs if run.number not in runs]
 
     def _do_configure(self, request: SpadRequest) -> SpadTiming:
-        first = self._recording.runs[0].header
+        first = self.recording.runs[0].header
         if not first.frame_period_ticks:
             raise LimitExceeded(
                 f"{self.name}: the recording does not say at what rate its frames were taken; import them again with "
@@ -286,11 +279,11 @@ class ReplaySpad(SpadArray):
     def _do_start(self, n_frames: int | None) -> None:
         runs = self._runs
         times, index = divmod(self._played, len(runs))
-        if times and not self._config.loop:
+        if times and not self.loops:
             raise DeviceFault(f"{self.name}: all its {len(runs)} starts are played; configure it anew, or let it loop")
         self._run_id = (runs[index].header.run_id + times * len(runs)) & 0xFFFF
         self._played += 1
-        self._reading = Cursor(self._recording, runs[index], n_frames, by_block=not self._info.markers)
+        self._reading = Cursor(self.recording, runs[index], n_frames, by_block=not self._info.markers)
         self._t0_ticks = runs[index].header.t0_ticks
         self._published = self._delivered = self._lost_at_last = 0
         self._counters = SpadCounters(0, 0, 0, 0, 0)
@@ -408,7 +401,7 @@ class ReplaySpad(SpadArray):
             lost_before=lost,
             sweep=first.header.sweep + (((int(records["sweep"][0]) - first.header.sweep) & 0xFFFF) if begin else 0),
         )
-        return seal_block(memory, header, layout, status=last.status, frames_lost=lost, payload_crc=False)
+        return seal_block(memory, header, layout, status=last.status, payload_crc=False)
 
 
 def create(config: ReplaySpadConfig, surroundings: Surroundings) -> ReplaySpad:

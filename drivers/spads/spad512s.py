@@ -348,7 +348,7 @@ class Spad512s(SpadArray):
         turn_packed(pixels.reshape(n, self._identity.rows, ROW_BYTES), self._config.rotation, bits)
         records[:] = np.zeros((), records.dtype)
         records["ticks"] = np.arange(n, dtype=np.uint32) * np.uint32(self._timing.frame_period_ticks)
-        block = seal_block(memory, self._header(run), layout, frames_lost=self._lost, payload_crc=False)
+        block = seal_block(memory, self._header(run), layout, payload_crc=False)
         self._count(n, lost=False)
         ring.publish(block)
 

@@ -54,7 +54,6 @@ class Spad512sIdentity:
     firmware: str
     hardware: str
     flavour: str
-    intensity: bool
 
     def __str__(self) -> str:
         """The identity as a text for people."""
@@ -214,11 +213,9 @@ class Spad512sLine:
         if len(lines) < 7:
             raise ProtocolError(f"{self._name} answers D with {len(lines)} lines, not with its serials and versions")
         master, slave, software, firmware, hardware, flavour, intensity = lines[:7]
-        enabled = intensity.lower() not in ("0", "no", "false", "disabled")
-        identity = Spad512sIdentity(detector, master, slave, software, firmware, hardware, flavour, enabled)
-        if not identity.intensity:
-            raise DeviceFault(f"{self._name} {identity.master_serial}: intensity imaging is not enabled on this unit")
-        return identity
+        if intensity.lower() in ("0", "no", "false", "disabled"):
+            raise DeviceFault(f"{self._name} {master}: intensity imaging is not enabled on this unit")
+        return Spad512sIdentity(detector, master, slave, software, firmware, hardware, flavour)
 
     def _send(self, stream: TcpStream, command: str) -> None:
         data = command.encode("ascii")

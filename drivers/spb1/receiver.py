@@ -12,10 +12,8 @@ import logging
 from collections import deque
 from dataclasses import dataclass, replace
 from enum import Enum
-from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
 from drivers.errors import CorruptBlock
 from drivers.frames import BlockFlag, FrameBlock, packed_row_bytes
@@ -201,7 +199,7 @@ class BlockReceiver:
         if block.n_frames == 0:
             self._give_back(item)
             return Took.CONTROL
-        self._hand_over(item, block)
+        self._hand_over(item, fields, block)
         return Took.FRAMES
 
     def _require_armed(self, fields: HeaderFields) -> None:
@@ -239,23 +237,23 @@ class BlockReceiver:
         self.ended = self.ended or bool(flags & _LAST)
         self.gate_forced_low = self.gate_forced_low or bool(flags & _FORCED_LOW)
 
-    def _hand_over(self, item: _Item, block: FrameBlock) -> None:
+    def _hand_over(self, item: _Item, fields: HeaderFields, block: FrameBlock) -> None:
         """Publish; a block that came into spare memory is copied or dropped."""
         assert self._ring is not None, "set by take"
-        block = self._as_received(block)
         if not item.slot:
-            copied = self._copied(block, item.buffer)
+            copied = self._copied(fields, item.buffer)
             self._spares.append(item.buffer)
             if copied is None:
                 self._ring.mark_overflow(block.n_frames)
                 return
             block = copied
+        block = self._as_received(block)
         self._ring.publish(block)
         self._lost_at_last = block.header.lost_before
         self.delivered += block.n_frames
         self._published += 1
 
-    def _copied(self, block: FrameBlock, buffer: Buffer) -> FrameBlock | None:
+    def _copied(self, fields: HeaderFields, buffer: Buffer) -> FrameBlock | None:
         """The block in a slot that came free; not where later blocks already have their slots: order is all."""
         assert self._ring is not None, "set by take"
         if self._held is not None or any(item.slot for item in self._items):
@@ -264,10 +262,7 @@ class BlockReceiver:
         if memory is None:
             return None
         np.copyto(memory[: len(buffer)], buffer)
-        start = buffer.ctypes.data
-        records = _moved(block.records, start, memory)
-        bits = _moved(block.bits, start, memory) if np.shares_memory(block.bits, buffer) else block.bits
-        return FrameBlock(block.header, records, bits, block.status)
+        return read_frames(memory, fields, check_payload=False)
 
     def _as_received(self, block: FrameBlock) -> FrameBlock:
         """Number and losses as they are behind this receiver, which may have refused or dropped blocks."""
@@ -294,9 +289,3 @@ class BlockReceiver:
                 item.use = False
             self._realign = offset
             return
-
-
-def _moved(array: NDArray[Any], start: int, memory: Buffer) -> NDArray[Any]:
-    """The same place in `memory` as `array` has in the memory that starts at address `start`."""
-    offset = array.ctypes.data - start
-    return memory[offset : offset + array.nbytes].view(array.dtype).reshape(array.shape)

@@ -32,13 +32,12 @@ def seal_block(
     layout: BlockLayout,
     *,
     status: int = BlockStatus.OK,
-    frames_lost: int = 0,
     payload_crc: bool,
 ) -> FrameBlock:
     """Write all but records and pixels, which `block_views` gave out to fill; the block over the same memory.
 
-    buffer: uint8 (stride,), contiguous; zeroed behind the trailer. frames_lost: since START. payload_crc: compute
-    the payload's CRC, which reads every byte; else the trailer says 'not computed'. Copies nothing.
+    buffer: uint8 (stride,), contiguous; zeroed behind the trailer. payload_crc: compute the payload's CRC, which reads
+    every byte; else the trailer says 'not computed'. Copies nothing.
     ValueError where the header contradicts the layout or has no packed SPB1 1.0 form.
     """
     _check(header, layout)
@@ -47,7 +46,7 @@ def seal_block(
     buffer[HEADER_BYTES + FRAME_RECORD.itemsize * layout.n_frames : layout.pixels_offset] = 0
     end = HEADER_BYTES + layout.payload_bytes
     crc = crc32(raw[HEADER_BYTES:end]) if payload_crc else 0
-    _pack(raw[:HEADER_BYTES], raw[end : end + TRAILER_BYTES], header, layout, status, frames_lost, crc)
+    _pack(raw[:HEADER_BYTES], raw[end : end + TRAILER_BYTES], header, layout, status, crc)
     buffer[end + TRAILER_BYTES :] = 0
     return FrameBlock(header, records, bits, status)
 
@@ -93,7 +92,7 @@ def block_parts(block: FrameBlock) -> tuple[memoryview, ...]:
     crc = crc32(bits, crc32(gap, crc32(records)))
     head, tail = memoryview(bytearray(HEADER_BYTES)), bytearray(layout.min_stride - layout.block_bytes + TRAILER_BYTES)
     trailer = memoryview(tail)[:TRAILER_BYTES]
-    _pack(head, trailer, header, layout, block.status, header.lost_before, crc)
+    _pack(head, trailer, header, layout, block.status, crc)
     return head, records, gap, bits, memoryview(tail)
 
 
@@ -103,12 +102,20 @@ def _bytes_of(array: NDArray[Any]) -> memoryview:
 
 
 def _pack(
-    head: memoryview, trailer: memoryview, header: BlockHeader, layout: BlockLayout, status: int, lost: int, crc: int
+    head: memoryview, trailer: memoryview, header: BlockHeader, layout: BlockLayout, status: int, crc: int
 ) -> None:
     try:
         _pack_header(head, header, layout)
         TRAILER.pack_into(
-            trailer, 0, TRAILER_MAGIC, status, header.block_seq, layout.payload_bytes, crc, lost & 0xFFFFFFFF, 0
+            trailer,
+            0,
+            TRAILER_MAGIC,
+            status,
+            header.block_seq,
+            layout.payload_bytes,
+            crc,
+            header.lost_before & 0xFFFFFFFF,
+            0,
         )
     except struct.error as error:
         raise ValueError(f"block {header.block_seq}: a field does not fit SPB1 1.0: {error}") from None

@@ -349,7 +349,7 @@ class SimulatedSpad(SpadArray):
         self._draw(state, start_s, x0, bits)
         self._link.repeat(self._next_frame, records, bits)
         header = self._header(sweep, n)
-        block = seal_block(buffer, header, layout, frames_lost=header.lost_before, payload_crc=True)
+        block = seal_block(buffer, header, layout, payload_crc=True)
         self._advance(n, lost=0)
         ring.publish(block)
         self._block_seq += 1

@@ -7,7 +7,7 @@ from contextlib import contextmanager
 import pytest
 
 from drivers.clock import SystemClock
-from drivers.spb1.control import SensorState
+from drivers.spb1.control import Register, SensorState
 from sim_backend.wire.firmware.spb_usb import SpbUsbModel
 from sim_backend.wire.serve.usb_model import AttachedDevice
 from tests.wire import spb_bodies
@@ -23,7 +23,7 @@ def pulling(attached: AttachedDevice, device: SpbUsbModel) -> Iterator[None]:
 
     def watch() -> None:
         while not over.wait(0.02):
-            if device.state is SensorState.RUNNING and device.heartbeat_ms == 12_345:
+            if device.state is SensorState.RUNNING and device._registers[Register.HEARTBEAT_MS] == 12_345:
                 over.wait(0.1)
                 attached.unplug()
                 return

@@ -74,11 +74,6 @@ class SpbUsbModel(UsbModel):
         """State of the device."""
         return self._state
 
-    @property
-    def heartbeat_ms(self) -> int:
-        """Time that the host set for the watchdog."""
-        return self._registers[Register.HEARTBEAT_MS]
-
     # The bus
 
     def unplugged(self, now_s: float) -> None:

@@ -241,7 +241,7 @@ class EmulatedRun:
             sensor_width=board.width,
             sensor_height=board.height,
         )
-        seal_block(memory, header, layout, status=status, frames_lost=self._lost, payload_crc=board.payload_crc)
+        seal_block(memory, header, layout, status=status, payload_crc=board.payload_crc)
         self.next_frame += n
         self._seq += 1
         self._just_lost = False

@@ -51,7 +51,7 @@ def block(run_id: int, seq: int, first: int, n: int, lost: int, **header_fields:
         sensor_height=HEIGHT,
         **header_fields,
     )
-    return seal_block(buffer, header, layout, frames_lost=lost, payload_crc=True)
+    return seal_block(buffer, header, layout, payload_crc=True)
 
 
 def two_starts() -> list[FrameBlock]:

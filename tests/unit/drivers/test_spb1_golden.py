@@ -50,7 +50,7 @@ def test_a_sealed_block_has_the_very_bytes_made_by_hand() -> None:
     records, bits = block_views(memory, layout)
     records.view(np.uint8)[:] = array(RECORDS)
     bits.reshape(-1)[:] = array(PIXELS)
-    block = seal_block(memory, GOLDEN_HEADER, layout, frames_lost=2, payload_crc=True)
+    block = seal_block(memory, GOLDEN_HEADER, layout, payload_crc=True)
     assert memory.tobytes() == golden_block()
     assert np.shares_memory(block.bits, memory)
     assert block.header is GOLDEN_HEADER
@@ -76,7 +76,7 @@ def test_a_block_in_parts_that_lies_anywhere_and_holds_nothing_is_written_too() 
 
 def test_a_payload_crc_that_was_not_computed_or_not_asked_for_is_not_checked() -> None:
     memory = array(golden_block()).copy()
-    seal_block(memory, GOLDEN_HEADER, BlockLayout(3, 12, 2), frames_lost=2, payload_crc=False)
+    seal_block(memory, GOLDEN_HEADER, BlockLayout(3, 12, 2), payload_crc=False)
     assert memory[240:272].tobytes() == trailer_bytes(checked=False)
     memory[200] ^= 1
     parse_block(memory, check_payload=True)
