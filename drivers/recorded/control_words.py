@@ -8,7 +8,7 @@ those of the drivers here: Helios, LaserCube, Cobolt, OBIS and PrawnDO (docs/ref
 import re
 from collections import defaultdict
 from collections.abc import Iterable
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from itertools import accumulate
 
 from drivers.transports.tap import OUT, Passed
@@ -27,29 +27,24 @@ BEGIN, END = (b"run", b"swr"), b"abt"
 
 
 @dataclass(frozen=True, slots=True)
-class Word:
-    """A command, or a buffer of points, that went to a device."""
-
-    t_ns: int
-    data: bytes
-
-
-@dataclass(frozen=True, slots=True)
 class Spoken:
-    """The commands that went to a rig, by device, and the buffers of points of each scan that was run."""
+    """The commands that went to a rig, by device, and the buffers of points of each scan that was run.
 
-    commands: dict[str, list[Word]]
-    scans: list[list[Word]]
+    Each command is a piece of its own, with the time at which the last of it passed.
+    """
+
+    commands: dict[str, list[Passed]]
+    scans: list[list[Passed]]
 
     @classmethod
     def of(cls, passed: Iterable[Passed]) -> "Spoken":
         """Sort out the pieces that passed the taps, given in order of time."""
-        sent: dict[tuple[str, str], list[Word]] = defaultdict(list)
+        sent: dict[tuple[str, str], list[Passed]] = defaultdict(list)
         for one in passed:
             if one.direction == OUT:
-                sent[one.device, one.port].append(Word(one.t_ns, one.data))
-        commands: dict[str, list[Word]] = {}
-        buffers: list[Word] = []
+                sent[one.device, one.port].append(one)
+        commands: dict[str, list[Passed]] = {}
+        buffers: list[Passed] = []
         for (device, port), words in sent.items():
             if port in FRAME_PORTS:
                 buffers += words
@@ -64,13 +59,13 @@ def is_question(piece: bytes) -> bool:
     return all(_QUESTION.fullmatch(line) for line in _LINE_END.split(piece))
 
 
-def _without_questions(port: str, words: list[Word]) -> list[Word]:
+def _without_questions(port: str, words: list[Passed]) -> list[Passed]:
     questions = _USB_QUESTIONS.get(port, ())
     return [word for word in words if word.data[0] not in questions]
 
 
-def _lines(pieces: list[Word]) -> list[Word]:
-    """The lines that are no questions, each with the time of its last piece."""
+def _lines(pieces: list[Passed]) -> list[Passed]:
+    """The lines that are no questions, as pieces."""
     stream = b"".join(piece.data for piece in pieces)
     ends = list(accumulate(len(piece.data) for piece in pieces))
     found, begin, piece = [], 0, 0
@@ -79,14 +74,14 @@ def _lines(pieces: list[Word]) -> list[Word]:
         while ends[piece] < begin_next:
             piece += 1
         if not _QUESTION.fullmatch(line):
-            found.append(Word(pieces[piece].t_ns, line))
+            found.append(replace(pieces[piece], data=line))
         begin = begin_next
     return found
 
 
-def _once(words: list[Word]) -> list[Word]:
+def _once(words: list[Passed]) -> list[Passed]:
     """The commands without repeats of the last one or two: drivers repeat both to make sure."""
-    kept: list[Word] = []
+    kept: list[Passed] = []
     for word in words:
         kept.append(word)
         said = [one.data for one in kept[-4:]]
@@ -97,7 +92,7 @@ def _once(words: list[Word]) -> list[Word]:
     return kept
 
 
-def _scans(sync: list[Word] | None, buffers: list[Word]) -> list[list[Word]]:
+def _scans(sync: list[Passed] | None, buffers: list[Passed]) -> list[list[Passed]]:
     """The buffers sent while a scan ran; without a sync source that says when, all of them."""
     if not buffers:
         return []

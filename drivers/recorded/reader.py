@@ -12,6 +12,7 @@ from concurrent.futures import Future, ThreadPoolExecutor
 from contextlib import suppress
 from dataclasses import dataclass, replace
 from itertools import pairwise
+from operator import attrgetter
 from pathlib import Path
 from typing import Any, Final
 
@@ -230,11 +231,6 @@ def usual_header(headers: Sequence[BlockHeader]) -> BlockHeader:
     return max(headers, key=lambda header: kinds[_run_kind(header)])
 
 
-def _run_kind(header: BlockHeader) -> tuple[Any, ...]:
-    """The values that all blocks of a run share: its id, size and clock."""
-    return tuple(getattr(header, name) for name in _OF_A_RUN)
-
-
 def _spread(n: int) -> Iterator[int]:
     """0 to n - 1, the first and some from all over first."""
     asked = np.unique(np.linspace(0, n - 1, _WITNESSES).astype(int)).tolist()
@@ -242,13 +238,7 @@ def _spread(n: int) -> Iterator[int]:
     yield from (at for at in range(n) if at not in asked)
 
 
-_OF_A_RUN: Final = (
-    "run_id",
-    "width",
-    "height",
-    "sensor_width",
-    "sensor_height",
-    "tick_hz",
-    "frame_period_ticks",
-    "exposure_ticks",
+_run_kind: Final = attrgetter(
+    *("run_id", "width", "height", "sensor_width", "sensor_height", "tick_hz", "frame_period_ticks", "exposure_ticks")
 )
+"""The values that all blocks of a run share: its id, size and clock."""

@@ -12,8 +12,8 @@ from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import Any
 
-from drivers.recorded.control_words import Spoken, Word
-from drivers.transports.tap import read_taps
+from drivers.recorded.control_words import Spoken
+from drivers.transports.tap import Passed, read_taps
 
 SWAP_TOLERANCE_S = 2e-3
 """Longest time by which a buffer may come earlier or later than in the recording."""
@@ -74,7 +74,7 @@ def check_control(recorded: Path, now: Path, *, devices: Sequence[str], toleranc
     return ControlCheck(commands, swaps, worst_s, tuple(problems))
 
 
-def _first_difference(device: str, what: str, said: list[Word], says: list[Word], *, tail: int) -> str | None:
+def _first_difference(device: str, what: str, said: list[Passed], says: list[Passed], *, tail: int) -> str | None:
     """The first byte that differs, in words; None where none does."""
     for number, (old, new) in enumerate(zip(said, says, strict=False)):
         if old.data != new.data:
@@ -92,7 +92,7 @@ def _first_difference(device: str, what: str, said: list[Word], says: list[Word]
     return f"{device}: {what} {len(said)} was not recorded: {_shown(says[len(said)].data, 0)}"
 
 
-def _swaps_off(said: list[Word], says: list[Word]) -> list[float]:
+def _swaps_off(said: list[Passed], says: list[Passed]) -> list[float]:
     """Seconds by which each buffer came later than recorded, less what the whole scan did.
 
     The second one has no time of its own, since a device takes it as soon as the host has it: it gets 0.

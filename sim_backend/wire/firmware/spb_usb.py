@@ -23,6 +23,7 @@ from drivers.spb1.control import (
 )
 from drivers.spb1.layout import ALIGN, REGISTER_ACK
 from sim_backend.wire.firmware.spb_usb_run import (
+    WINDOW_ENTRIES,
     WRITABLE,
     BlockMemory,
     Chip,
@@ -55,12 +56,8 @@ class SpbUsbModel(UsbModel):
         self.spec = device_spec(board.chip, board.acks, board.serial, board.product_name)
         self._source = source
         self._board = board
-        self._acks_in_stream = board.acks == "stream"
         self._registers = registers_at_power_up(board)
-        self._max_stride = board.max_stride
-        self._min_period = board.min_period_ticks
-        self._window_entries = self._registers[Register.WINDOW_ENTRIES]
-        self._state = SensorState.IDLE
+        self.state = SensorState.IDLE
         self._run: EmulatedRun | None = None
         self._run_id = 0
         self._exposed = 0
@@ -68,11 +65,6 @@ class SpbUsbModel(UsbModel):
         self._queue: deque[memoryview] = deque()
         self._memory = BlockMemory()
         self._session_open = board.chip == "fx3"
-
-    @property
-    def state(self) -> SensorState:
-        """State of the device."""
-        return self._state
 
     # The bus
 
@@ -155,7 +147,7 @@ class SpbUsbModel(UsbModel):
         return Ack(op, request_id, status, answer)
 
     def _acknowledge(self, ack: Ack) -> None:
-        if not self._acks_in_stream:
+        if self._board.acks == "endpoint":
             self._acks.append(ack.packed())
             return
         # That of START still has the stride of before the run: so the host knows where blocks of frames begin.
@@ -166,7 +158,7 @@ class SpbUsbModel(UsbModel):
     def _read(self, address: int) -> tuple[AckStatus, int]:
         run = self._run
         if address == Register.STATE:
-            return AckStatus.OK, self._state
+            return AckStatus.OK, self.state
         if address in (Register.EXPOSED, Register.EXPOSED + 4):
             exposed = self._exposed if run is None else run.next_frame
             return AckStatus.OK, exposed >> 8 * (address - Register.EXPOSED) & 0xFFFFFFFF
@@ -177,22 +169,21 @@ class SpbUsbModel(UsbModel):
         return AckStatus.OK, self._registers[address]
 
     def _write(self, address: int, value: int) -> AckStatus:
-        if Register.WINDOW_X0 <= address < Register.WINDOW_X0 + 4 * self._window_entries and address % 4 == 0:
-            pass
-        elif address not in WRITABLE:
+        in_table = Register.WINDOW_X0 <= address < Register.WINDOW_X0 + 4 * WINDOW_ENTRIES and address % 4 == 0
+        if not in_table and address not in WRITABLE:
             return AckStatus.BAD_ADDRESS
-        if self._state not in (SensorState.IDLE, SensorState.ARMED):
+        if self.state not in (SensorState.IDLE, SensorState.ARMED):
             return AckStatus.WRONG_STATE
-        if (address == Register.STRIDE and (value % ALIGN or not ALIGN <= value <= self._max_stride)) or (
-            address == Register.PERIOD_TICKS and value < self._min_period
+        if (address == Register.STRIDE and (value % ALIGN or not ALIGN <= value <= self._board.max_stride)) or (
+            address == Register.PERIOD_TICKS and value < self._board.min_period_ticks
         ):
             return AckStatus.BAD_VALUE
         self._registers[address] = value
-        self._state = SensorState.ARMED
+        self.state = SensorState.ARMED
         return AckStatus.OK
 
     def _start(self, now_s: float) -> tuple[AckStatus, int]:
-        if self._state is not SensorState.ARMED:
+        if self.state is not SensorState.ARMED:
             return AckStatus.WRONG_STATE, 0
         run_id = (self._run_id + 1) & 0xFFFF
         try:
@@ -201,7 +192,7 @@ class SpbUsbModel(UsbModel):
             return AckStatus.BAD_VALUE, 0
         self._run, self._run_id = run, run_id
         self._queue.clear()
-        self._state = SensorState.RUNNING
+        self.state = SensorState.RUNNING
         self.gate_allowed = True
         self._source.started()
         return AckStatus.OK, self._run_id
@@ -213,8 +204,8 @@ class SpbUsbModel(UsbModel):
             self._end(self._run, BlockStatus.ABORTED, BlockFlag(0))
         else:
             self._run.stop()
-            if self._state is SensorState.RUNNING:
-                self._state = SensorState.DRAINING
+            if self.state is SensorState.RUNNING:
+                self.state = SensorState.DRAINING
 
     def _end(self, run: EmulatedRun, status: BlockStatus, flag: BlockFlag) -> None:
         """End the run: gate low, FIFO flushed, a last block without frames, then idle."""
@@ -224,7 +215,7 @@ class SpbUsbModel(UsbModel):
 
     def _reset(self) -> None:
         self._run = None
-        self._state = SensorState.IDLE
+        self.state = SensorState.IDLE
         self._queue.clear()
         self._acks.clear()
         self._session_open = self.chip == "fx3"
@@ -246,7 +237,7 @@ class SpbUsbModel(UsbModel):
             self._exposed = run.next_frame
             self._registers[Register.FIFO_HIGH_WATER] = min(run.high_water_bytes, 0xFFFFFFFF)
             self._run = None
-            self._state = SensorState.ARMED
+            self.state = SensorState.ARMED
 
     def lose_next(self, n: int) -> None:
         """Lose the next frames of the run inside the device."""

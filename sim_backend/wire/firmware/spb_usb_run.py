@@ -269,6 +269,8 @@ def _draw_pattern(bits: NDArray[np.uint8], first_frame: int, width: int) -> None
 
 
 _PACKET = 1024
+WINDOW_ENTRIES: Final = 4096
+"""Most entries of all window tables together."""
 WRITABLE: Final = frozenset(
     (
         Register.HEARTBEAT_MS,
@@ -319,7 +321,7 @@ def registers_at_power_up(board: SpbUsbBoard) -> dict[int, int]:
         Register.ROI_STEP_PX: 64,
         Register.MIN_PERIOD_TICKS: board.min_period_ticks,
         Register.LINK_BYTES_PER_S: board.link_bytes_per_s,
-        Register.WINDOW_ENTRIES: 4096,
+        Register.WINDOW_ENTRIES: WINDOW_ENTRIES,
         Register.FIFO_HIGH_WATER: 0,
         Register.STRIDE: board.max_stride,
     }
