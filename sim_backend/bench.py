@@ -13,9 +13,9 @@ from numpy.typing import NDArray
 
 from calibration.model.rig_model import Lag
 from drivers.clock import NS_PER_S, Clock
-from drivers.interfaces import MARKER_LINE, MARKER_SCAN, Pulse, ScanWaveform
+from drivers.interfaces import MARKER_LINE, MARKER_SCAN, Pulse, ScanWaveform, SyncStatus
 from sim_backend.gate_program import GateProgram, gate_shares
-from sim_backend.mirror_motion import Idle, Jitter, Playing, ScannerMotion
+from sim_backend.mirror_motion import Jitter, Playing, resting
 
 Array = NDArray[np.float64]
 
@@ -49,7 +49,7 @@ class Bench:
         self.lag = lag
         self._epoch_ns = clock.now_ns()
         self._lock = threading.RLock()
-        self._motion: ScannerMotion = Idle(0.0)
+        self._motion = resting(0.0)
         self._program: GateProgram | None = None
         self._aborted = False
         self._power_w = 0.0
@@ -73,7 +73,7 @@ class Bench:
     def rest(self, command: float) -> None:
         """Stop the mirror now, at a command."""
         with self._lock:
-            self._motion = Idle(command)
+            self._motion = resting(command)
 
     def moving(self) -> bool:
         """Whether a waveform is being played."""
@@ -111,16 +111,16 @@ class Bench:
                 self._catch_up()
                 self._program.abort(self.now_s())
 
-    def outputs(self) -> tuple[str, int]:
-        """State of the program (stopped, waiting, running, aborted) and the levels of its outputs now."""
+    def outputs(self) -> SyncStatus:
+        """State of the program and the levels of its outputs now."""
         with self._lock:
             if self._program is None or self._aborted:
-                return ("aborted" if self._aborted else "stopped"), 0
+                return SyncStatus("aborted" if self._aborted else "stopped", 0)
             self._catch_up()
             word = int(self._program.levels(self.now_s(), np.inf)[1][0])
             if self._program.ended and word == 0:
-                return "stopped", word
-            return ("waiting" if self._program.waiting else "running"), word
+                return SyncStatus("stopped", word)
+            return SyncStatus("waiting" if self._program.waiting else "running", word)
 
     def during(self, start_s: Array, exposure_s: float, period_s: float) -> BenchState:
         """State during frames that start at start_s (n,), ascending, one period apart."""

@@ -7,6 +7,7 @@ share it, effects on the bits per whole frame; light that does not depend on the
 
 import time
 from collections.abc import Mapping, Sequence
+from dataclasses import asdict
 from statistics import median
 from typing import TYPE_CHECKING, Any
 
@@ -48,11 +49,7 @@ def effects_report(world: "SimulatedWorld", *, power_w: float, exposure_s: float
     costs: dict[str, float | None] = {**laser_us, **_bits_us(world, model, FrameTimes(exposure_s, exposure_s))}
     costs |= {entry.name: None for entry in CATALOGUE if entry.kind == "within"}
     return {
-        "planned_for": {
-            "power_w": plan.planned_for.power_w,
-            "exposure_s": plan.planned_for.exposure_s,
-            "exposures": plan.planned_for.exposures,
-        },
+        "planned_for": asdict(plan.planned_for),
         "changed_decisions_bound": plan.changes,
         "effects": [
             _line(decision, photons.get(decision.entry.name, 0.0) / whole if whole > 0 else 0.0, costs)

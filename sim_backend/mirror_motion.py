@@ -7,7 +7,7 @@ bench.
 
 import math
 from dataclasses import dataclass
-from typing import Protocol
+from fractions import Fraction
 
 import numpy as np
 from numpy.typing import NDArray
@@ -46,57 +46,6 @@ class Jitter:
         return result
 
 
-class ScannerMotion(Protocol):
-    """The part of the scanner that the bench uses."""
-
-    def mirror(self, time_s: Array) -> Array:
-        """Mirror position as the command it stands at, float64, same shape as the times."""
-        ...
-
-    def backward(self, time_s: Array) -> NDArray[np.bool_]:
-        """Level of the direction output at the times."""
-        ...
-
-    def edges(self, bit: int, from_s: float, until_s: float) -> Array:
-        """Times of the rising edges of a marker output in [from_s, until_s), ascending."""
-        ...
-
-    def first_high(self, bit: int, from_s: float, until_s: float) -> float | None:
-        """First time in [from_s, until_s) at which a marker output is high; None: it stays low."""
-        ...
-
-    def moving(self, time_s: float) -> bool:
-        """Whether a waveform is being played."""
-        ...
-
-
-@dataclass(frozen=True, slots=True)
-class Idle:
-    """A mirror that stands still."""
-
-    command: float
-
-    def mirror(self, time_s: Array) -> Array:
-        """The one position at all times."""
-        return np.full(time_s.shape, self.command)
-
-    def backward(self, time_s: Array) -> NDArray[np.bool_]:
-        """The direction output, always low."""
-        return np.zeros(time_s.shape, bool)
-
-    def edges(self, bit: int, from_s: float, until_s: float) -> Array:
-        """No edges."""
-        return np.empty(0)
-
-    def first_high(self, bit: int, from_s: float, until_s: float) -> float | None:
-        """None: no output is ever high."""
-        return None
-
-    def moving(self, time_s: float) -> bool:
-        """Whether a waveform is being played: never."""
-        return False
-
-
 @dataclass(frozen=True, slots=True, eq=False)
 class Playing:
     """A waveform played from `start_s` at `rate_hz` (the true rate, clock error included), then rest at its last
@@ -116,7 +65,7 @@ class Playing:
         return self.start_s + self.repeats * len(self.waveform.command) / self.rate_hz
 
     def mirror(self, time_s: Array) -> Array:
-        """Mirror positions, lag included."""
+        """Mirror position as the command it stands at, float64, same shape as the times; lag included."""
         forward = self._command(time_s - self.lag_forward_s)
         if self.lag_forward_s == self.lag_backward_s:
             return forward
@@ -124,11 +73,13 @@ class Playing:
         return np.where(turned, self._command(time_s - self.lag_backward_s), forward)
 
     def backward(self, time_s: Array) -> NDArray[np.bool_]:
-        """Level of the direction output; low before the start and after the end."""
+        """Level of the direction output at the times; low before the start and after the end."""
         return self._high(LEVEL_BACKWARD, time_s)
 
     def first_high(self, bit: int, from_s: float, until_s: float) -> float | None:
-        """Time from which on the output is high: at once where it is high then, else at its next rising edge."""
+        """First time in [from_s, until_s) at which a marker output is high: at once where it is high then, else at its
+        next rising edge. None: it stays low.
+        """
         if from_s < until_s and self._high(bit, np.array([from_s]))[0]:
             return from_s
         edges = self.edges(bit, from_s, until_s)
@@ -142,7 +93,10 @@ class Playing:
         return level
 
     def edges(self, bit: int, from_s: float, until_s: float) -> Array:
-        """Rising edges; a bit that stays high over several points is one edge, over the seam as well."""
+        """Times of the rising edges of a marker output in [from_s, until_s), ascending.
+
+        A bit that stays high over several points is one edge, over the seam as well.
+        """
         points = len(self.waveform.command)
         high = (self.waveform.markers & bit) != 0
         rising = np.flatnonzero(high & ~np.roll(high, 1))
@@ -156,7 +110,7 @@ class Playing:
         return times[(times >= from_s) & (times < until_s)]
 
     def moving(self, time_s: float) -> bool:
-        """Whether the last point has still to be played; before the start the waveform counts as under way already."""
+        """Whether the last point has still to be played; a waveform counts as under way before its start already."""
         return time_s < self.end_s
 
     def _command(self, time_s: Array) -> Array:
@@ -167,3 +121,9 @@ class Playing:
         here, following = command[index % points], command[(index + 1) % points]
         result: Array = here + (at - index) * (following - here)
         return result
+
+
+def resting(command: float) -> Playing:
+    """A mirror that stands still: a waveform of one point, played no times."""
+    waveform = ScanWaveform(np.array([command]), np.zeros(1, np.uint8), Fraction(1))
+    return Playing(waveform, 0, start_s=0.0, rate_hz=1.0, lag_forward_s=0.0, lag_backward_s=0.0)

@@ -127,7 +127,7 @@ class SimulatedWorld:
         if self.scene.motion is not None and is_active("motion", config.effects):
             from sim_backend.effects.motion import MovingSurfaces
 
-            motion = MovingSurfaces(self.scene.motion.velocity)
+            motion = MovingSurfaces(self.scene.motion.velocity).view
         view = make_view(self.model, self.surfaces, motion, (u, v))
         line_width(view, config.optics, config.sensor, config.line)  # refuses a focus within the lens, before any plan
         self.setting = Setting(view, self.scene, config.optics, config.sensor, config.line, gain, _own(self.model))
@@ -224,18 +224,17 @@ class SimulatedWorld:
         """The rig as it really is: what a calibration should find."""
         return self.model
 
-    def truth(self, commands: Array, velocity_per_s: float = 0.0, time_s: float = 0.0) -> SweepTruth:
+    def truth(self, commands: Array, velocity_per_s: float = 0.0) -> SweepTruth:
         """The true place of the stripe for each column (commands (columns,)), and the depth of every pixel.
 
-        velocity_per_s: of the command. time_s: of the bench, where surfaces move; a scan asks for time 0, that is for
-        the scene before it moved.
+        velocity_per_s: of the command. Where surfaces move, the truth is that of the bench's time 0, before they did.
         """
-        view = self.setting.view.at(time_s)
+        view = self.setting.view.at(0.0)
         x_px = np.full((view.rows, len(commands)), np.nan, np.float32)
         first = np.asarray(commands, dtype=np.float64)
         held = np.stack([first, first + velocity_per_s * self._frame_delay_s], axis=-1)
         held = np.clip(held, *self.model.scanner.command_range) if self._frame_delay_s else first
-        for column, (sheet,) in enumerate(ONE_LINE.sheets(self.model.sheets, held, view.rows, [time_s] * len(first))):
+        for column, (sheet,) in enumerate(ONE_LINE.sheets(self.model.sheets, held, view.rows, [0.0] * len(first))):
             view.trace(sheet, 0, view.rows)
             x_px[:, column] = sheet.x_stripe_px
         with np.errstate(divide="ignore"):

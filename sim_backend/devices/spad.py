@@ -320,7 +320,7 @@ class SimulatedSpad(SpadArray):
         """Expose n frames that get lost: time passes and markers count. Returns the seconds they took."""
         start_s, state = self._frames(n)
         self._markers.record(state, start_s, self._period_s, np.zeros(n, FRAME_RECORD))
-        if any(effect.reads_before for effect in self._world.flux_model.bit_effects):
+        if any(effect.reads_before for effect in self._world.flux_model.bits.values()):
             # The next frame depends on the last of these, whether anybody gets to see it or not.
             unseen = np.empty((1, self._info.height, self._layout(1).row_bytes), np.uint8)
             self._draw(state, start_s, np.zeros(n, np.int32), unseen, first=n - 1)

@@ -21,7 +21,6 @@ mirror position and thread for `MOST` of them.
 
 import math
 from dataclasses import dataclass
-from typing import Protocol
 
 import numba
 import numpy as np
@@ -30,7 +29,7 @@ from numpy.typing import NDArray
 from sim_backend.effects.setting import Setting
 from sim_backend.light.line import edge, edge_sum, line_width, sigma_px
 from sim_backend.light.sheet import LightSheet
-from sim_backend.scenes.medium import Sizes
+from sim_backend.scenes.medium import Rain, Sizes, Snow
 
 Array = NDArray[np.float64]
 
@@ -159,25 +158,7 @@ MARGIN = 0.02
 DEPTH_STEPS = 4096
 _RAIN, _SNOW = 1, 2
 """Streams of the scene's seed, so that drops and flakes lie in different places."""
-
-
-class Precipitation(Protocol):
-    """Rain or snow (`sim_backend.scenes.medium`)."""
-
-    wind: float
-
-    @property
-    def sizes(self) -> Sizes:
-        """The number of particles by diameter."""
-        ...
-
-    def back_m2_per_sr(self, diameter_mm: Array) -> Array:
-        """Light that a particle sends back, W/sr per W/m^2."""
-        ...
-
-    def fall_m_per_s(self, diameter_mm: Array) -> Array:
-        """Fall speed."""
-        ...
+Precipitation = Rain | Snow
 
 
 @dataclass(frozen=True, slots=True, eq=False)

@@ -50,11 +50,6 @@ class FluxModel:
         return (*self.laser, *self.steady, *self.bits)
 
     @property
-    def bit_effects(self) -> tuple[BitEffect, ...]:
-        """The sensor's effects on the bits, in the order in which they act."""
-        return tuple(self.bits.values())
-
-    @property
     def hold_s(self) -> float:
         """Time for which the sheet's light may be taken as constant; 0: nothing moves, it is constant for ever."""
         return min((held for effect in self.laser.values() if (held := hold_s(effect)) > 0), default=0.0)

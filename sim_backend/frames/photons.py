@@ -72,7 +72,7 @@ class PhotonSource:
         """Positions of the mirror and the moment of the sheets that were traced last."""
         self._levels_power_w = 0.0
         self._whole = np.zeros((0, rows, words), np.uint64)
-        self._before = [np.zeros((rows, words), np.uint64) for _ in model.bit_effects]
+        self._before = [np.zeros((rows, words), np.uint64) for _ in model.bits]
         self._next_frame = -1
         cuts = np.linspace(0, rows, threads + 1).round().astype(int).tolist()
         self._bands = [(a, b) for a, b in pairwise(cuts) if b > a]
@@ -98,7 +98,7 @@ class PhotonSource:
         words = bits.view(np.uint64)
         first_word = x0 // np.int32(WORD_PX)
         spans = self._spans(held, power_w, time_s)
-        if not self._model.bit_effects:
+        if not self._model.bits:
             self._draw(spans, first_frame, first_word, words)
             return
         if len(held) > len(self._whole):
@@ -189,7 +189,7 @@ class PhotonSource:
         self._next_frame = first_frame + len(whole)
         parts = len(self._bands)
         cuts = sorted({round(i * len(whole) / parts) for i in range(parts + 1)})
-        for effect, kept in zip(self._model.bit_effects, self._before, strict=True):
+        for effect, kept in zip(self._model.bits.values(), self._before, strict=True):
             found = [kept.copy(), *(whole[cut - 1].copy() for cut in cuts[1:-1])]
             kept[:] = whole[-1]
             self._each(

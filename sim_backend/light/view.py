@@ -1,7 +1,7 @@
 """The camera's view of a scene, per pixel, as the light transport needs it: rays, inverse depth, facets, albedo."""
 
+from collections.abc import Callable
 from dataclasses import dataclass, field
-from typing import Protocol
 
 import numpy as np
 from numpy.typing import NDArray
@@ -11,14 +11,8 @@ from sim_backend.light.sheet import DEPTH_JUMP, LightSheet, empty_sheet, span_bo
 from sim_backend.scenes.surfaces import Surfaces
 
 Array = NDArray[np.float64]
-
-
-class Moves(Protocol):
-    """A motion of the surfaces."""
-
-    def view(self, still: "CameraView", time_s: float) -> "CameraView":
-        """The view at a time of the bench; `still` is that at time 0. Any thread may ask."""
-        ...
+Moves = Callable[["CameraView", float], "CameraView"]
+"""A motion of the surfaces: from the view at time 0 to that at a time of the bench. Any thread may call it."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -46,7 +40,7 @@ class CameraView:
 
     def at(self, time_s: float) -> "CameraView":
         """The view at a time of the bench."""
-        return self if self.motion is None else self.motion.view(self, time_s)
+        return self if self.motion is None else self.motion(self, time_s)
 
     @property
     def rows(self) -> int:

@@ -106,7 +106,7 @@ def simulated_sync(folder: Path) -> Iterator[SyncCase]:
         surroundings.clock.sleep(2e-6)
 
     with simulated("sync", surroundings) as device:
-        yield SyncCase(device, surroundings.clock, trigger, lambda: int(bench.outputs()[1]))
+        yield SyncCase(device, surroundings.clock, trigger, lambda: int(bench.outputs().outputs))
 
 
 @contextmanager

@@ -243,31 +243,20 @@ def lone_importers(imports: Graph) -> list[str]:
 
 
 def circles_of(graph: Graph) -> list[list[str]]:
-    """Groups of two or more modules that reach each other (Tarjan's strongly connected components), by name."""
-    order: dict[str, int] = {}
-    lowest: dict[str, int] = {}
-    stack: list[str] = []
-    groups: list[list[str]] = []
+    """Groups of two or more modules that reach each other, by name."""
 
-    def visit(name: str) -> None:
-        order[name] = lowest[name] = len(order)
-        stack.append(name)
-        for target in sorted(graph[name]):
-            if target not in order:
-                visit(target)
-                lowest[name] = min(lowest[name], lowest[target])
-            elif target in stack:
-                lowest[name] = min(lowest[name], order[target])
-        if lowest[name] == order[name]:
-            group = stack[stack.index(name) :]
-            del stack[-len(group) :]
-            if len(group) > 1:
-                groups.append(sorted(group))
+    def reached(start: str) -> set[str]:
+        seen: set[str] = set()
+        ahead = [*graph[start]]
+        while ahead:
+            if (name := ahead.pop()) not in seen:
+                seen.add(name)
+                ahead += graph[name]
+        return seen
 
-    for name in sorted(graph):
-        if name not in order:
-            visit(name)
-    return sorted(groups)
+    reach = {name: reached(name) for name in graph}
+    groups = {tuple(sorted(other for other in reach[name] if name in reach[other])) for name in graph}
+    return sorted([*group] for group in groups if len(group) > 1)
 
 
 def parameter_figure(modules: Sequence[Module]) -> Figure:

@@ -33,7 +33,7 @@ from rig.plan.mirror_path import (
 )
 from rig.plan.scan_plan import Blanking, ScanPlan, blanking_for, column_command
 from rig.plan.waveform import moving_windows, window_widths
-from sim_backend.mirror_motion import Idle, Playing
+from sim_backend.mirror_motion import Playing, resting
 from tests.stability.inventory import EXAMPLES, covers
 from tests.unit.rig.count.light import blanked_plan
 from tests.unit.rig.count.streams import plan_of, scan, scanner_limits
@@ -238,7 +238,7 @@ def test_patterns_are_found_or_not_but_never_with_a_warning(level, bright, place
         assert found.place == pytest.approx(place, abs=0.1)
 
 
-@covers(Playing, Idle)
+@covers(Playing, resting)
 @EXAMPLES
 @given(
     points=st.integers(1, 20), repeats=st.integers(1, 10**6), start=st.floats(0, 2e5), rate=st.floats(1e3, 1e5),
@@ -263,6 +263,6 @@ def test_mirrors_stay_within_their_waveform_at_any_time(points, repeats, start, 
         assert np.all(np.diff(edges) > 0)
         first = motion.first_high(bit, start, until)
         assert first is None or start <= first < until
-    still = Idle(0.25)
+    still = resting(0.25)
     assert np.all(still.mirror(times) == 0.25)
     assert not any(itertools.chain(still.backward(times), still.edges(1, start, until)))

@@ -11,8 +11,8 @@ from tests.reference.tables.asked import Measured, findings
 
 def answers(errors: list[float], confidence: float = 0.9) -> Answers:
     error = np.array(errors, np.float32)
-    everywhere, nowhere = np.ones(error.size, np.bool_), np.zeros(error.size, np.bool_)
-    return Answers(error, np.full(error.size, confidence, np.float32), everywhere, everywhere, nowhere, 1.0)
+    everywhere = np.ones(error.size, np.bool_)
+    return Answers(error, np.full(error.size, confidence, np.float32), everywhere, everywhere, 1.0)
 
 
 def test_a_missing_answer_costs_10_px_and_an_outlier_leaves_the_bias_alone() -> None:
@@ -41,7 +41,7 @@ def test_calibration_error_of_honest_claims_is_small_and_of_boasts_their_excess(
 def test_an_answer_where_there_is_no_stripe_is_wrong_where_that_is_asked() -> None:
     error = np.array([0.1, np.nan], np.float32)
     lit = np.array([True, False])
-    a = Answers(error, np.array([0.9, 0.8], np.float32), lit, lit, ~lit, 1.0)
+    a = Answers(error, np.array([0.9, 0.8], np.float32), lit, lit, 1.0)
     assert a.claims()[1].tolist() == [True]
     assert a.claims(empty=True)[1].tolist() == [True, False]
 

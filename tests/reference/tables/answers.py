@@ -22,14 +22,13 @@ OUTLIER_PX = 3.0
 class Answers:
     """Answers at (row, column), flat. error_px: signed against the continuous truth, NaN where missing or no stripe.
 
-    scored: stripes on trusted pixels; lit: all true stripes; empty: whether there is certainly none.
+    scored: stripes on trusted pixels; lit: all true stripes.
     """
 
     error_px: NDArray[np.float32]
     confidence: NDArray[np.float32]
     scored: NDArray[np.bool_]
     lit: NDArray[np.bool_]
-    empty: NDArray[np.bool_]
     seconds: float
 
     @classmethod
@@ -37,10 +36,9 @@ class Answers:
         """Answers of a MapResult on the given rows."""
         x, truth = result.stripe.x_px[rows], point.x_true[rows]
         confidence = np.where(np.isfinite(x), result.stripe.confidence[rows], 0)
-        lit = np.isfinite(truth)
         error = (x - truth).astype(np.float32).ravel()
         scored = point.trusted[rows].ravel()
-        return cls(error, confidence.ravel(), scored, lit.ravel(), ~lit.ravel(), result.compute_s)
+        return cls(error, confidence.ravel(), scored, np.isfinite(truth).ravel(), result.compute_s)
 
     def over(self, wanted: NDArray[np.bool_]) -> Answers:
         """These answers with other stripes scored."""
@@ -80,14 +78,14 @@ class Answers:
 
     def claims(self, *, empty: bool = False) -> tuple[NDArray[np.float64], NDArray[np.bool_]]:
         """Confidence and whether the answer is right, over scored stripes, with `empty` also where there is none."""
-        wanted = self.scored | (self.empty & empty)
-        right = np.abs(np.where(self.empty, np.inf, self.error_px)) <= WITHIN_PX
+        wanted = self.scored | (~self.lit & empty)
+        right = np.abs(np.where(self.lit, self.error_px, np.inf)) <= WITHIN_PX
         return self.confidence[wanted].astype(np.float64), np.asarray(right[wanted])
 
 
 def pooled(answers: Sequence[Answers]) -> Answers:
     """Answers of several maps as one; seconds: their mean."""
-    arrays = ("error_px", "confidence", "scored", "lit", "empty")
+    arrays = ("error_px", "confidence", "scored", "lit")
     joined = [np.concatenate([getattr(one, name) for one in answers]) for name in arrays]
     return Answers(*joined, seconds=float(np.mean([one.seconds for one in answers])))
 

@@ -80,7 +80,7 @@ class Moved:
 
 
 def measure(
-    scene: Scene, disc: Disc | None, exposures: int, maps: int = 4, point: str = "report", threads: int = 2
+    scene: Scene, disc: Disc | None, exposures: int, maps: int = 4, point: str = "report"
 ) -> tuple[Moved, Moved]:
     """Without and with the prior, of the same maps of a scene; disc: None where nothing moves."""
     found: tuple[list[Answers], list[Answers]] = [], []
@@ -89,9 +89,7 @@ def measure(
     x_before: NDArray[np.float64] | None = None
     for index, (one, on) in enumerate(_worlds(scene, disc, maps)):
         world = WorkingPoint(one, POINTS[point])
-        makers = makers or [
-            reconstructor_of(world, "joint", threads=threads, temporal_prior=on) for on in (False, True)
-        ]
+        makers = makers or [reconstructor_of(world, "joint", threads=2, temporal_prior=on) for on in (False, True)]
         geometry = makers[0].geometry
         counts = world.counts_in(geometry.x0, geometry.window, exposures, seed=index + 1)
         results = []

@@ -27,6 +27,7 @@ from tests.reference.working_point import POINTS, THREADS, WorkingPoint, score
 
 FRAME_MS = 0.01
 COLUMNS = 496
+SEED = 1
 ROWS = 128
 """The middle ones of a scene: enough to learn from."""
 
@@ -80,10 +81,10 @@ class Lines:
         return LineGrid((0.0,) * self.lines, 1.0, line, place)
 
 
-def dark_frames(point: WorkingPoint, lines: Lines, exposures: int, seed: int) -> dict[str, Any]:
+def dark_frames(point: WorkingPoint, lines: Lines, exposures: int) -> dict[str, Any]:
     """Dark frames as a scan has them, a twentieth of the lit ones."""
     n = max(1, COLUMNS // lines.lines * exposures // 20)
-    counts = np.random.default_rng([seed, COLUMNS]).binomial(n, -np.expm1(-point.ambient))
+    counts = np.random.default_rng([SEED, COLUMNS]).binomial(n, -np.expm1(-point.ambient))
     return {"dark_counts": counts.astype(np.uint32), "n_dark": n}
 
 
@@ -95,7 +96,7 @@ def working_point(scene: Scene, point: str) -> WorkingPoint:
 
 
 def measure(
-    point: WorkingPoint, lines: Lines, exposures: int, estimators: Sequence[str], *, seed: int = 1, told: bool = True
+    point: WorkingPoint, lines: Lines, exposures: int, estimators: Sequence[str], *, told: bool = True
 ) -> Iterator[tuple[str, dict[str, float]]]:
     """Figures of one map by estimator. told: whether it knows that there are other lines."""
     counts: NDArray[np.unsignedinteger] | None = None
@@ -103,8 +104,8 @@ def measure(
         reconstructor = reconstructor_of(point, estimator, lines=lines.grid if lines.lines > 1 and told else None)
         geometry = reconstructor.geometry
         if counts is None:
-            counts = lines.counts(point, geometry.x0, geometry.window, exposures, seed)
-        volume = replace(volume_of(reconstructor, counts, exposures), **dark_frames(point, lines, exposures, seed))
+            counts = lines.counts(point, geometry.x0, geometry.window, exposures, SEED)
+        volume = replace(volume_of(reconstructor, counts, exposures), **dark_frames(point, lines, exposures))
         stripe = reconstructor.map(volume).stripe
         scored = point.trusted & np.isfinite(point.truth())
         figures = score(stripe.x_px, point.truth(), point.trusted)

@@ -8,7 +8,6 @@ are medians along the row: rare bright paths are outliers of the tracer.
 """
 
 import argparse
-from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
@@ -80,19 +79,13 @@ def decay(row: Array) -> float:
     return -float(np.polyfit(path_m, np.log(row[60 : BEFORE.stop] / ray), 1)[0])
 
 
-@dataclass(frozen=True, slots=True)
-class Figures:
-    """Figures of a row: its level before the stripe over that of single scattering, behind over before, its decay."""
-
-    before: float
-    behind: float
-    decay_per_m: float
-
-
-def figures(row: Array, tau: float) -> Figures:
-    """Figures of a row in the fog of optical depth tau."""
+def figures(row: Array, tau: float) -> tuple[float, float, float]:
+    """Of a row in the fog of optical depth tau: its level before the stripe over that of single scattering, the level
+    behind over that before, and its decay over the fog's extinction.
+    """
     haze, before = radiance("fog", medium=fog(tau)), float(np.median(row[BEFORE]))
-    return Figures(before / float(np.median(haze[BEFORE])), float(np.median(row[BEHIND])) / before, decay(row))
+    level = before / float(np.median(haze[BEFORE]))
+    return level, float(np.median(row[BEHIND])) / before, decay(row) / (tau / DISTANCE_M)
 
 
 def table(taus: tuple[float, ...] = (0.5, 1.0)) -> str:
@@ -109,9 +102,8 @@ def table(taus: tuple[float, ...] = (0.5, 1.0)) -> str:
             "simulated": radiance(medium=fog(tau)),
         }
         for name, row in rows.items():
-            f = figures(row, tau)
-            shown = (f.before, f.behind, f.decay_per_m / (tau / DISTANCE_M))
-            lines.append(f"| {tau} | {name} | " + " | ".join(f"{value:.2f}" for value in shown) + " |")
+            shown = " | ".join(f"{value:.2f}" for value in figures(row, tau))
+            lines.append(f"| {tau} | {name} | {shown} |")
     return "\n".join(lines)
 
 

@@ -20,6 +20,7 @@ from drivers.interfaces import (
     OUT_MARKER,
     Pulse,
     ScanWaveform,
+    SyncStatus,
 )
 from sim_backend.bench import Bench
 from sim_backend.gate_program import GateProgram
@@ -163,16 +164,16 @@ def test_no_program_no_light() -> None:
 
 def test_the_state_of_the_program_is_read_back() -> None:
     bench, clock = _bench()
-    assert bench.outputs() == ("stopped", 0)
+    assert bench.outputs() == SyncStatus("stopped", 0)
     bench.run_program([Pulse(0, 1e-3), Pulse(OUT_GATE, 1e-3)], 1)
-    assert bench.outputs() == ("running", 0)
+    assert bench.outputs() == SyncStatus("running", 0)
     clock.sleep(1.5e-3)
-    assert bench.outputs() == ("running", OUT_GATE)
+    assert bench.outputs() == SyncStatus("running", OUT_GATE)
     bench.lower_gate()
-    assert bench.outputs() == ("running", 0)
+    assert bench.outputs() == SyncStatus("running", 0)
     clock.sleep(1e-3)
-    assert bench.outputs() == ("stopped", 0)
+    assert bench.outputs() == SyncStatus("stopped", 0)
     bench.run_program([Pulse(0, None)], 1)
-    assert bench.outputs() == ("waiting", 0)
+    assert bench.outputs() == SyncStatus("waiting", 0)
     bench.abort_program()
-    assert bench.outputs() == ("aborted", 0)
+    assert bench.outputs() == SyncStatus("aborted", 0)

@@ -6,6 +6,7 @@ import pytest
 from sim_backend.effects import halo
 from sim_backend.effects.catalogue import CATALOGUE
 from sim_backend.effects.halo import halo_share
+from tests.reference.tables import path_traced
 from tests.reference.tables.path_traced import FOLDER, fog, radiance, traced_fog
 from tests.stability.inventory import covers
 from tests.unit.sim.rigs import effect_rate, rig, setting, wall
@@ -15,13 +16,11 @@ covers(halo)
 HALO = next(entry for entry in CATALOGUE if entry.name == "halo")
 
 
-@pytest.mark.parametrize(
-    ("tau", "forward", "even"), [(0.5, 0.7, (0.15, 0.18)), (1.0, 0.64, (0.15, 0.18)), (2.0, 0.5, (0.15, 0.18))]
-)
-def test_the_halo_over_the_ballistic_stripe(tau: float, forward: float, even: tuple[float, float]) -> None:
+@pytest.mark.parametrize(("tau", "forward"), [(0.5, 0.7), (1.0, 0.64), (2.0, 0.5)])
+def test_the_halo_over_the_ballistic_stripe(tau: float, forward: float) -> None:
     whole = np.expm1(2 * tau)
     assert halo_share(2 * tau, 1.0) / whole == pytest.approx(forward, abs=0.015)
-    assert even[0] <= halo_share(2 * tau, 0.0) / whole <= even[1]
+    assert 0.15 <= halo_share(2 * tau, 0.0) / whole <= 0.18
 
 
 def test_the_halo_passes_the_stripe_near_an_optical_depth_of_a_half() -> None:
@@ -84,15 +83,10 @@ def test_traced_rows_in_isotropic_fog(tau: float) -> None:
 
 
 @pytest.mark.parametrize(("tau", "low", "high"), [(0.5, 0.08, 0.13), (1.0, 0.18, 0.32), (2.0, 0.35, 0.46)])
-def test_the_pedestal_behind_the_stripe(tau: float, low: float, high: float) -> None:
+def test_the_pedestal_behind_the_stripe(monkeypatch: pytest.MonkeyPatch, tau: float, low: float, high: float) -> None:
     """Fog alone: a black wall; 10 px before the stripe."""
-    from tests.reference.tables import path_traced
-
-    was, path_traced.ALBEDO = path_traced.ALBEDO, 0.0
-    try:
-        row = radiance(medium={**fog(tau), "phase": {"g": 0.85}})
-    finally:
-        path_traced.ALBEDO = was
+    monkeypatch.setattr(path_traced, "ALBEDO", 0.0)
+    row = radiance(medium={**fog(tau), "phase": {"g": 0.85}})
     assert low < row[260] / row[208] < high
 
 

@@ -24,7 +24,7 @@ covers(motion)
 def _moving(velocity: tuple[float, float, float], normal: tuple[float, float, float]) -> Setting:
     model = rig(k1=-0.1)
     still = setting(model, wall(model, normal, 3.0))
-    return replace(still, view=make_view(model, wall(model, normal, 3.0), MovingSurfaces(velocity)))
+    return replace(still, view=make_view(model, wall(model, normal, 3.0), MovingSurfaces(velocity).view))
 
 
 @pytest.mark.parametrize("normal", [(0.0, 0.0, 1.0), (0.5, -0.3, 1.0)])
@@ -97,7 +97,7 @@ def test_frames_of_a_moving_scene_do_not_depend_on_blocks_or_threads() -> None:
     held, time_s = np.repeat([0.1, 0.12, 0.14], [100, 100, 30]), 0.3 + np.arange(230) * 1e-5
 
     def frames(block: int, threads: int) -> NDArray[np.uint8]:
-        moving = replace(still, view=make_view(model, surfaces, MovingSurfaces((1.0, 0.0, -20.0))))
+        moving = replace(still, view=make_view(model, surfaces, MovingSurfaces((1.0, 0.0, -20.0)).view))
         return drawn(FluxModel(moving), model.sheets, held, 0.05, time_s=time_s, block=block, threads=threads)
 
     whole = frames(230, 1)

@@ -13,9 +13,9 @@ OFFSETS = (-0.4, 0.1, 0.5)
 FOG = {"medium": {"extinction": "0.2 /m"}}
 
 
-def frames(flux, model, fan, n=12, power_w=0.05, threads=2):
+def frames(flux, model, fan, n=12):
     limits = model.scanner.command_range
-    bits = drawn(flux, model.sheets, np.full(n, 0.2), power_w, threads=threads, fan=fan, limits=limits)
+    bits = drawn(flux, model.sheets, np.full(n, 0.2), 0.05, fan=fan, limits=limits)
     return np.unpackbits(bits, axis=-1)[:, :, :96]
 
 
@@ -44,13 +44,6 @@ def test_one_line_is_drawn_as_if_there_were_no_others():
     assert np.array_equal(frames(flux, model, ONE_LINE), frames(flux, model, LineFan((0.0,), 1.0)))
     # The way of several lines, taken with one.
     assert np.array_equal(frames(flux, model, ONE_LINE), frames(flux, model, LineFan((0.0, 5.0), 1.0)))
-
-
-def test_threads_do_not_matter():
-    model = rig()
-    flux = FluxModel(setting(model, wall(model, (0, 0, 1), 3.0), **FOG))
-    fan = line_fan(OFFSETS, shared=True)
-    assert np.array_equal(frames(flux, model, fan, threads=1), frames(flux, model, fan, threads=3))
 
 
 def test_a_line_past_the_range_goes_nowhere():

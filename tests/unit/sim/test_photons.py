@@ -1,12 +1,9 @@
 """Binary frames: exact statistics, packed order, and the same bits however the work is cut."""
 
-from dataclasses import dataclass
-
 import numpy as np
 import pytest
 from numpy.typing import NDArray
 
-from sim_backend.effects.setting import FrameTimes, Words
 from sim_backend.frames import photon_kernels, photons
 from sim_backend.frames.flux import CommandGrid, FluxModel, column_grid, fine_grid
 from sim_backend.frames.photon_kernels import (
@@ -101,39 +98,23 @@ def test_seeds_and_frames_have_streams_of_their_own() -> None:
     assert len(keys) == 50 * 200
 
 
-@dataclass
-class _Carries:
-    """Sets what was set in the frame before, as this effect found it; a light that moves."""
-
-    reads_before = True
-    hold_s = 3e-5
-
-    def apply(self, seed: np.uint64, first_frame: int, words: Words, before: Words, times: FrameTimes) -> None:
-        words |= np.concatenate([before[None], words[:-1]])
-
-
-def _model(size: tuple[int, int], sensor: bool) -> tuple[FluxModel, SheetsOf]:
+def _model(size: tuple[int, int]) -> tuple[FluxModel, SheetsOf]:
     model = rig(size=size)
-    flux = FluxModel(setting(model, wall(model, (0.1, 0, 1), 2.0), medium={"extinction": "0.1 /m"}))
-    if sensor:
-        flux.bits = {"first": _Carries(), "second": _Carries()}
-    return flux, model.sheets
+    return FluxModel(setting(model, wall(model, (0.1, 0, 1), 2.0), medium={"extinction": "0.1 /m"})), model.sheets
 
 
-@pytest.mark.parametrize("sensor", [False, True], ids=["photons", "sensor"])
 @pytest.mark.parametrize("threads", [1, 2, 3])
 @pytest.mark.parametrize("block", [1, 7, 40])
-def test_bits_do_not_depend_on_block_size_or_threads(threads: int, block: int, sensor: bool) -> None:
+def test_bits_do_not_depend_on_block_size_or_threads(threads: int, block: int) -> None:
     held, power, time_s = np.repeat([np.nan, 0.1, 0.2, 0.1, np.nan], 8), np.full(40, 0.5), np.arange(40) * 1e-5
     power[11], power[20:23] = 0.2, 0.0
-    args = *_model((21, 70), sensor), held, power
+    args = *_model((21, 70)), held, power
     cut = drawn(*args, first=100, time_s=time_s, block=block, threads=threads)
     assert np.array_equal(cut, drawn(*args, first=100, time_s=time_s, threads=1))
 
 
-@pytest.mark.parametrize("sensor", [False, True], ids=["photons", "sensor"])
-def test_a_window_has_the_very_bits_of_the_whole_frame(sensor: bool) -> None:
-    args = *_model((9, 200), sensor), np.repeat([np.nan, 0.1, 0.2], 4), 0.5
+def test_a_window_has_the_very_bits_of_the_whole_frame() -> None:
+    args = *_model((9, 200)), np.repeat([np.nan, 0.1, 0.2], 4), 0.5
     x0 = np.array([0, 64, 128, 0] * 3, np.int32)
     whole, window = drawn(*args, first=7), drawn(*args, first=7, x0=x0, window_px=128)
     assert whole.any()
@@ -143,7 +124,7 @@ def test_a_window_has_the_very_bits_of_the_whole_frame(sensor: bool) -> None:
 
 
 def test_light_that_moves_is_made_anew_at_each_step_of_its_time_whatever_the_block() -> None:
-    flux, sheets = _model((9, 64), False)
+    flux, sheets = _model((9, 64))
     seen: list[float] = []
 
     class Moves:

@@ -57,7 +57,6 @@ class Rig:
         *,
         frames: int | None = 1000,
         block_frames: int = 31,
-        power_w: float = 0.1,
         window: WindowTable | None = None,
     ) -> BlockRing:
         """Everything started in the order of a scan: two sweeps of 4 ms, gate high from 0.5 to 3.5 ms of each."""
@@ -71,7 +70,7 @@ class Rig:
         self.scanner.load(ScanWaveform(command, markers, rate), 2)
         self.sync.program([Pulse(0, None), Pulse(0, GATE_OPEN_S), Pulse(OUT_GATE, GATE_S)], 2)
         self.spad.start(frames)
-        self.laser.arm(power_w)
+        self.laser.arm(0.1)
         self.sync.run()
         self.scanner.start()
         return BlockRing(4, timing.stride)
