@@ -16,7 +16,7 @@ out together would change more than `MOST_CHANGED` of the decisions.
 [1] A. B. Tsybakov, "Introduction to nonparametric estimation", Springer 2009, section 2.4.
 """
 
-from collections.abc import Collection, Sequence
+from collections.abc import Callable, Collection, Sequence
 from dataclasses import dataclass
 from typing import Literal
 
@@ -74,13 +74,13 @@ def plan_effects(
     total = 0.0
     if wanted == "planned":
         changes = {entry.name: float(entry.changes(setting, planned_for)) for entry in candidates if entry.changes}
-        left_out, total = _smallest(changes)
+        left_out, total = _largest_set(changes, MOST_CHANGED, lambda names: sum(changes[name] for name in names))
     model = FluxModel(setting, [entry for entry in candidates if entry.name not in left_out])
     if wanted == "planned":
         bounds = _Bounds(model, planes, planned_for)
         alone = {name: bounds.changes({name}) for name in bounds.names}
         changes |= {name: min(bound, changes.get(name, bound)) for name, bound in alone.items()}
-        more, evaluated = bounds.largest_set(alone, MOST_CHANGED - total)
+        more, evaluated = _largest_set(alone, MOST_CHANGED - total, bounds.changes)
         model, left_out, total = model.without(more), left_out | more, total + evaluated
     decisions = tuple(_decision(entry, calls[entry], wanted, changes, left_out) for entry in CATALOGUE)
     return EffectPlan(planned_for, decisions, total), model
@@ -103,15 +103,22 @@ def _decision(
     return EffectDecision(entry, called, why, bound if called else 0.0)
 
 
-def _smallest(changes: dict[str, float]) -> tuple[set[str], float]:
-    """The effects, smallest first, that stay within `MOST_CHANGED` together, and their sum."""
-    taken, total = set(), 0.0
-    for name in sorted(changes, key=changes.__getitem__):
-        if total + changes[name] > MOST_CHANGED:
+def _largest_set(
+    alone: dict[str, float], most: float, together: Callable[[Collection[str]], float]
+) -> tuple[set[str], float]:
+    """The effects, the smallest first, that can be left out together within a bound, and what they change then.
+
+    alone: what each changes. together: what some change.
+    """
+    taken: list[str] = []
+    total = 0.0
+    for name in sorted(alone, key=alone.__getitem__):
+        bound = together([*taken, name]) if taken else alone[name]
+        if bound > most:
             break
-        taken.add(name)
-        total += changes[name]
-    return taken, total
+        taken.append(name)
+        total = bound
+    return set(taken), total
 
 
 class _Bounds:
@@ -140,18 +147,6 @@ class _Bounds:
             seen = np.stack([~np.isnan(_rows(sheet.x_stripe_px, self._bands)) for sheet in self._sheets])
             found += SAFETY * float(each[seen].mean() if seen.any() else each.mean())
         return found
-
-    def largest_set(self, alone: dict[str, float], most: float) -> tuple[set[str], float]:
-        """The effects that can be left out together within a bound, the smallest first, and their bound."""
-        taken: set[str] = set()
-        total = 0.0
-        for name in sorted(alone, key=alone.__getitem__):
-            bound = self.changes({*taken, name}) if taken else alone[name]
-            if bound > most:
-                break
-            taken.add(name)
-            total = bound
-        return taken, total
 
     def _sampled(self, without: Collection[str]) -> Array:
         """Detections per second and watt, (columns, sampled rows, width), without some effects."""

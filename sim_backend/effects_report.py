@@ -6,7 +6,7 @@ share it, effects on the bits per whole frame; light that does not depend on the
 """
 
 import time
-from collections.abc import Mapping, Sequence
+from collections.abc import Mapping
 from dataclasses import asdict
 from statistics import median
 from typing import TYPE_CHECKING, Any
@@ -59,21 +59,23 @@ def effects_report(world: "SimulatedWorld", *, power_w: float, exposure_s: float
 
 
 def flux_row(
-    world: "SimulatedWorld", row: int, sheets: Sequence[LightSheet], *, power_w: float, exposure_s: float
+    world: "SimulatedWorld", row: int, command: float, power_w: float, exposure_s: float
 ) -> Mapping[str, Array]:
     """Photons per exposure (width,) of a row by effect of light or dark counts, zeros for those that are off.
 
-    sheets: of the lines that are there at once, traced on the row. power_w: of each of them.
+    command: of the mirror. power_w: of the laser.
     """
-    model = world.flux_model
+    model, view, limits = world.flux_model, world.setting.view, world.model.scanner.command_range
+    (sheets,) = world.fan.sheets(world.model.sheets, np.array([command]), view.rows, [0.0], limits)
     lit: dict[str, Array] = {}
     for sheet in sheets:
+        view.trace(sheet, row, row + 1)
         for name, (rate, _) in _parts(model, sheet, row, row + 1).items():
             lit[name] = lit.get(name, 0.0) + rate[0]
     found = {}
     for entry in CATALOGUE:
         if entry.kind == "laser":
-            found[entry.name] = exposure_s * power_w * lit.get(entry.name, np.zeros(world.size[1]))
+            found[entry.name] = exposure_s * (power_w * world.fan.share) * lit.get(entry.name, np.zeros(world.size[1]))
         elif entry.kind == "steady":
             steady = model.steady.get(entry.name)
             found[entry.name] = np.zeros(world.size[1]) if steady is None else exposure_s * steady[row]

@@ -255,11 +255,7 @@ class SimulatedWorld:
         """
         from sim_backend.effects_report import flux_row
 
-        view, limits = self.setting.view, self.model.scanner.command_range
-        (sheets,) = self.fan.sheets(self.model.sheets, np.array([command]), view.rows, [0.0], limits)
-        for sheet in sheets:
-            view.trace(sheet, row, row + 1)
-        return flux_row(self, row, sheets, power_w=power_w * self.fan.share, exposure_s=exposure_s)
+        return flux_row(self, row, command, power_w, exposure_s)
 
     def photons(self, times: FrameTimes, seed: int, threads: int) -> PhotonSource:
         """A source of frames that follow one another at these times."""

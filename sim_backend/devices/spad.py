@@ -46,28 +46,26 @@ _TWICE = np.uint64(0xE7037ED1A0B428DB)
 
 
 class FrameLink:
-    """lost_frames: numbers of frames that get lost. loss, duplicates: probability of each frame to get lost, and to be
-    replaced by the one before it in its block.
-    """
+    """The way to the computer, on which frames get lost and come twice as the config says."""
 
-    def __init__(self, lost_frames: tuple[int, ...], loss: float, duplicates: float, seed: int) -> None:
-        self._lost_frames = np.array(sorted(set(lost_frames)), dtype=np.int64)
-        self._loss = loss
-        self._duplicates = duplicates
+    def __init__(self, config: "SimulatedSpadConfig", seed: int) -> None:
+        self._config = config
+        self._lost_frames = np.array(sorted(set(config.lost_frames)), dtype=np.int64)
         self._seed = np.uint64(seed & 0xFFFFFFFFFFFFFFFF)
 
     def loses(self, first_frame: int, n: int) -> NDArray[np.bool_]:
         """Mask of the frames that get lost, bool (n,)."""
-        lost: NDArray[np.bool_] = dropped_frames(self._seed, first_frame, n, self._loss)
+        lost: NDArray[np.bool_] = dropped_frames(self._seed, first_frame, n, self._config.loss_probability)
         named = self._lost_frames[np.searchsorted(self._lost_frames, first_frame) :]
         lost[named[named < first_frame + n] - first_frame] = True
         return lost
 
     def repeat(self, first_frame: int, records: NDArray[np.void], bits: NDArray[np.uint8]) -> None:
         """Replace frames of a block by those before them; its first has none before it in the memory."""
-        if self._duplicates == 0:
+        duplicates = self._config.duplicate_probability
+        if duplicates == 0:
             return
-        twice = dropped_frames(self._seed ^ _TWICE, first_frame, len(records), self._duplicates)
+        twice = dropped_frames(self._seed ^ _TWICE, first_frame, len(records), duplicates)
         for i in np.flatnonzero(twice[1:]) + 1:
             records[i], bits[i] = records[i - 1], bits[i - 1]
 
@@ -208,8 +206,7 @@ class SimulatedSpad(SpadArray):
         self._threads = min(MAX_THREADS, os.cpu_count() or 1)
         self._photons: PhotonSource | None = None
         self._window: WindowTable | None = None
-        faults = config.lost_frames, config.loss_probability, config.duplicate_probability
-        self._link = FrameLink(*faults, seed)
+        self._link = FrameLink(config, seed)
         self._counters = SpadCounters(0, 0, 0, 0, 0)
         self._run_id = self._starts = 0
         self._n_frames: int | None = None

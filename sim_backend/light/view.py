@@ -162,25 +162,16 @@ def _surface_slope(surface: Array, axis: int) -> Array:
     total = np.zeros_like(w)
     weight = np.zeros_like(w)
     # The step between pixels i and i+1 (a neighbour's outer step counts half, and only if the inner one is joined).
+    nothing = np.zeros_like(joined[:1])
+    inner = {1: np.concatenate([nothing, joined[:-1]]), -2: np.concatenate([joined[1:], nothing])}
     for offset, share in ((0, 1.0), (-1, 1.0), (1, 0.5), (-2, 0.5)):
-        reach = joined.copy() if offset in (0, -1) else _inner_joined(joined, offset)
         lo, hi = max(0, -offset), min(len(w), len(step) - offset)
         if lo >= hi:
             continue
         take = slice(lo + offset, hi + offset)
-        usable = reach[take] & joined[take]
+        usable = inner.get(offset, joined)[take] & joined[take]
         total[lo:hi] += share * step[take] * usable
         weight[lo:hi] += share * usable
     with np.errstate(all="ignore"):
         slope = np.where(weight > 0, total / weight, 0.0)
     return np.ascontiguousarray(np.moveaxis(slope, 0, axis))
-
-
-def _inner_joined(joined: NDArray[np.bool_], offset: int) -> NDArray[np.bool_]:
-    """Whether the inner step between the pixel and the outer step at `offset` (1 or -2) is joined."""
-    inner = np.zeros_like(joined)
-    if offset == 1:
-        inner[1:] = joined[:-1]
-    else:
-        inner[:-1] = joined[1:]
-    return inner

@@ -13,7 +13,6 @@ About 2-4 s per map of 500 columns on two free cores.
 from __future__ import annotations
 
 import math
-from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
 
 import numba
@@ -22,7 +21,7 @@ from numpy.typing import NDArray
 
 from tests.reference import kernels
 from tests.reference.geometry import DEPTH_RANGE_M
-from tests.reference.working_point import THREADS, WorkingPoint
+from tests.reference.working_point import WorkingPoint, over_columns
 
 ALBEDO_BINS = 16  # 12 to 64 agree within 0.5 % on the prepared scenes
 TABLE_SIZE = 1 << 16
@@ -61,9 +60,7 @@ class Genie:
                 1 / DEPTH_RANGE_M[1], 1 / DEPTH_RANGE_M[0], table, first, end, x_est,
             )  # fmt: skip
 
-        with ThreadPoolExecutor(THREADS) as pool:
-            for done in [pool.submit(work, a, min(a + 16, g.columns)) for a in range(0, g.columns, 16)]:
-                done.result()
+        over_columns(g.columns, work)
         return x_est
 
 

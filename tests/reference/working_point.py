@@ -116,7 +116,7 @@ class WorkingPoint:
         g, light = self.geometry, self.light
         shape = (g.height, g.columns)
         x_true, x_end, stripe = np.empty(shape), np.empty(shape), np.empty(shape)
-        _over_columns(
+        over_columns(
             g.columns,
             lambda a, b: kernels.find_stripes(
                 g.u, g.v, depth_m, strength, g.planes, g.scanner_m, light.extinction_per_m, a, b, x_true, x_end, stripe
@@ -162,7 +162,7 @@ class WorkingPoint:
         g = self.geometry
         out = np.zeros((g.columns, g.height, window), np.uint8 if exposures <= 255 else np.uint16)
         optics, ends = self.optics, self.ends
-        _over_columns(g.columns, lambda a, b: kernels.draw_counts(optics, ends, exposures, seed, x0, a, b, out))
+        over_columns(g.columns, lambda a, b: kernels.draw_counts(optics, ends, exposures, seed, x0, a, b, out))
         return out
 
     def sub_pixel_sd(self, exposures: int, rows: slice = slice(None)) -> NDArray[np.float64]:
@@ -170,7 +170,7 @@ class WorkingPoint:
         out = np.zeros_like(self.stripe)
         chosen = np.arange(out.shape[0])[rows]
         optics, ends = self.optics, self.ends
-        _over_columns(
+        over_columns(
             self.geometry.columns,
             lambda a, b: kernels.sub_pixel_information(optics, ends, SUB_PIXEL_STEP_PX, chosen, a, b, out),
         )
@@ -217,7 +217,7 @@ class WorkingPoint:
                 kernels.scatter_frames(counts[c], exposures, seed, c, frames)
                 cube[c * exposures : (c + 1) * exposures] = frames
 
-        _over_columns(g.columns, scatter)
+        over_columns(g.columns, scatter)
         cube.flush()
         return path
 
@@ -304,7 +304,7 @@ def score(x_est: NDArray[np.floating], x_true: NDArray[np.floating], trusted: ND
     }
 
 
-def _over_columns(columns: int, work: Callable[[int, int], object]) -> None:
+def over_columns(columns: int, work: Callable[[int, int], object]) -> None:
     """Run `work(first, end)` over fixed pieces of the columns; the pieces do not depend on the number of threads."""
     pieces = [(a, min(a + 16, columns)) for a in range(0, columns, 16)]
     with ThreadPoolExecutor(THREADS) as pool:

@@ -18,6 +18,7 @@ from calibration.model.rig_model import RigModel
 from calibration.model.scanner import PlaneTable
 from sim_backend.effects.catalogue import CATALOGUE
 from sim_backend.frames.flux import FluxModel
+from tests.reference.tables.printed import Table
 from tests.unit.sim.rigs import setting, wall
 
 Array = NDArray[np.float64]
@@ -28,6 +29,10 @@ WIDTH, DISTANCE_M, ALBEDO, SCATTERING_SHARE = 320, 5.0, 0.5, 0.999
 STRIPE_PX = 217.830
 PEAK, BEFORE, BEHIND = slice(214, 222), slice(190, 213), slice(224, 254)
 """Pixels that the stripe lies on, and the levels beside it."""
+TITLES = (
+    "optical depth", "row", "level before the stripe, single scattering = 1", "level behind it, before = 1",
+    "decay, extinction = 1",
+)  # fmt: skip
 MEAN_PX = 15
 """Over so many pixels the tracer's noise, 7 % a pixel, is averaged."""
 
@@ -88,25 +93,20 @@ def figures(row: Array, tau: float) -> tuple[float, float, float]:
     return level, float(np.median(row[BEHIND])) / before, decay(row) / (tau / DISTANCE_M)
 
 
-def table(taus: tuple[float, ...] = (0.5, 1.0)) -> str:
-    """Table of what single scattering lacks, in Markdown."""
-    lines = [
-        "| optical depth | row | level before the stripe, single scattering = 1 | level behind it, before = 1 "
-        "| decay, extinction = 1 |",
-        "|---" * 5 + "|",
-    ]
-    for tau in taus:
+def table() -> Table:
+    """Table of what single scattering lacks."""
+    made = Table(TITLES)
+    for tau in (0.5, 1.0):
         rows = {
             "traced, single scattering": traced_fog(tau)["single"],
             "traced, all orders": traced_fog(tau)["all_orders"],
             "simulated": radiance(medium=fog(tau)),
         }
         for name, row in rows.items():
-            shown = " | ".join(f"{value:.2f}" for value in figures(row, tau))
-            lines.append(f"| {tau} | {name} | {shown} |")
-    return "\n".join(lines)
+            made.add([tau, name, *(f"{value:.2f}" for value in figures(row, tau))])
+    return made
 
 
 if __name__ == "__main__":
     argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter).parse_args()
-    print(table())
+    table()

@@ -31,7 +31,7 @@ from rig.tradeoff.files import colour_of
 from tests.reference.adapter import reconstruct
 from tests.reference.scene import Scene
 from tests.reference.tables.accuracy import Measurement, named
-from tests.reference.tables.printed import parser_of, scenes_asked
+from tests.reference.tables.printed import Table, parser_of, scenes_asked
 from tests.reference.working_point import CLEAR, DENSE, POINTS, REPORT, WorkingPoint
 
 COLUMNS, FRAME_RATE_HZ = 500, 100_000
@@ -175,10 +175,9 @@ def figure_9(figures: Sequence[Figure]) -> str:
     return chart_svg(panels, title="Error over map rate in the fog of the report", notes=notes)
 
 
-def claims_table(figures: Sequence[Figure]) -> str:
-    """The report's claims and ours, as Markdown."""
-    lines = ["| K | maps/s | the report | " + " | ".join(named(*method) for method in _methods(figures)) + " |"]
-    lines.append("|---" * (3 + len(_methods(figures))) + "|")
+def claims_table(figures: Sequence[Figure]) -> Table:
+    """The report's claims and ours."""
+    table = Table(["K", "maps/s", "the report", *(named(*method) for method in _methods(figures))])
     claims = {1: "cannot do", 10: "< 1 px", 20: "about 0.1 px"}
     for k in sorted({figure.exposures for figure in figures if figure.point == "report"}):
         cells = []
@@ -187,8 +186,8 @@ def claims_table(figures: Sequence[Figure]) -> str:
             cells.append(
                 f"{fmean(f.mean_px for f in here):.2f} ({fmean(f.rounded_px for f in here):.2f})" if here else "-"
             )
-        lines.append(f"| {k} | {FRAME_RATE_HZ / COLUMNS / k:g} | {claims.get(k, '')} | {' | '.join(cells)} |")
-    return "\n".join(lines)
+        table.add([k, f"{FRAME_RATE_HZ / COLUMNS / k:g}", claims.get(k, ""), *cells])
+    return table
 
 
 def _methods(figures: Sequence[Figure]) -> list[tuple[str, str]]:
@@ -327,10 +326,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
     }
     for name, text in drawn.items():
         (options.out / f"report-{name}.svg").write_text(text)
-    table = claims_table(figures)
-    print(table)
-    if options.markdown is not None:
-        options.markdown.write_text(table + "\n")
+    claims_table(figures).write(options.markdown)
     return 0
 
 

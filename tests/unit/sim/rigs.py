@@ -52,11 +52,24 @@ def wall(model: RigModel, normal: tuple[float, float, float], distance_m: float,
     return checked("wall", depth, np.full(u.shape, albedo), np.ones(u.shape, bool), u.shape)
 
 
+def before_wall(model: RigModel, distance_m: float, columns: slice, depth_m: float) -> Surfaces:
+    """A wall square to the camera's axis, something else in these columns of the picture."""
+    surfaces = wall(model, (0.0, 0.0, 1.0), distance_m)
+    surfaces.depth_m[:, columns] = depth_m
+    return surfaces
+
+
 def setting(
-    model: RigModel, surfaces: Surfaces, *, optics: Optics | None = None, line: Line | None = None, **scene: Any
+    model: RigModel,
+    surfaces: Surfaces,
+    *,
+    optics: Optics | None = None,
+    sensor: Sensor | None = None,
+    line: Line | None = None,
+    **scene: Any,
 ) -> Setting:
     """A scene given by the keys of a scene file, in front of default optics unless others are given."""
-    optics, sensor, line = optics or Optics(), Sensor(), line or Line()
+    optics, sensor, line = optics or Optics(), sensor or Sensor(), line or Line()
     parsed = SceneFile.model_validate(scene)
     gain = detections_per_radiance(optics, sensor, line)
     return Setting(make_view(model, surfaces), parsed, optics, sensor, line, gain)

@@ -12,7 +12,6 @@ from calibration.board.board import BLACK, WHITE, Board
 from calibration.views import BoardPose
 from drivers.errors import DeviceError
 from sim_backend.scenes.board import WALL_ALBEDO, BoardAtPose, board_scene
-from sim_backend.scenes.scene import SceneFile
 from sim_backend.world import SimulatedWorld
 from tests.system.small_rig import calibration
 from tests.unit.sim.rigs import made_world, rig
@@ -127,16 +126,3 @@ def test_scene_files_show_several_boards_from_files_of_their_own(tmp_path: Path)
     (tmp_path / "mine.yaml").unlink()
     with pytest.raises(DeviceError, match=r"mine\.yaml"):
         _world(tmp_path, scene=str(file))
-
-
-@pytest.mark.parametrize(
-    "content",
-    [
-        {"surfaces": "board"},
-        {"board": {"rotation": ["0 rad"] * 3, "position": ["0 m"] * 3}},
-        {"surfaces": "board", "board": {"rotation": [0, 0, 0], "position": ["0 m"] * 3}},
-    ],
-)
-def test_half_a_board_is_refused(content: dict[str, Any]) -> None:
-    with pytest.raises(ValueError, match="board"):
-        SceneFile.model_validate(content)

@@ -26,8 +26,7 @@ def _setting(extinction: str | None = None, **scene: object) -> Setting:
     """In fog of that extinction that scatters only once; a sensor without dark counts."""
     if extinction is not None:
         scene["medium"] = {"extinction": extinction, "multiple_scattering": False}
-    made = setting(MODEL, wall(MODEL, (0.1, 0.0, 1.0), 2.5), **scene)
-    return replace(made, sensor=Sensor(dark_rate="0 cps"))
+    return setting(MODEL, wall(MODEL, (0.1, 0.0, 1.0), 2.5), sensor=Sensor(dark_rate="0 cps"), **scene)
 
 
 def _decisions(plan: EffectPlan) -> dict[str, EffectDecision]:

@@ -4,8 +4,8 @@ import numpy as np
 import pytest
 
 from sim_backend.effects.fog import Haze
-from sim_backend.scenes.surfaces import Surfaces, checked
-from tests.unit.sim.rigs import effect_rate, pixel_solid_angle, rig, setting, wall
+from sim_backend.scenes.surfaces import checked
+from tests.unit.sim.rigs import before_wall, effect_rate, pixel_solid_angle, rig, setting, wall
 
 EXTINCTION, PHASE = 0.15, 0.05
 FOG = {"medium": {"extinction": f"{EXTINCTION} /m", "backscatter": f"{PHASE} /sr", "scattering_share": 0.9}}
@@ -48,10 +48,7 @@ def test_the_haze_is_what_the_volume_scatters_into_the_camera(baseline_m: float,
 
 def test_haze_ends_in_the_shadow_of_a_body_and_does_not_come_back() -> None:
     model = rig()
-    back = wall(model, (0.0, 0.0, 1.0), 3.0)
-    depth = back.depth_m.copy()
-    depth[:, 40:50] = 1.2
-    setup = setting(model, Surfaces(depth, back.albedo, back.trusted), **FOG)
+    setup = setting(model, before_wall(model, 3.0, slice(40, 50), 1.2), **FOG)
     met = 0
     for command in np.linspace(-0.5, 0.9, 41):
         plane = model.planes(command)

@@ -38,13 +38,3 @@ def test_only_media_that_say_so_have_it() -> None:
     assert entry.called(setting(model, surfaces, medium=MEDIUM))[0]
     assert not entry.called(setting(model, surfaces, medium={"extinction": "0.3 /m"}))[0]
     assert not entry.called(setting(model, surfaces))[0]
-
-
-def test_a_walk_of_many_turns_has_that_variance() -> None:
-    """Single turns drawn one by one along the way: number, place and angle."""
-    rng = np.random.default_rng(7)
-    depth = 1.3
-    number = rng.poisson(depth, 200_000)
-    angle = rng.normal(0, 1, number.sum()) * (1 - rng.random(number.sum()))
-    shift = np.bincount(np.repeat(np.arange(len(number)), number), angle, len(number))
-    assert shift[number > 0].var() == pytest.approx(depth / (1 - np.exp(-depth)) / 3, rel=0.02)

@@ -8,8 +8,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from calibration.model.light_sheet import depth
-from sim_backend.scenes.surfaces import Surfaces
-from tests.unit.sim.rigs import rig, setting, wall
+from tests.unit.sim.rigs import before_wall, rig, setting, wall
 
 
 @settings(max_examples=25, deadline=None)
@@ -37,20 +36,10 @@ def test_the_stripe_lies_on_wall_and_sheet(
     assert np.all(np.abs(1 / on_sheet - 1 / on_wall) < 2e-3 * du / 0.3)
 
 
-def test_the_near_side_follows_the_scanner() -> None:
-    for baseline_m, step in ((0.3, 1), (-0.3, -1)):
-        model = rig(baseline_m=baseline_m)
-        sheet = setting(model, wall(model, (0, 0, 1), 2.0)).view.sheet(model.planes(0.0))
-        assert np.all(sheet.step == step)
-
-
 @pytest.mark.parametrize("baseline_m", [0.3, -0.3])
 def test_no_stripe_behind_a_body_nor_on_its_unseen_side(baseline_m: float) -> None:
     model = rig(baseline_m=baseline_m)
-    back = wall(model, (0.0, 0.0, 1.0), 4.0)
-    depth_m = back.depth_m.copy()
-    depth_m[:, 44:52] = 1.5
-    view = setting(model, Surfaces(depth_m, back.albedo, back.trusted)).view
+    view = setting(model, before_wall(model, 4.0, slice(44, 52), 1.5)).view
     for command in np.linspace(-0.6, 0.6, 61):
         plane = model.planes(command)
         x = view.sheet(plane).x_stripe_px
@@ -69,10 +58,7 @@ def test_no_stripe_behind_a_body_nor_on_its_unseen_side(baseline_m: float) -> No
 
 def test_light_that_enters_behind_the_picture_edge_is_in_shadow() -> None:
     model = rig()
-    back = wall(model, (0.0, 0.0, 1.0), 4.0)
-    depth_m = back.depth_m.copy()
-    depth_m[:, :4] = 0.4
-    view = setting(model, Surfaces(depth_m, back.albedo, back.trusted)).view
+    view = setting(model, before_wall(model, 4.0, slice(4), 0.4)).view
     sheet = view.sheet(model.planes(-0.2))
     assert np.all(np.isnan(sheet.x_stripe_px))
     assert np.all(np.isnan(sheet.x_end_px))
@@ -80,6 +66,5 @@ def test_light_that_enters_behind_the_picture_edge_is_in_shadow() -> None:
 
 def test_open_sky_has_no_stripe() -> None:
     model = rig()
-    back = wall(model, (0.0, 0.0, 1.0), 4.0)
-    sky = Surfaces(np.full_like(back.depth_m, np.inf), back.albedo, back.trusted)
+    sky = wall(model, (0.0, 0.0, 1.0), np.inf)
     assert np.all(np.isnan(setting(model, sky).view.sheet(model.planes(0.0)).x_stripe_px))

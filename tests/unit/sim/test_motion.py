@@ -14,9 +14,8 @@ from sim_backend.frames.flux import FluxModel
 from sim_backend.light.optics import Line
 from sim_backend.light.view import make_view
 from sim_backend.scenes.scene import SceneFile
-from sim_backend.scenes.surfaces import Surfaces
 from tests.stability.inventory import covers
-from tests.unit.sim.rigs import Array, drawn, rig, setting, wall
+from tests.unit.sim.rigs import before_wall, drawn, rig, setting, wall
 
 covers(motion)
 
@@ -56,18 +55,15 @@ def test_time_zero_is_the_scene_itself_and_a_step_holds() -> None:
     assert np.array_equal(again.view.at(0.0105).surface, moving.view.at(0.0105).surface)
 
 
-def _box_before_wall() -> tuple[Setting, Array]:
+def _box_before_wall() -> Setting:
     model = rig()
-    back = wall(model, (0.0, 0.0, 1.0), 3.0)
-    depth = back.depth_m.copy()
-    depth[:, 40:50] = 1.2
-    albedo = np.where(depth < 2, 0.9, 0.3).astype(np.float32)
-    return setting(model, Surfaces(depth, albedo, back.trusted)), depth
+    surfaces = before_wall(model, 3.0, slice(40, 50), 1.2)
+    albedo = np.where(surfaces.depth_m < 2, 0.9, 0.3).astype(np.float32)
+    return setting(model, replace(surfaces, albedo=albedo))
 
 
 def test_a_near_box_moves_farther_in_the_picture_and_covers_the_wall() -> None:
-    setup, _ = _box_before_wall()
-    view = shifted(setup.view, np.array([0.1, 0.0, 0.0]))  # 9.2 px at 1.2 m, 3.7 px at 3 m
+    view = shifted(_box_before_wall().view, np.array([0.1, 0.0, 0.0]))  # 9.2 px at 1.2 m, 3.7 px at 3 m
     near = view.surface[32] > 0.5
     assert np.flatnonzero(near).tolist() == list(range(49, 59))
     np.testing.assert_allclose(1 / view.surface[32, near], 1.2, rtol=1e-6)
@@ -76,7 +72,7 @@ def test_a_near_box_moves_farther_in_the_picture_and_covers_the_wall() -> None:
 
 
 def test_what_comes_up_to_the_camera_is_gone_and_nothing_breaks() -> None:
-    setup, _ = _box_before_wall()
+    setup = _box_before_wall()
     for shift in ((0.0, 0.0, -1.2), (0.0, 0.0, -2.0), (0.0, 0.0, -50.0), (0.0, 0.0, 1e6), (1e6, 0.0, 0.0)):
         view = shifted(setup.view, np.array(shift))
         assert np.isfinite(view.surface).all()

@@ -21,7 +21,6 @@ from sim_backend.effects.particles import (
 from sim_backend.effects.setting import Setting
 from sim_backend.light.optics import Line
 from sim_backend.scenes.medium import Rain
-from sim_backend.scenes.surfaces import Surfaces
 from tests.stability.inventory import covers
 from tests.unit.sim.rigs import pixel_solid_angle, rig, setting, wall
 
@@ -149,9 +148,7 @@ def test_a_time_says_where_they_are_whatever_the_rows(effect: Callable[[Setting]
 
 def test_nothing_falls_in_front_of_a_camera_without_picture() -> None:
     model = rig()
-    surfaces = wall(model, (0.0, 0.0, 1.0), 3.0)
-    sky = Surfaces(np.full_like(surfaces.depth_m, np.inf), surfaces.albedo, surfaces.trusted)
-    setup = setting(model, sky, rain={"rate": "20 mm/h"})
+    setup = setting(model, wall(model, (0.0, 0.0, 1.0), np.inf), rain={"rate": "20 mm/h"})
     rate = np.zeros((64, 96))
     effect = rain_drops(setup)
     effect.add(setup.view.sheet(model.planes(0.3)), 0, 64, rate)

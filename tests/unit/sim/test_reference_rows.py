@@ -44,7 +44,7 @@ def test_single_scattering_in_fog_has_the_shape_and_the_strength_beside_the_stri
 
 
 def test_what_single_scattering_lacks_is_a_table() -> None:
-    lines = [[cell.strip() for cell in line.split("|")[1:-1]] for line in table().splitlines()[2:]]
+    lines = [[cell.strip() for cell in line.split("|")[1:-1]] for line in table().text.splitlines()[2:]]
     found = {(float(tau), row): [float(value) for value in values] for tau, row, *values in lines}
     for tau, before, behind in ((0.5, 1.27, 0.16), (1.0, 1.50, 0.28)):  # as docs/explanation/simulation.md says
         assert found[tau, "traced, all orders"][:2] == pytest.approx([before, behind], abs=0.015)

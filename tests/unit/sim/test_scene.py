@@ -19,7 +19,7 @@ from sim_backend.light.view import make_view
 from sim_backend.scenes import scene
 from sim_backend.scenes.medium import Medium
 from sim_backend.scenes.prepared import load_folder, prepare
-from sim_backend.scenes.scene import SceneFile, bundled_scenes, load_scene, load_surfaces, with_fog
+from sim_backend.scenes.scene import bundled_scenes, load_scene, load_surfaces, with_fog
 from sim_backend.scenes.street import street
 from sim_backend.world import WorldConfig
 from tests.stability.inventory import covers
@@ -49,11 +49,6 @@ def test_bundled_scenes_load(name: str, parts: str) -> None:
     scene, _ = load_scene(name)
     there = [part for part in ("medium", "rain", "snow", "ambient", "motion") if getattr(scene, part) is not None]
     assert there == parts.split()
-
-
-def test_visibility_is_that_of_two_percent_contrast() -> None:
-    scene = SceneFile.model_validate({"medium": {"fog": {"visibility": "30 m"}}})
-    assert scene.extinction_per_m == pytest.approx(3.912 / 30)
 
 
 PLACE = "rotation: [0 deg, 0 deg, 0 deg]\n  position: [0 m, 0 m, 1 m]"
@@ -89,6 +84,17 @@ PLACE = "rotation: [0 deg, 0 deg, 0 deg]\n  position: [0 m, 0 m, 1 m]"
         ("medium: {fog: {visibility: -30 m}}", "more than 0 m"),
         ("medium: {fog: {visibility: 30 m}, extinction: 0.1 /m}", "exactly one"),
         ("medium: {}", "exactly one"),
+        ("medium: {fog: {visibility: 40 m}, smoke: {extinction: 1 /m}}", "exactly one"),
+        ("medium: {smoke: {}}", "exactly one"),
+        ("medium: {extinction: 0.1 /m, phase: {terms: [[0.5, 0.9]]}}", "sum to 0.5"),
+        ("medium: {extinction: 0.1 /m, phase: isotropic, backscatter: 0.05 /sr}", "the same thing"),
+        ("medium: {extinction: 0.1 /m, forward_share: 0.6}", "forward_share is 0.6, it must be at most 0.5"),
+        ("surfaces: board", "both or neither"),
+        (f"board:\n  {PLACE}", "both or neither"),
+        (
+            "surfaces: board\nboard: {rotation: [0, 0 deg, 0 deg], position: [0 m, 0 m, 0 m]}",
+            "board.rotation.0: 0 has no unit",
+        ),
         ("medium: {extinction: 0.1 /m, backscatter: 0.05}", "/sr"),
         ("ambient: {illuminance: 100 m}", "lux"),
         ("[1, 2", "not YAML"),

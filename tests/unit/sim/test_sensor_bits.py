@@ -40,8 +40,7 @@ EVERYTHING = {
 def sensor_setting(**sensor: str | int) -> Setting:
     """A wall before a sensor of ROWS x WIDTH pixels with these keys."""
     model = rig(size=(ROWS, WIDTH))
-    made = setting_of(model, wall(model, (0.0, 0.0, 1.0), 2.0))
-    return Setting(made.view, made.scene, made.optics, Sensor.model_validate(sensor), made.line, made.gain)
+    return setting_of(model, wall(model, (0.0, 0.0, 1.0), 2.0), sensor=Sensor.model_validate(sensor))
 
 
 def acted_on(

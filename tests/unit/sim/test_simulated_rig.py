@@ -136,6 +136,13 @@ def _open(
     )
 
 
+def _runs(folder: Path, window: WindowTable | None = None, **spad_config: object) -> list[Recording]:
+    """The same run in blocks of several sizes."""
+    opened = [_open(folder, **spad_config) for _ in range(3)]
+    sizes = (31, 7, 600)
+    return [_record(one, one.start(block_frames=n, window=window)) for one, n in zip(opened, sizes, strict=True)]
+
+
 @pytest.fixture
 def small(tmp_path: Path) -> Iterator[Rig]:
     opened = _open(tmp_path)
@@ -187,11 +194,7 @@ def test_the_gate_lowered_midway_ends_the_light(small: Rig) -> None:
 
 
 def test_the_same_seed_gives_the_same_bits_for_any_block_size(tmp_path: Path) -> None:
-    runs = []
-    for block_frames in (31, 7, 600):
-        opened = _open(tmp_path)
-        runs.append(_record(opened, opened.start(block_frames=block_frames)))
-    other = _open(tmp_path, seed=2)
+    runs, other = _runs(tmp_path), _open(tmp_path, seed=2)
     for run in runs[1:]:
         assert np.array_equal(run.bits, runs[0].bits)
         assert np.array_equal(run.ticks, runs[0].ticks)
@@ -203,11 +206,7 @@ def test_the_same_seed_gives_the_same_bits_for_any_block_size(tmp_path: Path) ->
 def test_windows_move_with_the_markers_and_hold_the_bits_of_the_full_frames(tmp_path: Path) -> None:
     entries = np.arange(31) // 7 % 2 * 64
     window = WindowTable(64, (entries.astype(np.int32), 64 - entries.astype(np.int32)))
-    full, *runs = [
-        _record(opened, opened.start(block_frames=block_frames, window=table))
-        for block_frames, table in ((31, None), (31, window), (7, window), (600, window))
-        for opened in [_open(tmp_path, lost_frames=[200, 201, 430])]
-    ]
+    full, runs = _runs(tmp_path, lost_frames=[200, 201, 430])[0], _runs(tmp_path, window, lost_frames=[200, 201, 430])
     for run in runs:
         assert np.array_equal(run.records["marks"], full.records["marks"])
         assert {header.width for header in run.headers} == {64}
@@ -322,16 +321,12 @@ def test_a_frame_that_comes_twice_has_markers_counters_and_ticks_of_the_first_ti
 
 @pytest.mark.parametrize("wander", ["0 ppm", "900 ppm"])
 def test_a_spad_clock_that_is_off_sees_the_scanner_run_by_its_own_ticks(tmp_path: Path, wander: str) -> None:
-    runs = []
-    for block_frames in (31, 7, 600):
-        opened = _open(tmp_path, clock_error="-900 ppm", clock_wander=wander)
-        runs.append(_record(opened, opened.start(block_frames=block_frames)))
-    run = runs[0]
+    run, *others = _runs(tmp_path, clock_error="-900 ppm", clock_wander=wander)
     scans = np.flatnonzero(run.marked(Mark.SCAN))
     times = run.ticks[scans] / 1000 + (((run.records["marks"][scans] >> 8) & 0xFF) + 0.5) / 256
     expected = 400 * (1 - 900e-6) / (1 + 20e-6)
     assert np.diff(times)[0] == pytest.approx(expected, abs=1 / 256 if wander == "0 ppm" else 0.1)
-    for other in runs[1:]:
+    for other in others:
         assert np.array_equal(other.records[["marks", "line", "sweep"]], run.records[["marks", "line", "sweep"]])
         assert np.array_equal(other.bits, run.bits)
 
