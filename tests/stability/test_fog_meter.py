@@ -3,9 +3,8 @@
 import numpy as np
 import pytest
 
-from rig.depth.fog_meter import FogEstimate, fit_fog, read_fog
+from rig.depth.fog_meter import fit_fog, read_fog
 from rig.depth.kernels import add_clear_rows
-from rig.geometry.stripe_table import StripeTable
 from tests.reference.working_point import Light
 from tests.stability.inventory import covers
 from tests.unit.rig.depth.test_fog_meter import PATH_M, state_of, stripes_of, sums, swept
@@ -63,9 +62,3 @@ def test_pictures_without_any_contrast_have_no_fog(level) -> None:
     assert fog.extinction_per_m is None
     assert fog.veil_per_exposure is None
     assert fog.visibility_m is None
-
-
-def test_maps_without_an_answer_have_no_fog() -> None:
-    sweep = swept(Light(), 1)
-    nothing = StripeTable.empty(*sweep.point.x_true.shape)
-    assert read_fog(sweep.volume, nothing, sweep.geometry, state_of(sweep)) == FogEstimate()

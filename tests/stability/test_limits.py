@@ -58,16 +58,6 @@ def test_chernoff_exponents_of_pixels_nearly_alike(digits) -> None:
     assert np.all(chernoff_exponent(one[:, None], one[:, None]) == 0)
 
 
-@covers(chernoff_exponent)
-def test_exponents_of_a_swap_are_those_of_the_closed_form() -> None:
-    """Two pixels trade places: C = -2 log(sqrt(ps pb) + sqrt(qs qb)), 0.223 for (.5, .1) and 0.292 for (.8, .3)."""
-    for ps, pb, expected in ((0.5, 0.1, 0.223), (0.8, 0.3, 0.292)):
-        flux = -np.log1p(-np.array([ps, pb]))
-        got = float(chernoff_exponent(flux, flux[::-1]))
-        assert got == pytest.approx(-2 * np.log(np.sqrt(ps * pb) + np.sqrt((1 - ps) * (1 - pb))), rel=1e-13)
-        assert got == pytest.approx(expected, abs=5e-4)
-
-
 @covers(pixel_share, log_fired)
 def test_shares_of_a_line_far_out_in_its_flanks(worst, digits) -> None:
     away, sigma = (a.ravel() for a in np.meshgrid([0.0, 0.3, 0.5, 1.0, 2.5, 4.0], [0.2, 0.6, 3.0, 100.0]))

@@ -16,7 +16,6 @@ from rig.count.volume import BIN_DARK, CountVolume, FrameTally, SweepCounter, Sw
 from rig.depth.depth import depth_map
 from rig.depth.kernels import fill_rows
 from rig.errors import UsageError
-from rig.estimate.argmax_edge import peak_rows
 from rig.estimate.median import median_filter
 from rig.estimate.registry import ESTIMATORS, create_estimator
 from rig.estimate.row.ambient import ambient_map, hot_pixels
@@ -25,7 +24,7 @@ from rig.geometry.stripe_table import MISSING_PX, StripeTable, charged_errors, d
 from rig.geometry.windows import SweepGeometry, sweep_geometry, uncalibrated_geometry
 from rig.threads import RowWorkers
 from tests.stability.inventory import EXAMPLES, covers
-from tests.unit.small_maps import rows_of, simulated, volume_of
+from tests.unit.small_maps import simulated, volume_of
 
 NAN = st.just(np.nan)
 
@@ -178,19 +177,6 @@ def test_ambient_light_is_a_finite_flux_for_any_counts(k, level, n_dark, dark, q
 EVERY = pytest.mark.parametrize("name", ESTIMATORS)
 
 
-@covers(peak_rows)
-@EVERY
-@pytest.mark.parametrize("level", [0, 1])
-def test_a_million_exposures_of_nothing_or_all_ones(name, level) -> None:
-    geometry = simulated(rows=4, columns=24).geometry
-    counts = np.full((24, 4, 512), level * 10**6, np.uint32)
-    table = create_estimator(name).estimate(volume_of(counts, geometry, 10**6), geometry)
-    asked = geometry.x_lo <= geometry.x_hi
-    for values in (table.x_px, table.x_sd_px, table.signal, table.haze):
-        np.testing.assert_array_equal(np.isfinite(values), asked)
-    assert np.all((table.confidence >= 0) & (table.confidence <= 1))
-
-
 @EVERY
 def test_ties_dead_and_saturated_rows_give_the_same_answer_on_any_number_of_threads(name) -> None:
     sweep = simulated(rows=16, columns=24)
@@ -206,19 +192,3 @@ def test_ties_dead_and_saturated_rows_give_the_same_answer_on_any_number_of_thre
     for other in tables[1:]:
         for field in ("x_px", "confidence", "x_sd_px", "signal", "haze"):
             np.testing.assert_array_equal(getattr(other, field), getattr(tables[0], field))
-
-
-@pytest.mark.parametrize("near_is_left", [True, False])
-@pytest.mark.parametrize("name", ["argmax", "edge"])
-def test_ties_go_to_the_smallest_x_and_peaks_at_the_edge_stay_there(name, near_is_left) -> None:
-    counts = np.zeros((4, 1, 64), np.uint8)
-    counts[0, 0, [20, 40]] = 7
-    counts[1, 0, 10] = 7
-    counts[2, 0, 53] = 7
-    counts[3, 0, 30:34] = 7
-    volume, geometry = rows_of(counts, 10, near_is_left=near_is_left, x_lo=10, x_hi=53)
-    x = create_estimator(name).estimate(volume, geometry).x_px[0]
-    assert x[0] == 20 or name == "edge"
-    assert x[1] == 10
-    assert x[2] == 53
-    assert 29.5 <= x[3] <= 33.5

@@ -209,30 +209,6 @@ def test_a_mirror_that_stands_still_fills_its_column_no_further_than_bytes_count
     assert not clocks[0].synchronised
 
 
-def test_frames_before_the_first_marker_are_not_used():
-    plan = plan_of(scan())
-    stream = stream_of(plan, 1, latency_s=5e-4)
-    bound, _ = bind(plan, whole(stream))
-    before = np.arange(len(stream.records)) < stream.scan_frames[0]
-    assert before.sum() == 50
-    assert (bound["sweep"][before] == -1).all()
-    assert (bound["bins"][before] == BIN_UNUSABLE).all()
-    assert np.isnan(bound["column"][before]).all()
-
-
-def test_the_way_back_runs_through_the_same_columns_downwards():
-    plan = plan_of(scan(bidirectional=True, columns=21), Lag(1e-4, 3e-4))
-    stream = stream_of(plan, 2, lag=Lag(1e-4, 3e-4))
-    bound, _ = bind(plan, whole(stream))
-    out, back = (bound["column"][(bound["sweep"] == s) & (bound["bins"] >= 0)] for s in (0, 1))
-    assert (np.diff(out) > 0).all()
-    assert (np.diff(back) < 0).all()
-    assert set(bound["direction"][bound["sweep"] == 1].tolist()) == {-1}
-    for sweep in (0, 1):
-        lit = (bound["sweep"] == sweep) & (bound["bins"] >= 0)
-        np.testing.assert_allclose(plan.command_at(bound["column"][lit]), stream.mirror[lit], atol=0.05 * 0.6 / 21)
-
-
 @pytest.mark.parametrize("error", [-9e-5, 0.0, 1.1e-4])
 def test_the_ratio_of_the_clocks_is_found_and_used_in_the_next_sweep(error):
     plan = plan_of(scan(columns=300, exposures=10))
@@ -286,14 +262,6 @@ def test_a_direction_level_that_is_not_the_plans_flags_the_sweep():
     stream.records["marks"] ^= np.uint32(Mark.BACKWARD)
     _, clocks = bind(plan, whole(stream))
     assert not any(clock.synchronised for clock in clocks)
-
-
-def test_frames_whose_window_is_not_to_be_trusted_are_not_used():
-    plan = plan_of(scan())
-    stream = stream_of(plan, 1)
-    stream.records["marks"] |= np.uint32(Mark.WINDOW_LOST)
-    bound, _ = bind(plan, whole(stream))
-    assert (bound["bins"] == BIN_UNUSABLE).all()
 
 
 def test_counters_of_16_bits_run_over_without_harm():

@@ -8,7 +8,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from rig.count import kernels
-from rig.count.kernels import CHUNK, PLANES, add_frames, add_runs, new_planes, planes_for
+from rig.count.kernels import CHUNK, PLANES, add_frames, add_runs, planes_for
 from rig.count.lane_order import PAIRS, pixel_order
 from rig.simd.vectors import LANES
 from tests.stability.inventory import covers
@@ -62,13 +62,6 @@ def test_frames_may_come_in_pieces(pieces):
         add_frames(words.ravel(), 20, 0, first, first + piece, 20, first, planes)
         first += piece
     np.testing.assert_array_equal(planes_counts(planes, 20, first), bits_of(words).sum(axis=0))
-
-
-def test_new_planes_begin_at_cache_lines():
-    planes = new_planes(3)
-    assert planes.shape == (3, PLANES + 1, CHUNK)
-    assert planes.ctypes.data % 64 == 0
-    assert not planes.any()
 
 
 def test_words_beside_a_chunk_are_left_alone():
@@ -131,21 +124,6 @@ def test_runs_of_any_length_are_counted(k):
         np.testing.assert_array_equal(counts[0], wanted if value == 0 else 0)
         np.testing.assert_array_equal(dark, wanted if value == -1 else 0)
         assert wanted[0, 0] == k
-
-
-def test_windows_that_move_within_a_column_are_counted_at_their_place():
-    rows, width_words, used, columns = 5, 8, 4, 3
-    rng = np.random.default_rng(4)
-    n = 60
-    bins = np.repeat(np.arange(columns), n // columns)
-    x0 = np.array([2, 3, 3]) * WORD
-    first_word = rng.integers(1, 3, n)  # holds words 2 to 4 whatever it is
-    whole = random_words(5, n, rows, width_words)
-    cut = np.stack([frame[:, w : w + used] for frame, w in zip(whole, first_word, strict=True)])
-    counts, _ = runs(cut, first_word, used, used, bins, x0, 2 * WORD, rows, width_words, (0, 0.5, 1))
-    pixels = bits_of(whole)
-    for c in range(columns):
-        np.testing.assert_array_equal(counts[c], pixels[bins == c][:, :, x0[c] : x0[c] + 2 * WORD].sum(axis=0))
 
 
 def test_without_columns_only_dark_frames_are_counted():

@@ -51,14 +51,6 @@ def padding_of(n, lanes):
     return np.concatenate([pairs[:, :PAD].ravel(), pairs[:, PAD + lanes :].ravel()])
 
 
-@pytest.mark.parametrize(
-    ("pixels", "lanes"), [(1, 16), (64, 16), (128, 16), (192, 32), (256, 32), (320, 48), (512, 64)]
-)
-def test_rows_are_whole_vectors(pixels, lanes):
-    assert padded_lanes(pixels) == lanes
-    assert new_counts(3, lanes).shape == (3, PAIRS * (lanes + 2 * PAD) * 2)
-
-
 @pytest.mark.parametrize("window", range(64, 513, 64))
 @pytest.mark.parametrize("n_planes", [1, 2, 4, 8])
 @pytest.mark.parametrize("at", [(0, 64), (8, 16), (40, 40)])
@@ -75,17 +67,6 @@ def test_planes_are_read_as_the_bits_that_they_hold(n_planes, window, at):
         # Beyond the window lie other pixels' bits.
         assert not pixels_of(row, lanes)[window:].any()
         assert not padding_of(row, lanes).any()
-
-
-def test_every_count_of_eight_planes_is_read():
-    planes = np.zeros((8, PLANE_BYTES), np.uint8)
-    counts = np.arange(256)
-    for q in range(8):
-        planes[q, :32] = np.packbits((counts >> q) & 1)
-    n = new_counts(2, 32)
-    read(address(planes), 0, 0, PLANE_BYTES, 8, 256, address(n), 32)
-    for row in n:
-        np.testing.assert_array_equal(pixels_of(row, 32), counts)
 
 
 @pytest.mark.parametrize("dtype", [np.uint8, np.uint16, np.uint32])
@@ -130,25 +111,6 @@ def test_few_of_very_many_exposures_keep_their_mean_in_every_pixel(times):
         read_counts(counts, times, address(n), 16, turn)
         total += pixels_of(n, 16)
     np.testing.assert_allclose(total / 2048, counts / 2**times, atol=2.0 ** -min(times, 11))
-
-
-@pytest.mark.parametrize("times", [1, 2, 3])
-@pytest.mark.parametrize("rate", [0.1, 0.5, 2.0])
-def test_halved_counts_keep_their_mean(rate, times):
-    counts = np.random.default_rng(times).poisson(rate, (200, 512)).astype(np.uint16)
-    n = new_counts(1, 64)[0]
-    total = 0
-    for row in counts:
-        read_counts(row, times, address(n), 64)
-        total += int(pixels_of(n, 64).sum())
-    assert total / counts.sum() == pytest.approx(2.0**-times, rel=0.03)
-
-
-def test_the_largest_counts_are_halved_without_running_over():
-    counts = np.full(64, 2**31, np.uint32)
-    n = new_counts(1, 16)[0]
-    read_counts(counts, 26, address(n), 16)
-    assert set(pixels_of(n, 16)[:64].tolist()) == {32}
 
 
 def test_sums_of_counts_are_in_pixel_order_when_asked():

@@ -137,10 +137,6 @@ def test_depths_more_than_a_tenth_outside_the_range_are_no_estimate():
         assert np.isfinite(result).any() == inside
 
 
-def test_without_stripes_there_is_no_depth():
-    assert np.isnan(depth_map(StripeTable.empty(ROWS, COLUMNS), GEOMETRY, 0.0)).all()
-
-
 def test_a_single_stripe_makes_no_surface():
     x = np.full((ROWS, COLUMNS), np.nan)
     x[:, 250] = wall_stripes(3.0)[:, 250]

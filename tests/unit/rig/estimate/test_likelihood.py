@@ -40,18 +40,6 @@ def test_stripes_are_found_from_ten_exposures(light, share, rig):
     assert np.median(errors) < 0.5
 
 
-def test_one_exposure_is_enough_for_half_of_the_stripes():
-    errors = simulated(exposures=1).errors(estimated(exposures=1)[0].x_px)
-    assert np.mean(errors <= 1) > 0.4
-    assert np.median(errors) < 2.0
-
-
-def test_threads_change_nothing():
-    one, three = (estimated(threads=threads) for threads in (1, 3))
-    assert_same(one[0], three[0])
-    assert_same_model(one[1].model, three[1].model)
-
-
 def test_the_saved_model_gives_the_very_same_table_again(monkeypatch):
     _, estimator = estimated()
     monkeypatch.setattr(lessons, "TEACH_FRAMES", 1)
@@ -118,14 +106,6 @@ def test_counts_outside_the_search_windows_and_margins_do_not_matter():
     noisy[outside] = 10
     plain = Likelihood(model=model).estimate(sweep.volume, g)
     assert_same(plain, Likelihood(model=model).estimate(volume_of(noisy, g, 10), g))
-
-
-def test_the_type_of_the_counts_does_not_matter():
-    sweep, model = simulated(seed=2), estimated()[1].model
-    narrow = Likelihood(model=model).estimate(sweep.volume, sweep.geometry)
-    for wider in (np.uint16, np.uint32):
-        volume = volume_of(sweep.counts.astype(wider), sweep.geometry, 10)
-        assert_same(narrow, Likelihood(model=model).estimate(volume, sweep.geometry))
 
 
 @pytest.mark.parametrize("light", ["report", "clear"])
@@ -231,28 +211,6 @@ def test_a_sweep_without_dark_frames_and_one_with_them_agree():
     assert abs(right[0] - right[1]) < 0.03
 
 
-def test_a_second_map_is_no_worse_than_the_first():
-    first, later = simulated(exposures=3), simulated(exposures=3, seed=2)
-    table, estimator = estimated(exposures=3)
-    second = Likelihood(model=estimator.model).estimate(later.volume, later.geometry)
-    shares = np.mean(first.errors(table.x_px) <= 1), np.mean(later.errors(second.x_px) <= 1)
-    assert shares[1] > shares[0] - 0.03
-
-
-def test_a_map_teaches_when_enough_frames_have_come_and_is_heeded_some_later(monkeypatch):
-    # 960 frames a map: the third one teaches, the one after the next has waited long enough.
-    monkeypatch.setattr(lessons, "TEACH_FRAMES", 2000)
-    monkeypatch.setattr(lessons, "LAG_FRAMES", 1000)
-    sweep = simulated()
-    estimator, models = Likelihood(), []
-    for _ in range(6):
-        estimator.estimate(sweep.volume, sweep.geometry)
-        models.append(estimator.model)
-    assert all(model is models[0] for model in models[:4])
-    assert models[4] is models[5] is not models[0]
-    assert estimator.used is models[4]
-
-
 @pytest.mark.parametrize("level", [0, 10])
 def test_a_first_map_without_contrast_teaches_nothing(level):
     sweep = simulated()
@@ -262,13 +220,3 @@ def test_a_first_map_without_contrast_teaches_nothing(level):
     assert estimator.used is not None
     assert estimator.model is None
     assert_same(estimator.estimate(sweep.volume, sweep.geometry), estimated()[0])
-
-
-def test_a_later_map_of_a_closed_shutter_teaches_nothing(monkeypatch):
-    monkeypatch.setattr(lessons, "TEACH_FRAMES", 1)
-    monkeypatch.setattr(lessons, "LAG_FRAMES", 1)
-    sweep, model = simulated(), estimated()[1].model
-    estimator = Likelihood(model=model)
-    for _ in range(3):
-        estimator.estimate(volume_of(np.zeros_like(sweep.counts), sweep.geometry, 10), sweep.geometry)
-    assert estimator.model is model

@@ -11,7 +11,7 @@ from calibration.model.rig_model import RigModel
 from calibration.model.scanner import PlaneTable
 from rig.errors import UsageError
 from rig.geometry.kernels import row_windows
-from rig.geometry.windows import MARGIN_PX, evenly_spread, sweep_geometry, uncalibrated_geometry
+from rig.geometry.windows import MARGIN_PX, evenly_spread, sweep_geometry
 from tests.reference.geometry import Geometry
 from tests.stability.inventory import covers
 from tests.unit.small_maps import RIGS, geometry_of, rig_model
@@ -62,26 +62,6 @@ def test_windows_are_the_pixels_whose_depth_lies_in_the_range(view):
 
 
 @pytest.mark.parametrize("rig", RIGS)
-@pytest.mark.parametrize("depth_m", [1.02, 1.6, 3.0, 7.8])
-def test_stripes_of_a_wall_within_the_range_lie_in_their_windows(rig, depth_m):
-    g = Geometry.build(width=300, height=40, columns=60, **RIGS[rig])
-    geometry = geometry_of(g)
-    assert geometry.near_is_left == (rig == "left")
-    seen = 0
-    for c in range(g.columns):
-        beyond = g.inverse_depth(c) - 1 / depth_m
-        if rig != "left":
-            beyond = -beyond
-        # Near points are where inverse depth is largest: the stripe is where the difference changes sign.
-        for y in range(0, g.height, 7):
-            crossing = np.flatnonzero((beyond[y, :-1] >= 0) & (beyond[y, 1:] < 0))
-            for x in crossing:
-                seen += 1
-                assert geometry.x_lo[y, c] - 1 <= x <= geometry.x_hi[y, c]
-    assert seen > 40
-
-
-@pytest.mark.parametrize("rig", RIGS)
 @pytest.mark.parametrize(("width", "height"), [(512, 12), (70, 50), (500, 30), (65, 5), (300, 1)])
 def test_stored_windows_hold_every_search_interval_with_its_margin(rig, width, height):
     geometry = geometry_of(Geometry.build(width=width, height=height, columns=61, **RIGS[rig]))
@@ -97,16 +77,6 @@ def test_stored_windows_hold_every_search_interval_with_its_margin(rig, width, h
     assert np.all(geometry.x_hi[seen] < width)
     assert np.all(x0 <= np.maximum(geometry.x_lo[seen] - MARGIN_PX, 0))
     assert np.all(x0 + geometry.window > np.minimum(geometry.x_hi[seen] + MARGIN_PX, width - 1))
-
-
-@pytest.mark.parametrize("rig", ["left", "right"])
-def test_the_margin_is_kept_on_both_sides_of_every_single_column(rig):
-    g = Geometry.build(width=512, height=3, columns=120, **RIGS[rig])
-    for c in range(20, 100):
-        geometry = sweep_geometry(rig_model(g), np.array([float(c)]), (1.0, 8.0))
-        first, last = geometry.x_lo.min(), geometry.x_hi.max()
-        assert geometry.x0[0] <= max(first - MARGIN_PX, 0) < geometry.x0[0] + 64
-        assert geometry.x0[0] + geometry.window > min(last + MARGIN_PX, 511)
 
 
 def test_windows_are_no_wider_than_the_disparity_span_asks():
@@ -168,17 +138,6 @@ def test_rows_without_rays_still_have_a_reference():
     u[0], v[0] = np.nan, np.nan
     u[1, :50] = v[1, :50] = np.nan
     assert np.isfinite(replace(geometry, u=u, v=v).reference_px()).all()
-
-
-@pytest.mark.parametrize("width", [1, 63, 64, 65, 501])
-def test_without_a_model_the_whole_row_is_searched(width):
-    geometry = uncalibrated_geometry(3, width, 5)
-    assert (geometry.rows, geometry.width, geometry.columns) == (3, width, 5)
-    assert np.all(geometry.x_lo == 0)
-    assert np.all(geometry.x_hi == width - 1)
-    assert geometry.window % 64 == 0
-    assert geometry.window >= width
-    assert np.isfinite(geometry.u).all()
 
 
 def test_one_row_is_a_sensor_and_one_column_is_none():

@@ -1,4 +1,4 @@
-"""Every operation on lanes against numpy, on numbers at and around the limits of the type."""
+"""Operations on lanes that are more than one of LLVM's own, against numpy."""
 
 from typing import NamedTuple
 
@@ -17,16 +17,12 @@ INT16, BYTES, FLOAT = (
     (load_float32, memory.store_float32),
 )
 SIZES = {INT16: (np.int16, LANES), BYTES: (np.uint8, 2 * LANES), FLOAT: (np.float32, LANES)}
-EDGES = np.array([-32768, -32767, -20000, -256, -1, 0, 1, 2, 127, 128, 255, 256, 12345, 32000, 32766, 32767], np.int16)
 
 
 def samples(kind):
     """Pairs of operands, (count,) each."""
     dtype, count = SIZES[kind]
     rng = np.random.default_rng(1)
-    if kind is INT16:
-        yield EDGES, EDGES[::-1].copy()
-        yield EDGES, EDGES
     for _ in range(20):
         if kind is FLOAT:
             yield tuple(rng.normal(0, 100, (2, count)).astype(dtype))
@@ -55,19 +51,7 @@ def by_turns(a, b):
 
 
 OPERATIONS = {
-    "sum": (INT16, INT16, lambda a, b: a + b, lambda a, b: wide(a) + b),
-    "difference": (INT16, INT16, lambda a, b: a - b, lambda a, b: wide(a) - b),
-    "product": (INT16, INT16, lambda a, b: a * b, lambda a, b: wide(a) * b),
-    "and": (INT16, INT16, lambda a, b: a & b, lambda a, b: a & b),
-    "or": (INT16, INT16, lambda a, b: a | b, lambda a, b: a | b),
-    "saturated sum": (INT16, INT16, lambda a, b: vectors.add_saturated(a, b), lambda a, b: saturated(wide(a) + b)),
-    "saturated difference": (
-        INT16, INT16, lambda a, b: vectors.sub_saturated(a, b), lambda a, b: saturated(wide(a) - b),
-    ),
-    "larger": (INT16, INT16, lambda a, b: vectors.larger(a, b), np.maximum),
-    "smaller": (INT16, INT16, lambda a, b: vectors.smaller(a, b), np.minimum),
     "shift right": (INT16, INT16, lambda a, b: a >> 5, lambda a, b: a.view(np.uint16) >> 5),
-    "shift left": (INT16, INT16, lambda a, b: a << 3, lambda a, b: wide(a) << 3),
     "with a number": (INT16, INT16, lambda a, b: (a & 0x55) + 7, lambda a, b: (a & 0x55) + 7),
     "scaled": (INT16, INT16, lambda a, b: vectors.scaled(a, b), lambda a, b: (wide(a) * b + (1 << 14)) >> 15),
     "reversed": (INT16, INT16, lambda a, b: shuffles.reversed_lanes(a), lambda a, b: a[::-1]),
@@ -77,45 +61,22 @@ OPERATIONS = {
         # Of numbers small enough: saturated sums go by the order of their steps.
         INT16, INT16, lambda a, b: shuffles.running_sum(a & 0x7FF), lambda a, b: saturated(np.cumsum(wide(a) & 0x7FF)),
     ),
-    "no lanes": (INT16, INT16, lambda a, b: vectors.zero_int16(), lambda a, b: 0 * a),
-    "bytes of lanes": (INT16, BYTES, lambda a, b: vectors.as_bytes(a), lambda a, b: a.view(np.uint8)),
-    "numbers of lanes": (INT16, FLOAT, lambda a, b: vectors.to_float32(a), lambda a, b: a),
-    "numbers of patterns": (INT16, FLOAT, lambda a, b: vectors.from_bfloat16(a), lambda a, b: number_of(a)),
     "unpacked numbers": (
         INT16, FLOAT, lambda a, b: vectors.from_bfloat16_unpacked(a), lambda a, b: number_of(a)[list(UNPACKED)],
     ),
-    "sum of bytes": (BYTES, BYTES, lambda a, b: a + b, lambda a, b: a + b),
-    "shifted bytes": (BYTES, BYTES, lambda a, b: (a >> 3) & 0x55, lambda a, b: (a >> 3) & 0x55),
-    "mixed bytes": (BYTES, BYTES, lambda a, b: (a & 0xAA) | (b << 2), lambda a, b: (a & 0xAA) | (b << 2)),
     "first rows": (
         BYTES, BYTES, lambda a, b: shuffles.first_row_pairs(a, b), lambda a, b: by_turns(a[:LANES], b[:LANES]),
     ),
     "second rows": (
         BYTES, BYTES, lambda a, b: shuffles.second_row_pairs(a, b), lambda a, b: by_turns(a[LANES:], b[LANES:]),
     ),
-    "unsigned sum": (
-        BYTES, BYTES, lambda a, b: vectors.add_saturated_unsigned(a, b), lambda a, b: np.minimum(wide(a) + b, 255),
-    ),
-    "unsigned difference": (
-        BYTES, BYTES, lambda a, b: vectors.sub_saturated_unsigned(a, b), lambda a, b: np.maximum(wide(a) - b, 0),
-    ),
-    "smaller unsigned": (BYTES, BYTES, lambda a, b: vectors.smaller_unsigned(a, b), np.minimum),
     "smaller than a number": (
         BYTES, BYTES, lambda a, b: vectors.smaller_unsigned(a, 200), lambda a, b: np.minimum(a, 200),
     ),
-    "no bytes": (BYTES, BYTES, lambda a, b: vectors.zero_bytes(), lambda a, b: 0 * a),
-    "arithmetic": (
-        FLOAT, FLOAT, lambda a, b: vectors.larger_float(a, b) + a * b - b, lambda a, b: np.maximum(a, b) + a * b - b,
-    ),
-    "smaller float": (FLOAT, FLOAT, lambda a, b: vectors.smaller_float(a, b), np.minimum),
-    "quotient": (FLOAT, FLOAT, lambda a, b: a / (b * b + np.float32(1.0)), lambda a, b: a / (b * b + 1.0)),
-    "root": (FLOAT, FLOAT, lambda a, b: vectors.square_root(a * a), lambda a, b: np.abs(a)),
-    "no numbers": (FLOAT, FLOAT, lambda a, b: vectors.zero_float32(), lambda a, b: 0 * a),
     "where small": (
         FLOAT, FLOAT, lambda a, b: vectors.where_small(a, b, np.float32(50.0)), lambda a, b: a * (np.abs(b) <= 50),
     ),
     "where below": (FLOAT, FLOAT, lambda a, b: vectors.where_below(a, b, a, b), np.minimum),
-    "whole numbers": (FLOAT, INT16, lambda a, b: vectors.to_int16(a), lambda a, b: np.trunc(a)),
     "patterns of numbers": (FLOAT, INT16, lambda a, b: vectors.to_bfloat16(a), lambda a, b: upper_half(a)),
 }  # fmt: skip
 
@@ -142,11 +103,8 @@ def test_lanes_do_what_numpy_does(name):
     for one, other, found in zip(a, b, applied(kind, to, operation, a, b), strict=True):
         with np.errstate(invalid="ignore"):
             right = np.asarray(wanted(one, other))
-        if kind is FLOAT and to is FLOAT:
-            np.testing.assert_allclose(found, right, rtol=1e-5, atol=1e-2)
-        else:
-            # Plain sums and products wrap round as 16 bits do.
-            np.testing.assert_array_equal(found, right.astype(found.dtype))
+        # Numbers wrap round as 16 bits do.
+        np.testing.assert_array_equal(found, right.astype(found.dtype))
 
 
 @pytest.mark.parametrize("sign", [-1, 1])
@@ -214,45 +172,13 @@ def test_numbers_are_found_among_lanes_and_bytes():
 
 
 @numba.njit
-def read_and_written(source, out):
-    memory.write_int16(address_of(out), 0, memory.read_int16(address_of(source), 5))
-    memory.write_int32(address_of(out), 1, memory.read_int32(address_of(source), 4))
-    memory.write_int64(address_of(out), 1, memory.read_int64(address_of(source), 2))
-    memory.write_float32(address_of(out), 5, memory.read_float32(address_of(source), 1))
-    memory.write_byte(address_of(out), 30, memory.read_byte(address_of(source), 9))
-
-
-def numbers_moved(source):
-    out = np.zeros(64, np.uint8)
-    for begin, end, at in ((0, 2, 10), (4, 8, 16), (8, 16, 16), (20, 24, 4), (30, 31, 9)):
-        out[begin:end] = source[at : at + end - begin]
-    return out
-
-
-@numba.njit
 def two_rows(source, out):
     memory.store_bytes(address_of(out), 0, memory.load_two_rows(address_of(source), 3, 40))
 
 
 @numba.njit
-def widened(source, out):
-    memory.store_int16(address_of(out), 0, memory.load_widened(address_of(source), 3))
-
-
-@numba.njit
-def counts(source, out):
-    memory.store_float32(address_of(out), 0, memory.load_counts(address_of(source), 1))
-
-
-@numba.njit
 def added_bytes(source, out):
     memory.add_bytes(address_of(out), 3, load_bytes(address_of(source), 0))
-
-
-@numba.njit
-def four(source, out):
-    by = vectors.zero_four() + memory.load_four(address_of(source), 2) * np.float32(0.25)
-    memory.store_four(address_of(out), 1, by)
 
 
 @numba.njit
@@ -291,13 +217,9 @@ SOME_BYTES = RNG.integers(0, 256, 128).astype(np.uint8)
 FLOATS, FEW = RNG.normal(0, 10, 256).astype(np.float32), RNG.integers(0, 4, 100).astype(np.int16)
 ROWS = RNG.integers(-32768, 32768, 256).astype(np.int16)
 MOVES = [
-    (read_and_written, SOME_BYTES, np.zeros(64, np.uint8), numbers_moved),
     (two_rows, SOME_BYTES, np.zeros(32, np.uint8), lambda a: np.r_[a[3:19], a[40:56]]),
-    (widened, SOME_BYTES, np.zeros(16, np.int16), lambda a: a[3:19]),
-    (counts, SOME_BYTES, np.zeros(16, np.float32), lambda a: a[1:17]),
     (added_bytes, SOME_BYTES, np.full(40, 10**6, np.int32), lambda a: 10**6 + np.pad(a[:32].astype(int), (3, 5))),
     (spread, SOME_BYTES, np.zeros(128, np.float32), lambda a: a.reshape(LANES, EIGHT).T.ravel()),
-    (four, FLOATS, np.zeros(8, np.float32), lambda a: np.pad(a[2:6] / 4, (1, 3))),
     (
         fetched, FLOATS, np.zeros(128, np.float32),
         lambda a: a[np.arange(LANES) * 3 % 40 + 3 + np.arange(EIGHT)[:, None]].ravel(),

@@ -7,8 +7,8 @@ import numpy as np
 import pytest
 
 from rig.estimate.joint.labels.grid import label_grid
-from rig.estimate.joint.second_return_blocks import BLOCK, Blocks, sum_blocks
-from rig.estimate.joint.second_returns import distance_pixels, second_light, second_returns, second_room
+from rig.estimate.joint.second_return_blocks import BLOCK, sum_blocks
+from rig.estimate.joint.second_returns import second_light, second_returns, second_room
 from rig.estimate.row.inputs import state_of, sweep_of
 from rig.estimate.row.likelihood import FLUX_MAX
 from rig.threads import RowWorkers
@@ -31,16 +31,32 @@ def pane(light="report", rig="left", exposures=10) -> Sweep:
     return Sweep(point, geometry_of(g), point.counts(exposures, 1), exposures)
 
 
-def seconds_of(sweep: Sweep, x_px, haze=0.14, threads=WORKERS, left=0.0):
-    """left: what an earlier map left in the room."""
-    model = known_model(sweep.geometry, haze=haze)
+def seconds_of(sweep: Sweep, x_px, haze=0.14, threads=WORKERS, left=0.0, volume=None, model=None):
+    """left: what an earlier map left in the room; volume, model: other ones than the sweep's, and of such haze."""
+    model = known_model(sweep.geometry, haze=haze) if model is None else model
     grid = label_grid(sweep.geometry)
-    x_px = x_px.astype(np.float32)
     light = second_light(state_of(model), 0.6, grid, sweep_of(sweep.geometry))
     room = second_room(grid)
     for array in (*room.blocks, *room.candidates, *room.seconds, room.moved):
         array[:] = left
-    return second_returns(sweep.volume, grid, sweep_of(sweep.geometry), light, x_px, room, threads)
+    volume = sweep.volume if volume is None else volume
+    return second_returns(volume, grid, sweep_of(sweep.geometry), light, x_px.astype(np.float32), room, threads)
+
+
+def around(there):
+    """Places within REACH of those: light is looked for together with that of blocks around."""
+    side = 2 * REACH + 1
+    return np.lib.stride_tricks.sliding_window_view(np.pad(there, REACH), (side, side)).any((2, 3))
+
+
+def sums_of(counts, sweep: Sweep, light):
+    """Sums over blocks of the sweep's lines with these counts, and without the light of its stripes."""
+    blocks = second_room(label_grid(sweep.geometry)).blocks
+    sum_blocks(
+        counts, sweep.volume.n_frames, sweep_of(sweep.geometry), light.state, light.still, light.place,
+        label_grid(sweep.geometry).side, light.apart, sweep.point.x_true.astype(np.float32), 0, ROWS // BLOCK, blocks,
+    )  # fmt: skip
+    return blocks
 
 
 @pytest.mark.parametrize("rig", ["left", "right"])
@@ -52,9 +68,7 @@ def test_a_pane_before_the_wall_is_found_in_haze(rig) -> None:
     assert (np.abs(error) <= 1).mean() > 0.98
     assert abs(np.nanmedian(error)) < 0.1
     assert (confidence2[two] > SURE).mean() > 0.98
-    # Light is looked for together with that of blocks around: the pane's reaches a little beyond it.
-    near = np.lib.stride_tricks.sliding_window_view(np.pad(two, REACH), (2 * REACH + 1, 2 * REACH + 1)).any((2, 3))
-    assert (confidence2[~near] > SURE).mean() < 0.005
+    assert (confidence2[~around(two)] > SURE).mean() < 0.005
 
 
 def test_the_wall_behind_an_answer_is_found_in_clear_air() -> None:
@@ -103,11 +117,8 @@ def test_columns_without_exposures_are_left_alone() -> None:
     sweep = pane()
     volume = sweep.volume
     volume.n_frames[::7] = 0
-    model = known_model(sweep.geometry)
-    grid = label_grid(sweep.geometry)
-    x_px = np.where(volume.n_frames > 0, sweep.point.x_true, np.nan).astype(np.float32)
-    light = second_light(state_of(model), 0.6, grid, sweep_of(sweep.geometry))
-    x2_px, _ = second_returns(volume, grid, sweep_of(sweep.geometry), light, x_px, second_room(grid), WORKERS)
+    x_px = np.where(volume.n_frames > 0, sweep.point.x_true, np.nan)
+    x2_px, _ = seconds_of(sweep, x_px, volume=volume)
     assert np.isnan(x2_px[:, ::7]).all()
     two = np.isfinite(sweep.point.x_second) & np.isfinite(x_px)
     assert (np.abs(x2_px - sweep.point.x_second)[two] <= 1).mean() > 0.95
@@ -143,20 +154,10 @@ def test_pixels_not_to_be_used_neither_show_nor_hide_a_second_return() -> None:
     first = sweep.geometry.x0
     for c in range(COLUMNS):
         counts[c][bad[:, first[c] : first[c] + counts.shape[2]]] = 10 * (c % 2)
-    grid, x_px = label_grid(sweep.geometry), sweep.point.x_true.astype(np.float32)
-    x2_px, confidence2 = second_returns(
-        replace(volume, counts=counts),
-        grid,
-        sweep_of(sweep.geometry),
-        second_light(state_of(model), 0.6, grid, sweep_of(sweep.geometry)),
-        x_px,
-        second_room(grid),
-        WORKERS,
-    )
-    two = np.isfinite(sweep.point.x_second) & np.isfinite(x_px)
+    x2_px, confidence2 = seconds_of(sweep, sweep.point.x_true, volume=replace(volume, counts=counts), model=model)
+    two = np.isfinite(sweep.point.x_second) & np.isfinite(sweep.point.x_true)
     assert ((np.abs(x2_px - sweep.point.x_second) <= 1) & (confidence2 > SURE))[two].mean() > 0.95
-    near = np.lib.stride_tricks.sliding_window_view(np.pad(two, REACH), (2 * REACH + 1, 2 * REACH + 1)).any((2, 3))
-    assert (confidence2[~near] > SURE).mean() < 0.005
+    assert (confidence2[~around(two)] > SURE).mean() < 0.005
 
 
 def test_strong_ambient_light_is_expected_as_ones_not_as_photons() -> None:
@@ -165,35 +166,22 @@ def test_strong_ambient_light_is_expected_as_ones_not_as_photons() -> None:
     model.ambient[:] = 2.0
     model.ambient[::3, 200] = FLUX_MAX
     light = second_light(state_of(model), 0.6, grid, sweep_of(geometry))
-    x_px, pixels = sweep.point.x_true.astype(np.float32), distance_pixels(grid)
-    for counts in (np.uint8, np.uint16):
-        blocks = Blocks(*(np.empty((ROWS // BLOCK, COLUMNS // BLOCK, pixels), np.float32) for _ in range(2)))
-        once = np.ones_like(sweep.volume.counts, counts)
-        sum_blocks(
-            once, sweep.volume.n_frames, sweep_of(geometry), light.state, light.still, light.place, grid.side,
-            light.apart, x_px, 0, ROWS // BLOCK, blocks,
-        )  # fmt: skip
+    for dtype in (np.uint8, np.uint16):
+        blocks = sums_of(np.ones_like(sweep.volume.counts, dtype), sweep, light)
         np.testing.assert_allclose(blocks.expected, blocks.ones * 10 * -np.expm1(-2), rtol=1e-4)
         y, x = np.arange(ROWS)[:, None, None], np.arange(geometry.width)
         seen = (x >= geometry.x_lo[..., None]) & (x <= geometry.x_hi[..., None]) & ((x != 200) | (y % 3 != 0))
-        seen &= np.abs(x - x_px[..., None]) > light.apart
+        seen &= np.abs(x - sweep.point.x_true.astype(np.float32)[..., None]) > light.apart
         assert blocks.ones.sum() == seen.sum()
 
 
 @pytest.mark.parametrize("rig", ["left", "right"])
 def test_bytes_at_once_and_other_counts_one_by_one_give_the_same_sums(rig) -> None:
     sweep = pane(rig=rig)
-    geometry, grid = sweep.geometry, label_grid(sweep.geometry)
-    light = second_light(state_of(known_model(geometry)), 0.6, grid, sweep_of(geometry))
-    x_px = sweep.point.x_true.astype(np.float32)
-    sums = []
-    for counts in (sweep.volume.counts, sweep.volume.counts.astype(np.uint16)):
-        blocks = second_room(grid).blocks
-        sum_blocks(
-            counts, sweep.volume.n_frames, sweep_of(geometry), light.state, light.still, light.place, grid.side,
-            light.apart, x_px, 0, ROWS // BLOCK, blocks,
-        )  # fmt: skip
-        sums.append(blocks)
+    light = second_light(
+        state_of(known_model(sweep.geometry)), 0.6, label_grid(sweep.geometry), sweep_of(sweep.geometry)
+    )
+    sums = [sums_of(sweep.volume.counts.astype(dtype), sweep, light) for dtype in (np.uint8, np.uint16)]
     for one, other in zip(*sums, strict=True):
         assert one.max() > 0
         np.testing.assert_array_equal(one, other)

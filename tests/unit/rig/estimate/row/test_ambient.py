@@ -111,18 +111,6 @@ def test_pixels_that_were_never_quiet_take_the_level_around_them():
     assert np.median(result[:, :80]) == pytest.approx(0.03, rel=0.3)
 
 
-@pytest.mark.parametrize("level", [0, 3, 10])
-@pytest.mark.parametrize(("rows", "width"), [(ROWS, WIDTH), (1, 100), (3, 1), (1, 1)])
-def test_the_level_is_positive_and_finite_for_any_counts_and_size(level, rows, width):
-    counts = np.full((6, rows, width), level, np.uint8)
-    result = ambient_of(*sweep_of(counts, rows=rows, width=width), None)
-    assert result.shape == (rows, width)
-    assert np.all(np.isfinite(result) & (result > 0))
-    dark = {"dark_counts": np.full((rows, width), level, np.uint32), "n_dark": 10}
-    result = ambient_of(*sweep_of(counts, rows=rows, width=width, **dark), None)
-    assert np.all(np.isfinite(result) & (result > 0))
-
-
 def test_without_any_frame_the_level_is_a_small_guess():
     volume, geometry = sweep_of(exposures=0)
     result = ambient_of(volume, geometry, np.zeros((2, ROWS, WIDTH), np.uint32))

@@ -7,7 +7,7 @@ import pytest
 
 from rig.estimate.row import em, em_kernels
 from rig.estimate.row.ambient import ambient_map
-from rig.estimate.row.em import FADE, flux, lattice, learn_first, learn_next, lines_of, next_lattice
+from rig.estimate.row.em import FADE, lattice, learn_first, learn_next, lines_of, next_lattice
 from rig.estimate.row.model import BINS, RowModel, fit_haze, stripe_scale
 from rig.threads import RowWorkers
 from tests.reference.geometry import Geometry
@@ -52,13 +52,6 @@ def test_an_exponential_is_fitted_within_its_own_uncertainty(extinction):
         pulls.append((fit.extinction_per_m - extinction) / fit.extinction_sd_per_m)
     assert abs(np.mean(pulls)) < 0.4
     assert 0.7 < np.std(pulls) < 1.2
-
-
-def test_an_exact_exponential_is_found_again():
-    haze = 0.4 * np.exp(-2 * 0.123 * PATH_M)
-    fit = fit_haze(PATH_M, haze, np.full(BINS, 1e-6))
-    assert fit.extinction_per_m == pytest.approx(0.123, rel=1e-4)
-    assert fit.amplitude == pytest.approx(0.4, rel=1e-4)
 
 
 def test_even_light_has_no_extinction():
@@ -114,14 +107,6 @@ def test_the_lattice_picks_distinct_rows_and_columns_that_have_a_window(rig, lin
         share = np.bincount(y, minlength=40) / np.maximum(seen.sum(axis=1), 1)
         assert share[seen.any(axis=1)].max() < 3 * share[seen.any(axis=1)].mean()
         assert (share[seen.any(axis=1)] > 0).all()
-
-
-def test_flux_is_finite_from_no_ones_to_all_ones():
-    assert flux(0.0, 0.0) == 0.0
-    assert flux(0.0, 1000.0) == 0.0
-    assert np.isfinite(flux(1000.0, 1000.0))
-    assert flux(1000.0, 1000.0) > 7
-    assert flux(632.12, 1000.0) == pytest.approx(1.0, abs=0.01)
 
 
 @pytest.mark.parametrize("light", ["report", "dense", "clear"])

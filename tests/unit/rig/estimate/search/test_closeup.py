@@ -130,8 +130,10 @@ def test_levels_of_many_fluxes_are_those_of_each():
         )
 
 
-def compared(k, shift, sigma_px, near_is_left):
-    """Answers (mean, sd), those of the posterior, and the truth (n,), of lines of any brightness in any haze."""
+@pytest.mark.parametrize("near_is_left", [True, False])
+@pytest.mark.parametrize("sigma_px", [0.4, 0.6, 1.0])
+@pytest.mark.parametrize("k", [1, 3, 10, 20, 63])
+def test_the_answer_is_the_posterior_mean_and_sd_over_quarter_pixels(k, sigma_px, near_is_left):
     rng = np.random.default_rng(k)
     found, wanted, where = [], [], []
     for _ in range(300):
@@ -140,52 +142,15 @@ def compared(k, shift, sigma_px, near_is_left):
         label = rng.integers(4, LABELS - 4)
         flux = fluxes(haze, line, near_is_left, sigma_px)[label]
         counts = rng.binomial(k, -np.expm1(-flux))
-        found.append(placed(counts, k, haze_level, line_level, near_is_left, sigma_px, shift))
+        found.append(placed(counts, k, haze_level, line_level, near_is_left, sigma_px))
         wanted.append(posterior(counts, k, haze, line, near_is_left, sigma_px))
         where.append(OFFSETS[label])
-    return np.array(found), np.array(wanted), np.array(where)
-
-
-@pytest.mark.parametrize("near_is_left", [True, False])
-@pytest.mark.parametrize("sigma_px", [0.4, 0.6, 1.0])
-@pytest.mark.parametrize(("k", "shift"), [(1, 3), (3, 3), (10, 3)])
-def test_the_answer_is_the_posterior_mean_and_sd_over_quarter_pixels(k, shift, sigma_px, near_is_left):
-    found, wanted, _ = compared(k, shift, sigma_px, near_is_left)
+    found, wanted = np.array(found), np.array(wanted)
     # Sixteenths of an octave a count, and likelihoods up to 6 % too large.
-    assert np.abs(found - wanted).max() < 0.07
     assert np.abs((found - wanted).mean(axis=0)).max() < 0.015
-
-
-@pytest.mark.parametrize("sigma_px", [0.4, 0.6, 1.0])
-@pytest.mark.parametrize(
-    ("k", "shift"),
-    [(1, 3), (3, 3), (10, 3), (20, 3), (63, 3)],
-)
-def test_whole_units_cost_hardly_any_accuracy(k, shift, sigma_px):
-    # Units as `judge_of` takes them at so many exposures.
-    found, wanted, where = compared(k, shift, sigma_px, True)
+    assert k > 10 or np.abs(found - wanted).max() < 0.07
     errors = [np.sqrt(np.mean((answers[:, 0] - where) ** 2)) for answers in (found, wanted)]
     assert errors[0] < 1.1 * errors[1]
-
-
-@pytest.mark.parametrize("near_is_left", [True, False])
-@pytest.mark.parametrize("offset", [-0.5, -0.25, 0.0, 0.25, 0.5])
-@pytest.mark.parametrize("k", [20, 60])
-def test_the_expected_answer_is_where_the_line_is(k, offset, near_is_left):
-    rng = np.random.default_rng(1)
-    haze_level, line_level = level_of(np.float32(0.1)), level_of(np.float32(1.5))
-    label = int(np.argmin(np.abs(OFFSETS - offset)))
-    truth = fluxes(level_flux(haze_level), level_flux(line_level), near_is_left, 0.6)[label]
-    answers = np.array(
-        [
-            placed(c, k, haze_level, line_level, near_is_left, 0.6)
-            for c in rng.binomial(k, -np.expm1(-truth), (400, len(truth)))
-        ]
-    )
-    assert abs(answers[:, 0].mean() - offset) < 0.03
-    # What is stated is what happens, with the width of a label, in whose middle these lines lie.
-    happened = np.hypot(answers[:, 0].std(), LABEL_PX / np.sqrt(12))
-    assert 0.8 < happened / np.sqrt(np.mean(answers[:, 1] ** 2)) < 1.25
 
 
 @pytest.mark.parametrize("near_is_left", [True, False])

@@ -8,7 +8,7 @@ import pytest
 
 from rig.estimate.likelihood import Likelihood
 from rig.estimate.row.em import next_lattice
-from rig.estimate.search.inputs import COUNT_LIMIT, EXPOSURE_PARTS, count_fluxes
+from rig.estimate.search.inputs import COUNT_LIMIT
 from rig.estimate.search.prepare import (
     BAND_ROWS,
     BAND_SHEAR_PX,
@@ -98,14 +98,6 @@ def test_thick_haze_takes_coarser_units_where_its_edge_would_not_fit():
 def test_counts_are_halved_until_they_fit(exposures, times):
     assert halvings(exposures, COUNT_LIMIT) == times
     assert (exposures >> times) <= COUNT_LIMIT
-
-
-def test_count_fluxes_are_what_ones_among_exposures_speak_for():
-    flux = count_fluxes()
-    assert np.isfinite(flux).all()
-    assert flux[0, 0] == flux[EXPOSURE_PARTS * 63, 0] == 0.0
-    assert np.all(np.diff(flux[EXPOSURE_PARTS * 63, :64]) > 0)
-    assert flux[EXPOSURE_PARTS * 60, 30] == pytest.approx(np.log(2), abs=0.01)
 
 
 @pytest.mark.parametrize("rig", RIGS)
