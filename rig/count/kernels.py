@@ -224,6 +224,7 @@ def add_runs(
     row_words: int,
     used_words: int,
     bins: NDArray[np.int32],
+    columns_at: NDArray[np.int32],
     x0: NDArray[np.int32],
     counts: NDArray[np.unsignedinteger],
     dark: NDArray[np.int32],
@@ -233,11 +234,12 @@ def add_runs(
     """Add frames to `counts` (columns, rows, window), or to `dark` (rows, PAIRS, lanes + LANES, 2) in lane order.
 
     words: (all words,), `row_words` a row; first_word: (n,), word of the sensor at which a frame's used pixels begin,
-    used_words of them; bins: (n,) column, -1 dark, -2 skip. Only rows first_row..last_row-1 are touched, so that
-    threads may share the outputs. With counts of no columns lit frames are passed over.
+    used_words of them; bins: (n,), -1 dark, -2 skip, else a row of columns_at (bins, lines), the columns that a frame
+    is counted for, one of every line; without lines lit frames are passed over. x0: (columns,). Only rows
+    first_row..last_row-1 are touched, so that threads may share the outputs.
     """
     rows, width_words = dark.shape[0], (dark.shape[2] - LANES) * STEPS // WORD_PX
-    window = counts.shape[2] if counts.shape[0] else WORD_PX
+    window = counts.shape[2]
     planes = np.zeros((PLANES + 1) * CHUNK + 2, np.uint64)
     as_bytes = planes.view(np.uint8)
     n_lit = new_counts(2, padded_lanes(window))
@@ -248,15 +250,18 @@ def add_runs(
         n = (y1 - y0) * row_words
         f = 0
         while f < bins.shape[0]:
-            c, g = bins[f], f + 1
-            while g < bins.shape[0] and bins[g] == c and first_word[g] == first_word[f] and g - f < MOST_FRAMES:
+            bin, g = bins[f], f + 1
+            while g < bins.shape[0] and bins[g] == bin and first_word[g] == first_word[f] and g - f < MOST_FRAMES:
                 g += 1
-            if c == -1 or (c >= 0 and counts.shape[0] > 0):
+            times = columns_at.shape[1] if bin >= 0 else 1 if bin == -1 else 0
+            if times > 0:
                 add_frames(words, rows * row_words, y0 * row_words, f, g, n, 0, planes)
-                # A frame of whole rows begins at the sensor's first word, a window where its used pixels do.
-                begins = 0 if row_words == width_words else first_word[f]
+            # A frame of whole rows begins at the sensor's first word, a window where its used pixels do.
+            begins = 0 if row_words == width_words else first_word[f]
+            row_bytes, n_planes = row_words * WORD_BYTES, planes_for(g - f)
+            for line in range(times):
+                c = columns_at[bin, line] if bin >= 0 else -1
                 wanted = first_word[f] if c < 0 else x0[c] // WORD_PX
-                row_bytes, n_planes = row_words * WORD_BYTES, planes_for(g - f)
                 used_px = used_words * WORD_PX if c < 0 else window
                 n_row = n_dark if c < 0 else n_lit
                 for y in range(y0, y1, 2):

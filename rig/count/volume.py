@@ -207,13 +207,17 @@ class SweepCounter:
     def __init__(self, layout: SweepLayout, workers: RowWorkers) -> None:
         self._layout = layout
         self._workers = workers
+        self._bins = layout
+        """Layout whose columns are the bins of frames."""
+        self._columns_at = np.arange(layout.columns, dtype=np.int32)[:, None]
+        """Columns (bins, lines) that each bin's frames are counted for."""
         self.reset()
 
     def reset(self) -> None:
         """Begin the next sweep."""
         layout = self._layout
         self._counts: Counts = np.zeros((layout.columns, layout.rows, layout.window), np.uint8)
-        self._tally = SweepTally(layout)
+        self._tally = SweepTally(self._bins)
 
     def add(
         self, bits: NDArray[np.uint8], bins: NDArray[np.int32], column: NDArray[np.float64], x0: NDArray[np.int32]
@@ -228,8 +232,8 @@ class SweepCounter:
 
         def work(first: int, last: int) -> None:
             add_runs(
-                words, first_word, row_words, layout.used_words, bins, layout.x0, self._counts, self._tally.dark,
-                first, last,
+                words, first_word, row_words, layout.used_words, bins, self._columns_at, layout.x0, self._counts,
+                self._tally.dark, first, last,
             )  # fmt: skip
 
         self._workers.over(layout.rows, work)

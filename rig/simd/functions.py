@@ -18,11 +18,10 @@ from llvmlite import ir
 from rig.simd.vectors import (
     FLOAT32,
     LANES,
-    VectorCode,
     add_saturated,
+    emitted,
     from_bfloat16,
     from_bfloat16_unpacked,
-    intrinsic_of,
     larger,
     larger_float,
     smaller_float,
@@ -64,22 +63,11 @@ def _power(builder: Any, a: Any) -> Any:
     return builder.bitcast(builder.shl(biased, _whole(_MANTISSA_BITS)), FLOAT32.llvm)
 
 
-def _of_lanes(emit: Any) -> Any:
-    @intrinsic_of
-    def operation(typing: Any, a: Any) -> VectorCode:
-        def code(context: Any, builder: Any, signature: Any, args: Any) -> Any:
-            return emit(builder, args[0])
-
-        return a(a), code
-
-    return operation
-
-
-exponents = _of_lanes(lambda builder, a: builder.sitofp(_exponents(builder, a), FLOAT32.llvm))
+exponents = emitted(FLOAT32(FLOAT32), lambda builder, a: builder.sitofp(_exponents(builder, a), FLOAT32.llvm))
 """exponents(a): powers of two nearest to the lanes, which must be positive and no smaller than 1.2e-38."""
-mantissas = _of_lanes(_mantissas)
+mantissas = emitted(FLOAT32(FLOAT32), _mantissas)
 """mantissas(a): the lanes divided by those powers, sqrt(1/2) to sqrt(2)."""
-power_of_two = _of_lanes(_power)
+power_of_two = emitted(FLOAT32(FLOAT32), _power)
 """power_of_two(a): of whole numbers from -126 to 127."""
 
 

@@ -15,7 +15,7 @@ from llvmlite import ir
 from numba import types
 from numpy.typing import DTypeLike, NDArray
 
-from rig.simd.vectors import BLOCK, BYTES, FLOAT32, FOUR, INT16, LANES, VectorCode, called, intrinsic_of, place_list
+from rig.simd.vectors import BLOCK, BYTES, FLOAT32, FOUR, INT16, LANES, called, emitted, place_list
 
 _I8, _I16, _I32, _I64, _F32 = ir.IntType(8), ir.IntType(16), ir.IntType(32), ir.IntType(64), ir.FloatType()
 
@@ -48,30 +48,24 @@ def _pointer(builder: Any, address: Any, index: Any, element: Any, whole: Any) -
     return builder.bitcast(builder.gep(builder.inttoptr(address, element.as_pointer()), [index]), whole.as_pointer())
 
 
+def _load(builder: Any, address: Any, index: Any, element: Any, whole: Any, align: int) -> Any:
+    loaded = builder.load(_pointer(builder, address, index, element, whole))
+    loaded.align = align
+    return loaded
+
+
 def _reader(numba_type: Any, element: Any, whole: Any, align: int) -> Any:
-    @intrinsic_of
-    def read(typing: Any, address: Any, index: Any) -> VectorCode:
-        def code(context: Any, builder: Any, signature: Any, args: Any) -> Any:
-            loaded = builder.load(_pointer(builder, args[0], args[1], element, whole))
-            loaded.align = align
-            return loaded
+    def read(builder: Any, address: Any, index: Any) -> Any:
+        return _load(builder, address, index, element, whole, align)
 
-        return numba_type(types.intp, types.intp), code
-
-    return read
+    return emitted(numba_type(types.intp, types.intp), read)
 
 
 def _writer(numba_type: Any, element: Any, whole: Any, align: int) -> Any:
-    @intrinsic_of
-    def write(typing: Any, address: Any, index: Any, value: Any) -> VectorCode:
-        def code(context: Any, builder: Any, signature: Any, args: Any) -> Any:
-            stored = builder.store(args[2], _pointer(builder, args[0], args[1], element, whole))
-            stored.align = align
-            return context.get_dummy_value()
+    def write(builder: Any, address: Any, index: Any, value: Any) -> None:
+        builder.store(value, _pointer(builder, address, index, element, whole)).align = align
 
-        return types.void(types.intp, types.intp, numba_type), code
-
-    return write
+    return emitted(types.void(types.intp, types.intp, numba_type), write)
 
 
 load_bytes = _reader(BYTES, _I8, BYTES.llvm, 1)
@@ -116,47 +110,36 @@ def copy_floats(source: int, to: int, number: int) -> None:
         write_float32(to, i, read_float32(source, i))
 
 
-@intrinsic_of
-def add_bytes(typing: Any, address: Any, index: Any, counts: Any) -> VectorCode:
-    """add_bytes(address, index, counts): add 32 unsigned bytes to as many int32 at `address`, from `index` on."""
-
-    def code(context: Any, builder: Any, signature: Any, args: Any) -> Any:
-        wide = ir.VectorType(_I32, 2 * LANES)
-        pointer = _pointer(builder, args[0], args[1], _I32, wide)
-        before = builder.load(pointer)
-        stored = builder.store(builder.add(before, builder.zext(args[2], wide)), pointer)
-        before.align = stored.align = 4
-        return context.get_dummy_value()
-
-    return types.void(types.intp, types.intp, BYTES), code
+_HALF = ir.VectorType(_I8, LANES)
 
 
-@intrinsic_of
-def load_two_rows(typing: Any, address: Any, first: Any, second: Any) -> VectorCode:
-    """load_two_rows(address, first, second): 16 bytes from `first` on, and behind them 16 bytes from `second` on."""
+def _add_bytes(builder: Any, address: Any, index: Any, counts: Any) -> None:
+    wide = ir.VectorType(_I32, 2 * LANES)
+    pointer = _pointer(builder, address, index, _I32, wide)
+    before = builder.load(pointer)
+    stored = builder.store(builder.add(before, builder.zext(counts, wide)), pointer)
+    before.align = stored.align = 4
 
-    def code(context: Any, builder: Any, signature: Any, args: Any) -> Any:
-        half = ir.VectorType(_I8, LANES)
-        rows = [builder.load(_pointer(builder, args[0], at, _I8, half)) for at in args[1:]]
-        for row in rows:
-            row.align = 1
-        return builder.shuffle_vector(*rows, place_list(range(2 * LANES)))
 
-    return BYTES(types.intp, types.intp, types.intp), code
+add_bytes = emitted(types.void(types.intp, types.intp, BYTES), _add_bytes)
+"""add_bytes(address, index, counts): add 32 unsigned bytes to as many int32 at `address`, from `index` on."""
+
+
+def _load_two_rows(builder: Any, address: Any, first: Any, second: Any) -> Any:
+    rows = [_load(builder, address, at, _I8, _HALF, 1) for at in (first, second)]
+    return builder.shuffle_vector(*rows, place_list(range(2 * LANES)))
+
+
+load_two_rows = emitted(BYTES(types.intp, types.intp, types.intp), _load_two_rows)
+"""load_two_rows(address, first, second): 16 bytes from `first` on, and behind them 16 bytes from `second` on."""
 
 
 def _prefetch(to_write: int, locality: int) -> Any:
-    @intrinsic_of
-    def fetch(typing: Any, address: Any) -> VectorCode:
-        def code(context: Any, builder: Any, signature: Any, args: Any) -> Any:
-            pointer = builder.inttoptr(args[0], _I8.as_pointer())
-            how = [ir.Constant(_I32, number) for number in (to_write, locality, 1)]
-            called(builder, "llvm.prefetch.p0", ir.VoidType(), pointer, *how)
-            return context.get_dummy_value()
+    def fetch(builder: Any, address: Any) -> None:
+        how = [ir.Constant(_I32, number) for number in (to_write, locality, 1)]
+        called(builder, "llvm.prefetch.p0", ir.VoidType(), builder.inttoptr(address, _I8.as_pointer()), *how)
 
-        return types.void(types.intp), code
-
-    return fetch
+    return emitted(types.void(types.intp), fetch)
 
 
 prefetch = _prefetch(0, 2)
@@ -165,31 +148,20 @@ prefetch_to_write = _prefetch(1, 3)
 """prefetch_to_write(address): fetch the cache line there into the first cache, for this core alone."""
 
 
-@intrinsic_of
-def load_widened(typing: Any, address: Any, index: Any) -> VectorCode:
-    """load_widened(address, index): 16 unsigned bytes from `index` on as lanes of 16 bits."""
-
-    def code(context: Any, builder: Any, signature: Any, args: Any) -> Any:
-        loaded = builder.load(_pointer(builder, args[0], args[1], _I8, ir.VectorType(_I8, LANES)))
-        loaded.align = 1
-        return builder.zext(loaded, INT16.llvm)
-
-    return INT16(types.intp, types.intp), code
+load_widened = emitted(
+    INT16(types.intp, types.intp), lambda b, address, i: b.zext(_load(b, address, i, _I8, _HALF, 1), INT16.llvm)
+)
+"""load_widened(address, index): 16 unsigned bytes from `index` on as lanes of 16 bits."""
 
 
-@intrinsic_of
-def load_counts(typing: Any, address: Any, index: Any) -> VectorCode:
-    """load_counts(address, index): 16 unsigned bytes from `index` on as float32."""
-
-    def code(context: Any, builder: Any, signature: Any, args: Any) -> Any:
-        loaded = builder.load(_pointer(builder, args[0], args[1], _I8, ir.VectorType(_I8, LANES)))
-        loaded.align = 1
-        # By way of signed numbers, which every processor turns into float32 at once.
-        return builder.sitofp(builder.zext(loaded, ir.VectorType(_I32, LANES)), FLOAT32.llvm)
-
-    return FLOAT32(types.intp, types.intp), code
+def _load_counts(builder: Any, address: Any, index: Any) -> Any:
+    # By way of signed numbers, which every processor turns into float32 at once.
+    wide = builder.zext(_load(builder, address, index, _I8, _HALF, 1), ir.VectorType(_I32, LANES))
+    return builder.sitofp(wide, FLOAT32.llvm)
 
 
+load_counts = emitted(FLOAT32(types.intp, types.intp), _load_counts)
+"""load_counts(address, index): 16 unsigned bytes from `index` on as float32."""
 CACHE_LINE: Final = 64
 """Bytes."""
 

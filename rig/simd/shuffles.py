@@ -22,30 +22,21 @@ from rig.simd.vectors import (
     FLOAT32,
     INT16,
     LANES,
-    VectorCode,
     add_saturated,
     called,
-    intrinsic_of,
+    emitted,
+    everywhere,
     place_list,
-    splat,
     vector_name,
 )
 
 _HALF: Final = LANES // 2
-_I16, _I32 = ir.IntType(16), ir.IntType(32)
+_I16, _I32, _I64 = ir.IntType(16), ir.IntType(32), ir.IntType(64)
 
 
 def _interleaved(first: int) -> Any:
     source = [place for i in range(first, first + LANES) for place in (i, 2 * LANES + i)]
-
-    @intrinsic_of
-    def interleave(typing: Any, a: Any, b: Any) -> VectorCode:
-        def code(context: Any, builder: Any, signature: Any, args: Any) -> Any:
-            return builder.shuffle_vector(args[0], args[1], place_list(source))
-
-        return BYTES(a, b), code
-
-    return interleave
+    return emitted(BYTES(BYTES, BYTES), lambda builder, a, b: builder.shuffle_vector(a, b, place_list(source)))
 
 
 first_row_pairs, second_row_pairs = _interleaved(0), _interleaved(LANES)
@@ -54,16 +45,8 @@ first_row_pairs, second_row_pairs = _interleaved(0), _interleaved(LANES)
 
 def _shuffled(source: Sequence[int]) -> Any:
     """Lane i takes what lane source[i] had, 0 where that is LANES."""
-
-    @intrinsic_of
-    def shuffle(typing: Any, a: Any) -> VectorCode:
-        def code(context: Any, builder: Any, signature: Any, args: Any) -> Any:
-            zeros = ir.Constant(signature.args[0].llvm, [0] * LANES)
-            return builder.shuffle_vector(args[0], zeros, place_list(source))
-
-        return a(a), code
-
-    return shuffle
+    zeros = ir.Constant(INT16.llvm, [0] * LANES)
+    return emitted(INT16(INT16), lambda builder, a: builder.shuffle_vector(a, zeros, place_list(source)))
 
 
 def _up_in_halves(by: int) -> Any:
@@ -86,94 +69,56 @@ def running_sum(a):  # type: ignore[no-untyped-def]
     return add_saturated(a, _lower_end(a))
 
 
-@intrinsic_of
-def last_lane(typing: Any, a: Any) -> VectorCode:
-    """last_lane(a): the highest lane of 16-bit lanes."""
-
-    def code(context: Any, builder: Any, signature: Any, args: Any) -> Any:
-        return builder.extract_element(args[0], ir.Constant(_I32, LANES - 1))
-
-    return types.int16(a), code
+last_lane = emitted(types.int16(INT16), lambda builder, a: builder.extract_element(a, ir.Constant(_I32, LANES - 1)))
+"""last_lane(a): the highest lane of 16-bit lanes."""
 
 
-@intrinsic_of
-def equal_mask(typing: Any, a: Any, b: Any) -> VectorCode:
-    """equal_mask(a, number): bit i is set where lane i equals the number."""
-
-    def code(context: Any, builder: Any, signature: Any, args: Any) -> Any:
-        number = splat(context, builder, signature.args[0], signature.args[1], args[1])
-        mask = builder.bitcast(builder.icmp_signed("==", args[0], number), ir.IntType(LANES))
-        return builder.zext(mask, _I32)
-
-    return types.uint32(a, b), code
+def _bits_where(builder: Any, lanes: Any, number: Any) -> Any:
+    """A number with a bit for each lane, set where the lane equals the number."""
+    same = builder.icmp_signed("==", lanes, everywhere(builder, number, lanes.type.count))
+    return builder.bitcast(same, ir.IntType(lanes.type.count))
 
 
-@intrinsic_of
-def equal_bits(typing: Any, address: Any, index: Any, step: Any, number: Any) -> VectorCode:
-    """equal_bits(address, index, step, number): bit i is set where int16 number index + i step is it, i from 0 to 7."""
-
-    def code(context: Any, builder: Any, signature: Any, args: Any) -> Any:
-        at, first, by, wanted = args
-        few = ir.VectorType(_I16, _HALF)
-        found, pointer = ir.Constant(few, ir.Undefined), builder.inttoptr(at, _I16.as_pointer())
-        for i in range(_HALF):
-            here = builder.add(first, builder.mul(by, ir.Constant(by.type, i)))
-            loaded = builder.load(builder.gep(pointer, [here]))
-            loaded.align = 2
-            found = builder.insert_element(found, loaded, ir.Constant(_I32, i))
-        first_only = builder.insert_element(ir.Constant(few, ir.Undefined), wanted, ir.Constant(_I32, 0))
-        all_wanted = builder.shuffle_vector(first_only, first_only, place_list([0] * (_HALF)))
-        same = builder.icmp_signed("==", found, all_wanted)
-        return builder.zext(builder.bitcast(same, ir.IntType(_HALF)), _I32)
-
-    return types.uint32(types.intp, types.intp, types.intp, types.int16), code
+equal_mask = emitted(
+    types.uint32(INT16, types.int16), lambda builder, a, number: builder.zext(_bits_where(builder, a, number), _I32)
+)
+"""equal_mask(a, number): bit i is set where lane i equals the number."""
 
 
-@intrinsic_of
-def lowest_bit(typing: Any, mask: Any) -> VectorCode:
-    """lowest_bit(mask): number of the lowest bit that is set; 32 where none is."""
-
-    def code(context: Any, builder: Any, signature: Any, args: Any) -> Any:
-        return builder.cttz(args[0], ir.Constant(ir.IntType(1), 0))
-
-    return types.uint32(types.uint32), code
-
-
-@intrinsic_of
-def lanes_between(typing: Any, first: Any, end: Any) -> VectorCode:
-    """lanes_between(first, end): all bits of lanes first to end - 1 set, the others' clear; 16-bit lanes."""
-
-    def code(context: Any, builder: Any, signature: Any, args: Any) -> Any:
-        number = ir.Constant(INT16.llvm, list(range(LANES)))
-        low = splat(context, builder, INT16, types.int64, args[0])
-        high = splat(context, builder, INT16, types.int64, args[1])
-        inside = builder.and_(builder.icmp_signed(">=", number, low), builder.icmp_signed("<", number, high))
-        return builder.sext(inside, INT16.llvm)
-
-    return INT16(types.int64, types.int64), code
+def _equal_bits(builder: Any, address: Any, index: Any, step: Any, number: Any) -> Any:
+    pointer = builder.inttoptr(address, _I16.as_pointer())
+    found = ir.Constant(ir.VectorType(_I16, _HALF), ir.Undefined)
+    for i in range(_HALF):
+        here = builder.add(index, builder.mul(step, ir.Constant(step.type, i)))
+        loaded = builder.load(builder.gep(pointer, [here]))
+        loaded.align = 2
+        found = builder.insert_element(found, loaded, ir.Constant(_I32, i))
+    return builder.zext(_bits_where(builder, found, number), _I32)
 
 
-@intrinsic_of
-def equal_bytes(typing: Any, a: Any, b: Any) -> VectorCode:
-    """equal_bytes(a, number): bit i is set where byte i equals the number."""
-
-    def code(context: Any, builder: Any, signature: Any, args: Any) -> Any:
-        number = splat(context, builder, BYTES, signature.args[1], args[1])
-        return builder.bitcast(builder.icmp_signed("==", args[0], number), ir.IntType(BYTES.count))
-
-    return types.uint32(BYTES, b), code
+equal_bits = emitted(types.uint32(types.intp, types.intp, types.intp, types.int16), _equal_bits)
+"""equal_bits(address, index, step, number): bit i is set where int16 number index + i step is it, i from 0 to 7."""
+_NO = ir.Constant(ir.IntType(1), 0)
+lowest_bit = emitted(types.uint32(types.uint32), lambda builder, mask: builder.cttz(mask, _NO))
+"""lowest_bit(mask): number of the lowest bit that is set; 32 where none is."""
 
 
-@intrinsic_of
-def first_equal(typing: Any, a: Any, b: Any) -> VectorCode:
-    """first_equal(a, number): place of the first byte of a block that equals the number; 128 where none does."""
+def _lanes_between(builder: Any, first: Any, end: Any) -> Any:
+    number = ir.Constant(INT16.llvm, list(range(LANES)))
+    low, high = (everywhere(builder, builder.trunc(a, _I16), LANES) for a in (first, end))
+    inside = builder.and_(builder.icmp_signed(">=", number, low), builder.icmp_signed("<", number, high))
+    return builder.sext(inside, INT16.llvm)
 
-    def code(context: Any, builder: Any, signature: Any, args: Any) -> Any:
-        number = splat(context, builder, BLOCK, signature.args[1], args[1])
-        mask = builder.bitcast(builder.icmp_signed("==", args[0], number), ir.IntType(BLOCK.count))
-        return builder.trunc(builder.cttz(mask, ir.Constant(ir.IntType(1), 0)), ir.IntType(64))
 
-    return types.int64(BLOCK, b), code
+lanes_between = emitted(INT16(types.int64, types.int64), _lanes_between)
+"""lanes_between(first, end): all bits of lanes first to end - 1 set, the others' clear; 16-bit lanes."""
+equal_bytes = emitted(types.uint32(BYTES, types.uint8), _bits_where)
+"""equal_bytes(a, number): bit i is set where byte i equals the number."""
+first_equal = emitted(
+    types.int64(BLOCK, types.uint8),
+    lambda builder, a, number: builder.trunc(builder.cttz(_bits_where(builder, a, number), _NO), _I64),
+)
+"""first_equal(a, number): place of the first byte of a block that equals the number; 128 where none does."""
 
 
 reversed_lanes = _shuffled(range(LANES - 1, -1, -1))
@@ -216,54 +161,44 @@ def _reduced(builder: Any, rows: Sequence[Any], combine: Callable[[Any, Any], An
 
 def _loaded(builder: Any, address: Any, vector: Any, rows: int, align: int) -> list[Any]:
     pointer = builder.inttoptr(address, vector.as_pointer())
-    loaded = [builder.load(builder.gep(pointer, [ir.Constant(ir.IntType(64), r)])) for r in range(rows)]
+    loaded = [builder.load(builder.gep(pointer, [ir.Constant(_I64, r)])) for r in range(rows)]
     for load in loaded:
         load.align = align
     return loaded
 
 
-@intrinsic_of
-def largest_of_rows(typing: Any, address: Any) -> VectorCode:
-    """largest_of_rows(address): the largest one of each of 16 rows of 16 integers of 16 bits, one row after another."""
-
-    def code(context: Any, builder: Any, signature: Any, args: Any) -> Any:
-        rows = _loaded(builder, args[0], INT16.llvm, LANES, 2)
-        name = f"llvm.smax.{vector_name(INT16.llvm)}"
-        return _reduced(builder, rows, lambda a, b: called(builder, name, INT16.llvm, a, b))
-
-    return INT16(types.intp), code
+def _largest_of_rows(builder: Any, address: Any) -> Any:
+    name = f"llvm.smax.{vector_name(INT16.llvm)}"
+    rows = _loaded(builder, address, INT16.llvm, LANES, 2)
+    return _reduced(builder, rows, lambda a, b: called(builder, name, INT16.llvm, a, b))
 
 
-@intrinsic_of
-def store_folded(typing: Any, address: Any, row: Any, a: Any) -> VectorCode:
-    """store_folded(address, row, a): sums of the lower and the upper half of 16 float32, as row `row` of FOLDED."""
-
-    def code(context: Any, builder: Any, signature: Any, args: Any) -> Any:
-        low = builder.shuffle_vector(args[2], args[2], place_list(range(FOLDED)))
-        high = builder.shuffle_vector(args[2], args[2], place_list(range(FOLDED, LANES)))
-        pointer = builder.inttoptr(args[0], ir.VectorType(ir.FloatType(), FOLDED).as_pointer())
-        stored = builder.store(builder.fadd(low, high), builder.gep(pointer, [args[1]]))
-        stored.align = 4
-        return context.get_dummy_value()
-
-    return types.void(types.intp, types.intp, FLOAT32), code
+largest_of_rows = emitted(INT16(types.intp), _largest_of_rows)
+"""largest_of_rows(address): the largest one of each of 16 rows of 16 integers of 16 bits, one row after another."""
 
 
-@intrinsic_of
-def totals_of_rows(typing: Any, address: Any) -> VectorCode:
-    """totals_of_rows(address): sum of each of 16 rows of FOLDED float32, one row after another."""
+def _store_folded(builder: Any, address: Any, row: Any, a: Any) -> None:
+    low, high = (builder.shuffle_vector(a, a, place_list(range(i, i + FOLDED))) for i in (0, FOLDED))
+    pointer = builder.inttoptr(address, ir.VectorType(ir.FloatType(), FOLDED).as_pointer())
+    builder.store(builder.fadd(low, high), builder.gep(pointer, [row])).align = 4
 
-    def code(context: Any, builder: Any, signature: Any, args: Any) -> Any:
-        rows = _loaded(builder, args[0], ir.VectorType(ir.FloatType(), FOLDED), LANES, 4)
-        halves = [_reduced(builder, rows[i : i + FOLDED], builder.fadd) for i in (0, FOLDED)]
-        return builder.shuffle_vector(*halves, place_list(range(LANES)))
 
-    return FLOAT32(types.intp), code
+store_folded = emitted(types.void(types.intp, types.intp, FLOAT32), _store_folded)
+"""store_folded(address, row, a): sums of the lower and the upper half of 16 float32, as row `row` of FOLDED."""
+
+
+def _totals_of_rows(builder: Any, address: Any) -> Any:
+    rows = _loaded(builder, address, ir.VectorType(ir.FloatType(), FOLDED), LANES, 4)
+    halves = [_reduced(builder, rows[i : i + FOLDED], builder.fadd) for i in (0, FOLDED)]
+    return builder.shuffle_vector(*halves, place_list(range(LANES)))
+
+
+totals_of_rows = emitted(FLOAT32(types.intp), _totals_of_rows)
+"""totals_of_rows(address): sum of each of 16 rows of FOLDED float32, one row after another."""
 
 
 EIGHT: Final = 8
 _EIGHT_FLOATS = ir.VectorType(ir.FloatType(), EIGHT)
-_I64 = ir.IntType(64)
 _WIDE = ir.VectorType(ir.IntType(32), LANES)
 
 
@@ -285,48 +220,41 @@ def _turned(builder: Any, rows: list[Any]) -> list[Any]:
 
 def _store(builder: Any, vector: Any, to: Any, number: int) -> None:
     pointer = builder.inttoptr(to, vector.type.as_pointer())
-    stored = builder.store(vector, builder.gep(pointer, [ir.Constant(_I64, number)]))
-    stored.align = 4
+    builder.store(vector, builder.gep(pointer, [ir.Constant(_I64, number)])).align = 4
 
 
-@intrinsic_of
-def fetch_eights(typing: Any, places: Any, behind: Any, to: Any) -> VectorCode:
-    """fetch_eights(places, behind, to): write eight vectors; places: address of sixteen addresses.
-
-    Eight float32 each, `behind` bytes from there on.
-    """
-
-    def code(context: Any, builder: Any, signature: Any, args: Any) -> Any:
-        addresses = builder.inttoptr(args[0], _I64.as_pointer())
-        for half in range(LANES // EIGHT):
-            rows = []
-            for i in range(EIGHT):
-                at = builder.load(builder.gep(addresses, [ir.Constant(_I64, half * EIGHT + i)]))
-                row = builder.load(builder.inttoptr(builder.add(at, args[1]), _EIGHT_FLOATS.as_pointer()))
-                row.align = 4
-                rows.append(row)
-            for d, column in enumerate(_turned(builder, rows)):
-                _store(builder, column, args[2], 2 * d + half)
-        return context.get_dummy_value()
-
-    return types.void(types.intp, types.intp, types.intp), code
+def _fetch_eights(builder: Any, places: Any, behind: Any, to: Any) -> None:
+    addresses = builder.inttoptr(places, _I64.as_pointer())
+    for half in range(LANES // EIGHT):
+        rows = []
+        for i in range(EIGHT):
+            at = builder.load(builder.gep(addresses, [ir.Constant(_I64, half * EIGHT + i)]))
+            row = builder.load(builder.inttoptr(builder.add(at, behind), _EIGHT_FLOATS.as_pointer()))
+            row.align = 4
+            rows.append(row)
+        for d, column in enumerate(_turned(builder, rows)):
+            _store(builder, column, to, 2 * d + half)
 
 
-@intrinsic_of
-def spread_eights(typing: Any, source: Any, to: Any) -> VectorCode:
-    """spread_eights(source, to): write eight vectors from sixteen times eight unsigned bytes, one after another."""
+fetch_eights = emitted(types.void(types.intp, types.intp, types.intp), _fetch_eights)
+"""fetch_eights(places, behind, to): write eight vectors; places: address of sixteen addresses.
 
-    def code(context: Any, builder: Any, signature: Any, args: Any) -> Any:
-        both = ir.VectorType(ir.IntType(32), 2 * LANES)
-        loaded = builder.load(builder.inttoptr(args[0], both.as_pointer()))
-        loaded.align = 1
-        nothing = ir.Constant(both, ir.Undefined)
-        for half in range(2):
-            fours = builder.shuffle_vector(loaded, nothing, place_list(range(half, 2 * LANES, 2)))
-            for d in range(4):
-                moved = builder.lshr(fours, ir.Constant(_WIDE, [8 * d] * LANES))
-                byte = builder.and_(moved, ir.Constant(_WIDE, [255] * LANES))
-                _store(builder, builder.sitofp(byte, FLOAT32.llvm), args[1], 4 * half + d)
-        return context.get_dummy_value()
+Eight float32 each, `behind` bytes from there on.
+"""
 
-    return types.void(types.intp, types.intp), code
+
+def _spread_eights(builder: Any, source: Any, to: Any) -> None:
+    both = ir.VectorType(_I32, 2 * LANES)
+    loaded = builder.load(builder.inttoptr(source, both.as_pointer()))
+    loaded.align = 1
+    nothing = ir.Constant(both, ir.Undefined)
+    for half in range(2):
+        fours = builder.shuffle_vector(loaded, nothing, place_list(range(half, 2 * LANES, 2)))
+        for d in range(4):
+            moved = builder.lshr(fours, ir.Constant(_WIDE, [8 * d] * LANES))
+            byte = builder.and_(moved, ir.Constant(_WIDE, [255] * LANES))
+            _store(builder, builder.sitofp(byte, FLOAT32.llvm), to, 4 * half + d)
+
+
+spread_eights = emitted(types.void(types.intp, types.intp), _spread_eights)
+"""spread_eights(source, to): write eight vectors from sixteen times eight unsigned bytes, one after another."""

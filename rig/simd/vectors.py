@@ -10,6 +10,7 @@ A bfloat16 is the upper half of a float32: two bytes with 8 bits of precision an
 
 import operator
 from collections.abc import Callable, Iterable
+from inspect import Parameter, Signature
 from typing import Any, Final
 
 from llvmlite import binding, ir
@@ -62,13 +63,17 @@ FOUR = Lanes(32, real=True, count=4)
 """Four float32."""
 
 
-def splat(context: Any, builder: Any, lanes: Lanes, number_type: Any, number: Any) -> Any:
-    """A number as all of the lanes."""
+def _splat(context: Any, builder: Any, lanes: Lanes, number_type: Any, number: Any) -> Any:
+    """A number of any type as all of the lanes."""
     element = types.float32 if lanes.real else types.Integer.from_bitwidth(lanes.bits, signed=True)
-    cast = context.cast(builder, number, number_type, element)
-    nothing = ir.Constant(lanes.llvm, ir.Undefined)
-    first = builder.insert_element(nothing, cast, ir.Constant(_INT32, 0))
-    return builder.shuffle_vector(first, nothing, place_list([0] * lanes.count))
+    return everywhere(builder, context.cast(builder, number, number_type, element), lanes.count)
+
+
+def everywhere(builder: Any, number: Any, count: int) -> Any:
+    """A vector of so many of one number."""
+    nothing = ir.Constant(ir.VectorType(number.type, count), ir.Undefined)
+    first = builder.insert_element(nothing, number, ir.Constant(_INT32, 0))
+    return builder.shuffle_vector(first, nothing, place_list([0] * count))
 
 
 def place_list(indices: Iterable[int]) -> Any:
@@ -89,6 +94,23 @@ def called(builder: Any, name: str, result: Any, *args: Any) -> Any:
     return builder.call(function, args)
 
 
+def emitted(signature: Any, emit: Callable[..., Any]) -> Any:
+    """An intrinsic of that signature; emit(builder, *arguments) writes its LLVM code, and returns the result if any."""
+
+    def operation(typing: Any, *types_given: Any) -> VectorCode:
+        def code(context: Any, builder: Any, signature: Any, args: Any) -> Any:
+            result = emit(builder, *args)
+            return context.get_dummy_value() if result is None else result
+
+        return signature, code
+
+    # numba asks how many arguments there are.
+    names = ("typing", *(f"a{i}" for i in range(len(signature.args))))
+    parameters = [Parameter(name, Parameter.POSITIONAL_OR_KEYWORD) for name in names]
+    operation.__signature__ = Signature(parameters)  # type: ignore[attr-defined]
+    return intrinsic_of(operation)
+
+
 def _binary(emit: Callable[[Any, Any, Any], Any]) -> Any:
     """An operation of lanes with lanes or with a number."""
 
@@ -97,7 +119,7 @@ def _binary(emit: Callable[[Any, Any, Any], Any]) -> Any:
         def code(context: Any, builder: Any, signature: Any, args: Any) -> Any:
             left, right = args
             if not isinstance(signature.args[1], Lanes):
-                right = splat(context, builder, signature.args[0], signature.args[1], right)
+                right = _splat(context, builder, signature.args[0], signature.args[1], right)
             return emit(builder, left, right)
 
         return a(a, b), code
@@ -158,29 +180,16 @@ for _operator, _operation in (
     overload(_operator)(_overload(_operation))
 
 
-def conversion(to: Lanes, emit: Callable[[Any, Any], Any]) -> Any:
-    """An operation of lanes that gives lanes of another kind."""
-
-    @intrinsic_of
-    def convert(typing: Any, a: Any) -> VectorCode:
-        def code(context: Any, builder: Any, signature: Any, args: Any) -> Any:
-            return emit(builder, args[0])
-
-        return to(a), code
-
-    return convert
-
-
 _WIDE = ir.VectorType(_INT32, LANES)
 
 
-as_bytes = conversion(BYTES, lambda builder, a: builder.bitcast(a, BYTES.llvm))
+as_bytes = emitted(BYTES(INT16), lambda builder, a: builder.bitcast(a, BYTES.llvm))
 """as_bytes(a): the two bytes of each 16-bit lane."""
-to_int16 = conversion(INT16, lambda b, a: b.trunc(b.fptosi(a, _WIDE), INT16.llvm))
+to_int16 = emitted(INT16(FLOAT32), lambda b, a: b.trunc(b.fptosi(a, _WIDE), INT16.llvm))
 """to_int16(a): float32 lanes, which must fit, without their fraction."""
-to_float32 = conversion(FLOAT32, lambda b, a: b.sitofp(b.sext(a, _WIDE), FLOAT32.llvm))
+to_float32 = emitted(FLOAT32(INT16), lambda b, a: b.sitofp(b.sext(a, _WIDE), FLOAT32.llvm))
 """to_float32(a): 16-bit lanes as numbers."""
-square_root = conversion(FLOAT32, lambda b, a: called(b, f"llvm.sqrt.{vector_name(a.type)}", a.type, a))
+square_root = emitted(FLOAT32(FLOAT32), lambda b, a: called(b, f"llvm.sqrt.{vector_name(a.type)}", a.type, a))
 """square_root(a): of float32 lanes."""
 
 
@@ -192,43 +201,33 @@ def _has_avx2() -> bool:
     return "+avx2" in (settings.CPU_FEATURES or "")
 
 
-@intrinsic_of
-def dot_pairs(typing: Any, counts: Any, weights: Any) -> VectorCode:
-    """dot_pairs(counts, weights): in each lane the sum of its two products, 16 bits, stopping at their limits.
-
-    counts: unsigned bytes; weights: signed.
-    """
+def _dot_pairs(builder: Any, counts: Any, weights: Any) -> Any:
     # LLVM has no name of its own for what is one instruction on x86, and does not always recognise it.
-    one_instruction = _has_avx2()
+    if _has_avx2():
+        return called(builder, "llvm.x86.avx2.pmadd.ub.sw", INT16.llvm, counts, weights)
+    nothing = ir.Constant(BYTES.llvm, ir.Undefined)
 
-    def code(context: Any, builder: Any, signature: Any, args: Any) -> Any:
-        if one_instruction:
-            return called(builder, "llvm.x86.avx2.pmadd.ub.sw", INT16.llvm, *args)
-        nothing = ir.Constant(BYTES.llvm, ir.Undefined)
+    def product(place: int) -> Any:
+        places = place_list(range(place, 2 * LANES, 2))
+        n = builder.zext(builder.shuffle_vector(counts, nothing, places), _WIDE)
+        return builder.mul(n, builder.sext(builder.shuffle_vector(weights, nothing, places), _WIDE))
 
-        def product(place: int) -> Any:
-            places = place_list(range(place, 2 * LANES, 2))
-            n = builder.zext(builder.shuffle_vector(args[0], nothing, places), _WIDE)
-            return builder.mul(n, builder.sext(builder.shuffle_vector(args[1], nothing, places), _WIDE))
+    low, high = ir.Constant(_WIDE, [-32768] * LANES), ir.Constant(_WIDE, [32767] * LANES)
+    both = builder.add(product(0), product(1))
+    both = builder.select(builder.icmp_signed(">", both, low), both, low)
+    both = builder.select(builder.icmp_signed("<", both, high), both, high)
+    return builder.trunc(both, INT16.llvm)
 
-        low, high = ir.Constant(_WIDE, [-32768] * LANES), ir.Constant(_WIDE, [32767] * LANES)
-        both = builder.add(product(0), product(1))
-        both = builder.select(builder.icmp_signed(">", both, low), both, low)
-        both = builder.select(builder.icmp_signed("<", both, high), both, high)
-        return builder.trunc(both, INT16.llvm)
 
-    return INT16(BYTES, BYTES), code
+dot_pairs = emitted(INT16(BYTES, BYTES), _dot_pairs)
+"""dot_pairs(counts, weights): in each lane the sum of its two products, 16 bits, stopping at their limits.
+
+counts: unsigned bytes; weights: signed.
+"""
 
 
 def _constant(lanes: Lanes, number: float) -> Any:
-    @intrinsic_of
-    def constant(typing: Any) -> VectorCode:
-        def code(context: Any, builder: Any, signature: Any, args: Any) -> Any:
-            return ir.Constant(lanes.llvm, [number] * lanes.count)
-
-        return lanes(), code
-
-    return constant
+    return emitted(lanes(), lambda builder: ir.Constant(lanes.llvm, [number] * lanes.count))
 
 
 zero_bytes = _constant(BYTES, 0)
@@ -248,35 +247,28 @@ def smallest_byte(typing: Any, a: Any) -> VectorCode:
 
 
 def _extreme(name: str) -> Any:
-    @intrinsic_of
-    def extreme(typing: Any, a: Any) -> VectorCode:
-        def code(context: Any, builder: Any, signature: Any, args: Any) -> Any:
-            part = args[0]
-            while part.type.count > 1:
-                half = part.type.count // 2
-                parts = [builder.shuffle_vector(part, part, place_list(range(i, i + half))) for i in (0, half)]
-                part = called(builder, f"llvm.{name}.{vector_name(parts[0].type)}", parts[0].type, *parts)
-            return builder.extract_element(part, ir.Constant(_INT32, 0))
+    def emit(builder: Any, part: Any) -> Any:
+        while part.type.count > 1:
+            half = part.type.count // 2
+            parts = [builder.shuffle_vector(part, part, place_list(range(i, i + half))) for i in (0, half)]
+            part = called(builder, f"llvm.{name}.{vector_name(parts[0].type)}", parts[0].type, *parts)
+        return builder.extract_element(part, ir.Constant(_INT32, 0))
 
-        return types.float32(a), code
-
-    return extreme
+    return emitted(types.float32(FLOAT32), emit)
 
 
 largest_float, smallest_float = _extreme("maxnum"), _extreme("minnum")
 """largest_float(a), smallest_float(a): the largest, and the smallest, one of float32 lanes that is a number."""
 
 
-@intrinsic_of
-def where_small(typing: Any, values: Any, sizes: Any, limit: Any) -> VectorCode:
-    """where_small(values, sizes, limit): float32 lanes, 0 where the size is more than `limit` either way, or NaN."""
+def _where_small(builder: Any, values: Any, sizes: Any, limit: Any) -> Any:
+    size = called(builder, f"llvm.fabs.{vector_name(FLOAT32.llvm)}", FLOAT32.llvm, sizes)
+    small = builder.fcmp_ordered("<=", size, everywhere(builder, limit, LANES))
+    return builder.select(small, values, ir.Constant(FLOAT32.llvm, [0.0] * LANES))
 
-    def code(context: Any, builder: Any, signature: Any, args: Any) -> Any:
-        size = called(builder, f"llvm.fabs.{vector_name(FLOAT32.llvm)}", FLOAT32.llvm, args[1])
-        small = builder.fcmp_ordered("<=", size, splat(context, builder, FLOAT32, signature.args[2], args[2]))
-        return builder.select(small, args[0], ir.Constant(FLOAT32.llvm, [0.0] * LANES))
 
-    return FLOAT32(FLOAT32, FLOAT32, limit), code
+where_small = emitted(FLOAT32(FLOAT32, FLOAT32, types.float32), _where_small)
+"""where_small(values, sizes, limit): float32 lanes, 0 where the size is more than `limit` either way, or NaN."""
 
 
 @intrinsic_of
@@ -286,28 +278,22 @@ def where_below(typing: Any, values: Any, others: Any, sizes: Any, limits: Any) 
     def code(context: Any, builder: Any, signature: Any, args: Any) -> Any:
         limit = args[3]
         if not isinstance(signature.args[3], Lanes):
-            limit = splat(context, builder, FLOAT32, signature.args[3], limit)
+            limit = _splat(context, builder, FLOAT32, signature.args[3], limit)
         return builder.select(builder.fcmp_ordered("<", args[2], limit), args[0], args[1])
 
     return FLOAT32(FLOAT32, FLOAT32, FLOAT32, limits), code
 
 
-@intrinsic_of
-def scaled(typing: Any, a: Any, weights: Any) -> VectorCode:
-    """scaled(a, weights): a * weights / 2^15 rounded to the nearest, of signed 16-bit lanes; not both -32768."""
-    one_instruction = _has_avx2()
-
-    def code(context: Any, builder: Any, signature: Any, args: Any) -> Any:
-        if one_instruction:
-            return called(builder, "llvm.x86.avx2.pmul.hr.sw", INT16.llvm, *args)
-        product = builder.mul(builder.sext(args[0], _WIDE), builder.sext(args[1], _WIDE))
-        half, places = ir.Constant(_WIDE, [1 << 14] * LANES), ir.Constant(_WIDE, [15] * LANES)
-        return builder.trunc(builder.ashr(builder.add(product, half), places), INT16.llvm)
-
-    return INT16(INT16, INT16), code
+def _scaled(builder: Any, a: Any, weights: Any) -> Any:
+    if _has_avx2():
+        return called(builder, "llvm.x86.avx2.pmul.hr.sw", INT16.llvm, a, weights)
+    product = builder.mul(builder.sext(a, _WIDE), builder.sext(weights, _WIDE))
+    half, places = ir.Constant(_WIDE, [1 << 14] * LANES), ir.Constant(_WIDE, [15] * LANES)
+    return builder.trunc(builder.ashr(builder.add(product, half), places), INT16.llvm)
 
 
-_INT32_LANES = ir.VectorType(ir.IntType(32), LANES)
+scaled = emitted(INT16(INT16, INT16), _scaled)
+"""scaled(a, weights): a * weights / 2^15 rounded to the nearest, of signed 16-bit lanes; not both -32768."""
 
 UNPACKED: Final = (0, 1, 2, 3, 8, 9, 10, 11, 4, 5, 6, 7, 12, 13, 14, 15)
 """Order of the lanes after `from_bfloat16_unpacked`: the one that costs an x86 processor one instruction."""
@@ -322,19 +308,17 @@ def _unpacked(builder: Any, bits: Any) -> Any:
 
 
 def _as_float(builder: Any, bits: Any) -> Any:
-    wide = builder.shl(builder.zext(bits, _INT32_LANES), ir.Constant(_INT32_LANES, [16] * LANES))
+    wide = builder.shl(builder.zext(bits, _WIDE), ir.Constant(_WIDE, [16] * LANES))
     return builder.bitcast(wide, FLOAT32.llvm)
 
 
 def _upper_half(builder: Any, a: Any) -> Any:
-    return builder.trunc(
-        builder.lshr(builder.bitcast(a, _INT32_LANES), ir.Constant(_INT32_LANES, [16] * LANES)), INT16.llvm
-    )
+    return builder.trunc(builder.lshr(builder.bitcast(a, _WIDE), ir.Constant(_WIDE, [16] * LANES)), INT16.llvm)
 
 
-from_bfloat16 = conversion(FLOAT32, _as_float)
+from_bfloat16 = emitted(FLOAT32(INT16), _as_float)
 """from_bfloat16(a): 16-bit patterns, the upper halves of float32 numbers, as those numbers."""
-from_bfloat16_unpacked = conversion(FLOAT32, _unpacked)
+from_bfloat16_unpacked = emitted(FLOAT32(INT16), _unpacked)
 """from_bfloat16_unpacked(a): those numbers in the order UNPACKED."""
-to_bfloat16 = conversion(INT16, _upper_half)
+to_bfloat16 = emitted(INT16(FLOAT32), _upper_half)
 """to_bfloat16(a): upper halves of float32 lanes as 16-bit patterns."""

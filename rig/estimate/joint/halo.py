@@ -292,18 +292,8 @@ def bright_lines(
     clear = stripes.confidence[rows, columns] > CLEAR
     rows, columns = rows[clear], columns[clear]
     light, known = np.empty(len(rows), np.float32), np.empty(len(rows), np.bool_)
-    seen = (
-        volume.counts,
-        volume.n_frames,
-        tables.sweep,
-        tables.state,
-        tables.shares,
-        stripes.x_px,
-        places,
-        rows,
-        columns,
-    )
-    workers.over(len(rows), lambda first, last: likeliest_light(*seen, first, last, light, known))
+    seen = volume.counts, volume.n_frames, tables.sweep, tables.state, tables.shares, stripes.x_px, places
+    workers.over(len(rows), lambda first, last: likeliest_light(*seen, rows, columns, first, last, light, known))
     return BrightLines(lines_of(volume, (rows[known], columns[known]), stripes), light[known])
 
 

@@ -5,7 +5,8 @@ stripe; haze, pedestal, row gains, amplitudes and line width are set to what tho
 medium or the light is assumed beyond 'haze falls with the path length', and that only where data are few.
 """
 
-from dataclasses import dataclass, replace
+from dataclasses import replace
+from typing import Any, NamedTuple
 
 import cv2
 import numpy as np
@@ -47,8 +48,7 @@ START_EXTINCTIONS_PER_M = (0.0, 0.1, 0.4, 1.5)
 """Extinctions that a first sweep is begun with: clear air to dense fog."""
 
 
-@dataclass(frozen=True, slots=True)
-class Expectation:
+class Expectation(NamedTuple):
     """Weighted counts of one round; see `learn_rows`."""
 
     levels: NDArray[np.float64]
@@ -59,17 +59,13 @@ class Expectation:
 
     def plus(self, other: "Expectation") -> "Expectation":
         """Sums of both."""
-        return Expectation(
-            self.levels + other.levels, self.rows_seen + other.rows_seen, self.columns_seen + other.columns_seen,
-            self.amplitude_mass + other.amplitude_mass, self.evidence + other.evidence,
-        )  # fmt: skip
+        both: Any = zip(self, other, strict=True)
+        return Expectation(*(one + more for one, more in both))
 
     def faded(self, share: float) -> "Expectation":
         """The sums as if only this share of the lines had been seen."""
-        return Expectation(
-            share * self.levels, share * self.rows_seen, share * self.columns_seen, share * self.amplitude_mass,
-            share * self.evidence,
-        )  # fmt: skip
+        sums: Any = self
+        return Expectation(*(share * each for each in sums))
 
 
 def lattice(geometry: SweepGeometry, lines: int) -> tuple[NDArray[np.int32], NDArray[np.int32]]:

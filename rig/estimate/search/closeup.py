@@ -7,8 +7,7 @@ and R the flux left and right of the line, s its light and f_i,t its share in pi
 
 in units of 1 / (128 >> shift) octaves of likelihood, saturating int16; the position is the posterior mean over labels,
 float32. weight (int8) and constant (float32) are tabled over two fluxes, haze and line, two levels an octave; s is
-taken from the counts themselves. tests/unit/rig/estimate/search/test_closeup.py holds it against a posterior summed
-label by label.
+taken from the counts themselves.
 """
 
 from typing import Final, NamedTuple

@@ -3,7 +3,7 @@
 Every position is scored, the best looked at closely, and what the row teaches noted. BATCH rows of one column go
 together through 16-bit scores (`rig.estimate.search.scores`, tables of `rig.estimate.search.tables`), with SCREENS
 amplitudes instead of all, one table for a band of rows and counts of 6 bits. Answers are float32 (FIELDS, rows) per
-column (`RowAnswers`). tests/unit/rig/estimate/search/test_rows.py holds it against the exact form.
+column (`RowAnswers`).
 
 `judge_rows` serves frames as they come and counts of whole sweeps (`rig.estimate.search.stream`): the answers are the
 same bit for bit.

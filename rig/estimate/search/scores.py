@@ -8,7 +8,6 @@ n: uint8, at most COUNT_LIMIT. Scores: saturating int16, in units of 1 / (128 >>
 `rig.estimate.search.tables`. A row of 128 pixels is eight vectors of counts in lane order (`rig.count.lane_order`):
 prefix sums run over the steps within a lane and then once over the lanes. For the probability of the best position
 scores become likelihoods (`rig.simd.functions`), which are summed over the row.
-tests/unit/rig/estimate/search/test_rows.py holds scores against whole numbers and answers against the exact form.
 """
 
 from typing import Final

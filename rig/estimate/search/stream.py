@@ -1,7 +1,7 @@
 """A sweep judged while its frames come in, by the fast form of `rig.estimate.row.likelihood` that is tested against it.
 
-That form is `rig.estimate.search.rows`; tests/unit/rig/estimate/search/test_stream.py holds that judging on the way
-gives the very bits of judging a sweep that is counted already.
+That form is `rig.estimate.search.rows`; judging on the way gives the very bits of judging a sweep that is counted
+already.
 
 `ColumnJudge` is the counter of `likelihood`: it judges each column as soon as it is complete and keeps no counts of it.
 Rows are worked through in chunks, so that counts never leave the cache. A chunk's counters, uint64 bit planes
@@ -283,6 +283,7 @@ class ColumnJudge:
         self._planes: dict[int, NDArray[np.uint64]] = {}
         self._desks: dict[int, SearchPointers] = {}
         self._benches: dict[int, NDArray[np.uint8]] = {}
+        self._no_columns = np.zeros((0, 0), np.int32)
         self._no_counts = np.zeros((0, layout.rows, layout.window), np.uint8)
 
     def begin(self, judge: SearchTables) -> None:
@@ -306,7 +307,7 @@ class ColumnJudge:
 
             def work(first: int, last: int) -> None:
                 add_runs(
-                    words, first_word, row_words, layout.used_words, bins, layout.x0, self._no_counts,
+                    words, first_word, row_words, layout.used_words, bins, self._no_columns, layout.x0, self._no_counts,
                     self._tally.dark, first, last,
                 )  # fmt: skip
 

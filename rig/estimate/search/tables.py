@@ -9,8 +9,7 @@ p'_L and p'_R of a pixel left and right of the stripe and p'_S of one that it li
 
 Where near is left, left is haze and ambient light and right is the pedestal; with the scanner on the other side it is
 the other way round. Haze and pedestal vary slowly from row to row, so the rows of a band share one table per column.
-8-bit weights are what a processor multiplies and adds at once. `ScreenTables` has the shapes. Answers are held against
-the exact likelihood in tests/unit/rig/estimate/search/test_rows.py.
+8-bit weights are what a processor multiplies and adds at once. `ScreenTables` has the shapes.
 """
 
 from typing import Final, NamedTuple

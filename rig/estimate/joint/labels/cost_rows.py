@@ -10,8 +10,7 @@ Counts are read, edges summed, positions scored and costs written in saturating 
 Counts n are int16 fractions of what they can be (COUNT_BITS). The two phases of a pixel make the low and the high byte
 of the same 16 bits, which is their order. BATCH rows of a column go through each part together. Parts are functions of
 their own, not inlined: in one function the compiler keeps a register for every address. The loop over taps is unrolled
-for the usual width of the line. tests/unit/rig/estimate/joint/test_label_volume.py holds the costs against
-log-likelihoods written out in numpy.
+for the usual width of the line.
 """
 
 from typing import Any, Final, NamedTuple
@@ -33,7 +32,15 @@ from rig.estimate.joint.labels.grid import (
     VARIANT,
     VARIANTS,
 )
-from rig.estimate.joint.labels.halo_rows import HaloRoom, HaloTables, fit_halo, halo_rows, new_halo_room
+from rig.estimate.joint.labels.halo_rows import (
+    HIGHEST,
+    HaloRoom,
+    HaloTables,
+    fit_halo,
+    halo_rows,
+    new_halo_room,
+    rounded,
+)
 from rig.estimate.joint.labels.tables import (
     BATCH,
     POSITION,
@@ -69,12 +76,9 @@ from rig.simd.vectors import (
     add_saturated,
     as_bytes,
     larger,
-    larger_float,
     scaled,
     smaller,
-    smaller_float,
     sub_saturated,
-    to_int16,
     zero_bytes,
     zero_int16,
 )
@@ -85,8 +89,6 @@ EXCLUDED: Final = 255
 """Cost of a label that cannot be: outside the picture, more than a pixel outside the row's search window."""
 BASE: Final = -8000
 """Score of 'everything is before the stripe': most of the range lies above it."""
-HIGHEST: Final = 30000
-"""Scores and their parts are cut there."""
 _USUAL_TAPS: Final = 5
 """Pixels around a position where the line is as narrow as it mostly is."""
 COUNT_BITS: Final = 15
@@ -266,10 +268,6 @@ def write_rows(places: int, ways: Ways, b: Buffers, batch: int, out: int, row_by
             store_bytes(to, label, load_bytes(cost, label) | load_bytes(b.mask, label))
 
 
-_LIMIT: Final = np.float32(HIGHEST)
-_TO_UNSIGNED: Final = np.float32(32768.5)
-
-
 class CostRoom(NamedTuple):
     """Tables and buffers of `fill_costs` and `fit_tables`, which get `pointers` to them."""
 
@@ -404,20 +402,14 @@ def _fit_table(at: LabelTables, i: int, j: int, per_nat: float, to: Fitted, thro
     """Constants of table i for a number of exposures, as number j; per_nat: units times exposures."""
     source, constant = at.constant + 4 * i * at.constants, to.constant + 2 * j * at.constants
     for k in range(0, at.constants, LANES):
-        store_int16(constant, k, _rounded(load_float32(source, k) * np.float32(per_nat)))
+        store_int16(constant, k, rounded(load_float32(source, k) * np.float32(per_nat)))
     source, edge = at.edge_sum + 4 * i * at.pixels, to.edge + 2 * j * at.pixels
     # Differences of rounded sums: rounding each pixel would drift along the row.
     write_int16(through, LANES - 1, np.int16(0))
     for k in range(0, at.pixels, LANES):
-        store_int16(through, LANES + k, _rounded(load_float32(source, k) * np.float32(per_nat)))
+        store_int16(through, LANES + k, rounded(load_float32(source, k) * np.float32(per_nat)))
     for k in range(0, at.pixels, LANES):
         store_int16(edge, k, load_int16(through, LANES + k) - load_int16(through, LANES - 1 + k))
-
-
-@numba.njit(forceinline=True)
-def _rounded(a):  # type: ignore[no-untyped-def]
-    a = larger_float(smaller_float(a, _LIMIT), -_LIMIT)
-    return to_int16(a + _TO_UNSIGNED) + np.int16(-32768)
 
 
 @numba.njit(cache=True, nogil=True)

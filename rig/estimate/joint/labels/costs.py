@@ -8,7 +8,6 @@ own eighth of a pixel, LIGHTS amplitudes, and tables that the rows of a band sha
 
 or less where 16 bits would not hold the scores. EXCLUDED marks labels that cannot be. 'No stripe' is not among the
 labels, since a row that is taken for empty would pass nothing on from its neighbours.
-tests/unit/rig/estimate/joint/test_label_volume.py holds the costs against log-likelihoods written out in numpy.
 """
 
 from dataclasses import dataclass

@@ -4,8 +4,7 @@ The halo of `rig.estimate.row.inputs` is in every hypothesis. The tables of `rig
 halo for as bright everywhere as it is at the stripe, which is right where the stripe's place is decided. The difference
 elsewhere varies slowly with the stripe's place and from pixel to pixel. So it is tabled for stripes BLOCK_PX apart,
 with straight lines in between, and for the mean counts of blocks of as many pixels (`HaloTables`: int16 weights,
-float32 constants in nats per exposure). tests/unit/rig/estimate/joint/test_halo.py holds the costs against those of a
-stripe with its halo, pixel by pixel.
+float32 constants in nats per exposure).
 """
 
 from typing import Final, NamedTuple
@@ -159,10 +158,18 @@ def _middle(place: NDArray[np.int16], c: int, rows: tuple[int, int]) -> int:
     return best
 
 
-_LIMIT: Final = np.float32(30000)
+HIGHEST: Final = 30000
+"""Scores and their parts are cut there."""
 _TO_UNSIGNED: Final = np.float32(32768.5)
 _POSSIBLE: Final = np.int16(28000)
 """Constants of positions without a label lie below the negative of this, others above."""
+
+
+@numba.njit(forceinline=True)
+def rounded(a):  # type: ignore[no-untyped-def]
+    """Parts of scores, float32 lanes, as the nearest 16-bit ones."""
+    a = larger_float(smaller_float(a, np.float32(HIGHEST)), np.float32(-HIGHEST))
+    return to_int16(a + _TO_UNSIGNED) + np.int16(-32768)
 
 
 class HaloRoom(NamedTuple):
@@ -204,8 +211,7 @@ def fit_halo(halo: HaloRoom, column: int, per_nat: float) -> None:
     numbers = LIGHTS * halo.places
     for j in range(0, numbers, LANES):
         nats = load_float32(halo.tables.constant + 4 * column * numbers, j) * np.float32(per_nat)
-        nats = larger_float(smaller_float(nats, _LIMIT), -_LIMIT)
-        store_int16(halo.fitted, j, to_int16(nats + _TO_UNSIGNED) + np.int16(-32768))
+        store_int16(halo.fitted, j, rounded(nats))
 
 
 @numba.njit(cache=True, nogil=True)

@@ -9,8 +9,7 @@ of a pixel before and behind the stripe, p'_S of one that it lights,
 
 Haze, pedestal and ambient light vary slowly along a line, so the rows of a band share a table for each variant of
 `rig.estimate.joint.labels.grid` that occurs among them. Weights are for counts as `scaled` multiplies them.
-`LabelTables` has the shapes. tests/unit/rig/estimate/joint/test_label_volume.py holds the costs against
-log-likelihoods written out in numpy.
+`LabelTables` has the shapes.
 
 The stripe's brightness is not known: of two lights, the quartiles of what was learned, the likelier one counts, both
 equally probable. A single light errs by a fifth to four fifths more; all four learned amplitudes are no better. The

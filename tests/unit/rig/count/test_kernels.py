@@ -81,7 +81,7 @@ def runs(words, first_word, row_words, used_words, bins, x0, window, rows, width
     for first, last in pairwise(edges):
         add_runs(
             words.ravel(), np.asarray(first_word, np.int32), row_words, used_words, np.asarray(bins, np.int32),
-            np.asarray(x0, np.int32), counts, dark, first, last,
+            np.arange(len(x0), dtype=np.int32)[:, None], np.asarray(x0, np.int32), counts, dark, first, last,
         )  # fmt: skip
     return counts, pixel_order(dark, width_words * WORD)
 
@@ -132,6 +132,16 @@ def test_without_columns_only_dark_frames_are_counted():
     dark = np.zeros((3, PAIRS, 16 + LANES, 2), np.int32)
     none = np.zeros((0, 3, WORD), np.uint8)
     add_runs(
-        words.ravel(), np.zeros(12, np.int32), 2, 2, bins.astype(np.int32), np.zeros(2, np.int32), none, dark, 0, 3
+        words.ravel(),
+        np.zeros(12, np.int32),
+        2,
+        2,
+        bins.astype(np.int32),
+        np.zeros((0, 0), np.int32),
+        np.zeros(2, np.int32),
+        none,
+        dark,
+        0,
+        3,
     )
     np.testing.assert_array_equal(pixel_order(dark, 128), bits_of(words)[bins == -1].sum(axis=0))

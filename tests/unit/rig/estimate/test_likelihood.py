@@ -13,10 +13,10 @@ FIELDS = ("x_px", "confidence", "x_sd_px", "signal", "haze")
 
 
 @cache
-def estimated(light="report", exposures=10, rig="left", threads=2):
+def estimated(light="report", exposures=10, rig="left"):
     """Stripe table of a fresh estimator, and the estimator afterwards."""
     sweep = simulated(light, exposures, rig)
-    estimator = Likelihood(threads)
+    estimator = Likelihood(2)
     return estimator.estimate(sweep.volume, sweep.geometry), estimator
 
 

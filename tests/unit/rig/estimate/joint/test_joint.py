@@ -33,15 +33,6 @@ def assert_same(found: StripeTable, wanted: StripeTable) -> None:
         np.testing.assert_array_equal(getattr(found, field.name), getattr(wanted, field.name), err_msg=field.name)
 
 
-@pytest.mark.parametrize("threads", [1, 3])
-def test_threads_change_no_bit(threads):
-    sweep, (wanted, used) = simulated(exposures=3), estimated()
-    estimator = Joint(threads)
-    assert_same(estimator.estimate(sweep.volume, sweep.geometry), wanted)
-    for name, value in estimator.used.arrays().items():
-        np.testing.assert_array_equal(value, used.arrays()[name], err_msg=name)
-
-
 def test_a_state_that_was_kept_gives_the_same_bits_whatever_came_between():
     sweep, other, (wanted, used) = simulated(exposures=3), simulated(exposures=3, seed=2), estimated()
     kept = RowModel.from_arrays(used.arrays())

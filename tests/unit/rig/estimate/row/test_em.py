@@ -26,13 +26,13 @@ def learned(light="report", exposures=10, rig="left") -> RowModel:
     return first_model(sweep.volume, sweep.geometry)
 
 
-def first_model(volume, geometry, workers=WORKERS) -> RowModel:
-    return learn_first(volume, geometry, ambient_map(volume, volume.intensity(), geometry, None), workers)
+def first_model(volume, geometry) -> RowModel:
+    return learn_first(volume, geometry, ambient_map(volume, volume.intensity(), geometry, None), WORKERS)
 
 
-def next_model(sweep, model, before=None, workers=WORKERS):
+def next_model(sweep, model, before=None):
     lines = lines_of(sweep.volume, next_lattice(sweep.geometry))
-    return learn_next(lines, sweep.geometry, model, before, workers)
+    return learn_next(lines, sweep.geometry, model, before, WORKERS)
 
 
 def noisy_haze(rng, extinction, amplitude=0.3, photons=2000.0):
@@ -147,15 +147,6 @@ def test_learned_numbers_are_in_range():
         assert (model.row_gain > 0).all()
 
 
-def test_one_more_sweep_of_the_same_light_moves_the_model_little():
-    sweep, model = simulated(seed=2), learned()
-    after, _ = next_model(sweep, model)
-    assert after.extinction_per_m == pytest.approx(model.extinction_per_m, rel=0.25)
-    assert abs(np.log(after.line_sigma_px / model.line_sigma_px)) < 0.15
-    far = (model.path_m() > 1.0) & (model.path_m() < 4.0)
-    np.testing.assert_allclose(after.profile[far, 0], model.profile[far, 0], rtol=0.25, atol=0.01)
-
-
 def test_rows_with_a_weaker_line_get_a_smaller_gain():
     sweep = simulated("dense", rows=160, columns=40)
     # The lower rows see half of all light: haze, stripe and ambient.
@@ -175,17 +166,6 @@ def test_learning_does_not_change_the_model_it_started_from():
     next_model(sweep, model)
     for name in ("profile", "ambient", "row_gain"):
         np.testing.assert_array_equal(getattr(model, name), getattr(kept, name))
-
-
-def test_threads_change_nothing_of_what_is_learned():
-    sweep = simulated(seed=2)
-    with RowWorkers(3) as three:
-        one, other = learned(), first_model(simulated().volume, simulated().geometry, three)
-        (next_one, seen), (next_other, also) = next_model(sweep, one), next_model(sweep, other, workers=three)
-    for a, b in ((one, other), (next_one, next_other)):
-        for name, value in a.arrays().items():
-            np.testing.assert_array_equal(b.arrays()[name], value, err_msg=name)
-    np.testing.assert_array_equal(seen.levels, also.levels)
 
 
 def test_what_the_sweeps_before_taught_fades_with_each():
