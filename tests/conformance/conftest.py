@@ -5,13 +5,14 @@ A new device is added here and nowhere else: it then has to behave like all the 
 
 from collections.abc import Iterator
 from contextlib import contextmanager
-from dataclasses import replace
 from fractions import Fraction
+from functools import partial
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 import pytest
+import yaml
 
 from drivers.clock import VirtualClock
 from drivers.interfaces import MARKER_SCAN, ScanWaveform, SpadRequest, WindowTable
@@ -19,27 +20,10 @@ from drivers.registry import Surroundings, lookup
 from tests.conformance.cases import LaserCase, ScannerCase, SpadCase, SyncCase, Taken, WorldCase, run
 from tests.conformance.devices import LASERS, SCANNERS, SYNCS, Factory
 from tests.conformance.spads import EMULATED, N_FRAMES, replayed_spads
+from tests.system.small_rig import calibration
 
 ROWS, WIDTH = 24, 100
 """A small camera, its width no multiple of 64."""
-
-SMALL_RIG = f"""
-format: spadrig-calibration
-version: 1
-camera:
-  width: {WIDTH}
-  height: {ROWS}
-  matrix: [[120, 0, {(WIDTH - 1) / 2}], [0, 120, {(ROWS - 1) / 2}], [0, 0, 1]]
-  distortion: [0, 0, 0, 0, 0]
-scanner:
-  pivot:
-    axis_point_m: [-0.3, 0, 0]
-    axis_direction: [0, 1, 0]
-    zero_normal: [1, 0, 0]
-    angle_rad: [0.0861, 0.3776]
-    command_range: [-1, 1]
-source_m: [-0.3, 0, 0]
-"""
 
 
 def simulated(slot: str, surroundings: Surroundings, **config: Any) -> Any:
@@ -50,29 +34,16 @@ def simulated(slot: str, surroundings: Surroundings, **config: Any) -> Any:
 
 def simulated_surroundings(folder: Path) -> Surroundings:
     geometry = folder / "small-rig.yaml"
-    geometry.write_text(SMALL_RIG, encoding="utf-8")
+    geometry.write_text(yaml.safe_dump(calibration(WIDTH, ROWS)))
     clock = VirtualClock()
     world = simulated("world", Surroundings(clock, None, seed=1), geometry=str(geometry))
     return Surroundings(clock, world, seed=1)
 
 
 @contextmanager
-def simulated_spad(folder: Path, **config: Any) -> Iterator[SpadCase]:
+def simulated_spad(folder: Path, *, window: WindowTable | None = None, **config: Any) -> Iterator[SpadCase]:
     with simulated("spad", simulated_surroundings(folder), **config) as device:
-        yield SpadCase(device, SpadRequest(Fraction(100_000), 1e-5, "stream", block_frames=64))
-
-
-@contextmanager
-def simulated_lossy_spad(folder: Path) -> Iterator[SpadCase]:
-    with simulated_spad(folder, loss_probability=0.01, lost_frames=[0, 64, 65, 66]) as case:
-        yield case
-
-
-@contextmanager
-def simulated_window_spad(folder: Path) -> Iterator[SpadCase]:
-    with simulated_spad(folder, link="21 MB/s") as case:
-        window = WindowTable(64, (np.array([64, 0], np.int32),))
-        yield SpadCase(case.device, replace(case.request, window=window))
+        yield SpadCase(device, SpadRequest(Fraction(100_000), 1e-5, "stream", 64, window))
 
 
 @contextmanager
@@ -116,12 +87,15 @@ def simulated_world(folder: Path) -> Iterator[WorldCase]:
     yield WorldCase(world, ROWS, WIDTH)
 
 
+_LOSSY: Factory = partial(simulated_spad, loss_probability=0.01, lost_frames=[0, 64, 65, 66])
+_WINDOW = WindowTable(64, (np.array([64, 0], np.int32),))
+_WINDOWS: Factory = partial(simulated_spad, window=_WINDOW, link="21 MB/s")
 SPADS: dict[str, Factory] = {
     "simulated": simulated_spad,
-    "simulated, lossy": simulated_lossy_spad,
-    "simulated, windows": simulated_window_spad,
+    "simulated, lossy": _LOSSY,
+    "simulated, windows": _WINDOWS,
     **EMULATED,
-    **replayed_spads(simulated_spad, simulated_lossy_spad, simulated_window_spad),
+    **replayed_spads(simulated_spad, _LOSSY, _WINDOWS),
 }
 
 

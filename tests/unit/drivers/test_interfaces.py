@@ -2,14 +2,16 @@
 
 import math
 from collections.abc import Callable, Sequence
+from contextlib import nullcontext
 from dataclasses import replace
 from fractions import Fraction
+from functools import partial
 from typing import Any
 
 import numpy as np
 import pytest
 
-from drivers.errors import DeviceDisconnected, DeviceFault, InterlockOpen, LimitExceeded, WrongState
+from drivers.errors import DeviceDisconnected, DeviceError, DeviceFault, InterlockOpen, LimitExceeded, WrongState
 from drivers.interfaces import (
     OUT_GATE,
     BurstMode,
@@ -64,36 +66,32 @@ class TroubledLaser(LineLaser):
         self.calls.append("close")
 
 
-def test_an_open_interlock_keeps_the_laser_off() -> None:
-    laser = TroubledLaser(replace(DARK, interlock_closed=False))
-    with pytest.raises(InterlockOpen, match="lamp: the interlock is open; close it"):
+@pytest.mark.parametrize(
+    ("status", "error", "said"),
+    [
+        (replace(DARK, interlock_closed=False), InterlockOpen, "lamp: the interlock is open; close it"),
+        (replace(DARK, fault="diode too hot"), DeviceFault, "lamp: fault diode too hot; clear it"),
+    ],
+)
+def test_an_open_interlock_or_a_fault_keeps_the_laser_off_and_is_told(
+    status: LaserStatus, error: type[DeviceError], said: str
+) -> None:
+    laser = TroubledLaser(status)
+    with pytest.raises(error, match=said):
         laser.arm(0.01)
     assert laser.calls == []
     assert laser.state is DeviceState.READY
 
 
-def test_a_fault_keeps_the_laser_off_and_is_told() -> None:
-    laser = TroubledLaser(replace(DARK, fault="diode too hot"))
-    with pytest.raises(DeviceFault, match="lamp: fault diode too hot; clear it"):
-        laser.arm(0.01)
-    assert laser.calls == []
-
-
-def test_a_laser_is_paused_before_its_port_is_given_back_and_never_switched_off() -> None:
-    laser = TroubledLaser()
+@pytest.mark.parametrize("fails", [False, True])
+def test_a_laser_is_paused_before_its_port_is_given_back_and_never_switched_off(fails: bool) -> None:
+    laser = TroubledLaser(pause_error=DeviceDisconnected("lamp: unplugged") if fails else None)
     laser.arm(0.01)
+    with pytest.raises(DeviceDisconnected, match="unplugged") if fails else nullcontext():
+        laser.close()
     laser.close()
     assert laser.calls == ["arm 0.01", "pause", "close"]
-
-
-def test_a_port_is_given_back_and_the_failure_told_where_the_pause_fails() -> None:
-    laser = TroubledLaser(pause_error=DeviceDisconnected("lamp: unplugged"))
-    with pytest.raises(DeviceDisconnected, match="unplugged"):
-        laser.close()
-    assert laser.calls == ["pause", "close"]
     assert laser.state is DeviceState.CLOSED
-    laser.close()
-    assert laser.calls == ["pause", "close"]
 
 
 def test_a_failed_pause_is_not_taken_for_a_pause() -> None:
@@ -152,18 +150,20 @@ def test_a_sync_source_is_aborted_before_its_port_is_given_back() -> None:
     assert sync.state is DeviceState.CLOSED
 
 
-class SmallMemorySpad(SpadArray):
-    """A SPAD that only bursts, and whose read-out the test decides."""
+class ScriptedSpad(SpadArray):
+    """A SPAD whose read-out the test decides. width: 128 for one that also streams half of its full frames."""
 
-    def __init__(self) -> None:
+    def __init__(self, width: int = 64) -> None:
         super().__init__("cam")
         self.answers: list[bool | Exception | Callable[[], None]] = []
         self.stopped = 0
+        stream = StreamMode(8e6) if width == 128 else None
+        burst = BurstMode(100, 4e8)
+        self._info = SpadInfo("m", "s", width, 8, 0, Fraction(100_000), burst, stream, 64, True, ("free",))
 
     @property
     def info(self) -> SpadInfo:
-        burst = BurstMode(100, 4e8)
-        return SpadInfo("m", "s", 64, 8, 0, Fraction(100_000), burst, None, 64, True, ("free",))
+        return self._info
 
     def _do_configure(self, request: SpadRequest) -> SpadTiming:
         return SpadTiming(Fraction(10**8), 1000, 1000, 1024)
@@ -192,7 +192,7 @@ BURST = SpadRequest(Fraction(100_000), 1e-5, "burst", 10)
 
 
 def test_a_burst_has_to_fit_the_memory() -> None:
-    spad = SmallMemorySpad()
+    spad = ScriptedSpad()
     spad.configure(BURST)
     with pytest.raises(LimitExceeded, match="a burst of 101 frames exceeds the memory of 100 frames"):
         spad.start(101)
@@ -200,18 +200,9 @@ def test_a_burst_has_to_fit_the_memory() -> None:
         spad.start(None)
     spad.start(100)
     with pytest.raises(LimitExceeded, match="mode 'stream' is not available; it can burst"):
-        SmallMemorySpad().configure(replace(BURST, mode="stream"))
+        ScriptedSpad().configure(replace(BURST, mode="stream"))
 
 
-class StreamingSpad(SmallMemorySpad):
-    """A SPAD whose link carries half of its full frames."""
-
-    @property
-    def info(self) -> SpadInfo:
-        return SpadInfo("m", "s", 128, 8, 0, Fraction(100_000), BurstMode(100, 4e8), LINK, 64, True, ("free",))
-
-
-LINK = StreamMode(8e6)
 STREAM = SpadRequest(Fraction(100_000), 1e-5, "stream", 10)
 HALF = WindowTable(64, (np.array([0, 64], np.int32),))
 
@@ -220,13 +211,13 @@ def test_a_stream_that_the_link_cannot_carry_is_refused_with_both_rates() -> Non
     with pytest.raises(
         LimitExceeded, match=r"128 x 8 pixels a second are 14\.4 MB/s, the link carries 8\.0 MB/s; lower"
     ):
-        StreamingSpad().configure(STREAM)
-    StreamingSpad().configure(replace(STREAM, window=HALF))
-    StreamingSpad().configure(replace(STREAM, frame_rate_hz=Fraction(50_000)))
+        ScriptedSpad(128).configure(STREAM)
+    ScriptedSpad(128).configure(replace(STREAM, window=HALF))
+    ScriptedSpad(128).configure(replace(STREAM, frame_rate_hz=Fraction(50_000)))
 
 
 def test_windows_off_the_grid_or_in_a_burst_are_refused_under_the_name_of_the_device() -> None:
-    spad = StreamingSpad()
+    spad = ScriptedSpad(128)
     with pytest.raises(LimitExceeded, match="cam: a window of 64 pixels from pixel 128 on reaches beyond"):
         spad.configure(replace(STREAM, window=WindowTable(64, (np.array([128], np.int32),))))
     with pytest.raises(LimitExceeded, match="cam: windows in mode 'burst'"):
@@ -246,14 +237,14 @@ def test_windows_off_the_grid_or_in_a_burst_are_refused_under_the_name_of_the_de
     ],
 )
 def test_a_request_beyond_the_limits_is_refused_with_value_and_limit(wrong: dict[str, Any], said: str) -> None:
-    spad = SmallMemorySpad()
+    spad = ScriptedSpad()
     with pytest.raises(LimitExceeded, match=f"cam: .*{said}"):
         spad.configure(replace(BURST, **wrong))
     assert spad.state is DeviceState.READY
 
 
 def test_verbs_of_a_spad_out_of_order_are_refused_and_say_what_to_call() -> None:
-    spad, ring = SmallMemorySpad(), BlockRing(1, 1024)
+    spad, ring = ScriptedSpad(), BlockRing(1, 1024)
     spad.stop()
     with pytest.raises(WrongState, match="configure"):
         spad.start(10)
@@ -271,7 +262,7 @@ def test_verbs_of_a_spad_out_of_order_are_refused_and_say_what_to_call() -> None
 
 
 def test_a_run_goes_on_after_an_error_until_it_is_stopped() -> None:
-    spad, ring = SmallMemorySpad(), BlockRing(1, 1024)
+    spad, ring = ScriptedSpad(), BlockRing(1, 1024)
     spad.configure(BURST)
     spad.start(100)
     spad.answers = [True, DeviceDisconnected("cam: unplugged"), True]
@@ -288,23 +279,17 @@ def test_a_run_goes_on_after_an_error_until_it_is_stopped() -> None:
         spad.fill(ring, 0.1)
 
 
-def test_a_stop_that_comes_while_a_block_is_filled_ends_the_run() -> None:
-    spad = SmallMemorySpad()
-    spad.configure(BURST)
-    spad.start(100)
-    spad.answers = [spad.stop]
-    assert not spad.fill(BlockRing(1, 1024), 0.1)
+def test_a_stop_that_comes_while_a_block_is_filled_and_a_close_end_the_run() -> None:
+    for end in (ScriptedSpad.stop, ScriptedSpad.close):
+        spad = ScriptedSpad()
+        spad.configure(BURST)
+        spad.start(100)
+        spad.answers = [partial(end, spad)]
+        assert not spad.fill(BlockRing(1, 1024), 0.1)
+        assert spad.stopped == 1
 
 
 def test_an_exposure_of_one_period_is_taken_though_its_last_bit_was_rounded_up() -> None:
-    SmallMemorySpad().configure(replace(BURST, exposure_s=math.nextafter(BURST.exposure_s, 1)))
+    ScriptedSpad().configure(replace(BURST, exposure_s=math.nextafter(BURST.exposure_s, 1)))
     with pytest.raises(LimitExceeded, match="exposure"):
-        SmallMemorySpad().configure(replace(BURST, exposure_s=1.0001e-5))
-
-
-def test_close_stops_a_run() -> None:
-    spad = SmallMemorySpad()
-    spad.configure(BURST)
-    spad.start(100)
-    spad.close()
-    assert spad.stopped == 1
+        ScriptedSpad().configure(replace(BURST, exposure_s=1.0001e-5))
