@@ -10,6 +10,7 @@ import os
 import re
 from collections.abc import Callable, Iterator
 from fnmatch import fnmatch
+from functools import cache
 from pathlib import Path
 from typing import TypeVar
 
@@ -48,16 +49,20 @@ def covers(*things: object) -> Callable[[Test], Test]:
     return unchanged
 
 
-def public_functions() -> Iterator[str]:
+@cache
+def public_functions() -> list[str]:
     """Every public function and method within SCOPE that takes or gives numbers, as "module:Class.name"."""
+    found = []
     for path in sorted(ROOT.glob("[cdrs]*/**/*.py")):
         file = path.relative_to(ROOT).as_posix()
         if any(fnmatch(file, pattern) for pattern in SCOPE):
             module = file.removesuffix(".py").removesuffix("/__init__").replace("/", ".")
-            for name in _numeric(ast.parse(path.read_text(encoding="utf-8")).body):
-                yield f"{module}:{name}"
+            body = ast.parse(path.read_text(encoding="utf-8")).body
+            found += [f"{module}:{name}" for name in _numeric(body)]
+    return found
 
 
+@cache
 def covered() -> set[str]:
     """What the tests say they cover, as "module:Class.name"; read from their source, so that none has to be run."""
     found = set()

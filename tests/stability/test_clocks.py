@@ -43,7 +43,7 @@ def test_virtual_time_never_runs_back_and_keeps_its_nanoseconds(start, steps, to
     assert clock.now_ns() == max(before, to)
 
 
-@covers(Pace.speed, Pace.most_frames, Pace.wait, Pace.hold)
+@covers(Pace.most_frames, Pace.wait, Pace.hold)
 @EXAMPLES
 @given(
     uptime_s=st.integers(0, 10**9), speed=st.sampled_from([1e-4, 1.0, 1e4]), ahead_s=st.floats(0, 1),

@@ -65,7 +65,7 @@ EVERY = pytest.mark.parametrize("name", ESTIMATORS)
 
 
 @EVERY
-@pytest.mark.parametrize("rig", RIGS)
+@pytest.mark.parametrize("rig", ["left", "turned"])
 @pytest.mark.parametrize(
     ("k", "level"), [(1, 0), (1, 1), (10, 0), (10, 10), (255, 0), (255, 255), (10, 5), (10**6, 0), (10**6, 10**6)]
 )
@@ -77,8 +77,11 @@ def test_pictures_without_any_contrast(name, rig, k, level):
 
 
 @EVERY
-@pytest.mark.parametrize(("k", "dtype"), [(1, np.uint8), (300, np.uint16), (70_000, np.uint32)])
-@pytest.mark.parametrize("rate", [1e-4, 0.5, 0.9999])
+@pytest.mark.parametrize(
+    ("k", "dtype", "rate"),
+    [(1, np.uint8, 0.5), (1, np.uint8, 1e-4), (300, np.uint16, 0.5), (300, np.uint16, 0.9999),
+     (70_000, np.uint32, 1e-4), (70_000, np.uint32, 0.9999)],
+)  # fmt: skip
 def test_noise_without_any_stripe(name, k, dtype, rate):
     geometry = view()
     counts = np.random.default_rng(1).binomial(k, rate, full(0, geometry).shape).astype(dtype)
@@ -234,7 +237,7 @@ def test_a_bad_map_does_not_spoil_the_next_ones(name, level):
     sweep = simulated()
     estimator = create_estimator(name)
     estimator.estimate(volume_of(np.full_like(sweep.counts, level), sweep.geometry, 10), sweep.geometry)
-    for _ in range(6):
+    for _ in range(3):
         table = estimator.estimate(sweep.volume, sweep.geometry)
         check(table, sweep.volume, sweep.geometry)
     fresh = create_estimator(name).estimate(sweep.volume, sweep.geometry)

@@ -30,8 +30,11 @@ def assert_same_model(one, other) -> None:
         np.testing.assert_array_equal(getattr(one, name), getattr(other, name), err_msg=name)
 
 
-@pytest.mark.parametrize("rig", ["left", "right", "turned"])
-@pytest.mark.parametrize(("light", "share"), [("report", 0.85), ("dense", 0.6), ("clear", 0.8)])
+@pytest.mark.parametrize(
+    ("light", "share", "rig"),
+    [("report", 0.85, "left"), ("report", 0.85, "right"), ("report", 0.85, "turned"), ("dense", 0.6, "right"),
+     ("clear", 0.8, "turned")],
+)  # fmt: skip
 def test_stripes_are_found_from_ten_exposures(light, share, rig):
     table, _ = estimated(light, 10, rig)
     errors = simulated(light, 10, rig).errors(table.x_px)
@@ -129,8 +132,7 @@ def test_hot_pixels_do_not_capture_stripes(light):
     assert wrong.sum() < 0.005 * len(y)
 
 
-@pytest.mark.parametrize("rig", ["left", "right", "turned"])
-@pytest.mark.parametrize("light", ["report", "dense"])
+@pytest.mark.parametrize(("light", "rig"), [("report", "left"), ("dense", "turned")])
 def test_learned_extinction_is_the_fogs(light, rig):
     sweep = simulated(light, 10, rig, rows=80, columns=200)
     estimator = Likelihood()
@@ -147,7 +149,7 @@ def test_clear_air_resolves_no_extinction():
 
 
 @pytest.mark.parametrize("light", ["report", "dense"])
-@pytest.mark.parametrize("exposures", [1, 3, 10])
+@pytest.mark.parametrize("exposures", [1, 10])
 def test_confidence_is_the_share_of_right_answers(light, exposures):
     # Three scans, each with a model of its own: what one of them learned by chance shows in all its answers.
     confidence, right = [], []
@@ -211,11 +213,10 @@ def test_a_sweep_without_dark_frames_and_one_with_them_agree():
     assert abs(right[0] - right[1]) < 0.03
 
 
-@pytest.mark.parametrize("level", [0, 10])
-def test_a_first_map_without_contrast_teaches_nothing(level):
+def test_a_first_map_without_contrast_teaches_nothing():
     sweep = simulated()
     estimator = Likelihood()
-    flat = volume_of(np.full_like(sweep.counts, level), sweep.geometry, 10)
+    flat = volume_of(np.full_like(sweep.counts, 10), sweep.geometry, 10)
     estimator.estimate(flat, sweep.geometry)
     assert estimator.used is not None
     assert estimator.model is None

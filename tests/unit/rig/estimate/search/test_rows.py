@@ -85,8 +85,7 @@ def agreement(volume, geometry, learned, near_px=NEAR_PX):
 
 
 @pytest.mark.parametrize("rig", RIGS)
-@pytest.mark.parametrize("light", LIGHTS)
-@pytest.mark.parametrize("exposures", [1, 10, 40])
+@pytest.mark.parametrize(("light", "exposures"), [("report", 1), ("report", 10), ("dense", 10), ("clear", 40)])
 def test_sure_answers_are_those_of_the_exact_likelihood(light, rig, exposures):
     sweep = simulated(light, exposures, rig)
     sure, also, difference = agreement(sweep.volume, sweep.geometry, model(light, rig))
@@ -140,7 +139,7 @@ def drawn(seed, rig, exposures):
 
 
 @pytest.mark.parametrize("rig", RIGS)
-@pytest.mark.parametrize("exposures", [1, 5, 20, 60])
+@pytest.mark.parametrize("exposures", [1, 20])
 def test_random_models_are_searched_as_exactly(rig, exposures):
     sure, also, difference = [], [], []
     for seed in range(6):
@@ -246,7 +245,7 @@ def hard_rows(rng, window, exposures):
 
 @pytest.mark.parametrize("rig", RIGS)
 @pytest.mark.parametrize("light", LIGHTS)
-@pytest.mark.parametrize("exposures", [1, 3, 10, 63])
+@pytest.mark.parametrize("exposures", [1, 63])
 def test_scores_of_any_counts_are_sums_of_whole_numbers_and_stop_at_the_limits(light, rig, exposures):
     judge, geometry = judged_rows(rig, exposures, light)
     rng = np.random.default_rng(exposures)

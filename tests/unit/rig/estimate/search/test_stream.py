@@ -130,7 +130,7 @@ def every_map_teaches(monkeypatch):
 
 
 @pytest.mark.parametrize("rig", RIGS)
-@pytest.mark.parametrize("exposures", [1, 10, 20, 100])
+@pytest.mark.parametrize("exposures", [1, 10, 100])
 def test_judged_on_the_way_is_judged_afterwards(rig, exposures):
     layout = layout_of(rig, exposures)
     sweeps = [frames_of(rig, exposures, seed) for seed in (1, 2, 3)]
@@ -187,9 +187,11 @@ def moved(frames, layout, seed):
     return replace(frames, x0=x0.astype(np.int32))
 
 
-@pytest.mark.parametrize("rig", RIGS)
-@pytest.mark.parametrize("exposures", [1, 10, 30])
-@pytest.mark.parametrize("spare", [0, 64, 128])
+@pytest.mark.parametrize(
+    ("rig", "exposures", "spare"),
+    [("left", 1, 64), ("left", 10, 0), ("right", 10, 128), ("right", 30, 64), ("turned", 1, 128), ("turned", 10, 64),
+     ("turned", 30, 0)],
+)  # fmt: skip
 def test_windows_that_move_even_within_a_column_give_the_bits_of_whole_frames(rig, exposures, spare):
     used = scene(rig).geometry.window + spare
     layout = layout_of(rig, exposures, used)
