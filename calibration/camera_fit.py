@@ -17,14 +17,13 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
+from calibration.arrays import Array, Mask
 from calibration.board.board import Board, Coverage, coverage_of, spread_rad
 from calibration.errors import CalibrationError, Degenerate, condition_text
 from calibration.model.camera import TERM_COUNTS, Camera
 from calibration.model.parameters import DISTORTION, MATRIX
 from calibration.model.rig_model import Covariance
 from calibration.views import LEAST_ACROSS_PX, NO_POSE, BoardPose, Corners, View, robust_sd
-
-Array = NDArray[np.float64]
 
 _POSE = 6
 """OpenCV's columns: rotation, position, then fx fy cx cy and the distortion."""
@@ -77,8 +76,6 @@ def camera_normal(
         total += rest.T @ rest
     return Normal((*MATRIX, *DISTORTION[:terms]), total)
 
-
-Mask = NDArray[np.bool_]
 
 LEAST_SD_PX = 0.01
 """Least sd of corners: they are never better than this, however well they fit."""

@@ -17,13 +17,12 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
+from calibration.arrays import Array
 from calibration.board.board import Board
 from calibration.depth_error import propagated
 from calibration.errors import Degenerate
 from calibration.model.rig_model import RigModel
 from calibration.views import FEWEST_CORNERS, Passages, View
-
-Array = NDArray[np.float64]
 
 _FEWEST_CELLS = 8
 """Scanned squares of a board; three of them already go into its plane."""
@@ -146,8 +145,7 @@ def _scanned_points(model: RigModel, passages: Passages) -> Array:
 def off_plane(xy: Array) -> Array:
     """(cells, cells - 3) orthonormal basis of what is no plane."""
     full = np.linalg.qr(np.column_stack([np.ones(len(xy)), xy]), mode="complete")[0]
-    basis: Array = full[:, 3:]
-    return basis
+    return full[:, 3:]
 
 
 _PARALLEL = 1e-6

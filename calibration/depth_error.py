@@ -16,14 +16,13 @@ from dataclasses import dataclass
 from typing import Final
 
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import ArrayLike
 
+from calibration.arrays import Array
 from calibration.errors import CalibrationError, digits
 from calibration.model.light_sheet import depth_slope
 from calibration.model.parameters import DISTORTION, MATRIX, ROW_DELAY, TIMES, with_parameters
 from calibration.model.rig_model import Covariance, RigModel
-
-Array = NDArray[np.float64]
 
 _STEPS = dict.fromkeys(MATRIX, 1e-3) | dict.fromkeys(TIMES, 1e-9) | {ROW_DELAY: 1e-12}
 _STEP = 1e-6

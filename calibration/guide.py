@@ -18,6 +18,7 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
+from calibration.arrays import Array
 from calibration.board.board import Board
 from calibration.depth_error import command_at, depth_jacobian
 from calibration.errors import CalibrationError, Degenerate, mm
@@ -29,8 +30,6 @@ from calibration.rig_fit.rows import Terms
 from calibration.rig_fit.solve import scaled_inverse, view_normal
 from calibration.rig_fit.state import Sighting, first_state
 from calibration.views import FEWEST_CORNERS, BoardPose
-
-Array = NDArray[np.float64]
 
 FILLS = (0.6, 0.45, 0.32, 0.22)
 """Share of the picture's width or height, whichever it meets first, that the board fills: its distance, by name."""

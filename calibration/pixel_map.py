@@ -36,12 +36,10 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
+from calibration.arrays import Array, Mask
 from calibration.errors import CalibrationError
 from calibration.files.npy_files import load_numpy
 from calibration.views import robust_sd
-
-Array = NDArray[np.float64]
-Mask = NDArray[np.bool_]
 
 LEAST_COUNTS = 10.0
 """A pixel's mean counts in a block from which on chi-square describes their scatter; quieter ones are not judged."""
@@ -261,8 +259,7 @@ def _is_hot(flux: Array, frames: NDArray[np.int64], level: Array, limit: Array) 
     chance = np.sqrt(np.maximum(np.expm1(level), 1 / n) / n)
     excess = flux - level
     scatter = robust_sd(excess[seen]) if seen.any() else 0.0
-    result: Mask = seen & (flux > limit) & (excess > _HOT_SIGMA * np.maximum(chance, scatter))
-    return result
+    return seen & (flux > limit) & (excess > _HOT_SIGMA * np.maximum(chance, scatter))
 
 
 def _around(flux: Array) -> Array:
@@ -280,8 +277,7 @@ def _share(ones: NDArray[np.integer], frames: NDArray[np.integer]) -> Array:
 def _chi_square_limit(dof: NDArray[np.int64], probability: float) -> Array:
     """The value that chi-square exceeds with that probability (Wilson and Hilferty, 1931)."""
     spread = 2 / (9 * dof)
-    result: Array = dof * (1 - spread + NormalDist().inv_cdf(1 - probability) * np.sqrt(spread)) ** 3
-    return result
+    return dof * (1 - spread + NormalDist().inv_cdf(1 - probability) * np.sqrt(spread)) ** 3
 
 
 SIGNIFICANT = 5.0

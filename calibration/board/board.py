@@ -22,6 +22,7 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 from pydantic import BeforeValidator, Field
 
+from calibration.arrays import Array
 from calibration.errors import CalibrationError
 from calibration.files.problems import ValueSources, validated
 from calibration.files.sections import FileSection, load_yaml
@@ -52,8 +53,6 @@ class BoardFile(FileSection):
     marker: Length | None = Field(None, description="side of a marker, its black border included (charuco)")
     dictionary: str | None = Field(None, description="OpenCV's name of the set of markers, e.g. DICT_5X5_100 (charuco)")
 
-
-Array = NDArray[np.float64]
 
 BLACK, WHITE = 0.05, 0.85
 """Reflectance of a laser printer's black and of matt white paper, rounded."""

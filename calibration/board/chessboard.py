@@ -13,10 +13,9 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
+from calibration.arrays import Array
 from calibration.board.board import Board
 from calibration.board.lattice import FORMS, Gray, Lattice, MatchedPoints, as_form, known_lattice
-
-Array = NDArray[np.float64]
 
 _SMALLEST_PARTS = ((4, 4), (3, 3))
 """Inner corners of a chessboard that count as a part of one; small ones are more often found where none is."""
@@ -66,8 +65,7 @@ def _part(shown: Gray, form: tuple[int, float], smallest: tuple[int, int]) -> Ar
     found, corners, meta = cv2.findChessboardCornersSBWithMeta(as_form(shown, *form), smallest, flags)
     if not found:
         return None
-    px: Array = (np.asarray(corners, np.float64).reshape(*meta.shape[:2], 2) + 0.5) / form[0] - 0.5
-    return px
+    return (np.asarray(corners, np.float64).reshape(*meta.shape[:2], 2) + 0.5) / form[0] - 0.5
 
 
 def _whole_chessboard(form: Gray, grid: tuple[int, int]) -> Array | None:

@@ -11,6 +11,7 @@ from dataclasses import replace
 import numpy as np
 from numpy.typing import NDArray
 
+from calibration.arrays import Array
 from calibration.board.board import Board
 from calibration.board.chessboard import find_chessboard
 from calibration.board.drawing import BoardMap, Drawing, fit_map
@@ -42,8 +43,6 @@ def repaired(picture: NDArray[np.generic], defects: NDArray[np.bool_] | None = N
         values[rows[known], columns[known]] = np.nanmedian(around[known], axis=1)
     return np.nan_to_num(values)
 
-
-Array = NDArray[np.float64]
 
 LEAST_SHARE = 0.5
 """Share of the board's corners that a view must show more than; others are refused."""

@@ -13,6 +13,7 @@ import cv2
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
+from calibration.arrays import Array
 from calibration.board.board import MARGIN_SQUARES, Board
 
 _PX_PER_SQUARE = (32, 256)
@@ -57,8 +58,6 @@ class Drawing:
         return cls(board, np.pad(drawn.reshape(size), pad, constant_values=1.0), fine, pad)
 
 
-Array = NDArray[np.float64]
-
 _BENDS = ((30, 3), (12, 2))
 """(least number of points, degree of the polynomial): three points to a term at least."""
 _FEWEST_POINTS = 4
@@ -89,8 +88,7 @@ class BoardMap:
     def to_px(self, points_m: ArrayLike) -> Array:
         """Raw pixels (..., 2) of board positions (..., 2)."""
         flat = _projected(self.homography, (np.asarray(points_m, np.float64) - self.half_m) / self.half_m)
-        mapped: Array = flat + _terms((flat - self.centre_px) / self.half_px, self.degree) @ self.bend_px
-        return mapped
+        return flat + _terms((flat - self.centre_px) / self.half_px, self.degree) @ self.bend_px
 
 
 def fit_map(
@@ -130,8 +128,7 @@ def fit_map(
 
 def _projected(homography: Array, at: Array) -> Array:
     seen = np.concatenate([at, np.ones((*at.shape[:-1], 1))], axis=-1) @ homography.T
-    flat: Array = seen[..., :2] / seen[..., 2:]
-    return flat
+    return seen[..., :2] / seen[..., 2:]
 
 
 def _powers(degree: int) -> list[tuple[int, int]]:
@@ -142,5 +139,4 @@ def _terms(at: Array, degree: int) -> Array:
     across = np.polynomial.polynomial.polyvander(at[..., 0], degree)
     down = np.polynomial.polynomial.polyvander(at[..., 1], degree)
     i, j = np.array(_powers(degree)).T
-    terms: Array = across[..., i] * down[..., j]
-    return terms
+    return across[..., i] * down[..., j]

@@ -15,12 +15,12 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
+from calibration.arrays import Array
 from calibration.board.board import Board
 from calibration.board.drawing import BoardMap, Drawing, fit_map
 from calibration.board.markers import Markers
 from calibration.board.registration import SUBPIXELS, WIDE, register, sides_px
 
-Array = NDArray[np.float64]
 Picture = NDArray[np.float32]
 
 _OFFSETS = np.array([0.1, 0.2, 0.3, 0.4])

@@ -13,9 +13,9 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
+from calibration.arrays import Array
 from calibration.board.board import Board
 
-Array = NDArray[np.float64]
 Places = NDArray[np.int64]
 
 _NEXT_SQUARES = 2.5

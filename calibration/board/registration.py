@@ -17,10 +17,9 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
+from calibration.arrays import Array
 from calibration.board.board import Board
 from calibration.board.drawing import BoardMap, Drawing
-
-Array = NDArray[np.float64]
 
 SUBPIXELS = 12
 """Drawn per pixel and axis before they are averaged over the pixel's area; even. Drawings are as fine, within their

@@ -12,8 +12,8 @@ from dataclasses import dataclass
 from typing import Final
 
 import numpy as np
-from numpy.typing import NDArray
 
+from calibration.arrays import Array
 from calibration.board.board import Board
 from calibration.camera_fit import CameraFit
 from calibration.check import CheckedAngle, CheckedBoard
@@ -24,8 +24,6 @@ from calibration.model.parameters import changed_camera
 from calibration.model.rig_model import Covariance
 from calibration.verdict import SIGMAS, WORST_TIMES, AccuracyGoal, Reason, Verdict, more_poses, unguided
 from calibration.views import View
-
-Array = NDArray[np.float64]
 
 ACCURACY_PX = 0.1
 """Error of a pixel's place that is good enough: no estimator finds the stripe better in fog."""

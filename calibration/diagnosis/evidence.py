@@ -13,14 +13,13 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
+from calibration.arrays import Array
 from calibration.board.board import Board, spread_rad
 from calibration.model.camera import Camera
 from calibration.model.scanner import PivotScanner, Scanner
 from calibration.rig_fit.start import unfit
 from calibration.verdict import Reason, reason_for
 from calibration.views import FEWEST_CORNERS, BoardPose, Corners, View
-
-Array = NDArray[np.float64]
 
 _WHITE_PERCENT = 75
 """Percentile of the board's pixels that is white: half of a board is."""

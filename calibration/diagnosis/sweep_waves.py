@@ -10,11 +10,9 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
-from numpy.typing import NDArray
 
+from calibration.arrays import Array
 from calibration.views import robust_sd
-
-Array = NDArray[np.float64]
 
 BINS = 24
 """Bins of the command range: wide enough for tens of passages each, narrow enough for a wave of several turns."""

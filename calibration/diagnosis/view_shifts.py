@@ -10,16 +10,14 @@ from dataclasses import dataclass
 
 import cv2
 import numpy as np
-from numpy.typing import NDArray
 
+from calibration.arrays import Array
 from calibration.diagnosis.sweep_waves import NOISE_SIGMAS
 from calibration.model.rig_model import RigModel
 from calibration.rig_fit.result import RigFit, SweepFit
 from calibration.rig_fit.solve import corner_weights
 from calibration.rig_fit.state import corner_scale
 from calibration.views import FEWEST_CORNERS, BoardPose, View
-
-Array = NDArray[np.float64]
 
 _STEP = 1e-6
 """Change for differences: of the command as a share of its range, of a pose in rad and m."""
@@ -142,5 +140,4 @@ def _residual(model: RigModel, pose: BoardPose, sweep: SweepFit) -> Array:
     at = np.clip(sweep.command, low + step, high - step)
     off = model.sheets(at).distance_m(points)
     by_command = (model.sheets(at + step).distance_m(points) - model.sheets(at - step).distance_m(points)) / (2 * step)
-    residual: Array = off / by_command
-    return residual
+    return off / by_command

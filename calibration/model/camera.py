@@ -26,9 +26,8 @@ import numpy as np
 from numpy.polynomial import Polynomial
 from numpy.typing import ArrayLike, NDArray
 
+from calibration.arrays import Array
 from calibration.errors import CalibrationError
-
-Array = NDArray[np.float64]
 
 TERM_COUNTS = (4, 5, 8, 12, 14)
 """Numbers of distortion terms OpenCV defines."""

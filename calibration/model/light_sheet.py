@@ -20,10 +20,9 @@ from typing import Final
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
+from calibration.arrays import Array
 from calibration.model.camera import Camera
 from calibration.model.scanner import PivotScanner, Scanner
-
-Array = NDArray[np.float64]
 
 NEARLY_PARALLEL: Final = 1e-6
 """Sine of the angle between ray and plane below which there is no depth: 1e-3 px, finer than any calibration."""
@@ -60,8 +59,7 @@ def depth(u: ArrayLike, v: ArrayLike, planes: ArrayLike) -> Array:
 def _along(u: ArrayLike, v: ArrayLike, planes: ArrayLike) -> Array:
     """n.r, the ray's way along the plane's normal."""
     p = np.asarray(planes, np.float64)
-    result: Array = p[..., 0] * np.asarray(u, np.float64) + p[..., 1] * np.asarray(v, np.float64) + p[..., 2]
-    return result
+    return p[..., 0] * np.asarray(u, np.float64) + p[..., 1] * np.asarray(v, np.float64) + p[..., 2]
 
 
 def depth_slope(u: ArrayLike, v: ArrayLike, planes: ArrayLike, camera: Camera) -> Array:
@@ -187,5 +185,4 @@ def fan_origin(scanner: Scanner, source_m: ArrayLike | None) -> Array:
     if not isinstance(scanner, PivotScanner):
         return np.zeros(3)
     point, axis = scanner.axis_point_m, scanner.axis_direction
-    nearest: Array = point - (point @ axis) * axis
-    return nearest
+    return point - (point @ axis) * axis

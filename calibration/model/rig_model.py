@@ -8,13 +8,12 @@ from typing import Any, NamedTuple
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
+from calibration.arrays import Array
 from calibration.errors import CalibrationError
 from calibration.model.camera import Camera
 from calibration.model.light_sheet import LightSheets, fan_origin, light_sheets
 from calibration.model.scanner import Scanner
 from calibration.verdict import VerdictWord
-
-Array = NDArray[np.float64]
 
 _ASYMMETRY = 1e-6
 """Amount by which two correlations that are the same may differ, and a smallest eigenvalue lie below 0, from
@@ -158,10 +157,7 @@ class RigModel:
         """
         velocity = np.asarray(velocity_per_s, np.float64)
         lag_s = np.where(velocity < 0, self.lag_s.backward, self.lag_s.forward)
-        result: Array = np.asarray(commands, np.float64) - velocity * (
-            lag_s - self.row_delay_s * np.asarray(y_px, np.float64)
-        )
-        return result
+        return np.asarray(commands, np.float64) - velocity * (lag_s - self.row_delay_s * np.asarray(y_px, np.float64))
 
     def check_sensor(self, width: int, height: int) -> None:
         """Raise CalibrationError unless the model was made for a sensor of this size."""

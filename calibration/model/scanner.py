@@ -8,11 +8,10 @@ from dataclasses import dataclass, field
 from typing import Protocol
 
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import ArrayLike
 
+from calibration.arrays import Array
 from calibration.errors import CalibrationError
-
-Array = NDArray[np.float64]
 
 _ROUNDING = 1e-15
 """A few units in the last place of 1.0."""
@@ -169,8 +168,7 @@ class PivotScanner:
         distance = np.sum(normal * self.axis_point_m, axis=-1, keepdims=True)
         if self.offset_m.size:
             distance = distance + np.polynomial.polynomial.polyval(angle, self.offset_m)
-        result: Array = np.concatenate([normal, distance], axis=-1)
-        return result
+        return np.concatenate([normal, distance], axis=-1)
 
 
 def _inside(commands: ArrayLike, limits: tuple[float, float]) -> Array:
@@ -183,8 +181,7 @@ def _inside(commands: ArrayLike, limits: tuple[float, float]) -> Array:
             f"scanner command {at[wrong].flat[0]:g} lies outside the calibrated range [{low:g}, {high:g}]; "
             "narrow the sweep or calibrate over the wider range"
         )
-    clipped: Array = np.clip(at, low, high)
-    return clipped
+    return np.clip(at, low, high)
 
 
 def _vector(value: ArrayLike, name: str) -> Array:
@@ -215,8 +212,7 @@ def _unit(vector: Array, name: str) -> Array:
     length = float(np.linalg.norm(vector))
     if length == 0:
         raise CalibrationError(f"pivot scanner's {name} has length zero")
-    result: Array = vector / _exactly_one(np.array(length))
-    return result
+    return vector / _exactly_one(np.array(length))
 
 
 def _exactly_one(length: Array) -> Array:

@@ -16,11 +16,10 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from calibration.arrays import Array
 from calibration.passages.fit import PassageFit, fit_passages
 from calibration.passages.light import LineShape
 from calibration.views import Passages
-
-Array = NDArray[np.float64]
 
 CORES = (1, 3)
 """Half widths, in columns, of what the line is looked for with."""

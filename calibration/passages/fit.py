@@ -10,6 +10,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
+from calibration.arrays import Array
 from calibration.passages.light import (
     AFTER,
     AREA,
@@ -25,8 +26,6 @@ from calibration.passages.light import (
     residual_of,
     score_of,
 )
-
-Array = NDArray[np.float64]
 
 FITTED_BESIDES = 3
 """Levels before and after, and the line's light."""

@@ -15,11 +15,10 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
+from calibration.arrays import Array
 from calibration.board.board import PAPER_SQUARES, Board
 from calibration.passages.find import SweepCounts
 from calibration.views import Corners
-
-Array = NDArray[np.float64]
 
 LEFT_OUT = 10
 """Columns on either side of the line's brightest, and at most the following share of all."""
@@ -124,8 +123,7 @@ def even_pixels(picture: NDArray[np.float32]) -> NDArray[np.bool_]:
     edge = relative > max(LEAST_SLOPE, NOISE_TIMES * float(np.median(relative[known])) if known.any() else 0.0)
     kernel = np.ones((1, 2 * AWAY_PX + 1), np.uint8)
     near = cv2.dilate((edge | ~known).astype(np.uint8), kernel) > 0
-    result: NDArray[np.bool_] = ~near
-    return result
+    return ~near
 
 
 def board_pixels(corners: Corners, board: Board, size: tuple[int, int]) -> NDArray[np.bool_]:

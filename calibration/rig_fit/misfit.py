@@ -15,12 +15,11 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
+from calibration.arrays import Array
 from calibration.model.parameters import TIMES
 from calibration.rig_fit.noise import Noise, smooth_basis
 from calibration.rig_fit.rows import ANGLE_TERMS
 from calibration.rig_fit.solve import RigProblem, RigSolution, scaled_inverse
-
-Array = NDArray[np.float64]
 
 SIGNIFICANT_SD = 5.0
 LEAST_OWN_SHARE = 1e-7

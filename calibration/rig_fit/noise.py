@@ -16,11 +16,10 @@ from dataclasses import dataclass, replace
 import numpy as np
 from numpy.typing import NDArray
 
+from calibration.arrays import Array
 from calibration.model.parameters import alike_speeds
 from calibration.rig_fit.state import Sighting
 from calibration.views import MAD_TO_SD, robust_sd
-
-Array = NDArray[np.float64]
 
 BINS = 1024
 """Bins of the whole command range: some to a column, within which jitter hardly changes."""
@@ -63,8 +62,7 @@ def smooth_part(command: Array, y_px: Array, residual: Array, weight: Array) -> 
     """The part of a sweep's residuals (m,) that is as smooth as the basis."""
     basis = smooth_basis(command, y_px)
     root = np.sqrt(weight)[:, None]
-    part: Array = basis @ np.linalg.lstsq(basis * root, residual * root[:, 0], rcond=1e-9)[0]
-    return part
+    return basis @ np.linalg.lstsq(basis * root, residual * root[:, 0], rcond=1e-9)[0]
 
 
 def restated(residuals: Sequence[Array], sightings: Sequence[Sighting]) -> tuple[Sighting, ...]:
@@ -201,5 +199,4 @@ def _bin_width(sightings: Sequence[Sighting]) -> float:
 
 def _centred(values: Array) -> Array:
     low, high = float(values.min()), float(values.max())
-    result: Array = (2 * values - low - high) / max(high - low, 1e-12)
-    return result
+    return (2 * values - low - high) / max(high - low, 1e-12)

@@ -3,8 +3,8 @@
 from dataclasses import dataclass, replace
 
 import numpy as np
-from numpy.typing import NDArray
 
+from calibration.arrays import Array
 from calibration.board.board import Board
 from calibration.model.parameters import SWEPT, speed_range
 from calibration.model.rig_model import Covariance, Lag, RigModel
@@ -16,8 +16,6 @@ from calibration.rig_fit.solve import RigProblem
 from calibration.rig_fit.start import board_points, check_depth
 from calibration.rig_fit.state import RigState, Sighting
 from calibration.views import BoardPose
-
-Array = NDArray[np.float64]
 
 
 @dataclass(frozen=True, slots=True, eq=False)

@@ -16,16 +16,14 @@ from typing import NamedTuple
 
 import numpy as np
 from numpy.polynomial import polynomial
-from numpy.typing import NDArray
 
+from calibration.arrays import Array
 from calibration.model.camera import Camera, LensModel
 from calibration.model.light_sheet import fan_origin
 from calibration.model.parameters import AXIS, DISTORTION, MATRIX, TIMES
 from calibration.model.rig_model import RigModel
 from calibration.model.scanner import PivotScanner
 from calibration.views import BoardPose
-
-Array = NDArray[np.float64]
 
 LENS_TERMS = DISTORTION[:12]
 """Names of the distortion's terms, without those of a tilted sensor."""

@@ -17,14 +17,13 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
+from calibration.arrays import Array
 from calibration.errors import CalibrationError, Degenerate, condition_text
 from calibration.model.camera import Camera
 from calibration.model.rig_model import Covariance
 from calibration.rig_fit.noise import Noise, bin_starts, tail_weight
 from calibration.rig_fit.rows import Rows, Terms
 from calibration.rig_fit.state import RigState, Sighting
-
-Array = NDArray[np.float64]
 
 _USUAL_MISS = float(np.sqrt(np.log(2.0)))
 """Median of a distance in a plane (Rayleigh's distribution), its mean square 1."""
@@ -84,8 +83,7 @@ def weights(rows: Sequence[tuple[Rows, Rows]], sightings: Sequence[Sighting], no
 def corner_weights(residual_px: Array, sd_px: Array) -> Array:
     """(n,) of either coordinate of corners that are off by (2, n); sd_px: (n,) of a coordinate."""
     miss = np.hypot(*residual_px) / (sd_px * np.sqrt(2.0))
-    weight: Array = tail_weight(miss, _USUAL_MISS) / sd_px**2
-    return weight
+    return tail_weight(miss, _USUAL_MISS) / sd_px**2
 
 
 def all_rows(state: RigState, sightings: Sequence[Sighting], terms: Terms) -> list[tuple[Rows, Rows]]:
@@ -195,8 +193,7 @@ class RigSolution:
     def covariance(self, tie: Array) -> Array:
         """(p, p) of the shared parameters, 0 where they are not free."""
         inverse, _ = scaled_inverse(tie.T @ self.matrix @ tie)
-        result: Array = tie @ inverse @ tie.T
-        return result
+        return tie @ inverse @ tie.T
 
 
 def solved(problem: RigProblem, state: RigState, noise: Noise, *, roughly: bool = False) -> RigSolution:
@@ -275,8 +272,7 @@ def _damped(matrix: Array, right: Array, damping: float) -> Array:
     """The damped step of the free parameters."""
     scale = 1 / np.sqrt(np.diag(matrix))
     scaled = matrix * scale[:, None] * scale + damping * np.eye(len(scale))
-    result: Array = scale * np.linalg.solve(scaled, scale * right)
-    return result
+    return scale * np.linalg.solve(scaled, scale * right)
 
 
 def _tried(problem: RigProblem, state: RigState, shared: Array, views: Sequence[ViewNormal]) -> RigState | None:
@@ -318,8 +314,7 @@ def camera_prior(known: Covariance, camera: Camera, terms: Terms) -> Prior:
 
 def _off(prior: Prior, terms: Terms, state: RigState) -> Array:
     """The prior's values less those of the state."""
-    off: Array = prior.values - _camera_values(state.model.camera, terms)
-    return off
+    return prior.values - _camera_values(state.model.camera, terms)
 
 
 def _camera_values(camera: Camera, terms: Terms) -> Array:

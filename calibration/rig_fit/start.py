@@ -18,6 +18,7 @@ import numpy as np
 from numpy.polynomial import polynomial
 from numpy.typing import NDArray
 
+from calibration.arrays import Array
 from calibration.depth_error import command_at, depth_sd_m
 from calibration.errors import Degenerate, condition_text, digits
 from calibration.model.camera import Camera
@@ -27,8 +28,6 @@ from calibration.model.scanner import PivotScanner
 from calibration.rig_fit.state import Sighting
 from calibration.verdict import AT_M
 from calibration.views import NO_POSE, BoardPose, View
-
-Array = NDArray[np.float64]
 
 _ORDERS = (3, 1, 3)
 """Orders of d, b and e in the command: tangents of an angle that turns a quarter of a right angle either way."""
@@ -99,8 +98,7 @@ def _often_shown(points: LitPoints) -> Array:
     """The signed speeds at which enough boards were swept to tell their planes; where none was, the most swept."""
     velocities = np.unique(points.velocity_per_s)
     shown = np.array([np.unique(points.view[points.velocity_per_s == velocity]).size for velocity in velocities])
-    result: Array = velocities[shown >= min(POSES_FOR_PLANES, int(shown.max()))]
-    return result
+    return velocities[shown >= min(POSES_FOR_PLANES, int(shown.max()))]
 
 
 def _counts(points: LitPoints, velocities: Array) -> Array:

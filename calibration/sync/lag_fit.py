@@ -24,8 +24,8 @@ from collections.abc import Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
-from numpy.typing import NDArray
 
+from calibration.arrays import Array
 from calibration.errors import Degenerate
 from calibration.model.parameters import lag_groups, speed_range
 from calibration.model.rig_model import Lag
@@ -40,8 +40,6 @@ from calibration.sync.shared_pixels import (
     solve,
 )
 from calibration.views import Passages
-
-Array = NDArray[np.float64]
 
 SIGNIFICANT = 5.0
 """Standard deviations of a row delay that is believed against the known one, and of a lag below 0 that is refused."""
@@ -93,8 +91,7 @@ class SyncFit:
     @property
     def sd_s(self) -> Array:
         """Standard deviations (3,) of both lags and the row delay; NaN where the direction was not scanned."""
-        result: Array = np.sqrt(np.diag(self.covariance))
-        return result
+        return np.sqrt(np.diag(self.covariance))
 
     @property
     def velocities_per_s(self) -> tuple[float, ...]:

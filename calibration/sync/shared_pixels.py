@@ -10,10 +10,9 @@ from dataclasses import dataclass, replace
 import numpy as np
 from numpy.typing import NDArray
 
+from calibration.arrays import Array
 from calibration.errors import Degenerate
 from calibration.views import Passages, robust_sd
-
-Array = NDArray[np.float64]
 
 SWEEP_ERROR_S = 3e-7
 """Error of every sweep as a whole besides noise: a thirtieth of a frame of 10 us."""
@@ -40,8 +39,7 @@ class SharedPixels:
     @property
     def velocity(self) -> Array:
         """Velocities of the command, signed (sweeps,)."""
-        result: Array = self.direction * self.speed
-        return result
+        return self.direction * self.speed
 
     @classmethod
     def of(cls, sweeps: Sequence[Passages]) -> "SharedPixels":

@@ -16,15 +16,13 @@ knows of it, and has both in its value.
 from dataclasses import replace
 
 import numpy as np
-from numpy.typing import NDArray
 
+from calibration.arrays import Array
 from calibration.model.parameters import BACKWARD, FORWARD, ROW_DELAY, SWEPT, TIMES, parameters, untold, with_parameters
 from calibration.model.rig_model import Covariance, Lag, RigModel
 from calibration.model.scanner import PivotScanner
 from calibration.sync.lag_fit import SIGNIFICANT, SyncFit
 from calibration.verdict import Reason
-
-Array = NDArray[np.float64]
 
 _OPEN_S = 1e-4, 1e-2
 """Standard deviation of a lag that nothing tells: enough to follow it, and to be surprised by none."""

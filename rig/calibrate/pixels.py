@@ -102,7 +102,7 @@ class PixelResult:
     def as_json(self) -> dict[str, Any]:
         """Return what summary.json holds, as plain values."""
         pixels, drift = self.found.pixels, self.drift
-        content: dict[str, Any] = {
+        return {
             "sensor": self.found.sensor,
             "version": self.found.version,
             "id": self.found.id,
@@ -123,7 +123,6 @@ class PixelResult:
             "calibration": None if self.calibration is None else str(self.calibration),
             "verdict": self.verdict.as_json(),
         }
-        return content
 
 
 def pixel_verdict(pixels: PixelMap, drift: PixelDrift | None, leak: float) -> Verdict:

@@ -9,6 +9,7 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
+from calibration.arrays import Array
 from calibration.board.board import Board
 from calibration.camera_fit import CameraFit
 from calibration.check import CheckedBoard
@@ -38,7 +39,6 @@ from rig.calibrate.report_page import (
 )
 from rig.run_folder.charts import Panel, Series, chart_svg
 
-Array = NDArray[np.float64]
 Figures = Sequence[tuple[str, str]]
 
 
@@ -154,8 +154,7 @@ def corners_px(view: View) -> Array:
     if view.corners is None:
         return np.zeros((0, 2))
     px = np.asarray(view.corners.px, np.float64)
-    known: Array = px[np.isfinite(px).all(axis=1)]
-    return known
+    return px[np.isfinite(px).all(axis=1)]
 
 
 def pose_words(pose: BoardPose, board: Board) -> tuple[str, str]:

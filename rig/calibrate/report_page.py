@@ -15,6 +15,7 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
+from calibration.arrays import Array
 from calibration.board.board import Board
 from calibration.depth_error import DepthUncertainty
 from calibration.diagnosis.sweep_waves import SweepResidual, SweepWaves
@@ -155,8 +156,6 @@ def _devices(identity: Identity) -> list[str]:
         for slot in slots
     ]
 
-
-Array = NDArray[np.float64]
 
 _WIDTH_PX = 640
 _GROUND, _RIM, _INK = (255, 255, 255), (200, 194, 189), (77, 64, 51)

@@ -19,8 +19,8 @@ from tempfile import TemporaryDirectory
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
+from calibration.arrays import Array
 from calibration.depth_error import sensitivity
 from calibration.diagnosis.rig import goal, judge_sync
 from calibration.errors import CalibrationError, Degenerate, digits
@@ -46,8 +46,6 @@ from rig.progress import part, tell_stage
 from rig.recording.inputs import read_plan
 from rig.requests import SyncRequest
 from rig.scan.run import versions
-
-Array = NDArray[np.float64]
 
 AROUND_FRAMES = 12
 """Frames looked at on either side of the planned place of an edge."""
@@ -313,5 +311,4 @@ def _after_marker(column: Array, plan: ScanPlan, sweep: int) -> Array:
     """Time after the scan marker at which the mirror was due at fractional columns; undoes `ScanPlan.column`."""
     leg = plan.leg(sweep)
     done = column + 0.5 if leg.columns_rise else plan.places - 0.5 - column
-    after: Array = plan.lit_start_s(leg) + done * float(plan.column_s)
-    return after
+    return plan.lit_start_s(leg) + done * float(plan.column_s)

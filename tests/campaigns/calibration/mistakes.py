@@ -18,7 +18,6 @@ from dataclasses import dataclass, replace
 
 import cv2
 import numpy as np
-from numpy.typing import NDArray
 
 from calibration.board.board import Board
 from calibration.board.detect import find_corners
@@ -34,8 +33,6 @@ from tests.campaigns.calibration.board_capture import HOT_PER_S, Stand, SweepAsk
 from tests.campaigns.calibration.rig_figures import CALIBRATED
 from tests.campaigns.calibration.rigs import OTHER_SPEED, room_picture, view_of
 from tests.reference.boards.random_rigs import BOARD, random_pose, random_poses, random_rig
-
-Array = NDArray[np.float64]
 
 POSES = 8
 FAR_BOARD = Board("chessboard", (8, 6), 0.08)

@@ -7,8 +7,8 @@ from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
 
 import numpy as np
-from numpy.typing import NDArray
 
+from calibration.arrays import Array
 from calibration.depth_error import command_at, depth_sd_m
 from calibration.model.light_sheet import depth_slope
 from calibration.model.rig_model import RigModel
@@ -16,8 +16,6 @@ from calibration.rig_fit.result import RigFit
 from calibration.views import robust_sd
 from tests.campaigns.calibration.asked import ADDED_PX, INSIDE, RATIO, Figure
 from tests.campaigns.calibration.board_capture import speed
-
-Array = NDArray[np.float64]
 
 FAR_M = 5.0
 GRID = 12

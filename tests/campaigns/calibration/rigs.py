@@ -50,8 +50,6 @@ from tests.campaigns.calibration.board_capture import (
 from tests.campaigns.calibration.rig_figures import CALIBRATED, Outcome, compare, figures, summary
 from tests.reference.boards.random_rigs import BOARD, random_poses, random_rig
 
-Array = NDArray[np.float64]
-
 PIXELS = 500
 """Pixels of a sweep that are looked at for passages."""
 SLOW_EVERY, OTHER_SPEED = 4, 3

@@ -3,13 +3,11 @@
 from __future__ import annotations
 
 import numpy as np
-from numpy.typing import NDArray
 
+from calibration.arrays import Array
 from calibration.depth_error import depth_sd_m
 from calibration.model.rig_model import RigModel
 from tests.reference.boards.calibration_data import TrueRig, points_at
-
-Array = NDArray[np.float64]
 
 
 def depth_errors(

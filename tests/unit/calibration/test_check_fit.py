@@ -5,7 +5,6 @@ from dataclasses import replace
 import cv2
 import numpy as np
 import pytest
-from numpy.typing import NDArray
 
 from calibration import check
 from calibration.board.board import Board
@@ -19,8 +18,6 @@ from calibration.views import BoardPose, Corners, Passages, View
 from tests.stability.inventory import covers
 
 covers(check)
-
-Array = NDArray[np.float64]
 
 BOARD = Board("chessboard", (8, 6), 0.06)
 FOCAL_PX, CENTRE_PX, BASELINE_M = 600.0, 255.5, 0.3

@@ -9,6 +9,7 @@ import pytest
 from numpy.typing import NDArray
 
 from calibration import pixel_map
+from calibration.arrays import Array
 from calibration.errors import CalibrationError
 from calibration.pixel_map import (
     FALSE_ALARM,
@@ -33,7 +34,6 @@ covers(pixel_map)
 EXPOSURE_S = 1e-5
 SHAPE = (256, 256)
 BLOCKS = 32
-Array = NDArray[np.float64]
 
 
 def real_flux(rng: np.random.Generator, shape: tuple[int, int] = SHAPE, median: float = 1.3e-3) -> Array:

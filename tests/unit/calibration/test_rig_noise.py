@@ -4,12 +4,10 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-from numpy.typing import NDArray
 
+from calibration.arrays import Array
 from calibration.rig_fit.noise import passage_noise, restated
 from calibration.rig_fit.state import Sighting
-
-Array = NDArray[np.float64]
 
 PER_SWEEP = 3000
 SPEEDS = (88.0, -88.0, 293.0)
