@@ -18,7 +18,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from calibration.arrays import Array, Mask
-from calibration.board.board import Board, Coverage, coverage_of, spread_rad
+from calibration.board.board import Board, spread_rad
 from calibration.errors import CalibrationError, Degenerate, condition_text
 from calibration.model.camera import TERM_COUNTS, Camera
 from calibration.model.parameters import DISTORTION, MATRIX
@@ -269,7 +269,7 @@ class CameraFit:
 
     residual_px: (n, 2) float64 projected less seen, of every corner. used: (n,) bool, those in the fit. rms_px: of
     those, of the distance. outliers: names of the views that do not fit, wholly or in more than one corner. condition:
-    of the normal equations at unit diagonal. coverage: of the views that are in the fit.
+    of the normal equations at unit diagonal. spread_rad: largest angle between the boards that are in the fit.
     """
 
     camera: Camera
@@ -281,7 +281,7 @@ class CameraFit:
     covariance: Covariance
     condition: float
     outliers: tuple[str, ...]
-    coverage: Coverage
+    spread_rad: float
 
     @property
     def kept(self) -> tuple[str, ...]:
@@ -305,12 +305,10 @@ class CameraFit:
         return np.array([rms(residual) for residual in self.residual_px])
 
 
-def fit_camera(
-    views: Sequence[View], board: Board, size: tuple[int, int], *, distortion_terms: int = 5, robust: bool = True
-) -> CameraFit:
+def fit_camera(views: Sequence[View], board: Board, size: tuple[int, int], *, distortion_terms: int = 5) -> CameraFit:
     """The camera of pictures of `size` (width, height) from the corners in `views`.
 
-    distortion_terms: 0, 4, 5, 8, 12 or 14, OpenCV's. robust: leave out what does not fit; else every corner counts.
+    distortion_terms: 0, 4, 5, 8, 12 or 14, OpenCV's. What does not fit is left out.
     Raises Degenerate: no-board, mirrored, one-pose, coplanar, too-few-poses; the message has the condition number.
     """
     if distortion_terms not in (0, *TERM_COUNTS):
@@ -334,11 +332,9 @@ def fit_camera(
     used = [np.full(len(found.ids), not back) for found, back in zip(corners, behind, strict=True)]
     problem.check(used)
     solution = problem.solve(used)
-    if robust:
-        solution, used = _without_outliers(problem, solution, used)
+    solution, used = _without_outliers(problem, solution, used)
     variance, normal = problem.judged(solution, used)
     kept = [i for i, mask in enumerate(used) if mask.any()]
-    shown = [seen[i][0] for i in kept]
     return CameraFit(
         camera=Camera(size[0], size[1], solution.matrix, solution.distortion),
         views=tuple(names),
@@ -349,7 +345,7 @@ def fit_camera(
         covariance=normal.covariance(variance),
         condition=normal.condition,
         outliers=tuple(n for n, mask in zip(names, used, strict=True) if (~mask).sum() > _FEW_CORNERS),
-        coverage=coverage_of(shown, [solution.poses[i] for i in kept], board, size),
+        spread_rad=spread_rad([solution.poses[i] for i in kept]),
     )
 
 

@@ -159,7 +159,7 @@ class CheckedBoard:
     distance_m: depth of its middle. flatness_rms_m, flatness_peak_m: of its squares' means off their plane; expected_m:
     the rms that covariance and noise let expect. chi2, freedom: of the deviations. scale: size scanned over size
     stated; scale_sd: its expected sd. cells_m: (squares down, across) deviations, NaN where a square was not scanned.
-    point_rms_m: of single passages off the plane. normal: (3,) unit, towards the camera.
+    point_rms_m: of single passages off the plane.
     """
 
     name: str
@@ -173,7 +173,6 @@ class CheckedBoard:
     scale_sd: float
     point_rms_m: float
     cells_m: Array
-    normal: Array
 
 
 @dataclass(frozen=True, slots=True)
@@ -249,7 +248,6 @@ def _check(model: RigModel, view: View, board: Board) -> CheckedBoard:
         scale_sd=float(np.sqrt(covariance[count, count] + noise / count / offset**2)),
         point_rms_m=float(np.sqrt(np.nanmean(of_points**2))),
         cells_m=field,
-        normal=-normal if normal[2] > 0 else normal,
     )
 
 

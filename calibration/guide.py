@@ -24,8 +24,8 @@ from calibration.depth_error import command_at, depth_jacobian
 from calibration.errors import CalibrationError, Degenerate, mm
 from calibration.model.camera import Camera
 from calibration.model.rig_model import RigModel
+from calibration.rig_fit.fit import RigFit
 from calibration.rig_fit.noise import bin_starts
-from calibration.rig_fit.result import RigFit
 from calibration.rig_fit.rows import Terms
 from calibration.rig_fit.solve import scaled_inverse, view_normal
 from calibration.rig_fit.state import Sighting, first_state
@@ -114,20 +114,8 @@ def candidates(camera: Camera, board: Board, depth_range_m: tuple[float, float])
     return tuple(found)
 
 
-def next_pose(
-    shown: int,
-    choices: Sequence[Candidate],
-    at_m: float,
-    now_m: float = math.nan,
-    forecast: ExpectedError | None = None,
-) -> Advice:
-    """The pose to show after `shown` poses: the best by the forecast; without one, the next of the sequence that begins
-    well.
-    """
-    if not choices:
-        raise ValueError("no pose of the board fits into the picture")
-    if forecast is None:
-        return Advice(sequence(choices, shown + 1)[-1], at_m)
+def next_pose(choices: Sequence[Candidate], at_m: float, now_m: float, forecast: ExpectedError) -> Advice:
+    """The pose to show next of some (one at least): the best by the forecast."""
     errors = [forecast(candidate.pose) for candidate in choices]
     best = int(np.nanargmin(errors)) if np.isfinite(errors).any() else 0
     return Advice(choices[best], at_m, now_m, float(errors[best]))
@@ -139,8 +127,6 @@ def sequence(choices: Sequence[Candidate], poses: int, seed: int = 0) -> tuple[C
 
     Each is the one farthest from those before it; the first is a tilted one, near. seed: which of equals comes first.
     """
-    if not choices:
-        raise ValueError("no pose of the board fits into the picture")
     rng = np.random.default_rng(seed)
     order = rng.permutation(len(choices)) if seed else np.arange(len(choices))
     traits = np.array([_traits(choices[i]) for i in order])

@@ -17,7 +17,7 @@ from calibration.arrays import Array
 from calibration.board.board import Board
 from calibration.camera_fit import CameraFit
 from calibration.check import CheckedAngle, CheckedBoard
-from calibration.diagnosis.evidence import data_lack, hiding, pose_evidence, view_evidence
+from calibration.diagnosis.rules import data_lack, hiding, pose_evidence, view_evidence
 from calibration.errors import digits, mm
 from calibration.model.camera import Camera
 from calibration.model.parameters import changed_camera

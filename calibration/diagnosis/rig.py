@@ -11,22 +11,32 @@ import numpy as np
 
 from calibration.board.board import Board
 from calibration.depth_error import DepthUncertainty, Sensitivity, depth_uncertainty, propagated, sensitivity
-from calibration.diagnosis.evidence import baseline_m, pose_evidence, rough_poses, view_evidence
-from calibration.diagnosis.rules import FitEvidence, judge, judge_refusal, lag_lack
-from calibration.diagnosis.sweep_waves import SweepResidual, SweepWaves, sweep_waves
-from calibration.diagnosis.view_shifts import (
+from calibration.diagnosis.contradictions import (
+    SweepResidual,
+    SweepWaves,
     ViewShift,
     common_shift,
     counted,
     last_before_move,
     shift_noise,
+    sweep_waves,
     view_shifts,
+)
+from calibration.diagnosis.rules import (
+    FitEvidence,
+    baseline_m,
+    judge,
+    judge_refusal,
+    lag_lack,
+    pose_evidence,
+    rough_poses,
+    view_evidence,
 )
 from calibration.errors import Degenerate, digits, mm
 from calibration.guide import rough_camera
 from calibration.model.parameters import SWEPT
 from calibration.model.rig_model import RigModel
-from calibration.rig_fit.result import RigFit
+from calibration.rig_fit.fit import RigFit
 from calibration.rig_fit.state import shows_line, usable
 from calibration.sync.lag_fit import SyncFit
 from calibration.verdict import AT_M, AccuracyGoal, Reason, Verdict, unguided

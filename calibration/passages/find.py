@@ -17,8 +17,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from calibration.arrays import Array
-from calibration.passages.fit import PassageFit, fit_passages
-from calibration.passages.light import LineShape
+from calibration.passages.fit import LineShape, PassageFit, fit_passages
 from calibration.views import Passages
 
 CORES = (1, 3)

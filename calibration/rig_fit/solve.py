@@ -302,10 +302,12 @@ def _counted(views: Sequence[ViewNormal], problem: RigProblem) -> list[ViewNorma
     return [view for view, counts in zip(views, problem.counted, strict=True) if counts]
 
 
-def camera_prior(known: Covariance, camera: Camera, terms: Terms) -> Prior:
-    """The prior from a camera that other pictures told of, with their covariance."""
+def camera_prior(known: Covariance, camera: Camera, terms: Terms) -> Prior | None:
+    """The prior from a camera that other pictures told of, with their covariance; None where it is known exactly."""
     variance = dict(zip(known.names, np.diag(known.matrix), strict=True))
     names = [name for name in known.names if name in terms.camera and variance[name] > 0]
+    if not names:
+        return None
     at = terms.at(names)
     matrix: Array = np.zeros((len(terms.names), len(terms.names)))
     matrix[np.ix_(at, at)] = scaled_inverse(known.of(names))[0]

@@ -13,8 +13,7 @@ from calibration.files.camera_file import camera_content, camera_file_text, corn
 from calibration.model.camera import TERM_COUNTS
 from calibration.verdict import AT_M
 from rig.calibrate.capture import AskPerson, TellLine, require_live
-from rig.calibrate.report import camera_report
-from rig.calibrate.report_page import subject
+from rig.calibrate.report import camera_report, subject
 from rig.calibrate.session import CalibrationResult, Session, named
 from rig.calibrate.sources import SourcesLike, read_board, si_values, sort_sources
 from rig.calibrate.views import (
@@ -122,6 +121,6 @@ def _figures(fit: CameraFit, judged: JudgedCamera, taken: ViewCollection) -> lis
         ("distortion", terms),
         ("residuals", f"{fit.rms_px:.3f} px rms"),
         ("coverage", f"{judged.coverage:.0%} of the picture within the outline of all corners, boards up to "
-                     f"{np.degrees(fit.coverage.spread_rad):.0f} degrees apart"),
+                     f"{np.degrees(fit.spread_rad):.0f} degrees apart"),
         ("condition", condition_text(fit.condition)),
     ]  # fmt: skip

@@ -19,8 +19,7 @@ from calibration.model.rig_model import RigModel
 from calibration.verdict import AccuracyGoal, Verdict
 from calibration.views import View
 from rig.calibrate.capture import AskPerson, TellLine, require_live
-from rig.calibrate.report import check_report
-from rig.calibrate.report_page import subject
+from rig.calibrate.report import check_report, subject
 from rig.calibrate.session import CalibrationResult, Session, true_errors, truth_content
 from rig.calibrate.sources import SourcesLike, read_board, si_values, sort_sources
 from rig.calibrate.views import LiveViewOptions, ViewCollection, good_poses, note_views, take_kept, take_live

@@ -21,12 +21,10 @@ from calibration.files.camera_file import CORNERS, KnownCamera, corners_digest
 from calibration.files.rig_file import load_rig_model
 from calibration.guide import Advice, Forecast, candidates, next_pose
 from calibration.model.rig_model import Identity, RigModel
-from calibration.rig_fit.fit import fit_rig
-from calibration.rig_fit.result import RigFit
+from calibration.rig_fit.fit import RigFit, fit_rig
 from calibration.views import View
 from rig.calibrate.capture import AskPerson, TellLine, require_live
-from rig.calibrate.report import planes_report
-from rig.calibrate.report_page import subject
+from rig.calibrate.report import planes_report, subject
 from rig.calibrate.session import CalibrationResult, Session, named, true_errors, truth_content
 from rig.calibrate.sources import CameraUse, SourcesLike, camera_use, read_board, si_values, sort_sources
 from rig.calibrate.views import (
@@ -279,7 +277,7 @@ class PoseGuide:
         ]
         if not choices:
             return None
-        advice = next_pose(len(known), choices, at_m, now_m, Forecast(fit, at_m))
+        advice = next_pose(choices, at_m, now_m, Forecast(fit, at_m))
         chosen = advice.candidate
         self._asked.add((chosen.fill, chosen.place, chosen.tilt))  # a board that was not found there will not be again
         return advice

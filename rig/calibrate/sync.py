@@ -34,8 +34,7 @@ from drivers.frames import FrameBlock
 from drivers.recorded import RunRecording
 from rig.calibrate.capture import TellLine, capture_view
 from rig.calibrate.planes import speeds_of
-from rig.calibrate.report import sync_report
-from rig.calibrate.report_page import subject
+from rig.calibrate.report import subject, sync_report
 from rig.calibrate.session import CalibrationResult, LoadedCalibration, Session, true_model
 from rig.calibrate.sources import SourcesLike, si_values, sort_sources
 from rig.calibrate.views import ViewCollection, take_kept

@@ -19,8 +19,8 @@ from numpy.typing import NDArray
 
 from calibration.board.board import Board
 from calibration.board.detect import find_corners
-from calibration.diagnosis.evidence import FEWEST_POSES, FEWEST_WHY
 from calibration.diagnosis.rig import judge_refused
+from calibration.diagnosis.rules import FEWEST_POSES, FEWEST_WHY
 from calibration.errors import CalibrationError, Degenerate
 from calibration.files.camera_file import corners_digest
 from calibration.files.rig_file import load_rig_model

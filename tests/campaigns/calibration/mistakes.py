@@ -21,8 +21,8 @@ import numpy as np
 
 from calibration.board.board import Board
 from calibration.board.detect import find_corners
-from calibration.diagnosis.evidence import baseline_m
 from calibration.diagnosis.rig import judge_fit, judge_refused
+from calibration.diagnosis.rules import baseline_m
 from calibration.errors import Degenerate
 from calibration.model.scanner import PivotScanner
 from calibration.rig_fit.fit import fit_rig

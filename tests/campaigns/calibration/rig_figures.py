@@ -12,7 +12,7 @@ from calibration.arrays import Array
 from calibration.depth_error import command_at, depth_sd_m
 from calibration.model.light_sheet import depth_slope
 from calibration.model.rig_model import RigModel
-from calibration.rig_fit.result import RigFit
+from calibration.rig_fit.fit import RigFit
 from calibration.views import robust_sd
 from tests.campaigns.calibration.asked import ADDED_PX, INSIDE, RATIO, Figure
 from tests.campaigns.calibration.board_capture import speed

@@ -14,7 +14,7 @@ from numpy.typing import NDArray
 
 from calibration.arrays import Array
 from calibration.board.detect import find_corners
-from calibration.board.lattice import gray
+from calibration.board.markers import gray
 from calibration.errors import Degenerate
 from tests.reference.boards.board_pictures import CHARUCO, SIZE, albedo, corners_px, exposed, pose
 

@@ -48,8 +48,6 @@ def test_the_true_camera_lies_where_the_covariance_says():
         assert fit.sd["fx"] < 3
     assert 0.8 < np.std(scaled) < 1.2
     assert fit.covariance.names[:5] == ("fx", "fy", "cx", "cy", "k1")
-    assert 0.5 < fit.coverage.share <= 1
-    assert fit.coverage.distance_m.min() > 0.7
     assert fit.condition < 1e6
 
 

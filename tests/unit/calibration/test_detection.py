@@ -5,7 +5,7 @@ import numpy as np
 import pytest
 
 from calibration import views
-from calibration.board import board, detect, drawing, lattice, markers, registration
+from calibration.board import board, chessboard, detect, drawing, markers, registration
 from calibration.board.board import BLACK, WHITE, Board
 from calibration.board.detect import find_corners, repaired
 from calibration.errors import Degenerate
@@ -14,7 +14,7 @@ from tests.reference.boards.board_pictures import CHARUCO, CHESSBOARD, SIZE, alb
 from tests.reference.boards.chessboards import FOLDER
 from tests.stability.inventory import covers
 
-covers(board, drawing, detect, markers, lattice, registration, views)
+covers(board, drawing, detect, markers, chessboard, registration, views)
 
 TURNED = pose(CHARUCO, 0.9, (0.03, -0.02), (0.35, -0.3, 0.1))
 FRAMES = 5000

@@ -13,8 +13,7 @@ from calibration.errors import CalibrationError, Degenerate
 from calibration.model import parameters
 from calibration.model.parameters import SWEPT, alike_speeds, lag_groups, untold
 from calibration.model.rig_model import Covariance, Lag
-from calibration.rig_fit.fit import fit_rig
-from calibration.rig_fit.result import RigFit
+from calibration.rig_fit.fit import RigFit, fit_rig
 from calibration.sync import transfer
 from calibration.sync.lag_fit import SyncFit, fit_sync
 from calibration.sync.transfer import known_row_delay, with_lags

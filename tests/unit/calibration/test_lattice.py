@@ -3,8 +3,8 @@
 import numpy as np
 import pytest
 
+from calibration.board.chessboard import known_lattice
 from calibration.board.drawing import fit_map
-from calibration.board.lattice import known_lattice
 from tests.reference.boards.board_pictures import CHESSBOARD, albedo, corners_px, exposed, pose
 
 STANDS = pose(CHESSBOARD, 0.9, (0, 0), (0.2, -0.3, 0.1))

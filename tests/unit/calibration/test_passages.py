@@ -6,15 +6,12 @@ import pytest
 
 from calibration.passages import find as finding
 from calibration.passages import fit, flux_picture
-from calibration.passages import light as light_module
 from calibration.passages.find import SweepCounts, evenly, find_passages
-from calibration.passages.fit import fit_passages
-from calibration.passages.light import LineShape, light
-from calibration.sync import shared_pixels
+from calibration.passages.fit import LineShape, fit_passages, light
 from tests.stability.inventory import covers
 from tests.unit.calibration.passed_lines import Light, passed, sweep_of, true_at
 
-covers(light_module, fit, finding, flux_picture, shared_pixels)
+covers(fit, finding, flux_picture)
 
 CASES = {
     "clear": (Light(0.6, 4.0), 10, 0.9),

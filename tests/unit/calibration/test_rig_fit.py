@@ -7,15 +7,14 @@ import pytest
 
 from calibration.guide import Forecast
 from calibration.model.rig_model import Covariance
-from calibration.rig_fit import misfit, noise, result, rows, solve, start, state
-from calibration.rig_fit.fit import fit_rig
-from calibration.rig_fit.result import RigFit
+from calibration.rig_fit import fit, misfit, noise, rows, solve, start, state
+from calibration.rig_fit.fit import RigFit, fit_rig
 from tests.reference.boards.calibration_data import BOARD, Seen, TrueRig, random_pose, random_rig, rotation, seen_view
 from tests.reference.boards.fitted_depth import depth_errors
 from tests.stability.inventory import covers
-from tests.unit.calibration.fitted_rigs import EXACT, RIG, SEEN, SIZE, fitted, true_camera
+from tests.unit.calibration.fitted_rigs import EXACT, RIG, SEEN, SIZE, fitted, held, true_camera
 
-covers(start, rows, solve, state, noise, misfit, result)
+covers(start, rows, solve, state, noise, misfit, fit)
 
 
 def kept(fit: RigFit) -> set[str]:
@@ -48,7 +47,7 @@ def test_over_rigs_the_depth_error_is_neither_larger_nor_smaller_than_stated() -
     rig, seen = replace(RIG, angle=(0.09, 0.53)), replace(SEEN, passages=100)
     squares = []
     for seed in range(500, 508):
-        fit = fitted(rig, seed, seen, poses=6, camera=true_camera(rig), hold_camera=True)
+        fit = fitted(rig, seed, seen, poses=6, **held(rig))
         error, sd = depth_errors(fit.model, rig, 5.0, 35.2)
         squares.append(np.mean((error / sd) ** 2))
     assert 0.7 < np.sqrt(np.mean(squares)) < 1.4
@@ -56,7 +55,7 @@ def test_over_rigs_the_depth_error_is_neither_larger_nor_smaller_than_stated() -
 
 def test_a_term_that_is_neither_there_nor_not_widens_the_covariance() -> None:
     rig, seen = replace(RIG, angle=(0.09, 0.53, 0.0, -0.002)), replace(SEEN, passages=100)
-    fit = fitted(rig, 7, seen, poses=6, camera=true_camera(rig), hold_camera=True)
+    fit = fitted(rig, 7, seen, poses=6, **held(rig))
     (open_one,) = (d for d in fit.decisions if not d.kept and abs(d.value) > 2.5 * d.sd)
     assert fit.model.covariance is not None
     variance = np.diag(fit.model.covariance.of([group[0] for group in fit.free]))
@@ -140,7 +139,7 @@ def test_one_direction_at_one_speed_leaves_the_lag_as_it_was() -> None:
 
 
 def test_a_held_camera_counts_as_known_exactly() -> None:
-    fit = fitted(RIG, 10, poses=6, camera=true_camera(RIG), hold_camera=True)
+    fit = fitted(RIG, 10, poses=6, **held(RIG))
     assert fit.model.camera.matrix[0, 0] == RIG.fx
     assert fit.model.covariance is not None
     assert "fx" not in fit.model.covariance.names
@@ -177,7 +176,7 @@ def test_jitter_that_pixels_share_is_told_from_their_own_noise() -> None:
 
 
 def test_a_lag_that_noise_made_negative_is_held_even_where_a_fit_does_not_rest(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr("calibration.rig_fit.rounds.MOST_IDLE_ROUNDS", 1)
+    monkeypatch.setattr("calibration.rig_fit.fit.MOST_IDLE_ROUNDS", 1)
     fit = fitted(replace(RIG, lag=(-1e-6, -1e-6)), 20, replace(SEEN, passage=3e-3), poses=5)
     assert any(decision.reason.endswith("held at 0") for decision in fit.decisions)
     assert fit.model.lag_s == (0, 0)

@@ -13,7 +13,7 @@ from calibration.rig_fit.fit import fit_rig
 from calibration.views import Passages
 from tests.reference.boards.calibration_data import BOARD, points_at, random_pose, rotation, seen_view
 from tests.reference.boards.fitted_depth import depth_errors
-from tests.unit.calibration.fitted_rigs import EXACT, RIG, SEEN, SIZE, fitted, true_camera
+from tests.unit.calibration.fitted_rigs import EXACT, RIG, SEEN, SIZE, fitted, held
 
 
 def test_a_view_of_a_moved_rig_is_named_and_left_out() -> None:
@@ -91,7 +91,7 @@ def test_no_more_than_a_third_of_the_views_with_passages_is_left_out() -> None:
     rigs = [*places, *[RIG] * 9]
     views = [seen_view(rng, at, *random_pose(rng, RIG), SEEN, name=f"view {i}") for i, at in enumerate(rigs)]
     views[10:] = [replace(view, passages=()) for view in views[10:]]
-    fit = fit_rig(views, BOARD, SIZE, camera=true_camera(RIG), hold_camera=True)
+    fit = fit_rig(views, BOARD, SIZE, **held(RIG))
     assert fit.outliers == ("view 0", "view 1", "view 2")
 
 

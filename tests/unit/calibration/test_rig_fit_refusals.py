@@ -14,7 +14,7 @@ from calibration.rig_fit.start import check_depth
 from calibration.views import BoardPose, View
 from tests.reference.boards.calibration_data import BOARD, random_views, seen_view
 from tests.reference.boards.fitted_depth import depth_errors
-from tests.unit.calibration.fitted_rigs import RIG, SEEN, SIZE, fitted, true_camera
+from tests.unit.calibration.fitted_rigs import RIG, SEEN, SIZE, fitted, held
 
 
 def flat(z: float, x: float = 0.0) -> tuple[np.ndarray, np.ndarray]:
@@ -30,11 +30,11 @@ def flat(z: float, x: float = 0.0) -> tuple[np.ndarray, np.ndarray]:
         ([flat(1.5, x) for x in (-0.2, -0.1, 0, 0.1, 0.2)], {"coplanar"}),
     ],
 )
-@pytest.mark.parametrize("held", [False, True])
-def test_views_that_make_no_model_are_refused(poses: list[object], reasons: set[str], held: bool) -> None:
+@pytest.mark.parametrize("known", [False, True])
+def test_views_that_make_no_model_are_refused(poses: list[object], reasons: set[str], known: bool) -> None:
     rng = np.random.default_rng(15)
     views = [seen_view(rng, RIG, *pose, SEEN, name=str(i)) for i, pose in enumerate(poses)]  # type: ignore[misc]
-    given = {"camera": true_camera(RIG), "hold_camera": True} if held else {}
+    given = held(RIG) if known else {}
     with pytest.raises(Degenerate) as raised:
         fit_rig(views, BOARD, SIZE, **given)  # type: ignore[arg-type]
     assert raised.value.reason in reasons
@@ -46,7 +46,7 @@ def test_boards_without_tilt_need_a_camera_that_is_known() -> None:
     views = [seen_view(rng, RIG, *flat(z), SEEN, name=str(z)) for z in (1.0, 1.3, 1.6, 2.0, 2.5)]
     with pytest.raises(Degenerate, match="parallel"):
         fit_rig(views, BOARD, SIZE)
-    fit = fit_rig(views, BOARD, SIZE, camera=true_camera(RIG), hold_camera=True)
+    fit = fit_rig(views, BOARD, SIZE, **held(RIG))
     error, sd = depth_errors(fit.model, RIG, 3.0, 35.2)
     assert np.sqrt(np.mean((error / sd) ** 2)) < 3
 

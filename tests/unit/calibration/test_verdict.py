@@ -8,12 +8,25 @@ import pytest
 
 from calibration import verdict
 from calibration.board.board import Board
-from calibration.diagnosis import evidence, rig, view_shifts
-from calibration.diagnosis.evidence import PoseEvidence, ViewEvidence, pose_evidence, view_evidence
+from calibration.diagnosis import contradictions, rig
+from calibration.diagnosis.contradictions import (
+    SweepResidual,
+    ViewShift,
+    common_shift,
+    counted,
+    last_before_move,
+    sweep_waves,
+)
 from calibration.diagnosis.rig import judge_fit
-from calibration.diagnosis.rules import FitEvidence, judge, judge_refusal
-from calibration.diagnosis.sweep_waves import SweepResidual, sweep_waves
-from calibration.diagnosis.view_shifts import ViewShift, common_shift, counted, last_before_move
+from calibration.diagnosis.rules import (
+    FitEvidence,
+    PoseEvidence,
+    ViewEvidence,
+    judge,
+    judge_refusal,
+    pose_evidence,
+    view_evidence,
+)
 from calibration.errors import Degenerate
 from calibration.rig_fit.fit import fit_rig
 from calibration.verdict import AccuracyGoal, Verdict, unguided
@@ -21,7 +34,7 @@ from calibration.views import BoardPose, Corners, View
 from tests.reference.boards.calibration_data import BOARD, Seen, TrueRig, random_views
 from tests.stability.inventory import covers
 
-covers(evidence, verdict, rig, view_shifts)
+covers(verdict, rig, contradictions)
 
 ASKED = AccuracyGoal(accuracy_m=0.014, at_m=5.0, stated_baseline_m=0.3)
 VIEWS = ViewEvidence(shown=12, used=12, coverage=0.8, room_flux=0.2)

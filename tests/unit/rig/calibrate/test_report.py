@@ -12,12 +12,19 @@ import pytest
 from calibration.board.board import Board
 from calibration.diagnosis.rig import JudgedRig, judge_fit
 from calibration.model.rig_model import Identity
-from calibration.rig_fit.fit import fit_rig
-from calibration.rig_fit.result import RigFit
+from calibration.rig_fit.fit import RigFit, fit_rig
 from calibration.verdict import Reason, Verdict
 from calibration.views import View
-from rig.calibrate.report import planes_report
-from rig.calibrate.report_page import ReportSection, in_mm_with_sign, measured, page, paragraph, subject, table
+from rig.calibrate.report import (
+    ReportSection,
+    in_mm_with_sign,
+    measured,
+    page,
+    paragraph,
+    planes_report,
+    subject,
+    table,
+)
 from tests.reference.boards import calibration_data as data
 
 
