@@ -38,9 +38,7 @@ class Normal:
 
     @property
     def condition(self) -> float:
-        """Condition number of the matrix scaled to a unit diagonal, as in the parameters' best units; inf if
-        singular.
-        """
+        """Condition number of the matrix scaled to a unit diagonal; inf if singular."""
         scale = np.sqrt(np.diag(self.matrix))
         if not np.all(np.isfinite(scale)) or not np.all(scale > 0):
             return float("inf")
@@ -61,9 +59,7 @@ class Normal:
 def camera_normal(
     points_m: Sequence[Array], poses: Sequence[BoardPose], matrix: Array, distortion: Array, terms: int
 ) -> Normal:
-    """The normal equations of a camera with `terms` free terms of distortion that saw points (n, 3) of the board at
-    each of the poses.
-    """
+    """The normal equations of a camera with `terms` of distortion that saw points (n, 3) of the board at each pose."""
     total = np.zeros((4 + terms, 4 + terms))
     given = np.zeros(max(len(distortion), 5)) if terms <= 5 else np.zeros(14 if terms > 8 else 8)
     given[: len(distortion)] = distortion

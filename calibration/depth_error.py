@@ -94,10 +94,7 @@ class DepthUncertainty:
     part_m: Mapping[str, Array]
 
     def line(self) -> str:
-        """One line, 'at 5 m: 8 mm, 6 of them from the baseline': medians over the picture, of 8 the group's 6.
-
-        Without the group's part sqrt(8^2 - 6^2) would be left.
-        """
+        """One line, 'at 5 m: 8 mm, 6 of them from the baseline': medians over the picture, and the largest part."""
         at = f"at {self.depth_m:g} m"
         if not np.isfinite(self.sd_m).any():
             return f"{at}: not lit"
@@ -230,8 +227,7 @@ _DISTANCES_M: Final = np.geomspace(0.05, 100.0, 60)
 
 @dataclass(frozen=True, slots=True)
 class Sensitivity:
-    """Depth at one depth by command (m per command unit) and by the stripe's place (m per pixel): medians over those
-    parts of the picture where the line reaches it."""
+    """Depth by command (m per command unit) and by the stripe's place (m per pixel), medians where the line reaches."""
 
     per_command_m: float
     per_pixel_m: float
@@ -272,9 +268,7 @@ _TRUTH_GRID = 32
 
 @dataclass(frozen=True, slots=True, eq=False)
 class DepthErrors:
-    """Errors over a grid of pixels that the true rig lights at one depth. error_m: (n,) signed; sd_m: (n,) as the
-    model's covariance predicts, NaN for a model without one.
-    """
+    """Errors at pixels that the true rig lights at one depth: error_m (n,) signed; sd_m (n,) predicted or NaN."""
 
     depth_m: float
     error_m: Array

@@ -263,9 +263,7 @@ class Forecast:
 
 
 def _next_velocities(fit: RigFit) -> tuple[float, ...]:
-    """The velocities at which the next pose will be swept: poses take turns at the speeds, so those of the pose whose
-    turn is the longest ago.
-    """
+    """The velocities of the next pose, which take turns: those whose turn is the longest ago."""
     shown = [tuple(sweep.direction * sweep.speed_per_s for sweep in view) for view in fit.sweeps if view]
     last = {velocities: turn for turn, velocities in enumerate(shown)}
     return min(last, key=lambda velocities: last[velocities])

@@ -238,10 +238,7 @@ def dead_pixels(
 
 
 def light_leak(pixels: PixelMap) -> float:
-    """Correlation of ordinary neighbours' rates along the rows: 0 in the dark, where each pixel has a rate of its own.
-
-    0 as well where chance explains it.
-    """
+    """Correlation of ordinary neighbours' rates along the rows, a sign of light; 0 where chance explains it."""
     rate = np.where(pixels.defects, np.nan, pixels.rate_per_s.astype(np.float64))
     low, high = np.nanpercentile(rate, [1.0, 95.0])
     rate[(rate < low) | (rate > high)] = np.nan
@@ -365,9 +362,7 @@ def _ratio(
     sd_before: NDArray[np.float64],
     sd_after: NDArray[np.float64],
 ) -> tuple[float, float]:
-    """Ratio of the sums of two sets of rates, and its distance from 1 in sd; (1, 0) where there is nothing to
-    compare.
-    """
+    """Ratio of the sums of two sets of rates, and its distance from 1 in sd; (1, 0): nothing to compare."""
     old, new = float(before.sum()), float(after.sum())
     if old <= 0 or new <= 0:
         return 1.0, 0.0

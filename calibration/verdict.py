@@ -30,9 +30,7 @@ class AccuracyGoal:
 
 @dataclass(frozen=True, slots=True)
 class Reason:
-    """A reason why a calibration is not good enough: code for machines, text for people, value and limit in the same
-    unit.
-    """
+    """Why a calibration is not good enough: code for machines, text for people, value and limit in one unit."""
 
     code: str
     text: str

@@ -28,8 +28,7 @@ from calibration.board.registration import SUBPIXELS, WIDE, register, sides_px
 Picture = NDArray[np.float32]
 
 _OFFSETS = np.array([0.1, 0.2, 0.3, 0.4])
-"""Places where the change is looked at, in squares from the corner: clear of its edges, and within the outer squares
-where half of them was cut off."""
+"""Squares from a corner at which the change is looked at: clear of its edges, and within half an outer square."""
 _THERE = 0.3
 _GOES_ON = 0.5
 """Least change across a line outside the grid, as a share of that in the grid, for another row to follow there. In
@@ -73,9 +72,7 @@ class Lattice:
 
 
 def known_lattice(picture: Picture, px: Array) -> Lattice | None:
-    """The corners that are there, from a grid (down, across, 2) that may have some too many or too few; None where
-    the picture shows no chessboard there.
-    """
+    """The corners that are there, from a grid (down, across, 2) some too many or too few; None: no chessboard there."""
     cut = _cut_down(picture, px)
     if cut is None:
         return None
@@ -216,9 +213,7 @@ _NOTHING = MatchedPoints(np.zeros((0, 2)), np.zeros((0, 2)), 0)
 
 
 def find_chessboard(shown: Gray, board: Board) -> MatchedPoints:
-    """The chessboard's inner corners, the first one at the board's top left as far as that can be told; or what else
-    there is: a part of it, or another chessboard.
-    """
+    """The board's inner corners, the first at its top left if that can be told; or a part of it, or another board."""
     seen: Lattice | None = None
     for form in FORMS:
         lattice = _lattice(shown, _grid(shown, board, form))
@@ -332,9 +327,7 @@ def _from_top_left(px: Array, shown: Gray, board: Board) -> tuple[Array, bool]:
 
 
 def _top_left_is_black(px: Array, shown: Gray) -> bool:
-    """Whether the squares of the top left one's colour are the darker ones, as seen in the squares between the
-    corners.
-    """
+    """Whether squares of the top left one's colour are the darker ones, as seen between the corners."""
     middles = (px[:-1, :-1] + px[:-1, 1:] + px[1:, :-1] + px[1:, 1:]) / 4
     height, width = shown.shape
     x = np.clip(np.round(middles[..., 0]).astype(int), 0, width - 1)

@@ -35,9 +35,7 @@ class Drawing:
 
     @classmethod
     def of(cls, board: Board, px_per_square: float) -> "Drawing":
-        """Draw it, so fine if it can be: every pixel is the white share of its area, exactly, for markers end between
-        pixels.
-        """
+        """Draw it, so fine if it can be: every pixel is the white share of its area, exactly."""
         modules = board.modules
         down, across, side, _ = modules.shape
         least, most = _PX_PER_SQUARE
@@ -62,8 +60,7 @@ _BENDS = ((30, 3), (12, 2))
 """(least number of points, degree of the polynomial): three points to a term at least."""
 _FEWEST_POINTS = 4
 _KEPT_SHARES = (0.8, 0.8, 1.0)
-"""Shares of the points, the closest ones, to which the polynomial is fitted in turn: a point far off must not bend
-it."""
+"""Shares of the points, the closest ones, that the polynomial is fitted to in turn: one far off must not bend it."""
 _OUTLIER_MEDIANS = 5.0
 _LEAST_OUTLIER_PX = 0.3
 
@@ -94,10 +91,7 @@ class BoardMap:
 def fit_map(
     points_m: Array, px: Array, outlier_px: float, size_m: tuple[float, float]
 ) -> tuple[BoardMap, NDArray[np.bool_]] | None:
-    """The map through points (n, 2) seen at px (n, 2), and which of them lie on it within outlier_px.
-
-    size_m: the board's, over which the polynomial runs from -1 to 1. None where no four points agree.
-    """
+    """The map through points (n, 2) seen at px (n, 2), and which lie on it within outlier_px; None: no four agree."""
     if len(points_m) < _FEWEST_POINTS:
         return None
     half = np.array(size_m) / 2

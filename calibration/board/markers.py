@@ -39,9 +39,7 @@ _FEWEST = 6
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Markers:
-    """The markers that were read, whether the board has them or not. ids: (n,) int64; px: (n, 4, 2) corners, clockwise
-    from the marker's own top left.
-    """
+    """The markers that were read. ids: (n,) int64; px: (n, 4, 2) corners, clockwise from the marker's own top left."""
 
     ids: Places
     px: Array
@@ -69,9 +67,7 @@ class _Layout:
 
 
 def contradiction(read: Markers, board: Board, shown: NDArray[np.uint8]) -> str | None:
-    """A text on how the markers read in the picture `shown` do not fit the board; None where nothing speaks against
-    it.
-    """
+    """How the markers read in the picture `shown` do not fit the board, in words; None where they do."""
     assert board.marker_m is not None, "asked of boards with markers"
     placed, lattice = _lattice(read.px, board.marker_m / board.square_m)
     ids, lattice = read.ids[placed], lattice[placed]
@@ -133,9 +129,7 @@ def _support(layout: _Layout, ids: Places, lattice: Places) -> tuple[int, Places
 
 
 def _lattice(px: Array, marker_squares: float) -> tuple[NDArray[np.bool_], Places]:
-    """The markers (n, 4, 2) that stand on one lattice, as a mask (n,) of most of them if possible, and their (n, 2)
-    columns and rows.
-    """
+    """The markers (n, 4, 2) on one lattice: a mask (n,) of as many as can be, and their (n, 2) columns and rows."""
     best, places = np.zeros(len(px), np.bool_), np.zeros((len(px), 2), np.int64)
     tried = np.zeros(len(px), np.bool_)
     for start in np.argsort([-cv2.contourArea(corners.astype(np.float32)) for corners in px]):
@@ -185,9 +179,7 @@ def _map_to_lattice(places: Places, px: Array, marker_squares: float) -> Array |
 
 
 def _ends_early(board: Board, shown: NDArray[np.uint8], px: Array, places: Places) -> str | None:
-    """The fault of a print that ends before the board does, or None. Such a print shows white paper below its last
-    markers where the board has black squares.
-    """
+    """Words for a print that shows white paper below its last markers, where the board has black squares; or None."""
     across, down = board.squares
     assert board.marker_m is not None, "asked of boards with markers"
     to_lattice = _map_to_lattice(places, px, board.marker_m / board.square_m)
@@ -220,8 +212,7 @@ def _seen(shown: NDArray[np.uint8], to_lattice: Array, column: Array, row: float
 Gray = NDArray[np.uint8]
 
 FORMS = ((1, 0.0), (2, 0.8), (3, 0.8), (2, 1.5), (4, 1.2))
-"""(enlargement, smoothing in pixels of the picture), in the order they are tried; measured in
-docs/how-to/calibration.md."""
+"""(enlargement, smoothing in pixels of the picture), in the order they are tried (docs/how-to/calibration.md)."""
 _ENOUGH = 0.9
 """Share of the markers at which no further form is tried."""
 _DARKEST, _BRIGHTEST = 0.5, 99.5

@@ -33,9 +33,7 @@ _STEP = 1e-6
 
 @dataclass(frozen=True, slots=True, eq=False)
 class JudgedCamera:
-    """A verdict and what it was made of: sd_px, worst_px: of a pixel's place along the row, median and 95 %. coverage:
-    share of the picture within the outline of all corners.
-    """
+    """A verdict; sd of a pixel's place along the row (median, 95 %); share of the picture within all corners."""
 
     verdict: Verdict
     sd_px: float

@@ -30,8 +30,7 @@ BINS = 24
 """Bins of the command range: wide enough for tens of passages each, narrow enough for a wave of several turns."""
 _FEWEST_IN_BIN = 5
 _LEAST_SHARE_IN_BIN = 0.25
-"""Share of a sweep's usual bin contents that a bin must hold: where a sweep only reaches into a bin, noise has chosen
-the passages that are in it."""
+"""Share of a sweep's usual bin contents that a bin must hold: of a few, noise has chosen those that are in it."""
 _FEWEST_BINS = 4
 _MEDIAN_VARIANCE = np.pi / 2
 """Variance of a median in units of the mean's, normal distribution."""
@@ -154,9 +153,7 @@ MOST_UNEXPLAINED = 0.35
 
 @dataclass(frozen=True, slots=True, eq=False)
 class ViewShift:
-    """Shift of one view in command units: median of its passages off the light, and the sd that the pose's noise
-    gives.
-    """
+    """Shift of one view in command units: median of its passages off the light, and its sd by the pose's noise."""
 
     name: str
     shift: float

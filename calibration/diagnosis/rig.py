@@ -43,8 +43,7 @@ from calibration.verdict import AT_M, AccuracyGoal, Reason, Verdict, unguided
 from calibration.views import View
 
 ACCURACY_PX: Final = 0.1
-"""Error of the stripe, in pixels, whose depth error is asked for where nobody states an accuracy. No estimator does
-better in fog."""
+"""Error of the stripe, in pixels, whose depth error is asked for by default. No estimator does better in fog."""
 _WORST_PERCENT = 95
 
 
@@ -65,9 +64,7 @@ class JudgedRig:
 def goal(
     worth: Sensitivity, accuracy_m: float | None = None, at_m: float = AT_M, stated_baseline_m: float | None = None
 ) -> AccuracyGoal:
-    """The accuracy that a calibration is held to. accuracy_m: sd of depth at `at_m`, for which `worth` is; None: that
-    of ACCURACY_PX.
-    """
+    """The accuracy asked: sd of depth at `at_m`, for which `worth` is; None: that of ACCURACY_PX."""
     return AccuracyGoal(ACCURACY_PX * worth.per_pixel_m if accuracy_m is None else accuracy_m, at_m, stated_baseline_m)
 
 
@@ -148,8 +145,7 @@ _STILL = "check that nothing moved between the sweeps, or calibrate at the speed
 def judge_sync(
     fit: SyncFit, model: RigModel | None, asked: AccuracyGoal | None, changed: Reason | None = None
 ) -> Verdict:
-    """Judge a fit. model, asked: of the rig, None where nothing tells what a lag is worth in depth. changed: why the
-    model cannot be right with these lags."""
+    """Judge a fit; model, asked: None where nothing tells a lag's worth; changed: why the model is wrong with it."""
     found = []
     if not fit.steady:
         text = (

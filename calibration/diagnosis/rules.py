@@ -149,18 +149,13 @@ _FEWEST_TO_JUDGE = 3
 _MEND_VIEWS = "mend what is said of the other views, then show more"
 _SHOW_ANEW = "show the board again for each of these, at rest until its sweeps are over"
 FEWEST_POSES: Final = 6
-"""Fewest poses that can be checked: with fewer, a single bad view bends the fit to it, and nothing shows that it was
-bad."""
+"""Fewest poses that can be checked: with fewer, a bad view bends the fit to it, and nothing shows that it was bad."""
 FEWEST_WHY: Final = "are the fewest that can be checked against each other"
 
 
 @dataclass(frozen=True, slots=True)
 class EvidenceLimit:
-    """Limits of a number.
-
-    always: beyond it the number is never enough. imprecise: within it the number is no likely cause of an error that is
-    too large.
-    """
+    """Limits of a number: beyond `always` it is never enough; within `imprecise` it makes no error too large."""
 
     always: float
     imprecise: float
@@ -171,11 +166,9 @@ class EvidenceLimit:
 
 
 LEAST_TILT_RAD: Final = EvidenceLimit(math.radians(12), math.radians(20))
-"""Tilt between two boards. Of boards parallel to each other focal length and distance cannot be told apart: they hang
-on the mirror's model alone, which nothing checks then."""
+"""Tilt between two boards. Of parallel ones focal length and distance cannot be told apart."""
 LEAST_BOARD_RAD: Final = EvidenceLimit(0.11, 0.15)
-"""Angle under which a board is seen. Under smaller ones its perspective (by which focal length is told) goes with the
-angle's square."""
+"""Angle under which a board is seen. Its perspective, by which focal length is told, goes with the angle's square."""
 LEAST_COVERAGE: Final = EvidenceLimit(0.3, 0.5)
 """Share of the picture within the outline of all corners; the lens is extrapolated outside, which nothing checks."""
 MOST_ROOM_FLUX: Final = EvidenceLimit(3.0, 1.0)
@@ -334,10 +327,7 @@ def judge(views: ViewEvidence, fit: FitEvidence, asked: AccuracyGoal) -> Verdict
 def judge_refusal(
     refused: Degenerate, views: ViewEvidence, poses: PoseEvidence | None = None, *, photons: bool = True
 ) -> Verdict:
-    """The verdict where no model could be fitted: what the views lack, else what the fit said. poses: roughly.
-
-    photons: as for `data_lack`.
-    """
+    """The verdict where no model could be fitted: what the views lack, else what the fit said; as `data_lack`."""
     lacking = [*hiding(views, poses, photons=photons), *data_lack(views, poses, imprecise=True, photons=photons)]
     code = _REFUSED_FOR.get(refused.reason, refused.reason)
     own = reason_for(code, str(refused))

@@ -46,10 +46,7 @@ class _CameraFile(FileSection):
 
 @dataclass(frozen=True, slots=True, eq=False)
 class KnownCamera:
-    """A camera, how well it is known, and the digests of the views that told it.
-
-    verdict, reasons: of its calibration; None where nobody judged it.
-    """
+    """A camera, how well it is known, the digests of the views that told it, its verdict (None: nobody judged it)."""
 
     camera: Camera
     covariance: Covariance

@@ -42,10 +42,7 @@ _PLAIN = {"row_delay_s": 0.0, "gate_delay_s": 0.0, "colour_skew_s": 0.0, "marker
 
 
 def load_rig_model(path: str | os.PathLike[str]) -> RigModel:
-    """Read a calibration file. Paths inside it are relative to its folder.
-
-    Raises CalibrationError, one line: the file, the key, what is wrong and what would be right.
-    """
+    """Read a calibration file; its paths are relative to its folder. CalibrationError, one line, where it is none."""
     file = Path(path)
     parsed = read_yaml_file(file, "a calibration", FORMAT, VERSION, CalibrationFile)
     try:

@@ -213,10 +213,7 @@ def parse_yaml(text: str, what: str, example: str, name: str) -> YamlFile:
 
 
 def read_yaml_file(file: Path, what: str, format_name: str, version: int, model: type[Content]) -> Content:
-    """The content of a file that must say that format and version.
-
-    Raises CalibrationError, one line: the file, the key, what is wrong and what would be right.
-    """
+    """The content of a file that must say that format and version. CalibrationError, one line, where it is none."""
     read = load_yaml(file, what, f"format: {format_name}")
     content = read.content
     if content.get("format") != format_name:

@@ -16,8 +16,7 @@ from calibration.model.scanner import Scanner
 from calibration.verdict import VerdictWord
 
 _ASYMMETRY = 1e-6
-"""Amount by which two correlations that are the same may differ, and a smallest eigenvalue lie below 0, from
-rounding."""
+"""Rounding: by so much equal correlations may differ, and a smallest eigenvalue lie below 0."""
 
 
 @dataclass(frozen=True, eq=False)

@@ -29,16 +29,13 @@ _NODES = tuple((x / 2, w / 2) for x, w in zip(*np.polynomial.legendre.leggauss(3
 _TRAVEL = tuple((x / 2, w / 2) for x, w in zip(*np.polynomial.legendre.leggauss(4), strict=True))
 LEAST_FLUX = 1e-7
 LEVEL_COUNTS = 0.5
-"""Least number of 1s a level is taken to have, in counts: one without a single 1 is then half a count over all its
-frames, not 0."""
+"""Least number of 1s of a level: one without a single 1 is half a count over all its frames, not 0."""
 BEFORE, AFTER, AREA, CENTRE, SIGMA = range(5)
 
 
 @dataclass(frozen=True, slots=True)
 class LineShape:
-    """Shape of the line's light over the columns. box: width of the part that is no Gaussian, in the Gaussian's sigmas.
-    travels: whether the line moves while a column's frames are taken.
-    """
+    """Shape of the line. box: width of its part that is no Gaussian, in sigmas. travels: it moves within a column."""
 
     box: float = 0.0
     travels: bool = False
@@ -75,9 +72,7 @@ def _line(sigma: Array, away: Array, box: float) -> tuple[Array, Array]:
 
 
 def _travelled(area: Array, sigma: Array, away: Array, box: float) -> tuple[Array, Array, Array, Array]:
-    """Flux that makes as many 1s as the line's light over the column does; its slopes by area, centre, log sigma, the
-    latter two for an area of 1.
-    """
+    """Flux that makes as many 1s as the moving line; its slopes by area, centre, log sigma (these for an area of 1)."""
     places = np.array([place for place, _ in _TRAVEL])[:, None, None]
     moved = away + places
     line, slope = _line(sigma, moved, box)
@@ -142,8 +137,7 @@ DAMPING = 0.01
 LEAST_STEP = 1e-3
 """Change of the centre, in columns, at which the fit ends: less for all but one pixel in a hundred."""
 SPAN, SPACING = 4, 0.8
-"""Number of places at which the likelihood of a centre is looked at on either side of its best, and their distance in
-deviations."""
+"""Places on either side of a centre's best at which its likelihood is looked at; their distance in deviations."""
 MOST_AT_END = 0.03
 """Most chance at an end of that: where there is more, the centre is not known."""
 ALIKE = 1.25
@@ -328,9 +322,7 @@ def _width_step(log_sigma: Array, score: Array, information: Array, group: NDArr
 
 
 def _significance(ones: Array, frames: Array, at: Array, centre: Array, flux: Array) -> Array:
-    """Significance of the line (pixels,) in sds, against a level before the centre and one behind it with all the
-    light.
-    """
+    """Significance of the line (pixels,) in sds, against two levels, before the centre and behind it."""
     level = np.zeros_like(flux)
     for side in (at < centre[:, None], at >= centre[:, None]):
         share = ((ones * side).sum(axis=1) + LEVEL_COUNTS) / ((frames * side).sum(axis=1) + 2 * LEVEL_COUNTS)

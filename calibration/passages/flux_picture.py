@@ -28,10 +28,7 @@ LEAST_COUNTS = 30.0
 
 
 def flux_picture(sweeps: tuple[SweepCounts, ...]) -> NDArray[np.float32]:
-    """Flux (rows, width) of the lit frames of sweeps over the same scene, float32, NaN where no window ever was.
-
-    What a pixel counts in the dark is left in.
-    """
+    """Flux (rows, width) of the lit frames of sweeps over one scene, dark counts too; NaN where no window ever was."""
     off = [_off_the_line(sweep) for sweep in sweeps]
     ones: Array = np.sum([part[0] for part in off], axis=0)
     frames: Array = np.sum([part[1] for part in off], axis=0)

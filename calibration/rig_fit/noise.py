@@ -93,9 +93,7 @@ def restated(residuals: Sequence[Array], sightings: Sequence[Sighting]) -> tuple
 
 
 def _kinds(sightings: Sequence[Sighting]) -> list[list[int]]:
-    """A number for every sweep of every view, the same for sweeps of like speed: their frames in a column are alike,
-    too.
-    """
+    """A number for every sweep of every view, the same for sweeps of like speed, whose frames in a column are alike."""
     speeds = [[float(seen.velocity_per_s[sweep.start]) for sweep in seen.sweeps] for seen in sightings]
     kinds = iter(alike_speeds([speed for of_view in speeds for speed in of_view]).tolist())
     return [[next(kinds) for _ in of_view] for of_view in speeds]

@@ -83,9 +83,7 @@ class _Lit(NamedTuple):
 
 
 class Sheet(NamedTuple):
-    """Points on the light that meets them. command: (m,) of the mirror; per_command: dF/dc (m,); normal: (m, 3);
-    columns: (m, scanner and timing terms) dF/dp.
-    """
+    """Points on the light that meets them: mirror command (m,), dF/dc (m,), normal (m, 3), dF/dp (m, terms)."""
 
     command: Array
     per_command: Array
@@ -121,9 +119,7 @@ def sheet_rows(
 
 
 def mirror_command(timing: Array, command: Array, y_px: Array, velocity_per_s: Array) -> Array:
-    """Position of the mirror, on the command's scale; as `RigModel.mirror_command`, with `timing` (3,) in place of a
-    model.
-    """
+    """Position of the mirror, as `RigModel.mirror_command` has it, by `timing` (3,) instead of a model."""
     delay_s: Array = np.where(velocity_per_s > 0, timing[0], timing[1]) - timing[2] * y_px
     return command - velocity_per_s * delay_s
 

@@ -57,9 +57,7 @@ class ViewNormal:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Weights:
-    """Per view: of the corners' coordinates (2 n,), of the passages (m,), where bins of shared jitter start, and its
-    variance.
-    """
+    """Per view: of corners' coordinates (2 n,), of passages (m,), starts of bins that share jitter; its variance."""
 
     corners: tuple[Array, ...]
     passages: tuple[Array, ...]
@@ -139,8 +137,7 @@ MOST_STEPS = 12
 WEIGHED_STEPS = 6
 """Steps after which an outlier stays one: weights that follow every step never come to rest."""
 CONVERGED_CHI2 = 1e-3
-"""Gain in chi2 promised by the next step at which a fit is at rest: 0.03 of a standard deviation along any
-parameter."""
+"""Gain in chi2 promised by the next step at which a fit is at rest: 0.03 sd along any parameter."""
 ROUGH_SHARE = 1e-4
 """Share of chi2 that the next step may still promise where a term is only looked for."""
 WORSE_CHI2 = 0.1
@@ -152,9 +149,7 @@ MOST_CONDITION = 1e12
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Prior:
-    """Knowledge of the camera from elsewhere. matrix: (p, p) information, 0 for the other parameters, at the values
-    (p,).
-    """
+    """Knowledge of the camera from elsewhere: information (p, p), 0 for other parameters, at the values (p,)."""
 
     matrix: Array
     values: Array
@@ -177,9 +172,7 @@ class RigProblem:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class RigSolution:
-    """A state with its residuals, its equations (matrix (p, p), right (p,): of the shared parameters, whether free or
-    not) and the condition of the free ones.
-    """
+    """A state with residuals, the equations of all shared parameters (p, p), (p,), the condition of the free ones."""
 
     state: RigState
     rows: list[tuple[Rows, Rows]]
@@ -243,10 +236,7 @@ def equations(views: Sequence[ViewNormal], problem: RigProblem, state: RigState)
 
 
 def scaled_inverse(matrix: Array) -> tuple[Array, float]:
-    """(inverse, condition number) of an information matrix, its parameters scaled to the same weight.
-
-    Raises Degenerate where it has no inverse worth the name.
-    """
+    """(inverse, condition number) of an information matrix, scaled; Degenerate where there is none worth the name."""
     weight = np.diag(matrix)
     if not np.all(np.isfinite(matrix)) or np.any(weight <= 0):
         raise Degenerate(

@@ -41,9 +41,7 @@ _STEP = 0.7
 
 @dataclass(frozen=True, slots=True, eq=False)
 class LitPoints:
-    """Points at which light met the board: points_m (m, 3), command (m,), velocity_per_s (m,), and the view of each
-    (m,).
-    """
+    """Points at which light met the board: (m, 3), command (m,), velocity (m,), the view of each (m,)."""
 
     points_m: Array
     command: Array
@@ -164,8 +162,7 @@ def _lags(velocities: Array, curves: Sequence[tuple[Array, Array]]) -> tuple[flo
 LEAST_TILT_RAD = np.radians(5.0)
 """Least tilt between two boards."""
 LEAST_THICKNESS = 0.01
-"""Least thickness of the points about the plane that fits them best, as a share of their distance: less is one
-plane."""
+"""Least thickness of the points about their best plane, as a share of their distance: less is one plane."""
 LEAST_SPAN = 0.02
 """Least share of the mirror's command range: a line that hardly moved tells nothing of how it turns."""
 LEAST_LIT_SHARE = 0.1

@@ -46,8 +46,7 @@ MOST_OFF = 4.7
 
 @dataclass(frozen=True, slots=True, eq=False)
 class SharedPixels:
-    """Passages of the pixels that several sweeps share. command, weight: (pixels, sweeps), weight 0 where a sweep has
-    none. rows: (pixels,). direction, speed: (sweeps,)."""
+    """Pixels that several sweeps share: command, weight (0: none) (pixels, sweeps), rows (pixels,), of sweeps."""
 
     command: Array
     weight: Array
@@ -175,9 +174,7 @@ MOST_CHI2_SDS = 4.0
 
 @dataclass(frozen=True, slots=True)
 class SweepTiming:
-    """The timing that one sweep tells beside the others. lag_s: as if it were the only one of its kind; sd_s: of
-    that.
-    """
+    """The timing that one sweep tells beside the others: its own lag_s, with sd_s."""
 
     direction: int
     speed_per_s: float

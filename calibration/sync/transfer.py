@@ -40,8 +40,7 @@ def known_row_delay(base: RigModel) -> tuple[float, float]:
 
 
 def with_lags(base: RigModel, fit: SyncFit) -> tuple[RigModel, Reason | None]:
-    """The model with these lags, fitted with its `known_row_delay`; and why its angle cannot be right with them, None
-    where it may be."""
+    """The model with these lags, fitted with its `known_row_delay`; why its angle cannot be right then, or None."""
     assert fit.row_told or fit.row_delay_s == base.row_delay_s, "lags of another row delay"
     told, spread = _told(fit)
     names, values = parameters(base)
@@ -79,9 +78,7 @@ def _told(fit: SyncFit) -> tuple[dict[str, float], Array]:
 def _slopes(
     base: RigModel, known: Array, names: tuple[str, ...], lags: int, change: Array, spread: Array
 ) -> tuple[Array, Reason | None]:
-    """The slopes A (others, lags) of all else by the lags (the last of the names), and the reason where they cannot be
-    told.
-    """
+    """The slopes A (others, lags) of all else by the lags (the last names), and the reason where nothing tells them."""
     n = len(names) - lags
     slopes = np.zeros((n, lags))
     velocities = base.provenance.get(SWEPT) or ()

@@ -62,10 +62,7 @@ PLAIN = {"estimator": "argmax", "filter": "none", "temporal_prior": False}
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Capture:
-    """A view as it was taken.
-
-    refused: the reason why there are no corners in it; None where there are. identity: of the rig that took it.
-    """
+    """A view as it was taken, the reason why it has no corners (None: it has), the rig that took it."""
 
     view: View
     refused: Degenerate | None
@@ -213,8 +210,7 @@ def _corners(
 TellLine = Callable[[str], None]
 """A callback that takes a line for people."""
 AskPerson = Callable[[str], None]
-"""A callback that has the board moved as a text says and returns once it is done; KeyboardInterrupt ends the session.
-"""
+"""A callback that has the board moved as a text says; KeyboardInterrupt ends the session."""
 
 
 def world_moves_board(config: RigConfig) -> bool:
@@ -258,18 +254,14 @@ def shown(config: RigConfig, what: str, pose: Candidate, ask: AskPerson | None, 
 
 
 Scan = Callable[[int | None], Capture]
-"""A function that takes a view at so many exposures per column; None is the config's. PlanError where that cannot be.
-"""
+"""A function that takes a view at so many exposures per column; None: the config's. PlanError: it cannot."""
 
 
 class SpeedRotation:
     """Takes the views at several speeds by turns."""
 
     def __init__(self, exposures: Sequence[int], sees: Callable[[Capture], bool], tell: TellLine | None = None) -> None:
-        """Prepare the turns.
-
-        exposures: per column, by turns; empty is the config's. sees: whether a capture has what it was taken for.
-        """
+        """Take the exposures per column, none: the config's; `sees` says whether a capture has what it is taken for."""
         self.turns = list(exposures)
         self._sees = sees
         self._tell = tell

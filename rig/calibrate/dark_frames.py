@@ -119,10 +119,7 @@ def take_dark(
 
 
 def take_sweeps(rig: OpenRig, maps: int | None = None, progress: Progress | None = None) -> SweepSums:
-    """Take the frames of a scan with light, or of all sweeps of a recording that takes the SPAD's place.
-
-    An interrupt is raised again, once the rig is safe.
-    """
+    """Take the frames of a scan with light, or of all sweeps of a recording. An interrupt is raised again."""
     scan, sums = rig.config.scan, SweepSums()
 
     def live(now: ScanProgress) -> None:

@@ -113,10 +113,7 @@ _UNITS = {
     "offset_0": ("mm", 1e3), "offset": ("mm/rad^{order}", 1e3),
     "lag": ("us", 1e6), "row_delay": ("ns/row", 1e9),
 }  # fmt: skip
-"""Unit of each term of the model (`calibration.model.parameters`), and how many of them make one of SI's.
-
-Terms in units of the mirror command have none.
-"""
+"""Unit of each term of the model, and how many of them make one of SI's; none in units of the mirror command."""
 
 
 def measured(name: str, value: float, sd: float) -> tuple[str, str, str]:
@@ -246,10 +243,7 @@ _WAYS = {1: "rising command", -1: "falling command"}
 
 
 def plane_residuals(waves: SweepWaves, sweeps: Sequence[SweepResidual], metres_per_command: float, at_m: float) -> str:
-    """Chart (SVG) of the medians of each sweep's residuals over the command, a panel for each direction.
-
-    They are in millimetres of depth at `at_m`.
-    """
+    """Chart (SVG) of each sweep's median residuals over the command, in mm of depth at `at_m`, a panel each way."""
     views = list(dict.fromkeys(sweep.view for sweep in sweeps))
     panels = [
         Panel(
@@ -445,10 +439,7 @@ _DEAD_BGR = (0, 0, 0)
 
 
 def dark_rate_picture(pixels: PixelMap) -> NDArray[np.uint8]:
-    """Dark rates as a picture (rows, width, 3) BGR, dead pixels black.
-
-    The scale is logarithmic, from a third of the usual rate to the fastest.
-    """
+    """Dark rates (rows, width, 3) BGR, logarithmic from a third of the usual rate on; dead pixels black."""
     rate = np.nan_to_num(pixels.rate_per_s, nan=0.0).astype(np.float64)
     low = max(pixels.ordinary_per_s / 3, 1e-3)
     high = max(float(rate.max(initial=0.0)), 10 * low)

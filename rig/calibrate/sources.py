@@ -35,10 +35,7 @@ SourcesLike = Config | Sequence[Config]
 
 @dataclass(frozen=True, slots=True)
 class ViewSources:
-    """Sources of views, each kind in the order in which they were named.
-
-    live: the rig that takes new views; None where none is named. notes: lines to tell the user about them.
-    """
+    """Sources of views in the order in which they were named; the rig, if any, that takes new ones; lines on them."""
 
     live: RigConfig | None
     sessions: tuple[Path, ...] = ()

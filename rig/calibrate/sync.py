@@ -53,10 +53,7 @@ LEAST_FRAMES = 4
 SETTLED_FRAMES = 3
 """Frames from the edge at which a frame and the two that follow are all dark, or all lit."""
 MOST_LATE_FRAMES = 3
-"""Longest delay that is looked for, in frames.
-
-Gates take microseconds; a line that comes into the picture later is not an edge.
-"""
+"""Longest delay that is looked for, in frames; gates take microseconds."""
 MOST_SCATTER = 10.0
 """Most variance of the ones around an edge, in units of photons' variance; more comes from the scene."""
 STEPS = 32
@@ -248,10 +245,7 @@ def _is_told(edge: Edge) -> bool:
 
 
 def _edge(ones: Array, middle_s: Array, late_s: Array, plan: ScanPlan, *, rises: bool) -> Edge | None:
-    """The edge at delays (delays,) among the frames near its planned place, at 0; None where some are missing.
-
-    ones: (frames, 3), see `_ones`. middle_s: (frames,), middle of each exposure.
-    """
+    """The edge at delays (delays,) among frames near its plan at 0, by `_ones` and middles; None: some are missing."""
     frame_s = float(1 / plan.frame_rate_hz)
     near = np.abs(middle_s) < AROUND_FRAMES * frame_s
     if min((near & (middle_s < 0)).sum(), (near & (middle_s > 0)).sum()) < LEAST_FRAMES:
@@ -292,10 +286,7 @@ def _sweeps(run: Path, plan: ScanPlan) -> list[tuple[int, Array, Array]]:
 
 
 def _ones(block: FrameBlock) -> Array:
-    """Counts (frames, 3): ones of a frame, those that are ones in the next frame too, and in the one after that.
-
-    NaN at the end of a block, and where the window has moved.
-    """
+    """Ones of a frame, of it and the next, of it and the one after: (frames, 3), NaN where these do not follow."""
     bits, x0 = block.bits, block.records["x0"]
     ones = np.full((len(bits), 3), np.nan)
     for apart in range(3):

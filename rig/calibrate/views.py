@@ -40,18 +40,10 @@ from rig.progress import part, tell_stage
 
 
 class ViewCollection:
-    """The views taken so far.
-
-    views: all of them. refused: the reasons why some have no corners, by the view's name. identity: of the rig; None
-    where it is not known.
-    """
+    """The views taken so far; those without corners with the reason; the rig they are of (None: not known)."""
 
     def __init__(self, session: Session, tell: TellLine | None = None, of_camera: Collection[str] = ()) -> None:
-        """Begin without views.
-
-        session: keeps the views. tell: gets a line about each. of_camera: `corners_digest` of the views that a camera
-        known from elsewhere was made of.
-        """
+        """Take what keeps the views, what gets a line on each, and the digests of views that a camera was made of."""
         self.views: list[View] = []
         self.refused: dict[str, Degenerate] = {}
         self.identity: Identity | None = None
@@ -254,10 +246,7 @@ def _scan(
 def take_kept(
     taken: ViewCollection, sources: ViewSources, board: Board | None, defects: NDArray[np.bool_] | None = None
 ) -> None:
-    """Take the views that need no live rig.
-
-    board: None where nothing moves and none is looked for. defects: (rows, width), pixels that are not used.
-    """
+    """Take the views that need no live rig, without `defects` (rows, width). board: None where nothing moves."""
     for note in sources.notes:
         taken.say(note)
     for folder in sources.sessions:
@@ -274,10 +263,7 @@ def take_kept(
 
 
 def _require_alike(folder: Path, board: Board | None) -> None:
-    """Raise UsageError where a session's views do not show the board that is looked for.
-
-    The side of the squares may differ: it is what a user corrects where it was measured wrong.
-    """
+    """Raise UsageError where a session shows another board; the side of the squares may have been measured anew."""
     known = session_board(folder)
     if known is None:
         return
