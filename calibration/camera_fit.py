@@ -19,8 +19,8 @@ from numpy.typing import NDArray
 
 from calibration.arrays import Array, Mask
 from calibration.board.board import Board, spread_rad
-from calibration.errors import CalibrationError, Degenerate, condition_text
-from calibration.model.camera import TERM_COUNTS, Camera
+from calibration.errors import Degenerate, condition_text
+from calibration.model.camera import Camera
 from calibration.model.parameters import DISTORTION, MATRIX
 from calibration.model.rig_model import Covariance
 from calibration.views import LEAST_ACROSS_PX, NO_POSE, BoardPose, Corners, View, robust_sd
@@ -307,8 +307,6 @@ def fit_camera(views: Sequence[View], board: Board, size: tuple[int, int], *, di
     distortion_terms: 0, 4, 5, 8, 12 or 14, OpenCV's. What does not fit is left out.
     Raises Degenerate: no-board, mirrored, one-pose, coplanar, too-few-poses; the message has the condition number.
     """
-    if distortion_terms not in (0, *TERM_COUNTS):
-        raise CalibrationError(f"distortion has {distortion_terms} terms; OpenCV defines 0, {str(TERM_COUNTS)[1:-1]}")
     seen = [(view, view.corners) for view in views if view.corners is not None]
     seen = [
         (view, corners)

@@ -10,7 +10,6 @@ expected covariance and P what takes a plane off,
 """
 
 import math
-from collections.abc import Sequence
 from dataclasses import dataclass
 
 import cv2
@@ -77,11 +76,10 @@ def cells_of(model: RigModel, view: View, board: Board) -> BoardCells:
     )
 
 
-def points_of(model: RigModel, cells: BoardCells) -> Array:
+def _points_of(model: RigModel, cells: BoardCells) -> Array:
     """(cells, 3): each square's point, the mean of the sweeps'."""
-    found = _triangulated(model, cells.x_px, cells.y_px, cells.command, cells.velocity_per_s)
-    mean: Array = found.mean(axis=0)
-    return mean
+    points = _triangulated(model, cells.x_px, cells.y_px, cells.command, cells.velocity_per_s)
+    return np.asarray(points.mean(axis=0))
 
 
 def noise_m2(model: RigModel, cells: BoardCells, normal: Array) -> float:
@@ -114,15 +112,6 @@ def _on_board(model: RigModel, view: View, board: Board, x_px: Array, y_px: Arra
     xy = rays[:, :2] / rays[:, 2:]
     inside = np.all((xy >= 0) & (xy < np.array(board.size_m)), axis=1)
     return np.where(inside[:, None], xy, np.nan)
-
-
-def inside_points(model: RigModel, view: View, board: Board) -> Array:
-    """(m, 3) points of all passages on the board's squares; NaN outside the model's range of commands."""
-    found = []
-    for sweep in view.passages:
-        inside = np.isfinite(_on_board(model, view, board, sweep.x_px, sweep.y_px)).all(axis=1)
-        found.append(_scanned_points(model, sweep)[inside])
-    return np.concatenate(found)
 
 
 def corner_pixels(view: View) -> Array:
@@ -183,17 +172,12 @@ class CheckedAngle:
     sd_rad: float
 
 
-def check_boards(model: RigModel, views: Sequence[View], board: Board) -> tuple[CheckedBoard, ...]:
-    """Check every view's board. Raises Degenerate where a board or its passages are not there."""
-    return tuple(_check(model, view, board) for view in views)
-
-
 def check_angle(model: RigModel, first: View, second: View, board: Board) -> CheckedAngle:
     """The angle between the boards of two views, 0 to pi/2."""
     both = [(cells_of(model, view, board), view) for view in (first, second)]
 
     def measure(tried: RigModel) -> Array:
-        one, other = (_plane(points_of(tried, cells))[0] for cells, _ in both)
+        one, other = (_plane(_points_of(tried, cells))[0] for cells, _ in both)
         return np.array([math.acos(min(1.0, abs(float(one @ other))))])
 
     values, covariance = propagated(model, measure)
@@ -203,9 +187,9 @@ def check_angle(model: RigModel, first: View, second: View, board: Board) -> Che
 
 def _tilt_noise(model: RigModel, cells: BoardCells, other: BoardCells) -> float:
     """Variance (rad^2) by the noise of a board's scan of how far it is tilted towards another one."""
-    points = points_of(model, cells)
+    points = _points_of(model, cells)
     normal, _ = _plane(points)
-    towards = _plane(points_of(model, other))[0]
+    towards = _plane(_points_of(model, other))[0]
     towards = towards - (towards @ normal) * normal
     around = points - points.mean(axis=0)
     around -= np.outer(around @ normal, normal)
@@ -215,14 +199,15 @@ def _tilt_noise(model: RigModel, cells: BoardCells, other: BoardCells) -> float:
     return noise_m2(model, cells, normal) * share
 
 
-def _check(model: RigModel, view: View, board: Board) -> CheckedBoard:
+def check_board(model: RigModel, view: View, board: Board) -> CheckedBoard:
+    """Check a view's board. Raises Degenerate where it or its passages are not there."""
     cells = cells_of(model, view, board)
-    points = points_of(model, cells)
+    points = _points_of(model, cells)
     corners = corner_pixels(view)
     count = len(cells.board_xy_m)
 
     def measure(tried: RigModel) -> Array:
-        found = points_of(tried, cells)
+        found = _points_of(tried, cells)
         normal, offset = _plane(points)  # the same reference for all
         return np.append(found @ normal - offset, _scale(tried, found, view, board, corners))
 
@@ -230,20 +215,24 @@ def _check(model: RigModel, view: View, board: Board) -> CheckedBoard:
     deviations, scale = values[:count], float(values[count])
     normal, offset = _plane(points)
     noise = noise_m2(model, cells, normal)
-    chi2, freedom = _chi2(deviations, covariance[:count, :count] + noise * np.eye(count), cells.board_xy_m)
     basis = off_plane(cells.board_xy_m)
     expected = basis.T @ (covariance[:count, :count] + noise * np.eye(count)) @ basis
+    rest = basis.T @ deviations
     field = np.full((board.squares[1], board.squares[0]), np.nan)
     field[cells.at] = deviations
-    of_points = inside_points(model, view, board) @ normal - offset
+    on_board = [
+        _scanned_points(model, sweep)[np.isfinite(_on_board(model, view, board, sweep.x_px, sweep.y_px)).all(axis=1)]
+        for sweep in view.passages
+    ]
+    of_points = np.concatenate(on_board) @ normal - offset
     return CheckedBoard(
         name=view.name,
         distance_m=float(points[:, 2].mean()),
         flatness_rms_m=float(np.sqrt(np.mean(deviations**2))),
         flatness_peak_m=float(np.abs(deviations).max()),
         expected_m=float(np.sqrt(np.trace(expected) / count)),
-        chi2=chi2,
-        freedom=freedom,
+        chi2=float(rest @ np.linalg.solve(expected, rest)),
+        freedom=basis.shape[1],
         scale=scale,
         scale_sd=float(np.sqrt(covariance[count, count] + noise / count / offset**2)),
         point_rms_m=float(np.sqrt(np.nanmean(of_points**2))),
@@ -269,9 +258,3 @@ def _plane(points: Array) -> tuple[Array, float]:
     normal = np.linalg.svd(points - middle, full_matrices=False)[2][2]
     normal = normal if normal[2] >= 0 else -normal
     return normal, float(normal @ middle)
-
-
-def _chi2(deviations: Array, covariance: Array, xy: Array) -> tuple[float, int]:
-    basis = off_plane(xy)
-    rest = basis.T @ deviations
-    return float(rest @ np.linalg.solve(basis.T @ covariance @ basis, rest)), basis.shape[1]

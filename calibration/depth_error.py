@@ -128,10 +128,7 @@ def depth_uncertainty(model: RigModel, depth_m: float, velocity_per_s: float | N
 def depth_sd_m(
     model: RigModel, x_px: ArrayLike, y_px: ArrayLike, command: ArrayLike, velocity_per_s: float = 0.0
 ) -> Array:
-    """Standard deviation (m) of the depth at raw pixels where the mirror stands at `command`; all broadcast.
-
-    NaN where there is no depth. Raises CalibrationError for a model without covariance.
-    """
+    """Sd (m) of the depth at raw pixels for a mirror at `command`, NaN: none. CalibrationError: no covariance."""
     return np.sqrt(_variance(depth_jacobian(model, x_px, y_px, command, velocity_per_s), _covariance(model)))
 
 

@@ -200,7 +200,7 @@ class Forecast:
         for column, group in enumerate(fit.free):
             self._tie[self._terms.at(group), column] = 1.0
         self._jacobian = _depth_by_free(fit, at_m)
-        sweeps = [sweep for view in fit.sweeps for sweep in view]
+        sweeps = fit.every_sweep
         self._velocities = _next_velocities(fit)
         self._sd = float(np.median(np.concatenate([sweep.sd for sweep in sweeps])))
         self._count = float(np.median([sweep.sd.size for sweep in sweeps]))
@@ -287,7 +287,7 @@ def _depth_by_free(fit: RigFit, at_m: float) -> Array:
     across, down = ((np.arange(n) + 0.5) / n for n in _CELLS)
     x, y = np.meshgrid(across * model.camera.width - 0.5, down * model.camera.height - 0.5)
     command = command_at(model, x, y, at_m)
-    velocity = max((sweep.speed_per_s for view in fit.sweeps for sweep in view), default=0.0)
+    velocity = max((sweep.speed_per_s for sweep in fit.every_sweep), default=0.0)
     by_name = depth_jacobian(model, x, y, command, velocity)
     by_name = by_name[np.isfinite(by_name).all(axis=-1)]
     columns = [np.sum([by_name[:, names.index(name)] for name in group], axis=0) for group in fit.free]

@@ -380,6 +380,7 @@ def _correlation(before: NDArray[np.float64], after: NDArray[np.float64]) -> flo
 
 FORMAT: Final = "spadrig-pixels"
 _ARRAYS: Final = ("rate_per_s", "rate_sd_per_s", "jump_per_s", "limit_per_s", "hot", "noisy", "defects")
+_NUMBERS: Final = ("judged", "lit_judged", "exposure_s", "ordinary_per_s")
 _NEXT: Final = "name a pixels.npz that 'rig calibrate pixels' wrote"
 
 
@@ -409,18 +410,8 @@ class PixelVersion:
 def save_pixels(version: PixelVersion, path: str | os.PathLike[str]) -> None:
     """Write it, whole or not at all. Raises OSError."""
     file, pixels = Path(path), version.pixels
-    about = {
-        "format": FORMAT,
-        "version": version.version,
-        "created": version.created,
-        "parent": version.parent,
-        "sensor": version.sensor,
-        "exposure_s": pixels.exposure_s,
-        "frames": pixels.frames,
-        "judged": pixels.judged,
-        "lit_judged": pixels.lit_judged,
-        "ordinary_per_s": pixels.ordinary_per_s,
-    }
+    about = {"format": FORMAT, **{name: getattr(version, name) for name in ("version", "created", "parent", "sensor")}}
+    about |= {name: getattr(pixels, name) for name in ("frames", *_NUMBERS)}
     arrays = {name: getattr(pixels, name) for name in _ARRAYS}
     if pixels.dead is not None:
         arrays["dead"] = pixels.dead
@@ -446,11 +437,8 @@ def load_pixels(path: str | os.PathLike[str]) -> PixelVersion:
             dead = archive["dead"] if "dead" in archive.files else None
         if about["format"] != FORMAT or len({array.shape for array in arrays.values()}) != 1:
             raise ValueError(f"'format' is {about['format']!r}")
-        pixels = PixelMap(
-            **arrays, dead=dead, judged=float(about["judged"]), lit_judged=float(about["lit_judged"]),
-            frames=int(about["frames"]), exposure_s=float(about["exposure_s"]),
-            ordinary_per_s=float(about["ordinary_per_s"]),
-        )  # fmt: skip
+        numbers: dict[str, Any] = {name: float(about[name]) for name in _NUMBERS}
+        pixels = PixelMap(**arrays, dead=dead, frames=int(about["frames"]), **numbers)
         return PixelVersion(pixels, int(about["version"]), str(about["created"]), about["parent"], str(about["sensor"]))
     except OSError as error:
         raise CalibrationError(f"cannot read {file}: {error.strerror or error}; {_NEXT}") from error

@@ -67,7 +67,7 @@ class _Layout:
 
 
 def contradiction(read: Markers, board: Board, shown: NDArray[np.uint8]) -> str | None:
-    """How the markers read in the picture `shown` do not fit the board, in words; None where they do."""
+    """Words for how the markers read in the picture `shown` do not fit the board; None where they do."""
     assert board.marker_m is not None, "asked of boards with markers"
     placed, lattice = _lattice(read.px, board.marker_m / board.square_m)
     ids, lattice = read.ids[placed], lattice[placed]

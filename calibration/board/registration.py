@@ -63,11 +63,7 @@ class _Patch:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class _Place:
-    """A corner's expected place: its pixel, a square's side, half the width of the patch around it.
-
-    to_drawing: (4, 4, 2), the amounts that powers of x and y, in reaches from the corner, add to the place in the
-    drawing.
-    """
+    """A corner's place: pixel, side of a square, half width of its patch, (4, 4, 2) powers for the drawing's place."""
 
     expected_px: Array
     side_px: float
@@ -83,10 +79,7 @@ def register(
     reach: float,
     search: bool,
 ) -> tuple[NDArray[np.int32], Array, Array]:
-    """Corners `ids` that the picture shows near where the map has them: their ids, px (n, 2) and sd_px (n,).
-
-    reach: WIDE or OWN. search: look for each in whole pixels first (the map is rough).
-    """
+    """Corners `ids` in the picture near the map: ids, px (n, 2), sd_px (n,). search: in whole pixels first."""
     places = _places(drawing, board_map, ids, reach)
     found = [_register_one(picture, drawing, place, search) for place in places]
     good = np.array([one is not None for one in found], np.bool_)

@@ -41,16 +41,6 @@ NOISE_SIGMAS = 4.0
 
 
 @dataclass(frozen=True, slots=True, eq=False)
-class SweepResidual:
-    """Residuals of one sweep of a view. command, residual: (m,) float64, both in command units."""
-
-    view: str
-    direction: int
-    command: Array
-    residual: Array
-
-
-@dataclass(frozen=True, slots=True, eq=False)
 class SweepWaves:
     """rms: of the waves in command units, noise taken off; NaN where there are too few passages to tell. noise: up to
     here that may be noise.
@@ -64,7 +54,7 @@ class SweepWaves:
     sweeps: Array
 
 
-def sweep_waves(sweeps: Sequence[SweepResidual]) -> SweepWaves:
+def sweep_waves(sweeps: Sequence[SweepFit]) -> SweepWaves:
     """Compare the sweeps of each view."""
     edges = _edges(sweeps)
     middle, variance = _binned(sweeps, edges)
@@ -88,13 +78,13 @@ def sweep_waves(sweeps: Sequence[SweepResidual]) -> SweepWaves:
     )
 
 
-def _edges(sweeps: Sequence[SweepResidual]) -> Array:
+def _edges(sweeps: Sequence[SweepFit]) -> Array:
     commands = [sweep.command for sweep in sweeps if sweep.command.size]
     low, high = (min(map(np.min, commands)), max(map(np.max, commands))) if commands else (-1.0, 1.0)
     return np.linspace(low, high if high > low else low + 1, BINS + 1)
 
 
-def _binned(sweeps: Sequence[SweepResidual], edges: Array) -> tuple[Array, Array]:
+def _binned(sweeps: Sequence[SweepFit], edges: Array) -> tuple[Array, Array]:
     """Medians of the residuals (sweeps, BINS) and their variances."""
     middle, variance = np.full((len(sweeps), BINS), np.nan), np.full((len(sweeps), BINS), np.nan)
     for i, sweep in enumerate(sweeps):
@@ -195,11 +185,7 @@ def _variances(shifts: tuple[ViewShift, ...], wave: float, sweeps: int) -> Array
 
 
 def counted(shifts: tuple[ViewShift, ...], outliers: tuple[str, ...], misfit: float = 1.0) -> tuple[ViewShift, ...]:
-    """The shifts that have to agree: all, but for a single outlier, which had no say in the fit.
-
-    An outlier that is the last view counts, since the rig may be another since then; it also counts where the others do
-    not fit either.
-    """
+    """The shifts that have to agree: all but a single outlier, unless it is the last or the others do not fit."""
     if len(outliers) != 1 or not shifts or shifts[-1].name in outliers or misfit > MOST_MISFIT:
         return shifts
     return tuple(one for one in shifts if one.name not in outliers)

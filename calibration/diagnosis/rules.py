@@ -60,10 +60,7 @@ class ViewEvidence:
 
 @dataclass(frozen=True, slots=True)
 class PoseEvidence:
-    """Evidence of the boards' poses. tilt_rad: largest angle between two of them. distance_m: median of their centres.
-
-    board_rad: angle under which the camera sees a board's longer side, median.
-    """
+    """Poses: largest angle between two boards, median distance, median angle that a board's longer side takes."""
 
     tilt_rad: float
     distance_m: float
@@ -153,25 +150,15 @@ FEWEST_POSES: Final = 6
 FEWEST_WHY: Final = "are the fewest that can be checked against each other"
 
 
-@dataclass(frozen=True, slots=True)
-class EvidenceLimit:
-    """Limits of a number: beyond `always` it is never enough; within `imprecise` it makes no error too large."""
-
-    always: float
-    imprecise: float
-
-    def at(self, imprecise: bool) -> float:
-        """The limit that counts."""
-        return self.imprecise if imprecise else self.always
-
-
-LEAST_TILT_RAD: Final = EvidenceLimit(math.radians(12), math.radians(20))
+# Limits of a number: beyond the first it is never enough; within the second, looked up where a result is not precise
+# enough, it is no likely cause of that.
+LEAST_TILT_RAD: Final = math.radians(12), math.radians(20)
 """Tilt between two boards. Of parallel ones focal length and distance cannot be told apart."""
-LEAST_BOARD_RAD: Final = EvidenceLimit(0.11, 0.15)
+LEAST_BOARD_RAD: Final = 0.11, 0.15
 """Angle under which a board is seen. Its perspective, by which focal length is told, goes with the angle's square."""
-LEAST_COVERAGE: Final = EvidenceLimit(0.3, 0.5)
+LEAST_COVERAGE: Final = 0.3, 0.5
 """Share of the picture within the outline of all corners; the lens is extrapolated outside, which nothing checks."""
-MOST_ROOM_FLUX: Final = EvidenceLimit(3.0, 1.0)
+MOST_ROOM_FLUX: Final = 3.0, 1.0
 """Photons per pixel and exposure from white. At 3, 95 % of the frames hold a 1 whether the line is there or not; from 1
 on room light costs more than half of what a frame can tell of the line."""
 
@@ -184,8 +171,8 @@ def data_lack(
     poses: None where nothing tells. photons: whether pictures count photons; those from files do not.
     """
     found = []
-    bright = photons and MOST_ROOM_FLUX.at(imprecise) < views.room_flux <= MOST_ROOM_FLUX.always
-    light = [_room_light(views.room_flux, MOST_ROOM_FLUX.at(imprecise))] if bright else []
+    bright = photons and MOST_ROOM_FLUX[imprecise] < views.room_flux <= MOST_ROOM_FLUX[0]
+    light = [_room_light(views.room_flux, MOST_ROOM_FLUX[imprecise])] if bright else []
     if views.used < FEWEST_POSES <= views.shown:
         found, light = light, []  # what hides board and line goes before the views that lack them
     if views.used < FEWEST_POSES:
@@ -194,7 +181,7 @@ def data_lack(
         return found
     if poses is not None:
         found += _poses_lack(poses, imprecise)
-    least = LEAST_COVERAGE.at(imprecise)
+    least = LEAST_COVERAGE[imprecise]
     if views.coverage < least:
         text = f"corners reach {views.coverage:.0%} of the picture, {least:.0%} are needed"
         found.append(reason_for("poor-coverage", text, views.coverage, least))
@@ -206,10 +193,10 @@ def hiding(views: ViewEvidence, poses: PoseEvidence | None, *, photons: bool = T
     their corners do not say where they are. Arguments as for `data_lack`.
     """
     found = []
-    if photons and views.room_flux > MOST_ROOM_FLUX.always:
-        found.append(_room_light(views.room_flux, MOST_ROOM_FLUX.always))
-    if views.used >= _FEWEST_TO_JUDGE and poses is not None and poses.board_rad < LEAST_BOARD_RAD.always:
-        found.append(_too_far(poses, LEAST_BOARD_RAD.always))
+    if photons and views.room_flux > MOST_ROOM_FLUX[0]:
+        found.append(_room_light(views.room_flux, MOST_ROOM_FLUX[0]))
+    if views.used >= _FEWEST_TO_JUDGE and poses is not None and poses.board_rad < LEAST_BOARD_RAD[0]:
+        found.append(_too_far(poses, LEAST_BOARD_RAD[0]))
     return found
 
 
@@ -226,15 +213,15 @@ def _too_few(views: ViewEvidence) -> Reason:
 
 def _poses_lack(poses: PoseEvidence, imprecise: bool) -> list[Reason]:
     found = []
-    least = LEAST_TILT_RAD.at(imprecise)
+    least = LEAST_TILT_RAD[imprecise]
     if poses.tilt_rad < least:
         text = (
             f"no two boards are tilted more than {math.degrees(poses.tilt_rad):.0f} degrees against each other, "
             f"{math.degrees(least):.0f} are needed"
         )
         found.append(reason_for("no-tilt", text, poses.tilt_rad, least))
-    if LEAST_BOARD_RAD.always <= poses.board_rad < LEAST_BOARD_RAD.at(imprecise):
-        found.append(_too_far(poses, LEAST_BOARD_RAD.at(imprecise)))
+    if LEAST_BOARD_RAD[0] <= poses.board_rad < LEAST_BOARD_RAD[imprecise]:
+        found.append(_too_far(poses, LEAST_BOARD_RAD[imprecise]))
     return found
 
 
@@ -255,10 +242,7 @@ _SPEEDS = "scan both ways (scan.bidirectional), at two speeds or more (scan.expo
 
 
 def lag_lack(velocities_per_s: Sequence[float], *, mean_will_do: bool) -> list[Reason]:
-    """Reasons why sweeps at these signed velocities do not tell both lags.
-
-    mean_will_do: planes found with the mean of both lags at one speed are right at that speed, both ways.
-    """
+    """Reasons why sweeps do not tell both lags. mean_will_do: of planes, which are right at one speed, both ways."""
     ways = {velocity > 0 for velocity in velocities_per_s}
     if not ways:
         return []
@@ -348,11 +332,7 @@ _SEEN_AT_ONCE = ("no-board", "wrong-board", "board-half-out", "mirrored", "two-b
 
 
 def _contradictions(fit: FitEvidence, asked: AccuracyGoal, imprecise: bool) -> list[Reason]:
-    """Reasons that no one rig can have made. Sweeps of one view that differ tell waves from a rig that moved in
-    between.
-
-    Where the result would be precise but for the misfit, less than the accuracy asked is the cause already.
-    """
+    """Reasons that no one rig can have made. If the misfit alone makes it imprecise, less than what is asked is one."""
     limit = asked.accuracy_m
     grown = math.sqrt(max(fit.misfit, 1.0))
     if imprecise and fit.expected_m <= limit * grown and fit.worst_m <= WORST_TIMES * limit * grown:

@@ -46,16 +46,9 @@ _READS_ON = ("is ", "has ", "runs ", "begins ")
 _WORDS = {True: "true", False: "false", None: "null"}
 
 
-def _no_kinds(name: str, content: Any) -> None:
-    """No other model: every section has one."""
-
-
 @dataclass(frozen=True)
 class ValueSources:
-    """The origin of values: a file with the line of each key, and the keys that were given as options.
-
-    lines_of: called only once there is something wrong. flags: the command line's names of some keys.
-    """
+    """The origin of values: a file with each key's line, and the keys given as options, with their names there."""
 
     file: str
     lines_of: Callable[[], Mapping[Key, int]] = dict
@@ -134,7 +127,7 @@ def validated(
     model: type[Model],
     content: Mapping[str, Any],
     sources: ValueSources,
-    kind_of: KindOf = _no_kinds,
+    kind_of: KindOf = lambda name, content: None,
     context: Mapping[str, Any] | None = None,
 ) -> Model:
     """The content as a model. Raises FileError with a line for each problem, in the order of the file.

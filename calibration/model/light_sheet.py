@@ -40,10 +40,7 @@ def inverse_depth(u: ArrayLike, v: ArrayLike, planes: ArrayLike) -> Array:
 
 
 def depth(u: ArrayLike, v: ArrayLike, planes: ArrayLike) -> Array:
-    """Depth z (m) of rays (u, v) on planes (..., 4), |n| = 1; NaN where they do not meet in front of the camera.
-
-    Nor do they where they are nearly parallel: z is at most 1 / NEARLY_PARALLEL times the plane's distance.
-    """
+    """Depth z (m) of rays (u, v) on planes (..., 4), |n| = 1; NaN where nearly parallel or behind the camera."""
     inverse = inverse_depth(u, v, planes)
     with np.errstate(all="ignore"):
         length = np.sqrt(np.square(np.asarray(u, np.float64)) + np.square(np.asarray(v, np.float64)) + 1)
@@ -86,10 +83,7 @@ _CONVERGED = 1e-12
 
 @dataclass(frozen=True, slots=True, eq=False)
 class LightSheets:
-    """Sheets of any shape (...): planes (..., 4), |n| = 1, and how they bow.
-
-    origin_m: (3,) O. middle, across: (..., 3) unit vectors f and t. bow_per_rad: 0 for planes.
-    """
+    """Sheets (...): planes (..., 4), |n| = 1; O (3,); unit vectors f and t (..., 3); the bow, 0 for planes."""
 
     planes: Array
     origin_m: Array

@@ -148,10 +148,7 @@ SPEED_MARGIN: Final = 0.05
 
 
 def lag_groups(velocities_per_s: ArrayLike) -> tuple[tuple[str, ...], ...]:
-    """The lags that sweeps at these signed velocities tell: groups of names, each of one value.
-
-    Both lags are one where they cannot be told apart, and where one way was never swept; none: nothing is told.
-    """
+    """The lags that sweeps tell, in groups of one value each: both in one where nothing tells them apart, or none."""
     up, down = _speeds(velocities_per_s)
     several = _several(up) or _several(down)
     if several and up.size and down.size:
@@ -165,10 +162,7 @@ def one_speed(velocities_per_s: ArrayLike) -> bool:
 
 
 def untold(velocities_per_s: Sequence[float]) -> Array:
-    """(n, 3): changes of (position, lag forward, lag backward), in seconds and command units, that no sweep shows.
-
-    Each has a lag of 1 s; nothing at all where there are no sweeps.
-    """
+    """(n, 3): changes of (position, lag forward, lag backward) that no sweep shows, each with a lag of 1 s."""
     velocity = np.asarray(velocities_per_s, np.float64)
     if velocity.size == 0:
         return np.zeros((0, 3))

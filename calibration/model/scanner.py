@@ -40,10 +40,7 @@ class Scanner(Protocol):
 
 @dataclass(frozen=True, eq=False)
 class PlaneTable:
-    """Planes sampled at increasing commands, linear in between (n and d together, then renormalised).
-
-    command: (n,) float64, strictly increasing. rows: (n, 4) float64 nx, ny, nz, d in metres, any sign, any length of n.
-    """
+    """Planes at increasing commands (n,), linear in between: rows (n, 4) nx, ny, nz, d in metres, of any length."""
 
     command: Array
     rows: Array

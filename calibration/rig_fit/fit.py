@@ -170,6 +170,7 @@ class SweepFit:
     board lies off the light.
     """
 
+    view: str
     direction: int
     speed_per_s: float
     x_px: Array
@@ -192,6 +193,7 @@ def sweep_fits(seen: Sighting, residual: Array, state: RigState, view: int) -> t
         velocity = seen.velocity_per_s[sweep]
         found.append(
             SweepFit(
+                view=seen.name,
                 direction=1 if velocity[0] > 0 else -1,
                 speed_per_s=float(abs(velocity[0])),
                 x_px=seen.x_px[sweep],
@@ -235,6 +237,11 @@ class RigFit:
     information: Array
 
     @property
+    def every_sweep(self) -> list[SweepFit]:
+        """The sweeps of all views."""
+        return [sweep for sweeps in self.sweeps for sweep in sweeps]
+
+    @property
     def used(self) -> tuple[str, ...]:
         """Names of the views whose passages had a say."""
         pairs = zip(self.views, self.sweeps, strict=True)
@@ -255,11 +262,7 @@ class RigFit:
 def result_of(
     fit: Rounds, left_out: tuple[str, ...], board: Board, start: RigModel | None, velocities: Array
 ) -> RigFit:
-    """The result of rounds that have run.
-
-    left_out: names of views without corners. start: the model whose source, defects and command range are kept, None
-    for none. velocities: (sweeps,) of all sweeps, per second. Raises Degenerate where depth is next to unknown.
-    """
+    """The result of rounds that have run, its model else as `start` is. Degenerate where depth is next to unknown."""
     assert fit.solution is not None
     problem, solution, state = fit.problem, fit.solution, fit.state
     names = np.array(problem.terms.names)
@@ -341,7 +344,8 @@ def fit_rig(
     if not shown:
         check_views(views, ())
     camera = _first_camera(shown, board, size, camera, start)
-    poses = [_pose_of(view, board, camera) for view in shown]
+    seen = [view.corners for view in shown if view.corners is not None]
+    poses = [first_pose(camera, board.corners_m[one.ids], np.asarray(one.px, np.float64)) for one in seen]
     sightings = tuple(sighting(view, board, camera, pose) for view, pose in zip(shown, poses, strict=True))
     check_views(views, sightings)
     terms = Terms(camera.distortion.size)
@@ -387,11 +391,6 @@ def _first_camera(
             "calibrate the camera without the tilt of the sensor"
         )
     return camera
-
-
-def _pose_of(view: View, board: Board, camera: Camera) -> BoardPose:
-    assert view.corners is not None
-    return first_pose(camera, board.corners_m[view.corners.ids], np.asarray(view.corners.px, np.float64))
 
 
 def _first_state(

@@ -168,10 +168,7 @@ def bin_starts(seen: Sighting, reach: float) -> NDArray[np.int64]:
 
 
 def tail_weight(normalised: Array, usual: float = 1 / MAD_TO_SD) -> Array:
-    """Weight of errors in standard deviations, among others of their kind: where all are large, none is an outlier.
-
-    usual: the median of such errors' sizes, that of a normal distribution where nothing else is said.
-    """
+    """Weight of errors in sds, among others whose sizes' median is `usual`: where all are large, none is an outlier."""
     away = np.abs(normalised)
     if away.size:
         away = away / max(1.0, float(np.median(away)) / usual)

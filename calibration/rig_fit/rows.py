@@ -165,10 +165,7 @@ def passage_rows(
     model: RigModel, terms: Terms, timing: Array, pose: BoardPose, rays: Array, command: Array, y_px: Array,
     velocity_per_s: Array,
 ) -> Rows:  # fmt: skip
-    """Rows of passages with the rays (2, m) of their pixels; residuals in units of the command.
-
-    timing: (3,) lags up and down and row delay, in place of the model's.
-    """
+    """Rows of passages with rays (2, m), in units of the command. timing: (3,) both lags and row delay."""
     assert isinstance(model.scanner, PivotScanner)
     u, v = rays
     ray = np.stack([u, v, np.ones_like(u)], axis=-1)

@@ -190,10 +190,7 @@ class RigSolution:
 
 
 def solved(problem: RigProblem, state: RigState, noise: Noise, *, roughly: bool = False) -> RigSolution:
-    """The best state under this noise, or as near to it as a few steps lead; roughly: as near as decisions need.
-
-    Raises Degenerate where the equations have no single solution.
-    """
+    """The best state under this noise; roughly: as near as decisions need. Degenerate: there is no single one."""
     rows = all_rows(state, problem.sightings, problem.terms)
     damping = 0.0
     for step in range(MOST_STEPS):

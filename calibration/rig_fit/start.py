@@ -238,11 +238,7 @@ def check_depth(
     misfit: float = 1.0,
     outliers: Sequence[str] = (),
 ) -> None:
-    """Raise Degenerate where the poses of a fitted model tell next to nothing of depth.
-
-    misfit: by which its variances were widened since the data contradict each other; that says nothing of the poses.
-    outliers: names of the views that had no say, whose poses are none of these.
-    """
+    """Raise Degenerate where poses tell next to nothing of depth, the misfit of contradictions taken off."""
     camera = model.camera
     x, y = np.meshgrid(np.linspace(0.1, 0.9, 7) * camera.width, np.linspace(0.1, 0.9, 5) * camera.height)
     for at_m in (AT_M, float(np.median([np.linalg.norm(pose.position_m) for pose in poses]))):

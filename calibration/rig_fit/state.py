@@ -129,10 +129,7 @@ def _on_board(sweep: Passages, board: Board, camera: Camera, pose: BoardPose) ->
 
 @dataclass(frozen=True, slots=True, eq=False)
 class RigState:
-    """model: camera and PivotScanner, its lags 0. timing: (3,) lag_forward, lag_backward, row_delay in s, any sign.
-
-    poses, rays ((2, m) of the passages' pixels): per view.
-    """
+    """The model, its lags 0; timing (3,): both lags, row delay in s, any sign; per view poses, rays (2, m)."""
 
     model: RigModel
     timing: Array

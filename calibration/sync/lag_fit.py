@@ -110,10 +110,7 @@ class Solved:
 
 
 def solve(seen: SharedPixels, designs: Sequence[Array]) -> Solved:
-    """Weighted least squares, each pixel's own position taken out, and outliers.
-
-    Raises Degenerate where what the sweeps share does not tell every design from the others.
-    """
+    """Weighted least squares without pixels' own positions and outliers. Degenerate: designs cannot be told apart."""
     basis = np.stack([np.broadcast_to(each, seen.command.shape) for each in designs], axis=2)
     weight, noise = seen.weight, 1.0
     for _ in range(6):

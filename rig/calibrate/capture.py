@@ -56,8 +56,6 @@ MOST_LAG_S = 5e-4
 """Seconds; longest lag that is allowed for: small galvos follow their command within 100 to 300 us."""
 MOST_SWEEPS = 4
 """Most sweeps of a recording that are looked at."""
-PLAIN = {"estimator": "argmax", "filter": "none", "temporal_prior": False}
-"""Estimate settings of a scan whose maps nobody wants."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -114,6 +112,12 @@ def capture_recorded(run: Path, name: str, board: Board | None, *, defects: NDAr
         return _captured(rig, name, board, min(maps, MOST_SWEEPS), defects, None)
 
 
+def plain(config: RigConfig) -> RigConfig:
+    """The config of a scan whose maps nobody wants: its estimator leaves the counts whole."""
+    update = {"estimator": "argmax", "filter": "none", "temporal_prior": False}
+    return config.model_copy(update={"estimate": config.estimate.model_copy(update=update)})
+
+
 def _settings(config: RigConfig, exposures: int | None, *, bidirectional: bool) -> RigConfig:
     """The config of a capture. UsageError for a rig of several lines."""
     if len(config.line_offsets) > 1:
@@ -127,7 +131,7 @@ def _settings(config: RigConfig, exposures: int | None, *, bidirectional: bool) 
             scan = type(scan).model_validate({**scan.model_dump(mode="json"), "exposures": exposures})
         except ValidationError as error:
             raise UsageError(f"exposures {exposures}: {error.errors()[0]['msg']}") from error
-    return config.model_copy(update={"scan": scan, "estimate": config.estimate.model_copy(update=PLAIN)})
+    return plain(config.model_copy(update={"scan": scan}))
 
 
 def _captured(

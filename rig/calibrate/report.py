@@ -21,14 +21,13 @@ from calibration.board.board import Board
 from calibration.camera_fit import CameraFit
 from calibration.check import CheckedBoard
 from calibration.depth_error import DepthUncertainty
-from calibration.diagnosis.camera import JudgedCamera
-from calibration.diagnosis.contradictions import SweepResidual, SweepWaves
-from calibration.diagnosis.rig import JudgedRig
+from calibration.diagnosis.contradictions import SweepWaves
+from calibration.diagnosis.verdicts import JudgedCamera, JudgedRig
 from calibration.errors import digits, in_mm, mm
 from calibration.model.camera import Camera
 from calibration.model.rig_model import Identity
 from calibration.pixel_map import PixelDrift, PixelMap, PixelVersion
-from calibration.rig_fit.fit import RigFit
+from calibration.rig_fit.fit import RigFit, SweepFit
 from calibration.sync.lag_fit import SyncFit
 from calibration.verdict import Verdict
 from calibration.views import BoardPose, View
@@ -242,7 +241,7 @@ def _at(x: float, y: float, scale: float) -> tuple[int, int]:
 _WAYS = {1: "rising command", -1: "falling command"}
 
 
-def plane_residuals(waves: SweepWaves, sweeps: Sequence[SweepResidual], metres_per_command: float, at_m: float) -> str:
+def plane_residuals(waves: SweepWaves, sweeps: Sequence[SweepFit], metres_per_command: float, at_m: float) -> str:
     """Chart (SVG) of each sweep's median residuals over the command, in mm of depth at `at_m`, a panel each way."""
     views = list(dict.fromkeys(sweep.view for sweep in sweeps))
     panels = [
@@ -285,7 +284,7 @@ def planes_report(
     """Report on a calibration of camera and planes. about: rows of `subject`, as in the other reports."""
     by_name = {view.name: view for view in views}
     used = [by_name[name] for name in fit.views]
-    planes = plane_residuals(judged.waves, judged.residuals, judged.sensitivity.per_command_m, judged.asked.at_m)
+    planes = plane_residuals(judged.waves, fit.every_sweep, judged.sensitivity.per_command_m, judged.asked.at_m)
     sections = [
         *camera_sections(fit.model.camera, used, fit.corner_residual_px),
         ReportSection("Residuals of the planes", planes),

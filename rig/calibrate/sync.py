@@ -22,7 +22,7 @@ import numpy as np
 
 from calibration.arrays import Array
 from calibration.depth_error import sensitivity
-from calibration.diagnosis.rig import goal, judge_sync
+from calibration.diagnosis.verdicts import goal, judge_sync
 from calibration.errors import CalibrationError, Degenerate, digits
 from calibration.files.rig_file import load_rig_model
 from calibration.model.rig_model import RigModel
@@ -89,12 +89,7 @@ class GateDelay:
 
 
 def run_sync(sources: SourcesLike, request: SyncRequest, *, tell: TellLine | None = None) -> CalibrationResult:
-    """Measure the lags. They go into a copy of the live rig's model, or of the one that is named; without one only the
-    figures are written.
-
-    Raises Degenerate where the sweeps cannot tell, CalibrationError where the file cannot be read or its line does not
-    reach the distance asked.
-    """
+    """Measure the lags, for a copy of the model if there is one. Degenerate, CalibrationError: they cannot be told."""
     values = si_values(request)
     found, file = sort_sources(sources, scene=request.scene), request.calibration
     live = found.live
@@ -218,11 +213,7 @@ def _figures(fit: SyncFit, gate: GateDelay | None, truth: RigModel | None) -> Se
 
 
 def gate_delay(run: Path) -> GateDelay | None:
-    """Measure the gate's delay in a recorded run.
-
-    None where its SPAD carries no markers: the light itself gives the time then. UsageError where the run has no plan,
-    ProtocolError where it has no frames.
-    """
+    """Measure the gate's delay in a recorded run; None without markers, where the light itself gives the time."""
     plan = read_plan(run)
     if plan.blanking is not None:
         return None
