@@ -10,6 +10,12 @@ from calibration.model.rig_model import RigModel
 from tests.reference.boards.calibration_data import TrueRig, points_at
 
 
+def normalised(model: RigModel, rig: TrueRig, depth_m: float, velocity_per_s: float) -> float:
+    """Root mean square of the errors in units of their stated sd: 1 where the covariance is right, on average."""
+    error, sd = depth_errors(model, rig, depth_m, velocity_per_s)
+    return float(np.sqrt(np.mean((error / sd) ** 2)))
+
+
 def depth_errors(
     model: RigModel, rig: TrueRig, depth_m: float, velocity_per_s: float, seed: int = 0, count: int = 60
 ) -> tuple[Array, Array]:

@@ -60,14 +60,6 @@ def test_the_bundled_rig_sweeps_its_stated_tangents() -> None:
     model.check_sensor(512, 512)
 
 
-def test_planes_beside_the_file_or_inside_it_are_the_same_model(tmp_path: Path) -> None:
-    np.save(tmp_path / "planes.npy", [[1, 0, 0.3, -0.3], [1, 0, 0, -0.3], [1, 0, -0.3, -0.3]])
-    inside = load_rig_model(write(tmp_path, HEAD + CAMERA + ROWS))
-    beside = load_rig_model(write(tmp_path, HEAD + CAMERA + "planes: planes.npy\n"))
-    assert inside.fingerprint() == beside.fingerprint()
-    assert inside.scanner.command_range == (0, 2)
-
-
 @pytest.mark.parametrize("scanner", [pivot(), table()], ids=["pivot", "table"])
 @pytest.mark.parametrize("defects", [None, np.eye(512, dtype=bool)], ids=["no defects", "defects"])
 def test_what_is_saved_is_read_back(
@@ -153,7 +145,6 @@ def test_the_fingerprint_changes_with_what_depth_depends_on() -> None:
     [
         ("", "is empty; a calibration must hold keys and values, e.g. 'format: spadrig-calibration'"),
         ("just: text", "first entry must be"),
-        ("[1, 2", "not YAML"),
         ("format: spadrig-calibration\nversion: 2\n", "has version 2; this program reads version 1"),
         (HEAD + ROWS, "'camera' is missing"),
         (HEAD + CAMERA, "exactly one of 'planes' and 'scanner'"),
@@ -161,12 +152,10 @@ def test_the_fingerprint_changes_with_what_depth_depends_on() -> None:
         (HEAD + CAMERA.replace("512", "wide", 1) + ROWS, "camera.width is 'wide'"),
         (HEAD + CAMERA.replace("-0.1, ", "") + ROWS + "lag_s: {forward: .nan}\n", "lag_s.forward is nan"),
         (HEAD + CAMERA.replace("-0.1, 0", "0") + "planes: none.npy\n", "does not exist"),
-        (HEAD + CAMERA + "planes: calibration.yaml\n", "is not a readable .npy"),
         (HEAD + CAMERA + "planes: [[1, 0, 0]]\n", "planes.0"),
         (HEAD + CAMERA + "planes: []\n", "nx, ny, nz, d"),
         (HEAD + CAMERA + "planes: [[0.5, 0.6, 0, 1]]\n", "degrees from the search axis"),
         (HEAD + CAMERA.replace("[-0.1, 0, 0, 0, 0]", "[1, 2]") + ROWS, "distortion has 2 terms"),
-        (HEAD + CAMERA + "scanner: {}\n", "exactly one of 'table' and 'pivot'"),
         (HEAD + CAMERA + ROWS + "defects: planes.npy\n", "it must be bool"),
         (HEAD + CAMERA + ROWS + "lag_s: {forward: -1.0}\n", "lag_s is"),
         (HEAD + CAMERA + ROWS + "row_delay_s: .inf\n", "row_delay_s is inf"),
@@ -178,7 +167,6 @@ def test_the_fingerprint_changes_with_what_depth_depends_on() -> None:
         ),
         (HEAD + CAMERA + ROWS + "identity: {rig: a, created: b, verdict: fine}\n", "identity.verdict is 'fine'"),
         (HEAD + CAMERA + ROWS + "provenance: {velocities_per_s: fast}\n", "provenance.velocities_per_s is 'fast'"),
-        (HEAD + CAMERA + ROWS + "provenance: {velocities_per_s: [a]}\n", "provenance.velocities_per_s.0 is 'a'"),
         (HEAD + CAMERA + ROWS + "provenance: {corners: 35.2}\n", "provenance.corners is 35.2"),
     ],
 )
@@ -202,17 +190,15 @@ def test_an_absent_or_binary_file_is_refused(tmp_path: Path) -> None:
         load_rig_model(tmp_path / "planes.npy")
 
 
-def test_another_sensor_is_refused() -> None:
-    with pytest.raises(CalibrationError, match="512 x 512 pixels, this one has 320 x 240"):
-        RigModel(camera([]), table()).check_sensor(320, 240)
-
-
-def test_a_speed_the_lag_was_not_measured_at_is_refused() -> None:
-    model = RigModel(camera([]), table(), speed_range_per_s=(10, 100))
+def test_another_sensor_and_another_speed_are_refused(tmp_path: Path) -> None:
+    np.save(tmp_path / "planes.npy", [[1, 0, 0.3, -0.3], [1, 0, 0, -0.3], [1, 0, -0.3, -0.3]])
+    model = load_rig_model(write(tmp_path, HEAD + CAMERA + "planes: planes.npy\nspeed_range_per_s: [10, 100]\n"))
+    assert model.scanner.command_range == (0, 2)
     model.check_speed(50)
-    RigModel(camera([]), table()).check_speed(1e9)
     with pytest.raises(CalibrationError, match="outside the 10 to 100 /s"):
         model.check_speed(200)
+    with pytest.raises(CalibrationError, match="512 x 512 pixels, this one has 320 x 240"):
+        model.check_sensor(320, 240)
 
 
 def test_planes_along_the_search_axis_are_refused_whatever_their_sign() -> None:
