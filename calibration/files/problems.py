@@ -102,7 +102,8 @@ class _Schema:
 
     def of(self, name: str, info: FieldInfo, content: Any) -> type[BaseModel] | None:
         """The model of what a field holds, where it holds mappings."""
-        return self.kind_of(name, content) or _model_in(info.annotation)
+        models = (kind for kind in plain_types(info.annotation) if issubclass(kind, BaseModel))
+        return self.kind_of(name, content) or next(models, None)
 
     def field(self, key: Key) -> FieldInfo | None:
         """The field at `key`; for an item of a list, the list's."""
@@ -206,10 +207,14 @@ def _number_words(annotation: Any) -> str | None:
 
 def plain_types(annotation: Any) -> Iterator[type]:
     """The types that a field's annotation is made of."""
-    if isinstance(annotation, type) and not getattr(annotation, "__args__", ()):
-        yield annotation
+    return (part for part in _parts(annotation) if isinstance(part, type) and not getattr(part, "__args__", ()))
+
+
+def _parts(annotation: Any) -> Iterator[Any]:
+    """An annotation, then all that it is made of."""
+    yield annotation
     for part in getattr(annotation, "__args__", ()):
-        yield from plain_types(part)
+        yield from _parts(part)
 
 
 def _key(problem: ErrorDetails, content: Any) -> Key:
@@ -279,15 +284,11 @@ def _text(problems: list[ErrorDetails], key: Key, schema: _Schema, flag: str | N
 
 def _limit(info: FieldInfo | None, value: float) -> str:
     """A limit in the unit of its field, where that has one: its metadata then knows how numbers are `written`."""
-    marks = [] if info is None else [*info.metadata, *_metadata(info.annotation)]
+    marks = [] if info is None else list(info.metadata)
+    for part in () if info is None else _parts(info.annotation):
+        marks += getattr(part, "__metadata__", ())
     written = next((mark.written for mark in marks if hasattr(mark, "written")), None)
     return f"{float(value):g}" if written is None else str(written(value))
-
-
-def _metadata(annotation: Any) -> Iterator[Any]:
-    yield from getattr(annotation, "__metadata__", ())
-    for part in getattr(annotation, "__args__", ()):
-        yield from _metadata(part)
 
 
 def _asked_for(problem: ErrorDetails) -> str:
@@ -324,9 +325,3 @@ def _meant(value: object, expected: str) -> str:
 def _shown(value: object) -> str:
     text = _WORDS[value] if value is None or isinstance(value, bool) else repr(value)
     return text if len(text) <= MAX_VALUE_CHARACTERS else f"{text[: MAX_VALUE_CHARACTERS - 3]}..."
-
-
-def _model_in(annotation: Any) -> type[BaseModel] | None:
-    if isinstance(annotation, type) and issubclass(annotation, BaseModel):
-        return annotation
-    return next((found for part in getattr(annotation, "__args__", ()) if (found := _model_in(part)) is not None), None)

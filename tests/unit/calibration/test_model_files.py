@@ -1,6 +1,6 @@
 """The calibration file: what is written is read back, and what is wrong is said in one line."""
 
-from dataclasses import replace
+from dataclasses import fields, is_dataclass, replace
 from pathlib import Path
 
 import numpy as np
@@ -60,56 +60,34 @@ def test_the_bundled_rig_sweeps_its_stated_tangents() -> None:
     model.check_sensor(512, 512)
 
 
-@pytest.mark.parametrize("scanner", [pivot(), table()], ids=["pivot", "table"])
-@pytest.mark.parametrize("defects", [None, np.eye(512, dtype=bool)], ids=["no defects", "defects"])
-def test_what_is_saved_is_read_back(
-    tmp_path: Path, scanner: PivotScanner | PlaneTable, defects: np.ndarray | None
-) -> None:
-    model = RigModel(
-        camera=camera([-0.3, 0.1, 0.001, 0.001, 0.01]),
-        scanner=scanner,
-        lag_s=Lag(1e-4, 3e-4),
-        speed_range_per_s=(10.0, 400.0),
-        source_m=np.array([-0.3, 0, 0]),
-        defects=defects,
-        provenance={"rig": "bench", "velocities_per_s": [-35.2, 35.2], "residual_px": 0.1},
-    )
+def same(one: object, other: object) -> bool:
+    """Whether two parts of a model are equal to the last bit."""
+    if is_dataclass(one):
+        given = [field.name for field in fields(one) if field.init]
+        return type(one) is type(other) and all(same(getattr(one, name), getattr(other, name)) for name in given)
+    return np.array_equal(one, other) if isinstance(one, np.ndarray) else one == other
+
+
+PLAIN = RigModel(
+    camera=camera([-0.3, 0.1, 0.001, 0.001, 0.01]), scanner=table(), lag_s=Lag(1e-4, 3e-4),
+    speed_range_per_s=(10.0, 400.0), source_m=np.array([-0.3, 0, 0]), defects=np.eye(512, dtype=bool),
+    provenance={"rig": "bench", "velocities_per_s": [-35.2, 35.2], "residual_px": 0.1},
+)  # fmt: skip
+FULL = RigModel(
+    camera([-0.1, 0, 0, 0]), replace(pivot(), offset_m=np.array([1e-3, 1 / 3]), cone_rad=0.01, bow_per_rad=-0.02),
+    dark_rate_per_s=np.full((512, 512), 1 / 3, np.float32), row_delay_s=1e-8, gate_delay_s=2e-6, colour_skew_s=-1e-6,
+    marker_rising=False, covariance=Covariance(("fx", "axis_shift_1"), np.array([[0.04, 1e-5], [1e-5, 1e-8]])),
+    identity=Identity("0f3a", "2026-11-22T10:00:00+00:00", "bench", {"spad": "usb"}, {"spad": "7"}, "failed", ("a",)),
+)  # fmt: skip
+
+
+@pytest.mark.parametrize("model", [PLAIN, FULL, RigModel(camera([]), pivot())], ids=["table", "full", "bare"])
+def test_what_is_saved_is_read_back(tmp_path: Path, model: RigModel) -> None:
     save_rig_model(model, tmp_path / "rig.yaml")
     again = load_rig_model(tmp_path / "rig.yaml")
+    assert same(again, model)
     assert again.fingerprint() == model.fingerprint()
-    assert (again.lag_s, again.speed_range_per_s) == (model.lag_s, model.speed_range_per_s)
-    assert again.provenance == model.provenance
-    assert np.array_equal(again.camera.tangents()[0], model.camera.tangents()[0])
-    assert (defects is None) == (again.defects is None)
     assert not list(tmp_path.glob(".*"))
-
-
-def test_what_a_calibration_finds_out_is_saved_and_read_back(tmp_path: Path) -> None:
-    scanner = replace(pivot(), offset_m=np.array([1e-3, 1 / 3]), cone_rad=0.01, bow_per_rad=-0.02)
-    identity = Identity(
-        "0f3a", "2026-11-22T10:00:00+00:00", "bench", {"spad": "spb-usb"}, {"spad": "7"}, "failed", ("no-tilt",)
-    )
-    model = RigModel(
-        camera([-0.1, 0, 0, 0]),
-        scanner,
-        dark_rate_per_s=np.full((512, 512), 1 / 3, np.float32),
-        row_delay_s=1e-8,
-        gate_delay_s=2e-6,
-        colour_skew_s=-1e-6,
-        marker_rising=False,
-        covariance=Covariance(("fx", "axis_shift_1"), np.array([[0.04, 1e-5], [1e-5, 1e-8]])),
-        identity=identity,
-    )
-    save_rig_model(model, tmp_path / "rig.yaml")
-    again = load_rig_model(tmp_path / "rig.yaml")
-    assert again.fingerprint() == model.fingerprint()
-    assert np.array_equal(again.scanner.turned([-1, 0.3]), scanner.turned([-1, 0.3]))
-    assert again.identity == identity
-    for name in ("row_delay_s", "gate_delay_s", "colour_skew_s", "marker_rising"):
-        assert getattr(again, name) == getattr(model, name)
-    assert np.array_equal(again.dark_rate_per_s, model.dark_rate_per_s)
-    assert again.covariance.names == ("fx", "axis_shift_1")
-    assert np.array_equal(again.covariance.matrix, model.covariance.matrix)
 
 
 def test_files_and_fingerprints_of_models_without_all_that_are_what_they_were(tmp_path: Path) -> None:
