@@ -8,7 +8,7 @@ from typing import Any, NamedTuple
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from calibration.arrays import Array
+from calibration.arrays import Array, set_frozen
 from calibration.errors import CalibrationError
 from calibration.model.camera import Camera
 from calibration.model.light_sheet import LightSheets, fan_origin, light_sheets
@@ -46,10 +46,7 @@ class Covariance:
         unit = np.divide(matrix, scale, out=np.zeros_like(matrix), where=scale > 0)
         if np.any(np.abs(unit - unit.T) > _ASYMMETRY) or np.any(matrix[scale == 0]) or _least(unit) < -_ASYMMETRY:
             raise CalibrationError("covariance is not symmetric and positive, as one must be; fit the model again")
-        matrix = 0.5 * (matrix + matrix.T)
-        matrix.flags.writeable = False
-        object.__setattr__(self, "names", names)
-        object.__setattr__(self, "matrix", matrix)
+        set_frozen(self, names=names, matrix=0.5 * (matrix + matrix.T))
 
     def of(self, names: Sequence[str]) -> Array:
         """The matrix of some of the parameters, in this order."""

@@ -10,7 +10,7 @@ from typing import Protocol
 import numpy as np
 from numpy.typing import ArrayLike
 
-from calibration.arrays import Array
+from calibration.arrays import Array, set_frozen
 from calibration.errors import CalibrationError
 
 _ROUNDING = 1e-15
@@ -70,10 +70,7 @@ class PlaneTable:
         rows[1:][np.cumsum(turned) % 2 == 1] *= -1
         if np.sum(rows[:, 0]) < 0:
             rows *= -1
-        command.flags.writeable = False
-        rows.flags.writeable = False
-        object.__setattr__(self, "command", command)
-        object.__setattr__(self, "rows", rows)
+        set_frozen(self, command=command, rows=rows)
 
     @property
     def command_range(self) -> tuple[float, float]:
@@ -142,12 +139,8 @@ class PivotScanner:
         ):
             if not abs(size) <= most:
                 raise CalibrationError(f"pivot scanner's {what} is {size:g}; it must lie within -{most:g} and {most:g}")
-        parts = {"axis_point_m": point, "axis_direction": axis, "zero_normal": normal}
-        parts |= {"angle_rad": angle, "offset_m": offset}
-        for name, value in parts.items():
-            value.flags.writeable = False
-            object.__setattr__(self, name, value)
-        object.__setattr__(self, "command_range", (float(low), float(high)))
+        set_frozen(self, axis_point_m=point, axis_direction=axis, zero_normal=normal, angle_rad=angle, offset_m=offset)
+        set_frozen(self, command_range=(float(low), float(high)))
 
     def planes(self, commands: ArrayLike) -> Array:
         """Planes (..., 4) for commands (...). Raises CalibrationError outside command_range."""
