@@ -31,6 +31,7 @@ from calibration.arrays import Array
 from calibration.board.board import Board, spread_rad
 from calibration.errors import Degenerate, mm
 from calibration.model.camera import Camera
+from calibration.model.light_sheet import fan_origin
 from calibration.model.parameters import lag_groups, one_speed
 from calibration.model.scanner import PivotScanner, Scanner
 from calibration.rig_fit.start import unfit
@@ -114,10 +115,7 @@ def rough_poses(views: Sequence[View], board: Board, camera: Camera) -> list[Boa
 
 def baseline_m(scanner: Scanner) -> float:
     """Distance of the camera from the axis that the line turns about; NaN where the scanner is a table of planes."""
-    if not isinstance(scanner, PivotScanner):
-        return float("nan")
-    along = float(scanner.axis_direction @ scanner.axis_point_m)
-    return float(np.linalg.norm(scanner.axis_point_m - along * scanner.axis_direction))
+    return float(np.linalg.norm(fan_origin(scanner, None))) if isinstance(scanner, PivotScanner) else math.nan
 
 
 def _outline_area(px: Array) -> float:

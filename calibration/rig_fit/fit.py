@@ -14,7 +14,7 @@ import numpy as np
 
 from calibration.arrays import Array
 from calibration.board.board import Board
-from calibration.camera_fit import fit_camera
+from calibration.camera_fit import fit_camera, rms
 from calibration.errors import CalibrationError, Degenerate, digits
 from calibration.model.camera import Camera
 from calibration.model.parameters import SWEPT, lag_groups, speed_range
@@ -255,8 +255,7 @@ class RigFit:
     @property
     def corner_rms_px(self) -> float:
         """Root mean square of all corners' distances."""
-        squares = np.concatenate([np.sum(left**2, axis=1) for left in self.corner_residual_px])
-        return float(np.sqrt(squares.mean()))
+        return rms(np.concatenate(self.corner_residual_px))
 
 
 def result_of(

@@ -19,6 +19,7 @@ from numpy.polynomial import polynomial
 from numpy.typing import NDArray
 
 from calibration.arrays import Array
+from calibration.board.board import spread_rad
 from calibration.depth_error import command_at, depth_sd_m
 from calibration.errors import Degenerate, condition_text, digits
 from calibration.model.camera import Camera
@@ -211,9 +212,7 @@ def check_poses(points_m: Array, poses: Sequence[BoardPose]) -> None:
 
 def reason_of(poses: Sequence[BoardPose]) -> str:
     """The likeliest reason why boards at these poses fix too little: a guess, where `coplanar` is seen."""
-    normals = np.array([pose.matrix[:, 2] for pose in poses])
-    tilt = float(np.arccos(np.clip(normals @ normals.T, -1, 1).min()))
-    return "too-few-poses" if tilt >= LEAST_TILT_RAD and len(poses) < 6 else "no-tilt"
+    return "too-few-poses" if spread_rad(poses) >= LEAST_TILT_RAD and len(poses) < 6 else "no-tilt"
 
 
 def no_start(error: Exception, poses: Sequence[BoardPose]) -> Degenerate:

@@ -18,7 +18,7 @@ from numpy.typing import NDArray
 
 from calibration.arrays import Array
 from calibration.board.board import Board
-from calibration.camera_fit import CameraFit
+from calibration.camera_fit import CameraFit, rms
 from calibration.check import CheckedBoard
 from calibration.depth_error import DepthUncertainty
 from calibration.diagnosis.contradictions import SweepWaves
@@ -79,7 +79,8 @@ def page(
 
 def paragraph(text: str, *, small: bool = False) -> str:
     """Make a paragraph of plain text."""
-    return f"<p{' class=' + chr(34) + 'small' + chr(34) if small else ''}>{escape(text)}</p>"
+    kind = ' class="small"' if small else ""
+    return f"<p{kind}>{escape(text)}</p>"
 
 
 def table(head: Sequence[str], rows: Sequence[Sequence[str]]) -> str:
@@ -91,7 +92,8 @@ def table(head: Sequence[str], rows: Sequence[Sequence[str]]) -> str:
         return "".join(f"<{tag}{kind}>{escape(text)}</{tag}>" for kind, text in zip(kinds, row, strict=True))
 
     top = f"<tr>{cells(head, 'th')}</tr>" if any(head) else ""
-    return f"<table>{top}{''.join(f'<tr>{cells(row, chr(116) + chr(100))}</tr>' for row in rows)}</table>"
+    body = "".join(f"<tr>{cells(row, 'td')}</tr>" for row in rows)
+    return f"<table>{top}{body}</table>"
 
 
 def picture(pixels: Picture, caption: str) -> str:
@@ -332,9 +334,9 @@ def camera_report(
             name + (" (outlier)" if name in fit.outliers else ""),
             *pose_words(pose, board),
             f"{np.count_nonzero(used)} of {len(used)}",
-            f"{rms:.3f}",
+            f"{off_px:.3f}",
         )
-        for name, pose, used, rms in zip(fit.views, fit.poses, fit.used, fit.view_rms_px, strict=True)
+        for name, pose, used, off_px in zip(fit.views, fit.poses, fit.used, fit.view_rms_px, strict=True)
     ]
     head = ("view", "distance, m", "tilt, degrees", "corners used", "rms, px")
     shown = [view for view, px in zip(views, seen, strict=True) if len(px)]
@@ -405,14 +407,13 @@ def _views_section(fit: RigFit, judged: JudgedRig) -> ReportSection:
     worth = judged.sensitivity.per_command_m
     shifts = {one.name: one.shift for one in judged.shifts}
     for name, pose, residual, sweeps in zip(fit.views, fit.poses, fit.corner_residual_px, fit.sweeps, strict=True):
-        rms = float(np.sqrt(np.mean(np.sum(residual**2, axis=1)))) if len(residual) else np.nan
         shift = shifts.get(name, np.nan) * worth
         rows.append(
             (
                 name + (" (outlier)" if name in fit.outliers else ""),
                 *pose_words(pose, fit.board),
                 str(len(residual)),
-                f"{rms:.3f}",
+                f"{rms(residual):.3f}",
                 str(sum(len(sweep.residual) for sweep in sweeps)),
                 in_mm_with_sign(shift),
             )
