@@ -17,14 +17,13 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from calibration.board.board import Board, Coverage, coverage_of, spread_rad
-from calibration.errors import CalibrationError, Degenerate, condition_text
-from calibration.model.camera import TERM_COUNTS, Camera
+from calibration.arrays import Array, Mask
+from calibration.board.board import Board, spread_rad
+from calibration.errors import Degenerate, condition_text
+from calibration.model.camera import Camera
 from calibration.model.parameters import DISTORTION, MATRIX
 from calibration.model.rig_model import Covariance
 from calibration.views import LEAST_ACROSS_PX, NO_POSE, BoardPose, Corners, View, robust_sd
-
-Array = NDArray[np.float64]
 
 _POSE = 6
 """OpenCV's columns: rotation, position, then fx fy cx cy and the distortion."""
@@ -39,9 +38,7 @@ class Normal:
 
     @property
     def condition(self) -> float:
-        """Condition number of the matrix scaled to a unit diagonal, as in the parameters' best units; inf if
-        singular.
-        """
+        """Condition number of the matrix scaled to a unit diagonal; inf if singular."""
         scale = np.sqrt(np.diag(self.matrix))
         if not np.all(np.isfinite(scale)) or not np.all(scale > 0):
             return float("inf")
@@ -62,9 +59,7 @@ class Normal:
 def camera_normal(
     points_m: Sequence[Array], poses: Sequence[BoardPose], matrix: Array, distortion: Array, terms: int
 ) -> Normal:
-    """The normal equations of a camera with `terms` free terms of distortion that saw points (n, 3) of the board at
-    each of the poses.
-    """
+    """The normal equations of a camera with `terms` of distortion that saw points (n, 3) of the board at each pose."""
     total = np.zeros((4 + terms, 4 + terms))
     given = np.zeros(max(len(distortion), 5)) if terms <= 5 else np.zeros(14 if terms > 8 else 8)
     given[: len(distortion)] = distortion
@@ -77,8 +72,6 @@ def camera_normal(
         total += rest.T @ rest
     return Normal((*MATRIX, *DISTORTION[:terms]), total)
 
-
-Mask = NDArray[np.bool_]
 
 LEAST_SD_PX = 0.01
 """Least sd of corners: they are never better than this, however well they fit."""
@@ -272,7 +265,7 @@ class CameraFit:
 
     residual_px: (n, 2) float64 projected less seen, of every corner. used: (n,) bool, those in the fit. rms_px: of
     those, of the distance. outliers: names of the views that do not fit, wholly or in more than one corner. condition:
-    of the normal equations at unit diagonal. coverage: of the views that are in the fit.
+    of the normal equations at unit diagonal. spread_rad: largest angle between the boards that are in the fit.
     """
 
     camera: Camera
@@ -284,7 +277,7 @@ class CameraFit:
     covariance: Covariance
     condition: float
     outliers: tuple[str, ...]
-    coverage: Coverage
+    spread_rad: float
 
     @property
     def kept(self) -> tuple[str, ...]:
@@ -308,16 +301,12 @@ class CameraFit:
         return np.array([rms(residual) for residual in self.residual_px])
 
 
-def fit_camera(
-    views: Sequence[View], board: Board, size: tuple[int, int], *, distortion_terms: int = 5, robust: bool = True
-) -> CameraFit:
+def fit_camera(views: Sequence[View], board: Board, size: tuple[int, int], *, distortion_terms: int = 5) -> CameraFit:
     """The camera of pictures of `size` (width, height) from the corners in `views`.
 
-    distortion_terms: 0, 4, 5, 8, 12 or 14, OpenCV's. robust: leave out what does not fit; else every corner counts.
+    distortion_terms: 0, 4, 5, 8, 12 or 14, OpenCV's. What does not fit is left out.
     Raises Degenerate: no-board, mirrored, one-pose, coplanar, too-few-poses; the message has the condition number.
     """
-    if distortion_terms not in (0, *TERM_COUNTS):
-        raise CalibrationError(f"distortion has {distortion_terms} terms; OpenCV defines 0, {str(TERM_COUNTS)[1:-1]}")
     seen = [(view, view.corners) for view in views if view.corners is not None]
     seen = [
         (view, corners)
@@ -337,11 +326,9 @@ def fit_camera(
     used = [np.full(len(found.ids), not back) for found, back in zip(corners, behind, strict=True)]
     problem.check(used)
     solution = problem.solve(used)
-    if robust:
-        solution, used = _without_outliers(problem, solution, used)
+    solution, used = _without_outliers(problem, solution, used)
     variance, normal = problem.judged(solution, used)
     kept = [i for i, mask in enumerate(used) if mask.any()]
-    shown = [seen[i][0] for i in kept]
     return CameraFit(
         camera=Camera(size[0], size[1], solution.matrix, solution.distortion),
         views=tuple(names),
@@ -352,7 +339,7 @@ def fit_camera(
         covariance=normal.covariance(variance),
         condition=normal.condition,
         outliers=tuple(n for n, mask in zip(names, used, strict=True) if (~mask).sum() > _FEW_CORNERS),
-        coverage=coverage_of(shown, [solution.poses[i] for i in kept], board, size),
+        spread_rad=spread_rad([solution.poses[i] for i in kept]),
     )
 
 

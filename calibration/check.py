@@ -10,20 +10,18 @@ expected covariance and P what takes a plane off,
 """
 
 import math
-from collections.abc import Sequence
 from dataclasses import dataclass
 
 import cv2
 import numpy as np
 from numpy.typing import NDArray
 
+from calibration.arrays import Array
 from calibration.board.board import Board
 from calibration.depth_error import propagated
 from calibration.errors import Degenerate
 from calibration.model.rig_model import RigModel
 from calibration.views import FEWEST_CORNERS, Passages, View
-
-Array = NDArray[np.float64]
 
 _FEWEST_CELLS = 8
 """Scanned squares of a board; three of them already go into its plane."""
@@ -78,11 +76,10 @@ def cells_of(model: RigModel, view: View, board: Board) -> BoardCells:
     )
 
 
-def points_of(model: RigModel, cells: BoardCells) -> Array:
+def _points_of(model: RigModel, cells: BoardCells) -> Array:
     """(cells, 3): each square's point, the mean of the sweeps'."""
-    found = _triangulated(model, cells.x_px, cells.y_px, cells.command, cells.velocity_per_s)
-    mean: Array = found.mean(axis=0)
-    return mean
+    points = _triangulated(model, cells.x_px, cells.y_px, cells.command, cells.velocity_per_s)
+    return np.asarray(points.mean(axis=0))
 
 
 def noise_m2(model: RigModel, cells: BoardCells, normal: Array) -> float:
@@ -117,15 +114,6 @@ def _on_board(model: RigModel, view: View, board: Board, x_px: Array, y_px: Arra
     return np.where(inside[:, None], xy, np.nan)
 
 
-def inside_points(model: RigModel, view: View, board: Board) -> Array:
-    """(m, 3) points of all passages on the board's squares; NaN outside the model's range of commands."""
-    found = []
-    for sweep in view.passages:
-        inside = np.isfinite(_on_board(model, view, board, sweep.x_px, sweep.y_px)).all(axis=1)
-        found.append(_scanned_points(model, sweep)[inside])
-    return np.concatenate(found)
-
-
 def corner_pixels(view: View) -> Array:
     """(n, 2) the view's corners. Degenerate where they are too few to say where the board is."""
     if view.corners is None or len(view.corners.ids) < FEWEST_CORNERS:
@@ -146,8 +134,7 @@ def _scanned_points(model: RigModel, passages: Passages) -> Array:
 def off_plane(xy: Array) -> Array:
     """(cells, cells - 3) orthonormal basis of what is no plane."""
     full = np.linalg.qr(np.column_stack([np.ones(len(xy)), xy]), mode="complete")[0]
-    basis: Array = full[:, 3:]
-    return basis
+    return full[:, 3:]
 
 
 _PARALLEL = 1e-6
@@ -161,7 +148,7 @@ class CheckedBoard:
     distance_m: depth of its middle. flatness_rms_m, flatness_peak_m: of its squares' means off their plane; expected_m:
     the rms that covariance and noise let expect. chi2, freedom: of the deviations. scale: size scanned over size
     stated; scale_sd: its expected sd. cells_m: (squares down, across) deviations, NaN where a square was not scanned.
-    point_rms_m: of single passages off the plane. normal: (3,) unit, towards the camera.
+    point_rms_m: of single passages off the plane.
     """
 
     name: str
@@ -175,7 +162,6 @@ class CheckedBoard:
     scale_sd: float
     point_rms_m: float
     cells_m: Array
-    normal: Array
 
 
 @dataclass(frozen=True, slots=True)
@@ -186,17 +172,12 @@ class CheckedAngle:
     sd_rad: float
 
 
-def check_boards(model: RigModel, views: Sequence[View], board: Board) -> tuple[CheckedBoard, ...]:
-    """Check every view's board. Raises Degenerate where a board or its passages are not there."""
-    return tuple(_check(model, view, board) for view in views)
-
-
 def check_angle(model: RigModel, first: View, second: View, board: Board) -> CheckedAngle:
     """The angle between the boards of two views, 0 to pi/2."""
     both = [(cells_of(model, view, board), view) for view in (first, second)]
 
     def measure(tried: RigModel) -> Array:
-        one, other = (_plane(points_of(tried, cells))[0] for cells, _ in both)
+        one, other = (_plane(_points_of(tried, cells))[0] for cells, _ in both)
         return np.array([math.acos(min(1.0, abs(float(one @ other))))])
 
     values, covariance = propagated(model, measure)
@@ -206,9 +187,9 @@ def check_angle(model: RigModel, first: View, second: View, board: Board) -> Che
 
 def _tilt_noise(model: RigModel, cells: BoardCells, other: BoardCells) -> float:
     """Variance (rad^2) by the noise of a board's scan of how far it is tilted towards another one."""
-    points = points_of(model, cells)
+    points = _points_of(model, cells)
     normal, _ = _plane(points)
-    towards = _plane(points_of(model, other))[0]
+    towards = _plane(_points_of(model, other))[0]
     towards = towards - (towards @ normal) * normal
     around = points - points.mean(axis=0)
     around -= np.outer(around @ normal, normal)
@@ -218,14 +199,15 @@ def _tilt_noise(model: RigModel, cells: BoardCells, other: BoardCells) -> float:
     return noise_m2(model, cells, normal) * share
 
 
-def _check(model: RigModel, view: View, board: Board) -> CheckedBoard:
+def check_board(model: RigModel, view: View, board: Board) -> CheckedBoard:
+    """Check a view's board. Raises Degenerate where it or its passages are not there."""
     cells = cells_of(model, view, board)
-    points = points_of(model, cells)
+    points = _points_of(model, cells)
     corners = corner_pixels(view)
     count = len(cells.board_xy_m)
 
     def measure(tried: RigModel) -> Array:
-        found = points_of(tried, cells)
+        found = _points_of(tried, cells)
         normal, offset = _plane(points)  # the same reference for all
         return np.append(found @ normal - offset, _scale(tried, found, view, board, corners))
 
@@ -233,25 +215,28 @@ def _check(model: RigModel, view: View, board: Board) -> CheckedBoard:
     deviations, scale = values[:count], float(values[count])
     normal, offset = _plane(points)
     noise = noise_m2(model, cells, normal)
-    chi2, freedom = _chi2(deviations, covariance[:count, :count] + noise * np.eye(count), cells.board_xy_m)
     basis = off_plane(cells.board_xy_m)
     expected = basis.T @ (covariance[:count, :count] + noise * np.eye(count)) @ basis
+    rest = basis.T @ deviations
     field = np.full((board.squares[1], board.squares[0]), np.nan)
     field[cells.at] = deviations
-    of_points = inside_points(model, view, board) @ normal - offset
+    on_board = [
+        _scanned_points(model, sweep)[np.isfinite(_on_board(model, view, board, sweep.x_px, sweep.y_px)).all(axis=1)]
+        for sweep in view.passages
+    ]
+    of_points = np.concatenate(on_board) @ normal - offset
     return CheckedBoard(
         name=view.name,
         distance_m=float(points[:, 2].mean()),
         flatness_rms_m=float(np.sqrt(np.mean(deviations**2))),
         flatness_peak_m=float(np.abs(deviations).max()),
         expected_m=float(np.sqrt(np.trace(expected) / count)),
-        chi2=chi2,
-        freedom=freedom,
+        chi2=float(rest @ np.linalg.solve(expected, rest)),
+        freedom=basis.shape[1],
         scale=scale,
         scale_sd=float(np.sqrt(covariance[count, count] + noise / count / offset**2)),
         point_rms_m=float(np.sqrt(np.nanmean(of_points**2))),
         cells_m=field,
-        normal=-normal if normal[2] > 0 else normal,
     )
 
 
@@ -273,9 +258,3 @@ def _plane(points: Array) -> tuple[Array, float]:
     normal = np.linalg.svd(points - middle, full_matrices=False)[2][2]
     normal = normal if normal[2] >= 0 else -normal
     return normal, float(normal @ middle)
-
-
-def _chi2(deviations: Array, covariance: Array, xy: Array) -> tuple[float, int]:
-    basis = off_plane(xy)
-    rest = basis.T @ deviations
-    return float(rest @ np.linalg.solve(basis.T @ covariance @ basis, rest)), basis.shape[1]

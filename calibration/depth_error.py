@@ -16,14 +16,13 @@ from dataclasses import dataclass
 from typing import Final
 
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import ArrayLike
 
+from calibration.arrays import Array
 from calibration.errors import CalibrationError, digits
 from calibration.model.light_sheet import depth_slope
 from calibration.model.parameters import DISTORTION, MATRIX, ROW_DELAY, TIMES, with_parameters
 from calibration.model.rig_model import Covariance, RigModel
-
-Array = NDArray[np.float64]
 
 _STEPS = dict.fromkeys(MATRIX, 1e-3) | dict.fromkeys(TIMES, 1e-9) | {ROW_DELAY: 1e-12}
 _STEP = 1e-6
@@ -95,10 +94,7 @@ class DepthUncertainty:
     part_m: Mapping[str, Array]
 
     def line(self) -> str:
-        """One line, 'at 5 m: 8 mm, 6 of them from the baseline': medians over the picture, of 8 the group's 6.
-
-        Without the group's part sqrt(8^2 - 6^2) would be left.
-        """
+        """One line, 'at 5 m: 8 mm, 6 of them from the baseline': medians over the picture, and the largest part."""
         at = f"at {self.depth_m:g} m"
         if not np.isfinite(self.sd_m).any():
             return f"{at}: not lit"
@@ -132,10 +128,7 @@ def depth_uncertainty(model: RigModel, depth_m: float, velocity_per_s: float | N
 def depth_sd_m(
     model: RigModel, x_px: ArrayLike, y_px: ArrayLike, command: ArrayLike, velocity_per_s: float = 0.0
 ) -> Array:
-    """Standard deviation (m) of the depth at raw pixels where the mirror stands at `command`; all broadcast.
-
-    NaN where there is no depth. Raises CalibrationError for a model without covariance.
-    """
+    """Sd (m) of the depth at raw pixels for a mirror at `command`, NaN: none. CalibrationError: no covariance."""
     return np.sqrt(_variance(depth_jacobian(model, x_px, y_px, command, velocity_per_s), _covariance(model)))
 
 
@@ -231,8 +224,7 @@ _DISTANCES_M: Final = np.geomspace(0.05, 100.0, 60)
 
 @dataclass(frozen=True, slots=True)
 class Sensitivity:
-    """Depth at one depth by command (m per command unit) and by the stripe's place (m per pixel): medians over those
-    parts of the picture where the line reaches it."""
+    """Depth by command (m per command unit) and by the stripe's place (m per pixel), medians where the line reaches."""
 
     per_command_m: float
     per_pixel_m: float
@@ -273,9 +265,7 @@ _TRUTH_GRID = 32
 
 @dataclass(frozen=True, slots=True, eq=False)
 class DepthErrors:
-    """Errors over a grid of pixels that the true rig lights at one depth. error_m: (n,) signed; sd_m: (n,) as the
-    model's covariance predicts, NaN for a model without one.
-    """
+    """Errors at pixels that the true rig lights at one depth: error_m (n,) signed; sd_m (n,) predicted or NaN."""
 
     depth_m: float
     error_m: Array

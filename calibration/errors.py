@@ -4,10 +4,7 @@ import numpy as np
 
 
 class CalibrationError(ValueError):
-    """A rig model that cannot be used: unreadable, inconsistent, for another sensor, or asked outside its range.
-
-    The message is one line that names the thing, the value, the limit and the next step.
-    """
+    """A rig model that cannot be used; in one line the thing, the value, the limit and the next step."""
 
 
 class Degenerate(CalibrationError):  # noqa: N818, the input is, not the program

@@ -18,19 +18,18 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
+from calibration.arrays import Array
 from calibration.board.board import Board
 from calibration.depth_error import command_at, depth_jacobian
 from calibration.errors import CalibrationError, Degenerate, mm
 from calibration.model.camera import Camera
 from calibration.model.rig_model import RigModel
+from calibration.rig_fit.fit import RigFit
 from calibration.rig_fit.noise import bin_starts
-from calibration.rig_fit.result import RigFit
 from calibration.rig_fit.rows import Terms
 from calibration.rig_fit.solve import scaled_inverse, view_normal
 from calibration.rig_fit.state import Sighting, first_state
 from calibration.views import FEWEST_CORNERS, BoardPose
-
-Array = NDArray[np.float64]
 
 FILLS = (0.6, 0.45, 0.32, 0.22)
 """Share of the picture's width or height, whichever it meets first, that the board fills: its distance, by name."""
@@ -115,20 +114,8 @@ def candidates(camera: Camera, board: Board, depth_range_m: tuple[float, float])
     return tuple(found)
 
 
-def next_pose(
-    shown: int,
-    choices: Sequence[Candidate],
-    at_m: float,
-    now_m: float = math.nan,
-    forecast: ExpectedError | None = None,
-) -> Advice:
-    """The pose to show after `shown` poses: the best by the forecast; without one, the next of the sequence that begins
-    well.
-    """
-    if not choices:
-        raise ValueError("no pose of the board fits into the picture")
-    if forecast is None:
-        return Advice(sequence(choices, shown + 1)[-1], at_m)
+def next_pose(choices: Sequence[Candidate], at_m: float, now_m: float, forecast: ExpectedError) -> Advice:
+    """The pose to show next of some (one at least): the best by the forecast."""
     errors = [forecast(candidate.pose) for candidate in choices]
     best = int(np.nanargmin(errors)) if np.isfinite(errors).any() else 0
     return Advice(choices[best], at_m, now_m, float(errors[best]))
@@ -140,8 +127,6 @@ def sequence(choices: Sequence[Candidate], poses: int, seed: int = 0) -> tuple[C
 
     Each is the one farthest from those before it; the first is a tilted one, near. seed: which of equals comes first.
     """
-    if not choices:
-        raise ValueError("no pose of the board fits into the picture")
     rng = np.random.default_rng(seed)
     order = rng.permutation(len(choices)) if seed else np.arange(len(choices))
     traits = np.array([_traits(choices[i]) for i in order])
@@ -215,7 +200,7 @@ class Forecast:
         for column, group in enumerate(fit.free):
             self._tie[self._terms.at(group), column] = 1.0
         self._jacobian = _depth_by_free(fit, at_m)
-        sweeps = [sweep for view in fit.sweeps for sweep in view]
+        sweeps = fit.every_sweep
         self._velocities = _next_velocities(fit)
         self._sd = float(np.median(np.concatenate([sweep.sd for sweep in sweeps])))
         self._count = float(np.median([sweep.sd.size for sweep in sweeps]))
@@ -278,9 +263,7 @@ class Forecast:
 
 
 def _next_velocities(fit: RigFit) -> tuple[float, ...]:
-    """The velocities at which the next pose will be swept: poses take turns at the speeds, so those of the pose whose
-    turn is the longest ago.
-    """
+    """The velocities of the next pose, which take turns: those whose turn is the longest ago."""
     shown = [tuple(sweep.direction * sweep.speed_per_s for sweep in view) for view in fit.sweeps if view]
     last = {velocities: turn for turn, velocities in enumerate(shown)}
     return min(last, key=lambda velocities: last[velocities])
@@ -304,7 +287,7 @@ def _depth_by_free(fit: RigFit, at_m: float) -> Array:
     across, down = ((np.arange(n) + 0.5) / n for n in _CELLS)
     x, y = np.meshgrid(across * model.camera.width - 0.5, down * model.camera.height - 0.5)
     command = command_at(model, x, y, at_m)
-    velocity = max((sweep.speed_per_s for view in fit.sweeps for sweep in view), default=0.0)
+    velocity = max((sweep.speed_per_s for sweep in fit.every_sweep), default=0.0)
     by_name = depth_jacobian(model, x, y, command, velocity)
     by_name = by_name[np.isfinite(by_name).all(axis=-1)]
     columns = [np.sum([by_name[:, names.index(name)] for name in group], axis=0) for group in fit.free]

@@ -36,12 +36,10 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
+from calibration.arrays import Array, Mask
 from calibration.errors import CalibrationError
 from calibration.files.npy_files import load_numpy
 from calibration.views import robust_sd
-
-Array = NDArray[np.float64]
-Mask = NDArray[np.bool_]
 
 LEAST_COUNTS = 10.0
 """A pixel's mean counts in a block from which on chi-square describes their scatter; quieter ones are not judged."""
@@ -240,10 +238,7 @@ def dead_pixels(
 
 
 def light_leak(pixels: PixelMap) -> float:
-    """Correlation of ordinary neighbours' rates along the rows: 0 in the dark, where each pixel has a rate of its own.
-
-    0 as well where chance explains it.
-    """
+    """Correlation of ordinary neighbours' rates along the rows, a sign of light; 0 where chance explains it."""
     rate = np.where(pixels.defects, np.nan, pixels.rate_per_s.astype(np.float64))
     low, high = np.nanpercentile(rate, [1.0, 95.0])
     rate[(rate < low) | (rate > high)] = np.nan
@@ -261,8 +256,7 @@ def _is_hot(flux: Array, frames: NDArray[np.int64], level: Array, limit: Array) 
     chance = np.sqrt(np.maximum(np.expm1(level), 1 / n) / n)
     excess = flux - level
     scatter = robust_sd(excess[seen]) if seen.any() else 0.0
-    result: Mask = seen & (flux > limit) & (excess > _HOT_SIGMA * np.maximum(chance, scatter))
-    return result
+    return seen & (flux > limit) & (excess > _HOT_SIGMA * np.maximum(chance, scatter))
 
 
 def _around(flux: Array) -> Array:
@@ -280,8 +274,7 @@ def _share(ones: NDArray[np.integer], frames: NDArray[np.integer]) -> Array:
 def _chi_square_limit(dof: NDArray[np.int64], probability: float) -> Array:
     """The value that chi-square exceeds with that probability (Wilson and Hilferty, 1931)."""
     spread = 2 / (9 * dof)
-    result: Array = dof * (1 - spread + NormalDist().inv_cdf(1 - probability) * np.sqrt(spread)) ** 3
-    return result
+    return dof * (1 - spread + NormalDist().inv_cdf(1 - probability) * np.sqrt(spread)) ** 3
 
 
 SIGNIFICANT = 5.0
@@ -369,9 +362,7 @@ def _ratio(
     sd_before: NDArray[np.float64],
     sd_after: NDArray[np.float64],
 ) -> tuple[float, float]:
-    """Ratio of the sums of two sets of rates, and its distance from 1 in sd; (1, 0) where there is nothing to
-    compare.
-    """
+    """Ratio of the sums of two sets of rates, and its distance from 1 in sd; (1, 0): nothing to compare."""
     old, new = float(before.sum()), float(after.sum())
     if old <= 0 or new <= 0:
         return 1.0, 0.0
@@ -389,6 +380,7 @@ def _correlation(before: NDArray[np.float64], after: NDArray[np.float64]) -> flo
 
 FORMAT: Final = "spadrig-pixels"
 _ARRAYS: Final = ("rate_per_s", "rate_sd_per_s", "jump_per_s", "limit_per_s", "hot", "noisy", "defects")
+_NUMBERS: Final = ("judged", "lit_judged", "exposure_s", "ordinary_per_s")
 _NEXT: Final = "name a pixels.npz that 'rig calibrate pixels' wrote"
 
 
@@ -418,18 +410,8 @@ class PixelVersion:
 def save_pixels(version: PixelVersion, path: str | os.PathLike[str]) -> None:
     """Write it, whole or not at all. Raises OSError."""
     file, pixels = Path(path), version.pixels
-    about = {
-        "format": FORMAT,
-        "version": version.version,
-        "created": version.created,
-        "parent": version.parent,
-        "sensor": version.sensor,
-        "exposure_s": pixels.exposure_s,
-        "frames": pixels.frames,
-        "judged": pixels.judged,
-        "lit_judged": pixels.lit_judged,
-        "ordinary_per_s": pixels.ordinary_per_s,
-    }
+    about = {"format": FORMAT, **{name: getattr(version, name) for name in ("version", "created", "parent", "sensor")}}
+    about |= {name: getattr(pixels, name) for name in ("frames", *_NUMBERS)}
     arrays = {name: getattr(pixels, name) for name in _ARRAYS}
     if pixels.dead is not None:
         arrays["dead"] = pixels.dead
@@ -455,11 +437,8 @@ def load_pixels(path: str | os.PathLike[str]) -> PixelVersion:
             dead = archive["dead"] if "dead" in archive.files else None
         if about["format"] != FORMAT or len({array.shape for array in arrays.values()}) != 1:
             raise ValueError(f"'format' is {about['format']!r}")
-        pixels = PixelMap(
-            **arrays, dead=dead, judged=float(about["judged"]), lit_judged=float(about["lit_judged"]),
-            frames=int(about["frames"]), exposure_s=float(about["exposure_s"]),
-            ordinary_per_s=float(about["ordinary_per_s"]),
-        )  # fmt: skip
+        numbers: dict[str, Any] = {name: float(about[name]) for name in _NUMBERS}
+        pixels = PixelMap(**arrays, dead=dead, frames=int(about["frames"]), **numbers)
         return PixelVersion(pixels, int(about["version"]), str(about["created"]), about["parent"], str(about["sensor"]))
     except OSError as error:
         raise CalibrationError(f"cannot read {file}: {error.strerror or error}; {_NEXT}") from error

@@ -30,9 +30,7 @@ class AccuracyGoal:
 
 @dataclass(frozen=True, slots=True)
 class Reason:
-    """A reason why a calibration is not good enough: code for machines, text for people, value and limit in the same
-    unit.
-    """
+    """A reason against a calibration: code for machines, text for people, value and limit in one unit."""
 
     code: str
     text: str
@@ -103,11 +101,7 @@ def unguided(verdict: Verdict) -> Verdict:
 
 
 def more_poses(shown: int, what: str, found: tuple[float, float], asked: float, said: Callable[[float], str]) -> Reason:
-    """The reason where nothing is wrong with the data but their number: errors fall with the root of it.
-
-    what: the words before an error; found: its median and 95 % over the picture, of which the one that is farther from
-    what is asked for is named; said: an error in words.
-    """
+    """The reason where data are only too few; of errors (median, 95 %) the one farther off is named by `said`."""
     over = [error / limit for error, limit in zip(found, (asked, WORST_TIMES * asked), strict=True)]
     worst = over[1] > over[0]
     text = f"{'in the worst 5 % of the picture ' if worst else ''}{what} {said(found[worst])}, asked for are "

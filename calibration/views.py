@@ -12,7 +12,7 @@ import cv2
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-Array = NDArray[np.float64]
+from calibration.arrays import Array
 
 NO_POSE = "corners of a view are no picture of a board; take the view out, or name the board that it shows"
 USUAL_CORNER_SD_PX = 0.03
@@ -40,8 +40,7 @@ class Corners:
         if self.sd_px is None:
             return np.full(len(self.ids), USUAL_CORNER_SD_PX)
         known = np.nan_to_num(self.sd_px, nan=USUAL_CORNER_SD_PX, posinf=1.0)
-        result: Array = np.where(known > 0, known, USUAL_CORNER_SD_PX)
-        return result
+        return np.where(known > 0, known, USUAL_CORNER_SD_PX)
 
     @property
     def across_px(self) -> float:
@@ -91,8 +90,7 @@ class BoardPose:
 
     def to_camera(self, points_m: ArrayLike) -> Array:
         """Points (..., 3) of the board in the camera's frame, metres."""
-        moved: Array = np.asarray(points_m, np.float64) @ self.matrix.T + self.position_m
-        return moved
+        return np.asarray(points_m, np.float64) @ self.matrix.T + self.position_m
 
     @property
     def matrix(self) -> Array:

@@ -1,6 +1,4 @@
-"""The calibration board, a ChArUco board or a plain chessboard, its file, and how much of it views have shown.
-
-A set of views covers a part of the picture, of the angles and of the distances (`Coverage`).
+"""The calibration board, a ChArUco board or a plain chessboard, and its file.
 
 Board coordinates in metres: x right, y down, z into the board, origin at the top left corner of the top left square,
 which is black. The inner corners are numbered row by row, as cv2.aruco.CharucoBoard does. The board's file holds what
@@ -12,20 +10,21 @@ same number, does its mirror image differ; only with one of the two even can it 
 
 import os
 import re
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import Annotated, Any, Literal
+from typing import Annotated, Literal
 
 import cv2
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 from pydantic import BeforeValidator, Field
 
+from calibration.arrays import Array
 from calibration.errors import CalibrationError
 from calibration.files.problems import ValueSources, validated
 from calibration.files.sections import FileSection, load_yaml
-from calibration.views import BoardPose, View
+from calibration.views import BoardPose
 
 _METRES = {"um": 1e-6, "mm": 1e-3, "cm": 1e-2, "m": 1.0}
 _LENGTH = re.compile(r"(\d+(?:\.\d*)?|\.\d+)\s*([a-z]*)")
@@ -52,8 +51,6 @@ class BoardFile(FileSection):
     marker: Length | None = Field(None, description="side of a marker, its black border included (charuco)")
     dictionary: str | None = Field(None, description="OpenCV's name of the set of markers, e.g. DICT_5X5_100 (charuco)")
 
-
-Array = NDArray[np.float64]
 
 BLACK, WHITE = 0.05, 0.85
 """Reflectance of a laser printer's black and of matt white paper, rounded."""
@@ -193,18 +190,9 @@ def load_board(path: str | os.PathLike[str] = BUNDLED_BOARD) -> Board:
     read = load_yaml(file, "a board", "kind: charuco")
     parsed = validated(BoardFile, read.content, ValueSources(str(file), read.lines))
     try:
-        return _board(parsed)
+        return Board(parsed.kind, parsed.squares, parsed.square, parsed.marker, parsed.dictionary)
     except CalibrationError as error:
         raise CalibrationError(f"{file}: {error}") from error
-
-
-def parse_board(content: Mapping[str, Any]) -> Board:
-    """A board from the keys of its file, lengths as text with a unit. Raises CalibrationError."""
-    return _board(validated(BoardFile, content, ValueSources("board")))
-
-
-def _board(parsed: BoardFile) -> Board:
-    return Board(parsed.kind, parsed.squares, parsed.square, parsed.marker, parsed.dictionary)
 
 
 def _dictionary(name: str) -> cv2.aruco.Dictionary:
@@ -212,42 +200,6 @@ def _dictionary(name: str) -> cv2.aruco.Dictionary:
     if name not in known:
         raise CalibrationError(f"there is no dictionary '{name}'; OpenCV has {', '.join(known)}")
     return cv2.aruco.getPredefinedDictionary(getattr(cv2.aruco, name))
-
-
-CELLS = 8
-"""Cells along each side of the picture."""
-
-
-@dataclass(frozen=True, slots=True, eq=False)
-class Coverage:
-    """cells: (8, 8) int64, corners in each cell of the picture. tilt_rad, distance_m: (views,) float64.
-
-    tilt: between the board's normal and the line of sight to its middle. spread_rad: largest angle between the normals
-    of two views: what tells the focal length from the distance.
-    """
-
-    cells: NDArray[np.int64]
-    tilt_rad: Array
-    distance_m: Array
-    spread_rad: float
-
-    @property
-    def share(self) -> float:
-        """Share of the cells that hold a corner."""
-        return float(np.count_nonzero(self.cells) / self.cells.size)
-
-
-def coverage_of(views: Sequence[View], poses: Sequence[BoardPose], board: Board, size: tuple[int, int]) -> Coverage:
-    """The coverage of a picture of size (width, height) by the corners of `views`, whose boards stand at `poses`."""
-    px = np.concatenate([view.corners.px for view in views if view.corners is not None])
-    edges = [np.linspace(-0.5, length - 0.5, CELLS + 1) for length in (size[1], size[0])]
-    cells = np.histogram2d(px[:, 1], px[:, 0], bins=edges)[0].astype(np.int64)
-    middle = np.array([*board.size_m, 0.0]) / 2
-    middles = np.stack([pose.to_camera(middle) for pose in poses])
-    distance = np.linalg.norm(middles, axis=1)
-    normals = np.stack([pose.matrix[:, 2] for pose in poses])
-    tilt = np.arccos(np.clip(np.sum(normals * middles, axis=1) / distance, -1, 1))
-    return Coverage(cells, tilt, distance, spread_rad(poses))
 
 
 def spread_rad(poses: Sequence[BoardPose]) -> float:

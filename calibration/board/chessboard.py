@@ -2,21 +2,208 @@
 
 OpenCV finds the grid that it is asked for in any larger print, and now and then in a smaller one, with corners that are
 none. So a grid counts as the board only where its print has as many corners as the board, no fewer and no more, as far
-as the picture shows (lattice.py). Measured by tests/reference/boards/chessboard_extent.py.
+as the picture shows.
+
+Where four squares meet, the light changes across the line between them above the corner and, the other way round, below
+it; along a row of corners the change turns about from one to the next. A row that was only guessed, or that lies on the
+edge of the print, shows no such change on its outer side, and one that follows outside the grid does. So a grid is cut
+down to the corners that are there, and grows while more of them follow (`known_lattice`). What lies outside the picture
+is not known.
 """
 
 import itertools
 import math
-from dataclasses import replace
+from dataclasses import dataclass, replace
 
 import cv2
 import numpy as np
 from numpy.typing import NDArray
 
+from calibration.arrays import Array
 from calibration.board.board import Board
-from calibration.board.lattice import FORMS, Gray, Lattice, MatchedPoints, as_form, known_lattice
+from calibration.board.drawing import BoardMap, Drawing, fit_map
+from calibration.board.markers import FORMS, Gray, MatchedPoints, as_form
+from calibration.board.registration import SUBPIXELS, WIDE, register, sides_px
 
-Array = NDArray[np.float64]
+Picture = NDArray[np.float32]
+
+_OFFSETS = np.array([0.1, 0.2, 0.3, 0.4])
+"""Squares from a corner at which the change is looked at: clear of its edges, and within half an outer square."""
+_THERE = 0.3
+_GOES_ON = 0.5
+"""Least change across a line outside the grid, as a share of that in the grid, for another row to follow there. In
+OpenCV's 26 chessboard pictures a row that is there has 0.75 to 1.15 of it, one that is not 0.09 at most."""
+_LEAST_ALIKE = 0.8
+"""Share of the corners that are there; in noise it is half of them."""
+_FEWEST = 2
+"""Corners along a side, and changes that tell of a row."""
+_OUTLIER_SQUARES = 0.4
+_MOST = 100
+"""Corners along a side: as many as a board may have."""
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Lattice:
+    """Corners of a chessboard as far as they are seen.
+
+    px: (down, across, 2) raw pixels. beyond: of its upper, right, lower and left side, the change of light in the next
+    row of squares as a share of the usual one; NaN where the picture does not show it.
+    """
+
+    px: Array
+    beyond: tuple[float, float, float, float]
+
+    @property
+    def grid(self) -> tuple[int, int]:
+        """Corners along (x, y)."""
+        return self.px.shape[1], self.px.shape[0]
+
+    @property
+    def least(self) -> tuple[int, int]:
+        """Corners along (x, y), counting rows that are seen to follow but could not be placed."""
+        upper, right, lower, left = (change >= _GOES_ON for change in self.beyond)
+        return self.px.shape[1] + left + right, self.px.shape[0] + upper + lower
+
+    @property
+    def known(self) -> tuple[bool, bool]:
+        """Whether the number along (x, y) is the print's: it is seen to end on both sides."""
+        upper, right, lower, left = (change < _GOES_ON for change in self.beyond)
+        return left and right, upper and lower
+
+
+def known_lattice(picture: Picture, px: Array) -> Lattice | None:
+    """The corners that are there, from a grid (down, across, 2) some too many or too few; None: no chessboard there."""
+    cut = _cut_down(picture, px)
+    if cut is None:
+        return None
+    grown = _grown(picture, cut)
+    seen = _seen(picture, grown)
+    if seen is None or seen.alike < _LEAST_ALIKE:
+        return None
+    upper, right, lower, left = (_seen_beyond(picture, np.rot90(grown, turn)) for turn in range(4))
+    return Lattice(grown, (upper, right, lower, left))
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class _Seen:
+    """usual: change across a line, positive where the top left square is black. alike: share of the corners with one
+    like it. own: of the uppermost row, on its outer side, as a share of the usual; NaN where it cannot be seen.
+    """
+
+    usual: float
+    alike: float
+    own: float
+
+
+def _cut_down(picture: Picture, px: Array) -> Array | None:
+    """The grid without outer rows that are not there."""
+    while min(px.shape[:2]) >= _FEWEST:
+        sides = [_seen(picture, np.rot90(px, turn)) for turn in range(4)]
+        own = [np.inf if side is None or not np.isfinite(side.own) else side.own for side in sides]
+        worst = int(np.argmin(own))
+        if own[worst] >= _THERE:
+            return px
+        px = np.rot90(np.rot90(px, worst)[1:], -worst)
+    return None
+
+
+def _grown(picture: Picture, px: Array) -> Array:
+    """The grid with the rows that follow outside."""
+    turn = kept = 0
+    while kept < 4 and max(px.shape[:2]) < _MOST:
+        turned = np.rot90(px, turn)
+        more = _row_above(picture, turned) if _seen_beyond(picture, turned) >= _GOES_ON else None
+        if more is None:
+            turn, kept = (turn + 1) % 4, kept + 1
+        else:
+            px, kept = np.rot90(np.concatenate([more[None], turned]), -turn), 0
+    return px
+
+
+def _seen(picture: Picture, px: Array) -> _Seen | None:
+    board_map = _map(px)
+    if board_map is None:
+        return None
+    down, across = px.shape[:2]
+    x, y = np.meshgrid(np.arange(1, across + 1), np.arange(1, down + 1))
+    sign = np.where((x + y) % 2 == 0, 1.0, -1.0)
+    above, below = (sign * side * _change(picture, board_map, x, y, side) for side in (1, -1))
+    both = np.stack([above, below])
+    if np.isfinite(both).sum() < both.size / 2:
+        return None
+    usual = float(np.nanmedian(both))
+    if usual == 0:
+        return None
+    alike = float(np.mean(both[np.isfinite(both)] / usual > _THERE))
+    return _Seen(usual, alike, _median(above[0] / usual))
+
+
+def _seen_beyond(picture: Picture, px: Array) -> float:
+    """The change in the row of squares above the grid's uppermost, as a share of the usual; NaN where not seen."""
+    board_map, seen = _map(px), _seen(picture, px)
+    if board_map is None or seen is None:
+        return np.nan
+    x = np.arange(1, px.shape[1] + 1)
+    change = _change(picture, board_map, x, np.zeros_like(x), 1)
+    return _median(np.where(x % 2 == 0, 1.0, -1.0) * change / seen.usual)
+
+
+def _change(picture: Picture, board_map: BoardMap, x: NDArray[np.integer], y: NDArray[np.integer], side: int) -> Array:
+    """Light right of a lattice point less that left of it, above (side 1) or below (-1); NaN outside the picture."""
+    along, up = np.meshgrid(np.concatenate([-_OFFSETS[::-1], _OFFSETS]), side * _OFFSETS)
+    at = np.stack([x[..., None, None] + along, y[..., None, None] - up], axis=-1)
+    px = board_map.to_px(at).astype(np.float32).reshape(-1, 2)
+    height, width = picture.shape
+    inside = ((px >= 0) & (px <= np.array([width - 1, height - 1]))).all(axis=1)
+    light = cv2.remap(picture, np.where(inside, px.T, 0)[0], np.where(inside, px.T, 0)[1], cv2.INTER_LINEAR).ravel()
+    light = np.where(inside, light, np.nan).reshape(*at.shape[:-1])
+    half = len(_OFFSETS)
+    change: Array = light[..., half:].mean(axis=(-1, -2)) - light[..., :half].mean(axis=(-1, -2))
+    return change
+
+
+def _row_above(picture: Picture, px: Array) -> Array | None:
+    """(across, 2) corners above the uppermost row; None where most of them are not found."""
+    board_map, seen = _map(px), _seen(picture, px)
+    if board_map is None or seen is None:
+        return None
+    down, across = px.shape[:2]
+    x = np.arange(1, across + 1)
+    expected = board_map.to_px(np.stack([x, np.zeros_like(x)], axis=-1))
+    taller = _map(np.concatenate([expected[None], px]))
+    if taller is None:
+        return None
+    board = _board(across, down + 1)
+    # The drawing's top left square is black; that of the taller grid is where this one's is white.
+    shown = picture if seen.usual < 0 else np.float32(picture.max()) - picture
+    side = sides_px(board, taller, np.array([board.size_m]) / 2)[0]
+    ids, found, _ = register(
+        shown, Drawing.of(board, SUBPIXELS * side), taller, np.arange(across, dtype=np.int32), WIDE, True
+    )
+    if 2 * len(ids) < across:
+        return None
+    expected[ids] = found
+    return expected
+
+
+def _map(px: Array) -> BoardMap | None:
+    """The map to pixels from squares, counted from the outer corner of the grid's top left one."""
+    board = _board(px.shape[1], px.shape[0])
+    points = px.reshape(-1, 2)
+    side = np.median(np.linalg.norm(np.diff(px, axis=1), axis=-1))
+    found = fit_map(board.corners_m[:, :2], points, max(_OUTLIER_SQUARES * float(side), 1.0), board.size_m)
+    return None if found is None else found[0]
+
+
+def _board(across: int, down: int) -> Board:
+    return Board("chessboard", (across + 1, down + 1), 1.0)
+
+
+def _median(values: Array) -> float:
+    """NaN where fewer than half of them, or than two, are known."""
+    known = values[np.isfinite(values)]
+    return float(np.median(known)) if len(known) >= max(_FEWEST, len(values) / 2) else np.nan
+
 
 _SMALLEST_PARTS = ((4, 4), (3, 3))
 """Inner corners of a chessboard that count as a part of one; small ones are more often found where none is."""
@@ -26,9 +213,7 @@ _NOTHING = MatchedPoints(np.zeros((0, 2)), np.zeros((0, 2)), 0)
 
 
 def find_chessboard(shown: Gray, board: Board) -> MatchedPoints:
-    """The chessboard's inner corners, the first one at the board's top left as far as that can be told; or what else
-    there is: a part of it, or another chessboard.
-    """
+    """The board's inner corners, the first at its top left if that can be told; or a part of it, or another board."""
     seen: Lattice | None = None
     for form in FORMS:
         lattice = _lattice(shown, _grid(shown, board, form))
@@ -66,8 +251,7 @@ def _part(shown: Gray, form: tuple[int, float], smallest: tuple[int, int]) -> Ar
     found, corners, meta = cv2.findChessboardCornersSBWithMeta(as_form(shown, *form), smallest, flags)
     if not found:
         return None
-    px: Array = (np.asarray(corners, np.float64).reshape(*meta.shape[:2], 2) + 0.5) / form[0] - 0.5
-    return px
+    return (np.asarray(corners, np.float64).reshape(*meta.shape[:2], 2) + 0.5) / form[0] - 0.5
 
 
 def _whole_chessboard(form: Gray, grid: tuple[int, int]) -> Array | None:
@@ -143,9 +327,7 @@ def _from_top_left(px: Array, shown: Gray, board: Board) -> tuple[Array, bool]:
 
 
 def _top_left_is_black(px: Array, shown: Gray) -> bool:
-    """Whether the squares of the top left one's colour are the darker ones, as seen in the squares between the
-    corners.
-    """
+    """Whether squares of the top left one's colour are the darker ones, as seen between the corners."""
     middles = (px[:-1, :-1] + px[:-1, 1:] + px[1:, :-1] + px[1:, 1:]) / 4
     height, width = shown.shape
     x = np.clip(np.round(middles[..., 0]).astype(int), 0, width - 1)

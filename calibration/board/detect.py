@@ -11,11 +11,11 @@ from dataclasses import replace
 import numpy as np
 from numpy.typing import NDArray
 
+from calibration.arrays import Array
 from calibration.board.board import Board
 from calibration.board.chessboard import find_chessboard
 from calibration.board.drawing import BoardMap, Drawing, fit_map
-from calibration.board.lattice import MatchedPoints, find_markers, gray
-from calibration.board.markers import contradiction
+from calibration.board.markers import MatchedPoints, contradiction, find_markers, gray
 from calibration.board.registration import OWN, SUBPIXELS, WIDE, register, sides_px
 from calibration.errors import Degenerate
 from calibration.views import Corners
@@ -43,8 +43,6 @@ def repaired(picture: NDArray[np.generic], defects: NDArray[np.bool_] | None = N
     return np.nan_to_num(values)
 
 
-Array = NDArray[np.float64]
-
 LEAST_SHARE = 0.5
 """Share of the board's corners that a view must show more than; others are refused."""
 _SECOND_BOARD_MARKERS = 4
@@ -52,11 +50,9 @@ _SECOND_BOARD_MARKERS = 4
 _MAP_OUTLIER_SQUARES = 0.4
 """Distance from the homography, in squares, that no lens bends a board by and every misread marker exceeds."""
 _GROWTH_SQUARES = 1.6
-"""Distance from the known part of a far board to the next corners; beyond, a map through a few noisy markers leads
-astray."""
+"""Distance from the known part of a board to the next corners; beyond, a map through a few markers leads astray."""
 _OUTLIER_SDS = 6.0
-"""Sds that a corner may lie off the map through all corners, or as many pixels and squares as follow: a lens bends more
-than the map does."""
+"""Sds that a corner may lie off the map, or as many pixels and squares as follow: a lens bends more than the map."""
 _LEAST_OUTLIER_PX = 0.3
 _MOST_USUAL_SDS = 4.0
 """Largest ratio of a corner's sd to that of its neighbours: beyond, the drawing was laid over something else."""
@@ -120,9 +116,7 @@ def _another(sighting: MatchedPoints, board: Board) -> bool:
 def _refined(
     values: NDArray[np.float32], board: Board, rough: BoardMap, sighting: MatchedPoints
 ) -> tuple[NDArray[np.int32], Array, Array]:
-    """Find all corners that the picture shows: around the rough map first, then, growing, around the map through those
-    found; last, each on pixels of its own.
-    """
+    """Find all corners: around the rough map, then, growing, around better ones; last, each on pixels of its own."""
     corners_m = board.corners_m[:, :2]
     side = sides_px(board, rough, np.array([board.size_m]) / 2)[0]
     drawing = Drawing.of(board, SUBPIXELS * side)

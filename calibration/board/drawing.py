@@ -13,6 +13,7 @@ import cv2
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
+from calibration.arrays import Array
 from calibration.board.board import MARGIN_SQUARES, Board
 
 _PX_PER_SQUARE = (32, 256)
@@ -34,9 +35,7 @@ class Drawing:
 
     @classmethod
     def of(cls, board: Board, px_per_square: float) -> "Drawing":
-        """Draw it, so fine if it can be: every pixel is the white share of its area, exactly, for markers end between
-        pixels.
-        """
+        """Draw it, so fine if it can be: every pixel is the white share of its area, exactly."""
         modules = board.modules
         down, across, side, _ = modules.shape
         least, most = _PX_PER_SQUARE
@@ -57,14 +56,11 @@ class Drawing:
         return cls(board, np.pad(drawn.reshape(size), pad, constant_values=1.0), fine, pad)
 
 
-Array = NDArray[np.float64]
-
 _BENDS = ((30, 3), (12, 2))
 """(least number of points, degree of the polynomial): three points to a term at least."""
 _FEWEST_POINTS = 4
 _KEPT_SHARES = (0.8, 0.8, 1.0)
-"""Shares of the points, the closest ones, to which the polynomial is fitted in turn: a point far off must not bend
-it."""
+"""Shares of the points, the closest ones, that the polynomial is fitted to in turn: one far off must not bend it."""
 _OUTLIER_MEDIANS = 5.0
 _LEAST_OUTLIER_PX = 0.3
 
@@ -89,17 +85,13 @@ class BoardMap:
     def to_px(self, points_m: ArrayLike) -> Array:
         """Raw pixels (..., 2) of board positions (..., 2)."""
         flat = _projected(self.homography, (np.asarray(points_m, np.float64) - self.half_m) / self.half_m)
-        mapped: Array = flat + _terms((flat - self.centre_px) / self.half_px, self.degree) @ self.bend_px
-        return mapped
+        return flat + _terms((flat - self.centre_px) / self.half_px, self.degree) @ self.bend_px
 
 
 def fit_map(
     points_m: Array, px: Array, outlier_px: float, size_m: tuple[float, float]
 ) -> tuple[BoardMap, NDArray[np.bool_]] | None:
-    """The map through points (n, 2) seen at px (n, 2), and which of them lie on it within outlier_px.
-
-    size_m: the board's, over which the polynomial runs from -1 to 1. None where no four points agree.
-    """
+    """The map through points (n, 2) seen at px (n, 2), and which lie on it within outlier_px; None: no four agree."""
     if len(points_m) < _FEWEST_POINTS:
         return None
     half = np.array(size_m) / 2
@@ -130,8 +122,7 @@ def fit_map(
 
 def _projected(homography: Array, at: Array) -> Array:
     seen = np.concatenate([at, np.ones((*at.shape[:-1], 1))], axis=-1) @ homography.T
-    flat: Array = seen[..., :2] / seen[..., 2:]
-    return flat
+    return seen[..., :2] / seen[..., 2:]
 
 
 def _powers(degree: int) -> list[tuple[int, int]]:
@@ -142,5 +133,4 @@ def _terms(at: Array, degree: int) -> Array:
     across = np.polynomial.polynomial.polyvander(at[..., 0], degree)
     down = np.polynomial.polynomial.polyvander(at[..., 1], degree)
     i, j = np.array(_powers(degree)).T
-    terms: Array = across[..., i] * down[..., j]
-    return terms
+    return across[..., i] * down[..., j]

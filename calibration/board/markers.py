@@ -13,9 +13,9 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
+from calibration.arrays import Array
 from calibration.board.board import Board
 
-Array = NDArray[np.float64]
 Places = NDArray[np.int64]
 
 _NEXT_SQUARES = 2.5
@@ -39,9 +39,7 @@ _FEWEST = 6
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Markers:
-    """The markers that were read, whether the board has them or not. ids: (n,) int64; px: (n, 4, 2) corners, clockwise
-    from the marker's own top left.
-    """
+    """The markers that were read. ids: (n,) int64; px: (n, 4, 2) corners, clockwise from the marker's own top left."""
 
     ids: Places
     px: Array
@@ -69,9 +67,7 @@ class _Layout:
 
 
 def contradiction(read: Markers, board: Board, shown: NDArray[np.uint8]) -> str | None:
-    """A text on how the markers read in the picture `shown` do not fit the board; None where nothing speaks against
-    it.
-    """
+    """Words for how the markers read in the picture `shown` do not fit the board; None where they do."""
     assert board.marker_m is not None, "asked of boards with markers"
     placed, lattice = _lattice(read.px, board.marker_m / board.square_m)
     ids, lattice = read.ids[placed], lattice[placed]
@@ -133,9 +129,7 @@ def _support(layout: _Layout, ids: Places, lattice: Places) -> tuple[int, Places
 
 
 def _lattice(px: Array, marker_squares: float) -> tuple[NDArray[np.bool_], Places]:
-    """The markers (n, 4, 2) that stand on one lattice, as a mask (n,) of most of them if possible, and their (n, 2)
-    columns and rows.
-    """
+    """The markers (n, 4, 2) on one lattice: a mask (n,) of as many as can be, and their (n, 2) columns and rows."""
     best, places = np.zeros(len(px), np.bool_), np.zeros((len(px), 2), np.int64)
     tried = np.zeros(len(px), np.bool_)
     for start in np.argsort([-cv2.contourArea(corners.astype(np.float32)) for corners in px]):
@@ -185,9 +179,7 @@ def _map_to_lattice(places: Places, px: Array, marker_squares: float) -> Array |
 
 
 def _ends_early(board: Board, shown: NDArray[np.uint8], px: Array, places: Places) -> str | None:
-    """The fault of a print that ends before the board does, or None. Such a print shows white paper below its last
-    markers where the board has black squares.
-    """
+    """Words for a print that shows white paper below its last markers, where the board has black squares; or None."""
     across, down = board.squares
     assert board.marker_m is not None, "asked of boards with markers"
     to_lattice = _map_to_lattice(places, px, board.marker_m / board.square_m)
@@ -215,3 +207,86 @@ def _seen(shown: NDArray[np.uint8], to_lattice: Array, column: Array, row: float
     if px.min() < 0 or px[:, 0].max() >= width or px[:, 1].max() >= height:
         return None
     return np.asarray(shown[px[:, 1], px[:, 0]], np.float64)
+
+
+Gray = NDArray[np.uint8]
+
+FORMS = ((1, 0.0), (2, 0.8), (3, 0.8), (2, 1.5), (4, 1.2))
+"""(enlargement, smoothing in pixels of the picture), in the order they are tried (docs/how-to/calibration.md)."""
+_ENOUGH = 0.9
+"""Share of the markers at which no further form is tried."""
+_DARKEST, _BRIGHTEST = 0.5, 99.5
+"""Percentiles that become black and white: a hot pixel or a lamp is neither."""
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class MatchedPoints:
+    """Points of the board (n, 2) in metres and where they are seen, (n, 2) raw pixels, about half a pixel.
+
+    count: markers or corners read. chessboards: how many are in the picture. part: corners along (x, y) of what may be
+    a part of the chessboard. other: how the chessboard that is seen differs from the board. markers: all that were
+    read, the board's and others.
+    """
+
+    points_m: Array
+    px: Array
+    count: int
+    mirrored: bool = False
+    chessboards: int = 1
+    part: tuple[int, int] | None = None
+    other: str | None = None
+    markers: Markers | None = None
+
+    def square_px(self, board: Board) -> float:
+        """Side of a square, from the points' spread."""
+        spread_px = np.sqrt(np.prod(np.std(self.px, axis=0)))
+        return float(max(spread_px / np.sqrt(np.prod(np.std(self.points_m, axis=0))) * board.square_m, 1.0))
+
+
+def gray(values: NDArray[np.float32]) -> Gray:
+    """The picture from 0 to 255, stretched between its darkest and brightest parts."""
+    low, high = np.percentile(values, [_DARKEST, _BRIGHTEST])
+    span = max(float(high - low), 1e-12)
+    return np.asarray(np.clip((values - low) * (255 / span), 0, 255), np.uint8)
+
+
+def find_markers(shown: Gray, board: Board) -> MatchedPoints:
+    """The board's markers; `mirrored` where the mirror image of the picture shows more of them."""
+    best = _most_markers(shown, board)
+    if best.count <= 0.25 * len(board.charuco().getIds()):
+        flipped = _most_markers(np.ascontiguousarray(shown[:, ::-1]), board)
+        if flipped.count > 2 * best.count + 2:
+            return MatchedPoints(flipped.points_m, flipped.px, flipped.count, mirrored=True)
+    return best
+
+
+def as_form(shown: Gray, scale: int, smooth: float) -> Gray:
+    """One of the forms; a pixel of it lies at (x + 0.5) / scale - 0.5 of the picture."""
+    smoothed = cv2.GaussianBlur(shown, (0, 0), smooth) if smooth else shown
+    if scale == 1:
+        return np.asarray(smoothed, np.uint8)
+    return np.asarray(cv2.resize(smoothed, None, fx=scale, fy=scale, interpolation=cv2.INTER_CUBIC), np.uint8)
+
+
+def _most_markers(shown: Gray, board: Board) -> MatchedPoints:
+    charuco = board.charuco()
+    places = {
+        int(marker): np.asarray(points, np.float64)[:, :2]
+        for marker, points in zip(np.ravel(charuco.getIds()), charuco.getObjPoints(), strict=True)
+    }
+    detector = cv2.aruco.ArucoDetector(charuco.getDictionary())
+    best, most = MatchedPoints(np.zeros((0, 2)), np.zeros((0, 2)), 0), (0, 0)
+    for scale, smooth in FORMS:
+        corners, found, _ = detector.detectMarkers(as_form(shown, scale, smooth))
+        if found is None:
+            continue
+        ids = found.ravel().astype(np.int64)
+        px = (np.array(corners, np.float64).reshape(-1, 4, 2) + 0.5) / scale - 0.5
+        known = np.isin(ids, list(places))
+        if (int(known.sum()), len(ids)) > most:
+            most = int(known.sum()), len(ids)
+            points = np.array([places[marker] for marker in ids[known].tolist()]).reshape(-1, 2)
+            best = MatchedPoints(points, px[known].reshape(-1, 2), most[0], markers=Markers(ids, px))
+        if best.count >= _ENOUGH * len(places):
+            break
+    return best

@@ -17,10 +17,9 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
+from calibration.arrays import Array
 from calibration.board.board import Board
 from calibration.board.drawing import BoardMap, Drawing
-
-Array = NDArray[np.float64]
 
 SUBPIXELS = 12
 """Drawn per pixel and axis before they are averaged over the pixel's area; even. Drawings are as fine, within their
@@ -37,8 +36,7 @@ _LEAST_REACH_PX = 4
 _SEARCH_SQUARES = 0.25
 """Farthest search for a corner: beyond, a shift could mistake one module of a marker for the next."""
 _POWERS = [(i, j) for i in range(4) for j in range(4 - i)]
-"""Powers of x and y in pixels that place the drawing around a corner: a tilt and a lens bend no more over two
-squares."""
+"""Powers of x and y that place the drawing around a corner: a tilt and a lens bend no more over two squares."""
 _AROUND = np.stack(np.meshgrid(*2 * [np.linspace(-1.25, 1.25, 7)]), axis=-1).reshape(-1, 2)
 """Points, in reaches, through which that polynomial goes; the patch and what a pixel more on every side needs."""
 _STEPS = 4
@@ -65,11 +63,7 @@ class _Patch:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class _Place:
-    """A corner's expected place: its pixel, a square's side, half the width of the patch around it.
-
-    to_drawing: (4, 4, 2), the amounts that powers of x and y, in reaches from the corner, add to the place in the
-    drawing.
-    """
+    """A corner's place: pixel, side of a square, half width of its patch, (4, 4, 2) powers for the drawing's place."""
 
     expected_px: Array
     side_px: float
@@ -85,10 +79,7 @@ def register(
     reach: float,
     search: bool,
 ) -> tuple[NDArray[np.int32], Array, Array]:
-    """Corners `ids` that the picture shows near where the map has them: their ids, px (n, 2) and sd_px (n,).
-
-    reach: WIDE or OWN. search: look for each in whole pixels first (the map is rough).
-    """
+    """Corners `ids` in the picture near the map: ids, px (n, 2), sd_px (n,). search: in whole pixels first."""
     places = _places(drawing, board_map, ids, reach)
     found = [_register_one(picture, drawing, place, search) for place in places]
     good = np.array([one is not None for one in found], np.bool_)

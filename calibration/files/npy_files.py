@@ -22,10 +22,7 @@ _DEFLATE_RATIO: Final = 1032
 
 
 def load_numpy(file: str | os.PathLike[str], mmap_mode: Literal["r"] | None = None) -> Any:
-    """An array, or an archive of arrays by name, as `numpy.load` gives them; never a pickle.
-
-    Raises OSError, and ValueError or BadZipFile for what is no such file or tells of more than it holds.
-    """
+    """An array, or an archive of them, never a pickle. OSError; ValueError or BadZipFile for what is no such file."""
     with Path(file).open("rb") as stream:
         is_archive = stream.read(4) == b"PK\x03\x04"
         stream.seek(0)

@@ -46,16 +46,9 @@ _READS_ON = ("is ", "has ", "runs ", "begins ")
 _WORDS = {True: "true", False: "false", None: "null"}
 
 
-def _no_kinds(name: str, content: Any) -> None:
-    """No other model: every section has one."""
-
-
 @dataclass(frozen=True)
 class ValueSources:
-    """The origin of values: a file with the line of each key, and the keys that were given as options.
-
-    lines_of: called only once there is something wrong. flags: the command line's names of some keys.
-    """
+    """The origin of values: a file with each key's line, and the keys given as options, with their names there."""
 
     file: str
     lines_of: Callable[[], Mapping[Key, int]] = dict
@@ -109,7 +102,8 @@ class _Schema:
 
     def of(self, name: str, info: FieldInfo, content: Any) -> type[BaseModel] | None:
         """The model of what a field holds, where it holds mappings."""
-        return self.kind_of(name, content) or _model_in(info.annotation)
+        models = (kind for kind in plain_types(info.annotation) if issubclass(kind, BaseModel))
+        return self.kind_of(name, content) or next(models, None)
 
     def field(self, key: Key) -> FieldInfo | None:
         """The field at `key`; for an item of a list, the list's."""
@@ -134,7 +128,7 @@ def validated(
     model: type[Model],
     content: Mapping[str, Any],
     sources: ValueSources,
-    kind_of: KindOf = _no_kinds,
+    kind_of: KindOf = lambda name, content: None,
     context: Mapping[str, Any] | None = None,
 ) -> Model:
     """The content as a model. Raises FileError with a line for each problem, in the order of the file.
@@ -213,10 +207,14 @@ def _number_words(annotation: Any) -> str | None:
 
 def plain_types(annotation: Any) -> Iterator[type]:
     """The types that a field's annotation is made of."""
-    if isinstance(annotation, type) and not getattr(annotation, "__args__", ()):
-        yield annotation
+    return (part for part in _parts(annotation) if isinstance(part, type) and not getattr(part, "__args__", ()))
+
+
+def _parts(annotation: Any) -> Iterator[Any]:
+    """An annotation, then all that it is made of."""
+    yield annotation
     for part in getattr(annotation, "__args__", ()):
-        yield from plain_types(part)
+        yield from _parts(part)
 
 
 def _key(problem: ErrorDetails, content: Any) -> Key:
@@ -286,15 +284,11 @@ def _text(problems: list[ErrorDetails], key: Key, schema: _Schema, flag: str | N
 
 def _limit(info: FieldInfo | None, value: float) -> str:
     """A limit in the unit of its field, where that has one: its metadata then knows how numbers are `written`."""
-    marks = [] if info is None else [*info.metadata, *_metadata(info.annotation)]
+    marks = [] if info is None else list(info.metadata)
+    for part in () if info is None else _parts(info.annotation):
+        marks += getattr(part, "__metadata__", ())
     written = next((mark.written for mark in marks if hasattr(mark, "written")), None)
     return f"{float(value):g}" if written is None else str(written(value))
-
-
-def _metadata(annotation: Any) -> Iterator[Any]:
-    yield from getattr(annotation, "__metadata__", ())
-    for part in getattr(annotation, "__args__", ()):
-        yield from _metadata(part)
 
 
 def _asked_for(problem: ErrorDetails) -> str:
@@ -331,9 +325,3 @@ def _meant(value: object, expected: str) -> str:
 def _shown(value: object) -> str:
     text = _WORDS[value] if value is None or isinstance(value, bool) else repr(value)
     return text if len(text) <= MAX_VALUE_CHARACTERS else f"{text[: MAX_VALUE_CHARACTERS - 3]}..."
-
-
-def _model_in(annotation: Any) -> type[BaseModel] | None:
-    if isinstance(annotation, type) and issubclass(annotation, BaseModel):
-        return annotation
-    return next((found for part in getattr(annotation, "__args__", ()) if (found := _model_in(part)) is not None), None)

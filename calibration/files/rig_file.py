@@ -1,4 +1,4 @@
-"""The calibration file: YAML, `format: spadrig-calibration`, version 1.
+"""The calibration file, and the file of a camera alone, which a calibration of the light planes can begin with; YAML.
 
     format: spadrig-calibration
     version: 1
@@ -14,26 +14,120 @@ or, instead of `planes`, a scanner with commands of its own:
 Optional: source_m, lag_s: {forward, backward}, speed_range_per_s: [low, high], row_delay_s, gate_delay_s,
 colour_skew_s, marker_rising, defects: a bool .npy, dark_rate: a float .npy, covariance: {names, file}, identity,
 provenance: any mapping, two of whose keys are read. Paths are relative to the file's folder;
-docs/reference/calibration-file.md says it all.
+docs/reference/calibration-file.md says it all. Of a camera alone:
+
+    format: spadrig-camera
+    version: 1
+    camera: {width, height, matrix, distortion}              # as above
+    covariance: {names: [fx, fy, ...], matrix: [[...]]}      # how well that is known
+    views: [16 hexadecimal digits, ...]                      # corners it was made of: they must not count twice
+    verdict: passed or failed                                # left out: nobody judged it
+    reasons: [too-few-poses, ...]                            # why it failed, by their codes
 """
 
+import hashlib
 import os
 import zipfile
-from dataclasses import asdict
+from dataclasses import asdict, dataclass
 from pathlib import Path
-from typing import Any, Final
+from typing import Any, Final, Literal
 
 import numpy as np
 import yaml
 from numpy.typing import NDArray
 
 from calibration.errors import CalibrationError
-from calibration.files.camera_file import build_camera, camera_content
 from calibration.files.npy_files import load_numpy
-from calibration.files.sections import FORMAT, VERSION, CalibrationFile, PlaneRows, read_yaml_file
+from calibration.files.sections import (
+    FORMAT,
+    VERSION,
+    CalibrationFile,
+    CameraSection,
+    FileSection,
+    Number,
+    PlaneRows,
+    read_yaml_file,
+)
+from calibration.model.camera import Camera
 from calibration.model.parameters import with_parameters
 from calibration.model.rig_model import Covariance, Identity, Lag, RigModel
 from calibration.model.scanner import PivotScanner, PlaneTable, Scanner
+from calibration.verdict import Verdict, VerdictWord
+from calibration.views import View
+
+CAMERA_FORMAT = "spadrig-camera"
+CAMERA_VERSION = 1
+CORNERS = "corners"
+"""Key in the provenance of a rig's calibration: digests of the views it was made of, those of its camera too."""
+
+
+class _CovarianceRows(FileSection):
+    names: list[str]
+    matrix: list[list[Number]]
+
+
+class _CameraFile(FileSection):
+    format: Literal["spadrig-camera"]
+    version: Literal[1]
+    camera: CameraSection
+    covariance: _CovarianceRows
+    views: tuple[str, ...] = ()
+    verdict: VerdictWord | None = None
+    reasons: tuple[str, ...] = ()
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class KnownCamera:
+    """A camera, how well it is known, the digests of the views that told it, its verdict (None: nobody judged it)."""
+
+    camera: Camera
+    covariance: Covariance
+    views: frozenset[str]
+    verdict: VerdictWord | None = None
+    reasons: tuple[str, ...] = ()
+
+
+def load_camera(path: Path) -> KnownCamera:
+    """Read a camera file. Raises CalibrationError, one line."""
+    parsed = read_yaml_file(path, "a camera", CAMERA_FORMAT, CAMERA_VERSION, _CameraFile)
+    covariance = Covariance(tuple(parsed.covariance.names), np.array(parsed.covariance.matrix, dtype=np.float64))
+    camera = Camera(**parsed.camera.model_dump())
+    return KnownCamera(camera, covariance, frozenset(parsed.views), parsed.verdict, parsed.reasons)
+
+
+def camera_file_text(camera: Camera, covariance: Covariance, views: list[str], verdict: Verdict) -> str:
+    """The text of a camera file."""
+    content: dict[str, Any] = {
+        "format": CAMERA_FORMAT,
+        "version": CAMERA_VERSION,
+        "camera": camera_content(camera),
+        "covariance": {"names": list(covariance.names), "matrix": covariance.matrix.tolist()},
+        "views": views,
+        "verdict": verdict.word,
+    }
+    if verdict.reasons:
+        content["reasons"] = list(verdict.codes)
+    return yaml.safe_dump(content, sort_keys=False, default_flow_style=None, width=120)
+
+
+def corners_digest(view: View) -> str:
+    """Sixteen hexadecimal digits of a view's corners; of none where it has none."""
+    digest = hashlib.sha256()
+    if view.corners is not None:
+        digest.update(np.ascontiguousarray(view.corners.ids, "<i4").tobytes())
+        digest.update(np.ascontiguousarray(view.corners.px, "<f8").tobytes())
+    return digest.hexdigest()[:16]
+
+
+def camera_content(camera: Camera) -> dict[str, Any]:
+    """The `camera` section of a file."""
+    return {
+        "width": camera.width,
+        "height": camera.height,
+        "matrix": camera.matrix.tolist(),
+        "distortion": camera.distortion.tolist(),
+    }
+
 
 CALIBRATION_FILE: Final = "calibration.yaml"
 """Name of a calibration file wherever the project writes one."""
@@ -42,10 +136,7 @@ _PLAIN = {"row_delay_s": 0.0, "gate_delay_s": 0.0, "colour_skew_s": 0.0, "marker
 
 
 def load_rig_model(path: str | os.PathLike[str]) -> RigModel:
-    """Read a calibration file. Paths inside it are relative to its folder.
-
-    Raises CalibrationError, one line: the file, the key, what is wrong and what would be right.
-    """
+    """Read a calibration file; its paths are relative to its folder. CalibrationError, one line, where it is none."""
     file = Path(path)
     parsed = read_yaml_file(file, "a calibration", FORMAT, VERSION, CalibrationFile)
     try:
@@ -55,10 +146,7 @@ def load_rig_model(path: str | os.PathLike[str]) -> RigModel:
 
 
 def save_rig_model(model: RigModel, path: str | os.PathLike[str]) -> None:
-    """Write a model so that `load_rig_model` gives the same numbers back; maps and covariance become .npy beside it.
-
-    Each file appears whole or not at all, the YAML last. Raises OSError where the folder cannot be written.
-    """
+    """Write a model for `load_rig_model`, its arrays beside it, each file whole or not at all. Raises OSError."""
     file = Path(path)
     content: dict[str, Any] = {
         "format": FORMAT,
@@ -113,7 +201,7 @@ def _build(parsed: CalibrationFile, folder: Path) -> RigModel:
             )
     speed, identity = parsed.speed_range_per_s, parsed.identity
     model = RigModel(
-        camera=build_camera(parsed.camera),
+        camera=Camera(**parsed.camera.model_dump()),
         scanner=_build_scanner(parsed, folder),
         lag_s=Lag(**parsed.lag_s.model_dump()),
         speed_range_per_s=None if speed is None else (speed[0], speed[1]),

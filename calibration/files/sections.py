@@ -165,11 +165,7 @@ class YamlFile:
 
 
 def load_yaml(file: Path, what: str, example: str, name: str | None = None) -> YamlFile:
-    """The keys and values of a file.
-
-    what: 'a calibration', for messages, as is an example of a line. name: of the file there, its path by default.
-    Raises FileError, also where a key is given twice.
-    """
+    """A file's keys and values; what: 'a calibration', for messages. FileError, also where a key is given twice."""
     name = str(file) if name is None else name
     try:
         size = file.stat().st_size
@@ -192,7 +188,7 @@ def parse_yaml(text: str, what: str, example: str, name: str) -> YamlFile:
         loader = _Loader(text)
         try:
             node = loader.get_single_node()
-            twice = [] if node is None else list(_twice(node, ()))  # before merge keys are resolved, which may repeat
+            twice = [] if node is None else _twice(node)  # before merge keys are resolved, which may repeat
             content = None if node is None else loader.construct_document(node)
         finally:
             loader.dispose()
@@ -213,10 +209,7 @@ def parse_yaml(text: str, what: str, example: str, name: str) -> YamlFile:
 
 
 def read_yaml_file(file: Path, what: str, format_name: str, version: int, model: type[Content]) -> Content:
-    """The content of a file that must say that format and version.
-
-    Raises CalibrationError, one line: the file, the key, what is wrong and what would be right.
-    """
+    """The content of a file that must say that format and version. CalibrationError, one line, where it is none."""
     read = load_yaml(file, what, f"format: {format_name}")
     content = read.content
     if content.get("format") != format_name:
@@ -315,17 +308,12 @@ def _places(node: yaml.Node, path: Key) -> Iterator[tuple[Key, int]]:
             yield from _places(value, (*path, str(i)))
 
 
-def _twice(node: yaml.Node, path: Key) -> Iterator[tuple[Key, int]]:
-    """The keys that were there before, with their lines."""
-    if isinstance(node, yaml.MappingNode):
-        seen = set()
-        for key, value in node.value:
-            here = (*path, str(key.value))
-            if here in seen:
-                yield here, key.start_mark.line + 1
-            seen.add(here)
-            yield from _twice(value, here)
-    elif isinstance(node, yaml.SequenceNode):
-        for i, value in enumerate(node.value):
-            if isinstance(value, yaml.CollectionNode):
-                yield from _twice(value, (*path, str(i)))
+def _twice(node: yaml.Node) -> list[tuple[Key, int]]:
+    """The keys that were there before, with their lines; of what is below such a key nothing more is said."""
+    seen: set[Key] = set()
+    found: list[tuple[Key, int]] = []
+    for key, line in _places(node, ()):
+        if key in seen and not any(key[: len(other)] == other for other, _ in found):
+            found.append((key, line))
+        seen.add(key)
+    return found

@@ -26,9 +26,8 @@ import numpy as np
 from numpy.polynomial import Polynomial
 from numpy.typing import ArrayLike, NDArray
 
+from calibration.arrays import Array, set_frozen
 from calibration.errors import CalibrationError
-
-Array = NDArray[np.float64]
 
 TERM_COUNTS = (4, 5, 8, 12, 14)
 """Numbers of distortion terms OpenCV defines."""
@@ -256,7 +255,7 @@ class Camera:
     height: int
     matrix: Array
     distortion: Array
-    _lens: LensModel = field(init=False, repr=False)
+    lens: LensModel = field(init=False, repr=False)
 
     def __post_init__(self) -> None:
         """Check the numbers and freeze the arrays."""
@@ -274,17 +273,7 @@ class Camera:
                 "OpenCV's model has no skew"
             )
         distortion = np.array(self.distortion, dtype=np.float64).ravel()
-        lens = LensModel(distortion)
-        matrix.flags.writeable = False
-        distortion.flags.writeable = False
-        object.__setattr__(self, "matrix", matrix)
-        object.__setattr__(self, "distortion", distortion)
-        object.__setattr__(self, "_lens", lens)
-
-    @property
-    def lens(self) -> LensModel:
-        """The distortion, on tangents."""
-        return self._lens
+        set_frozen(self, matrix=matrix, distortion=distortion, lens=LensModel(distortion))
 
     def tangents(self) -> tuple[Array, Array]:
         """(u, v) of every raw pixel, each (height, width) float64; NaN where the lens model has no inverse."""
@@ -297,13 +286,13 @@ class Camera:
         m = self.matrix
         with np.errstate(all="ignore"):
             at_x, at_y = (x - m[0, 2]) / m[0, 0], (y - m[1, 2]) / m[1, 1]
-        u, v = self._lens.undistort(np.atleast_1d(at_x), np.atleast_1d(at_y))
+        u, v = self.lens.undistort(np.atleast_1d(at_x), np.atleast_1d(at_y))
         return u.reshape(x.shape), v.reshape(x.shape)
 
     def tangent_slopes(self, u: ArrayLike, v: ArrayLike) -> tuple[Array, Array]:
         """(du/dx, dv/dx) per raw pixel along the row, at the rays (u, v)."""
         u_, v_ = np.broadcast_arrays(np.asarray(u, np.float64), np.asarray(v, np.float64))
-        du, _, dv, _ = self._lens.undistort_slope(u_, v_)
+        du, _, dv, _ = self.lens.undistort_slope(u_, v_)
         fx = self.matrix[0, 0]
         return du / fx, dv / fx
 
@@ -312,7 +301,7 @@ class Camera:
         points = np.asarray(points_m, np.float64)
         with np.errstate(all="ignore"):
             z = np.where(points[..., 2] > 0, points[..., 2], np.nan)
-            u, v = self._lens.distort(points[..., 0] / z, points[..., 1] / z)
+            u, v = self.lens.distort(points[..., 0] / z, points[..., 1] / z)
             m = self.matrix
             x, y = m[0, 0] * u + m[0, 2], m[1, 1] * v + m[1, 2]
             seen = np.isfinite(x) & np.isfinite(y)

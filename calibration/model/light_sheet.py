@@ -20,23 +20,18 @@ from typing import Final
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
+from calibration.arrays import Array
 from calibration.model.camera import Camera
 from calibration.model.scanner import PivotScanner, Scanner
-
-Array = NDArray[np.float64]
 
 NEARLY_PARALLEL: Final = 1e-6
 """Sine of the angle between ray and plane below which there is no depth: 1e-3 px, finer than any calibration."""
 LEAST_OFFSET_M: Final = 1e-6
-"""Least distance of a plane from the camera; one that passes closer gives no depth: all its points are seen on one
-line."""
+"""Least distance of a plane from the camera: all points of one that passes closer are seen on one line."""
 
 
 def inverse_depth(u: ArrayLike, v: ArrayLike, planes: ArrayLike) -> Array:
-    """1/z (1/m) of rays (u, v) on planes (..., 4), |n| = 1; negative behind the camera, 0 for parallel rays.
-
-    NaN for planes through the camera (LEAST_OFFSET_M).
-    """
+    """1/z (1/m) of rays (u, v) on planes (..., 4), |n| = 1: below 0 behind, 0 parallel, NaN within LEAST_OFFSET_M."""
     p = np.asarray(planes, np.float64)
     offset = p[..., 3]
     with np.errstate(all="ignore"):
@@ -45,10 +40,7 @@ def inverse_depth(u: ArrayLike, v: ArrayLike, planes: ArrayLike) -> Array:
 
 
 def depth(u: ArrayLike, v: ArrayLike, planes: ArrayLike) -> Array:
-    """Depth z (m) of rays (u, v) on planes (..., 4), |n| = 1; NaN where they do not meet in front of the camera.
-
-    Nor do they where they are nearly parallel: z is at most 1 / NEARLY_PARALLEL times the plane's distance.
-    """
+    """Depth z (m) of rays (u, v) on planes (..., 4), |n| = 1; NaN where nearly parallel or behind the camera."""
     inverse = inverse_depth(u, v, planes)
     with np.errstate(all="ignore"):
         length = np.sqrt(np.square(np.asarray(u, np.float64)) + np.square(np.asarray(v, np.float64)) + 1)
@@ -60,8 +52,7 @@ def depth(u: ArrayLike, v: ArrayLike, planes: ArrayLike) -> Array:
 def _along(u: ArrayLike, v: ArrayLike, planes: ArrayLike) -> Array:
     """n.r, the ray's way along the plane's normal."""
     p = np.asarray(planes, np.float64)
-    result: Array = p[..., 0] * np.asarray(u, np.float64) + p[..., 1] * np.asarray(v, np.float64) + p[..., 2]
-    return result
+    return p[..., 0] * np.asarray(u, np.float64) + p[..., 1] * np.asarray(v, np.float64) + p[..., 2]
 
 
 def depth_slope(u: ArrayLike, v: ArrayLike, planes: ArrayLike, camera: Camera) -> Array:
@@ -75,10 +66,7 @@ def depth_slope(u: ArrayLike, v: ArrayLike, planes: ArrayLike, camera: Camera) -
 
 
 def near_side(u: ArrayLike, v: ArrayLike, planes: ArrayLike, camera: Camera) -> NDArray[np.int8]:
-    """Side of the stripe on which nearer points of the same plane are seen: -1 smaller x, +1 larger x, 0 undefined.
-
-    A scanner left of the camera gives -1, one on the right +1.
-    """
+    """Side of the stripe on which nearer points are seen (the scanner's): -1 smaller x, +1 larger x, 0 undefined."""
     p = np.asarray(planes, np.float64)
     du, dv = camera.tangent_slopes(u, v)
     offset = np.where(np.abs(p[..., 3]) < LEAST_OFFSET_M, 0.0, p[..., 3])
@@ -95,10 +83,7 @@ _CONVERGED = 1e-12
 
 @dataclass(frozen=True, slots=True, eq=False)
 class LightSheets:
-    """Sheets of any shape (...): planes (..., 4), |n| = 1, and how they bow.
-
-    origin_m: (3,) O. middle, across: (..., 3) unit vectors f and t. bow_per_rad: 0 for planes.
-    """
+    """Sheets (...): planes (..., 4), |n| = 1; O (3,); unit vectors f and t (..., 3); the bow, 0 for planes."""
 
     planes: Array
     origin_m: Array
@@ -150,9 +135,7 @@ class LightSheets:
         return z
 
     def _bowed(self, seen: Array) -> tuple[Array, Array, NDArray[np.bool_]]:
-        """The bow for X - O, or for that over z: the distance off the plane, its slope by w, and whether it lies ahead
-        of the fan.
-        """
+        """The bow for X - O, or that over z: distance off the plane, slope by w, whether it lies ahead of the fan."""
         p, q = np.sum(seen * self.middle, axis=-1), np.sum(seen * self.across, axis=-1)
         dp, dq = -(self.middle @ self.origin_m), -(self.across @ self.origin_m)
         reach = np.hypot(p, q)
@@ -179,13 +162,10 @@ def light_sheets(scanner: Scanner, source_m: ArrayLike | None, commands: ArrayLi
 
 
 def fan_origin(scanner: Scanner, source_m: ArrayLike | None) -> Array:
-    """The point (3,) from which the fan of light spreads: the source, or the point of the mirror's axis nearest to the
-    camera.
-    """
+    """The point (3,) from which the light spreads: the source, or the mirror axis' point nearest to the camera."""
     if source_m is not None:
         return np.asarray(source_m, np.float64)
     if not isinstance(scanner, PivotScanner):
         return np.zeros(3)
     point, axis = scanner.axis_point_m, scanner.axis_direction
-    nearest: Array = point - (point @ axis) * axis
-    return nearest
+    return point - (point @ axis) * axis

@@ -30,12 +30,11 @@ from typing import Final
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
+from calibration.arrays import Array
 from calibration.errors import CalibrationError
 from calibration.model.camera import Camera
 from calibration.model.rig_model import Lag, RigModel
 from calibration.model.scanner import PivotScanner
-
-Array = NDArray[np.float64]
 
 MATRIX = {"fx": (0, 0), "fy": (1, 1), "cx": (0, 2), "cy": (1, 2)}
 DISTORTION = ("k1", "k2", "p1", "p2", "k3", "k4", "k5", "k6", "s1", "s2", "s3", "s4", "tau_x", "tau_y")
@@ -137,8 +136,7 @@ def _rotation(vector: Array) -> Array:
     cross: Array = np.array([[0.0, -z, y], [z, 0.0, -x], [-y, x, 0.0]])
     # np.sinc is sin(pi t) / (pi t): no division by an angle that may be zero.
     once, twice = np.sinc(angle / np.pi), 0.5 * np.sinc(angle / (2 * np.pi)) ** 2
-    result: Array = np.eye(3) + once * cross + twice * (cross @ cross)
-    return result
+    return np.eye(3) + once * cross + twice * (cross @ cross)
 
 
 SWEPT: Final = "velocities_per_s"
@@ -150,10 +148,7 @@ SPEED_MARGIN: Final = 0.05
 
 
 def lag_groups(velocities_per_s: ArrayLike) -> tuple[tuple[str, ...], ...]:
-    """The lags that sweeps at these signed velocities tell: groups of names, each of one value.
-
-    Both lags are one where they cannot be told apart, and where one way was never swept; none: nothing is told.
-    """
+    """The lags that sweeps tell, in groups of one value each: both in one where nothing tells them apart, or none."""
     up, down = _speeds(velocities_per_s)
     several = _several(up) or _several(down)
     if several and up.size and down.size:
@@ -167,10 +162,7 @@ def one_speed(velocities_per_s: ArrayLike) -> bool:
 
 
 def untold(velocities_per_s: Sequence[float]) -> Array:
-    """(n, 3): changes of (position, lag forward, lag backward), in seconds and command units, that no sweep shows.
-
-    Each has a lag of 1 s; nothing at all where there are no sweeps.
-    """
+    """(n, 3): changes of (position, lag forward, lag backward) that no sweep shows, each with a lag of 1 s."""
     velocity = np.asarray(velocities_per_s, np.float64)
     if velocity.size == 0:
         return np.zeros((0, 3))
@@ -186,8 +178,7 @@ def alike_speeds(speeds_per_s: ArrayLike) -> NDArray[np.int64]:
     """(n,): a number for each speed, shared by all between which and it there is no gap, whichever way they went."""
     speeds, which = np.unique(np.abs(np.asarray(speeds_per_s, np.float64)), return_inverse=True)
     apart = np.diff(speeds, prepend=speeds[:1]) > ALIKE_SPEEDS * speeds
-    result: NDArray[np.int64] = np.cumsum(apart, dtype=np.int64)[which.reshape(-1)]
-    return result
+    return np.cumsum(apart, dtype=np.int64)[which.reshape(-1)]
 
 
 def speed_range(speeds_per_s: ArrayLike) -> tuple[float, float]:

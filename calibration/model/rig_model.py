@@ -8,17 +8,15 @@ from typing import Any, NamedTuple
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
+from calibration.arrays import Array, set_frozen
 from calibration.errors import CalibrationError
 from calibration.model.camera import Camera
 from calibration.model.light_sheet import LightSheets, fan_origin, light_sheets
 from calibration.model.scanner import Scanner
 from calibration.verdict import VerdictWord
 
-Array = NDArray[np.float64]
-
 _ASYMMETRY = 1e-6
-"""Amount by which two correlations that are the same may differ, and a smallest eigenvalue lie below 0, from
-rounding."""
+"""Rounding: by so much equal correlations may differ, and a smallest eigenvalue lie below 0."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -48,10 +46,7 @@ class Covariance:
         unit = np.divide(matrix, scale, out=np.zeros_like(matrix), where=scale > 0)
         if np.any(np.abs(unit - unit.T) > _ASYMMETRY) or np.any(matrix[scale == 0]) or _least(unit) < -_ASYMMETRY:
             raise CalibrationError("covariance is not symmetric and positive, as one must be; fit the model again")
-        matrix = 0.5 * (matrix + matrix.T)
-        matrix.flags.writeable = False
-        object.__setattr__(self, "names", names)
-        object.__setattr__(self, "matrix", matrix)
+        set_frozen(self, names=names, matrix=0.5 * (matrix + matrix.T))
 
     def of(self, names: Sequence[str]) -> Array:
         """The matrix of some of the parameters, in this order."""
@@ -158,10 +153,7 @@ class RigModel:
         """
         velocity = np.asarray(velocity_per_s, np.float64)
         lag_s = np.where(velocity < 0, self.lag_s.backward, self.lag_s.forward)
-        result: Array = np.asarray(commands, np.float64) - velocity * (
-            lag_s - self.row_delay_s * np.asarray(y_px, np.float64)
-        )
-        return result
+        return np.asarray(commands, np.float64) - velocity * (lag_s - self.row_delay_s * np.asarray(y_px, np.float64))
 
     def check_sensor(self, width: int, height: int) -> None:
         """Raise CalibrationError unless the model was made for a sensor of this size."""

@@ -8,11 +8,10 @@ from dataclasses import dataclass, field
 from typing import Protocol
 
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import ArrayLike
 
+from calibration.arrays import Array, set_frozen
 from calibration.errors import CalibrationError
-
-Array = NDArray[np.float64]
 
 _ROUNDING = 1e-15
 """A few units in the last place of 1.0."""
@@ -41,10 +40,7 @@ class Scanner(Protocol):
 
 @dataclass(frozen=True, eq=False)
 class PlaneTable:
-    """Planes sampled at increasing commands, linear in between (n and d together, then renormalised).
-
-    command: (n,) float64, strictly increasing. rows: (n, 4) float64 nx, ny, nz, d in metres, any sign, any length of n.
-    """
+    """Planes at increasing commands (n,), linear in between: rows (n, 4) nx, ny, nz, d in metres, of any length."""
 
     command: Array
     rows: Array
@@ -74,10 +70,7 @@ class PlaneTable:
         rows[1:][np.cumsum(turned) % 2 == 1] *= -1
         if np.sum(rows[:, 0]) < 0:
             rows *= -1
-        command.flags.writeable = False
-        rows.flags.writeable = False
-        object.__setattr__(self, "command", command)
-        object.__setattr__(self, "rows", rows)
+        set_frozen(self, command=command, rows=rows)
 
     @property
     def command_range(self) -> tuple[float, float]:
@@ -146,12 +139,8 @@ class PivotScanner:
         ):
             if not abs(size) <= most:
                 raise CalibrationError(f"pivot scanner's {what} is {size:g}; it must lie within -{most:g} and {most:g}")
-        parts = {"axis_point_m": point, "axis_direction": axis, "zero_normal": normal}
-        parts |= {"angle_rad": angle, "offset_m": offset}
-        for name, value in parts.items():
-            value.flags.writeable = False
-            object.__setattr__(self, name, value)
-        object.__setattr__(self, "command_range", (float(low), float(high)))
+        set_frozen(self, axis_point_m=point, axis_direction=axis, zero_normal=normal, angle_rad=angle, offset_m=offset)
+        set_frozen(self, command_range=(float(low), float(high)))
 
     def planes(self, commands: ArrayLike) -> Array:
         """Planes (..., 4) for commands (...). Raises CalibrationError outside command_range."""
@@ -169,8 +158,7 @@ class PivotScanner:
         distance = np.sum(normal * self.axis_point_m, axis=-1, keepdims=True)
         if self.offset_m.size:
             distance = distance + np.polynomial.polynomial.polyval(angle, self.offset_m)
-        result: Array = np.concatenate([normal, distance], axis=-1)
-        return result
+        return np.concatenate([normal, distance], axis=-1)
 
 
 def _inside(commands: ArrayLike, limits: tuple[float, float]) -> Array:
@@ -183,8 +171,7 @@ def _inside(commands: ArrayLike, limits: tuple[float, float]) -> Array:
             f"scanner command {at[wrong].flat[0]:g} lies outside the calibrated range [{low:g}, {high:g}]; "
             "narrow the sweep or calibrate over the wider range"
         )
-    clipped: Array = np.clip(at, low, high)
-    return clipped
+    return np.clip(at, low, high)
 
 
 def _vector(value: ArrayLike, name: str) -> Array:
@@ -215,8 +202,7 @@ def _unit(vector: Array, name: str) -> Array:
     length = float(np.linalg.norm(vector))
     if length == 0:
         raise CalibrationError(f"pivot scanner's {name} has length zero")
-    result: Array = vector / _exactly_one(np.array(length))
-    return result
+    return vector / _exactly_one(np.array(length))
 
 
 def _exactly_one(length: Array) -> Array:

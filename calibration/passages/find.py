@@ -16,11 +16,9 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from calibration.passages.fit import PassageFit, fit_passages
-from calibration.passages.light import LineShape
+from calibration.arrays import Array
+from calibration.passages.fit import LineShape, PassageFit, fit_passages
 from calibration.views import Passages
-
-Array = NDArray[np.float64]
 
 CORES = (1, 3)
 """Half widths, in columns, of what the line is looked for with."""
@@ -130,8 +128,7 @@ SHAPES = (*(LineShape(box) for box in (0.0, 1.5, 2.5, 4.0)), LineShape(1.5, trav
 """Shapes that are tried: lines whose light is the same in all frames of a column, as on a DAC's stairs, and one that
 moves, for which the pixel's width hardly matters."""
 MOST_LOSS = 2.0
-"""Most that a pixel's log-likelihood may lose against its best shape: otherwise a single one whose fit went astray
-would choose for all."""
+"""Most that a pixel's log-likelihood may lose against its best shape: one astray must not choose for all."""
 LEAST_SAMPLE, SAMPLE = 50, 300
 """Pixels that tell of the passage's shape: fewer than the first find one for themselves alone, more are not asked."""
 LEAST_SIGNIFICANCE = 5.0

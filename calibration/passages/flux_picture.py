@@ -15,11 +15,10 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
+from calibration.arrays import Array
 from calibration.board.board import PAPER_SQUARES, Board
 from calibration.passages.find import SweepCounts
 from calibration.views import Corners
-
-Array = NDArray[np.float64]
 
 LEFT_OUT = 10
 """Columns on either side of the line's brightest, and at most the following share of all."""
@@ -29,10 +28,7 @@ LEAST_COUNTS = 30.0
 
 
 def flux_picture(sweeps: tuple[SweepCounts, ...]) -> NDArray[np.float32]:
-    """Flux (rows, width) of the lit frames of sweeps over the same scene, float32, NaN where no window ever was.
-
-    What a pixel counts in the dark is left in.
-    """
+    """Flux (rows, width) of the lit frames of sweeps over one scene, dark counts too; NaN where no window ever was."""
     off = [_off_the_line(sweep) for sweep in sweeps]
     ones: Array = np.sum([part[0] for part in off], axis=0)
     frames: Array = np.sum([part[1] for part in off], axis=0)
@@ -124,8 +120,7 @@ def even_pixels(picture: NDArray[np.float32]) -> NDArray[np.bool_]:
     edge = relative > max(LEAST_SLOPE, NOISE_TIMES * float(np.median(relative[known])) if known.any() else 0.0)
     kernel = np.ones((1, 2 * AWAY_PX + 1), np.uint8)
     near = cv2.dilate((edge | ~known).astype(np.uint8), kernel) > 0
-    result: NDArray[np.bool_] = ~near
-    return result
+    return ~near
 
 
 def board_pixels(corners: Corners, board: Board, size: tuple[int, int]) -> NDArray[np.bool_]:

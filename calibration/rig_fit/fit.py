@@ -1,32 +1,325 @@
 """Bundle adjustment of a whole rig: camera, poses of the board, mirror and lag, from corners and passages together.
 
 Start values come from linear fits (`start`), the best values from robust least squares (`solve`) whose noise is told
-from the residuals themselves (`noise`). Terms of the mirror that the data call for are added one at a time (`rounds`,
-`misfit`); a lag that the sweeps' speeds and directions cannot tell is not fitted. The covariance is that of all
-parameters jointly.
+from the residuals themselves (`noise`). A round (`Rounds`) fits, looks at what is left, and ends with one decision at
+most (`misfit`): a term of the mirror that the data call for comes in, a lag below 0 is held, a view that does not
+belong loses its say. A lag that the sweeps' speeds and directions cannot tell is not fitted. The covariance is that of
+all parameters jointly.
 """
 
 from collections.abc import Sequence
-from dataclasses import replace
+from dataclasses import dataclass, field, replace
 
 import numpy as np
 
+from calibration.arrays import Array
 from calibration.board.board import Board
-from calibration.camera_fit import CameraFit, fit_camera
-from calibration.errors import CalibrationError, Degenerate
+from calibration.camera_fit import fit_camera, rms
+from calibration.errors import CalibrationError, Degenerate, digits
 from calibration.model.camera import Camera
-from calibration.model.parameters import lag_groups
-from calibration.model.rig_model import Covariance, RigModel
+from calibration.model.parameters import SWEPT, lag_groups, speed_range
+from calibration.model.rig_model import Covariance, Lag, RigModel
 from calibration.model.scanner import PivotScanner
-from calibration.rig_fit.misfit import with_free
+from calibration.rig_fit.misfit import (
+    TermDecision,
+    best,
+    candidates,
+    corner_noise,
+    lag_decisions,
+    misfit,
+    odd_view,
+    tried,
+    widening,
+    with_free,
+    with_passages,
+)
 from calibration.rig_fit.noise import Noise, passage_noise, restated
-from calibration.rig_fit.result import RigFit, result_of
-from calibration.rig_fit.rounds import Rounds
-from calibration.rig_fit.rows import ANGLE_TERMS, LENS_TERMS, OFFSET_TERMS, Terms
-from calibration.rig_fit.solve import RigProblem, all_rows, camera_prior
-from calibration.rig_fit.start import board_points, check_poses, check_views, first_pose, first_scanner, no_start
+from calibration.rig_fit.rows import ANGLE_TERMS, LENS_TERMS, OFFSET_TERMS, Terms, mirror_command, sheet_rows
+from calibration.rig_fit.solve import RigProblem, RigSolution, all_rows, camera_prior, solved
+from calibration.rig_fit.start import (
+    board_points,
+    check_depth,
+    check_poses,
+    check_views,
+    first_pose,
+    first_scanner,
+    no_start,
+)
 from calibration.rig_fit.state import RigState, Sighting, first_state, sighting, usable, with_terms_of
 from calibration.views import BoardPose, View, robust_sd
+
+MOST_ROUNDS = 16
+"""Most rounds of fitting and deciding; every round but the last adds a term, drops a view or settles the noise."""
+MOST_IDLE_ROUNDS = 4
+"""Most rounds without a decision: data that contradict each other may keep a fit from coming to rest for ever."""
+SETTLED_SHARE = 0.02
+"""Relative change of the noise that is still allowed in the last round."""
+MOST_ODD_SHARE = 1 / 3
+"""Largest share of the views with passages that may be dropped as outliers; beyond it, it is not they who are wrong."""
+
+
+@dataclass
+class Rounds:
+    """The state of fitting and deciding.
+
+    base: parameters that are free to begin with; free: now. decisions: the last ones about terms; kept: those that
+    changed the model.
+    """
+
+    problem: RigProblem
+    base: tuple[tuple[str, ...], ...]
+    state: RigState
+    noise: Noise
+    free: list[tuple[str, ...]] = field(init=False)
+    solution: RigSolution | None = None
+    decisions: tuple[TermDecision, ...] = ()
+    kept: tuple[TermDecision, ...] = ()
+
+    def __post_init__(self) -> None:
+        """Begin with the least of all models."""
+        self.free = list(self.base)
+
+    def run(self) -> None:
+        """Fit and decide until nothing changes."""
+        idle = 0
+        for _ in range(MOST_ROUNDS):
+            self.solution = solved(self.problem, self.state, self.noise, roughly=idle == 0)
+            self.state = self.solution.state
+            before, self.noise = self.noise, self._noise()
+            there = self.solution.converged and idle > 0
+            last = idle + 1 == MOST_IDLE_ROUNDS
+            if self._with_new_term() or ((there or last) and self._without_negative_lag()) or self._without_odd_view():
+                idle = 0
+                continue
+            idle += 1
+            if last or (there and _settled(before, self.noise)):
+                return
+
+    def _noise(self) -> Noise:
+        assert self.solution is not None
+        factor, jitter, reach = passage_noise([rows.residual for _, rows in self.solution.rows], self.problem.sightings)
+        return Noise(corner_noise(self.problem, self.solution, self.noise), factor, jitter, reach)
+
+    def _without_odd_view(self) -> bool:
+        assert self.solution is not None
+        if np.count_nonzero(~self.problem.counted) + 1 > MOST_ODD_SHARE * np.count_nonzero(with_passages(self.problem)):
+            return False
+        odd = odd_view(self.problem, self.solution, misfit(self.problem, self.solution))
+        if odd is None:
+            return False
+        counted = self.problem.counted.copy()
+        counted[odd] = False
+        # What it made the fit take in is decided again without it.
+        self.free, self.kept = list(self.base), ()
+        self.problem = replace(with_free(self.problem, self.free), counted=counted)
+        self.state = with_terms_of(self.state, self.base)
+        return True
+
+    def _without_negative_lag(self) -> bool:
+        assert self.solution is not None
+        spread = np.sqrt(np.diag(self.solution.covariance(self.problem.tie)))
+        for group in self.free:
+            at = self.problem.terms.at(group)[0] - len(self.problem.terms.names)
+            if not group[0].startswith("lag") or self.state.timing[at] >= 0:
+                continue
+            value, sd = float(self.state.timing[at]), float(spread[at])
+            if value < -5 * sd:
+                raise Degenerate(
+                    "negative-lag",
+                    f"mirror would run {digits(-value * 1e6)} us +- {digits(sd * 1e6, 2)} us ahead of its command, "
+                    "limit 0; check the polarity and the delay of the scan marker",
+                )
+            timing = self.state.timing.copy()
+            timing[[self.problem.terms.at([name])[0] - len(self.problem.terms.names) for name in group]] = 0.0
+            self.state = replace(self.state, timing=timing)
+            self.free.remove(group)
+            self.problem = with_free(self.problem, self.free)
+            self.kept += (TermDecision("/".join(group), False, value, sd, "not below 0 for any mirror: held at 0"),)
+            return True
+        return False
+
+    def _with_new_term(self) -> bool:
+        assert self.solution is not None
+        timed = any(group[0].startswith("lag") for group in self.free)
+        tries = candidates(self.free, row_delay=timed)
+        left_over = misfit(self.problem, self.solution).without
+        self.decisions = tuple(tried(self.problem, self.solution, new, left_over) for new in tries)
+        chosen = best(self.decisions)
+        if chosen is None:
+            return False
+        self.free += [(name,) for name in tries[chosen]]
+        self.problem = with_free(self.problem, self.free)
+        self.kept += (self.decisions[chosen],)
+        return True
+
+
+def _settled(before: Noise, after: Noise) -> bool:
+    def near(a: float, b: float) -> bool:
+        return abs(a - b) <= SETTLED_SHARE * max(a, b)
+
+    return near(before.corner_sd_px, after.corner_sd_px) and near(
+        np.hypot(before.passage_factor, before.jitter_sd), np.hypot(after.passage_factor, after.jitter_sd)
+    )
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class SweepFit:
+    """The residuals of the passages of one sweep of a view; all float64 (m,), sorted by command.
+
+    command: the mirror's, as the model has it. residual, sd: in command units. distance_m: how far the point on the
+    board lies off the light.
+    """
+
+    view: str
+    direction: int
+    speed_per_s: float
+    x_px: Array
+    y_px: Array
+    command: Array
+    residual: Array
+    distance_m: Array
+    sd: Array
+
+
+def sweep_fits(seen: Sighting, residual: Array, state: RigState, view: int) -> tuple[SweepFit, ...]:
+    """The fits of a view's sweeps, from the residuals of its passages."""
+    command = mirror_command(state.timing, seen.command, seen.y_px, seen.velocity_per_s)
+    points = board_points(state.model.camera, [seen], [state.poses[view]]).points_m
+    per_command_m = sheet_rows(
+        state.scanner, state.model.source_m, points, command, seen.y_px, seen.velocity_per_s
+    ).per_command
+    found = []
+    for sweep in seen.sweeps:
+        velocity = seen.velocity_per_s[sweep]
+        found.append(
+            SweepFit(
+                view=seen.name,
+                direction=1 if velocity[0] > 0 else -1,
+                speed_per_s=float(abs(velocity[0])),
+                x_px=seen.x_px[sweep],
+                y_px=seen.y_px[sweep],
+                command=command[sweep],
+                residual=residual[sweep],
+                distance_m=residual[sweep] * per_command_m[sweep],
+                sd=seen.sd[sweep],
+            )
+        )
+    return tuple(found)
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class RigFit:
+    """A fitted rig. Per view, in the order of `views`: poses, corner_residual_px (n, 2) predicted less seen, sweeps.
+
+    left_out: names of views without corners; outliers: of views that do not fit the others, which had no say.
+    noise: what the residuals speak for; corner_scale: of the usual corner, by which its sd is the noise's. misfit: by
+    which variances were multiplied, 1 where the model describes all. condition: of the scaled equations of the shared
+    parameters. converged: False where data that contradict each other keep the fit from coming to rest. decisions:
+    about terms and lags. free: what was fitted, names of one group having one value; information: (free, free) about
+    it, the inverse of its covariance.
+    """
+
+    model: RigModel
+    views: tuple[str, ...]
+    poses: tuple[BoardPose, ...]
+    corner_residual_px: tuple[Array, ...]
+    sweeps: tuple[tuple[SweepFit, ...], ...]
+    left_out: tuple[str, ...]
+    outliers: tuple[str, ...]
+    noise: Noise
+    corner_scale: float
+    misfit: float
+    condition: float
+    converged: bool
+    decisions: tuple[TermDecision, ...]
+    board: Board
+    free: tuple[tuple[str, ...], ...]
+    information: Array
+
+    @property
+    def every_sweep(self) -> list[SweepFit]:
+        """The sweeps of all views."""
+        return [sweep for sweeps in self.sweeps for sweep in sweeps]
+
+    @property
+    def used(self) -> tuple[str, ...]:
+        """Names of the views whose passages had a say."""
+        pairs = zip(self.views, self.sweeps, strict=True)
+        return tuple(name for name, sweeps in pairs if sweeps and name not in self.outliers)
+
+    @property
+    def without_line(self) -> tuple[str, ...]:
+        """Names of the views with corners, but too few passages on the board."""
+        return tuple(name for name, sweeps in zip(self.views, self.sweeps, strict=True) if not sweeps)
+
+    @property
+    def corner_rms_px(self) -> float:
+        """Root mean square of all corners' distances."""
+        return rms(np.concatenate(self.corner_residual_px))
+
+
+def result_of(
+    fit: Rounds, left_out: tuple[str, ...], board: Board, start: RigModel | None, velocities: Array
+) -> RigFit:
+    """The result of rounds that have run, its model else as `start` is. Degenerate where depth is next to unknown."""
+    assert fit.solution is not None
+    problem, solution, state = fit.problem, fit.solution, fit.state
+    names = np.array(problem.terms.names)
+    unexplained = misfit(problem, solution).factor
+    matrix = unexplained * solution.covariance(problem.tie) + widening(problem, solution, fit.decisions)
+    fitted = np.flatnonzero(np.diag(matrix) > 0)
+    covariance = Covariance(tuple(names[fitted].tolist()), matrix[np.ix_(fitted, fitted)])
+    scanner = state.scanner
+    scanner = replace(scanner, angle_rad=_trimmed(scanner.angle_rad, 2), offset_m=_trimmed(scanner.offset_m, 0))
+    model = replace(
+        RigModel(state.model.camera, scanner) if start is None else start,
+        camera=state.model.camera,
+        scanner=scanner,
+        covariance=covariance,
+        lag_s=Lag(*(max(float(lag), 0.0) for lag in state.timing[:2])),
+        row_delay_s=float(state.timing[2]),
+        provenance={SWEPT: _swept(problem)},
+        speed_range_per_s=speed_range(np.abs(velocities)),
+    )
+    counted = problem.counted
+    fastest = float(velocities[np.argmax(np.abs(velocities))])
+    outliers = tuple(seen.name for seen, counts in zip(problem.sightings, counted, strict=True) if not counts)
+    said = [pose for pose, counts in zip(state.poses, counted, strict=True) if counts]
+    check_depth(model, said, solution.condition, fastest, unexplained, outliers)
+    return RigFit(
+        model=model,
+        views=tuple(seen.name for seen in problem.sightings),
+        poses=state.poses,
+        corner_residual_px=tuple(rows.residual.reshape(2, -1).T for rows, _ in solution.rows),
+        sweeps=tuple(
+            sweep_fits(seen, rows.residual, state, view)
+            for view, (seen, (_, rows)) in enumerate(zip(problem.sightings, solution.rows, strict=True))
+        ),
+        left_out=left_out,
+        outliers=outliers,
+        noise=fit.noise,
+        corner_scale=float(np.median(np.concatenate([seen.corner_scale for seen in problem.sightings]))),
+        misfit=unexplained,
+        condition=solution.condition,
+        converged=solution.converged,
+        decisions=(*fit.kept, *fit.decisions, *lag_decisions(solution, problem, fit.free, state.timing)),
+        board=board,
+        free=tuple(fit.free),
+        information=problem.tie.T @ solution.matrix @ problem.tie / unexplained,
+    )
+
+
+def _swept(problem: RigProblem) -> list[float]:
+    """Signed velocities of the sweeps that had a say."""
+    shown = [seen.velocity_per_s for seen, counts in zip(problem.sightings, problem.counted, strict=True) if counts]
+    swept: list[float] = np.unique(np.concatenate(shown)).tolist()
+    return swept
+
+
+def _trimmed(terms: Array, least: int) -> Array:
+    """The terms without the zeros at the end."""
+    used = np.flatnonzero(terms)
+    return terms[: max(least, int(used[-1]) + 1 if used.size else 0)]
 
 
 def fit_rig(
@@ -34,29 +327,27 @@ def fit_rig(
     board: Board,
     size: tuple[int, int],
     *,
-    camera: Camera | CameraFit | None = None,
-    hold_camera: bool = False,
+    camera: Camera | None = None,
     known: Covariance | None = None,
     start: RigModel | None = None,
 ) -> RigFit:
     """Fit a rig to views of a board; size: (width, height) of the picture.
 
-    camera: to start from (None: `start`'s or OpenCV's); with hold_camera it is not fitted and counts as known exactly.
+    camera: to start from (None: `start`'s or OpenCV's).
     known: how well that camera is known from other pictures than these, by the names of its parameters; what has no
-    variance is not fitted.
+    variance is known exactly and not fitted.
     start: its mirror and lag are where the fit begins, its source, defects and command range are kept.
     Raises Degenerate where the views do not make a model, with the reason, and CalibrationError.
     """
     shown = usable(views)
     if not shown:
         check_views(views, ())
-    camera = camera.camera if isinstance(camera, CameraFit) else camera
     camera = _first_camera(shown, board, size, camera, start)
-    poses = [_pose_of(view, board, camera) for view in shown]
+    seen = [view.corners for view in shown if view.corners is not None]
+    poses = [first_pose(camera, board.corners_m[one.ids], np.asarray(one.px, np.float64)) for one in seen]
     sightings = tuple(sighting(view, board, camera, pose) for view, pose in zip(shown, poses, strict=True))
     check_views(views, sightings)
-    free_camera = not hold_camera
-    terms = Terms(camera.distortion.size if free_camera else 0)
+    terms = Terms(camera.distortion.size)
     try:
         state = _first_state(camera, poses, sightings, start)
     except Degenerate:
@@ -65,11 +356,11 @@ def fit_rig(
         raise no_start(error, poses) from error
     velocities = np.unique(np.concatenate([seen.velocity_per_s for seen in sightings]))
     exact = () if known is None else tuple(np.array(known.names)[np.diag(known.matrix) == 0])
-    groups: list[tuple[str, ...]] = [(name,) for name in terms.camera if free_camera and name not in exact]
+    groups: list[tuple[str, ...]] = [(name,) for name in terms.camera if name not in exact]
     groups += [(name,) for name in ("axis_turn_1", "axis_turn_2", "axis_shift_1", "axis_shift_2", "angle_0", "angle_1")]
     groups += lag_groups(velocities)
     state = with_terms_of(state, groups)
-    prior = None if known is None or hold_camera else camera_prior(known, camera, terms)
+    prior = None if known is None else camera_prior(known, camera, terms)
     problem = with_free(RigProblem(sightings, terms, np.zeros((0, 0)), np.ones(len(shown), bool), prior), groups)
     problem, noise = _first_noise(problem, state)
     fit = Rounds(problem, tuple(groups), state, noise)
@@ -99,11 +390,6 @@ def _first_camera(
             "calibrate the camera without the tilt of the sensor"
         )
     return camera
-
-
-def _pose_of(view: View, board: Board, camera: Camera) -> BoardPose:
-    assert view.corners is not None
-    return first_pose(camera, board.corners_m[view.corners.ids], np.asarray(view.corners.px, np.float64))
 
 
 def _first_state(

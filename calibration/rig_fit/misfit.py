@@ -15,12 +15,11 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
+from calibration.arrays import Array
 from calibration.model.parameters import TIMES
 from calibration.rig_fit.noise import Noise, smooth_basis
 from calibration.rig_fit.rows import ANGLE_TERMS
 from calibration.rig_fit.solve import RigProblem, RigSolution, scaled_inverse
-
-Array = NDArray[np.float64]
 
 SIGNIFICANT_SD = 5.0
 LEAST_OWN_SHARE = 1e-7
@@ -71,10 +70,7 @@ def candidates(free: Sequence[Sequence[str]], row_delay: bool) -> list[tuple[str
 def tried(
     problem: RigProblem, solution: RigSolution, new: Sequence[str], left_over: Callable[[float], float]
 ) -> TermDecision:
-    """The decision on the last of the new terms, with all of them free.
-
-    left_over: gives the factor by which variances would still be too large, were chi2 less by so much.
-    """
+    """The decision on the last of the new terms, all free. left_over: variances' factor were chi2 less by so much."""
     at = problem.terms.at(new)
     matrix, right = solution.matrix, solution.right
     tie = problem.tie
@@ -131,10 +127,7 @@ def first_order(problem: RigProblem, solution: RigSolution, open_one: TermDecisi
 
 
 def corner_noise(problem: RigProblem, solution: RigSolution, noise: Noise) -> float:
-    """Corner sd (pixels) that is left when the corners alone decide about camera and poses.
-
-    With the passages in, corners that contradict them, as after a knock on the rig, would only pass for noisy ones.
-    """
+    """Corner sd (pixels) by the corners alone: passages that contradict them would only make them seem noisy."""
     p = len(problem.terms.names)
     shared: Array = np.zeros((p, p))
     right: Array = np.zeros(p)

@@ -16,11 +16,10 @@ from dataclasses import dataclass, replace
 import numpy as np
 from numpy.typing import NDArray
 
+from calibration.arrays import Array
 from calibration.model.parameters import alike_speeds
 from calibration.rig_fit.state import Sighting
 from calibration.views import MAD_TO_SD, robust_sd
-
-Array = NDArray[np.float64]
 
 BINS = 1024
 """Bins of the whole command range: some to a column, within which jitter hardly changes."""
@@ -63,8 +62,7 @@ def smooth_part(command: Array, y_px: Array, residual: Array, weight: Array) -> 
     """The part of a sweep's residuals (m,) that is as smooth as the basis."""
     basis = smooth_basis(command, y_px)
     root = np.sqrt(weight)[:, None]
-    part: Array = basis @ np.linalg.lstsq(basis * root, residual * root[:, 0], rcond=1e-9)[0]
-    return part
+    return basis @ np.linalg.lstsq(basis * root, residual * root[:, 0], rcond=1e-9)[0]
 
 
 def restated(residuals: Sequence[Array], sightings: Sequence[Sighting]) -> tuple[Sighting, ...]:
@@ -95,9 +93,7 @@ def restated(residuals: Sequence[Array], sightings: Sequence[Sighting]) -> tuple
 
 
 def _kinds(sightings: Sequence[Sighting]) -> list[list[int]]:
-    """A number for every sweep of every view, the same for sweeps of like speed: their frames in a column are alike,
-    too.
-    """
+    """A number for every sweep of every view, the same for sweeps of like speed, whose frames in a column are alike."""
     speeds = [[float(seen.velocity_per_s[sweep.start]) for sweep in seen.sweeps] for seen in sightings]
     kinds = iter(alike_speeds([speed for of_view in speeds for speed in of_view]).tolist())
     return [[next(kinds) for _ in of_view] for of_view in speeds]
@@ -172,10 +168,7 @@ def bin_starts(seen: Sighting, reach: float) -> NDArray[np.int64]:
 
 
 def tail_weight(normalised: Array, usual: float = 1 / MAD_TO_SD) -> Array:
-    """Weight of errors in standard deviations, among others of their kind: where all are large, none is an outlier.
-
-    usual: the median of such errors' sizes, that of a normal distribution where nothing else is said.
-    """
+    """Weight of errors in sds, among others whose sizes' median is `usual`: where all are large, none is an outlier."""
     away = np.abs(normalised)
     if away.size:
         away = away / max(1.0, float(np.median(away)) / usual)
@@ -201,5 +194,4 @@ def _bin_width(sightings: Sequence[Sighting]) -> float:
 
 def _centred(values: Array) -> Array:
     low, high = float(values.min()), float(values.max())
-    result: Array = (2 * values - low - high) / max(high - low, 1e-12)
-    return result
+    return (2 * values - low - high) / max(high - low, 1e-12)

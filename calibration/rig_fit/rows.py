@@ -16,16 +16,14 @@ from typing import NamedTuple
 
 import numpy as np
 from numpy.polynomial import polynomial
-from numpy.typing import NDArray
 
+from calibration.arrays import Array
 from calibration.model.camera import Camera, LensModel
 from calibration.model.light_sheet import fan_origin
 from calibration.model.parameters import AXIS, DISTORTION, MATRIX, TIMES
 from calibration.model.rig_model import RigModel
 from calibration.model.scanner import PivotScanner
 from calibration.views import BoardPose
-
-Array = NDArray[np.float64]
 
 LENS_TERMS = DISTORTION[:12]
 """Names of the distortion's terms, without those of a tilted sensor."""
@@ -85,9 +83,7 @@ class _Lit(NamedTuple):
 
 
 class Sheet(NamedTuple):
-    """Points on the light that meets them. command: (m,) of the mirror; per_command: dF/dc (m,); normal: (m, 3);
-    columns: (m, scanner and timing terms) dF/dp.
-    """
+    """Points on the light that meets them: mirror command (m,), dF/dc (m,), normal (m, 3), dF/dp (m, terms)."""
 
     command: Array
     per_command: Array
@@ -123,9 +119,7 @@ def sheet_rows(
 
 
 def mirror_command(timing: Array, command: Array, y_px: Array, velocity_per_s: Array) -> Array:
-    """Position of the mirror, on the command's scale; as `RigModel.mirror_command`, with `timing` (3,) in place of a
-    model.
-    """
+    """Position of the mirror, as `RigModel.mirror_command` has it, by `timing` (3,) instead of a model."""
     delay_s: Array = np.where(velocity_per_s > 0, timing[0], timing[1]) - timing[2] * y_px
     return command - velocity_per_s * delay_s
 
@@ -171,10 +165,7 @@ def passage_rows(
     model: RigModel, terms: Terms, timing: Array, pose: BoardPose, rays: Array, command: Array, y_px: Array,
     velocity_per_s: Array,
 ) -> Rows:  # fmt: skip
-    """Rows of passages with the rays (2, m) of their pixels; residuals in units of the command.
-
-    timing: (3,) lags up and down and row delay, in place of the model's.
-    """
+    """Rows of passages with rays (2, m), in units of the command. timing: (3,) both lags and row delay."""
     assert isinstance(model.scanner, PivotScanner)
     u, v = rays
     ray = np.stack([u, v, np.ones_like(u)], axis=-1)

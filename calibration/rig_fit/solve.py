@@ -17,14 +17,13 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
+from calibration.arrays import Array
 from calibration.errors import CalibrationError, Degenerate, condition_text
 from calibration.model.camera import Camera
 from calibration.model.rig_model import Covariance
 from calibration.rig_fit.noise import Noise, bin_starts, tail_weight
 from calibration.rig_fit.rows import Rows, Terms
 from calibration.rig_fit.state import RigState, Sighting
-
-Array = NDArray[np.float64]
 
 _USUAL_MISS = float(np.sqrt(np.log(2.0)))
 """Median of a distance in a plane (Rayleigh's distribution), its mean square 1."""
@@ -58,9 +57,7 @@ class ViewNormal:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Weights:
-    """Per view: of the corners' coordinates (2 n,), of the passages (m,), where bins of shared jitter start, and its
-    variance.
-    """
+    """Per view: of corners' coordinates (2 n,), of passages (m,), starts of bins that share jitter; its variance."""
 
     corners: tuple[Array, ...]
     passages: tuple[Array, ...]
@@ -84,8 +81,7 @@ def weights(rows: Sequence[tuple[Rows, Rows]], sightings: Sequence[Sighting], no
 def corner_weights(residual_px: Array, sd_px: Array) -> Array:
     """(n,) of either coordinate of corners that are off by (2, n); sd_px: (n,) of a coordinate."""
     miss = np.hypot(*residual_px) / (sd_px * np.sqrt(2.0))
-    weight: Array = tail_weight(miss, _USUAL_MISS) / sd_px**2
-    return weight
+    return tail_weight(miss, _USUAL_MISS) / sd_px**2
 
 
 def all_rows(state: RigState, sightings: Sequence[Sighting], terms: Terms) -> list[tuple[Rows, Rows]]:
@@ -141,8 +137,7 @@ MOST_STEPS = 12
 WEIGHED_STEPS = 6
 """Steps after which an outlier stays one: weights that follow every step never come to rest."""
 CONVERGED_CHI2 = 1e-3
-"""Gain in chi2 promised by the next step at which a fit is at rest: 0.03 of a standard deviation along any
-parameter."""
+"""Gain in chi2 promised by the next step at which a fit is at rest: 0.03 sd along any parameter."""
 ROUGH_SHARE = 1e-4
 """Share of chi2 that the next step may still promise where a term is only looked for."""
 WORSE_CHI2 = 0.1
@@ -154,9 +149,7 @@ MOST_CONDITION = 1e12
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Prior:
-    """Knowledge of the camera from elsewhere. matrix: (p, p) information, 0 for the other parameters, at the values
-    (p,).
-    """
+    """Knowledge of the camera from elsewhere: information (p, p), 0 for other parameters, at the values (p,)."""
 
     matrix: Array
     values: Array
@@ -179,9 +172,7 @@ class RigProblem:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class RigSolution:
-    """A state with its residuals, its equations (matrix (p, p), right (p,): of the shared parameters, whether free or
-    not) and the condition of the free ones.
-    """
+    """A state with residuals, the equations of all shared parameters (p, p), (p,), the condition of the free ones."""
 
     state: RigState
     rows: list[tuple[Rows, Rows]]
@@ -195,15 +186,11 @@ class RigSolution:
     def covariance(self, tie: Array) -> Array:
         """(p, p) of the shared parameters, 0 where they are not free."""
         inverse, _ = scaled_inverse(tie.T @ self.matrix @ tie)
-        result: Array = tie @ inverse @ tie.T
-        return result
+        return tie @ inverse @ tie.T
 
 
 def solved(problem: RigProblem, state: RigState, noise: Noise, *, roughly: bool = False) -> RigSolution:
-    """The best state under this noise, or as near to it as a few steps lead; roughly: as near as decisions need.
-
-    Raises Degenerate where the equations have no single solution.
-    """
+    """The best state under this noise; roughly: as near as decisions need. Degenerate: there is no single one."""
     rows = all_rows(state, problem.sightings, problem.terms)
     damping = 0.0
     for step in range(MOST_STEPS):
@@ -246,10 +233,7 @@ def equations(views: Sequence[ViewNormal], problem: RigProblem, state: RigState)
 
 
 def scaled_inverse(matrix: Array) -> tuple[Array, float]:
-    """(inverse, condition number) of an information matrix, its parameters scaled to the same weight.
-
-    Raises Degenerate where it has no inverse worth the name.
-    """
+    """(inverse, condition number) of an information matrix, scaled; Degenerate where there is none worth the name."""
     weight = np.diag(matrix)
     if not np.all(np.isfinite(matrix)) or np.any(weight <= 0):
         raise Degenerate(
@@ -275,8 +259,7 @@ def _damped(matrix: Array, right: Array, damping: float) -> Array:
     """The damped step of the free parameters."""
     scale = 1 / np.sqrt(np.diag(matrix))
     scaled = matrix * scale[:, None] * scale + damping * np.eye(len(scale))
-    result: Array = scale * np.linalg.solve(scaled, scale * right)
-    return result
+    return scale * np.linalg.solve(scaled, scale * right)
 
 
 def _tried(problem: RigProblem, state: RigState, shared: Array, views: Sequence[ViewNormal]) -> RigState | None:
@@ -306,10 +289,12 @@ def _counted(views: Sequence[ViewNormal], problem: RigProblem) -> list[ViewNorma
     return [view for view, counts in zip(views, problem.counted, strict=True) if counts]
 
 
-def camera_prior(known: Covariance, camera: Camera, terms: Terms) -> Prior:
-    """The prior from a camera that other pictures told of, with their covariance."""
+def camera_prior(known: Covariance, camera: Camera, terms: Terms) -> Prior | None:
+    """The prior from a camera that other pictures told of, with their covariance; None where it is known exactly."""
     variance = dict(zip(known.names, np.diag(known.matrix), strict=True))
     names = [name for name in known.names if name in terms.camera and variance[name] > 0]
+    if not names:
+        return None
     at = terms.at(names)
     matrix: Array = np.zeros((len(terms.names), len(terms.names)))
     matrix[np.ix_(at, at)] = scaled_inverse(known.of(names))[0]
@@ -318,8 +303,7 @@ def camera_prior(known: Covariance, camera: Camera, terms: Terms) -> Prior:
 
 def _off(prior: Prior, terms: Terms, state: RigState) -> Array:
     """The prior's values less those of the state."""
-    off: Array = prior.values - _camera_values(state.model.camera, terms)
-    return off
+    return prior.values - _camera_values(state.model.camera, terms)
 
 
 def _camera_values(camera: Camera, terms: Terms) -> Array:

@@ -18,6 +18,8 @@ import numpy as np
 from numpy.polynomial import polynomial
 from numpy.typing import NDArray
 
+from calibration.arrays import Array
+from calibration.board.board import spread_rad
 from calibration.depth_error import command_at, depth_sd_m
 from calibration.errors import Degenerate, condition_text, digits
 from calibration.model.camera import Camera
@@ -27,8 +29,6 @@ from calibration.model.scanner import PivotScanner
 from calibration.rig_fit.state import Sighting
 from calibration.verdict import AT_M
 from calibration.views import NO_POSE, BoardPose, View
-
-Array = NDArray[np.float64]
 
 _ORDERS = (3, 1, 3)
 """Orders of d, b and e in the command: tangents of an angle that turns a quarter of a right angle either way."""
@@ -42,9 +42,7 @@ _STEP = 0.7
 
 @dataclass(frozen=True, slots=True, eq=False)
 class LitPoints:
-    """Points at which light met the board: points_m (m, 3), command (m,), velocity_per_s (m,), and the view of each
-    (m,).
-    """
+    """Points at which light met the board: (m, 3), command (m,), velocity (m,), the view of each (m,)."""
 
     points_m: Array
     command: Array
@@ -99,8 +97,7 @@ def _often_shown(points: LitPoints) -> Array:
     """The signed speeds at which enough boards were swept to tell their planes; where none was, the most swept."""
     velocities = np.unique(points.velocity_per_s)
     shown = np.array([np.unique(points.view[points.velocity_per_s == velocity]).size for velocity in velocities])
-    result: Array = velocities[shown >= min(POSES_FOR_PLANES, int(shown.max()))]
-    return result
+    return velocities[shown >= min(POSES_FOR_PLANES, int(shown.max()))]
 
 
 def _counts(points: LitPoints, velocities: Array) -> Array:
@@ -166,8 +163,7 @@ def _lags(velocities: Array, curves: Sequence[tuple[Array, Array]]) -> tuple[flo
 LEAST_TILT_RAD = np.radians(5.0)
 """Least tilt between two boards."""
 LEAST_THICKNESS = 0.01
-"""Least thickness of the points about the plane that fits them best, as a share of their distance: less is one
-plane."""
+"""Least thickness of the points about their best plane, as a share of their distance: less is one plane."""
 LEAST_SPAN = 0.02
 """Least share of the mirror's command range: a line that hardly moved tells nothing of how it turns."""
 LEAST_LIT_SHARE = 0.1
@@ -216,9 +212,7 @@ def check_poses(points_m: Array, poses: Sequence[BoardPose]) -> None:
 
 def reason_of(poses: Sequence[BoardPose]) -> str:
     """The likeliest reason why boards at these poses fix too little: a guess, where `coplanar` is seen."""
-    normals = np.array([pose.matrix[:, 2] for pose in poses])
-    tilt = float(np.arccos(np.clip(normals @ normals.T, -1, 1).min()))
-    return "too-few-poses" if tilt >= LEAST_TILT_RAD and len(poses) < 6 else "no-tilt"
+    return "too-few-poses" if spread_rad(poses) >= LEAST_TILT_RAD and len(poses) < 6 else "no-tilt"
 
 
 def no_start(error: Exception, poses: Sequence[BoardPose]) -> Degenerate:
@@ -243,11 +237,7 @@ def check_depth(
     misfit: float = 1.0,
     outliers: Sequence[str] = (),
 ) -> None:
-    """Raise Degenerate where the poses of a fitted model tell next to nothing of depth.
-
-    misfit: by which its variances were widened since the data contradict each other; that says nothing of the poses.
-    outliers: names of the views that had no say, whose poses are none of these.
-    """
+    """Raise Degenerate where poses tell next to nothing of depth, the misfit of contradictions taken off."""
     camera = model.camera
     x, y = np.meshgrid(np.linspace(0.1, 0.9, 7) * camera.width, np.linspace(0.1, 0.9, 5) * camera.height)
     for at_m in (AT_M, float(np.median([np.linalg.norm(pose.position_m) for pose in poses]))):

@@ -9,6 +9,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 from numpy.typing import NDArray
 
+from calibration.arrays import Array
 from calibration.board.board import PAPER_SQUARES, Board
 from calibration.model.camera import Camera
 from calibration.model.parameters import ROW_DELAY, TIMES, with_parameters
@@ -16,8 +17,6 @@ from calibration.model.rig_model import RigModel
 from calibration.model.scanner import PivotScanner
 from calibration.rig_fit.rows import Rows, Terms, corner_rows, passage_rows, refined_rays
 from calibration.views import FEWEST_CORNERS, LEAST_ACROSS_PX, USUAL_CORNER_SD_PX, BoardPose, Corners, Passages, View
-
-Array = NDArray[np.float64]
 
 EDGE_PX = 1.5
 """Passages this close to the board's outline are left out: such pixels see what stands behind it too."""
@@ -83,8 +82,7 @@ def corner_scale(corners: Corners) -> Array:
     """Relative sd of each corner, 1 where the picture did not tell."""
     if corners.sd_px is None:
         return np.ones(len(corners.ids))
-    scale: Array = np.hypot(corners.likely_sd_px, LEAST_CORNER_SD_PX) / USUAL_CORNER_SD_PX
-    return scale
+    return np.hypot(corners.likely_sd_px, LEAST_CORNER_SD_PX) / USUAL_CORNER_SD_PX
 
 
 def usable(views: Sequence[View]) -> list[View]:
@@ -131,10 +129,7 @@ def _on_board(sweep: Passages, board: Board, camera: Camera, pose: BoardPose) ->
 
 @dataclass(frozen=True, slots=True, eq=False)
 class RigState:
-    """model: camera and PivotScanner, its lags 0. timing: (3,) lag_forward, lag_backward, row_delay in s, any sign.
-
-    poses, rays ((2, m) of the passages' pixels): per view.
-    """
+    """The model, its lags 0; timing (3,): both lags, row delay in s, any sign; per view poses, rays (2, m)."""
 
     model: RigModel
     timing: Array
@@ -157,9 +152,7 @@ class RigState:
         return corners, passages
 
     def stepped(self, terms: Terms, shared: Array, poses: Sequence[Array], sightings: Sequence[Sighting]) -> "RigState":
-        """The state moved by changes of the shared parameters (p,) and of each pose (6,). CalibrationError: no such
-        model.
-        """
+        """The state moved by changes of shared parameters (p,) and of poses (6,). CalibrationError: no such model."""
         untimed = len(terms.names) - len(TIMES)
         moved = [name for name, change in zip(terms.names[:untimed], shared, strict=False) if change != 0]
         model = with_parameters(self.model, moved, [shared[terms.names.index(name)] for name in moved])

@@ -20,9 +20,8 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
-from numpy.typing import NDArray
 
-Array = NDArray[np.float64]
+from calibration.arrays import Array
 
 SPARE_FRAMES = 2
 """Frames at either end between which the edge is looked for."""
@@ -69,10 +68,7 @@ def fit_edge(
 
 
 def edge_time(edges: Sequence[Edge], times_s: Array) -> tuple[float, float]:
-    """The moment (s) that all edges share and its standard deviation; times_s: (times,), even, of what they tell.
-
-    Where they contradict each other all are worth so much less.
-    """
+    """The moment (s) that all edges share and its sd, larger where they disagree; times_s: (times,), even."""
     chi2 = np.sum([edge.chi2 for edge in edges], axis=0)
     apart = (chi2.min() - sum(edge.chi2.min() for edge in edges)) / max(len(edges) - 1, 1)
     likely = np.exp(-0.5 * (chi2 - chi2.min()) / max(apart, 1.0))

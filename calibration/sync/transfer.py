@@ -16,15 +16,13 @@ knows of it, and has both in its value.
 from dataclasses import replace
 
 import numpy as np
-from numpy.typing import NDArray
 
+from calibration.arrays import Array
 from calibration.model.parameters import BACKWARD, FORWARD, ROW_DELAY, SWEPT, TIMES, parameters, untold, with_parameters
 from calibration.model.rig_model import Covariance, Lag, RigModel
 from calibration.model.scanner import PivotScanner
 from calibration.sync.lag_fit import SIGNIFICANT, SyncFit
 from calibration.verdict import Reason
-
-Array = NDArray[np.float64]
 
 _OPEN_S = 1e-4, 1e-2
 """Standard deviation of a lag that nothing tells: enough to follow it, and to be surprised by none."""
@@ -42,8 +40,7 @@ def known_row_delay(base: RigModel) -> tuple[float, float]:
 
 
 def with_lags(base: RigModel, fit: SyncFit) -> tuple[RigModel, Reason | None]:
-    """The model with these lags, fitted with its `known_row_delay`; and why its angle cannot be right with them, None
-    where it may be."""
+    """The model with these lags, fitted with its `known_row_delay`; why its angle cannot be right then, or None."""
     assert fit.row_told or fit.row_delay_s == base.row_delay_s, "lags of another row delay"
     told, spread = _told(fit)
     names, values = parameters(base)
@@ -81,9 +78,7 @@ def _told(fit: SyncFit) -> tuple[dict[str, float], Array]:
 def _slopes(
     base: RigModel, known: Array, names: tuple[str, ...], lags: int, change: Array, spread: Array
 ) -> tuple[Array, Reason | None]:
-    """The slopes A (others, lags) of all else by the lags (the last of the names), and the reason where they cannot be
-    told.
-    """
+    """The slopes A (others, lags) of all else by the lags (the last names), and the reason where nothing tells them."""
     n = len(names) - lags
     slopes = np.zeros((n, lags))
     velocities = base.provenance.get(SWEPT) or ()

@@ -7,20 +7,20 @@ import numpy as np
 
 from calibration.board.board import Board
 from calibration.camera_fit import CameraFit, fit_camera
-from calibration.diagnosis.camera import ACCURACY_PX, JudgedCamera, judge_camera
+from calibration.diagnosis.verdicts import ACCURACY_PX, JudgedCamera, judge_camera
 from calibration.errors import Degenerate, condition_text, digits
-from calibration.files.camera_file import camera_content, camera_file_text, corners_digest
+from calibration.files.rig_file import camera_content, camera_file_text, corners_digest
 from calibration.model.camera import TERM_COUNTS
 from calibration.verdict import AT_M
 from rig.calibrate.capture import AskPerson, TellLine, require_live
-from rig.calibrate.report import camera_report
-from rig.calibrate.report_page import subject
+from rig.calibrate.report import camera_report, subject
 from rig.calibrate.session import CalibrationResult, Session, named
 from rig.calibrate.sources import SourcesLike, read_board, si_values, sort_sources
 from rig.calibrate.views import (
     LiveViewOptions,
     ViewCollection,
     good_poses,
+    in_order,
     refusal,
     require_poses,
     take_kept,
@@ -39,10 +39,7 @@ FEWEST_VIEWS = 3
 def run_camera(
     sources: SourcesLike, request: CameraRequest, *, ask: AskPerson | None = None, tell: TellLine | None = None
 ) -> CalibrationResult:
-    """Calibrate the camera; camera.yaml (`calibration.files.camera_file`) can be given to a calibration of the planes.
-
-    Raises Degenerate where the views make no camera; its notes say why, root cause first.
-    """
+    """Calibrate the camera; Degenerate, with notes why, root cause first, where the views make none."""
     si_values(request)
     if request.terms not in (0, *TERM_COUNTS):
         known = ", ".join(map(str, TERM_COUNTS))
@@ -56,7 +53,7 @@ def run_camera(
         take_kept(taken, found, board)
         if live is not None:
             require_poses(taken, request.poses)
-            choose = good_poses(live, board, request.poses, AT_M, request.seed, len(taken.views))
+            choose = in_order(good_poses(live, board, request.poses, AT_M, request.seed, len(taken.views)))
             options = LiveViewOptions(live, request.poses, choose, ask, seed=request.seed, arm=request.arm, line=False)
             take_live(taken, options, board)
         tell_stage("fitting", len(taken.views), unit="views")
@@ -122,6 +119,6 @@ def _figures(fit: CameraFit, judged: JudgedCamera, taken: ViewCollection) -> lis
         ("distortion", terms),
         ("residuals", f"{fit.rms_px:.3f} px rms"),
         ("coverage", f"{judged.coverage:.0%} of the picture within the outline of all corners, boards up to "
-                     f"{np.degrees(fit.coverage.spread_rad):.0f} degrees apart"),
+                     f"{np.degrees(fit.spread_rad):.0f} degrees apart"),
         ("condition", condition_text(fit.condition)),
     ]  # fmt: skip

@@ -56,16 +56,11 @@ MOST_LAG_S = 5e-4
 """Seconds; longest lag that is allowed for: small galvos follow their command within 100 to 300 us."""
 MOST_SWEEPS = 4
 """Most sweeps of a recording that are looked at."""
-PLAIN = {"estimator": "argmax", "filter": "none", "temporal_prior": False}
-"""Estimate settings of a scan whose maps nobody wants."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Capture:
-    """A view as it was taken.
-
-    refused: the reason why there are no corners in it; None where there are. identity: of the rig that took it.
-    """
+    """A view as it was taken, the reason why it has no corners (None: it has), the rig that took it."""
 
     view: View
     refused: Degenerate | None
@@ -117,6 +112,12 @@ def capture_recorded(run: Path, name: str, board: Board | None, *, defects: NDAr
         return _captured(rig, name, board, min(maps, MOST_SWEEPS), defects, None)
 
 
+def plain(config: RigConfig) -> RigConfig:
+    """The config of a scan whose maps nobody wants: its estimator leaves the counts whole."""
+    update = {"estimator": "argmax", "filter": "none", "temporal_prior": False}
+    return config.model_copy(update={"estimate": config.estimate.model_copy(update=update)})
+
+
 def _settings(config: RigConfig, exposures: int | None, *, bidirectional: bool) -> RigConfig:
     """The config of a capture. UsageError for a rig of several lines."""
     if len(config.line_offsets) > 1:
@@ -130,7 +131,7 @@ def _settings(config: RigConfig, exposures: int | None, *, bidirectional: bool) 
             scan = type(scan).model_validate({**scan.model_dump(mode="json"), "exposures": exposures})
         except ValidationError as error:
             raise UsageError(f"exposures {exposures}: {error.errors()[0]['msg']}") from error
-    return config.model_copy(update={"scan": scan, "estimate": config.estimate.model_copy(update=PLAIN)})
+    return plain(config.model_copy(update={"scan": scan}))
 
 
 def _captured(
@@ -213,8 +214,7 @@ def _corners(
 TellLine = Callable[[str], None]
 """A callback that takes a line for people."""
 AskPerson = Callable[[str], None]
-"""A callback that has the board moved as a text says and returns once it is done; KeyboardInterrupt ends the session.
-"""
+"""A callback that has the board moved as a text says; KeyboardInterrupt ends the session."""
 
 
 def world_moves_board(config: RigConfig) -> bool:
@@ -258,18 +258,14 @@ def shown(config: RigConfig, what: str, pose: Candidate, ask: AskPerson | None, 
 
 
 Scan = Callable[[int | None], Capture]
-"""A function that takes a view at so many exposures per column; None is the config's. PlanError where that cannot be.
-"""
+"""A function that takes a view at so many exposures per column; None: the config's. PlanError: it cannot."""
 
 
 class SpeedRotation:
     """Takes the views at several speeds by turns."""
 
     def __init__(self, exposures: Sequence[int], sees: Callable[[Capture], bool], tell: TellLine | None = None) -> None:
-        """Prepare the turns.
-
-        exposures: per column, by turns; empty is the config's. sees: whether a capture has what it was taken for.
-        """
+        """Take the exposures per column, none: the config's; `sees` says whether a capture has what it is taken for."""
         self.turns = list(exposures)
         self._sees = sees
         self._tell = tell

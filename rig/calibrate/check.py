@@ -8,28 +8,30 @@ from typing import Any
 
 import numpy as np
 
-from calibration.check import CheckedAngle, CheckedBoard, check_angle, check_boards
+from calibration.check import CheckedAngle, CheckedBoard, check_angle, check_board
 from calibration.depth_error import DepthUncertainty, depth_uncertainty, sensitivity
-from calibration.diagnosis.camera import judge_check
-from calibration.diagnosis.rig import goal
+from calibration.diagnosis.verdicts import goal, judge_check
 from calibration.errors import Degenerate, mm
-from calibration.files.camera_file import CORNERS, corners_digest
-from calibration.files.rig_file import load_rig_model
+from calibration.files.rig_file import CORNERS, corners_digest, load_rig_model
 from calibration.model.rig_model import RigModel
 from calibration.verdict import AccuracyGoal, Verdict
 from calibration.views import View
 from rig.calibrate.capture import AskPerson, TellLine, require_live
-from rig.calibrate.report import check_report
-from rig.calibrate.report_page import subject
+from rig.calibrate.report import check_report, subject
 from rig.calibrate.session import CalibrationResult, Session, true_errors, truth_content
 from rig.calibrate.sources import SourcesLike, read_board, si_values, sort_sources
-from rig.calibrate.views import LiveViewOptions, ViewCollection, good_poses, note_views, take_kept, take_live
+from rig.calibrate.views import LiveViewOptions, ViewCollection, good_poses, in_order, note_views, take_kept, take_live
 from rig.devices.calibration_use import note_check
 from rig.errors import UsageError
 from rig.progress import tell_stage
 from rig.requests import CheckRequest
 from rig.scan.run import versions
 
+_BOARD_KEYS = (
+    "distance_m", "flatness_rms_m", "flatness_peak_m", "expected_m", "chi2", "freedom", "scale", "scale_sd",
+    "point_rms_m",
+)  # fmt: skip
+"""Figures of a checked board that are in the summary."""
 NO_COVARIANCE = "the calibration has no covariance: nothing tells what depth error to expect"
 SEED_APART = 1 << 20
 """Offset of a check's seeds from a calibration's: a simulated rig then shows other poses and other photons."""
@@ -38,11 +40,7 @@ SEED_APART = 1 << 20
 def run_check(
     sources: SourcesLike, request: CheckRequest, *, ask: AskPerson | None = None, tell: TellLine | None = None
 ) -> CalibrationResult:
-    """Check a calibration and note the result beside its file, if the calibration says of which rig it is.
-
-    Raises Degenerate where the board was not scanned, UsageError where there is no calibration, or one made of these
-    very views.
-    """
+    """Check a calibration, note the result beside it. Degenerate: no board; UsageError: views it is made of."""
     values = si_values(request)
     stated_rad = values.pop("angle_rad", None)
     found, board = sort_sources(sources, scene=request.scene), read_board(request.board)
@@ -60,13 +58,13 @@ def run_check(
         _require_others(taken.views, model)
         if live is not None:
             seed, poses = request.seed + SEED_APART, max(request.poses, views_needed)
-            choose = good_poses(live, board, poses, wanted.at_m, seed)
+            choose = in_order(good_poses(live, board, poses, wanted.at_m, seed))
             options = LiveViewOptions(live, poses, choose, ask, seed=seed, arm=request.arm, defects=model.defects)
             take_live(taken, options, board)
         views = _with_board(taken, views_needed)
         model.check_sensor(*taken.size)
         tell_stage("judging", len(views), unit="views")
-        boards = check_boards(model, views, board)
+        boards = [check_board(model, view, board) for view in views]
         angle = None if stated_rad is None else check_angle(model, views[0], views[1], board)
         verdict = judge_check(boards, wanted, board.size_m[0], angle, stated_rad)
         uncertainty = None if model.covariance is None else depth_uncertainty(model, wanted.at_m)
@@ -120,21 +118,7 @@ def _summary(
     boards: Sequence[CheckedBoard], wanted: AccuracyGoal, uncertainty: DepthUncertainty | None
 ) -> dict[str, Any]:
     return {
-        "boards": [
-            {
-                "view": board.name,
-                "distance_m": board.distance_m,
-                "flatness_rms_m": board.flatness_rms_m,
-                "flatness_peak_m": board.flatness_peak_m,
-                "expected_m": board.expected_m,
-                "chi2": board.chi2,
-                "freedom": board.freedom,
-                "scale": board.scale,
-                "scale_sd": board.scale_sd,
-                "point_rms_m": board.point_rms_m,
-            }
-            for board in boards
-        ],
+        "boards": [{"view": board.name, **{key: getattr(board, key) for key in _BOARD_KEYS}} for board in boards],
         "depth_error": {
             "at_m": wanted.at_m,
             "asked_m": wanted.accuracy_m,
@@ -158,14 +142,11 @@ def _consequence(verdict: Verdict, model: RigModel, file: Path) -> list[tuple[st
 def _figures(boards: Sequence[CheckedBoard], angle: CheckedAngle | None) -> list[tuple[str, str]]:
     rows = []
     for board in boards:
-        rows.append(
-            (
-                f"view {board.name}",
-                f"{board.distance_m:.2f} m away, flat to {mm(board.flatness_rms_m)} rms "
-                f"({mm(board.expected_m)} expected), {mm(board.flatness_peak_m)} peak, scale "
-                f"{board.scale - 1:+.3%} (sd {board.scale_sd:.2%})",
-            )
+        said = (
+            f"{board.distance_m:.2f} m away, flat to {mm(board.flatness_rms_m)} rms ({mm(board.expected_m)} expected), "
+            f"{mm(board.flatness_peak_m)} peak, scale {board.scale - 1:+.3%} (sd {board.scale_sd:.2%})"
         )
+        rows.append((f"view {board.name}", said))
     if angle is not None:
         rows.append(("angle", f"{math.degrees(angle.angle_rad):.3f} degrees, sd {math.degrees(angle.sd_rad):.2g}"))
     return rows

@@ -1,19 +1,27 @@
 """`rig calibrate pixels`: maps the pixels from dark frames and compares the map with the last one.
 
+Frames come from the SPAD alone, or are the dark and lit ones of a recorded run. In the dark nothing moves and no light
+leaves: the gate is low, the laser is not armed, the scanner stands. The frames come in short starts spread over a
+while, since rates that jump do so within milliseconds or minutes.
+
 The folder: pixels.npz (the map with its version), calibration.yaml (that of the config with the new defects and dark
-rates, where it has one), dark_rate.png, report.html, summary.json. The statistics are in `calibration.pixels`.
+rates, where it has one), dark_rate.png, report.html, summary.json. The statistics are in `calibration.pixel_map`.
 """
 
 import logging
 import math
-from collections.abc import Callable
-from dataclasses import dataclass, replace
+import os
+from collections.abc import Callable, Iterator
+from dataclasses import asdict, dataclass, replace
 from datetime import UTC, datetime
+from fractions import Fraction
 from pathlib import Path
-from typing import Any, Final
+from typing import Any, Final, Protocol, runtime_checkable
 
 import numpy as np
+from numpy.typing import NDArray
 
+from calibration.arrays import Mask
 from calibration.errors import CalibrationError, digits
 from calibration.files.rig_file import CALIBRATION_FILE, load_rig_model, save_rig_model
 from calibration.model.rig_model import RigModel
@@ -35,20 +43,178 @@ from calibration.pixel_map import (
     save_pixels,
 )
 from calibration.verdict import Reason, Verdict
+from drivers.frames import FrameBlock, frame_bytes
+from drivers.interfaces import SpadInfo, SpadMode, SpadRequest
 from drivers.recorded.segments import segment_files
-from rig.calibrate.dark_frames import Sums, recorded_exposure_s, take_dark, take_sweeps
+from drivers.ring import BlockRing
+from rig.calibrate.capture import plain
 from rig.calibrate.report import dark_rate_picture, pixel_page
 from rig.calibrate.session import EXIT_NOT_TRUSTWORTHY
-from rig.config.models import RigConfig
+from rig.config.models import RigConfig, ScanConfig
 from rig.config.overrides import Config, PathLike, configure
+from rig.count.sweeps import SweepData
+from rig.count.volume import BIN_DARK, CountVolume, SweepCounter, SweepLayout
 from rig.devices.calibration_use import carry_notes, note_check
 from rig.devices.open import OpenRig, open_rig, require_simulated_or_armed
 from rig.errors import UsageError
-from rig.progress import Progress
+from rig.geometry.windows import WORD_PX
+from rig.progress import Progress, counted
+from rig.recording.inputs import read_plan
 from rig.recording.replay import ReplayOptions, replay_config
-from rig.requests import PixelsRequest
+from rig.requests import PixelsRequest, RunRequest
 from rig.run_folder.folder import RunFolder
 from rig.run_folder.pictures import png_bytes
+from rig.run_folder.summary import MapTally
+from rig.scan.monitor import Listeners, ScanProgress
+from rig.scan.pipeline import JOIN_S
+from rig.scan.run import Run
+from rig.scan.scan import run_scan
+from rig.scan.source import Source, blocks
+from rig.threads import RowWorkers
+
+STARTS: Final = 32
+"""Number of starts of the SPAD, and so of blocks whose counts are compared."""
+BLOCK_FRAMES: Final = 128
+SPARE_SLOTS: Final = 4
+"""Slots of the ring beyond those needed, for a device that sends shorter blocks than asked for, and would drop some."""
+SILENCE_S: Final = 5.0
+SPREAD_S: Final = 10.0
+"""Seconds from the first start to the last one."""
+
+Sums = tuple[NDArray[np.int64], NDArray[np.int64]]
+"""Ones and frames of every pixel, (rows, width) each."""
+
+
+@runtime_checkable
+class CoversLens(Protocol):
+    """A world that can put the cap on the lens."""
+
+    def cover_lens(self) -> None:
+        """Let no light in any more."""
+        ...
+
+
+@dataclass(slots=True)
+class SweepSums:
+    """Adds up the dark and the lit frames of counted sweeps; `add` fits the `sweeps` option of a scan."""
+
+    tally: DarkTally | None = None
+    lit: Sums | None = None
+
+    def add(self, sweep: SweepData) -> None:
+        """Add a sweep; its dark frames are one block."""
+        volume = sweep.volume
+        if not isinstance(volume, CountVolume) or volume.dark_counts is None:
+            return
+        shape = volume.dark_counts.shape
+        self.tally = self.tally or DarkTally((shape[0], shape[1]))
+        dark_frames = volume.n_dark if volume.dark_frames is None else volume.dark_frames
+        self.tally.add(volume.dark_counts.astype(np.int64), np.asarray(dark_frames, np.int64))
+        ones, frames = self.lit or (np.zeros(shape, np.int64), np.zeros(shape, np.int64))
+        self.lit = ones + volume.intensity(), frames + _frames_in_windows(volume)
+
+
+def take_dark(
+    rig: OpenRig,
+    frames: int,
+    *,
+    progress: Progress | None = None,
+    covered: Callable[[], None] | None = None,
+) -> tuple[DarkTally, float]:
+    """Take at least so many frames in the dark, once the lens is `covered`; also their exposure in s. DeviceError."""
+    if isinstance(rig.world, CoversLens):
+        rig.world.cover_lens()
+    elif covered is not None:
+        covered()
+    info = rig.spad.info
+    burst = info.burst.capacity_frames if info.stream is None and info.burst is not None else None
+    per_start = min(math.ceil(frames / STARTS), burst or frames)
+    request = _request(rig.config.scan, info, per_start)
+    timing = rig.spad.configure(request)
+    rig.sync.gate_low()
+    workers = RowWorkers(rig.config.estimate.threads or os.cpu_count() or 1)
+    counter = SweepCounter(_layout(info.height, info.width), workers)
+    tally = DarkTally((info.height, info.width))
+    starts = math.ceil(frames / per_start)
+    rest_s = max(0.0, (SPREAD_S - frames / float(request.frame_rate_hz)) / max(starts - 1, 1))
+    told = counted("taking dark frames", "frames", progress)
+    for start in range(starts):
+        if start:
+            rig.clock.sleep(rest_s)
+        counter.reset()
+        for block in _blocks(rig, per_start, timing.stride, request.block_frames):
+            _count(counter, block)
+        sums = counter.finish()
+        if sums.dark_counts is not None:
+            tally.add(sums.dark_counts.astype(np.int64), sums.n_dark)
+        told((start + 1) * per_start, frames)
+    return tally, float(timing.exposure_ticks / timing.tick_hz)
+
+
+def take_sweeps(rig: OpenRig, maps: int | None = None, progress: Progress | None = None) -> SweepSums:
+    """Take the frames of a scan with light, or of all sweeps of a recording. An interrupt is raised again."""
+    scan, sums = rig.config.scan, SweepSums()
+
+    def live(now: ScanProgress) -> None:
+        if progress is not None:
+            progress(now.frames, now.frames_planned)
+
+    with Run(None, MapTally(scan.columns, scan.exposures, "argmax", "none")) as run:
+        request = RunRequest(maps=maps, accept_calibration=True)
+        run_scan(rig, run, request, Listeners(sweeps=sums.add, live=live)).uninterrupted()
+    if sums.tally is None:
+        raise UsageError(f"{rig.spad.name} gave no sweep with dark frames in one piece; scan again")
+    return sums
+
+
+def recorded_exposure_s(run: Path) -> float:
+    """Exposure of a recording's frames, seconds."""
+    return float(read_plan(run).exposure_s)
+
+
+def _request(scan: ScanConfig, info: SpadInfo, frames: int) -> SpadRequest:
+    """Request for full frames of the scan's exposure, as fast as the link carries them."""
+    rate = Fraction(scan.frame_rate)
+    if info.stream is not None:
+        rate = min(rate, Fraction(math.floor(info.stream.bytes_per_s / frame_bytes(info.width, info.height))))
+    mode: SpadMode = "burst" if info.stream is None else "stream"
+    return SpadRequest(rate, scan.exposure_s, mode, min(BLOCK_FRAMES, frames))
+
+
+def _layout(rows: int, width: int) -> SweepLayout:
+    """Layout for dark frames only: no column will ever be counted."""
+    return SweepLayout(1, rows, width, np.zeros(1, np.int32), WORD_PX, 1)
+
+
+def _blocks(rig: OpenRig, frames: int, stride: int, block_frames: int) -> Iterator[FrameBlock]:
+    """Blocks of a start of so many frames, for all of which the ring has room."""
+    ring = BlockRing(-(-frames // block_frames) + SPARE_SLOTS, stride)
+    source = Source(rig.spad, ring, SILENCE_S, lambda: None)
+    with ring.reader("pixels") as reader:
+        rig.spad.start(frames)
+        source.start()
+        try:
+            yield from blocks(reader, source, SILENCE_S)
+        finally:
+            source.end()
+            rig.spad.stop()
+            source.join(JOIN_S)
+
+
+def _count(counter: SweepCounter, block: FrameBlock) -> None:
+    n = block.n_frames
+    if n:
+        counter.add(block.bits, np.full(n, BIN_DARK, np.int32), np.zeros(n), np.zeros(n, np.int32))
+
+
+def _frames_in_windows(volume: CountVolume) -> NDArray[np.int64]:
+    """Frames (width,) in which each pixel of a row lay within the counted window."""
+    window = volume.counts.shape[2]
+    change = np.zeros(max(volume.width, int(volume.x0.max(initial=0)) + window) + 1, np.int64)
+    np.add.at(change, volume.x0, volume.n_frames)
+    np.add.at(change, volume.x0 + window, -volume.n_frames)
+    return np.cumsum(change)[: volume.width]
+
 
 MOST_LEAK: Final = 0.1
 """Correlation of neighbouring pixels' rates beyond which the lens was not covered; crosstalk makes 0.01."""
@@ -102,20 +268,13 @@ class PixelResult:
     def as_json(self) -> dict[str, Any]:
         """Return what summary.json holds, as plain values."""
         pixels, drift = self.found.pixels, self.drift
-        content: dict[str, Any] = {
-            "sensor": self.found.sensor,
-            "version": self.found.version,
-            "id": self.found.id,
-            "parent": self.found.parent,
-            "created": self.found.created,
+        return {
+            **{key: getattr(self.found, key) for key in ("sensor", "version", "id", "parent", "created")},
             "frames": pixels.frames,
             "exposure_s": pixels.exposure_s,
             "dark_rate_per_s": pixels.ordinary_per_s,
             "limit_per_s": float(np.nanmedian(pixels.limit_per_s)),
-            "hot": int(pixels.hot.sum()),
-            "noisy": int(pixels.noisy.sum()),
-            "dead": None if pixels.dead is None else int(pixels.dead.sum()),
-            "defects": int(pixels.defects.sum()),
+            **{key: _total(getattr(pixels, key)) for key in ("hot", "noisy", "dead", "defects")},
             "judged": pixels.judged,
             "lit_judged": pixels.lit_judged,
             "light_leak": self.leak,
@@ -123,7 +282,10 @@ class PixelResult:
             "calibration": None if self.calibration is None else str(self.calibration),
             "verdict": self.verdict.as_json(),
         }
-        return content
+
+
+def _total(mask: Mask | None) -> int | None:
+    return None if mask is None else int(mask.sum())
 
 
 def pixel_verdict(pixels: PixelMap, drift: PixelDrift | None, leak: float) -> Verdict:
@@ -143,10 +305,11 @@ def pixel_verdict(pixels: PixelMap, drift: PixelDrift | None, leak: float) -> Ve
 
 def _drift_reasons(drift: PixelDrift) -> list[Reason]:
     again = "scan with the calibration written here"
-    alike = drift.alike if drift.alike is not None else 1.0
-    said = f"{alike:.0%} of the hot pixels are hot again"
+    alike = 1.0 if drift.alike is None else drift.alike
     told = {
-        "other-sensor": (said, alike, LEAST_ALIKE, "compare maps of one sensor"),
+        "other-sensor": (
+            f"{alike:.0%} of the hot pixels are hot again", alike, LEAST_ALIKE, "compare maps of one sensor",
+        ),
         "dark-rate-drift": (f"dark rates are {drift.ratio:.3g} times those before", drift.ratio, MOST_RATIO, again),
         "new-defects": (
             f"{drift.new_defects:.2%} of the pixels became defects", drift.new_defects, MOST_NEW_DEFECTS, again,
@@ -167,18 +330,9 @@ def _drift_rows(drift: PixelDrift, against: PixelVersion) -> list[tuple[str, str
 
 
 def _drift_json(drift: PixelDrift) -> dict[str, Any]:
-    return {
-        "became_hot": drift.became_hot.tolist(),
-        "became_dead": drift.became_dead.tolist(),
-        "recovered": drift.recovered.tolist(),
-        "ratio": drift.ratio,
-        "ratio_sigma": drift.ratio_sigma,
-        "changed": drift.changed,
-        "correlation": None if np.isnan(drift.correlation) else drift.correlation,
-        "alike": drift.alike,
-        "new_defects": drift.new_defects,
-        "reasons": list(drift.reasons),
-    }
+    content = {key: value.tolist() if isinstance(value, np.ndarray) else value for key, value in asdict(drift).items()}
+    content["correlation"] = None if np.isnan(drift.correlation) else drift.correlation
+    return {**content, "reasons": list(drift.reasons)}
 
 
 _log = logging.getLogger(__name__)
@@ -195,15 +349,9 @@ def run_pixels(
     progress: Progress | None = None,
     covered: Callable[[], None] | None = None,
 ) -> PixelResult:
-    """Map the pixels of a sensor (`rig calibrate pixels`).
-
-    source: a rig, whose SPAD then takes frames in the dark; or the folder of a recorded run, whose dark and lit frames
-      are taken.
-    covered: called where a person has to cover the lens.
-    Raises UsageError, DeviceError.
-    """
+    """Map the pixels of a rig, its lens `covered`, or of a recorded run's frames. Raises UsageError, DeviceError."""
     recorded, frames = _recorded(source), request.frames
-    config = _quick(replay_config(recorded, ReplayOptions(), None, {}) if recorded else configure(source))
+    config = plain(replay_config(recorded, ReplayOptions(), None, {}) if recorded else configure(source))
     problems = [] if not request.light or recorded else require_simulated_or_armed(config, request.arm)
     if frames is not None and frames < 1:
         problems.append(f"frames is {frames}; it must be at least 1")
@@ -225,7 +373,10 @@ def run_pixels(
                 wanted = frames or frames_for(float(hot_flux(SIGNAL, 0.0)))
                 tally, exposure_s = take_dark(rig, wanted, progress=progress, covered=covered)
         found = _version(judge_pixels(tally, exposure_s, lit=lit_sums), last, sensor)
-        drift = None if last is None else _drift(last.pixels, found.pixels)
+        try:
+            drift = None if last is None else pixel_drift(last.pixels, found.pixels)
+        except CalibrationError as error:
+            raise UsageError(str(error)) from error
         leak = 0.0 if recorded else light_leak(found.pixels)
         result = PixelResult(found, drift, last, pixel_verdict(found.pixels, drift, leak), leak)
         if request.against is None and drift is not None:
@@ -244,15 +395,9 @@ def _recorded(source: Config) -> Path | None:
     return path if path.is_dir() and segment_files(path) else None
 
 
-def _quick(config: RigConfig) -> RigConfig:
-    """The config with the estimator that leaves the counts whole."""
-    estimate = config.estimate.model_copy(update={"estimator": "argmax", "filter": "none", "temporal_prior": False})
-    return config.model_copy(update={"estimate": estimate})
-
-
 def _recorded_sums(run: Path, progress: Progress | None) -> tuple[DarkTally, Sums | None, str]:
     """Dark and lit sums of a recording's sweeps, and the sensor that took them."""
-    with open_rig(_quick(replay_config(run, ReplayOptions(), None, {}))) as rig:
+    with open_rig(plain(replay_config(run, ReplayOptions(), None, {}))) as rig:
         sums, sensor = take_sweeps(rig, progress=progress), _sensor(rig)
     assert sums.tally is not None, "else it would have been refused"
     return sums.tally, sums.lit, sensor
@@ -275,13 +420,6 @@ def _last(against: PathLike | None, config: RigConfig, recorded: Path | None) ->
         return None
     try:
         return load_pixels(path)
-    except CalibrationError as error:
-        raise UsageError(str(error)) from error
-
-
-def _drift(old: PixelMap, new: PixelMap) -> PixelDrift:
-    try:
-        return pixel_drift(old, new)
     except CalibrationError as error:
         raise UsageError(str(error)) from error
 

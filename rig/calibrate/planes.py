@@ -15,25 +15,23 @@ import numpy as np
 
 from calibration.board.board import Board
 from calibration.depth_error import DepthErrors
-from calibration.diagnosis.rig import JudgedRig, judge_fit
+from calibration.diagnosis.verdicts import JudgedRig, judge_fit
 from calibration.errors import CalibrationError, Degenerate, condition_text, mm
-from calibration.files.camera_file import CORNERS, KnownCamera, corners_digest
-from calibration.files.rig_file import load_rig_model
+from calibration.files.rig_file import CORNERS, KnownCamera, corners_digest, load_rig_model
 from calibration.guide import Advice, Forecast, candidates, next_pose
 from calibration.model.rig_model import Identity, RigModel
-from calibration.rig_fit.fit import fit_rig
-from calibration.rig_fit.result import RigFit
+from calibration.rig_fit.fit import RigFit, fit_rig
 from calibration.views import View
 from rig.calibrate.capture import AskPerson, TellLine, require_live
-from rig.calibrate.report import planes_report
-from rig.calibrate.report_page import subject
+from rig.calibrate.report import planes_report, subject
 from rig.calibrate.session import CalibrationResult, Session, named, true_errors, truth_content
 from rig.calibrate.sources import CameraUse, SourcesLike, camera_use, read_board, si_values, sort_sources
 from rig.calibrate.views import (
-    FixedPoses,
+    ChoosePose,
     LiveViewOptions,
     ViewCollection,
     good_poses,
+    in_order,
     refusal,
     require_poses,
     take_kept,
@@ -55,11 +53,7 @@ the line in bright light only, so that it is tried only where it is the config's
 def run_planes(
     sources: SourcesLike, request: PlanesRequest, *, ask: AskPerson | None = None, tell: TellLine | None = None
 ) -> CalibrationResult:
-    """Calibrate the planes from the sources; the defective pixels of `request.calibration` are kept.
-
-    ask: gets a person to move the board. tell: gets a line about each view.
-    Raises Degenerate where the views make no calibration; its notes say why, root cause first.
-    """
+    """Calibrate the planes; the base's defects are kept. Degenerate, with notes why, where the views make none."""
     values = si_values(request)
     found = sort_sources(sources, scene=request.scene)
     camera = None if request.camera is None else camera_use(Path(request.camera), accept=request.accept_calibration)
@@ -73,13 +67,13 @@ def run_planes(
         take_kept(taken, found, board, defects)
         if live is not None:
             require_poses(taken, request.poses)
-            start = good_poses(live, board, request.poses, values["at_m"], request.seed, len(taken.views))
+            start = in_order(good_poses(live, board, request.poses, values["at_m"], request.seed, len(taken.views)))
             fit_and_judge = partial(_fit, taken, board, base, known), partial(_judged, taken, values)
             guide = PoseGuide(start, board, live.scan.depth_range, taken, *fit_and_judge)
             options = LiveViewOptions(
                 live,
                 request.poses,
-                guide if request.guided else start,
+                guide.next if request.guided else start,
                 ask,
                 exposures=request.exposures or speeds_of(live),
                 seed=request.seed,
@@ -193,7 +187,7 @@ def _summary(fit: RigFit, judged: JudgedRig, taken: ViewCollection) -> dict[str,
             "line": uncertainty.line(),
         },
         "corner_rms_px": fit.corner_rms_px,
-        "passages": sum(len(sweep.residual) for sweeps in fit.sweeps for sweep in sweeps),
+        "passages": sum(len(sweep.residual) for sweep in fit.every_sweep),
         "passage_factor": fit.noise.passage_factor,
         "jitter_sd": fit.noise.jitter_sd,
         "misfit": fit.misfit,
@@ -244,14 +238,10 @@ class PoseGuide:
     """Chooses poses by how much they lower the expected error, until the accuracy asked for is expected."""
 
     def __init__(
-        self, start: FixedPoses, board: Board, depth_range_m: tuple[float, float], taken: ViewCollection,
+        self, start: ChoosePose, board: Board, depth_range_m: tuple[float, float], taken: ViewCollection,
         fit: Callable[[], RigFit], judge: Callable[[RigFit], JudgedRig],
     ) -> None:  # fmt: skip
-        """Prepare the guide.
-
-        start: poses for as long as no fit can be judged. taken: all views so far, those kept earlier too. fit, judge:
-        fit and judge these views as the calibration itself will be.
-        """
+        """Take poses for as long as no fit can be judged, all views so far, how they will be fitted and judged."""
         self._start = start
         self._board = board
         self._depth_range_m = depth_range_m
@@ -265,7 +255,7 @@ class PoseGuide:
         known = self._taken.views
         told = self._told() if len(known) >= START_POSES else None
         if told is None:
-            return self._start.next(views)
+            return self._start(views)
         fit, judged = told
         at_m = judged.asked.at_m
         now_m = judged.evidence.expected_m
@@ -279,7 +269,7 @@ class PoseGuide:
         ]
         if not choices:
             return None
-        advice = next_pose(len(known), choices, at_m, now_m, Forecast(fit, at_m))
+        advice = next_pose(choices, at_m, now_m, Forecast(fit, at_m))
         chosen = advice.candidate
         self._asked.add((chosen.fill, chosen.place, chosen.tilt))  # a board that was not found there will not be again
         return advice

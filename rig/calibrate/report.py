@@ -1,44 +1,282 @@
 """Writes the reports of `rig calibrate`, one HTML file each: verdict and reasons first, then the pictures.
 
-`planes_report`, `camera_report`, `check_report`, `sync_report` and `pixel_page` make them.
+`planes_report`, `camera_report`, `check_report`, `sync_report` and `pixel_page` make them from `page`, its tables,
+pictures and charts; nothing is loaded from elsewhere. Numbers have their units and as many digits as are known.
+`subject` says what a report is of, so that two of them on a desk can be told apart.
 """
 
-from collections.abc import Sequence
+import base64
+import re
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from datetime import UTC, datetime
+from html import escape
 
 import cv2
 import numpy as np
 from numpy.typing import NDArray
 
+from calibration.arrays import Array
 from calibration.board.board import Board
-from calibration.camera_fit import CameraFit
+from calibration.camera_fit import CameraFit, rms
 from calibration.check import CheckedBoard
 from calibration.depth_error import DepthUncertainty
-from calibration.diagnosis.camera import JudgedCamera
-from calibration.diagnosis.rig import JudgedRig
+from calibration.diagnosis.contradictions import SweepWaves
+from calibration.diagnosis.verdicts import JudgedCamera, JudgedRig
 from calibration.errors import digits, in_mm, mm
 from calibration.model.camera import Camera
+from calibration.model.rig_model import Identity
 from calibration.pixel_map import PixelDrift, PixelMap, PixelVersion
-from calibration.rig_fit.result import RigFit
+from calibration.rig_fit.fit import RigFit, SweepFit
 from calibration.sync.lag_fit import SyncFit
 from calibration.verdict import Verdict
 from calibration.views import BoardPose, View
-from rig.calibrate.report_page import (
-    ReportSection,
-    cells_picture,
-    coverage_picture,
-    error_picture,
-    in_mm_with_sign,
-    measured,
-    page,
-    paragraph,
-    picture,
-    plane_residuals,
-    residual_picture,
-    table,
-)
 from rig.run_folder.charts import Panel, Series, chart_svg
+from rig.run_folder.pictures import depth_limits, depth_picture, png_bytes
 
-Array = NDArray[np.float64]
+_STYLE = """
+body { font: 15px/1.45 Helvetica, Arial, sans-serif; color: #33404d; max-width: 860px; margin: 2em auto }
+h1 { font-size: 1.5em } h2 { font-size: 1.15em; margin-top: 2em } p { margin: 0.5em 0 }
+.passed, .failed { padding: 0.6em 1em; margin-bottom: 1em; border-left: 6px solid; background: #f6f8fa }
+.passed { border-color: #009e73 } .failed { border-color: #d55e00 }
+table { border-collapse: collapse; font-size: 0.92em } td, th { padding: 0.15em 0.9em 0.15em 0; text-align: left }
+td.number, th.number { text-align: right; font-variant-numeric: tabular-nums }
+img { max-width: 100%; margin-top: 0.7em; image-rendering: auto } .small { color: #7b8896; font-size: 0.88em }
+"""
+
+_NUMBER = re.compile(r"-|[-+]?[\d.]+(e[-+]?\d+)?( of \d+)?")
+
+Picture = NDArray[np.uint8]
+
+
+@dataclass(frozen=True, slots=True)
+class ReportSection:
+    """A part of a report. body: its HTML."""
+
+    title: str
+    body: str
+
+
+def page(
+    title: str,
+    verdict: Verdict,
+    line: str,
+    figures: Sequence[tuple[str, str]],
+    sections: Sequence[ReportSection],
+    about: Sequence[tuple[str, str]] = (),
+) -> str:
+    """Make the HTML file: verdict with its reasons, the one line that matters, the figures, `about`, the sections."""
+    parts = [
+        f'<!DOCTYPE html>\n<html lang="en"><head><meta charset="utf-8"><title>{escape(title)}</title>',
+        f"<style>{_STYLE}</style></head><body><h1>{escape(title)}</h1>",
+        _verdict(verdict, line),
+        table(("", ""), [*figures, *about]) if figures or about else "",
+        *(f"<h2>{escape(section.title)}</h2>\n{section.body}" for section in sections),
+        "</body></html>\n",
+    ]
+    return "\n".join(parts)
+
+
+def paragraph(text: str, *, small: bool = False) -> str:
+    """Make a paragraph of plain text."""
+    kind = ' class="small"' if small else ""
+    return f"<p{kind}>{escape(text)}</p>"
+
+
+def table(head: Sequence[str], rows: Sequence[Sequence[str]]) -> str:
+    """Make a table; columns whose cells are all numbers, or dashes in their place, are aligned right."""
+    numbers = [bool(rows) and all(_NUMBER.fullmatch(row[i]) for row in rows) for i in range(len(head))]
+
+    def cells(row: Sequence[str], tag: str) -> str:
+        kinds = (' class="number"' if number else "" for number in numbers)
+        return "".join(f"<{tag}{kind}>{escape(text)}</{tag}>" for kind, text in zip(kinds, row, strict=True))
+
+    top = f"<tr>{cells(head, 'th')}</tr>" if any(head) else ""
+    body = "".join(f"<tr>{cells(row, 'td')}</tr>" for row in rows)
+    return f"<table>{top}{body}</table>"
+
+
+def picture(pixels: Picture, caption: str) -> str:
+    """Show a picture, BGR or grey, with a caption below it."""
+    data = base64.b64encode(png_bytes(pixels)).decode()
+    return f'<img alt="{escape(caption)}" src="data:image/png;base64,{data}">{paragraph(caption, small=True)}'
+
+
+def _verdict(verdict: Verdict, line: str) -> str:
+    word = "passed" if verdict.passed else "failed"
+    reasons = "".join(f"<p>{escape(str(reason))}.</p>" for reason in verdict.reasons)
+    said = f"<p>{escape(line)}</p>" if line else ""
+    return f'<div class="{word}"><p><b>{word.upper()}</b></p>{said}{reasons}</div>'
+
+
+_UNITS = {
+    "angle": ("mrad", 1e3), "cone": ("mrad", 1e3), "bow": ("mrad/rad^2", 1e3),
+    "offset_0": ("mm", 1e3), "offset": ("mm/rad^{order}", 1e3),
+    "lag": ("us", 1e6), "row_delay": ("ns/row", 1e9),
+}  # fmt: skip
+"""Unit of each term of the model, and how many of them make one of SI's; none in units of the mirror command."""
+
+
+def measured(name: str, value: float, sd: float) -> tuple[str, str, str]:
+    """Value and standard deviation of a model's term, to the second digit of the latter, and their unit."""
+    first = name.split("/", maxsplit=1)[0]
+    kind, _, order = first.rpartition("_") if first[-1].isdigit() else (first, "", "")
+    unit, times = next((_UNITS[key] for key in (first, kind, kind.split("_")[0]) if key in _UNITS), ("", 1.0))
+    value, sd, unit = value * times, sd * times, unit.format(order=order)
+    if not (np.isfinite(value) and np.isfinite(sd) and sd > 0):
+        return (f"{value:.4g}" if np.isfinite(value) else "-"), "-", unit
+    digits = max(0, 1 - int(np.floor(np.log10(sd))))
+    return f"{value:.{digits}f}", f"{sd:.{digits}f}", unit
+
+
+def in_mm_with_sign(length_m: float) -> str:
+    """A length with its sign in millimetres, such as '+3.1', for a table whose head names the unit."""
+    return f"+{in_mm(length_m)}" if length_m > 0 else in_mm(length_m)
+
+
+def subject(
+    identity: Identity | None, board: Board | None, versions: Mapping[str, str], now: datetime
+) -> list[tuple[str, str]]:
+    """Rows that name rig and serial numbers, board, date and versions; `identity` and `board` may be None."""
+    rows = []
+    if identity is not None:
+        rows.append(("rig", identity.name or "unnamed"))
+        rows.append(("devices", ", ".join(_devices(identity)) or "not known"))
+    if board is not None:
+        rows.append(("board", board_words(board)))
+    rows.append(("date", now.astimezone(UTC).strftime("%Y-%m-%d %H:%M UTC")))
+    rows.append(("versions", ", ".join(f"{name} {number}" for name, number in versions.items())))
+    return rows
+
+
+def board_words(board: Board) -> str:
+    """Describe a board in one line."""
+    squares = f"{board.squares[0]} x {board.squares[1]} squares of {board.square_m * 1e3:.6g} mm"
+    if board.marker_m is None:
+        return f"chessboard, {squares}"
+    return f"ChArUco, {squares}, markers of {board.marker_m * 1e3:.6g} mm, {board.dictionary}"
+
+
+def _devices(identity: Identity) -> list[str]:
+    slots = dict.fromkeys([*identity.kinds, *identity.serials])
+    return [
+        " ".join(word for word in (slot, identity.kinds.get(slot, ""), identity.serials.get(slot, "")) if word)
+        for slot in slots
+    ]
+
+
+_WIDTH_PX = 640
+_GROUND, _RIM, _INK = (255, 255, 255), (200, 194, 189), (77, 64, 51)
+_ERROR = (0, 94, 213)
+"""Colour of errors; colours here are BGR."""
+_COLOURS = ((178, 114, 0), (0, 94, 213), (115, 158, 0), (167, 121, 204), (0, 159, 230), (233, 180, 86), (66, 228, 240))
+"""Colours of the views, by turns: those of Okabe and Ito, which the colour-blind can tell apart."""
+ARROW_TIMES = (1000, 500, 200, 100, 50, 20, 10, 5, 2, 1)
+
+
+def view_colour(view: int) -> tuple[int, int, int]:
+    """Colour (BGR) of the view with this number, in all pictures and charts."""
+    return _COLOURS[view % len(_COLOURS)]
+
+
+def coverage_picture(names: Sequence[str], corners_px: Sequence[Array], size: tuple[int, int]) -> Picture:
+    """Draw the corners of all views in the outline of the picture (width, height), in colours and with names."""
+    picture, scale = _sheet(size)
+    for i, (name, corners) in enumerate(zip(names, corners_px, strict=True)):
+        for x, y in corners:
+            cv2.circle(picture, _at(x, y, scale), 3, view_colour(i), -1, cv2.LINE_AA)
+        if len(corners):
+            x, y = _at(float(corners[0, 0]), float(corners[0, 1]), scale)
+            cv2.putText(picture, name, (x + 5, y - 5), cv2.FONT_HERSHEY_SIMPLEX, 0.4, _INK, 1, cv2.LINE_AA)
+    return picture
+
+
+def residual_picture(
+    corners_px: Sequence[Array], residuals_px: Sequence[Array], size: tuple[int, int]
+) -> tuple[Picture, int]:
+    """Draw arrows from corners along their residuals; returns also how many times too long they are drawn."""
+    picture, scale = _sheet(size)
+    lengths = np.concatenate([np.hypot(*residual.T) for residual in residuals_px if len(residual)] or [np.ones(1)])
+    typical = float(np.percentile(lengths, 90)) * scale
+    times = next((factor for factor in ARROW_TIMES if typical * factor < _WIDTH_PX / 25), 1)
+    for corners, residuals in zip(corners_px, residuals_px, strict=True):
+        for (x, y), (dx, dy) in zip(corners, residuals, strict=True):
+            end = _at(x + times * dx, y + times * dy, scale)
+            cv2.line(picture, _at(x, y, scale), end, _ERROR, 1, cv2.LINE_AA)
+            cv2.circle(picture, _at(x, y, scale), 2, _INK, -1, cv2.LINE_AA)
+    return picture, times
+
+
+def error_picture(uncertainty: DepthUncertainty) -> Picture:
+    """Draw the expected depth error, red where it is large, black where the scan does not reach at this depth."""
+    large = _enlarged_mm(uncertainty.sd_m)
+    limits = depth_limits(large)
+    return depth_picture(large, None if limits is None else (limits[1], limits[0]), unit="mm")  # red: large
+
+
+def cells_picture(cells_m: Array) -> Picture:
+    """Draw how far a board's squares lie off their plane: red in front of it, black where they were not scanned."""
+    large = _enlarged_mm(cells_m)
+    known = large[np.isfinite(large)]
+    most = max(float(np.abs(known).max()), 1e-3) if known.size else 1.0
+    return depth_picture(large, (-most, most), unit="mm")
+
+
+def _enlarged_mm(values_m: Array) -> NDArray[np.float32]:
+    rows, columns = values_m.shape
+    size = (_WIDTH_PX, max(1, round(_WIDTH_PX * rows / columns)))
+    return np.asarray(cv2.resize(values_m * 1e3, size, interpolation=cv2.INTER_NEAREST), np.float32)
+
+
+def _sheet(size: tuple[int, int]) -> tuple[Picture, float]:
+    width, height = size
+    scale = _WIDTH_PX / width
+    picture = np.full((round(height * scale), _WIDTH_PX, 3), _GROUND, np.uint8)
+    cv2.rectangle(picture, (0, 0), (_WIDTH_PX - 1, picture.shape[0] - 1), _RIM, 1)
+    return picture, scale
+
+
+def _at(x: float, y: float, scale: float) -> tuple[int, int]:
+    return round((x + 0.5) * scale), round((y + 0.5) * scale)
+
+
+_WAYS = {1: "rising command", -1: "falling command"}
+
+
+def plane_residuals(waves: SweepWaves, sweeps: Sequence[SweepFit], metres_per_command: float, at_m: float) -> str:
+    """Chart (SVG) of each sweep's median residuals over the command, in mm of depth at `at_m`, a panel each way."""
+    views = list(dict.fromkeys(sweep.view for sweep in sweeps))
+    panels = [
+        Panel(
+            title=title,
+            x_label="mirror command",
+            y_label=f"depth at {at_m:g} m, mm",
+            series=[
+                Series(
+                    label="",
+                    colour="#{2:02x}{1:02x}{0:02x}".format(*view_colour(views.index(sweep.view))),
+                    points=[
+                        (float(command), float(value) * metres_per_command * 1e3)
+                        for command, value in zip(waves.command, values, strict=True)
+                    ],
+                    marker=False,
+                )
+                for sweep, values in zip(sweeps, waves.sweeps, strict=True)
+                if sweep.direction == way
+            ],
+            x_log=False,
+            y_log=False,
+        )
+        for way, title in _WAYS.items()
+        if any(sweep.direction == way for sweep in sweeps)
+    ]
+    notes = [
+        "A curve for each sweep, in its view's colour above. What all curves share is the scanner model's misfit;",
+        "waves that differ from sweep to sweep come from exposures that are not locked to the scan.",
+    ]
+    return chart_svg(panels, title="By how much depth misses the board, sweep by sweep", notes=notes) if panels else ""
+
+
 Figures = Sequence[tuple[str, str]]
 
 
@@ -48,7 +286,7 @@ def planes_report(
     """Report on a calibration of camera and planes. about: rows of `subject`, as in the other reports."""
     by_name = {view.name: view for view in views}
     used = [by_name[name] for name in fit.views]
-    planes = plane_residuals(judged.waves, judged.residuals, judged.sensitivity.per_command_m, judged.asked.at_m)
+    planes = plane_residuals(judged.waves, fit.every_sweep, judged.sensitivity.per_command_m, judged.asked.at_m)
     sections = [
         *camera_sections(fit.model.camera, used, fit.corner_residual_px),
         ReportSection("Residuals of the planes", planes),
@@ -96,9 +334,9 @@ def camera_report(
             name + (" (outlier)" if name in fit.outliers else ""),
             *pose_words(pose, board),
             f"{np.count_nonzero(used)} of {len(used)}",
-            f"{rms:.3f}",
+            f"{off_px:.3f}",
         )
-        for name, pose, used, rms in zip(fit.views, fit.poses, fit.used, fit.view_rms_px, strict=True)
+        for name, pose, used, off_px in zip(fit.views, fit.poses, fit.used, fit.view_rms_px, strict=True)
     ]
     head = ("view", "distance, m", "tilt, degrees", "corners used", "rms, px")
     shown = [view for view, px in zip(views, seen, strict=True) if len(px)]
@@ -154,8 +392,7 @@ def corners_px(view: View) -> Array:
     if view.corners is None:
         return np.zeros((0, 2))
     px = np.asarray(view.corners.px, np.float64)
-    known: Array = px[np.isfinite(px).all(axis=1)]
-    return known
+    return px[np.isfinite(px).all(axis=1)]
 
 
 def pose_words(pose: BoardPose, board: Board) -> tuple[str, str]:
@@ -170,14 +407,13 @@ def _views_section(fit: RigFit, judged: JudgedRig) -> ReportSection:
     worth = judged.sensitivity.per_command_m
     shifts = {one.name: one.shift for one in judged.shifts}
     for name, pose, residual, sweeps in zip(fit.views, fit.poses, fit.corner_residual_px, fit.sweeps, strict=True):
-        rms = float(np.sqrt(np.mean(np.sum(residual**2, axis=1)))) if len(residual) else np.nan
         shift = shifts.get(name, np.nan) * worth
         rows.append(
             (
                 name + (" (outlier)" if name in fit.outliers else ""),
                 *pose_words(pose, fit.board),
                 str(len(residual)),
-                f"{rms:.3f}",
+                f"{rms(residual):.3f}",
                 str(sum(len(sweep.residual) for sweep in sweeps)),
                 in_mm_with_sign(shift),
             )
@@ -203,10 +439,7 @@ _DEAD_BGR = (0, 0, 0)
 
 
 def dark_rate_picture(pixels: PixelMap) -> NDArray[np.uint8]:
-    """Dark rates as a picture (rows, width, 3) BGR, dead pixels black.
-
-    The scale is logarithmic, from a third of the usual rate to the fastest.
-    """
+    """Dark rates (rows, width, 3) BGR, logarithmic from a third of the usual rate on; dead pixels black."""
     rate = np.nan_to_num(pixels.rate_per_s, nan=0.0).astype(np.float64)
     low = max(pixels.ordinary_per_s / 3, 1e-3)
     high = max(float(rate.max(initial=0.0)), 10 * low)

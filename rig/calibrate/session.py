@@ -118,11 +118,7 @@ class Session:
     def finish(
         self, summary: dict[str, Any], report: str, model: RigModel | None, made_from: LoadedCalibration | None = None
     ) -> Path | None:
-        """Write what was made of the views; returns the calibration's file, None where there is none.
-
-        made_from: file and content of the calibration that the model is a change of; notes on failed checks of it are
-        carried over.
-        """
+        """Write what was made of the views, with notes on the calibration it was made from; return its file, if any."""
         if self._folder is None:
             return None
         file = None

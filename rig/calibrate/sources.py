@@ -10,7 +10,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from calibration.files.camera_file import KnownCamera, load_camera
+from calibration.files.rig_file import KnownCamera, load_camera
 from drivers.units import parse_quantity
 from rig.config.files import NO_CONFIG
 from rig.config.models import RigConfig
@@ -35,10 +35,7 @@ SourcesLike = Config | Sequence[Config]
 
 @dataclass(frozen=True, slots=True)
 class ViewSources:
-    """Sources of views, each kind in the order in which they were named.
-
-    live: the rig that takes new views; None where none is named. notes: lines to tell the user about them.
-    """
+    """Sources of views in the order in which they were named; the rig, if any, that takes new ones; lines on them."""
 
     live: RigConfig | None
     sessions: tuple[Path, ...] = ()
@@ -139,10 +136,7 @@ _QUANTITIES = {
 
 
 def si_values(request: CalibrationRequest) -> dict[str, float]:
-    """The quantities that a request states, in SI units: `accuracy_m`, `at_m`, `stated_baseline_m`, `angle_rad`.
-
-    UsageError, a line per problem, for those that are none and for numbers that cannot be.
-    """
+    """The quantities that a request states, in SI units. UsageError, a line per problem: those that cannot be."""
     exposures, poses = getattr(request, "exposures", ()), getattr(request, "poses", 1)
     problems = [f"exposures has {k}; it must be at least 1" for k in exposures if k < 1]
     if poses < 1:
@@ -178,10 +172,7 @@ class CameraUse:
 
 
 def camera_use(file: Path, *, accept: bool = False) -> CameraUse:
-    """Read a camera file. UsageError where its verdict failed, unless `accept`; CalibrationError for an unreadable one.
-
-    A file without a verdict, such as one written by hand, is used unchecked.
-    """
+    """Read a camera file. UsageError where its verdict failed, unless `accept`; without one it is used unchecked."""
     known = load_camera(file)
     found = failed_verdict(known.verdict, known.reasons)
     require_accepted(f"camera {file}", found, {each.code for each in found} if accept else ())

@@ -19,10 +19,10 @@ from tempfile import TemporaryDirectory
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
+from calibration.arrays import Array
 from calibration.depth_error import sensitivity
-from calibration.diagnosis.rig import goal, judge_sync
+from calibration.diagnosis.verdicts import goal, judge_sync
 from calibration.errors import CalibrationError, Degenerate, digits
 from calibration.files.rig_file import load_rig_model
 from calibration.model.rig_model import RigModel
@@ -34,8 +34,7 @@ from drivers.frames import FrameBlock
 from drivers.recorded import RunRecording
 from rig.calibrate.capture import TellLine, capture_view
 from rig.calibrate.planes import speeds_of
-from rig.calibrate.report import sync_report
-from rig.calibrate.report_page import subject
+from rig.calibrate.report import subject, sync_report
 from rig.calibrate.session import CalibrationResult, LoadedCalibration, Session, true_model
 from rig.calibrate.sources import SourcesLike, si_values, sort_sources
 from rig.calibrate.views import ViewCollection, take_kept
@@ -47,8 +46,6 @@ from rig.recording.inputs import read_plan
 from rig.requests import SyncRequest
 from rig.scan.run import versions
 
-Array = NDArray[np.float64]
-
 AROUND_FRAMES = 12
 """Frames looked at on either side of the planned place of an edge."""
 LEAST_FRAMES = 4
@@ -56,10 +53,7 @@ LEAST_FRAMES = 4
 SETTLED_FRAMES = 3
 """Frames from the edge at which a frame and the two that follow are all dark, or all lit."""
 MOST_LATE_FRAMES = 3
-"""Longest delay that is looked for, in frames.
-
-Gates take microseconds; a line that comes into the picture later is not an edge.
-"""
+"""Longest delay that is looked for, in frames; gates take microseconds."""
 MOST_SCATTER = 10.0
 """Most variance of the ones around an edge, in units of photons' variance; more comes from the scene."""
 STEPS = 32
@@ -95,12 +89,7 @@ class GateDelay:
 
 
 def run_sync(sources: SourcesLike, request: SyncRequest, *, tell: TellLine | None = None) -> CalibrationResult:
-    """Measure the lags. They go into a copy of the live rig's model, or of the one that is named; without one only the
-    figures are written.
-
-    Raises Degenerate where the sweeps cannot tell, CalibrationError where the file cannot be read or its line does not
-    reach the distance asked.
-    """
+    """Measure the lags, for a copy of the model if there is one. Degenerate, CalibrationError: they cannot be told."""
     values = si_values(request)
     found, file = sort_sources(sources, scene=request.scene), request.calibration
     live = found.live
@@ -224,11 +213,7 @@ def _figures(fit: SyncFit, gate: GateDelay | None, truth: RigModel | None) -> Se
 
 
 def gate_delay(run: Path) -> GateDelay | None:
-    """Measure the gate's delay in a recorded run.
-
-    None where its SPAD carries no markers: the light itself gives the time then. UsageError where the run has no plan,
-    ProtocolError where it has no frames.
-    """
+    """Measure the gate's delay in a recorded run; None without markers, where the light itself gives the time."""
     plan = read_plan(run)
     if plan.blanking is not None:
         return None
@@ -251,10 +236,7 @@ def _is_told(edge: Edge) -> bool:
 
 
 def _edge(ones: Array, middle_s: Array, late_s: Array, plan: ScanPlan, *, rises: bool) -> Edge | None:
-    """The edge at delays (delays,) among the frames near its planned place, at 0; None where some are missing.
-
-    ones: (frames, 3), see `_ones`. middle_s: (frames,), middle of each exposure.
-    """
+    """The edge at delays (delays,) among frames near its plan at 0, by `_ones` and middles; None: some are missing."""
     frame_s = float(1 / plan.frame_rate_hz)
     near = np.abs(middle_s) < AROUND_FRAMES * frame_s
     if min((near & (middle_s < 0)).sum(), (near & (middle_s > 0)).sum()) < LEAST_FRAMES:
@@ -295,10 +277,7 @@ def _sweeps(run: Path, plan: ScanPlan) -> list[tuple[int, Array, Array]]:
 
 
 def _ones(block: FrameBlock) -> Array:
-    """Counts (frames, 3): ones of a frame, those that are ones in the next frame too, and in the one after that.
-
-    NaN at the end of a block, and where the window has moved.
-    """
+    """Ones of a frame, of it and the next, of it and the one after: (frames, 3), NaN where these do not follow."""
     bits, x0 = block.bits, block.records["x0"]
     ones = np.full((len(bits), 3), np.nan)
     for apart in range(3):
@@ -313,5 +292,4 @@ def _after_marker(column: Array, plan: ScanPlan, sweep: int) -> Array:
     """Time after the scan marker at which the mirror was due at fractional columns; undoes `ScanPlan.column`."""
     leg = plan.leg(sweep)
     done = column + 0.5 if leg.columns_rise else plan.places - 0.5 - column
-    after: Array = plan.lit_start_s(leg) + done * float(plan.column_s)
-    return after
+    return plan.lit_start_s(leg) + done * float(plan.column_s)

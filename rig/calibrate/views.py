@@ -7,11 +7,10 @@ views, and about views that make no calibration.
 
 import math
 from collections import Counter
-from collections.abc import Collection, Sequence
+from collections.abc import Callable, Collection, Sequence
 from dataclasses import dataclass, replace
 from functools import partial
 from pathlib import Path
-from typing import Protocol
 
 import cv2
 import numpy as np
@@ -19,11 +18,10 @@ from numpy.typing import NDArray
 
 from calibration.board.board import Board
 from calibration.board.detect import find_corners
-from calibration.diagnosis.evidence import FEWEST_POSES, FEWEST_WHY
-from calibration.diagnosis.rig import judge_refused
+from calibration.diagnosis.rules import FEWEST_POSES, FEWEST_WHY
+from calibration.diagnosis.verdicts import judge_refused
 from calibration.errors import CalibrationError, Degenerate
-from calibration.files.camera_file import corners_digest
-from calibration.files.rig_file import load_rig_model
+from calibration.files.rig_file import corners_digest, load_rig_model
 from calibration.guide import Advice, candidates, rough_camera, sequence
 from calibration.model.camera import Camera
 from calibration.model.rig_model import Identity
@@ -40,18 +38,10 @@ from rig.progress import part, tell_stage
 
 
 class ViewCollection:
-    """The views taken so far.
-
-    views: all of them. refused: the reasons why some have no corners, by the view's name. identity: of the rig; None
-    where it is not known.
-    """
+    """The views taken so far; those without corners with the reason; the rig they are of (None: not known)."""
 
     def __init__(self, session: Session, tell: TellLine | None = None, of_camera: Collection[str] = ()) -> None:
-        """Begin without views.
-
-        session: keeps the views. tell: gets a line about each. of_camera: `corners_digest` of the views that a camera
-        known from elsewhere was made of.
-        """
+        """Take what keeps the views, what gets a line on each, and the digests of views that a camera was made of."""
         self.views: list[View] = []
         self.refused: dict[str, Degenerate] = {}
         self.identity: Identity | None = None
@@ -67,10 +57,7 @@ class ViewCollection:
         identity: Identity | None = None,
         source: Path | None = None,
     ) -> None:
-        """Add a view; where its name is taken it gets a number.
-
-        source: the file or run that it is from. UsageError for a view that is there already: it would count twice.
-        """
+        """Add a view from a file or run, with a name of its own. UsageError for one that would count twice."""
         self._require_new(view, str(source or view.name))
         if view.name in [known.name for known in self.views]:
             view = replace(view, name=f"{view.name}-{len(self.views)}")
@@ -140,23 +127,13 @@ LASTING = (["wrong-board"] * 3, ["mirrored"] * 3)
 """Refusals of a session's first views which no pose of the board will change: the session ends with them."""
 
 
-class ChoosesPoses(Protocol):
-    """Chooses the pose that is shown next."""
-
-    def next(self, views: Sequence[View]) -> Advice | None:
-        """The pose to show after these views; None where no more are needed."""
-        ...
+ChoosePose = Callable[[Sequence[View]], Advice | None]
+"""A function that says which pose to show after these views; None where no more are needed."""
 
 
-@dataclass(frozen=True, slots=True)
-class FixedPoses:
-    """Poses of a sequence that was chosen before."""
-
-    poses: Sequence[Advice]
-
-    def next(self, views: Sequence[View]) -> Advice | None:
-        """The next pose of the sequence; None at its end."""
-        return self.poses[len(views)] if len(views) < len(self.poses) else None
+def in_order(poses: Sequence[Advice]) -> ChoosePose:
+    """Choose the poses of a sequence one after the other."""
+    return lambda views: poses[len(views)] if len(views) < len(poses) else None
 
 
 def require_poses(taken: ViewCollection, poses: int) -> None:
@@ -169,17 +146,14 @@ def require_poses(taken: ViewCollection, poses: int) -> None:
         )
 
 
-def good_poses(config: RigConfig, board: Board, poses: int, at_m: float, seed: int, behind: int = 0) -> FixedPoses:
-    """Choose poses that tell most about any rig, and a few more in case the board is missed in some.
-
-    behind: number of poses of the sequence that an earlier session has shown; it goes on from there.
-    """
+def good_poses(config: RigConfig, board: Board, poses: int, at_m: float, seed: int, behind: int = 0) -> list[Advice]:
+    """Choose poses that tell most about any rig, some to spare; `behind` of the sequence were shown before."""
     choices = candidates(first_camera(config), board, config.scan.depth_range)
     if not choices:
         raise UsageError(f"no pose of a board of {board.size_m[0]:g} x {board.size_m[1]:g} m fits the picture within "
                          f"scan.depth_range; use a smaller board or widen the range")  # fmt: skip
     chosen = sequence(choices, behind + poses + math.ceil(MISSED_SHARE * poses), seed)
-    return FixedPoses([Advice(candidate, at_m) for candidate in chosen[behind:]])
+    return [Advice(candidate, at_m) for candidate in chosen[behind:]]
 
 
 def first_camera(config: RigConfig) -> Camera:
@@ -206,7 +180,7 @@ class LiveViewOptions:
 
     config: RigConfig
     poses: int
-    choose: ChoosesPoses
+    choose: ChoosePose
     ask: AskPerson | None = None
     exposures: Sequence[int] = ()
     seed: int = 0
@@ -224,7 +198,7 @@ def take_live(taken: ViewCollection, live: LiveViewOptions, board: Board) -> Non
     good, seen, reasons = 0, list[View](), list[str]()
     speeds = SpeedRotation(live.exposures, live.sees, taken.tell)
     while good < live.poses and len(seen) < live.poses + math.ceil(MISSED_SHARE * live.poses):
-        advice = live.choose.next(seen)
+        advice = live.choose(seen)
         if advice is None:
             return
         config = shown(
@@ -254,10 +228,7 @@ def _scan(
 def take_kept(
     taken: ViewCollection, sources: ViewSources, board: Board | None, defects: NDArray[np.bool_] | None = None
 ) -> None:
-    """Take the views that need no live rig.
-
-    board: None where nothing moves and none is looked for. defects: (rows, width), pixels that are not used.
-    """
+    """Take the views that need no live rig, without `defects` (rows, width). board: None where nothing moves."""
     for note in sources.notes:
         taken.say(note)
     for folder in sources.sessions:
@@ -274,10 +245,7 @@ def take_kept(
 
 
 def _require_alike(folder: Path, board: Board | None) -> None:
-    """Raise UsageError where a session's views do not show the board that is looked for.
-
-    The side of the squares may differ: it is what a user corrects where it was measured wrong.
-    """
+    """Raise UsageError where a session shows another board; the side of the squares may have been measured anew."""
     known = session_board(folder)
     if known is None:
         return
@@ -314,13 +282,7 @@ def _pictured(file: Path, board: Board | None) -> tuple[View, Degenerate | None]
 def refusal(
     refused: Degenerate, taken: ViewCollection, board: Board, *, photons: bool = True, line: bool = True
 ) -> Degenerate:
-    """The error for views that make no calibration: its root cause.
-
-    Its notes are what the fit said, the other reasons, and the trouble of single views unless that was told when they
-    were taken.
-    photons: whether the pictures count photons; those from files do not. line: whether the line was to be seen; False
-    for a camera alone.
-    """
+    """The error for views that make no calibration: its root cause; notes: all else. Others: as `judge_refused`."""
     refused = _of_views(refused, taken)
     reasons = judge_refused(refused, taken.views, board, taken.size, photons=photons, line=line).reasons
     error = Degenerate(reasons[0].code, str(reasons[0]))

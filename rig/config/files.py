@@ -13,8 +13,8 @@ from typing import Any, TypeVar
 from pydantic import BaseModel
 
 from calibration.errors import FileError
-from calibration.files.camera_file import CAMERA_FORMAT
 from calibration.files.problems import Key, ValueSources, plain_types, validated
+from calibration.files.rig_file import CAMERA_FORMAT
 from calibration.files.sections import FORMAT, YamlFile, load_yaml, parse_yaml
 from drivers.errors import UnknownKind
 from drivers.registry import SLOTS, kinds, lookup

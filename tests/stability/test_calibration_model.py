@@ -2,7 +2,6 @@
 
 from dataclasses import replace
 
-import mpmath
 import numpy as np
 from hypothesis import assume, given
 from hypothesis import strategies as st
@@ -15,7 +14,6 @@ from calibration.model.light_sheet import NEARLY_PARALLEL, LightSheets, fan_orig
 from calibration.model.parameters import changed_camera, parameters, with_parameters
 from calibration.model.rig_model import Covariance, Lag, RigModel
 from calibration.model.scanner import PivotScanner, PlaneTable
-from tests.stability.exactly import relative
 from tests.stability.inventory import EXAMPLES, covers
 
 ANY = st.floats(allow_nan=False, allow_infinity=False)
@@ -61,30 +59,6 @@ def test_bowed_sheets_of_any_numbers_give_depth_or_none(
     points = np.stack([u * z, v * z, z], axis=-1)
     size = np.abs(points).max(axis=-1) + np.abs(sheets.planes[:, 3]) + np.abs(sheets.origin_m).max()
     assert np.all(np.abs(sheets.distance_m(points))[met] <= 1e-9 * size[met])
-
-
-@covers(LightSheets.depth)
-def test_depth_on_a_bowed_sheet_is_exact(worst) -> None:
-    bow, point, terms = 0.03, (-0.3, 0.01, 0.02), (0.1, 0.4)
-    phi, way = np.meshgrid(np.linspace(-0.5, 0.5, 7), np.linspace(0.5, 9, 5))
-    command = 0.25
-    with mpmath.workdps(50):
-        angle, traced = mpmath.mpf(terms[0]) + mpmath.mpf(terms[1]) * command, []
-        n = (mpmath.cos(angle), 0, -mpmath.sin(angle))
-        f = (mpmath.sin(angle), 0, mpmath.cos(angle))
-        for each, far in zip(phi.ravel(), way.ravel(), strict=True):
-            turn = mpmath.mpf(float(each))
-            out = mpmath.mpf(bow) * turn**2
-            ray = [
-                mpmath.cos(out) * (mpmath.cos(turn) * f[i] + mpmath.sin(turn) * (i == 1)) + mpmath.sin(out) * n[i]
-                for i in range(3)
-            ]
-            traced.append([mpmath.mpf(point[i]) + mpmath.mpf(float(far)) * ray[i] for i in range(3)])
-        u, v = (np.array([float(p[i] / p[2]) for p in traced]) for i in (0, 1))
-        z = np.array([float(p[2]) for p in traced])
-    sheets = light_sheets(mirror(bow_per_rad=bow), point, command)
-    errors = relative(sheets.depth(u, v), lambda exact: exact, z)
-    worst("depth on a bowed sheet, rays 1 to 30 degrees off it", "light traced in 50 digits", errors, 1e-13)
 
 
 @covers(RigModel.sheets, RigModel.mirror_command)

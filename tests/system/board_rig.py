@@ -34,7 +34,7 @@ def write_board_rig(folder: Path) -> tuple[Path, Path]:
     content = small_rig.config()
     content["name"] = "board-rig"
     content["world"]["scene"] = str(folder / "scene.yaml")
-    content["scan"] |= {"columns": 300, "exposures": 3, "depth_range": ["0.5 m", "8 m"], "command_range": [-0.9, 0.9]}
+    content["scan"] |= {"columns": 220, "exposures": 3, "depth_range": ["0.5 m", "8 m"], "command_range": [-0.9, 0.9]}
     config = folder / "board-rig.yaml"
     config.write_text(yaml.safe_dump(content, sort_keys=False))
     return config, board

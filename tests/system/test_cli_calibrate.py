@@ -13,7 +13,6 @@ from calibration.board.board import load_board
 from calibration.files.rig_file import load_rig_model
 from rig import api
 from rig.devices.calibration_use import note_check, refusals
-from rig.errors import UsageError
 from tests.system.board_rig import write_board_rig
 from tests.system.conftest import Rig
 
@@ -123,13 +122,11 @@ def test_the_guide_asks_for_the_poses_that_make_the_expected_error_fall(calibrat
     result = api.calibrate_planes(
         [calibrated / "out", calibrated / "board-rig.yaml"], board=calibrated / "board.yaml",
         scene=str(calibrated / "scene.yaml"), guided=True, exposures=(3,), at="3 m",
-        accuracy=f"{0.2 * before_m * 1e3:.4f} mm", poses=2, tell=told.append,
+        accuracy=f"{0.2 * before_m * 1e3:.4f} mm", poses=1, tell=told.append,
     )  # fmt: skip
-    assert len([line for line in told if line.startswith("view ")]) == POSES + 2
-    asked = [line for line in told if line.startswith("pose ")]
-    assert len(asked) == 2
-    assert asked[0] != asked[1]
-    assert "expected error at 3 m falls from" in asked[0]
+    assert len([line for line in told if line.startswith("view ")]) == POSES + 1
+    (asked,) = [line for line in told if line.startswith("pose ")]
+    assert "expected error at 3 m falls from" in asked
     assert result.summary["depth_error"]["median_m"] < before_m
     assert not result.verdict.passed
 
@@ -203,35 +200,35 @@ def _draw_pictures(shown: int, blank: int = 0) -> Path:
     drawn = board.picture(40)
     Path("pictures").mkdir()
     rng = np.random.default_rng(2)
-    matrix = np.array([[500, 0, 320.0], [0, 500, 240], [0, 0, 1]])
+    matrix = np.array([[250, 0, 160.0], [0, 250, 120], [0, 0, 1]])
     for i in range(shown):
         turn = cv2.Rodrigues(np.array([*rng.uniform(-0.5, 0.5, 2), 0.1]))[0]
         shift = np.array([*rng.uniform(-0.06, 0.06, 2), 0.45]) - turn @ [0.12, 0.09, 0]
         to_board = np.array([[0.03 / 40, 0, -0.015], [0, 0.03 / 40, -0.015], [0, 0, 1]])
         seen = matrix @ np.column_stack([turn[:, 0], turn[:, 1], shift]) @ to_board
-        picture = cv2.warpPerspective(drawn, seen, (640, 480), flags=cv2.INTER_AREA, borderValue=128)
+        picture = cv2.warpPerspective(drawn, seen, (320, 240), flags=cv2.INTER_AREA, borderValue=128)
         cv2.imwrite(f"pictures/{i}.png", picture)
     for i in range(blank):
-        cv2.imwrite(f"pictures/blank-{i}.png", np.full((480, 640), 128, np.uint8))
+        cv2.imwrite(f"pictures/blank-{i}.png", np.full((240, 320), 128, np.uint8))
     return board_file
 
 
 def test_a_camera_comes_from_pictures_too(rig: Rig) -> None:
-    board_file = _draw_pictures(8)
+    board_file = _draw_pictures(5)
     ran = rig("calibrate", "camera", "pictures", "--board", board_file, "--terms", "4", "--out", "camera", "--json")
     assert ran.code in (0, 1), ran.err
     summary = json.loads(ran.out)
-    assert summary["camera"]["matrix"][0][0] == pytest.approx(500, rel=0.02)
-    assert summary["views"]["shown"] == 8
-    assert yaml.safe_load(Path("camera/camera.yaml").read_text())["camera"]["width"] == 640
+    assert summary["camera"]["matrix"][0][0] == pytest.approx(250, rel=0.02)
+    assert summary["views"]["shown"] == 5
+    assert yaml.safe_load(Path("camera/camera.yaml").read_text())["camera"]["width"] == 320
     assert Path("camera/report.html").is_file()
 
 
 def test_two_pictures_that_show_the_board_are_no_camera_however_many_are_named(rig: Rig) -> None:
-    board_file = _draw_pictures(2, blank=6)
+    board_file = _draw_pictures(2, blank=1)
     ran = rig("calibrate", "camera", "pictures", "--board", board_file, "--terms", "4", "--out", "camera")
     assert ran.code == 2
-    assert ran.problems[0].startswith("error: too-few-poses: 8 poses were shown, 2 of them could be used, 6 are ")
+    assert ran.problems[0].startswith("error: too-few-poses: 3 poses were shown, 2 of them could be used, 6 are ")
     assert "a camera takes 3 poses or more" in ran.err
     assert "condition number" in ran.err
     assert not Path("camera/camera.yaml").exists()
@@ -254,17 +251,14 @@ def test_recorded_runs_are_sources_of_every_command(calibrated: Path, bright: Pa
         ran = rig("scan", bright, "--maps", "2", "--exposures", exposures, "--record", "--out", run)
         assert ran.code == 0, ran.err
     board, file = calibrated / "board.yaml", calibrated / "out" / "calibration.yaml"
-    doubted = Path("doubted") / "calibration.yaml"
+    doubted, made = Path("doubted") / "calibration.yaml", Path("sync/calibration.yaml")
     shutil.copytree(file.parent, doubted.parent)
     note_check(doubted, load_rig_model(doubted), "check", passed=False, reasons=("moved-rig",))
-    ran = rig("calibrate", "sync", "run-3", "run-6", "--calibration", doubted, "--out", "again")
-    assert ran.code == 0, ran.err
-    made = Path("again/calibration.yaml")
-    assert [each.code for each in refusals(load_rig_model(made), made, None)] == ["failed-check"]
-    ran = rig("calibrate", "sync", "run-3", "run-6", "--calibration", file, "--out", "sync", "--json")
+    ran = rig("calibrate", "sync", "run-3", "run-6", "--calibration", doubted, "--out", "sync", "--json")
     assert ran.code == 0, ran.err  # light that is held at the middle of columns makes lags that change with the speed
     assert json.loads(ran.out)["lag_s"]["forward"] == pytest.approx(2e-4, abs=5e-6)
-    identity = load_rig_model(Path("sync/calibration.yaml")).identity
+    assert [each.code for each in refusals(load_rig_model(made), made, None)] == ["failed-check"]
+    identity = load_rig_model(made).identity
     assert identity is not None
     assert identity.verdict == "passed"
     ran = rig(
@@ -273,11 +267,6 @@ def test_recorded_runs_are_sources_of_every_command(calibrated: Path, bright: Pa
     )  # fmt: skip
     assert ran.code == 0, ran.err
     assert rig("calibrate", "pixels", "run-3", "--out", "pixels", "--json").code == 1  # few dark frames
-    ran = rig("calibrate", "planes", "run-3", "run-6", "--board", board, "--out", "planes")
-    assert ran.code == 2
-    assert "too-few-poses" in ran.problems[0]
-    assert "one-pose" in ran.err
-    assert "condition number" in ran.err
 
 
 def test_a_camera_of_other_views_serves_the_planes(calibrated: Path, rig: Rig) -> None:
@@ -311,12 +300,11 @@ def test_a_camera_of_other_views_serves_the_planes(calibrated: Path, rig: Rig) -
     assert "must not count twice" in ran.problems[0]
     assert not Path("twice/calibration.yaml").exists()
     content = yaml.safe_load(Path("camera/camera.yaml").read_text())
-    for verdict, said in (("passed", "passed"), (None, "unchecked")):
-        known = {key: value for key, value in content.items() if key not in ("verdict", "reasons")}
-        Path("known.yaml").write_text(yaml.safe_dump(known | ({"verdict": verdict} if verdict else {})))
-        ran = rig("calibrate", "planes", "second", *board, "--camera", "known.yaml", "--out", said, "--json")
-        assert "accepted_calibration" not in json.loads(ran.out)
-        assert load_rig_model(Path(said, "calibration.yaml")).provenance["camera"] == {"check": said}
+    known = {key: value for key, value in content.items() if key not in ("verdict", "reasons")}
+    Path("known.yaml").write_text(yaml.safe_dump(known))
+    ran = rig("calibrate", "planes", "second", *board, "--camera", "known.yaml", "--out", "unchecked", "--json")
+    assert "accepted_calibration" not in json.loads(ran.out)
+    assert load_rig_model(Path("unchecked/calibration.yaml")).provenance["camera"] == {"check": "unchecked"}
 
 
 def test_views_of_another_print_or_of_a_moved_board_are_refused(calibrated: Path, rig: Rig) -> None:
@@ -330,18 +318,6 @@ def test_views_of_another_print_or_of_a_moved_board_are_refused(calibrated: Path
     assert not Path("other").exists()
 
 
-@pytest.mark.parametrize(("shown", "reason"), [("mirrored", "mirrored"), ("nothing", "no-board")])
-def test_views_that_show_no_board_are_refused_for_what_is_wrong_with_them(rig: Rig, shown: str, reason: str) -> None:
-    board = load_board()
-    picture = board.picture(40)[:, ::-1] if shown == "mirrored" else np.full((400, 500), 128, np.uint8)
-    Path("pictures").mkdir()
-    cv2.imwrite("pictures/0.png", np.pad(picture, 60, constant_values=128))
-    ran = rig("calibrate", "camera", "pictures", "--out", "camera")
-    assert ran.code == 2
-    assert ran.problems[0].startswith(f"error: {reason}: ")
-    assert "room-light" not in ran.err  # pictures count no photons
-
-
 def test_what_is_no_source_is_said_before_anything_moves(rig: Rig, tmp_path: Path) -> None:
     (tmp_path / "empty").mkdir()
     ran = rig("calibrate", "planes", tmp_path / "empty", "simulated", "lab", "--poses", "0", "--accuracy", "10")
@@ -350,8 +326,3 @@ def test_what_is_no_source_is_said_before_anything_moves(rig: Rig, tmp_path: Pat
     assert len(ran.problems) >= 2
     assert "exposures has 0" in rig("calibrate", "planes", "--exposures", "0,3").problems[0]
     assert "terms is 3" in rig("calibrate", "camera", "--terms", "3").problems[0]
-
-
-def test_a_real_rig_needs_somebody_to_move_the_board_and_arm(calibrated: Path) -> None:
-    with pytest.raises(UsageError):
-        api.calibrate_planes("lab", board=calibrated / "board.yaml")

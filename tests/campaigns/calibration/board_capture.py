@@ -12,6 +12,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
+from calibration.arrays import Array
 from calibration.board.board import MARGIN_SQUARES, Board
 from calibration.views import BoardPose
 from rig.count.volume import CountVolume, SweepCounter, SweepLayout
@@ -26,8 +27,6 @@ from sim_backend.mirror_motion import Jitter
 from sim_backend.scenes.board import BoardAtPose, board_scene
 from sim_backend.scenes.scene import SceneFile
 from tests.reference.boards.random_rigs import COMMAND_REACH, RandomRig
-
-Array = NDArray[np.float64]
 
 FRAME_S = 1e-5
 COLUMNS = 800

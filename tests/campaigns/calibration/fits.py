@@ -14,8 +14,7 @@ import time
 import numpy as np
 
 from calibration.errors import CalibrationError
-from calibration.rig_fit.fit import fit_rig
-from calibration.rig_fit.result import RigFit
+from calibration.rig_fit.fit import RigFit, fit_rig
 from calibration.views import MAD_TO_SD
 from tests.campaigns.calibration.asked import INSIDE, RATIO, Figure, exit_code
 from tests.reference.boards.calibration_data import BOARD, Seen, random_rig, random_views

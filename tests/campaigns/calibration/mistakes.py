@@ -18,12 +18,11 @@ from dataclasses import dataclass, replace
 
 import cv2
 import numpy as np
-from numpy.typing import NDArray
 
 from calibration.board.board import Board
 from calibration.board.detect import find_corners
-from calibration.diagnosis.evidence import baseline_m
-from calibration.diagnosis.rig import judge_fit, judge_refused
+from calibration.diagnosis.rules import baseline_m
+from calibration.diagnosis.verdicts import judge_fit, judge_refused
 from calibration.errors import Degenerate
 from calibration.model.scanner import PivotScanner
 from calibration.rig_fit.fit import fit_rig
@@ -31,11 +30,8 @@ from calibration.views import BoardPose, View
 from sim_backend.scenes.board import BoardAtPose
 from tests.campaigns.calibration.asked import NAMED, Figure, exit_code
 from tests.campaigns.calibration.board_capture import HOT_PER_S, Stand, SweepAsked, set_up, take_sweeps
-from tests.campaigns.calibration.rig_figures import CALIBRATED
-from tests.campaigns.calibration.rigs import OTHER_SPEED, room_picture, view_of
+from tests.campaigns.calibration.rigs import CALIBRATED, OTHER_SPEED, room_picture, view_of
 from tests.reference.boards.random_rigs import BOARD, random_pose, random_poses, random_rig
-
-Array = NDArray[np.float64]
 
 POSES = 8
 FAR_BOARD = Board("chessboard", (8, 6), 0.08)

@@ -6,10 +6,9 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
+from calibration.arrays import Array
 from calibration.board.board import WHITE, Board
 from calibration.views import BoardPose
-
-Array = NDArray[np.float64]
 
 SIZE = (320, 240)
 MATRIX = np.array([[380.0, 0, 162], [0, 379.0, 117], [0, 0, 1]])

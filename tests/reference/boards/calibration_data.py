@@ -12,10 +12,9 @@ from dataclasses import dataclass, field, replace
 import numpy as np
 from numpy.typing import NDArray
 
+from calibration.arrays import Array
 from calibration.board.board import Board
 from calibration.views import Corners, Passages, View
-
-Array = NDArray[np.float64]
 
 BOARD = Board("chessboard", (9, 7), 0.06)
 HOLD_S = 1e-4

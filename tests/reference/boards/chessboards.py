@@ -77,9 +77,8 @@ def main() -> None:
             "cornerSubPix 11": subpixel(views, asked.folder, 11),
         }.items():
             fit, (rms, fx) = fit_camera(with_corners, BOARD, size), opencv_rms(with_corners, size)
-            plain = fit_camera(with_corners, BOARD, size, robust=False)
             print(
-                f"{side:6}{name:16} views {len(views)}  ours {fit.rms_px:.4f} px (all corners {plain.rms_px:.4f})  "
+                f"{side:6}{name:16} views {len(views)}  ours {fit.rms_px:.4f} px  "
                 f"OpenCV {rms:.4f} px  fx {fit.camera.matrix[0, 0]:.2f} +- {fit.sd['fx']:.2f} (OpenCV {fx:.2f})  "
                 f"condition {fit.condition:.1e}  outliers {', '.join(fit.outliers) or 'none'}"
             )

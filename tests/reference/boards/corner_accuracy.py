@@ -12,14 +12,14 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
+from calibration.arrays import Array
 from calibration.board.detect import find_corners
-from calibration.board.lattice import gray
+from calibration.board.markers import gray
 from calibration.errors import Degenerate
 from tests.reference.boards.board_pictures import CHARUCO, SIZE, albedo, corners_px, exposed, pose
 
 FRAMES = 5000
 WHITE_FLUX = (0.2, 0.05, 0.01, 0.004, 0.002)
-Array = NDArray[np.float64]
 
 
 def opencv_corners(picture: NDArray[np.float32]) -> tuple[Array, Array]:

@@ -3,13 +3,17 @@
 from __future__ import annotations
 
 import numpy as np
-from numpy.typing import NDArray
 
+from calibration.arrays import Array
 from calibration.depth_error import depth_sd_m
 from calibration.model.rig_model import RigModel
 from tests.reference.boards.calibration_data import TrueRig, points_at
 
-Array = NDArray[np.float64]
+
+def normalised(model: RigModel, rig: TrueRig, depth_m: float, velocity_per_s: float) -> float:
+    """Root mean square of the errors in units of their stated sd: 1 where the covariance is right, on average."""
+    error, sd = depth_errors(model, rig, depth_m, velocity_per_s)
+    return float(np.sqrt(np.mean((error / sd) ** 2)))
 
 
 def depth_errors(

@@ -12,15 +12,13 @@ from dataclasses import dataclass
 
 import cv2
 import numpy as np
-from numpy.typing import NDArray
 
+from calibration.arrays import Array
 from calibration.board.board import MARGIN_SQUARES, Board
 from calibration.model.camera import Camera
 from calibration.model.rig_model import Lag, RigModel
 from calibration.model.scanner import PivotScanner
 from calibration.views import BoardPose
-
-Array = NDArray[np.float64]
 
 BOARD = Board("charuco", (8, 6), 0.08, 0.062, "DICT_4X4_50")
 """640 x 480 mm: its markers can be read as far away as most of the rigs' depth goes."""

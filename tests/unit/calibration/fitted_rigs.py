@@ -1,10 +1,12 @@
 """A rig of the second simulator, and fits of its views."""
 
+from typing import Any
+
 import numpy as np
 
 from calibration.model.camera import Camera
-from calibration.rig_fit.fit import fit_rig
-from calibration.rig_fit.result import RigFit
+from calibration.model.rig_model import Covariance
+from calibration.rig_fit.fit import RigFit, fit_rig
 from tests.reference.boards.calibration_data import BOARD, Seen, TrueRig, random_views
 
 SIZE = (512, 512)
@@ -17,6 +19,12 @@ def fitted(rig: TrueRig, seed: int, seen: Seen = SEEN, poses: int = 8, **given: 
     velocities = given.pop("velocities", (35.2, -35.2))
     views = random_views(np.random.default_rng(seed), rig, poses, seen, velocities)  # type: ignore[arg-type]
     return fit_rig(views, BOARD, SIZE, **given)  # type: ignore[arg-type]
+
+
+def held(rig: TrueRig) -> dict[str, Any]:
+    """What is given to a fit of a rig whose camera is known exactly."""
+    names = ("fx", "fy", "cx", "cy", "k1", "k2", "p1", "p2", "k3")
+    return {"camera": true_camera(rig), "known": Covariance(names, np.zeros((9, 9)))}
 
 
 def true_camera(rig: TrueRig) -> Camera:

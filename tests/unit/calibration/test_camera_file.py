@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from calibration.errors import CalibrationError
-from calibration.files.camera_file import KnownCamera, camera_file_text, load_camera
+from calibration.files.rig_file import KnownCamera, camera_file_text, load_camera
 from calibration.model.rig_model import Covariance
 from calibration.verdict import Verdict, reason_for
 from tests.unit.calibration.cameras import camera

@@ -5,9 +5,8 @@ from collections import Counter
 import numpy as np
 import pytest
 
-from tests.campaigns.calibration import fits, mistakes, rig_figures
+from tests.campaigns.calibration import fits, mistakes
 from tests.campaigns.calibration.asked import Figure, exit_code, shortfalls
-from tests.campaigns.calibration.rig_figures import SCANNED, Compared
 
 
 def test_figures_within_their_limits_and_on_them_are_no_shortfall(capsys: pytest.CaptureFixture[str]) -> None:
@@ -22,29 +21,6 @@ def test_a_figure_beyond_its_limits_or_missing_is_named_with_them(capsys: pytest
         "short: ratio is 1.31, asked for are 0.8 to 1.3",
         "short: px was not found, asked for are 0 to 0.1",
     ]
-
-
-def rigs(scale: float, added_px: float = 0.05) -> list[Compared]:
-    """Normal errors of so many times what is stated."""
-    rng = np.random.default_rng(0)
-    added = {(k, way): 0.02 for k in SCANNED for way in (1, -1)} | {(SCANNED[-1], -1): added_px}
-    return [Compared(scale * rng.standard_normal(288), np.ones(288), added) for _ in range(60)]
-
-
-@pytest.mark.parametrize(
-    ("compared", "short"),
-    [
-        (rigs(1.0), []),
-        (rigs(1.2), ["share of true depths"]),
-        (rigs(0.7), ["depth error over", "share of true depths"]),
-        (rigs(1.0, 0.11), ["px added to a scan at K = 20 (worst rig) is 0.11"]),
-        ([], ["depth error over", "share of true depths", "px added", "px added", "px added"]),
-    ],
-    ids=["as stated", "a fifth larger", "smaller", "one rig too far off", "none"],
-)
-def test_rigs_are_judged_by_error_interval_and_added_pixels(compared: list[Compared], short: list[str]) -> None:
-    lines = shortfalls(rig_figures.figures(compared))
-    assert [line[: len(begin)] for line, begin in zip(lines, short, strict=True)] == short
 
 
 def test_rigs_of_the_second_simulator_are_judged_by_error_and_interval() -> None:

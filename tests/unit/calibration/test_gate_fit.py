@@ -40,7 +40,7 @@ def test_edges_are_found_within_a_frame(rises: bool) -> None:
 
 
 @pytest.mark.parametrize("rises", [True, False])
-@pytest.mark.parametrize("flux", [0.7, 3.0, 300.0])
+@pytest.mark.parametrize("flux", [0.7, 300.0])
 def test_a_line_that_saturates_says_less_and_nothing_wrong(flux: float, rises: bool) -> None:
     """As it was: taken for light that is not saturated, edges are off by up to half a frame, many sds."""
     rng = np.random.default_rng(2)

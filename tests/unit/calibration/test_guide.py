@@ -52,25 +52,13 @@ def test_the_sequence_spreads_over_distance_place_and_tilt() -> None:
     assert sequence(found, 4, seed=3) == chosen[:4]
 
 
-def test_the_first_poses_need_no_fit() -> None:
-    found = candidates(rough_camera((512, 512)), BOARD, DEPTH_RANGE_M)
-    first = [next_pose(shown, found, 5.0) for shown in range(3)]
-    assert "expected error" not in str(first[0])
-    assert len({advice.candidate for advice in first}) == 3
-
-
 def test_the_next_pose_is_the_one_with_the_least_expected_error() -> None:
     found = candidates(rough_camera((512, 512)), BOARD, DEPTH_RANGE_M)
 
     def forecast(pose: BoardPose) -> float:
         return math.nan if pose.rotation[1] == 0 else 0.009 + 0.001 * float(pose.position_m[2])
 
-    advice = next_pose(4, found, 5.0, 0.014, forecast)
+    advice = next_pose(found, 5.0, 0.014, forecast)
     assert advice.after_m == min(forecast(one.pose) for one in found if one.tilt[1])
     assert "35 degrees about the vertical" in str(advice)
     assert "expected error at 5 m falls from 14 mm to 9." in str(advice)
-
-
-def test_no_candidate_is_an_error() -> None:
-    with pytest.raises(ValueError, match="no pose"):
-        next_pose(0, (), 5.0)

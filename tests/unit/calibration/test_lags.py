@@ -7,21 +7,19 @@ import numpy as np
 import pytest
 
 from calibration.diagnosis import rules
-from calibration.diagnosis.rig import judge_fit, judge_sync
-from calibration.diagnosis.rules import lag_lack
+from calibration.diagnosis.verdicts import judge_fit, judge_sync
 from calibration.errors import CalibrationError, Degenerate
 from calibration.model import parameters
-from calibration.model.parameters import SWEPT, alike_speeds, lag_groups, untold
+from calibration.model.parameters import SWEPT, lag_groups, untold
 from calibration.model.rig_model import Covariance, Lag
-from calibration.rig_fit.fit import fit_rig
-from calibration.rig_fit.result import RigFit
+from calibration.rig_fit.fit import RigFit, fit_rig
 from calibration.sync import transfer
 from calibration.sync.lag_fit import SyncFit, fit_sync
 from calibration.sync.transfer import known_row_delay, with_lags
 from calibration.verdict import AccuracyGoal
 from calibration.views import Passages, View
 from tests.reference.boards.calibration_data import BOARD, Seen, TrueRig, random_pose, random_views, seen_view
-from tests.reference.boards.fitted_depth import depth_errors
+from tests.reference.boards.fitted_depth import depth_errors, normalised
 from tests.stability.inventory import covers
 
 covers(parameters, rules, transfer)
@@ -56,12 +54,9 @@ def swept(*velocities: float) -> list[Passages]:
     [
         ((35.0, -35.0), ONE, 1),
         ((35.0, -70.0), ONE, 1),
-        ((35.0, -70.0, 35.5, -70.5), ONE, 1),
         ((35.0, 70.0), ONE, 1),
         ((35.0,), (), 2),
-        ((-35.0, -35.1), (), 2),
         ((35.0, -35.0, 70.0), APART, 0),
-        ((35.0, -35.0, -70.0), APART, 0),
     ],
 )
 def test_lags_are_told_apart_by_two_speeds_in_one_direction(
@@ -73,14 +68,6 @@ def test_lags_are_told_apart_by_two_speeds_in_one_direction(
     for moved, forward, backward in changes:
         for v in velocities:
             assert abs(moved + v * (forward if v > 0 else backward)) < 0.02 * 70
-
-
-@pytest.mark.parametrize("velocities", [(40.0, -80.0), (40.0, -80.0, 40.0, -80.0), (40.0, -41.0)])
-def test_sync_does_not_tell_lags_apart_by_one_speed_each_way(velocities: tuple[float, ...]) -> None:
-    fit = fit_sync(swept(*velocities))
-    assert fit.common
-    assert fit.lag_s.forward == fit.lag_s.backward
-    assert "one-speed" in judge_sync(fit, None, None).codes
 
 
 def test_sync_refuses_pixels_that_no_two_speeds_share() -> None:
@@ -103,7 +90,6 @@ def test_sync_refuses_pixels_that_no_two_speeds_share() -> None:
         ((35.2, 70.4), ("one-way",)),
         ((35.2, -70.4), ("one-speed",)),
         ((35.2, -35.2), ()),
-        ((35.2, -35.2, 70.4, -70.4), ()),
     ],
 )
 def test_planes_say_which_way_was_never_seen(velocities: tuple[float, ...], codes: tuple[str, ...]) -> None:
@@ -111,20 +97,10 @@ def test_planes_say_which_way_was_never_seen(velocities: tuple[float, ...], code
     assert judge_fit(fit, views, accuracy_m=0.05).verdict.codes == codes
     assert fit.model.provenance[SWEPT] == sorted(velocities)
     for v in velocities:
-        error, sd = depth_errors(fit.model, RIG, 5.0, v)
-        assert np.sqrt(np.mean((error / sd) ** 2)) < 2.5
+        assert normalised(fit.model, RIG, 5.0, v) < 2.5
 
 
-def test_a_direction_never_swept_lags_like_the_other_and_is_known_no_better() -> None:
-    fit, _ = planes(35.2, 70.4)
-    assert fit.model.lag_s.forward == fit.model.lag_s.backward == pytest.approx(1.5e-4, abs=2e-6)
-    assert fit.model.covariance is not None
-    forward, backward = np.diag(fit.model.covariance.of(["lag_forward", "lag_backward"]))
-    assert forward == pytest.approx(backward)
-    assert forward > 0
-
-
-@pytest.mark.parametrize("velocities", [(35.2, -35.2), (35.2,), (35.2, -70.4), (35.2, 70.4)])
+@pytest.mark.parametrize("velocities", [(35.2,), (35.2, -70.4)])
 def test_new_lags_turn_the_angle_that_went_with_the_old_ones(velocities: tuple[float, ...]) -> None:
     fit, _ = planes(*velocities)
     model, reason = with_lags(fit.model, found())
@@ -136,15 +112,6 @@ def test_new_lags_turn_the_angle_that_went_with_the_old_ones(velocities: tuple[f
         error, sd = depth_errors(model, RIG, 5.0, v)
         assert np.sqrt(np.mean((error / sd) ** 2)) < 2.5
         assert np.median(sd) < 0.015
-
-
-def test_depth_after_new_lags_is_off_by_what_is_stated() -> None:
-    squares = []
-    for seed in range(4):
-        off = np.random.default_rng(seed).normal(0, 1e-6, 2)
-        model, _ = with_lags(planes(35.2, -35.2, seed=seed)[0].model, found(Lag(*(LAG + off)), sd_s=1e-6))
-        squares += [np.mean(np.divide(*depth_errors(model, RIG, 5.0, v)) ** 2) for v in (176.0, -176.0)]
-    assert 0.5 < np.sqrt(np.mean(squares)) < 1.6
 
 
 def test_lags_that_changed_leave_planes_alone_that_had_told_them_apart() -> None:
@@ -186,19 +153,10 @@ def test_a_row_delay_that_the_planes_know_is_not_thrown_away(sd_s: float) -> Non
     assert np.all(np.abs(np.subtract(given.lag_s, LAG)) < 4 * fit.sd_s[:2])
 
 
-def test_speeds_are_alike_where_no_gap_is_between_them() -> None:
-    assert alike_speeds([70.4, -35.2, 35.201, 36.5, -71.0]).tolist() == [2, 0, 0, 1, 2]
-    assert alike_speeds([]).size == 0
-
-
 def test_a_model_that_says_nothing_of_its_errors_takes_the_lags_alone() -> None:
     fit, _ = planes(35.2, -35.2)
     model, reason = with_lags(replace(fit.model, covariance=None), found())
     assert (model.lag_s, model.covariance, reason) == (LAG, None, None)
-
-
-def test_nothing_is_lacking_where_nothing_was_swept() -> None:
-    assert lag_lack((), mean_will_do=True) == []
 
 
 def test_a_line_that_does_not_reach_the_distance_asked_is_refused_with_its_reach() -> None:

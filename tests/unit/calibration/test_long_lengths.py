@@ -3,15 +3,14 @@
 import numpy as np
 
 from calibration.check import CheckedBoard
-from calibration.diagnosis.camera import judge_check
-from calibration.diagnosis.rig import judge_sync
+from calibration.diagnosis.verdicts import judge_check, judge_sync
 from calibration.model.rig_model import Lag, RigModel
 from calibration.model.scanner import PivotScanner
 from calibration.sync.lag_fit import SweepTiming, SyncFit
 from calibration.verdict import AccuracyGoal
 from tests.unit.calibration.cameras import camera
 
-FAR = CheckedBoard("000", 9.0, 1.2345, 3.0, 0.4, 900.0, 60, 1.0, 0.01, 0.1, np.zeros((2, 2)), np.array([0, 0, -1.0]))
+FAR = CheckedBoard("000", 9.0, 1.2345, 3.0, 0.4, 900.0, 60, 1.0, 0.01, 0.1, np.zeros((2, 2)))
 
 
 def test_a_board_metres_off_a_plane() -> None:

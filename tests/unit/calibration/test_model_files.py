@@ -1,6 +1,6 @@
 """The calibration file: what is written is read back, and what is wrong is said in one line."""
 
-from dataclasses import replace
+from dataclasses import fields, is_dataclass, replace
 from pathlib import Path
 
 import numpy as np
@@ -60,64 +60,34 @@ def test_the_bundled_rig_sweeps_its_stated_tangents() -> None:
     model.check_sensor(512, 512)
 
 
-def test_planes_beside_the_file_or_inside_it_are_the_same_model(tmp_path: Path) -> None:
-    np.save(tmp_path / "planes.npy", [[1, 0, 0.3, -0.3], [1, 0, 0, -0.3], [1, 0, -0.3, -0.3]])
-    inside = load_rig_model(write(tmp_path, HEAD + CAMERA + ROWS))
-    beside = load_rig_model(write(tmp_path, HEAD + CAMERA + "planes: planes.npy\n"))
-    assert inside.fingerprint() == beside.fingerprint()
-    assert inside.scanner.command_range == (0, 2)
+def same(one: object, other: object) -> bool:
+    """Whether two parts of a model are equal to the last bit."""
+    if is_dataclass(one):
+        given = [field.name for field in fields(one) if field.init]
+        return type(one) is type(other) and all(same(getattr(one, name), getattr(other, name)) for name in given)
+    return np.array_equal(one, other) if isinstance(one, np.ndarray) else one == other
 
 
-@pytest.mark.parametrize("scanner", [pivot(), table()], ids=["pivot", "table"])
-@pytest.mark.parametrize("defects", [None, np.eye(512, dtype=bool)], ids=["no defects", "defects"])
-def test_what_is_saved_is_read_back(
-    tmp_path: Path, scanner: PivotScanner | PlaneTable, defects: np.ndarray | None
-) -> None:
-    model = RigModel(
-        camera=camera([-0.3, 0.1, 0.001, 0.001, 0.01]),
-        scanner=scanner,
-        lag_s=Lag(1e-4, 3e-4),
-        speed_range_per_s=(10.0, 400.0),
-        source_m=np.array([-0.3, 0, 0]),
-        defects=defects,
-        provenance={"rig": "bench", "velocities_per_s": [-35.2, 35.2], "residual_px": 0.1},
-    )
+PLAIN = RigModel(
+    camera=camera([-0.3, 0.1, 0.001, 0.001, 0.01]), scanner=table(), lag_s=Lag(1e-4, 3e-4),
+    speed_range_per_s=(10.0, 400.0), source_m=np.array([-0.3, 0, 0]), defects=np.eye(512, dtype=bool),
+    provenance={"rig": "bench", "velocities_per_s": [-35.2, 35.2], "residual_px": 0.1},
+)  # fmt: skip
+FULL = RigModel(
+    camera([-0.1, 0, 0, 0]), replace(pivot(), offset_m=np.array([1e-3, 1 / 3]), cone_rad=0.01, bow_per_rad=-0.02),
+    dark_rate_per_s=np.full((512, 512), 1 / 3, np.float32), row_delay_s=1e-8, gate_delay_s=2e-6, colour_skew_s=-1e-6,
+    marker_rising=False, covariance=Covariance(("fx", "axis_shift_1"), np.array([[0.04, 1e-5], [1e-5, 1e-8]])),
+    identity=Identity("0f3a", "2026-11-22T10:00:00+00:00", "bench", {"spad": "usb"}, {"spad": "7"}, "failed", ("a",)),
+)  # fmt: skip
+
+
+@pytest.mark.parametrize("model", [PLAIN, FULL, RigModel(camera([]), pivot())], ids=["table", "full", "bare"])
+def test_what_is_saved_is_read_back(tmp_path: Path, model: RigModel) -> None:
     save_rig_model(model, tmp_path / "rig.yaml")
     again = load_rig_model(tmp_path / "rig.yaml")
+    assert same(again, model)
     assert again.fingerprint() == model.fingerprint()
-    assert (again.lag_s, again.speed_range_per_s) == (model.lag_s, model.speed_range_per_s)
-    assert again.provenance == model.provenance
-    assert np.array_equal(again.camera.tangents()[0], model.camera.tangents()[0])
-    assert (defects is None) == (again.defects is None)
     assert not list(tmp_path.glob(".*"))
-
-
-def test_what_a_calibration_finds_out_is_saved_and_read_back(tmp_path: Path) -> None:
-    scanner = replace(pivot(), offset_m=np.array([1e-3, 1 / 3]), cone_rad=0.01, bow_per_rad=-0.02)
-    identity = Identity(
-        "0f3a", "2026-11-22T10:00:00+00:00", "bench", {"spad": "spb-usb"}, {"spad": "7"}, "failed", ("no-tilt",)
-    )
-    model = RigModel(
-        camera([-0.1, 0, 0, 0]),
-        scanner,
-        dark_rate_per_s=np.full((512, 512), 1 / 3, np.float32),
-        row_delay_s=1e-8,
-        gate_delay_s=2e-6,
-        colour_skew_s=-1e-6,
-        marker_rising=False,
-        covariance=Covariance(("fx", "axis_shift_1"), np.array([[0.04, 1e-5], [1e-5, 1e-8]])),
-        identity=identity,
-    )
-    save_rig_model(model, tmp_path / "rig.yaml")
-    again = load_rig_model(tmp_path / "rig.yaml")
-    assert again.fingerprint() == model.fingerprint()
-    assert np.array_equal(again.scanner.turned([-1, 0.3]), scanner.turned([-1, 0.3]))
-    assert again.identity == identity
-    for name in ("row_delay_s", "gate_delay_s", "colour_skew_s", "marker_rising"):
-        assert getattr(again, name) == getattr(model, name)
-    assert np.array_equal(again.dark_rate_per_s, model.dark_rate_per_s)
-    assert again.covariance.names == ("fx", "axis_shift_1")
-    assert np.array_equal(again.covariance.matrix, model.covariance.matrix)
 
 
 def test_files_and_fingerprints_of_models_without_all_that_are_what_they_were(tmp_path: Path) -> None:
@@ -153,7 +123,6 @@ def test_the_fingerprint_changes_with_what_depth_depends_on() -> None:
     [
         ("", "is empty; a calibration must hold keys and values, e.g. 'format: spadrig-calibration'"),
         ("just: text", "first entry must be"),
-        ("[1, 2", "not YAML"),
         ("format: spadrig-calibration\nversion: 2\n", "has version 2; this program reads version 1"),
         (HEAD + ROWS, "'camera' is missing"),
         (HEAD + CAMERA, "exactly one of 'planes' and 'scanner'"),
@@ -161,12 +130,10 @@ def test_the_fingerprint_changes_with_what_depth_depends_on() -> None:
         (HEAD + CAMERA.replace("512", "wide", 1) + ROWS, "camera.width is 'wide'"),
         (HEAD + CAMERA.replace("-0.1, ", "") + ROWS + "lag_s: {forward: .nan}\n", "lag_s.forward is nan"),
         (HEAD + CAMERA.replace("-0.1, 0", "0") + "planes: none.npy\n", "does not exist"),
-        (HEAD + CAMERA + "planes: calibration.yaml\n", "is not a readable .npy"),
         (HEAD + CAMERA + "planes: [[1, 0, 0]]\n", "planes.0"),
         (HEAD + CAMERA + "planes: []\n", "nx, ny, nz, d"),
         (HEAD + CAMERA + "planes: [[0.5, 0.6, 0, 1]]\n", "degrees from the search axis"),
         (HEAD + CAMERA.replace("[-0.1, 0, 0, 0, 0]", "[1, 2]") + ROWS, "distortion has 2 terms"),
-        (HEAD + CAMERA + "scanner: {}\n", "exactly one of 'table' and 'pivot'"),
         (HEAD + CAMERA + ROWS + "defects: planes.npy\n", "it must be bool"),
         (HEAD + CAMERA + ROWS + "lag_s: {forward: -1.0}\n", "lag_s is"),
         (HEAD + CAMERA + ROWS + "row_delay_s: .inf\n", "row_delay_s is inf"),
@@ -178,7 +145,6 @@ def test_the_fingerprint_changes_with_what_depth_depends_on() -> None:
         ),
         (HEAD + CAMERA + ROWS + "identity: {rig: a, created: b, verdict: fine}\n", "identity.verdict is 'fine'"),
         (HEAD + CAMERA + ROWS + "provenance: {velocities_per_s: fast}\n", "provenance.velocities_per_s is 'fast'"),
-        (HEAD + CAMERA + ROWS + "provenance: {velocities_per_s: [a]}\n", "provenance.velocities_per_s.0 is 'a'"),
         (HEAD + CAMERA + ROWS + "provenance: {corners: 35.2}\n", "provenance.corners is 35.2"),
     ],
 )
@@ -202,17 +168,15 @@ def test_an_absent_or_binary_file_is_refused(tmp_path: Path) -> None:
         load_rig_model(tmp_path / "planes.npy")
 
 
-def test_another_sensor_is_refused() -> None:
-    with pytest.raises(CalibrationError, match="512 x 512 pixels, this one has 320 x 240"):
-        RigModel(camera([]), table()).check_sensor(320, 240)
-
-
-def test_a_speed_the_lag_was_not_measured_at_is_refused() -> None:
-    model = RigModel(camera([]), table(), speed_range_per_s=(10, 100))
+def test_another_sensor_and_another_speed_are_refused(tmp_path: Path) -> None:
+    np.save(tmp_path / "planes.npy", [[1, 0, 0.3, -0.3], [1, 0, 0, -0.3], [1, 0, -0.3, -0.3]])
+    model = load_rig_model(write(tmp_path, HEAD + CAMERA + "planes: planes.npy\nspeed_range_per_s: [10, 100]\n"))
+    assert model.scanner.command_range == (0, 2)
     model.check_speed(50)
-    RigModel(camera([]), table()).check_speed(1e9)
     with pytest.raises(CalibrationError, match="outside the 10 to 100 /s"):
         model.check_speed(200)
+    with pytest.raises(CalibrationError, match="512 x 512 pixels, this one has 320 x 240"):
+        model.check_sensor(320, 240)
 
 
 def test_planes_along_the_search_axis_are_refused_whatever_their_sign() -> None:

@@ -6,15 +6,12 @@ import pytest
 
 from calibration.passages import find as finding
 from calibration.passages import fit, flux_picture
-from calibration.passages import light as light_module
 from calibration.passages.find import SweepCounts, evenly, find_passages
-from calibration.passages.fit import fit_passages
-from calibration.passages.light import LineShape, light
-from calibration.sync import shared_pixels
+from calibration.passages.fit import LineShape, fit_passages, light
 from tests.stability.inventory import covers
 from tests.unit.calibration.passed_lines import Light, passed, sweep_of, true_at
 
-covers(light_module, fit, finding, flux_picture, shared_pixels)
+covers(fit, finding, flux_picture)
 
 CASES = {
     "clear": (Light(0.6, 4.0), 10, 0.9),
@@ -40,15 +37,6 @@ def test_passages_are_unbiased_and_their_sds_honest(case):
     assert abs(np.mean(error / found.sd)) < 0.1 + 3 / np.sqrt(len(error))
     assert 0.8 < np.std(error / found.sd) < 1.15
     assert np.mean(np.abs(error) > 5 * found.sd) < 0.003
-
-
-def test_passages_do_not_lock_to_columns():
-    counts, centre = passed(np.random.default_rng(4), Light(0.4, 6.0), 20, pixels=6000)
-    found = find_passages(sweep_of(counts, 20), 1, 1.0, most=6000)
-    true = true_at(centre, found)
-    phase = ((true % 1) * 8).astype(int)
-    bias = np.bincount(phase, found.command - true) / np.bincount(phase)
-    assert np.abs(bias).max() < 0.02
 
 
 @pytest.mark.parametrize("line", [Light(0.4, 4.0, travels=True), Light(0.6, 20.0, travels=True)])
@@ -80,14 +68,6 @@ def test_one_pixel_whose_fit_went_astray_does_not_choose_the_shape_for_all(lost,
     assert [shape.travels for shape in chosen] == [True]
 
 
-def test_commands_follow_the_columns_either_way():
-    counts, centre = passed(np.random.default_rng(5), Light(0.6, 6.0), 10, pixels=600)
-    found = find_passages(sweep_of(counts, 10, step=-0.01, first=0.4), -1, 35.0)
-    assert (found.direction, found.speed_per_s) == (-1, 35.0)
-    error = (found.command - (0.4 - 0.01 * true_at(centre, found))) / found.sd
-    assert 0.8 < error.std() < 1.15
-
-
 def test_windows_that_move_with_the_line_give_what_they_hold():
     rng = np.random.default_rng(6)
     counts, centre = passed(rng, Light(0.6, 6.0), 10, pixels=3840)
@@ -101,22 +81,6 @@ def test_windows_that_move_with_the_line_give_what_they_hold():
     assert 0.8 < error.std() < 1.2
     at = np.rint(found.command).astype(int)
     assert np.all((found.x_px >= x0[at]) & (found.x_px < x0[at] + window))
-
-
-def test_bins_of_several_sizes_and_none_count_as_they_are():
-    rng = np.random.default_rng(7)
-    counts, centre = passed(rng, Light(0.8, 6.0, ambient=0.1), 12, pixels=900)
-    frames = rng.integers(8, 13, len(counts))
-    frames[::17] = 0
-    thinned = (
-        rng.hypergeometric(counts, 12 - counts, np.maximum(frames, 1)[:, None, None]) * (frames > 0)[:, None, None]
-    )
-    sweep = sweep_of(thinned.astype(np.uint8), 1)
-    command = np.where(frames > 0, sweep.command, np.nan)
-    found = find_passages(SweepCounts(sweep.counts, frames, command, sweep.x0, sweep.width), 1, 1.0)
-    error = (found.command - true_at(centre, found)) / found.sd
-    assert len(error) > 800
-    assert 0.85 < error.std() < 1.2
 
 
 def test_noise_hot_pixels_and_saturation_give_no_passages():

@@ -1,7 +1,6 @@
 """Corners of pictures without noise: what finding them leaves, which no number of photons averages out."""
 
 import numpy as np
-import pytest
 
 from calibration.board.board import Board
 from calibration.board.detect import find_corners
@@ -10,17 +9,16 @@ from sim_backend.scenes.board import BoardAtPose, board_scene
 from tests.reference.boards.random_rigs import BOARD, random_poses, random_rig
 
 MOST_RMS_PX = 0.0014
-"""0.0008 and 0.0012 here, most of it the drawn picture's own; drawn half as finely for the comparison 0.0017."""
+"""0.0012 here, most of it the drawn picture's own; drawn half as finely for the comparison 0.0017."""
 
 
-@pytest.mark.parametrize("seed", [6, 7])
-def test_corners_without_noise_lie_within_a_thousandth_of_a_pixel(seed: int) -> None:
-    """Over tilted boards and bent pictures."""
-    rng = np.random.default_rng(seed)
+def test_corners_without_noise_lie_within_a_thousandth_of_a_pixel() -> None:
+    """Over a tilted board and a bent picture."""
+    rng = np.random.default_rng(7)
     camera = random_rig(rng).model.camera
     rays = camera.tangents()
     off = []
-    for pose in random_poses(rng, camera, BOARD, 2):
+    for pose in random_poses(rng, camera, BOARD, 1):
         picture = 0.05 * board_scene(*rays, [BoardAtPose(BOARD, pose)], 4.0).albedo
         found = find_corners(picture.astype(np.float32), BOARD)
         assert len(found.ids) == len(BOARD.corners_m)

@@ -13,8 +13,8 @@ from calibration.rig_fit.fit import fit_rig
 from calibration.rig_fit.start import check_depth
 from calibration.views import BoardPose, View
 from tests.reference.boards.calibration_data import BOARD, random_views, seen_view
-from tests.reference.boards.fitted_depth import depth_errors
-from tests.unit.calibration.fitted_rigs import RIG, SEEN, SIZE, fitted, true_camera
+from tests.reference.boards.fitted_depth import normalised
+from tests.unit.calibration.fitted_rigs import RIG, SEEN, SIZE, fitted, held
 
 
 def flat(z: float, x: float = 0.0) -> tuple[np.ndarray, np.ndarray]:
@@ -30,11 +30,11 @@ def flat(z: float, x: float = 0.0) -> tuple[np.ndarray, np.ndarray]:
         ([flat(1.5, x) for x in (-0.2, -0.1, 0, 0.1, 0.2)], {"coplanar"}),
     ],
 )
-@pytest.mark.parametrize("held", [False, True])
-def test_views_that_make_no_model_are_refused(poses: list[object], reasons: set[str], held: bool) -> None:
+@pytest.mark.parametrize("known", [False, True])
+def test_views_that_make_no_model_are_refused(poses: list[object], reasons: set[str], known: bool) -> None:
     rng = np.random.default_rng(15)
     views = [seen_view(rng, RIG, *pose, SEEN, name=str(i)) for i, pose in enumerate(poses)]  # type: ignore[misc]
-    given = {"camera": true_camera(RIG), "hold_camera": True} if held else {}
+    given = held(RIG) if known else {}
     with pytest.raises(Degenerate) as raised:
         fit_rig(views, BOARD, SIZE, **given)  # type: ignore[arg-type]
     assert raised.value.reason in reasons
@@ -46,9 +46,8 @@ def test_boards_without_tilt_need_a_camera_that_is_known() -> None:
     views = [seen_view(rng, RIG, *flat(z), SEEN, name=str(z)) for z in (1.0, 1.3, 1.6, 2.0, 2.5)]
     with pytest.raises(Degenerate, match="parallel"):
         fit_rig(views, BOARD, SIZE)
-    fit = fit_rig(views, BOARD, SIZE, camera=true_camera(RIG), hold_camera=True)
-    error, sd = depth_errors(fit.model, RIG, 3.0, 35.2)
-    assert np.sqrt(np.mean((error / sd) ** 2)) < 3
+    fit = fit_rig(views, BOARD, SIZE, **held(RIG))
+    assert normalised(fit.model, RIG, 3.0, 35.2) < 3
 
 
 def test_a_line_that_hardly_moved_is_refused() -> None:
@@ -72,17 +71,6 @@ def test_views_without_a_line_are_refused() -> None:
     assert raised.value.reason == "no-line"
 
 
-def test_two_poses_are_a_model_that_knows_little_or_none() -> None:
-    for seed in range(3):
-        try:
-            fit = fitted(RIG, seed, poses=2)
-        except CalibrationError:
-            continue
-        error, sd = depth_errors(fit.model, RIG, 5.0, 35.2)
-        assert np.median(sd) > 0.01
-        assert np.median(np.abs(error)) < 5 * np.median(sd)
-
-
 def test_depth_that_is_next_to_unknown_names_the_views_that_had_no_say() -> None:
     lens = Camera(*SIZE, np.array([[600, 0, 255.5], [0, 600, 255.5], [0, 0, 1.0]]), np.zeros(5))
     across = np.array([1.0, 0, 0])
@@ -101,8 +89,7 @@ def test_what_is_no_number_does_not_count() -> None:
     corners = views[1].corners
     assert corners is not None
     corners.px[3] = np.nan
-    error, sd = depth_errors(fit_rig(views, BOARD, SIZE).model, RIG, 5.0, 35.2)
-    assert np.sqrt(np.mean((error / sd) ** 2)) < 2.5
+    assert normalised(fit_rig(views, BOARD, SIZE).model, RIG, 5.0, 35.2) < 2.5
 
 
 def test_a_camera_of_another_size_is_refused() -> None:

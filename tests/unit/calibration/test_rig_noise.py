@@ -4,12 +4,10 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-from numpy.typing import NDArray
 
+from calibration.arrays import Array
 from calibration.rig_fit.noise import passage_noise, restated
 from calibration.rig_fit.state import Sighting
-
-Array = NDArray[np.float64]
 
 PER_SWEEP = 3000
 SPEEDS = (88.0, -88.0, 293.0)
@@ -46,12 +44,6 @@ def told(chance: float, spread: float, seed: int = 0) -> tuple[Array, Array, Arr
     return view.sd.reshape(shape), changed.sd.reshape(shape), true
 
 
-def test_sd_that_are_right_stay() -> None:
-    stated, after, _ = told(chance=0.0, spread=0.4)
-    assert np.abs(np.log(after / stated)).max() < 0.25
-    assert np.abs(np.log(after / stated)).mean() < 0.08
-
-
 @pytest.mark.parametrize("spread", [0.0, 0.3])
 def test_a_passage_that_is_sharp_by_chance_gets_no_more_than_its_due(spread: float) -> None:
     stated, after, true = told(chance=0.4, spread=spread)
@@ -59,15 +51,6 @@ def test_a_passage_that_is_sharp_by_chance_gets_no_more_than_its_due(spread: flo
     assert weighted[0] > 1.3
     assert abs(weighted[1] - 1) < 0.1
     assert np.mean(np.log(after)) == pytest.approx(np.mean(np.log(stated)))
-
-
-def test_a_speed_whose_sd_are_all_too_large_is_put_right() -> None:
-    rng = np.random.default_rng(2)
-    true = np.full((len(SPEEDS), PER_SWEEP), 3e-4)
-    view = seen(true * np.array([[1.0], [1.0], [1.5]]), rng)
-    (changed,) = restated([rng.normal(size=true.size) * true.ravel()], [view])
-    level = changed.sd.reshape(true.shape).mean(axis=1)
-    assert level[2] / level[0] == pytest.approx(1, abs=0.12)
 
 
 def trembling(views: int, sweep: float, reach: float, jitter: float, seed: int) -> tuple[list[Array], list[Sighting]]:

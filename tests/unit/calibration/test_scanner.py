@@ -32,25 +32,6 @@ def test_a_table_gives_its_own_planes_back() -> None:
     assert table.planes(7).shape == (4,)
 
 
-def test_signs_and_lengths_in_a_table_do_not_matter() -> None:
-    rows = vertical_planes(np.linspace(-0.3, 0.5, 9))
-    signs = np.array([1, -1, -1, 1, -2, 3, -1, 1, -1.0])
-    at = np.linspace(0, 8, 50)
-    assert np.allclose(
-        PlaneTable(np.arange(9.0), rows * signs[:, None]).planes(at), PlaneTable(np.arange(9.0), rows).planes(at)
-    )
-
-
-def test_planes_between_the_samples_are_unit_and_close_to_the_true_ones() -> None:
-    mirror = pivot()
-    command = np.linspace(-1, 1, 41)
-    between = np.linspace(-1, 1, 333)
-    table = PlaneTable(command, mirror.planes(command))
-    planes = table.planes(between)
-    assert np.allclose(np.linalg.norm(planes[:, :3], axis=1), 1)
-    assert np.abs(planes - mirror.planes(between)).max() < 1e-4
-
-
 def test_a_pivot_turns_about_its_axis() -> None:
     mirror = pivot()
     command = np.linspace(-1, 1, 7)

@@ -4,7 +4,7 @@ from dataclasses import replace
 
 import numpy as np
 
-from calibration.diagnosis.rig import judge_fit
+from calibration.diagnosis.verdicts import judge_fit
 from calibration.rig_fit.fit import fit_rig
 from tests.reference.boards.calibration_data import BOARD, Seen, TrueRig, random_pose, random_rig, seen_view
 from tests.reference.boards.fitted_depth import depth_errors

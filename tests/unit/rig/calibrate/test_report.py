@@ -1,7 +1,6 @@
 """A report is one HTML file: verdict and reasons before all pictures, nothing loaded from elsewhere."""
 
 import re
-from dataclasses import replace
 from datetime import UTC, datetime
 from functools import cache
 from html import escape
@@ -10,14 +9,19 @@ import numpy as np
 import pytest
 
 from calibration.board.board import Board
-from calibration.diagnosis.rig import JudgedRig, judge_fit
+from calibration.diagnosis.verdicts import JudgedRig, judge_fit
 from calibration.model.rig_model import Identity
-from calibration.rig_fit.fit import fit_rig
-from calibration.rig_fit.result import RigFit
-from calibration.verdict import Reason, Verdict
+from calibration.rig_fit.fit import RigFit, fit_rig
+from calibration.verdict import Verdict
 from calibration.views import View
-from rig.calibrate.report import planes_report
-from rig.calibrate.report_page import ReportSection, in_mm_with_sign, measured, page, paragraph, subject, table
+from rig.calibrate.report import (
+    ReportSection,
+    measured,
+    page,
+    paragraph,
+    planes_report,
+    subject,
+)
 from tests.reference.boards import calibration_data as data
 
 
@@ -46,17 +50,10 @@ def test_the_report_of_planes_shows_text_first_then_the_four_pictures(judged: Ju
         assert f"<h2>{title}</h2>" in html
     assert html.count("data:image/png;base64,") == 3
     assert html.count("<svg ") == 1
+    terms = html[html.index("Terms of the model") :]
+    assert '<th class="number">value</th>' in terms
+    assert "<th>unit</th>" in terms
     assert not re.search(r'(src|href)="(?!data:)', html)
-
-
-def test_a_failed_verdict_leads_with_its_root_cause(judged: JudgedRig) -> None:
-    views, fit = _fitted()
-    reasons = (
-        Reason("moved-rig", "views contradict each other", 0.2, 0.01, "calibrate again"),
-        Reason("poor-coverage", "corners reach 20 %", 0.2, 0.5, "show the borders"),
-    )
-    html = planes_report(fit, views, replace(judged, verdict=Verdict(False, reasons)), "", [])
-    assert html.index("FAILED") < html.index("moved-rig") < html.index("poor-coverage") < html.index("<img")
 
 
 def test_a_report_says_what_it_is_of(judged: JudgedRig) -> None:
@@ -87,23 +84,6 @@ def test_terms_of_the_model_have_units_and_the_digits_that_are_known() -> None:
     assert measured("offset_1", 1e-4, 2e-4) == ("0.10", "0.20", "mm/rad^1")
     assert measured("bow", np.nan, np.nan) == ("-", "-", "mrad/rad^2")
     assert measured("lag", 1e-4, np.nan) == ("100", "-", "us")
-    views, fit = _fitted()
-    html = planes_report(fit, views, judge_fit(fit, views, stated_baseline_m=0.3), "", [])
-    terms = html[html.index("Terms of the model") :]
-    assert '<th class="number">value</th>' in terms
-    assert "<td>us</td>" in terms
-
-
-def test_the_shift_of_a_view_says_which_way_it_goes(judged: JudgedRig) -> None:
-    assert [in_mm_with_sign(length_m) for length_m in (0.00314, -0.00314, 0.0, np.nan)] == ["+3.14", "-3.14", "0", "-"]
-    views, fit = _fitted()
-    first, second, *others = judged.shifts
-    either_way = (replace(first, shift=1e-3), replace(second, shift=-1e-3), *others)
-    html = planes_report(fit, views, replace(judged, shifts=either_way), "", [])
-    rows = html[html.index("shift, mm") :].split("<tr>")[1:3]
-    said = [re.findall(r"<td[^>]*>([^<]*)</td>", row)[-1] for row in rows]
-    assert [one[0] for one in said] == ["+", "-"]
-    assert said[0][1:] == said[1][1:]
 
 
 def test_whatever_users_name_is_escaped() -> None:
@@ -111,15 +91,3 @@ def test_whatever_users_name_is_escaped() -> None:
     assert "<script>" not in html
     assert "&lt;script&gt;" in html
     assert "<title>a &lt; b</title>" in html
-
-
-def test_columns_of_numbers_stand_to_the_right() -> None:
-    html = table(("name", "mm", "why"), [("a", "1.5", "3 sd from 0"), ("b", "-2e-05", "-")])
-    assert '<th class="number">mm</th>' in html
-    assert "<th>name</th>" in html
-    assert "<th>why</th>" in html
-
-
-def test_a_model_of_the_right_rig_is_found(judged: JudgedRig) -> None:
-    assert judged.evidence.baseline_m == pytest.approx(0.3, abs=6 * judged.evidence.baseline_sd_m)
-    assert judged.evidence.expected_m < judged.asked.accuracy_m

@@ -11,13 +11,6 @@ from rig.errors import UsageError
 from tests.system.board_rig import write_board_rig
 
 
-def test_a_scene_that_has_a_board_is_used(tmp_path: Path) -> None:
-    config, _ = write_board_rig(tmp_path)
-    found = sort_sources([config])
-    assert found.live == configure(config)
-    assert found.notes == ()
-
-
 def test_a_scene_that_has_none_is_replaced_and_it_is_said() -> None:
     found = sort_sources([])
     assert found.live == configure("simulated", scene="board")

@@ -16,6 +16,9 @@ def _view(name="000"):
 
 
 def test_view_comes_back_bit_for_bit(tmp_path):
+    save_view(View("bare", None), tmp_path / "bare.npz")
+    bare = load_view(tmp_path / "bare.npz")
+    assert (bare.name, bare.corners, bare.passages, bare.picture) == ("bare", None, (), None)
     view = _view()
     save_view(view, tmp_path / "000.npz")
     back = load_view(tmp_path / "000.npz")
@@ -28,12 +31,6 @@ def test_view_comes_back_bit_for_bit(tmp_path):
         assert (before.direction, before.speed_per_s) == (after.direction, after.speed_per_s)
         for field in ("x_px", "y_px", "command", "sd"):
             assert np.array_equal(getattr(before, field), getattr(after, field))
-
-
-def test_view_without_board_or_sweeps_comes_back(tmp_path):
-    save_view(View("bare", None), tmp_path / "000.npz")
-    back = load_view(tmp_path / "000.npz")
-    assert (back.name, back.corners, back.passages, back.picture) == ("bare", None, (), None)
 
 
 def test_views_of_a_folder_come_in_order(tmp_path):

@@ -8,12 +8,12 @@ import numpy as np
 import pytest
 
 from calibration.errors import Degenerate
-from calibration.files.camera_file import corners_digest
+from calibration.files.rig_file import corners_digest
 from calibration.guide import Advice
 from calibration.views import Corners, Passages, View
 from rig.calibrate import views as taking
 from rig.calibrate.session import Session
-from rig.calibrate.views import FixedPoses, LiveViewOptions, ViewCollection, take_live
+from rig.calibrate.views import LiveViewOptions, ViewCollection, in_order, take_live
 from rig.errors import UsageError
 
 
@@ -42,7 +42,7 @@ def shown(
     config: Any = None
     candidate: Any = None
     taken = ViewCollection(Session(None), told.append, of_camera)
-    choose = FixedPoses([Advice(candidate, 5.0)] * 9)
+    choose = in_order([Advice(candidate, 5.0)] * 9)
     board: Any = None
     take_live(taken, LiveViewOptions(config, 4, choose, exposures=(3, 6), line=line), board)
     return taken, told
