@@ -49,19 +49,10 @@ class Spoken:
             if port in FRAME_PORTS:
                 buffers += words
             else:
-                said = _once(_lines(words)) if port == _SERIAL else _without_questions(port, words)
+                asked = _USB_QUESTIONS.get(port, ())
+                said = _once(_lines(words)) if port == _SERIAL else [one for one in words if one.data[0] not in asked]
                 commands.setdefault(device, []).extend(said)
         return cls(commands, _scans(commands.get("sync"), buffers))
-
-
-def is_question(piece: bytes) -> bool:
-    """Whether a piece of bytes to a serial device does nothing but ask."""
-    return all(_QUESTION.fullmatch(line) for line in _LINE_END.split(piece))
-
-
-def _without_questions(port: str, words: list[Passed]) -> list[Passed]:
-    questions = _USB_QUESTIONS.get(port, ())
-    return [word for word in words if word.data[0] not in questions]
 
 
 def _lines(pieces: list[Passed]) -> list[Passed]:
