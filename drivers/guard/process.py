@@ -19,13 +19,14 @@ import sys
 import threading
 import time
 from collections.abc import Callable, Mapping
+from contextlib import closing
 from functools import partial
 from typing import Any
 
 from drivers.clock import SystemClock
 from drivers.errors import DeviceBusy, DeviceDisconnected, DeviceError, DeviceFault, DeviceTimeout, InterlockOpen
 from drivers.guard.channel import Channel, Heartbeat, Message, error_message
-from drivers.guard.owned import Owned
+from drivers.guard.owned import Owned, make_safe
 from drivers.guard.watch import TICK_S, FrameWatch, GuardLimits, WatchedProcess
 from drivers.interfaces import DeviceState, LineLaser
 from drivers.registry import Surroundings, lookup
@@ -283,7 +284,7 @@ class GuardProcess:
         for owned in self._owned.values():
             if owned.enabling:  # dark at once; what is still being switched on is switched off behind it
                 owned.urgent.do(owned.calm, first=True)
-            owned.want_safe()
+            owned.unsafe = True
         self._make_safe()
         _log.error("guard: %s", cause)
         self._channel.send({"tripped": error_message(cause)})
@@ -360,10 +361,7 @@ class Rescue:
 
     def run(self, slots: set[str], armed: bool) -> str:
         """Make the devices of these slots safe; returns what came of it, for a message. armed: the laser was."""
-        threads = [
-            threading.Thread(target=self._save, args=(slot, armed), name=f"rescue {slot}", daemon=True)
-            for slot in slots
-        ]
+        threads = [threading.Thread(target=self._save, args=(slot, armed), daemon=True) for slot in slots]
         for thread in threads:
             thread.start()
         for thread in threads:
@@ -375,12 +373,7 @@ class Rescue:
             if armed and slot in self._off:
                 self._switch_off(slot)
             with _once_free(self._create[slot]) as device:
-                if isinstance(device, LineLaser):
-                    device.pause()
-                    if armed:
-                        device.disarm()
-                else:
-                    device.abort()
+                make_safe(device, disarm=armed)
             self._outcome[slot] = "made safe by the application"
         except DeviceError as error:
             self._outcome[slot] = f"NOT made safe, {error}"
@@ -390,13 +383,10 @@ class Rescue:
         """Switch the emission off before anything is asked: opening a slow laser takes more than a second."""
         place, off = self._off[slot]
         endpoint = place()
-        port = _once_free(lambda: SerialPort(slot, endpoint))
-        try:
+        with closing(_once_free(lambda: SerialPort(slot, endpoint))) as port:
             for _ in range(OFF_TIMES):
                 port.write(off)
                 time.sleep(OFF_GAP_S)
-        finally:
-            port.close()
 
 
 def _once_free(open_it: Callable[[], Any]) -> Any:

@@ -30,7 +30,7 @@ from numpy.typing import NDArray
 from pydantic import Field
 
 from drivers.errors import DeviceFault, DeviceNotFound, DeviceTimeout, LimitExceeded, ProtocolError
-from drivers.frames import BlockFlag, BlockHeader
+from drivers.frames import BlockFlag, BlockHeader, FrameBlock
 from drivers.interfaces import BurstMode, SpadArray, SpadCounters, SpadHealth, SpadInfo, SpadRequest, SpadTiming
 from drivers.registry import Kind, KindConfig, Surroundings
 from drivers.ring import BlockRing
@@ -198,7 +198,7 @@ class Spad512s(SpadArray):
         self._busy = threading.Lock()
         """Held while the line is in use, so that `stop` waits for `fill`."""
         self._halt = threading.Event()
-        self._counters = SpadCounters(0, 0, 0, None, None)
+        self._exposed = self._delivered = self._lost = 0
         self._run_id = 0
         self._run: Spad512sRun | None = None
         self._identity = self._line.connect()
@@ -238,7 +238,7 @@ class Spad512s(SpadArray):
         return SpadHealth(temperatures, excess_bias_v=excess_v, frame_clock_hz=frame_clock_hz)
 
     def _do_counters(self) -> SpadCounters:
-        return self._counters
+        return SpadCounters(self._exposed, self._delivered, self._lost, None, None)
 
     def _do_configure(self, request: SpadRequest) -> SpadTiming:
         exposure_us = round(request.exposure_s * 1e6)
@@ -252,9 +252,9 @@ class Spad512s(SpadArray):
         period = int(tick_hz / request.frame_rate_hz)
         exposure = min(round(exposure_us * tick_hz / 1_000_000), period)
         self._exposure_us = exposure_us
-        layout = BlockLayout(request.block_frames, self._info.width, self._info.height)
         self._block_frames = request.block_frames
-        self._timing = SpadTiming(tick_hz, period, exposure, layout.min_stride)
+        stride = BlockLayout(request.block_frames, self._info.width, self._info.height).min_stride
+        self._timing = SpadTiming(tick_hz, period, exposure, stride)
         return self._timing
 
     def _check_period(self, request: SpadRequest, exposure_us: int) -> None:
@@ -275,7 +275,7 @@ class Spad512s(SpadArray):
             self._line.ask("PU,0")
             self._halt.clear()
             self._run_id = (self._run_id + 1) & 0xFFFF
-            self._counters = SpadCounters(n_frames, 0, 0, None, None)
+            self._exposed, self._delivered, self._lost = n_frames, 0, 0
             frame_bytes = self._identity.rows * ROW_BYTES
             self._run = Spad512sRun(self.name, self._line, n_frames, self._block_frames, frame_bytes)
             external = int(self._config.trigger == "external")
@@ -317,7 +317,7 @@ class Spad512s(SpadArray):
             except BaseException:
                 # Nothing that still comes can be told from an answer, so the connection goes with the run.
                 self._run = None
-                self._rest_is_lost()
+                self._lost = self._exposed - self._delivered
                 self._line.hang_up()
                 raise
             if not more:
@@ -332,25 +332,25 @@ class Spad512s(SpadArray):
             return False
         memory = self._claim(ring, ends_at, timeout_s)
         if memory is None:
-            self._count(run.next_n, lost=True)
+            self._lost += run.next_n
             ring.mark_overflow(run.next_n)
         else:
-            self._publish(run, ring, memory, pixels)
+            block = self._written(run, memory, pixels)
+            self._delivered += run.next_n
+            ring.publish(block)
             run.block_seq += 1
         run.just_lost = memory is None
         run.go_on()
         return run.next_n > 0
 
-    def _publish(self, run: Spad512sRun, ring: BlockRing, memory: NDArray[np.uint8], pixels: NDArray[np.uint8]) -> None:
+    def _written(self, run: Spad512sRun, memory: NDArray[np.uint8], pixels: NDArray[np.uint8]) -> FrameBlock:
         n = run.next_n
         layout = BlockLayout(n, self._info.width, self._info.height)
         records, bits = block_views(memory, layout)
         turn_packed(pixels.reshape(n, self._identity.rows, ROW_BYTES), self._config.rotation, bits)
         records[:] = np.zeros((), records.dtype)
         records["ticks"] = np.arange(n, dtype=np.uint32) * np.uint32(self._timing.frame_period_ticks)
-        block = seal_block(memory, self._header(run), layout, payload_crc=False)
-        self._count(n, lost=False)
-        ring.publish(block)
+        return seal_block(memory, self._header(run), layout, payload_crc=False)
 
     def _claim(self, ring: BlockRing, ends_at: float, timeout_s: float) -> NDArray[np.uint8] | None:
         """A free slot; None where there is none and the ring does not wait."""
@@ -362,16 +362,6 @@ class Spad512s(SpadArray):
                 raise DeviceTimeout(
                     f"{self.name}: no free slot in the ring within {timeout_s:g} s; readers are too slow"
                 )
-
-    def _count(self, n: int, *, lost: bool) -> None:
-        old = self._counters
-        self._counters = SpadCounters(
-            old.exposed, old.delivered + (0 if lost else n), (old.lost or 0) + (n if lost else 0), None, None
-        )
-
-    @property
-    def _lost(self) -> int:
-        return self._counters.lost or 0
 
     def _header(self, run: Spad512sRun) -> BlockHeader:
         flags = BlockFlag.BURST
@@ -405,13 +395,8 @@ class Spad512s(SpadArray):
         with self._busy:
             run, self._run = self._run, None
             if run is not None:
-                self._rest_is_lost()
+                self._lost = self._exposed - self._delivered
                 self._line.leave_run()
-
-    def _rest_is_lost(self) -> None:
-        old = self._counters
-        exposed = old.exposed or 0
-        self._counters = SpadCounters(exposed, old.delivered, exposed - old.delivered, None, None)
 
     def _do_close(self) -> None:
         self._line.hang_up()

@@ -149,17 +149,9 @@ class SpbUsb(SpadArray):
             write_length(self._control, n_frames)
             self._halt.clear()
             run_id = self._control.send(Op.START).value
-            info = self.info
-            armed = Armed(
-                run_id,
-                self._timing.stride,
-                self._width,
-                info.height,
-                info.width,
-                info.height,
-                n_frames,
-                self._check_payload,
-            )
+            sensor = self.info.width, self.info.height
+            frames = self._width, self.info.height, *sensor
+            armed = Armed(run_id, self._timing.stride, *frames, n_frames, self._check_payload)
             self._receiver = BlockReceiver(self._link, self._wiring.stream_in, armed, self.name)
             self._counters = SpadCounters(0, 0, 0, 0, 0)
             self._pinged_at = self._heard_at = self._now_s()
