@@ -18,7 +18,6 @@ from drivers.interfaces import (
     SpadRequest,
     SpadTiming,
     SyncSource,
-    World,
 )
 from drivers.ring import BlockRing
 
@@ -105,12 +104,3 @@ class SyncCase:
     def waiting(self) -> str:
         """The state that it tells while a program waits."""
         return "waiting" if self.tells_waiting else "running"
-
-
-@dataclass(frozen=True)
-class WorldCase:
-    """A world and the size of its camera."""
-
-    world: World
-    rows: int
-    width: int
