@@ -4,8 +4,7 @@ The main thread never touches a device: it reads messages, looks at the applicat
 What ends the light ("trip"): the application ended, was stopped or takes no frames; a port hung up; the laser reports
 an open interlock or a fault, or stops answering. Then, at the same time: all outputs of the gate low, the laser paused.
 After it: an application that cannot help itself is killed, the laser disarmed, the ports closed. Where frames stop
-because the gate's program has come to its end, the laser is paused and nothing else happens: it has nothing to shine
-for, and an application that waits for a silent SPAD may take seconds to say so.
+because the gate's program has come to its end, the laser is paused and nothing else happens.
 
 `Rescue` is for the opposite case, a guard that is gone: the application opens the ports, which are free now, and lowers
 what it can.
@@ -153,7 +152,7 @@ class GuardProcess:
         answer: Message = {"id": message["id"]}
         with self._trip_lock:
             refused = self._tripped if verb in _ENABLING else None
-            owned.enabling = owned.enabling or (verb in _ENABLING and refused is None)
+            owned.enabling |= verb in _ENABLING and refused is None
         try:
             if refused is not None:
                 raise refused
@@ -307,10 +306,9 @@ class GuardProcess:
             self._make_safe()
             time.sleep(TICK_S)
         for owned in self._owned.values():
-            if owned.device is None:
-                continue
             try:
-                owned.device.close()
+                if owned.device is not None:
+                    owned.device.close()
             except DeviceError as error:
                 _log.error("%s: %s", owned.slot, error)
         for owned in self._owned.values():

@@ -151,18 +151,17 @@ def read_entry(segment: SegmentReader, entry: Any) -> FrameBlock:
 
 def _told(folder: Path, problems: list[str]) -> Entries | None:
     """Sound index records, sorted by place; None where there is no index."""
+    if not folder.is_dir():  # a single file has none
+        return None
     try:
-        data = np.fromfile(folder / INDEX_FILE, np.uint8) if folder.is_dir() else None
+        data = np.fromfile(folder / INDEX_FILE, np.uint8)
+        records, sound = decode_index(data)
     except FileNotFoundError:
         problems.append(f"{INDEX_FILE} is missing")
         return None
     except OSError as error:
         problems.append(f"{INDEX_FILE} cannot be read: {error.strerror or error}")
         return None
-    if data is None:  # a single file has none
-        return None
-    try:
-        records, sound = decode_index(data)
     except CorruptBlock as error:
         problems.append(str(error))
         return None

@@ -295,13 +295,13 @@ class ReplaySpad(SpadArray):
             more = False
             try:
                 more = self._fill(self._reading, ring, timeout_s)
+                return more
             except DeviceTimeout:
                 more = True
                 raise
             finally:
                 if self.pace.halted or not more:
                     self._reading.close()
-        return more
 
     def _fill(self, reading: Cursor, ring: BlockRing, timeout_s: float) -> bool:
         ends_at = time.monotonic() + timeout_s

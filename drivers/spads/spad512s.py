@@ -3,19 +3,15 @@
 Facts and their sources: docs/reference/hardware.md; `spad512s_line` speaks with the program. In short:
 
 - The vendor's program must run, on this computer or behind a bridge; it serves one client.
-- `PU,0` goes before every acquisition. `I,1,tInt,n,trigger,overlap,sparse,1` takes n frames of 1 bit: tInt is in
-  microseconds at 1 and 4 bits, in milliseconds from 6 bits on, so this driver sends microseconds and 1 bit only.
+- `PU,0` goes before every acquisition. `I,1,tInt,n,trigger,overlap,sparse,1` takes n frames of 1 bit, tInt in
+  microseconds (at 1 and 4 bits; milliseconds from 6 bits on).
 - The answer is 32 768 bytes a frame (65 536 of a 1M sensor), most significant bit first; then `DONE`, or text that ends
-  with `ERROR`, anywhere.
+  with `ERROR`, anywhere. Pixels may well read the same: the exact length decides, and the text behind it.
 - Frames lie on their side: the vendor's samples turn them by 90 degrees counter-clockwise (`rotation`).
-
-The sensor takes a run into its own memory (BURST). Its frames carry neither ticks nor markers: they say nothing of the
-scanner, the records' ticks are nominal. `STOP` is known from other people's code only; a run that does not end soon
-after it is left by closing the connection.
-
-Pixels may well read `DONE` or `ERROR`: the exact length decides, and the text behind it. A block is given out once so
-much has come behind it that no error text can be part of it. Frames have neither number nor checksum: pixels handed
-over twice in place of others have the right length, so that no frame may be the very same as one before.
+- Frames carry neither ticks nor markers: the records' ticks are nominal. Nor have they number or checksum: pixels
+  handed over twice have the right length, so that no frame may be the very same as one before.
+- `STOP` is known from other people's code only; a run that does not end soon after it is left by closing the
+  connection.
 """
 
 import threading
@@ -35,7 +31,7 @@ from drivers.interfaces import BurstMode, SpadArray, SpadCounters, SpadHealth, S
 from drivers.registry import Kind, KindConfig, Surroundings
 from drivers.ring import BlockRing
 from drivers.spads.orientation import QuarterTurn, turn_packed, turned_size
-from drivers.spads.spad512s_line import DONE, ERROR, Deadlines, Spad512sIdentity, Spad512sLine
+from drivers.spads.spad512s_line import DONE, ERROR, Deadlines, Spad512sLine
 from drivers.spb1 import BlockLayout, block_views, seal_block
 from drivers.transports.endpoints import Endpoint, resolve
 from drivers.transports.tap import Tap
@@ -283,27 +279,25 @@ class Spad512s(SpadArray):
             self._line.tell(f"I,1,{self._exposure_us},{n_frames},{external},1,0,1\n")
 
     def _connect_where_lost(self) -> None:
-        """Connect again after the program was restarted or left. DeviceFault where another device answers now."""
-        if self._line.is_open:
-            return
-        again, before = self._connect_again().master_serial, self._identity.master_serial
-        if again != before:
-            self._line.hang_up()
-            raise DeviceFault(
-                f"{self.name}: another device ({again}) answers at {self._line.address} now, it was {before}; "
-                "open it again"
-            )
+        """Connect again after the program was restarted or left, which listens again a moment after its one client.
 
-    def _connect_again(self) -> Spad512sIdentity:
-        """Connect again: the program serves one client, and listens again a moment after that one has left."""
+        DeviceFault where another device answers now.
+        """
         ends_at = time.monotonic() + self._deadlines.listens_s
-        while True:
+        while not self._line.is_open:
             try:
-                return self._line.connect()
+                again, before = self._line.connect().master_serial, self._identity.master_serial
             except DeviceNotFound:
                 if time.monotonic() >= ends_at:
                     raise
                 time.sleep(0.02)
+                continue
+            if again != before:
+                self._line.hang_up()
+                raise DeviceFault(
+                    f"{self.name}: another device ({again}) answers at {self._line.address} now, it was {before}; "
+                    "open it again"
+                )
 
     def _do_fill(self, ring: BlockRing, timeout_s: float) -> bool:
         with self._busy:
@@ -311,7 +305,7 @@ class Spad512s(SpadArray):
             if run is None or self._halt.is_set():
                 return False
             try:
-                more = self._fill(run, ring, timeout_s)
+                self._fill(run, ring, timeout_s)
             except DeviceTimeout:
                 raise
             except BaseException:
@@ -320,16 +314,14 @@ class Spad512s(SpadArray):
                 self._lost = self._exposed - self._delivered
                 self._line.hang_up()
                 raise
-            if not more:
-                self._run = None
-            return more
+            return run.next_n > 0
 
-    def _fill(self, run: Spad512sRun, ring: BlockRing, timeout_s: float) -> bool:
+    def _fill(self, run: Spad512sRun, ring: BlockRing, timeout_s: float) -> None:
         """Receive one block and publish it."""
         ends_at = time.monotonic() + timeout_s
         pixels = run.receive(ends_at, timeout_s, self._halt.is_set)
         if pixels is None:
-            return False
+            return
         memory = self._claim(ring, ends_at, timeout_s)
         if memory is None:
             self._lost += run.next_n
@@ -341,7 +333,6 @@ class Spad512s(SpadArray):
             run.block_seq += 1
         run.just_lost = memory is None
         run.go_on()
-        return run.next_n > 0
 
     def _written(self, run: Spad512sRun, memory: NDArray[np.uint8], pixels: NDArray[np.uint8]) -> FrameBlock:
         n = run.next_n

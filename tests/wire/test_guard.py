@@ -80,12 +80,20 @@ def guard_of(rig: GuardedRig, limits: GuardLimits | None = None) -> Guard:
     )
 
 
-def test_errors_come_through_with_their_type_and_text(rig: GuardedRig) -> None:
+def test_errors_come_through_with_their_type_and_text_and_the_guard_gives_its_ports_back(rig: GuardedRig) -> None:
+    config = PrawnDoConfig(port=rig.sync.path)
+    surroundings = Surroundings(None, None, 0)  # type: ignore[arg-type]
     with guard_of(rig) as guard:
         with pytest.raises(LimitExceeded, match="60 W is outside"):
             guard.laser.arm(60)
         with pytest.raises(LimitExceeded, match="outside 5e-08 to"):
             guard.sync.program([SWEEP[0], type(SWEEP[0])(0, 2e-8)], 1)
+        assert guard.sync.status.state == "stopped"
+        with pytest.raises(DeviceBusy):
+            PrawnDo(config, surroundings)
+    PrawnDo(config, surroundings).close()
+    with Guard(sync=config) as guard, pytest.raises(DeviceError, match="not guarded"):
+        _ = guard.laser
 
 
 @pytest.mark.parametrize(
@@ -119,21 +127,6 @@ def test_a_laser_is_off_before_it_is_opened_once_the_guard_is_gone(channel: int 
         said = model.commands[before:]
         assert said.index(f"SOUR{address}:AM:STAT OFF") < said.index("SYST:COMM:HAND?")  # the first one of opening it
         assert not any(command.startswith("SOUR:AM:STSOUR") for command in said)
-
-
-def test_a_device_without_config_is_not_guarded(rig: GuardedRig) -> None:
-    with Guard(sync=PrawnDoConfig(port=rig.sync.path)) as guard, pytest.raises(DeviceError, match="not guarded"):
-        _ = guard.laser
-
-
-def test_the_guard_holds_the_ports_and_gives_them_back(rig: GuardedRig) -> None:
-    config = PrawnDoConfig(port=rig.sync.path)
-    surroundings = Surroundings(None, None, 0)  # type: ignore[arg-type]
-    with guard_of(rig) as guard:
-        assert guard.sync.status.state == "stopped"
-        with pytest.raises(DeviceBusy):
-            PrawnDo(config, surroundings)
-    PrawnDo(config, surroundings).close()
 
 
 @pytest.mark.parametrize("at_work", [False, True])
@@ -178,10 +171,9 @@ def test_no_first_frame_at_all_ends_the_light(rig: GuardedRig) -> None:
         guard.sync.program(SWEEP, 1000)
         guard.sync.run()
         eventually(lambda: guard.failure is not None and not rig.emission.levels[-1])
-        with pytest.raises(DeviceError, match="took no frame for"):
-            guard.beat(1)
-        with pytest.raises(DeviceError, match="took no frame for"):
-            guard.laser.arm(POWER_W)
+        for verb in (lambda: guard.beat(1), lambda: guard.laser.arm(POWER_W)):
+            with pytest.raises(DeviceError, match="took no frame for"):
+                verb()
         guard.sync.abort()
         guard.laser.pause()
 

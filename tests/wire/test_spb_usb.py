@@ -85,28 +85,29 @@ def test_what_is_written_before_a_run() -> None:
         device.commands.clear()
         take(spad, 32)
     written = {address: value for op, address, value in device.commands if op == Op.WRITE}
-    assert written[Register.HEARTBEAT_MS] == 500
-    assert (written[Register.PERIOD_TICKS], written[Register.EXPOSURE_TICKS]) == (1000, 1000)
-    assert (written[Register.STRIDE], written[Register.BLOCK_FRAMES]) == (STRIDE, 16)
-    assert (written[Register.MODE], written[Register.N_FRAMES], written[Register.N_FRAMES + 4]) == (0, 32, 0)
+    assert written == {
+        **{Register.HEARTBEAT_MS: 500, Register.PERIOD_TICKS: 1000, Register.EXPOSURE_TICKS: 1000, Register.MODE: 0},
+        **{Register.STRIDE: STRIDE, Register.BLOCK_FRAMES: 16, Register.WINDOW_WIDTH_PX: 0},
+        **{Register.N_FRAMES: 32, Register.N_FRAMES + 4: 0},
+    }
     assert device.commands[-5][0] == Op.START  # EXPOSED is asked for behind it, two halves twice
 
 
 @pytest.mark.parametrize(
-    ("settings", "sort", "words"),
+    ("settings", "registers", "deaf", "sort", "words"),
     [
-        ({"product_name": "FX3 camera"}, DeviceNotFound, "no USB device|none is attached"),
-        ({"protocol": 0x0200}, DeviceFault, r"speaks SPB1 2\.0, this driver 1\.x"),
-        ({"magic": 0x12345678}, DeviceNotFound, "identity 0x12345678 is not SPB1"),
-        ({"deaf": True}, DeviceNotFound, "does not speak SPB1"),
+        ({"product_name": "FX3 camera"}, {}, False, DeviceNotFound, "no USB device|none is attached"),
+        ({"protocol": 0x0200}, {}, False, DeviceFault, r"speaks SPB1 2\.0, this driver 1\.x"),
+        ({}, {Register.MAGIC: 0x12345678}, False, DeviceNotFound, "identity 0x12345678 is not SPB1"),
+        ({}, {}, True, DeviceNotFound, "does not speak SPB1"),
     ],
 )
-def test_the_wrong_firmware_is_one_line(settings: dict[str, Any], sort: type[DeviceError], words: str) -> None:
-    deaf, magic = settings.pop("deaf", False), settings.pop("magic", None)
+def test_the_wrong_firmware_is_one_line(
+    settings: dict[str, Any], registers: dict[int, int], deaf: bool, sort: type[DeviceError], words: str
+) -> None:
     device = model(**settings)
+    device._registers |= registers
     device.deaf = deaf
-    if magic is not None:
-        device._registers[Register.MAGIC] = magic
     with pytest.raises(sort, match=words) as refused:
         opened(device)
     assert "\n" not in str(refused.value)
