@@ -72,8 +72,7 @@ def frame_bytes(width: int, height: int) -> int:
 
 @dataclass(frozen=True, slots=True)
 class BlockHeader:
-    """Everything that holds for all frames of a block. Fields as in the SPB1 1.0 wire layout
-    (docs/reference/spb1.md)."""
+    """Everything that holds for all frames of a block. Fields as in SPB1 1.0 (docs/reference/spb1.md)."""
 
     flags: BlockFlag
     run_id: int

@@ -1,7 +1,4 @@
-"""The application's side of the guard: starts it, talks to it, beats for it, and steps in where it is lost.
-
-`GuardedLaser` and `GuardedSync` are the usual device interfaces; each verb is carried out by the guard.
-"""
+"""The application's side of the guard: starts it, talks to it, beats for it, and steps in where it is lost."""
 
 import itertools
 import logging
@@ -127,8 +124,7 @@ BUSY_SILENCE_S = 5.0
 _TICK_S = 0.01
 _MAX_STEP_S = 0.1
 _RESCUE_SWITCH_S = 5e-4
-"""Longest time for which other threads keep the interpreter while laser and gate are rescued; Python's default is 5
-ms."""
+"""Longest time for which other threads keep the interpreter while light is taken; Python's default is 5 ms."""
 _LOWERING = ("pause", "disarm", "gate_low", "abort")
 _ENABLING = ("arm", "program", "run")
 
@@ -214,10 +210,7 @@ class Guard:
         return self._process.pid
 
     def beat(self, frame: int) -> None:
-        """Tell the last frame number received: one store. On the source thread, for every block.
-
-        Raises the guard's `failure`, so that a scan whose light was taken ends with the reason.
-        """
+        """Tell the last frame number received: one store, for every block. Raises `failure`, where there is one."""
         self._heartbeat.waited_s = 0.0
         self._heartbeat.frame = frame
         if self._failure is not None:

@@ -61,10 +61,7 @@ def index_header() -> bytes:
 
 
 def index_of(block: FrameBlock, segment: int, offset: int, length: int | None = None) -> bytes:
-    """The record, 64 bytes, of a block that begins at byte `offset` of `segment`.
-
-    length: its bytes, where it was not written by `drivers.spb1.writer.block_parts`.
-    """
+    """The record, 64 bytes, of a block at byte `offset` of `segment`. length: None for that of `block_parts`."""
     header = block.header
     length = length or BlockLayout(block.n_frames, header.width, header.height).block_bytes
     place = segment, int(header.flags), offset, length

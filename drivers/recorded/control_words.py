@@ -28,10 +28,7 @@ BEGIN, END = (b"run", b"swr"), b"abt"
 
 @dataclass(frozen=True, slots=True)
 class Spoken:
-    """The commands that went to a rig, by device, and the buffers of points of each scan that was run.
-
-    Each command is a piece of its own, with the time at which the last of it passed.
-    """
+    """The commands that went to a rig, each with its time, by device, and the buffers of points of each scan."""
 
     commands: dict[str, list[Passed]]
     scans: list[list[Passed]]

@@ -73,10 +73,7 @@ class SpbUsb(SpadArray):
     """An SPB1 SPAD over an open link."""
 
     def __init__(self, config: SpbUsbConfig, link: BulkLink, clock: Clock, tap: Tap | None = None) -> None:
-        """Check who is there and, where asked for, its test pattern. The link is closed with the device.
-
-        clock: of its deadlines, that on which the link waits. tap: told of its control traffic.
-        """
+        """Check who is there and its test pattern. clock: of its deadlines, that on which the link waits."""
         super().__init__(link.label)
         self._config = config
         self._link = link

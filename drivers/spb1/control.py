@@ -240,10 +240,7 @@ class ControlChannel:
         return self.read_all((register,))[0]
 
     def read_all(self, registers: Sequence[int]) -> list[int]:
-        """The values of several registers, each asked for twice, since acknowledgements carry no checksum.
-
-        `ProtocolError` where the answers never agree.
-        """
+        """The values of several registers, each asked for twice: they have no checksum. `ProtocolError`."""
         for _ in range(_TRIES):
             values = [ack.value for ack in self._ask([(Op.READ, register, 0) for register in (*registers, *registers)])]
             if values[: len(registers)] == values[len(registers) :]:

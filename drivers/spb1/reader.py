@@ -266,10 +266,7 @@ class Placed:
 
 
 def walk_placed(buffer: NDArray[np.uint8], stride: int | None, *, check_payload: bool) -> Iterator[Placed | Damage]:
-    """Walk the blocks as `walk_blocks` does, with their places, and in whatever order they come, even twice.
-
-    A block of another sort is damage here, but what is behind it is read all the same.
-    """
+    """The blocks with their places, in whatever order they come, even twice; what is of another sort is damage."""
     if stride is not None:
         check_stride(stride)
     offset = 0

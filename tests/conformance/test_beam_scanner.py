@@ -37,17 +37,14 @@ def gentle(case: ScannerCase) -> ScanWaveform:
     return ScanWaveform(command, markers, clock)
 
 
-def test_the_point_clock_is_exact_and_asking_for_it_gives_it(scanner: ScannerCase) -> None:
-    low, high = scanner.device.limits.point_rate_hz
+def test_the_point_clock_is_exact_and_verbs_out_of_order_are_refused_and_say_what_to_call(scanner: ScannerCase) -> None:
+    device = scanner.device
+    low, high = device.limits.point_rate_hz
     for requested in np.geomspace(low * 1.01, high * 0.99, 23):
-        clock = scanner.device.point_clock(float(requested))
+        clock = device.point_clock(float(requested))
         assert isinstance(clock, Fraction)
         assert low <= clock <= high
-        assert clock == scanner.device.point_clock(float(clock))
-
-
-def test_verbs_out_of_order_are_refused_and_say_what_to_call(scanner: ScannerCase) -> None:
-    device = scanner.device
+        assert clock == device.point_clock(float(clock))
     with pytest.raises(WrongState, match="load"):
         device.start()
     device.load(gentle(scanner), ENDLESS)

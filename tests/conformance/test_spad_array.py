@@ -1,6 +1,7 @@
 """Every SPAD array: contiguous frames with records, counters that add up, an end that ends."""
 
 from concurrent.futures import ThreadPoolExecutor
+from contextlib import suppress
 from functools import partial
 from itertools import pairwise
 
@@ -52,11 +53,12 @@ def test_frames_are_contiguous_within_blocks_and_a_jump_is_the_loss(taken: Taken
     assert counters.exposed in (None, N_FRAMES)
 
 
-def test_the_header_of_every_block_tells_the_geometry_and_the_timing(taken: Taken) -> None:
+def test_every_block_tells_geometry_and_timing_and_its_bits_are_packed_rows_with_pad_bits_zero(taken: Taken) -> None:
     info, timing, blocks = taken.case.device.info, taken.timing, taken.blocks
     assert [block.header.block_seq for block in blocks] == list(range(len(blocks)))
     assert len({block.header.run_id for block in blocks}) == 1
     assert [bool(block.header.flags & BlockFlag.FIRST) for block in blocks] == [True] + [False] * (len(blocks) - 1)
+    shares = []
     for block in blocks:
         header = block.header
         assert (header.sensor_width, header.sensor_height) == (info.width, info.height)
@@ -64,12 +66,6 @@ def test_the_header_of_every_block_tells_the_geometry_and_the_timing(taken: Take
         assert header.tick_hz == timing.tick_hz
         assert (header.frame_period_ticks, header.exposure_ticks) == (timing.frame_period_ticks, timing.exposure_ticks)
         assert block.status == 0
-
-
-def test_bits_are_packed_rows_with_pad_bits_zero_inside_the_window(taken: Taken) -> None:
-    shares = []
-    for block in taken.blocks:
-        header = block.header
         assert block.bits.dtype == np.uint8
         assert block.bits.shape == (block.n_frames, header.height, packed_row_bytes(header.width))
         pixels = np.unpackbits(block.bits, axis=2)
@@ -140,10 +136,11 @@ def test_a_full_ring_is_waited_for_or_the_loss_is_counted(spad: SpadCase) -> Non
         try:
             more = device.fill(ring, 0.05)
         except DeviceTimeout:
-            waited = True
-            block = reader.next(0)
-            assert block is not None
-            numbers += block.frame_numbers.tolist()
+            with suppress(DeviceTimeout):  # the device was late, and nothing has come
+                block = reader.next(0)
+                assert block is not None
+                numbers += block.frame_numbers.tolist()
+                waited = True
     ring.finish()
     assert waited or ring.dropped_blocks
     for block in reader:

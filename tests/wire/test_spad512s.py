@@ -5,6 +5,7 @@ import threading
 import time
 from collections.abc import Iterator
 from contextlib import contextmanager
+from dataclasses import replace
 from fractions import Fraction
 from pathlib import Path
 from typing import Any
@@ -33,7 +34,7 @@ from drivers.transports.endpoints import Endpoint
 from drivers.transports.tap import CONTROL_FILE, IN, OUT, Tap, TapFile, read_taps
 from sim_backend.wire.firmware.spad512s import Spad512sModel
 from sim_backend.wire.serve.tcp import TcpServer
-from tests.wire.lasers import PATIENCE_S
+from tests.wire.lasers import PATIENCE_S, eventually
 from tests.wire.spads import begin, finish, take_run
 
 FRAME_BYTES = 32_768
@@ -149,6 +150,7 @@ def test_trap_time_in_microseconds_for_one_bit() -> None:
     with connected(model) as (device, _):
         device.configure(SpadRequest(Fraction(10_000), 100e-6, "burst", 16))
         device.start(10_000)
+        eventually(lambda: model.running)  # commands that come together are none
         device.stop()
         assert model.commands[2:] == ["I,1,100,10000,0,1,0,1", "STOP"]
 
@@ -254,7 +256,7 @@ def test_a_server_that_hangs_up_at_once_is_busy_and_silence_a_timeout() -> None:
             Spad512s(Spad512sConfig(), address, PATIENT)
     words = r"calibration did not end within 0\.2 s"
     with TcpServer(Spad512sModel(noise, calibration_s=60)) as server, pytest.raises(DeviceTimeout, match=words):
-        Spad512s(Spad512sConfig(), server.endpoint, Deadlines(open_s=PATIENCE_S, calibration_s=0.2))
+        Spad512s(Spad512sConfig(), server.endpoint, replace(PATIENT, calibration_s=0.2))
 
 
 def test_wrong_addresses_are_one_line_each() -> None:
@@ -287,8 +289,8 @@ def test_a_rate_that_does_not_follow_from_the_exposure_is_refused_or_triggered()
     with connected(model, trigger="external") as (device, _):
         device.configure(request)
         device.start(1)
+        eventually(lambda: "I,1,10,1,1,1,0,1" in model.commands)
         device.stop()
-        assert "I,1,10,1,1,1,0,1" in model.commands
 
 
 @pytest.mark.parametrize("heeds_stop", [True, False])

@@ -1,7 +1,4 @@
-"""One run of an emulated SPB1 device, its USB descriptors and its registers (docs/reference/spb1-usb.md).
-
-In a run frames are exposed, the memory may lose some, and the others come in blocks.
-"""
+"""One run of an emulated SPB1 device, its USB descriptors and its registers (docs/reference/spb1-usb.md)."""
 
 from collections import deque
 from collections.abc import Mapping
