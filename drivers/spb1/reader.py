@@ -103,13 +103,13 @@ def read_header(buffer: NDArray[np.uint8]) -> HeaderFields:
         raise CorruptBlock(f"no block: starts with 0x{magic.hex()}, not 0x{MAGIC.hex()} ({MAGIC.decode()})")
     fields = HEADER.unpack(raw)
     _check_crc("header", crc32(raw[: -CRC.size]), fields[-1])
-    _, version, header_bytes, flags, bits_per_px, payload_type, *counts = fields[:11]  # run_id to lost_before
-    tick_hz, tick_hz_den, period, exposure, sweep, n_frames, frame_step, *sizes = fields[11:22]
-    rate, kept_flags = _rate(tick_hz, tick_hz_den), BlockFlag(flags & ~_LSB_FIRST)
-    header = BlockHeader(
-        kept_flags, *counts, rate, period, exposure, sweep, frame_step, *sizes, bits_per_px, payload_type
-    )
-    payload_bytes, pixels_offset = fields[22:24]
+    (_, version, header_bytes, flags, bits_per_px, payload_type, run_id, block_seq, first_frame, t0_ticks) = fields[:10]
+    (lost_before, tick_hz, tick_hz_den, period, exposure, sweep, n_frames, frame_step, width, height) = fields[10:20]
+    (sensor_width, sensor_height, payload_bytes, pixels_offset) = fields[20:24]
+    counts = run_id, block_seq, first_frame, t0_ticks, lost_before
+    times = _rate(tick_hz, tick_hz_den), period, exposure, sweep, frame_step
+    sizes = width, height, sensor_width, sensor_height
+    header = BlockHeader(BlockFlag(flags & ~_LSB_FIRST), *counts, *times, *sizes, bits_per_px, payload_type)
     lsb_first = bool(flags & _LSB_FIRST)
     return HeaderFields(header, version, lsb_first, n_frames, header_bytes, payload_bytes, pixels_offset)
 
