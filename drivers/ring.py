@@ -76,6 +76,11 @@ class BlockRing:
         return self._on_full is OnFull.WAIT
 
     @property
+    def full(self) -> bool:
+        """Whether there is no free slot at this moment."""
+        return not self._free
+
+    @property
     def finished(self) -> bool:
         """Whether the source published its last block."""
         return self._finished

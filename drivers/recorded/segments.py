@@ -99,7 +99,7 @@ def zstandard_or_error() -> Any:
     try:
         import zstandard
     except ImportError:
-        command = install_command("zstandard", "compress")
+        command = install_command("zstandard")
         raise ProtocolError(f"compressed recordings need the package zstandard; install it: {command}") from None
     return zstandard
 

@@ -45,6 +45,8 @@ class SpbUsbModel(UsbModel):
         self._source = source
         self._board = board
         self._registers = registers_at_power_up(board)
+        self.state = SensorState.IDLE
+        self._run: EmulatedRun | None = None
         self._run_id = self._exposed = 0
         self._acks: deque[bytes] = deque()
         self._queue: deque[memoryview] = deque()
@@ -200,7 +202,7 @@ class SpbUsbModel(UsbModel):
         self._send(run, run.end(status, flag))
 
     def _reset(self) -> None:
-        self._run: EmulatedRun | None = None
+        self._run = None
         self.state = SensorState.IDLE
         self._queue.clear()
         self._acks.clear()
