@@ -15,7 +15,6 @@ from drivers.errors import (
     DeviceError,
     DeviceFault,
     DeviceNotFound,
-    DevicePermission,
     DeviceTimeout,
     LimitExceeded,
     ProtocolError,
@@ -132,22 +131,6 @@ def test_a_flipped_bit_in_an_answer_without_a_checksum_is_noticed() -> None:
         device.left = 100
         with pytest.raises(ProtocolError, match="two answers to the same question differ"):
             take(spad, 20)
-
-
-def test_absent_forbidden_and_two_equal_devices_are_one_line_each() -> None:
-    bus = EmulatedUsb(VirtualClock())
-    with pytest.raises(DeviceNotFound, match="04b4:00f1"):
-        on_bus(bus)
-    attached = bus.plug(model(serial="A"))
-    attached.denied = True
-    with pytest.raises(DevicePermission, match=r"70-spadrig\.rules"):
-        on_bus(bus)
-    attached.denied = False
-    bus.plug(model(serial="B"))
-    with pytest.raises(DeviceError, match="2 are attached"):
-        on_bus(bus)
-    with on_bus(bus, "usb:serial=B") as spad:
-        assert spad.info.serial == "B"
 
 
 @pytest.mark.parametrize("order", ["bits", "rows"])

@@ -36,19 +36,6 @@ def sequence(block: FrameBlock | None) -> int | None:
     return None if block is None else block.header.block_seq
 
 
-def test_blocks_come_in_order_and_over_the_slots_memory() -> None:
-    ring = BlockRing(3, STRIDE)
-    reader = ring.reader("count")
-    for seq in range(3):
-        put(ring, seq)
-    ring.finish()
-    block = reader.next(0)
-    assert block is not None
-    assert np.shares_memory(block.bits, ring._memory)
-    assert [sequence(block)] + [block.header.block_seq for block in reader] == [0, 1, 2]
-    assert reader.next(0) is None
-
-
 def test_a_full_ring_gives_no_slot_until_the_slowest_reader_moves_on() -> None:
     ring = BlockRing(2, STRIDE)
     quick, slow = ring.reader("quick"), ring.reader("slow")
