@@ -54,7 +54,6 @@ campaign-devices: .venv/.installed-tests  ## SEQUENCES of faults on the wire of 
 		$(BIN)/python -m tests.campaigns.devices.faults $${driver} --sequences $(SEQUENCES) || exit; \
 	done
 campaign-guard: .venv/.installed-tests  ## blows to scans: how long the laser shines after them
-	$(BIN)/python -m tests.campaigns.devices.guard_blows
 	$(BIN)/python -m tests.campaigns.devices.guard_kill
 campaign-recording: .venv/.installed-tests  ## recordings killed and damaged, and depth from them
 	$(BIN)/python -m tests.campaigns.recording.kill

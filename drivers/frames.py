@@ -72,11 +72,9 @@ def frame_bytes(width: int, height: int) -> int:
 
 @dataclass(frozen=True, slots=True)
 class BlockHeader:
-    """Everything that holds for all frames of a block. Fields as in the SPB1 1.0 wire layout
-    (docs/reference/spb1.md)."""
+    """Everything that holds for all frames of a block. Fields as in SPB1 1.0 (docs/reference/spb1.md)."""
 
     flags: BlockFlag
-    """Flags of the block."""
     run_id: int
     """Number of the run, 16 bit; changes at each START, so that stale data after a re-arm is recognised."""
     block_seq: int
@@ -92,7 +90,6 @@ class BlockHeader:
     frame_period_ticks: int
     """Nominal period; 0 = triggered from outside."""
     exposure_ticks: int
-    """Exposure of every frame."""
     sweep: int
     """Scan markers since START at the first frame."""
     frame_step: int
@@ -100,15 +97,12 @@ class BlockHeader:
     width: int
     """Pixels of each frame's window; constant within a block."""
     height: int
-    """Rows of each frame."""
     sensor_width: int
-    """Pixels of a row of the whole sensor."""
     sensor_height: int
-    """Rows of the whole sensor."""
     bits_per_px: int = 1
     """Always 1 for blocks of frames that this program reads."""
     payload_type: int = 0
-    """Type of the payload; 0: packed frames."""
+    """0: packed frames."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -124,7 +118,6 @@ class FrameBlock:
     records: NDArray[np.void]
     bits: NDArray[np.uint8]
     status: int = BlockStatus.OK
-    """End of the block, a `BlockStatus`."""
 
     @property
     def n_frames(self) -> int:
@@ -139,6 +132,5 @@ class FrameBlock:
     @property
     def start_ticks(self) -> NDArray[np.int64]:
         """Start of each exposure in ticks of `header.tick_hz`, int64 (n,)."""
-        ticks: NDArray[np.int64] = self.records["ticks"].astype(np.int64)
-        ticks += self.header.t0_ticks
+        ticks: NDArray[np.int64] = self.records["ticks"].astype(np.int64) + self.header.t0_ticks
         return ticks

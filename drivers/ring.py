@@ -108,10 +108,7 @@ class BlockRing:
             return reader
 
     def claim(self, timeout_s: float) -> NDArray[np.uint8] | None:
-        """Memory of a free slot, uint8 (stride,), with old bytes in it; None where none came free in `timeout_s`.
-
-        A ring that does not wait (`waits`) gives its answer at once, whatever the time-out.
-        """
+        """Memory of a free slot, uint8 (stride,), old bytes in it; None: none came free in time, if `waits`."""
         with self._changed:
             self._require_unfinished("claim")
             self._any_claimed = True
@@ -144,10 +141,7 @@ class BlockRing:
             self._changed.notify_all()
 
     def mark_overflow(self, n_frames: int = 0) -> None:
-        """Note for good that the source dropped a block of `n_frames` frames because no slot was free.
-
-        Called once the source has counted them as lost. Raises RingOverflow where such a loss ends the run.
-        """
+        """Note that a block of `n_frames`, counted as lost, found no slot. RingOverflow where that ends the run."""
         with self._changed:
             self.last_frame += n_frames
             self.dropped_blocks += 1

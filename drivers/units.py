@@ -26,8 +26,6 @@ MANY_ZEROS = 5
 _FAITHFUL = Context(prec=20)
 """Decimal digits that pin a 64-bit float (17) with enough to spare for one multiplication by a unit."""
 
-_DEGREE = Fraction(math.pi) / 180
-
 
 @dataclass(frozen=True, slots=True)
 class Dimension:
@@ -40,58 +38,34 @@ class Dimension:
     """Units that nothing is written in."""
 
 
+_PREFIXES = {"G": 9, "M": 6, "k": 3, "": 0, "c": -2, "m": -3, "u": -6, "\u00b5": -6, "\u03bc": -6, "n": -9, "p": -12}
+"""Powers of ten; micro also by the sign of keyboards and by the Greek letter."""
+_SMALL = ("u", "\u00b5", "\u03bc", "n")
+
+
+def _si(unit: str, *prefixes: str) -> dict[str, Fraction]:
+    return {prefix + unit: Fraction(10) ** _PREFIXES[prefix] for prefix in prefixes}
+
+
 _ALL = (
-    Dimension(
-        "time",
-        {
-            "s": Fraction(1),
-            "ms": Fraction(1, 10**3),
-            "us": Fraction(1, 10**6),
-            "\u00b5s": Fraction(1, 10**6),  # the micro sign of keyboards
-            "\u03bcs": Fraction(1, 10**6),  # the Greek letter
-            "ns": Fraction(1, 10**9),
-            "ps": Fraction(1, 10**12),
-        },
-        "10 us",
-    ),
+    Dimension("time", _si("s", "", "m", *_SMALL, "p"), "10 us"),
     Dimension("age", {"d": Fraction(86400), "h": Fraction(3600), "s": Fraction(1)}, "90 d"),
-    Dimension(
-        "frequency",
-        {"Hz": Fraction(1), "kHz": Fraction(10**3), "MHz": Fraction(10**6), "GHz": Fraction(10**9)},
-        "100 kHz",
-    ),
-    Dimension(
-        "length",
-        {
-            "m": Fraction(1),
-            "km": Fraction(10**3),
-            "cm": Fraction(1, 10**2),
-            "mm": Fraction(1, 10**3),
-            "um": Fraction(1, 10**6),
-            "\u00b5m": Fraction(1, 10**6),
-            "\u03bcm": Fraction(1, 10**6),
-            "nm": Fraction(1, 10**9),
-        },
-        "30 m",
-    ),
-    Dimension("power", {"W": Fraction(1), "mW": Fraction(1, 10**3), "uW": Fraction(1, 10**6)}, "50 mW"),
+    Dimension("frequency", _si("Hz", "", "k", "M", "G"), "100 kHz"),
+    Dimension("length", _si("m", "", "k", "c", "m", *_SMALL), "30 m"),
+    Dimension("power", _si("W", "", "m", "u"), "50 mW"),
     Dimension(
         "inverse length",
         {"/m": Fraction(1), "1/m": Fraction(1), "/km": Fraction(1, 10**3), "1/km": Fraction(1, 10**3)},
         "0.05 /m",
         frozenset({"/km", "1/km"}),
     ),
-    Dimension("angle", {"rad": Fraction(1), "mrad": Fraction(1, 10**3), "deg": _DEGREE}, "3 deg"),
+    Dimension("angle", {**_si("rad", "", "m"), "deg": Fraction(math.pi) / 180}, "3 deg"),
     Dimension("illuminance", {"lx": Fraction(1), "lux": Fraction(1), "klx": Fraction(10**3)}, "200 lx"),
     Dimension("ratio", {"ppm": Fraction(1, 10**6), "%": Fraction(1, 100), "ppb": Fraction(1, 10**9)}, "20 ppm"),
-    Dimension("speed", {"m/s": Fraction(1), "mm/s": Fraction(1, 10**3), "km/h": Fraction(1000, 3600)}, "1.5 m/s"),
-    Dimension("rain rate", {"m/h": Fraction(1), "mm/h": Fraction(1, 10**3)}, "20 mm/h"),
-    Dimension("count rate", {"cps": Fraction(1), "kcps": Fraction(10**3), "Mcps": Fraction(10**6)}, "20 cps"),
-    Dimension(
-        "data rate",
-        {"B/s": Fraction(1), "kB/s": Fraction(10**3), "MB/s": Fraction(10**6), "GB/s": Fraction(10**9)},
-        "400 MB/s",
-    ),
+    Dimension("speed", {**_si("m/s", "", "m"), "km/h": Fraction(1000, 3600)}, "1.5 m/s"),
+    Dimension("rain rate", _si("m/h", "", "m"), "20 mm/h"),
+    Dimension("count rate", _si("cps", "", "k", "M"), "20 cps"),
+    Dimension("data rate", _si("B/s", "", "k", "M", "G"), "400 MB/s"),
     Dimension("rate", {"/s": Fraction(1), "1/s": Fraction(1), "/ms": Fraction(10**3)}, "5 /s", frozenset({"/ms"})),
     Dimension("acceleration", {"/s2": Fraction(1), "/ms2": Fraction(10**6)}, "1e6 /s2", frozenset({"/ms2"})),
 )

@@ -132,7 +132,6 @@ class ReplayRequest(RunRequest):
         unset="they are recorded too",
         read_as=str | None,
     )
-    against_recording: bool = option(False, "the recorded drivers take part, against what was answered then")
     threads: int | None = option(None, "threads that count and estimate", unset="as recorded")
     block_frames: int | None = option(None, "most frames of a block", unset="5 ms", least=1)
     save: str | None = option(None, "maps to write: all, last or every N", unset="all, of the command with --loop last")

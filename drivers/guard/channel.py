@@ -40,10 +40,7 @@ class Channel:
         return self._end.fileno()
 
     def send(self, message: Message, within_s: float = 0.0) -> None:
-        """Queue a message and pass on what the socket takes within that time; the rest goes with later calls.
-
-        A peer that is gone is no error here: `receive` tells.
-        """
+        """Queue a message and pass on what the socket takes in that time. A peer that is gone is no error here."""
         line = json.dumps(message, separators=(",", ":")).encode() + b"\n"
         with self._lock:
             self._unsent += line

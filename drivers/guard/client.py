@@ -1,7 +1,4 @@
-"""The application's side of the guard: starts it, talks to it, beats for it, and steps in where it is lost.
-
-`GuardedLaser` and `GuardedSync` are the usual device interfaces; each verb is carried out by the guard.
-"""
+"""The application's side of the guard: starts it, talks to it, beats for it, and steps in where it is lost."""
 
 import itertools
 import logging
@@ -16,99 +13,95 @@ import time
 from collections.abc import Mapping, Sequence
 from dataclasses import asdict
 from pathlib import Path
-from typing import Any, Self
+from typing import Any, ClassVar, Self
 
 from drivers.errors import DeviceError, DeviceTimeout, GuardLost
 from drivers.guard.channel import Channel, Heartbeat, Message, error_from, plain_ports
 from drivers.guard.process import Rescue
 from drivers.guard.watch import GuardLimits, WatchedProcess
-from drivers.interfaces import LaserLimits, LaserStatus, LineLaser, Pulse, SyncSource, SyncStatus
+from drivers.interfaces import Device, LaserLimits, LaserStatus, LineLaser, Pulse, SyncSource, SyncStatus
 from drivers.registry import KindConfig
 from drivers.transports.endpoints import Endpoint
 from drivers.transports.tap import TapFile
 
 
-class GuardedLaser(LineLaser):
-    """A laser whose port the guard owns."""
+class _Guarded(Device):
+    """A device whose port the guard owns. about: what the guard read when it opened it."""
+
+    _slot: ClassVar[str]
 
     def __init__(self, guard: "Guard", about: dict[str, Any]) -> None:
         super().__init__(about["name"])
-        self._guard = guard
-        self._identity = str(about["identity"])
-        self._limits = LaserLimits(*about["limits"])
+        self._guard, self._about = guard, about
 
     @property
     def identity(self) -> str:
-        """The identity that the guard read when it opened the device."""
-        return self._identity
+        """The identity that the guard read."""
+        return str(self._about["identity"])
+
+    def _ask(self, verb: str, *arguments: Any) -> Any:
+        return self._guard.ask(self._slot, verb, *arguments)
+
+    def _do_close(self) -> None:
+        if not self._guard.lost:
+            self._ask("close")
+
+
+class GuardedLaser(_Guarded, LineLaser):
+    """A laser whose port the guard owns."""
+
+    _slot = "laser"
 
     @property
     def limits(self) -> LaserLimits:
-        """The limits that the guard read when it opened the laser."""
-        return self._limits
+        """The limits that the guard read."""
+        return LaserLimits(*self._about["limits"])
 
     def _do_status(self) -> LaserStatus:
-        return LaserStatus(**self._guard.ask("laser", "status"))
+        return LaserStatus(**self._ask("status"))
 
     def _check_health(self) -> None:
         """Do nothing: the guard's own `arm` checks, and a slow laser is not asked twice."""
 
     def _do_arm(self, power_w: float) -> None:
-        self._guard.ask("laser", "arm", power_w)
+        self._ask("arm", power_w)
 
     def _do_pause(self) -> None:
-        self._guard.ask("laser", "pause")
+        self._ask("pause")
 
     def _do_disarm(self) -> None:
-        self._guard.ask("laser", "disarm")
-
-    def _do_close(self) -> None:
-        if not self._guard.lost:
-            self._guard.ask("laser", "close")
+        self._ask("disarm")
 
 
-class GuardedSync(SyncSource):
+class GuardedSync(_Guarded, SyncSource):
     """A sync source whose port the guard owns."""
 
-    def __init__(self, guard: "Guard", about: dict[str, Any]) -> None:
-        super().__init__(about["name"])
-        self._guard = guard
-        self._identity = str(about["identity"])
-        self._resolution_s = float(about["resolution_s"])
-
-    @property
-    def identity(self) -> str:
-        """The identity that the guard read when it opened the device."""
-        return self._identity
+    _slot = "sync"
 
     @property
     def resolution_s(self) -> float:
-        """The resolution that the guard read when it opened the device."""
-        return self._resolution_s
+        """The resolution that the guard read."""
+        return float(self._about["resolution_s"])
 
     def most_repeats(self, pulses: Sequence[Pulse]) -> int | None:
         """The limit of the device behind the guard; None where it has none."""
-        most: int | None = self._guard.ask("sync", "most_repeats", _plain(pulses))
+        most: int | None = self._ask("most_repeats", _plain(pulses))
         return most
 
     def _do_program(self, pulses: Sequence[Pulse], repeats: int) -> None:
-        self._guard.ask("sync", "program", _plain(pulses), repeats)
+        self._ask("program", _plain(pulses), repeats)
 
     def _do_run(self) -> None:
-        self._guard.ask("sync", "run")
+        self._ask("run")
 
     def _do_gate_low(self) -> None:
-        self._guard.ask("sync", "gate_low")
+        self._ask("gate_low")
 
     def _do_abort(self) -> None:
-        self._guard.ask("sync", "abort")
+        self._ask("abort")
 
     def _do_status(self) -> SyncStatus:
-        return SyncStatus(**self._guard.ask("sync", "status"))
-
-    def _do_close(self) -> None:
-        if not self._guard.lost:
-            self._guard.ask("sync", "close")
+        return SyncStatus(**self._ask("status"))
 
 
 def _plain(pulses: Sequence[Pulse]) -> list[list[Any]]:
@@ -131,8 +124,7 @@ BUSY_SILENCE_S = 5.0
 _TICK_S = 0.01
 _MAX_STEP_S = 0.1
 _RESCUE_SWITCH_S = 5e-4
-"""Longest time for which other threads keep the interpreter while laser and gate are rescued; Python's default is 5
-ms."""
+"""Longest time for which other threads keep the interpreter while light is taken; Python's default is 5 ms."""
 _LOWERING = ("pause", "disarm", "gate_low", "abort")
 _ENABLING = ("arm", "program", "run")
 
@@ -153,10 +145,7 @@ class Guard:
         limits: GuardLimits | None = None,
         tap: TapFile | None = None,
     ) -> None:
-        """Start the guard, which opens the devices meanwhile. `UnknownKind` for a kind that is not installed.
-
-        tap: records what passes their ports.
-        """
+        """Start the guard, which opens the devices meanwhile. `UnknownKind` for a kind that is not installed."""
         configs = {slot: config for slot, config in (("laser", laser), ("sync", sync)) if config is not None}
         ports = ports or {}
         self._rescue = Rescue(configs, ports)
@@ -221,10 +210,7 @@ class Guard:
         return self._process.pid
 
     def beat(self, frame: int) -> None:
-        """Tell the last frame number received: one store. On the source thread, for every block.
-
-        Raises the guard's `failure`, so that a scan whose light was taken ends with the reason.
-        """
+        """Tell the last frame number received: one store, for every block. Raises `failure`, where there is one."""
         self._heartbeat.waited_s = 0.0
         self._heartbeat.frame = frame
         if self._failure is not None:
@@ -257,18 +243,13 @@ class Guard:
             request = {"id": number, "slot": slot, "verb": verb, "arguments": arguments}
             self._channel.send(request, within_s=1.0)
             deadline_s = ANSWER_S.get(verb, USUAL_ANSWER_S)
-            try:
-                answer = inbox.get(timeout=deadline_s)
-            except queue.Empty:
-                raise DeviceTimeout(f"{slot}: {verb} is not done after {deadline_s:g} s; check the device") from None
+            answer = inbox.get(timeout=deadline_s)
+        except queue.Empty:
+            raise DeviceTimeout(f"{slot}: {verb} is not done after {deadline_s:g} s; check the device") from None
         finally:
             with self._lock:
                 del self._answers[number]
-        if answer is None:
-            raise self._gone(verb)
-        if "error" in answer:
-            raise error_from(answer["error"])
-        return answer["result"]
+        return self._told(answer, verb)["result"]
 
     def close(self) -> None:
         """Close both devices, which leaves them safe, and end the guard; again: nothing happens."""
@@ -302,15 +283,19 @@ class Guard:
             raise DeviceError(f"{slot}: not guarded; open it by itself")
         if not self._opening[slot].wait(OPEN_S):
             raise DeviceTimeout(f"{slot}: the guard has not opened it after {OPEN_S:g} s; check the device")
-        answer = self._opened.get(slot)
-        if answer is None:
-            raise self._gone("open")
-        if "error" in answer:
-            raise error_from(answer["error"])
+        about = self._told(self._opened.get(slot), "open")["about"]
         with self._lock:
             if slot not in self._proxies:
-                self._proxies[slot] = make(self, answer["about"])
+                self._proxies[slot] = make(self, about)
             return self._proxies[slot]
+
+    def _told(self, answer: Message | None, verb: str) -> Message:
+        """The answer, unless it is an error, or there is none since the guard is gone."""
+        if answer is None:
+            raise self._gone(verb)
+        if "error" in answer:
+            raise error_from(answer["error"])
+        return answer
 
     def _gone(self, verb: str) -> GuardLost:
         if verb in _LOWERING:

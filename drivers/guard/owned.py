@@ -10,6 +10,7 @@ import threading
 import time
 from collections.abc import Callable
 from dataclasses import asdict
+from functools import partial
 from typing import Any
 
 from drivers.clock import SystemClock
@@ -28,21 +29,16 @@ class Lane:
     def __init__(self, name: str) -> None:
         self._jobs: queue.PriorityQueue[tuple[int, int, Job]] = queue.PriorityQueue()
         self._order = itertools.count()
-        self._open = 0
-        self._lock = threading.Lock()
         threading.Thread(target=self._work, name=name, daemon=True).start()
 
     def do(self, job: Job, *, first: bool = False) -> None:
         """Queue a job; `first`: ahead of all that are not."""
-        with self._lock:
-            self._open += 1
         self._jobs.put((0 if first else 1, next(self._order), job))
 
     @property
     def idle(self) -> bool:
         """Whether nothing is queued or under way."""
-        with self._lock:
-            return self._open == 0
+        return self._jobs.unfinished_tasks == 0
 
     def _work(self) -> None:
         while True:
@@ -50,8 +46,7 @@ class Lane:
             try:
                 job()
             finally:
-                with self._lock:
-                    self._open -= 1
+                self._jobs.task_done()
 
 
 _log = logging.getLogger(__name__)
@@ -63,9 +58,7 @@ RETRY_S = 0.1
 class Owned:
     """One slot of the rig, with a lane for its ordinary jobs and one for those that must not wait for them."""
 
-    def __init__(
-        self, slot: str, config: dict[str, Any], ports: dict[str, str], tap: dict[str, Any] | None = None
-    ) -> None:
+    def __init__(self, slot: str, config: dict[str, Any], ports: dict[str, str], tap: dict[str, Any] | None) -> None:
         """tap: fields of the `TapFile` that records its port; None: nothing is recorded."""
         self.slot = slot
         self.device: Any = None
@@ -78,9 +71,8 @@ class Owned:
         self.enabling = False
         """Whether a verb that may end in light is under way on `lane`."""
         self.unsafe = False
+        """Whether `try_safe` is to be called until it has succeeded."""
         self.trying = False
-        self.finished = threading.Event()
-        """Set once the device was made safe."""
         self._next_try = 0.0
         self._trouble = ""
         kind = lookup(slot, config["kind"])
@@ -88,7 +80,7 @@ class Owned:
         self._tap = None if tap is None else TapFile(**tap).tap(slot)
         surroundings = Surroundings(SystemClock(), None, 0, endpoints, self._tap)
         model = kind.config.model_validate(config)
-        self._create: Callable[[], Any] = lambda: kind.create(model, surroundings)
+        self._create = partial(kind.create, model, surroundings)
 
     def open(self) -> dict[str, Any]:
         """Open the device; returns what its proxy tells of it without asking. DeviceError."""
@@ -136,10 +128,6 @@ class Owned:
                 raise DeviceError(f"the guard knows no {self.slot}.{verb}")
         return None
 
-    def want_safe(self) -> None:
-        """Ask for `try_safe` to be called from now on until `finished`."""
-        self.unsafe = True
-
     @property
     def due(self) -> bool:
         """Whether it is time to try (again), and nothing of it is under way."""
@@ -149,10 +137,12 @@ class Owned:
         """Try once to make the device safe: all outputs low, or paused and, if it was armed, disarmed. On a lane."""
         try:
             if self.port_lost:
-                self._reopen()
-            self._make_safe()
+                self.device = self._create()  # DeviceError while it is not plugged in again
+            if self.device is not None and self.device.state is not DeviceState.CLOSED:
+                armed = self.armed
+                make_safe(self.device, disarm=armed)
+                self.armed = self.armed and not armed
             self.unsafe = False
-            self.finished.set()
         except DeviceError as error:
             if str(error) != self._trouble:
                 _log.error("%s: %s", self.slot, error)
@@ -164,24 +154,16 @@ class Owned:
     def calm(self) -> None:
         """Make the device dark now, beside a verb that may end in light; `try_safe` follows it."""
         try:
-            if isinstance(self.device, SyncSource):
-                self.device.abort()
-            else:
-                self.device.pause()
+            make_safe(self.device, disarm=False)
         except DeviceError as error:
             _log.error("%s: %s", self.slot, error)
 
-    def _make_safe(self) -> None:
-        if self.device is None or self.device.state is DeviceState.CLOSED:
-            return
-        if isinstance(self.device, SyncSource):
-            self.device.abort()
-            return
-        self.device.pause()
-        if self.armed:
-            self.device.disarm()
-            self.armed = False
 
-    def _reopen(self) -> None:
-        """Open the device again after its port was lost. DeviceError while it is not plugged in again."""
-        self.device = self._create()
+def make_safe(device: LineLaser | SyncSource, *, disarm: bool) -> None:
+    """Take all outputs low, or pause a laser and, where asked for, disarm it. DeviceError."""
+    if isinstance(device, SyncSource):
+        device.abort()
+        return
+    device.pause()
+    if disarm:
+        device.disarm()

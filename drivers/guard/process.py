@@ -4,8 +4,7 @@ The main thread never touches a device: it reads messages, looks at the applicat
 What ends the light ("trip"): the application ended, was stopped or takes no frames; a port hung up; the laser reports
 an open interlock or a fault, or stops answering. Then, at the same time: all outputs of the gate low, the laser paused.
 After it: an application that cannot help itself is killed, the laser disarmed, the ports closed. Where frames stop
-because the gate's program has come to its end, the laser is paused and nothing else happens: it has nothing to shine
-for, and an application that waits for a silent SPAD may take seconds to say so.
+because the gate's program has come to its end, the laser is paused and nothing else happens.
 
 `Rescue` is for the opposite case, a guard that is gone: the application opens the ports, which are free now, and lowers
 what it can.
@@ -19,13 +18,14 @@ import sys
 import threading
 import time
 from collections.abc import Callable, Mapping
+from contextlib import closing
 from functools import partial
 from typing import Any
 
 from drivers.clock import SystemClock
 from drivers.errors import DeviceBusy, DeviceDisconnected, DeviceError, DeviceFault, DeviceTimeout, InterlockOpen
 from drivers.guard.channel import Channel, Heartbeat, Message, error_message
-from drivers.guard.owned import Owned
+from drivers.guard.owned import Owned, make_safe
 from drivers.guard.watch import TICK_S, FrameWatch, GuardLimits, WatchedProcess
 from drivers.interfaces import DeviceState, LineLaser
 from drivers.registry import Surroundings, lookup
@@ -152,7 +152,7 @@ class GuardProcess:
         answer: Message = {"id": message["id"]}
         with self._trip_lock:
             refused = self._tripped if verb in _ENABLING else None
-            owned.enabling = owned.enabling or (verb in _ENABLING and refused is None)
+            owned.enabling |= verb in _ENABLING and refused is None
         try:
             if refused is not None:
                 raise refused
@@ -283,7 +283,7 @@ class GuardProcess:
         for owned in self._owned.values():
             if owned.enabling:  # dark at once; what is still being switched on is switched off behind it
                 owned.urgent.do(owned.calm, first=True)
-            owned.want_safe()
+            owned.unsafe = True
         self._make_safe()
         _log.error("guard: %s", cause)
         self._channel.send({"tripped": error_message(cause)})
@@ -306,10 +306,9 @@ class GuardProcess:
             self._make_safe()
             time.sleep(TICK_S)
         for owned in self._owned.values():
-            if owned.device is None:
-                continue
             try:
-                owned.device.close()
+                if owned.device is not None:
+                    owned.device.close()
             except DeviceError as error:
                 _log.error("%s: %s", owned.slot, error)
         for owned in self._owned.values():
@@ -360,10 +359,7 @@ class Rescue:
 
     def run(self, slots: set[str], armed: bool) -> str:
         """Make the devices of these slots safe; returns what came of it, for a message. armed: the laser was."""
-        threads = [
-            threading.Thread(target=self._save, args=(slot, armed), name=f"rescue {slot}", daemon=True)
-            for slot in slots
-        ]
+        threads = [threading.Thread(target=self._save, args=(slot, armed), daemon=True) for slot in slots]
         for thread in threads:
             thread.start()
         for thread in threads:
@@ -375,12 +371,7 @@ class Rescue:
             if armed and slot in self._off:
                 self._switch_off(slot)
             with _once_free(self._create[slot]) as device:
-                if isinstance(device, LineLaser):
-                    device.pause()
-                    if armed:
-                        device.disarm()
-                else:
-                    device.abort()
+                make_safe(device, disarm=armed)
             self._outcome[slot] = "made safe by the application"
         except DeviceError as error:
             self._outcome[slot] = f"NOT made safe, {error}"
@@ -390,13 +381,10 @@ class Rescue:
         """Switch the emission off before anything is asked: opening a slow laser takes more than a second."""
         place, off = self._off[slot]
         endpoint = place()
-        port = _once_free(lambda: SerialPort(slot, endpoint))
-        try:
+        with closing(_once_free(lambda: SerialPort(slot, endpoint))) as port:
             for _ in range(OFF_TIMES):
                 port.write(off)
                 time.sleep(OFF_GAP_S)
-        finally:
-            port.close()
 
 
 def _once_free(open_it: Callable[[], Any]) -> Any:

@@ -1,12 +1,9 @@
 """Decides whether an application that should be taking frames still does, and looks at its process from outside.
 
-A deadline on frames alone would either be too long for the laser or trip on a busy machine. So there are two: a short
-one for an application that does nothing at all (all its threads asleep, or the process stopped), and a longer one for
-one that is at work or waits for a processor or a disk, as its threads' states tell. Work is no excuse where the source
-thread itself says that it has asked the SPAD in vain: then it is the SPAD that is silent.
-
-The guard's own time counts in short steps only: what stops the guard as well (a suspended or overloaded machine) is no
-silence of the application's. The decision (`FrameWatch`) is pure: fed with what was seen, and when.
+One deadline on frames would be too long for the laser or trip on a busy machine. So there are two: a short one for an
+application whose threads are all asleep, and a longer one for one at work or waiting for a processor or a disk. Work is
+no excuse where the source thread says that it has asked the SPAD in vain. The guard's own time counts in short steps
+only: what stops the guard as well is no silence of the application's.
 
 A process's state comes from /proc (proc(5), the fields of `stat`; Documentation/scheduler/sched-stats.rst of Linux, the
 first two numbers of `schedstat`: nanoseconds on a processor and waiting for one) and from a pidfd, which names the
@@ -38,10 +35,9 @@ class GuardLimits:
     frames_within_s: float = 0.05
     """Limit for an application that sleeps, as two looks say: with their 20 ms and the gate's 30 ms, 100 ms in all."""
     busy_within_s: float = 1.5
-    """Limit for one that computes or waits for a processor or a disk. With four times more work than processors a
-    thread that only sleeps 1 ms was seen to wake 0.2 s late, one that shares its interpreter 0.35 s, and disks stall
-    for a second: none of that may end a scan. The light meanwhile is that of a moving mirror, since each sweep waits,
-    with its gate low, for a scan marker. An application that is killed or stopped never gets this long."""
+    """Limit for one that computes or waits for a processor or a disk. Under load threads were seen to wake 0.35 s late,
+    and disks stall for a second: none of that may end a scan. The light meanwhile is that of a moving mirror, since
+    each sweep waits, with its gate low, for a scan marker."""
     waits_within_s: float = 0.04
     """Limit for one at work whose source thread says that it has asked the SPAD for so long in vain."""
     first_wait_s: float = 0.3
@@ -56,7 +52,7 @@ class GuardLimits:
 
 
 class FrameWatch:
-    """The decision whether frames come as they should, from `start` to `stop`."""
+    """The decision whether frames come as they should, from `start` to `stop`: fed with what was seen, and when."""
 
     def __init__(self, limits: GuardLimits) -> None:
         self.limits = limits

@@ -59,10 +59,9 @@ class LineLaser(Device):
         return self._do_status()
 
     def arm(self, power_w: float) -> None:
-        """Set the power and enable emission under the gate; again while armed: change the power.
+        """Set the power and enable emission under the gate, which may follow later (`status.warming_up`).
 
-        `LimitExceeded`, `InterlockOpen`, `DeviceFault`: refused before anything is enabled. Emission may follow later
-        (`status.warming_up`).
+        `LimitExceeded`, `InterlockOpen`, `DeviceFault`: refused before anything is enabled.
         """
         self._require("arm", *OPEN_STATES)
         limits = self.limits

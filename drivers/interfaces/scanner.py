@@ -198,16 +198,12 @@ def check_waveform(waveform: ScanWaveform, limits: ScannerLimits, clock_hz: Frac
     rms = float(np.sqrt(np.mean(acceleration**2))) if acceleration.size else 0.0
     peak = float(acceleration.max(initial=0.0))
     step = float(np.abs(steps).max())
-    slower = "raise exposures or narrow command_range"
+    most_rms = limits.rms_duty * limits.acceleration_per_s2
     for what, value, limit in (
-        ("step of {:.6g} from point to point exceeds {:.6g}; raise the point rate, " + slower, step, limits.step),
-        ("velocity of {:.6g} /s exceeds {:.6g} /s; " + slower, step * rate_hz, limits.velocity_per_s),
-        ("acceleration of {:.6g} /s2 exceeds {:.6g} /s2; " + slower, peak, limits.acceleration_per_s2),
-        (
-            "RMS acceleration of {:.6g} /s2 exceeds {:.6g} /s2; " + slower,
-            rms,
-            limits.rms_duty * limits.acceleration_per_s2,
-        ),
+        ("step of {:.6g} from point to point exceeds {:.6g}; raise the point rate,", step, limits.step),
+        ("velocity of {:.6g} /s exceeds {:.6g} /s;", step * rate_hz, limits.velocity_per_s),
+        ("acceleration of {:.6g} /s2 exceeds {:.6g} /s2;", peak, limits.acceleration_per_s2),
+        ("RMS acceleration of {:.6g} /s2 exceeds {:.6g} /s2;", rms, most_rms),
     ):
         if value > limit * (1 + _ROUNDING):
-            raise LimitExceeded(what.format(value, limit))
+            raise LimitExceeded(f"{what.format(value, limit)} raise exposures or narrow command_range")

@@ -113,7 +113,6 @@ class StreamMode:
     """The device sends frames while it takes them, as fast as its link carries them."""
 
     bytes_per_s: float
-    """Rate that the link carries."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -149,9 +148,8 @@ class SpadRequest:
 
     frame_rate_hz: Fraction
     exposure_s: float
-    """Exposure of a frame, at most one frame period."""
+    """At most one frame period."""
     mode: SpadMode
-    """Whether frames are streamed or stored and read out."""
     block_frames: int
     """Frames wanted per block; a device may send shorter blocks, never longer ones."""
     window: WindowTable | None = None
@@ -176,7 +174,6 @@ class SpadCounters:
     """Counts since `start`. None: the device does not say."""
 
     exposed: int | None
-    """Frames exposed."""
     delivered: int
     """Frames published in the ring."""
     lost: int | None
@@ -310,27 +307,19 @@ class SpadArray(Device):
             raise LimitExceeded(f"{self._name}: mode {request.mode!r} is not available; it can {' and '.join(modes)}")
         if request.block_frames < 1:
             raise LimitExceeded(f"{self._name}: blocks of {request.block_frames} frames; ask for at least 1")
+        width = info.width
         if request.window is not None:
-            self._check_window(request.window, request.mode)
-        self._check_link(request)
-
-    def _check_window(self, window: WindowTable, mode: SpadMode) -> None:
-        if mode != "stream":
-            raise LimitExceeded(
-                f"{self._name}: windows in mode {mode!r}; they move in a stream only, ask for full frames"
-            )
-        try:
-            window.check(self.info.width, self.info.roi_step_px)
-        except LimitExceeded as error:
-            raise LimitExceeded(f"{self._name}: {error}") from None
-
-    def _check_link(self, request: SpadRequest) -> None:
-        info = self.info
-        if request.mode != "stream" or info.stream is None:
-            return
-        width = info.width if request.window is None else request.window.width_px
+            if request.mode != "stream":
+                raise LimitExceeded(
+                    f"{self._name}: windows in mode {request.mode!r}; they move in a stream only, ask for full frames"
+                )
+            try:
+                request.window.check(info.width, info.roi_step_px)
+            except LimitExceeded as error:
+                raise LimitExceeded(f"{self._name}: {error}") from None
+            width = request.window.width_px
         need = float(request.frame_rate_hz) * frame_bytes(width, info.height)
-        if need > info.stream.bytes_per_s:
+        if request.mode == "stream" and info.stream is not None and need > info.stream.bytes_per_s:
             raise LimitExceeded(
                 f"{self._name}: {float(request.frame_rate_hz):g} frames of {width} x {info.height} pixels a second are "
                 f"{need / 1e6:.1f} MB/s, the link carries {info.stream.bytes_per_s / 1e6:.1f} MB/s; lower frame_rate "

@@ -59,8 +59,7 @@ class SyncStatus:
     """The device's own report, asked afresh each time."""
 
     state: Literal["stopped", "waiting", "running", "aborted"]
-    """State of the program. A device that cannot tell whether its program waits for the scan marker says "running"
-    then, too."""
+    """State of the program; "running" also where the device cannot tell that its program waits for the scan marker."""
     outputs: int | None
     """Levels read back from the pins; None: this device cannot read them while a program runs."""
 
@@ -105,20 +104,14 @@ class SyncSource(Device):
         self._state = DeviceState.RUNNING
 
     def gate_low(self) -> None:
-        """Take the gate low now, in any state; it stays low until the next `run`. Any thread.
-
-        `DeviceFault` when the gate reads back high.
-        """
+        """Take the gate low now, in any state, until the next `run`. Any thread. `DeviceFault`: it reads back high."""
         self._require("gate_low", *OPEN_STATES)
         _log.info("%s: gate low", self._name)
         self._do_gate_low()
         self._check_low(OUT_GATE, "gate_low")
 
     def abort(self) -> None:
-        """End the program now and take all outputs low, in any state. The program stays loaded. Any thread.
-
-        `DeviceFault` when an output reads back high.
-        """
+        """Take all outputs low, in any state; the program stays loaded. Any thread. `DeviceFault`: one reads high."""
         self._require("abort", *OPEN_STATES)
         _log.info("%s: abort", self._name)
         self._do_abort()

@@ -24,6 +24,8 @@ from drivers.frames import FrameBlock
 from drivers.recorded.order import Entries, in_order
 from drivers.recorded.segments import SegmentReader
 from drivers.spb1 import ALIGN, BlockLayout, Damage, Placed, parse_block
+from drivers.spb1.layout import MAX_FRAMES
+from drivers.spb1.reader import MAX_COUNT
 
 INDEX_FILE: Final = "frames.idx"
 HEADER_BYTES: Final = 64
@@ -34,18 +36,9 @@ MINOR: Final = 0
 
 INDEX_RECORD: Final = np.dtype(
     [
-        ("segment", "<u4"),
-        ("flags", "<u4"),
-        ("offset", "<u8"),
-        ("length", "<u8"),
-        ("run_id", "<u4"),
-        ("block_seq", "<u4"),
-        ("first_frame", "<u8"),
-        ("n_frames", "<u4"),
-        ("sweep", "<u4"),
-        ("t0_ticks", "<u8"),
-        ("reserved", "<u4"),
-        ("crc", "<u4"),
+        *(("segment", "<u4"), ("flags", "<u4"), ("offset", "<u8"), ("length", "<u8")),
+        *(("run_id", "<u4"), ("block_seq", "<u4"), ("first_frame", "<u8"), ("n_frames", "<u4")),
+        *(("sweep", "<u4"), ("t0_ticks", "<u8"), ("reserved", "<u4"), ("crc", "<u4")),
     ]
 )
 """The place of a block: number of its segment, offset and length in bytes (header to trailer, without the zeros behind
@@ -64,30 +57,21 @@ def segment_name(number: int) -> str:
 
 def index_header() -> bytes:
     """The first 64 bytes of an index."""
-    bare = _HEADER.pack(MAGIC, MAJOR, MINOR, RECORD_BYTES, 0)[: -_CRC.size]
-    return bare + _CRC.pack(zlib.crc32(bare))
+    return _signed(_HEADER.pack(MAGIC, MAJOR, MINOR, RECORD_BYTES, 0))
 
 
 def index_of(block: FrameBlock, segment: int, offset: int, length: int | None = None) -> bytes:
-    """The record, 64 bytes, of a block that begins at byte `offset` of `segment`.
-
-    length: its bytes, where it was not written by `drivers.spb1.writer.block_parts`.
-    """
+    """The record, 64 bytes, of a block at byte `offset` of `segment`. length: None for that of `block_parts`."""
     header = block.header
-    bare = _RECORD.pack(
-        segment,
-        int(header.flags),
-        offset,
-        length or BlockLayout(block.n_frames, header.width, header.height).block_bytes,
-        header.run_id,
-        header.block_seq & 0xFFFFFFFF,
-        header.first_frame,
-        block.n_frames,
-        header.sweep,
-        header.t0_ticks,
-        0,
-        0,
-    )[: -_CRC.size]
+    length = length or BlockLayout(block.n_frames, header.width, header.height).block_bytes
+    place = segment, int(header.flags), offset, length
+    numbers = header.run_id, header.block_seq & 0xFFFFFFFF, header.first_frame, block.n_frames
+    return _signed(_RECORD.pack(*place, *numbers, header.sweep, header.t0_ticks, 0, 0))
+
+
+def _signed(record: bytes) -> bytes:
+    """The record with the CRC of all bytes before as its last field."""
+    bare = record[: -_CRC.size]
     return bare + _CRC.pack(zlib.crc32(bare))
 
 
@@ -114,10 +98,6 @@ def decode_index(buffer: NDArray[np.uint8]) -> tuple[NDArray[np.void], NDArray[n
 
 PAGE_BYTES: Final = 4096
 """Blocks of a recording begin on multiples of this."""
-MOST_BLOCK_FRAMES: Final = 0xFFFF
-"""Most frames of a block."""
-MOST_COUNTED: Final = 2**63 - 2**32
-"""Largest count of frames or ticks, as in a block's header."""
 
 
 @dataclass(slots=True)
@@ -168,18 +148,17 @@ def read_entry(segment: SegmentReader, entry: Any) -> FrameBlock:
 
 def _told(folder: Path, problems: list[str]) -> Entries | None:
     """Sound index records, sorted by place; None where there is no index."""
+    if not folder.is_dir():  # a single file has none
+        return None
     try:
-        data = np.fromfile(folder / INDEX_FILE, np.uint8) if folder.is_dir() else None
+        data = np.fromfile(folder / INDEX_FILE, np.uint8)
+        records, sound = decode_index(data)
     except FileNotFoundError:
         problems.append(f"{INDEX_FILE} is missing")
         return None
     except OSError as error:
         problems.append(f"{INDEX_FILE} cannot be read: {error.strerror or error}")
         return None
-    if data is None:  # a single file has none
-        return None
-    try:
-        records, sound = decode_index(data)
     except CorruptBlock as error:
         problems.append(str(error))
         return None
@@ -200,8 +179,8 @@ def _inside(records: Entries, segments: dict[int, SegmentReader], problems: list
     sizes[list(segments)] = [segment.size for segment in segments.values()]
     room = sizes[np.minimum(records["segment"], len(sizes) - 1)]
     inside = records["offset"].astype(np.float64) + records["length"] <= room
-    inside &= (records["offset"] % ALIGN == 0) & (records["length"] > 0) & (records["n_frames"] <= MOST_BLOCK_FRAMES)
-    inside &= (records["first_frame"] <= MOST_COUNTED) & (records["t0_ticks"] <= MOST_COUNTED)
+    inside &= (records["offset"] % ALIGN == 0) & (records["length"] > 0) & (records["n_frames"] <= MAX_FRAMES)
+    inside &= (records["first_frame"] <= MAX_COUNT) & (records["t0_ticks"] <= MAX_COUNT)
     if not inside.all():
         problems.append(f"{INDEX_FILE}: {int((~inside).sum())} blocks lie beyond the end of their segments")
     records = records[inside]
@@ -217,12 +196,9 @@ def _inside(records: Entries, segments: dict[int, SegmentReader], problems: list
 
 def _fits(records: Entries, segment: SegmentReader) -> bool:
     """Whether the first and the last block that the index tells of in a segment are there."""
-    return len(records) == 0 or all(_is_there(segment, entry) for entry in (records[0], records[-1]))
-
-
-def _is_there(segment: SegmentReader, entry: Any) -> bool:
+    ends = (records[0], records[-1]) if len(records) else ()
     try:
-        return _block_at(segment, entry, check_payload=False) is not None
+        return all(_block_at(segment, entry, check_payload=False) is not None for entry in ends)
     except (CorruptBlock, UnsupportedBlock):
         return False
 

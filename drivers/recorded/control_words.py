@@ -28,10 +28,7 @@ BEGIN, END = (b"run", b"swr"), b"abt"
 
 @dataclass(frozen=True, slots=True)
 class Spoken:
-    """The commands that went to a rig, by device, and the buffers of points of each scan that was run.
-
-    Each command is a piece of its own, with the time at which the last of it passed.
-    """
+    """The commands that went to a rig, each with its time, by device, and the buffers of points of each scan."""
 
     commands: dict[str, list[Passed]]
     scans: list[list[Passed]]
@@ -49,19 +46,10 @@ class Spoken:
             if port in FRAME_PORTS:
                 buffers += words
             else:
-                said = _once(_lines(words)) if port == _SERIAL else _without_questions(port, words)
+                asked = _USB_QUESTIONS.get(port, ())
+                said = _once(_lines(words)) if port == _SERIAL else [one for one in words if one.data[0] not in asked]
                 commands.setdefault(device, []).extend(said)
         return cls(commands, _scans(commands.get("sync"), buffers))
-
-
-def is_question(piece: bytes) -> bool:
-    """Whether a piece of bytes to a serial device does nothing but ask."""
-    return all(_QUESTION.fullmatch(line) for line in _LINE_END.split(piece))
-
-
-def _without_questions(port: str, words: list[Passed]) -> list[Passed]:
-    questions = _USB_QUESTIONS.get(port, ())
-    return [word for word in words if word.data[0] not in questions]
 
 
 def _lines(pieces: list[Passed]) -> list[Passed]:

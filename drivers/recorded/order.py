@@ -20,8 +20,7 @@ _OF_BLOCK: Final = 16
 _OF_INDEX: Final = 8
 """Weight of a block and its record in the index, beside 1 for each neighbour: fewer blocks never outweigh more."""
 _OUTLIERS: Final = 4
-"""If more than one block in so many has the wrong ticks or sweep, the device counts in this way, and none is left
-out."""
+"""If more than one block in so many has the wrong ticks or sweep, the device counts so, and none is left out."""
 
 
 def in_order(entries: Entries, told: Entries, problems: list[str], *, folder: bool) -> tuple[Entries, bool]:
@@ -122,10 +121,7 @@ def _agreeing(seq: Ints, first: Ints, t0: Ints, n_frames: Ints) -> Ints:
 
 
 def _heaviest(low: Ints, high: Ints, group: Ints, weight: Ints) -> Ints:
-    """Indices of the heaviest chain in which `low` is at least the `high` of the one before and `group` rises.
-
-    group: does not fall.
-    """
+    """Indices of the heaviest chain whose `low` is at least the `high` before; `group` (never falls) rises in it."""
     ends: list[int] = []  # of chains so far, rising, as do their weights
     totals: list[int] = []
     lasts: list[int] = []

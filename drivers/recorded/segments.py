@@ -99,7 +99,7 @@ def zstandard_or_error() -> Any:
     try:
         import zstandard
     except ImportError:
-        command = install_command("zstandard", "compress")
+        command = install_command("zstandard")
         raise ProtocolError(f"compressed recordings need the package zstandard; install it: {command}") from None
     return zstandard
 
@@ -118,11 +118,8 @@ def _stated_sizes(data: Bytes) -> NDArray[np.int64] | None:
     entries = data[begin + _HEAD.size : len(data) - _FOOT.size].tobytes()
     sizes = np.frombuffer(entries, "<u4").reshape(-1, 2).astype(np.int64)
     packed = np.concatenate([[0], np.cumsum(sizes[:, 0])])
-    if packed[-1] != begin or (sizes <= 0).any() or (sizes[:, 1] > MAX_FRAME_BYTES).any():
-        return None
-    if (sizes[:, 1] > MOST_RATIO * sizes[:, 0]).any():
-        return None
-    return sizes
+    possible = (sizes > 0).all() and (sizes[:, 1] <= np.minimum(MAX_FRAME_BYTES, MOST_RATIO * sizes[:, 0])).all()
+    return sizes if packed[-1] == begin and possible else None
 
 
 def _found_sizes(data: Bytes) -> Iterator[tuple[int, int]]:

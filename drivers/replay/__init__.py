@@ -1,4 +1,1 @@
-"""A recording in place of the devices.
-
-`spad` plays the frames, `stand_ins` play the other devices, `pace` keeps the clock.
-"""
+"""A recording in place of the devices: `spad` plays the frames, `stand_ins` the others, `pace` keeps the clock."""

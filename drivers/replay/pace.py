@@ -24,10 +24,7 @@ _TIMES = re.compile(r"x(\d+(?:\.\d*)?|\.\d+)")
 
 @dataclass(frozen=True, slots=True)
 class ReplayClock:
-    """The replay clock that `--clock` asks for.
-
-    speed: recorded seconds per second. None: frames are due as fast as they are taken, or step by step.
-    """
+    """The replay clock that `--clock` asks for. speed: recorded seconds per second; None: as taken, or in steps."""
 
     speed: float | None = None
     steps: bool = False

@@ -34,10 +34,7 @@ MANIFEST = "manifest.json"
 
 
 def recorded_device(recording: Path, slot: str) -> dict[str, Any] | None:
-    """The manifest's entry on a device of a recording; None where there is no manifest or nothing in it.
-
-    `ProtocolError` where the manifest cannot be read.
-    """
+    """The manifest's entry on a device of a recording; None where there is none. `ProtocolError`: it cannot be read."""
     file = recording / MANIFEST
     try:
         content = parse_json(file.read_text(encoding="utf-8"))
@@ -119,10 +116,7 @@ Piece = tuple[FrameBlock, int, int]
 
 
 class Cursor:
-    """A reading of one start from its first frame to its end, or to frame number `n_frames`. For one thread.
-
-    by_block: steps are blocks, since there are no markers.
-    """
+    """A reading of one start to its end, or to frame number `n_frames`. by_block: steps are blocks. For one thread."""
 
     def __init__(self, recording: RunRecording, run: RecordedRun, n_frames: int | None, *, by_block: bool) -> None:
         begins = run.entries["first_frame"].astype(np.int64)
@@ -295,13 +289,13 @@ class ReplaySpad(SpadArray):
             more = False
             try:
                 more = self._fill(self._reading, ring, timeout_s)
+                return more
             except DeviceTimeout:
                 more = True
                 raise
             finally:
                 if self.pace.halted or not more:
                     self._reading.close()
-        return more
 
     def _fill(self, reading: Cursor, ring: BlockRing, timeout_s: float) -> bool:
         ends_at = time.monotonic() + timeout_s

@@ -10,7 +10,7 @@ from typing import ClassVar, Literal
 from drivers.clock import NS_PER_S, Clock
 from drivers.interfaces import BeamScanner, Pulse, ScannerLimits, ScannerStatus, ScanWaveform, SyncSource, SyncStatus
 from drivers.lasers.serial_laser import PlainLaser
-from drivers.registry import Kind, KindConfig, Surroundings
+from drivers.registry import Kind, KindConfig
 
 LIMITS = ScannerLimits(
     command_range=(-1.0, 1.0),
@@ -104,18 +104,6 @@ class RecordedSync(SyncSource):
         pass  # no handles
 
 
-def _scanner(config: StandInConfig, surroundings: Surroundings) -> RecordedScanner:
-    return RecordedScanner(surroundings.clock)
-
-
-def _laser(config: StandInConfig, surroundings: Surroundings) -> PlainLaser:
-    return PlainLaser("recorded laser", MAX_POWER_W)
-
-
-def _sync(config: StandInConfig, surroundings: Surroundings) -> RecordedSync:
-    return RecordedSync("recorded sync source")
-
-
-SCANNER = Kind(config=StandInConfig, create=_scanner)
-LASER = Kind(config=StandInConfig, create=_laser)
-SYNC = Kind(config=StandInConfig, create=_sync)
+SCANNER = Kind(config=StandInConfig, create=lambda _, surroundings: RecordedScanner(surroundings.clock))
+LASER = Kind(config=StandInConfig, create=lambda _, surroundings: PlainLaser("recorded laser", MAX_POWER_W))
+SYNC = Kind(config=StandInConfig, create=lambda _, surroundings: RecordedSync("recorded sync source"))

@@ -3,19 +3,15 @@
 Facts and their sources: docs/reference/hardware.md; `spad512s_line` speaks with the program. In short:
 
 - The vendor's program must run, on this computer or behind a bridge; it serves one client.
-- `PU,0` goes before every acquisition. `I,1,tInt,n,trigger,overlap,sparse,1` takes n frames of 1 bit: tInt is in
-  microseconds at 1 and 4 bits, in milliseconds from 6 bits on, so this driver sends microseconds and 1 bit only.
+- `PU,0` goes before every acquisition. `I,1,tInt,n,trigger,overlap,sparse,1` takes n frames of 1 bit, tInt in
+  microseconds (at 1 and 4 bits; milliseconds from 6 bits on).
 - The answer is 32 768 bytes a frame (65 536 of a 1M sensor), most significant bit first; then `DONE`, or text that ends
-  with `ERROR`, anywhere.
+  with `ERROR`, anywhere. Pixels may well read the same: the exact length decides, and the text behind it.
 - Frames lie on their side: the vendor's samples turn them by 90 degrees counter-clockwise (`rotation`).
-
-The sensor takes a run into its own memory (BURST). Its frames carry neither ticks nor markers: they say nothing of the
-scanner, the records' ticks are nominal. `STOP` is known from other people's code only; a run that does not end soon
-after it is left by closing the connection.
-
-Pixels may well read `DONE` or `ERROR`: the exact length decides, and the text behind it. A block is given out once so
-much has come behind it that no error text can be part of it. Frames have neither number nor checksum: pixels handed
-over twice in place of others have the right length, so that no frame may be the very same as one before.
+- Frames carry neither ticks nor markers: the records' ticks are nominal. Nor have they number or checksum: pixels
+  handed over twice have the right length, so that no frame may be the very same as one before.
+- `STOP` is known from other people's code only; a run that does not end soon after it is left by closing the
+  connection.
 """
 
 import threading
@@ -30,12 +26,12 @@ from numpy.typing import NDArray
 from pydantic import Field
 
 from drivers.errors import DeviceFault, DeviceNotFound, DeviceTimeout, LimitExceeded, ProtocolError
-from drivers.frames import BlockFlag, BlockHeader
+from drivers.frames import BlockFlag, BlockHeader, FrameBlock
 from drivers.interfaces import BurstMode, SpadArray, SpadCounters, SpadHealth, SpadInfo, SpadRequest, SpadTiming
 from drivers.registry import Kind, KindConfig, Surroundings
 from drivers.ring import BlockRing
 from drivers.spads.orientation import QuarterTurn, turn_packed, turned_size
-from drivers.spads.spad512s_line import DONE, ERROR, Deadlines, Spad512sIdentity, Spad512sLine
+from drivers.spads.spad512s_line import DONE, ERROR, Deadlines, Spad512sLine
 from drivers.spb1 import BlockLayout, block_views, seal_block
 from drivers.transports.endpoints import Endpoint, resolve
 from drivers.transports.tap import Tap
@@ -198,7 +194,7 @@ class Spad512s(SpadArray):
         self._busy = threading.Lock()
         """Held while the line is in use, so that `stop` waits for `fill`."""
         self._halt = threading.Event()
-        self._counters = SpadCounters(0, 0, 0, None, None)
+        self._exposed = self._delivered = self._lost = 0
         self._run_id = 0
         self._run: Spad512sRun | None = None
         self._identity = self._line.connect()
@@ -238,7 +234,7 @@ class Spad512s(SpadArray):
         return SpadHealth(temperatures, excess_bias_v=excess_v, frame_clock_hz=frame_clock_hz)
 
     def _do_counters(self) -> SpadCounters:
-        return self._counters
+        return SpadCounters(self._exposed, self._delivered, self._lost, None, None)
 
     def _do_configure(self, request: SpadRequest) -> SpadTiming:
         exposure_us = round(request.exposure_s * 1e6)
@@ -252,9 +248,9 @@ class Spad512s(SpadArray):
         period = int(tick_hz / request.frame_rate_hz)
         exposure = min(round(exposure_us * tick_hz / 1_000_000), period)
         self._exposure_us = exposure_us
-        layout = BlockLayout(request.block_frames, self._info.width, self._info.height)
         self._block_frames = request.block_frames
-        self._timing = SpadTiming(tick_hz, period, exposure, layout.min_stride)
+        stride = BlockLayout(request.block_frames, self._info.width, self._info.height).min_stride
+        self._timing = SpadTiming(tick_hz, period, exposure, stride)
         return self._timing
 
     def _check_period(self, request: SpadRequest, exposure_us: int) -> None:
@@ -275,7 +271,7 @@ class Spad512s(SpadArray):
             self._line.ask("PU,0")
             self._halt.clear()
             self._run_id = (self._run_id + 1) & 0xFFFF
-            self._counters = SpadCounters(n_frames, 0, 0, None, None)
+            self._exposed, self._delivered, self._lost = n_frames, 0, 0
             frame_bytes = self._identity.rows * ROW_BYTES
             self._run = Spad512sRun(self.name, self._line, n_frames, self._block_frames, frame_bytes)
             external = int(self._config.trigger == "external")
@@ -283,27 +279,25 @@ class Spad512s(SpadArray):
             self._line.tell(f"I,1,{self._exposure_us},{n_frames},{external},1,0,1\n")
 
     def _connect_where_lost(self) -> None:
-        """Connect again after the program was restarted or left. DeviceFault where another device answers now."""
-        if self._line.is_open:
-            return
-        again, before = self._connect_again().master_serial, self._identity.master_serial
-        if again != before:
-            self._line.hang_up()
-            raise DeviceFault(
-                f"{self.name}: another device ({again}) answers at {self._line.address} now, it was {before}; "
-                "open it again"
-            )
+        """Connect again after the program was restarted or left, which listens again a moment after its one client.
 
-    def _connect_again(self) -> Spad512sIdentity:
-        """Connect again: the program serves one client, and listens again a moment after that one has left."""
+        DeviceFault where another device answers now.
+        """
         ends_at = time.monotonic() + self._deadlines.listens_s
-        while True:
+        while not self._line.is_open:
             try:
-                return self._line.connect()
+                again, before = self._line.connect().master_serial, self._identity.master_serial
             except DeviceNotFound:
                 if time.monotonic() >= ends_at:
                     raise
                 time.sleep(0.02)
+                continue
+            if again != before:
+                self._line.hang_up()
+                raise DeviceFault(
+                    f"{self.name}: another device ({again}) answers at {self._line.address} now, it was {before}; "
+                    "open it again"
+                )
 
     def _do_fill(self, ring: BlockRing, timeout_s: float) -> bool:
         with self._busy:
@@ -311,46 +305,43 @@ class Spad512s(SpadArray):
             if run is None or self._halt.is_set():
                 return False
             try:
-                more = self._fill(run, ring, timeout_s)
+                self._fill(run, ring, timeout_s)
             except DeviceTimeout:
                 raise
             except BaseException:
                 # Nothing that still comes can be told from an answer, so the connection goes with the run.
                 self._run = None
-                self._rest_is_lost()
+                self._lost = self._exposed - self._delivered
                 self._line.hang_up()
                 raise
-            if not more:
-                self._run = None
-            return more
+            return run.next_n > 0
 
-    def _fill(self, run: Spad512sRun, ring: BlockRing, timeout_s: float) -> bool:
+    def _fill(self, run: Spad512sRun, ring: BlockRing, timeout_s: float) -> None:
         """Receive one block and publish it."""
         ends_at = time.monotonic() + timeout_s
         pixels = run.receive(ends_at, timeout_s, self._halt.is_set)
         if pixels is None:
-            return False
+            return
         memory = self._claim(ring, ends_at, timeout_s)
         if memory is None:
-            self._count(run.next_n, lost=True)
+            self._lost += run.next_n
             ring.mark_overflow(run.next_n)
         else:
-            self._publish(run, ring, memory, pixels)
+            block = self._written(run, memory, pixels)
+            self._delivered += run.next_n
+            ring.publish(block)
             run.block_seq += 1
         run.just_lost = memory is None
         run.go_on()
-        return run.next_n > 0
 
-    def _publish(self, run: Spad512sRun, ring: BlockRing, memory: NDArray[np.uint8], pixels: NDArray[np.uint8]) -> None:
+    def _written(self, run: Spad512sRun, memory: NDArray[np.uint8], pixels: NDArray[np.uint8]) -> FrameBlock:
         n = run.next_n
         layout = BlockLayout(n, self._info.width, self._info.height)
         records, bits = block_views(memory, layout)
         turn_packed(pixels.reshape(n, self._identity.rows, ROW_BYTES), self._config.rotation, bits)
         records[:] = np.zeros((), records.dtype)
         records["ticks"] = np.arange(n, dtype=np.uint32) * np.uint32(self._timing.frame_period_ticks)
-        block = seal_block(memory, self._header(run), layout, payload_crc=False)
-        self._count(n, lost=False)
-        ring.publish(block)
+        return seal_block(memory, self._header(run), layout, payload_crc=False)
 
     def _claim(self, ring: BlockRing, ends_at: float, timeout_s: float) -> NDArray[np.uint8] | None:
         """A free slot; None where there is none and the ring does not wait."""
@@ -362,16 +353,6 @@ class Spad512s(SpadArray):
                 raise DeviceTimeout(
                     f"{self.name}: no free slot in the ring within {timeout_s:g} s; readers are too slow"
                 )
-
-    def _count(self, n: int, *, lost: bool) -> None:
-        old = self._counters
-        self._counters = SpadCounters(
-            old.exposed, old.delivered + (0 if lost else n), (old.lost or 0) + (n if lost else 0), None, None
-        )
-
-    @property
-    def _lost(self) -> int:
-        return self._counters.lost or 0
 
     def _header(self, run: Spad512sRun) -> BlockHeader:
         flags = BlockFlag.BURST
@@ -405,13 +386,8 @@ class Spad512s(SpadArray):
         with self._busy:
             run, self._run = self._run, None
             if run is not None:
-                self._rest_is_lost()
+                self._lost = self._exposed - self._delivered
                 self._line.leave_run()
-
-    def _rest_is_lost(self) -> None:
-        old = self._counters
-        exposed = old.exposed or 0
-        self._counters = SpadCounters(exposed, old.delivered, exposed - old.delivered, None, None)
 
     def _do_close(self) -> None:
         self._line.hang_up()

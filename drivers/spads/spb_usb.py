@@ -73,10 +73,7 @@ class SpbUsb(SpadArray):
     """An SPB1 SPAD over an open link."""
 
     def __init__(self, config: SpbUsbConfig, link: BulkLink, clock: Clock, tap: Tap | None = None) -> None:
-        """Check who is there and, where asked for, its test pattern. The link is closed with the device.
-
-        clock: of its deadlines, that on which the link waits. tap: told of its control traffic.
-        """
+        """Check who is there and its test pattern. clock: of its deadlines, that on which the link waits."""
         super().__init__(link.label)
         self._config = config
         self._link = link
@@ -149,17 +146,9 @@ class SpbUsb(SpadArray):
             write_length(self._control, n_frames)
             self._halt.clear()
             run_id = self._control.send(Op.START).value
-            info = self.info
-            armed = Armed(
-                run_id,
-                self._timing.stride,
-                self._width,
-                info.height,
-                info.width,
-                info.height,
-                n_frames,
-                self._check_payload,
-            )
+            sensor = self.info.width, self.info.height
+            frames = self._width, self.info.height, *sensor
+            armed = Armed(run_id, self._timing.stride, *frames, n_frames, self._check_payload)
             self._receiver = BlockReceiver(self._link, self._wiring.stream_in, armed, self.name)
             self._counters = SpadCounters(0, 0, 0, 0, 0)
             self._pinged_at = self._heard_at = self._now_s()

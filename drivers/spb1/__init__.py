@@ -1,21 +1,15 @@
 """SPB1 blocks, the zero-copy form of frames on the wire and on disk: layout, writing, reading, walking a stream."""
 
-from drivers.spb1.layout import ALIGN, HEADER_BYTES, TRAILER_BYTES, BlockLayout, block_views, frames_per_block
-from drivers.spb1.reader import Damage, Placed, parse_block, walk_blocks, walk_placed
-from drivers.spb1.writer import block_parts, seal_block
-
-__all__ = [
-    "ALIGN",
-    "HEADER_BYTES",
-    "TRAILER_BYTES",
-    "BlockLayout",
-    "Damage",
-    "Placed",
-    "block_parts",
-    "block_views",
-    "frames_per_block",
-    "parse_block",
-    "seal_block",
-    "walk_blocks",
-    "walk_placed",
-]
+from drivers.spb1.layout import ALIGN as ALIGN
+from drivers.spb1.layout import HEADER_BYTES as HEADER_BYTES
+from drivers.spb1.layout import TRAILER_BYTES as TRAILER_BYTES
+from drivers.spb1.layout import BlockLayout as BlockLayout
+from drivers.spb1.layout import block_views as block_views
+from drivers.spb1.layout import frames_per_block as frames_per_block
+from drivers.spb1.reader import Damage as Damage
+from drivers.spb1.reader import Placed as Placed
+from drivers.spb1.reader import parse_block as parse_block
+from drivers.spb1.reader import walk_blocks as walk_blocks
+from drivers.spb1.reader import walk_placed as walk_placed
+from drivers.spb1.writer import block_parts as block_parts
+from drivers.spb1.writer import seal_block as seal_block

@@ -6,9 +6,8 @@ acknowledged with 16 bytes, in order: on an IN endpoint of their own, or as payl
 
 import struct
 from collections.abc import Callable, Iterable, Sequence
-from dataclasses import dataclass
 from enum import IntEnum, IntFlag
-from typing import Final
+from typing import Final, NamedTuple
 
 import numpy as np
 
@@ -22,7 +21,7 @@ from drivers.transports.tap import IN, OUT, Tap
 COMMAND: Final = struct.Struct("<4sHHII")
 """magic, op, request id, address, value."""
 COMMAND_MAGIC: Final = b"SPC1"
-ACK: Final = struct.Struct("<4sHHII")
+ACK: Final = COMMAND
 """magic, op, request id, status, value."""
 ACK_MAGIC: Final = b"SPA1"
 ACK_BLOCK_BYTES: Final = 1024
@@ -128,8 +127,7 @@ class Register(IntEnum):
     """x0 of all entries, one register each, sweep after sweep."""
 
 
-@dataclass(frozen=True, slots=True)
-class Command:
+class Command(NamedTuple):
     """One command."""
 
     op: int
@@ -139,11 +137,10 @@ class Command:
 
     def packed(self) -> bytes:
         """The command's 16 bytes."""
-        return COMMAND.pack(COMMAND_MAGIC, self.op, self.request_id, self.address, self.value)
+        return COMMAND.pack(COMMAND_MAGIC, *self)
 
 
-@dataclass(frozen=True, slots=True)
-class Ack:
+class Ack(NamedTuple):
     """One acknowledgement."""
 
     op: int
@@ -153,7 +150,7 @@ class Ack:
 
     def packed(self) -> bytes:
         """The acknowledgement's 16 bytes."""
-        return ACK.pack(ACK_MAGIC, self.op, self.request_id, self.status, self.value)
+        return ACK.pack(ACK_MAGIC, *self)
 
 
 def read_acks(data: bytes) -> list[Ack]:
@@ -170,17 +167,17 @@ def read_acks(data: bytes) -> list[Ack]:
 
 def require_ok(label: str, command: Command, ack: Ack) -> None:
     """`DeviceFault` where a command was refused."""
-    if ack.status == AckStatus.OK:
-        return
-    words = {
-        AckStatus.UNKNOWN_OP: "does not know it",
-        AckStatus.BAD_ADDRESS: "has no such register",
-        AckStatus.BAD_VALUE: "refuses the value",
-        AckStatus.WRONG_STATE: "is in the wrong state",
-    }
-    why = words[AckStatus(ack.status)] if ack.status in words else f"answers status {ack.status}"
-    name = Op(command.op).name
-    raise DeviceFault(f"{label}: {name} 0x{command.address:04x} = {command.value}: the device {why}")
+    if ack.status != AckStatus.OK:
+        why, name = _REFUSALS.get(ack.status, f"answers status {ack.status}"), Op(command.op).name
+        raise DeviceFault(f"{label}: {name} 0x{command.address:04x} = {command.value}: the device {why}")
+
+
+_REFUSALS: Final[dict[int, str]] = {
+    AckStatus.UNKNOWN_OP: "does not know it",
+    AckStatus.BAD_ADDRESS: "has no such register",
+    AckStatus.BAD_VALUE: "refuses the value",
+    AckStatus.WRONG_STATE: "is in the wrong state",
+}
 
 
 def pattern_row(row: int, frame: int, width: int) -> bytes:
@@ -243,11 +240,7 @@ class ControlChannel:
         return self.read_all((register,))[0]
 
     def read_all(self, registers: Sequence[int]) -> list[int]:
-        """The values of several registers, each asked for twice: acknowledgements carry no checksum, and a value may
-        just change.
-
-        `ProtocolError` where the answers never agree.
-        """
+        """The values of several registers, each asked for twice: they have no checksum. `ProtocolError`."""
         for _ in range(_TRIES):
             values = [ack.value for ack in self._ask([(Op.READ, register, 0) for register in (*registers, *registers)])]
             if values[: len(registers)] == values[len(registers) :]:

@@ -24,7 +24,7 @@ MAX_FRAMES: Final = 0xFFFF
 MAGIC: Final = b"SPB1"
 TRAILER_MAGIC: Final = b"SPE1"
 MAJOR: Final = 1
-MINOR: Final = 0
+VERSION: Final = MAJOR << 8 | 0
 
 HEADER: Final = struct.Struct("<4sHHIBBHQQQQIIIIIHHHHHHIIII")
 TRAILER: Final = struct.Struct("<4sIQIIII")

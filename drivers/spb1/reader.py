@@ -5,6 +5,7 @@ that would cost a live path a good part of a core. Nothing damaged is passed on,
 """
 
 from collections.abc import Iterator
+from contextlib import suppress
 from dataclasses import dataclass
 from fractions import Fraction
 from functools import lru_cache
@@ -45,7 +46,7 @@ _PAYLOADS: Final = {
     IDLE: "an idle heartbeat, no frames",
 }
 
-_MAX_COUNT: Final = 2**63 - 2**32
+MAX_COUNT: Final = 2**63 - 2**32
 """Frame numbers and ticks stay within int64 also after adding what a block's records span."""
 
 _LSB_FIRST: Final = int(BlockFlag.LSB_FIRST)
@@ -105,25 +106,10 @@ def read_header(buffer: NDArray[np.uint8]) -> HeaderFields:
     (_, version, header_bytes, flags, bits_per_px, payload_type, run_id, block_seq, first_frame, t0_ticks) = fields[:10]
     (lost_before, tick_hz, tick_hz_den, period, exposure, sweep, n_frames, frame_step, width, height) = fields[10:20]
     (sensor_width, sensor_height, payload_bytes, pixels_offset) = fields[20:24]
-    header = BlockHeader(
-        BlockFlag(flags & ~_LSB_FIRST),
-        run_id,
-        block_seq,
-        first_frame,
-        t0_ticks,
-        lost_before,
-        _rate(tick_hz, tick_hz_den),
-        period,
-        exposure,
-        sweep,
-        frame_step,
-        width,
-        height,
-        sensor_width,
-        sensor_height,
-        bits_per_px,
-        payload_type,
-    )
+    counts = run_id, block_seq, first_frame, t0_ticks, lost_before
+    times = _rate(tick_hz, tick_hz_den), period, exposure, sweep, frame_step
+    sizes = width, height, sensor_width, sensor_height
+    header = BlockHeader(BlockFlag(flags & ~_LSB_FIRST), *counts, *times, *sizes, bits_per_px, payload_type)
     lsb_first = bool(flags & _LSB_FIRST)
     return HeaderFields(header, version, lsb_first, n_frames, header_bytes, payload_bytes, pixels_offset)
 
@@ -188,7 +174,7 @@ def _checked_layout(fields: HeaderFields, room: int) -> BlockLayout:
         )
     if block.tick_hz <= 0:
         raise CorruptBlock(f"{where}: tick rate of 0 Hz")
-    if max(block.first_frame, block.t0_ticks) > _MAX_COUNT:
+    if max(block.first_frame, block.t0_ticks) > MAX_COUNT:
         raise CorruptBlock(f"{where}: frame {block.first_frame} at tick {block.t0_ticks} is beyond 63 bits")
     layout = BlockLayout(fields.n_frames, block.width, block.height)
     records_end = fields.header_bytes + FRAME_RECORD.itemsize * fields.n_frames
@@ -259,13 +245,14 @@ def walk_blocks(buffer: NDArray[np.uint8], stride: int | None, *, check_payload:
             if item.unsupported:
                 raise UnsupportedBlock(item.reason)
             yield item
-        elif last is None or not _repeats(item.block, last):
-            last = item.block
-            yield item.block
-        else:
-            seq, run = item.block.header.block_seq, item.block.header.run_id
+            continue
+        seq, run = item.block.header.block_seq, item.block.header.run_id
+        if last is not None and last.header.run_id == run and last.header.block_seq >= seq:
             reason = f"block {seq} of run {run} comes after block {last.header.block_seq}"
             yield Damage(item.offset, min(item.end, len(buffer)) - item.offset, reason)
+        else:
+            last = item.block
+            yield last
 
 
 @dataclass(frozen=True, slots=True)
@@ -279,10 +266,7 @@ class Placed:
 
 
 def walk_placed(buffer: NDArray[np.uint8], stride: int | None, *, check_payload: bool) -> Iterator[Placed | Damage]:
-    """Walk the blocks as `walk_blocks` does, with their places, and in whatever order they come, even twice.
-
-    A block of another sort is damage here, but what is behind it is read all the same.
-    """
+    """The blocks with their places, in whatever order they come, even twice; what is of another sort is damage."""
     if stride is not None:
         check_stride(stride)
     offset = 0
@@ -323,24 +307,14 @@ def _zeros(buffer: NDArray[np.uint8], offset: int) -> int:
     return end - offset
 
 
-def _repeats(block: FrameBlock, last: FrameBlock) -> bool:
-    return block.header.run_id == last.header.run_id and block.header.block_seq <= last.header.block_seq
-
-
 def _next_header(buffer: NDArray[np.uint8], start: int, *, passed_over: int) -> int:
     """Offset of the next sound header at or after `start`, or the buffer's end."""
     for window in range(start, len(buffer), _SEARCH_BYTES):
         first_bytes = buffer[window : window + _SEARCH_BYTES : ALIGN]
         for index in np.flatnonzero(first_bytes == MAGIC[0]):
             offset = window + int(index) * ALIGN
-            if offset != passed_over and _has_header(buffer[offset:]):
-                return offset
+            if offset != passed_over:
+                with suppress(CorruptBlock):
+                    read_header(buffer[offset:])
+                    return offset
     return len(buffer)
-
-
-def _has_header(buffer: NDArray[np.uint8]) -> bool:
-    try:
-        read_header(buffer)
-    except CorruptBlock:
-        return False
-    return True

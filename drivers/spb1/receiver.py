@@ -1,11 +1,9 @@
 """The receiving end of a live SPB1 stream (docs/reference/spb1-usb.md): queued reads that point into ring slots.
 
-Reads of one stride each are kept in flight, into slots claimed in the order in which they will be published. A block is
-taken where it lies, or refused and counted; after damage the next sound header on a multiple of 1024 bytes tells where
-blocks begin, the reads already queued across that border are given up and one short read restores the step.
-
-Where the ring has no free slot, reads go on into spare memory so that the device's FIFO does not starve: what comes
-there is copied where a slot came free meanwhile, else dropped and counted.
+Reads of one stride each are kept in flight, into slots claimed in order. A block is taken where it lies, or refused and
+counted; after damage the next sound header on a multiple of 1024 bytes tells where blocks begin, and one short read
+restores the step. Where the ring has no free slot, reads go on into spare memory so that the device's FIFO does not
+starve: what comes there is copied where a slot came free meanwhile, else dropped and counted.
 """
 
 import logging
@@ -178,29 +176,26 @@ class BlockReceiver:
             self._ring.discard()
 
     def _judge(self, item: _Item, data: Buffer) -> Took:
+        took = Took.CONTROL
         try:
             fields = read_header(data)
-            if fields.is_control or fields.block.run_id != self._armed.run_id:
-                self._give_back(item)
-                return Took.CONTROL
-            self._require_armed(fields)
-            block = read_frames(data, fields, check_payload=self._armed.check_payload)
-            self._require_windows(block)
+            if not fields.is_control and fields.block.run_id == self._armed.run_id:
+                self._require_armed(fields)
+                block = read_frames(data, fields, check_payload=self._armed.check_payload)
+                self._require_windows(block)
+                self._note(fields, block.n_frames)
+                took = Took.FRAMES if block.n_frames else Took.CONTROL
         except CorruptBlock as error:
             self.crc_errors += 1
             _log.warning("%s: block refused: %s", self._label, error)
             self._find_step(data)
-            self._give_back(item)
-            return Took.REFUSED
-        except BaseException:
-            self._give_back(item)
-            raise
-        self._note(fields, block.n_frames)
-        if block.n_frames == 0:
-            self._give_back(item)
-            return Took.CONTROL
-        self._hand_over(item, fields, block)
-        return Took.FRAMES
+            took = Took.REFUSED
+        finally:
+            if took is not Took.FRAMES:
+                self._give_back(item)
+        if took is Took.FRAMES:
+            self._hand_over(item, fields, block)
+        return took
 
     def _require_armed(self, fields: HeaderFields) -> None:
         """CorruptBlock for a sound block that cannot be the next of this run."""

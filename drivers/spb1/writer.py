@@ -12,13 +12,12 @@ from drivers.spb1.layout import (
     HEADER,
     HEADER_BYTES,
     MAGIC,
-    MAJOR,
-    MINOR,
     PACKED,
     PIXELS_ALIGN,
     TRAILER,
     TRAILER_BYTES,
     TRAILER_MAGIC,
+    VERSION,
     BlockLayout,
     block_views,
     crc32,
@@ -55,20 +54,8 @@ def seal_control(buffer: NDArray[np.uint8], payload_type: int, run_id: int, payl
     """Write a control block (`REGISTER_ACK`, `IDLE`) without frames. buffer: uint8 (stride,), all of it is written."""
     end = HEADER_BYTES + len(payload)
     raw = buffer.data
-    pixels_offset = round_up(end, PIXELS_ALIGN)
-    numbers = (
-        MAGIC,
-        MAJOR << 8 | MINOR,
-        HEADER_BYTES,
-        0,
-        1,
-        payload_type,
-        run_id,
-        *(0,) * 15,
-        len(payload),
-        pixels_offset,
-    )
-    HEADER.pack_into(raw, 0, *numbers, 0, 0)
+    sizes = len(payload), round_up(end, PIXELS_ALIGN)
+    HEADER.pack_into(raw, 0, MAGIC, VERSION, HEADER_BYTES, 0, 1, payload_type, run_id, *(0,) * 15, *sizes, 0, 0)
     raw[HEADER_BYTES:end] = payload
     trailer = raw[end : end + TRAILER_BYTES]
     TRAILER.pack_into(trailer, 0, TRAILER_MAGIC, BlockStatus.OK, 0, len(payload), crc32(payload), 0, 0)
@@ -104,56 +91,20 @@ def _bytes_of(array: NDArray[Any]) -> memoryview:
 def _pack(
     head: memoryview, trailer: memoryview, header: BlockHeader, layout: BlockLayout, status: int, crc: int
 ) -> None:
+    sort = int(header.flags), header.bits_per_px, header.payload_type
+    counts = header.run_id, header.block_seq, header.first_frame, header.t0_ticks, header.lost_before
+    times = header.tick_hz.numerator, header.tick_hz.denominator, header.frame_period_ticks, header.exposure_ticks
+    frames = header.sweep, layout.n_frames, header.frame_step
+    sizes = header.width, header.height, header.sensor_width, header.sensor_height
+    places = layout.payload_bytes, layout.pixels_offset
+    lost = header.lost_before & 0xFFFFFFFF
     try:
-        _pack_header(head, header, layout)
-        TRAILER.pack_into(
-            trailer,
-            0,
-            TRAILER_MAGIC,
-            status,
-            header.block_seq,
-            layout.payload_bytes,
-            crc,
-            header.lost_before & 0xFFFFFFFF,
-            0,
-        )
+        HEADER.pack_into(head, 0, MAGIC, VERSION, HEADER_BYTES, *sort, *counts, *times, *frames, *sizes, *places, 0, 0)
+        TRAILER.pack_into(trailer, 0, TRAILER_MAGIC, status, header.block_seq, layout.payload_bytes, crc, lost, 0)
     except struct.error as error:
         raise ValueError(f"block {header.block_seq}: a field does not fit SPB1 1.0: {error}") from None
     _sign(head)
     _sign(trailer)
-
-
-def _pack_header(raw: memoryview, header: BlockHeader, layout: BlockLayout) -> None:
-    HEADER.pack_into(
-        raw,
-        0,
-        MAGIC,
-        MAJOR << 8 | MINOR,
-        HEADER_BYTES,
-        int(header.flags),
-        header.bits_per_px,
-        header.payload_type,
-        header.run_id,
-        header.block_seq,
-        header.first_frame,
-        header.t0_ticks,
-        header.lost_before,
-        header.tick_hz.numerator,
-        header.tick_hz.denominator,
-        header.frame_period_ticks,
-        header.exposure_ticks,
-        header.sweep,
-        layout.n_frames,
-        header.frame_step,
-        header.width,
-        header.height,
-        header.sensor_width,
-        header.sensor_height,
-        layout.payload_bytes,
-        layout.pixels_offset,
-        0,
-        0,
-    )
 
 
 def _sign(part: memoryview) -> None:

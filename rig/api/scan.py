@@ -133,7 +133,7 @@ def replay(
     played = ReplayOptions(request.clock, request.loop, request.block_frames)
     others = None if request.config is None else configure(request.config)
     estimate = _chosen(request, "estimator", "filter", "min_confidence", "threads")
-    settings = replay_config(Path(run), played, others, estimate, against_recording=request.against_recording)
+    settings = replay_config(Path(run), played, others, estimate)
     if calibration is not None:
         settings = settings.model_copy(update={"calibration": Path(calibration)})
     listeners = _listeners(progress, live, monitor, on_space)

@@ -47,7 +47,7 @@ def require_h5py() -> Any:
     try:
         import h5py
     except ImportError as error:
-        raise UsageError(f"export as hdf5 needs h5py; install it: {install_command('h5py', 'exchange')}") from error
+        raise UsageError(f"export as hdf5 needs h5py; install it: {install_command('h5py')}") from error
     return h5py
 
 

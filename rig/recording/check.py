@@ -15,11 +15,11 @@ import numpy as np
 from numpy.typing import NDArray
 
 from drivers.frames import BlockHeader
-from drivers.recorded.contents import INDEX_RECORD, MOST_BLOCK_FRAMES, Contents, damage_line, index_of
+from drivers.recorded.contents import INDEX_RECORD, Contents, damage_line, index_of
 from drivers.recorded.order import Entries, in_order
 from drivers.recorded.segments import SegmentReader
 from drivers.spb1 import HEADER_BYTES, TRAILER_BYTES, BlockLayout, Placed
-from drivers.spb1.layout import TRAILER
+from drivers.spb1.layout import MAX_FRAMES, TRAILER
 from rig.progress import tell_stage
 from rig.run_folder.manifest import RunGap, device_counters, ended_early
 
@@ -329,10 +329,7 @@ def _reaches_beyond(entry: Any, run: Run) -> bool:
     if near is run[0] and first + n_frames > near.first_frame:
         return False
     header = near.header
-    if (
-        n_frames > MOST_BLOCK_FRAMES
-        or int(entry["length"]) != BlockLayout(n_frames, header.width, header.height).block_bytes
-    ):
+    if n_frames > MAX_FRAMES or int(entry["length"]) != BlockLayout(n_frames, header.width, header.height).block_bytes:
         return False
     return in_step(first - near.first_frame, int(entry["t0_ticks"]) - header.t0_ticks, header)
 

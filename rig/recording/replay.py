@@ -80,18 +80,10 @@ class ReplayOptions:
             raise UsageError(f"block_frames is {self.block_frames}; it must be at least 1")
 
 
-def replay_config(
-    run: Path,
-    options: ReplayOptions,
-    others: RigConfig | None,
-    estimate: dict[str, Any],
-    *,
-    against_recording: bool = False,
-) -> RigConfig:
+def replay_config(run: Path, options: ReplayOptions, others: RigConfig | None, estimate: dict[str, Any]) -> RigConfig:
     """Make the config of the rig that plays a recording.
 
     others: rig whose world, scanner, laser and sync source take part; None plays the recorded ones.
-    against_recording: the recording's own drivers take part, and get the answers that their devices gave then.
     estimate: settings laid over those of the recording.
     Raises UsageError where there is no recording.
     """
@@ -126,8 +118,6 @@ def replay_config(
         content["estimate"].pop("temporal_prior", None)
     if others is not None:
         content |= {slot: part for slot, part in others.model_dump(mode="json").items() if slot in (*RECORDED, "world")}
-    elif against_recording:
-        content |= _own_drivers(run, recorded)
     return parse_config(content, options=[f"estimate.{key}" for key in given])
 
 
@@ -365,18 +355,6 @@ def _whole_sweeps(recording: RunRecording, run: RecordedRun, plan: ScanPlan) -> 
         return 0
     before = last.header.sweep
     return min(run.frames, max(0, before + int(((last.records["sweep"].astype(np.int64) - before) & 0xFFFF).max()) - 1))
-
-
-def _own_drivers(run: Path, recorded: dict[str, Any]) -> dict[str, Any]:
-    """The drivers of a recorded config, at ports where the recorded traffic answers. UsageError without any."""
-    parts = {slot: recorded.get(slot) or {} for slot in RECORDED}
-    parts = {slot: {**part, "port": f"emulated:{slot}"} for slot, part in parts.items() if "port" in part}
-    if not parts:
-        raise UsageError(f"{run} was taken with simulated devices only: there is no driver to play it against")
-    world = {"kind": "recorded", "recording": str(run.absolute())}
-    if "scanner" in parts:
-        world["scanner"] = parts["scanner"]["kind"]
-    return {"world": world, **parts}
 
 
 def _scan_of(plan: ScanPlan) -> dict[str, Any]:

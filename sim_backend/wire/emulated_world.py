@@ -112,29 +112,21 @@ class EmulatedWorld(SimulatedWorld):
             "scanner": on_bus,
             "spad": on_bus,
         }
-        self.spad512s_wire: TcpServer | None = None
+        self._wires: list[SerialServer | TcpServer] = [self.laser_wire, self.gate_wire]
         if config.spad == "spad512s":
-            self.spad512s_wire = TcpServer(Spad512sModel(self._frames.whole, paced=True), clock=clock).start()
-            self.ports["spad"] = self.spad512s_wire.endpoint
-        """Where the emulated devices are."""
+            wire = TcpServer(Spad512sModel(self._frames.whole, paced=True), clock=clock).start()
+            self.ports["spad"] = wire.endpoint
+            self._wires.append(wire)
 
     def close(self) -> None:
         """Unplug everything and end the threads; again: nothing happens."""
-        self.laser_wire.close()
-        self.gate_wire.close()
-        if self.spad512s_wire is not None:
-            self.spad512s_wire.close()
+        for wire in self._wires:
+            wire.close()
         self._frames.close()
-
-    @property
-    def seed(self) -> int:
-        """Seed of everything that is random here."""
-        return self._seed
 
     def photon_source(self, times: FrameTimes) -> PhotonSource:
         """A source of frames that follow one another at these times."""
-        threads = min(MAX_THREADS, os.cpu_count() or 1)
-        return self.photons(times, self._seed, threads)
+        return self.photons(times, self._seed, min(MAX_THREADS, os.cpu_count() or 1))
 
     def _draw_once(self) -> None:
         """Draw a lit frame before time counts: once the laser is armed, nothing may be left to plan or to compile."""

@@ -18,7 +18,6 @@ from drivers.interfaces import (
     SpadRequest,
     SpadTiming,
     SyncSource,
-    World,
 )
 from drivers.ring import BlockRing
 
@@ -90,27 +89,13 @@ class LaserCase:
 class SyncCase:
     """A sync source, open. `trigger` gives its input one scan marker; `pins` reads the outputs, also after close.
 
-    tells_waiting: its status tells a program that waits from one that plays. plays: its outputs follow the program; of
-    a stand-in they are low for good.
+    waiting: what its status says while a program waits. plays: its outputs follow the program; of a stand-in they are
+    low for good.
     """
 
     device: SyncSource
     clock: Clock
     trigger: Callable[[], None]
     pins: Callable[[], int]
-    tells_waiting: bool = True
+    waiting: str = "waiting"
     plays: bool = True
-
-    @property
-    def waiting(self) -> str:
-        """The state that it tells while a program waits."""
-        return "waiting" if self.tells_waiting else "running"
-
-
-@dataclass(frozen=True)
-class WorldCase:
-    """A world and the size of its camera."""
-
-    world: World
-    rows: int
-    width: int

@@ -17,7 +17,7 @@ import yaml
 from drivers.clock import VirtualClock
 from drivers.interfaces import MARKER_SCAN, ScanWaveform, SpadRequest, WindowTable
 from drivers.registry import Surroundings, lookup
-from tests.conformance.cases import LaserCase, ScannerCase, SpadCase, SyncCase, Taken, WorldCase, run
+from tests.conformance.cases import LaserCase, ScannerCase, SpadCase, SyncCase, Taken, run
 from tests.conformance.devices import LASERS, SCANNERS, SYNCS, Factory
 from tests.conformance.spads import EMULATED, N_FRAMES, replayed_spads
 from tests.system.small_rig import calibration
@@ -47,44 +47,25 @@ def simulated_spad(folder: Path, *, window: WindowTable | None = None, **config:
 
 
 @contextmanager
-def simulated_scanner(folder: Path) -> Iterator[ScannerCase]:
+def simulated_device(folder: Path, slot: str) -> Iterator[LaserCase | ScannerCase | SyncCase]:
     surroundings = simulated_surroundings(folder)
-    bench = surroundings.world.bench  # type: ignore[union-attr]
-    with simulated("scanner", surroundings) as device:
-        yield ScannerCase(device, bench.moving, surroundings.clock.sleep)
-
-
-@contextmanager
-def simulated_laser(folder: Path) -> Iterator[LaserCase]:
-    surroundings = simulated_surroundings(folder)
-    bench = surroundings.world.bench  # type: ignore[union-attr]
+    bench, clock = surroundings.world.bench, surroundings.clock  # type: ignore[union-attr]
+    marker = ScanWaveform(np.zeros(2), np.array([MARKER_SCAN, 0], np.uint8), Fraction(100_000))
 
     def shining() -> bool:
         return bool(bench.during(np.array([bench.now_s()]), 1e-6, 1e-6).power_w > 0)
 
-    with simulated("laser", surroundings) as device:
-        yield LaserCase(device, surroundings.clock, shining)
-
-
-@contextmanager
-def simulated_sync(folder: Path) -> Iterator[SyncCase]:
-    surroundings = simulated_surroundings(folder)
-    bench = surroundings.world.bench  # type: ignore[union-attr]
-    marker = ScanWaveform(np.zeros(2), np.array([MARKER_SCAN, 0], np.uint8), Fraction(100_000))
-
     def trigger() -> None:
         bench.play(marker, 1, latency_s=1e-6, rate_hz=1e5)
-        surroundings.clock.sleep(2e-6)
+        clock.sleep(2e-6)
 
-    with simulated("sync", surroundings) as device:
-        yield SyncCase(device, surroundings.clock, trigger, lambda: int(bench.outputs().outputs))
-
-
-@contextmanager
-def simulated_world(folder: Path) -> Iterator[WorldCase]:
-    world = simulated_surroundings(folder).world
-    assert world is not None
-    yield WorldCase(world, ROWS, WIDTH)
+    with simulated(slot, surroundings) as device:
+        if slot == "laser":
+            yield LaserCase(device, clock, shining)
+        elif slot == "scanner":
+            yield ScannerCase(device, bench.moving, clock.sleep)
+        else:
+            yield SyncCase(device, clock, trigger, lambda: int(bench.outputs().outputs))
 
 
 _LOSSY: Factory = partial(simulated_spad, loss_probability=0.01, lost_frames=[0, 64, 65, 66])
@@ -120,7 +101,6 @@ def taken(request: pytest.FixtureRequest, tmp_path_factory: pytest.TempPathFacto
 
 
 spad = over(SPADS)
-scanner = over({"simulated": simulated_scanner, **SCANNERS})
-laser = over({"simulated": simulated_laser, **LASERS})
-sync = over({"simulated": simulated_sync, **SYNCS})
-world = over({"simulated": simulated_world})
+scanner = over({"simulated": partial(simulated_device, slot="scanner"), **SCANNERS})
+laser = over({"simulated": partial(simulated_device, slot="laser"), **LASERS})
+sync = over({"simulated": partial(simulated_device, slot="sync"), **SYNCS})

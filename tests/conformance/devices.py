@@ -73,7 +73,7 @@ def _on_board(board: Board, device: SyncSource) -> SyncCase:
         board.trigger.pulse(board.now_s + 1e-6, 10e-6)
         board.clock.sleep(2e-6)
 
-    return SyncCase(device, board.clock, trigger, lambda: board.pins, tells_waiting=False)
+    return SyncCase(device, board.clock, trigger, lambda: board.pins, waiting="running")
 
 
 @contextmanager
@@ -103,12 +103,9 @@ def stand_in(folder: Path, slot: str) -> Iterator[LaserCase | ScannerCase | Sync
 
 LASERS: dict[str, Factory] = {
     "replay": partial(stand_in, slot="laser"),
-    "cobolt 06-MLD": cobolt,
     "cobolt 06-MLD without autostart": partial(cobolt, autostart=False),
     "cobolt 06-01": partial(cobolt, family="06-01"),
-    "obis": obis,
-    "obis without handshake": partial(obis, handshake=False),
-    "obis, cold": partial(obis, warm_up_s=3.0),
+    "obis without handshake, cold": partial(obis, handshake=False, warm_up_s=3.0),
     "obis behind a remote": partial(obis, channel=2),
     "obis, guarded": guarded_obis,
 }

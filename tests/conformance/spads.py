@@ -23,7 +23,7 @@ from sim_backend.wire.firmware.spb_usb_run import SpbUsbBoard
 from sim_backend.wire.serve.tcp import TcpServer
 from tests.conformance.cases import SpadCase, run
 from tests.wire.lasers import PATIENCE_S
-from tests.wire.spb_device import HEIGHT, REQUEST, WIDTH, TiledSource, model, opened
+from tests.wire.spb_device import HEIGHT, REQUEST, WIDTH, TiledSource, opened
 
 Factory = Callable[[Path], AbstractContextManager[SpadCase]]
 
@@ -52,26 +52,6 @@ def spb_usb(folder: Path, request: SpadRequest = REQUEST, **settings: Any) -> It
         yield SpadCase(device, request)
 
 
-@contextmanager
-def spb_usb_damaged(folder: Path) -> Iterator[SpadCase]:
-    """Some blocks arrive with a flipped bit, some not at all."""
-
-    def mangle(block: memoryview) -> tuple[bytes | memoryview, ...]:
-        number = int.from_bytes(block[16:24], "little")
-        if number % 11 == 5:
-            return ()
-        if number % 7 != 3:
-            return (block,)
-        damaged = bytearray(block)
-        damaged[number * 37 % 3000] ^= 1
-        return (bytes(damaged),)
-
-    emulated = model()
-    with opened(emulated) as device:
-        emulated.mangle = mangle
-        yield SpadCase(device, REQUEST)
-
-
 _WINDOW = WindowTable(64, (np.array([64, 0], np.int32), np.array([0, 64], np.int32)))
 _BURST: Factory = partial(spb_usb, request=replace(REQUEST, mode="burst"), ddr_bytes=1 << 20)
 
@@ -81,7 +61,6 @@ EMULATED: dict[str, Factory] = {
     "spb-usb, FT601": partial(spb_usb, chip="ft601", acks="stream"),
     "spb-usb, windows": partial(spb_usb, request=replace(REQUEST, window=_WINDOW)),
     "spb-usb, burst": _BURST,
-    "spb-usb, damaged": spb_usb_damaged,
 }
 
 
@@ -104,7 +83,6 @@ def replayed_spads(simulated: Factory, lossy: Factory, windows: Factory) -> dict
     """The cases, each from another implementation's frames."""
     return {
         "replay": partial(replayed, source=simulated, clock="realtime"),
-        "replay, longer blocks": partial(replayed, source=simulated, block_frames=100),
         "replay, shorter blocks": partial(replayed, source=lossy, block_frames=29),
         "replay, windows": partial(replayed, source=windows),
         "replay, burst": partial(replayed, source=_BURST),

@@ -16,15 +16,11 @@ ENDLESS = 10**9
 """Repeats that no test waits for."""
 
 
-def clock_of(case: ScannerCase) -> Fraction:
-    """A point clock in the middle of what the device can run."""
-    low, high = case.device.limits.point_rate_hz
-    return case.device.point_clock((low * high) ** 0.5)
-
-
 def gentle(case: ScannerCase) -> ScanWaveform:
-    """A raised cosine, seamless, at a third of the first limit it meets."""
-    limits, clock = case.device.limits, clock_of(case)
+    """A raised cosine, seamless, at a third of the first limit it meets, at a clock in the middle of its range."""
+    limits = case.device.limits
+    slowest, fastest = limits.point_rate_hz
+    clock = case.device.point_clock((slowest * fastest) ** 0.5)
     low, high = limits.command_range
     turn = 2 * np.pi / POINTS
     rate = float(clock)
@@ -41,17 +37,14 @@ def gentle(case: ScannerCase) -> ScanWaveform:
     return ScanWaveform(command, markers, clock)
 
 
-def test_the_point_clock_is_exact_and_asking_for_it_gives_it(scanner: ScannerCase) -> None:
-    low, high = scanner.device.limits.point_rate_hz
+def test_the_point_clock_is_exact_and_verbs_out_of_order_are_refused_and_say_what_to_call(scanner: ScannerCase) -> None:
+    device = scanner.device
+    low, high = device.limits.point_rate_hz
     for requested in np.geomspace(low * 1.01, high * 0.99, 23):
-        clock = scanner.device.point_clock(float(requested))
+        clock = device.point_clock(float(requested))
         assert isinstance(clock, Fraction)
         assert low <= clock <= high
-        assert clock == scanner.device.point_clock(float(clock))
-
-
-def test_verbs_out_of_order_are_refused_and_say_what_to_call(scanner: ScannerCase) -> None:
-    device = scanner.device
+        assert clock == device.point_clock(float(clock))
     with pytest.raises(WrongState, match="load"):
         device.start()
     device.load(gentle(scanner), ENDLESS)
@@ -63,13 +56,6 @@ def test_verbs_out_of_order_are_refused_and_say_what_to_call(scanner: ScannerCas
         device.load(gentle(scanner), 1)
     device.stop()
     device.load(gentle(scanner), 1)
-
-
-def test_load_returns_the_clock_it_was_asked_for_and_moves_nothing(scanner: ScannerCase) -> None:
-    wave = gentle(scanner)
-    assert scanner.device.load(wave, 3) == wave.point_rate_hz
-    assert not scanner.turning()
-    assert not scanner.device.status.moving
 
 
 def test_what_is_beyond_its_limits_is_refused_with_value_and_limit_and_moves_nothing(scanner: ScannerCase) -> None:
@@ -97,30 +83,25 @@ def test_what_is_beyond_its_limits_is_refused_with_value_and_limit_and_moves_not
     assert not scanner.turning()
 
 
-def test_what_is_loaded_is_a_copy(scanner: ScannerCase) -> None:
-    wave = gentle(scanner)
-    scanner.device.load(wave, ENDLESS)
-    wave.command[:] = np.nan
-    scanner.device.start()
-    scanner.let_pass(0.01)
-    position = scanner.device.status.position
-    assert position is None or np.isfinite(position)
-
-
-def test_it_moves_until_its_repeats_are_over(scanner: ScannerCase) -> None:
+def test_loading_moves_nothing_and_what_is_loaded_is_a_copy_played_until_its_repeats_are_over(
+    scanner: ScannerCase,
+) -> None:
     device, wave = scanner.device, gentle(scanner)
     repeats = 4
-    device.load(wave, repeats)
+    assert device.load(wave, repeats) == wave.point_rate_hz
+    assert not scanner.turning()
+    assert not device.status.moving
+    wave.command[:] = np.nan
     device.start()
     assert device.state is DeviceState.RUNNING
     assert device.status.fault is None
     scanner.let_pass(1.0 + 1.1 * repeats * POINTS / float(wave.point_rate_hz))
+    position = device.status.position
+    assert position is None or np.isfinite(position)
     assert not device.status.moving
     assert not scanner.turning()
-    device.load(wave, 1)
+    device.load(gentle(scanner), 1)
     assert device.state is DeviceState.CONFIGURED
-    device.start()
-    device.stop()
 
 
 def test_stop_ends_the_movement_and_the_waveform_can_be_started_again(scanner: ScannerCase) -> None:
@@ -138,7 +119,7 @@ def test_stop_ends_the_movement_and_the_waveform_can_be_started_again(scanner: S
     assert scanner.turning()
 
 
-def test_park_stops_at_one_place_and_is_possible_in_any_state(scanner: ScannerCase) -> None:
+def test_park_stops_at_one_place_in_any_state_and_a_close_for_good(scanner: ScannerCase) -> None:
     device, wave = scanner.device, gentle(scanner)
     low, high = device.limits.command_range
 
@@ -158,11 +139,6 @@ def test_park_stops_at_one_place_and_is_possible_in_any_state(scanner: ScannerCa
     if places[0] is not None:
         assert places == pytest.approx([places[0]] * 3, abs=1e-3 * (high - low))
         assert low <= places[0] <= high
-
-
-def test_it_closes_for_good_and_stops_the_mirror_whatever_happened(scanner: ScannerCase) -> None:
-    device, wave = scanner.device, gentle(scanner)
-    device.load(wave, ENDLESS)
     device.start()
     verbs = (lambda: device.load(wave, 1), device.start, device.stop, device.park, lambda: device.status)
     require_final(device, *verbs, lambda: device.point_clock(float(wave.point_rate_hz)))

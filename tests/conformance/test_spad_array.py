@@ -1,6 +1,7 @@
 """Every SPAD array: contiguous frames with records, counters that add up, an end that ends."""
 
-import threading
+from concurrent.futures import ThreadPoolExecutor
+from contextlib import suppress
 from functools import partial
 from itertools import pairwise
 
@@ -15,20 +16,12 @@ from tests.conformance.cases import TIMEOUT_S, SpadCase, Taken, require_final, r
 from tests.conformance.spads import N_FRAMES
 
 
-def test_it_describes_itself(taken: Taken) -> None:
-    info = taken.case.device.info
-    assert taken.case.device.name
-    assert info.model
-    assert info.serial
-    assert min(info.width, info.height, info.roi_step_px) >= 1
-    assert info.max_frame_rate_hz > 0
+def test_it_describes_itself_and_blocks_lie_in_the_ring_and_are_of_the_window_that_was_asked_for(taken: Taken) -> None:
+    info, window = taken.case.device.info, taken.case.request.window
+    assert all((taken.case.device.name, info.model, info.serial, info.burst or info.stream))
+    assert min(info.width, info.height, info.roi_step_px, info.max_frame_rate_hz) > 0
     assert info.rotation_deg in (0, 90, 180, 270)
-    assert info.burst is not None or info.stream is not None
-
-
-def test_blocks_lie_in_the_ring_and_are_of_the_window_that_was_asked_for(taken: Taken) -> None:
-    window = taken.case.request.window
-    width = taken.case.device.info.width if window is None else window.width_px
+    width = info.width if window is None else window.width_px
     first = 0 if window is None else window.x0[0][0]  # there was no marker yet
     assert taken.blocks
     for block in taken.blocks:
@@ -60,11 +53,12 @@ def test_frames_are_contiguous_within_blocks_and_a_jump_is_the_loss(taken: Taken
     assert counters.exposed in (None, N_FRAMES)
 
 
-def test_the_header_of_every_block_tells_the_geometry_and_the_timing(taken: Taken) -> None:
+def test_every_block_tells_geometry_and_timing_and_its_bits_are_packed_rows_with_pad_bits_zero(taken: Taken) -> None:
     info, timing, blocks = taken.case.device.info, taken.timing, taken.blocks
     assert [block.header.block_seq for block in blocks] == list(range(len(blocks)))
     assert len({block.header.run_id for block in blocks}) == 1
     assert [bool(block.header.flags & BlockFlag.FIRST) for block in blocks] == [True] + [False] * (len(blocks) - 1)
+    shares = []
     for block in blocks:
         header = block.header
         assert (header.sensor_width, header.sensor_height) == (info.width, info.height)
@@ -72,12 +66,6 @@ def test_the_header_of_every_block_tells_the_geometry_and_the_timing(taken: Take
         assert header.tick_hz == timing.tick_hz
         assert (header.frame_period_ticks, header.exposure_ticks) == (timing.frame_period_ticks, timing.exposure_ticks)
         assert block.status == 0
-
-
-def test_bits_are_packed_rows_with_pad_bits_zero_inside_the_window(taken: Taken) -> None:
-    shares = []
-    for block in taken.blocks:
-        header = block.header
         assert block.bits.dtype == np.uint8
         assert block.bits.shape == (block.n_frames, header.height, packed_row_bytes(header.width))
         pixels = np.unpackbits(block.bits, axis=2)
@@ -91,7 +79,7 @@ def test_bits_are_packed_rows_with_pad_bits_zero_inside_the_window(taken: Taken)
     assert 0 < np.mean(shares) < 1
 
 
-def test_after_the_end_it_gives_no_more_and_starts_again_at_frame_0(spad: SpadCase) -> None:
+def test_after_the_end_it_gives_no_more_starts_again_at_frame_0_and_closes_for_good(spad: SpadCase) -> None:
     timing = spad.device.configure(spad.request)
     _, blocks = run(spad, timing, 200)
     assert spad.device.state is DeviceState.CONFIGURED
@@ -101,6 +89,11 @@ def test_after_the_end_it_gives_no_more_and_starts_again_at_frame_0(spad: SpadCa
     assert second[0].header.run_id != blocks[0].header.run_id
     assert second[-1].frame_numbers[-1] < 200
     assert spad.device.counters.delivered == sum(block.n_frames for block in second)
+    spad.device.start(None if spad.request.mode == "stream" else 10)
+    fill = partial(spad.device.fill, BlockRing(1, timing.stride), 0.1)
+    verbs = (lambda: spad.device.configure(spad.request), lambda: spad.device.start(1), fill, spad.device.stop)
+    require_final(spad.device, *verbs)
+    assert spad.device.counters.delivered == 0
 
 
 def test_an_endless_run_ends_when_another_thread_stops_it(spad: SpadCase) -> None:
@@ -115,18 +108,15 @@ def test_an_endless_run_ends_when_another_thread_stops_it(spad: SpadCase) -> Non
         try:
             while device.fill(ring, TIMEOUT_S):
                 pass
-        except BaseException as error:
-            ring.finish(error)
-            raise
-        ring.finish()
+        finally:
+            ring.finish()
 
-    thread = threading.Thread(target=source)
-    thread.start()
-    for count, _ in enumerate(reader):
-        if count == 5:
-            device.stop()
-    thread.join(TIMEOUT_S)
-    assert not thread.is_alive()
+    with ThreadPoolExecutor(1) as pool:
+        filled = pool.submit(source)
+        for count, _ in enumerate(reader):
+            if count == 5:
+                device.stop()
+        filled.result(TIMEOUT_S)
     assert device.state is DeviceState.CONFIGURED
     assert device.fill(ring, TIMEOUT_S) is False
     counters = device.counters
@@ -146,10 +136,11 @@ def test_a_full_ring_is_waited_for_or_the_loss_is_counted(spad: SpadCase) -> Non
         try:
             more = device.fill(ring, 0.05)
         except DeviceTimeout:
-            waited = True
-            block = reader.next(0)
-            assert block is not None
-            numbers += block.frame_numbers.tolist()
+            with suppress(DeviceTimeout):  # the device was late, and nothing has come
+                block = reader.next(0)
+                assert block is not None
+                numbers += block.frame_numbers.tolist()
+                waited = True
     ring.finish()
     assert waited or ring.dropped_blocks
     for block in reader:
@@ -158,12 +149,3 @@ def test_a_full_ring_is_waited_for_or_the_loss_is_counted(spad: SpadCase) -> Non
     counters = device.counters
     assert counters.delivered == len(numbers)
     assert counters.lost in (None, n_frames - len(numbers))
-
-
-def test_it_closes_for_good_whatever_happened(spad: SpadCase) -> None:
-    device = spad.device
-    timing = device.configure(spad.request)
-    device.start(None if spad.request.mode == "stream" else 10)
-    fill = partial(device.fill, BlockRing(1, timing.stride), 0.1)
-    require_final(device, lambda: device.configure(spad.request), lambda: device.start(1), fill, device.stop)
-    assert device.counters.delivered == 0

@@ -31,19 +31,17 @@ def running(case: SyncCase, repeats: int = 2) -> None:
     assert case.pins() == (OUT_GATE | OUT_FRAME if case.plays else 0)
 
 
-def test_it_is_found_with_all_outputs_low(sync: SyncCase) -> None:
-    assert sync.device.name
-    assert sync.device.resolution_s > 0
-    assert sync.device.status.outputs == 0
-    assert sync.pins() == 0
-
-
-def test_verbs_out_of_order_are_refused_and_say_what_to_call(sync: SyncCase) -> None:
+def test_it_is_found_low_and_verbs_out_of_order_are_refused_and_say_what_to_call(sync: SyncCase) -> None:
     device = sync.device
+    assert device.name
+    assert device.resolution_s > 0
+    assert device.status.outputs == 0
     with pytest.raises(WrongState, match="program"):
         device.run()
-    device.program(SWEEP, 2)
+    device.program([Pulse(OUT_FRAME, STEP_S)], 100)  # which plays nothing yet
     assert device.state is DeviceState.CONFIGURED
+    assert device.status.state == "stopped"
+    assert sync.pins() == 0
     device.run()
     with pytest.raises(WrongState, match="abort"):
         device.run()
@@ -80,15 +78,9 @@ def test_what_no_source_may_play_is_refused_and_replaces_nothing(sync: SyncCase)
     assert device.status.state == sync.waiting
 
 
-def test_loading_a_program_plays_nothing(sync: SyncCase) -> None:
-    sync.device.program([Pulse(OUT_FRAME, STEP_S)], 100)
-    assert sync.device.status.state == "stopped"
-    assert sync.pins() == 0
-
-
 @pytest.mark.usefixtures("playing")
-def test_it_waits_dark_for_the_scan_marker_however_long(sync: SyncCase) -> None:
-    sync.device.program(SWEEP, 1)
+def test_it_waits_dark_for_each_scan_marker_plays_the_program_once_and_ends_low(sync: SyncCase) -> None:
+    sync.device.program(SWEEP, 2)
     sync.device.run()
     for _ in range(3):
         sync.clock.sleep(STEP_S)
@@ -97,12 +89,6 @@ def test_it_waits_dark_for_the_scan_marker_however_long(sync: SyncCase) -> None:
         assert status.outputs in (None, OUT_MARKER)
         assert sync.pins() == OUT_MARKER
     assert sync.device.state is DeviceState.RUNNING
-
-
-@pytest.mark.usefixtures("playing")
-def test_each_scan_marker_plays_the_program_once_and_the_end_is_low(sync: SyncCase) -> None:
-    sync.device.program(SWEEP, 2)
-    sync.device.run()
     for sweep in range(2):
         sync.trigger()
         sync.clock.sleep(0.5 * STEP_S)
@@ -135,7 +121,9 @@ def test_a_program_that_ends_on_a_high_word_ends_low(sync: SyncCase) -> None:
     assert sync.device.status.state == "stopped"
 
 
-def test_abort_leaves_all_outputs_low_at_once(sync: SyncCase) -> None:
+def test_abort_is_possible_in_any_state_and_low_at_once_and_the_program_may_run_again(sync: SyncCase) -> None:
+    sync.device.abort()
+    assert sync.device.state is DeviceState.READY
     running(sync)
     sync.device.abort()
     assert sync.pins() == 0
@@ -146,19 +134,12 @@ def test_abort_leaves_all_outputs_low_at_once(sync: SyncCase) -> None:
     sync.trigger()
     sync.clock.sleep(1.5 * STEP_S)
     assert sync.pins() == 0
-
-
-def test_abort_is_possible_in_any_state_and_the_program_may_run_again(sync: SyncCase) -> None:
-    sync.device.abort()
-    assert sync.device.state is DeviceState.READY
-    running(sync)
-    sync.device.abort()
     sync.device.abort()
     sync.device.run()
     assert sync.device.status.state == sync.waiting
 
 
-def test_gate_low_is_low_until_the_next_run(sync: SyncCase) -> None:
+def test_gate_low_is_low_until_the_next_run_and_a_close_leaves_all_low_for_good(sync: SyncCase) -> None:
     sync.device.gate_low()
     running(sync)
     sync.device.gate_low()
@@ -167,12 +148,8 @@ def test_gate_low_is_low_until_the_next_run(sync: SyncCase) -> None:
     for _ in range(5):
         sync.clock.sleep(STEP_S)
         assert not sync.pins() & OUT_GATE
-    sync.device.abort()
-    running(sync)
-
-
-def test_it_closes_for_good_with_all_outputs_low_whatever_happened(sync: SyncCase) -> None:
     device = sync.device
+    device.abort()
     running(sync)
     verbs = (device.run, device.gate_low, device.abort, lambda: device.status)
     require_final(device, lambda: device.program(SWEEP, 1), *verbs)

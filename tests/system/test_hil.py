@@ -82,13 +82,6 @@ def test_drivers_in_the_loop_say_what_they_said_and_the_depth_is_the_same(taken:
 
 
 @pytest.mark.usefixtures("patient")
-def test_drivers_play_against_what_their_devices_answered(taken: Path) -> None:
-    result = api.replay(taken, against_recording=True)
-    assert result.control is not None
-    assert result.control.problems == ()
-
-
-@pytest.mark.usefixtures("patient")
 def test_the_first_byte_that_was_not_recorded_fails_the_replay_and_is_shown(taken: Path, tmp_path: Path) -> None:
     other = tmp_path / "other"
     other.mkdir()
@@ -101,15 +94,7 @@ def test_the_first_byte_that_was_not_recorded_fails_the_replay_and_is_shown(take
     power["bytes"] = changed.hex()
     (other / "control.jsonl").write_text("".join(json.dumps(one) + "\n" for one in lines))
     with pytest.raises(DivergedError, match=r"laser: command \d+: byte 24 is 0x30, recorded was 0x31 .*AMPL 0\.0"):
-        api.replay(other, against_recording=True)
-
-
-def test_a_simulated_recording_has_no_drivers_to_play(tmp_path: Path) -> None:
-    content = config()
-    api.scan(write_rig(tmp_path / "rig", content), out=tmp_path / "run", record=True)
-    assert not (tmp_path / "run" / "control.jsonl").exists()
-    with pytest.raises(UsageError, match="simulated devices only"):
-        api.replay(tmp_path / "run", against_recording=True)
+        api.replay(other, config=hil(taken.parent, LASER))
 
 
 def test_no_light_is_let_out_without_a_word(taken: Path) -> None:

@@ -1,6 +1,5 @@
 """A laser and a gate on emulated wires in this process, and what counts: when there was light (emission AND gate)."""
 
-import bisect
 import time
 from collections.abc import Iterator
 from contextlib import contextmanager
@@ -39,9 +38,6 @@ class Line:
         """Whether it has been low for so long."""
         return not self.levels[-1] and time.monotonic() - self.times[-1] >= seconds
 
-    def at(self, at_s: float) -> bool:
-        return self.levels[bisect.bisect_right(self.times, at_s) - 1]
-
 
 @dataclass
 class GuardedRig:
@@ -49,32 +45,6 @@ class GuardedRig:
     sync: SerialServer
     emission: Line
     gate: Line
-
-    def light_after(self, at_s: float) -> float:
-        """Seconds from `at_s` to the last moment of light after it; 0 where there was none."""
-        last = 0.0
-        now = time.monotonic()
-        ends = [*self.gate.times[1:], now]
-        for start, end, level in zip(self.gate.times, ends, self.gate.levels, strict=True):
-            if level and end > at_s:
-                last = max([last, *(t - at_s for t in self._dark_at(max(start, at_s), end))])
-        return last
-
-    def _dark_at(self, start: float, end: float) -> Iterator[float]:
-        """Ends of light within a time of open gate."""
-        if self.emission.at(end - 1e-9):
-            yield end
-        yield from (
-            t
-            for t, level in zip(self.emission.times, self.emission.levels, strict=True)
-            if not level and start < t < end and self.emission.at(t - 1e-9)
-        )
-
-    @property
-    def light(self) -> bool:
-        """Whether light came out in the last sweeps."""
-        now = time.monotonic()
-        return self.emission.levels[-1] and self.light_after(now - 3 * SWEEP_S) > 0
 
 
 @contextmanager

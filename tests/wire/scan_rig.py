@@ -1,6 +1,6 @@
 """A whole rig with a small sensor, emulated outside of the application that scans with it, so that it outlives it.
 
-    with applications() as applications, scan_bench(applications, "cobolt") as bench:
+    with closing(Applications()) as applications, scan_bench(applications, "cobolt") as bench:
         bench.start(maps=10)
         ...
         bench.light(since_s), bench.light_at_rest(since_s)
@@ -17,7 +17,7 @@ import sys
 import tempfile
 import time
 from collections.abc import Iterator
-from contextlib import closing, contextmanager
+from contextlib import closing, contextmanager, suppress
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -61,14 +61,11 @@ class Applications:
 
     def start(self, arguments: list[str], environment: dict[str, str], log: Path, labours: bool) -> int:
         """`rig` with these arguments; its process number."""
-        number = self._ask(arguments=arguments, environment=environment, log=str(log), labours=labours)
-        assert isinstance(number, int)
-        return number
+        return int(self._ask(arguments=arguments, environment=environment, log=str(log), labours=labours))
 
-    def exit_code(self, number: int, within_s: float) -> int | None:
+    def exit_code(self, number: int, within_s: float) -> Any:
         """Its exit code, negative for a signal; None: it still runs."""
-        code: int | None = self._ask(wait=number, within_s=within_s)
-        return code
+        return self._ask(wait=number, within_s=within_s)
 
     def close(self) -> None:
         self._process.communicate()
@@ -83,15 +80,6 @@ class Applications:
         assert self._process.stdout is not None
         line = self._process.stdout.readline()
         return json.loads(line) if line else None
-
-
-@contextmanager
-def applications() -> Iterator[Applications]:
-    made = Applications()
-    try:
-        yield made
-    finally:
-        made.close()
 
 
 @dataclass
@@ -195,12 +183,9 @@ def _end(bench: ScanBench) -> None:
         guard = bench.guard()
     except (ScanFailedError, OSError):
         guard = 0
-    for number in (guard, bench.number):
-        if number:
-            try:
-                os.kill(number, 9)
-            except ProcessLookupError:
-                continue
+    for number in filter(None, (guard, bench.number)):
+        with suppress(ProcessLookupError):
+            os.kill(number, signal.SIGKILL)
     bench.applications.exit_code(bench.number, 5.0)
 
 

@@ -9,10 +9,15 @@ from collections.abc import Callable
 from dataclasses import dataclass
 
 from drivers.guard import GuardLimits
-from tests.wire.guard_strikes import EMISSION_S, GONE_S, NEVER_S
 from tests.wire.lasers import eventually
 from tests.wire.scan_rig import STEP_S, Applications, ScanBench, scan_bench
 
+GONE_S = 0.1
+"""Light has to be gone after this, at the 99.9th percentile..."""
+NEVER_S = 0.5
+"""...and after this always."""
+EMISSION_S = 1.0
+"""Emission is off after this where the laser's port still answers."""
 MAPS = 40
 """Of a scan that is struck: about a second."""
 LONG_MAPS = 2000

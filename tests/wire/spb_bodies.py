@@ -13,7 +13,6 @@ import pytest
 
 from drivers.clock import SystemClock
 from drivers.errors import DeviceBusy, DeviceDisconnected, DeviceTimeout
-from drivers.ring import BlockRing
 from drivers.spads.spb_usb import SpbUsb, SpbUsbConfig, open_link
 from drivers.transports.endpoints import Endpoint
 from drivers.transports.queued_link import QueuedLink
@@ -34,7 +33,9 @@ def opened(reads: str, heartbeat: str = "60 s") -> SpbUsb:
     return SpbUsb(config, open_link(config, Endpoint("usb")), SystemClock())
 
 
-def queued_reads_bring_every_frame_where_libusb_wrote_it() -> None:
+def queued_reads_bring_every_frame_where_libusb_wrote_it_and_plain_ones_too() -> None:
+    with opened("plain") as device:
+        assert require_right(take(device, 1000)) == list(range(1000))
     with opened("queued") as device:
         assert isinstance(device._link, QueuedLink)
         for _ in range(3):
@@ -45,17 +46,10 @@ def queued_reads_bring_every_frame_where_libusb_wrote_it() -> None:
             assert all(np.shares_memory(block.bits, ring._memory) for block in blocks)
 
 
-def plain_reads_bring_every_frame() -> None:
-    with opened("plain") as device:
-        assert require_right(take(device, 1000)) == list(range(1000))
-
-
 def stopping_with_reads_in_flight_leaves_the_device_ready() -> None:
     with opened("queued") as device:
-        timing = device.configure(REQUEST)
         for _ in range(3):
-            ring = BlockRing(40, timing.stride)
-            device.start(None)
+            ring, _ = begin(device, REQUEST, None, 40)
             for _ in range(5):
                 device.fill(ring, PATIENCE_S)
             device.stop()
@@ -93,19 +87,15 @@ def a_second_program_finds_it_busy() -> None:
 
 def pulling_the_cable_is_a_disconnection() -> None:
     with opened("queued", heartbeat=PULL_HEARTBEAT) as device:
-        timing = device.configure(REQUEST)
-        ring = BlockRing(40, timing.stride)
-        device.start(None)
-        with pytest.raises(DeviceDisconnected, match="the device is gone"):  # noqa: PT012
-            while device.fill(ring, PATIENCE_S):
-                pass
+        ring, _ = begin(device, REQUEST, None, 40)
+        with pytest.raises(DeviceDisconnected, match="the device is gone"):
+            finish(device, ring)
         device.stop()
         assert not ring._claimed
 
 
 BODIES: tuple[Callable[[], None], ...] = (
-    queued_reads_bring_every_frame_where_libusb_wrote_it,
-    plain_reads_bring_every_frame,
+    queued_reads_bring_every_frame_where_libusb_wrote_it_and_plain_ones_too,
     stopping_with_reads_in_flight_leaves_the_device_ready,
     bytes_that_came_before_a_time_out_are_kept,
     the_kernels_16_mb_grant_fewer_reads,

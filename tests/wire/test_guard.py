@@ -2,11 +2,12 @@
 
 import os
 import signal
+import subprocess
+import sys
+import tempfile
 import time
-from collections.abc import Iterator
-from concurrent.futures import Future, ThreadPoolExecutor
+from collections.abc import Callable, Iterator
 
-import numpy as np
 import pytest
 
 from drivers.errors import DeviceBusy, DeviceError, DeviceNotFound, GuardLost, LimitExceeded
@@ -17,46 +18,57 @@ from drivers.registry import Surroundings
 from drivers.sync.prawndo import PrawnDo, PrawnDoConfig
 from sim_backend.wire.firmware.obis import ObisModel
 from sim_backend.wire.serve.serial import SerialServer
-from tests.wire.guard_strikes import STRIKES, Outcome, strike
 from tests.wire.guarded_application import SWEEP
 from tests.wire.guarded_rig import POWER_W, GuardedRig, guarded_rig
 from tests.wire.lasers import PATIENCE_S, eventually
 
-SCAN_S = 2.0
-"""Start, opening, arming and the first sweeps of the application's scan."""
-ERRORS = {"guard killed": "GuardLost", "gate unplugged, powered on": "DeviceDisconnected"}
-"""The error that an application ends with which survives the blow."""
-
-
-@pytest.fixture(scope="module")
-def outcomes() -> Iterator[dict[str, "Future[Outcome]"]]:
-    """Every blow at a random moment, four scans at a time; `tests.campaigns.devices.guard_blows` says how soon."""
-    random = np.random.default_rng(4)
-    with ThreadPoolExecutor(4) as pool:
-        yield {
-            name: pool.submit(
-                strike, name, float(random.uniform(0, SCAN_S) if made.at_once else random.uniform(0, 0.1))
-            )
-            for name, made in STRIKES.items()
-        }
-
-
-@pytest.mark.parametrize("name", STRIKES)
-def test_a_blow_ends_the_light(name: str, outcomes: dict[str, "Future[Outcome]"]) -> None:
-    made, result = STRIKES[name], outcomes[name].result()
-    assert result.was_lit or made.mode != "beat" or made.at_once
-    assert "Traceback" not in result.output
-    if made.mode in ("hang", "spin"):
-        assert result.code == -9  # an application that cannot help itself is killed
-    if name in ERRORS:
-        assert result.code == 3
-        assert any(line.startswith(f"{ERRORS[name]}: ") for line in result.output.splitlines())
+DARK_S = 0.3
+"""A laser that is dark for so long stays dark."""
 
 
 @pytest.fixture
 def rig() -> Iterator[GuardedRig]:
     with guarded_rig() as made:
         yield made
+
+
+Blow = Callable[[GuardedRig, "subprocess.Popen[str]", int], None]
+BLOWS: dict[str, tuple[str, Blow, int, str]] = {
+    "application killed": ("beat", lambda rig, application, guard: application.kill(), -signal.SIGKILL, ""),
+    "application hangs": ("hang", lambda rig, application, guard: None, -signal.SIGKILL, "now"),
+    "application computes for ever": ("spin", lambda rig, application, guard: None, -signal.SIGKILL, "now"),
+    "application exits": ("vanish", lambda rig, application, guard: None, 7, "now"),
+    "guard killed": ("beat", lambda rig, application, guard: os.kill(guard, signal.SIGKILL), 3, "GuardLost: "),
+    "gate unplugged, powered on": (
+        "beat",
+        lambda rig, application, guard: rig.sync.unplug(),
+        3,
+        "DeviceDisconnected: ",
+    ),
+}
+"""Mode of the application, blow, exit code of the application and words that it ends with."""
+
+
+@pytest.mark.parametrize(("mode", "blow", "code", "said"), BLOWS.values(), ids=BLOWS)
+def test_a_blow_ends_the_light(mode: str, blow: Blow, code: int, said: str, rig: GuardedRig) -> None:
+    command = [sys.executable, "-m", "tests.wire.guarded_application", rig.laser.path, rig.sync.path, mode]
+    with (
+        tempfile.TemporaryFile("w+") as log,  # no pipe: the guard may hold it for a while
+        subprocess.Popen(command, stdout=subprocess.PIPE, stderr=log, text=True) as application,
+    ):
+        try:
+            assert application.stdout is not None
+            first = application.stdout.readline()
+            assert first.startswith("lit ")
+            blow(rig, application, int(first.split()[1]))
+            eventually(lambda: rig.emission.dark_for(DARK_S))
+            output = application.communicate(timeout=PATIENCE_S)[0]
+        finally:
+            application.kill()
+        log.seek(0)
+        assert "Traceback" not in log.read()
+    assert application.returncode == code
+    assert said in output
 
 
 def guard_of(rig: GuardedRig, limits: GuardLimits | None = None) -> Guard:
@@ -68,12 +80,20 @@ def guard_of(rig: GuardedRig, limits: GuardLimits | None = None) -> Guard:
     )
 
 
-def test_errors_come_through_with_their_type_and_text(rig: GuardedRig) -> None:
+def test_errors_come_through_with_their_type_and_text_and_the_guard_gives_its_ports_back(rig: GuardedRig) -> None:
+    config = PrawnDoConfig(port=rig.sync.path)
+    surroundings = Surroundings(None, None, 0)  # type: ignore[arg-type]
     with guard_of(rig) as guard:
         with pytest.raises(LimitExceeded, match="60 W is outside"):
             guard.laser.arm(60)
         with pytest.raises(LimitExceeded, match="outside 5e-08 to"):
             guard.sync.program([SWEEP[0], type(SWEEP[0])(0, 2e-8)], 1)
+        assert guard.sync.status.state == "stopped"
+        with pytest.raises(DeviceBusy):
+            PrawnDo(config, surroundings)
+    PrawnDo(config, surroundings).close()
+    with Guard(sync=config) as guard, pytest.raises(DeviceError, match="not guarded"):
+        _ = guard.laser
 
 
 @pytest.mark.parametrize(
@@ -109,21 +129,6 @@ def test_a_laser_is_off_before_it_is_opened_once_the_guard_is_gone(channel: int 
         assert not any(command.startswith("SOUR:AM:STSOUR") for command in said)
 
 
-def test_a_device_without_config_is_not_guarded(rig: GuardedRig) -> None:
-    with Guard(sync=PrawnDoConfig(port=rig.sync.path)) as guard, pytest.raises(DeviceError, match="not guarded"):
-        _ = guard.laser
-
-
-def test_the_guard_holds_the_ports_and_gives_them_back(rig: GuardedRig) -> None:
-    config = PrawnDoConfig(port=rig.sync.path)
-    surroundings = Surroundings(None, None, 0)  # type: ignore[arg-type]
-    with guard_of(rig) as guard:
-        assert guard.sync.status.state == "stopped"
-        with pytest.raises(DeviceBusy):
-            PrawnDo(config, surroundings)
-    PrawnDo(config, surroundings).close()
-
-
 @pytest.mark.parametrize("at_work", [False, True])
 def test_a_program_that_ends_by_itself_is_no_hang_and_its_laser_rests(at_work: bool, rig: GuardedRig) -> None:
     limits = GuardLimits(busy_within_s=PATIENCE_S, check_s=PATIENCE_S, help_itself_s=PATIENCE_S)
@@ -143,16 +148,6 @@ def test_a_program_that_ends_by_itself_is_no_hang_and_its_laser_rests(at_work: b
         guard.laser.pause()
         guard.laser.arm(POWER_W)
         assert guard.laser.status.emission
-
-
-def test_longer_limits_allow_longer_silence(rig: GuardedRig) -> None:
-    with guard_of(rig) as guard:
-        guard.sync.program(SWEEP, 1000)
-        guard.expect(GuardLimits(PATIENCE_S, PATIENCE_S))
-        guard.sync.run()
-        guard.beat(1)
-        time.sleep(0.3)
-        assert guard.failure is None
 
 
 def test_without_a_running_program_no_frames_are_asked_for(rig: GuardedRig) -> None:
@@ -176,10 +171,9 @@ def test_no_first_frame_at_all_ends_the_light(rig: GuardedRig) -> None:
         guard.sync.program(SWEEP, 1000)
         guard.sync.run()
         eventually(lambda: guard.failure is not None and not rig.emission.levels[-1])
-        with pytest.raises(DeviceError, match="took no frame for"):
-            guard.beat(1)
-        with pytest.raises(DeviceError, match="took no frame for"):
-            guard.laser.arm(POWER_W)
+        for verb in (lambda: guard.beat(1), lambda: guard.laser.arm(POWER_W)):
+            with pytest.raises(DeviceError, match="took no frame for"):
+                verb()
         guard.sync.abort()
         guard.laser.pause()
 

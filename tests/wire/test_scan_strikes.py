@@ -4,11 +4,12 @@ Hundreds of each, and how soon it is dark: `python -m tests.campaigns.devices.gu
 """
 
 from collections.abc import Iterator
+from contextlib import closing
 
 import pytest
 
 from tests.wire.lasers import PATIENCE_S
-from tests.wire.scan_rig import Applications, ScanFailedError, applications, scan_bench
+from tests.wire.scan_rig import Applications, ScanFailedError, scan_bench
 from tests.wire.scan_strikes import SCAN_STRIKES, strike_scan, trouble_of
 from tests.wire.usb.umockdev import missing
 
@@ -22,7 +23,7 @@ pytestmark = pytest.mark.skipif(bool(missing()), reason=missing())
 
 @pytest.fixture(scope="module")
 def scans() -> Iterator[Applications]:
-    with applications() as made:
+    with closing(Applications()) as made:
         yield made
 
 

@@ -50,7 +50,7 @@ def truncated(block: bytearray) -> tuple[bytes]:
     [
         *(
             pytest.param(flipped(at), 16, 1, id=f"flipped byte {at}")
-            for at in (0, 24, 69, 92, 96, 300, 400, 6000, 384 + 16 * 384 + 4, 384 + 16 * 384 + 28)
+            for at in (0, 24, 92, 300, 6000, 384 + 16 * 384 + 4)
         ),
         pytest.param(resealed(76, "<H", 256), 16, 1, id="another geometry"),
         pytest.param(resealed(14, "<H", 9999), 16, 0, id="another run"),
@@ -59,7 +59,7 @@ def truncated(block: bytearray) -> tuple[bytes]:
         pytest.param(lambda block: (), 16, 0, id="lost"),
     ],
 )
-@pytest.mark.parametrize("number", [0, 3, 9])
+@pytest.mark.parametrize("number", [3, 9])
 def test_damage_of_a_block_costs_that_block_only(number: int, change: Change, lost: int, refused: int) -> None:
     device = model()
     with opened(device) as spad:
@@ -92,33 +92,26 @@ def test_a_block_cut_short_or_bytes_between_blocks_shift_the_stream_and_it_is_re
         assert len(numbers) > 1000
 
 
-def test_frames_lost_inside_the_device_are_a_gap() -> None:
-    device = model()
-    with opened(device) as spad:
-        ring, reader = begin(spad, REQUEST, 160)
-        device.lose_next(5)
-        finish(spad, ring)
-        blocks = list(reader)
-        assert require_right(blocks) == list(range(5, 160))
-        assert blocks[0].header.flags & BlockFlag.MEMORY_OVERFLOW
-        assert (spad.counters.exposed, spad.counters.lost) == (160, 5)
-
-
-def test_the_high_water_mark_of_its_memory_is_told_behind_a_run() -> None:
+def test_frames_lost_inside_the_device_are_a_gap_and_its_high_water_mark_is_told() -> None:
     with opened(model(paced=True, fifo_frames=64)) as spad:
-        ring, _ = begin(spad, REQUEST, 200)
+        ring, reader = begin(spad, REQUEST, 200)
         with pytest.raises(WrongState, match="health is not possible while running"):
             _ = spad.health
-        spad._clock.sleep(0.01)  # the memory fills up
+        spad._clock.sleep(0.001)  # 100 frames of 10 us
         finish(spad, ring)
         assert spad.health.memory_high_water_bytes == 64 * (16 + 384)
-        assert spad.counters.lost
+        blocks = list(reader)
+        numbers = require_right(blocks)
+        assert numbers == list(range(numbers[0], 200))
+        assert blocks[0].header.flags & BlockFlag.MEMORY_OVERFLOW
+        assert (spad.counters.exposed, spad.counters.lost) == (200, numbers[0])
+        assert numbers[0] >= 36
 
 
 # The ring
 
 
-@pytest.mark.parametrize("slots", [1, 2, 3, 8, 40])
+@pytest.mark.parametrize("slots", [1, 3, 40])
 def test_a_reader_that_keeps_up_loses_nothing_however_short_the_ring(slots: int) -> None:
     n_frames = 320 if slots >= 3 else 16  # a short one holds what the source needs
     with opened(model(paced=True, fifo_frames=1_000_000)) as spad:

@@ -5,6 +5,7 @@ comes from `frames`, upright, and is turned onto the sensor's side as the real o
 """
 
 from collections.abc import Callable
+from dataclasses import dataclass
 from typing import Final
 
 import numpy as np
@@ -77,7 +78,7 @@ class Spad512sModel:
         self._run = None
 
     def disconnected(self, now_s: float) -> None:
-        """Give the run, if there is one, to nobody from now on."""
+        """End the run, if there is one."""
         self._run = None
         self._out.clear()
 
@@ -164,10 +165,8 @@ class Spad512sModel:
         run.next_frame += n
         data = pixels.tobytes()
         if self.fail_at_byte is not None and sent + len(data) > self.fail_at_byte:
-            self._out += data[: self.fail_at_byte - sent] + self.fail_text
-            self.fail_at_byte = None
-            self._run = None
-            return
+            data = data[: self.fail_at_byte - sent] + self.fail_text
+            self.fail_at_byte = self._run = None
         self._out += data
 
     def _say(self, text: str) -> None:
@@ -178,10 +177,10 @@ _BACK: Final[dict[QuarterTurn, QuarterTurn]] = {0: 0, 90: 270, 180: 180, 270: 90
 """The turn that undoes another."""
 
 
+@dataclass(slots=True)
 class _Run:
-    def __init__(self, n_frames: int, period_s: float, start_s: float) -> None:
-        self.n_frames = n_frames
-        self.period_s = period_s
-        self.start_s = start_s
-        self.next_frame = 0
-        self.aborted = False
+    n_frames: int
+    period_s: float
+    start_s: float
+    next_frame: int = 0
+    aborted: bool = False

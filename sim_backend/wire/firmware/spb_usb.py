@@ -11,16 +11,7 @@ from collections.abc import Callable, Iterable
 from typing import Final
 
 from drivers.frames import BlockFlag, BlockStatus
-from drivers.spb1.control import (
-    ACK_BLOCK_BYTES,
-    COMMAND,
-    COMMAND_MAGIC,
-    Ack,
-    AckStatus,
-    Op,
-    Register,
-    SensorState,
-)
+from drivers.spb1.control import ACK_BLOCK_BYTES, COMMAND, COMMAND_MAGIC, Ack, AckStatus, Op, Register, SensorState
 from drivers.spb1.layout import ALIGN, REGISTER_ACK
 from sim_backend.wire.firmware.spb_usb_run import (
     WINDOW_ENTRIES,
@@ -45,9 +36,6 @@ class SpbUsbModel(UsbModel):
     def __init__(self, source: FrameSource, board: SpbUsbBoard) -> None:
         self.chip: Chip = board.chip
         self.mangle: Callable[[memoryview], Iterable[bytes | memoryview]] | None = None
-        self.gate_allowed = True
-        """The FPGA's own gate line: low from the moment the watchdog strikes or a run is aborted until the next START.
-        """
         self.deaf = False
         """Test knob: whether the firmware hangs: it takes commands and says nothing."""
         self.pings: list[int] = []
@@ -59,12 +47,12 @@ class SpbUsbModel(UsbModel):
         self._registers = registers_at_power_up(board)
         self.state = SensorState.IDLE
         self._run: EmulatedRun | None = None
-        self._run_id = 0
-        self._exposed = 0
+        self._run_id = self._exposed = 0
         self._acks: deque[bytes] = deque()
         self._queue: deque[memoryview] = deque()
         self._memory = BlockMemory()
-        self._session_open = board.chip == "fx3"
+        self._reset()
+        self.gate_allowed = True
 
     # The bus
 
@@ -128,13 +116,13 @@ class SpbUsbModel(UsbModel):
 
     def _obey(self, op: int, request_id: int, address: int, value: int, now_s: float) -> Ack:
         status, answer = AckStatus.OK, value
+        if op != Op.PING:
+            self.commands.append((op, address, value))
         if op == Op.PING:
             self.pings.append(value)
             if self._run is not None:
                 self._run.pinged_s = now_s
-            return Ack(op, request_id, status, value)
-        self.commands.append((op, address, value))
-        if op == Op.READ:
+        elif op == Op.READ:
             status, answer = self._read(address)
         elif op == Op.WRITE:
             status = self._write(address, value)
@@ -220,6 +208,8 @@ class SpbUsbModel(UsbModel):
         self._acks.clear()
         self._session_open = self.chip == "fx3"
         self.gate_allowed = False
+        """The FPGA's own gate line: low from the moment the watchdog strikes or a run is aborted until the next START.
+        """
 
     def _watch(self, now_s: float) -> None:
         """Act as the watchdog: a run whose host sends no PING ends dark."""
@@ -238,8 +228,3 @@ class SpbUsbModel(UsbModel):
             self._registers[Register.FIFO_HIGH_WATER] = min(run.high_water_bytes, 0xFFFFFFFF)
             self._run = None
             self.state = SensorState.ARMED
-
-    def lose_next(self, n: int) -> None:
-        """Lose the next frames of the run inside the device."""
-        if self._run is not None:
-            self._run.lose(n)

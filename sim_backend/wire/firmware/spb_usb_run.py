@@ -1,8 +1,6 @@
-"""One run of an emulated SPB1 device, its USB descriptors and its registers (docs/reference/spb1-usb.md).
+"""One run of an emulated SPB1 device, its USB descriptors and its registers (docs/reference/spb1-usb.md)."""
 
-In a run frames are exposed, the memory may lose some, and the others come in blocks.
-"""
-
+from collections import deque
 from collections.abc import Mapping
 from dataclasses import dataclass
 from fractions import Fraction
@@ -60,15 +58,11 @@ class SpbUsbBoard:
     """The board that is emulated: its sensor, its chip and its abilities."""
 
     width: int
-    """Pixels of a row."""
     height: int
-    """Rows of the sensor."""
     chip: Chip = "fx3"
-    """USB chip."""
     acks: Literal["endpoint", "stream"] = "endpoint"
     """Way of the acknowledgements: an endpoint of their own, or the stream."""
     serial: str | None = "SPB-0001"
-    """Serial number; None: it has none."""
     product_name: str = "SPB1 SPAD"
     """Product string by which drivers find it."""
     paced: bool = False
@@ -78,13 +72,10 @@ class SpbUsbBoard:
     payload_crc: bool = True
     """Blocks carry the CRC of their payload."""
     tick_hz: int = 100_000_000
-    """Rate of the tick counter."""
     min_period_ticks: int = 1000
-    """Shortest frame period."""
     ddr_bytes: int = 1 << 30
     """Memory for bursts."""
     max_stride: int = 1 << 20
-    """Largest stride of a block in bytes."""
     link_bytes_per_s: int = 400_000_000
     """Rate that the link carries, as the board states it."""
     protocol: int = 0x0100
@@ -97,17 +88,14 @@ class BlockMemory:
     """Buffers that no transport holds any more."""
 
     def __init__(self) -> None:
-        self._buffers: list[NDArray[np.uint8]] = []
-        self._next = 0
+        self._buffers: deque[NDArray[np.uint8]] = deque()
 
     def take(self, size: int) -> NDArray[np.uint8]:
         """The buffer that was given out longest ago."""
-        if self._next == len(self._buffers):
-            self._buffers.append(np.zeros(0, np.uint8))
-        if len(self._buffers[self._next]) != size:
-            self._buffers[self._next] = np.zeros(size, np.uint8)
-        memory = self._buffers[self._next]
-        self._next = (self._next + 1) % BUFFERS
+        memory = self._buffers.popleft() if len(self._buffers) == BUFFERS else np.zeros(size, np.uint8)
+        if len(memory) != size:
+            memory = np.zeros(size, np.uint8)
+        self._buffers.append(memory)
         return memory
 
     def control_block(self, stride: int, payload_type: int, run_id: int, payload: bytes) -> memoryview:
@@ -133,9 +121,7 @@ class EmulatedRun:
         self.next_frame = 0
         self.pinged_s = now_s
         self.over = False
-        """Whether the last block was made."""
         self.high_water_bytes = 0
-        """Largest number of bytes that waited for the host."""
         self._board, self._source, self._memory, self._run_id = board, source, memory, run_id
         self._period, self._exposure = registers[Register.PERIOD_TICKS], registers[Register.EXPOSURE_TICKS]
         self._burst = registers[Register.MODE] == 1
@@ -217,7 +203,9 @@ class EmulatedRun:
             sweep = self._source.expose(self._span(n), records, bits)
             if self._pattern:
                 flags |= BlockFlag.TEST_PATTERN
-                _draw_pattern(bits, self.next_frame, self._width)
+                for frame, image in enumerate(bits, self.next_frame):
+                    rows = b"".join(pattern_row(row, frame, self._width) for row in range(len(image)))
+                    image[:] = np.frombuffer(rows, np.uint8).reshape(image.shape)
         if self._seq == 0:
             flags |= BlockFlag.FIRST
         if self._just_lost:
@@ -262,46 +250,26 @@ def _window(registers: Mapping[int, int]) -> WindowTable | None:
     return WindowTable(width, tuple(tables))
 
 
-def _draw_pattern(bits: NDArray[np.uint8], first_frame: int, width: int) -> None:
-    for frame, image in enumerate(bits, first_frame):
-        for row in range(len(image)):
-            image[row] = np.frombuffer(pattern_row(row, frame, width), np.uint8)
-
-
 _PACKET = 1024
 WINDOW_ENTRIES: Final = 4096
 """Most entries of all window tables together."""
 WRITABLE: Final = frozenset(
     (
-        Register.HEARTBEAT_MS,
-        Register.PERIOD_TICKS,
-        Register.EXPOSURE_TICKS,
-        Register.MODE,
-        Register.STRIDE,
-        Register.BLOCK_FRAMES,
-        Register.N_FRAMES,
-        Register.N_FRAMES + 4,
-        Register.WINDOW_WIDTH_PX,
-        Register.WINDOW_SWEEPS,
-        Register.TEST_PATTERN,
-        Register.WINDOW_COUNTS,
-        Register.WINDOW_COUNTS + 4,
+        *(Register.HEARTBEAT_MS, Register.PERIOD_TICKS, Register.EXPOSURE_TICKS, Register.MODE, Register.STRIDE),
+        *(Register.BLOCK_FRAMES, Register.N_FRAMES, Register.N_FRAMES + 4, Register.WINDOW_WIDTH_PX),
+        *(Register.WINDOW_SWEEPS, Register.TEST_PATTERN, Register.WINDOW_COUNTS, Register.WINDOW_COUNTS + 4),
     )
 )
 
 
 def device_spec(chip: Chip, acks: str, serial: str | None, product_name: str) -> DeviceSpec:
     """FX3: 04B4:00F1, one interface. FT601: 0403:601F, interface 0 for its session, interface 1 for data."""
-    bulk = [EndpointSpec(address, "bulk", _PACKET) for address in (0x01, 0x81)]
+    addresses = ((0x01, 0x81, 0x82) if chip == "fx3" else (0x02, 0x82, 0x83))[: 3 if acks == "endpoint" else 2]
+    bulk = tuple(EndpointSpec(address, "bulk", _PACKET) for address in addresses)
     if chip == "fx3":
-        if acks == "endpoint":
-            bulk.append(EndpointSpec(0x82, "bulk", _PACKET))
-        return DeviceSpec(0x04B4, 0x00F1, "spadrig", product_name, serial, "super", (AlternateSpec(0, 0, tuple(bulk)),))
+        return DeviceSpec(0x04B4, 0x00F1, "spadrig", product_name, serial, "super", (AlternateSpec(0, 0, bulk),))
     session = (EndpointSpec(0x01, "bulk", _PACKET), EndpointSpec(0x81, "interrupt", 64, 1))
-    data = [EndpointSpec(address, "bulk", _PACKET) for address in (0x02, 0x82)]
-    if acks == "endpoint":
-        data.append(EndpointSpec(0x83, "bulk", _PACKET))
-    alternates = (AlternateSpec(0, 0, session), AlternateSpec(1, 0, tuple(data)))
+    alternates = (AlternateSpec(0, 0, session), AlternateSpec(1, 0, bulk))
     return DeviceSpec(0x0403, 0x601F, "FTDI", product_name, serial, "super", alternates)
 
 

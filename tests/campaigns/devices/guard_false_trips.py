@@ -14,8 +14,9 @@ import subprocess
 import sys
 import tempfile
 import time
+from contextlib import closing
 
-from tests.wire.scan_rig import Applications, ScanFailedError, applications, scan_bench
+from tests.wire.scan_rig import Applications, ScanFailedError, scan_bench
 
 MAPS = 500
 """Maps of one scan: a quarter of a minute where the emulated devices keep up."""
@@ -40,7 +41,7 @@ def main() -> int:
     parser.add_argument("--burners", type=int, default=2 * (os.cpu_count() or 1))
     options = parser.parse_args()
     tripped, others, scans, lit_s = 0, 0, 0, 0.0
-    with applications() as scanning, tempfile.NamedTemporaryFile(dir=".", prefix="guard-load-") as scratch:
+    with closing(Applications()) as scanning, tempfile.NamedTemporaryFile(dir=".", prefix="guard-load-") as scratch:
         loads = [subprocess.Popen([sys.executable, "-c", BURN]) for _ in range(options.burners)]
         loads.append(subprocess.Popen([sys.executable, "-c", WRITE, scratch.name]))
         ends_at = time.monotonic() + options.seconds

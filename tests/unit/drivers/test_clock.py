@@ -1,7 +1,5 @@
 """The virtual clock stands still, never runs back and takes no time."""
 
-import threading
-
 from drivers.clock import SystemClock, VirtualClock
 from drivers.replay.pace import Pace
 from tests.stability.inventory import covers
@@ -25,18 +23,3 @@ def test_a_virtual_day_passes_at_once_and_never_back() -> None:
     assert clock.now_ns() == 86_400 * 10**9 + 5
     clock.advance_to_ns(86_401 * 10**9)
     assert clock.now_ns() == 86_401 * 10**9
-
-
-def test_threads_that_sleep_on_a_virtual_clock_add_up() -> None:
-    clock = VirtualClock()
-
-    def doze() -> None:
-        for _ in range(2000):
-            clock.sleep(1e-9)
-
-    threads = [threading.Thread(target=doze) for _ in range(4)]
-    for thread in threads:
-        thread.start()
-    for thread in threads:
-        thread.join()
-    assert clock.now_ns() == 8000

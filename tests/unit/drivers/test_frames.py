@@ -3,15 +3,13 @@
 from dataclasses import replace
 
 import numpy as np
-import pytest
 
 from drivers.frames import FRAME_RECORD, FrameBlock, packed_row_bytes
 from tests.unit.drivers.spb1_bytes import GOLDEN_HEADER
 
 
-@pytest.mark.parametrize(("width", "row_bytes"), [(1, 8), (64, 8), (65, 16), (320, 40), (500, 64), (512, 64)])
-def test_rows_are_padded_to_whole_words(width: int, row_bytes: int) -> None:
-    assert packed_row_bytes(width) == row_bytes
+def test_rows_are_padded_to_whole_words() -> None:
+    assert [packed_row_bytes(width) for width in (1, 64, 65, 320, 500, 512)] == [8, 8, 16, 40, 64, 64]
 
 
 def test_frame_numbers_and_times_stay_exact_beyond_32_bits() -> None:

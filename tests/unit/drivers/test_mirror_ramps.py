@@ -50,12 +50,7 @@ def test_a_brake_ends_at_rest_within_the_limits(position: float, velocity_per_s:
         np.concatenate([[position - velocity_per_s / RATE_HZ, position], way, [way[-1] if len(way) else position] * 2]),
         brief,
     )
-
-
-@given(PLACE, st.floats(-5000, 5000))
-def test_a_brake_never_leaves_the_range(position: float, velocity_per_s: float) -> None:
-    way = brake(position, velocity_per_s, LIMITS, RATE_HZ)
-    assert (np.abs(way) <= 1).all()
+    assert (np.abs(brake(2 * position, 6 * velocity_per_s, LIMITS, RATE_HZ)) <= 1).all()
 
 
 @given(PLACE, st.integers(1, 5), st.lists(st.integers(1, 300), min_size=1, max_size=40))
@@ -88,7 +83,4 @@ def test_a_stop_goes_on_from_where_the_run_was(taken: int) -> None:
     assert source.left == 0
     assert not after.lit.any()
     checked(np.concatenate([[-0.3], before.command, after.command, [after.command[-1] if len(after) else source.last]]))
-
-
-def test_parking_where_it_stands_needs_no_points() -> None:
-    assert PointSource(0.5, 0.5, LIMITS, RATE_HZ).left == 0
+    assert PointSource(0.5, 0.5, LIMITS, RATE_HZ).left == 0  # parking where it stands needs no points

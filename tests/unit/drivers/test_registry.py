@@ -34,12 +34,11 @@ def installed(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(registry, "entry_points", entry_points)
 
 
-def test_kinds_are_listed_once_and_sorted() -> None:
+def test_kinds_are_listed_once_and_sorted_and_one_that_is_found_creates_its_device() -> None:
     assert kinds("laser") == ("arc", "broken", "lamp", "same", "twice")
     assert kinds("spad") == ()
-
-
-def test_a_kind_is_found_and_creates_its_device() -> None:
+    with pytest.raises(ValueError, match="no slot 'camera'"):
+        kinds("camera")
     kind = lookup("laser", "lamp")
     device = kind.create(kind.config(kind="lamp", watts=3), Surroundings(VirtualClock(), None, seed=4))
     assert device == (3, 4)
@@ -58,11 +57,6 @@ def test_a_kind_is_found_and_creates_its_device() -> None:
 def test_a_kind_that_is_unknown_or_cannot_be_used_is_refused(slot: str, kind: str, said: str) -> None:
     with pytest.raises(UnknownKind, match=said):
         lookup(slot, kind)
-
-
-def test_a_slot_no_rig_has_is_a_mistake_of_the_program() -> None:
-    with pytest.raises(ValueError, match="no slot 'camera'"):
-        kinds("camera")
 
 
 def test_a_kinds_config_takes_no_stray_keys_and_does_not_change() -> None:

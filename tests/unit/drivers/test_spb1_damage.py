@@ -99,11 +99,9 @@ def streams(draw: st.DrawFn) -> Stream:
 
 def walked(raw: NDArray[np.uint8], stride: int | None) -> tuple[list[FrameBlock], list[Damage]]:
     items = list(walk_blocks(raw, stride, check_payload=True))
-    assert all("\n" not in item.reason for item in items if isinstance(item, Damage))
-    return (
-        [item for item in items if isinstance(item, FrameBlock)],
-        [item for item in items if isinstance(item, Damage)],
-    )
+    damage = [item for item in items if isinstance(item, Damage)]
+    assert all("\n" not in item.reason for item in damage)
+    return [item for item in items if isinstance(item, FrameBlock)], damage
 
 
 def check_only_true_blocks(blocks: list[FrameBlock], stream: Stream) -> set[int]:
@@ -116,20 +114,12 @@ def check_only_true_blocks(blocks: list[FrameBlock], stream: Stream) -> set[int]
 
 
 @FEW
-@given(streams(), st.booleans())
-def test_a_clean_stream_gives_every_block_and_no_damage(stream: Stream, known_stride: bool) -> None:
-    blocks, damage = walked(stream.raw, stream.stride if known_stride else None)
-    assert check_only_true_blocks(blocks, stream) == set(stream.blocks)
-    assert damage == []
-
-
-@FEW
 @given(streams(), st.booleans(), st.data())
 def test_flipped_and_zeroed_bytes_cost_just_the_blocks_they_hit(
     stream: Stream, known_stride: bool, data: st.DataObject
 ) -> None:
     raw = stream.raw.copy()
-    for _ in range(data.draw(st.integers(1, 4), "wounds")):
+    for _ in range(data.draw(st.integers(0, 4), "wounds")):
         start = data.draw(st.integers(0, len(raw) - 1), "start")
         if data.draw(st.booleans(), "flip"):
             raw[start] ^= 1 << data.draw(st.integers(0, 7), "bit")
@@ -165,33 +155,18 @@ def test_a_piece_lost_or_come_twice_costs_just_the_blocks_it_touches(
 
 @FEW
 @given(streams(), st.booleans(), st.data())
-def test_a_torn_stream_gives_what_was_whole(stream: Stream, known_stride: bool, data: st.DataObject) -> None:
+def test_a_torn_stream_gives_what_was_whole_and_bytes_slipped_in_nothing_wrong(
+    stream: Stream, known_stride: bool, data: st.DataObject
+) -> None:
     length = data.draw(st.integers(0, len(stream.raw)), "length")
-    blocks, damage = walked(stream.raw[:length], stream.stride if known_stride else None)
+    stride = stream.stride if known_stride else None
+    blocks, damage = walked(stream.raw[:length], stride)
     whole = {seq for seq, span in enumerate(stream.spans) if span.stop <= length}
     assert check_only_true_blocks(blocks, stream) == whole
     assert all(item.offset + item.length <= length for item in damage)
-
-
-@FEW
-@given(streams(), st.booleans(), st.lists(st.tuples(st.integers(0, 2**30), st.binary(max_size=9)), max_size=3))
-def test_bytes_slipped_in_anywhere_never_give_a_wrong_block(
-    stream: Stream, known_stride: bool, slips: list[tuple[int, bytes]]
-) -> None:
-    raw = stream.raw.tobytes()
-    for where, extra in slips:
-        cut = where % len(raw)
-        raw = raw[:cut] + extra + raw[cut + 3 :]
-    blocks, _ = walked(np.frombuffer(raw, np.uint8), stream.stride if known_stride else None)
+    extra = np.frombuffer(data.draw(st.binary(max_size=9)), np.uint8)
+    blocks, _ = walked(np.concatenate([stream.raw[:length], extra, stream.raw[length + 3 :]]), stride)
     check_only_true_blocks(blocks, stream)
-
-
-@FEW
-@given(st.binary(max_size=4000), st.booleans())
-def test_noise_gives_no_block(noise: bytes, known_stride: bool) -> None:
-    blocks, damage = walked(np.frombuffer(noise, np.uint8), ALIGN if known_stride else None)
-    assert blocks == []
-    assert sum(item.length for item in damage) <= len(noise)
 
 
 def test_damage_says_where_and_why() -> None:
@@ -251,9 +226,7 @@ def test_a_payload_that_holds_a_block_is_no_place_to_start_from_while_the_outer_
     inner = np.frombuffer(golden_block(), np.uint8)
     _, bits = block_views(memory, layout)
     bits.reshape(-1)[1024 - layout.pixels_offset :][:1024] = inner
-    header = parse_block(
-        written_block(layout, layout.min_stride, 3, np.random.default_rng(1)), check_payload=True
-    ).header
+    header = replace(GOLDEN_HEADER, width=512, height=64, sensor_width=512, sensor_height=64)
     seal_block(memory, header, layout, payload_crc=True)
     blocks, damage = walked(memory, None)
     assert [block.header for block in blocks] == [header]

@@ -11,19 +11,10 @@ from pydantic import BaseModel, Field, ValidationError
 
 from drivers.units import (
     DIMENSIONS,
-    BytesPerSecond,
-    CountsPerSecond,
     ExactHertz,
-    Hertz,
-    Lux,
     Metres,
-    MetresPerHour,
     PerMetre,
-    PerSecond,
-    Ppm,
-    Radians,
     Seconds,
-    Watts,
     format_quantity,
     parse_exact,
     parse_quantity,
@@ -33,40 +24,20 @@ DIMENSION = st.sampled_from(sorted(DIMENSIONS))
 FINITE = st.floats(allow_nan=False, allow_infinity=False)
 
 
-class Everything(BaseModel):
-    exposure: Seconds = 1e-5
-    rate: Hertz = 1e5
+class Camera(BaseModel):
+    exposure: Annotated[Seconds, Field(gt=0)] = 1e-5
     frame_rate: ExactHertz = Fraction(100_000, 3)
     depth_range: tuple[Metres, Metres] = (1.0, 8.0)
-    power: Watts = 0.05
     extinction: PerMetre | None = 0.05
-    roll: Radians = 0.05
-    sun: Lux = 2e4
-    drift: Ppm = 2e-5
-    rain: MetresPerHour = 0.02
-    dark: CountsPerSecond = 20.0
-    drops: PerSecond = 5.0
-    link: BytesPerSecond = 4e8
 
 
 @pytest.mark.parametrize(
     ("text", "dimension", "value"),
     [
-        ("10 us", "time", 1e-5),
-        ("0.1us", "time", 1e-7),
-        ("10 µs", "time", 1e-5),
-        ("10 μs", "time", 1e-5),
-        ("  +1.5e3 ns ", "time", 1.5e-6),
-        ("97.7 kHz", "frequency", 97_700.0),
-        ("30 m", "length", 30.0),
-        ("-3 mm", "length", -0.003),
-        ("0.05 /m", "inverse length", 0.05),
-        ("50 1/km", "inverse length", 0.05),
-        ("180 deg", "angle", math.pi),
-        ("20 ppm", "ratio", 2e-5),
-        ("20 mm/h", "rain rate", 0.02),
-        (".5 W", "power", 0.5),
-        ("400 MB/s", "data rate", 4e8),
+        *((text, "time", 1e-5) for text in ("10 us", "10 µs", "10 μs", "10us", "  +1.0e4 ns ")),
+        *(("0.1us", "time", 1e-7), ("97.7 kHz", "frequency", 97_700.0), ("-3 mm", "length", -0.003)),
+        *(("0.05 /m", "inverse length", 0.05), ("50 1/km", "inverse length", 0.05), ("180 deg", "angle", math.pi)),
+        *(("20 ppm", "ratio", 2e-5), ("20 mm/h", "rain rate", 0.02), (".5 W", "power", 0.5)),
         ("3.28GB/s", "data rate", 3.28e9),
     ],
 )
@@ -123,51 +94,32 @@ def test_what_is_not_finite_is_not_written(value: float) -> None:
 @pytest.mark.parametrize(
     ("value", "dimension", "text"),
     [
-        (1e-5, "time", "10 us"),
-        (1e5, "frequency", "100 kHz"),
-        (8.0, "length", "8 m"),
-        (0.05, "inverse length", "0.05 /m"),
-        (2e-5, "ratio", "20 ppm"),
-        (0.0, "ratio", "0 ppm"),
-        (0.001, "ratio", "0.1 %"),
-        (2000.0, "rate", "2000 /s"),
-        (4e6, "acceleration", "4e6 /s2"),
-        (1e-7, "time", "100 ns"),
-        (0.05, "power", "50 mW"),
-        (0.02, "rain rate", "20 mm/h"),
-        (Fraction(97_700), "frequency", "97.7 kHz"),
-        (Fraction(100_000, 3), "frequency", "100000/3 Hz"),
+        *((1e-5, "time", "10 us"), (1e-7, "time", "100 ns"), (1e5, "frequency", "100 kHz"), (8.0, "length", "8 m")),
+        *((0.05, "inverse length", "0.05 /m"), (2e-5, "ratio", "20 ppm"), (0.0, "ratio", "0 ppm")),
+        *((0.001, "ratio", "0.1 %"), (2000.0, "rate", "2000 /s"), (4e6, "acceleration", "4e6 /s2")),
+        *((0.05, "power", "50 mW"), (0.02, "rain rate", "20 mm/h")),
+        *((Fraction(97_700), "frequency", "97.7 kHz"), (Fraction(100_000, 3), "frequency", "100000/3 Hz")),
     ],
 )
 def test_text_is_written_as_people_write_it(value: float | Fraction, dimension: str, text: str) -> None:
     assert format_quantity(value, dimension) == text
 
 
-def test_a_model_of_every_type_is_read_back_from_its_dump() -> None:
-    model = Everything()
+def test_a_model_is_read_back_from_its_dump_and_its_schema_says_text_with_an_example() -> None:
+    model = Camera()
     dumped = model.model_dump(mode="json")
     assert dumped["exposure"] == "10 us"
-    assert Everything.model_validate(dumped) == model
+    assert Camera.model_validate(dumped) == model
     assert model.model_dump()["exposure"] == 1e-5
+    schema = Camera.model_json_schema()["properties"]["exposure"]
+    assert (schema["type"], schema["examples"]) == ("string", ["10 us"])
 
 
-def test_a_model_names_the_key_and_an_example() -> None:
+def test_a_model_names_the_key_and_an_example_and_checks_limits_in_si() -> None:
     with pytest.raises(ValidationError) as refused:
-        Everything.model_validate({"depth_range": ["1 m", 8]})
+        Camera.model_validate({"depth_range": ["1 m", 8]})
     (error,) = refused.value.errors()
     assert error["loc"] == ("depth_range", 1)
     assert '"30 m"' in error["msg"]
-
-
-def test_limits_on_a_field_are_checked_in_si() -> None:
-    class Shutter(BaseModel):
-        exposure: Annotated[Seconds, Field(gt=0)]
-
-    assert Shutter.model_validate({"exposure": "1 ns"}).exposure == 1e-9
     with pytest.raises(ValidationError, match="greater than 0"):
-        Shutter.model_validate({"exposure": "-10 us"})
-
-
-def test_the_json_schema_says_text_with_an_example() -> None:
-    schema = Everything.model_json_schema()["properties"]["exposure"]
-    assert (schema["type"], schema["examples"]) == ("string", ["10 us"])
+        Camera.model_validate({"exposure": "-10 us"})

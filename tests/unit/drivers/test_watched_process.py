@@ -65,13 +65,3 @@ def test_what_a_thread_that_wakes_by_itself_did_does_not_count_but_that_it_is_at
         monkeypatch.setattr(watched_process, "_AT_WORK", ())
         assert busy_looks(WatchedProcess(pid)) == 20
         eventually(lambda: busy_looks(WatchedProcess(pid, thread)) <= 4)
-
-
-def test_two_looks_in_a_row_have_to_find_it_asleep(monkeypatch: pytest.MonkeyPatch) -> None:
-    with running(ASLEEP) as (pid, _):
-        watched = WatchedProcess(pid)
-        watched.note_progress()
-        found = iter([True, False, True, True, True])
-        monkeypatch.setattr(WatchedProcess, "_asleep", lambda self: next(found))
-        assert [watched.busy() for _ in range(5)] == [True, True, True, False, False]
-        watched.close()
