@@ -246,12 +246,12 @@ def test_trap_analog_modulation_is_switched_off() -> None:
 def test_a_flipped_bit_arms_no_laser_without_its_gate() -> None:
     model = CoboltModel(warm_up_s=0.0)
     model.on, model.mode = True, "modulation"
-    query = model._query_mld
+    query = model._query
 
     def garble(command: str) -> str | None:
         return "1" if command == "gdmes?" and model.commands.count(command) == 2 else query(command)
 
-    model._query_mld = garble  # type: ignore[method-assign]
+    model._query = garble  # type: ignore[method-assign]
     with wire(model) as (_, surroundings), open_cobolt(surroundings) as laser:
         laser.arm(0.05)  # looks at it twice before it believes that it is gated
         assert model.gated
@@ -313,8 +313,8 @@ def test_a_laser_found_emitting_at_constant_current_is_switched_off(family: Fami
 
 def test_a_laser_that_keeps_its_power_is_switched_off_by_a_pause() -> None:
     class Stubborn(CoboltModel):
-        def _set_mld(self, name: str, value: str) -> bool:
-            return name == "slmp" or super()._set_mld(name, value)
+        def _set(self, name: str, value: str) -> bool:
+            return name == "slmp" or super()._set(name, value)
 
     model = Stubborn()
     model.shine(0.06)
@@ -327,8 +327,8 @@ def test_a_laser_that_keeps_its_power_is_switched_off_by_a_pause() -> None:
 
 def test_arm_that_fails_half_way_leaves_it_dark() -> None:
     class NoGate(CoboltModel):
-        def _set_mld(self, name: str, value: str) -> bool:
-            return name != "sames" and super()._set_mld(name, value)
+        def _set(self, name: str, value: str) -> bool:
+            return name != "sames" and super()._set(name, value)
 
     model = NoGate()
     model.on, model.analog = True, True
