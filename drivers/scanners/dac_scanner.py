@@ -118,11 +118,9 @@ class DacRun(Protocol):
 
     def begin(self) -> None:
         """Send the first points; they play at once."""
-        ...
 
     def feed(self, stopping: threading.Event) -> None:
         """Send the rest; returns when the mirror rests. Brakes once `stopping` is set."""
-        ...
 
 
 class Dac(Protocol):
@@ -139,23 +137,18 @@ class Dac(Protocol):
 
     def point_clock(self, requested_hz: float, low_hz: float, high_hz: float) -> Fraction:
         """The exact rate nearest to the requested one, within low to high."""
-        ...
 
     def run(self, source: PointSource, clock_hz: Fraction) -> DacRun:
         """A run of these points at a rate that `point_clock` returned."""
-        ...
 
     def check(self) -> None:
         """Raise where the board does not answer. Any thread."""
-        ...
 
     def halt(self) -> float:
         """End what the board plays, in an emergency; returns where the mirror rests then."""
-        ...
 
     def close(self) -> None:
         """Make the outputs safe and give the board back."""
-        ...
 
 
 class DacScanner(BeamScanner):

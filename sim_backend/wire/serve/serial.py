@@ -39,11 +39,9 @@ class SerialModel(Protocol):
 
     def receive(self, data: bytes, now_s: float) -> bytes:
         """Take bytes from the host, in pieces of any size; returns what the device answers."""
-        ...
 
     def tick(self, now_s: float) -> bytes:
         """Let time pass; returns what the device sends unasked."""
-        ...
 
 
 class _SerialLine(Wire[SerialModel]):
