@@ -1,19 +1,12 @@
 """The Cobolt (Huebner) 06-01 line laser, gated by its digital modulation input.
 
-docs/reference/hardware.md; from cobolt-lasers/pycobolt 1333e53 (2025-09) and python-microscope `lights/cobolt.py`. The
-laser has no watchdog: where its port is lost it stays as it was, so treat it as on. It judges its temperatures itself:
-fault 1.
+Its bytes are in docs/reference/hardware.md; from cobolt-lasers/pycobolt 1333e53 (2025-09) and python-microscope
+`lights/cobolt.py`. Old firmware may put junk before a reply. It judges its temperatures itself: fault 1.
 
-Modes. 06-MLD speaks one language, newer lasers an SCPI-like one; a `Dialect` is written for each. 06-DPL is refused:
-its regulated power follows a gate up to about 1 kHz only. Both languages keep the laser dark by a power of 0 and not by
-`l0`: after `l0` its key must be turned (pycobolt issue 6), and a power of 0 can be read back, by the next program too.
-Pause = power 0 (and `las:paus 1`): no key is needed to resume. Disarm = the same, then `l0`: with autostart enabled the
-key must be turned off and on before the laser starts again. Never sent: commands that change autostart, key switch or
-direct control (`@cobas x`, `@cobasky`, `@cobasdr`).
-
-Bytes. 115 200 baud, 8N1. A command ends with CR; its reply is one line that ends with CRLF: a value, `OK` or `Syntax
-error: illegal command`. Old firmware may put junk before a reply. Commands follow one another at 100 ms or more; a
-reply may take a second (0.1 s is too little: python-microscope issue 234).
+06-MLD speaks one language, newer lasers an SCPI-like one; 06-DPL is refused, since its power follows a gate up to about
+1 kHz only. The laser is kept dark by a power of 0 and not by `l0`: after `l0` its key must be turned (pycobolt issue
+6), and a power of 0 can be read back, by the next program too. Pause = power 0 (and `las:paus 1`): no key is needed to
+resume. Disarm = the same, then `l0`: with autostart enabled the key must be turned off and on before it starts again.
 """
 
 import logging

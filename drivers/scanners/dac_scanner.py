@@ -13,7 +13,7 @@ import threading
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 from fractions import Fraction
-from typing import Protocol
+from typing import Any, Protocol
 
 import numpy as np
 from numpy.typing import NDArray
@@ -25,6 +25,16 @@ from drivers.scanners.galvo import GalvoConfig, brake, ramp
 from drivers.transports.endpoints import resolve
 from drivers.transports.usb_device import UsbDevice, UsbId, open_device
 
+_log = logging.getLogger(__name__)
+
+FULL_SCALE, CENTRE = 4095, 0x800
+"""Largest value of the converters, and the one at which the mirror stands without power."""
+POLL_S = 0.002
+"""Time between two questions how far the board is."""
+PATIENCE_S = 1.0
+"""Wait for a buffer to fall free, beyond the time that its points take."""
+DRIFT = 1e-3
+"""Largest relative difference between a board's crystal and the host's clock."""
 _NO_WAVE = ScanWaveform(np.zeros(1), np.zeros(1, np.uint8), Fraction(1))
 
 
@@ -39,6 +49,20 @@ class PointSlice:
     def __len__(self) -> int:
         """Points of the slice."""
         return len(self.command)
+
+    @property
+    def steps(self) -> NDArray[np.uint16]:
+        """The commands as the boards' converters of 12 bits take them."""
+        return np.rint((self.command + 1) / 2 * FULL_SCALE).astype(np.uint16)
+
+    def level(self, bit: int) -> NDArray[np.uint8]:
+        """A colour output that follows a marker."""
+        return colour(self.markers & bit)
+
+
+def colour(high: NDArray[Any]) -> NDArray[np.uint8]:
+    """Full brightness of a colour output at the points that are not 0."""
+    return np.where(high, 255, 0).astype(np.uint8)
 
 
 class PointSource:
@@ -89,7 +113,9 @@ class PointSource:
         of_wave = (at[lit] - len(self._way)) % len(self._wave.command)
         command[lit], markers[lit] = self._wave.command[of_wave], self._wave.markers[of_wave]
         command[~lit] = self._way[at[~lit]]
-        self._note(command)
+        if len(command):
+            self._before = float(command[-2]) if len(command) > 1 else self.last
+            self.last = float(command[-1])
         return PointSlice(command, markers, lit)
 
     def give_back(self) -> None:
@@ -101,14 +127,6 @@ class PointSource:
         if self.left:
             self._way = brake(self.last, (self.last - self._before) * self._rate_hz, self._limits, self._rate_hz)
             self._at, self._end = 0, len(self._way)
-
-    def _note(self, command: NDArray[np.float64]) -> None:
-        if len(command):
-            self._before = float(command[-2]) if len(command) > 1 else self.last
-            self.last = float(command[-1])
-
-
-_log = logging.getLogger(__name__)
 
 
 class DacRun(Protocol):

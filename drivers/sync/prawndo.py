@@ -24,22 +24,12 @@ from pydantic import Field
 from drivers.errors import DeviceError, DeviceFault, LimitExceeded, ProtocolError
 from drivers.interfaces import Pulse, SyncSource, SyncStatus, sliced
 from drivers.registry import Kind, KindConfig, Surroundings
-from drivers.sync.prawndo_line import (
-    ABORT_REQUESTED,
-    ABORTED,
-    ABORTING,
-    IDLE,
-    RUNNING,
-    STARTING,
-    STOPPED,
-    STOPPING,
-    USUAL_TIMING,
-    PrawnDoLine,
-    PrawnDoTiming,
-)
+from drivers.sync.prawndo_line import IDLE, USUAL_TIMING, PrawnDoLine, PrawnDoTiming
 from drivers.transports.endpoints import resolve
 from drivers.transports.serial_port import SerialPort
 from drivers.units import Hertz, Seconds
+
+_log = logging.getLogger(__name__)
 
 MIN_CYCLES = 5
 MAX_CYCLES = 2**32 - 1
@@ -79,10 +69,7 @@ def most_repeats(pulses: Sequence[Pulse], board: ProgramLimits) -> int:
 
 
 def _words(pulses: Sequence[Pulse], board: ProgramLimits) -> NDArray[np.void]:
-    words = np.zeros(len(pulses), WORD)
-    for index, pulse in enumerate(pulses):
-        words[index] = pulse.outputs, _cycles(index, pulse, board)
-    return words
+    return np.array([(pulse.outputs, _cycles(index, pulse, board)) for index, pulse in enumerate(pulses)], WORD)
 
 
 def _cycles(index: int, pulse: Pulse, board: ProgramLimits) -> int:
@@ -115,8 +102,6 @@ def _check_waits(period: NDArray[np.void], repeats: int, board: ProgramLimits) -
         )
 
 
-_log = logging.getLogger(__name__)
-
 INTERNAL_HZ = 100_000_000
 """The board's own clock (docs/reference/hardware.md)."""
 MAX_WORDS = {"board: pico1": 30_000, "board: pico2": 60_000}
@@ -125,15 +110,10 @@ OLDEST_FIRMWARE = (1, 3)
 _CLOCK_CHANGE_S = 0.02
 """Time for the board to find out that there is no clock on GPIO20."""
 _CLOCK_TOLERANCE = 0.01
-_STATES: dict[int, Literal["stopped", "running", "aborted"]] = {
-    STOPPED: "stopped",
-    STARTING: "running",
-    RUNNING: "running",
-    ABORT_REQUESTED: "aborted",
-    ABORTING: "aborted",
-    ABORTED: "aborted",
-    STOPPING: "stopped",
-}
+_STATES: Sequence[Literal["stopped", "running", "aborted"]] = (
+    *("stopped", "running", "running", "aborted", "aborted", "aborted", "stopped"),
+)
+"""Meaning of each `run-status`."""
 
 
 class PrawnDoConfig(KindConfig):
@@ -293,9 +273,4 @@ class PrawnDo(SyncSource):
             )
 
 
-def create(config: PrawnDoConfig, surroundings: Surroundings, timing: PrawnDoTiming = USUAL_TIMING) -> PrawnDo:
-    """The board at the config's port."""
-    return PrawnDo(config, surroundings, timing)
-
-
-KIND = Kind(config=PrawnDoConfig, create=create)
+KIND = Kind(config=PrawnDoConfig, create=PrawnDo)

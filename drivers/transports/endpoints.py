@@ -27,7 +27,7 @@ class Endpoint:
 
 
 def one_line(error: Exception) -> str:
-    """What another library says of an error, without its line ends."""
+    """The text of another library's error without its line ends."""
     return " ".join(str(error).split())
 
 

@@ -9,7 +9,7 @@ import random
 
 from drivers.interfaces import OUT_FRAME, OUT_GATE, Pulse
 from drivers.registry import Surroundings
-from drivers.sync.prawndo import PrawnDo, PrawnDoConfig, create
+from drivers.sync.prawndo import PrawnDo, PrawnDoConfig
 from drivers.sync.prawndo_line import PrawnDoTiming
 from sim_backend.wire.serve.wire_server import Fault, FaultSchedule
 from tests.campaigns.outcomes import Ending, Verbs
@@ -59,7 +59,7 @@ class Sequence:
     def _open(self) -> None:
         config = PrawnDoConfig(port="emulated:sync")
         ports = {"sync": self._board.server.endpoint}
-        self._device = create(config, Surroundings(self._board.clock, None, 0, ports), TIMING)
+        self._device = PrawnDo(config, Surroundings(self._board.clock, None, 0, ports), TIMING)
         self._require_low()
 
     def _program(self, device: PrawnDo) -> None:
