@@ -1,10 +1,8 @@
 """A beam scanner that is a galvo behind a DAC on USB: everything that is the same whatever the DAC.
 
-A `Dac` is one board with its link: it says at what rates it runs, and plays points. The mirror moves only when it is
-started or parked, always along ramps; opening a scanner asks the board who it is, no more.
-
-A run is the way to the first point, the waveform, and the way to rest. A thread feeds its points to the DAC slice by
-slice, and knows where the mirror rests. Nothing is laid out beforehand: a waveform of a million points repeated for
+The mirror moves only when it is started or parked, always along ramps; opening a scanner asks the board who it is, no
+more. A run is the way to the first point, the waveform, and the way to rest. A thread feeds its points to the DAC slice
+by slice, and knows where the mirror rests. Nothing is laid out beforehand: a waveform of a million points repeated for
 hours takes the memory of the waveform.
 """
 

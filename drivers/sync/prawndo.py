@@ -5,11 +5,9 @@ Facts: docs/reference/hardware.md; from `prawn_do/prawn_do.{c,pio}` of labscript
 GPIO2 marks records.
 
 The firmware has no loops and no watchdog. So programs are written out in full and end on two words that hold everything
-low, whatever happens to the host. It cannot read its pins while a program runs, nor tell a wait from play.
-
-A word is 16 outputs and a number of cycles: 0 cycles wait for the trigger, two such words in a row are the end, with
-the first one's outputs left on the pins. The trigger is a level, so that a wait passes at once while it is high: that
-is how a held pulse looks at the scan marker. Pulses that the board would play otherwise than written are refused.
+low, whatever happens to the host. It cannot read its pins while a program runs, nor tell a wait from play. The trigger
+is a level, so that a wait passes at once while it is high: that is how a held pulse looks at the scan marker. Pulses
+that the board would play otherwise than written are refused.
 """
 
 import logging
@@ -190,7 +188,10 @@ class PrawnDo(SyncSource):
                 self._line.load(words.tobytes())
                 self._require_length(len(words))
             except DeviceError:
-                self._forget_program()
+                try:  # nothing of what did not arrive whole may ever be run
+                    self._line.command("cls")
+                except DeviceError as error:
+                    _log.warning("%s: %s", self.name, error)
                 raise
             self._confirmed = True
 
@@ -256,13 +257,6 @@ class PrawnDo(SyncSource):
         lines = self._line.transact("len")
         if f"Number of instructions: {n_words}" not in lines:
             raise DeviceFault(f"{self.name}: {lines} after a program of {n_words} words; load it again")
-
-    def _forget_program(self) -> None:
-        """Clear a program that did not arrive whole: nothing of it may ever be run."""
-        try:
-            self._line.command("cls")
-        except DeviceError as error:
-            _log.warning("%s: %s", self.name, error)
 
     def _check_clock(self) -> None:
         _, external = self._line.run_status()

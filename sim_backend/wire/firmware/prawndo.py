@@ -38,14 +38,9 @@ class TriggerLine:
     def __init__(self) -> None:
         self._edges: list[tuple[float, bool]] = []
 
-    def set(self, high: bool, at_s: float) -> None:
-        """Switch the line at a time not before the last one."""
-        self._edges.append((at_s, high))
-
     def pulse(self, at_s: float, width_s: float) -> None:
-        """Hold the line high for `width_s` from `at_s` on."""
-        self.set(True, at_s)
-        self.set(False, at_s + width_s)
+        """Hold the line high for `width_s` from `at_s` on, which is not before the last pulse."""
+        self._edges += [(at_s, True), (at_s + width_s, False)]
 
     def __call__(self, from_s: float, until_s: float) -> float | None:
         """First time in [from_s, until_s) at which the line is high; None: it is low until then."""

@@ -92,10 +92,6 @@ class EmulatedUsb(usb.backend.IBackend):  # type: ignore[misc] # pyusb carries n
         with self._lock:
             return iter(list(self._devices))
 
-    def get_parent(self, dev: AttachedDevice) -> None:
-        """None: all devices hang on the root."""
-        return None
-
     def get_device_descriptor(self, dev: AttachedDevice) -> SimpleNamespace:
         """The device descriptor, and where the device is."""
         place = {"address": dev.address, "bus": dev.bus, "port_number": dev.port, "port_numbers": (dev.port,)}
@@ -198,10 +194,6 @@ class EmulatedUsb(usb.backend.IBackend):  # type: ignore[misc] # pyusb carries n
     def clear_halt(self, dev_handle: _Handle, ep: int) -> None:
         """End a stall."""
         dev_handle.device.clear_halt(ep)
-
-    def is_kernel_driver_active(self, dev_handle: _Handle, intf: int) -> bool:
-        """False: vendor-specific interfaces have no kernel driver."""
-        return False
 
     def _until(self, timeout_ms: int) -> Iterator[None]:
         """Yield now and then until the time is over, at least once."""
