@@ -278,4 +278,4 @@ def _endpoints(device: Any) -> Iterator[int]:
 
 
 BulkLink = PlainLink | QueuedLink
-"""What a streaming driver talks to."""
+"""The link of a streaming driver."""

@@ -97,7 +97,7 @@ class DacHistory:
         return np.concatenate(edges) if edges else np.empty(0)
 
     def _at(self, time_s: Array) -> Iterator[tuple[Played, NDArray[np.bool_], NDArray[np.int64]]]:
-        """What was played at the times: at which of them, and its points then."""
+        """All that was played at the times: at which of them, and its points then."""
         for one in self._between(time_s.min(initial=np.inf), time_s.max(initial=-np.inf)):
             inside = (time_s >= one.start_s) & (time_s < one.end_s)
             at = np.floor((time_s[inside] - one.start_s) / one.period_s + 1e-9).astype(np.int64)

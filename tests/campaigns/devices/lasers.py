@@ -147,7 +147,6 @@ class Sequence:
 
 
 def sequence(subject: Subject, seed: int) -> Ending:
-    """One sequence, run: how it ended, and what was wrong with that, if anything."""
     return Sequence(subject, seed).run()
 
 

@@ -104,5 +104,4 @@ class Sequence:
 
 
 def sequence(seed: int) -> Ending:
-    """One sequence, run: how it ended, and what was wrong with that, if anything."""
     return Sequence(seed).run()

@@ -64,7 +64,6 @@ LASERCUBE = Subject(
 
 
 def sequence(subject: Subject, seed: int) -> Ending:
-    """One sequence, run: how it ended, and what was wrong with that, if anything."""
     rng = random.Random(seed)
     probability = rng.choice((0.003, 0.01, 0.05, 0.3))
     schedule = FaultSchedule(

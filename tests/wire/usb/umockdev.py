@@ -97,7 +97,6 @@ class UsbFile:
         self.thread = threading.Thread(target=self._serve, daemon=True)
 
     def close(self) -> None:
-        """End the connection."""
         with contextlib.suppress(OSError):
             self._connection.shutdown(socket.SHUT_RDWR)
         self.thread.join()
@@ -117,7 +116,6 @@ class UsbFile:
             return bool(over)
 
     def _work(self, urb: _Urb) -> bool:
-        """Whether the transfer is over."""
         try:
             if urb.setup is not None:
                 reply = self._device.control(urb.setup, urb.out_data)
@@ -316,7 +314,6 @@ class UmockdevBus:
         return attached
 
     def environment(self) -> dict[str, str]:
-        """Environment of a client process."""
         return {**os.environ, "LD_PRELOAD": PRELOAD, "UMOCKDEV_DIR": str(self._root)}
 
     def close(self) -> None:
@@ -326,11 +323,9 @@ class UmockdevBus:
         shutil.rmtree(self._root, ignore_errors=True)
 
     def __enter__(self) -> Self:
-        """The bus itself."""
         return self
 
     def __exit__(self, *_: object) -> None:
-        """Close."""
         self.close()
 
 
@@ -369,7 +364,6 @@ class _ServedDevice:
                     os.write(self._fifo, bytes(_FIFO_BYTES))
 
     def refresh(self) -> None:
-        """Say whether any handle has something to reap."""
         with self._lock:
             self.ready(any(handle.over for handle in self._handles))
 
@@ -378,7 +372,6 @@ class _ServedDevice:
         self._configuration_file.write_text(f"{value}\n")
 
     def close(self) -> None:
-        """End the threads."""
         self._closing.set()
         self._listener.shutdown(socket.SHUT_RDWR)
         self._listener.close()
@@ -400,7 +393,6 @@ class _ServedDevice:
             handle.thread.start()
 
     def forget(self, handle: UsbFile) -> None:
-        """The client closed it."""
         with self._lock:
             self._handles.remove(handle)
         self.device.close(handle)
