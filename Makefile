@@ -4,7 +4,7 @@ BIN := .venv/bin
 
 .PHONY: demo help test lint types layers house unit clean
 .PHONY: accuracy accuracy-rows accuracy-joint accuracy-calibration
-.PHONY: campaign campaign-devices campaign-guard campaign-recording campaign-simulation campaign-calibration campaign-kernel
+.PHONY: campaign campaign-devices campaign-guard campaign-recording campaign-simulation campaign-calibration
 .DELETE_ON_ERROR:
 
 demo: .venv/.installed  ## scan the simulated rig in a foggy street
@@ -45,14 +45,15 @@ accuracy-calibration: .venv/.installed-tests  ## corners of drawn boards; camera
 	@test ! -d $(PICTURES) || $(BIN)/python -m tests.reference.boards.chessboards --folder $(PICTURES)
 
 # Without tests.campaigns.devices.guard_false_trips, which burns all processors: nothing else could be measured beside it.
-campaign: campaign-devices campaign-guard campaign-recording campaign-simulation campaign-calibration campaign-kernel
-campaign:  ## the six below: what is tried at random (many hours)
+campaign: campaign-devices campaign-guard campaign-recording campaign-simulation campaign-calibration
+campaign:  ## the five below: what is tried at random (many hours)
 
 SEQUENCES ?= 10000
-campaign-devices: .venv/.installed-tests  ## SEQUENCES of faults on the wire of every driver; sweeps without markers
+campaign-devices: .venv/.installed-tests  ## SEQUENCES of faults on the wire of every driver; sweeps without markers; hardware in the loop
 	for driver in cobolt obis prawndo helios lasercube spb-usb spad512s blanking; do \
 		$(BIN)/python -m tests.campaigns.devices.faults $${driver} --sequences $(SEQUENCES) || exit; \
 	done
+	$(BIN)/python -m tests.campaigns.devices.hil_swaps
 campaign-guard: .venv/.installed-tests  ## blows to scans: how long the laser shines after them
 	$(BIN)/python -m tests.campaigns.devices.guard_kill
 campaign-recording: .venv/.installed-tests  ## recordings killed and damaged, and depth from them
@@ -71,10 +72,6 @@ campaign-calibration: .venv/.installed-tests  ## RIGS calibrated, TRIALS of deli
 	$(BIN)/python -m tests.campaigns.calibration.mistakes --trials $(TRIALS) || short=1; \
 	$(BIN)/python -m tests.campaigns.calibration.fits || short=1; \
 	exit $$short
-campaign-kernel: .venv/.installed-tests  ## drivers through real kernels; hardware in the loop, on an idle machine
-	$(BIN)/python -m tests.campaigns.kernel.usb
-	$(BIN)/python -m tests.campaigns.kernel.serial
-	$(BIN)/python -m tests.campaigns.devices.hil_swaps
 
 .venv/.created:
 	@test -n "$(PYTHON)" || { echo "error: no python3 found; install Python 3.11 or newer, or call make PYTHON=/path/to/python" >&2; exit 2; }

@@ -1,26 +1,19 @@
 """The Cobolt (Huebner) 06-01 line laser, gated by its digital modulation input.
 
-docs/reference/hardware.md; from cobolt-lasers/pycobolt 1333e53 (2025-09) and python-microscope `lights/cobolt.py`. The
-laser has no watchdog: where its port is lost it stays as it was, so treat it as on. It judges its temperatures itself:
-fault 1.
+Its bytes are in docs/reference/hardware.md; from cobolt-lasers/pycobolt 1333e53 (2025-09) and python-microscope
+`lights/cobolt.py`. Old firmware may put junk before a reply. It judges its temperatures itself: fault 1.
 
-Modes. 06-MLD speaks one language, newer lasers an SCPI-like one; a `Dialect` is written for each. 06-DPL is refused:
-its regulated power follows a gate up to about 1 kHz only. Both languages keep the laser dark by a power of 0 and not by
-`l0`: after `l0` its key must be turned (pycobolt issue 6), and a power of 0 can be read back, by the next program too.
-Pause = power 0 (and `las:paus 1`): no key is needed to resume. Disarm = the same, then `l0`: with autostart enabled the
-key must be turned off and on before the laser starts again. Never sent: commands that change autostart, key switch or
-direct control (`@cobas x`, `@cobasky`, `@cobasdr`).
-
-Bytes. 115 200 baud, 8N1. A command ends with CR; its reply is one line that ends with CRLF: a value, `OK` or `Syntax
-error: illegal command`. Old firmware may put junk before a reply. Commands follow one another at 100 ms or more; a
-reply may take a second (0.1 s is too little: python-microscope issue 234).
+06-MLD speaks one language, newer lasers an SCPI-like one; 06-DPL is refused, since its power follows a gate up to about
+1 kHz only. The laser is kept dark by a power of 0 and not by `l0`: after `l0` its key must be turned (pycobolt issue
+6), and a power of 0 can be read back, by the next program too. Pause = power 0 (and `las:paus 1`): no key is needed to
+resume. Disarm = the same, then `l0`: with autostart enabled the key must be turned off and on before it starts again.
 """
 
 import logging
 import re
-from abc import ABC, abstractmethod
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from contextlib import suppress
+from dataclasses import dataclass
 from functools import partial
 from typing import Literal
 
@@ -29,6 +22,8 @@ from drivers.interfaces import LaserLimits, LaserStatus
 from drivers.lasers.serial_laser import SerialLaser, SerialLaserConfig, open_laser, require_serial_number
 from drivers.registry import Kind, Surroundings
 from drivers.transports.dialogue import DONE, FLAG, NUMBER, CommandRefused, Dialogue, LineTiming
+
+_log = logging.getLogger(__name__)
 
 COUNT = re.compile(r"\d{1,4}")
 WORD = re.compile(r"[A-Za-z][A-Za-z0-9_]*")
@@ -40,6 +35,8 @@ _REFUSED = re.compile(r"syntax error.*", re.IGNORECASE)
 _JUNK = re.compile(r"^[^A-Za-z0-9+-]+")
 _MOST_LINES = 3
 """A reply, and lines of nothing but junk before it."""
+_POWER_STEP_MW = 0.1
+"""The finest power that every model keeps."""
 
 
 class CoboltFraming:
@@ -68,70 +65,70 @@ class CoboltFraming:
         return reply if _REFUSED.fullmatch(reply) else None
 
 
-_POWER_STEP_W = 1e-4
-"""The finest power that every model keeps: 0.1 mW."""
+@dataclass(frozen=True, slots=True)
+class Dialect:
+    """The words of one language of the laser. Pairs: a command without its value, and the question of it."""
+
+    mode: str
+    """Question of the mode; the answer has the form `mode_form`."""
+    mode_form: re.Pattern[str]
+    modulate: str
+    """Command of the mode in which an input governs the light..."""
+    modulated: str
+    """...and that mode's name."""
+    digital: tuple[str, str]
+    analog: tuple[str, str]
+    """Whether the TTL input, and the analog one, govern the light there."""
+    set_power: str
+    """Command of the power under the gate, in milliwatts."""
+    powers: Mapping[str, tuple[str, float]]
+    """Question of the power in each mode that knows one, and its unit in watts."""
+    no_power: str
+    """Command that takes the power of the mode without input."""
+    waits_for_key: tuple[str, re.Pattern[str], re.Pattern[str]]
+    """Question of its state, the answer's form, and the answers of a laser that starts only once its key is turned."""
+    names: Mapping[str, str]
+    """Names of modes without input, where the laser calls them by a number."""
+    external: str = ""
+    """Command that lets the input govern and not the host."""
+    pause: str = ""
+    """Command that blanks at once (1), until it is taken back (0)."""
 
 
-class Dialect(ABC):
-    """The commands of one language of the laser that the driver uses. All methods raise the errors of `Dialogue`."""
-
-    family: str
-    _modulated: str
-    """The mode in which an input governs the light."""
-    _digital: str
-    _analog: str
-    """Questions whether the TTL input, and the analog one, govern the light."""
-    _power: tuple[str, str]
-    """Command and question of the power under the gate, in milliwatts."""
-
-    def __init__(self, line: Dialogue) -> None:
-        self._line = line
-
-    @abstractmethod
-    def mode(self) -> str:
-        """The mode as the laser calls it."""
-
-    def input_mode(self, mode: str) -> str:
-        """The control of the light in this mode: only "digital" keeps it under the gate."""
-        if mode != self._modulated:
-            return self._unmodulated(mode)
-        digital, analog = self._line.ask_flag(self._digital), self._line.ask_flag(self._analog)
-        if digital and not analog:
-            return "digital"
-        return "mixed" if digital else "analog" if analog else "modulation without input"
-
-    @abstractmethod
-    def gate(self) -> None:
-        """Let the TTL input, and nothing else, govern the light. Read back; to be called in the dark."""
-
-    def set_power(self, power_w: float) -> None:
-        """Set the power while the gate is high. Read back."""
-        command, question = self._power
-        power_mw = power_w * 1e3
-        slack_mw = max(0.01 * power_mw, _POWER_STEP_W * 1e3 / 2)
-        self._line.tell_and_check(
-            f"{command} {power_mw:.4f}", question, NUMBER, lambda reply: abs(float(reply) - power_mw) <= slack_mw
-        )
-
-    @abstractmethod
-    def power_w(self, mode: str) -> float | None:
-        """The power that the laser is set to in this mode. None: set by current, it cannot say."""
-
-    @abstractmethod
-    def darken(self) -> None:
-        """Leave no light in any mode that knows a power, at once and without the key."""
-
-    @abstractmethod
-    def brighten(self) -> None:
-        """End what `darken` did besides the power."""
-
-    @abstractmethod
-    def waits_for_key(self) -> bool:
-        """Whether the laser starts only once its key is turned off and on."""
-
-    @abstractmethod
-    def _unmodulated(self, mode: str) -> str:
-        """Name of a mode in which no input governs the light."""
+MLD = Dialect(
+    mode="gam?",
+    mode_form=re.compile("[012]"),
+    modulate="em",
+    modulated="2",
+    digital=("sdmes", "gdmes?"),
+    analog=("sames", "games?"),
+    set_power="slmp",
+    powers={"1": ("p?", 1.0), "2": ("glmp?", 1e-3)},
+    no_power="p 0",
+    waits_for_key=("gom?", COUNT, re.compile("1")),
+    names={"0": "constant current", "1": "constant power"},
+)
+"""The language of 06-MLD."""
+SCPI = Dialect(
+    mode="laser:runmode?",
+    mode_form=WORD,
+    modulate="laser:runmode PowerModulation",
+    modulated="powermodulation",
+    digital=("las:pm:dig:ena", "las:pm:dig:ena?"),
+    analog=("las:pm:ana:ena", "las:pm:ana:ena?"),
+    set_power="laser:powermodulation:power:setpoint",
+    powers={
+        "powermodulation": ("laser:powermodulation:power:setpoint?", 1e-3),
+        "constantpower": ("laser:cp:power:setpoint?", 1e-3),
+    },
+    no_power="laser:cp:power:setpoint 0",
+    waits_for_key=("state?", WORD, re.compile(".*waitingforkey.*", re.IGNORECASE)),
+    names={},
+    external="laser:pm:dig:modulator external",
+    pause="las:paus",
+)
+"""The newer 06-01 language. As "command" its modulator follows `!e` and `!d` without ever replying."""
+DIALECTS = {"06-MLD": MLD, "06-01": SCPI}
 
 
 def classify(model: str) -> str:
@@ -144,92 +141,6 @@ def classify(model: str) -> str:
         return "06-MLD"
     return "unknown"
 
-
-class MldDialect(Dialect):
-    """The language of 06-MLD: `slmp`, `sdmes`, `em`."""
-
-    family = "06-MLD"
-    _modulated, _digital, _analog = "2", "gdmes?", "games?"
-    _power = "slmp", "glmp?"
-
-    def mode(self) -> str:
-        """The answer to `gam?`: 0 constant current, 1 constant power, 2 modulation."""
-        return self._line.ask("gam?", re.compile("[012]"))
-
-    def gate(self) -> None:
-        """Set digital modulation on, analog off, and modulation mode."""
-        self._line.tell_and_check("sdmes 1", "gdmes?", FLAG, "1".__eq__)
-        self._line.tell_and_check("sames 0", "games?", FLAG, "0".__eq__)
-        self._line.tell_and_check("em", "gam?", COUNT, "2".__eq__)
-
-    def power_w(self, mode: str) -> float | None:
-        """The power set, in W: `glmp?` answers in milliwatts, `p?` in watts."""
-        if mode == "0":
-            return None
-        return self._line.ask_number("glmp?") * 1e-3 if mode == "2" else self._line.ask_number("p?")
-
-    def darken(self) -> None:
-        """Set powers to 0, that of the present mode first: this may be an emergency."""
-        self.set_power(0.0)
-        self._line.tell("p 0")
-
-    def brighten(self) -> None:
-        """Nothing more to do: the power alone makes this laser bright."""
-
-    def waits_for_key(self) -> bool:
-        """Whether `gom?` is 1."""
-        return self._line.ask("gom?", COUNT) == "1"
-
-    def _unmodulated(self, mode: str) -> str:
-        return ("constant current", "constant power")[int(mode)]
-
-
-class ScpiDialect(Dialect):
-    """The newer 06-01 language: `laser:runmode`, `las:paus`."""
-
-    family = "06-01"
-    _modulated, _digital, _analog = "powermodulation", "las:pm:dig:ena?", "las:pm:ana:ena?"
-    _power = "laser:powermodulation:power:setpoint", "laser:powermodulation:power:setpoint?"
-
-    def mode(self) -> str:
-        """The run mode."""
-        return self._line.ask("laser:runmode?", WORD).lower()
-
-    def gate(self) -> None:
-        """Set the external modulator and nothing else: as "command" it follows `!e` and `!d` without ever replying."""
-        self._line.tell_and_check("las:pm:dig:ena 1", "las:pm:dig:ena?", FLAG, "1".__eq__)
-        self._line.tell_and_check("las:pm:ana:ena 0", "las:pm:ana:ena?", FLAG, "0".__eq__)
-        self._line.tell("laser:pm:dig:modulator external")
-        self._line.tell_and_check("laser:runmode PowerModulation", "laser:runmode?", WORD, _is_modulation)
-
-    def power_w(self, mode: str) -> float | None:
-        """The power set, in W; milliwatts on the wire, in both modes that know a power."""
-        questions = {self._modulated: self._power[1], "constantpower": "laser:cp:power:setpoint?"}
-        return self._line.ask_number(questions[mode]) * 1e-3 if mode in questions else None
-
-    def darken(self) -> None:
-        """Blank at once by `las:paus 1`; the powers of 0 tell the next program so."""
-        self._line.tell("las:paus 1")
-        self.set_power(0.0)
-        self._line.tell("laser:cp:power:setpoint 0")
-
-    def brighten(self) -> None:
-        """End the pause."""
-        self._line.tell("las:paus 0")
-
-    def waits_for_key(self) -> bool:
-        """Whether `state?` is AutostartWaitingForKeyOn."""
-        return "waitingforkey" in self._line.ask("state?", WORD).lower()
-
-    def _unmodulated(self, mode: str) -> str:
-        return mode
-
-
-def _is_modulation(reply: str) -> bool:
-    return reply.lower() == "powermodulation"
-
-
-_log = logging.getLogger(__name__)
 
 FAULTS = {1: "temperature", 3: "interlock was open", 4: "constant power timed out"}
 """Meaning of `f?`; 0 is none."""
@@ -251,16 +162,16 @@ class CoboltLaser(SerialLaser):
         self._started = False
 
     def _do_status(self) -> LaserStatus:
-        line, dialect = self._line, self._dialect
+        line = self._line
         # A flipped bit is a false alarm: what ends a scan is asked twice. One that hides an alarm lasts for one poll.
         interlock_open = line.ask_flag("ilk?") and line.ask_flag("ilk?")
         fault = self._fault()
         on = line.ask_flag("l?")
-        mode = dialect.mode()
-        input_mode = dialect.input_mode(mode)
-        set_w = dialect.power_w(mode) if on else 0.0
+        mode = self._mode()
+        input_mode = self._input_mode(mode)
+        set_w = self._power_w(mode) if on else 0.0
         key_on = line.ask_flag("@cobasks?") if self._autostart else None
-        if not on and fault is None and dialect.waits_for_key():
+        if not on and fault is None and self._waits_for_key():
             fault = "it waits for its key: turn the key off and on"
         return LaserStatus(
             emission=on and (set_w is None or set_w > 0),
@@ -277,47 +188,101 @@ class CoboltLaser(SerialLaser):
         number = int(self._line.ask("f?", COUNT)) and int(self._line.ask("f?", COUNT))
         return None if number == 0 else FAULTS.get(number, f"number {number}")
 
+    def _mode(self) -> str:
+        return self._line.ask(self._dialect.mode, self._dialect.mode_form).lower()
+
+    def _input_mode(self, mode: str) -> str:
+        """The control of the light in this mode: only "digital" keeps it under the gate."""
+        dialect = self._dialect
+        if mode != dialect.modulated:
+            return dialect.names.get(mode, mode)
+        digital, analog = self._line.ask_flag(dialect.digital[1]), self._line.ask_flag(dialect.analog[1])
+        if digital and not analog:
+            return "digital"
+        return "mixed" if digital else "analog" if analog else "modulation without input"
+
+    def _power_w(self, mode: str) -> float | None:
+        """The power that the laser is set to in this mode. None: set by current, it cannot say."""
+        if mode not in self._dialect.powers:
+            return None
+        question, unit_w = self._dialect.powers[mode]
+        return self._line.ask_number(question) * unit_w
+
+    def _waits_for_key(self) -> bool:
+        question, form, waits = self._dialect.waits_for_key
+        return waits.fullmatch(self._line.ask(question, form)) is not None
+
     def _do_arm(self, power_w: float) -> None:
         try:
             self._enable(power_w)
             self._require_no_stop()
         except DeviceError:
             with suppress(DeviceError):  # the first error is the one to tell
-                self._dialect.darken()
+                self._darken()
             raise
         self._armed = True
 
     def _enable(self, power_w: float) -> None:
         """Keep the laser dark until the gate is known to govern the light; only then set the power."""
-        dialect = self._dialect
-        gated = all(dialect.input_mode(dialect.mode()) == "digital" for _ in range(2))  # a flipped bit must not shine
+        gated = all(self._input_mode(self._mode()) == "digital" for _ in range(2))  # a flipped bit must not shine
         on = self._line.ask_flag("l?")
         if not (gated and on):
-            dialect.darken()  # whenever it comes on, it is dark until the power is set
+            self._darken()  # whenever it comes on, it is dark until the power is set
         if not gated:
-            dialect.gate()
+            self._gate()
         # Each exchange takes a tenth of a second: a pause from another thread is heeded before what lights.
         self._require_no_stop()
         if not on:
             self._start()
         self._require_no_stop()
-        dialect.set_power(power_w)
+        self._set_power(power_w)
         self._require_no_stop()
-        dialect.brighten()
+        if self._dialect.pause:
+            self._line.tell(f"{self._dialect.pause} 0")
+
+    def _gate(self) -> None:
+        """Let the TTL input, and nothing else, govern the light. Read back; to be called in the dark."""
+        line, dialect = self._line, self._dialect
+        for (command, question), value in ((dialect.digital, "1"), (dialect.analog, "0")):
+            line.tell_and_check(f"{command} {value}", question, FLAG, value.__eq__)
+        if dialect.external:
+            line.tell(dialect.external)
+        line.tell_and_check(
+            dialect.modulate, dialect.mode, dialect.mode_form, lambda reply: reply.lower() == dialect.modulated
+        )
+
+    def _set_power(self, power_w: float) -> None:
+        """Set the power while the gate is high. Read back."""
+        command, (question, _) = self._dialect.set_power, self._dialect.powers[self._dialect.modulated]
+        power_mw = power_w * 1e3
+        slack_mw = max(0.01 * power_mw, _POWER_STEP_MW / 2)
+        self._line.tell_and_check(
+            f"{command} {power_mw:.4f}", question, NUMBER, lambda reply: abs(float(reply) - power_mw) <= slack_mw
+        )
+
+    def _darken(self) -> None:
+        """Leave no light in any mode that knows a power, at once and without the key.
+
+        The power of the present mode first: this may be an emergency. The next program reads of the powers.
+        """
+        if self._dialect.pause:
+            self._line.tell(f"{self._dialect.pause} 1")
+        self._set_power(0.0)
+        self._line.tell(self._dialect.no_power)
 
     def _start(self) -> None:
         """Switch on; emission follows once temperatures are reached."""
         self._line.tell("@cob1" if self._autostart else "l1")
         self._started = True
-        if not self._line.ask_flag("l?") and self._dialect.waits_for_key():
+        if not self._line.ask_flag("l?") and self._waits_for_key():
             # The start is not called back: the key that is turned now leads to a laser that is on, and dark.
             self._started = False
             raise DeviceFault(f"{self._name} waits for its key; turn the key off and on, then start again")
 
     def _do_pause(self) -> None:
         try:
-            self._dialect.darken()
-            power_w = self._dialect.power_w(self._dialect.mode())
+            self._darken()
+            power_w = self._power_w(self._mode())
         except (DeviceFault, ProtocolError) as error:
             _log.warning("%s: pause failed (%s); switching off", self._name, error)
             power_w = None
@@ -328,7 +293,7 @@ class CoboltLaser(SerialLaser):
 
     def _do_disarm(self) -> None:
         try:
-            self._dialect.darken()
+            self._darken()
         finally:
             self._switch_off()
         self._armed = False
@@ -352,7 +317,7 @@ def _identify(config: CoboltConfig, line: Dialogue) -> CoboltLaser:
         raise DeviceFault(
             f"cobolt laser on {config.port} does not know its model, as -04- types do not; use an 06-01 laser"
         ) from None
-    dialect = _dialect(line, model)
+    dialect = _dialect(model)
     serial = line.ask_surely("sn?", NAME)
     require_serial_number("cobolt", config, serial)
     limit_w = float(line.ask_surely("gmlp?", NUMBER)) * 1e-3
@@ -363,11 +328,10 @@ def _identify(config: CoboltConfig, line: Dialogue) -> CoboltLaser:
     return CoboltLaser(line, dialect, f"Cobolt {model} {serial}", limits, autostart)
 
 
-def _dialect(line: Dialogue, model: str) -> Dialect:
+def _dialect(model: str) -> Dialect:
     family = classify(model)
-    for dialect in (MldDialect, ScpiDialect):
-        if dialect.family == family:
-            return dialect(line)
+    if family in DIALECTS:
+        return DIALECTS[family]
     if family == "06-DPL":
         raise DeviceFault(
             f"cobolt laser {model} is an 06-DPL: its power follows a gate up to 1 kHz only; use an 06-MLD"

@@ -1,27 +1,21 @@
 """The Coherent OBIS LX/LS line laser, gated by its digital modulation input (`SOUR:AM:EXT DIG`).
 
-docs/reference/hardware.md; from python-microscope `lights/obis.py` (69625e0), the bit tables of `obis.h`, the
-operator's manual (appendix C) and mmCoreAndDevices PRs 645 and 531. Limits of the base plate's temperature are read by
-`SOUR:TEMP:PROT:BAS:LOW?` and `HIGH?`, which are not in docs/reference/hardware.md but in `obis.cpp` beside `obis.h` and
-in Micro-Manager's `CoherentOBIS.cpp`. The laser has no watchdog: where its port is lost it stays as it was, so treat it
-as on.
+Its bytes are in docs/reference/hardware.md; from python-microscope `lights/obis.py` (69625e0), the bit tables of
+`obis.h`, the operator's manual (appendix C) and mmCoreAndDevices PRs 645 and 531. Limits of the base plate's
+temperature, `SOUR:TEMP:PROT:BAS:LOW?` and `HIGH?`, are in `obis.cpp` and in Micro-Manager's `CoherentOBIS.cpp`.
 
 Arming. `AM:STAT ON` during warm-up is deferred, light may come minutes later. So `arm` waits until the laser is ready
 and only then says ON; where the wait ends in any other way it says OFF. With CDRH the emission follows ON by 5 s. Modes
 cannot be changed while it is on. Pause = `AM:STAT OFF`, confirmed by the emission bit; no key is needed to resume.
-Disarm = the same, and least power. Never sent: CDRH OFF.
-
-Bytes. 115 200 baud, 8N1 (over USB the rate is ignored); commands end with CRLF. With the handshake on, a set answers
-`OK`, a query its value and then `OK`, an error `ERR-nnn` in their place; with it off, a set answers nothing at all, a
-query its value. So the handshake is asked for first and never changed, and every setting is read back. Behind an OBIS
-Remote a number on SYST and SOUR addresses the laser; bare commands go to the Remote.
+Disarm = the same, and least power. With the handshake off a set answers nothing at all: so the handshake is asked for
+first and never changed, and every setting is read back.
 """
 
 import re
 from collections.abc import Callable
 from contextlib import suppress
 from functools import partial
-from typing import Annotated, Literal, NamedTuple
+from typing import Annotated, Literal
 
 from pydantic import Field
 
@@ -161,11 +155,8 @@ class ObisConfig(SerialLaserConfig):
     """Longest wait of `arm` for a laser that is not ready yet."""
 
 
-class TemperatureRange(NamedTuple):
-    """Temperatures at which the base plate may be, in degrees Celsius."""
-
-    low_c: float
-    high_c: float
+TemperatureRange = tuple[float, float]
+"""The least and the most at which the base plate may be, in degrees Celsius."""
 
 
 class ObisLaser(SerialLaser):
@@ -211,14 +202,15 @@ class ObisLaser(SerialLaser):
 
     def _do_arm(self, power_w: float) -> None:
         try:
-            if not (self._told_on and self._bits() & EMISSION and self._is_digital()):
+            shines = self._told_on and self._bits() & EMISSION
+            shines_gated = shines and self._line.ask("SOUR:AM:SOUR?", _MODE) in _DIGITAL
+            if not shines_gated:
                 self._prepare()
-                self._set_power(power_w)
+            self._set_power(power_w)
+            if not shines_gated:
                 self._await_ready()
                 self._told_on = True
-                self._line.tell_and_check("SOUR:AM:STAT ON", "SOUR:AM:STAT?", SWITCH, "ON".__eq__)
-            else:
-                self._set_power(power_w)
+                self._switch("SOUR:AM:STAT", "ON")
         except DeviceError:
             with suppress(DeviceError):  # the first error is the one to tell
                 self._switch_off()
@@ -230,19 +222,21 @@ class ObisLaser(SerialLaser):
 
     def _prepare(self) -> None:
         """Switch off, and set up the laser so that nothing but the gate governs the light, now and after power-up."""
-        line = self._line
         self._switch_off()
-        line.tell_and_check("SYST:CDRH ON", "SYST:CDRH?", SWITCH, "ON".__eq__)
-        line.tell_and_check("SYST:AUT OFF", "SYST:AUT?", SWITCH, "OFF".__eq__)
-        line.tell_and_check("SOUR:AM:EXT DIG", "SOUR:AM:SOUR?", _MODE, _DIGITAL.__contains__)
-        line.tell_and_check("SOUR:TEMP:APR ON", "SOUR:TEMP:APR?", SWITCH, "ON".__eq__)
+        self._switch("SYST:CDRH", "ON")
+        self._switch("SYST:AUT", "OFF")
+        self._line.tell_and_check("SOUR:AM:EXT DIG", "SOUR:AM:SOUR?", _MODE, _DIGITAL.__contains__)
+        self._switch("SOUR:TEMP:APR", "ON")
+
+    def _switch(self, setting: str, value: str) -> None:
+        self._line.tell_and_check(f"{setting} {value}", f"{setting}?", SWITCH, value.__eq__)
 
     def _set_power(self, power_w: float) -> None:
         def is_power(reply: str) -> bool:
             return abs(float(reply) - power_w) <= max(0.01 * power_w, 5e-5)  # they keep 0.1 mW
 
-        query = "SOUR:POW:LEV:IMM:AMPL?"
-        self._line.tell_and_check(f"SOUR:POW:LEV:IMM:AMPL {power_w:.5f}", query, NUMBER, is_power)
+        setting = "SOUR:POW:LEV:IMM:AMPL"
+        self._line.tell_and_check(f"{setting} {power_w:.5f}", f"{setting}?", NUMBER, is_power)
 
     def _await_ready(self) -> None:
         """Wait until an ON acts at once: said earlier it would be deferred, and light come when nobody expects it."""
@@ -273,7 +267,7 @@ class ObisLaser(SerialLaser):
 
     def _switch_off(self) -> None:
         """Switch off, a deferred ON too. `DeviceFault` where the laser still emits."""
-        self._line.tell_and_check("SOUR:AM:STAT OFF", "SOUR:AM:STAT?", SWITCH, "OFF".__eq__)
+        self._switch("SOUR:AM:STAT", "OFF")
         self._told_on = False
         if self._bits() & EMISSION:
             raise DeviceFault(f"{self._name} still emits after OFF; turn its key off")
@@ -293,19 +287,16 @@ class ObisLaser(SerialLaser):
         if base_c is not None and self._out_of_range(base_c):
             base_c = _celsius(self._line.ask_surely("SOUR:TEMP:BAS?", CELSIUS))  # a flipped bit ends no scan
             if (allowed := self._out_of_range(base_c)) is not None:
-                said.append(f"base plate at {base_c:g} C, outside {allowed.low_c:g} to {allowed.high_c:g} C")
+                said.append(f"base plate at {base_c:g} C, outside {allowed[0]:g} to {allowed[1]:g} C")
         return "; ".join(said) or None
 
     def _out_of_range(self, base_c: float) -> TemperatureRange | None:
         """The range that the base plate is outside of; None where it is inside."""
         allowed = self._base_range
-        return None if allowed is None or allowed.low_c <= base_c <= allowed.high_c else allowed
+        return None if allowed is None or allowed[0] <= base_c <= allowed[1] else allowed
 
     def _interlock_closed(self, bits: int) -> bool:
         return self._line.ask_surely("SYST:LOCK?", _LOCK) != "OFF" and not bits & INTERLOCK
-
-    def _is_digital(self) -> bool:
-        return self._line.ask("SOUR:AM:SOUR?", _MODE) in _DIGITAL
 
 
 def create(config: ObisConfig, surroundings: Surroundings, timing: LineTiming = USUAL_TIMING) -> ObisLaser:
@@ -341,8 +332,8 @@ def _base_range(line: Dialogue) -> TemperatureRange | None:
         low, high = (line.ask_surely(f"SOUR:TEMP:PROT:BAS:{end}?", CELSIUS) for end in ("LOW", "HIGH"))
     except CommandRefused:
         return None
-    found = TemperatureRange(_celsius(low), _celsius(high))
-    return found if found.low_c < found.high_c else None
+    found = _celsius(low), _celsius(high)
+    return found if found[0] < found[1] else None
 
 
 def _celsius(reply: str) -> float:

@@ -1,10 +1,8 @@
 """A beam scanner that is a galvo behind a DAC on USB: everything that is the same whatever the DAC.
 
-A `Dac` is one board with its link: it says at what rates it runs, and plays points. The mirror moves only when it is
-started or parked, always along ramps; opening a scanner asks the board who it is, no more.
-
-A run is the way to the first point, the waveform, and the way to rest. A thread feeds its points to the DAC slice by
-slice, and knows where the mirror rests. Nothing is laid out beforehand: a waveform of a million points repeated for
+The mirror moves only when it is started or parked, always along ramps; opening a scanner asks the board who it is, no
+more. A run is the way to the first point, the waveform, and the way to rest. A thread feeds its points to the DAC slice
+by slice, and knows where the mirror rests. Nothing is laid out beforehand: a waveform of a million points repeated for
 hours takes the memory of the waveform.
 """
 
@@ -13,7 +11,7 @@ import threading
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 from fractions import Fraction
-from typing import Protocol
+from typing import Any, Protocol
 
 import numpy as np
 from numpy.typing import NDArray
@@ -25,6 +23,16 @@ from drivers.scanners.galvo import GalvoConfig, brake, ramp
 from drivers.transports.endpoints import resolve
 from drivers.transports.usb_device import UsbDevice, UsbId, open_device
 
+_log = logging.getLogger(__name__)
+
+FULL_SCALE, CENTRE = 4095, 0x800
+"""Largest value of the converters, and the one at which the mirror stands without power."""
+POLL_S = 0.002
+"""Time between two questions how far the board is."""
+PATIENCE_S = 1.0
+"""Wait for a buffer to fall free, beyond the time that its points take."""
+DRIFT = 1e-3
+"""Largest relative difference between a board's crystal and the host's clock."""
 _NO_WAVE = ScanWaveform(np.zeros(1), np.zeros(1, np.uint8), Fraction(1))
 
 
@@ -39,6 +47,20 @@ class PointSlice:
     def __len__(self) -> int:
         """Points of the slice."""
         return len(self.command)
+
+    @property
+    def steps(self) -> NDArray[np.uint16]:
+        """The commands as the boards' converters of 12 bits take them."""
+        return np.rint((self.command + 1) / 2 * FULL_SCALE).astype(np.uint16)
+
+    def level(self, bit: int) -> NDArray[np.uint8]:
+        """A colour output that follows a marker."""
+        return colour(self.markers & bit)
+
+
+def colour(high: NDArray[Any]) -> NDArray[np.uint8]:
+    """Full brightness of a colour output at the points that are not 0."""
+    return np.where(high, 255, 0).astype(np.uint8)
 
 
 class PointSource:
@@ -89,7 +111,9 @@ class PointSource:
         of_wave = (at[lit] - len(self._way)) % len(self._wave.command)
         command[lit], markers[lit] = self._wave.command[of_wave], self._wave.markers[of_wave]
         command[~lit] = self._way[at[~lit]]
-        self._note(command)
+        if len(command):
+            self._before = float(command[-2]) if len(command) > 1 else self.last
+            self.last = float(command[-1])
         return PointSlice(command, markers, lit)
 
     def give_back(self) -> None:
@@ -102,14 +126,6 @@ class PointSource:
             self._way = brake(self.last, (self.last - self._before) * self._rate_hz, self._limits, self._rate_hz)
             self._at, self._end = 0, len(self._way)
 
-    def _note(self, command: NDArray[np.float64]) -> None:
-        if len(command):
-            self._before = float(command[-2]) if len(command) > 1 else self.last
-            self.last = float(command[-1])
-
-
-_log = logging.getLogger(__name__)
-
 
 class DacRun(Protocol):
     """One run on a certain device. Every wait inside has an end."""
@@ -118,11 +134,9 @@ class DacRun(Protocol):
 
     def begin(self) -> None:
         """Send the first points; they play at once."""
-        ...
 
     def feed(self, stopping: threading.Event) -> None:
         """Send the rest; returns when the mirror rests. Brakes once `stopping` is set."""
-        ...
 
 
 class Dac(Protocol):
@@ -139,23 +153,18 @@ class Dac(Protocol):
 
     def point_clock(self, requested_hz: float, low_hz: float, high_hz: float) -> Fraction:
         """The exact rate nearest to the requested one, within low to high."""
-        ...
 
     def run(self, source: PointSource, clock_hz: Fraction) -> DacRun:
         """A run of these points at a rate that `point_clock` returned."""
-        ...
 
     def check(self) -> None:
         """Raise where the board does not answer. Any thread."""
-        ...
 
     def halt(self) -> float:
         """End what the board plays, in an emergency; returns where the mirror rests then."""
-        ...
 
     def close(self) -> None:
         """Make the outputs safe and give the board back."""
-        ...
 
 
 class DacScanner(BeamScanner):

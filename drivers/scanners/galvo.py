@@ -1,7 +1,6 @@
 """A galvo behind a DAC: its config and limits, and its ways between two commands within them.
 
-The config says what the mirror can follow, where it may go and where the beam is dumped. The ways are those to the
-first point, to a stop and to the dump angle:
+The ways are those to the first point, to a stop and to the dump angle:
 
     ramp   x(t) = a + (b - a) (1 - cos(pi t / T)) / 2      peaks: v = |b - a| pi / 2T, a = |b - a| pi^2 / 2T^2
     brake  constant deceleration from the speed that the mirror has

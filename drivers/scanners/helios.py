@@ -1,7 +1,6 @@
 """Scanner kind `helios`: a galvo behind a Helios laser DAC on USB (docs/reference/hardware.md; vendor's firmware v6 and
 SDK v11).
 
-    config    kind: helios, port: usb or usb:path=1-2, max_velocity, max_acceleration of the galvo behind it
     outputs   X (or Y): mirror. R: lit, i.e. a waveform is being played. G: line marker. B: scan marker. I: backward
 
 The device plays frames of up to 4095 points from two buffers, one playing and one pending, and has neither a trigger
@@ -16,14 +15,9 @@ frame that arrives after the earliest such end may have left the mirror standing
 that falls free before the playing frame can have ended means that the device dropped a frame in silence. Only the
 markers in the SPAD's stream tell what was really played.
 
-Bytes. Sources: `Grix/helios_dac` 0952a2a, firmware/AtmelStudio_helios/lasdac_mainfirmware/src/main.c and
-sdk/cpp/HeliosDac.cpp (read for facts; no code taken). Endpoints of alternate setting 1: interrupt OUT 0x06 commands,
-interrupt IN 0x83 replies, bulk OUT 0x02 frames. Only the opcodes below exist here: DE would jump to the bootloader, 06
-wears the flash, and 02 is sent with 0 only.
-
-    point (7 B)     x[11:4], x[3:0] << 4 | y[11:8], y[7:0], R, G, B, I       12 bit, centre 0x800
-    trailer (5 B)   u16 LE points per second, u16 LE points, u8 flags        1 start now, 2 single
-    clock           SysTick of 112 MHz, floor(112e6 / pps) + 1 cycles a point
+Sources of the bytes: `Grix/helios_dac` 0952a2a, firmware/AtmelStudio_helios/lasdac_mainfirmware/src/main.c and
+sdk/cpp/HeliosDac.cpp (read for facts; no code taken). Only the opcodes below exist here: DE would jump to the
+bootloader, 06 wears the flash, and 02 is sent with 0 only. A point takes floor(112e6 / pps) + 1 cycles of 112 MHz.
 """
 
 import logging
@@ -31,21 +25,33 @@ import math
 import struct
 import threading
 from fractions import Fraction
-from typing import Annotated, Any, Literal
+from typing import Annotated, Literal
 
 import numpy as np
-from numpy.typing import NDArray
 from pydantic import Field
 
 from drivers.clock import NS_PER_S, Clock
 from drivers.errors import DeviceFault, DeviceNotFound, DeviceTimeout, ProtocolError
 from drivers.interfaces import LEVEL_BACKWARD, MARKER_LINE, MARKER_SCAN
 from drivers.registry import Kind, Surroundings
-from drivers.scanners.dac_scanner import DacScanner, PointSlice, PointSource, open_scanner
+from drivers.scanners.dac_scanner import (
+    CENTRE,
+    DRIFT,
+    PATIENCE_S,
+    POLL_S,
+    DacScanner,
+    PointSlice,
+    PointSource,
+    colour,
+    open_scanner,
+)
 from drivers.scanners.galvo import LOWEST_RATE_HZ, GalvoConfig
 from drivers.transports.usb_device import UsbDevice, UsbId
 from drivers.units import Hertz, Seconds
 
+_log = logging.getLogger(__name__)
+
+_TESTED_FIRMWARE = 6
 SYSTICK_HZ = 112_000_000
 LEAST_PPS, MOST_PPS = 7, 65535
 """Beyond these the firmware clamps and the vendor's library drops points, both in silence: refused here."""
@@ -53,9 +59,6 @@ MOST_POINTS = 4095
 """Most points of a frame in the vendor's library; the firmware's buffer holds one more."""
 
 FLAG_START, FLAG_SINGLE = 1, 2
-_CENTRE = 0x800
-_FULL_SCALE = 4095
-_HIGH = 255
 
 
 def rate_of(pps: int) -> Fraction:
@@ -102,22 +105,16 @@ def slice_points(left: int, most: int) -> int:
 
 def encode(points: PointSlice, axis: str, pps: int, flags: int) -> bytes:
     """One frame. R: lit, G: line marker, B: scan marker, I: backward; the axis that does not scan stands at centre."""
-    value = np.rint((points.command + 1) / 2 * _FULL_SCALE).astype(np.uint16)
-    centre = np.full(len(points), _CENTRE, np.uint16)
-    x, y = (value, centre) if axis == "x" else (centre, value)
+    centre = np.full(len(points), CENTRE, np.uint16)
+    x, y = (points.steps, centre) if axis == "x" else (centre, points.steps)
     frame = np.empty((len(points), 7), np.uint8)
     frame[:, 0] = x >> 4
     frame[:, 1] = (x & 0xF) << 4 | y >> 8
     frame[:, 2] = y & 0xFF
-    frame[:, 3] = _level(points.lit)
-    frame[:, 4] = _level(points.markers & MARKER_LINE)
-    frame[:, 5] = _level(points.markers & MARKER_SCAN)
-    frame[:, 6] = _level(points.markers & LEVEL_BACKWARD)
+    frame[:, 3] = colour(points.lit)
+    for column, bit in enumerate((MARKER_LINE, MARKER_SCAN, LEVEL_BACKWARD), 4):
+        frame[:, column] = points.level(bit)
     return frame.tobytes() + struct.pack("<HHB", pps, len(points), flags)
-
-
-def _level(high: NDArray[Any]) -> NDArray[np.uint8]:
-    return np.where(high, _HIGH, 0).astype(np.uint8)
 
 
 HELIOS = UsbId("Helios laser DAC", 0x1209, 0xE500)
@@ -257,15 +254,10 @@ class HeliosDac:
         )
 
 
-_POLL_S = 0.002
 _SILENT_S = 0.5
 """Time without a proper status after which the device counts as hung."""
-_PATIENCE_S = 1.0
-"""Wait for the buffer to fall free, beyond the time that its frames take."""
 _WIRE_BYTES_PER_S = 1.216e6
 """Bytes a second that a full-speed bulk endpoint carries: 19 packets of 64 bytes a millisecond (USB 2.0, table 5-9)."""
-_DRIFT = 1e-3
-"""Largest relative difference between the device's crystal and the host's clock."""
 
 
 class HeliosRun:
@@ -298,8 +290,8 @@ class HeliosRun:
         first, duration_s = self._made(FLAG_SINGLE | FLAG_START)
         earliest_s, arrived_s = self._send(first)
         self._playing_s = duration_s
-        self._earliest_end_s = earliest_s + duration_s * (1 - _DRIFT)
-        self._latest_end_s = arrived_s + duration_s * (1 + _DRIFT)
+        self._earliest_end_s = earliest_s + duration_s * (1 - DRIFT)
+        self._latest_end_s = arrived_s + duration_s * (1 + DRIFT)
         self._next = self._made() if self.source.left else None
 
     def feed(self, stopping: threading.Event) -> None:
@@ -314,7 +306,7 @@ class HeliosRun:
             else:
                 continue
             self._next = self._made() if self.source.left else None
-        latest_s = self._latest_end_s + self._pending_s * (1 + _DRIFT)
+        latest_s = self._latest_end_s + self._pending_s * (1 + DRIFT)
         self._clock.sleep(latest_s - self._now_s())
 
     def _append(self, frame: bytes, duration_s: float) -> None:
@@ -372,7 +364,7 @@ class HeliosRun:
         while not self._link.free():
             if self._now_s() > end_s:
                 raise DeviceTimeout(f"{self._link.name}: takes no frame; unplug it and plug it in again")
-            self._clock.sleep(_POLL_S)
+            self._clock.sleep(POLL_S)
 
     def _wait_until_free(self, stopping: threading.Event | None) -> bool:
         """True once the pending buffer is free; False where a stop came first."""
@@ -388,28 +380,23 @@ class HeliosRun:
                 raise DeviceTimeout(f"{self._link.name}: gives no status; unplug it and plug it in again")
             if free is False:
                 heard_s, full_s = now_s, asked_s
-            if now_s > self._latest_end_s + _PATIENCE_S:
+            if now_s > self._latest_end_s + PATIENCE_S:
                 raise DeviceFault(f"{self._link.name}: its frame buffer stays full; unplug it and plug it in again")
-            self._clock.sleep(_POLL_S)
+            self._clock.sleep(POLL_S)
         return False
 
     def _note_swap(self, earliest_s: float, latest_s: float) -> None:
         """Note that the pending frame, if any, began to play between these times."""
         if not self._pending_s:
             return
-        if latest_s < self._earliest_end_s - _POLL_S:
+        if latest_s < self._earliest_end_s - POLL_S:
             self._raise_dropped()
         self._playing_s, self._pending_s = self._pending_s, 0.0
-        self._earliest_end_s = earliest_s + self._playing_s * (1 - _DRIFT)
-        self._latest_end_s = min(latest_s, self._latest_end_s) + self._playing_s * (1 + _DRIFT)
+        self._earliest_end_s = earliest_s + self._playing_s * (1 - DRIFT)
+        self._latest_end_s = min(latest_s, self._latest_end_s) + self._playing_s * (1 + DRIFT)
 
     def _now_s(self) -> float:
         return self._clock.now_ns() / NS_PER_S
-
-
-_log = logging.getLogger(__name__)
-
-_TESTED_FIRMWARE = 6
 
 
 def create(config: HeliosConfig, surroundings: Surroundings) -> DacScanner:

@@ -1,6 +1,5 @@
 """Scanner kind `lasercube`: a galvo behind a LaserCube / LaserDock USB board (docs/reference/hardware.md).
 
-    config    kind: lasercube, port: usb or usb:serial=ABC, max_velocity, max_acceleration of its galvo
     outputs   X (or Y): mirror. With `colours: markers` R: backward. G: line marker. B: scan marker. X is not
               turned round as the vendor's program does: which way a command leads is for the calibration to say
 
@@ -15,12 +14,8 @@ its first point, so that a sample lost before the first answer is one of them. I
 device does when its ring runs empty is not documented (hold or repeat), so that the ring is cleared while they are
 played.
 
-Bytes. Source: `Wickedlasers/laserdocklib` 51d13bc, lib/src/LaserdockDevice*.cpp (read for facts; no code taken). The
-USB ids are shared with Lasershark boards, so that the product string decides.
-
-    command   interface 0, bulk OUT 0x01: opcode and 0 to 4 bytes; reply on bulk IN 0x81, 64 B: [1] = 0 is 'done', data
-              little-endian from [2]. [0] is not to be relied on
-    samples   interface 1 alternate 1, bulk OUT 0x03: 64 samples a transfer, each 4 x u16 LE: R | G << 8, B, X, Y
+Source of the bytes: `Wickedlasers/laserdocklib` 51d13bc, lib/src/LaserdockDevice*.cpp (read for facts; no code taken).
+The USB ids are shared with Lasershark boards, so that the product string decides.
 """
 
 import math
@@ -29,14 +24,23 @@ from fractions import Fraction
 from typing import Annotated, Literal
 
 import numpy as np
-from numpy.typing import NDArray
 from pydantic import Field
 
 from drivers.clock import NS_PER_S, Clock
 from drivers.errors import DeviceFault, DeviceTimeout, ProtocolError
 from drivers.interfaces import LEVEL_BACKWARD, MARKER_LINE, MARKER_SCAN
 from drivers.registry import Kind, Surroundings
-from drivers.scanners.dac_scanner import DacScanner, PointSlice, PointSource, open_scanner
+from drivers.scanners.dac_scanner import (
+    CENTRE,
+    DRIFT,
+    FULL_SCALE,
+    PATIENCE_S,
+    POLL_S,
+    DacScanner,
+    PointSlice,
+    PointSource,
+    open_scanner,
+)
 from drivers.scanners.galvo import LOWEST_RATE_HZ, GalvoConfig
 from drivers.transports.usb_device import UsbDevice, UsbId
 from drivers.units import Hertz, Seconds
@@ -52,9 +56,6 @@ _ENABLE, _SET_RATE, _GET_RATE, _MAX_RATE = 0x80, 0x82, 0x83, 0x84
 _DAC_MIN, _DAC_MAX, _RING_SIZE, _RING_FREE, _CLEAR = 0x87, 0x88, 0x89, 0x8A, 0x8D
 _MAJOR, _MINOR = 0x8B, 0x8C
 
-_FULL_SCALE = 4095
-_CENTRE = 0x800
-_HIGH = 255
 _COMMAND_S = 0.1
 """Deadline for a command; the vendor's library waits for ever."""
 _SAMPLES_S = 0.5
@@ -99,7 +100,7 @@ class LaserCubeDac:
         self.highest_rate_hz = min(config.max_point_rate, float(most_hz))
         self.ring_points = self._number(_RING_SIZE)
         scale = (self._number(_DAC_MIN), self._number(_DAC_MAX))
-        if scale != (0, _FULL_SCALE) or self.ring_points < 8 * SAMPLES_PER_TRANSFER or most_hz == 0:
+        if scale != (0, FULL_SCALE) or self.ring_points < 8 * SAMPLES_PER_TRANSFER or most_hz == 0:
             raise ProtocolError(
                 f"{self.name}: says range {scale[0]} to {scale[1]}, {self.ring_points} samples of buffer, "
                 f"{most_hz} Hz at most; this is no LaserCube firmware"
@@ -191,29 +192,18 @@ class LaserCubeDac:
 
 def encode(points: PointSlice, axis: str, *, markers: bool) -> bytes:
     """The bytes of samples. With markers: R backward, G line marker, B scan marker; else dark."""
-    value = np.rint((points.command + 1) / 2 * _FULL_SCALE).astype("<u2")
-    red, green, blue = (
-        _level(points.markers, bit) if markers else np.zeros(len(points), "<u2")
-        for bit in (LEVEL_BACKWARD, MARKER_LINE, MARKER_SCAN)
-    )
-    samples = np.full((len(points), 4), _CENTRE, "<u2")
-    samples[:, 0] = red | green << 8
-    samples[:, 1] = blue
-    samples[:, 2 if axis == "x" else 3] = value
+    samples = np.full((len(points), 4), CENTRE, "<u2")
+    samples[:, :2] = 0
+    if markers:
+        samples[:, 0] = points.level(LEVEL_BACKWARD) | points.level(MARKER_LINE).astype("<u2") << 8
+        samples[:, 1] = points.level(MARKER_SCAN)
+    samples[:, 2 if axis == "x" else 3] = points.steps
     return samples.tobytes()
 
 
-def _level(markers: NDArray[np.uint8], bit: int) -> NDArray[np.uint16]:
-    return np.where(markers & bit, _HIGH, 0).astype("<u2")
-
-
-_POLL_S = 0.002
-_PATIENCE_S = 1.0
 _HOLD_S = 0.03
 """Shortest time for which the first and the last point are held: the host may be late by this when it asks first and
 clears last."""
-_DRIFT = 1e-3
-"""Largest relative difference between the device's crystal and the host's clock."""
 _TOLERANCE_POINTS = 48
 """Tolerance in points: less than a transfer, which gets lost as a whole; more than the device's own steps in
 counting."""
@@ -263,14 +253,14 @@ class LaserCubeRun:
                 self.source.stop()
             if queued < self._most:
                 self._send(self.source.take(self._most - queued))
-            self._link.clock.sleep(_POLL_S)
+            self._link.clock.sleep(POLL_S)
         self._finish()
 
     def _finish(self) -> None:
         """Send copies of the last point, and find an end among them."""
         hold = self._hold + -(len(self._waiting) // 8) % SAMPLES_PER_TRANSFER
         self._send(PointSlice(np.full(hold, self.source.last), np.zeros(hold, np.uint8), np.zeros(hold, bool)))
-        end_s = self._now_s() + (self._most + hold) / self._rate_hz * (1 + _DRIFT) + _PATIENCE_S
+        end_s = self._now_s() + (self._most + hold) / self._rate_hz * (1 + DRIFT) + PATIENCE_S
         seen = False
         while True:
             asked_s = self._now_s()
@@ -281,7 +271,7 @@ class LaserCubeRun:
                 break
             if self._now_s() > end_s:
                 raise DeviceFault(f"{self._link.name}: its buffer does not empty; unplug it and plug it in again")
-            self._link.clock.sleep(_POLL_S)
+            self._link.clock.sleep(POLL_S)
         self._link.safe()
         if not seen:
             raise DeviceFault(f"{self._link.name}: answered too late to tell how the run ended; unload the host")
@@ -308,7 +298,7 @@ class LaserCubeRun:
         if queued == 0:
             self._raise_dry()
         played_s = (self._sent - queued) / self._rate_hz
-        slack_s = _DRIFT * (after_s - self._asked_s)
+        slack_s = DRIFT * (after_s - self._asked_s)
         self._asked_s = after_s
         earliest_s = max(self._start_s[0] - slack_s, before_s - played_s)
         latest_s = min(self._start_s[1] + slack_s, after_s - played_s)

@@ -30,9 +30,8 @@ from drivers.spads.spb_usb_setup import (
 )
 from drivers.spb1.control import ControlChannel, Op, Register, SensorState
 from drivers.spb1.receiver import Armed, BlockReceiver, Took
-from drivers.transports.bulk_link import BulkLink, PlainLink
+from drivers.transports.bulk_link import BulkLink, PlainLink, QueuedLink
 from drivers.transports.endpoints import Endpoint, resolve
-from drivers.transports.queued_link import QueuedLink
 from drivers.transports.tap import Tap
 from drivers.transports.usb_device import find_device
 from drivers.units import Seconds

@@ -244,8 +244,8 @@ class Wiring:
 
 
 WIRINGS: dict[Chip, Wiring] = {
-    "fx3": Wiring(UsbId(LABEL, 0x04B4, 0x00F1, "SPB1"), (0,), 0x01, 0x81, 0x82),
-    "ft601": Wiring(UsbId(LABEL, 0x0403, 0x601F, "SPB1"), (0, 1), 0x02, 0x82, 0x83, has_session=True),
+    "fx3": Wiring(UsbId(LABEL, 0x04B4, 0x00F1, ("SPB1",)), (0,), 0x01, 0x81, 0x82),
+    "ft601": Wiring(UsbId(LABEL, 0x0403, 0x601F, ("SPB1",)), (0, 1), 0x02, 0x82, 0x83, has_session=True),
 }
 USB_IDS = tuple(wiring.usb for wiring in WIRINGS.values())
 """USB ids and product strings by which such boards are found."""

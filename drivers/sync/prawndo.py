@@ -5,11 +5,9 @@ Facts: docs/reference/hardware.md; from `prawn_do/prawn_do.{c,pio}` of labscript
 GPIO2 marks records.
 
 The firmware has no loops and no watchdog. So programs are written out in full and end on two words that hold everything
-low, whatever happens to the host. It cannot read its pins while a program runs, nor tell a wait from play.
-
-A word is 16 outputs and a number of cycles: 0 cycles wait for the trigger, two such words in a row are the end, with
-the first one's outputs left on the pins. The trigger is a level, so that a wait passes at once while it is high: that
-is how a held pulse looks at the scan marker. Pulses that the board would play otherwise than written are refused.
+low, whatever happens to the host. It cannot read its pins while a program runs, nor tell a wait from play. The trigger
+is a level, so that a wait passes at once while it is high: that is how a held pulse looks at the scan marker. Pulses
+that the board would play otherwise than written are refused.
 """
 
 import logging
@@ -24,22 +22,12 @@ from pydantic import Field
 from drivers.errors import DeviceError, DeviceFault, LimitExceeded, ProtocolError
 from drivers.interfaces import Pulse, SyncSource, SyncStatus, sliced
 from drivers.registry import Kind, KindConfig, Surroundings
-from drivers.sync.prawndo_line import (
-    ABORT_REQUESTED,
-    ABORTED,
-    ABORTING,
-    IDLE,
-    RUNNING,
-    STARTING,
-    STOPPED,
-    STOPPING,
-    USUAL_TIMING,
-    PrawnDoLine,
-    PrawnDoTiming,
-)
+from drivers.sync.prawndo_line import IDLE, USUAL_TIMING, PrawnDoLine, PrawnDoTiming
 from drivers.transports.endpoints import resolve
 from drivers.transports.serial_port import SerialPort
 from drivers.units import Hertz, Seconds
+
+_log = logging.getLogger(__name__)
 
 MIN_CYCLES = 5
 MAX_CYCLES = 2**32 - 1
@@ -79,10 +67,7 @@ def most_repeats(pulses: Sequence[Pulse], board: ProgramLimits) -> int:
 
 
 def _words(pulses: Sequence[Pulse], board: ProgramLimits) -> NDArray[np.void]:
-    words = np.zeros(len(pulses), WORD)
-    for index, pulse in enumerate(pulses):
-        words[index] = pulse.outputs, _cycles(index, pulse, board)
-    return words
+    return np.array([(pulse.outputs, _cycles(index, pulse, board)) for index, pulse in enumerate(pulses)], WORD)
 
 
 def _cycles(index: int, pulse: Pulse, board: ProgramLimits) -> int:
@@ -115,8 +100,6 @@ def _check_waits(period: NDArray[np.void], repeats: int, board: ProgramLimits) -
         )
 
 
-_log = logging.getLogger(__name__)
-
 INTERNAL_HZ = 100_000_000
 """The board's own clock (docs/reference/hardware.md)."""
 MAX_WORDS = {"board: pico1": 30_000, "board: pico2": 60_000}
@@ -125,15 +108,10 @@ OLDEST_FIRMWARE = (1, 3)
 _CLOCK_CHANGE_S = 0.02
 """Time for the board to find out that there is no clock on GPIO20."""
 _CLOCK_TOLERANCE = 0.01
-_STATES: dict[int, Literal["stopped", "running", "aborted"]] = {
-    STOPPED: "stopped",
-    STARTING: "running",
-    RUNNING: "running",
-    ABORT_REQUESTED: "aborted",
-    ABORTING: "aborted",
-    ABORTED: "aborted",
-    STOPPING: "stopped",
-}
+_STATES: Sequence[Literal["stopped", "running", "aborted"]] = (
+    *("stopped", "running", "running", "aborted", "aborted", "aborted", "stopped"),
+)
+"""Meaning of each `run-status`."""
 
 
 class PrawnDoConfig(KindConfig):
@@ -210,7 +188,10 @@ class PrawnDo(SyncSource):
                 self._line.load(words.tobytes())
                 self._require_length(len(words))
             except DeviceError:
-                self._forget_program()
+                try:  # nothing of what did not arrive whole may ever be run
+                    self._line.command("cls")
+                except DeviceError as error:
+                    _log.warning("%s: %s", self.name, error)
                 raise
             self._confirmed = True
 
@@ -277,13 +258,6 @@ class PrawnDo(SyncSource):
         if f"Number of instructions: {n_words}" not in lines:
             raise DeviceFault(f"{self.name}: {lines} after a program of {n_words} words; load it again")
 
-    def _forget_program(self) -> None:
-        """Clear a program that did not arrive whole: nothing of it may ever be run."""
-        try:
-            self._line.command("cls")
-        except DeviceError as error:
-            _log.warning("%s: %s", self.name, error)
-
     def _check_clock(self) -> None:
         _, external = self._line.run_status()
         if external != (self._config.external_clock is not None):
@@ -293,9 +267,4 @@ class PrawnDo(SyncSource):
             )
 
 
-def create(config: PrawnDoConfig, surroundings: Surroundings, timing: PrawnDoTiming = USUAL_TIMING) -> PrawnDo:
-    """The board at the config's port."""
-    return PrawnDo(config, surroundings, timing)
-
-
-KIND = Kind(config=PrawnDoConfig, create=create)
+KIND = Kind(config=PrawnDoConfig, create=PrawnDo)

@@ -18,10 +18,8 @@ from drivers.transports.serial_port import SerialPort
 _log = logging.getLogger(__name__)
 _T = TypeVar("_T")
 
-STOPPED, STARTING, RUNNING, ABORT_REQUESTED, ABORTING, ABORTED, STOPPING = range(7)
-"""Values of `run-status` (docs/reference/hardware.md)."""
-IDLE = (STOPPED, ABORTED)
-"""States in which everything but `sts`, `abt`, `ver` and `brd` is executed."""
+IDLE = (0, 5)
+"""Values of `run-status`, stopped and aborted, in which everything but `sts`, `abt`, `ver` and `brd` is executed."""
 BYTES_PER_WORD = 6
 
 _CRLF = b"\r\n"
@@ -74,11 +72,6 @@ class PrawnDoLine:
         """Whether the port has hung up. Any thread."""
         return self._port.lost
 
-    @property
-    def path(self) -> str:
-        """The port's path."""
-        return self._port.path
-
     def close(self) -> None:
         """Give the port back."""
         self._port.close()
@@ -93,8 +86,8 @@ class PrawnDoLine:
         except DeviceTimeout:
             if self._last_heard:
                 raise ProtocolError(
-                    f"{self._name}: what answers on {self.path} is no PrawnDO (it says {self._last_heard[:40]!r}); "
-                    "correct 'port'"
+                    f"{self._name}: what answers on {self._port.path} is no PrawnDO (it says "
+                    f"{self._last_heard[:40]!r}); correct 'port'"
                 ) from None
             self._free_wedged(most_words)
 
@@ -134,7 +127,18 @@ class PrawnDoLine:
     def load(self, payload: bytes) -> None:
         """Replace the program by these words of six bytes. `DeviceFault` for any answer but `ok` (pitfall 2)."""
         with self.lock:
-            lines = self._load(payload)
+            before, after = self._token(), self._token()
+            self._pay_debt()
+            with self._in_one_piece:
+                self._owed_bytes = len(payload)  # `adm` cannot be left before all bytes have come
+                self._port.write(f"{before}\nadm 0 {len(payload) // BYTES_PER_WORD:x}\n".encode())
+                self._until(lambda lines: lines[-1] == "ready", before, self._timing.reply_s, urgent=False)
+                for at in range(0, len(payload), _CHUNK_BYTES):
+                    piece = payload[at : at + _CHUNK_BYTES]
+                    self._port.write(piece)
+                    self._owed_bytes -= len(piece)
+                self._port.write(f"{after}\n".encode())
+            lines = self._until(lambda lines: after in lines[-1], None, self._timing.load_s, urgent=False)[:-1]
         if lines != ["ok"]:
             raise DeviceFault(f"{self._name}: the program was answered {lines}, not ok; load it again")
 
@@ -198,21 +202,6 @@ class PrawnDoLine:
             self.lower()
             return
         raise DeviceTimeout(f"{self._name} does not answer on {self._port.path}; unplug it, plug it in and start again")
-
-    def _load(self, payload: bytes) -> list[str]:
-        before, after = self._token(), self._token()
-        self._pay_debt()
-        with self._in_one_piece:
-            self._owed_bytes = len(payload)  # `adm` cannot be left before all bytes have come
-            self._port.write(f"{before}\nadm 0 {len(payload) // BYTES_PER_WORD:x}\n".encode())
-            self._until(lambda lines: lines[-1] == "ready", before, self._timing.reply_s, urgent=False)
-            for at in range(0, len(payload), _CHUNK_BYTES):
-                piece = payload[at : at + _CHUNK_BYTES]
-                self._port.write(piece)
-                self._owed_bytes -= len(piece)
-            self._port.write(f"{after}\n".encode())
-        lines = self._until(lambda lines: after in lines[-1], None, self._timing.load_s, urgent=False)
-        return lines[:-1]
 
     def _ask_twice(self, command: str, parse: Callable[[str], _T], deadline_s: float | None, urgent: bool) -> _T:
         """Ask until two answers in a row agree: a flipped bit makes a low gate of a high one."""

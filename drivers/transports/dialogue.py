@@ -69,23 +69,18 @@ class Framing(Protocol):
     @property
     def ping(self) -> str:
         """A question that may be asked at any time."""
-        ...
 
     def greets(self, reply: str) -> bool:
         """Whether `reply` answers the ping."""
-        ...
 
     def encode(self, command: str) -> bytes:
         """The bytes of a command."""
-        ...
 
     def read(self, command: str, read_line: Callable[[], str]) -> str:
         """The reply to a command, from as many lines as it has; "" where they do not go together."""
-        ...
 
     def refusal(self, reply: str) -> str | None:
         """The reason for which `reply` refuses its command; None: it does not."""
-        ...
 
 
 class Dialogue:

@@ -26,6 +26,11 @@ class Endpoint:
     opens the address."""
 
 
+def one_line(error: Exception) -> str:
+    """The text of another library's error without its line ends."""
+    return " ".join(str(error).split())
+
+
 def resolve(port: str, ports: Mapping[str, Endpoint]) -> Endpoint:
     """The endpoint that a config's `port` means. ports: what the emulating world created, by name.
 
@@ -36,8 +41,8 @@ def resolve(port: str, ports: Mapping[str, Endpoint]) -> Endpoint:
     name = port.removeprefix(EMULATED_PREFIX)
     if name in ports:
         return ports[name]
-    if not ports:
-        raise DeviceNotFound(
-            f"port {port}: this rig emulates no devices; give a real port, or use a config with an emulating world"
-        )
-    raise DeviceNotFound(f"port {port}: no such emulated device; choose one of: {', '.join(sorted(ports))}")
+    if ports:
+        raise DeviceNotFound(f"port {port}: no such emulated device; choose one of: {', '.join(sorted(ports))}")
+    raise DeviceNotFound(
+        f"port {port}: this rig emulates no devices; give a real port, or use a config with an emulating world"
+    )

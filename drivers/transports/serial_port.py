@@ -1,11 +1,8 @@
 """A serial port with a deadline on every call, and one typed error for each way in which it can fail.
 
-Wraps pyserial. What a lost port raises there depends on the call (SerialException, a bare OSError or termios.error), so
-all of them are caught around every call. Deadlines are in the host's time, since pyserial waits in no other; an
-emulated port (`Endpoint.serial_port`) brings the clock that it waits on.
-
-Its network ports are refused: a write to `rfc2217://` has no deadline, nobody but a reader learns that it is lost, and
-`socket://` leaks its connection where that was reset (pyserial 3.5). A bridge to a local port has neither fault.
+Wraps pyserial. What a lost port raises there depends on the call, so that everything is caught around every call.
+Deadlines are in the host's time, since pyserial waits in no other; an emulated port (`Endpoint.serial_port`) brings the
+clock that it waits on. Network ports are refused: pyserial's (3.5) have writes without a deadline and leaks.
 """
 
 import errno
@@ -27,7 +24,7 @@ from drivers.errors import (
     DeviceTimeout,
     ProtocolError,
 )
-from drivers.transports.endpoints import UDEV_RULES, Endpoint
+from drivers.transports.endpoints import UDEV_RULES, Endpoint, one_line
 from drivers.transports.tap import IN, OUT, Tap
 
 try:
@@ -62,17 +59,13 @@ class SerialPort:
         vendor and product, the only one attached). Raises `DeviceNotFound`, `DevicePermission` or `DeviceBusy`.
         """
         self._name = name
-        self._path = _find(name, endpoint.address)
+        self.path = _find(name, endpoint.address)
+        """The port's path, found where the address was a serial number."""
         self._received = bytearray()
         self._tap = tap
         self._port = self._open(endpoint)
         self.clock: Clock = SystemClock() if endpoint.serial_port is None else self._port.clock
         """The clock of its deadlines."""
-
-    @property
-    def path(self) -> str:
-        """The port's path, found where the address was a serial number."""
-        return self._path
 
     @property
     def lost(self) -> bool:
@@ -94,7 +87,7 @@ class SerialPort:
                 self._port.write(data)
             except serial.SerialTimeoutException:
                 raise DeviceTimeout(
-                    f"{self._name} took no data for {_WRITE_S:g} s on {self._path}; it hangs: power-cycle it"
+                    f"{self._name} took no data for {_WRITE_S:g} s on {self.path}; it hangs: power-cycle it"
                 ) from None
 
     def read_line(self, terminator: bytes, deadline_s: float) -> bytes:
@@ -105,7 +98,11 @@ class SerialPort:
             if len(self._received) > _MAX_LINE_BYTES:
                 raise ProtocolError(f"{self._name} sent {len(self._received)} bytes without an end of line: noise")
             searched = max(0, len(self._received) - len(terminator) + 1)
-            self._receive(ends_at, deadline_s)
+            if not self._receive_some() and self._now_s() >= ends_at:
+                raise DeviceTimeout(
+                    f"{self._name} did not send a whole line within {deadline_s:g} s on {self.path} "
+                    f"({len(self._received)} bytes came); check its power and cable"
+                )
         return self._take(end, len(terminator))
 
     def reset_input(self) -> bytes:
@@ -131,21 +128,21 @@ class SerialPort:
             self._port.close()
 
     def _open(self, endpoint: Endpoint) -> Any:
-        if "://" in self._path:
+        if "://" in self.path:
             raise DeviceNotFound(
-                f"{self._name}: port {self._path} is on the network; make a local one of it (socat PTY,raw,link=PATH "
+                f"{self._name}: port {self.path} is on the network; make a local one of it (socat PTY,raw,link=PATH "
                 "TCP:HOST:PORT) and write its path"
             )
         try:
             if endpoint.serial_port is not None:
                 return endpoint.serial_port()
-            return serial.Serial(self._path, _BAUD, timeout=_SLICE_S, write_timeout=_WRITE_S, exclusive=True)
+            return serial.Serial(self.path, _BAUD, timeout=_SLICE_S, write_timeout=_WRITE_S, exclusive=True)
         except _FOREIGN as error:
             raise self._refused(error) from None
 
     def _refused(self, error: Exception) -> DeviceError:
         number = getattr(error, "errno", None)
-        where = f"{self._name}: port {self._path}"
+        where = f"{self._name}: port {self.path}"
         if number in _ABSENT:
             return DeviceNotFound(f"{where} is not there; plug the device in, switch it on, or correct 'port'")
         if number in _FORBIDDEN:
@@ -154,17 +151,7 @@ class SerialPort:
             )
         if number in _HELD:
             return DeviceBusy(f"{where} is held by another program; close that program and try again")
-        return DeviceNotFound(f"{where} cannot be opened as a serial port ({_one_line(error)}); correct 'port'")
-
-    def _receive(self, ends_at: float, deadline_s: float) -> None:
-        """Wait for bytes; DeviceTimeout past the deadline."""
-        if self._receive_some():
-            return
-        if self._now_s() >= ends_at:
-            raise DeviceTimeout(
-                f"{self._name} did not send a whole line within {deadline_s:g} s on {self._path} "
-                f"({len(self._received)} bytes came); check its power and cable"
-            )
+        return DeviceNotFound(f"{where} cannot be opened as a serial port ({one_line(error)}); correct 'port'")
 
     def _receive_some(self) -> bool:
         with self._translated():
@@ -193,7 +180,7 @@ class SerialPort:
         except (*_FOREIGN, TypeError) as error:
             # TypeError: what pyserial's calls raise on the handle of a port that was closed under them.
             raise DeviceDisconnected(
-                f"{self._name}: port {self._path} is lost ({_one_line(error)}); plug it in again"
+                f"{self._name}: port {self.path} is lost ({one_line(error)}); plug it in again"
             ) from None
 
 
@@ -207,11 +194,8 @@ def _find(name: str, address: str) -> str:
         matches = [port.device for port in attached if port.serial_number == value]
         other = "give the port's path"
     else:
-        matches = [
-            port.device
-            for port in attached
-            if port.vid is not None and f"{port.vid:04x}:{port.pid:04x}" == value.lower()
-        ]
+        usb = [port for port in attached if port.vid is not None]
+        matches = [port.device for port in usb if f"{port.vid:04x}:{port.pid:04x}" == value.lower()]
         other = "give serial=... or the port's path"
     if not matches:
         choices = ", ".join(f"{p.device} (serial={p.serial_number})" for p in attached if p.serial_number)
@@ -219,7 +203,3 @@ def _find(name: str, address: str) -> str:
     if len(matches) > 1:
         raise DeviceNotFound(f"{name}: {len(matches)} serial ports with {address} ({', '.join(matches)}); {other}")
     return str(matches[0])
-
-
-def _one_line(error: Exception) -> str:
-    return " ".join(str(error).split())

@@ -12,6 +12,7 @@ from collections.abc import Iterator
 from contextlib import contextmanager, suppress
 
 from drivers.errors import DeviceDisconnected, DeviceError, DeviceNotFound, DevicePermission, DeviceTimeout
+from drivers.transports.endpoints import one_line
 
 _FORBIDDEN = (errno.EACCES, errno.EPERM)
 _CHUNK_BYTES = 65_536
@@ -93,7 +94,7 @@ class TcpStream:
             return DevicePermission(f"{where} may not be connected to by this user; ask for a firewall rule")
         if isinstance(error, TimeoutError):
             return DeviceNotFound(f"{where} did not answer within {connect_s:g} s; check cable and address")
-        return DeviceNotFound(f"{where} cannot be reached ({_one_line(error)}); correct 'port'")
+        return DeviceNotFound(f"{where} cannot be reached ({one_line(error)}); correct 'port'")
 
     @contextmanager
     def _translated(self) -> Iterator[None]:
@@ -103,7 +104,7 @@ class TcpStream:
         except (OSError, ValueError) as error:
             # ValueError: what select makes of a socket that was closed by another thread.
             raise DeviceDisconnected(
-                f"{self._name}: the connection to {self._address} is lost ({_one_line(error)})"
+                f"{self._name}: the connection to {self._address} is lost ({one_line(error)})"
             ) from None
 
 
@@ -113,7 +114,3 @@ def _split(name: str, address: str) -> tuple[str, int]:
     if not colon or not host or not port.isascii() or not port.isdigit() or not 0 < int(port) < 65_536:
         raise DeviceNotFound(f"{name}: {address!r} is no address; write 'port' as host:port, like 127.0.0.1:9999")
     return host.strip("[]"), int(port)
-
-
-def _one_line(error: Exception) -> str:
-    return " ".join(str(error).split())

@@ -1,11 +1,8 @@
 """One USB device, opened and claimed through pyusb: every call has a deadline, every failure is one of ours.
 
 Addresses: "usb" (the only one attached), "usb:serial=ABC", "usb:path=1-2.4" (bus and hub ports, as in
-/sys/bus/usb/devices; for devices without a serial string). Two equal devices and a plain "usb" are refused with the
-addresses to choose from. `backend` is pyusb's: None for the real libusb, an emulator's object otherwise.
-
-pyusb is synchronous: between two reads nothing is queued, so the device's FIFO must hold that long. A stream that
-cannot wait needs several transfers in flight, which pyusb does not offer (package `libusb1` does).
+/sys/bus/usb/devices; for devices without a serial string). `backend` is pyusb's: None for the real libusb, an
+emulator's object otherwise. Between two reads nothing is queued; `bulk_link` has what a stream needs.
 
 Errors are numbered by libusb 1.0 and mean what Linux means by them: unplugging shows as ENODEV, EIO or ESHUTDOWN; a
 read shorter than a packet overflows and loses the packet; the sum of all queued transfers is limited by
@@ -15,7 +12,7 @@ read shorter than a packet overflows and loses the packet; the sum of all queued
 import array
 import errno
 from collections.abc import Callable, Iterator, Mapping
-from contextlib import contextmanager
+from contextlib import contextmanager, suppress
 from dataclasses import dataclass, field
 from threading import RLock
 from typing import Any, Self
@@ -64,21 +61,18 @@ def usb_failure(
 ) -> DeviceError:
     """The error of ours for an errno of libusb's, None where it has none; `text` is libusb's own."""
     where = "" if endpoint is None else f" on endpoint 0x{endpoint:02x}"
-    if number == errno.ETIMEDOUT:
-        return DeviceTimeout(f"{label}: nothing{where} within {timeout_s or 0:g} s")
     if number in _LOST:
         return DeviceDisconnected(f"{label}: the device is gone ({text}); check cable and power, open again")
     if number == errno.EACCES:
         return DevicePermission(no_permission(label))
-    if number == errno.EBUSY:
-        return DeviceBusy(f"{label}: another program holds it; end that program")
-    if number == errno.EPIPE:
-        return DeviceFault(f"{label}: the device refused the transfer{where} (stall)")
-    if number == errno.EOVERFLOW:
-        return ProtocolError(f"{label}: more bytes than asked for{where}; check the firmware")
-    if number == errno.ENOMEM:
-        return DeviceError(f"{label}: the kernel's USB memory is used up; run: {USBFS_HINT}")
-    return DeviceError(f"{label}: USB error{where}: {text}")
+    kind, said = {
+        errno.ETIMEDOUT: (DeviceTimeout, f"nothing{where} within {timeout_s or 0:g} s"),
+        errno.EBUSY: (DeviceBusy, "another program holds it; end that program"),
+        errno.EPIPE: (DeviceFault, f"the device refused the transfer{where} (stall)"),
+        errno.EOVERFLOW: (ProtocolError, f"more bytes than asked for{where}; check the firmware"),
+        errno.ENOMEM: (DeviceError, f"the kernel's USB memory is used up; run: {USBFS_HINT}"),
+    }.get(number or 0, (DeviceError, f"USB error{where}: {text}"))
+    return kind(f"{label}: {said}")
 
 
 @dataclass(frozen=True, slots=True)
@@ -88,15 +82,13 @@ class UsbId:
     label: str
     vendor: int
     product: int
-    product_names: str | tuple[str, ...] = ()
+    product_names: tuple[str, ...] = ()
 
 
 @dataclass(frozen=True, slots=True)
 class UsbListing:
     """A device on the bus as far as it can be known without claiming it. Strings are None where it may not be asked."""
 
-    vendor: int
-    product: int
     path: str
     serial: str | None
     product_name: str | None
@@ -110,16 +102,13 @@ class UsbListing:
 
 def attached(wanted: UsbId, backend: object | None = None) -> list[UsbListing]:
     """The attached devices of one sort, ordered by path. Claims nothing and changes nothing."""
-    found = usb.core.find(find_all=True, backend=backend or _libusb(), idVendor=wanted.vendor, idProduct=wanted.product)
+    ids = {"idVendor": wanted.vendor, "idProduct": wanted.product}
+    devices = usb.core.find(find_all=True, backend=backend or _libusb(), **ids)
     with translated(wanted.label):
-        listings = [_listing(device) for device in found]
-    return sorted((one for one in listings if _named(one, wanted)), key=lambda one: one.path)
-
-
-def _named(one: UsbListing, wanted: UsbId) -> bool:
-    names = (wanted.product_names,) if isinstance(wanted.product_names, str) else wanted.product_names
-    name = one.product_name
-    return name is None or not names or any(part in name for part in names)
+        listings = [_listing(device) for device in devices]
+    names = wanted.product_names or ("",)
+    found = [one for one in listings if one.product_name is None or any(name in one.product_name for name in names)]
+    return sorted(found, key=lambda one: one.path)
 
 
 class UsbDevice:
@@ -220,10 +209,8 @@ class UsbDevice:
             if not self._open:
                 return
             self._open = False
-            try:
+            with suppress(usb.core.USBError, NotImplementedError):
                 usb.util.dispose_resources(self._device)
-            except (usb.core.USBError, NotImplementedError):
-                return
 
     def __enter__(self) -> Self:
         """The device itself."""
@@ -288,8 +275,6 @@ def _listing(device: Any) -> UsbListing:
     serial, product = (_string(device, index) for index in (device.iSerialNumber, device.iProduct))
     usb.util.dispose_resources(device)  # asking for strings opened it
     return UsbListing(
-        vendor=device.idVendor,
-        product=device.idProduct,
         path=f"{device.bus}-{'.'.join(str(port) for port in ports)}",
         serial=serial,
         product_name=product,

@@ -28,8 +28,8 @@ from drivers.interfaces import SpadRequest
 from drivers.ring import BlockRing
 from drivers.spads.spb_usb import SpbUsb, SpbUsbConfig, open_link
 from drivers.spb1.control import Op, Register
+from drivers.transports.bulk_link import QueuedLink
 from drivers.transports.endpoints import Endpoint
-from drivers.transports.queued_link import QueuedLink
 from sim_backend.wire.firmware.spb_usb import SpbUsbModel
 from sim_backend.wire.firmware.spb_usb_run import SpbUsbBoard
 from tests.wire.spb_device import TiledSource

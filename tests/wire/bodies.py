@@ -5,19 +5,10 @@ import subprocess
 import sys
 import traceback
 from collections.abc import Callable
-from typing import Protocol
 
-from sim_backend.wire.serve.usb_model import AttachedDevice, UsbModel
+from tests.wire.usb.umockdev import UmockdevBus
 
 WITHIN_S = 120
-
-
-class ServesProcesses(Protocol):
-    """A bus for other processes: umockdev's, or a kernel's."""
-
-    def plug(self, model: UsbModel) -> AttachedDevice: ...
-
-    def environment(self) -> dict[str, str]: ...
 
 
 def report(bodies: dict[str, Callable[[], None]]) -> None:
@@ -32,7 +23,7 @@ def report(bodies: dict[str, Callable[[], None]]) -> None:
     print(json.dumps(outcomes))
 
 
-def outcomes(bus: ServesProcesses, module: str, *arguments: str) -> dict[str, str]:
+def outcomes(bus: UmockdevBus, module: str, *arguments: str) -> dict[str, str]:
     """What became of each body of a module that reports when it is run, with the devices of a bus."""
     command = [sys.executable, "-m", module, *arguments]
     done = subprocess.run(command, env=bus.environment(), capture_output=True, text=True, timeout=WITHIN_S, check=False)

@@ -16,9 +16,9 @@ from drivers.clock import SystemClock
 from drivers.interfaces import MARKER_SCAN, BeamScanner, ScanWaveform
 from drivers.registry import Surroundings, lookup
 from sim_backend.wire.firmware.helios import BLUE, HeliosModel
-from tests.wire.bodies import ServesProcesses
 from tests.wire.lasers import eventually
 from tests.wire.scanners import GALVO
+from tests.wire.usb.umockdev import UmockdevBus
 
 COMMAND = [sys.executable, "-m", "tests.wire.helios_over_libusb"]
 TOLERANCE_S = 1e-6
@@ -48,7 +48,7 @@ def main() -> None:
 # In the test's own process, on a bus for others.
 
 
-def a_run_is_played_and_parked(bus: ServesProcesses) -> None:
+def a_run_is_played_and_parked(bus: UmockdevBus) -> None:
     model = HeliosModel()
     bus.plug(model)
     done = subprocess.run(COMMAND, env=bus.environment(), capture_output=True, text=True, timeout=60, check=False)
@@ -59,7 +59,7 @@ def a_run_is_played_and_parked(bus: ServesProcesses) -> None:
     assert not model.shutter
 
 
-def kill_9_stops_the_mirror_through_alternate_0(bus: ServesProcesses) -> None:
+def kill_9_stops_the_mirror_through_alternate_0(bus: UmockdevBus) -> None:
     model = HeliosModel()
     attached = bus.plug(model)
 

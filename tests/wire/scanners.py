@@ -46,7 +46,6 @@ class Recording(DacModel):
         return taken
 
     def sent(self, endpoint: int) -> list[bytes]:
-        """What came on an endpoint."""
         return [data for _, at, data in self.log if at == endpoint]
 
 

@@ -14,8 +14,8 @@ import pytest
 from drivers.clock import SystemClock
 from drivers.errors import DeviceBusy, DeviceDisconnected, DeviceTimeout
 from drivers.spads.spb_usb import SpbUsb, SpbUsbConfig, open_link
+from drivers.transports.bulk_link import QueuedLink
 from drivers.transports.endpoints import Endpoint
-from drivers.transports.queued_link import QueuedLink
 from tests.wire.bodies import report
 from tests.wire.lasers import PATIENCE_S
 from tests.wire.spads import begin, finish

@@ -7,7 +7,7 @@ from typing import Any
 from drivers.clock import NS_PER_S, VirtualClock
 from drivers.interfaces import OUT_GATE, Pulse
 from drivers.registry import Surroundings
-from drivers.sync.prawndo import PrawnDo, PrawnDoConfig, create
+from drivers.sync.prawndo import PrawnDo, PrawnDoConfig
 from drivers.sync.prawndo_line import USUAL_TIMING, PrawnDoTiming
 from sim_backend.wire.firmware.prawndo import PrawnDoModel, TriggerLine
 from sim_backend.wire.serve.serial import SerialServer, SerialWire
@@ -40,7 +40,7 @@ class Board:
 
     def open(self, timing: PrawnDoTiming = USUAL_TIMING, **config: Any) -> PrawnDo:
         made = PrawnDoConfig.model_validate({"port": "emulated:sync", **config})
-        return create(made, Surroundings(self.clock, None, 0, {"sync": self.server.endpoint}), timing)
+        return PrawnDo(made, Surroundings(self.clock, None, 0, {"sync": self.server.endpoint}), timing)
 
 
 @contextmanager

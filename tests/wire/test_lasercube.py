@@ -1,16 +1,17 @@
 """The LaserCube driver against the firmware model. Golden bytes: docs/reference/hardware.md."""
 
+from typing import Any
+
 import numpy as np
 import pytest
 
-from drivers.clock import VirtualClock
-from drivers.errors import DeviceFault, DeviceNotFound, LimitExceeded, ProtocolError
+from drivers.errors import DeviceError, DeviceFault, DeviceNotFound, LimitExceeded, ProtocolError
 from drivers.interfaces import LEVEL_BACKWARD, MARKER_LINE, MARKER_SCAN
 from drivers.scanners.dac_scanner import PointSlice
 from drivers.scanners.lasercube import encode
 from sim_backend.wire.firmware.lasercube import BLUE, COMMANDS, GREEN, RED, SAMPLES, LaserCubeModel
 from sim_backend.wire.serve.usb_model import Stall
-from tests.wire.scanners import LaserCubeRecorder, cosine, finish, open_scanner, opened, play, plug
+from tests.wire.scanners import LaserCubeRecorder, cosine, opened, play
 
 
 def test_samples_are_the_bytes_of_the_manual() -> None:
@@ -20,33 +21,25 @@ def test_samples_are_the_bytes_of_the_manual() -> None:
     assert encode(points, "y", markers=False).hex(" ", 8) == "000000000008ff0f 0000000000080000 0000000000080008"
 
 
-def test_opening_turns_the_output_off_and_empties_the_ring_before_anything_else() -> None:
+def test_it_is_found_and_left_with_its_output_off_and_its_ring_empty() -> None:
     model = LaserCubeRecorder()
-    with opened("lasercube", model):
-        assert model.sent(COMMANDS)[:2] == [b"\x80\x00", b"\x8d\x00"]
-
-
-def test_samples_go_to_alternate_setting_1_of_the_second_interface() -> None:
-    model = LaserCubeRecorder()
-    with opened("lasercube", model):
-        assert model.sent(-1) == [b"\x00", b"\x01"]
-
-
-def test_close_turns_the_output_off_and_empties_the_ring() -> None:
-    model = LaserCubeRecorder()
+    off = [b"\x80\x00", b"\x8d\x00"]
     with opened("lasercube", model, colours="markers") as (device, _):
+        assert model.sent(COMMANDS)[:2] == off
+        assert model.sent(-1) == [b"\x00", b"\x01"]  # samples go to alternate setting 1 of the second interface
         device.load(cosine(device), 100)
         device.start()
-    assert model.sent(COMMANDS)[-2:] == [b"\x80\x00", b"\x8d\x00"]
+    assert model.sent(COMMANDS)[-2:] == off
     assert not model.enabled
 
 
-def test_the_rate_is_set_as_four_bytes_and_read_back() -> None:
+def test_the_rate_is_set_as_four_bytes_and_read_back_and_transfers_hold_at_most_64_samples() -> None:
     model = LaserCubeRecorder()
     with opened("lasercube", model) as (device, _):
-        play(device, 1)
+        play(device, 2)
         at = model.sent(COMMANDS).index(b"\x82\xa8\x61\x00\x00")
         assert model.sent(COMMANDS)[at + 1] == b"\x83"
+        assert max(len(data) for data in model.sent(SAMPLES)) == 512
 
 
 def test_another_rate_than_the_asked_one_is_a_fault() -> None:
@@ -59,39 +52,29 @@ def test_another_rate_than_the_asked_one_is_a_fault() -> None:
         model.rate_offset_hz = 0
 
 
-def test_transfers_hold_at_most_64_samples() -> None:
+def test_its_own_lasers_stay_dark_unless_the_config_says_where_the_colours_lead() -> None:
     model = LaserCubeRecorder()
     with opened("lasercube", model) as (device, _):
         play(device, 2)
-        assert max(len(data) for data in model.sent(SAMPLES)) == 512
-
-
-def test_its_own_lasers_stay_dark_unless_the_config_says_where_the_colours_lead() -> None:
-    clock, model = VirtualClock(), LaserCubeRecorder()
-    with opened("lasercube", model, clock) as (device, plugged):
-        play(device, 2)
         assert b"\x80\x01" not in model.sent(COMMANDS)
         assert all(not any(data[at : at + 4]) for data in model.sent(SAMPLES) for at in range(0, len(data), 8))
-        assert not len(model.history.rising(GREEN, 0, plugged.now_s()))
 
 
 @pytest.mark.parametrize("when_empty", ["hold", "repeat"])
 def test_points_and_markers_come_out_once_whatever_an_empty_ring_does(when_empty: str) -> None:
-    clock, model = VirtualClock(), LaserCubeRecorder(when_empty=when_empty)
-    with opened("lasercube", model, clock, colours="markers") as (device, plugged):
-        wave, repeats = cosine(device), 3
-        device.load(wave, repeats)
-        device.start()
-        finish(device)
-        history, period = model.history, 1 / 25_000
-        scans = history.rising(BLUE, 0, plugged.now_s())
-        assert scans - scans[0] == pytest.approx(np.arange(repeats) * 6000 * period, abs=1e-6)
-        assert len(history.rising(GREEN, 0, plugged.now_s())) == 60 * repeats
-        assert len(history.rising(RED, 0, plugged.now_s())) == repeats
-        times = scans[0] + (np.arange(repeats * 6000) + 0.5) * period
+    model = LaserCubeRecorder(when_empty=when_empty)
+    with opened("lasercube", model, colours="markers") as (device, plugged):
+        wave, repeats, rate_hz = cosine(device), 3, 25_000
+        play(device, repeats)
+        history, now_s = model.history, plugged.now_s()
+        scans = history.rising(BLUE, 0, now_s)
+        assert scans - scans[0] == pytest.approx(np.arange(repeats) * 6000 / rate_hz, abs=1e-6)
+        assert len(history.rising(GREEN, 0, now_s)) == 60 * repeats
+        assert len(history.rising(RED, 0, now_s)) == repeats
+        times = scans[0] + (np.arange(repeats * 6000) + 0.5) / rate_hz
         assert history.command(times) == pytest.approx(np.tile(wave.command, repeats), abs=1.01 / 4095)
-        assert not model.moving(plugged.now_s())
-        assert history.command(np.array([plugged.now_s()]))[0] == pytest.approx(wave.command[-1], abs=1.01 / 4095)
+        assert not model.moving(now_s)
+        assert history.command(np.array([now_s]))[0] == pytest.approx(wave.command[-1], abs=1.01 / 4095)
 
 
 def test_a_lost_transfer_is_a_fault() -> None:
@@ -104,9 +87,7 @@ def test_a_lost_transfer_is_a_fault() -> None:
 
     with opened("lasercube", Lossy()) as (device, _):
         play(device, 100)
-        fault = device.status.fault
-        assert fault is not None
-        assert "lost" in fault
+        assert "lost" in str(device.status.fault)
 
 
 def test_the_reply_s_first_byte_does_not_matter_but_its_second_does() -> None:
@@ -137,16 +118,16 @@ def test_a_reply_left_by_another_program_is_dropped() -> None:
         assert device._dac.firmware == (0, 12)  # type: ignore[attr-defined]
 
 
-def test_a_lasershark_with_the_same_numbers_is_not_taken_for_one() -> None:
-    plugged = plug(LaserCubeModel(product_name="Lasershark"), VirtualClock())
-    with pytest.raises(DeviceNotFound, match="1fc9:04d8"):
-        open_scanner("lasercube", plugged.bus, plugged.clock)
-
-
-def test_a_foreign_firmware_is_one_line() -> None:
-    plugged = plug(LaserCubeModel(ring=0), VirtualClock())
-    with pytest.raises(ProtocolError, match="no LaserCube firmware") as refused:
-        open_scanner("lasercube", plugged.bus, plugged.clock)
+@pytest.mark.parametrize(
+    ("settings", "error", "said"),
+    [
+        ({"product_name": "Lasershark"}, DeviceNotFound, "1fc9:04d8"),  # of the same numbers
+        ({"ring": 0}, ProtocolError, "no LaserCube firmware"),
+    ],
+)
+def test_another_board_is_refused_in_one_line(settings: dict[str, Any], error: type[DeviceError], said: str) -> None:
+    with pytest.raises(error, match=said) as refused, opened("lasercube", LaserCubeModel(**settings)):
+        pass
     assert "\n" not in str(refused.value)
 
 

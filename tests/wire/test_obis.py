@@ -13,12 +13,17 @@ from drivers.errors import (
     WrongState,
 )
 from drivers.guard import Guard
-from drivers.lasers.obis import ERRORS, FAULTS, ObisConfig
+from drivers.lasers.obis import FAULTS, ObisConfig
 from sim_backend.wire.firmware.obis import ObisModel
 from sim_backend.wire.serve.serial import SerialServer
 from tests.wire.lasers import bring_up, eventually, now_s, open_obis, overtaken_arm, wire
 
 HANDSHAKES = (True, False)
+
+
+def sets(model: ObisModel) -> list[str]:
+    """What it was told, but for questions."""
+    return [command for command in model.commands if not command.endswith("?")]
 
 
 # The bytes themselves, from docs/reference/hardware.md.
@@ -76,7 +81,7 @@ def test_the_gate_is_set_up_while_off_and_on_comes_last(handshake: bool) -> None
         assert model.commands[0] == "SYST:COMM:HAND?"
         model.commands.clear()
         laser.arm(0.05)
-        assert [command for command in model.commands if not command.endswith("?")] == [
+        assert sets(model) == [
             "SOUR:AM:STAT OFF",
             "SYST:CDRH ON",
             "SYST:AUT OFF",
@@ -113,14 +118,6 @@ def test_trap_with_the_handshake_on_each_query_ends_with_ok() -> None:
         for _ in range(3):
             assert laser.status.temperature_c == pytest.approx(24.6)
         assert model.commands.count("*IDN?") == 2  # it never was out of step
-
-
-def test_trap_the_handshake_setting_is_never_changed() -> None:
-    for handshake in HANDSHAKES:
-        model = ObisModel(handshake=handshake)
-        with wire(model) as (_, surroundings), open_obis(surroundings) as laser:
-            bring_up(laser, surroundings.clock)
-        assert not any(command.startswith("SYST:COMM:HAND ") for command in model.commands)
 
 
 def test_trap_on_during_warm_up_is_deferred_so_it_is_never_said_then() -> None:
@@ -169,7 +166,6 @@ def test_a_pause_from_another_thread_ends_the_wait_for_the_warm_up() -> None:
     with wire(model) as (_, surroundings), open_obis(surroundings) as laser:
         assert isinstance(overtaken_arm(laser, model, b"SYST:STAT?"), WrongState)
         assert "SOUR:AM:STAT ON" not in model.commands
-        assert not model.state_on
 
 
 def test_trap_with_cdrh_emission_follows_on_by_five_seconds() -> None:
@@ -211,9 +207,8 @@ def test_trap_modes_cannot_be_changed_while_it_is_on(handshake: bool) -> None:
 def test_trap_behind_a_remote_bare_commands_do_not_reach_the_laser() -> None:
     model = ObisModel(channel=1)
     with wire(model) as (_, surroundings):
-        with pytest.raises(DeviceNotFound, match="channel: 1") as refused:
+        with pytest.raises(DeviceNotFound, match="channel: 1"):
             open_obis(surroundings)
-        assert "\n" not in str(refused.value)
         with open_obis(surroundings, channel=1) as laser:
             bring_up(laser, surroundings.clock)
             assert "SOUR1:AM:STAT ON" in model.commands
@@ -224,8 +219,6 @@ def test_trap_behind_a_remote_bare_commands_do_not_reach_the_laser() -> None:
 
 
 def test_trap_error_numbers_come_in_place_of_the_answer_and_are_named() -> None:
-    assert ERRORS[-200].startswith("not in this order")
-
     class Poor(ObisModel):
         def _query_laser(self, command: str) -> str | None:
             return None if command == "SOUR:TEMP:BAS?" else super()._query_laser(command)
@@ -239,15 +232,6 @@ def test_trap_error_numbers_come_in_place_of_the_answer_and_are_named() -> None:
 
 
 def test_every_fault_bit_is_named_and_refuses_to_arm() -> None:
-    model = ObisModel()
-    with wire(model) as (_, surroundings), open_obis(surroundings) as laser:
-        for model.fault, name in FAULTS.items():
-            with pytest.raises(DeviceFault, match=name):
-                laser.arm(0.05)
-            assert not model.state_on
-
-
-def test_fault_words_are_those_of_the_manual() -> None:
     by_hand = {
         0x1: "base temperature",
         0x400: "TEC",
@@ -257,24 +241,24 @@ def test_fault_words_are_those_of_the_manual() -> None:
     }
     assert by_hand.items() <= FAULTS.items()
     model = ObisModel()
-    model.fault = 0x0010_0400
     with wire(model) as (_, surroundings), open_obis(surroundings) as laser:
-        assert laser.status.fault == "0x00100400 (TEC, over-power)"
-        model.fault = 0x4000_0000
-        assert laser.status.fault == "0x40000000 (unknown)"
+        for model.fault, name in FAULTS.items():
+            with pytest.raises(DeviceFault, match=name):
+                laser.arm(0.05)
+            assert not model.state_on
+        for model.fault, said in ((0x0010_0400, "0x00100400 (TEC, over-power)"), (0x4000_0000, "0x40000000 (unknown)")):
+            assert laser.status.fault == said
 
 
-@pytest.mark.parametrize(("base_c", "limit"), [(51.5, "51.5 C, outside 10 to 50 C"), (9.0, "9 C, outside 10 to 50 C")])
-def test_a_base_plate_outside_the_limits_that_the_laser_states_is_a_fault(base_c: float, limit: str) -> None:
+def test_a_base_plate_outside_the_limits_that_the_laser_states_is_a_fault() -> None:
     model = ObisModel()
     with wire(model) as (_, surroundings), open_obis(surroundings) as laser:
-        model.base_c = base_c
-        assert laser.status.fault == f"base plate at {limit}"
-        with pytest.raises(DeviceFault, match=limit):
+        for model.base_c, fault in ((51.5, "base plate at 51.5 C, outside 10 to 50 C"), (50.0, None)):
+            assert laser.status.fault == fault
+        model.base_c = 9.0
+        with pytest.raises(DeviceFault, match="base plate at 9 C, outside 10 to 50 C"):
             laser.arm(0.05)
         assert not model.state_on
-        model.base_c = 50.0
-        assert laser.status.fault is None
         model.base_c, model.fault = 60.0, 0x1
         assert laser.status.fault == "0x00000001 (base temperature); base plate at 60 C, outside 10 to 50 C"
 
@@ -304,13 +288,11 @@ def test_a_flipped_bit_in_a_temperature_ends_nothing() -> None:
 def test_the_guard_ends_the_light_of_a_laser_that_gets_too_warm() -> None:
     model = ObisModel(cdrh_delay_s=0.0)
     with SerialServer(model, baud=1_000_000) as server:  # the guard is a process of its own
-        config = ObisConfig.model_validate({"port": "emulated:laser", "max_power": "80 mW"})
-        with Guard(laser=config, ports={"laser": server.endpoint}) as guard:
+        config = ObisConfig.model_validate({"port": server.path, "max_power": "80 mW"})
+        with Guard(laser=config) as guard:
             guard.laser.arm(0.05)
-            assert model.emitting
             model.base_c = 55.0
             eventually(lambda: guard.failure is not None and not model.emitting)
-            assert isinstance(guard.failure, DeviceFault)
             assert "base plate at 55 C, outside 10 to 50 C" in str(guard.failure)
 
 
@@ -327,29 +309,21 @@ def test_an_open_interlock_and_a_key_that_is_off_refuse_to_arm() -> None:
         assert not model.state_on
 
 
-def test_disarm_leaves_the_least_power_and_pause_the_power_that_was_set() -> None:
-    model = ObisModel()
-    with wire(model) as (_, surroundings), open_obis(surroundings) as laser:
-        bring_up(laser, surroundings.clock)
-        laser.pause()
-        assert model.set_power_w == pytest.approx(0.05)
-        laser.disarm()
-        assert model.set_power_w == pytest.approx(0.002)
-
-
-def test_the_power_is_changed_without_switching_off() -> None:
+def test_the_power_is_changed_without_switching_off_and_left_at_the_least() -> None:
     model = ObisModel()
     with wire(model) as (_, surroundings), open_obis(surroundings) as laser:
         bring_up(laser, surroundings.clock)
         model.commands.clear()
         laser.arm(0.02)
         assert model.power_w == pytest.approx(0.02)
-        assert not any(command.startswith("SOUR:AM:STAT O") for command in model.commands)
+        assert sets(model) == ["SOUR:POW:LEV:IMM:AMPL 0.02000"]
+        laser.pause()
+        assert model.set_power_w == pytest.approx(0.02)
+        laser.disarm()
+        assert model.set_power_w == pytest.approx(0.002)
 
 
 def test_a_config_below_the_least_power_is_refused() -> None:
-    with wire(ObisModel()) as (_, surroundings), open_obis(surroundings) as laser:
-        assert laser.limits.min_power_w == pytest.approx(0.002)
     below = pytest.raises(LimitExceeded, match="1 mW is below the least it can give, 2 mW")
     with wire(ObisModel()) as (_, surroundings), below:
         open_obis(surroundings, max_power="1 mW")

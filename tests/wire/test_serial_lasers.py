@@ -9,7 +9,7 @@ from typing import Any
 import pytest
 from pydantic import ValidationError
 
-from drivers.errors import DeviceBusy, DeviceDisconnected, DeviceError, DeviceNotFound, DeviceTimeout, LimitExceeded
+from drivers.errors import DeviceBusy, DeviceDisconnected, DeviceNotFound, DeviceTimeout, LimitExceeded
 from drivers.interfaces import LineLaser
 from drivers.lasers import cobolt as cobolt_framing
 from drivers.lasers import obis as obis_framing
@@ -23,7 +23,6 @@ from rig.errors import DevicesError
 from sim_backend.wire.firmware.cobolt import CoboltModel
 from sim_backend.wire.firmware.obis import ObisModel
 from sim_backend.wire.serve.serial import SerialServer
-from sim_backend.wire.serve.wire_server import Fault, FaultScript
 from tests.wire.lasers import Babble, Silent, bring_up, eventually, now_s, open_cobolt, open_obis, wire
 
 
@@ -35,10 +34,6 @@ class Make:
     open: Callable[..., LineLaser]
     config: type[SerialLaserConfig]
     most_w: float
-
-    def set_power_w(self, model: Any) -> float:
-        """What it would shine with under its gate."""
-        return float(model.modulation_power_w if isinstance(model, CoboltModel) else model.set_power_w)
 
 
 MLD = Make(CoboltModel, open_cobolt, CoboltConfig, 0.1)
@@ -84,14 +79,6 @@ def test_a_port_where_none_of_the_make_answers_is_one_line_and_given_back(make: 
             with pytest.raises(DeviceNotFound, match="nothing on port emulated:laser") as refused:
                 make.open(surroundings)
             assert "\n" not in str(refused.value)
-
-
-def test_no_emulated_port_of_that_name() -> None:
-    with (
-        wire(CoboltModel()) as (_, surroundings),
-        pytest.raises(DeviceNotFound, match="choose one of: laser"),
-    ):
-        open_cobolt(surroundings, port="emulated:lesar")
 
 
 def test_the_application_pauses_a_laser_found_emitting_and_refuses_the_scan() -> None:
@@ -153,24 +140,6 @@ def test_a_firmware_that_hangs_is_a_timeout_within_its_deadline(make: Make) -> N
         laser.close()
 
 
-def test_a_pause_comes_through_beside_a_thread_that_polls() -> None:
-    model = ObisModel()
-    with wire(model) as (_, surroundings), open_obis(surroundings) as laser:
-        model.shine(0.05)
-        ending = threading.Event()
-
-        def poll() -> None:
-            while not ending.is_set():
-                _ = laser.status
-
-        thread = threading.Thread(target=poll)
-        thread.start()
-        laser.pause()
-        ending.set()
-        thread.join()
-        assert not model.emitting
-
-
 def test_the_line_goes_to_who_waits_before_who_had_it_last() -> None:
     lock, order = FairLock(), []
 
@@ -198,26 +167,6 @@ def test_emission_is_told_to_the_world_with_its_time(make: Make) -> None:
         laser.pause()
     assert [emits for emits, _ in told] == [True, False]
     assert 0 < told[0][1] < told[1][1]
-
-
-@each_make
-@pytest.mark.parametrize("fault", list(Fault))
-def test_one_fault_in_an_arm_ends_in_a_typed_error_or_as_told(fault: Fault, make: Make) -> None:
-    model = make.model()
-    with wire(model) as (server, surroundings):
-        laser = make.open(surroundings)
-        server.faults = FaultScript(*[None] * 9, fault, late_s=0.1, stall_s=0.2)
-        try:
-            laser.arm(0.05)
-        except DeviceError:
-            assert fault in (Fault.UNPLUG, Fault.HANG)
-        else:
-            assert model.gated
-            assert make.set_power_w(model) == pytest.approx(0.05)
-        assert server.faults.struck == [fault]
-        server.close()
-        with pytest.raises(DeviceDisconnected):
-            laser.close()
 
 
 def test_trap_a_tenth_of_a_second_was_too_little_for_a_reply() -> None:

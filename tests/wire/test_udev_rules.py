@@ -3,8 +3,6 @@
 import re
 from pathlib import Path
 
-import pytest
-
 from drivers.transports.endpoints import UDEV_RULES
 
 ROOT = Path(__file__).parents[2]
@@ -17,14 +15,11 @@ IDS = sorted(
 )
 
 
-def test_there_are_devices() -> None:
-    assert ("1209", "e500") in IDS
-
-
-@pytest.mark.parametrize(("vendor", "product"), IDS)
-def test_a_rule_names_the_device(vendor: str, product: str) -> None:
+def test_a_rule_names_each_device() -> None:
     rules = (ROOT / UDEV_RULES).read_text(encoding="utf-8")
-    assert f'ATTR{{idVendor}}=="{vendor}", ATTR{{idProduct}}=="{product}"' in rules
+    assert ("1209", "e500") in IDS
+    for vendor, product in IDS:
+        assert f'ATTR{{idVendor}}=="{vendor}", ATTR{{idProduct}}=="{product}"' in rules
 
 
 def test_it_says_how_to_install_it_in_one_line() -> None:

@@ -32,13 +32,26 @@ _SHORT = {
     "setpoint": "setp",
     "pause": "paus",
 }
-_MODE_NUMBER: dict[Mode, str] = {"constant current": "0", "constant power": "1", "modulation": "2"}
-_RUN_MODE_NAME: dict[Mode, str] = {
-    "constant current": "ConstantCurrent",
-    "constant power": "ConstantPower",
-    "modulation": "PowerModulation",
+_MODES: dict[Mode, tuple[str, str]] = {
+    "constant current": ("0", "ConstantCurrent"),
+    "constant power": ("1", "ConstantPower"),
+    "modulation": ("2", "PowerModulation"),
 }
-_RUN_MODES = {name.lower(): mode for mode, name in _RUN_MODE_NAME.items()}
+"""The modes as either family calls them."""
+_RUN_MODES = {name.lower(): mode for mode, (_, name) in _MODES.items()}
+_FLAGS: dict[Family, dict[str, str]] = {
+    "06-MLD": {"sdmes": "digital", "sames": "analog"},
+    "06-01": {"las:pm:dig:ena": "digital", "las:pm:ana:ena": "analog", "las:paus": "paused"},
+}
+_POWERS: dict[Family, dict[str, tuple[str, float]]] = {
+    "06-MLD": {"slmp": ("modulation_power_w", 1e-3), "p": ("constant_power_w", 1.0)},
+    "06-01": {
+        "las:pm:pow:setp": ("modulation_power_w", 1e-3),
+        "las:cp:pow:setp": ("constant_power_w", 1e-3),
+        "p": ("constant_power_w", 1.0),
+    },
+}
+"""Commands that set a flag, or a power in a unit of so many watts, and the model's attribute for it."""
 
 
 class CoboltModel:
@@ -176,70 +189,40 @@ class CoboltModel:
         return self.junk + text.encode("ascii") + b"\r\n"
 
     def _answer(self, command: str, now_s: float) -> str:
-        said = self._query(command)
+        name, _, value = command.partition(" ")
+        if self.family == "06-01":
+            name = re.sub("[a-z]+", lambda word: _SHORT.get(word[0], word[0]), name)
+        said = self._query(name)
         if said is not None:
             return said
-        name, _, value = command.partition(" ")
-        done = self._common(name, now_s)
-        if not done:
-            done = self._set_mld(name, value) if self.family == "06-MLD" else self._set_scpi(_short(name), value)
-        return "OK" if done else ILLEGAL
+        return "OK" if self._act(name, now_s) or self._set(name, value) else ILLEGAL
 
     def _query(self, command: str) -> str | None:
-        said = self._query_common(command)
-        if said is None:
-            said = self._query_mld(command) if self.family == "06-MLD" else self._query_scpi(_short(command))
-        return said
-
-    def _query_common(self, command: str) -> str | None:
-        match command:
-            case "?":
-                return "OK"
-            case "sn?":
-                return self.serial
-            case "gfv?" | "ver?":
-                return self.firmware
-            case "glm?" if "." in self.firmware:  # -04- types have no dot there, and do not know it
-                return self.model
-            case "hrs?":
-                return "123.45"
-            case "l?":
-                return "1" if self.on else "0"
-            case "@cobas?":
-                return "1" if self.autostart else "0"
-            case "@cobasks?":
-                return "1" if self.key_on else "0"
-            case "ilk?":
-                return "1" if self.interlock_open else "0"
-            case "f?":
-                return str(self.fault)
-            case "gmlp?":
-                return f"{self.max_power_w * 1e3:.1f}"
-            case "p?":
-                return f"{self.constant_power_w:.4f}"
-            case "pa?":
-                return f"{self.power_w:.4f}"
-            case "i?":
-                return f"{self.current_ma if self.on else 0.0:.1f}"
-        return None
-
-    def _query_mld(self, command: str) -> str | None:
-        match command:
-            case "gam?":
-                return _MODE_NUMBER[self.mode]
-            case "gdmes?":
-                return "1" if self.digital else "0"
-            case "games?":
-                return "1" if self.analog else "0"
-            case "glmp?":
-                return f"{self.modulation_power_w * 1e3:.4f}"
-            case "glp?":
-                return f"{self.constant_power_w * 1e3:.4f}"
-            case "glc?":
-                return f"{self.current_ma:.1f}"
-            case "gom?":
-                return self._operating_mode()
-        return None
+        """The answer to a question; None where the laser does not know it."""
+        answers = {
+            "?": "OK",
+            "sn?": self.serial,
+            "l?": _flag(self.on),
+            "@cobas?": _flag(self.autostart),
+            "@cobasks?": _flag(self.key_on),
+            "ilk?": _flag(self.interlock_open),
+            "f?": str(self.fault),
+            "gmlp?": f"{self.max_power_w * 1e3:.1f}",
+            "p?": f"{self.constant_power_w:.4f}",
+            "pa?": f"{self.power_w:.4f}",
+        }
+        if "." in self.firmware:  # -04- types have no dot there, and do not know it
+            answers["glm?"] = self.model
+        number, name = _MODES[self.mode]
+        modulation = f"{self.modulation_power_w * 1e3:.4f}"
+        if self.family == "06-MLD":
+            answers |= {"gam?": number, "gdmes?": _flag(self.digital), "games?": _flag(self.analog)}
+            answers |= {"glmp?": modulation, "gom?": self._operating_mode()}
+        else:
+            answers |= {"las:runm?": name, "las:pm:dig:ena?": _flag(self.digital), "state?": self._state()}
+            answers |= {"las:pm:ana:ena?": _flag(self.analog), "las:pm:pow:setp?": modulation}
+            answers["las:cp:pow:setp?"] = f"{self.constant_power_w * 1e3:.4f}"
+        return answers.get(command)
 
     def _operating_mode(self) -> str:
         if self.fault:
@@ -250,30 +233,12 @@ class CoboltModel:
             return "0"
         return "4" if self.mode == "modulation" else "2"
 
-    def _query_scpi(self, command: str) -> str | None:
-        match command:
-            case "state?":
-                return self._state()
-            case "las:runm?":
-                return _RUN_MODE_NAME[self.mode]
-            case "las:pm:dig:ena?":
-                return "1" if self.digital else "0"
-            case "las:pm:ana:ena?":
-                return "1" if self.analog else "0"
-            case "las:pm:pow:setp?":
-                return f"{self.modulation_power_w * 1e3:.4f}"
-            case "las:cp:pow:setp?":
-                return f"{self.constant_power_w * 1e3:.4f}"
-            case "las:pow?":
-                return f"{self.power_w * 1e3:.4f}"
-        return None
-
     def _state(self) -> str:
         if self.waiting_for_key:
             return "AutostartWaitingForKeyOn"
         return "AutostartLaserOn" if self.on else "AutostartStandby"
 
-    def _common(self, name: str, now_s: float) -> bool:
+    def _act(self, name: str, now_s: float) -> bool:
         match name:
             case "l0":
                 self._stop()
@@ -288,56 +253,26 @@ class CoboltModel:
             case "@cob0":
                 self.waiting_for_key = False
                 self._ready_at_s = None
-            case "cf":
-                self.fault = 3 if self.interlock_open else 0
             case _:
                 return False
         return True
 
-    def _set_mld(self, name: str, value: str) -> bool:
-        match name:
-            case "em":
-                self.mode = "modulation"
-            case "cp":
-                self.mode = "constant power"
-            case "ci":
-                self.mode = "constant current"
-            case "sdmes" if value in "01":
-                self.digital = value == "1"
-            case "sames" if value in "01":
-                self.analog = value == "1"
-            case "slmp" if (power_w := self._power(value, 1e-3)) is not None:
-                self.modulation_power_w = power_w
-            case "slp" if (power_w := self._power(value, 1e-3)) is not None:
-                self.constant_power_w = power_w
-            case "p" if (power_w := self._power(value, 1.0)) is not None:
-                self.constant_power_w = power_w
-            case "slc":
-                self.current_ma = float(value)
-            case _:
+    def _set(self, name: str, value: str) -> bool:
+        flag, (power, unit_w) = _FLAGS[self.family].get(name), _POWERS[self.family].get(name, ("", 1.0))
+        if flag and value in ("0", "1"):
+            setattr(self, flag, value == "1")
+        elif power and (power_w := self._power(value, unit_w)) is not None:
+            setattr(self, power, power_w)
+        elif self.family == "06-MLD":
+            if name != "em":
                 return False
-        return True
-
-    def _set_scpi(self, name: str, value: str) -> bool:
-        match name:
-            case "las:runm" if value in _RUN_MODES:
-                self.mode = _RUN_MODES[value]
-            case "las:pm:dig:ena" if value in "01":
-                self.digital = value == "1"
-            case "las:pm:ana:ena" if value in "01":
-                self.analog = value == "1"
-            case "las:pm:dig:modulator" if value in ("external", "command"):
-                self.modulator = value
-            case "las:pm:pow:setp" if (power_w := self._power(value, 1e-3)) is not None:
-                self.modulation_power_w = power_w
-            case "las:cp:pow:setp" if (power_w := self._power(value, 1e-3)) is not None:
-                self.constant_power_w = power_w
-            case "p" if (power_w := self._power(value, 1.0)) is not None:
-                self.constant_power_w = power_w
-            case "las:paus" if value in "01":
-                self.paused = value == "1"
-            case _:
-                return False
+            self.mode = "modulation"
+        elif name == "las:runm" and value in _RUN_MODES:
+            self.mode = _RUN_MODES[value]
+        elif name == "las:pm:dig:modulator" and value in ("external", "command"):
+            self.modulator = value
+        else:
+            return False
         return True
 
     def _power(self, value: str, unit_w: float) -> float | None:
@@ -360,8 +295,5 @@ class CoboltModel:
                 self.on_emission(self.emitting, now_s)
 
 
-def _short(command: str) -> str:
-    """A command in its short form."""
-    asks = command.endswith("?")
-    words = command.removesuffix("?").split(":")
-    return ":".join(_SHORT.get(word, word) for word in words) + "?" * asks
+def _flag(value: bool) -> str:
+    return "1" if value else "0"

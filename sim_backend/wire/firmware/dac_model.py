@@ -5,7 +5,8 @@ An emulated world and tests look at that record.
 
 import threading
 from collections import deque
-from dataclasses import dataclass
+from collections.abc import Iterator
+from dataclasses import dataclass, replace
 
 import numpy as np
 from numpy.typing import NDArray
@@ -59,8 +60,7 @@ class DacHistory:
             while self._played and self._played[-1].start_s >= time_s:
                 self._played.pop()
             if self._played and self._played[-1].end_s > time_s:
-                last = self._played.pop()
-                self._played.append(Played(last.start_s, time_s, last.period_s, last.command, last.levels))
+                self._played[-1] = replace(self._played[-1], end_s=time_s)
             while len(self._rests) > 1 and self._rests[-1][0] >= time_s:
                 self._rests.pop()
             self._rests.append((time_s, here if command is None else command))
@@ -68,21 +68,18 @@ class DacHistory:
     def command(self, time_s: Array) -> Array:
         """Normalised drive at the times: the DAC's stairs, no mirror lag."""
         with self._lock:
-            starts = np.array([start for start, _ in self._rests])
-            values = np.array([value for _, value in self._rests])
-            result = values[np.maximum(np.searchsorted(starts, time_s, side="right") - 1, 0)]
-            for one in self._between(time_s.min(initial=np.inf), time_s.max(initial=-np.inf)):
-                inside = (time_s >= one.start_s) & (time_s < one.end_s)
-                result[inside] = one.command[_index(one, time_s[inside])]
+            starts, values = np.array(self._rests).T
+            result: Array = values[np.maximum(np.searchsorted(starts, time_s, side="right") - 1, 0)]
+            for one, inside, at in self._at(time_s):
+                result[inside] = one.command[at]
             return result
 
     def level(self, line: int, time_s: Array) -> NDArray[np.uint8]:
         """An output's level at the times; 0 where nothing is played."""
         result = np.zeros(time_s.shape, np.uint8)
         with self._lock:
-            for one in self._between(time_s.min(initial=np.inf), time_s.max(initial=-np.inf)):
-                inside = (time_s >= one.start_s) & (time_s < one.end_s)
-                result[inside] = one.levels[_index(one, time_s[inside]), line]
+            for one, inside, at in self._at(time_s):
+                result[inside] = one.levels[at, line]
         return result
 
     def rising(self, line: int, from_s: float, until_s: float) -> Array:
@@ -99,28 +96,21 @@ class DacHistory:
                 high_until = one.end_s if high[-1] else -np.inf
         return np.concatenate(edges) if edges else np.empty(0)
 
+    def _at(self, time_s: Array) -> Iterator[tuple[Played, NDArray[np.bool_], NDArray[np.int64]]]:
+        """All that was played at the times: at which of them, and its points then."""
+        for one in self._between(time_s.min(initial=np.inf), time_s.max(initial=-np.inf)):
+            inside = (time_s >= one.start_s) & (time_s < one.end_s)
+            at = np.floor((time_s[inside] - one.start_s) / one.period_s + 1e-9).astype(np.int64)
+            yield one, inside, np.clip(at, 0, len(one.command) - 1)
+
     def _between(self, from_s: float, until_s: float) -> list[Played]:
         """The points that were played in [from_s, until_s], ascending."""
         return [one for one in self._played if one.end_s > from_s and one.start_s <= until_s]
 
-    def playing(self, time_s: float) -> bool:
-        """Whether points are being played at that time."""
-        with self._lock:
-            return any(one.start_s <= time_s < one.end_s for one in self._played)
-
-
-def _index(one: Played, time_s: Array) -> NDArray[np.int64]:
-    at = np.floor((time_s - one.start_s) / one.period_s + 1e-9).astype(np.int64)
-    return np.clip(at, 0, len(one.command) - 1)
-
 
 DAC_STEPS = 4095
-CENTRE = 0x800
-
-
-def normal(value: int) -> float:
-    """The normalised drive of a value of the DAC."""
-    return value / DAC_STEPS * 2 - 1
+CENTRE = 0x800 / DAC_STEPS * 2 - 1
+"""Normalised drive without power."""
 
 
 class DacModel(UsbModel):
@@ -129,7 +119,7 @@ class DacModel(UsbModel):
     def __init__(self, spec: DeviceSpec, *, commands: int, replies: int, points: int) -> None:
         """commands, replies, points: its endpoints."""
         self.spec = spec
-        self.history = DacHistory(normal(CENTRE), lines=4)
+        self.history = DacHistory(CENTRE, lines=4)
         self.deaf = False
         """Test knob: whether the firmware hangs, while its outputs play on."""
         self.points_endpoint = points
@@ -160,7 +150,7 @@ class DacModel(UsbModel):
         """Let the outputs fall to 0 V without power, which is the centre."""
         self.advance(now_s)
         self._halt(now_s)
-        self.history.cut(now_s, normal(CENTRE))
+        self.history.cut(now_s, CENTRE)
 
     def moving(self, now_s: float) -> bool:
         """Whether points are being played."""

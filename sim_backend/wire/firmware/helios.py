@@ -11,7 +11,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from sim_backend.wire.firmware.dac_model import CENTRE, DAC_STEPS, Array, DacModel, Played, normal
+from sim_backend.wire.firmware.dac_model import CENTRE, DAC_STEPS, Array, DacModel, Played
 from sim_backend.wire.serve.usb_model import AlternateSpec, DeviceSpec, EndpointSpec
 
 SYSTICK_HZ = 112_000_000
@@ -86,7 +86,7 @@ class HeliosModel(DacModel):
         self.advance(now_s)
         self._halt(now_s)
         if alternate != 1:
-            self.history.cut(now_s, normal(CENTRE))
+            self.history.cut(now_s, CENTRE)
         self._armed = alternate == 1
 
     def advance(self, now_s: float) -> None:
@@ -110,7 +110,7 @@ class HeliosModel(DacModel):
             case 0x01:
                 self._halt(now_s)
                 self._dead_until_s = now_s + STOP_DEAD_S
-                self.history.cut(self._dead_until_s, normal(CENTRE))
+                self.history.cut(self._dead_until_s, CENTRE)
             case 0x02:
                 self.shutter = bool(data[1])
             case 0x03:

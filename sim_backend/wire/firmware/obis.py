@@ -13,8 +13,10 @@ OFF_BITS = 0xC800_0000
 """Bits of every sample status in docs/reference/hardware.md."""
 _COMMAND = re.compile(r"[^\r\n]+[\r\n]+")
 _ADDRESS = re.compile(r"^(SYST|SOUR)(\d*)(?=:)")
-FORBIDDEN = ("SYST:CDRH OFF",)
-"""Commands that bypass a safeguard: a driver that sends one of them has failed its test."""
+FORBIDDEN = "SYST:CDRH OFF"
+"""The command that bypasses a safeguard: a driver that sends it has failed its test."""
+_SWITCHES = {"SYST:CDRH": "cdrh", "SYST:AUT": "autostart", "SOUR:TEMP:APR": "tec"}
+"""Commands that switch one of the model's attributes."""
 
 
 class ObisModel:
@@ -65,7 +67,7 @@ class ObisModel:
 
     @property
     def warm(self) -> bool:
-        """End the warm-up."""
+        """Whether the warm-up is over."""
         return self._warm_at_s is not None and self._now_s >= self._warm_at_s
 
     @property
@@ -127,14 +129,14 @@ class ObisModel:
         self.commands.append(command)
         address = _ADDRESS.match(command)
         bare = _ADDRESS.sub(r"\1", command)
-        if bare in FORBIDDEN:
+        if bare == FORBIDDEN:
             self.forbidden.append(bare)
         for_laser = self.channel is None or (address is not None and address[2] == str(self.channel))
-        said = self._query(bare, for_laser) if command.endswith("?") else None
-        if said is not None:
-            return f"{said}\r\n" + ("OK\r\n" if self.handshake else "")
         if command.endswith("?"):
-            return "ERR-100\r\n"
+            said = self._query(bare, for_laser)
+            if said is None:
+                return "ERR-100\r\n"
+            return f"{said}\r\n" + ("OK\r\n" if self.handshake else "")
         error = self._set(bare) if for_laser else -100
         if not self.handshake:
             return ""
@@ -148,84 +150,62 @@ class ObisModel:
         return self._query_laser(command) if for_laser else None
 
     def _query_laser(self, command: str) -> str | None:
-        match command:
-            case "SYST:INF:MOD?":
-                return "OBIS 488nm 100mW"
-            case "SYST:INF:SNUM?":
-                return self.serial
-            case "SYST:INF:FVER?":
-                return "V1.8.2"
-            case "SYST:STAT?":
-                return f"{self._bits():08X}"
-            case "SYST:FAUL?":
-                return f"{self.fault:08X}"
-            case "SYST:LOCK?":
-                return "OFF" if self.interlock_open else "ON"
-            case "SYST:CDRH?":
-                return _switch(self.cdrh)
-            case "SYST:AUT?":
-                return _switch(self.autostart)
-            case "SOUR:AM:STAT?":
-                return _switch(self.state_on)
-            case "SOUR:AM:SOUR?":
-                return self.mode
-            case "SOUR:POW:LEV:IMM:AMPL?":
-                return f"{self.set_power_w:.5f}"
-            case "SOUR:POW:LEV?":
-                return f"{self.power_w:.5f}"
-            case "SOUR:POW:LIM:LOW?":
-                return f"{self.least_power_w:.5f}"
-            case "SOUR:POW:LIM:HIGH?":
-                return f"{self.max_power_w:.5f}"
-            case "SOUR:POW:NOM?":
-                return f"{self.max_power_w / 1.1:.5f}"
-            case "SOUR:TEMP:APR?":
-                return _switch(self.tec)
-            case "SOUR:TEMP:BAS?":
-                return f"{self.base_c:.1f}C"
-            case "SOUR:TEMP:PROT:BAS:LOW?" if self.base_range_c is not None:
-                return f"{self.base_range_c[0]:.1f}C"
-            case "SOUR:TEMP:PROT:BAS:HIGH?" if self.base_range_c is not None:
-                return f"{self.base_range_c[1]:.1f}C"
-        return None
+        answers = {
+            "SYST:INF:MOD?": "OBIS 488nm 100mW",
+            "SYST:INF:SNUM?": self.serial,
+            "SYST:STAT?": f"{self._bits():08X}",
+            "SYST:FAUL?": f"{self.fault:08X}",
+            "SYST:LOCK?": _switch(not self.interlock_open),
+            "SYST:CDRH?": _switch(self.cdrh),
+            "SYST:AUT?": _switch(self.autostart),
+            "SOUR:AM:STAT?": _switch(self.state_on),
+            "SOUR:AM:SOUR?": self.mode,
+            "SOUR:POW:LEV:IMM:AMPL?": f"{self.set_power_w:.5f}",
+            "SOUR:POW:LEV?": f"{self.power_w:.5f}",
+            "SOUR:POW:LIM:LOW?": f"{self.least_power_w:.5f}",
+            "SOUR:POW:LIM:HIGH?": f"{self.max_power_w:.5f}",
+            "SOUR:TEMP:APR?": _switch(self.tec),
+            "SOUR:TEMP:BAS?": f"{self.base_c:.1f}C",
+        }
+        if self.base_range_c is not None:
+            answers["SOUR:TEMP:PROT:BAS:LOW?"] = f"{self.base_range_c[0]:.1f}C"
+            answers["SOUR:TEMP:PROT:BAS:HIGH?"] = f"{self.base_range_c[1]:.1f}C"
+        return answers.get(command)
 
     def _bits(self) -> int:
-        bits = OFF_BITS
-        bits |= 0x1 if self.fault else 0
-        bits |= 0x2 if self.emitting else 0
-        bits |= 0x4 if self.warm and self.able and not self.state_on else 0
-        bits |= 0x8 if not self.able else 0
-        bits |= 0x10 if self.state_on and self._lit_at_s is not None and not self.emitting and self.able else 0
-        bits |= 0x100 if not self.warm else 0
-        bits |= 0x400 if self.mode == "DIGITAL" else 0
-        bits |= 0x0200_0000 if not self.key_on else 0
-        bits |= 0x0400_0000 if self.interlock_open else 0
-        return bits
+        delayed = self.state_on and self._lit_at_s is not None and not self.emitting and self.able
+        bits = {
+            0x1: self.fault,
+            0x2: self.emitting,
+            0x4: self.warm and self.able and not self.state_on,
+            0x8: not self.able,
+            0x10: delayed,
+            0x100: not self.warm,
+            0x400: self.gated,
+            0x0200_0000: not self.key_on,
+            0x0400_0000: self.interlock_open,
+        }
+        return OFF_BITS | sum(bit for bit, is_set in bits.items() if is_set)
 
     def _set(self, command: str) -> int:
         """Error number, 0 for none."""
         name, _, value = command.partition(" ")
         if not value:
             return -109
-        match name:
-            case "SOUR:AM:STAT" if value in ("ON", "OFF"):
-                if value == "ON" and not self.able:
-                    return -200
-                self._switch(value == "ON")
-            case "SOUR:AM:EXT" if value in ("DIG", "ANAL", "MIX"):
-                return self._change_mode({"DIG": "DIGITAL", "ANAL": "ANALOG", "MIX": "MIXED"}[value])
-            case "SOUR:AM:INT" if value in ("CWP", "CWC"):
-                return self._change_mode(value)
-            case "SOUR:POW:LEV:IMM:AMPL":
-                return self._change_power(value)
-            case "SYST:CDRH" if value in ("ON", "OFF"):
-                self.cdrh = value == "ON"
-            case "SYST:AUT" if value in ("ON", "OFF"):
-                self.autostart = value == "ON"
-            case "SOUR:TEMP:APR" if value in ("ON", "OFF"):
-                self.tec = value == "ON"
-            case _:
-                return -100
+        if name == "SOUR:POW:LEV:IMM:AMPL":
+            return self._change_power(value)
+        if (name, value) == ("SOUR:AM:EXT", "DIG"):
+            return self._change_mode("DIGITAL")
+        if value not in ("ON", "OFF"):
+            return -100
+        if name == "SOUR:AM:STAT":
+            if value == "ON" and not self.able:
+                return -200
+            self._switch(value == "ON")
+        elif name in _SWITCHES:
+            setattr(self, _SWITCHES[name], value == "ON")
+        else:
+            return -100
         return 0
 
     def _switch(self, on: bool) -> None:

@@ -25,6 +25,8 @@ LINE_BYTES = 256
 """Size of the firmware's line buffer."""
 CLOCK_LIMIT_HZ = {1: 133_000_000, 2: 150_000_000}
 BANNER = b"Prawn Digital Output online\r\n"
+_WHEN_IDLE = ("gto", "len", "adm", "clk", "frq", "add", "cls", "man", "run", "swr")
+"""Commands that are refused while a program runs."""
 
 Trigger = Callable[[float, float], float | None]
 """The first time in [from, until) at which the trigger input is high; None: it stays low."""
@@ -36,14 +38,9 @@ class TriggerLine:
     def __init__(self) -> None:
         self._edges: list[tuple[float, bool]] = []
 
-    def set(self, high: bool, at_s: float) -> None:
-        """Switch the line at a time not before the last one."""
-        self._edges.append((at_s, high))
-
     def pulse(self, at_s: float, width_s: float) -> None:
-        """Hold the line high for `width_s` from `at_s` on."""
-        self.set(True, at_s)
-        self.set(False, at_s + width_s)
+        """Hold the line high for `width_s` from `at_s` on, which is not before the last pulse."""
+        self._edges += [(at_s, True), (at_s + width_s, False)]
 
     def __call__(self, from_s: float, until_s: float) -> float | None:
         """First time in [from_s, until_s) at which the line is high; None: it is low until then."""
@@ -225,71 +222,57 @@ class PrawnDoModel:
         line = line.partition("\0")[0]  # a C string
         if self._adding:
             return self._add(line)
-        name = line[:3]
-        if len(line) < 3:
-            return _said(f"Invalid command: {line}")
-        if name in _ANY_TIME:
-            return _ANY_TIME[name](self, now_s)
-        if self.status not in (STOPPED, ABORTED):
-            return _said(f"Cannot execute command {line} during buffered execution.")
-        if name in _WHEN_IDLE:
-            return _WHEN_IDLE[name](self, line, now_s)
+        match line[:3]:
+            case "ver":
+                return _said(f"Version: {self._version}")
+            case "brd":
+                return _said(f"board: pico{self._board}")
+            case "sts":
+                return _said(f"run-status:{self.status} clock-status:{int(self.clock_external)}")
+            case "abt":
+                return self._abort()
+            case name if name in _WHEN_IDLE and self.status in (STOPPED, ABORTED):
+                return self._idle_answer(name, line, now_s)
+            case name if len(name) == 3 and self.status not in (STOPPED, ABORTED):
+                return _said(f"Cannot execute command {line} during buffered execution.")
         return _said(f"Invalid command: {line}")
 
-    def _version_line(self, now_s: float) -> bytes:
-        return _said(f"Version: {self._version}")
-
-    def _board_line(self, now_s: float) -> bytes:
-        return _said(f"board: pico{self._board}")
-
-    def _status_line(self, now_s: float) -> bytes:
-        return _said(f"run-status:{self.status} clock-status:{int(self.clock_external)}")
-
-    def _debug(self, now_s: float) -> bytes:
+    def _idle_answer(self, name: str, line: str, now_s: float) -> bytes:
+        match name:
+            case "gto":
+                return _said(f"{self.outputs_at(now_s):x}")
+            case "len":
+                n = len(self.words)
+                return _said(f"Number of command lines: {2 * n}", f"Number of instructions: {n}")
+            case "adm":
+                return self._add_many(line)
+            case "clk":
+                return self._clock(line)
+            case "frq":
+                return self._frequencies()
+            case "add":
+                self._adding = True
+                return b""
+            case "cls":
+                self.words.clear()
+            case "man":
+                numbers = _numbers(line, 16, 1)
+                if numbers is None:
+                    return _said("invalid request")
+                self._set_outputs(numbers[0] & 0xFFFF, now_s)
+            case "run" | "swr":  # started by hardware, it waits for a trigger before the first word
+                self.status = STARTING
+                self._run = _Run(-1, now_s)
+                if name == "swr":
+                    self._enter(0, now_s)
         return _said("ok")
 
-    def _abort(self, now_s: float) -> bytes:
+    def _abort(self) -> bytes:
         if self.status not in (STARTING, RUNNING):
             return _said("Can only abort when status is 1 or 2")
         self._run = None  # the outputs stay as they are
         self.status = ABORT_REQUESTED
         return _said("ok")
-
-    def _clear(self, line: str, now_s: float) -> bytes:
-        self.words.clear()
-        return _said("ok")
-
-    def _hardware_start(self, line: str, now_s: float) -> bytes:
-        self.status = STARTING
-        self._run = _Run(-1, now_s)
-        return _said("ok")
-
-    def _software_start(self, line: str, now_s: float) -> bytes:
-        self.status = STARTING
-        self._run = _Run(-1, now_s)
-        self._enter(0, now_s)
-        return _said("ok")
-
-    def _manual(self, line: str, now_s: float) -> bytes:
-        (level,) = _numbers(line, 16, 1) or (None,)
-        if level is None:
-            return _said("invalid request")
-        self._set_outputs(level & 0xFFFF, now_s)
-        return _said("ok")
-
-    def _pins(self, line: str, now_s: float) -> bytes:
-        return _said(f"{self.outputs_at(now_s):x}")
-
-    def _length(self, line: str, now_s: float) -> bytes:
-        return _said(f"Number of command lines: {2 * len(self.words)}", f"Number of instructions: {len(self.words)}")
-
-    def _dump(self, line: str, now_s: float) -> bytes:
-        lines = ((f"do_cmd: {word:04x}", f"\treps: {cycles:x}" if cycles else "\tWait") for word, cycles in self.words)
-        return b"".join(_said(*pair) for pair in lines)
-
-    def _start_adding(self, line: str, now_s: float) -> bytes:
-        self._adding = True
-        return b""
 
     def _add(self, line: str) -> bytes:
         if line.startswith("end"):
@@ -301,12 +284,12 @@ class PrawnDoModel:
         word, cycles = numbers
         if word > 0xFFFF or 0 < cycles < MIN_CYCLES:
             self._adding = False
-            what = f"Invalid output specification {word:x}" if word > 0xFFFF else _short(cycles)
-            return _said(what)
+            short = f"Reps must be 0 or greater than 4, got {cycles:x}"
+            return _said(f"Invalid output specification {word:x}" if word > 0xFFFF else short)
         self.words.append((word, cycles))
         return b""
 
-    def _add_many(self, line: str, now_s: float) -> bytes:
+    def _add_many(self, line: str) -> bytes:
         numbers = _numbers(line, 16, 2)
         if numbers is None:
             return _said("Invalid request")
@@ -335,7 +318,7 @@ class PrawnDoModel:
             "Setting reps to zero for these instructions."
         )
 
-    def _clock(self, line: str, now_s: float) -> bytes:
+    def _clock(self, line: str) -> bytes:
         numbers = _numbers(line, 10, 2)
         if numbers is None:
             return _said("invalid clock request")
@@ -355,42 +338,15 @@ class PrawnDoModel:
         self.clock_hz = INTERNAL_HZ
         self._unasked += _said("System Clock Resus'd")
 
-    def _frequencies(self, line: str, now_s: float) -> bytes:
+    def _frequencies(self) -> bytes:
         sys_khz = (self.external_clock_hz or 0) // 1000 if self.clock_external else self.clock_hz // 1000
         names = ("pll_sys", "pll_usb", "rosc", "clk_sys", "clk_peri", "clk_usb", "clk_adc", "clk_rtc")
         khz = (100_000, 48_000, 5_000, sys_khz, 48_000, 48_000, 48_000, 46)
         return _said(*(f"{name} = {value}kHz" for name, value in zip(names, khz, strict=True)))
 
 
-_ANY_TIME: dict[str, Callable[[PrawnDoModel, float], bytes]] = {
-    "ver": PrawnDoModel._version_line,
-    "brd": PrawnDoModel._board_line,
-    "sts": PrawnDoModel._status_line,
-    "deb": PrawnDoModel._debug,
-    "ndb": PrawnDoModel._debug,
-    "abt": PrawnDoModel._abort,
-}
-_WHEN_IDLE: dict[str, Callable[[PrawnDoModel, str, float], bytes]] = {
-    "cls": PrawnDoModel._clear,
-    "run": PrawnDoModel._hardware_start,
-    "swr": PrawnDoModel._software_start,
-    "man": PrawnDoModel._manual,
-    "gto": PrawnDoModel._pins,
-    "len": PrawnDoModel._length,
-    "dmp": PrawnDoModel._dump,
-    "add": PrawnDoModel._start_adding,
-    "adm": PrawnDoModel._add_many,
-    "clk": PrawnDoModel._clock,
-    "frq": PrawnDoModel._frequencies,
-}
-
-
 def _said(*lines: str) -> bytes:
     return "".join(f"{line}\r\n" for line in lines).encode("latin-1")
-
-
-def _short(cycles: int) -> str:
-    return f"Reps must be 0 or greater than 4, got {cycles:x}"
 
 
 def _numbers(line: str, base: int, count: int) -> tuple[int, ...] | None:

@@ -26,10 +26,8 @@ BITS_PER_CHARACTER = 10
 """8N1: a start bit, eight data bits, a stop bit."""
 MOST_UNHEARD_BYTES = 4096
 """Bytes that a port keeps for a device that hangs, as a pseudo terminal does."""
-PORT_WRITE_S = 1.0
-"""Time after which an emulated port gives up a write."""
-PORT_SLICE_S = 0.02
-"""Longest wait of one read of an emulated port."""
+_WRITE_S, _SLICE_S = 1.0, 0.02
+"""Time after which an emulated port gives up a write, and longest wait of one read."""
 _TURN_S = 0.001
 """One turn of the serving thread while bytes are on their way."""
 _IDLE_S = 0.01
@@ -41,17 +39,24 @@ class SerialModel(Protocol):
 
     def receive(self, data: bytes, now_s: float) -> bytes:
         """Take bytes from the host, in pieces of any size; returns what the device answers."""
-        ...
 
     def tick(self, now_s: float) -> bytes:
         """Let time pass; returns what the device sends unasked."""
-        ...
 
 
 class _SerialLine(Wire[SerialModel]):
     """The line itself, wherever it leads: it takes what came, lets the model answer and sends what is due."""
 
-    _characters_per_s: float
+    def __init__(
+        self,
+        model: SerialModel,
+        *,
+        clock: Clock | None = None,
+        baud: int = 115_200,
+        faults: FaultSchedule | None = None,
+    ) -> None:
+        super().__init__(model, clock, faults)
+        self._characters_per_s = baud / BITS_PER_CHARACTER
 
     def _turn(self) -> None:
         """Take what came, let the model answer, send what is due."""
@@ -89,29 +94,14 @@ class _SerialLine(Wire[SerialModel]):
 class SerialWire(_SerialLine):
     """A serial device within this process, whose ports wait on the clock of its model, where time may be virtual."""
 
-    def __init__(
-        self,
-        model: SerialModel,
-        *,
-        clock: Clock | None = None,
-        baud: int = 115_200,
-        faults: FaultSchedule | None = None,
-    ) -> None:
-        super().__init__(model, clock, faults)
-        self._characters_per_s = baud / BITS_PER_CHARACTER
-        self._plugged = False
-        self._port: EmulatedPort | None = None
-        self._from_host = bytearray()
-
-    @property
-    def path(self) -> str:
-        """Name of the port in messages."""
-        return f"/dev/emulated-{id(self):x}"
+    _plugged = False
+    _port: "EmulatedPort | None" = None
+    _from_host = b""
 
     @property
     def endpoint(self) -> Endpoint:
-        """The endpoint that opens such ports."""
-        return Endpoint(self.path, serial_port=self._open)
+        """The endpoint that opens such ports; its address is for messages."""
+        return Endpoint(f"/dev/emulated-{id(self):x}", serial_port=self._open)
 
     def plug(self) -> None:
         """Put the cable in."""
@@ -122,7 +112,7 @@ class SerialWire(_SerialLine):
         with self.lock:
             self._plugged = False
             self._outbox.clear()
-            self._from_host.clear()
+            self._from_host = b""
             if self._port is not None:
                 self._port.hang_up()
                 self._port = None
@@ -130,9 +120,9 @@ class SerialWire(_SerialLine):
     def _open(self) -> "EmulatedPort":
         with self.lock:
             if not self._plugged:
-                raise serial.SerialException(errno.ENOENT, f"could not open port {self.path}")
+                raise serial.SerialException(errno.ENOENT, "no such port")
             if self._port is not None:
-                raise serial.SerialException(errno.EBUSY, f"could not lock port {self.path}")
+                raise serial.SerialException(errno.EBUSY, "port is locked")
             self._port = EmulatedPort(self, self._clock)
             return self._port
 
@@ -142,7 +132,7 @@ class SerialWire(_SerialLine):
             if self._port is not port:
                 raise serial.SerialException(errno.EIO, "the cable was pulled or the port closed")
             if self._hung and data and len(self._from_host) + len(data) > MOST_UNHEARD_BYTES:
-                self._clock.sleep(PORT_WRITE_S)
+                self._clock.sleep(_WRITE_S)
                 raise serial.SerialTimeoutException("write timeout")
             self._from_host += data
             if not self._hung:
@@ -156,8 +146,7 @@ class SerialWire(_SerialLine):
                 self._outbox.clear()
 
     def _take(self) -> bytes:
-        data = bytes(self._from_host)
-        self._from_host.clear()
+        data, self._from_host = self._from_host, b""
         return data
 
     def _send(self, data: bytes) -> int:
@@ -174,7 +163,6 @@ class EmulatedPort:
         self.received = bytearray()
         """Bytes that came and were not read yet."""
         self._wire = wire
-        self._hung_up = False
         self._end, self._far_end = os.pipe()
 
     @property
@@ -185,7 +173,7 @@ class EmulatedPort:
 
     def read(self, size: int) -> bytes:
         """At most `size` bytes; none after one slice of waiting."""
-        ends_ns = self.clock.now_ns() + round(PORT_SLICE_S * NS_PER_S)
+        ends_ns = self.clock.now_ns() + round(_SLICE_S * NS_PER_S)
         while not self.in_waiting and self.clock.now_ns() < ends_ns:
             self.clock.sleep(_TURN_S)
         with self._wire.lock:
@@ -202,10 +190,10 @@ class EmulatedPort:
         return self._end
 
     def hang_up(self) -> None:
-        """Act as a port whose cable is pulled."""
-        if not self._hung_up:
-            self._hung_up = True
+        """Act as a port whose cable is pulled; again: nothing happens."""
+        if self._far_end >= 0:
             os.close(self._far_end)
+            self._far_end = -1
 
     def close(self) -> None:
         """Give the port back; again: nothing happens."""
@@ -227,8 +215,7 @@ class SerialServer(_SerialLine, WireServer[SerialModel]):
         baud: int = 115_200,
         faults: FaultSchedule | None = None,
     ) -> None:
-        super().__init__(model, clock, faults)
-        self._characters_per_s = baud / BITS_PER_CHARACTER
+        super().__init__(model, clock=clock, baud=baud, faults=faults)
         self._folder = tempfile.TemporaryDirectory(prefix="spadrig-tty-")
         self._master: int | None = None
         self._slave: int | None = None
@@ -284,14 +271,10 @@ class SerialServer(_SerialLine, WireServer[SerialModel]):
                 if master is not None:
                     self._turn()
                 wait_s = _TURN_S if self._outbox else _IDLE_S
-            if master is None:
-                self._rest()
+            if master is None:  # it hangs or is not plugged in: what comes stays where it is
+                self._ending.wait(_IDLE_S)
             else:
                 self._await_input(master, wait_s)
-
-    def _rest(self) -> None:
-        """One turn of a device that hangs or is not plugged in: what comes stays where it is."""
-        self._ending.wait(_IDLE_S)
 
     def _await_input(self, master: int, wait_s: float) -> None:
         with self._waiting:

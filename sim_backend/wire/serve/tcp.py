@@ -25,19 +25,15 @@ class TcpModel(Protocol):
 
     def connected(self, now_s: float) -> None:
         """A client connected."""
-        ...
 
     def receive(self, data: bytes, now_s: float) -> None:
         """Take bytes from the client, in pieces of any size."""
-        ...
 
     def send(self, limit: int, now_s: float) -> bytes:
         """The next bytes for the client, at most `limit`; b"" where there are none yet."""
-        ...
 
     def disconnected(self, now_s: float) -> None:
         """The client is gone."""
-        ...
 
 
 class TcpServer(WireServer[TcpModel]):

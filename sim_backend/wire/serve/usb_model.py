@@ -8,10 +8,13 @@ thread and never waits. `AttachedDevice` puts the bus around it: claims, setting
 import errno
 import struct
 import threading
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
 from dataclasses import dataclass
 from enum import Enum
-from typing import Final, Literal
+from typing import Final, Literal, NoReturn
+
+import usb.core
 
 Speed = Literal["full", "high", "super"]
 
@@ -22,6 +25,8 @@ DEVICE, CONFIGURATION, STRING = 1, 2, 3
 """Types of descriptors that a host asks for."""
 _INTERFACE, _ENDPOINT, _COMPANION = 4, 5, 0x30
 _LANGUAGE_EN_US = 0x0409
+DEVICE_FORM, CONFIGURATION_FORM, INTERFACE_FORM, ENDPOINT_FORM = "<BBHBBBBHHHBBBB", "<BBHBBBBB", "<9B", "<BBBBHB"
+"""Layouts of the descriptors, as `struct` takes them."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -33,6 +38,11 @@ class EndpointSpec:
     packet_bytes: int
     interval: int = 0
 
+    def descriptor(self) -> bytes:
+        """7 bytes, USB 2.0 table 9-13."""
+        kind = 2 if self.kind == "bulk" else 3
+        return struct.pack(ENDPOINT_FORM, 7, _ENDPOINT, self.address, kind, self.packet_bytes, self.interval)
+
 
 @dataclass(frozen=True, slots=True)
 class AlternateSpec:
@@ -41,6 +51,11 @@ class AlternateSpec:
     interface: int
     alternate: int
     endpoints: tuple[EndpointSpec, ...] = ()
+
+    def descriptor(self) -> bytes:
+        """9 bytes, USB 2.0 table 9-12."""
+        head = 9, _INTERFACE, self.interface, self.alternate, len(self.endpoints)
+        return struct.pack(INTERFACE_FORM, *head, 0xFF, 0xFF, 0xFF, 0)
 
 
 @dataclass(frozen=True, slots=True)
@@ -68,26 +83,20 @@ class DeviceSpec:
         packet = 9 if self.speed == "super" else 64  # USB 3: an exponent
         serial = 3 if self.serial is not None else 0
         return struct.pack(
-            "<BBHBBBBHHHBBBB",
+            DEVICE_FORM,
             *(18, DEVICE, usb, 0, 0, 0, packet),
             *(self.vendor, self.product, self.release, 1, 2, serial, 1),
         )
 
     def configuration_descriptor(self) -> bytes:
         """The whole configuration: header, interfaces, endpoints (with companions on SuperSpeed)."""
-        body = b"".join(self._alternate(one) for one in self.alternates)
+        companion = bytes((6, _COMPANION, 15, 0, 0, 0)) if self.speed == "super" else b""
+        body = b""
+        for one in self.alternates:
+            body += one.descriptor() + b"".join(end.descriptor() + companion for end in one.endpoints)
         interfaces = len({one.interface for one in self.alternates})
         power = self.max_power_ma // (8 if self.speed == "super" else 2)  # USB 3 counts in 8 mA
-        return struct.pack("<BBHBBBBB", 9, CONFIGURATION, 9 + len(body), interfaces, 1, 0, 0x80, power) + body
-
-    def _alternate(self, one: AlternateSpec) -> bytes:
-        head = struct.pack("<9B", 9, _INTERFACE, one.interface, one.alternate, len(one.endpoints), 0xFF, 0xFF, 0xFF, 0)
-        return head + b"".join(self._endpoint(end) for end in one.endpoints)
-
-    def _endpoint(self, end: EndpointSpec) -> bytes:
-        kind = 2 if end.kind == "bulk" else 3
-        text = struct.pack("<BBBBHB", 7, _ENDPOINT, end.address, kind, end.packet_bytes, end.interval)
-        return text + (bytes((6, _COMPANION, 15, 0, 0, 0)) if self.speed == "super" else b"")
+        return struct.pack(CONFIGURATION_FORM, 9, CONFIGURATION, 9 + len(body), interfaces, 1, 0, 0x80, power) + body
 
     def string_descriptor(self, index: int) -> bytes | None:
         """Index 0 lists the languages; None where there is no such string."""
@@ -114,11 +123,23 @@ Answer = bytes | memoryview | Stall | None
 """Bytes that arrived; `STALL`; None: not ready, ask again later (NAK)."""
 
 
-class UsbFailure(Exception):  # noqa: N818 - it is what libusb calls a failure, with its number
-    """A transfer or request that fails at the host; `number` is the errno."""
+_LIBUSB = {
+    errno.EACCES: (-3, "Access denied (insufficient permissions)"),
+    errno.ENODEV: (-4, "No such device (it may have been disconnected)"),
+    errno.ENOENT: (-5, "Entity not found"),
+    errno.EBUSY: (-6, "Resource busy"),
+    errno.EOVERFLOW: (-8, "Overflow"),
+    errno.EPIPE: (-9, "Pipe error"),
+}
+"""libusb's code and text for an errno, as `libusb_strerror` gives them."""
+
+
+class UsbFailure(usb.core.USBError):  # type: ignore[misc] # pyusb carries no types
+    """A transfer or request that fails at the host, as pyusb raises it; `number` is the errno."""
 
     def __init__(self, number: int) -> None:
-        super().__init__(errno.errorcode[number])
+        code, text = _LIBUSB.get(number, (-99, "Other error"))
+        super().__init__(text, code, number)
         self.number = number
 
 
@@ -175,20 +196,16 @@ class AttachedDevice:
         self.denied = False
         """Whether this user may not open it (EACCES)."""
         self.configuration = 1
+        self.lock = threading.RLock()
+        """Held around every call of the model; hold it to look at it."""
         self._now = now
-        self._lock = threading.RLock()
         self._claims: dict[int, object] = {}
         self._alternates: dict[int, int] = {}
         self._halted: set[int] = set()
 
-    @property
-    def lock(self) -> threading.RLock:
-        """Held around every call of the model; hold it to look at it."""
-        return self._lock
-
     def unplug(self) -> None:
         """Pull the cable: every call fails with ENODEV from now on."""
-        with self._lock:
+        with self.lock:
             if self.present:
                 self.present = False
                 self._claims.clear()
@@ -196,21 +213,19 @@ class AttachedDevice:
 
     def open(self) -> None:
         """Open the device. EACCES where this user may not."""
-        with self._lock:
-            self._alive()
+        with self._alive():
             if self.denied:
                 raise UsbFailure(errno.EACCES)
 
     def close(self, owner: object) -> None:
         """Deal with a host that closed its handle or died: interfaces fall free and back to alternate 0."""
-        with self._lock:
+        with self.lock:
             for interface in [number for number, holder in self._claims.items() if holder is owner]:
                 self._give_back(interface)
 
     def set_configuration(self, value: int) -> None:
         """Choose a configuration. EBUSY while an interface is claimed, ENOENT for an unknown one."""
-        with self._lock:
-            self._alive()
+        with self._alive():
             if self._claims:
                 raise UsbFailure(errno.EBUSY)
             if value not in (0, 1):
@@ -221,8 +236,7 @@ class AttachedDevice:
 
     def claim(self, interface: int, owner: object) -> None:
         """Claim an interface. EBUSY where another holds it."""
-        with self._lock:
-            self._alive()
+        with self._alive():
             if all(one.interface != interface for one in self.spec.alternates):
                 raise UsbFailure(errno.ENOENT)
             if self._claims.get(interface, owner) is not owner:
@@ -231,22 +245,15 @@ class AttachedDevice:
 
     def release(self, interface: int, owner: object) -> None:
         """Give an interface back. As Linux does, the device returns to alternate setting 0."""
-        with self._lock:
-            self._alive()
-            if self._claims.get(interface) is not owner:
-                raise UsbFailure(errno.ENOENT)
+        with self._alive():
+            self._require_claim(interface, owner)
             self._give_back(interface)
-
-    def _give_back(self, interface: int) -> None:
-        del self._claims[interface]
-        if self._alternates.pop(interface, 0):
-            self.model.set_interface(interface, 0, self._now())
 
     def set_alternate(self, interface: int, alternate: int, owner: object) -> None:
         """Choose an alternate setting. ENOENT for an unknown one or an interface that is not claimed."""
-        with self._lock:
-            self._alive()
-            if self._claims.get(interface) is not owner or self._setting(interface, alternate) is None:
+        with self._alive():
+            self._require_claim(interface, owner)
+            if all((one.interface, one.alternate) != (interface, alternate) for one in self.spec.alternates):
                 raise UsbFailure(errno.ENOENT)
             self._alternates[interface] = alternate
             self._halted.clear()
@@ -254,82 +261,87 @@ class AttachedDevice:
 
     def clear_halt(self, endpoint: int) -> None:
         """End a stall."""
-        with self._lock:
-            self._alive()
+        with self._alive():
             self._halted.discard(endpoint)
 
     def control(self, setup: Setup, data: bytes) -> bytes | None:
         """A control transfer: the reply (b"" for OUT), or None while the device is not ready."""
-        with self._lock:
-            self._alive()
+        with self._alive():
             if setup.request_type & 0x60 == 0:
                 answer = self._standard(setup)
             else:
                 answer = self.model.control(setup, data, self._now())
-            self._alive()
-            if answer is None:
-                return None
+            self._require_plugged()
             if isinstance(answer, Stall):
                 raise UsbFailure(errno.EPIPE)
-            return bytes(answer[: setup.length])
+            return None if answer is None else bytes(answer[: setup.length])
 
     def out(self, endpoint: int, data: bytes, owner: object) -> int:
         """Bytes that the device takes now."""
-        with self._lock:
+        with self._alive():
             self._usable(endpoint, owner)
             taken = self.model.out(endpoint, data, self._now())
-            self._alive()
+            self._require_plugged()
             if isinstance(taken, Stall):
-                self._halted.add(endpoint)
-                raise UsbFailure(errno.EPIPE)
+                self._halt(endpoint)
             return taken or 0
 
     def inp(self, endpoint: int, room: int, owner: object) -> bytes | memoryview | None:
         """Data that the device has now, or None. EOVERFLOW where its packet is larger than the room left."""
-        with self._lock:
+        with self._alive():
             packet = self._usable(endpoint, owner).packet_bytes
             answer = self.model.inp(endpoint, -(-room // packet) * packet, self._now())
-            self._alive()
+            self._require_plugged()
             if isinstance(answer, Stall):
-                self._halted.add(endpoint)
-                raise UsbFailure(errno.EPIPE)
+                self._halt(endpoint)
             if answer is not None and len(answer) > room:
                 raise UsbFailure(errno.EOVERFLOW)
             return answer
 
     def ends_transfer(self, endpoint: int, received: int) -> bool:
         """Whether an IN transfer ends after a burst of that many bytes: the last packet was short."""
-        return received % self._endpoint(endpoint).packet_bytes != 0 or received == 0
+        return received % self._endpoint(endpoint)[1].packet_bytes != 0 or received == 0
 
-    def _usable(self, endpoint: int, owner: object) -> EndpointSpec:
-        self._alive()
-        end = self._endpoint(endpoint)
-        interface = next(one.interface for one in self._current() if end in one.endpoints)
-        if self._claims.get(interface) is not owner:
-            raise UsbFailure(errno.ENOENT)
-        if endpoint in self._halted:
-            raise UsbFailure(errno.EPIPE)
-        return end
+    @contextmanager
+    def _alive(self) -> Iterator[None]:
+        """Hold the lock. ENODEV where the device is no longer there."""
+        with self.lock:
+            self._require_plugged()
+            yield
 
-    def _endpoint(self, address: int) -> EndpointSpec:
-        for one in self._current():
-            for end in one.endpoints:
-                if end.address == address:
-                    return end
-        raise UsbFailure(errno.ENOENT)
-
-    def _current(self) -> list[AlternateSpec]:
-        return [one for one in self.spec.alternates if one.alternate == self._alternates.get(one.interface, 0)]
-
-    def _setting(self, interface: int, alternate: int) -> AlternateSpec | None:
-        matches = (one for one in self.spec.alternates if (one.interface, one.alternate) == (interface, alternate))
-        return next(matches, None)
-
-    def _alive(self) -> None:
+    def _require_plugged(self) -> None:
         if self.model.gone:
             self.unplug()
         if not self.present:
             raise UsbFailure(errno.ENODEV)
+
+    def _require_claim(self, interface: int, owner: object) -> None:
+        if self._claims.get(interface) is not owner:
+            raise UsbFailure(errno.ENOENT)
+
+    def _give_back(self, interface: int) -> None:
+        del self._claims[interface]
+        if self._alternates.pop(interface, 0):
+            self.model.set_interface(interface, 0, self._now())
+
+    def _halt(self, endpoint: int) -> NoReturn:
+        self._halted.add(endpoint)
+        raise UsbFailure(errno.EPIPE)
+
+    def _usable(self, endpoint: int, owner: object) -> EndpointSpec:
+        interface, end = self._endpoint(endpoint)
+        self._require_claim(interface, owner)
+        if endpoint in self._halted:
+            raise UsbFailure(errno.EPIPE)
+        return end
+
+    def _endpoint(self, address: int) -> tuple[int, EndpointSpec]:
+        """An endpoint of the present alternate settings, and its interface."""
+        for one in self.spec.alternates:
+            for end in one.endpoints if one.alternate == self._alternates.get(one.interface, 0) else ():
+                if end.address == address:
+                    return one.interface, end
+        raise UsbFailure(errno.ENOENT)
 
     def _standard(self, setup: Setup) -> Answer:
         """The requests of USB 2.0 chapter 9 that a host sends outside of enumeration."""

@@ -9,7 +9,7 @@ import random
 
 from drivers.interfaces import OUT_FRAME, OUT_GATE, Pulse
 from drivers.registry import Surroundings
-from drivers.sync.prawndo import PrawnDo, PrawnDoConfig, create
+from drivers.sync.prawndo import PrawnDo, PrawnDoConfig
 from drivers.sync.prawndo_line import PrawnDoTiming
 from sim_backend.wire.serve.wire_server import Fault, FaultSchedule
 from tests.campaigns.outcomes import Ending, Verbs
@@ -37,7 +37,6 @@ class Sequence:
         self._programmed: list[tuple[int, int]] | None = None
 
     def run(self) -> Ending:
-        """Until done, or a verb lied."""
         if self._random.random() < 0.3:  # left running by a dead host
             words = bytes.fromhex("0200 00ca9a3b 0000 00000000 0000 00000000")
             self._board.model.receive(b"adm 0 3\n", 0.0)
@@ -50,16 +49,17 @@ class Sequence:
         self._verb("open", self._open)
         if (device := self._device) is None:
             return
-        verbs = (self._program, self._run, self._abort, self._gate_low, self._status, self._play)
+        verbs = (self._program, self._run, self._lower, self._lower, self._status, self._play)
         for _ in range(VERBS):
             verb = self._random.choice(verbs)
             self._verb(verb.__name__, lambda verb=verb: verb(device))  # type: ignore[misc]
-        self._verb("close", lambda: self._close(device))
+        if self._verb("close", device.close):
+            self._require_low()
 
     def _open(self) -> None:
         config = PrawnDoConfig(port="emulated:sync")
         ports = {"sync": self._board.server.endpoint}
-        self._device = create(config, Surroundings(self._board.clock, None, 0, ports), TIMING)
+        self._device = PrawnDo(config, Surroundings(self._board.clock, None, 0, ports), TIMING)
         self._require_low()
 
     def _program(self, device: PrawnDo) -> None:
@@ -79,12 +79,8 @@ class Sequence:
         is_over = self._board.now_s - begun_s >= 1e-8 * sum(cycles for _, cycles in self._programmed)
         assert is_over or self._board.model.status in (1, 2), f"the board's status is {self._board.model.status}"
 
-    def _abort(self, device: PrawnDo) -> None:
-        device.abort()
-        self._require_low()
-
-    def _gate_low(self, device: PrawnDo) -> None:
-        device.gate_low()
+    def _lower(self, device: PrawnDo) -> None:
+        self._random.choice((device.abort, device.gate_low))()
         self._require_low()
 
     def _status(self, device: PrawnDo) -> None:
@@ -100,10 +96,6 @@ class Sequence:
             self._board.clock.sleep(self._random.uniform(0, 0.02))
             self._board.model.tick(self._board.now_s)
 
-    def _close(self, device: PrawnDo) -> None:
-        device.close()
-        self._require_low()
-
     def _require_low(self) -> None:
         assert not self._board.pins, f"outputs are {self._board.pins}"
         with self._board.server.lock:
@@ -112,5 +104,4 @@ class Sequence:
 
 
 def sequence(seed: int) -> Ending:
-    """One sequence, run: how it ended, and what was wrong with that, if anything."""
     return Sequence(seed).run()

@@ -35,7 +35,6 @@ def _frames(first: int, start_s: float, period_s: float, n: int) -> NDArray[np.u
 
 
 def sequence(seed: int) -> Ending:
-    """One sequence, run: how it ended, and what was wrong with that, if anything."""
     rng = random.Random(seed)
     probability = rng.choice((0.1, 0.5, 1.0))
     skip, most = rng.randrange(12), rng.randrange(1, 4)

@@ -100,7 +100,6 @@ class FaultyModel(SpbUsbModel):
 
 
 def sequence(seed: int) -> Ending:
-    """One sequence, run: how it ended, and what was wrong with that, if anything."""
     rng = random.Random(seed)
     chip = rng.choice(("fx3", "ft601"))
     device = FaultyModel(

@@ -28,21 +28,17 @@ class FaultyUsb(UsbModel):
         """endpoint, length and earliest time of a transfer that waits to be taken."""
 
     def set_interface(self, interface: int, alternate: int, now_s: float) -> None:
-        """Forgets what was on its way."""
         self._arriving.clear()
         self._offered = None
         self._model.set_interface(interface, alternate, now_s)
 
     def control(self, setup: Setup, data: bytes, now_s: float) -> Answer:
-        """Unharmed."""
         return None if self._hung else self._model.control(setup, data, now_s)
 
     def unplugged(self, now_s: float) -> None:
-        """No power for the model."""
         self._model.unplugged(now_s)
 
     def out(self, endpoint: int, data: bytes, now_s: float) -> int | Stall | None:
-        """One decision a transfer."""
         if self._hung or now_s < self._silent_until_s:
             return None
         if self._offered is None or self._offered[:2] != (endpoint, len(data)):
@@ -62,7 +58,6 @@ class FaultyUsb(UsbModel):
         return taken
 
     def inp(self, endpoint: int, length: int, now_s: float) -> Answer:
-        """One decision a reply."""
         answer = None if self._hung else self._model.inp(endpoint, length, now_s)
         if isinstance(answer, Stall):
             return answer

@@ -63,7 +63,6 @@ class LoopbackModel(UsbModel):
             queue.clear()
 
     def control(self, setup: Setup, data: bytes, now_s: float) -> Answer:
-        """The steering requests; others stall."""
         if setup.request == ECHO_IN:
             return setup.value.to_bytes(2, "little")
         if setup.request == STALL_BULK_IN:
@@ -79,14 +78,12 @@ class LoopbackModel(UsbModel):
         return b""
 
     def out(self, endpoint: int, data: bytes, now_s: float) -> int | Stall | None:
-        """Queue it for the way back."""
         if self._deaf and endpoint == 0x02:
             return None
         self._queues[_BACK[endpoint]].append(data)
         return len(data)
 
     def inp(self, endpoint: int, length: int, now_s: float) -> Answer:
-        """What was sent, in order."""
         if endpoint == 0x81 and self._stall:
             self._stall = False
             return STALL

@@ -1,22 +1,16 @@
-"""One open USB device file of a client under umockdev: usbfs calls, its queue of transfers, its memory.
-
-The client's ioctl calls come over a socket as three 64-bit words (command, argument, argument); memory of the client is
-read and written through the same socket. Structures and numbers: linux/usbdevice_fs.h (64 bit).
-
-Emulated USB devices for real libusb, in another process: a device tree and usbfs calls served through umockdev.
+"""Emulated USB devices for real libusb, in another process: a device tree and usbfs calls served through umockdev.
 
     with UmockdevBus(SystemClock()) as bus:
         bus.plug(HeliosModel())
         subprocess.run([sys.executable, "-m", "..."], env=bus.environment())
 
 The client runs under `libumockdev-preload.so.0` (Debian packages umockdev and libusb-1.0-0), which sends its ioctl
-calls on /dev/bus/usb/* to a socket of the device (`tests.wire.usb.umockdev`).
+calls on /dev/bus/usb/* to a socket of the device, as three 64-bit words (command, argument, argument); memory of the
+client is read and written through the same socket. Structures and numbers: linux/usbdevice_fs.h (64 bit).
 
 libusb waits for the device file to become writable when a transfer is over. The file is a FIFO here: full means that
 there is nothing to reap. It is filled and drained by this side only. A client whose server dies is aborted by the
 preloaded library: run clients as subprocesses, and close the bus after them.
-
-The part of /sys and /dev that libusb and libudev read of an emulated USB device, as files for umockdev.
 """
 
 import contextlib
@@ -29,7 +23,6 @@ import struct
 import tempfile
 import threading
 from collections import deque
-from collections.abc import Callable
 from ctypes.util import find_library
 from dataclasses import dataclass
 from enum import IntEnum
@@ -93,26 +86,17 @@ class _Urb:
 
 
 class UsbFile:
-    """The file. ready: called when what can be reaped changed; configured: with the new one; closed: last."""
+    """The device file as one client has it open."""
 
-    def __init__(
-        self,
-        connection: socket.socket,
-        device: AttachedDevice,
-        ready: Callable[[], None],
-        configured: Callable[[int], None],
-        closed: "Callable[[UsbFile], None]",
-    ) -> None:
+    def __init__(self, connection: socket.socket, served: "_ServedDevice") -> None:
         self._connection = connection
-        self._device = device
-        self._ready, self._configured, self._closed = ready, configured, closed
+        self._served, self._device = served, served.device
         self._lock = threading.Lock()
         self._queued: list[_Urb] = []
         self.over: deque[_Urb] = deque()
         self.thread = threading.Thread(target=self._serve, daemon=True)
 
     def close(self) -> None:
-        """End the connection."""
         with contextlib.suppress(OSError):
             self._connection.shutdown(socket.SHUT_RDWR)
         self.thread.join()
@@ -123,18 +107,15 @@ class UsbFile:
             busy: set[int] = set()
             over = []
             for urb in self._queued:
-                if urb.endpoint in busy:
-                    continue
-                if not self._work(urb):
-                    busy.add(urb.endpoint)
-                else:
+                if urb.endpoint not in busy and self._work(urb):
                     over.append(urb)
+                else:
+                    busy.add(urb.endpoint)
             self._queued = [urb for urb in self._queued if urb not in over]
             self.over.extend(over)
             return bool(over)
 
     def _work(self, urb: _Urb) -> bool:
-        """Whether the transfer is over."""
         try:
             if urb.setup is not None:
                 reply = self._device.control(urb.setup, urb.out_data)
@@ -174,7 +155,7 @@ class UsbFile:
             pass  # the client closed the file or died
         finally:
             self._connection.close()
-            self._closed(self)
+            self._served.forget(self)
 
     def _call(self, request: int, argument: int) -> int:
         match request:
@@ -194,7 +175,7 @@ class UsbFile:
             case _Call.SETCONFIGURATION:
                 value = self._number(argument)
                 self._device.set_configuration(value)
-                self._configured(value)
+                self._served.configured(value)
             case _Call.CLEAR_HALT | _Call.RESETEP:
                 self._device.clear_halt(self._number(argument))
             case _Call.GET_CAPABILITIES:
@@ -222,13 +203,13 @@ class UsbFile:
         with self._lock:
             self._queued.append(_Urb(address, buffer, endpoint, length, setup, data))
         if self.advance():
-            self._ready()
+            self._served.refresh()
 
     def _reap(self, argument: int) -> None:
         with self._lock:
             urb = self.over.popleft() if self.over else None
         if urb is None:
-            self._ready()
+            self._served.refresh()
             raise UsbFailure(errno.EAGAIN if self._device.present else errno.ENODEV)
         if urb.arrived:
             self._poke(urb.buffer, urb.arrived)
@@ -244,7 +225,7 @@ class UsbFile:
             found[0].status = -errno.ENOENT
             self._queued.remove(found[0])
             self.over.append(found[0])
-        self._ready()
+        self._served.refresh()
 
     def _number(self, address: int) -> int:
         return int.from_bytes(self._peek(address, 4), "little")
@@ -333,7 +314,6 @@ class UmockdevBus:
         return attached
 
     def environment(self) -> dict[str, str]:
-        """Environment of a client process."""
         return {**os.environ, "LD_PRELOAD": PRELOAD, "UMOCKDEV_DIR": str(self._root)}
 
     def close(self) -> None:
@@ -343,11 +323,9 @@ class UmockdevBus:
         shutil.rmtree(self._root, ignore_errors=True)
 
     def __enter__(self) -> Self:
-        """The bus itself."""
         return self
 
     def __exit__(self, *_: object) -> None:
-        """Close."""
         self.close()
 
 
@@ -386,7 +364,6 @@ class _ServedDevice:
                     os.write(self._fifo, bytes(_FIFO_BYTES))
 
     def refresh(self) -> None:
-        """Say whether any handle has something to reap."""
         with self._lock:
             self.ready(any(handle.over for handle in self._handles))
 
@@ -395,7 +372,6 @@ class _ServedDevice:
         self._configuration_file.write_text(f"{value}\n")
 
     def close(self) -> None:
-        """End the threads."""
         self._closing.set()
         self._listener.shutdown(socket.SHUT_RDWR)
         self._listener.close()
@@ -411,13 +387,12 @@ class _ServedDevice:
                 connection, _ = self._listener.accept()
             except OSError:
                 return
-            handle = UsbFile(connection, self.device, self.refresh, self.configured, self.forget)
+            handle = UsbFile(connection, self)
             with self._lock:
                 self._handles.append(handle)
             handle.thread.start()
 
     def forget(self, handle: UsbFile) -> None:
-        """The client closed it."""
         with self._lock:
             self._handles.remove(handle)
         self.device.close(handle)

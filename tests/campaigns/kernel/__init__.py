@@ -1,1 +1,0 @@
-"""Drivers through real Linux kernels in virtual machines."""
