@@ -22,7 +22,7 @@ from sim_backend.effects.catalogue import CATALOGUE
 from sim_backend.effects.setting import FrameTimes, PlannedFor, Setting
 from sim_backend.frames.flux import ROUNDING, FluxModel, column_grid, fine_grid
 from sim_backend.frames.photons import PhotonSource
-from sim_backend.light.line import ONE_LINE, LineFan, line_fan, line_width
+from sim_backend.light.line import ONE_LINE, LineFan, line_width
 from sim_backend.light.optics import Line, Optics, Sensor, detections_per_radiance
 from sim_backend.light.view import make_view
 from sim_backend.scenes.scene import CLEAR, BoardPlace, load_scene, load_surfaces, with_board_at, with_fog
@@ -185,7 +185,7 @@ class SimulatedWorld:
 
         shared: they share the laser's power; else each has all of it. To be called before the SPAD is configured.
         """
-        self.fan = line_fan(offsets, shared=shared)
+        self.fan = LineFan(tuple(offsets), 1 / len(offsets) if shared else 1.0)
 
     def hold_columns(self, commands: Array) -> None:
         """Hold the flux in columns of these mirror commands (columns,): all frames of a column share one p.

@@ -148,11 +148,9 @@ class PhotonSource:
                     self._set_rate(span.sheets, a, b)
                 if span.fresh:
                     self._set_levels(span.power_w, self._dark, self._levels, a, b)
-                draw_frames(
-                    self._levels if span.power_w > 0 else self._dark, model.steady_per_s, rate, exposure_s,
-                    span.power_w, self._seed, first_frame + span.first, a, b, first_word[span.first : span.last],
-                    words[span.first : span.last],
-                )  # fmt: skip
+                light, part = (model.steady_per_s, rate, exposure_s, span.power_w), slice(span.first, span.last)
+                levels = self._levels if span.power_w > 0 else self._dark
+                draw_frames(levels, light, self._seed, first_frame + span.first, (a, b), first_word[part], words[part])
 
         try:
             # What moves is where it is at one time: its picture is made once, for all bands.
@@ -178,7 +176,7 @@ class PhotonSource:
 
     def _set_levels(self, power_w: float, dark: Levels, levels: Levels, a: int, b: int) -> None:
         exposure_w_s = self._times.exposure_s * power_w
-        set_levels(self._steady, self._rate, exposure_w_s, a, b, dark, self._lit, levels)
+        set_levels(self._steady, self._rate, exposure_w_s, (a, b), dark, self._lit, levels)
 
     def _apply_bit_effects(self, first_frame: int, whole: Words) -> None:
         """Let the sensor act on whole frames, in as many parts as there are threads: a part needs what the effect found

@@ -1,14 +1,5 @@
 """The medium and the weather of a scene: fog or smoke, rain or snow, how dense, and where they scatter light to.
 
-    medium: {fog: {visibility: 40 m}}                           # 2 % contrast; or {extinction: 0.1 /m}
-    medium: {smoke: {extinction: 0.5 /m}}                       # or its visibility
-    medium: {extinction: 0.1 /m, backscatter: 0.05 /sr}         # phase function near 180 degrees, taken constant
-    medium: {extinction: 0.1 /m, phase: isotropic}
-    medium: {extinction: 0.1 /m, phase: {g: 0.85}}              # Henyey-Greenstein
-    medium: {extinction: 0.1 /m, phase: {terms: [[0.9, 0.9], [0.1, -0.5]]}}     # weights and g of several
-    rain: {rate: 20 mm/h}
-    snow: {rate: 2 mm/h, wind: 1 m/s}
-
 Henyey and Greenstein (1941): p(theta) = (1 - g^2) / (4 pi (1 + g^2 - 2 g cos theta)^1.5), in 1/sr, of integral 1 over
 all directions and mean cosine g; at 180 degrees (1 - g) / (4 pi (1 + g)^2).
 
@@ -155,10 +146,9 @@ class Medium(SceneSection):
     @property
     def extinction_per_m(self) -> float:
         """Extinction coefficient in 1/m, of light that must not be turned at all."""
-        if self.fog is not None:
-            return KOSCHMIEDER / self.fog.visibility
-        if self.smoke is not None and self.smoke.visibility is not None:
-            return KOSCHMIEDER / self.smoke.visibility
+        seen = self.fog or self.smoke
+        if seen is not None and seen.visibility is not None:
+            return KOSCHMIEDER / seen.visibility
         found = self.extinction if self.smoke is None else self.smoke.extinction
         assert found is not None, "the validators let exactly one be there"
         return found

@@ -9,18 +9,10 @@ def passed(*pieces: tuple[float, str, bytes]) -> list[Passed]:
 
 
 TALK = passed(
-    (0.0, OUT, b"?\r"),
-    (0.1, IN, b"OK\r\n"),
-    (1.0, OUT, b"slmp 5\r"),
-    (1.1, IN, b"O"),
-    (1.2, IN, b"K\r\n"),
-    (1.3, OUT, b"pa?\r"),
-    (1.4, IN, b"0\r\n"),
-    (3.0, OUT, b"pa?\r"),
-    (3.1, IN, b"5\r\n"),
-    (4.0, OUT, b"slmp 0\r"),
-    (4.1, IN, b"DONE\r\n"),
-)
+    (0.0, OUT, b"?\r"), (0.1, IN, b"OK\r\n"), (1.0, OUT, b"slmp 5\r"), (1.1, IN, b"O"), (1.2, IN, b"K\r\n"),
+    (1.3, OUT, b"pa?\r"), (1.4, IN, b"0\r\n"), (3.0, OUT, b"pa?\r"), (3.1, IN, b"5\r\n"),
+    (4.0, OUT, b"slmp 0\r"), (4.1, IN, b"DONE\r\n"),
+)  # fmt: skip
 
 
 def test_questions_are_answered_as_often_as_asked_and_as_it_stood_then() -> None:
@@ -43,14 +35,9 @@ def test_commands_come_in_their_order_and_may_be_said_again() -> None:
     model = RecordedModel(TALK)
     assert model.receive(b"slmp 5\r", 0.0) == model.receive(b"slmp 5\r", 0.1) == b"OK\r\n"
     assert model.receive(b"slmp 0\r", 0.2) == b"DONE\r\n"
-    assert RecordedModel(TALK).receive(b"slmp 0\r", 0.0) == b""
-
-
-def test_after_what_was_not_recorded_nothing_is_answered() -> None:
-    model = RecordedModel(TALK)
-    assert model.receive(b"slmp 6\r", 0.0) == b""
-    assert model.diverged
-    assert model.receive(b"?\r", 0.1) == b""
+    skips = RecordedModel(TALK)
+    assert skips.receive(b"slmp 0\r", 0.0) == skips.receive(b"?\r", 0.1) == b""  # nothing after what was not recorded
+    assert skips.diverged
 
 
 def test_answers_bear_the_tokens_of_today() -> None:

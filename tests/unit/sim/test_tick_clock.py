@@ -33,7 +33,7 @@ def test_the_error_wanders_with_the_root_of_time() -> None:
     assert abs(np.mean(late)) < 4 * expected / np.sqrt(runs)
 
 
-@pytest.mark.parametrize("block", [1, 7, 450])
+@pytest.mark.parametrize("block", [1, 450])
 def test_times_do_not_depend_on_how_they_are_asked_for(block: int) -> None:
     frames = round(3.2 * STEP_S / TICK_S / PERIOD)
     whole = _clock(50e-6, 1e-3).times_s(0, PERIOD, frames + 1)
