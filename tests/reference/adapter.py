@@ -34,12 +34,7 @@ def reconstruct(
 
 
 def reconstructor_of(
-    point: WorkingPoint,
-    estimator: str,
-    *,
-    threads: int = 2,
-    lines: Any = None,
-    temporal_prior: bool = False,
+    point: WorkingPoint, estimator: str, *, threads: int = 2, lines: Any = None, temporal_prior: bool = False
 ) -> Any:
     """The project's Reconstructor for the rig of a working point, whose calibration it reads from a file.
 
