@@ -22,22 +22,19 @@ from itertools import product
 from typing import Literal
 
 import numpy as np
-from numpy.typing import NDArray
 
 from sim_backend.effects.catalogue import CATALOGUE, MEASURED, Entry
-from sim_backend.effects.setting import PlannedFor, Setting
+from sim_backend.effects.setting import Array, PlannedFor, Setting
 from sim_backend.frames.flux import FluxModel, hold_s
 from sim_backend.light.sheet import empty_sheet
 
-Array = NDArray[np.float64]
 Wanted = Literal["planned", "all"] | tuple[str, ...]
 """The effects to run of those that a scene calls for: all but the negligible ones, all, or these."""
 
 MOST_CHANGED = 0.01
 """Share of decisions that may change by all that is left out: eps = 2e-4."""
 MOST = PlannedFor(power_w=1.0, exposure_s=1e-3, exposures=100)
-"""The most that a plan holds for where nobody says what is to be scanned: more than a line laser and an ordinary scan
-have."""
+"""Plan where nobody says what is to be scanned: more than a line laser and an ordinary scan have."""
 SAFETY = 2.0
 """Safety factor on the mean over sampled rows: their spread over rows and columns is less."""
 SAMPLED_COLUMNS, SAMPLED_BANDS, BAND_ROWS = 16, 4, 8

@@ -13,11 +13,10 @@ from statistics import median
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
-from numpy.typing import NDArray
 
 from sim_backend.effect_planner import EffectDecision
 from sim_backend.effects.catalogue import CATALOGUE, MEASURED
-from sim_backend.effects.setting import FrameTimes, Words
+from sim_backend.effects.setting import Array, FrameTimes, Words
 from sim_backend.frames.flux import FluxModel, hold_s
 from sim_backend.light.sheet import LightSheet
 from sim_backend.random_numbers import WORD_PX
@@ -25,7 +24,6 @@ from sim_backend.random_numbers import WORD_PX
 if TYPE_CHECKING:
     from sim_backend.world import SimulatedWorld
 
-Array = NDArray[np.float64]
 
 MOTION = "motion"
 TIMED_FRAMES = 50

@@ -25,7 +25,7 @@ from numpy.typing import NDArray
 from pydantic import Field
 
 from drivers.clock import NS_PER_S, VirtualClock
-from drivers.errors import DeviceTimeout, LimitExceeded
+from drivers.errors import DeviceError, DeviceTimeout, LimitExceeded
 from drivers.frames import FRAME_RECORD, SUBFRAME_SHIFT, BlockFlag, BlockHeader, Mark
 from drivers.interfaces import SpadArray, SpadCounters, SpadInfo, SpadRequest, SpadTiming, StreamMode, WindowTable
 from drivers.registry import Kind, KindConfig, Surroundings
@@ -33,17 +33,15 @@ from drivers.ring import BlockRing
 from drivers.spb1 import BlockLayout, block_views, seal_block
 from drivers.units import BytesPerSecond, ExactHertz, Ppm
 from sim_backend.bench import BenchState
-from sim_backend.devices.place import note_effect, world_of
-from sim_backend.effects.setting import FrameTimes
+from sim_backend.effects.setting import Array, FrameTimes
 from sim_backend.frames.photon_kernels import dropped_frames
 from sim_backend.frames.photons import PhotonSource
-from sim_backend.world import SimulatedWorld
+from sim_backend.world import SimulatedWorld, note_effect
 
 _TWICE = np.uint64(0xE7037ED1A0B428DB)
 """Stream that keeps the draws of frames that come twice apart from those of frames that get lost."""
 
 
-Array = NDArray[np.float64]
 SUBFRAME_STEPS = 256
 STEP_S = 1e-3
 """Time between the steps of a wandering crystal's error."""
@@ -375,7 +373,11 @@ class SimulatedSpad(SpadArray):
 
 
 def create(config: SimulatedSpadConfig, surroundings: Surroundings) -> SimulatedSpad:
-    """The SPAD that looks at the world."""
+    """The SPAD that looks at the world. DeviceError where the rig has none."""
+    if not isinstance(surroundings.world, SimulatedWorld):
+        raise DeviceError(
+            "simulated SPAD has nothing to look at: the rig has no simulated world; add world: {kind: simulated}"
+        )
     error, wander = 1e6 * config.clock_error, 1e6 * config.clock_wander
     named, chance, twice = len(config.lost_frames), config.loss_probability, config.duplicate_probability
     for effect, there, does in (
@@ -389,7 +391,7 @@ def create(config: SimulatedSpadConfig, surroundings: Surroundings) -> Simulated
     ):
         if there:
             note_effect(surroundings, effect, f"the SPAD {does}")
-    return SimulatedSpad(config, world_of(surroundings, "simulated SPAD"), surroundings.seed)
+    return SimulatedSpad(config, surroundings.world, surroundings.seed)
 
 
 KIND = Kind(config=SimulatedSpadConfig, create=create)

@@ -16,6 +16,7 @@ what is scattered more than once is right within 30 % all along the traced rows.
 512 x 512 pixels."""
 
 import math
+from typing import Any
 
 import numba
 import numpy as np
@@ -86,14 +87,8 @@ def _add_side(level: float, a: float, b: float, narrow: Array, wide: Array, side
 
 
 @numba.njit(cache=True, nogil=True)
-def _add_halo(
-    view: Arrays,
-    sheet: Traced,
-    parts: tuple[tuple[float, ...], tuple[float, float], tuple[Array, ...]],
-    first_row: int,
-    last_row: int,
-    rate: Array,
-) -> None:
+def _add_halo(view: Arrays, sheet: Traced, parts: tuple[Any, ...], first_row: int, last_row: int, rate: Array) -> None:
+    """Add halo and pedestal. parts: scales of the light, of the two exponentials in px, and their tables."""
     u, v, _, _, _, _, source = view
     inverse, offset_m, x_stripe, x_end, _, step = sheet
     (stripe_scale, haze_scale, extinction_per_m, scattering_per_m, peaked), scales_px, tables = parts

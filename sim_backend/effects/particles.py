@@ -81,23 +81,15 @@ def share(pixel: int, first: float, length: float, sigma: float) -> float:
 
 @numba.njit(cache=True, nogil=True)
 def _add_particles(
-    view: Arrays,
-    particles: tuple[Array, Array, Array, Array, Array],
-    normal: Array,
-    sheet: Traced,
-    light: tuple[float, float, float, float, float],
-    width: Array,
-    first_row: int,
-    last_row: int,
-    rate: Array,
+    view: Arrays, particles: Arrays, sheet: Traced, light: tuple[float, ...], first_row: int, last_row: int, rate: Array
 ) -> None:
     """Add the particles' light to rows first_row..last_row-1 of `rate`.
 
-    particles: cone, z, back, at, per_s. normal: of the sheet's planes. light: detections per second per W/rad and
-    W/(m^2 sr), extinction per metre, time, sigma of the sheet at the mirror and per metre. width: `line_width`.
+    particles: cone, z, back, at, per_s, normal of the sheet's planes, `line_width`. light: detections per second per
+    W/rad and W/(m^2 sr), extinction per metre, time, sigma of the sheet at the mirror and per metre.
     """
     u, v, _, _, _, _, source = view
-    cone, depth, back, at, per_s = particles
+    cone, depth, back, at, per_s, normal, width = particles
     _, offset_m, _, x_end, _, step = sheet
     scale, extinction_per_m, time_s, sheet_sd_m, sheet_sd_per_m = light
     most_off_m = REACH_SIGMAS * (sheet_sd_m + sheet_sd_per_m * FARTHEST_RANGE_M)
@@ -213,9 +205,9 @@ class ParticleLight:
         if not np.isfinite(sheet.inverse).all():
             return
         view, them = self._view.arrays, self.particles
-        particles = them.cone, them.z_m, them.back_m2_per_sr, them.at, them.per_s
+        particles = them.cone, them.z_m, them.back_m2_per_sr, them.at, them.per_s, sheet.normal, self._width
         light = *self._light, math.floor(sheet.time_s / HOLD_S + 1e-6) * HOLD_S, *self._sheet_sd
-        _add_particles(view, particles, sheet.normal, sheet.traced, light, self._width, first_row, last_row, rate)
+        _add_particles(view, particles, sheet.traced, light, first_row, last_row, rate)
 
 
 def rain_drops(setting: Setting) -> ParticleLight:

@@ -14,13 +14,10 @@ from copy import copy
 from dataclasses import dataclass
 
 import numpy as np
-from numpy.typing import NDArray
 
 from sim_backend.effects.catalogue import CATALOGUE, Entry
-from sim_backend.effects.setting import BitEffect, LaserEffect, Setting
+from sim_backend.effects.setting import Array, BitEffect, LaserEffect, Setting
 from sim_backend.light.sheet import LightSheet
-
-Array = NDArray[np.float64]
 
 
 class FluxModel:

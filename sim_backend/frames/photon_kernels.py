@@ -15,6 +15,7 @@ Measured, 512 x 512 on one core: 12 us a frame, 0.12 ms for new levels where hal
 """
 
 import math
+from typing import Any
 
 import numba
 import numpy as np
@@ -63,12 +64,16 @@ _PLACE = np.array(PLACE, np.uint8)
 
 Single = NDArray[np.float32]
 Words = NDArray[np.uint64]
+Places = NDArray[np.int32]
+Rows = tuple[int, int]
+"""The first row, and that after the last."""
 Levels = tuple[NDArray[np.int16], Words]
 """The input for drawing a frame: levels (rows, words, 64), as they are stored, in the order `PLACE`; and bits (rows,
 words) of the pixels of the highest level."""
 Light = tuple[NDArray[np.float64], Single, float, float]
 """Of frames: detections per second without the laser and per second and watt of it, (rows, width), exposure in s and
 power in W."""
+Key = tuple[np.uint64, np.uint64]
 
 
 def new_levels(rows: int, words: int) -> Levels:
@@ -77,10 +82,10 @@ def new_levels(rows: int, words: int) -> Levels:
 
 
 def set_levels(
-    steady: Single, rate: Single, exposure_w_s: float, rows: tuple[int, int], dark: Levels, lit: NDArray[np.bool_],
+    steady: Single, rate: Single, exposure_w_s: float, rows: Rows, dark: Levels, lit: NDArray[np.bool_],
     levels: Levels,
 ) -> None:  # fmt: skip
-    """Levels of the rows from the first up to the second of `rows` for p = 1 - exp(-(steady + exposure_w_s rate)).
+    """Levels of rows for p = 1 - exp(-(steady + exposure_w_s rate)).
 
     steady: photons per exposure; rate: per second and watt, both (rows, width), not negative; exposure_w_s: of power
     and time. Words of 64 pixels before the first and behind the last with light take their levels from `dark`, unless
@@ -101,13 +106,7 @@ def _is_lit(rate_bits: NDArray[np.uint32], row: np.uint64, word: int, width: int
 
 @numba.njit(cache=True, nogil=True, error_model="numpy", fastmath={"contract"})
 def _set_levels(
-    steady: Single,
-    rates: tuple[Single, NDArray[np.uint32], np.float32],
-    rows: tuple[int, int],
-    dark: Levels,
-    lit: NDArray[np.bool_],
-    levels: Levels,
-    constants: tuple[tuple[np.float32, ...], tuple[np.float32, ...]],
+    steady: Single, rates: tuple[Any, ...], rows: Rows, dark: Levels, lit: Any, levels: Levels, constants: Any
 ) -> None:
     (first_row, last_row), (rate, rate_bits, factor) = rows, rates
     roughly, (offset, slope, least, largest) = constants
@@ -144,16 +143,9 @@ def _set_levels(
 
 @numba.njit(cache=True, nogil=True, error_model="numpy")
 def draw_frames(
-    levels: Levels,
-    light: Light,
-    seed: np.uint64,
-    first_frame: int,
-    rows: tuple[int, int],
-    first_word: NDArray[np.int32],
-    words: Words,
+    levels: Levels, light: Light, seed: np.uint64, first_frame: int, rows: Rows, first_word: Places, words: Words
 ) -> None:
-    """Draw rows of frames first_frame, first_frame + 1, ... into `words` (frames, rows, words), from the first up to
-    the second of `rows`.
+    """Draw rows of frames first_frame, first_frame + 1, ... into `words` (frames, rows, words).
 
     levels: as `set_levels` made them of the light. first_word: (frames,), word of the row at which each frame's window
     begins; its bits are those of the whole frame.
@@ -185,13 +177,7 @@ def draw_frames(
 
 @numba.njit(cache=True, nogil=True, error_model="numpy")
 def _draw_anew(
-    key: tuple[np.uint64, np.uint64],
-    levels: Levels,
-    light: Light,
-    first_frame: int,
-    rows: tuple[int, int],
-    first_word: NDArray[np.int32],
-    words: Words,
+    key: Key, levels: Levels, light: Light, first_frame: int, rows: Rows, first_word: Places, words: Words
 ) -> None:
     """Draw the pixels that chance chooses anew; arguments as of `draw_frames`."""
     (stored, _), (first_row, last_row) = levels, rows

@@ -26,17 +26,18 @@ from dataclasses import dataclass, replace
 
 import numba
 import numpy as np
-from numpy.typing import NDArray
 
 from calibration.model.light_sheet import LightSheets
 from drivers.errors import DeviceError
 from sim_backend.light.optics import Line, Optics, Sensor
-from sim_backend.light.sheet import LightSheet, empty_sheet
+from sim_backend.light.sheet import Array, LightSheet, empty_sheet
 from sim_backend.light.view import CameraView
 
-Array = NDArray[np.float64]
 SheetsOf = Callable[[Array], LightSheets]
 """Mirror commands (...) to the light that they stand for."""
+Limits = tuple[float, float]
+"""Least and largest command of the mirror."""
+EVERYWHERE: Limits = (-np.inf, np.inf)
 
 
 @dataclass(frozen=True, slots=True)
@@ -46,18 +47,8 @@ class LineFan:
     offsets: tuple[float, ...] = (0.0,)
     share: float = 1.0
 
-    @property
-    def power_factor(self) -> float:
-        """Power of all lines together, over that of a laser with one line."""
-        return self.share * len(self.offsets)
-
     def sheets(
-        self,
-        sheets_of: SheetsOf,
-        held: Array,
-        rows: int,
-        moment_s: Sequence[float],
-        command_range: tuple[float, float] = (-np.inf, np.inf),
+        self, sheets_of: SheetsOf, held: Array, rows: int, moment_s: Sequence[float], limits: Limits = EVERYWHERE
     ) -> list[list[LightSheet]]:
         """Sheets of the lines at each of the mirror positions (n,), or (n, 2) while the first and the last row are
         exposed, not traced yet; moment_s: (n,) times of the bench.
@@ -68,7 +59,7 @@ class LineFan:
         down = np.linspace(0, 1, rows) if ends.shape[1] > 1 else np.zeros(1)
         of_rows = ends[:, :1] + (ends[:, -1:] - ends[:, :1]) * down
         at = of_rows[:, None] + np.asarray(self.offsets)[:, None]
-        low, high = command_range
+        low, high = limits
         inside = ((at >= low) & (at <= high)).all(axis=-1)
         found = sheets_of(at[inside])
         lines: list[list[LightSheet]] = [[] for _ in held]

@@ -4,13 +4,11 @@ from collections.abc import Callable
 from dataclasses import dataclass, field
 
 import numpy as np
-from numpy.typing import NDArray
 
 from calibration.model.rig_model import RigModel
-from sim_backend.light.sheet import DEPTH_JUMP, Arrays, LightSheet, empty_sheet, span_bounds, trace_rows
+from sim_backend.light.sheet import DEPTH_JUMP, Array, Arrays, LightSheet, empty_sheet, span_bounds, trace_rows
 from sim_backend.scenes.surfaces import Surfaces
 
-Array = NDArray[np.float64]
 Moves = Callable[["CameraView", float], "CameraView"]
 """A motion of the surfaces: from the view at time 0 to that at a time of the bench. Any thread may call it."""
 

@@ -62,19 +62,19 @@ def henyey_greenstein(cosine: float, g: float) -> float:
     return (1 - g) * (1 + g) / (4 * math.pi * math.pow((1 - sharp) ** 2 + 2 * sharp * (1 - ahead), 1.5))
 
 
-class SceneSection(BaseModel):
-    """Part of a scene file: unknown keys are refused."""
+class Section(BaseModel):
+    """Part of a config or a scene file: unknown keys are refused."""
 
     model_config = ConfigDict(extra="forbid", frozen=True)
 
 
-class Fog(SceneSection):
+class Fog(Section):
     """Fog by how far one sees in it (2 % contrast)."""
 
     visibility: Annotated[Metres, Field(gt=0, examples=["30 m"])]
 
 
-class Smoke(SceneSection):
+class Smoke(Section):
     """Smoke by its extinction or by how far one sees in it (2 % contrast)."""
 
     extinction: Annotated[PerMetre, Field(gt=0)] | None = Field(default=None, examples=["0.5 /m"])
@@ -87,7 +87,7 @@ class Smoke(SceneSection):
         return self
 
 
-class Phase(SceneSection):
+class Phase(Section):
     """A Henyey-Greenstein phase function of mean cosine g, or the sum of several as (weight, g)."""
 
     g: MeanCosine | None = Field(default=None, examples=["0.85"])
@@ -106,7 +106,7 @@ class Phase(SceneSection):
         return self
 
 
-class Medium(SceneSection):
+class Medium(Section):
     """A homogeneous scattering medium. Exactly one of `fog`, `smoke` and `extinction` says how dense it is."""
 
     fog: Fog | None = Field(default=None, examples=["{visibility: 30 m}"])
@@ -215,7 +215,7 @@ class Sizes:
         return M2_PER_MM2 * math.pi / 4 * 2 * self.n0_per_m3_mm / self.slope_per_mm**3
 
 
-class Rain(SceneSection):
+class Rain(Section):
     """Rain by the water that falls."""
 
     rate: Annotated[MetresPerHour, Field(gt=0, le=0.3, examples=["20 mm/h"])]
@@ -240,11 +240,10 @@ class Rain(SceneSection):
 
     def fall_m_per_s(self, diameter_mm: Array) -> Array:
         """Fall speed."""
-        result: Array = np.maximum(9.65 - 10.3 * np.exp(-0.6 * diameter_mm), 0.0)
-        return result
+        return np.maximum(9.65 - 10.3 * np.exp(-0.6 * diameter_mm), 0.0)
 
 
-class Snow(SceneSection):
+class Snow(Section):
     """Snow by the water that falls."""
 
     rate: Annotated[MetresPerHour, Field(gt=0, le=0.05, examples=["2 mm/h"])]
@@ -269,8 +268,7 @@ class Snow(SceneSection):
 
     def fall_m_per_s(self, diameter_mm: Array) -> Array:
         """Fall speed."""
-        result: Array = 1.6 * (diameter_mm / 10.0) ** 0.31
-        return result
+        return np.asarray(1.6 * (diameter_mm / 10.0) ** 0.31)
 
 
 def _disc_m2(diameter_mm: Array) -> Array:

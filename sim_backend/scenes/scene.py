@@ -10,7 +10,6 @@ from pathlib import Path
 from typing import Annotated, Self
 
 import numpy as np
-from numpy.typing import NDArray
 from pydantic import Field, model_validator
 
 from calibration.errors import FileError
@@ -19,10 +18,9 @@ from calibration.files.problems import ValueSources, validated
 from calibration.files.sections import load_yaml
 from drivers.errors import DeviceError
 from drivers.units import Lux, Metres, MetresPerSecond, Radians
-from sim_backend.scenes.medium import Fog, Medium, Rain, SceneSection, Snow
-from sim_backend.scenes.surfaces import Surfaces, checked
+from sim_backend.scenes.medium import Fog, Medium, Rain, Section, Snow
+from sim_backend.scenes.surfaces import Array, Surfaces, checked
 
-Array = NDArray[np.float64]
 SCENE_FOLDER = Path(__file__).parents[2] / "config" / "scenes"
 """Folder in which the bundled scenes are found by name."""
 WORLD_FILE = "world.npz"
@@ -30,20 +28,20 @@ CLEAR = "clear"
 """Word in place of a visibility: no fog."""
 
 
-class AmbientLight(SceneSection):
+class AmbientLight(Section):
     """Daylight or lamps on the scene, diffuse."""
 
     illuminance: Annotated[Lux, Field(ge=0, examples=["100 lux"])]
 
 
-class SceneMotion(SceneSection):
+class SceneMotion(Section):
     """Motion of the surfaces, all of them together and straight on, from the bench's time 0 on."""
 
     velocity: tuple[MetresPerSecond, MetresPerSecond, MetresPerSecond] = Field(examples=["[0 m/s, 0 m/s, -2 m/s]"])
     """Velocity along x (right), y (down), z (away from the camera)."""
 
 
-class BoardPlace(SceneSection):
+class BoardPlace(Section):
     """Pose of a calibration board, as `calibration.views.BoardPose` has it."""
 
     rotation: tuple[Radians, Radians, Radians] = Field(examples=["[20 deg, 0 deg, 0 deg]"])
@@ -61,7 +59,7 @@ class SceneBoard(BoardPlace):
     """Printed the wrong way round."""
 
 
-class SceneFile(SceneSection):
+class SceneFile(Section):
     """A whole scene file."""
 
     surfaces: str = Field(default="street", examples=["street"])

@@ -33,8 +33,6 @@ LIMITS: Mapping[str, tuple[str, int]] = {
 }
 GOALS = ("lines", "tests")
 """Limits that the tree is on its way to: told, but no failure."""
-ROOMIER_FOLDERS = {"sim_backend/effects": 20}
-"""Folders with a limit of their own: one file is one effect."""
 
 PRODUCT = ("drivers", "calibration", "sim_backend", "rig")
 CLAUSES = ("What", "Of", "As", "Where", "How", "Whose", "Which", "Why", "When")
@@ -146,12 +144,10 @@ def read_modules(root: Path, packages: Iterable[str]) -> list[Module]:
 
 
 def folder_figure(modules: Sequence[Module]) -> Figure:
-    """Modules of the fullest folder; one with a limit of its own only where it passes that."""
-    counts = Counter(module.path.parent.as_posix() for module in modules if not module.is_face)
-    judged = {folder: n for folder, n in counts.items() if n > ROOMIER_FOLDERS.get(folder, 0)}
-    folder = max(judged, key=lambda each: judged[each], default="none")
-    items = [f"{each}: {n}" for each, n in counts.most_common()]
-    return Figure("folder", judged.get(folder, 0), f"{judged.get(folder, 0)} modules in {folder}", items)
+    """Modules of the fullest folder."""
+    counts = Counter(module.path.parent.as_posix() for module in modules if not module.is_face).most_common()
+    folder, most = counts[0]
+    return Figure("folder", most, f"{most} modules in {folder}", [f"{each}: {n}" for each, n in counts])
 
 
 def import_graphs(modules: Sequence[Module]) -> tuple[Graph, Graph]:

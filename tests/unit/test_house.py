@@ -46,16 +46,6 @@ def test_modules_faces_lines_and_folders_are_counted(tree: Path) -> None:
     assert (figures["folder"].value, figures["folder"].told) == (3, "3 modules in rig")
 
 
-def test_a_folder_with_a_limit_of_its_own_counts_only_beyond_it(tree: Path) -> None:
-    effects = tree / "sim_backend" / "effects"
-    effects.mkdir(parents=True)
-    for number in range(20):
-        (effects / f"effect{number}.py").touch()
-    assert found(tree)["folder"].value == 3
-    (effects / "more.py").touch()
-    assert found(tree)["folder"].told == "21 modules in sim_backend/effects"
-
-
 def test_imports_for_types_and_in_functions_make_circles_of_their_own_kind(tree: Path) -> None:
     circles = found(tree)["circles"]
     assert (circles.value, circles.items) == (0, ["deferred: rig.laser, rig.scan"])

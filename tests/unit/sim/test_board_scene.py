@@ -83,9 +83,8 @@ def test_a_mirrored_board_is_the_other_way_round() -> None:
 
 
 def _world(tmp_path: Path, **config: Any) -> SimulatedWorld:
-    geometry = tmp_path / "rig.yaml"
-    geometry.write_text(yaml.safe_dump(calibration()))
-    return made_world(geometry=str(geometry), **config)
+    (tmp_path / "rig.yaml").write_text(yaml.safe_dump(calibration()))
+    return made_world(geometry=str(tmp_path / "rig.yaml"), **config)
 
 
 def test_the_bundled_board_can_be_moved(tmp_path: Path) -> None:

@@ -103,16 +103,12 @@ def test_a_detection_sets_or_clears_the_next_bit_as_often_as_the_closed_form_say
     assert not changed[1:][free].any()
 
 
-def _lone(y: int, x: int, frames: int) -> Bits:
-    bits = np.zeros((frames, ROWS, WIDTH), np.bool_)
-    bits[:, y, x] = True
-    return bits
-
-
 @pytest.mark.parametrize(("y", "x"), [(0, 0), (7, 7), (7, 63), (9, 64), (ROWS - 1, 127), (9, WIDTH - 1)])
 def test_a_lone_detection_fires_each_neighbour_there_is_with_a_quarter_of_c(y: int, x: int) -> None:
     frames = 2000
-    seen = acted_on(Crosstalk(sensor_setting(crosstalk="20 %")), _lone(y, x, frames)).sum(axis=0)
+    lone = np.zeros((frames, ROWS, WIDTH), np.bool_)
+    lone[:, y, x] = True
+    seen = acted_on(Crosstalk(sensor_setting(crosstalk="20 %")), lone).sum(axis=0)
     for at_y, at_x in ((y - 1, x), (y + 1, x), (y, x - 1), (y, x + 1)):
         if 0 <= at_y < ROWS and 0 <= at_x < WIDTH:
             assert_count(seen[at_y, at_x], frames, 0.05)
@@ -120,13 +116,6 @@ def test_a_lone_detection_fires_each_neighbour_there_is_with_a_quarter_of_c(y: i
     assert seen[y, x] == frames
     seen[y, x] = 0
     assert not seen.any()
-
-
-def test_fired_pixels_are_independent_of_one_another() -> None:
-    seen = acted_on(Crosstalk(sensor_setting(crosstalk="40 %")), _lone(9, 64, 10_000))
-    left, right, up = seen[:, 9, 63], seen[:, 9, 65], seen[:, 8, 64]
-    for one, other in ((left, right), (left, up), (left[1:], left[:-1])):
-        assert_count(one & other, len(one), 0.1**2)
 
 
 def _stuck(**sensor: str | int) -> tuple[Bits, Bits]:
@@ -196,9 +185,3 @@ def test_a_window_has_the_very_bits_of_the_whole_frame() -> None:
     whole, windows = _frames(), _frames(x0=x0)
     for f in range(FRAMES):
         assert np.array_equal(windows[f], whole[f, :, x0[f] // 8 : x0[f] // 8 + 8])
-
-
-def test_effects_act_in_the_order_of_the_way_from_the_diode_to_the_link() -> None:
-    model = FluxModel(sensor_setting(**EVERYTHING))
-    assert list(model.bits) == ["afterpulsing and dead time", "crosstalk", "hot and dead pixels", "bit errors"]
-    assert not FluxModel(sensor_setting()).bits

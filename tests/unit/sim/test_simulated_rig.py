@@ -30,7 +30,6 @@ from drivers.interfaces import (
 )
 from drivers.registry import Surroundings
 from drivers.ring import BlockRing, OnFull
-from drivers.spb1 import walk_blocks
 from sim_backend.devices import laser, scanner, spad, sync
 from sim_backend.light.optics import Sensor
 from sim_backend.world import SimulatedWorld, WorldConfig
@@ -153,21 +152,6 @@ def test_frames_are_lit_exactly_while_the_gate_is_high_where_the_mirror_is(small
     assert late @ x / late.sum() > early @ x / early.sum() + 8
 
 
-def test_the_gate_lowered_midway_ends_the_light(small: Rig) -> None:
-    ring = small.start(block_frames=10)
-    reader = ring.reader("test")
-    for _ in range(30):
-        small.spad.fill(ring, 1.0)
-        reader.next(0.1)
-    small.sync.gate_low()
-    after = []
-    while small.spad.fill(ring, 1.0):
-        block = reader.next(0.1)
-        assert block is not None
-        after.append(block.records["marks"].copy())
-    assert not np.any(np.concatenate(after) & (Mark.GATE_HIGH | Mark.GATE_EDGE))
-
-
 def test_windows_move_with_the_markers_and_hold_the_bits_of_the_full_frames(tmp_path: Path) -> None:
     entries = np.arange(31) // 7 % 2 * 64
     window = WindowTable(64, (entries.astype(np.int32), 64 - entries.astype(np.int32)))
@@ -187,20 +171,6 @@ def test_windows_move_with_the_markers_and_hold_the_bits_of_the_full_frames(tmp_
         for i in range(len(run.frames)):
             assert np.array_equal(run.bits[i], full.bits[i, :, at[i] : at[i] + 8])
         assert set(run.records["x0"].tolist()) == {0, 64}
-
-
-def test_a_block_of_windows_is_an_spb1_block(small: Rig) -> None:
-    ring = small.start(block_frames=10, window=WindowTable(64, (np.array([64], np.int32),)))
-    reader = ring.reader("test")
-    small.spad.fill(ring, 1.0)
-    block = reader.next(0.1)
-    assert block is not None
-    slot = next(memory for memory in ring._memory if np.shares_memory(memory, block.bits))
-    (read,) = walk_blocks(slot, ring.stride, check_payload=True)
-    assert isinstance(read, FrameBlock)
-    assert (read.header.width, read.header.sensor_width) == (64, 70)
-    assert np.array_equal(read.records, block.records)
-    assert np.array_equal(read.bits, block.bits)
 
 
 def test_records_tell_markers_direction_and_counters(small: Rig) -> None:
