@@ -1,7 +1,5 @@
 """The only place where the yardstick touches the project: counts and calibration files in, stripe table out."""
 
-from __future__ import annotations
-
 import tempfile
 import time
 from collections.abc import Sequence

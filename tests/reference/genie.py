@@ -10,8 +10,6 @@ The genie may not know: the truth's sub-pixel place, the albedo of a pixel, whic
 About 2-4 s per map of 500 columns on two free cores.
 """
 
-from __future__ import annotations
-
 import math
 from dataclasses import dataclass
 

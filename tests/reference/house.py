@@ -10,8 +10,6 @@ limit that is not kept is told; the exit code is 1 where one is broken that must
 told as 'short by N' and do not fail.
 """
 
-from __future__ import annotations
-
 import argparse
 import ast
 import re

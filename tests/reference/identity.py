@@ -10,8 +10,6 @@ commands (`rig ...`) and files are used, so that modules may move. Hashes differ
 exit code is 1 where anything differs.
 """
 
-from __future__ import annotations
-
 import argparse
 import hashlib
 import json

@@ -1,7 +1,5 @@
 """The yardstick against closed forms: geometry, light, photon statistics, packing, genie and score."""
 
-from __future__ import annotations
-
 import math
 from dataclasses import replace
 from pathlib import Path

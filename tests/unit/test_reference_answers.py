@@ -1,7 +1,5 @@
 """Figures of the yardstick for `joint`: charges, calibration, averaged pixels, and the table of what is asked."""
 
-from __future__ import annotations
-
 import numpy as np
 import pytest
 
