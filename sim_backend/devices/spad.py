@@ -383,11 +383,7 @@ def create(config: SimulatedSpadConfig, surroundings: Surroundings) -> Simulated
     for effect, there, does in (
         ("lost frames", named or chance, f"loses {named} named frames and {chance:g} of all others"),
         ("duplicated frames", twice, f"sends {twice:g} of its frames in place of the next one, too"),
-        (
-            "clock drift",
-            error or wander,
-            f"has a crystal {error:g} ppm off that wanders {wander:g} ppm per root second",
-        ),
+        ("clock drift", error or wander, f"has a crystal {error:g} ppm off, wandering by {wander:g} ppm/sqrt(s)"),
     ):
         if there:
             note_effect(surroundings, effect, f"the SPAD {does}")
