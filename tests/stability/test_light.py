@@ -12,7 +12,7 @@ from sim_backend.effects.ambient import airlight, ambient
 from sim_backend.effects.catalogue import CATALOGUE
 from sim_backend.effects.dark_counts import dark_counts, dark_rates
 from sim_backend.effects.fog import Haze
-from sim_backend.effects.stripe import ForwardBlur, Stripe
+from sim_backend.effects.stripe import Stripe
 from sim_backend.frames.flux import FluxModel, hold_s
 from sim_backend.light.optics import Line, Optics, Sensor, ambient_irradiance, detections_per_radiance
 from sim_backend.light.sheet import LightSheet, empty_sheet, span_bounds, trace_rows
@@ -97,7 +97,7 @@ SCENE = st.fixed_dictionaries(
 
 
 @covers(FluxModel, hold_s, empty_sheet, CameraView)
-@covers(airlight, ambient, Haze.add, dark_counts, dark_rates, ForwardBlur.add)
+@covers(airlight, ambient, Haze.add, dark_counts, dark_rates)
 @EXAMPLES
 @given(
     scene=SCENE, baseline=st.sampled_from([-0.3, 1e-9, 1e-3, 0.3, 30.0]), command=st.floats(-1, 1),
