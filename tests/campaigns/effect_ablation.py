@@ -11,7 +11,7 @@ that may change.
 
 import argparse
 import sys
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterable, Iterator, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from statistics import fmean, stdev
@@ -76,11 +76,13 @@ class Ablation:
 TITLES = ("scene", "left out", "bound, px", "difference of the mean error, px", "time saved")
 
 
-def ablations(config: RigConfig, folder: Path, seeds: Sequence[int]) -> Iterator[Ablation]:
-    """The scenes one by one; folder: for their files."""
-    for name, content in SCENES.items():
+def ablations(
+    config: RigConfig, folder: Path, seeds: Sequence[int], names: Iterable[str] = SCENES
+) -> Iterator[Ablation]:
+    """The scenes of these names one by one; folder: for their files."""
+    for name in names:
         file = folder / f"{name.replace(' ', '-')}.yaml"
-        file.write_text(yaml.safe_dump({"surfaces": "street", **content}))
+        file.write_text(yaml.safe_dump({"surfaces": "street", **SCENES[name]}))
         yield _ablation(name, api.configure(config, scene=str(file)), seeds)
 
 
