@@ -25,9 +25,7 @@ if TYPE_CHECKING:
     from sim_backend.world import SimulatedWorld
 
 
-MOTION = "motion"
-TIMED_FRAMES = 50
-TIMED_ROUNDS = 5
+TIMED_FRAMES, TIMED_ROUNDS = 50, 5
 SPARSITY = 6
 """Halvings of the lit share on which bits are timed: 1 pixel in 2^6, as in fog."""
 
@@ -104,7 +102,7 @@ def _light(
         frames = exposures if held == 0 else min(exposures, max(1, round(held / exposure_s)))
         photons[name] = joules * float(np.mean([part[name][0].sum(dtype=np.float64) for part in parts]))
         took_s = [part[name][1] for part in parts]
-        if name == MOTION:  # its work is the view that all others ask for, whatever the columns
+        if name == "motion":  # its work is the view that all others ask for, whatever the columns
             took_s = [_took_s(partial(view.at, (turn + 1) * held)) for turn in range(TIMED_ROUNDS)]
             frames = max(1, round(held / exposure_s))
         us[name] = 1e6 * median(took_s) / frames

@@ -40,11 +40,6 @@ class FluxModel:
         """Detections per second without the laser, float64 (rows, width)."""
 
     @property
-    def names(self) -> tuple[str, ...]:
-        """The effects whose code runs."""
-        return (*self.laser, *self.steady, *self.bits)
-
-    @property
     def hold_s(self) -> float:
         """Time for which the sheet's light may be taken as constant; 0: nothing moves, it is constant for ever."""
         return min((held for effect in self.laser.values() if (held := hold_s(effect)) > 0), default=0.0)

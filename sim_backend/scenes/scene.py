@@ -1,7 +1,4 @@
-"""The scene file: surfaces, medium, weather, ambient light, motion. Unknown keys are refused, quantities carry units.
-
-docs/reference/config.md has an example and says what each key means.
-"""
+"""The scene file: surfaces, medium, weather, ambient light, motion; docs/reference/config.md says what keys mean."""
 
 import difflib
 import os
