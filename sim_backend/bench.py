@@ -7,6 +7,7 @@ made before stay as they are. Thread-safe."""
 import threading
 from collections.abc import Sequence
 from dataclasses import dataclass
+from functools import partial
 
 import numpy as np
 from numpy.typing import NDArray
@@ -15,9 +16,7 @@ from calibration.model.rig_model import Lag
 from drivers.clock import NS_PER_S, Clock
 from drivers.interfaces import MARKER_LINE, MARKER_SCAN, Pulse, ScanWaveform, SyncStatus
 from sim_backend.gate_program import GateProgram, gate_shares
-from sim_backend.mirror_motion import Jitter, Playing, resting
-
-Array = NDArray[np.float64]
+from sim_backend.mirror_motion import Array, Jitter, Playing, resting
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -145,7 +144,7 @@ class Bench:
         program = self._program
         if program is None:
             return np.zeros(len(start_s)), np.zeros(len(start_s), bool)
-        program.advance(until_s, self._trigger)
+        program.advance(until_s, partial(self._motion.first_high, MARKER_SCAN))
         program.forget(float(start_s[0]) - exposure_s)
         times, words = program.levels(float(start_s[0]), until_s)
         return gate_shares(times, words, start_s, exposure_s)
@@ -153,7 +152,4 @@ class Bench:
     def _catch_up(self) -> None:
         assert self._program is not None
         # Up to and including now: an edge at this very moment has happened.
-        self._program.advance(np.nextafter(self.now_s(), np.inf), self._trigger)
-
-    def _trigger(self, from_s: float, until_s: float) -> float | None:
-        return self._motion.first_high(MARKER_SCAN, from_s, until_s)
+        self._program.advance(np.nextafter(self.now_s(), np.inf), partial(self._motion.first_high, MARKER_SCAN))

@@ -18,25 +18,23 @@ out together would change more than `MOST_CHANGED` of the decisions.
 
 from collections.abc import Callable, Collection, Sequence
 from dataclasses import dataclass
+from itertools import product
 from typing import Literal
 
 import numpy as np
-from numpy.typing import NDArray
 
 from sim_backend.effects.catalogue import CATALOGUE, MEASURED, Entry
-from sim_backend.effects.setting import PlannedFor, Setting
+from sim_backend.effects.setting import Array, PlannedFor, Setting
 from sim_backend.frames.flux import FluxModel, hold_s
-from sim_backend.light.sheet import LightSheet, empty_sheet
+from sim_backend.light.sheet import empty_sheet
 
-Array = NDArray[np.float64]
 Wanted = Literal["planned", "all"] | tuple[str, ...]
 """The effects to run of those that a scene calls for: all but the negligible ones, all, or these."""
 
 MOST_CHANGED = 0.01
 """Share of decisions that may change by all that is left out: eps = 2e-4."""
 MOST = PlannedFor(power_w=1.0, exposure_s=1e-3, exposures=100)
-"""The most that a plan holds for where nobody says what is to be scanned: more than a line laser and an ordinary scan
-have."""
+"""Plan where nobody says what is to be scanned: more than a line laser and an ordinary scan have."""
 SAFETY = 2.0
 """Safety factor on the mean over sampled rows: their spread over rows and columns is less."""
 SAMPLED_COLUMNS, SAMPLED_BANDS, BAND_ROWS = 16, 4, 8
@@ -130,8 +128,11 @@ class _Bounds:
         light = [name for name, effect in model.laser.items() if name != MEASURED and hold_s(effect) == 0]
         self.names = (*light, *model.steady)
         """Names of the effects that can be bounded: light that stands still, and dark counts."""
-        self._bands = _bands(model.setting.view.rows)
-        self._sheets = _sheets(model, planes, self._bands) if light else []
+        view = model.setting.view
+        self._bands = _bands(view.rows)
+        self._sheets = [empty_sheet(plane, view.rows) for plane in planes] if light else []
+        for sheet, (first, last) in product(self._sheets, self._bands):
+            view.trace(sheet, first, last)
         self._whole = self._sampled(()) if light else np.zeros(0)
 
     def changes(self, names: Collection[str]) -> float:
@@ -164,10 +165,8 @@ class _Bounds:
 def _changed(change: Array, least: Array) -> Array:
     """The bound above per row for photons (..., width) of a column: by how much they change, and the least they are."""
     small = change < least
-    with np.errstate(divide="ignore", invalid="ignore"):
-        spread = np.where(small, change * change / least, 0.0).sum(axis=-1)
-    result: Array = 0.5 * np.sqrt(spread) + np.where(small, 0.0, change).sum(axis=-1)
-    return result
+    spread = np.divide(change * change, least, out=np.zeros_like(change), where=small)
+    return np.asarray(0.5 * np.sqrt(spread.sum(axis=-1)) + np.where(small, 0.0, change).sum(axis=-1))
 
 
 def _bands(rows: int) -> list[tuple[int, int]]:
@@ -180,13 +179,3 @@ def _bands(rows: int) -> list[tuple[int, int]]:
 
 def _rows(values: Array, bands: Sequence[tuple[int, int]]) -> Array:
     return np.concatenate([values[first:last] for first, last in bands])
-
-
-def _sheets(model: FluxModel, planes: Array, bands: Sequence[tuple[int, int]]) -> list[LightSheet]:
-    """Sheets of the planes, traced on the bands."""
-    view = model.setting.view
-    sheets = [empty_sheet(plane, view.rows) for plane in planes]
-    for sheet in sheets:
-        for first, last in bands:
-            view.trace(sheet, first, last)
-    return sheets

@@ -6,17 +6,17 @@ share it, effects on the bits per whole frame; light that does not depend on the
 """
 
 import time
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from dataclasses import asdict
+from functools import partial
 from statistics import median
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
-from numpy.typing import NDArray
 
 from sim_backend.effect_planner import EffectDecision
 from sim_backend.effects.catalogue import CATALOGUE, MEASURED
-from sim_backend.effects.setting import FrameTimes, Words
+from sim_backend.effects.setting import Array, FrameTimes, Words
 from sim_backend.frames.flux import FluxModel, hold_s
 from sim_backend.light.sheet import LightSheet
 from sim_backend.random_numbers import WORD_PX
@@ -24,11 +24,8 @@ from sim_backend.random_numbers import WORD_PX
 if TYPE_CHECKING:
     from sim_backend.world import SimulatedWorld
 
-Array = NDArray[np.float64]
 
-MOTION = "motion"
-TIMED_FRAMES = 50
-TIMED_ROUNDS = 5
+TIMED_FRAMES, TIMED_ROUNDS = 50, 5
 SPARSITY = 6
 """Halvings of the lit share on which bits are timed: 1 pixel in 2^6, as in fog."""
 
@@ -72,14 +69,10 @@ def flux_row(
         view.trace(sheet, row, row + 1)
         for name, (rate, _) in _parts(model, sheet, row, row + 1).items():
             lit[name] = lit.get(name, 0.0) + rate[0]
-    found = {}
-    for entry in CATALOGUE:
-        if entry.kind == "laser":
-            found[entry.name] = exposure_s * (power_w * world.fan.share) * lit.get(entry.name, np.zeros(world.size[1]))
-        elif entry.kind == "steady":
-            steady = model.steady.get(entry.name)
-            found[entry.name] = np.zeros(world.size[1]) if steady is None else exposure_s * steady[row]
-    return found
+    found = {name: exposure_s * (power_w * world.fan.share) * rate for name, rate in lit.items()}
+    found |= {name: exposure_s * steady[row] for name, steady in model.steady.items()}
+    light = [entry.name for entry in CATALOGUE if entry.kind in ("laser", "steady")]
+    return {name: found.get(name, np.zeros(view.width)) for name in light}
 
 
 def _line(decision: EffectDecision, share: float, costs: Mapping[str, float | None]) -> dict[str, Any]:
@@ -99,7 +92,8 @@ def _light(
     world: "SimulatedWorld", model: FluxModel, joules: float, exposure_s: float, exposures: int
 ) -> tuple[dict[str, float], dict[str, float]]:
     """Mean photons per frame over the mirror positions, and us per frame, of every effect of the laser."""
-    sheets = [world.setting.view.sheet(plane) for plane in world.sampled_planes]
+    view = world.setting.view
+    sheets = [view.sheet(plane) for plane in world.sampled_planes]
     _parts(model, sheets[0], 0, 1, np.float32)  # compiled, and in the cache; in the precision that frames are drawn in
     parts = [_parts(model, sheet, 0, world.size[0], np.float32) for sheet in sheets]
     photons, us = {}, {}
@@ -108,17 +102,17 @@ def _light(
         frames = exposures if held == 0 else min(exposures, max(1, round(held / exposure_s)))
         photons[name] = joules * float(np.mean([part[name][0].sum(dtype=np.float64) for part in parts]))
         took_s = [part[name][1] for part in parts]
-        if name == MOTION:  # its work is the view that all others ask for, whatever the columns
-            took_s = [_view_s(world, (turn + 1) * held) for turn in range(TIMED_ROUNDS)]
+        if name == "motion":  # its work is the view that all others ask for, whatever the columns
+            took_s = [_took_s(partial(view.at, (turn + 1) * held)) for turn in range(TIMED_ROUNDS)]
             frames = max(1, round(held / exposure_s))
         us[name] = 1e6 * median(took_s) / frames
     return photons, us
 
 
-def _view_s(world: "SimulatedWorld", time_s: float) -> float:
-    """Seconds that the view of a new time takes."""
+def _took_s(work: Callable[[], object]) -> float:
+    """Seconds that the work takes."""
     begun_s = time.perf_counter()
-    world.setting.view.at(time_s)
+    work()
     return time.perf_counter() - begun_s
 
 
@@ -132,9 +126,7 @@ def _parts(
     parts = {}
     for name, effect in model.laser.items():
         before = rate[first_row:last_row].copy()
-        begun_s = time.perf_counter()
-        effect.add(sheet, first_row, last_row, rate)
-        took_s = time.perf_counter() - begun_s
+        took_s = _took_s(partial(effect.add, sheet, first_row, last_row, rate))
         parts[name] = rate[first_row:last_row] - before, took_s
     return parts
 
@@ -151,9 +143,6 @@ def _bits_us(world: "SimulatedWorld", model: FluxModel, times: FrameTimes) -> di
     for name, effect in model.bits.items():
         took_s = []
         for turn in range(TIMED_ROUNDS + 1):
-            words = frames[1:].copy()
-            begun_s = time.perf_counter()
-            effect.apply(np.uint64(turn), 1, words, frames[0], times)
-            took_s.append(time.perf_counter() - begun_s)
+            took_s.append(_took_s(partial(effect.apply, np.uint64(turn), 1, frames[1:].copy(), frames[0], times)))
         us[name] = 1e6 * median(took_s[1:]) / TIMED_FRAMES
     return us

@@ -17,7 +17,6 @@ from sim_backend.random_numbers import GOLDEN, mixed
 
 Array = NDArray[np.float64]
 
-
 JITTER_HOLD_S = 1e-4
 """Time for which the mirror's error stays the same: a small galvo answers within 100 us."""
 

@@ -9,7 +9,7 @@ which two rounds spread over all 16; after the third, bytes of two blocks agree 
 1e-7. For single numbers that follow from a seed and a place there is SplitMix64 (Steele, Lea, Flood 2014).
 
 One AES round of 256 bits takes one cycle on x86 with VAES, two with AES-NI or on 64-bit ARM. Elsewhere it is table
-look-ups: the same bits, many times as slow. Everything here is for code compiled with `numba.njit`.
+look-ups: the same bits, many times as slow.
 
 Exponentials are straight-line, so that loops over them become vector instructions; libm's are calls. With k = round(t)
 and f = k - t, |f| <= 1/2:  2^-t = 2^-k 2^f, the latter by its Taylor series. Relative error against 50 digits:
@@ -49,6 +49,15 @@ _PACKED: Final = (*range(8), *range(16, 24), *range(8, 16), *range(24, 32))
 PLACE: Final = tuple(8 * (0, 2, 1, 3, 4, 6, 5, 7)[x // 8] + 7 - x % 8 for x in range(WORD_PX))
 """Place of the level of pixel x of a word, so that bits come out as `packbits` has them."""
 
+_S_BOX = bytes.fromhex(
+    "637c777bf26b6fc53001672bfed7ab76ca82c97dfa5947f0add4a2af9ca472c0b7fd9326363ff7cc34a5e5f171d8311504c723c3"
+    "1896059a071280e2eb27b27509832c1a1b6e5aa0523bd6b329e32f8453d100ed20fcb15b6acbbe394a4c58cfd0efaafb434d3385"
+    "45f9027f503c9fa851a3408f929d38f5bcb6da2110fff3d2cd0c13ec5f974417c4a77e3d645d197360814fdc222a908846eeb814"
+    "de5e0bdbe0323a0a4906245cc2d3ac629195e479e7c8376d8dd54ea96c56f4ea657aae08ba78252e1ca6b4c6e8dd741f4bbd8b8a"
+    "703eb5664803f60e613557b986c11d9ee1f8981169d98e949b1e87e9ce5528df8ca1890dbfe6426841992d0fb054bb16"
+)
+"""S-box of AES (FIPS 197, figure 7)."""
+
 _intrinsic: Any = intrinsic
 _Code = tuple[Any, Callable[[Any, Any, Any, Any], Any]]
 
@@ -71,37 +80,13 @@ def _chosen(builder: Any, a: Any, b: Any, places: Any) -> Any:
     return builder.shuffle_vector(a, b, ir.Constant(ir.VectorType(_I32, len(numbers)), numbers))
 
 
-def _doubled(value: int) -> int:
-    """Times x in AES's field of 256 elements."""
-    return (value << 1) ^ (0x11B if value & 0x80 else 0)
-
-
-def _product(a: int, b: int) -> int:
-    total = 0
-    while b:
-        total ^= a if b & 1 else 0
-        a, b = _doubled(a), b >> 1
-    return total
-
-
-def substitution() -> NDArray[np.uint8]:
-    """AES's S-box: the inverse in the field, then an affine map (FIPS 197, 5.1.1)."""
-    box = np.zeros(256, np.uint8)
-    for value in range(256):
-        inverse = next((i for i in range(256) if _product(value, i) == 1), 0)
-        turned = inverse
-        for turn in range(1, 5):
-            turned ^= (inverse << turn | inverse >> (8 - turn)) & 0xFF
-        box[value] = turned ^ 0x63
-    return box
-
-
 def _table(builder: Any) -> Any:
     """A table of what each byte of a column becomes: its S-box value times 2, 1, 1 and 3, lowest byte first."""
     name = "spadrig.aes"
     known = builder.module.globals.get(name)
     if known is None:
-        values = [_product(s, 2) | s << 8 | s << 16 | _product(s, 3) << 24 for s in map(int, substitution())]
+        doubled = [s << 1 ^ (0x11B if s & 0x80 else 0) for s in _S_BOX]  # times x in the field of 256 elements
+        values = [two | s << 8 | s << 16 | (two ^ s) << 24 for s, two in zip(_S_BOX, doubled, strict=True)]
         kind = ir.ArrayType(_I32, 256)
         known = ir.GlobalVariable(builder.module, kind, name)
         known.linkage, known.global_constant = "internal", True
@@ -144,10 +129,8 @@ def _round_of_pair(builder: Any, state: Any, key: Any) -> Any:
     """One AES round of each half of 256 bits."""
     if _has("vaes"):
         return _call(builder, "llvm.x86.aesni.aesenc.256", _PAIR, state, key)
-    low, high = (
-        round_of_block(builder, *(_chosen(builder, v, v, places) for v in (state, key))) for places in ((0, 1), (2, 3))
-    )
-    return _chosen(builder, low, high, range(4))
+    halves = ([_chosen(builder, v, v, places) for v in (state, key)] for places in ((0, 1), (2, 3)))
+    return _chosen(builder, *(round_of_block(builder, *half) for half in halves), range(4))
 
 
 def _vector(builder: Any, kind: Any, halves: Any) -> Any:
@@ -198,14 +181,9 @@ def _levels_at(builder: Any, address: Any) -> list[Any]:
 
 @numba.njit(cache=True)
 def block_numbers(words: int) -> NDArray[np.uint64]:
-    """The block numbers that `drawn_word` takes for each word of a row, uint64 (words, 16): that of each block,
-    twice.
-    """
-    numbers = np.empty((words, 2 * WORD_PX // BLOCK_PX), np.uint64)
-    for k in range(words):
-        for i in range(2 * WORD_PX // BLOCK_PX):
-            numbers[k, i] = k * (WORD_PX // BLOCK_PX) + i // 2
-    return numbers
+    """Block numbers that `drawn_word` takes for each word of a row, uint64 (words, 16): that of each block, twice."""
+    shape = words, 2 * WORD_PX // BLOCK_PX
+    return np.repeat(np.arange(words * WORD_PX // BLOCK_PX), 2).astype(np.uint64).reshape(shape)
 
 
 @_intrinsic
@@ -299,12 +277,10 @@ HALVING: Final[dict[Any, tuple[Any, ...]]] = {
     np.float64: (1010.0, _ROUNDER, *_SERIES),
     np.float32: tuple(map(np.float32, (120.0, _ROUNDER_32, *_SERIES))),
 }
-"""Constants of `power_of_half`, by precision: the most halvings, above which it stays what it is there; rounder;
-series."""
+"""Constants of `power_of_half`, by precision: most halvings, rounder, series."""
 _SERIES_32 = (1 / math.factorial(n) for n in (0, 2, 3, 4, 5, 6))
 ROUGHLY: Final = tuple(map(np.float32, (80.0, LOG2_E, _ROUNDER_32, math.log(2), *_SERIES_32)))
-"""Constants of `one_minus_exp_minus_32`: largest t, scale, rounder, ln 2, series without its linear term;
-float32."""
+"""Constants of `one_minus_exp_minus_32`: largest t, scale, rounder, ln 2, series without its linear term."""
 
 
 @_intrinsic

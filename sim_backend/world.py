@@ -6,12 +6,11 @@ from pathlib import Path
 from typing import Annotated, Any, ClassVar
 
 import numpy as np
-from numpy.typing import NDArray
-from pydantic import AfterValidator, BaseModel, BeforeValidator, ConfigDict, Field
+from pydantic import AfterValidator, BeforeValidator, Field
 
 from calibration.errors import CalibrationError
 from calibration.files.rig_file import load_rig_model
-from calibration.model.rig_model import RigModel
+from calibration.model.rig_model import Lag, RigModel
 from drivers.errors import DeviceError
 from drivers.interfaces import SweepTruth
 from drivers.registry import Kind, KindConfig, Surroundings
@@ -19,18 +18,15 @@ from drivers.units import parse_quantity
 from sim_backend.bench import Bench, BenchState
 from sim_backend.effect_planner import MOST, SAMPLED_COLUMNS, EffectPlan, Wanted, is_active, plan_effects
 from sim_backend.effects.catalogue import CATALOGUE
-from sim_backend.effects.setting import FrameTimes, PlannedFor, Setting
+from sim_backend.effects.setting import Array, FrameTimes, PlannedFor, Setting
 from sim_backend.frames.flux import ROUNDING, FluxModel, column_grid, fine_grid
 from sim_backend.frames.photons import PhotonSource
-from sim_backend.light.line import ONE_LINE, LineFan, line_fan, line_width
+from sim_backend.light.line import ONE_LINE, LineFan, line_width
 from sim_backend.light.optics import Line, Optics, Sensor, detections_per_radiance
 from sim_backend.light.view import make_view
+from sim_backend.scenes.medium import Section
 from sim_backend.scenes.scene import CLEAR, BoardPlace, load_scene, load_surfaces, with_board_at, with_fog
 
-Array = NDArray[np.float64]
-
-DARK_EFFECTS = ("dark counts",)
-"""Steady detections that need no light."""
 LEAST_PIXELS = 2
 """Least size of the camera each way: light is computed with the slopes of the rays from pixel to pixel."""
 DEFAULT_GEOMETRY = Path(__file__).parent.parent / "config" / "simulated-rig.yaml"
@@ -56,10 +52,8 @@ def _known_fog(fog: object) -> object:
     return fog
 
 
-class CommandGridConfig(BaseModel):
+class CommandGridConfig(Section):
     """Mirror commands of the first and last column's centre, and the number of columns."""
-
-    model_config = ConfigDict(extra="forbid", frozen=True)
 
     first: float
     last: float
@@ -149,7 +143,7 @@ class SimulatedWorld:
         """
         frames = exposures + 1  # as many as a column can get, since the clocks are independent
         # Photons of several lines add up: what can be left out of one with all their power can be left out of each.
-        planned_for = PlannedFor(power_w * self.fan.power_factor, frames * exposure_s, frames)
+        planned_for = PlannedFor(power_w * (self.fan.share * len(self.fan.offsets)), frames * exposure_s, frames)
         if planned_for != self._planned_for:
             self._planned_for, self._planned = planned_for, None
         self._plan()
@@ -185,7 +179,7 @@ class SimulatedWorld:
 
         shared: they share the laser's power; else each has all of it. To be called before the SPAD is configured.
         """
-        self.fan = line_fan(offsets, shared=shared)
+        self.fan = LineFan(tuple(offsets), 1 / len(offsets) if shared else 1.0)
 
     def hold_columns(self, commands: Array) -> None:
         """Hold the flux in columns of these mirror commands (columns,): all frames of a column share one p.
@@ -199,7 +193,7 @@ class SimulatedWorld:
 
         To be called before the SPAD is configured; for good.
         """
-        kept = [entry for entry in CATALOGUE if entry.name in DARK_EFFECTS or entry.kind == "bits"]
+        kept = [entry for entry in CATALOGUE if entry.name == "dark counts" or entry.kind == "bits"]
         wanted = [e for e in kept if e.called(self.setting)[0] and is_active(e.name, self.config.effects)]
         self._planned = self._plan()[0], FluxModel(self.setting, wanted)
 
@@ -289,6 +283,18 @@ def _load_geometry(path: Path) -> RigModel:
             f"least {LEAST_PIXELS} each way, give it more rows and columns"
         )
     return model
+
+
+def bench_of(surroundings: Surroundings) -> Bench:
+    """The shared bench; without a simulated world a bench nobody else sees, for a single device among real ones."""
+    world = surroundings.world
+    return world.bench if isinstance(world, SimulatedWorld) else Bench(surroundings.clock, Lag())
+
+
+def note_effect(surroundings: Surroundings, effect: str, why: str) -> None:
+    """Tell the world that a device has an effect of its own, one of the catalogue's of kind `within`, and which."""
+    if isinstance(surroundings.world, SimulatedWorld):
+        surroundings.world.setting.devices[effect] = why
 
 
 KIND = Kind(config=WorldConfig, create=SimulatedWorld)

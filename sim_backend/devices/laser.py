@@ -7,7 +7,7 @@ from pydantic import Field
 from drivers.lasers.serial_laser import PlainLaser
 from drivers.registry import Kind, KindConfig, Surroundings
 from drivers.units import Watts
-from sim_backend.devices.place import bench_of
+from sim_backend.world import bench_of
 
 
 class SimulatedLaserConfig(KindConfig):

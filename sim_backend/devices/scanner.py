@@ -10,8 +10,8 @@ from drivers.interfaces import BeamScanner, ScannerLimits, ScannerStatus, ScanWa
 from drivers.registry import Kind, KindConfig, Surroundings
 from drivers.units import Ppm, Seconds
 from sim_backend.bench import Bench
-from sim_backend.devices.place import bench_of, note_effect
 from sim_backend.mirror_motion import Jitter
+from sim_backend.world import bench_of, note_effect
 
 MASTER_HZ = 48_000_000
 """Master clock: the point clock is this divided by a whole number, as in a timer of a microcontroller."""

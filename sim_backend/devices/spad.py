@@ -3,19 +3,17 @@
 On a `VirtualClock` time passes as frames are made; on any other clock a block comes when its last frame has been
 exposed.
 
-On the way to the computer some frames get lost, some come twice. A frame comes twice where the memory before the link
-gives its last entry once more instead of the next one: pixels, markers, counters and ticks are all those of the frame
-before, and the frame itself is gone. Its number is the next one all the same, since blocks count what they hold; only
-its ticks tell. Which frames follows from seed and number.
+On the way to the computer some frames get lost, some come twice: pixels, markers, counters and ticks are those of the
+frame before, and the frame itself is gone. Its number is the next one all the same, since blocks count what they hold;
+only its ticks tell. Which frames follows from seed and number.
 
-The tick counter runs on a crystal of its own (`clock_error`, `clock_wander`), off from the time of the bench by a
-constant, and wandering:
+The tick counter runs on a crystal of its own (`clock_error`, `clock_wander`), off by a constant, and wandering:
 
     dt/dtick = 1 / (tick_hz (1 + y)),    y = error + W,    W a random walk: var W(t) = wander^2 t
 
 (random walk of frequency, of which the Allan deviation is wander sqrt(t/3): D. Allan, IEEE Trans. UFFC 34, 647, 1987.)
-W makes a step every millisecond of the counter, the same for any blocks. An ordinary crystal is off by up to 50 ppm,
-and by 1 ppm more per K; a wander of 0.1 ppm per root second is much.
+W makes a step every millisecond of the counter. An ordinary crystal is off by up to 50 ppm, and by 1 ppm more per K; a
+wander of 0.1 ppm per root second is much.
 """
 
 import os
@@ -27,7 +25,7 @@ from numpy.typing import NDArray
 from pydantic import Field
 
 from drivers.clock import NS_PER_S, VirtualClock
-from drivers.errors import DeviceTimeout, LimitExceeded
+from drivers.errors import DeviceError, DeviceTimeout, LimitExceeded
 from drivers.frames import FRAME_RECORD, SUBFRAME_SHIFT, BlockFlag, BlockHeader, Mark
 from drivers.interfaces import SpadArray, SpadCounters, SpadInfo, SpadRequest, SpadTiming, StreamMode, WindowTable
 from drivers.registry import Kind, KindConfig, Surroundings
@@ -35,44 +33,18 @@ from drivers.ring import BlockRing
 from drivers.spb1 import BlockLayout, block_views, seal_block
 from drivers.units import BytesPerSecond, ExactHertz, Ppm
 from sim_backend.bench import BenchState
-from sim_backend.devices.place import note_effect, world_of
-from sim_backend.effects.setting import FrameTimes
+from sim_backend.effects.setting import Array, FrameTimes
 from sim_backend.frames.photon_kernels import dropped_frames
 from sim_backend.frames.photons import PhotonSource
-from sim_backend.world import SimulatedWorld
+from sim_backend.world import SimulatedWorld, note_effect
 
 _TWICE = np.uint64(0xE7037ED1A0B428DB)
 """Stream that keeps the draws of frames that come twice apart from those of frames that get lost."""
 
 
-class FrameLink:
-    """The way to the computer, on which frames get lost and come twice as the config says."""
-
-    def __init__(self, config: "SimulatedSpadConfig", seed: int) -> None:
-        self._config = config
-        self._lost_frames = np.array(sorted(set(config.lost_frames)), dtype=np.int64)
-        self._seed = np.uint64(seed & 0xFFFFFFFFFFFFFFFF)
-
-    def loses(self, first_frame: int, n: int) -> NDArray[np.bool_]:
-        """Mask of the frames that get lost, bool (n,)."""
-        lost: NDArray[np.bool_] = dropped_frames(self._seed, first_frame, n, self._config.loss_probability)
-        named = self._lost_frames[np.searchsorted(self._lost_frames, first_frame) :]
-        lost[named[named < first_frame + n] - first_frame] = True
-        return lost
-
-    def repeat(self, first_frame: int, records: NDArray[np.void], bits: NDArray[np.uint8]) -> None:
-        """Replace frames of a block by those before them; its first has none before it in the memory."""
-        duplicates = self._config.duplicate_probability
-        if duplicates == 0:
-            return
-        twice = dropped_frames(self._seed ^ _TWICE, first_frame, len(records), duplicates)
-        for i in np.flatnonzero(twice[1:]) + 1:
-            records[i], bits[i] = records[i - 1], bits[i - 1]
-
-
-Array = NDArray[np.float64]
-
 SUBFRAME_STEPS = 256
+STEP_S = 1e-3
+"""Time between the steps of a wandering crystal's error."""
 
 
 class MarkerInputs:
@@ -90,12 +62,9 @@ class MarkerInputs:
 
         Returns the scan markers since START at the first of them, which the records' own counters cut to 16 bits.
         """
-        marks = np.zeros(len(start_s), np.int64)
-        marks[state.edge] |= Mark.GATE_EDGE
-        marks[~state.edge & (state.share > 0)] |= Mark.GATE_HIGH
-        marks[state.backward] |= Mark.BACKWARD
-        lines = np.full(len(start_s), self.line, np.int64)
-        sweeps = np.full(len(start_s), self.sweep, np.int64)
+        lit = np.where(state.edge, int(Mark.GATE_EDGE), np.where(state.share > 0, int(Mark.GATE_HIGH), 0))
+        marks = lit | np.where(state.backward, int(Mark.BACKWARD), 0)
+        lines, sweeps = np.full(len(start_s), self.line), np.full(len(start_s), self.sweep)
         events = [(float(t), 0, Mark.SCAN) for t in state.scan_s] + [(float(t), 1, Mark.LINE) for t in state.line_s]
         first = self.sweep
         for time_s, _, mark in sorted(events):
@@ -108,11 +77,8 @@ class MarkerInputs:
                 self.sweep, self.line = self.sweep + 1, 0
             else:
                 self.line += 1
-            lines[frame:] = self.line
-            sweeps[frame:] = self.sweep
-        records["marks"] = marks
-        records["line"] = lines & 0xFFFF
-        records["sweep"] = sweeps & 0xFFFF
+            lines[frame:], sweeps[frame:] = self.line, self.sweep
+        records["marks"], records["line"], records["sweep"] = marks, lines & 0xFFFF, sweeps & 0xFFFF
         return first
 
 
@@ -122,9 +88,6 @@ def windows_at(window: WindowTable | None, first_sweep: int, records: NDArray[np
         return np.zeros(len(records), np.int32)
     since = first_sweep + ((records["sweep"].astype(np.int64) - first_sweep) & 0xFFFF)
     return window.x0_of(records["marks"], records["line"], since - 1)
-
-
-STEP_S = 1e-3
 
 
 class TickClock:
@@ -160,11 +123,8 @@ class TickClock:
 
 
 TICK_HZ = 100_000_000
-"""Tick rate where it divides the frame period; else a multiple of the frame rate near it, so that nothing is rounded.
-"""
+"""Tick rate where it divides the frame period; else a multiple of the frame rate near it: nothing is rounded."""
 TICKS_PER_FRAME = 1024
-LINK_BYTES_PER_S = 8e9
-"""Bytes a second, more than any frame rate needs: unless the config names a `link`, it is no bottleneck."""
 MAX_THREADS = 4
 START_BITS = 48
 MOST_STARTS = 0x3FFF
@@ -179,8 +139,9 @@ class SimulatedSpadConfig(KindConfig):
 
     kind: Literal["simulated"] = "simulated"
     max_frame_rate: Annotated[ExactHertz, Field(gt=0)] = Fraction(100_000)
-    link: Annotated[BytesPerSecond, Field(gt=0)] = LINK_BYTES_PER_S
-    """Bytes a second that the link to the computer carries; where full frames are too much for it, windows are sent."""
+    link: Annotated[BytesPerSecond, Field(gt=0)] = 8e9
+    """Bytes a second that the link to the computer carries; where full frames are too much for it, windows are sent. By
+    default more than any frame rate needs."""
     lost_frames: tuple[int, ...] = ()
     """Numbers of frames that get lost on the way, to try gaps with."""
     loss_probability: float = Field(default=0.0, ge=0, le=1)
@@ -203,10 +164,9 @@ class SimulatedSpad(SpadArray):
         self._config = config
         self._world = world
         self._seed = seed
-        self._threads = min(MAX_THREADS, os.cpu_count() or 1)
+        self._random_seed = seed & 0xFFFFFFFFFFFFFFFF
         self._photons: PhotonSource | None = None
         self._window: WindowTable | None = None
-        self._link = FrameLink(config, seed)
         self._counters = SpadCounters(0, 0, 0, 0, 0)
         self._run_id = self._starts = 0
         self._n_frames: int | None = None
@@ -255,7 +215,7 @@ class SimulatedSpad(SpadArray):
         world = self._world
         self._exposure_s, self._period_s = float(exposure / tick_hz), float(period / tick_hz)
         times = FrameTimes(self._exposure_s, self._period_s)
-        self._photons = world.photons(times, self._seed, self._threads)
+        self._photons = world.photons(times, self._seed, min(MAX_THREADS, os.cpu_count() or 1))
         return self._timing
 
     def _do_start(self, n_frames: int | None) -> None:
@@ -273,7 +233,7 @@ class SimulatedSpad(SpadArray):
         self._starts += 1
         self._run_id = (self._run_id + 1) & 0xFFFF
         crystal = self._config.clock_error, self._config.clock_wander
-        self._ticks = TickClock(float(1 / tick_hz), start_s, *crystal, [self._seed & 0xFFFFFFFFFFFFFFFF, self._run_id])
+        self._ticks = TickClock(float(1 / tick_hz), start_s, *crystal, [self._random_seed, self._run_id])
 
     def _do_fill(self, ring: BlockRing, timeout_s: float) -> bool:
         silent_s = 0.0
@@ -309,7 +269,8 @@ class SimulatedSpad(SpadArray):
         """
         first = self._next_frame
         n = self._block_frames if self._n_frames is None else min(self._block_frames, self._n_frames - first)
-        lost = self._link.loses(first, n)
+        lost = dropped_frames(np.uint64(self._random_seed), first, n, self._config.loss_probability)
+        lost |= np.isin(np.arange(first, first + n), self._config.lost_frames)
         change = np.flatnonzero(lost != lost[0])
         return (int(change[0]) if len(change) else n), bool(lost[0])
 
@@ -344,21 +305,23 @@ class SimulatedSpad(SpadArray):
         records["ticks"] = np.arange(n, dtype=np.uint32) * np.uint32(self._timing.frame_period_ticks)
         records["x0"], records["y0"] = x0, 0
         self._draw(state, start_s, x0, bits)
-        self._link.repeat(self._next_frame, records, bits)
-        header = self._header(sweep, n)
-        block = seal_block(buffer, header, layout, payload_crc=True)
+        if self._config.duplicate_probability:
+            self._repeat(records, bits)
+        block = seal_block(buffer, self._header(sweep, n), layout, payload_crc=True)
         self._advance(n, lost=0)
         ring.publish(block)
         self._block_seq += 1
         self._just_lost = False
 
+    def _repeat(self, records: NDArray[np.void], bits: NDArray[np.uint8]) -> None:
+        """Replace frames of a block by those before them; its first has none before it in the memory."""
+        chance = self._config.duplicate_probability
+        twice = dropped_frames(np.uint64(self._random_seed) ^ _TWICE, self._next_frame, len(records), chance)
+        for i in np.flatnonzero(twice[1:]) + 1:
+            records[i], bits[i] = records[i - 1], bits[i - 1]
+
     def _draw(
-        self,
-        state: BenchState,
-        start_s: NDArray[np.float64],
-        x0: NDArray[np.int32],
-        bits: NDArray[np.uint8],
-        first: int = 0,
+        self, state: BenchState, start_s: Array, x0: NDArray[np.int32], bits: NDArray[np.uint8], first: int = 0
     ) -> None:
         """Draw the next frames, without the first few, into `bits`."""
         assert self._photons is not None, "configured before started"
@@ -379,14 +342,9 @@ class SimulatedSpad(SpadArray):
             clock.sleep((end_ns - clock.now_ns()) / NS_PER_S)
 
     def _header(self, sweep: int, n: int) -> BlockHeader:
-        flags = BlockFlag(0)
-        if self._block_seq == 0:
-            flags |= BlockFlag.FIRST
-        if self._next_frame + n == self._n_frames:
-            flags |= BlockFlag.LAST
-        if self._just_lost:
-            flags |= BlockFlag.LOST_BEFORE
-        timing = self._timing
+        timing, last = self._timing, self._next_frame + n == self._n_frames
+        flags = BlockFlag(0) if self._block_seq else BlockFlag.FIRST
+        flags |= (BlockFlag.LAST if last else 0) | (BlockFlag.LOST_BEFORE if self._just_lost else 0)
         return BlockHeader(
             flags=flags,
             run_id=self._run_id,
@@ -405,7 +363,7 @@ class SimulatedSpad(SpadArray):
             sensor_height=self._info.height,
         )
 
-    def _frames(self, n: int) -> tuple[NDArray[np.float64], BenchState]:
+    def _frames(self, n: int) -> tuple[Array, BenchState]:
         """Start of each of the next n frames in seconds of the bench, and what happens during them."""
         period_ticks = self._timing.frame_period_ticks
         start_s = self._ticks.times_s(self._next_frame * period_ticks, period_ticks, n + 1)
@@ -415,18 +373,21 @@ class SimulatedSpad(SpadArray):
 
 
 def create(config: SimulatedSpadConfig, surroundings: Surroundings) -> SimulatedSpad:
-    """The SPAD that looks at the world."""
-    if config.lost_frames or config.loss_probability:
-        why = f"the SPAD loses {len(config.lost_frames)} named frames and {config.loss_probability:g} of all others"
-        note_effect(surroundings, "lost frames", why)
-    if config.duplicate_probability:
-        why = f"the SPAD sends {config.duplicate_probability:g} of its frames in place of the next one, too"
-        note_effect(surroundings, "duplicated frames", why)
-    if config.clock_error or config.clock_wander:
-        error, wander = 1e6 * config.clock_error, 1e6 * config.clock_wander
-        why = f"the SPAD's crystal is off by {error:g} ppm and wanders by {wander:g} ppm per root second"
-        note_effect(surroundings, "clock drift", why)
-    return SimulatedSpad(config, world_of(surroundings, "simulated SPAD"), surroundings.seed)
+    """The SPAD that looks at the world. DeviceError where the rig has none."""
+    if not isinstance(surroundings.world, SimulatedWorld):
+        raise DeviceError(
+            "simulated SPAD has nothing to look at: the rig has no simulated world; add world: {kind: simulated}"
+        )
+    error, wander = 1e6 * config.clock_error, 1e6 * config.clock_wander
+    named, chance, twice = len(config.lost_frames), config.loss_probability, config.duplicate_probability
+    for effect, there, does in (
+        ("lost frames", named or chance, f"loses {named} named frames and {chance:g} of all others"),
+        ("duplicated frames", twice, f"sends {twice:g} of its frames in place of the next one, too"),
+        ("clock drift", error or wander, f"has a crystal {error:g} ppm off, wandering by {wander:g} ppm/sqrt(s)"),
+    ):
+        if there:
+            note_effect(surroundings, effect, f"the SPAD {does}")
+    return SimulatedSpad(config, surroundings.world, surroundings.seed)
 
 
 KIND = Kind(config=SimulatedSpadConfig, create=create)

@@ -6,7 +6,7 @@ from typing import ClassVar, Literal
 from drivers.interfaces import Pulse, SyncSource, SyncStatus
 from drivers.registry import Kind, KindConfig, Surroundings
 from sim_backend.bench import Bench
-from sim_backend.devices.place import bench_of
+from sim_backend.world import bench_of
 
 RESOLUTION_S = 1e-8
 """Resolution: one cycle of a 100 MHz pattern generator."""

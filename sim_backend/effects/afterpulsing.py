@@ -13,19 +13,16 @@ detection there falls into the blind part with probability
 
     1/T^2 int_0^T min(T, max(0, t + d - P)) dt = s^2 / (2 T^2),    s = d - gap between 0 and T
 
-These are the chances that the pixel's next bit is set, or is cleared, where its bit is 1. With a = 0.5 %, tau = 100 ns
-and frames of 10 us without a gap: 5e-5; with d = 100 ns: 5e-5. Exposures later than the next, and afterpulses of
-afterpulses, are left out.
-
-Called for by `world.sensor.afterpulsing` (a; with `trap_lifetime`, tau) or `dead_time` (d) above 0. Exact draws; cost
-per frame of 512 x 512: 0.8 us at these figures, and the photons of the frame before each block.
+These are the chances that the pixel's next bit is set, or is cleared, where its bit is 1: 5e-5 each with a = 0.5 %,
+tau = d = 100 ns and frames of 10 us without a gap. Exposures later than the next, and afterpulses of afterpulses, are
+left out. Exact draws; cost per frame of 512 x 512: 0.8 us at these figures, and the photons of the frame before each
+block.
 """
 
 import math
 
 import numba
 import numpy as np
-from numpy.typing import NDArray
 
 from sim_backend.effects.sensor_bits import bit_of, log_miss, next_hit
 from sim_backend.effects.setting import FrameTimes, Setting, Words
@@ -68,13 +65,7 @@ def blind_probability(dead_time_s: float, times: FrameTimes) -> float:
 
 @numba.njit(cache=True, nogil=True, error_model="numpy")
 def _carry_over(
-    words: NDArray[np.uint64],
-    before: NDArray[np.uint64],
-    width: int,
-    seed: np.uint64,
-    first_frame: int,
-    after: float,
-    blind: float,
+    words: Words, before: Words, width: int, seed: np.uint64, first_frame: int, after: float, blind: float
 ) -> None:
     """Clear bits of frames (frames, rows, words) that the frame before blinds, then set those that pulse after it."""
     # From the last frame to the first: each finds the one before it as it was.
@@ -86,15 +77,12 @@ def _carry_over(
 
 
 @numba.njit(cache=True, nogil=True, error_model="numpy")
-def _carry_bits(
-    now: NDArray[np.uint64], earlier: NDArray[np.uint64], width: int, key: np.uint64, log_miss: float, lit: bool
-) -> None:
+def _carry_bits(now: Words, earlier: Words, width: int, key: np.uint64, log_miss: float, lit: bool) -> None:
     """Set (lit) or clear each bit (rows, words) that is 1 in the earlier frame, with the chance that log_miss says."""
     draw = 0
     place = next_hit(-1.0, key, draw, log_miss)
     while place < len(now) * width:
-        y = int(place) // width
-        x = int(place) - y * width
+        y, x = divmod(int(place), width)
         bit = earlier[y, x // WORD_PX] & bit_of(x)
         if lit:
             now[y, x // WORD_PX] |= bit

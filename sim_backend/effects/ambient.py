@@ -13,41 +13,25 @@ from sim_backend.effects.setting import Array, Setting
 from sim_backend.light.optics import ambient_irradiance
 
 
-class Ambient:
-    """Steady light from the surfaces."""
-
-    def __init__(self, setting: Setting) -> None:
-        self._setting = setting
-
-    def rate(self) -> Array:
-        """Detections per second, float64 (rows, width); 0 where there is no surface."""
-        s = self._setting
-        extinction_per_m = s.scene.diffuse_extinction_per_m
-        transmission = np.exp(-extinction_per_m * _path_m(s)) if extinction_per_m > 0 else 1.0
-        radiance = s.view.albedo / math.pi * ambient_irradiance(s.scene.illuminance_lux, s.optics) * transmission
-        result: Array = np.where(s.view.surface > 0, s.gain * radiance, 0.0)
-        return result
+def ambient(setting: Setting) -> Array:
+    """Light from the surfaces, detections per second, float64 (rows, width); 0 where there is no surface."""
+    scene, view = setting.scene, setting.view
+    extinction_per_m = scene.diffuse_extinction_per_m
+    transmission = np.exp(-extinction_per_m * _path_m(setting)) if extinction_per_m > 0 else 1.0
+    radiance = view.albedo / math.pi * ambient_irradiance(scene.illuminance_lux, setting.optics) * transmission
+    return np.where(view.surface > 0, setting.gain * radiance, 0.0)
 
 
-class Airlight:
-    """Steady light from the medium."""
-
-    def __init__(self, setting: Setting) -> None:
-        self._setting = setting
-
-    def rate(self) -> Array:
-        """Detections per second, float64 (rows, width)."""
-        s = self._setting
-        medium = s.scene.medium
-        assert medium is not None, "airlight is asked for by scenes with a medium only"
-        thick = medium.scattering_share * ambient_irradiance(s.scene.illuminance_lux, s.optics) / math.pi
-        result: Array = -s.gain * thick * np.expm1(-s.scene.diffuse_extinction_per_m * _path_m(s))
-        return result
+def airlight(setting: Setting) -> Array:
+    """Light from the medium, detections per second, float64 (rows, width)."""
+    scene = setting.scene
+    assert scene.medium is not None, "airlight is asked for by scenes with a medium only"
+    thick = scene.medium.scattering_share * ambient_irradiance(scene.illuminance_lux, setting.optics) / math.pi
+    return np.asarray(-setting.gain * thick * np.expm1(-scene.diffuse_extinction_per_m * _path_m(setting)))
 
 
 def _path_m(setting: Setting) -> Array:
     """Distance of each pixel's surface from the camera, infinity where there is none."""
     view = setting.view
     with np.errstate(divide="ignore"):
-        path_m: Array = np.sqrt(np.nan_to_num(view.u) ** 2 + np.nan_to_num(view.v) ** 2 + 1) / view.surface
-    return path_m
+        return np.asarray(np.sqrt(np.nan_to_num(view.u) ** 2 + np.nan_to_num(view.v) ** 2 + 1) / view.surface)

@@ -5,8 +5,7 @@
 
 As measured on a 512 x 512 binary SPAD (50 x 50 pixels, 7650 frames of 10 us; public data of LabPresse/SP2T.jl): shares
 above 2, 3, 5, 10, 30 and 100 times the median of 3.4, 2.2, 1.4, 1.0, 0.5 and 0.2 %, here 3.1, 2.3, 1.6, 1.0, 0.5 and
-0.2. Hot pixels lie anywhere, there as here: they come in no clusters. Called for by `world.sensor.dark_rate` above 0,
-which is the median. Costs nothing per frame: it is part of the light that is there without the laser.
+0.2. Hot pixels lie anywhere, there as here: they come in no clusters. The median is `world.sensor.dark_rate`.
 """
 
 import math
@@ -25,15 +24,9 @@ _TAIL_POWER = math.log10(5)
 _MAX_RATIO = 1e5
 
 
-class DarkCounts:
-    """Steady detections of the sensor itself."""
-
-    def __init__(self, setting: Setting) -> None:
-        self._setting = setting
-
-    def rate(self) -> Array:
-        """Detections per second, float64 (rows, width)."""
-        return dark_rates(self._setting.sensor, self._setting.view.u.shape)
+def dark_counts(setting: Setting) -> Array:
+    """Detections of the sensor itself per second, float64 (rows, width)."""
+    return dark_rates(setting.sensor, setting.view.u.shape)
 
 
 def dark_rates(sensor: Sensor, size: tuple[int, ...]) -> Array:

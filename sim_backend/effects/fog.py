@@ -9,15 +9,14 @@ function p is constant (`backscatter`: scattering angles are all near 180 degree
 at the cosine -(z q - S).q/(r |q|). The haze ends where the sheet's light ends: at the object, blurred like the stripe,
 and in the sheet's own shadow along the row. Called for by `medium`.
 
-Per row everything is straight-line over the lit pixels, in two loops, so that it becomes vector instructions, and only
-those under the blurred end are walked one by one: 0.36 ms a mirror position for 512 x 512 pixels, half of them lit, in
-float64 and 0.19 in float32. Kernels run in the precision of what they add to. In float32 the haze is right to 1e-5 at
+Per row everything is straight-line over the lit pixels, so that it becomes vector instructions, and only those under
+the blurred end are walked one by one: 0.36 ms a mirror position for 512 x 512 pixels, half of them lit, in float64 and
+0.19 in float32. Kernels run in the precision of what they add to. In float32 the haze is right to 1e-5 at
 an optical depth of 10: by the divergence of `sim_backend.effect_planner` that is 1e-8 for a row's pixels in a column,
 of 2e-4.
 """
 
 import math
-from dataclasses import dataclass
 from typing import Any
 
 import numba
@@ -26,28 +25,16 @@ from numpy.typing import NDArray
 
 from sim_backend.effects.setting import Array, Setting
 from sim_backend.light.line import edge_sum
-from sim_backend.light.sheet import LightSheet
+from sim_backend.light.sheet import LightSheet, Traced
 from sim_backend.random_numbers import HALVING, LOG2_E, power_of_half
 
 REACH_SIGMAS = 5.0
 """Sds at which the blurred end is cut."""
 LEAST_INVERSE_DEPTH = 1e-12
 """Least inverse depth, in 1/m: what lies farther or behind the camera is taken as there."""
-Rays = tuple[NDArray[Any], NDArray[Any], NDArray[Any], NDArray[Any]]
-
-
-@dataclass(frozen=True, slots=True, eq=False)
-class _Numbers:
-    """The kernel's numbers, in one precision.
-
-    rays: u, v, |q| (rows, width) and source (3,); terms: (n, 3) weight, |g| and sign of each Henyey-Greenstein term;
-    halving: see `power_of_half`; simple: 0, 1, 2 and least inverse depth.
-    """
-
-    rays: Rays
-    terms: NDArray[Any]
-    halving: tuple[Any, ...]
-    simple: tuple[Any, ...]
+Numbers = tuple[tuple[NDArray[Any], ...], NDArray[Any], tuple[Any, ...], tuple[Any, ...]]
+"""The kernel's numbers, in one precision: rays u, v, |q| (rows, width) and source (3,); terms (n, 3), weight, |g| and
+sign of each Henyey-Greenstein term; halving, see `power_of_half`; 0, 1, 2 and least inverse depth."""
 
 
 class Haze:
@@ -62,12 +49,12 @@ class Haze:
         if terms is None:
             self._scale *= medium.backscatter
         of_terms = [[w * (1 - g * g) / (4 * math.pi), abs(g), math.copysign(1, g)] for w, g in terms or ()]
-        self._numbers = {
-            np.dtype(kind): _Numbers(
-                rays=tuple(part.astype(kind) for part in rays),  # type: ignore[arg-type]
-                terms=np.array(of_terms, kind).reshape(-1, 3),
-                halving=HALVING[kind],
-                simple=tuple(map(kind, (0.0, 1.0, 2.0, LEAST_INVERSE_DEPTH))),
+        self._numbers: dict[Any, Numbers] = {
+            np.dtype(kind): (
+                tuple(part.astype(kind) for part in rays),
+                np.array(of_terms, kind).reshape(-1, 3),
+                HALVING[kind],
+                tuple(map(kind, (0.0, 1.0, 2.0, LEAST_INVERSE_DEPTH))),
             )
             for kind in (np.float64, np.float32)
         }
@@ -76,51 +63,25 @@ class Haze:
 
     def add(self, sheet: LightSheet, first_row: int, last_row: int, rate: Array) -> None:
         """Add detections per second and watt of laser power."""
-        kind, numbers = rate.dtype, self._numbers[rate.dtype]
-        _add_haze(
-            numbers.rays,
-            sheet.inverse.astype(kind),
-            sheet.x_stripe_px,
-            sheet.x_end_px,
-            sheet.start_px,
-            sheet.step,
-            (self._scale / np.where(sheet.offset_m != 0, np.abs(sheet.offset_m), np.inf)).astype(kind),
-            self._sigma_px,
-            kind.type(LOG2_E * self._extinction_per_m),
-            numbers.terms,
-            numbers.halving,
-            numbers.simple,
-            first_row,
-            last_row,
-            rate,
-        )
+        kind = rate.dtype
+        scales = (self._scale / np.where(sheet.offset_m != 0, np.abs(sheet.offset_m), np.inf)).astype(kind)
+        light = sheet.inverse.astype(kind), scales, kind.type(LOG2_E * self._extinction_per_m), self._sigma_px
+        _add_haze(sheet.traced, light, self._numbers[kind], first_row, last_row, rate)
 
 
 @numba.njit(cache=True, nogil=True, error_model="numpy", fastmath={"contract"})
 def _add_haze(
-    rays: Rays,
-    inverse: NDArray[np.float64],
-    x_stripe: NDArray[np.float64],
-    x_end: NDArray[np.float64],
-    start: NDArray[np.int64],
-    step: NDArray[np.int64],
-    scales: NDArray[np.float64],
-    sigma_px: float,
-    halvings_per_m: float,
-    terms: NDArray[np.float64],
-    halving: tuple[float, ...],
-    simple: tuple[float, ...],
-    first_row: int,
-    last_row: int,
-    rate: NDArray[np.float64],
+    sheet: Traced, light: tuple[Any, ...], numbers: Numbers, first_row: int, last_row: int, rate: Array
 ) -> None:
+    """Add the haze of a sheet. light: the sheet's planes, scale of each of them, halvings per m, sigma_px."""
     # What arrays and tuples are asked for stands before the loops: within, each would be counted a reference. Numbers
     # come from outside, too: written here they would be float64.
-    u, v, q, source = rays
+    _, _, x_stripe, x_end, start, step = sheet
+    inverse, scales, halvings_per_m, sigma_px = light
+    (u, v, q, source), terms, halving, (zero, unit, two, least) = numbers
     source_x, source_y, source_z = source
-    zero, unit, two, least = simple
     width, n_terms = rate.shape[1], len(terms)
-    light, halvings, phase = np.empty(width, u.dtype), np.empty(width, u.dtype), np.empty(width, u.dtype)
+    lit, halvings, phase = np.empty(width, u.dtype), np.empty(width, u.dtype), np.empty(width, u.dtype)
     reach = REACH_SIGMAS * sigma_px + 0.5
     for y in range(first_row, last_row):
         end, move, row, k = x_end[y], step[y], np.uint64(y), min(y, len(inverse) - 1)
@@ -143,11 +104,11 @@ def _add_haze(
             away_x, away_y, away_z = ray_u - w * source_x, ray_v - w * source_y, unit - w * source_z
             r2 = away_x * away_x + away_y * away_y + away_z * away_z
             r, one = math.sqrt(r2), unit / (r2 * w)
-            light[x] = scale * length * (one * (r * w))
+            lit[x] = scale * length * (one * (r * w))
             halvings[x] = halvings_per_m * ((r + length) * (one * r2))
         for i in range(high - low):  # a loop of its own: more pixels are then under way at a time
             x = np.uint64(low) + np.uint64(i)
-            light[x] *= power_of_half(halvings[x], halving)
+            lit[x] *= power_of_half(halvings[x], halving)
         if n_terms > 0:
             phase[:] = zero
         for term in range(n_terms):
@@ -164,14 +125,14 @@ def _add_haze(
         if n_terms > 0:
             for i in range(high - low):
                 x = np.uint64(low) + np.uint64(i)
-                light[x] = light[x] * phase[x] if light[x] > zero else zero  # no ray, no phase
+                lit[x] = lit[x] * phase[x] if lit[x] > zero else zero  # no ray, no phase
         for i in range(high_whole - low_whole):
             whole = np.uint64(low_whole) + np.uint64(i)
-            rate[row, whole] += light[whole]
+            rate[row, whole] += lit[whole]
         first, last = (high_whole, high) if move > 0 else (low, low_whole)
         near = edge_sum((end - first + 0.5) * move / sigma_px)
         for edge in range(first, last):
             far = edge_sum((end - edge - 0.5) * move / sigma_px)
-            if light[edge] > zero:  # a pixel without a ray sees nothing
-                rate[y, edge] += light[edge] * sigma_px * abs(near - far)
+            if lit[edge] > zero:  # a pixel without a ray sees nothing
+                rate[y, edge] += lit[edge] * sigma_px * abs(near - far)
             near = far

@@ -1,7 +1,6 @@
 """Light that the medium scatters more than once: a halo around the stripe, and a pedestal behind it.
 
-Called for by a medium, unless it says `multiple_scattering: false`; in front of thin ones the planner leaves it out. A
-fit to path tracing (walls at tau 0.5, 1 and 2, forward-peaked and isotropic), not a closed form:
+A fit to path tracing (walls at tau 0.5, 1 and 2, forward-peaked and isotropic), not a closed form:
 
     halo(r) = eta (e^(2 tau) - 1) k(r)    times the ballistic stripe, per pixel of row at the distance r from it
 
@@ -17,14 +16,14 @@ what is scattered more than once is right within 30 % all along the traced rows.
 512 x 512 pixels."""
 
 import math
+from typing import Any
 
 import numba
 import numpy as np
-from numpy.typing import NDArray
 
 from sim_backend.effects.setting import Array, Setting
-from sim_backend.effects.stripe import Lit, lit_surface, row_light
-from sim_backend.light.sheet import LightSheet
+from sim_backend.effects.stripe import row_light
+from sim_backend.light.sheet import Arrays, LightSheet, Traced
 from sim_backend.scenes.medium import DROPLET_G
 
 NARROW, WIDE = math.radians(1.7), math.radians(6.0)
@@ -45,11 +44,10 @@ class Halo:
         assert medium is not None, "called for by scenes with a medium only"
         self._view = setting.view
         per_radian = setting.gain / setting.line.fan
-        self._stripe = per_radian / math.pi
-        self._haze = per_radian * medium.scattering_per_m * medium.back_per_sr
-        self._extinction_per_m = setting.scene.diffuse_extinction_per_m
-        self._scattering_per_m = medium.scattering_per_m - medium.forward_per_m
-        self._peaked = min(max(medium.mean_cosine / DROPLET_G, 0.0), 1.0)
+        haze = per_radian * medium.scattering_per_m * medium.back_per_sr
+        scattering_per_m = medium.scattering_per_m - medium.forward_per_m
+        peaked = min(max(medium.mean_cosine / DROPLET_G, 0.0), 1.0)
+        self._light = per_radian / math.pi, haze, setting.scene.diffuse_extinction_per_m, scattering_per_m, peaked
         self._scales_px = (NARROW * setting.view.focal_px, WIDE * setting.view.focal_px)
         away_px = np.arange(setting.view.width + 1)
         narrow, wide = (np.exp(-away_px / scale) for scale in self._scales_px)
@@ -57,20 +55,8 @@ class Halo:
 
     def add(self, sheet: LightSheet, first_row: int, last_row: int, rate: Array) -> None:
         """Add detections per second and watt of laser power."""
-        _add_halo(
-            lit_surface(self._view.at(sheet.time_s)),
-            sheet.inverse,
-            sheet.offset_m,
-            sheet.x_stripe_px,
-            sheet.x_end_px,
-            sheet.step,
-            (self._stripe, self._haze, self._extinction_per_m, self._scattering_per_m, self._peaked),
-            self._scales_px,
-            self._tables,
-            first_row,
-            last_row,
-            rate,
-        )
+        parts = self._light, self._scales_px, self._tables
+        _add_halo(self._view.at(sheet.time_s).arrays, sheet.traced, parts, first_row, last_row, rate)
 
 
 @numba.njit(cache=True, nogil=True)
@@ -89,11 +75,8 @@ def _around(off: float, scale: float, total: float) -> tuple[float, float, float
     """
     left, right = (0.5 + off) / scale, (0.5 - off) / scale
     side = -0.5 * total * math.expm1(-1.0 / scale)
-    return (
-        -0.5 * total * (math.expm1(-left) + math.expm1(-right)),
-        side * math.exp(-left),
-        side * math.exp(-right),
-    )
+    here = -0.5 * total * (math.expm1(-left) + math.expm1(-right))
+    return here, side * math.exp(-left), side * math.exp(-right)
 
 
 @numba.njit(cache=True, nogil=True)
@@ -104,22 +87,11 @@ def _add_side(level: float, a: float, b: float, narrow: Array, wide: Array, side
 
 
 @numba.njit(cache=True, nogil=True)
-def _add_halo(
-    lit: Lit,
-    inverse: NDArray[np.float64],
-    offset_m: NDArray[np.float64],
-    x_stripe: NDArray[np.float64],
-    x_end: NDArray[np.float64],
-    step: NDArray[np.int64],
-    light: tuple[float, float, float, float, float],
-    scales_px: tuple[float, float],
-    tables: tuple[Array, Array, Array, Array],
-    first_row: int,
-    last_row: int,
-    rate: NDArray[np.float64],
-) -> None:
-    u, v, source = lit[0], lit[1], lit[6]
-    stripe_scale, haze_scale, extinction_per_m, scattering_per_m, peaked = light
+def _add_halo(view: Arrays, sheet: Traced, parts: tuple[Any, ...], first_row: int, last_row: int, rate: Array) -> None:
+    """Add halo and pedestal. parts: scales of the light, of the two exponentials in px, and their tables."""
+    u, v, _, _, _, _, source = view
+    inverse, offset_m, x_stripe, x_end, _, step = sheet
+    (stripe_scale, haze_scale, extinction_per_m, scattering_per_m, peaked), scales_px, tables = parts
     narrow, wide, narrow_back, wide_back = tables
     width = u.shape[1]
     for y in range(first_row, last_row):
@@ -140,7 +112,7 @@ def _add_halo(
         level *= PEDESTAL * math.expm1(min(PEDESTAL_RISE * 0.5 * scattering_per_m * way_m, MOST_DEPTH))
         total = 0.0
         if not np.isnan(x_stripe[y]):
-            ballistic, way_m, _, _ = row_light(lit, inverse, offset_m, extinction_per_m, y, x_stripe[y])
+            ballistic, way_m, _, _ = row_light(view, inverse, offset_m, extinction_per_m, y, x_stripe[y])
             total = stripe_scale * ballistic * halo_share(scattering_per_m * way_m, peaked)
         off = x_end[y] - middle
         near, near_left, near_right = _around(off, scales_px[0], 0.5 * total)

@@ -1,11 +1,10 @@
 """Motion: the surfaces move while the mirror sweeps, so that columns see them at different times.
 
-Called for by `motion: {velocity: [0 m/s, 0 m/s, -2 m/s]}`. All surfaces are shifted together by D = velocity x time. A
-surface's facet m.X = 1 becomes m.(X - D) = 1, that is m / (1 + m.D), so the inverse depth of a ray q = (u, v, 1) is
-m.q / (1 + m.D) with m of the pixel at which the point was at time 0. That pixel is searched with two starts, from the
-nearest surface and from the one that is seen there at time 0; the nearer result wins, which is right but for a pixel or
-two along edges. What is uncovered continues what is behind, and what comes in at the borders what is there. Facets are
-plane, so surfaces move by parts of a pixel; albedo is that of the nearest pixel.
+All surfaces are shifted together by D = velocity x time. A surface's facet m.X = 1 becomes m.(X - D) = 1, that is m /
+(1 + m.D), so the inverse depth of a ray q = (u, v, 1) is m.q / (1 + m.D) with m of the pixel at which the point was at
+time 0. That pixel is searched with two starts, from the nearest surface and from the one that is seen there at time 0;
+the nearer result wins, which is right but for a pixel or two along edges. What is uncovered continues what is behind,
+and what comes in at the borders what is there. Albedo is that of the nearest pixel.
 
 The picture is made anew every `HOLD_S`, in which a surface at 10 m/s moves by 1 cm: about 40 ms each for 512 x 512
 pixels. Light that does not come from the laser stays that of time 0."""
@@ -63,15 +62,13 @@ class Motion:
 
 def shifted(still: CameraView, shift_m: Array) -> CameraView:
     """The view of the same surfaces shifted by (3,) metres."""
-    surface, albedo, facet = np.zeros_like(still.surface), np.zeros_like(still.albedo), np.zeros_like(still.facet)
-    _shift(still.u, still.v, still.surface, still.facet, still.albedo, shift_m, surface, facet, albedo)
+    surface, facet, albedo = (np.zeros_like(part) for part in (still.surface, still.facet, still.albedo))
+    _shift(still.u, still.v, still.surface, still.facet, still.albedo, shift_m, (surface, facet, albedo))
     return replace(still, surface=surface, facet=facet, albedo=albedo, motion=None)
 
 
 @numba.njit(cache=True, nogil=True)
-def _source(
-    u: NDArray[np.float64], v: NDArray[np.float64], y: int, x: int, w: float, shift: NDArray[np.float64]
-) -> tuple[int, int]:
+def _source(u: Array, v: Array, y: int, x: int, w: float, shift: Array) -> tuple[int, int]:
     """Pixel (row, column) of the point at time 0 that a ray now sees at inverse depth w; -1: it was behind the camera.
 
     The tangents are taken as linear over the way."""
@@ -88,21 +85,12 @@ def _source(
 
 @numba.njit(cache=True, nogil=True)
 def _shift(
-    u: NDArray[np.float64],
-    v: NDArray[np.float64],
-    surface: NDArray[np.float64],
-    facet: NDArray[np.float64],
-    albedo: NDArray[np.float64],
-    shift: NDArray[np.float64],
-    new_surface: NDArray[np.float64],
-    new_facet: NDArray[np.float64],
-    new_albedo: NDArray[np.float64],
+    u: Array, v: Array, surface: Array, facet: Array, albedo: Array, shift: Array, new: tuple[Array, Array, Array]
 ) -> None:
+    """Write surface, facet and albedo of the shifted surfaces."""
+    new_surface, new_facet, new_albedo = new
     rows, width = u.shape
-    nearest = 0.0
-    for y in range(rows):
-        for x in range(width):
-            nearest = max(nearest, surface[y, x])
+    nearest = max(0.0, np.max(surface))
     known = np.zeros(width, np.bool_)
     for y in range(rows):
         known[:] = False
@@ -148,5 +136,4 @@ def _uncover(u: Array, v: Array, known: NDArray[np.bool_], surface: Array, facet
                 best, found = w, i
         if found >= 0 and best > 0.0:
             surface[x], albedo[x] = best, albedo[found]
-            for k in range(3):
-                facet[x, k] = facet[found, k]
+            facet[x] = facet[found]

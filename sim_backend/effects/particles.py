@@ -1,11 +1,10 @@
 """Rain and snow: drops and flakes flash up where they cross the sheet, and have fallen on by the next sweep.
 
-Called for by `rain: {rate: 20 mm/h}` and `snow: {rate: 2 mm/h}`; sizes, extinction and fall speed are in
-`sim_backend.scenes.medium`. There are density x thickness x area of them in the sheet (drops at 20 mm/h and 2 mm: 7 per
-m^2), bright as 1/z^3; what rain takes out of the beam, next to nothing below 20 m, is in the extinction of stripe and
-haze. A flake is taken as a diffuse sphere of albedo 0.9 and 4.5 times its melted cross-section: seen from the side it
-is lit from, it sends 8/3 of the mean of all directions back, at equal melted diameter eight times as much light as a
-drop.
+Sizes, extinction and fall speed are in `sim_backend.scenes.medium`. There are density x thickness x area of them in the
+sheet (drops at 20 mm/h and 2 mm: 7 per m^2), bright as 1/z^3; what rain takes out of the beam, next to nothing below
+20 m, is in the extinction of stripe and haze. A flake is taken as a diffuse sphere of albedo 0.9 and 4.5 times its
+melted cross-section: seen from the side it is lit from, it sends 8/3 of the mean of all directions back, at equal
+melted diameter eight times as much light as a drop.
 
 A particle at X in a sheet of Gaussian thickness, s = n.X - d off its middle, gets J/r N(s; thickness/4) W/m^2 with
 J = P/fan, sends back that times its `back_m2_per_sr`, and is seen as a point of this intensity: a pixel of solid angle
@@ -15,8 +14,7 @@ The particles are a fixed set in the cone that the camera sees: each has its dep
 speed and comes in again at the other side, so that they are spread evenly at any time and a time says where all of them
 are. Those too faint (diameter below k z^1.5, brightness goes with D^2/z^3) are left out: k is that of 0.5 mm at 8 m, or
 more where more than `MOST` were left. With 50 mW and the default optics that is 5 thousandths of a photon per exposure
-for the brightest left out. The search for the particles in a sheet and their pictures are compiled: 0.6 to 0.8 ms per
-mirror position and thread for `MOST` of them.
+for the brightest left out. 0.6 to 0.8 ms per mirror position and thread for `MOST` of them.
 """
 
 import math
@@ -24,14 +22,11 @@ from dataclasses import dataclass
 
 import numba
 import numpy as np
-from numpy.typing import NDArray
 
-from sim_backend.effects.setting import Setting
+from sim_backend.effects.setting import Array, Setting
 from sim_backend.light.line import edge, edge_sum, line_width, sigma_px
-from sim_backend.light.sheet import LightSheet
-from sim_backend.scenes.medium import Rain, Sizes, Snow
-
-Array = NDArray[np.float64]
+from sim_backend.light.sheet import Arrays, LightSheet, Traced
+from sim_backend.scenes.medium import Rain, Snow
 
 REACH_SIGMAS = 4.0
 """Sds at which sheet and picture of a particle are cut."""
@@ -40,6 +35,8 @@ FARTHEST_RANGE_M = 30.0
 NEWTON_STEPS = 8
 SHORT_PX = 0.05
 """Length in pixels below which a streak is a point."""
+HOLD_S = 2e-4
+"""Time for which a particle stands still: less than 2 mm of fall."""
 
 
 @numba.njit(cache=True, nogil=True)
@@ -62,8 +59,7 @@ def find_pixel(u: Array, v: Array, at_u: float, at_v: float) -> tuple[float, flo
         off_u = at_u - (u[j, i] + s * u_x + t * u_y)
         off_v = at_v - (v[j, i] + s * v_x + t * v_y)
         step_x, step_y = (off_u * v_y - off_v * u_y) / area, (off_v * u_x - off_u * v_x) / area
-        x += step_x
-        y += step_y
+        x, y = x + step_x, y + step_y
         if not (abs(x) < 4 * width and abs(y) < 4 * rows):
             return np.nan, np.nan, np.nan
         if abs(step_x) + abs(step_y) < 1e-3:
@@ -84,28 +80,19 @@ def share(pixel: int, first: float, length: float, sigma: float) -> float:
 
 
 @numba.njit(cache=True, nogil=True)
-def add_particles(
-    view: tuple[Array, Array, Array],
-    particles: tuple[Array, Array, Array, Array, Array],
-    sheet: tuple[Array, Array, Array, NDArray[np.int64]],
-    light: tuple[float, float, float, float],
-    thickness: Array,
-    width: Array,
-    first_row: int,
-    last_row: int,
-    rate: Array,
+def _add_particles(
+    view: Arrays, particles: Arrays, sheet: Traced, light: tuple[float, ...], first_row: int, last_row: int, rate: Array
 ) -> None:
     """Add the particles' light to rows first_row..last_row-1 of `rate`.
 
-    view: u, v, source. particles: cone, z, back, at, per_s. sheet: normal, offset, x_end, step. light: detections per
-    second per W/rad and W/(m^2 sr), extinction per metre, time, time for which it holds. thickness: sigma of the sheet
-    at the mirror and per metre. width: `line_width`.
+    particles: cone, z, back, at, per_s, normal of the sheet's planes, `line_width`. light: detections per second per
+    W/rad and W/(m^2 sr), extinction per metre, time, sigma of the sheet at the mirror and per metre.
     """
-    u, v, source = view
-    cone, depth, back, at, per_s = particles
-    normal, offset_m, x_end, step = sheet
-    scale, extinction_per_m, time_s, hold_s = light
-    most_off_m = REACH_SIGMAS * (thickness[0] + thickness[1] * FARTHEST_RANGE_M)
+    u, v, _, _, _, _, source = view
+    cone, depth, back, at, per_s, normal, width = particles
+    _, offset_m, _, x_end, _, step = sheet
+    scale, extinction_per_m, time_s, sheet_sd_m, sheet_sd_per_m = light
+    most_off_m = REACH_SIGMAS * (sheet_sd_m + sheet_sd_per_m * FARTHEST_RANGE_M)
     middle, k = u.shape[1] // 2, 0
     top_v, rows_per_v = v[0, middle], (len(v) - 1) / (v[len(v) - 1, middle] - v[0, middle])
     u_low, u_span, v_low, v_span = cone[0, 0], cone[0, 1], cone[1, 0], cone[1, 1]
@@ -122,14 +109,14 @@ def add_particles(
             continue
         away_x, away_y, away_z = z * at_u - source[0], z * at_v - source[1], z - source[2]
         r = math.sqrt(away_x**2 + away_y**2 + away_z**2)
-        sigma_m = math.hypot(thickness[0], thickness[1] * r)
+        sigma_m = math.hypot(sheet_sd_m, sheet_sd_per_m * r)
         if abs(off_m) > REACH_SIGMAS * sigma_m or r == 0.0:
             continue
         x, y, area = find_pixel(u, v, at_u, at_v)
         if not area > 0.0:
             continue
         sigma = sigma_px(width, 1.0 / z, r)
-        streak_px = per_s[i, 1] * v_span * hold_s / math.sqrt(area)
+        streak_px = per_s[i, 1] * v_span * HOLD_S / math.sqrt(area)
         reach = REACH_SIGMAS * sigma + 0.5
         top, bottom = max(first_row, math.ceil(y - reach)), min(last_row - 1, math.floor(y + streak_px + reach))
         left, right = max(0, math.ceil(x - reach)), min(rate.shape[1] - 1, math.floor(x + reach))
@@ -148,8 +135,6 @@ def add_particles(
 
 MOST = 100_000
 """Particles that are kept, on average."""
-HOLD_S = 2e-4
-"""Time for which a particle stands still: less than 2 mm of fall."""
 NEAREST_M, FARTHEST_M = 0.1, 10.0
 """Depths between which particles are made."""
 FAINTEST_MM, FAINTEST_AT_M = 0.5, 8.0
@@ -163,7 +148,7 @@ Precipitation = Rain | Snow
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Particles:
-    """n particles in the cone u_low..u_low + u_span, v_low..v_low + v_span (tangents).
+    """n particles in the cone ((2, 2): low and span of the tangents u and v).
 
     z_m, back_m2_per_sr: (n,). at, per_s: (n, 2), where they are along u and v at time 0 and how fast they run, as
     shares of the cone's width.
@@ -188,7 +173,8 @@ def make_particles(what: Precipitation, cone: Array, farthest_m: float, rng: np.
     z = np.linspace(min(NEAREST_M, farthest_m), farthest_m, DEPTH_STEPS)
     volume = z**2 * cone[0, 1] * cone[1, 1]
     faintest = FAINTEST_MM / FAINTEST_AT_M**1.5
-    while (below := _below(volume * _density(what.sizes, z, faintest), z))[-1] > MOST:
+    density_per_m3 = np.vectorize(what.sizes.density_per_m3)
+    while (below := _below(volume * density_per_m3(faintest * z**1.5), z))[-1] > MOST:
         faintest *= 1.05
     n = int(rng.poisson(below[-1]))
     depth = np.interp(rng.random(n) * below[-1], below, z)
@@ -204,11 +190,9 @@ class ParticleLight:
     hold_s = HOLD_S
 
     def __init__(self, setting: Setting, what: Precipitation, rng: np.random.Generator) -> None:
-        view = setting.view
-        self._view = view
-        self._scale = setting.gain / setting.line.fan
-        self._extinction_per_m = setting.scene.extinction_per_m
-        self._sheet = np.array([setting.line.thickness / 4, setting.line.spread / 4])
+        view = self._view = setting.view
+        self._light = setting.gain / setting.line.fan, setting.scene.extinction_per_m
+        self._sheet_sd = setting.line.thickness / 4, setting.line.spread / 4
         self._width = line_width(view, setting.optics, setting.sensor, setting.line)
         lit = view.surface[view.surface > 0]
         farthest_m = min(FARTHEST_M, 1 / float(lit.min()) if len(lit) == view.surface.size else FARTHEST_M)
@@ -218,20 +202,12 @@ class ParticleLight:
 
     def add(self, sheet: LightSheet, first_row: int, last_row: int, rate: Array) -> None:
         """Add detections per second and watt of laser power."""
-        view, all_of_them = self._view, self.particles
         if not np.isfinite(sheet.inverse).all():
             return
-        add_particles(
-            (view.u, view.v, view.source_m),
-            (all_of_them.cone, all_of_them.z_m, all_of_them.back_m2_per_sr, all_of_them.at, all_of_them.per_s),
-            (sheet.normal, sheet.offset_m, sheet.x_end_px, sheet.step),
-            (self._scale, self._extinction_per_m, math.floor(sheet.time_s / HOLD_S + 1e-6) * HOLD_S, HOLD_S),
-            self._sheet,
-            self._width,
-            first_row,
-            last_row,
-            rate,
-        )
+        view, them = self._view.arrays, self.particles
+        particles = them.cone, them.z_m, them.back_m2_per_sr, them.at, them.per_s, sheet.normal, self._width
+        light = *self._light, math.floor(sheet.time_s / HOLD_S + 1e-6) * HOLD_S, *self._sheet_sd
+        _add_particles(view, particles, sheet.traced, light, first_row, last_row, rate)
 
 
 def rain_drops(setting: Setting) -> ParticleLight:
@@ -244,11 +220,6 @@ def snow_flakes(setting: Setting) -> ParticleLight:
     """The flakes of a scene in which it snows."""
     assert setting.scene.snow is not None, "called for by scenes with snow only"
     return ParticleLight(setting, setting.scene.snow, np.random.default_rng([setting.scene.seed, _SNOW]))
-
-
-def _density(sizes: Sizes, depth_m: Array, faintest: float) -> Array:
-    result: Array = np.vectorize(sizes.density_per_m3)(faintest * depth_m**1.5)
-    return result
 
 
 def _below(values: Array, at: Array) -> Array:

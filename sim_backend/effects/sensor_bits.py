@@ -23,9 +23,6 @@ _CROSSTALK, _ERRORS = np.uint64(0xC6A4A7935BD1E995), np.uint64(0x8EBC6AF09C88C6E
 """Streams that keep these draws apart from those of photons and other effects."""
 _DEFECTS = 2
 """Stream of the sensor's seed, apart from the one that says which pixels are hot in the dark."""
-_S11 = np.uint64(11)
-_ONE = np.uint64(1)
-_UNIT = 2.0**-53
 
 
 def log_miss(probability: float) -> float:
@@ -36,14 +33,14 @@ def log_miss(probability: float) -> float:
 @numba.njit(cache=True, nogil=True, error_model="numpy")
 def next_hit(place: float, key: np.uint64, draw: int, log_miss: float) -> float:
     """The hit behind `place` (-1: from the start), infinity where p is 0. draw: 0, 1, 2, ... of this key's stream."""
-    uniform = (float(frame_key(key, np.uint64(draw)) >> _S11) + 0.5) * _UNIT
+    uniform = (float(frame_key(key, np.uint64(draw)) >> np.uint64(11)) + 0.5) * 2.0**-53
     return place + 1.0 + math.floor(math.log(uniform) / log_miss) if log_miss < 0.0 else math.inf
 
 
 @numba.njit(cache=True, nogil=True)
 def bit_of(x: int) -> np.uint64:
     """The bit of pixel x in its word, x // 64 of the row (`packbits` order in a little-endian word)."""
-    return _ONE << np.uint64((x % WORD_PX) ^ 7)
+    return np.uint64(1) << np.uint64((x % WORD_PX) ^ 7)
 
 
 def packed(pixels: NDArray[np.bool_]) -> Words:
@@ -63,9 +60,8 @@ class Crosstalk:
     a flat picture of small p that is p (1 + c). At the border the light is lost. c is 0.1 to 0.2 % in 512 x 512 arrays
     of large pitch; the share beyond the 4 neighbours is not modelled.
 
-    Called for by `world.sensor.crosstalk` above 0, which is c. Exact for any c: of the 4 x pixels of a frame, in the
-    order pixel by pixel (up, down, left, right), those that would pass are drawn by their gaps. Cost per frame of 512 x
-    512: 9 us at 0.15 %, in proportion to c.
+    Exact for any c: of the 4 x pixels of a frame, in the order pixel by pixel (up, down, left, right), those that would
+    pass are drawn by their gaps. Cost per frame of 512 x 512: 9 us at 0.15 %, in proportion to c.
     """
 
     reads_before = False
@@ -80,10 +76,10 @@ class Crosstalk:
 
 
 @numba.njit(cache=True, nogil=True, error_model="numpy")
-def _spark_over(words: NDArray[np.uint64], width: int, seed: np.uint64, first_frame: int, log_miss: float) -> None:
+def _spark_over(words: Words, width: int, seed: np.uint64, first_frame: int, log_miss: float) -> None:
     """Set the neighbours' bits in frames (frames, rows, words)."""
-    frames, rows, n_words = words.shape
-    fired = np.empty((rows, n_words), np.uint64)
+    frames, rows, _ = words.shape
+    fired = np.empty_like(words[0])
     for f in range(frames):
         fired[:] = words[f]
         key = frame_key(seed, np.uint64(first_frame + f))
@@ -91,8 +87,7 @@ def _spark_over(words: NDArray[np.uint64], width: int, seed: np.uint64, first_fr
         place = next_hit(-1.0, key, draw, log_miss)
         while place < 4 * rows * width:
             pixel, side = int(place) >> 2, int(place) & 3
-            y = pixel // width
-            x = pixel - y * width
+            y, x = divmod(pixel, width)
             if fired[y, x // WORD_PX] & bit_of(x):
                 y += (side == 1) - (side == 0)
                 x += (side == 3) - (side == 2)
@@ -109,9 +104,8 @@ class Defects:
     4 % of defective pixels (crop of 254 x 496, public data of wision-lab/photoncube), in no clusters: pairs of
     neighbours are as frequent as chance has it (0.98 times along the row, 0.92 along the column, each +-0.07). So a
     pixel is dead with probability `dead_share`, hot with `hot_share`, never both, and independent of all others; which
-    ones they are follows from `pixel_seed`. Diodes that fire too often are the tail of the dark counts.
-
-    Called for by `world.sensor.dead_share` or `hot_share` above 0. Cost per frame of 512 x 512: 3 us.
+    ones they are follows from `pixel_seed`. Diodes that fire too often are the tail of the dark counts. Cost per frame
+    of 512 x 512: 3 us.
     """
 
     reads_before = False
@@ -134,11 +128,8 @@ class BitErrors:
 
     Acts on the bits as they are read, the last of all. Errors happen inside the sensor, on the way from the pixels to
     the logic that packs frames: checksums are made of the wrong bits, so no CRC tells of them, and neither does a
-    recording's `verify`. Errors behind the checksum, on the cable, are not modelled here; those are damage that the
-    link's CRC finds (`sim_backend.wire.serve.wire_server`).
-
-    Called for by `world.sensor.bit_error_rate` above 0, which is e. Exact; cost per frame of 512 x 512: 5 us at 0.1 %,
-    in proportion to e.
+    recording's `verify`; errors behind the checksum, on the cable, are those of `sim_backend.wire.serve.wire_server`.
+    Exact; cost per frame of 512 x 512: 5 us at 0.1 %, in proportion to e.
     """
 
     reads_before = False
@@ -153,15 +144,14 @@ class BitErrors:
 
 
 @numba.njit(cache=True, nogil=True, error_model="numpy")
-def _flip(words: NDArray[np.uint64], width: int, seed: np.uint64, first_frame: int, log_miss: float) -> None:
+def _flip(words: Words, width: int, seed: np.uint64, first_frame: int, log_miss: float) -> None:
     frames, rows, _ = words.shape
     for f in range(frames):
         key = frame_key(seed, np.uint64(first_frame + f))
         draw = 0
         place = next_hit(-1.0, key, draw, log_miss)
         while place < rows * width:
-            y = int(place) // width
-            x = int(place) - y * width
+            y, x = divmod(int(place), width)
             words[f, y, x // WORD_PX] ^= bit_of(x)
             draw += 1
             place = next_hit(place, key, draw, log_miss)

@@ -54,14 +54,6 @@ class FrameTimes:
         return max(0.0, self.period_s - self.exposure_s)
 
 
-class SteadyEffect(Protocol):
-    """Light (or dark counts) that is there whatever the laser does."""
-
-    def rate(self) -> Array:
-        """Detections per second of every pixel, float64 (rows, width)."""
-        ...
-
-
 class LaserEffect(Protocol):
     """Light that comes from the laser's sheet."""
 

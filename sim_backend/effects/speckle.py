@@ -5,15 +5,14 @@ The light of M independent grains is gamma distributed with mean 1 and contrast 
 twice that as a diffuse surface depolarises (Goodman, "Speckle phenomena in optics", 2007, sections 4.2 and 4.6). With
 the default sensor at f/2 the contrast is 0.15.
 
-Called for by `line: {speckle: true}`. Acts on the stripe, as the light before this effect; the grains belong to the
-pixel and to where the sheet is, in steps of the line's width, so they stay for all exposures of a column and come again
-in every sweep. About 0.4 ms per mirror position for 512 rows."""
+Acts on the stripe, as the light before this effect; the grains belong to the pixel and to where the sheet is, in steps
+of the line's width, so they stay for all exposures of a column and come again in every sweep. About 0.4 ms per mirror
+position for 512 rows."""
 
 import math
 
 import numba
 import numpy as np
-from numpy.typing import NDArray
 
 from sim_backend.effects.setting import Array, Setting
 from sim_backend.light.optics import Line, Optics, Sensor
@@ -68,9 +67,7 @@ def gamma_of(key: np.uint64, shape: float) -> float:
 
 
 @numba.njit(cache=True, nogil=True)
-def _roughen(
-    seed: np.uint64, place: np.uint64, shape: float, first_row: int, last_row: int, rate: NDArray[np.float64]
-) -> None:
+def _roughen(seed: np.uint64, place: np.uint64, shape: float, first_row: int, last_row: int, rate: Array) -> None:
     width = rate.shape[1]
     key = frame_key(seed, place)
     for y in range(first_row, last_row):

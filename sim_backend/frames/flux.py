@@ -2,13 +2,11 @@
 
     lambda = exposure (steady + share power sheet),     p = 1 - exp(-lambda)
 
-share is the part of the exposure during which the gate let light out. `steady` is made once, `sheet` once per command
-(for the cost see `sim_backend.frames.photons`).
+share is the part of the exposure during which the gate let light out. `steady` is made once, `sheet` once per command.
 
 Tracing the light costs more than drawing a frame, so the frames that the mirror spends in one cell of a grid
-(`CommandGrid`) all get their mean position. A mean over a column's frames, which is what is counted and bound, is then
-that of a mirror that moves on, wherever in their column the frames happen to lie. Told the columns' commands the cells
-are the columns; not told, the command range is divided finely, four cells per pixel of width.
+(`CommandGrid`) all get their mean position: a mean over a column's frames is then that of a mirror that moves on. Told
+the columns' commands the cells are the columns; not told, the range is divided finely, four cells per pixel of width.
 """
 
 from collections.abc import Collection, Mapping, Sequence
@@ -16,13 +14,10 @@ from copy import copy
 from dataclasses import dataclass
 
 import numpy as np
-from numpy.typing import NDArray
 
 from sim_backend.effects.catalogue import CATALOGUE, Entry
-from sim_backend.effects.setting import BitEffect, LaserEffect, Setting
+from sim_backend.effects.setting import Array, BitEffect, LaserEffect, Setting
 from sim_backend.light.sheet import LightSheet
-
-Array = NDArray[np.float64]
 
 
 class FluxModel:
@@ -37,17 +32,12 @@ class FluxModel:
         self.laser: Mapping[str, LaserEffect] = {e.name: effect for e, effect in loaded.items() if e.kind == "laser"}
         """The laser's effects by name, in the order in which they add: a later one may act on what the earlier ones
         brought."""
-        self.steady: Mapping[str, Array] = {e.name: effect.rate() for e, effect in loaded.items() if e.kind == "steady"}
+        self.steady: Mapping[str, Array] = {e.name: rate for e, rate in loaded.items() if e.kind == "steady"}
         """Detections per second (rows, width) by name."""
         self.bits: Mapping[str, BitEffect] = {e.name: effect for e, effect in loaded.items() if e.kind == "bits"}
         """The sensor's effects on the bits, by name, in the order in which they act."""
         self.steady_per_s: Array = sum(self.steady.values(), np.zeros(setting.view.u.shape))
         """Detections per second without the laser, float64 (rows, width)."""
-
-    @property
-    def names(self) -> tuple[str, ...]:
-        """The effects whose code runs."""
-        return (*self.laser, *self.steady, *self.bits)
 
     @property
     def hold_s(self) -> float:

@@ -11,12 +11,11 @@ a float64; 0 never fires and 1 always. The highest level that 16 bits hold stand
 whatever the random number, so they are set afterwards. Random numbers are functions of seed, frame, row and place alone
 (`sim_backend.random_numbers`): windows, threads and blocks do not matter.
 
-Measured, 512 x 512 on one core: 12 us a frame, 0.12 ms for new levels where half of the words are lit. Skipping from
-hit to hit where p is small would not pay: at 0.004 (5 lux behind the stripe) that is a hit in every fourth word, which
-costs as much as drawing four.
+Measured, 512 x 512 on one core: 12 us a frame, 0.12 ms for new levels where half of the words are lit.
 """
 
 import math
+from typing import Any
 
 import numba
 import numpy as np
@@ -63,9 +62,18 @@ _UNIT = 2.0**-53
 _PLACE = np.array(PLACE, np.uint8)
 
 
-Levels = tuple[NDArray[np.int16], NDArray[np.uint64]]
+Single = NDArray[np.float32]
+Words = NDArray[np.uint64]
+Places = NDArray[np.int32]
+Rows = tuple[int, int]
+"""The first row, and that after the last."""
+Levels = tuple[NDArray[np.int16], Words]
 """The input for drawing a frame: levels (rows, words, 64), as they are stored, in the order `PLACE`; and bits (rows,
 words) of the pixels of the highest level."""
+Light = tuple[NDArray[np.float64], Single, float, float]
+"""Of frames: detections per second without the laser and per second and watt of it, (rows, width), exposure in s and
+power in W."""
+Key = tuple[np.uint64, np.uint64]
 
 
 def new_levels(rows: int, words: int) -> Levels:
@@ -74,61 +82,45 @@ def new_levels(rows: int, words: int) -> Levels:
 
 
 def set_levels(
-    steady: NDArray[np.float32],
-    rate: NDArray[np.float32],
-    exposure_w_s: float,
-    first_row: int,
-    last_row: int,
-    dark: Levels,
-    lit: NDArray[np.bool_],
+    steady: Single, rate: Single, exposure_w_s: float, rows: Rows, dark: Levels, lit: NDArray[np.bool_],
     levels: Levels,
-) -> None:
-    """Levels of rows first_row..last_row-1 for p = 1 - exp(-(steady + exposure_w_s rate)).
+) -> None:  # fmt: skip
+    """Levels of rows for p = 1 - exp(-(steady + exposure_w_s rate)).
 
     steady: photons per exposure; rate: per second and watt, both (rows, width), not negative; exposure_w_s: of power
     and time. Words of 64 pixels before the first and behind the last with light take their levels from `dark`, unless
     that has no rows; lit (rows, words) says which of `levels` are not those of `dark`, before and after the call.
     """
-    factor = np.float32(exposure_w_s)
-    _set_levels(steady, rate, rate.view(np.uint32), factor, first_row, last_row, dark, lit, levels, ROUGHLY, _LEVELING)
+    rates, constants = (rate, rate.view(np.uint32), np.float32(exposure_w_s)), (ROUGHLY, _LEVELING)
+    _set_levels(steady, rates, rows, dark, lit, levels, constants)
+
+
+@numba.njit(inline="always")
+def _is_lit(rate_bits: NDArray[np.uint32], row: np.uint64, word: int, width: int) -> bool:
+    """Whether there is light in a word of pixels."""
+    light = np.uint32(0)
+    for i in range(min(WORD_PX, width - word * WORD_PX)):
+        light |= rate_bits[row, np.uint64(word * WORD_PX) + np.uint64(i)]
+    return bool(light != 0)
 
 
 @numba.njit(cache=True, nogil=True, error_model="numpy", fastmath={"contract"})
 def _set_levels(
-    steady: NDArray[np.float32],
-    rate: NDArray[np.float32],
-    rate_bits: NDArray[np.uint32],
-    factor: np.float32,
-    first_row: int,
-    last_row: int,
-    dark: Levels,
-    lit: NDArray[np.bool_],
-    levels: Levels,
-    roughly: tuple[np.float32, ...],
-    leveling: tuple[np.float32, ...],
+    steady: Single, rates: tuple[Any, ...], rows: Rows, dark: Levels, lit: Any, levels: Levels, constants: Any
 ) -> None:
-    offset, slope, least, largest = leveling
-    stored, sure = levels
-    dark_stored, dark_sure = dark
+    (first_row, last_row), (rate, rate_bits, factor) = rows, rates
+    roughly, (offset, slope, least, largest) = constants
+    (stored, sure), (dark_stored, dark_sure) = levels, dark
     copies = len(dark_sure) > 0
     width, words = steady.shape[1], stored.shape[1]
     values = np.full(words * WORD_PX, NEVER, np.int16)
     to_levels, from_values = stored.ctypes.data, values.ctypes.data
     for y in range(first_row, last_row):
         row = np.uint64(y)
-        first, last, light = 0, words, np.uint32(0)
-        while copies and first < last:
-            for i in range(min(WORD_PX, width - first * WORD_PX)):
-                light |= rate_bits[row, np.uint64(first * WORD_PX) + np.uint64(i)]
-            if light != 0:
-                break
+        first, last = 0, words
+        while copies and first < last and not _is_lit(rate_bits, row, first, width):
             first += 1
-        light = np.uint32(0)
-        while copies and last > first:
-            for i in range(min(WORD_PX, width - (last - 1) * WORD_PX)):
-                light |= rate_bits[row, np.uint64((last - 1) * WORD_PX) + np.uint64(i)]
-            if light != 0:
-                break
+        while copies and last > first and not _is_lit(rate_bits, row, last - 1, width):
             last -= 1
         for k in range(words):
             inside = first <= k < last
@@ -151,24 +143,14 @@ def _set_levels(
 
 @numba.njit(cache=True, nogil=True, error_model="numpy")
 def draw_frames(
-    levels: Levels,
-    steady: NDArray[np.float64],
-    rate: NDArray[np.float32],
-    exposure_s: float,
-    power_w: float,
-    seed: np.uint64,
-    first_frame: int,
-    first_row: int,
-    last_row: int,
-    first_word: NDArray[np.int32],
-    words: NDArray[np.uint64],
+    levels: Levels, light: Light, seed: np.uint64, first_frame: int, rows: Rows, first_word: Places, words: Words
 ) -> None:
-    """Draw frames first_frame, first_frame + 1, ... into `words` (frames, rows, words) uint64, rows
-    first_row..last_row-1.
+    """Draw rows of frames first_frame, first_frame + 1, ... into `words` (frames, rows, words).
 
-    levels, and what they were made of: see `set_levels`. first_word: (frames,), word of the row at which each frame's
-    window begins; its bits are those of the whole frame.
+    levels: as `set_levels` made them of the light. first_word: (frames,), word of the row at which each frame's window
+    begins; its bits are those of the whole frame.
     """
+    first_row, last_row = rows
     frames, _, n_words = words.shape
     key = mixed_word(seed + GOLDEN), mixed_word(seed + FRAME_STEP)
     stored, sure = levels
@@ -190,27 +172,16 @@ def draw_frames(
                         offset = np.int64(k) * _WORD_BYTES
                         bits = drawn_word(row_key, of_blocks + offset, of_row + offset)
                         words[np.uint64(f), np.uint64(y), np.uint64(i)] = bits | sure[np.uint64(y), k]
-    _draw_anew(
-        key, levels, steady, rate, exposure_s, power_w, first_frame, first_row, last_row, first_word, words
-    )  # fmt: skip
+    _draw_anew(key, levels, light, first_frame, rows, first_word, words)
 
 
 @numba.njit(cache=True, nogil=True, error_model="numpy")
 def _draw_anew(
-    key: tuple[np.uint64, np.uint64],
-    levels: Levels,
-    steady: NDArray[np.float64],
-    rate: NDArray[np.float32],
-    exposure_s: float,
-    power_w: float,
-    first_frame: int,
-    first_row: int,
-    last_row: int,
-    first_word: NDArray[np.int32],
-    words: NDArray[np.uint64],
+    key: Key, levels: Levels, light: Light, first_frame: int, rows: Rows, first_word: Places, words: Words
 ) -> None:
     """Draw the pixels that chance chooses anew; arguments as of `draw_frames`."""
-    stored, _ = levels
+    (stored, _), (first_row, last_row) = levels, rows
+    steady, rate, exposure_s, power_w = light
     width, row_px = steady.shape[1], stored.shape[1] * WORD_PX
     for f in range(len(words)):
         # Strips of rows have streams of their own, so that a thread need not go through other threads' rows.

@@ -17,14 +17,13 @@ import numba
 import numpy as np
 from numpy.typing import NDArray
 
-from sim_backend.effects.setting import FrameTimes, Words
+from sim_backend.effects.setting import Array, FrameTimes, Words
 from sim_backend.frames.flux import FluxModel
-from sim_backend.frames.photon_kernels import Levels, draw_frames, new_levels, set_levels
+from sim_backend.frames.photon_kernels import Levels, Places, draw_frames, new_levels, set_levels
 from sim_backend.light.line import ONE_LINE, LineFan, SheetsOf
 from sim_backend.light.sheet import LightSheet
 from sim_backend.random_numbers import WORD_PX
 
-Array = NDArray[np.float64]
 _SLACK = 1e-6
 """Slack, as a share of a time step, by which times may miss a multiple of it."""
 
@@ -80,20 +79,13 @@ class PhotonSource:
         self._each_band(lambda a, b: self._set_levels(0.0, new_levels(0, words), self._dark, a, b))
 
     def expose(
-        self,
-        first_frame: int,
-        held: Array,
-        power_w: Array,
-        x0: NDArray[np.int32],
-        bits: NDArray[np.uint8],
-        time_s: Array,
+        self, first_frame: int, held: Array, power_w: Array, x0: Places, bits: NDArray[np.uint8], time_s: Array
     ) -> None:
         """Fill `bits` (n, rows, row bytes) with windows of frames first_frame, first_frame + 1, ...
 
         held: (n,) mirror positions, NaN = the light goes nowhere; or (n, 2), while the first and the last row are
-        exposed. power_w: (n,) power averaged over each exposure.
-        x0: (n,) first pixel of each window, a multiple of 64; a window has the very bits of the whole frame. time_s:
-        (n,) when each exposure begins, of the bench, for scenes that move.
+        exposed. power_w: (n,) averaged over each exposure. x0: (n,) first pixel of each window, a multiple of 64.
+        time_s: (n,) when each exposure begins, of the bench, for scenes that move.
         """
         words = bits.view(np.uint64)
         first_word = x0 // np.int32(WORD_PX)
@@ -139,7 +131,7 @@ class PhotonSource:
             self._traced, self._levels_power_w = tuple(where), power
         return spans
 
-    def _draw(self, spans: list[_Span], first_frame: int, first_word: NDArray[np.int32], words: Words) -> None:
+    def _draw(self, spans: list[_Span], first_frame: int, first_word: Places, words: Words) -> None:
         model, rate, exposure_s = self._model, self._rate, self._times.exposure_s
 
         def band(spans: list[_Span], a: int, b: int) -> None:
@@ -148,11 +140,9 @@ class PhotonSource:
                     self._set_rate(span.sheets, a, b)
                 if span.fresh:
                     self._set_levels(span.power_w, self._dark, self._levels, a, b)
-                draw_frames(
-                    self._levels if span.power_w > 0 else self._dark, model.steady_per_s, rate, exposure_s,
-                    span.power_w, self._seed, first_frame + span.first, a, b, first_word[span.first : span.last],
-                    words[span.first : span.last],
-                )  # fmt: skip
+                light, part = (model.steady_per_s, rate, exposure_s, span.power_w), slice(span.first, span.last)
+                levels = self._levels if span.power_w > 0 else self._dark
+                draw_frames(levels, light, self._seed, first_frame + span.first, (a, b), first_word[part], words[part])
 
         try:
             # What moves is where it is at one time: its picture is made once, for all bands.
@@ -178,7 +168,7 @@ class PhotonSource:
 
     def _set_levels(self, power_w: float, dark: Levels, levels: Levels, a: int, b: int) -> None:
         exposure_w_s = self._times.exposure_s * power_w
-        set_levels(self._steady, self._rate, exposure_w_s, a, b, dark, self._lit, levels)
+        set_levels(self._steady, self._rate, exposure_w_s, (a, b), dark, self._lit, levels)
 
     def _apply_bit_effects(self, first_frame: int, whole: Words) -> None:
         """Let the sensor act on whole frames, in as many parts as there are threads: a part needs what the effect found
@@ -213,7 +203,7 @@ class PhotonSource:
 
 
 @numba.njit(cache=True, nogil=True)
-def _cut_windows(whole: Words, first_word: NDArray[np.int32], words: Words) -> None:
+def _cut_windows(whole: Words, first_word: Places, words: Words) -> None:
     """Copy each frame's window, words (frames, rows, words of a window), out of whole frames."""
     for f in range(len(words)):
         first = first_word[f]

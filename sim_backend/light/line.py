@@ -15,12 +15,9 @@ diameter in pixels of the disc that a lens of f-number N focused at z0 makes of 
 variance of c^2/16 along the row. Called for by `optics: {focus: 3 m}` and `line: {spread: 1 mrad}`; without them the
 width is `sigma_px` at every depth. The haze's end is blurred by `sigma_px` alone.
 
-The blurred edge of a Gaussian and its integral come from a table, three times as fast as erf and exp:
-
-    edge(a) = Phi(a),     edge_sum(a) = a Phi(a) + phi(a), whose slope is Phi
-
-Cubic Hermite interpolation between values and slopes a 64th of a standard deviation apart: absolute error below 1e-10;
-beyond seven standard deviations the limits, 0, 1 and a.
+The blurred edge of a Gaussian, Phi(a), and its integral, a Phi(a) + phi(a), come from a table, three times as fast as
+erf and exp: cubic Hermite interpolation between values and slopes a 64th of a standard deviation apart, absolute error
+below 1e-10; beyond seven standard deviations the limits, 0, 1 and a.
 """
 
 import math
@@ -29,17 +26,18 @@ from dataclasses import dataclass, replace
 
 import numba
 import numpy as np
-from numpy.typing import NDArray
 
 from calibration.model.light_sheet import LightSheets
 from drivers.errors import DeviceError
 from sim_backend.light.optics import Line, Optics, Sensor
-from sim_backend.light.sheet import LightSheet, empty_sheet
+from sim_backend.light.sheet import Array, LightSheet, empty_sheet
 from sim_backend.light.view import CameraView
 
-Array = NDArray[np.float64]
 SheetsOf = Callable[[Array], LightSheets]
 """Mirror commands (...) to the light that they stand for."""
+Limits = tuple[float, float]
+"""Least and largest command of the mirror."""
+EVERYWHERE: Limits = (-np.inf, np.inf)
 
 
 @dataclass(frozen=True, slots=True)
@@ -49,18 +47,8 @@ class LineFan:
     offsets: tuple[float, ...] = (0.0,)
     share: float = 1.0
 
-    @property
-    def power_factor(self) -> float:
-        """Power of all lines together, over that of a laser with one line."""
-        return self.share * len(self.offsets)
-
     def sheets(
-        self,
-        sheets_of: SheetsOf,
-        held: Array,
-        rows: int,
-        moment_s: Sequence[float],
-        command_range: tuple[float, float] = (-np.inf, np.inf),
+        self, sheets_of: SheetsOf, held: Array, rows: int, moment_s: Sequence[float], limits: Limits = EVERYWHERE
     ) -> list[list[LightSheet]]:
         """Sheets of the lines at each of the mirror positions (n,), or (n, 2) while the first and the last row are
         exposed, not traced yet; moment_s: (n,) times of the bench.
@@ -71,7 +59,7 @@ class LineFan:
         down = np.linspace(0, 1, rows) if ends.shape[1] > 1 else np.zeros(1)
         of_rows = ends[:, :1] + (ends[:, -1:] - ends[:, :1]) * down
         at = of_rows[:, None] + np.asarray(self.offsets)[:, None]
-        low, high = command_range
+        low, high = limits
         inside = ((at >= low) & (at <= high)).all(axis=-1)
         found = sheets_of(at[inside])
         lines: list[list[LightSheet]] = [[] for _ in held]
@@ -87,14 +75,9 @@ ONE_LINE = LineFan()
 
 def _of_rows(sheets: LightSheets, index: int, rows: int) -> LightSheets:
     """The sheets of one position and line, one for each row."""
-    parts = sheets.planes[index], sheets.middle[index], sheets.across[index]
+    parts = (part[index] for part in (sheets.planes, sheets.middle, sheets.across))
     planes, middle, across = (np.broadcast_to(part, (rows, part.shape[-1])) for part in parts)
     return replace(sheets, planes=planes, middle=middle, across=across)
-
-
-def line_fan(offsets: Sequence[float], *, shared: bool) -> LineFan:
-    """The lines of a rig. shared: they share the power of one laser; else each has a laser's power."""
-    return LineFan(tuple(offsets), 1 / len(offsets) if shared else 1.0)
 
 
 def line_width(view: CameraView, optics: Optics, sensor: Sensor, line: Line) -> Array:
@@ -102,17 +85,15 @@ def line_width(view: CameraView, optics: Optics, sensor: Sensor, line: Line) -> 
 
     DeviceError where the focus lies within the focal length: a lens makes no picture of what is there.
     """
-    focal_px = view.focal_px
-    defocus = 0.0
+    focal_px, defocus, inverse_focus = view.focal_px, 0.0, 0.0
     if optics.focus is not None:
-        focal_m = focal_px * sensor.pitch
+        focal_m, inverse_focus = focal_px * sensor.pitch, 1 / optics.focus
         if optics.focus <= focal_m:
             raise DeviceError(
                 f"optics.focus is {1e3 * optics.focus:g} mm, within the focal length of {1e3 * focal_m:.3g} mm "
                 "that the geometry's camera matrix and sensor.pitch make; give a depth beyond it, e.g. 3 m"
             )
         defocus = focal_m**2 / (optics.f_number * sensor.pitch * (1 - focal_m / optics.focus)) / 4
-    inverse_focus = 0.0 if optics.focus is None else 1 / optics.focus
     return np.array([line.sigma_px**2, focal_px * line.spread / 4, defocus, inverse_focus])
 
 

@@ -6,9 +6,10 @@ Detections per second of a pixel that sees radiance L:  FF PDP T (pi/4)/N^2 pitc
 import math
 from typing import Annotated, Self
 
-from pydantic import BaseModel, ConfigDict, Field, model_validator
+from pydantic import Field, model_validator
 
 from drivers.units import CountsPerSecond, Metres, Ppm, Radians, Seconds
+from sim_backend.scenes.medium import Section
 
 PLANCK_J_S = 6.62607015e-34
 LIGHT_M_PER_S = 299792458.0
@@ -18,11 +19,7 @@ DAYLIGHT_W_PER_M3_LUX = 1.4e4
 (ASTM G173 global sunlight)."""
 
 
-class _Part(BaseModel):
-    model_config = ConfigDict(extra="forbid", frozen=True)
-
-
-class Optics(_Part):
+class Optics(Section):
     """Lens and filter in front of the sensor."""
 
     f_number: float = Field(default=2.0, gt=0)
@@ -33,7 +30,7 @@ class Optics(_Part):
     """Depth at which the picture is sharp; leave out for a lens that is sharp at every depth."""
 
 
-class Sensor(_Part):
+class Sensor(Section):
     """The SPAD array's pixels. Defaults: 512 x 512 class at 520 nm."""
 
     pitch: Annotated[Metres, Field(gt=0)] = 16.38e-6
@@ -61,13 +58,12 @@ class Sensor(_Part):
     @model_validator(mode="after")
     def _one_defect_a_pixel(self) -> Self:
         if self.dead_share + self.hot_share > 1:
-            raise ValueError(
-                f"dead_share {self.dead_share:g} and hot_share {self.hot_share:g} are more than all pixels"
-            )
+            shares = f"dead_share {self.dead_share:g} and hot_share {self.hot_share:g}"
+            raise ValueError(f"{shares} are more than all pixels")
         return self
 
 
-class Line(_Part):
+class Line(Section):
     """The laser line as the scene and the camera see it."""
 
     wavelength: Annotated[Metres, Field(gt=0)] = 520e-9

@@ -7,8 +7,7 @@ its own: that of the mirror at its time, and the tangent of the bowed sheet wher
 A compiled walk follows the light along each row and tells whether it ends as a stripe. On a row the sheet's inverse
 depth w(x) = n.(u, v, 1)/d falls in the direction in which its light travels outward. The walk starts at the near edge
 of the picture and ends where w passes the surface's inverse depth. Spans of 32 pixels in which even the least w lies
-before the nearest surface are passed at once. Measured: about 0.05 ms for 512 x 512 pixels on one core, half of them
-lit.
+before the nearest surface are passed at once: about 0.05 ms for 512 x 512 pixels, half of them lit.
 """
 
 from dataclasses import dataclass, replace
@@ -20,6 +19,10 @@ from numpy.typing import NDArray
 from calibration.model.light_sheet import LightSheets
 
 Array = NDArray[np.float64]
+Arrays = tuple[Array, ...]
+"""Arrays of a view, as kernels take them: `CameraView.arrays`."""
+Traced = tuple[Array, Array, Array, Array, NDArray[np.int64], NDArray[np.int64]]
+"""A sheet as kernels take it: `inverse`, `offset_m`, `x_stripe_px`, `x_end_px`, `start_px` and `step` of it."""
 
 _TANGENT_STEP_M = 1e-4
 """Step to either side of a point for the tangent: sheets bend over metres."""
@@ -45,6 +48,11 @@ class LightSheet:
     time_s: float = 0.0
     bowed: LightSheets | None = None
 
+    @property
+    def traced(self) -> Traced:
+        """The sheet for kernels."""
+        return self.inverse, self.offset_m, self.x_stripe_px, self.x_end_px, self.start_px, self.step
+
     def touch(self, u: Array, v: Array, first_row: int, last_row: int) -> None:
         """Make the planes of rows first_row..last_row-1 touch the bowed sheet where the rays u, v (rows,) meet it.
 
@@ -67,9 +75,8 @@ class LightSheet:
             normal, offset_m = normal / length, offset_m / length[:, 0]
             inverse = normal / np.where(offset_m != 0, offset_m, np.nan)[:, None]
         met = np.isfinite(offset_m)
-        self.normal[rows][met], self.offset_m[rows][met], self.inverse[rows][met] = (
-            normal[met], offset_m[met], inverse[met],
-        )  # fmt: skip
+        for kept, new in ((self.normal, normal), (self.offset_m, offset_m), (self.inverse, inverse)):
+            kept[rows][met] = new[met]
 
 
 def empty_sheet(planes: Array, rows: int, time_s: float = 0.0, bowed: LightSheets | None = None) -> LightSheet:
@@ -81,60 +88,34 @@ def empty_sheet(planes: Array, rows: int, time_s: float = 0.0, bowed: LightSheet
     offset = planes[:, 3]
     with np.errstate(divide="ignore", invalid="ignore"):  # through the camera: seen edge-on, no depth
         inverse = np.where(offset[:, None] != 0, planes[:, :3] / offset[:, None], np.nan)
-    return LightSheet(
-        normal=np.ascontiguousarray(planes[:, :3]),
-        offset_m=offset.copy(),
-        inverse=inverse,
-        x_stripe_px=np.full(rows, np.nan),
-        x_end_px=np.full(rows, np.nan),
-        start_px=np.zeros(rows, np.int64),
-        step=np.zeros(rows, np.int64),
-        time_s=time_s,
-        bowed=bowed,
-    )
+    nowhere, unseen = (np.full(rows, np.nan) for _ in range(2)), (np.zeros(rows, np.int64) for _ in range(2))
+    normal = np.ascontiguousarray(planes[:, :3])
+    return LightSheet(normal, offset.copy(), inverse, *nowhere, *unseen, time_s=time_s, bowed=bowed)
 
 
 DEPTH_JUMP = 0.02
 """Relative step of depth from one pixel to the next above which two pixels lie on different surfaces. A surface this
-steep makes 85 degrees with the image plane at f = 600 px and returns next to no light.
-"""
-
+steep makes 85 degrees with the image plane at f = 600 px and returns next to no light."""
 SPAN_PX = 32
 """Pixels that are passed at a time."""
 
 
 @numba.njit(cache=True, nogil=True)
-def trace_rows(
-    u: NDArray[np.float64],
-    v: NDArray[np.float64],
-    surface: NDArray[np.float64],
-    bounds: NDArray[np.float64],
-    plane: NDArray[np.float64],
-    first_row: int,
-    last_row: int,
-    x_stripe: NDArray[np.float64],
-    x_end: NDArray[np.float64],
-    start: NDArray[np.int64],
-    step: NDArray[np.int64],
-) -> None:
-    """Trace rows first_row..last_row-1 of planes p = n/d, (1, 3) or one a row (rows, 3), inverse depth p.(u, v, 1).
+def trace_rows(u: Array, v: Array, surface: Array, bounds: Array, sheet: Traced, first_row: int, last_row: int) -> None:
+    """Trace rows first_row..last_row-1 of a sheet: write where its stripe, its end and its way are on each of them.
 
-    surface: inverse depth of the scene (rows, width), 0 = open sky. bounds: see `span_bounds`. Writes per row:
-    x_stripe, NaN where there is none; x_end, where the lit part of the sheet ends (NaN: nothing of it is lit); start,
-    first pixel on the light's way; step, +1 where the light travels towards larger x (scanner on the left), -1 the
-    other way, 0 where the row sees no sheet."""
+    surface: inverse depth of the scene (rows, width), 0 = open sky. bounds: see `span_bounds`. step is +1 where the
+    light travels towards larger x (scanner on the left)."""
+    plane, _, x_stripe, x_end, start, step = sheet
     width = u.shape[1]
     for y in range(first_row, last_row):
         k = min(y, len(plane) - 1)
         px, py, pz = plane[k, 0], plane[k, 1], plane[k, 2]
         low_u, low_v = 0 if px >= 0 else 1, 2 if py >= 0 else 3
-        x_stripe[y] = np.nan
-        x_end[y] = np.nan
-        step[y] = 0
-        left = 0
+        x_stripe[y], x_end[y], step[y] = np.nan, np.nan, 0
+        left, right = 0, width - 1
         while left < width and np.isnan(u[y, left]):
             left += 1
-        right = width - 1
         while right > left and np.isnan(u[y, right]):
             right -= 1
         if left >= right:
@@ -144,10 +125,8 @@ def trace_rows(
         if not (w_left > 0.0 or w_right > 0.0):
             continue
         move = 1 if w_left > w_right else -1
-        x = left if move == 1 else right
-        last = right if move == 1 else left
-        start[y] = x
-        step[y] = move
+        x, last = (left, right) if move == 1 else (right, left)
+        start[y], step[y] = x, move
         if not px * u[y, x] + py * v[y, x] + pz - surface[y, x] > 0.0:
             continue  # enters the picture behind what is seen there: in its shadow
         x_end[y] = last + 0.5 * move
@@ -165,8 +144,7 @@ def trace_rows(
                 here = px * u[y, x] + py * v[y, x] + pz - surface[y, x]
             if here > 0.0:
                 continue
-            s0 = surface[y, x - move]
-            s1 = surface[y, x]
+            s0, s1 = surface[y, x - move], surface[y, x]
             if abs(s1 - s0) > DEPTH_JUMP * max(s0, s1) or max(s0, s1) == 0.0:
                 x_end[y] = x - 0.5 * move  # a side that the camera does not see, or open sky
             else:
@@ -177,7 +155,7 @@ def trace_rows(
 
 
 @numba.njit(cache=True)
-def span_bounds(u: NDArray[np.float64], v: NDArray[np.float64], surface: NDArray[np.float64]) -> NDArray[np.float64]:
+def span_bounds(u: Array, v: Array, surface: Array) -> Array:
     """Least and largest u, least and largest v, and largest inverse depth of every span, (rows, spans, 5); infinite
     inverse depth where a ray is NaN."""
     rows, width = u.shape

@@ -4,13 +4,11 @@ from collections.abc import Callable
 from dataclasses import dataclass, field
 
 import numpy as np
-from numpy.typing import NDArray
 
 from calibration.model.rig_model import RigModel
-from sim_backend.light.sheet import DEPTH_JUMP, LightSheet, empty_sheet, span_bounds, trace_rows
+from sim_backend.light.sheet import DEPTH_JUMP, Array, Arrays, LightSheet, empty_sheet, span_bounds, trace_rows
 from sim_backend.scenes.surfaces import Surfaces
 
-Array = NDArray[np.float64]
 Moves = Callable[["CameraView", float], "CameraView"]
 """A motion of the surfaces: from the view at time 0 to that at a time of the bench. Any thread may call it."""
 
@@ -43,6 +41,11 @@ class CameraView:
         return self if self.motion is None else self.motion(self, time_s)
 
     @property
+    def arrays(self) -> Arrays:
+        """What kernels take of it: u, v, u_x, v_x, facet, albedo and source_m."""
+        return self.u, self.v, self.u_x, self.v_x, self.facet, self.albedo, self.source_m
+
+    @property
     def rows(self) -> int:
         """Image rows."""
         return int(self.u.shape[0])
@@ -72,7 +75,8 @@ class CameraView:
     def trace(self, sheet: LightSheet, first_row: int, last_row: int) -> None:
         """Trace rows first_row..last_row-1 of a sheet in place. Releases the GIL, but for sheets that bow."""
         now = self.at(sheet.time_s)
-        now._trace_planes(sheet, first_row, last_row)
+        given = now.u, now.v, now.surface, now.bounds, sheet.traced, first_row, last_row
+        trace_rows(*given)
         if sheet.bowed is not None:
             # The plane of the fan's middle ends a pixel or two beside the sheet: near enough for a tangent.
             rows = np.arange(first_row, last_row)
@@ -80,22 +84,7 @@ class CameraView:
             x = np.where(np.isnan(ends), sheet.start_px[rows], np.rint(np.clip(ends, 0, now.width - 1)))
             at = rows, x.astype(np.int64)
             sheet.touch(now.u[at], now.v[at], first_row, last_row)
-            now._trace_planes(sheet, first_row, last_row)
-
-    def _trace_planes(self, sheet: LightSheet, first_row: int, last_row: int) -> None:
-        trace_rows(
-            self.u,
-            self.v,
-            self.surface,
-            self.bounds,
-            sheet.inverse,
-            first_row,
-            last_row,
-            sheet.x_stripe_px,
-            sheet.x_end_px,
-            sheet.start_px,
-            sheet.step,
-        )
+            trace_rows(*given)
 
 
 def make_view(
@@ -110,22 +99,13 @@ def make_view(
     u_y, v_y = _slope(u, 0), _slope(v, 0)
     surface = 1.0 / surfaces.depth_m.astype(np.float64)
     surface[~np.isfinite(surface)] = 0.0
-    return CameraView(
-        u=np.ascontiguousarray(u),
-        v=np.ascontiguousarray(v),
-        u_x=u_x,
-        v_x=v_x,
-        surface=surface,
-        facet=_facets(surface, (u, v), (u_x, v_x, u_y, v_y)),
-        albedo=surfaces.albedo.astype(np.float64),
-        source_m=np.array(model.source_m, dtype=np.float64),
-        motion=motion,
-    )
+    facet = _facets(surface, (u, v), (u_x, v_x, u_y, v_y))
+    albedo, source_m = surfaces.albedo.astype(np.float64), np.array(model.source_m, dtype=np.float64)
+    u, v = np.ascontiguousarray(u), np.ascontiguousarray(v)
+    return CameraView(u, v, u_x, v_x, surface, facet, albedo, source_m, motion)
 
 
 def _slope(tangent: Array, axis: int) -> Array:
-    if tangent.shape[axis] < 2:
-        return np.zeros_like(tangent)
     slope: Array = np.gradient(tangent, axis=axis)
     # Beside a pixel without a ray the step to the other neighbour counts; a pixel alone has no slope.
     step, none = np.diff(tangent, axis=axis), np.full_like(np.take(tangent, [0], axis), np.nan)
@@ -139,8 +119,7 @@ def _facets(surface: Array, rays: tuple[Array, Array], slopes: tuple[Array, Arra
 
     On a plane the inverse depth is w = m.(u, v, 1), so m = (w_u, w_v, w - u w_u - v w_v). Gradients are averaged over
     two pixels to each side that lie on the same surface."""
-    u, v = rays
-    u_x, v_x, u_y, v_y = slopes
+    (u, v), (u_x, v_x, u_y, v_y) = rays, slopes
     w_x, w_y = _surface_slope(surface, 1), _surface_slope(surface, 0)
     determinant = u_x * v_y - u_y * v_x
     with np.errstate(all="ignore"):
@@ -148,8 +127,7 @@ def _facets(surface: Array, rays: tuple[Array, Array], slopes: tuple[Array, Arra
         w_v = (w_y * u_x - w_x * u_y) / determinant
     facet = np.stack([w_u, w_v, surface - u * w_u - v * w_v], axis=-1)
     lost = ~np.isfinite(facet).all(axis=-1)
-    facet[lost] = 0.0
-    facet[lost, 2] = surface[lost]
+    facet[lost, :2], facet[lost, 2] = 0.0, surface[lost]
     return np.ascontiguousarray(facet)
 
 
@@ -159,8 +137,7 @@ def _surface_slope(surface: Array, axis: int) -> Array:
     step = np.diff(w, axis=0)
     joined = np.abs(step) <= DEPTH_JUMP * np.maximum(w[1:], w[:-1])
     step = np.where(joined, step, 0.0)
-    total = np.zeros_like(w)
-    weight = np.zeros_like(w)
+    total, weight = np.zeros_like(w), np.zeros_like(w)
     # The step between pixels i and i+1 (a neighbour's outer step counts half, and only if the inner one is joined).
     nothing = np.zeros_like(joined[:1])
     inner = {1: np.concatenate([nothing, joined[:-1]]), -2: np.concatenate([joined[1:], nothing])}

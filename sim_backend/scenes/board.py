@@ -18,10 +18,7 @@ from calibration.errors import CalibrationError
 from calibration.views import BoardPose
 from drivers.errors import DeviceError
 from sim_backend.scenes.scene import SceneBoard
-from sim_backend.scenes.surfaces import Surfaces, checked
-
-Array = NDArray[np.float64]
-Mask = NDArray[np.bool_]
+from sim_backend.scenes.surfaces import Array, Surfaces, checked
 
 RAYS, TURNS = 233, 144
 """Neighbouring Fibonacci numbers: rays through a pixel that sees an edge, no two in line with its row or its column.
@@ -79,7 +76,7 @@ def board_scene(u: Array, v: Array, boards: Sequence[BoardAtPose], wall_m: float
         z, centre = shown.trace(u, v)
         inside = ~np.isnan(centre) & (z < depth)
         depth[inside] = z[inside]
-        near = _grown(inside)
+        near = cv2.dilate(inside.astype(np.uint8), np.ones((3, 3), np.uint8)) > 0  # and the pixels around them
         share, light = _over_area(shown, u[near], v[near], [(along[near], down[near]) for along, down in slopes])
         albedo[near] = light + (1 - share) * albedo[near]
     return checked("board", depth, albedo, np.ones(u.shape, bool), u.shape)
@@ -108,9 +105,3 @@ def _over_area(shown: BoardAtPose, u: Array, v: Array, slopes: list[tuple[Array,
         share[edge] += ~np.isnan(there) / RAYS
         light[edge] += np.nan_to_num(there) / RAYS
     return share, light
-
-
-def _grown(inside: Mask) -> Mask:
-    """The pixels and those around them."""
-    grown: Mask = cv2.dilate(inside.astype(np.uint8), np.ones((3, 3), np.uint8)) > 0
-    return grown

@@ -1,14 +1,5 @@
 """The medium and the weather of a scene: fog or smoke, rain or snow, how dense, and where they scatter light to.
 
-    medium: {fog: {visibility: 40 m}}                           # 2 % contrast; or {extinction: 0.1 /m}
-    medium: {smoke: {extinction: 0.5 /m}}                       # or its visibility
-    medium: {extinction: 0.1 /m, backscatter: 0.05 /sr}         # phase function near 180 degrees, taken constant
-    medium: {extinction: 0.1 /m, phase: isotropic}
-    medium: {extinction: 0.1 /m, phase: {g: 0.85}}              # Henyey-Greenstein
-    medium: {extinction: 0.1 /m, phase: {terms: [[0.9, 0.9], [0.1, -0.5]]}}     # weights and g of several
-    rain: {rate: 20 mm/h}
-    snow: {rate: 2 mm/h, wind: 1 m/s}
-
 Henyey and Greenstein (1941): p(theta) = (1 - g^2) / (4 pi (1 + g^2 - 2 g cos theta)^1.5), in 1/sr, of integral 1 over
 all directions and mean cosine g; at 180 degrees (1 - g) / (4 pi (1 + g)^2).
 
@@ -71,19 +62,19 @@ def henyey_greenstein(cosine: float, g: float) -> float:
     return (1 - g) * (1 + g) / (4 * math.pi * math.pow((1 - sharp) ** 2 + 2 * sharp * (1 - ahead), 1.5))
 
 
-class SceneSection(BaseModel):
-    """Part of a scene file: unknown keys are refused."""
+class Section(BaseModel):
+    """Part of a config or a scene file: unknown keys are refused."""
 
     model_config = ConfigDict(extra="forbid", frozen=True)
 
 
-class Fog(SceneSection):
+class Fog(Section):
     """Fog by how far one sees in it (2 % contrast)."""
 
     visibility: Annotated[Metres, Field(gt=0, examples=["30 m"])]
 
 
-class Smoke(SceneSection):
+class Smoke(Section):
     """Smoke by its extinction or by how far one sees in it (2 % contrast)."""
 
     extinction: Annotated[PerMetre, Field(gt=0)] | None = Field(default=None, examples=["0.5 /m"])
@@ -96,7 +87,7 @@ class Smoke(SceneSection):
         return self
 
 
-class Phase(SceneSection):
+class Phase(Section):
     """A Henyey-Greenstein phase function of mean cosine g, or the sum of several as (weight, g)."""
 
     g: MeanCosine | None = Field(default=None, examples=["0.85"])
@@ -115,7 +106,7 @@ class Phase(SceneSection):
         return self
 
 
-class Medium(SceneSection):
+class Medium(Section):
     """A homogeneous scattering medium. Exactly one of `fog`, `smoke` and `extinction` says how dense it is."""
 
     fog: Fog | None = Field(default=None, examples=["{visibility: 30 m}"])
@@ -155,10 +146,9 @@ class Medium(SceneSection):
     @property
     def extinction_per_m(self) -> float:
         """Extinction coefficient in 1/m, of light that must not be turned at all."""
-        if self.fog is not None:
-            return KOSCHMIEDER / self.fog.visibility
-        if self.smoke is not None and self.smoke.visibility is not None:
-            return KOSCHMIEDER / self.smoke.visibility
+        seen = self.fog or self.smoke
+        if seen is not None and seen.visibility is not None:
+            return KOSCHMIEDER / seen.visibility
         found = self.extinction if self.smoke is None else self.smoke.extinction
         assert found is not None, "the validators let exactly one be there"
         return found
@@ -225,7 +215,7 @@ class Sizes:
         return M2_PER_MM2 * math.pi / 4 * 2 * self.n0_per_m3_mm / self.slope_per_mm**3
 
 
-class Rain(SceneSection):
+class Rain(Section):
     """Rain by the water that falls."""
 
     rate: Annotated[MetresPerHour, Field(gt=0, le=0.3, examples=["20 mm/h"])]
@@ -250,11 +240,10 @@ class Rain(SceneSection):
 
     def fall_m_per_s(self, diameter_mm: Array) -> Array:
         """Fall speed."""
-        result: Array = np.maximum(9.65 - 10.3 * np.exp(-0.6 * diameter_mm), 0.0)
-        return result
+        return np.maximum(9.65 - 10.3 * np.exp(-0.6 * diameter_mm), 0.0)
 
 
-class Snow(SceneSection):
+class Snow(Section):
     """Snow by the water that falls."""
 
     rate: Annotated[MetresPerHour, Field(gt=0, le=0.05, examples=["2 mm/h"])]
@@ -279,8 +268,7 @@ class Snow(SceneSection):
 
     def fall_m_per_s(self, diameter_mm: Array) -> Array:
         """Fall speed."""
-        result: Array = 1.6 * (diameter_mm / 10.0) ** 0.31
-        return result
+        return np.asarray(1.6 * (diameter_mm / 10.0) ** 0.31)
 
 
 def _disc_m2(diameter_mm: Array) -> Array:

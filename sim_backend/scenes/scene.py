@@ -1,54 +1,44 @@
-"""The scene file: surfaces, medium, weather, ambient light, motion. Unknown keys are refused, quantities carry units.
-
-surfaces: street              # the built-in street, board, or a folder with world.npz or disparity.npy and left.png
-board: {rotation: [20 deg, 0 deg, 0 deg], position: [-30 cm, -20 cm, 1.5 m]}    # of `surfaces: board`; or a list
-wall: 4 m                                                     # behind the board
-medium: {fog: {visibility: 30 m}, backscatter: 0.05 /sr}      # or smoke, see `scenes.medium`; none: clear air
-rain: {rate: 20 mm/h}                                         # or snow: {rate: 2 mm/h}, see `scenes.medium`
-ambient: {illuminance: 100 lux}                               # none: darkness
-motion: {velocity: [0 m/s, 0 m/s, -2 m/s]}                    # of all surfaces: x right, y down, z away from camera
-seed: 1                                                       # where the drops are
-"""
+"""The scene file: surfaces, medium, weather, ambient light, motion; docs/reference/config.md says what keys mean."""
 
 import difflib
 import os
+import zipfile
 from pathlib import Path
 from typing import Annotated, Self
 
 import numpy as np
-from numpy.typing import NDArray
 from pydantic import Field, model_validator
 
 from calibration.errors import FileError
+from calibration.files.npy_files import load_numpy
 from calibration.files.problems import ValueSources, validated
 from calibration.files.sections import load_yaml
 from drivers.errors import DeviceError
 from drivers.units import Lux, Metres, MetresPerSecond, Radians
-from sim_backend.scenes.medium import Fog, Medium, Rain, SceneSection, Snow
-from sim_backend.scenes.prepared import load_folder
-from sim_backend.scenes.surfaces import Surfaces
+from sim_backend.scenes.medium import Fog, Medium, Rain, Section, Snow
+from sim_backend.scenes.surfaces import Array, Surfaces, checked
 
-Array = NDArray[np.float64]
 SCENE_FOLDER = Path(__file__).parents[2] / "config" / "scenes"
 """Folder in which the bundled scenes are found by name."""
+WORLD_FILE = "world.npz"
 CLEAR = "clear"
 """Word in place of a visibility: no fog."""
 
 
-class AmbientLight(SceneSection):
+class AmbientLight(Section):
     """Daylight or lamps on the scene, diffuse."""
 
     illuminance: Annotated[Lux, Field(ge=0, examples=["100 lux"])]
 
 
-class SceneMotion(SceneSection):
+class SceneMotion(Section):
     """Motion of the surfaces, all of them together and straight on, from the bench's time 0 on."""
 
     velocity: tuple[MetresPerSecond, MetresPerSecond, MetresPerSecond] = Field(examples=["[0 m/s, 0 m/s, -2 m/s]"])
     """Velocity along x (right), y (down), z (away from the camera)."""
 
 
-class BoardPlace(SceneSection):
+class BoardPlace(Section):
     """Pose of a calibration board, as `calibration.views.BoardPose` has it."""
 
     rotation: tuple[Radians, Radians, Radians] = Field(examples=["[20 deg, 0 deg, 0 deg]"])
@@ -66,7 +56,7 @@ class SceneBoard(BoardPlace):
     """Printed the wrong way round."""
 
 
-class SceneFile(SceneSection):
+class SceneFile(Section):
     """A whole scene file."""
 
     surfaces: str = Field(default="street", examples=["street"])
@@ -177,3 +167,23 @@ def load_surfaces(scene: SceneFile, folder: Path, u: Array, v: Array) -> Surface
             f"surfaces {scene.surfaces!r}: {path} is no folder; name 'street', 'board' or a folder with a scene in it"
         )
     return load_folder(path, (u.shape[0], u.shape[1]))
+
+
+def load_folder(folder: Path, size: tuple[int, int]) -> Surfaces:
+    """Surfaces of a folder for a camera of size (rows, width). DeviceError where it holds no scene of that size.
+
+    `world.npz` holds `depth_m`, `albedo` and, where some depths were guessed, `trusted`.
+    """
+    path = folder / WORLD_FILE
+    if not path.is_file():
+        raise DeviceError(f"scene folder {folder} has no {WORLD_FILE}")
+    try:
+        with load_numpy(path) as stored:
+            missing = [key for key in ("depth_m", "albedo") if key not in stored]
+            if missing:
+                raise DeviceError(f"scene file {path} lacks {' and '.join(missing)}; it holds {', '.join(stored)}")
+            depth_m, albedo = stored["depth_m"], stored["albedo"]
+            trusted = stored["trusted"] if "trusted" in stored else np.ones(depth_m.shape, bool)
+    except (OSError, ValueError, zipfile.BadZipFile) as error:
+        raise DeviceError(f"scene file {path} cannot be read: {error}") from error
+    return checked(str(folder), depth_m, albedo, trusted, size)

@@ -7,11 +7,9 @@ Frame: x right, y down, z forward, metres.
 from collections.abc import Callable, Sequence
 
 import numpy as np
-from numpy.typing import NDArray
 
-from sim_backend.scenes.surfaces import Face, Surfaces, box, checked, convex, ellipsoid, layered_noise, post
+from sim_backend.scenes.surfaces import Array, Face, Surfaces, box, checked, convex, ellipsoid, layered_noise, post
 
-Array = NDArray[np.float64]
 Texture = Callable[[Array, Array, Array], Array]
 Body = tuple[Array, Texture]
 

@@ -72,8 +72,7 @@ class Surfaces:
 
 def checked(name: str, depth_m: object, albedo: object, trusted: object, size: tuple[int, int]) -> Surfaces:
     """Surfaces from arrays of any float type. DeviceError where one is impossible; size is (rows, width)."""
-    depth = np.asarray(depth_m, dtype=np.float32)
-    light = np.asarray(albedo, dtype=np.float32)
+    depth, light = np.asarray(depth_m, dtype=np.float32), np.asarray(albedo, dtype=np.float32)
     trust = np.asarray(trusted, dtype=bool)
     for key, array in (("depth_m", depth), ("albedo", light), ("trusted", trust)):
         if array.shape != size:
@@ -106,13 +105,10 @@ def noise(a: Array, b: Array, size: float, seed: int) -> Array:
     return lower * (1 - s) + upper * s
 
 
-def layered_noise(a: Array, b: Array, size: float, seed: int, layers: int = 3) -> Array:
-    """Sum of noises of `size`, size/2, size/4 ... each half as strong as the one before, scaled to 0..1."""
-    total, weight = np.zeros_like(a), 0.0
-    for k in range(layers):
-        total = total + noise(a, b, size / 2**k, seed + k) / 2**k
-        weight += 1 / 2**k
-    return total / weight
+def layered_noise(a: Array, b: Array, size: float, seed: int) -> Array:
+    """Sum of noises of `size`, size/2 and size/4, each half as strong as the one before, scaled to 0..1."""
+    total: Array = sum((noise(a, b, size / 2**k, seed + k) / 2**k for k in range(3)), np.zeros_like(a))
+    return total / 1.75
 
 
 def _smooth(t: Array) -> Array:

@@ -9,14 +9,13 @@ import argparse
 import mmap
 import os
 import shutil
-import statistics
 import tempfile
 import time
 from collections import deque
 from collections.abc import Callable, Iterator
 from concurrent.futures import Future, ThreadPoolExecutor
 from contextlib import closing, contextmanager
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -45,16 +44,6 @@ PLAIN_BYTES = 4 << 20
 PLAIN_THREADS = 2
 
 
-@dataclass(frozen=True, slots=True)
-class DiskRow:
-    """Medians over the rounds. of_plain: as fast as plain writing or reading; None for those themselves."""
-
-    stage: str
-    mb_per_s: float
-    cpu_s_per_gb: float
-    of_plain: float | None
-
-
 def main() -> None:
     """Print the rows."""
     parser = argparse.ArgumentParser(description=__doc__)
@@ -64,17 +53,14 @@ def main() -> None:
         rows = measure_disk(folder)
     console = Console(highlight=False, width=BENCH_WIDTH)
     print_machine(console, machine())
-    table = Table(box=None, pad_edge=False)
-    for title in ("row", "MB/s", "CPU s/GB", "of plain"):
-        table.add_column(title, justify="left" if title == "row" else "right")
-    for row in rows:
-        of_plain = "" if row.of_plain is None else f"{row.of_plain:.2f}"
-        table.add_row(row.stage, f"{row.mb_per_s:.0f}", f"{row.cpu_s_per_gb:.2f}", of_plain)
+    table = Table("row", "MB/s", "CPU s/GB", "of plain", box=None, pad_edge=False)
+    for stage, (mb_per_s, cpu_s_per_gb, of_plain) in rows.items():
+        table.add_row(stage, f"{mb_per_s:.0f}", f"{cpu_s_per_gb:.2f}", f"{of_plain:.2f}")
     console.print(table)
 
 
-def measure_disk(folder: Path) -> list[DiskRow]:
-    """Measure the disk of `folder`."""
+def measure_disk(folder: Path) -> dict[str, tuple[float, float, float]]:
+    """Medians over the rounds of each row: MB a second, CPU seconds a GB, and how fast beside the plain row."""
     layout = BlockLayout(FRAMES, 512, 512)
     size = paged(layout.block_bytes)
     count = max(BLOCKS, round(GIGABYTES * 1e9) // size)
@@ -96,7 +82,7 @@ def measure_disk(folder: Path) -> list[DiskRow]:
             for stage, work in stages.items():
                 _settle(Path(name))
                 found.setdefault(stage, []).append(_timed(work))
-    return [_row(stage, found, count * size) for stage in found]
+    return {stage: _medians(found[stage], found[f"{stage.split('-')[0]}-plain"], count * size / 1e9) for stage in found}
 
 
 def _block(layout: BlockLayout) -> FrameBlock:
@@ -180,14 +166,13 @@ def _timed(work: Callable[[], None]) -> tuple[float, float]:
     return time.perf_counter() - begun, time.process_time() - cpu
 
 
-def _row(stage: str, found: dict[str, list[tuple[float, float]]], n_bytes: int) -> DiskRow:
-    wall_s = statistics.median(wall for wall, _ in found[stage])
-    cpu_s = statistics.median(cpu for _, cpu in found[stage])
-    plain = found.get(f"{stage}-plain")
-    of_plain = None
-    if plain is not None:  # each round's quotient: disks have moods
-        of_plain = statistics.median(p / w for (p, _), (w, _) in zip(plain, found[stage], strict=True))
-    return DiskRow(stage, n_bytes / 1e6 / wall_s, cpu_s / (n_bytes / 1e9), of_plain)
+def _medians(
+    seen: list[tuple[float, float]], plain: list[tuple[float, float]], gigabytes: float
+) -> tuple[float, float, float]:
+    wall_s, cpu_s = np.median(seen, axis=0).tolist()
+    # Each round's quotient: disks have moods.
+    of_plain = float(np.median([p / w for (p, _), (w, _) in zip(plain, seen, strict=True)]))
+    return 1e3 * gigabytes / wall_s, cpu_s / gigabytes, of_plain
 
 
 if __name__ == "__main__":

@@ -4,8 +4,8 @@
 
 The device is emulated under real libusb (umockdev) in this process and sends blocks of 31 full frames, 1 MiB each, as
 fast as they are taken. Clients are processes of their own: a bare loop that keeps eight reads of 1 MiB in flight with
-usb1 and looks at nothing, into eight buffers over and over or into as much memory as the driver's ring has; the driver
-with the same reads queued; and the driver with plain reads one after the other (pyusb). They take turns. CPU share: the
+usb1 and looks at nothing, into eight buffers over and over; the driver with the same reads queued; and the driver with
+plain reads one after the other (pyusb). They take turns. CPU share: the
 client's processor time over wall time, all threads. The driver checks headers and trailers, publishes every block to a
 reader and pings; at this rate it leaves payload CRCs to the recorder. Blocks dropped for want of a slot do not count.
 """
@@ -40,7 +40,11 @@ FRAMES = 31
 IN_FLIGHT = 8
 SLOTS = 16
 _PR_SET_TIMERSLACK = 29
-CLIENTS = ("raw", "raw ring", "queued", "plain")
+CLIENTS = {
+    "raw": "bare usb1 loop, 8 buffers",
+    "queued": "driver, queued reads (usb1)",
+    "plain": "driver, plain reads (pyusb)",
+}
 
 
 def client(sort: str, seconds: float) -> dict[str, float]:
@@ -51,37 +55,29 @@ def client(sort: str, seconds: float) -> dict[str, float]:
     with SpbUsb(config, link, SystemClock()) as device:
         timing = device.configure(SpadRequest(Fraction(100_000), 1e-5, "stream", FRAMES))
         assert timing.stride <= STRIDE
-        if sort in ("raw", "raw ring"):
+        if sort == "raw":
             assert isinstance(link, QueuedLink)
-            return _raw(device, link, timing.stride, seconds, IN_FLIGHT if sort == "raw" else SLOTS)
+            return _raw(device, link, timing.stride, seconds)
         return _driver(device, timing.stride, seconds)
 
 
-def _raw(device: SpbUsb, link: QueuedLink, stride: int, seconds: float, slots: int) -> dict[str, float]:
+def _raw(device: SpbUsb, link: QueuedLink, stride: int, seconds: float) -> dict[str, float]:
     """usb1 and nothing else, into touched memory."""
     device._control.write_all(((Register.HEARTBEAT_MS, 0), (Register.N_FRAMES, 0), (Register.N_FRAMES + 4, 0)))
     device._control.send(Op.START)
-    taken = 0
-    going = True
+    taken, going = 0, True
 
     def again(transfer: Any) -> None:
         nonlocal taken
         taken += transfer.getActualLength()
         if going:
-            begin(transfer)
+            transfer.submit()
 
-    def begin(transfer: Any) -> None:
-        nonlocal slot
-        transfer.setBulk(0x81, memory[slot].data, callback=again, timeout=0)
-        transfer.submit()
-        slot = (slot + 1) % slots
-
-    slot = 0
-    memory = np.zeros((slots, stride), np.uint8)
     transfers = []
-    for _ in range(IN_FLIGHT):
+    for memory in np.zeros((IN_FLIGHT, stride), np.uint8):
         transfer = link._handle.getTransfer()
-        begin(transfer)
+        transfer.setBulk(0x81, memory.data, callback=again, timeout=0)
+        transfer.submit()
         transfers.append(transfer)
     begun, cpu, base = time.perf_counter(), time.process_time(), taken
     while time.perf_counter() - begun < seconds:
@@ -129,22 +125,12 @@ def measure(rounds: int, seconds: float) -> dict[str, dict[str, float]]:
         bus.plug(device)
         for _ in range(rounds):
             for sort in CLIENTS:
-                command = [
-                    sys.executable,
-                    "-m",
-                    "tests.benchmarks.spb_usb",
-                    "--client",
-                    sort,
-                    "--seconds",
-                    str(seconds),
-                ]
+                words = "-m", "tests.benchmarks.spb_usb", "--client", sort, "--seconds", str(seconds)
+                command = [sys.executable, *words]
                 done = subprocess.run(command, env=bus.environment(), stdout=subprocess.PIPE, text=True, check=True)
                 results[sort].append(json.loads(done.stdout))
     return {
-        sort: {
-            key: statistics.median(one[key] for one in results[sort]) for key in ("mb_per_s", "cpu_share", "lost_share")
-        }
-        for sort in CLIENTS
+        sort: {key: statistics.median(one[key] for one in found) for key in found[0]} for sort, found in results.items()
     }
 
 
@@ -163,16 +149,10 @@ def main() -> int:
         return 0
     medians = measure(asked.rounds, asked.seconds)
     raw = medians["raw"]["mb_per_s"]
-    names = {
-        "raw": "bare usb1 loop, 8 buffers",
-        "raw ring": "bare usb1 loop, 16 buffers",
-        "queued": "driver, queued reads (usb1)",
-        "plain": "driver, plain reads (pyusb)",
-    }
     for sort, found in medians.items():
         ratio = found["mb_per_s"] / raw
         print(
-            f"{names[sort]:<28} {found['mb_per_s']:7.0f} MB/s  {ratio:5.2f}  CPU {found['cpu_share']:4.0%}"
+            f"{CLIENTS[sort]:<28} {found['mb_per_s']:7.0f} MB/s  {ratio:5.2f}  CPU {found['cpu_share']:4.0%}"
             + (f", lost {found['lost_share']:.1%}: the reader had no processor" if found["lost_share"] else "")
         )
     return 0 if medians["queued"]["mb_per_s"] >= 0.8 * raw else 1

@@ -53,14 +53,14 @@ class Sensor:
         words = width // 64
         self._levels, lit = new_levels(rows, words), np.ones((rows, words), bool)
         self._rate = np.zeros_like(self._steady, np.float32)
-        set_levels(self._steady.astype(np.float32), self._rate, 0.0, 0, rows, new_levels(0, words), lit, self._levels)
+        set_levels(self._steady.astype(np.float32), self._rate, 0.0, (0, rows), new_levels(0, words), lit, self._levels)
 
     def frames(self, first: int, n: int, seed: int) -> NDArray[np.uint8]:
         """Bits (n, rows, width), 0 and 1."""
         rows, words = self._levels[1].shape
         drawn = np.zeros((n, rows, words), np.uint64)
-        rest = np.uint64(seed), first, 0, rows, np.zeros(n, np.int32), drawn
-        draw_frames(self._levels, self._steady, self._rate, 1.0, 0.0, *rest)
+        light = self._steady, self._rate, 1.0, 0.0
+        draw_frames(self._levels, light, np.uint64(seed), first, (0, rows), np.zeros(n, np.int32), drawn)
         return np.unpackbits(drawn.view(np.uint8).reshape(n, rows, -1), axis=-1)
 
 
@@ -81,6 +81,8 @@ def chi_square(counts: Counts) -> float:
     certain = (counts.p == 0) | (counts.p == 1)
     if np.any(counts.ones[certain] != counts.bits[certain] * counts.p[certain]):
         return 0.0
+    if certain.all():
+        return 1.0
     p, ones, bits = (values[~certain] for values in (counts.p, counts.ones, counts.bits))
     # Where few are expected, ones or zeros, chi-square does not hold: those are judged by Poisson's law below.
     many = bits * np.minimum(p, 1 - p) >= 20
@@ -125,9 +127,7 @@ def main() -> int:
     counts = draw(PROBABILITIES, frames, options.seed)
     failed = False
     for p, ones, bits in zip(counts.p, counts.ones, counts.bits, strict=True):
-        alone = float(ones == bits * p)
-        if 0 < p < 1:
-            alone = chi_square(Counts(np.array([p]), np.array([ones]), np.array([bits])))
+        alone = chi_square(Counts(np.array([p]), np.array([ones]), np.array([bits])))
         failed |= alone < LEAST_PROBABILITY
         print(f"p {p:<10.7g} {ones:>10} of {bits}: expected {bits * p:.1f}, probability {alone:.3g}", flush=True)
     together = chi_square(counts)

@@ -1,7 +1,5 @@
 """The only place where the yardstick touches the project: counts and calibration files in, stripe table out."""
 
-from __future__ import annotations
-
 import tempfile
 import time
 from collections.abc import Sequence
@@ -34,12 +32,7 @@ def reconstruct(
 
 
 def reconstructor_of(
-    point: WorkingPoint,
-    estimator: str,
-    *,
-    threads: int = 2,
-    lines: Any = None,
-    temporal_prior: bool = False,
+    point: WorkingPoint, estimator: str, *, threads: int = 2, lines: Any = None, temporal_prior: bool = False
 ) -> Any:
     """The project's Reconstructor for the rig of a working point, whose calibration it reads from a file.
 

@@ -10,8 +10,6 @@ The genie may not know: the truth's sub-pixel place, the albedo of a pixel, whic
 About 2-4 s per map of 500 columns on two free cores.
 """
 
-from __future__ import annotations
-
 import math
 from dataclasses import dataclass
 
@@ -55,9 +53,8 @@ class Genie:
 
         def work(first: int, end: int) -> None:
             estimate_columns(
-                counts, exposures, wanted, g.u, g.v, g.planes, g.scanner_m, light.extinction_per_m, point.haze_scale,
-                light.ambient, point.stripe_scale * strengths, np.log(weights), shares, lit, self.mean_reach,
-                1 / DEPTH_RANGE_M[1], 1 / DEPTH_RANGE_M[0], table, first, end, x_est,
+                counts, exposures, wanted, point.optics, light.ambient, point.stripe_scale * strengths, np.log(weights),
+                shares, lit, self.mean_reach, table, first, end, x_est,
             )  # fmt: skip
 
         over_columns(g.columns, work)
@@ -105,41 +102,19 @@ def log_expm1(flux, table):  # type: ignore[no-untyped-def]
 
 @numba.njit(cache=True, nogil=True)
 def estimate_columns(  # type: ignore[no-untyped-def]
-    counts,
-    exposures,
-    rows,
-    u,
-    v,
-    planes,
-    scanner,
-    extinction,
-    haze_scale,
-    ambient,
-    strengths,
-    log_weights,
-    shares,
-    lit,
-    mean_reach,
-    inv_far,
-    inv_near,
-    table,
-    first,
-    end,
-    x_est,
+    counts, exposures, rows, optics, ambient, strengths, log_weights, shares, lit, mean_reach, table, first, end, x_est
 ):
     """Fill x_est (H, columns) for columns first..end on the given rows."""
+    u, v, planes, scanner = optics.u, optics.v, optics.planes, optics.scanner
+    extinction, haze_scale = optics.extinction, optics.haze
+    inv_near, inv_far = 1 / DEPTH_RANGE_M[0], 1 / DEPTH_RANGE_M[1]
     width = u.shape[1]
     labels, taps = shares.shape
     reach = taps // 2
     number = strengths.size
-    inverse = np.empty(width)
-    haze = np.empty(width)
     dark = log_expm1(ambient, table)
-    near_sum = np.empty(width + 1)
-    amplitude = np.empty(width)
-    coarse = np.empty(width * labels)
-    posterior = np.empty(width * labels)
-    values = np.empty(number)
+    inverse, haze, near_sum, amplitude = np.empty(width), np.empty(width), np.empty(width + 1), np.empty(width)
+    coarse, posterior, values = np.empty(width * labels), np.empty(width * labels), np.empty(number)
     for c in range(first, end):
         n0, n1, n2, d = planes[c]
         forward = n0 / d < 0
@@ -206,8 +181,7 @@ def estimate_columns(  # type: ignore[no-untyped-def]
             for slot in range(start * labels, stop * labels):
                 if posterior[slot] > posterior[chosen]:
                     chosen = slot
-            mass = 0.0
-            moment = 0.0
+            mass, moment = 0.0, 0.0
             for slot in range(max(start * labels, chosen - mean_reach), min(stop * labels, chosen + mean_reach + 1)):
                 weight = math.exp(posterior[slot] - posterior[chosen])
                 mass += weight

@@ -10,8 +10,6 @@ commands (`rig ...`) and files are used, so that modules may move. Hashes differ
 exit code is 1 where anything differs.
 """
 
-from __future__ import annotations
-
 import argparse
 import hashlib
 import json
@@ -42,22 +40,13 @@ Task = tuple[str, str, Callable[[Path], Hashes]]
 RIG = Path(sys.executable).with_name("rig")
 ENVIRONMENT = os.environ | {"OPENCV_FOR_THREADS_NUM": "1"}
 """OpenCV 5.0 adds up in the order in which its threads end: `cv2.calibrateCamera` differs in its last bits."""
-ESTIMATES: Mapping[str, tuple[str, ...]] = {
-    "argmax": ("--estimator", "argmax", "--filter", "none"),
-    "edge": ("--estimator", "edge", "--filter", "none"),
-    "median": ("--estimator", "edge", "--filter", "median"),
-    "likelihood": ("--estimator", "likelihood", "--filter", "none"),
-    "joint": ("--estimator", "joint", "--filter", "none"),
-}
+ESTIMATES = {name: ("--estimator", name, "--filter", "none") for name in ("argmax", "edge", "likelihood", "joint")}
+ESTIMATES["median"] = ("--estimator", "edge", "--filter", "median")
 ONLY_JOINT = ("learning-K10",)
 """Recorded with the temporal prior, which the other estimators refuse."""
 SCENES = tuple(f"street{kind}" for kind in ("", "-clear", "-light-fog", "-dense-fog", "-smoke", "-rain", "-snow"))
 CONFIGS = ("simulated", "simulated-4-lines", "lab-emulated", "lab-spad512s-emulated", "lab", "hil")
-PLANS: Mapping[str, tuple[str, ...]] = {
-    "as it is": (),
-    "K 1": ("--exposures", "1"),
-    "K 20": ("--exposures", "20"),
-}
+PLANS = {"as it is": (), "K 1": ("--exposures", "1"), "K 20": ("--exposures", "20")}
 POSES = 6
 ACCURACY = ("--at", "3 m", "--accuracy", "20 mm")
 
@@ -89,8 +78,8 @@ def main(arguments: Sequence[str] | None = None) -> int:
         given.write.write_text(json.dumps(results, indent=1, sort_keys=True) + "\n")
     if given.against is None:
         return 0
-    before = {name: steps for name, steps in json.loads(given.against.read_text()).items() if given.only in name}
-    found = differences(before, results)
+    before = json.loads(given.against.read_text())
+    found = differences({name: steps for name, steps in before.items() if given.only in name}, results)
     print("\n".join(found) if found else f"identical with {given.against}")
     return 1 if found else 0
 
@@ -132,25 +121,26 @@ def all_tasks(folder: Path) -> Iterator[Task]:
         recorded = folder / name / "run"
         for step, options in ESTIMATES.items():
             if step == "joint" or name not in ONLY_JOINT:
-                yield name, step, partial(made_by, "reconstruct", recorded, *options)
+                yield name, step, partial(made_by, ("reconstruct", recorded, *options))
         options = ESTIMATES["joint" if name in ONLY_JOINT else "likelihood"]
-        yield name, "replay", partial(made_by, "replay", recorded, "--clock", "max", *options)
+        yield name, "replay", partial(made_by, ("replay", recorded, "--clock", "max", *options))
         yield name, "frames", partial(exported, recorded)
         if case.repeats:
-            yield name, "scan", partial(scanned, *scan_options(name, folder / name / "rig" / "config.yaml"))
+            yield name, "scan", partial(scanned, scan_options(name, folder / name / "rig" / "config.yaml"))
     cube = folder / "cube"
     plan = ("--plan", cube / "plan.yaml", "--calibration", cube / "calibration.yaml")
     for step, options in ESTIMATES.items():
-        yield "cube-K5", step, partial(made_by, "reconstruct", cube / "cube.npy", *plan, *options)
+        yield "cube-K5", step, partial(made_by, ("reconstruct", cube / "cube.npy", *plan, *options))
     first = folder / next(iter(CASES)) / "rig" / "config.yaml"
     for scene in SCENES:
-        options = ("--scene", scene, "--exposures", 3, "--record", "--seed", SEED + 1)
-        yield scene, "scan", partial(scanned, "scan", first, *options)
-        yield scene, "flux", partial(printed, "effects", first, "--scene", scene, "--row", 30, "--column", 90, "--json")
+        words = ("scan", first, "--scene", scene, "--exposures", 3, "--record", "--seed", SEED + 1)
+        yield scene, "scan", partial(scanned, words)
+        words = ("effects", first, "--scene", scene, "--row", 30, "--column", 90, "--json")
+        yield scene, "flux", partial(printed, words)
     for name in CONFIGS:
-        yield f"config {name}", "shown", partial(printed, "config", "show", name)
+        yield f"config {name}", "shown", partial(printed, ("config", "show", name))
         for step, choice in PLANS.items():
-            yield f"config {name}", step, partial(printed, "scan", name, "--dry-run", *choice, "--json")
+            yield f"config {name}", step, partial(printed, ("scan", name, "--dry-run", *choice, "--json"))
     yield from calibrations(folder)
 
 
@@ -169,7 +159,7 @@ def calibrations(folder: Path) -> Iterator[Task]:
         "pixels": ("pixels", folder / "dirty-sensor-K20" / "rig" / "config.yaml", "--light", "--seed", SEED),
     }
     for step, words in steps.items():
-        yield "calibrate", step, partial(made_by, "calibrate", *words)
+        yield "calibrate", step, partial(made_by, ("calibrate", *words))
 
 
 def run(tasks: Sequence[Task], jobs: int) -> Results:
@@ -202,22 +192,18 @@ def rig(*words: object, cwd: Path | None = None) -> tuple[int, str]:
     return done.returncode, done.stdout if done.returncode in (0, 1) else done.stderr
 
 
-def made_by(*words: object) -> Hashes:
-    """Hashes of the folder that a command writes. The last word is where there is room for it."""
-    *command, scratch = words
-    assert isinstance(scratch, Path)
+def made_by(command: Sequence[object], scratch: Path) -> Hashes:
+    """Hashes of the folder that a command writes; scratch: where there is room for it."""
     code, told = rig(*command, "--out", scratch / "out", cwd=scratch)
     return ended(code, told) | folder_hashes(scratch / "out")
 
 
-def scanned(*words: object) -> Hashes:
+def scanned(command: Sequence[object], scratch: Path) -> Hashes:
     """Hashes as of `made_by`, with the plan, and the frames up to the marker that closes the last sweep of each start.
 
     How many frames are recorded behind that marker depends on the moment at which the devices are stopped.
     """
-    *command, scratch = words
-    assert isinstance(scratch, Path)
-    hashes = made_by(*command, scratch)
+    hashes = made_by(command, scratch)
     recorded = scratch / "out"
     if not (recorded / "manifest.json").exists():
         return hashes
@@ -262,10 +248,8 @@ def plan_hashes(recorded: Path) -> Hashes:
     return hashes
 
 
-def printed(*words: object) -> Hashes:
+def printed(command: Sequence[object], scratch: Path) -> Hashes:
     """Hash of what a command prints, without the folders that it names."""
-    *command, scratch = words
-    assert isinstance(scratch, Path)
     code, told = rig(*command, cwd=scratch)
     return ended(code, told) | {"printed": digest(without_folders(told).encode())}
 
@@ -293,24 +277,20 @@ def folder_hashes(folder: Path) -> Hashes:
         elif file.suffix == ".npz":
             with np.load(file, allow_pickle=False) as members:
                 for member in sorted(members.files):
-                    hashes |= member_hashes(f"{name}:{member}", members[member])
+                    array = members[member]
+                    if array.dtype.kind == "U" and array.ndim == 0 and str(array).startswith("{"):
+                        hashes |= mapping_hashes(f"{name}:{member}", json.loads(str(array)))
+                    else:
+                        hashes[f"{name}:{member}"] = array_hash(array)
         elif file.suffix in (".ply", ".png"):
             hashes[name] = digest(file.read_bytes())
         elif name in ("calibration.yaml", "camera.yaml"):
             hashes |= mapping_hashes(name, yaml.safe_load(file.read_bytes()))
-        elif name == "summary.json":
-            hashes |= mapping_hashes(name, json.loads(file.read_text()))
-        elif name == "manifest.json":
-            manifest = json.loads(file.read_text())
-            hashes |= mapping_hashes(name, {key: manifest[key] for key in ("sweeps", "passes") if key in manifest})
+        elif name in ("summary.json", "manifest.json"):
+            content = json.loads(file.read_text())
+            kept = ("sweeps",) if name == "manifest.json" else content
+            hashes |= mapping_hashes(name, {key: content[key] for key in kept if key in content})
     return hashes
-
-
-def member_hashes(name: str, array: np.ndarray) -> Hashes:
-    """Hash of an array; of a text that is a JSON object, those of its keys."""
-    if array.dtype.kind == "U" and array.ndim == 0 and str(array).startswith("{"):
-        return mapping_hashes(name, json.loads(str(array)))
-    return {name: array_hash(array)}
 
 
 def array_hash(array: np.ndarray) -> str:
@@ -320,10 +300,8 @@ def array_hash(array: np.ndarray) -> str:
 
 def mapping_hashes(name: str, content: Mapping[str, Any]) -> Hashes:
     """Hashes of each key of a file's content, without moments and paths; numbers count to the last bit."""
-    kept = without_moments(content)
-    return {
-        f"{name}:{key}": digest(json.dumps(value, sort_keys=True, default=str).encode()) for key, value in kept.items()
-    }
+    kept = {key: json.dumps(value, sort_keys=True, default=str) for key, value in without_moments(content).items()}
+    return {f"{name}:{key}": digest(text.encode()) for key, text in kept.items()}
 
 
 def without_moments(value: Any) -> Any:

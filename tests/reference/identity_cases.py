@@ -1,7 +1,5 @@
 """Files of the identity check: rigs of `identity_cases.yaml` and a bare cube; imports nothing of the program."""
 
-from __future__ import annotations
-
 from collections.abc import Mapping
 from dataclasses import dataclass
 from pathlib import Path

@@ -4,8 +4,6 @@ A row is walked from its near side (where the sheet is closest to the camera). T
 while 1/z of the plane exceeds 1/z of the object; the first change of that order ends it.
 """
 
-from __future__ import annotations
-
 import math
 from typing import NamedTuple
 

@@ -1,7 +1,5 @@
 """Scenes made for one question each: are thin objects found, how good is the sub-pixel place, is a pane seen twice."""
 
-from __future__ import annotations
-
 import numpy as np
 from numpy.typing import NDArray
 

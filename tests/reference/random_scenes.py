@@ -4,8 +4,6 @@ A wavy wall, often a floor, and 3 to 29 boxes, balls, poles and fences between 1
 own between 0.025 and 0.9 under a texture of three sizes. Maps of numbers 0 to 10 taught `joint` its confidence.
 """
 
-from __future__ import annotations
-
 import cv2
 import numpy as np
 from numpy.typing import NDArray

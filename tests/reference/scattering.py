@@ -11,8 +11,6 @@ docs/explanation/physics.md, Light scattered more than once. Even weights and th
 own.)
 """
 
-from __future__ import annotations
-
 import numpy as np
 from numpy.typing import NDArray
 

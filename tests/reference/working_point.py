@@ -15,8 +15,6 @@ the camera's side is left out unless asked for: normals of the prepared depth ma
 working point fixes the median stripe, not its parts.
 """
 
-from __future__ import annotations
-
 from collections.abc import Callable
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass, replace

@@ -8,11 +8,10 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from sim_backend.effects.ambient import Airlight, Ambient
+from sim_backend.effects.ambient import airlight, ambient
 from sim_backend.effects.catalogue import CATALOGUE
-from sim_backend.effects.dark_counts import DarkCounts, dark_rates
+from sim_backend.effects.dark_counts import dark_counts, dark_rates
 from sim_backend.effects.fog import Haze
-from sim_backend.effects.forward_blur import ForwardBlur
 from sim_backend.effects.stripe import Stripe
 from sim_backend.frames.flux import FluxModel, hold_s
 from sim_backend.light.optics import Line, Optics, Sensor, ambient_irradiance, detections_per_radiance
@@ -98,7 +97,7 @@ SCENE = st.fixed_dictionaries(
 
 
 @covers(FluxModel, hold_s, empty_sheet, CameraView)
-@covers(Airlight.rate, Ambient.rate, Haze.add, DarkCounts.rate, dark_rates, ForwardBlur.add)
+@covers(airlight, ambient, Haze.add, dark_counts, dark_rates)
 @EXAMPLES
 @given(
     scene=SCENE, baseline=st.sampled_from([-0.3, 1e-9, 1e-3, 0.3, 30.0]), command=st.floats(-1, 1),
@@ -158,10 +157,9 @@ def test_radiometry_is_exact(digits) -> None:
     def exact(_):
         h, c = mpmath.mpf("6.62607015e-34"), mpmath.mpf("299792458")
         area = mpmath.pi / 4 / mpmath.mpf(optics.f_number) ** 2 * mpmath.mpf(sensor.pitch) ** 2
-        share = (
-            mpmath.mpf(sensor.fill_factor) * mpmath.mpf(sensor.detection_probability) * mpmath.mpf(optics.transmission)
-        )
-        return share * area * mpmath.mpf(line.wavelength) / (h * c)
+        for share in (sensor.fill_factor, sensor.detection_probability, optics.transmission, line.wavelength):
+            area *= mpmath.mpf(share)
+        return area / (h * c)
 
     digits("detections per radiance", 1e-14, detections_per_radiance(optics, sensor, line), exact, 0)
     assert ambient_irradiance(0.0, optics) == 0
@@ -185,9 +183,9 @@ def test_passing_spans_at_once_finds_what_pixel_by_pixel_is_found(seed, plane, e
     none_passed[:, :, 4] = np.inf
 
     def walked(bounds):
-        found = np.zeros(rows), np.zeros(rows), np.zeros(rows, np.int64), np.zeros(rows, np.int64)
-        trace_rows(u, v, surface, bounds, np.array(plane)[None], 0, rows, *found)
-        return found
+        sheet = replace(empty_sheet(np.array([0.0, 0.0, 1.0, 1.0]), rows), inverse=np.array(plane)[None])
+        trace_rows(u, v, surface, bounds, sheet.traced, 0, rows)
+        return sheet.traced[2:]
 
     for passed, each in zip(walked(bounds), walked(none_passed), strict=True):
         np.testing.assert_array_equal(passed, each)

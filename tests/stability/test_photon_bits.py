@@ -23,38 +23,25 @@ DOUBLE, SINGLE = HALVING[np.float64], HALVING[np.float32]
 
 
 @numba.njit
-def _half(t):  # type: ignore[no-untyped-def]
-    return power_of_half(t, DOUBLE)
-
-
-@numba.njit
-def _half_32(t):  # type: ignore[no-untyped-def]
-    return power_of_half(t, SINGLE)
-
-
-@numba.njit
-def _miss(t):  # type: ignore[no-untyped-def]
-    return one_minus_exp_minus(t)
-
-
-@numba.njit
-def _roughly(t):  # type: ignore[no-untyped-def]
-    return one_minus_exp_minus_32(np.float32(t), ROUGHLY)
+def _compiled(t):  # type: ignore[no-untyped-def]
+    """2^-t in both precisions, 1 - exp(-t) in both."""
+    short = np.float32(min(t, 100.0))
+    roughly = one_minus_exp_minus_32(np.float32(min(t, 80.0)), ROUGHLY)
+    return power_of_half(t, DOUBLE), power_of_half(short, SINGLE), one_minus_exp_minus(t), roughly
 
 
 def test_exponentials_of_kernels_hold_their_stated_errors(worst: Worst) -> None:
     rng = np.random.default_rng(1)
     t = np.concatenate([10 ** rng.uniform(-17, 2.84, 300), rng.uniform(0, 5, 300), [0.0, 1e-300, 0.5, 700.0]])
-    halves = relative([_half(x) for x in t], lambda x: mpmath.mpf(2) ** -x, t)
-    misses = relative([_miss(x) for x in t], lambda x: -mpmath.expm1(-x), t)
-    small = np.minimum(t, 80).astype(np.float32).astype(np.float64)
-    worst("2^-t in a kernel", "50 digits", halves, 4e-13)
-    short = np.minimum(t, 100).astype(np.float32)
-    worst("2^-t in float32", "float64", [_half_32(x) * 2.0 ** float(x) - 1 for x in short], 4e-7)
+    half, half_32, miss, roughly = np.array([_compiled(x) for x in t]).T
+    worst("2^-t in a kernel", "50 digits", relative(half, lambda x: mpmath.mpf(2) ** -x, t), 4e-13)
+    short, shorter = (np.minimum(t, most).astype(np.float32).astype(np.float64) for most in (100, 80))
+    worst("2^-t in float32", "float64", half_32 * 2.0**short - 1, 4e-7)
+    misses = relative(miss, lambda x: -mpmath.expm1(-x), t)
     worst("1 - exp(-t) in a kernel, t from 1e-300", "50 digits", misses, 5e-16)
-    worst("1 - exp(-t) in float32, absolute", "float64", [_roughly(x) + math.expm1(-x) for x in small], 4e-7)
-    assert _half(1e300) < 1e-300
-    assert _miss(1e300) == 1
+    worst("1 - exp(-t) in float32, absolute", "float64", roughly + np.expm1(-shorter), 4e-7)
+    assert _compiled(1e300)[0] < 1e-300
+    assert _compiled(1e300)[2] == 1
 
 
 def test_a_tabulated_gaussian_edge_holds_its_stated_error(worst: Worst) -> None:
@@ -72,7 +59,7 @@ def _levels(flux: float, rows: int) -> tuple[NDArray[np.float64], Levels]:
     lit = np.ones((rows, 1), bool)
     with np.errstate(over="ignore"):
         single = steady.astype(np.float32)
-    set_levels(single, np.zeros_like(single), 0.0, 0, rows, new_levels(0, 1), lit, levels)
+    set_levels(single, np.zeros_like(single), 0.0, (0, rows), new_levels(0, 1), lit, levels)
     return steady, levels
 
 
@@ -93,8 +80,8 @@ def test_frames_past_all_counters_are_drawn_and_differ() -> None:
     seen = []
     for first in (0, 2**31, 2**32, 2**40, 2**62):
         words = np.zeros((2, 4, 1), np.uint64)
-        rest = np.uint64(2**64 - 1), first, 0, 4, np.zeros(2, np.int32), words
-        draw_frames(levels, steady, np.zeros_like(steady, np.float32), 1.0, 0.0, *rest)
+        light = steady, np.zeros_like(steady, np.float32), 1.0, 0.0
+        draw_frames(levels, light, np.uint64(2**64 - 1), first, (0, 4), np.zeros(2, np.int32), words)
         seen.append(words)
     assert len({words[f].tobytes() for words in seen for f in (0, 1)}) == 10
     assert np.unpackbits(np.stack(seen).view(np.uint8)).mean() == pytest.approx(-math.expm1(-0.7), abs=0.05)

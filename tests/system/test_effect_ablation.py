@@ -3,14 +3,13 @@
 from pathlib import Path
 
 from rig import api
-from tests.campaigns.effect_ablation import SCENES, ablations
+from tests.campaigns.effect_ablation import ablations
 
 
 def test_the_full_model_and_the_plan_differ_by_less_than_the_bound(small: Path, tmp_path: Path) -> None:
     config = api.configure(small)
     config = config.model_copy(update={"scan": config.scan.model_copy(update={"columns": 80})})
-    found = {each.scene: each for each in ablations(config, tmp_path, seeds=[1])}
-    assert set(found) == set(SCENES)
+    found = {each.scene: each for each in ablations(config, tmp_path, [1], ["clear room", "dense fog"])}
     for each in found.values():
         assert each.within, str(each)
         assert "bit errors" in each.left_out

@@ -7,7 +7,7 @@ from typing import Any
 import numpy as np
 import pytest
 
-from tests.reference.identity import Results, bound_frames, differences, folder_hashes, run
+from tests.reference.identity import Results, bound_frames, differences, folder_hashes
 
 DEPTH_M = np.array([[1.5, np.nan], [2.5, 0.0]], np.float32)
 SUMMARY = {"maps": 1, "truth": {"median_abs": 0.1}, "compute_time_s": 3.0, "stages": {"counting_s": 1.0}}
@@ -53,28 +53,6 @@ def test_moments_and_the_bytes_of_containers_do_not_count(tmp_path: Path) -> Non
     assert differences(before, {"fog": {"edge": folder_hashes(folder)}}) == differences(before, now) == []
     again = results(tmp_path / "c", summary=SUMMARY | {"truth": {"median_abs": 0.10000000000000002}})
     assert differences(before, again) == ["fog, edge, summary.json:truth differs"]
-
-
-def test_texts_in_an_archive_count_and_moments_in_them_do_not(tmp_path: Path) -> None:
-    def told(name: str, **members: str) -> Results:
-        return results(tmp_path / name, **{key: np.array(text) for key, text in members.items()})
-
-    before = told("a", about='{"created": "now", "frames": 3}', source="3 views")
-    assert differences(before, told("b", about='{"created": "then", "frames": 3}', source="3 views")) == []
-    assert differences(before, told("c", about='{"created": "now", "frames": 4}', source="4 views")) == [
-        "fog, edge, stripe/000000.npz:about:frames differs",
-        "fog, edge, stripe/000000.npz:source differs",
-    ]
-
-
-def test_files_that_cannot_be_read_are_a_difference_and_lose_no_other_hash() -> None:
-    def torn(scratch: Path) -> dict[str, str]:
-        (scratch / "depth.npy").write_bytes(b"torn")
-        return folder_hashes(scratch)
-
-    found = run([("fog", "edge", torn), ("fog", "joint", lambda scratch: {"a": "1"})], jobs=2)
-    assert found["fog"]["joint"] == {"a": "1"}
-    assert found["fog"]["edge"]["exit code"].startswith("files that cannot be read: ValueError")
 
 
 def test_frames_count_up_to_the_closing_marker_whenever_a_start_was() -> None:

@@ -1,10 +1,9 @@
 """The yardstick against closed forms: geometry, light, photon statistics, packing, genie and score."""
 
-from __future__ import annotations
-
 import math
 from dataclasses import replace
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
@@ -14,8 +13,8 @@ from hypothesis import strategies as st
 
 from tests.reference import kernels
 from tests.reference.genie import Genie, albedo_histogram, log_expm1, log_expm1_table
-from tests.reference.geometry import BASELINE_M, DEPTH_RANGE_M, FOCAL_PX, Geometry, undistorted_rays
-from tests.reference.made_scenes import pane_scene, smooth_scene, thin_scene
+from tests.reference.geometry import BASELINE_M, DEPTH_RANGE_M, FOCAL_PX, Geometry
+from tests.reference.made_scenes import pane_scene, smooth_scene
 from tests.reference.scene import Scene, procedural_scene
 from tests.reference.working_point import CLEAR, FORWARD, HOT, REPORT, Light, WorkingPoint, at_stripe, dark_map, score
 
@@ -29,16 +28,10 @@ def wall(depth_m: float = 3.0, albedo: float = 0.5, rows: int = ROWS, width: int
     )
 
 
-def point(
-    scene: Scene | None = None, light: Light = REPORT, columns: int = COLUMNS, **rig: float | str
-) -> WorkingPoint:
+def point(scene: Scene | None = None, light: Light = REPORT, columns: int = COLUMNS, **rig: Any) -> WorkingPoint:
     scene = scene or wall()
     height, width = scene.shape
-    return WorkingPoint(
-        scene,
-        light,
-        Geometry.build(width=width, height=height, columns=columns, **rig),  # type: ignore[arg-type]
-    )
+    return WorkingPoint(scene, light, Geometry.build(width=width, height=height, columns=columns, **rig))
 
 
 def test_stripe_on_a_wall_stands_where_plane_and_wall_cross() -> None:
@@ -51,21 +44,13 @@ def test_stripe_on_a_wall_stands_where_plane_and_wall_cross() -> None:
     assert np.isnan(x[~inside]).all()
 
 
-def test_scanner_on_the_right_sees_the_mirror_picture() -> None:
+def test_scanner_on_the_right_sees_the_mirror_picture_and_the_median_stripe_is_as_stated() -> None:
     scene = procedural_scene(24, WIDTH)
     mirrored = Scene("m", scene.depth_m[:, ::-1].copy(), scene.albedo[:, ::-1].copy(), scene.trusted[:, ::-1].copy())
     left, right = point(scene), point(mirrored, side="right")
     np.testing.assert_allclose(right.x_true, WIDTH - 1 - left.x_true, atol=1e-9)
     np.testing.assert_allclose(right.flux_of_column(30)[:, ::-1], left.flux_of_column(30), rtol=1e-5)
-
-
-@pytest.mark.parametrize("k1", [0.0, -0.1, -0.35])
-def test_distorting_the_rays_again_gives_the_pixels(k1: float) -> None:
-    u, v = undistorted_rays(WIDTH, WIDTH, FOCAL_PX, k1)
-    scale = FOCAL_PX * (1 + k1 * (u**2 + v**2))
-    y, x = np.mgrid[0:WIDTH, 0:WIDTH]
-    np.testing.assert_allclose(scale * u + (WIDTH - 1) / 2, x, atol=1e-8)
-    np.testing.assert_allclose(scale * v + (WIDTH - 1) / 2, y, atol=1e-8)
+    assert np.median(left.stripe[left.stripe > 0]) == pytest.approx(0.7)
 
 
 def test_every_turned_plane_passes_the_scanner_and_the_points_it_reports() -> None:
@@ -76,20 +61,6 @@ def test_every_turned_plane_passes_the_scanner_and_the_points_it_reports() -> No
     inverse = g.inverse_depth(3)
     met = np.stack([g.u, g.v, np.ones_like(g.u)], axis=-1) / inverse[..., None]
     np.testing.assert_allclose(met @ g.planes[3, :3], g.planes[3, 3], atol=1e-9)
-
-
-def test_stripe_sums_to_its_amplitude_and_is_centred_on_the_truth() -> None:
-    p = point(light=Light(haze=0.0, ambient=0.0))
-    x = np.arange(WIDTH)
-    for c in range(15, 45, 3):
-        row = p.flux_of_column(c)[3].astype(np.float64)
-        assert row.sum() == pytest.approx(p.stripe[3, c], rel=1e-5)
-        assert (row * x).sum() / row.sum() == pytest.approx(p.x_true[3, c], abs=0.01)
-
-
-def test_median_stripe_is_that_of_the_working_point() -> None:
-    p = point(procedural_scene(32, WIDTH))
-    assert np.median(p.stripe[p.stripe > 0]) == pytest.approx(0.7)
 
 
 def test_stripe_falls_as_depth_squared_and_both_paths() -> None:
@@ -156,24 +127,21 @@ def test_counts_follow_the_binomial_law() -> None:
     spread = ((counts - exposures * hit) ** 2).sum() / (exposures * hit * (1 - hit)).sum()
     assert spread == pytest.approx(1.0, abs=0.02)
     assert counts.max() <= exposures
+    bright = point(light=Light(stripe=30.0, ambient=3.0), columns=5).counts(1000, seed=1)
+    assert (bright.dtype, bright.max()) == (np.uint16, 1000)
+    assert bright.mean() == pytest.approx(1000 * (1 - math.exp(-3.0)), rel=0.02)
 
 
-def test_bright_pixels_of_many_exposures_do_not_overflow() -> None:
-    p = point(light=Light(stripe=30.0, ambient=3.0), columns=21)
-    counts = p.counts(1000, seed=1)
-    assert counts.dtype == np.uint16
-    assert counts.max() == 1000
-    assert counts.mean() == pytest.approx(1000 * (1 - math.exp(-3.0)), rel=0.02)
-
-
-@pytest.mark.parametrize(("width", "exposures"), [(512, 1), (509, 5), (300, 12)])
+@pytest.mark.parametrize(("width", "exposures"), [(512, 1), (509, 5)])
 def test_bits_of_a_cube_sum_to_the_counts(tmp_path: Path, width: int, exposures: int) -> None:
     p = point(procedural_scene(5, width), columns=9)
     cube = np.load(p.write_cube(tmp_path, exposures, seed=3))
     assert cube.shape == (9 * exposures, 5, -(-width // 8))
     bits = np.unpackbits(cube, axis=2)
     assert not bits[:, :, width:].any()
-    sums = bits[:, :, :width].reshape(9, exposures, 5, width).sum(axis=1)
+    of_columns = bits[:, :, :width].reshape(9, exposures, 5, width)
+    np.testing.assert_allclose(of_columns.mean(axis=(0, 2, 3)), bits[:, :, :width].mean(), rtol=0.15)  # spread evenly
+    sums = of_columns.sum(axis=1)
     np.testing.assert_array_equal(sums, p.counts(exposures, seed=3))
     plan = yaml.safe_load((tmp_path / "plan.yaml").read_text())
     assert plan == {
@@ -182,13 +150,6 @@ def test_bits_of_a_cube_sum_to_the_counts(tmp_path: Path, width: int, exposures:
     model = yaml.safe_load((tmp_path / "calibration.yaml").read_text())
     assert (model["format"], model["version"], model["camera"]["width"]) == ("spadrig-calibration", 1, width)
     assert np.load(tmp_path / model["planes"]).shape == (9, 4)
-
-
-def test_ones_of_a_pixel_are_spread_evenly_over_its_frames(tmp_path: Path) -> None:
-    p = point(wall(rows=200), Light(ambient=0.5), columns=9)
-    bits = np.unpackbits(np.load(p.write_cube(tmp_path, 4)), axis=2).reshape(9, 4, -1)
-    share = bits.mean(axis=(0, 2)) / bits.mean()
-    np.testing.assert_allclose(share, 1, atol=0.01)
 
 
 @given(st.floats(1e-4, 60.0))
@@ -210,12 +171,8 @@ def test_genie_is_the_brute_force_posterior_mode(side: str) -> None:
     x = np.arange(WIDTH)
     for c in range(12, 50, 7):
         inverse = g.inverse_depth(c)[y]
-        free = p.haze_scale * np.array(
-            [
-                kernels.haze_at(g.u[y, i], g.v[y, i], inverse[i], g.scanner_m, light.extinction_per_m)
-                for i in range(WIDTH)
-            ]
-        )
+        rays = zip(g.u[y], g.v[y], inverse, strict=True)
+        free = p.haze_scale * np.array([kernels.haze_at(*ray, g.scanner_m, light.extinction_per_m) for ray in rays])
         window = np.flatnonzero((inverse >= 1 / DEPTH_RANGE_M[1]) & (inverse <= 1 / DEPTH_RANGE_M[0]))
         posterior = {}
         for j in window:
@@ -240,14 +197,16 @@ def _gaussian_share(offset: float, sigma: float) -> float:
     return 0.5 * (math.erf((offset + 0.5) * scale) - math.erf((offset - 0.5) * scale))
 
 
-@pytest.mark.parametrize("light", [REPORT, CLEAR])
-def test_genie_finds_a_bright_wall_with_many_exposures(light: Light) -> None:
-    p = point(light=light, columns=77)  # the truth falls on all fractions of a pixel
+def test_genie_finds_a_bright_wall_with_many_exposures() -> None:
+    p = point(light=CLEAR, columns=77)  # the truth falls on all fractions of a pixel
     x = Genie(labels=4, mean_reach=8, profile_reach=3).estimate(p, p.counts(200), 200)
     assert score(x, p.truth(), p.trusted)["mean_abs"] < 0.09
 
 
 def test_score_charges_what_it_says() -> None:
+    none = score(np.full((2, 3), np.nan), np.ones((2, 3)), np.ones((2, 3), np.bool_))
+    assert none["missing"] == 1.0
+    assert math.isnan(none["mean_abs"])
     truth = np.array([[1.4, 2.0, 5.0, np.nan, 7.0]])
     given_x = np.array([[1.0, np.nan, 8.0, 3.0, 99.0]])
     trusted = np.array([[True, True, True, True, False]])
@@ -257,13 +216,6 @@ def test_score_charges_what_it_says() -> None:
     assert figures["mean_abs_charged"] == pytest.approx((0.4 + 10 + 3) / 3)
     assert figures["within_1px"] == pytest.approx(1 / 3)
     assert figures["missing"] == pytest.approx(1 / 3)
-
-
-def test_score_without_any_answer_is_all_missing() -> None:
-    truth = np.ones((2, 3))
-    figures = score(np.full((2, 3), np.nan), truth, np.ones((2, 3), np.bool_))
-    assert figures["missing"] == 1.0
-    assert math.isnan(figures["mean_abs"])
 
 
 def test_a_window_holds_the_very_counts_of_the_whole_picture() -> None:
@@ -315,23 +267,10 @@ def test_a_pane_shows_a_second_stripe_in_front_and_dims_the_first() -> None:
     through = at_stripe(np.isfinite(scene.pane.depth_m), with_pane.x_true)[two]  # type: ignore[union-attr]
     np.testing.assert_allclose(dimmed, np.where(through, 0.64, 0.8))
     y, c = np.argwhere(two)[len(np.argwhere(two)) // 2]
-    added = (
-        with_pane.flux_of_column(c)[y].astype(np.float64)
-        - point(replace(scene, pane=None), replace(REPORT, stripe=REPORT.stripe * dimmed[0])).flux_of_column(c)[y]
-    )
+    dimmer = point(replace(scene, pane=None), replace(REPORT, stripe=REPORT.stripe * dimmed[0]))
+    added = with_pane.flux_of_column(c)[y].astype(np.float64) - dimmer.flux_of_column(c)[y]
     near = np.abs(np.arange(WIDTH) - with_pane.x_second[y, c]) < 4
     assert added[near].sum() == pytest.approx(with_pane.second[y, c], rel=1e-3)
-
-
-def test_thin_objects_are_as_wide_as_stated_and_seen() -> None:
-    scene, thin = thin_scene(64, WIDTH)
-    assert thin["pole"][30].sum() == 4
-    runs = np.diff(np.flatnonzero(np.diff(np.concatenate([[0], thin["fence"][30].astype(int), [0]]))))[::2]
-    assert set(runs) == {3, 4}
-    p = point(scene, columns=500)
-    for mask in thin.values():
-        assert at_stripe(mask, p.x_true).sum() > 100
-        assert not (scene.trusted & mask).any()
 
 
 def test_sub_pixel_bound_is_met_by_a_maximum_likelihood_fit() -> None:

@@ -1,7 +1,5 @@
 """Figures of the yardstick for `joint`: charges, calibration, averaged pixels, and the table of what is asked."""
 
-from __future__ import annotations
-
 import numpy as np
 import pytest
 
@@ -46,12 +44,12 @@ def test_an_answer_where_there_is_no_stripe_is_wrong_where_that_is_asked() -> No
     assert a.claims(empty=True)[1].tolist() == [True, False]
 
 
-@pytest.mark.parametrize(("side", "pixels"), [(1, 1), (3, 9), (5, 25)])
-def test_averaged_pixels_counts_those_of_a_box(side: int, pixels: int) -> None:
+@pytest.mark.parametrize("side", [1, 5])
+def test_averaged_pixels_counts_those_of_a_box(side: int) -> None:
     noise = np.random.default_rng(4).standard_normal((420, 420))
     boxed = sum(np.roll(noise, (i, j), (0, 1)) for i in range(side) for j in range(side)) / side**2
     boxed[::7, ::11] = np.nan
-    assert averaged_pixels(np.asarray(boxed), 8) == pytest.approx(pixels, rel=0.25)
+    assert averaged_pixels(np.asarray(boxed), 8) == pytest.approx(side**2, rel=0.25)
 
 
 def test_what_is_asked_stands_beside_what_came_out() -> None:

@@ -1,4 +1,4 @@
-"""The bench over time: mirror with lag, marker edges, gate program, light = emission AND gate."""
+"""The bench over time: mirror with lag and shaking, marker edges, gate program, light = emission AND gate."""
 
 from fractions import Fraction
 from itertools import pairwise
@@ -7,7 +7,6 @@ import numpy as np
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
-from numpy.typing import NDArray
 
 from calibration.model.rig_model import Lag
 from drivers.clock import VirtualClock
@@ -22,9 +21,15 @@ from drivers.interfaces import (
     ScanWaveform,
     SyncStatus,
 )
+from drivers.registry import Surroundings
 from sim_backend.bench import Bench
+from sim_backend.devices.scanner import SimulatedScannerConfig, create
 from sim_backend.gate_program import GateProgram
-from sim_backend.mirror_motion import Playing
+from sim_backend.mirror_motion import JITTER_HOLD_S, Jitter, Playing
+from sim_backend.world import KIND, WorldConfig
+from tests.stability.inventory import covers
+
+covers(Jitter)
 
 PERIOD_S = 1e-5
 
@@ -43,22 +48,12 @@ def _playing(repeats: int = 3, lag: tuple[float, float] = (0.0, 0.0), markers: l
     )
 
 
-def test_the_command_runs_straight_from_point_to_point_and_over_the_seam() -> None:
-    at = 1.0 + np.array([0.0, 0.5, 1.0, 3.25, 5.5, 6.0, 6.5]) * 1e-3
-    np.testing.assert_allclose(_playing().mirror(at), [0.0, 0.05, 0.1, 0.275, 0.05, 0.0, 0.05], atol=1e-12)
-
-
-def test_the_mirror_rests_at_the_first_point_before_and_at_the_last_after() -> None:
-    np.testing.assert_allclose(_playing().mirror(np.array([0.0, 0.999, 1.5])), [0.0, 0.0, 0.1])
-    assert _playing().moving(0.5)
-    assert _playing().moving(1.0179)
-    assert not _playing().moving(1.0181)
-
-
-def test_the_mirror_lags_by_direction() -> None:
-    playing = _playing(lag=(2e-4, 5e-4))
+def test_the_command_runs_straight_from_point_to_point_and_rests_before_and_after() -> None:
+    at = 1.0 + np.array([-1.0, 0.0, 0.5, 1.0, 3.25, 5.5, 6.0, 6.5, 500]) * 1e-3
+    np.testing.assert_allclose(_playing().mirror(at), [0, 0, 0.05, 0.1, 0.275, 0.05, 0, 0.05, 0.1], atol=1e-12)
+    assert [_playing().moving(time_s) for time_s in (0.5, 1.0179, 1.0181)] == [True, True, False]
     at = np.array([1.0012, 1.0042])  # the second on the way back
-    np.testing.assert_allclose(playing.mirror(at), [0.1, 0.3 - 0.1 * 0.7], atol=1e-9)
+    np.testing.assert_allclose(_playing(lag=(2e-4, 5e-4)).mirror(at), [0.1, 0.3 - 0.1 * 0.7], atol=1e-9)
 
 
 def test_marker_edges_are_rising_edges_within_the_time_asked_for() -> None:
@@ -66,9 +61,7 @@ def test_marker_edges_are_rising_edges_within_the_time_asked_for() -> None:
     np.testing.assert_allclose(playing.edges(MARKER_SCAN, 0.0, 9.0), [1.0, 1.006, 1.012])
     np.testing.assert_allclose(playing.edges(MARKER_LINE, 1.001, 1.010), [1.001, 1.004, 1.007])
     assert len(playing.edges(MARKER_LINE, 1.0011, 1.004)) == 0
-
-
-def test_a_marker_held_high_over_the_seam_is_one_edge() -> None:
+    # High over the seam is one edge.
     playing = _playing(markers=[MARKER_LINE, 0, 0, 0, 0, MARKER_LINE])
     np.testing.assert_allclose(playing.edges(MARKER_LINE, 0.0, 9.0), [1.0, 1.005, 1.011, 1.017])
 
@@ -92,18 +85,7 @@ def _edges(times: list[float], width_s: float = 0.0):  # type: ignore[no-untyped
     return first_high
 
 
-@pytest.mark.parametrize("step", [0.01, 0.13, 10.0])
-def test_the_gate_program_waits_for_each_trigger_and_ends_low(step: float) -> None:
-    program = GateProgram([Pulse(0, None), Pulse(OUT_MARKER, 0.2), Pulse(OUT_GATE, 0.5)], 2, start_s=0.0)
-    for until in np.arange(step, 10 + step, step):
-        program.advance(float(until), _edges([1.0, 1.4, 3.0, 5.0]))
-    times, words = program.levels(0.0, 10.0)
-    np.testing.assert_allclose(times, [0.0, 1.0, 1.2, 1.7, 3.0, 3.2, 3.7])
-    assert words.tolist() == [0, OUT_MARKER, OUT_GATE, 0, OUT_MARKER, OUT_GATE, 0]
-    assert program.ended
-
-
-@pytest.mark.parametrize("step", [1e-4, 0.13])
+@pytest.mark.parametrize("step", [1e-3, 0.13])
 def test_a_held_pulse_lasts_as_long_as_the_marker_and_not_a_slice_longer(step: float) -> None:
     lit_s = 20 * HOLD_S
     program = GateProgram([Pulse(0, None), Pulse(0, HOLD_S), Pulse(OUT_GATE, lit_s, held=True), Pulse(0, 1.0)], 2, 0.0)
@@ -126,15 +108,6 @@ def test_lowering_the_gate_keeps_the_past_and_lasts() -> None:
     assert words.tolist() == [0, OUT_GATE | OUT_MARKER, OUT_MARKER, 0, OUT_MARKER, 0]
 
 
-def _bench() -> tuple[Bench, VirtualClock]:
-    clock = VirtualClock(5_000)
-    return Bench(clock, Lag(0.0, 0.0)), clock
-
-
-def _frames(n: int, start_s: float = 0.0) -> NDArray[np.float64]:
-    return start_s + np.arange(n) * PERIOD_S
-
-
 @settings(max_examples=60, deadline=None)
 @given(
     opens=st.floats(0.0, 2e-4), lasts=st.floats(1e-8, 2e-4), exposure_s=st.floats(1e-6, 1e-5), block=st.integers(1, 60)
@@ -142,9 +115,9 @@ def _frames(n: int, start_s: float = 0.0) -> NDArray[np.float64]:
 def test_the_share_of_light_is_the_time_the_gate_is_high(
     opens: float, lasts: float, exposure_s: float, block: int
 ) -> None:
-    bench, _ = _bench()
+    bench = Bench(VirtualClock(5_000), Lag(0.0, 0.0))
     bench.run_program([Pulse(0, max(opens, 1e-9)), Pulse(OUT_GATE, lasts)], 1)
-    start = _frames(60)
+    start = np.arange(60) * PERIOD_S
     parts = [bench.during(start[i : i + block], exposure_s, PERIOD_S) for i in range(0, 60, block)]
     share = np.concatenate([p.share for p in parts])
     edge = np.concatenate([p.edge for p in parts])
@@ -156,24 +129,48 @@ def test_the_share_of_light_is_the_time_the_gate_is_high(
     assert np.all(share[~edge] == np.rint(share[~edge]))
 
 
-def test_no_program_no_light() -> None:
-    bench, _ = _bench()
-    bench.emit(1.0)
-    assert np.all(bench.during(_frames(5), 1e-5, PERIOD_S).share == 0)
-
-
 def test_the_state_of_the_program_is_read_back() -> None:
-    bench, clock = _bench()
+    clock = VirtualClock(5_000)
+    bench = Bench(clock, Lag(0.0, 0.0))
     assert bench.outputs() == SyncStatus("stopped", 0)
-    bench.run_program([Pulse(0, 1e-3), Pulse(OUT_GATE, 1e-3)], 1)
-    assert bench.outputs() == SyncStatus("running", 0)
-    clock.sleep(1.5e-3)
-    assert bench.outputs() == SyncStatus("running", OUT_GATE)
-    bench.lower_gate()
-    assert bench.outputs() == SyncStatus("running", 0)
-    clock.sleep(1e-3)
-    assert bench.outputs() == SyncStatus("stopped", 0)
-    bench.run_program([Pulse(0, None)], 1)
-    assert bench.outputs() == SyncStatus("waiting", 0)
-    bench.abort_program()
-    assert bench.outputs() == SyncStatus("aborted", 0)
+    assert np.all(bench.during(np.arange(5) * PERIOD_S, 1e-5, PERIOD_S).share == 0)
+    bench.run_program([Pulse(OUT_GATE, 1e-3), Pulse(0, None)], 1)
+    seen = [bench.outputs()]
+    for act in (bench.lower_gate, lambda: clock.sleep(1.5e-3), bench.abort_program):
+        act()
+        seen.append(bench.outputs())
+    states = ("running", OUT_GATE), ("running", 0), ("waiting", 0), ("aborted", 0)
+    assert seen == [SyncStatus(*state) for state in states]
+
+
+def test_it_is_gaussian_white_and_of_the_size_asked_for() -> None:
+    time_s = (np.arange(200_000) + 0.5) * JITTER_HOLD_S
+    error = Jitter(2e-3, 7).error(time_s)
+    assert error.mean() == pytest.approx(0, abs=4 * 2e-3 / np.sqrt(len(error)))
+    assert error.std() == pytest.approx(2e-3, rel=0.01)
+    assert np.mean(np.abs(error) < 2e-3) == pytest.approx(0.6827, abs=0.005)
+    assert abs(np.corrcoef(error[1:], error[:-1])[0, 1]) < 0.01
+    assert abs(np.corrcoef(error, Jitter(2e-3, 8).error(time_s))[0, 1]) < 0.01
+
+
+def test_a_time_says_what_it_is() -> None:
+    jitter, time_s = Jitter(1e-3, 2**70), np.arange(1000) * 1e-5 + 3e5
+    assert np.array_equal(jitter.error(time_s)[300:400], jitter.error(time_s[300:400]))
+    assert 99 <= len(np.unique(jitter.error(time_s))) <= 102
+    assert np.array_equal(Jitter(0.0, 1).error(time_s), np.zeros(1000))
+    assert Jitter(1e-3, 2**64 - 1).error(time_s).std() > 0  # the largest seed, and no warning
+
+
+def test_frames_see_the_mirror_where_it_shakes_to_within_its_range() -> None:
+    world = KIND.create(WorldConfig(), Surroundings(VirtualClock(), None, 3))
+    scanner = create(SimulatedScannerConfig(jitter=0.01), Surroundings(VirtualClock(), world, 3))
+    world.hold_columns(np.linspace(-0.8, 0.8, 5))
+    world.bench.rest(0.4)
+    state = world.bench.during(np.arange(1000) * 1e-5, 1e-5, 1e-5)
+    held = world.mirror_positions(state, 1e-5)
+    assert held.std() == pytest.approx(0.01, rel=0.3)
+    assert held.mean() == pytest.approx(0.4, abs=5e-3)
+    assert "0.01" in world.setting.devices["galvo jitter"]
+    world.bench.rest(world.model.scanner.command_range[1])
+    assert np.nanmax(world.mirror_positions(world.bench.during(np.arange(1000) * 1e-5, 1e-5, 1e-5), 1e-5)) <= 1.0
+    scanner.close()

@@ -55,21 +55,18 @@ def test_a_pixel_sees_the_mean_print_over_its_area() -> None:
         error = (seen.albedo[y, x] - expected)[np.isfinite(expected)]
         assert abs(error.mean()) < 1e-3
         assert error.std() < most
+    between = (seen.albedo > WALL_ALBEDO + 0.02) & (seen.albedo < WHITE - 0.02)
+    assert np.any(between & (seen.depth_m == 3.0))  # the paper's edge is shared with the wall
     on_board = seen.albedo[seen.depth_m < 2.9]
     assert on_board.min() == pytest.approx(BLACK)
     assert on_board.max() == pytest.approx(WHITE)
 
 
-def test_an_edge_of_the_paper_is_shared_with_the_wall() -> None:
-    seen = board_scene(U, V, [BoardAtPose(BOARD, POSE)], wall_m=3.0)
-    between = (seen.albedo > WALL_ALBEDO + 0.02) & (seen.albedo < WHITE - 0.02)
-    assert np.any(between & (seen.depth_m == 3.0))
-
-
 def test_the_nearer_board_is_in_front() -> None:
     far = BoardAtPose(BOARD, BoardPose(np.zeros(3), np.array([-0.2, -0.1, 2.0])))
     near = BoardAtPose(BOARD, BoardPose(np.zeros(3), np.array([0.0, -0.1, 1.0])))
-    both = board_scene(U, V, [near, far], wall_m=3.0)
+    turned = BoardAtPose(BOARD, BoardPose(np.array([0.0, np.pi, 0.0]), np.array([0.2, -0.1, 0.8])))  # seen from behind
+    both = board_scene(U, V, [near, far, turned], wall_m=3.0)
     alone = board_scene(U, V, [near], wall_m=3.0)
     there = alone.depth_m < 2.9
     assert np.array_equal(both.depth_m[there], alone.depth_m[there])
@@ -85,32 +82,18 @@ def test_a_mirrored_board_is_the_other_way_round() -> None:
     assert not np.array_equal(right.albedo, wrong.albedo)
 
 
-def test_a_board_seen_from_behind_is_not_there() -> None:
-    turned = BoardPose(np.array([0.0, np.pi, 0.0]), np.array([0.2, -0.1, 1.0]))
-    assert np.all(board_scene(U, V, [BoardAtPose(BOARD, turned)], wall_m=3.0).depth_m == 3.0)
-
-
 def _world(tmp_path: Path, **config: Any) -> SimulatedWorld:
-    geometry = tmp_path / "rig.yaml"
-    geometry.write_text(yaml.safe_dump(calibration()))
-    return made_world(geometry=str(geometry), **config)
+    (tmp_path / "rig.yaml").write_text(yaml.safe_dump(calibration()))
+    return made_world(geometry=str(tmp_path / "rig.yaml"), **config)
 
 
 def test_the_bundled_board_can_be_moved(tmp_path: Path) -> None:
     still = _world(tmp_path, scene="board")
     assert (still.scene.illuminance_lux, still.scene.extinction_per_m) == (30, 0)  # a dimmed lab
-    near = _world(
-        tmp_path,
-        scene="board",
-        board_pose={"rotation": ["0 rad", "0 rad", "0 rad"], "position": ["-25 cm", "-18 cm", "60 cm"]},
-    )
+    pose = {"rotation": ["0 rad"] * 3, "position": ["-25 cm", "-18 cm", "60 cm"]}
+    near = _world(tmp_path, scene="board", board_pose=pose)
     assert still.surfaces.depth_m.min() > 0.9
     assert near.surfaces.depth_m.min() == pytest.approx(0.6)
-    assert near.true_model() is near.model
-
-
-def test_a_pose_needs_a_board(tmp_path: Path) -> None:
-    pose = {"rotation": ["0 rad"] * 3, "position": ["0 m", "0 m", "1 m"]}
     with pytest.raises(DeviceError, match="surfaces: board"):
         _world(tmp_path, scene="street", board_pose=pose)
 

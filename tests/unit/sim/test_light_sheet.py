@@ -62,9 +62,3 @@ def test_light_that_enters_behind_the_picture_edge_is_in_shadow() -> None:
     sheet = view.sheet(model.planes(-0.2))
     assert np.all(np.isnan(sheet.x_stripe_px))
     assert np.all(np.isnan(sheet.x_end_px))
-
-
-def test_open_sky_has_no_stripe() -> None:
-    model = rig()
-    sky = wall(model, (0.0, 0.0, 1.0), np.inf)
-    assert np.all(np.isnan(setting(model, sky).view.sheet(model.planes(0.0)).x_stripe_px))

@@ -49,13 +49,7 @@ def test_without_either_it_is_as_wide_everywhere() -> None:
 
 
 @pytest.mark.parametrize("focus", ["1 mm", "9.828 mm"])
-def test_a_focus_within_the_focal_length_is_refused(focus: str) -> None:
-    model = rig(focal_px=600.0)  # times 16.38 um: 9.828 mm
-    view = setting(model, wall(model, (0.0, 0.0, 1.0), 2.0)).view
+def test_a_world_refuses_a_focus_within_the_focal_length(focus: str) -> None:
+    # 600 px times 16.38 um: 9.828 mm
     with pytest.raises(DeviceError, match=r"optics\.focus.*focal length of 9\.83 mm.*beyond"):
-        line_width(view, Optics.model_validate({"focus": focus}), Sensor(), Line())
-
-
-def test_a_world_refuses_such_a_focus_before_anything_is_planned() -> None:
-    with pytest.raises(DeviceError, match=r"optics\.focus is 5 mm"):
-        made_world(optics={"focus": "5 mm"})
+        made_world(optics={"focus": focus})

@@ -27,6 +27,8 @@ def test_rain_is_marshall_and_palmers(rate: float) -> None:
     assert rain.extinction_per_m == pytest.approx(3.65e-4 * rate**0.63, rel=2e-3)
     water_mm_per_h = _integral(number * np.pi / 6 * DIAMETER_MM**3 * rain.fall_m_per_s(DIAMETER_MM)) * 1e-9 * 3.6e6
     assert water_mm_per_h == pytest.approx(rate, rel=0.2)
+    speed = rain.fall_m_per_s(np.array([0.05, 1.0, 2.0, 5.0]))  # fine drizzle does not rise
+    assert speed == pytest.approx([0.0, 4.0, 6.5, 9.1], abs=0.1)  # Gunn and Kinzer 1949: 4.0, 6.5, 9.1 m/s
 
 
 @pytest.mark.parametrize("rate", [0.5, 2.0, 5.0])
@@ -40,20 +42,9 @@ def test_snow_is_gunn_and_marshalls(rate: float) -> None:
     assert water_mm_per_h == pytest.approx(rate, rel=0.4)
 
 
-def test_a_drop_falls_as_fast_as_measured_and_fine_drizzle_does_not_rise() -> None:
-    rain = Rain.model_validate({"rate": "5 mm/h"})
-    speed = rain.fall_m_per_s(np.array([0.05, 1.0, 2.0, 5.0]))
-    assert speed == pytest.approx([0.0, 4.0, 6.5, 9.1], abs=0.1)  # Gunn and Kinzer 1949: 4.0, 6.5, 9.1 m/s
-
-
 def test_what_is_in_the_air_adds_up() -> None:
-    scene = SceneFile.model_validate(
-        {
-            "medium": {"extinction": "0.1 /m", "forward_share": 0.5},
-            "rain": {"rate": "20 mm/h"},
-            "snow": {"rate": "1 mm/h"},
-        }
-    )
+    medium = {"extinction": "0.1 /m", "forward_share": 0.5}
+    scene = SceneFile.model_validate({"medium": medium, "rain": {"rate": "20 mm/h"}, "snow": {"rate": "1 mm/h"}})
     assert scene.rain is not None
     assert scene.snow is not None
     rest = scene.rain.extinction_per_m + scene.snow.extinction_per_m
@@ -71,21 +62,17 @@ def test_henyey_greenstein_is_normalised_and_has_its_mean_cosine(g: float) -> No
 
 
 @pytest.mark.parametrize(
-    ("phase", "back"),
+    ("phase", "back", "cosine"),
     [
-        ("isotropic", 1 / (4 * np.pi)),
-        ({"g": 0.85}, 0.0035),  # published values near 180 degrees
-        ({"terms": [[0.9, 0.9], [0.1, -0.5]]}, 0.050),
+        ("isotropic", 1 / (4 * np.pi), 0.0),
+        ({"g": 0.85}, 0.0035, 0.85),  # published values near 180 degrees
+        ({"terms": [[0.9, 0.9], [0.1, -0.5]]}, 0.050, 0.76),
     ],
 )
-def test_values_at_180_degrees(phase: object, back: float) -> None:
+def test_values_at_180_degrees_and_mean_cosines(phase: object, back: float, cosine: float) -> None:
     medium = Medium.model_validate({"extinction": "0.1 /m", "phase": phase})
     assert medium.back_per_sr == pytest.approx(back, rel=0.02)
-
-
-def test_the_mean_cosine_is_that_of_the_terms_and_droplets_scatter_forward() -> None:
-    two = Medium.model_validate({"extinction": "0.1 /m", "phase": {"terms": [[0.9, 0.9], [0.1, -0.5]]}})
-    assert two.mean_cosine == pytest.approx(0.76)
+    assert medium.mean_cosine == pytest.approx(cosine)
     fog = Medium.model_validate({"fog": {"visibility": "40 m"}})
     assert (fog.phase_terms, fog.back_per_sr, fog.mean_cosine) == (None, 0.05, 0.85)
 

@@ -13,7 +13,6 @@ from sim_backend.effects.stripe import Stripe
 from sim_backend.frames.flux import FluxModel
 from sim_backend.light.optics import Line
 from sim_backend.light.view import make_view
-from sim_backend.scenes.scene import SceneFile
 from tests.stability.inventory import covers
 from tests.unit.sim.rigs import before_wall, drawn, rig, setting, wall
 
@@ -77,12 +76,6 @@ def test_what_comes_up_to_the_camera_is_gone_and_nothing_breaks() -> None:
         view = shifted(setup.view, np.array(shift))
         assert np.isfinite(view.surface).all()
         assert view.surface.min() >= 0
-
-
-def test_a_scene_file_says_it_in_metres_per_second() -> None:
-    scene = SceneFile.model_validate({"motion": {"velocity": ["0 m/s", "0 m/s", "-7.2 km/h"]}})
-    assert scene.motion is not None
-    assert scene.motion.velocity == pytest.approx((0, 0, -2))
 
 
 def test_frames_of_a_moving_scene_do_not_depend_on_blocks_or_threads() -> None:

@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 
 from sim_backend.frames.flux import FluxModel
-from sim_backend.light.line import ONE_LINE, LineFan, line_fan
+from sim_backend.light.line import ONE_LINE, LineFan
 from sim_backend.light.optics import Line
 from tests.unit.sim.rigs import deviations, drawn, made_world, rig, setting, wall
 
@@ -30,9 +30,10 @@ def mean_flux(model, flux, share):
 @pytest.mark.parametrize(("shared", "share"), [(True, 1 / 3), (False, 1.0)])
 def test_a_frame_has_the_light_of_all_lines_and_the_ambient_light_once(shared, share):
     model = rig()
-    setup = setting(model, wall(model, (0, 0, 1), 3.0), ambient={"illuminance": "2000 lux"}, **FOG)
+    line = Line(speckle=not shared)  # of one line, which leaves the others alone
+    setup = setting(model, wall(model, (0, 0, 1), 3.0), line=line, ambient={"illuminance": "2000 lux"}, **FOG)
     flux, n = FluxModel(setup), 3000
-    counts = frames(flux, model, line_fan(OFFSETS, shared=shared), n).sum(axis=0, dtype=np.int64)
+    counts = frames(flux, model, LineFan(OFFSETS, share), n).sum(axis=0, dtype=np.int64)
     z = deviations(counts, n, mean_flux(model, flux, share))
     assert np.abs(z).max() < 6
     assert np.sqrt((z**2).mean()) == pytest.approx(1, abs=0.05)
@@ -41,7 +42,6 @@ def test_a_frame_has_the_light_of_all_lines_and_the_ambient_light_once(shared, s
 def test_one_line_is_drawn_as_if_there_were_no_others():
     model = rig()
     flux = FluxModel(setting(model, wall(model, (0, 0, 1), 3.0), **FOG))
-    assert np.array_equal(frames(flux, model, ONE_LINE), frames(flux, model, LineFan((0.0,), 1.0)))
     # The way of several lines, taken with one.
     assert np.array_equal(frames(flux, model, ONE_LINE), frames(flux, model, LineFan((0.0, 5.0), 1.0)))
 
@@ -49,18 +49,10 @@ def test_one_line_is_drawn_as_if_there_were_no_others():
 def test_a_line_past_the_range_goes_nowhere():
     model = rig()
     low, high = model.scanner.command_range
-    fan = line_fan((-2.5, 0.0, 2.5), shared=True)
+    fan = LineFan((-2.5, 0.0, 2.5), 1 / 3)
     sheets = fan.sheets(model.sheets, np.array([low, 0.0, high]), 64, [0.0] * 3, (low, high))
     assert [len(lines) for lines in sheets] == [1, 1, 1]
     np.testing.assert_array_equal(sheets[1][0].normal[0], model.planes(0.0)[:3])
-
-
-def test_speckle_of_one_line_leaves_the_others_alone():
-    model = rig()
-    setup = setting(model, wall(model, (0, 0, 1), 3.0), line=Line(speckle=True))
-    flux, n = FluxModel(setup), 3000
-    counts = frames(flux, model, line_fan(OFFSETS, shared=False), n).sum(axis=0, dtype=np.int64)
-    assert np.abs(deviations(counts, n, mean_flux(model, flux, 1.0))).max() < 6
 
 
 def test_the_world_plans_its_effects_for_the_light_of_all_lines_and_tells_their_flux():

@@ -29,22 +29,12 @@ def _compiled(code_of_round: Callable[..., Any]) -> Any:
     @make
     def one_round(typing, s0, s1, k0, k1):  # type: ignore[no-untyped-def]
         def code(context, builder, signature, args):  # type: ignore[no-untyped-def]
-            block = ir.VectorType(ir.IntType(64), 2)
-            whole = []
-            for halves in (args[:2], args[2:]):
-                vector = ir.Constant(block, ir.Undefined)
-                for i, half in enumerate(halves):
-                    vector = builder.insert_element(vector, half, ir.Constant(ir.IntType(32), i))
-                whole.append(vector)
-            state = code_of_round(builder, *whole)
-            return context.make_tuple(
-                builder,
-                signature.return_type,
-                [builder.extract_element(state, ir.Constant(ir.IntType(32), i)) for i in (0, 1)],
-            )
+            given = [random_lanes._vector(builder, random_lanes._BLOCK, halves) for halves in (args[:2], args[2:])]
+            state = code_of_round(builder, *given)
+            halves = [builder.extract_element(state, ir.Constant(ir.IntType(32), i)) for i in (0, 1)]
+            return context.make_tuple(builder, signature.return_type, halves)
 
-        u64 = types.uint64
-        return types.UniTuple(u64, 2)(u64, u64, u64, u64), code
+        return types.UniTuple(types.uint64, 2)(*[types.uint64] * 4), code
 
     return numba.njit(lambda a, b, c, d: one_round(a, b, c, d))
 

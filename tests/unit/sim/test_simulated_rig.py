@@ -1,16 +1,17 @@
-"""The simulated devices together: what the SPAD records depends on mirror, gate and laser, and on nothing else."""
+"""The simulated devices together: what the SPAD records depends on mirror, gate and laser, and on its own crystal."""
 
 from collections.abc import Iterator
 from dataclasses import dataclass
 from fractions import Fraction
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
 from numpy.typing import NDArray
 
 from calibration.files.rig_file import save_rig_model
-from drivers.clock import SystemClock, VirtualClock
+from drivers.clock import VirtualClock
 from drivers.errors import DeviceError, DeviceTimeout
 from drivers.frames import BlockFlag, FrameBlock, Mark
 from drivers.interfaces import (
@@ -29,10 +30,9 @@ from drivers.interfaces import (
 )
 from drivers.registry import Surroundings
 from drivers.ring import BlockRing, OnFull
-from drivers.spb1 import walk_blocks
 from sim_backend.devices import laser, scanner, spad, sync
+from sim_backend.devices.spad import STEP_S, TickClock
 from sim_backend.light.optics import Sensor
-from sim_backend.world import KIND as WORLD
 from sim_backend.world import SimulatedWorld, WorldConfig
 from tests.unit.sim.rigs import rig
 
@@ -53,11 +53,7 @@ class Rig:
     sync: SyncSource
 
     def start(
-        self,
-        *,
-        frames: int | None = 1000,
-        block_frames: int = 31,
-        window: WindowTable | None = None,
+        self, *, frames: int | None = 1000, block_frames: int = 31, window: WindowTable | None = None
     ) -> BlockRing:
         """Everything started in the order of a scan: two sweeps of 4 ms, gate high from 0.5 to 3.5 ms of each."""
         timing = self.spad.configure(SpadRequest(Fraction(100_000), 1e-5, "stream", block_frames, window))
@@ -76,15 +72,15 @@ class Rig:
         return BlockRing(4, timing.stride)
 
 
-@dataclass
 class Recording:
     """What came out of a run, copied."""
 
-    headers: list
-    frames: NDArray[np.int64]
-    records: NDArray[np.void]
-    bits: NDArray[np.uint8]
-    ticks: NDArray[np.int64]
+    def __init__(self, blocks: list[FrameBlock]) -> None:
+        self.headers = [block.header for block in blocks]
+        self.frames = np.concatenate([block.frame_numbers for block in blocks])
+        self.records = np.concatenate([block.records for block in blocks])
+        self.bits = np.concatenate([block.bits for block in blocks])
+        self.ticks = np.concatenate([block.start_ticks for block in blocks])
 
     @property
     def ones(self) -> NDArray[np.int64]:
@@ -106,25 +102,15 @@ def _record(rig: Rig, ring: BlockRing) -> Recording:
         block = reader.next(0.1)
         if block is not None:  # None: the last frames of the run got lost
             blocks.append(FrameBlock(block.header, block.records.copy(), block.bits.copy()))
-    return Recording(
-        headers=[b.header for b in blocks],
-        frames=np.concatenate([b.frame_numbers for b in blocks]),
-        records=np.concatenate([b.records for b in blocks]),
-        bits=np.concatenate([b.bits for b in blocks]),
-        ticks=np.concatenate([b.start_ticks for b in blocks]),
-    )
+    return Recording(blocks)
 
 
-def _open(
-    folder: Path, seed: int = 1, scene: str = "street-clear", sensor: Sensor = _SENSOR, **spad_config: object
-) -> Rig:
+def _open(folder: Path, seed: int = 1, sensor: Sensor = _SENSOR, **spad_config: object) -> Rig:
     geometry = folder / "rig.yaml"
     if not geometry.exists():
         save_rig_model(rig(size=(20, 70), focal_px=80.0), geometry)
-    clock = VirtualClock(123_457)
-    world = WORLD.create(
-        WorldConfig(geometry=str(geometry), scene=scene, sensor=sensor), Surroundings(clock, None, seed)
-    )
+    clock, config = VirtualClock(123_457), WorldConfig(geometry=str(geometry), scene="street-clear", sensor=sensor)
+    world = SimulatedWorld(config, Surroundings(clock, None, seed))
     around = Surroundings(clock, world, seed)
     return Rig(
         clock,
@@ -136,11 +122,14 @@ def _open(
     )
 
 
-def _runs(folder: Path, window: WindowTable | None = None, **spad_config: object) -> list[Recording]:
-    """The same run in blocks of several sizes."""
-    opened = [_open(folder, **spad_config) for _ in range(3)]
-    sizes = (31, 7, 600)
-    return [_record(one, one.start(block_frames=n, window=window)) for one, n in zip(opened, sizes, strict=True)]
+def _run(folder: Path, block_frames: int = 31, window: WindowTable | None = None, **config: Any) -> Recording:
+    opened = _open(folder, **config)
+    return _record(opened, opened.start(block_frames=block_frames, window=window))
+
+
+def _runs(folder: Path, window: WindowTable | None = None, **config: Any) -> list[Recording]:
+    """The same run in blocks of two sizes."""
+    return [_run(folder, block_frames, window, **config) for block_frames in (31, 600)]
 
 
 @pytest.fixture
@@ -151,62 +140,24 @@ def small(tmp_path: Path) -> Iterator[Rig]:
         device.close()
 
 
-def test_frames_are_lit_exactly_while_the_gate_is_high(small: Rig) -> None:
+def test_frames_are_lit_exactly_while_the_gate_is_high_where_the_mirror_is(small: Rig) -> None:
     run = _record(small, small.start())
     lit = run.marked(Mark.GATE_HIGH)
     assert 2 * 298 <= lit.sum() <= 2 * 300
     assert run.marked(Mark.GATE_EDGE).sum() <= 4
     dark = ~lit & ~run.marked(Mark.GATE_EDGE)
     assert run.ones[lit].mean() > 3 * run.ones[dark].mean()
-
-
-def test_a_paused_laser_leaves_the_gate_marks_but_no_light(small: Rig) -> None:
-    ring = small.start()
-    small.laser.pause()
-    run = _record(small, ring)
-    lit = run.marked(Mark.GATE_HIGH)
-    assert lit.sum() > 590
-    assert run.ones[lit].mean() == pytest.approx(run.ones[~lit].mean(), abs=0.3)
-
-
-def test_the_picture_follows_the_mirror(small: Rig) -> None:
-    run = _record(small, small.start())
-    lit = np.flatnonzero(run.marked(Mark.GATE_HIGH))[:290]
-    columns = np.unpackbits(run.bits[lit], axis=-1)[:, :, :70].sum(axis=1)
+    columns = np.unpackbits(run.bits[np.flatnonzero(lit)[:290]], axis=-1)[:, :, :70].sum(axis=1)
     x = np.arange(70)
     early, late = columns[:20].sum(axis=0), columns[130:150].sum(axis=0)
     assert late @ x / late.sum() > early @ x / early.sum() + 8
 
 
-def test_the_gate_lowered_midway_ends_the_light(small: Rig) -> None:
-    ring = small.start(block_frames=10)
-    reader = ring.reader("test")
-    for _ in range(30):
-        small.spad.fill(ring, 1.0)
-        reader.next(0.1)
-    small.sync.gate_low()
-    after = []
-    while small.spad.fill(ring, 1.0):
-        block = reader.next(0.1)
-        assert block is not None
-        after.append(block.records["marks"].copy())
-    assert not np.any(np.concatenate(after) & (Mark.GATE_HIGH | Mark.GATE_EDGE))
-
-
-def test_the_same_seed_gives_the_same_bits_for_any_block_size(tmp_path: Path) -> None:
-    runs, other = _runs(tmp_path), _open(tmp_path, seed=2)
-    for run in runs[1:]:
-        assert np.array_equal(run.bits, runs[0].bits)
-        assert np.array_equal(run.ticks, runs[0].ticks)
-        for name in ("marks", "line", "sweep"):
-            assert np.array_equal(run.records[name], runs[0].records[name])
-    assert not np.array_equal(_record(other, other.start()).bits, runs[0].bits)
-
-
 def test_windows_move_with_the_markers_and_hold_the_bits_of_the_full_frames(tmp_path: Path) -> None:
     entries = np.arange(31) // 7 % 2 * 64
     window = WindowTable(64, (entries.astype(np.int32), 64 - entries.astype(np.int32)))
-    full, runs = _runs(tmp_path, lost_frames=[200, 201, 430])[0], _runs(tmp_path, window, lost_frames=[200, 201, 430])
+    lost = [200, 201, 430]
+    full, runs = _run(tmp_path, lost_frames=lost), _runs(tmp_path, window, lost_frames=lost)
     for run in runs:
         assert np.array_equal(run.records["marks"], full.records["marks"])
         assert {header.width for header in run.headers} == {64}
@@ -221,42 +172,6 @@ def test_windows_move_with_the_markers_and_hold_the_bits_of_the_full_frames(tmp_
         for i in range(len(run.frames)):
             assert np.array_equal(run.bits[i], full.bits[i, :, at[i] : at[i] + 8])
         assert set(run.records["x0"].tolist()) == {0, 64}
-
-
-def _first_block(opened: Rig, window: WindowTable | None = None) -> tuple[FrameBlock, FrameBlock]:
-    """The first block of a run as it comes out of the ring, and as SPB1 reads it there."""
-    ring = opened.start(block_frames=10, window=window)
-    reader = ring.reader("test")
-    opened.spad.fill(ring, 1.0)
-    block = reader.next(0.1)
-    assert block is not None
-    slot = next(memory for memory in ring._memory if np.shares_memory(memory, block.bits))
-    (read,) = walk_blocks(slot, ring.stride, check_payload=True)
-    assert isinstance(read, FrameBlock)
-    return block, read
-
-
-def test_a_block_of_windows_is_an_spb1_block(small: Rig) -> None:
-    block, read = _first_block(small, WindowTable(64, (np.array([64], np.int32),)))
-    assert (read.header.width, read.header.sensor_width) == (64, 70)
-    assert np.array_equal(read.records, block.records)
-    assert np.array_equal(read.bits, block.bits)
-
-
-def test_bit_errors_of_the_sensor_lie_in_blocks_with_sound_checksums(tmp_path: Path) -> None:
-    clean, damaged = (
-        _first_block(_open(tmp_path, sensor=sensor))[1] for sensor in (_SENSOR, Sensor(bit_error_rate="5 %"))
-    )
-    flipped = np.bitwise_count(clean.bits ^ damaged.bits).sum() / (10 * 20 * 70)
-    assert flipped == pytest.approx(0.05, abs=0.01)
-
-
-def test_only_virtual_time_can_wait(small: Rig) -> None:
-    assert small.spad.info.can_wait
-    small.world.bench.clock = SystemClock()
-    seeing = spad.SimulatedSpad(spad.SimulatedSpadConfig(), small.world, 0)
-    assert not seeing.info.can_wait
-    seeing.close()
 
 
 def test_records_tell_markers_direction_and_counters(small: Rig) -> None:
@@ -280,9 +195,8 @@ def test_records_tell_markers_direction_and_counters(small: Rig) -> None:
 
 @pytest.mark.parametrize("sensor", [_SENSOR, Sensor(afterpulsing="50 %", trap_lifetime="8 us")])
 def test_lost_frames_close_the_block_and_are_counted(tmp_path: Path, sensor: Sensor) -> None:
-    clean = _open(tmp_path, sensor=sensor)
     gappy = _open(tmp_path, sensor=sensor, lost_frames=(0, 140, 141, 999))
-    whole, run = _record(clean, clean.start()), _record(gappy, gappy.start())
+    whole, run = _run(tmp_path, sensor=sensor), _record(gappy, gappy.start())
     kept = np.setdiff1d(np.arange(1000), [0, 140, 141, 999])
     assert np.array_equal(run.frames, kept)
     assert np.array_equal(run.bits, whole.bits[kept])
@@ -294,18 +208,9 @@ def test_lost_frames_close_the_block_and_are_counted(tmp_path: Path, sensor: Sen
     assert (counters.exposed, counters.delivered, counters.lost) == (1000, 996, 4)
 
 
-def test_frames_lost_at_random_differ_by_seed(tmp_path: Path) -> None:
-    runs = []
-    for seed in (1, 2):
-        opened = _open(tmp_path, seed=seed, loss_probability=0.05)
-        runs.append(_record(opened, opened.start()).frames)
-    assert all(900 < len(frames) < 990 for frames in runs)
-    assert not np.array_equal(*[np.isin(np.arange(1000), frames) for frames in runs])
-
-
 def test_a_frame_that_comes_twice_has_markers_counters_and_ticks_of_the_first_time(tmp_path: Path) -> None:
-    clean, doubled = _open(tmp_path), _open(tmp_path, duplicate_probability=0.1)
-    whole, run = _record(clean, clean.start()), _record(doubled, doubled.start())
+    doubled = _open(tmp_path, duplicate_probability=0.1)
+    whole, run = _run(tmp_path), _record(doubled, doubled.start())
     assert np.array_equal(run.frames, whole.frames)
     twice = np.flatnonzero(np.diff(run.ticks) == 0) + 1
     assert 60 < len(twice) < 140
@@ -316,19 +221,19 @@ def test_a_frame_that_comes_twice_has_markers_counters_and_ticks_of_the_first_ti
     once = np.setdiff1d(run.frames, twice)
     assert np.array_equal(run.ticks[once], whole.ticks[once])
     assert np.array_equal(run.bits[once], whole.bits[once])
-    assert doubled.spad.counters == clean.spad.counters
+    assert doubled.spad.counters.lost == 0
 
 
 @pytest.mark.parametrize("wander", ["0 ppm", "900 ppm"])
 def test_a_spad_clock_that_is_off_sees_the_scanner_run_by_its_own_ticks(tmp_path: Path, wander: str) -> None:
-    run, *others = _runs(tmp_path, clock_error="-900 ppm", clock_wander=wander)
+    run, other = _runs(tmp_path, clock_error="-900 ppm", clock_wander=wander)
     scans = np.flatnonzero(run.marked(Mark.SCAN))
     times = run.ticks[scans] / 1000 + (((run.records["marks"][scans] >> 8) & 0xFF) + 0.5) / 256
     expected = 400 * (1 - 900e-6) / (1 + 20e-6)
     assert np.diff(times)[0] == pytest.approx(expected, abs=1 / 256 if wander == "0 ppm" else 0.1)
-    for other in others:
-        assert np.array_equal(other.records[["marks", "line", "sweep"]], run.records[["marks", "line", "sweep"]])
-        assert np.array_equal(other.bits, run.bits)
+    assert np.array_equal(other.records[["marks", "line", "sweep"]], run.records[["marks", "line", "sweep"]])
+    assert np.array_equal(other.bits, run.bits)
+    assert np.array_equal(other.ticks, run.ticks)
 
 
 def test_a_spad_that_loses_everything_times_out(tmp_path: Path) -> None:
@@ -336,13 +241,8 @@ def test_a_spad_that_loses_everything_times_out(tmp_path: Path) -> None:
     ring = opened.start(frames=None)
     with pytest.raises(DeviceTimeout, match="got lost"):
         opened.spad.fill(ring, 0.01)
-
-
-def test_headers_carry_the_timing_exactly(tmp_path: Path) -> None:
-    opened = _open(tmp_path)
-    timing = opened.spad.configure(SpadRequest(Fraction(97_700), 1e-5, "stream", 31))
-    assert timing.tick_hz / timing.frame_period_ticks == 97_700
-    assert float(timing.exposure_ticks / timing.tick_hz) == pytest.approx(1e-5, rel=1e-3)
+    with pytest.raises(DeviceError, match="no simulated world"):
+        spad.KIND.create(spad.SimulatedSpadConfig(), Surroundings(VirtualClock(), None, 0))
 
 
 def test_the_frames_of_a_column_share_the_flux_of_their_mean_position(small: Rig) -> None:
@@ -364,11 +264,6 @@ def test_the_frames_of_a_column_share_the_flux_of_their_mean_position(small: Rig
     assert hold(np.array([0.41]), unknown[:1])[0] == pytest.approx(0.4)
 
 
-def test_a_spad_without_a_world_is_refused() -> None:
-    with pytest.raises(DeviceError, match="no simulated world"):
-        spad.KIND.create(spad.SimulatedSpadConfig(), Surroundings(VirtualClock(), None, 0))
-
-
 def test_where_the_ring_lets_it_not_wait_it_drops_whole_blocks_and_counts_them(small: Rig) -> None:
     stride = small.start(frames=155).stride
     ring = BlockRing(2, stride, on_full=OnFull.DROP)
@@ -385,3 +280,42 @@ def test_where_the_ring_lets_it_not_wait_it_drops_whole_blocks_and_counts_them(s
     assert last.header.flags == BlockFlag.LAST | BlockFlag.LOST_BEFORE
     counters = small.spad.counters
     assert (counters.exposed, counters.delivered, counters.lost) == (155, 93, 62)
+
+
+TICK_S, PERIOD = 1e-8, 1000
+START_S = 12.5
+
+
+def _clock(error: float, wander: float, seed: int = 1) -> TickClock:
+    return TickClock(TICK_S, START_S, error, wander, [seed])
+
+
+@pytest.mark.parametrize("error", [-200e-6, 0.0, 50e-6])
+def test_a_fast_crystal_takes_its_frames_closer_together(error: float) -> None:
+    times = _clock(error, 0.0).times_s(0, PERIOD, 100_001)
+    assert times[0] == START_S
+    assert times[-1] - START_S == pytest.approx(1 / (1 + error), abs=1e-12)
+    assert np.all(np.diff(times) > 0)
+
+
+def test_the_error_wanders_with_the_root_of_time() -> None:
+    wander, seconds, runs = 1e-6, 0.5, 200
+    late = []
+    for seed in range(runs):
+        times = _clock(20e-6, wander, seed).times_s(0, round(0.1 / TICK_S), 6)
+        late.append((times[-1] - START_S) * (1 + 20e-6) - seconds)
+    # The integral of a random walk over T has variance wander^2 T^3 / 3.
+    expected = wander * np.sqrt(seconds**3 / 3)
+    assert np.std(late) == pytest.approx(expected, rel=4 / np.sqrt(2 * runs))
+    assert abs(np.mean(late)) < 4 * expected / np.sqrt(runs)
+
+
+@pytest.mark.parametrize("block", [1, 450])
+def test_times_do_not_depend_on_how_they_are_asked_for(block: int) -> None:
+    frames = round(3.2 * STEP_S / TICK_S / PERIOD)
+    whole = _clock(50e-6, 1e-3).times_s(0, PERIOD, frames + 1)
+    clock = _clock(50e-6, 1e-3)
+    for first in range(0, frames, block):
+        n = min(block, frames - first)
+        # As the SPAD asks: with the start of the frame behind, which is asked for again.
+        assert np.array_equal(clock.times_s(first * PERIOD, PERIOD, n + 1), whole[first : first + n + 1])

@@ -17,13 +17,13 @@ from tests.unit.sim.rigs import Array, rig, setting, wall
 covers(speckle)
 
 
-@pytest.mark.parametrize("shape", [1.0, 2.5, 43.0])
+@pytest.mark.parametrize("shape", [1.0, 43.0])
 def test_a_pixels_light_is_gamma_distributed(shape: float) -> None:
-    drawn = np.array([gamma_of(np.uint64(frame_key(np.uint64(5), np.uint64(i))), shape) for i in range(100_000)])
+    drawn = np.array([gamma_of(np.uint64(frame_key(np.uint64(5), np.uint64(i))), shape) for i in range(40_000)])
     assert drawn.mean() == pytest.approx(1, abs=5 / np.sqrt(shape * len(drawn)))
-    assert drawn.std() == pytest.approx(1 / np.sqrt(shape), rel=0.02)
+    assert drawn.std() == pytest.approx(1 / np.sqrt(shape), rel=0.03)
     third = np.mean((drawn - 1) ** 3) / drawn.std() ** 3
-    assert third == pytest.approx(2 / np.sqrt(shape), rel=0.1, abs=0.03)
+    assert third == pytest.approx(2 / np.sqrt(shape), rel=0.15, abs=0.05)
 
 
 def test_the_contrast_is_that_of_the_grains_in_a_diode() -> None:
