@@ -1,12 +1,8 @@
 """Operations across lanes: shuffles, sums along the lanes, masks with a bit for each lane, turned blocks of numbers.
 
 Reductions (`largest_of_rows`, `totals_of_rows`) take LANES rows at once and give one number a row, which then is one
-lane of the answer. Row by row every step of a reduction would wait for the one before, and take as many instructions
-for one row as here for all.
-
-`fetch_eights` and `spread_eights` take eight numbers from each of LANES places and turn them, so that lane i of eight
-vectors holds those of place i: the pixels around stripes are fetched in this way, with two instructions a stripe
-instead of two a number.
+lane of the answer: row by row every step would wait for the one before. `fetch_eights` and `spread_eights` take eight
+numbers from each of LANES places and turn them, so that lane i of eight vectors holds those of place i.
 """
 
 from collections.abc import Callable, Sequence

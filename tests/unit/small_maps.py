@@ -9,6 +9,7 @@ from calibration.model.camera import Camera
 from calibration.model.rig_model import RigModel
 from calibration.model.scanner import PlaneTable
 from rig.count.volume import CountVolume
+from rig.geometry.stripe_table import StripeTable
 from rig.geometry.windows import SweepGeometry, sweep_geometry, uncalibrated_geometry
 from tests.reference.adapter import windowed
 from tests.reference.geometry import DEPTH_RANGE_M, Geometry
@@ -78,6 +79,12 @@ class Sweep:
         """Absolute errors in px over the trusted stripes; NaN where there is no answer."""
         scored = self.point.trusted
         return np.abs(x_px[scored].astype(float) - self.point.x_true[scored])
+
+
+def assert_same(found: StripeTable, wanted: StripeTable) -> None:
+    """The same bits in every field."""
+    for name, values in wanted.arrays().items():
+        np.testing.assert_array_equal(found.arrays()[name], values, err_msg=name)
 
 
 def street(rows: int) -> Scene:

@@ -8,9 +8,8 @@ and around its 5 x 5 neighbours on the same surface are explained by one amplitu
     flux = base + a scale (share + glow),   log-likelihood = sum n log(1 - exp(-flux)) - (K - n) flux
 
 with haze and ambient light as base. It is concave in a; Newton's steps come from below, since the slope is convex. Full
-pixels tell nothing, those beside them do. Where the amplitude is hardly more than its noise there may be no stripe, and
-where neighbours do not agree on it some are brighter, or in a shadow: the light of such stripes is not known, and they
-teach nothing.
+pixels tell nothing, those beside them do. Where the amplitude is hardly more than its noise, or neighbours do not agree
+on it, the light of a stripe is not known, and it teaches nothing.
 
 The fit (`add_equations`, `solve`). What is counted beside a stripe of s photons, at the distance d along the row, is
 
@@ -24,21 +23,19 @@ maps are asked whether there still is a halo, or one now.
 """
 
 import math
-from dataclasses import dataclass, replace
-from typing import Final
+from dataclasses import replace
+from typing import Final, NamedTuple
 
 import numba
 import numpy as np
-from numpy.typing import NDArray
 
-from rig.count.volume import CountVolume
+from rig.count.volume import Counts, CountVolume
+from rig.estimate.joint.place.light import FRACTIONS
 from rig.estimate.joint.place.places import BLIND_FLUX, REACH_PX, Places
 from rig.estimate.joint.place.pool import SAME_PX
-from rig.estimate.joint.place.score import FRACTIONS
 from rig.estimate.joint.tables import JointTables
 from rig.estimate.row.em import LATTICE_LINES, PIECES, lattice, lines_of
 from rig.estimate.row.inputs import (
-    Float32,
     Lines,
     RowState,
     Sweep,
@@ -53,6 +50,7 @@ from rig.estimate.row.model import BINS, HALO_NODES, HALO_REACHES_PX, RowModel, 
 from rig.estimate.search.online_learning import LearningSetting
 from rig.geometry.stripe_table import StripeTable
 from rig.geometry.windows import SweepGeometry
+from rig.simd import Bools, Float32, Float64, Int32
 from rig.threads import RowWorkers
 
 LEAST_FLUX: Final = 2e-3
@@ -65,19 +63,9 @@ MOST_SWEEPS: Final = 3000
 
 @numba.njit(cache=True, nogil=True)
 def add_equations(
-    lines: Lines,
-    light: Float32,
-    sweep: Sweep,
-    state: RowState,
-    halo: Float32,
-    reaches: NDArray[np.float64],
-    nodes: int,
-    hot_flux: float,
-    first_line: int,
-    last_line: int,
-    matrix: NDArray[np.float64],
-    right: NDArray[np.float64],
-) -> None:
+    lines: Lines, light: Float32, sweep: Sweep, state: RowState, halo: Float32, reaches: Float64, nodes: int,
+    hot_flux: float, first_line: int, last_line: int, matrix: Float64, right: Float64,
+) -> None:  # fmt: skip
     """Add the normal equations of lines first_line..last_line-1, weighted as the present state expects counts.
 
     Unknown: haze in each profile bin; its share behind the stripe at each node; halo at each node and reach; ambient
@@ -135,7 +123,7 @@ def add_equations(
 
 
 @numba.njit(cache=True, nogil=True)
-def solve(matrix: NDArray[np.float64], right: NDArray[np.float64], free: int) -> NDArray[np.float64]:
+def solve(matrix: Float64, right: Float64, free: int) -> Float64:
     """The x that minimises x' matrix x - 2 right' x, no number below 0 but number `free`; one number at a time."""
     x, slope = np.zeros_like(right), -right
     for _ in range(MOST_SWEEPS):
@@ -163,8 +151,7 @@ LEAST_SURE: Final = 4.0
 """Standard deviations of its noise that the light is more than."""
 DISAGREED: Final = 3.0
 """Standard deviations by which the stripes' misfit may exceed what chance brings. Of stripes that pass these limits
-less than 1 % are none (random scenes at five exposures); the trust of `rig.estimate.joint.lesson` alone lets 17 to 19 %
-of such through."""
+less than 1 % are none (random scenes at five exposures)."""
 MOST_STEPS: Final = 8
 MOST_GROWTH: Final = 4.0
 """By so much an amplitude may grow or shrink in a step."""
@@ -175,24 +162,12 @@ MOST_FLUX: Final = 20.0
 
 @numba.njit(cache=True, nogil=True, error_model="numpy")
 def likeliest_light(
-    counts: NDArray[np.unsignedinteger],
-    n_frames: NDArray[np.int32],
-    sweep: Sweep,
-    state: RowState,
-    shares: Float32,
-    x_px: Float32,
-    places: Places,
-    rows: NDArray[np.int32],
-    columns: NDArray[np.int32],
-    first_line: int,
-    last_line: int,
-    light: Float32,
-    known: NDArray[np.bool_],
-) -> None:
+    counts: Counts, n_frames: Int32, sweep: Sweep, state: RowState, shares: Float32, x_px: Float32, places: Places,
+    rows: Int32, columns: Int32, first_line: int, last_line: int, light: Float32, known: Bools,
+) -> None:  # fmt: skip
     """Fill light, photons per exposure, and known of stripes first_line..last_line-1 of those at (rows, columns).
 
-    counts: (columns, rows, window); shares: of `profile_table` in `rig.estimate.joint.place.place`; x_px: (rows,
-    columns), of all stripes.
+    counts: (columns, rows, window); shares: of `profile_table`; x_px: (rows, columns), of all stripes.
     """
     for i in range(first_line, last_line):
         y, c = rows[i], columns[i]
@@ -267,23 +242,17 @@ _SHARE, _HALO = BINS, BINS + HALO_NODES
 _SIZE = _HALO + HALO_NODES * len(HALO_REACHES_PX) + 1
 
 
-@dataclass(frozen=True, slots=True, eq=False)
-class BrightLines:
+class BrightLines(NamedTuple):
     """Lines with a clear stripe, which can teach of a halo, and the light of each stripe in photons."""
 
     lines: Lines
-    light: NDArray[np.float32]
+    light: Float32
 
 
 def bright_lines(
-    volume: CountVolume,
-    geometry: SweepGeometry,
-    tables: JointTables,
-    stripes: StripeTable,
-    places: Places,
-    workers: RowWorkers,
-    number: int = FIRST_LINES,
-) -> BrightLines:
+    volume: CountVolume, geometry: SweepGeometry, tables: JointTables, stripes: StripeTable, places: Places,
+    workers: RowWorkers, number: int = FIRST_LINES,
+) -> BrightLines:  # fmt: skip
     """Lines of a map whose light is known, out of about `number`.
 
     tables: those that the map was made with; places: of its stripes.
@@ -298,15 +267,9 @@ def bright_lines(
 
 
 def learn_first_halo(
-    volume: CountVolume,
-    geometry: SweepGeometry,
-    model: RowModel,
-    ambient: NDArray[np.float32],
-    tables: JointTables,
-    stripes: StripeTable,
-    places: Places,
-    workers: RowWorkers,
-) -> RowModel:
+    volume: CountVolume, geometry: SweepGeometry, model: RowModel, ambient: Float32, tables: JointTables,
+    stripes: StripeTable, places: Places, workers: RowWorkers,
+) -> RowModel:  # fmt: skip
     """The first map's model with the halo of `learn_halo`; to be called again with the map that is made under it.
 
     With several lines at once the model stays as it is: the other lines' haze would be taken for a halo.
@@ -332,13 +295,7 @@ def learn_next_halo(setting: LearningSetting, seen: BrightLines, workers: RowWor
 
 
 def learn_halo(
-    seen: BrightLines,
-    geometry: SweepGeometry,
-    model: RowModel,
-    ambient: NDArray[np.float32],
-    workers: RowWorkers,
-    *,
-    dark: bool,
+    seen: BrightLines, geometry: SweepGeometry, model: RowModel, ambient: Float32, workers: RowWorkers, *, dark: bool
 ) -> RowModel:
     """The model with the halo that these stripes have, and the haze under it; without a halo where they have none.
 
@@ -374,7 +331,7 @@ def learn_halo(
 
 def _equations(
     seen: BrightLines, geometry: SweepGeometry, model: RowModel, workers: RowWorkers
-) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+) -> tuple[Float64, Float64]:
     sweep, state = sweep_of(geometry), state_of(model)
     shares, reaches = halo_shares(model, geometry.width), np.array(HALO_REACHES_PX)
     hot_flux = 5.0 * float(np.median(model.ambient)) + 1e-3
@@ -394,7 +351,7 @@ def _equations(
     return half + np.tril(half, -1).T, rights.sum(axis=0)
 
 
-def _smoothness() -> NDArray[np.float64]:
+def _smoothness() -> Float64:
     out = np.zeros((_SIZE, _SIZE))
 
     def add(places: list[int], taps: list[float], strength: float) -> None:
@@ -411,5 +368,5 @@ def _smoothness() -> NDArray[np.float64]:
     return out
 
 
-def _misfit(matrix: NDArray[np.float64], right: NDArray[np.float64], x: NDArray[np.float64]) -> float:
+def _misfit(matrix: Float64, right: Float64, x: Float64) -> float:
     return float(x @ matrix @ x - 2 * right @ x)

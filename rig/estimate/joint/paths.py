@@ -18,7 +18,6 @@ from typing import Final, NamedTuple
 
 import numba
 import numpy as np
-from numpy.typing import NDArray
 
 from rig.estimate.joint.winner import (
     LARGEST,
@@ -27,6 +26,7 @@ from rig.estimate.joint.winner import (
     answer_columns,
     fetch_answers,
 )
+from rig.simd import Uint8
 from rig.simd.memory import address_of, load_bytes, prefetch, read_byte, store_bytes, write_byte
 from rig.simd.vectors import add_saturated_unsigned, smaller_unsigned, smallest_byte, sub_saturated_unsigned, zero_bytes
 
@@ -54,7 +54,7 @@ class Penalties(NamedTuple):
 
 
 @numba.njit(cache=True, nogil=True)
-def _path_memory(paths: int, labels: int) -> NDArray[np.uint8]:
+def _path_memory(paths: int, labels: int) -> Uint8:
     """Memory for L of the last pixel and of this one on so many paths; must live as long as the paths."""
     return np.full(2 * paths * (labels + 2 * _SIDE) + _SIDE, LARGEST, np.uint8)
 
@@ -147,9 +147,7 @@ def _along_row(cost: int, message: int, columns: int, labels: int, penalties: Pe
 
 
 @numba.njit(cache=True, nogil=True)
-def along_rows(
-    cost: NDArray[np.uint8], message: NDArray[np.uint8], penalties: Penalties, first_row: int, last_row: int
-) -> None:
+def along_rows(cost: Uint8, message: Uint8, penalties: Penalties, first_row: int, last_row: int) -> None:
     """Sums of the messages from the left and from the right, for rows first_row..last_row-1.
 
     cost, message: (rows, columns, labels), C-contiguous; labels: a multiple of VECTOR.
@@ -222,12 +220,7 @@ def _go_up(
 
 @numba.njit(cache=True, nogil=True)
 def along_columns(
-    cost: NDArray[np.uint8],
-    message: NDArray[np.uint8],
-    penalties: Penalties,
-    first_column: int,
-    last_column: int,
-    desk: Readout,
+    cost: Uint8, message: Uint8, penalties: Penalties, first_column: int, last_column: int, desk: Readout
 ) -> None:
     """Answer columns first_column..last_column-1, from what `along_rows` left in all rows of message.
 

@@ -14,6 +14,7 @@ from rig.estimate.joint.labels.grid import PER_PX, LabelGrid
 from rig.estimate.joint.winner import VECTOR
 from rig.geometry.stripe_table import StripeTable
 from rig.geometry.windows import SweepGeometry
+from rig.simd import Float32, Float64, Int32, Uint8
 from rig.simd.memory import address_of, load_bytes, store_bytes
 from rig.simd.vectors import add_saturated_unsigned
 from rig.threads import RowWorkers
@@ -39,7 +40,7 @@ class TemporalPrior:
         self.on = on
         self.before: NDArray[np.uint16] | None = None
         self._of: SweepGeometry | None = None
-        self._ramps: NDArray[np.uint8] | None = None
+        self._ramps: Uint8 | None = None
 
     def recall(self, before: NDArray[np.uint16] | None) -> None:
         """Go on from what was kept with a map."""
@@ -55,7 +56,7 @@ class TemporalPrior:
         if self._ramps is None or self._ramps.shape[1] != 2 * grid.labels:
             self._ramps = _ramps(grid.labels)
 
-    def add(self, volume: CountVolume, first: int, last: int, cost: NDArray[np.uint8]) -> None:
+    def add(self, volume: CountVolume, first: int, last: int, cost: Uint8) -> None:
         """Add to the costs (rows, columns, labels) of rows first..last-1."""
         if self.before is not None and self._ramps is not None:
             _add_ramps(self.before, volume.n_frames, self._ramps, first, last, cost)
@@ -76,7 +77,7 @@ class TemporalPrior:
         self.before = before if before[1].any() else None
 
 
-def _ramps(labels: int) -> NDArray[np.uint8]:
+def _ramps(labels: int) -> Uint8:
     """Cost that is added to the label i - labels beyond the last one, for each limit of it: (MOST + 1, 2 labels)."""
     away = np.abs(np.arange(2 * labels) - labels)
     ramp = SLOPE * np.maximum(away - FREE, 0)
@@ -85,15 +86,9 @@ def _ramps(labels: int) -> NDArray[np.uint8]:
 
 @numba.njit(cache=True, nogil=True)
 def _leave(
-    x_px: NDArray[np.float32],
-    confidence: NDArray[np.float32],
-    x_far: NDArray[np.float64],
-    side: int,
-    stripes: int,
-    first_row: int,
-    last_row: int,
+    x_px: Float32, confidence: Float32, x_far: Float64, side: int, stripes: int, first_row: int, last_row: int,
     before: NDArray[np.uint16],
-) -> None:
+) -> None:  # fmt: skip
     """Fill rows first_row..last_row-1 of `before`."""
     for y in range(first_row, last_row):
         for c in range(x_px.shape[1]):
@@ -106,12 +101,7 @@ def _leave(
 
 @numba.njit(cache=True, nogil=True)
 def _add_ramps(
-    before: NDArray[np.uint16],
-    n_frames: NDArray[np.int32],
-    ramps: NDArray[np.uint8],
-    first_row: int,
-    last_row: int,
-    cost: NDArray[np.uint8],
+    before: NDArray[np.uint16], n_frames: Int32, ramps: Uint8, first_row: int, last_row: int, cost: Uint8
 ) -> None:
     """Add each pixel's ramp to its costs; labels: a multiple of VECTOR."""
     _, columns, labels = cost.shape

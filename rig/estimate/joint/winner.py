@@ -13,8 +13,8 @@ from typing import Final, NamedTuple
 
 import numba
 import numpy as np
-from numpy.typing import NDArray
 
+from rig.simd import Float32, Int32, Uint8
 from rig.simd.memory import (
     aligned_zeros,
     load_block,
@@ -55,16 +55,15 @@ class AnswerSettings(NamedTuple):
     """Number of labels that are stripes, 0..stripes-1, and the tables of `answer_settings`.
 
     weights: float32 (256,), of a total's excess over the least. powers: float32 (REACH + 1, TAPS, POWERS), powers of
-    the distance for each reach, 0 at taps beyond it. reach: uint8 (2^TAPS,), how far labels reach to both sides where
-    the taps of the set bits are excluded. near: uint8 (VECTOR,) with the winner at MIDDLE, LARGEST at labels that do
-    not count for the margin.
+    the distance for each reach, 0 at taps beyond it. reach: uint8 (2^TAPS,), how far labels reach where the taps of the
+    set bits are excluded. near: uint8 (VECTOR,) with the winner at MIDDLE, LARGEST where the margin does not count.
     """
 
     stripes: int
-    weights: NDArray[np.float32]
-    powers: NDArray[np.float32]
-    reach: NDArray[np.uint8]
-    near: NDArray[np.uint8]
+    weights: Float32
+    powers: Float32
+    reach: Uint8
+    near: Uint8
 
 
 class LabelAnswers(NamedTuple):
@@ -75,8 +74,8 @@ class LabelAnswers(NamedTuple):
     least MARGIN_FROM labels away less the winner's.
     """
 
-    label: NDArray[np.float32]
-    margin: NDArray[np.uint8]
+    label: Float32
+    margin: Uint8
 
 
 def new_answer(rows: int, columns: int) -> LabelAnswers:
@@ -117,11 +116,11 @@ class Readout(NamedTuple):
     end: int
     size: int
     totals: int
-    around: NDArray[np.uint8]
-    hidden: NDArray[np.uint8]
-    least_label: NDArray[np.int32]
-    least: NDArray[np.uint8]
-    moments: NDArray[np.float32]
+    around: Uint8
+    hidden: Uint8
+    least_label: Int32
+    least: Uint8
+    moments: Float32
 
 
 def new_readout(settings: AnswerSettings, answer: LabelAnswers, columns: int, labels: int) -> Readout:

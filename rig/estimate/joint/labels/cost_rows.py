@@ -13,12 +13,12 @@ their own, not inlined: in one function the compiler keeps a register for every 
 for the usual width of the line.
 """
 
-from typing import Any, Final, NamedTuple
+from typing import Final, NamedTuple
 
 import numba
 import numpy as np
-from numpy.typing import NDArray
 
+from rig.count.volume import Counts
 from rig.estimate.joint.labels.grid import (
     FAR_PX,
     LABEL,
@@ -51,6 +51,7 @@ from rig.estimate.joint.labels.tables import (
     Ways,
     new_buffers,
 )
+from rig.simd import Int16, Int32, Uint8
 from rig.simd.memory import (
     CACHE_LINE,
     address_of,
@@ -283,17 +284,9 @@ def room_for(tables: LabelTables, halo: HaloTables, labels: int) -> CostRoom:
 
 @numba.njit(cache=True, nogil=True)
 def fill_costs(
-    counts: NDArray[np.unsignedinteger[Any]],
-    n_frames: NDArray[np.int32],
-    x0: NDArray[np.int32],
-    place: NDArray[np.int16],
-    tables: LabelTables,
-    room: CostRoom,
-    ways: Ways,
-    first_row: int,
-    last_row: int,
-    out: NDArray[np.uint8],
-) -> None:
+    counts: Counts, n_frames: Int32, x0: Int32, place: Int16, tables: LabelTables, room: CostRoom, ways: Ways,
+    first_row: int, last_row: int, out: Uint8,
+) -> None:  # fmt: skip
     """Costs of rows first_row..last_row-1, see `Costs.fill` in `rig.estimate.joint.labels.costs`.
 
     room: pointers to the tables and a thread's buffers.
@@ -414,7 +407,7 @@ def _fit_table(at: LabelTables, i: int, j: int, per_nat: float, to: Fitted, thro
 
 @numba.njit(cache=True, nogil=True)
 def _read_any(
-    counts: NDArray[np.unsignedinteger[Any]], c: int, y: int, places: int, x0: int, side: int, pixels: int,
+    counts: Counts, c: int, y: int, places: int, x0: int, side: int, pixels: int,
     times: float, b: Buffers, batch: int,
 ) -> None:  # fmt: skip
     """Fill n as `read_bytes` does, from counts of any size."""

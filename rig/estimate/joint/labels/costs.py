@@ -15,7 +15,6 @@ from typing import Final
 
 import numba
 import numpy as np
-from numpy.typing import NDArray
 
 from rig.count.volume import CountVolume
 from rig.estimate.joint.labels.cost_rows import CostRoom, fill_costs, fit_tables, room_for
@@ -37,13 +36,13 @@ from rig.estimate.row.likelihood import FLUX_MAX, cell_of
 from rig.estimate.row.model import RowModel, pixel_shares
 from rig.estimate.search.prepare import HOT_FACTOR, HOT_FLUX
 from rig.geometry.windows import MARGIN_PX, SweepGeometry
+from rig.simd import Bools, Float32, Int16, Int32, Uint8
 from rig.simd.memory import aligned_zeros, pointers
 from rig.simd.vectors import LANES
 from rig.threads import RowWorkers
 
 SHARP: Final = 8.0
-"""Exposures at which a nat is worth half as many units: where rows are sharp, the labels beside the best one must still
-count."""
+"""Exposures at which a nat is worth half as many units: the labels beside the best one must still count."""
 BAND_ROWS: Final = 64
 """Rows that share tables."""
 FINEST: Final = 64.0
@@ -72,7 +71,7 @@ class Costs:
     grid: LabelGrid
     tables: LabelTables
     halo: HaloTables
-    place: NDArray[np.int16]
+    place: Int16
     ways: Ways
     units_per_nat: float
 
@@ -80,12 +79,11 @@ class Costs:
         """Room for one thread to fill costs in, one band of rows after the other."""
         return room_for(self.tables, self.halo, self.grid.labels)
 
-    def fill(self, volume: CountVolume, first: int, last: int, room: CostRoom, out: NDArray[np.uint8]) -> None:
+    def fill(self, volume: CountVolume, first: int, last: int, room: CostRoom, out: Uint8) -> None:
         """Write the costs of rows first..last-1 to out, uint8 (rows, columns, labels) of all rows.
 
-        Cost: by how much a label is less likely than the best one of that row and column (of all that the band has), at
-        most COST_LIMIT; EXCLUDED where it cannot be. Rows without frames, or with nothing to search, cost 0 everywhere.
-        Best called with 16 rows or more at a time; threads may fill different rows at once, each in its own room.
+        Rows without frames, or with nothing to search, cost 0 everywhere. Best called with 16 rows or more at a time;
+        threads may fill different rows at once, each in its own room.
         """
         fill_costs(
             volume.counts, volume.n_frames, volume.x0, self.place, self.tables, pointers(room), self.ways, first, last,
@@ -119,15 +117,10 @@ def costs_of(model: RowModel, geometry: SweepGeometry, grid: LabelGrid, exposure
     workers.over(bands, work)
     halo = halo_tables(tables, bool(model.halo.any()))
 
-    def around(first: int, last: int) -> None:
-        fill_halo(
-            sweep, dark, shares_of_halo, place, ambient, hot, light, ways.units * scale, BAND_ROWS, first, last, tables,
-            halo,
-        )  # fmt: skip
-
     if halo.weight.size > 0:
         shares_of_halo = halo_shares(model, tables.edge.shape[1] + FAR_PX)
-        workers.over(bands, around)
+        seen = sweep, dark, shares_of_halo, place, ambient, hot, light, ways.units * scale, BAND_ROWS
+        workers.over(bands, lambda first, last: fill_halo(*seen, first, last, tables, halo))
 
     def fit(first: int, last: int) -> None:
         room = room_for(tables, halo, grid.labels)
@@ -139,7 +132,7 @@ def costs_of(model: RowModel, geometry: SweepGeometry, grid: LabelGrid, exposure
 
 
 def _ways(
-    sweep: Sweep, state: RowState, grid: LabelGrid, exposures: int, light: NDArray[np.float32], reach: int
+    sweep: Sweep, state: RowState, grid: LabelGrid, exposures: int, light: Float32, reach: int
 ) -> tuple[Ways, float]:
     most = exposures + exposures // 2 + FRAMES_OVER_HALF_MORE
     bits = most.bit_length()
@@ -182,9 +175,7 @@ def _largest(sweep: Sweep, state: RowState, row: RowBuffers, light: float) -> tu
     return rise, gain
 
 
-def _empty_tables(
-    at: NDArray[np.int32], tables: int, grid: LabelGrid, taps: int, hot: NDArray[np.bool_]
-) -> LabelTables:
+def _empty_tables(at: Int32, tables: int, grid: LabelGrid, taps: int, hot: Bools) -> LabelTables:
     y, x = np.nonzero(hot)
     vectors = -(-label_pixels(grid) // LANES)
     pixels = -(-(FAR_PX + label_pixels(grid) + MARGIN_PX) // LANES) * LANES
@@ -206,20 +197,20 @@ def _empty_tables(
     )
 
 
-def _lights(model: RowModel) -> NDArray[np.float32]:
+def _lights(model: RowModel) -> Float32:
     """The quartiles of the learned amplitudes."""
     weight = np.maximum(model.weight, 1e-6)
     middle = (np.cumsum(weight) - 0.5 * weight) / weight.sum()
     return np.exp(np.interp(QUARTILES, middle, np.log(model.amplitude.astype(np.float64)))).astype(np.float32)
 
 
-def hot_in_bands(ambient: NDArray[np.float32]) -> NDArray[np.bool_]:
+def hot_in_bands(ambient: Float32) -> Bools:
     """Pixels (rows, width) that are far brighter than those of their column in the band."""
     bands = np.arange(BAND_ROWS, ambient.shape[0], BAND_ROWS)
     return np.concatenate([part > HOT_FACTOR * np.median(part, axis=0) + HOT_FLUX for part in np.split(ambient, bands)])
 
 
-def _band_means(gain: NDArray[np.float32]) -> NDArray[np.float32]:
+def _band_means(gain: Float32) -> Float32:
     """Each row's gain as the mean of its band's."""
     parts = np.split(gain, np.arange(BAND_ROWS, len(gain), BAND_ROWS))
     return np.concatenate([np.full_like(part, part.mean()) for part in parts])

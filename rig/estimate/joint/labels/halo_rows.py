@@ -11,7 +11,6 @@ from typing import Final, NamedTuple
 
 import numba
 import numpy as np
-from numpy.typing import NDArray
 
 from rig.estimate.joint.labels.grid import FAR_PX, PHASES, START, VARIANT, VARIANTS
 from rig.estimate.joint.labels.tables import (
@@ -24,8 +23,9 @@ from rig.estimate.joint.labels.tables import (
     LabelTables,
     mean_ambient,
 )
-from rig.estimate.row.inputs import Float32, RowState, Sweep, row_buffers, row_fluxes
+from rig.estimate.row.inputs import RowState, Sweep, row_buffers, row_fluxes
 from rig.estimate.row.likelihood import FLUX_MAX, FLUX_MIN, cell_of
+from rig.simd import Bools, Float32, Int16, Int32
 from rig.simd.memory import (
     aligned_zeros,
     load_float32,
@@ -53,9 +53,9 @@ class HaloTables(NamedTuple):
     around a vector of labels have in each, of 2^15. Without a halo all but `ramp` are empty.
     """
 
-    weight: NDArray[np.int16]
-    constant: NDArray[np.float32]
-    ramp: NDArray[np.int16]
+    weight: Int16
+    constant: Float32
+    ramp: Int16
 
 
 def halo_tables(tables: LabelTables, there: bool) -> HaloTables:
@@ -69,7 +69,7 @@ def halo_tables(tables: LabelTables, there: bool) -> HaloTables:
     return HaloTables(weight, aligned_zeros((bands, columns, LIGHTS, places), np.float32), _ramps())
 
 
-def _ramps() -> NDArray[np.int16]:
+def _ramps() -> Int16:
     pixel = np.arange(LANES) + 0.5
     # A pixel's labels lie about a quarter of it to either side of its middle.
     at = (pixel + np.array([-0.25, 0.25])[:, None]) / BLOCK_PX
@@ -79,20 +79,9 @@ def _ramps() -> NDArray[np.int16]:
 
 @numba.njit(cache=True, nogil=True)
 def fill_halo(
-    sweep: Sweep,
-    state: RowState,
-    halo: Float32,
-    place: NDArray[np.int16],
-    ambient: Float32,
-    hot: NDArray[np.bool_],
-    light: Float32,
-    per_nat: float,
-    band_rows: int,
-    first_band: int,
-    last_band: int,
-    tables: LabelTables,
-    out: HaloTables,
-) -> None:
+    sweep: Sweep, state: RowState, halo: Float32, place: Int16, ambient: Float32, hot: Bools, light: Float32,
+    per_nat: float, band_rows: int, first_band: int, last_band: int, tables: LabelTables, out: HaloTables,
+) -> None:  # fmt: skip
     """Fill bands first_band..last_band-1; arguments as of `rig.estimate.joint.labels.tables.fill_tables`.
 
     halo: (BINS, pixels) of `halo_shares`.
@@ -149,7 +138,7 @@ def fill_halo(
 
 
 @numba.njit(cache=True, nogil=True)
-def _middle(place: NDArray[np.int16], c: int, rows: tuple[int, int]) -> int:
+def _middle(place: Int16, c: int, rows: tuple[int, int]) -> int:
     """The row nearest the band's middle that has labels; -1: none."""
     best, middle = -1, (rows[0] + rows[1]) // 2
     for y in range(rows[0], rows[1]):
@@ -183,11 +172,11 @@ class HaloRoom(NamedTuple):
     tables: HaloTables
     blocks: int
     places: int
-    fitted: NDArray[np.int16]
-    mean: NDArray[np.int16]
-    level: NDArray[np.int16]
-    constant: NDArray[np.int16]
-    which: NDArray[np.int32]
+    fitted: Int16
+    mean: Int16
+    level: Int16
+    constant: Int16
+    which: Int32
 
 
 def new_halo_room(halo: HaloTables, constants: int) -> HaloRoom:

@@ -97,26 +97,13 @@ def check(cost, stripes, beta=0.5, penalties=PENALTIES):
 
 
 @pytest.mark.parametrize(
-    ("shape", "stripes"),
-    [
-        ((9, 21, 32), 27),
-        ((20, 9, 64), 58),
-        ((12, 17, 96), 64),
-        ((17, 12, 128), 128),
-        ((8, 8, 160), 127),
-        ((6, 11, 320), 305),
-        ((1, 19, 128), 97),
-        ((19, 1, 64), 32),
-        ((1, 1, 32), 13),
-    ],
+    ("shape", "stripes"), [((20, 9, 64), 58), ((17, 12, 128), 128), ((6, 11, 320), 305), ((1, 19, 128), 97)]
 )
 def test_sums_are_exact_and_answers_follow(shape, stripes):
     check(costs_of(sum(shape), shape, stripes), stripes)
 
 
-@pytest.mark.parametrize(
-    "penalties", [Penalties(), Penalties(0, 0, 0, 0), Penalties(5, 40, 41, 60), Penalties(63, 63, 63, 63)]
-)
+@pytest.mark.parametrize("penalties", [Penalties(0, 0, 0, 0), Penalties(5, 40, 41, 60)])
 def test_penalties_and_weights_are_the_callers(penalties):
     check(costs_of(3, (11, 10, 64), 57), 57, beta=1.3, penalties=penalties)
 
@@ -128,10 +115,3 @@ def test_nothing_wraps_round_where_all_is_alike(fill):
     cost[3, 3] = 255 - fill
     cost[:, 4, 10] = 0
     check(cost, 58)
-
-
-def test_the_ends_of_the_range_draw_no_answer_to_the_inside():
-    cost = np.full((3, 3, 64), 255, np.uint8)
-    cost[:, :, 5:50] = 6 * np.abs(np.arange(45) - 1)
-    out = aggregated(cost, answer_settings(58))[2]
-    np.testing.assert_allclose(out.label, 6.0, atol=1e-6)

@@ -5,7 +5,7 @@ from itertools import pairwise
 import numpy as np
 import pytest
 
-from rig.estimate.joint.place.place import ENOUGH, PAIRS
+from rig.estimate.joint.place.place import PAIRS
 from rig.estimate.joint.place.pool import SAME_PX, SIGMAS, join_pairs
 
 DIRECTIONS = ((0, 1), (1, -1), (1, 0), (1, 1))
@@ -39,7 +39,7 @@ def joined_one(distance, sd, y, c, step, share, enough):
     return own + pull / (1 / variance + weight), (1 / variance + share * weight) ** -0.5
 
 
-@pytest.mark.parametrize(("rows", "columns"), [(1, 1), (9, 24), (40, 61)])
+@pytest.mark.parametrize(("rows", "columns"), [(1, 1), (40, 61)])
 @pytest.mark.parametrize(("step", "share"), PAIRS)
 def test_stripes_are_joined_by_opposite_neighbours_that_agree(rows, columns, step, share):
     rng = np.random.default_rng(3)
@@ -58,8 +58,8 @@ def test_stripes_are_joined_by_opposite_neighbours_that_agree(rows, columns, ste
         assert 0.3 < np.mean(moved > 0.01) < 0.9  # both kinds are there
 
 
-@pytest.mark.parametrize("slope", [(0.0, 0.0), (0.3, -0.5)])
-def test_a_plane_is_found_whatever_its_slope_and_as_well_as_is_said(slope):
+def test_a_plane_is_found_whatever_its_slope_and_as_well_as_is_said():
+    slope = 0.3, -0.5
     y, c = np.mgrid[0:200, 0:300].astype(float)
     plane = 60 + slope[0] * y + slope[1] * c
     noise = np.random.default_rng(4).normal(0, 1.0, (204, 304))
@@ -73,32 +73,3 @@ def test_a_plane_is_found_whatever_its_slope_and_as_well_as_is_said(slope):
     assert error.mean() == pytest.approx(pooled[inner].mean(), abs=0.005)
     # Those that chance has put far from all others stay there; half of a normal error is within 0.674.
     assert np.median(np.abs(error / said)) == pytest.approx(0.674, abs=0.15)
-
-
-def test_surfaces_end_where_they_end_and_thin_things_stay():
-    distance = np.full((40, 60), 20.0)
-    distance[:, 30:] = 24.0
-    distance[:, 10:14] = 26.0
-    distance[20, :] += 0.8  # a ridge, of little noise
-    out, sd = joined(distance, np.full(distance.shape, 0.1), 4)
-    np.testing.assert_allclose(out[:19], distance[:19], atol=1e-5)
-    # Along the ridge all agree, across it nothing does.
-    np.testing.assert_allclose(out[20], distance[20], atol=1e-5)
-    assert (sd[4:16, 10:14] < 0.08).all()
-
-
-def test_those_that_know_nothing_tell_nothing():
-    distance, sd = np.full((12, 40), 20.0), np.ones((12, 40))
-    distance[:, 20:], sd[:, 20:] = 20.5, 0.3
-    out, told = joined(distance, sd, 4)
-    np.testing.assert_array_equal(told[:, :16], 1.0)
-    np.testing.assert_array_equal(out[:, :16], 20.0)
-    assert (told[:, 24:36] < 0.3).all()
-
-
-def test_what_is_known_well_enough_stays():
-    rng = np.random.default_rng(5)
-    distance = 20 + rng.normal(0, 0.05, (20, 40))
-    out, sd = joined(distance, np.full(distance.shape, 0.05), 4, enough=ENOUGH)
-    np.testing.assert_array_equal(out, distance.astype(np.float32))
-    np.testing.assert_array_equal(sd, np.float32(0.05))
