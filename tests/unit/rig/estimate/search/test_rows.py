@@ -83,8 +83,8 @@ def agreement(volume, geometry, learned, near_px=NEAR_PX):
 
 @pytest.mark.parametrize(
     ("light", "exposures", "rig", "sigma_px"),
-    [("report", 1, "left", 0.6), ("report", 10, "turned", 0.6), ("dense", 10, "right", 0.6), ("clear", 100, "left", 0.6),
-     ("report", 10, "left", 1.8)],
+    [("report", 1, "left", 0.6), ("report", 10, "turned", 0.6), ("dense", 10, "right", 0.6),
+     ("clear", 100, "left", 0.6), ("report", 10, "left", 1.8)],
 )  # fmt: skip
 def test_sure_answers_are_those_of_the_exact_likelihood(light, exposures, rig, sigma_px):
     sweep, learned = simulated(light, exposures, rig), replace(model(light, rig), line_sigma_px=sigma_px)
