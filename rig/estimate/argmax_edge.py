@@ -198,11 +198,8 @@ class Peaks:
 
     with_edge: bool
     threads: int = 2
-
-    @property
-    def used(self) -> None:
-        """Nothing is learned."""
-        return None
+    used: None = None
+    """Nothing is learned."""
 
     def counter(self, layout: SweepLayout, geometry: SweepGeometry) -> Counter:
         """A counter of whole sweeps."""

@@ -24,6 +24,7 @@ from rig.simd.vectors import (
     everywhere,
     place_list,
     vector_name,
+    wide,
 )
 
 _HALF: Final = LANES // 2
@@ -195,7 +196,6 @@ totals_of_rows = emitted(FLOAT32(types.intp), _totals_of_rows)
 
 EIGHT: Final = 8
 _EIGHT_FLOATS = ir.VectorType(ir.FloatType(), EIGHT)
-_WIDE = ir.VectorType(ir.IntType(32), LANES)
 
 
 def _turned(builder: Any, rows: list[Any]) -> list[Any]:
@@ -247,8 +247,7 @@ def _spread_eights(builder: Any, source: Any, to: Any) -> None:
     for half in range(2):
         fours = builder.shuffle_vector(loaded, nothing, place_list(range(half, 2 * LANES, 2)))
         for d in range(4):
-            moved = builder.lshr(fours, ir.Constant(_WIDE, [8 * d] * LANES))
-            byte = builder.and_(moved, ir.Constant(_WIDE, [255] * LANES))
+            byte = builder.and_(builder.lshr(fours, wide(8 * d)), wide(255))
             _store(builder, builder.sitofp(byte, FLOAT32.llvm), to, 4 * half + d)
 
 

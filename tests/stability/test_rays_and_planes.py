@@ -82,10 +82,7 @@ def test_slopes_are_finite_or_none_and_agree_with_the_near_side(u, v, normal, of
 
 @covers(PlaneTable.planes, PlaneTable.command_range)
 @EXAMPLES
-@given(
-    rows=st.lists(st.tuples(ANY, ANY, ANY, ANY), min_size=1, max_size=5),
-    share=st.floats(0, 1),
-)
+@given(rows=st.lists(st.tuples(ANY, ANY, ANY, ANY), min_size=1, max_size=5), share=st.floats(0, 1))
 def test_plane_tables_of_any_numbers_give_unit_planes_or_say_why_not(rows, share) -> None:
     try:
         table = PlaneTable(np.arange(len(rows), dtype=float), np.array(rows))

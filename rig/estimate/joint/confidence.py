@@ -48,13 +48,7 @@ from rig.geometry.stripe_table import StripeTable
 from rig.simd import Bools, Float32, Int16, Int32
 from rig.simd.functions import error_function, exponential, logarithm
 from rig.simd.memory import address_of, copy_floats, load_float32, store_float32
-from rig.simd.vectors import (
-    LANES,
-    larger_float,
-    smaller_float,
-    square_root,
-    zero_float32,
-)
+from rig.simd.vectors import LANES, larger_float, smaller_float, square_root, zero_float32
 from rig.threads import RowWorkers
 
 NEIGHBOURS: Final = 2

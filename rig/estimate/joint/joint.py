@@ -94,7 +94,7 @@ class Joint:
             sweep, tables.grid, tables.sweep, tables.light, first.x_px, room, self._workers
         )
         stripes = replace(first, x2_px=x2_px, confidence2=confidence2)
-        self._prior.leave(stripes, tables.grid, self._workers)
+        self._prior.leave(stripes, tables.grid)
         # Whether the first map has taught anything is for the trust of its lessons to say.
         known = self._lessons.model is not None
         judged = stripes if known else self._teaching(sweep, tables, stripes)

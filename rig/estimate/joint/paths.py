@@ -19,13 +19,7 @@ from typing import Final, NamedTuple
 import numba
 import numpy as np
 
-from rig.estimate.joint.winner import (
-    LARGEST,
-    VECTOR,
-    Readout,
-    answer_columns,
-    fetch_answers,
-)
+from rig.estimate.joint.winner import LARGEST, VECTOR, Readout, answer_columns, fetch_answers
 from rig.simd import Uint8
 from rig.simd.memory import address_of, load_bytes, prefetch, read_byte, store_bytes, write_byte
 from rig.simd.vectors import add_saturated_unsigned, smaller_unsigned, smallest_byte, sub_saturated_unsigned, zero_bytes

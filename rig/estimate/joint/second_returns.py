@@ -63,7 +63,7 @@ class Seconds(NamedTuple):
     """Candidates of second returns, float32 (rows, columns) each.
 
     distance: from the far end in px, NaN where there is no candidate; ones, expected: within the line's reach of it;
-    light, moment: ones above those expected, and that times the distance in px.
+    light, moment: ones above those expected, and that times the distance in px; moved: see `move_seconds`.
     """
 
     distance: Float32
@@ -71,6 +71,7 @@ class Seconds(NamedTuple):
     expected: Float32
     light: Float32
     moment: Float32
+    moved: Float32
 
 
 @numba.njit(cache=True, nogil=True, error_model="numpy")
@@ -185,8 +186,9 @@ def measure_seconds(
 
 
 @numba.njit(cache=True, nogil=True, error_model="numpy")
-def move_seconds(reach: int, first_row: int, last_row: int, seconds: Seconds, moved: Float32) -> None:
-    """Distance of each candidate, moved to the middle of the light around it, pooled over neighbours."""
+def move_seconds(reach: int, first_row: int, last_row: int, seconds: Seconds) -> None:
+    """Fill moved: distance of each candidate, moved to the middle of the light around it, pooled over neighbours."""
+    moved = seconds.moved
     distance = with_margin(seconds.distance, first_row, last_row)
     moment, light = with_margin(seconds.moment, first_row, last_row), with_margin(seconds.light, first_row, last_row)
     sums = np.empty((2, distance.shape[1] - 2 * LANES), np.float32)
@@ -267,7 +269,6 @@ class SecondRoom(NamedTuple):
     blocks: Blocks
     candidates: Candidates
     seconds: Seconds
-    moved: Float32
 
 
 def second_room(grid: LabelGrid) -> SecondRoom:
@@ -278,7 +279,6 @@ def second_room(grid: LabelGrid) -> SecondRoom:
         Blocks(*(aligned_zeros((*shape, grid.labels // PER_PX), np.float32) for _ in Blocks._fields)),
         Candidates(*(np.empty(shape, np.float32) for _ in Candidates._fields)),
         Seconds(*(np.empty((rows, columns), np.float32) for _ in Seconds._fields)),
-        np.empty((rows, columns), np.float32),
     )
 
 
@@ -288,7 +288,7 @@ def second_returns(
 ) -> tuple[Float32, Float32]:  # fmt: skip
     """x2_px and confidence2 (rows, columns) beside stripes at x_px: NaN and 0 where nothing stands out."""
     rows, columns = x_px.shape
-    blocks, candidates, seconds, moved = room
+    blocks, candidates, seconds = room
     # Read by address: another kind of number would be read as nonsense.
     n_frames = np.ascontiguousarray(volume.n_frames, np.int32)
     seen = volume.counts, n_frames, sweep, light.state, light.still
@@ -324,12 +324,12 @@ def second_returns(
         measure(first, last)
 
     def measure_moved(first: int, last: int) -> None:
-        seconds.distance[first:last] = moved[first:last]
+        seconds.distance[first:last] = seconds.moved[first:last]
         measure(first, last)
 
     def judge(first: int, last: int) -> None:
         judge_seconds(grid.x_far, x_px, candidates.sure, first, last, seconds, x2_px, confidence2)
 
-    for work in (begin, lambda first, last: move_seconds(reach, first, last, seconds, moved), measure_moved, judge):
+    for work in (begin, lambda first, last: move_seconds(reach, first, last, seconds), measure_moved, judge):
         of_asked(work)
     return x2_px, confidence2

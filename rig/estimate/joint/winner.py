@@ -131,18 +131,11 @@ def new_readout(settings: AnswerSettings, answer: LabelAnswers, columns: int, la
     hidden = aligned_zeros((labels,), np.uint8)
     hidden[settings.stripes :] = LARGEST
     return Readout(
-        settings=settings,
-        answer=answer,
-        labels=labels,
-        end=-(-settings.stripes // _BLOCK) * _BLOCK,
-        size=size,
-        totals=around.ctypes.data + VECTOR,
-        around=around,
-        hidden=hidden,
-        least_label=aligned_zeros((columns,), np.int32),
-        least=aligned_zeros((columns,), np.uint8),
+        settings=settings, answer=answer, labels=labels, end=-(-settings.stripes // _BLOCK) * _BLOCK, size=size,
+        totals=around.ctypes.data + VECTOR, around=around, hidden=hidden,
+        least_label=aligned_zeros((columns,), np.int32), least=aligned_zeros((columns,), np.uint8),
         moments=aligned_zeros((columns, POWERS), np.float32),
-    )
+    )  # fmt: skip
 
 
 @numba.njit(forceinline=True)

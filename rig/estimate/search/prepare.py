@@ -98,28 +98,12 @@ def judge_of(
     padded = np.zeros((bands, int(geometry.x0.max(initial=0)) + geometry.window), np.float32)
     padded[:, : geometry.width] = state.ambient[:, : padded.shape[1]]
     return SearchTables(
-        tables=tables,
-        closeup=closeup,
-        band_rows=band_rows,
-        x0=geometry.x0,
-        window=geometry.window,
-        rows=geometry.rows,
-        limits=_limits(geometry),
-        near_is_left=geometry.near_is_left,
-        ambient=padded,
-        hot_start=hot_start,
-        hot_at=hot_at,
-        hot_place=hot_place,
-        nominal=np.float32(nominal),
-        faintest=np.float32(model.amplitude[0]),
-        brightest=np.float32(model.amplitude[-1]),
-        reach=max(SIGNAL_REACH_PX, reach),
-        shift=shift,
-        close_shift=close_shift,
-        most=most,
-        quiet_step=QUIET_STEP if dark else 1,
-        flux=count_fluxes(),
-    )
+        tables=tables, closeup=closeup, band_rows=band_rows, x0=geometry.x0, window=geometry.window, rows=geometry.rows,
+        limits=_limits(geometry), near_is_left=geometry.near_is_left, ambient=padded, hot_start=hot_start,
+        hot_at=hot_at, hot_place=hot_place, nominal=np.float32(nominal), faintest=np.float32(model.amplitude[0]),
+        brightest=np.float32(model.amplitude[-1]), reach=max(SIGNAL_REACH_PX, reach), shift=shift,
+        close_shift=close_shift, most=most, quiet_step=QUIET_STEP if dark else 1, flux=count_fluxes(),
+    )  # fmt: skip
 
 
 def _hot_of_windows(hot: Bools, geometry: SweepGeometry) -> tuple[Int32, Int16, Int32]:
@@ -146,16 +130,14 @@ def nothing_found(geometry: SweepGeometry, lines: tuple[Int32, Int32] | None) ->
     stripe[:, 1] = 0.0
     line_row, line_column = (np.zeros(0, np.int32),) * 2 if lines is None else lines
     return RowAnswers(
-        stripe=stripe,
-        quiet=np.zeros((rows, PAIRS, lanes, 2), np.int32),
-        quiet_exposures=np.zeros((rows, lanes + 1), np.int32),
-        light=np.zeros((rows, PAIRS, lanes, 2), np.int32),
+        stripe=stripe, quiet=np.zeros((rows, PAIRS, lanes, 2), np.int32),
+        quiet_exposures=np.zeros((rows, lanes + 1), np.int32), light=np.zeros((rows, PAIRS, lanes, 2), np.int32),
         quiet_here=aligned_zeros((rows, PAIRS, padded_lanes(geometry.window), 2), np.uint8),
         light_here=aligned_zeros((rows, PAIRS, padded_lanes(geometry.window), 2), np.uint8),
         lines=np.zeros((len(line_row), geometry.window), np.int32),
         line_start=np.searchsorted(line_column, np.arange(columns + 1)).astype(np.int32),
         line_row=np.ascontiguousarray(line_row),
-    )
+    )  # fmt: skip
 
 
 def clear_found(found: RowAnswers) -> None:
@@ -244,19 +226,11 @@ def _empty_tables(columns: int, bands: int, lanes: int, reach: int, *, others: b
         return aligned_zeros((columns, bands, *shape), dtype)
 
     return ScreenTables(
-        edge=of(PAIRS, lanes, 2, dtype=np.int8),
-        tap=of(SCREENS, STEPS, reach + 1, lanes, 2, dtype=np.int8),
-        position=of(SCREENS, pixels, dtype=np.int16),
-        slope=of(SCREENS, pixels, dtype=np.int16),
-        lane=of(lanes),
-        none=of(NONE),
-        neutral=of(pixels),
-        before=of(pixels),
-        scale=of(pixels),
-        first=of(dtype=np.int32),
-        last=of(dtype=np.int32),
-        ambient=of(pixels) if others else aligned_zeros((0, bands, pixels), np.float32),
-    )
+        edge=of(PAIRS, lanes, 2, dtype=np.int8), tap=of(SCREENS, STEPS, reach + 1, lanes, 2, dtype=np.int8),
+        position=of(SCREENS, pixels, dtype=np.int16), slope=of(SCREENS, pixels, dtype=np.int16), lane=of(lanes),
+        none=of(NONE), neutral=of(pixels), before=of(pixels), scale=of(pixels), first=of(dtype=np.int32),
+        last=of(dtype=np.int32), ambient=of(pixels) if others else aligned_zeros((0, bands, pixels), np.float32),
+    )  # fmt: skip
 
 
 def _largest(sweep: Sweep, state: RowState, light: Float32, reach: int) -> tuple[float, float]:

@@ -145,19 +145,11 @@ def pointers_of(judge: SearchTables, found: RowAnswers, memory: Uint8) -> Search
     several_lines = tables.ambient.shape[0] > 0
     ambient = tables.ambient if several_lines else judge.ambient
     return SearchPointers(
-        judge=pointers(judge),
-        found=pointers(found),
-        memory=memory.ctypes.data,
-        lanes=tables.lane.shape[2],
-        bands=tables.lane.shape[1],
-        taps=tables.tap.shape[4],
-        weight_pairs=judge.closeup.weight.shape[3],
-        sum_lanes=found.light.shape[2],
-        limit_rows=judge.limits.shape[2],
-        ambient=ambient.ctypes.data,
-        ambient_px=judge.ambient.shape[1],
-        several_lines=several_lines,
-    )
+        judge=pointers(judge), found=pointers(found), memory=memory.ctypes.data, lanes=tables.lane.shape[2],
+        bands=tables.lane.shape[1], taps=tables.tap.shape[4], weight_pairs=judge.closeup.weight.shape[3],
+        sum_lanes=found.light.shape[2], limit_rows=judge.limits.shape[2], ambient=ambient.ctypes.data,
+        ambient_px=judge.ambient.shape[1], several_lines=several_lines,
+    )  # fmt: skip
 
 
 def count_fluxes() -> Float32:

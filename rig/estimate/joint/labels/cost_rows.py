@@ -41,16 +41,7 @@ from rig.estimate.joint.labels.halo_rows import (
     new_halo_room,
     rounded,
 )
-from rig.estimate.joint.labels.tables import (
-    BATCH,
-    POSITION,
-    SUMS_FROM,
-    Buffers,
-    Fitted,
-    LabelTables,
-    Ways,
-    new_buffers,
-)
+from rig.estimate.joint.labels.tables import BATCH, POSITION, SUMS_FROM, Buffers, Fitted, LabelTables, Ways, new_buffers
 from rig.simd import Int16, Int32, Uint8
 from rig.simd.memory import (
     CACHE_LINE,

@@ -180,21 +180,15 @@ def _empty_tables(at: Int32, tables: int, grid: LabelGrid, taps: int, hot: Bools
     vectors = -(-label_pixels(grid) // LANES)
     pixels = -(-(FAR_PX + label_pixels(grid) + MARGIN_PX) // LANES) * LANES
     return LabelTables(
-        at=at,
-        edge=aligned_zeros((tables, pixels), np.int16),
-        edge_sum=aligned_zeros((tables, pixels), np.float32),
+        at=at, edge=aligned_zeros((tables, pixels), np.int16), edge_sum=aligned_zeros((tables, pixels), np.float32),
         tap=aligned_zeros((tables, vectors, taps, PHASES, LIGHTS, LANES), np.int16),
         constant=aligned_zeros((tables, vectors, PHASES, LIGHTS, LANES), np.float32),
-        span=np.zeros((tables, 2), np.int16),
-        used=np.zeros(tables, np.int16),
+        span=np.zeros((tables, 2), np.int16), used=np.zeros(tables, np.int16),
         fitted_constant=aligned_zeros((tables, vectors, PHASES, LIGHTS, LANES), np.int16),
         fitted_edge=aligned_zeros((tables, pixels), np.int16),
-        hot_start=np.searchsorted(y, np.arange(len(hot) + 1)).astype(np.int32),
-        hot_x=x.astype(np.int16),
-        pixels=pixels,
-        taps=vectors * taps * PHASES * LIGHTS * LANES,
-        constants=vectors * PHASES * LIGHTS * LANES,
-    )
+        hot_start=np.searchsorted(y, np.arange(len(hot) + 1)).astype(np.int32), hot_x=x.astype(np.int16), pixels=pixels,
+        taps=vectors * taps * PHASES * LIGHTS * LANES, constants=vectors * PHASES * LIGHTS * LANES,
+    )  # fmt: skip
 
 
 def _lights(model: RowModel) -> Float32:

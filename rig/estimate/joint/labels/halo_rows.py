@@ -12,7 +12,7 @@ from typing import Final, NamedTuple
 import numba
 import numpy as np
 
-from rig.estimate.joint.labels.grid import FAR_PX, PHASES, START, VARIANT, VARIANTS
+from rig.estimate.joint.labels.grid import FAR_PX, PHASES, START, VARIANTS
 from rig.estimate.joint.labels.tables import (
     BATCH,
     LIGHTS,
@@ -22,19 +22,12 @@ from rig.estimate.joint.labels.tables import (
     Fitted,
     LabelTables,
     mean_ambient,
+    middle_row,
 )
 from rig.estimate.row.inputs import RowState, Sweep, row_buffers, row_fluxes
 from rig.estimate.row.likelihood import FLUX_MAX, FLUX_MIN, cell_of
 from rig.simd import Bools, Float32, Int16, Int32
-from rig.simd.memory import (
-    aligned_zeros,
-    load_float32,
-    load_int16,
-    read_int16,
-    read_int32,
-    store_int16,
-    write_int16,
-)
+from rig.simd.memory import aligned_zeros, load_float32, load_int16, read_int16, read_int32, store_int16, write_int16
 from rig.simd.vectors import LANES, add_saturated, larger_float, scaled, smaller, smaller_float, to_int16, zero_int16
 
 BLOCK_PX: Final = 8
@@ -95,7 +88,7 @@ def fill_halo(
     for b in range(first_band, last_band):
         rows = b * band_rows, min((b + 1) * band_rows, place.shape[1])
         for c in range(place.shape[0]):
-            y = _middle(place, c, rows)
+            y, _, _ = middle_row(place, c, rows, -1)
             if y < 0:
                 continue
             mean_ambient(place, ambient, hot, side, c, rows, mean, number)
@@ -137,16 +130,6 @@ def fill_halo(
                         out.constant[b, c, m, j] += size[k] * (state.table[1, own] - state.table[1, other])
 
 
-@numba.njit(cache=True, nogil=True)
-def _middle(place: Int16, c: int, rows: tuple[int, int]) -> int:
-    """The row nearest the band's middle that has labels; -1: none."""
-    best, middle = -1, (rows[0] + rows[1]) // 2
-    for y in range(rows[0], rows[1]):
-        if place[c, y, VARIANT] >= 0 and (best < 0 or abs(y - middle) < abs(best - middle)):
-            best = y
-    return best
-
-
 HIGHEST: Final = 30000
 """Scores and their parts are cut there."""
 _TO_UNSIGNED: Final = np.float32(32768.5)
@@ -183,15 +166,10 @@ def new_halo_room(halo: HaloTables, constants: int) -> HaloRoom:
     """Room for rows of so many constants of positions."""
     blocks, places = halo.weight.shape[2], halo.weight.shape[4]
     return HaloRoom(
-        tables=halo,
-        blocks=blocks,
-        places=places,
-        fitted=aligned_zeros((LIGHTS, places), np.int16),
-        mean=aligned_zeros((blocks,), np.int16),
-        level=aligned_zeros((LIGHTS, places), np.int16),
-        constant=aligned_zeros((BATCH if blocks else 0, constants), np.int16),
-        which=np.arange(BATCH, dtype=np.int32),
-    )
+        tables=halo, blocks=blocks, places=places, fitted=aligned_zeros((LIGHTS, places), np.int16),
+        mean=aligned_zeros((blocks,), np.int16), level=aligned_zeros((LIGHTS, places), np.int16),
+        constant=aligned_zeros((BATCH if blocks else 0, constants), np.int16), which=np.arange(BATCH, dtype=np.int32),
+    )  # fmt: skip
 
 
 @numba.njit(cache=True, nogil=True)

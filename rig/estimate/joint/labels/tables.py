@@ -124,7 +124,7 @@ def fill_tables(
                 i = out.at[b, c, variant]
                 if i < 0:
                     continue
-                y, label, label_end = _middle_row(place, c, rows, variant)
+                y, label, label_end = middle_row(place, c, rows, variant)
                 here = place[c, y]
                 length, _, _, start = row_fluxes(sweep, state, row, y, c)
                 to_t = side * (here[START] - start)
@@ -164,8 +164,8 @@ def mark_rows(place: Int16, hot: Bools, side: int, band_rows: int, tables: Label
 
 
 @numba.njit(cache=True, nogil=True)
-def _middle_row(place: Int16, c: int, rows: tuple[int, int], variant: int) -> tuple[int, int, int]:
-    """The row of that variant nearest the band's middle; first position and the one behind the last, of all its rows.
+def middle_row(place: Int16, c: int, rows: tuple[int, int], variant: int) -> tuple[int, int, int]:
+    """The row of a variant, -1: of any, nearest the band's middle, -1: none; first and end position of all its rows.
 
     Positions count two a pixel, from the pixel that holds label 0 on.
     """
@@ -173,7 +173,7 @@ def _middle_row(place: Int16, c: int, rows: tuple[int, int], variant: int) -> tu
     best, first, end = -1, 1 << 15, 0
     for y in range(rows[0], rows[1]):
         here = place[c, y]
-        if here[VARIANT] == variant:
+        if here[VARIANT] == variant or variant < 0 <= here[VARIANT]:
             if best < 0 or abs(y - middle) < abs(best - middle):
                 best = y
             first = min(first, int(here[LABEL] + here[ODD]))
@@ -342,24 +342,15 @@ def new_buffers(tables: LabelTables, labels: int) -> Buffers:
     score_row = vectors * PHASES * LANES
     cost_row = _whole(max(labels, score_row) + 2 * 2 * LANES)
     return Buffers(
-        n=aligned_zeros((BATCH, n_row), np.int16),
-        sums=aligned_zeros((BATCH, n_row), np.int16),
-        score=aligned_zeros((BATCH, score_row), np.int16),
-        top=aligned_zeros((BATCH, LANES), np.int16),
-        cost=aligned_zeros((BATCH, cost_row), np.uint8),
-        mask=aligned_zeros((labels,), np.uint8),
+        n=aligned_zeros((BATCH, n_row), np.int16), sums=aligned_zeros((BATCH, n_row), np.int16),
+        score=aligned_zeros((BATCH, score_row), np.int16), top=aligned_zeros((BATCH, LANES), np.int16),
+        cost=aligned_zeros((BATCH, cost_row), np.uint8), mask=aligned_zeros((labels,), np.uint8),
         constant=aligned_zeros((VARIANTS, tables.constants), np.int16),
-        edge=aligned_zeros((VARIANTS, pixels), np.int16),
-        through=aligned_zeros((pixels + 2 * LANES,), np.int16),
-        table=aligned_zeros((VARIANTS + 1,), np.int32),
-        here=aligned_zeros((BATCH,), np.int32),
-        fitted=aligned_zeros((BATCH,), np.int32),
-        shown=aligned_zeros((2,), np.int32),
-        n_row=n_row,
-        score_row=score_row,
-        cost_row=cost_row,
-        labels=labels,
-    )
+        edge=aligned_zeros((VARIANTS, pixels), np.int16), through=aligned_zeros((pixels + 2 * LANES,), np.int16),
+        table=aligned_zeros((VARIANTS + 1,), np.int32), here=aligned_zeros((BATCH,), np.int32),
+        fitted=aligned_zeros((BATCH,), np.int32), shown=aligned_zeros((2,), np.int32), n_row=n_row, score_row=score_row,
+        cost_row=cost_row, labels=labels,
+    )  # fmt: skip
 
 
 def _whole(number: int) -> int:

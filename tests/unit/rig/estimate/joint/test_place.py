@@ -9,13 +9,7 @@ import pytest
 from rig.estimate.joint.labels.grid import label_grid
 from rig.estimate.joint.place import light, pool
 from rig.estimate.joint.place import place as place_module
-from rig.estimate.joint.place.place import (
-    amplitudes_of,
-    line_width,
-    new_places,
-    place,
-    profile_table,
-)
+from rig.estimate.joint.place.place import amplitudes_of, line_width, new_places, place, profile_table
 from rig.estimate.joint.place.places import BESIDE_PX, REACH_PX
 from rig.estimate.row.inputs import row_buffers, row_fluxes, state_of, sweep_of
 from rig.estimate.row.model import pixel_shares

@@ -37,7 +37,7 @@ def seconds_of(sweep: Sweep, x_px, haze=0.14, threads=WORKERS, left=0.0, volume=
     grid = label_grid(sweep.geometry)
     light = second_light(state_of(model), 0.6, grid, sweep_of(sweep.geometry))
     room = second_room(grid)
-    for array in (*room.blocks, *room.candidates, *room.seconds, room.moved):
+    for array in (*room.blocks, *room.candidates, *room.seconds):
         array[:] = left
     volume = sweep.volume if volume is None else volume
     return second_returns(volume, grid, sweep_of(sweep.geometry), light, x_px.astype(np.float32), room, threads)

@@ -52,7 +52,7 @@ def told(confidence: float) -> tuple[TemporalPrior, StripeTable]:
     table = replace(StripeTable.empty(ROWS, COLUMNS), x_px=x_px, confidence=np.full_like(x_px, confidence))
     prior = TemporalPrior(True)
     prior.begin(at, grid)
-    prior.leave(table, grid, WORKERS)
+    prior.leave(table, grid)
     prior.begin(at, grid)
     return prior, table
 

@@ -6,14 +6,7 @@ import numpy as np
 import pytest
 
 from rig.estimate.likelihood import Likelihood
-from rig.estimate.search.prepare import (
-    BAND_ROWS,
-    BAND_SHEAR_PX,
-    CLOSE_SHIFT,
-    SCORE_LIMIT,
-    judge_of,
-    rows_of_band,
-)
+from rig.estimate.search.prepare import BAND_ROWS, BAND_SHEAR_PX, CLOSE_SHIFT, SCORE_LIMIT, judge_of, rows_of_band
 from rig.estimate.search.rows import COUNT_LIMIT
 from rig.estimate.search.tables import WEIGHT_LIMIT
 from rig.threads import RowWorkers
