@@ -80,6 +80,20 @@ def test_slopes_are_finite_or_none_and_agree_with_the_near_side(u, v, normal, of
         assert side == -np.sign(slope)  # near points lie where depth falls
 
 
+@covers(depth_slope)
+def test_depth_slopes_keep_nine_digits(digits) -> None:
+    plane = np.array([0.9, 0.1, -0.4, -0.3])
+    plane[:3] /= np.linalg.norm(plane[:3])
+    u, v = rays_about(plane, -np.geomspace(1e-4, 0.5, 60))
+    lens = CAMERA.tangent_slopes(u, v)
+
+    def exact(u, v, du, dv, nx, ny, nz, d):
+        return -(d / (nx * u + ny * v + nz) ** 2) * (nx * du + ny * dv)
+
+    slope = depth_slope(u, v, plane, CAMERA)
+    digits("slope of depth along a row, sine above 1e-4", 1e-11, slope, exact, u, v, *lens, *plane)
+
+
 @covers(PlaneTable.planes, PlaneTable.command_range)
 @EXAMPLES
 @given(rows=st.lists(st.tuples(ANY, ANY, ANY, ANY), min_size=1, max_size=5), share=st.floats(0, 1))

@@ -9,6 +9,8 @@ from calibration.model.camera import Camera
 from calibration.model.rig_model import RigModel
 from calibration.model.scanner import PlaneTable
 from rig.count.volume import CountVolume
+from rig.estimate.likelihood import Likelihood
+from rig.estimate.row.model import RowModel
 from rig.geometry.stripe_table import StripeTable
 from rig.geometry.windows import SweepGeometry, sweep_geometry, uncalibrated_geometry
 from tests.reference.adapter import windowed
@@ -99,3 +101,11 @@ def simulated(light="report", exposures=10, rig="left", rows=32, columns=96, see
     g = Geometry.build(width=512, height=rows, columns=columns, **RIGS[rig])
     point = WorkingPoint(street(rows), POINTS[light], g)
     return Sweep(point, geometry_of(g), point.counts(exposures, seed), exposures)
+
+
+@cache
+def learned_from(light="report", exposures=10, rig="left", rows=32, columns=96) -> RowModel:
+    """The state that `likelihood` learns from such a sweep; tests must not write into it."""
+    sweep, estimator = simulated(light, exposures, rig, rows, columns), Likelihood(1)
+    estimator.estimate(sweep.volume, sweep.geometry)
+    return estimator.used

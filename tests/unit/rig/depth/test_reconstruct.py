@@ -1,5 +1,4 @@
 import re
-from dataclasses import replace
 from functools import cache
 
 import numpy as np
@@ -9,11 +8,9 @@ from rig.config.models import EstimateConfig
 from rig.depth.reconstruct import MapResult, Reconstructor
 from rig.depth.warm_up import warm_up
 from rig.errors import UsageError
-from tests.reference.geometry import DEPTH_RANGE_M, Geometry
-from tests.reference.scene import Scene
-from tests.reference.working_point import Light, WorkingPoint
+from tests.reference.geometry import DEPTH_RANGE_M
 from tests.stability.inventory import covers
-from tests.unit.small_maps import Sweep, geometry_of, rig_model, simulated, volume_of
+from tests.unit.small_maps import rig_model, simulated, volume_of
 
 covers(Reconstructor, warm_up)
 
@@ -27,21 +24,6 @@ def reconstructor(sweep, **options) -> Reconstructor:
 def mapped(light="report", exposures=10, rig="left", **options) -> MapResult:
     sweep = simulated(light, exposures, rig)
     return reconstructor(sweep, **options).map(sweep.volume)
-
-
-@cache
-def bright_wall(between=0.0) -> Sweep:
-    """A wall at 3 m in clear air with the light `between` columns later than the nominal planes."""
-    rows, columns, pitch = 6, 400, 0.8 / 499
-    g = Geometry.build(width=512, height=rows, columns=columns)
-    tangents = -0.25 + pitch * (np.arange(columns) + between)
-    normals = np.stack([np.ones(columns), np.zeros(columns), -tangents], axis=1)
-    normals /= np.linalg.norm(normals, axis=1, keepdims=True)
-    g = replace(g, planes=np.column_stack([normals, normals @ g.scanner_m]))
-    shape = (rows, 512)
-    scene = Scene("wall", np.full(shape, 3.0, np.float32), np.ones(shape, np.float32), np.ones(shape, bool))
-    point = WorkingPoint(scene, Light(stripe=2.0, haze=0.0, ambient=0.0, extinction_per_m=0.0), g)
-    return Sweep(point, geometry_of(g), point.counts(100, 1), 100)
 
 
 def test_without_a_model_the_sensor_size_is_asked_for():
@@ -63,17 +45,6 @@ def test_a_map_has_the_shapes_that_its_files_promise(estimator):
     np.testing.assert_array_equal(result.intensity, sweep.volume.intensity())
     assert result.compute_s > 0
     assert (result.fog.extinction_per_m is None) == (estimator in ("argmax", "edge"))
-
-
-def test_depth_follows_where_the_frames_of_a_column_really_were():
-    nominal, shifted = bright_wall(), bright_wall(0.4)
-    rebuilt = reconstructor(nominal, estimator="argmax")
-    volume = volume_of(shifted.counts, rebuilt.geometry, 100, column=np.arange(400) + 0.4)
-    bound = rebuilt.map(volume).depth_m
-    blind = rebuilt.map(replace(volume, column=np.arange(400.0))).depth_m
-    # 0.4 columns are 0.38 px: 2 cm at 3 m.
-    assert abs(np.nanmedian(bound) - 3.0) < 0.004
-    assert np.nanmedian(blind) - 3.0 == pytest.approx(0.0195, abs=0.004)
 
 
 def test_depth_of_a_foggy_street_is_close_to_the_truth():

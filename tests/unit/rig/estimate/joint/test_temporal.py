@@ -10,8 +10,6 @@ from rig.estimate.joint import temporal
 from rig.estimate.joint.joint import Joint
 from rig.estimate.joint.labels.grid import label_grid
 from rig.estimate.joint.temporal import FREE, MOST, SLOPE, TemporalPrior
-from rig.estimate.registry import recalling
-from rig.estimate.row.model import RowModel
 from rig.geometry.stripe_table import StripeTable
 from rig.threads import RowWorkers
 from tests.reference.scene import procedural_scene
@@ -85,18 +83,6 @@ def test_behind_a_map_without_frames_and_at_another_geometry_there_is_no_prior()
         estimator.estimate(first, geometry())
         assert_same(estimator.estimate(volume_at(2), then), alone)
         assert estimator.used.before is None
-
-
-def test_every_map_is_estimated_again_bit_for_bit_alone_and_in_a_row_for_any_threads():
-    kept = [RowModel.from_arrays(state.arrays()) for _, state in sequence()]
-    assert kept[0].before is None
-    assert kept[1].before is not None
-    for (table, _), state, seed in zip(sequence(), kept, (1, 2, 3), strict=True):
-        assert_same(Joint(1, state, learns=False).estimate(volume_at(seed), geometry()), table)
-    part = recalling("joint", kept[1:], 3, temporal_prior=True)
-    for (table, state), seed in zip(sequence()[1:], (2, 3), strict=True):
-        assert_same(part.estimate(volume_at(seed), geometry()), table)
-        np.testing.assert_array_equal(part.used.before, state.before)
 
 
 def test_what_stands_still_is_found_better_from_one_exposure():

@@ -48,13 +48,6 @@ def test_an_exponential_is_fitted_within_its_own_uncertainty(extinction):
     assert 0.7 < np.std(pulls) < 1.2
 
 
-def test_even_light_has_no_extinction():
-    fit = fit_haze(PATH_M, np.full(BINS, 0.2), np.full(BINS, 1e-6))
-    assert fit.extinction_per_m == pytest.approx(0.0, abs=1e-6)
-    growing = fit_haze(PATH_M, 0.1 + 0.02 * PATH_M, np.full(BINS, 1e-6))
-    assert growing.extinction_per_m == 0.0
-
-
 def test_where_there_is_no_haze_there_is_no_fit():
     nothing, variance = np.zeros(BINS), np.full(BINS, 1e-6)
     assert fit_haze(PATH_M, nothing, variance) is None

@@ -5,23 +5,14 @@ from functools import cache
 import numpy as np
 import pytest
 
-from rig.estimate.likelihood import Likelihood
 from rig.estimate.search.prepare import BAND_ROWS, BAND_SHEAR_PX, CLOSE_SHIFT, SCORE_LIMIT, judge_of, rows_of_band
 from rig.estimate.search.rows import COUNT_LIMIT
 from rig.estimate.search.tables import WEIGHT_LIMIT
 from rig.threads import RowWorkers
 from tests.reference.geometry import Geometry
-from tests.unit.small_maps import RIGS, geometry_of, simulated
+from tests.unit.small_maps import RIGS, geometry_of, learned_from, simulated
 
 WORKERS = RowWorkers(1)
-
-
-@cache
-def model(light="report", rig="left"):
-    sweep = simulated(light, 10, rig)
-    estimator = Likelihood(1)
-    estimator.estimate(sweep.volume, sweep.geometry)
-    return estimator.used
 
 
 @cache
@@ -53,7 +44,7 @@ def test_more_roll_makes_lower_bands():
     ("light", "rig", "exposures"), [("report", "turned", 1), ("dense", "left", 63), ("clear", "left", 200)]
 )
 def test_units_are_as_fine_as_leaves_room_for_every_sum(light, rig, exposures):
-    judge = judge_of(model(light, rig), simulated(light, 10, rig).geometry, exposures, WORKERS, dark=False)
+    judge = judge_of(learned_from(light, 10, rig), simulated(light, 10, rig).geometry, exposures, WORKERS, dark=False)
     tables, most = judge.tables, judge.most
     assert min(2 * exposures, COUNT_LIMIT) <= most <= COUNT_LIMIT
     tap, edge = np.abs(tables.tap.astype(np.int64)), np.abs(tables.edge.astype(np.int64))

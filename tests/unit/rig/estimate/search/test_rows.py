@@ -1,18 +1,15 @@
 """The 16-bit search against the exact row likelihood, which is what it approximates, and against whole numbers."""
 
 from dataclasses import replace
-from functools import cache
 
 import numba
 import numpy as np
 import pytest
 
 from rig.count.lane_order import STEPS, padded_lanes, read_counts
-from rig.estimate.likelihood import Likelihood
 from rig.estimate.row.em import lines_of
 from rig.estimate.row.inputs import judge_line, row_buffers, state_of, sweep_of
 from rig.estimate.row.likelihood import mode_of
-from rig.estimate.row.model import RowModel
 from rig.estimate.search import prepare as judging
 from rig.estimate.search import rows, stream, tables
 from rig.estimate.search import scores as scores_module
@@ -25,7 +22,7 @@ from rig.simd.memory import read_int16
 from rig.threads import RowWorkers
 from tests.reference.geometry import Geometry
 from tests.stability.inventory import covers
-from tests.unit.small_maps import geometry_of, simulated, volume_of
+from tests.unit.small_maps import geometry_of, learned_from, simulated, volume_of
 
 covers(scores_module, rows, tables, judging, stream)
 
@@ -34,14 +31,6 @@ SURE = 0.6
 """Confidence from which two ways to the same answer must agree."""
 NEAR_PX = 1.2
 """A neighbouring pixel and a sub-pixel offset: answers as near as this are the same one."""
-
-
-@cache
-def model(light="report", rig="left", exposures=10) -> RowModel:
-    sweep = simulated(light, exposures, rig)
-    estimator = Likelihood(1)
-    estimator.estimate(sweep.volume, sweep.geometry)
-    return estimator.used
 
 
 def searched(volume, geometry, learned, exposures=None):
@@ -87,7 +76,7 @@ def agreement(volume, geometry, learned, near_px=NEAR_PX):
      ("clear", 100, "left", 0.6), ("report", 10, "left", 1.8)],
 )  # fmt: skip
 def test_sure_answers_are_those_of_the_exact_likelihood(light, exposures, rig, sigma_px):
-    sweep, learned = simulated(light, exposures, rig), replace(model(light, rig), line_sigma_px=sigma_px)
+    sweep, learned = simulated(light, exposures, rig), replace(learned_from(light, 10, rig), line_sigma_px=sigma_px)
     # The middle of so wide a line is not known to the pixel.
     sure, also, difference = agreement(sweep.volume, sweep.geometry, learned, NEAR_PX + (sigma_px > 1))
     # From 64 exposures on counts are halved: that costs evidence, and must not invent any.
@@ -171,7 +160,7 @@ def scores(judge, c, band, counts, exposures):
 
 def judged_rows(rig, exposures, light="report"):
     geometry = simulated(light, rig=rig).geometry
-    judge = judge_of(model(light, rig), geometry, exposures, WORKERS, dark=False)
+    judge = judge_of(learned_from(light, 10, rig), geometry, exposures, WORKERS, dark=False)
     return judge, geometry
 
 
@@ -215,7 +204,7 @@ EXTREMES = {
 @pytest.mark.parametrize("name", EXTREMES)
 def test_extreme_models_neither_wrap_round_nor_leave_the_numbers(name):
     rig = "left"
-    change, base, sweep = EXTREMES[name], model(rig=rig), simulated(rig=rig)
+    change, base, sweep = EXTREMES[name], learned_from(rig=rig), simulated(rig=rig)
     profile = base.profile.copy()
     profile[:, :2] *= np.float32(change.get("haze", 1.0))
     learned = replace(
@@ -245,7 +234,7 @@ def stored(geometry, window, depth_range_m):
 
 @pytest.mark.parametrize(("window", "exposures"), [(64, 10), (192, 1), (448, 10)])
 def test_windows_of_any_size_are_searched_as_exactly(window, exposures):
-    sweep, learned = simulated(exposures=exposures), model()
+    sweep, learned = simulated(exposures=exposures), learned_from()
     geometry = stored(sweep.geometry, window, (3.0, 4.0))
     sure, also, difference = agreement(volume_of(sweep.counts, geometry, exposures), geometry, learned)
     assert min(sure, also) > 0.985
@@ -256,9 +245,8 @@ def test_windows_of_any_size_are_searched_as_exactly(window, exposures):
 def test_halved_counts_keep_their_light():
     """65 exposures become 32.5: half an exposure left out would make pixels behind the stripe 1.6 % too bright."""
     exposures = 65
-    sweep = simulated("report", exposures, rows=64, columns=128)
-    estimator = Likelihood(1)
-    estimator.estimate(sweep.volume, sweep.geometry)
-    judge = judge_of(estimator.used, sweep.geometry, exposures, WORKERS, dark=False)
+    size = {"rows": 64, "columns": 128}
+    sweep, learned = simulated("report", exposures, **size), learned_from("report", exposures, **size)
+    judge = judge_of(learned, sweep.geometry, exposures, WORKERS, dark=False)
     ones, lit = search_volume(sweep.volume, sweep.geometry, judge, WORKERS)[1]
     assert ones.sum() / lit.sum() == pytest.approx(-np.expm1(-sweep.point.light.ambient), rel=0.006)

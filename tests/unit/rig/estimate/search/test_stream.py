@@ -15,7 +15,7 @@ from rig.estimate.search.stream import ColumnJudge, SearchedSweep
 from rig.geometry.windows import uncalibrated_geometry
 from rig.threads import RowWorkers
 from tests.stability.inventory import covers
-from tests.unit.small_maps import Sweep, assert_same, simulated
+from tests.unit.small_maps import Sweep, assert_same, learned_from, simulated
 
 covers(likelihood)
 
@@ -46,11 +46,8 @@ def scene(rig="left") -> Sweep:
     return simulated("report", 10, rig, ROWS, COLUMNS)
 
 
-@cache
 def model(rig="left") -> RowModel:
-    estimator = Likelihood(1)
-    estimator.estimate(scene(rig).volume, scene(rig).geometry)
-    return estimator.model
+    return learned_from("report", 10, rig, ROWS, COLUMNS)
 
 
 @cache
@@ -134,12 +131,6 @@ def test_judged_on_the_way_is_judged_afterwards(rig, exposures):
     assert all(isinstance(sweep, SearchedSweep) for _, sweep, _ in found)
     assert found[1][2] is not found[0][2], "the third sweep is judged with what the first one taught"
     assert_same_maps(found, counted(rig, layout, sweeps))
-
-
-@pytest.mark.parametrize(("threads", "sizes"), [(1, [1]), (2, [7, 64, 1]), (3, [10**9])])
-def test_neither_threads_nor_blocks_change_a_bit(threads, sizes):
-    layout, sweeps = layout_of("turned"), [frames_of("turned")]
-    assert_same_maps(judged("turned", layout, sweeps, threads, sizes), counted("turned", layout, sweeps))
 
 
 def test_columns_of_more_exposures_than_the_counters_hold_are_counted_whole():
