@@ -212,7 +212,7 @@ def read_fog(sweep: Any, stripe: StripeTable, geometry: SweepGeometry, state: An
         return FogEstimate()
     block = row * BLOCKS // geometry.rows * BLOCKS + column * BLOCKS // geometry.columns
     sums, at_stripe = np.zeros((BLOCKS**2, 2, BINS, SUMS)), np.zeros((len(row), 2))
-    hot_flux = 5.0 * float(np.median(state.ambient)) + 1e-3
+    hot_flux = state.hot_flux()
     add_clear_rows(
         sweep_of(replace(geometry, others=None)), state_of(state), lines, stripe.x_px[row, column], clear,
         block.astype(np.int32), CLEAR_PX, hot_flux, sums, at_stripe,

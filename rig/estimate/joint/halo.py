@@ -57,14 +57,15 @@ LEAST_FLUX: Final = 2e-3
 """Least flux of a pixel when its counts are weighted."""
 LINE_PX: Final = 4.5
 """Pixels so far from a stripe show nothing of the line itself."""
+_REACHES: Final = np.array(HALO_REACHES_PX)
 SETTLED: Final = 1e-6
 MOST_SWEEPS: Final = 3000
 
 
 @numba.njit(cache=True, nogil=True)
 def add_equations(
-    lines: Lines, light: Float32, sweep: Sweep, state: RowState, halo: Float32, reaches: Float64, nodes: int,
-    hot_flux: float, first_line: int, last_line: int, matrix: Float64, right: Float64,
+    lines: Lines, light: Float32, sweep: Sweep, state: RowState, halo: Float32, hot_flux: float, first_line: int,
+    last_line: int, matrix: Float64, right: Float64,
 ) -> None:  # fmt: skip
     """Add the normal equations of lines first_line..last_line-1, weighted as the present state expects counts.
 
@@ -72,12 +73,12 @@ def add_equations(
     light that the state has too little of. halo: (BINS, pixels) of `halo_shares`; light: of each line's stripe at its
     x_px, photons. Only one half of the matrix is filled, rows from columns on.
     """
-    bins, number = state.profile.shape[0], len(reaches)
-    first_share, first_halo, last = bins, bins + nodes, matrix.shape[0] - 1
+    bins, number = state.profile.shape[0], len(_REACHES)
+    first_share, first_halo, last = bins, bins + HALO_NODES, matrix.shape[0] - 1
     terms = 3 + 2 * number
     index, value = np.empty(terms + 1, np.int64), np.empty(terms + 1)
     row, side = row_buffers(sweep.window, 1), 1 if sweep.near_is_left else -1
-    per_bin = (nodes - 1) / (bins - 1)
+    per_bin = (HALO_NODES - 1) / (bins - 1)
     for i in range(first_line, last_line):
         y, c = lines.row[i], lines.column[i]
         length, _, _, start = row_fluxes(sweep, state, row, y, c)
@@ -86,7 +87,7 @@ def add_equations(
         frames, s = np.float64(lines.exposures[i]), np.float64(light[i])
         place = side * (np.float64(lines.x_px[i]) - start)
         own = row.cell[min(max(int(np.rint(place)), 0), length - 1)]
-        low = min(int(own * per_bin), nodes - 2)
+        low = min(int(own * per_bin), HALO_NODES - 2)
         part = own * per_bin - low
         for t in range(length):
             away = abs(t - place)
@@ -103,14 +104,14 @@ def add_equations(
             if before:
                 index[0], value[0], used = cell, gain, 1
             else:
-                node = min(int(cell * per_bin), nodes - 2)
+                node = min(int(cell * per_bin), HALO_NODES - 2)
                 haze = gain * state.profile[cell, 0]
                 index[0], index[1] = first_share + node, first_share + node + 1
                 value[1] = haze * (cell * per_bin - node)
                 value[0] = haze - value[1]
                 used = 2
             for k in range(number):
-                there = s * np.exp(-away / reaches[k]) / (2 * reaches[k])
+                there = s * np.exp(-away / _REACHES[k]) / (2 * _REACHES[k])
                 index[used], index[used + 1] = first_halo + low * number + k, first_halo + (low + 1) * number + k
                 value[used], value[used + 1] = (1.0 - part) * there, part * there
                 used += 2
@@ -333,8 +334,7 @@ def _equations(
     seen: BrightLines, geometry: SweepGeometry, model: RowModel, workers: RowWorkers
 ) -> tuple[Float64, Float64]:
     sweep, state = sweep_of(geometry), state_of(model)
-    shares, reaches = halo_shares(model, geometry.width), np.array(HALO_REACHES_PX)
-    hot_flux = 5.0 * float(np.median(model.ambient)) + 1e-3
+    shares, hot_flux = halo_shares(model, geometry.width), model.hot_flux()
     # Fixed pieces, added in order: the sums do not depend on the number of threads.
     edges = np.linspace(0, len(seen.light), PIECES + 1).astype(int)
     matrices, rights = np.zeros((PIECES, _SIZE, _SIZE)), np.zeros((PIECES, _SIZE))
@@ -342,7 +342,7 @@ def _equations(
     def work(first: int, last: int) -> None:
         for i in range(first, last):
             add_equations(
-                seen.lines, seen.light, sweep, state, shares, reaches, HALO_NODES, hot_flux, edges[i], edges[i + 1],
+                seen.lines, seen.light, sweep, state, shares, hot_flux, edges[i], edges[i + 1],
                 matrices[i], rights[i],
             )  # fmt: skip
 

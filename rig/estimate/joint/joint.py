@@ -17,10 +17,9 @@ import numpy as np
 from rig.count.volume import Counter, CountVolume, SweepCounter, SweepLayout
 from rig.estimate.joint.confidence import pairs_to_ask, stripe_table
 from rig.estimate.joint.halo import bright_lines, learn_first_halo, learn_next_halo
-from rig.estimate.joint.labels.costs import BAND_ROWS
-from rig.estimate.joint.labels.grid import LabelGrid
+from rig.estimate.joint.labels.grid import BAND_ROWS, LabelGrid
 from rig.estimate.joint.lesson import add_quiet, fill_trust, read_positions
-from rig.estimate.joint.paths import CHUNK, Penalties, along_columns, along_rows
+from rig.estimate.joint.paths import CHUNK, along_columns, along_rows
 from rig.estimate.joint.place.place import amplitudes_of, line_width, place, weigh_light
 from rig.estimate.joint.second_returns import second_returns
 from rig.estimate.joint.tables import JointTables, Memory, grid_of, memory_for, tables_of
@@ -142,7 +141,7 @@ class Joint:
         grid, workers = tables.grid, self._workers
         rows, columns = grid.x_far.shape
         memory = self._room(grid)
-        settings, penalties = answer_settings(grid.stripes), Penalties()
+        settings = answer_settings(grid.stripes)
 
         def tie_rows(first: int, last: int) -> None:
             # Rows that share tables: those are fetched once, and costs are tied along rows while the cache has them.
@@ -151,11 +150,11 @@ class Joint:
                 end = min(band + BAND_ROWS, last)
                 tables.costs.fill(volume, band, end, room, memory.cost)
                 self._prior.add(volume, band, end, memory.cost)
-                along_rows(memory.cost, memory.message, penalties, band, end)
+                along_rows(memory.cost, memory.message, band, end)
 
         def tie_columns(first: int, last: int) -> None:
             desk = new_readout(settings, memory.answer, CHUNK, grid.labels)
-            along_columns(memory.cost, memory.message, penalties, first, last, pointers(desk))
+            along_columns(memory.cost, memory.message, first, last, pointers(desk))
 
         x_px, neighbours = np.empty((rows, columns), np.float32), grid.column_px <= NEIGHBOURS_PX
 

@@ -51,6 +51,10 @@ UNITS: Final = 8.0
 """
 
 
+BETA: Final = 0.5
+"""A label weighs exp(-BETA * excess of its total / UNITS)."""
+
+
 class AnswerSettings(NamedTuple):
     """Number of labels that are stripes, 0..stripes-1, and the tables of `answer_settings`.
 
@@ -83,9 +87,9 @@ def new_answer(rows: int, columns: int) -> LabelAnswers:
     return LabelAnswers(np.zeros((rows, columns), np.float32), np.zeros((rows, columns), np.uint8))
 
 
-def answer_settings(stripes: int, beta: float = 0.5) -> AnswerSettings:
-    """Settings for so many stripe labels; a label weighs exp(-beta * excess of its total / UNITS)."""
-    weights = np.exp(-beta / UNITS * np.arange(LARGEST + 1)).astype(np.float32)
+def answer_settings(stripes: int) -> AnswerSettings:
+    """Settings for so many stripe labels."""
+    weights = np.exp(-BETA / UNITS * np.arange(LARGEST + 1)).astype(np.float32)
     distance = np.arange(-REACH, REACH + 1)
     powers = np.zeros((REACH + 1, TAPS, POWERS), np.float32)
     for reach in range(REACH + 1):

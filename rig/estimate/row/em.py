@@ -95,9 +95,7 @@ def lines_of(volume: CountVolume, where: tuple[Int32, Int32], known: StripeTable
 
 def expect(lines: Lines, geometry: SweepGeometry, model: RowModel, workers: RowWorkers) -> Expectation:
     """Expectation step of `model` over some lines."""
-    typical = float(np.median(model.ambient))
-    sweep, state = sweep_of(geometry), state_of(model)
-    hot_flux = 5.0 * typical + 1e-3
+    sweep, state, hot_flux = sweep_of(geometry), state_of(model), model.hot_flux()
     # Fixed pieces, added in order: the sums do not depend on the number of threads.
     edges = np.linspace(0, len(lines.row), PIECES + 1).astype(int)
     parts: dict[int, Expectation] = {}

@@ -78,6 +78,10 @@ class RowModel:
         values: dict[str, Any] = {name: value if value.ndim else float(value) for name, value in kept.items()}
         return cls(**values)
 
+    def hot_flux(self) -> float:
+        """Ambient light in photons per exposure above which a pixel teaches nothing of the medium."""
+        return 5.0 * float(np.median(self.ambient)) + 1e-3
+
     def path_m(self) -> Float64:
         """Mean of the two path lengths at each profile bin, (BINS,) metres."""
         return 1.0 / (self.w_lo + np.arange(BINS) / self.per_w)

@@ -20,6 +20,7 @@ import numpy as np
 
 from rig.count.volume import Counts
 from rig.estimate.joint.labels.grid import (
+    BAND_ROWS,
     FAR_PX,
     LABEL,
     LABEL_END,
@@ -283,7 +284,7 @@ def fill_costs(
     room: pointers to the tables and a thread's buffers.
     """
     at, around, b, labels = room.at, room.halo, room.buffers, out.shape[2]
-    rows, columns, band_rows = out.shape[0], out.shape[1], ways.band_rows
+    rows, columns = out.shape[0], out.shape[1]
     usually, unusually = Fitted(at.fitted_constant, at.fitted_edge), Fitted(b.constant, b.edge)
     place_at, out_at, counts_at = address_of(place), address_of(out), address_of(counts)
     window, in_bytes = counts.shape[2], counts.itemsize == 1
@@ -293,8 +294,8 @@ def fill_costs(
         read = min(read, -(-(FAR_PX + LANES * int(tables.used.max()) + ways.reach) // LANES) * LANES)
     write_int32(b.table, 0, np.int32(-1))
     write_int32(b.shown, 0, np.int32(-1))
-    for band in range(first_row // band_rows, -(-last_row // band_rows)):
-        top, end = max(first_row, band * band_rows), min(last_row, (band + 1) * band_rows)
+    for band in range(first_row // BAND_ROWS, -(-last_row // BAND_ROWS)):
+        top, end = max(first_row, band * BAND_ROWS), min(last_row, (band + 1) * BAND_ROWS)
         for c in range(columns):
             exposures = int(n_frames[c])
             stored = int(x0[c]), window, counts.size, window * rows

@@ -18,7 +18,16 @@ import numpy as np
 
 from rig.count.volume import CountVolume
 from rig.estimate.joint.labels.cost_rows import CostRoom, fill_costs, fit_tables, room_for
-from rig.estimate.joint.labels.grid import FAR_PX, FRACTIONS, PHASES, VARIANTS, LabelGrid, label_pixels, places_of
+from rig.estimate.joint.labels.grid import (
+    BAND_ROWS,
+    FAR_PX,
+    FRACTIONS,
+    PHASES,
+    VARIANTS,
+    LabelGrid,
+    label_pixels,
+    places_of,
+)
 from rig.estimate.joint.labels.halo_rows import BLOCK_PX, HaloTables, fill_halo, halo_tables
 from rig.estimate.joint.labels.tables import LIGHTS, LabelTables, Ways, fill_tables, mark_rows, number_tables
 from rig.estimate.joint.winner import UNITS
@@ -43,8 +52,6 @@ from rig.threads import RowWorkers
 
 SHARP: Final = 8.0
 """Exposures at which a nat is worth half as many units: the labels beside the best one must still count."""
-BAND_ROWS: Final = 64
-"""Rows that share tables."""
 FINEST: Final = 64.0
 """Most units of scores per nat."""
 WEIGHT_BITS: Final = 12
@@ -101,33 +108,31 @@ def costs_of(model: RowModel, geometry: SweepGeometry, grid: LabelGrid, exposure
     bands = -(-geometry.rows // BAND_ROWS)
     at = np.empty((bands, geometry.columns, VARIANTS), np.int32)
     ambient, hot = model.ambient, hot_in_bands(model.ambient)
-    tables = _empty_tables(at, number_tables(place, BAND_ROWS, at), grid, 2 * reach + 1, hot)
+    tables = _empty_tables(at, number_tables(place, at), grid, 2 * reach + 1, hot)
     distance = np.arange(-reach, reach + 1) - (np.arange(FRACTIONS)[:, None] - FRACTIONS // 2) / FRACTIONS
     shares = pixel_shares(model.line_sigma_px, distance)
     beside = np.ascontiguousarray(halo_shares(model, BLOCK_PX // 2 + 1)[:, -1])
     dark = state._replace(ambient=np.zeros_like(ambient), row_gain=_band_means(state.row_gain))
-    scale = 2.0**ways.bits
+    scale, seen = 2.0**ways.bits, (sweep, dark, place, ambient, hot, light)
 
     def work(first: int, last: int) -> None:
-        fill_tables(
-            sweep, dark, place, ambient, hot, light, shares, beside, ways.units * scale, TAPS_LIMIT * scale / ways.most,
-            BAND_ROWS, first, last, tables,
-        )  # fmt: skip
+        most = TAPS_LIMIT * scale / ways.most
+        fill_tables(*seen, shares, beside, ways.units * scale, most, first, last, tables)
 
     workers.over(bands, work)
     halo = halo_tables(tables, bool(model.halo.any()))
 
     if halo.weight.size > 0:
         shares_of_halo = halo_shares(model, tables.edge.shape[1] + FAR_PX)
-        seen = sweep, dark, shares_of_halo, place, ambient, hot, light, ways.units * scale, BAND_ROWS
-        workers.over(bands, lambda first, last: fill_halo(*seen, first, last, tables, halo))
+        around = *seen, shares_of_halo, ways.units * scale
+        workers.over(bands, lambda first, last: fill_halo(*around, first, last, tables, halo))
 
     def fit(first: int, last: int) -> None:
         room = room_for(tables, halo, grid.labels)
         fit_tables(pointers(room), ways, first, last)
 
     workers.over(len(tables.span), fit)
-    mark_rows(place, hot, grid.side, BAND_ROWS, tables)
+    mark_rows(place, hot, grid.side, tables)
     return Costs(grid, tables, halo, place, ways, units_per_nat)
 
 
@@ -145,7 +150,7 @@ def _ways(
     units_per_nat = min(wanted, finest)
     ways = Ways(
         units=units_per_nat * 2.0**down, bits=bits, exposures=exposures, most=most, sharp=SHARP, down=down,
-        reach=reach, side=grid.side, stripes=grid.stripes, band_rows=BAND_ROWS,
+        reach=reach, side=grid.side, stripes=grid.stripes,
     )  # fmt: skip
     return ways, units_per_nat
 

@@ -28,6 +28,8 @@ PER_PX: Final = 2
 SPARE: Final = 1
 """Labels beyond the searched pixels at either end, for the mean of a peak there."""
 VECTOR: Final = 32
+BAND_ROWS: Final = 64
+"""Rows that share tables of costs."""
 _ROWS_APART: Final = 8
 """One row in so many is looked at for the distance of columns."""
 

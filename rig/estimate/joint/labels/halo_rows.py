@@ -12,7 +12,7 @@ from typing import Final, NamedTuple
 import numba
 import numpy as np
 
-from rig.estimate.joint.labels.grid import FAR_PX, PHASES, START, VARIANTS
+from rig.estimate.joint.labels.grid import BAND_ROWS, FAR_PX, PHASES, START, VARIANTS
 from rig.estimate.joint.labels.tables import (
     BATCH,
     LIGHTS,
@@ -72,8 +72,8 @@ def _ramps() -> Int16:
 
 @numba.njit(cache=True, nogil=True)
 def fill_halo(
-    sweep: Sweep, state: RowState, halo: Float32, place: Int16, ambient: Float32, hot: Bools, light: Float32,
-    per_nat: float, band_rows: int, first_band: int, last_band: int, tables: LabelTables, out: HaloTables,
+    sweep: Sweep, state: RowState, place: Int16, ambient: Float32, hot: Bools, light: Float32, halo: Float32,
+    per_nat: float, first_band: int, last_band: int, tables: LabelTables, out: HaloTables,
 ) -> None:  # fmt: skip
     """Fill bands first_band..last_band-1; arguments as of `rig.estimate.joint.labels.tables.fill_tables`.
 
@@ -86,7 +86,7 @@ def fill_halo(
     # Of the blocks: flux before and behind the stripe, and of the halo as the tables of labels have it.
     level, size = np.empty((3, out.weight.shape[2]), np.float32), np.empty(out.weight.shape[2], np.int64)
     for b in range(first_band, last_band):
-        rows = b * band_rows, min((b + 1) * band_rows, place.shape[1])
+        rows = b * BAND_ROWS, min((b + 1) * BAND_ROWS, place.shape[1])
         for c in range(place.shape[0]):
             y, _, _ = middle_row(place, c, rows, -1)
             if y < 0:

@@ -20,6 +20,7 @@ import numba
 import numpy as np
 
 from rig.estimate.joint.labels.grid import (
+    BAND_ROWS,
     FAR_PX,
     FRACTIONS,
     LABEL,
@@ -83,13 +84,13 @@ class LabelTables(NamedTuple):
 
 
 @numba.njit(cache=True, nogil=True)
-def number_tables(place: Int16, band_rows: int, at: Int32) -> int:
+def number_tables(place: Int16, at: Int32) -> int:
     """Fill `at` of LabelTables with the numbers of the tables that the rows need; returns how many those are."""
     tables = 0
     at[:] = -1
     for b in range(at.shape[0]):
         for c in range(at.shape[1]):
-            for y in range(b * band_rows, min((b + 1) * band_rows, place.shape[1])):
+            for y in range(b * BAND_ROWS, min((b + 1) * BAND_ROWS, place.shape[1])):
                 variant = place[c, y, VARIANT]
                 if variant >= 0 and at[b, c, variant] < 0:
                     at[b, c, variant] = tables
@@ -100,7 +101,7 @@ def number_tables(place: Int16, band_rows: int, at: Int32) -> int:
 @numba.njit(cache=True, nogil=True)
 def fill_tables(
     sweep: Sweep, state: RowState, place: Int16, ambient: Float32, hot: Bools, light: Float32, shares: Float32,
-    beside: Float32, per_nat: float, most: float, band_rows: int, first_band: int, last_band: int, out: LabelTables,
+    beside: Float32, per_nat: float, most: float, first_band: int, last_band: int, out: LabelTables,
 ) -> None:  # fmt: skip
     """Tables of bands first_band..last_band-1.
 
@@ -115,7 +116,7 @@ def fill_tables(
     flux, level = np.empty((2, pixels), np.float32), np.empty((4, pixels), np.float32)
     glow, near_glow = np.empty(pixels, np.float32), np.empty(pixels, np.float32)
     for b in range(first_band, last_band):
-        rows = b * band_rows, min((b + 1) * band_rows, place.shape[1])
+        rows = b * BAND_ROWS, min((b + 1) * BAND_ROWS, place.shape[1])
         for c in range(place.shape[0]):
             if out.at[b, c].max() < 0:
                 continue
@@ -149,14 +150,14 @@ def fill_tables(
 
 
 @numba.njit(cache=True, nogil=True)
-def mark_rows(place: Int16, hot: Bools, side: int, band_rows: int, tables: LabelTables) -> None:
+def mark_rows(place: Int16, hot: Bools, side: int, tables: LabelTables) -> None:
     """Set MEND of rows whose tables weigh pixels that the rows do not have, or that are hot."""
     for c in range(place.shape[0]):
         for y in range(place.shape[1]):
             here = place[c, y]
             if here[VARIANT] < 0:
                 continue
-            span = tables.span[tables.at[y // band_rows, c, here[VARIANT]]]
+            span = tables.span[tables.at[y // BAND_ROWS, c, here[VARIANT]]]
             here[MEND] = 1 if here[VALID] > span[0] or here[VALID_END] < span[1] else 0
             for p in range(max(here[VALID], span[0]), min(here[VALID_END], span[1])):
                 if hot[y, here[START] - side * p]:
@@ -282,8 +283,7 @@ class Ways(NamedTuple):
 
     units: of scores per nat, of columns with the usual number of `exposures`; bits: of the largest count; most: what a
     column's exposures may count as; sharp: exposures at which a nat is worth half as many units; down: power of two
-    that scores are divided by to be costs; reach: taps on either side; side, stripes: as in `LabelGrid`; band_rows:
-    rows that share tables.
+    that scores are divided by to be costs; reach: taps on either side; side, stripes: as in `LabelGrid`.
     """
 
     units: float
@@ -295,7 +295,6 @@ class Ways(NamedTuple):
     reach: int
     side: int
     stripes: int
-    band_rows: int
 
 
 class Fitted(NamedTuple):
