@@ -6,7 +6,6 @@ import pytest
 
 from rig.simd import memory, shuffles, vectors
 from rig.simd.memory import address_of, load_bytes, load_float32, load_int16
-from rig.simd.shuffles import EIGHT, FOLDED
 from rig.simd.vectors import LANES, UNPACKED
 
 INT16, FLOAT = (load_int16, memory.store_int16), (load_float32, memory.store_float32)
@@ -105,54 +104,3 @@ def test_products_of_pairs_are_added_and_stop_at_the_limits(one_instruction, mon
     found = applied(BYTES, INT16, lambda a, b: vectors.dot_pairs(a, b), counts, weights.view(np.uint8))
     for n, w, pairs in zip(counts, weights, found, strict=True):
         np.testing.assert_array_equal(pairs, saturated((n.astype(int) * w).reshape(LANES, 2).sum(axis=1)))
-
-
-def bits(places):
-    return sum(1 << int(i) for i in places)
-
-
-@numba.njit
-def spread(source, out):
-    shuffles.spread_eights(address_of(source), address_of(out))
-
-
-@numba.njit
-def fetched(source, out):
-    places = np.arange(LANES) * 3 % 40 * 4 + address_of(source)
-    shuffles.fetch_eights(address_of(places), 4 * 3, address_of(out))
-    places[0] = 0  # kept alive up to here: only the address is used above
-
-
-@numba.njit
-def totals(source, out):
-    folded = np.empty((LANES, FOLDED), np.float32)
-    for r in range(LANES):
-        shuffles.store_folded(address_of(folded), r, load_float32(address_of(source), r * LANES))
-    memory.store_float32(address_of(out), 0, shuffles.totals_of_rows(address_of(folded)))
-    folded[0] = 0.0  # kept alive up to here: only the address is used above
-
-
-@numba.njit
-def equal_steps(source, out):
-    out[0] = shuffles.equal_bits(address_of(source), 5, 7, np.int16(2))
-
-
-RNG = np.random.default_rng(4)
-SOME_BYTES = RNG.integers(0, 256, 128).astype(np.uint8)
-FLOATS, FEW = RNG.normal(0, 10, 256).astype(np.float32), RNG.integers(0, 4, 100).astype(np.int16)
-MOVES = [
-    (spread, SOME_BYTES, np.zeros(128, np.float32), lambda a: a.reshape(LANES, EIGHT).T.ravel()),
-    (
-        fetched, FLOATS, np.zeros(128, np.float32),
-        lambda a: a[np.arange(LANES) * 3 % 40 + 3 + np.arange(EIGHT)[:, None]].ravel(),
-    ),
-    (totals, FLOATS, np.zeros(16, np.float32), lambda a: a.reshape(LANES, LANES).sum(axis=1)),
-    (equal_steps, FEW, np.zeros(1, np.int64), lambda a: [bits(np.flatnonzero(a[5:61:7] == 2))]),
-]  # fmt: skip
-
-
-@pytest.mark.parametrize(("kernel", "source", "out", "wanted"), MOVES, ids=lambda a: getattr(a, "__name__", ""))
-def test_numbers_are_read_and_written_where_they_are_said_to_be(kernel, source, out, wanted):
-    kernel(source, out := out.copy())
-    exact = kernel is not totals
-    np.testing.assert_allclose(out, wanted(source), rtol=0 if exact else 1e-5, atol=0 if exact else 1e-4)

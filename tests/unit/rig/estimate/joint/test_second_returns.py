@@ -113,21 +113,6 @@ def test_pixels_not_to_be_used_neither_show_nor_hide_a_second_return() -> None:
     assert (confidence2[~around(two)] > SURE).mean() < 0.005
 
 
-def test_strong_ambient_light_is_expected_as_ones_not_as_photons() -> None:
-    sweep = pane()
-    geometry, model, grid = sweep.geometry, known_model(sweep.geometry, haze=1e-9), label_grid(sweep.geometry)
-    model.ambient[:] = 2.0
-    model.ambient[::3, 200] = FLUX_MAX
-    light = second_light(state_of(model), 0.6, grid, sweep_of(geometry))
-    for dtype in (np.uint8, np.uint16):
-        blocks = sums_of(np.ones_like(sweep.volume.counts, dtype), sweep, light)
-        np.testing.assert_allclose(blocks.expected, blocks.ones * 10 * -np.expm1(-2), rtol=1e-4)
-        y, x = np.arange(ROWS)[:, None, None], np.arange(geometry.width)
-        seen = (x >= geometry.x_lo[..., None]) & (x <= geometry.x_hi[..., None]) & ((x != 200) | (y % 3 != 0))
-        seen &= np.abs(x - sweep.point.x_true.astype(np.float32)[..., None]) > light.apart
-        assert blocks.ones.sum() == seen.sum()
-
-
 def test_bytes_at_once_and_other_counts_one_by_one_give_the_same_sums() -> None:
     sweep = pane()
     light = second_light(
