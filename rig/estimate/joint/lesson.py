@@ -24,7 +24,8 @@ from rig.count.volume import Counts
 from rig.estimate.joint.labels.grid import PER_PX
 from rig.estimate.joint.place.places import LIGHT_PX, Places, most_shown
 from rig.estimate.joint.winner import UNITS, LabelAnswers
-from rig.estimate.row.inputs import RowState, Sweep, fluxes_at, line_light, with_rays
+from rig.estimate.row.inputs import RowState, Sweep, fluxes_at, line_light
+from rig.geometry.kernels import with_rays
 from rig.simd import Float32, Float64, Int32, Uint8
 
 SURFACE_PX: Final = 3.0

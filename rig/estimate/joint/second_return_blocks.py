@@ -17,8 +17,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from rig.count.volume import Counts
-from rig.estimate.row.inputs import RowState, Sweep, flux_between, line_light, others_at, profile_place, with_rays
+from rig.estimate.row.inputs import RowState, Sweep, flux_between, line_light, others_at, profile_place
 from rig.estimate.row.likelihood import FLUX_MAX
+from rig.geometry.kernels import with_rays
 from rig.simd import Float32, Float64, Int16, Int32
 from rig.simd.memory import (
     CACHE_LINE,

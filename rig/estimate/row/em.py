@@ -110,7 +110,8 @@ def expect(lines: Lines, geometry: SweepGeometry, model: RowModel, workers: RowW
 
 
 def _some(lines: Lines, part: slice) -> Lines:
-    return Lines(*(each[part] for each in lines))
+    some: Any = (each[part] for each in lines)
+    return Lines(*some)
 
 
 def _expect_piece(sweep: Sweep, state: RowState, lines: Lines, geometry: SweepGeometry, hot_flux: float) -> Expectation:

@@ -19,7 +19,8 @@ from typing import Final
 import numba
 import numpy as np
 
-from rig.estimate.row.inputs import Sweep, with_rays
+from rig.estimate.row.inputs import Sweep
+from rig.geometry.kernels import with_rays
 from rig.geometry.windows import MARGIN_PX, SweepGeometry
 from rig.simd import Float32, Float64, Int16, Int32
 
