@@ -5,7 +5,6 @@ import pytest
 from hypothesis import assume, given, settings
 from hypothesis import strategies as st
 
-from calibration.model.camera import Camera
 from calibration.model.rig_model import RigModel
 from calibration.model.scanner import PlaneTable
 from rig.errors import UsageError
@@ -76,18 +75,6 @@ def test_stored_windows_hold_every_search_interval_with_its_margin(rig, width, h
     assert np.all(geometry.x_hi[seen] < width)
     assert np.all(x0 <= np.maximum(geometry.x_lo[seen] - MARGIN_PX, 0))
     assert np.all(x0 + geometry.window > np.minimum(geometry.x_hi[seen] + MARGIN_PX, width - 1))
-
-
-def test_a_lens_that_does_not_reach_the_corners_leaves_them_out():
-    matrix = np.array([[60.0, 0, 79.5], [0, 60.0, 29.5], [0, 0, 1]])
-    camera = Camera(160, 60, matrix, np.array([-0.3, 0.0, 0.0, 0.0]))
-    planes = Geometry.build(columns=40).planes
-    geometry = sweep_geometry(RigModel(camera, PlaneTable(np.arange(40.0), planes)), np.arange(40.0), (0.3, 50.0))
-    blind = np.isnan(geometry.u)
-    assert 0.05 < blind.mean() < 0.95
-    y, c = np.nonzero(geometry.x_lo <= geometry.x_hi)
-    assert not blind[y, geometry.x_lo[y, c]].any()
-    assert not blind[y, geometry.x_hi[y, c]].any()
 
 
 def test_a_plane_through_the_camera_is_refused_with_its_column():

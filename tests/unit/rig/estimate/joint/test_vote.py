@@ -65,12 +65,3 @@ def test_a_streak_goes_and_its_place_is_as_sure_as_those_around_it():
     out = voted(answer, cost)
     np.testing.assert_array_equal(out.label, 20.0)
     assert 10 < out.margin[4, 15] < 30
-
-
-def test_what_the_rows_own_counts_say_stays_but_is_unsure():
-    answer, cost = flat()
-    answer.label[4, 15] = 50.0
-    cost[4, 15, 20] = OBJECTION + 1
-    out = voted(answer, cost)
-    assert out.label[4, 15] == 50.0
-    assert out.margin[4, 15] == 0

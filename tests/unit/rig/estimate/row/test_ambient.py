@@ -36,14 +36,6 @@ def test_even_light_is_read_from_dark_frames(flux, n):
     assert result.std() < 0.6 * np.sqrt(flux / n)
 
 
-def test_pixels_that_truly_differ_keep_their_own_level():
-    rng = np.random.default_rng(2)
-    flux = 0.02 * np.exp(rng.normal(0, 0.6, (ROWS, WIDTH)))
-    result = ambient_of(*sweep_of(**dark_frames(rng, flux, 2000)), None)
-    assert np.corrcoef(np.log(result.ravel()), np.log(flux.ravel()))[0, 1] > 0.9
-    assert np.median(np.abs(result / flux - 1)) < 0.15
-
-
 def test_hot_pixels_are_found_in_dark_frames_and_spare_their_neighbours():
     rng = np.random.default_rng(4)
     flux = np.full((ROWS, WIDTH), 0.005)
