@@ -21,6 +21,10 @@ covers(peak_rows, registry, second_returns, second_return_blocks)
 ROWS, COLUMNS = 12, 24
 
 
+def small():
+    return simulated(rows=24, columns=48)
+
+
 @cache
 def view(rig="left", rows=ROWS, width=256, columns=COLUMNS):
     return geometry_of(Geometry.build(width=width, height=rows, columns=columns, **RIGS[rig]))
@@ -99,7 +103,7 @@ def test_many_exposures(name, exposures):
 
 @EVERY
 def test_counts_of_any_type_give_the_same_and_stay_as_they_were(name):
-    sweep = simulated()
+    sweep = small()
     tables = []
     # Those that learn take a minute to compile for each type.
     for dtype in (np.uint8, np.uint16) if name in LEARNING else (np.uint8, np.uint32):
@@ -111,10 +115,10 @@ def test_counts_of_any_type_give_the_same_and_stay_as_they_were(name):
 
 
 @EVERY
-@pytest.mark.parametrize("lost", [slice(1, 96, 2), slice(1, 96), slice(96)], ids=["odd", "all but one", "all"])
+@pytest.mark.parametrize("lost", [slice(1, None, 2), slice(1, None), slice(None)], ids=["odd", "all but one", "all"])
 def test_columns_without_frames(name, lost):
-    sweep = simulated()
-    frames = np.full(96, 10)
+    sweep = small()
+    frames = np.full(48, 10)
     frames[lost] = 0
     counts = np.where(frames[:, None, None] > 0, sweep.counts, 0).astype(np.uint8)
     run(name, counts, frames, sweep.geometry, maps=2)
@@ -122,18 +126,18 @@ def test_columns_without_frames(name, lost):
 
 @EVERY
 def test_rows_without_a_window(name):
-    sweep = simulated()
+    sweep = small()
     geometry = replace(sweep.geometry, x_lo=sweep.geometry.x_lo.copy(), x_hi=sweep.geometry.x_hi.copy())
     geometry.x_lo[[0, 7, 20]], geometry.x_hi[[0, 7, 20]] = 0, -1
-    geometry.x_lo[:, 50], geometry.x_hi[:, 50] = 0, -1
+    geometry.x_lo[:, 25], geometry.x_hi[:, 25] = 0, -1
     run(name, sweep.counts, 10, geometry)
 
 
 @EVERY
 def test_rays_that_end_within_the_picture(name):
-    sweep = simulated()
+    sweep = small()
     u, v = sweep.geometry.u.copy(), sweep.geometry.v.copy()
-    for y in range(32):
+    for y in range(len(u)):
         reach = int(6 * y**0.5) + 5
         u[y, :reach] = v[y, :reach] = np.nan
         u[y, -reach:] = v[y, -reach:] = np.nan
@@ -179,9 +183,9 @@ def test_tiny_sensors_without_a_model(name, rows, width):
 
 @EVERY
 def test_dark_frames_that_are_all_ones_or_all_zeros(name):
-    sweep = simulated()
+    sweep = small()
     for level in (0, 50):
-        dark = np.full((32, 512), level, np.uint32)
+        dark = np.full((24, 512), level, np.uint32)
         run(name, sweep.counts, 10, sweep.geometry, dark_counts=dark, n_dark=50)
 
 
@@ -189,7 +193,7 @@ def test_learning_goes_on_for_many_maps_without_drifting():
     maps = [simulated(exposures=5, seed=seed) for seed in range(4)]
     estimator = create_estimator("likelihood")
     errors = []
-    for index in range(40):
+    for index in range(24):
         sweep = maps[index % len(maps)]
         errors.append(np.nanmean(sweep.errors(estimator.estimate(sweep.volume, sweep.geometry).x_px)))
     assert np.mean(errors[-4:]) < 1.15 * np.mean(errors[:4])
@@ -197,7 +201,7 @@ def test_learning_goes_on_for_many_maps_without_drifting():
 
 @EVERY
 def test_a_bad_map_does_not_spoil_the_next_ones(name):
-    sweep = simulated()
+    sweep = small()
     estimator = create_estimator(name)
     estimator.estimate(volume_of(np.full_like(sweep.counts, 10), sweep.geometry, 10), sweep.geometry)
     for _ in range(3):
