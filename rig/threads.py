@@ -10,7 +10,6 @@ import weakref
 from collections.abc import Callable
 from itertools import pairwise
 from queue import SimpleQueue
-from types import TracebackType
 from typing import Self
 
 import numpy as np
@@ -24,10 +23,9 @@ _LEAST_URGENT = 19
 class RowWorkers:
     """Threads that share the rows of a picture, each one always the same rows: what it touched is still in its cache.
 
-    Work can be left with them (`post`): each thread goes through it in order, none waits for the others, and handing
-    over costs the caller little. An error in the work is raised at the next call, and work left behind it is not begun.
-    With one thread everything is done at once. The threads end with `close`, or when nothing refers to the workers any
-    more.
+    Work can be left with them (`post`): each thread goes through it in order and none waits for the others. An error in
+    the work is raised at the next call, and work left behind it is not begun. With one thread everything is done at
+    once. The threads end with `close`, or when nothing refers to the workers any more.
     """
 
     def __init__(self, threads: int) -> None:
@@ -81,9 +79,7 @@ class RowWorkers:
         """The workers themselves."""
         return self
 
-    def __exit__(
-        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
-    ) -> None:
+    def __exit__(self, *error: object) -> None:
         """Close."""
         self.close()
 

@@ -10,17 +10,17 @@ them is right. So answers of one row and place of the mirror that coincide share
 from dataclasses import replace
 
 import numpy as np
-from numpy.typing import NDArray
 
 from rig.geometry.line_grid import LineGrid
 from rig.geometry.stripe_table import StripeTable
 from rig.geometry.windows import SweepGeometry
+from rig.simd import Float32
 from rig.threads import RowWorkers
 
 
 def depth_map(
     stripes: StripeTable, geometry: SweepGeometry, min_confidence: float, workers: RowWorkers | None = None
-) -> NDArray[np.float32]:
+) -> Float32:
     """Depth z in metres (rows, width) float32, NaN where two confident neighbouring stripes do not enclose the pixel.
 
     Only stripes of at least `min_confidence` take part; nothing else is filled. Depth outside the depth range by more
@@ -43,8 +43,7 @@ def depth_map(
         )  # fmt: skip
         if light is not None:
             inverse_depth = light.inverse_depth(command, first)
-        with np.errstate(invalid="ignore"):
-            inside = (inverse_depth <= 1.1 / near_m) & (inverse_depth >= 0.9 / far_m)
+        inside = (inverse_depth <= 1.1 / near_m) & (inverse_depth >= 0.9 / far_m)
         depth[rows][inside] = 1.0 / inverse_depth[inside]
 
     (workers or RowWorkers(1)).over(geometry.rows, work)
@@ -64,8 +63,7 @@ def share_claims(stripes: StripeTable, grid: LineGrid) -> StripeTable:
     x, confidence = stripes.x_px[:, columns], stripes.confidence[:, columns]  # (rows, places, lines)
     claimed = np.zeros_like(confidence)
     for other in range(grid.lines):
-        with np.errstate(invalid="ignore"):
-            same = np.abs(x - x[:, :, other, None]) <= SAME_PX
+        same = np.abs(x - x[:, :, other, None]) <= SAME_PX
         claimed += np.where(same, confidence[:, :, other, None], np.float32(0))
     shared = np.array(stripes.confidence)
     shared[:, columns] = np.where(

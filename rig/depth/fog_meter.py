@@ -25,20 +25,18 @@ from dataclasses import dataclass, replace
 from typing import TYPE_CHECKING, Any, Final
 
 import numpy as np
-from numpy.typing import NDArray
 
 from calibration.errors import digits
 from rig.count.volume import CountVolume
 from rig.geometry.stripe_table import StripeTable
 from rig.geometry.windows import SweepGeometry
+from rig.simd import Bools, Float32, Float64
 
 if TYPE_CHECKING:
     from rig.estimate.row.inputs import Lines
 
-Array = NDArray[np.float64]
 
 LEAST_EXPOSURES: Final = 50.0
-"""Least exposures of a bin that takes part."""
 STARTS_PER_M: Final = (0.0, 0.05, 0.15, 0.5, 1.5)
 STEPS: Final = 40
 REST_PRIOR: Final = 25.0
@@ -54,12 +52,12 @@ FLUX_MAX: Final = 50.0
 class FogFit:
     """haze, extinction, offset and rest, (4,), and their covariance (4, 4); haze is that at the path `at_m`."""
 
-    value: Array
-    covariance: Array
+    value: Float64
+    covariance: Float64
     at_m: float
 
 
-def fit_fog(sums: Array, path_m: Array) -> FogFit | None:
+def fit_fog(sums: Float64, path_m: Float64) -> FogFit | None:
     """Fit of block sums (blocks, 2, bins, 4) over bins of mean path; None where too little was seen before stripes.
 
     Levenberg's steps from the likeliest of several extinctions. The covariance is that of the counts, widened number
@@ -97,7 +95,7 @@ def fit_fog(sums: Array, path_m: Array) -> FogFit | None:
     return FogFit(value, inverse * np.outer(wider, wider), at_m)
 
 
-def _inverse(information: Array) -> Array:
+def _inverse(information: Float64) -> Float64:
     """Inverse of an information whose numbers may be of any size, and may depend on each other."""
     size = np.sqrt(np.diag(information))
     relative = information / np.outer(size, size) + RIDGE * np.eye(len(size))
@@ -108,14 +106,14 @@ def _inverse(information: Array) -> Array:
 class _Data:
     """Sums of the fit, (blocks, cells) each; path_m, behind: (cells,), off the middle path, and side of the stripe."""
 
-    ones: Array
-    exposures: Array
-    gain: Array
-    ambient: Array
-    path_m: Array
-    behind: NDArray[np.bool_]
+    ones: Float64
+    exposures: Float64
+    gain: Float64
+    ambient: Float64
+    path_m: Float64
+    behind: Bools
 
-    def started(self, extinction_per_m: float) -> Array:
+    def started(self, extinction_per_m: float) -> Float64:
         """Parameters of this extinction with the haze that gives the ones before stripes."""
         shape = self.gain * np.exp(np.minimum(-2.0 * extinction_per_m * self.path_m, 50.0))
         shape, before = (each[:, ~self.behind] for each in (shape, self.exposures))
@@ -123,24 +121,23 @@ class _Data:
         level = -math.log1p(-rate) - float(np.average(self.ambient[:, ~self.behind], weights=before))
         return np.array([max(level, 0.0) / max(float(np.average(shape, weights=before)), 1e-9), extinction_per_m, 0, 0])
 
-    def _light(self, value: Array) -> tuple[Array, Array, Array]:
+    def _light(self, value: Float64) -> tuple[Float64, Float64, Float64]:
         """Shape of the haze, the part of it that each cell sees, and the flux."""
         shape = self.gain * np.exp(np.minimum(-2.0 * value[1] * self.path_m, 50.0))
         part = np.where(self.behind, value[3], 1.0)
         return shape, part, np.clip(self.ambient + value[2] + value[0] * shape * part, FLUX_MIN, FLUX_MAX)
 
-    def evidence(self, value: Array) -> float:
+    def evidence(self, value: Float64) -> float:
         """Log-likelihood of the counts, and of the weak prior."""
         flux = self._light(value)[2]
-        return float(np.sum(self.ones * np.log(np.expm1(flux)) - self.exposures * flux)) - 0.5 * float(
-            self.prior(value) @ value
-        )
+        likelihood = float(np.sum(self.ones * np.log(np.expm1(flux)) - self.exposures * flux))
+        return likelihood - 0.5 * float(self.prior(value) @ value)
 
-    def prior(self, value: Array) -> Array:
+    def prior(self, value: Float64) -> Float64:
         """Slope of the weak prior, downwards."""
         return np.array([0.0, 1e-3, 0.0, REST_PRIOR]) * value
 
-    def slopes(self, value: Array) -> tuple[Array, Array]:
+    def slopes(self, value: Float64) -> tuple[Float64, Float64]:
         """Slope of each block's log-likelihood (blocks, 4), and the information (4, 4) with the prior's."""
         shape, part, flux = self._light(value)
         haze = value[0] * shape
@@ -201,8 +198,7 @@ class FogEstimate:
 def read_fog(sweep: Any, stripe: StripeTable, geometry: SweepGeometry, state: Any) -> FogEstimate:
     """The fog of one map.
 
-    sweep: what was counted, a `CountVolume` or one with `lines` of counts. stripe, state: what its estimator gave, and
-    the `RowModel` that it gave it with.
+    sweep: a `CountVolume`, or a sweep with `lines` of counts. stripe: of its estimator, made with the `RowModel` state.
     """
     from rig.depth.kernels import SUMS, add_clear_rows
     from rig.estimate.row.em import lines_of, next_lattice
@@ -216,7 +212,7 @@ def read_fog(sweep: Any, stripe: StripeTable, geometry: SweepGeometry, state: An
         return FogEstimate()
     block = row * BLOCKS // geometry.rows * BLOCKS + column * BLOCKS // geometry.columns
     sums, at_stripe = np.zeros((BLOCKS**2, 2, BINS, SUMS)), np.zeros((len(row), 2))
-    hot_flux = 5.0 * float(np.median(state.ambient)) + 1e-3
+    hot_flux = state.hot_flux()
     add_clear_rows(
         sweep_of(replace(geometry, others=None)), state_of(state), lines, stripe.x_px[row, column], clear,
         block.astype(np.int32), CLEAR_PX, hot_flux, sums, at_stripe,
@@ -232,7 +228,7 @@ def read_fog(sweep: Any, stripe: StripeTable, geometry: SweepGeometry, state: An
     return _stated(fit, sums, state.path_m(), dark, at_stripe[read], signal)
 
 
-def _dark_offset(sweep: Any, ambient: NDArray[np.float32], hot_flux: float) -> tuple[float, float] | None:
+def _dark_offset(sweep: Any, ambient: Float32, hot_flux: float) -> tuple[float, float] | None:
     """Excess of dark frames over the learned ambient light, and its standard deviation; None without dark frames."""
     if sweep.dark_counts is None:
         return None
@@ -245,10 +241,8 @@ def _dark_offset(sweep: Any, ambient: NDArray[np.float32], hot_flux: float) -> t
     return level - float(np.average(ambient[used], weights=frames[used])), level / math.sqrt(ones)
 
 
-def _dark_alone(sums: Array, dark: tuple[float, float] | None) -> FogEstimate:
-    """The ambient light alone, if dark frames tell of it: for maps where a halo or the haze of other lines lies on all
-    that is read.
-    """
+def _dark_alone(sums: Float64, dark: tuple[float, float] | None) -> FogEstimate:
+    """The ambient light, if dark frames tell of it: a halo or the haze of other lines lies on all that is read."""
     if dark is None:
         return FogEstimate()
     level = float(sums[..., 3].sum() / sums[..., 1].sum()) + dark[0]
@@ -260,7 +254,7 @@ def _ambient(level: float, sd: float) -> dict[str, float]:
 
 
 def _stated(
-    fit: FogFit, sums: Array, path_m: Array, dark: tuple[float, float] | None, at_stripe: Array, signal: float
+    fit: FogFit, sums: Float64, path_m: Float64, dark: tuple[float, float] | None, at_stripe: Float64, signal: float
 ) -> FogEstimate:
     haze, extinction, offset, rest = fit.value
     sd = np.sqrt(np.diag(fit.covariance))

@@ -13,9 +13,9 @@ from typing import Final
 
 import numba
 import numpy as np
-from numpy.typing import NDArray
 
 from rig.estimate.row.inputs import Lines, RowState, Sweep, row_buffers, row_fluxes
+from rig.simd import Bools, Float32, Float64, Int32
 
 MAX_COLUMN_GAP: Final = 2
 """Stripes of columns farther apart than this are not joined to one surface."""
@@ -26,18 +26,9 @@ SPACING_SIGMAS: Final = 3.0
 
 @numba.njit(cache=True, nogil=True)
 def fill_rows(
-    x_px: NDArray[np.float32],
-    confidence: NDArray[np.float32],
-    x_sd_px: NDArray[np.float32],
-    min_confidence: float,
-    plane: NDArray[np.float64],
-    u: NDArray[np.float32],
-    v: NDArray[np.float32],
-    inverse_depth: NDArray[np.float32],
-    depth_confidence: NDArray[np.float32],
-    commands: NDArray[np.float64],
-    command: NDArray[np.float64],
-) -> None:
+    x_px: Float32, confidence: Float32, x_sd_px: Float32, min_confidence: float, plane: Float64, u: Float32, v: Float32,
+    inverse_depth: Float32, depth_confidence: Float32, commands: Float64, command: Float64,
+) -> None:  # fmt: skip
     """Write inverse depth and its confidence (rows, width) for pixels between stripes of neighbouring columns.
 
     Also writes the mirror's command there, from the columns' `commands`, unless `command` is empty.
@@ -90,17 +81,9 @@ SUMS: Final = 4
 
 @numba.njit(cache=True, nogil=True)
 def add_clear_rows(
-    sweep: Sweep,
-    state: RowState,
-    lines: Lines,
-    x_px: NDArray[np.float32],
-    clear: NDArray[np.bool_],
-    block: NDArray[np.int32],
-    clear_px: float,
-    hot_flux: float,
-    sums: NDArray[np.float64],
-    at_stripe: NDArray[np.float64],
-) -> None:
+    sweep: Sweep, state: RowState, lines: Lines, x_px: Float32, clear: Bools, block: Int32, clear_px: float,
+    hot_flux: float, sums: Float64, at_stripe: Float64,
+) -> None:  # fmt: skip
     """Add the pixels of clear lines that are clear_px and more before or behind their stripe at x_px.
 
     sums: (blocks, 2, bins, SUMS), before and behind. at_stripe (lines, 2): path in metres and geometry factor of the

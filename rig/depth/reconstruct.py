@@ -21,6 +21,7 @@ from rig.estimate.registry import COUPLED, LEARNING, Learned, create_estimator, 
 from rig.geometry.line_grid import LineGrid
 from rig.geometry.stripe_table import StripeTable
 from rig.geometry.windows import SweepGeometry, sweep_geometry, uncalibrated_geometry
+from rig.simd import Float32, Float64
 from rig.threads import RowWorkers
 
 
@@ -33,7 +34,7 @@ class MapResult:
     """
 
     stripe: StripeTable
-    depth_m: NDArray[np.float32]
+    depth_m: Float32
     intensity: NDArray[np.uint32]
     fog: FogEstimate
     compute_s: float
@@ -52,7 +53,7 @@ class Reconstructor:
     def __init__(
         self,
         model: RigModel | None,
-        column_commands: Sequence[float] | NDArray[np.float64],
+        column_commands: Sequence[float] | Float64,
         depth_range_m: tuple[float, float],
         estimate: EstimateConfig,
         *,

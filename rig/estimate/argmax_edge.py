@@ -11,11 +11,11 @@ from typing import Final
 
 import numba
 import numpy as np
-from numpy.typing import NDArray
 
-from rig.count.volume import Counter, CountVolume, SweepCounter, SweepLayout
+from rig.count.volume import Counter, Counts, CountVolume, SweepCounter, SweepLayout
 from rig.geometry.stripe_table import StripeTable
 from rig.geometry.windows import MARGIN_PX, SweepGeometry
+from rig.simd import Bools, Float32, Float64, Int32
 from rig.threads import RowWorkers
 
 EDGE_REACH_PX: Final = 8
@@ -29,7 +29,7 @@ NEAR_SHARE: Final = 0.25
 
 
 @numba.njit(cache=True, nogil=True)
-def sub_pixel(weight: NDArray[np.float64], peak: int, length: int) -> float:
+def sub_pixel(weight: Float64, peak: int, length: int) -> float:
     """Offset of the peak in -0.5..0.5 from its two neighbours: centroid of what rises above the lower of them.
 
     A flat top or a peak at the end of the row has no offset.
@@ -45,9 +45,7 @@ def sub_pixel(weight: NDArray[np.float64], peak: int, length: int) -> float:
 
 
 @numba.njit(cache=True, nogil=True)
-def peak_confidence(
-    weight: NDArray[np.float64], counts: NDArray[np.float64], k: float, peak: int, length: int
-) -> tuple[float, float]:
+def peak_confidence(weight: Float64, counts: Float64, k: float, peak: int, length: int) -> tuple[float, float]:
     """(P(the true peak is within 1 px of `peak`), mean count away from it).
 
     The row is read as 'one pixel at the peak's rate, the others at the mean rate of the rest', whose likelihood at x is
@@ -84,7 +82,7 @@ def peak_confidence(
 
 
 @numba.njit(cache=True, nogil=True)
-def _near_fit(n: NDArray[np.float64], length: int) -> tuple[float, float]:
+def _near_fit(n: Float64, length: int) -> tuple[float, float]:
     """Level and decay per pixel of an exponential through the near part of a row, by its two halves' sums."""
     half = max(int(length * NEAR_SHARE) // 2, 2)
     if 2 * half > length:
@@ -105,18 +103,9 @@ def _near_fit(n: NDArray[np.float64], length: int) -> tuple[float, float]:
 
 @numba.njit(cache=True, nogil=True)
 def peak_rows(
-    counts: NDArray[np.unsignedinteger],
-    n_frames: NDArray[np.int32],
-    x0: NDArray[np.int32],
-    x_lo: NDArray[np.int32],
-    x_hi: NDArray[np.int32],
-    near_is_left: bool,
-    defects: NDArray[np.bool_],
-    with_edge: bool,
-    first_row: int,
-    last_row: int,
-    out: NDArray[np.float32],
-) -> None:
+    counts: Counts, n_frames: Int32, x0: Int32, x_lo: Int32, x_hi: Int32, near_is_left: bool, defects: Bools,
+    with_edge: bool, first_row: int, last_row: int, out: Float32,
+) -> None:  # fmt: skip
     """`argmax` (with_edge False) or `edge` on rows first_row..last_row-1; out (5, rows, columns) as in StripeTable."""
     window = counts.shape[2]
     n = np.empty(window + 2 * MARGIN_PX, np.float64)
@@ -175,9 +164,7 @@ def peak_rows(
 
 
 @numba.njit(cache=True, nogil=True)
-def _edge_scores(
-    n: NDArray[np.float64], begin: int, length: int, background: float, decay: float, score: NDArray[np.float64]
-) -> None:
+def _edge_scores(n: Float64, begin: int, length: int, background: float, decay: float, score: Float64) -> None:
     """(count - background) times the drop of the mean level from the 8 px before to the 8 px behind, both cut at 0.
 
     n: counts with whatever lies beyond the window; score (length,) is of pixels begin..begin + length - 1.
@@ -211,11 +198,8 @@ class Peaks:
 
     with_edge: bool
     threads: int = 2
-
-    @property
-    def used(self) -> None:
-        """Nothing is learned."""
-        return None
+    used: None = None
+    """Nothing is learned."""
 
     def counter(self, layout: SweepLayout, geometry: SweepGeometry) -> Counter:
         """A counter of whole sweeps."""

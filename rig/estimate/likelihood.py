@@ -6,18 +6,16 @@ is counted whole and estimated twice: the first pass finds which pixels were qui
 judged column by column while its frames come in, under a model learned from earlier maps alone.
 """
 
-import numpy as np
-from numpy.typing import NDArray
-
 from rig.count.volume import BYTE_EXPOSURES, Counter, CountVolume, SweepCounter, SweepLayout
 from rig.estimate.row.em import lines_of, next_lattice
 from rig.estimate.row.model import RowModel
-from rig.estimate.search.inputs import SearchTables
 from rig.estimate.search.online_learning import LearningSetting, OnlineLearner, Seen, first_model
 from rig.estimate.search.prepare import judge_of
+from rig.estimate.search.rows import SearchTables
 from rig.estimate.search.stream import ColumnJudge, SearchedSweep, search_volume
 from rig.geometry.stripe_table import StripeTable
 from rig.geometry.windows import SweepGeometry
+from rig.simd import Float64, Int32, Uint8
 from rig.threads import RowWorkers
 
 
@@ -78,10 +76,7 @@ class _LikelihoodCounter:
     """Counts the first sweep whole; judges the columns of every later one as they come."""
 
     def __init__(self, of: Likelihood, layout: SweepLayout, geometry: SweepGeometry, workers: RowWorkers) -> None:
-        self._of = of
-        self._layout = layout
-        self._geometry = geometry
-        self._workers = workers
+        self._of, self._layout, self._geometry, self._workers = of, layout, geometry, workers
         self._counter: SweepCounter | ColumnJudge | None = None
         self._memory: ColumnJudge | None = None
 
@@ -89,9 +84,7 @@ class _LikelihoodCounter:
         """Begin the next sweep."""
         self._counter = None
 
-    def add(
-        self, bits: NDArray[np.uint8], bins: NDArray[np.int32], column: NDArray[np.float64], x0: NDArray[np.int32]
-    ) -> None:
+    def add(self, bits: Uint8, bins: Int32, column: Float64, x0: Int32) -> None:
         """Add frames, see `Counter`."""
         self._present().add(bits, bins, column, x0)
 

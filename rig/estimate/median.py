@@ -7,9 +7,9 @@ from dataclasses import replace
 
 import numba
 import numpy as np
-from numpy.typing import NDArray
 
 from rig.geometry.stripe_table import StripeTable
+from rig.simd import Float32, Float64
 
 REACH = 2
 MEDIAN_EFFICIENCY = 1.2533
@@ -19,12 +19,7 @@ SURE = np.float32(0.999999)
 
 
 @numba.njit(cache=True, nogil=True)
-def _median_rows(
-    disparity: NDArray[np.float32],
-    confidence: NDArray[np.float32],
-    coupled: bool,
-    out: NDArray[np.float32],
-) -> None:
+def _median_rows(disparity: Float32, confidence: Float32, coupled: bool, out: Float32) -> None:
     """Write median, agreement and standard deviation of every answer to out (3, rows, columns)."""
     rows, columns = disparity.shape
     values = np.empty((2 * REACH + 1) ** 2, np.float32)
@@ -63,14 +58,13 @@ def _median_rows(
             out[2, y, c] = MEDIAN_EFFICIENCY * np.sqrt((spread / max(number, 1) + 1.0 / 12.0) / max(number, 1))
 
 
-def median_filter(stripes: StripeTable, reference_px: NDArray[np.float64], *, coupled: bool = False) -> StripeTable:
+def median_filter(stripes: StripeTable, reference_px: Float64, *, coupled: bool = False) -> StripeTable:
     """Stripe table with x_px replaced by the 5x5 median of its disparity; reference_px (rows, columns), NaN allowed.
 
-    The reference is where the column's line stands at a fixed depth: smooth over rows and columns. Confidence becomes
-    the share of the neighbours' confidence that lies within 1 px of the median, times the probability that those are
-    right: one of them at least, where each goes by its own row; coupled: their mean, since answers that go by each
-    other agree where nothing is lit too. x_sd_px becomes the standard deviation of a median of those neighbours; signal
-    and haze stay.
+    The reference is where the column's line stands at a fixed depth. Confidence becomes the share of the neighbours'
+    confidence that lies within 1 px of the median, times the probability that one of those at least is right; coupled:
+    times their mean, since answers that go by each other agree where nothing is lit too. x_sd_px becomes the standard
+    deviation of a median of those neighbours.
     """
     reference = reference_px.astype(np.float32)
     out = np.full((3, *stripes.x_px.shape), np.nan, np.float32)

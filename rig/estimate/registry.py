@@ -93,14 +93,10 @@ def _learning(name: str, threads: int, *, learns: bool, temporal_prior: bool) ->
 
 
 class Recalled:
-    """Estimates each map with a state of its own; maps behind the last state are estimated with the last.
-
-    of: an estimator that learns nothing by itself.
-    """
+    """Estimates each map with a state of its own, later maps with the last; of: an estimator that learns nothing."""
 
     def __init__(self, of: LearnsFromStream, states: Sequence[Learned]) -> None:
-        self._states = list(states)
-        self._of = of
+        self._states, self._of = list(states), of
         self._of.model = self._states.pop(0)
 
     @property

@@ -1,25 +1,21 @@
 """Light that is no plane at one column: sheets that bow, and rows that are read one after the other.
 
 Windows, estimators and the joining of stripes take planes and rays (u, v, 1). So they are given rays bent sideways by
-what the bow does in the middle of the depth range: that is nearly the same for all columns that a pixel can see. What
-is left of it, and the delay of the rows, whose sign changes with the direction of the sweep, is below a pixel or two:
-the windows are wider by that (`beside_px`), and the depth of a map is put right afterwards, exactly, from each pixel's
-command (`BentLight.inverse_depth`). `calibration.model.light_sheet` has the formula of a bowed sheet. Rays are float32
-(rows, width), commands and sheets float64.
+what the bow does in the middle of the depth range. What is left of it, and the delay of the rows, is below a pixel or
+two: the windows are wider by that (`beside_px`), and the depth of a map is put right afterwards, exactly, from each
+pixel's command (`BentLight.inverse_depth`). `calibration.model.light_sheet` has the formula of a bowed sheet. Rays are
+float32 (rows, width), commands and sheets float64.
 """
 
 import math
 from dataclasses import dataclass
 
 import numpy as np
-from numpy.typing import NDArray
 
 from calibration.model.light_sheet import fan_origin, inverse_depth
 from calibration.model.rig_model import RigModel
 from calibration.model.scanner import PivotScanner
-
-Array = NDArray[np.float64]
-Float32 = NDArray[np.float32]
+from rig.simd import Float32, Float64
 
 _SAMPLED_SHEETS = 4097
 """Sheets sampled over the command range: between two of them a plane is linear to 1e-8 rad."""
@@ -39,11 +35,11 @@ class BentLight:
     model: RigModel
     u: Float32
     v: Float32
-    commands: Array
-    sheets: Array
+    commands: Float64
+    sheets: Float64
     velocity_per_s: float = 0.0
 
-    def inverse_depth(self, command: Array, first_row: int = 0) -> Float32:
+    def inverse_depth(self, command: Float64, first_row: int = 0) -> Float32:
         """Inverse depth where the mirror was bound to commands (rows, width) from a row on; NaN stays NaN."""
         from rig.geometry.kernels import bent_inverse_depth
 
@@ -57,7 +53,7 @@ class BentLight:
         return result
 
 
-def bent_light(model: RigModel, u: Float32, v: Float32, commands: Array) -> BentLight:
+def bent_light(model: RigModel, u: Float32, v: Float32, commands: Float64) -> BentLight:
     """The bent light of a model, its kernel compiled: u, v, commands as in `BentLight`."""
     sheets = model.sheets(np.linspace(*model.scanner.command_range, _SAMPLED_SHEETS))
     light = BentLight(model, u, v, commands, np.hstack([sheets.planes, sheets.middle, sheets.across]))
@@ -75,7 +71,7 @@ def is_bent(model: RigModel) -> bool:
     return model.row_delay_s != 0 or bow_per_rad(model) != 0
 
 
-def bent_u(model: RigModel, u: Array, v: Array, depth_m: float) -> Array:
+def bent_u(model: RigModel, u: Float64, v: Float64, depth_m: float) -> Float64:
     """The u (rows, width) that rays would need to meet the planes where, at this depth, they meet the bowed sheets.
 
     Offset and cone are left out of where the planes stand: they change this by less than the windows' margin.
@@ -89,12 +85,12 @@ def bent_u(model: RigModel, u: Array, v: Array, depth_m: float) -> Array:
     away = np.linalg.norm(normal, axis=-1)  # from the axis, within the plane
     normal_x = normal[..., 0] / away * np.where(normal @ scanner.zero_normal < 0, -1.0, 1.0)
     off = np.tan(scanner.bow_per_rad * np.arctan2(across, away) ** 2) * np.hypot(across, away)
-    bent: Array = u - off / (normal_x * depth_m)
+    bent: Float64 = u - off / (normal_x * depth_m)
     return bent
 
 
 def beside_px(
-    model: RigModel, rays: tuple[Array, Array], bent: Array, commands: Array, depth_range_m: tuple[float, float]
+    model: RigModel, rays: tuple[Float64, Float64], bent: Float64, commands: Float64, depth_range_m: tuple[float, float]
 ) -> int:
     """Most pixels that stripes stand beside the place that planes and bent rays give, within the depth range.
 

@@ -10,29 +10,22 @@ from typing import Final
 
 import numba
 import numpy as np
-from numpy.typing import NDArray
+
+from rig.simd import Float32, Float64, Int32
 
 
 @numba.njit(cache=True, nogil=True)
-def row_windows(
-    u: NDArray[np.float32], v: NDArray[np.float32], plane: NDArray[np.float64], w_far: float, w_near: float
-) -> tuple[NDArray[np.int32], NDArray[np.int32]]:
+def row_windows(u: Float32, v: Float32, plane: Float64, w_far: float, w_near: float) -> tuple[Int32, Int32]:
     """First and last pixel (rows, columns) int32 whose inverse depth p.(u, v, 1) lies in [w_far, w_near].
 
-    Pixels without a ray (NaN) are outside. Inverse depth is monotone between the first and the last valid pixel of a
-    row, so both ends are found by bisection.
+    Pixels without a ray (NaN) are outside.
     """
     rows, width = u.shape
     columns = plane.shape[0]
     x_lo = np.zeros((rows, columns), np.int32)
     x_hi = np.full((rows, columns), -1, np.int32)
     for y in range(rows):
-        first = 0
-        while first < width and np.isnan(u[y, first]):
-            first += 1
-        last = width - 1
-        while last > first and np.isnan(u[y, last]):
-            last -= 1
+        first, last = with_rays(u, y, 0, width - 1)
         if first >= last:
             continue
         for c in range(columns):
@@ -40,29 +33,32 @@ def row_windows(
             w_first = px * u[y, first] + py * v[y, first] + pz
             w_last = px * u[y, last] + py * v[y, last] + pz
             falling = w_first > w_last
-            # Lowest x at which w has passed the first limit, in the sense of travel.
+            # Lowest x at which w has reached the first limit, or passed the second, in the sense of travel.
             enter, leave = (w_near, w_far) if falling else (w_far, w_near)
-            lo, hi = first, last + 1
-            while lo < hi:
-                mid = (lo + hi) // 2
-                w = px * u[y, mid] + py * v[y, mid] + pz
-                inside = w <= enter if falling else w >= enter
-                if inside:
-                    hi = mid
+            for passed, limit in ((False, enter), (True, leave)):
+                lo, hi = first, last + 1
+                while lo < hi:
+                    mid = (lo + hi) // 2
+                    w = px * u[y, mid] + py * v[y, mid] + pz
+                    if (w < limit if falling else w > limit) or (w == limit and not passed):
+                        hi = mid
+                    else:
+                        lo = mid + 1
+                if passed:
+                    x_hi[y, c] = lo - 1
                 else:
-                    lo = mid + 1
-            x_lo[y, c] = lo
-            lo, hi = first, last + 1
-            while lo < hi:
-                mid = (lo + hi) // 2
-                w = px * u[y, mid] + py * v[y, mid] + pz
-                beyond = w < leave if falling else w > leave
-                if beyond:
-                    hi = mid
-                else:
-                    lo = mid + 1
-            x_hi[y, c] = lo - 1
+                    x_lo[y, c] = lo
     return x_lo, x_hi
+
+
+@numba.njit(inline="always")
+def with_rays(u, y, first, last):  # type: ignore[no-untyped-def]
+    """First and last of those pixels of a row, without the ones at its ends that have no ray; one is always left."""
+    while first < last and np.isnan(u[y, first]):
+        first += 1
+    while last > first and np.isnan(u[y, last]):
+        last -= 1
+    return first, last
 
 
 NEWTON_STEPS: Final = 2
@@ -72,17 +68,9 @@ bad lens's."""
 
 @numba.njit(cache=True, nogil=True)
 def bent_inverse_depth(
-    command: NDArray[np.float64],
-    ahead: NDArray[np.float64],
-    u: NDArray[np.float32],
-    v: NDArray[np.float32],
-    sheets: NDArray[np.float64],
-    low: float,
-    high: float,
-    origin: NDArray[np.float64],
-    bow: float,
-    inverse_depth: NDArray[np.float32],
-) -> None:
+    command: Float64, ahead: Float64, u: Float32, v: Float32, sheets: Float64, low: float, high: float, origin: Float64,
+    bow: float, inverse_depth: Float32,
+) -> None:  # fmt: skip
     """Write inverse depth (rows, width) where the mirror was bound to `command`; NaN where there is none.
 
     ahead: (rows,) by how much the command is past that. sheets: (samples, 10) float64, n, d, middle and across of the

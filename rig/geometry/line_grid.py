@@ -9,11 +9,9 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
-from numpy.typing import NDArray
 
 from rig.geometry.windows import SweepGeometry
-
-Array = NDArray[np.float64]
+from rig.simd import Float64, Int32
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -27,8 +25,8 @@ class LineGrid:
 
     offsets: tuple[float, ...]
     step: float
-    line: NDArray[np.int32]
-    place: NDArray[np.int32]
+    line: Int32
+    place: Int32
     overlap: float = 0.0
 
     @property
@@ -41,29 +39,29 @@ class LineGrid:
         """Number of places of the mirror in a sweep."""
         return len(self.place) // self.lines
 
-    def columns_at(self) -> NDArray[np.int32]:
+    def columns_at(self) -> Int32:
         """Columns that are lit at each place, by line: int32 (places, lines)."""
         columns = np.empty((self.places, self.lines), np.int32)
         columns[self.place, self.line] = np.arange(len(self.place), dtype=np.int32)
         return columns
 
-    def others(self, plane: Array) -> Array:
+    def others(self, plane: Float64) -> Float64:
         """Planes of the columns that are lit together with each: (columns, lines - 1, 3); plane: (columns, 3)."""
         together = self.columns_at()[self.place]
         own = together == np.arange(len(self.place))[:, None]
-        result: Array = plane[together[~own].reshape(len(self.place), self.lines - 1)]
+        result: Float64 = plane[together[~own].reshape(len(self.place), self.lines - 1)]
         return result
 
-    def bound_commands(self, commands: Array, column: Array) -> Array:
+    def bound_commands(self, commands: Float64, column: Float64) -> Float64:
         """Commands at which the lines of all columns stood when the mirror bound them to `column`, both (columns,).
 
         commands: of the columns' centres. Fractional columns count from each one's own number.
         """
-        result: Array = commands + (column - np.arange(len(commands))) * self.step
+        result: Float64 = commands + (column - np.arange(len(commands))) * self.step
         return result
 
 
-def line_grid(offsets: Sequence[float], columns: int, command_range: tuple[float, float]) -> tuple[LineGrid, Array]:
+def line_grid(offsets: Sequence[float], columns: int, command_range: tuple[float, float]) -> tuple[LineGrid, Float64]:
     """The grid of a map of so many columns, a multiple of the lines, and the commands (columns,) of their centres."""
     lines = len(offsets)
     places = columns // lines
@@ -78,27 +76,17 @@ def line_grid(offsets: Sequence[float], columns: int, command_range: tuple[float
 
 def window_overlap(grid: LineGrid, geometry: SweepGeometry) -> float:
     """Mean share of a column's search window, on rows that it is seen on, that those of other lines cover."""
-    columns = grid.columns_at()
-    covered = whole = 0
-    for place in range(grid.places):
-        lo, hi = geometry.x_lo[:, columns[place]], geometry.x_hi[:, columns[place]]
-        for line in range(grid.lines):
-            others = [other for other in range(grid.lines) if other != line]
-            whole += int(np.maximum(hi[:, line] - lo[:, line] + 1, 0).sum())
-            covered += int(_covered(lo[:, line], hi[:, line], lo[:, others], hi[:, others]).sum())
+    columns, covered, whole = grid.columns_at(), 0, 0
+    for line in range(grid.lines):
+        own, others = columns[:, line], np.delete(columns, line, axis=1)
+        lo, hi = geometry.x_lo[:, own], geometry.x_hi[:, own]
+        # The others' windows (rows, places, lines) from left to right, each without what those before it cover.
+        order = np.argsort(geometry.x_lo[:, others], axis=2)
+        los, his = (np.take_along_axis(x[:, others], order, 2) for x in (geometry.x_lo, geometry.x_hi))
+        reached = lo.copy()
+        for other in range(grid.lines - 1):
+            end = np.minimum(his[:, :, other], hi) + 1
+            covered += int(np.maximum(end - np.maximum(los[:, :, other], reached), 0).sum())
+            reached = np.maximum(reached, end)
+        whole += int(np.maximum(hi - lo + 1, 0).sum())
     return covered / whole if whole else 0.0
-
-
-def _covered(
-    lo: NDArray[np.int32], hi: NDArray[np.int32], los: NDArray[np.int32], his: NDArray[np.int32]
-) -> NDArray[np.int64]:
-    """Pixels of lo..hi (rows,) that lie in any of los..his (rows, others)."""
-    order = np.argsort(los, axis=1)
-    los, his = np.take_along_axis(los, order, 1), np.take_along_axis(his, order, 1)
-    reached = lo.astype(np.int64)
-    total = np.zeros(len(lo), np.int64)
-    for other in range(los.shape[1]):
-        first, end = np.maximum(los[:, other], reached), np.minimum(his[:, other], hi) + 1
-        total += np.maximum(end - first, 0)
-        reached = np.maximum(reached, end)
-    return total

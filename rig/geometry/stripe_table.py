@@ -6,7 +6,8 @@ All arrays are (rows, columns). The errors are against a truth that a world or a
 from dataclasses import dataclass, fields
 
 import numpy as np
-from numpy.typing import NDArray
+
+from rig.simd import Float32, Float64
 
 
 @dataclass(frozen=True, slots=True)
@@ -22,15 +23,15 @@ class StripeTable:
     estimator looks for none.
     """
 
-    x_px: NDArray[np.float32]
-    confidence: NDArray[np.float32]
-    x_sd_px: NDArray[np.float32]
-    signal: NDArray[np.float32]
-    haze: NDArray[np.float32]
-    x2_px: NDArray[np.float32] | None = None
-    confidence2: NDArray[np.float32] | None = None
+    x_px: Float32
+    confidence: Float32
+    x_sd_px: Float32
+    signal: Float32
+    haze: Float32
+    x2_px: Float32 | None = None
+    confidence2: Float32 | None = None
 
-    def arrays(self) -> dict[str, NDArray[np.float32]]:
+    def arrays(self) -> dict[str, Float32]:
         """Every array that there is, by its name."""
         values = {field.name: getattr(self, field.name) for field in fields(self)}
         return {name: value for name, value in values.items() if value is not None}
@@ -46,26 +47,22 @@ MISSING_PX = 10.0
 """Error charged for a missing answer, in px, where leaving answers out must not help."""
 
 
-def stripe_errors(x_px: NDArray[np.float32], true_x_px: NDArray[np.float32]) -> dict[str, float | None]:
+def stripe_errors(x_px: Float32, true_x_px: Float32) -> dict[str, float | None]:
     """Errors in pixels over the (row, column) that have a true stripe; both arrays (rows, columns), NaN = none.
 
     `missing`: share of those without an estimate; `mean_abs`, `median_abs`: over the estimated (None where there are
     none); `within_1px`: over all, a missing one counts as wrong.
     """
     scored = np.isfinite(true_x_px)
-    if not scored.any():
-        return {"mean_abs": None, "median_abs": None, "within_1px": None, "missing": None}
     error = np.abs(x_px[scored].astype(np.float64) - true_x_px[scored])
     given = error[np.isfinite(error)]
-    return {
-        "mean_abs": float(given.mean()) if given.size else None,
-        "median_abs": float(np.median(given)) if given.size else None,
-        "within_1px": float(np.count_nonzero(given <= 1.0) / error.size),
-        "missing": float(1.0 - given.size / error.size),
-    }
+    if not error.size:
+        return _sizes(given) | {"within_1px": None, "missing": None}
+    within, answered = np.count_nonzero(given <= 1.0) / error.size, given.size / error.size
+    return _sizes(given) | {"within_1px": float(within), "missing": float(1.0 - answered)}
 
 
-def charged_errors(x_px: NDArray[np.float32], true_x_px: NDArray[np.float32]) -> NDArray[np.float64]:
+def charged_errors(x_px: Float32, true_x_px: Float32) -> Float64:
     """Error of every (row, column) in pixels, NaN where there is no true stripe; a missing answer, or one farther off,
     counts as `MISSING_PX`.
     """
@@ -74,10 +71,13 @@ def charged_errors(x_px: NDArray[np.float32], true_x_px: NDArray[np.float32]) ->
     return np.where(np.isfinite(true_x_px), charged, np.nan)
 
 
-def depth_errors(depth_m: NDArray[np.float32], true_depth_m: NDArray[np.float32]) -> dict[str, float | None]:
+def depth_errors(depth_m: Float32, true_depth_m: Float32) -> dict[str, float | None]:
     """Mean and median absolute depth error in metres over pixels that have both; None where no pixel has."""
     error = np.abs(depth_m.astype(np.float64) - true_depth_m)
-    error = error[np.isfinite(error)]
+    return _sizes(error[np.isfinite(error)])
+
+
+def _sizes(error: Float64) -> dict[str, float | None]:
     if not error.size:
         return {"mean_abs": None, "median_abs": None}
     return {"mean_abs": float(error.mean()), "median_abs": float(np.median(error))}

@@ -15,6 +15,7 @@ from calibration.model.light_sheet import LEAST_OFFSET_M, near_side
 from calibration.model.rig_model import RigModel
 from rig.errors import UsageError
 from rig.geometry.bent_light import BentLight, bent_light, bent_u, beside_px, is_bent
+from rig.simd import Bools, Float32, Float64, Int32
 
 WORD_PX: Final = 64
 """Windows start and end at multiples of one 64-bit word, so that counting runs on whole words."""
@@ -40,26 +41,26 @@ class SweepGeometry:
     line is alone. light: what is to be put right in depths from planes; None: nothing.
     """
 
-    u: NDArray[np.float32]
-    v: NDArray[np.float32]
-    plane: NDArray[np.float64]
-    planes: NDArray[np.float64]
-    x_lo: NDArray[np.int32]
-    x_hi: NDArray[np.int32]
-    x0: NDArray[np.int32]
+    u: Float32
+    v: Float32
+    plane: Float64
+    planes: Float64
+    x_lo: Int32
+    x_hi: Int32
+    x0: Int32
     window: int
     near_is_left: bool
     depth_range_m: tuple[float, float]
-    defects: NDArray[np.bool_]
-    others: NDArray[np.float64] | None = None
+    defects: Bools
+    others: Float64 | None = None
     light: BentLight | None = None
 
     @property
-    def rays(self) -> tuple[NDArray[np.float32], NDArray[np.float32]]:
+    def rays(self) -> tuple[Float32, Float32]:
         """True rays (u, v), each (rows, width)."""
         return (self.u, self.v) if self.light is None else (self.light.u, self.light.v)
 
-    def bound_to(self, model: RigModel, commands: NDArray[np.float64], velocity_per_s: float) -> "SweepGeometry":
+    def bound_to(self, model: RigModel, commands: Float64, velocity_per_s: float) -> "SweepGeometry":
         """The same windows with the light of a sweep whose columns were bound to `commands`, at this velocity."""
         planes = model.planes(commands)
         light = None if self.light is None else replace(self.light, commands=commands, velocity_per_s=velocity_per_s)
@@ -80,7 +81,7 @@ class SweepGeometry:
         """Laser line positions of the sweep."""
         return int(self.plane.shape[0])
 
-    def reference_px(self) -> NDArray[np.float64]:
+    def reference_px(self) -> Float64:
         """Position of each column's line at the middle inverse depth, (rows, columns) px, as if without distortion.
 
         Only its differences between neighbouring rows and columns matter; it may lie outside the picture.
@@ -99,11 +100,10 @@ class SweepGeometry:
         return np.asarray(left + px_per_tangent * (u - u_left))
 
 
-def sweep_geometry(model: RigModel, commands: NDArray[np.float64], depth_range_m: tuple[float, float]) -> SweepGeometry:
+def sweep_geometry(model: RigModel, commands: Float64, depth_range_m: tuple[float, float]) -> SweepGeometry:
     """Search windows of the light at mirror commands (columns,), for a camera and a depth range in metres.
 
-    Raises UsageError where a plane passes through the camera (its depth is not determined) or where no column can be
-    seen at all within the depth range.
+    UsageError where a plane passes through the camera, or where no column can be seen within the depth range.
     """
     from rig.geometry.kernels import row_windows
 
@@ -138,8 +138,7 @@ def sweep_geometry(model: RigModel, commands: NDArray[np.float64], depth_range_m
         x_lo = np.where(seen, np.maximum(x_lo - np.int32(beside), 0), x_lo)
         x_hi = np.where(seen, np.minimum(x_hi + np.int32(beside), width - 1), x_hi)
     padded = -(-width // WORD_PX) * WORD_PX
-    big = np.int32(padded)
-    first = np.where(seen, x_lo, big).min(axis=0) - MARGIN_PX
+    first = np.where(seen, x_lo, np.int32(padded)).min(axis=0) - MARGIN_PX
     last = np.where(seen, x_hi, -1).max(axis=0) + MARGIN_PX
     empty = ~seen.any(axis=0)
     first = np.where(empty, 0, np.clip(first, 0, width - 1)) // WORD_PX * WORD_PX

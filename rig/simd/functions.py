@@ -13,11 +13,10 @@ from typing import Any, Final
 
 import numba
 import numpy as np
-from llvmlite import ir
 
 from rig.simd.vectors import (
     FLOAT32,
-    LANES,
+    WIDE,
     add_saturated,
     emitted,
     from_bfloat16,
@@ -26,11 +25,11 @@ from rig.simd.vectors import (
     larger_float,
     smaller_float,
     sub_saturated,
+    wide,
     zero_float32,
     zero_int16,
 )
 
-_WIDE = ir.VectorType(ir.IntType(32), LANES)
 _MANTISSA_BITS: Final = 23
 _BIAS: Final = 127
 _ROOT_HALF: Final = 0x3F3504F3
@@ -44,23 +43,19 @@ _ERF: Final = 0.0000430638, 0.0002765672, 0.0001520143, 0.0092705272, 0.04228201
 """Abramowitz and Stegun, Handbook of Mathematical Functions, 7.1.28, the highest power first."""
 
 
-def _whole(number: int) -> Any:
-    return ir.Constant(_WIDE, [number] * LANES)
-
-
 def _exponents(builder: Any, a: Any) -> Any:
-    above = builder.sub(builder.bitcast(a, _WIDE), _whole(_ROOT_HALF))
-    return builder.ashr(above, _whole(_MANTISSA_BITS))
+    above = builder.sub(builder.bitcast(a, WIDE), wide(_ROOT_HALF))
+    return builder.ashr(above, wide(_MANTISSA_BITS))
 
 
 def _mantissas(builder: Any, a: Any) -> Any:
-    exponents = builder.shl(_exponents(builder, a), _whole(_MANTISSA_BITS))
-    return builder.bitcast(builder.sub(builder.bitcast(a, _WIDE), exponents), FLOAT32.llvm)
+    exponents = builder.shl(_exponents(builder, a), wide(_MANTISSA_BITS))
+    return builder.bitcast(builder.sub(builder.bitcast(a, WIDE), exponents), FLOAT32.llvm)
 
 
 def _power(builder: Any, a: Any) -> Any:
-    biased = builder.add(builder.fptosi(a, _WIDE), _whole(_BIAS))
-    return builder.bitcast(builder.shl(biased, _whole(_MANTISSA_BITS)), FLOAT32.llvm)
+    biased = builder.add(builder.fptosi(a, WIDE), wide(_BIAS))
+    return builder.bitcast(builder.shl(biased, wide(_MANTISSA_BITS)), FLOAT32.llvm)
 
 
 exponents = emitted(FLOAT32(FLOAT32), lambda builder, a: builder.sitofp(_exponents(builder, a), FLOAT32.llvm))

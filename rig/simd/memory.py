@@ -86,17 +86,11 @@ store_float32 = _writer(FLOAT32, _F32, FLOAT32.llvm, 4)
 """store_float32(address, index, lanes): write 16 float32."""
 store_four = _writer(FOUR, _F32, FOUR.llvm, 4)
 """store_four(address, index, lanes): write four float32."""
-read_byte = _reader(types.uint8, _I8, _I8, 1)
-read_int16 = _reader(types.int16, _I16, _I16, 2)
-read_int32 = _reader(types.int32, _I32, _I32, 4)
-read_int64 = _reader(types.int64, _I64, _I64, 1)
-read_float32 = _reader(types.float32, _F32, _F32, 4)
+_WHOLE = (types.uint8, _I8, 1), (types.int16, _I16, 2), (types.int32, _I32, 4), (types.int64, _I64, 1)
+_NUMBERS = *_WHOLE, (types.float32, _F32, 4)
+read_byte, read_int16, read_int32, read_int64, read_float32 = (_reader(kind, a, a, at) for kind, a, at in _NUMBERS)
 """read_...(address, index): one number."""
-write_byte = _writer(types.uint8, _I8, _I8, 1)
-write_int16 = _writer(types.int16, _I16, _I16, 2)
-write_int32 = _writer(types.int32, _I32, _I32, 4)
-write_int64 = _writer(types.int64, _I64, _I64, 1)
-write_float32 = _writer(types.float32, _F32, _F32, 4)
+write_byte, write_int16, write_int32, write_int64, write_float32 = (_writer(kind, a, a, at) for kind, a, at in _NUMBERS)
 """write_...(address, index, number): one number."""
 
 

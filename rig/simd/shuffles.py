@@ -1,12 +1,8 @@
 """Operations across lanes: shuffles, sums along the lanes, masks with a bit for each lane, turned blocks of numbers.
 
 Reductions (`largest_of_rows`, `totals_of_rows`) take LANES rows at once and give one number a row, which then is one
-lane of the answer. Row by row every step of a reduction would wait for the one before, and take as many instructions
-for one row as here for all.
-
-`fetch_eights` and `spread_eights` take eight numbers from each of LANES places and turn them, so that lane i of eight
-vectors holds those of place i: the pixels around stripes are fetched in this way, with two instructions a stripe
-instead of two a number.
+lane of the answer: row by row every step would wait for the one before. `fetch_eights` and `spread_eights` take eight
+numbers from each of LANES places and turn them, so that lane i of eight vectors holds those of place i.
 """
 
 from collections.abc import Callable, Sequence
@@ -28,6 +24,7 @@ from rig.simd.vectors import (
     everywhere,
     place_list,
     vector_name,
+    wide,
 )
 
 _HALF: Final = LANES // 2
@@ -199,7 +196,6 @@ totals_of_rows = emitted(FLOAT32(types.intp), _totals_of_rows)
 
 EIGHT: Final = 8
 _EIGHT_FLOATS = ir.VectorType(ir.FloatType(), EIGHT)
-_WIDE = ir.VectorType(ir.IntType(32), LANES)
 
 
 def _turned(builder: Any, rows: list[Any]) -> list[Any]:
@@ -251,8 +247,7 @@ def _spread_eights(builder: Any, source: Any, to: Any) -> None:
     for half in range(2):
         fours = builder.shuffle_vector(loaded, nothing, place_list(range(half, 2 * LANES, 2)))
         for d in range(4):
-            moved = builder.lshr(fours, ir.Constant(_WIDE, [8 * d] * LANES))
-            byte = builder.and_(moved, ir.Constant(_WIDE, [255] * LANES))
+            byte = builder.and_(builder.lshr(fours, wide(8 * d)), wide(255))
             _store(builder, builder.sitofp(byte, FLOAT32.llvm), to, 4 * half + d)
 
 

@@ -180,14 +180,20 @@ for _operator, _operation in (
     overload(_operator)(_overload(_operation))
 
 
-_WIDE = ir.VectorType(_INT32, LANES)
+WIDE = ir.VectorType(_INT32, LANES)
+"""LLVM type of 32-bit lanes."""
+
+
+def wide(number: int) -> Any:
+    """A whole number in 32-bit lanes, as an LLVM constant."""
+    return ir.Constant(WIDE, [number] * LANES)
 
 
 as_bytes = emitted(BYTES(INT16), lambda builder, a: builder.bitcast(a, BYTES.llvm))
 """as_bytes(a): the two bytes of each 16-bit lane."""
-to_int16 = emitted(INT16(FLOAT32), lambda b, a: b.trunc(b.fptosi(a, _WIDE), INT16.llvm))
+to_int16 = emitted(INT16(FLOAT32), lambda b, a: b.trunc(b.fptosi(a, WIDE), INT16.llvm))
 """to_int16(a): float32 lanes, which must fit, without their fraction."""
-to_float32 = emitted(FLOAT32(INT16), lambda b, a: b.sitofp(b.sext(a, _WIDE), FLOAT32.llvm))
+to_float32 = emitted(FLOAT32(INT16), lambda b, a: b.sitofp(b.sext(a, WIDE), FLOAT32.llvm))
 """to_float32(a): 16-bit lanes as numbers."""
 square_root = emitted(FLOAT32(FLOAT32), lambda b, a: called(b, f"llvm.sqrt.{vector_name(a.type)}", a.type, a))
 """square_root(a): of float32 lanes."""
@@ -209,10 +215,10 @@ def _dot_pairs(builder: Any, counts: Any, weights: Any) -> Any:
 
     def product(place: int) -> Any:
         places = place_list(range(place, 2 * LANES, 2))
-        n = builder.zext(builder.shuffle_vector(counts, nothing, places), _WIDE)
-        return builder.mul(n, builder.sext(builder.shuffle_vector(weights, nothing, places), _WIDE))
+        n = builder.zext(builder.shuffle_vector(counts, nothing, places), WIDE)
+        return builder.mul(n, builder.sext(builder.shuffle_vector(weights, nothing, places), WIDE))
 
-    low, high = ir.Constant(_WIDE, [-32768] * LANES), ir.Constant(_WIDE, [32767] * LANES)
+    low, high = wide(-32768), wide(32767)
     both = builder.add(product(0), product(1))
     both = builder.select(builder.icmp_signed(">", both, low), both, low)
     both = builder.select(builder.icmp_signed("<", both, high), both, high)
@@ -287,9 +293,8 @@ def where_below(typing: Any, values: Any, others: Any, sizes: Any, limits: Any) 
 def _scaled(builder: Any, a: Any, weights: Any) -> Any:
     if _has_avx2():
         return called(builder, "llvm.x86.avx2.pmul.hr.sw", INT16.llvm, a, weights)
-    product = builder.mul(builder.sext(a, _WIDE), builder.sext(weights, _WIDE))
-    half, places = ir.Constant(_WIDE, [1 << 14] * LANES), ir.Constant(_WIDE, [15] * LANES)
-    return builder.trunc(builder.ashr(builder.add(product, half), places), INT16.llvm)
+    product = builder.mul(builder.sext(a, WIDE), builder.sext(weights, WIDE))
+    return builder.trunc(builder.ashr(builder.add(product, wide(1 << 14)), wide(15)), INT16.llvm)
 
 
 scaled = emitted(INT16(INT16, INT16), _scaled)
@@ -303,22 +308,12 @@ def _unpacked(builder: Any, bits: Any) -> Any:
     # A zero in front of each number (at the lower address) is the lower half of a float32.
     zeros = ir.Constant(bits.type, [0] * LANES)
     pairs = [index for lane in UNPACKED for index in (LANES, lane)]
-    wide = builder.shuffle_vector(bits, zeros, place_list(pairs))
-    return builder.bitcast(wide, FLOAT32.llvm)
+    return builder.bitcast(builder.shuffle_vector(bits, zeros, place_list(pairs)), FLOAT32.llvm)
 
 
-def _as_float(builder: Any, bits: Any) -> Any:
-    wide = builder.shl(builder.zext(bits, _WIDE), ir.Constant(_WIDE, [16] * LANES))
-    return builder.bitcast(wide, FLOAT32.llvm)
-
-
-def _upper_half(builder: Any, a: Any) -> Any:
-    return builder.trunc(builder.lshr(builder.bitcast(a, _WIDE), ir.Constant(_WIDE, [16] * LANES)), INT16.llvm)
-
-
-from_bfloat16 = emitted(FLOAT32(INT16), _as_float)
+from_bfloat16 = emitted(FLOAT32(INT16), lambda b, a: b.bitcast(b.shl(b.zext(a, WIDE), wide(16)), FLOAT32.llvm))
 """from_bfloat16(a): 16-bit patterns, the upper halves of float32 numbers, as those numbers."""
 from_bfloat16_unpacked = emitted(FLOAT32(INT16), _unpacked)
 """from_bfloat16_unpacked(a): those numbers in the order UNPACKED."""
-to_bfloat16 = emitted(INT16(FLOAT32), _upper_half)
+to_bfloat16 = emitted(INT16(FLOAT32), lambda b, a: b.trunc(b.lshr(b.bitcast(a, WIDE), wide(16)), INT16.llvm))
 """to_bfloat16(a): upper halves of float32 lanes as 16-bit patterns."""

@@ -27,6 +27,7 @@ SCOPE = (
 )
 """Files whose functions compute; the others move bytes, words and files, which tests/unit and tests/wire hold."""
 NUMERIC = {"int", "float", "complex", "NDArray", "ArrayLike", "Array", "Fraction", "Pixels", "Counts"}
+NUMERIC |= {"Float32", "Float64", "Int16", "Int32", "Uint8", "Bools"}
 """Names in an annotation by which a function takes or gives numbers."""
 
 EXAMPLES = settings(

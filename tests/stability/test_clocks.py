@@ -20,13 +20,6 @@ from tests.stability.inventory import EXAMPLES, covers
 from tests.unit.rig.count.streams import plan_of, scan, stream_of
 
 TWO_DAYS_S = 48 * 3600
-RATES = (
-    Fraction(97_700),
-    Fraction(100_000_000),
-    Fraction(1_000_000_000),
-    Fraction(293_100, 3),
-    Fraction(48_000_000, 491),
-)
 
 
 @covers(VirtualClock.now_ns, VirtualClock.sleep, VirtualClock.advance_to_ns)

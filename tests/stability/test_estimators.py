@@ -10,15 +10,19 @@ from rig.estimate import registry
 from rig.estimate.argmax_edge import peak_rows
 from rig.estimate.joint import second_return_blocks, second_returns
 from rig.estimate.median import median_filter
-from rig.estimate.registry import ESTIMATORS, create_estimator
+from rig.estimate.registry import ESTIMATORS, LEARNING, create_estimator
 from rig.geometry.windows import uncalibrated_geometry
 from tests.reference.geometry import Geometry
 from tests.stability.inventory import covers
-from tests.unit.small_maps import RIGS, geometry_of, simulated, volume_of
+from tests.unit.small_maps import RIGS, assert_same, geometry_of, simulated, volume_of
 
 covers(peak_rows, registry, second_returns, second_return_blocks)
 
 ROWS, COLUMNS = 12, 24
+
+
+def small():
+    return simulated(rows=24, columns=48)
 
 
 @cache
@@ -65,23 +69,15 @@ EVERY = pytest.mark.parametrize("name", ESTIMATORS)
 
 
 @EVERY
-@pytest.mark.parametrize("rig", ["left", "turned"])
-@pytest.mark.parametrize(
-    ("k", "level"), [(1, 0), (1, 1), (10, 0), (10, 10), (255, 0), (255, 255), (10, 5), (10**6, 0), (10**6, 10**6)]
-)
-def test_pictures_without_any_contrast(name, rig, k, level):
-    geometry = view(rig)
-    table, _ = run(name, full(level, geometry, np.uint8 if k < 256 else np.uint32), k, geometry, maps=2)
-    seen = table.x_px[np.isfinite(table.x_px)]
-    assert seen.size > 50
+@pytest.mark.parametrize(("k", "level"), [(1, 1), (10, 0), (10, 5), (65_535, 65_535)])
+def test_pictures_without_any_contrast(name, k, level):
+    geometry = view("turned")
+    table, _ = run(name, full(level, geometry, np.uint8 if k < 256 else np.uint16), k, geometry, maps=2)
+    assert np.isfinite(table.x_px).sum() > 50
 
 
 @EVERY
-@pytest.mark.parametrize(
-    ("k", "dtype", "rate"),
-    [(1, np.uint8, 0.5), (1, np.uint8, 1e-4), (300, np.uint16, 0.5), (300, np.uint16, 0.9999),
-     (70_000, np.uint32, 1e-4), (70_000, np.uint32, 0.9999)],
-)  # fmt: skip
+@pytest.mark.parametrize(("k", "dtype", "rate"), [(1, np.uint8, 0.5), (300, np.uint16, 1e-4), (300, np.uint16, 0.9999)])
 def test_noise_without_any_stripe(name, k, dtype, rate):
     geometry = view()
     counts = np.random.default_rng(1).binomial(k, rate, full(0, geometry).shape).astype(dtype)
@@ -91,7 +87,7 @@ def test_noise_without_any_stripe(name, k, dtype, rate):
 
 
 @EVERY
-@pytest.mark.parametrize("exposures", [300, 3000, 65_535])
+@pytest.mark.parametrize("exposures", [300, 65_535])
 def test_many_exposures(name, exposures):
     sweep = simulated(rows=16, columns=24)
     rng = np.random.default_rng(1)
@@ -107,51 +103,41 @@ def test_many_exposures(name, exposures):
 
 @EVERY
 def test_counts_of_any_type_give_the_same_and_stay_as_they_were(name):
-    sweep = simulated()
+    sweep = small()
     tables = []
-    for dtype in (np.uint8, np.uint16, np.uint32):
+    # Those that learn take a minute to compile for each type.
+    for dtype in (np.uint8, np.uint16) if name in LEARNING else (np.uint8, np.uint32):
         volume = volume_of(sweep.counts.astype(dtype), sweep.geometry, 10)
         before = volume.counts.copy()
         tables.append(create_estimator(name).estimate(volume, sweep.geometry))
         np.testing.assert_array_equal(volume.counts, before)
-    for table in tables[1:]:
-        for field, values in tables[0].arrays().items():
-            np.testing.assert_array_equal(getattr(table, field), values, err_msg=field)
+    assert_same(*tables)
 
 
 @EVERY
-@pytest.mark.parametrize("lost", ["odd", "all but one", "all"])
+@pytest.mark.parametrize("lost", [slice(1, None, 2), slice(1, None), slice(None)], ids=["odd", "all but one", "all"])
 def test_columns_without_frames(name, lost):
-    sweep = simulated()
-    frames = np.full(96, 10)
-    frames[{"odd": np.arange(1, 96, 2), "all but one": np.arange(96) != 64, "all": np.arange(96)}[lost]] = 0
+    sweep = small()
+    frames = np.full(48, 10)
+    frames[lost] = 0
     counts = np.where(frames[:, None, None] > 0, sweep.counts, 0).astype(np.uint8)
     run(name, counts, frames, sweep.geometry, maps=2)
 
 
 @EVERY
-def test_columns_of_very_different_numbers_of_frames(name):
-    rng = np.random.default_rng(1)
-    geometry = view()
-    frames = rng.choice([1, 2, 10, 200, 40_000], geometry.columns)
-    counts = rng.binomial(frames[:, None, None], 0.1, full(0, geometry).shape).astype(np.uint16)
-    run(name, counts, frames, geometry)
-
-
-@EVERY
 def test_rows_without_a_window(name):
-    sweep = simulated()
+    sweep = small()
     geometry = replace(sweep.geometry, x_lo=sweep.geometry.x_lo.copy(), x_hi=sweep.geometry.x_hi.copy())
     geometry.x_lo[[0, 7, 20]], geometry.x_hi[[0, 7, 20]] = 0, -1
-    geometry.x_lo[:, 50], geometry.x_hi[:, 50] = 0, -1
+    geometry.x_lo[:, 25], geometry.x_hi[:, 25] = 0, -1
     run(name, sweep.counts, 10, geometry)
 
 
 @EVERY
 def test_rays_that_end_within_the_picture(name):
-    sweep = simulated()
+    sweep = small()
     u, v = sweep.geometry.u.copy(), sweep.geometry.v.copy()
-    for y in range(32):
+    for y in range(len(u)):
         reach = int(6 * y**0.5) + 5
         u[y, :reach] = v[y, :reach] = np.nan
         u[y, -reach:] = v[y, -reach:] = np.nan
@@ -166,10 +152,9 @@ def test_rays_that_end_within_the_picture(name):
 
 
 @EVERY
-@pytest.mark.parametrize("near_is_left", [True, False])
-@pytest.mark.parametrize("length", [1, 2, 3, 8])
-def test_search_windows_of_a_few_pixels(name, near_is_left, length):
-    geometry = view("left" if near_is_left else "right")
+@pytest.mark.parametrize(("rig", "length"), [("left", 1), ("right", 2), ("left", 8)])
+def test_search_windows_of_a_few_pixels(name, rig, length):
+    geometry = view(rig)
     seen = geometry.x_lo <= geometry.x_hi
     x_hi = np.where(seen, np.minimum(geometry.x_lo + length - 1, geometry.x_hi), -1).astype(np.int32)
     counts = np.random.default_rng(2).binomial(10, 0.2, full(0, geometry).shape).astype(np.uint8)
@@ -177,8 +162,9 @@ def test_search_windows_of_a_few_pixels(name, near_is_left, length):
 
 
 @EVERY
-@pytest.mark.parametrize(("rows", "width", "columns"), [(1, 256, 24), (1, 256, 1), (50, 70, 24), (30, 500, 7)])
-@pytest.mark.parametrize("rig", ["left", "right"])
+@pytest.mark.parametrize(
+    ("rows", "width", "columns", "rig"), [(1, 256, 24, "left"), (1, 256, 1, "right"), (50, 70, 24, "right")]
+)
 def test_odd_sensors_and_sweeps(name, rows, width, columns, rig):
     g = Geometry.build(width=width, height=rows, columns=max(columns, 3), **RIGS[rig])
     g = replace(g, planes=g.planes[len(g.planes) // 2 :][:columns]) if columns == 1 else g
@@ -188,55 +174,36 @@ def test_odd_sensors_and_sweeps(name, rows, width, columns, rig):
 
 
 @EVERY
-@pytest.mark.parametrize(("rows", "width"), [(1, 1), (1, 2), (2, 1), (3, 65)])
+@pytest.mark.parametrize(("rows", "width"), [(1, 1), (2, 1), (3, 65)])
 def test_tiny_sensors_without_a_model(name, rows, width):
     geometry = uncalibrated_geometry(rows, width, 3)
     counts = np.random.default_rng(3).binomial(10, 0.3, full(0, geometry).shape).astype(np.uint8)
-    estimator = create_estimator(name)
-    for _ in range(2):
-        table = estimator.estimate(volume_of(counts, geometry, 10), geometry)
-        assert np.isfinite(table.x_px).all()
-        assert np.all((table.confidence >= 0) & (table.confidence <= 1))
-
-
-@EVERY
-def test_rows_of_stuck_pixels(name):
-    sweep = simulated()
-    counts = sweep.counts.copy()
-    counts[:, 10] = 10
-    counts[:, 11] = 0
-    counts[:, :, 300] = 10
-    table, _ = run(name, counts, 10, sweep.geometry)
-    if name == "likelihood":
-        good = np.delete(np.arange(32), [10, 11])
-        errors = np.abs(table.x_px - sweep.point.x_true)[good][sweep.point.trusted[good]]
-        assert np.mean(errors <= 1) > 0.8
+    run(name, counts, 10, geometry, maps=2)
 
 
 @EVERY
 def test_dark_frames_that_are_all_ones_or_all_zeros(name):
-    sweep = simulated()
+    sweep = small()
     for level in (0, 50):
-        dark = np.full((32, 512), level, np.uint32)
+        dark = np.full((24, 512), level, np.uint32)
         run(name, sweep.counts, 10, sweep.geometry, dark_counts=dark, n_dark=50)
 
 
 def test_learning_goes_on_for_many_maps_without_drifting():
-    maps = [simulated(exposures=5, rows=48, columns=120, seed=seed) for seed in range(4)]
+    maps = [simulated(exposures=5, seed=seed) for seed in range(4)]
     estimator = create_estimator("likelihood")
     errors = []
-    for index in range(40):
+    for index in range(24):
         sweep = maps[index % len(maps)]
         errors.append(np.nanmean(sweep.errors(estimator.estimate(sweep.volume, sweep.geometry).x_px)))
     assert np.mean(errors[-4:]) < 1.15 * np.mean(errors[:4])
 
 
 @EVERY
-@pytest.mark.parametrize("level", [0, 10])
-def test_a_bad_map_does_not_spoil_the_next_ones(name, level):
-    sweep = simulated()
+def test_a_bad_map_does_not_spoil_the_next_ones(name):
+    sweep = small()
     estimator = create_estimator(name)
-    estimator.estimate(volume_of(np.full_like(sweep.counts, level), sweep.geometry, 10), sweep.geometry)
+    estimator.estimate(volume_of(np.full_like(sweep.counts, 10), sweep.geometry, 10), sweep.geometry)
     for _ in range(3):
         table = estimator.estimate(sweep.volume, sweep.geometry)
         check(table, sweep.volume, sweep.geometry)

@@ -26,7 +26,7 @@ from rig.estimate.row.likelihood import (
     row_scores,
 )
 from rig.estimate.row.model import EXTINCTION_MAX_PER_M, RowModel, fine_profiles, fit_haze, line_profile, stripe_scale
-from rig.estimate.search.inputs import EXPOSURE_PARTS, count_fluxes
+from rig.estimate.search.rows import EXPOSURE_PARTS, count_fluxes
 from tests.stability.inventory import EXAMPLES, covers
 
 EXPOSURES = (1, 2, 10, 255, 65_535, 10**6)

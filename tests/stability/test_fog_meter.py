@@ -26,12 +26,8 @@ def test_any_light_has_a_finite_fit(exposures, extinction, haze, ambient) -> Non
 def test_exact_light_is_found_again_exactly(worst) -> None:
     for extinction, haze, rest in ((0.02, 0.1, 0.0), (0.2, 0.3, 0.3), (0.8, 1.0, 0.1)):
         fit = fit_fog(sums(extinction, haze, rest, 0.02, 1e7), PATH_M)
-        found = [
-            fit.value[0] * np.exp(2 * fit.value[1] * fit.at_m),
-            fit.value[1],
-            0.02 + fit.value[2],
-            fit.value[3] + 1,
-        ]
+        haze_there, found_extinction, offset, found_rest = fit.value
+        found = [haze_there * np.exp(2 * found_extinction * fit.at_m), found_extinction, 0.02 + offset, found_rest + 1]
         expected = np.array([haze, extinction, 0.02, rest + 1])
         worst("extinction, haze and rest of exact sums", "what they were made of", found / expected - 1, 1e-3)
 

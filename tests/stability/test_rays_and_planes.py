@@ -67,33 +67,6 @@ def test_there_is_no_huge_no_negative_and_no_infinite_depth(u, v, normal, offset
         assert np.isnan(inverse)
 
 
-@covers(depth)
-@pytest.mark.parametrize(
-    ("u", "plane"),
-    [
-        (0.0, [1, 0, 0, -0.3]),  # along the plane
-        (1e-17, [-1, 0, 0, -0.3]),  # along it but for rounding: z would be 3e16 m
-        (0.0, [1, 0, 0.5, -0.3]),  # behind the camera
-        (0.3, [1, 0, -0.5, 0.0]),  # no baseline
-        (0.3, [1, 0, -0.5, 1e-17]),  # none but for rounding: z would be 1e-16 m
-        (0.5, [1, 0, -0.5, 0.0]),  # within the plane, through its origin
-        (np.inf, [1, 0, 0, 0.3]),
-        (np.nan, [1, 0, 0, 0.3]),
-    ],
-)
-def test_what_meets_nowhere_has_no_depth(u, plane) -> None:
-    assert np.isnan(depth(u, 0.0, plane))
-
-
-@covers(depth)
-def test_the_scanner_s_own_axis_is_at_its_depth() -> None:
-    pivot = np.array([-0.1, 0.0, 0.5])
-    planes = PivotScanner(pivot, np.array([0, 1.0, 0]), np.array([1.0, 0, 0]), np.array([0, 0.3])).planes(
-        np.linspace(-1, 1, 21)
-    )
-    assert depth(-0.2, 0.0, planes) == pytest.approx(np.full(21, 0.5), rel=1e-12)
-
-
 @covers(depth_slope, near_side)
 @EXAMPLES
 @given(u=TANGENT, v=TANGENT, normal=st.tuples(METRES, METRES, METRES), offset=METRES | st.floats(-1e-5, 1e-5))
@@ -123,10 +96,7 @@ def test_depth_slopes_keep_nine_digits(digits) -> None:
 
 @covers(PlaneTable.planes, PlaneTable.command_range)
 @EXAMPLES
-@given(
-    rows=st.lists(st.tuples(ANY, ANY, ANY, ANY), min_size=1, max_size=5),
-    share=st.floats(0, 1),
-)
+@given(rows=st.lists(st.tuples(ANY, ANY, ANY, ANY), min_size=1, max_size=5), share=st.floats(0, 1))
 def test_plane_tables_of_any_numbers_give_unit_planes_or_say_why_not(rows, share) -> None:
     try:
         table = PlaneTable(np.arange(len(rows), dtype=float), np.array(rows))

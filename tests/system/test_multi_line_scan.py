@@ -71,14 +71,6 @@ def test_the_dry_run_of_the_bundled_rig_prints_what_lines_share(rig: Rig) -> Non
     assert "21% of a column's window is other lines' too" in ran.out
 
 
-def test_a_row_of_flux_holds_the_stripes_of_all_lines(rig: Rig) -> None:
-    ran = rig("effects", "simulated-4-lines", "--scene", "street-clear", "--row", 256, "--column", 60, "--json")
-    assert ran.code == 0, ran.err
-    stripe = np.array(json.loads(ran.out)["stripe"])
-    peaks = (stripe[1:-1] > stripe[:-2]) & (stripe[1:-1] >= stripe[2:]) & (stripe[1:-1] > 0.05 * stripe.max())
-    assert peaks.sum() == 4
-
-
 def test_lines_that_leave_gaps_are_a_usage_error(two_lines: Path, rig: Rig) -> None:
     content = yaml.safe_load(two_lines.read_text())
     content["scan"]["command_range"] = [-0.2, 0.2]

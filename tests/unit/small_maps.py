@@ -9,6 +9,9 @@ from calibration.model.camera import Camera
 from calibration.model.rig_model import RigModel
 from calibration.model.scanner import PlaneTable
 from rig.count.volume import CountVolume
+from rig.estimate.likelihood import Likelihood
+from rig.estimate.row.model import RowModel
+from rig.geometry.stripe_table import StripeTable
 from rig.geometry.windows import SweepGeometry, sweep_geometry, uncalibrated_geometry
 from tests.reference.adapter import windowed
 from tests.reference.geometry import DEPTH_RANGE_M, Geometry
@@ -80,6 +83,12 @@ class Sweep:
         return np.abs(x_px[scored].astype(float) - self.point.x_true[scored])
 
 
+def assert_same(found: StripeTable, wanted: StripeTable) -> None:
+    """The same bits in every field."""
+    for name, values in wanted.arrays().items():
+        np.testing.assert_array_equal(found.arrays()[name], values, err_msg=name)
+
+
 def street(rows: int) -> Scene:
     """Rows of the yardstick's procedural scene where it is richest: board, pole, ball, back wall and a little floor."""
     scene, part = procedural_scene(), slice(232, 232 + rows)
@@ -92,3 +101,11 @@ def simulated(light="report", exposures=10, rig="left", rows=32, columns=96, see
     g = Geometry.build(width=512, height=rows, columns=columns, **RIGS[rig])
     point = WorkingPoint(street(rows), POINTS[light], g)
     return Sweep(point, geometry_of(g), point.counts(exposures, seed), exposures)
+
+
+@cache
+def learned_from(light="report", exposures=10, rig="left", rows=32, columns=96) -> RowModel:
+    """The state that `likelihood` learns from such a sweep; tests must not write into it."""
+    sweep, estimator = simulated(light, exposures, rig, rows, columns), Likelihood(1)
+    estimator.estimate(sweep.volume, sweep.geometry)
+    return estimator.used

@@ -19,14 +19,12 @@ Three things can be wrong with an answer, and each has its factor:
   contrast sums, bright: what the model's largest amplitude would bring. Where a dark stripe would still shine, no light
   is no stripe, and light over its noise cannot tell that.
 - unseen: max(AT_END - CLEARLY max(contrast, 0), 0), with e = 1 up to 1 px from the far end of the depth range and 0
-  from 3 px on. Haze that goes on ends there for want of places, so evenly that answers agree; a stripe so far away has
-  to shine by itself.
+  from 3 px on. Haze that goes on ends there for want of places, so evenly that answers agree.
 
-Agreement tells a surface from nothing at all: where there is no stripe, in a shadow or behind the end of the haze,
-every row finds what its noise looks most like, and four paths tie those answers into streaks but not into surfaces.
-Each answer has a number of 5 x 5 neighbours on the same surface (`count_neighbours`); odds come from the sum of these
-numbers over 7 x 7 answers (`agreement_row`). Thin and slanted things have few such neighbours, but a wrong answer is
-mostly not where those opposite each other put it, whatever the slope.
+Agreement tells a surface from nothing at all: where there is no stripe every row finds what its noise looks most like,
+and four paths tie those answers into streaks but not into surfaces. Each answer has a number of 5 x 5 neighbours on the
+same surface (`count_neighbours`); odds come from the sum of these numbers over 7 x 7 answers (`agreement_row`). Thin
+and slanted things have few such neighbours, but a wrong answer is mostly not where those opposite each other put it.
 
 Arrays are float32 (rows, columns), numbers of neighbours int16. Source of the constants: WIDER, B, C, D, E and F are
 fitted by maximum likelihood to random cluttered scenes of a second simulator, K = 1 to 30 in air and fog, all answers
@@ -38,24 +36,19 @@ sky in part (`tests.reference.tables.open_scenes`): larger ones take too much fr
 import math
 from typing import Final, NamedTuple
 
+import cv2
 import numba
 import numpy as np
-from numpy.typing import NDArray
 
 from rig.estimate.joint.place.places import LIGHT_PX, Places
 from rig.estimate.joint.place.pool import COPIED_ROWS, MARGIN, SAME_PX, with_margin
 from rig.estimate.joint.winner import UNITS, LabelAnswers
 from rig.estimate.row.model import RowModel
 from rig.geometry.stripe_table import StripeTable
+from rig.simd import Bools, Float32, Int16, Int32
 from rig.simd.functions import error_function, exponential, logarithm
 from rig.simd.memory import address_of, copy_floats, load_float32, store_float32
-from rig.simd.vectors import (
-    LANES,
-    larger_float,
-    smaller_float,
-    square_root,
-    zero_float32,
-)
+from rig.simd.vectors import LANES, larger_float, smaller_float, square_root, zero_float32
 from rig.threads import RowWorkers
 
 NEIGHBOURS: Final = 2
@@ -74,39 +67,33 @@ class Neighbours(NamedTuple):
     number: int16 (rows, columns) with AROUND rows and LANES columns around, 0 there. pairs: of `pairs_to_ask`.
     """
 
-    number: NDArray[np.int16]
-    pairs: NDArray[np.float32]
+    number: Int16
+    pairs: Float32
 
 
-def new_neighbours(pairs: NDArray[np.float32]) -> Neighbours:
+def new_neighbours(pairs: Float32) -> Neighbours:
     """Room for a map with so many pairs to ask."""
     rows, columns = pairs.shape
     return Neighbours(np.zeros((rows + 2 * AROUND, (-(-columns // LANES) + 2) * LANES), np.int16), pairs)
 
 
-def pairs_to_ask(there: NDArray[np.bool_]) -> NDArray[np.float32]:
+def pairs_to_ask(there: Bools) -> Float32:
     """Number of pairs of neighbours around each place (rows, columns) that are both there; at least 1.
 
     there: whether a place is searched and has frames; others have no say.
     """
-    weight = there.astype(np.int16)
-    return np.maximum(_around(weight * _around(weight, NEIGHBOURS), AROUND), 1).astype(np.float32)
+    weight = there.astype(np.float32)
+    return np.maximum(_around(weight * _around(weight, NEIGHBOURS), AROUND), np.float32(1))
 
 
-def _around(number: NDArray[np.int16], reach: int) -> NDArray[np.int16]:
-    """Sums over so many rows and columns to either side."""
-    (rows, columns), wide = number.shape, np.pad(number, reach)
-    tall = wide[:rows].copy()
-    for i in range(1, 2 * reach + 1):
-        tall += wide[i : i + rows]
-    total = tall[:, :columns].copy()
-    for i in range(1, 2 * reach + 1):
-        total += tall[:, i : i + columns]
-    return total
+def _around(number: Float32, reach: int) -> Float32:
+    """Sums of whole numbers over so many rows and columns to either side, 0 beyond."""
+    side = 2 * reach + 1
+    return np.asarray(cv2.boxFilter(number, -1, (side, side), normalize=False, borderType=cv2.BORDER_CONSTANT))
 
 
 @numba.njit(cache=True, nogil=True)
-def count_neighbours(distance: NDArray[np.float32], first_row: int, last_row: int, out: Neighbours) -> None:
+def count_neighbours(distance: Float32, first_row: int, last_row: int, out: Neighbours) -> None:
     """Fill number of rows first_row..last_row-1; distance: (rows, columns) of answers from the far end, NaN: none."""
     for band in range(first_row, last_row, COPIED_ROWS):
         end = min(band + COPIED_ROWS, last_row)
@@ -116,7 +103,7 @@ def count_neighbours(distance: NDArray[np.float32], first_row: int, last_row: in
 
 
 @numba.njit(cache=True, nogil=True)
-def _count_row(distance: NDArray[np.float32], row: int, number: NDArray[np.int16]) -> None:
+def _count_row(distance: Float32, row: int, number: Int16) -> None:
     """Count the neighbours in a row of a copy `with_margin`."""
     columns = distance.shape[1] - 2 * LANES
     own = distance[row, LANES:]
@@ -129,7 +116,7 @@ def _count_row(distance: NDArray[np.float32], row: int, number: NDArray[np.int16
 
 
 @numba.njit(cache=True, nogil=True)
-def agreement_row(number: NDArray[np.int16], y: int, line: NDArray[np.int16], out: NDArray[np.float32]) -> None:
+def agreement_row(number: Int16, y: int, line: Int16, out: Float32) -> None:
     """Write the pairs that agree around each answer of row y.
 
     number: as in `Neighbours`; line: as wide, room whose margins are 0.
@@ -149,7 +136,7 @@ def agreement_row(number: NDArray[np.int16], y: int, line: NDArray[np.int16], ou
 
 
 @numba.njit(cache=True, nogil=True)
-def apart_row(placed: NDArray[np.float32], row: int, out: NDArray[np.float32]) -> None:
+def apart_row(placed: Float32, row: int, out: Float32) -> None:
     """Write the pairs of opposite neighbours whose mean is not within SAME_PX of the answer between them.
 
     placed: a copy `with_margin` of final distances; row: of the copy.
@@ -168,8 +155,8 @@ def apart_row(placed: NDArray[np.float32], row: int, out: NDArray[np.float32]) -
 
 @numba.njit(cache=True, nogil=True)
 def light_row(
-    distance: NDArray[np.float32], light: NDArray[np.float32], row: int, number: NDArray[np.float32],
-    total: NDArray[np.float32],
+    distance: Float32, light: Float32, row: int, number: Float32,
+    total: Float32,
 ) -> None:  # fmt: skip
     """Write numbers of 3 x 3 neighbours on the surface of each answer of a row, and their light.
 
@@ -187,8 +174,6 @@ def light_row(
                 more = value[c]
                 total[c] += more if abs(near[c] - own[c]) <= SAME_PX else nothing
 
-
-Float32 = NDArray[np.float32]
 
 WIDER: Final = 1.556
 """Factor on the stated standard deviation: surfaces bend, and neighbours are shared, which counts do not show."""
@@ -210,8 +195,7 @@ NEAR_END_PX: Final = 1.0, 3.0
 SOME_HAZE: Final = 0.05
 """Photons of haze per pixel, over all exposures, from which on its end can be taken for a stripe."""
 FAR_BELOW: Final = 6.0
-"""Standard deviations below the haze from which on no agreement around makes up for a hole where light should be, as in
-counts that are all ones."""
+"""Standard deviations below the haze from which on no agreement around makes up for a hole where light should be."""
 _HALF_PX: Final = LIGHT_PX + 0.5
 """Half the pixels that a stripe's light is summed over."""
 _LEAST_ODDS: Final = 1e-3
@@ -233,23 +217,12 @@ class Brightness(NamedTuple):
 
 @numba.njit(cache=True, nogil=True, error_model="numpy")
 def confidences(
-    x_px: Float32,
-    sd_px: Float32,
-    n_frames: NDArray[np.int32],
-    answer: LabelAnswers,
-    places: Places,
-    neighbours: Neighbours,
-    bright: Brightness,
-    first_row: int,
-    last_row: int,
-    confidence: Float32,
-    signal: Float32,
-    haze: Float32,
-) -> None:
+    x_px: Float32, sd_px: Float32, n_frames: Int32, answer: LabelAnswers, places: Places, neighbours: Neighbours,
+    bright: Brightness, first_row: int, last_row: int, confidence: Float32, signal: Float32, haze: Float32,
+) -> None:  # fmt: skip
     """Fill confidence, signal and haze of rows first_row..last_row-1, all (rows, columns).
 
-    Where x_px is NaN the confidence is 0 and the others, sd_px too, are made NaN. The neighbours of all rows must have
-    been counted before.
+    Where x_px is NaN the confidence is 0 and the others, sd_px too, are made NaN. Neighbours must have been counted.
     """
     nothing = np.float32(np.nan)
     # Local names: each use of the tuple itself in the loop would count references to all of its arrays.
@@ -369,15 +342,9 @@ def brightness_of(model: RowModel) -> Brightness:
 
 
 def stripe_table(
-    x_px: NDArray[np.float32],
-    sd_px: NDArray[np.float32],
-    n_frames: NDArray[np.int32],
-    answer: LabelAnswers,
-    places: Places,
-    pairs: NDArray[np.float32],
-    bright: Brightness,
-    workers: RowWorkers,
-) -> StripeTable:
+    x_px: Float32, sd_px: Float32, n_frames: Int32, answer: LabelAnswers, places: Places, pairs: Float32,
+    bright: Brightness, workers: RowWorkers,
+) -> StripeTable:  # fmt: skip
     """The table of a map; arrays (rows, columns), x_px NaN where there are no data. pairs: of `pairs_to_ask`."""
     confidence, signal, haze = (np.empty_like(x_px) for _ in range(3))
     neighbours = new_neighbours(pairs)

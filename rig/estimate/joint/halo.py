@@ -8,9 +8,8 @@ and around its 5 x 5 neighbours on the same surface are explained by one amplitu
     flux = base + a scale (share + glow),   log-likelihood = sum n log(1 - exp(-flux)) - (K - n) flux
 
 with haze and ambient light as base. It is concave in a; Newton's steps come from below, since the slope is convex. Full
-pixels tell nothing, those beside them do. Where the amplitude is hardly more than its noise there may be no stripe, and
-where neighbours do not agree on it some are brighter, or in a shadow: the light of such stripes is not known, and they
-teach nothing.
+pixels tell nothing, those beside them do. Where the amplitude is hardly more than its noise, or neighbours do not agree
+on it, the light of a stripe is not known, and it teaches nothing.
 
 The fit (`add_equations`, `solve`). What is counted beside a stripe of s photons, at the distance d along the row, is
 
@@ -24,21 +23,19 @@ maps are asked whether there still is a halo, or one now.
 """
 
 import math
-from dataclasses import dataclass, replace
-from typing import Final
+from dataclasses import replace
+from typing import Final, NamedTuple
 
 import numba
 import numpy as np
-from numpy.typing import NDArray
 
-from rig.count.volume import CountVolume
+from rig.count.volume import Counts, CountVolume
+from rig.estimate.joint.place.light import FRACTIONS
 from rig.estimate.joint.place.places import BLIND_FLUX, REACH_PX, Places
 from rig.estimate.joint.place.pool import SAME_PX
-from rig.estimate.joint.place.score import FRACTIONS
 from rig.estimate.joint.tables import JointTables
 from rig.estimate.row.em import LATTICE_LINES, PIECES, lattice, lines_of
 from rig.estimate.row.inputs import (
-    Float32,
     Lines,
     RowState,
     Sweep,
@@ -53,43 +50,35 @@ from rig.estimate.row.model import BINS, HALO_NODES, HALO_REACHES_PX, RowModel, 
 from rig.estimate.search.online_learning import LearningSetting
 from rig.geometry.stripe_table import StripeTable
 from rig.geometry.windows import SweepGeometry
+from rig.simd import Bools, Float32, Float64, Int32
 from rig.threads import RowWorkers
 
 LEAST_FLUX: Final = 2e-3
 """Least flux of a pixel when its counts are weighted."""
 LINE_PX: Final = 4.5
 """Pixels so far from a stripe show nothing of the line itself."""
+_REACHES: Final = np.array(HALO_REACHES_PX)
 SETTLED: Final = 1e-6
 MOST_SWEEPS: Final = 3000
 
 
 @numba.njit(cache=True, nogil=True)
 def add_equations(
-    lines: Lines,
-    light: Float32,
-    sweep: Sweep,
-    state: RowState,
-    halo: Float32,
-    reaches: NDArray[np.float64],
-    nodes: int,
-    hot_flux: float,
-    first_line: int,
-    last_line: int,
-    matrix: NDArray[np.float64],
-    right: NDArray[np.float64],
-) -> None:
+    lines: Lines, light: Float32, sweep: Sweep, state: RowState, halo: Float32, hot_flux: float, first_line: int,
+    last_line: int, matrix: Float64, right: Float64,
+) -> None:  # fmt: skip
     """Add the normal equations of lines first_line..last_line-1, weighted as the present state expects counts.
 
     Unknown: haze in each profile bin; its share behind the stripe at each node; halo at each node and reach; ambient
     light that the state has too little of. halo: (BINS, pixels) of `halo_shares`; light: of each line's stripe at its
     x_px, photons. Only one half of the matrix is filled, rows from columns on.
     """
-    bins, number = state.profile.shape[0], len(reaches)
-    first_share, first_halo, last = bins, bins + nodes, matrix.shape[0] - 1
+    bins, number = state.profile.shape[0], len(_REACHES)
+    first_share, first_halo, last = bins, bins + HALO_NODES, matrix.shape[0] - 1
     terms = 3 + 2 * number
     index, value = np.empty(terms + 1, np.int64), np.empty(terms + 1)
     row, side = row_buffers(sweep.window, 1), 1 if sweep.near_is_left else -1
-    per_bin = (nodes - 1) / (bins - 1)
+    per_bin = (HALO_NODES - 1) / (bins - 1)
     for i in range(first_line, last_line):
         y, c = lines.row[i], lines.column[i]
         length, _, _, start = row_fluxes(sweep, state, row, y, c)
@@ -98,7 +87,7 @@ def add_equations(
         frames, s = np.float64(lines.exposures[i]), np.float64(light[i])
         place = side * (np.float64(lines.x_px[i]) - start)
         own = row.cell[min(max(int(np.rint(place)), 0), length - 1)]
-        low = min(int(own * per_bin), nodes - 2)
+        low = min(int(own * per_bin), HALO_NODES - 2)
         part = own * per_bin - low
         for t in range(length):
             away = abs(t - place)
@@ -115,14 +104,14 @@ def add_equations(
             if before:
                 index[0], value[0], used = cell, gain, 1
             else:
-                node = min(int(cell * per_bin), nodes - 2)
+                node = min(int(cell * per_bin), HALO_NODES - 2)
                 haze = gain * state.profile[cell, 0]
                 index[0], index[1] = first_share + node, first_share + node + 1
                 value[1] = haze * (cell * per_bin - node)
                 value[0] = haze - value[1]
                 used = 2
             for k in range(number):
-                there = s * np.exp(-away / reaches[k]) / (2 * reaches[k])
+                there = s * np.exp(-away / _REACHES[k]) / (2 * _REACHES[k])
                 index[used], index[used + 1] = first_halo + low * number + k, first_halo + (low + 1) * number + k
                 value[used], value[used + 1] = (1.0 - part) * there, part * there
                 used += 2
@@ -135,7 +124,7 @@ def add_equations(
 
 
 @numba.njit(cache=True, nogil=True)
-def solve(matrix: NDArray[np.float64], right: NDArray[np.float64], free: int) -> NDArray[np.float64]:
+def solve(matrix: Float64, right: Float64, free: int) -> Float64:
     """The x that minimises x' matrix x - 2 right' x, no number below 0 but number `free`; one number at a time."""
     x, slope = np.zeros_like(right), -right
     for _ in range(MOST_SWEEPS):
@@ -163,8 +152,7 @@ LEAST_SURE: Final = 4.0
 """Standard deviations of its noise that the light is more than."""
 DISAGREED: Final = 3.0
 """Standard deviations by which the stripes' misfit may exceed what chance brings. Of stripes that pass these limits
-less than 1 % are none (random scenes at five exposures); the trust of `rig.estimate.joint.lesson` alone lets 17 to 19 %
-of such through."""
+less than 1 % are none (random scenes at five exposures)."""
 MOST_STEPS: Final = 8
 MOST_GROWTH: Final = 4.0
 """By so much an amplitude may grow or shrink in a step."""
@@ -175,24 +163,12 @@ MOST_FLUX: Final = 20.0
 
 @numba.njit(cache=True, nogil=True, error_model="numpy")
 def likeliest_light(
-    counts: NDArray[np.unsignedinteger],
-    n_frames: NDArray[np.int32],
-    sweep: Sweep,
-    state: RowState,
-    shares: Float32,
-    x_px: Float32,
-    places: Places,
-    rows: NDArray[np.int32],
-    columns: NDArray[np.int32],
-    first_line: int,
-    last_line: int,
-    light: Float32,
-    known: NDArray[np.bool_],
-) -> None:
+    counts: Counts, n_frames: Int32, sweep: Sweep, state: RowState, shares: Float32, x_px: Float32, places: Places,
+    rows: Int32, columns: Int32, first_line: int, last_line: int, light: Float32, known: Bools,
+) -> None:  # fmt: skip
     """Fill light, photons per exposure, and known of stripes first_line..last_line-1 of those at (rows, columns).
 
-    counts: (columns, rows, window); shares: of `profile_table` in `rig.estimate.joint.place.place`; x_px: (rows,
-    columns), of all stripes.
+    counts: (columns, rows, window); shares: of `profile_table`; x_px: (rows, columns), of all stripes.
     """
     for i in range(first_line, last_line):
         y, c = rows[i], columns[i]
@@ -267,23 +243,17 @@ _SHARE, _HALO = BINS, BINS + HALO_NODES
 _SIZE = _HALO + HALO_NODES * len(HALO_REACHES_PX) + 1
 
 
-@dataclass(frozen=True, slots=True, eq=False)
-class BrightLines:
+class BrightLines(NamedTuple):
     """Lines with a clear stripe, which can teach of a halo, and the light of each stripe in photons."""
 
     lines: Lines
-    light: NDArray[np.float32]
+    light: Float32
 
 
 def bright_lines(
-    volume: CountVolume,
-    geometry: SweepGeometry,
-    tables: JointTables,
-    stripes: StripeTable,
-    places: Places,
-    workers: RowWorkers,
-    number: int = FIRST_LINES,
-) -> BrightLines:
+    volume: CountVolume, geometry: SweepGeometry, tables: JointTables, stripes: StripeTable, places: Places,
+    workers: RowWorkers, number: int = FIRST_LINES,
+) -> BrightLines:  # fmt: skip
     """Lines of a map whose light is known, out of about `number`.
 
     tables: those that the map was made with; places: of its stripes.
@@ -298,15 +268,9 @@ def bright_lines(
 
 
 def learn_first_halo(
-    volume: CountVolume,
-    geometry: SweepGeometry,
-    model: RowModel,
-    ambient: NDArray[np.float32],
-    tables: JointTables,
-    stripes: StripeTable,
-    places: Places,
-    workers: RowWorkers,
-) -> RowModel:
+    volume: CountVolume, geometry: SweepGeometry, model: RowModel, ambient: Float32, tables: JointTables,
+    stripes: StripeTable, places: Places, workers: RowWorkers,
+) -> RowModel:  # fmt: skip
     """The first map's model with the halo of `learn_halo`; to be called again with the map that is made under it.
 
     With several lines at once the model stays as it is: the other lines' haze would be taken for a halo.
@@ -332,13 +296,7 @@ def learn_next_halo(setting: LearningSetting, seen: BrightLines, workers: RowWor
 
 
 def learn_halo(
-    seen: BrightLines,
-    geometry: SweepGeometry,
-    model: RowModel,
-    ambient: NDArray[np.float32],
-    workers: RowWorkers,
-    *,
-    dark: bool,
+    seen: BrightLines, geometry: SweepGeometry, model: RowModel, ambient: Float32, workers: RowWorkers, *, dark: bool
 ) -> RowModel:
     """The model with the halo that these stripes have, and the haze under it; without a halo where they have none.
 
@@ -374,10 +332,9 @@ def learn_halo(
 
 def _equations(
     seen: BrightLines, geometry: SweepGeometry, model: RowModel, workers: RowWorkers
-) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+) -> tuple[Float64, Float64]:
     sweep, state = sweep_of(geometry), state_of(model)
-    shares, reaches = halo_shares(model, geometry.width), np.array(HALO_REACHES_PX)
-    hot_flux = 5.0 * float(np.median(model.ambient)) + 1e-3
+    shares, hot_flux = halo_shares(model, geometry.width), model.hot_flux()
     # Fixed pieces, added in order: the sums do not depend on the number of threads.
     edges = np.linspace(0, len(seen.light), PIECES + 1).astype(int)
     matrices, rights = np.zeros((PIECES, _SIZE, _SIZE)), np.zeros((PIECES, _SIZE))
@@ -385,7 +342,7 @@ def _equations(
     def work(first: int, last: int) -> None:
         for i in range(first, last):
             add_equations(
-                seen.lines, seen.light, sweep, state, shares, reaches, HALO_NODES, hot_flux, edges[i], edges[i + 1],
+                seen.lines, seen.light, sweep, state, shares, hot_flux, edges[i], edges[i + 1],
                 matrices[i], rights[i],
             )  # fmt: skip
 
@@ -394,7 +351,7 @@ def _equations(
     return half + np.tril(half, -1).T, rights.sum(axis=0)
 
 
-def _smoothness() -> NDArray[np.float64]:
+def _smoothness() -> Float64:
     out = np.zeros((_SIZE, _SIZE))
 
     def add(places: list[int], taps: list[float], strength: float) -> None:
@@ -411,5 +368,5 @@ def _smoothness() -> NDArray[np.float64]:
     return out
 
 
-def _misfit(matrix: NDArray[np.float64], right: NDArray[np.float64], x: NDArray[np.float64]) -> float:
+def _misfit(matrix: Float64, right: Float64, x: Float64) -> float:
     return float(x @ matrix @ x - 2 * right @ x)

@@ -13,15 +13,13 @@ second line (`rig.estimate.joint.second_returns`). The model of light and medium
 from dataclasses import replace
 
 import numpy as np
-from numpy.typing import NDArray
 
 from rig.count.volume import Counter, CountVolume, SweepCounter, SweepLayout
 from rig.estimate.joint.confidence import pairs_to_ask, stripe_table
 from rig.estimate.joint.halo import bright_lines, learn_first_halo, learn_next_halo
-from rig.estimate.joint.labels.costs import BAND_ROWS
-from rig.estimate.joint.labels.grid import LabelGrid
+from rig.estimate.joint.labels.grid import BAND_ROWS, LabelGrid
 from rig.estimate.joint.lesson import add_quiet, fill_trust, read_positions
-from rig.estimate.joint.paths import CHUNK, Penalties, along_columns, along_rows
+from rig.estimate.joint.paths import CHUNK, along_columns, along_rows
 from rig.estimate.joint.place.place import amplitudes_of, line_width, place, weigh_light
 from rig.estimate.joint.second_returns import second_returns
 from rig.estimate.joint.tables import JointTables, Memory, grid_of, memory_for, tables_of
@@ -35,6 +33,7 @@ from rig.estimate.row.model import RowModel
 from rig.estimate.search.online_learning import LearningSetting, OnlineLearner, Seen, first_model
 from rig.geometry.stripe_table import StripeTable
 from rig.geometry.windows import SweepGeometry
+from rig.simd import Float64
 from rig.simd.memory import pointers
 from rig.threads import RowWorkers
 
@@ -89,8 +88,12 @@ class Joint:
         tables = self._lessons.tables(setting, self._workers)
         self._prior.begin(geometry, tables.grid)
         self.used = model if self._prior.before is None else replace(model, before=self._prior.before)
-        stripes = self._with_seconds(sweep, tables, self._stripes(sweep, tables))
-        self._prior.leave(stripes, tables.grid, self._workers)
+        first, room = self._stripes(sweep, tables), self._room(tables.grid).seconds
+        x2_px, confidence2 = second_returns(
+            sweep, tables.grid, tables.sweep, tables.light, first.x_px, room, self._workers
+        )
+        stripes = replace(first, x2_px=x2_px, confidence2=confidence2)
+        self._prior.leave(stripes, tables.grid)
         # Whether the first map has taught anything is for the trust of its lessons to say.
         known = self._lessons.model is not None
         judged = stripes if known else self._teaching(sweep, tables, stripes)
@@ -138,7 +141,7 @@ class Joint:
         grid, workers = tables.grid, self._workers
         rows, columns = grid.x_far.shape
         memory = self._room(grid)
-        settings, penalties = answer_settings(grid.stripes), Penalties()
+        settings = answer_settings(grid.stripes)
 
         def tie_rows(first: int, last: int) -> None:
             # Rows that share tables: those are fetched once, and costs are tied along rows while the cache has them.
@@ -147,15 +150,13 @@ class Joint:
                 end = min(band + BAND_ROWS, last)
                 tables.costs.fill(volume, band, end, room, memory.cost)
                 self._prior.add(volume, band, end, memory.cost)
-                along_rows(memory.cost, memory.message, penalties, band, end)
+                along_rows(memory.cost, memory.message, band, end)
 
         def tie_columns(first: int, last: int) -> None:
             desk = new_readout(settings, memory.answer, CHUNK, grid.labels)
-            along_columns(memory.cost, memory.message, penalties, first, last, pointers(desk))
+            along_columns(memory.cost, memory.message, first, last, pointers(desk))
 
-        x_px = np.empty((rows, columns), np.float32)
-
-        neighbours = grid.column_px <= NEIGHBOURS_PX
+        x_px, neighbours = np.empty((rows, columns), np.float32), grid.column_px <= NEIGHBOURS_PX
 
         def read(first: int, last: int) -> None:
             if neighbours:
@@ -177,13 +178,6 @@ class Joint:
         pairs = tables.pairs if lit.all() else pairs_to_ask(np.isfinite(grid.x_far) & lit)
         return stripe_table(x_px, sd, volume.n_frames, memory.answer, memory.places, pairs, tables.bright, workers)
 
-    def _with_seconds(self, volume: CountVolume, tables: JointTables, stripes: StripeTable) -> StripeTable:
-        room = self._room(tables.grid).seconds
-        x2_px, confidence2 = second_returns(
-            volume, tables.grid, tables.sweep, tables.light, stripes.x_px, room, self._workers
-        )
-        return replace(stripes, x2_px=x2_px, confidence2=confidence2)
-
     def _room(self, grid: LabelGrid) -> Memory:
         memory = self._memory
         if memory is None or not memory.fits(grid):
@@ -199,7 +193,7 @@ class Joint:
 
     def _quiet(
         self, volume: CountVolume, geometry: SweepGeometry, tables: JointTables, stripes: StripeTable
-    ) -> NDArray[np.float64]:
+    ) -> Float64:
         quiet = np.zeros((2, geometry.rows, geometry.width))
         most_light = float(np.median(tables.state.ambient))
 

@@ -19,14 +19,14 @@ from typing import Final
 
 import numba
 import numpy as np
-from numpy.typing import NDArray
 
+from rig.count.volume import Counts
 from rig.estimate.joint.labels.grid import PER_PX
 from rig.estimate.joint.place.places import LIGHT_PX, Places, most_shown
 from rig.estimate.joint.winner import UNITS, LabelAnswers
-from rig.estimate.row.inputs import RowState, Sweep, fluxes_at, line_light, with_rays
-
-Float32 = NDArray[np.float32]
+from rig.estimate.row.inputs import RowState, Sweep, fluxes_at, line_light
+from rig.geometry.kernels import with_rays
+from rig.simd import Float32, Float64, Int32, Uint8
 
 SURFACE_PX: Final = 3.0
 A: Final = 1.25
@@ -41,16 +41,9 @@ LEAST_Z: Final = 0.05
 
 @numba.njit(cache=True, nogil=True, error_model="numpy")
 def fill_trust(
-    x_px: Float32,
-    sd_px: Float32,
-    n_frames: NDArray[np.int32],
-    margin: NDArray[np.uint8],
-    places: Places,
-    ambient: float,
-    first_row: int,
-    last_row: int,
-    trust: Float32,
-) -> None:
+    x_px: Float32, sd_px: Float32, n_frames: Int32, margin: Uint8, places: Places, ambient: float, first_row: int,
+    last_row: int, trust: Float32,
+) -> None:  # fmt: skip
     """Fill trust, 0 to 1, of rows first_row..last_row-1; arrays (rows, columns), 0 where x_px is NaN."""
     amplitudes, scales, hazes = places.amplitude, places.scale, places.haze
     for y in range(first_row, last_row):
@@ -76,16 +69,9 @@ QUIET: Final = 0.9
 
 @numba.njit(cache=True, nogil=True)
 def read_positions(
-    x_far: NDArray[np.float64],
-    n_frames: NDArray[np.int32],
-    side: int,
-    width: int,
-    answer: LabelAnswers,
-    first_row: int,
-    last_row: int,
-    x_px: NDArray[np.float32],
-    distance: NDArray[np.float32],
-) -> None:
+    x_far: Float64, n_frames: Int32, side: int, width: int, answer: LabelAnswers, first_row: int, last_row: int,
+    x_px: Float32, distance: Float32,
+) -> None:  # fmt: skip
     """x_px (rows, columns) of the answers' labels, and its distance from x_far; NaN where there are no data.
 
     An answer in the outer half of the first or last of `width` pixels loses its margin in `answer`: beyond it a stripe
@@ -103,20 +89,9 @@ def read_positions(
 
 @numba.njit(cache=True, nogil=True)
 def add_quiet(
-    counts: NDArray[np.unsignedinteger],
-    n_frames: NDArray[np.int32],
-    sweep: Sweep,
-    state: RowState,
-    halo: NDArray[np.float32],
-    x_px: NDArray[np.float32],
-    signal: NDArray[np.float32],
-    confidence: NDArray[np.float32],
-    column_step: int,
-    most_light: float,
-    first_row: int,
-    last_row: int,
-    quiet: NDArray[np.float64],
-) -> None:
+    counts: Counts, n_frames: Int32, sweep: Sweep, state: RowState, halo: Float32, x_px: Float32, signal: Float32,
+    confidence: Float32, column_step: int, most_light: float, first_row: int, last_row: int, quiet: Float64,
+) -> None:  # fmt: skip
     """Add to quiet (2, rows, width) the ones and exposures of pixels behind clear stripes, of some columns.
 
     Pixels without a ray are left out. halo: (BINS, pixels) of `halo_shares`, without pixels where there is none. With a

@@ -14,19 +14,13 @@ Labels stay in order in memory and neighbours are unaligned loads from the first
 gains nothing. Several paths are under way at once, because each step of a path waits for the one before.
 """
 
-from typing import Final, NamedTuple
+from typing import Final
 
 import numba
 import numpy as np
-from numpy.typing import NDArray
 
-from rig.estimate.joint.winner import (
-    LARGEST,
-    VECTOR,
-    Readout,
-    answer_columns,
-    fetch_answers,
-)
+from rig.estimate.joint.winner import LARGEST, VECTOR, Readout, answer_columns, fetch_answers
+from rig.simd import Uint8
 from rig.simd.memory import address_of, load_bytes, prefetch, read_byte, store_bytes, write_byte
 from rig.simd.vectors import add_saturated_unsigned, smaller_unsigned, smallest_byte, sub_saturated_unsigned, zero_bytes
 
@@ -40,21 +34,16 @@ _AHEAD: Final = 3
 _SET, _ADD, _TOTAL = 0, 1, 2
 
 
-class Penalties(NamedTuple):
-    """Costs of a change of label between neighbours, in units: of a step of 1, 2 or 3 labels, or of any other.
-
-    Units of `rig.estimate.joint.labels.costs`, 8 / (1 + K / 8) to a nat of K exposures: counted in nats a change costs
-    more the more exposures there are.
-    """
-
-    one: int = 16
-    two: int = 24
-    three: int = 30
-    jump: int = 40
+ONE: Final = 16
+TWO: Final = 24
+THREE: Final = 30
+JUMP: Final = 40
+"""Costs of a change of label between neighbours, of 1, 2 or 3 labels, or of any other, in units of
+`rig.estimate.joint.labels.costs`: counted in nats a change costs more the more exposures there are."""
 
 
 @numba.njit(cache=True, nogil=True)
-def _path_memory(paths: int, labels: int) -> NDArray[np.uint8]:
+def _path_memory(paths: int, labels: int) -> Uint8:
     """Memory for L of the last pixel and of this one on so many paths; must live as long as the paths."""
     return np.full(2 * paths * (labels + 2 * _SIDE) + _SIDE, LARGEST, np.uint8)
 
@@ -76,22 +65,14 @@ def _begin(path, paths, labels):  # type: ignore[no-untyped-def]
 
 
 @numba.njit(forceinline=True)
-def _vectors(penalties):  # type: ignore[no-untyped-def]
-    """Each penalty as a vector."""
-    none = zero_bytes()
-    return none + penalties.one, none + penalties.two, none + penalties.three, none + penalties.jump
-
-
-@numba.njit(forceinline=True)
-def _step(before, after, cost, message, total, hidden, labels, ahead, penalties, use):  # type: ignore[no-untyped-def]
+def _step(before, after, cost, message, total, hidden, labels, ahead, use):  # type: ignore[no-untyped-def]
     """One step of a path: from L of its last pixel, at `before`, to L of this one, at `after`; all of these addresses.
 
     use: whether the message is written to `message`, added to it, or all of them and the cost make up `total`, without
     the labels that are `hidden`. ahead: bytes to the cost and message that are to be fetched into the cache; 0: none.
     """
-    one, two, three, jump = penalties
     least = zero_bytes() + read_byte(before, _LEAST_AT)
-    most = add_saturated_unsigned(least, jump)
+    most = add_saturated_unsigned(least, JUMP)
     next_least = zero_bytes() + LARGEST
     for v in range(0, labels, VECTOR):
         if ahead != 0 and v & VECTOR == 0:
@@ -101,9 +82,9 @@ def _step(before, after, cost, message, total, hidden, labels, ahead, penalties,
         by_one = smaller_unsigned(load_bytes(before, v - 1), load_bytes(before, v + 1))
         by_two = smaller_unsigned(load_bytes(before, v - 2), load_bytes(before, v + 2))
         by_three = smaller_unsigned(load_bytes(before, v - 3), load_bytes(before, v + 3))
-        by_one = add_saturated_unsigned(by_one, one)
-        by_two = add_saturated_unsigned(by_two, two)
-        by_three = add_saturated_unsigned(by_three, three)
+        by_one = add_saturated_unsigned(by_one, ONE)
+        by_two = add_saturated_unsigned(by_two, TWO)
+        by_three = add_saturated_unsigned(by_three, THREE)
         best = smaller_unsigned(smaller_unsigned(by_one, by_two), smaller_unsigned(by_three, load_bytes(before, v)))
         # L is as it is, not less its least: what is subtracted at the end need not be waited for before.
         sent = sub_saturated_unsigned(smaller_unsigned(best, most), least)
@@ -121,35 +102,33 @@ def _step(before, after, cost, message, total, hidden, labels, ahead, penalties,
 
 
 @numba.njit(forceinline=True)
-def _both_ways(cost, message, paths, columns, labels, first, last, penalties, use):  # type: ignore[no-untyped-def]
+def _both_ways(cost, message, paths, columns, labels, first, last, use):  # type: ignore[no-untyped-def]
     """Steps first..last-1 from both ends of a row; cost, message, paths: addresses."""
     size = labels + 2 * _SIDE
     to_right, to_left = first * labels, (columns - 1 - first) * labels
     before, after = paths + 2 * size * (first & 1), paths + 2 * size * (1 - (first & 1))
     for _ in range(first, last):
-        _step(before, after, cost + to_right, message + to_right, 0, 0, labels, 0, penalties, use)
-        _step(before + size, after + size, cost + to_left, message + to_left, 0, 0, labels, 0, penalties, use)
+        _step(before, after, cost + to_right, message + to_right, 0, 0, labels, 0, use)
+        _step(before + size, after + size, cost + to_left, message + to_left, 0, 0, labels, 0, use)
         to_right += labels
         to_left -= labels
         before, after = after, before
 
 
 @numba.njit(cache=True, nogil=True)
-def _along_row(cost: int, message: int, columns: int, labels: int, penalties: Penalties, paths: int) -> None:
+def _along_row(cost: int, message: int, columns: int, labels: int, paths: int) -> None:
     """Messages of both ways along one row; all but numbers addresses."""
     _begin(paths, 2, labels)
-    vectors, half = _vectors(penalties), columns // 2
+    half = columns // 2
     # From both ends at once, two paths that do not wait for each other: to the middle there is nothing to add to.
-    _both_ways(cost, message, paths, columns, labels, 0, half, vectors, _SET)
+    _both_ways(cost, message, paths, columns, labels, 0, half, _SET)
     for v in range(half * labels, (columns - half) * labels, VECTOR):
         store_bytes(message, v, zero_bytes())
-    _both_ways(cost, message, paths, columns, labels, half, columns, vectors, _ADD)
+    _both_ways(cost, message, paths, columns, labels, half, columns, _ADD)
 
 
 @numba.njit(cache=True, nogil=True)
-def along_rows(
-    cost: NDArray[np.uint8], message: NDArray[np.uint8], penalties: Penalties, first_row: int, last_row: int
-) -> None:
+def along_rows(cost: Uint8, message: Uint8, first_row: int, last_row: int) -> None:
     """Sums of the messages from the left and from the right, for rows first_row..last_row-1.
 
     cost, message: (rows, columns, labels), C-contiguous; labels: a multiple of VECTOR.
@@ -158,52 +137,46 @@ def along_rows(
     memory = _path_memory(2, labels)
     for row in range(first_row, last_row):
         at = row * columns * labels
-        _along_row(address_of(cost) + at, address_of(message) + at, columns, labels, penalties, _paths_in(memory))
+        _along_row(address_of(cost) + at, address_of(message) + at, columns, labels, _paths_in(memory))
     memory[:1] = 0  # kept alive up to here: only the address is used above
 
 
 @numba.njit(cache=True, nogil=True)
-def _step_down(
-    before: int, after: int, cost: int, message: int, labels: int, columns: int, ahead: int, penalties: Penalties
-) -> None:
+def _step_down(before: int, after: int, cost: int, message: int, labels: int, columns: int, ahead: int) -> None:
     """Step some columns of a row on their way down; all but numbers are addresses."""
     # Apart from what surrounds it: all that the loop needs finds room in the registers.
-    vectors = _vectors(penalties)
     for _ in range(columns):
-        _step(before, after, cost, message, 0, 0, labels, ahead, vectors, _ADD)
+        _step(before, after, cost, message, 0, 0, labels, ahead, _ADD)
         before, after = before + labels + 2 * _SIDE, after + labels + 2 * _SIDE
         cost, message = cost + labels, message + labels
 
 
 @numba.njit(cache=True, nogil=True)
 def _step_up(
-    before: int, after: int, cost: int, message: int, labels: int, columns: int, ahead: int, penalties: Penalties,
+    before: int, after: int, cost: int, message: int, labels: int, columns: int, ahead: int,
     total: int, total_bytes: int, hidden: int,
 ) -> None:  # fmt: skip
     """Step some columns of a row on their way up and write their totals, total_bytes from column to column."""
-    vectors = _vectors(penalties)
     for _ in range(columns):
-        _step(before, after, cost, message, total, hidden, labels, ahead, vectors, _TOTAL)
+        _step(before, after, cost, message, total, hidden, labels, ahead, _TOTAL)
         before, after = before + labels + 2 * _SIDE, after + labels + 2 * _SIDE
         cost, message, total = cost + labels, message + labels, total + total_bytes
 
 
 @numba.njit(cache=True, nogil=True)
-def _go_down(
-    cost: int, message: int, rows: int, row_bytes: int, labels: int, columns: int, penalties: Penalties, paths: int
-) -> None:
+def _go_down(cost: int, message: int, rows: int, row_bytes: int, labels: int, columns: int, paths: int) -> None:
     """Add the messages from above to those of some columns; cost, message, paths: addresses."""
     before, after = paths, paths + CHUNK * (labels + 2 * _SIDE)
     _begin(paths, CHUNK, labels)
     for _ in range(rows):
-        _step_down(before, after, cost, message, labels, columns, _AHEAD * row_bytes, penalties)
+        _step_down(before, after, cost, message, labels, columns, _AHEAD * row_bytes)
         before, after = after, before
         cost, message = cost + row_bytes, message + row_bytes
 
 
 @numba.njit(cache=True, nogil=True)
 def _go_up(
-    cost: int, message: int, rows: int, row_bytes: int, columns: int, penalties: Penalties, paths: int, pixel: int,
+    cost: int, message: int, rows: int, row_bytes: int, columns: int, paths: int, pixel: int,
     desk: Readout,
 ) -> None:  # fmt: skip
     """Totals of some columns and their answers, from the last row on; pixel: place of the first among the answers."""
@@ -214,21 +187,14 @@ def _go_up(
     for row in range(rows - 1, -1, -1):
         costs, messages, here = cost + row * row_bytes, message + row * row_bytes, pixel + row * width
         fetch_answers(here - _AHEAD * width, columns, desk)
-        _step_up(before, after, costs, messages, labels, columns, -_AHEAD * row_bytes, penalties, desk.totals,
+        _step_up(before, after, costs, messages, labels, columns, -_AHEAD * row_bytes, desk.totals,
                  desk.size, desk.hidden)  # fmt: skip
         answer_columns(here, columns, desk)
         before, after = after, before
 
 
 @numba.njit(cache=True, nogil=True)
-def along_columns(
-    cost: NDArray[np.uint8],
-    message: NDArray[np.uint8],
-    penalties: Penalties,
-    first_column: int,
-    last_column: int,
-    desk: Readout,
-) -> None:
+def along_columns(cost: Uint8, message: Uint8, first_column: int, last_column: int, desk: Readout) -> None:
     """Answer columns first_column..last_column-1, from what `along_rows` left in all rows of message.
 
     Adds the messages from above to message. desk: pointers to the `Readout` of CHUNK columns.
@@ -239,6 +205,6 @@ def along_columns(
     for column in range(first_column, last_column, CHUNK):
         count, at = min(CHUNK, last_column - column), column * labels
         costs, messages = address_of(cost) + at, address_of(message) + at
-        _go_down(costs, messages, rows, row_bytes, labels, count, penalties, paths)
-        _go_up(costs, messages, rows, row_bytes, count, penalties, paths, column, desk)
+        _go_down(costs, messages, rows, row_bytes, labels, count, paths)
+        _go_up(costs, messages, rows, row_bytes, count, paths, column, desk)
     memory[:1] = 0  # kept alive up to here: only the address is used above

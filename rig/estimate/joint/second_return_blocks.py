@@ -16,8 +16,11 @@ import numba
 import numpy as np
 from numpy.typing import NDArray
 
-from rig.estimate.row.inputs import RowState, Sweep, flux_between, line_light, others_at, profile_place, with_rays
+from rig.count.volume import Counts
+from rig.estimate.row.inputs import RowState, Sweep, flux_between, line_light, others_at, profile_place
 from rig.estimate.row.likelihood import FLUX_MAX
+from rig.geometry.kernels import with_rays
+from rig.simd import Float32, Float64, Int16, Int32
 from rig.simd.memory import (
     CACHE_LINE,
     address_of,
@@ -62,7 +65,7 @@ class LineTable(NamedTuple):
 
 
 @numba.njit(cache=True, nogil=True)
-def line_places(sweep: Sweep, x_far: NDArray[np.float64], side: int, pixels: int) -> NDArray[np.int16]:
+def line_places(sweep: Sweep, x_far: Float64, side: int, pixels: int) -> Int16:
     """Places of the lines of all rows and columns, int16 (rows, columns, PLACES); made once per model.
 
     PLACE_X: x of pixel 0 of distance, the leftmost of `pixels`, NOWHERE where nothing is searched; PLACE_BEGIN,
@@ -133,8 +136,6 @@ def sum_lines(
         store_float32(to_expected, v, expected)
 
 
-Float32 = NDArray[np.float32]
-
 HAZE_BLOCKS: Final = 4
 """Blocks above one another that haze is worked out for at once: it changes slowly from row to row."""
 HAZE_STEP: Final = 8
@@ -153,8 +154,7 @@ class Blocks(NamedTuple):
 
 
 class _Map(NamedTuple):
-    """Addresses of the arrays that lines are looked up in: each use of an array itself in the loop would count
-    references to its whole tuple.
+    """Addresses of the arrays that lines are looked up in.
 
     x_px, place, x0, n_frames, counts: first elements; still: pixel 0 of the first row.
     """
@@ -175,19 +175,9 @@ class _Map(NamedTuple):
 
 @numba.njit(cache=True, nogil=True, error_model="numpy")
 def sum_blocks(
-    counts: NDArray[np.unsignedinteger],
-    n_frames: NDArray[np.int32],
-    sweep: Sweep,
-    state: RowState,
-    still: Float32,
-    place: NDArray[np.int16],
-    side: int,
-    apart: float,
-    x_px: Float32,
-    first_block: int,
-    last_block: int,
-    out: Blocks,
-) -> None:
+    counts: Counts, n_frames: Int32, sweep: Sweep, state: RowState, still: Float32, place: Int16, side: int,
+    apart: float, x_px: Float32, first_block: int, last_block: int, out: Blocks,
+) -> None:  # fmt: skip
     """Fill the sums of rows of blocks first_block..last_block-1, without what lies within `apart` px of stripes x_px.
 
     Haze is that in the middle of HAZE_BLOCKS blocks, or of the block where there is nothing to search there. state,
@@ -233,9 +223,7 @@ def sum_blocks(
 
 @numba.njit(forceinline=True)
 def _ask_for_block(seen: _Map, by: int, before: int) -> None:
-    """Prefetch the counts of the block after `before`, and the places and stripes of the fourth: counts of one column
-    after the other are not what a processor foresees, nor are places and stripes of four rows at once.
-    """
+    """Prefetch the counts of the block after `before`, and the places and stripes of the fourth: none is foreseen."""
     row_bytes, top = seen.window * seen.count_bytes, by * BLOCK
     for y in range(top, min(top + BLOCK, seen.rows)):
         there = y * seen.columns + (before + 4) * BLOCK
@@ -289,17 +277,12 @@ def _list_lines(
 
 @numba.njit(cache=True, nogil=True)
 def _copy_lines(
-    counts: NDArray[np.unsignedinteger],
-    still: Float32,
-    place: NDArray[np.int16],
-    x0: NDArray[np.int32],
-    width: int,
-    number: int,
-    lines: NDArray[np.int64],
+    counts: Counts, still: Float32, place: Int16, x0: Int32, width: int, number: int, lines: NDArray[np.int64],
     spare: Float32,
-) -> None:
-    """Copy what lines show to `spare`, counts as float32, and have them point there: at the ends of an array, and of
-    counts that are no bytes, vectors cannot be read where they are.
+) -> None:  # fmt: skip
+    """Copy what lines show to `spare`, counts as float32, and have them point there.
+
+    At the ends of an array, and of counts that are no bytes, vectors cannot be read where they are.
     """
     columns = place.shape[1]
     for i in range(number):

@@ -1,11 +1,10 @@
 """Second returns: a second line of light beside the stripe, from a pane before a wall, a twig, a flake of snow.
 
-In haze a row cannot answer with both surfaces: the light behind the nearer one excludes that the haze ends there, so
-that the best rival of an answer is hardly ever the second surface. So its light is looked for in the counts. It stands
-off the haze by too little for a row alone; light is summed over blocks of rows and columns first
-(`rig.estimate.joint.second_return_blocks`) and compared with what haze and ambient light bring, pixel by pixel of
-distance from the far end. Then each row is asked itself, with its neighbours. In standard deviations of the light that
-a candidate shows over its own neighbourhood (own) and its block's (block), the probability that it is right is
+In haze a row cannot answer with both surfaces: the light behind the nearer one excludes that the haze ends there. So
+its light is looked for in the counts. It stands off the haze by too little for a row alone; light is summed over blocks
+of rows and columns first (`rig.estimate.joint.second_return_blocks`) and compared with what haze and ambient light
+bring, pixel by pixel of distance from the far end. Then each row is asked itself, with its neighbours. In standard
+deviations of the light that a candidate shows over its own neighbourhood (own) and its block's (block), it is right by
 
     logit confidence2 = LOG_ODDS . (1, own, block)
 
@@ -18,19 +17,18 @@ from typing import Final, NamedTuple
 
 import numba
 import numpy as np
-from numpy.typing import NDArray
 
-from rig.count.volume import CountVolume
+from rig.count.volume import Counts, CountVolume
 from rig.estimate.joint.labels.costs import hot_in_bands
 from rig.estimate.joint.labels.grid import PER_PX, LabelGrid
 from rig.estimate.joint.place.pool import pool_row, with_margin
 from rig.estimate.joint.second_return_blocks import BLOCK, HAZE_STEP, LEFT_OUT, Blocks, line_places, sum_blocks
-from rig.estimate.row.inputs import RowState, Sweep, fluxes_at, line_light, with_rays
+from rig.estimate.row.inputs import RowState, Sweep, fluxes_at, line_light
+from rig.geometry.kernels import with_rays
+from rig.simd import Float32, Float64, Int16, Int32
 from rig.simd.memory import address_of, aligned_zeros, load_float32, store_float32
 from rig.simd.vectors import LANES, larger_float, largest_float, square_root, zero_float32
 from rig.threads import RowWorkers, Work
-
-Float32 = NDArray[np.float32]
 
 RING_PX: Final = 4
 """Pixels to either side of where light is looked for that tell whether haze is as strong as was learned."""
@@ -45,9 +43,7 @@ CANDIDATE: Final = np.float32(4.0)
 REACH: Final = 3
 """Rows and columns to either side that light is pooled over in the end."""
 LOG_ODDS: Final = -16.0, 0.4, 3.0
-"""Log odds that a candidate is right are these times 1, and the standard deviations of its own light and its block's.
-
-Fitted to maps with a pane over a third of them and to maps without any, and rounded."""
+"""Log odds that a candidate is right are these times 1 and the standard deviations of its light and its block's."""
 _AROUND: Final = -(-(RING_PX + GAP_PX + 6) // LANES) * LANES
 """Room beside the pixels of distance: whatever the line's reach, up to 6 px."""
 
@@ -68,7 +64,7 @@ class Seconds(NamedTuple):
     """Candidates of second returns, float32 (rows, columns) each.
 
     distance: from the far end in px, NaN where there is no candidate; ones, expected: within the line's reach of it;
-    light, moment: ones above those expected, and that times the distance in px.
+    light, moment: ones above those expected, and that times the distance in px; moved: see `move_seconds`.
     """
 
     distance: Float32
@@ -76,6 +72,7 @@ class Seconds(NamedTuple):
     expected: Float32
     light: Float32
     moment: Float32
+    moved: Float32
 
 
 @numba.njit(cache=True, nogil=True, error_model="numpy")
@@ -148,31 +145,11 @@ def _stands_out(sums: Float32, i: int, reach: int) -> tuple[float, float]:
     return (n - e * more) / np.sqrt(e * more + 1.0), more
 
 
-@numba.njit(cache=True, nogil=True)
-def begin_seconds(candidates: Candidates, first_row: int, last_row: int, out: Seconds) -> None:
-    """Give each of rows first_row..last_row-1 the distances of its blocks' candidates."""
-    for y in range(first_row, last_row):
-        for c in range(out.distance.shape[1]):
-            out.distance[y, c] = candidates.distance[y // BLOCK, c // BLOCK]
-
-
 @numba.njit(cache=True, nogil=True, error_model="numpy")
 def measure_seconds(
-    counts: NDArray[np.unsignedinteger],
-    n_frames: NDArray[np.int32],
-    sweep: Sweep,
-    state: RowState,
-    still: Float32,
-    x_far: NDArray[np.float64],
-    side: int,
-    apart: float,
-    reach: int,
-    x_px: Float32,
-    haze: Float32,
-    first_row: int,
-    last_row: int,
-    out: Seconds,
-) -> None:
+    counts: Counts, n_frames: Int32, sweep: Sweep, state: RowState, still: Float32, x_far: Float64, side: int,
+    apart: float, reach: int, x_px: Float32, haze: Float32, first_row: int, last_row: int, out: Seconds,
+) -> None:  # fmt: skip
     """Fill all but distance of candidates of rows first_row..last_row-1; zeros near a stripe and where none is asked.
 
     state, still: see `SecondLight`; haze: of `Candidates`.
@@ -210,8 +187,9 @@ def measure_seconds(
 
 
 @numba.njit(cache=True, nogil=True, error_model="numpy")
-def move_seconds(reach: int, first_row: int, last_row: int, seconds: Seconds, moved: Float32) -> None:
-    """Distance of each candidate, moved to the middle of the light around it, pooled over neighbours."""
+def move_seconds(reach: int, first_row: int, last_row: int, seconds: Seconds) -> None:
+    """Fill moved: distance of each candidate, moved to the middle of the light around it, pooled over neighbours."""
+    moved = seconds.moved
     distance = with_margin(seconds.distance, first_row, last_row)
     moment, light = with_margin(seconds.moment, first_row, last_row), with_margin(seconds.light, first_row, last_row)
     sums = np.empty((2, distance.shape[1] - 2 * LANES), np.float32)
@@ -227,15 +205,9 @@ def move_seconds(reach: int, first_row: int, last_row: int, seconds: Seconds, mo
 
 @numba.njit(cache=True, nogil=True, error_model="numpy")
 def judge_seconds(
-    x_far: NDArray[np.float64],
-    x_px: Float32,
-    sure: Float32,
-    first_row: int,
-    last_row: int,
-    seconds: Seconds,
-    x2_px: Float32,
+    x_far: Float64, x_px: Float32, sure: Float32, first_row: int, last_row: int, seconds: Seconds, x2_px: Float32,
     confidence2: Float32,
-) -> None:
+) -> None:  # fmt: skip
     """Fill x2_px and confidence2 of rows first_row..last_row-1; NaN and 0 where nothing stands out.
 
     A candidate's light, pooled over neighbours, stands out by the signed root of twice the gain in log-likelihood of
@@ -274,8 +246,8 @@ class SecondLight(NamedTuple):
     """
 
     state: RowState
-    still: NDArray[np.float32]
-    place: NDArray[np.int16]
+    still: Float32
+    place: Int16
     apart: float
     reach: int
 
@@ -286,15 +258,10 @@ def second_light(state: RowState, line_sigma_px: float, grid: LabelGrid, sweep: 
     return SecondLight(
         state._replace(ambient=np.zeros_like(state.ambient)),
         np.pad(still.ravel(), LANES),
-        line_places(sweep, grid.x_far, grid.side, distance_pixels(grid)),
+        line_places(sweep, grid.x_far, grid.side, grid.labels // PER_PX),
         APART_PX + LINE_SIGMAS * line_sigma_px,
         max(int(np.rint(LIGHT_SIGMAS * line_sigma_px)), 1),
     )
-
-
-def distance_pixels(grid: LabelGrid) -> int:
-    """Pixels of distance that sums are made of, a multiple of LANES."""
-    return grid.labels // PER_PX
 
 
 class SecondRoom(NamedTuple):
@@ -303,7 +270,6 @@ class SecondRoom(NamedTuple):
     blocks: Blocks
     candidates: Candidates
     seconds: Seconds
-    moved: NDArray[np.float32]
 
 
 def second_room(grid: LabelGrid) -> SecondRoom:
@@ -311,25 +277,19 @@ def second_room(grid: LabelGrid) -> SecondRoom:
     rows, columns = grid.x_far.shape
     shape = -(-rows // BLOCK), -(-columns // BLOCK)
     return SecondRoom(
-        Blocks(*(aligned_zeros((*shape, distance_pixels(grid)), np.float32) for _ in Blocks._fields)),
+        Blocks(*(aligned_zeros((*shape, grid.labels // PER_PX), np.float32) for _ in Blocks._fields)),
         Candidates(*(np.empty(shape, np.float32) for _ in Candidates._fields)),
         Seconds(*(np.empty((rows, columns), np.float32) for _ in Seconds._fields)),
-        np.empty((rows, columns), np.float32),
     )
 
 
 def second_returns(
-    volume: CountVolume,
-    grid: LabelGrid,
-    sweep: Sweep,
-    light: SecondLight,
-    x_px: NDArray[np.float32],
-    room: SecondRoom,
+    volume: CountVolume, grid: LabelGrid, sweep: Sweep, light: SecondLight, x_px: Float32, room: SecondRoom,
     workers: RowWorkers,
-) -> tuple[NDArray[np.float32], NDArray[np.float32]]:
+) -> tuple[Float32, Float32]:  # fmt: skip
     """x2_px and confidence2 (rows, columns) beside stripes at x_px: NaN and 0 where nothing stands out."""
     rows, columns = x_px.shape
-    blocks, candidates, seconds, moved = room
+    blocks, candidates, seconds = room
     # Read by address: another kind of number would be read as nonsense.
     n_frames = np.ascontiguousarray(volume.n_frames, np.int32)
     seen = volume.counts, n_frames, sweep, light.state, light.still
@@ -360,19 +320,17 @@ def second_returns(
         measure_seconds(*seen, grid.x_far, side, apart, reach, x_px, candidates.haze, first, last, seconds)
 
     def begin(first: int, last: int) -> None:
-        begin_seconds(candidates, first, last, seconds)
+        here = candidates.distance[first // BLOCK : -(-last // BLOCK)].repeat(BLOCK, 0).repeat(BLOCK, 1)
+        seconds.distance[first:last] = here[: last - first, :columns]
         measure(first, last)
 
-    def move(first: int, last: int) -> None:
-        move_seconds(reach, first, last, seconds, moved)
-
     def measure_moved(first: int, last: int) -> None:
-        seconds.distance[first:last] = moved[first:last]
+        seconds.distance[first:last] = seconds.moved[first:last]
         measure(first, last)
 
     def judge(first: int, last: int) -> None:
         judge_seconds(grid.x_far, x_px, candidates.sure, first, last, seconds, x2_px, confidence2)
 
-    for work in (begin, move, measure_moved, judge):
+    for work in (begin, lambda first, last: move_seconds(reach, first, last, seconds), measure_moved, judge):
         of_asked(work)
     return x2_px, confidence2

@@ -3,7 +3,6 @@
 from typing import NamedTuple
 
 import numpy as np
-from numpy.typing import NDArray
 
 from rig.errors import UsageError
 from rig.estimate.joint.confidence import Brightness, brightness_of, pairs_to_ask
@@ -17,6 +16,7 @@ from rig.estimate.joint.winner import LabelAnswers, new_answer
 from rig.estimate.row.inputs import RowState, Sweep, halo_shares, state_of, sweep_of
 from rig.estimate.search.online_learning import LearningSetting
 from rig.geometry.windows import SweepGeometry
+from rig.simd import Float32, Uint8
 from rig.simd.memory import aligned_zeros
 from rig.threads import RowWorkers
 
@@ -31,20 +31,20 @@ class JointTables(NamedTuple):
     costs: Costs
     sweep: Sweep
     state: RowState
-    shares: NDArray[np.float32]
-    halo: NDArray[np.float32]
+    shares: Float32
+    halo: Float32
     light: SecondLight
     bright: Brightness
     dark: bool
-    pairs: NDArray[np.float32]
+    pairs: Float32
     """Pairs of `pairs_to_ask`, for maps whose columns all have frames."""
 
 
 class Memory(NamedTuple):
     """Room for one map after the other: costs and messages (rows, columns, labels) uint8, and the answers."""
 
-    cost: NDArray[np.uint8]
-    message: NDArray[np.uint8]
+    cost: Uint8
+    message: Uint8
     answer: LabelAnswers
     ballots: Ballots
     places: Places
@@ -80,11 +80,11 @@ def grid_of(geometry: SweepGeometry) -> LabelGrid:
 
 def tables_of(setting: LearningSetting, workers: RowWorkers) -> JointTables:
     """The tables of a model, for a geometry and so many exposures a column."""
-    grid = grid_of(setting.geometry)
-    costs = costs_of(setting.model, setting.geometry, grid, setting.exposures, workers)
-    state, sigma_px, sweep = state_of(setting.model), setting.model.line_sigma_px, sweep_of(setting.geometry)
-    halo = halo_shares(setting.model, setting.geometry.width if setting.model.halo.any() else 0)
+    model, geometry, grid = setting.model, setting.geometry, grid_of(setting.geometry)
+    costs = costs_of(model, geometry, grid, setting.exposures, workers)
+    state, sigma_px, sweep = state_of(model), model.line_sigma_px, sweep_of(geometry)
     return JointTables(
-        grid, costs, sweep, state, profile_table(sigma_px), halo, second_light(state, sigma_px, grid, sweep),
-        brightness_of(setting.model), setting.dark, pairs_to_ask(np.isfinite(grid.x_far)),
+        grid, costs, sweep, state, profile_table(sigma_px),
+        halo_shares(model, geometry.width if model.halo.any() else 0), second_light(state, sigma_px, grid, sweep),
+        brightness_of(model), setting.dark, pairs_to_ask(np.isfinite(grid.x_far)),
     )  # fmt: skip

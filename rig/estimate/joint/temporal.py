@@ -14,9 +14,9 @@ from rig.estimate.joint.labels.grid import PER_PX, LabelGrid
 from rig.estimate.joint.winner import VECTOR
 from rig.geometry.stripe_table import StripeTable
 from rig.geometry.windows import SweepGeometry
+from rig.simd import Int32, Uint8
 from rig.simd.memory import address_of, load_bytes, store_bytes
 from rig.simd.vectors import add_saturated_unsigned
-from rig.threads import RowWorkers
 
 MOST = 3
 """Most that a label costs more, in units as all costs (`UNITS`). With 6, dark things that move are held back."""
@@ -39,7 +39,7 @@ class TemporalPrior:
         self.on = on
         self.before: NDArray[np.uint16] | None = None
         self._of: SweepGeometry | None = None
-        self._ramps: NDArray[np.uint8] | None = None
+        self._ramps: Uint8 | None = None
 
     def recall(self, before: NDArray[np.uint16] | None) -> None:
         """Go on from what was kept with a map."""
@@ -55,28 +55,27 @@ class TemporalPrior:
         if self._ramps is None or self._ramps.shape[1] != 2 * grid.labels:
             self._ramps = _ramps(grid.labels)
 
-    def add(self, volume: CountVolume, first: int, last: int, cost: NDArray[np.uint8]) -> None:
+    def add(self, volume: CountVolume, first: int, last: int, cost: Uint8) -> None:
         """Add to the costs (rows, columns, labels) of rows first..last-1."""
         if self.before is not None and self._ramps is not None:
             _add_ramps(self.before, volume.n_frames, self._ramps, first, last, cost)
 
-    def leave(self, stripes: StripeTable, grid: LabelGrid, workers: RowWorkers) -> None:
+    def leave(self, stripes: StripeTable, grid: LabelGrid) -> None:
         """Keep of a map what it leaves to the next."""
         if not self.on:
             self.before = None
             return
+        sure = np.minimum((stripes.confidence.astype(np.float64) - LEAST_SURE) / (1.0 - LEAST_SURE), 1.0)
+        off = grid.side * (grid.x_far - stripes.x_px) * PER_PX
+        there = (sure > 0.0) & np.isfinite(off)
         # A new one each time: the last one is part of the state that its map was estimated with.
-        before = np.zeros((2, *grid.x_far.shape), np.uint16)
-        workers.over(
-            before.shape[1],
-            lambda first, last: _leave(
-                stripes.x_px, stripes.confidence, grid.x_far, grid.side, grid.stripes, first, last, before
-            ),
-        )
+        before = np.zeros((2, *off.shape), np.uint16)
+        before[0, there] = np.clip(np.rint(off[there]), 0, grid.stripes - 1)
+        before[1, there] = np.rint(sure[there] * MOST)
         self.before = before if before[1].any() else None
 
 
-def _ramps(labels: int) -> NDArray[np.uint8]:
+def _ramps(labels: int) -> Uint8:
     """Cost that is added to the label i - labels beyond the last one, for each limit of it: (MOST + 1, 2 labels)."""
     away = np.abs(np.arange(2 * labels) - labels)
     ramp = SLOPE * np.maximum(away - FREE, 0)
@@ -84,34 +83,8 @@ def _ramps(labels: int) -> NDArray[np.uint8]:
 
 
 @numba.njit(cache=True, nogil=True)
-def _leave(
-    x_px: NDArray[np.float32],
-    confidence: NDArray[np.float32],
-    x_far: NDArray[np.float64],
-    side: int,
-    stripes: int,
-    first_row: int,
-    last_row: int,
-    before: NDArray[np.uint16],
-) -> None:
-    """Fill rows first_row..last_row-1 of `before`."""
-    for y in range(first_row, last_row):
-        for c in range(x_px.shape[1]):
-            sure = (confidence[y, c] - LEAST_SURE) / (1.0 - LEAST_SURE)
-            off = side * (x_far[y, c] - x_px[y, c]) * PER_PX
-            if sure > 0.0 and np.isfinite(off):
-                before[0, y, c] = min(max(int(np.rint(off)), 0), stripes - 1)
-                before[1, y, c] = int(np.rint(min(sure, 1.0) * MOST))
-
-
-@numba.njit(cache=True, nogil=True)
 def _add_ramps(
-    before: NDArray[np.uint16],
-    n_frames: NDArray[np.int32],
-    ramps: NDArray[np.uint8],
-    first_row: int,
-    last_row: int,
-    cost: NDArray[np.uint8],
+    before: NDArray[np.uint16], n_frames: Int32, ramps: Uint8, first_row: int, last_row: int, cost: Uint8
 ) -> None:
     """Add each pixel's ramp to its costs; labels: a multiple of VECTOR."""
     _, columns, labels = cost.shape

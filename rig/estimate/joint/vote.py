@@ -8,17 +8,16 @@ four nearest neighbours the one is taken that has least
 
 unless the row's own counts make it worse than the old one by more than OBJECTION. Its margin is then what the
 neighbours say for the label less what they say for others, over their number: what streaks disagree on is not sure.
-Labels are int16, margins uint8 in units of cost; sums fit 16 bits (SHARE). There is one vote, and rows may object,
-since a second vote and votes without objections gain in clear air at one exposure but lose in fog.
+Labels are int16, margins uint8 in units of cost; sums fit 16 bits (SHARE).
 """
 
 from typing import Final, NamedTuple
 
 import numba
 import numpy as np
-from numpy.typing import NDArray
 
 from rig.estimate.joint.winner import LabelAnswers
+from rig.simd import Float32, Int16, Uint8
 from rig.simd.memory import (
     load_float32,
     load_int16,
@@ -50,9 +49,9 @@ class Ballots(NamedTuple):
     label: float32 as answered; whole: int16, the nearest whole one; votes: int16, the margin over SHARE.
     """
 
-    label: NDArray[np.float32]
-    whole: NDArray[np.int16]
-    votes: NDArray[np.int16]
+    label: Float32
+    whole: Int16
+    votes: Int16
 
 
 def new_ballots(rows: int, columns: int) -> Ballots:
@@ -94,17 +93,17 @@ class _Hall(NamedTuple):
     """
 
     ballots: Ballots
-    cost: NDArray[np.uint8]
+    cost: Uint8
     answer: LabelAnswers
-    elected: NDArray[np.int16]
-    against: NDArray[np.int16]
-    share: NDArray[np.float32]
+    elected: Int16
+    against: Int16
+    share: Float32
     width: int
     columns: int
     labels: int
 
 
-def vote(ballots: Ballots, cost: NDArray[np.uint8], first_row: int, last_row: int, answer: LabelAnswers) -> None:
+def vote(ballots: Ballots, cost: Uint8, first_row: int, last_row: int, answer: LabelAnswers) -> None:
     """Mend the answers of rows first_row..last_row-1; cost: (rows, columns, labels), C-contiguous.
 
     The ballots of all columns must have been collected before.

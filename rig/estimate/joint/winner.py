@@ -13,8 +13,8 @@ from typing import Final, NamedTuple
 
 import numba
 import numpy as np
-from numpy.typing import NDArray
 
+from rig.simd import Float32, Int32, Uint8
 from rig.simd.memory import (
     aligned_zeros,
     load_block,
@@ -51,20 +51,23 @@ UNITS: Final = 8.0
 """
 
 
+BETA: Final = 0.5
+"""A label weighs exp(-BETA * excess of its total / UNITS)."""
+
+
 class AnswerSettings(NamedTuple):
     """Number of labels that are stripes, 0..stripes-1, and the tables of `answer_settings`.
 
     weights: float32 (256,), of a total's excess over the least. powers: float32 (REACH + 1, TAPS, POWERS), powers of
-    the distance for each reach, 0 at taps beyond it. reach: uint8 (2^TAPS,), how far labels reach to both sides where
-    the taps of the set bits are excluded. near: uint8 (VECTOR,) with the winner at MIDDLE, LARGEST at labels that do
-    not count for the margin.
+    the distance for each reach, 0 at taps beyond it. reach: uint8 (2^TAPS,), how far labels reach where the taps of the
+    set bits are excluded. near: uint8 (VECTOR,) with the winner at MIDDLE, LARGEST where the margin does not count.
     """
 
     stripes: int
-    weights: NDArray[np.float32]
-    powers: NDArray[np.float32]
-    reach: NDArray[np.uint8]
-    near: NDArray[np.uint8]
+    weights: Float32
+    powers: Float32
+    reach: Uint8
+    near: Uint8
 
 
 class LabelAnswers(NamedTuple):
@@ -75,8 +78,8 @@ class LabelAnswers(NamedTuple):
     least MARGIN_FROM labels away less the winner's.
     """
 
-    label: NDArray[np.float32]
-    margin: NDArray[np.uint8]
+    label: Float32
+    margin: Uint8
 
 
 def new_answer(rows: int, columns: int) -> LabelAnswers:
@@ -84,9 +87,9 @@ def new_answer(rows: int, columns: int) -> LabelAnswers:
     return LabelAnswers(np.zeros((rows, columns), np.float32), np.zeros((rows, columns), np.uint8))
 
 
-def answer_settings(stripes: int, beta: float = 0.5) -> AnswerSettings:
-    """Settings for so many stripe labels; a label weighs exp(-beta * excess of its total / UNITS)."""
-    weights = np.exp(-beta / UNITS * np.arange(LARGEST + 1)).astype(np.float32)
+def answer_settings(stripes: int) -> AnswerSettings:
+    """Settings for so many stripe labels."""
+    weights = np.exp(-BETA / UNITS * np.arange(LARGEST + 1)).astype(np.float32)
     distance = np.arange(-REACH, REACH + 1)
     powers = np.zeros((REACH + 1, TAPS, POWERS), np.float32)
     for reach in range(REACH + 1):
@@ -117,11 +120,11 @@ class Readout(NamedTuple):
     end: int
     size: int
     totals: int
-    around: NDArray[np.uint8]
-    hidden: NDArray[np.uint8]
-    least_label: NDArray[np.int32]
-    least: NDArray[np.uint8]
-    moments: NDArray[np.float32]
+    around: Uint8
+    hidden: Uint8
+    least_label: Int32
+    least: Uint8
+    moments: Float32
 
 
 def new_readout(settings: AnswerSettings, answer: LabelAnswers, columns: int, labels: int) -> Readout:
@@ -132,18 +135,11 @@ def new_readout(settings: AnswerSettings, answer: LabelAnswers, columns: int, la
     hidden = aligned_zeros((labels,), np.uint8)
     hidden[settings.stripes :] = LARGEST
     return Readout(
-        settings=settings,
-        answer=answer,
-        labels=labels,
-        end=-(-settings.stripes // _BLOCK) * _BLOCK,
-        size=size,
-        totals=around.ctypes.data + VECTOR,
-        around=around,
-        hidden=hidden,
-        least_label=aligned_zeros((columns,), np.int32),
-        least=aligned_zeros((columns,), np.uint8),
+        settings=settings, answer=answer, labels=labels, end=-(-settings.stripes // _BLOCK) * _BLOCK, size=size,
+        totals=around.ctypes.data + VECTOR, around=around, hidden=hidden,
+        least_label=aligned_zeros((columns,), np.int32), least=aligned_zeros((columns,), np.uint8),
         moments=aligned_zeros((columns, POWERS), np.float32),
-    )
+    )  # fmt: skip
 
 
 @numba.njit(forceinline=True)

@@ -12,6 +12,7 @@ from numpy.typing import NDArray
 from rig.count.volume import FrameTally
 from rig.estimate.row.likelihood import FLUX_MAX
 from rig.geometry.windows import SweepGeometry
+from rig.simd import Float32, Float64
 
 NEIGHBOURHOOD_PX = 31
 """Side of the square of pixels whose mean a pixel is drawn to."""
@@ -22,8 +23,8 @@ HOT_SIGMA = 6.0
 
 
 def ambient_map(
-    tally: FrameTally, intensity: NDArray[np.uint32], geometry: SweepGeometry, quiet: NDArray[np.float64] | None
-) -> NDArray[np.float32]:
+    tally: FrameTally, intensity: NDArray[np.uint32], geometry: SweepGeometry, quiet: Float64 | None
+) -> Float32:
     """Photons per exposure (rows, width) float32 from dark frames, `quiet` (2, rows, width) counts and hot pixels.
 
     intensity: (rows, width), ones of each pixel within the windows. quiet: ones and exposures of each pixel while
@@ -45,7 +46,7 @@ def ambient_map(
         base = np.full(ones.shape, level)
     else:
         base = _shrunk(ones, exposures)
-    ambient: NDArray[np.float32] = np.maximum(base, hot_pixels(totals)).astype(np.float32)
+    ambient: Float32 = np.maximum(base, hot_pixels(totals)).astype(np.float32)
     ambient[geometry.defects] = DEFECT_FLUX
     return ambient
 
@@ -68,7 +69,7 @@ def _lowest_level(totals: NDArray[np.uint32]) -> float:
     return float(max(-np.log1p(-np.percentile(rate, 2.0)) * 0.5, 1e-5))
 
 
-def _shrunk(ones: NDArray[np.float64], exposures: NDArray[np.float64]) -> NDArray[np.float64]:
+def _shrunk(ones: Float64, exposures: Float64) -> Float64:
     """Flux per pixel: its own counts drawn to the local mean by as much as pixels are alike (empirical Bayes)."""
     row_rates = ones.sum(1)[exposures.sum(1) > 0] / exposures.sum(1)[exposures.sum(1) > 0]
     overall = max(float(np.median(row_rates)), 1e-6)
@@ -93,7 +94,7 @@ def _shrunk(ones: NDArray[np.float64], exposures: NDArray[np.float64]) -> NDArra
     return np.asarray(-np.log1p(-np.minimum(rate, 0.9999)))
 
 
-def hot_pixels(totals: NDArray[np.uint32]) -> NDArray[np.float64]:
+def hot_pixels(totals: NDArray[np.uint32]) -> Float64:
     """Flux (rows, width) of pixels far above their neighbours over the whole sweep, 0 elsewhere.
 
     totals: (2, rows, width), ones and exposures of each pixel while inside the stored window.

@@ -1,23 +1,28 @@
 """Learns the row model from the counts of a sweep by expectation-maximisation over a lattice of rows and columns.
 
-Each round the row likelihood says, with its posterior, how much of every pixel's evidence lay before and behind the
-stripe; haze, pedestal, row gains, amplitudes and line width are set to what those weighted counts say. Nothing of the
-medium or the light is assumed beyond 'haze falls with the path length', and that only where data are few.
+Each round the row likelihood says, with its posterior P(j) over positions, how much of every pixel's evidence lay
+before and behind the stripe: pixel t lies before it with the probability that the stripe is farther, sum over j > t of
+P(j). Ones and exposures are added with these weights per bin of path inverse depth (`learn_rows`); haze, pedestal, row
+gains, amplitudes and line width are set to what those float64 sums say. Nothing of the medium or the light is assumed
+beyond 'haze falls with the path length', and that only where data are few.
 """
 
 from dataclasses import replace
-from typing import Any, NamedTuple
+from functools import reduce
+from operator import itemgetter
+from typing import Any, Final, NamedTuple
 
 import cv2
+import numba
 import numpy as np
-from numpy.typing import NDArray
 
 from rig.count.volume import CountVolume
-from rig.estimate.row.em_kernels import learn_rows
-from rig.estimate.row.inputs import Lines, RowState, Sweep, state_of, sweep_of
+from rig.estimate.row.inputs import Lines, RowBuffers, RowState, Sweep, judge_line, row_buffers, state_of, sweep_of
+from rig.estimate.row.likelihood import mode_of
 from rig.estimate.row.model import AMPLITUDES, BINS, RowModel, fit_haze, stripe_scale
 from rig.geometry.stripe_table import StripeTable
 from rig.geometry.windows import SweepGeometry, evenly_spread
+from rig.simd import Float32, Float64, Int32
 from rig.threads import RowWorkers
 
 LATTICE_LINES = 8192
@@ -51,10 +56,10 @@ START_EXTINCTIONS_PER_M = (0.0, 0.1, 0.4, 1.5)
 class Expectation(NamedTuple):
     """Weighted counts of one round; see `learn_rows`."""
 
-    levels: NDArray[np.float64]
-    rows_seen: NDArray[np.float64]
-    columns_seen: NDArray[np.float64]
-    amplitude_mass: NDArray[np.float64]
+    levels: Float64
+    rows_seen: Float64
+    columns_seen: Float64
+    amplitude_mass: Float64
     evidence: float
 
     def plus(self, other: "Expectation") -> "Expectation":
@@ -68,16 +73,14 @@ class Expectation(NamedTuple):
         return Expectation(*(share * each for each in sums))
 
 
-def lattice(geometry: SweepGeometry, lines: int) -> tuple[NDArray[np.int32], NDArray[np.int32]]:
+def lattice(geometry: SweepGeometry, lines: int) -> tuple[Int32, Int32]:
     """About `lines` (row, column) pairs spread evenly over those with a window: a fixed pattern, no chance in it."""
     y, c = np.nonzero(geometry.x_lo <= geometry.x_hi)
     pick = evenly_spread(len(y), lines)
     return y[pick].astype(np.int32), c[pick].astype(np.int32)
 
 
-def lines_of(
-    volume: CountVolume, where: tuple[NDArray[np.int32], NDArray[np.int32]], known: StripeTable | None = None
-) -> Lines:
+def lines_of(volume: CountVolume, where: tuple[Int32, Int32], known: StripeTable | None = None) -> Lines:
     """The counts of a volume at (rows, columns), each one row of its column's window.
 
     known: stripes of which the neighbours' counts have had a say.
@@ -92,12 +95,10 @@ def lines_of(
 
 def expect(lines: Lines, geometry: SweepGeometry, model: RowModel, workers: RowWorkers) -> Expectation:
     """Expectation step of `model` over some lines."""
-    typical = float(np.median(model.ambient))
-    sweep, state = sweep_of(geometry), state_of(model)
-    hot_flux = 5.0 * typical + 1e-3
+    sweep, state, hot_flux = sweep_of(geometry), state_of(model), model.hot_flux()
     # Fixed pieces, added in order: the sums do not depend on the number of threads.
     edges = np.linspace(0, len(lines.row), PIECES + 1).astype(int)
-    parts: list[Expectation | None] = [None] * PIECES
+    parts: dict[int, Expectation] = {}
 
     def work(first: int, last: int) -> None:
         for i in range(first, last):
@@ -105,16 +106,12 @@ def expect(lines: Lines, geometry: SweepGeometry, model: RowModel, workers: RowW
             parts[i] = _expect_piece(sweep, state, _some(lines, part), geometry, hot_flux)
 
     workers.over(PIECES, work)
-    done = [part for part in parts if part is not None]
-    total = done[0]
-    for part in done[1:]:
-        total = total.plus(part)
-    return total
+    return reduce(Expectation.plus, (parts[i] for i in range(PIECES)))
 
 
 def _some(lines: Lines, part: slice) -> Lines:
-    counts, row, column, exposures, x_px, trust = lines
-    return Lines(counts[part], row[part], column[part], exposures[part], x_px[part], trust[part])
+    some: Any = (each[part] for each in lines)
+    return Lines(*some)
 
 
 def _expect_piece(sweep: Sweep, state: RowState, lines: Lines, geometry: SweepGeometry, hot_flux: float) -> Expectation:
@@ -125,23 +122,18 @@ def _expect_piece(sweep: Sweep, state: RowState, lines: Lines, geometry: SweepGe
     return Expectation(levels, rows_seen, columns_seen, mass, float(evidence))
 
 
-def learn_first(
-    volume: CountVolume, geometry: SweepGeometry, ambient: NDArray[np.float32], workers: RowWorkers
-) -> RowModel:
+def learn_first(volume: CountVolume, geometry: SweepGeometry, ambient: Float32, workers: RowWorkers) -> RowModel:
     """Row model of a sweep that nothing is known about: several starts, the likeliest one refined."""
     lines = lines_of(volume, lattice(geometry, LATTICE_LINES))
     few = lines_of(volume, lattice(geometry, LATTICE_LINES // 4))
     guessed = volume.dark_counts is None
-    best: tuple[float, RowModel] | None = None
+    starts = []
     for extinction in START_EXTINCTIONS_PER_M:
         model = _start(volume, geometry, ambient, extinction)
         for _ in range(2):
             model = maximise(model, expect(few, geometry, model, workers), spread=True, free_ambient=guessed)
-        evidence = expect(few, geometry, model, workers).evidence
-        if best is None or evidence > best[0]:
-            best = evidence, model
-    assert best is not None
-    model = best[1]
+        starts.append((expect(few, geometry, model, workers).evidence, model))
+    model = max(starts, key=itemgetter(0))[1]
     for _ in range(FIRST_ROUNDS):
         model = maximise(model, expect(few, geometry, model, workers), spread=True, free_ambient=guessed)
         model = fit_line_width(few, geometry, model, workers)
@@ -150,7 +142,7 @@ def learn_first(
     return model
 
 
-def next_lattice(geometry: SweepGeometry) -> tuple[NDArray[np.int32], NDArray[np.int32]]:
+def next_lattice(geometry: SweepGeometry) -> tuple[Int32, Int32]:
     """The (rows, columns) that carry a model on from sweep to sweep, sorted by column."""
     rows, columns = lattice(geometry, NEXT_LINES)
     order = np.lexsort((rows, columns))
@@ -178,7 +170,7 @@ def learn_again(
     volume: CountVolume,
     geometry: SweepGeometry,
     model: RowModel,
-    ambient: NDArray[np.float32],
+    ambient: Float32,
     known: StripeTable,
     workers: RowWorkers,
 ) -> RowModel:
@@ -206,9 +198,7 @@ def _bins(geometry: SweepGeometry) -> tuple[float, float]:
     return w_lo, (BINS - 1) / (w_hi - w_lo)
 
 
-def _start(
-    volume: CountVolume, geometry: SweepGeometry, ambient: NDArray[np.float32], extinction_per_m: float
-) -> RowModel:
+def _start(volume: CountVolume, geometry: SweepGeometry, ambient: Float32, extinction_per_m: float) -> RowModel:
     """Row model with haze of a guessed extinction that matches the mean level of the nearest pixels."""
     w_lo, per_w = _bins(geometry)
     path_m = 1.0 / (w_lo + np.arange(BINS) / per_w)
@@ -219,11 +209,11 @@ def _start(
     columns = [haze, np.zeros(BINS), stripe_scale(path_m, extinction_per_m), np.zeros(BINS)]
     profile = np.stack(columns, 1).astype(np.float32)
     amplitude = np.geomspace(0.03, 30.0, AMPLITUDES).astype(np.float32)
+    row_gain, column_gain = np.ones(geometry.rows, np.float32), np.ones(geometry.columns, np.float32)
+    weight = np.full(AMPLITUDES, 1.0 / AMPLITUDES)
     return RowModel(
-        profile, w_lo, per_w, np.ones(geometry.rows, np.float32),
-        np.ones(geometry.columns, np.float32), ambient, amplitude,
-        np.full(AMPLITUDES, 1.0 / AMPLITUDES), 0.02, 0.8, extinction_per_m, np.nan,
-    )  # fmt: skip
+        profile, w_lo, per_w, row_gain, column_gain, ambient, amplitude, weight, 0.02, 0.8, extinction_per_m, np.nan
+    )
 
 
 def _near_level(volume: CountVolume, geometry: SweepGeometry) -> float:
@@ -233,12 +223,8 @@ def _near_level(volume: CountVolume, geometry: SweepGeometry) -> float:
     lo, hi = geometry.x_lo[rows, columns], geometry.x_hi[rows, columns]
     share = np.maximum((hi - lo + 1) // 8, 1)
     for y, c, a, b, n in zip(rows, columns, lo, hi, share, strict=True):
-        x = (
-            slice(a - volume.x0[c], a - volume.x0[c] + n)
-            if geometry.near_is_left
-            else slice(b - n + 1 - volume.x0[c], b + 1 - volume.x0[c])
-        )
-        ones += float(volume.counts[c, y, x].sum())
+        first = (a if geometry.near_is_left else b - n + 1) - volume.x0[c]
+        ones += float(volume.counts[c, y, first : first + n].sum())
         exposures += float(volume.n_frames[c]) * n
     return flux(ones, exposures)
 
@@ -294,9 +280,7 @@ def maximise(
     )  # fmt: skip
 
 
-def _split_rest(
-    rest: NDArray[np.float64], variance: NDArray[np.float64], haze: NDArray[np.float64]
-) -> tuple[float, float]:
+def _split_rest(rest: Float64, variance: Float64, haze: Float64) -> tuple[float, float]:
     """The level behind the stripe as ambient left over and a share (0 to 1) of the haze: light scattered twice or more.
 
     Weighted fit of rest = excess + share * haze over the bins; without enough bins all of it is haze's, or nothing.
@@ -314,7 +298,7 @@ def _split_rest(
     return float(mean_y - share * mean_x), share
 
 
-def _level(sums: NDArray[np.float64]) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+def _level(sums: Float64) -> tuple[Float64, Float64]:
     """Flux above ambient per unit geometry factor and its variance (BINS,), NaN in bins without data.
 
     sums: (BINS, 4), ones, exposures, and exposures weighted with geometry factor and ambient flux.
@@ -330,18 +314,14 @@ def _level(sums: NDArray[np.float64]) -> tuple[NDArray[np.float64], NDArray[np.f
     return np.where(few, np.nan, level), np.where(few, np.nan, variance / gain**2)
 
 
-def _blend(
-    level: NDArray[np.float64], variance: NDArray[np.float64], fitted: NDArray[np.float64]
-) -> NDArray[np.float64]:
+def _blend(level: Float64, variance: Float64, fitted: Float64) -> Float64:
     """Each bin's own level where it has many photons, the fitted curve where it has few."""
     own = np.where(np.isfinite(level), 1.0 / np.maximum(variance, 1e-12), 0.0)
     prior = PRIOR_PHOTONS / np.maximum(fitted, 1e-4) ** 2
     return np.maximum((own * np.nan_to_num(level) + prior * fitted) / (own + prior), 0.0)
 
 
-def _amplitudes(
-    model: RowModel, mass: NDArray[np.float64], spread: bool
-) -> tuple[NDArray[np.float32], NDArray[np.float64], float]:
+def _amplitudes(model: RowModel, mass: Float64, spread: bool) -> tuple[Float32, Float64, float]:
     total = float(mass.sum())
     none = float(np.clip(mass[-1] / max(total, 1.0), 0.005, 0.5))
     weight = (mass[:-1] + 1.0) / (mass[:-1].sum() + len(mass) - 1)
@@ -357,7 +337,7 @@ def _amplitudes(
     return np.exp(moved).astype(np.float32), density / density.sum(), none
 
 
-def _position_prior(levels: NDArray[np.float64]) -> NDArray[np.float64]:
+def _position_prior(levels: Float64) -> Float64:
     """Log density of stripes over the bins (BINS,), 0 where they are spread evenly; smooth, and never against a place.
 
     It decides only where a row hardly has photons; a quarter of it stays even: it says at most 1.4 nats against.
@@ -368,9 +348,7 @@ def _position_prior(levels: NDArray[np.float64]) -> NDArray[np.float64]:
     return np.asarray(np.log(EVEN_SHARE + (1.0 - EVEN_SHARE) * density))
 
 
-def _gain(
-    gain: NDArray[np.float32], seen: NDArray[np.float64], ambient: float, before: NDArray[np.float64]
-) -> NDArray[np.float32]:
+def _gain(gain: Float32, seen: Float64, ambient: float, before: Float64) -> Float32:
     """Strength of the haze per row or column, smoothed over 65 of them; 1 on average, unchanged where haze is weak.
 
     seen: (n, 2), ones before the stripe and those expected with the present gain.
@@ -385,3 +363,109 @@ def _gain(
     # Few counts say little: as if 100 more had been as expected.
     learned = gain * np.clip((ones + 100.0) / (expected + 100.0), 0.5, 2.0)
     return np.asarray(np.clip(learned / learned.mean(), 0.2, 5.0), dtype=np.float32)
+
+
+CUT: Final = 0.05
+"""Share of the depth range outside the picture up to which a row tells how often the stripe is missing."""
+CERTAIN: Final = 0.6
+"""Probability within 1 px from which a row teaches the level behind the stripe."""
+CLEAR: Final = 0.97
+CLEAR_PX: Final = 6
+"""Rows as certain as this, and pixels as far before their stripe, measure the haze itself."""
+LEAST_OWN: Final = 1e-3
+"""Least haze of a line, over that of the others at a pixel, that is told from none."""
+
+
+@numba.njit(cache=True, nogil=True)
+def learn_rows(
+    sweep: Sweep, state: RowState, lines: Lines, hot_flux: float, levels: Float64, rows_seen: Float64,
+    columns_seen: Float64, amplitude_mass: Float64,
+) -> float:  # fmt: skip
+    """Expectation step over some lines; returns the log evidence.
+
+    Adds to levels (bins, 14): ones, exposures, and exposures weighted with geometry factor and with ambient flux, of
+    pixels before the stripe, then of those behind it, each with the probability of being there, then of those well
+    before a stripe beyond doubt; then stripes, and stripes if all positions were alike. To rows_seen (rows, 2) and
+    columns_seen (columns, 2): ones before the stripe, and those expected. To amplitude_mass (M + 1,): rows per
+    amplitude, the last entry 'no stripe'. Pixels with more ambient flux than hot_flux are left out.
+    """
+    amplitudes = state.amplitude.shape[0]
+    row = row_buffers(sweep.window, amplitudes)
+    total = 0.0
+    for i in range(lines.row.shape[0]):
+        length, first, last, start, none, cut, evidence = judge_line(sweep, state, row, lines, i)
+        if length == 0:
+            continue
+        total += evidence
+        if cut < CUT:
+            for m in range(amplitudes):
+                amplitude_mass[m] += row.by_amplitude[m]
+            amplitude_mass[amplitudes] += none
+            for j in range(first, last + 1):
+                levels[row.cell[j], 12] += row.posterior[j]
+                levels[row.cell[j], 13] += (1.0 - none) / (last - first + 1)
+        if none < 0.5:
+            where = lines.row[i], lines.column[i], lines.exposures[i]
+            _learn_levels(
+                sweep, state, row, where, (length, first, last, start), none, hot_flux, levels, rows_seen, columns_seen
+            )
+    return total
+
+
+@numba.njit(cache=True, nogil=True)
+def _learn_levels(
+    sweep: Sweep, state: RowState, row: RowBuffers, where: tuple[int, int, int], span: tuple[int, int, int, int],
+    none: float, hot_flux: float, levels: Float64, rows_seen: Float64,
+    columns_seen: Float64,
+) -> None:  # fmt: skip
+    """Add one row's pixels to the levels before and behind the stripe.
+
+    where: row, column and exposures; span: what `row_fluxes` says of it.
+    """
+    (y, c, k), (length, first, last, start) = where, span
+    step = 1 if sweep.near_is_left else -1
+    reach = state.psi.shape[0]
+    # Doubtful rows would teach the level behind the stripe their own guess; haze before it is plentiful anyway.
+    mode, near_mass = mode_of(row.posterior, first, last)
+    certain, clear = near_mass > CERTAIN, near_mass > CLEAR
+    passed = 0.0
+    for t in range(length):
+        passed += row.posterior[t]
+        ambient = state.ambient[y, start + step * t]
+        if ambient > hot_flux:
+            continue
+        gain, others = row.gain[t], row.others[t]
+        if others > 0.0:
+            # Other lines' haze is haze like this one's: what there is of both tells the strength of each.
+            own = row.before[t] - ambient - others
+            gain *= 1.0 + others / max(own, LEAST_OWN * others)
+        # The stripe's own width counts for neither side.
+        ahead = 0.0
+        near = row.posterior[t]
+        for d in range(1, reach + 1):
+            if t + d < length:
+                ahead += row.posterior[t + d]
+            if t - d >= 0:
+                near += row.posterior[t - d]
+        is_before = max(1.0 - none - passed - ahead, 0.0)
+        b = row.cell[t]
+        levels[b, 0] += is_before * row.n[t]
+        levels[b, 1] += is_before * k
+        levels[b, 2] += is_before * k * gain
+        levels[b, 3] += is_before * k * ambient
+        expected = is_before * k * -np.expm1(-row.before[t])
+        rows_seen[y, 0] += is_before * row.n[t]
+        rows_seen[y, 1] += expected
+        columns_seen[c, 0] += is_before * row.n[t]
+        columns_seen[c, 1] += expected
+        if clear and t < mode - CLEAR_PX:
+            levels[b, 8] += row.n[t]
+            levels[b, 9] += k
+            levels[b, 10] += k * gain
+            levels[b, 11] += k * ambient
+        if certain:
+            is_behind = max(passed - near, 0.0)
+            levels[b, 4] += is_behind * row.n[t]
+            levels[b, 5] += is_behind * k
+            levels[b, 6] += is_behind * k * row.gain[t]
+            levels[b, 7] += is_behind * k * (ambient + others)

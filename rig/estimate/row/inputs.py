@@ -25,17 +25,19 @@ from numpy.typing import NDArray
 
 from rig.estimate.row.likelihood import FLUX_MAX, FLUX_MIN, logit_table, none_prior, row_posterior, row_scores
 from rig.estimate.row.model import HALO_REACHES_PX, RowModel, fine_profiles, line_profile
+from rig.geometry.kernels import with_rays
 from rig.geometry.windows import MARGIN_PX, SweepGeometry
+from rig.simd import Float32, Float64, Int32
 
 
-def halo_shares(model: RowModel, pixels: int) -> NDArray[np.float32]:
+def halo_shares(model: RowModel, pixels: int) -> Float32:
     """rho at each profile bin and 0 to pixels - 1 px from the stripe, (BINS, pixels); zeros where there is no halo."""
     reach = np.array(HALO_REACHES_PX)[:, None]
     shape = np.exp(-np.arange(pixels) / reach) / (2 * reach)
     return np.asarray(over_bins(np.asarray(model.halo), len(model.profile)) @ shape, np.float32)
 
 
-def over_bins(values: NDArray[np.floating], bins: int) -> NDArray[np.float64]:
+def over_bins(values: NDArray[np.floating], bins: int) -> Float64:
     """Values given at HALO_NODES nodes, (nodes, n), interpolated at each profile bin: (bins, n)."""
     at = np.linspace(0, len(values) - 1, bins)
     low = np.minimum(at.astype(int), len(values) - 2)
@@ -45,23 +47,21 @@ def over_bins(values: NDArray[np.floating], bins: int) -> NDArray[np.float64]:
 
 TABLE = logit_table()
 
-Float32 = NDArray[np.float32]
-
 
 class Sweep(NamedTuple):
     """Geometry of a sweep; arrays as in SweepGeometry, depth range as inverse depths."""
 
     window: int
-    x0: NDArray[np.int32]
-    x_lo: NDArray[np.int32]
-    x_hi: NDArray[np.int32]
+    x0: Int32
+    x_lo: Int32
+    x_hi: Int32
     near_is_left: bool
-    plane: NDArray[np.float64]
+    plane: Float64
     u: Float32
     v: Float32
     w_near: float
     w_far: float
-    others: NDArray[np.float64]
+    others: Float64
 
 
 class Lines(NamedTuple):
@@ -72,9 +72,9 @@ class Lines(NamedTuple):
     """
 
     counts: NDArray[np.integer]
-    row: NDArray[np.int32]
-    column: NDArray[np.int32]
-    exposures: NDArray[np.int32]
+    row: Int32
+    column: Int32
+    exposures: Int32
     x_px: Float32
     trust: Float32
 
@@ -105,15 +105,14 @@ class RowBuffers(NamedTuple):
 
     n: ones; before, behind: flux of each pixel in front of and behind the stripe; scale: stripe photons at amplitude 1;
     cell: nearest profile bin; gain: geometry factor of the haze; others: flux of other lines' haze, in before and
-    behind; w: inverse depth; log_prior: of positions; taps, edge, score, posterior, by_amplitude: see `row_scores` and
-    `row_posterior`.
+    behind; w: inverse depth; log_prior: of positions; the rest: see `row_scores` and `row_posterior`.
     """
 
     n: Float32
     before: Float32
     behind: Float32
     scale: Float32
-    cell: NDArray[np.int32]
+    cell: Int32
     gain: Float32
     others: Float32
     w: Float32
@@ -122,7 +121,7 @@ class RowBuffers(NamedTuple):
     edge: Float32
     score: Float32
     posterior: Float32
-    by_amplitude: NDArray[np.float64]
+    by_amplitude: Float64
 
 
 def sweep_of(geometry: SweepGeometry) -> Sweep:
@@ -162,16 +161,14 @@ def row_buffers(window: int, amplitudes: int) -> RowBuffers:
 @numba.njit(inline="always")
 def path_to_plane(px, py, pz, vy):  # type: ignore[no-untyped-def]
     """Length of the light's path to a plane's points on a row of tangent vy, per unit of depth."""
-    # Tangent at which this row meets the plane infinitely far away: the direction of the light in the row.
+    # Tangent at which this row meets the plane infinitely far away.
     path_u = -(py * vy + pz) / px
     return np.sqrt(1.0 + path_u * path_u + vy * vy)
 
 
 @numba.njit(inline="always")
 def profile_place(px, py, pz, ux, vx, path_p, w_lo, per_w, bins):  # type: ignore[no-untyped-def]
-    """Path from the camera to a plane's point in a pixel's direction, per unit of depth; its inverse depth; its place
-    among the profile's bins.
-    """
+    """Path from the camera to a plane's point, per unit of depth; its inverse depth and place among the bins."""
     path_c = np.sqrt(np.float32(1.0) + ux * ux + vx * vx)
     w = px * ux + py * vx + pz
     return path_c, w, min(max((w * 2.0 / (path_p + path_c) - w_lo) * per_w, 0.0), bins - 1.001)
@@ -181,16 +178,6 @@ def profile_place(px, py, pz, ux, vx, path_p, w_lo, per_w, bins):  # type: ignor
 def flux_between(ambient, gain, one, other, part):  # type: ignore[no-untyped-def]
     """Flux of ambient light plus gain times the profile, from `one` in a bin to `other` in the next at `part` of it."""
     return min(max(ambient + gain * (one + part * (other - one)), FLUX_MIN), FLUX_MAX)
-
-
-@numba.njit(inline="always")
-def with_rays(u, y, first, last):  # type: ignore[no-untyped-def]
-    """First and last of those pixels of a row, without the ones at its ends that have no ray; one is always left."""
-    while first < last and np.isnan(u[y, first]):
-        first += 1
-    while last > first and np.isnan(u[y, last]):
-        last -= 1
-    return first, last
 
 
 @numba.njit(inline="always")
@@ -208,17 +195,15 @@ def line_light(sweep, state, y, c, middle):  # type: ignore[no-untyped-def]
 def others_at(sweep, state, y, c, x):  # type: ignore[no-untyped-def]
     """Haze of the lines that are lit together with column c, at one pixel, whichever side of c's stripe it lies on.
 
-    Where their own stripes lie is not known. With the probability that is the share of the depth range behind the
-    pixel's point on their plane their haze has not ended there; where the point is nearer than the range it surely has
-    not.
+    Where their own stripes lie is not known: their haze has not ended there with the probability that is the share of
+    the depth range behind the pixel's point on their plane.
     """
     profile, light = state.profile, 0.0
     ux, vx = np.float64(sweep.u[y, x]), np.float64(sweep.v[y, x])
     path_c = np.sqrt(1.0 + ux * ux + vx * vx)
     for other in range(sweep.others.shape[1]):
         plane = sweep.others[c, other]
-        path_u = -(plane[1] * vx + plane[2]) / plane[0]
-        path_p = np.sqrt(1.0 + path_u * path_u + vx * vx)
+        path_p = path_to_plane(plane[0], plane[1], plane[2], vx)
         w = plane[0] * ux + plane[1] * vx + plane[2]
         there = min(max((w - sweep.w_far) / (sweep.w_near - sweep.w_far), 0.0), 1.0)
         b = min(max((w * 2.0 / (path_p + path_c) - state.w_lo) * state.per_w, 0.0), profile.shape[0] - 1.001)
@@ -231,8 +216,8 @@ def others_at(sweep, state, y, c, x):  # type: ignore[no-untyped-def]
 
 @numba.njit(inline="always")
 def fluxes_at(sweep, state, y, x, c, path_p, strength):  # type: ignore[no-untyped-def]
-    """Flux before and behind the stripe of column c, the stripe's scale, geometry factor, inverse depth and profile bin
-    of one pixel, and what other lines' haze brings to both fluxes.
+    """Flux before and behind column c's stripe, its scale, geometry factor, inverse depth and bin of one pixel, and
+    what other lines' haze brings to both fluxes.
     """
     plane, profile = sweep.plane[c], state.profile
     path_c, w, b = profile_place(

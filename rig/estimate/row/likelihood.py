@@ -30,7 +30,8 @@ from typing import Any, Final
 
 import numba
 import numpy as np
-from numpy.typing import NDArray
+
+from rig.simd import Float32, Float64
 
 Real = float | np.floating[Any]
 
@@ -54,7 +55,7 @@ LOST: Final = np.float32(24.0)
 """Log-likelihood below the best from which on a hypothesis does not count (exp(-24) = 4e-11)."""
 
 
-def logit_table() -> NDArray[np.float32]:
+def logit_table() -> Float32:
     """Table (2, cells) float32 of logit p' and log(1 - p') over flux: 256 cells an octave, value at the cell's middle.
 
     The largest error, half a cell, changes a log-likelihood by 0.002 per count: far below its own noise.
@@ -76,14 +77,7 @@ def cell_of(flux):  # type: ignore[no-untyped-def]
 
 @numba.njit(cache=True, nogil=True, fastmath=True, error_model="numpy")
 def add_evidence(
-    n: NDArray[np.float32],
-    k: Real,
-    base: NDArray[np.float32],
-    light: Real,
-    scale: NDArray[np.float32],
-    own: NDArray[np.float32],
-    table: NDArray[np.float32],
-    score: NDArray[np.float32],
+    n: Float32, k: Real, base: Float32, light: Real, scale: Float32, own: Float32, table: Float32, score: Float32
 ) -> None:
     """score += log-likelihood of n ones in k frames at flux base + light * scale, less `own`; all arrays alike long.
 
@@ -98,19 +92,9 @@ def add_evidence(
 
 @numba.njit(cache=True, nogil=True)
 def row_scores(
-    n: NDArray[np.float32],
-    k: Real,
-    before: NDArray[np.float32],
-    behind: NDArray[np.float32],
-    scale: NDArray[np.float32],
-    length: int,
-    amplitude: NDArray[np.float32],
-    psi: NDArray[np.float32],
-    table: NDArray[np.float32],
-    taps: NDArray[np.float32],
-    edge: NDArray[np.float32],
-    score: NDArray[np.float32],
-) -> None:
+    n: Float32, k: Real, before: Float32, behind: Float32, scale: Float32, length: int, amplitude: Float32,
+    psi: Float32, table: Float32, taps: Float32, edge: Float32, score: Float32,
+) -> None:  # fmt: skip
     """Log-likelihood of every position and amplitude against 'everything is behind'.
 
     psi: (T + 1,) share of the stripe at 0..T px from its centre. Writes score (M, length), edge (length + 1,), the
@@ -165,17 +149,9 @@ def none_prior(
 
 @numba.njit(cache=True, nogil=True)
 def row_posterior(
-    score: NDArray[np.float32],
-    edge: NDArray[np.float32],
-    length: int,
-    first: int,
-    last: int,
-    log_weight: NDArray[np.float32],
-    log_prior: NDArray[np.float32],
-    none: tuple[float, float, float],
-    posterior: NDArray[np.float32],
-    by_amplitude: NDArray[np.float64],
-) -> tuple[float, float]:
+    score: Float32, edge: Float32, length: int, first: int, last: int, log_weight: Float32, log_prior: Float32,
+    none: tuple[float, float, float], posterior: Float32, by_amplitude: Float64,
+) -> tuple[float, float]:  # fmt: skip
     """Posterior (length,) over positions, summed over amplitudes; by_amplitude (M,) sums the other way.
 
     none: prior of a row that is behind its stripe all along (nearer than the picture), of one that is before it, and of
@@ -227,7 +203,7 @@ def row_posterior(
 
 
 @numba.njit(cache=True, nogil=True)
-def mode_of(posterior: NDArray[np.float32], first: int, last: int) -> tuple[int, float]:
+def mode_of(posterior: Float32, first: int, last: int) -> tuple[int, float]:
     """Most probable position, ties to the smaller index, and the probability of lying within 1 px of it."""
     mode = first
     for j in range(first, last + 1):

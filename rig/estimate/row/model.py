@@ -18,6 +18,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from rig.estimate.row.likelihood import LABEL_PX, LABELS
+from rig.simd import Float32, Float64
 
 BINS = 64
 """Bins of path inverse depth of the profiles."""
@@ -46,21 +47,19 @@ class RowModel:
     labels that the map before left to this one (`rig.estimate.joint.temporal`), None where it left none.
     """
 
-    profile: NDArray[np.float32]
+    profile: Float32
     w_lo: float
     per_w: float
-    row_gain: NDArray[np.float32]
-    column_gain: NDArray[np.float32]
-    ambient: NDArray[np.float32]
-    amplitude: NDArray[np.float32]
-    weight: NDArray[np.float64]
+    row_gain: Float32
+    column_gain: Float32
+    ambient: Float32
+    amplitude: Float32
+    weight: Float64
     none_weight: float
     line_sigma_px: float
     extinction_per_m: float
     extinction_sd_per_m: float
-    halo: NDArray[np.float32] = field_of(
-        default_factory=lambda: np.zeros((HALO_NODES, len(HALO_REACHES_PX)), np.float32)
-    )
+    halo: Float32 = field_of(default_factory=lambda: np.zeros((HALO_NODES, len(HALO_REACHES_PX)), np.float32))
     before: NDArray[np.uint16] | None = None
 
     def arrays(self) -> dict[str, NDArray[np.generic]]:
@@ -79,24 +78,28 @@ class RowModel:
         values: dict[str, Any] = {name: value if value.ndim else float(value) for name, value in kept.items()}
         return cls(**values)
 
-    def path_m(self) -> NDArray[np.float64]:
+    def hot_flux(self) -> float:
+        """Ambient light in photons per exposure above which a pixel teaches nothing of the medium."""
+        return 5.0 * float(np.median(self.ambient)) + 1e-3
+
+    def path_m(self) -> Float64:
         """Mean of the two path lengths at each profile bin, (BINS,) metres."""
         return 1.0 / (self.w_lo + np.arange(BINS) / self.per_w)
 
 
-def stripe_scale(path_m: NDArray[np.float64], extinction_per_m: float) -> NDArray[np.float64]:
+def stripe_scale(path_m: Float64, extinction_per_m: float) -> Float64:
     """Relative strength of a stripe of given reflectance over distance, 1 at the middle of the inverse depth range."""
     log_scale = -2.0 * np.log(path_m) - 2.0 * extinction_per_m * path_m
     middle = len(path_m) // 2
     return np.asarray(np.exp(np.clip(log_scale - log_scale[middle], -30.0, 30.0)))
 
 
-def line_profile(sigma_px: float) -> NDArray[np.float32]:
+def line_profile(sigma_px: float) -> Float32:
     """Share of a Gaussian line in the pixels 0, 1, ... T px from its centre; T = 2 to 6 covers 2.5 sigma."""
     return pixel_shares(sigma_px, np.arange(_reach(sigma_px) + 1, dtype=np.float64))
 
 
-def fine_profiles(sigma_px: float) -> NDArray[np.float32]:
+def fine_profiles(sigma_px: float) -> Float32:
     """Share of the line in pixels -R..R for centres a quarter pixel apart around 0, (LABELS, 2R + 1) float32."""
     reach = _reach(sigma_px) + 1
     centres = (np.arange(LABELS) - LABELS // 2) * LABEL_PX
@@ -107,7 +110,7 @@ def _reach(sigma_px: float) -> int:
     return int(min(max(2, math.ceil(2.5 * sigma_px)), 6))
 
 
-def pixel_shares(sigma_px: float, distance_px: NDArray[np.float64]) -> NDArray[np.float32]:
+def pixel_shares(sigma_px: float, distance_px: Float64) -> Float32:
     """Integral of a unit Gaussian over the pixels at the given distances."""
     erf = np.vectorize(math.erf, otypes=[np.float64])
     scale = 1.0 / (math.sqrt(2.0) * sigma_px)
@@ -124,7 +127,7 @@ class HazeFit:
     extinction_sd_per_m: float
 
 
-def fit_haze(path_m: NDArray[np.float64], flux: NDArray[np.float64], variance: NDArray[np.float64]) -> HazeFit | None:
+def fit_haze(path_m: Float64, flux: Float64, variance: Float64) -> HazeFit | None:
     """Weighted fit of an exponential to haze flux (bins,) with its variance (bins,); None where there is no haze.
 
     Gauss-Newton on amplitude and extinction, the latter kept in 0 to EXTINCTION_MAX_PER_M and OPTICAL_DEPTH_MAX at the
@@ -140,32 +143,32 @@ def fit_haze(path_m: NDArray[np.float64], flux: NDArray[np.float64], variance: N
     most = min(EXTINCTION_MAX_PER_M, OPTICAL_DEPTH_MAX / float(s.min()))
     candidates = np.concatenate([[0.0], np.geomspace(min(0.005, most), most, 60)])
 
-    def residual(extinction: float) -> tuple[float, float]:
+    def fitted(extinction: float) -> tuple[float, Float64]:
+        """Best amplitude at an extinction, and the shape of the haze."""
         shape = np.exp(-2.0 * extinction * (s - s.min()))
-        amplitude = float(np.sum(weight * shape * h) / np.sum(weight * shape**2))
-        return float(np.sum(weight * (h - amplitude * shape) ** 2)), amplitude
+        return float(np.sum(weight * shape * h) / np.sum(weight * shape**2)), shape
 
-    extinction = float(candidates[int(np.argmin([residual(float(e))[0] for e in candidates]))])
+    def misfit(extinction: float) -> float:
+        amplitude, shape = fitted(extinction)
+        return float(np.sum(weight * (h - amplitude * shape) ** 2))
+
+    def linear(extinction: float) -> tuple[float, Float64, Float64]:
+        """Amplitude, slopes of the haze by amplitude and extinction, and the matrix of the normal equations."""
+        amplitude, shape = fitted(extinction)
+        design = np.stack([shape, -2.0 * (s - s.min()) * amplitude * shape])
+        return amplitude, design, (design * weight) @ design.T
+
+    extinction = float(candidates[int(np.argmin([misfit(float(e)) for e in candidates]))])
     for _ in range(20):
-        amplitude = residual(extinction)[1]
-        shape = np.exp(-2.0 * extinction * (s - s.min()))
-        slope = -2.0 * (s - s.min()) * amplitude * shape
-        design = np.stack([shape, slope])
-        normal = (design * weight) @ design.T
+        amplitude, design, normal = linear(extinction)
         if np.linalg.det(normal) <= 1e-12 * normal[0, 0] * max(normal[1, 1], 1e-300):
             break
-        step = float(np.linalg.solve(normal, (design * weight) @ (h - amplitude * shape))[1])
-        extinction = float(
-            np.clip(extinction + np.clip(step, -0.5 * extinction - 0.01, 0.5 * extinction + 0.01), 0.0, most)
-        )
+        step = float(np.linalg.solve(normal, (design * weight) @ (h - amplitude * design[0]))[1])
+        most_step = 0.5 * extinction + 0.01
+        extinction = float(np.clip(extinction + np.clip(step, -most_step, most_step), 0.0, most))
         if abs(step) < 1e-7:
             break
-    misfit, amplitude = residual(extinction)
-    shape = np.exp(-2.0 * extinction * (s - s.min()))
-    slope = -2.0 * (s - s.min()) * amplitude * shape
-    normal = (np.stack([shape, slope]) * weight) @ np.stack([shape, slope]).T
-    determinant = float(np.linalg.det(normal))
-    sd = (
-        np.inf if determinant <= 0 else float(np.sqrt(normal[0, 0] / determinant * max(misfit / (used.sum() - 2), 1.0)))
-    )
+    amplitude, _, normal = linear(extinction)
+    determinant, scatter = float(np.linalg.det(normal)), max(misfit(extinction) / (used.sum() - 2), 1.0)
+    sd = np.inf if determinant <= 0 else float(np.sqrt(normal[0, 0] / determinant * scatter))
     return HazeFit(amplitude * float(np.exp(2.0 * extinction * s.min())), extinction, sd)

@@ -18,6 +18,7 @@ from numpy.typing import NDArray
 
 from rig.estimate.row.likelihood import FLUX_MAX, FLUX_MIN, LABEL_PX, LABELS, cell_of
 from rig.estimate.search.tables import LN2, WEIGHT_LIMIT, count_place
+from rig.simd import Float32
 from rig.simd.memory import aligned_zeros, load_bytes, load_float32, read_int16
 from rig.simd.vectors import (
     LANES,
@@ -54,15 +55,15 @@ class Closeup(NamedTuple):
     """
 
     weight: NDArray[np.int8]
-    constant: NDArray[np.float32]
-    label: NDArray[np.float32]
-    square: NDArray[np.float32]
+    constant: Float32
+    label: Float32
+    square: Float32
 
 
 @numba.njit(cache=True, nogil=True)
 def label_weights(
-    ambient: float, share: float, near_is_left: bool, fine: NDArray[np.float32], table: NDArray[np.float32]
-) -> tuple[NDArray[np.float32], NDArray[np.float32]]:
+    ambient: float, share: float, near_is_left: bool, fine: Float32, table: Float32
+) -> tuple[Float32, Float32]:
     """Weight of a count for each label, (LEVELS, LEVELS, F, LABELS), and of an exposure, (LEVELS, LEVELS, LABELS).
 
     Both in octaves of likelihood, less their mean over the labels. ambient: photons per exposure; share: the pedestal's
@@ -92,7 +93,7 @@ def label_weights(
     return weight, constant
 
 
-def closeup_tables(weight: NDArray[np.float32], constant: NDArray[np.float32], units: int) -> Closeup:
+def closeup_tables(weight: Float32, constant: Float32, units: int) -> Closeup:
     """Tables in so many units an octave, from `label_weights`."""
     pixels = weight.shape[2]
     reach = (pixels - 1) // 2
@@ -110,12 +111,12 @@ def closeup_tables(weight: NDArray[np.float32], constant: NDArray[np.float32], u
     return Closeup(pairs, padded, index, index * index)
 
 
-def largest_score(weight: NDArray[np.float32], units: int) -> float:
+def largest_score(weight: Float32, units: int) -> float:
     """Largest sum of the weights of a label, in so many units an octave, from `label_weights`."""
     return float(np.abs(_cut(weight, units)).sum(axis=2).max())
 
 
-def _cut(weight: NDArray[np.float32], units: int) -> NDArray[np.float32]:
+def _cut(weight: Float32, units: int) -> Float32:
     """Weights in whole units, cut to what 8 bits hold."""
     return np.clip(np.rint(weight * np.float32(units)), -WEIGHT_LIMIT, WEIGHT_LIMIT)
 

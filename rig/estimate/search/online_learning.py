@@ -23,6 +23,7 @@ from rig.estimate.search.prepare import judge_of
 from rig.estimate.search.stream import search_volume
 from rig.geometry.stripe_table import StripeTable
 from rig.geometry.windows import SweepGeometry
+from rig.simd import Float64
 from rig.threads import RowWorkers, yield_to_others
 
 LEAST_SURE = 0.02
@@ -39,11 +40,9 @@ Tables = TypeVar("Tables")
 
 @dataclass(frozen=True, slots=True, eq=False)
 class LearningSetting:
-    """A model and the kind of sweep that tables are made for.
+    """A model and the kind of sweep that tables are made for. UsageError where it was learned from one of another size.
 
     exposures: of most columns; dark: whether sweeps have dark frames.
-
-    UsageError where the model was learned from a sweep of another size.
     """
 
     model: RowModel
@@ -54,11 +53,12 @@ class LearningSetting:
     def __post_init__(self) -> None:
         """Check the model's size: kernels do not, and would read beyond the end of a model that is too small."""
         model, geometry = self.model, self.geometry
+        size = "{} rows of {} pixels and {} columns".format
         learned = *model.ambient.shape, len(model.column_gain)
         here = geometry.rows, geometry.width, geometry.columns
         if learned != here or len(model.row_gain) != geometry.rows:
             raise UsageError(
-                f"the learned state is of {_size(*learned)}, the sweep of {_size(*here)}; estimate it with a state of "
+                f"the learned state is of {size(*learned)}, the sweep of {size(*here)}; estimate it with a state of "
                 "its own, or with none, to learn one from it"
             )
 
@@ -66,10 +66,6 @@ class LearningSetting:
         """Whether the other has the same tables."""
         alike = (self.exposures, self.dark) == (other.exposures, other.dark)
         return alike and self.model is other.model and self.geometry is other.geometry
-
-
-def _size(rows: int, pixels: int, columns: int) -> str:
-    return f"{rows} rows of {pixels} pixels and {columns} columns"
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -82,7 +78,7 @@ class Seen:
 
     tally: FrameTally
     intensity: NDArray[np.uint32]
-    quiet: NDArray[np.float64]
+    quiet: Float64
     lines: Lines
     more: Any = None
 
@@ -147,9 +143,8 @@ class OnlineLearner(Generic[Tables]):
         """The setting carried on by one sweep, and the tables that follow from it, on one thread beside the stream."""
         ambient = ambient_map(seen.tally, seen.intensity, setting.geometry, seen.quiet)
         with RowWorkers(1) as workers:
-            model, taught = learn_next(
-                seen.lines, setting.geometry, replace(setting.model, ambient=ambient), before, workers
-            )
+            model = replace(setting.model, ambient=ambient)
+            model, taught = learn_next(seen.lines, setting.geometry, model, before, workers)
             setting = replace(setting, model=model)
             if self._learn_more is not None:
                 setting = replace(setting, model=self._learn_more(setting, seen.more, workers))

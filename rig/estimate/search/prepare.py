@@ -8,17 +8,27 @@ are halved (`judge_of`); tests/unit/rig/estimate/search/test_prepare.py checks t
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
 from rig.count.lane_order import PAIRS, STEPS, padded_lanes, pair_bytes, pixel_order, places_of
 from rig.estimate.row.inputs import TABLE, RowState, Sweep, state_of, sweep_of
 from rig.estimate.row.model import RowModel
 from rig.estimate.search.closeup import closeup_tables, label_weights, largest_score
-from rig.estimate.search.inputs import COUNT_LIMIT, EXPOSURE_PARTS, FIELDS, RowAnswers, SearchTables, count_fluxes
-from rig.estimate.search.rows import QUIET_STEP, SIGNAL_REACH_PX, halvings, turned
+from rig.estimate.search.rows import (
+    COUNT_LIMIT,
+    EXPOSURE_PARTS,
+    FIELDS,
+    QUIET_STEP,
+    SIGNAL_REACH_PX,
+    RowAnswers,
+    SearchTables,
+    count_fluxes,
+    halvings,
+    turned,
+)
 from rig.estimate.search.tables import NONE, SCREENS, WEIGHT_LIMIT, ScreenTables, fill_tables
 from rig.geometry.stripe_table import StripeTable
 from rig.geometry.windows import WORD_PX, SweepGeometry
+from rig.simd import Bools, Float32, Float64, Int16, Int32
 from rig.simd.memory import aligned_zeros
 from rig.simd.vectors import LANES
 from rig.threads import RowWorkers
@@ -88,33 +98,15 @@ def judge_of(
     padded = np.zeros((bands, int(geometry.x0.max(initial=0)) + geometry.window), np.float32)
     padded[:, : geometry.width] = state.ambient[:, : padded.shape[1]]
     return SearchTables(
-        tables=tables,
-        closeup=closeup,
-        band_rows=band_rows,
-        x0=geometry.x0,
-        window=geometry.window,
-        rows=geometry.rows,
-        limits=_limits(geometry),
-        near_is_left=geometry.near_is_left,
-        ambient=padded,
-        hot_start=hot_start,
-        hot_at=hot_at,
-        hot_place=hot_place,
-        nominal=np.float32(nominal),
-        faintest=np.float32(model.amplitude[0]),
-        brightest=np.float32(model.amplitude[-1]),
-        reach=max(SIGNAL_REACH_PX, reach),
-        shift=shift,
-        close_shift=close_shift,
-        most=most,
-        quiet_step=QUIET_STEP if dark else 1,
-        flux=count_fluxes(),
-    )
+        tables=tables, closeup=closeup, band_rows=band_rows, x0=geometry.x0, window=geometry.window, rows=geometry.rows,
+        limits=_limits(geometry), near_is_left=geometry.near_is_left, ambient=padded, hot_start=hot_start,
+        hot_at=hot_at, hot_place=hot_place, nominal=np.float32(nominal), faintest=np.float32(model.amplitude[0]),
+        brightest=np.float32(model.amplitude[-1]), reach=max(SIGNAL_REACH_PX, reach), shift=shift,
+        close_shift=close_shift, most=most, quiet_step=QUIET_STEP if dark else 1, flux=count_fluxes(),
+    )  # fmt: skip
 
 
-def _hot_of_windows(
-    hot: NDArray[np.bool_], geometry: SweepGeometry
-) -> tuple[NDArray[np.int32], NDArray[np.int16], NDArray[np.int32]]:
+def _hot_of_windows(hot: Bools, geometry: SweepGeometry) -> tuple[Int32, Int16, Int32]:
     """hot_start, hot_at and hot_place of `SearchTables`; hot: (rows, width)."""
     lanes, rows = padded_lanes(geometry.window), geometry.rows
     starts, at, places = [], [np.zeros(0, np.int16)], [np.zeros(0, np.int32)]
@@ -130,7 +122,7 @@ def _hot_of_windows(
     return np.array(starts, np.int32), np.concatenate(at), np.concatenate(places)
 
 
-def nothing_found(geometry: SweepGeometry, lines: tuple[NDArray[np.int32], NDArray[np.int32]] | None) -> RowAnswers:
+def nothing_found(geometry: SweepGeometry, lines: tuple[Int32, Int32] | None) -> RowAnswers:
     """Empty results of a sweep; lines: (rows, columns) whose counts are to be kept, sorted by column."""
     rows, columns = geometry.rows, geometry.columns
     lanes = -(-geometry.width // WORD_PX) * WORD_PX // STEPS + LANES
@@ -138,16 +130,14 @@ def nothing_found(geometry: SweepGeometry, lines: tuple[NDArray[np.int32], NDArr
     stripe[:, 1] = 0.0
     line_row, line_column = (np.zeros(0, np.int32),) * 2 if lines is None else lines
     return RowAnswers(
-        stripe=stripe,
-        quiet=np.zeros((rows, PAIRS, lanes, 2), np.int32),
-        quiet_exposures=np.zeros((rows, lanes + 1), np.int32),
-        light=np.zeros((rows, PAIRS, lanes, 2), np.int32),
+        stripe=stripe, quiet=np.zeros((rows, PAIRS, lanes, 2), np.int32),
+        quiet_exposures=np.zeros((rows, lanes + 1), np.int32), light=np.zeros((rows, PAIRS, lanes, 2), np.int32),
         quiet_here=aligned_zeros((rows, PAIRS, padded_lanes(geometry.window), 2), np.uint8),
         light_here=aligned_zeros((rows, PAIRS, padded_lanes(geometry.window), 2), np.uint8),
         lines=np.zeros((len(line_row), geometry.window), np.int32),
         line_start=np.searchsorted(line_column, np.arange(columns + 1)).astype(np.int32),
         line_row=np.ascontiguousarray(line_row),
-    )
+    )  # fmt: skip
 
 
 def clear_found(found: RowAnswers) -> None:
@@ -166,13 +156,13 @@ def stripes_of(found: RowAnswers, judge: SearchTables, workers: RowWorkers) -> S
     return StripeTable(*out)
 
 
-def quiet_of(found: RowAnswers, width: int) -> NDArray[np.float64]:
+def quiet_of(found: RowAnswers, width: int) -> Float64:
     """Ones and exposures of pixels while clearly behind a stripe, float64 (2, rows, width); both as halved."""
     exposures = np.repeat(np.cumsum(found.quiet_exposures[:, :-1], axis=1), STEPS, axis=1)[:, :width]
     return np.stack([pixel_order(found.quiet, width), exposures / EXPOSURE_PARTS])
 
 
-def _limits(geometry: SweepGeometry) -> NDArray[np.int16]:
+def _limits(geometry: SweepGeometry) -> Int16:
     low = np.maximum(geometry.x_lo - geometry.x0, 0)
     high = np.minimum(geometry.x_hi - geometry.x0, geometry.window - 1)
     limits = np.zeros((geometry.columns, 2, geometry.rows + LANES), np.int16)
@@ -195,7 +185,7 @@ def rows_of_band(geometry: SweepGeometry) -> int:
     return BAND_ROWS[-1]
 
 
-def _lights(model: RowModel) -> tuple[NDArray[np.float32], NDArray[np.float32]]:
+def _lights(model: RowModel) -> tuple[Float32, Float32]:
     """Amplitudes of the search and the logarithm of their shares: the dim and the bright half of the learned ones."""
     log_q, weight = np.log(model.amplitude.astype(np.float64)), np.maximum(model.weight, 1e-6)
     halves = np.array_split(np.arange(len(log_q)), SCREENS)
@@ -223,7 +213,7 @@ def _banded(sweep: Sweep, state: RowState, band_rows: int) -> tuple[Sweep, RowSt
     )  # fmt: skip
 
 
-def _usual_mean(ambient: NDArray[np.float32]) -> NDArray[np.float32]:
+def _usual_mean(ambient: Float32) -> Float32:
     """Mean over the rows (rows, width) of pixels that are not hot."""
     usual = ambient <= HOT_FACTOR * np.median(ambient, axis=0) + HOT_FLUX
     return np.asarray((np.where(usual, ambient, 0.0).sum(0) / usual.sum(0)).astype(np.float32))
@@ -236,37 +226,28 @@ def _empty_tables(columns: int, bands: int, lanes: int, reach: int, *, others: b
         return aligned_zeros((columns, bands, *shape), dtype)
 
     return ScreenTables(
-        edge=of(PAIRS, lanes, 2, dtype=np.int8),
-        tap=of(SCREENS, STEPS, reach + 1, lanes, 2, dtype=np.int8),
-        position=of(SCREENS, pixels, dtype=np.int16),
-        slope=of(SCREENS, pixels, dtype=np.int16),
-        lane=of(lanes),
-        none=of(NONE),
-        neutral=of(pixels),
-        before=of(pixels),
-        scale=of(pixels),
-        first=of(dtype=np.int32),
-        last=of(dtype=np.int32),
-        ambient=of(pixels) if others else aligned_zeros((0, bands, pixels), np.float32),
-    )
+        edge=of(PAIRS, lanes, 2, dtype=np.int8), tap=of(SCREENS, STEPS, reach + 1, lanes, 2, dtype=np.int8),
+        position=of(SCREENS, pixels, dtype=np.int16), slope=of(SCREENS, pixels, dtype=np.int16), lane=of(lanes),
+        none=of(NONE), neutral=of(pixels), before=of(pixels), scale=of(pixels), first=of(dtype=np.int32),
+        last=of(dtype=np.int32), ambient=of(pixels) if others else aligned_zeros((0, bands, pixels), np.float32),
+    )  # fmt: skip
 
 
-def _largest(sweep: Sweep, state: RowState, light: NDArray[np.float32], reach: int) -> tuple[float, float]:
+def _largest(sweep: Sweep, state: RowState, light: Float32, reach: int) -> tuple[float, float]:
     """Largest sum of a position's taps, or half of that of a lane's edge weights, which stand alone, and largest tap.
 
     In octaves, from the tables of one band in the middle of some columns.
     """
     columns = np.unique(np.linspace(0, sweep.plane.shape[0] - 1, LOOKED_AT).astype(np.int64))
     middle = slice(sweep.u.shape[0] // 2, sweep.u.shape[0] // 2 + 1)
+    x_lo, x_hi = (np.ascontiguousarray(x[middle, columns]) for x in (sweep.x_lo, sweep.x_hi))
     few = sweep._replace(
-        x0=sweep.x0[columns], plane=np.ascontiguousarray(sweep.plane[columns]),
-        x_lo=np.ascontiguousarray(sweep.x_lo[middle, columns]), x_hi=np.ascontiguousarray(sweep.x_hi[middle, columns]),
-        u=np.ascontiguousarray(sweep.u[middle]), v=np.ascontiguousarray(sweep.v[middle]), others=sweep.others[columns],
+        x0=sweep.x0[columns], plane=sweep.plane[columns], x_lo=x_lo, x_hi=x_hi, u=sweep.u[middle], v=sweep.v[middle],
+        others=sweep.others[columns],
     )  # fmt: skip
     part = state._replace(
-        ambient=np.ascontiguousarray(state.ambient[middle]), row_gain=np.ascontiguousarray(state.row_gain[middle]),
-        column_gain=np.ascontiguousarray(state.column_gain[columns]),
-    )  # fmt: skip
+        ambient=state.ambient[middle], row_gain=state.row_gain[middle], column_gain=state.column_gain[columns]
+    )
     tables = _empty_tables(len(columns), 1, padded_lanes(sweep.window), reach)
     fill_tables(few, part, light, np.zeros(SCREENS, np.float32), ROUGH_UNITS, 1.0, 0, 1, tables)
     tap, edge = np.abs(tables.tap.astype(np.int64)), np.abs(tables.edge.astype(np.int64))

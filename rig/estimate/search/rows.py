@@ -2,23 +2,20 @@
 
 Every position is scored, the best looked at closely, and what the row teaches noted. BATCH rows of one column go
 together through 16-bit scores (`rig.estimate.search.scores`, tables of `rig.estimate.search.tables`), with SCREENS
-amplitudes instead of all, one table for a band of rows and counts of 6 bits. Answers are float32 (FIELDS, rows) per
-column (`RowAnswers`).
+amplitudes instead of all, one table for a band of rows and counts of 6 bits. `SearchTables` go in, `RowAnswers`
+come out, float32 (FIELDS, rows) per column; kernels get `SearchPointers` to both.
 
-`judge_rows` serves frames as they come and counts of whole sweeps (`rig.estimate.search.stream`): the answers are the
-same bit for bit.
+`judge_rows` serves frames as they come and counts of whole sweeps (`rig.estimate.search.stream`).
 """
 
-from typing import Final
+from typing import Final, NamedTuple
 
 import numba
 import numpy as np
-from numpy.typing import NDArray
 
 from rig.count.lane_order import PAD, PAIRS, STEPS, pair_bytes, place_of
 from rig.estimate.row.likelihood import LABEL_PX
-from rig.estimate.search.closeup import label_scores, levels_of, offsets
-from rig.estimate.search.inputs import COUNT_LIMIT, EXPOSURE_PARTS, FIELDS, SearchPointers
+from rig.estimate.search.closeup import Closeup, label_scores, levels_of, offsets
 from rig.estimate.search.scores import (
     NOTHING,
     START,
@@ -29,14 +26,16 @@ from rig.estimate.search.scores import (
     fit_positions,
     score_rows,
 )
-from rig.estimate.search.tables import BATCH, NONE, OUTSIDE, SCREENS, ScreenTable, Search, count_place
+from rig.estimate.search.tables import BATCH, NONE, OUTSIDE, SCREENS, ScreenTable, ScreenTables, Search, count_place
 from rig.geometry.windows import WORD_PX
+from rig.simd import Float32, Int16, Int32, Uint8
 from rig.simd.functions import lift_to_powers, powers, powers_in_order
 from rig.simd.memory import (
     CACHE_LINE,
     load_bytes,
     load_float32,
     load_int16,
+    pointers,
     prefetch,
     read_byte,
     read_float32,
@@ -51,6 +50,118 @@ from rig.simd.memory import (
 )
 from rig.simd.shuffles import lanes_between, largest_of_rows, store_folded, totals_of_rows
 from rig.simd.vectors import LANES, as_bytes, larger, larger_float, smaller, smaller_float, to_float32
+
+COUNT_LIMIT: Final = 63
+"""Largest count the search works with; counts of more exposures are halved until they fit."""
+EXPOSURE_PARTS: Final = 4
+"""Steps per exposure: where counts are halved exposures become fractions, 65 become 32.5, 65535 become 63.999."""
+FIELDS: Final = 5
+"""Fields of an answer: x_px, confidence, x_sd_px, signal and haze, see `StripeTable`."""
+
+
+class SearchTables(NamedTuple):
+    """Inputs of the search in the rows of a sweep, fixed while the sweep lasts.
+
+    x0: int32 (columns,), first stored pixel; window: stored pixels; limits: int16 (columns, 2, rows + LANES), first and
+    last stored pixel of each search window, the first behind the last where there is none. rows: of the picture.
+    ambient: float32 (bands, width padded to whole words). hot_start: int32 (words, rows + 1), for windows that begin at
+    each word the first entry of each row in hot_at, int16, stored pixels whose counts say nothing, and hot_place,
+    int32, their places in the counts of all rows of the picture. nominal: exposures the tables are for. faintest,
+    brightest: photons of a stripe at scale 1. reach: half the line's width in px. shift: units of the scores are
+    128 >> shift an octave, close_shift: of the close-up's. most: largest count. quiet_step: one column in so many
+    teaches the ambient light. flux: see `count_fluxes`.
+    """
+
+    tables: ScreenTables
+    closeup: Closeup
+    band_rows: int
+    x0: Int32
+    window: int
+    rows: int
+    limits: Int16
+    near_is_left: bool
+    ambient: Float32
+    hot_start: Int32
+    hot_at: Int16
+    hot_place: Int32
+    nominal: np.float32
+    faintest: np.float32
+    brightest: np.float32
+    reach: int
+    shift: int
+    close_shift: int
+    most: int
+    quiet_step: int
+    flux: Float32
+
+
+class RowAnswers(NamedTuple):
+    """Answers of a sweep, to be filled.
+
+    stripe: float32 (columns, FIELDS, rows), NaN and confidence 0 where there is nothing. quiet: int32 (rows, PAIRS,
+    lanes of the sensor + LANES, 2), ones of pixels while clearly behind a stripe, in lane order; quiet_exposures: int32
+    (rows, lanes + 1), their exposures in 1/EXPOSURE_PARTS as steps up and down. light: int32, like quiet, ones of every
+    pixel within the windows. The latest ones of both are still in quiet_here and light_here, uint8 (rows, PAIRS, lanes
+    of the window, 2). lines: int32 (lines, window), counts of the rows that the learning reads; line_start:
+    int32 (columns + 1,) and line_row: int32, the rows of each column in order.
+    """
+
+    stripe: Float32
+    quiet: Int32
+    quiet_exposures: Int32
+    light: Int32
+    quiet_here: Uint8
+    light_here: Uint8
+    lines: Int32
+    line_start: Int32
+    line_row: Int32
+
+
+class SearchPointers(NamedTuple):
+    """Pointers (`rig.simd.memory.pointers`) to tables, answers and a thread's memory, with the sizes of their arrays.
+
+    bands, taps: tables of a column, and pairs that a table has taps for; weight_pairs: the same of the close-up.
+    lanes: of the window, sum_lanes: of the sums over the picture. limit_rows: of `limits`. ambient: that of the
+    tables where they have it (several_lines), else of the bands, ambient_px wide.
+    """
+
+    judge: SearchTables
+    found: RowAnswers
+    memory: int
+    lanes: int
+    bands: int
+    taps: int
+    weight_pairs: int
+    sum_lanes: int
+    limit_rows: int
+    ambient: int
+    ambient_px: int
+    several_lines: bool
+
+
+def pointers_of(judge: SearchTables, found: RowAnswers, memory: Uint8) -> SearchPointers:
+    """Pointers to everything; the arrays must outlive them. memory: of a thread, see `search_memory`."""
+    tables = judge.tables
+    several_lines = tables.ambient.shape[0] > 0
+    ambient = tables.ambient if several_lines else judge.ambient
+    return SearchPointers(
+        judge=pointers(judge), found=pointers(found), memory=memory.ctypes.data, lanes=tables.lane.shape[2],
+        bands=tables.lane.shape[1], taps=tables.tap.shape[4], weight_pairs=judge.closeup.weight.shape[3],
+        sum_lanes=found.light.shape[2], limit_rows=judge.limits.shape[2], ambient=ambient.ctypes.data,
+        ambient_px=judge.ambient.shape[1], several_lines=several_lines,
+    )  # fmt: skip
+
+
+def count_fluxes() -> Float32:
+    """Photons per exposure that n ones in k exposures speak for, float32: log (k + 1/2) / (k - n + 1/2).
+
+    Nearly unbiased, finite also at n = k. Rows are k in steps of 1/EXPOSURE_PARTS, columns n: up to one more than
+    COUNT_LIMIT, since halved counts are rounded up.
+    """
+    parts, n = np.mgrid[: EXPOSURE_PARTS * (COUNT_LIMIT + 1), : COUNT_LIMIT + 2]
+    k = parts / EXPOSURE_PARTS
+    return np.log((k + 0.5) / (np.maximum(k - n, 0) + 0.5)).astype(np.float32)
+
 
 QUIET: Final = 0.9
 """Probability within 1 px from which the pixels behind the stripe teach the ambient light."""
@@ -317,9 +428,7 @@ def keep_line(n: int, lanes: int, window: int, to: int) -> None:
 
 
 @numba.njit(cache=True, nogil=True)
-def turned(
-    stripe: NDArray[np.float32], limits: NDArray[np.int16], first_row: int, last_row: int, out: NDArray[np.float32]
-) -> None:
+def turned(stripe: Float32, limits: Int16, first_row: int, last_row: int, out: Float32) -> None:
     """Rows first_row..last_row-1 of answers (columns, FIELDS, rows) as (FIELDS, rows, columns).
 
     limits: as in `SearchTables`; rows without a search window have no answer.

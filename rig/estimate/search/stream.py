@@ -1,7 +1,4 @@
-"""A sweep judged while its frames come in, by the fast form of `rig.estimate.row.likelihood` that is tested against it.
-
-That form is `rig.estimate.search.rows`; judging on the way gives the very bits of judging a sweep that is counted
-already.
+"""A sweep judged while its frames come in, by `rig.estimate.search.rows`: the very bits of judging it afterwards.
 
 `ColumnJudge` is the counter of `likelihood`: it judges each column as soon as it is complete and keeps no counts of it.
 Rows are worked through in chunks, so that counts never leave the cache. A chunk's counters, uint64 bit planes
@@ -29,15 +26,24 @@ from rig.count.lane_order import (
     sum_counts,
 )
 from rig.count.map_checks import check_points
-from rig.count.volume import BYTE_FRAMES, CountVolume, FrameTally, SweepLayout, SweepTally
+from rig.count.volume import BYTE_FRAMES, Counts, CountVolume, FrameTally, SweepLayout, SweepTally
 from rig.estimate.row.em import next_lattice
 from rig.estimate.row.inputs import Lines
-from rig.estimate.search.inputs import RowAnswers, SearchPointers, SearchTables, pointers_of
 from rig.estimate.search.prepare import clear_found, nothing_found, quiet_of, stripes_of
-from rig.estimate.search.rows import halvings, judge_rows, keep_line, table_for
+from rig.estimate.search.rows import (
+    RowAnswers,
+    SearchPointers,
+    SearchTables,
+    halvings,
+    judge_rows,
+    keep_line,
+    pointers_of,
+    table_for,
+)
 from rig.estimate.search.tables import BATCH, search_in, search_memory
 from rig.geometry.stripe_table import StripeTable
 from rig.geometry.windows import WORD_PX, SweepGeometry
+from rig.simd import Float64, Int32, Uint8
 from rig.simd.memory import add_bytes, address_of, load_bytes, read_int32, store_bytes
 from rig.simd.vectors import LANES, zero_bytes
 from rig.threads import RowWorkers
@@ -140,17 +146,9 @@ def _finish_rows(desk, search, state, planes, row_bytes, first_row, last_row):  
 
 @numba.njit(cache=True, nogil=True)
 def search_frames(
-    words: NDArray[np.uint64],
-    bins: NDArray[np.int32],
-    first_word: NDArray[np.int32],
-    row_words: int,
-    open_column: OpenColumn,
-    end: bool,
-    desk: SearchPointers,
-    planes: NDArray[np.uint64],
-    first_chunk: int,
-    last_chunk: int,
-) -> OpenColumn:
+    words: NDArray[np.uint64], bins: Int32, first_word: Int32, row_words: int, open_column: OpenColumn, end: bool,
+    desk: SearchPointers, planes: NDArray[np.uint64], first_chunk: int, last_chunk: int,
+) -> OpenColumn:  # fmt: skip
     """Count and judge a block; returns the column that is open behind it.
 
     words: (all words,) of the block's frames; bins: (n,), column of each frame, negative ones are passed over;
@@ -202,13 +200,7 @@ def _after(state: OpenColumn, desk: SearchPointers, column: int, first_word: int
 
 
 @numba.njit(cache=True, nogil=True)
-def search_counts(
-    counts: NDArray[np.unsignedinteger],
-    n_frames: NDArray[np.int32],
-    desk: SearchPointers,
-    first_row: int,
-    last_row: int,
-) -> None:
+def search_counts(counts: Counts, n_frames: Int32, desk: SearchPointers, first_row: int, last_row: int) -> None:
     """Judge rows first_row..last_row-1 of counts (columns, rows, window); no light and no lines are kept."""
     judge, search = desk.judge, search_in(desk.memory, desk.lanes)
     sums_x0, pending = np.int64(0), 0
@@ -248,9 +240,9 @@ class SearchedSweep(FrameTally):
 
     stripe: StripeTable
     light: NDArray[np.uint32]
-    quiet: NDArray[np.float64]
+    quiet: Float64
     lines: Lines
-    checked: NDArray[np.int32]
+    checked: Int32
 
     def intensity(self) -> NDArray[np.uint32]:
         """Counts summed over the columns, (rows, width) uint32."""
@@ -282,7 +274,7 @@ class ColumnJudge:
         self._open: dict[int, OpenColumn] = {}
         self._planes: dict[int, NDArray[np.uint64]] = {}
         self._desks: dict[int, SearchPointers] = {}
-        self._benches: dict[int, NDArray[np.uint8]] = {}
+        self._benches: dict[int, Uint8] = {}
         self._no_columns = np.zeros((0, 0), np.int32)
         self._no_counts = np.zeros((0, layout.rows, layout.window), np.uint8)
 
@@ -294,9 +286,7 @@ class ColumnJudge:
         self._tally.reset()
         self._open, self._desks, self._row_words = {}, {}, 0
 
-    def add(
-        self, bits: NDArray[np.uint8], bins: NDArray[np.int32], column: NDArray[np.float64], x0: NDArray[np.int32]
-    ) -> None:
+    def add(self, bits: Uint8, bins: Int32, column: Float64, x0: Int32) -> None:
         """Add frames, see `Counter`; columns that they complete are judged."""
         first_word = x0 // np.int32(WORD_PX)
         self._tally.note(bins, column, first_word)
@@ -340,7 +330,7 @@ class ColumnJudge:
         )  # fmt: skip
 
     def _judge_block(
-        self, words: NDArray[np.uint64], bins: NDArray[np.int32], first_word: NDArray[np.int32], row_words: int, *,
+        self, words: NDArray[np.uint64], bins: Int32, first_word: Int32, row_words: int, *,
         end: bool,
     ) -> None:  # fmt: skip
         layout = self._layout
@@ -378,7 +368,7 @@ class ColumnJudge:
 
 def search_volume(
     volume: CountVolume, geometry: SweepGeometry, judge: SearchTables, workers: RowWorkers
-) -> tuple[StripeTable, NDArray[np.float64]]:
+) -> tuple[StripeTable, Float64]:
     """Stripes as `judge` sees them, and the ones and exposures of pixels behind clear stripes (2, rows, width)."""
     found = nothing_found(geometry, None)
 

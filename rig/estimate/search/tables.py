@@ -21,6 +21,7 @@ from numpy.typing import NDArray
 from rig.count.lane_order import PAIRS, STEPS, pair_bytes, place_of
 from rig.estimate.row.inputs import RowState, Sweep, row_buffers, row_fluxes
 from rig.estimate.row.likelihood import FLUX_MAX, cell_of, none_prior
+from rig.simd import Float32, Int16, Int32, Uint8
 from rig.simd.memory import CACHE_LINE, address_of, read_int16, write_int16
 from rig.simd.shuffles import FOLDED
 from rig.simd.vectors import LANES
@@ -59,30 +60,23 @@ class ScreenTables(NamedTuple):
 
     edge: NDArray[np.int8]
     tap: NDArray[np.int8]
-    position: NDArray[np.int16]
-    slope: NDArray[np.int16]
-    lane: NDArray[np.float32]
-    none: NDArray[np.float32]
-    neutral: NDArray[np.float32]
-    before: NDArray[np.float32]
-    scale: NDArray[np.float32]
-    first: NDArray[np.int32]
-    last: NDArray[np.int32]
-    ambient: NDArray[np.float32]
+    position: Int16
+    slope: Int16
+    lane: Float32
+    none: Float32
+    neutral: Float32
+    before: Float32
+    scale: Float32
+    first: Int32
+    last: Int32
+    ambient: Float32
 
 
 @numba.njit(cache=True, nogil=True)
 def fill_tables(
-    sweep: Sweep,
-    state: RowState,
-    light: NDArray[np.float32],
-    log_share: NDArray[np.float32],
-    units: float,
-    nominal: float,
-    first_band: int,
-    last_band: int,
-    out: ScreenTables,
-) -> None:
+    sweep: Sweep, state: RowState, light: Float32, log_share: Float32, units: float, nominal: float, first_band: int,
+    last_band: int, out: ScreenTables,
+) -> None:  # fmt: skip
     """Tables of bands first_band..last_band-1.
 
     sweep, state: as of a sweep whose rows are the bands (`rig.estimate.search.prepare`). light, log_share:
@@ -219,8 +213,7 @@ def first_pair(s, reach):  # type: ignore[no-untyped-def]
 
 
 BATCH: Final = LANES
-"""Rows that go through each part of the search together: while one waits for a result, others go on, and numbers of
-which a row has one fill the lanes."""
+"""Rows that go through each part of the search together: while one waits for a result, others go on."""
 PLACE_BEFORE: Final = 8
 """Pixels before the first one, and behind the last one, of which the place is known."""
 
@@ -318,7 +311,7 @@ def _search_at(n, lanes):  # type: ignore[no-untyped-def]
 
 
 @numba.njit(cache=True, nogil=True)
-def search_memory(lanes: int) -> NDArray[np.uint8]:
+def search_memory(lanes: int) -> Uint8:
     """Memory for the buffers of a `Search`, at whole cache lines."""
     _, end = _search_at(0, lanes)
     whole = np.zeros(end + CACHE_LINE, np.uint8)

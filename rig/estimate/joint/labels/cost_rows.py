@@ -13,13 +13,14 @@ their own, not inlined: in one function the compiler keeps a register for every 
 for the usual width of the line.
 """
 
-from typing import Any, Final, NamedTuple
+from typing import Final, NamedTuple
 
 import numba
 import numpy as np
-from numpy.typing import NDArray
 
+from rig.count.volume import Counts
 from rig.estimate.joint.labels.grid import (
+    BAND_ROWS,
     FAR_PX,
     LABEL,
     LABEL_END,
@@ -41,16 +42,8 @@ from rig.estimate.joint.labels.halo_rows import (
     new_halo_room,
     rounded,
 )
-from rig.estimate.joint.labels.tables import (
-    BATCH,
-    POSITION,
-    SUMS_FROM,
-    Buffers,
-    Fitted,
-    LabelTables,
-    Ways,
-    new_buffers,
-)
+from rig.estimate.joint.labels.tables import BATCH, POSITION, SUMS_FROM, Buffers, Fitted, LabelTables, Ways, new_buffers
+from rig.simd import Int16, Int32, Uint8
 from rig.simd.memory import (
     CACHE_LINE,
     address_of,
@@ -283,23 +276,15 @@ def room_for(tables: LabelTables, halo: HaloTables, labels: int) -> CostRoom:
 
 @numba.njit(cache=True, nogil=True)
 def fill_costs(
-    counts: NDArray[np.unsignedinteger[Any]],
-    n_frames: NDArray[np.int32],
-    x0: NDArray[np.int32],
-    place: NDArray[np.int16],
-    tables: LabelTables,
-    room: CostRoom,
-    ways: Ways,
-    first_row: int,
-    last_row: int,
-    out: NDArray[np.uint8],
-) -> None:
+    counts: Counts, n_frames: Int32, x0: Int32, place: Int16, tables: LabelTables, room: CostRoom, ways: Ways,
+    first_row: int, last_row: int, out: Uint8,
+) -> None:  # fmt: skip
     """Costs of rows first_row..last_row-1, see `Costs.fill` in `rig.estimate.joint.labels.costs`.
 
     room: pointers to the tables and a thread's buffers.
     """
     at, around, b, labels = room.at, room.halo, room.buffers, out.shape[2]
-    rows, columns, band_rows = out.shape[0], out.shape[1], ways.band_rows
+    rows, columns = out.shape[0], out.shape[1]
     usually, unusually = Fitted(at.fitted_constant, at.fitted_edge), Fitted(b.constant, b.edge)
     place_at, out_at, counts_at = address_of(place), address_of(out), address_of(counts)
     window, in_bytes = counts.shape[2], counts.itemsize == 1
@@ -309,8 +294,8 @@ def fill_costs(
         read = min(read, -(-(FAR_PX + LANES * int(tables.used.max()) + ways.reach) // LANES) * LANES)
     write_int32(b.table, 0, np.int32(-1))
     write_int32(b.shown, 0, np.int32(-1))
-    for band in range(first_row // band_rows, -(-last_row // band_rows)):
-        top, end = max(first_row, band * band_rows), min(last_row, (band + 1) * band_rows)
+    for band in range(first_row // BAND_ROWS, -(-last_row // BAND_ROWS)):
+        top, end = max(first_row, band * BAND_ROWS), min(last_row, (band + 1) * BAND_ROWS)
         for c in range(columns):
             exposures = int(n_frames[c])
             stored = int(x0[c]), window, counts.size, window * rows
@@ -414,7 +399,7 @@ def _fit_table(at: LabelTables, i: int, j: int, per_nat: float, to: Fitted, thro
 
 @numba.njit(cache=True, nogil=True)
 def _read_any(
-    counts: NDArray[np.unsignedinteger[Any]], c: int, y: int, places: int, x0: int, side: int, pixels: int,
+    counts: Counts, c: int, y: int, places: int, x0: int, side: int, pixels: int,
     times: float, b: Buffers, batch: int,
 ) -> None:  # fmt: skip
     """Fill n as `read_bytes` does, from counts of any size."""

@@ -15,11 +15,19 @@ from typing import Final
 
 import numba
 import numpy as np
-from numpy.typing import NDArray
 
 from rig.count.volume import CountVolume
 from rig.estimate.joint.labels.cost_rows import CostRoom, fill_costs, fit_tables, room_for
-from rig.estimate.joint.labels.grid import FAR_PX, FRACTIONS, PHASES, VARIANTS, LabelGrid, label_pixels, places_of
+from rig.estimate.joint.labels.grid import (
+    BAND_ROWS,
+    FAR_PX,
+    FRACTIONS,
+    PHASES,
+    VARIANTS,
+    LabelGrid,
+    label_pixels,
+    places_of,
+)
 from rig.estimate.joint.labels.halo_rows import BLOCK_PX, HaloTables, fill_halo, halo_tables
 from rig.estimate.joint.labels.tables import LIGHTS, LabelTables, Ways, fill_tables, mark_rows, number_tables
 from rig.estimate.joint.winner import UNITS
@@ -37,15 +45,13 @@ from rig.estimate.row.likelihood import FLUX_MAX, cell_of
 from rig.estimate.row.model import RowModel, pixel_shares
 from rig.estimate.search.prepare import HOT_FACTOR, HOT_FLUX
 from rig.geometry.windows import MARGIN_PX, SweepGeometry
+from rig.simd import Bools, Float32, Int16, Int32, Uint8
 from rig.simd.memory import aligned_zeros, pointers
 from rig.simd.vectors import LANES
 from rig.threads import RowWorkers
 
 SHARP: Final = 8.0
-"""Exposures at which a nat is worth half as many units: where rows are sharp, the labels beside the best one must still
-count."""
-BAND_ROWS: Final = 64
-"""Rows that share tables."""
+"""Exposures at which a nat is worth half as many units: the labels beside the best one must still count."""
 FINEST: Final = 64.0
 """Most units of scores per nat."""
 WEIGHT_BITS: Final = 12
@@ -72,7 +78,7 @@ class Costs:
     grid: LabelGrid
     tables: LabelTables
     halo: HaloTables
-    place: NDArray[np.int16]
+    place: Int16
     ways: Ways
     units_per_nat: float
 
@@ -80,12 +86,11 @@ class Costs:
         """Room for one thread to fill costs in, one band of rows after the other."""
         return room_for(self.tables, self.halo, self.grid.labels)
 
-    def fill(self, volume: CountVolume, first: int, last: int, room: CostRoom, out: NDArray[np.uint8]) -> None:
+    def fill(self, volume: CountVolume, first: int, last: int, room: CostRoom, out: Uint8) -> None:
         """Write the costs of rows first..last-1 to out, uint8 (rows, columns, labels) of all rows.
 
-        Cost: by how much a label is less likely than the best one of that row and column (of all that the band has), at
-        most COST_LIMIT; EXCLUDED where it cannot be. Rows without frames, or with nothing to search, cost 0 everywhere.
-        Best called with 16 rows or more at a time; threads may fill different rows at once, each in its own room.
+        Rows without frames, or with nothing to search, cost 0 everywhere. Best called with 16 rows or more at a time;
+        threads may fill different rows at once, each in its own room.
         """
         fill_costs(
             volume.counts, volume.n_frames, volume.x0, self.place, self.tables, pointers(room), self.ways, first, last,
@@ -103,43 +108,36 @@ def costs_of(model: RowModel, geometry: SweepGeometry, grid: LabelGrid, exposure
     bands = -(-geometry.rows // BAND_ROWS)
     at = np.empty((bands, geometry.columns, VARIANTS), np.int32)
     ambient, hot = model.ambient, hot_in_bands(model.ambient)
-    tables = _empty_tables(at, number_tables(place, BAND_ROWS, at), grid, 2 * reach + 1, hot)
+    tables = _empty_tables(at, number_tables(place, at), grid, 2 * reach + 1, hot)
     distance = np.arange(-reach, reach + 1) - (np.arange(FRACTIONS)[:, None] - FRACTIONS // 2) / FRACTIONS
     shares = pixel_shares(model.line_sigma_px, distance)
     beside = np.ascontiguousarray(halo_shares(model, BLOCK_PX // 2 + 1)[:, -1])
     dark = state._replace(ambient=np.zeros_like(ambient), row_gain=_band_means(state.row_gain))
-    scale = 2.0**ways.bits
+    scale, seen = 2.0**ways.bits, (sweep, dark, place, ambient, hot, light)
 
     def work(first: int, last: int) -> None:
-        fill_tables(
-            sweep, dark, place, ambient, hot, light, shares, beside, ways.units * scale, TAPS_LIMIT * scale / ways.most,
-            BAND_ROWS, first, last, tables,
-        )  # fmt: skip
+        most = TAPS_LIMIT * scale / ways.most
+        fill_tables(*seen, shares, beside, ways.units * scale, most, first, last, tables)
 
     workers.over(bands, work)
     halo = halo_tables(tables, bool(model.halo.any()))
 
-    def around(first: int, last: int) -> None:
-        fill_halo(
-            sweep, dark, shares_of_halo, place, ambient, hot, light, ways.units * scale, BAND_ROWS, first, last, tables,
-            halo,
-        )  # fmt: skip
-
     if halo.weight.size > 0:
         shares_of_halo = halo_shares(model, tables.edge.shape[1] + FAR_PX)
-        workers.over(bands, around)
+        around = *seen, shares_of_halo, ways.units * scale
+        workers.over(bands, lambda first, last: fill_halo(*around, first, last, tables, halo))
 
     def fit(first: int, last: int) -> None:
         room = room_for(tables, halo, grid.labels)
         fit_tables(pointers(room), ways, first, last)
 
     workers.over(len(tables.span), fit)
-    mark_rows(place, hot, grid.side, BAND_ROWS, tables)
+    mark_rows(place, hot, grid.side, tables)
     return Costs(grid, tables, halo, place, ways, units_per_nat)
 
 
 def _ways(
-    sweep: Sweep, state: RowState, grid: LabelGrid, exposures: int, light: NDArray[np.float32], reach: int
+    sweep: Sweep, state: RowState, grid: LabelGrid, exposures: int, light: Float32, reach: int
 ) -> tuple[Ways, float]:
     most = exposures + exposures // 2 + FRAMES_OVER_HALF_MORE
     bits = most.bit_length()
@@ -152,7 +150,7 @@ def _ways(
     units_per_nat = min(wanted, finest)
     ways = Ways(
         units=units_per_nat * 2.0**down, bits=bits, exposures=exposures, most=most, sharp=SHARP, down=down,
-        reach=reach, side=grid.side, stripes=grid.stripes, band_rows=BAND_ROWS,
+        reach=reach, side=grid.side, stripes=grid.stripes,
     )  # fmt: skip
     return ways, units_per_nat
 
@@ -182,44 +180,36 @@ def _largest(sweep: Sweep, state: RowState, row: RowBuffers, light: float) -> tu
     return rise, gain
 
 
-def _empty_tables(
-    at: NDArray[np.int32], tables: int, grid: LabelGrid, taps: int, hot: NDArray[np.bool_]
-) -> LabelTables:
+def _empty_tables(at: Int32, tables: int, grid: LabelGrid, taps: int, hot: Bools) -> LabelTables:
     y, x = np.nonzero(hot)
     vectors = -(-label_pixels(grid) // LANES)
     pixels = -(-(FAR_PX + label_pixels(grid) + MARGIN_PX) // LANES) * LANES
     return LabelTables(
-        at=at,
-        edge=aligned_zeros((tables, pixels), np.int16),
-        edge_sum=aligned_zeros((tables, pixels), np.float32),
+        at=at, edge=aligned_zeros((tables, pixels), np.int16), edge_sum=aligned_zeros((tables, pixels), np.float32),
         tap=aligned_zeros((tables, vectors, taps, PHASES, LIGHTS, LANES), np.int16),
         constant=aligned_zeros((tables, vectors, PHASES, LIGHTS, LANES), np.float32),
-        span=np.zeros((tables, 2), np.int16),
-        used=np.zeros(tables, np.int16),
+        span=np.zeros((tables, 2), np.int16), used=np.zeros(tables, np.int16),
         fitted_constant=aligned_zeros((tables, vectors, PHASES, LIGHTS, LANES), np.int16),
         fitted_edge=aligned_zeros((tables, pixels), np.int16),
-        hot_start=np.searchsorted(y, np.arange(len(hot) + 1)).astype(np.int32),
-        hot_x=x.astype(np.int16),
-        pixels=pixels,
-        taps=vectors * taps * PHASES * LIGHTS * LANES,
-        constants=vectors * PHASES * LIGHTS * LANES,
-    )
+        hot_start=np.searchsorted(y, np.arange(len(hot) + 1)).astype(np.int32), hot_x=x.astype(np.int16), pixels=pixels,
+        taps=vectors * taps * PHASES * LIGHTS * LANES, constants=vectors * PHASES * LIGHTS * LANES,
+    )  # fmt: skip
 
 
-def _lights(model: RowModel) -> NDArray[np.float32]:
+def _lights(model: RowModel) -> Float32:
     """The quartiles of the learned amplitudes."""
     weight = np.maximum(model.weight, 1e-6)
     middle = (np.cumsum(weight) - 0.5 * weight) / weight.sum()
     return np.exp(np.interp(QUARTILES, middle, np.log(model.amplitude.astype(np.float64)))).astype(np.float32)
 
 
-def hot_in_bands(ambient: NDArray[np.float32]) -> NDArray[np.bool_]:
+def hot_in_bands(ambient: Float32) -> Bools:
     """Pixels (rows, width) that are far brighter than those of their column in the band."""
     bands = np.arange(BAND_ROWS, ambient.shape[0], BAND_ROWS)
     return np.concatenate([part > HOT_FACTOR * np.median(part, axis=0) + HOT_FLUX for part in np.split(ambient, bands)])
 
 
-def _band_means(gain: NDArray[np.float32]) -> NDArray[np.float32]:
+def _band_means(gain: Float32) -> Float32:
     """Each row's gain as the mean of its band's."""
     parts = np.split(gain, np.arange(BAND_ROWS, len(gain), BAND_ROWS))
     return np.concatenate([np.full_like(part, part.mean()) for part in parts])

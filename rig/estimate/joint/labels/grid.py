@@ -18,16 +18,19 @@ from typing import Final
 
 import numba
 import numpy as np
-from numpy.typing import NDArray
 
-from rig.estimate.row.inputs import Sweep, with_rays
+from rig.estimate.row.inputs import Sweep
+from rig.geometry.kernels import with_rays
 from rig.geometry.windows import MARGIN_PX, SweepGeometry
+from rig.simd import Float32, Float64, Int16, Int32
 
 PER_PX: Final = 2
 """Labels per pixel: with one, the stripe's place between two of them costs 0.05 px of error at 10 exposures."""
 SPARE: Final = 1
 """Labels beyond the searched pixels at either end, for the mean of a peak there."""
 VECTOR: Final = 32
+BAND_ROWS: Final = 64
+"""Rows that share tables of costs."""
 _ROWS_APART: Final = 8
 """One row in so many is looked at for the distance of columns."""
 
@@ -36,12 +39,11 @@ _ROWS_APART: Final = 8
 class LabelGrid:
     """Label l of a row and column is at x_far - side * l / PER_PX, for l from 0 to stripes - 1.
 
-    x_far: float64 (rows, columns), NaN where nothing is searched; x may lie outside the picture there. side: 1 where
-    near is left, else -1. labels: a multiple of VECTOR; those from stripes on mean nothing. column_px: from a column to
-    the next, as a rule.
+    x_far: float64 (rows, columns), NaN where nothing is searched. side: 1 where near is left, else -1. labels: a
+    multiple of VECTOR; those from stripes on mean nothing. column_px: from a column to the next, as a rule.
     """
 
-    x_far: NDArray[np.float64]
+    x_far: Float64
     side: int
     stripes: int
     labels: int
@@ -65,14 +67,7 @@ def label_grid(geometry: SweepGeometry) -> LabelGrid:
 
 
 @numba.njit(cache=True, nogil=True)
-def far_ends(
-    u: NDArray[np.float32],
-    v: NDArray[np.float32],
-    plane: NDArray[np.float64],
-    x_lo: NDArray[np.int32],
-    x_hi: NDArray[np.int32],
-    w_far: float,
-) -> NDArray[np.float64]:
+def far_ends(u: Float32, v: Float32, plane: Float64, x_lo: Int32, x_hi: Int32, w_far: float) -> Float64:
     """Position of each column's line on each row at inverse depth w_far: (rows, columns) pixels.
 
     Interpolated between pixels, continued outside the picture along its last two; NaN where x_lo > x_hi.
@@ -123,7 +118,7 @@ def label_pixels(grid: LabelGrid) -> int:
     return grid.stripes // PHASES + 1
 
 
-def places_of(sweep: Sweep, grid: LabelGrid) -> NDArray[np.int16]:
+def places_of(sweep: Sweep, grid: LabelGrid) -> Int16:
     """The numbers of each row of each column, int16 (columns, rows, PLACES)."""
     out = np.zeros((*grid.x_far.T.shape, PLACES), np.int16)
     _fill_places(sweep, grid.x_far, grid.side, grid.stripes, label_pixels(grid), out)
@@ -131,9 +126,7 @@ def places_of(sweep: Sweep, grid: LabelGrid) -> NDArray[np.int16]:
 
 
 @numba.njit(cache=True, nogil=True)
-def _fill_places(
-    sweep: Sweep, x_far: NDArray[np.float64], side: int, stripes: int, pixels: int, out: NDArray[np.int16]
-) -> None:
+def _fill_places(sweep: Sweep, x_far: Float64, side: int, stripes: int, pixels: int, out: Int16) -> None:
     rows, columns = x_far.shape
     width = sweep.u.shape[1]
     for c in range(columns):

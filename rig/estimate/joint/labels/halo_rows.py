@@ -11,9 +11,8 @@ from typing import Final, NamedTuple
 
 import numba
 import numpy as np
-from numpy.typing import NDArray
 
-from rig.estimate.joint.labels.grid import FAR_PX, PHASES, START, VARIANT, VARIANTS
+from rig.estimate.joint.labels.grid import BAND_ROWS, FAR_PX, PHASES, START, VARIANTS
 from rig.estimate.joint.labels.tables import (
     BATCH,
     LIGHTS,
@@ -23,18 +22,12 @@ from rig.estimate.joint.labels.tables import (
     Fitted,
     LabelTables,
     mean_ambient,
+    middle_row,
 )
-from rig.estimate.row.inputs import Float32, RowState, Sweep, row_buffers, row_fluxes
+from rig.estimate.row.inputs import RowState, Sweep, row_buffers, row_fluxes
 from rig.estimate.row.likelihood import FLUX_MAX, FLUX_MIN, cell_of
-from rig.simd.memory import (
-    aligned_zeros,
-    load_float32,
-    load_int16,
-    read_int16,
-    read_int32,
-    store_int16,
-    write_int16,
-)
+from rig.simd import Bools, Float32, Int16, Int32
+from rig.simd.memory import aligned_zeros, load_float32, load_int16, read_int16, read_int32, store_int16, write_int16
 from rig.simd.vectors import LANES, add_saturated, larger_float, scaled, smaller, smaller_float, to_int16, zero_int16
 
 BLOCK_PX: Final = 8
@@ -53,9 +46,9 @@ class HaloTables(NamedTuple):
     around a vector of labels have in each, of 2^15. Without a halo all but `ramp` are empty.
     """
 
-    weight: NDArray[np.int16]
-    constant: NDArray[np.float32]
-    ramp: NDArray[np.int16]
+    weight: Int16
+    constant: Float32
+    ramp: Int16
 
 
 def halo_tables(tables: LabelTables, there: bool) -> HaloTables:
@@ -69,7 +62,7 @@ def halo_tables(tables: LabelTables, there: bool) -> HaloTables:
     return HaloTables(weight, aligned_zeros((bands, columns, LIGHTS, places), np.float32), _ramps())
 
 
-def _ramps() -> NDArray[np.int16]:
+def _ramps() -> Int16:
     pixel = np.arange(LANES) + 0.5
     # A pixel's labels lie about a quarter of it to either side of its middle.
     at = (pixel + np.array([-0.25, 0.25])[:, None]) / BLOCK_PX
@@ -79,20 +72,9 @@ def _ramps() -> NDArray[np.int16]:
 
 @numba.njit(cache=True, nogil=True)
 def fill_halo(
-    sweep: Sweep,
-    state: RowState,
-    halo: Float32,
-    place: NDArray[np.int16],
-    ambient: Float32,
-    hot: NDArray[np.bool_],
-    light: Float32,
-    per_nat: float,
-    band_rows: int,
-    first_band: int,
-    last_band: int,
-    tables: LabelTables,
-    out: HaloTables,
-) -> None:
+    sweep: Sweep, state: RowState, place: Int16, ambient: Float32, hot: Bools, light: Float32, halo: Float32,
+    per_nat: float, first_band: int, last_band: int, tables: LabelTables, out: HaloTables,
+) -> None:  # fmt: skip
     """Fill bands first_band..last_band-1; arguments as of `rig.estimate.joint.labels.tables.fill_tables`.
 
     halo: (BINS, pixels) of `halo_shares`.
@@ -104,9 +86,9 @@ def fill_halo(
     # Of the blocks: flux before and behind the stripe, and of the halo as the tables of labels have it.
     level, size = np.empty((3, out.weight.shape[2]), np.float32), np.empty(out.weight.shape[2], np.int64)
     for b in range(first_band, last_band):
-        rows = b * band_rows, min((b + 1) * band_rows, place.shape[1])
+        rows = b * BAND_ROWS, min((b + 1) * BAND_ROWS, place.shape[1])
         for c in range(place.shape[0]):
-            y = _middle(place, c, rows)
+            y, _, _ = middle_row(place, c, rows, -1)
             if y < 0:
                 continue
             mean_ambient(place, ambient, hot, side, c, rows, mean, number)
@@ -148,16 +130,6 @@ def fill_halo(
                         out.constant[b, c, m, j] += size[k] * (state.table[1, own] - state.table[1, other])
 
 
-@numba.njit(cache=True, nogil=True)
-def _middle(place: NDArray[np.int16], c: int, rows: tuple[int, int]) -> int:
-    """The row nearest the band's middle that has labels; -1: none."""
-    best, middle = -1, (rows[0] + rows[1]) // 2
-    for y in range(rows[0], rows[1]):
-        if place[c, y, VARIANT] >= 0 and (best < 0 or abs(y - middle) < abs(best - middle)):
-            best = y
-    return best
-
-
 HIGHEST: Final = 30000
 """Scores and their parts are cut there."""
 _TO_UNSIGNED: Final = np.float32(32768.5)
@@ -183,26 +155,21 @@ class HaloRoom(NamedTuple):
     tables: HaloTables
     blocks: int
     places: int
-    fitted: NDArray[np.int16]
-    mean: NDArray[np.int16]
-    level: NDArray[np.int16]
-    constant: NDArray[np.int16]
-    which: NDArray[np.int32]
+    fitted: Int16
+    mean: Int16
+    level: Int16
+    constant: Int16
+    which: Int32
 
 
 def new_halo_room(halo: HaloTables, constants: int) -> HaloRoom:
     """Room for rows of so many constants of positions."""
     blocks, places = halo.weight.shape[2], halo.weight.shape[4]
     return HaloRoom(
-        tables=halo,
-        blocks=blocks,
-        places=places,
-        fitted=aligned_zeros((LIGHTS, places), np.int16),
-        mean=aligned_zeros((blocks,), np.int16),
-        level=aligned_zeros((LIGHTS, places), np.int16),
-        constant=aligned_zeros((BATCH if blocks else 0, constants), np.int16),
-        which=np.arange(BATCH, dtype=np.int32),
-    )
+        tables=halo, blocks=blocks, places=places, fitted=aligned_zeros((LIGHTS, places), np.int16),
+        mean=aligned_zeros((blocks,), np.int16), level=aligned_zeros((LIGHTS, places), np.int16),
+        constant=aligned_zeros((BATCH if blocks else 0, constants), np.int16), which=np.arange(BATCH, dtype=np.int32),
+    )  # fmt: skip
 
 
 @numba.njit(cache=True, nogil=True)

@@ -9,10 +9,8 @@ of a pixel before and behind the stripe, p'_S of one that it lights,
 
 Haze, pedestal and ambient light vary slowly along a line, so the rows of a band share a table for each variant of
 `rig.estimate.joint.labels.grid` that occurs among them. Weights are for counts as `scaled` multiplies them.
-`LabelTables` has the shapes.
 
-The stripe's brightness is not known: of two lights, the quartiles of what was learned, the likelier one counts, both
-equally probable. A single light errs by a fifth to four fifths more; all four learned amplitudes are no better. The
+The stripe's brightness is not known: of two lights, the quartiles of what was learned, the likelier one counts. The
 learned prior of positions does not enter, since it makes errors larger.
 """
 
@@ -20,9 +18,9 @@ from typing import Final, NamedTuple
 
 import numba
 import numpy as np
-from numpy.typing import NDArray
 
 from rig.estimate.joint.labels.grid import (
+    BAND_ROWS,
     FAR_PX,
     FRACTIONS,
     LABEL,
@@ -38,6 +36,7 @@ from rig.estimate.joint.labels.grid import (
 )
 from rig.estimate.row.inputs import RowState, Sweep, row_buffers, row_fluxes
 from rig.estimate.row.likelihood import FLUX_MAX, FLUX_MIN, cell_of
+from rig.simd import Bools, Float32, Int16, Int32, Uint8
 from rig.simd.memory import CACHE_LINE, aligned_zeros
 from rig.simd.vectors import LANES
 
@@ -68,30 +67,30 @@ class LabelTables(NamedTuple):
     pixels, taps, constants: numbers of edge, tap and constant that a table has.
     """
 
-    at: NDArray[np.int32]
-    edge: NDArray[np.int16]
-    edge_sum: NDArray[np.float32]
-    tap: NDArray[np.int16]
-    constant: NDArray[np.float32]
-    span: NDArray[np.int16]
-    used: NDArray[np.int16]
-    fitted_constant: NDArray[np.int16]
-    fitted_edge: NDArray[np.int16]
-    hot_start: NDArray[np.int32]
-    hot_x: NDArray[np.int16]
+    at: Int32
+    edge: Int16
+    edge_sum: Float32
+    tap: Int16
+    constant: Float32
+    span: Int16
+    used: Int16
+    fitted_constant: Int16
+    fitted_edge: Int16
+    hot_start: Int32
+    hot_x: Int16
     pixels: int
     taps: int
     constants: int
 
 
 @numba.njit(cache=True, nogil=True)
-def number_tables(place: NDArray[np.int16], band_rows: int, at: NDArray[np.int32]) -> int:
+def number_tables(place: Int16, at: Int32) -> int:
     """Fill `at` of LabelTables with the numbers of the tables that the rows need; returns how many those are."""
     tables = 0
     at[:] = -1
     for b in range(at.shape[0]):
         for c in range(at.shape[1]):
-            for y in range(b * band_rows, min((b + 1) * band_rows, place.shape[1])):
+            for y in range(b * BAND_ROWS, min((b + 1) * BAND_ROWS, place.shape[1])):
                 variant = place[c, y, VARIANT]
                 if variant >= 0 and at[b, c, variant] < 0:
                     at[b, c, variant] = tables
@@ -101,21 +100,9 @@ def number_tables(place: NDArray[np.int16], band_rows: int, at: NDArray[np.int32
 
 @numba.njit(cache=True, nogil=True)
 def fill_tables(
-    sweep: Sweep,
-    state: RowState,
-    place: NDArray[np.int16],
-    ambient: NDArray[np.float32],
-    hot: NDArray[np.bool_],
-    light: NDArray[np.float32],
-    shares: NDArray[np.float32],
-    beside: NDArray[np.float32],
-    per_nat: float,
-    most: float,
-    band_rows: int,
-    first_band: int,
-    last_band: int,
-    out: LabelTables,
-) -> None:
+    sweep: Sweep, state: RowState, place: Int16, ambient: Float32, hot: Bools, light: Float32, shares: Float32,
+    beside: Float32, per_nat: float, most: float, first_band: int, last_band: int, out: LabelTables,
+) -> None:  # fmt: skip
     """Tables of bands first_band..last_band-1.
 
     state: without ambient light, which is in `ambient` (rows, width), of pixels that are not `hot`. light: (LIGHTS,)
@@ -129,7 +116,7 @@ def fill_tables(
     flux, level = np.empty((2, pixels), np.float32), np.empty((4, pixels), np.float32)
     glow, near_glow = np.empty(pixels, np.float32), np.empty(pixels, np.float32)
     for b in range(first_band, last_band):
-        rows = b * band_rows, min((b + 1) * band_rows, place.shape[1])
+        rows = b * BAND_ROWS, min((b + 1) * BAND_ROWS, place.shape[1])
         for c in range(place.shape[0]):
             if out.at[b, c].max() < 0:
                 continue
@@ -138,7 +125,7 @@ def fill_tables(
                 i = out.at[b, c, variant]
                 if i < 0:
                     continue
-                y, label, label_end = _middle_row(place, c, rows, variant)
+                y, label, label_end = middle_row(place, c, rows, variant)
                 here = place[c, y]
                 length, _, _, start = row_fluxes(sweep, state, row, y, c)
                 to_t = side * (here[START] - start)
@@ -163,14 +150,14 @@ def fill_tables(
 
 
 @numba.njit(cache=True, nogil=True)
-def mark_rows(place: NDArray[np.int16], hot: NDArray[np.bool_], side: int, band_rows: int, tables: LabelTables) -> None:
+def mark_rows(place: Int16, hot: Bools, side: int, tables: LabelTables) -> None:
     """Set MEND of rows whose tables weigh pixels that the rows do not have, or that are hot."""
     for c in range(place.shape[0]):
         for y in range(place.shape[1]):
             here = place[c, y]
             if here[VARIANT] < 0:
                 continue
-            span = tables.span[tables.at[y // band_rows, c, here[VARIANT]]]
+            span = tables.span[tables.at[y // BAND_ROWS, c, here[VARIANT]]]
             here[MEND] = 1 if here[VALID] > span[0] or here[VALID_END] < span[1] else 0
             for p in range(max(here[VALID], span[0]), min(here[VALID_END], span[1])):
                 if hot[y, here[START] - side * p]:
@@ -178,8 +165,8 @@ def mark_rows(place: NDArray[np.int16], hot: NDArray[np.bool_], side: int, band_
 
 
 @numba.njit(cache=True, nogil=True)
-def _middle_row(place: NDArray[np.int16], c: int, rows: tuple[int, int], variant: int) -> tuple[int, int, int]:
-    """The row of that variant nearest the band's middle; first position and the one behind the last, of all its rows.
+def middle_row(place: Int16, c: int, rows: tuple[int, int], variant: int) -> tuple[int, int, int]:
+    """The row of a variant, -1: of any, nearest the band's middle, -1: none; first and end position of all its rows.
 
     Positions count two a pixel, from the pixel that holds label 0 on.
     """
@@ -187,7 +174,7 @@ def _middle_row(place: NDArray[np.int16], c: int, rows: tuple[int, int], variant
     best, first, end = -1, 1 << 15, 0
     for y in range(rows[0], rows[1]):
         here = place[c, y]
-        if here[VARIANT] == variant:
+        if here[VARIANT] == variant or variant < 0 <= here[VARIANT]:
             if best < 0 or abs(y - middle) < abs(best - middle):
                 best = y
             first = min(first, int(here[LABEL] + here[ODD]))
@@ -197,8 +184,8 @@ def _middle_row(place: NDArray[np.int16], c: int, rows: tuple[int, int], variant
 
 @numba.njit(cache=True, nogil=True)
 def mean_ambient(
-    place: NDArray[np.int16], ambient: NDArray[np.float32], hot: NDArray[np.bool_], side: int, c: int,
-    rows: tuple[int, int], mean: NDArray[np.float32], number: NDArray[np.int32],
+    place: Int16, ambient: Float32, hot: Bools, side: int, c: int,
+    rows: tuple[int, int], mean: Float32, number: Int32,
 ) -> None:  # fmt: skip
     """Mean ambient light of the band's rows at each pixel p; where none is to be had, that of the pixel before."""
     mean[:] = 0.0
@@ -221,8 +208,8 @@ def mean_ambient(
 
 @numba.njit(cache=True, nogil=True)
 def _fill_edges(
-    level: NDArray[np.float32], span: tuple[int, int], per_nat: float, edge: NDArray[np.int16],
-    edge_sum: NDArray[np.float32],
+    level: Float32, span: tuple[int, int], per_nat: float, edge: Int16,
+    edge_sum: Float32,
 ) -> None:  # fmt: skip
     total = 0.0
     for p in range(edge.shape[0]):
@@ -235,10 +222,10 @@ def _fill_edges(
 
 @numba.njit(cache=True, nogil=True)
 def _fill_taps(
-    table: NDArray[np.float32], scale: NDArray[np.float32], glow: NDArray[np.float32], near_glow: NDArray[np.float32],
-    to_t: int, span: tuple[int, int], flux: NDArray[np.float32], light: NDArray[np.float32],
-    shares: NDArray[np.float32], variant: int, per_nat: float, most: float, labels: tuple[int, int],
-    tap: NDArray[np.int16], constant: NDArray[np.float32],
+    table: Float32, scale: Float32, glow: Float32, near_glow: Float32,
+    to_t: int, span: tuple[int, int], flux: Float32, light: Float32,
+    shares: Float32, variant: int, per_nat: float, most: float, labels: tuple[int, int],
+    tap: Int16, constant: Float32,
 ) -> None:  # fmt: skip
     reach = shares.shape[1] // 2
     half, middle_light = np.float32(0.5), np.sqrt(light[0] * light[-1])
@@ -296,8 +283,7 @@ class Ways(NamedTuple):
 
     units: of scores per nat, of columns with the usual number of `exposures`; bits: of the largest count; most: what a
     column's exposures may count as; sharp: exposures at which a nat is worth half as many units; down: power of two
-    that scores are divided by to be costs; reach: taps on either side; side, stripes: as in `LabelGrid`; band_rows:
-    rows that share tables.
+    that scores are divided by to be costs; reach: taps on either side; side, stripes: as in `LabelGrid`.
     """
 
     units: float
@@ -309,7 +295,6 @@ class Ways(NamedTuple):
     reach: int
     side: int
     stripes: int
-    band_rows: int
 
 
 class Fitted(NamedTuple):
@@ -330,19 +315,19 @@ class Buffers(NamedTuple):
     row of the batch; fitted: place of it in `Fitted`; shown: labels that the mask is for, from and up to.
     """
 
-    n: NDArray[np.int16]
-    sums: NDArray[np.int16]
-    score: NDArray[np.int16]
-    top: NDArray[np.int16]
-    cost: NDArray[np.uint8]
-    mask: NDArray[np.uint8]
-    constant: NDArray[np.int16]
-    edge: NDArray[np.int16]
-    through: NDArray[np.int16]
-    table: NDArray[np.int32]
-    here: NDArray[np.int32]
-    fitted: NDArray[np.int32]
-    shown: NDArray[np.int32]
+    n: Int16
+    sums: Int16
+    score: Int16
+    top: Int16
+    cost: Uint8
+    mask: Uint8
+    constant: Int16
+    edge: Int16
+    through: Int16
+    table: Int32
+    here: Int32
+    fitted: Int32
+    shown: Int32
     n_row: int
     score_row: int
     cost_row: int
@@ -356,24 +341,15 @@ def new_buffers(tables: LabelTables, labels: int) -> Buffers:
     score_row = vectors * PHASES * LANES
     cost_row = _whole(max(labels, score_row) + 2 * 2 * LANES)
     return Buffers(
-        n=aligned_zeros((BATCH, n_row), np.int16),
-        sums=aligned_zeros((BATCH, n_row), np.int16),
-        score=aligned_zeros((BATCH, score_row), np.int16),
-        top=aligned_zeros((BATCH, LANES), np.int16),
-        cost=aligned_zeros((BATCH, cost_row), np.uint8),
-        mask=aligned_zeros((labels,), np.uint8),
+        n=aligned_zeros((BATCH, n_row), np.int16), sums=aligned_zeros((BATCH, n_row), np.int16),
+        score=aligned_zeros((BATCH, score_row), np.int16), top=aligned_zeros((BATCH, LANES), np.int16),
+        cost=aligned_zeros((BATCH, cost_row), np.uint8), mask=aligned_zeros((labels,), np.uint8),
         constant=aligned_zeros((VARIANTS, tables.constants), np.int16),
-        edge=aligned_zeros((VARIANTS, pixels), np.int16),
-        through=aligned_zeros((pixels + 2 * LANES,), np.int16),
-        table=aligned_zeros((VARIANTS + 1,), np.int32),
-        here=aligned_zeros((BATCH,), np.int32),
-        fitted=aligned_zeros((BATCH,), np.int32),
-        shown=aligned_zeros((2,), np.int32),
-        n_row=n_row,
-        score_row=score_row,
-        cost_row=cost_row,
-        labels=labels,
-    )
+        edge=aligned_zeros((VARIANTS, pixels), np.int16), through=aligned_zeros((pixels + 2 * LANES,), np.int16),
+        table=aligned_zeros((VARIANTS + 1,), np.int32), here=aligned_zeros((BATCH,), np.int32),
+        fitted=aligned_zeros((BATCH,), np.int32), shown=aligned_zeros((2,), np.int32), n_row=n_row, score_row=score_row,
+        cost_row=cost_row, labels=labels,
+    )  # fmt: skip
 
 
 def _whole(number: int) -> int:

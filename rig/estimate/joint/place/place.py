@@ -8,16 +8,15 @@ then joined by pairs of opposite neighbours. The formulas are in `rig.estimate.j
 from itertools import pairwise
 
 import numpy as np
-from numpy.typing import NDArray
 
-from rig.count.volume import CountVolume
-from rig.estimate.joint.place.light import measure_light
-from rig.estimate.joint.place.places import REACH_PX, TAPS, Counts, Places, add_moments, fetch_counts
+from rig.count.volume import Counts, CountVolume
+from rig.estimate.joint.place.light import FRACTIONS, measure_light, score_places
+from rig.estimate.joint.place.places import REACH_PX, TAPS, Places, add_moments, fetch_counts
 from rig.estimate.joint.place.pool import join_pairs, pool_amplitude, pool_places
-from rig.estimate.joint.place.score import FRACTIONS, score_places
 from rig.estimate.row.inputs import RowState, Sweep
 from rig.estimate.row.model import pixel_shares
 from rig.geometry.stripe_table import StripeTable
+from rig.simd import Float32, Float64
 from rig.simd.memory import aligned_zeros
 from rig.simd.shuffles import EIGHT
 from rig.threads import RowWorkers
@@ -49,7 +48,7 @@ LINE_SIGMA_PX = np.array([0.25, 2.4])
 """Smallest and largest width that is looked for."""
 
 
-def profile_table(sigma_px: float) -> NDArray[np.float32]:
+def profile_table(sigma_px: float) -> Float32:
     """Shares of the line and their slopes as `score_places` takes them."""
     centre = (np.arange(FRACTIONS) + 0.5) / FRACTIONS - 0.5
     distance = np.arange(-REACH_PX, REACH_PX + 1) - centre[:, None]
@@ -70,13 +69,13 @@ def place(
     volume: CountVolume,
     sweep: Sweep,
     state: RowState,
-    shares: NDArray[np.float32],
-    x_px: NDArray[np.float32],
+    shares: Float32,
+    x_px: Float32,
     places: Places,
     workers: RowWorkers,
     *,
     lesson: bool = False,
-) -> NDArray[np.float32]:
+) -> Float32:
     """Move x_px, whose distances from the far end are in `places`, to where neighbours together put it.
 
     lesson: whether they are to teach the first map. Returns its standard deviation in px; light and haze are left in
@@ -86,17 +85,11 @@ def place(
     around = weigh_light(volume, sweep, state, x_px, places, workers)
     seen = volume.n_frames, sweep, state, shares, around, x_px
     distance, placed, joined, joined_sd = places.distance, places.placed, places.joined, places.joined_sd
-    (near, near_share), (far, far_share) = PAIRS
+    near, far = PAIRS
 
     def pool(first: int, last: int) -> None:
         pool_places(places, LESSON_REACHES if lesson else REACHES, ENOUGH, first, last, placed, sd)
         placed[first:last] += distance[first:last]
-
-    def join_near(first: int, last: int) -> None:
-        join_pairs(placed, sd, near, near_share, ENOUGH, first, last, joined, joined_sd)
-
-    def join_far(first: int, last: int) -> None:
-        join_pairs(joined, joined_sd, far, far_share, ENOUGH, first, last, placed, sd)
 
     def move(first: int, last: int) -> None:
         moved = placed[first:last] - distance[first:last]
@@ -106,14 +99,14 @@ def place(
     workers.over(rows, lambda first, last: score_places(*seen, first, last, places))
     workers.over(rows, pool)
     if not lesson:
-        workers.over(rows, join_near)
-        workers.post(rows, join_far)
+        workers.over(rows, lambda first, last: join_pairs(placed, sd, *near, ENOUGH, first, last, joined, joined_sd))
+        workers.post(rows, lambda first, last: join_pairs(joined, joined_sd, *far, ENOUGH, first, last, placed, sd))
     workers.post(rows, move)
     return sd
 
 
 def weigh_light(
-    volume: CountVolume, sweep: Sweep, state: RowState, x_px: NDArray[np.float32], places: Places, workers: RowWorkers
+    volume: CountVolume, sweep: Sweep, state: RowState, x_px: Float32, places: Places, workers: RowWorkers
 ) -> Counts:
     """Fill light, scale, haze and amplitude of `places` for stripes at x_px, as `state` sees them.
 
@@ -148,7 +141,7 @@ def line_width(
     return float(np.sqrt(np.clip(moment / light - pixel_variance, *LINE_SIGMA_PX**2)))
 
 
-def amplitudes_of(places: Places) -> tuple[NDArray[np.float32], NDArray[np.float64]]:
+def amplitudes_of(places: Places) -> tuple[Float32, Float64]:
     """Four amplitudes that stand for those of a map's stripes, pooled over neighbours, and their shares."""
     found = places.amplitude[places.scale > 0]
     edges, shares = (0.0, 0.2, 0.5, 0.8, 1.0), np.array([0.2, 0.3, 0.3, 0.2])

@@ -1,7 +1,7 @@
 """Sub-pixel placing of stripes: one step of Fisher scoring, pooled over neighbours on the same surface; counts around.
 
 At its answer each row says how much likelier its counts become with the stripe a little further on (the score g), and
-how much it knows of that at all (the information h), `rig.estimate.joint.place.score`. Neighbours on one surface share
+how much it knows of that at all (the information h), `rig.estimate.joint.place.light`. Neighbours on one surface share
 its distance d from the far end, float32 px:
 
     d = sum (h d_n + g_n) / sum h
@@ -10,22 +10,20 @@ over them is as good as the maximum of their common likelihood, and 1 / sqrt(sum
 brightness is pooled in the same way before: on its own a dark row is taken for a brighter one that stands on haze.
 
 Counts lie column by column, answers are worked on row by row, LANES columns to a vector. So the counts around all
-stripes are brought into the order of the answers once, in tiles of rows and columns (`fetch_counts`), for all that asks
-for them afterwards.
+stripes are brought into the order of the answers once, in tiles of rows and columns (`fetch_counts`).
 """
 
-from typing import Any, Final, NamedTuple
+from typing import Final, NamedTuple
 
 import numba
 import numpy as np
-from numpy.typing import NDArray
 
+from rig.count.volume import Counts
 from rig.estimate.row.inputs import RowState, Sweep, fluxes_at, line_light
+from rig.simd import Float32, Float64, Int32
 from rig.simd.memory import address_of, prefetch, read_float32, read_int64, write_float32, write_int64
 from rig.simd.shuffles import EIGHT, spread_eights
 from rig.simd.vectors import LANES
-
-Float32 = NDArray[np.float32]
 
 REACH_PX: Final = 3
 """Pixels to either side of a stripe that say where it is."""
@@ -78,18 +76,9 @@ def most_shown(frames):  # type: ignore[no-untyped-def]
 
 @numba.njit(cache=True, nogil=True)
 def add_moments(
-    counts: NDArray[np.unsignedinteger],
-    n_frames: NDArray[np.int32],
-    sweep: Sweep,
-    state: RowState,
-    x_px: Float32,
-    sd_px: Float32,
-    confidence: Float32,
-    signal: Float32,
-    first_row: int,
-    last_row: int,
-    sums: NDArray[np.float64],
-) -> None:
+    counts: Counts, n_frames: Int32, sweep: Sweep, state: RowState, x_px: Float32, sd_px: Float32, confidence: Float32,
+    signal: Float32, first_row: int, last_row: int, sums: Float64,
+) -> None:  # fmt: skip
     """Add to sums (rows, 2) the light of clear stripes within REACH_PX, and that times its squared distance less sd^2.
 
     Light above haze, halo and ambient, photons; what is added to a row of sums comes from that row of the picture.
@@ -138,8 +127,6 @@ def add_moments(
             sums[y, 1] -= halo * wide
 
 
-Counts = NDArray[np.unsignedinteger[Any]]
-
 TAPS: Final = 2 * REACH_PX + 1
 """Pixels around a stripe that are looked at; EIGHT are fetched."""
 MOST_FLUX: Final = np.float32(20.0)
@@ -148,9 +135,7 @@ _TILE: Final = 16
 
 
 @numba.njit(cache=True, nogil=True)
-def fetch_counts(
-    counts: Counts, x0: NDArray[np.int32], x_px: Float32, first_row: int, last_row: int, around: Counts
-) -> None:
+def fetch_counts(counts: Counts, x0: Int32, x_px: Float32, first_row: int, last_row: int, around: Counts) -> None:
     """Fill around (rows, columns, EIGHT) of rows first_row..last_row-1: counts from REACH_PX before each stripe on.
 
     counts: (columns, rows, window), C-contiguous; around: of the same type. 0 where no pixel was stored, of any value

@@ -12,18 +12,17 @@ deviations of both let expect,
     d' = (d / s^2 + sum m / v) / (1 / s^2 + sum 1 / v),    v = (s1^2 + s2^2) / 4
 
 Where a surface ends or bends they do not agree, and the stripe stays where it is. Two such rounds reach as far as 25 x
-25 neighbours for the work of 16; summed one by one so many would ask for slopes of less than SAME_PX over the whole
-reach, and half a neighbourhood at an edge is off by its slope. Neighbourhoods overlap, so that pairs know less than the
-sum of what each knows: `share` of it, which makes the standard deviation right where all agree.
+25 neighbours for the work of 16. Neighbourhoods overlap, so that pairs know less than the sum of what each knows:
+`share` of it, which makes the standard deviation right where all agree.
 """
 
 from typing import Final
 
 import numba
 import numpy as np
-from numpy.typing import NDArray
 
 from rig.estimate.joint.place.places import Places
+from rig.simd import Float32
 from rig.simd.memory import address_of, copy_floats, load_float32, store_float32
 from rig.simd.vectors import (
     LANES,
@@ -36,8 +35,6 @@ from rig.simd.vectors import (
     where_small,
     zero_float32,
 )
-
-Float32 = NDArray[np.float32]
 
 SAME_PX: Final = np.float32(1.0)
 """Neighbours whose distances from the far end differ by no more lie on the same surface."""
@@ -190,16 +187,9 @@ and a surface that bends by more than its noise is left as it is."""
 
 @numba.njit(cache=True, nogil=True)
 def join_pairs(
-    distance: Float32,
-    sd_px: Float32,
-    step: int,
-    share: float,
-    enough: float,
-    first_row: int,
-    last_row: int,
-    out_distance: Float32,
-    out_sd_px: Float32,
-) -> None:
+    distance: Float32, sd_px: Float32, step: int, share: float, enough: float, first_row: int, last_row: int,
+    out_distance: Float32, out_sd_px: Float32,
+) -> None:  # fmt: skip
     """Fill the outputs, (rows, columns) as the inputs, of rows first_row..last_row-1.
 
     distance: from the far end in px, NaN where there is no stripe; sd_px: at most 1, which is to know nothing. step:

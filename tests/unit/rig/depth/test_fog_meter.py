@@ -2,13 +2,11 @@
 
 from dataclasses import replace
 from functools import cache
-from types import SimpleNamespace
 
 import numpy as np
 import pytest
 
 from rig.depth.fog_meter import CLEAR, FogEstimate, fit_fog, read_fog
-from rig.estimate.row.em import lines_of, next_lattice
 from rig.estimate.row.model import BINS, RowModel
 from rig.geometry.stripe_table import StripeTable
 from tests.reference.geometry import Geometry
@@ -48,6 +46,10 @@ def read(sweep: Sweep, ambient=1.0) -> FogEstimate:
     return read_fog(sweep.volume, stripes_of(sweep), sweep.geometry, state_of(sweep, ambient))
 
 
+def seen_in(sweep: Sweep) -> np.ndarray:
+    return np.isfinite(sweep.point.x_true)
+
+
 @cache
 def pulls() -> dict[str, np.ndarray]:
     """Errors over their bars in 32 maps of all sorts of fog, the ambient light known within 30 %; NaN: unresolved."""
@@ -62,15 +64,16 @@ def pulls() -> dict[str, np.ndarray]:
         for name, truth, value, sd in (
             ("extinction", extinction, fog.extinction_per_m, fog.extinction_sd_per_m),
             ("ambient", ambient, fog.ambient_per_exposure, fog.ambient_sd_per_exposure),
-            (
-                "veil",
-                veil(sweep.point, np.isfinite(sweep.point.x_true)),
-                fog.veil_per_exposure,
-                fog.veil_sd_per_exposure,
-            ),
+            ("veil", veil(sweep.point, seen_in(sweep)), fog.veil_per_exposure, fog.veil_sd_per_exposure),
         ):
             found[name].append(np.nan if value is None else (value - truth) / sd)
     return {name: np.array(each) for name, each in found.items()}
+
+
+def ambient_alone(fog: FogEstimate) -> FogEstimate:
+    return FogEstimate(
+        ambient_per_exposure=fog.ambient_per_exposure, ambient_sd_per_exposure=fog.ambient_sd_per_exposure
+    )
 
 
 @pytest.mark.parametrize("figure", ["extinction", "ambient", "veil"])
@@ -94,7 +97,7 @@ def test_a_reading_says_what_there_is(rig) -> None:
     clearest_m = 3.912 / (fog.extinction_per_m - 2 * fog.extinction_sd_per_m)
     assert fog.visibility_m + 2 * fog.visibility_sd_m == pytest.approx(clearest_m)
     assert fog.ambient_per_exposure == pytest.approx(0.02, rel=0.15)
-    seen = np.isfinite(sweep.point.x_true)
+    seen = seen_in(sweep)
     assert fog.veil_per_exposure == pytest.approx(veil(sweep.point, seen), rel=0.05)
     signal = sweep.point.stripe[seen].mean()
     assert fog.veil_to_signal == pytest.approx(fog.veil_per_exposure / signal, rel=0.2)
@@ -105,9 +108,7 @@ def test_a_reading_says_what_there_is(rig) -> None:
 def test_clear_air_has_ambient_light_and_nothing_else() -> None:
     fog = read(swept(Light(haze=0.0, ambient=0.01, extinction_per_m=0.0), 10))
     assert fog.ambient_per_exposure == pytest.approx(0.01, rel=0.1)
-    assert fog == FogEstimate(
-        ambient_per_exposure=fog.ambient_per_exposure, ambient_sd_per_exposure=fog.ambient_sd_per_exposure
-    )
+    assert fog == ambient_alone(fog)
     assert fog.brief() == ""
 
 
@@ -125,9 +126,7 @@ def test_light_that_is_no_haze_of_the_line_leaves_only_what_dark_frames_tell(cau
     volume = volume_of(sweep.counts, sweep.geometry, 20, dark_counts=dark, n_dark=500)
     fog = read_fog(volume, stripes_of(sweep), geometry, state)
     assert fog.ambient_per_exposure == pytest.approx(0.02, rel=0.05)
-    assert fog == FogEstimate(
-        ambient_per_exposure=fog.ambient_per_exposure, ambient_sd_per_exposure=fog.ambient_sd_per_exposure
-    )
+    assert fog == ambient_alone(fog)
 
 
 def test_maps_without_sure_stripes_say_nothing() -> None:
@@ -135,12 +134,6 @@ def test_maps_without_sure_stripes_say_nothing() -> None:
     stripes = stripes_of(sweep)
     stripes.confidence[:] *= 0.99 * CLEAR
     assert read_fog(sweep.volume, stripes, sweep.geometry, state_of(sweep)) == FogEstimate()
-
-
-def test_lines_of_a_searched_sweep_say_the_same_as_its_counts() -> None:
-    sweep = swept(Light(), 5)
-    alone = SimpleNamespace(lines=lines_of(sweep.volume, next_lattice(sweep.geometry)), dark_counts=None)
-    assert read_fog(alone, stripes_of(sweep), sweep.geometry, state_of(sweep)) == read(sweep)
 
 
 def sums(extinction=0.2, haze=0.3, rest=0.0, ambient=0.02, exposures=2000.0, scatter=0.0, seed=1) -> np.ndarray:

@@ -68,20 +68,6 @@ def test_edge_finds_the_step_that_argmax_misses(near_is_left):
 
 
 @NAMES
-def test_a_mirrored_rig_gives_the_mirrored_answer(name):
-    # With 300 exposures hardly a row has two equal largest counts, which go to the smallest x on both sides.
-    counts = np.ascontiguousarray(simulated(exposures=300).counts[:, :, 100:400])
-    left = estimate(name, counts, 300)
-    right = estimate(name, np.ascontiguousarray(counts[:, :, ::-1]), 300, near_is_left=False)
-    unique = (counts == counts.max(axis=2, keepdims=True)).sum(axis=2).T == 1
-    assert unique.mean() > 0.7
-    same = np.isclose(right.x_px[unique], 299 - left.x_px[unique], atol=1e-3)
-    # Scores of `edge` are products of small numbers and tie a little more often.
-    assert same.mean() > (0.99 if name == "edge" else 0.999)
-    np.testing.assert_allclose(right.confidence[unique][same], left.confidence[unique][same], atol=1e-5)
-
-
-@NAMES
 @SIDES
 @pytest.mark.parametrize("offset", [-0.4, -0.2, 0.0, 0.2, 0.4])
 def test_positions_are_sub_pixel(name, near_is_left, offset):
@@ -96,29 +82,12 @@ def test_positions_are_sub_pixel(name, near_is_left, offset):
     assert stripes.confidence.item() > 0.99
 
 
-@NAMES
-def test_signal_is_summed_across_the_stripe(name):
-    flux = 0.01 + 0.5 * np.array([0.0] * 48 + [0.10, 0.20, 0.40, 0.20, 0.10] + [0.0] * 47)
-    counts = np.round(10_000 * -np.expm1(-flux)).astype(np.uint16)[None, None]
-    stripes = estimate(name, counts, 10_000)
-    assert stripes.signal.item() == pytest.approx(0.5, rel=0.2)
-    assert stripes.haze.item() == pytest.approx(0.01, rel=0.2)
-
-
 def test_confidence_of_argmax_says_how_far_the_peak_stands_out():
     clear = estimate("argmax", row(x30=9), 10)
     doubtful = estimate("argmax", row(x30=2, x60=2), 10)
     assert clear.confidence.item() > 0.99
     assert 0.2 < doubtful.confidence.item() < 0.6
     assert 0 < clear.x_sd_px.item() < 1
-
-
-def test_in_fog_edge_is_better_than_argmax():
-    sweep = simulated(exposures=20)
-    argmax, edge = (
-        sweep.errors(create_estimator(name).estimate(sweep.volume, sweep.geometry).x_px) for name in ("argmax", "edge")
-    )
-    assert np.mean(edge < 1) > 1.2 * np.mean(argmax < 1)
 
 
 @NAMES

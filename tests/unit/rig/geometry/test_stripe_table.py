@@ -26,11 +26,6 @@ def test_an_error_of_exactly_one_pixel_is_within_one_pixel():
     assert errors["missing"] == 0.0
 
 
-def test_without_any_answer_everything_is_missing():
-    errors = stripe_errors(f32([NAN, NAN]), f32([2.0, 3.0]))
-    assert errors == {"mean_abs": None, "median_abs": None, "within_1px": 0.0, "missing": 1.0}
-
-
 def test_without_any_true_stripe_there_is_no_figure():
     errors = stripe_errors(f32([1.0, NAN]), f32([NAN, NAN]))
     assert errors == {"mean_abs": None, "median_abs": None, "within_1px": None, "missing": None}
@@ -40,8 +35,3 @@ def test_depth_errors_use_the_pixels_that_have_both():
     errors = depth_errors(f32([1.0, 2.5, NAN, 4.0]), f32([1.25, 2.0, 3.0, NAN]))
     assert errors == pytest.approx({"mean_abs": 0.375, "median_abs": 0.375})
     assert depth_errors(f32([NAN]), f32([1.0])) == {"mean_abs": None, "median_abs": None}
-
-
-def test_figures_are_plain_numbers_that_json_can_write():
-    for errors in (stripe_errors(f32([1.0]), f32([2.0])), depth_errors(f32([1.0]), f32([2.0]))):
-        assert all(type(value) is float for value in errors.values())

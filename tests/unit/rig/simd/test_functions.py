@@ -61,8 +61,8 @@ def answers(scores, best, shift):
     return out
 
 
-@pytest.mark.parametrize("shift", range(7))
-@pytest.mark.parametrize("best", [-32768, -32767, -31752, -30736, -17000, -1, 0, 1, 12345, 32767])
+@pytest.mark.parametrize("shift", [0, 3, 6])
+@pytest.mark.parametrize("best", [-32768, -31752, -17000, 0, 12345, 32767])
 def test_the_best_score_counts_and_what_lies_far_below_does_not(best, shift):
     octave = 128 >> shift
     below = np.maximum(best - octave * np.array([0, 1, 2, 10, 60, 200, *[300] * 10]), -32768)

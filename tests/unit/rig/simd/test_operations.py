@@ -1,21 +1,15 @@
 """Operations on lanes that are more than one of LLVM's own, against numpy."""
 
-from typing import NamedTuple
-
 import numba
 import numpy as np
 import pytest
 
 from rig.simd import memory, shuffles, vectors
-from rig.simd.memory import address_of, load_block, load_bytes, load_float32, load_int16
-from rig.simd.shuffles import EIGHT, FOLDED
+from rig.simd.memory import address_of, load_bytes, load_float32, load_int16
 from rig.simd.vectors import LANES, UNPACKED
 
-INT16, BYTES, FLOAT = (
-    (load_int16, memory.store_int16),
-    (load_bytes, memory.store_bytes),
-    (load_float32, memory.store_float32),
-)
+INT16, FLOAT = (load_int16, memory.store_int16), (load_float32, memory.store_float32)
+BYTES = load_bytes, memory.store_bytes
 SIZES = {INT16: (np.int16, LANES), BYTES: (np.uint8, 2 * LANES), FLOAT: (np.float32, LANES)}
 
 
@@ -46,32 +40,14 @@ def number_of(patterns):
     return (patterns.view(np.uint16).astype(np.uint32) << 16).view(np.float32)
 
 
-def by_turns(a, b):
-    return np.stack([a, b], axis=1).ravel()
-
-
 OPERATIONS = {
-    "shift right": (INT16, INT16, lambda a, b: a >> 5, lambda a, b: a.view(np.uint16) >> 5),
-    "with a number": (INT16, INT16, lambda a, b: (a & 0x55) + 7, lambda a, b: (a & 0x55) + 7),
     "scaled": (INT16, INT16, lambda a, b: vectors.scaled(a, b), lambda a, b: (wide(a) * b + (1 << 14)) >> 15),
-    "reversed": (INT16, INT16, lambda a, b: shuffles.reversed_lanes(a), lambda a, b: a[::-1]),
-    "last everywhere": (INT16, INT16, lambda a, b: shuffles.last_everywhere(a), lambda a, b: 0 * a + a[-1]),
-    "one lane up": (INT16, INT16, lambda a, b: shuffles.up_1(a), lambda a, b: np.append(0, a[:-1])),
     "running sum": (
         # Of numbers small enough: saturated sums go by the order of their steps.
         INT16, INT16, lambda a, b: shuffles.running_sum(a & 0x7FF), lambda a, b: saturated(np.cumsum(wide(a) & 0x7FF)),
     ),
     "unpacked numbers": (
         INT16, FLOAT, lambda a, b: vectors.from_bfloat16_unpacked(a), lambda a, b: number_of(a)[list(UNPACKED)],
-    ),
-    "first rows": (
-        BYTES, BYTES, lambda a, b: shuffles.first_row_pairs(a, b), lambda a, b: by_turns(a[:LANES], b[:LANES]),
-    ),
-    "second rows": (
-        BYTES, BYTES, lambda a, b: shuffles.second_row_pairs(a, b), lambda a, b: by_turns(a[LANES:], b[LANES:]),
-    ),
-    "smaller than a number": (
-        BYTES, BYTES, lambda a, b: vectors.smaller_unsigned(a, 200), lambda a, b: np.minimum(a, 200),
     ),
     "where small": (
         FLOAT, FLOAT, lambda a, b: vectors.where_small(a, b, np.float32(50.0)), lambda a, b: a * (np.abs(b) <= 50),
@@ -128,156 +104,3 @@ def test_products_of_pairs_are_added_and_stop_at_the_limits(one_instruction, mon
     found = applied(BYTES, INT16, lambda a, b: vectors.dot_pairs(a, b), counts, weights.view(np.uint8))
     for n, w, pairs in zip(counts, weights, found, strict=True):
         np.testing.assert_array_equal(pairs, saturated((n.astype(int) * w).reshape(LANES, 2).sum(axis=1)))
-
-
-def bits(places):
-    return sum(1 << int(i) for i in places)
-
-
-def first_of(places, none):
-    return places[0] if len(places) else none
-
-
-@numba.njit
-def found_in_lanes(a, number):
-    mask = shuffles.equal_mask(load_int16(address_of(a), 0), number)
-    return mask, shuffles.lowest_bit(mask), shuffles.last_lane(load_int16(address_of(a), 0))
-
-
-@numba.njit
-def found_in_bytes(a, number):
-    one, block = load_bytes(address_of(a), 0), load_block(address_of(a), 0)
-    places = shuffles.equal_bytes(one, number), shuffles.first_equal(block, number)
-    return *places, vectors.smallest_byte(one), vectors.smallest_byte(block)
-
-
-@numba.njit
-def ends_of(a):
-    return vectors.smallest_float(load_float32(address_of(a), 0)), vectors.largest_float(load_float32(address_of(a), 0))
-
-
-def test_numbers_are_found_among_lanes_and_bytes():
-    for a, b in samples(INT16):
-        for number in (a[3], a[15], b[0]):
-            equal = np.flatnonzero(a == number)
-            assert found_in_lanes(a, number) == (bits(equal), first_of(equal, 32), a[-1])
-    for a, _ in samples(FLOAT):
-        assert ends_of(a) == (a.min(), a.max())
-    for seed in range(20):
-        a = np.random.default_rng(seed).integers(0, 256, 8 * LANES).astype(np.uint8) | np.uint8(seed)
-        for number in (a[0], a[70], a[127], np.uint8(0)):
-            equal, some = np.flatnonzero(a == number), a[: 2 * LANES]
-            wanted = bits(equal[equal < 2 * LANES]), first_of(equal, 8 * LANES), some.min(), a.min()
-            assert found_in_bytes(a, number) == wanted
-
-
-@numba.njit
-def two_rows(source, out):
-    memory.store_bytes(address_of(out), 0, memory.load_two_rows(address_of(source), 3, 40))
-
-
-@numba.njit
-def added_bytes(source, out):
-    memory.add_bytes(address_of(out), 3, load_bytes(address_of(source), 0))
-
-
-@numba.njit
-def spread(source, out):
-    shuffles.spread_eights(address_of(source), address_of(out))
-
-
-@numba.njit
-def fetched(source, out):
-    places = np.arange(LANES) * 3 % 40 * 4 + address_of(source)
-    shuffles.fetch_eights(address_of(places), 4 * 3, address_of(out))
-    places[0] = 0  # kept alive up to here: only the address is used above
-
-
-@numba.njit
-def largest(source, out):
-    memory.store_int16(address_of(out), 0, shuffles.largest_of_rows(address_of(source)))
-
-
-@numba.njit
-def totals(source, out):
-    folded = np.empty((LANES, FOLDED), np.float32)
-    for r in range(LANES):
-        shuffles.store_folded(address_of(folded), r, load_float32(address_of(source), r * LANES))
-    memory.store_float32(address_of(out), 0, shuffles.totals_of_rows(address_of(folded)))
-    folded[0] = 0.0  # kept alive up to here: only the address is used above
-
-
-@numba.njit
-def equal_steps(source, out):
-    out[0] = shuffles.equal_bits(address_of(source), 5, 7, np.int16(2))
-
-
-RNG = np.random.default_rng(4)
-SOME_BYTES = RNG.integers(0, 256, 128).astype(np.uint8)
-FLOATS, FEW = RNG.normal(0, 10, 256).astype(np.float32), RNG.integers(0, 4, 100).astype(np.int16)
-ROWS = RNG.integers(-32768, 32768, 256).astype(np.int16)
-MOVES = [
-    (two_rows, SOME_BYTES, np.zeros(32, np.uint8), lambda a: np.r_[a[3:19], a[40:56]]),
-    (added_bytes, SOME_BYTES, np.full(40, 10**6, np.int32), lambda a: 10**6 + np.pad(a[:32].astype(int), (3, 5))),
-    (spread, SOME_BYTES, np.zeros(128, np.float32), lambda a: a.reshape(LANES, EIGHT).T.ravel()),
-    (
-        fetched, FLOATS, np.zeros(128, np.float32),
-        lambda a: a[np.arange(LANES) * 3 % 40 + 3 + np.arange(EIGHT)[:, None]].ravel(),
-    ),
-    (largest, ROWS, np.zeros(16, np.int16), lambda a: a.reshape(LANES, LANES).max(axis=1)),
-    (totals, FLOATS, np.zeros(16, np.float32), lambda a: a.reshape(LANES, LANES).sum(axis=1)),
-    (equal_steps, FEW, np.zeros(1, np.int64), lambda a: [bits(np.flatnonzero(a[5:61:7] == 2))]),
-]  # fmt: skip
-
-
-@pytest.mark.parametrize(("kernel", "source", "out", "wanted"), MOVES, ids=lambda a: getattr(a, "__name__", ""))
-def test_numbers_are_read_and_written_where_they_are_said_to_be(kernel, source, out, wanted):
-    kernel(source, out := out.copy())
-    exact = kernel is not totals
-    np.testing.assert_allclose(out, wanted(source), rtol=0 if exact else 1e-5, atol=0 if exact else 1e-4)
-
-
-@pytest.mark.parametrize(("first", "end"), [(0, 16), (-20, 40), (3, 4), (5, 5), (7, 2), (16, 20), (-5, 0), (15, 16)])
-def test_lanes_between(first, end):
-    out = np.empty(LANES, np.int16)
-    mask_between(first, end, out)
-    inside = (np.arange(LANES) >= first) & (np.arange(LANES) < end)
-    np.testing.assert_array_equal(out, np.where(inside, -1, 0))
-
-
-@numba.njit
-def mask_between(first, end, out):
-    memory.store_int16(address_of(out), 0, shuffles.lanes_between(first, end))
-
-
-@pytest.mark.parametrize("number", [0, 1, LANES - 1, LANES, LANES + 3, 5 * LANES])
-def test_copies_are_as_long_as_asked(number):
-    source, to = np.arange(1.0, 100.0, dtype=np.float32), np.zeros(99, np.float32)
-    memory.copy_floats(source.ctypes.data, to.ctypes.data, number)
-    np.testing.assert_array_equal(to[:number], source[:number])
-    assert not to[number:].any()
-
-
-class Some(NamedTuple):
-    numbers: np.ndarray
-    times: int
-
-
-class Both(NamedTuple):
-    some: Some
-    out: np.ndarray
-
-
-@numba.njit
-def multiplied(both):
-    for i in range(3):
-        memory.write_int16(both.out, i, np.int16(memory.read_int16(both.some.numbers, i) * both.some.times))
-
-
-def test_kernels_read_and_write_a_named_tuple_of_arrays_by_its_pointers():
-    both = Both(Some(np.array([1, 2, 3], np.int16), 5), np.zeros(3, np.int16))
-    given = memory.pointers(both)
-    assert type(given) is Both
-    assert given.some.times == 5
-    multiplied(given)
-    np.testing.assert_array_equal(both.out, [5, 10, 15])

@@ -8,7 +8,6 @@ import pytest
 from rig.estimate.joint.confidence import (
     AROUND,
     NEIGHBOURS,
-    SOME_HAZE,
     Brightness,
     agreement_row,
     count_neighbours,
@@ -23,11 +22,11 @@ from rig.simd.vectors import LANES
 from rig.threads import RowWorkers
 
 ROWS, COLUMNS = 40, 37
-ONE, TWO, THREE = RowWorkers(1), RowWorkers(2), RowWorkers(3)
+ONE = RowWorkers(1)
 BRIGHT = Brightness(0.1, 10.0, 0.005)
 
 
-def judged(distance, *, light=0.7, haze=0.1, scale=1.0, exposures=3, margin=10.0, sd=0.1, workers=ONE, searched=True):
+def judged(distance, *, light=0.7, haze=0.1, scale=1.0, exposures=3, margin=10.0, sd=0.1):
     """The table of answers at `distance` (rows, columns) from the far end, all of one light and margin."""
     rows, columns = distance.shape
     answer, places = new_answer(rows, columns), new_places(rows, columns)
@@ -37,8 +36,8 @@ def judged(distance, *, light=0.7, haze=0.1, scale=1.0, exposures=3, margin=10.0
     x_px = np.where(np.isnan(distance), np.nan, 100.0).astype(np.float32)
     frames = np.broadcast_to(np.asarray(exposures, np.int32), columns).copy()
     sds = np.full(distance.shape, sd, np.float32)
-    pairs = pairs_to_ask(np.broadcast_to(searched, distance.shape))
-    return stripe_table(x_px, sds, frames, answer, places, pairs, BRIGHT, workers)
+    pairs = pairs_to_ask(np.ones(distance.shape, np.bool_))
+    return stripe_table(x_px, sds, frames, answer, places, pairs, BRIGHT, ONE)
 
 
 def wall(rows=ROWS, columns=COLUMNS):
@@ -69,19 +68,9 @@ def test_neighbours_and_the_pairs_around_are_counted_as_they_are():
         np.testing.assert_array_equal(pairs[:COLUMNS], np.convolve(rows, np.ones(2 * AROUND + 1), "valid"))
 
 
-def places_there(case):
-    """Places of a map of which some have no frames or are not searched."""
-    there, (y, x) = np.ones((ROWS, COLUMNS), np.bool_), np.mgrid[:ROWS, :COLUMNS]
-    if "columns" in case:
-        there &= (x < 10) | (x > 13)
-    if "oblique" in case:
-        there &= x >= y - 5
-    return there if case != "scattered" else np.random.default_rng(2).random(there.shape) < 0.6
-
-
-@pytest.mark.parametrize("case", ["all", "columns", "oblique", "columns oblique", "scattered"])
-def test_all_pairs_of_a_wall_agree_up_to_its_border_and_to_what_is_not_there(case):
-    here = places_there(case)
+@pytest.mark.parametrize("share", [1.0, 0.6])
+def test_all_pairs_of_a_wall_agree_up_to_its_border_and_to_what_is_not_there(share):
+    here = np.random.default_rng(2).random((ROWS, COLUMNS)) < share
     there = new_neighbours(pairs_to_ask(here))
     count_neighbours(np.where(here, wall(), np.float32(np.nan)), 0, ROWS, there)
     width = there.number.shape[1]
@@ -91,17 +80,7 @@ def test_all_pairs_of_a_wall_agree_up_to_its_border_and_to_what_is_not_there(cas
         np.testing.assert_array_equal(pairs[:COLUMNS][here[y]], there.pairs[y, here[y]])
 
 
-def test_a_surface_is_as_sure_beside_places_that_are_not_searched():
-    settings = {"light": 0.3, "haze": 0.14, "exposures": 10}  # haze enough for neighbours to have a say
-    alone, here = judged(wall(), **settings).confidence, places_there("oblique")
-    found = judged(np.where(here, wall(), np.float32(np.nan)), searched=here, **settings).confidence
-    # Light is pooled over 3 x 3: where some of it is missing, it tells a little less.
-    lit = np.lib.stride_tricks.sliding_window_view(np.pad(here, 1), (3, 3)).all((2, 3))
-    np.testing.assert_allclose(found[lit], alone[lit], rtol=1e-3)
-    assert found[here].min() > alone.min() - 0.02
-
-
-@pytest.mark.parametrize("exposures", [1, 3, 20, 1000])
+@pytest.mark.parametrize("exposures", [1, 20, 1000])
 def test_a_lit_surface_is_believed_and_scattered_answers_are_not(exposures):
     light = 3.0 / exposures + 0.7
     assert judged(wall(), light=light, exposures=exposures, margin=14).confidence.min() > 0.9
@@ -119,31 +98,13 @@ def test_haze_that_only_ends_is_no_stripe():
 CLEAR = {"haze": 0.0, "margin": 10.0}
 
 
-def test_no_light_in_clear_air_is_no_stripe_where_stripes_bring_much():
-    """Brightest amplitude 10: at 10 exposures bright stripes bring 900 photons to nine answers."""
+def test_no_light_in_clear_air_is_no_stripe_where_bright_stripes_bring_much_and_says_nothing_elsewhere():
+    """900 photons to nine answers at 10 exposures; 0.9 at one: four of ten such stripes send none."""
     assert judged(wall(), light=0.0, exposures=10, **CLEAR).confidence.max() < 0.1
     assert judged(wall(), light=0.3, exposures=10, **CLEAR).confidence.min() > 0.95
-
-
-def test_no_light_says_nothing_where_bright_stripes_bring_hardly_any():
-    """0.9 photons to nine answers at one exposure: four of ten such stripes send none. At 100 exposures, all do."""
     dim = {"light": 0.0, "scale": 0.01, **CLEAR}
     assert judged(wall(), exposures=1, **dim).confidence.min() > 0.8
     assert judged(wall(), exposures=100, **dim).confidence[1:-1, 1:-1].max() < 0.1
-
-
-def test_missing_light_counts_by_the_square_of_how_clear_the_air_is():
-    """With so much haze that odds have half their weight, a quarter of it is left; odds tell the rest."""
-    seen = {"light": 0.0, "margin": 10.0, "exposures": 1, "scale": 0.5}
-    alone, hazy = (judged(wall(), haze=haze, **seen).confidence[3:-3, 3:-3] for haze in (0.0, SOME_HAZE))
-    assert alone.max() < 0.05
-    assert hazy.min() > 0.88
-    assert judged(scattered(), haze=SOME_HAZE, **seen).confidence.mean() < 0.2
-
-
-def test_a_dark_thing_beside_bright_ones_is_believed_in_clear_air():
-    """Three photons an answer stand out by themselves, though others bring hundreds of times as many."""
-    assert judged(wall(), light=0.3, scale=10.0, exposures=10, haze=0.0).confidence.min() > 0.9
 
 
 @pytest.mark.parametrize("side", [-1, 1])
@@ -170,18 +131,13 @@ def test_no_agreement_around_makes_up_for_a_hole_where_light_should_be():
     assert judged(wall(), light=0.25, exposures=200, **seen).confidence.min() > 0.9
 
 
-@pytest.mark.parametrize("sd", [0.4, 0.6, 1.0])
+@pytest.mark.parametrize("sd", [0.4, 1.0])
 def test_a_stripe_is_taken_to_be_half_as_far_off_again_as_counts_alone_say(sd):
     """Nothing else is in doubt, so the confidence is the chance of a normal error to stay within a pixel."""
     found = judged(wall(), light=5.0, haze=0.0, exposures=100, margin=30, sd=sd).confidence
     least, most = (math.erf(1 / (times * sd * math.sqrt(2))) for times in (1.65, 1.45))
     assert least < found.min()
     assert found.max() < most
-
-
-@pytest.mark.parametrize(("better", "worse"), [({"sd": 0.1}, {"sd": 0.9}), ({"margin": 12}, {"margin": 2})])
-def test_well_placed_answers_without_rivals_are_surer(better, worse):
-    assert judged(wall(), **better).confidence.min() > judged(wall(), **worse).confidence.max()
 
 
 def test_an_answer_is_sure_where_opposite_neighbours_put_it_whatever_the_slope():
@@ -197,26 +153,3 @@ def test_an_answer_is_sure_where_opposite_neighbours_put_it_whatever_the_slope()
     # Two and four rows and columns away it is one of eight pairs that say otherwise.
     assert alone[22, 18] > found[22, 18] > found[20, 18]
     np.testing.assert_array_equal(found[:, 30:], alone[:, 30:])
-
-
-def test_a_pole_is_surer_than_single_answers():
-    pole = scattered()
-    pole[:, 15:19] = 50.0
-    found = judged(pole).confidence
-    assert found[:, 16:18].mean() > 2 * np.delete(found, range(12, 22), axis=1).mean()
-
-
-def test_bits_do_not_depend_on_threads():
-    alone, others = judged(scattered()), [judged(scattered(), workers=workers) for workers in (TWO, THREE)]
-    for other in others:
-        np.testing.assert_array_equal(other.confidence, alone.confidence)
-
-
-def test_what_has_no_place_has_no_confidence():
-    distance = wall()
-    distance[:5] = np.nan
-    found = judged(distance)
-    assert not found.confidence[:5].any()
-    assert found.confidence[5:].all()
-    for field in (found.signal, found.haze, found.x_sd_px):
-        assert np.isnan(field[:5]).all()

@@ -1,6 +1,5 @@
 """The halo of forward-peaked fog: what it adds to label costs, and that it is found where it is and only there."""
 
-import io
 from dataclasses import replace
 from functools import cache
 
@@ -8,7 +7,7 @@ import numpy as np
 import pytest
 
 from rig.estimate.joint import halo
-from rig.estimate.joint.halo import bright_lines, learn_next_halo, solve
+from rig.estimate.joint.halo import bright_lines, learn_next_halo, likeliest_light, solve
 from rig.estimate.joint.joint import Joint
 from rig.estimate.joint.labels import halo_rows
 from rig.estimate.joint.labels.cost_rows import EXCLUDED
@@ -16,17 +15,19 @@ from rig.estimate.joint.labels.costs import _lights, costs_of
 from rig.estimate.joint.labels.grid import PER_PX, label_grid
 from rig.estimate.joint.labels.halo_rows import BLOCK_PX
 from rig.estimate.joint.lesson import add_quiet
+from rig.estimate.joint.place.place import new_places, profile_table, weigh_light
 from rig.estimate.joint.place.places import most_shown
 from rig.estimate.joint.tables import tables_of
 from rig.estimate.row import inputs
-from rig.estimate.row.inputs import halo_shares, over_bins, row_buffers, row_fluxes, state_of, sweep_of
+from rig.estimate.row.inputs import halo_shares, row_buffers, row_fluxes, state_of, sweep_of
 from rig.estimate.row.likelihood import FLOOR
-from rig.estimate.row.model import BINS, HALO_NODES, HALO_REACHES_PX, RowModel, pixel_shares
+from rig.estimate.row.model import BINS, HALO_NODES, RowModel, pixel_shares
 from rig.estimate.search.online_learning import LearningSetting
 from rig.simd.vectors import LANES
 from rig.threads import RowWorkers
 from tests.stability.inventory import covers
 from tests.unit.rig.estimate.joint.test_label_volume import known_model
+from tests.unit.rig.estimate.joint.test_place import COLUMNS, ROWS, wall
 from tests.unit.small_maps import simulated
 
 covers(halo, halo_rows, inputs)
@@ -97,20 +98,14 @@ def first_map(light):
     return swept, joint, joint.estimate(swept.volume, swept.geometry)
 
 
-@pytest.mark.parametrize("light", ["halo", "halo-less"])
-def test_a_halo_is_found_where_there_is_one(light):
+@pytest.mark.parametrize(("light", "other"), [("halo", "halo-less"), ("halo-less", "halo")])
+def test_first_and_later_maps_tell_whether_there_is_a_halo(light, other):
     swept, joint, stripes = first_map(light)
-    model = joint.used
-    assert bool(model.halo.any()) is (light == "halo")
-    assert model.extinction_per_m == pytest.approx(swept.point.light.extinction_per_m, rel=0.3)
+    assert joint.used.halo.any() == (light == "halo")
+    assert joint.used.extinction_per_m == pytest.approx(swept.point.light.extinction_per_m, rel=0.3)
     errors = swept.errors(stripes.x_px)
     assert np.nanmean(errors) < 1.0
     assert np.isfinite(errors).mean() > 0.95
-
-
-@pytest.mark.parametrize(("light", "other"), [("halo", "halo-less"), ("halo-less", "halo")])
-def test_later_maps_tell_whether_there_is_a_halo(light, other):
-    swept, joint, stripes = first_map(light)
     setting = LearningSetting(joint.used, swept.geometry, 5, False)
     tables = tables_of(setting, WORKERS)
     seen = bright_lines(swept.volume, swept.geometry, tables, stripes, joint._memory.places, WORKERS)
@@ -121,31 +116,6 @@ def test_later_maps_tell_whether_there_is_a_halo(light, other):
     assert learn_next_halo(replace(setting, model=wrong, geometry=several), seen, WORKERS) is wrong
     clear = replace(first_map("halo-less")[1].used, extinction_per_m=np.nan)
     assert learn_next_halo(replace(setting, model=clear), seen, WORKERS) is clear, "without haze there is no halo"
-
-
-def test_pixels_without_a_ray_are_not_quiet():
-    swept = simulated("halo", 10, rows=20, columns=48)
-    g, volume = swept.geometry, swept.volume
-    cut = int(np.median(swept.point.x_true[np.isfinite(swept.point.x_true)])) + 40
-    u = g.u.copy()
-    u[:, cut:] = np.nan
-    g = replace(g, u=u, v=np.where(np.isnan(u), u, g.v), x_hi=np.minimum(g.x_hi, cut - 1))
-    model = replace(known_model(g), halo=HALO)
-    x_px = swept.point.x_true.astype(np.float32)
-    there = np.isfinite(x_px) & (x_px < cut)
-    signal, confidence = np.where(there, 0.3, 0).astype(np.float32), there.astype(np.float32)
-    shares = halo_shares(model, g.width)
-    found = {}
-    for name, share in (("halo", shares), ("none", shares[:, :0])):
-        quiet = found[name] = np.zeros((2, g.rows, g.width))
-        add_quiet(
-            volume.counts, volume.n_frames, sweep_of(g), state_of(model), share, x_px, signal, confidence, 1, np.inf, 0,
-            g.rows, quiet,
-        )  # fmt: skip
-        assert not quiet[:, :, cut:].any()
-        assert quiet[1, :, :cut].any()
-    assert np.isfinite(found["halo"]).all()
-    np.testing.assert_array_equal(found["halo"][1], found["none"][1])
 
 
 def test_pixels_are_not_quiet_in_the_halo_of_a_stripe_whose_light_is_not_known():
@@ -177,8 +147,6 @@ def test_shares_add_up_to_the_halos_light():
     model = replace(known_model(simulated(rows=20, columns=48).geometry), halo=HALO)
     shares = halo_shares(model, 2000)
     assert 2 * shares.sum(axis=1) - shares[:, 0] == pytest.approx(np.full(BINS, 2.5), rel=1e-2)
-    assert over_bins(np.arange(HALO_NODES)[:, None] * 1.0, BINS)[[0, -1], 0] == pytest.approx([0, HALO_NODES - 1])
-    assert len(HALO_REACHES_PX) == HALO.shape[1]
 
 
 def test_the_fit_keeps_numbers_from_falling_below_zero():
@@ -196,12 +164,52 @@ def test_the_fit_keeps_numbers_from_falling_below_zero():
 
 def test_states_kept_before_there_was_a_halo_still_load():
     model = known_model(simulated(rows=20, columns=48).geometry)
-    room = io.BytesIO()
-    np.savez(room, **{name: array for name, array in model.arrays().items() if name != "halo"})
-    room.seek(0)
-    with np.load(room) as kept:
-        assert not RowModel.from_arrays(dict(kept)).halo.any()
+    assert not RowModel.from_arrays({n: array for n, array in model.arrays().items() if n != "halo"}).halo.any()
     with_halo = RowModel.from_arrays(replace(model, halo=HALO).arrays())
     assert with_halo.halo.tobytes() == HALO.tobytes()
     with pytest.raises(KeyError):
         RowModel.from_arrays({name: array for name, array in model.arrays().items() if name != "ambient"})
+
+
+def light_of(volume, geometry, x_px):
+    """Light by likelihood and whether it is known, light of each pixel's own flux, and scale of all stripes."""
+    model, places = known_model(geometry), new_places(ROWS, COLUMNS)
+    state, sweep, x = state_of(model), sweep_of(geometry), x_px.astype(np.float32)
+    state = state._replace(amplitude=np.array([0.1, 1000.0], np.float32))
+    places.distance[:] = x_px - label_grid(geometry).x_far
+    weigh_light(volume, sweep, state, x, places, WORKERS)
+    WORKERS.settle()
+    rows, columns = (a.astype(np.int32) for a in np.nonzero(np.isfinite(x_px)))
+    light, known = np.empty(len(rows), np.float32), np.empty(len(rows), np.bool_)
+    likeliest_light(
+        volume.counts, volume.n_frames, sweep, state, profile_table(0.6), x, places, rows, columns, 0, len(rows),
+        light, known,
+    )  # fmt: skip
+    return light, known, (places.amplitude * places.scale)[rows, columns], places.scale[rows, columns]
+
+
+@pytest.mark.parametrize(
+    ("rig", "exposures", "amplitude"), [("left", 1, 20.0), ("right", 5, 4.0), ("left", 5, 120.0), ("right", 50, 60.0)]
+)
+def test_light_is_that_of_the_stripe_however_full_its_pixels(rig, exposures, amplitude):
+    volume, geometry, x_px = wall(rig, exposures, light=amplitude)
+    light, known, added_up, scale = light_of(volume, geometry, x_px)
+    assert known.mean() > 0.7
+    ratio = light[known] / (amplitude * scale[known])
+    assert np.median(ratio) == pytest.approx(1.0, abs=0.1)
+    if exposures == 5 and amplitude >= 60:
+        assert np.median(added_up / (amplitude * scale)) < 0.75, "pixels are not full: nothing is shown"
+
+
+def test_light_is_not_known_where_neighbours_do_not_agree():
+    volume, geometry, x_px = wall("left", 5, light=30.0)
+    dark, _, _ = wall("left", 5, light=0.0)
+    _, known, _, _ = light_of(dark, geometry, x_px)
+    assert known.mean() < 0.02, "there is no stripe"
+    counts = volume.counts.copy()
+    counts[:, ::2] = dark.counts[:, ::2]
+    _, known, _, _ = light_of(replace(volume, counts=counts), geometry, x_px)
+    assert known.mean() < 0.02, "every other row is in a shadow"
+    alone = np.where((np.arange(ROWS) == 9)[:, None], x_px, np.nan)
+    _, known, _, _ = light_of(volume, geometry, alone)
+    assert not known.any(), "five stripes are too few to tell whether they agree"

@@ -9,14 +9,14 @@ import pytest
 from rig.estimate.joint import confidence, lesson
 from rig.estimate.joint.joint import Joint
 from rig.estimate.joint.labels.grid import PER_PX, label_grid
-from rig.estimate.registry import create_estimator, recalling
+from rig.estimate.registry import recalling
 from rig.estimate.row.model import RowModel
 from rig.geometry.stripe_table import StripeTable
 from tests.reference.geometry import Geometry
 from tests.reference.scene import Scene
 from tests.reference.working_point import POINTS, WorkingPoint
 from tests.stability.inventory import covers
-from tests.unit.small_maps import geometry_of, simulated, street, volume_of
+from tests.unit.small_maps import assert_same, geometry_of, simulated, street, volume_of
 
 covers(confidence, lesson)
 
@@ -26,11 +26,6 @@ def estimated(light="report", exposures=3, rig="left") -> tuple[StripeTable, Row
     """The first map of a sweep and the state it was estimated with."""
     sweep, estimator = simulated(light, exposures, rig), Joint(2)
     return estimator.estimate(sweep.volume, sweep.geometry), estimator.used
-
-
-def assert_same(found: StripeTable, wanted: StripeTable) -> None:
-    for field in fields(StripeTable):
-        np.testing.assert_array_equal(getattr(found, field.name), getattr(wanted, field.name), err_msg=field.name)
 
 
 def test_a_state_that_was_kept_gives_the_same_bits_whatever_came_between():
@@ -62,10 +57,7 @@ def test_columns_without_frames_have_no_answer_and_those_beside_them_do():
     assert np.mean(np.abs(found.x_px - sweep.point.x_true)[scored] <= 1) > 0.85
 
 
-LIMITS = {
-    ("report", 3, "left"): 0.3, ("report", 3, "turned"): 0.3, ("report", 1, "left"): 0.5, ("dense", 10, "left"): 0.4,
-    ("clear", 3, "left"): 0.3,
-}  # fmt: skip
+LIMITS = {("report", 3, "turned"): 0.3, ("dense", 10, "left"): 0.4, ("clear", 3, "left"): 0.3}
 """Mean error in px, cut off at 10, that so few rows and columns allow."""
 
 
@@ -75,21 +67,10 @@ def test_errors_are_small_on_every_rig(light, exposures, rig):
     assert np.minimum(sweep.errors(found.x_px), 10).mean() < LIMITS[light, exposures, rig]
 
 
-@pytest.mark.parametrize("level", [0, 3])
-def test_counts_of_nothing_or_all_ones_are_answered_without_confidence(level):
-    sweep = simulated(exposures=3)
-    blank = volume_of(np.full_like(sweep.counts, level), sweep.geometry, 3)
-    asked = sweep.geometry.x_lo <= sweep.geometry.x_hi
-    found = create_estimator("joint").estimate(blank, sweep.geometry)
-    np.testing.assert_array_equal(np.isfinite(found.x_px), asked)
-    assert np.median(found.confidence[asked]) < 0.5
-
-
-@pytest.mark.parametrize("side", ["left", "right"])
-def test_lines_that_leave_the_picture_are_not_believed_at_its_edge(side, monkeypatch):
+def test_lines_that_leave_the_picture_are_not_believed_at_its_edge(monkeypatch):
     # Planes to both sides of what the camera sees: most of their search lies beside the sensor, the rest is dark.
     monkeypatch.setattr("tests.reference.geometry.TANGENTS", (-0.6, 0.9))
-    g = Geometry.build(height=32, columns=96, side=side)
+    g = Geometry.build(height=32, columns=96, side="right")
     point = WorkingPoint(street(32), POINTS["clear"], g)
     sweep = volume_of(point.counts(5, 1), geometry_of(g), 5)
     found = Joint(2).estimate(sweep, geometry_of(g))
@@ -109,11 +90,7 @@ def test_room_of_a_map_is_not_carried_to_one_of_another_size():
     assert_same(estimator.estimate(large.volume, large.geometry), wanted)
 
 
-ROLLED = {"side": "right", "roll_deg": 5.0}
-
-
-@pytest.mark.parametrize("rig", [{}, {"side": "right"}, ROLLED], ids=["left", "right", "rolled"])
-@pytest.mark.parametrize("depth_m", [1.6, 4.0])
+@pytest.mark.parametrize(("rig", "depth_m"), [({}, 1.6), ({"side": "right", "roll_deg": 5.0}, 4.0)])
 def test_a_wall_has_one_label_over_all_columns_and_rows(rig, depth_m):
     wall = np.full((24, 512), depth_m, np.float32)
     g = Geometry.build(height=24, columns=60, **rig)

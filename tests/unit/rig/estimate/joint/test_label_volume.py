@@ -11,7 +11,6 @@ from rig.estimate.joint.labels import cost_rows, costs, grid, tables
 from rig.estimate.joint.labels.cost_rows import COST_LIMIT, COUNT_BITS, EXCLUDED, _times
 from rig.estimate.joint.labels.costs import SHARP, _lights, costs_of
 from rig.estimate.joint.labels.grid import PER_PX, label_grid
-from rig.estimate.joint.winner import UNITS
 from rig.estimate.row.inputs import row_buffers, row_fluxes, state_of, sweep_of
 from rig.estimate.row.likelihood import FLOOR
 from rig.estimate.row.model import BINS, RowModel, pixel_shares, stripe_scale
@@ -118,8 +117,7 @@ def differences(model, geometry, volume, exposures, columns=(0, 3, 17, 30, 47), 
     return np.concatenate(found), alone
 
 
-@pytest.mark.parametrize("rig", ["left", "right"])
-@pytest.mark.parametrize("exposures", [1, 10, 255, 1000])
+@pytest.mark.parametrize(("rig", "exposures"), [("left", 1), ("right", 10), ("left", 255), ("right", 1000)])
 def test_costs_are_log_likelihoods(rig, exposures):
     s = sweep(rig, exposures)
     found, alone = differences(known_model(s.geometry), s.geometry, s.volume, exposures)
@@ -150,26 +148,12 @@ def test_turned_and_distorted_rigs():
 @pytest.mark.parametrize("ones", [0, 1], ids=["dark", "saturated"])
 def test_rows_of_zeros_or_ones_stay_in_range(ones):
     s = sweep()
-    for exposures, dtype in ((1, np.uint8), (10, np.uint8), (60000, np.uint16)):
+    for exposures, dtype in ((1, np.uint8), (60000, np.uint16)):
         counts = np.full_like(s.counts, exposures * ones, dtype)
         volume = volume_of(counts, s.geometry, exposures)
         found, _ = differences(known_model(s.geometry), s.geometry, volume, exposures, columns=(3, 20), rows=(5,))
         # So unlikely a row lies outside of what 16 bits hold, but its best answer is the right one.
         assert found.max(initial=0) <= (2.0 if exposures < 100 else COST_LIMIT)
-
-
-def test_columns_of_other_lengths_and_without_frames():
-    s = sweep()
-    exposures = np.full(COLUMNS, 10, np.int32)
-    exposures[[3, 17, 30]] = 7, 14, 0
-    counts = np.minimum(s.counts, exposures[:, None, None]).astype(np.uint8)
-    volume = volume_of(counts, s.geometry, exposures)
-    found, _ = differences(known_model(s.geometry), s.geometry, volume, 10, columns=(3, 17))
-    assert found.max() <= 2.0
-    out, costs = filled(known_model(s.geometry), s.geometry, volume, 10)
-    grid = costs.grid
-    assert not out[:, 30, : grid.stripes].any()
-    assert (out[:, 30, grid.stripes :] == EXCLUDED).all()
 
 
 @pytest.mark.parametrize("frames", [2, 40])
@@ -186,13 +170,11 @@ def test_a_column_of_another_length_costs_what_it_would_among_its_like(frames):
     assert np.abs(other[compared] - own[compared]).max() <= 3.0
 
 
-@pytest.mark.parametrize("rig", ["left", "turned"])
-def test_rows_may_be_filled_in_any_pieces(rig):
-    s = sweep(rig, 3, rows=70)
+def test_rows_may_be_filled_in_any_pieces():
+    s = sweep("turned", 3, rows=70)
     model = known_model(s.geometry)
     whole, _ = filled(model, s.geometry, s.volume, 3)
-    for pieces in (3, 70):
-        np.testing.assert_array_equal(filled(model, s.geometry, s.volume, 3, pieces)[0], whole)
+    np.testing.assert_array_equal(filled(model, s.geometry, s.volume, 3, 5)[0], whole)
     assert not (whole == 7).all(axis=2).any()
 
 
@@ -211,14 +193,7 @@ def test_hot_pixels_say_nothing():
     assert np.mean(np.abs(best - unaware) <= 2) < 0.85
 
 
-def test_units_follow_the_exposures():
-    s = sweep()
-    model, grid = known_model(s.geometry), label_grid(s.geometry)
-    units = [costs_of(model, s.geometry, grid, k, WORKERS).units_per_nat for k in (1, 8, 24)]
-    np.testing.assert_allclose(units, [UNITS / (1 + 1 / SHARP), UNITS / 2, UNITS / 4])
-
-
-@pytest.mark.parametrize("usual", [1, 2, 3, 10, 255, 20_000])
+@pytest.mark.parametrize("usual", [1, 10, 20_000])
 def test_no_column_counts_for_more_than_the_longest_that_tables_are_made_for(usual):
     """Counts of columns of other lengths are multiplied to one scale: products must fit 16 bits."""
     geometry = sweep().geometry

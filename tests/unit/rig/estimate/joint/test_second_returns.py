@@ -37,7 +37,7 @@ def seconds_of(sweep: Sweep, x_px, haze=0.14, threads=WORKERS, left=0.0, volume=
     grid = label_grid(sweep.geometry)
     light = second_light(state_of(model), 0.6, grid, sweep_of(sweep.geometry))
     room = second_room(grid)
-    for array in (*room.blocks, *room.candidates, *room.seconds, room.moved):
+    for array in (*room.blocks, *room.candidates, *room.seconds):
         array[:] = left
     volume = sweep.volume if volume is None else volume
     return second_returns(volume, grid, sweep_of(sweep.geometry), light, x_px.astype(np.float32), room, threads)
@@ -80,69 +80,22 @@ def test_the_wall_behind_an_answer_is_found_in_clear_air() -> None:
     assert right[two].mean() > 0.98
 
 
-@pytest.mark.parametrize("light", ["report", "clear"])
-def test_one_surface_has_no_second_return(light) -> None:
-    sweep = simulated(light, 10, rows=ROWS)
-    haze = 0.14 if light == "report" else 1e-4
-    x2_px, confidence2 = seconds_of(sweep, sweep.point.x_true, haze)
+def test_one_surface_has_no_second_return() -> None:
+    sweep = simulated(exposures=10, rows=ROWS)
+    x2_px, confidence2 = seconds_of(sweep, sweep.point.x_true)
     assert (confidence2[sweep.point.trusted] > SURE).mean() < 0.005
     assert (confidence2[np.isnan(x2_px)] == 0).all()
 
 
-def test_rows_without_data_have_none_and_threads_do_not_matter() -> None:
-    sweep = pane()
-    x_px = sweep.point.x_true.copy()
-    x_px[:, 40:60] = np.nan
-    x2_px, confidence2 = seconds_of(sweep, x_px)
-    assert np.isnan(x2_px[:, 40:60]).all()
-    assert (confidence2[:, 40:60] == 0).all()
-    with RowWorkers(3) as workers:
-        for one, other in zip((x2_px, confidence2), seconds_of(sweep, x_px, threads=workers), strict=True):
-            np.testing.assert_array_equal(one, other)
-
-
-@pytest.mark.parametrize("left", [1e6, np.nan])
-def test_what_an_earlier_map_left_is_forgotten_where_nothing_is_searched(left) -> None:
+def test_what_an_earlier_map_left_is_forgotten_where_nothing_is_searched() -> None:
     sweep = pane()
     g, empty = sweep.geometry, np.random.default_rng(2).random((ROWS, COLUMNS)) < 0.2
     g = replace(g, x_lo=np.where(empty, 0, g.x_lo), x_hi=np.where(empty, -1, g.x_hi))
     x_px = np.where(empty, np.nan, sweep.point.x_true)
-    found = [seconds_of(replace(sweep, geometry=g), x_px, left=each) for each in (0.0, left)]
+    found = [seconds_of(replace(sweep, geometry=g), x_px, left=each) for each in (0.0, 1e6)]
     assert (found[0][1] > SURE).any()
     for one, other in zip(*found, strict=True):
         np.testing.assert_array_equal(one, other)
-
-
-def test_columns_without_exposures_are_left_alone() -> None:
-    sweep = pane()
-    volume = sweep.volume
-    volume.n_frames[::7] = 0
-    x_px = np.where(volume.n_frames > 0, sweep.point.x_true, np.nan)
-    x2_px, _ = seconds_of(sweep, x_px, volume=volume)
-    assert np.isnan(x2_px[:, ::7]).all()
-    two = np.isfinite(sweep.point.x_second) & np.isfinite(x_px)
-    assert (np.abs(x2_px - sweep.point.x_second)[two] <= 1).mean() > 0.95
-
-
-@pytest.mark.parametrize("rig", ["left", "right"])
-def test_rows_that_end_before_the_picture_does_are_as_good(rig) -> None:
-    sweep = pane(rig=rig)
-    g, point = sweep.geometry, sweep.point
-    seen = np.isfinite(point.x_true)
-    low, high = (int(q) for q in np.quantile(point.x_true[seen], (0.2, 0.8)))
-    u = g.u.copy()
-    u[:, :low] = u[:, high + 1 :] = np.nan
-    x_lo, x_hi = np.maximum(g.x_lo, low), np.minimum(g.x_hi, high)
-    empty = (g.x_lo > g.x_hi) | (x_lo > x_hi)
-    x_lo[empty], x_hi[empty] = 0, -1
-    g = replace(g, u=u, v=np.where(np.isnan(u), u, g.v), x_lo=x_lo, x_hi=x_hi)
-    inside = [(x > low + REACH) & (x < high - REACH) for x in (point.x_true, point.x_second)]
-    x_px = np.where(inside[0], point.x_true, np.nan)
-    x2_px, confidence2 = seconds_of(replace(sweep, geometry=g), x_px)
-    two = inside[0] & inside[1]
-    assert two.mean() > 0.05
-    assert ((np.abs(x2_px - point.x_second) <= 1) & (confidence2 > SURE))[two].mean() > 0.9
-    assert (confidence2[np.isnan(point.x_second)] > SURE).mean() < 0.01
 
 
 def test_pixels_not_to_be_used_neither_show_nor_hide_a_second_return() -> None:
@@ -160,24 +113,8 @@ def test_pixels_not_to_be_used_neither_show_nor_hide_a_second_return() -> None:
     assert (confidence2[~around(two)] > SURE).mean() < 0.005
 
 
-def test_strong_ambient_light_is_expected_as_ones_not_as_photons() -> None:
+def test_bytes_at_once_and_other_counts_one_by_one_give_the_same_sums() -> None:
     sweep = pane()
-    geometry, model, grid = sweep.geometry, known_model(sweep.geometry, haze=1e-9), label_grid(sweep.geometry)
-    model.ambient[:] = 2.0
-    model.ambient[::3, 200] = FLUX_MAX
-    light = second_light(state_of(model), 0.6, grid, sweep_of(geometry))
-    for dtype in (np.uint8, np.uint16):
-        blocks = sums_of(np.ones_like(sweep.volume.counts, dtype), sweep, light)
-        np.testing.assert_allclose(blocks.expected, blocks.ones * 10 * -np.expm1(-2), rtol=1e-4)
-        y, x = np.arange(ROWS)[:, None, None], np.arange(geometry.width)
-        seen = (x >= geometry.x_lo[..., None]) & (x <= geometry.x_hi[..., None]) & ((x != 200) | (y % 3 != 0))
-        seen &= np.abs(x - sweep.point.x_true.astype(np.float32)[..., None]) > light.apart
-        assert blocks.ones.sum() == seen.sum()
-
-
-@pytest.mark.parametrize("rig", ["left", "right"])
-def test_bytes_at_once_and_other_counts_one_by_one_give_the_same_sums(rig) -> None:
-    sweep = pane(rig=rig)
     light = second_light(
         state_of(known_model(sweep.geometry)), 0.6, label_grid(sweep.geometry), sweep_of(sweep.geometry)
     )

@@ -10,20 +10,17 @@ from rig.estimate.joint import temporal
 from rig.estimate.joint.joint import Joint
 from rig.estimate.joint.labels.grid import label_grid
 from rig.estimate.joint.temporal import FREE, MOST, SLOPE, TemporalPrior
-from rig.estimate.registry import recalling
-from rig.estimate.row.model import RowModel
 from rig.geometry.stripe_table import StripeTable
 from rig.threads import RowWorkers
 from tests.reference.scene import procedural_scene
 from tests.reference.tables.moving import Disc, measure
 from tests.stability.inventory import covers
-from tests.unit.small_maps import simulated
+from tests.unit.small_maps import assert_same, simulated
 
 covers(temporal)
 
 WORKERS = RowWorkers(2)
 ROWS, COLUMNS = 32, 96
-FIELDS = ("x_px", "confidence", "x_sd_px", "signal", "haze")
 
 
 def volume_at(seed: int):
@@ -45,32 +42,28 @@ def sequence():
     return found
 
 
-def told(confidence: float, rig: str = "left") -> tuple[TemporalPrior, StripeTable]:
+def told(confidence: float) -> tuple[TemporalPrior, StripeTable]:
     """A prior that was left a map with stripes 40 labels from the far end, of one confidence."""
-    at = simulated(rig=rig).geometry
+    at = geometry()
     grid = label_grid(at)
     x_px = (grid.x_far - grid.side * 20.0).astype(np.float32)
     table = replace(StripeTable.empty(ROWS, COLUMNS), x_px=x_px, confidence=np.full_like(x_px, confidence))
     prior = TemporalPrior(True)
     prior.begin(at, grid)
-    prior.leave(table, grid, WORKERS)
+    prior.leave(table, grid)
     prior.begin(at, grid)
     return prior, table
 
 
-def added(prior: TemporalPrior, volume, cost: int = 10) -> np.ndarray:
-    """What the prior adds to costs that are even."""
+def added(prior: TemporalPrior, volume) -> np.ndarray:
+    """What the prior adds to costs that are even, and such that the most it may add just fits a byte."""
+    cost = 255 - MOST
     out = np.full((ROWS, COLUMNS, label_grid(geometry()).labels), cost, np.uint8)
     prior.add(volume, 0, ROWS, out)
     return out.astype(int) - cost
 
 
-def assert_same(one: StripeTable, other: StripeTable) -> None:
-    for name in FIELDS:
-        np.testing.assert_array_equal(getattr(one, name), getattr(other, name), err_msg=name)
-
-
-@pytest.mark.parametrize(("confidence", "most"), [(1.0, MOST), (0.75, round(MOST / 2)), (0.5, 0), (0.1, 0)])
+@pytest.mark.parametrize(("confidence", "most"), [(1.0, MOST), (0.75, round(MOST / 2)), (0.5, 0)])
 def test_labels_far_from_the_last_one_cost_more_up_to_what_its_confidence_allows(confidence, most):
     prior, table = told(confidence)
     more = added(prior, volume_at(1))
@@ -81,62 +74,15 @@ def test_labels_far_from_the_last_one_cost_more_up_to_what_its_confidence_allows
     assert not more[np.isnan(table.x_px)].any()
 
 
-def test_near_may_be_on_the_right():
-    prior, table = told(1.0, "right")
-    assert prior.before is not None
-    assert set(prior.before[0][np.isfinite(table.x_px)]) == {40}
-
-
-def test_costs_stop_at_the_largest_byte():
-    prior, _ = told(1.0)
-    assert added(prior, volume_at(1), cost=254).max() == 1
-
-
-def test_columns_without_frames_are_told_nothing_and_leave_nothing():
-    volume = volume_at(1)
-    gap = np.where(np.arange(COLUMNS) < 50, volume.n_frames, 0).astype(np.int32)
-    prior, _ = told(1.0)
-    more = added(prior, replace(volume, n_frames=gap))
-    assert not more[:, 50:].any()
-    assert more[:, :50].any()
-    estimator = Joint(2, sequence()[1][1], temporal_prior=True)
-    estimator.estimate(replace(volume, n_frames=gap), geometry())
-    after = estimator.model.before
-    assert not after[1, :, 50:].any()
-    assert after[1, :, :50].any()
-
-
 def test_behind_a_map_without_frames_and_at_another_geometry_there_is_no_prior():
     plain = replace(sequence()[0][1], before=None)
     alone = Joint(2, plain).estimate(volume_at(2), geometry())
-    for other in (replace(volume_at(1), n_frames=np.zeros(COLUMNS, np.int32)), None):
+    without_frames = replace(volume_at(1), n_frames=np.zeros(COLUMNS, np.int32))
+    for first, then in ((without_frames, geometry()), (volume_at(1), replace(geometry()))):
         estimator = Joint(2, plain, temporal_prior=True)
-        if other is not None:
-            estimator.estimate(other, geometry())
-            assert_same(estimator.estimate(volume_at(2), geometry()), alone)
-        else:
-            estimator.estimate(volume_at(1), geometry())
-            assert_same(estimator.estimate(volume_at(2), replace(geometry())), alone)
+        estimator.estimate(first, geometry())
+        assert_same(estimator.estimate(volume_at(2), then), alone)
         assert estimator.used.before is None
-
-
-def test_without_the_option_every_map_is_estimated_by_itself():
-    plain = replace(sequence()[0][1], before=None)
-    estimator = Joint(2, plain)
-    estimator.estimate(volume_at(1), geometry())
-    assert_same(estimator.estimate(volume_at(2), geometry()), Joint(2, plain).estimate(volume_at(2), geometry()))
-
-
-def test_every_map_is_estimated_again_bit_for_bit_alone_and_in_a_row_for_any_threads():
-    kept = [RowModel.from_arrays(state.arrays()) for _, state in sequence()]
-    assert kept[0].before is None
-    assert kept[1].before is not None
-    for (table, _), state, seed in zip(sequence(), kept, (1, 2, 3), strict=True):
-        assert_same(Joint(1, state, learns=False).estimate(volume_at(seed), geometry()), table)
-    part = recalling("joint", kept[1:], 3, temporal_prior=True)
-    for (table, state), seed in zip(sequence()[1:], (2, 3), strict=True):
-        assert_same(part.estimate(volume_at(seed), geometry()), table)
-        np.testing.assert_array_equal(part.used.before, state.before)
 
 
 def test_what_stands_still_is_found_better_from_one_exposure():
@@ -144,8 +90,8 @@ def test_what_stands_still_is_found_better_from_one_exposure():
     means = {}
     for on in (False, True):
         estimator = Joint(2, plain, temporal_prior=on)
-        tables = [estimator.estimate(volume_at(seed), geometry()) for seed in range(1, 6)]
-        errors = [simulated(exposures=1, seed=seed).errors(tables[seed - 1].x_px) for seed in range(2, 6)]
+        tables = [estimator.estimate(volume_at(seed), geometry()) for seed in range(1, 4)]
+        errors = [simulated(exposures=1, seed=seed).errors(tables[seed - 1].x_px) for seed in (2, 3)]
         means[on] = np.mean([np.minimum(error, 10).mean() for error in errors])
     assert means[True] < means[False]
 

@@ -1,10 +1,9 @@
 """The vote on weak answers against plain loops, and what it is there for: streaks go, what the counts say stays."""
 
 import numpy as np
-import pytest
 
 from rig.estimate.joint.vote import FAR, OBJECTION, REACH, SAME, WEAK, collect, new_ballots, vote
-from rig.estimate.joint.winner import UNITS, LabelAnswers
+from rig.estimate.joint.winner import LabelAnswers
 from rig.threads import RowWorkers
 
 LABELS = 64
@@ -66,34 +65,3 @@ def test_a_streak_goes_and_its_place_is_as_sure_as_those_around_it():
     out = voted(answer, cost)
     np.testing.assert_array_equal(out.label, 20.0)
     assert 10 < out.margin[4, 15] < 30
-
-
-def test_what_the_rows_own_counts_say_stays_but_is_unsure():
-    answer, cost = flat()
-    answer.label[4, 15] = 50.0
-    cost[4, 15, 20] = OBJECTION + 1
-    out = voted(answer, cost)
-    assert out.label[4, 15] == 50.0
-    assert out.margin[4, 15] == 0
-
-
-@pytest.mark.parametrize(("nats", "stays"), [(0.5, False), (2.0, True)])
-def test_few_counts_of_a_row_outweigh_what_all_neighbours_say_once_they_are_two_nats_against_it(nats, stays):
-    answer, cost = flat()
-    answer.label[4, 15] = 50.0
-    cost[4, 15, 20] = round(nats * UNITS)
-    assert voted(answer, cost).label[4, 15] == (50.0 if stays else 20.0)
-
-
-def test_answers_that_are_sure_stay_as_they_are():
-    answer, cost = flat()
-    answer.label[4, 15], answer.margin[4, 15] = 50.0, WEAK
-    out = voted(answer, cost)
-    assert out.label[4, 15] == 50.0
-    assert out.margin[4, 15] == WEAK
-
-
-def test_nothing_outside_the_picture_is_elected():
-    answer, cost = flat(label=1.0)
-    answer.label[0, 0] = 40.0
-    np.testing.assert_array_equal(voted(answer, cost).label, 1.0)

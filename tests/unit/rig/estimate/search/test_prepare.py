@@ -1,38 +1,18 @@
 """What the search is given to read: bands of rows on any rig, and units that leave room in 16 bits."""
 
-from dataclasses import replace
 from functools import cache
 
 import numpy as np
 import pytest
 
-from rig.estimate.likelihood import Likelihood
-from rig.estimate.row.em import next_lattice
-from rig.estimate.search.inputs import COUNT_LIMIT
-from rig.estimate.search.prepare import (
-    BAND_ROWS,
-    BAND_SHEAR_PX,
-    CLOSE_SHIFT,
-    SCORE_LIMIT,
-    judge_of,
-    nothing_found,
-    rows_of_band,
-)
-from rig.estimate.search.rows import halvings
+from rig.estimate.search.prepare import BAND_ROWS, BAND_SHEAR_PX, CLOSE_SHIFT, SCORE_LIMIT, judge_of, rows_of_band
+from rig.estimate.search.rows import COUNT_LIMIT
 from rig.estimate.search.tables import WEIGHT_LIMIT
 from rig.threads import RowWorkers
 from tests.reference.geometry import Geometry
-from tests.unit.small_maps import RIGS, geometry_of, simulated
+from tests.unit.small_maps import RIGS, geometry_of, learned_from, simulated
 
 WORKERS = RowWorkers(1)
-
-
-@cache
-def model(light="report", rig="left"):
-    sweep = simulated(light, 10, rig)
-    estimator = Likelihood(1)
-    estimator.estimate(sweep.volume, sweep.geometry)
-    return estimator.used
 
 
 @cache
@@ -40,12 +20,7 @@ def view(rig, **other):
     return geometry_of(Geometry.build(width=512, height=128, columns=60, **{**RIGS[rig], **other}))
 
 
-@pytest.mark.parametrize("rig", ["left", "right"])
-def test_where_lines_stand_upright_bands_are_as_high_as_can_be(rig):
-    assert rows_of_band(view(rig)) == BAND_ROWS[0]
-
-
-@pytest.mark.parametrize("roll_deg", [0.3, 1.0, 3.0, 8.0])
+@pytest.mark.parametrize("roll_deg", [0.3, 3.0])
 def test_lines_hardly_leave_a_pixel_within_a_band(roll_deg):
     geometry = view("turned", roll_deg=roll_deg)
     rows = rows_of_band(geometry)
@@ -62,14 +37,14 @@ def test_lines_hardly_leave_a_pixel_within_a_band(roll_deg):
 def test_more_roll_makes_lower_bands():
     rows = [rows_of_band(view("left", roll_deg=roll)) for roll in (0.0, 1.0, 3.0, 8.0)]
     assert rows == sorted(rows, reverse=True)
-    assert rows[0] > rows[-1]
+    assert BAND_ROWS[0] == rows[0] > rows[-1]
 
 
-@pytest.mark.parametrize("rig", ["left", "turned"])
-@pytest.mark.parametrize("light", ["report", "dense", "clear"])
-@pytest.mark.parametrize("exposures", [1, 63, 200])
+@pytest.mark.parametrize(
+    ("light", "rig", "exposures"), [("report", "turned", 1), ("dense", "left", 63), ("clear", "left", 200)]
+)
 def test_units_are_as_fine_as_leaves_room_for_every_sum(light, rig, exposures):
-    judge = judge_of(model(light, rig), simulated(light, 10, rig).geometry, exposures, WORKERS, dark=False)
+    judge = judge_of(learned_from(light, 10, rig), simulated(light, 10, rig).geometry, exposures, WORKERS, dark=False)
     tables, most = judge.tables, judge.most
     assert min(2 * exposures, COUNT_LIMIT) <= most <= COUNT_LIMIT
     tap, edge = np.abs(tables.tap.astype(np.int64)), np.abs(tables.edge.astype(np.int64))
@@ -81,33 +56,3 @@ def test_units_are_as_fine_as_leaves_room_for_every_sum(light, rig, exposures):
     if judge.shift > 0:
         assert 2.6 * most * max(taps, edges / 2) > SCORE_LIMIT or tap.max() > WEIGHT_LIMIT / 2
     assert judge.close_shift == CLOSE_SHIFT
-
-
-def test_thick_haze_takes_coarser_units_where_its_edge_would_not_fit():
-    base, geometry = model(), simulated().geometry
-    profile = base.profile.copy()
-    profile[:, :2] *= 50
-    shifts = [
-        judge_of(m, geometry, 10, WORKERS, dark=False).shift
-        for m in (base, replace(base, profile=profile, amplitude=base.amplitude * np.float32(0.1)))
-    ]
-    assert shifts[1] > shifts[0]
-
-
-@pytest.mark.parametrize(("exposures", "times"), [(1, 0), (63, 0), (64, 1), (127, 1), (128, 2), (255, 2), (70_000, 11)])
-def test_counts_are_halved_until_they_fit(exposures, times):
-    assert halvings(exposures, COUNT_LIMIT) == times
-    assert (exposures >> times) <= COUNT_LIMIT
-
-
-@pytest.mark.parametrize("rig", RIGS)
-def test_nothing_is_found_before_anything_was_judged(rig):
-    geometry = simulated(rig=rig).geometry
-    lines = next_lattice(geometry)
-    found = nothing_found(geometry, lines)
-    assert found.lines.shape == (len(lines[0]), geometry.window)
-    assert found.line_start[0] == 0
-    assert found.line_start[-1] == len(lines[0])
-    for c in (0, 40, geometry.columns - 1):
-        here = slice(found.line_start[c], found.line_start[c + 1])
-        np.testing.assert_array_equal(found.line_row[here], lines[0][lines[1] == c])

@@ -15,14 +15,12 @@ from rig.estimate.search.stream import ColumnJudge, SearchedSweep
 from rig.geometry.windows import uncalibrated_geometry
 from rig.threads import RowWorkers
 from tests.stability.inventory import covers
-from tests.unit.small_maps import Sweep, simulated
+from tests.unit.small_maps import Sweep, assert_same, learned_from, simulated
 
 covers(likelihood)
 
-ROWS, COLUMNS = 72, 30
+ROWS, COLUMNS = 72, 24
 """Rows are several chunks of whole frames, the last one shorter."""
-FIELDS = ("x_px", "confidence", "x_sd_px", "signal", "haze")
-RIGS = ("left", "right", "turned")
 
 
 @dataclass(frozen=True)
@@ -48,11 +46,8 @@ def scene(rig="left") -> Sweep:
     return simulated("report", 10, rig, ROWS, COLUMNS)
 
 
-@cache
 def model(rig="left") -> RowModel:
-    estimator = Likelihood(1)
-    estimator.estimate(scene(rig).volume, scene(rig).geometry)
-    return estimator.model
+    return learned_from("report", 10, rig, ROWS, COLUMNS)
 
 
 @cache
@@ -112,10 +107,9 @@ def judged(rig, layout, sweeps, threads, sizes):
     return found
 
 
-def assert_same(found, wanted):
+def assert_same_maps(found, wanted):
     for (table, sweep, learned), (wanted_table, volume, wanted_learned) in zip(found, wanted, strict=True):
-        for name in FIELDS:
-            np.testing.assert_array_equal(getattr(table, name), getattr(wanted_table, name), err_msg=name)
+        assert_same(table, wanted_table)
         for name in ("n_frames", "column", "dark_counts", "n_dark", "dark_frames", "width"):
             np.testing.assert_array_equal(getattr(sweep, name), getattr(volume, name), err_msg=name)
         np.testing.assert_array_equal(sweep.intensity(), volume.intensity())
@@ -129,22 +123,14 @@ def every_map_teaches(monkeypatch):
     monkeypatch.setattr(lessons, "LAG_FRAMES", 1)
 
 
-@pytest.mark.parametrize("rig", RIGS)
-@pytest.mark.parametrize("exposures", [1, 10, 100])
+@pytest.mark.parametrize(("rig", "exposures"), [("left", 100), ("right", 1), ("turned", 10)])
 def test_judged_on_the_way_is_judged_afterwards(rig, exposures):
     layout = layout_of(rig, exposures)
     sweeps = [frames_of(rig, exposures, seed) for seed in (1, 2, 3)]
     found = judged(rig, layout, sweeps, 2, [37])
     assert all(isinstance(sweep, SearchedSweep) for _, sweep, _ in found)
     assert found[1][2] is not found[0][2], "the third sweep is judged with what the first one taught"
-    assert_same(found, counted(rig, layout, sweeps))
-
-
-@pytest.mark.parametrize("threads", [1, 2, 3])
-@pytest.mark.parametrize("sizes", [[1], [7, 64, 1], [10**9]])
-def test_neither_threads_nor_blocks_change_a_bit(threads, sizes):
-    layout, sweeps = layout_of("turned"), [frames_of("turned")]
-    assert_same(judged("turned", layout, sweeps, threads, sizes), counted("turned", layout, sweeps))
+    assert_same_maps(found, counted(rig, layout, sweeps))
 
 
 def test_columns_of_more_exposures_than_the_counters_hold_are_counted_whole():
@@ -152,24 +138,18 @@ def test_columns_of_more_exposures_than_the_counters_hold_are_counted_whole():
     layout, sweeps = layout_of(exposures=exposures), [frames_of(exposures=exposures)]
     found = judged("left", layout, sweeps, 2, [500])
     assert isinstance(found[0][1], CountVolume)
-    assert_same(found, counted("left", layout, sweeps))
+    assert_same_maps(found, counted("left", layout, sweeps))
 
 
-@pytest.mark.parametrize("exposures", [1, 10])
-@pytest.mark.parametrize("missing", ["first", "last", "some", "parts", "all"])
-def test_gaps_leave_the_other_columns_alone(missing, exposures):
-    whole = frames_of(exposures=exposures)
+@pytest.mark.parametrize("missing", ["some", "parts", "all"])
+def test_gaps_leave_the_other_columns_alone(missing):
+    whole = frames_of()
     lit, number = whole.bins >= 0, np.arange(len(whole.bins))
-    keep = {
-        "first": ~lit | (whole.bins > 2),
-        "last": ~lit | (whole.bins < COLUMNS - 3),
-        "some": ~lit | (whole.bins % 4 != 1),
-        "parts": number % 40 != 1,
-        "all": ~lit,
-    }[missing]
-    layout, sweeps = layout_of(exposures=exposures), [whole[keep], whole]
+    some = (whole.bins > 2) & (whole.bins < COLUMNS - 3) & (whole.bins % 4 != 1)
+    keep = {"some": ~lit | some, "parts": number % 40 != 1, "all": ~lit}[missing]
+    layout, sweeps = layout_of(), [whole[keep], whole]
     found = judged("left", layout, sweeps, 2, [23])
-    assert_same(found, counted("left", layout, sweeps))
+    assert_same_maps(found, counted("left", layout, sweeps))
     seen = found[0][1].n_frames > 0
     assert not found[0][0].confidence[:, ~seen].any()
     assert np.isnan(found[0][0].x_px[:, ~seen]).all()
@@ -187,20 +167,15 @@ def moved(frames, layout, seed):
     return replace(frames, x0=x0.astype(np.int32))
 
 
-@pytest.mark.parametrize(
-    ("rig", "exposures", "spare"),
-    [("left", 1, 64), ("left", 10, 0), ("right", 10, 128), ("right", 30, 64), ("turned", 1, 128), ("turned", 10, 64),
-     ("turned", 30, 0)],
-)  # fmt: skip
+@pytest.mark.parametrize(("rig", "exposures", "spare"), [("left", 10, 0), ("right", 30, 64), ("turned", 1, 128)])
 def test_windows_that_move_even_within_a_column_give_the_bits_of_whole_frames(rig, exposures, spare):
     used = scene(rig).geometry.window + spare
     layout = layout_of(rig, exposures, used)
-    whole = [moved(frames_of(rig, exposures, seed), layout, seed) for seed in (1, 2)]
+    whole = [moved(frames_of(rig, exposures, 1), layout, 1)]
     cut = [frames.cut(used) for frames in whole]
     wanted = counted(rig, layout, whole)
-    for sweeps in (whole, cut):
-        for threads, sizes in ((1, [10**9]), (3, [13])):
-            assert_same(judged(rig, layout, sweeps, threads, sizes), wanted)
+    for sweeps, threads, sizes in ((whole, 1, [10**9]), (cut, 3, [13])):
+        assert_same_maps(judged(rig, layout, sweeps, threads, sizes), wanted)
     if spare and exposures > 1:
         lit = whole[0].bins == COLUMNS // 2
         assert len(np.unique(whole[0].x0[lit])) > 1
@@ -221,8 +196,8 @@ def test_a_block_of_very_many_frames_is_summed_without_running_over():
         assert np.all(judge.finish().intensity() == len(bins))
 
 
-@pytest.mark.parametrize(("exposures", "lost"), [(10, 2), (10, 6), (40, 6)])
-def test_a_first_map_that_lost_frames_everywhere_is_the_same_again_with_what_it_taught(exposures, lost):
+def test_a_first_map_that_lost_frames_everywhere_is_the_same_again_with_what_it_taught():
+    exposures, lost = 10, 6
     whole = frames_of(exposures=exposures)
     in_column = np.arange(len(whole.bins)) - np.searchsorted(whole.bins, whole.bins)
     frames, layout = whole[(whole.bins < 0) | (in_column >= lost)], layout_of(exposures=exposures)
@@ -232,5 +207,4 @@ def test_a_first_map_that_lost_frames_everywhere_is_the_same_again_with_what_it_
     again = Likelihood(1, first.used)
     counter = again.counter(layout, scene().geometry)
     recalled = again.estimate(fed(counter, frames, [37]), scene().geometry)
-    for name in FIELDS:
-        np.testing.assert_array_equal(getattr(recalled, name), getattr(table, name), err_msg=name)
+    assert_same(recalled, table)
