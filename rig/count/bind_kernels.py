@@ -1,9 +1,7 @@
 """Compiled walk along the records of a block, which gives every frame its sweep, direction, column and bin.
 
-The column of a frame follows from the latest marker, see `rig.count.bind`. The walk goes frame by frame because each
-frame decides what may be done with the next. What it has to remember lies in one record (`CARRIED` in `rig.count.bind`,
-int64), so that it goes on in the next block where it left off in this one. Outputs are (n,): sweep int32, direction
-int8, column float64, bin int32.
+It goes frame by frame because each frame decides what may be done with the next. What it has to remember lies in one
+record (`CARRIED` in `rig.count.bind`), so that it goes on in the next block where it left off in this one.
 """
 
 from typing import Any, Final
@@ -120,7 +118,7 @@ def walk(
 def cover(
     bins: NDArray[np.int32], x0: NDArray[np.int32], used_px: int, column_x0: NDArray[np.int32], window: int
 ) -> tuple[int, int]:
-    """Take the bin of frames whose used pixels do not hold all that their column counts: none is counted in part.
+    """Take the bin of frames whose used pixels do not hold all that their column counts.
 
     x0: (n,) first of the `used_px` pixels of each frame. column_x0: (columns,) first of the `window` pixels of each
     column. Returns the numbers of frames that are left on columns and in the dark.

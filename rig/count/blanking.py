@@ -6,19 +6,15 @@ being exposed from i on):
     n_i = level + drift i + brightness g_i(t),     g_i = share of frame i's exposure with the gate open
 
 For every t it is fitted by least squares (float64); the best t is where it explains most. Photons of the laser, of
-daylight and of the dark all scatter alike here, so nothing needs to be known about them. `score` is brightness over its
+daylight and of the dark all scatter alike, so nothing needs to be known about them. `score` is brightness over its
 standard deviation; what remains beyond the scatter of photons must be less than what the pattern explains, which tells
-it from other light that comes and goes. tests/unit/rig/count/test_blanking.py checks both against a simulation.
+it from other light that comes and goes.
 
 The sweeps (`BlankingSync`). Scan markers lie on a straight line of time, which is fitted to all patterns found so far
 (`MarkerLine`): one that is missing, because frames were lost or nothing was in the light's way, is taken from that
-line.
-
-    nothing known --a pattern, and the next one a sweep later--> sweep 0 --the pattern where it is expected--> sweep 1
-
-A sweep begins, for those who count, with the frame at which its pattern has surely passed, just before the gate opens
-for the lit part. All of that depends on the frames before it only, not on the size of blocks, and never on the host's
-time or the device's word for its clock.
+line. A sweep begins, for those who count, with the frame at which its pattern has surely passed, just before the gate
+opens for the lit part. All of that depends on the frames before it only, not on the size of blocks, and never on the
+host's time or the device's word for its clock.
 """
 
 import logging
@@ -81,12 +77,10 @@ class PatternShape:
 
     def shares(self, places: Array, frames: Array) -> Array:
         """Share of each frame's exposure with the gate open, (places, frames), of a pattern at each place."""
-        opened = places[:, None, None] + self.flashes[:, 0]
-        closed = places[:, None, None] + self.flashes[:, 1]
+        opened, closed = (places[:, None, None] + self.flashes[:, edge] for edge in (0, 1))
         start = frames[None, :, None]
         lit: Array = np.minimum(start + self.exposure, closed) - np.maximum(start, opened)
-        shares: Array = np.clip(lit, 0, None).sum(axis=2) / self.exposure
-        return shares
+        return np.asarray(np.clip(lit, 0, None).sum(axis=2) / self.exposure)
 
 
 class PatternSearch:
@@ -392,9 +386,9 @@ class BlankingSync:
         if self._end_sweep is not None and index - self._plan.pilots > self._end_sweep:
             return None
         if first:
-            expected, sd, period = self._line.place[-1] + self._period, math.nan, self._period
+            expected, sd = self._line.place[-1] + self._period, math.nan
         else:
-            expected, sd, period = self._line.fit(index)
+            expected, sd, _ = self._line.fit(index)
         frame = self._known_at(index, expected)
         if frame > last:
             return None
@@ -413,7 +407,14 @@ class BlankingSync:
         place = SweepPlace(number, frame, scan, ratio, found)
         if number >= 0:
             self._places[number] = place
-        self._tell(place)
+        if found is None:
+            _log.warning("sweep %d: no blanking pattern where it was expected", number)
+        else:
+            _log.info(
+                "sweep %d: blanking pattern at frame %.3f +- %.3f, %.1f sigma (%.4g over %.4g ones), detection "
+                "probability %.6f",
+                number, found.place, found.sd, found.score, found.brightness, found.level, place.detection,
+            )  # fmt: skip
         return place
 
     def _known_at(self, index: int, scan: float) -> int:
@@ -443,18 +444,6 @@ class BlankingSync:
         marks[(since >= opened + early) & (since + 1 <= closed - late)] = Mark.GATE_HIGH
         records["marks"] = marks | np.uint32(Mark.BACKWARD if leg.direction < 0 else 0)
         records["sweep"] = (now.number + 1) & 0xFFFF
-
-    def _tell(self, place: SweepPlace) -> None:
-        if place.found is None:
-            _log.warning("sweep %d: no blanking pattern where it was expected", place.number)
-            return
-        found = place.found
-        _log.info(
-            "sweep %d: blanking pattern at frame %.3f +- %.3f, %.1f sigma (%.4g over %.4g ones), detection probability "
-            "%.6f",
-            place.number, found.place, found.sd, found.score, found.brightness, found.level,
-            place.detection,
-        )  # fmt: skip
 
     def _give_up(self, header: BlockHeader, last: int) -> None:
         assert self._origin is not None, "frames were counted"

@@ -45,9 +45,7 @@ class SweepAccount:
     """Account of a sweep, kept when its counts are gone.
 
     direction: +1 where the mirror command rose, -1 where it fell; column indices mean the same commands both ways.
-    residual_columns: largest distance of a marker from the sweep's clock line; synchronised: whether that and the clock
-    are within their limits. gaps: (first, last) numbers of frames exposed but not received. first_frame, end_frame:
-    frame numbers from this scan marker to the next. detection: as in `SweepClock`.
+    gaps: (first, last) numbers of frames exposed but not received. The others are as in `SweepClock`.
     """
 
     index: int

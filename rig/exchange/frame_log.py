@@ -19,10 +19,8 @@ class FrameLog:
 
     def __init__(self) -> None:
         self._header: BlockHeader | None = None
-        self._records: list[NDArray[np.void]] = []
-        self._numbers: list[NDArray[np.int64]] = []
-        self._ticks: list[NDArray[np.int64]] = []
-        self._runs: list[int] = []
+        self._parts: list[tuple[int, NDArray[np.int64], NDArray[np.int64], NDArray[np.void]]] = []
+        """Run, numbers, ticks and records of each block."""
         self.n_frames = 0
 
     def add(self, block: FrameBlock) -> None:
@@ -39,10 +37,7 @@ class FrameLog:
                 f"the recording's frame clock changes at frame {header.first_frame} of run {header.run_id}; "
                 "split it with rig cut"
             )
-        self._records.append(block.records.copy())
-        self._numbers.append(block.frame_numbers)
-        self._ticks.append(block.start_ticks)
-        self._runs += [header.run_id]
+        self._parts.append((header.run_id, block.frame_numbers, block.start_ticks, block.records.copy()))
         self.n_frames += block.n_frames
 
     @property
@@ -54,11 +49,11 @@ class FrameLog:
 
     def columns(self) -> dict[str, NDArray[Any]]:
         """Arrays (frames,): number, run, ticks and the fields of the records."""
-        records = np.concatenate(self._records)
-        ticks = np.concatenate(self._ticks)
+        runs, *arrays = zip(*self._parts, strict=True)
+        number, ticks, records = map(np.concatenate, arrays)
         return {
-            "number": np.concatenate(self._numbers),
-            "run": np.repeat(np.array(self._runs, np.uint16), [len(part) for part in self._records]),
+            "number": number,
+            "run": np.repeat(np.array(runs, np.uint16), [len(part) for part in arrays[0]]),
             "ticks": ticks,
             **{name: records[name] for name in ("marks", "x0", "y0", "line", "sweep")},
             "time_s": ticks / float(self.header.tick_hz),
@@ -67,7 +62,7 @@ class FrameLog:
     def ranges(self) -> Ranges:
         """Ranges of consecutive frames, in order."""
         ranges: Ranges = []
-        for run, numbers in zip(self._runs, self._numbers, strict=True):
+        for run, numbers, *_ in self._parts:
             if len(numbers) == 0:
                 continue
             first, n = int(numbers[0]), len(numbers)
@@ -87,8 +82,7 @@ class FrameLog:
 
     def content(self) -> dict[str, Any]:
         """Describe, for a JSON file, all that an array of the pixels cannot say. Places are indices of the array."""
-        header = self.header
-        columns = self.columns()
+        header, columns = self.header, self.columns()
         marks = columns["marks"]
         return {
             "width": header.width,

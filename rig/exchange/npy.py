@@ -2,7 +2,7 @@
 
 The array is uint8 (frames, height, ceil(width / 8)), most significant bit first, the frames that were received one
 after the other. `frames.json` says what it cannot: clock, numbers and gaps, markers, windows. `transforms.json`, where
-there is a camera, makes it a data set of visionsim. `MapFiles` lists the maps in a run's folder and reads their arrays.
+there is a camera, makes it a data set of visionsim.
 """
 
 import json
@@ -59,19 +59,9 @@ def _write_header(file: BinaryIO, block: FrameBlock, n_frames: int) -> None:
 
 def _transforms(camera: Camera, n_frames: int) -> str:
     """Describe the data set as visionsim does (visionsim 0.1, dataset/schema.py)."""
-    matrix = camera.matrix
-    content = {
-        "fl_x": float(matrix[0, 0]),
-        "fl_y": float(matrix[1, 1]),
-        "cx": float(matrix[0, 2]),
-        "cy": float(matrix[1, 2]),
-        "w": camera.width,
-        "h": camera.height,
-        "c": 1,
-        "bitpack": True,
-        "bitpack_dim": 2,
-        "file_path": CUBE,
-    }
+    (fl_x, _, cx), (_, fl_y, cy), _ = camera.matrix.tolist()
+    content = {"fl_x": fl_x, "fl_y": fl_y, "cx": cx, "cy": cy, "w": camera.width, "h": camera.height, "c": 1}
+    content |= {"bitpack": True, "bitpack_dim": 2, "file_path": CUBE}
     frames = ",\n".join([f'{{"transform_matrix": {_POSE}}}'] * n_frames)
     return f'{json.dumps(content)[:-1]}, "frames": [\n{frames}\n]}}\n'
 
@@ -87,15 +77,12 @@ class MapFiles:
         """Files of one kind, in order of the maps: depth, .npy; intensity, .png; cloud, .ply."""
         return sorted(self._run.glob(f"{folder}/*{suffix}"))
 
-    def depth_m(self, index: int) -> NDArray[np.float32] | None:
-        """Depth of a map, float32 (height, width); None for an uncalibrated rig."""
-        file = self._run / "depth" / f"{index:06d}.npy"
-        return load(file) if file.exists() else None
-
-    def stripe(self, index: int) -> Mapping[str, NDArray[np.float32]]:
-        """Stripe table of a map, float32 (rows, columns) each."""
+    def arrays(self, index: int) -> dict[str, NDArray[np.float32]]:
+        """Stripe table of a map, (rows, columns) each, and its depth_m (height, width) where the rig is calibrated."""
         with load(self._run / "stripe" / f"{index:06d}.npz") as table:
-            return {name: table[name] for name in table.files}
+            arrays = dict(table)
+        file = self._run / "depth" / f"{index:06d}.npy"
+        return {**arrays, "depth_m": load(file)} if file.exists() else arrays
 
 
 def load(file: Path) -> Any:

@@ -8,15 +8,14 @@ number of pixels closes a frame.
 
 from collections.abc import Iterator, Sequence
 from pathlib import Path
-from typing import Final, Literal
+from typing import Final
 
 import numpy as np
 from numpy.typing import NDArray
 
 from rig.errors import UsageError
-from rig.exchange.foreign import ForeignFrames, bytes_of, chunks_of
+from rig.exchange.foreign import ForeignFrames, bytes_of, chunks_of, open_each
 
-Form = Literal["packed", "sparse"]
 FORMS: Final = ("packed", "sparse")
 COLUMNS: Final = 512
 ROWS: Final = 512
@@ -25,25 +24,19 @@ _SPARSE_BATCH: Final = 64
 """Number of frames expanded at a time."""
 
 
-def open_pi_imaging(files: Sequence[Path], form: Form | None, rows: int = ROWS) -> ForeignFrames:
-    """Open files as frames one after the other. form: None to see from each file which it is.
+def open_pi_imaging(files: Sequence[Path], form: str | None, rows: int | None) -> ForeignFrames:
+    """Open files as frames one after the other. form: one of FORMS; None to see from each file which it is.
 
     rows: 512, or 1024 of the 1M flavour. UsageError, a line per file, for contents that are no whole number of frames.
     """
-    problems: list[str] = []
-    opened: list[tuple[Form, NDArray[np.uint8]]] = []
-    for file in files:
-        try:
-            opened.append(_open(file, form, rows))
-        except UsageError as error:
-            problems += error.problems
-    if problems:
-        raise UsageError.of(problems)
+    rows = rows or ROWS
+    opened = open_each(files, lambda file: _open(file, form, rows))
     forms = sorted({kind for kind, _ in opened})
 
     def chunks() -> Iterator[NDArray[np.uint8]]:
         for kind, content in opened:
-            yield from _packed(content, rows) if kind == "packed" else _sparse(content, rows)
+            packed = kind == "packed"
+            yield from chunks_of(content.reshape(-1, rows, COLUMNS // 8)) if packed else _sparse(content, rows)
 
     frame_bytes = rows * COLUMNS // 8
     n_frames = sum(
@@ -53,7 +46,7 @@ def open_pi_imaging(files: Sequence[Path], form: Form | None, rows: int = ROWS) 
     return ForeignFrames(COLUMNS, rows, n_frames, chunks, {"form": "+".join(forms)})
 
 
-def _open(file: Path, form: Form | None, rows: int) -> tuple[Form, NDArray[np.uint8]]:
+def _open(file: Path, form: str | None, rows: int) -> tuple[str, NDArray[np.uint8]]:
     """Find out the form of a file, and return it with the bytes of the frames."""
     content = bytes_of(file)
     frame_bytes = rows * COLUMNS // 8
@@ -85,10 +78,6 @@ def _is_list(content: NDArray[np.uint8], end: int) -> bool:
         return False
     words = content.view("<u4")
     return bool(words[-1] == end) and all(bool((piece <= end).all()) for piece in chunks_of(words))
-
-
-def _packed(content: NDArray[np.uint8], rows: int) -> Iterator[NDArray[np.uint8]]:
-    yield from chunks_of(content.reshape(-1, rows, COLUMNS // 8))
 
 
 def _sparse(content: NDArray[np.uint8], rows: int) -> Iterator[NDArray[np.uint8]]:

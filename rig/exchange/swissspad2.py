@@ -8,15 +8,14 @@ says which it is.
 
 from collections.abc import Iterator, Sequence
 from pathlib import Path
-from typing import Final, Literal
+from typing import Final
 
 import numpy as np
 from numpy.typing import NDArray
 
 from rig.errors import UsageError
-from rig.exchange.foreign import LSB_FIRST, ForeignFrames, bytes_of, chunks_of
+from rig.exchange.foreign import LSB_FIRST, ForeignFrames, bytes_of, chunks_of, open_each
 
-Form = Literal["half", "full"]
 FORMS: Final = ("half", "full")
 WIDTH: Final = 512
 HALF_ROWS: Final = 256
@@ -24,30 +23,31 @@ _ROW_BYTES: Final = WIDTH // 8
 _HALF_BYTES: Final = HALF_ROWS * _ROW_BYTES
 _QUARTERS: Final = 4
 _ZONE_BYTES: Final = _ROW_BYTES // _QUARTERS
-
 _JUDGED_FRAMES: Final = 512
 _JUDGED_SIGMAS: Final = 10.0
 """Standard deviations by which even and odd frames of one scene do not differ by chance."""
 
 
-def open_swissspad2(files: Sequence[Path], form: Form | None) -> ForeignFrames:
+def open_swissspad2(files: Sequence[Path], form: str | None) -> ForeignFrames:
     """Open files as frames one after the other; form None is half. UsageError, a line per file, for parts of frames."""
     full = form == "full"
     frame_bytes = _HALF_BYTES * (2 if full else 1)
-    contents = [bytes_of(file) for file in files]
-    problems = [
-        f"{file} has {len(content)} bytes, no whole number of {'full' if full else 'half'} frames of {frame_bytes}; "
-        "was it cut off?"
-        for file, content in zip(files, contents, strict=True)
-        if len(content) == 0 or len(content) % frame_bytes
-    ]
-    if problems:
-        raise UsageError.of(problems)
+
+    def open_one(file: Path) -> NDArray[np.uint8]:
+        content = bytes_of(file)
+        if len(content) == 0 or len(content) % frame_bytes:
+            raise UsageError(
+                f"{file} has {len(content)} bytes, no whole number of {'full' if full else 'half'} frames of "
+                f"{frame_bytes}; was it cut off?"
+            )
+        return content
+
+    contents = open_each(files, open_one)
 
     def chunks() -> Iterator[NDArray[np.uint8]]:
         for content in contents:
             for raw in chunks_of(content.reshape(-1, frame_bytes)):
-                yield full_frames(raw) if full else half_frames(raw)
+                yield full_frames(raw) if full else LSB_FIRST[raw.reshape(-1, HALF_ROWS, _ROW_BYTES)]
 
     rows = 2 * HALF_ROWS if full else HALF_ROWS
     hints = []
@@ -58,12 +58,6 @@ def open_swissspad2(files: Sequence[Path], form: Form | None) -> ForeignFrames:
         )
     n_frames = sum(len(content) for content in contents) // frame_bytes
     return ForeignFrames(WIDTH, rows, n_frames, chunks, {"form": "full" if full else "half"}, hints=hints)
-
-
-def half_frames(raw: NDArray[np.uint8]) -> NDArray[np.uint8]:
-    """(n, 256, 64), most significant bit first, of half frames as read out (n, 16384)."""
-    turned: NDArray[np.uint8] = LSB_FIRST[raw.reshape(-1, HALF_ROWS, _ROW_BYTES)]
-    return turned
 
 
 def full_frames(raw: NDArray[np.uint8]) -> NDArray[np.uint8]:

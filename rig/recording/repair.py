@@ -10,7 +10,7 @@ import os
 from collections.abc import Iterator
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any, Final
+from typing import Any, BinaryIO, Final
 
 import numpy as np
 
@@ -26,7 +26,6 @@ from rig.run_folder.manifest import MANIFEST, UNFINISHED, device_counters, ended
 from rig.run_folder.summary import RunVerdict
 
 _PIECE_BYTES: Final = 1 << 24
-
 Range = tuple[int, int]
 """Bytes of a segment, from the first to before the second number."""
 
@@ -94,7 +93,8 @@ def _clear(segment: SegmentReader, blocks: list[Range], done: list[str]) -> None
     others = [(a, used) for a, b in _between(blocks, segment.size) if (used := _used(segment, a, b)) > a]
     if others:
         torn = segment.path.with_suffix(".torn")
-        _keep(segment, others, torn)
+        with torn.open("rb+" if torn.exists() else "wb") as copy:
+            _copy(segment, others, copy)
         done.append(f"{segment.path.name}: {len(others)} pieces that are no sound block are kept in {torn.name}")
     if not blocks:
         segment.path.unlink()
@@ -125,11 +125,8 @@ def _unpack(segment: SegmentReader, blocks: list[Range], done: list[str]) -> Non
     if blocks:
         scratch = plain.with_name(f"{plain.name}.part")
         with scratch.open("wb") as file:
-            for begin, stop in blocks:
-                file.seek(begin)
-                file.write(segment.at(begin, stop - begin).data)
             file.truncate(end)
-            os.fsync(file.fileno())
+            _copy(segment, blocks, file)
         scratch.replace(plain)
     segment.path.rename(torn)
     kept = f"its sound blocks are in {plain.name}, plain" if blocks else "it holds no sound block"
@@ -159,14 +156,13 @@ def _used(segment: SegmentReader, begin: int, stop: int) -> int:
     return stop - int((data[::-1] != 0).argmax()) if data.any() else begin
 
 
-def _keep(segment: SegmentReader, pieces: list[Range], torn: Path) -> None:
+def _copy(segment: SegmentReader, pieces: list[Range], file: BinaryIO) -> None:
     """Copy pieces of a segment to the same places of another file, which is on the disk when this returns."""
-    with torn.open("rb+" if torn.exists() else "wb") as copy:
-        for begin, stop in pieces:
-            copy.seek(begin)
-            copy.write(segment.at(begin, stop - begin).data)
-        copy.flush()
-        os.fsync(copy.fileno())
+    for begin, stop in pieces:
+        file.seek(begin)
+        file.write(segment.at(begin, stop - begin).data)
+    file.flush()
+    os.fsync(file.fileno())
 
 
 def _write_index(folder: Path, found: Examination, done: list[str]) -> None:
@@ -200,9 +196,14 @@ def _write_manifest(folder: Path, found: Examination, done: list[str]) -> None:
         for number, first, last in dict.fromkeys(found.joined.missing)
     ]
     done += [f"{line}; left out" for line in device_counters(manifest)[1]]
+    verdict, blocks = manifest["verdict"], (manifest.get("recording") or {}).get("blocks")
+    if missing or (verdict != UNFINISHED and blocks is not None and blocks > recording["blocks"]):
+        verdict = RunVerdict.GAPS
+    elif verdict == UNFINISHED:
+        verdict = RunVerdict.ABORTED
     content: dict[str, Any] = {
         **{key: value for key, value in manifest.items() if key != "counters"},
-        "verdict": _verdict(manifest, recording, missing),
+        "verdict": verdict,
         "recording": recording,
         "missing": missing,
         "repaired": [*(manifest.get("repaired") or []), *done],
@@ -212,18 +213,11 @@ def _write_manifest(folder: Path, found: Examination, done: list[str]) -> None:
     replace_file(folder / MANIFEST, (sealed_text(json.dumps(content)) + "\n").encode())
 
 
-def _verdict(manifest: dict[str, Any], recording: dict[str, Any], missing: list[Any]) -> str:
-    before = (manifest.get("recording") or {}).get("blocks")
-    if missing or (manifest["verdict"] != UNFINISHED and before is not None and before > recording["blocks"]):
-        return RunVerdict.GAPS
-    return RunVerdict.ABORTED if manifest["verdict"] == UNFINISHED else str(manifest["verdict"])
-
-
 def _recording(found: Examination) -> dict[str, Any]:
     """Describe the recording as `Recording.content` does; its starts only where the manifest does not have them."""
     with_blocks = set(found.entries["segment"].tolist())
     content: dict[str, Any] = {
-        "files": [s.path.name.removesuffix(".zst") for s in found.segments if s.number in with_blocks],
+        "files": [s.path.name.removesuffix(PACKED_SUFFIX) for s in found.segments if s.number in with_blocks],
         "index": INDEX_FILE,
         "blocks": len(found.entries),
         "bytes": found.bytes,
@@ -235,5 +229,6 @@ def _recording(found: Examination) -> dict[str, Any]:
 
 def _start(found: Examination, run: list[SoundBlock]) -> dict[str, int]:
     """Fields of `rig.recording.writer.Start`: whole sweeps of a run, as its blocks tell, and its first segment."""
-    mine = found.entries[found.entries["run_id"] == run[0].run_id]
-    return {"sweeps": max(0, run[-1].last_sweep - max(1, run[0].sweep)), "segment": int(mine["segment"].min())}
+    first = run[0].header
+    segments = found.entries["segment"][found.entries["run_id"] == first.run_id]
+    return {"sweeps": max(0, run[-1].last_sweep - max(1, first.sweep)), "segment": int(segments.min())}

@@ -1,20 +1,17 @@
 """Prepares a recording for the live stack: its plan and its starts, with other devices recorded, emulated or real.
 
 Frames are bound by the plan that they were taken with (`plan.yaml`), never by one compiled anew, and each start of the
-SPAD is played as one: so a map is made of the very same frames in the very same order, at any clock. `replay_config`
-makes the rig that plays, `ReplaySource` tells a run what it needs to know of the recording.
+SPAD is played as one: so a map is made of the very same frames in the very same order, at any clock.
 """
 
 import itertools
-import zipfile
 from collections.abc import Iterator, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import asdict, dataclass, replace
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 
-from calibration.files.npy_files import load_numpy
 from calibration.files.rig_file import CALIBRATION_FILE
 from calibration.model.rig_model import RigModel
 from drivers.interfaces import SpadArray, SpadTiming, SweepTruth
@@ -34,6 +31,8 @@ from rig.recording.open import (
     end_block,
     end_gaps,
     fitted_ratio,
+    kept,
+    markers_seen,
     part_learned,
     part_starts,
     readable_range,
@@ -45,8 +44,7 @@ from rig.run_folder.manifest import (
     ended_before_last_map,
     is_cut_short,
     read_manifest,
-    require_inputs,
-    require_plain_sweeps,
+    require_playable,
 )
 
 SILENCE_S = 5.0
@@ -88,20 +86,18 @@ def replay_config(
     *,
     against_recording: bool = False,
 ) -> RigConfig:
-    """Make the config of the rig that plays a recording.
+    """Make the config of the rig that plays a recording. UsageError where there is none.
 
     others: rig whose world, scanner, laser and sync source take part; None plays the recorded ones.
     against_recording: the recording's own drivers take part, and get the answers that their devices gave then.
     estimate: settings laid over those of the recording.
-    Raises UsageError where there is no recording.
     """
     require_recording(run)
     plan = read_plan(run)
     manifest = read_manifest(run)
     if manifest is None:
         raise DamagedRecordingError(f"{run / MANIFEST} is missing; 'rig repair' writes a new one")
-    require_inputs(run, manifest)
-    require_plain_sweeps(run, manifest)
+    require_playable(run, manifest)
     recorded = manifest.get("config") or {}
     calibration = run / CALIBRATION_FILE
     given = {key: value for key, value in estimate.items() if value is not None}
@@ -111,13 +107,7 @@ def replay_config(
         "calibration": str(calibration.absolute()) if calibration.exists() else None,
         "calibration_max_age": recorded.get("calibration_max_age"),
         "world": None,
-        "spad": {
-            "kind": "replay",
-            "recording": str(run.absolute()),
-            "clock": options.clock,
-            "loop": options.loop,
-            "block_frames": options.block_frames,
-        },
+        "spad": {"kind": "replay", "recording": str(run.absolute()), **asdict(options)},
         **{slot: {"kind": "replay"} for slot in RECORDED},
         "scan": scan,
         "estimate": {**(recorded.get("estimate") or {}), **given},
@@ -134,23 +124,13 @@ def replay_config(
 def replay_plan(
     spad: SpadArray, recording: RunRecording, scan: ScanConfig, model: RigModel | None
 ) -> tuple[ScanPlan, SpadTiming]:
-    """The plan that the frames were taken with, for the present calibration, and the timing of the configured SPAD."""
+    """The plan that the frames were taken with, for the present calibration, and the timing of the configured SPAD.
+
+    DamagedRecordingError where the frames are of another size than the plan's, which counters are made by.
+    """
+    from rig.plan.calibration_reach import recalibrated, whole_rows
+
     plan = read_plan(recording.path)
-    _require_frames_of(plan, recording)
-    if model is not None:
-        from rig.plan.calibration_reach import recalibrated
-
-        plan = recalibrated(plan, model)
-    elif not plan.windowed:
-        from rig.plan.calibration_reach import whole_rows
-
-        plan = whole_rows(plan)
-    request = replace(spad_request(scan, plan), frame_rate_hz=plan.frame_rate_hz, exposure_s=plan.exposure_s)
-    return plan, spad.configure(request)
-
-
-def _require_frames_of(plan: ScanPlan, recording: RunRecording) -> None:
-    """Raise DamagedRecordingError where the frames are of another size than the plan's, which counters are made by."""
     widths = {plan.width} if plan.windows is None else {plan.width, plan.windows.width_px}
     for run in recording.runs:
         header = run.header
@@ -159,10 +139,16 @@ def _require_frames_of(plan: ScanPlan, recording: RunRecording) -> None:
                 f"{recording.path}: the frames of start {run.number} are {header.width} x {header.height} pixels of a "
                 f"sensor {header.sensor_width} wide, {PLAN_FILE} is for {plan.width} x {plan.rows}; take it from a copy"
             )
+    if model is not None:
+        plan = recalibrated(plan, model)
+    elif not plan.windowed:
+        plan = whole_rows(plan)
+    request = replace(spad_request(scan, plan), frame_rate_hz=plan.frame_rate_hz, exposure_s=plan.exposure_s)
+    return plan, spad.configure(request)
 
 
 class ReplaySource:
-    """Facts about a recording for the run that plays it. maps: how many the run will take."""
+    """Facts about a recording for the run that plays it. maps: how many the run will take; None: all there are."""
 
     def __init__(self, spad: ReplaySpad, plan: ScanPlan, maps: int | None) -> None:
         self._spad = spad
@@ -222,7 +208,8 @@ class ReplaySource:
 
         DamagedRecordingError where it is of other columns or of another sensor.
         """
-        truth = recorded_truth(self._spad.recording.path, self._numbers[index % self._there])
+        file = self._spad.recording.path / "truth" / f"{self._numbers[index % self._there]:06d}.npz"
+        truth = kept(file, lambda arrays: SweepTruth(x_px=arrays["x_px"], depth_m=arrays["depth_m"]))
         if truth is not None and (truth.x_px.shape, truth.depth_m.shape) != self._shapes:
             raise DamagedRecordingError(
                 f"{self._spad.recording.path}: the truth of map {index} is of {truth.x_px.shape} and "
@@ -259,7 +246,7 @@ class RecordedStart:
     begin: SweepStart
     first_map: int
     sweeps: int
-    gone: tuple[RunGap, ...]
+    gone: tuple[RunGap, ...] = ()
 
 
 def recorded_sweeps(recording: RunRecording, plan: ScanPlan) -> list[RecordedStart]:
@@ -268,9 +255,8 @@ def recorded_sweeps(recording: RunRecording, plan: ScanPlan) -> list[RecordedSta
     DamagedRecordingError where a start is missing: its maps would be taken for those of others.
     """
     manifest = read_manifest(recording.path) or {}
-    noted = manifest.get("recording") or {}
     begins = part_starts(recording)
-    starts = noted.get("starts")
+    starts = (manifest.get("recording") or {}).get("starts")
     if not starts:
         planned = [_whole_sweeps(recording, run, plan) for run in recording.runs]
     else:
@@ -283,31 +269,23 @@ def recorded_sweeps(recording: RunRecording, plan: ScanPlan) -> list[RecordedSta
                 "first; take the missing segments from a copy"
             )
         planned = [min(sweeps, run.frames) for sweeps, run in zip(planned, recording.runs, strict=False)]
-    sweeps = manifest.get("sweeps")
     taken: list[RecordedStart] = []
     first_map = 0
     for run, begin, of_run in zip(recording.runs, begins, planned, strict=False):
-        mine = None if sweeps is None else sweeps[first_map : first_map + of_run]
-        taken.append(_recorded_start(recording, run, begin, first_map, of_run, mine, manifest, plan))
+        start = RecordedStart(run.number, begin, first_map, of_run)
+        taken.append(_what_is_left(start, recording, run, plan, manifest))
         first_map += of_run
     return taken
 
 
-def _recorded_start(
-    recording: RunRecording,
-    run: RecordedRun,
-    begin: SweepStart,
-    first_map: int,
-    maps: int,
-    sweeps: Sequence[dict[str, Any]] | None,
-    manifest: dict[str, Any],
-    plan: ScanPlan,
+def _what_is_left(
+    start: RecordedStart, recording: RunRecording, run: RecordedRun, plan: ScanPlan, manifest: dict[str, Any]
 ) -> RecordedStart:
-    """Describe a start that gave `maps` maps from number `first_map` on.
-
-    sweeps: those of the start in the manifest; None where they are not noted.
-    """
+    """The part of a start, as the run took it, whose frames are there."""
     first, end = readable_range(recording, run)
+    begin, first_map, maps = start.begin, start.first_map, start.sweeps
+    noted = manifest.get("sweeps")
+    sweeps = None if noted is None else noted[first_map : first_map + maps]
     whole = maps
     cut_short = is_cut_short(manifest) or ended_before_last_map(manifest)
     if plan.blanking is None or sweeps is None or cut_short or recording.problems:
@@ -340,18 +318,6 @@ def _by_start(sweeps: Sequence[SweepAccount], numbers: Sequence[int]) -> dict[in
     return spans
 
 
-def recorded_truth(folder: Path, index: int) -> SweepTruth | None:
-    """Read the truth of a map that a world knew when it was recorded; None where there is none."""
-    file = folder / "truth" / f"{index:06d}.npz"
-    if not file.exists():
-        return None
-    try:
-        with load_numpy(file) as arrays:
-            return SweepTruth(x_px=arrays["x_px"], depth_m=arrays["depth_m"])
-    except (OSError, ValueError, KeyError, zipfile.BadZipFile) as error:
-        raise DamagedRecordingError(f"{file} is not readable ({error}); move it away to go on without it") from error
-
-
 def _whole_sweeps(recording: RunRecording, run: RecordedRun, plan: ScanPlan) -> int:
     """Number of sweeps of a start that are complete: by its markers or, without markers, by its number of frames.
 
@@ -361,10 +327,7 @@ def _whole_sweeps(recording: RunRecording, run: RecordedRun, plan: ScanPlan) -> 
         frames = float(plan.frames_per_sweep)
         return min(run.frames, max(0, int((readable_range(recording, run)[1] - plan.frames_for(0)) / frames)))
     last = end_block(recording, run, last=True)
-    if last is None:
-        return 0
-    before = last.header.sweep
-    return min(run.frames, max(0, before + int(((last.records["sweep"].astype(np.int64) - before) & 0xFFFF).max()) - 1))
+    return 0 if last is None else min(run.frames, max(0, int(markers_seen(last).max()) - 1))
 
 
 def _own_drivers(run: Path, recorded: dict[str, Any]) -> dict[str, Any]:

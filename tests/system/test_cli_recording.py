@@ -15,24 +15,9 @@ from calibration.errors import digits
 from rig.scan import run as rig_run
 from rig.scan.acquisition import Acquisition
 from tests.system.conftest import Rig
+from tests.system.run_files import assert_same
 
 OPTIONS = ("--exposures", 3, "--maps", 3, "--seed", 5)
-
-
-def arrays(folder: Path) -> dict[str, Any]:
-    """Everything that a run made of its frames, by file and name."""
-    found = {str(file.relative_to(folder)): np.load(file) for file in folder.glob("depth/*.npy")}
-    for file in (*folder.glob("stripe/*.npz"), *folder.glob("learned/*.npz"), *folder.glob("truth/*.npz")):
-        with np.load(file) as content:
-            found |= {f"{file.relative_to(folder)}/{name}": content[name] for name in content}
-    return found
-
-
-def assert_same(a: Path, b: Path) -> None:
-    first, second = arrays(a), arrays(b)
-    assert first.keys() == second.keys()
-    for name, array in first.items():
-        assert array.tobytes() == second[name].tobytes(), name
 
 
 def summary(folder: Path) -> dict[str, Any]:

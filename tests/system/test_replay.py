@@ -10,7 +10,6 @@ from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
-import numpy as np
 import pytest
 
 from drivers.recorded import RunRecording
@@ -19,6 +18,7 @@ from rig.errors import DamagedRecordingError, UsageError
 from rig.run_folder.manifest import read_manifest, sealed_text
 from rig.scan import scan as scanning
 from tests.system.conftest import Rig
+from tests.system.run_files import arrays
 from tests.system.small_rig import config, write_rig
 
 
@@ -45,18 +45,6 @@ def lossy(tmp_path_factory: pytest.TempPathFactory) -> Path:
         return scan_of(tmp_path_factory.mktemp("lossy"), "argmax", 3, loss_probability=0.01)
 
 
-def arrays(run: Path) -> dict[str, bytes]:
-    """Every number of every map."""
-    found = {}
-    for kind in ("depth", "stripe", "learned", "truth"):
-        for file in sorted((run / kind).glob("*.np[yz]")):
-            loaded = np.load(file)
-            parts = {"": loaded} if file.suffix == ".npy" else dict(loaded)
-            found |= {f"{kind}/{file.stem}/{name}": part.tobytes() for name, part in parts.items()}
-    assert found
-    return found
-
-
 def with_manifest(run: Path, copy: Path, change: Callable[[dict[str, Any]], None]) -> Path:
     """A copy of a run whose manifest was changed and sealed again."""
     shutil.copytree(run, copy)
@@ -81,9 +69,8 @@ def test_the_maps_are_those_of_the_scan_to_the_last_bit(learned: Path, tmp_path:
     assert arrays(tmp_path / "again") == arrays(learned)
 
 
-@pytest.mark.parametrize("block_frames", [None, 5])
-def test_gaps_and_starts_are_those_of_the_scan(lossy: Path, tmp_path: Path, block_frames: int | None) -> None:
-    result = api.replay(lossy, clock="max", block_frames=block_frames, out=tmp_path / "again", record=True)
+def test_gaps_and_starts_are_those_of_the_scan(lossy: Path, tmp_path: Path) -> None:
+    result = api.replay(lossy, clock="max", block_frames=5, out=tmp_path / "again", record=True)
     before, after = read_manifest(lossy), read_manifest(tmp_path / "again")
     assert before is not None
     assert after is not None

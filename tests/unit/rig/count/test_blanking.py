@@ -11,11 +11,11 @@ from drivers.errors import DeviceFault
 from drivers.interfaces import OUT_GATE, BurstMode
 from rig.count import blanking
 from rig.count.bind import FrameBinder
-from rig.count.blanking import PatternSearch, PatternShape, detection_probability
+from rig.count.blanking import PatternSearch, PatternShape
 from rig.count.volume import BIN_DARK
 from rig.errors import PlanError
 from rig.plan.gate_pulses import sync_program
-from rig.plan.scan_plan import CODE, Blanking
+from rig.plan.scan_plan import Blanking
 from tests.stability.inventory import covers
 from tests.unit.rig.count.light import blanked_plan, see
 from tests.unit.rig.count.streams import SPAD, plan_of, scan
@@ -46,16 +46,12 @@ def error_of(plan, seen, bound, sweep):
 
 
 CASES = {
-    "clear air": ({}, {"brightness": 60, "level": 20}),
-    "fog": ({}, {"brightness": 2000, "level": 300}),
     "daylight": ({}, {"brightness": 400, "level": 8000}),
     "few photons": ({"exposures": 50, "columns": 30}, {"brightness": 12, "level": 3}),
     "light that varies": ({}, {"scene": 0.6}),
-    "both ways": ({"bidirectional": True}, {"scanner_error": 3e-4}),
     "both ways, downward": ({"bidirectional": True, "command_range": [0.3, -0.3]}, {"scanner_error": -2e-4}),
     "fast scanner": ({}, {"scanner_error": 9e-4, "brightness": 300}),
     "slow scanner": ({}, {"scanner_error": -9e-4, "brightness": 300}),
-    "a little off": ({}, {"scanner_error": 1e-4, "sync_error": -1e-4}),
     "fast sync": ({}, {"sync_error": 9e-4, "brightness": 300}),
     "K = 1": ({"exposures": 1, "columns": 300}, {"brightness": 2000}),
     "short exposure": ({"exposure": "12 us"}, {}),
@@ -114,7 +110,7 @@ def test_place_and_standard_deviation_of_a_pattern_are_true(exposure):
     assert 0.75 < np.std(pulls) < 1.3
 
 
-@pytest.mark.parametrize("brightness", [1, 3, 6, 10, 15, 20, 25, 30, 40, 60])
+@pytest.mark.parametrize("brightness", [1, 6, 15, 20, 25, 40])
 @pytest.mark.parametrize("exposures", [2, 10])
 def test_with_too_little_light_a_map_is_refused_or_flagged_never_silently_wrong(brightness, exposures):
     plan = blanked_plan(columns=60, exposures=exposures)
@@ -135,13 +131,8 @@ def test_without_a_pattern_the_message_says_what_was_looked_for_and_what_to_do()
     assert "\n" not in message
     for words in ("pattern of 64 frames was not found twice, 118", "sigma at most, at frame", "gate cable", "picture"):
         assert words in message
-
-
-def test_one_pattern_alone_points_at_marker_and_clocks():
-    plan = blanked_plan()
-    seen = see(plan, 1, brightness=300, scanner_error=5e-3)
-    with pytest.raises(DeviceFault, match="scan marker at the sync source, and the clocks"):
-        bind(plan, seen.blocks())
+    with pytest.raises(DeviceFault, match="scan marker at the sync source, and the clocks"):  # one alone
+        bind(plan, see(plan, 1, brightness=300, scanner_error=5e-3).blocks())
 
 
 def test_clocks_further_apart_than_a_crystal_may_be_are_flagged():
@@ -149,16 +140,6 @@ def test_clocks_further_apart_than_a_crystal_may_be_are_flagged():
     _, clocks = bind(plan, see(plan, 2, brightness=300, scanner_error=1.4e-3).blocks())
     assert [clock.synchronised for clock in clocks] == [False, False]
     assert clocks[0].clock_error == pytest.approx(1.4e-3, abs=5e-5)
-
-
-def test_frames_lost_on_columns_leave_the_others_where_they_are():
-    plan = blanked_plan()
-    seen = see(plan, 2)
-    begin = int(seen.scan_frame[1]) + 500
-    bound, clocks = bind(plan, seen.blocks(lost=range(begin, begin + 77)))
-    for clock in clocks:
-        assert clock.synchronised
-        assert error_of(plan, seen, bound, clock.sweep) < 0.06
 
 
 def test_a_pattern_that_was_lost_is_taken_from_the_others_and_the_sweep_before_it_flagged():
@@ -184,27 +165,13 @@ def test_sweeps_follow_one_another_also_where_the_frames_between_them_are_lost()
     assert error_of(plan, seen, bound, 2) < 0.06
 
 
-@pytest.mark.parametrize("dropped", [1, 3, 20])
-def test_frames_that_the_device_dropped_silently_are_noticed(dropped):
+def test_frames_that_the_device_dropped_silently_are_noticed():
     plan = blanked_plan()
     seen = see(plan, 2, brightness=500)
     begin = int(seen.scan_frame[1]) + 500
-    _, clocks = bind(plan, seen.without(range(begin, begin + dropped)).blocks())
-    assert not clocks[0].synchronised
-
-
-def test_the_code_is_unlike_itself_shifted_or_reversed():
-    code = np.array([int(chip) for chip in CODE]) - CODE.count("1") / len(CODE)
-    same, other = np.correlate(code, code, "full"), np.correlate(code, code[::-1], "full")
-    peak = len(code) - 1
-    assert np.abs(np.delete(same, peak)).max() < 0.4 * same[peak]
-    assert np.abs(other).max() < 0.5 * same[peak]
-
-
-def test_the_chance_of_detection_is_even_at_the_limit_and_grows_with_the_light():
-    assert detection_probability(4.0) == pytest.approx(0.5)
-    assert detection_probability(2.0) == pytest.approx(0.0228, abs=1e-4)
-    assert detection_probability(8.0) > 0.9999
+    for dropped in (1, 20):
+        _, clocks = bind(plan, seen.without(range(begin, begin + dropped)).blocks())
+        assert not clocks[0].synchronised
 
 
 @pytest.mark.parametrize("bidirectional", [False, True])

@@ -51,7 +51,7 @@ def padding_of(n, lanes):
     return np.concatenate([pairs[:, :PAD].ravel(), pairs[:, PAD + lanes :].ravel()])
 
 
-@pytest.mark.parametrize("window", range(64, 513, 64))
+@pytest.mark.parametrize("window", [64, 128, 192, 512])
 @pytest.mark.parametrize("n_planes", [1, 2, 4, 8])
 @pytest.mark.parametrize("at", [(0, 64), (8, 16), (40, 40)])
 def test_planes_are_read_as_the_bits_that_they_hold(n_planes, window, at):

@@ -109,7 +109,7 @@ def values_of(name: str, old: int) -> list[int]:
     return sorted(value for value in values if 0 <= value <= most and value != old)
 
 
-@pytest.mark.parametrize("number", [0, MIDDLE, -2, -1])
+@pytest.mark.parametrize("number", [0, MIDDLE, -1])
 @pytest.mark.parametrize("name", [name for name in HEADER_FIELDS if name not in ("magic", "header_crc")])
 def test_a_forged_header_costs_its_block_alone(
     tmp_path: Path, pristine: Files, runs: Runs, name: str, number: int
@@ -160,23 +160,11 @@ def test_forged_records_of_frames_cost_their_block_at_most(
     def change(records: np.ndarray) -> None:  # type: ignore[type-arg]
         records[name][frames] = value
 
-    for frames in (slice(0, 1), slice(7, 8), slice(-1, None), slice(None)):
+    for frames in (slice(0, 1), slice(-1, None), slice(None)):
         for value in (0, 1, np.iinfo(np.uint32 if name in ("marks", "ticks") else np.uint16).max):
             folder = copied(pristine, tmp_path / f"{frames.start}-{frames.stop}-{value}")
             forge(places(folder, 0)[where], lambda data, at: forge_payload(data, at, change))
             salvaged(folder, runs, runs[0][where])
-
-
-@pytest.mark.parametrize("payload_type", [REGISTER_ACK, IDLE])
-@pytest.mark.parametrize("size", [0, 1, 3000, 4000, 40_000, 2**31, 2**32 - 1])
-def test_a_control_block_with_a_strange_size_costs_itself(
-    tmp_path: Path, pristine: Files, runs: Runs, payload_type: int, size: int
-) -> None:
-    for number in (0, 3, -1):
-        folder = copied(pristine, tmp_path / f"{number}")
-        change = {"payload_type": payload_type, "payload_len": size}
-        forge(places(folder, 0)[number], lambda data, at, change=change: forge_header(data, at, **change))
-        salvaged(folder, runs, runs[0][number])
 
 
 @pytest.mark.parametrize(
