@@ -14,6 +14,7 @@ by the residual where a marker corrects the way from the one before, is not used
 import math
 from dataclasses import dataclass
 from fractions import Fraction
+from itertools import pairwise
 from typing import NamedTuple
 
 import numpy as np
@@ -269,14 +270,14 @@ class FrameBinder:
         assert self._light is not None, "asked for by the caller"
         now = self._carried[0]
         running, number = int(now["sweep"]), _sweep_named(record, terms)
-        place = self._light.place(number)
+        places = self._light.places(running if running >= 0 else number, number)
         closed = []
-        for missed in range(running, number) if running >= 0 else ():
-            detection, end = self._light.place(missed).detection, self._light.end(missed)
-            frame, residual = self._light.place(missed + 1).frame, end.residual_frames / self._plan.exposures
-            clock = end.clock_error, residual, end.patterns
-            closed.append(SweepClock(missed, *clock, self._first_frame, frame, int(now["wrong_way"]), detection))
-            self._first_frame, now["wrong_way"] = frame, 0
+        for ended, place in pairwise(places):
+            clock = place.ratio - 1, place.residual_frames / self._plan.exposures, place.patterns
+            frames = self._first_frame, place.frame
+            closed.append(SweepClock(ended.number, *clock, *frames, int(now["wrong_way"]), ended.detection))
+            self._first_frame, now["wrong_way"] = place.frame, 0
+        place = places[-1]
         if running < 0:
             self._first_frame = place.frame
         start = (int(record["ticks"]) + terms.start_ticks) * UNITS_PER_TICK
@@ -326,10 +327,7 @@ def _new_places(n: int) -> Places:
 
 
 def _sweep_named(record: np.void, terms: BlockTerms) -> int:
-    """Number of the sweep that a frame names, -1 before the first: one less than the scan markers it has seen.
-
-    Of those the record has the low 16 bits, continued from the header's 32.
-    """
+    """Number of the sweep that a frame names: scan markers so far, of which its record has the low 16 bits, less 1."""
     return terms.sweep + ((int(record["sweep"]) - terms.sweep) & 0xFFFF) - 1
 
 

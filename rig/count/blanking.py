@@ -96,10 +96,7 @@ class PatternSearch:
         self._shares = np.round(shares * _GRAIN)
 
     def scores(self, ones: Array) -> tuple[Array, NDArray[np.bool_]]:
-        """Score of the best place in each window of `ones` (n,), and whether it may be the pattern; (n - window + 1,).
-
-        NaN where a frame of the window is missing.
-        """
+        """Best score in each window of `ones` (n,), NaN where a frame is lost, and whether it may be the pattern."""
         n = self.window
         windows = sliding_window_view(ones, n)
         mean, drift = windows.sum(axis=1) / n, windows @ self._time
@@ -225,32 +222,23 @@ class SweepPlace:
     """Place of a sweep among the frames.
 
     frame: the first one that counts. scan_frame: place of its scan marker, in frames. ratio: of the scanner's clock to
-    nominal, in the SPAD's time. found: its pattern; None: the place is taken from the line of the others.
+    nominal, in the SPAD's time, from so many patterns. found: its own; None: the place is taken from the line of the
+    others. residual_frames: distance of its pattern from where the ones before it put it, or its standard deviation
+    where that is more; NaN without one.
     """
 
     number: int
     frame: int
     scan_frame: float
     ratio: float
+    patterns: int
     found: PatternFit | None
+    residual_frames: float
 
     @property
     def detection(self) -> float:
         """Chance that a pattern as bright as this one is found; 0: it was not."""
         return 0.0 if self.found is None else detection_probability(self.found.score)
-
-
-@dataclass(frozen=True, slots=True)
-class SweepEnd:
-    """Figures of a finished sweep from the pattern behind it.
-
-    clock_error: relative. residual_frames: distance of that pattern from where the ones before it put it, or its
-    standard deviation where that is more. patterns: number of patterns that this rests on.
-    """
-
-    clock_error: float
-    residual_frames: float
-    patterns: int
 
 
 class BlankingSync:
@@ -289,7 +277,6 @@ class BlankingSync:
         self._next: int | None = None
         """Index of the sweep whose pattern is expected next; None: nothing is known yet."""
         self._places: dict[int, SweepPlace] = {}
-        self._ends: dict[int, SweepEnd] = {}
         self._now: SweepPlace | None = None
 
     def mark(self, block: FrameBlock, records: NDArray[np.void]) -> None:
@@ -311,14 +298,9 @@ class BlankingSync:
         if self._next is None:
             self._give_up(header, last)
 
-    def place(self, number: int) -> SweepPlace:
-        """Place of the sweep of map `number`; it is forgotten with the end of the sweep."""
-        return self._places[number]
-
-    def end(self, number: int) -> SweepEnd:
-        """Figures of that sweep; call it once the next one has begun."""
-        del self._places[number]
-        return self._ends.pop(number)
+    def places(self, first: int, last: int) -> list[SweepPlace]:
+        """Places of the sweeps of maps `first` to `last`; all but the last one are forgotten."""
+        return [*(self._places.pop(number) for number in range(first, last)), self._places[last]]
 
     def _count(self, block: FrameBlock) -> None:
         """The ones of each frame, where each leg's run-in is seen; lost frames are NaN."""
@@ -400,11 +382,8 @@ class BlankingSync:
             residual = max(abs(scan - expected), math.hypot(sd, found.sd))
             self._line.add(index, scan, found.sd)
         scan, _, period = self._line.fit(index)
-        ratio = self._period / period
-        if number > 0:
-            self._ends[number - 1] = SweepEnd(ratio - 1, residual, len(self._line.index))
         self._next = index + 1
-        place = SweepPlace(number, frame, scan, ratio, found)
+        place = SweepPlace(number, frame, scan, self._period / period, len(self._line.index), found, residual)
         if number >= 0:
             self._places[number] = place
         if found is None:

@@ -140,10 +140,7 @@ def _in_bins(px):  # type: ignore[no-untyped-def]
 
 @numba.njit
 def _add_products(a, b, margin, to, out):  # type: ignore[no-untyped-def]
-    """Add to out[o + reach] the sum over i of a(i) b(i + to + o), for o from -reach to reach.
-
-    a, b: lines between margins of zeros.
-    """
+    """Add to out[o + reach] the sum over i of a(i) b(i + to + o), for o from -reach to reach; around a, b are zeros."""
     reach = out.shape[0] // 2
     bins = a.shape[0] - 2 * margin
     if abs(to) > bins:

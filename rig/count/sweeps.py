@@ -116,7 +116,10 @@ class SweepAssembler:
     def add(self, block: FrameBlock) -> Iterator[SweepData]:
         """Count a block; yields the sweeps that end in it. Stop adding once `complete`."""
         self._check(block)
-        self._note_gap(block)
+        first = block.header.first_frame
+        if self._next_frame is not None and first > self._next_frame:
+            self._gaps.append((self._next_frame, first - 1))
+        self._next_frame = first + block.n_frames
         begun = time.perf_counter()
         bound, clocks = self._binder.bind(block)
         x0 = self._windows(block, bound)
@@ -184,12 +187,6 @@ class SweepAssembler:
         self.sweeps_done += 1
         self.complete = clock.sweep + 1 - self._start.sweep >= self._maps
         return data
-
-    def _note_gap(self, block: FrameBlock) -> None:
-        first = block.header.first_frame
-        if self._next_frame is not None and first > self._next_frame:
-            self._gaps.append((self._next_frame, first - 1))
-        self._next_frame = first + block.n_frames
 
     def _note_repeated(self, block: FrameBlock, bound: BoundFrames) -> NDArray[np.int64]:
         """Indices of frames whose ticks do not rise: the one before them once more, in their place. They are lost."""

@@ -45,8 +45,11 @@ def gather(files: Iterable[str | os.PathLike[str]], suffix: str) -> list[Path]:
     A folder's files come in natural order (2 before 10), as the cameras number them. UsageError where one is missing.
     """
 
+    def natural(file: Path) -> list[tuple[int, str]]:
+        return [(int(part), "") if part.isdigit() else (-1, part) for part in re.split(r"([0-9]+)", str(file))]
+
     def inside(file: Path) -> list[Path]:
-        found = [file] if file.is_file() else sorted(file.rglob(f"*{suffix}"), key=_natural)
+        found = [file] if file.is_file() else sorted(file.rglob(f"*{suffix}"), key=natural)
         if not found:
             raise UsageError(f"{file} holds no {suffix} file" if file.is_dir() else f"{file} does not exist")
         return found
@@ -83,7 +86,3 @@ def chunks_of(frames: NDArray[np.uint8]) -> Iterator[NDArray[np.uint8]]:
     step = max(1, CHUNK_BYTES // max(1, frames[:1].nbytes))
     for first in range(0, len(frames), step):
         yield frames[first : first + step]
-
-
-def _natural(file: Path) -> list[tuple[int, str]]:
-    return [(int(part), "") if part.isdigit() else (-1, part) for part in re.split(r"([0-9]+)", str(file))]

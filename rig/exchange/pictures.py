@@ -68,7 +68,9 @@ def write_mp4(pictures: Iterable[Picture], path: Path, pictures_per_s: float) ->
     n = 0
     try:
         for picture in pictures:
-            frame = _even(picture)
+            frame = np.repeat(picture[:, :, None], 3, axis=2) if picture.ndim == 2 else picture
+            height, width = frame.shape[:2]
+            frame = np.pad(frame, ((0, height % 2), (0, width % 2), (0, 0)))  # the format asks for even sides
             if film is None:
                 codec = cv2.VideoWriter.fourcc(*"mp4v")
                 film = cv2.VideoWriter(str(path), codec, pictures_per_s, frame.shape[1::-1])
@@ -111,10 +113,3 @@ def _sums(blocks: Iterable[FrameBlock], n: int) -> Iterator[NDArray[np.uint32]]:
             if missing == 0:
                 yield counts
                 counts, missing = None, n
-
-
-def _even(picture: Picture) -> Picture:
-    """Make a picture BGR with even sides, which the film format asks for."""
-    bgr = np.repeat(picture[:, :, None], 3, axis=2) if picture.ndim == 2 else picture
-    height, width = bgr.shape[:2]
-    return np.pad(bgr, ((0, height % 2), (0, width % 2), (0, 0)))

@@ -185,17 +185,13 @@ def out_of_step(run: Run) -> list[SoundBlock]:
     votes = [0] * len(run)
     for i, block in enumerate(run):
         for j in range(max(0, i - _NEIGHBOURS), i):
-            agree = _go_together(run[j], block)
+            before = run[j].header
+            frames, ticks = block.first_frame - before.first_frame, block.header.t0_ticks - before.t0_ticks
+            agree = 0 <= block.header.sweep - before.sweep <= frames and in_step(frames, ticks, block.header)
             votes[i] += agree
             votes[j] += agree
     alone = [block for block, vote in zip(run, votes, strict=True) if not vote]
     return alone if len(run) > 2 and len(alone) * _FEW <= max(len(run), _FEW) else []
-
-
-def _go_together(before: SoundBlock, block: SoundBlock) -> bool:
-    frames = block.first_frame - before.first_frame
-    ticks = block.header.t0_ticks - before.header.t0_ticks
-    return 0 <= block.header.sweep - before.header.sweep <= frames and in_step(frames, ticks, block.header)
 
 
 def _check(segment: SegmentReader) -> tuple[list[SoundBlock], list[str]]:

@@ -9,8 +9,9 @@ dark frames.
 import os
 import tokenize
 import zipfile
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from dataclasses import dataclass
+from functools import partial
 from pathlib import Path
 from typing import Any, Final
 
@@ -37,37 +38,14 @@ Piece = tuple[int, NDArray[np.uint8]]
 
 
 @dataclass(frozen=True, slots=True, eq=False)
-class ArrayFrames:
-    """Frames in an array (n, height, row bytes), numbered from 0, read from disk as needed."""
-
-    array: NDArray[np.uint8]
-
-    def between(self, first: int, end: int, step: int) -> Iterator[Piece]:
-        """Give the frames from `first` to before `end`, at most `step` at a time."""
-        for start in range(first, end, step):
-            yield start, self.array[start : min(start + step, end)]
-
-
-@dataclass(frozen=True, slots=True, eq=False)
-class RecordedFrames:
-    """Frames of a recording's only run, by their own numbers. Those of damaged blocks are left out."""
-
-    recording: RunRecording
-    run: RecordedRun
-
-    def between(self, first: int, end: int, step: int) -> Iterator[Piece]:
-        """Give the frames that exist from `first` to before `end`, in the blocks they lie in."""
-        for block in self.recording.blocks(self.run, first, end):
-            for start in range(0, block.n_frames, step):
-                yield block.header.first_frame + start, block.bits[start : start + step]
-
-
-@dataclass(frozen=True, slots=True, eq=False)
 class Cube:
-    """Checked frames of whole maps. first_frame: number of the first map's first frame. maps: whole sweeps."""
+    """Checked frames of whole maps. first_frame: number of the first map's first frame. maps: whole sweeps.
+
+    between: gives the frames that exist from a first one to before an end, so many at most at a time, from the disk.
+    """
 
     path: Path
-    frames: ArrayFrames | RecordedFrames
+    between: Callable[[int, int, int], Iterator[Piece]]
     plan: CubePlan
     width: int
     height: int
@@ -84,20 +62,31 @@ def open_cube(path: str | os.PathLike[str], plan: CubePlan, model: RigModel) -> 
     """Open a .npy file, or the folder of a recording; UsageError where it disagrees with its plan and calibration."""
     file = Path(path)
     camera = model.camera
-    frames: ArrayFrames | RecordedFrames
     if file.is_dir():
         recording = open_recording(file)
         run = recording.runs[0]
         problems = _recording_problems(recording, plan, camera)
-        frames, first, n = RecordedFrames(recording, run), run.first_frame, run.end_frame - run.first_frame
+        between, first, n = partial(_recorded, recording, run), run.first_frame, run.end_frame - run.first_frame
     else:
         array = open_array(file)
         problems = _array_problems(file, array, plan, camera)
-        frames, first, n = ArrayFrames(array), 0, len(array) if array.ndim else 0
+        between, first, n = partial(_in_array, array), 0, len(array) if array.ndim else 0
     problems += _plane_problems(plan, model)
     if problems:
         raise UsageError.of(problems)
-    return Cube(file, frames, plan, camera.width, camera.height, n // (plan.columns * plan.exposures), first)
+    return Cube(file, between, plan, camera.width, camera.height, n // (plan.columns * plan.exposures), first)
+
+
+def _in_array(array: NDArray[np.uint8], first: int, end: int, step: int) -> Iterator[Piece]:
+    for start in range(first, end, step):
+        yield start, array[start : min(start + step, end)]
+
+
+def _recorded(recording: RunRecording, run: RecordedRun, first: int, end: int, step: int) -> Iterator[Piece]:
+    """Frames by their own numbers, without those of damaged blocks."""
+    for block in recording.blocks(run, first, end):
+        for start in range(0, block.n_frames, step):
+            yield block.header.first_frame + start, block.bits[start : start + step]
 
 
 def cube_columns(model: RigModel) -> int | None:
@@ -125,7 +114,7 @@ def count_map(cube: Cube, index: int, counter: Counter) -> tuple[FrameTally, lis
     last_byte = np.uint8(0xFF << (-cube.width % 8) & 0xFF)
     gaps: list[Gap] = []
     following = first
-    for start, piece in cube.frames.between(first, end, step):
+    for start, piece in cube.between(first, end, step):
         if start > following:
             gaps.append((following, start - 1))
         following = start + len(piece)

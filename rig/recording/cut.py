@@ -79,7 +79,7 @@ def cut(
             )
         content = _manifest(manifest, parts, written.content(), lost)
         try:
-            _copy_inputs(folder, target.place("."), manifest, content["cut"]["maps"])
+            _copy_inputs(folder, target.place("."), manifest, parts)
         except OSError as error:
             raise RecordingError(
                 f"cannot copy {error.filename} to {out}: {error.strerror or error}; free the space it needs or name "
@@ -198,14 +198,13 @@ def _clock_ratio(manifest: dict[str, Any], part: Part, is_first: bool) -> float:
     return fitted_ratio(ratio, sweeps[: part.first_map] if is_first else ())
 
 
-def _copy_inputs(folder: Path, out: Path, manifest: dict[str, Any], maps: Sequence[int]) -> None:
+def _copy_inputs(folder: Path, out: Path, manifest: dict[str, Any], parts: Sequence[Part]) -> None:
     """Copy the files beside the frames; files of maps are numbered from 0 again, as the part's maps are."""
     for name in manifest.get("inputs") or {}:
         shutil.copyfile(folder / name, out / name)
-    before = (manifest.get("cut") or {}).get("maps", [0])[0]
     for kind in OF_MAPS:
-        for i in range(maps[0] - before, maps[1] - before):
+        for number, i in enumerate(range(parts[0].first_map, parts[-1].end_map)):
             file = folder / kind / f"{i:06d}.npz"
             if file.exists():
                 (out / kind).mkdir(exist_ok=True)
-                shutil.copyfile(file, out / kind / f"{i - (maps[0] - before):06d}.npz")
+                shutil.copyfile(file, out / kind / f"{number:06d}.npz")

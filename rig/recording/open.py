@@ -127,12 +127,11 @@ def _stated(recording: RunRecording, sweeps: list[dict[str, Any]]) -> Iterator[M
 def _marked(recording: RunRecording) -> Iterator[MapSpan]:
     """Spans between markers; a map whose beginning or end was lost has the frames that are left."""
     for run in recording.runs:
-        begins = [frame for _, frame in _sweep_begins(recording, run)]
-        yield from (MapSpan(run.number, a, b) for a, b in pairwise(begins))
+        yield from (MapSpan(run.number, a, b) for a, b in pairwise(_sweep_begins(recording, run)))
 
 
-def _sweep_begins(recording: RunRecording, run: RecordedRun) -> Iterator[tuple[int, int]]:
-    """(number of scan markers so far, first frame with them), for each scan marker except those before the run."""
+def _sweep_begins(recording: RunRecording, run: RecordedRun) -> Iterator[int]:
+    """The frame of each scan marker except those before the run."""
     entries = run.entries
     changes = np.flatnonzero(np.diff(entries["sweep"].astype(np.int64), prepend=-1) != 0)
     look_into = sorted({0, len(entries) - 1, *changes.tolist(), *(changes[1:] - 1).tolist()})
@@ -143,8 +142,7 @@ def _sweep_begins(recording: RunRecording, run: RecordedRun) -> Iterator[tuple[i
             continue
         counts = markers_seen(block)
         before = counts[0] if i == 0 and not _begins_sweep(block) else seen
-        for at in np.flatnonzero(np.diff(counts, prepend=before) > 0):
-            yield int(counts[at]), block.header.first_frame + int(at)
+        yield from (block.header.first_frame + np.flatnonzero(np.diff(counts, prepend=before) > 0)).tolist()
         seen = int(counts[-1])
 
 
@@ -237,10 +235,7 @@ def info(folder: Path) -> RecordingInfo:
 
 
 def _is_there(span: MapSpan, run: RecordedRun, manifest: dict[str, Any]) -> bool:
-    """Whether a map can be made of what a repair left.
-
-    In a part, which has no frames before its first map, only whole maps can.
-    """
+    """Whether a map can be made of what a repair left: in a part, without frames before its maps, of a whole one."""
     if "repaired" not in manifest:
         return True
     begin = span.first_frame if "cut" in manifest else span.end_frame - 1

@@ -18,7 +18,6 @@ from drivers.errors import CorruptBlock
 from drivers.recorded.contents import INDEX_FILE, index_header, round_up_to_page
 from drivers.recorded.segments import PACKED_SUFFIX, PlainSegment, SegmentReader
 from rig.errors import RecordingError, UsageError
-from rig.recording.check import SoundBlock
 from rig.recording.verify import Examination, Verification, examine, verify
 from rig.recording.writer import RESERVE_FILE
 from rig.run_folder.folder import is_held, replace_file, sync_folder
@@ -51,9 +50,14 @@ def repair(folder: Path) -> Repair:
         if _put_in_order(found, done):
             found = examine(folder)
         for segment in found.segments:
+            mine = np.sort(found.entries[found.entries["segment"] == segment.number], order="offset")
+            ends = (mine["offset"] + mine["length"]).tolist()
             mend = _clear if isinstance(segment, PlainSegment) else _unpack
-            mend(segment, _blocks_in(segment, found), done)
-        _write_index(folder, found, done)
+            mend(segment, list(zip(mine["offset"].tolist(), ends, strict=True)), done)
+        index = index_header() + np.sort(found.entries, order=["segment", "offset"]).tobytes()
+        if not ((folder / INDEX_FILE).exists() and (folder / INDEX_FILE).read_bytes() == index):
+            replace_file(folder / INDEX_FILE, index)
+            done.append(f"{INDEX_FILE} written anew, of {len(found.entries)} blocks")
         _write_manifest(folder, found, done)
         (folder / RESERVE_FILE).unlink(missing_ok=True)
         sync_folder(folder)
@@ -78,13 +82,6 @@ def _put_in_order(found: Examination, done: list[str]) -> bool:
         path.with_name(f"{path.name}.moving").rename(target)
         done.append(f"{path.name} is {target.name} now, by the frames in it")
     return True
-
-
-def _blocks_in(segment: SegmentReader, found: Examination) -> list[Range]:
-    """Ranges of the sound blocks of a segment, in order."""
-    mine = found.entries[found.entries["segment"] == segment.number]
-    begin = np.sort(mine, order="offset")
-    return list(zip(begin["offset"].tolist(), (begin["offset"] + begin["length"]).tolist(), strict=True))
 
 
 def _clear(segment: SegmentReader, blocks: list[Range], done: list[str]) -> None:
@@ -165,15 +162,6 @@ def _copy(segment: SegmentReader, pieces: list[Range], file: BinaryIO) -> None:
     os.fsync(file.fileno())
 
 
-def _write_index(folder: Path, found: Examination, done: list[str]) -> None:
-    data = index_header() + np.sort(found.entries, order=["segment", "offset"]).tobytes()
-    file = folder / INDEX_FILE
-    if file.exists() and file.read_bytes() == data:
-        return
-    replace_file(file, data)
-    done.append(f"{INDEX_FILE} written anew, of {len(found.entries)} blocks")
-
-
 def _write_manifest(folder: Path, found: Examination, done: list[str]) -> None:
     manifest = found.manifest
     if manifest is None:
@@ -223,12 +211,10 @@ def _recording(found: Examination) -> dict[str, Any]:
         "bytes": found.bytes,
     }
     if "starts" not in ((found.manifest or {}).get("recording") or {}):
-        content["starts"] = [_start(found, run) for run in found.runs]
+        content["starts"] = starts = []
+        for run in found.runs:  # whole sweeps, as the blocks tell, and the first segment
+            first = run[0].header
+            segments = found.entries["segment"][found.entries["run_id"] == first.run_id]
+            sweeps = max(0, run[-1].last_sweep - max(1, first.sweep))
+            starts.append({"sweeps": sweeps, "segment": int(segments.min())})
     return content
-
-
-def _start(found: Examination, run: list[SoundBlock]) -> dict[str, int]:
-    """Fields of `rig.recording.writer.Start`: whole sweeps of a run, as its blocks tell, and its first segment."""
-    first = run[0].header
-    segments = found.entries["segment"][found.entries["run_id"] == first.run_id]
-    return {"sweeps": max(0, run[-1].last_sweep - max(1, first.sweep)), "segment": int(segments.min())}

@@ -49,7 +49,6 @@ from rig.run_folder.manifest import (
 
 SILENCE_S = 5.0
 """Silence after which a SPAD has failed, as for a live one, in the time of the recording."""
-ENDLESS_S = 1e6
 ENDLESS = 1_000_000_000
 """Number of maps that stands for a loop without end."""
 RECORDED = ("scanner", "laser", "sync")
@@ -182,7 +181,7 @@ class ReplaySource:
     def silence_s(self) -> float:
         """Longest silence of the SPAD that is allowed: more at a slow clock, and no limit while it waits for steps."""
         pace = self._spad.pace
-        return ENDLESS_S if pace.stepping else SILENCE_S / min(1.0, pace.speed or 1.0)
+        return 1e6 if pace.stepping else SILENCE_S / min(1.0, pace.speed or 1.0)
 
     def groups(self) -> Iterator[int]:
         """Give the number of sweeps of each start, one after the other."""
@@ -204,10 +203,7 @@ class ReplaySource:
         return [learned[number] for number in self._numbers if number < len(learned)]
 
     def truth(self, index: int) -> SweepTruth | None:
-        """Truth of a map that was recorded with it; None where it was not kept.
-
-        DamagedRecordingError where it is of other columns or of another sensor.
-        """
+        """Truth of a map that was recorded with it; None where it was not kept. DamagedRecordingError if of others."""
         file = self._spad.recording.path / "truth" / f"{self._numbers[index % self._there]:06d}.npz"
         truth = kept(file, lambda arrays: SweepTruth(x_px=arrays["x_px"], depth_m=arrays["depth_m"]))
         if truth is not None and (truth.x_px.shape, truth.depth_m.shape) != self._shapes:
@@ -218,10 +214,7 @@ class ReplaySource:
         return truth
 
     def lost_outside(self, sweeps: Sequence[SweepAccount]) -> list[Gap]:
-        """Frames (first, last) known to be gone from the recording and outside all these sweeps.
-
-        Empty where fewer maps were asked for than there are.
-        """
+        """Frames (first, last) gone outside all these sweeps; empty where fewer maps were asked for than there are."""
         if not self._all:
             return []
         spans = _by_start(sweeps, [start.number for start in self._played])
@@ -319,10 +312,7 @@ def _by_start(sweeps: Sequence[SweepAccount], numbers: Sequence[int]) -> dict[in
 
 
 def _whole_sweeps(recording: RunRecording, run: RecordedRun, plan: ScanPlan) -> int:
-    """Number of sweeps of a start that are complete: by its markers or, without markers, by its number of frames.
-
-    Never more than its frames, whatever their headers say.
-    """
+    """Complete sweeps of a start, by its markers or else by its frames; never more than these, whatever headers say."""
     if plan.blanking is not None:
         frames = float(plan.frames_per_sweep)
         return min(run.frames, max(0, int((readable_range(recording, run)[1] - plan.frames_for(0)) / frames)))

@@ -148,10 +148,7 @@ class Recording:
         self._companions.append(companion)
 
     def close(self) -> None:
-        """Wait until everything is written, end the files and sync them. A second call does nothing.
-
-        Raises RecordingError where the disk did not take it.
-        """
+        """Wait until everything is written, end the files and sync them, once. RecordingError where that fails."""
         if self._closed.is_set():
             return
         self._pool.shutdown()

@@ -176,11 +176,10 @@ class RunFolder:
             raise UsageError(f"--out {self.path} is a file; name a new folder")
         if there and any(self.path.iterdir()):
             raise UsageError(f"--out {self.path} exists and is not empty; name a new folder or empty this one")
-        wanted = [self.path, *self.path.parents] if self._in_place else [*self.path.parents]
-        for folder in reversed(wanted):
-            if not folder.exists():
-                folder.mkdir()
-                self._made_parents.append(folder)
+        missing = [folder for folder in self.path.parents if not folder.exists()]
+        for folder in [*reversed(missing), *([self.path] if self._in_place and not there else ())]:
+            folder.mkdir()
+            self._made_parents.append(folder)
         if self._in_place:
             return self.path
         scratch = (self.path if there else self.path.parent) / f".{self.path.name}.{secrets.token_hex(4)}.part"

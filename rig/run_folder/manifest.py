@@ -144,10 +144,7 @@ def ended_early(manifest: Mapping[str, Any]) -> str | None:
 
 
 def ended_before_last_map(manifest: Mapping[str, Any]) -> bool:
-    """Whether a run ended before it had made maps of all sweeps that its starts were to give.
-
-    Whole sweeps without a map may lie behind those that the manifest lists, for example where the run was killed.
-    """
+    """Whether a run ended before it had made maps of all sweeps: whole ones may lie behind those of the manifest."""
     starts = (manifest.get("recording") or {}).get("starts") or []
     return len(manifest.get("sweeps") or []) < sum(int(start["sweeps"]) for start in starts)
 

@@ -27,13 +27,11 @@ class PipelineStats:
     """Figures of a pipeline at one moment or at its end. Times are wall time in seconds; None: there is no such stage.
 
     source_fill_s: in the SPAD's `fill`, without source_wait_s, which is spent waiting for a free slot of the ring.
-    ring_high_water: most slots in use at one time, of ring_slots, which take ring_bytes together.
-    dropped_blocks, dropped_frames: found no free slot.
-    counting_s: binding and counting. estimation_s: from counts to map.
-    map_wait_s: waiting for room among the maps that the caller has not taken yet; map_queue is that room, and at most
-      map_queue_high_water maps waited.
-    recorder_s: computing checksums and writing.
-    monitor_updates: views shown. monitor_skipped_blocks: blocks that the monitor did not look at.
+    ring_high_water: most slots in use at one time, of ring_slots, which take ring_bytes together. dropped_blocks,
+    dropped_frames: found no free slot. counting_s: binding and counting. estimation_s: from counts to map. map_wait_s:
+    waiting for room among the maps that the caller has not taken yet; map_queue is that room, and at most
+    map_queue_high_water maps waited. recorder_s: computing checksums and writing. monitor_updates: views shown.
+    monitor_skipped_blocks: blocks that the monitor did not look at.
     """
 
     source_fill_s: float = 0.0
@@ -99,8 +97,7 @@ class Synchronisation:
     """The binding of a run's frames to columns: by what, and how well.
 
     residual_columns, clock_error: the largest of its sweeps; None where one could not be checked.
-    detection_probability: the least over the sweeps, of finding a blanking pattern as bright as theirs; None where
-      markers bound the frames.
+    detection_probability: the least, of a blanking pattern as bright as a sweep's; None where markers bound the frames.
     """
 
     by: Literal["markers", "blanking pattern"]

@@ -95,13 +95,6 @@ def test_fewer_maps_are_the_first_ones_and_more_need_a_loop(lossy: Path, tmp_pat
     assert first["depth/000004/"] == first["depth/000001/"]
 
 
-def test_another_estimator_can_be_tried_on_the_same_frames(learned: Path) -> None:
-    result = api.replay(learned, clock="max", estimator="argmax", filter="median")
-    assert (result.summary.estimator, result.summary.filter) == ("argmax", "median")
-    assert result.summary.maps == 3
-    assert result.summary.truth is not None
-
-
 @pytest.mark.parametrize("why", ["killed", "disk full"])
 def test_a_recording_that_was_cut_short_gives_its_whole_maps(learned: Path, tmp_path: Path, why: str) -> None:
     def change(manifest: dict[str, Any]) -> None:

@@ -29,7 +29,7 @@ def test_a_frame_that_comes_twice_counts_once_and_the_one_it_replaces_is_lost(tm
     assert twice.summary.frames.lost == len(replaced) > 20
     lost = _scan(tmp_path / "lost", 2, lost_frames=replaced)
     assert lost.summary.frames == twice.summary.frames
-    assert_same(tmp_path / "lost" / "run", tmp_path / "twice" / "run")
+    assert_same(tmp_path / "lost" / "run", tmp_path / "twice" / "run", "stripe", "depth")
     assert any("the clock goes back within block" in line for line in verify(tmp_path / "twice" / "run").problems)
 
 

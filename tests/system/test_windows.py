@@ -7,7 +7,7 @@ from typing import Any
 import numpy as np
 import pytest
 
-from rig.api import configure, plan_scan, scan
+from rig.api import configure, scan
 from rig.devices.open import open_rig
 from rig.devices.prepare import prepare
 from tests.system.conftest import Rig
@@ -62,18 +62,6 @@ def test_lost_frames_are_lost_alike_also_where_rows_end_in_padding(tmp_path: Pat
     np.testing.assert_array_equal(windows.last.stripe.x_px, full.last.stripe.x_px)
 
 
-def test_a_link_of_400_megabytes_a_second_streams_windows(tmp_path: Path) -> None:
-    file = wide_rig(tmp_path, "400 MB/s", height=160, columns=100)
-    plan = plan_scan(file)
-    assert (plan.mode, plan.windowed, plan.frame_width) == ("stream", True, 192)
-    assert plan.bytes_per_s == 1e5 * (160 * 24 + 16)
-    result = scan(file)
-    assert result.summary.verdict == "complete"
-    assert result.summary.truth is not None
-    assert result.summary.truth.stripe_error_px["missing"] == 0
-    assert result.summary.truth.stripe_error_px["within_1px"] > 0.8
-
-
 def test_a_dry_run_prints_window_megabytes_and_the_rates_of_the_link(rig: Rig, tmp_path: Path) -> None:
     ran = rig("scan", wide_rig(tmp_path / "rig", SLOW), "--dry-run")
     assert ran.code == 0
@@ -81,12 +69,8 @@ def test_a_dry_run_prints_window_megabytes_and_the_rates_of_the_link(rig: Rig, t
     assert "stream of moving windows of 192 pixels, 97.6 MB/s; the link carries full frames up to 61.88 kHz" in ran.out
     assert "windows of 192 pixels up to 102.5 kHz" in ran.out
     plan = json.loads(rig("scan", wide_rig(tmp_path / "rig", SLOW), "--dry-run", "--json").out)["plan"]
-    assert (plan["windowed"], plan["frame_width_px"], plan["windows_px"], plan["link_bytes_per_s"]) == (
-        True,
-        192,
-        192,
-        1e8,
-    )
+    told = ("windowed", "frame_width_px", "windows_px", "link_bytes_per_s")
+    assert [plan[name] for name in told] == [True, 192, 192, 1e8]
     assert plan["bytes_per_s"] == 1e5 * (40 * 24 + 16)
     assert plan["full_frames_hz"] == pytest.approx(1e8 / (40 * 40 + 16))
     assert plan["windows_hz"] == pytest.approx(1e8 / (40 * 24 + 16))

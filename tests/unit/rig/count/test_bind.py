@@ -10,7 +10,7 @@ from calibration.model.rig_model import Lag
 from drivers.errors import ProtocolError
 from drivers.frames import SUBFRAME_SHIFT, Mark
 from rig.count import sweeps
-from rig.count.bind import FrameBinder, SweepClock
+from rig.count.bind import FrameBinder
 from rig.count.bind_kernels import cover
 from rig.count.volume import BIN_DARK, BIN_UNUSABLE
 from rig.errors import PlanError
@@ -218,12 +218,6 @@ def test_counters_of_16_bits_run_over_without_harm():
     lit = expected["bins"] >= 0
     np.testing.assert_array_equal(bound["bins"][lit], expected["bins"][lit])
     assert [c.sweep for c in clocks][-3:] == [65534, 65535, 65536]
-
-
-def test_a_sweep_with_too_few_markers_is_not_called_synchronised():
-    assert not SweepClock(0, 0.0, float("nan"), 1, 0, 10, 0).synchronised
-    assert not SweepClock(0, 5e-3, 0.0, 9, 0, 10, 0).synchronised
-    assert SweepClock(0, 5e-5, 0.01, 9, 0, 10, 0).synchronised
 
 
 @pytest.mark.parametrize("bit", [0, 1, 5, 15])

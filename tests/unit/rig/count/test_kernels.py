@@ -56,12 +56,3 @@ def test_frames_may_come_in_pieces(pieces):
         add_frames(words.ravel(), 20, 0, first, first + piece, 20, first, planes)
         first += piece
     np.testing.assert_array_equal(planes_counts(planes, 20, first), bits_of(words).sum(axis=0))
-
-
-def test_words_beside_a_chunk_are_left_alone():
-    planes = random_words(4, (PLANES + 1) * CHUNK)
-    before = planes.copy()
-    add_frames(random_words(3, 30, 10).ravel(), 10, 0, 0, 30, 10, 0, planes)
-    untouched = np.ones((PLANES + 1, CHUNK), bool)
-    untouched[:, :10] = False
-    np.testing.assert_array_equal(planes[untouched.ravel()], before[untouched.ravel()])

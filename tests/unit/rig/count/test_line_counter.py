@@ -124,16 +124,6 @@ def test_the_overlap_is_the_share_of_a_window_that_other_windows_cover():
     assert 0 < window_overlap(grid, geometry) == pytest.approx(covered / whole)
 
 
-def test_each_column_is_told_the_planes_of_those_lit_together_with_it():
-    grid, _ = line_grid(OFFSETS, 40, (-0.1, 0.1))
-    plane = np.random.default_rng(1).normal(size=(40, 3))
-    others = grid.others(plane)
-    assert others.shape == (40, 3, 3)
-    for c in range(40):
-        expected = [plane[o] for o in grid.columns_at()[grid.place[c]] if o != c]
-        assert np.array_equal(others[c], expected)
-
-
 @pytest.mark.parametrize("n", [3, 700])
 def test_lines_are_counted_as_if_each_had_the_frames_to_itself(n):
     rows, width, places, lines, window = 5, 150, 3, 2, 64

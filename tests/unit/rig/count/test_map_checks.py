@@ -9,7 +9,7 @@ import pytest
 from numpy.typing import NDArray
 
 from rig.count import map_check_kernels, map_checks
-from rig.count.map_checks import POINTS, MapChecks, check_points
+from rig.count.map_checks import MapChecks
 from rig.geometry.stripe_table import StripeTable
 from tests.stability.inventory import covers
 from tests.unit.small_maps import simulated, volume_of
@@ -126,15 +126,6 @@ def test_a_map_of_few_points_is_not_judged() -> None:
     volume = volume_of(noise(sweep.counts, 10, np.random.default_rng(0)), sweep.geometry, 10)
     checks = MapChecks(sweep.geometry, calibrated=True, knows=True)
     assert checks.doubts(volume, volume.intensity(), StripeTable.empty(4, 30)) == ()
-
-
-def test_points_lie_in_the_searched_windows_with_their_partners() -> None:
-    geometry = simulated("report", 10, "turned", rows=ROWS, columns=COLUMNS).geometry
-    points = check_points(geometry)
-    assert 0 < points.row.shape[1] <= POINTS
-    assert (geometry.x_lo <= geometry.x_hi)[points.row, points.column].all()
-    assert np.array_equal(points.row[1], points.row[0] + 1)
-    assert (points.column[2] > points.column[0]).all()
 
 
 def test_a_map_whose_frames_were_all_lost_is_not_called_dark() -> None:

@@ -134,8 +134,7 @@ def test_a_volume_outlives_the_next_sweep():
         np.testing.assert_array_equal(getattr(volumes[1], name), getattr(volumes[0], name))
 
 
-@pytest.mark.parametrize("blocks", [(10**9,), (1,), (7, 30)])
-@pytest.mark.parametrize("threads", [1, 3])
+@pytest.mark.parametrize(("blocks", "threads"), [((10**9,), 1), ((1,), 3), ((7, 30), 3)])
 def test_frames_cut_to_their_used_pixels_are_counted_as_whole_ones(blocks, threads):
     frames, bins, column = stream(11, 300, 5, 300, 6)
     rng, used, window = np.random.default_rng(2), 192, 128
@@ -163,14 +162,3 @@ def test_frames_cut_to_their_used_pixels_are_counted_as_whole_ones(blocks, threa
 def test_windows_off_the_word_grid_are_refused(window, x0):
     with pytest.raises(ValueError, match="multiples of 64"):
         SweepLayout(1, 2, 200, np.array([x0], np.int32), window, 10)
-
-
-def test_intensity_of_wide_counts_does_not_wrap():
-    counts = np.full((3, 2, 64), 65_535, np.uint16)
-    full = np.full(3, 65_535, np.int32)
-    volume = CountVolume(
-        counts=counts, x0=np.zeros(3, np.int32), n_frames=full, column=np.arange(3.0), dark_counts=None, n_dark=0,
-        width=50, exposures=65_535,
-    )  # fmt: skip
-    assert np.all(volume.intensity() == 3 * 65_535)
-    assert volume.intensity().shape == (2, 50)

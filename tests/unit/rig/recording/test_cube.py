@@ -1,6 +1,5 @@
 """Bare cubes: every bit is counted once, in its column; what is no cube is told what makes it one."""
 
-from fractions import Fraction
 from io import BytesIO
 from pathlib import Path
 
@@ -15,7 +14,7 @@ from rig.config.models import CubePlan
 from rig.count.volume import SweepCounter, SweepLayout
 from rig.errors import UsageError
 from rig.recording import cube as cube_module
-from rig.recording.cube import ArrayFrames, column_commands, count_map, open_cube
+from rig.recording.cube import count_map, open_cube
 from rig.threads import RowWorkers
 from tests.stability.inventory import covers
 
@@ -74,15 +73,6 @@ def test_counts_are_the_sums_of_the_bits(
             assert np.array_equal(volume.n_frames, np.full(columns, exposures))
             assert np.array_equal(volume.column, np.arange(columns))
             assert volume.dark_counts is None
-
-
-def test_a_cube_is_not_read_before_it_is_counted(tmp_path: Path) -> None:
-    np.save(tmp_path / "cube.npy", np.zeros((6, 4, 13), np.uint8))
-    cube = open_cube(tmp_path / "cube.npy", plan(2, 3), model(2, 100, 4))
-    assert isinstance(cube.frames, ArrayFrames)
-    assert isinstance(cube.frames.array, np.memmap)
-    assert np.array_equal(column_commands(cube.plan), [0, 1])
-    assert cube.plan.frame_rate == Fraction(97_700)
 
 
 def test_all_that_does_not_fit_is_said_at_once(tmp_path: Path) -> None:

@@ -1,8 +1,6 @@
 """`cut`, `info`, maps of a recording, and compression: parts and compressed recordings give the very frames."""
 
-import subprocess
 import sys
-from contextlib import suppress
 from dataclasses import replace
 from pathlib import Path
 
@@ -132,12 +130,17 @@ def test_what_a_repair_found_missing_is_known_to_be_missing_in_a_part(tmp_path: 
     assert verify(tmp_path / "behind").verdict is Integrity.INTACT
 
 
-@pytest.mark.parametrize("what", ["lost", "changed"])
-def test_nothing_is_cut_without_the_plan_that_it_was_taken_with(tmp_path: Path, runs: Runs, what: str) -> None:
-    folder = record(tmp_path / "run", runs, inputs={"plan.yaml": 0})
-    if what == "changed":
+@pytest.mark.parametrize("what", ["lost plan", "changed plan", "damaged frames"])
+def test_nothing_is_cut_of_what_is_damaged_or_without_the_plan_that_it_was_taken_with(
+    tmp_path: Path, runs: Runs, what: str
+) -> None:
+    frames = what == "damaged frames"
+    folder = record(tmp_path / "run", runs, **({} if frames else {"inputs": {"plan.yaml": 0}}))
+    if frames:
+        flip(folder / "frames-000000.spb", 500)
+    elif what == "changed plan":
         (folder / "plan.yaml").write_bytes(b"other")
-    with pytest.raises(DamagedRecordingError, match=r"plan.yaml .* from a copy"):
+    with pytest.raises(DamagedRecordingError, match="repair" if frames else r"plan.yaml .* from a copy"):
         cut(folder, tmp_path / "part", maps="0:2")
     assert not (tmp_path / "part").exists()
 
@@ -173,14 +176,6 @@ def test_what_is_not_there_is_not_cut(tmp_path: Path, runs: Runs, asked: dict[st
     assert not (tmp_path / "part").exists()
 
 
-def test_a_damaged_recording_is_not_cut(tmp_path: Path, runs: Runs) -> None:
-    folder = record(tmp_path / "run", runs)
-    flip(folder / "frames-000000.spb", 500)
-    with pytest.raises(DamagedRecordingError, match="repair"):
-        cut(folder, tmp_path / "part", maps="0:2")
-    assert not (tmp_path / "part").exists()
-
-
 class TestCompressed:
     @pytest.fixture(autouse=True)
     def _zstandard(self) -> None:
@@ -208,11 +203,8 @@ class TestCompressed:
         folder = record(tmp_path, runs)
         plain = (folder / "frames-000000.spb").read_bytes()
         compress(folder)
-        packed = folder / "frames-000000.spb.zst"
-        with packed.open("rb") as file:
+        with (folder / "frames-000000.spb.zst").open("rb") as file:
             assert zstandard.ZstdDecompressor().stream_reader(file, read_across_frames=True).read() == plain
-        with suppress(FileNotFoundError):  # not installed everywhere
-            assert subprocess.run(["zstd", "-dc", packed], capture_output=True, check=True).stdout == plain
 
     @pytest.mark.parametrize("what", ["table", "frame"])
     def test_damage_costs_what_it_hit(self, tmp_path: Path, runs: Runs, what: str) -> None:
