@@ -30,8 +30,8 @@ MAX_RESIDUAL_COLUMNS = 0.05
 """A sweep whose markers stray further from one straight line of time than this is not synchronised."""
 MOST_OUT_OF_TURN = 1000
 """Frames of a sweep that may name one which cannot have begun; more are no flipped bits but a wrong line or link."""
-Places = tuple[NDArray[np.int32], NDArray[np.int8], NDArray[np.float64], NDArray[np.int32]]
-"""Sweep, direction, column and bin of each frame."""
+Places = tuple[NDArray[np.int32], NDArray[np.float64], NDArray[np.int32]]
+"""Sweep, column and bin of each frame."""
 UNITS_PER_TICK = 2 * (SUBFRAME_MASK + 1)
 """Times are whole numbers (int64) of this part of a tick, in which markers and exposure middles are exact: a frame's
 column is then the same to the last bit in whatever block it comes. Good for 200 days at 1 GHz."""
@@ -48,15 +48,14 @@ column, in_column: the column that the sweep has come to, -1 before the first, a
 
 @dataclass(frozen=True, slots=True)
 class BoundFrames:
-    """Sweep, direction, column and bin of each frame of a block.
+    """Sweep, column and bin of each frame of a block.
 
-    sweep: -1 before the first marker. direction: +1 where the command rises, -1 where it falls, 0 unknown. column:
-    fractional, at the middle of the exposure; NaN before the first marker, continued linearly outside the lit part.
-    bins: column index, BIN_DARK or BIN_UNUSABLE. starts: indices of frames, 0 and those with which a sweep begins.
+    sweep: -1 before the first marker. column: fractional, at the middle of the exposure; NaN before the first marker,
+    continued linearly outside the lit part. bins: column index, BIN_DARK or BIN_UNUSABLE. starts: indices of frames, 0
+    and those with which a sweep begins.
     """
 
     sweep: NDArray[np.int32]
-    direction: NDArray[np.int8]
     column: NDArray[np.float64]
     bins: NDArray[np.int32]
     starts: tuple[int, ...]
@@ -237,8 +236,8 @@ class FrameBinder:
                 f"frame {header.first_frame + at} and {MOST_OUT_OF_TURN} before it name sweeps that cannot have begun "
                 f"behind sweep {int(self._carried['sweep'][0])}; check the scan marker's line and the SPAD's link"
             )
-        sweep, direction, column, bins = places
-        sweep[at], direction[at], column[at], bins[at] = int(self._carried["sweep"][0]), 0, np.nan, BIN_UNUSABLE
+        sweep, column, bins = places
+        sweep[at], column[at], bins[at] = int(self._carried["sweep"][0]), np.nan, BIN_UNUSABLE
 
     def _begin(self, at: int, record: np.void, terms: BlockTerms, header: BlockHeader) -> list[SweepClock]:
         """Close the sweep that ran, begin the next one at frame index `at`, where its scan marker is if received."""
@@ -323,7 +322,7 @@ _WHOLE = np.dtype((np.void, FRAME_RECORD.itemsize))
 
 
 def _new_places(n: int) -> Places:
-    return np.empty(n, np.int32), np.empty(n, np.int8), np.empty(n, np.float64), np.empty(n, np.int32)
+    return np.empty(n, np.int32), np.empty(n, np.float64), np.empty(n, np.int32)
 
 
 def _sweep_named(record: np.void, terms: BlockTerms) -> int:

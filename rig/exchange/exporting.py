@@ -13,8 +13,7 @@ from drivers.recorded import RunRecording
 from drivers.recorded.segments import segment_files
 from rig.errors import DamagedRecordingError, UsageError
 from rig.exchange import hdf5, pictures
-from rig.exchange.frame_log import FrameLog
-from rig.exchange.npy import MapFiles, write_npy
+from rig.exchange.npy import FrameLog, MapFiles, write_npy
 from rig.exchange.pictures import VIEWS, Picture, View
 from rig.progress import Progress, counted
 from rig.recording.inputs import read_model, reconstruct_line

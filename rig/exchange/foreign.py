@@ -16,8 +16,6 @@ from rig.errors import UsageError
 T = TypeVar("T")
 CHUNK_BYTES: Final = 16 << 20
 """Bytes of the pieces that files are read in, about."""
-LSB_FIRST: Final = np.packbits(np.unpackbits(np.arange(256, dtype=np.uint8), bitorder="little"))
-"""Bytes with their bits reversed, for cameras that send the leftmost pixel in the least significant bit."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)

@@ -24,8 +24,7 @@ from numpy.typing import NDArray
 from drivers.frames import FrameBlock
 from drivers.optional_packages import install_command
 from rig.errors import UsageError
-from rig.exchange.frame_log import FrameLog
-from rig.exchange.npy import MapFiles
+from rig.exchange.npy import FrameLog, MapFiles
 from rig.run_folder.folder import json_text
 
 FILE: Final = "run.h5"

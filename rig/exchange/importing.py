@@ -22,7 +22,7 @@ from drivers.spads.orientation import QuarterTurn, turn_packed, turned_size
 from drivers.spb1 import BlockLayout, frames_per_block
 from drivers.units import parse_exact
 from rig.errors import UsageError
-from rig.exchange import photoncube, pi_imaging, swissspad2
+from rig.exchange import photoncube, raw_files
 from rig.exchange.foreign import ForeignFrames, gather
 from rig.progress import Progress, counted
 from rig.recording.writer import Recording
@@ -42,16 +42,10 @@ class _Kind(NamedTuple):
 
 
 _KINDS: Final = {
-    "pi-imaging": _Kind(
-        ".bin",
-        pi_imaging.FORMS,
-        lambda files, asked: pi_imaging.open_pi_imaging(files, asked.form, asked.rows),
-        90,  # as the vendor's samples and the driver (`rotation`) turn them
-    ),
-    "swissspad2": _Kind(".bin", swissspad2.FORMS, lambda files, asked: swissspad2.open_swissspad2(files, asked.form)),
-    "photoncube": _Kind(
-        ".npy", photoncube.FORMS, lambda files, asked: photoncube.open_photoncube(files, packed=asked.form == "packed")
-    ),
+    # As the vendor's samples and the driver (`rotation`) turn them.
+    "pi-imaging": _Kind(".bin", raw_files.PI_IMAGING_FORMS, raw_files.open_pi_imaging, 90),
+    "swissspad2": _Kind(".bin", raw_files.SWISSSPAD2_FORMS, raw_files.open_swissspad2),
+    "photoncube": _Kind(".npy", photoncube.FORMS, photoncube.open_photoncube),
 }
 _RUN_ID: Final = 1
 _BLOCK_BYTES: Final = 1 << 20

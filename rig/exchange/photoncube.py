@@ -17,6 +17,7 @@ from drivers.json_text import parse_json
 from rig.errors import UsageError
 from rig.exchange.foreign import ForeignFrames, chunks_of, open_each
 from rig.recording.cube import holds_bits, open_array, pack_line
+from rig.requests import ImportRequest
 
 FORMS: Final = ("packed",)
 PACK: Final = "numpy.packbits(frames, axis=2)"
@@ -36,12 +37,12 @@ class _Cube:
     ranges: tuple[tuple[int, int], ...]
 
 
-def open_photoncube(files: Sequence[Path], *, packed: bool = False) -> ForeignFrames:
+def open_photoncube(files: Sequence[Path], asked: ImportRequest) -> ForeignFrames:
     """Open cubes as frames one after the other. UsageError, a line per problem, for files that are no such cubes.
 
-    packed: take them for packed even where all bytes are 0 or 1, which is refused otherwise.
+    Where all bytes are 0 or 1 they must be asked for as packed.
     """
-    cubes = open_each(files, lambda file: _open(file, packed=packed))
+    cubes = open_each(files, lambda file: _open(file, packed=asked.form == "packed"))
     if len({(cube.width, cube.frames.shape[1:]) for cube in cubes}) > 1:
         sizes = ", ".join(
             f"{file.name} {cube.width} x {cube.frames.shape[1]}" for file, cube in zip(files, cubes, strict=True)

@@ -62,28 +62,13 @@ def test_lost_frames_are_lost_alike_also_where_rows_end_in_padding(tmp_path: Pat
     np.testing.assert_array_equal(windows.last.stripe.x_px, full.last.stripe.x_px)
 
 
-def test_a_dry_run_prints_window_megabytes_and_the_rates_of_the_link(rig: Rig, tmp_path: Path) -> None:
-    ran = rig("scan", wide_rig(tmp_path / "rig", SLOW), "--dry-run")
-    assert ran.code == 0
-    assert "window      128 of 320 pixels for 2 to 15 m" in ran.out
-    assert "stream of moving windows of 192 pixels, 97.6 MB/s; the link carries full frames up to 61.88 kHz" in ran.out
-    assert "windows of 192 pixels up to 102.5 kHz" in ran.out
+def test_a_dry_run_tells_the_rates_of_the_link(rig: Rig, tmp_path: Path) -> None:
     plan = json.loads(rig("scan", wide_rig(tmp_path / "rig", SLOW), "--dry-run", "--json").out)["plan"]
     told = ("windowed", "frame_width_px", "windows_px", "link_bytes_per_s")
     assert [plan[name] for name in told] == [True, 192, 192, 1e8]
     assert plan["bytes_per_s"] == 1e5 * (40 * 24 + 16)
     assert plan["full_frames_hz"] == pytest.approx(1e8 / (40 * 40 + 16))
     assert plan["windows_hz"] == pytest.approx(1e8 / (40 * 24 + 16))
-
-
-def test_a_link_too_slow_for_windows_is_refused_with_the_rate_it_carries(rig: Rig, tmp_path: Path) -> None:
-    ran = rig("scan", wide_rig(tmp_path / "slow", "50 MB/s"))
-    assert (ran.code, len(ran.problems)) == (2, 1)
-    assert "162 MB/s of full frames" in ran.problems[0] or "161.6 MB/s of full frames" in ran.problems[0]
-    assert "lower frame_rate to 51.229 kHz" in ran.problems[0]
-    slower = rig("scan", wide_rig(tmp_path / "slower", "50 MB/s", frame_rate="51.229 kHz"), "--dry-run")
-    assert slower.code == 0
-    assert "moving windows of 192 pixels" in slower.out
 
 
 def test_a_spad_that_rounds_its_frame_rate_gets_the_windows_of_the_rate_it_has(

@@ -27,9 +27,7 @@ def bind(plan, blocks):
         places, closed = binder.bind(block)
         bound.append(places)
         clocks += closed
-    merged = {
-        name: np.concatenate([getattr(b, name) for b in bound]) for name in ("sweep", "direction", "column", "bins")
-    }
+    merged = {name: np.concatenate([getattr(b, name) for b in bound]) for name in ("sweep", "column", "bins")}
     return merged, clocks
 
 

@@ -13,7 +13,7 @@ from drivers.frames import BlockFlag, FrameBlock
 from drivers.recorded import RunRecording
 from rig.api import import_frames, verify
 from rig.errors import UsageError
-from rig.exchange import swissspad2
+from rig.exchange import raw_files
 from rig.exchange.importing import ImportResult
 from tests.unit.rig.exchange.foreign_files import (
     Frames,
@@ -115,9 +115,9 @@ def test_full_frames_read_as_halves_are_noticed() -> None:
         scene[:254, :496][np.load(DEFECTS)] = 0.9
     frames = np.random.default_rng(2).random((24, 512, 512)) < scene
     raw = np.frombuffer(swissspad2_full(frames), np.uint8)
-    assert swissspad2._alternates(raw)
+    assert raw_files._alternates(raw)
     halves = np.frombuffer(swissspad2_half(frames[:, :256]), np.uint8)
-    assert not swissspad2._alternates(halves)
+    assert not raw_files._alternates(halves)
 
 
 def test_a_photon_cube_of_any_width_keeps_its_clock_and_numbers(tmp_path: Path) -> None:
