@@ -7,6 +7,7 @@ frame rate no clock (`frame_period_ticks` 0, one tick a frame). The pixels are t
 import os
 import shutil
 from collections.abc import Callable, Iterable, Iterator
+from contextlib import closing
 from dataclasses import dataclass
 from fractions import Fraction
 from itertools import pairwise
@@ -113,15 +114,12 @@ def import_frames(
                 f"the recording will take {digits(expected / 1e9)} GB, the disk of {scratch.parent} has "
                 f"{digits(free / 1e9)} GB free; free some or name a folder on another disk with --out"
             )
-        recording = Recording(scratch, expected_bytes=expected)
-        try:
+        with closing(Recording(scratch, expected_bytes=expected)) as recording:
             done, told = 0, counted("reading", "frames", progress)
             for block in _blocks(foreign, turn, ranges, rate):
                 recording.append(block)
                 done += block.n_frames
                 told(done, foreign.n_frames)
-        finally:
-            recording.close()
         manifest: dict[str, Any] = {
             "versions": versions(),
             "command": "import",
@@ -153,19 +151,16 @@ def _checked_turn(kind: str, request: ImportRequest) -> QuarterTurn:
     """Check that all options fit the kind, and return the quarter turn."""
     if kind not in _KINDS:
         raise UsageError(f"import kind {kind!r} is unknown; choose one of {', '.join(_KINDS)}")
-    problems = []
-    forms = _KINDS[kind].forms
-    if request.form is not None and request.form not in forms:
-        problems.append(f"{kind} has no form {request.form!r}; choose {' or '.join(forms)}, or leave --form out")
+    forms, form, rows, turns = _KINDS[kind].forms, request.form, request.rows, get_args(QuarterTurn)
     turn = _KINDS[kind].upright_deg if request.turn_deg is None else request.turn_deg
-    turns = get_args(QuarterTurn)
-    if turn not in turns:
-        problems.append(f"frames cannot be turned by {turn} degrees; choose one of {', '.join(map(str, turns))}")
-    if request.rows is not None and kind != "pi-imaging":
-        problems.append(f"rows is {request.rows}, but {kind} files say their size themselves; leave --rows out")
-    elif request.rows is not None and request.rows not in (512, 1024):
-        problems.append(f"rows is {request.rows}; a SPAD512S has 512, its 1M flavour 1024")
-    if problems:
+    has_rows, stated = kind == "pi-imaging", rows is not None
+    checks = [
+        (form not in (None, *forms), f"{kind} has no form {form!r}; choose {' or '.join(forms)}, or leave --form out"),
+        (turn not in turns, f"frames cannot be turned by {turn} degrees; choose one of {', '.join(map(str, turns))}"),
+        (stated and not has_rows, f"rows is {rows}, but {kind} files say their size themselves; leave --rows out"),
+        (has_rows and rows not in (None, 512, 1024), f"rows is {rows}; a SPAD512S has 512, its 1M flavour 1024"),
+    ]
+    if problems := [line for wrong, line in checks if wrong]:
         raise UsageError.of(problems)
     return next(one for one in turns if one == turn)
 

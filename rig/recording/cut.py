@@ -8,6 +8,7 @@ import math
 import re
 import shutil
 from collections.abc import Sequence
+from contextlib import closing
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, Final
@@ -62,17 +63,14 @@ def cut(
     spans = map_spans(recording, manifest)
     parts = _parts(recording, spans, maps, frames, time, run)
     with RunFolder(out) as target:
-        written = Recording(target.place("."), expected_bytes=0)
         lost: list[list[int]] = []
-        try:
+        with closing(Recording(target.place("."), expected_bytes=0)) as written:
             for part in parts:
                 written.begin(part.end_map - part.first_map)
                 for block in recording.blocks(part.run, part.first_frame, part.end_frame):
                     written.append(block)
                     tell_stage("writing", written.blocks, unit="blocks")
                 lost += [list(gap) for gap in part.run.gaps() if gap[0] < part.end_frame and gap[1] >= part.first_frame]
-        finally:
-            written.close()
         if written.blocks == 0 or recording.problems:
             raise DamagedRecordingError(
                 f"{folder} is damaged: {'; '.join(recording.problems[:3]) or 'no frame is left there'}; 'rig repair' it"

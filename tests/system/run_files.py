@@ -23,10 +23,10 @@ def files(folder: Path) -> set[str]:
     return {str(file.relative_to(folder)) for file in folder.rglob("*") if file.is_file()}
 
 
-def arrays(run: Path, *kinds: str) -> dict[str, bytes]:
-    """Every number of every map, by kind, map and name. kinds: without any, all there are."""
+def arrays(run: Path) -> dict[str, bytes]:
+    """Every number of every map, by kind, map and name."""
     found = {}
-    for kind in kinds or ("depth", "stripe", "learned", "truth"):
+    for kind in ("depth", "stripe", "learned", "truth"):
         for file in sorted((run / kind).glob("*.np[yz]")):
             loaded = np.load(file)
             parts = {"": loaded} if file.suffix == ".npy" else dict(loaded)
@@ -35,8 +35,8 @@ def arrays(run: Path, *kinds: str) -> dict[str, bytes]:
     return found
 
 
-def assert_same(run: Path, other: Path, *kinds: str) -> None:
+def assert_same(run: Path, other: Path) -> None:
     """Both runs have the very same maps."""
-    ours, theirs = arrays(run, *kinds), arrays(other, *kinds)
+    ours, theirs = arrays(run), arrays(other)
     assert ours.keys() == theirs.keys()
     assert [name for name in ours if ours[name] != theirs[name]] == []
