@@ -1,37 +1,23 @@
-"""Opens recordings for the commands that read one, and says what they hold and which frames belong to which map.
+"""Opens recordings for the commands that read one, and says what they hold and which frames belong to which map."""
 
-`open_recording` opens one, `info` describes it from index and manifest (`verify` reads all of it), and `map_spans`
-finds the frames of each map: as the manifest says or, for a run that ended early, its markers. The rest is about where
-the starts of a recording begin and end, and what a part (`rig cut`) takes over from the whole, so that its maps come
-out the same bit for bit.
-"""
-
-import zipfile
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Iterator, Sequence
 from dataclasses import asdict, dataclass
 from itertools import pairwise
 from pathlib import Path
-from typing import Any, Final, TypeVar
+from typing import Any, Final
 
 import numpy as np
 from numpy.typing import NDArray
 
-from calibration.files.npy_files import load_numpy
-from calibration.model.rig_model import RigModel
 from drivers.errors import DeviceNotFound, ProtocolError
 from drivers.frames import FrameBlock, Mark
 from drivers.recorded import RecordedRun, RunRecording
 from drivers.recorded.segments import PACKED_SUFFIX, segment_files
-from rig.config.models import EstimateConfig
 from rig.count.bind import MAX_RESIDUAL_COLUMNS
-from rig.count.sweeps import SweepStart
 from rig.errors import DamagedRecordingError, UsageError
-from rig.estimate.registry import LEARNING
-from rig.estimate.row.model import RowModel
 from rig.plan.scan_plan import MAX_CLOCK_ERROR
 from rig.run_folder.manifest import MANIFEST, RunGap, ended_before_last_map, is_cut_short, known_missing, read_manifest
 
-T = TypeVar("T")
 SEGMENTS: Final = "frames-*.spb"
 """Pattern of the files that the frames of a recording lie in."""
 
@@ -141,7 +127,7 @@ def _sweep_begins(recording: RunRecording, run: RecordedRun) -> Iterator[int]:
         if block is None or block.n_frames == 0:
             continue
         counts = markers_seen(block)
-        before = counts[0] if i == 0 and not _begins_sweep(block) else seen
+        before = counts[0] if i == 0 and not begins_sweep(block) else seen
         yield from (block.header.first_frame + np.flatnonzero(np.diff(counts, prepend=before) > 0)).tolist()
         seen = int(counts[-1])
 
@@ -152,7 +138,7 @@ def markers_seen(block: FrameBlock) -> NDArray[np.int64]:
     return np.asarray(sweep + ((block.records["sweep"].astype(np.int64) - sweep) & 0xFFFF))
 
 
-def _begins_sweep(block: FrameBlock) -> bool:
+def begins_sweep(block: FrameBlock) -> bool:
     """Whether the first frame of a block has a scan marker of its own."""
     return bool(int(block.records["marks"][0]) & Mark.SCAN)
 
@@ -267,50 +253,6 @@ def _run_info(run: RecordedRun, spans: Sequence[MapSpan], known: Sequence[RunGap
     )
 
 
-def end_block(recording: RunRecording, run: RecordedRun, *, last: bool) -> FrameBlock | None:
-    """The first or the last sound block of a start with a frame in it; None where there is none."""
-    entries = run.entries[::-1] if last else run.entries
-    return next((b for entry in entries if (b := recording.read(run, entry)) is not None and b.n_frames), None)
-
-
-def readable_range(recording: RunRecording, run: RecordedRun) -> tuple[int, int]:
-    """First frame of a start and the one behind its last, in sound blocks; (first, first) where no block is sound."""
-    first, last = (end_block(recording, run, last=end) for end in (False, True))
-    if first is None or last is None:
-        return run.first_frame, run.first_frame
-    return first.header.first_frame, last.header.first_frame + last.n_frames
-
-
-def end_gaps(recording: RunRecording) -> list[RunGap]:
-    """Gaps that a repair found, and the frames of damaged blocks at the ends of starts."""
-    known = known_missing(read_manifest(recording.path)) if recording.path.is_dir() else None
-    gaps = list(dict.fromkeys(known or ()))
-    for run in recording.runs:
-        first, end = readable_range(recording, run)
-        gaps += [(run.number, run.first_frame, first - 1)] if first > run.first_frame else []
-        gaps += [(run.number, end, run.end_frame - 1)] if end < run.end_frame else []
-    return sorted(gaps)
-
-
-def part_starts(recording: RunRecording) -> list[SweepStart]:
-    """The sweep that the maps of each run begin with: the first one, except in a part."""
-    cut = (read_manifest(recording.path) or {}).get("cut") if recording.path.is_dir() else None
-    if cut is None:
-        return [SweepStart() for _ in recording.runs]
-    ratios = cut.get("clock_ratios") or []
-    starts = []
-    for run in recording.runs:
-        block = end_block(recording, run, last=False)
-        if block is None:
-            raise DamagedRecordingError(
-                f"{recording.path}: no block of start {run.number} is sound; take it from the whole"
-            )
-        # A part may begin in the middle of a sweep.
-        first = block.header.sweep - _begins_sweep(block)
-        starts.append(SweepStart(first, float(ratios[run.number]) if run.number < len(ratios) else 1.0))
-    return starts
-
-
 def fitted_ratio(ratio: float, sweeps: Sequence[dict[str, Any]]) -> float:
     """Ratio of the scanner's clock to nominal after these sweeps of a manifest; `ratio` is the one before the first."""
     for i, sweep in enumerate(sweeps):
@@ -320,36 +262,3 @@ def fitted_ratio(ratio: float, sweeps: Sequence[dict[str, Any]]) -> float:
         if residual is not None and residual <= MAX_RESIDUAL_COLUMNS and abs(error) <= MAX_CLOCK_ERROR:
             ratio = 1 + error
     return ratio
-
-
-def part_learned(folder: Path, estimate: EstimateConfig, model: RigModel | None) -> list[RowModel]:
-    """States that the maps of a part were estimated with, where it is estimated as the whole was; otherwise none.
-
-    None for a whole recording either: it learns the same again from its first map on.
-    """
-    manifest: dict[str, Any] = (read_manifest(folder) or {}) if folder.is_dir() else {}
-    before = (manifest.get("config") or {}).get("estimate") or {}
-    same = before.get("estimator") == estimate.estimator and estimate.estimator in LEARNING
-    if estimate.estimator == "joint":  # recordings from before there was a prior have none
-        same = same and before.get("temporal_prior", False) == estimate.temporal_prior
-    calibration = (manifest.get("calibration") or {}).get("id")
-    if "cut" not in manifest or not same or model is None or calibration != model.fingerprint():
-        return []
-    states = []
-    for i in range(manifest["cut"]["maps"][1] - manifest["cut"]["maps"][0]):
-        state = kept(folder / "learned" / f"{i:06d}.npz", RowModel.from_arrays)
-        if state is None:  # the whole kept those of some maps only
-            return []
-        states.append(state)
-    return states
-
-
-def kept(file: Path, make: Callable[[dict[str, NDArray[Any]]], T]) -> T | None:
-    """Make something of the arrays kept of a map; None where there are none. DamagedRecordingError if unreadable."""
-    if not file.exists():
-        return None
-    try:
-        with load_numpy(file) as arrays:
-            return make(dict(arrays))
-    except (OSError, ValueError, KeyError, zipfile.BadZipFile) as error:
-        raise DamagedRecordingError(f"{file} is not readable ({error}); move it away to go on without it") from error

@@ -5,15 +5,19 @@ SPAD is played as one: so a map is made of the very same frames in the very same
 """
 
 import itertools
-from collections.abc import Iterator, Sequence
+import zipfile
+from collections.abc import Callable, Iterator, Sequence
 from dataclasses import asdict, dataclass, replace
 from pathlib import Path
-from typing import Any
+from typing import Any, TypeVar
 
 import numpy as np
+from numpy.typing import NDArray
 
+from calibration.files.npy_files import load_numpy
 from calibration.files.rig_file import CALIBRATION_FILE
 from calibration.model.rig_model import RigModel
+from drivers.frames import FrameBlock
 from drivers.interfaces import SpadArray, SpadTiming, SweepTruth
 from drivers.recorded import RecordedRun, RunRecording
 from drivers.replay.pace import PaceReport, ReplayClock
@@ -22,31 +26,24 @@ from rig.config.files import parse_config
 from rig.config.models import EstimateConfig, RigConfig, ScanConfig
 from rig.count.sweeps import Gap, SweepAccount, SweepStart
 from rig.errors import DamagedRecordingError, UsageError
-from rig.estimate.registry import Learned
+from rig.estimate.registry import LEARNING, Learned
+from rig.estimate.row.model import RowModel
 from rig.plan.compile import spad_request
 from rig.plan.scan_plan import ScanPlan
 from rig.recording.check import merged_gaps
 from rig.recording.inputs import PLAN_FILE, read_plan
-from rig.recording.open import (
-    end_block,
-    end_gaps,
-    fitted_ratio,
-    kept,
-    markers_seen,
-    part_learned,
-    part_starts,
-    readable_range,
-    require_recording,
-)
+from rig.recording.open import begins_sweep, fitted_ratio, markers_seen, require_recording
 from rig.run_folder.manifest import (
     MANIFEST,
     RunGap,
     ended_before_last_map,
     is_cut_short,
+    known_missing,
     read_manifest,
     require_playable,
 )
 
+T = TypeVar("T")
 SILENCE_S = 5.0
 """Silence after which a SPAD has failed, as for a live one, in the time of the recording."""
 ENDLESS = 1_000_000_000
@@ -157,7 +154,7 @@ class ReplaySource:
         self._played = [start for start in starts if start.sweeps]
         self._numbers = [start.first_map + i for start in starts for i in range(start.sweeps)]
         spad.leave_out({run.number for run in spad.recording.runs} - {start.number for start in self._played})
-        self._gone = merged_gaps([*end_gaps(spad.recording), *(gap for start in starts for gap in start.gone)])
+        self._gone = merged_gaps([*_end_gaps(spad.recording), *(gap for start in starts for gap in start.gone)])
         there = self._there = len(self._numbers)
         if there == 0:
             lost = sum(last + 1 - first for _, first, last in self._gone)
@@ -199,13 +196,13 @@ class ReplaySource:
 
     def learned(self, estimate: EstimateConfig, model: RigModel | None) -> Sequence[Learned]:
         """States that the maps of a part were estimated with; empty where they are to be learned anew."""
-        learned = part_learned(self._spad.recording.path, estimate, model)
+        learned = _part_learned(self._spad.recording.path, estimate, model)
         return [learned[number] for number in self._numbers if number < len(learned)]
 
     def truth(self, index: int) -> SweepTruth | None:
         """Truth of a map that was recorded with it; None where it was not kept. DamagedRecordingError if of others."""
         file = self._spad.recording.path / "truth" / f"{self._numbers[index % self._there]:06d}.npz"
-        truth = kept(file, lambda arrays: SweepTruth(x_px=arrays["x_px"], depth_m=arrays["depth_m"]))
+        truth = _kept(file, lambda arrays: SweepTruth(x_px=arrays["x_px"], depth_m=arrays["depth_m"]))
         if truth is not None and (truth.x_px.shape, truth.depth_m.shape) != self._shapes:
             raise DamagedRecordingError(
                 f"{self._spad.recording.path}: the truth of map {index} is of {truth.x_px.shape} and "
@@ -248,7 +245,7 @@ def recorded_sweeps(recording: RunRecording, plan: ScanPlan) -> list[RecordedSta
     DamagedRecordingError where a start is missing: its maps would be taken for those of others.
     """
     manifest = read_manifest(recording.path) or {}
-    begins = part_starts(recording)
+    begins = _part_starts(recording)
     starts = (manifest.get("recording") or {}).get("starts")
     if not starts:
         planned = [_whole_sweeps(recording, run, plan) for run in recording.runs]
@@ -275,7 +272,7 @@ def _what_is_left(
     start: RecordedStart, recording: RunRecording, run: RecordedRun, plan: ScanPlan, manifest: dict[str, Any]
 ) -> RecordedStart:
     """The part of a start, as the run took it, whose frames are there."""
-    first, end = readable_range(recording, run)
+    first, end = _readable_range(recording, run)
     begin, first_map, maps = start.begin, start.first_map, start.sweeps
     noted = manifest.get("sweeps")
     sweeps = None if noted is None else noted[first_map : first_map + maps]
@@ -315,9 +312,86 @@ def _whole_sweeps(recording: RunRecording, run: RecordedRun, plan: ScanPlan) -> 
     """Complete sweeps of a start, by its markers or else by its frames; never more than these, whatever headers say."""
     if plan.blanking is not None:
         frames = float(plan.frames_per_sweep)
-        return min(run.frames, max(0, int((readable_range(recording, run)[1] - plan.frames_for(0)) / frames)))
-    last = end_block(recording, run, last=True)
+        return min(run.frames, max(0, int((_readable_range(recording, run)[1] - plan.frames_for(0)) / frames)))
+    last = _end_block(recording, run, last=True)
     return 0 if last is None else min(run.frames, max(0, int(markers_seen(last).max()) - 1))
+
+
+def _end_block(recording: RunRecording, run: RecordedRun, *, last: bool) -> FrameBlock | None:
+    """The first or the last sound block of a start with a frame in it; None where there is none."""
+    entries = run.entries[::-1] if last else run.entries
+    return next((b for entry in entries if (b := recording.read(run, entry)) is not None and b.n_frames), None)
+
+
+def _readable_range(recording: RunRecording, run: RecordedRun) -> tuple[int, int]:
+    """First frame of a start and the one behind its last, in sound blocks; (first, first) where no block is sound."""
+    first, last = (_end_block(recording, run, last=end) for end in (False, True))
+    if first is None or last is None:
+        return run.first_frame, run.first_frame
+    return first.header.first_frame, last.header.first_frame + last.n_frames
+
+
+def _end_gaps(recording: RunRecording) -> list[RunGap]:
+    """Gaps that a repair found, and the frames of damaged blocks at the ends of starts."""
+    known = known_missing(read_manifest(recording.path)) if recording.path.is_dir() else None
+    gaps = list(dict.fromkeys(known or ()))
+    for run in recording.runs:
+        first, end = _readable_range(recording, run)
+        gaps += [(run.number, run.first_frame, first - 1)] if first > run.first_frame else []
+        gaps += [(run.number, end, run.end_frame - 1)] if end < run.end_frame else []
+    return sorted(gaps)
+
+
+def _part_starts(recording: RunRecording) -> list[SweepStart]:
+    """The sweep that the maps of each run begin with: the first one, except in a part."""
+    cut = (read_manifest(recording.path) or {}).get("cut") if recording.path.is_dir() else None
+    if cut is None:
+        return [SweepStart() for _ in recording.runs]
+    ratios = cut.get("clock_ratios") or []
+    starts = []
+    for run in recording.runs:
+        block = _end_block(recording, run, last=False)
+        if block is None:
+            raise DamagedRecordingError(
+                f"{recording.path}: no block of start {run.number} is sound; take it from the whole"
+            )
+        # A part may begin in the middle of a sweep.
+        first = block.header.sweep - begins_sweep(block)
+        starts.append(SweepStart(first, float(ratios[run.number]) if run.number < len(ratios) else 1.0))
+    return starts
+
+
+def _part_learned(folder: Path, estimate: EstimateConfig, model: RigModel | None) -> list[RowModel]:
+    """States that the maps of a part were estimated with, where it is estimated as the whole was; otherwise none.
+
+    None for a whole recording either: it learns the same again from its first map on.
+    """
+    manifest: dict[str, Any] = (read_manifest(folder) or {}) if folder.is_dir() else {}
+    before = (manifest.get("config") or {}).get("estimate") or {}
+    same = before.get("estimator") == estimate.estimator and estimate.estimator in LEARNING
+    if estimate.estimator == "joint":  # recordings from before there was a prior have none
+        same = same and before.get("temporal_prior", False) == estimate.temporal_prior
+    calibration = (manifest.get("calibration") or {}).get("id")
+    if "cut" not in manifest or not same or model is None or calibration != model.fingerprint():
+        return []
+    states = []
+    for i in range(manifest["cut"]["maps"][1] - manifest["cut"]["maps"][0]):
+        state = _kept(folder / "learned" / f"{i:06d}.npz", RowModel.from_arrays)
+        if state is None:  # the whole kept those of some maps only
+            return []
+        states.append(state)
+    return states
+
+
+def _kept(file: Path, make: Callable[[dict[str, NDArray[Any]]], T]) -> T | None:
+    """Make something of the arrays kept of a map; None where there are none. DamagedRecordingError if unreadable."""
+    if not file.exists():
+        return None
+    try:
+        with load_numpy(file) as arrays:
+            return make(dict(arrays))
+    except (OSError, ValueError, KeyError, zipfile.BadZipFile) as error:
+        raise DamagedRecordingError(f"{file} is not readable ({error}); move it away to go on without it") from error
 
 
 def _own_drivers(run: Path, recorded: dict[str, Any]) -> dict[str, Any]:

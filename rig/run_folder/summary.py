@@ -1,8 +1,4 @@
-"""The summary of a run: counts of frames, times, fog, errors against the truth, and a verdict.
-
-`MapTally` adds up the maps and makes the `Summary`; its `as_json` is what `--json` prints and what summary.json holds.
-`PipelineStats` is the part on the stages of the pipeline: times, high-water marks and losses, live too.
-"""
+"""The summary of a run, as `--json` prints and summary.json holds it: frames, times, fog, errors and a verdict."""
 
 import statistics
 from collections.abc import Mapping, Sequence
@@ -127,7 +123,10 @@ class TruthErrors:
 
 @dataclass(frozen=True, slots=True)
 class Summary:
-    """A run in figures. Times in seconds of sensor and computer, fractions of camera pixels; None = no value."""
+    """A run in figures. Times in seconds of sensor and computer, fractions of camera pixels; None = no value.
+
+    verdict_reasons: against maps, found in the maps themselves. accepted_calibration: what the user accepted of it.
+    """
 
     maps: int
     map_rate_hz: float | None
@@ -147,9 +146,7 @@ class Summary:
     sync: Synchronisation | None = None
     replay: PaceReport | None = None
     verdict_reasons: tuple[Doubt, ...] = ()
-    """Reasons against maps, found in the maps themselves, whatever the verdict."""
     accepted_calibration: tuple[str, ...] = ()
-    """Reasons against the calibration that the user accepted."""
 
     def as_json(self) -> dict[str, Any]:
         """Return the summary as plain values; `truth` only where it is known, some only for a scan or a replay."""
