@@ -70,13 +70,8 @@ LEAST_CONTRAST: Final = 0.5
 LINE_PX, BEHIND_PX = (-1, 1), (3, 9)
 """Pixels from an answer, away from the near side, that hold its light, and light behind it."""
 
-ORDERS: Final = {
-    "the bits of each byte": "most significant bit first",
-    "the bytes of 16-bit words": "bytes as they lie along the row",
-    "the bytes of 32-bit words": "bytes as they lie along the row",
-    "the bytes of 64-bit words": "bytes as they lie along the row",
-}
-"""Wrong orders of pixels that are tried, each with the order that is expected."""
+ORDERS: Final = ("the bits of each byte", *(f"the bytes of {bits}-bit words" for bits in (16, 32, 64)))
+"""Wrong orders of pixels that are tried."""
 
 
 class Points(NamedTuple):
@@ -172,10 +167,10 @@ class MapChecks:
             # Pixels that are always on are the same on every line of a row: rows are what is independent.
             likeliest = int(out[:, 3:].sum(axis=0).argmax())
             if _deviations(np.bincount(of_row, out[:, 3 + likeliest]).astype(np.float64)) > LIMIT:
-                what, expected = list(ORDERS.items())[likeliest]
+                expected = "bytes as they lie along the row" if likeliest else "most significant bit first"
                 return (
-                    f"{what} seem reversed: in that order neighbouring pixels agree better than as they come; frames "
-                    f"are expected as numpy.packbits makes them along the width, {expected}"
+                    f"{ORDERS[likeliest]} seem reversed: in that order neighbouring pixels agree better than as they "
+                    f"come; frames are expected as numpy.packbits makes them along the width, {expected}"
                 )
         rows, columns = out[:, 0], out[:, 1]
         if _deviations(rows) < LIMIT:
@@ -311,9 +306,10 @@ class _Counts:
 
     def lines(self, chosen: NDArray[np.int64], most: int) -> NDArray[np.int32]:
         """Whole lines of chosen points and their first partners, (most, chosen, window)."""
-        if not self.of_volume:
-            return np.ascontiguousarray(self._sweep.checked[:most, chosen], np.int32)
-        found = self._sweep.counts[self.points.column[:most, chosen], self.points.row[:most, chosen]]
+        if self.of_volume:
+            found = self._sweep.counts[self.points.column[:most, chosen], self.points.row[:most, chosen]]
+        else:
+            found = self._sweep.checked[:most, chosen]
         return np.ascontiguousarray(found, np.int32)
 
     def mean(
