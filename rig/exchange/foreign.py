@@ -60,7 +60,8 @@ def gather(files: Iterable[str | os.PathLike[str]], suffix: str) -> list[Path]:
 
 def open_each(files: Iterable[Path], open_one: Callable[[Path], T]) -> list[T]:
     """Open all files. UsageError, a line per file, where some cannot be."""
-    opened, problems = [], []
+    opened: list[T] = []
+    problems: list[str] = []
     for file in files:
         try:
             opened.append(open_one(file))
