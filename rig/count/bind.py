@@ -5,11 +5,7 @@ Where the SPAD puts no markers into its frames, `rig.count.blanking` finds the s
 Each frame is placed from the latest marker at or before it: that marker's point of the scanner clock is known from the
 plan, the way on from there is the SPAD's own clock times the ratio of the two clocks, which is fitted to the markers of
 every sweep and used in the next one. So a frame's column depends on earlier frames only and not on the size of blocks.
-
-    no sweep --scan marker--> sweep 0 --scan marker: its clock is fitted--> sweep 1 --> ...
-
-Times are whole numbers of 1 / UNITS_PER_TICK ticks (int64), columns float64, bins int32 (`BoundFrames`). A compiled
-walk (`rig.count.bind_kernels`) places the frames; Python runs once a block and where a sweep begins.
+A compiled walk (`rig.count.bind_kernels`) places the frames; Python runs once a block and where a sweep begins.
 
 The lit frames of a sweep run through its columns in order. One that would fall back to a column already left, as it can
 by the residual where a marker corrects the way from the one before, is not used.
@@ -18,6 +14,7 @@ by the residual where a marker corrects the way from the one before, is not used
 import math
 from dataclasses import dataclass
 from fractions import Fraction
+from itertools import pairwise
 from typing import NamedTuple
 
 import numpy as np
@@ -33,10 +30,10 @@ MAX_RESIDUAL_COLUMNS = 0.05
 """A sweep whose markers stray further from one straight line of time than this is not synchronised."""
 MOST_OUT_OF_TURN = 1000
 """Frames of a sweep that may name one which cannot have begun; more are no flipped bits but a wrong line or link."""
-Places = tuple[NDArray[np.int32], NDArray[np.int8], NDArray[np.float64], NDArray[np.int32]]
-"""Sweep, direction, column and bin of each frame."""
+Places = tuple[NDArray[np.int32], NDArray[np.float64], NDArray[np.int32]]
+"""Sweep, column and bin of each frame."""
 UNITS_PER_TICK = 2 * (SUBFRAME_MASK + 1)
-"""Times are kept as whole numbers of this part of a tick, in which markers and exposure middles are exact: a frame's
+"""Times are whole numbers (int64) of this part of a tick, in which markers and exposure middles are exact: a frame's
 column is then the same to the last bit in whatever block it comes. Good for 200 days at 1 GHz."""
 CARRIED = np.dtype(
     [(name, np.int64) for name in ("sweep", "anchor_time", "anchor_point", "edges", "wrong_way", "column", "in_column")]
@@ -51,16 +48,14 @@ column, in_column: the column that the sweep has come to, -1 before the first, a
 
 @dataclass(frozen=True, slots=True)
 class BoundFrames:
-    """Sweep, direction, column and bin of the frames of a block; one entry per frame.
+    """Sweep, column and bin of each frame of a block.
 
-    sweep: int32, -1 before the first marker. direction: int8, +1 where the command rises, -1 where it falls, 0 unknown.
-    column: float64, fractional column at the middle of the exposure; NaN before the first marker, continued linearly
-    outside the lit part. bins: int32, column index, BIN_DARK or BIN_UNUSABLE. starts: indices of frames, 0
+    sweep: -1 before the first marker. column: fractional, at the middle of the exposure; NaN before the first marker,
+    continued linearly outside the lit part. bins: column index, BIN_DARK or BIN_UNUSABLE. starts: indices of frames, 0
     and those with which a sweep begins.
     """
 
     sweep: NDArray[np.int32]
-    direction: NDArray[np.int8]
     column: NDArray[np.float64]
     bins: NDArray[np.int32]
     starts: tuple[int, ...]
@@ -68,15 +63,14 @@ class BoundFrames:
 
 @dataclass(frozen=True, slots=True)
 class SweepClock:
-    """Clock of one finished sweep, from its markers or blanking patterns.
+    """Clock of one finished sweep.
 
     clock_error: relative excess of the scanner's clock over nominal, in the SPAD's time. residual_columns: largest
-    distance of a marker from the fitted line, in columns; NaN where there were fewer than two markers. With blanking
-    patterns it is the distance of the pattern behind the sweep from the line of those before it, or its standard
-    deviation where that is more; NaN where it was not found. markers: number of markers or patterns that the clock
-    rests on. first_frame, end_frame: frame numbers from this sweep's scan marker to the next one's. wrong_way: lit
-    frames whose direction level was not the plan's. detection: chance that a blanking pattern as bright as this sweep's
-    is found, 0 where it was not; None: bound by markers.
+    distance of a marker from the fitted line, NaN with fewer than two markers; or that of the pattern behind the sweep
+    from the line of those before it, its standard deviation where that is more, NaN where it was not found. markers:
+    markers or patterns that the clock rests on. first_frame, end_frame: frames from this sweep's scan marker to before
+    the next one's. wrong_way: lit frames whose direction level was not the plan's. detection: chance that a blanking
+    pattern as bright as this sweep's is found, 0 where it was not; None: bound by markers.
     """
 
     sweep: int
@@ -125,9 +119,8 @@ class BlockTerms(NamedTuple):
 class FrameBinder:
     """Binds the blocks of one run, in order. Records count markers up to and including their own frame.
 
-    clock_ratio: of the scanner's clock to nominal, as of the sweep before the first, where that is known. first_sweep:
-    number of that first one; of those before it only a piece may be there, which fits no clock. end_sweep: one behind
-    the last sweep that is wanted; None: all that the frames tell of.
+    clock_ratio: of the scanner's clock to nominal, before the first sweep. first_sweep: number of the first whole one;
+    a piece of one fits no clock. end_sweep: one behind the last sweep that is wanted; None: all that there are.
     """
 
     def __init__(
@@ -137,7 +130,17 @@ class FrameBinder:
 
         self._walk = walk
         self._plan = plan
-        self._terms = _plan_terms(plan)
+        self._terms = PlanTerms(
+            plan.places,
+            float(plan.column_s),
+            float(plan.point_rate_hz),
+            plan.sweep_points,
+            np.array(plan.marker_points, np.int64),
+            np.array([plan.lit_start_s(leg) for leg in plan.legs], np.float64),
+            np.array([leg.columns_rise for leg in plan.legs], np.bool_),
+            np.array([leg.direction for leg in plan.legs], np.int8),
+            BYTE_FRAMES if plan.exposures <= BYTE_EXPOSURES else np.iinfo(np.int64).max,
+        )
         self._ratio = clock_ratio
         self._end_sweep = end_sweep
         self._first_sweep = first_sweep
@@ -158,7 +161,11 @@ class FrameBinder:
         header, n = block.header, block.n_frames
         if self._t0 is None:
             self._t0 = header.t0_ticks
-        self._make_room(n)
+        if n > len(self._records):
+            self._records = np.empty(n, FRAME_RECORD)
+        have = self._edges.shape[1]
+        if self._carried["edges"][0] + n + 1 > have:  # should there be a marker in each frame
+            self._edges = np.concatenate([self._edges, np.empty((2, have + n), np.int64)], axis=1)
         records = self._records[:n]
         # Always of one type, which memory of a ring, a file or a wire is not: each would be compiled by itself.
         records.view(_WHOLE)[:] = block.records.view(_WHOLE)
@@ -169,7 +176,13 @@ class FrameBinder:
         starts = [0]
         at = 0
         while True:
-            terms = self._block_terms(header)
+            terms = BlockTerms(
+                header.sweep if self._light is None else int(self._carried["sweep"][0]) + 1,
+                header.t0_ticks - self._t0,
+                _period(header),
+                header.exposure_ticks * (UNITS_PER_TICK // 2),
+                self._points_per_unit(header.tick_hz),
+            )
             at = self._walk(records, at, terms, self._terms, self._carried, self._edges, *places)
             if at == n:
                 break
@@ -223,25 +236,8 @@ class FrameBinder:
                 f"frame {header.first_frame + at} and {MOST_OUT_OF_TURN} before it name sweeps that cannot have begun "
                 f"behind sweep {int(self._carried['sweep'][0])}; check the scan marker's line and the SPAD's link"
             )
-        sweep, direction, column, bins = places
-        sweep[at], direction[at], column[at], bins[at] = int(self._carried["sweep"][0]), 0, np.nan, BIN_UNUSABLE
-
-    def _make_room(self, n: int) -> None:
-        """Make room for n more frames, should there be a marker in each of them."""
-        if n > len(self._records):
-            self._records = np.empty(n, FRAME_RECORD)
-        have = self._edges.shape[1]
-        if self._carried["edges"][0] + n + 1 > have:
-            self._edges = np.concatenate([self._edges, np.empty((2, have + n), np.int64)], axis=1)
-
-    def _block_terms(self, header: BlockHeader) -> BlockTerms:
-        return BlockTerms(
-            header.sweep if self._light is None else self._markers_before,
-            header.t0_ticks - (self._t0 or 0),
-            _period(header),
-            header.exposure_ticks * (UNITS_PER_TICK // 2),
-            self._points_per_unit(header.tick_hz),
-        )
+        sweep, column, bins = places
+        sweep[at], column[at], bins[at] = int(self._carried["sweep"][0]), np.nan, BIN_UNUSABLE
 
     def _begin(self, at: int, record: np.void, terms: BlockTerms, header: BlockHeader) -> list[SweepClock]:
         """Close the sweep that ran, begin the next one at frame index `at`, where its scan marker is if received."""
@@ -273,14 +269,14 @@ class FrameBinder:
         assert self._light is not None, "asked for by the caller"
         now = self._carried[0]
         running, number = int(now["sweep"]), _sweep_named(record, terms)
-        place = self._light.place(number)
+        places = self._light.places(running if running >= 0 else number, number)
         closed = []
-        for missed in range(running, number) if running >= 0 else ():
-            detection, end = self._light.place(missed).detection, self._light.end(missed)
-            frame, residual = self._light.place(missed + 1).frame, end.residual_frames / self._plan.exposures
-            clock = end.clock_error, residual, end.patterns
-            closed.append(SweepClock(missed, *clock, self._first_frame, frame, int(now["wrong_way"]), detection))
-            self._first_frame, now["wrong_way"] = frame, 0
+        for ended, place in pairwise(places):
+            clock = place.ratio - 1, place.residual_frames / self._plan.exposures, place.patterns
+            frames = self._first_frame, place.frame
+            closed.append(SweepClock(ended.number, *clock, *frames, int(now["wrong_way"]), ended.detection))
+            self._first_frame, now["wrong_way"] = place.frame, 0
+        place = places[-1]
         if running < 0:
             self._first_frame = place.frame
         start = (int(record["ticks"]) + terms.start_ticks) * UNITS_PER_TICK
@@ -290,11 +286,6 @@ class FrameBinder:
         now["anchor_point"] = number * self._plan.sweep_points
         now["sweep"], now["edges"], now["column"] = number, 0, -1
         return closed
-
-    @property
-    def _markers_before(self) -> int:
-        """Scan markers up to the frames that come next, of which records have the low 16 bits."""
-        return int(self._carried["sweep"][0]) + 1
 
     def _boundary_frame(self, number: int, at: int, header: BlockHeader, start: int) -> int:
         """Number of the frame in which sweep `number` began, from the scanner's clock where the marker was lost."""
@@ -330,29 +321,12 @@ _WHOLE = np.dtype((np.void, FRAME_RECORD.itemsize))
 """A record as bytes, which numpy copies at once instead of field by field."""
 
 
-def _plan_terms(plan: ScanPlan) -> PlanTerms:
-    return PlanTerms(
-        plan.places,
-        float(plan.column_s),
-        float(plan.point_rate_hz),
-        plan.sweep_points,
-        np.array(plan.marker_points, np.int64),
-        np.array([plan.lit_start_s(leg) for leg in plan.legs], np.float64),
-        np.array([leg.columns_rise for leg in plan.legs], np.bool_),
-        np.array([leg.direction for leg in plan.legs], np.int8),
-        BYTE_FRAMES if plan.exposures <= BYTE_EXPOSURES else np.iinfo(np.int64).max,
-    )
-
-
 def _new_places(n: int) -> Places:
-    return np.empty(n, np.int32), np.empty(n, np.int8), np.empty(n, np.float64), np.empty(n, np.int32)
+    return np.empty(n, np.int32), np.empty(n, np.float64), np.empty(n, np.int32)
 
 
 def _sweep_named(record: np.void, terms: BlockTerms) -> int:
-    """Number of the sweep that a frame names, -1 before the first: one less than the scan markers it has seen.
-
-    Of those the record has the low 16 bits, continued from the header's 32.
-    """
+    """Number of the sweep that a frame names: scan markers so far, of which its record has the low 16 bits, less 1."""
     return terms.sweep + ((int(record["sweep"]) - terms.sweep) & 0xFFFF) - 1
 
 

@@ -1,9 +1,7 @@
-"""Compiled walk along the records of a block, which gives every frame its sweep, direction, column and bin.
+"""Compiled walk along the records of a block, which gives every frame its sweep, column and bin.
 
-The column of a frame follows from the latest marker, see `rig.count.bind`. The walk goes frame by frame because each
-frame decides what may be done with the next. What it has to remember lies in one record (`CARRIED` in `rig.count.bind`,
-int64), so that it goes on in the next block where it left off in this one. Outputs are (n,): sweep int32, direction
-int8, column float64, bin int32.
+It goes frame by frame because each frame decides what may be done with the next. What it has to remember lies in one
+record (`CARRIED` in `rig.count.bind`), so that it goes on in the next block where it left off in this one.
 """
 
 from typing import Any, Final
@@ -73,7 +71,6 @@ def walk(
     carried: NDArray[np.void],
     edges: NDArray[np.int64],
     sweep: NDArray[np.int32],
-    direction: NDArray[np.int8],
     column: NDArray[np.float64],
     bins: NDArray[np.int32],
 ) -> Any:
@@ -89,7 +86,7 @@ def walk(
         number = block.sweep + ((np.int64(record.sweep) - block.sweep) & 0xFFFF) - 1
         if number > now.sweep:
             return i
-        sweep[i], direction[i], column[i], bins[i] = number, 0, np.nan, BIN_UNUSABLE
+        sweep[i], column[i], bins[i] = number, np.nan, BIN_UNUSABLE
         # Sweeps never go back: such a number is damaged, and so may be the marker beside it.
         if number < 0 or number < now.sweep:
             continue
@@ -102,7 +99,6 @@ def walk(
             edges[0, now.edges], edges[1, now.edges] = point, now.anchor_time
             now.edges += 1
         leg = number % len(plan.direction)
-        direction[i] = plan.direction[leg]
         if marks & _GATE_HIGH and (marks & _BACKWARD != 0) != (plan.direction[leg] < 0):
             now.wrong_way += 1
         if now.anchor_point >= 0:
@@ -120,7 +116,7 @@ def walk(
 def cover(
     bins: NDArray[np.int32], x0: NDArray[np.int32], used_px: int, column_x0: NDArray[np.int32], window: int
 ) -> tuple[int, int]:
-    """Take the bin of frames whose used pixels do not hold all that their column counts: none is counted in part.
+    """Take the bin of frames whose used pixels do not hold all that their column counts.
 
     x0: (n,) first of the `used_px` pixels of each frame. column_x0: (columns,) first of the `window` pixels of each
     column. Returns the numbers of frames that are left on columns and in the dark.

@@ -6,19 +6,15 @@ being exposed from i on):
     n_i = level + drift i + brightness g_i(t),     g_i = share of frame i's exposure with the gate open
 
 For every t it is fitted by least squares (float64); the best t is where it explains most. Photons of the laser, of
-daylight and of the dark all scatter alike here, so nothing needs to be known about them. `score` is brightness over its
+daylight and of the dark all scatter alike, so nothing needs to be known about them. `score` is brightness over its
 standard deviation; what remains beyond the scatter of photons must be less than what the pattern explains, which tells
-it from other light that comes and goes. tests/unit/rig/count/test_blanking.py checks both against a simulation.
+it from other light that comes and goes.
 
 The sweeps (`BlankingSync`). Scan markers lie on a straight line of time, which is fitted to all patterns found so far
 (`MarkerLine`): one that is missing, because frames were lost or nothing was in the light's way, is taken from that
-line.
-
-    nothing known --a pattern, and the next one a sweep later--> sweep 0 --the pattern where it is expected--> sweep 1
-
-A sweep begins, for those who count, with the frame at which its pattern has surely passed, just before the gate opens
-for the lit part. All of that depends on the frames before it only, not on the size of blocks, and never on the host's
-time or the device's word for its clock.
+line. A sweep begins, for those who count, with the frame at which its pattern has surely passed, just before the gate
+opens for the lit part. All of that depends on the frames before it only, not on the size of blocks, and never on the
+host's time or the device's word for its clock.
 """
 
 import logging
@@ -81,12 +77,10 @@ class PatternShape:
 
     def shares(self, places: Array, frames: Array) -> Array:
         """Share of each frame's exposure with the gate open, (places, frames), of a pattern at each place."""
-        opened = places[:, None, None] + self.flashes[:, 0]
-        closed = places[:, None, None] + self.flashes[:, 1]
+        opened, closed = (places[:, None, None] + self.flashes[:, edge] for edge in (0, 1))
         start = frames[None, :, None]
         lit: Array = np.minimum(start + self.exposure, closed) - np.maximum(start, opened)
-        shares: Array = np.clip(lit, 0, None).sum(axis=2) / self.exposure
-        return shares
+        return np.asarray(np.clip(lit, 0, None).sum(axis=2) / self.exposure)
 
 
 class PatternSearch:
@@ -102,10 +96,7 @@ class PatternSearch:
         self._shares = np.round(shares * _GRAIN)
 
     def scores(self, ones: Array) -> tuple[Array, NDArray[np.bool_]]:
-        """Score of the best place in each window of `ones` (n,), and whether it may be the pattern; (n - window + 1,).
-
-        NaN where a frame of the window is missing.
-        """
+        """Best score in each window of `ones` (n,), NaN where a frame is lost, and whether it may be the pattern."""
         n = self.window
         windows = sliding_window_view(ones, n)
         mean, drift = windows.sum(axis=1) / n, windows @ self._time
@@ -231,32 +222,23 @@ class SweepPlace:
     """Place of a sweep among the frames.
 
     frame: the first one that counts. scan_frame: place of its scan marker, in frames. ratio: of the scanner's clock to
-    nominal, in the SPAD's time. found: its pattern; None: the place is taken from the line of the others.
+    nominal, in the SPAD's time, from so many patterns. found: its own; None: the place is taken from the line of the
+    others. residual_frames: distance of its pattern from where the ones before it put it, or its standard deviation
+    where that is more; NaN without one.
     """
 
     number: int
     frame: int
     scan_frame: float
     ratio: float
+    patterns: int
     found: PatternFit | None
+    residual_frames: float
 
     @property
     def detection(self) -> float:
         """Chance that a pattern as bright as this one is found; 0: it was not."""
         return 0.0 if self.found is None else detection_probability(self.found.score)
-
-
-@dataclass(frozen=True, slots=True)
-class SweepEnd:
-    """Figures of a finished sweep from the pattern behind it.
-
-    clock_error: relative. residual_frames: distance of that pattern from where the ones before it put it, or its
-    standard deviation where that is more. patterns: number of patterns that this rests on.
-    """
-
-    clock_error: float
-    residual_frames: float
-    patterns: int
 
 
 class BlankingSync:
@@ -295,7 +277,6 @@ class BlankingSync:
         self._next: int | None = None
         """Index of the sweep whose pattern is expected next; None: nothing is known yet."""
         self._places: dict[int, SweepPlace] = {}
-        self._ends: dict[int, SweepEnd] = {}
         self._now: SweepPlace | None = None
 
     def mark(self, block: FrameBlock, records: NDArray[np.void]) -> None:
@@ -317,14 +298,9 @@ class BlankingSync:
         if self._next is None:
             self._give_up(header, last)
 
-    def place(self, number: int) -> SweepPlace:
-        """Place of the sweep of map `number`; it is forgotten with the end of the sweep."""
-        return self._places[number]
-
-    def end(self, number: int) -> SweepEnd:
-        """Figures of that sweep; call it once the next one has begun."""
-        del self._places[number]
-        return self._ends.pop(number)
+    def places(self, first: int, last: int) -> list[SweepPlace]:
+        """Places of the sweeps of maps `first` to `last`; all but the last one are forgotten."""
+        return [*(self._places.pop(number) for number in range(first, last)), self._places[last]]
 
     def _count(self, block: FrameBlock) -> None:
         """The ones of each frame, where each leg's run-in is seen; lost frames are NaN."""
@@ -392,9 +368,9 @@ class BlankingSync:
         if self._end_sweep is not None and index - self._plan.pilots > self._end_sweep:
             return None
         if first:
-            expected, sd, period = self._line.place[-1] + self._period, math.nan, self._period
+            expected, sd = self._line.place[-1] + self._period, math.nan
         else:
-            expected, sd, period = self._line.fit(index)
+            expected, sd, _ = self._line.fit(index)
         frame = self._known_at(index, expected)
         if frame > last:
             return None
@@ -406,14 +382,18 @@ class BlankingSync:
             residual = max(abs(scan - expected), math.hypot(sd, found.sd))
             self._line.add(index, scan, found.sd)
         scan, _, period = self._line.fit(index)
-        ratio = self._period / period
-        if number > 0:
-            self._ends[number - 1] = SweepEnd(ratio - 1, residual, len(self._line.index))
         self._next = index + 1
-        place = SweepPlace(number, frame, scan, ratio, found)
+        place = SweepPlace(number, frame, scan, self._period / period, len(self._line.index), found, residual)
         if number >= 0:
             self._places[number] = place
-        self._tell(place)
+        if found is None:
+            _log.warning("sweep %d: no blanking pattern where it was expected", number)
+        else:
+            _log.info(
+                "sweep %d: blanking pattern at frame %.3f +- %.3f, %.1f sigma (%.4g over %.4g ones), detection "
+                "probability %.6f",
+                number, found.place, found.sd, found.score, found.brightness, found.level, place.detection,
+            )  # fmt: skip
         return place
 
     def _known_at(self, index: int, scan: float) -> int:
@@ -443,18 +423,6 @@ class BlankingSync:
         marks[(since >= opened + early) & (since + 1 <= closed - late)] = Mark.GATE_HIGH
         records["marks"] = marks | np.uint32(Mark.BACKWARD if leg.direction < 0 else 0)
         records["sweep"] = (now.number + 1) & 0xFFFF
-
-    def _tell(self, place: SweepPlace) -> None:
-        if place.found is None:
-            _log.warning("sweep %d: no blanking pattern where it was expected", place.number)
-            return
-        found = place.found
-        _log.info(
-            "sweep %d: blanking pattern at frame %.3f +- %.3f, %.1f sigma (%.4g over %.4g ones), detection probability "
-            "%.6f",
-            place.number, found.place, found.sd, found.score, found.brightness, found.level,
-            place.detection,
-        )  # fmt: skip
 
     def _give_up(self, header: BlockHeader, last: int) -> None:
         assert self._origin is not None, "frames were counted"

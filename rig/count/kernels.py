@@ -25,9 +25,6 @@ CHUNK: Final = 256
 PLANES: Final = 8
 """Bit planes of a counter."""
 MOST_FRAMES: Final = (1 << PLANES) - 1
-"""Frames that a set of planes can count."""
-PAIR_FRAMES: Final = 3
-"""Frames that two planes can count."""
 FEW_FRAMES: Final = 15
 """Frames that four planes can count."""
 
@@ -39,11 +36,9 @@ def rows_of_chunk(row_words: int) -> int:
 
 
 def new_planes(chunks: int) -> NDArray[np.uint64]:
-    """Counters, all zero, for so many chunks of a frame: (chunks, PLANES + 1, CHUNK); the last plane is scratch.
-
-    Padded by two words, since kernels read 16 bytes at a time.
-    """
+    """Counters, all zero, for so many chunks of a frame: (chunks, PLANES + 1, CHUNK); the last plane is scratch."""
     size = chunks * (PLANES + 1) * CHUNK
+    # Kernels read 16 bytes at a time, beyond the end too.
     return aligned_zeros((size + 2,), np.uint64)[:size].reshape(chunks, PLANES + 1, CHUNK)
 
 
@@ -52,7 +47,7 @@ def planes_for(frames: int) -> int:
     """Number of planes that hold the counts of so many frames: 1, 2, 4 or 8."""
     if frames <= 1:
         return 1
-    if frames <= PAIR_FRAMES:
+    if frames <= 3:
         return 2
     return 4 if frames <= FEW_FRAMES else PLANES
 
@@ -191,7 +186,8 @@ def add_frames(
         return
     few = all_frames <= FEW_FRAMES
     # Whatever is added goes into four planes at least.
-    _clear(planes_for(counted + f - first), 4 if few else PLANES, n, planes)
+    for q in range(planes_for(counted + f - first), 4 if few else PLANES):
+        planes[q * CHUNK : q * CHUNK + n] = np.uint64(0)
     while f < last:
         here = f * frame + at
         if f + 7 <= last:
@@ -208,13 +204,6 @@ def add_frames(
             f += 1
         if not few:
             _carry_on(n, planes)
-
-
-@numba.njit(cache=True, nogil=True)
-def _clear(first_plane: int, last_plane: int, n: int, planes: NDArray[np.uint64]) -> None:
-    """Set planes first_plane..last_plane-1 of a chunk's first n counters to zero."""
-    for q in range(first_plane, last_plane):
-        planes[q * CHUNK : q * CHUNK + n] = np.uint64(0)
 
 
 @numba.njit(cache=True, nogil=True)

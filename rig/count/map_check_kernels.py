@@ -61,29 +61,26 @@ def compare_lines(
     usual: NDArray[np.float32],
     least: float,
     orders: NDArray[np.int64],
-    first: int,
-    last: int,
     out: NDArray[np.float64],
 ) -> None:
-    """Compare points first..last-1; out: (points, 3 + orders).
+    """Compare points; out: (points, 3 + orders).
 
     lines: (3, points, window) counts of each point's line and its first two partners; exposures, row, column: (3 or
     more, points). shift: (2 or more, points), pixels from a stripe of the line to the partner's. usual: (rows, width),
     mean ones per exposure of each pixel over the sweep, NaN where it is not to be used; least: what a lower one counts
     as. orders: (orders, WORD_PX), pixels of each word.
 
-    Out come the light in common with each partner and by how much the sum of products of neighbouring pixels grows when
-    they are taken in each order. Light in common is a product of line-shaped excess over what is usual for each pixel,
-    in its standard deviations: 0 on average for noise, haze and whatever stands still. Between them comes by how much
+    Out come the light in common with each partner, 0 on average for noise, haze and whatever stands still; by how much
     LEAST_SHARED of what single pixels have in common with the next row is above what their own frames have in common
-    with each other: frames of one column show the same line, so that this is below 0.
+    with each other, below 0 since frames of one column show the same line; and by how much the sum of products of
+    neighbouring pixels grows when they are taken in each order.
     """
     window = lines.shape[2]
     line = np.zeros((3, window))
     total = np.zeros(window + 1)
     pixels = np.zeros((2, window))
     excesses = np.zeros((2, window))
-    for i in range(first, last):
+    for i in range(lines.shape[1]):
         for k in range(3):
             y, c = row[k, i], column[k, i]
             low, high = _searched(x_lo[y, c], x_hi[y, c], x0[c], window, usual.shape[1])
@@ -143,10 +140,7 @@ def _in_bins(px):  # type: ignore[no-untyped-def]
 
 @numba.njit
 def _add_products(a, b, margin, to, out):  # type: ignore[no-untyped-def]
-    """Add to out[o + reach] the sum over i of a(i) b(i + to + o), for o from -reach to reach.
-
-    a, b: lines between margins of zeros.
-    """
+    """Add to out[o + reach] the sum over i of a(i) b(i + to + o), for o from -reach to reach; around a, b are zeros."""
     reach = out.shape[0] // 2
     bins = a.shape[0] - 2 * margin
     if abs(to) > bins:

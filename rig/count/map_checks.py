@@ -1,4 +1,4 @@
-"""Does a map's own light bear it out? Checks of counts and answers that no scene fails, whatever it looks like.
+"""Checks of a map's counts and answers by its own light, which no scene fails, whatever it looks like.
 
 They ask a few thousand points, each a row and column with partners: the next row, and four columns by whose times the
 line has moved 6 to 64 px. A stripe is seen at all of them, at places that the planes tell, and no noise is.
@@ -11,8 +11,7 @@ line has moved 6 to 64 px. A stripe is seen at all of them, at places that the p
   seven nats. At most 7 x 7 lines have a say in it, so that each brings a seventh at least, which is a mean of half a
   standard deviation: so much more light must stand at the answers than behind them, on lines that did not give them.
 
-Every limit is in standard deviations, taken from the points themselves, or follows from such a count; where points are
-too few for it a check says nothing.
+Limits are in standard deviations taken from the points themselves; where these are too few a check says nothing.
 """
 
 from collections.abc import Iterator
@@ -34,8 +33,7 @@ VOLUME_POINTS: Final = 8192
 FEWEST_POINTS: Final = 128
 """Points below which a check says nothing."""
 APART_PX: Final = (6.0, 16.0, 32.0, 64.0)
-"""The line's motion from a point's column to its partners: the least is more than the line is wide, the greatest as
-much as haze is."""
+"""The line's motion from a point's column to its partners: from more than the line is wide to as much as haze is."""
 MOST_APART: Final = (1 / 16, 1 / 6, 1 / 6, 1 / 6)
 """Share of a sweep's columns that lie at most between a point and each partner: what is farther is another surface."""
 NEAREST: Final = 3
@@ -47,12 +45,12 @@ LIMIT: Final = 4.0
 FEWEST_ROWS: Final = 24
 """With fewer rows than this a mean over rows cannot be LIMIT deviations off."""
 LEAST_FOLLOWING: Final = 0.25
-"""Least light in common with the other column, over that with the next row. Scenes have 0.8 and more, clutter such as
+"""Least light in common with the other column, over that with the next row: scenes have 0.8 and more, clutter such as
 fences half of it; columns that do not follow one another have none."""
 MOST_AMISS: Final = -0.45
 """Light in common with the partner columns at the best of all wrong places, less that at the best of those where the
-planes put it, over that with the next row; the sum over the four partners. Maps have -0.65 in dense fog, whose haze is
-wider than the line moves, to -3 in clear air; shuffled or reversed columns have -0.4 to 2."""
+planes put it, over that with the next row; the sum over the four partners. Maps have -0.65 in dense fog to -3 in clear
+air; shuffled or reversed columns have -0.4 to 2."""
 LEAST_LIGHT: Final = 12.0
 """Light in common with the next row, in standard deviations, below which nothing is said of where it moves to."""
 MARGIN: Final = 3.5
@@ -72,13 +70,8 @@ LEAST_CONTRAST: Final = 0.5
 LINE_PX, BEHIND_PX = (-1, 1), (3, 9)
 """Pixels from an answer, away from the near side, that hold its light, and light behind it."""
 
-ORDERS: Final = {
-    "the bits of each byte": "most significant bit first",
-    "the bytes of 16-bit words": "bytes as they lie along the row",
-    "the bytes of 32-bit words": "bytes as they lie along the row",
-    "the bytes of 64-bit words": "bytes as they lie along the row",
-}
-"""Wrong orders of pixels that are tried, each with the order that is expected."""
+ORDERS: Final = ("the bits of each byte", *(f"the bytes of {bits}-bit words" for bits in (16, 32, 64)))
+"""Wrong orders of pixels that are tried."""
 
 
 class Points(NamedTuple):
@@ -116,8 +109,7 @@ def check_points(geometry: SweepGeometry, points: int = POINTS) -> Points:
 class MapChecks:
     """The checks of maps of one geometry.
 
-    calibrated: whether its planes are known. knows: whether the estimator's confidence is a probability, as of those
-    that learn what the light is like.
+    calibrated: whether its planes are known. knows: whether the estimator's confidence is a probability.
     """
 
     def __init__(self, geometry: SweepGeometry, *, calibrated: bool, knows: bool) -> None:
@@ -175,10 +167,10 @@ class MapChecks:
             # Pixels that are always on are the same on every line of a row: rows are what is independent.
             likeliest = int(out[:, 3:].sum(axis=0).argmax())
             if _deviations(np.bincount(of_row, out[:, 3 + likeliest]).astype(np.float64)) > LIMIT:
-                what, expected = list(ORDERS.items())[likeliest]
+                expected = "bytes as they lie along the row" if likeliest else "most significant bit first"
                 return (
-                    f"{what} seem reversed: in that order neighbouring pixels agree better than as they come; frames "
-                    f"are expected as numpy.packbits makes them along the width, {expected}"
+                    f"{ORDERS[likeliest]} seem reversed: in that order neighbouring pixels agree better than as they "
+                    f"come; frames are expected as numpy.packbits makes them along the width, {expected}"
                 )
         rows, columns = out[:, 0], out[:, 1]
         if _deviations(rows) < LIMIT:
@@ -214,8 +206,7 @@ class MapChecks:
         out = np.zeros((len(chosen), 3 + len(self._orders)))
         compare_lines(
             counts.lines(chosen, NEAREST), counts.exposures[:, chosen], points.row[:, chosen], points.column[:, chosen],
-            points.shift[:, chosen], geometry.x0, geometry.x_lo, geometry.x_hi, usual,
-            least, self._orders, 0, len(chosen), out,
+            points.shift[:, chosen], geometry.x0, geometry.x_lo, geometry.x_hi, usual, least, self._orders, out,
         )  # fmt: skip
         return out
 
@@ -279,7 +270,9 @@ class MapChecks:
                 found = _deviations(contrast[group]) / np.sqrt(len(group))
                 if found + 1.0 / np.sqrt(len(group)) < LEAST_CONTRAST:
                     middle = group[len(group) // 2]
-                    depth_m = self._depth_m(y[middle], c[middle], x[middle])
+                    row, px = y[middle], min(max(x[middle], 0), geometry.width - 1)
+                    ray = geometry.u[row, px], geometry.v[row, px], 1.0
+                    depth_m = float(1.0 / (geometry.plane[c[middle]] @ ray))
                     where = f" at about {depth_m:.1f} m" if self._calibrated else ""
                     return (
                         f"answers without light: those of confidence {SURE:g} and more{where} "
@@ -287,11 +280,6 @@ class MapChecks:
                         "with the other of likelihood and joint, other exposures, or a shorter depth range"
                     )
         return None
-
-    def _depth_m(self, y: int, c: int, x: int) -> float:
-        geometry = self._geometry
-        x = min(max(x, 0), geometry.width - 1)
-        return float(1.0 / (geometry.plane[c] @ (geometry.u[y, x], geometry.v[y, x], 1.0)))
 
 
 class _Counts:
@@ -318,9 +306,10 @@ class _Counts:
 
     def lines(self, chosen: NDArray[np.int64], most: int) -> NDArray[np.int32]:
         """Whole lines of chosen points and their first partners, (most, chosen, window)."""
-        if not self.of_volume:
-            return np.ascontiguousarray(self._sweep.checked[:most, chosen], np.int32)
-        found = self._sweep.counts[self.points.column[:most, chosen], self.points.row[:most, chosen]]
+        if self.of_volume:
+            found = self._sweep.counts[self.points.column[:most, chosen], self.points.row[:most, chosen]]
+        else:
+            found = self._sweep.checked[:most, chosen]
         return np.ascontiguousarray(found, np.int32)
 
     def mean(

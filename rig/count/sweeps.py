@@ -45,9 +45,7 @@ class SweepAccount:
     """Account of a sweep, kept when its counts are gone.
 
     direction: +1 where the mirror command rose, -1 where it fell; column indices mean the same commands both ways.
-    residual_columns: largest distance of a marker from the sweep's clock line; synchronised: whether that and the clock
-    are within their limits. gaps: (first, last) numbers of frames exposed but not received. first_frame, end_frame:
-    frame numbers from this scan marker to the next. detection: as in `SweepClock`.
+    gaps: (first, last) numbers of frames exposed but not received. The others are as in `SweepClock`.
     """
 
     index: int
@@ -118,7 +116,10 @@ class SweepAssembler:
     def add(self, block: FrameBlock) -> Iterator[SweepData]:
         """Count a block; yields the sweeps that end in it. Stop adding once `complete`."""
         self._check(block)
-        self._note_gap(block)
+        first = block.header.first_frame
+        if self._next_frame is not None and first > self._next_frame:
+            self._gaps.append((self._next_frame, first - 1))
+        self._next_frame = first + block.n_frames
         begun = time.perf_counter()
         bound, clocks = self._binder.bind(block)
         x0 = self._windows(block, bound)
@@ -186,12 +187,6 @@ class SweepAssembler:
         self.sweeps_done += 1
         self.complete = clock.sweep + 1 - self._start.sweep >= self._maps
         return data
-
-    def _note_gap(self, block: FrameBlock) -> None:
-        first = block.header.first_frame
-        if self._next_frame is not None and first > self._next_frame:
-            self._gaps.append((self._next_frame, first - 1))
-        self._next_frame = first + block.n_frames
 
     def _note_repeated(self, block: FrameBlock, bound: BoundFrames) -> NDArray[np.int64]:
         """Indices of frames whose ticks do not rise: the one before them once more, in their place. They are lost."""

@@ -1,16 +1,17 @@
 """Counts per column from packed frames: bits are added in bit-sliced form and never unpacked outside the window.
 
 `rig.count.kernels` does the adding. `SweepCounter` keeps the counts of a whole sweep, unsigned integers (columns, rows,
-window); estimators that judge a column as soon as it is complete bring a counter of their own, which keeps less
-(`Counter`). What all of them note besides the counts is in `FrameTally`.
+window), and `LineCounter` those of a rig with several lines; estimators that judge a column as soon as it is complete
+bring a counter of their own, which keeps less (`Counter`). All of them note a `FrameTally` besides.
 """
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Any, Protocol
 
 import numpy as np
 from numpy.typing import NDArray
 
+from rig.geometry.line_grid import LineGrid
 from rig.geometry.windows import WORD_PX
 from rig.threads import RowWorkers
 
@@ -31,11 +32,10 @@ Counts = NDArray[np.unsignedinteger[Any]]
 
 @dataclass(frozen=True, slots=True, eq=False)
 class SweepLayout:
-    """Pixels of each column that are counted.
+    """Pixels of each column that are counted: `window` from x0 (columns,) on, on a sensor of rows x width pixels.
 
-    columns of `window` pixels from x0 (columns,) on, multiples of 64, on a sensor of rows x width pixels. exposures:
-    frames nominally taken per column. used_px: pixels of each frame that are used; None: whole rows. dark: whether
-    there will be frames with the gate low.
+    exposures: frames nominally taken per column. used_px: pixels of each frame that are used; None: whole rows. dark:
+    whether there will be frames with the gate low.
     """
 
     columns: int
@@ -69,12 +69,10 @@ class SweepLayout:
 class FrameTally:
     """Frames of a sweep, as every counter notes them besides the counts.
 
-    n_frames: (columns,) int32, frames in each column's bin; 0 where none were received.
-    column: (columns,) float64, mean fractional column of those frames, NaN where none.
-    dark_counts: (rows, width) uint32 over n_dark frames with the gate low, None where there are none.
-    width: sensor width in pixels.
-    dark_frames: (width,) int32, those of the n_dark frames in which a pixel was used; None: all of them.
-    velocity_per_s: of the mirror command over the columns, negative where it fell, 0 where nobody says.
+    n_frames: (columns,), in each column's bin. column: (columns,), mean fractional column of those frames, NaN where
+    there are none. dark_counts: (rows, width) over n_dark frames with the gate low, None where there are none. width:
+    of the sensor, pixels. dark_frames: (width,), those of the n_dark frames in which a pixel was used; None: all of
+    them. velocity_per_s: of the mirror command over the columns, negative where it fell, 0 where nobody says.
     """
 
     n_frames: NDArray[np.int32]
@@ -120,7 +118,6 @@ class Counter(Protocol):
 
     def reset(self) -> None:
         """Begin the next sweep."""
-        ...
 
     def add(
         self, bits: NDArray[np.uint8], bins: NDArray[np.int32], column: NDArray[np.float64], x0: NDArray[np.int32]
@@ -128,15 +125,13 @@ class Counter(Protocol):
         """Add packed frames `bits` (n, rows, row bytes) to `bins` (n,); `column` (n,): each frame's fractional column.
 
         Row bytes are a multiple of 8; bins are a column index, BIN_DARK or BIN_UNUSABLE; the frames of a column follow
-        one another. x0: (n,) int32, first used pixel of each frame, a multiple of 64; with rows shorter than the
-        sensor's, their first pixel. The used pixels of a frame with a column index must hold that column's window.
-        The frames may be read on after this returns, see `settle`.
+        one another. x0: (n,), first used pixel of each frame, a multiple of 64; with rows shorter than the sensor's,
+        their first pixel. The used pixels of a frame on a column must hold that column's window. The frames may be
+        read on after this returns, see `settle`.
         """
-        ...
 
     def settle(self, under_way: int = 0) -> None:
         """Wait until the frames of all but the last `under_way` calls of `add` have been read."""
-        ...
 
     def finish(self) -> FrameTally:
         """The counted sweep; the counter must be `reset` before the next one."""
@@ -249,3 +244,23 @@ class SweepCounter:
             dark_counts=tally.dark_counts, n_dark=tally.n_dark, width=tally.width, dark_frames=tally.dark_frames,
             exposures=self._layout.exposures,
         )  # fmt: skip
+
+
+class LineCounter(SweepCounter):
+    """The counter of a rig with several lines, whose bins are places of the mirror and whose frames are whole rows.
+
+    Frames of a place are added once and each line's window is read from that. layout, and the volume: of all columns.
+    """
+
+    def __init__(self, layout: SweepLayout, grid: LineGrid, workers: RowWorkers) -> None:
+        super().__init__(layout, workers)
+        self._grid = grid
+        self._bins = replace(layout, columns=grid.places, x0=layout.x0[: grid.places])
+        self._columns_at = grid.columns_at()
+        self.reset()
+
+    def finish(self) -> CountVolume:
+        """The counts so far; a column's frames are those of its place, as far off its centre as they were off that."""
+        place, volume = self._grid.place, super().finish()
+        column = np.arange(len(place)) + (volume.column - np.arange(self._grid.places))[place]
+        return replace(volume, n_frames=volume.n_frames[place], column=column)

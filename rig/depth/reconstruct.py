@@ -11,9 +11,8 @@ from numpy.typing import NDArray
 
 from calibration.model.rig_model import RigModel
 from rig.config.models import EstimateConfig
-from rig.count.line_counter import LineCounter
 from rig.count.map_checks import MapChecks
-from rig.count.volume import Counter, FrameTally, SweepLayout
+from rig.count.volume import Counter, FrameTally, LineCounter, SweepLayout
 from rig.depth.depth import depth_map, share_claims
 from rig.depth.fog_meter import FogEstimate, read_fog
 from rig.errors import UsageError

@@ -2,10 +2,10 @@
 
 import os
 import shutil
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any, Final, Literal, get_args
+from typing import Any, Final
 
 from drivers.errors import ProtocolError
 from drivers.frames import FrameBlock
@@ -13,8 +13,7 @@ from drivers.recorded import RunRecording
 from drivers.recorded.segments import segment_files
 from rig.errors import DamagedRecordingError, UsageError
 from rig.exchange import hdf5, pictures
-from rig.exchange.frame_log import FrameLog
-from rig.exchange.npy import MapFiles, write_npy
+from rig.exchange.npy import FrameLog, MapFiles, write_npy
 from rig.exchange.pictures import VIEWS, Picture, View
 from rig.progress import Progress, counted
 from rig.recording.inputs import read_model, reconstruct_line
@@ -23,8 +22,7 @@ from rig.requests import ExportRequest
 from rig.run_folder.folder import RunFolder
 from rig.run_folder.manifest import read_manifest
 
-ExportKind = Literal["npy", "hdf5", "ply", "png", "mp4"]
-EXPORT_KINDS: Final[tuple[ExportKind, ...]] = get_args(ExportKind)
+EXPORT_KINDS: Final = ("npy", "hdf5", "ply", "png", "mp4")
 PICTURE_KINDS: Final = ("png", "mp4")
 """Kinds that show a view."""
 FILMS_PER_S: Final = 25.0
@@ -33,10 +31,7 @@ FRAMES_PER_PICTURE: Final = 100
 
 @dataclass(frozen=True, slots=True)
 class ExportResult:
-    """Result of an export.
-
-    gaps: missing frames, [run id, first, last]. damage: a line for each part that could not be read, with the reason.
-    """
+    """Result of an export. gaps: missing frames, [run id, first, last]. damage: a line for each part not readable."""
 
     folder: Path
     kind: str
@@ -92,7 +87,6 @@ class _Export:
     def __init__(self, run: Path, folder: RunFolder, request: ExportRequest, progress: Progress | None) -> None:
         self._run, self._folder, self._asked = run, folder, request
         self._told = counted("writing", "frames", progress)
-        self._frames_per_picture = request.frames_per_picture or FRAMES_PER_PICTURE
         self._maps = MapFiles(run)
         self.log: FrameLog | None = None
         self.n_maps = self.n_frames = 0
@@ -126,14 +120,22 @@ class _Export:
 
     def write_png(self) -> None:
         """Write single pictures."""
-        view = self._view()
-        self._count(view, pictures.write_pngs(self._pictures(view), self._folder, view))
+        self._write_pictures(lambda shown, view: pictures.write_pngs(shown, self._folder, view))
 
     def write_mp4(self) -> None:
         """Write a film."""
+        per_s = self._asked.pictures_per_s or FILMS_PER_S
+        self._write_pictures(lambda shown, view: pictures.write_mp4(shown, self._folder.place(f"{view}.mp4"), per_s))
+
+    def _write_pictures(self, write: Callable[[Iterator[Picture], View], int]) -> None:
         view = self._view()
-        film = self._folder.place(f"{view}.mp4")
-        self._count(view, pictures.write_mp4(self._pictures(view), film, self._asked.pictures_per_s or FILMS_PER_S))
+        if view != "frames":
+            self.n_maps = write(pictures.map_pictures(self._maps, view), view)
+            return
+        summed = self._asked.frames_per_picture or FRAMES_PER_PICTURE
+        self.n_frames = summed * write(pictures.frame_pictures(self._blocks(), summed), view)
+        if self.n_frames == 0:
+            raise UsageError(f"{self._run} holds fewer than {summed} frames, one picture's; lower --frames")
 
     @property
     def _recorded(self) -> bool:
@@ -183,46 +185,23 @@ class _Export:
         require_recording(self._run)
         return f"make them first: {reconstruct_line(self._run)}, and export that folder"
 
-    def _pictures(self, view: View) -> Iterator[Picture]:
-        if view == "frames":
-            return pictures.frame_pictures(self._blocks(), self._frames_per_picture)
-        return pictures.map_pictures(self._maps, view)
-
-    def _count(self, view: View, n: int) -> None:
-        if view != "frames":
-            self.n_maps = n
-            return
-        self.n_frames = n * self._frames_per_picture
-        if n == 0:
-            raise UsageError(
-                f"{self._run} holds fewer than {self._frames_per_picture} frames, one picture's; lower --frames"
-            )
-
 
 def _check(run: Path, kind: str, request: ExportRequest) -> None:
-    problems = []
-    known = kind in EXPORT_KINDS
-    pictureless, filmless = known and kind not in PICTURE_KINDS, known and kind != "mp4"
-    if not known:
-        problems.append(f"export kind {kind!r} is unknown; choose one of {', '.join(EXPORT_KINDS)}")
-    if not run.exists():
-        problems.append(f"{run} does not exist; name the folder of a run")
-    if request.view is not None and request.view not in VIEWS:
-        problems.append(f"view {request.view!r} is unknown; choose one of {', '.join(VIEWS)}")
-    elif request.view is not None and pictureless:
-        problems.append(f"view {request.view!r} is of pictures, {kind} has none; export png or mp4, or leave it out")
+    known, view = kind in EXPORT_KINDS, request.view
     summed, per_s = request.frames_per_picture, request.pictures_per_s
-    if summed is not None and pictureless:
-        problems.append(
-            f"--frames {summed} are summed for pictures, {kind} has none; export png or mp4, or leave it out"
-        )
-    elif summed is not None and summed < 1:
-        problems.append(f"{summed} frames make no picture; sum at least 1")
-    if per_s is not None and filmless:
-        problems.append(f"--fps {per_s:g} is of a film, {kind} is none; export mp4, or leave it out")
-    elif per_s is not None and not 0 < per_s <= 1000:
-        problems.append(f"a film of {per_s:g} pictures a second; choose 1000 or less, above 0")
-    if problems:
+    no_pictures = f"{kind} has none; export png or mp4, or leave it out" if known and kind not in PICTURE_KINDS else ""
+    no_film = known and kind != "mp4"
+    checks = [
+        (not known, f"export kind {kind!r} is unknown; choose one of {', '.join(EXPORT_KINDS)}"),
+        (not run.exists(), f"{run} does not exist; name the folder of a run"),
+        (view not in (None, *VIEWS), f"view {view!r} is unknown; choose one of {', '.join(VIEWS)}"),
+        (view in VIEWS and no_pictures, f"view {view!r} is of pictures, {no_pictures}"),
+        (summed is not None and no_pictures, f"--frames {summed} are summed for pictures, {no_pictures}"),
+        (summed is not None and summed < 1, f"{summed} frames make no picture; sum at least 1"),
+        (per_s is not None and no_film, f"--fps {per_s} is of a film, {kind} is none; export mp4, or leave it out"),
+        (per_s is not None and not 0 < per_s <= 1000, f"a film of {per_s} pictures a second; choose up to 1000"),
+    ]
+    if problems := [line for wrong, line in checks if wrong]:
         raise UsageError.of(problems)
     if kind == "hdf5":
         hdf5.require_h5py()

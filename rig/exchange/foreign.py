@@ -3,32 +3,28 @@
 import os
 import re
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 from fractions import Fraction
 from pathlib import Path
-from typing import Any, Final
+from typing import Any, Final, TypeVar
 
 import numpy as np
 from numpy.typing import NDArray
 
 from rig.errors import UsageError
 
+T = TypeVar("T")
 CHUNK_BYTES: Final = 16 << 20
 """Bytes of the pieces that files are read in, about."""
-
-LSB_FIRST: Final = np.packbits(np.unpackbits(np.arange(256, dtype=np.uint8), bitorder="little"))
-"""Bytes with their bits reversed, for cameras that send the leftmost pixel in the least significant bit."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class ForeignFrames:
     """Frames of one size in their order.
 
-    chunks: gives them anew at each call, uint8 (n, height, ceil(width / 8)), most significant bit = leftmost pixel; n
-      may differ and be 0.
-    origin: for the manifest, where the frames come from.
-    ranges: [first frame, frames] of consecutive numbers, where the file tells of lost ones.
-    hints: lines for the user about what may be wrong.
+    chunks: gives them, uint8 (any number, height, ceil(width / 8)), most significant bit = leftmost pixel. origin: for
+    the manifest. ranges: [first frame, frames] of consecutive numbers, where the file tells of lost ones. hints: lines
+    for the user about what may be wrong.
     """
 
     width: int
@@ -38,7 +34,7 @@ class ForeignFrames:
     origin: Mapping[str, Any]
     frame_rate: Fraction | None = None
     ranges: Sequence[tuple[int, int]] = ()
-    hints: Sequence[str] = field(default=())
+    hints: Sequence[str] = ()
 
 
 def gather(files: Iterable[str | os.PathLike[str]], suffix: str) -> list[Path]:
@@ -46,18 +42,34 @@ def gather(files: Iterable[str | os.PathLike[str]], suffix: str) -> list[Path]:
 
     A folder's files come in natural order (2 before 10), as the cameras number them. UsageError where one is missing.
     """
-    found: list[Path] = []
-    problems = []
-    for file in map(Path, files):
-        inside = [file] if file.is_file() else sorted(file.rglob(f"*{suffix}"), key=_natural) if file.is_dir() else []
-        if not inside:
-            problems.append(f"{file} holds no {suffix} file" if file.is_dir() else f"{file} does not exist")
-        found += inside
-    if problems:
-        raise UsageError.of(problems)
+
+    def natural(file: Path) -> list[tuple[int, str]]:
+        return [(int(part), "") if part.isdigit() else (-1, part) for part in re.split(r"([0-9]+)", str(file))]
+
+    def inside(file: Path) -> list[Path]:
+        found = [file] if file.is_file() else sorted(file.rglob(f"*{suffix}"), key=natural)
+        if not found:
+            raise UsageError(f"{file} holds no {suffix} file" if file.is_dir() else f"{file} does not exist")
+        return found
+
+    found = [file for part in open_each(map(Path, files), inside) for file in part]
     if not found:
         raise UsageError(f"no file was named; name {suffix} files, or the folder that holds them")
     return found
+
+
+def open_each(files: Iterable[Path], open_one: Callable[[Path], T]) -> list[T]:
+    """Open all files. UsageError, a line per file, where some cannot be."""
+    opened: list[T] = []
+    problems: list[str] = []
+    for file in files:
+        try:
+            opened.append(open_one(file))
+        except UsageError as error:
+            problems += error.problems
+    if problems:
+        raise UsageError.of(problems)
+    return opened
 
 
 def bytes_of(file: Path) -> NDArray[np.uint8]:
@@ -73,7 +85,3 @@ def chunks_of(frames: NDArray[np.uint8]) -> Iterator[NDArray[np.uint8]]:
     step = max(1, CHUNK_BYTES // max(1, frames[:1].nbytes))
     for first in range(0, len(frames), step):
         yield frames[first : first + step]
-
-
-def _natural(file: Path) -> list[tuple[int, str]]:
-    return [(int(part), "") if part.isdigit() else (-1, part) for part in re.split(r"([0-9]+)", str(file))]

@@ -24,8 +24,7 @@ from numpy.typing import NDArray
 from drivers.frames import FrameBlock
 from drivers.optional_packages import install_command
 from rig.errors import UsageError
-from rig.exchange.frame_log import FrameLog
-from rig.exchange.npy import MapFiles
+from rig.exchange.npy import FrameLog, MapFiles
 from rig.run_folder.folder import json_text
 
 FILE: Final = "run.h5"
@@ -36,8 +35,6 @@ _HEADER_END: Final = b"\0" * 8 + b"\x00\x02" + b"IM"
 _CHUNK_BYTES: Final = 1 << 20
 _CLASSES: Final = {"float32": "single", "float64": "double"}
 """MATLAB's names of types; integers have the same names as in numpy."""
-
-
 _ROOM_BYTES: Final = 16 << 20
 """Bytes left free for what HDF5 itself keeps and writes late."""
 
@@ -56,7 +53,7 @@ def write_hdf5(blocks: Iterable[FrameBlock], maps: MapFiles, manifest: Mapping[s
     h5py = require_h5py()
     log = FrameLog()
     with h5py.File(path, "w", userblock_size=_USER_BLOCK) as file:
-        bits = None
+        bits: Any = None
         for block in blocks:
             log.add(block)
             _require_room(path, block.bits.nbytes)
@@ -73,7 +70,10 @@ def write_hdf5(blocks: Iterable[FrameBlock], maps: MapFiles, manifest: Mapping[s
         units = np.frombuffer(text.encode("utf-16-le"), "<u2")
         characters = _array(file, "manifest", units[:, None], matlab="char")
         characters.attrs["MATLAB_int_decode"] = np.int32(2)
-    _write_mat_header(path)
+    made = datetime.now(UTC).strftime("%a %b %d %H:%M:%S %Y")
+    title = f"MATLAB 7.3 MAT-file, Platform: spadrig, Created on: {made} HDF5 schema 1.00 ."
+    with path.open("r+b") as raw:
+        raw.write(title.encode("ascii").ljust(_HEADER_TEXT) + _HEADER_END)
     return log
 
 
@@ -101,10 +101,7 @@ def _write_frames(file: Any, log: FrameLog) -> None:
 def _write_maps(group: Any, maps: MapFiles) -> None:
     """Write the maps one by one: a run may hold more than memory does."""
     for place, index in enumerate(maps.indices):
-        arrays = dict(maps.stripe(index))
-        depth = maps.depth_m(index)
-        if depth is not None:
-            arrays["depth_m"] = depth
+        arrays = maps.arrays(index)
         _require_room(Path(group.file.filename), sum(values.nbytes for values in arrays.values()))
         for name, values in arrays.items():
             if name not in group:
@@ -135,10 +132,3 @@ def _growing(group: Any, name: str, first: NDArray[Any]) -> Any:
     )
     made.attrs["MATLAB_class"] = np.bytes_(_CLASSES.get(first.dtype.name, first.dtype.name))
     return made
-
-
-def _write_mat_header(path: Path) -> None:
-    made = datetime.now(UTC).strftime("%a %b %d %H:%M:%S %Y")
-    text = f"MATLAB 7.3 MAT-file, Platform: spadrig, Created on: {made} HDF5 schema 1.00 ."
-    with path.open("r+b") as file:
-        file.write(text.encode("ascii").ljust(_HEADER_TEXT) + _HEADER_END)

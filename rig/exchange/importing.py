@@ -6,12 +6,13 @@ frame rate no clock (`frame_period_ticks` 0, one tick a frame). The pixels are t
 
 import os
 import shutil
-from collections.abc import Iterable, Iterator
+from collections.abc import Callable, Iterable, Iterator
+from contextlib import closing
 from dataclasses import dataclass
 from fractions import Fraction
 from itertools import pairwise
 from pathlib import Path
-from typing import Any, Final, Literal, NamedTuple, get_args
+from typing import Any, Final, NamedTuple, get_args
 
 import numpy as np
 from numpy.typing import NDArray
@@ -22,7 +23,7 @@ from drivers.spads.orientation import QuarterTurn, turn_packed, turned_size
 from drivers.spb1 import BlockLayout, frames_per_block
 from drivers.units import parse_exact
 from rig.errors import UsageError
-from rig.exchange import photoncube, pi_imaging, swissspad2
+from rig.exchange import photoncube, raw_files
 from rig.exchange.foreign import ForeignFrames, gather
 from rig.progress import Progress, counted
 from rig.recording.writer import Recording
@@ -31,22 +32,21 @@ from rig.run_folder.folder import RunFolder
 from rig.run_folder.manifest import MANIFEST
 from rig.scan.run import versions
 
-ImportKind = Literal["pi-imaging", "swissspad2", "photoncube"]
-IMPORT_KINDS: Final[tuple[ImportKind, ...]] = get_args(ImportKind)
-
 
 class _Kind(NamedTuple):
     """A kind of foreign files. upright_deg: the turn that makes their frames upright."""
 
     suffix: str
     forms: tuple[str, ...]
+    open: Callable[[list[Path], ImportRequest], ForeignFrames]
     upright_deg: QuarterTurn = 0
 
 
 _KINDS: Final = {
-    "pi-imaging": _Kind(".bin", pi_imaging.FORMS, 90),  # as the vendor's samples and the driver (`rotation`) turn them
-    "swissspad2": _Kind(".bin", swissspad2.FORMS),
-    "photoncube": _Kind(".npy", photoncube.FORMS),
+    # As the vendor's samples and the driver (`rotation`) turn them.
+    "pi-imaging": _Kind(".bin", raw_files.PI_IMAGING_FORMS, raw_files.open_pi_imaging, 90),
+    "swissspad2": _Kind(".bin", raw_files.SWISSSPAD2_FORMS, raw_files.open_swissspad2),
+    "photoncube": _Kind(".npy", photoncube.FORMS, photoncube.open_photoncube),
 }
 _RUN_ID: Final = 1
 _BLOCK_BYTES: Final = 1 << 20
@@ -93,7 +93,7 @@ def import_frames(
         raise UsageError(f"frame rate {error}") from None
     turn = _checked_turn(kind, request)
     sources = gather(files, _KINDS[kind].suffix)
-    foreign = _opened(kind, sources, request)
+    foreign = _KINDS[kind].open(sources, request)
     if turn and (foreign.width % 8 or foreign.height % 8):
         raise UsageError(
             f"frames of {foreign.width} x {foreign.height} pixels cannot be turned, sizes that are no multiples of 8 "
@@ -108,16 +108,18 @@ def import_frames(
     with RunFolder(out) as folder:
         expected = foreign.n_frames * frame_bytes(width, height)
         scratch = folder.place("")
-        _require_space(scratch, expected)
-        recording = Recording(scratch, expected_bytes=expected)
-        try:
+        free = shutil.disk_usage(scratch).free
+        if expected > free:
+            raise UsageError(
+                f"the recording will take {digits(expected / 1e9)} GB, the disk of {scratch.parent} has "
+                f"{digits(free / 1e9)} GB free; free some or name a folder on another disk with --out"
+            )
+        with closing(Recording(scratch, expected_bytes=expected)) as recording:
             done, told = 0, counted("reading", "frames", progress)
-            for block in _blocks(_turned(foreign, turn), width, height, ranges, rate):
+            for block in _blocks(foreign, turn, ranges, rate):
                 recording.append(block)
                 done += block.n_frames
                 told(done, foreign.n_frames)
-        finally:
-            recording.close()
         manifest: dict[str, Any] = {
             "versions": versions(),
             "command": "import",
@@ -147,32 +149,20 @@ def import_frames(
 
 def _checked_turn(kind: str, request: ImportRequest) -> QuarterTurn:
     """Check that all options fit the kind, and return the quarter turn."""
-    if kind not in IMPORT_KINDS:
-        raise UsageError(f"import kind {kind!r} is unknown; choose one of {', '.join(IMPORT_KINDS)}")
-    problems = []
-    forms = _KINDS[kind].forms
-    if request.form is not None and request.form not in forms:
-        problems.append(f"{kind} has no form {request.form!r}; choose {' or '.join(forms)}, or leave --form out")
+    if kind not in _KINDS:
+        raise UsageError(f"import kind {kind!r} is unknown; choose one of {', '.join(_KINDS)}")
+    forms, form, rows, turns = _KINDS[kind].forms, request.form, request.rows, get_args(QuarterTurn)
     turn = _KINDS[kind].upright_deg if request.turn_deg is None else request.turn_deg
-    turns = get_args(QuarterTurn)
-    if turn not in turns:
-        problems.append(f"frames cannot be turned by {turn} degrees; choose one of {', '.join(map(str, turns))}")
-    if request.rows is not None and kind != "pi-imaging":
-        problems.append(f"rows is {request.rows}, but {kind} files say their size themselves; leave --rows out")
-    elif request.rows is not None and request.rows not in (512, 1024):
-        problems.append(f"rows is {request.rows}; a SPAD512S has 512, its 1M flavour 1024")
-    if problems:
+    has_rows, stated = kind == "pi-imaging", rows is not None
+    checks = [
+        (form not in (None, *forms), f"{kind} has no form {form!r}; choose {' or '.join(forms)}, or leave --form out"),
+        (turn not in turns, f"frames cannot be turned by {turn} degrees; choose one of {', '.join(map(str, turns))}"),
+        (stated and not has_rows, f"rows is {rows}, but {kind} files say their size themselves; leave --rows out"),
+        (has_rows and rows not in (None, 512, 1024), f"rows is {rows}; a SPAD512S has 512, its 1M flavour 1024"),
+    ]
+    if problems := [line for wrong, line in checks if wrong]:
         raise UsageError.of(problems)
     return next(one for one in turns if one == turn)
-
-
-def _opened(kind: str, sources: list[Path], request: ImportRequest) -> ForeignFrames:
-    if kind == "pi-imaging":
-        form = next((form for form in get_args(pi_imaging.Form) if form == request.form), None)
-        return pi_imaging.open_pi_imaging(sources, form, request.rows or pi_imaging.ROWS)
-    if kind == "swissspad2":
-        return swissspad2.open_swissspad2(sources, "full" if request.form == "full" else "half")
-    return photoncube.open_photoncube(sources, packed=request.form == "packed")
 
 
 def _turned(foreign: ForeignFrames, turn: QuarterTurn) -> Iterator[NDArray[np.uint8]]:
@@ -200,20 +190,17 @@ def _clock(rate: Fraction | None) -> tuple[Fraction, int]:
 
 
 def _blocks(
-    chunks: Iterable[NDArray[np.uint8]],
-    width: int,
-    height: int,
-    ranges: Iterable[tuple[int, int]],
-    rate: Fraction | None,
+    foreign: ForeignFrames, turn: QuarterTurn, ranges: Iterable[tuple[int, int]], rate: Fraction | None
 ) -> Iterator[FrameBlock]:
-    """Make blocks of consecutive frames; the first and the last one are marked as such."""
+    """Make blocks of consecutive upright frames; the first and the last one are marked as such."""
+    width, height = turned_size(foreign.width, foreign.height, turn)
     tick_hz, ticks = _clock(rate)
     stride = max(_BLOCK_BYTES, BlockLayout(1, width, height).min_stride)
     most = frames_per_block(stride, width, height)
     left = [[first, n] for first, n in ranges]
     expected = left[0][0]
     seq = lost_before = 0
-    for bits in chunks:
+    for bits in _turned(foreign, turn):
         at = 0
         while at < len(bits):
             first, n = left[0]
@@ -237,12 +224,3 @@ def _blocks(
             at += take
             expected = first + take
             seq += 1
-
-
-def _require_space(folder: Path, size: int) -> None:
-    free = shutil.disk_usage(folder).free
-    if size > free:
-        raise UsageError(
-            f"the recording will take {digits(size / 1e9)} GB, the disk of {folder.parent} has {digits(free / 1e9)} GB "
-            "free; free some or name a folder on another disk with --out"
-        )

@@ -15,10 +15,12 @@ from numpy.typing import NDArray
 
 from drivers.json_text import parse_json
 from rig.errors import UsageError
-from rig.exchange.foreign import ForeignFrames, chunks_of
-from rig.recording.cube import PACK, holds_bits, open_array
+from rig.exchange.foreign import ForeignFrames, chunks_of, open_each
+from rig.recording.cube import holds_bits, open_array, pack_line
+from rig.requests import ImportRequest
 
 FORMS: Final = ("packed",)
+PACK: Final = "numpy.packbits(frames, axis=2)"
 SIDECAR_FORMAT: Final = "spadrig-frames"
 TRANSFORMS: Final = "transforms.json"
 _MOST_PIXELS: Final = 0xFFFF
@@ -35,25 +37,17 @@ class _Cube:
     ranges: tuple[tuple[int, int], ...]
 
 
-def open_photoncube(files: Sequence[Path], *, packed: bool = False) -> ForeignFrames:
+def open_photoncube(files: Sequence[Path], asked: ImportRequest) -> ForeignFrames:
     """Open cubes as frames one after the other. UsageError, a line per problem, for files that are no such cubes.
 
-    packed: take them for packed even where all bytes are 0 or 1, which is refused otherwise.
+    Where all bytes are 0 or 1 they must be asked for as packed.
     """
-    problems: list[str] = []
-    cubes: list[_Cube] = []
-    for file in files:
-        try:
-            cubes.append(_open(file, packed=packed))
-        except UsageError as error:
-            problems += error.problems
-    if not problems and len({(cube.width, cube.frames.shape[1:]) for cube in cubes}) > 1:
+    cubes = open_each(files, lambda file: _open(file, packed=asked.form == "packed"))
+    if len({(cube.width, cube.frames.shape[1:]) for cube in cubes}) > 1:
         sizes = ", ".join(
             f"{file.name} {cube.width} x {cube.frames.shape[1]}" for file, cube in zip(files, cubes, strict=True)
         )
-        problems.append(f"the cubes differ in size: {sizes}; import them one by one")
-    if problems:
-        raise UsageError.of(problems)
+        raise UsageError(f"the cubes differ in size: {sizes}; import them one by one")
     first = cubes[0]
 
     def chunks() -> Iterator[NDArray[np.uint8]]:
@@ -62,15 +56,9 @@ def open_photoncube(files: Sequence[Path], *, packed: bool = False) -> ForeignFr
 
     n_frames = sum(len(cube.frames) for cube in cubes)
     rates = {cube.frame_rate for cube in cubes}
-    return ForeignFrames(
-        first.width,
-        first.frames.shape[1],
-        n_frames,
-        chunks,
-        {},
-        frame_rate=rates.pop() if len(rates) == 1 else None,
-        ranges=first.ranges if len(cubes) == 1 else (),
-    )
+    rate = rates.pop() if len(rates) == 1 else None
+    ranges = first.ranges if len(cubes) == 1 else ()
+    return ForeignFrames(first.width, first.frames.shape[1], n_frames, chunks, {}, frame_rate=rate, ranges=ranges)
 
 
 def _open(file: Path, *, packed: bool) -> _Cube:
@@ -78,7 +66,7 @@ def _open(file: Path, *, packed: bool) -> _Cube:
     if loaded.dtype != np.uint8 or loaded.ndim not in (3, 4) or 0 in loaded.shape:
         raise UsageError(
             f"{file} holds {loaded.dtype} of shape {loaded.shape}; a photon cube is uint8 (frames, height, width / 8), "
-            f"eight pixels a byte; make it with {_advice(loaded)}"
+            f"eight pixels a byte; make it with {pack_line('frames', loaded.dtype)}"
         )
     if loaded.ndim == 4:
         if loaded.shape[3] != 1:
@@ -96,13 +84,6 @@ def _open(file: Path, *, packed: bool) -> _Cube:
             f"with {PACK}, or, where they are packed, import with --form packed"
         )
     return _Cube(loaded, width, _frame_rate(beside), _ranges(beside, len(loaded)))
-
-
-def _advice(array: NDArray[Any]) -> str:
-    """The line of numpy that may make a cube of an array, as far as that is seen without the frames' size."""
-    if array.ndim != 3:
-        return f"frames.reshape(number, height, width), then {PACK}"
-    return PACK if array.dtype.kind in "biu" else PACK.replace("frames", "frames != 0")
 
 
 def _beside(file: Path) -> Mapping[str, Any]:

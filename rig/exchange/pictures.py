@@ -17,10 +17,8 @@ View = Literal["depth", "intensity", "frames"]
 VIEWS: Final[tuple[View, ...]] = get_args(View)
 _BRIGHT_SHARE: Final = 0.999
 """Share of the first picture's pixels that are darker than what is shown as white."""
-
 _MOST_PIXELS: Final = 1 << 24
 """Most pixels of a picture of frames: five times as many as the largest SPAD array has."""
-
 Picture = NDArray[np.uint8]
 """Grey (height, width) or BGR (height, width, 3)."""
 
@@ -70,7 +68,9 @@ def write_mp4(pictures: Iterable[Picture], path: Path, pictures_per_s: float) ->
     n = 0
     try:
         for picture in pictures:
-            frame = _even(picture)
+            frame = np.repeat(picture[:, :, None], 3, axis=2) if picture.ndim == 2 else picture
+            height, width = frame.shape[:2]
+            frame = np.pad(frame, ((0, height % 2), (0, width % 2), (0, 0)))  # the format asks for even sides
             if film is None:
                 codec = cv2.VideoWriter.fourcc(*"mp4v")
                 film = cv2.VideoWriter(str(path), codec, pictures_per_s, frame.shape[1::-1])
@@ -96,8 +96,13 @@ def _sums(blocks: Iterable[FrameBlock], n: int) -> Iterator[NDArray[np.uint32]]:
         at = 0
         while at < block.n_frames:
             if counts is None:
-                _require_picture(header.sensor_width, header.sensor_height)
-                counts = np.zeros((header.sensor_height, header.sensor_width), np.uint32)
+                size = header.sensor_height, header.sensor_width
+                if size[0] * size[1] > _MOST_PIXELS:  # only a header says so, and the picture is made of it
+                    raise UsageError(
+                        f"the recording says that its sensor has {size[1]} x {size[0]} pixels; pictures have at most "
+                        f"{_MOST_PIXELS}; 'rig export' the frames as npy, which are only as large as their windows"
+                    )
+                counts = np.zeros(size, np.uint32)
             same = (x0[at:] == x0[at]) & (y0[at:] == y0[at])
             take = min(missing, len(same) if same.all() else int(np.argmin(same)))
             part = np.unpackbits(block.bits[at : at + take], axis=2, count=header.width).sum(axis=0, dtype=np.uint32)
@@ -108,19 +113,3 @@ def _sums(blocks: Iterable[FrameBlock], n: int) -> Iterator[NDArray[np.uint32]]:
             if missing == 0:
                 yield counts
                 counts, missing = None, n
-
-
-def _require_picture(width: int, height: int) -> None:
-    """Raise UsageError for a sensor larger than any: only its header says so, and the picture is made of it."""
-    if width * height > _MOST_PIXELS:
-        raise UsageError(
-            f"the recording says that its sensor has {width} x {height} pixels; pictures have at most {_MOST_PIXELS}; "
-            "'rig export' the frames as npy, which are only as large as their windows"
-        )
-
-
-def _even(picture: Picture) -> Picture:
-    """Make a picture BGR with even sides, which the film format asks for."""
-    bgr = np.repeat(picture[:, :, None], 3, axis=2) if picture.ndim == 2 else picture
-    height, width = bgr.shape[:2]
-    return np.pad(bgr, ((0, height % 2), (0, width % 2), (0, 0)))

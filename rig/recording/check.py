@@ -1,7 +1,7 @@
 """Reads every byte of a recording: which blocks are sound, what is damaged, and whether frames follow on frames.
 
-`check_segments` finds the sound blocks and `continuity` the gaps between them, which show in the blocks' numbers. Gaps
-at the ends of a recording show only in what else is known of the run: `lost_ends` looks at index, manifest and part.
+`check_segments` finds the sound blocks, `Continuity` the gaps between them, which show in the blocks' numbers. Gaps at
+the ends of a recording show only in what else is known of the run: `lost_ends` looks at index, manifest and part.
 """
 
 import zlib
@@ -15,8 +15,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from drivers.frames import BlockHeader
-from drivers.recorded.contents import INDEX_RECORD, Contents, damage_line, index_of
-from drivers.recorded.order import Entries, in_order
+from drivers.recorded.contents import Contents, damage_line, index_of
+from drivers.recorded.order import in_order
 from drivers.recorded.segments import SegmentReader
 from drivers.spb1 import HEADER_BYTES, TRAILER_BYTES, BlockLayout, Placed
 from drivers.spb1.layout import MAX_FRAMES, TRAILER
@@ -24,7 +24,6 @@ from rig.progress import tell_stage
 from rig.run_folder.manifest import RunGap, device_counters, ended_early
 
 CHECKING: Final = "checking every block"
-"""Name of the stage."""
 CHECKERS: Final = 2
 """Number of segments checked at a time."""
 _STEP_BYTES: Final = 64 * 2**20
@@ -40,22 +39,14 @@ _FEW: Final = 4
 class SoundBlock:
     """A block whose every byte is right.
 
-    entry: its index record. header: the values in it that hold.
-    first_tick, last_tick: of its frames; 0 where it has none.
-    lost_before: frames lost before it, as the device counted.
-    sweep, last_sweep: number of scan markers up to its first and its last frame.
-    repeated: (first, last) numbers of frames whose ticks do not rise; they count as lost.
-    objection: why the block cannot be what was recorded; None where it can.
+    entry: its index record. first_tick, last_tick: of its frames; 0 where it has none. last_sweep: number of scan
+    markers up to its last frame. repeated: (first, last) numbers of frames whose ticks do not rise; they count as
+    lost. objection: why the block cannot be what was recorded; None where it can.
     """
 
     entry: bytes
     header: BlockHeader
-    run_id: int
-    block_seq: int
-    first_frame: int
     n_frames: int
-    lost_before: int
-    sweep: int
     last_sweep: int
     first_tick: int
     last_tick: int
@@ -63,9 +54,22 @@ class SoundBlock:
     objection: str | None
 
     @property
+    def block_seq(self) -> int:
+        """Its number, low 32 bits, as the index has it."""
+        return self.header.block_seq & 0xFFFFFFFF
+
+    @property
+    def first_frame(self) -> int:
+        """Number of its first frame."""
+        return self.header.first_frame
+
+    @property
     def end_frame(self) -> int:
         """Number of the frame behind its last one."""
         return self.first_frame + self.n_frames
+
+
+Run = Sequence[SoundBlock]
 
 
 def check_segments(segments: Sequence[SegmentReader]) -> tuple[list[SoundBlock], list[str]]:
@@ -96,10 +100,12 @@ def merged_gaps(gaps: Iterable[RunGap]) -> list[RunGap]:
 class Continuity:
     """Gaps and problems between the blocks of a recording.
 
+    known: gaps that a repair found and noted; None where there was no repair.
     gaps: frames that the device lost, or that a repair found missing, and that the recording says are lost.
     missing: frames that are not there and of which nothing is said.
     """
 
+    known: Collection[RunGap] | None
     gaps: list[RunGap] = field(default_factory=list)
     missing: list[RunGap] = field(default_factory=list)
     problems: list[str] = field(default_factory=list)
@@ -109,17 +115,60 @@ class Continuity:
         """Frames in the gaps, each counted once."""
         return sum(last + 1 - first for _, first, last in merged_gaps(self.gaps))
 
+    def follow(self, number: int, run: Run, *, is_part: bool) -> None:
+        """Check whether the blocks of a run follow on each other, apart from frames that the device says it lost.
 
-def continuity(runs: Iterable[Sequence[SoundBlock]], *, is_part: bool, known: Collection[RunGap] | None) -> Continuity:
-    """Check whether the blocks of each run follow on each other, apart from frames that the device says it lost.
+        is_part: the recording was cut from another one, so that it need not begin with the first block.
+        """
+        first = run[0]
+        self.gaps += [
+            gap
+            for gap in dict.fromkeys(self.known or ())
+            if gap[0] == number and (gap[2] < first.first_frame or gap[1] >= run[-1].end_frame)
+        ]
+        if not is_part and not any(gap[0] == number and gap[2] == first.first_frame - 1 for gap in self.gaps):
+            self._join(number, (0, 0, -1), first)
+        for before, block in pairwise(run):
+            self._join(number, (before.end_frame, before.header.lost_before, before.block_seq), block)
+            if before.n_frames and block.n_frames and block.first_tick <= before.last_tick:
+                self._repeat(number, block.first_frame, block.first_frame, f"at frame {block.first_frame}")
+        for block in run:
+            for frames in block.repeated:
+                self._repeat(number, *frames, f"within block {block.block_seq}")
 
-    is_part: the recording was cut from another one, so that it need not begin with the first block. known: gaps that a
-    repair found and noted; None where there was no repair.
-    """
-    found = Continuity()
-    for number, run in enumerate(runs):
-        _follow(number, run, is_part, known, found)
-    return found
+    def _repeat(self, number: int, first: int, last: int, where: str) -> None:
+        """Count frames whose ticks do not rise as lost, although they are there."""
+        gap = number, first, last
+        if gap in (self.known or ()):
+            self.gaps.append(gap)
+        else:
+            self.missing.append(gap)
+            self.problems.append(f"run {number}: the clock goes back {where}")
+
+    def _join(self, number: int, before: tuple[int, int, int], block: SoundBlock) -> None:
+        """Check whether `block` can follow `before`: (end of the frames, frames lost by then, number of the block).
+
+        Gaps that a repair found take the place of the device's counts, which may belong to blocks that are gone.
+        """
+        end_frame, lost_before, block_seq = before
+        missing, lost = block.first_frame - end_frame, block.header.lost_before - lost_before
+        gap = number, end_frame, block.first_frame - 1
+        if gap in (self.known or ()) or missing == lost > 0:
+            self.gaps.append(gap)
+        elif missing > 0:
+            self.missing.append(gap)
+            self.problems.append(
+                f"run {number}: frames {end_frame} to {block.first_frame - 1} are missing, of which the device lost "
+                f"{min(max(0, lost), missing)}"
+            )
+        elif lost and self.known is None:
+            self.problems.append(
+                f"run {number}: block {block.block_seq} counts {block.header.lost_before} lost frames, the one before "
+                f"{lost_before}, and none is missing between them"
+            )
+        gone = block.block_seq - block_seq - 1
+        if gone and self.known is None and missing in (0, lost):
+            self.problems.append(f"run {number}: {gone} blocks are missing before block {block.block_seq}")
 
 
 def in_step(frames: int, ticks: int, header: BlockHeader) -> bool:
@@ -128,7 +177,7 @@ def in_step(frames: int, ticks: int, header: BlockHeader) -> bool:
     return not period or abs(ticks - frames * period) <= period * (0.5 + _CLOCK_SHARE * abs(frames))
 
 
-def out_of_step(run: Sequence[SoundBlock]) -> list[SoundBlock]:
+def out_of_step(run: Run) -> list[SoundBlock]:
     """Blocks of a run whose ticks or sweep disagree with their frame numbers, judged by their neighbours.
 
     Empty where those would be more than a few: then the device counts differently.
@@ -136,17 +185,13 @@ def out_of_step(run: Sequence[SoundBlock]) -> list[SoundBlock]:
     votes = [0] * len(run)
     for i, block in enumerate(run):
         for j in range(max(0, i - _NEIGHBOURS), i):
-            agree = _go_together(run[j], block)
+            before = run[j].header
+            frames, ticks = block.first_frame - before.first_frame, block.header.t0_ticks - before.t0_ticks
+            agree = 0 <= block.header.sweep - before.sweep <= frames and in_step(frames, ticks, block.header)
             votes[i] += agree
             votes[j] += agree
     alone = [block for block, vote in zip(run, votes, strict=True) if not vote]
     return alone if len(run) > 2 and len(alone) * _FEW <= max(len(run), _FEW) else []
-
-
-def _go_together(before: SoundBlock, block: SoundBlock) -> bool:
-    frames = block.first_frame - before.first_frame
-    ticks = block.header.t0_ticks - before.header.t0_ticks
-    return 0 <= block.sweep - before.sweep <= frames and in_step(frames, ticks, block.header)
 
 
 def _check(segment: SegmentReader) -> tuple[list[SoundBlock], list[str]]:
@@ -167,16 +212,10 @@ def _check(segment: SegmentReader) -> tuple[list[SoundBlock], list[str]]:
 def _sound(segment: SegmentReader, placed: Placed) -> SoundBlock:
     block, header = placed.block, placed.block.header
     ticks = block.start_ticks
-    entry = np.frombuffer(index_of(block, segment.number, placed.offset, placed.length), INDEX_RECORD)[0]
     return SoundBlock(
-        entry.tobytes(),
+        index_of(block, segment.number, placed.offset, placed.length),
         header,
-        header.run_id,
-        int(entry["block_seq"]),
-        header.first_frame,
         block.n_frames,
-        header.lost_before,
-        header.sweep,
         header.sweep + ((int(block.records["sweep"][-1]) - header.sweep) & 0xFFFF if len(ticks) else 0),
         int(ticks[0]) if len(ticks) else 0,
         int(ticks[-1]) if len(ticks) else 0,
@@ -194,85 +233,16 @@ def _stretches(numbers: NDArray[np.int64]) -> Iterator[tuple[int, int]]:
 
 def _objection(segment: SegmentReader, placed: Placed) -> str | None:
     """Reason why a block with all its checksums cannot be what was recorded; None where it can."""
-    if not _has_checksum(segment, placed):
-        return "has no checksum of its pixels"
+    end = placed.offset + placed.length
+    if not TRAILER.unpack(segment.at(end - TRAILER_BYTES, TRAILER_BYTES).tobytes())[4]:  # no CRC, unless it is 0
+        payload = segment.at(placed.offset + HEADER_BYTES, placed.length - HEADER_BYTES - TRAILER_BYTES)
+        if zlib.crc32(payload.tobytes()) != 0:
+            return "has no checksum of its pixels"
     block = placed.block
     markers = (block.records["sweep"].astype(np.int64) - block.header.sweep) & 0xFFFF
     if block.n_frames and int(np.sort(markers)[(block.n_frames - 1) // 2]) > block.n_frames:
         return f"says that it begins in sweep {block.header.sweep}, its frames do not"
     return None
-
-
-def _has_checksum(segment: SegmentReader, placed: Placed) -> bool:
-    """Whether the trailer states a payload CRC: 0 says none, unless it is 0."""
-    trailer = segment.at(placed.offset + placed.length - TRAILER_BYTES, TRAILER_BYTES)
-    if TRAILER.unpack(trailer.tobytes())[4]:
-        return True
-    payload = segment.at(placed.offset + HEADER_BYTES, placed.length - HEADER_BYTES - TRAILER_BYTES)
-    return zlib.crc32(payload.tobytes()) == 0
-
-
-def _follow(
-    number: int, run: Sequence[SoundBlock], is_part: bool, known: Collection[RunGap] | None, found: Continuity
-) -> None:
-    first = run[0]
-    found.gaps += [
-        gap
-        for gap in dict.fromkeys(known or ())
-        if gap[0] == number and (gap[2] < first.first_frame or gap[1] >= run[-1].end_frame)
-    ]
-    if not is_part and not any(gap[0] == number and gap[2] == first.first_frame - 1 for gap in found.gaps):
-        _join(number, (0, 0, -1), first, known, found)
-    for before, block in pairwise(run):
-        _join(number, (before.end_frame, before.lost_before, before.block_seq), block, known, found)
-        if before.n_frames and block.n_frames and block.first_tick <= before.last_tick:
-            _repeat(number, block.first_frame, block.first_frame, f"at frame {block.first_frame}", known, found)
-    for block in run:
-        for frames in block.repeated:
-            _repeat(number, *frames, f"within block {block.block_seq}", known, found)
-
-
-def _repeat(
-    number: int, first: int, last: int, where: str, known: Collection[RunGap] | None, found: Continuity
-) -> None:
-    """Count frames whose ticks do not rise as lost, although they are there."""
-    gap = number, first, last
-    if known is not None and gap in known:
-        found.gaps.append(gap)
-        return
-    found.missing.append(gap)
-    found.problems.append(f"run {number}: the clock goes back {where}")
-
-
-def _join(
-    number: int, before: tuple[int, int, int], block: SoundBlock, known: Collection[RunGap] | None, found: Continuity
-) -> None:
-    """Check whether `block` can follow `before`: (end of the frames, frames lost by then, number of the block).
-
-    Gaps that a repair found take the place of the device's counts, which may belong to blocks that are gone.
-    """
-    end_frame, lost_before, block_seq = before
-    missing, lost = block.first_frame - end_frame, block.lost_before - lost_before
-    gap = number, end_frame, block.first_frame - 1
-    if (known is not None and gap in known) or missing == lost > 0:
-        found.gaps.append(gap)
-    elif missing > 0:
-        found.missing.append(gap)
-        found.problems.append(
-            f"run {number}: frames {end_frame} to {block.first_frame - 1} are missing, of which the device lost "
-            f"{min(max(0, lost), missing)}"
-        )
-    elif lost and known is None:
-        found.problems.append(
-            f"run {number}: block {block.block_seq} counts {block.lost_before} lost frames, the one before "
-            f"{lost_before}, and none is missing between them"
-        )
-    gone = block.block_seq - block_seq - 1
-    if gone and known is None and missing in (0, lost):
-        found.problems.append(f"run {number}: {gone} blocks are missing before block {block.block_seq}")
-
-
-Run = Sequence[SoundBlock]
 
 
 def lost_ends(
@@ -285,13 +255,13 @@ def lost_ends(
     """
     cut = (manifest or {}).get("cut")
     ranges = _told_ranges(contents, runs)
-    if cut is not None and _blocks_are_gone(manifest or {}, runs):
+    blocks = ((manifest or {}).get("recording") or {}).get("blocks")
+    if cut is not None and isinstance(blocks, int) and blocks > sum(map(len, runs)):
         for run_id, first, end in cut["frames"]:
-            began, ended = ranges.get(run_id, (first, end))
-            ranges[run_id] = min(began, first), max(ended, end)
+            _extend(ranges, run_id, first, end)
     gaps: list[RunGap] = []
     for number, run in enumerate(runs):
-        first, end = ranges.pop(run[0].run_id, (run[0].first_frame, run[-1].end_frame))
+        first, end = ranges.pop(run[0].header.run_id, (run[0].first_frame, run[-1].end_frame))
         if cut is not None and first < run[0].first_frame:  # of a whole run the first frame is number 0
             gaps.append((number, first, run[0].first_frame - 1))
         if end > run[-1].end_frame:
@@ -306,20 +276,21 @@ def _told_ranges(contents: Contents, runs: Sequence[Run]) -> dict[int, tuple[int
     sound = {block.entry for run in runs for block in run}
     if len(contents.told) == 0 or 2 * sum(entry.tobytes() in sound for entry in contents.told) < len(sound):
         return {}
-    of_run = {run[0].run_id: run for run in runs}
+    of_run = {run[0].header.run_id: run for run in runs}
     ranges: dict[int, tuple[int, int]] = {}
-    for entry in in_order(_believed(contents.told), contents.told, [], folder=True)[0]:
+    told = contents.told
+    believed = told[(told["first_frame"] < 1 << 62) & (told["t0_ticks"] < 1 << 62)]
+    for entry in in_order(believed, told, [], folder=True)[0]:
         run_id, first = int(entry["run_id"]), int(entry["first_frame"])
-        end = first + int(entry["n_frames"])
-        if run_id in of_run and not _reaches_beyond(entry, of_run[run_id]):
-            continue
-        began, ended = ranges.get(run_id, (first, end))
-        ranges[run_id] = min(began, first), max(ended, end)
+        if run_id not in of_run or _reaches_beyond(entry, of_run[run_id]):
+            _extend(ranges, run_id, first, first + int(entry["n_frames"]))
     return ranges
 
 
-def _believed(told: Entries) -> Entries:
-    return told[(told["first_frame"] < 1 << 62) & (told["t0_ticks"] < 1 << 62)]
+def _extend(ranges: dict[int, tuple[int, int]], run_id: int, first: int, end: int) -> None:
+    """Extend the range of a run's frames to these."""
+    began, ended = ranges.get(run_id, (first, end))
+    ranges[run_id] = min(began, first), max(ended, end)
 
 
 def _reaches_beyond(entry: Any, run: Run) -> bool:
@@ -329,14 +300,11 @@ def _reaches_beyond(entry: Any, run: Run) -> bool:
     if near is run[0] and first + n_frames > near.first_frame:
         return False
     header = near.header
-    if n_frames > MAX_FRAMES or int(entry["length"]) != BlockLayout(n_frames, header.width, header.height).block_bytes:
-        return False
-    return in_step(first - near.first_frame, int(entry["t0_ticks"]) - header.t0_ticks, header)
-
-
-def _blocks_are_gone(manifest: dict[str, Any], runs: Sequence[Run]) -> bool:
-    stated = (manifest.get("recording") or {}).get("blocks")
-    return isinstance(stated, int) and stated > sum(map(len, runs))
+    return (
+        n_frames <= MAX_FRAMES
+        and int(entry["length"]) == BlockLayout(n_frames, header.width, header.height).block_bytes
+        and in_step(first - near.first_frame, int(entry["t0_ticks"]) - header.t0_ticks, header)
+    )
 
 
 def _delivered_behind(runs: Sequence[Run], missing: Sequence[RunGap], manifest: dict[str, Any] | None) -> list[RunGap]:

@@ -6,6 +6,7 @@ compressed one is on the disk and unpacks to the same bytes.
 
 import os
 from dataclasses import dataclass
+from itertools import pairwise
 from pathlib import Path
 from typing import Final
 
@@ -78,7 +79,7 @@ def _compress(segment: PlainSegment, offsets: list[int]) -> None:
     sizes: list[tuple[int, int]] = []
     try:
         with scratch.open("wb") as file:
-            for begin, end in _pieces(offsets, segment.size):
+            for begin, end in pairwise(sorted({0, *offsets, segment.size})):  # what is before the first block too
                 plain = segment.at(begin, end - begin)
                 frame = packer.compress(plain.data)
                 if not np.array_equal(unpack_frame(np.frombuffer(frame, np.uint8), len(plain)), plain):
@@ -95,10 +96,3 @@ def _compress(segment: PlainSegment, offsets: list[int]) -> None:
     finally:
         scratch.unlink(missing_ok=True)
     segment.path.unlink()
-
-
-def _pieces(offsets: list[int], size: int) -> list[tuple[int, int]]:
-    """Pieces (begin, end) from each block to the next one; bytes before the first block are a piece too."""
-    begins = [0, *offsets] if not offsets or offsets[0] else offsets
-    ends = [*begins[1:], size]
-    return [(begin, end) for begin, end in zip(begins, ends, strict=True) if end > begin]

@@ -1,24 +1,19 @@
 """A bare cube of packed frames, made by any program: checked against its plan, counted map by map.
 
 The frames are in a .npy file: uint8 (maps x columns x exposures, height, ceil(width / 8)), packed along the width, most
-significant bit first (`numpy.packbits(frames, axis=2)`). Nothing in an array tells which end of a byte is the left one.
-An array of another form is refused with the line of numpy that converts it. Or the frames are in a recording of frames
-alone, as `rig import` writes it, whose frames may have gaps in their numbers.
-
-Frame f of a map belongs to column f // exposures, exactly; there are no dark frames. `open_cube` checks a cube and
-`count_map` counts a map of it.
+significant bit first (`numpy.packbits(frames, axis=2)`). Or they are in a recording of frames alone, as `rig import`
+writes it, with gaps in their numbers perhaps. Frame f of a map belongs to column f // exposures, exactly; there are no
+dark frames.
 """
 
-import io
-import math
 import os
 import tokenize
 import zipfile
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from dataclasses import dataclass
-from itertools import permutations
+from functools import partial
 from pathlib import Path
-from typing import Any, BinaryIO, Final
+from typing import Any, Final
 
 import numpy as np
 from numpy.typing import NDArray
@@ -34,7 +29,7 @@ from rig.errors import UsageError
 from rig.recording.open import open_recording
 
 CHUNK_BYTES = 16 << 20
-"""Bytes of the pieces that frames are read in; larger ones only cost memory."""
+"""Bytes of the pieces that frames are read in."""
 RATE_TOLERANCE: Final = 1e-3
 """Relative tolerance of frame rates, which are written with three digits or so."""
 
@@ -43,37 +38,14 @@ Piece = tuple[int, NDArray[np.uint8]]
 
 
 @dataclass(frozen=True, slots=True, eq=False)
-class ArrayFrames:
-    """Frames in an array (n, height, row bytes), numbered from 0, read from disk as needed."""
-
-    array: NDArray[np.uint8]
-
-    def between(self, first: int, end: int, step: int) -> Iterator[Piece]:
-        """Give the frames from `first` to before `end`, at most `step` at a time."""
-        for start in range(first, end, step):
-            yield start, self.array[start : min(start + step, end)]
-
-
-@dataclass(frozen=True, slots=True, eq=False)
-class RecordedFrames:
-    """Frames of a recording's only run, by their own numbers. Those of damaged blocks are left out."""
-
-    recording: RunRecording
-    run: RecordedRun
-
-    def between(self, first: int, end: int, step: int) -> Iterator[Piece]:
-        """Give the frames that exist from `first` to before `end`, in the blocks they lie in."""
-        for block in self.recording.blocks(self.run, first, end):
-            for start in range(0, block.n_frames, step):
-                yield block.header.first_frame + start, block.bits[start : start + step]
-
-
-@dataclass(frozen=True, slots=True, eq=False)
 class Cube:
-    """Checked frames of whole maps. first_frame: number of the first map's first frame. maps: whole sweeps."""
+    """Checked frames of whole maps. first_frame: number of the first map's first frame. maps: whole sweeps.
+
+    between: gives the frames that exist from a first one to before an end, so many at most at a time, from the disk.
+    """
 
     path: Path
-    frames: ArrayFrames | RecordedFrames
+    between: Callable[[int, int, int], Iterator[Piece]]
     plan: CubePlan
     width: int
     height: int
@@ -87,26 +59,34 @@ class Cube:
 
 
 def open_cube(path: str | os.PathLike[str], plan: CubePlan, model: RigModel) -> Cube:
-    """Open a .npy file, or the folder of a recording, and check it against its plan and calibration.
-
-    UsageError where they disagree.
-    """
+    """Open a .npy file, or the folder of a recording; UsageError where it disagrees with its plan and calibration."""
     file = Path(path)
     camera = model.camera
-    frames: ArrayFrames | RecordedFrames
     if file.is_dir():
         recording = open_recording(file)
         run = recording.runs[0]
         problems = _recording_problems(recording, plan, camera)
-        frames, first, n = RecordedFrames(recording, run), run.first_frame, run.end_frame - run.first_frame
+        between, first, n = partial(_recorded, recording, run), run.first_frame, run.end_frame - run.first_frame
     else:
         array = open_array(file)
         problems = _array_problems(file, array, plan, camera)
-        frames, first, n = ArrayFrames(array), 0, len(array) if array.ndim else 0
+        between, first, n = partial(_in_array, array), 0, len(array) if array.ndim else 0
     problems += _plane_problems(plan, model)
     if problems:
         raise UsageError.of(problems)
-    return Cube(file, frames, plan, camera.width, camera.height, n // (plan.columns * plan.exposures), first)
+    return Cube(file, between, plan, camera.width, camera.height, n // (plan.columns * plan.exposures), first)
+
+
+def _in_array(array: NDArray[np.uint8], first: int, end: int, step: int) -> Iterator[Piece]:
+    for start in range(first, end, step):
+        yield start, array[start : min(start + step, end)]
+
+
+def _recorded(recording: RunRecording, run: RecordedRun, first: int, end: int, step: int) -> Iterator[Piece]:
+    """Frames by their own numbers, without those of damaged blocks."""
+    for block in recording.blocks(run, first, end):
+        for start in range(0, block.n_frames, step):
+            yield block.header.first_frame + start, block.bits[start : start + step]
 
 
 def cube_columns(model: RigModel) -> int | None:
@@ -123,10 +103,7 @@ def column_commands(plan: CubePlan) -> NDArray[np.float64]:
 
 
 def count_map(cube: Cube, index: int, counter: Counter) -> tuple[FrameTally, list[Gap]]:
-    """Count one map; return the counts and the gaps in its frames.
-
-    counter: made for the cube's columns and size; it is reset first.
-    """
+    """Count one map by a counter made for the cube's columns and size; return counts and the gaps in its frames."""
     counter.reset()
     first = cube.first_frame + index * cube.frames_per_map
     end = first + cube.frames_per_map
@@ -137,7 +114,7 @@ def count_map(cube: Cube, index: int, counter: Counter) -> tuple[FrameTally, lis
     last_byte = np.uint8(0xFF << (-cube.width % 8) & 0xFF)
     gaps: list[Gap] = []
     following = first
-    for start, piece in cube.frames.between(first, end, step):
+    for start, piece in cube.between(first, end, step):
         if start > following:
             gaps.append((following, start - 1))
         following = start + len(piece)
@@ -156,12 +133,12 @@ def _array_problems(file: Path, array: NDArray[Any], plan: CubePlan, camera: Cam
     size = (camera.height, -(-camera.width // 8))
     if array.dtype == np.uint8 and array.ndim == 3 and array.shape[1:] == size:
         return _length_problems(f"{file} has {len(array)} frames", len(array), plan)
-    line = numpy_line(array, camera.height, camera.width)
+    line = _numpy_line(array, camera.height, camera.width)
     if line is None:
-        then = "use the calibration made with this sensor"
+        then = "bring it into that form, or use the calibration made with this sensor"
     else:
         then = f"make it with {line}"
-        if "packbits" in line and "unpackbits" not in line and array.dtype != bool and not holds_bits(array):
+        if "packbits" in line and array.dtype != bool and not holds_bits(array):
             then += " (every value but 0 becomes 1; sums of several exposures are no frames)"
     return [
         f"{file} holds {array.dtype} of shape {array.shape}; the calibration's {camera.width} x {camera.height} sensor "
@@ -225,10 +202,7 @@ def _plane_problems(plan: CubePlan, model: RigModel) -> list[str]:
     return []
 
 
-PACK: Final = "numpy.packbits(frames, axis=2)"
-"""Line of numpy that packs frames of one byte or number a pixel."""
 LOOK_BYTES: Final = 16 << 20
-_HEADERS: Final = {(1, 0): np.lib.format.read_array_header_1_0, (2, 0): np.lib.format.read_array_header_2_0}
 _UNREADABLE: Final = (ValueError, EOFError, SyntaxError, OverflowError, MemoryError, tokenize.TokenError)
 """Errors that numpy raises for bytes that are no array."""
 
@@ -237,24 +211,14 @@ def open_array(file: Path) -> NDArray[Any]:
     """The array of a `.npy` file, mapped into memory. UsageError, one line, where it holds none."""
     try:
         if zipfile.is_zipfile(file):
-            raise UsageError(_archive(file))
+            raise UsageError(f"{file} is an archive of arrays; a cube is one array, written with numpy.save")
         array: NDArray[Any] = np.lib.format.open_memmap(file, mode="r")
     except OSError as error:
         raise UsageError(f"cannot read {file}: {error.strerror or error}; check the path") from error
     except _UNREADABLE as error:
-        raise UsageError(f"{file} {_why_unreadable(file)}") from error
+        why = (str(error) or type(error).__name__).splitlines()[0]
+        raise UsageError(f"{file} is no whole .npy file of numbers ({why}); write it with numpy.save") from error
     return array
-
-
-def _archive(file: Path) -> str:
-    """Message about a file of several arrays, with the line that takes one of them out."""
-    with zipfile.ZipFile(file) as archive:
-        names = [name.removesuffix(".npy") for name in archive.namelist()]
-    one = f": numpy.save('cube.npy', numpy.load('{file.name}')['{names[0]}'])" if names else ""
-    return (
-        f"{file} is an archive of arrays ({', '.join(names) or 'none'}); a cube is one array, written with numpy.save"
-        f"{one}"
-    )
 
 
 def holds_bits(frames: NDArray[Any]) -> bool:
@@ -269,77 +233,21 @@ def holds_bits(frames: NDArray[Any]) -> bool:
     return seen
 
 
-def numpy_line(frames: NDArray[Any], height: int, width: int) -> str | None:
-    """The line of numpy that makes uint8 (frames, height, ceil(width / 8)) of an array; None for another size.
+def pack_line(frames: str, dtype: np.dtype[Any]) -> str:
+    """The line of numpy that packs frames of one number a pixel."""
+    return f"numpy.packbits({frames}, axis=2)" if dtype.kind in "biu" else f"numpy.packbits({frames} != 0, axis=2)"
 
-    Where there are several ways it is the one that changes least.
-    """
-    line, shape = "frames", frames.shape
-    packed, whole = (height, -(-width // 8)), (height, width)
-    if len(shape) == 4 and shape[3] == 1:
-        line, shape = "frames[..., 0]", shape[:3]
-    elif shape in (packed, whole):
-        line, shape = "frames[None]", (1, *shape)
-    elif len(shape) in (1, 2):
-        per_frame = shape[1] if len(shape) == 2 else frames.size
-        sizes = [size for size in (packed, whole) if per_frame % math.prod(size) == 0]
-        sizes = [size for size in sizes if len(shape) == 1 or math.prod(size) == per_frame]
-        if not sizes:
-            return None
-        size = sizes[0] if frames.dtype in (np.uint8, np.int8) and not holds_bits(frames) else sizes[-1]
-        line, shape = f"frames.reshape(-1, {size[0]}, {size[1]})", (frames.size // math.prod(size), *size)
-    if len(shape) != 3:
+
+def _numpy_line(frames: NDArray[Any], height: int, width: int) -> str | None:
+    """The line of numpy that makes uint8 (frames, height, ceil(width / 8)) of a stack; None for another size."""
+    if frames.ndim != 3:
         return None
-    for axes in sorted(permutations(range(3)), key=lambda axes: (axes != (0, 1, 2), axes != (2, 0, 1))):
-        turned = line if axes == (0, 1, 2) else f"numpy.transpose({line}, {axes})"
-        size = (shape[axes[1]], shape[axes[2]])
-        if size == packed and (packed != whole or frames.dtype == np.uint8):
-            made = _as_bytes(turned, frames.dtype)
-            if made is not None:
-                return made
+    packed, whole, dtype = (height, -(-width // 8)), (height, width), frames.dtype
+    for axes in ((0, 1, 2), (2, 0, 1), (0, 2, 1)):
+        line = "frames" if axes == (0, 1, 2) else f"numpy.transpose(frames, {axes})"
+        size = frames.shape[axes[1]], frames.shape[axes[2]]
+        if size == packed and dtype.kind in "iuf" and (packed != whole or dtype == np.uint8):
+            return line if dtype == np.uint8 else f"{line}.astype(numpy.uint8)"
         if size == whole:
-            return _pack(turned, frames.dtype)
-    if shape[1:] == (-(-height // 8), width) and frames.dtype == np.uint8:
-        return f"numpy.packbits(numpy.unpackbits({line}, axis=1, count={height}), axis=2)"
+            return pack_line(line, dtype)
     return None
-
-
-def _as_bytes(line: str, dtype: np.dtype[Any]) -> str | None:
-    """Extend the line by what makes bytes of packed frames of another type; None where the type holds no bytes."""
-    if dtype == np.uint8:
-        return line
-    if dtype == np.int8:
-        return f"{line}.view(numpy.uint8)"
-    return f"{line}.astype(numpy.uint8)" if dtype.kind in "iuf" else None
-
-
-def _pack(line: str, dtype: np.dtype[Any]) -> str:
-    return f"numpy.packbits({line}, axis=2)" if dtype.kind in "biu" else f"numpy.packbits({line} != 0, axis=2)"
-
-
-def _why_unreadable(file: Path) -> str:
-    """Message about a file that numpy does not load, with the next step."""
-    with file.open("rb") as opened:
-        header = _header(opened)
-        begin, end = opened.tell(), opened.seek(0, io.SEEK_END)
-    if header is not None:
-        shape, _, dtype = header
-        if dtype.hasobject:
-            return (
-                f"holds Python objects of shape {shape}, which are not read; make one array of numbers of them: "
-                "frames = numpy.stack(list(objects))"
-            )
-        size = math.prod(shape) * dtype.itemsize
-        if size > end - begin:
-            return (
-                f"is no whole .npy file: {dtype} of shape {shape} takes {size} bytes, {end - begin} are there; "
-                "copy or write it again"
-            )
-    return "is no whole .npy file of numbers; write it with numpy.save"
-
-
-def _header(opened: BinaryIO) -> tuple[tuple[int, ...], bool, np.dtype[Any]] | None:
-    try:
-        return _HEADERS[np.lib.format.read_magic(opened)](opened)
-    except (*_UNREADABLE, KeyError):
-        return None

@@ -8,6 +8,7 @@ import math
 import re
 import shutil
 from collections.abc import Sequence
+from contextlib import closing
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, Final
@@ -18,12 +19,11 @@ from rig.progress import tell_stage
 from rig.recording.open import MapSpan, fitted_ratio, manifest_or_none, map_spans, open_recording
 from rig.recording.writer import Recording
 from rig.run_folder.folder import RunFolder
-from rig.run_folder.manifest import MANIFEST, UNFINISHED, manifest_crc32, require_inputs, require_plain_sweeps
+from rig.run_folder.manifest import MANIFEST, UNFINISHED, known_missing, manifest_crc32, require_playable
 from rig.run_folder.summary import RunVerdict
 
 OF_MAPS: Final = ("learned", "truth")
 """Folders with a file for each map, which a part takes along."""
-
 _VERDICT_WITHOUT_GAPS: Final = {RunVerdict.GAPS: RunVerdict.COMPLETE, UNFINISHED: RunVerdict.ABORTED}
 """Verdict of a part, by that of the whole: its gaps may lie elsewhere, and a part is over even if the run is not."""
 
@@ -50,39 +50,34 @@ def cut(
 ) -> dict[str, Any]:
     """Write a part of a recording to a new folder and return its manifest (`rig cut`).
 
-    Give exactly one of: maps 'A:B', frames 'A:B' of a run, time 'A:B' in seconds of its frame clock from its first
-    frame; each from A to before B, either left out for the first or the end; a single number means one map or frame.
-    run: the run that frames and time are of.
-    Raises UsageError for a part that does not exist, or where `out` cannot be written, DamagedRecordingError where the
-    recording is not as it was recorded, RecordingError where the disk is full.
+    Give exactly one of: maps 'A:B', frames 'A:B' of run number `run`, time 'A:B' in seconds of its frame clock from its
+    first frame; each from A to before B, either left out for the first or the end; a single number means one map or
+    frame. Raises UsageError for a part that does not exist, or where `out` cannot be written, DamagedRecordingError
+    where the recording is not as it was recorded, RecordingError where the disk is full.
     """
     recording = open_recording(folder)
     manifest, trouble = manifest_or_none(folder)
     if manifest is None:
         raise DamagedRecordingError(f"{folder}: {trouble}")
-    require_inputs(folder, manifest)
-    require_plain_sweeps(folder, manifest)
+    require_playable(folder, manifest)
     spans = map_spans(recording, manifest)
     parts = _parts(recording, spans, maps, frames, time, run)
     with RunFolder(out) as target:
-        written = Recording(target.place("."), expected_bytes=0)
         lost: list[list[int]] = []
-        try:
+        with closing(Recording(target.place("."), expected_bytes=0)) as written:
             for part in parts:
                 written.begin(part.end_map - part.first_map)
                 for block in recording.blocks(part.run, part.first_frame, part.end_frame):
                     written.append(block)
                     tell_stage("writing", written.blocks, unit="blocks")
                 lost += [list(gap) for gap in part.run.gaps() if gap[0] < part.end_frame and gap[1] >= part.first_frame]
-        finally:
-            written.close()
         if written.blocks == 0 or recording.problems:
             raise DamagedRecordingError(
                 f"{folder} is damaged: {'; '.join(recording.problems[:3]) or 'no frame is left there'}; 'rig repair' it"
             )
         content = _manifest(manifest, parts, written.content(), lost)
         try:
-            _copy_inputs(folder, target.place("."), manifest, content["cut"]["maps"])
+            _copy_inputs(folder, target.place("."), manifest, parts)
         except OSError as error:
             raise RecordingError(
                 f"cannot copy {error.filename} to {out}: {error.strerror or error}; free the space it needs or name "
@@ -106,19 +101,15 @@ def _parts(
     name, text = asked[0]
     if name == "--maps":
         return _map_parts(recording, spans, *_range(name, text, 0, len(spans)))
-    if name == "--frames":
-        first, end = _range(name, text, of.first_frame, of.end_frame)
-    else:
-        first_s, end_s = _range_s(text)
-        first = of.first_frame if first_s is None else of.frame_at(first_s)
-        end = of.end_frame if end_s is None else of.frame_at(end_s)
-    if max(first, of.first_frame) >= min(end, of.end_frame):
+    first, end = _range(name, text, of.first_frame, of.end_frame) if name == "--frames" else _time_range(text, of)
+    first, end = max(first, of.first_frame), min(end, of.end_frame)
+    if first >= end:
         raise UsageError(
             f"{name} {text} holds no frame of start {run}, which has {of.first_frame} to {of.end_frame - 1}"
         )
     inside = [i for i, s in enumerate(spans) if s.run == run and s.first_frame >= first and s.end_frame < end]
     maps_in = (inside[0], inside[-1] + 1) if inside else (0, 0)
-    return [Part(of, max(first, of.first_frame), min(end, of.end_frame), *maps_in)]
+    return [Part(of, first, end, *maps_in)]
 
 
 def _map_parts(recording: RunRecording, spans: Sequence[MapSpan], first: int, end: int) -> list[Part]:
@@ -148,14 +139,15 @@ def _range(name: str, text: str, first: int, end: int) -> tuple[int, int]:
     return int(match[1] or first), int(match[3] or end)
 
 
-def _range_s(text: str) -> tuple[float | None, float | None]:
+def _time_range(text: str, of: RecordedRun) -> tuple[int, int]:
     try:
-        first, end = (float(part) if part.strip() else None for part in text.split(":"))
-        if not all(math.isfinite(one) for one in (first, end) if one is not None):
+        first_s, end_s = (float(part) if part.strip() else None for part in text.split(":"))
+        if not all(math.isfinite(one) for one in (first_s, end_s) if one is not None):
             raise ValueError(text)
     except ValueError:
         raise UsageError(f"--time {text!r} is no range; write seconds from the first frame, as 0.5:1.25") from None
-    return first, end
+    first = of.first_frame if first_s is None else of.frame_at(first_s)
+    return first, of.end_frame if end_s is None else of.frame_at(end_s)
 
 
 def _manifest(
@@ -182,22 +174,18 @@ def _manifest(
             "clock_ratios": [_clock_ratio(manifest, part, i == 0) for i, part in enumerate(parts)],
         },
     }
-    if "repaired" in manifest:
-        content |= {"repaired": manifest["repaired"], "missing": _missing(manifest.get("missing") or [], parts)}
+    if (known := known_missing(manifest)) is not None:
+        missing = [
+            [number, first, last]
+            for number, part in enumerate(parts)
+            for run, first, last in known
+            if run == part.run.number and part.first_frame < first and last < part.end_frame - 1
+        ]
+        content |= {"repaired": manifest["repaired"], "missing": missing}
     if sweeps is not None:
         content["sweeps"] = sweeps[first_map:end_map]
         content["maps"] = end_map - first_map
     return content
-
-
-def _missing(known: Sequence[Sequence[int]], parts: Sequence[Part]) -> list[list[int]]:
-    """Gaps [run, first, last] that a repair found in the whole, as far as they lie within the parts."""
-    return [
-        [number, first, last]
-        for number, part in enumerate(parts)
-        for run, first, last in known
-        if run == part.run.number and part.first_frame < first and last < part.end_frame - 1
-    ]
 
 
 def _clock_ratio(manifest: dict[str, Any], part: Part, is_first: bool) -> float:
@@ -208,14 +196,13 @@ def _clock_ratio(manifest: dict[str, Any], part: Part, is_first: bool) -> float:
     return fitted_ratio(ratio, sweeps[: part.first_map] if is_first else ())
 
 
-def _copy_inputs(folder: Path, out: Path, manifest: dict[str, Any], maps: Sequence[int]) -> None:
+def _copy_inputs(folder: Path, out: Path, manifest: dict[str, Any], parts: Sequence[Part]) -> None:
     """Copy the files beside the frames; files of maps are numbered from 0 again, as the part's maps are."""
     for name in manifest.get("inputs") or {}:
         shutil.copyfile(folder / name, out / name)
-    before = (manifest.get("cut") or {}).get("maps", [0])[0]
     for kind in OF_MAPS:
-        for i in range(maps[0] - before, maps[1] - before):
+        for number, i in enumerate(range(parts[0].first_map, parts[-1].end_map)):
             file = folder / kind / f"{i:06d}.npz"
             if file.exists():
                 (out / kind).mkdir(exist_ok=True)
-                shutil.copyfile(file, out / kind / f"{i - (maps[0] - before):06d}.npz")
+                shutil.copyfile(file, out / kind / f"{number:06d}.npz")

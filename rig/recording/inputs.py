@@ -1,9 +1,8 @@
 """Plan and calibration beside the frames of a recording, which give them meaning without the rig.
 
-`write_inputs` writes them, `read_plan` and `read_model` read them. `to_plain` and `from_plain` turn dataclasses into
-plain values for YAML and JSON and back, exactly: fractions become text ("100000/3"), arrays their dtype and values;
-floats are written so that they read back as the same number. Fields that a dataclass computes for itself (init=False)
-are left out, and so are fields marked `SINCE` while they have no value, so that older files can still be read.
+`to_plain` and `from_plain` turn dataclasses into plain values for YAML and JSON and back, exactly: fractions become
+text ("100000/3"), arrays their dtype and values. Fields that a dataclass computes for itself (init=False) are left out,
+and so are fields marked `SINCE` while they have no value, so that older files can still be read.
 """
 
 import re
@@ -106,10 +105,9 @@ def _require_sizes(plan: ScanPlan) -> None:
 
 
 def holds_frames_alone(folder: Path) -> bool:
-    """Whether a recording has no plan and never had one, as imported frames.
+    """Whether a recording has no plan and never had one, as imported frames: no manifest and no marker tells of one.
 
-    That is so where neither its manifest nor a marker tells of one. DamagedRecordingError where the manifest is
-    damaged.
+    DamagedRecordingError where the manifest is damaged.
     """
     if (folder / PLAN_FILE).exists() or PLAN_FILE in ((read_manifest(folder) or {}).get("inputs") or {}):
         return False
@@ -170,8 +168,13 @@ def _read(kind: Any, content: Any, where: str) -> Any:
     origin, inner = get_origin(kind), get_args(kind)
     if origin in (Union, types.UnionType):
         return None if content is None else _read(next(one for one in inner if one is not type(None)), content, where)
-    if is_dataclass(kind):
-        return _read_dataclass(kind, content, where)
+    of_fields: bool = is_dataclass(kind)
+    if of_fields:
+        given, hints = _need(content, Mapping, where), get_type_hints(kind)
+        names = [of.name for of in fields(kind) if of.init and (SINCE not in of.metadata or of.name in given)]
+        if odd := ", ".join(sorted(set(names) ^ set(given))):
+            raise ValueError(f"{where}: {odd} is unknown or missing; it was written by another version of the program")
+        return kind(**{name: _read(hints[name], given[name], f"{where}.{name}") for name in names})
     if origin is np.ndarray:
         dtype = np.dtype(_need(content, Mapping, where)["dtype"])
         if dtype.kind not in "biuf":
@@ -192,18 +195,6 @@ def _read(kind: Any, content: Any, where: str) -> Any:
             return content
         raise ValueError(f"{where} is {content!r}; it must be one of {', '.join(map(str, inner))}")
     return _need(content, kind, where)
-
-
-def _read_dataclass(kind: Any, content: Any, where: str) -> Any:
-    given = _need(content, Mapping, where)
-    hints = get_type_hints(kind)
-    names = [
-        field.name for field in fields(kind) if field.init and (SINCE not in field.metadata or field.name in given)
-    ]
-    if set(names) != set(given):
-        odd = ", ".join(sorted(set(names) ^ set(given)))
-        raise ValueError(f"{where}: {odd} is unknown or missing; it was written by another version of the program")
-    return kind(**{name: _read(hints[name], given[name], f"{where}.{name}") for name in names})
 
 
 def _need(content: Any, kind: Any, where: str) -> Any:

@@ -1,12 +1,5 @@
-"""Opens recordings for the commands that read one, and says what they hold and which frames belong to which map.
+"""Opens recordings for the commands that read one, and says what they hold and which frames belong to which map."""
 
-`open_recording` opens one, `info` describes it from index and manifest (`verify` reads all of it), and `map_spans`
-finds the frames of each map: as the manifest says or, for a run that ended early, its markers. The rest is about where
-the starts of a recording begin and end, and what a part (`rig cut`) takes over from the whole, so that its maps come
-out the same bit for bit. What is wrong with a folder is a UsageError: its user can mend it.
-"""
-
-import zipfile
 from collections.abc import Iterator, Sequence
 from dataclasses import asdict, dataclass
 from itertools import pairwise
@@ -14,19 +7,14 @@ from pathlib import Path
 from typing import Any, Final
 
 import numpy as np
+from numpy.typing import NDArray
 
-from calibration.files.npy_files import load_numpy
-from calibration.model.rig_model import RigModel
 from drivers.errors import DeviceNotFound, ProtocolError
 from drivers.frames import FrameBlock, Mark
 from drivers.recorded import RecordedRun, RunRecording
 from drivers.recorded.segments import PACKED_SUFFIX, segment_files
-from rig.config.models import EstimateConfig
 from rig.count.bind import MAX_RESIDUAL_COLUMNS
-from rig.count.sweeps import Gap, SweepStart
 from rig.errors import DamagedRecordingError, UsageError
-from rig.estimate.registry import LEARNING
-from rig.estimate.row.model import RowModel
 from rig.plan.scan_plan import MAX_CLOCK_ERROR
 from rig.run_folder.manifest import MANIFEST, RunGap, ended_before_last_map, is_cut_short, known_missing, read_manifest
 
@@ -53,12 +41,11 @@ def require_recording(path: Path) -> None:
 
 def _instead(path: Path) -> str:
     """Say what a path without a recording is, and the next step."""
+    name_one = "name the folder of a run taken with --record"
     if path.is_file():
-        recorded = path.match(f"{SEGMENTS}*")
-        then = "the folder that it lies in" if recorded else "the folder of a run taken with --record"
-        return f"is a file; name {then}"
+        return "is a file; " + ("name the folder that it lies in" if path.match(f"{SEGMENTS}*") else name_one)
     if not path.exists():
-        return "does not exist; name the folder of a run taken with --record"
+        return f"does not exist; {name_one}"
     inside = sorted(part for part in path.iterdir() if part.is_dir() and segment_files(part))
     if inside:
         more = "" if len(inside) == 1 else f" or another of {len(inside)} in it"
@@ -75,7 +62,7 @@ def _instead(path: Path) -> str:
                 f"'rig import {kind} {path} --out DIR' makes a recording of them"
             )
     what = "a folder without a recording" if any(path.iterdir()) else "an empty folder"
-    return f"is {what}: no {SEGMENTS}; name the folder of a run taken with --record"
+    return f"is {what}: no {SEGMENTS}; {name_one}"
 
 
 def manifest_or_none(folder: Path) -> tuple[dict[str, Any] | None, str | None]:
@@ -126,12 +113,11 @@ def _stated(recording: RunRecording, sweeps: list[dict[str, Any]]) -> Iterator[M
 def _marked(recording: RunRecording) -> Iterator[MapSpan]:
     """Spans between markers; a map whose beginning or end was lost has the frames that are left."""
     for run in recording.runs:
-        begins = [frame for _, frame in _sweep_begins(recording, run)]
-        yield from (MapSpan(run.number, a, b) for a, b in pairwise(begins))
+        yield from (MapSpan(run.number, a, b) for a, b in pairwise(_sweep_begins(recording, run)))
 
 
-def _sweep_begins(recording: RunRecording, run: RecordedRun) -> Iterator[tuple[int, int]]:
-    """(number of scan markers so far, first frame with them), for each scan marker except those before the run."""
+def _sweep_begins(recording: RunRecording, run: RecordedRun) -> Iterator[int]:
+    """The frame of each scan marker except those before the run."""
     entries = run.entries
     changes = np.flatnonzero(np.diff(entries["sweep"].astype(np.int64), prepend=-1) != 0)
     look_into = sorted({0, len(entries) - 1, *changes.tolist(), *(changes[1:] - 1).tolist()})
@@ -140,32 +126,30 @@ def _sweep_begins(recording: RunRecording, run: RecordedRun) -> Iterator[tuple[i
         block = recording.read(run, entries[i])
         if block is None or block.n_frames == 0:
             continue
-        counts = _markers_seen(block)
-        before = counts[0] if i == 0 and not _begins_sweep(block) else seen
-        for at in np.flatnonzero(np.diff(counts, prepend=before) > 0):
-            yield int(counts[at]), block.header.first_frame + int(at)
+        counts = markers_seen(block)
+        before = counts[0] if i == 0 and not begins_sweep(block) else seen
+        yield from (block.header.first_frame + np.flatnonzero(np.diff(counts, prepend=before) > 0)).tolist()
         seen = int(counts[-1])
 
 
-def _markers_seen(block: FrameBlock) -> np.ndarray[Any, np.dtype[np.int64]]:
+def markers_seen(block: FrameBlock) -> NDArray[np.int64]:
     """Number of scan markers in the run up to each frame: a record's low 16 bits, continued from the header's 32."""
     sweep = block.header.sweep
-    return sweep + ((block.records["sweep"].astype(np.int64) - sweep) & 0xFFFF)
+    return np.asarray(sweep + ((block.records["sweep"].astype(np.int64) - sweep) & 0xFFFF))
 
 
-def _begins_sweep(block: FrameBlock) -> bool:
+def begins_sweep(block: FrameBlock) -> bool:
     """Whether the first frame of a block has a scan marker of its own."""
     return bool(int(block.records["marks"][0]) & Mark.SCAN)
 
 
 @dataclass(frozen=True, slots=True)
 class RunInfo:
-    """One start of the SPAD, with frames first_frame to end_frame - 1.
+    """One start of the SPAD, with frames first_frame to end_frame - 1 and maps first_map to end_map - 1.
 
     gaps: number of missing pieces between its frames and, as a repair found, at its ends. lost: frames in these.
-    width, height: pixels of a frame; sensor_width, sensor_height: of the sensor.
-    first_map, end_map: its maps, from the first to before the end; None where it has none.
-    duration_s: from the first frame to the end of the last one; without a frame period, to the last block's start.
+    width, height: pixels of a frame. duration_s: from the first frame to the end of the last one; without a frame
+    period, to the last block's start.
     """
 
     run_id: int
@@ -188,8 +172,8 @@ class RunInfo:
 class RecordingInfo:
     """Contents of a recording.
 
-    verdict: the run's own. compressed: number of compressed segments. bytes: size on the disk.
-    problems: a line each, as far as they can be seen without reading the frames.
+    verdict: the run's own. compressed: number of compressed segments. bytes: size on the disk. problems: a line each,
+    as far as they can be seen without reading the frames.
     """
 
     folder: Path
@@ -218,9 +202,7 @@ def info(folder: Path) -> RecordingInfo:
     spans = map_spans(recording, manifest)
     files = list(segment_files(folder).values())
     content = manifest or {}
-    maps_of = {run.number: [i for i, span in enumerate(spans) if span.run == run.number] for run in recording.runs}
     known = known_missing(manifest) or []
-    runs = [_run_info(run, maps_of[run.number], [g[1:] for g in known if g[0] == run.number]) for run in recording.runs]
     return RecordingInfo(
         folder=folder,
         verdict=content.get("verdict"),
@@ -230,7 +212,7 @@ def info(folder: Path) -> RecordingInfo:
         blocks=sum(len(run.entries) for run in recording.runs),
         frames=recording.frames,
         maps=sum(_is_there(span, recording.runs[span.run], content) for span in spans),
-        runs=runs,
+        runs=[_run_info(run, spans, known) for run in recording.runs],
         config=(content.get("config") or {}).get("name"),
         devices={slot: str(of.get("name")) for slot, of in (content.get("devices") or {}).items()},
         versions=content.get("versions") or {},
@@ -239,20 +221,18 @@ def info(folder: Path) -> RecordingInfo:
 
 
 def _is_there(span: MapSpan, run: RecordedRun, manifest: dict[str, Any]) -> bool:
-    """Whether a map can be made of what a repair left.
-
-    In a part, which has no frames before its first map, only whole maps can.
-    """
+    """Whether a map can be made of what a repair left: in a part, without frames before its maps, of a whole one."""
     if "repaired" not in manifest:
         return True
     begin = span.first_frame if "cut" in manifest else span.end_frame - 1
     return begin >= run.first_frame and span.end_frame < run.end_frame
 
 
-def _run_info(run: RecordedRun, maps: list[int], known: list[Gap]) -> RunInfo:
+def _run_info(run: RecordedRun, spans: Sequence[MapSpan], known: Sequence[RunGap]) -> RunInfo:
     header, entries = run.header, run.entries
-    ends = {gap for gap in known if gap[1] < run.first_frame or gap[0] >= run.end_frame}
-    gaps = [*run.gaps(), *ends]
+    maps = [i for i, span in enumerate(spans) if span.run == run.number]
+    of_run = {(first, last) for number, first, last in known if number == run.number}
+    gaps = [*run.gaps(), *(gap for gap in of_run if gap[1] < run.first_frame or gap[0] >= run.end_frame)]
     period = header.frame_period_ticks
     last_tick = int(entries["t0_ticks"][-1]) + int(entries["n_frames"][-1]) * period
     return RunInfo(
@@ -273,43 +253,6 @@ def _run_info(run: RecordedRun, maps: list[int], known: list[Gap]) -> RunInfo:
     )
 
 
-def end_block(recording: RunRecording, run: RecordedRun, *, last: bool) -> FrameBlock | None:
-    """The first or the last sound block of a start with a frame in it; None where there is none."""
-    entries = run.entries[::-1] if last else run.entries
-    return next((b for entry in entries if (b := recording.read(run, entry)) is not None and b.n_frames), None)
-
-
-def readable_range(recording: RunRecording, run: RecordedRun) -> tuple[int, int]:
-    """First frame of a start and the one behind its last, in sound blocks; (first, first) where no block is sound."""
-    first, last = (end_block(recording, run, last=end) for end in (False, True))
-    if first is None or last is None:
-        return run.first_frame, run.first_frame
-    return first.header.first_frame, last.header.first_frame + last.n_frames
-
-
-def end_gaps(recording: RunRecording) -> list[RunGap]:
-    """Gaps that a repair found, and the frames of damaged blocks at the ends of starts."""
-    known = known_missing(read_manifest(recording.path)) if recording.path.is_dir() else None
-    gaps = list(dict.fromkeys(known or ()))
-    for run in recording.runs:
-        first, end = readable_range(recording, run)
-        gaps += [(run.number, run.first_frame, first - 1)] if first > run.first_frame else []
-        gaps += [(run.number, end, run.end_frame - 1)] if end < run.end_frame else []
-    return sorted(gaps)
-
-
-def part_starts(recording: RunRecording) -> list[SweepStart]:
-    """The sweep that the maps of each run begin with: the first one, except in a part."""
-    cut = (read_manifest(recording.path) or {}).get("cut") if recording.path.is_dir() else None
-    if cut is None:
-        return [SweepStart() for _ in recording.runs]
-    ratios = cut.get("clock_ratios") or []
-    return [
-        SweepStart(_first_sweep(recording, run), float(ratios[run.number]) if run.number < len(ratios) else 1.0)
-        for run in recording.runs
-    ]
-
-
 def fitted_ratio(ratio: float, sweeps: Sequence[dict[str, Any]]) -> float:
     """Ratio of the scanner's clock to nominal after these sweeps of a manifest; `ratio` is the one before the first."""
     for i, sweep in enumerate(sweeps):
@@ -319,39 +262,3 @@ def fitted_ratio(ratio: float, sweeps: Sequence[dict[str, Any]]) -> float:
         if residual is not None and residual <= MAX_RESIDUAL_COLUMNS and abs(error) <= MAX_CLOCK_ERROR:
             ratio = 1 + error
     return ratio
-
-
-def part_learned(folder: Path, estimate: EstimateConfig, model: RigModel | None) -> list[RowModel]:
-    """States that the maps of a part were estimated with, where it is estimated as the whole was; otherwise none.
-
-    None for a whole recording either: it learns the same again from its first map on.
-    """
-    manifest: dict[str, Any] = (read_manifest(folder) or {}) if folder.is_dir() else {}
-    before = (manifest.get("config") or {}).get("estimate") or {}
-    same = before.get("estimator") == estimate.estimator and estimate.estimator in LEARNING
-    if estimate.estimator == "joint":  # recordings from before there was a prior have none
-        same = same and before.get("temporal_prior", False) == estimate.temporal_prior
-    calibration = (manifest.get("calibration") or {}).get("id")
-    if "cut" not in manifest or not same or model is None or calibration != model.fingerprint():
-        return []
-    states = []
-    for i in range(manifest["cut"]["maps"][1] - manifest["cut"]["maps"][0]):
-        file = folder / "learned" / f"{i:06d}.npz"
-        if not file.exists():  # the whole kept those of some maps only
-            return []
-        try:
-            with load_numpy(file) as arrays:
-                states.append(RowModel.from_arrays(dict(arrays)))
-        except (OSError, ValueError, KeyError, zipfile.BadZipFile) as error:
-            raise DamagedRecordingError(f"{file} is not readable ({error}); move it away to learn anew") from error
-    return states
-
-
-def _first_sweep(recording: RunRecording, run: RecordedRun) -> int:
-    """Number of the first sweep that begins in a run: a part may begin in the middle of one."""
-    block = end_block(recording, run, last=False)
-    if block is None:
-        raise DamagedRecordingError(
-            f"{recording.path}: no block of start {run.number} is sound; take it from the whole"
-        )
-    return block.header.sweep - _begins_sweep(block)

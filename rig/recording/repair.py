@@ -10,7 +10,7 @@ import os
 from collections.abc import Iterator
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any, Final
+from typing import Any, BinaryIO, Final
 
 import numpy as np
 
@@ -18,7 +18,6 @@ from drivers.errors import CorruptBlock
 from drivers.recorded.contents import INDEX_FILE, index_header, round_up_to_page
 from drivers.recorded.segments import PACKED_SUFFIX, PlainSegment, SegmentReader
 from rig.errors import RecordingError, UsageError
-from rig.recording.check import SoundBlock
 from rig.recording.verify import Examination, Verification, examine, verify
 from rig.recording.writer import RESERVE_FILE
 from rig.run_folder.folder import is_held, replace_file, sync_folder
@@ -26,7 +25,6 @@ from rig.run_folder.manifest import MANIFEST, UNFINISHED, device_counters, ended
 from rig.run_folder.summary import RunVerdict
 
 _PIECE_BYTES: Final = 1 << 24
-
 Range = tuple[int, int]
 """Bytes of a segment, from the first to before the second number."""
 
@@ -52,9 +50,14 @@ def repair(folder: Path) -> Repair:
         if _put_in_order(found, done):
             found = examine(folder)
         for segment in found.segments:
+            mine = np.sort(found.entries[found.entries["segment"] == segment.number], order="offset")
+            ends = (mine["offset"] + mine["length"]).tolist()
             mend = _clear if isinstance(segment, PlainSegment) else _unpack
-            mend(segment, _blocks_in(segment, found), done)
-        _write_index(folder, found, done)
+            mend(segment, list(zip(mine["offset"].tolist(), ends, strict=True)), done)
+        index = index_header() + np.sort(found.entries, order=["segment", "offset"]).tobytes()
+        if not ((folder / INDEX_FILE).exists() and (folder / INDEX_FILE).read_bytes() == index):
+            replace_file(folder / INDEX_FILE, index)
+            done.append(f"{INDEX_FILE} written anew, of {len(found.entries)} blocks")
         _write_manifest(folder, found, done)
         (folder / RESERVE_FILE).unlink(missing_ok=True)
         sync_folder(folder)
@@ -81,20 +84,14 @@ def _put_in_order(found: Examination, done: list[str]) -> bool:
     return True
 
 
-def _blocks_in(segment: SegmentReader, found: Examination) -> list[Range]:
-    """Ranges of the sound blocks of a segment, in order."""
-    mine = found.entries[found.entries["segment"] == segment.number]
-    begin = np.sort(mine, order="offset")
-    return list(zip(begin["offset"].tolist(), (begin["offset"] + begin["length"]).tolist(), strict=True))
-
-
 def _clear(segment: SegmentReader, blocks: list[Range], done: list[str]) -> None:
     """Zero what is no sound block and end the segment behind the last one, after copying it to the torn file."""
     end = round_up_to_page(blocks[-1][1]) if blocks else 0
     others = [(a, used) for a, b in _between(blocks, segment.size) if (used := _used(segment, a, b)) > a]
     if others:
         torn = segment.path.with_suffix(".torn")
-        _keep(segment, others, torn)
+        with torn.open("rb+" if torn.exists() else "wb") as copy:
+            _copy(segment, others, copy)
         done.append(f"{segment.path.name}: {len(others)} pieces that are no sound block are kept in {torn.name}")
     if not blocks:
         segment.path.unlink()
@@ -125,11 +122,8 @@ def _unpack(segment: SegmentReader, blocks: list[Range], done: list[str]) -> Non
     if blocks:
         scratch = plain.with_name(f"{plain.name}.part")
         with scratch.open("wb") as file:
-            for begin, stop in blocks:
-                file.seek(begin)
-                file.write(segment.at(begin, stop - begin).data)
             file.truncate(end)
-            os.fsync(file.fileno())
+            _copy(segment, blocks, file)
         scratch.replace(plain)
     segment.path.rename(torn)
     kept = f"its sound blocks are in {plain.name}, plain" if blocks else "it holds no sound block"
@@ -159,23 +153,13 @@ def _used(segment: SegmentReader, begin: int, stop: int) -> int:
     return stop - int((data[::-1] != 0).argmax()) if data.any() else begin
 
 
-def _keep(segment: SegmentReader, pieces: list[Range], torn: Path) -> None:
+def _copy(segment: SegmentReader, pieces: list[Range], file: BinaryIO) -> None:
     """Copy pieces of a segment to the same places of another file, which is on the disk when this returns."""
-    with torn.open("rb+" if torn.exists() else "wb") as copy:
-        for begin, stop in pieces:
-            copy.seek(begin)
-            copy.write(segment.at(begin, stop - begin).data)
-        copy.flush()
-        os.fsync(copy.fileno())
-
-
-def _write_index(folder: Path, found: Examination, done: list[str]) -> None:
-    data = index_header() + np.sort(found.entries, order=["segment", "offset"]).tobytes()
-    file = folder / INDEX_FILE
-    if file.exists() and file.read_bytes() == data:
-        return
-    replace_file(file, data)
-    done.append(f"{INDEX_FILE} written anew, of {len(found.entries)} blocks")
+    for begin, stop in pieces:
+        file.seek(begin)
+        file.write(segment.at(begin, stop - begin).data)
+    file.flush()
+    os.fsync(file.fileno())
 
 
 def _write_manifest(folder: Path, found: Examination, done: list[str]) -> None:
@@ -200,9 +184,14 @@ def _write_manifest(folder: Path, found: Examination, done: list[str]) -> None:
         for number, first, last in dict.fromkeys(found.joined.missing)
     ]
     done += [f"{line}; left out" for line in device_counters(manifest)[1]]
+    verdict, blocks = manifest["verdict"], (manifest.get("recording") or {}).get("blocks")
+    if missing or (verdict != UNFINISHED and blocks is not None and blocks > recording["blocks"]):
+        verdict = RunVerdict.GAPS
+    elif verdict == UNFINISHED:
+        verdict = RunVerdict.ABORTED
     content: dict[str, Any] = {
         **{key: value for key, value in manifest.items() if key != "counters"},
-        "verdict": _verdict(manifest, recording, missing),
+        "verdict": verdict,
         "recording": recording,
         "missing": missing,
         "repaired": [*(manifest.get("repaired") or []), *done],
@@ -212,28 +201,20 @@ def _write_manifest(folder: Path, found: Examination, done: list[str]) -> None:
     replace_file(folder / MANIFEST, (sealed_text(json.dumps(content)) + "\n").encode())
 
 
-def _verdict(manifest: dict[str, Any], recording: dict[str, Any], missing: list[Any]) -> str:
-    before = (manifest.get("recording") or {}).get("blocks")
-    if missing or (manifest["verdict"] != UNFINISHED and before is not None and before > recording["blocks"]):
-        return RunVerdict.GAPS
-    return RunVerdict.ABORTED if manifest["verdict"] == UNFINISHED else str(manifest["verdict"])
-
-
 def _recording(found: Examination) -> dict[str, Any]:
     """Describe the recording as `Recording.content` does; its starts only where the manifest does not have them."""
     with_blocks = set(found.entries["segment"].tolist())
     content: dict[str, Any] = {
-        "files": [s.path.name.removesuffix(".zst") for s in found.segments if s.number in with_blocks],
+        "files": [s.path.name.removesuffix(PACKED_SUFFIX) for s in found.segments if s.number in with_blocks],
         "index": INDEX_FILE,
         "blocks": len(found.entries),
         "bytes": found.bytes,
     }
     if "starts" not in ((found.manifest or {}).get("recording") or {}):
-        content["starts"] = [_start(found, run) for run in found.runs]
+        content["starts"] = starts = []
+        for run in found.runs:  # whole sweeps, as the blocks tell, and the first segment
+            first = run[0].header
+            segments = found.entries["segment"][found.entries["run_id"] == first.run_id]
+            sweeps = max(0, run[-1].last_sweep - max(1, first.sweep))
+            starts.append({"sweeps": sweeps, "segment": int(segments.min())})
     return content
-
-
-def _start(found: Examination, run: list[SoundBlock]) -> dict[str, int]:
-    """Fields of `rig.recording.writer.Start`: whole sweeps of a run, as its blocks tell, and its first segment."""
-    mine = found.entries[found.entries["run_id"] == run[0].run_id]
-    return {"sweeps": max(0, run[-1].last_sweep - max(1, run[0].sweep)), "segment": int(mine["segment"].min())}

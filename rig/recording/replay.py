@@ -1,22 +1,23 @@
 """Prepares a recording for the live stack: its plan and its starts, with other devices recorded, emulated or real.
 
 Frames are bound by the plan that they were taken with (`plan.yaml`), never by one compiled anew, and each start of the
-SPAD is played as one: so a map is made of the very same frames in the very same order, at any clock. `replay_config`
-makes the rig that plays, `ReplaySource` tells a run what it needs to know of the recording.
+SPAD is played as one: so a map is made of the very same frames in the very same order, at any clock.
 """
 
 import itertools
 import zipfile
-from collections.abc import Iterator, Sequence
-from dataclasses import dataclass, replace
+from collections.abc import Callable, Iterator, Sequence
+from dataclasses import asdict, dataclass, replace
 from pathlib import Path
-from typing import Any
+from typing import Any, TypeVar
 
 import numpy as np
+from numpy.typing import NDArray
 
 from calibration.files.npy_files import load_numpy
 from calibration.files.rig_file import CALIBRATION_FILE
 from calibration.model.rig_model import RigModel
+from drivers.frames import FrameBlock
 from drivers.interfaces import SpadArray, SpadTiming, SweepTruth
 from drivers.recorded import RecordedRun, RunRecording
 from drivers.replay.pace import PaceReport, ReplayClock
@@ -25,33 +26,26 @@ from rig.config.files import parse_config
 from rig.config.models import EstimateConfig, RigConfig, ScanConfig
 from rig.count.sweeps import Gap, SweepAccount, SweepStart
 from rig.errors import DamagedRecordingError, UsageError
-from rig.estimate.registry import Learned
+from rig.estimate.registry import LEARNING, Learned
+from rig.estimate.row.model import RowModel
 from rig.plan.compile import spad_request
 from rig.plan.scan_plan import ScanPlan
 from rig.recording.check import merged_gaps
 from rig.recording.inputs import PLAN_FILE, read_plan
-from rig.recording.open import (
-    end_block,
-    end_gaps,
-    fitted_ratio,
-    part_learned,
-    part_starts,
-    readable_range,
-    require_recording,
-)
+from rig.recording.open import begins_sweep, fitted_ratio, markers_seen, require_recording
 from rig.run_folder.manifest import (
     MANIFEST,
     RunGap,
     ended_before_last_map,
     is_cut_short,
+    known_missing,
     read_manifest,
-    require_inputs,
-    require_plain_sweeps,
+    require_playable,
 )
 
+T = TypeVar("T")
 SILENCE_S = 5.0
 """Silence after which a SPAD has failed, as for a live one, in the time of the recording."""
-ENDLESS_S = 1e6
 ENDLESS = 1_000_000_000
 """Number of maps that stands for a loop without end."""
 RECORDED = ("scanner", "laser", "sync")
@@ -81,19 +75,17 @@ class ReplayOptions:
 
 
 def replay_config(run: Path, options: ReplayOptions, others: RigConfig | None, estimate: dict[str, Any]) -> RigConfig:
-    """Make the config of the rig that plays a recording.
+    """Make the config of the rig that plays a recording. UsageError where there is none.
 
     others: rig whose world, scanner, laser and sync source take part; None plays the recorded ones.
     estimate: settings laid over those of the recording.
-    Raises UsageError where there is no recording.
     """
     require_recording(run)
     plan = read_plan(run)
     manifest = read_manifest(run)
     if manifest is None:
         raise DamagedRecordingError(f"{run / MANIFEST} is missing; 'rig repair' writes a new one")
-    require_inputs(run, manifest)
-    require_plain_sweeps(run, manifest)
+    require_playable(run, manifest)
     recorded = manifest.get("config") or {}
     calibration = run / CALIBRATION_FILE
     given = {key: value for key, value in estimate.items() if value is not None}
@@ -103,13 +95,7 @@ def replay_config(run: Path, options: ReplayOptions, others: RigConfig | None, e
         "calibration": str(calibration.absolute()) if calibration.exists() else None,
         "calibration_max_age": recorded.get("calibration_max_age"),
         "world": None,
-        "spad": {
-            "kind": "replay",
-            "recording": str(run.absolute()),
-            "clock": options.clock,
-            "loop": options.loop,
-            "block_frames": options.block_frames,
-        },
+        "spad": {"kind": "replay", "recording": str(run.absolute()), **asdict(options)},
         **{slot: {"kind": "replay"} for slot in RECORDED},
         "scan": scan,
         "estimate": {**(recorded.get("estimate") or {}), **given},
@@ -124,23 +110,13 @@ def replay_config(run: Path, options: ReplayOptions, others: RigConfig | None, e
 def replay_plan(
     spad: SpadArray, recording: RunRecording, scan: ScanConfig, model: RigModel | None
 ) -> tuple[ScanPlan, SpadTiming]:
-    """The plan that the frames were taken with, for the present calibration, and the timing of the configured SPAD."""
+    """The plan that the frames were taken with, for the present calibration, and the timing of the configured SPAD.
+
+    DamagedRecordingError where the frames are of another size than the plan's, which counters are made by.
+    """
+    from rig.plan.calibration_reach import recalibrated, whole_rows
+
     plan = read_plan(recording.path)
-    _require_frames_of(plan, recording)
-    if model is not None:
-        from rig.plan.calibration_reach import recalibrated
-
-        plan = recalibrated(plan, model)
-    elif not plan.windowed:
-        from rig.plan.calibration_reach import whole_rows
-
-        plan = whole_rows(plan)
-    request = replace(spad_request(scan, plan), frame_rate_hz=plan.frame_rate_hz, exposure_s=plan.exposure_s)
-    return plan, spad.configure(request)
-
-
-def _require_frames_of(plan: ScanPlan, recording: RunRecording) -> None:
-    """Raise DamagedRecordingError where the frames are of another size than the plan's, which counters are made by."""
     widths = {plan.width} if plan.windows is None else {plan.width, plan.windows.width_px}
     for run in recording.runs:
         header = run.header
@@ -149,10 +125,16 @@ def _require_frames_of(plan: ScanPlan, recording: RunRecording) -> None:
                 f"{recording.path}: the frames of start {run.number} are {header.width} x {header.height} pixels of a "
                 f"sensor {header.sensor_width} wide, {PLAN_FILE} is for {plan.width} x {plan.rows}; take it from a copy"
             )
+    if model is not None:
+        plan = recalibrated(plan, model)
+    elif not plan.windowed:
+        plan = whole_rows(plan)
+    request = replace(spad_request(scan, plan), frame_rate_hz=plan.frame_rate_hz, exposure_s=plan.exposure_s)
+    return plan, spad.configure(request)
 
 
 class ReplaySource:
-    """Facts about a recording for the run that plays it. maps: how many the run will take."""
+    """Facts about a recording for the run that plays it. maps: how many the run will take; None: all there are."""
 
     def __init__(self, spad: ReplaySpad, plan: ScanPlan, maps: int | None) -> None:
         self._spad = spad
@@ -162,7 +144,7 @@ class ReplaySource:
         self._played = [start for start in starts if start.sweeps]
         self._numbers = [start.first_map + i for start in starts for i in range(start.sweeps)]
         spad.leave_out({run.number for run in spad.recording.runs} - {start.number for start in self._played})
-        self._gone = merged_gaps([*end_gaps(spad.recording), *(gap for start in starts for gap in start.gone)])
+        self._gone = merged_gaps([*_end_gaps(spad.recording), *(gap for start in starts for gap in start.gone)])
         there = self._there = len(self._numbers)
         if there == 0:
             lost = sum(last + 1 - first for _, first, last in self._gone)
@@ -186,7 +168,7 @@ class ReplaySource:
     def silence_s(self) -> float:
         """Longest silence of the SPAD that is allowed: more at a slow clock, and no limit while it waits for steps."""
         pace = self._spad.pace
-        return ENDLESS_S if pace.stepping else SILENCE_S / min(1.0, pace.speed or 1.0)
+        return 1e6 if pace.stepping else SILENCE_S / min(1.0, pace.speed or 1.0)
 
     def groups(self) -> Iterator[int]:
         """Give the number of sweeps of each start, one after the other."""
@@ -204,15 +186,13 @@ class ReplaySource:
 
     def learned(self, estimate: EstimateConfig, model: RigModel | None) -> Sequence[Learned]:
         """States that the maps of a part were estimated with; empty where they are to be learned anew."""
-        learned = part_learned(self._spad.recording.path, estimate, model)
+        learned = _part_learned(self._spad.recording.path, estimate, model)
         return [learned[number] for number in self._numbers if number < len(learned)]
 
     def truth(self, index: int) -> SweepTruth | None:
-        """Truth of a map that was recorded with it; None where it was not kept.
-
-        DamagedRecordingError where it is of other columns or of another sensor.
-        """
-        truth = recorded_truth(self._spad.recording.path, self._numbers[index % self._there])
+        """Truth of a map that was recorded with it; None where it was not kept. DamagedRecordingError if of others."""
+        file = self._spad.recording.path / "truth" / f"{self._numbers[index % self._there]:06d}.npz"
+        truth = _kept(file, lambda arrays: SweepTruth(x_px=arrays["x_px"], depth_m=arrays["depth_m"]))
         if truth is not None and (truth.x_px.shape, truth.depth_m.shape) != self._shapes:
             raise DamagedRecordingError(
                 f"{self._spad.recording.path}: the truth of map {index} is of {truth.x_px.shape} and "
@@ -221,10 +201,7 @@ class ReplaySource:
         return truth
 
     def lost_outside(self, sweeps: Sequence[SweepAccount]) -> list[Gap]:
-        """Frames (first, last) known to be gone from the recording and outside all these sweeps.
-
-        Empty where fewer maps were asked for than there are.
-        """
+        """Frames (first, last) gone outside all these sweeps; empty where fewer maps were asked for than there are."""
         if not self._all:
             return []
         spans = _by_start(sweeps, [start.number for start in self._played])
@@ -249,7 +226,7 @@ class RecordedStart:
     begin: SweepStart
     first_map: int
     sweeps: int
-    gone: tuple[RunGap, ...]
+    gone: tuple[RunGap, ...] = ()
 
 
 def recorded_sweeps(recording: RunRecording, plan: ScanPlan) -> list[RecordedStart]:
@@ -258,9 +235,8 @@ def recorded_sweeps(recording: RunRecording, plan: ScanPlan) -> list[RecordedSta
     DamagedRecordingError where a start is missing: its maps would be taken for those of others.
     """
     manifest = read_manifest(recording.path) or {}
-    noted = manifest.get("recording") or {}
-    begins = part_starts(recording)
-    starts = noted.get("starts")
+    begins = _part_starts(recording)
+    starts = (manifest.get("recording") or {}).get("starts")
     if not starts:
         planned = [_whole_sweeps(recording, run, plan) for run in recording.runs]
     else:
@@ -273,31 +249,23 @@ def recorded_sweeps(recording: RunRecording, plan: ScanPlan) -> list[RecordedSta
                 "first; take the missing segments from a copy"
             )
         planned = [min(sweeps, run.frames) for sweeps, run in zip(planned, recording.runs, strict=False)]
-    sweeps = manifest.get("sweeps")
     taken: list[RecordedStart] = []
     first_map = 0
     for run, begin, of_run in zip(recording.runs, begins, planned, strict=False):
-        mine = None if sweeps is None else sweeps[first_map : first_map + of_run]
-        taken.append(_recorded_start(recording, run, begin, first_map, of_run, mine, manifest, plan))
+        start = RecordedStart(run.number, begin, first_map, of_run)
+        taken.append(_what_is_left(start, recording, run, plan, manifest))
         first_map += of_run
     return taken
 
 
-def _recorded_start(
-    recording: RunRecording,
-    run: RecordedRun,
-    begin: SweepStart,
-    first_map: int,
-    maps: int,
-    sweeps: Sequence[dict[str, Any]] | None,
-    manifest: dict[str, Any],
-    plan: ScanPlan,
+def _what_is_left(
+    start: RecordedStart, recording: RunRecording, run: RecordedRun, plan: ScanPlan, manifest: dict[str, Any]
 ) -> RecordedStart:
-    """Describe a start that gave `maps` maps from number `first_map` on.
-
-    sweeps: those of the start in the manifest; None where they are not noted.
-    """
-    first, end = readable_range(recording, run)
+    """The part of a start, as the run took it, whose frames are there."""
+    first, end = _readable_range(recording, run)
+    begin, first_map, maps = start.begin, start.first_map, start.sweeps
+    noted = manifest.get("sweeps")
+    sweeps = None if noted is None else noted[first_map : first_map + maps]
     whole = maps
     cut_short = is_cut_short(manifest) or ended_before_last_map(manifest)
     if plan.blanking is None or sweeps is None or cut_short or recording.problems:
@@ -330,31 +298,90 @@ def _by_start(sweeps: Sequence[SweepAccount], numbers: Sequence[int]) -> dict[in
     return spans
 
 
-def recorded_truth(folder: Path, index: int) -> SweepTruth | None:
-    """Read the truth of a map that a world knew when it was recorded; None where there is none."""
-    file = folder / "truth" / f"{index:06d}.npz"
+def _whole_sweeps(recording: RunRecording, run: RecordedRun, plan: ScanPlan) -> int:
+    """Complete sweeps of a start, by its markers or else by its frames; never more than these, whatever headers say."""
+    if plan.blanking is not None:
+        frames = float(plan.frames_per_sweep)
+        return min(run.frames, max(0, int((_readable_range(recording, run)[1] - plan.frames_for(0)) / frames)))
+    last = _end_block(recording, run, last=True)
+    return 0 if last is None else min(run.frames, max(0, int(markers_seen(last).max()) - 1))
+
+
+def _end_block(recording: RunRecording, run: RecordedRun, *, last: bool) -> FrameBlock | None:
+    """The first or the last sound block of a start with a frame in it; None where there is none."""
+    entries = run.entries[::-1] if last else run.entries
+    return next((b for entry in entries if (b := recording.read(run, entry)) is not None and b.n_frames), None)
+
+
+def _readable_range(recording: RunRecording, run: RecordedRun) -> tuple[int, int]:
+    """First frame of a start and the one behind its last, in sound blocks; (first, first) where no block is sound."""
+    first, last = (_end_block(recording, run, last=end) for end in (False, True))
+    if first is None or last is None:
+        return run.first_frame, run.first_frame
+    return first.header.first_frame, last.header.first_frame + last.n_frames
+
+
+def _end_gaps(recording: RunRecording) -> list[RunGap]:
+    """Gaps that a repair found, and the frames of damaged blocks at the ends of starts."""
+    known = known_missing(read_manifest(recording.path)) if recording.path.is_dir() else None
+    gaps = list(dict.fromkeys(known or ()))
+    for run in recording.runs:
+        first, end = _readable_range(recording, run)
+        gaps += [(run.number, run.first_frame, first - 1)] if first > run.first_frame else []
+        gaps += [(run.number, end, run.end_frame - 1)] if end < run.end_frame else []
+    return sorted(gaps)
+
+
+def _part_starts(recording: RunRecording) -> list[SweepStart]:
+    """The sweep that the maps of each run begin with: the first one, except in a part."""
+    cut = (read_manifest(recording.path) or {}).get("cut") if recording.path.is_dir() else None
+    if cut is None:
+        return [SweepStart() for _ in recording.runs]
+    ratios = cut.get("clock_ratios") or []
+    starts = []
+    for run in recording.runs:
+        block = _end_block(recording, run, last=False)
+        if block is None:
+            raise DamagedRecordingError(
+                f"{recording.path}: no block of start {run.number} is sound; take it from the whole"
+            )
+        # A part may begin in the middle of a sweep.
+        first = block.header.sweep - begins_sweep(block)
+        starts.append(SweepStart(first, float(ratios[run.number]) if run.number < len(ratios) else 1.0))
+    return starts
+
+
+def _part_learned(folder: Path, estimate: EstimateConfig, model: RigModel | None) -> list[RowModel]:
+    """States that the maps of a part were estimated with, where it is estimated as the whole was; otherwise none.
+
+    None for a whole recording either: it learns the same again from its first map on.
+    """
+    manifest: dict[str, Any] = (read_manifest(folder) or {}) if folder.is_dir() else {}
+    before = (manifest.get("config") or {}).get("estimate") or {}
+    same = before.get("estimator") == estimate.estimator and estimate.estimator in LEARNING
+    if estimate.estimator == "joint":  # recordings from before there was a prior have none
+        same = same and before.get("temporal_prior", False) == estimate.temporal_prior
+    calibration = (manifest.get("calibration") or {}).get("id")
+    if "cut" not in manifest or not same or model is None or calibration != model.fingerprint():
+        return []
+    states = []
+    for i in range(manifest["cut"]["maps"][1] - manifest["cut"]["maps"][0]):
+        state = _kept(folder / "learned" / f"{i:06d}.npz", RowModel.from_arrays)
+        if state is None:  # the whole kept those of some maps only
+            return []
+        states.append(state)
+    return states
+
+
+def _kept(file: Path, make: Callable[[dict[str, NDArray[Any]]], T]) -> T | None:
+    """Make something of the arrays kept of a map; None where there are none. DamagedRecordingError if unreadable."""
     if not file.exists():
         return None
     try:
         with load_numpy(file) as arrays:
-            return SweepTruth(x_px=arrays["x_px"], depth_m=arrays["depth_m"])
+            return make(dict(arrays))
     except (OSError, ValueError, KeyError, zipfile.BadZipFile) as error:
         raise DamagedRecordingError(f"{file} is not readable ({error}); move it away to go on without it") from error
-
-
-def _whole_sweeps(recording: RunRecording, run: RecordedRun, plan: ScanPlan) -> int:
-    """Number of sweeps of a start that are complete: by its markers or, without markers, by its number of frames.
-
-    Never more than its frames, whatever their headers say.
-    """
-    if plan.blanking is not None:
-        frames = float(plan.frames_per_sweep)
-        return min(run.frames, max(0, int((readable_range(recording, run)[1] - plan.frames_for(0)) / frames)))
-    last = end_block(recording, run, last=True)
-    if last is None:
-        return 0
-    before = last.header.sweep
-    return min(run.frames, max(0, before + int(((last.records["sweep"].astype(np.int64) - before) & 0xFFFF).max()) - 1))
 
 
 def _scan_of(plan: ScanPlan) -> dict[str, Any]:

@@ -2,9 +2,7 @@
 
 Blocks are written past the page cache where the system can (O_DIRECT), several at a time, pixels straight from where
 they lie: 0.3 s of CPU a GB, nearly all of it for the checksum, where the page cache takes 2 s. What is written is then
-on the disk, and a sync has little to do.
-
-`Space` is the room that a recorded run will take on the disk at most, as far as its plan tells, and what the disk has.
+on the disk, and a sync has little to do. `Space` is the room that a recorded run will take at most.
 """
 
 import errno
@@ -35,8 +33,8 @@ _SHARE_OF_FREE: Final = 2
 _sync_data = getattr(os, "fdatasync", os.fsync)
 
 
-class Staging:
-    """Page-aligned memory of a thread, in which the parts of a block that do not lie on pages are put together."""
+class Staging(threading.local):
+    """Page-aligned memory of each thread, for the parts of a block that do not lie on pages."""
 
     def __init__(self) -> None:
         self._memory = mmap.mmap(-1, PAGE_BYTES)
@@ -82,7 +80,10 @@ class OpenSegment:
         while pieces:
             written = self._write(pieces, offset)
             offset += written
-            pieces = _behind(pieces, written)
+            while pieces and written >= len(pieces[0]):
+                written -= len(pieces.pop(0))
+            if written:
+                pieces[0] = pieces[0][written:]
 
     def sync(self) -> None:
         """Make sure that what is written survives a loss of power. Raises OSError."""
@@ -142,16 +143,6 @@ def _pieces(block: FrameBlock, staging: Staging) -> list[memoryview]:
     return [piece for piece in (memory[:split], bits[before : before + inside], memory[split:]) if len(piece)]
 
 
-def _behind(pieces: Sequence[memoryview], written: int) -> list[memoryview]:
-    """The pieces that are left behind the first `written` bytes."""
-    left = []
-    for piece in pieces:
-        if written < len(piece):
-            left.append(piece[written:])
-        written = max(0, written - len(piece))
-    return left
-
-
 def _open_direct(path: Path) -> int:
     """Create a file and open it past the page cache where file system and system can."""
     flags = os.O_WRONLY | os.O_CREAT | os.O_EXCL | getattr(os, "O_BINARY", 0)
@@ -184,10 +175,7 @@ def _reserve(path: Path, size: int) -> None:
 
 
 BYTES_PER_PIXEL: Final = 40
-"""Bytes that the files of a map take for every pixel of the camera or of the stripe table, whichever is more.
-
-They are depth, picture, cloud, learned state and, on a simulated rig, truth.
-"""
+"""Bytes that all files of a map take for every pixel of the camera or of the stripe table, whichever is more."""
 
 
 @dataclass(frozen=True, slots=True)

@@ -1,7 +1,4 @@
-"""Verifies a recording: every byte of it, its index, its manifest and the device's own counts.
-
-`verify` gives the verdict, `examine` all that `verify` and `repair` need to know.
-"""
+"""Verifies a recording: every byte of it, its index, its manifest and the device's own counts."""
 
 from collections.abc import Sequence
 from dataclasses import asdict, dataclass
@@ -16,18 +13,10 @@ from drivers.frames import BlockHeader
 from drivers.recorded.contents import INDEX_FILE, INDEX_RECORD, Contents, find_blocks, round_up_to_page
 from drivers.recorded.order import in_order
 from drivers.recorded.reader import is_of_run, usual_header
-from drivers.recorded.segments import SegmentReader, open_segments
+from drivers.recorded.segments import PACKED_SUFFIX, SegmentReader, open_segments
 from rig.errors import DamagedRecordingError, UsageError
 from rig.progress import tell_stage
-from rig.recording.check import (
-    CHECKING,
-    Continuity,
-    SoundBlock,
-    check_segments,
-    continuity,
-    lost_ends,
-    out_of_step,
-)
+from rig.recording.check import CHECKING, Continuity, Run, SoundBlock, check_segments, lost_ends, out_of_step
 from rig.recording.open import require_recording
 from rig.run_folder.manifest import (
     MANIFEST,
@@ -56,11 +45,9 @@ class Integrity(StrEnum):
 class Verification:
     """Verdict on a recording, and what it rests on.
 
-    blocks, frames, bytes: number of sound ones.
-    lost: frames that the device lost or a repair found missing. gaps: where these are, [run, first, last].
-    problems: a line each.
-    run: the verdict of the run that was recorded.
-    ended: reason why the recording ended before the run; None where it did not.
+    blocks, frames, bytes: number of sound ones. lost: frames that the device lost or a repair found missing. gaps:
+    where these are, [run, first, last]. problems: a line each. run: the verdict of the run that was recorded. ended:
+    reason why the recording ended before the run; None where it did not.
     """
 
     verdict: Integrity
@@ -90,7 +77,6 @@ class Examination:
     """All that can be known of a recording. runs: the sound blocks of each run, in order of their frames."""
 
     segments: list[SegmentReader]
-    contents: Contents
     runs: list[list[SoundBlock]]
     joined: Continuity
     manifest: dict[str, Any] | None
@@ -111,8 +97,15 @@ def verify(folder: Path) -> Verification:
     """Read all of a recording (`rig verify`). UsageError where there is none; damage is in the result."""
     found = examine(folder)
     blocks = [block for run in found.runs for block in run]
+    manifest = found.manifest or {}
+    ended = ended_early(manifest)
+    verdict = Integrity.GAPS if found.joined.gaps else Integrity.INTACT
+    if found.problems or not found.runs:
+        verdict = Integrity.DAMAGED
+    elif manifest.get("verdict") == UNFINISHED or ended is not None:
+        verdict = Integrity.UNFINISHED
     return Verification(
-        verdict=_verdict(found),
+        verdict=verdict,
         segments=len(found.segments),
         runs=len(found.runs),
         blocks=len(blocks),
@@ -121,8 +114,8 @@ def verify(folder: Path) -> Verification:
         lost=found.joined.lost,
         gaps=found.joined.gaps,
         problems=found.problems,
-        run=None if found.manifest is None else found.manifest.get("verdict"),
-        ended=None if found.manifest is None else ended_early(found.manifest),
+        run=manifest.get("verdict"),
+        ended=ended,
     )
 
 
@@ -147,41 +140,43 @@ def examine(folder: Path) -> Examination:
     except DamagedRecordingError as error:
         problems.append(str(error))
     runs = _runs(contents, sound, problems)
-    joined = continuity(runs, is_part=manifest is not None and "cut" in manifest, known=known_missing(manifest))
+    joined = Continuity(known_missing(manifest))
+    for number, run in enumerate(runs):
+        joined.follow(number, run, is_part="cut" in (manifest or {}))
     problems += joined.problems
     if problems:  # where nothing is wrong nothing is gone
         joined.missing += lost_ends(contents, runs, joined, manifest)
-    if manifest is not None and manifest.get("verdict") != UNFINISHED:
-        problems += _against_manifest(manifest, segments, contents, runs, joined)
     if manifest is not None:
+        if manifest.get("verdict") != UNFINISHED:
+            problems += _against_manifest(manifest, segments, runs, joined)
         problems += inputs_problems(folder, manifest)
-    return Examination(segments, contents, runs, joined, manifest, problems)
+    return Examination(segments, runs, joined, manifest, problems)
 
 
 def _runs(contents: Contents, sound: Sequence[SoundBlock], problems: list[str]) -> list[list[SoundBlock]]:
     """The sound blocks of each run, in order; a problem for each block that should be there and is not."""
     headers: dict[int, list[BlockHeader]] = {}
     for block in sound:
-        headers.setdefault(block.run_id, []).append(block.header)
+        headers.setdefault(block.header.run_id, []).append(block.header)
     usual = {run_id: usual_header(of_run) for run_id, of_run in headers.items()}
     by_entry = {}
     for block in sound:
         why = block.objection
-        if why is None and not is_of_run(block.header, usual[block.run_id]):
+        if why is None and not is_of_run(block.header, usual[block.header.run_id]):
             why = "is of another size or clock than its run"
         if why is None:
             by_entry[block.entry] = block
         else:
             problems.append(_left_out(block, why))
     told = {entry.tobytes(): entry for entry in contents.entries}
-    for entry in (entry for raw, entry in told.items() if raw not in by_entry):
-        last = int(entry["first_frame"]) + int(entry["n_frames"]) - 1
-        problems.append(
-            f"block {entry['block_seq']} of run {entry['run_id']} (frames {entry['first_frame']} to {last}) is damaged "
-            f"or gone: segment {entry['segment']}, byte {entry['offset']}"
-        )
-    others = sum(raw not in told for raw in by_entry)
-    if others:
+    for raw, entry in told.items():
+        if raw not in by_entry:
+            last = int(entry["first_frame"]) + int(entry["n_frames"]) - 1
+            problems.append(
+                f"block {entry['block_seq']} of run {entry['run_id']} (frames {entry['first_frame']} to {last}) is "
+                f"damaged or gone: segment {entry['segment']}, byte {entry['offset']}"
+            )
+    if others := sum(raw not in told for raw in by_entry):
         problems.append(
             f"{others} blocks are not where {INDEX_FILE} tells of them, come twice or do not fit the others"
         )
@@ -189,7 +184,7 @@ def _runs(contents: Contents, sound: Sequence[SoundBlock], problems: list[str]) 
     runs: dict[int, list[SoundBlock]] = {}
     for entry in in_order(entries, contents.told, [], folder=True)[0]:
         block = by_entry[entry.tobytes()]
-        runs.setdefault(block.run_id, []).append(block)
+        runs.setdefault(block.header.run_id, []).append(block)
     for run in runs.values():
         for block in out_of_step(run):
             problems.append(_left_out(block, "is not in step with those around it"))
@@ -199,28 +194,23 @@ def _runs(contents: Contents, sound: Sequence[SoundBlock], problems: list[str]) 
 
 def _left_out(block: SoundBlock, why: str) -> str:
     frames = f"frames {block.first_frame} to {block.end_frame - 1}"
-    return f"block {block.block_seq} of run {block.run_id} ({frames}) {why}"
+    return f"block {block.block_seq} of run {block.header.run_id} ({frames}) {why}"
 
 
 def _against_manifest(
-    manifest: dict[str, Any],
-    segments: Sequence[SegmentReader],
-    contents: Contents,
-    runs: Sequence[Sequence[SoundBlock]],
-    joined: Continuity,
+    manifest: dict[str, Any], segments: Sequence[SegmentReader], runs: Sequence[Run], joined: Continuity
 ) -> list[str]:
     """Problems where a finished run's manifest tells of other blocks and frames than there are."""
     recording = manifest.get("recording") or {}
-    blocks = sum(len(run) for run in runs)
     frames = sum(block.n_frames for run in runs for block in run)
-    files = [segment.path.name.removesuffix(".zst") for segment in segments]
+    there = {
+        "blocks": sum(len(run) for run in runs),
+        "files": [segment.path.name.removesuffix(PACKED_SUFFIX) for segment in segments],
+    }
     problems = [
-        f"{MANIFEST} tells of {stated} {what}, there are {found}"
-        for what, stated, found in (
-            ("blocks", recording.get("blocks"), blocks),
-            ("segments", recording.get("files"), files),
-        )
-        if stated is not None and stated != found
+        f"{MANIFEST} tells of {stated} {'segments' if key == 'files' else key}, there are {found}"
+        for key, found in there.items()
+        if (stated := recording.get(key)) is not None and stated != found
     ]
     counters, absurd = device_counters(manifest)
     delivered, lost = counters.get("delivered"), counters.get("lost")
@@ -229,12 +219,3 @@ def _against_manifest(
     if lost is not None and lost < joined.lost:
         problems.append(f"the device says that it lost {lost} frames, its blocks say {joined.lost}")
     return problems + absurd
-
-
-def _verdict(found: Examination) -> Integrity:
-    if found.problems or not found.runs:
-        return Integrity.DAMAGED
-    manifest = found.manifest
-    if manifest is not None and (manifest.get("verdict") == UNFINISHED or ended_early(manifest) is not None):
-        return Integrity.UNFINISHED
-    return Integrity.GAPS if found.joined.gaps else Integrity.INTACT

@@ -4,9 +4,9 @@ A block counts once all its bytes and those of every block before it are with th
 written. So a killed program loses no block that counted, and a loss of power none older than `SYNC_INTERVAL_S`: a
 thread makes the disk keep what was written, blocks before index.
 
-`Recording` is that. `Recorder` is the pipeline's thread that hands the blocks of one start of the SPAD to it. It has a
-required place in the ring: where the disk is slower than the stream, the ring fills and the overload policy decides.
-Blocks are written by the recording's own threads, several at a time, from the slots they lie in.
+`Recording` is that. `Recorder` is the pipeline's thread that hands the blocks of one start of the SPAD to it, which its
+threads write, several at a time, from the slots they lie in. It has a required place in the ring: where the disk is
+slower than the stream, the ring fills and the overload policy decides.
 """
 
 import errno
@@ -63,10 +63,8 @@ class Start:
 class Recording:
     """A recording that grows block by block in a folder; whatever fails, it ends behind a whole block.
 
-    `submit` and `append` belong to one thread.
-
-    expected_bytes: how much will come, as far as that is known; so much is set aside on the disk. on_begin: called
-    where a start of the SPAD begins. Raises RecordingError where the folder cannot be written.
+    One thread submits and appends. expected_bytes: so much is set aside on the disk, where it is known. on_begin:
+    called where a start of the SPAD begins. Raises RecordingError where the folder cannot be written.
     """
 
     def __init__(
@@ -98,7 +96,7 @@ class Recording:
         self._lock = threading.Lock()
         self._failure: BaseException | None = None
         self._companions: list[Callable[[], None]] = []
-        self._staging = threading.local()
+        self._staging = Staging()
         self._closed = threading.Event()
         self._reserve = folder / RESERVE_FILE
         try:
@@ -150,10 +148,7 @@ class Recording:
         self._companions.append(companion)
 
     def close(self) -> None:
-        """Wait until everything is written, end the files and sync them. A second call does nothing.
-
-        Raises RecordingError where the disk did not take it.
-        """
+        """Wait until everything is written, end the files and sync them, once. RecordingError where that fails."""
         if self._closed.is_set():
             return
         self._pool.shutdown()
@@ -213,10 +208,7 @@ class Recording:
         """Write one block, on a thread of the pool."""
         begun = time.perf_counter()
         try:
-            staging = getattr(self._staging, "of_thread", None)
-            if staging is None:
-                staging = self._staging.of_thread = Staging()
-            placed.segment.write(block, offset, staging)
+            placed.segment.write(block, offset, self._staging)
             self._count(placed)
         except BaseException as error:
             with self._lock:

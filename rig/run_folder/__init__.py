@@ -1,3 +1,1 @@
-"""The folder that a run leaves: maps, pictures, point clouds, manifest and summary, written so that it appears whole or
-not at all.
-"""
+"""The folder that a run leaves, which appears whole or not at all: maps, pictures, clouds, manifest and summary."""

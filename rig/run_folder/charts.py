@@ -1,7 +1,6 @@
 """Draws charts as SVG text: curves over linear or logarithmic axes, side by side, with one legend, on a white ground.
 
-Pictures in the repository are SVG (docs/decisions/0008); what these show is a handful of curves, for which no library
-is needed. `chart_svg` makes the file of some `Panel`s.
+Pictures in the repository are SVG (docs/decisions/0008); a handful of curves needs no library.
 """
 
 import math

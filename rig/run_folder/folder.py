@@ -5,10 +5,7 @@
     truth/000000.npz (where a world knows it)  manifest.json  summary.json
 
 Everything is written beside the folder under a hidden name and moved in one step at the end; the folder of a recording
-is there from the start and grows in place. `RunFolder` does this, and `SavePolicy` says which maps are written.
-
-The rest is for recordings too: what `replace_file` and `sync_folder` wrote survives a loss of power, and `hold` and
-`is_held` tell whether somebody is still recording into a folder.
+is there from the start and grows in place. What `replace_file` and `sync_folder` wrote survives a loss of power.
 """
 
 import io
@@ -86,7 +83,9 @@ class RunFolder:
         if rays is not None:
             # The first map sets the colours of all, so that a film of them does not flicker.
             self._limits = self._limits or depth_limits(result.depth_m)
-            files[f"depth/{name}.npy"] = _npy_bytes(result.depth_m)
+            depth = io.BytesIO()
+            np.save(depth, result.depth_m, allow_pickle=False)
+            files[f"depth/{name}.npy"] = depth.getvalue()
             files[f"depth/{name}.png"] = png_bytes(depth_picture(result.depth_m, self._limits))
             files[f"cloud/{name}.ply"] = ply_bytes(cloud(result.depth_m, *rays, result.intensity))
         self._write(files)
@@ -102,8 +101,7 @@ class RunFolder:
 
     def remove_map(self, index: int) -> None:
         """Remove every file of a map that was not finished."""
-        assert self._scratch is not None, "the run folder is published or discarded already"
-        for file in self._scratch.glob(f"*/{index:06d}.*"):
+        for file in self.place("").glob(f"*/{index:06d}.*"):
             file.unlink(missing_ok=True)
 
     def write_json(self, name: str, content: Mapping[str, Any]) -> None:
@@ -173,33 +171,26 @@ class RunFolder:
         self._made_parents.clear()
 
     def _claim(self) -> Path:
-        if self.path.exists():
-            if not self.path.is_dir():
-                raise UsageError(f"--out {self.path} is a file; name a new folder")
-            if any(self.path.iterdir()):
-                raise UsageError(f"--out {self.path} exists and is not empty; name a new folder or empty this one")
-            parent = self.path
-        else:
-            missing = [folder for folder in self.path.parents if not folder.exists()]
-            for folder in reversed(missing):
-                folder.mkdir()
-                self._made_parents.append(folder)
-            parent = self.path.parent
+        there = self.path.exists()
+        if there and not self.path.is_dir():
+            raise UsageError(f"--out {self.path} is a file; name a new folder")
+        if there and any(self.path.iterdir()):
+            raise UsageError(f"--out {self.path} exists and is not empty; name a new folder or empty this one")
+        missing = [folder for folder in self.path.parents if not folder.exists()]
+        for folder in [*reversed(missing), *([self.path] if self._in_place and not there else ())]:
+            folder.mkdir()
+            self._made_parents.append(folder)
         if self._in_place:
-            if parent is not self.path:
-                self.path.mkdir()
-                self._made_parents.append(self.path)
             return self.path
-        scratch = parent / f".{self.path.name}.{secrets.token_hex(4)}.part"
+        scratch = (self.path if there else self.path.parent) / f".{self.path.name}.{secrets.token_hex(4)}.part"
         scratch.mkdir()
         return scratch
 
     def _write(self, files: Mapping[str, bytes]) -> None:
-        assert self._scratch is not None, "the run folder is published or discarded already"
         written: list[Path] = []
         try:
             for name, data in files.items():
-                file = self._scratch / name
+                file = self.place(name)
                 file.parent.mkdir(exist_ok=True)
                 written.append(file)
                 file.write_bytes(data)
@@ -216,27 +207,19 @@ def json_text(content: Mapping[str, Any]) -> str:
     return json.dumps(_plain(content), indent=1, allow_nan=False, ensure_ascii=False)
 
 
-_EVERY = re.compile(r"every[\s:=]+(?P<step>\d+)", re.ASCII)
-
-
 @dataclass(frozen=True, slots=True)
 class SavePolicy:
-    """Policy for which maps of a run are written (`--save`). step: maps 0, step, 2 step, ...; None: only the last."""
+    """The maps of a run that are written (`--save`). step: maps 0, step, 2 step, ...; None: only the last."""
 
     step: int | None = 1
 
     @classmethod
     def parse(cls, text: str) -> "SavePolicy":
         """Parse "all", "last" or "every 5". Raises UsageError for anything else."""
-        cleaned = text.strip().lower()
-        if cleaned == "all":
-            return cls(1)
-        if cleaned == "last":
-            return cls(None)
-        match = _EVERY.fullmatch(cleaned)
-        if match is None or int(match["step"]) == 0:
+        match = re.fullmatch(r"(all)|(last)|every[\s:=]+0*([1-9]\d*)", text.strip().lower(), re.ASCII)
+        if match is None:
             raise UsageError(f"--save is {text!r}; write 'all', 'last' or 'every N' with N of 1 or more")
-        return cls(int(match["step"]))
+        return cls(None if match[2] else int(match[3] or 1))
 
     def count(self, maps: int) -> int:
         """Number of maps written of a run of `maps` maps."""
@@ -277,12 +260,6 @@ def _plain(value: Any) -> Any:
 def _unwritable(path: Path, error: OSError) -> UsageError:
     reason = error.strerror or str(error)
     return UsageError(f"cannot write {path}: {reason}; name another folder with --out or free the space it needs")
-
-
-def _npy_bytes(array: NDArray[Any]) -> bytes:
-    stream = io.BytesIO()
-    np.save(stream, array, allow_pickle=False)
-    return stream.getvalue()
 
 
 def _npz_bytes(arrays: Mapping[str, NDArray[Any]]) -> bytes:

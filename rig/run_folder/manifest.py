@@ -21,7 +21,6 @@ UNFINISHED: Final = "recording"
 """Verdict of a run that is not over, or was killed."""
 MOST_RUN_FRAMES: Final = 1 << 48
 """Most frames that a run can have: 80 years at 100 kHz."""
-_PIECE_BYTES: Final = 1 << 20
 _NEXT: Final = "'rig repair' writes a new one"
 
 Count = Annotated[int, Field(ge=0, lt=MOST_RUN_FRAMES)]
@@ -145,10 +144,7 @@ def ended_early(manifest: Mapping[str, Any]) -> str | None:
 
 
 def ended_before_last_map(manifest: Mapping[str, Any]) -> bool:
-    """Whether a run ended before it had made maps of all sweeps that its starts were to give.
-
-    Whole sweeps without a map may lie behind those that the manifest lists, for example where the run was killed.
-    """
+    """Whether a run ended before it had made maps of all sweeps: whole ones may lie behind those of the manifest."""
     starts = (manifest.get("recording") or {}).get("starts") or []
     return len(manifest.get("sweeps") or []) < sum(int(start["sweeps"]) for start in starts)
 
@@ -175,7 +171,7 @@ def file_crc32(path: Path) -> int:
     """CRC-32 of a file, for the manifest. Raises OSError."""
     crc = 0
     with path.open("rb") as file:
-        while piece := file.read(_PIECE_BYTES):
+        while piece := file.read(1 << 20):
             crc = zlib.crc32(piece, crc)
     return crc
 
@@ -192,22 +188,21 @@ def inputs_problems(folder: Path, manifest: Mapping[str, Any]) -> list[str]:
     return problems
 
 
-def require_inputs(folder: Path, manifest: Mapping[str, Any]) -> None:
-    """Raise DamagedRecordingError, a line each, for files beside the frames that are not what the manifest says."""
+def require_playable(folder: Path, manifest: Mapping[str, Any]) -> None:
+    """Raise DamagedRecordingError, a line each, for files beside the frames that are not what the manifest says.
+
+    UsageError for a recording whose maps spadrig 0.1 took in several passes over part of the columns each.
+    """
     if problems := inputs_problems(folder, manifest):
         raise DamagedRecordingError("\n".join(f"{line}; take it from a copy of the recording" for line in problems))
+    if "passes" in manifest:
+        raise UsageError(
+            f"{folder} was scanned with --adaptive, in passes that this version cannot put together; take spadrig 0.1 "
+            "to it, or scan again"
+        )
 
 
 def manifest_crc32(content: Mapping[str, Any]) -> int:
     """CRC-32 of a manifest, with or without its seal."""
     bare = {key: value for key, value in content.items() if key != SEAL}
     return zlib.crc32(json.dumps(bare, sort_keys=True, separators=(",", ":")).encode())
-
-
-def require_plain_sweeps(folder: Path, manifest: Mapping[str, Any]) -> None:
-    """Raise UsageError for a recording whose maps spadrig 0.1 took in several passes over part of the columns each."""
-    if "passes" in manifest:
-        raise UsageError(
-            f"{folder} was scanned with --adaptive, in passes that this version cannot put together; take spadrig 0.1 "
-            "to it, or scan again"
-        )

@@ -29,10 +29,7 @@ def depth_limits(depth_m: NDArray[np.float32]) -> tuple[float, float] | None:
 def depth_picture(
     depth_m: NDArray[np.float32], limits: tuple[float, float] | None, unit: str = "m"
 ) -> NDArray[np.uint8]:
-    """Depth in colours from near (red) to far (blue), with a scale at the right; BGR, black where there is no depth.
-
-    limits: depths of red and of blue; either may be the larger one.
-    """
+    """Depth in colours between its limits, red to blue, with a scale at the right; BGR, black where there is none."""
     import cv2
 
     rows, width = depth_m.shape
@@ -77,10 +74,7 @@ def png_bytes(picture: NDArray[np.uint8]) -> bytes:
 
 
 def _without_window_steps(intensity: NDArray[np.uint32]) -> NDArray[np.float64]:
-    """Counts as floats, without the steps where windows begin and end.
-
-    A pixel's sum holds haze and ambient light of all columns whose window covers it, and windows are whole words.
-    """
+    """Counts as floats, without the steps where windows of whole words, and the haze in them, begin and end."""
     level = intensity.astype(np.float64)
     reach = 3
     for edge in range(WORD_PX, level.shape[1] - reach, WORD_PX):
@@ -129,15 +123,9 @@ def cloud(
 
 def ply_bytes(points: NDArray[np.void]) -> bytes:
     """Points of dtype POINT as a PLY file."""
-    header = "\n".join(
-        [
-            "ply",
-            "format binary_little_endian 1.0",
-            "comment camera frame: x right, y down, z forward; metres",
-            f"element vertex {len(points)}",
-            *(f"property float {name}" for name in POINT.names or ()),
-            "end_header",
-            "",
-        ]
+    properties = "".join(f"property float {name}\n" for name in POINT.names or ())
+    header = (
+        "ply\nformat binary_little_endian 1.0\ncomment camera frame: x right, y down, z forward; metres\n"
+        f"element vertex {len(points)}\n{properties}end_header\n"
     )
     return header.encode("ascii") + points.tobytes()

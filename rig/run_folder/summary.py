@@ -1,8 +1,4 @@
-"""The summary of a run: counts of frames, times, fog, errors against the truth, and a verdict.
-
-`MapTally` adds up the maps and makes the `Summary`; its `as_json` is what `--json` prints and what summary.json holds.
-`PipelineStats` is the part on the stages of the pipeline: times, high-water marks and losses, live too.
-"""
+"""The summary of a run, as `--json` prints and summary.json holds it: frames, times, fog, errors and a verdict."""
 
 import statistics
 from collections.abc import Mapping, Sequence
@@ -27,13 +23,11 @@ class PipelineStats:
     """Figures of a pipeline at one moment or at its end. Times are wall time in seconds; None: there is no such stage.
 
     source_fill_s: in the SPAD's `fill`, without source_wait_s, which is spent waiting for a free slot of the ring.
-    ring_high_water: most slots in use at one time, of ring_slots, which take ring_bytes together.
-    dropped_blocks, dropped_frames: found no free slot.
-    counting_s: binding and counting. estimation_s: from counts to map.
-    map_wait_s: waiting for room among the maps that the caller has not taken yet; map_queue is that room, and at most
-      map_queue_high_water maps waited.
-    recorder_s: computing checksums and writing.
-    monitor_updates: views shown. monitor_skipped_blocks: blocks that the monitor did not look at.
+    ring_high_water: most slots in use at one time, of ring_slots, which take ring_bytes together. dropped_blocks,
+    dropped_frames: found no free slot. counting_s: binding and counting. estimation_s: from counts to map. map_wait_s:
+    waiting for room among the maps that the caller has not taken yet; map_queue is that room, and at most
+    map_queue_high_water maps waited. recorder_s: computing checksums and writing. monitor_updates: views shown.
+    monitor_skipped_blocks: blocks that the monitor did not look at.
     """
 
     source_fill_s: float = 0.0
@@ -99,8 +93,7 @@ class Synchronisation:
     """The binding of a run's frames to columns: by what, and how well.
 
     residual_columns, clock_error: the largest of its sweeps; None where one could not be checked.
-    detection_probability: the least over the sweeps, of finding a blanking pattern as bright as theirs; None where
-      markers bound the frames.
+    detection_probability: the least, of a blanking pattern as bright as a sweep's; None where markers bound the frames.
     """
 
     by: Literal["markers", "blanking pattern"]
@@ -130,7 +123,10 @@ class TruthErrors:
 
 @dataclass(frozen=True, slots=True)
 class Summary:
-    """A run in figures. Times in seconds of sensor and computer, fractions of camera pixels; None = no value."""
+    """A run in figures. Times in seconds of sensor and computer, fractions of camera pixels; None = no value.
+
+    verdict_reasons: against maps, found in the maps themselves. accepted_calibration: what the user accepted of it.
+    """
 
     maps: int
     map_rate_hz: float | None
@@ -150,9 +146,7 @@ class Summary:
     sync: Synchronisation | None = None
     replay: PaceReport | None = None
     verdict_reasons: tuple[Doubt, ...] = ()
-    """Reasons against maps, found in the maps themselves, whatever the verdict."""
     accepted_calibration: tuple[str, ...] = ()
-    """Reasons against the calibration that the user accepted."""
 
     def as_json(self) -> dict[str, Any]:
         """Return the summary as plain values; `truth` only where it is known, some only for a scan or a replay."""

@@ -15,13 +15,12 @@ from __future__ import annotations
 import argparse
 import sys
 from collections import Counter, defaultdict
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from dataclasses import replace
 from types import SimpleNamespace
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
 from rig.count.map_checks import SURE, MapChecks, check_points
 from rig.estimate.registry import LEARNING
@@ -31,8 +30,7 @@ from tests.reference.made_scenes import pane_scene, thin_scene
 from tests.reference.random_scenes import random_scene
 from tests.reference.scene import Scene, load_scene, scene_names
 from tests.reference.working_point import POINTS, WorkingPoint
-
-Counts = NDArray[np.unsignedinteger[Any]]
+from tests.unit.rig.count import test_map_checks as faults
 
 ROWS, COLUMNS = 64, 250
 RIGS: dict[str, dict[str, Any]] = {
@@ -44,53 +42,25 @@ RIGS: dict[str, dict[str, Any]] = {
 EXPOSURES = (1, 3, 10, 20)
 
 
-def _bits(counts: Counts, exposures: int, rng: np.random.Generator) -> Counts:
-    x = np.arange(counts.shape[2])
-    return counts[:, :, 8 * (x // 8) + 7 - x % 8]
-
-
-def _exposures_first(counts: Counts, exposures: int, rng: np.random.Generator) -> Counts:
-    out = np.zeros_like(counts)
-    for c in range(len(counts)):
-        for k in range(exposures):
-            # One frame of each column: its ones are a share of the column's.
-            chance = rng.integers(exposures, size=out.shape[1:], dtype=np.uint8)
-            out[c] += chance < counts[(c * exposures + k) % len(counts)]
-    return out
-
-
-def _noise(counts: Counts, exposures: int, rng: np.random.Generator) -> Counts:
-    return rng.binomial(exposures, counts.mean() / exposures, counts.shape).astype(counts.dtype)
-
-
-FAULTS: dict[str, Callable[[Counts, int, np.random.Generator], Counts]] = {
-    "bits of bytes reversed": _bits,
-    "exposures before columns": _exposures_first,
-    "columns reversed": lambda counts, exposures, rng: counts[::-1],
-    "columns shuffled": lambda counts, exposures, rng: counts[rng.permutation(len(counts))],
-    "planes of half the angle": lambda counts, exposures, rng: np.concatenate(
-        [counts[::2], np.zeros_like(counts[1::2])]
-    ),
+FAULTS: dict[str, faults.Change] = {
+    "bits of bytes reversed": faults.least_significant_first,
+    "exposures before columns": faults.exposures_first,
+    "columns reversed": faults.reversed_,
+    "columns shuffled": faults.shuffled,
+    "planes of half the angle": faults.half_the_angle,
     "picture mirrored": lambda counts, exposures, rng: counts[:, :, ::-1],
-    "noise alone": _noise,
-    "all zero": lambda counts, exposures, rng: np.zeros_like(counts),
-    "all one": lambda counts, exposures, rng: np.full_like(counts, exposures),
+    "noise alone": faults.noise,
+    "all zero": faults.dark,
+    "all one": faults.full,
 }
 
 
 def _scene(rng: np.random.Generator) -> Scene:
     """Some rows of a scene."""
     prepared = [scene for name in scene_names() if (scene := load_scene(name)) is not None]
-    pick = int(rng.integers(2 * (len(prepared) + 2)))
-    whole = (
-        prepared[pick]
-        if pick < len(prepared)
-        else thin_scene()[0]
-        if pick == len(prepared)
-        else pane_scene()
-        if pick == len(prepared) + 1
-        else random_scene(int(rng.integers(400, 500)))
-    )
+    fixed = [*prepared, thin_scene()[0], pane_scene()]
+    pick = int(rng.integers(2 * len(fixed)))
+    whole = fixed[pick] if pick < len(fixed) else random_scene(int(rng.integers(400, 500)))
     first = int(rng.integers(0, whole.shape[0] - ROWS))
     part = slice(first, first + ROWS)
     pane = None if whole.pane is None else replace(whole.pane, depth_m=whole.pane.depth_m[part])

@@ -7,7 +7,6 @@ import cv2
 import numpy as np
 
 from tests.system.conftest import Rig
-from tests.unit.rig.exchange.foreign_files import pi_packed, some_frames, swissspad2_full
 
 
 def test_every_kind_of_export_of_a_scan(rig: Rig, run: Path) -> None:
@@ -35,18 +34,3 @@ def test_the_camera_goes_with_the_cube(rig: Rig, scanned: Path, tmp_path: Path) 
     assert (described["w"], described["h"], described["bitpack_dim"]) == (96, 40, 2)
     assert (described["fl_x"], described["cx"]) == (110, 47.5)
     assert len(described["frames"]) == len(frames)
-
-
-def test_foreign_frames_become_a_recording_that_verifies(rig: Rig, tmp_path: Path) -> None:
-    (tmp_path / "acq").mkdir()
-    (tmp_path / "acq" / "RAW00000.bin").write_bytes(pi_packed(some_frames(3, 512, 512)) + b"DONE")
-    (tmp_path / "full.bin").write_bytes(swissspad2_full(some_frames(2, 512, 512)))
-    ran = rig("import", "pi-imaging", tmp_path / "acq", "--out", "pi", "--frame-rate", "97.7 kHz", "--json")
-    assert (ran.code, ran.err) == (0, "")
-    assert json.loads(ran.out)["frame_rate_hz"] == 97_700
-    assert rig("import", "swissspad2", tmp_path / "full.bin", "--form", "full", "--out", "swiss").code == 0
-    for run in ("pi", "swiss"):
-        verified = rig("verify", run)
-        assert verified.code == 0, verified.out + verified.err
-    assert rig("export", "pi", "npy").code == 0
-    assert np.load("pi-npy/frames.npy").shape == (3, 512, 64)

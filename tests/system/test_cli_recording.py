@@ -1,9 +1,7 @@
 """Recordings as a user makes them: a folder in place from the start, and depth from it that is the same to the bit."""
 
-import io
 import json
 import shutil
-import sys
 from pathlib import Path
 from typing import Any
 
@@ -12,27 +10,11 @@ import pytest
 import yaml
 
 from calibration.errors import digits
-from rig.scan import run as rig_run
 from rig.scan.acquisition import Acquisition
 from tests.system.conftest import Rig
+from tests.system.run_files import assert_same
 
 OPTIONS = ("--exposures", 3, "--maps", 3, "--seed", 5)
-
-
-def arrays(folder: Path) -> dict[str, Any]:
-    """Everything that a run made of its frames, by file and name."""
-    found = {str(file.relative_to(folder)): np.load(file) for file in folder.glob("depth/*.npy")}
-    for file in (*folder.glob("stripe/*.npz"), *folder.glob("learned/*.npz"), *folder.glob("truth/*.npz")):
-        with np.load(file) as content:
-            found |= {f"{file.relative_to(folder)}/{name}": content[name] for name in content}
-    return found
-
-
-def assert_same(a: Path, b: Path) -> None:
-    first, second = arrays(a), arrays(b)
-    assert first.keys() == second.keys()
-    for name, array in first.items():
-        assert array.tobytes() == second[name].tobytes(), name
 
 
 def summary(folder: Path) -> dict[str, Any]:
@@ -97,13 +79,12 @@ def test_a_disk_with_too_little_room_is_refused_before_the_start(
 ) -> None:
     usage = shutil.disk_usage(".")
     monkeypatch.setattr(shutil, "disk_usage", lambda folder: usage._replace(free=1000))
-    ran = rig("scan", small, "--record", "--maps", 50, "--out", "deep/run")
-    assert (ran.code, len(ran.problems)) == (2, 1)
-    assert "the recording will take at most" in ran.problems[0]
-    assert "has 0.000001 GB free; free some" in ran.problems[0]
-    assert not Path("deep").exists()
-    tried = rig("scan", small, "--record", "--maps", 50, "--out", "deep/run", "--dry-run")
-    assert (tried.code, tried.out, tried.problems) == (2, "", ran.problems)
+    for more in ((), ("--dry-run",)):
+        ran = rig("scan", small, "--record", "--maps", 50, "--out", "deep/run", *more)
+        assert (ran.code, ran.out, len(ran.problems)) == (2, "", 1)
+        assert "the recording will take at most" in ran.problems[0]
+        assert "has 0.000001 GB free; free some" in ran.problems[0]
+        assert not Path("deep").exists()
 
 
 def test_a_recording_says_before_it_starts_what_it_takes_at_most(
@@ -117,44 +98,12 @@ def test_a_recording_says_before_it_starts_what_it_takes_at_most(
     assert tried.code == 0, tried.err
     assert not Path("deep").exists()
     assert told["free_bytes"] == 12_300_000_000
-    said = (
-        f"at most {digits(told['recording_bytes'] / 1e9)} GB of frames and {digits(told['map_bytes'] / 1e9)} GB of maps"
-    )
+    frames_gb, maps_gb = (digits(told[name] / 1e9) for name in ("recording_bytes", "map_bytes"))
+    said = f"at most {frames_gb} GB of frames and {maps_gb} GB of maps"
     assert said in rig(*arguments, "--dry-run").out
-    arm, heard = Acquisition._arm, []
-
-    def look(self: Acquisition) -> None:
-        heard.append(sys.stderr.getvalue())  # type: ignore[attr-defined]
-        arm(self)
-
-    with monkeypatch.context() as patch:
-        patch.setattr(Acquisition, "_arm", look)
-        patch.setattr(sys, "stderr", io.StringIO())
-        assert rig(*arguments).code == 0
-    assert said in heard[0]
-    assert "has 12.3 GB free" in heard[0]
+    ran = rig(*arguments)
+    assert (ran.code, said in ran.err, "has 12.3 GB free" in ran.err) == (0, True, True)
     files = [file for file in Path("deep/run").rglob("*") if file.is_file()]
     frames = sum(file.stat().st_size for file in files if file.suffix == ".spb")
     assert 0 < frames <= told["recording_bytes"]
     assert sum(file.stat().st_size for file in files) <= told["recording_bytes"] + told["map_bytes"]
-
-
-def test_a_dry_run_without_a_recording_says_nothing_of_the_disk(rig: Rig, small: Path) -> None:
-    assert list(json.loads(rig("scan", small, "--dry-run", "--json").out)) == ["plan"]
-
-
-def test_an_error_of_ours_leaves_what_was_recorded(rig: Rig, small: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    add = rig_run.Run.add
-
-    def broken(self: rig_run.Run, *arguments: Any) -> None:
-        if self.tally.maps == 1:
-            raise ZeroDivisionError("ours")
-        add(self, *arguments)
-
-    monkeypatch.setattr(rig_run.Run, "add", broken)
-    assert rig("scan", small, "--record", "--maps", 4, "--out", "run").code == 70
-    monkeypatch.setattr(rig_run.Run, "add", add)
-    assert json.loads(Path("run/manifest.json").read_text())["verdict"] == "recording"
-    assert rig("reconstruct", "run", "--out", "again").code == 0
-    assert summary(Path("again"))["maps"] >= 1
-    assert np.load("run/depth/000000.npy").tobytes() == np.load("again/depth/000000.npy").tobytes()

@@ -23,16 +23,12 @@ def test_a_recorded_scan_is_intact_until_it_is_damaged_and_whole_once_repaired(r
     assert (found["verdict"], found["problems"], found["run"]) == ("intact", [], "complete")
     summary = json.loads((run / "summary.json").read_text())
     assert found["frames"] >= summary["frames"]["received"]
-
     damage(run, (run / "frames-000000.spb").stat().st_size // 2)
     ran = rig("verify", run)
-    assert ran.code == 1
+    assert (ran.code, "damaged: " in ran.out) == (1, True)
     assert "frames-000000.spb, bytes " in ran.err
-    assert "damaged: " in ran.out
-
     ran = rig("repair", run)
-    assert ran.code == 1  # there is a gap now
-    assert "gaps: " in ran.out
+    assert (ran.code, "gaps: " in ran.out) == (1, True)  # there is a gap now
     assert json.loads(rig("verify", run, "--json").out)["verdict"] == "gaps"
     assert json.loads(rig("repair", run, "--json").out)["done"] == []
 
@@ -49,7 +45,7 @@ def test_parts_and_compressed_recordings_are_recordings(rig: Rig, run: Path, tmp
     assert rig("cut", run, "--frames", "0:9", "--out", tmp_path / "few").out.rstrip().endswith("blocks, no whole map")
 
 
-@pytest.mark.parametrize("estimator", ["argmax", "likelihood", "joint"])
+@pytest.mark.parametrize("estimator", ["likelihood", "joint"])
 def test_the_maps_of_a_part_come_out_as_in_the_whole(rig: Rig, tmp_path: Path, estimator: str) -> None:
     content = config()
     content["scan"] |= {"bidirectional": True}
@@ -64,29 +60,14 @@ def test_the_maps_of_a_part_come_out_as_in_the_whole(rig: Rig, tmp_path: Path, e
             assert (again / name.format(made)).read_bytes() == (whole / name.format(was)).read_bytes()
 
 
-def commands_of(folder: Path) -> list[tuple[object, ...]]:
-    """All that take the folder of a recording."""
-    return [
-        ("reconstruct", folder, "--out", "new"),
-        ("reconstruct", folder, "--plan", folder / "plan.yaml", "--out", "new"),
-        ("replay", folder, "--out", "new"),
-        ("verify", folder),
-        ("repair", folder),
-        ("info", folder),
-        ("cut", folder, "--maps", "0:1", "--out", "new"),
-        ("export", folder, "npy", "--out", "new"),
-        ("export", folder, "ply", "--out", "new"),
-        ("export", folder, "png", "--view", "frames", "--out", "new"),
-    ]
-
-
 def test_a_folder_without_a_recording_is_called_what_it_is_by_every_command(rig: Rig, run: Path) -> None:
     for file in run.glob("frames*"):
         file.unlink()
     shutil.rmtree(run / "cloud")
-    for arguments in commands_of(run):
-        ran = rig(*arguments)
-        assert (ran.code, len(ran.problems), ran.err.count("\n")) == (2, 1, 1), (arguments, ran.err)
+    commands = "reconstruct R --out new", "reconstruct R --plan R/plan.yaml --out new", "replay R", "verify R", "info R"
+    for command in (*commands, "repair R", "cut R --maps 0:1 --out new", "export R npy", "export R ply"):
+        ran = rig(*(word.replace("R", str(run), 1) if word[0] == "R" else word for word in command.split()))
+        assert (ran.code, len(ran.problems), ran.err.count("\n")) == (2, 1, 1), (command, ran.err)
         assert f"{run} holds no recording (frames-*.spb): the frames of this run were not recorded" in ran.err
     assert not list(Path().iterdir())
 
@@ -131,10 +112,9 @@ def damage(folder: Path, at: int) -> None:
 @pytest.mark.parametrize(
     "key",
     [
-        "verdict", "maps", "config", "config.scan", "config.spad", "calibration", "calibration.accepted", "rig",
-        "rig.kinds", "inputs", "inputs.plan.yaml", "counters", "counters.delivered", "recording", "recording.starts",
-        "recording.blocks", "sweeps", "sweeps.0", "sweeps.0.first_frame", "sweeps.0.clock_error", "cut", "cut.frames",
-        "cut.maps", "missing", "repaired", "gaps", "devices", "devices.spad", "plan", "versions",
+        "verdict", "maps", "config", "config.scan", "calibration.accepted", "rig.kinds", "inputs.plan.yaml",
+        "counters.delivered", "recording", "recording.starts", "recording.blocks", "sweeps", "sweeps.0.first_frame",
+        "sweeps.0.clock_error", "cut", "cut.maps", "missing", "repaired", "gaps", "devices.spad", "plan", "versions",
     ],
 )  # fmt: skip
 def test_a_sealed_manifest_of_wrong_types_is_damaged_or_harmless(run: Path, tmp_path: Path, key: str) -> None:

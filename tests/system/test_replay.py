@@ -10,7 +10,6 @@ from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
-import numpy as np
 import pytest
 
 from drivers.recorded import RunRecording
@@ -19,6 +18,7 @@ from rig.errors import DamagedRecordingError, UsageError
 from rig.run_folder.manifest import read_manifest, sealed_text
 from rig.scan import scan as scanning
 from tests.system.conftest import Rig
+from tests.system.run_files import arrays
 from tests.system.small_rig import config, write_rig
 
 
@@ -45,18 +45,6 @@ def lossy(tmp_path_factory: pytest.TempPathFactory) -> Path:
         return scan_of(tmp_path_factory.mktemp("lossy"), "argmax", 3, loss_probability=0.01)
 
 
-def arrays(run: Path) -> dict[str, bytes]:
-    """Every number of every map."""
-    found = {}
-    for kind in ("depth", "stripe", "learned", "truth"):
-        for file in sorted((run / kind).glob("*.np[yz]")):
-            loaded = np.load(file)
-            parts = {"": loaded} if file.suffix == ".npy" else dict(loaded)
-            found |= {f"{kind}/{file.stem}/{name}": part.tobytes() for name, part in parts.items()}
-    assert found
-    return found
-
-
 def with_manifest(run: Path, copy: Path, change: Callable[[dict[str, Any]], None]) -> Path:
     """A copy of a run whose manifest was changed and sealed again."""
     shutil.copytree(run, copy)
@@ -81,9 +69,8 @@ def test_the_maps_are_those_of_the_scan_to_the_last_bit(learned: Path, tmp_path:
     assert arrays(tmp_path / "again") == arrays(learned)
 
 
-@pytest.mark.parametrize("block_frames", [None, 5])
-def test_gaps_and_starts_are_those_of_the_scan(lossy: Path, tmp_path: Path, block_frames: int | None) -> None:
-    result = api.replay(lossy, clock="max", block_frames=block_frames, out=tmp_path / "again", record=True)
+def test_gaps_and_starts_are_those_of_the_scan(lossy: Path, tmp_path: Path) -> None:
+    result = api.replay(lossy, clock="max", block_frames=5, out=tmp_path / "again", record=True)
     before, after = read_manifest(lossy), read_manifest(tmp_path / "again")
     assert before is not None
     assert after is not None
@@ -108,13 +95,6 @@ def test_fewer_maps_are_the_first_ones_and_more_need_a_loop(lossy: Path, tmp_pat
     assert first["depth/000004/"] == first["depth/000001/"]
 
 
-def test_another_estimator_can_be_tried_on_the_same_frames(learned: Path) -> None:
-    result = api.replay(learned, clock="max", estimator="argmax", filter="median")
-    assert (result.summary.estimator, result.summary.filter) == ("argmax", "median")
-    assert result.summary.maps == 3
-    assert result.summary.truth is not None
-
-
 @pytest.mark.parametrize("why", ["killed", "disk full"])
 def test_a_recording_that_was_cut_short_gives_its_whole_maps(learned: Path, tmp_path: Path, why: str) -> None:
     def change(manifest: dict[str, Any]) -> None:
@@ -136,11 +116,7 @@ def test_a_recording_that_was_cut_short_gives_its_whole_maps(learned: Path, tmp_
     assert arrays(tmp_path / "again").items() < arrays(learned).items()
 
 
-def test_recordings_of_versions_that_knew_passes_are_played_or_refused_in_a_sentence(
-    lossy: Path, tmp_path: Path
-) -> None:
-    plain = with_manifest(lossy, tmp_path / "plain", lambda manifest: manifest["config"]["scan"].update(adaptive=None))
-    assert api.replay(plain, clock="max", maps=1).summary.maps == 1
+def test_recordings_in_passes_of_older_versions_are_refused_in_a_sentence(lossy: Path, tmp_path: Path) -> None:
     in_passes = with_manifest(lossy, tmp_path / "passes", lambda manifest: manifest.update(passes=[]))
     for call in (lambda: api.replay(in_passes, clock="max"), lambda: api.cut(in_passes, maps="0", out=tmp_path / "x")):
         with pytest.raises(UsageError, match="was scanned with --adaptive"):

@@ -4,8 +4,8 @@
 
 A small recording of two starts, plain or compressed, with or without frames that the device lost, gets one to three
 wounds: bytes flipped, cut off, doubled, swapped or zeroed, in a segment, the index or the manifest, or whole files lost
-or swapped. Some of the plain ones get false numbers with the right checksums instead, in headers, trailers and index,
-and such wounds beside; they are repaired, and only what holds of any repair is looked at. It ends wrong where
+or swapped. Some of the plain ones get false numbers with the right checksums besides, in headers, trailers and index.
+It ends wrong where
 
 - `verify` calls it what it was before, and a frame or a word of the manifest is not as it was;
 - a frame is read that is not one of those recorded, or not in order without a problem being told;
@@ -105,12 +105,25 @@ def _wounded(files: dict[str, bytes], rng: np.random.Generator) -> str | None:
             return "file lost"
         files[one], files[other] = files[other], files[one]
         return "files swapped"
-    if target not in files:
+    before = files.get(target)
+    if not before:
         return None
-    name, act = _WOUNDS[int(rng.integers(len(_WOUNDS)))]
-    before = files[target]
-    files[target] = bytes(act(bytearray(before), rng)) if before else before
-    return name if files[target] != before else None
+    kind, data = str(rng.choice(["flipped", "cut off", "doubled", "swapped", "zeroed"])), bytearray(before)
+    piece, at = _piece(data, rng), _piece(data, rng).start
+    other = slice(at, at + piece.stop - piece.start)
+    if kind == "flipped":
+        for _ in range(int(rng.integers(1, 9))):
+            data[int(rng.integers(len(data)))] ^= 1 << int(rng.integers(8))
+    elif kind == "cut off":
+        del data[at:]
+    elif kind == "doubled":
+        data[at : other.stop if rng.integers(2) else at] = data[piece]
+    elif kind == "zeroed":
+        data[piece] = bytes(piece.stop - piece.start)
+    elif other.stop <= len(data) and (other.stop <= piece.start or piece.stop <= other.start):
+        data[piece], data[other] = data[other], data[piece]
+    files[target] = bytes(data)
+    return kind if files[target] != before else None
 
 
 def _piece(data: bytearray, rng: np.random.Generator) -> slice:
@@ -119,46 +132,6 @@ def _piece(data: bytearray, rng: np.random.Generator) -> slice:
     begin = int(rng.integers(len(data))) // step * step
     length = int(rng.choice([1, 4, 64, 1000, 4096, 8192, 20_000]))
     return slice(begin, min(len(data), begin + -(-length // step) * step))
-
-
-def _flip(data: bytearray, rng: np.random.Generator) -> bytearray:
-    for _ in range(int(rng.integers(1, 9))):
-        data[int(rng.integers(len(data)))] ^= 1 << int(rng.integers(8))
-    return data
-
-
-def _truncate(data: bytearray, rng: np.random.Generator) -> bytearray:
-    return data[: _piece(data, rng).start]
-
-
-def _duplicate(data: bytearray, rng: np.random.Generator) -> bytearray:
-    piece, at = _piece(data, rng), _piece(data, rng).start
-    if rng.integers(2):
-        return data[:at] + data[piece] + data[at:]
-    return data[:at] + data[piece] + data[at + piece.stop - piece.start :]
-
-
-def _swap(data: bytearray, rng: np.random.Generator) -> bytearray:
-    piece, at = _piece(data, rng), _piece(data, rng).start
-    other = slice(at, at + piece.stop - piece.start)
-    if other.stop <= len(data) and (other.stop <= piece.start or piece.stop <= other.start):
-        data[piece], data[other] = data[other], data[piece]
-    return data
-
-
-def _zero(data: bytearray, rng: np.random.Generator) -> bytearray:
-    piece = _piece(data, rng)
-    data[piece] = bytes(piece.stop - piece.start)
-    return data
-
-
-_WOUNDS: list[tuple[str, Callable[[bytearray, np.random.Generator], bytearray]]] = [
-    ("flipped", _flip),
-    ("cut off", _truncate),
-    ("doubled", _duplicate),
-    ("swapped", _swap),
-    ("zeroed", _zero),
-]
 
 
 def judge(folder: Path, pristine: Pristine) -> str:
@@ -230,15 +203,14 @@ def mend(folder: Path, pristine: Pristine) -> None:
 
 def forge(files: dict[str, bytes], rng: np.random.Generator) -> str:
     """Give one block or one record of the index a false number with the right checksum; what was done."""
-    if rng.integers(4) == 0 and INDEX_FILE in files:
-        data = bytearray(files[INDEX_FILE])
-        records = (len(data) - INDEX_HEADER_BYTES) // INDEX_RECORD.itemsize
-        if records > 0:
-            name = str(rng.choice([name for name in INDEX_RECORD.names or () if name != "crc"]))
-            most = 2 ** (8 * INDEX_RECORD[name].itemsize) - 1
-            forge_record(data, int(rng.integers(records)), name, _number(rng, most))
-            files[INDEX_FILE] = bytes(data)
-            return "index forged"
+    data = bytearray(files.get(INDEX_FILE, b""))
+    records = (len(data) - INDEX_HEADER_BYTES) // INDEX_RECORD.itemsize
+    if rng.integers(4) == 0 and records > 0:
+        name = str(rng.choice([name for name in INDEX_RECORD.names or () if name != "crc"]))
+        most = 2 ** (8 * INDEX_RECORD[name].itemsize) - 1
+        forge_record(data, int(rng.integers(records)), name, _number(rng, most))
+        files[INDEX_FILE] = bytes(data)
+        return "index forged"
     segments = sorted(name for name in files if name.endswith(".spb") and len(files[name]) >= PAGE_BYTES)
     if not segments:
         return "nothing forged"
@@ -290,10 +262,8 @@ def make_sequence(root: Path) -> Callable[[int], Ending]:
         files = dict(pristine.files)
         wounds = int(rng.choice([1, 2, 3], p=[0.8, 0.15, 0.05]))
         forged = seed % FORGED == 0 and not any(name.endswith(".zst") for name in files)
-        if forged:
-            kinds = {forge(files, rng) for _ in range(wounds)} | {wound(files, rng) for _ in range(wounds - 1)}
-        else:
-            kinds = {wound(files, rng) for _ in range(wounds)}
+        kinds = {forge(files, rng) for _ in range(wounds)} if forged else {wound(files, rng)}
+        kinds |= {wound(files, rng) for _ in range(wounds - 1)}
 
         def act(folder: Path) -> str:
             if forged:

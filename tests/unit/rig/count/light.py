@@ -15,11 +15,10 @@ from calibration.model.camera import Camera
 from calibration.model.rig_model import Lag, RigModel
 from calibration.model.scanner import PivotScanner
 from drivers.frames import FRAME_RECORD, BlockFlag, BlockHeader, FrameBlock
-from drivers.interfaces import LEVEL_BACKWARD, MARKER_SCAN, OUT_GATE, BurstMode
+from drivers.interfaces import LEVEL_BACKWARD, MARKER_SCAN, BurstMode
 from rig.plan.compile import compile_plan
-from rig.plan.gate_pulses import sync_program
 from rig.plan.scan_plan import ScanPlan
-from tests.unit.rig.count.streams import SPAD, TICK_HZ, scan, scanner_limits, timer_clock
+from tests.unit.rig.count.streams import SPAD, TICK_HZ, gate_high_s, scan, scanner_limits, timer_clock
 
 WIDTH, HEIGHT = 512, 64
 LAG = Lag(2e-4, 1.5e-4)
@@ -109,18 +108,7 @@ def see(
     command, words = np.tile(plan.waveform.command, repeats), np.tile(plan.waveform.markers, repeats)
     high = np.concatenate([[False], (words & MARKER_SCAN) != 0])
     scan_s = latency_s + np.flatnonzero(high[1:] & ~high[:-1]) / rate
-    pulses, times = sync_program(plan, maps)
-    lit: list[tuple[float, float]] = []
-    now, sweep = 0.0, 0
-    for pulse in pulses * times:
-        if pulse.duration_s is None:
-            assert not pulse.outputs & OUT_GATE
-            now, sweep = scan_s[sweep], sweep + 1
-            continue
-        end = now + pulse.duration_s / (1 + sync_error)
-        if pulse.outputs & OUT_GATE:
-            lit.append((now, end))
-        now = end
+    lit = list(gate_high_s(plan, maps, scan_s, 1 / (1 + sync_error)))
     period = int(TICK_HZ / plan.frame_rate_hz)
     frame_s = period / float(TICK_HZ)
     start = np.arange(int((lit[-1][1] + 20 * frame_s) / frame_s)) * frame_s

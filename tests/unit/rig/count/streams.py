@@ -1,7 +1,7 @@
 """Frame streams made from a plan's waveform and pulses alone, with none of the plan's or the binder's formulas."""
 
-from collections.abc import Iterable, Sequence
-from dataclasses import dataclass
+from collections.abc import Iterable, Iterator, Sequence
+from dataclasses import dataclass, replace
 from fractions import Fraction
 
 import numpy as np
@@ -22,32 +22,18 @@ TICK_HZ = Fraction(100_000_000)
 NO_LAG = Lag()
 
 SPAD = SpadInfo(
-    model="test",
-    serial="0",
-    width=WIDTH,
-    height=HEIGHT,
-    rotation_deg=0,
-    max_frame_rate_hz=Fraction(200_000),
-    burst=None,
-    stream=StreamMode(1e10),
-    roi_step_px=64,
-    markers=True,
-    trigger_modes=("free",),
-)
+    model="test", serial="0", width=WIDTH, height=HEIGHT, rotation_deg=0, max_frame_rate_hz=Fraction(200_000),
+    burst=None, stream=StreamMode(1e10), roi_step_px=64, markers=True, trigger_modes=("free",),
+)  # fmt: skip
 
 
 def scanner_limits(**changes: object) -> ScannerLimits:
     """A galvo faster than any, so that only the changed limits bind."""
-    values: dict[str, object] = {
-        "command_range": (-1.0, 1.0),
-        "velocity_per_s": 1e5,
-        "acceleration_per_s2": 1e9,
-        "step": 2.0,
-        "rms_duty": 1.0,
-        "max_points": 1_000_000,
-        "point_rate_hz": (1e3, 2e5),
-    }
-    return ScannerLimits(**{**values, **changes})  # type: ignore[arg-type]
+    fastest = ScannerLimits(
+        command_range=(-1.0, 1.0), velocity_per_s=1e5, acceleration_per_s2=1e9, step=2.0, rms_duty=1.0,
+        max_points=1_000_000, point_rate_hz=(1e3, 2e5),
+    )  # fmt: skip
+    return replace(fastest, **changes)  # type: ignore[arg-type]
 
 
 def timer_clock(requested_hz: float) -> Fraction:
@@ -111,22 +97,11 @@ class Stream:
         records = self.records[first:end].copy()
         records["ticks"] = self.ticks[first:end] - self.ticks[first]
         header = BlockHeader(
-            flags=BlockFlag(0),
-            run_id=1,
-            block_seq=seq,
-            first_frame=first,
-            t0_ticks=int(self.ticks[first]),
-            lost_before=lost_before,
-            tick_hz=TICK_HZ,
-            frame_period_ticks=self.period_ticks,
-            exposure_ticks=self.exposure_ticks,
-            sweep=int(self.records["sweep"][first]),
-            frame_step=1,
-            width=WIDTH,
-            height=HEIGHT,
-            sensor_width=WIDTH,
-            sensor_height=HEIGHT,
-        )
+            flags=BlockFlag(0), run_id=1, block_seq=seq, first_frame=first, t0_ticks=int(self.ticks[first]),
+            lost_before=lost_before, tick_hz=TICK_HZ, frame_period_ticks=self.period_ticks,
+            exposure_ticks=self.exposure_ticks, sweep=int(self.records["sweep"][first]), frame_step=1,
+            width=WIDTH, height=HEIGHT, sensor_width=WIDTH, sensor_height=HEIGHT,
+        )  # fmt: skip
         bits = np.zeros((end - first, HEIGHT, packed_row_bytes(WIDTH)), np.uint8)
         for i in range(first, end):  # the same bits for a frame in whatever block it comes
             bits[i - first] = np.random.default_rng((seed, i)).integers(0, 256, bits.shape[1:], np.uint8)
@@ -163,12 +138,7 @@ def stream_of(
 
     at = (middle_s - latency_s) * rate
     falls = (markers[np.clip(at.astype(np.int64), 0, len(markers) - 1)] & LEVEL_BACKWARD) != 0
-    grid = np.arange(len(command))
-    mirror = np.where(
-        falls,
-        np.interp(at - lag.backward * rate, grid, command),
-        np.interp(at - lag.forward * rate, grid, command),
-    )
+    mirror = np.interp(at - np.where(falls, lag.backward, lag.forward) * rate, np.arange(len(command)), command)
     records = np.zeros(n, FRAME_RECORD)
     marks = np.zeros(n, np.uint32)
     position = np.zeros(n, np.uint32)
@@ -181,25 +151,32 @@ def stream_of(
     lines_before = np.concatenate([[0], np.searchsorted(line_s, scan_s)])
     records["line"] = np.searchsorted(line_frames, np.arange(n), side="right") - lines_before[records["sweep"]]
     marks[falls] |= np.uint32(Mark.BACKWARD)
-    pulses, times = sync_program(plan, maps)
-    sequence = [pulse for _ in range(times) for pulse in pulses]
-    now, sweep = 0.0, 0
     end_s = start_s + exposure / float(TICK_HZ)
-    for pulse in sequence:
+    for opens, closes in gate_high_s(plan, maps, scan_s, 1 + gate_error):
+        marks[(start_s >= opens) & (end_s <= closes)] |= np.uint32(Mark.GATE_HIGH)
+        edge = ((start_s < opens) & (end_s > opens)) | ((start_s < closes) & (end_s > closes))
+        marks[edge] |= np.uint32(Mark.GATE_EDGE)
+        position[edge] = 128  # the latest edge may be the gate's
+    records["marks"] = marks | (position << 8)
+    assert points == plan.sweep_points * plan.sweeps_per_period
+    return Stream(records, ticks, mirror, scan_frames, exposure, period)
+
+
+def gate_high_s(
+    plan: ScanPlan, maps: int, scan_s: NDArray[np.float64], stretch: float
+) -> Iterator[tuple[float, float]]:
+    """From when to when each pulse of light lasts, with scan markers at scan_s and a sync clock that stretches time."""
+    pulses, times = sync_program(plan, maps)
+    now, sweep = 0.0, 0
+    for pulse in pulses * times:
         if pulse.duration_s is None:
             assert not pulse.outputs & OUT_GATE
             now, sweep = scan_s[sweep], sweep + 1
             continue
-        end = now + pulse.duration_s * (1 + gate_error)
+        end = now + pulse.duration_s * stretch
         if pulse.outputs & OUT_GATE:
-            marks[(start_s >= now) & (end_s <= end)] |= np.uint32(Mark.GATE_HIGH)
-            edge = ((start_s < now) & (end_s > now)) | ((start_s < end) & (end_s > end))
-            marks[edge] |= np.uint32(Mark.GATE_EDGE)
-            position[edge] = 128  # the latest edge may be the gate's
+            yield now, end
         now = end
-    records["marks"] = marks | (position << 8)
-    assert points == plan.sweep_points * plan.sweeps_per_period
-    return Stream(records, ticks, mirror, scan_frames, exposure, period)
 
 
 def stand_still(stream: Stream, frames: int) -> int:

@@ -10,12 +10,12 @@ from calibration.model.rig_model import Lag
 from drivers.errors import ProtocolError
 from drivers.frames import SUBFRAME_SHIFT, Mark
 from rig.count import sweeps
-from rig.count.bind import FrameBinder, SweepClock
+from rig.count.bind import FrameBinder
 from rig.count.bind_kernels import cover
 from rig.count.volume import BIN_DARK, BIN_UNUSABLE
 from rig.errors import PlanError
 from tests.stability.inventory import covers
-from tests.unit.rig.count.streams import Stream, plan_of, scan, scanner_limits, stand_still, stream_of
+from tests.unit.rig.count.streams import Stream, plan_of, scan, scanner_limits, stream_of
 
 covers(cover, sweeps)
 
@@ -27,9 +27,7 @@ def bind(plan, blocks):
         places, closed = binder.bind(block)
         bound.append(places)
         clocks += closed
-    merged = {
-        name: np.concatenate([getattr(b, name) for b in bound]) for name in ("sweep", "direction", "column", "bins")
-    }
+    merged = {name: np.concatenate([getattr(b, name) for b in bound]) for name in ("sweep", "column", "bins")}
     return merged, clocks
 
 
@@ -134,18 +132,6 @@ def test_every_column_gets_its_exposures_and_the_column_is_where_the_mirror_is(c
         assert dark >= 0.05 * np.count_nonzero(bound["sweep"] == sweep) - 1
 
 
-@settings(max_examples=15, deadline=None)
-@given(st.lists(st.integers(1, 300), min_size=1, max_size=20), st.booleans())
-def test_places_do_not_depend_on_the_size_of_blocks(sizes, bidirectional):
-    plan = plan_of(scan(bidirectional=bidirectional), Lag(1e-4, 2e-4))
-    stream = stream_of(plan, 3, lag=Lag(1e-4, 2e-4), clock_error=7e-5)
-    one, clocks = bind(plan, whole(stream, itertools.repeat(10**6)))
-    other, same_clocks = bind(plan, whole(stream, itertools.cycle(sizes)))
-    for name, values in one.items():
-        np.testing.assert_array_equal(other[name], values)
-    assert same_clocks == clocks
-
-
 @settings(max_examples=25, deadline=None)
 @given(cases(), st.lists(st.integers(1, 300), min_size=1, max_size=5), st.randoms(use_true_random=False), st.booleans())
 def test_every_frame_is_where_the_rule_puts_it_to_the_last_bit(case, sizes, rng, disturbed):
@@ -165,48 +151,6 @@ def test_every_frame_is_where_the_rule_puts_it_to_the_last_bit(case, sizes, rng,
     np.testing.assert_array_equal(bound["sweep"], sweep)
     np.testing.assert_array_equal(bound["column"], column)
     np.testing.assert_array_equal(bound["bins"], bins)
-
-
-@pytest.mark.parametrize("sizes", [1, 64, 10**6])
-@pytest.mark.parametrize("sweep", [0, 1])
-def test_a_frame_that_would_fall_back_to_a_column_already_left_is_not_used(sweep, sizes):
-    plan = plan_of(scan(bidirectional=True, exposures=100))
-    stream = stream_of(plan, 2)
-    records = stream.records
-    at = np.flatnonzero((records["marks"] & Mark.LINE != 0) & (records["sweep"] == sweep + 1) & (records["line"] == 9))
-    marker = int(at[0])
-    # The edge seen 3 frames late, at the end of a frame: the frames before it have gone on to the next column.
-    records["marks"][marker] &= np.uint32(0xFF & ~Mark.LINE)
-    records["line"][marker : marker + 3] -= 1
-    late = marker + 3
-    records["marks"][late] = (records["marks"][late] & 0xFF) | Mark.LINE | 0xFF00
-    bound, clocks = bind(plan, whole(stream, itertools.repeat(sizes)))
-    assert all(clock.synchronised for clock in clocks)
-    left, entered = (7, 8) if sweep == 0 else (12, 11)
-    assert bound["bins"][late - 1] == entered
-    assert np.floor(bound["column"][late] + 0.5) == left
-    assert bound["bins"][late] == BIN_UNUSABLE
-    assert bound["bins"][late + 1] == entered
-    for number in (0, 1):
-        used = bound["bins"][(bound["bins"] >= 0) & (bound["sweep"] == number)]
-        assert (np.diff(used) * plan.leg(number).direction >= 0).all()
-        assert np.abs(np.bincount(used) - 100).max() <= 4
-
-
-@pytest.mark.parametrize(("exposures", "limited"), [(40, True), (200, True), (201, False)])
-def test_a_mirror_that_stands_still_fills_its_column_no_further_than_bytes_count(exposures, limited):
-    plan = plan_of(scan(exposures=exposures, columns=30))
-    stream = stream_of(plan, 1)
-    at = stand_still(stream, 700)
-    bound, clocks = bind(plan, whole(stream, itertools.repeat(64)))
-    there = bound["bins"][at : at + 700]
-    column = int(there[0])
-    assert np.count_nonzero(there == column) == (255 if limited else 700)
-    assert (there[:255] == column).all()
-    assert (there[255:] == (BIN_UNUSABLE if limited else column)).all()
-    assert np.bincount(bound["bins"][bound["bins"] >= 0]).max() == 255 or not limited
-    assert (bound["sweep"][at : at + 700] == 0).all()
-    assert not clocks[0].synchronised
 
 
 @pytest.mark.parametrize("error", [-9e-5, 0.0, 1.1e-4])
@@ -244,24 +188,17 @@ def test_a_sweep_that_was_lost_whole_is_still_counted():
     assert not clocks[1].synchronised
 
 
-def test_a_stray_marker_position_flags_the_sweep():
+def test_a_stray_marker_position_or_a_wrong_direction_level_flags_the_sweep():
     plan = plan_of(scan(columns=40, exposures=1))
     stream = stream_of(plan, 2)
     line = np.flatnonzero(stream.records["marks"] & Mark.LINE)[2]
     marks = int(stream.records["marks"][line])
     stream.records["marks"][line] = (marks & 0xFF) | (((marks >> 8) + 100) % 256 << 8)
     _, clocks = bind(plan, whole(stream))
+    assert [clock.synchronised for clock in clocks] == [False, True]
     assert clocks[0].residual_columns > 0.05
-    assert not clocks[0].synchronised
-    assert clocks[1].synchronised
-
-
-def test_a_direction_level_that_is_not_the_plans_flags_the_sweep():
-    plan = plan_of(scan(bidirectional=True))
-    stream = stream_of(plan, 2)
     stream.records["marks"] ^= np.uint32(Mark.BACKWARD)
-    _, clocks = bind(plan, whole(stream))
-    assert not any(clock.synchronised for clock in clocks)
+    assert not any(clock.synchronised for clock in bind(plan, whole(stream))[1])
 
 
 def test_counters_of_16_bits_run_over_without_harm():
@@ -269,9 +206,8 @@ def test_counters_of_16_bits_run_over_without_harm():
     stream = stream_of(plan, 3)
     expected, _ = bind(plan, whole(stream))
     counted = stream.records["sweep"].astype(np.int64)
-    blocks = whole(stream)
     shifted = []
-    for block in blocks:
+    for block in whole(stream):
         at = block.header.first_frame
         block.records["sweep"] = (counted[at : at + block.n_frames] + 65534) & 0xFFFF
         header = dataclasses.replace(block.header, sweep=int(counted[at]) + 65534)
@@ -282,14 +218,8 @@ def test_counters_of_16_bits_run_over_without_harm():
     assert [c.sweep for c in clocks][-3:] == [65534, 65535, 65536]
 
 
-def test_a_sweep_with_too_few_markers_is_not_called_synchronised():
-    assert not SweepClock(0, 0.0, float("nan"), 1, 0, 10, 0).synchronised
-    assert not SweepClock(0, 5e-3, 0.0, 9, 0, 10, 0).synchronised
-    assert SweepClock(0, 5e-5, 0.01, 9, 0, 10, 0).synchronised
-
-
-@pytest.mark.parametrize("bit", range(16))
-@pytest.mark.parametrize("at", [1, 10, 12, 105, 150, 250, 251, 400])
+@pytest.mark.parametrize("bit", [0, 1, 5, 15])
+@pytest.mark.parametrize("at", [1, 12, 105, 250, 251, 400])
 def test_one_flipped_bit_of_a_sweep_number_costs_no_more_than_its_frame(bit, at):
     plan = plan_of(scan())
     stream = stream_of(plan, 5)

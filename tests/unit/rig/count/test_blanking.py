@@ -11,11 +11,9 @@ from drivers.errors import DeviceFault
 from drivers.interfaces import OUT_GATE, BurstMode
 from rig.count import blanking
 from rig.count.bind import FrameBinder
-from rig.count.blanking import PatternSearch, PatternShape, detection_probability
 from rig.count.volume import BIN_DARK
 from rig.errors import PlanError
 from rig.plan.gate_pulses import sync_program
-from rig.plan.scan_plan import CODE, Blanking
 from tests.stability.inventory import covers
 from tests.unit.rig.count.light import blanked_plan, see
 from tests.unit.rig.count.streams import SPAD, plan_of, scan
@@ -29,13 +27,13 @@ def bind(plan, blocks):
     for block in blocks:
         bound, closed = binder.bind(block)
         clocks += closed
-        parts.append((block.frame_numbers, bound.sweep, bound.direction, bound.column, bound.bins))
+        parts.append((block.frame_numbers, bound.sweep, bound.column, bound.bins))
     return [np.concatenate(part) for part in zip(*parts, strict=True)], clocks
 
 
 def error_of(plan, seen, bound, sweep):
     """Largest distance of the frames of a sweep from where the mirror was, in columns; checks their light besides."""
-    frame, number, _, column, bins = bound
+    frame, number, column, bins = bound
     here = number == sweep
     lit, dark = here & (bins >= 0), here & (bins == BIN_DARK)
     first, last = plan.command_range
@@ -46,16 +44,12 @@ def error_of(plan, seen, bound, sweep):
 
 
 CASES = {
-    "clear air": ({}, {"brightness": 60, "level": 20}),
-    "fog": ({}, {"brightness": 2000, "level": 300}),
     "daylight": ({}, {"brightness": 400, "level": 8000}),
     "few photons": ({"exposures": 50, "columns": 30}, {"brightness": 12, "level": 3}),
     "light that varies": ({}, {"scene": 0.6}),
-    "both ways": ({"bidirectional": True}, {"scanner_error": 3e-4}),
     "both ways, downward": ({"bidirectional": True, "command_range": [0.3, -0.3]}, {"scanner_error": -2e-4}),
     "fast scanner": ({}, {"scanner_error": 9e-4, "brightness": 300}),
     "slow scanner": ({}, {"scanner_error": -9e-4, "brightness": 300}),
-    "a little off": ({}, {"scanner_error": 1e-4, "sync_error": -1e-4}),
     "fast sync": ({}, {"sync_error": 9e-4, "brightness": 300}),
     "K = 1": ({"exposures": 1, "columns": 300}, {"brightness": 2000}),
     "short exposure": ({"exposure": "12 us"}, {}),
@@ -76,10 +70,9 @@ def test_frames_are_bound_to_columns_by_their_light_alone(name):
         assert clock.clock_error == pytest.approx(light.get("scanner_error", 0.0), abs=1.5e-4)
         # From the frame on at which its pattern has passed: a sweep and no more.
         assert clock.end_frame - clock.first_frame == pytest.approx(float(plan.frames_per_sweep), abs=3)
-        here = (bound[1] == clock.sweep) & (bound[4] >= 0)
-        counts = np.bincount(bound[4][here], minlength=plan.columns)
+        _, number, _, bins = bound
+        counts = np.bincount(bins[(number == clock.sweep) & (bins >= 0)], minlength=plan.columns)
         assert np.abs(counts - plan.exposures).max() <= 1
-        assert set(bound[2][here]) == {plan.leg(clock.sweep).direction}
 
 
 def test_the_block_size_changes_nothing():
@@ -94,27 +87,7 @@ def test_the_block_size_changes_nothing():
             np.testing.assert_array_equal(a, b)
 
 
-@pytest.mark.parametrize("exposure", [1.0, 0.6])
-def test_place_and_standard_deviation_of_a_pattern_are_true(exposure):
-    flashes = np.array(Blanking(2.382, 0, 0).flashes_s(0))
-    shape, rng = PatternShape(flashes, exposure), np.random.default_rng(1)
-    search = PatternSearch(shape)
-    pulls, errors = [], []
-    for _ in range(150):
-        place = 10 + rng.uniform()
-        frames = np.arange(100.0)
-        start = frames[:, None]
-        inside = np.minimum(start + exposure, place + flashes[:, 1]) - np.maximum(start, place + flashes[:, 0])
-        share = np.clip(inside, 0, None).sum(axis=1) / exposure
-        found = search.measure(rng.poisson(200 + 80 * share).astype(float), 0, 10.5, 4)
-        assert found is not None
-        errors.append(found.place - place)
-        pulls.append(errors[-1] / found.sd)
-    assert abs(np.mean(errors)) < 0.02
-    assert 0.75 < np.std(pulls) < 1.3
-
-
-@pytest.mark.parametrize("brightness", [1, 3, 6, 10, 15, 20, 25, 30, 40, 60])
+@pytest.mark.parametrize("brightness", [1, 6, 15, 20, 25, 40])
 @pytest.mark.parametrize("exposures", [2, 10])
 def test_with_too_little_light_a_map_is_refused_or_flagged_never_silently_wrong(brightness, exposures):
     plan = blanked_plan(columns=60, exposures=exposures)
@@ -135,13 +108,8 @@ def test_without_a_pattern_the_message_says_what_was_looked_for_and_what_to_do()
     assert "\n" not in message
     for words in ("pattern of 64 frames was not found twice, 118", "sigma at most, at frame", "gate cable", "picture"):
         assert words in message
-
-
-def test_one_pattern_alone_points_at_marker_and_clocks():
-    plan = blanked_plan()
-    seen = see(plan, 1, brightness=300, scanner_error=5e-3)
-    with pytest.raises(DeviceFault, match="scan marker at the sync source, and the clocks"):
-        bind(plan, seen.blocks())
+    with pytest.raises(DeviceFault, match="scan marker at the sync source, and the clocks"):  # one alone
+        bind(plan, see(plan, 1, brightness=300, scanner_error=5e-3).blocks())
 
 
 def test_clocks_further_apart_than_a_crystal_may_be_are_flagged():
@@ -149,16 +117,6 @@ def test_clocks_further_apart_than_a_crystal_may_be_are_flagged():
     _, clocks = bind(plan, see(plan, 2, brightness=300, scanner_error=1.4e-3).blocks())
     assert [clock.synchronised for clock in clocks] == [False, False]
     assert clocks[0].clock_error == pytest.approx(1.4e-3, abs=5e-5)
-
-
-def test_frames_lost_on_columns_leave_the_others_where_they_are():
-    plan = blanked_plan()
-    seen = see(plan, 2)
-    begin = int(seen.scan_frame[1]) + 500
-    bound, clocks = bind(plan, seen.blocks(lost=range(begin, begin + 77)))
-    for clock in clocks:
-        assert clock.synchronised
-        assert error_of(plan, seen, bound, clock.sweep) < 0.06
 
 
 def test_a_pattern_that_was_lost_is_taken_from_the_others_and_the_sweep_before_it_flagged():
@@ -184,27 +142,13 @@ def test_sweeps_follow_one_another_also_where_the_frames_between_them_are_lost()
     assert error_of(plan, seen, bound, 2) < 0.06
 
 
-@pytest.mark.parametrize("dropped", [1, 3, 20])
-def test_frames_that_the_device_dropped_silently_are_noticed(dropped):
+def test_frames_that_the_device_dropped_silently_are_noticed():
     plan = blanked_plan()
     seen = see(plan, 2, brightness=500)
     begin = int(seen.scan_frame[1]) + 500
-    _, clocks = bind(plan, seen.without(range(begin, begin + dropped)).blocks())
-    assert not clocks[0].synchronised
-
-
-def test_the_code_is_unlike_itself_shifted_or_reversed():
-    code = np.array([int(chip) for chip in CODE]) - CODE.count("1") / len(CODE)
-    same, other = np.correlate(code, code, "full"), np.correlate(code, code[::-1], "full")
-    peak = len(code) - 1
-    assert np.abs(np.delete(same, peak)).max() < 0.4 * same[peak]
-    assert np.abs(other).max() < 0.5 * same[peak]
-
-
-def test_the_chance_of_detection_is_even_at_the_limit_and_grows_with_the_light():
-    assert detection_probability(4.0) == pytest.approx(0.5)
-    assert detection_probability(2.0) == pytest.approx(0.0228, abs=1e-4)
-    assert detection_probability(8.0) > 0.9999
+    for dropped in (1, 20):
+        _, clocks = bind(plan, seen.without(range(begin, begin + dropped)).blocks())
+        assert not clocks[0].synchronised
 
 
 @pytest.mark.parametrize("bidirectional", [False, True])

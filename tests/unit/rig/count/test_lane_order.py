@@ -1,6 +1,5 @@
-"""Counts in lane order against unpacked bits: from planes, from counts in pixel order, and back."""
+"""Counts in lane order that are halved: rounded alike from either side, with the mean kept."""
 
-import numba
 import numpy as np
 import pytest
 
@@ -8,32 +7,13 @@ from rig.count import lane_order
 from rig.count.lane_order import (
     PAD,
     PAIRS,
-    STEPS,
     halve_counts,
     new_counts,
-    padded_lanes,
-    pixel_order,
-    place_of,
     read_counts,
-    read_planes,
-    sum_counts,
-    write_counts,
 )
 from tests.stability.inventory import covers
 
 covers(lane_order)
-
-PLANE_BYTES = 256
-
-
-@numba.njit
-def read(planes, first, second, plane_bytes, n_planes, window, n, lanes):
-    read_planes(planes, first, second, plane_bytes, n_planes, window, n, lanes)
-
-
-@numba.njit
-def add(n, lanes, sums):
-    sum_counts(n, lanes, sums)
 
 
 def address(array):
@@ -44,48 +24,6 @@ def pixels_of(n, lanes):
     """A row of counts in pixel order (8 lanes,)."""
     pairs = n.reshape(PAIRS, lanes + 2 * PAD, 2)
     return pairs[:, PAD : PAD + lanes].transpose(1, 0, 2).ravel()
-
-
-def padding_of(n, lanes):
-    pairs = n.reshape(PAIRS, lanes + 2 * PAD, 2)
-    return np.concatenate([pairs[:, :PAD].ravel(), pairs[:, PAD + lanes :].ravel()])
-
-
-@pytest.mark.parametrize("window", range(64, 513, 64))
-@pytest.mark.parametrize("n_planes", [1, 2, 4, 8])
-@pytest.mark.parametrize("at", [(0, 64), (8, 16), (40, 40)])
-def test_planes_are_read_as_the_bits_that_they_hold(n_planes, window, at):
-    rng = np.random.default_rng(window + n_planes)
-    planes = rng.integers(0, 256, (8, PLANE_BYTES), np.uint8)
-    lanes = padded_lanes(window)
-    n = new_counts(2, lanes)
-    read(address(planes), *at, PLANE_BYTES, n_planes, window, address(n), lanes)
-    for row, begin in zip(n, at, strict=True):
-        bits = np.unpackbits(planes[:, begin : begin + window // 8], axis=1).astype(int)
-        wanted = (bits[:n_planes] << np.arange(n_planes)[:, None]).sum(axis=0)
-        np.testing.assert_array_equal(pixels_of(row, lanes)[:window], wanted)
-        # Beyond the window lie other pixels' bits.
-        assert not pixels_of(row, lanes)[window:].any()
-        assert not padding_of(row, lanes).any()
-
-
-@pytest.mark.parametrize("dtype", [np.uint8, np.uint16, np.uint32])
-@pytest.mark.parametrize("window", [64, 128, 192, 448])
-def test_counts_come_back_as_they_went_in(window, dtype):
-    rng = np.random.default_rng(window)
-    counts = rng.integers(0, 200, window).astype(dtype)
-    lanes = padded_lanes(window)
-    n = new_counts(1, lanes)[0]
-    read_counts(counts, 0, address(n), lanes)
-    np.testing.assert_array_equal(pixels_of(n, lanes)[:window], counts)
-    assert not padding_of(n, lanes).any()
-    for x in (0, 1, 7, 8, window - 1):
-        assert n[place_of(x, lanes)] == counts[x]
-    for x in (-1, -8, lanes * STEPS, lanes * STEPS + 7):
-        assert n[place_of(x, lanes)] == 0
-    out = np.full(window, 3, dtype)
-    write_counts(n, out)
-    np.testing.assert_array_equal(out, counts + 3)
 
 
 @pytest.mark.parametrize("times", [1, 2, 3])
@@ -111,17 +49,3 @@ def test_few_of_very_many_exposures_keep_their_mean_in_every_pixel(times):
         read_counts(counts, times, address(n), 16, turn)
         total += pixels_of(n, 16)
     np.testing.assert_allclose(total / 2048, counts / 2**times, atol=2.0 ** -min(times, 11))
-
-
-def test_sums_of_counts_are_in_pixel_order_when_asked():
-    rng = np.random.default_rng(1)
-    sums = np.zeros((3, PAIRS, 16, 2), np.uint8)
-    wanted = np.zeros((3, 128), np.int64)
-    for _ in range(5):
-        for y in range(3):
-            counts, n = rng.integers(0, 52, 128).astype(np.uint8), new_counts(1, 16)[0]
-            read_counts(counts, 0, address(n), 16)
-            add(address(n), 16, address(sums[y]))
-            wanted[y] += counts
-    for width in (128, 100, 1):
-        np.testing.assert_array_equal(pixel_order(sums, width), wanted[:, :width])

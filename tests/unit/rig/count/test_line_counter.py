@@ -8,9 +8,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from calibration.model.rig_model import Lag
-from rig.count import line_counter
-from rig.count.line_counter import LineCounter
-from rig.count.volume import BIN_DARK, BIN_UNUSABLE, SweepCounter, SweepLayout
+from rig.count.volume import BIN_DARK, BIN_UNUSABLE, LineCounter, SweepCounter, SweepLayout
 from rig.depth.depth import share_claims
 from rig.errors import PlanError
 from rig.geometry import line_grid as line_grid_module
@@ -27,7 +25,7 @@ from tests.stability.inventory import covers
 from tests.unit.rig.count.streams import NO_LAG, SPAD, plan_of, rig_model, scan, scanner_limits, timer_clock
 from tests.unit.rig.count.test_volume import packed, stream
 
-covers(line_grid_module, line_counter)
+covers(line_grid_module, LineCounter)
 
 OFFSETS = (-0.3, -0.1, 0.1, 0.3)
 
@@ -81,12 +79,6 @@ def test_bound_columns_say_where_each_line_stood(ends):
             )
 
 
-def test_one_line_is_bound_as_ever():
-    plan, column = plan_of(scan()), np.linspace(-0.5, 19.5, 20)
-    assert plan.lines is None
-    assert np.array_equal(plan.line_commands(column), plan.command_at(column))
-
-
 def test_several_lines_use_whole_rows_of_a_sensor_whose_windows_would_move():
     wide = dataclasses.replace(SPAD, width=512)
     camera = dataclasses.replace(rig_model().camera, width=512)
@@ -101,15 +93,12 @@ def test_lines_outside_the_calibration_are_refused():
         plan_with((-0.9, 0.0, 0.9), command_range=[-0.4, 0.4], columns=21)
 
 
-def test_the_plan_says_how_many_lines_there_are_and_how_far_they_can_be_taken_for_one_another():
-    text = plan_text(plan_with(OFFSETS, command_range=[-0.1, 0.1], columns=40))
+def test_a_plan_with_lines_says_so_is_read_back_and_one_without_is_written_as_before():
+    plan = plan_with(OFFSETS, command_range=[-0.1, 0.1], columns=40)
+    text = plan_text(plan)
     assert "10 x 4 frames at 100 kHz, 40 us each, for 4 lines at once: 40 columns" in text
     assert "of a column's window is other lines' too" in text
     assert "lines" not in plan_text(plan_of(scan()))
-
-
-def test_a_plan_with_lines_is_kept_and_read_back_and_one_without_is_written_as_before():
-    plan = plan_with(OFFSETS, command_range=[-0.1, 0.1], columns=40)
     again = from_plain(ScanPlan, to_plain(plan))
     assert again.lines.offsets == OFFSETS
     assert again.lines.overlap == plan.lines.overlap
@@ -133,16 +122,6 @@ def test_the_overlap_is_the_share_of_a_window_that_other_windows_cover():
             shares.append((len(own & taken), len(own)))
     covered, whole = np.sum(shares, axis=0)
     assert 0 < window_overlap(grid, geometry) == pytest.approx(covered / whole)
-
-
-def test_each_column_is_told_the_planes_of_those_lit_together_with_it():
-    grid, _ = line_grid(OFFSETS, 40, (-0.1, 0.1))
-    plane = np.random.default_rng(1).normal(size=(40, 3))
-    others = grid.others(plane)
-    assert others.shape == (40, 3, 3)
-    for c in range(40):
-        expected = [plane[o] for o in grid.columns_at()[grid.place[c]] if o != c]
-        assert np.array_equal(others[c], expected)
 
 
 @pytest.mark.parametrize("n", [3, 700])
@@ -173,14 +152,6 @@ def test_lines_are_counted_as_if_each_had_the_frames_to_itself(n):
     assert found.n_dark == np.count_nonzero(bins == BIN_DARK)
     assert np.array_equal(found.dark_counts, frames[bins == BIN_DARK].sum(axis=0))
     assert np.any(bins == BIN_UNUSABLE)
-
-
-def test_windows_of_frames_are_refused():
-    grid, _ = line_grid((0.0, 1.0), 4, (0.0, 1.0))
-    with RowWorkers(1) as workers:
-        counter = LineCounter(SweepLayout(4, 2, 128, np.zeros(4, np.int32), 64, 1), grid, workers)
-        with pytest.raises(ValueError, match="64 pixels a row; several lines need all 128"):
-            counter.add(np.zeros((1, 2, 8), np.uint8), np.zeros(1, np.int32), np.zeros(1), np.zeros(1, np.int32))
 
 
 def test_answers_that_take_the_same_stripe_share_what_they_are_worth():

@@ -1,12 +1,15 @@
 """Maps whose own light speaks against them, and maps that are right though faint, hazy, tilted or small."""
 
+from collections.abc import Callable
 from dataclasses import replace
+from typing import Any
 
 import numpy as np
 import pytest
+from numpy.typing import NDArray
 
 from rig.count import map_check_kernels, map_checks
-from rig.count.map_checks import POINTS, MapChecks, check_points
+from rig.count.map_checks import MapChecks
 from rig.geometry.stripe_table import StripeTable
 from tests.stability.inventory import covers
 from tests.unit.small_maps import simulated, volume_of
@@ -14,52 +17,67 @@ from tests.unit.small_maps import simulated, volume_of
 covers(map_checks, map_check_kernels)
 
 ROWS, COLUMNS = 64, 160
+Counts = NDArray[Any]
+Change = Callable[[Counts, int, np.random.Generator], Counts]
 
 
-def doubts(light: str, exposures: int, change=None, rig: str = "left") -> tuple[str, ...]:
+def doubts(light: str, exposures: int, change: Change | None = None, rig: str = "left") -> tuple[str, ...]:
     """Of a simulated sweep whose counts (columns, rows, width) were changed; no answer is sure."""
     sweep = simulated(light, exposures, rig, rows=ROWS, columns=COLUMNS)
-    counts = sweep.counts if change is None else change(sweep.counts)
+    counts = sweep.counts if change is None else change(sweep.counts, exposures, np.random.default_rng(0))
     volume = volume_of(counts, sweep.geometry, exposures)
     checks = MapChecks(sweep.geometry, calibrated=True, knows=False)
     return checks.doubts(volume, volume.intensity(), StripeTable.empty(ROWS, COLUMNS))
 
 
-def least_significant_first(counts):
+def least_significant_first(counts: Counts, *_: Any) -> Counts:
     x = np.arange(counts.shape[2])
     return counts[:, :, 8 * (x // 8) + 7 - x % 8]
 
 
-def exposures_first(counts):
+def exposures_first(counts: Counts, exposures: int, rng: np.random.Generator) -> Counts:
     """Frame k of all columns, then the next: K frames of following columns are taken for one column's."""
-    rng = np.random.default_rng(0)
-    columns, exposures = len(counts), int(counts.max())
-    of = (np.arange(columns)[:, None] * exposures + np.arange(exposures)) % columns
-    share = counts[of] / exposures
-    return (rng.random(share.shape) < share).sum(axis=1).astype(counts.dtype)
+    out = np.zeros_like(counts)
+    for c in range(len(counts)):
+        for k in range(exposures):
+            # One frame of each column: its ones are a share of the column's.
+            out[c] += rng.integers(exposures, size=out.shape[1:]) < counts[(c * exposures + k) % len(counts)]
+    return out
 
 
-def shuffled(counts):
-    return counts[np.random.default_rng(0).permutation(len(counts))]
+def reversed_(counts: Counts, *_: Any) -> Counts:
+    return counts[::-1]
 
 
-def twice_as_fast(counts):
-    """The planes of half the angle; the line has left the picture for the second half of the columns."""
+def shuffled(counts: Counts, _: int, rng: np.random.Generator) -> Counts:
+    return counts[rng.permutation(len(counts))]
+
+
+def half_the_angle(counts: Counts, *_: Any) -> Counts:
+    """The line moves twice as fast, and has left the picture for the second half of the columns."""
     return np.concatenate([counts[::2], np.zeros_like(counts[1::2])])
 
 
-def noise(counts):
-    return np.random.default_rng(0).binomial(10, 0.05, counts.shape).astype(counts.dtype)
+def noise(counts: Counts, exposures: int, rng: np.random.Generator) -> Counts:
+    return rng.binomial(exposures, counts.mean() / exposures, counts.shape).astype(counts.dtype)
 
 
-def pattern(counts):
+def dark(counts: Counts, *_: Any) -> Counts:
+    return np.zeros_like(counts)
+
+
+def full(counts: Counts, exposures: int, _: np.random.Generator) -> Counts:
+    return np.full_like(counts, exposures)
+
+
+def pattern(counts: Counts, exposures: int, rng: np.random.Generator) -> Counts:
     """The same pixels in all frames."""
-    lit = np.random.default_rng(0).random(counts.shape[1:]) < 0.3
-    return np.broadcast_to(np.where(lit, 10, 0), counts.shape).astype(counts.dtype)
+    lit = rng.random(counts.shape[1:]) < 0.3
+    return np.broadcast_to(np.where(lit, exposures, 0), counts.shape).astype(counts.dtype)
 
 
 @pytest.mark.parametrize("rig", ["left", "right", "turned"])
-@pytest.mark.parametrize(("light", "exposures"), [("clear", 3), ("report", 3), ("report", 10), ("dense", 20)])
+@pytest.mark.parametrize(("light", "exposures"), [("clear", 3), ("report", 10), ("dense", 20)])
 def test_a_right_map_is_not_doubted(light: str, exposures: int, rig: str) -> None:
     assert doubts(light, exposures, rig=rig) == ()
 
@@ -70,16 +88,16 @@ def test_a_right_map_is_not_doubted(light: str, exposures: int, rig: str) -> Non
         (least_significant_first, "the bits of each byte seem reversed", ("clear", "report", "dense")),
         (exposures_first, "frames of one column show light in different places", ("clear", "report")),
         (exposures_first, "columns do not follow one another", ("dense",)),
-        (lambda counts: counts[::-1], "columns do not follow one another", ("clear", "report", "dense")),
+        (reversed_, "columns do not follow one another", ("clear", "report", "dense")),
         (shuffled, "columns do not follow one another", ("clear", "report", "dense")),
-        (twice_as_fast, "columns do not follow one another", ("clear",)),
+        (half_the_angle, "columns do not follow one another", ("clear",)),
         (noise, "no line", ("clear",)),
         (pattern, "no line", ("clear",)),
-        (np.zeros_like, "no light", ("clear",)),
-        (lambda counts: np.full_like(counts, 10), "saturated", ("clear",)),
+        (dark, "no light", ("clear",)),
+        (full, "saturated", ("clear",)),
     ],
 )
-def test_a_wrong_map_says_what_is_wrong(change, seen: str, lights: tuple[str, ...]) -> None:
+def test_a_wrong_map_says_what_is_wrong(change: Change, seen: str, lights: tuple[str, ...]) -> None:
     for light in lights:
         (reason,) = doubts(light, 10, change)
         assert reason.startswith(seen)
@@ -105,18 +123,9 @@ def test_sure_answers_need_light() -> None:
 
 def test_a_map_of_few_points_is_not_judged() -> None:
     sweep = simulated("report", 10, rows=4, columns=30)
-    volume = volume_of(noise(sweep.counts), sweep.geometry, 10)
+    volume = volume_of(noise(sweep.counts, 10, np.random.default_rng(0)), sweep.geometry, 10)
     checks = MapChecks(sweep.geometry, calibrated=True, knows=True)
     assert checks.doubts(volume, volume.intensity(), StripeTable.empty(4, 30)) == ()
-
-
-def test_points_lie_in_the_searched_windows_with_their_partners() -> None:
-    geometry = simulated("report", 10, "turned", rows=ROWS, columns=COLUMNS).geometry
-    points = check_points(geometry)
-    assert 0 < points.row.shape[1] <= POINTS
-    assert (geometry.x_lo <= geometry.x_hi)[points.row, points.column].all()
-    assert np.array_equal(points.row[1], points.row[0] + 1)
-    assert (points.column[2] > points.column[0]).all()
 
 
 def test_a_map_whose_frames_were_all_lost_is_not_called_dark() -> None:

@@ -108,8 +108,8 @@ def test_counts_widen_before_they_overflow(k, dtype):
     assert volume.intensity()[0, 0] == k + 100
 
 
-@pytest.mark.parametrize("threads", [1, 2, 3, 16])
-@pytest.mark.parametrize("blocks", [(1,), (7,), (64, 1, 63), (3, 500)])
+@pytest.mark.parametrize("threads", [2, 16])
+@pytest.mark.parametrize("blocks", [(1,), (64, 1, 63)])
 def test_neither_threads_nor_blocks_change_a_bit(threads, blocks):
     frames, bins, column = stream(5, 400, 13, 130, 5)
     bins = np.sort(bins)  # long runs of one column, so that blocks cut them
@@ -122,25 +122,19 @@ def test_neither_threads_nor_blocks_change_a_bit(threads, blocks):
 
 def test_a_volume_outlives_the_next_sweep():
     frames, bins, column = stream(1, 60, 3, 64, 3)
-    nowhere = np.zeros(60, np.int32)
     counter = SweepCounter(layout_of(frames, [0, 0, 0], 64), RowWorkers(1))
-    counter.add(packed(frames), bins, column, nowhere)
-    first = counter.finish()
-    kept = first.counts.copy(), first.n_frames.copy(), first.dark_counts.copy()
-    counter.reset()
-    empty = counter.finish()
-    assert not empty.counts.any()
-    assert not empty.n_frames.any()
-    assert empty.n_dark == 0
-    counter.add(packed(frames), bins, column, nowhere)
-    second = counter.finish()
-    for volume in (first, second):
-        for got, wanted in zip((volume.counts, volume.n_frames, volume.dark_counts), kept, strict=True):
-            np.testing.assert_array_equal(got, wanted)
+    volumes = []
+    for _ in range(2):
+        counter.reset()
+        assert not counter.finish().counts.any()
+        counter.add(packed(frames), bins, column, np.zeros(60, np.int32))
+        volumes.append(counter.finish())
+    np.testing.assert_array_equal(volumes[0].counts, expected_counts(frames, bins, [0, 0, 0], 64))
+    for name in VOLUME:
+        np.testing.assert_array_equal(getattr(volumes[1], name), getattr(volumes[0], name))
 
 
-@pytest.mark.parametrize("blocks", [(10**9,), (1,), (7, 30)])
-@pytest.mark.parametrize("threads", [1, 3])
+@pytest.mark.parametrize(("blocks", "threads"), [((10**9,), 1), ((1,), 3), ((7, 30), 3)])
 def test_frames_cut_to_their_used_pixels_are_counted_as_whole_ones(blocks, threads):
     frames, bins, column = stream(11, 300, 5, 300, 6)
     rng, used, window = np.random.default_rng(2), 192, 128
@@ -168,14 +162,3 @@ def test_frames_cut_to_their_used_pixels_are_counted_as_whole_ones(blocks, threa
 def test_windows_off_the_word_grid_are_refused(window, x0):
     with pytest.raises(ValueError, match="multiples of 64"):
         SweepLayout(1, 2, 200, np.array([x0], np.int32), window, 10)
-
-
-def test_intensity_of_wide_counts_does_not_wrap():
-    counts = np.full((3, 2, 64), 65_535, np.uint16)
-    full = np.full(3, 65_535, np.int32)
-    volume = CountVolume(
-        counts=counts, x0=np.zeros(3, np.int32), n_frames=full, column=np.arange(3.0), dark_counts=None, n_dark=0,
-        width=50, exposures=65_535,
-    )  # fmt: skip
-    assert np.all(volume.intensity() == 3 * 65_535)
-    assert volume.intensity().shape == (2, 50)

@@ -3,7 +3,7 @@
 import struct
 import zlib
 from pathlib import Path
-from typing import Any, Final
+from typing import Final
 
 import numpy as np
 
@@ -45,12 +45,10 @@ def forge_trailer(data: bytearray, at: int, **values: int) -> None:
     _sign(data, at, TRAILER_BYTES)
 
 
-def forge_payload(data: bytearray, at: int, change: Any) -> None:
-    """Change the records of the block at `at` by `change(records)`, with the payload's checksum made anew."""
+def forge_payload(data: bytearray, at: int, name: str, frames: slice, value: int) -> None:
+    """Write another value into the records of some frames of the block at `at`, and sign its payload anew."""
     fields = dict(zip(HEADER_FIELDS, HEADER.unpack_from(data, at), strict=True))
-    records = np.frombuffer(data, FRAME_RECORD, fields["n_frames"], at + HEADER_BYTES).copy()
-    change(records)
-    data[at + HEADER_BYTES : at + HEADER_BYTES + records.nbytes] = records.tobytes()
+    np.frombuffer(data, FRAME_RECORD, fields["n_frames"], at + HEADER_BYTES)[name][frames] = value
     end = at + HEADER_BYTES + fields["payload_len"]
     forge_trailer(data, end, payload_crc=zlib.crc32(data[at + HEADER_BYTES : end]))
 

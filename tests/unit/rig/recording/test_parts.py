@@ -1,8 +1,6 @@
 """`cut`, `info`, maps of a recording, and compression: parts and compressed recordings give the very frames."""
 
-import subprocess
 import sys
-from contextlib import suppress
 from dataclasses import replace
 from pathlib import Path
 
@@ -113,13 +111,6 @@ def test_frames_and_times_are_cut_out(tmp_path: Path, runs: Runs, asked: dict[st
     assert not verify(tmp_path / "part").problems
 
 
-def test_frames_are_found_by_their_time(tmp_path: Path, runs: Runs) -> None:
-    run = RunRecording(record(tmp_path, runs)).runs[1]
-    times_s = (-1.0, 0.0, 0.4e-5, 1e-5, 1.001e-5, 1.39e-3, 1.42e-3, 1.45e-3, 1e9, float("inf"))
-    last = run.end_frame
-    assert [run.frame_at(time_s) for time_s in times_s] == [0, 0, 1, 1, 2, 139, 142, 145, last, last]  # 142 is lost
-
-
 def test_a_part_is_over_and_has_its_own_verdict(tmp_path: Path, runs: Runs) -> None:
     folder = record(tmp_path / "run", runs, verdict="gaps")
     assert cut(folder, tmp_path / "without", frames=":20")["verdict"] == "complete"
@@ -139,12 +130,17 @@ def test_what_a_repair_found_missing_is_known_to_be_missing_in_a_part(tmp_path: 
     assert verify(tmp_path / "behind").verdict is Integrity.INTACT
 
 
-@pytest.mark.parametrize("what", ["lost", "changed"])
-def test_nothing_is_cut_without_the_plan_that_it_was_taken_with(tmp_path: Path, runs: Runs, what: str) -> None:
-    folder = record(tmp_path / "run", runs, inputs={"plan.yaml": 0})
-    if what == "changed":
+@pytest.mark.parametrize("what", ["lost plan", "changed plan", "damaged frames"])
+def test_nothing_is_cut_of_what_is_damaged_or_without_the_plan_that_it_was_taken_with(
+    tmp_path: Path, runs: Runs, what: str
+) -> None:
+    frames = what == "damaged frames"
+    folder = record(tmp_path / "run", runs, **({} if frames else {"inputs": {"plan.yaml": 0}}))
+    if frames:
+        flip(folder / "frames-000000.spb", 500)
+    elif what == "changed plan":
         (folder / "plan.yaml").write_bytes(b"other")
-    with pytest.raises(DamagedRecordingError, match=r"plan.yaml .* from a copy"):
+    with pytest.raises(DamagedRecordingError, match="repair" if frames else r"plan.yaml .* from a copy"):
         cut(folder, tmp_path / "part", maps="0:2")
     assert not (tmp_path / "part").exists()
 
@@ -163,15 +159,12 @@ def test_maps_cannot_be_cut_where_there_are_no_markers(tmp_path: Path, runs: Run
 @pytest.mark.parametrize(
     ("asked", "words"),
     [
-        ({}, "0 were given"),
         ({"maps": "0", "time": "0:1"}, "2 were given"),
         ({"maps": "4:9"}, "it has 6"),
         ({"maps": "x"}, "no range"),
-        ({"frames": "900:"}, "holds no frame"),
         ({"frames": "1", "run": 2}, "it has 2"),
         ({"time": "1:2:3"}, "no range"),
         ({"time": "nan:1"}, "no range"),
-        ({"time": "0:inf"}, "no range"),
         ({"time": "1e300:"}, "holds no frame"),
         ({"frames": "9" * 30 + ":"}, "holds no frame"),
     ],
@@ -180,14 +173,6 @@ def test_what_is_not_there_is_not_cut(tmp_path: Path, runs: Runs, asked: dict[st
     folder = record(tmp_path / "run", runs)
     with pytest.raises(UsageError, match=words):
         cut(folder, tmp_path / "part", **asked)  # type: ignore[arg-type]
-    assert not (tmp_path / "part").exists()
-
-
-def test_a_damaged_recording_is_not_cut(tmp_path: Path, runs: Runs) -> None:
-    folder = record(tmp_path / "run", runs)
-    flip(folder / "frames-000000.spb", 500)
-    with pytest.raises(DamagedRecordingError, match="repair"):
-        cut(folder, tmp_path / "part", maps="0:2")
     assert not (tmp_path / "part").exists()
 
 
@@ -218,11 +203,8 @@ class TestCompressed:
         folder = record(tmp_path, runs)
         plain = (folder / "frames-000000.spb").read_bytes()
         compress(folder)
-        packed = folder / "frames-000000.spb.zst"
-        with packed.open("rb") as file:
+        with (folder / "frames-000000.spb.zst").open("rb") as file:
             assert zstandard.ZstdDecompressor().stream_reader(file, read_across_frames=True).read() == plain
-        with suppress(FileNotFoundError):  # not installed everywhere
-            assert subprocess.run(["zstd", "-dc", packed], capture_output=True, check=True).stdout == plain
 
     @pytest.mark.parametrize("what", ["table", "frame"])
     def test_damage_costs_what_it_hit(self, tmp_path: Path, runs: Runs, what: str) -> None:

@@ -1,6 +1,7 @@
 """`repair` of what is false with the right checksums, and of what is gone at the ends: it costs itself and is told."""
 
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
+from functools import partial
 from pathlib import Path
 
 import numpy as np
@@ -101,82 +102,53 @@ def salvaged(folder: Path, runs: Runs, lost: FrameBlock | None) -> Verification:
     return after
 
 
-def values_of(name: str, old: int) -> list[int]:
-    most = most_of(HEADER, HEADER_FIELDS, name)
-    values = {0, 1, old - 1, old + 1, old + 17, old * 2, most // 2 + 1, most}
-    if name == "payload_type":
-        values |= {PACKED, SPARSE, SUMMED, REGISTER_ACK, IDLE, 5}
-    return sorted(value for value in values if 0 <= value <= most and value != old)
+PARTS = [
+    *(("header", name) for name in HEADER_FIELDS if name not in ("magic", "header_crc")),
+    *(("trailer", name) for name in TRAILER_FIELDS if name not in ("magic", "crc")),
+    *(("records", name) for name in ("marks", "ticks", "x0", "y0", "line", "sweep")),
+]
 
 
-@pytest.mark.parametrize("number", [0, MIDDLE, -2, -1])
-@pytest.mark.parametrize("name", [name for name in HEADER_FIELDS if name not in ("magic", "header_crc")])
-def test_a_forged_header_costs_its_block_alone(
-    tmp_path: Path, pristine: Files, runs: Runs, name: str, number: int
-) -> None:
-    folder = copied(pristine, tmp_path / "whole")
-    file, at = places(folder, 0)[number]
-    old = HEADER.unpack_from(file.read_bytes(), at)[HEADER_FIELDS.index(name)]
-    for value in values_of(name, old):
-        folder = copied(pristine, tmp_path / f"{value}")
-        forge(places(folder, 0)[number], lambda data, at, value=value: forge_header(data, at, **{name: value}))
-        salvaged(folder, runs, runs[0][number])
-
-
-@pytest.mark.parametrize("index", ["there", "lost"])
-@pytest.mark.parametrize("name", ["block_seq", "first_frame", "t0_ticks", "sweep", "run_id", "lost_before", "height"])
-def test_a_forged_header_in_the_middle_costs_its_block_alone_without_an_index_too(
-    tmp_path: Path, pristine: Files, runs: Runs, name: str, index: str
-) -> None:
-    number = 3
-    for value in (0, 1, 2**15, 2**16 - 1):
-        folder = copied(pristine, tmp_path / f"{value}")
-        forge(places(folder, 1)[number], lambda data, at, value=value: forge_header(data, at, **{name: value}))
-        if index == "lost":
-            (folder / INDEX_FILE).unlink()
-        salvaged(folder, runs, runs[1][number])
+def forgeries(part: str, name: str, header: dict[str, int]) -> Iterator[Callable[[bytearray, int], None]]:
+    """Changes of a block, each of which gives a field of one of its parts a false value."""
+    if part == "header":
+        most, old = most_of(HEADER, HEADER_FIELDS, name), header[name]
+        values = {0, 1, old - 1, old + 1, old + 17, old * 2, most // 2 + 1, most}
+        if name == "payload_type":
+            values |= {PACKED, SPARSE, SUMMED, REGISTER_ACK, IDLE, 5}
+        yield from (partial(forge_header, **{name: value}) for value in values if 0 <= value <= most and value != old)
+    elif part == "trailer":
+        most, end = most_of(TRAILER, TRAILER_FIELDS, name), header["header_len"] + header["payload_len"]
+        for value in (0, 1, 700, most // 2, most):
+            yield lambda data, at, value=value: forge_trailer(data, at + end, **{name: value})
+    else:
+        for frames in (slice(0, 1), slice(-1, None), slice(None)):
+            for value in (0, 1, np.iinfo(np.uint32 if name in ("marks", "ticks") else np.uint16).max):
+                yield partial(forge_payload, name=name, frames=frames, value=value)
 
 
 @pytest.mark.parametrize("number", [0, MIDDLE, -1])
-@pytest.mark.parametrize("name", [name for name in TRAILER_FIELDS if name not in ("magic", "crc")])
-def test_a_forged_trailer_costs_its_block_alone(
-    tmp_path: Path, pristine: Files, runs: Runs, name: str, number: int
+@pytest.mark.parametrize(("part", "name"), PARTS)
+def test_what_is_forged_in_a_block_costs_it_alone(
+    tmp_path: Path, pristine: Files, runs: Runs, part: str, name: str, number: int
 ) -> None:
-    most = most_of(TRAILER, TRAILER_FIELDS, name)
-    for value in (0, 1, 700, most // 2, most):
+    file, at = places(copied(pristine, tmp_path / "whole"), 0)[number]
+    header = dict(zip(HEADER_FIELDS, HEADER.unpack_from(file.read_bytes(), at), strict=True))
+    for i, change in enumerate(forgeries(part, name, header)):
+        folder = copied(pristine, tmp_path / f"{i}")
+        forge(places(folder, 0)[number], change)
+        salvaged(folder, runs, runs[0][number])
+
+
+@pytest.mark.parametrize("name", ["block_seq", "first_frame", "t0_ticks", "sweep", "run_id", "lost_before", "height"])
+def test_a_forged_header_in_the_middle_costs_its_block_alone_without_an_index_too(
+    tmp_path: Path, pristine: Files, runs: Runs, name: str
+) -> None:
+    for value in (0, 1, 2**15, 2**16 - 1):
         folder = copied(pristine, tmp_path / f"{value}")
-        file, at = places(folder, 0)[number]
-        fields = dict(zip(HEADER_FIELDS, HEADER.unpack_from(file.read_bytes(), at), strict=True))
-        end = fields["header_len"] + fields["payload_len"]
-        forge((file, at), lambda data, at, value=value, end=end: forge_trailer(data, at + end, **{name: value}))
-        salvaged(folder, runs, runs[0][number])
-
-
-@pytest.mark.parametrize("where", [0, 4, -1])
-@pytest.mark.parametrize("name", ["marks", "ticks", "x0", "y0", "line", "sweep"])
-def test_forged_records_of_frames_cost_their_block_at_most(
-    tmp_path: Path, pristine: Files, runs: Runs, name: str, where: int
-) -> None:
-    def change(records: np.ndarray) -> None:  # type: ignore[type-arg]
-        records[name][frames] = value
-
-    for frames in (slice(0, 1), slice(7, 8), slice(-1, None), slice(None)):
-        for value in (0, 1, np.iinfo(np.uint32 if name in ("marks", "ticks") else np.uint16).max):
-            folder = copied(pristine, tmp_path / f"{frames.start}-{frames.stop}-{value}")
-            forge(places(folder, 0)[where], lambda data, at: forge_payload(data, at, change))
-            salvaged(folder, runs, runs[0][where])
-
-
-@pytest.mark.parametrize("payload_type", [REGISTER_ACK, IDLE])
-@pytest.mark.parametrize("size", [0, 1, 3000, 4000, 40_000, 2**31, 2**32 - 1])
-def test_a_control_block_with_a_strange_size_costs_itself(
-    tmp_path: Path, pristine: Files, runs: Runs, payload_type: int, size: int
-) -> None:
-    for number in (0, 3, -1):
-        folder = copied(pristine, tmp_path / f"{number}")
-        change = {"payload_type": payload_type, "payload_len": size}
-        forge(places(folder, 0)[number], lambda data, at, change=change: forge_header(data, at, **change))
-        salvaged(folder, runs, runs[0][number])
+        forge(places(folder, 1)[3], partial(forge_header, **{name: value}))
+        (folder / INDEX_FILE).unlink()
+        salvaged(folder, runs, runs[1][3])
 
 
 @pytest.mark.parametrize(
