@@ -10,8 +10,8 @@ import time
 
 import numpy as np
 
-from rig.bench.cases import learn
 from rig.bench.frames import COLUMNS, window_frames
+from rig.bench.speed import learn
 from rig.estimate.search.stream import ColumnJudge
 from rig.threads import RowWorkers
 
