@@ -26,9 +26,9 @@ from rig.plan.gate_pulses import sync_program
 from rig.plan.scan_plan import ScanPlan
 from rig.recording.writer import Recording
 from rig.run_folder.summary import PipelineStats
-from rig.scan.counting import AcquiredMap, MakesMaps
+from rig.scan.counting import AcquiredMap, CountingRequest, MakesMaps
 from rig.scan.monitor import NOBODY, Listeners, ScanProgress
-from rig.scan.pipeline import JOIN_S, Overload, Pipeline, PipelineRequest, require_policy, ring_for
+from rig.scan.pipeline import JOIN_S, Overload, Pipeline, require_policy, ring_for
 
 _log = logging.getLogger(__name__)
 
@@ -150,12 +150,9 @@ class Acquisition:
         rig.sync.program(*sync_program(plan, sweeps))
         asked = self._asked
         ring = ring_for(asked.policy, rig.spad.info, plan, self._timing, keeps_time=asked.groups is not None)
-        pipeline = Pipeline(
-            rig.spad,
-            ring,
-            PipelineRequest(assembler, sweeps, self._maker, asked.silence_s, asked.recording, self._listeners),
-            on_frame=None if rig.guard is None else rig.guard.beat,
-        )
+        work = CountingRequest(assembler, sweeps, self._maker, asked.silence_s, self._listeners.sweeps)
+        on_frame = None if rig.guard is None else rig.guard.beat
+        pipeline = Pipeline(rig.spad, ring, work, asked.recording, self._listeners.monitor, on_frame)
         if rig.guard is not None:
             rig.guard.expect(self._guard_limits(sweeps))
             rig.spad.on_wait = rig.guard.wait
@@ -170,8 +167,8 @@ class Acquisition:
                 rig.sync.run()
                 rig.scanner.start()
                 pipeline.start()
-                while pipeline.streaming:
-                    if (found := pipeline.take_streaming(TELL_S)) is not None:
+                while pipeline.maps.streaming:
+                    if (found := pipeline.maps.take_streaming(TELL_S)) is not None:
                         self._fog = found.result.fog
                         yield found
                     if rig.guard is not None and rig.guard.failure is not None:
@@ -182,8 +179,8 @@ class Acquisition:
             finally:
                 trouble = self._make_safe(pipeline)
             # Nothing moves or shines any more: what was received is still counted and estimated.
-            while not pipeline.drained:
-                if (found := pipeline.take_rest(TELL_S)) is not None:
+            while not pipeline.maps.drained:
+                if (found := pipeline.maps.take_rest(TELL_S)) is not None:
                     self._fog = found.result.fog
                     yield found
                 self._tell(assembler, done)
