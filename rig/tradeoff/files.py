@@ -65,10 +65,10 @@ OTHER_COLOUR = "#cc79a7"
 
 def tradeoff_svg(rows: Sequence[TradeoffRow], ci95_by: str) -> str:
     """Draw the SVG file. Rows with too many answers missing are left out."""
-    places = list(dict.fromkeys((row.scene, row.fog) for row in rows))
+    places = dict.fromkeys(row.place for row in rows)
     shown = [row for row in rows if row.counts]
     panels = [
-        _panel([row for row in shown if (row.scene, row.fog) == place], _named(*place), of)
+        _panel([row for row in shown if row.place == place], _named(*place), of)
         for place in places
         for of in ("sensor", "compute")
     ]

@@ -29,7 +29,7 @@ import numpy as np
 from rig.config.models import RigConfig
 from rig.errors import UsageError
 from rig.tradeoff.row_light import FLUX_MIN, Array, RowLight, scene_lights
-from rig.tradeoff.rows import LOCAL_PX, TradeoffRow
+from rig.tradeoff.rows import LOCAL_PX, Place, TradeoffRow
 
 
 def least_exponent(light: RowLight) -> float:
@@ -177,9 +177,6 @@ LEAST_WRONG = 0.003
 LOCAL_SDS = 3.0
 """Standard deviations that must fit into LOCAL_PX, so that answers within it are all that found the stripe."""
 
-Place = tuple[str, str | None]
-"""Scene and fog."""
-
 
 class SceneLimits:
     """Limits of scenes and fogs, each computed once. exposures: all that will be tried."""
@@ -196,7 +193,7 @@ class SceneLimits:
         """
         if len(config.line_offsets) > 1:
             return list(rows)
-        place = rows[0].scene, rows[0].fog
+        place = rows[0].place
         if place not in self._lights:
             self._lights[place] = self._lights_of(config)
         return [self._with_limit(row, place) for row in rows] if self._lights[place] else list(rows)

@@ -156,11 +156,11 @@ def score_methods(
     estimators: Sequence[str],
     filters: Sequence[str],
     seed: int,
-    on_frames: Callable[[int, int], None] | None = None,
+    tell: Callable[[float], None],
 ) -> dict[Method, MapScore]:
     """Scan once with a simulated rig and score what each estimator, with each filter, makes of the same frames.
 
-    on_frames: called with the frames taken and the frames to take.
+    tell: called with the share of the frames that are taken.
     """
     with open_rig(config, seed=seed) as rig:
         assert rig.world is not None, "only simulated rigs are tried"
@@ -170,9 +170,8 @@ def score_methods(
                 warm_up(estimator, filter, plan.exposures, dark=True)
         warm_binding(plan)
         maker = ManyMakers({name: _maker(rig, plan, name) for name in estimators}, filters)
-        live = None if on_frames is None else lambda now: on_frames(now.frames, now.frames_planned)
-        learns = not LEARNING.isdisjoint(estimators)
-        request = AcquisitionRequest(maps=MAPS, learns=learns, listeners=Listeners(live=live))
+        listeners = Listeners(live=lambda now: tell(now.frames / max(now.frames_planned, 1)))
+        request = AcquisitionRequest(maps=MAPS, learns=not LEARNING.isdisjoint(estimators), listeners=listeners)
         running = Acquisition(rig, plan, timing, maker, request).run()
         with closing(running):
             last = [found for found in running][-1]
