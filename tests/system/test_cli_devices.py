@@ -37,23 +37,6 @@ def test_the_doctor_names_every_device_that_is_absent(rig):
     ]  # fmt: skip
 
 
-def test_a_folder_that_cannot_be_written_is_found(rig, small, monkeypatch):
-    def refuse(*arguments, **options):
-        raise PermissionError(13, "Permission denied")
-
-    monkeypatch.setattr("rig.devices.doctor.tempfile.NamedTemporaryFile", refuse)
-    ran = rig("doctor", small)
-    assert ran.code == 3
-    assert "cannot be written: Permission denied; choose another folder" in ran.out
-
-
-@pytest.mark.parametrize("command", [("doctor",), ("laser", "off")])
-def test_an_unknown_config_is_a_usage_error(rig, command):
-    ran = rig(*command, "nowhere.yaml")
-    assert ran.code == 2
-    assert len(ran.problems) == 1
-
-
 def test_a_dry_run_of_a_real_rig_needs_no_arming_and_names_every_device_that_is_absent(rig):
     ran = rig("scan", "lab", "--dry-run")
     assert ran.code == 3

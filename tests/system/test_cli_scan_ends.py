@@ -2,7 +2,6 @@
 
 import dataclasses
 import errno
-import json
 import os
 import signal
 import subprocess
@@ -99,13 +98,6 @@ def test_ctrl_c_keeps_the_whole_maps_and_exits_4(rig: Rig, small: Path, monkeypa
     assert strict(Path("run/summary.json").read_text()) == summary
 
 
-def test_ctrl_c_before_the_first_map_leaves_nothing(rig: Rig, small: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    stop_at_map(0, KeyboardInterrupt(), monkeypatch)
-    ran = rig("scan", small, "--json", "--out", "run")
-    assert (ran.code, strict(ran.out)["maps"]) == (4, 0)
-    assert not list(Path().iterdir())
-
-
 def test_an_aborted_run_says_what_of_it_is_kept(rig: Rig, small: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     with monkeypatch.context() as patch:
         stop_at_map(0, KeyboardInterrupt(), patch)
@@ -123,7 +115,7 @@ def test_an_aborted_run_says_what_of_it_is_kept(rig: Rig, small: Path, monkeypat
 
 
 @pytest.mark.skipif(os.name == "nt", reason="signals of POSIX")
-@pytest.mark.parametrize("name", ["SIGINT", "SIGTERM", "SIGHUP"])
+@pytest.mark.parametrize("name", ["SIGINT", "SIGTERM"])
 def test_a_real_signal_ends_a_scan_in_order(small: Path, tmp_path: Path, name: str) -> None:
     # Background shells and nohup leave signals ignored, and a child would inherit that.
     handler = "default_int_handler" if name == "SIGINT" else "SIG_DFL"
@@ -147,12 +139,6 @@ def test_a_real_signal_ends_a_scan_in_order(small: Path, tmp_path: Path, name: s
     assert not list(tmp_path.glob(".run*"))
 
 
-def test_signals_are_as_before_after_a_command(rig: Rig) -> None:
-    before = signal.getsignal(signal.SIGTERM)
-    rig("config", "check")
-    assert signal.getsignal(signal.SIGTERM) is before
-
-
 def test_an_interrupt_while_a_map_is_written_leaves_no_part_of_it(
     rig: Rig, small: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
@@ -171,17 +157,6 @@ def test_an_interrupt_while_a_map_is_written_leaves_no_part_of_it(
     assert len(strict(Path("run/manifest.json").read_text())["sweeps"]) == 1  # type: ignore[arg-type]
 
 
-def test_a_mistake_of_the_program_prints_its_traceback_and_exits_70(
-    rig: Rig, small: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    stop_at_map(0, ZeroDivisionError("ours"), monkeypatch)
-    ran = rig("scan", small, "--out", "run")
-    assert (ran.code, ran.out) == (70, "")
-    assert "Traceback" in ran.err
-    assert "ZeroDivisionError: ours" in ran.err
-    assert not list(Path().iterdir())
-
-
 def test_a_map_without_any_depth_is_warned_of(rig: Rig, small: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     estimate = Reconstructor.map
 
@@ -194,16 +169,6 @@ def test_a_map_without_any_depth_is_warned_of(rig: Rig, small: Path, monkeypatch
     assert ran.err.splitlines() == [
         "warning: no pixel has a depth; raise --exposures, lower --min-confidence or check the depth range"
     ]
-
-
-def test_a_full_disk_is_one_line_and_leaves_nothing(rig: Rig, small: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    fill_disk_after(3, monkeypatch)
-    ran = rig("scan", small, "--json", "--out", "run")
-    assert ran.code == 2
-    assert json.loads(ran.out)["error"]["problems"] == [ran.problems[0].removeprefix("error: ")]
-    assert len(ran.problems) == 1
-    assert "No space left on device" in ran.problems[0]
-    assert not list(Path().iterdir())
 
 
 def test_a_disk_that_fills_later_keeps_the_whole_maps(rig: Rig, small: Path, monkeypatch: pytest.MonkeyPatch) -> None:
@@ -253,12 +218,12 @@ def fill_disk_after(files: int, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(Path, "write_bytes", limited)
 
 
-@pytest.mark.parametrize("at", [0, 1, 2])
 @pytest.mark.parametrize(
-    ("command", "options"), [(["effects"], []), (["calibrate", "pixels"], ["--light", "--out", "out"])]
+    ("command", "options", "at"),
+    [(["effects"], [], 0), (["effects"], [], 2), (["calibrate", "pixels"], ["--light", "--out", "out"], 1)],
 )
 def test_ctrl_c_in_a_scan_within_another_command_ends_that_in_one_line(
-    rig: Rig, small: Path, monkeypatch: pytest.MonkeyPatch, at: int, command: list[str], options: list[str]
+    rig: Rig, small: Path, monkeypatch: pytest.MonkeyPatch, command: list[str], options: list[str], at: int
 ) -> None:
     stop_at_map(at, KeyboardInterrupt(), monkeypatch)
     ran = rig(*command, small, *options)

@@ -90,16 +90,8 @@ def test_a_dry_run_opens_every_device_and_neither_moves_nor_shines(worlds):
     assert np.ptp(world.mirror(np.linspace(begun_s, ended_s, 1000))) == 0
 
 
-def test_the_doctor_says_that_it_could(tmp_path, worlds):
-    findings = {one.name: one for one in api.doctor("lab-emulated", out=tmp_path)}
-    assert all(one.ok for one in findings.values()), findings
-    assert "owns laser and gate" in findings["guard"].text
-    ((world, ended_s),) = worlds
-    assert world.light(ended_s - KEPT_S, ended_s) == []
-
-
 def test_the_laser_is_switched_off_without_a_scan(worlds):
-    done = api.laser_off("lab-emulated")
-    assert any("all outputs low" in line for line in done)
-    assert any("emission off" in line for line in done)
+    done = "\n".join(api.laser_off("lab-emulated"))
+    assert "all outputs low" in done
+    assert "emission off" in done
     assert len(worlds) == 1

@@ -78,15 +78,6 @@ def test_the_line_has_stage_and_counts_as_far_as_they_are_known(step, text):
     assert line.text() == text
 
 
-def test_the_clock_runs_by_itself(monkeypatch):
-    now = [100.0]
-    monkeypatch.setattr(cli_progress.time, "monotonic", lambda: now[0])
-    line, seen = ProgressLine(), []
-    for now[0] in (100.9, 152.0, 165.0, 3700.0 + 100):
-        seen.append(line.clock)
-    assert seen == ["0:00", "0:52", "1:05", "1:01:40"]
-
-
 def test_without_a_terminal_each_stage_is_one_line_however_often_it_is_told(impatient, capsys):
     with progress():
         for done in range(5000):
@@ -127,13 +118,6 @@ def test_while_it_compiles_no_other_stage_is_claimed():
     assert line.text() == COMPILING
     line.heard(Step("rendering", 3, 9, "frames"))
     assert line.text() == "rendering, 3 of 9 frames"
-
-
-def test_a_command_that_is_soon_done_says_nothing_without_a_terminal(monkeypatch, capsys):
-    monkeypatch.setattr(cli_progress, "PATIENCE_S", 3600.0)
-    with progress():
-        tell_stage("rendering")
-    assert capsys.readouterr().err == ""
 
 
 def test_at_a_terminal_the_line_is_drawn_on_stderr_alone(monkeypatch, capsys):

@@ -1,6 +1,5 @@
 import json
 from fractions import Fraction
-from typing import get_args
 
 import pytest
 import yaml
@@ -10,16 +9,13 @@ from rig.config.files import (
     bundled_configs,
     completed_text,
     config_content,
-    config_schema,
     find_config,
     load_config,
     load_cube_plan,
-    parse_config,
     portable_content,
 )
-from rig.config.models import MIN_DARK_FRACTION, Estimator, Filter
+from rig.config.models import MIN_DARK_FRACTION
 from rig.errors import UsageError
-from rig.estimate.registry import ESTIMATORS, FILTERS
 
 RIG = """\
 name: test
@@ -51,16 +47,6 @@ def problems(path, overrides=None):
         load_config(path, overrides)
     assert caught.value.exit_code == 2
     return [line.replace(str(path), "rig.yaml") for line in str(caught.value).splitlines()]
-
-
-def test_the_bundled_rig_loads_by_name_from_any_folder(tmp_path, monkeypatch):
-    monkeypatch.chdir(tmp_path)
-    config = load_config("simulated")
-    assert config.name == "simulated"
-    assert config.calibration is not None
-    assert config.calibration.is_file()
-    assert "simulated" in bundled_configs()
-    assert find_config("simulated") == BUNDLED / "simulated.yaml"
 
 
 def test_quantities_become_exact_numbers(write):
@@ -162,10 +148,6 @@ def test_a_missing_file_and_a_folder_are_told_apart(tmp_path):
     for absent in ("none.yaml", "nodir/", "nodir/none"):
         assert "that path does not exist" in problems(absent)[0]
     assert "is a folder" in problems(tmp_path)[0]
-
-
-def test_names_of_estimators_and_filters_are_the_same_everywhere():
-    assert (get_args(Estimator), get_args(Filter)) == (ESTIMATORS, FILTERS)
 
 
 def test_overrides_lie_over_the_file_and_none_leaves_it_alone(write):
@@ -307,22 +289,6 @@ def test_a_plan_is_checked_as_a_config_is(write):
         ':3: frame_rate: 100 has no unit; write the frequency with a unit, like "100 kHz"',
         ":4: depth_range is 5, it must be a list; write for example 'depth_range: [1 m, 8 m]'",
     ]
-
-
-def test_a_config_written_out_reads_back_to_the_same(write):
-    config = load_config(write(RIG), {"scan.exposure": "9 us", "scan.power": "20 mW"})
-    text = yaml.safe_dump(config.model_dump(mode="json"))
-    assert load_config(write(text, "again.yaml")) == config
-    assert parse_config(json.loads(config.model_dump_json())) == config
-
-
-def test_the_schema_offers_the_installed_kinds_of_every_slot():
-    schema = config_schema()
-    json.dumps(schema)
-    for slot in ("spad", "scanner", "laser", "sync", "world"):
-        assert {"$ref": f"#/$defs/{slot}.simulated"} in schema["properties"][slot]["oneOf"]
-        assert schema["$defs"][f"{slot}.simulated"]["properties"]["kind"] == {"const": "simulated"}
-    assert schema["$defs"]["ScanConfig"]["properties"]["exposures"]["minimum"] == 1
 
 
 def test_a_cube_plan_has_its_four_keys_and_no_others(write):

@@ -23,10 +23,6 @@ def refused(**sections):
     return str(caught.value)
 
 
-def test_a_config_without_lines_has_one():
-    assert SIMULATED.line_offsets == (0.0,)
-
-
 def test_the_bundled_rig_has_four_lines_that_tile_the_field_of_the_one():
     four = load_config("simulated-4-lines")
     assert four.line_offsets == pytest.approx(with_lines(SIMULATED, 4).line_offsets)

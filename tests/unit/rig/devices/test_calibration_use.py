@@ -179,13 +179,6 @@ def test_views_of_one_rig_are_told_from_those_of_another() -> None:
     assert not same_rig(mine, replace(mine, serials={}))
 
 
-def test_all_that_is_wrong_is_said_at_once(tmp_path: Path) -> None:
-    rig = calibrated(tmp_path, failed, spad={"serial": "A"}, scanner={"serial": "B"})
-    with pytest.raises(UsageError) as refused:
-        api.scan(rig)
-    assert len(refused.value.problems) == 3
-
-
 def test_a_check_that_failed_since_then_speaks_against_a_calibration_until_one_passes(tmp_path: Path) -> None:
     rig = calibrated(tmp_path)
     file = tmp_path / "made.yaml"

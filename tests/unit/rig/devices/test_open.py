@@ -124,17 +124,6 @@ def test_the_simulated_rig_scans_both_ways_and_the_same_frames_with_the_same_see
     assert (first != other).any()
 
 
-def test_lost_frames_of_the_simulated_spad_are_gaps():
-    config = load_config("simulated", {**SMALL, "spad.lost_frames": [150, 151, 160]})
-    with open_rig(config) as rig:
-        plan, timing = prepare(rig)
-        (found,) = Acquisition(rig, plan, timing, FakeMaker(), AcquisitionRequest(maps=1)).run()
-    sweep = found.sweep
-    assert sweep.gaps == ((150, 151), (160, 160))
-    assert sweep.frames.lost == 3
-    assert sweep.frames.received + 3 == sweep.frames.expected == sweep.end_frame - sweep.first_frame
-
-
 def test_the_plan_has_the_exposure_that_the_spad_answered():
     with open_rig(load_config("simulated", {**SMALL, "scan.exposure": "1.004 us"})) as rig:
         plan, timing = prepare(rig)

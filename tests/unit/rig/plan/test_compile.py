@@ -110,18 +110,6 @@ def test_the_command_crosses_the_columns_at_constant_velocity(bidirectional):
         np.testing.assert_allclose(plan.command(centres), commands, atol=1e-12)
 
 
-def test_the_same_column_means_the_same_command_both_ways():
-    plan = plan_of(scan(bidirectional=True, columns=7), Lag(1e-4, 3e-4))
-    out, back = plan.legs
-    assert (out.direction, back.direction) == (1, -1)
-    assert (out.lag_s, back.lag_s) == (1e-4, 3e-4)
-    for leg in plan.legs:
-        tau = np.linspace(leg.gate_open_s, leg.gate_close_s, 50)
-        np.testing.assert_allclose(
-            plan.command_at(plan.column(tau, leg)), leg.path.command((tau - leg.lag_s) * float(plan.point_rate_hz))
-        )
-
-
 def test_a_falling_sweep_has_the_lag_and_the_level_of_falling_commands():
     plan = plan_of(scan(command_range=[0.2, -0.2]), Lag(1e-4, 3e-4))
     assert plan.legs[0].lag_s == 3e-4
@@ -144,12 +132,6 @@ def test_line_markers_come_as_often_as_the_point_clock_allows():
             np.arange(len(edges)) * plan.columns_per_marker,
             atol=1.01 / float(plan.points_per_column),
         )
-
-
-def test_times_of_any_sweep_are_exact():
-    plan = plan_of(scan(frame_rate="97.7 kHz"))
-    assert plan.column_s == Fraction(4, 97_700)
-    assert plan.sweep_s * plan.point_rate_hz == plan.sweep_points
 
 
 @pytest.mark.parametrize(("bidirectional", "maps"), [(False, 3), (True, 4), (True, 3), (True, 1)])
@@ -263,9 +245,3 @@ def test_without_a_calibration_the_window_is_the_whole_row():
     assert "window      all 100 pixels for" in plan_text(plan)
     assert not plan.x0.any()
     assert plan.legs[0].lag_s == 0
-
-
-def test_the_description_names_columns_map_rate_sensor_time_dark_share_window_and_megabytes():
-    text = plan_text(plan_of(scan(columns=500, exposures=10), limits=GALVO))
-    for words in ("500 x 10 frames at 100 kHz", "maps ", "ms of sensor time", "% of them dark", "pixels", "MB/s"):
-        assert words in text

@@ -114,13 +114,6 @@ def test_every_bound_frame_carries_the_window_of_its_column(case):
     assert plan.windows.width_px < WIDTH
 
 
-def test_windows_are_hardly_wider_than_the_columns_need():
-    for lag, most in ((Lag(), 192), (Lag(4e-4, 4e-4), 256)):  # 4e-4 s are 10 columns, 31 pixels
-        plan = plan_of(scan(columns=160, exposures=4, command_range=[-0.8, 0.8], depth_range=["2 m", "4 m"]), lag)
-        assert plan.window == 128
-        assert plan.windows.width_px <= most
-
-
 def test_every_pixel_that_a_column_uses_has_dark_frames():
     limits = scanner_limits(velocity_per_s=500, acceleration_per_s2=2e6, rms_duty=0.5, point_rate_hz=(2e3, 1e5))
     config = scan(columns=200, exposures=4, command_range=[-0.4, 0.4], depth_range=["2 m", "4 m"])
@@ -162,15 +155,6 @@ def test_a_link_gets_full_frames_else_windows_else_bursts_else_a_refusal():
         assert spad_request(config, plan).mode == mode
     with pytest.raises(PlanError, match="lower frame_rate to"):
         plan_of(config, spad=linked(little))
-
-
-def test_what_is_counted_does_not_depend_on_the_link():
-    config = scan(depth_range=["2 m", "4 m"])
-    fast, slow = plan_of(config), plan_of(config, spad=linked(12e6))
-    assert (fast.windowed, slow.windowed) == (False, True)
-    assert fast.windows.width_px == slow.windows.width_px
-    np.testing.assert_array_equal(fast.windows.x0, slow.windows.x0)
-    np.testing.assert_array_equal(fast.marker_points, slow.marker_points)
 
 
 @settings(max_examples=30, deadline=None)
@@ -305,12 +289,6 @@ def test_the_rate_that_is_named_is_that_of_the_narrower_windows_of_a_slower_scan
         plan_of(config, NO_LAG, linked(7e6), few_points)
     slower = plan_of(config.model_copy(update={"frame_rate": Fraction(62_500)}), NO_LAG, linked(7e6), few_points)
     assert slower.windows.width_px == 192
-
-
-def test_the_table_follows_the_exact_timing_of_the_spad():
-    slow = plan_of(scan(frame_rate=f"{100_000 - 7} Hz"))
-    assert slow.frame_rate_hz == Fraction(99_993)
-    assert [len(x0) for x0 in slow.windows.x0] == [len(slow.marker_points) + 1]
 
 
 def test_columns_that_see_nothing_make_no_window_jump():

@@ -39,8 +39,3 @@ def test_an_interval_over_blocks_holds_the_true_mean_as_often_as_it_says():
         low, high = blocks_interval(sums, numbers, seed)
         held += low <= 0.3 <= high
     assert held >= 88
-
-
-def test_blocks_without_a_stripe_do_not_matter():
-    sums, numbers = np.array([1.0, 0, 4.0]), np.array([10, 0, 10])
-    assert blocks_interval(sums, numbers) == blocks_interval(sums[[0, 2]], numbers[[0, 2]])

@@ -121,16 +121,6 @@ def test_neighbours_of_one_surface_count_as_exposures() -> None:
     assert limits(lights, [2])[0].mean_abs_px > 2 * coupled.mean_abs_px
 
 
-def test_more_light_is_never_worse() -> None:
-    lights = [row(position=30 + 0.37 * i) for i in range(60)]
-    found = limits(lights, [1, 3, 10, 30, 100])
-    for name in ("mean_abs_px", "position_sd_px"):
-        values = [getattr(each, name) for each in found]
-        assert values == sorted(values, reverse=True)
-    within = [each.within_1px for each in found]
-    assert within == sorted(within)
-
-
 def test_a_row_that_says_nothing_leaves_the_middle_of_the_search() -> None:
     dark = row(position=15.0, stripe=1e-12, haze=0.0, ambient=0.1)
     error = bayes_errors(dark, [5], 20, np.random.default_rng(1))[0]
