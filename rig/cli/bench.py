@@ -4,17 +4,10 @@ from typing import Annotated
 
 import typer
 
-from rig.cli.command import ConfigArgument, JsonOption, command, print_json
+from rig.cli.command import Commands, ConfigArgument, JsonOption, print_json
 from rig.cli.progress import progress
 
 
-def register(app: typer.Typer) -> None:
-    """Add the commands to `app`."""
-    app.command("bench")(bench_command)
-    app.command("warmup")(warmup_command)
-
-
-@command
 def bench_command(
     threads: Annotated[
         int | None, typer.Option("--threads", help="most threads to measure", show_default="one a core", min=1)
@@ -58,7 +51,6 @@ def bench_command(
     return 0 if stream is None else stream.exit_code
 
 
-@command
 def warmup_command(config: ConfigArgument = "simulated", as_json: JsonOption = False) -> int:
     """Compile everything that is compiled, so that no scan waits for it."""
     from rig import api
@@ -70,3 +62,6 @@ def warmup_command(config: ConfigArgument = "simulated", as_json: JsonOption = F
     else:
         print(f"warm after {seconds:.1f} s; compiled code is kept on disk, once more takes seconds")
     return 0
+
+
+COMMANDS: Commands = {"bench": bench_command, "warmup": warmup_command}

@@ -32,6 +32,9 @@ EXIT_SOFTWARE = 70
 
 P = ParamSpec("P")
 
+Commands = Mapping[str, "Callable[..., int] | tuple[str, Commands]"]
+"""Commands by name; a group is its help and the commands in it."""
+
 ConfigArgument = Annotated[
     str,
     typer.Argument(
@@ -44,7 +47,18 @@ ConfigArgument = Annotated[
 JsonOption = Annotated[bool, typer.Option("--json", help="print exactly one JSON object to stdout, errors too")]
 
 
-def command(function: Callable[P, int | None]) -> Callable[P, None]:
+def add_commands(app: typer.Typer, commands: Commands) -> None:
+    """Add commands and groups to `app`, in their order."""
+    for name, given in commands.items():
+        if isinstance(given, tuple):
+            group = typer.Typer(name=name, help=given[0], rich_markup_mode=None)
+            add_commands(group, given[1])
+            app.add_typer(group)
+        else:
+            app.command(name)(command(given))
+
+
+def command(function: Callable[P, int]) -> Callable[P, None]:
     """Wrap a command so that its user's mistakes and its devices' faults become lines and exit codes."""
 
     @functools.wraps(function)
@@ -59,7 +73,7 @@ def command(function: Callable[P, int | None]) -> Callable[P, None]:
             if code is None:
                 raise
             fail(code, (refused or str(error)).splitlines(), getattr(error, "__notes__", []), kwargs.get("as_json"))
-        raise typer.Exit(code or 0)
+        raise typer.Exit(code)
 
     return wrapped
 

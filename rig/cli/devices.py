@@ -5,19 +5,9 @@ from typing import Annotated
 
 import typer
 
-from rig.cli.command import EXIT_DEVICE, ConfigArgument, JsonOption, command, print_json
+from rig.cli.command import EXIT_DEVICE, Commands, ConfigArgument, JsonOption, print_json
 
 
-def register(app: typer.Typer) -> None:
-    """Add the commands to `app`."""
-    app.command("doctor")(doctor_command)
-    app.command("devices")(devices_command)
-    laser = typer.Typer(name="laser", help="The laser's safe state.", rich_markup_mode=None)
-    laser.command("off")(laser_off_command)
-    app.add_typer(laser)
-
-
-@command
 def doctor_command(
     config: ConfigArgument = "simulated",
     out: Annotated[Path, typer.Option("--out", help="folder that a scan would write to")] = Path("runs"),
@@ -35,7 +25,6 @@ def doctor_command(
     return 0 if all(one.ok for one in findings) else EXIT_DEVICE
 
 
-@command
 def devices_command(as_json: JsonOption = False) -> int:
     """List what is attached: USB devices that a driver knows, and serial ports."""
     from rig import api
@@ -51,7 +40,6 @@ def devices_command(as_json: JsonOption = False) -> int:
     return 0
 
 
-@command
 def laser_off_command(config: ConfigArgument = "simulated") -> int:
     """Take the gate low and switch the laser's emission off for good."""
     from rig import api
@@ -61,17 +49,6 @@ def laser_off_command(config: ConfigArgument = "simulated") -> int:
     return 0
 
 
-def register_config(app: typer.Typer) -> None:
-    """Add the commands for configs and scenes to `app`."""
-    config = typer.Typer(name="config", help="Check, show or describe a config.", rich_markup_mode=None)
-    config.command("check")(check_command)
-    config.command("show")(show_command)
-    config.command("schema")(schema_command)
-    app.add_typer(config)
-    app.command("scenes")(scenes_command)
-
-
-@command
 def check_command(config: ConfigArgument = "simulated", as_json: JsonOption = False) -> int:
     """Say whether a config is valid and the files that it names can be used; all problems at once."""
     from rig.api import check_config
@@ -84,20 +61,18 @@ def check_command(config: ConfigArgument = "simulated", as_json: JsonOption = Fa
     return 0
 
 
-@command
 def show_command(config: ConfigArgument = "simulated", as_json: JsonOption = False) -> int:
-    """Print a config as it is written, with every default filled in and every path absolute."""
-    from rig.config.files import completed_text, config_content
+    """Print a config with every default filled in and every path absolute."""
+    from rig.config.files import config_text, load_config, portable_content
 
-    text = completed_text(config)
+    loaded = load_config(config)
     if as_json:
-        print_json(config_content(text))
+        print_json(portable_content(loaded))
     else:
-        print(text, end="")
+        print(config_text(loaded), end="")
     return 0
 
 
-@command
 def schema_command() -> int:
     """Print the JSON schema of a config, for editors."""
     from rig.config.files import config_schema
@@ -106,7 +81,6 @@ def schema_command() -> int:
     return 0
 
 
-@command
 def scenes_command(as_json: JsonOption = False) -> int:
     """List the bundled scenes (--scene) and rigs (CONFIG), with a sentence on each."""
     from rig import api
@@ -121,3 +95,17 @@ def scenes_command(as_json: JsonOption = False) -> int:
         for one in members:
             print(f"  {one.name:<{wide}}  {one.about}")
     return 0
+
+
+SCENES: Commands = {
+    "config": (
+        "Check, show or describe a config.",
+        {"check": check_command, "show": show_command, "schema": schema_command},
+    ),
+    "scenes": scenes_command,
+}
+COMMANDS: Commands = {
+    "doctor": doctor_command,
+    "devices": devices_command,
+    "laser": ("The laser's safe state.", {"off": laser_off_command}),
+}

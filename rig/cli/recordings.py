@@ -5,7 +5,7 @@ from typing import TYPE_CHECKING, Annotated
 
 import typer
 
-from rig.cli.command import JsonOption, asks, command, print_json, say
+from rig.cli.command import Commands, JsonOption, asks, print_json, say
 from rig.cli.progress import progress
 from rig.requests import CutRequest, ExportRequest, ImportRequest
 
@@ -17,18 +17,6 @@ RunArgument = Annotated[Path, typer.Argument(metavar="RUN", help="folder of a re
 
 MOST_LINES = 20
 """Most problems that are shown to people; `--json` has all."""
-
-
-def register(app: typer.Typer) -> None:
-    """Add the commands to `app`."""
-    for name, function in (
-        ("verify", verify_command),
-        ("repair", repair_command),
-        ("info", info_command),
-        ("cut", cut_command),
-        ("compress", compress_command),
-    ):
-        app.command(name)(command(function))
 
 
 def verify_command(run: RunArgument, as_json: JsonOption = False) -> int:
@@ -149,13 +137,6 @@ def _megabytes(size: int) -> str:
     return f"{size / 1e6:.1f} MB"
 
 
-def register_exchange(app: typer.Typer) -> None:
-    """Add the commands that exchange frames with other programs to `app`."""
-    app.command("import")(import_command)
-    app.command("export")(export_command)
-
-
-@command
 @asks(ImportRequest)
 def import_command(
     request: ImportRequest,
@@ -185,7 +166,6 @@ def import_command(
     return 0
 
 
-@command
 @asks(ExportRequest)
 def export_command(
     request: ExportRequest,
@@ -212,3 +192,14 @@ def export_command(
         for _, first, last in result.gaps:
             print(f"frames {first} to {last} are missing")
     return result.exit_code
+
+
+COMMANDS: Commands = {
+    "verify": verify_command,
+    "repair": repair_command,
+    "info": info_command,
+    "cut": cut_command,
+    "compress": compress_command,
+    "import": import_command,
+    "export": export_command,
+}

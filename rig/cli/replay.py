@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING, Annotated
 
 import typer
 
-from rig.cli.command import JsonOption, asks, command, report, say, say_space
+from rig.cli.command import Commands, JsonOption, asks, report, say, say_space
 from rig.cli.progress import progress
 from rig.requests import ReplayRequest
 
@@ -21,12 +21,6 @@ _LOOK_S = 0.2
 """Seconds of one wait for a key."""
 
 
-def register(app: typer.Typer) -> None:
-    """Add the command to `app`."""
-    app.command("replay")(replay_command)
-
-
-@command
 @asks(ReplayRequest)
 def replay_command(
     request: ReplayRequest,
@@ -63,3 +57,6 @@ def _follow(pace: "Pace", handle: int) -> None:
             if not data:
                 pace.run_on()
                 return
+
+
+COMMANDS: Commands = {"replay": replay_command}

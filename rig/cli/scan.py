@@ -7,10 +7,10 @@ from typing import TYPE_CHECKING, Annotated
 import typer
 
 from rig.cli.command import (
+    Commands,
     ConfigArgument,
     JsonOption,
     asks,
-    command,
     print_json,
     report,
     say_space,
@@ -24,14 +24,6 @@ if TYPE_CHECKING:
     from rig.recording.segment import Space
 
 
-def register(app: typer.Typer) -> None:
-    """Add the commands to `app`."""
-    app.command("scan")(scan_command)
-    app.command("reconstruct")(reconstruct_command)
-    app.command("effects")(effects_command)
-
-
-@command
 @asks(ScanRequest)
 def scan_command(
     request: ScanRequest,
@@ -64,7 +56,6 @@ def _show_plan(plan: "ScanPlan", space: "Space | None", as_json: bool) -> int:
     return 0
 
 
-@command
 @asks(ReconstructRequest)
 def reconstruct_command(
     request: ReconstructRequest,
@@ -91,7 +82,6 @@ def reconstruct_command(
     return report(result, as_json)
 
 
-@command
 def effects_command(
     config: ConfigArgument = "simulated",
     config_option: Annotated[
@@ -146,3 +136,6 @@ def effects_command(
     else:
         effects_table(effects)
     return 0
+
+
+COMMANDS: Commands = {"scan": scan_command, "reconstruct": reconstruct_command, "effects": effects_command}

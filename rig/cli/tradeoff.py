@@ -1,18 +1,10 @@
 """The command that finds what accuracy costs in time, and which setting to use: `rig tradeoff`."""
 
-import typer
-
-from rig.cli.command import EXIT_ABORTED, ConfigArgument, JsonOption, asks, command, print_json, say
+from rig.cli.command import EXIT_ABORTED, Commands, ConfigArgument, JsonOption, asks, print_json, say
 from rig.cli.progress import progress
 from rig.requests import TradeoffRequest
 
 
-def register(app: typer.Typer) -> None:
-    """Add the command to `app`."""
-    app.command("tradeoff")(tradeoff_command)
-
-
-@command
 @asks(TradeoffRequest)
 def tradeoff_command(
     request: TradeoffRequest, config: ConfigArgument = "simulated", as_json: JsonOption = False
@@ -38,3 +30,6 @@ def tradeoff_command(
             "raise --exposures")  # fmt: skip
         return 1
     return 0 if done.answer.fits else 1
+
+
+COMMANDS: Commands = {"tradeoff": tradeoff_command}

@@ -8,9 +8,7 @@ import io
 from collections.abc import Sequence
 from dataclasses import replace
 
-import yaml
-
-from rig.config.files import portable_content
+from rig.config.files import config_text
 from rig.config.models import RigConfig
 from rig.run_folder.charts import Panel, Series, chart_svg
 from rig.run_folder.folder import RunFolder
@@ -33,7 +31,8 @@ def write_files(folder: RunFolder, done: Tradeoff, setting: RigConfig | None) ->
         comments = [f"rig tradeoff: {done.answer}"]
         if done.accepted_calibration:
             comments.append("its calibration was accepted all the same: scan with --accept-calibration")
-        folder.write_text(SETTING_FILE, config_text(setting, comments))
+        head = "".join(f"# {comment}\n" for comment in comments)
+        folder.write_text(SETTING_FILE, head + config_text(setting))
     return replace(done, folder=folder.publish())
 
 
@@ -50,12 +49,6 @@ def csv_text(rows: Sequence[TradeoffRow]) -> str:
             writer.writeheader()
         writer.writerow(line)
     return stream.getvalue()
-
-
-def config_text(config: RigConfig, comments: Sequence[str]) -> str:
-    """A config as a YAML file that every command takes, wherever it lies."""
-    head = "".join(f"# {comment}\n" for comment in comments)
-    return head + yaml.safe_dump(portable_content(config), sort_keys=False, allow_unicode=True)
 
 
 COLOURS = {"argmax": "#7b8896", "edge": "#d55e00", "likelihood": "#0072b2", "joint": "#009e73"}
