@@ -117,24 +117,20 @@ def test_a_falling_sweep_has_the_lag_and_the_level_of_falling_commands():
     assert plan.commands[0] > plan.commands[-1]
 
 
-def test_line_markers_come_as_often_as_the_point_clock_allows():
-    for exposures, fastest in ((1, 65_535), (10, 65_535), (1, 5000), (50, 5000)):
-        limits = dataclasses.replace(GALVO, point_rate_hz=(2e3, fastest))
-        plan = plan_of(scan(columns=40, exposures=exposures, command_range=[0, 0.01]), limits=limits)
-        needed = max(4 / float(plan.points_per_column), 2 / exposures)
-        assert needed <= plan.columns_per_marker < needed + 1
-        lit_end = float((plan.legs[0].path.lit_start + plan.legs[0].path.lit_points) / plan.points_per_column)
-        edges = plan.marker_points / float(plan.points_per_column)
-        edges = edges[edges <= lit_end]
-        first = float(plan.legs[0].path.lit_start / plan.points_per_column)
-        np.testing.assert_allclose(
-            edges - first,
-            np.arange(len(edges)) * plan.columns_per_marker,
-            atol=1.01 / float(plan.points_per_column),
-        )
+@pytest.mark.parametrize(("exposures", "fastest"), [(1, 65_535), (50, 5000)])
+def test_line_markers_come_as_often_as_the_point_clock_allows(exposures, fastest):
+    limits = dataclasses.replace(GALVO, point_rate_hz=(2e3, fastest))
+    plan = plan_of(scan(columns=40, exposures=exposures, command_range=[0, 0.01]), limits=limits)
+    needed = max(4 / float(plan.points_per_column), 2 / exposures)
+    assert needed <= plan.columns_per_marker < needed + 1
+    path = plan.legs[0].path
+    points = plan.marker_points[plan.marker_points <= path.lit_start + path.lit_points]
+    edges = (points - float(path.lit_start)) / float(plan.points_per_column)
+    steps = np.arange(len(edges)) * plan.columns_per_marker
+    np.testing.assert_allclose(edges, steps, atol=1.01 / float(plan.points_per_column))
 
 
-@pytest.mark.parametrize(("bidirectional", "maps"), [(False, 3), (True, 4), (True, 3), (True, 1)])
+@pytest.mark.parametrize(("bidirectional", "maps"), [(False, 3), (True, 4), (True, 3)])
 def test_the_gate_program_opens_once_per_map_and_waits_with_the_gate_low(bidirectional, maps):
     plan = plan_of(scan(bidirectional=bidirectional), Lag(1e-4, 3e-4))
     pulses, repeats = sync_program(plan, maps)
@@ -202,21 +198,11 @@ def test_more_points_than_the_scanner_holds_lower_the_point_clock():
         plan_of(scan(columns=500, exposures=10), limits=dataclasses.replace(GALVO, max_points=50))
 
 
-def test_a_link_that_cannot_carry_the_frames_is_refused_with_the_rate_it_can():
-    spad = dataclasses.replace(SPAD, stream=StreamMode(2.4e6))
-    with pytest.raises(PlanError, match=r"makes 4\.8 MB/s of full frames; .*2\.4 MB/s; lower frame_rate to 50 kHz"):
-        plan_of(scan(), spad=spad)
-    config = scan(frame_rate="50 kHz")
-    assert spad_request(config, plan_of(config, spad=spad)).mode == "stream"
-
-
 @pytest.mark.parametrize(("most_hz", "kept"), [(80_000, "lower frame_rate to 50 kHz"), (40_000, "does is 40 kHz")])
 def test_of_two_limits_of_the_frame_rate_only_the_stricter_is_named(most_hz, kept):
     spad = dataclasses.replace(SPAD, stream=StreamMode(2.4e6), max_frame_rate_hz=Fraction(most_hz))
-    with pytest.raises(PlanError) as caught:
+    with pytest.raises(PlanError, match=rf"\A[^\n]*{kept}[^\n]*\Z"):
         plan_of(scan(), spad=spad)
-    (problem,) = caught.value.problems
-    assert kept in problem
 
 
 def test_a_spad_that_cannot_stream_fast_enough_takes_bursts():
