@@ -101,17 +101,6 @@ def test_completion_is_installed_for_the_shell_that_calls(
     assert "_RIG_COMPLETE=complete_bash" in written
 
 
-def test_completion_that_cannot_be_installed_is_one_line(
-    tmp_path: Path, rig: Rig, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    (tmp_path / "home").touch()  # no folder: nothing can be written below it
-    monkeypatch.setenv("HOME", str(tmp_path / "home"))
-    monkeypatch.setattr("shellingham.detect_shell", lambda: ("bash", "bash"))
-    ran = rig("--install-completion")
-    assert (ran.code, len(ran.err.splitlines())) == (2, 1)
-    assert str(tmp_path / "home") in ran.err
-
-
 def test_scenes_and_rigs_are_listed_with_what_their_files_say(rig: Rig) -> None:
     listed = json.loads(rig("scenes", "--json").out)
     assert [one["name"] for one in listed["scenes"]] == sorted(
@@ -126,13 +115,6 @@ def test_scenes_and_rigs_are_listed_with_what_their_files_say(rig: Rig) -> None:
         assert comment.startswith(one["about"])
         assert f"  {one['name']} " in told
         assert one["about"] in told
-
-
-def test_the_package_runs_as_the_command_does() -> None:
-    ran = subprocess.run(
-        [sys.executable, "-m", "rig", "--version"], capture_output=True, text=True, check=True, timeout=60
-    )
-    assert ran.stdout.startswith("spadrig ")
 
 
 def test_version_and_no_command(rig: Rig) -> None:
@@ -187,10 +169,9 @@ def test_effects_says_which_a_scene_calls_for_why_and_what_each_is_worth(rig: Ri
     assert foggy["fog"]["basis"] == "trial"
     assert abs(foggy["fog"]["stripe_error_change_px"]) < 10
     assert foggy["stripe"]["basis"] is None
-    told = rig("effects", small, "--no-trials")
-    assert told.code == 0
-    assert "medium" in told.out
-    assert "of decisions changed" in told.out
+    told = rig("effects", small, "--no-trials").out
+    assert "medium" in told
+    assert "of decisions changed" in told
 
 
 def test_effects_gives_the_flux_of_an_image_row(rig: Rig, small: Path) -> None:
@@ -203,18 +184,14 @@ def test_effects_gives_the_flux_of_an_image_row(rig: Rig, small: Path) -> None:
     assert len(rig(*asked).out.splitlines()) == 97
 
 
-@pytest.mark.parametrize(
-    ("place", "problem"),
-    [
-        (("--row", 40, "--column", 3), "row is 40; the camera has rows 0 to 39"),
-        (("--row", 3, "--column", -1), "column is -1; the scan has columns 0 to 199"),
-        (("--row", 3), "both --row and --column"),
-    ],
-)
-def test_a_row_that_is_not_there_is_one_line(rig: Rig, small: Path, place: tuple[object, ...], problem: str) -> None:
-    ran = rig("effects", small, *place)
-    assert (ran.code, len(ran.problems)) == (2, 1)
-    assert problem in ran.problems[0]
+def test_a_row_that_is_not_there_is_one_line(rig: Rig, small: Path) -> None:
+    ran = rig("effects", small, "--row", 40, "--column", -1)
+    assert ran.code == 2
+    assert [problem.removeprefix("error: ") for problem in ran.problems] == [
+        "row is 40; the camera has rows 0 to 39",
+        "column is -1; the scan has columns 0 to 199",
+    ]
+    assert "both --row and --column" in rig("effects", small, "--row", 3).problems[0]
 
 
 def test_a_shown_config_is_a_config(rig: Rig, small: Path) -> None:
@@ -251,15 +228,6 @@ def test_check_opens_every_file_that_a_config_names(rig: Rig, small: Path) -> No
     ]
     scanned = rig("scan", small, "--dry-run")
     assert scanned.problems[:3] == ran.problems[:3]
-
-
-@pytest.mark.parametrize("scene", ["fog: 20", "surfaces: board"])
-def test_check_reads_what_the_files_say(rig: Rig, small: Path, scene: str) -> None:
-    (small.parent / "mine.yaml").write_text(scene)
-    small.write_text(small.read_text().replace("scene: street-clear", "scene: mine.yaml"))
-    ran = rig("config", "check", small)
-    assert (ran.code, len(ran.problems)) == (2, 1)
-    assert ran.problems == rig("scan", small, "--dry-run").problems
 
 
 @pytest.mark.parametrize("name", bundled_configs())

@@ -37,12 +37,6 @@ def test_the_doctor_names_every_device_that_is_absent(rig):
     ]  # fmt: skip
 
 
-def test_a_dry_run_of_a_real_rig_needs_no_arming_and_names_every_device_that_is_absent(rig):
-    ran = rig("scan", "lab", "--dry-run")
-    assert ran.code == 3
-    assert [line.split(": ")[1] for line in ran.problems] == ["spad", "scanner", "laser", "sync"]
-
-
 def test_a_real_rig_is_not_scanned_without_arming(rig):
     ran = rig("scan", "lab")
     assert ran.code == 2

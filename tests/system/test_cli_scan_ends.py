@@ -6,78 +6,17 @@ import os
 import signal
 import subprocess
 import sys
-import threading
 import time
 from pathlib import Path
 
 import numpy as np
 import pytest
 
-from drivers.frames import FrameBlock
-from drivers.ring import BlockRing
-from drivers.spb1 import walk_blocks
 from rig.depth.reconstruct import MapResult, Reconstructor
-from rig.recording.segment import OpenSegment, Staging
 from rig.run_folder.folder import RunFolder
 from tests.system.conftest import Rig
 from tests.system.run_files import FILES, files, strict
 from tests.system.small_rig import config, write_rig
-
-
-def test_frames_dropped_for_a_slow_estimate_are_gaps(rig: Rig, small: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    estimate, dropping = Reconstructor.map, threading.Event()
-    mark = BlockRing.mark_overflow
-
-    def marked(self: BlockRing, n_frames: int = 0) -> None:
-        mark(self, n_frames)
-        dropping.set()
-
-    def slow(self: Reconstructor, volume: object) -> MapResult:
-        assert dropping.wait(60)
-        return estimate(self, volume)  # type: ignore[arg-type]
-
-    monkeypatch.setattr(BlockRing, "mark_overflow", marked)
-    monkeypatch.setattr(Reconstructor, "map", slow)
-    ran = rig("scan", small, "--maps", 8, "--on-overload", "drop", "--json", "--out", "run")
-    summary, manifest = strict(ran.out), strict(Path("run/manifest.json").read_text())
-    frames, gaps = summary["frames"], manifest["gaps"]
-    assert isinstance(frames, dict)
-    assert isinstance(gaps, list)
-    assert (ran.code, summary["verdict"], summary["maps"]) == (1, "gaps", 8), summary.get("verdict_reasons")
-    assert frames["expected"] == frames["received"] + frames["lost"]
-    assert frames["lost"] == sum(last - first + 1 for first, last in gaps) > 0
-    assert summary["stages"]["dropped_frames"] >= frames["lost"]  # type: ignore[index]
-    assert manifest["on_overload"] == "drop"
-
-
-def test_a_disk_that_the_recording_fills_ends_the_scan_in_a_line_and_keeps_what_is_whole(
-    rig: Rig, small: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    write = OpenSegment.write
-
-    def full(self: OpenSegment, block: FrameBlock, offset: int, staging: Staging) -> None:
-        if block.header.block_seq == 3:
-            os.write(-1, b"")
-        write(self, block, offset, staging)
-
-    monkeypatch.setattr(OpenSegment, "write", full)
-    ran = rig("scan", small, "--maps", 20, "--record", "--out", "run")
-    assert (ran.code, len(ran.problems)) == (3, 1)
-    assert "cannot write the recording frames-000000.spb" in ran.problems[0]
-    assert "of 20 maps were whole" in ran.err
-    assert strict(Path("run/summary.json").read_text())["verdict"] == "aborted"
-    blocks = list(walk_blocks(np.fromfile("run/frames-000000.spb", np.uint8), None, check_payload=True))
-    assert [isinstance(block, FrameBlock) for block in blocks] == [True] * 3
-
-
-def test_lost_frames_are_a_verdict_and_exit_code(rig: Rig, tmp_path: Path) -> None:
-    content = config()
-    content["spad"]["lost_frames"] = list(range(400, 410))
-    ran = rig("scan", write_rig(tmp_path / "lossy", content), "--json", "--out", "run")
-    summary = strict(ran.out)
-    assert (ran.code, summary["verdict"]) == (1, "gaps")
-    assert summary["frames"]["lost"] == 10  # type: ignore[index]
-    assert strict(Path("run/manifest.json").read_text())["gaps"] == [[400, 409]]
 
 
 def test_without_a_calibration_there_are_stripes_but_no_depth(rig: Rig, tmp_path: Path) -> None:

@@ -93,6 +93,4 @@ def test_bad_options_are_one_line_each_and_leave_nothing(rig: Rig, small: Path, 
 
 @pytest.mark.parametrize(("config", "named"), [("lab", "is a real rig"), ("lab-emulated", "the host's time")])
 def test_only_simulated_rigs_are_tried(rig: Rig, config: str, named: str) -> None:
-    ran = rig("tradeoff", config)
-    assert (ran.code, len(ran.problems)) == (2, 1)
-    assert named in ran.problems[0]
+    assert [named in problem for problem in rig("tradeoff", config).problems] == [True]

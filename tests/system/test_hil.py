@@ -104,14 +104,6 @@ def test_the_first_byte_that_was_not_recorded_fails_the_replay_and_is_shown(take
         api.replay(other, against_recording=True)
 
 
-def test_a_simulated_recording_has_no_drivers_to_play(tmp_path: Path) -> None:
-    content = config()
-    api.scan(write_rig(tmp_path / "rig", content), out=tmp_path / "run", record=True)
-    assert not (tmp_path / "run" / "control.jsonl").exists()
-    with pytest.raises(UsageError, match="simulated devices only"):
-        api.replay(tmp_path / "run", against_recording=True)
-
-
 def test_no_light_is_let_out_without_a_word(taken: Path) -> None:
     content = load_config("hil").model_dump(mode="json")
     content["sync"]["port"] = "/dev/ttyACM0"

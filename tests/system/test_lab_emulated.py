@@ -88,10 +88,3 @@ def test_a_dry_run_opens_every_device_and_neither_moves_nor_shines(worlds):
     assert not any(power_w for _, power_w in world.emission())
     assert world.light(begun_s, ended_s) == []
     assert np.ptp(world.mirror(np.linspace(begun_s, ended_s, 1000))) == 0
-
-
-def test_the_laser_is_switched_off_without_a_scan(worlds):
-    done = "\n".join(api.laser_off("lab-emulated"))
-    assert "all outputs low" in done
-    assert "emission off" in done
-    assert len(worlds) == 1

@@ -6,7 +6,6 @@ import math
 from dataclasses import replace
 from fractions import Fraction
 
-import cv2
 import numpy as np
 import pytest
 
@@ -18,20 +17,14 @@ from drivers.ring import BlockRing, OnFull
 from rig import api
 from rig.bench import soak, speed, stages
 from rig.bench.frames import (
-    BLOCK_FRAMES,
-    EDGE_PX,
-    PLACE_FRAMES,
     ROWS,
     WINDOW,
-    bench_surface,
     count_columns,
     draw_frames,
-    read_all,
     window_frames,
 )
 from rig.bench.soak import LEAD_FRAMES, Loop, LoopedSpad
 from rig.bench.speed import Extent, measure_speed
-from rig.bench.stages import sgbm_stage
 from rig.cli import main as cli
 from rig.cli.tables import speed_table
 from rig.count.kernels import CHUNK, new_planes, planes_for
@@ -42,7 +35,7 @@ from rig.threads import RowWorkers
 from tests.unit.rig.count.streams import SPAD, plan_of, scan, stream_of
 
 SMALL = Extent(
-    windows=(64, 128), exposures=(1, 10), rounds=2, moment_s=1e-3, count_moment_s=1e-3, latency_s=0.02,
+    windows=(64, 128), exposures=(1, 10), rounds=1, moment_s=1e-3, count_moment_s=1e-3, latency_s=0.02,
     frames_bytes=2**22, read_bytes=2**20, map_rows=64, map_columns=128,
 )  # fmt: skip
 KEYS = {
@@ -76,16 +69,6 @@ def test_pixels_detect_as_often_as_their_threshold_says():
     assert share == pytest.approx(0.25, abs=5 * math.sqrt(0.25 * 0.75 / pixels[:, :, :32].size))
 
 
-def test_the_brightest_pixel_over_many_frames_is_where_the_truth_is(frames):
-    x0 = int(frames.geometry.x0[0])
-    pixels = np.unpackbits(frames.bits[:PLACE_FRAMES], axis=2)
-    off = pixels.sum(axis=0, dtype=np.int64).argmax(axis=1) + x0 - frames.truth_px[0]
-    assert np.median(np.abs(off)) < 0.5
-    inside = frames.truth_px - x0
-    assert inside.min() >= EDGE_PX
-    assert inside.max() <= 64 - EDGE_PX
-
-
 # Stages
 
 
@@ -99,11 +82,6 @@ def test_counting_alone_counts_all_frames_of_a_column(frames):
     counts = (bits << np.arange(used)[:, None]).sum(axis=1).reshape(rows, 64)
     last = np.unpackbits(frames.bits[exposures : 2 * exposures], axis=2).sum(axis=0)
     np.testing.assert_array_equal(counts, last)
-
-
-def test_reading_reads_every_word():
-    words = np.random.default_rng(0).integers(0, 2**63, 1001).astype(np.uint64)
-    assert read_all(words) == int(np.bitwise_xor.reduce(words))
 
 
 # The report
@@ -178,18 +156,6 @@ def test_the_quotient_with_sgbm_is_of_maps_made_by_turns(monkeypatch):
     found = stages._timed(make, 0.0, 10, None, beside)
     assert made == ["joint", "sgbm"] * stages.PAIRS
     assert (found.maps, found.frames, found.seconds, found.times_sgbm) == (5, 50, 11.0, 0.75)
-
-
-def test_opencv_keeps_the_threads_it_had():
-    before = cv2.getNumThreads()
-    sgbm_stage(bench_surface(64, 128), before + 1)(0.0)
-    assert cv2.getNumThreads() == before
-
-
-def test_latency_counts_every_column(report):
-    latency = report.latency_us
-    assert latency.columns == 4 * BLOCK_FRAMES // 10 - 1  # nothing came behind the last one
-    assert 0 < latency.median <= latency.p999 <= latency.max
 
 
 # The command

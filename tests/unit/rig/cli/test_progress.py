@@ -9,7 +9,7 @@ from numba.core import event
 
 from rig.cli import progress as cli_progress
 from rig.cli.progress import COMPILING, ProgressLine, progress
-from rig.progress import Step, counted, listening, part, tell_stage
+from rig.progress import Step, listening, part, tell_stage
 
 
 class Terminal(io.StringIO):
@@ -53,15 +53,6 @@ def test_what_is_told_is_heard_within_and_nowhere_else():
     ]
 
 
-def test_a_count_is_never_above_its_total():
-    heard, given = [], []
-    with listening(heard.append):
-        tell_stage("rendering", 3000, 2718, "frames")
-        counted("measuring", "rows", lambda done, total: given.append((done, total)))(13, 12)
-    assert [(step.done, step.total) for step in heard] == [(2718, 2718), (12, 12)]
-    assert given == [(12, 12)]
-
-
 @pytest.mark.parametrize(
     ("step", "text"),
     [
@@ -96,17 +87,6 @@ def test_without_a_terminal_each_stage_is_one_line_however_often_it_is_told(impa
         "pose 1 of 2: preparing",
         "pose 2 of 2: preparing",
     ]
-
-
-def test_what_is_compiled_is_a_stage_of_its_own_until_the_next_one(impatient, capsys):
-    with progress():
-        for _ in range(3):
-            with compiling():
-                pass
-        tell_stage("rendering")
-    with compiling():
-        pass
-    assert stages(capsys.readouterr().err) == [COMPILING, "rendering"]
 
 
 def test_while_it_compiles_no_other_stage_is_claimed():

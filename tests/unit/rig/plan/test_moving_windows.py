@@ -266,15 +266,6 @@ def test_a_window_or_a_width_where_the_plan_has_none_is_refused_in_a_line(moving
         counted(plan, blocks_of(plan, stream, plan.windows.width_px, x0))
 
 
-def test_the_rate_that_is_named_is_that_of_the_narrower_windows_of_a_slower_scan():
-    config = scan(columns=120, exposures=1, command_range=[-0.6, 0.6], depth_range=["2 m", "4 m"])
-    few_points = scanner_limits(point_rate_hz=(1e3, 1e4))
-    with pytest.raises(PlanError, match=r"windows of 256 pixels; .* lower frame_rate to 62\.5 kHz"):
-        plan_of(config, NO_LAG, linked(7e6), few_points)
-    slower = plan_of(config.model_copy(update={"frame_rate": Fraction(62_500)}), NO_LAG, linked(7e6), few_points)
-    assert slower.windows.width_px == 192
-
-
 def test_columns_that_see_nothing_make_no_window_jump():
     with open_rig(load_config("simulated", {"scan.depth_range": ["4 m", "15 m"]})) as rig:
         plan, _ = prepare(rig)

@@ -207,22 +207,6 @@ def sweeps_of(plan, blocks, maps):
     return found
 
 
-def test_expected_frames_are_received_and_lost_ones_between_the_markers():
-    stream = stream_of(PLAN, 2, lag=LAG)
-    begin, middle, end = stream.scan_frames[:3]
-    lost = [begin - 3, begin + 30, begin + 31, begin + 60, middle - 1, middle, middle + 1]
-    first, second = sweeps_of(PLAN, stream.blocks(itertools.repeat(50), lost), 2)
-    assert (first.first_frame, first.end_frame, second.end_frame) == (begin, middle, end)
-    assert first.gaps == ((begin + 30, begin + 31), (begin + 60, begin + 60), (middle - 1, middle - 1))
-    assert second.gaps == ((middle, middle + 1),)
-    assert (first.frames.expected, first.frames.lost) == (middle - begin, 4)
-    assert (second.frames.expected, second.frames.lost) == (end - middle, 2)
-    for sweep in (first, second):
-        assert sweep.frames.received == sweep.frames.expected - sweep.frames.lost
-        assert sweep.frames.lit == sweep.volume.n_frames.sum()
-        assert sweep.frames.dark == sweep.volume.n_dark
-
-
 @settings(max_examples=10, deadline=None)
 @given(st.lists(st.integers(1, 200), min_size=1, max_size=8), st.lists(st.integers(0, 400), max_size=6))
 def test_counted_sweeps_do_not_depend_on_the_size_of_blocks(sizes, lost):

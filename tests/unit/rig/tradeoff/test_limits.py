@@ -71,7 +71,7 @@ def beside_the_genie(name: str, light: str) -> tuple[list[float], list[float], l
     )
 
 
-@pytest.mark.parametrize(("name", "light"), [("procedural", "report"), ("cones", "report"), ("art", "dense")])
+@pytest.mark.parametrize(("name", "light"), [("procedural", "report"), ("art", "dense")])
 def test_the_genie_comes_close_to_the_limit_and_not_below(name, light) -> None:
     """It is told all but the stripe's brightness, which the limit is told too."""
     limit, se, genie = map(np.array, beside_the_genie(name, light))

@@ -105,7 +105,7 @@ def test_the_advice_is_what_was_asked_for_and_else_the_shortest_scan_of_little_m
         replace(ROW, estimator="joint", filter="none", exposures=k, mean_abs_px=px, sensor_ms=5.0 * k, compute_ms=80.0)
         for k, px in ((1, 0.4), (3, 0.14), (10, 0.1))
     ]
-    took = "K = 3 with joint: 0.14 px in 15 ms of sensor and 80 ms of computing a map"
+    took = "joint, 3 exposures: 0.14 px in 15 ms of sensor and 80 ms of computing a map"
     assert advice(rows, None, None) == f"take {took}; the shortest scan within 1.5 times the least error, 0.1 px"
     wish = Wish(time_ms=20.0)
     asked = f"take {took}, the best for at most 20 ms of sensor time a map"
@@ -183,10 +183,10 @@ def test_an_interrupt_leaves_the_rows_that_are_whole(monkeypatch, whole):
     )
     done = iter(range(whole))
 
-    def scanned(config, estimators, filters, seed, on_frames):
+    def scanned(config, estimators, filters, seed, tell):
         if next(done, None) is None:
             raise KeyboardInterrupt
-        return {("edge", "none"): MapScore(0.5, 0.9, 0.0, 10.0, 50.0, 20.0, np.array([50.0]), np.array([100]))}
+        return {("edge", "none"): MapScore(0.5, 0.9, 0.0, 10.0, 50.0, 20.0, (0.4, 0.6))}
 
     monkeypatch.setattr("rig.tradeoff.trials.score_methods", scanned)
     if not whole:
