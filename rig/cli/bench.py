@@ -1,10 +1,11 @@
 """Commands for the speed of this machine: `rig bench`, `warmup`."""
 
+from dataclasses import asdict
 from typing import Annotated
 
 import typer
 
-from rig.cli.command import Commands, ConfigArgument, JsonOption, print_json
+from rig.cli.command import Commands, ConfigArgument, JsonOption, api, print_json
 from rig.cli.progress import progress
 
 
@@ -26,7 +27,6 @@ def bench_command(
     as_json: JsonOption = False,
 ) -> int:
     """Measure how fast this machine counts and estimates, beside how fast it reads its memory."""
-    from rig import api
     from rig.errors import UsageError
 
     if soak is None and (window or slow_consumer != 0 or on_overload != "abort"):
@@ -40,7 +40,7 @@ def bench_command(
     with progress():
         report = api.bench(threads=threads)
     if as_json:
-        print_json(report.as_json() | ({} if stream is None else {"soak": stream.as_json()}))
+        print_json(report.as_json() | ({} if stream is None else {"soak": asdict(stream)}))
     else:
         from rig.cli.tables import soak_table, speed_table
 
@@ -53,8 +53,6 @@ def bench_command(
 
 def warmup_command(config: ConfigArgument = "simulated", as_json: JsonOption = False) -> int:
     """Compile everything that is compiled, so that no scan waits for it."""
-    from rig import api
-
     with progress():
         seconds = api.warm_up(config)
     if as_json:

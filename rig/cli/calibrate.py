@@ -5,7 +5,7 @@ from typing import TYPE_CHECKING, Annotated
 
 import typer
 
-from rig.cli.command import Commands, JsonOption, asks, print_json, say
+from rig.cli.command import Commands, JsonOption, api, asks, print_json, say
 from rig.cli.completion import one_of, rig_names
 from rig.cli.progress import paused, progress
 from rig.requests import CameraRequest, CheckRequest, PixelsRequest, PlanesRequest, SyncRequest
@@ -66,7 +66,6 @@ def pixels_command(
     as_json: JsonOption = False,
 ) -> int:
     """Map hot, dead and noisy pixels and the dark rate, from dark frames."""
-    from rig import api
     from rig.cli.tables import print_result
 
     ask = ask_at_terminal()
@@ -82,8 +81,6 @@ def pixels_command(
 @asks(CameraRequest)
 def camera_command(request: CameraRequest, sources: SourcesArgument = None, as_json: JsonOption = False) -> int:
     """Calibrate the camera alone, from views of a board or from pictures."""
-    from rig import api
-
     with progress():
         result = api.calibrate_camera(sources or (), request, ask=ask_at_terminal(), tell=say)
     return print_report(result, as_json)
@@ -92,8 +89,6 @@ def camera_command(request: CameraRequest, sources: SourcesArgument = None, as_j
 @asks(PlanesRequest)
 def planes_command(request: PlanesRequest, sources: SourcesArgument = None, as_json: JsonOption = False) -> int:
     """Calibrate camera, light planes and lag from views of a board."""
-    from rig import api
-
     with progress():
         result = api.calibrate_planes(sources or (), request, ask=ask_at_terminal(), tell=say)
     return print_report(result, as_json)
@@ -102,8 +97,6 @@ def planes_command(request: PlanesRequest, sources: SourcesArgument = None, as_j
 @asks(SyncRequest)
 def sync_command(request: SyncRequest, sources: SourcesArgument = None, as_json: JsonOption = False) -> int:
     """Measure the mirror's lag each way and the rows' delay, from one unmoved scene at several speeds."""
-    from rig import api
-
     with progress():
         result = api.calibrate_sync(sources or (), request, tell=say)
     return print_report(result, as_json)
@@ -112,8 +105,6 @@ def sync_command(request: SyncRequest, sources: SourcesArgument = None, as_json:
 @asks(CheckRequest)
 def check_command(request: CheckRequest, sources: SourcesArgument = None, as_json: JsonOption = False) -> int:
     """Judge a calibration by scans of a flat board: flatness, scale, angle."""
-    from rig import api
-
     with progress():
         result = api.calibrate_check(sources or (), request, ask=ask_at_terminal(), tell=say)
     return print_report(result, as_json)

@@ -11,6 +11,7 @@ import sys
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import Field
 from datetime import datetime
+from importlib import import_module
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any, ParamSpec
 
@@ -21,8 +22,18 @@ from rig.errors import UsageError
 from rig.requests import options_of
 
 if TYPE_CHECKING:
+    from rig import api
     from rig.recording.segment import Space
     from rig.scan.run import RunResult
+else:
+
+    class _Api:
+        """The module `rig.api`, which is imported where a command first calls something of it."""
+
+        def __getattr__(self, name: str) -> Any:
+            return getattr(import_module("rig.api"), name)
+
+    api = _Api()
 
 EXIT_USAGE = 2
 EXIT_DEVICE = 3

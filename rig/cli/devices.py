@@ -1,11 +1,12 @@
 """Commands for devices (`rig doctor`, `devices`, `laser off`), configs (`rig config`) and scenes (`rig scenes`)."""
 
+from dataclasses import asdict
 from pathlib import Path
 from typing import Annotated
 
 import typer
 
-from rig.cli.command import EXIT_DEVICE, Commands, ConfigArgument, JsonOption, print_json
+from rig.cli.command import EXIT_DEVICE, Commands, ConfigArgument, JsonOption, api, print_json
 
 
 def doctor_command(
@@ -14,11 +15,9 @@ def doctor_command(
     as_json: JsonOption = False,
 ) -> int:
     """Open everything, look at the stream with the gate low, and say whether a scan could run."""
-    from rig import api
-
     findings = api.doctor(config, out=out)
     if as_json:
-        print_json({"could_scan": all(one.ok for one in findings), "findings": [one.as_json() for one in findings]})
+        print_json({"could_scan": all(one.ok for one in findings), "findings": [asdict(one) for one in findings]})
     else:
         for one in findings:
             print(f"{'ok  ' if one.ok else 'FAIL'}  {one.name:<12}{one.text}")
@@ -27,11 +26,9 @@ def doctor_command(
 
 def devices_command(as_json: JsonOption = False) -> int:
     """List what is attached: USB devices that a driver knows, and serial ports."""
-    from rig import api
-
     found = api.devices()
     if as_json:
-        print_json({"devices": [one.as_json() for one in found]})
+        print_json({"devices": [asdict(one) for one in found]})
     else:
         for one in found:
             print(f"{one.address:<32}{one.what}")
@@ -42,8 +39,6 @@ def devices_command(as_json: JsonOption = False) -> int:
 
 def laser_off_command(config: ConfigArgument = "simulated") -> int:
     """Take the gate low and switch the laser's emission off for good."""
-    from rig import api
-
     for line in api.laser_off(config):
         print(line)
     return 0
@@ -51,9 +46,7 @@ def laser_off_command(config: ConfigArgument = "simulated") -> int:
 
 def check_command(config: ConfigArgument = "simulated", as_json: JsonOption = False) -> int:
     """Say whether a config is valid and the files that it names can be used; all problems at once."""
-    from rig.api import check_config
-
-    checked = check_config(config)
+    checked = api.check_config(config)
     if as_json:
         print_json({"config": config, "name": checked.name, "valid": True})
     else:
@@ -83,11 +76,9 @@ def schema_command() -> int:
 
 def scenes_command(as_json: JsonOption = False) -> int:
     """List the bundled scenes (--scene) and rigs (CONFIG), with a sentence on each."""
-    from rig import api
-
     listed = {"scenes": api.bundled_scenes(), "rigs": api.bundled_rigs()}
     if as_json:
-        print_json({group: [one.as_json() for one in members] for group, members in listed.items()})
+        print_json({group: [asdict(one) for one in members] for group, members in listed.items()})
         return 0
     wide = max(len(one.name) for members in listed.values() for one in members)
     for group, members in listed.items():

@@ -5,7 +5,7 @@ from typing import TYPE_CHECKING, Annotated
 
 import typer
 
-from rig.cli.command import Commands, JsonOption, asks, print_json, say
+from rig.cli.command import Commands, JsonOption, api, asks, print_json, say
 from rig.cli.progress import progress
 from rig.requests import CutRequest, ExportRequest, ImportRequest
 
@@ -21,8 +21,6 @@ MOST_LINES = 20
 
 def verify_command(run: RunArgument, as_json: JsonOption = False) -> int:
     """Read every byte of a recording and say whether it is what was recorded; exit code 1 where it is not."""
-    from rig import api
-
     with progress(compiles=False):
         found = api.verify(run)
     if as_json:
@@ -34,8 +32,6 @@ def verify_command(run: RunArgument, as_json: JsonOption = False) -> int:
 
 def repair_command(run: RunArgument, as_json: JsonOption = False) -> int:
     """Make a torn recording whole: cut torn tails off, write a lost index or manifest anew; frames stay as they are."""
-    from rig import api
-
     with progress(compiles=False):
         made = api.repair(run)
     if as_json:
@@ -49,8 +45,6 @@ def repair_command(run: RunArgument, as_json: JsonOption = False) -> int:
 
 def info_command(run: RunArgument, as_json: JsonOption = False) -> int:
     """Describe what a recording holds."""
-    from rig import api
-
     found = api.recording_info(run)
     if as_json:
         print_json(found.as_json())
@@ -67,8 +61,6 @@ def cut_command(
     as_json: JsonOption = False,
 ) -> int:
     """Write a part of a recording to a folder of its own, with all that is needed to reconstruct it."""
-    from rig import api
-
     with progress(compiles=False):
         content = api.cut(run, out, request)
     if as_json:
@@ -82,8 +74,6 @@ def cut_command(
 
 def compress_command(run: RunArgument, as_json: JsonOption = False) -> int:
     """Compress a recording with zstd; every command reads it as any other."""
-    from rig import api
-
     with progress(compiles=False):
         made = api.compress(run)
     if as_json:
@@ -150,8 +140,6 @@ def import_command(
     as_json: JsonOption = False,
 ) -> int:
     """Make a recording from the frames in another program's files."""
-    from rig import api
-
     with progress(compiles=False):
         result = api.import_frames(kind, files, out, request)
     for hint in result.hints:
@@ -177,8 +165,6 @@ def export_command(
     as_json: JsonOption = False,
 ) -> int:
     """Write a run in a form that other programs read."""
-    from rig import api
-
     with progress(compiles=False):
         result = api.export_run(run, kind, request, out=out)
     for line in result.damage:

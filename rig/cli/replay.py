@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING, Annotated
 
 import typer
 
-from rig.cli.command import Commands, JsonOption, asks, report, say, say_space
+from rig.cli.command import Commands, JsonOption, api, asks, report, say, say_space
 from rig.cli.progress import progress
 from rig.requests import ReplayRequest
 
@@ -28,8 +28,6 @@ def replay_command(
     as_json: JsonOption = False,
 ) -> int:
     """Play a recording through the live stack, at any clock."""
-    from rig import api
-
     if request.loop and request.save is None:
         request = replace(request, save="last")
     steps = _step_by_keys if request.clock == "step" else None

@@ -1,6 +1,6 @@
 """Commands that make depth maps, and one on what to expect of a scene: `rig scan`, `reconstruct`, `effects`."""
 
-from dataclasses import replace
+from dataclasses import asdict, replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
 
@@ -10,6 +10,7 @@ from rig.cli.command import (
     Commands,
     ConfigArgument,
     JsonOption,
+    api,
     asks,
     print_json,
     report,
@@ -32,8 +33,6 @@ def scan_command(
     as_json: JsonOption = False,
 ) -> int:
     """Acquire and reconstruct depth maps."""
-    from rig import api
-
     if dry_run:
         spaces: list[Space] = []
         plan = api.plan_scan(config, request, on_space=spaces.append)
@@ -75,8 +74,6 @@ def reconstruct_command(
     as_json: JsonOption = False,
 ) -> int:
     """Make depth maps from a recording, from imported frames or from a packed .npy cube of them."""
-    from rig import api
-
     with progress():
         result = api.reconstruct(source, plan, calibration, replace(request, out=out))
     return report(result, as_json)
@@ -118,7 +115,6 @@ def effects_command(
 
     With --row and --column, print the noise-free flux of that row instead.
     """
-    from rig import api
     from rig.cli.tables import effects_table, flux_table
 
     chosen = config if config_option is None else config_option
@@ -132,7 +128,7 @@ def effects_command(
     with progress():
         effects = api.effects(chosen, scene=scene, trials=trials)
     if as_json:
-        print_json(effects.as_json())
+        print_json(asdict(effects))
     else:
         effects_table(effects)
     return 0

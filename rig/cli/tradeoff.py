@@ -1,6 +1,6 @@
 """The command that finds what accuracy costs in time, and which setting to use: `rig tradeoff`."""
 
-from rig.cli.command import EXIT_ABORTED, Commands, ConfigArgument, JsonOption, asks, print_json, say
+from rig.cli.command import EXIT_ABORTED, Commands, ConfigArgument, JsonOption, api, asks, print_json, say
 from rig.cli.progress import progress
 from rig.requests import TradeoffRequest
 
@@ -10,8 +10,6 @@ def tradeoff_command(
     request: TradeoffRequest, config: ConfigArgument = "simulated", as_json: JsonOption = False
 ) -> int:
     """Scan a simulated rig with many settings: error over sensor time and compute time, and which setting to use."""
-    from rig import api
-
     with progress():
         done = api.tradeoff(config, request)
     if as_json:

@@ -6,7 +6,6 @@ Light to import: shells ask for the names at every Tab.
 import re
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
 
 BUNDLED = Path(__file__).parents[2] / "config"
 """Folder of the configs that travel with the program."""
@@ -21,10 +20,6 @@ class Bundled:
     name: str
     about: str
     file: Path
-
-    def as_json(self) -> dict[str, Any]:
-        """Return it as plain values."""
-        return {"name": self.name, "about": self.about, "file": str(self.file)}
 
 
 def bundled_rigs() -> tuple[Bundled, ...]:

@@ -2,7 +2,7 @@
 
 from collections.abc import Iterator, Mapping
 from contextlib import ExitStack, contextmanager
-from dataclasses import asdict, dataclass, replace
+from dataclasses import dataclass, replace
 from typing import Any, Literal, Protocol, runtime_checkable
 
 import numpy as np
@@ -81,10 +81,6 @@ class Effect:
     stripe_error_change_sd_px: float | None = None
     basis: Literal["trial", "bound"] | None = None
 
-    def as_json(self) -> dict[str, Any]:
-        """Return it as plain values."""
-        return asdict(self)
-
 
 @dataclass(frozen=True, slots=True)
 class SceneEffects:
@@ -101,10 +97,6 @@ class SceneEffects:
     def __iter__(self) -> Iterator[Effect]:
         """The effects."""
         return iter(self.effects)
-
-    def as_json(self) -> dict[str, Any]:
-        """Return it as plain values."""
-        return asdict(self)
 
 
 def scene_effects(config: RigConfig, *, trials: bool = True, progress: Progress | None = None) -> SceneEffects:

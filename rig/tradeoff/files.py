@@ -6,7 +6,7 @@ The picture shows error over sensor time and over compute time, a pair of panels
 import csv
 import io
 from collections.abc import Sequence
-from dataclasses import replace
+from dataclasses import asdict, replace
 
 from rig.config.files import config_text
 from rig.config.models import RigConfig
@@ -41,7 +41,7 @@ def csv_text(rows: Sequence[TradeoffRow]) -> str:
     stream = io.StringIO()
     writer: csv.DictWriter[str] | None = None
     for row in rows:
-        content = row.as_json()
+        content = asdict(row)
         low, high = content.pop("ci95")
         line = {**content, "ci95_low": low, "ci95_high": high}
         if writer is None:

@@ -12,7 +12,7 @@ import math
 import statistics
 from collections.abc import Sequence
 from dataclasses import asdict, dataclass, replace
-from typing import Any, Literal
+from typing import Literal
 
 import numpy as np
 from numpy.typing import NDArray
@@ -135,10 +135,6 @@ class TradeoffRow:
     def time_ms(self, of: Clock) -> float:
         """Time of a map on the sensor or on the computer."""
         return self.sensor_ms if of == "sensor" else self.compute_ms
-
-    def as_json(self) -> dict[str, Any]:
-        """Return it as plain values."""
-        return asdict(self)
 
 
 def score_map(result: MapResult, truth: SweepTruth, sensor_ms: float, compute_ms: float) -> MapScore:

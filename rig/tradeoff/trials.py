@@ -1,7 +1,7 @@
 """Scans a simulated rig over settings and scores the maps by the world's truth: what accuracy costs in time."""
 
 from collections.abc import Callable, Iterable, Iterator, Sequence
-from dataclasses import dataclass
+from dataclasses import asdict, dataclass
 from itertools import count, product, starmap
 from pathlib import Path
 from typing import Any, Literal, NamedTuple, TypeVar
@@ -104,7 +104,7 @@ class Tradeoff:
         """Return it as plain values; `answer` only where a setting was asked for."""
         content: dict[str, Any] = {
             "advice": self.advice,
-            "rows": [row.as_json() for row in self.rows],
+            "rows": [asdict(row) for row in self.rows],
             "ci95_by": self.ci95_by,
         }
         if self.wish is not None:
