@@ -228,17 +228,13 @@ def reconstruct(
         raise UsageError(f"{source} holds frames alone; add {' and '.join(missing)}, which say how they were taken")
     estimate = _estimate(request)
     cube_plan = plan if isinstance(plan, CubePlan) else load_cube_plan(Path(plan))
-    model = calibration if isinstance(calibration, RigModel) else _load_calibration(calibration)
     file = None if isinstance(calibration, RigModel) else Path(calibration)
-    use = cube_calibration_use(model, file, accept=request.accept_calibration)
-    return reconstruct_cube(open_cube(source, cube_plan, model), use, estimate, request.out, progress)
-
-
-def _load_calibration(path: PathLike) -> RigModel:
     try:
-        return load_rig_model(path)
+        model = calibration if isinstance(calibration, RigModel) else load_rig_model(calibration)
     except CalibrationError as error:
         raise UsageError(str(error)) from error
+    use = cube_calibration_use(model, file, accept=request.accept_calibration)
+    return reconstruct_cube(open_cube(source, cube_plan, model), use, estimate, request.out, progress)
 
 
 def _estimate(request: ReconstructRequest) -> EstimateConfig:

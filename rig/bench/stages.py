@@ -44,7 +44,7 @@ from rig.count.volume import CountVolume
 from rig.estimate.joint.joint import Joint
 from rig.estimate.likelihood import Likelihood
 from rig.estimate.row.model import RowModel
-from rig.estimate.search.stream import ColumnJudge, SearchedSweep
+from rig.estimate.search.stream import ColumnJudge
 from rig.threads import RowWorkers
 
 Bits = NDArray[np.uint8]
@@ -207,16 +207,12 @@ def search_stage(
             counter.begin(judge)
             spent += time.perf_counter() - ended if whole_sweeps else 0.0
             if error is None and sweep is not None:
-                error = _search_error(sweep, frames, places, exposures)
+                columns = len(places) * PLACE_FRAMES // exposures
+                truth_px = frames.truth_px[np.repeat(places, PLACE_FRAMES // exposures)].T
+                error = stripe_error(sweep.stripe.x_px[:, :columns] - truth_px)
         return Measured(done, spent, error)
 
     return measure
-
-
-def _search_error(sweep: SearchedSweep, frames: BenchFrames, places: list[int], exposures: int) -> StripeError:
-    columns = len(places) * PLACE_FRAMES // exposures
-    place = np.repeat(np.array(places), PLACE_FRAMES // exposures)
-    return stripe_error(sweep.stripe.x_px[:, :columns] - frames.truth_px[place].T)
 
 
 def stripe_error(difference: NDArray[np.float32]) -> StripeError:

@@ -162,7 +162,7 @@ def _parameter(field: "Field[Any]") -> inspect.Parameter:
 
 def _read(field: "Field[Any]", value: Any) -> Any:
     if field.name == "out" and value is None:
-        return default_out()
+        return Path("runs") / datetime.now().strftime("%Y%m%d-%H%M%S")
     return _MANY[field.type](_option_name(field), value) if field.type in _MANY else value
 
 
@@ -233,11 +233,6 @@ def print_json(content: Mapping[str, Any]) -> None:
 def say_space(space: "Space") -> None:
     """Say how much room a recording will take on the disk, before it begins."""
     say(f"recording: {space}")
-
-
-def default_out() -> Path:
-    """Folder of a run whose user names none: runs/DATE-TIME."""
-    return Path("runs") / datetime.now().strftime("%Y%m%d-%H%M%S")
 
 
 def say(line: str) -> None:

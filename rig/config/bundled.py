@@ -24,7 +24,9 @@ class Bundled:
 
 def bundled_rigs() -> tuple[Bundled, ...]:
     """The rigs that a command takes by name as CONFIG, sorted."""
-    return tuple(_bundled(path) for path in _by_name(BUNDLED) if _is_rig(path))
+    # Boards and calibrations lie in the same folder.
+    is_rig = re.compile(r"^scan:", re.MULTILINE).search
+    return tuple(_bundled(path) for path in _by_name(BUNDLED) if is_rig(path.read_text(encoding="utf-8")))
 
 
 def bundled_scenes() -> tuple[Bundled, ...]:
@@ -44,8 +46,3 @@ def _bundled(path: Path) -> Bundled:
         comment.append(line.removeprefix("#").strip())
     first = re.match(r".*?\.(?=\s|$)", " ".join(comment))
     return Bundled(path.stem, first.group() if first else "", path)
-
-
-def _is_rig(path: Path) -> bool:
-    """Whether a file is a rig's config; boards and calibrations lie in the same folder."""
-    return re.search(r"^scan:", path.read_text(encoding="utf-8"), re.MULTILINE) is not None

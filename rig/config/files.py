@@ -202,13 +202,14 @@ def _anchor_paths(content: dict[str, Any], folder: Path) -> None:
             return {key: anchored(part) for key, part in value.items()}
         return value
 
+    scenes = {one.name for one in bundled_scenes()}
     for slot in SLOTS:
         if slot in content:
             content[slot] = anchored(content[slot])
             kind = kind_of(slot, content[slot])
             for name, info in ({} if kind is None else kind.model_fields).items():
                 value = content[slot].get(name)
-                named = Path in plain_types(info.annotation) or ((slot, name) == SCENE and not _is_bundled(value))
+                named = Path in plain_types(info.annotation) or ((slot, name) == SCENE and value not in scenes)
                 if named and isinstance(value, str) and not value.startswith("~"):
                     content[slot][name] = _absolute(folder / value)
 
@@ -224,10 +225,6 @@ def _is_path(value: str, folder: Path) -> bool:
     return (
         value.startswith(("./", "../")) or value.endswith(SUFFIXES) or ("/" in value and os.path.exists(folder / value))
     )
-
-
-def _is_bundled(scene: object) -> bool:
-    return scene in {path.stem for path in (BUNDLED / "scenes").glob("*.yaml")}
 
 
 def _lay_over(content: dict[str, Any], key: str, value: object) -> None:

@@ -60,11 +60,6 @@ class LineMarkers:
     jitter_columns: float
     clock_error: float
 
-    @property
-    def clock_fits(self) -> bool:
-        """Whether the clock error is that of a crystal; a larger one means missing or foreign markers."""
-        return abs(self.clock_error) <= MAX_CLOCK_ERROR
-
 
 @dataclass(frozen=True, slots=True, eq=False)
 class DarkLook:
@@ -265,7 +260,7 @@ def _markers(seen: DarkLook, plan: ScanPlan) -> Finding:
         return Finding("markers", False, text)
     return Finding(
         "markers",
-        lines.jitter_columns <= MOST_JITTER and lines.clock_fits,
+        lines.jitter_columns <= MOST_JITTER and abs(lines.clock_error) <= MAX_CLOCK_ERROR,
         f"{seen.scans} scan and {seen.line_markers} line markers, {lines.rate_hz:.6g} lines a second, jitter "
         f"{lines.jitter_columns:.3g} columns, scanner's clock {lines.clock_error * 1e6:+.0f} ppm against the SPAD's",
     )

@@ -223,13 +223,13 @@ def _pause_if_emitting(laser: LineLaser) -> list[str]:
 
 def require_simulated_or_armed(config: RigConfig, arm: bool) -> list[str]:
     """Problems with letting light out: every real laser and gate needs the user's word."""
-    real = [slot for slot in ("laser", "sync") if not _made_here(getattr(config, slot))]
+    devices = {slot: getattr(config, slot) for slot in GUARDED}
+    real = [
+        slot
+        for slot, device in devices.items()
+        if device.real_time and not str(getattr(device, "port", "")).startswith(EMULATED_PREFIX)
+    ]
     if arm or not real:
         return []
-    kinds = ", ".join(f"{slot} {getattr(config, slot).kind}" for slot in real)
+    kinds = ", ".join(f"{slot} {devices[slot].kind}" for slot in real)
     return [f"{config.name} has real light ({kinds}); clear the beam path, then add --arm"]
-
-
-def _made_here(device: KindConfig) -> bool:
-    """Whether a device shines no real light: simulated, or at a port that this process emulates."""
-    return not device.real_time or str(getattr(device, "port", "")).startswith(EMULATED_PREFIX)

@@ -199,7 +199,7 @@ class SceneLimits:
         return [self._with_limit(row, place) for row in rows] if self._lights[place] else list(rows)
 
     def _with_limit(self, row: TradeoffRow, place: Place) -> TradeoffRow:
-        averaged = _averaged(row)
+        averaged = COUPLED_ROWS if row.estimator == COUPLED or row.filter == "median" else 1
         if (place, averaged) not in self._found:
             found = limits(self._lights[place], self._exposures, averaged=averaged)
             self._found[place, averaged] = {limit.exposures: limit for limit in found}
@@ -212,10 +212,6 @@ class SceneLimits:
             return scene_lights(config.model_copy(update={"scan": scan}), rows=ROWS)
         except UsageError:  # a scene whose stripe is nowhere whole can still be scored
             return ()
-
-
-def _averaged(row: TradeoffRow) -> int:
-    return COUPLED_ROWS if row.estimator == COUPLED or row.filter == "median" else 1
 
 
 def _beside(row: TradeoffRow, limit: StatisticalLimit) -> TradeoffRow:
