@@ -6,6 +6,7 @@ import os
 import subprocess
 import sys
 from collections.abc import Iterator
+from dataclasses import fields
 from pathlib import Path
 from typing import Any
 
@@ -14,6 +15,7 @@ import typer
 import yaml
 
 from drivers.errors import DeviceError
+from rig import requests
 from rig.cli.main import app
 from rig.config.bundled import BUNDLED
 from rig.config.files import bundled_configs
@@ -286,3 +288,13 @@ def test_the_schema_offers_the_installed_kinds_of_every_slot(rig: Rig) -> None:
         assert {"$ref": f"#/$defs/{slot}.simulated"} in schema["properties"][slot]["oneOf"]
         assert schema["$defs"][f"{slot}.simulated"]["properties"]["kind"] == {"const": "simulated"}
     assert schema["$defs"]["ScanConfig"]["properties"]["exposures"]["minimum"] == 1
+
+
+@pytest.mark.parametrize("command", ["scan", "replay", "reconstruct", "tradeoff", "cut", "import", "export"])
+def test_a_field_of_a_request_is_an_option_and_is_described_once(command: str) -> None:
+    request = getattr(requests, f"{command.capitalize()}Request")
+    options = {each.name: each for each in typer.main.get_command(app).commands[command].params}  # type: ignore[attr-defined]
+    for field in fields(request):
+        about = field.metadata["about"]
+        assert options[field.name].help == about
+        assert f"{field.name}: {about} (default: " in request.__doc__

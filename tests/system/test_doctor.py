@@ -1,6 +1,7 @@
-"""The doctor on a small rig with emulated devices: what it shows, and that it says no wherever a scan could not run."""
+"""The doctor on a small rig with emulated devices, and what a user sees of devices without one."""
 
 import copy
+import json
 from collections.abc import Callable
 from pathlib import Path
 from types import SimpleNamespace
@@ -8,6 +9,7 @@ from typing import Any
 
 import numpy as np
 import pytest
+import usb.backend.libusb1
 
 from drivers.lasers.obis import ObisConfig
 from rig import api
@@ -16,6 +18,7 @@ from rig.devices.doctor import Finding
 from rig.errors import PlanError
 from sim_backend.wire.emulated_world import EmulatedWorld
 from sim_backend.wire.firmware.helios import GREEN
+from tests.system.conftest import Rig
 from tests.system.small_rig import config, write_rig
 
 Examine = Callable[..., dict[str, Finding]]
@@ -140,3 +143,49 @@ def test_a_full_disk_and_a_folder_that_cannot_be_written(small: Path, monkeypatc
     assert "make room" in disk().text
     monkeypatch.setattr("rig.devices.doctor.tempfile.NamedTemporaryFile", refuse)
     assert "cannot be written: Permission denied; choose another folder" in disk().text
+
+
+def test_devices_lists_what_is_attached_and_opens_nothing(rig: Rig) -> None:
+    ran = rig("devices", "--json")
+    if usb.backend.libusb1.get_backend() is None:
+        assert ran.code == 3
+        assert "libusb" in ran.err
+        pytest.skip("libusb is not installed")
+    assert ran.code == 0
+    for one in json.loads(ran.out)["devices"]:
+        assert set(one) == {"address", "what", "kind"}
+
+
+def test_the_doctor_finds_a_simulated_rig_fit(rig: Rig, small: Path, tmp_path: Path) -> None:
+    ran = rig("doctor", small, "--out", tmp_path, "--json")
+    found = json.loads(ran.out)
+    assert ran.code == 0, found
+    assert found["could_scan"]
+    names = [one["name"] for one in found["findings"]]
+    assert {"spad", "scanner", "laser", "sync", "guard", "plan", "frames", "dark counts", "markers", "disk"} <= set(
+        names
+    )
+
+
+def test_the_doctor_names_every_device_that_is_absent(rig: Rig) -> None:
+    ran = rig("doctor", "lab")
+    assert ran.code == 3
+    failed = [line for line in ran.out.splitlines() if line.startswith("FAIL")]
+    assert [slot for line in failed for slot in ("spad", "scanner", "laser", "sync") if f"  {slot}: " in line] == [
+        "spad", "scanner", "laser", "sync",
+    ]  # fmt: skip
+
+
+def test_a_real_rig_is_not_scanned_without_arming(rig: Rig) -> None:
+    ran = rig("scan", "lab")
+    assert ran.code == 2
+    assert ran.problems == [
+        "error: lab has real light (laser cobolt, sync prawndo); clear the beam path, then add --arm"
+    ]
+
+
+def test_the_laser_is_switched_off(rig: Rig, small: Path) -> None:
+    ran = rig("laser", "off", small)
+    assert ran.code == 0
+    assert "all outputs low" in ran.out
+    assert "emission off" in ran.out

@@ -3,6 +3,7 @@
 import xml.etree.ElementTree as ElementTree
 from dataclasses import replace
 
+import mpmath
 import numpy as np
 import pytest
 from hypothesis import given, settings
@@ -17,13 +18,31 @@ from rig.errors import UsageError
 from rig.geometry.stripe_table import StripeTable
 from rig.requests import TradeoffRequest
 from rig.threads import RowWorkers
+from rig.tradeoff import rows as rows_module
 from rig.tradeoff.choice import Wish, advice, choose, wish_of
 from rig.tradeoff.files import tradeoff_svg
 from rig.tradeoff.limits import LEAST_WRONG, SceneLimits
 from rig.tradeoff.row_light import RowLight
-from rig.tradeoff.rows import MOST_MISSING, MapScore, TradeoffRow, TrialSetting, row_of, score_map, with_fronts
+from rig.tradeoff.rows import (
+    BLOCK_COLUMNS,
+    BLOCK_ROWS,
+    MOST_MISSING,
+    MapScore,
+    TradeoffRow,
+    TrialSetting,
+    blocks_interval,
+    blocks_of,
+    repeats_interval,
+    row_of,
+    score_map,
+    t_quantile,
+    with_fronts,
+)  # fmt: skip
 from rig.tradeoff.scan import FrameKeeper
 from rig.tradeoff.trials import Tradeoff, Trials, run_tradeoff
+from tests.stability.inventory import covers
+
+covers(rows_module)
 
 ROW = TradeoffRow(
     scene="street", fog=None, estimator="edge", filter="none", exposures=10, lines=1, sensor_ms=50.0, compute_ms=20.0,
@@ -254,3 +273,35 @@ def test_the_tables_fit_into_80_characters(capsys):
     assert sum(line.endswith("*+") for line in lines) == len(rows)
     assert sum("(48.4)" in line for line in lines) == len(rows) / 2
     assert {"street, visibility 20 m", "street, visibility 20 m, 4 lines at once"} < set(lines)
+
+
+@pytest.mark.parametrize("freedom", [1, 2, 3, 4, 5, 6, 9, 20, 999])
+def test_the_quantile_is_that_of_students_t(freedom):
+    x = freedom / (freedom + t_quantile(freedom) ** 2)
+    beyond = mpmath.betainc(freedom / 2, 0.5, 0, x, regularized=True)  # both tails
+    assert float(beyond) == pytest.approx(0.05, rel=2e-3)
+
+
+def test_an_interval_over_repeats_follows_its_formula_and_is_never_below_zero():
+    low, high = repeats_interval([1.0, 2.0, 3.0])
+    assert (low, high) == (0.0, pytest.approx(2 + 4.3027 / 3**0.5))
+
+
+def test_the_blocks_of_a_map_hold_its_errors_and_leave_nan_out():
+    errors = np.full((BLOCK_ROWS + 3, 2 * BLOCK_COLUMNS), 2.0)
+    errors[0, 0] = np.nan
+    sums, numbers = blocks_of(errors)
+    whole = BLOCK_ROWS * BLOCK_COLUMNS
+    assert numbers.tolist() == [whole - 1, whole, 3 * BLOCK_COLUMNS, 3 * BLOCK_COLUMNS]
+    assert (sums == 2 * numbers).all()
+
+
+def test_an_interval_over_blocks_holds_the_true_mean_as_often_as_it_says():
+    rng = np.random.default_rng(1)
+    held = 0
+    for seed in range(100):
+        numbers = rng.integers(400, 801, 100)
+        sums = numbers * rng.exponential(0.3, 100)
+        low, high = blocks_interval(sums, numbers, seed)
+        held += low <= 0.3 <= high
+    assert held >= 88
