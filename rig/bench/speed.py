@@ -17,6 +17,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from calibration.errors import digits
+from rig.bench import stages
 from rig.bench.frames import (
     COLUMNS,
     FRAMES_BYTES,
@@ -29,22 +30,10 @@ from rig.bench.frames import (
     read_all,
     sweep_frames,
     window_frames,
-)
+)  # fmt: skip
 from rig.bench.latency import SECONDS, Latency, measure_latency, recording_of
 from rig.bench.machine import machine
-from rig.bench.stages import (
-    Measured,
-    Stage,
-    Walk,
-    count_stage,
-    from_file,
-    joint_stage,
-    joint_sweep_stage,
-    learn_joint,
-    numpy_stage,
-    search_stage,
-    sgbm_stage,
-)
+from rig.bench.stages import Measured, Stage, Walk, search_stage
 from rig.count.volume import SweepCounter
 from rig.estimate.likelihood import Likelihood
 from rig.progress import Progress, counted, tell_stage
@@ -218,7 +207,7 @@ def warm_bench() -> None:
     """Compile what the bench alone needs."""
     with RowWorkers(1) as workers:
         frames = window_frames(WINDOWS[0], workers, 1)
-        count_stage(frames, Walk(frames), PLACE_FRAMES, workers)(0.0)
+        stages.count_stage(frames, Walk(frames), PLACE_FRAMES, workers)(0.0)
     read_all(frames.bits.reshape(-1).view(np.uint64))
 
 
@@ -256,10 +245,14 @@ def _window_cases(frames: BenchFrames, learned: Likelihood, workers: Workers, ex
     walk, one = Walk(frames), {1: workers[1]}
     every = sorted({*COUNT_EXPOSURES, *extent.exposures})
     return [
-        *_cases("numpy", frames, every, one, lambda k, _: numpy_stage(frames, walk, k)),
-        *_cases("count", frames, every, workers, lambda k, own: count_stage(frames, walk, k, own)),
+        *_cases("numpy", frames, every, one, lambda k, _: stages.numpy_stage(frames, walk, k)),
+        *_cases("count", frames, every, workers, lambda k, own: stages.count_stage(frames, walk, k, own)),
         *_cases(
-            "likelihood", frames, extent.exposures, workers, lambda k, own: search_stage(frames, walk, k, own, learned)
+            "likelihood",
+            frames,
+            extent.exposures,
+            workers,
+            lambda k, own: search_stage(frames, walk, k, own, learned),
         ),
     ]
 
@@ -274,7 +267,7 @@ def _usual_cases(
     recording, stride = recording_of(frames)
     path = folder / "frames.spb"
     recording.tofile(path)
-    source = from_file(path, stride)
+    source = stages.from_file(path, stride)
 
     def whole(k: int, own: RowWorkers) -> Stage:
         return search_stage(frames, walk, k, own, learned, whole_sweeps=True)
@@ -290,13 +283,13 @@ def _map_cases(workers: Workers, extent: Extent) -> list[Case]:
     """The rows of whole maps."""
     surface = bench_surface(extent.map_rows, extent.map_columns)
     most, window = max(workers), WINDOWS[0]
-    model = learn_joint(surface, LEARN_EXPOSURES, most)
-    cases = [Case("sgbm", window, None, n, None, sgbm_stage(surface, n)) for n in workers]
+    model = stages.learn_joint(surface, LEARN_EXPOSURES, most)
+    cases = [Case("sgbm", window, None, n, None, stages.sgbm_stage(surface, n)) for n in workers]
     for k in FEW_EXPOSURES:
         bits = surface.frames(k, workers[most])
         volume = count_surface(surface, bits, k, workers[most])
-        cases += [Case("joint", window, k, n, None, joint_stage(surface, volume, n, model)) for n in workers]
-    cases.append(Case("joint-sweep", window, k, most, None, joint_sweep_stage(surface, bits, k, most, model)))
+        cases += [Case("joint", window, k, n, None, stages.joint_stage(surface, volume, n, model)) for n in workers]
+    cases.append(Case("joint-sweep", window, k, most, None, stages.joint_sweep_stage(surface, bits, k, most, model)))
     return cases
 
 
@@ -309,8 +302,8 @@ def _in_turn(
     memory: list[float] = []
     measured: list[list[Measured]] = [[] for _ in cases]
     read_all(words)
-    for stage in {case.stage: case for case in cases}.values():  # compiled code is loaded before anything is timed
-        stage.measure(0.0)
+    for case in {case.stage: case for case in cases}.values():  # compiled code is loaded before anything is timed
+        case.measure(0.0)
     told = counted("measuring", "rows", progress)
     for done in range(extent.rounds):
         for i, case in enumerate(cases):

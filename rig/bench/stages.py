@@ -1,19 +1,8 @@
 """The stages that are measured: each works on frames for a moment and says how many it did in how long.
 
-count: frames of just the window into bit planes, column after column; turning planes into counts is part of an
-estimate and left out. numpy: what one writes first: unpackbits, sum, argmax. likelihood: `ColumnJudge`, the counter of
-`rig scan --estimator likelihood`, fed blocks as in a scan; taking its result at the end of a sweep and clearing it for
-the next is not timed, with sweep it is. disk: the same from SPB1 blocks in a file mapped into memory, which the system
-most likely holds in its page cache. full: whole frames of the sensor, of which only the window is searched.
-
-The stages that make a whole map at a time, for so many threads each.
-
-joint: the estimate alone, from counts that were made before, and by turns with it a map of sgbm on as many threads: of
-figures that were measured one after the other a machine with other work makes any quotient. joint-sweep: counting in
-blocks as in a scan, then the estimate. sgbm: OpenCV's StereoSGBM (MODE_HH4, which aggregates along four paths too) on a
-pair of pictures of the same surface, as many disparities as the window has pixels; OpenCV leaves out as many columns at
-the left edge. Nothing is learned meanwhile: `joint` goes by what it learned from the first sweep. Each begins with a
-map that is not timed.
+docs/results/speed.md says what each of them is. What is done once a sweep is not timed, but for `whole_sweeps`. Of
+figures that were measured one after the other a machine with other work makes any quotient: so `joint` and StereoSGBM
+make maps by turns. Nothing is learned meanwhile, and each begins with a map that is not timed.
 """
 
 import time
@@ -37,7 +26,7 @@ from rig.bench.frames import (
     count_columns,
     count_surface,
     sweep_frames,
-)
+)  # fmt: skip
 from rig.count.kernels import new_planes, rows_of_chunk
 from rig.count.sweeps import MOST_UNDER_WAY
 from rig.count.volume import CountVolume

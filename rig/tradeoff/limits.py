@@ -1,22 +1,11 @@
 """The statistical limit: the least error that any estimator can have on a scene, however well it knows the light.
 
 The ideal is told haze, ambient light, the line's width and how bright the stripe is, and asked only where it is. Where
-stripes are spread evenly over the search, no answer has a smaller mean |error| than the median of the posterior.
-`bayes_errors` draws counts and takes that median: the limit itself, no bound of it, within the noise of the draw, at 5
-ms a row for four numbers of exposures. Cramer-Rao's bound is too small wherever a rival may win.
-
-Neighbours on one surface say the same: M of them, of equal disparity and equally bright, count as M times the
-exposures. The gain of coupling neighbours is compared with that.
-
-`chernoff_exponent`, `least_exponent` and `position_sd_px` say how often at least, and by how much, a row's photons lead
-to the wrong position. B ~ Bernoulli(1 - exp(-flux)) per pixel and exposure, pixels independent, p and q = 1 - p of one
-position of the stripe, p' and q' of another:
-
-    C = max over t of -sum log(p^t p'^(1-t) + q^t q'^(1-t))     Chernoff, per exposure
-    P(k beats j) <= exp(-K C)                                   a bound at any K; as K grows, the true exponent
-    sd >= 1 / sqrt(K I), I = sum flux'^2 / (exp(flux) - 1)      Cramer-Rao, for answers without bias near the truth
-
-`SceneLimits` puts the limits beside the rows of a trade-off.
+stripes are spread evenly over the search, no answer has a smaller mean |error| than the median of the posterior, which
+`bayes_errors` takes of drawn counts, at 5 ms a row for four numbers of exposures. M neighbours on one surface count as
+M times the exposures. `chernoff_exponent` and `position_sd_px` say how often at least, and by how much, a row's photons
+lead to the wrong position; the formulas are in docs/explanation/limits.md. A pixel fires in an exposure with
+probability p = 1 - exp(-flux), all of them independently; q = 1 - p, and p', q' are those of another position.
 """
 
 import math
