@@ -303,15 +303,11 @@ _TITLES = {
     "count": "counting alone, frames of just the window",
     "likelihood": "counting + likelihood, frames of just the window",
     "likelihood-sweep": "the same with what is done once a sweep",
-    "count-full": "counting alone, whole frames",
     "likelihood-full": "counting + likelihood in a window of whole frames",
     "joint": "joint from counts, whole maps of 512 x 500; x sgbm: its time over that of sgbm, by turns",
     "joint-sweep": "counting + joint, one after the other",
     "sgbm": "OpenCV's StereoSGBM, MODE_HH4, as many disparities and pixels, two pictures",
     "disk": "counting + likelihood from a recording (page cache), header checksums",
-    "disk-crc": "the same, payload checksums too",
-    "parse": "reading SPB1 blocks in memory, header checksums",
-    "parse-crc": "the same, payload checksums too",
     "numpy": "numpy: unpackbits, sum, argmax",
 }
 

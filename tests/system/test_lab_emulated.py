@@ -52,7 +52,7 @@ def scan_slowly(tmp_path, monkeypatch):
 
 
 def test_a_scan_over_emulated_wires_ends_in_a_depth_map_through_fog(scan_slowly, worlds):
-    summary = scan_slowly("lab-emulated", frame_rate=Fraction(20_000), power=10e-3)
+    summary = scan_slowly("lab-emulated", columns=125, frame_rate=Fraction(20_000), power=10e-3)
     assert summary["verdict"] == "complete"
     frames = summary["frames"]
     assert frames["lost"] == 0
