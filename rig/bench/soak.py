@@ -282,8 +282,7 @@ def soak(
         warm_up("likelihood", "none", plan.exposures, dark=True)
         maker = _reconstructor(rig, plan, EstimateConfig(estimator="likelihood", threads=threads))
         asked = AcquisitionRequest(maps=maps, policy=policy, first_alone=True, learns=True, listeners=listeners)
-        report = _played(Acquisition(rig, plan, timing, maker, asked), plan, asked)
-    return replace(report, slow_consumer_ms=1e3 * slow_consumer_s, source_late_max_s=spad.late_max_s)
+        return _played(Acquisition(rig, plan, timing, maker, asked), spad, plan, asked, slow_consumer_s)
 
 
 @contextmanager
@@ -339,8 +338,10 @@ def _reconstructor(rig: OpenRig, plan: ScanPlan, estimate: EstimateConfig) -> Re
     return Reconstructor(rig.model, plan.commands, plan.depth_range_m, estimate, sensor=(plan.rows, plan.width))
 
 
-def _played(acquisition: Acquisition, plan: ScanPlan, asked: AcquisitionRequest) -> SoakReport:
-    """Run the acquisition to its end and report on it, but for what only the caller knows."""
+def _played(
+    acquisition: Acquisition, spad: LoopedSpad, plan: ScanPlan, asked: AcquisitionRequest, slow_consumer_s: float
+) -> SoakReport:
+    """Run the acquisition to its end and report on it."""
     resident: list[int] = []
     settled = expected = received = lost = worked_off = 0
     compute_s = 0.0
@@ -370,7 +371,7 @@ def _played(acquisition: Acquisition, plan: ScanPlan, asked: AcquisitionRequest)
         seconds=exposed / float(plan.frame_rate_hz),
         frame_width=plan.frame_width,
         on_overload=asked.policy.value,
-        slow_consumer_ms=0.0,
+        slow_consumer_ms=1e3 * slow_consumer_s,
         maps=len(resident),
         maps_planned=asked.maps,
         frames=SoakFrames(exposed, counters.delivered, gone, expected, received, lost, agree),
@@ -378,7 +379,7 @@ def _played(acquisition: Acquisition, plan: ScanPlan, asked: AcquisitionRequest)
         resident_settled_bytes=first,
         resident_end_bytes=last,
         resident_growth=None if first is None or last is None else last / first - 1,
-        source_late_max_s=0.0,
+        source_late_max_s=spad.late_max_s,
         ended_by=ended_by,
         stages=stages,
         machine=machine(),
