@@ -28,7 +28,6 @@ from drivers.spb1 import BlockLayout, block_views, walk_blocks
 from rig.bench.machine import machine
 from rig.config.files import load_config
 from rig.config.models import EstimateConfig
-from rig.depth.reconstruct import Reconstructor
 from rig.depth.warm_up import warm_up
 from rig.devices.open import OpenRig, open_rig
 from rig.devices.prepare import prepare
@@ -40,6 +39,7 @@ from rig.run_folder.summary import PipelineStats
 from rig.scan.acquisition import Acquisition, AcquisitionRequest
 from rig.scan.monitor import Listeners, MonitorView, ScanProgress
 from rig.scan.pipeline import Overload, require_policy
+from rig.scan.scan import make_reconstructor
 
 LEAD_FRAMES = 200
 """Most frames before the first scan marker: the end of a sweep, as of a scanner that runs already."""
@@ -280,7 +280,7 @@ def soak(
         plan, timing = prepare(rig)
         maps = max(2, 1 + math.ceil(seconds / float(plan.sweep_s)))  # the first one is taken alone
         warm_up("likelihood", "none", plan.exposures, dark=True)
-        maker = _reconstructor(rig, plan, EstimateConfig(estimator="likelihood", threads=threads))
+        maker = make_reconstructor(rig, plan, EstimateConfig(estimator="likelihood", threads=threads))
         asked = AcquisitionRequest(maps=maps, policy=policy, first_alone=True, learns=True, listeners=listeners)
         return _played(Acquisition(rig, plan, timing, maker, asked), spad, plan, asked, slow_consumer_s)
 
@@ -324,7 +324,7 @@ def _recorded(rig: OpenRig, plan: ScanPlan, timing: SpadTiming) -> Loop:
     whole = plan.frames_per_sweep.denominator
     sweeps = math.ceil(math.ceil(LOOP_S / float(plan.sweep_s)) / whole) * whole
     with tempfile.TemporaryDirectory(prefix="spadrig-bench-") as folder:
-        maker = _reconstructor(rig, plan, EstimateConfig(estimator="argmax", threads=1))
+        maker = make_reconstructor(rig, plan, EstimateConfig(estimator="argmax", threads=1))
         with closing(Recording(Path(folder))) as recording:
             request = AcquisitionRequest(maps=sweeps, recording=recording)
             for _ in Acquisition(rig, plan, timing, maker, request).run():
@@ -332,10 +332,6 @@ def _recorded(rig: OpenRig, plan: ScanPlan, timing: SpadTiming) -> Loop:
         files = (np.memmap(Path(folder) / name, np.uint8, "r") for name in recording.files)
         items = (item for file in files for item in walk_blocks(file, None, check_payload=False))
         return Loop.of((item for item in items if isinstance(item, FrameBlock)), sweeps)
-
-
-def _reconstructor(rig: OpenRig, plan: ScanPlan, estimate: EstimateConfig) -> Reconstructor:
-    return Reconstructor(rig.model, plan.commands, plan.depth_range_m, estimate, sensor=(plan.rows, plan.width))
 
 
 def _played(

@@ -18,13 +18,12 @@ from rig.config.models import RigConfig
 from rig.count.volume import Counter, FrameTally, SweepLayout, SweepTally
 from rig.depth.reconstruct import MapResult, Reconstructor
 from rig.depth.warm_up import warm_binding, warm_up
-from rig.devices.open import OpenRig, open_rig
+from rig.devices.open import open_rig
 from rig.devices.prepare import prepare
 from rig.errors import UsageError
 from rig.estimate.registry import LEARNING
 from rig.geometry.stripe_table import StripeTable
 from rig.geometry.windows import WORD_PX
-from rig.plan.scan_plan import ScanPlan
 from rig.scan.acquisition import Acquisition, AcquisitionRequest
 from rig.scan.monitor import Listeners
 from rig.scan.scan import make_reconstructor
@@ -169,7 +168,9 @@ def score_methods(
             for filter in filters:
                 warm_up(estimator, filter, plan.exposures, dark=True)
         warm_binding(plan)
-        maker = ManyMakers({name: _maker(rig, plan, name) for name in estimators}, filters)
+        estimate = rig.config.estimate
+        settings = {name: estimate.model_copy(update={"estimator": name}) for name in estimators}
+        maker = ManyMakers({name: make_reconstructor(rig, plan, each) for name, each in settings.items()}, filters)
         listeners = Listeners(live=lambda now: tell(now.frames / max(now.frames_planned, 1)))
         request = AcquisitionRequest(maps=MAPS, learns=not LEARNING.isdisjoint(estimators), listeners=listeners)
         running = Acquisition(rig, plan, timing, maker, request).run()
@@ -196,9 +197,3 @@ def require_plan(config: RigConfig) -> None:
             f"{plan.exposures} exposures make {kept / 1e9:.3g} GB of frames a sweep, at most "
             f"{MOST_KEPT_BYTES / 1e9:g} GB are kept for all estimators; leave out --exposures above {most}"
         )
-
-
-def _maker(rig: OpenRig, plan: ScanPlan, estimator: str) -> Reconstructor:
-    estimate = rig.config.estimate.model_copy(update={"estimator": estimator})
-    config = rig.config.model_copy(update={"estimate": estimate})
-    return make_reconstructor(replace(rig, config=config), plan)
