@@ -13,7 +13,7 @@ from drivers.clock import VirtualClock
 from drivers.errors import LimitExceeded
 from drivers.frames import Mark
 from drivers.interfaces import SpadRequest, SpadTiming
-from drivers.ring import BlockRing, OnFull
+from drivers.ring import BlockRing
 from rig import api
 from rig.bench import soak, speed, stages
 from rig.bench.frames import (
@@ -252,19 +252,6 @@ def test_frames_go_on_across_the_ends_of_the_loop_in_real_time(in_no_time):
     np.testing.assert_array_equal(found[0].volume.counts, found[SWEEPS].volume.counts)
     assert spad.late_max_s == pytest.approx(0, abs=1e-6)
     spad.close()
-
-
-def test_every_frame_that_finds_no_slot_is_counted(in_no_time):
-    _, spad = looped()
-    ring = BlockRing(3, 2**16, on_full=OnFull.DROP)
-    reader = ring.reader("counting")
-    spad.start(320)
-    while spad.fill(ring, 1.0):
-        pass
-    counters = spad.counters
-    assert (counters.exposed, counters.delivered, counters.lost) == (320, 48, 272)
-    assert ring.dropped_frames == 272
-    assert [reader.next().header.first_frame for _ in range(3)] == [0, 16, 32]
 
 
 def test_the_count_of_sweeps_goes_on_where_that_of_records_begins_again(in_no_time):

@@ -21,7 +21,6 @@ from drivers.interfaces.scanner import check_waveform
 from rig.errors import PlanError
 from rig.plan.calibration_reach import model_problems, require_speed
 from rig.plan.compile import compile_plan, spad_request
-from rig.plan.describe import plan_text
 from rig.plan.gate_pulses import sync_program
 from rig.plan.mirror_path import remedy
 from tests.stability.inventory import covers
@@ -218,11 +217,3 @@ def test_a_block_holds_five_milliseconds_of_frames_and_at_most_sixteen_mebibytes
     config = scan(frame_rate=rate)
     plan = compile_plan(config, scanner_limits(), timer_clock, None, tall)
     assert spad_request(config, plan).block_frames == frames
-
-
-def test_without_a_calibration_the_window_is_the_whole_row():
-    plan = compile_plan(scan(), scanner_limits(), timer_clock, None, dataclasses.replace(SPAD, width=100))
-    assert plan.window == 128
-    assert "window      all 100 pixels for" in plan_text(plan)
-    assert not plan.x0.any()
-    assert plan.legs[0].lag_s == 0
