@@ -22,7 +22,7 @@ from rig.errors import UsageError
 from rig.requests import options_of
 
 if TYPE_CHECKING:
-    from rig import api
+    from rig import api as api
     from rig.recording.segment import Space
     from rig.scan.run import RunResult
 else:
@@ -80,10 +80,11 @@ def command(function: Callable[P, int]) -> Callable[P, None]:
             code = fail(EXIT_ABORTED, [], ["aborted", *getattr(interrupt, "__notes__", [])], kwargs.get("as_json"))
         except Exception as error:
             refused = refused_file(error)
-            code = EXIT_USAGE if refused else _code_of(error)
-            if code is None:
+            found = EXIT_USAGE if refused else _code_of(error)
+            if found is None:
                 raise
-            fail(code, (refused or str(error)).splitlines(), getattr(error, "__notes__", []), kwargs.get("as_json"))
+            said, notes = (refused or str(error)).splitlines(), getattr(error, "__notes__", [])
+            code = fail(found, said, notes, kwargs.get("as_json"))
         raise typer.Exit(code)
 
     return wrapped
