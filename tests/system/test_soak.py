@@ -7,14 +7,14 @@ from rig.bench import soak as soaking
 from rig.errors import UsageError
 from rig.scan import pipeline as overload
 
-SLOW_S = 0.1
+SLOW_S = 0.4
 """Four times what the ring holds, so that it overflows on any machine."""
 
 
 @pytest.fixture(autouse=True)
 def _short_loop(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(soaking, "LOOP_S", 0.01)
-    monkeypatch.setattr(overload, "RING_BYTES", 32 << 20)
+    monkeypatch.setattr(overload, "RING_BYTES", 128 << 20)
 
 
 def test_drop_goes_on_and_accounts_for_every_frame() -> None:
