@@ -15,7 +15,7 @@ from typing import Any
 from numba.core.dispatcher import Dispatcher
 
 from rig import api
-from rig.estimate.registry import ESTIMATORS
+from rig.estimate.registry import ESTIMATORS, LEARNING
 from rig.estimate.search import online_learning as lessons
 from rig.scan.acquisition import Acquisition
 from tests.system.small_rig import config, write_rig
@@ -55,7 +55,8 @@ def main(folder: Path) -> None:
     lessons.TEACH_FRAMES = lessons.LAG_FRAMES = LESSON_FRAMES
     for estimator in ESTIMATORS:
         options = {"estimator": estimator, "filter": "median", "temporal_prior": estimator == "joint"}
-        _say_late("rig.", write_rig(folder / estimator), maps=MAPS, **options)
+        maps = MAPS if estimator in LEARNING else 1
+        _say_late("rig.", write_rig(folder / estimator), maps=maps, **options)
 
 
 def _say_late(of: str, file: Path, **options: Any) -> None:
