@@ -82,13 +82,9 @@ def _board_scene() -> str | None:
 class ReconstructRequest:
     """Depth maps of frames that exist (`rig reconstruct`)."""
 
-    estimator: str | None = option(
-        None, "argmax, edge, likelihood or joint", unset="as configured or recorded, else likelihood"
-    )
-    filter: str | None = option(None, "none or median (5 x 5)", unset="as configured or recorded, else none")
-    min_confidence: float | None = option(
-        None, "answers below this do not enter the depth map", unset="as configured or recorded, else 0.5"
-    )
+    estimator: str | None = option(None, "argmax, edge, likelihood or joint", unset="as configured, else likelihood")
+    filter: str | None = option(None, "none or median (5 x 5)", unset="as configured, else none")
+    min_confidence: float | None = option(None, "least confidence in the depth map", unset="as configured, else 0.5")
     accept_calibration: bool = _accept_calibration()
     out: str | os.PathLike[str] | None = _out()
 
@@ -112,9 +108,7 @@ class ScanRequest(RunRequest):
 
     scene: str | None = option(None, "a bundled scene, a scene file or a folder (simulated rigs)", unset="the config's")
     exposures: int | None = option(None, "frames per column (K)", unset="the config's")
-    temporal_prior: bool | None = option(
-        None, "joint: hold each map to the last one a little", unset="as the config says"
-    )
+    temporal_prior: bool | None = option(None, "joint: hold each map to the last one a little", unset="the config's")
     seed: int = option(0, "seed of everything simulated")
 
 
@@ -129,7 +123,7 @@ class ReplayRequest(RunRequest):
     config: Any = option(
         None,
         "a rig whose scanner, laser and sync source take part, like hil",
-        unset="they are recorded too",
+        unset="recorded ones",
         read_as=str | None,
     )
     threads: int | None = option(None, "threads that count and estimate", unset="as recorded")
@@ -147,9 +141,7 @@ class TradeoffRequest:
     fogs: Sequence[str] = option((), "visibilities, or clear: 20m,50m,clear", unset="the scene's", name="fog")
     exposures: Sequence[int] = option((), "frames per column (K)", unset="1,3,10")
     lines: Sequence[int] = option((), "lines at once", unset="the config's")
-    estimators: Sequence[str] = option(
-        (), "of argmax, edge, likelihood, joint, by commas", unset="edge,likelihood,joint"
-    )
+    estimators: Sequence[str] = option((), "of argmax, edge, likelihood, joint, by commas", unset="all but argmax")
     filters: Sequence[str] = option((), "of none, median (5 x 5), by commas", unset="none,median")
     repeat: int = option(1, "scans of each, for the confidence intervals")
     seed: int = option(0, "seed of the first of them")
@@ -178,18 +170,13 @@ class ImportRequest:
     """A reading of frames in another program's files (`rig import`)."""
 
     form: str | None = option(
-        None,
-        "pi-imaging: packed or sparse; swissspad2: half or full; photoncube: packed",
-        unset="as the file looks; half",
+        None, "pi-imaging: packed or sparse; swissspad2: half or full; photoncube: packed", unset="as it looks; half"
     )
     frame_rate: str | Fraction | None = option(
         None, 'such as "97.7 kHz"; hertz as a fraction', unset="not known", read_as=str | None
     )
     turn_deg: int | None = option(
-        None,
-        "turn frames counter-clockwise by 0, 90, 180 or 270 degrees",
-        unset="90 for pi-imaging, as its driver does, else 0",
-        name="rotate",
+        None, "turn frames counter-clockwise: 0, 90, 180 or 270", unset="90 for pi-imaging, else 0", name="rotate"
     )
     rows: int | None = option(None, "pi-imaging: 512, or 1024 of the 1M sensor", unset="512")
 
@@ -200,13 +187,9 @@ class ExportRequest:
     """Pictures and films of a run (`rig export`)."""
 
     view: str | None = option(
-        None,
-        "png, mp4: depth, intensity or frames (sums of recorded frames)",
-        unset="the first of them that there is",
+        None, "png, mp4: depth, intensity or frames (sums of recorded frames)", unset="the first that there is"
     )
-    frames_per_picture: int | None = option(
-        None, "frames summed for a picture of view frames", unset="100", name="frames"
-    )
+    frames_per_picture: int | None = option(None, "frames summed for a picture", unset="100", name="frames")
     pictures_per_s: float | None = option(None, "pictures of a film a second", unset="25", name="fps")
 
 
@@ -228,9 +211,7 @@ class PixelsRequest(CalibrationRequest):
     frames: int | None = option(None, "dark ones", unset="as many as the limit of hot pixels needs")
     lit: str | os.PathLike[str] | None = path_option("a recorded run whose lit frames tell dead pixels", "none")
     light: bool = option(False, "take lit frames now")
-    against: str | os.PathLike[str] | None = path_option(
-        "an older map, for the drift", "the one beside the rig's calibration"
-    )
+    against: str | os.PathLike[str] | None = path_option("an older map, for the drift", "that of the calibration")
 
 
 @described
@@ -258,9 +239,7 @@ class PlanesRequest(BoardRequest):
 
     guided: bool = option(False, "ask for the poses that help most, until it is enough or all poses were shown")
     calibration: str | os.PathLike[str] | None = path_option("one to start from; its defects are kept", "none")
-    camera: str | os.PathLike[str] | None = path_option(
-        "camera.yaml of `calibrate camera`, made of other views", "none"
-    )
+    camera: str | os.PathLike[str] | None = path_option("camera.yaml of `calibrate camera`, of other views", "none")
     stated_baseline: str | None = option(None, "camera to mirror as measured: '300 mm'", unset="not known")
     accuracy: str | None = _accuracy()
     at: str = _at()

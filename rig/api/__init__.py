@@ -7,19 +7,10 @@ result.last.depth_m, result.summary.truth
 
 from rig.api.calibrate import calibrate_camera, calibrate_check, calibrate_pixels, calibrate_planes, calibrate_sync
 from rig.api.recordings import compress, cut, export_run, import_frames, recording_info, repair, verify
-from rig.api.rig import (
-    bench,
-    check_config,
-    devices,
-    doctor,
-    effects,
-    flux_row,
-    laser_off,
-    soak,
-    warm_up,
-)
+from rig.api.rig import bench, check_config, devices, doctor, effects, flux_row, laser_off, warm_up
 from rig.api.scan import plan_scan, reconstruct, replay, scan
 from rig.api.tradeoff import tradeoff
+from rig.bench.soak import soak
 from rig.config.bundled import bundled_rigs, bundled_scenes
 from rig.config.overrides import MAX_SEED, SIMULATED, Config, PathLike, configure
 from rig.plan.describe import plan_text

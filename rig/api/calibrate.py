@@ -15,30 +15,30 @@ Views that were taken by then are in `out`.
 
 from collections.abc import Callable
 from dataclasses import replace
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
+from rig.calibrate.camera import run_camera
+from rig.calibrate.capture import AskPerson, TellLine
+from rig.calibrate.check import run_check
+from rig.calibrate.pixels import PixelResult, run_pixels
+from rig.calibrate.planes import run_planes
+from rig.calibrate.session import CalibrationResult
 from rig.calibrate.sources import SourcesLike
+from rig.calibrate.sync import run_sync
 from rig.config.overrides import SIMULATED, Config
 from rig.progress import Progress
 from rig.requests import CameraRequest, CheckRequest, PixelsRequest, PlanesRequest, SyncRequest
-
-if TYPE_CHECKING:
-    from rig.calibrate.capture import AskPerson, TellLine
-    from rig.calibrate.pixels import PixelResult
-    from rig.calibrate.session import CalibrationResult
 
 
 def calibrate_planes(
     sources: SourcesLike = (),
     request: PlanesRequest | None = None,
     *,
-    ask: "AskPerson | None" = None,
-    tell: "TellLine | None" = None,
+    ask: AskPerson | None = None,
+    tell: TellLine | None = None,
     **changes: Any,
-) -> "CalibrationResult":
+) -> CalibrationResult:
     """Calibrate camera, light planes and lag together from views of a board (`rig calibrate planes`)."""
-    from rig.calibrate.planes import run_planes
-
     return run_planes(sources, replace(request or PlanesRequest(), **changes), ask=ask, tell=tell)
 
 
@@ -46,13 +46,11 @@ def calibrate_camera(
     sources: SourcesLike = (),
     request: CameraRequest | None = None,
     *,
-    ask: "AskPerson | None" = None,
-    tell: "TellLine | None" = None,
+    ask: AskPerson | None = None,
+    tell: TellLine | None = None,
     **changes: Any,
-) -> "CalibrationResult":
+) -> CalibrationResult:
     """Calibrate the camera alone (`rig calibrate camera`); `sources` may be pictures, and folders of them, as well."""
-    from rig.calibrate.camera import run_camera
-
     return run_camera(sources, replace(request or CameraRequest(), **changes), ask=ask, tell=tell)
 
 
@@ -60,17 +58,15 @@ def calibrate_pixels(
     source: Config = SIMULATED,
     request: PixelsRequest | None = None,
     *,
-    covered: "Callable[[], None] | None" = None,
+    covered: Callable[[], None] | None = None,
     progress: Progress | None = None,
     **changes: Any,
-) -> "PixelResult":
+) -> PixelResult:
     """Map hot, dead and noisy pixels and the dark rate from dark frames (`rig calibrate pixels`).
 
     source: a rig, or the folder of a recorded run.
     covered: called where a person has to cover the lens; it returns once that is done.
     """
-    from rig.calibrate.pixels import run_pixels
-
     return run_pixels(source, replace(request or PixelsRequest(), **changes), covered=covered, progress=progress)
 
 
@@ -78,12 +74,10 @@ def calibrate_sync(
     sources: SourcesLike = (),
     request: SyncRequest | None = None,
     *,
-    tell: "TellLine | None" = None,
+    tell: TellLine | None = None,
     **changes: Any,
-) -> "CalibrationResult":
+) -> CalibrationResult:
     """Measure the mirror's lag each way and the rows' delay from one unmoved scene (`rig calibrate sync`)."""
-    from rig.calibrate.sync import run_sync
-
     return run_sync(sources, replace(request or SyncRequest(), **changes), tell=tell)
 
 
@@ -91,11 +85,9 @@ def calibrate_check(
     sources: SourcesLike = (),
     request: CheckRequest | None = None,
     *,
-    ask: "AskPerson | None" = None,
-    tell: "TellLine | None" = None,
+    ask: AskPerson | None = None,
+    tell: TellLine | None = None,
     **changes: Any,
-) -> "CalibrationResult":
+) -> CalibrationResult:
     """Judge a calibration by a flat board that it was not made with (`rig calibrate check`)."""
-    from rig.calibrate.check import run_check
-
     return run_check(sources, replace(request or CheckRequest(), **changes), ask=ask, tell=tell)

@@ -3,41 +3,33 @@
 from collections.abc import Sequence
 from dataclasses import replace
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 from rig.config.overrides import PathLike
+from rig.exchange import exporting, importing
 from rig.progress import Progress
+from rig.recording import compress as compressing
+from rig.recording import cut as cutting
+from rig.recording import open as opening
+from rig.recording import repair as mending
+from rig.recording import verify as verifying
 from rig.requests import CutRequest, ExportRequest, ImportRequest
 from rig.scan.run import OutFolder
 
-if TYPE_CHECKING:
-    from rig.exchange.exporting import ExportResult
-    from rig.exchange.importing import ImportResult
-    from rig.recording.compress import Compression
-    from rig.recording.open import RecordingInfo
-    from rig.recording.repair import Repair
-    from rig.recording.verify import Verification
 
-
-def verify(run: PathLike) -> "Verification":
+def verify(run: PathLike) -> verifying.Verification:
     """Read every byte of a recording and report whether it is what was recorded (`rig verify`)."""
-    from rig.recording.verify import verify as read_all
-
-    return read_all(Path(run))
+    return verifying.verify(Path(run))
 
 
-def repair(run: PathLike) -> "Repair":
+def repair(run: PathLike) -> mending.Repair:
     """Make a torn recording whole; no frame is changed and no byte thrown away (`rig repair`)."""
-    from rig.recording.repair import repair as mend
-
-    return mend(Path(run))
+    return mending.repair(Path(run))
 
 
-def recording_info(run: PathLike) -> "RecordingInfo":
+def recording_info(run: PathLike) -> opening.RecordingInfo:
     """Describe a recording from its index and manifest, without reading the frames (`rig info`)."""
-    from rig.recording.open import info
-
-    return info(Path(run))
+    return opening.info(Path(run))
 
 
 def cut(run: PathLike, out: PathLike, request: CutRequest | None = None, **changes: Any) -> dict[str, Any]:
@@ -45,17 +37,13 @@ def cut(run: PathLike, out: PathLike, request: CutRequest | None = None, **chang
 
     request, changes: the part, as a `CutRequest` or by the names of its fields: `cut("run", "part", maps="0:2")`.
     """
-    from rig.recording.cut import cut as cut_out
-
     asked = replace(request or CutRequest(), **changes)
-    return cut_out(Path(run), Path(out), maps=asked.maps, frames=asked.frames, time=asked.time, run=asked.start)
+    return cutting.cut(Path(run), Path(out), maps=asked.maps, frames=asked.frames, time=asked.time, run=asked.start)
 
 
-def compress(run: PathLike) -> "Compression":
+def compress(run: PathLike) -> compressing.Compression:
     """Compress a recording with zstd; it is read as any other (`rig compress`). Needs the extra `compress`."""
-    from rig.recording.compress import compress as pack
-
-    return pack(Path(run))
+    return compressing.compress(Path(run))
 
 
 def import_frames(
@@ -66,7 +54,7 @@ def import_frames(
     *,
     progress: Progress | None = None,
     **changes: Any,
-) -> "ImportResult":
+) -> importing.ImportResult:
     """Make a recording from the frames of another program (`rig import`).
 
     kind: pi-imaging, swissspad2 or photoncube.
@@ -75,9 +63,7 @@ def import_frames(
     progress: called with frames done and frames to do.
     Raises UsageError, one line per problem.
     """
-    from rig.exchange.importing import import_frames as take
-
-    return take(kind, files, out, replace(request or ImportRequest(), **changes), progress)
+    return importing.import_frames(kind, files, out, replace(request or ImportRequest(), **changes), progress)
 
 
 def export_run(
@@ -88,7 +74,7 @@ def export_run(
     out: OutFolder = None,
     progress: Progress | None = None,
     **changes: Any,
-) -> "ExportResult":
+) -> exporting.ExportResult:
     """Write a run for other programs (`rig export`): npy, hdf5, ply, png or mp4.
 
     request, changes: what pictures and films show, as an `ExportRequest` or by the names of its fields.
@@ -96,6 +82,4 @@ def export_run(
     progress: called with frames done and frames to do.
     Raises UsageError where the run has nothing of that kind.
     """
-    from rig.exchange.exporting import export_run as write
-
-    return write(run, kind, out, replace(request or ExportRequest(), **changes), progress)
+    return exporting.export_run(run, kind, out, replace(request or ExportRequest(), **changes), progress)

@@ -8,7 +8,6 @@ from rig.errors import UsageError
 from rig.progress import Progress
 
 if TYPE_CHECKING:
-    from rig.bench.soak import SoakReport
     from rig.bench.speed import SpeedReport
     from rig.config.models import RigConfig
     from rig.devices.doctor import Attached, Finding
@@ -90,29 +89,6 @@ def bench(*, threads: int | None = None, progress: Progress | None = None) -> "S
     if threads is not None and threads < 1:
         raise UsageError(f"threads is {threads}; it must be at least 1")
     return measure_speed(threads, progress=progress)
-
-
-def soak(
-    seconds: float = 60.0,
-    *,
-    threads: int | None = None,
-    window: bool = False,
-    slow_consumer_s: float = 0.0,
-    on_overload: str = "abort",
-    progress: Progress | None = None,
-) -> "SoakReport":
-    """Play a stream of 100 kHz in real time through the acquisition (`rig bench --soak`).
-
-    window: send windows that move with the line instead of whole frames.
-    slow_consumer_s: time added to every map, to see what an overload does.
-    on_overload: as in `scan`; a stream that is ended by it gives a report too.
-    progress: called with frames done and frames planned.
-    """
-    from rig.bench.soak import SoakOptions
-    from rig.bench.soak import soak as play
-    from rig.scan.pipeline import Overload
-
-    return play(SoakOptions(seconds, window, Overload.parse(on_overload), slow_consumer_s, threads), progress)
 
 
 def warm_up(config: Config = SIMULATED) -> float:

@@ -3,31 +3,36 @@
 from collections.abc import Callable, Sequence
 from dataclasses import replace
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 from calibration.errors import CalibrationError
 from calibration.files.rig_file import load_rig_model
 from calibration.model.rig_model import RigModel
+from drivers.replay.pace import Pace
 from rig.config.files import load_cube_plan
 from rig.config.models import CubePlan, EstimateConfig, RigConfig
 from rig.config.overrides import SIMULATED, Config, PathLike, configure, seed_problems
+from rig.devices.calibration_use import calibration_use, cube_calibration_use
+from rig.devices.open import open_rig, require_simulated_or_armed
+from rig.devices.prepare import prepare, require_memory
 from rig.errors import UsageError
 from rig.estimate.registry import ESTIMATORS, FILTERS
+from rig.plan.scan_plan import ScanPlan
 from rig.progress import Progress
+from rig.recording.cube import open_cube
 from rig.recording.inputs import holds_frames_alone
 from rig.recording.open import require_recording
+from rig.recording.replay import ReplayOptions, replay_config
+from rig.recording.segment import Space
 from rig.requests import ReconstructRequest, ReplayRequest, RunRequest, ScanRequest
 from rig.run_folder.folder import SavePolicy
 from rig.run_folder.summary import MapTally
+from rig.scan.monitor import Listeners, MonitorCallback, ScanProgress
+from rig.scan.pipeline import Overload, require_policy
+from rig.scan.reconstruct import reconstruct_cube
+from rig.scan.replay import play
 from rig.scan.run import Run, RunResult
-
-if TYPE_CHECKING:
-    from drivers.replay.pace import Pace
-    from rig.plan.scan_plan import ScanPlan
-    from rig.recording.segment import Space
-    from rig.scan.monitor import Listeners, MonitorCallback, ScanProgress
-
-_NO_FOLDER = "record writes the frames into the run's folder; name one with out"
+from rig.scan.scan import recorded_bytes, run_scan
 
 
 def scan(
@@ -35,9 +40,9 @@ def scan(
     request: ScanRequest | None = None,
     *,
     progress: Progress | None = None,
-    live: "Callable[[ScanProgress], None] | None" = None,
-    monitor: "MonitorCallback | None" = None,
-    on_space: "Callable[[Space], None] | None" = None,
+    live: Callable[[ScanProgress], None] | None = None,
+    monitor: MonitorCallback | None = None,
+    on_space: Callable[[Space], None] | None = None,
     **changes: Any,
 ) -> RunResult:
     """Scan with a rig and return its depth maps (`rig scan`).
@@ -52,9 +57,6 @@ def scan(
     Raises UsageError for a request that cannot be met, DeviceError or DevicesError where devices fail; maps that were
     whole by then are in `out`. An interrupt ends the scan after its last whole map, with verdict 'aborted'.
     """
-    from rig.devices.open import open_rig
-    from rig.scan.scan import run_scan
-
     request = replace(request or ScanRequest(), **changes)
     settings = _configured(config, request)
     listeners = _listeners(progress, live, monitor, on_space)
@@ -68,22 +70,15 @@ def plan_scan(
     config: Config = SIMULATED,
     request: ScanRequest | None = None,
     *,
-    on_space: "Callable[[Space], None] | None" = None,
+    on_space: Callable[[Space], None] | None = None,
     **changes: Any,
-) -> "ScanPlan":
+) -> ScanPlan:
     """Compile the plan of a scan and check it against the limits of its devices (`rig scan --dry-run`).
 
     Everything is as in `scan` and checked as there, the room on the disk too. Devices are opened, asked for their
     limits and closed again: nothing moves and no light leaves, so that `arm` is not needed. Raises DevicesError, one
     line per device, where real ones are not there.
     """
-    from rig.devices.calibration_use import calibration_use
-    from rig.devices.open import open_rig
-    from rig.devices.prepare import prepare, require_memory
-    from rig.recording.segment import Space
-    from rig.scan.pipeline import Overload, require_policy
-    from rig.scan.scan import recorded_bytes
-
     request = replace(request or ScanRequest(), **changes)
     settings = _configured(config, request)
     save = _checked(request)
@@ -108,10 +103,10 @@ def replay(
     *,
     calibration: PathLike | None = None,
     progress: Progress | None = None,
-    live: "Callable[[ScanProgress], None] | None" = None,
-    monitor: "MonitorCallback | None" = None,
-    on_space: "Callable[[Space], None] | None" = None,
-    steps: "Callable[[Pace], None] | None" = None,
+    live: Callable[[ScanProgress], None] | None = None,
+    monitor: MonitorCallback | None = None,
+    on_space: Callable[[Space], None] | None = None,
+    steps: Callable[[Pace], None] | None = None,
     **changes: Any,
 ) -> RunResult:
     """Play a recording through the live stack; the depth is the same, bit for bit, at any clock (`rig replay`).
@@ -126,9 +121,6 @@ def replay(
     Raises UsageError where there is no recording, and DivergedError where drivers sent something else than in the
     recording or sent it more than 2 ms from its time.
     """
-    from rig.recording.replay import ReplayOptions, replay_config
-    from rig.scan.replay import play
-
     request = replace(request or ReplayRequest(), **changes)
     played = ReplayOptions(request.clock, request.loop, request.block_frames)
     others = None if request.config is None else configure(request.config)
@@ -152,13 +144,11 @@ def _chosen(request: object, *names: str) -> dict[str, Any]:
 
 def _listeners(
     progress: Progress | None,
-    live: "Callable[[ScanProgress], None] | None",
-    monitor: "MonitorCallback | None",
-    on_space: "Callable[[Space], None] | None",
-) -> "Listeners":
-    from rig.scan.monitor import Listeners
-
-    def tell(now: "ScanProgress") -> None:
+    live: Callable[[ScanProgress], None] | None,
+    monitor: MonitorCallback | None,
+    on_space: Callable[[Space], None] | None,
+) -> Listeners:
+    def tell(now: ScanProgress) -> None:
         if progress is not None:
             progress(now.frames, now.frames_planned)
         if live is not None:
@@ -169,8 +159,6 @@ def _listeners(
 
 def _new_run(settings: RigConfig, request: RunRequest) -> Run:
     """Claim the run's folder. Raises UsageError with all that is wrong with the request."""
-    from rig.devices.open import require_simulated_or_armed
-
     save = _checked(request, require_simulated_or_armed(settings, request.arm))
     scan, estimate = settings.scan, settings.estimate
     tally = MapTally(scan.columns, scan.exposures, estimate.estimator, estimate.filter)
@@ -179,11 +167,9 @@ def _new_run(settings: RigConfig, request: RunRequest) -> Run:
 
 def _checked(request: RunRequest, others: Sequence[str] = ()) -> SavePolicy:
     """The policy for maps to write. Raises UsageError with `others` and all that is wrong with the request."""
-    from rig.scan.pipeline import Overload
-
     problems = list(others)
     if request.record and request.out is None:
-        problems.append(_NO_FOLDER)
+        problems.append("record writes the frames into the run's folder; name one with out")
     if request.maps is not None and request.maps < 1:
         problems.append(f"maps is {request.maps}; it must be at least 1")
     if isinstance(request, ScanRequest):
@@ -234,10 +220,6 @@ def reconstruct(
             raise UsageError("the calibration for a recording is a file; calibration.save_rig_model writes one")
         asked = _chosen(request, "estimator", "filter", "min_confidence", "accept_calibration", "out")
         return replay(source, clock="max", calibration=calibration, progress=progress, **asked)
-    from rig.devices.calibration_use import cube_calibration_use
-    from rig.recording.cube import open_cube
-    from rig.scan.reconstruct import reconstruct_cube
-
     if plan is None or calibration is None:
         if not source.exists():
             said = "does not exist; name the folder of a run taken with --record, or an .npy of frames"
@@ -246,17 +228,13 @@ def reconstruct(
         raise UsageError(f"{source} holds frames alone; add {' and '.join(missing)}, which say how they were taken")
     estimate = _estimate(request)
     cube_plan = plan if isinstance(plan, CubePlan) else load_cube_plan(Path(plan))
-    model = calibration if isinstance(calibration, RigModel) else _load_calibration(calibration)
     file = None if isinstance(calibration, RigModel) else Path(calibration)
-    use = cube_calibration_use(model, file, accept=request.accept_calibration)
-    return reconstruct_cube(open_cube(source, cube_plan, model), use, estimate, request.out, progress)
-
-
-def _load_calibration(path: PathLike) -> RigModel:
     try:
-        return load_rig_model(path)
+        model = calibration if isinstance(calibration, RigModel) else load_rig_model(calibration)
     except CalibrationError as error:
         raise UsageError(str(error)) from error
+    use = cube_calibration_use(model, file, accept=request.accept_calibration)
+    return reconstruct_cube(open_cube(source, cube_plan, model), use, estimate, request.out, progress)
 
 
 def _estimate(request: ReconstructRequest) -> EstimateConfig:

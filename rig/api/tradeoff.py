@@ -1,16 +1,20 @@
 """The call that tries settings on a simulated rig: `tradeoff`."""
 
 from dataclasses import replace
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 from rig.config.models import RigConfig
-from rig.config.overrides import MAX_SEED, SIMULATED, Config, configure
+from rig.config.overrides import MAX_SEED, SIMULATED, Config, configure, with_lines
+from rig.devices.calibration_use import accepted_by, calibration_use
+from rig.devices.open import open_rig
 from rig.errors import UsageError
+from rig.estimate.registry import ESTIMATORS, FILTERS
 from rig.progress import Progress
 from rig.requests import TradeoffRequest
-
-if TYPE_CHECKING:
-    from rig.tradeoff.trials import Tradeoff
+from rig.run_folder.folder import RunFolder
+from rig.tradeoff.choice import wish_of
+from rig.tradeoff.files import write_files
+from rig.tradeoff.trials import Tradeoff, Trial, Trials, require_methods, run_tradeoff
 
 EXPOSURES = (1, 3, 10)
 """Exposures per column that are tried where the caller names none."""
@@ -22,7 +26,7 @@ def tradeoff(
     *,
     progress: Progress | None = None,
     **changes: Any,
-) -> "Tradeoff":
+) -> Tradeoff:
     """Scan a simulated rig with all combinations of settings and score them by the world's truth (`rig tradeoff`).
 
     request, changes: what is asked for, as a `TradeoffRequest` or by the names of its fields:
@@ -32,15 +36,6 @@ def tradeoff(
 
     Raises UsageError, one line per problem. An interrupt ends it after the last whole row, with verdict 'aborted'.
     """
-    from rig.config.overrides import with_lines
-    from rig.devices.calibration_use import accepted_by, calibration_use
-    from rig.devices.open import open_rig
-    from rig.estimate.registry import ESTIMATORS, FILTERS
-    from rig.run_folder.folder import RunFolder
-    from rig.tradeoff.choice import wish_of
-    from rig.tradeoff.files import write_files
-    from rig.tradeoff.trials import Trial, Trials, require_methods, run_tradeoff
-
     request = replace(request or TradeoffRequest(), **changes)
     loaded = configure(config)
     problems = _of_rig(loaded)
@@ -78,7 +73,7 @@ def tradeoff(
     with open_rig(config_of(trials.first())) as rig:
         accepted = accepted_by(calibration_use(rig, accept=request.accept_calibration))
 
-    def run() -> "Tradeoff":
+    def run() -> Tradeoff:
         return replace(run_tradeoff(trials, wish, progress), accepted_calibration=accepted)
 
     if request.out is None:

@@ -243,14 +243,13 @@ def bench_surface(rows: int = ROWS, columns: int = COLUMNS) -> BenchSurface:
 def count_surface(surface: BenchSurface, bits: NDArray[np.uint8], exposures: int, workers: RowWorkers) -> CountVolume:
     """The counts of all frames."""
     counter = SweepCounter(surface.layout(exposures), workers)
-    bins, column, x0 = sweep_frames(surface, exposures)
-    counter.add(bits, bins, column, x0)
+    counter.add(bits, *sweep_frames(surface.geometry, exposures))
     return counter.finish()
 
 
 def sweep_frames(
-    surface: BenchSurface, exposures: int
+    geometry: SweepGeometry, exposures: int
 ) -> tuple[NDArray[np.int32], NDArray[np.float64], NDArray[np.int32]]:
-    """Bins and fractional columns of the sweep's frames, and where the window of each begins."""
-    bins = np.repeat(np.arange(len(surface.place_px), dtype=np.int32), exposures)
-    return bins, bins.astype(np.float64), np.full(len(bins), surface.geometry.x0[0], np.int32)
+    """Bins and fractional columns of a sweep's frames, and where the window of each begins."""
+    bins = np.repeat(np.arange(len(geometry.x0), dtype=np.int32), exposures)
+    return bins, bins.astype(np.float64), np.repeat(geometry.x0, exposures)

@@ -5,8 +5,6 @@ A source thread copies blocks of 5 ms into the ring and publishes each when its 
 takes the result and clears the counter for the next, as a scan does. A frame's time is its block's minus the frames
 behind it: the wait for the block to fill is included, and so is that of a block's last column for the next block, whose
 first frame says that the column is complete. Binding frames to columns and making the map are not included.
-
-The bench's frames as an SPB1 recording, in blocks as large as a scan's.
 """
 
 import threading
@@ -20,7 +18,7 @@ from numpy.typing import NDArray
 from drivers.frames import FRAME_RECORD, BlockFlag, BlockHeader, FrameBlock
 from drivers.ring import BlockRing
 from drivers.spb1 import BlockLayout, block_views, seal_block
-from rig.bench.frames import BLOCK_FRAMES, COLUMNS, ROWS, WIDTH, BenchFrames
+from rig.bench.frames import BLOCK_FRAMES, COLUMNS, ROWS, WIDTH, BenchFrames, sweep_frames
 from rig.estimate.likelihood import Likelihood
 from rig.estimate.search.stream import ColumnJudge
 from rig.threads import RowWorkers
@@ -31,7 +29,10 @@ PERIOD_TICKS = 1000
 
 
 def recording_of(frames: BenchFrames) -> tuple[NDArray[np.uint8], int]:
-    """The recording, uint8 (all bytes,) with payload checksums, and the bytes from block to block."""
+    """The frames as an SPB1 recording in blocks as large as a scan's; the bytes from block to block.
+
+    The recording is uint8 (all bytes,), with payload checksums.
+    """
     width = frames.bits.shape[2] * 8
     layout = BlockLayout(BLOCK_FRAMES, width, ROWS)
     blocks = len(frames.bits) // BLOCK_FRAMES
@@ -98,20 +99,18 @@ def measure_latency(
 
     source = threading.Thread(target=_play, args=(frames, ring, published, late), name="bench source", daemon=True)
     judge = likelihood.judge(frames.geometry, exposures, dark=True)
-    layout = frames.layout(exposures)
     sweep_blocks = COLUMNS * exposures // BLOCK_FRAMES
-    bins = np.repeat(np.arange(COLUMNS, dtype=np.int32), exposures)
-    column = bins.astype(np.float64)
-    x0 = np.full(BLOCK_FRAMES, frames.geometry.x0[0], np.int32)
+    bins, column, x0 = sweep_frames(frames.geometry, exposures)
     judged = np.zeros(n_blocks)
     """Time at which all columns but the last one of each block were judged."""
     ended = np.zeros(n_blocks)
     """Time at which a block's last column was judged."""
-    counter = ColumnJudge(layout, frames.geometry, judge, workers)
+    counter = ColumnJudge(frames.layout(exposures), frames.geometry, judge, workers)
     source.start()
     for i, block in enumerate(reader):
         at = i % sweep_blocks * BLOCK_FRAMES
-        counter.add(block.bits, bins[at : at + BLOCK_FRAMES], column[at : at + BLOCK_FRAMES], x0)
+        now = slice(at, at + BLOCK_FRAMES)
+        counter.add(block.bits, bins[now], column[now], x0[now])
         counter.settle()
         judged[i] = time.perf_counter()
         if at:

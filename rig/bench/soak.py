@@ -2,9 +2,6 @@
 
 The bundled simulated rig records a few sweeps, once. A SPAD that cannot wait plays them in real time, with running
 frame numbers; all else is as in a scan: ring, binding, counting, estimation, maps, a monitor, and the overload policy.
-
-A SPAD that cannot wait: frames that were recorded once come from memory over and over, in real time.
-
 Copying a block into its ring slot stands for the transfer that a device does by itself.
 """
 
@@ -13,9 +10,9 @@ import math
 import os
 import tempfile
 import time
-from collections.abc import Callable, Iterable, Iterator
+from collections.abc import Iterable, Iterator
 from contextlib import closing, contextmanager
-from dataclasses import asdict, dataclass, replace
+from dataclasses import dataclass, replace
 from fractions import Fraction
 from pathlib import Path
 from typing import Any, Self
@@ -31,19 +28,18 @@ from drivers.spb1 import BlockLayout, block_views, walk_blocks
 from rig.bench.machine import machine
 from rig.config.files import load_config
 from rig.config.models import EstimateConfig
-from rig.count.volume import Counter, FrameTally, SweepLayout
-from rig.depth.reconstruct import MapResult, Reconstructor
 from rig.depth.warm_up import warm_up
 from rig.devices.open import OpenRig, open_rig
 from rig.devices.prepare import prepare
 from rig.errors import UsageError
 from rig.plan.scan_plan import ScanPlan
+from rig.progress import Progress
 from rig.recording.writer import Recording
 from rig.run_folder.summary import PipelineStats
 from rig.scan.acquisition import Acquisition, AcquisitionRequest
-from rig.scan.counting import MakesMaps
 from rig.scan.monitor import Listeners, MonitorView, ScanProgress
 from rig.scan.pipeline import Overload, require_policy
+from rig.scan.scan import make_reconstructor
 
 LEAD_FRAMES = 200
 """Most frames before the first scan marker: the end of a sweep, as of a scanner that runs already."""
@@ -248,50 +244,45 @@ class SoakReport:
             return EXIT_DEVICE
         return int(self.frames.lost > 0 or not self.frames.agree)
 
-    def as_json(self) -> dict[str, Any]:
-        """For programs."""
-        return asdict(self)
 
+def soak(
+    seconds: float = 60.0,
+    *,
+    threads: int | None = None,
+    window: bool = False,
+    slow_consumer_s: float = 0.0,
+    on_overload: str = "abort",
+    progress: Progress | None = None,
+) -> SoakReport:
+    """Play a stream of 100 kHz in real time through the acquisition (`rig bench --soak`).
 
-@dataclass(frozen=True, slots=True)
-class SoakOptions:
-    """seconds: of stream. window: moving windows instead of whole frames. slow_s: added to each map."""
+    window: send windows that move with the line instead of whole frames.
+    slow_consumer_s: time added to every map, to see what an overload does.
+    on_overload: as in `rig.api.scan`; a stream that is ended by it gives a report too.
+    progress: called with frames done and frames planned.
 
-    seconds: float = 60.0
-    window: bool = False
-    policy: Overload = Overload.ABORT
-    slow_s: float = 0.0
-    threads: int | None = None
-
-
-class _SlowMaker:
-    """Makes the maps, as slowly as asked."""
-
-    def __init__(self, maker: MakesMaps, slow_s: float) -> None:
-        self._maker = maker
-        self._slow_s = slow_s
-
-    def counter(self, layout: SweepLayout) -> Counter:
-        """The maker's own."""
-        return self._maker.counter(layout)
-
-    def map(self, sweep: FrameTally) -> MapResult:
-        """The maker's map, later."""
-        result = self._maker.map(sweep)
-        if self._slow_s:
-            time.sleep(self._slow_s)
-        return result
-
-
-def soak(options: SoakOptions, progress: Callable[[int, int], None] | None = None) -> SoakReport:
-    """Play a stream through the acquisition. progress: told frames done and planned.
-
-    Raises UsageError for what cannot be asked for. A stream that ends by its policy is a report, not an error.
+    Raises UsageError for what cannot be asked for.
     """
-    if not (options.seconds > 0 and options.slow_s >= 0):
-        raise UsageError(f"a soak of {options.seconds:g} s, slowed by {options.slow_s:g} s; ask for more than 0 s")
-    with _looped_rig(options) as (rig, spad), _quiet_sweeps():
-        return _run(rig, spad, options, progress)
+    policy = Overload.parse(on_overload)
+    if not (seconds > 0 and slow_consumer_s >= 0):
+        raise UsageError(f"a soak of {seconds:g} s, slowed by {slow_consumer_s:g} s; ask for more than 0 s")
+
+    def tell(done: ScanProgress) -> None:
+        if progress is not None:
+            progress(done.frames, done.frames_planned)
+
+    listeners = Listeners(
+        live=tell,
+        monitor=MonitorView.row_profile,  # what a viewer would show
+        sweeps=(lambda _: time.sleep(slow_consumer_s)) if slow_consumer_s else None,
+    )
+    with _looped_rig(policy, window) as (rig, spad), _quiet_sweeps():
+        plan, timing = prepare(rig)
+        maps = max(2, 1 + math.ceil(seconds / float(plan.sweep_s)))  # the first one is taken alone
+        warm_up("likelihood", "none", plan.exposures, dark=True)
+        maker = make_reconstructor(rig, plan, EstimateConfig(estimator="likelihood", threads=threads))
+        asked = AcquisitionRequest(maps=maps, policy=policy, first_alone=True, learns=True, listeners=listeners)
+        return _played(Acquisition(rig, plan, timing, maker, asked), spad, plan, asked, slow_consumer_s)
 
 
 @contextmanager
@@ -307,15 +298,15 @@ def _quiet_sweeps() -> Iterator[None]:
 
 
 @contextmanager
-def _looped_rig(options: SoakOptions) -> Iterator[tuple[OpenRig, LoopedSpad]]:
+def _looped_rig(policy: Overload, window: bool) -> Iterator[tuple[OpenRig, LoopedSpad]]:
     """The simulated rig, and in its SPAD's place one that plays what that recorded."""
     # Clocks that agree to the last bit: the loop then closes without a jump.
     settings: dict[str, object] = {"scanner.clock_error": "0 ppm", "scan.depth_range": DEPTH_RANGE}
-    if options.window:
+    if window:
         settings["spad.link"] = f"{_window_bytes_per_s(settings) / 1e6:.6f} MB/s"
     with open_rig(load_config(CONFIG, settings)) as rig:
         info = replace(rig.spad.info, model="looped", can_wait=False)
-        require_policy(options.policy, info)
+        require_policy(policy, info)
         plan, timing = prepare(rig)
         with LoopedSpad(_recorded(rig, plan, timing), info, timing) as spad:
             yield replace(rig, spad=spad), spad
@@ -333,7 +324,7 @@ def _recorded(rig: OpenRig, plan: ScanPlan, timing: SpadTiming) -> Loop:
     whole = plan.frames_per_sweep.denominator
     sweeps = math.ceil(math.ceil(LOOP_S / float(plan.sweep_s)) / whole) * whole
     with tempfile.TemporaryDirectory(prefix="spadrig-bench-") as folder:
-        maker = _reconstructor(rig, plan, EstimateConfig(estimator="argmax", threads=1))
+        maker = make_reconstructor(rig, plan, EstimateConfig(estimator="argmax", threads=1))
         with closing(Recording(Path(folder))) as recording:
             request = AcquisitionRequest(maps=sweeps, recording=recording)
             for _ in Acquisition(rig, plan, timing, maker, request).run():
@@ -343,53 +334,43 @@ def _recorded(rig: OpenRig, plan: ScanPlan, timing: SpadTiming) -> Loop:
         return Loop.of((item for item in items if isinstance(item, FrameBlock)), sweeps)
 
 
-def _reconstructor(rig: OpenRig, plan: ScanPlan, estimate: EstimateConfig) -> Reconstructor:
-    return Reconstructor(rig.model, plan.commands, plan.depth_range_m, estimate, sensor=(plan.rows, plan.width))
-
-
-def _run(
-    rig: OpenRig, spad: LoopedSpad, options: SoakOptions, progress: Callable[[int, int], None] | None
+def _played(
+    acquisition: Acquisition, spad: LoopedSpad, plan: ScanPlan, asked: AcquisitionRequest, slow_consumer_s: float
 ) -> SoakReport:
-    plan, timing = prepare(rig)
-    maps = max(2, 1 + math.ceil(options.seconds / float(plan.sweep_s)))  # the first one is taken alone
-    warm_up("likelihood", "none", plan.exposures, dark=True)
+    """Run the acquisition to its end and report on it."""
     resident: list[int] = []
-    settled = 0
-
-    def tell(done: ScanProgress) -> None:
-        if progress is not None:
-            progress(done.frames, done.frames_planned)
-
-    estimate = EstimateConfig(estimator="likelihood", threads=options.threads)
-    maker = _SlowMaker(_reconstructor(rig, plan, estimate), options.slow_s)
-    listeners = Listeners(live=tell, monitor=_look)
-    request = AcquisitionRequest(maps=maps, policy=options.policy, first_alone=True, learns=True, listeners=listeners)
-    acquisition = Acquisition(rig, plan, timing, maker, request)
-    expected = received = lost = made = worked_off = 0
+    settled = expected = received = lost = worked_off = 0
     compute_s = 0.0
     ended_by: str | None = None
     try:
         for found in acquisition.run():
-            made += 1
             frames = found.sweep.frames
             expected, received, lost = expected + frames.expected, received + frames.received, lost + frames.lost
-            if made > 1:  # the first map is learned from, which is done once
+            if resident:  # the first map is learned from, which is done once
                 worked_off, compute_s = worked_off + frames.received, compute_s + found.compute_s
             resident.append(_resident_bytes())
-            if made <= max(1, SETTLED * maps):
-                settled = made - 1
+            if len(resident) <= max(1, SETTLED * asked.maps):
+                settled = len(resident) - 1
     except RingOverflow as error:
         ended_by = str(error)
     counters, stages = acquisition.counters, acquisition.stages
+    exposed, gone = counters.exposed or 0, counters.lost or 0
+    agree = (
+        exposed == counters.delivered + gone
+        and expected == received + lost
+        and gone == stages.dropped_frames
+        and lost <= gone
+        and received <= counters.delivered
+    )
     first, last = (resident[settled], resident[-1]) if resident and resident[-1] else (None, None)
     return SoakReport(
-        seconds=(counters.exposed or 0) / float(plan.frame_rate_hz),
+        seconds=exposed / float(plan.frame_rate_hz),
         frame_width=plan.frame_width,
-        on_overload=options.policy.value,
-        slow_consumer_ms=1e3 * options.slow_s,
-        maps=made,
-        maps_planned=maps,
-        frames=_account(counters, stages, expected, received, lost),
+        on_overload=asked.policy.value,
+        slow_consumer_ms=1e3 * slow_consumer_s,
+        maps=len(resident),
+        maps_planned=asked.maps,
+        frames=SoakFrames(exposed, counters.delivered, gone, expected, received, lost, agree),
         times_real_time=worked_off / float(plan.frame_rate_hz) / compute_s if compute_s else None,
         resident_settled_bytes=first,
         resident_end_bytes=last,
@@ -399,23 +380,6 @@ def _run(
         stages=stages,
         machine=machine(),
     )
-
-
-def _account(counters: SpadCounters, stages: PipelineStats, expected: int, received: int, lost: int) -> SoakFrames:
-    exposed, gone = counters.exposed or 0, counters.lost or 0
-    agree = (
-        exposed == counters.delivered + gone
-        and expected == received + lost
-        and gone == stages.dropped_frames
-        and lost <= gone
-        and received <= counters.delivered
-    )
-    return SoakFrames(exposed, counters.delivered, gone, expected, received, lost, agree)
-
-
-def _look(view: MonitorView) -> None:
-    """A monitor as of a viewer: it makes the row profile that one would show."""
-    view.row_profile()
 
 
 def _resident_bytes() -> int:

@@ -7,8 +7,9 @@ begins behind the frames of the one before it, so that frames come from memory.
 import os
 import tempfile
 import time
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from contextlib import ExitStack
-from dataclasses import asdict, dataclass, replace
+from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import Any
 
@@ -16,11 +17,25 @@ import numpy as np
 from numpy.typing import NDArray
 
 from calibration.errors import digits
-from rig.bench.cases import LEARN_EXPOSURES, WINDOWS, Case, Extent, learn, map_cases, stream_cases, usual_window
-from rig.bench.frames import COLUMNS, PLACE_FRAMES, BenchFrames, read_all, window_frames
-from rig.bench.latency import Latency, measure_latency
+from rig.bench import stages
+from rig.bench.frames import (
+    COLUMNS,
+    FRAMES_BYTES,
+    PLACE_FRAMES,
+    ROWS,
+    BenchFrames,
+    bench_surface,
+    count_surface,
+    full_frames,
+    read_all,
+    sweep_frames,
+    window_frames,
+)  # fmt: skip
+from rig.bench.latency import SECONDS, Latency, measure_latency, recording_of
 from rig.bench.machine import machine
-from rig.bench.stages import Measured, StripeError, Walk, count_stage
+from rig.bench.stages import Measured, Stage, Walk, search_stage
+from rig.count.volume import SweepCounter
+from rig.estimate.likelihood import Likelihood
 from rig.progress import Progress, counted, tell_stage
 from rig.threads import RowWorkers
 
@@ -28,6 +43,59 @@ REAL_TIME_HZ = 100_000
 """Frames a second of the sensor."""
 READ_EVERY = 12
 """Rows from one reading of the memory to the next."""
+
+WINDOWS = (64, 128, 256, 512)
+EXPOSURES = (1, 5, 10, 20, 50)
+COUNT_EXPOSURES = (1, 3, 5, 10, 15, 20, 50)
+"""Counting is claimed for 3 to 15 and beyond."""
+WINDOW = 128
+"""Window of the rows that are not measured at every one."""
+FEW_EXPOSURES = (1, 10)
+LEARN_EXPOSURES = 10
+"""Exposures of the sweep that is learned from, once a window: the light does not depend on them."""
+READ_BYTES = 256 * 2**20
+"""Memory that is read for its bandwidth: far more than any cache holds."""
+
+Workers = Mapping[int, RowWorkers]
+"""Workers by their number of threads."""
+
+
+@dataclass(frozen=True, slots=True)
+class Extent:
+    """Amount of work that is measured.
+
+    moment_s, count_moment_s: of each row in each of the `rounds`, those of `count` being fast. latency_s: of the stream
+    for the latency. frames_bytes, read_bytes: memory of the frames of each window, and for the plain read. map_rows,
+    map_columns: of the maps that are made as a whole.
+    """
+
+    windows: tuple[int, ...] = WINDOWS
+    exposures: tuple[int, ...] = EXPOSURES
+    rounds: int = 3
+    moment_s: float = 0.05
+    count_moment_s: float = 0.015
+    latency_s: float = SECONDS
+    frames_bytes: int = FRAMES_BYTES
+    read_bytes: int = READ_BYTES
+    map_rows: int = ROWS
+    map_columns: int = COLUMNS
+
+    @property
+    def usual_window(self) -> int:
+        """Window of the rows that are not measured at every one."""
+        return WINDOW if WINDOW in self.windows else self.windows[0]
+
+
+@dataclass(frozen=True, slots=True)
+class Case:
+    """A row to be measured. frame_bytes: read from memory per frame; None where that means nothing."""
+
+    stage: str
+    window: int
+    exposures: int | None
+    threads: int
+    frame_bytes: int | None
+    measure: Stage
 
 
 @dataclass(frozen=True, slots=True)
@@ -124,11 +192,13 @@ def measure_speed(
         frames = {window: window_frames(window, workers[most], extent.frames_bytes) for window in extent.windows}
         tell_stage("learning")
         learned = {window: learn(these, most) for window, these in frames.items()}
-        cases = stream_cases(frames, learned, workers, extent, folder) + map_cases(workers, extent)
+        cases = [case for w, these in frames.items() for case in _window_cases(these, learned[w], workers, extent)]
+        usual, likelihood = frames[extent.usual_window], learned[extent.usual_window]
+        cases += _usual_cases(usual, likelihood, workers, extent, folder)
+        cases += _map_cases(workers, extent)
         memory, measured = _in_turn(cases, frames[extent.windows[-1]], extent, progress)
-        window = usual_window(extent)
         tell_stage("measuring the latency")
-        latency = measure_latency(frames[window], LEARN_EXPOSURES, workers[most], learned[window], extent.latency_s)
+        latency = measure_latency(usual, LEARN_EXPOSURES, workers[most], likelihood, extent.latency_s)
     read = float(np.median(memory))
     return SpeedReport(found, read / 1e9, _rows(cases, measured, read), latency, time.perf_counter() - begun)
 
@@ -137,34 +207,112 @@ def warm_bench() -> None:
     """Compile what the bench alone needs."""
     with RowWorkers(1) as workers:
         frames = window_frames(WINDOWS[0], workers, 1)
-        count_stage(frames, Walk(1), PLACE_FRAMES, workers)(0.0)
+        stages.count_stage(frames, Walk(frames), PLACE_FRAMES, workers)(0.0)
     read_all(frames.bits.reshape(-1).view(np.uint64))
+
+
+def learn(frames: BenchFrames, threads: int) -> Likelihood:
+    """An estimator that has learned from a first sweep of these frames, as it would in a scan."""
+    likelihood = Likelihood(threads)
+    # Each column has its own stripe, as in a scan: one that stayed would look like hot pixels.
+    places, column = len(frames.bits) // PLACE_FRAMES, np.arange(COLUMNS)
+    first = column % places * PLACE_FRAMES + column // places * LEARN_EXPOSURES % PLACE_FRAMES
+    bits = frames.bits[(first[:, None] + np.arange(LEARN_EXPOSURES)).ravel()]
+    with RowWorkers(threads) as workers:
+        counter = SweepCounter(frames.layout(LEARN_EXPOSURES), workers)
+        counter.add(bits, *sweep_frames(frames.geometry, LEARN_EXPOSURES))
+    likelihood.estimate(counter.finish(), frames.geometry)
+    return likelihood
+
+
+def _cases(
+    stage: str,
+    frames: BenchFrames,
+    exposures: Iterable[int],
+    workers: Workers,
+    make: Callable[[int, RowWorkers], Stage],
+) -> list[Case]:
+    """A stage at these numbers of exposures and of threads."""
+    return [
+        Case(stage, frames.window, k, n, frames.frame_bytes, make(k, own))
+        for k in exposures
+        for n, own in workers.items()
+    ]
+
+
+def _window_cases(frames: BenchFrames, learned: Likelihood, workers: Workers, extent: Extent) -> list[Case]:
+    """The rows of every window."""
+    walk, one = Walk(frames), {1: workers[1]}
+    every = sorted({*COUNT_EXPOSURES, *extent.exposures})
+    return [
+        *_cases("numpy", frames, every, one, lambda k, _: stages.numpy_stage(frames, walk, k)),
+        *_cases("count", frames, every, workers, lambda k, own: stages.count_stage(frames, walk, k, own)),
+        *_cases(
+            "likelihood",
+            frames,
+            extent.exposures,
+            workers,
+            lambda k, own: search_stage(frames, walk, k, own, learned),
+        ),
+    ]
+
+
+def _usual_cases(
+    frames: BenchFrames, learned: Likelihood, workers: Workers, extent: Extent, folder: Path
+) -> list[Case]:
+    """The rows of the usual window: with the ends of sweeps, in whole frames, and from a recording."""
+    few = [k for k in FEW_EXPOSURES if k in extent.exposures]
+    full = full_frames(frames, extent.frames_bytes)
+    walk, full_walk = Walk(frames), Walk(full)
+    recording, stride = recording_of(frames)
+    path = folder / "frames.spb"
+    recording.tofile(path)
+    source = stages.from_file(path, stride)
+
+    def whole(k: int, own: RowWorkers) -> Stage:
+        return search_stage(frames, walk, k, own, learned, whole_sweeps=True)
+
+    return [
+        *_cases("likelihood-sweep", frames, few, workers, whole),
+        *_cases("likelihood-full", full, few, workers, lambda k, own: search_stage(full, full_walk, k, own, learned)),
+        *_cases("disk", frames, few, workers, lambda k, own: search_stage(frames, walk, k, own, learned, source)),
+    ]
+
+
+def _map_cases(workers: Workers, extent: Extent) -> list[Case]:
+    """The rows of whole maps."""
+    surface = bench_surface(extent.map_rows, extent.map_columns)
+    most, window = max(workers), WINDOWS[0]
+    model = stages.learn_joint(surface, LEARN_EXPOSURES, most)
+    cases = [Case("sgbm", window, None, n, None, stages.sgbm_stage(surface, n)) for n in workers]
+    for k in FEW_EXPOSURES:
+        bits = surface.frames(k, workers[most])
+        volume = count_surface(surface, bits, k, workers[most])
+        cases += [Case("joint", window, k, n, None, stages.joint_stage(surface, volume, n, model)) for n in workers]
+    cases.append(Case("joint-sweep", window, k, most, None, stages.joint_sweep_stage(surface, bits, k, most, model)))
+    return cases
 
 
 def _in_turn(
     cases: list[Case], frames: BenchFrames, extent: Extent, progress: Progress | None
 ) -> tuple[list[float], list[list[Measured]]]:
     """Bytes a second of each reading of the memory, and what each case measured in each round."""
-    words = _random_words(frames, extent.read_bytes)
+    # Memory of its own with the bits of frames: pages of zeros would be read from a cache.
+    words = np.resize(frames.bits.reshape(-1).view(np.uint64), extent.read_bytes // 8)
     memory: list[float] = []
     measured: list[list[Measured]] = [[] for _ in cases]
     read_all(words)
-    for stage in {case.stage: case for case in cases}.values():  # compiled code is loaded before anything is timed
-        stage.measure(0.0)
+    for case in {case.stage: case for case in cases}.values():  # compiled code is loaded before anything is timed
+        case.measure(0.0)
     told = counted("measuring", "rows", progress)
     for done in range(extent.rounds):
         for i, case in enumerate(cases):
             if i % READ_EVERY == 0:
                 memory.append(_read_bytes_per_s(words))
-            moment_s = extent.count_moment_s if case.stage.startswith("count") else extent.moment_s
+            moment_s = extent.count_moment_s if case.stage == "count" else extent.moment_s
             measured[i].append(case.measure(moment_s))
             told(done * len(cases) + i + 1, extent.rounds * len(cases))
     return memory, measured
-
-
-def _random_words(frames: BenchFrames, n_bytes: int) -> NDArray[np.uint64]:
-    """Memory of its own with the bits of frames: pages of zeros would be read from a cache."""
-    return np.resize(frames.bits.reshape(-1).view(np.uint64), n_bytes // 8)
 
 
 def _read_bytes_per_s(words: NDArray[np.uint64]) -> float:
@@ -173,39 +321,38 @@ def _read_bytes_per_s(words: NDArray[np.uint64]) -> float:
     return words.nbytes / (time.perf_counter() - begun)
 
 
-def _rows(cases: list[Case], measured: list[list[Measured]], read: float) -> tuple[SpeedRow, ...]:
-    speeds = [float(np.median([each.frames / each.seconds for each in these])) or None for these in measured]
+def _rows(cases: Sequence[Case], measured: Sequence[Sequence[Measured]], read: float) -> tuple[SpeedRow, ...]:
+    speeds = [_median(each.frames / each.seconds for each in these) or None for these in measured]
     naive = {
         (case.window, case.exposures): speed for case, speed in zip(cases, speeds, strict=True) if case.stage == "numpy"
     }
     rows = []
     for case, speed, these in zip(cases, speeds, measured, strict=True):
-        slow = naive.get((case.window, case.exposures))
-        error = these[0].error or StripeError(*(float("nan"),) * 3)
-        row = SpeedRow(
-            stage=case.stage,
-            window=case.window,
-            exposures=case.exposures,
-            threads=case.threads,
-            frames_per_s=speed,
-            times_real_time=None if speed is None else speed / REAL_TIME_HZ,
-            of_memory_bandwidth=None if speed is None or case.frame_bytes is None else speed * case.frame_bytes / read,
-            times_numpy=None if speed is None or slow is None else speed / slow,
-            error_px=error.mean_abs_px,
-            median_error_px=error.median_abs_px,
-            missing=error.missing,
-            ms_per_map=_ms_per_map(these),
-            times_sgbm=_times_sgbm(these),
+        error = these[0].error
+        rows.append(
+            SpeedRow(
+                stage=case.stage,
+                window=case.window,
+                exposures=case.exposures,
+                threads=case.threads,
+                frames_per_s=speed,
+                times_real_time=_over(speed, REAL_TIME_HZ),
+                of_memory_bandwidth=_over(speed, read / case.frame_bytes if case.frame_bytes else None),
+                times_numpy=_over(speed, naive.get((case.window, case.exposures))),
+                error_px=error.mean_abs_px if error else None,
+                median_error_px=error.median_abs_px if error else None,
+                missing=error.missing if error else None,
+                ms_per_map=_median(1e3 * each.seconds / each.maps for each in these if each.maps),
+                times_sgbm=_median(each.times_sgbm for each in these if each.times_sgbm is not None),
+            )
         )
-        rows.append(row if these[0].error else replace(row, error_px=None, median_error_px=None, missing=None))
     return tuple(rows)
 
 
-def _ms_per_map(measured: list[Measured]) -> float | None:
-    times = [1e3 * each.seconds / each.maps for each in measured if each.maps]
-    return float(np.median(times)) if times else None
+def _over(value: float | None, unit: float | None) -> float | None:
+    return None if value is None or unit is None else value / unit
 
 
-def _times_sgbm(measured: list[Measured]) -> float | None:
-    quotients = [each.times_sgbm for each in measured if each.times_sgbm is not None]
-    return float(np.median(quotients)) if quotients else None
+def _median(values: Iterable[float]) -> float | None:
+    found = list(values)
+    return float(np.median(found)) if found else None

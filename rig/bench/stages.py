@@ -1,20 +1,8 @@
 """The stages that are measured: each works on frames for a moment and says how many it did in how long.
 
-count: frames of just the window into bit planes, column after column; turning planes into counts is part of an
-estimate and left out. numpy: what one writes first: unpackbits, sum, argmax. likelihood: `ColumnJudge`, the counter of
-`rig scan --estimator likelihood`, fed blocks as in a scan; taking its result at the end of a sweep and clearing it for
-the next is not timed, with sweep it is. disk: the same from SPB1 blocks in a file mapped into memory, which the system
-most likely holds in its page cache. parse: blocks of that recording in memory, read without an estimate. full: whole
-frames of the sensor, of which only the window is searched. crc: payload checksums are verified.
-
-The stages that make a whole map at a time, for so many threads each.
-
-joint: the estimate alone, from counts that were made before, and by turns with it a map of sgbm on as many threads: of
-figures that were measured one after the other a machine with other work makes any quotient. joint-sweep: counting in
-blocks as in a scan, then the estimate. sgbm: OpenCV's StereoSGBM (MODE_HH4, which aggregates along four paths too) on a
-pair of pictures of the same surface, as many disparities as the window has pixels; OpenCV leaves out as many columns at
-the left edge. Nothing is learned meanwhile: `joint` goes by what it learned from the first sweep. Each begins with a
-map that is not timed.
+docs/results/speed.md says what each of them is. What is done once a sweep is not timed, but for `whole_sweeps`. Of
+figures that were measured one after the other a machine with other work makes any quotient: so `joint` and StereoSGBM
+make maps by turns. Nothing is learned meanwhile, and each begins with a map that is not timed.
 """
 
 import time
@@ -31,7 +19,6 @@ from drivers.spb1 import walk_blocks
 from rig.bench.frames import (
     BLOCK_FRAMES,
     BLOCK_PLACES,
-    COLUMNS,
     PLACE_FRAMES,
     WINDOW,
     BenchFrames,
@@ -39,14 +26,14 @@ from rig.bench.frames import (
     count_columns,
     count_surface,
     sweep_frames,
-)
+)  # fmt: skip
 from rig.count.kernels import new_planes, rows_of_chunk
 from rig.count.sweeps import MOST_UNDER_WAY
 from rig.count.volume import CountVolume
 from rig.estimate.joint.joint import Joint
 from rig.estimate.likelihood import Likelihood
 from rig.estimate.row.model import RowModel
-from rig.estimate.search.stream import ColumnJudge, SearchedSweep
+from rig.estimate.search.stream import ColumnJudge
 from rig.threads import RowWorkers
 
 Bits = NDArray[np.uint8]
@@ -82,13 +69,15 @@ class Measured:
 
 Stage = Callable[[float], Measured]
 """Works for about so many seconds."""
+Blocks = Callable[[BenchFrames, "Walk"], Iterator[tuple[int, Bits]]]
+"""Gives blocks of frames and the first place of each, for ever."""
 
 
 class Walk:
     """Places in the frames at which measurements begin in turn, so that none finds its frames in a cache."""
 
-    def __init__(self, places: int) -> None:
-        self._places = places
+    def __init__(self, frames: BenchFrames) -> None:
+        self._places = len(frames.bits) // PLACE_FRAMES
         self._at = 0
 
     def next(self, places: int = 1) -> int:
@@ -144,23 +133,43 @@ def numpy_stage(frames: BenchFrames, walk: Walk, exposures: int) -> Stage:
     return measure
 
 
+def from_memory(frames: BenchFrames, walk: Walk) -> Iterator[tuple[int, Bits]]:
+    """Blocks as they lie in memory."""
+    while True:
+        place = walk.next(BLOCK_PLACES)
+        yield place, frames.bits[place * PLACE_FRAMES : place * PLACE_FRAMES + BLOCK_FRAMES]
+
+
+def from_file(path: Path, stride: int) -> Blocks:
+    """A source of the same blocks that reads them from a recording; header checksums are checked."""
+
+    def blocks(frames: BenchFrames, walk: Walk) -> Iterator[tuple[int, Bits]]:
+        # Copy-on-write: kernels are compiled for memory that may be written.
+        mapped = np.memmap(path, np.uint8, "c")
+        seq = walk.next(BLOCK_PLACES) // BLOCK_PLACES
+        while True:
+            for block in walk_blocks(mapped[seq * stride :], stride, check_payload=False):
+                if not isinstance(block, FrameBlock):
+                    raise RuntimeError(f"the bench's own recording is damaged: {block}")
+                yield block.header.block_seq * BLOCK_PLACES, block.bits
+            seq = 0
+
+    return blocks
+
+
 def search_stage(
     frames: BenchFrames,
     walk: Walk,
     exposures: int,
     workers: RowWorkers,
     likelihood: Likelihood,
-    source: "Callable[[BenchFrames, Walk], Iterator[tuple[int, Bits]]] | None" = None,
+    source: Blocks = from_memory,
     *,
     whole_sweeps: bool = False,
 ) -> Stage:
-    """Counting and `likelihood`. source: gives blocks and their first places for ever; from memory where None.
-
-    whole_sweeps: time also what is done once a sweep.
-    """
-    bins, column, x0 = _sweep_frames(frames, exposures)
+    """Counting and `likelihood`. whole_sweeps: time also what is done once a sweep."""
+    bins, column, x0 = sweep_frames(frames.geometry, exposures)
     layout = frames.layout(exposures)
-    source = source or from_memory
 
     def measure(seconds: float) -> Measured:
         judge = likelihood.judge(frames.geometry, exposures, dark=True)
@@ -181,84 +190,18 @@ def search_stage(
                 places += range(place, place + BLOCK_PLACES)
                 if spent >= seconds and not whole_sweeps:
                     break
-            settled = time.perf_counter()
-            counter.settle()
-            spent += time.perf_counter() - settled
+            spent += _seconds_of(counter.settle)
             ended = time.perf_counter()
             sweep = counter.finish() if error is None or whole_sweeps else None
             counter.begin(judge)
             spent += time.perf_counter() - ended if whole_sweeps else 0.0
             if error is None and sweep is not None:
-                error = _search_error(sweep, frames, places, exposures)
+                columns = len(places) * PLACE_FRAMES // exposures
+                truth_px = frames.truth_px[np.repeat(places, PLACE_FRAMES // exposures)].T
+                error = stripe_error(sweep.stripe.x_px[:, :columns] - truth_px)
         return Measured(done, spent, error)
 
     return measure
-
-
-def parse_stage(recording: NDArray[np.uint8], stride: int, *, check_payload: bool) -> Stage:
-    """Reading SPB1 blocks (all bytes,) in memory, header checksums always checked."""
-    start = 0
-
-    def measure(seconds: float) -> Measured:
-        nonlocal start
-        done, spent = 0, 0.0
-        while spent < seconds or not done:
-            begun = time.perf_counter()
-            for block in walk_blocks(recording[start:], stride, check_payload=check_payload):
-                start += stride
-                done += _sound(block).n_frames
-                if spent + time.perf_counter() - begun >= seconds:
-                    break
-            spent += time.perf_counter() - begun
-            start %= len(recording)
-        return Measured(done, spent)
-
-    return measure
-
-
-def from_memory(frames: BenchFrames, walk: Walk) -> Iterator[tuple[int, Bits]]:
-    """Blocks and the first place of each, as they lie in memory."""
-    while True:
-        place = walk.next(BLOCK_PLACES)
-        yield place, frames.bits[place * PLACE_FRAMES : place * PLACE_FRAMES + BLOCK_FRAMES]
-
-
-def from_file(
-    path: Path, stride: int, *, check_payload: bool
-) -> Callable[[BenchFrames, Walk], Iterator[tuple[int, Bits]]]:
-    """A source of the same blocks that reads them from a recording."""
-
-    def blocks(frames: BenchFrames, walk: Walk) -> Iterator[tuple[int, Bits]]:
-        # Copy-on-write: kernels are compiled for memory that may be written.
-        mapped = np.memmap(path, np.uint8, "c")
-        seq = walk.next(BLOCK_PLACES) // BLOCK_PLACES
-        while True:
-            for block in walk_blocks(mapped[seq * stride :], stride, check_payload=check_payload):
-                yield seq * BLOCK_PLACES, _sound(block).bits
-                seq += 1
-            seq = 0
-
-    return blocks
-
-
-def _sound(block: object) -> FrameBlock:
-    if not isinstance(block, FrameBlock):
-        raise RuntimeError(f"the bench's own recording is damaged: {block}")
-    return block
-
-
-def _sweep_frames(
-    frames: BenchFrames, exposures: int
-) -> tuple[NDArray[np.int32], NDArray[np.float64], NDArray[np.int32]]:
-    """Bins and fractional columns of a sweep's frames, and where the windows of a block's begin."""
-    bins = np.repeat(np.arange(COLUMNS, dtype=np.int32), exposures)
-    return bins, bins.astype(np.float64), np.full(BLOCK_FRAMES, frames.geometry.x0[0], np.int32)
-
-
-def _search_error(sweep: SearchedSweep, frames: BenchFrames, places: list[int], exposures: int) -> StripeError:
-    columns = len(places) * PLACE_FRAMES // exposures
-    place = np.repeat(np.array(places), PLACE_FRAMES // exposures)
-    return stripe_error(sweep.stripe.x_px[:, :columns] - frames.truth_px[place].T)
 
 
 def stripe_error(difference: NDArray[np.float32]) -> StripeError:
@@ -268,8 +211,6 @@ def stripe_error(difference: NDArray[np.float32]) -> StripeError:
         return StripeError(float("nan"), float("nan"), 1.0)
     return StripeError(float(found.mean()), float(np.median(found)), 1.0 - found.size / difference.size)
 
-
-Picture = NDArray[np.uint8]
 
 SGBM_BLOCK_PX = 3
 """OpenCV's own default; its penalties follow from it as its documentation advises."""
@@ -308,11 +249,9 @@ def joint_stage(surface: BenchSurface, volume: CountVolume, threads: int, model:
     return measure
 
 
-def joint_sweep_stage(
-    surface: BenchSurface, bits: NDArray[np.uint8], exposures: int, threads: int, model: RowModel
-) -> Stage:
+def joint_sweep_stage(surface: BenchSurface, bits: Bits, exposures: int, threads: int, model: RowModel) -> Stage:
     """Counting and `joint`, one after the other."""
-    bins, column, x0 = sweep_frames(surface, exposures)
+    bins, column, x0 = sweep_frames(surface.geometry, exposures)
 
     def measure(seconds: float) -> Measured:
         joint = Joint(threads, model, learns=False)
@@ -346,21 +285,17 @@ def sgbm_stage(surface: BenchSurface, threads: int) -> Stage:
 
 
 @contextmanager
-def matching(pictures: tuple[Picture, Picture], threads: int) -> Iterator[Callable[[], NDArray[np.int16]]]:
+def matching(pictures: tuple[Bits, Bits], threads: int) -> Iterator[Callable[[], NDArray[np.int16]]]:
     """StereoSGBM of left and right picture on so many threads, a map a call: disparities in SGBM_STEPS to the pixel."""
     import cv2
 
     area = SGBM_BLOCK_PX**2
     mode = cv2.STEREO_SGBM_MODE_HH4
     matcher = cv2.StereoSGBM.create(0, WINDOW, SGBM_BLOCK_PX, P1=8 * area, P2=32 * area, mode=mode)
-
-    def match() -> NDArray[np.int16]:
-        return np.asarray(matcher.compute(*pictures), np.int16)
-
     before = cv2.getNumThreads()
     cv2.setNumThreads(threads)
     try:
-        yield match
+        yield lambda: np.asarray(matcher.compute(*pictures), np.int16)
     finally:
         cv2.setNumThreads(before)
 

@@ -4,13 +4,12 @@ Each is run once on little; what numba compiles it keeps on disk, so that a seco
 """
 
 import time
-from contextlib import closing
+from contextlib import closing, suppress
 
 import numpy as np
 
 from rig.bench.speed import warm_bench
 from rig.config.models import EstimateConfig, RigConfig
-from rig.depth.reconstruct import Reconstructor
 from rig.depth.warm_up import warm_up
 from rig.devices.open import OpenRig, open_rig
 from rig.devices.prepare import prepare
@@ -18,6 +17,7 @@ from rig.estimate.registry import ESTIMATORS
 from rig.progress import tell_stage
 from rig.scan.acquisition import Acquisition, AcquisitionRequest
 from rig.scan.monitor import Listeners, ScanProgress
+from rig.scan.scan import make_reconstructor
 
 ENOUGH_FRAMES = 1000
 """Simulated frames, the first columns of a sweep among them."""
@@ -46,8 +46,7 @@ class _EnoughError(Exception):
 def _simulate(rig: OpenRig) -> None:
     """Let the world make the frames of a scan's beginning, bind and count them, and tell the truth of two columns."""
     plan, timing = prepare(rig)
-    estimate = EstimateConfig(estimator="argmax", threads=1)
-    maker = Reconstructor(rig.model, plan.commands, plan.depth_range_m, estimate, sensor=(plan.rows, plan.width))
+    maker = make_reconstructor(rig, plan, EstimateConfig(estimator="argmax", threads=1))
 
     def enough(done: ScanProgress) -> None:
         if done.frames >= ENOUGH_FRAMES:
@@ -55,11 +54,8 @@ def _simulate(rig: OpenRig) -> None:
 
     request = AcquisitionRequest(maps=1, listeners=Listeners(live=enough))
     running = Acquisition(rig, plan, timing, maker, request).run()
-    with closing(running):
-        try:
-            for _ in running:
-                pass
-        except _EnoughError:
+    with closing(running), suppress(_EnoughError):
+        for _ in running:
             pass
     assert rig.world is not None, "only a simulated rig is asked for frames"
     rig.world.truth(plan.command_at(np.arange(2.0)))

@@ -1,20 +1,14 @@
 """Commands for the speed of this machine: `rig bench`, `warmup`."""
 
+from dataclasses import asdict
 from typing import Annotated
 
 import typer
 
-from rig.cli.command import ConfigArgument, JsonOption, command, print_json
+from rig.cli.command import Commands, ConfigArgument, JsonOption, api, print_json
 from rig.cli.progress import progress
 
 
-def register(app: typer.Typer) -> None:
-    """Add the commands to `app`."""
-    app.command("bench")(bench_command)
-    app.command("warmup")(warmup_command)
-
-
-@command
 def bench_command(
     threads: Annotated[
         int | None, typer.Option("--threads", help="most threads to measure", show_default="one a core", min=1)
@@ -33,7 +27,6 @@ def bench_command(
     as_json: JsonOption = False,
 ) -> int:
     """Measure how fast this machine counts and estimates, beside how fast it reads its memory."""
-    from rig import api
     from rig.errors import UsageError
 
     if soak is None and (window or slow_consumer != 0 or on_overload != "abort"):
@@ -47,7 +40,7 @@ def bench_command(
     with progress():
         report = api.bench(threads=threads)
     if as_json:
-        print_json(report.as_json() | ({} if stream is None else {"soak": stream.as_json()}))
+        print_json(report.as_json() | ({} if stream is None else {"soak": asdict(stream)}))
     else:
         from rig.cli.tables import soak_table, speed_table
 
@@ -58,11 +51,8 @@ def bench_command(
     return 0 if stream is None else stream.exit_code
 
 
-@command
 def warmup_command(config: ConfigArgument = "simulated", as_json: JsonOption = False) -> int:
     """Compile everything that is compiled, so that no scan waits for it."""
-    from rig import api
-
     with progress():
         seconds = api.warm_up(config)
     if as_json:
@@ -70,3 +60,6 @@ def warmup_command(config: ConfigArgument = "simulated", as_json: JsonOption = F
     else:
         print(f"warm after {seconds:.1f} s; compiled code is kept on disk, once more takes seconds")
     return 0
+
+
+COMMANDS: Commands = {"bench": bench_command, "warmup": warmup_command}

@@ -5,7 +5,7 @@ from typing import TYPE_CHECKING, Annotated
 
 import typer
 
-from rig.cli.command import JsonOption, asks, command, print_json, say
+from rig.cli.command import Commands, JsonOption, api, asks, print_json, say
 from rig.cli.completion import one_of, rig_names
 from rig.cli.progress import paused, progress
 from rig.requests import CameraRequest, CheckRequest, PixelsRequest, PlanesRequest, SyncRequest
@@ -51,18 +51,6 @@ def print_report(result: "CalibrationResult", as_json: bool) -> int:
     return result.exit_code
 
 
-def register(app: typer.Typer) -> None:
-    """Add the group to `app`."""
-    group = typer.Typer(name="calibrate", help="Estimate or judge the rig model.", rich_markup_mode=None)
-    group.command("pixels")(pixels_command)
-    group.command("camera")(camera_command)
-    group.command("planes")(planes_command)
-    group.command("sync")(sync_command)
-    group.command("check")(check_command)
-    app.add_typer(group)
-
-
-@command
 @asks(PixelsRequest)
 def pixels_command(
     request: PixelsRequest,
@@ -78,7 +66,6 @@ def pixels_command(
     as_json: JsonOption = False,
 ) -> int:
     """Map hot, dead and noisy pixels and the dark rate, from dark frames."""
-    from rig import api
     from rig.cli.tables import print_result
 
     ask = ask_at_terminal()
@@ -91,45 +78,47 @@ def pixels_command(
     return result.exit_code
 
 
-@command
 @asks(CameraRequest)
 def camera_command(request: CameraRequest, sources: SourcesArgument = None, as_json: JsonOption = False) -> int:
     """Calibrate the camera alone, from views of a board or from pictures."""
-    from rig import api
-
     with progress():
         result = api.calibrate_camera(sources or (), request, ask=ask_at_terminal(), tell=say)
     return print_report(result, as_json)
 
 
-@command
 @asks(PlanesRequest)
 def planes_command(request: PlanesRequest, sources: SourcesArgument = None, as_json: JsonOption = False) -> int:
     """Calibrate camera, light planes and lag from views of a board."""
-    from rig import api
-
     with progress():
         result = api.calibrate_planes(sources or (), request, ask=ask_at_terminal(), tell=say)
     return print_report(result, as_json)
 
 
-@command
 @asks(SyncRequest)
 def sync_command(request: SyncRequest, sources: SourcesArgument = None, as_json: JsonOption = False) -> int:
     """Measure the mirror's lag each way and the rows' delay, from one unmoved scene at several speeds."""
-    from rig import api
-
     with progress():
         result = api.calibrate_sync(sources or (), request, tell=say)
     return print_report(result, as_json)
 
 
-@command
 @asks(CheckRequest)
 def check_command(request: CheckRequest, sources: SourcesArgument = None, as_json: JsonOption = False) -> int:
     """Judge a calibration by scans of a flat board: flatness, scale, angle."""
-    from rig import api
-
     with progress():
         result = api.calibrate_check(sources or (), request, ask=ask_at_terminal(), tell=say)
     return print_report(result, as_json)
+
+
+COMMANDS: Commands = {
+    "calibrate": (
+        "Estimate or judge the rig model.",
+        {
+            "pixels": pixels_command,
+            "camera": camera_command,
+            "planes": planes_command,
+            "sync": sync_command,
+            "check": check_command,
+        },
+    )
+}

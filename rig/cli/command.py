@@ -11,6 +11,7 @@ import sys
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import Field
 from datetime import datetime
+from importlib import import_module
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any, ParamSpec
 
@@ -21,8 +22,18 @@ from rig.errors import UsageError
 from rig.requests import options_of
 
 if TYPE_CHECKING:
+    from rig import api as api
     from rig.recording.segment import Space
     from rig.scan.run import RunResult
+else:
+
+    class _Api:
+        """The module `rig.api`, which is imported where a command first calls something of it."""
+
+        def __getattr__(self, name: str) -> Any:
+            return getattr(import_module("rig.api"), name)
+
+    api = _Api()
 
 EXIT_USAGE = 2
 EXIT_DEVICE = 3
@@ -31,6 +42,9 @@ EXIT_SOFTWARE = 70
 """An error in the program itself: EX_SOFTWARE of sysexits.h."""
 
 P = ParamSpec("P")
+
+Commands = Mapping[str, "Callable[..., int] | tuple[str, Commands]"]
+"""Commands by name; a group is its help and the commands in it."""
 
 ConfigArgument = Annotated[
     str,
@@ -44,7 +58,18 @@ ConfigArgument = Annotated[
 JsonOption = Annotated[bool, typer.Option("--json", help="print exactly one JSON object to stdout, errors too")]
 
 
-def command(function: Callable[P, int | None]) -> Callable[P, None]:
+def add_commands(app: typer.Typer, commands: Commands) -> None:
+    """Add commands and groups to `app`, in their order."""
+    for name, given in commands.items():
+        if isinstance(given, tuple):
+            group = typer.Typer(name=name, help=given[0], rich_markup_mode=None)
+            add_commands(group, given[1])
+            app.add_typer(group)
+        else:
+            app.command(name)(command(given))
+
+
+def command(function: Callable[P, int]) -> Callable[P, None]:
     """Wrap a command so that its user's mistakes and its devices' faults become lines and exit codes."""
 
     @functools.wraps(function)
@@ -55,11 +80,12 @@ def command(function: Callable[P, int | None]) -> Callable[P, None]:
             code = fail(EXIT_ABORTED, [], ["aborted", *getattr(interrupt, "__notes__", [])], kwargs.get("as_json"))
         except Exception as error:
             refused = refused_file(error)
-            code = EXIT_USAGE if refused else _code_of(error)
-            if code is None:
+            found = EXIT_USAGE if refused else _code_of(error)
+            if found is None:
                 raise
-            fail(code, (refused or str(error)).splitlines(), getattr(error, "__notes__", []), kwargs.get("as_json"))
-        raise typer.Exit(code or 0)
+            said, notes = (refused or str(error)).splitlines(), getattr(error, "__notes__", [])
+            code = fail(found, said, notes, kwargs.get("as_json"))
+        raise typer.Exit(code)
 
     return wrapped
 
@@ -137,7 +163,7 @@ def _parameter(field: "Field[Any]") -> inspect.Parameter:
 
 def _read(field: "Field[Any]", value: Any) -> Any:
     if field.name == "out" and value is None:
-        return default_out()
+        return Path("runs") / datetime.now().strftime("%Y%m%d-%H%M%S")
     return _MANY[field.type](_option_name(field), value) if field.type in _MANY else value
 
 
@@ -208,11 +234,6 @@ def print_json(content: Mapping[str, Any]) -> None:
 def say_space(space: "Space") -> None:
     """Say how much room a recording will take on the disk, before it begins."""
     say(f"recording: {space}")
-
-
-def default_out() -> Path:
-    """Folder of a run whose user names none: runs/DATE-TIME."""
-    return Path("runs") / datetime.now().strftime("%Y%m%d-%H%M%S")
 
 
 def say(line: str) -> None:

@@ -24,7 +24,7 @@ from typing import Annotated
 import typer
 
 from rig.cli import bench, calibrate, devices, recordings, replay, scan, tradeoff
-from rig.cli.command import EXIT_ABORTED, EXIT_SOFTWARE, EXIT_USAGE, fail, refused_file, say
+from rig.cli.command import EXIT_ABORTED, EXIT_SOFTWARE, EXIT_USAGE, add_commands, fail, refused_file, say
 
 _ENDING = ("SIGTERM", "SIGHUP", "SIGBREAK")
 """Signals that end a program, beside Ctrl-C; no system has all of them."""
@@ -39,18 +39,17 @@ app = typer.Typer(
     context_settings={"help_option_names": ["-h", "--help"]},  # of every command below as well
 )
 # In the order in which '--help' lists them; groups come last.
-for _register in (
-    devices.register_config,
-    recordings.register,
-    recordings.register_exchange,
-    replay.register,
-    scan.register,
-    tradeoff.register,
-    calibrate.register,
-    devices.register,
-    bench.register,
+for _commands in (
+    devices.SCENES,
+    recordings.COMMANDS,
+    replay.COMMANDS,
+    scan.COMMANDS,
+    tradeoff.COMMANDS,
+    calibrate.COMMANDS,
+    devices.COMMANDS,
+    bench.COMMANDS,
 ):
-    _register(app)
+    add_commands(app, _commands)
 
 
 def main(argv: Sequence[str] | None = None) -> None:

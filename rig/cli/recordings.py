@@ -5,7 +5,7 @@ from typing import TYPE_CHECKING, Annotated
 
 import typer
 
-from rig.cli.command import JsonOption, asks, command, print_json, say
+from rig.cli.command import Commands, JsonOption, api, asks, print_json, say
 from rig.cli.progress import progress
 from rig.requests import CutRequest, ExportRequest, ImportRequest
 
@@ -19,22 +19,8 @@ MOST_LINES = 20
 """Most problems that are shown to people; `--json` has all."""
 
 
-def register(app: typer.Typer) -> None:
-    """Add the commands to `app`."""
-    for name, function in (
-        ("verify", verify_command),
-        ("repair", repair_command),
-        ("info", info_command),
-        ("cut", cut_command),
-        ("compress", compress_command),
-    ):
-        app.command(name)(command(function))
-
-
 def verify_command(run: RunArgument, as_json: JsonOption = False) -> int:
     """Read every byte of a recording and say whether it is what was recorded; exit code 1 where it is not."""
-    from rig import api
-
     with progress(compiles=False):
         found = api.verify(run)
     if as_json:
@@ -46,8 +32,6 @@ def verify_command(run: RunArgument, as_json: JsonOption = False) -> int:
 
 def repair_command(run: RunArgument, as_json: JsonOption = False) -> int:
     """Make a torn recording whole: cut torn tails off, write a lost index or manifest anew; frames stay as they are."""
-    from rig import api
-
     with progress(compiles=False):
         made = api.repair(run)
     if as_json:
@@ -61,8 +45,6 @@ def repair_command(run: RunArgument, as_json: JsonOption = False) -> int:
 
 def info_command(run: RunArgument, as_json: JsonOption = False) -> int:
     """Describe what a recording holds."""
-    from rig import api
-
     found = api.recording_info(run)
     if as_json:
         print_json(found.as_json())
@@ -79,8 +61,6 @@ def cut_command(
     as_json: JsonOption = False,
 ) -> int:
     """Write a part of a recording to a folder of its own, with all that is needed to reconstruct it."""
-    from rig import api
-
     with progress(compiles=False):
         content = api.cut(run, out, request)
     if as_json:
@@ -94,8 +74,6 @@ def cut_command(
 
 def compress_command(run: RunArgument, as_json: JsonOption = False) -> int:
     """Compress a recording with zstd; every command reads it as any other."""
-    from rig import api
-
     with progress(compiles=False):
         made = api.compress(run)
     if as_json:
@@ -149,13 +127,6 @@ def _megabytes(size: int) -> str:
     return f"{size / 1e6:.1f} MB"
 
 
-def register_exchange(app: typer.Typer) -> None:
-    """Add the commands that exchange frames with other programs to `app`."""
-    app.command("import")(import_command)
-    app.command("export")(export_command)
-
-
-@command
 @asks(ImportRequest)
 def import_command(
     request: ImportRequest,
@@ -169,8 +140,6 @@ def import_command(
     as_json: JsonOption = False,
 ) -> int:
     """Make a recording from the frames in another program's files."""
-    from rig import api
-
     with progress(compiles=False):
         result = api.import_frames(kind, files, out, request)
     for hint in result.hints:
@@ -185,7 +154,6 @@ def import_command(
     return 0
 
 
-@command
 @asks(ExportRequest)
 def export_command(
     request: ExportRequest,
@@ -197,8 +165,6 @@ def export_command(
     as_json: JsonOption = False,
 ) -> int:
     """Write a run in a form that other programs read."""
-    from rig import api
-
     with progress(compiles=False):
         result = api.export_run(run, kind, request, out=out)
     for line in result.damage:
@@ -212,3 +178,14 @@ def export_command(
         for _, first, last in result.gaps:
             print(f"frames {first} to {last} are missing")
     return result.exit_code
+
+
+COMMANDS: Commands = {
+    "verify": verify_command,
+    "repair": repair_command,
+    "info": info_command,
+    "cut": cut_command,
+    "compress": compress_command,
+    "import": import_command,
+    "export": export_command,
+}

@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING, Annotated
 
 import typer
 
-from rig.cli.command import JsonOption, asks, command, report, say, say_space
+from rig.cli.command import Commands, JsonOption, api, asks, report, say, say_space
 from rig.cli.progress import progress
 from rig.requests import ReplayRequest
 
@@ -21,12 +21,6 @@ _LOOK_S = 0.2
 """Seconds of one wait for a key."""
 
 
-def register(app: typer.Typer) -> None:
-    """Add the command to `app`."""
-    app.command("replay")(replay_command)
-
-
-@command
 @asks(ReplayRequest)
 def replay_command(
     request: ReplayRequest,
@@ -34,8 +28,6 @@ def replay_command(
     as_json: JsonOption = False,
 ) -> int:
     """Play a recording through the live stack, at any clock."""
-    from rig import api
-
     if request.loop and request.save is None:
         request = replace(request, save="last")
     steps = _step_by_keys if request.clock == "step" else None
@@ -63,3 +55,6 @@ def _follow(pace: "Pace", handle: int) -> None:
             if not data:
                 pace.run_on()
                 return
+
+
+COMMANDS: Commands = {"replay": replay_command}

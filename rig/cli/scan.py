@@ -1,16 +1,17 @@
 """Commands that make depth maps, and one on what to expect of a scene: `rig scan`, `reconstruct`, `effects`."""
 
-from dataclasses import replace
+from dataclasses import asdict, replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
 
 import typer
 
 from rig.cli.command import (
+    Commands,
     ConfigArgument,
     JsonOption,
+    api,
     asks,
-    command,
     print_json,
     report,
     say_space,
@@ -24,14 +25,6 @@ if TYPE_CHECKING:
     from rig.recording.segment import Space
 
 
-def register(app: typer.Typer) -> None:
-    """Add the commands to `app`."""
-    app.command("scan")(scan_command)
-    app.command("reconstruct")(reconstruct_command)
-    app.command("effects")(effects_command)
-
-
-@command
 @asks(ScanRequest)
 def scan_command(
     request: ScanRequest,
@@ -40,8 +33,6 @@ def scan_command(
     as_json: JsonOption = False,
 ) -> int:
     """Acquire and reconstruct depth maps."""
-    from rig import api
-
     if dry_run:
         spaces: list[Space] = []
         plan = api.plan_scan(config, request, on_space=spaces.append)
@@ -64,7 +55,6 @@ def _show_plan(plan: "ScanPlan", space: "Space | None", as_json: bool) -> int:
     return 0
 
 
-@command
 @asks(ReconstructRequest)
 def reconstruct_command(
     request: ReconstructRequest,
@@ -84,14 +74,11 @@ def reconstruct_command(
     as_json: JsonOption = False,
 ) -> int:
     """Make depth maps from a recording, from imported frames or from a packed .npy cube of them."""
-    from rig import api
-
     with progress():
         result = api.reconstruct(source, plan, calibration, replace(request, out=out))
     return report(result, as_json)
 
 
-@command
 def effects_command(
     config: ConfigArgument = "simulated",
     config_option: Annotated[
@@ -128,7 +115,6 @@ def effects_command(
 
     With --row and --column, print the noise-free flux of that row instead.
     """
-    from rig import api
     from rig.cli.tables import effects_table, flux_table
 
     chosen = config if config_option is None else config_option
@@ -142,7 +128,10 @@ def effects_command(
     with progress():
         effects = api.effects(chosen, scene=scene, trials=trials)
     if as_json:
-        print_json(effects.as_json())
+        print_json(asdict(effects))
     else:
         effects_table(effects)
     return 0
+
+
+COMMANDS: Commands = {"scan": scan_command, "reconstruct": reconstruct_command, "effects": effects_command}

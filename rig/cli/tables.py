@@ -2,9 +2,9 @@
 
 import sys
 import textwrap
-from collections.abc import Callable, Iterable, Sequence
+from collections.abc import Callable, Collection, Iterable, Sequence
 from itertools import groupby
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, TypeVar
 
 from rich.console import Console
 from rich.table import Table
@@ -27,6 +27,10 @@ if TYPE_CHECKING:
 WIDE = 300
 """Characters of a line that goes to a file or a pipe; no line here is as long."""
 
+Row = TypeVar("Row")
+Columns = Sequence[tuple[str, Callable[[Row], str]]]
+"""Headings, each with the function that gives the cell of a row."""
+
 _NAME_CELLS = 17
 """Characters that an effect's name takes on each of its lines."""
 LEAST_WAIT_S = 1e-3
@@ -42,24 +46,42 @@ _NEXT_STEP = {
 }
 
 
-def run_table(result: RunResult) -> None:
-    """Print the table of a run to stdout."""
-    summary = result.summary
+def console(width: int | None = None) -> Console:
+    """A console that writes to stdout; into a file or a pipe nothing is wrapped, unless a width is given."""
+    return Console(highlight=False, width=width or (None if sys.stdout.isatty() else WIDE))
+
+
+def _print_pairs(pairs: Iterable[tuple[str, str]], width: int | None = None) -> None:
+    """Print names, and the text of each beside it."""
     table = Table.grid(padding=(0, 2))
     table.add_column(style="bold")
     table.add_column()
-    for name, text in _rows(summary):
-        table.add_row(name, text)
+    for pair in pairs:
+        table.add_row(*pair)
+    console(width).print(table)
+
+
+def _table(columns: "Columns[Row]", rows: Iterable[Row], *, left: Collection[str] = (), apart: int = 1) -> Table:
+    """A table of these rows. left: headings of text, which begins at the left. apart: spaces between columns."""
+    table = Table(box=None, pad_edge=False, padding=(0, apart, 0, 0))
+    for name, _ in columns:
+        table.add_column(name, justify="left" if name in left else "right", no_wrap=True)
+    for row in rows:
+        table.add_row(*(cell(row) for _, cell in columns))
+    return table
+
+
+def run_table(result: RunResult) -> None:
+    """Print the table of a run to stdout."""
+    summary = result.summary
+    pairs = _rows(summary)
     if result.folder is not None:
         for name, what in (("depth", "depth"), ("intensity", "counts"), ("cloud", "points")):
-            for file in sorted((result.folder / name).glob("*.p[nl][gy]"))[-1:]:
-                table.add_row(what, str(file))
-    verdict = summary.verdict.value
+            pairs += [(what, str(file)) for file in sorted((result.folder / name).glob("*.p[nl][gy]"))[-1:]]
     advice = _advice(result)
-    table.add_row("verdict", f"{verdict}: {advice}" if advice else verdict)
-    for doubt in summary.verdict_reasons:
-        table.add_row("because", f"{_of_maps(doubt.maps, summary.maps)}{doubt.reason}")
-    console().print(table)
+    pairs.append(("verdict", summary.verdict.value + (f": {advice}" if advice else "")))
+    pairs += [("because", _of_maps(doubt.maps, summary.maps) + doubt.reason) for doubt in summary.verdict_reasons]
+    _print_pairs(pairs)
 
 
 def _advice(result: RunResult) -> str | None:
@@ -121,12 +143,6 @@ def _of_maps(maps: tuple[int, ...], of: int) -> str:
     if of == 1:
         return ""
     return f"map {maps[0]}: " if len(maps) == 1 else f"{len(maps)} of {of} maps, the first is {maps[0]}: "
-
-
-def console() -> Console:
-    """A console that writes to stdout."""
-    # Into a file or a pipe nothing is wrapped.
-    return Console(highlight=False, width=None if sys.stdout.isatty() else WIDE)
 
 
 def _rows(summary: Summary) -> list[tuple[str, str]]:
@@ -207,15 +223,12 @@ def _percent(value: float | None) -> str:
 WIDTH = 80
 """Most characters of a line of a trade-off, except lines that name files."""
 
-Column = tuple[str, Callable[[TradeoffRow], str]]
-"""Heading, and the function that gives the cell of a row."""
-
-_SETTING: tuple[Column, ...] = (
+_SETTING: Columns[TradeoffRow] = (
     ("estimator", lambda row: row.estimator),
     ("filter", lambda row: row.filter),
     ("K", lambda row: str(row.exposures)),
 )
-_FIGURES: tuple[Column, ...] = (
+_FIGURES: Columns[TradeoffRow] = (
     *_SETTING,
     ("sensor\nms", lambda row: _short(row.sensor_ms)),
     ("compute\nms", lambda row: _short(row.compute_ms)),
@@ -226,7 +239,7 @@ _FIGURES: tuple[Column, ...] = (
     ("depth\nmm", lambda row: _short(row.depth_mm)),
     ("", lambda row: ("*" if row.pareto else " ") + ("+" if row.pareto_compute else "")),
 )
-_LIMITS: tuple[Column, ...] = (
+_LIMITS: Columns[TradeoffRow] = (
     *_SETTING,
     ("error\nx limit", lambda row: _times(row.times_limit)),
     ("> 1 px\nx limit", lambda row: _times(row.times_wrong_limit)),
@@ -245,8 +258,8 @@ def tradeoff_table(done: Tradeoff) -> None:
     """
     print(textwrap.fill(done.advice, WIDTH))
     print()
-    for place in dict.fromkeys((row.scene, row.fog, row.lines) for row in done.rows):
-        rows = [row for row in done.rows if (row.scene, row.fog, row.lines) == place]
+    for place in dict.fromkeys((*row.place, row.lines) for row in done.rows):
+        rows = [row for row in done.rows if (*row.place, row.lines) == place]
         _print(_named(*place), _FIGURES, rows)
         if any(row.times_limit is not None for row in rows):
             _print(f"{_named(*place)}: beside what its light allows", _LIMITS, rows)
@@ -266,14 +279,9 @@ def _named(scene: str, fog: str | None, lines: int) -> str:
     return scene + air + ("" if lines == 1 else f", {lines} lines at once")
 
 
-def _print(title: str, columns: Sequence[Column], rows: Sequence[TradeoffRow]) -> None:
-    table = Table(title_justify="left", title_style="bold", box=None, pad_edge=False, padding=(0, 1, 0, 0))
-    for name, _ in columns:
-        table.add_column(name, justify="left" if name in _LEFT else "right", no_wrap=True)
-    for row in rows:
-        table.add_row(*(cell(row) for _, cell in columns))
+def _print(title: str, columns: "Columns[TradeoffRow]", rows: Sequence[TradeoffRow]) -> None:
     console().print(title, style="bold", markup=False)
-    console().print(table)
+    console().print(_table(columns, rows, left=_LEFT))
     print()
 
 
@@ -295,74 +303,80 @@ _TITLES = {
     "count": "counting alone, frames of just the window",
     "likelihood": "counting + likelihood, frames of just the window",
     "likelihood-sweep": "the same with what is done once a sweep",
-    "count-full": "counting alone, whole frames",
     "likelihood-full": "counting + likelihood in a window of whole frames",
     "joint": "joint from counts, whole maps of 512 x 500; x sgbm: its time over that of sgbm, by turns",
     "joint-sweep": "counting + joint, one after the other",
     "sgbm": "OpenCV's StereoSGBM, MODE_HH4, as many disparities and pixels, two pictures",
     "disk": "counting + likelihood from a recording (page cache), header checksums",
-    "disk-crc": "the same, payload checksums too",
-    "parse": "reading SPB1 blocks in memory, header checksums",
-    "parse-crc": "the same, payload checksums too",
     "numpy": "numpy: unpackbits, sum, argmax",
 }
 
 
+_SPEED: Columns[SpeedRow] = (
+    ("window", lambda row: str(row.window)),
+    ("K", lambda row: "-" if row.exposures is None else str(row.exposures)),
+    ("threads", lambda row: str(row.threads)),
+    ("kframes/s", lambda row: "-" if row.frames_per_s is None else digits(row.frames_per_s / 1e3, 4)),
+    ("real time", lambda row: _number(row.times_real_time)),
+    ("of memory", lambda row: _number(row.of_memory_bandwidth, 2)),
+    ("x numpy", lambda row: _number(row.times_numpy)),
+    ("error px", lambda row: _number(row.error_px)),
+    ("median px", lambda row: _number(row.median_error_px)),
+    ("ms/map", lambda row: _number(row.ms_per_map)),
+    ("x sgbm", lambda row: _number(row.times_sgbm, 2)),
+)
+
+
 def speed_table(report: SpeedReport) -> None:
     """Print whether this machine keeps up, then the rows, grouped by stage, to stdout."""
-    console = Console(highlight=False, width=BENCH_WIDTH)
+    out = console(BENCH_WIDTH)
     for point in report.working_points:
-        console.print(str(point))
-    console.print(f"(maps of {COLUMNS} columns at {REAL_TIME_HZ / 1e3:g} kHz, counting included)\n")
-    print_machine(console, report.machine)
-    console.print(f"memory read, one thread: {report.memory_read_gb_per_s:.1f} GB/s")
+        out.print(str(point))
+    out.print(f"(maps of {COLUMNS} columns at {REAL_TIME_HZ / 1e3:g} kHz, counting included)\n")
+    print_machine(out, report.machine)
+    out.print(f"memory read, one thread: {report.memory_read_gb_per_s:.1f} GB/s")
     order = list(_TITLES)
     rows = sorted(report.rows, key=lambda row: (order.index(row.stage), row.window, row.exposures or 0, row.threads))
     for stage, group in groupby(rows, key=lambda row: row.stage):
-        console.print(f"\n[bold]{stage}[/bold]: {_TITLES[stage]}")
-        console.print(_table(group))
+        out.print(f"\n[bold]{stage}[/bold]: {_TITLES[stage]}")
+        out.print(_table(_SPEED, group, apart=2))
     latency = report.latency_us
-    console.print(
+    out.print(
         f"\nlatency of a column's estimate: median {latency.median:.0f} us, 99.9 % {latency.p999:.0f} us, "
         f"most {latency.max:.0f} us"
     )
-    console.print("(from its last frame on, waiting for its block of 5 ms to fill included)")
+    out.print("(from its last frame on, waiting for its block of 5 ms to fill included)")
     if not latency.kept_up:
-        console.print("the estimate did not keep up with 100 kHz: this is the latency of a full ring")
-    console.print(f"measured in {report.seconds:.0f} s")
+        out.print("the estimate did not keep up with 100 kHz: this is the latency of a full ring")
+    out.print(f"measured in {report.seconds:.0f} s")
 
 
 def soak_table(report: SoakReport) -> None:
     """Print the result of a soak to stdout."""
-    console = Console(highlight=False, width=BENCH_WIDTH)
-    table = Table.grid(padding=(0, 2))
-    table.add_column(style="bold")
-    table.add_column()
     frames, stages = report.frames, report.stages
-    added = "adds up" if frames.agree else "does NOT add up"
-    table.add_row("stream", f"{report.seconds:.1f} s of frames {report.frame_width} pixels wide")
-    table.add_row(
-        "frames",
-        f"{frames.exposed} exposed, {frames.received} received, {frames.lost} lost: {added}",
-    )
-    table.add_row(
-        "in sweeps",
-        f"{frames.expected_in_sweeps} expected, {frames.received_in_sweeps} received, {frames.lost_in_sweeps} lost",
-    )
-    table.add_row("maps", f"{report.maps} of {report.maps_planned}, real time x {_figure(report.times_real_time)}")
-    table.add_row(
-        "ring",
-        f"{stages.ring_high_water} of {stages.ring_slots} slots used at most, {stages.dropped_blocks} blocks dropped",
-    )
-    table.add_row("source", f"{1e3 * report.source_late_max_s:.1f} ms late at most")
+    sums = f"{frames.received_in_sweeps} received, {frames.lost_in_sweeps} lost"
+    pairs = [
+        ("stream", f"{report.seconds:.1f} s of frames {report.frame_width} pixels wide"),
+        (
+            "frames",
+            f"{frames.exposed} exposed, {frames.received} received, {frames.lost} lost: "
+            + ("adds up" if frames.agree else "does NOT add up"),
+        ),
+        ("in sweeps", f"{frames.expected_in_sweeps} expected, {sums}"),
+        ("maps", f"{report.maps} of {report.maps_planned}, real time x {_number(report.times_real_time)}"),
+        (
+            "ring",
+            f"{stages.ring_high_water} of {stages.ring_slots} slots used at most, "
+            f"{stages.dropped_blocks} blocks dropped",
+        ),
+        ("source", f"{1e3 * report.source_late_max_s:.1f} ms late at most"),
+    ]
     if report.resident_growth is not None and report.resident_end_bytes is not None:
-        table.add_row(
-            "memory", f"{report.resident_end_bytes / 1e6:.0f} MB at the end, {report.resident_growth:+.2%} since 10 %"
-        )
-    table.add_row("overload", f"{report.on_overload}, consumer slowed by {report.slow_consumer_ms:g} ms a map")
-    if report.ended_by is not None:
-        table.add_row("ended by", report.ended_by)
-    console.print(table)
+        grown = f"{report.resident_end_bytes / 1e6:.0f} MB at the end, {report.resident_growth:+.2%} since 10 %"
+        pairs.append(("memory", grown))
+    pairs.append(("overload", f"{report.on_overload}, consumer slowed by {report.slow_consumer_ms:g} ms a map"))
+    pairs += [] if report.ended_by is None else [("ended by", report.ended_by)]
+    _print_pairs(pairs, BENCH_WIDTH)
 
 
 def print_machine(console: Console, found: dict[str, object]) -> None:
@@ -374,48 +388,12 @@ def print_machine(console: Console, found: dict[str, object]) -> None:
     console.print(f"Python {found['python']}, numpy {found['numpy']}, numba {found['numba']}")
 
 
-def _table(rows: Iterable[SpeedRow]) -> Table:
-    table = Table(box=None, pad_edge=False, padding=(0, 2, 0, 0))
-    for name in (
-        "window", "K", "threads", "kframes/s", "real time", "of memory", "x numpy", "error px", "median px", "ms/map",
-        "x sgbm",
-    ):  # fmt: skip
-        table.add_column(name, justify="right", no_wrap=True)
-    for row in rows:
-        table.add_row(
-            str(row.window),
-            "-" if row.exposures is None else str(row.exposures),
-            str(row.threads),
-            "-" if row.frames_per_s is None else f"{row.frames_per_s / 1e3:.4g}",
-            "-" if row.times_real_time is None else f"{row.times_real_time:.2f}",
-            _figure(row.of_memory_bandwidth, 2),
-            _figure(row.times_numpy),
-            _figure(row.error_px),
-            _figure(row.median_error_px),
-            _figure(row.ms_per_map),
-            _figure(row.times_sgbm, 2),
-        )
-    return table
-
-
-def _figure(value: float | None, digits: int = 3) -> str:
-    return "-" if value is None else f"{value:.{digits}g}"
-
-
 def print_result(result: "CalibrationResult | PixelResult", line: str = "") -> None:
     """Print the verdict and its reasons, the one line, the figures and the files to stdout."""
-    table = Table.grid(padding=(0, 2))
-    table.add_column(style="bold")
-    table.add_column()
-    table.add_row("verdict", "passed" if result.verdict.passed else "failed")
-    for reason in result.verdict.reasons:
-        table.add_row("", str(reason))
-    if line:
-        table.add_row("in short", line)
-    for name, text in result.rows():
-        table.add_row(name, text)
-    if result.calibration is not None:
-        table.add_row("calibration", str(result.calibration))
-    if result.folder is not None:
-        table.add_row("report", str(result.folder / "report.html"))
-    console().print(table)
+    pairs = [("verdict", "passed" if result.verdict.passed else "failed")]
+    pairs += [("", str(reason)) for reason in result.verdict.reasons]
+    pairs += [("in short", line)] if line else []
+    pairs += result.rows()
+    pairs += [] if result.calibration is None else [("calibration", str(result.calibration))]
+    pairs += [] if result.folder is None else [("report", str(result.folder / "report.html"))]
+    _print_pairs(pairs)

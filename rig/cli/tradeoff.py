@@ -1,25 +1,15 @@
 """The command that finds what accuracy costs in time, and which setting to use: `rig tradeoff`."""
 
-import typer
-
-from rig.cli.command import EXIT_ABORTED, ConfigArgument, JsonOption, asks, command, print_json, say
+from rig.cli.command import EXIT_ABORTED, Commands, ConfigArgument, JsonOption, api, asks, print_json, say
 from rig.cli.progress import progress
 from rig.requests import TradeoffRequest
 
 
-def register(app: typer.Typer) -> None:
-    """Add the command to `app`."""
-    app.command("tradeoff")(tradeoff_command)
-
-
-@command
 @asks(TradeoffRequest)
 def tradeoff_command(
     request: TradeoffRequest, config: ConfigArgument = "simulated", as_json: JsonOption = False
 ) -> int:
     """Scan a simulated rig with many settings: error over sensor time and compute time, and which setting to use."""
-    from rig import api
-
     with progress():
         done = api.tradeoff(config, request)
     if as_json:
@@ -38,3 +28,6 @@ def tradeoff_command(
             "raise --exposures")  # fmt: skip
         return 1
     return 0 if done.answer.fits else 1
+
+
+COMMANDS: Commands = {"tradeoff": tradeoff_command}

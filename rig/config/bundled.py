@@ -6,7 +6,6 @@ Light to import: shells ask for the names at every Tab.
 import re
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
 
 BUNDLED = Path(__file__).parents[2] / "config"
 """Folder of the configs that travel with the program."""
@@ -22,14 +21,12 @@ class Bundled:
     about: str
     file: Path
 
-    def as_json(self) -> dict[str, Any]:
-        """Return it as plain values."""
-        return {"name": self.name, "about": self.about, "file": str(self.file)}
-
 
 def bundled_rigs() -> tuple[Bundled, ...]:
     """The rigs that a command takes by name as CONFIG, sorted."""
-    return tuple(_bundled(path) for path in _by_name(BUNDLED) if _is_rig(path))
+    # Boards and calibrations lie in the same folder.
+    is_rig = re.compile(r"^scan:", re.MULTILINE).search
+    return tuple(_bundled(path) for path in _by_name(BUNDLED) if is_rig(path.read_text(encoding="utf-8")))
 
 
 def bundled_scenes() -> tuple[Bundled, ...]:
@@ -49,8 +46,3 @@ def _bundled(path: Path) -> Bundled:
         comment.append(line.removeprefix("#").strip())
     first = re.match(r".*?\.(?=\s|$)", " ".join(comment))
     return Bundled(path.stem, first.group() if first else "", path)
-
-
-def _is_rig(path: Path) -> bool:
-    """Whether a file is a rig's config; boards and calibrations lie in the same folder."""
-    return re.search(r"^scan:", path.read_text(encoding="utf-8"), re.MULTILINE) is not None

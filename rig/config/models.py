@@ -184,7 +184,7 @@ def _of_slot(slot: str) -> BeforeValidator:
         if isinstance(value, KindConfig):
             value = value.model_dump(mode="json")
         if not isinstance(value, dict):
-            raise ValueError(f"is {value!r}; it must be a mapping that names a kind, e.g. {{kind: {_a_kind(slot)}}}")
+            raise ValueError(f"is {value!r}; it must be a mapping that names a kind of: {', '.join(kinds(slot))}")
         if "kind" not in value:
             raise ValueError(f"has no 'kind'; add one of: {', '.join(kinds(slot))}")
         try:
@@ -194,10 +194,6 @@ def _of_slot(slot: str) -> BeforeValidator:
         return kind.config.model_validate(value, context=info.context)
 
     return BeforeValidator(validate)
-
-
-def _a_kind(slot: str) -> str:
-    return next(iter(kinds(slot)), "simulated")
 
 
 def _beside_config(value: Path | None, info: ValidationInfo) -> Path | None:

@@ -86,7 +86,7 @@ def open_rig(config: RigConfig, seed: int = 0, tap: TapFile | None = None) -> It
 def open_light(config: RigConfig, trouble: list[str]) -> Iterator[tuple[SyncSource | None, LineLaser | None]]:
     """Open the gate and the laser alone, without a guard; None, with a line in `trouble`, for one that fails."""
     with ExitStack() as stack:
-        surroundings = _surroundings(config, 0, stack)
+        surroundings = surroundings_of(config, 0, stack)
         opened: dict[str, Any] = {"sync": None, "laser": None}
         for slot in GUARDED:
             try:
@@ -145,13 +145,13 @@ def _open(config: RigConfig, seed: int, tap: TapFile | None, stack: ExitStack) -
 def _create_surroundings(config: RigConfig, seed: int, stack: ExitStack, problems: list[str]) -> Surroundings | None:
     """Clock and world; None where the world cannot be made, with lines in `problems`."""
     try:
-        return _surroundings(config, seed, stack)
+        return surroundings_of(config, seed, stack)
     except DeviceError as error:  # a scene that is not there is the config's fault, not a device's
         problems += [f"world: {line}" for line in str(error).splitlines()]
         return None
 
 
-def _surroundings(config: RigConfig, seed: int, stack: ExitStack) -> Surroundings:
+def surroundings_of(config: RigConfig, seed: int, stack: ExitStack) -> Surroundings:
     """Clock and world of the config, with the devices that the world plugs in. DeviceError where it cannot be made."""
     virtual = config.world is not None and not config.world.real_time
     clock = VirtualClock() if virtual else SystemClock()
@@ -223,13 +223,13 @@ def _pause_if_emitting(laser: LineLaser) -> list[str]:
 
 def require_simulated_or_armed(config: RigConfig, arm: bool) -> list[str]:
     """Problems with letting light out: every real laser and gate needs the user's word."""
-    real = [slot for slot in ("laser", "sync") if not _made_here(getattr(config, slot))]
+    devices = {slot: getattr(config, slot) for slot in GUARDED}
+    real = [
+        slot
+        for slot, device in devices.items()
+        if device.real_time and not str(getattr(device, "port", "")).startswith(EMULATED_PREFIX)
+    ]
     if arm or not real:
         return []
-    kinds = ", ".join(f"{slot} {getattr(config, slot).kind}" for slot in real)
+    kinds = ", ".join(f"{slot} {devices[slot].kind}" for slot in real)
     return [f"{config.name} has real light ({kinds}); clear the beam path, then add --arm"]
-
-
-def _made_here(device: KindConfig) -> bool:
-    """Whether a device shines no real light: simulated, or at a port that this process emulates."""
-    return not device.real_time or str(getattr(device, "port", "")).startswith(EMULATED_PREFIX)

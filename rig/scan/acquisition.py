@@ -10,7 +10,7 @@ from collections.abc import Callable, Generator, Iterator
 from dataclasses import dataclass, fields, replace
 from fractions import Fraction
 
-from drivers.clock import Clock, VirtualClock
+from drivers.clock import VirtualClock
 from drivers.errors import DeviceFault, DeviceTimeout
 from drivers.guard import GuardLimits
 from drivers.interfaces import SpadCounters, SpadTiming
@@ -26,9 +26,9 @@ from rig.plan.gate_pulses import sync_program
 from rig.plan.scan_plan import ScanPlan
 from rig.recording.writer import Recording
 from rig.run_folder.summary import PipelineStats
-from rig.scan.counting import AcquiredMap, MakesMaps
+from rig.scan.counting import AcquiredMap, CountingRequest, MakesMaps
 from rig.scan.monitor import NOBODY, Listeners, ScanProgress
-from rig.scan.pipeline import JOIN_S, Overload, Pipeline, PipelineRequest, require_policy, ring_for
+from rig.scan.pipeline import JOIN_S, Overload, Pipeline, require_policy, ring_for
 
 _log = logging.getLogger(__name__)
 
@@ -36,6 +36,7 @@ SILENCE_S = 5.0
 """A SPAD that sends nothing for this long, with the ring empty, has failed."""
 WARM_UP_S = 120.0
 """Longest wait for a laser to warm up."""
+WARM_LOOK_S = 0.2
 TELL_S = 0.1
 """Time from one report of progress to the next."""
 
@@ -150,12 +151,9 @@ class Acquisition:
         rig.sync.program(*sync_program(plan, sweeps))
         asked = self._asked
         ring = ring_for(asked.policy, rig.spad.info, plan, self._timing, keeps_time=asked.groups is not None)
-        pipeline = Pipeline(
-            rig.spad,
-            ring,
-            PipelineRequest(assembler, sweeps, self._maker, asked.silence_s, asked.recording, self._listeners),
-            on_frame=None if rig.guard is None else rig.guard.beat,
-        )
+        work = CountingRequest(assembler, sweeps, self._maker, asked.silence_s, self._listeners.sweeps)
+        on_frame = None if rig.guard is None else rig.guard.beat
+        pipeline = Pipeline(rig.spad, ring, work, asked.recording, self._listeners.monitor, on_frame)
         if rig.guard is not None:
             rig.guard.expect(self._guard_limits(sweeps))
             rig.spad.on_wait = rig.guard.wait
@@ -170,20 +168,21 @@ class Acquisition:
                 rig.sync.run()
                 rig.scanner.start()
                 pipeline.start()
-                while pipeline.streaming:
-                    if (found := pipeline.take_streaming(TELL_S)) is not None:
+                while pipeline.maps.streaming:
+                    if (found := pipeline.maps.take_streaming(TELL_S)) is not None:
                         self._fog = found.result.fog
                         yield found
                     if rig.guard is not None and rig.guard.failure is not None:
                         pipeline.end_source(rig.guard.failure)  # the SPAD may be what is silent: not waited for
                         break
-                    self._check_scanner()
+                    if (fault := rig.scanner.status.fault) is not None:  # frames would go on without markers
+                        raise DeviceFault(fault)
                     self._tell(assembler, done)
             finally:
                 trouble = self._make_safe(pipeline)
             # Nothing moves or shines any more: what was received is still counted and estimated.
-            while not pipeline.drained:
-                if (found := pipeline.take_rest(TELL_S)) is not None:
+            while not pipeline.maps.drained:
+                if (found := pipeline.maps.take_rest(TELL_S)) is not None:
                     self._fog = found.result.fog
                     yield found
                 self._tell(assembler, done)
@@ -228,12 +227,6 @@ class Acquisition:
             self._pipeline = None
         self._frames_before += assembler.frames_seen
 
-    def _check_scanner(self) -> None:
-        """Raise DeviceFault where the mirror has stopped early: frames would go on without markers."""
-        fault = self._rig.scanner.status.fault
-        if fault is not None:
-            raise DeviceFault(fault)
-
     def _tell(self, assembler: SweepAssembler, done: int) -> None:
         planned = self._frames_before + math.ceil(self._plan.frames_for(self._asked.maps - done))
         frames, sweeps = min(self._frames_before + assembler.frames_seen, planned), done + assembler.sweeps_done
@@ -254,9 +247,14 @@ class Acquisition:
     def _arm(self) -> None:
         """Arm the laser behind a gate that reads back low and wait for it; a started SPAD would overflow meanwhile."""
         self._rig.sync.gate_low()
-        power_w = self._rig.config.scan.power
-        self._rig.laser.arm(self._rig.laser.limits.max_power_w if power_w is None else power_w)
-        _wait_until_warm(self._rig, self._rig.clock)
+        laser, power_w = self._rig.laser, self._rig.config.scan.power
+        laser.arm(laser.limits.max_power_w if power_w is None else power_w)
+        waited_s = 0.0
+        while laser.status.warming_up:  # 'armed' does not mean 'light'
+            if waited_s >= WARM_UP_S:
+                raise DeviceTimeout(f"{laser.name} is still warming up after {WARM_UP_S:g} s; wait and start again")
+            self._rig.clock.sleep(WARM_LOOK_S)
+            waited_s += WARM_LOOK_S
 
     def _make_safe(self, pipeline: Pipeline) -> list[str]:
         """Gate low, no more frames taken, laser paused, mirror parked, SPAD stopped: in this order, each one always."""
@@ -283,16 +281,6 @@ class Acquisition:
         if interrupted is not None:
             raise interrupted
         return trouble
-
-
-def _wait_until_warm(rig: OpenRig, clock: Clock) -> None:
-    """Wait while the laser says that it warms up: 'armed' does not mean 'light'."""
-    waited_s = 0.0
-    while rig.laser.status.warming_up:
-        if waited_s >= WARM_UP_S:
-            raise DeviceTimeout(f"{rig.laser.name} is still warming up after {WARM_UP_S:g} s; wait and start again")
-        clock.sleep(0.2)
-        waited_s += 0.2
 
 
 def added_counters(before: SpadCounters, now: SpadCounters) -> SpadCounters:

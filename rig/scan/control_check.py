@@ -8,9 +8,8 @@ mirror was parked.
 
 import statistics
 from collections.abc import Sequence
-from dataclasses import asdict, dataclass
+from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
 
 from drivers.recorded.control_words import Spoken
 from drivers.transports.tap import Passed, read_taps
@@ -34,10 +33,6 @@ class ControlCheck:
     swaps: int
     worst_swap_s: float
     problems: tuple[str, ...]
-
-    def as_json(self) -> dict[str, Any]:
-        """Return it as plain values."""
-        return asdict(self)
 
     def __str__(self) -> str:
         """Say in one line what was compared."""

@@ -38,60 +38,60 @@ class AcquiredMap:
 
 
 class MapQueue:
-    """At most `room` maps that wait for the caller. One thread puts, one takes; any may end the stream."""
+    """At most `room` maps that wait for the caller. One thread puts, one takes; any may end the stream.
+
+    streaming: whether the rig still has to be kept running.
+    closed: whether nobody will take maps any more.
+    high_water: most maps that waited at one time.
+    """
 
     def __init__(self, room: int) -> None:
         self.room = room
         self.high_water = 0
-        """Most maps that waited at one time."""
+        self.streaming = True
+        self.closed = False
         self._maps: deque[AcquiredMap] = deque()
         self._changed = threading.Condition()
-        self._streaming = True
         self._ended = False
-        self._closed = False
-
-    @property
-    def streaming(self) -> bool:
-        """Whether the rig still has to be kept running."""
-        return self._streaming
 
     @property
     def drained(self) -> bool:
         """Whether every map was taken and none will come."""
         return self._ended and not self._maps
 
-    @property
-    def closed(self) -> bool:
-        """Whether nobody will take maps any more."""
-        return self._closed
-
     def put(self, found: AcquiredMap) -> None:
         """Add a map, once there is room. In a closed queue the map is dropped."""
         with self._changed:
-            self._changed.wait_for(lambda: len(self._maps) < self.room or self._closed)
+            self._changed.wait_for(lambda: len(self._maps) < self.room or self.closed)
             self._maps.append(found)
             self.high_water = max(self.high_water, len(self._maps))
             self._changed.notify_all()
 
     def end_stream(self) -> None:
         """Say that the rig can be made safe: all frames are there, or something failed. Maps may still come."""
-        self._set("_streaming", False)
+        with self._changed:
+            self.streaming = False
+            self._changed.notify_all()
 
     def end(self) -> None:
         """Say that no more maps will come."""
-        self._set("_ended", True)
+        with self._changed:
+            self.streaming, self._ended = False, True
+            self._changed.notify_all()
 
     def close(self) -> None:
         """Say that nobody takes maps any more, which frees a thread that waits to put one."""
-        self._set("_closed", True)
+        with self._changed:
+            self.closed = True
+            self._changed.notify_all()
 
     def take_streaming(self, timeout_s: float) -> AcquiredMap | None:
         """The next map; None after `timeout_s`, or at once when the stream is over: the rig is made safe first."""
-        return self._take(timeout_s, lambda: not self._streaming)
+        return self._take(timeout_s, lambda: not self.streaming)
 
     def take_rest(self, timeout_s: float) -> AcquiredMap | None:
         """The next map; None after `timeout_s`, or at once where none will come."""
-        return self._take(timeout_s, lambda: self._ended and not self._maps)
+        return self._take(timeout_s, lambda: self.drained)
 
     def _take(self, timeout_s: float, over: Callable[[], bool]) -> AcquiredMap | None:
         with self._changed:
@@ -101,11 +101,6 @@ class MapQueue:
             found = self._maps.popleft()
             self._changed.notify_all()
             return found
-
-    def _set(self, name: str, value: bool) -> None:
-        with self._changed:
-            setattr(self, name, value)
-            self._changed.notify_all()
 
 
 class MakesMaps(Protocol):
@@ -120,6 +115,21 @@ class MakesMaps(Protocol):
         ...
 
 
+@dataclass(frozen=True, slots=True)
+class CountingRequest:
+    """The work of one start of the SPAD.
+
+    assembler: takes `sweeps` sweeps. maker: makes their maps. silence_s: longest silence of the SPAD. on_sweep: called
+    on the counting thread with each counted sweep before its map is made.
+    """
+
+    assembler: SweepAssembler
+    sweeps: int
+    maker: MakesMaps
+    silence_s: float
+    on_sweep: Callable[[SweepData], None] | None = None
+
+
 class CountingThread:
     """Thread that counts the blocks of one start of the SPAD and estimates each sweep where it ends.
 
@@ -127,8 +137,6 @@ class CountingThread:
 
     on_complete: called on this thread as soon as the marker that closes the last sweep is counted; the last map is
       estimated after that.
-    on_sweep: called on this thread with each counted sweep before its map is made.
-    sweeps: how many there will be.
 
     Maps go to `queue`, which ends with this thread; `error` says why, where it ended too early.
     """
@@ -136,24 +144,16 @@ class CountingThread:
     def __init__(
         self,
         reader: RingReader,
-        assembler: SweepAssembler,
-        sweeps: int,
-        maker: MakesMaps,
+        request: CountingRequest,
         queue: MapQueue,
         source: Source,
-        silence_s: float,
         on_complete: Callable[[], None],
-        on_sweep: Callable[[SweepData], None] | None = None,
     ) -> None:
         self._reader = reader
-        self._assembler = assembler
-        self._sweeps = sweeps
-        self._maker = maker
+        self._asked = request
         self._queue = queue
         self._source = source
-        self._silence_s = silence_s
         self._on_complete = on_complete
-        self._on_sweep = on_sweep
         self._thread = StageThread(self._run, "counting")
         self.counting_s = 0.0
         self.estimation_s = 0.0
@@ -179,25 +179,25 @@ class CountingThread:
                 finally:
                     # Threads may still be at work on blocks whose slots go back now.
                     with suppress(Exception):
-                        self._assembler.settle(0)
+                        self._asked.assembler.settle(0)
         except BaseException as error:  # raised again on the caller's thread
             self.error = error
-        self._queue.end_stream()
         self._queue.end()
 
     def _count(self) -> None:
-        for block in blocks(self._reader, self._source, self._silence_s):
-            sweeps = self._assembler.add(block)
+        assembler = self._asked.assembler
+        for block in blocks(self._reader, self._source, self._asked.silence_s):
+            sweeps = assembler.add(block)
             while (sweep := self._next(sweeps)) is not None:
-                if self._assembler.complete:
+                if assembler.complete:
                     self._reader.close()
                     self._on_complete()
                 self._estimate(sweep)
-            if self._assembler.complete or self._queue.closed:
+            if assembler.complete or self._queue.closed:
                 return
             self._settle()
         raise DeviceFault(
-            f"{self._source.name}: the stream ended after {self._assembler.sweeps_done} of {self._sweeps} sweeps, "
+            f"{self._source.name}: the stream ended after {assembler.sweeps_done} of {self._asked.sweeps} sweeps, "
             "without the scan marker that closes the last one; check the scanner and its marker line"
         )
 
@@ -210,15 +210,15 @@ class CountingThread:
 
     def _settle(self) -> None:
         begun = time.perf_counter()
-        self._assembler.settle(self._reader.holds - 1)
+        self._asked.assembler.settle(self._reader.holds - 1)
         self.counting_s += time.perf_counter() - begun
 
     def _estimate(self, sweep: SweepData) -> None:
         begun = time.perf_counter()
         self.estimating = True
-        if self._on_sweep is not None:
-            self._on_sweep(sweep)
-        result = self._maker.map(sweep.volume)
+        if self._asked.on_sweep is not None:
+            self._asked.on_sweep(sweep)
+        result = self._asked.maker.map(sweep.volume)
         self.estimating = False
         column = sweep.volume.bound_column()
         found = AcquiredMap(sweep.account(), column, result, sweep.count_s + result.compute_s)

@@ -53,7 +53,7 @@ class MonitorView:
         return profile
 
 
-MonitorCallback = Callable[[MonitorView], None]
+MonitorCallback = Callable[[MonitorView], object]
 
 
 @dataclass(frozen=True, slots=True)

@@ -9,18 +9,17 @@ that the policy asks for.
 """
 
 from collections.abc import Callable
-from dataclasses import dataclass
 from enum import StrEnum
 
 from drivers.interfaces import SpadArray, SpadInfo, SpadTiming
 from drivers.ring import BlockRing, OnFull
-from rig.count.sweeps import MOST_UNDER_WAY, SweepAssembler
+from rig.count.sweeps import MOST_UNDER_WAY
 from rig.errors import RecordingError, UsageError
 from rig.plan.scan_plan import ScanPlan
 from rig.recording.writer import WRITERS, Recorder, Recording
 from rig.run_folder.summary import PipelineStats
-from rig.scan.counting import AcquiredMap, CountingThread, MakesMaps, MapQueue
-from rig.scan.monitor import NOBODY, Listeners, Monitor
+from rig.scan.counting import CountingRequest, CountingThread, MapQueue
+from rig.scan.monitor import Monitor, MonitorCallback
 from rig.scan.source import Source
 
 MAPS_AHEAD = 2
@@ -35,69 +34,35 @@ MONITOR_S = 0.5
 """Longest wait for the monitor's callback at the end."""
 
 
-@dataclass(frozen=True, slots=True)
-class PipelineRequest:
-    """The work of one start of the SPAD.
-
-    assembler: takes `sweeps` sweeps. maker: makes their maps, on the counting thread. silence_s: longest silence of the
-    SPAD. recording: takes every block; None is no recorder.
-    """
-
-    assembler: SweepAssembler
-    sweeps: int
-    maker: MakesMaps
-    silence_s: float
-    recording: Recording | None = None
-    listeners: Listeners = NOBODY
-
-
 class Pipeline:
     """The threads of one start of the SPAD: source -> ring -> {counting + estimation, recorder, monitor} -> maps.
 
-    on_frame: as in `Source`.
+    recording: takes every block; None is no recorder. on_frame: as in `Source`.
     """
 
     def __init__(
         self,
         spad: SpadArray,
         ring: BlockRing,
-        request: PipelineRequest,
+        work: CountingRequest,
+        recording: Recording | None = None,
+        monitor: MonitorCallback | None = None,
         on_frame: Callable[[int], None] | None = None,
     ) -> None:
         self._ring = ring
-        self._queue = MapQueue(MAPS_AHEAD)
-        self._source = Source(spad, ring, request.silence_s, self._queue.end_stream, on_frame)
-        recording, monitor = request.recording, request.listeners.monitor
-        self._counting = CountingThread(
-            ring.reader("counting", holds=max(1, min(MOST_UNDER_WAY, ring.slots // 4))),
-            request.assembler,
-            request.sweeps,
-            request.maker,
-            self._queue,
-            self._source,
-            request.silence_s,
-            on_complete=self._complete,
-            on_sweep=request.listeners.sweeps,
-        )
+        self.maps = MapQueue(MAPS_AHEAD)
+        self._source = Source(spad, ring, work.silence_s, self.maps.end_stream, on_frame)
+        reader = ring.reader("counting", holds=max(1, min(MOST_UNDER_WAY, ring.slots // 4)))
+        self._counting = CountingThread(reader, work, self.maps, self._source, self._complete)
         self._recorder: Recorder | None = None
         if recording is not None:
             reader = ring.reader("recorder", holds=max(1, min(WRITERS, ring.slots // 4)))
-            self._recorder = Recorder(reader, recording, self._queue.end_stream)
+            self._recorder = Recorder(reader, recording, self.maps.end_stream)
         self._monitor: Monitor | None = None
         if monitor is not None:
             self._monitor = Monitor(ring.reader("monitor", required=False), monitor, self.stats)
         self.monitor_lost = False
         """Whether the monitor's callback raised or was left behind: it must not be called again."""
-
-    @property
-    def streaming(self) -> bool:
-        """Whether the rig still has to be kept running: frames are missing and nothing failed."""
-        return self._queue.streaming
-
-    @property
-    def drained(self) -> bool:
-        """Whether every map was taken and none will come."""
-        return self._queue.drained
 
     @property
     def estimating(self) -> bool:
@@ -118,8 +83,8 @@ class Pipeline:
             counting_s=counting.counting_s,
             estimation_s=counting.estimation_s,
             map_wait_s=counting.wait_s,
-            map_queue=self._queue.room,
-            map_queue_high_water=self._queue.high_water,
+            map_queue=self.maps.room,
+            map_queue_high_water=self.maps.high_water,
             recorder_s=None if recorder is None else recorder.busy_s,
             recorder_blocks=None if recorder is None else recorder.blocks,
             recorder_bytes=None if recorder is None else recorder.bytes,
@@ -135,14 +100,6 @@ class Pipeline:
         if self._monitor is not None:
             self._monitor.start()
         self._source.start()
-
-    def take_streaming(self, timeout_s: float) -> AcquiredMap | None:
-        """The next map; None after `timeout_s`, and at once when the rig can be made safe, which comes first."""
-        return self._queue.take_streaming(timeout_s)
-
-    def take_rest(self, timeout_s: float) -> AcquiredMap | None:
-        """The next map from what is left in the ring; None after `timeout_s`, and at once when none will come."""
-        return self._queue.take_rest(timeout_s)
 
     def end_source(self, why: BaseException | None = None) -> None:
         """Stop filling the ring; returns at once. why: error that the readers get behind the last block."""
@@ -168,7 +125,7 @@ class Pipeline:
         """End all threads, whatever they are doing. Maps not taken are gone; what is left in the ring is recorded."""
         try:
             self._source.end()
-            self._queue.close()
+            self.maps.close()
             if self._monitor is not None:
                 self.monitor_lost = not self._monitor.end(MONITOR_S) or self._monitor.failed
             self._counting.join(LEAVE_S)
@@ -179,7 +136,7 @@ class Pipeline:
     def _complete(self) -> None:
         """End the source when all frames are there: the ring must not fill up while the last map is estimated."""
         self._source.end()
-        self._queue.end_stream()
+        self.maps.end_stream()
 
 
 RING_BYTES = 512 * 2**20

@@ -11,6 +11,7 @@ from typing import Any
 
 from drivers.errors import DeviceError
 from drivers.interfaces import SpadTiming, SweepTruth
+from rig.config.models import EstimateConfig
 from rig.count.sweeps import SweepAccount
 from rig.depth.reconstruct import Reconstructor
 from rig.depth.warm_up import warm_binding, warm_up
@@ -59,7 +60,7 @@ def run_scan(
     replayed = ReplaySource.of(rig.spad, plan, maps)
     maps = maps or 1 if replayed is None else replayed.maps
     recalled = () if replayed is None else replayed.learned(rig.config.estimate, rig.model)
-    reconstructor = make_reconstructor(rig, plan, recalled)
+    reconstructor = make_reconstructor(rig, plan, learned=recalled)
     geometry = reconstructor.geometry
     run.rays = geometry.rays if rig.model is not None else None
 
@@ -155,9 +156,11 @@ def _first_alone(rig: OpenRig) -> bool:
     return rig.config.estimate.estimator in LEARNING and not rig.spad.info.can_wait
 
 
-def make_reconstructor(rig: OpenRig, plan: ScanPlan, learned: Sequence[Learned] = ()) -> Reconstructor:
-    """Make the reconstructor for the maps of a plan, as the config says."""
-    estimate, sensor = rig.config.estimate, (plan.rows, plan.width)
+def make_reconstructor(
+    rig: OpenRig, plan: ScanPlan, estimate: EstimateConfig | None = None, learned: Sequence[Learned] = ()
+) -> Reconstructor:
+    """Make the reconstructor for the maps of a plan. estimate: its settings, where they are not those of the config."""
+    estimate, sensor = estimate or rig.config.estimate, (plan.rows, plan.width)
     return Reconstructor(
         rig.model, plan.commands, plan.depth_range_m, estimate, sensor=sensor, learned=learned, lines=plan.lines
     )

@@ -15,8 +15,6 @@ from rig.errors import UsageError
 from rig.tradeoff.rows import Clock, TradeoffRow, TrialSetting
 
 _PIXELS = re.compile(r"\s*(\d+\.?\d*(?:[eE][+-]?\d{1,3})?|\.\d+)\s*px\s*", re.ASCII)
-
-
 WORTH = 1.5
 """Factor on the least error of all: what a longer scan would still gain is not worth its time to most users."""
 
@@ -129,21 +127,14 @@ def advice(rows: Sequence[TradeoffRow], wish: Wish | None, answer: Choice | None
     least of all. answer: the choice for the wish.
     """
     if wish is not None and answer is not None:
-        return f"take {_named(answer)}, the best for {wish}" if answer.fits else str(answer)
+        return f"take {answer.setting}: {answer.figures}, the best for {wish}" if answer.fits else str(answer)
     least = choose(rows, Wish(error_px=0.0))
     if least is None:
         return "no setting can be named: every one leaves more than 5 % of the answers out; raise --exposures"
     found = choose(rows, Wish(error_px=WORTH * least.mean_abs_px))
     assert found is not None, "the one with the least error fits"
     why = f"the shortest scan within {WORTH:g} times the least error, {digits(least.mean_abs_px)} px"
-    return f"take {_named(found)}; {why}"
-
-
-def _named(answer: Choice) -> str:
-    setting = answer.setting
-    filtered = "" if setting.filter == "none" else f" + {setting.filter}"
-    lines = "" if setting.lines == 1 else f" and {setting.lines} lines"
-    return f"K = {setting.exposures} with {setting.estimator}{filtered}{lines}: {answer.figures}"
+    return f"take {found.setting}: {found.figures}; {why}"
 
 
 def _answer(wish: Wish, setting: TrialSetting, rows: Sequence[TradeoffRow]) -> Choice:

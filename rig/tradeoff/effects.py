@@ -1,24 +1,27 @@
 """Tells which physical effects a simulated scene calls for, as its world says, and measures what each is worth."""
 
 from collections.abc import Iterator, Mapping
-from contextlib import ExitStack, closing, contextmanager
-from dataclasses import asdict, dataclass, replace
+from contextlib import ExitStack, contextmanager
+from dataclasses import dataclass, replace
 from typing import Any, Literal, Protocol, runtime_checkable
 
 import numpy as np
 from numpy.typing import NDArray
 
-from drivers.clock import VirtualClock
 from drivers.errors import DeviceError
 from drivers.interfaces import World
-from drivers.registry import Surroundings, lookup
+from drivers.registry import lookup
 from rig.config.models import RigConfig
-from rig.devices.open import ProjectsLines
+from rig.devices.open import DEVICES, open_rig, surroundings_of
 from rig.errors import PlanError, UsageError
 from rig.geometry.line_grid import line_grid
 from rig.geometry.stripe_table import MISSING_PX, charged_errors
 from rig.plan.scan_plan import column_command
 from rig.progress import Progress, part
+from rig.requests import RunRequest
+from rig.run_folder.summary import MapTally
+from rig.scan.run import Run
+from rig.scan.scan import run_scan
 
 Array = NDArray[np.float64]
 Flux = dict[str, NDArray[Any]]
@@ -78,10 +81,6 @@ class Effect:
     stripe_error_change_sd_px: float | None = None
     basis: Literal["trial", "bound"] | None = None
 
-    def as_json(self) -> dict[str, Any]:
-        """Return it as plain values."""
-        return asdict(self)
-
 
 @dataclass(frozen=True, slots=True)
 class SceneEffects:
@@ -98,10 +97,6 @@ class SceneEffects:
     def __iter__(self) -> Iterator[Effect]:
         """The effects."""
         return iter(self.effects)
-
-    def as_json(self) -> dict[str, Any]:
-        """Return it as plain values."""
-        return asdict(self)
 
 
 def scene_effects(config: RigConfig, *, trials: bool = True, progress: Progress | None = None) -> SceneEffects:
@@ -158,22 +153,18 @@ def open_world(config: RigConfig) -> Iterator[tuple[ReportsEffects, float]]:
     """Open the config's world with its simulated devices, planned for its scan; also gives the scan's power in W."""
     if config.world is None:
         raise UsageError(f"{config.name} has no simulated world; name a config that has one, such as 'simulated'")
-    alone = Surroundings(VirtualClock(), None, 0)
     with ExitStack() as stack:
         try:
-            world: Any = lookup("world", config.world.kind).create(config.world, alone)
+            surroundings = surroundings_of(config, 0, stack)
         except DeviceError as error:  # a scene that is not there is the config's fault
             raise UsageError(f"world: {error}") from error
-        if isinstance(world, ProjectsLines):
-            world.project_lines(config.line_offsets, shared=config.line_power == "shared")
-        if hasattr(world, "close"):
-            stack.enter_context(closing(world))
+        world: Any = surroundings.world
         if not isinstance(world, ReportsEffects):
             raise UsageError(f"world {config.world.kind} says nothing of its effects")
-        for slot in ("spad", "scanner", "laser", "sync"):
+        for slot in DEVICES:
             device = getattr(config, slot)
             if not device.real_time:  # a simulated one tells the world what it does
-                stack.enter_context(lookup(slot, device.kind).create(device, replace(alone, world=world)))
+                stack.enter_context(lookup(slot, device.kind).create(device, surroundings))
         # As a scan does: the laser's limit. One that is not there states it in its config.
         power_w = getattr(config.laser, "max_power", None) if config.scan.power is None else config.scan.power
         if power_w is None:
@@ -221,12 +212,6 @@ def _trial(config: RigConfig, columns: int, names: list[str]) -> Array:
 
     An interrupt is raised again.
     """
-    from rig.devices.open import open_rig
-    from rig.requests import RunRequest
-    from rig.run_folder.summary import MapTally
-    from rig.scan.run import Run
-    from rig.scan.scan import run_scan
-
     assert config.world is not None, "there was a report"
     world = config.world.model_copy(update={"effects": tuple(names)})
     short = config.scan.model_copy(update={"columns": columns})

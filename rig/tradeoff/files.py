@@ -6,11 +6,9 @@ The picture shows error over sensor time and over compute time, a pair of panels
 import csv
 import io
 from collections.abc import Sequence
-from dataclasses import replace
+from dataclasses import asdict, replace
 
-import yaml
-
-from rig.config.files import portable_content
+from rig.config.files import config_text
 from rig.config.models import RigConfig
 from rig.run_folder.charts import Panel, Series, chart_svg
 from rig.run_folder.folder import RunFolder
@@ -33,7 +31,8 @@ def write_files(folder: RunFolder, done: Tradeoff, setting: RigConfig | None) ->
         comments = [f"rig tradeoff: {done.answer}"]
         if done.accepted_calibration:
             comments.append("its calibration was accepted all the same: scan with --accept-calibration")
-        folder.write_text(SETTING_FILE, config_text(setting, comments))
+        head = "".join(f"# {comment}\n" for comment in comments)
+        folder.write_text(SETTING_FILE, head + config_text(setting))
     return replace(done, folder=folder.publish())
 
 
@@ -42,7 +41,7 @@ def csv_text(rows: Sequence[TradeoffRow]) -> str:
     stream = io.StringIO()
     writer: csv.DictWriter[str] | None = None
     for row in rows:
-        content = row.as_json()
+        content = asdict(row)
         low, high = content.pop("ci95")
         line = {**content, "ci95_low": low, "ci95_high": high}
         if writer is None:
@@ -52,12 +51,6 @@ def csv_text(rows: Sequence[TradeoffRow]) -> str:
     return stream.getvalue()
 
 
-def config_text(config: RigConfig, comments: Sequence[str]) -> str:
-    """A config as a YAML file that every command takes, wherever it lies."""
-    head = "".join(f"# {comment}\n" for comment in comments)
-    return head + yaml.safe_dump(portable_content(config), sort_keys=False, allow_unicode=True)
-
-
 COLOURS = {"argmax": "#7b8896", "edge": "#d55e00", "likelihood": "#0072b2", "joint": "#009e73"}
 """Colours of estimators, which the colour-blind can tell apart (Okabe and Ito, 'Color universal design', 2008)."""
 OTHER_COLOUR = "#cc79a7"
@@ -65,10 +58,10 @@ OTHER_COLOUR = "#cc79a7"
 
 def tradeoff_svg(rows: Sequence[TradeoffRow], ci95_by: str) -> str:
     """Draw the SVG file. Rows with too many answers missing are left out."""
-    places = list(dict.fromkeys((row.scene, row.fog) for row in rows))
+    places = dict.fromkeys(row.place for row in rows)
     shown = [row for row in rows if row.counts]
     panels = [
-        _panel([row for row in shown if (row.scene, row.fog) == place], _named(*place), of)
+        _panel([row for row in shown if row.place == place], _named(*place), of)
         for place in places
         for of in ("sensor", "compute")
     ]

@@ -1,22 +1,11 @@
 """The statistical limit: the least error that any estimator can have on a scene, however well it knows the light.
 
 The ideal is told haze, ambient light, the line's width and how bright the stripe is, and asked only where it is. Where
-stripes are spread evenly over the search, no answer has a smaller mean |error| than the median of the posterior.
-`bayes_errors` draws counts and takes that median: the limit itself, no bound of it, within the noise of the draw, at 5
-ms a row for four numbers of exposures. Cramer-Rao's bound is too small wherever a rival may win.
-
-Neighbours on one surface say the same: M of them, of equal disparity and equally bright, count as M times the
-exposures. The gain of coupling neighbours is compared with that.
-
-`chernoff_exponent`, `least_exponent` and `position_sd_px` say how often at least, and by how much, a row's photons lead
-to the wrong position. B ~ Bernoulli(1 - exp(-flux)) per pixel and exposure, pixels independent, p and q = 1 - p of one
-position of the stripe, p' and q' of another:
-
-    C = max over t of -sum log(p^t p'^(1-t) + q^t q'^(1-t))     Chernoff, per exposure
-    P(k beats j) <= exp(-K C)                                   a bound at any K; as K grows, the true exponent
-    sd >= 1 / sqrt(K I), I = sum flux'^2 / (exp(flux) - 1)      Cramer-Rao, for answers without bias near the truth
-
-`SceneLimits` puts the limits beside the rows of a trade-off.
+stripes are spread evenly over the search, no answer has a smaller mean |error| than the median of the posterior, which
+`bayes_errors` takes of drawn counts, at 5 ms a row for four numbers of exposures. M neighbours on one surface count as
+M times the exposures. `chernoff_exponent` and `position_sd_px` say how often at least, and by how much, a row's photons
+lead to the wrong position; the formulas are in docs/explanation/limits.md. A pixel fires in an exposure with
+probability p = 1 - exp(-flux), all of them independently; q = 1 - p, and p', q' are those of another position.
 """
 
 import math
@@ -29,7 +18,7 @@ import numpy as np
 from rig.config.models import RigConfig
 from rig.errors import UsageError
 from rig.tradeoff.row_light import FLUX_MIN, Array, RowLight, scene_lights
-from rig.tradeoff.rows import LOCAL_PX, TradeoffRow
+from rig.tradeoff.rows import LOCAL_PX, Place, TradeoffRow
 
 
 def least_exponent(light: RowLight) -> float:
@@ -177,9 +166,6 @@ LEAST_WRONG = 0.003
 LOCAL_SDS = 3.0
 """Standard deviations that must fit into LOCAL_PX, so that answers within it are all that found the stripe."""
 
-Place = tuple[str, str | None]
-"""Scene and fog."""
-
 
 class SceneLimits:
     """Limits of scenes and fogs, each computed once. exposures: all that will be tried."""
@@ -196,13 +182,13 @@ class SceneLimits:
         """
         if len(config.line_offsets) > 1:
             return list(rows)
-        place = rows[0].scene, rows[0].fog
+        place = rows[0].place
         if place not in self._lights:
             self._lights[place] = self._lights_of(config)
         return [self._with_limit(row, place) for row in rows] if self._lights[place] else list(rows)
 
     def _with_limit(self, row: TradeoffRow, place: Place) -> TradeoffRow:
-        averaged = _averaged(row)
+        averaged = COUPLED_ROWS if row.estimator == COUPLED or row.filter == "median" else 1
         if (place, averaged) not in self._found:
             found = limits(self._lights[place], self._exposures, averaged=averaged)
             self._found[place, averaged] = {limit.exposures: limit for limit in found}
@@ -215,10 +201,6 @@ class SceneLimits:
             return scene_lights(config.model_copy(update={"scan": scan}), rows=ROWS)
         except UsageError:  # a scene whose stripe is nowhere whole can still be scored
             return ()
-
-
-def _averaged(row: TradeoffRow) -> int:
-    return COUPLED_ROWS if row.estimator == COUPLED or row.filter == "median" else 1
 
 
 def _beside(row: TradeoffRow, limit: StatisticalLimit) -> TradeoffRow:

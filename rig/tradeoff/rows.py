@@ -10,9 +10,9 @@ correlated, since filters and coupled estimators share them out; so whole blocks
 
 import math
 import statistics
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from dataclasses import asdict, dataclass, replace
-from typing import Any, Literal
+from typing import Literal
 
 import numpy as np
 from numpy.typing import NDArray
@@ -23,7 +23,8 @@ from rig.errors import UsageError
 from rig.geometry.stripe_table import MISSING_PX, depth_errors
 
 Interval = tuple[float, float]
-
+Place = tuple[str, str | None]
+"""Scene and fog."""
 
 MOST_MISSING = 0.05
 """Most true stripes without an answer, as a share, with which a figure counts."""
@@ -53,14 +54,14 @@ class TrialSetting:
         return f"{self.estimator}{filtered}, {self.exposures} exposure{'s' * (self.exposures != 1)}{lines}"
 
 
-@dataclass(frozen=True, slots=True, eq=False)
+@dataclass(frozen=True, slots=True)
 class MapScore:
     """Errors of one map against the world's truth, over every (row, column) with a true stripe, and its times.
 
     mean_abs_px: a missing answer counts as `MISSING_PX`.
     within_1px, missing: shares of the true stripes.
     sensor_ms, compute_ms: times of the map.
-    sums, numbers: of the blocks, see `blocks_of`.
+    ci95: confidence interval of mean_abs_px over blocks of the map.
     local_sd_px: standard deviation of the errors of answers within LOCAL_PX, from their median; None without any.
     """
 
@@ -70,8 +71,7 @@ class MapScore:
     depth_mm: float | None
     sensor_ms: float
     compute_ms: float
-    sums: NDArray[np.float64]
-    numbers: NDArray[np.int64]
+    ci95: Interval
     local_sd_px: float | None = None
 
 
@@ -123,6 +123,11 @@ class TradeoffRow:
         return self.missing <= MOST_MISSING
 
     @property
+    def place(self) -> Place:
+        """Scene and fog."""
+        return self.scene, self.fog
+
+    @property
     def setting(self) -> TrialSetting:
         """The setting of this row."""
         return TrialSetting(self.estimator, self.filter, self.exposures, self.lines)
@@ -130,10 +135,6 @@ class TradeoffRow:
     def time_ms(self, of: Clock) -> float:
         """Time of a map on the sensor or on the computer."""
         return self.sensor_ms if of == "sensor" else self.compute_ms
-
-    def as_json(self) -> dict[str, Any]:
-        """Return it as plain values."""
-        return asdict(self)
 
 
 def score_map(result: MapResult, truth: SweepTruth, sensor_ms: float, compute_ms: float) -> MapScore:
@@ -155,8 +156,7 @@ def score_map(result: MapResult, truth: SweepTruth, sensor_ms: float, compute_ms
         depth_mm=None if depth_m is None else 1e3 * depth_m,
         sensor_ms=sensor_ms,
         compute_ms=compute_ms,
-        sums=sums,
-        numbers=numbers,
+        ci95=blocks_interval(sums, numbers),
         local_sd_px=float(_SD_OF_MEDIAN * np.median(errors[near])) if near.any() else None,
     )
 
@@ -167,14 +167,10 @@ def row_of(scene: str, fog: str | None, setting: TrialSetting, scores: Sequence[
     errors = [score.mean_abs_px for score in scores]
     depths = [score.depth_mm for score in scores if score.depth_mm is not None]
     local = [score.local_sd_px for score in scores if score.local_sd_px is not None]
-    alone = scores[0]
     return TradeoffRow(
         scene=scene,
         fog=fog,
-        estimator=setting.estimator,
-        filter=setting.filter,
-        exposures=setting.exposures,
-        lines=setting.lines,
+        **asdict(setting),
         sensor_ms=mean(score.sensor_ms for score in scores),
         compute_ms=statistics.median(score.compute_ms for score in scores),
         mean_abs_px=mean(errors),
@@ -182,25 +178,25 @@ def row_of(scene: str, fog: str | None, setting: TrialSetting, scores: Sequence[
         missing=mean(score.missing for score in scores),
         depth_mm=mean(depths) if depths else None,
         local_sd_px=mean(local) if local else None,
-        ci95=repeats_interval(errors) if len(errors) > 1 else blocks_interval(alone.sums, alone.numbers),
+        ci95=repeats_interval(errors) if len(errors) > 1 else scores[0].ci95,
     )
 
 
 def with_fronts(rows: Sequence[TradeoffRow]) -> tuple[TradeoffRow, ...]:
     """Mark the rows that lie on the Pareto front of their scene and fog."""
-    sensor, compute = _fronts(rows, lambda row: row.sensor_ms), _fronts(rows, lambda row: row.compute_ms)
+    sensor, compute = _fronts(rows, "sensor"), _fronts(rows, "compute")
     return tuple(replace(row, pareto=i in sensor, pareto_compute=i in compute) for i, row in enumerate(rows))
 
 
-def _fronts(rows: Sequence[TradeoffRow], time_ms: Callable[[TradeoffRow], float]) -> set[int]:
+def _fronts(rows: Sequence[TradeoffRow], of: Clock) -> set[int]:
+    """Places of the rows that no other one in their scene and fog beats."""
     found: set[int] = set()
-    for place in dict.fromkeys((row.scene, row.fog) for row in rows):
-        here = [i for i, row in enumerate(rows) if (row.scene, row.fog) == place and row.counts]
-        best = math.inf
-        for i in sorted(here, key=lambda i: (time_ms(rows[i]), rows[i].mean_abs_px)):
-            if rows[i].mean_abs_px < best:
-                found.add(i)
-                best = rows[i].mean_abs_px
+    best: dict[Place, float] = {}
+    counting = [(row.time_ms(of), row.mean_abs_px, i) for i, row in enumerate(rows) if row.counts]
+    for _, error_px, i in sorted(counting):
+        if error_px < best.get(rows[i].place, math.inf):
+            found.add(i)
+            best[rows[i].place] = error_px
     return found
 
 

@@ -18,13 +18,12 @@ from rig.config.models import RigConfig
 from rig.count.volume import Counter, FrameTally, SweepLayout, SweepTally
 from rig.depth.reconstruct import MapResult, Reconstructor
 from rig.depth.warm_up import warm_binding, warm_up
-from rig.devices.open import OpenRig, open_rig
+from rig.devices.open import open_rig
 from rig.devices.prepare import prepare
 from rig.errors import UsageError
 from rig.estimate.registry import LEARNING
 from rig.geometry.stripe_table import StripeTable
 from rig.geometry.windows import WORD_PX
-from rig.plan.scan_plan import ScanPlan
 from rig.scan.acquisition import Acquisition, AcquisitionRequest
 from rig.scan.monitor import Listeners
 from rig.scan.scan import make_reconstructor
@@ -156,11 +155,11 @@ def score_methods(
     estimators: Sequence[str],
     filters: Sequence[str],
     seed: int,
-    on_frames: Callable[[int, int], None] | None = None,
+    tell: Callable[[float], None],
 ) -> dict[Method, MapScore]:
     """Scan once with a simulated rig and score what each estimator, with each filter, makes of the same frames.
 
-    on_frames: called with the frames taken and the frames to take.
+    tell: called with the share of the frames that are taken.
     """
     with open_rig(config, seed=seed) as rig:
         assert rig.world is not None, "only simulated rigs are tried"
@@ -169,10 +168,11 @@ def score_methods(
             for filter in filters:
                 warm_up(estimator, filter, plan.exposures, dark=True)
         warm_binding(plan)
-        maker = ManyMakers({name: _maker(rig, plan, name) for name in estimators}, filters)
-        live = None if on_frames is None else lambda now: on_frames(now.frames, now.frames_planned)
-        learns = not LEARNING.isdisjoint(estimators)
-        request = AcquisitionRequest(maps=MAPS, learns=learns, listeners=Listeners(live=live))
+        estimate = rig.config.estimate
+        settings = {name: estimate.model_copy(update={"estimator": name}) for name in estimators}
+        maker = ManyMakers({name: make_reconstructor(rig, plan, each) for name, each in settings.items()}, filters)
+        listeners = Listeners(live=lambda now: tell(now.frames / max(now.frames_planned, 1)))
+        request = AcquisitionRequest(maps=MAPS, learns=not LEARNING.isdisjoint(estimators), listeners=listeners)
         running = Acquisition(rig, plan, timing, maker, request).run()
         with closing(running):
             last = [found for found in running][-1]
@@ -197,9 +197,3 @@ def require_plan(config: RigConfig) -> None:
             f"{plan.exposures} exposures make {kept / 1e9:.3g} GB of frames a sweep, at most "
             f"{MOST_KEPT_BYTES / 1e9:g} GB are kept for all estimators; leave out --exposures above {most}"
         )
-
-
-def _maker(rig: OpenRig, plan: ScanPlan, estimator: str) -> Reconstructor:
-    estimate = rig.config.estimate.model_copy(update={"estimator": estimator})
-    config = rig.config.model_copy(update={"estimate": estimate})
-    return make_reconstructor(replace(rig, config=config), plan)

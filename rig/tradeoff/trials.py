@@ -1,7 +1,7 @@
 """Scans a simulated rig over settings and scores the maps by the world's truth: what accuracy costs in time."""
 
 from collections.abc import Callable, Iterable, Iterator, Sequence
-from dataclasses import dataclass
+from dataclasses import asdict, dataclass
 from itertools import count, product, starmap
 from pathlib import Path
 from typing import Any, Literal, NamedTuple, TypeVar
@@ -104,7 +104,7 @@ class Tradeoff:
         """Return it as plain values; `answer` only where a setting was asked for."""
         content: dict[str, Any] = {
             "advice": self.advice,
-            "rows": [row.as_json() for row in self.rows],
+            "rows": [asdict(row) for row in self.rows],
             "ci95_by": self.ci95_by,
         }
         if self.wish is not None:
@@ -151,18 +151,24 @@ def require_methods(estimators: Sequence[str], filters: Sequence[str]) -> list[s
 def _rows(trials: Trials, progress: Progress | None) -> Iterator[list[TradeoffRow]]:
     """Give the rows of one trial after the other."""
     configs, asked = trials.configs(), trials.asked
-    bar = _Bar(progress, asked.repeat * sum(map(_frames_of, configs.values())))
+    frames_of_all = asked.repeat * sum(map(_frames_of, configs.values()))
+    done = 0
     limits = SceneLimits(asked.exposures)
-    scans = len(configs) * asked.repeat
     numbers = count(1)
+
+    def tell(share: float = 0.0) -> None:
+        if progress is not None:
+            progress(round(done + share * _frames_of(config)), frames_of_all)
+
     for trial, config in configs.items():
         scores: dict[Method, list[MapScore]] = {}
         for seed in range(asked.seed, asked.seed + asked.repeat):
-            with part(f"scan {next(numbers)} of {scans}"):
-                found = score_methods(config, asked.estimators, asked.filters, seed, bar.within(_frames_of(config)))
+            with part(f"scan {next(numbers)} of {len(configs) * asked.repeat}"):
+                found = score_methods(config, asked.estimators, asked.filters, seed, tell)
             for method, score in found.items():
                 scores.setdefault(method, []).append(score)
-            bar.add(_frames_of(config))
+            done += _frames_of(config)
+            tell()
         scene = str(getattr(config.world, "scene", "")) if trial.scene is None else trial.scene
         lines = len(config.line_offsets)
         rows = [
@@ -177,27 +183,3 @@ def _rows(trials: Trials, progress: Progress | None) -> Iterator[list[TradeoffRo
 def _frames_of(config: RigConfig) -> int:
     """Number of frames on columns of one scan."""
     return MAPS * config.scan.columns * config.scan.exposures // len(config.line_offsets)
-
-
-class _Bar:
-    """Progress in frames on columns."""
-
-    def __init__(self, progress: Progress | None, total: int) -> None:
-        self._progress = progress
-        self._total = total
-        self._done = 0
-
-    def within(self, frames: int) -> Callable[[int, int], None] | None:
-        """A callback for a scan of so many frames to tell its progress with; None where nobody listens."""
-        if self._progress is None:
-            return None
-        return lambda done, planned: self._tell(self._done + frames * min(1.0, done / max(planned, 1)))
-
-    def add(self, frames: int) -> None:
-        """Note that a scan of so many frames is done."""
-        self._done += frames
-        self._tell(self._done)
-
-    def _tell(self, done: float) -> None:
-        if self._progress is not None:
-            self._progress(round(done), self._total)

@@ -9,12 +9,10 @@ import yaml
 
 from tests.system.conftest import Rig
 from tests.system.run_files import files
-from tests.system.small_rig import config, write_rig
+from tests.system.small_rig import calibration, config, write_rig
 
 
 def test_the_calibration_of_a_cube_is_refused_as_such(rig: Rig, tmp_path: Path) -> None:
-    from tests.system.small_rig import calibration
-
     file = write_rig(tmp_path / "cube", config())
     content = calibration()
     del content["scanner"], content["source_m"], content["lag_s"]
@@ -26,37 +24,20 @@ def test_the_calibration_of_a_cube_is_refused_as_such(rig: Rig, tmp_path: Path) 
     assert "is for a bare cube" in ran.problems[0]
 
 
-def test_problems_of_spad_and_scanner_are_listed_together(rig: Rig, tmp_path: Path) -> None:
-    content = config()
-    content["scan"] |= {"frame_rate": "1 MHz", "columns": 3}
-    ran = rig("scan", write_rig(tmp_path / "fast", content))
-    assert ran.code == 2
-    assert "the most the" in ran.problems[0]
-    assert "scan of 3 columns" in ran.problems[-1]
-    assert len(ran.problems) >= 2
-
-
 @pytest.mark.parametrize(
     ("edit", "said"),
     [
         ({"scan.colums": 500}, "unknown key 'scan.colums'; did you mean 'columns'?"),
-        ({"scan.frame_rate": 100000}, 'has no unit; write the frequency with a unit, like "100 kHz"'),
-        ({"scan.depth_range": ["1 m", 8]}, "has no unit"),
-        ({"scan.exposures": -4}, "exposures is -4, it must be at least 1"),
         ({"scan.columns": 3, "scan.exposures": 1}, "raise scan.exposures to"),
-        ({"scan.depth_range": ["8 m", "1 m"]}, "near < far"),
         ({"spad.kind": "simulatd"}, "choose one of"),
         ({"world.scene": "nowhere"}, "nowhere' is no file, no folder and none of the bundled"),
         ({"calibration": "absent.yaml"}, "cannot read calibration"),
         ({"calibration": "other.yaml"}, "sensor of 128 x 40 pixels, this one has 96 x 40"),
-        ({"scan.command_range": [-1, 1]}, "command"),
     ],
 )
 def test_a_bad_config_is_refused_in_a_line_and_nothing_is_left(
     rig: Rig, tmp_path: Path, edit: dict[str, object], said: str
 ) -> None:
-    from tests.system.small_rig import calibration
-
     content = config()
     for key, value in edit.items():
         *section, name = key.split(".")
@@ -75,24 +56,16 @@ def test_a_bad_config_is_refused_in_a_line_and_nothing_is_left(
 @pytest.mark.parametrize(
     ("arguments", "said"),
     [
-        (["--no-such-option"], "No such option"),
         (["--on-overload", "ignore"], "write 'abort', 'drop' or 'block'"),
-        (["--dry-run", "--on-overload", "ignore"], "write 'abort', 'drop' or 'block'"),
         (["--exposures", "-1"], "--exposures is -1, it must be at least 1; write for example '--exposures 10'"),
         (["--exposures", "many"], "write a whole number or see 'rig scan --help'"),
         (["--min-confidence", "high"], "write a number or see 'rig scan --help'"),
         (["--maps", "0"], "maps is 0; it must be at least 1"),
         (["--seed", "-3"], "seed is -3; it must be 0 or more"),
         (["--seed", str(2**63)], "at most 2^63 - 1"),
-        (["--dry-run", "--maps", "0"], "maps is 0; it must be at least 1"),
-        (["--dry-run", "--seed", "-5"], "seed is -5; it must be 0 or more"),
         (["--dry-run", "--save", "never"], "write 'all', 'last' or 'every N'"),
         (["--estimator", "best"], "choose 'argmax', 'edge'"),
-        (["--filter", "mean"], "choose 'none' or 'median'"),
-        (["--min-confidence", "1.5"], "--min-confidence is 1.5, it must be at most 1"),
-        (["--save", "some"], "write 'all', 'last' or 'every N'"),
         (["--save", "every", "0"], "'every N' with N of 1 or more"),
-        (["--scene", "nowhere"], "scene 'nowhere' is no file, no folder and none of the bundled"),
     ],
 )
 def test_a_bad_option_is_refused_in_a_line(rig: Rig, small: Path, arguments: list[str], said: str) -> None:
@@ -101,13 +74,6 @@ def test_a_bad_option_is_refused_in_a_line(rig: Rig, small: Path, arguments: lis
     assert said in ran.err
     assert len(ran.err.splitlines()) == 1
     assert not list(Path().iterdir())
-
-
-def test_several_problems_are_listed_together(rig: Rig, tmp_path: Path) -> None:
-    content = config()
-    content["scan"] |= {"exposures": -4, "frame_rate": 1e5, "colums": 3}
-    ran = rig("scan", write_rig(tmp_path / "bad", content))
-    assert len(ran.problems) == 3
 
 
 def test_an_out_folder_that_cannot_be_is_refused_before_anything_runs(rig: Rig, small: Path) -> None:
@@ -121,7 +87,7 @@ def test_an_out_folder_that_cannot_be_is_refused_before_anything_runs(rig: Rig, 
     assert files(Path()) == {"file", "full/notes.txt"}
 
 
-@pytest.mark.parametrize(("width", "height"), [(1, 40), (96, 1), (1, 1)])
+@pytest.mark.parametrize(("width", "height"), [(1, 40), (96, 1)])
 def test_a_simulated_camera_of_one_pixel_either_way_is_refused(
     rig: Rig, tmp_path: Path, width: int, height: int
 ) -> None:
@@ -133,12 +99,11 @@ def test_a_simulated_camera_of_one_pixel_either_way_is_refused(
     assert not list(Path().iterdir())
 
 
-@pytest.mark.parametrize(("width", "height"), [(2, 40), (96, 2), (2, 2), (8, 8), (65, 3)])
+@pytest.mark.parametrize(("width", "height"), [(2, 40), (65, 2)])
 def test_a_camera_of_a_few_pixels_is_scanned(rig: Rig, tmp_path: Path, width: int, height: int) -> None:
     file = write_rig(tmp_path / "tiny", width=width, height=height)
-    for scene in ("street-everything", "board"):
-        ran = rig("scan", file, "--scene", scene, "--out", scene)
-        assert ran.code == 0, ran.err
-        assert np.load(Path(scene) / "depth" / "000000.npy").shape == (height, width)
+    ran = rig("scan", file, "--scene", "street-everything", "--out", "run")
+    assert ran.code == 0, ran.err
+    assert np.load("run/depth/000000.npy").shape == (height, width)
     ran = rig("effects", file)
     assert ran.code == 0, ran.err

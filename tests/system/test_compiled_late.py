@@ -1,19 +1,96 @@
-"""Nothing is left to compile once a laser is armed: seconds in which an application takes no frames end its light."""
+"""Nothing is left to compile once a laser is armed: seconds in which an application takes no frames end its light.
 
+Scans run in a process of their own, `python -m tests.system.test_compiled_late FOLDER`, since what an earlier scan
+compiled would hide it. It prints a line for each kernel and signature that came after arming: over emulated wires of
+anything, and of scans that learn from later maps.
+"""
+
+import gc
 import os
 import subprocess
 import sys
 from pathlib import Path
+from typing import Any
 
-from rig.estimate.registry import ESTIMATORS
+from numba.core.dispatcher import Dispatcher
 
-ROOT = Path(__file__).parents[2]
+from rig import api
+from rig.estimate.registry import ESTIMATORS, LEARNING
+from rig.estimate.search import online_learning as lessons
+from rig.scan.acquisition import Acquisition
+from tests.system.small_rig import config, write_rig
+
+MAPS, LESSON_FRAMES = 5, 1600
+"""Maps of 800 lit frames, and how many there are from one lesson to the next."""
+EMULATED: dict[str, Any] = {
+    "world": {"kind": "emulated", "geometry": "./rig.yaml", "scene": "street", "laser": "obis"},
+    "spad": {"kind": "spb-usb", "port": "emulated:spad", "reads": "plain", "heartbeat": "10 s"},
+    "scanner": {
+        "kind": "helios",
+        "port": "emulated:scanner",
+        "max_velocity": "4000 /s",
+        "max_acceleration": "4e6 /s2",
+        "rms_duty": 1.0,
+        "frame": "250 ms",
+    },
+    "laser": {"kind": "obis", "port": "emulated:laser", "max_power": "50 mW"},
+    "sync": {"kind": "prawndo", "port": "emulated:gate"},
+}
+SCAN = {"columns": 40, "exposures": 12, "frame_rate": "12.5 kHz"}
 
 
 def test_no_kernel_is_compiled_after_arming(tmp_path: Path) -> None:
-    command = [sys.executable, "-m", "tests.system.compiled_late", str(tmp_path)]
-    environment = {**os.environ, "PYTHONPATH": str(ROOT)}
+    command = [sys.executable, "-m", "tests.system.test_compiled_late", str(tmp_path)]
+    environment = {**os.environ, "PYTHONPATH": str(Path(__file__).parents[2])}
     ran = subprocess.run(command, env=environment, capture_output=True, text=True, timeout=600, check=False)
     assert ran.returncode == 0, ran.stderr
     assert ran.stdout.count("scanned") == 1 + len(ESTIMATORS)
     assert "late:" not in ran.stdout, ran.stdout
+
+
+def main(folder: Path) -> None:
+    """Run the scans."""
+    emulated = {**config(), **EMULATED, "scan": {**config()["scan"], **SCAN}}
+    _say_late("", write_rig(folder / "emulated", emulated), maps=3, estimator="likelihood", filter="median")
+    lessons.TEACH_FRAMES = lessons.LAG_FRAMES = LESSON_FRAMES
+    for estimator in ESTIMATORS:
+        options = {"estimator": estimator, "filter": "median", "temporal_prior": estimator == "joint"}
+        maps = MAPS if estimator in LEARNING else 1
+        _say_late("rig.", write_rig(folder / estimator), maps=maps, **options)
+
+
+def _say_late(of: str, file: Path, **options: Any) -> None:
+    """Scan, and print what was compiled late of the modules whose names begin so."""
+    armed: set[str] = set()
+    arm = Acquisition._arm
+
+    def note(acquisition: Acquisition) -> None:
+        arm(acquisition)
+        armed.update(_compiled(of))
+
+    Acquisition._arm = note  # type: ignore[method-assign]
+    try:
+        run = api.scan(file, out=file.parent / "run", save="last", record=True, **options)
+    finally:
+        Acquisition._arm = arm  # type: ignore[method-assign]
+    assert armed, "the laser was armed"
+    print(f"scanned {run.summary.maps}")
+    for kernel in sorted(_compiled(of) - armed):
+        print(f"late: {kernel}")
+
+
+def _compiled(of: str) -> set[str]:
+    """Kernels of this project with their signatures, compiled or loaded from numba's cache."""
+    packages = ("rig", "sim_backend", "calibration", "drivers")
+    return {
+        f"{name}.{kernel.py_func.__qualname__} {signature}"
+        for kernel in gc.get_objects()
+        if isinstance(kernel, Dispatcher)
+        and (name := kernel.py_func.__module__).split(".")[0] in packages
+        and name.startswith(of)
+        for signature in kernel.signatures
+    }
+
+
+if __name__ == "__main__":
+    main(Path(sys.argv[1]))

@@ -1,12 +1,15 @@
-"""The doctor on a small rig with emulated devices: what it shows, and that it says no wherever a scan could not run."""
+"""The doctor on a small rig with emulated devices, and what a user sees of devices without one."""
 
 import copy
+import json
 from collections.abc import Callable
 from pathlib import Path
+from types import SimpleNamespace
 from typing import Any
 
 import numpy as np
 import pytest
+import usb.backend.libusb1
 
 from drivers.lasers.obis import ObisConfig
 from rig import api
@@ -15,6 +18,7 @@ from rig.devices.doctor import Finding
 from rig.errors import PlanError
 from sim_backend.wire.emulated_world import EmulatedWorld
 from sim_backend.wire.firmware.helios import GREEN
+from tests.system.conftest import Rig
 from tests.system.small_rig import config, write_rig
 
 Examine = Callable[..., dict[str, Finding]]
@@ -80,44 +84,19 @@ def test_it_shows_who_is_there_and_how_they_are(examine: Examine) -> None:
     assert rate_hz == pytest.approx(12_500 / 10, rel=0.01)
 
 
-def open_interlock(world: EmulatedWorld) -> None:
-    world.laser.interlock_open = True
+def hot_and_locked_out(world: EmulatedWorld) -> None:
+    world.laser.interlock_open, world.laser.key_on, world.laser.base_c = True, False, 60.0
 
 
-def overheat(world: EmulatedWorld) -> None:
-    world.laser.base_c = 60.0
-
-
-def turn_key_off(world: EmulatedWorld) -> None:
-    world.laser.key_on = False
-
-
-@pytest.mark.parametrize(
-    ("alter", "words"),
-    [
-        (open_interlock, "interlock open"),
-        (overheat, "base plate at 60 C, outside 10 to 50 C"),
-        (turn_key_off, "key off"),
-    ],
-)
-def test_a_laser_that_could_not_be_armed(alter: Callable[[EmulatedWorld], None], words: str, examine: Examine) -> None:
-    found = examine(alter)
+def test_a_laser_that_could_not_be_armed(examine: Examine) -> None:
+    found = examine(hot_and_locked_out)
     assert not found["laser"].ok
-    assert words in found["laser"].text
+    assert "interlock open, fault base plate at 60 C, outside 10 to 50 C, key off" in found["laser"].text
 
 
-def test_a_scan_marker_that_does_not_reach_the_sync_source(examine: Examine) -> None:
-    def cut(world: EmulatedWorld) -> None:
+def test_markers_that_do_not_come(examine: Examine) -> None:
+    def cut_and_thin(world: EmulatedWorld) -> None:
         world.sync._trigger = lambda from_s, until_s: None
-
-    found = examine(cut)
-    assert found["markers"].ok
-    assert not found["trigger"].ok
-    assert "check that line" in found["trigger"].text
-
-
-def test_line_markers_of_which_every_other_one_is_missing(examine: Examine) -> None:
-    def thin(world: EmulatedWorld) -> None:
         rising = world.scanner.history.rising
 
         def thinned(line: int, from_s: float, until_s: float) -> Any:
@@ -128,8 +107,10 @@ def test_line_markers_of_which_every_other_one_is_missing(examine: Examine) -> N
 
         world.scanner.history.rising = thinned
 
-    found = examine(thin)
+    found = examine(cut_and_thin)
     assert not found["markers"].ok
+    assert not found["trigger"].ok
+    assert "check that line" in found["trigger"].text
 
 
 def test_a_memory_that_holds_no_map_is_found_by_the_doctor_and_by_a_dry_run(tmp_path: Path) -> None:
@@ -150,11 +131,61 @@ def test_a_memory_that_holds_no_map_is_found_by_the_doctor_and_by_a_dry_run(tmp_
         api.plan_scan(made)
 
 
-def test_a_full_disk(examine: Examine, monkeypatch: pytest.MonkeyPatch) -> None:
-    class Usage:
-        free = 10**6
+def test_a_full_disk_and_a_folder_that_cannot_be_written(small: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    def disk() -> Finding:
+        return {one.name: one for one in api.doctor(small, out=small.parent)}["disk"]
 
-    monkeypatch.setattr("rig.devices.doctor.shutil.disk_usage", lambda folder: Usage)
-    found = examine()
-    assert not found["disk"].ok
-    assert "make room" in found["disk"].text
+    def refuse(*arguments: object, **options: object) -> None:
+        raise PermissionError(13, "Permission denied")
+
+    monkeypatch.setattr("rig.devices.doctor.shutil.disk_usage", lambda folder: SimpleNamespace(free=10**6))
+    assert not disk().ok
+    assert "make room" in disk().text
+    monkeypatch.setattr("rig.devices.doctor.tempfile.NamedTemporaryFile", refuse)
+    assert "cannot be written: Permission denied; choose another folder" in disk().text
+
+
+def test_devices_lists_what_is_attached_and_opens_nothing(rig: Rig) -> None:
+    ran = rig("devices", "--json")
+    if usb.backend.libusb1.get_backend() is None:
+        assert ran.code == 3
+        assert "libusb" in ran.err
+        pytest.skip("libusb is not installed")
+    assert ran.code == 0
+    for one in json.loads(ran.out)["devices"]:
+        assert set(one) == {"address", "what", "kind"}
+
+
+def test_the_doctor_finds_a_simulated_rig_fit(rig: Rig, small: Path, tmp_path: Path) -> None:
+    ran = rig("doctor", small, "--out", tmp_path, "--json")
+    found = json.loads(ran.out)
+    assert ran.code == 0, found
+    assert found["could_scan"]
+    names = [one["name"] for one in found["findings"]]
+    assert {"spad", "scanner", "laser", "sync", "guard", "plan", "frames", "dark counts", "markers", "disk"} <= set(
+        names
+    )
+
+
+def test_the_doctor_names_every_device_that_is_absent(rig: Rig) -> None:
+    ran = rig("doctor", "lab")
+    assert ran.code == 3
+    failed = [line for line in ran.out.splitlines() if line.startswith("FAIL")]
+    assert [slot for line in failed for slot in ("spad", "scanner", "laser", "sync") if f"  {slot}: " in line] == [
+        "spad", "scanner", "laser", "sync",
+    ]  # fmt: skip
+
+
+def test_a_real_rig_is_not_scanned_without_arming(rig: Rig) -> None:
+    ran = rig("scan", "lab")
+    assert ran.code == 2
+    assert ran.problems == [
+        "error: lab has real light (laser cobolt, sync prawndo); clear the beam path, then add --arm"
+    ]
+
+
+def test_the_laser_is_switched_off(rig: Rig, small: Path) -> None:
+    ran = rig("laser", "off", small)
+    assert ran.code == 0
+    assert "all outputs low" in ran.out
+    assert "emission off" in ran.out

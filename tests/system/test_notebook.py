@@ -2,11 +2,9 @@
 
 from pathlib import Path
 
-import numpy as np
 import pytest
 
-from rig.api import configure, effects, plan_scan, plan_text, scan
-from rig.errors import UsageError
+from rig.api import effects, plan_scan, plan_text, scan
 from tests.system.small_rig import HEIGHT, WIDTH
 
 NOTEBOOK = Path(__file__).parents[2] / "docs" / "tutorials" / "notebook.md"
@@ -28,24 +26,11 @@ def test_a_scan_is_one_call_and_writes_nothing_unasked(
     assert sorted(tmp_path.rglob("*")) == before
 
 
-def test_a_config_object_and_its_file_give_the_same_scan(small: Path) -> None:
-    from_file = scan(small, exposures=3, seed=4).last
-    from_object = scan(configure(small), exposures=3, seed=4).last
-    assert from_file is not None
-    assert from_object is not None
-    assert np.array_equal(from_file.depth_m, from_object.depth_m, equal_nan=True)
-
-
 def test_plan_and_effects_are_one_call_each(small: Path) -> None:
     plan = plan_scan(small, exposures=3)
     assert plan.exposures == 3
     assert " x 3 frames at 100 kHz" in plan_text(plan)
     assert {effect.effect for effect in effects(small)} >= {"stripe", "fog"}
-
-
-def test_options_of_a_config_object_are_checked_too(small: Path) -> None:
-    with pytest.raises(UsageError, match="exposures is -1"):
-        scan(configure(small), exposures=-1)
 
 
 def test_the_document_runs_as_far_as_names_go() -> None:

@@ -28,7 +28,6 @@ def test_a_scan_counts_to_all_of_its_plan_s_frames_and_no_further(small: Path) -
     [
         (("scan", "RIG", "--out", "run"), {"writing", "comparing with the truth"}),
         (("verify", "RUN"), {"checking every block"}),
-        (("repair", "RUN"), {"checking every block"}),
         (("replay", "RUN", "--clock", "max", "--out", "again"), {"writing"}),
         (("reconstruct", "RUN", "--out", "again"), {"writing"}),
         (("export", "RUN", "npy", "--out", "cube"), {"writing"}),
@@ -54,24 +53,20 @@ def test_every_long_command_names_its_stages_on_stderr_and_prints_one_object(
     assert len(said) == len(set(said)) < 100
 
 
-@pytest.mark.parametrize("poses", [1, 5])
-@pytest.mark.parametrize("command", ["planes", "camera"])
-def test_poses_that_can_never_suffice_are_refused_before_anything_is_scanned(
-    rig: Rig, small: Path, command: str, poses: int
-) -> None:
-    ran = rig("calibrate", command, small, "--poses", poses, "--out", "out")
+def test_poses_that_can_never_suffice_are_refused_before_anything_is_scanned(rig: Rig, small: Path) -> None:
+    ran = rig("calibrate", "planes", small, "--poses", 5, "--out", "out")
     assert ran.code == 2
     assert ran.problems == [
-        f"error: poses is {poses}; 6 are the fewest that can be checked against each other: ask for 6 or more"
+        "error: poses is 5; 6 are the fewest that can be checked against each other: ask for 6 or more"
     ]
     assert "pose 1 of" not in ran.err
     assert not Path("out").exists()
 
 
-@pytest.mark.parametrize("columns", [80, 100])
 def test_effects_keep_their_reasons_at_a_terminal(
-    small: Path, columns: int, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+    small: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
+    columns = 80
     found = api.effects(str(small), trials=False)
     monkeypatch.setenv("COLUMNS", str(columns))
     monkeypatch.setattr(sys.stdout, "isatty", lambda: True)

@@ -41,5 +41,5 @@ def test_abort_ends_at_the_first_block_without_a_slot() -> None:
 
 
 def test_block_is_refused() -> None:
-    with pytest.raises(UsageError, match="cannot wait"):
+    with pytest.raises(UsageError, match=r"'block', but the looped SPAD cannot wait .*'abort' .* 'drop'"):
         soak(0.3, window=True, on_overload="block")

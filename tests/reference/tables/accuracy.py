@@ -11,7 +11,7 @@ from __future__ import annotations
 import sys
 import time
 from collections.abc import Iterator, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import NDArray
@@ -24,7 +24,6 @@ from tests.reference.working_point import POINTS, WorkingPoint, score
 
 ESTIMATORS = ("argmax", "edge", "likelihood")
 FILTERS = ("none", "median")
-FINE_GENIE = Genie(labels=4, mean_reach=8, profile_reach=3)
 DEFAULT_EXPOSURES = {"report": (1, 3, 10, 20), "dense": (10, 30), "clear": (1, 3, 10)}
 RIGS = {
     "rectified": {},
@@ -87,12 +86,9 @@ def main(arguments: Sequence[str] | None = None) -> int:
     parser.add_argument("--estimators", default=",".join(ESTIMATORS))
     parser.add_argument("--filters", default=",".join(FILTERS))
     parser.add_argument("--row-step", type=int, default=1, help="score every n-th row only")
-    parser.add_argument("--cosine", action="store_true", help="stripe with the cosine of the camera's side")
-    parser.add_argument("--fine", action="store_true", help="also a genie with quarter-pixel labels")
     options = parser.parse_args(arguments)
-    genies = {"genie": Genie(), **({"genie (quarter px)": FINE_GENIE} if options.fine else {})}
-    estimators = [name for name in options.estimators.split(",") if name]
-    measurement = Measurement(estimators, options.filters.split(","), genies, options.row_step)
+    filters = options.filters.split(",")
+    measurement = Measurement(options.estimators.split(","), filters, {"genie": Genie()}, options.row_step)
     scenes = scenes_asked(parser, options.scenes)
     table = Table(TITLES)
     for name in options.points.split(","):
@@ -100,7 +96,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
         for scene in scenes:
             height, width = scene.shape
             geometry = Geometry.build(width=width, height=height, **RIGS[options.rig])  # type: ignore[arg-type]
-            point = WorkingPoint(scene, replace(POINTS[name], cosine=options.cosine), geometry)
+            point = WorkingPoint(scene, POINTS[name], geometry)
             for exposures in map(int, chosen):
                 reference = np.nan
                 for estimator, f, seconds in measurement.means(point, exposures, options.seeds):

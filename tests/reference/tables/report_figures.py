@@ -14,6 +14,7 @@ from __future__ import annotations
 
 import json
 import sys
+from base64 import b64encode
 from collections.abc import Collection, Iterator, Sequence
 from dataclasses import asdict, dataclass
 from html import escape
@@ -43,10 +44,8 @@ SHARE = "within_1px"
 ROW = 250
 """Image row of figures 3 and 4."""
 
-COLOURS = 24
-"""Steps between the nearest and the farthest depth."""
 SIDE_PX = 246
-"""Side of a mosaic."""
+"""Side of a depth map."""
 PLACE_PX = (SIDE_PX + 24, SIDE_PX + 50)
 """Width and height that it takes with its words."""
 
@@ -121,13 +120,13 @@ def figure_6(scene: Scene) -> str:
     point = WorkingPoint(scene, REPORT)
     known = scene.depth_m[np.isfinite(scene.depth_m)]
     limits = float(np.percentile(known, 1)), float(np.percentile(known, 99))
-    panels: list[Drawable] = [Mosaic("truth", scene.depth_m, limits)]
+    panels: list[Drawable] = [DepthMap("truth", scene.depth_m, limits)]
     for k, estimator, filter in (
         (1, "edge", "median"), (10, "edge", "none"), (10, "edge", "median"),
         (1, "joint", "none"), (10, "joint", "none"),
     ):  # fmt: skip
         (result,) = reconstruct(point, point.counts(k, SEED), k, estimator=estimator, filters=(filter,))
-        panels.append(Mosaic(f"{named(estimator, filter)}, {k} exposure{'s' * (k > 1)}", result.depth_m, limits))
+        panels.append(DepthMap(f"{named(estimator, filter)}, {k} exposure{'s' * (k > 1)}", result.depth_m, limits))
     notes = [f"Scene {scene.name} in the fog of the report (0.05 /m); answers of confidence 0.5 and more enter a map."]
     return chart_svg(panels, title="Depth maps", across=3, notes=notes, panel_px=PLACE_PX)
 
@@ -237,13 +236,12 @@ def _column_of(point: WorkingPoint) -> tuple[int, float]:
 
 
 @dataclass(frozen=True, slots=True)
-class Mosaic:
-    """A depth map (rows, width) in metres, NaN where there is none, as `cells` x `cells` cells; limits: near, far."""
+class DepthMap:
+    """A depth map (rows, width) in metres, black where it is NaN; limits: near, far."""
 
     title: str
     depth_m: NDArray[np.floating]
     limits: tuple[float, float]
-    cells: int = 73
 
     @property
     def legend(self) -> Sequence[Series]:
@@ -251,49 +249,19 @@ class Mosaic:
         return ()
 
     def svg(self) -> str:
-        """The mosaic in a place of a chart, depth in words below it."""
+        """The map in a place of a chart, depth in words below it."""
         near, far = self.limits
-        steps = self._steps()
-        scale = SIDE_PX / self.cells
-        left = 16
-        paths = [
-            f'<path d="{_runs(steps == step)}" stroke="{_colour(step)}"/>'
-            for step in range(COLOURS)
-            if (steps == step).any()
-        ]
+        level = np.clip(245 - 225 * (self.depth_m - near) / (far - near), 20, 245)
+        picture = cv2.applyColorMap(np.nan_to_num(level).astype(np.uint8), cv2.COLORMAP_TURBO)
+        picture[~np.isfinite(self.depth_m)] = 0
+        _, png = cv2.imencode(".png", cv2.resize(picture, (SIDE_PX, SIDE_PX), interpolation=cv2.INTER_AREA))
         return (
-            f'<text x="{left}" y="18" font-weight="bold" fill="{INK}">{escape(self.title)}</text>'
-            f'<g transform="translate({left} 28) scale({scale:.3f})" fill="none" stroke-width="1.1">'
-            f'<path d="M0 0h{self.cells}v{self.cells}h-{self.cells}z" fill="#111" stroke="none"/>{"".join(paths)}</g>'
-            f'<text x="{left}" y="{SIDE_PX + 41}" font-size="10" fill="{INK}">red {near:.1f} m, blue {far:.1f} m, '
+            f'<text x="16" y="18" font-weight="bold" fill="{INK}">{escape(self.title)}</text>'
+            f'<image x="16" y="28" width="{SIDE_PX}" height="{SIDE_PX}" '
+            f'href="data:image/png;base64,{b64encode(png).decode()}"/>'
+            f'<text x="16" y="{SIDE_PX + 41}" font-size="10" fill="{INK}">red {near:.1f} m, blue {far:.1f} m, '
             "black: no answer</text>"
         )
-
-    def _steps(self) -> NDArray[np.int64]:
-        """Colour of each cell, -1 where most of it has no depth: the depth in its middle rank."""
-        rows, width = (part // self.cells for part in self.depth_m.shape)
-        used = self.depth_m[: rows * self.cells, : width * self.cells]
-        parts = used.reshape(self.cells, rows, self.cells, width).swapaxes(1, 2).reshape(self.cells, self.cells, -1)
-        ranked = np.sort(parts, axis=2)  # NaN last
-        known = np.isfinite(parts).sum(axis=2)
-        middle = np.take_along_axis(ranked, np.maximum(known - 1, 0)[..., None] // 2, axis=2)[..., 0]
-        near, far = self.limits
-        step = np.clip((middle - near) / (far - near) * COLOURS, 0, COLOURS - 1)
-        return np.where(known * 2 > rows * width, np.nan_to_num(step), -1).astype(np.int64)
-
-
-def _runs(mask: NDArray[np.bool_]) -> str:
-    parts = []
-    for y, row in enumerate(mask):
-        ends = np.flatnonzero(np.diff(np.concatenate([[0], row.astype(np.int8), [0]])))
-        parts += [f"M{a} {y}.5h{b - a}.1" for a, b in zip(ends[::2], ends[1::2], strict=True)]
-    return "".join(parts)
-
-
-def _colour(step: int) -> str:
-    level = np.array([[round(20 + 225 * (1 - (step + 0.5) / COLOURS))]], np.uint8)
-    blue, green, red = (int(part) for part in cv2.applyColorMap(level, cv2.COLORMAP_TURBO)[0, 0])
-    return f"#{red:02x}{green:02x}{blue:02x}"
 
 
 def main(arguments: Sequence[str] | None = None) -> int:

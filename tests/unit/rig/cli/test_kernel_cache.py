@@ -20,20 +20,18 @@ def _nothing_writable(monkeypatch, tmp_path):
 
 
 @pytest.mark.usefixtures("_nothing_writable")
-def test_a_private_folder_serves_where_nothing_can_be_written(tmp_path):
+@pytest.mark.parametrize("open_to_all", [False, True])
+def test_a_private_folder_serves_where_nothing_can_be_written_and_one_open_to_others_is_not_trusted(
+    tmp_path, open_to_all
+):
+    usual = tmp_path / f"spadrig-kernels-{os.getuid()}"
+    if open_to_all:
+        usual.mkdir()
+        usual.chmod(0o777)
     kernel_cache.ensure_kernel_cache()
     folder = os.environ[kernel_cache.VARIABLE]
-    assert folder == str(tmp_path / f"spadrig-kernels-{os.getuid()}")
+    assert (folder == str(usual)) is not open_to_all
     assert stat.S_IMODE(os.stat(folder).st_mode) == 0o700
-
-
-@pytest.mark.usefixtures("_nothing_writable")
-def test_a_folder_open_to_others_is_not_trusted(tmp_path):
-    open_to_all = tmp_path / f"spadrig-kernels-{os.getuid()}"
-    open_to_all.mkdir()
-    open_to_all.chmod(0o777)
-    kernel_cache.ensure_kernel_cache()
-    assert os.environ[kernel_cache.VARIABLE] != str(open_to_all)
 
 
 def test_the_users_own_setting_stays(monkeypatch):

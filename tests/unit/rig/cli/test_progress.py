@@ -9,7 +9,7 @@ from numba.core import event
 
 from rig.cli import progress as cli_progress
 from rig.cli.progress import COMPILING, ProgressLine, progress
-from rig.progress import Step, counted, listening, part, tell_stage
+from rig.progress import Step, listening, part, tell_stage
 
 
 class Terminal(io.StringIO):
@@ -53,15 +53,6 @@ def test_what_is_told_is_heard_within_and_nowhere_else():
     ]
 
 
-def test_a_count_is_never_above_its_total():
-    heard, given = [], []
-    with listening(heard.append):
-        tell_stage("rendering", 3000, 2718, "frames")
-        counted("measuring", "rows", lambda done, total: given.append((done, total)))(13, 12)
-    assert [(step.done, step.total) for step in heard] == [(2718, 2718), (12, 12)]
-    assert given == [(12, 12)]
-
-
 @pytest.mark.parametrize(
     ("step", "text"),
     [
@@ -76,15 +67,6 @@ def test_the_line_has_stage_and_counts_as_far_as_they_are_known(step, text):
     line = ProgressLine()
     line.heard(step)
     assert line.text() == text
-
-
-def test_the_clock_runs_by_itself(monkeypatch):
-    now = [100.0]
-    monkeypatch.setattr(cli_progress.time, "monotonic", lambda: now[0])
-    line, seen = ProgressLine(), []
-    for now[0] in (100.9, 152.0, 165.0, 3700.0 + 100):
-        seen.append(line.clock)
-    assert seen == ["0:00", "0:52", "1:05", "1:01:40"]
 
 
 def test_without_a_terminal_each_stage_is_one_line_however_often_it_is_told(impatient, capsys):
@@ -107,17 +89,6 @@ def test_without_a_terminal_each_stage_is_one_line_however_often_it_is_told(impa
     ]
 
 
-def test_what_is_compiled_is_a_stage_of_its_own_until_the_next_one(impatient, capsys):
-    with progress():
-        for _ in range(3):
-            with compiling():
-                pass
-        tell_stage("rendering")
-    with compiling():
-        pass
-    assert stages(capsys.readouterr().err) == [COMPILING, "rendering"]
-
-
 def test_while_it_compiles_no_other_stage_is_claimed():
     line = ProgressLine()
     line.compiler_began()
@@ -127,13 +98,6 @@ def test_while_it_compiles_no_other_stage_is_claimed():
     assert line.text() == COMPILING
     line.heard(Step("rendering", 3, 9, "frames"))
     assert line.text() == "rendering, 3 of 9 frames"
-
-
-def test_a_command_that_is_soon_done_says_nothing_without_a_terminal(monkeypatch, capsys):
-    monkeypatch.setattr(cli_progress, "PATIENCE_S", 3600.0)
-    with progress():
-        tell_stage("rendering")
-    assert capsys.readouterr().err == ""
 
 
 def test_at_a_terminal_the_line_is_drawn_on_stderr_alone(monkeypatch, capsys):

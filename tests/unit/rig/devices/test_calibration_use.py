@@ -61,11 +61,8 @@ def test_the_rig_s_own_calibration_is_used_and_said_to_match(tmp_path: Path) -> 
     assert noted["calibration"]["check"] == "matches"
     assert "accepted" not in noted["calibration"]
     assert noted["rig"]["serials"] == {"spad": "SIM-0001", "scanner": "SIM-MIRROR-0001"}
-
-
-def test_a_calibration_that_says_nothing_of_its_rig_is_used_unchecked(tmp_path: Path) -> None:
-    api.scan(write_rig(tmp_path / "rig", small()), out=tmp_path / "run")
-    assert manifest(tmp_path / "run")["calibration"]["check"] == "unchecked"
+    api.scan(write_rig(tmp_path / "silent", small()), out=tmp_path / "unchecked")  # its file says nothing of its rig
+    assert manifest(tmp_path / "unchecked")["calibration"]["check"] == "unchecked"
 
 
 OTHER_SCAN = {"columns": 60, "exposures": 6, "command_range": [-0.5, 0.5], "bidirectional": True, "power": "10 mW"}
@@ -87,18 +84,7 @@ def test_a_calibration_is_used_with(tmp_path: Path, change: Change, sections: di
 @pytest.mark.parametrize(
     ("sections", "change", "code", "says"),
     [
-        (
-            {"spad": {"serial": "SIM-0002"}},
-            None,
-            "other-spad",
-            "spad serial number 'SIM-0001', this rig has 'SIM-0002'",
-        ),
-        (
-            {"scanner": {"serial": "X"}},
-            None,
-            "other-scanner",
-            "scanner serial number 'SIM-MIRROR-0001', this rig has 'X'",
-        ),
+        ({"spad": {"serial": "2"}}, None, "other-spad", "spad serial number 'SIM-0001', this rig has '2'"),
         (
             {"line_offsets": [-0.3, 0.3], "scan": {"command_range": [-0.3, 0.3]}},
             None,
@@ -107,28 +93,21 @@ def test_a_calibration_is_used_with(tmp_path: Path, change: Change, sections: di
         ),
         ({}, failed, "failed-verdict", r"verdict is 'failed' \(no-tilt, too-few-poses\), 'passed' is needed"),
         ({"calibration_max_age": "30 d"}, dated(40), "too-old", "40[.0-9]* days ago .* calibration_max_age is 30 days"),
-        (
-            {"calibration_max_age": "2 h"},
-            dated(0.5),
-            "too-old",
-            "12[.0-9]* hours ago .* calibration_max_age is 2 hours",
-        ),
+        ({"calibration_max_age": "2 h"}, dated(0.5), "too-old", "12[.0-9]* hours ago .* calibration_max_age is 2 h"),
     ],
-    ids=["other-spad", "other-scanner", "other-lines", "failed-verdict", "too-old", "hours-too-old"],
+    ids=["other-spad", "other-lines", "failed-verdict", "too-old", "hours-too-old"],
 )
 def test_a_foreign_or_stale_calibration_is_refused_and_can_be_accepted(
     tmp_path: Path, sections: dict[str, Any], change: Change | None, code: str, says: str
 ) -> None:
     rig = calibrated(tmp_path / "rig", change or (lambda identity: identity), **sections)
-    with pytest.raises(UsageError, match=says) as refused:
-        api.scan(rig, out=tmp_path / "none")
-    assert len(refused.value.problems) == 1
-    assert refused.value.problems[0].endswith("calibrate again, or add --accept-calibration to use it all the same")
-    assert "made.yaml" in refused.value.problems[0]
+    for call in (api.scan, api.plan_scan):
+        with pytest.raises(UsageError, match=says) as refused:
+            call(rig, out=tmp_path / "none")
+    (problem,) = refused.value.problems
+    assert problem.endswith("calibrate again, or add --accept-calibration to use it all the same")
+    assert "made.yaml" in problem
     assert not (tmp_path / "none").exists()
-    with pytest.raises(UsageError, match=says):
-        api.plan_scan(rig)
-    api.plan_scan(rig, accept_calibration=True)
     result = api.scan(rig, out=tmp_path / "run", accept_calibration=True)
     noted = manifest(tmp_path / "run")["calibration"]
     assert noted["check"] == "accepted"
@@ -177,13 +156,6 @@ def test_views_of_one_rig_are_told_from_those_of_another() -> None:
     assert not same_rig(mine, replace(mine, kinds={"world": "rig.yaml", "geometry": "cd"}))
     assert not same_rig(old(mine), replace(mine, kinds={"world": "other.yaml"}))
     assert not same_rig(mine, replace(mine, serials={}))
-
-
-def test_all_that_is_wrong_is_said_at_once(tmp_path: Path) -> None:
-    rig = calibrated(tmp_path, failed, spad={"serial": "A"}, scanner={"serial": "B"})
-    with pytest.raises(UsageError) as refused:
-        api.scan(rig)
-    assert len(refused.value.problems) == 3
 
 
 def test_a_check_that_failed_since_then_speaks_against_a_calibration_until_one_passes(tmp_path: Path) -> None:

@@ -21,7 +21,6 @@ from drivers.interfaces.scanner import check_waveform
 from rig.errors import PlanError
 from rig.plan.calibration_reach import model_problems, require_speed
 from rig.plan.compile import compile_plan, spad_request
-from rig.plan.describe import plan_text
 from rig.plan.gate_pulses import sync_program
 from rig.plan.mirror_path import remedy
 from tests.stability.inventory import covers
@@ -110,18 +109,6 @@ def test_the_command_crosses_the_columns_at_constant_velocity(bidirectional):
         np.testing.assert_allclose(plan.command(centres), commands, atol=1e-12)
 
 
-def test_the_same_column_means_the_same_command_both_ways():
-    plan = plan_of(scan(bidirectional=True, columns=7), Lag(1e-4, 3e-4))
-    out, back = plan.legs
-    assert (out.direction, back.direction) == (1, -1)
-    assert (out.lag_s, back.lag_s) == (1e-4, 3e-4)
-    for leg in plan.legs:
-        tau = np.linspace(leg.gate_open_s, leg.gate_close_s, 50)
-        np.testing.assert_allclose(
-            plan.command_at(plan.column(tau, leg)), leg.path.command((tau - leg.lag_s) * float(plan.point_rate_hz))
-        )
-
-
 def test_a_falling_sweep_has_the_lag_and_the_level_of_falling_commands():
     plan = plan_of(scan(command_range=[0.2, -0.2]), Lag(1e-4, 3e-4))
     assert plan.legs[0].lag_s == 3e-4
@@ -129,30 +116,20 @@ def test_a_falling_sweep_has_the_lag_and_the_level_of_falling_commands():
     assert plan.commands[0] > plan.commands[-1]
 
 
-def test_line_markers_come_as_often_as_the_point_clock_allows():
-    for exposures, fastest in ((1, 65_535), (10, 65_535), (1, 5000), (50, 5000)):
-        limits = dataclasses.replace(GALVO, point_rate_hz=(2e3, fastest))
-        plan = plan_of(scan(columns=40, exposures=exposures, command_range=[0, 0.01]), limits=limits)
-        needed = max(4 / float(plan.points_per_column), 2 / exposures)
-        assert needed <= plan.columns_per_marker < needed + 1
-        lit_end = float((plan.legs[0].path.lit_start + plan.legs[0].path.lit_points) / plan.points_per_column)
-        edges = plan.marker_points / float(plan.points_per_column)
-        edges = edges[edges <= lit_end]
-        first = float(plan.legs[0].path.lit_start / plan.points_per_column)
-        np.testing.assert_allclose(
-            edges - first,
-            np.arange(len(edges)) * plan.columns_per_marker,
-            atol=1.01 / float(plan.points_per_column),
-        )
+@pytest.mark.parametrize(("exposures", "fastest"), [(1, 65_535), (50, 5000)])
+def test_line_markers_come_as_often_as_the_point_clock_allows(exposures, fastest):
+    limits = dataclasses.replace(GALVO, point_rate_hz=(2e3, fastest))
+    plan = plan_of(scan(columns=40, exposures=exposures, command_range=[0, 0.01]), limits=limits)
+    needed = max(4 / float(plan.points_per_column), 2 / exposures)
+    assert needed <= plan.columns_per_marker < needed + 1
+    path = plan.legs[0].path
+    points = plan.marker_points[plan.marker_points <= path.lit_start + path.lit_points]
+    edges = (points - float(path.lit_start)) / float(plan.points_per_column)
+    steps = np.arange(len(edges)) * plan.columns_per_marker
+    np.testing.assert_allclose(edges, steps, atol=1.01 / float(plan.points_per_column))
 
 
-def test_times_of_any_sweep_are_exact():
-    plan = plan_of(scan(frame_rate="97.7 kHz"))
-    assert plan.column_s == Fraction(4, 97_700)
-    assert plan.sweep_s * plan.point_rate_hz == plan.sweep_points
-
-
-@pytest.mark.parametrize(("bidirectional", "maps"), [(False, 3), (True, 4), (True, 3), (True, 1)])
+@pytest.mark.parametrize(("bidirectional", "maps"), [(False, 3), (True, 4), (True, 3)])
 def test_the_gate_program_opens_once_per_map_and_waits_with_the_gate_low(bidirectional, maps):
     plan = plan_of(scan(bidirectional=bidirectional), Lag(1e-4, 3e-4))
     pulses, repeats = sync_program(plan, maps)
@@ -179,11 +156,6 @@ def test_the_remedy_for_a_scan_that_is_too_fast_works():
     plan_of(scan(columns=200, exposures=1, command_range=[low, high]), Lag(1e-4, 1e-4), GALVO)
     with pytest.raises(PlanError):
         plan_of(scan(columns=200, exposures=exposures - 1, command_range=[-0.8, 0.8]), Lag(1e-4, 1e-4), GALVO)
-
-
-def test_a_range_without_room_for_the_run_in_names_both_ranges():
-    with pytest.raises(PlanError, match=r"command runs from -1\.\d+ to 1\.\d+, the scanner's range is -1 to 1; "):
-        plan_of(scan(columns=300, command_range=[-1, 1]), Lag(2e-4, 2e-4), GALVO)
 
 
 def test_everything_that_does_not_fit_is_listed_at_once():
@@ -220,21 +192,11 @@ def test_more_points_than_the_scanner_holds_lower_the_point_clock():
         plan_of(scan(columns=500, exposures=10), limits=dataclasses.replace(GALVO, max_points=50))
 
 
-def test_a_link_that_cannot_carry_the_frames_is_refused_with_the_rate_it_can():
-    spad = dataclasses.replace(SPAD, stream=StreamMode(2.4e6))
-    with pytest.raises(PlanError, match=r"makes 4\.8 MB/s of full frames; .*2\.4 MB/s; lower frame_rate to 50 kHz"):
-        plan_of(scan(), spad=spad)
-    config = scan(frame_rate="50 kHz")
-    assert spad_request(config, plan_of(config, spad=spad)).mode == "stream"
-
-
 @pytest.mark.parametrize(("most_hz", "kept"), [(80_000, "lower frame_rate to 50 kHz"), (40_000, "does is 40 kHz")])
 def test_of_two_limits_of_the_frame_rate_only_the_stricter_is_named(most_hz, kept):
     spad = dataclasses.replace(SPAD, stream=StreamMode(2.4e6), max_frame_rate_hz=Fraction(most_hz))
-    with pytest.raises(PlanError) as caught:
+    with pytest.raises(PlanError, match=rf"\A[^\n]*{kept}[^\n]*\Z"):
         plan_of(scan(), spad=spad)
-    (problem,) = caught.value.problems
-    assert kept in problem
 
 
 def test_a_spad_that_cannot_stream_fast_enough_takes_bursts():
@@ -255,17 +217,3 @@ def test_a_block_holds_five_milliseconds_of_frames_and_at_most_sixteen_mebibytes
     config = scan(frame_rate=rate)
     plan = compile_plan(config, scanner_limits(), timer_clock, None, tall)
     assert spad_request(config, plan).block_frames == frames
-
-
-def test_without_a_calibration_the_window_is_the_whole_row():
-    plan = compile_plan(scan(), scanner_limits(), timer_clock, None, dataclasses.replace(SPAD, width=100))
-    assert plan.window == 128
-    assert "window      all 100 pixels for" in plan_text(plan)
-    assert not plan.x0.any()
-    assert plan.legs[0].lag_s == 0
-
-
-def test_the_description_names_columns_map_rate_sensor_time_dark_share_window_and_megabytes():
-    text = plan_text(plan_of(scan(columns=500, exposures=10), limits=GALVO))
-    for words in ("500 x 10 frames at 100 kHz", "maps ", "ms of sensor time", "% of them dark", "pixels", "MB/s"):
-        assert words in text

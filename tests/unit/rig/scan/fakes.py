@@ -39,6 +39,10 @@ class Device:
         if verb in self.failing:
             raise self.failing[verb]
 
+    def __getattr__(self, verb):
+        """Any verb that is only noted."""
+        return lambda *_: self.told(verb)
+
 
 class FakeScanner(Device):
     fault = None
@@ -51,12 +55,6 @@ class FakeScanner(Device):
     @property
     def status(self):
         return ScannerStatus(True, self.fault, None)
-
-    def start(self):
-        self.told("start")
-
-    def park(self):
-        self.told("park")
 
 
 class FakeLaser(Device):
@@ -72,27 +70,12 @@ class FakeLaser(Device):
         self.cold -= 1
         return LaserStatus(self.cold <= 0, True, True, None, None, self.cold > 0, "digital")
 
-    def pause(self):
-        self.told("pause")
-
 
 class FakeSync(Device):
     most = None
 
     def most_repeats(self, pulses):
         return self.most
-
-    def program(self, pulses, repeats):
-        self.told("program")
-
-    def run(self):
-        self.told("run")
-
-    def gate_low(self):
-        self.told("gate_low")
-
-    def abort(self):
-        self.told("abort")
 
 
 class FakeSpad(Device):
@@ -133,24 +116,22 @@ class FakeSpad(Device):
                 raise DeviceTimeout("spad: no free slot")
             self._drop(ring, block)
             return True
-        before = self.counters
+        exposed, delivered, lost, *_ = dataclasses.astuple(self.counters)
         header = dataclasses.replace(
-            block.header, block_seq=self.seq, lost_before=block.header.lost_before + before.lost, flags=self.flags
+            block.header, block_seq=self.seq, lost_before=block.header.lost_before + lost, flags=self.flags
         )
-        self.counters = SpadCounters(
-            before.exposed + block.n_frames, before.delivered + block.n_frames, before.lost, 0, 0
-        )
+        self.counters = SpadCounters(exposed + block.n_frames, delivered + block.n_frames, lost, 0, 0)
         self.delivered += block.frame_numbers.tolist()
         self.seq, self.flags = self.seq + 1, BlockFlag(0)
         ring.publish(dataclasses.replace(block, header=header))
         return True
 
     def _drop(self, ring, block):
-        before, n = self.counters, block.n_frames
-        self.counters = SpadCounters(before.exposed + n, before.delivered, before.lost + n, 0, 0)
+        exposed, delivered, lost, *_ = dataclasses.astuple(self.counters)
+        self.counters = SpadCounters(exposed + block.n_frames, delivered, lost + block.n_frames, 0, 0)
         self.dropped += block.frame_numbers.tolist()
         self.flags = BlockFlag.LOST_BEFORE
-        ring.mark_overflow(n)
+        ring.mark_overflow(block.n_frames)
 
     def stop(self):
         self.told("stop")
@@ -181,17 +162,10 @@ def fake_rig(plan, streams, failing=None, power=None, **spad):
     failing = failing or {}
     log: list[str] = []
     config = dataclasses.make_dataclass("Config", ["scan", "spad"])(scan(power=power), spad=None)
-    rig = OpenRig(
-        config=config,
-        clock=VirtualClock(),
-        world=None,
-        spad=FakeSpad(log, streams, failing.get("spad", {}), **spad),
-        scanner=FakeScanner("scanner", log, failing.get("scanner", {})),
-        laser=FakeLaser("laser", log, failing.get("laser", {})),
-        sync=FakeSync("sync", log, failing.get("sync", {})),
-        model=None,
-    )
-    return rig, log
+    makes = {"scanner": FakeScanner, "laser": FakeLaser, "sync": FakeSync}
+    devices = {name: make(name, log, failing.get(name, {})) for name, make in makes.items()}
+    fake = FakeSpad(log, streams, failing.get("spad", {}), **spad)
+    return OpenRig(config=config, clock=VirtualClock(), world=None, spad=fake, model=None, **devices), log
 
 
 def acquisition(rig, plan, maps, maker=None, **options):

@@ -1,10 +1,9 @@
 """Rows, fronts, choice and files of a trade-off; the command is in tests/system/test_cli_tradeoff.py."""
 
-import csv
-import io
 import xml.etree.ElementTree as ElementTree
 from dataclasses import replace
 
+import mpmath
 import numpy as np
 import pytest
 from hypothesis import given, settings
@@ -19,13 +18,31 @@ from rig.errors import UsageError
 from rig.geometry.stripe_table import StripeTable
 from rig.requests import TradeoffRequest
 from rig.threads import RowWorkers
+from rig.tradeoff import rows as rows_module
 from rig.tradeoff.choice import Wish, advice, choose, wish_of
-from rig.tradeoff.files import csv_text, tradeoff_svg
+from rig.tradeoff.files import tradeoff_svg
 from rig.tradeoff.limits import LEAST_WRONG, SceneLimits
 from rig.tradeoff.row_light import RowLight
-from rig.tradeoff.rows import MOST_MISSING, MapScore, TradeoffRow, TrialSetting, row_of, score_map, with_fronts
+from rig.tradeoff.rows import (
+    BLOCK_COLUMNS,
+    BLOCK_ROWS,
+    MOST_MISSING,
+    MapScore,
+    TradeoffRow,
+    TrialSetting,
+    blocks_interval,
+    blocks_of,
+    repeats_interval,
+    row_of,
+    score_map,
+    t_quantile,
+    with_fronts,
+)  # fmt: skip
 from rig.tradeoff.scan import FrameKeeper
 from rig.tradeoff.trials import Tradeoff, Trials, run_tradeoff
+from tests.stability.inventory import covers
+
+covers(rows_module)
 
 ROW = TradeoffRow(
     scene="street", fog=None, estimator="edge", filter="none", exposures=10, lines=1, sensor_ms=50.0, compute_ms=20.0,
@@ -107,7 +124,7 @@ def test_the_advice_is_what_was_asked_for_and_else_the_shortest_scan_of_little_m
         replace(ROW, estimator="joint", filter="none", exposures=k, mean_abs_px=px, sensor_ms=5.0 * k, compute_ms=80.0)
         for k, px in ((1, 0.4), (3, 0.14), (10, 0.1))
     ]
-    took = "K = 3 with joint: 0.14 px in 15 ms of sensor and 80 ms of computing a map"
+    took = "joint, 3 exposures: 0.14 px in 15 ms of sensor and 80 ms of computing a map"
     assert advice(rows, None, None) == f"take {took}; the shortest scan within 1.5 times the least error, 0.1 px"
     wish = Wish(time_ms=20.0)
     asked = f"take {took}, the best for at most 20 ms of sensor time a map"
@@ -134,12 +151,6 @@ def test_the_advice_is_what_was_asked_for_and_else_the_shortest_scan_of_little_m
 def test_wishes_that_are_none_are_refused(time_budget, error, of, named):
     with pytest.raises(UsageError, match=named):
         wish_of(time_budget, error, of)
-
-
-def test_wishes_are_read_with_their_units():
-    assert wish_of("5 ms", None, "compute") == Wish(5.0, None, "compute")
-    assert wish_of(None, ".1px", "sensor") == Wish(None, 0.1, "sensor")
-    assert wish_of(None, None, "sensor") is None
 
 
 def test_missing_answers_are_charged_and_repeats_averaged():
@@ -191,10 +202,10 @@ def test_an_interrupt_leaves_the_rows_that_are_whole(monkeypatch, whole):
     )
     done = iter(range(whole))
 
-    def scanned(config, estimators, filters, seed, on_frames):
+    def scanned(config, estimators, filters, seed, tell):
         if next(done, None) is None:
             raise KeyboardInterrupt
-        return {("edge", "none"): MapScore(0.5, 0.9, 0.0, 10.0, 50.0, 20.0, np.array([50.0]), np.array([100]))}
+        return {("edge", "none"): MapScore(0.5, 0.9, 0.0, 10.0, 50.0, 20.0, (0.4, 0.6))}
 
     monkeypatch.setattr("rig.tradeoff.trials.score_methods", scanned)
     if not whole:
@@ -216,12 +227,6 @@ def test_the_figure_is_sound_svg_and_shows_what_counts():
     assert "nan" not in text
     assert "missing answers: 1 of 5 rows" in text
     assert text.count("&lt;new&gt; + median") == 1
-
-
-def test_the_table_for_programs_has_a_column_for_each_figure():
-    (line,) = csv.DictReader(io.StringIO(csv_text([ROW])))
-    assert (line["mean_abs_px"], line["ci95_low"], line["ci95_high"]) == ("0.5", "0.4", "0.6")
-    assert set(ROW.as_json()) - {"ci95"} < set(line)
 
 
 def lights(stripe: float) -> list[RowLight]:
@@ -268,3 +273,35 @@ def test_the_tables_fit_into_80_characters(capsys):
     assert sum(line.endswith("*+") for line in lines) == len(rows)
     assert sum("(48.4)" in line for line in lines) == len(rows) / 2
     assert {"street, visibility 20 m", "street, visibility 20 m, 4 lines at once"} < set(lines)
+
+
+@pytest.mark.parametrize("freedom", [1, 2, 3, 4, 5, 6, 9, 20, 999])
+def test_the_quantile_is_that_of_students_t(freedom):
+    x = freedom / (freedom + t_quantile(freedom) ** 2)
+    beyond = mpmath.betainc(freedom / 2, 0.5, 0, x, regularized=True)  # both tails
+    assert float(beyond) == pytest.approx(0.05, rel=2e-3)
+
+
+def test_an_interval_over_repeats_follows_its_formula_and_is_never_below_zero():
+    low, high = repeats_interval([1.0, 2.0, 3.0])
+    assert (low, high) == (0.0, pytest.approx(2 + 4.3027 / 3**0.5))
+
+
+def test_the_blocks_of_a_map_hold_its_errors_and_leave_nan_out():
+    errors = np.full((BLOCK_ROWS + 3, 2 * BLOCK_COLUMNS), 2.0)
+    errors[0, 0] = np.nan
+    sums, numbers = blocks_of(errors)
+    whole = BLOCK_ROWS * BLOCK_COLUMNS
+    assert numbers.tolist() == [whole - 1, whole, 3 * BLOCK_COLUMNS, 3 * BLOCK_COLUMNS]
+    assert (sums == 2 * numbers).all()
+
+
+def test_an_interval_over_blocks_holds_the_true_mean_as_often_as_it_says():
+    rng = np.random.default_rng(1)
+    held = 0
+    for seed in range(100):
+        numbers = rng.integers(400, 801, 100)
+        sums = numbers * rng.exponential(0.3, 100)
+        low, high = blocks_interval(sums, numbers, seed)
+        held += low <= 0.3 <= high
+    assert held >= 88
