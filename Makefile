@@ -66,11 +66,12 @@ campaign-simulation: .venv/.installed-tests  ## effects left out against the ful
 # A rig takes some 20 s of CPU, a trial, which makes all mistakes, 180 s.
 RIGS ?= 500
 TRIALS ?= 30
-campaign-calibration: .venv/.installed-tests  ## RIGS calibrated, TRIALS of deliberate mistakes; a second simulator
+campaign-calibration: .venv/.installed-tests  ## RIGS calibrated, TRIALS of deliberate mistakes; a second simulator; the guide
 	short=0; \
 	$(BIN)/python -m tests.campaigns.calibration.rigs --rigs $(RIGS) || short=1; \
 	$(BIN)/python -m tests.campaigns.calibration.mistakes --trials $(TRIALS) || short=1; \
 	$(BIN)/python -m tests.campaigns.calibration.fits || short=1; \
+	$(BIN)/python -m tests.campaigns.calibration.guided || short=1; \
 	exit $$short
 
 .venv/.created:

@@ -1,7 +1,7 @@
-"""Figures of the tree itself: modules, lines, folders, imports, docstrings.
+"""Figures of the tree itself: modules, lines, folders, imports, parameters, docstrings, names.
 
     python -m tests.reference.house
-    python -m tests.reference.house --details circles docstrings
+    python -m tests.reference.house --details circles words
     python -m tests.reference.house --limits        # part of `make test`
 
 Product code is `drivers`, `calibration`, `sim_backend` and `rig`; sources are read, never imported. A package face, an
@@ -10,12 +10,14 @@ limit that is not kept is told; the exit code is 1 where one is broken that must
 told as 'short by N' and do not fail.
 """
 
+from __future__ import annotations
+
 import argparse
 import ast
 import re
 import statistics
 import sys
-from collections import Counter
+from collections import Counter, defaultdict
 from collections.abc import Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -31,10 +33,15 @@ LIMITS: Mapping[str, tuple[str, int]] = {
 }
 GOALS = ("lines", "tests")
 """Limits that the tree is on its way to: told, but no failure."""
+ROOMIER_FOLDERS = {"sim_backend/effects": 20}
+"""Folders with a limit of their own: one file is one effect."""
 
 PRODUCT = ("drivers", "calibration", "sim_backend", "rig")
+MANY_PARAMETERS = 10
 CLAUSES = ("What", "Of", "As", "Where", "How", "Whose", "Which", "Why", "When")
 FINITE_VERBS = re.compile(r"\b(is|are|was|were|has|have|does|do|can|may|must|will|gives?|holds?|returns?|comes?)\b")
+COMPILED = re.compile(r"\b(njit|jit|vectorize|guvectorize|intrinsic|overload|kernel)\b")
+WORDS_FILE = Path(__file__).with_name("field_words.txt")
 
 Function = ast.FunctionDef | ast.AsyncFunctionDef
 Definition = Function | ast.ClassDef
@@ -80,7 +87,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
     parser.add_argument("--limits", action="store_true", help="compare with the limits; exit code 1 when broken")
     parser.add_argument("--details", nargs="*", default=(), metavar="FIGURE", help="list what these figures count")
     given = parser.parse_args(arguments)
-    found = {figure.name: figure for figure in figures(given.root)}
+    found = {figure.name: figure for figure in figures(given.root, words_of(WORDS_FILE))}
     if unknown := [name for name in given.details if name not in found]:
         parser.error(f"no figure is named {', '.join(unknown)}; choose from {', '.join(found)}")
     for figure in found.values():
@@ -93,7 +100,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
     return 1 if broken.keys() - set(GOALS) else 0
 
 
-def figures(root: Path) -> Iterator[Figure]:
+def figures(root: Path, field_words: set[str]) -> Iterator[Figure]:
     """All figures of the tree below root."""
     modules = read_modules(root, PRODUCT)
     faces = sum(module.is_face for module in modules)
@@ -105,17 +112,30 @@ def figures(root: Path) -> Iterator[Figure]:
     yield Figure("median", median, f"{median:g} lines a module, {own:g} without package faces")
     yield folder_figure(modules)
     loads, all_imports = import_graphs(modules)
+    lone = lone_importers(all_imports)
+    yield Figure("single", len(lone), f"{len(lone)} modules with a single importer", lone)
     circles = [", ".join(circle) for circle in circles_of(loads)]
     deferred = [circle for each in circles_of(all_imports) if (circle := ", ".join(each)) not in circles]
     told = f"{len(circles)} import circles; {len(deferred)} more or larger ones with imports in functions and for types"
     yield Figure("circles", len(circles), told, [*circles, *(f"deferred: {circle}" for circle in deferred)])
+    yield parameter_figure(modules)
     clauses = sorted(f"{place}: {text}" for module in modules for place, text in clause_docstrings(module))
     yield Figure("docstrings", len(clauses), f"{len(clauses)} docstrings begin with a relative clause", clauses)
+    yield word_figure(modules, field_words)
     of_tests = read_modules(root, ("tests",))
     tests = sum(module.lines for module in of_tests)
     yield Figure("tests", tests, f"{tests} lines of tests")
     missing = missing_imports([*modules, *of_tests])
     yield Figure("missing", len(missing), f"{len(missing)} imports of ours, tests' among them, name nothing", missing)
+    stems = shared_names((module.path.stem, module.name) for module in modules if not module.path.stem.startswith("__"))
+    yield Figure("same-modules", len(stems), f"{len(stems)} module names are used for two or more things", stems)
+    classes = shared_names(
+        (node.name, module.name)
+        for module in modules
+        for node in module.tree.body
+        if isinstance(node, ast.ClassDef) and not node.name.startswith("_")
+    )
+    yield Figure("same-classes", len(classes), f"{len(classes)} class names are used for two or more things", classes)
 
 
 def broken_limits(found: Mapping[str, Figure]) -> dict[str, str]:
@@ -142,10 +162,12 @@ def read_modules(root: Path, packages: Iterable[str]) -> list[Module]:
 
 
 def folder_figure(modules: Sequence[Module]) -> Figure:
-    """Modules of the fullest folder."""
-    counts = Counter(module.path.parent.as_posix() for module in modules if not module.is_face).most_common()
-    folder, most = counts[0]
-    return Figure("folder", most, f"{most} modules in {folder}", [f"{each}: {n}" for each, n in counts])
+    """Modules of the fullest folder; one with a limit of its own only where it passes that."""
+    counts = Counter(module.path.parent.as_posix() for module in modules if not module.is_face)
+    judged = {folder: n for folder, n in counts.items() if n > ROOMIER_FOLDERS.get(folder, 0)}
+    folder = max(judged, key=lambda each: judged[each], default="none")
+    items = [f"{each}: {n}" for each, n in counts.most_common()]
+    return Figure("folder", judged.get(folder, 0), f"{judged.get(folder, 0)} modules in {folder}", items)
 
 
 def import_graphs(modules: Sequence[Module]) -> tuple[Graph, Graph]:
@@ -211,6 +233,15 @@ def bound_names(tree: ast.AST) -> Iterator[str]:
             yield from bound_names(node)
 
 
+def lone_importers(imports: Graph) -> list[str]:
+    """Modules that one module alone imports, each with it."""
+    importers: dict[str, list[str]] = defaultdict(list)
+    for name, targets in imports.items():
+        for target in targets:
+            importers[target].append(name)
+    return sorted(f"{name} by {by[0]}" for name, by in importers.items() if len(by) == 1)
+
+
 def circles_of(graph: Graph) -> list[list[str]]:
     """Groups of two or more modules that reach each other, by name."""
 
@@ -226,6 +257,45 @@ def circles_of(graph: Graph) -> list[list[str]]:
     reach = {name: reached(name) for name in graph}
     groups = {tuple(sorted(other for other in reach[name] if name in reach[other])) for name in graph}
     return sorted([*group] for group in groups if len(group) > 1)
+
+
+def parameter_figure(modules: Sequence[Module]) -> Figure:
+    """Functions with ten parameters or more."""
+    items, public = [], 0
+    for module in modules:
+        for path, node in definitions(module.tree):
+            if isinstance(node, ast.ClassDef) or (n := parameters(node)) < MANY_PARAMETERS:
+                continue
+            compiled = any(COMPILED.search(ast.unparse(each)) for each in node.decorator_list)
+            outside = not compiled and is_public(path)
+            public += outside
+            kind = "compiled" if compiled else "public" if outside else "private"
+            items.append(f"{module.name}.{'.'.join(path)}: {n}, {kind}")
+    told = f"{len(items)} functions with {MANY_PARAMETERS} or more parameters, {public} of them public and not compiled"
+    return Figure("parameters", len(items), told, sorted(items))
+
+
+def parameters(node: Function) -> int:
+    """Number of a function's parameters, without self and cls."""
+    given = node.args
+    named = [each.arg for each in (*given.posonlyargs, *given.args)]
+    rest = sum(each is not None for each in (given.vararg, given.kwarg))
+    return len(named) - (named[:1] in (["self"], ["cls"])) + len(given.kwonlyargs) + rest
+
+
+def definitions(tree: ast.AST, path: tuple[str, ...] = ()) -> Iterator[tuple[tuple[str, ...], Definition]]:
+    """Functions and classes at any depth, with their names from the outside in."""
+    for node in ast.iter_child_nodes(tree):
+        if isinstance(node, Definition):
+            yield (*path, node.name), node
+            yield from definitions(node, (*path, node.name))
+        else:
+            yield from definitions(node, path)
+
+
+def is_public(path: Sequence[str]) -> bool:
+    """Whether no part of a dotted name is private; `__init__` is as public as its class."""
+    return not any(part.startswith("_") and not part.endswith("__") for part in path)
 
 
 def clause_docstrings(module: Module) -> Iterator[tuple[str, str]]:
@@ -248,6 +318,60 @@ def is_clause(docstring: str) -> bool:
         return True
     sentence = re.split(r"[.;:](?:\s|$)", text, maxsplit=1)[0]
     return sentence.startswith("The same") and not FINITE_VERBS.search(sentence)
+
+
+def word_figure(modules: Sequence[Module], field_words: set[str]) -> Figure:
+    """Words of public names that are not in the word list, with how often and where first."""
+    counts: Counter[str] = Counter()
+    first: dict[str, str] = {}
+    for where, name in public_names(modules):
+        for word in words_in(name):
+            if word not in field_words:
+                counts[word] += 1
+                first.setdefault(word, where)
+    items = [f"{word}: {n}, {first[word]}" for word, n in sorted(counts.items(), key=lambda each: (-each[1], each[0]))]
+    told = f"{len(counts)} words in public names, {counts.total()} times, are not in {WORDS_FILE.name}"
+    return Figure("words", len(counts), told, items)
+
+
+def public_names(modules: Sequence[Module]) -> Iterator[tuple[str, str]]:
+    """Public names of packages, modules, classes, functions and methods, each with its dotted place."""
+    for module in modules:
+        own = module.name.rsplit(".", 1)[-1]
+        if not own.startswith("_"):
+            yield module.name, own
+        for path, node in definitions(module.tree):
+            if is_public(path) and not node.name.startswith("__") and not _within_function(module.tree, path):
+                yield f"{module.name}.{'.'.join(path)}", node.name
+
+
+def _within_function(tree: ast.Module, path: Sequence[str]) -> bool:
+    """Whether a definition lies in a function, where its name is nobody else's business."""
+    body: list[ast.stmt] = tree.body
+    for name in path[:-1]:
+        outer = next((node for node in body if isinstance(node, Definition) and node.name == name), None)
+        if not isinstance(outer, ast.ClassDef):
+            return outer is not None
+        body = outer.body
+    return False
+
+
+def words_in(name: str) -> list[str]:
+    """Words of a name in small letters, split at underscores, capitals and digits."""
+    return [word.lower() for word in re.findall(r"[A-Z]+(?![a-z])|[A-Z]?[a-z]+", name)]
+
+
+def words_of(file: Path) -> set[str]:
+    """Words of a word list; lines that begin with # are none."""
+    return {word for line in file.read_text().splitlines() if not line.startswith("#") for word in line.split()}
+
+
+def shared_names(named: Iterable[tuple[str, str]]) -> list[str]:
+    """Names that stand for two or more things, with where."""
+    places: dict[str, list[str]] = defaultdict(list)
+    for name, place in named:
+        places[name].append(place)
+    return sorted(f"{name}: {', '.join(where)}" for name, where in places.items() if len(where) > 1)
 
 
 def _names_all(node: ast.stmt) -> bool:
