@@ -55,14 +55,14 @@ def check_command(config: ConfigArgument = "simulated", as_json: JsonOption = Fa
 
 
 def show_command(config: ConfigArgument = "simulated", as_json: JsonOption = False) -> int:
-    """Print a config with every default filled in and every path absolute."""
-    from rig.config.files import config_text, load_config, portable_content
+    """Print a config as it is written, with every default filled in and every path absolute."""
+    from rig.config.files import completed_text, config_content
 
-    loaded = load_config(config)
+    text = completed_text(config)
     if as_json:
-        print_json(portable_content(loaded))
+        print_json(config_content(text))
     else:
-        print(config_text(loaded), end="")
+        print(text, end="")
     return 0
 
 

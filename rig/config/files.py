@@ -10,16 +10,16 @@ from collections.abc import Iterable, Mapping
 from pathlib import Path
 from typing import Any, TypeVar
 
-import yaml
 from pydantic import BaseModel
 
 from calibration.errors import FileError
 from calibration.files.problems import Key, ValueSources, plain_types, validated
 from calibration.files.rig_file import CAMERA_FORMAT
-from calibration.files.sections import FORMAT, YamlFile, load_yaml
+from calibration.files.sections import FORMAT, YamlFile, load_yaml, parse_yaml
 from drivers.errors import UnknownKind
 from drivers.registry import SLOTS, kinds, lookup
 from rig.config.bundled import BUNDLED, bundled_rigs, bundled_scenes
+from rig.config.completion import block_text, completed
 from rig.config.models import CubePlan, RigConfig
 from rig.errors import UsageError
 
@@ -55,6 +55,7 @@ _OTHERS = {
     CAMERA_FORMAT: "the calibration of a camera alone",
 }
 """Other files of this program that are taken for configs, by their `format`."""
+_CONFIG = ("a config", "scan: {columns: 500}")
 MAX_PATH = 1000
 """Characters; longer text is no path."""
 SCENE = ("world", "scene")
@@ -73,7 +74,7 @@ def load_config(name_or_path: str | Path = "simulated", overrides: Mapping[str, 
     per problem, all problems at once.
     """
     path = find_config(name_or_path)
-    read = _read(path, "a config", "scan: {columns: 500}")
+    read = read_config(path)
     content = read.content
     _refuse_others(path, content, f"name the config of a rig, such as {bundled_configs()[0]}")
     _anchor_paths(content, path.parent)
@@ -92,9 +93,35 @@ def load_cube_plan(path: str | Path) -> CubePlan:
     return _validated(CubePlan, read.content, ValueSources(_shown(Path(path)), read.lines), Path(path).parent)
 
 
-def config_text(config: RigConfig) -> str:
-    """A config as YAML with every default filled in and every path absolute; it means the same in any folder."""
-    return yaml.safe_dump(portable_content(config), sort_keys=False, allow_unicode=True)
+def completed_text(name_or_path: str | Path) -> str:
+    """The text of a config, its comments included, with every default filled in and every path absolute.
+
+    It means the same in a file of any folder. Where aliases or the like leave no place to fill defaults in, the text is
+    made anew without comments. Raises UsageError as `load_config` does.
+    """
+    path = find_config(name_or_path)
+    read = read_config(path)
+    anchored = copy.deepcopy(read.content)
+    _anchor_paths(anchored, path.parent)
+    full = portable_content(load_config(path))
+    if anchored.get("calibration") is not None:
+        anchored["calibration"] = full["calibration"]
+    text = completed(read.text, read.node, anchored, full)
+    try:
+        same = portable_content(parse_config(config_content(text))) == full
+    except UsageError:
+        same = False
+    if same:
+        return text
+    return f"# {_shown(path)}, written anew without its comments\n{block_text(full)}"
+
+
+def config_content(text: str) -> dict[str, Any]:
+    """The keys and values of a config's text. Raises UsageError where it is not one."""
+    try:
+        return parse_yaml(text, *_CONFIG, "config").content
+    except FileError as error:
+        raise UsageError(*error.problems) from error
 
 
 def parse_config(content: Mapping[str, object], folder: Path | None = None, options: Iterable[str] = ()) -> RigConfig:
@@ -166,6 +193,11 @@ def config_schema() -> dict[str, Any]:
         described = {k: v for k, v in schema["properties"][slot].items() if k in ("description", "default")}
         schema["properties"][slot] = {**described, "oneOf": choices or [{"type": "object"}]}
     return schema
+
+
+def read_config(path: Path) -> YamlFile:
+    """Read a config file without filling anything in. Raises UsageError, for a key given twice as well."""
+    return _read(path, *_CONFIG)
 
 
 def _read(path: Path, what: str, example: str) -> YamlFile:

@@ -8,7 +8,9 @@ import io
 from collections.abc import Sequence
 from dataclasses import asdict, replace
 
-from rig.config.files import config_text
+import yaml
+
+from rig.config.files import portable_content
 from rig.config.models import RigConfig
 from rig.run_folder.charts import Panel, Series, chart_svg
 from rig.run_folder.folder import RunFolder
@@ -32,7 +34,9 @@ def write_files(folder: RunFolder, done: Tradeoff, setting: RigConfig | None) ->
         if done.accepted_calibration:
             comments.append("its calibration was accepted all the same: scan with --accept-calibration")
         head = "".join(f"# {comment}\n" for comment in comments)
-        folder.write_text(SETTING_FILE, head + config_text(setting))
+        folder.write_text(
+            SETTING_FILE, head + yaml.safe_dump(portable_content(setting), sort_keys=False, allow_unicode=True)
+        )
     return replace(done, folder=folder.publish())
 
 
