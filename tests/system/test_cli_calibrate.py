@@ -13,6 +13,7 @@ from calibration.board.board import load_board
 from calibration.files.rig_file import load_rig_model
 from rig import api
 from rig.devices.calibration_use import note_check, refusals
+from rig.errors import UsageError
 from tests.system.board_rig import write_board_rig
 from tests.system.conftest import Rig
 
@@ -326,3 +327,17 @@ def test_what_is_no_source_is_said_before_anything_moves(rig: Rig, tmp_path: Pat
     assert len(ran.problems) >= 2
     assert "exposures has 0" in rig("calibrate", "planes", "--exposures", "0,3").problems[0]
     assert "terms is 3" in rig("calibrate", "camera", "--terms", "3").problems[0]
+
+
+def test_a_real_rig_needs_somebody_to_move_the_board_and_arm(calibrated: Path) -> None:
+    with pytest.raises(UsageError):
+        api.calibrate_planes("lab", board=calibrated / "board.yaml")
+
+
+def test_a_mirrored_board_is_refused_for_that(rig: Rig) -> None:
+    Path("pictures").mkdir()
+    cv2.imwrite("pictures/0.png", np.pad(load_board().picture(40)[:, ::-1], 60, constant_values=128))
+    ran = rig("calibrate", "camera", "pictures", "--out", "camera")
+    assert ran.code == 2
+    assert ran.problems[0].startswith("error: mirrored: ")
+    assert "room-light" not in ran.err  # pictures count no photons

@@ -152,3 +152,8 @@ def test_a_lag_that_noise_made_negative_is_held_even_where_a_fit_does_not_rest(m
     fit = fitted(replace(RIG, lag=(-1e-6, -1e-6)), 20, replace(SEEN, passage=3e-3), poses=5)
     assert any(decision.reason.endswith("held at 0") for decision in fit.decisions)
     assert fit.model.lag_s == (0, 0)
+
+
+def test_a_light_that_passes_the_axis_is_seen() -> None:
+    fit = fitted(replace(RIG, offset=0.02), 7, replace(SEEN, passage=2e-4), poses=10)
+    assert normalised(fit.model, replace(RIG, offset=0.02), 5.0, 35.2) < 2.5

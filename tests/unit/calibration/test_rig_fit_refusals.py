@@ -13,7 +13,7 @@ from calibration.rig_fit.fit import fit_rig
 from calibration.rig_fit.start import check_depth
 from calibration.views import BoardPose, View
 from tests.reference.boards.calibration_data import BOARD, random_views, seen_view
-from tests.reference.boards.fitted_depth import normalised
+from tests.reference.boards.fitted_depth import depth_errors, normalised
 from tests.unit.calibration.fitted_rigs import RIG, SEEN, SIZE, fitted, held
 
 
@@ -102,3 +102,14 @@ def test_a_mirror_ahead_of_its_command_is_refused() -> None:
     with pytest.raises(Degenerate, match=r"run \d+ us \+- [\d.]+ us ahead of its command, limit 0") as raised:
         fitted(replace(RIG, lag=(-2e-3, -2e-3)), 20, poses=6)
     assert raised.value.reason == "negative-lag"
+
+
+def test_two_poses_are_a_model_that_knows_little_or_none() -> None:
+    for seed in range(3):
+        try:
+            fit = fitted(RIG, seed, poses=2)
+        except CalibrationError:
+            continue
+        error, sd = depth_errors(fit.model, RIG, 5.0, 35.2)
+        assert np.median(sd) > 0.01
+        assert np.median(np.abs(error)) < 5 * np.median(sd)

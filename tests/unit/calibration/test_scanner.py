@@ -76,3 +76,12 @@ def test_a_table_that_is_none_is_refused(command: list[float], rows: list[list[f
 def test_a_pivot_that_is_none_is_refused(changes: dict[str, object], said: str) -> None:
     with pytest.raises(CalibrationError, match=said):
         pivot(**changes)
+
+
+def test_signs_and_lengths_in_a_table_do_not_matter() -> None:
+    rows = vertical_planes(np.linspace(-0.3, 0.5, 9))
+    signs = np.array([1, -1, -1, 1, -2, 3, -1, 1, -1.0])
+    at = np.linspace(0, 8, 50)
+    assert np.allclose(
+        PlaneTable(np.arange(9.0), rows * signs[:, None]).planes(at), PlaneTable(np.arange(9.0), rows).planes(at)
+    )

@@ -111,3 +111,11 @@ def test_what_cannot_be_told_is_refused(sweeps, reason):
 
 def _reversed(sweep):
     return Passages(sweep.x_px, sweep.y_px, -sweep.command, sweep.sd, sweep.direction, sweep.speed_per_s)
+
+
+def test_a_sweep_without_passages_says_nothing_of_its_speed():
+    rng = np.random.default_rng(8)
+    silent = Passages(*np.empty((4, 0)), 1, 400.0)
+    fit = fit_sync([*_sweeps(rng, (35.0, 90.0)), silent])
+    assert fit.speed_range_per_s == pytest.approx((35 * 0.95, 90 * 1.05))
+    assert np.isfinite(fit.chi2)

@@ -32,3 +32,10 @@ def test_a_source_that_is_not_there_is_said_to_be_none_of_all() -> None:
         sort_sources(["nopics"], pictures=True)
     with pytest.raises(UsageError, match=r"no config 'nopics'.*of that name \(a run, an earlier calibration\)"):
         sort_sources(["nopics"])
+
+
+def test_a_scene_that_has_a_board_is_used(tmp_path: Path) -> None:
+    config, _ = write_board_rig(tmp_path)
+    found = sort_sources([config])
+    assert found.live == configure(config)
+    assert found.notes == ()
