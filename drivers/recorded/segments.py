@@ -72,7 +72,7 @@ class FrameTable:
         return range(first, int(np.searchsorted(self.plain, min(end, self.size), "left")))
 
     def places(self, frame: int) -> tuple[int, int, int, int]:
-        """Where a frame begins and ends in the file, and in the plain segment."""
+        """The places at which a frame begins and ends, in the file and in the plain segment."""
         return (*self.packed[frame : frame + 2].tolist(), *self.plain[frame : frame + 2].tolist())
 
 
