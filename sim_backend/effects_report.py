@@ -58,10 +58,7 @@ def effects_report(world: "SimulatedWorld", *, power_w: float, exposure_s: float
 def flux_row(
     world: "SimulatedWorld", row: int, command: float, power_w: float, exposure_s: float
 ) -> Mapping[str, Array]:
-    """Photons per exposure (width,) of a row by effect of light or dark counts, zeros for those that are off.
-
-    command: of the mirror. power_w: of the laser.
-    """
+    """Photons per exposure (width,) of a row by effect of light or dark counts, zeros for those that are off."""
     model, view, limits = world.flux_model, world.setting.view, world.model.scanner.command_range
     (sheets,) = world.fan.sheets(world.model.sheets, np.array([command]), view.rows, [0.0], limits)
     lit: dict[str, Array] = {}

@@ -243,10 +243,7 @@ class SimulatedWorld:
         return effects_report(self, power_w=power_w, exposure_s=exposure_s, exposures=exposures)
 
     def flux_row(self, row: int, command: float, power_w: float, exposure_s: float) -> Mapping[str, Array]:
-        """Photons per exposure of every pixel of an image row, noise-free, by effect; those that are off bring none.
-
-        command: of the mirror; power_w: of the laser.
-        """
+        """Noise-free photons per exposure of an image row's pixels by effect, at a command of the mirror."""
         from sim_backend.effects_report import flux_row
 
         return flux_row(self, row, command, power_w, exposure_s)

@@ -48,7 +48,7 @@ class Entry:
 
 def _fog(setting: Setting) -> str | None:
     medium = setting.scene.medium
-    return medium and f"the medium has an extinction of {medium.extinction_per_m:.3g} /m"
+    return None if medium is None else f"the medium has an extinction of {medium.extinction_per_m:.3g} /m"
 
 
 def _halo(setting: Setting) -> str | None:
@@ -68,12 +68,16 @@ def _forward_blur(setting: Setting) -> str | None:
 
 def _rain(setting: Setting) -> str | None:
     rain = setting.scene.rain
-    return rain and f"it rains {1e3 * rain.rate:g} mm/h: {rain.sizes.density_per_m3():.0f} drops per m^3"
+    if rain is None:
+        return None
+    return f"it rains {1e3 * rain.rate:g} mm/h: {rain.sizes.density_per_m3():.0f} drops per m^3"
 
 
 def _snow(setting: Setting) -> str | None:
     snow = setting.scene.snow
-    return snow and f"it snows {1e3 * snow.rate:g} mm/h: {snow.sizes.density_per_m3():.0f} flakes per m^3"
+    if snow is None:
+        return None
+    return f"it snows {1e3 * snow.rate:g} mm/h: {snow.sizes.density_per_m3():.0f} flakes per m^3"
 
 
 def _speckle(setting: Setting) -> str | None:
@@ -89,8 +93,8 @@ def _defocus(setting: Setting) -> str | None:
 
 
 def _motion(setting: Setting) -> str | None:
-    motion = setting.scene.motion
-    return motion and f"the surfaces move by {', '.join(f'{speed:g}' for speed in motion.velocity)} m/s"
+    speeds = () if setting.scene.motion is None else setting.scene.motion.velocity
+    return f"the surfaces move by {', '.join(f'{speed:g}' for speed in speeds)} m/s" if speeds else None
 
 
 def _ambient(setting: Setting) -> str | None:

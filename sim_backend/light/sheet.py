@@ -88,9 +88,9 @@ def empty_sheet(planes: Array, rows: int, time_s: float = 0.0, bowed: LightSheet
     offset = planes[:, 3]
     with np.errstate(divide="ignore", invalid="ignore"):  # through the camera: seen edge-on, no depth
         inverse = np.where(offset[:, None] != 0, planes[:, :3] / offset[:, None], np.nan)
-    nowhere, unseen = (np.full(rows, np.nan) for _ in range(2)), (np.zeros(rows, np.int64) for _ in range(2))
-    normal = np.ascontiguousarray(planes[:, :3])
-    return LightSheet(normal, offset.copy(), inverse, *nowhere, *unseen, time_s=time_s, bowed=bowed)
+    normal, nowhere, unseen = np.ascontiguousarray(planes[:, :3]), np.full(rows, np.nan), np.zeros(rows, np.int64)
+    places = nowhere, nowhere.copy(), unseen, unseen.copy()
+    return LightSheet(normal, offset.copy(), inverse, *places, time_s, bowed)
 
 
 DEPTH_JUMP = 0.02

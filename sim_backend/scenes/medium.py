@@ -240,7 +240,7 @@ class Rain(Section):
 
     def fall_m_per_s(self, diameter_mm: Array) -> Array:
         """Fall speed."""
-        return np.maximum(9.65 - 10.3 * np.exp(-0.6 * diameter_mm), 0.0)
+        return np.asarray(np.maximum(9.65 - 10.3 * np.exp(-0.6 * diameter_mm), 0.0))
 
 
 class Snow(Section):
