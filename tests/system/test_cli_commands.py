@@ -101,6 +101,10 @@ def test_completion_is_installed_for_the_shell_that_calls(
     assert rig("--install-completion").code == 0
     written = "".join(file.read_text() for file in (tmp_path / "home").rglob("*") if file.is_file())
     assert "_RIG_COMPLETE=complete_bash" in written
+    (tmp_path / "file").touch()
+    monkeypatch.setenv("HOME", str(tmp_path / "file"))  # no folder: nothing can be written below it
+    ran = rig("--install-completion")
+    assert (ran.code, len(ran.err.splitlines())) == (2, 1)
 
 
 def test_scenes_and_rigs_are_listed_with_what_their_files_say(rig: Rig) -> None:
@@ -230,6 +234,14 @@ def test_check_opens_every_file_that_a_config_names(rig: Rig, small: Path) -> No
     ]
     scanned = rig("scan", small, "--dry-run")
     assert scanned.problems[:3] == ran.problems[:3]
+
+
+def test_check_reads_what_the_files_say(rig: Rig, small: Path) -> None:
+    (small.parent / "mine.yaml").write_text("surfaces: nowhere")
+    small.write_text(small.read_text().replace("scene: street-clear", "scene: mine.yaml"))
+    ran = rig("config", "check", small)
+    assert (ran.code, len(ran.problems)) == (2, 1)
+    assert ran.problems == rig("scan", small, "--dry-run").problems
 
 
 @pytest.mark.parametrize("name", bundled_configs())

@@ -99,7 +99,7 @@ def test_a_simulated_camera_of_one_pixel_either_way_is_refused(
     assert not list(Path().iterdir())
 
 
-@pytest.mark.parametrize(("width", "height"), [(2, 40), (65, 2)])
+@pytest.mark.parametrize(("width", "height"), [(2, 2), (65, 3)])
 def test_a_camera_of_a_few_pixels_is_scanned(rig: Rig, tmp_path: Path, width: int, height: int) -> None:
     file = write_rig(tmp_path / "tiny", width=width, height=height)
     ran = rig("scan", file, "--scene", "street-everything", "--out", "run")

@@ -9,7 +9,7 @@ from numba.core import event
 
 from rig.cli import progress as cli_progress
 from rig.cli.progress import COMPILING, ProgressLine, progress
-from rig.progress import Step, listening, part, tell_stage
+from rig.progress import Step, counted, listening, part, tell_stage
 
 
 class Terminal(io.StringIO):
@@ -51,6 +51,13 @@ def test_what_is_told_is_heard_within_and_nowhere_else():
         Step("preparing", part="pose 2 of 12"),
         Step("rendering", 1, 5, "frames", "2 lost", "pose 2 of 12"),
     ]
+
+
+def test_a_count_is_never_above_its_total():
+    heard, given = [], []
+    with listening(heard.append):
+        counted("measuring", "rows", lambda done, total: given.append((done, total)))(13, 12)
+    assert [(step.done, step.total) for step in heard] == given == [(12, 12)]
 
 
 @pytest.mark.parametrize(

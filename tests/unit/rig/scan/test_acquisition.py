@@ -16,6 +16,8 @@ from drivers.interfaces import BurstMode
 from rig.count.sweeps import SweepAssembler
 from rig.count.volume import SweepCounter, SweepLayout
 from rig.errors import DevicesError
+from rig.run_folder.summary import RunVerdict
+from rig.scan.run import verdict_of
 from rig.threads import RowWorkers
 from tests.unit.rig.count.streams import HEIGHT, SPAD, WIDTH, plan_of, scan, stream_of
 from tests.unit.rig.scan.fakes import PATIENCE_S, START, STOP, FakeMaker, acquisition, fake_rig
@@ -234,3 +236,7 @@ def test_blocks_of_another_run_or_size_are_refused():
         sweeps_of(PLAN, [small], 1)
     with pytest.raises(ProtocolError, match="before frame 32"):
         sweeps_of(PLAN, [blocks[0], blocks[0]], 1)
+
+
+def test_a_map_that_its_own_light_speaks_against_makes_the_run_doubtful():
+    assert verdict_of([], None, aborted=False, doubtful=True) is RunVerdict.DOUBTFUL
