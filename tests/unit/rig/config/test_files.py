@@ -9,7 +9,6 @@ import yaml
 from drivers.registry import SLOTS, lookup
 from rig.config.bundled import BUNDLED
 from rig.config.files import (
-    BUNDLED,
     bundled_configs,
     completed_text,
     config_content,
