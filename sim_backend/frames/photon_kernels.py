@@ -71,8 +71,8 @@ Levels = tuple[NDArray[np.int16], Words]
 """The input for drawing a frame: levels (rows, words, 64), as they are stored, in the order `PLACE`; and bits (rows,
 words) of the pixels of the highest level."""
 Light = tuple[NDArray[np.float64], Single, float, float]
-"""Of frames: detections per second without the laser and per second and watt of it, (rows, width), exposure in s and
-power in W."""
+"""The light of frames: detections per second without the laser and per second and watt of it, (rows, width); exposure
+in s and power in W."""
 Key = tuple[np.uint64, np.uint64]
 
 

@@ -42,7 +42,7 @@ class CameraView:
 
     @property
     def arrays(self) -> Arrays:
-        """What kernels take of it: u, v, u_x, v_x, facet, albedo and source_m."""
+        """The arrays that kernels take: u, v, u_x, v_x, facet, albedo and source_m."""
         return self.u, self.v, self.u_x, self.v_x, self.facet, self.albedo, self.source_m
 
     @property

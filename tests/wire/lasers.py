@@ -11,13 +11,10 @@ import pytest
 from drivers.clock import NS_PER_S, Clock, VirtualClock
 from drivers.errors import DeviceError
 from drivers.interfaces import LineLaser
-from drivers.lasers.cobolt import CoboltConfig
-from drivers.lasers.cobolt import create as create_cobolt
-from drivers.lasers.obis import ObisConfig
-from drivers.lasers.obis import create as create_obis
+from drivers.lasers import cobolt, obis
 from drivers.registry import Surroundings
 from drivers.transports.dialogue import LineTiming
-from sim_backend.wire.serve.serial import SerialModel, SerialServer, SerialWire
+from sim_backend.wire.serve.serial import SerialModel, SerialWire
 from sim_backend.wire.serve.wire_server import FaultSchedule
 
 PATIENCE_S = 60.0
@@ -27,10 +24,6 @@ QUICK_COBOLT = LineTiming(gap_s=0.1, reply_s=0.15, quiet_s=0.02, drain_s=0.1)
 QUICK_OBIS = LineTiming(reply_s=0.15, quiet_s=0.02, drain_s=0.1)
 
 
-def around(clock: Clock, server: SerialWire | SerialServer) -> Surroundings:
-    return Surroundings(clock, None, 0, {"laser": server.endpoint})
-
-
 @contextmanager
 def wire(
     model: SerialModel, *, clock: Clock | None = None, faults: FaultSchedule | None = None
@@ -38,17 +31,18 @@ def wire(
     """A wire within this process, on virtual time."""
     clock = clock or VirtualClock()
     with SerialWire(model, clock=clock, baud=1_000_000, faults=faults) as server:
-        yield server, around(clock, server)
+        yield server, Surroundings(clock, None, 0, {"laser": server.endpoint})
+
+
+USUAL = {"port": "emulated:laser", "max_power": "80 mW"}
 
 
 def open_cobolt(surroundings: Surroundings, **config: Any) -> LineLaser:
-    made = CoboltConfig.model_validate({"port": "emulated:laser", "max_power": "80 mW", **config})
-    return create_cobolt(made, surroundings, QUICK_COBOLT)
+    return cobolt.create(cobolt.CoboltConfig.model_validate(USUAL | config), surroundings, QUICK_COBOLT)
 
 
 def open_obis(surroundings: Surroundings, **config: Any) -> LineLaser:
-    made = ObisConfig.model_validate({"port": "emulated:laser", "max_power": "80 mW", **config})
-    return create_obis(made, surroundings, QUICK_OBIS)
+    return obis.create(obis.ObisConfig.model_validate(USUAL | config), surroundings, QUICK_OBIS)
 
 
 def now_s(clock: Clock) -> float:

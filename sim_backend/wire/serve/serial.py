@@ -220,7 +220,6 @@ class SerialServer(_SerialLine, WireServer[SerialModel]):
         self._master: int | None = None
         self._slave: int | None = None
         self._waiting = threading.Lock()
-        self._wake_in, self._wake_out = os.pipe()
 
     @property
     def path(self) -> str:
@@ -235,10 +234,6 @@ class SerialServer(_SerialLine, WireServer[SerialModel]):
     def close(self) -> None:
         """Unplug it for good; again: nothing happens."""
         super().close()
-        if self._wake_in >= 0:
-            os.close(self._wake_in)
-            os.close(self._wake_out)
-            self._wake_in = self._wake_out = -1
         self._folder.cleanup()
 
     def plug(self) -> None:
@@ -258,7 +253,6 @@ class SerialServer(_SerialLine, WireServer[SerialModel]):
                 return
             os.unlink(self.path)
             self._outbox.clear()
-            os.write(self._wake_out, b"w")
             with self._waiting:  # a terminal that somebody waits on stays open, and the cable would still be in
                 os.close(self._slave)
                 os.close(self._master)
@@ -273,16 +267,10 @@ class SerialServer(_SerialLine, WireServer[SerialModel]):
                 wait_s = _TURN_S if self._outbox else _IDLE_S
             if master is None:  # it hangs or is not plugged in: what comes stays where it is
                 self._ending.wait(_IDLE_S)
-            else:
-                self._await_input(master, wait_s)
-
-    def _await_input(self, master: int, wait_s: float) -> None:
-        with self._waiting:
-            if self._master != master:
-                return  # unplugged
-            readable, _, _ = select.select([master, self._wake_in], [], [], wait_s)
-            if self._wake_in in readable:
-                os.read(self._wake_in, 64)
+                continue
+            with self._waiting:
+                if self._master == master:  # else it was unplugged
+                    select.select([master], [], [], wait_s)
 
     def _take(self) -> bytes:
         try:

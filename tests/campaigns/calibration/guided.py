@@ -12,12 +12,11 @@ from collections.abc import Iterator
 from typing import NamedTuple
 
 import numpy as np
-from calibration.diagnosis.rig import judge_fit
-from calibration.rig_fit.result import RigFit
 
+from calibration.diagnosis.verdicts import judge_fit
 from calibration.errors import CalibrationError
 from calibration.guide import Forecast, candidates, next_pose, rough_camera, sequence
-from calibration.rig_fit.fit import fit_rig
+from calibration.rig_fit.fit import RigFit, fit_rig
 from calibration.views import View
 from tests.reference.boards.calibration_data import BOARD, Seen, TrueRig, random_rig, seen_view
 
