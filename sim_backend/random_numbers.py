@@ -130,7 +130,8 @@ def _round_of_pair(builder: Any, state: Any, key: Any) -> Any:
     if _has("vaes"):
         return _call(builder, "llvm.x86.aesni.aesenc.256", _PAIR, state, key)
     halves = ([_chosen(builder, v, v, places) for v in (state, key)] for places in ((0, 1), (2, 3)))
-    return _chosen(builder, *(round_of_block(builder, *half) for half in halves), range(4))
+    low, high = (round_of_block(builder, *half) for half in halves)
+    return _chosen(builder, low, high, range(4))
 
 
 def _vector(builder: Any, kind: Any, halves: Any) -> Any:
