@@ -239,15 +239,21 @@ def pack_line(frames: str, dtype: np.dtype[Any]) -> str:
 
 
 def _numpy_line(frames: NDArray[Any], height: int, width: int) -> str | None:
-    """The line of numpy that makes uint8 (frames, height, ceil(width / 8)) of a stack; None for another size."""
-    if frames.ndim != 3:
-        return None
+    """The line of numpy that makes uint8 (frames, height, ceil(width / 8)) of an array; None for another size."""
     packed, whole, dtype = (height, -(-width // 8)), (height, width), frames.dtype
+    line, shape = "frames", frames.shape
+    if shape in (packed, whole):
+        line, shape = "frames[None]", (1, *shape)
+    elif len(shape) == 2 and shape[1] in (height * packed[1], height * width):
+        size = packed if shape[1] == height * packed[1] else whole
+        line, shape = f"frames.reshape(-1, {size[0]}, {size[1]})", (len(frames), *size)
+    if len(shape) != 3:
+        return None
     for axes in ((0, 1, 2), (2, 0, 1), (0, 2, 1)):
-        line = "frames" if axes == (0, 1, 2) else f"numpy.transpose(frames, {axes})"
-        size = frames.shape[axes[1]], frames.shape[axes[2]]
+        turned = line if axes == (0, 1, 2) else f"numpy.transpose({line}, {axes})"
+        size = shape[axes[1]], shape[axes[2]]
         if size == packed and dtype.kind in "iuf" and (packed != whole or dtype == np.uint8):
-            return line if dtype == np.uint8 else f"{line}.astype(numpy.uint8)"
+            return turned if dtype == np.uint8 else f"{turned}.astype(numpy.uint8)"
         if size == whole:
-            return pack_line(line, dtype)
+            return pack_line(turned, dtype)
     return None

@@ -111,6 +111,9 @@ def refusal(file: Path, exposures: int = 3, width: int = WIDTH) -> str:
         (UNPACKED.transpose(1, 2, 0), "numpy.packbits(numpy.transpose(frames, (2, 0, 1)), axis=2)"),
         (PACKED.transpose(1, 2, 0), "numpy.transpose(frames, (2, 0, 1))"),
         (UNPACKED.transpose(0, 2, 1), "numpy.packbits(numpy.transpose(frames, (0, 2, 1)), axis=2)"),
+        (PACKED.reshape(-1, ROWS * 13), "frames.reshape(-1, 24, 13)"),
+        (UNPACKED.reshape(-1, ROWS * WIDTH), "numpy.packbits(frames.reshape(-1, 24, 100), axis=2)"),
+        (UNPACKED[0], "numpy.packbits(frames[None], axis=2)"),
         (PACKED.astype(np.int16), "frames.astype(numpy.uint8)"),
     ],
 )
