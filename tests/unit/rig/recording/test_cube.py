@@ -113,7 +113,6 @@ def refusal(file: Path, exposures: int = 3, width: int = WIDTH) -> str:
         (UNPACKED.transpose(0, 2, 1), "numpy.packbits(numpy.transpose(frames, (0, 2, 1)), axis=2)"),
         (PACKED.reshape(-1, ROWS * 13), "frames.reshape(-1, 24, 13)"),
         (UNPACKED.reshape(-1, ROWS * WIDTH), "numpy.packbits(frames.reshape(-1, 24, 100), axis=2)"),
-        (UNPACKED[0], "numpy.packbits(frames[None], axis=2)"),
         (PACKED.astype(np.int16), "frames.astype(numpy.uint8)"),
     ],
 )
@@ -141,6 +140,7 @@ WHOLE, ARCHIVE = bytes_of(np.save, PACKED), bytes_of(np.savez, a=PACKED, b=PACKE
         (PACKED[:, :, :12], "the calibration's 100 x 24 sensor needs (frames, 24, 13)"),
         (PACKED[:, :, 0], "needs (frames, 24, 13)"),
         (PACKED[0, 0, 0], "use the calibration made with this sensor"),
+        (UNPACKED[0], "make it with numpy.packbits(frames[None], axis=2)"),
         (3 * UNPACKED, "sums of several exposures are no frames"),
         (b"columns: 3", "is no whole .npy file"),
         (b"", "is no whole .npy file"),
@@ -150,7 +150,7 @@ WHOLE, ARCHIVE = bytes_of(np.save, PACKED), bytes_of(np.savez, a=PACKED, b=PACKE
         (bytes_of(np.save, np.array([{}, []], object), allow_pickle=True), "Python objects"),
         (None, "No such file or directory; check the path"),
     ],
-    ids=range(13),
+    ids=range(14),
 )
 def test_a_file_that_is_no_cube_is_told_why(tmp_path: Path, content: np.ndarray | bytes | None, said: str) -> None:
     if content is not None:
