@@ -2,13 +2,15 @@
 PYTHON ?= $(shell command -v python3.11 || command -v python3)
 BIN := .venv/bin
 
-.PHONY: demo help test lint types layers house unit clean
+.PHONY: demo help install test lint types layers house unit clean
 .PHONY: accuracy accuracy-rows accuracy-joint accuracy-calibration
 .PHONY: campaign campaign-devices campaign-guard campaign-recording campaign-simulation campaign-calibration
 .DELETE_ON_ERROR:
 
 demo: .venv/.installed  ## scan the simulated rig in a foggy street
 	$(BIN)/rig scan --out runs/demo-$$(date +%Y%m%d-%H%M%S)
+
+install: .venv/.installed-tests  ## set up .venv with everything that tests need; again after a change of pyproject.toml
 
 help:  ## this list
 	@awk -F' *## ' '/^[a-z-]+:.*## / { sub(/:.*/, "", $$1); printf "%-21s %s\n", $$1, $$2 }' Makefile

@@ -73,7 +73,10 @@ def lookup(slot: str, kind: str) -> Kind:
     if len(found) > 1:
         raise UnknownKind(f"{slot}: kind {kind!r} is offered twice ({', '.join(sorted(found))}); uninstall one package")
     entry = next(iter(found.values()))
-    loaded = entry.load()
+    try:
+        loaded = entry.load()
+    except (ImportError, AttributeError, TypeError) as error:
+        raise UnknownKind(f"{slot}: kind {kind!r} cannot be loaded from {entry.value}: {error}") from error
     if not isinstance(loaded, Kind):
         raise UnknownKind(f"{slot}: entry point {entry.value} of kind {kind!r} is no drivers.registry.Kind")
     return loaded

@@ -1,4 +1,4 @@
-"""The ring of block slots between one source thread and its readers: allocated once, nothing copied, nothing lost.
+"""The ring of block slots between one source thread and its readers: allocated once, no copies, no loss unsaid.
 
 The source claims free slots (several at once where USB transfers are queued), fills them and publishes them in the
 order of claiming; every reader gets every block in that order and holds its slot until it asks for the next, or for

@@ -1,7 +1,8 @@
 """Requests of a user: one frozen dataclass a command, which the command line fills and `rig.api` takes.
 
-A field is declared here and nowhere else: its type, its default and a phrase that says what it is. `rig scan --help`
-prints the phrase, `help(ScanRequest)` has it for Python; `rig/cli/command.py` makes an option of each field.
+A field has its type and a phrase that says what it is. `rig scan --help` prints the phrase, `help(ScanRequest)` has it
+for Python; `rig/cli/command.py` makes an option of each field. None leaves a setting to the config, whose defaults are
+in `rig/config/models.py`.
 """
 
 import inspect

@@ -193,7 +193,7 @@ class SimulatedWorld:
 
         To be called before the SPAD is configured; for good.
         """
-        kept = [entry for entry in CATALOGUE if entry.name == "dark counts" or entry.kind == "bits"]
+        kept = [entry for entry in CATALOGUE if entry.of_sensor or entry.kind == "bits"]
         wanted = [e for e in kept if e.called(self.setting)[0] and is_active(e.name, self.config.effects)]
         self._planned = self._plan()[0], FluxModel(self.setting, wanted)
 

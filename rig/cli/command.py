@@ -114,7 +114,7 @@ _MANY = {Sequence[str]: split_option, Sequence[int]: whole_numbers}
 """Readers of options that may be given several times and with commas, by the type of their field."""
 
 
-def asks(request: type[Any]) -> Callable[[Callable[..., int]], Callable[..., int]]:
+def asks(request_type: type[Any]) -> Callable[[Callable[..., int]], Callable[..., int]]:
     """Give a command an option for each field of a request; it gets them together, as its argument `request`.
 
     A field that the command has an option of its own for is left to it.
@@ -122,13 +122,13 @@ def asks(request: type[Any]) -> Callable[[Callable[..., int]], Callable[..., int
 
     def decorate(function: Callable[..., int]) -> Callable[..., int]:
         plain = inspect.signature(function).parameters
-        asked = [each for each in options_of(request) if each.name not in plain]
+        asked = [each for each in options_of(request_type) if each.name not in plain]
         given = [_parameter(each) for each in asked]
 
         @functools.wraps(function)
         def filled(**values: Any) -> int:
             read = {each.name: _read(each, values.pop(each.name)) for each in asked}
-            return function(request=request(**read), **values)
+            return function(request=request_type(**read), **values)
 
         shown: list[inspect.Parameter] = []
         for name, parameter in plain.items():

@@ -197,8 +197,8 @@ def require_playable(folder: Path, manifest: Mapping[str, Any]) -> None:
         raise DamagedRecordingError("\n".join(f"{line}; take it from a copy of the recording" for line in problems))
     if "passes" in manifest:
         raise UsageError(
-            f"{folder} was scanned with --adaptive, in passes that this version cannot put together; take spadrig 0.1 "
-            "to it, or scan again"
+            f"{folder} was scanned with --adaptive, in passes that this version cannot put together; "
+            "scan again without it"
         )
 
 

@@ -69,7 +69,7 @@ class AcquisitionRequest:
 class Acquisition:
     """A scan with an open rig, and with the plan and timing that `rig.devices.prepare` gave. Iterate once over `run()`.
 
-    maker: makes the maps, on the counting thread.
+    maker: makes the maps, on the counting thread; a `rig.depth.reconstruct.Reconstructor`.
 
     Raises UsageError where the SPAD cannot do what the policy asks, PlanError where its memory is too small for a map.
     """

@@ -1,6 +1,7 @@
-"""A scan from open devices to its folder: sweeps in, maps out, and an account of what was lost.
+"""A scan from open devices to its folder: what happens before, while and after `acquisition` runs the devices.
 
-`run_scan` does it; `devices_content` describes the devices for the manifest.
+`run_scan` makes the plan and what turns counts into maps, starts the recording, hands each map to its `Run`, and says
+at the end what came and what was lost. `devices_content` describes the devices for the manifest.
 """
 
 import logging
@@ -58,7 +59,7 @@ def run_scan(
     calibration = calibration_use(rig, accept=request.accept_calibration, here=here)
     plan, timing = prepared or prepare(rig)
     replayed = ReplaySource.of(rig.spad, plan, maps)
-    maps = maps or 1 if replayed is None else replayed.maps
+    maps = (maps or 1) if replayed is None else replayed.maps
     recalled = () if replayed is None else replayed.learned(rig.config.estimate, rig.model)
     reconstructor = make_reconstructor(rig, plan, learned=recalled)
     geometry = reconstructor.geometry
@@ -112,19 +113,21 @@ def run_scan(
         _log.warning("%d frames are gone from the recording, beside its whole maps", sum(b + 1 - a for a, b in outside))
     frames = frames_of(sweeps, counters.crc_errors, outside)
     result = run.finish(
-        frames if ended_by is None else frames_that_came(frames, counters, stages.dropped_frames),
-        frames.expected / float(plan.frame_rate_hz) + plan.readout_s(frames.expected),
-        verdict_of(sweeps, rig.model, aborted=ended_by is not None, doubtful=bool(run.tally.doubts), outside=outside),
-        {
+        frames=frames if ended_by is None else frames_that_came(frames, counters, stages.dropped_frames),
+        sensor_time_s=frames.expected / float(plan.frame_rate_hz) + plan.readout_s(frames.expected),
+        verdict=verdict_of(
+            sweeps, rig.model, aborted=ended_by is not None, doubtful=bool(run.tally.doubts), outside=outside
+        ),
+        manifest={
             **manifest,
             "sweeps": [sweep_content(sweep) for sweep in sweeps],
             "gaps": [list(gap) for gap in (*(gap for sweep in sweeps for gap in sweep.gaps), *outside)],
             "counters": asdict(counters),
         },
-        stages,
-        synchronisation_of(sweeps),
-        None if replayed is None else replayed.report,
-        accepted_by(calibration),
+        stages=stages,
+        sync=synchronisation_of(sweeps),
+        replay=None if replayed is None else replayed.report,
+        accepted_calibration=accepted_by(calibration),
     )
     if ended_by is not None and not isinstance(ended_by, KeyboardInterrupt):
         if result.folder is not None:

@@ -22,6 +22,7 @@ class Entry:
 
     why(setting): the reason in words why it is called for, None where it is not; absent: then the reason why not, ""
     where that is the sensor.
+    of_sensor: light or counts that stay under a covered lens.
     changes(setting, planned_for), in closed form: the largest share of decisions on a row and column that can differ
     without the effect (may exceed 1). None: there is no such form; the planner then evaluates light and dark counts,
     and never leaves out others, nor light that moves.
@@ -33,6 +34,7 @@ class Entry:
     why: Callable[[Setting], str | None]
     absent: str = ""
     changes: Callable[[Setting, PlannedFor], float] | None = None
+    of_sensor: bool = False
 
     def called(self, setting: Setting) -> tuple[bool, str]:
         """Whether the setting calls for it, and why or why not."""
@@ -187,7 +189,7 @@ CATALOGUE = (
     Entry("inter-reflection", "within", "", lambda _: None, _FLAT),
     Entry("ambient", "steady", "ambient:ambient", _ambient, "the scene has no ambient light", _ambient_changes),
     Entry("airlight", "steady", "ambient:airlight", _airlight, f"{_NO_MEDIUM} or no ambient light", _ambient_changes),
-    Entry("dark counts", "steady", "dark_counts:dark_counts", _dark_counts),
+    Entry("dark counts", "steady", "dark_counts:dark_counts", _dark_counts, of_sensor=True),
     Entry("quantum efficiency and fill factor", "within", "", _efficiency),
     # The one that reads the frame before is the first on the bits: those are then the photons' own.
     Entry("afterpulsing and dead time", "bits", "afterpulsing:Afterpulsing", _afterpulsing),

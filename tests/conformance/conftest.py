@@ -1,6 +1,7 @@
 """The implementations every conformance suite runs over: one factory each, by name.
 
-A new device is added here and nowhere else: it then has to behave like all the others.
+A new device gets its factory in `devices.py` or `spads.py`, a new simulated one below, as
+`"NAME": partial(simulated_device, slot="laser", kind="NAME")`. It then has to behave like all the others.
 """
 
 from collections.abc import Iterator
@@ -26,10 +27,10 @@ ROWS, WIDTH = 24, 100
 """A small camera, its width no multiple of 64."""
 
 
-def simulated(slot: str, surroundings: Surroundings, **config: Any) -> Any:
+def simulated(slot: str, surroundings: Surroundings, kind: str = "simulated", **config: Any) -> Any:
     """A simulated device or world, made the way the application makes it."""
-    kind = lookup(slot, "simulated")
-    return kind.create(kind.config.model_validate({"kind": "simulated", **config}), surroundings)
+    found = lookup(slot, kind)
+    return found.create(found.config.model_validate({"kind": kind, **config}), surroundings)
 
 
 def simulated_surroundings(folder: Path) -> Surroundings:
@@ -47,7 +48,7 @@ def simulated_spad(folder: Path, *, window: WindowTable | None = None, **config:
 
 
 @contextmanager
-def simulated_device(folder: Path, slot: str) -> Iterator[LaserCase | ScannerCase | SyncCase]:
+def simulated_device(folder: Path, slot: str, kind: str = "simulated") -> Iterator[LaserCase | ScannerCase | SyncCase]:
     surroundings = simulated_surroundings(folder)
     bench, clock = surroundings.world.bench, surroundings.clock  # type: ignore[union-attr]
     marker = ScanWaveform(np.zeros(2), np.array([MARKER_SCAN, 0], np.uint8), Fraction(100_000))
@@ -59,7 +60,7 @@ def simulated_device(folder: Path, slot: str) -> Iterator[LaserCase | ScannerCas
         bench.play(marker, 1, latency_s=1e-6, rate_hz=1e5)
         clock.sleep(2e-6)
 
-    with simulated(slot, surroundings) as device:
+    with simulated(slot, surroundings, kind) as device:
         if slot == "laser":
             yield LaserCase(device, clock, shining)
         elif slot == "scanner":

@@ -12,6 +12,8 @@ import typer
 
 from rig.cli.main import app
 from rig.config.bundled import bundled_rigs, bundled_scenes
+from sim_backend.effects.catalogue import CATALOGUE
+from sim_backend.scenes.scene import SceneFile
 
 ROOT = Path(__file__).parents[2]
 PAGES = sorted([ROOT / "README.md", ROOT / "CONTRIBUTING.md", ROOT / "CHANGELOG.md", *(ROOT / "docs").rglob("*.md")])
@@ -38,6 +40,13 @@ def test_links_lead_somewhere(page: Path) -> None:
         target = (page.parent / file).resolve() if file else page
         assert target.exists(), link
         assert not heading or heading in anchors(target), link
+
+
+def test_every_effect_has_a_row_and_every_key_of_a_scene_is_named() -> None:
+    rows = (ROOT / "docs" / "explanation" / "simulation.md").read_text()
+    assert [entry.name for entry in CATALOGUE if f"`{entry.name}`" not in rows] == []
+    keys = (ROOT / "docs" / "reference" / "config.md").read_text()
+    assert [name for name in SceneFile.model_fields if not re.search(rf"^\| .*`{name}[.`]", keys, re.M)] == []
 
 
 @pages

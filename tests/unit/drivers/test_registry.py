@@ -20,7 +20,7 @@ NO_KIND = object()
 
 
 INSTALLED = (
-    *(("lamp", "LAMP"), ("broken", "NO_KIND"), ("arc", "LAMP")),
+    *(("lamp", "LAMP"), ("broken", "NO_KIND"), ("arc", "LAMP"), ("gone", "NOT_THERE")),
     *(("twice", "LAMP"), ("twice", "NO_KIND"), ("same", "LAMP"), ("same", "LAMP")),
 )
 
@@ -35,7 +35,7 @@ def installed(monkeypatch: pytest.MonkeyPatch) -> None:
 
 
 def test_kinds_are_listed_once_and_sorted_and_one_that_is_found_creates_its_device() -> None:
-    assert kinds("laser") == ("arc", "broken", "lamp", "same", "twice")
+    assert kinds("laser") == ("arc", "broken", "gone", "lamp", "same", "twice")
     assert kinds("spad") == ()
     with pytest.raises(ValueError, match="no slot 'camera'"):
         kinds("camera")
@@ -48,9 +48,10 @@ def test_kinds_are_listed_once_and_sorted_and_one_that_is_found_creates_its_devi
 @pytest.mark.parametrize(
     ("slot", "kind", "said"),
     [
-        ("laser", "lmap", "laser: unknown kind 'lmap'; choose one of: arc, broken, lamp, same, twice"),
+        ("laser", "lmap", "laser: unknown kind 'lmap'; choose one of: arc, broken, gone, lamp, same, twice"),
         ("spad", "lamp", "none installed"),
         ("laser", "broken", r"no drivers\.registry\.Kind"),
+        ("laser", "gone", "'gone' cannot be loaded from .*NOT_THERE"),
         ("laser", "twice", "offered twice"),
     ],
 )

@@ -25,7 +25,7 @@ from tests.stability.inventory import covers
 from tests.unit.rig.count.streams import NO_LAG, SPAD, plan_of, rig_model, scan, scanner_limits, timer_clock
 from tests.unit.rig.count.test_volume import packed, stream
 
-covers(line_grid_module, LineCounter)
+covers(line_grid_module)
 
 OFFSETS = (-0.3, -0.1, 0.1, 0.3)
 
