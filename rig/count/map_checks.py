@@ -63,7 +63,7 @@ DIMMEST: Final = 0.1
 """Least mean rate of a pixel, over that of all, that its noise is reckoned with."""
 SURE: Final = 0.9
 """Confidence of answers that must have light."""
-GROUPS: Final = 64
+GROUPS: Final = 16
 """Most groups of sure answers by distance: wrong ones are mostly wrong together, as a surface that is not there."""
 LEAST_CONTRAST: Final = 0.5
 """Mean light at sure answers above that behind them, in standard deviations: see the module."""

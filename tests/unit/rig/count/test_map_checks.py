@@ -116,9 +116,9 @@ def test_sure_answers_need_light() -> None:
     beside = replace(right, x_px=np.where(np.arange(COLUMNS) % 4 == 0, truth - 25, truth).astype(np.float32))
     (reason,) = checks.doubts(volume, volume.intensity(), beside)
     assert reason.startswith("answers without light")
-    pole = replace(right, x_px=np.where(np.arange(COLUMNS) % 16 == 0, truth - 40, truth).astype(np.float32))
+    pole = replace(right, x_px=np.where(np.arange(COLUMNS) % 10 == 0, truth - 60, truth).astype(np.float32))
     (reason,) = checks.doubts(volume, volume.intensity(), pole)
-    assert reason.startswith("answers without light"), "a sixteenth of the answers is wrong"
+    assert reason.startswith("answers without light"), "a tenth of the answers is wrong"
     # An estimator that says it is not sure has claimed nothing.
     unsure = replace(beside, confidence=np.full_like(truth, 0.5))
     assert checks.doubts(volume, volume.intensity(), unsure) == ()
