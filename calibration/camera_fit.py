@@ -50,7 +50,9 @@ class Normal:
         return Normal(self.names[:count], self.matrix[:count, :count])
 
     def covariance(self, variance_px2: float) -> Covariance:
-        """The covariance for corners of this variance. CalibrationError or LinAlgError where the matrix is singular."""
+        """The covariance for corners of this variance. Raises CalibrationError or LinAlgError if the matrix is
+        singular.
+        """
         scale = np.sqrt(np.diag(self.matrix))
         inverse = np.linalg.inv(self.matrix / np.outer(scale, scale)) / np.outer(scale, scale)
         return Covariance(self.names, variance_px2 * (inverse + inverse.T) / 2)

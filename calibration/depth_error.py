@@ -128,7 +128,8 @@ def depth_uncertainty(model: RigModel, depth_m: float, velocity_per_s: float | N
 def depth_sd_m(
     model: RigModel, x_px: ArrayLike, y_px: ArrayLike, command: ArrayLike, velocity_per_s: float = 0.0
 ) -> Array:
-    """Sd (m) of the depth at raw pixels for a mirror at `command`, NaN: none. CalibrationError: no covariance."""
+    """Sd (m) of the depth at raw pixels for a mirror at `command`, NaN: none. Raises CalibrationError if no covariance.
+    """
     return np.sqrt(_variance(depth_jacobian(model, x_px, y_px, command, velocity_per_s), _covariance(model)))
 
 
@@ -231,7 +232,7 @@ class Sensitivity:
 
 
 def sensitivity(model: RigModel, at_m: float) -> Sensitivity:
-    """Look at a grid over the picture. CalibrationError where the line does not reach that depth."""
+    """Look at a grid over the picture. Raises CalibrationError if the line does not reach that depth."""
     camera = model.camera
     x = np.linspace(0, camera.width - 1, _SENSITIVITY_GRID)
     y = np.linspace(0, camera.height - 1, _SENSITIVITY_GRID)[:, None]

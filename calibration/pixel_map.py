@@ -11,7 +11,7 @@ above what its neighbours' scatter explains. Fewer frames than `frames_for` cann
 A noisy pixel is one whose counts scatter over blocks of frames more than counting does, as they do where its rate jumps
 (random telegraph noise). Index of dispersion: sum (n - e)^2 / e over the blocks, e in proportion to what ordinary
 pixels count in them, so that a lamp or a warming sensor makes nobody noisy; chi-square with blocks - 1 degrees of
-freedom but for the 1 - p of bits. `FALSE_ALARM` is the probability by which a pixel without fault is called noisy.
+freedom except for the 1 - p of bits. `FALSE_ALARM` is the probability by which a pixel without fault is called noisy.
 
 A dead pixel is one that hardly fires in light although its neighbours do. Without light nobody can tell.
 
@@ -322,7 +322,7 @@ class PixelDrift:
 
 
 def pixel_drift(old: PixelMap, new: PixelMap) -> PixelDrift:
-    """Compare two maps of one sensor. CalibrationError where they differ in size."""
+    """Compare two maps of one sensor. Raises CalibrationError if they differ in size."""
     if old.rate_per_s.shape != new.rate_per_s.shape:
         (rows, width), (old_rows, old_width) = new.rate_per_s.shape, old.rate_per_s.shape
         raise CalibrationError(
@@ -428,7 +428,7 @@ _DAMAGE = (
 
 
 def load_pixels(path: str | os.PathLike[str]) -> PixelVersion:
-    """Read one. CalibrationError where there is none."""
+    """Read one. Raises CalibrationError if there is none."""
     file = Path(path)
     try:
         with load_numpy(file) as archive:

@@ -141,7 +141,7 @@ class BlockRing:
             self._changed.notify_all()
 
     def mark_overflow(self, n_frames: int = 0) -> None:
-        """Note that a block of `n_frames`, counted as lost, found no slot. RingOverflow where that ends the run."""
+        """Note that a block of `n_frames`, counted as lost, found no slot. Raises RingOverflow if that ends the run."""
         with self._changed:
             self.last_frame += n_frames
             self.dropped_blocks += 1

@@ -111,7 +111,8 @@ def parse_exact(text: object, dimension: str) -> Fraction:
 
 
 def format_quantity(value: float | Fraction, dimension: str) -> str:
-    """A text with a unit, as people write it, that reads back to exactly `value`. ValueError where that is not finite.
+    """A text with a unit, as people write it, that reads back to exactly `value`. Raises ValueError if that is not
+    finite.
 
     The shortest number from 0.1 to 1000, where there is one; a close race goes to the first unit, then to a number of
     at least 1.

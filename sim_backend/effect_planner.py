@@ -1,4 +1,4 @@
-"""Plans which effects to run: what the scene calls for, but for what provably changes next to no decision.
+"""Plans which effects to run: what the scene calls for, except for what provably changes next to no decision.
 
 Let a pixel detect m photons in a column's K frames, on average, and m + D with an effect. Per exposure the divergence
 of its bits is at most (D/K)^2 / (2 (e^(m/K) - 1)), so that over pixels and frames it is at most eps = sum D^2 / (2 m),

@@ -87,7 +87,7 @@ class WorldConfig(KindConfig):
 
     @property
     def has_board(self) -> bool:
-        """Whether there is a calibration board in the scene. DeviceError where the scene cannot be read."""
+        """Whether there is a calibration board in the scene. Raises DeviceError if the scene cannot be read."""
         return bool(load_scene(self.scene)[0].boards)
 
 
@@ -95,7 +95,7 @@ class SimulatedWorld:
     """One scene, one rig, one bench. Reading is safe from any thread."""
 
     def __init__(self, config: WorldConfig, surroundings: Surroundings) -> None:
-        """DeviceError where the geometry, the scene or the focus cannot be used."""
+        """Raises DeviceError if the geometry, the scene or the focus cannot be used."""
         self.config = config
         wrong: list[str] = []
         try:

@@ -143,7 +143,7 @@ class Board:
         return np.where(self.albedo_at(x, y[:, None]) > BLACK, np.uint8(255), np.uint8(0))
 
     def charuco(self) -> cv2.aruco.CharucoBoard:
-        """OpenCV's object for this board. CalibrationError for a chessboard."""
+        """OpenCV's object for this board. Raises CalibrationError for a chessboard."""
         if self.dictionary is None or self.marker_m is None:
             raise CalibrationError("a chessboard has no markers to look for; set kind: charuco")
         return cv2.aruco.CharucoBoard(self.squares, self.square_m, self.marker_m, _dictionary(self.dictionary))

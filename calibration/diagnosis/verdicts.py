@@ -212,7 +212,9 @@ def judge_fit(
     accuracy_m: float | None = None,
     stated_baseline_m: float | None = None,
 ) -> JudgedRig:
-    """Judge a fit by the sd of depth asked for, None: that of ACCURACY_PX. CalibrationError: the line is not there."""
+    """Judge a fit by the sd of depth asked for, None: that of ACCURACY_PX. Raises CalibrationError if the line is not
+    there.
+    """
     model = fit.model
     worth = sensitivity(model, at_m)
     asked = goal(worth, accuracy_m, at_m, stated_baseline_m)

@@ -44,7 +44,7 @@ def _check_archive(stream: IO[bytes]) -> None:
 
 
 def _check_array(stream: IO[bytes], size: int) -> None:
-    """ValueError unless the array of a file of `size` bytes, from where the stream is at, has room in it."""
+    """Raises ValueError unless the array of a file of `size` bytes, from where the stream is at, has room in it."""
     magic = stream.read(_MAGIC_BYTES)
     if len(magic) < _MAGIC_BYTES or not magic.startswith(np.lib.format.MAGIC_PREFIX):
         raise ValueError("it is no array of numpy's")

@@ -61,8 +61,8 @@ def parameters(model: RigModel) -> tuple[tuple[str, ...], Array]:
 def with_parameters(model: RigModel, names: Sequence[str], deltas: ArrayLike) -> RigModel:
     """The model with `deltas` (n,) added to the parameters `names`; the others stay.
 
-    Terms angle_i and offset_i beyond those of the model begin at 0. CalibrationError for a parameter that a model of
-    this kind does not have, and where the change leaves no valid model.
+    Terms angle_i and offset_i beyond those of the model begin at 0. Raises CalibrationError for a parameter that a
+    model of this kind does not have, and where the change leaves no valid model.
     """
     change = dict(zip(names, np.asarray(deltas, np.float64).tolist(), strict=True))
     camera = changed_camera(model.camera, change)

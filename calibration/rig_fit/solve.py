@@ -141,7 +141,7 @@ CONVERGED_CHI2 = 1e-3
 ROUGH_SHARE = 1e-4
 """Share of chi2 that the next step may still promise where a term is only looked for."""
 WORSE_CHI2 = 0.1
-"""Amount by which a step may raise chi2: derivatives are exact but for how a bow changes along the line."""
+"""Amount by which a step may raise chi2: derivatives are exact except for how a bow changes along the line."""
 MOST_DAMPING = 1e8
 MOST_CONDITION = 1e12
 """Largest condition number of the scaled equations; beyond it float64 leaves no digits of the worst direction."""

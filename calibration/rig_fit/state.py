@@ -152,7 +152,9 @@ class RigState:
         return corners, passages
 
     def stepped(self, terms: Terms, shared: Array, poses: Sequence[Array], sightings: Sequence[Sighting]) -> "RigState":
-        """The state moved by changes of shared parameters (p,) and of poses (6,). CalibrationError: no such model."""
+        """The state moved by changes of shared parameters (p,) and of poses (6,). Raises CalibrationError if no such
+        model.
+        """
         untimed = len(terms.names) - len(TIMES)
         moved = [name for name, change in zip(terms.names[:untimed], shared, strict=False) if change != 0]
         model = with_parameters(self.model, moved, [shared[terms.names.index(name)] for name in moved])

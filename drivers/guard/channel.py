@@ -80,7 +80,7 @@ class Channel:
         return [json.loads(line) for line in lines]
 
     def close(self) -> None:
-        """Hang up; again: nothing happens."""
+        """Hang up; a second call does nothing."""
         self._end.close()
 
 
@@ -145,7 +145,7 @@ class Heartbeat:
         _WAITED.pack_into(self._page, _FRAME.size, seconds)
 
     def close(self) -> None:
-        """Give the page back; again: nothing happens."""
+        """Give the page back; a second call does nothing."""
         if self.handle >= 0:
             self._page.close()
             os.close(self.handle)

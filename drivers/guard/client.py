@@ -145,7 +145,7 @@ class Guard:
         limits: GuardLimits | None = None,
         tap: TapFile | None = None,
     ) -> None:
-        """Start the guard, which opens the devices meanwhile. `UnknownKind` for a kind that is not installed."""
+        """Start the guard, which opens the devices meanwhile. Raises `UnknownKind` for a kind that is not installed."""
         configs = {slot: config for slot, config in (("laser", laser), ("sync", sync)) if config is not None}
         ports = ports or {}
         self._rescue = Rescue(configs, ports)
@@ -227,8 +227,8 @@ class Guard:
     def ask(self, slot: str, verb: str, *arguments: Any) -> Any:
         """Have the guard do a verb for a proxy; returns its result or raises its error.
 
-        `GuardLost` where there is no guard: at once, but for verbs that lower, which wait for the application's own
-        attempt at it.
+        Raises `GuardLost` if there is no guard: at once, except for verbs that lower, which wait for the application's
+        own attempt at it.
         """
         if self._failure is not None and verb in _ENABLING:
             raise self._failure
@@ -252,7 +252,7 @@ class Guard:
         return self._told(answer, verb)["result"]
 
     def close(self) -> None:
-        """Close both devices, which leaves them safe, and end the guard; again: nothing happens."""
+        """Close both devices, which leaves them safe, and end the guard; a second call does nothing."""
         if self._closing:
             return
         self._closing = True

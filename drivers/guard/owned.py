@@ -83,7 +83,7 @@ class Owned:
         self._create = partial(kind.create, model, surroundings)
 
     def open(self) -> dict[str, Any]:
-        """Open the device; returns what its proxy tells of it without asking. DeviceError."""
+        """Open the device; returns what its proxy tells of it without asking. May raise DeviceError."""
         self.device = self._create()
         about: dict[str, Any] = {"name": self.device.name, "identity": self.device.identity}
         if isinstance(self.device, LineLaser):
@@ -107,7 +107,7 @@ class Owned:
         return bool(getattr(device, "port_lost", False))
 
     def call(self, verb: str, arguments: list[Any]) -> Any:
-        """Do what a proxy asks; the result as JSON. DeviceError."""
+        """Do what a proxy asks; the result as JSON. May raise DeviceError."""
         device = self.device
         if isinstance(device, LineLaser):
             self.armed = (self.armed or verb == "arm") and verb != "disarm"
@@ -160,7 +160,7 @@ class Owned:
 
 
 def make_safe(device: LineLaser | SyncSource, *, disarm: bool) -> None:
-    """Take all outputs low, or pause a laser and, where asked for, disarm it. DeviceError."""
+    """Take all outputs low, or pause a laser and, where asked for, disarm it. May raise DeviceError."""
     if isinstance(device, SyncSource):
         device.abort()
         return

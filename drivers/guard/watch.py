@@ -202,7 +202,7 @@ class WatchedProcess:
                 os.kill(self._pid, signal.SIGKILL)
 
     def close(self) -> None:
-        """Give the pidfd back; again: nothing happens."""
+        """Give the pidfd back; a second call does nothing."""
         if self.handle is not None:
             os.close(self.handle)
             self.handle = None

@@ -54,7 +54,7 @@ class LineLaser(Device):
 
     @property
     def status(self) -> LaserStatus:
-        """Ask the laser. `WrongState` after close. Any thread."""
+        """Ask the laser. Raises `WrongState` after close. May be called from any thread."""
         self._require("status", *OPEN_STATES)
         return self._do_status()
 
@@ -97,7 +97,7 @@ class LineLaser(Device):
         self.pause()
 
     def _check_health(self) -> None:
-        """Refuse a laser that must not be enabled. `InterlockOpen`, `DeviceFault`."""
+        """Refuse a laser that must not be enabled. May raise `InterlockOpen`, `DeviceFault`."""
         status = self._do_status()
         if not status.interlock_closed:
             raise InterlockOpen(f"{self._name}: the interlock is open; close it and arm again")

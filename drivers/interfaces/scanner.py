@@ -87,7 +87,7 @@ class BeamScanner(Device):
 
     @property
     def status(self) -> ScannerStatus:
-        """Ask the scanner. `WrongState` after close. Any thread."""
+        """Ask the scanner. Raises `WrongState` after close. May be called from any thread."""
         self._require("status", *OPEN_STATES)
         return self._do_status()
 
@@ -131,7 +131,9 @@ class BeamScanner(Device):
         self._state = DeviceState.RUNNING
 
     def stop(self) -> None:
-        """Bring the mirror to rest. The waveform stays loaded. Where nothing moves it does nothing. Any thread."""
+        """Bring the mirror to rest. The waveform stays loaded. Where nothing moves it does nothing. May be called from
+        any thread.
+        """
         self._require("stop", *OPEN_STATES)
         if self._state is DeviceState.RUNNING:
             _log.info("%s: stop", self._name)
@@ -139,7 +141,7 @@ class BeamScanner(Device):
             self._state = DeviceState.CONFIGURED
 
     def park(self) -> None:
-        """Stop, and turn the mirror to where the beam is dumped. In any state. Any thread."""
+        """Stop, and turn the mirror to where the beam is dumped. In any state. May be called from any thread."""
         self.stop()
         _log.info("%s: park", self._name)
         self._has_moved = True

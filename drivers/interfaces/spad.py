@@ -68,7 +68,8 @@ class WindowTable:
         return x0
 
     def check(self, sensor_width: int, step_px: int) -> None:
-        """`LimitExceeded` for windows that a sensor cannot give: off the grid of its steps and words, or beyond it.
+        """Raises `LimitExceeded` for windows that a sensor cannot give: off the grid of its steps and words, or beyond
+        it.
 
         The last word of a row may reach beyond a sensor that is no whole number of words wide; its pad bits are 0.
         """
@@ -226,7 +227,7 @@ class SpadArray(Device):
 
     @property
     def counters(self) -> SpadCounters:
-        """Counts of the present run, or of the last one; also after `close`. Any thread."""
+        """Counts of the present run, or of the last one; also after `close`. May be called from any thread."""
         return self._do_counters()
 
     @property
@@ -236,7 +237,7 @@ class SpadArray(Device):
         return self._do_health()
 
     def configure(self, request: SpadRequest) -> SpadTiming:
-        """Set the frame timing. `LimitExceeded` when the device cannot do it; nothing is rounded silently."""
+        """Set the frame timing. Raises `LimitExceeded` when the device cannot do it; nothing is rounded silently."""
         self._require("configure", DeviceState.READY, DeviceState.CONFIGURED, first="stop")
         self._check(request)
         timing = self._do_configure(request)

@@ -78,7 +78,7 @@ class SyncSource(Device):
 
     @property
     def status(self) -> SyncStatus:
-        """Ask the device. `WrongState` after close. Any thread."""
+        """Ask the device. Raises `WrongState` after close. May be called from any thread."""
         self._require("status", *OPEN_STATES)
         return self._do_status()
 
@@ -104,14 +104,18 @@ class SyncSource(Device):
         self._state = DeviceState.RUNNING
 
     def gate_low(self) -> None:
-        """Take the gate low now, in any state, until the next `run`. Any thread. `DeviceFault`: it reads back high."""
+        """Take the gate low now, in any state, until the next `run`. May be called from any thread. Raises
+        `DeviceFault` if it reads back high.
+        """
         self._require("gate_low", *OPEN_STATES)
         _log.info("%s: gate low", self._name)
         self._do_gate_low()
         self._check_low(OUT_GATE, "gate_low")
 
     def abort(self) -> None:
-        """Take all outputs low, in any state; the program stays loaded. Any thread. `DeviceFault`: one reads high."""
+        """Take all outputs low, in any state; the program stays loaded. May be called from any thread. Raises
+        `DeviceFault` if one reads high.
+        """
         self._require("abort", *OPEN_STATES)
         _log.info("%s: abort", self._name)
         self._do_abort()

@@ -266,7 +266,7 @@ class ObisLaser(SerialLaser):
         self._set_power(self._limits.min_power_w)
 
     def _switch_off(self) -> None:
-        """Switch off, a deferred ON too. `DeviceFault` where the laser still emits."""
+        """Switch off, a deferred ON too. Raises `DeviceFault` if the laser still emits."""
         self._switch("SOUR:AM:STAT", "OFF")
         self._told_on = False
         if self._bits() & EMISSION:

@@ -42,7 +42,7 @@ class SerialLaser(LineLaser):
         """Whether pause or disarm was called since arm began: other threads may."""
 
     def arm(self, power_w: float) -> None:
-        """See `LineLaser`. `WrongState`: ended by a pause from another thread."""
+        """See `LineLaser`. Raises `WrongState` if ended by a pause from another thread."""
         self._stopped = False
         super().arm(power_w)
 
@@ -57,7 +57,7 @@ class SerialLaser(LineLaser):
         super().disarm()
 
     def _require_no_stop(self) -> None:
-        """`WrongState` where a pause has come while arming: what is to be lit must stay dark."""
+        """Raises `WrongState` if a pause has come while arming: what is to be lit must stay dark."""
         if self._stopped:
             raise WrongState(f"{self._name}: arm was ended by a pause; arm again")
 
@@ -68,7 +68,7 @@ class SerialLaser(LineLaser):
 
     @property
     def port_lost(self) -> bool:
-        """Whether the port is gone, told without a word on the wire. Any thread."""
+        """Whether the port is gone, told without a word on the wire. May be called from any thread."""
         return self._line.port_lost
 
     def _do_close(self) -> None:
@@ -88,7 +88,7 @@ def open_laser(
 ) -> _Laser:
     """Open the port, get into step and identify the laser; gives the port back where any of it fails.
 
-    make: what messages call it. `DeviceNotFound` where nothing of that make answers; what `identify` raises.
+    make: what messages call it. Raises `DeviceNotFound` if nothing of that make answers; what `identify` raises.
     """
     port = SerialPort(f"{make} laser", resolve(config.port, surroundings.ports), surroundings.tap)
     try:
@@ -106,7 +106,7 @@ def open_laser(
 
 
 def require_serial_number(make: str, config: SerialLaserConfig, found: str) -> None:
-    """`DeviceNotFound` where the config names another laser than was found."""
+    """Raises `DeviceNotFound` if the config names another laser than was found."""
     if config.serial_number not in (None, found):
         raise DeviceNotFound(
             f"{make} laser on {config.port} has serial number {found}, not {config.serial_number}; correct "

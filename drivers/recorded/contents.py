@@ -139,7 +139,7 @@ def find_blocks(segments: Sequence[SegmentReader], folder: Path) -> Contents:
 
 
 def read_entry(segment: SegmentReader, entry: Any) -> FrameBlock:
-    """The block that an entry tells of, its payload checked. CorruptBlock where there is another one, or none."""
+    """The block that an entry tells of, its payload checked. Raises CorruptBlock if there is another one, or none."""
     block = _block_at(segment, entry, check_payload=True)
     if block is None:
         raise CorruptBlock(f"not block {entry['block_seq']} of run {entry['run_id']}, of which {INDEX_FILE} tells")

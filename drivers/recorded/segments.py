@@ -188,7 +188,7 @@ class PackedSegment:
         self.size = self._table.size
 
     def at(self, offset: int, length: int) -> Bytes:
-        """Bytes from `offset` on, fewer at the end, unpacked. CorruptBlock where they cannot be."""
+        """Bytes from `offset` on, fewer at the end, unpacked. Raises CorruptBlock if they cannot be."""
         parts = []
         for frame in self._table.frames_at(offset, offset + length):
             _, _, start, _ = self._table.places(frame)
@@ -222,7 +222,7 @@ SegmentReader = PlainSegment | PackedSegment
 
 
 def open_segments(path: Path) -> list[SegmentReader]:
-    """The segments of a recording's folder in order, or of one file. `DeviceNotFound` where there are none."""
+    """The segments of a recording's folder in order, or of one file. Raises `DeviceNotFound` if there are none."""
     files = segment_files(path)
     if not files:
         raise DeviceNotFound(f"{path} {NO_SEGMENT}")

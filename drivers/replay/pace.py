@@ -32,7 +32,7 @@ class ReplayClock:
 
     @classmethod
     def parse(cls, text: str) -> "ReplayClock":
-        """The clock that a text means: realtime, max, step or xN. ValueError for anything else."""
+        """The clock that a text means: realtime, max, step or xN. Raises ValueError for anything else."""
         named = {"realtime": cls(1.0), "max": cls(), "step": cls(steps=True)}
         if text in named:
             return named[text]

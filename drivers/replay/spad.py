@@ -34,7 +34,9 @@ MANIFEST = "manifest.json"
 
 
 def recorded_device(recording: Path, slot: str) -> dict[str, Any] | None:
-    """The manifest's entry on a device of a recording; None where there is none. `ProtocolError`: it cannot be read."""
+    """The manifest's entry on a device of a recording; None where there is none. Raises `ProtocolError` if it cannot be
+    read.
+    """
     file = recording / MANIFEST
     try:
         content = parse_json(file.read_text(encoding="utf-8"))
@@ -116,7 +118,9 @@ Piece = tuple[FrameBlock, int, int]
 
 
 class Cursor:
-    """A reading of one start to its end, or to frame number `n_frames`. by_block: steps are blocks. For one thread."""
+    """A reading of one start to its end, or to frame number `n_frames`. by_block: steps are blocks. For use by one
+    thread at a time.
+    """
 
     def __init__(self, recording: RunRecording, run: RecordedRun, n_frames: int | None, *, by_block: bool) -> None:
         begins = run.entries["first_frame"].astype(np.int64)
@@ -406,7 +410,7 @@ def create(config: ReplaySpadConfig, surroundings: Surroundings) -> ReplaySpad:
 
 
 def check_files(config: ReplaySpadConfig) -> None:
-    """Open the recording, where one is named. `DeviceError` where it cannot be played."""
+    """Open the recording, where one is named. Raises `DeviceError` if it cannot be played."""
     if config.recording is not None:
         recorded_info(RunRecording(config.recording))
 

@@ -158,7 +158,7 @@ class Dac(Protocol):
         """A run of these points at a rate that `point_clock` returned."""
 
     def check(self) -> None:
-        """Raise where the board does not answer. Any thread."""
+        """Raise where the board does not answer. May be called from any thread."""
 
     def halt(self) -> float:
         """End what the board plays, in an emergency; returns where the mirror rests then."""

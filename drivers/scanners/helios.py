@@ -152,7 +152,7 @@ class HeliosConfig(GalvoConfig):
 
 
 class HeliosDac:
-    """A Helios as a `Dac`: its commands, one at a time. Any thread.
+    """A Helios as a `Dac`: its commands, one at a time. May be called from any thread.
 
     STOP and the alternate setting without endpoints leave the mirror at the centre.
     """

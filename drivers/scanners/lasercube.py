@@ -76,7 +76,7 @@ class LaserCubeConfig(GalvoConfig):
 
 
 class LaserCubeDac:
-    """A LaserCube as a `Dac`: its commands, one at a time. Any thread.
+    """A LaserCube as a `Dac`: its commands, one at a time. May be called from any thread.
 
     It cannot tell where its mirror stands: the first run begins at the centre.
     """

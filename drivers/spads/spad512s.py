@@ -128,7 +128,8 @@ class Spad512sRun:
         )
 
     def _require_new(self, frames: NDArray[np.uint8]) -> None:
-        """ProtocolError for a frame that was there before, unless all dark or all bright. frames: (n, 2, half)."""
+        """Raises ProtocolError for a frame that was there before, unless all dark or all bright. frames: (n, 2, half).
+        """
         for number, (one, other) in enumerate(frames, self.next_frame):
             before = self._seen.setdefault((zlib.crc32(one), zlib.crc32(other)), number)
             if before != number and not (one[0] in _UNIFORM and (one == one[0]).all() and (other == one[0]).all()):
@@ -281,7 +282,7 @@ class Spad512s(SpadArray):
     def _connect_where_lost(self) -> None:
         """Connect again after the program was restarted or left, which listens again a moment after its one client.
 
-        DeviceFault where another device answers now.
+        Raises DeviceFault if another device answers now.
         """
         ends_at = time.monotonic() + self._deadlines.listens_s
         while not self._line.is_open:

@@ -69,7 +69,7 @@ class Spad512sIdentity:
 
 
 class Spad512sLine:
-    """The line, open once `connect` returned. For one thread at a time."""
+    """The line, open once `connect` returned. For use by one thread at a time."""
 
     def __init__(self, name: str, address: str, deadlines: Deadlines, tap: Tap | None = None) -> None:
         """tap: told of commands and answers, not of pixels."""
@@ -94,7 +94,7 @@ class Spad512sLine:
             raise
 
     def hang_up(self) -> None:
-        """Give the connection back; again: nothing happens."""
+        """Give the connection back; a second call does nothing."""
         stream, self._stream = self._stream, None
         if stream is not None:
             stream.close()
@@ -137,7 +137,7 @@ class Spad512sLine:
             raise ProtocolError(f"{self._name} answers {command} with {fields!r}, not with {n} numbers") from None
 
     def receive_into(self, view: memoryview, wait_s: float) -> int:
-        """Bytes of a run; 0 where none came. `DeviceDisconnected`."""
+        """Bytes of a run; 0 where none came. May raise `DeviceDisconnected`."""
         return self._open().receive_into(view, wait_s)
 
     def rest(self) -> bytes:

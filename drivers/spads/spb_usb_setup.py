@@ -51,7 +51,9 @@ class SensorIdentity:
 
 
 def identify(control: ControlChannel, name: str) -> SensorIdentity:
-    """Read the identity registers. `DeviceNotFound`: it does not speak SPB1. `DeviceFault`: another version."""
+    """Read the identity registers. Raises `DeviceNotFound` if it does not speak SPB1. Raises `DeviceFault` if another
+    version.
+    """
     # A program that died may have left a run behind, which would drown the answers.
     control.forget_run()
     try:
@@ -100,7 +102,7 @@ _PATTERN_S = 1.0
 
 @dataclass(frozen=True, slots=True)
 class RunSetup:
-    """The registers of a run but for its length. Windows: None for full frames."""
+    """The registers of a run except for its length. Windows: None for full frames."""
 
     period_ticks: int
     exposure_ticks: int
@@ -142,7 +144,8 @@ def write_length(control: ControlChannel, n_frames: int | None) -> None:
 
 
 def block_size(identity: SensorIdentity, width: int, block_frames: int, name: str) -> tuple[int, int]:
-    """Stride and frames of a block: as many as were asked for, or as many as fit. `LimitExceeded` where none does."""
+    """Stride and frames of a block: as many as were asked for, or as many as fit. Raises `LimitExceeded` if none does.
+    """
     height = identity.info.height
     try:
         n = min(block_frames, frames_per_block(identity.max_stride, width, height))
@@ -152,7 +155,7 @@ def block_size(identity: SensorIdentity, width: int, block_frames: int, name: st
 
 
 def require_windows(identity: SensorIdentity, window: WindowTable, name: str) -> None:
-    """`LimitExceeded` where the device moves no windows, or not so many."""
+    """Raises `LimitExceeded` if the device moves no windows, or not so many."""
     if Feature.WINDOWS not in identity.features:
         raise LimitExceeded(f"{name}: its firmware moves no windows; ask for full frames or a lower frame_rate")
     entries = sum(len(x0) for x0 in window.x0)

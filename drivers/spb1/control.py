@@ -154,7 +154,7 @@ class Ack(NamedTuple):
 
 
 def read_acks(data: bytes) -> list[Ack]:
-    """The acknowledgements in `data`, which is nothing else. `ProtocolError` where it is."""
+    """The acknowledgements in `data`, which is nothing else. Raises `ProtocolError` if it is."""
     if len(data) % ACK.size:
         raise ProtocolError(f"{len(data)} bytes of acknowledgements, no multiple of {ACK.size}")
     acks = []
@@ -166,7 +166,7 @@ def read_acks(data: bytes) -> list[Ack]:
 
 
 def require_ok(label: str, command: Command, ack: Ack) -> None:
-    """`DeviceFault` where a command was refused."""
+    """Raises `DeviceFault` if a command was refused."""
     if ack.status != AckStatus.OK:
         why, name = _REFUSALS.get(ack.status, f"answers status {ack.status}"), Op(command.op).name
         raise DeviceFault(f"{label}: {name} 0x{command.address:04x} = {command.value}: the device {why}")
@@ -207,7 +207,8 @@ TAP_PORT = "control"
 
 
 class ControlChannel:
-    """The control plane over a link. For one thread at a time. ack_in: None where acknowledgements come as blocks.
+    """The control plane over a link. For use by one thread at a time. ack_in: None where acknowledgements come as
+    blocks.
 
     tap: told of commands and acknowledgements; what is left of a run in their way is not for it.
     """
@@ -240,7 +241,7 @@ class ControlChannel:
         return self.read_all((register,))[0]
 
     def read_all(self, registers: Sequence[int]) -> list[int]:
-        """The values of several registers, each asked for twice: they have no checksum. `ProtocolError`."""
+        """The values of several registers, each asked for twice: they have no checksum. May raise `ProtocolError`."""
         for _ in range(_TRIES):
             values = [ack.value for ack in self._ask([(Op.READ, register, 0) for register in (*registers, *registers)])]
             if values[: len(registers)] == values[len(registers) :]:
@@ -259,11 +260,11 @@ class ControlChannel:
         return raw.split(b"\0")[0].decode("utf-8", "replace").strip()
 
     def write_all(self, values: Iterable[tuple[int, int]]) -> None:
-        """Write several registers. `DeviceFault` where the device refuses one."""
+        """Write several registers. Raises `DeviceFault` if the device refuses one."""
         self._ask([(Op.WRITE, register, value) for register, value in values])
 
     def send(self, op: Op, value: int = 0) -> Ack:
-        """Send one command. `DeviceFault` where the device refuses it."""
+        """Send one command. Raises `DeviceFault` if the device refuses it."""
         return self._ask([(op, 0, value)])[0]
 
     def send_in_run(self, op: Op, value: int = 0) -> None:
@@ -279,7 +280,7 @@ class ControlChannel:
         self.drain()
 
     def drain(self) -> None:
-        """Drop what lies ready on the stream. `ProtocolError` where it does not end."""
+        """Drop what lies ready on the stream. Raises `ProtocolError` if it does not end."""
         ends_at = self.now_s() + _DRAIN_S
         while self.now_s() < ends_at:
             try:

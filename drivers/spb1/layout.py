@@ -47,7 +47,7 @@ class BlockLayout:
     height: int
 
     def __post_init__(self) -> None:
-        """ValueError for sizes that the header's fields cannot say."""
+        """Raises ValueError for sizes that the header's fields cannot say."""
         if not 0 <= self.n_frames <= MAX_FRAMES:
             raise ValueError(f"{self.n_frames} frames in a block; SPB1 holds 0 to {MAX_FRAMES}")
         if not (1 <= self.width <= 0xFFFF and 1 <= self.height <= 0xFFFF):
@@ -85,7 +85,7 @@ class BlockLayout:
 
 
 def frames_per_block(stride: int, width: int, height: int) -> int:
-    """Number of frames that fit into a stride. ValueError where the stride is bad or holds no frame."""
+    """Number of frames that fit into a stride. Raises ValueError if the stride is bad or holds no frame."""
     check_stride(stride)
     one = BlockLayout(1, width, height)
     room = stride - HEADER_BYTES - TRAILER_BYTES
@@ -100,7 +100,7 @@ def frames_per_block(stride: int, width: int, height: int) -> int:
 def block_views(buffer: NDArray[np.uint8], layout: BlockLayout) -> tuple[NDArray[np.void], NDArray[np.uint8]]:
     """The places in `buffer` (uint8 (bytes,)) where a source writes: records (n,), bits (n, height, row bytes).
 
-    Views, not copies. ValueError where the buffer is too short. Pad bits are for the source to clear.
+    Views, not copies. Raises ValueError if the buffer is too short. Pad bits are for the source to clear.
     """
     if len(buffer) < layout.block_bytes:
         raise ValueError(f"a buffer of {len(buffer)} bytes for a block of {layout.block_bytes}")
@@ -118,7 +118,7 @@ def views_at(
 
 
 def check_stride(stride: int) -> None:
-    """ValueError unless `stride` is a positive multiple of `ALIGN`."""
+    """Raises ValueError unless `stride` is a positive multiple of `ALIGN`."""
     if stride < ALIGN or stride % ALIGN:
         raise ValueError(f"stride {stride} is no positive multiple of {ALIGN} bytes")
 

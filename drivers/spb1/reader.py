@@ -86,15 +86,15 @@ class HeaderFields:
 def parse_block(buffer: NDArray[np.uint8], *, check_payload: bool) -> FrameBlock:
     """The block at the start of `buffer` (uint8 (bytes,), contiguous, may be longer), over the same memory.
 
-    `CorruptBlock` where anything is wrong with it; `UnsupportedBlock` where it is sound but sparse, summed, skipping,
-    of another major version or without frames. A truncated block gives its whole frames. Blocks sent with the least
-    significant bit first are copied, and delivered like all others, without the LSB_FIRST flag.
+    Raises `CorruptBlock` if anything is wrong with it; `UnsupportedBlock` where it is sound but sparse, summed,
+    skipping, of another major version or without frames. A truncated block gives its whole frames. Blocks sent with the
+    least significant bit first are copied, and delivered like all others, without the LSB_FIRST flag.
     """
     return read_frames(buffer, read_header(buffer), check_payload=check_payload)
 
 
 def read_header(buffer: NDArray[np.uint8]) -> HeaderFields:
-    """The header at the start of `buffer`. `CorruptBlock` where magic or CRC are wrong, nothing else is judged."""
+    """The header at the start of `buffer`. Raises `CorruptBlock` if magic or CRC are wrong, nothing else is judged."""
     if len(buffer) < HEADER_BYTES:
         raise CorruptBlock(f"{len(buffer)} bytes left, too few for a block header of {HEADER_BYTES}")
     raw = buffer.data[:HEADER_BYTES]
@@ -115,7 +115,7 @@ def read_header(buffer: NDArray[np.uint8]) -> HeaderFields:
 
 
 def read_frames(buffer: NDArray[np.uint8], fields: HeaderFields, *, check_payload: bool) -> FrameBlock:
-    """The frames behind a header that was read. Errors as of `parse_block`."""
+    """The frames behind a header that was read. Errors as in `parse_block`."""
     _refuse_unsupported(fields)
     layout = _checked_layout(fields, len(buffer))
     status, valid_bytes, payload_crc = _read_trailer(buffer, fields)
@@ -131,7 +131,7 @@ def read_frames(buffer: NDArray[np.uint8], fields: HeaderFields, *, check_payloa
 
 
 def read_control(buffer: NDArray[np.uint8], fields: HeaderFields) -> bytes:
-    """The payload of a control block whose header was read, its CRC checked. `CorruptBlock` where it is damaged."""
+    """The payload of a control block whose header was read, its CRC checked. Raises `CorruptBlock` if it is damaged."""
     if fields.block_bytes > len(buffer):
         raise CorruptBlock(f"control block cut off: {len(buffer)} of {fields.block_bytes} bytes")
     _, valid_bytes, payload_crc = _read_trailer(buffer, fields)
@@ -237,7 +237,7 @@ def walk_blocks(buffer: NDArray[np.uint8], stride: int | None, *, check_payload:
     stride: bytes from block to block; None where it is not known or changes: each block ends then at its own size and
     zeros up to the next one are padding. After damage the next header with the right CRC on a multiple of `ALIGN`
     counts. A block whose number does not rise within its run was sent or written twice: damage too. Control blocks
-    are passed over. `UnsupportedBlock` where the stream is of another sort than this reader takes.
+    are passed over. Raises `UnsupportedBlock` if the stream is of another sort than this reader takes.
     """
     last: FrameBlock | None = None
     for item in walk_placed(buffer, stride, check_payload=check_payload):

@@ -68,7 +68,7 @@ class _Item:
 
 
 class BlockReceiver:
-    """The stream of one run. For one thread."""
+    """The stream of one run. For use by one thread at a time."""
 
     def __init__(self, link: BulkLink, endpoint: int, armed: Armed, label: str) -> None:
         self.delivered = 0
@@ -198,7 +198,7 @@ class BlockReceiver:
         return took
 
     def _require_armed(self, fields: HeaderFields) -> None:
-        """CorruptBlock for a sound block that cannot be the next of this run."""
+        """Raises CorruptBlock for a sound block that cannot be the next of this run."""
         block, armed = fields.block, self._armed
         found = (block.width, block.height, block.sensor_width, block.sensor_height)
         if found != (armed.width, armed.height, armed.sensor_width, armed.sensor_height):
@@ -212,7 +212,8 @@ class BlockReceiver:
             raise CorruptBlock(f"block {block.block_seq} reaches beyond the {armed.n_frames} frames of the run")
 
     def _require_windows(self, block: FrameBlock) -> None:
-        """CorruptBlock where a window lies off the words or beyond the row: what counts bits must not trip over it."""
+        """Raises CorruptBlock if a window lies off the words or beyond the row: what counts bits must not trip over it.
+        """
         if block.n_frames == 0:
             return
         x0 = block.records["x0"]

@@ -37,7 +37,7 @@ def seal_block(
 
     buffer: uint8 (stride,), contiguous; zeroed behind the trailer. payload_crc: compute the payload's CRC, which reads
     every byte; else the trailer says 'not computed'. Copies nothing.
-    ValueError where the header contradicts the layout or has no packed SPB1 1.0 form.
+    Raises ValueError if the header contradicts the layout or has no packed SPB1 1.0 form.
     """
     _check(header, layout)
     records, bits = block_views(buffer, layout)

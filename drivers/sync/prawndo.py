@@ -47,7 +47,8 @@ class ProgramLimits:
 
 
 def compile_program(pulses: Sequence[Pulse], repeats: int, board: ProgramLimits) -> NDArray[np.void]:
-    """The words of the whole program, repeats written out and the end with all outputs low. `LimitExceeded`."""
+    """The words of the whole program, repeats written out and the end with all outputs low. May raise `LimitExceeded`.
+    """
     _check_waits(_words(pulses, board), repeats, board)
     period = _words(sliced(pulses), board)
     # A wait beside the end's own zeros would be the end, on that wait's outputs: a shortest word parts them.
@@ -171,7 +172,7 @@ class PrawnDo(SyncSource):
 
     @property
     def port_lost(self) -> bool:
-        """Whether the port is gone, told without a word on the wire. Any thread."""
+        """Whether the port is gone, told without a word on the wire. May be called from any thread."""
         return self._line.port_lost
 
     def most_repeats(self, pulses: Sequence[Pulse]) -> int:

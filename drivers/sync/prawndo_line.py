@@ -69,7 +69,7 @@ class PrawnDoLine:
 
     @property
     def port_lost(self) -> bool:
-        """Whether the port has hung up. Any thread."""
+        """Whether the port has hung up. May be called from any thread."""
         return self._port.lost
 
     def close(self) -> None:
@@ -79,7 +79,7 @@ class PrawnDoLine:
     def connect(self, most_words: int) -> None:
         """Take all outputs low, before anything else is asked, whatever state a former host left the board in.
 
-        most_words: of any board. `ProtocolError` where something else answers, `DeviceTimeout` where nothing does.
+        most_words: of any board. Raises `ProtocolError` if something else answers, `DeviceTimeout` where nothing does.
         """
         try:
             self.lower()
@@ -104,7 +104,7 @@ class PrawnDoLine:
             return self._until(lambda lines: bool(lines) and after in lines[-1], before, deadline_s, urgent)[:-1]
 
     def command(self, command: str) -> None:
-        """Send a command that answers `ok`. `DeviceFault` for any other answer."""
+        """Send a command that answers `ok`. Raises `DeviceFault` for any other answer."""
         lines = self.transact(command)
         if lines != ["ok"]:
             raise DeviceFault(f"{self._name}: {command} was answered {lines}, not ok")
@@ -125,7 +125,7 @@ class PrawnDoLine:
         return self._ask_twice("gto", lambda line: int(line, 16), deadline_s, urgent)
 
     def load(self, payload: bytes) -> None:
-        """Replace the program by these words of six bytes. `DeviceFault` for any answer but `ok` (pitfall 2)."""
+        """Replace the program by these words of six bytes. Raises `DeviceFault` for any answer but `ok` (pitfall 2)."""
         with self.lock:
             before, after = self._token(), self._token()
             self._pay_debt()
@@ -147,7 +147,7 @@ class PrawnDoLine:
 
         `abt` alone leaves the outputs as they are, and `man` is executed only once the state machine has stopped
         (pitfall 3). Both are sent before anybody waits for anything; then it is checked and said again until it is so.
-        `DeviceTimeout` where the board does not answer: whether the gate is low is then unknown.
+        Raises `DeviceTimeout` if the board does not answer: whether the gate is low is then unknown.
         """
         self._gate_first.set()
         try:

@@ -112,14 +112,14 @@ class QueuedLink:
             raise
 
     def write(self, endpoint: int, data: bytes, timeout_s: float) -> None:
-        """One OUT transfer. `DeviceTimeout` where not all of it went out."""
+        """One OUT transfer. Raises `DeviceTimeout` if not all of it went out."""
         with self._translated(endpoint, timeout_s):
             sent = self._handle.bulkWrite(endpoint, data, milliseconds(timeout_s))
         if sent != len(data):
             raise DeviceTimeout(f"{self.label}: {sent} of {len(data)} bytes went out within {timeout_s:g} s")
 
     def read(self, endpoint: int, size: int, timeout_s: float) -> bytes:
-        """One IN transfer of at most `size` bytes, whole packets. `DeviceTimeout` where nothing came.
+        """One IN transfer of at most `size` bytes, whole packets. Raises `DeviceTimeout` if nothing came.
 
         Bytes that came before a time-out are kept: libusb1's own read loses them (its issue 42).
         """
@@ -184,7 +184,7 @@ class QueuedLink:
         self._queue.clear()
 
     def close(self) -> None:
-        """Cancel and give the device back; again: nothing happens."""
+        """Cancel and give the device back; a second call does nothing."""
         if self._handle is not None:
             self.cancel()
             for transfer in self._spare:

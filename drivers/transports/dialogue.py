@@ -104,7 +104,7 @@ class Dialogue:
             self._resync(self._timing.quiet_s / 3)
 
     def tell(self, command: str) -> None:
-        """Have something done. `CommandRefused`, `DeviceTimeout`, `ProtocolError`, `DeviceDisconnected`.
+        """Have something done. May raise `CommandRefused`, `DeviceTimeout`, `ProtocolError`, `DeviceDisconnected`.
 
         A command whose reply was lost is sent again: all commands of the drivers may come twice.
         """
@@ -149,7 +149,8 @@ class Dialogue:
         raise ProtocolError(f"{self.name} answers {command!r} differently each time; check its cable")
 
     def tell_and_check(self, command: str, query: str, form: re.Pattern[str], wanted: Callable[[str], bool]) -> None:
-        """Set something and read it back, which alone counts. `DeviceFault` where it reads back as something else."""
+        """Set something and read it back, which alone counts. Raises `DeviceFault` if it reads back as something else.
+        """
         reply = ""
         for _ in range(_ATTEMPTS):  # a bit may flip in the answer as well as in the command
             refused: CommandRefused | None = None
@@ -166,7 +167,7 @@ class Dialogue:
 
     @property
     def port_lost(self) -> bool:
-        """Whether the port has hung up. Any thread."""
+        """Whether the port has hung up. May be called from any thread."""
         return self._port.lost
 
     def close(self) -> None:

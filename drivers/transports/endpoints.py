@@ -34,7 +34,8 @@ def one_line(error: Exception) -> str:
 def resolve(port: str, ports: Mapping[str, Endpoint]) -> Endpoint:
     """The endpoint that a config's `port` means. ports: what the emulating world created, by name.
 
-    `DeviceNotFound` for an emulated port that is not among them; a real address is not looked at before it is opened.
+    Raises `DeviceNotFound` for an emulated port that is not among them; a real address is not looked at before it is
+    opened.
     """
     if not port.startswith(EMULATED_PREFIX):
         return Endpoint(port)

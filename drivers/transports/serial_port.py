@@ -69,7 +69,8 @@ class SerialPort:
 
     @property
     def lost(self) -> bool:
-        """Whether the port has hung up, told by the kernel without a word on the wire. Any thread."""
+        """Whether the port has hung up, told by the kernel without a word on the wire. May be called from any thread.
+        """
         if not hasattr(select, "poll"):
             return False  # Windows tells with the next read
         try:
@@ -80,7 +81,7 @@ class SerialPort:
             return True
 
     def write(self, data: bytes) -> None:
-        """Send all of `data`. `DeviceTimeout` where the device takes none for a second, `DeviceDisconnected`."""
+        """Send all of `data`. Raises `DeviceTimeout` if the device takes none for a second, `DeviceDisconnected`."""
         self._note(OUT, data)
         with self._translated():
             try:
@@ -91,7 +92,9 @@ class SerialPort:
                 ) from None
 
     def read_line(self, terminator: bytes, deadline_s: float) -> bytes:
-        """The next line without its terminator. `DeviceTimeout` after `deadline_s`: what came is kept for the next."""
+        """The next line without its terminator. Raises `DeviceTimeout` after `deadline_s`: what came is kept for the
+        next.
+        """
         ends_at = self._now_s() + deadline_s
         searched = 0
         while (end := self._received.find(terminator, searched)) < 0:
@@ -123,7 +126,7 @@ class SerialPort:
         return self._take(len(self._received), 0)
 
     def close(self) -> None:
-        """Give the port back; again: nothing happens. Never raises: a lost port is closed all the same."""
+        """Give the port back; a second call does nothing. Never raises: a lost port is closed all the same."""
         with suppress(*_FOREIGN):  # the port is gone, and with it all that could be given back
             self._port.close()
 

@@ -123,7 +123,9 @@ class Passed:
 
 
 def read_taps(file: Path) -> list[Passed]:
-    """Everything that passed, in order of time, but for a torn last line. `ProtocolError` for another sort of file."""
+    """Everything that passed, in order of time, except for a torn last line. Raises `ProtocolError` for another sort of
+    file.
+    """
     *lines, _ = file.read_bytes().split(b"\n")
     found = []
     for number, line in enumerate(lines, 1):

@@ -20,7 +20,7 @@ _CHUNK_BYTES = 65_536
 
 
 class TcpStream:
-    """An open connection. `close` is idempotent. For one thread, but for `close`."""
+    """An open connection. `close` is idempotent. For one thread, except for `close`."""
 
     def __init__(self, name: str, address: str, *, connect_s: float = 5.0) -> None:
         """Connect. name: the device's name in messages; address: "host:port".
@@ -39,7 +39,7 @@ class TcpStream:
             self._socket.setsockopt(socket.IPPROTO_TCP, socket.TCP_NODELAY, 1)
 
     def send(self, data: bytes, deadline_s: float) -> None:
-        """Send all of `data`. `DeviceTimeout` where the other side takes none for so long, `DeviceDisconnected`."""
+        """Send all of `data`. Raises `DeviceTimeout` if the other side takes none for so long, `DeviceDisconnected`."""
         ends_at = time.monotonic() + deadline_s
         rest = memoryview(data)
         while rest:
@@ -50,12 +50,14 @@ class TcpStream:
                     rest = rest[self._socket.send(rest) :]
 
     def receive(self, deadline_s: float, limit: int = _CHUNK_BYTES) -> bytes:
-        """The bytes that have come, at least one; b"" where nothing came within the deadline. `DeviceDisconnected`."""
+        """The bytes that have come, at least one; b"" where nothing came within the deadline. May raise
+        `DeviceDisconnected`.
+        """
         buffer = bytearray(limit)
         return bytes(buffer[: self.receive_into(memoryview(buffer), deadline_s)])
 
     def receive_into(self, view: memoryview, deadline_s: float) -> int:
-        """Receive bytes into `view`; returns their number, 0 past the deadline. `DeviceDisconnected`."""
+        """Receive bytes into `view`; returns their number, 0 past the deadline. May raise `DeviceDisconnected`."""
         ends_at = time.monotonic() + deadline_s
         while True:
             with self._translated():
@@ -79,7 +81,7 @@ class TcpStream:
         return bytes(dropped)
 
     def close(self) -> None:
-        """Give the connection back; again: nothing happens. Never raises."""
+        """Give the connection back; a second call does nothing. Never raises."""
         with suppress(OSError):
             self._socket.close()
 

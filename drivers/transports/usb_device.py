@@ -153,7 +153,8 @@ class UsbDevice:
             self._device.set_interface_altsetting(interface, alternate)
 
     def write(self, endpoint: int, data: bytes, timeout_s: float) -> None:
-        """One OUT transfer, interrupt or bulk as the descriptor says. `DeviceTimeout` where not all of it went out."""
+        """One OUT transfer, interrupt or bulk as the descriptor says. Raises `DeviceTimeout` if not all of it went out.
+        """
         if self._tap is not None:
             self._tap.note(f"{endpoint:02x}", OUT, data)
         with translated(self.label, endpoint, timeout_s):
@@ -164,7 +165,8 @@ class UsbDevice:
             )
 
     def read(self, endpoint: int, size: int, timeout_s: float) -> bytes:
-        """One IN transfer of at most `size` bytes, a whole number of packets. `DeviceTimeout` where nothing came."""
+        """One IN transfer of at most `size` bytes, a whole number of packets. Raises `DeviceTimeout` if nothing came.
+        """
         with translated(self.label, endpoint, timeout_s):
             data = bytes(self._device.read(endpoint, size, milliseconds(timeout_s)))
         if self._tap is not None:
@@ -179,7 +181,7 @@ class UsbDevice:
     def drain(self, endpoint: int, size: int, timeout_s: float, most: int = 1000) -> int:
         """Read and drop until nothing comes for `timeout_s`; returns the transfers dropped.
 
-        `ProtocolError` after `most` of them: a device that never falls silent follows another protocol.
+        Raises `ProtocolError` after `most` of them: a device that never falls silent follows another protocol.
         """
         for dropped in range(most):
             try:
@@ -191,7 +193,7 @@ class UsbDevice:
     def control_in(
         self, request_type: int, request: int, value: int, index: int, length: int, timeout_s: float
     ) -> bytes:
-        """A control transfer that reads. `DeviceFault` where the device refuses it (stall)."""
+        """A control transfer that reads. Raises `DeviceFault` if the device refuses it (stall)."""
         with translated(self.label, 0, timeout_s):
             reply = self._device.ctrl_transfer(request_type, request, value, index, length, milliseconds(timeout_s))
         return bytes(reply)
@@ -204,7 +206,8 @@ class UsbDevice:
         return frozenset(endpoint.bEndpointAddress for interface in interfaces for endpoint in interface)
 
     def close(self) -> None:
-        """Give the interfaces and the device back; again: nothing happens. Raises nothing: the device may be gone."""
+        """Give the interfaces and the device back; a second call does nothing. Raises nothing: the device may be gone.
+        """
         with self._lock:
             if not self._open:
                 return
@@ -230,14 +233,14 @@ def open_device(
 ) -> UsbDevice:
     """Find, open, configure and claim.
 
-    `DeviceNotFound`: none, or none at that address. `DeviceError`: several equal ones and the address does not choose.
-    `DevicePermission` names the udev rule. `DeviceBusy`: claimed by another program.
+    Raises `DeviceNotFound` if none, or none at that address. Raises `DeviceError` if several equal ones and the address
+    does not choose. `DevicePermission` names the udev rule. Raises `DeviceBusy` if claimed by another program.
     """
     return UsbDevice(find_device(wanted, address, backend), wanted.label, alternates, tap)
 
 
 def find_device(wanted: UsbId, address: str, backend: object | None = None) -> UsbListing:
-    """The one device that an address means. Errors as of `open_device`, but for those of claiming it."""
+    """The one device that an address means. Errors as in `open_device`, except for those of claiming it."""
     return _choose(attached(wanted, backend), wanted, address)
 
 

@@ -1,6 +1,6 @@
 """The stages that are measured: each works on frames for a moment and says how many it did in how long.
 
-docs/results/speed.md says what each of them is. What is done once a sweep is not timed, but for `whole_sweeps`. Of
+docs/results/speed.md says what each of them is. What is done once a sweep is not timed, except for `whole_sweeps`. Of
 figures that were measured one after the other a machine with other work makes any quotient: so `joint` and StereoSGBM
 make maps by turns. Nothing is learned meanwhile, and each begins with a map that is not timed.
 """

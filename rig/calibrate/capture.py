@@ -103,7 +103,7 @@ def capture_view(
 
 
 def capture_recorded(run: Path, name: str, board: Board | None, *, defects: NDArray[np.bool_] | None = None) -> Capture:
-    """Take the view from the first sweeps of a recorded run. UsageError where there is none."""
+    """Take the view from the first sweeps of a recorded run. Raises UsageError if there is none."""
     config = replay_config(run, ReplayOptions("max"), None, {"estimator": "argmax", "filter": "none"})
     if not read_plan(run).windowed:
         config = config.model_copy(update={"calibration": None})
@@ -119,7 +119,7 @@ def plain(config: RigConfig) -> RigConfig:
 
 
 def _settings(config: RigConfig, exposures: int | None, *, bidirectional: bool) -> RigConfig:
-    """The config of a capture. UsageError for a rig of several lines."""
+    """The config of a capture. Raises UsageError for a rig of several lines."""
     if len(config.line_offsets) > 1:
         raise UsageError(
             f"{config.name} has {len(config.line_offsets)} lines (line_offsets); a pixel cannot tell which one passed: "
@@ -258,7 +258,7 @@ def shown(config: RigConfig, what: str, pose: Candidate, ask: AskPerson | None, 
 
 
 Scan = Callable[[int | None], Capture]
-"""A function that takes a view at so many exposures per column; None: the config's. PlanError: it cannot."""
+"""A function that takes a view at so many exposures per column; None: the config's. Raises PlanError if it cannot."""
 
 
 class SpeedRotation:

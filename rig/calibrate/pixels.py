@@ -121,7 +121,9 @@ def take_dark(
     progress: Progress | None = None,
     covered: Callable[[], None] | None = None,
 ) -> tuple[DarkTally, float]:
-    """Take at least so many frames in the dark, once the lens is `covered`; also their exposure in s. DeviceError."""
+    """Take at least so many frames in the dark, once the lens is `covered`; also their exposure in s. May raise
+    DeviceError.
+    """
     if isinstance(rig.world, CoversLens):
         rig.world.cover_lens()
     elif covered is not None:
@@ -408,7 +410,7 @@ def _sensor(rig: OpenRig) -> str:
 
 
 def _last(against: PathLike | None, config: RigConfig, recorded: Path | None) -> PixelVersion | None:
-    """The older map to compare with; None where there is none. UsageError where a file was named that is no map."""
+    """The older map to compare with; None where there is none. Raises UsageError if a file was named that is no map."""
     if against is not None:
         path = Path(against)
         path = path / PIXELS_FILE if path.is_dir() else path
@@ -444,7 +446,7 @@ def _note(config: RigConfig, drift: PixelDrift) -> None:
 
 
 def _written(result: PixelResult, folder: RunFolder, calibration: Path | None) -> PixelResult:
-    """Write the folder's files. UsageError where they cannot be written."""
+    """Write the folder's files. Raises UsageError if they cannot be written."""
     pixels = result.found.pixels
     try:
         save_pixels(result.found, folder.place(PIXELS_FILE))

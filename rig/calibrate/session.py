@@ -68,7 +68,8 @@ class Session:
     """Writes the views of a calibration one by one, then what was made of them."""
 
     def __init__(self, out: OutFolder, board: Board | None = None) -> None:
-        """Claim the folder; None writes nothing. board: what the views show. UsageError where it cannot be claimed."""
+        """Claim the folder; None writes nothing. board: what the views show. Raises UsageError if it cannot be claimed.
+        """
         self._board = board
         self._folder = None if out is None else RunFolder(out, in_place=True)
         self._views = 0
@@ -218,7 +219,7 @@ Arrays = Mapping[str, NDArray[Any]]
 
 
 def save_view(view: View, file: Path) -> None:
-    """Write a view, in one step. UsageError where it cannot be written."""
+    """Write a view, in one step. Raises UsageError if it cannot be written."""
     stream = io.BytesIO()
     np.savez_compressed(stream, allow_pickle=False, **_arrays(view))
     part = file.with_name(f".{file.name}.part")
@@ -233,7 +234,7 @@ def save_view(view: View, file: Path) -> None:
 
 
 def load_view(file: Path) -> View:
-    """Read a view. UsageError where the file holds none."""
+    """Read a view. Raises UsageError if the file holds none."""
     try:
         with load_numpy(file) as arrays:
             version = int(arrays["format_version"])

@@ -172,7 +172,8 @@ class CameraUse:
 
 
 def camera_use(file: Path, *, accept: bool = False) -> CameraUse:
-    """Read a camera file. UsageError where its verdict failed, unless `accept`; without one it is used unchecked."""
+    """Read a camera file. Raises UsageError if its verdict failed, unless `accept`; without one it is used unchecked.
+    """
     known = load_camera(file)
     found = failed_verdict(known.verdict, known.reasons)
     require_accepted(f"camera {file}", found, {each.code for each in found} if accept else ())

@@ -57,7 +57,7 @@ class ViewCollection:
         identity: Identity | None = None,
         source: Path | None = None,
     ) -> None:
-        """Add a view from a file or run, with a name of its own. UsageError for one that would count twice."""
+        """Add a view from a file or run, with a name of its own. Raises UsageError for one that would count twice."""
         self._require_new(view, str(source or view.name))
         if view.name in [known.name for known in self.views]:
             view = replace(view, name=f"{view.name}-{len(self.views)}")
@@ -107,7 +107,7 @@ class ViewCollection:
 
     @property
     def size(self) -> tuple[int, int]:
-        """(width, height) of the pictures. UsageError where views are of different sizes."""
+        """(width, height) of the pictures. Raises UsageError if views are of different sizes."""
         sizes = {view.picture.shape[::-1] for view in self.views if view.picture is not None}
         if len(sizes) != 1:
             named = ", ".join(f"{width} x {height}" for width, height in sorted(sizes)) or "none"

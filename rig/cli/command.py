@@ -91,7 +91,7 @@ def command(function: Callable[P, int]) -> Callable[P, None]:
 
 
 def split_option(option: str, given: list[str] | None) -> list[str]:
-    """Split an option that may be given several times and with commas. UsageError where it names nothing."""
+    """Split an option that may be given several times and with commas. Raises UsageError if it names nothing."""
     parts = (part.strip() for value in given or () for part in value.split(","))
     named = list(dict.fromkeys(part for part in parts if part))
     if given and not named:
@@ -100,7 +100,7 @@ def split_option(option: str, given: list[str] | None) -> list[str]:
 
 
 def whole_numbers(option: str, given: list[str] | None) -> list[int]:
-    """Split an option as `split_option` does, into whole numbers. UsageError for anything else."""
+    """Split an option as `split_option` does, into whole numbers. Raises UsageError for anything else."""
     parts = split_option(option, given)
     wrong = [part for part in parts if not part.isdecimal()]
     if wrong:

@@ -282,7 +282,7 @@ class BlankingSync:
     def mark(self, block: FrameBlock, records: NDArray[np.void]) -> None:
         """Fill marks, line and sweep of the block's `records` (n,).
 
-        DeviceFault where the run, or `SEARCH_S`, ends without two patterns a sweep apart.
+        Raises DeviceFault if the run, or `SEARCH_S`, ends without two patterns a sweep apart.
         """
         header, n = block.header, block.n_frames
         self._count(block)

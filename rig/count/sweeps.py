@@ -74,7 +74,7 @@ class SweepData(SweepAccount):
 
 @dataclass(frozen=True, slots=True)
 class SweepStart:
-    """First sweep of a run that becomes a map: number 0, but for a part that was cut from a recording.
+    """First sweep of a run that becomes a map: number 0, except for a part that was cut from a recording.
 
     clock_ratio: as of `FrameBinder`. Frames of sweeps before it are not counted.
     """

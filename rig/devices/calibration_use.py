@@ -141,7 +141,9 @@ def calibration_use(rig: OpenRig, *, accept: bool = False, here: Identity | None
 
 
 def cube_calibration_use(model: RigModel, file: Path | None, *, accept: bool = False) -> CalibrationUse:
-    """The calibration of a bare cube, of whose rig nothing is known: its verdict and checks count. UsageError."""
+    """The calibration of a bare cube, of whose rig nothing is known: its verdict and checks count. May raise
+    UsageError.
+    """
     found = refusals(model, file, None, None)
     return _used(model, file, found, frozenset(r.code for r in found) if accept else frozenset())
 

@@ -152,7 +152,8 @@ def _create_surroundings(config: RigConfig, seed: int, stack: ExitStack, problem
 
 
 def surroundings_of(config: RigConfig, seed: int, stack: ExitStack) -> Surroundings:
-    """Clock and world of the config, with the devices that the world plugs in. DeviceError where it cannot be made."""
+    """Clock and world of the config, with the devices that the world plugs in. Raises DeviceError if it cannot be made.
+    """
     virtual = config.world is not None and not config.world.real_time
     clock = VirtualClock() if virtual else SystemClock()
     bare = Surroundings(clock, None, seed)

@@ -164,7 +164,7 @@ class _Export:
             return {}
 
     def _view(self) -> View:
-        """The view to show. UsageError where the run has nothing of it."""
+        """The view to show. Raises UsageError if the run has nothing of it."""
         there = {
             "depth": bool(self._maps.files("depth", ".npy")),
             "intensity": bool(self._maps.files("intensity", ".png")),
@@ -181,7 +181,7 @@ class _Export:
         return view
 
     def _make_maps(self) -> str:
-        """The next step where there are no maps. UsageError where there are no frames to make maps of either."""
+        """The next step where there are no maps. Raises UsageError if there are no frames to make maps of either."""
         require_recording(self._run)
         return f"make them first: {reconstruct_line(self._run)}, and export that folder"
 

@@ -40,7 +40,8 @@ class ForeignFrames:
 def gather(files: Iterable[str | os.PathLike[str]], suffix: str) -> list[Path]:
     """List the given files in that order; a folder stands for all its files with `suffix`, in inner folders too.
 
-    A folder's files come in natural order (2 before 10), as the cameras number them. UsageError where one is missing.
+    A folder's files come in natural order (2 before 10), as the cameras number them. Raises UsageError if one is
+    missing.
     """
 
     def natural(file: Path) -> list[tuple[int, str]]:

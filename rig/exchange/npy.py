@@ -139,7 +139,7 @@ def _changes(values: NDArray[np.integer[Any]]) -> Iterator[tuple[int, int]]:
 def write_npy(
     blocks: Iterable[FrameBlock], folder: RunFolder, source: Mapping[str, Any], camera: Camera | None
 ) -> FrameLog:
-    """Write the cube of `blocks` and the files beside it. UsageError where the blocks do not make one array."""
+    """Write the cube of `blocks` and the files beside it. Raises UsageError if the blocks do not make one array."""
     log = FrameLog()
     with folder.place(CUBE).open("wb") as file:
         for block in blocks:

@@ -103,7 +103,7 @@ class SweepGeometry:
 def sweep_geometry(model: RigModel, commands: Float64, depth_range_m: tuple[float, float]) -> SweepGeometry:
     """Search windows of the light at mirror commands (columns,), for a camera and a depth range in metres.
 
-    UsageError where a plane passes through the camera, or where no column can be seen within the depth range.
+    Raises UsageError if a plane passes through the camera, or where no column can be seen within the depth range.
     """
     from rig.geometry.kernels import row_windows
 

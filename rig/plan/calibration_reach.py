@@ -70,7 +70,7 @@ def recalibrated(plan: ScanPlan, model: RigModel) -> ScanPlan:
     """The plan with the lag and the windows of `model`; it is unchanged where it was compiled for that model.
 
     Mirror, gate and markers stay as they were, and so do the pixels that the SPAD sent: frames that do not hold a
-    column's window do not count for it. UsageError where the calibration is not one of this rig and scan.
+    column's window do not count for it. Raises UsageError if the calibration is not one of this rig and scan.
     """
     try:
         model.check_sensor(plan.width, plan.rows)

@@ -43,8 +43,8 @@ class Compression:
 def compress(folder: Path) -> Compression:
     """Compress the segments of a recording (`rig compress`); compressed ones stay as they are.
 
-    UsageError where there is no recording, or the package zstandard is missing; DamagedRecordingError where it is not
-    whole; RecordingError where the disk is full, with every segment plain or compressed as a whole.
+    Raises UsageError if there is no recording, or the package zstandard is missing; DamagedRecordingError where it is
+    not whole; RecordingError where the disk is full, with every segment plain or compressed as a whole.
     """
     try:
         zstandard_or_error()

@@ -46,7 +46,7 @@ def write_inputs(folder: Path, plan: ScanPlan, model: RigModel | None) -> None:
 
 
 def read_plan(folder: Path, name: str = PLAN_FILE) -> ScanPlan:
-    """Read the plan that a recording was taken with. UsageError where there is none that this program reads."""
+    """Read the plan that a recording was taken with. Raises UsageError if there is none that this program reads."""
     file = folder / name
     try:
         content = load_yaml(file, "a plan", f"format: {PLAN_FORMAT}").content
@@ -107,7 +107,7 @@ def _require_sizes(plan: ScanPlan) -> None:
 def holds_frames_alone(folder: Path) -> bool:
     """Whether a recording has no plan and never had one, as imported frames: no manifest and no marker tells of one.
 
-    DamagedRecordingError where the manifest is damaged.
+    Raises DamagedRecordingError if the manifest is damaged.
     """
     if (folder / PLAN_FILE).exists() or PLAN_FILE in ((read_manifest(folder) or {}).get("inputs") or {}):
         return False
@@ -122,7 +122,8 @@ def reconstruct_line(folder: Path) -> str:
 
 
 def read_model(folder: Path) -> RigModel | None:
-    """Read the calibration that a recording was taken with; None where it has none. UsageError where it is damaged."""
+    """Read the calibration that a recording was taken with; None where it has none. Raises UsageError if it is damaged.
+    """
     file = folder / CALIBRATION_FILE
     if not file.exists():
         return None
@@ -139,7 +140,7 @@ SINCE = "since"
 
 
 def to_plain(value: Any) -> Any:
-    """Numbers, text, lists and mappings that `from_plain` reads. TypeError for a value that has no such form."""
+    """Numbers, text, lists and mappings that `from_plain` reads. Raises TypeError for a value that has no such form."""
     if is_dataclass(value):
         kept = [(field, getattr(value, field.name)) for field in fields(value) if field.init]
         return {field.name: to_plain(one) for field, one in kept if one is not None or SINCE not in field.metadata}
@@ -159,7 +160,7 @@ def to_plain(value: Any) -> Any:
 
 
 def from_plain(kind: type[T], content: Any) -> T:
-    """The value of type `kind` that `to_plain` wrote. ValueError where `content` is not one."""
+    """The value of type `kind` that `to_plain` wrote. Raises ValueError if `content` is not one."""
     value: T = _read(kind, content, kind.__name__)
     return value
 

@@ -196,7 +196,7 @@ class RecordingInfo:
 
 
 def info(folder: Path) -> RecordingInfo:
-    """Describe a recording (`rig info`). UsageError where there is none."""
+    """Describe a recording (`rig info`). Raises UsageError if there is none."""
     recording = open_recording(folder)
     manifest, trouble = manifest_or_none(folder)
     spans = map_spans(recording, manifest)

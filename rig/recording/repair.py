@@ -40,7 +40,7 @@ class Repair:
 def repair(folder: Path) -> Repair:
     """Make a recording whole as far as possible (`rig repair`).
 
-    UsageError where there is none, RecordingError where it cannot be written.
+    Raises UsageError if there is none, RecordingError where it cannot be written.
     """
     if is_held(folder / INDEX_FILE):
         raise UsageError(f"{folder} is still being recorded; let the run end, or end it, and repair it then")

@@ -75,7 +75,7 @@ class ReplayOptions:
 
 
 def replay_config(run: Path, options: ReplayOptions, others: RigConfig | None, estimate: dict[str, Any]) -> RigConfig:
-    """Make the config of the rig that plays a recording. UsageError where there is none.
+    """Make the config of the rig that plays a recording. Raises UsageError if there is none.
 
     others: rig whose world, scanner, laser and sync source take part; None plays the recorded ones.
     estimate: settings laid over those of the recording.
@@ -112,7 +112,7 @@ def replay_plan(
 ) -> tuple[ScanPlan, SpadTiming]:
     """The plan that the frames were taken with, for the present calibration, and the timing of the configured SPAD.
 
-    DamagedRecordingError where the frames are of another size than the plan's, which counters are made by.
+    Raises DamagedRecordingError if the frames are of another size than the plan's, which counters are made by.
     """
     from rig.plan.calibration_reach import recalibrated, whole_rows
 
@@ -156,7 +156,8 @@ class ReplaySource:
 
     @classmethod
     def of(cls, spad: SpadArray, plan: ScanPlan, maps: int | None) -> "ReplaySource | None":
-        """Make it for a SPAD that plays a recording; None for any other. UsageError where there are too few maps."""
+        """Make it for a SPAD that plays a recording; None for any other. Raises UsageError if there are too few maps.
+        """
         return cls(spad, plan, maps) if isinstance(spad, ReplaySpad) else None
 
     @property
@@ -232,7 +233,7 @@ class RecordedStart:
 def recorded_sweeps(recording: RunRecording, plan: ScanPlan) -> list[RecordedStart]:
     """The whole sweeps of each start of the SPAD, as the run took them, as far as their frames are there.
 
-    DamagedRecordingError where a start is missing: its maps would be taken for those of others.
+    Raises DamagedRecordingError if a start is missing: its maps would be taken for those of others.
     """
     manifest = read_manifest(recording.path) or {}
     begins = _part_starts(recording)

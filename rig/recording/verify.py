@@ -94,7 +94,7 @@ class Examination:
 
 
 def verify(folder: Path) -> Verification:
-    """Read all of a recording (`rig verify`). UsageError where there is none; damage is in the result."""
+    """Read all of a recording (`rig verify`). Raises UsageError if there is none; damage is in the result."""
     found = examine(folder)
     blocks = [block for run in found.runs for block in run]
     manifest = found.manifest or {}
@@ -120,7 +120,7 @@ def verify(folder: Path) -> Verification:
 
 
 def examine(folder: Path) -> Examination:
-    """Find out everything that `verify` and `repair` need to know. UsageError where there is no recording."""
+    """Find out everything that `verify` and `repair` need to know. Raises UsageError if there is no recording."""
     require_recording(folder)
     try:
         segments = open_segments(folder)

@@ -148,7 +148,7 @@ class Recording:
         self._companions.append(companion)
 
     def close(self) -> None:
-        """Wait until everything is written, end the files and sync them, once. RecordingError where that fails."""
+        """Wait until everything is written, end the files and sync them, once. Raises RecordingError if that fails."""
         if self._closed.is_set():
             return
         self._pool.shutdown()

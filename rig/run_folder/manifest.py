@@ -191,7 +191,7 @@ def inputs_problems(folder: Path, manifest: Mapping[str, Any]) -> list[str]:
 def require_playable(folder: Path, manifest: Mapping[str, Any]) -> None:
     """Raise DamagedRecordingError, a line each, for files beside the frames that are not what the manifest says.
 
-    UsageError for a recording whose maps spadrig 0.1 took in several passes over part of the columns each.
+    Raises UsageError for a recording whose maps spadrig 0.1 took in several passes over part of the columns each.
     """
     if problems := inputs_problems(folder, manifest):
         raise DamagedRecordingError("\n".join(f"{line}; take it from a copy of the recording" for line in problems))

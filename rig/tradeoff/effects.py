@@ -122,7 +122,7 @@ def flux_row(config: RigConfig, row: int, column: int) -> Flux:
     """Noise-free photons per exposure of one image row while the line is at a column's centre.
 
     x_px: pixels (width,); total; and by name the share of each effect of light and dark counts, zeros for effects that
-    are off. The shares add up to the total. UsageError for a row or column that does not exist.
+    are off. The shares add up to the total. Raises UsageError for a row or column that does not exist.
     """
     scan = config.scan
     with open_world(config) as (world, power_w):

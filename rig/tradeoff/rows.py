@@ -138,7 +138,7 @@ class TradeoffRow:
 
 
 def score_map(result: MapResult, truth: SweepTruth, sensor_ms: float, compute_ms: float) -> MapScore:
-    """Score a map. UsageError where the world has no stripe to be found."""
+    """Score a map. Raises UsageError if the world has no stripe to be found."""
     true_px = truth.x_px.astype(np.float64)
     if not np.isfinite(true_px).any():
         raise UsageError("the line is nowhere seen in this scene; check the scene and scan.command_range")

@@ -373,7 +373,7 @@ class SimulatedSpad(SpadArray):
 
 
 def create(config: SimulatedSpadConfig, surroundings: Surroundings) -> SimulatedSpad:
-    """The SPAD that looks at the world. DeviceError where the rig has none."""
+    """The SPAD that looks at the world. Raises DeviceError if the rig has none."""
     if not isinstance(surroundings.world, SimulatedWorld):
         raise DeviceError(
             "simulated SPAD has nothing to look at: the rig has no simulated world; add world: {kind: simulated}"

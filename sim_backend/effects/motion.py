@@ -3,11 +3,12 @@
 All surfaces are shifted together by D = velocity x time. A surface's facet m.X = 1 becomes m.(X - D) = 1, that is m /
 (1 + m.D), so the inverse depth of a ray q = (u, v, 1) is m.q / (1 + m.D) with m of the pixel at which the point was at
 time 0. That pixel is searched with two starts, from the nearest surface and from the one that is seen there at time 0;
-the nearer result wins, which is right but for a pixel or two along edges. What is uncovered continues what is behind,
-and what comes in at the borders what is there. Albedo is that of the nearest pixel.
+the nearer result wins, which is right except for a pixel or two along edges. What is uncovered continues what is
+behind, and what comes in at the borders what is there. Albedo is that of the nearest pixel.
 
 The picture is made anew every `HOLD_S`, in which a surface at 10 m/s moves by 1 cm: about 40 ms each for 512 x 512
-pixels. Light that does not come from the laser stays that of time 0."""
+pixels. Light that does not come from the laser stays that of time 0.
+"""
 
 import math
 import threading

@@ -83,7 +83,7 @@ def _of_rows(sheets: LightSheets, index: int, rows: int) -> LightSheets:
 def line_width(view: CameraView, optics: Optics, sensor: Sensor, line: Line) -> Array:
     """The numbers that `sigma_px` takes: (4,) variance in px^2, spread in px, defocus in px m, inverse focus in 1/m.
 
-    DeviceError where the focus lies within the focal length: a lens makes no picture of what is there.
+    Raises DeviceError if the focus lies within the focal length: a lens makes no picture of what is there.
     """
     focal_px, defocus, inverse_focus = view.focal_px, 0.0, 0.0
     if optics.focus is not None:

@@ -73,7 +73,7 @@ class CameraView:
         return sheet
 
     def trace(self, sheet: LightSheet, first_row: int, last_row: int) -> None:
-        """Trace rows first_row..last_row-1 of a sheet in place. Releases the GIL, but for sheets that bow."""
+        """Trace rows first_row..last_row-1 of a sheet in place. Releases the GIL, except for sheets that bow."""
         now = self.at(sheet.time_s)
         given = now.u, now.v, now.surface, now.bounds, sheet.traced, first_row, last_row
         trace_rows(*given)

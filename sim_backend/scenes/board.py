@@ -54,7 +54,7 @@ class BoardAtPose:
 
 
 def load_boards(shown: Sequence[SceneBoard], folder: Path) -> list[BoardAtPose]:
-    """The boards of a scene file whose paths start at `folder`. DeviceError where a board's file is no board's."""
+    """The boards of a scene file whose paths start at `folder`. Raises DeviceError if a board's file is no board's."""
     try:
         return [
             BoardAtPose(

@@ -109,8 +109,9 @@ def bundled_scenes() -> tuple[str, ...]:
 def load_scene(name: str) -> tuple[SceneFile, Path]:
     """The scene of a bundled name, a scene file or a folder of surfaces, and the folder its paths are relative to.
 
-    A bare folder is its surfaces in clear, dark air. DeviceError where there is no such scene or it is wrong, a line
-    for each problem of its file."""
+    A bare folder is its surfaces in clear, dark air. Raises DeviceError if there is no such scene or it is wrong, a
+    line for each problem of its file.
+    """
     bundled = SCENE_FOLDER / f"{name}.yaml"
     path = Path(name).expanduser()
     file = bundled if name in bundled_scenes() else path
@@ -142,7 +143,8 @@ def with_fog(scene: SceneFile, visibility: str) -> SceneFile:
 
 
 def with_board_at(scene: SceneFile, place: BoardPlace) -> SceneFile:
-    """The scene with its board, the first where there are several, held elsewhere. DeviceError where there is none."""
+    """The scene with its board, the first where there are several, held elsewhere. Raises DeviceError if there is none.
+    """
     if not scene.boards:
         raise DeviceError(
             "board_pose moves the board of a scene, this one has none; choose a scene with 'surfaces: board'"
@@ -170,7 +172,7 @@ def load_surfaces(scene: SceneFile, folder: Path, u: Array, v: Array) -> Surface
 
 
 def load_folder(folder: Path, size: tuple[int, int]) -> Surfaces:
-    """Surfaces of a folder for a camera of size (rows, width). DeviceError where it holds no scene of that size.
+    """Surfaces of a folder for a camera of size (rows, width). Raises DeviceError if it holds no scene of that size.
 
     `world.npz` holds `depth_m`, `albedo` and, where some depths were guessed, `trusted`.
     """

@@ -71,7 +71,7 @@ class Surfaces:
 
 
 def checked(name: str, depth_m: object, albedo: object, trusted: object, size: tuple[int, int]) -> Surfaces:
-    """Surfaces from arrays of any float type. DeviceError where one is impossible; size is (rows, width)."""
+    """Surfaces from arrays of any float type. Raises DeviceError if one is impossible; size is (rows, width)."""
     depth, light = np.asarray(depth_m, dtype=np.float32), np.asarray(albedo, dtype=np.float32)
     trust = np.asarray(trusted, dtype=bool)
     for key, array in (("depth_m", depth), ("albedo", light), ("trusted", trust)):

@@ -80,7 +80,7 @@ class EmulatedWorld(SimulatedWorld):
     """One scene and the devices that look at it, plugged in from its creation to `close`."""
 
     def __init__(self, config: EmulatedWorldConfig, surroundings: Surroundings, bus: UsbBus | None = None) -> None:
-        """DeviceError where the geometry or the scene cannot be used.
+        """Raises DeviceError if the geometry or the scene cannot be used.
 
         bus: where the USB devices are plugged in, and who closes it is its maker; by default one within this process.
         """
@@ -119,7 +119,7 @@ class EmulatedWorld(SimulatedWorld):
             self._wires.append(wire)
 
     def close(self) -> None:
-        """Unplug everything and end the threads; again: nothing happens."""
+        """Unplug everything and end the threads; a second call does nothing."""
         for wire in self._wires:
             wire.close()
         self._frames.close()
@@ -246,7 +246,7 @@ class WorldFrames:
         return bits
 
     def close(self) -> None:
-        """End the threads that draw; again: nothing happens."""
+        """End the threads that draw; a second call does nothing."""
         if self._photons is not None:
             self._photons.close()
             self._photons = None

@@ -76,7 +76,7 @@ class Joint:
     def counter(self, layout: SweepLayout, geometry: SweepGeometry) -> Counter:
         """A counter whose sweeps `estimate` takes; geometry: nominal, as of every sweep.
 
-        UsageError where its maps would take too much memory: before any light is let out.
+        Raises UsageError if its maps would take too much memory: before any light is let out.
         """
         grid_of(geometry)
         return SweepCounter(layout, self._workers)

@@ -4,7 +4,7 @@ How far the lessons of the first map believe an answer (`fill_trust`, float32 (r
 
     trust = erf(3 px / (sqrt 2 sd)) / (1 + exp(A - B margin)) / (1 + C z^-D)
 
-This is the confidence of `rig.estimate.joint.confidence` but for z, the stripe's light over its noise, pooled over
+This is the confidence of `rig.estimate.joint.confidence` except for z, the stripe's light over its noise, pooled over
 neighbours, above half of the haze; whether answers around agree does not count, and it asks for the right surface,
 within 3 px. Later lessons go by the table's confidence, for by then the model is known.
 

@@ -66,7 +66,7 @@ def memory_for(grid: LabelGrid) -> Memory:
 
 
 def grid_of(geometry: SweepGeometry) -> LabelGrid:
-    """The labels of a geometry. UsageError where their costs would take too much memory."""
+    """The labels of a geometry. Raises UsageError if their costs would take too much memory."""
     grid = label_grid(geometry)
     rows, columns = grid.x_far.shape
     if (needed := 2 * rows * columns * grid.labels) > MOST_BYTES:

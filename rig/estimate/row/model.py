@@ -69,7 +69,7 @@ class RowModel:
 
     @classmethod
     def from_arrays(cls, arrays: Mapping[str, NDArray[np.generic]]) -> "RowModel":
-        """The state that `arrays` gave, bit for bit. KeyError where one is missing that was always there."""
+        """The state that `arrays` gave, bit for bit. Raises KeyError if one is missing that was always there."""
         kept = {
             field.name: arrays[field.name]
             for field in fields(cls)

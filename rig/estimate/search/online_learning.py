@@ -40,7 +40,8 @@ Tables = TypeVar("Tables")
 
 @dataclass(frozen=True, slots=True, eq=False)
 class LearningSetting:
-    """A model and the kind of sweep that tables are made for. UsageError where it was learned from one of another size.
+    """A model and the kind of sweep that tables are made for. Raises UsageError if it was learned from one of another
+    size.
 
     exposures: of most columns; dark: whether sweeps have dark frames.
     """

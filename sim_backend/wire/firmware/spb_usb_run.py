@@ -117,7 +117,7 @@ class EmulatedRun:
         memory: BlockMemory,
         now_s: float,
     ) -> None:
-        """ValueError where the stride holds no frame."""
+        """Raises ValueError if the stride holds no frame."""
         self.next_frame = 0
         self.pinged_s = now_s
         self.over = False

@@ -190,13 +190,13 @@ class EmulatedPort:
         return self._end
 
     def hang_up(self) -> None:
-        """Act as a port whose cable is pulled; again: nothing happens."""
+        """Act as a port whose cable is pulled; a second call does nothing."""
         if self._far_end >= 0:
             os.close(self._far_end)
             self._far_end = -1
 
     def close(self) -> None:
-        """Give the port back; again: nothing happens."""
+        """Give the port back; a second call does nothing."""
         self._wire.release(self)
         self.hang_up()
         if self._end >= 0:
@@ -232,7 +232,7 @@ class SerialServer(_SerialLine, WireServer[SerialModel]):
         return Endpoint(self.path)
 
     def close(self) -> None:
-        """Unplug it for good; again: nothing happens."""
+        """Unplug it for good; a second call does nothing."""
         super().close()
         self._folder.cleanup()
 

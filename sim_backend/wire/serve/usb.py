@@ -218,7 +218,7 @@ def _named(fields: str, form: str, descriptor: bytes, **more: object) -> SimpleN
 
 
 def _or_timeout(passed: int) -> int:
-    """The bytes that passed within the time. USBTimeoutError where none did."""
+    """The bytes that passed within the time. Raises USBTimeoutError if none did."""
     if passed == 0:
         raise usb.core.USBTimeoutError("Operation timed out", -7, errno.ETIMEDOUT)
     return passed

@@ -174,7 +174,7 @@ class Wire(ABC, Generic[Model]):
         return self
 
     def close(self) -> None:
-        """Unplug it for good; again: nothing happens."""
+        """Unplug it for good; a second call does nothing."""
         self.unplug()
 
     def __enter__(self) -> Self:
@@ -251,7 +251,7 @@ class WireServer(Wire[Model]):
         return self
 
     def close(self) -> None:
-        """Unplug it for good; again: nothing happens."""
+        """Unplug it for good; a second call does nothing."""
         self._ending.set()
         if self._thread.ident is not None:
             self._thread.join()
