@@ -1,8 +1,8 @@
 """Ambient light: on the surfaces, and scattered into the pixel by the medium in front of them.
 
-Surfaces have the radiance rho/pi E exp(-sigma |X|), E the irradiance within the filter's band (Lambert, Beer-Lambert).
-The medium has L_inf (1 - exp(-sigma |X|)) (Koschmieder) with L_inf = (scattering share) E/pi: a thick layer of a medium
-that does not absorb looks like a white surface in the same diffuse light.
+Surfaces have the radiance rho/pi E exp(-sigma |X|), where E is the irradiance within the filter's band (Lambert,
+Beer-Lambert). The medium has L_inf (1 - exp(-sigma |X|)) (Koschmieder) with L_inf = (scattering share) E/pi: a thick
+layer of a medium that does not absorb looks like a white surface in the same diffuse light.
 """
 
 import math
