@@ -73,7 +73,7 @@ class FrameTable:
         return range(first, int(np.searchsorted(self.plain, min(end, self.size), "left")))
 
     def places(self, frame: int) -> tuple[int, int, int, int]:
-        """Where a frame begins and ends, first in the file, then in the plain segment."""
+        """The begin and end of a frame, first in the file, then in the plain segment."""
         return (*self.packed[frame : frame + 2].tolist(), *self.plain[frame : frame + 2].tolist())
 
 

@@ -48,7 +48,7 @@ class ReplayClock:
 
 @dataclass(frozen=True, slots=True)
 class PaceReport:
-    """How late `blocks` blocks were against their own times. held_s: for how long a full ring held up the replay."""
+    """Lateness of `blocks` blocks against their own times. held_s: for how long a full ring held up the replay."""
 
     blocks: int = 0
     late_mean_s: float = 0.0
