@@ -173,7 +173,7 @@ MOST_DEPTH_SD_SHARE = 0.2
 
 
 def check_views(views: Sequence[View], sightings: Sequence[Sighting]) -> None:
-    """Raise Degenerate unless two views show board and line, and the line moved between them."""
+    """Raise Degenerate unless two views show board and line, and the line moved across the board."""
     with_line = [seen for seen in sightings if seen.command.size]
     if len(sightings) == 0:
         raise Degenerate(
@@ -239,7 +239,7 @@ def check_depth(
     misfit: float = 1.0,
     outliers: Sequence[str] = (),
 ) -> None:
-    """Raise Degenerate if the poses determine depth hardly at all, apart from the misfit of contradictory data."""
+    """Raise Degenerate if the poses hardly determine depth, apart from the misfit of contradictory data."""
     camera = model.camera
     x, y = np.meshgrid(np.linspace(0.1, 0.9, 7) * camera.width, np.linspace(0.1, 0.9, 5) * camera.height)
     for at_m in (AT_M, float(np.median([np.linalg.norm(pose.position_m) for pose in poses]))):

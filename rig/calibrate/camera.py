@@ -39,7 +39,9 @@ FEWEST_VIEWS = 3
 def run_camera(
     sources: SourcesLike, request: CameraRequest, *, ask: AskPerson | None = None, tell: TellLine | None = None
 ) -> CalibrationResult:
-    """Calibrate the camera; Degenerate, with notes why, root cause first, where the views make none."""
+    """Calibrate the camera. Raises Degenerate if the views give no calibration, with the root cause and notes on all
+    causes.
+    """
     si_values(request)
     if request.terms not in (0, *TERM_COUNTS):
         known = ", ".join(map(str, TERM_COUNTS))
