@@ -132,8 +132,8 @@ def _fine_share(x, times, turn):  # type: ignore[no-untyped-def]
 def read_counts(counts: NDArray[np.unsignedinteger], halved: int, n: int, lanes: int, turn: int = 0) -> None:
     """Write the counts of a row in pixel order (window,) to address n, divided by 2^halved.
 
-    The rounding is that of `halve_counts` for values up to 8. turn: a number that differs between the columns in which
-    a pixel is read.
+    The rounding is that of `halve_counts` for divisors up to 8. turn: a number that differs between the columns in
+    which a pixel is read.
     """
     for x in range(counts.shape[0]):
         share = _share(x, halved) if halved <= 3 else _fine_share(x, halved, turn)

@@ -70,10 +70,10 @@ def compare_lines(
     mean ones per exposure of each pixel over the sweep, NaN for unusable pixels; least: value used for lower ones.
     orders: (orders, WORD_PX), pixels of each word.
 
-    The outputs are: the light in common with each partner, which is 0 on average for noise, haze and anything that
-    stands still; the excess of LEAST_SHARED of what single pixels have in common with the next row over what their own
-    frames have in common, which is negative because frames of one column show the same line; and the increase of the
-    sum of products of neighbouring pixels when they are taken in each order.
+    The first two outputs are the light in common with each partner, which is 0 on average for noise, haze and anything
+    that stands still. The third is LEAST_SHARED times the light that single pixels have in common with the next row,
+    minus the light that their own frames have in common. It is negative, since frames of one column show the same line.
+    The others are the increase of the sum of products of neighbouring pixels when they are taken in each order.
     """
     window = lines.shape[2]
     line = np.zeros((3, window))
