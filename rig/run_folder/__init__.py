@@ -1,1 +1,3 @@
-"""The folder that a run leaves, which appears whole or not at all: maps, pictures, clouds, manifest and summary."""
+"""The folder with the results of a run: maps, pictures, clouds, manifest and summary. It appears only once it is
+complete.
+"""

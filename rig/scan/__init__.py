@@ -1,5 +1,5 @@
 """A scan from open devices to its folder, and its replay from a recording.
 
-Enters: a rig and a request. Leaves: maps, one after the other, and an account of every frame. `scan` runs it;
-`acquisition` starts and stops the devices, `pipeline` moves blocks between threads, `counting` makes maps of them.
+Input: a rig and a request. Output: maps, one after the other, and an account of every frame. `scan` runs it;
+`acquisition` starts and stops the devices, `pipeline` moves blocks between threads, `counting` makes maps from them.
 """

@@ -1,9 +1,9 @@
-"""Compares what drivers said to their devices in a replay with the recording: the commands, and when each was sent.
+"""Compares what drivers sent to their devices in a replay with the recording: the commands, and when each was sent.
 
-Commands are compared byte by byte. Buffers of points are compared in their time as well: how much later than in the
-recording each was sent, relative to the middle of its scan, since the host chooses when a scan begins. Where a scan was
-stopped depends on the host's timing too: a last buffer that only one of the two had sent is not compared, nor how the
-mirror was parked.
+Commands are compared byte by byte. For buffers of points the time is compared too: how much later than in the recording
+each was sent, relative to the middle of its scan, since the host chooses when a scan begins. The point at which a scan
+was stopped also depends on the host's timing. So a last buffer that only one of the two had sent is not compared, nor
+how the mirror was parked.
 """
 
 import statistics
@@ -26,7 +26,7 @@ _SHOWN = 24
 class ControlCheck:
     """Result of a comparison. worst_swap_s: lateness of the buffer, of `swaps`, that is furthest from its time.
 
-    problems: one line each; empty where the two agree.
+    problems: one line each; empty if the two agree.
     """
 
     commands: int

@@ -1,8 +1,10 @@
-"""Operations across lanes: shuffles, sums along the lanes, masks with a bit for each lane, turned blocks of numbers.
+"""Operations across lanes: shuffles, sums along the lanes, masks with a bit for each lane, transposed blocks of
+numbers.
 
-Reductions (`largest_of_rows`, `totals_of_rows`) take LANES rows at once and give one number a row, which then is one
-lane of the answer: row by row every step would wait for the one before. `fetch_eights` and `spread_eights` take eight
-numbers from each of LANES places and turn them, so that lane i of eight vectors holds those of place i.
+Reductions (`largest_of_rows`, `totals_of_rows`) take LANES rows at once and give one number per row, which becomes one
+lane of the answer. If they went row by row, every step would wait for the one before. `fetch_eights` and
+`spread_eights` take eight numbers from each of LANES places and transpose them, so that lane i of eight vectors holds
+those of place i.
 """
 
 from collections.abc import Callable, Sequence
