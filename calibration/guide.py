@@ -154,7 +154,7 @@ def rough_camera(size: tuple[int, int]) -> Camera:
 def _candidate(
     camera: Camera, board: Board, fill: float, place: tuple[int, int], tilt: tuple[int, int]
 ) -> Candidate | None:
-    """The pose that brings the board to its place and no farther than the border; None where it does not fit."""
+    """The pose that brings the board to its place and no farther than the border; None if it does not fit."""
     rotation = TILT_RAD * np.array([tilt[0], tilt[1], 0.0])
     turn = cv2.Rodrigues(rotation)[0]
     width, height = camera.width - 1, camera.height - 1
@@ -231,7 +231,7 @@ class Forecast:
         return float(np.sqrt(np.median(variance))) if variance.size else math.nan
 
     def _seen(self, pose: BoardPose) -> Sighting | None:
-        """The corners and passages that a board there would give, without errors; None where they are too few."""
+        """The corners and passages that a board there would give, without errors; None if they are too few."""
         model, board = self._fit.model, self._fit.board
         corners_m = board.corners_m
         x, y, found = _inside(model, pose.to_camera(corners_m))

@@ -52,8 +52,9 @@ class Kind:
     config: type[BaseModel]
     create: Callable[[Any, Surroundings], Any]
     check_files: Callable[[Any], object] | None = None
-    """Opens the files that its config names, as `create` does, without the device; `DeviceError` where one cannot be
-    used. None: it names none. A world needs none, it is created."""
+    """Opens the files that its config names, as `create` does, without the device; raises `DeviceError` if one cannot
+    be used. None: it names none. A world needs none, it is created.
+    """
     off: Callable[[Any], bytes] | None = None
     """The bytes that switch off the emission of a laser on a serial port, by its config, whatever it answers: sent
     where there is no time to open it first."""

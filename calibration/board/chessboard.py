@@ -153,7 +153,7 @@ def _seen_beyond(picture: Picture, px: Array) -> float:
 
 
 def _change(picture: Picture, board_map: BoardMap, x: NDArray[np.integer], y: NDArray[np.integer], side: int) -> Array:
-    """Light right of a lattice point less that left of it, above (side 1) or below (-1); NaN outside the picture."""
+    """Light right of a lattice point minus that left of it, above (side 1) or below (-1); NaN outside the picture."""
     along, up = np.meshgrid(np.concatenate([-_OFFSETS[::-1], _OFFSETS]), side * _OFFSETS)
     at = np.stack([x[..., None, None] + along, y[..., None, None] - up], axis=-1)
     px = board_map.to_px(at).astype(np.float32).reshape(-1, 2)
@@ -167,7 +167,7 @@ def _change(picture: Picture, board_map: BoardMap, x: NDArray[np.integer], y: ND
 
 
 def _row_above(picture: Picture, px: Array) -> Array | None:
-    """(across, 2) corners above the uppermost row; None where most of them are not found."""
+    """(across, 2) corners above the uppermost row; None if most of them are not found."""
     board_map, seen = _map(px), _seen(picture, px)
     if board_map is None or seen is None:
         return None

@@ -200,7 +200,7 @@ def _ends_early(board: Board, shown: NDArray[np.uint8], px: Array, places: Place
 
 
 def _seen(shown: NDArray[np.uint8], to_lattice: Array, column: Array, row: float) -> Array | None:
-    """The picture at places of the lattice; None where one lies outside."""
+    """The picture at places of the lattice; None if one lies outside."""
     at = np.stack([column, np.full(column.size, row)], axis=-1)[:, None]
     px = np.round(cv2.perspectiveTransform(at, np.linalg.inv(to_lattice))[:, 0]).astype(int)
     height, width = shown.shape

@@ -118,7 +118,7 @@ def _places(drawing: Drawing, board_map: BoardMap, ids: NDArray[np.int32], reach
 
 
 def _bent(at: Array, drawn: Array) -> Array | None:
-    """The polynomial from picture to drawing; None where a map gone astray squeezes the board into a line."""
+    """The polynomial from picture to drawing; None if a map gone astray squeezes the board into a line."""
     if not np.isfinite(at).all():
         return None
     i, j = np.array(_POWERS).T
@@ -133,7 +133,7 @@ def _bent(at: Array, drawn: Array) -> Array | None:
 def _register_one(
     picture: NDArray[np.float32], drawing: Drawing, place: _Place, search: bool
 ) -> tuple[float, float, float] | None:
-    """(x, y, sd) of one corner in pixels; None where the picture does not show it."""
+    """(x, y, sd) of one corner in pixels; None if the picture does not show it."""
     expected, side, reach, to_drawing = place.expected_px, place.side_px, place.reach, place.to_drawing
     farthest = _SEARCH_SQUARES * side + 1
     at = expected
@@ -190,7 +190,7 @@ def _draw(drawing: Drawing, place: _Place, to_drawing: Array, shift: Array, box:
 def _best_whole_shift(
     picture: NDArray[np.float32], drawing: Drawing, place: _Place, to_drawing: Array, search: int
 ) -> Array | None:
-    """The shift in whole pixels at which picture and drawing correlate best; None where they do not."""
+    """The shift in whole pixels at which picture and drawing correlate best; None if they do not."""
     x, y = (round(float(value)) for value in place.expected_px)
     height, width = picture.shape
     reach = min(place.reach, x, y, width - 1 - x, height - 1 - y)
@@ -207,7 +207,7 @@ def _best_whole_shift(
 
 
 def _shift(seen: Array, patch: _Patch) -> tuple[float, float, float] | None:
-    """(dx, dy, sd) that brings the drawing onto what is seen; None where the drawing is not there."""
+    """(dx, dy, sd) that brings the drawing onto what is seen; None if the drawing is not there."""
     rows, columns = seen.shape
     x, y = np.linspace(-1, 1, columns), np.linspace(-1, 1, rows)[:, None]
     drawn = patch.drawn

@@ -199,7 +199,7 @@ def _leaves(value: Any, key: Key) -> Iterator[tuple[Key, Any]]:
 
 
 def _number_words(annotation: Any) -> str | None:
-    """Words for the number that a field asks for; None where it takes truth values or no numbers."""
+    """Words for the number that a field asks for; None if it takes truth values or no numbers."""
     kinds = set(plain_types(annotation))
     if bool in kinds or not kinds & {int, float}:
         return None

@@ -195,7 +195,7 @@ class LensModel:
 
 
 def _folds(terms: Array) -> tuple[float, list[float]]:
-    """r2 of the first fold of k1 to k6 alone, inf where there is none, and an r2 within each ring that is folded.
+    """r2 of the first fold of k1 to k6 alone, inf if there is none, and an r2 within each ring that is folded.
 
     With g = n / d a ring is folded where n, d or the slope of r g, n d + 2 r2 (n' d - n d'), is not positive. Rings
     narrower than _RING are no lens's.

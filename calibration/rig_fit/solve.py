@@ -285,7 +285,7 @@ def _own_promise(view: ViewNormal) -> float:
 
 
 def _chi2(views: Sequence[ViewNormal], problem: RigProblem, state: RigState) -> float:
-    """Chi2; inf where it or its slopes are no numbers, as where a lens folds within the picture."""
+    """Chi2; inf if it or its slopes are no numbers, as where a lens folds within the picture."""
     if not all(np.isfinite(view.matrix).all() for view in views):
         return np.inf
     total = sum(sum(view.chi2) for view in _counted(views, problem))

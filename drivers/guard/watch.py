@@ -141,7 +141,7 @@ class WatchedProcess:
         self._since = 0.0
         self._found_asleep = False
         self.handle: int | None = None
-        """Handle that is readable once the process has ended; None where the kernel has no pidfd (before Linux 5.3)."""
+        """Handle that is readable once the process has ended; None if the kernel has no pidfd (before Linux 5.3)."""
         if hasattr(os, "pidfd_open"):
             try:
                 self.handle = os.pidfd_open(pid)

@@ -69,7 +69,7 @@ class ScannerStatus:
     fault: str | None
     """The fault in one line; None: there is none."""
     position: float | None
-    """Position of the mirror, normalised drive; None where the device does not say."""
+    """Position of the mirror, normalised drive; None if the device does not say."""
 
 
 class BeamScanner(Device):

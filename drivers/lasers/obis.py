@@ -276,7 +276,7 @@ class ObisLaser(SerialLaser):
         return int(self._line.ask_surely("SYST:STAT?", BITS), 16)
 
     def _fault(self, bits: int, base_c: float | None = None) -> str | None:
-        """The faults that the laser reports, and a base plate outside its range; None where all is well."""
+        """The faults that the laser reports, and a base plate outside its range; None if all is well."""
         said = []
         word = int(self._line.ask_surely("SYST:FAUL?", BITS), 16)
         if word:
@@ -291,7 +291,7 @@ class ObisLaser(SerialLaser):
         return "; ".join(said) or None
 
     def _out_of_range(self, base_c: float) -> TemperatureRange | None:
-        """The range that the base plate is outside of; None where it is inside."""
+        """The range that the base plate is outside of; None if it is inside."""
         allowed = self._base_range
         return None if allowed is None or allowed[0] <= base_c <= allowed[1] else allowed
 

@@ -150,7 +150,7 @@ def read_entry(segment: SegmentReader, entry: Any) -> FrameBlock:
 
 
 def _told(folder: Path, problems: list[str]) -> Entries | None:
-    """Sound index records, sorted by place; None where there is no index."""
+    """Sound index records, sorted by place; None if there is no index."""
     if not folder.is_dir():  # a single file has none
         return None
     try:
@@ -207,7 +207,7 @@ def _fits(records: Entries, segment: SegmentReader) -> bool:
 
 
 def _block_at(segment: SegmentReader, entry: Any, *, check_payload: bool) -> FrameBlock | None:
-    """The block at an entry's place; None where its header is not what the entry says."""
+    """The block at an entry's place; None if its header is not what the entry says."""
     offset, length = int(entry["offset"]), int(entry["length"])
     block = parse_block(segment.at(offset, length), check_payload=check_payload)
     return block if index_of(block, segment.number, offset, length) == entry.tobytes() else None

@@ -178,7 +178,7 @@ class RunRecording:
         return runs
 
     def _header(self, entries: Entries) -> BlockHeader | None:
-        """A header of the size and clock that most of several sound blocks have; None where no block is sound."""
+        """A header of the size and clock that most of several sound blocks have; None if no block is sound."""
         headers: list[BlockHeader] = []
         for at in _spread(len(entries)):
             with suppress(ProtocolError):

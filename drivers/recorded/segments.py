@@ -106,7 +106,7 @@ def zstandard_or_error() -> Any:
 
 
 def _stated_sizes(data: Bytes) -> NDArray[np.int64] | None:
-    """(packed, plain) of each frame as the table says, None where it cannot be."""
+    """(packed, plain) of each frame as the table says, None if it cannot be."""
     if len(data) < _HEAD.size + _FOOT.size:
         return None
     frames, descriptor, magic = _FOOT.unpack(data[-_FOOT.size :].tobytes())

@@ -346,7 +346,7 @@ class ReplaySpad(SpadArray):
         return self._counters
 
     def _not_yet(self, why: str) -> bool:
-        """Raise DeviceTimeout with the reason why nothing was published; False where the run was stopped meanwhile."""
+        """Raise DeviceTimeout with the reason why nothing was published; False if the run was stopped meanwhile."""
         if self.pace.halted:
             return False
         raise DeviceTimeout(f"{self.name}: {why}")

@@ -369,7 +369,7 @@ class HeliosRun:
             self._clock.sleep(POLL_S)
 
     def _wait_until_free(self, stopping: threading.Event | None) -> bool:
-        """True once the pending buffer is free; False where a stop came first."""
+        """True once the pending buffer is free; False if a stop came first."""
         heard_s, full_s = self._now_s(), self._earliest_end_s
         while stopping is None or not stopping.is_set():
             asked_s = self._now_s()

@@ -292,7 +292,7 @@ class LaserCubeRun:
         raise DeviceFault(f"{self._link.name}: the points ran dry; lengthen buffer or unload the host")
 
     def _queued(self) -> int:
-        """Samples not yet played; `DeviceFault` where their number cannot be."""
+        """Samples not yet played; raises `DeviceFault` if their number cannot be."""
         before_s = self._now_s()
         queued = self._link.queued()
         after_s = self._now_s()

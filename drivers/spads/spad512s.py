@@ -345,7 +345,7 @@ class Spad512s(SpadArray):
         return seal_block(memory, self._header(run), layout, payload_crc=False)
 
     def _claim(self, ring: BlockRing, ends_at: float, timeout_s: float) -> NDArray[np.uint8] | None:
-        """A free slot; None where there is none and the ring does not wait."""
+        """A free slot; None if there is none and the ring does not wait."""
         while True:
             memory = ring.claim(min(SLICE_S, max(0.0, ends_at - time.monotonic())))
             if memory is not None or not ring.waits:

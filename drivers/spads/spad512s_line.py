@@ -72,7 +72,7 @@ class Spad512sLine:
     """The line, which is open once `connect` has returned. For use by one thread at a time."""
 
     def __init__(self, name: str, address: str, deadlines: Deadlines, tap: Tap | None = None) -> None:
-        """tap: told of commands and answers, not of pixels."""
+        """tap: notes commands and answers, not of pixels."""
         self.address = address
         self._tap = tap
         self._name = name
@@ -227,7 +227,7 @@ class Spad512sLine:
             self._tap.note("tcp", direction, data)
 
     def _read_text(self, stream: TcpStream, deadline_s: float) -> str:
-        """The text until the line is quiet or says DONE, at most for `deadline_s`; empty where nothing came."""
+        """The text until the line is quiet or says DONE, at most for `deadline_s`; empty if nothing came."""
         ends_at = time.monotonic() + deadline_s
         data = stream.receive(deadline_s)
         while data and not data.endswith(DONE) and time.monotonic() < ends_at:

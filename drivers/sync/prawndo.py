@@ -219,7 +219,7 @@ class PrawnDo(SyncSource):
         self._line.close()
 
     def _identify(self) -> tuple[str, int]:
-        """Firmware, and words that the board holds; ProtocolError where its firmware is too old."""
+        """Firmware, and words that the board holds; raises ProtocolError if its firmware is too old."""
         version = "".join(self._line.transact("ver")).removeprefix("Version: ")
         try:
             numbers = tuple(int(part) for part in version.split(".")[:2])

@@ -53,7 +53,7 @@ class SerialPort:
     """
 
     def __init__(self, name: str, endpoint: Endpoint, tap: Tap | None = None) -> None:
-        """Open the port. name: the device's name in messages. tap: told of all that passes.
+        """Open the port. name: the device's name in messages. tap: notes all that passes.
 
         Addresses: a path or COM port, "serial=ABC" (serial number of the USB device) or "usb=VVVV:PPPP" (hexadecimal
         vendor and product, the only one attached). Raises `DeviceNotFound`, `DevicePermission` or `DeviceBusy`.

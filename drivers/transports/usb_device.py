@@ -121,7 +121,7 @@ class UsbDevice:
     def __init__(self, listing: UsbListing, label: str, alternates: Mapping[int, int], tap: Tap | None = None) -> None:
         """Claim and set `alternates`, {interface: alternate setting}. Use `open_device` to find the listing.
 
-        tap: told of what `write` and `read` pass.
+        tap: notes what `write` and `read` pass.
         """
         self.listing = listing
         self.label = f"{label} at {listing.address}"
@@ -289,7 +289,7 @@ def _listing(device: Any) -> UsbListing:
 
 
 def _string(device: Any, index: int) -> str | None:
-    """A string of the device; None where there is none or it may not be asked."""
+    """A string of the device; None if there is none or it may not be asked."""
     try:
         text = usb.util.get_string(device, index)
     except (usb.core.USBError, ValueError, NotImplementedError):  # ValueError: pyusb's 'no languages', mostly EACCES

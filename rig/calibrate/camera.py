@@ -77,7 +77,7 @@ def run_camera(
 
 
 def _fitted(taken: ViewCollection, board: Board, terms: int) -> CameraFit:
-    """Fit the camera; Degenerate where it would hang on so few views that they cannot contradict each other."""
+    """Fit the camera; raises Degenerate if it would hang on so few views that they cannot contradict each other."""
     fit = fit_camera(taken.views, board, taken.size, distortion_terms=terms)
     if len(fit.kept) < FEWEST_VIEWS:
         raise Degenerate(

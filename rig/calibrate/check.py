@@ -106,7 +106,7 @@ def _require_others(views: Sequence[View], model: RigModel) -> None:
 
 
 def _with_board(taken: ViewCollection, least: int) -> list[View]:
-    """The views that show the board. Degenerate, with the trouble of each view, where they are too few."""
+    """The views that show the board. Raises Degenerate, with the trouble of each view, if they are too few."""
     views = [view for view in taken.views if view.corners is not None]
     if len(views) < least:
         reason = next((why.reason for why in taken.refused.values()), "no-board")

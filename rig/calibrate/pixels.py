@@ -414,7 +414,7 @@ def _sensor(rig: OpenRig) -> str:
 
 
 def _last(against: PathLike | None, config: RigConfig, recorded: Path | None) -> PixelVersion | None:
-    """The older map to compare with; None where there is none. Raises UsageError if a file was named that is no map."""
+    """The older map to compare with; None if there is none. Raises UsageError if a file was named that is no map."""
     if against is not None:
         path = Path(against)
         path = path / PIXELS_FILE if path.is_dir() else path

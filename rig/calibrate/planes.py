@@ -277,7 +277,7 @@ class PoseGuide:
         return advice
 
     def _told(self) -> tuple[RigFit, JudgedRig] | None:
-        """Fit and judge the views so far; None where they make no model yet, or its line misses the distance asked."""
+        """Fit and judge the views so far; None if they make no model yet, or its line misses the distance asked."""
         try:
             fit = self._fitted()
             return fit, self._judged(fit)

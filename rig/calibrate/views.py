@@ -128,7 +128,7 @@ LASTING = (["wrong-board"] * 3, ["mirrored"] * 3)
 
 
 ChoosePose = Callable[[Sequence[View]], Advice | None]
-"""A function that says which pose to show after these views; None where no more are needed."""
+"""A function that says which pose to show after these views; None if no more are needed."""
 
 
 def in_order(poses: Sequence[Advice]) -> ChoosePose:

@@ -51,9 +51,10 @@ LEAST_FOLLOWING: Final = 0.25
 """Least light in common with the other column, over that with the next row: scenes have 0.8 and more, clutter such as
 fences half of it; columns that do not follow one another have none."""
 MOST_AMISS: Final = -0.45
-"""Light in common with the partner columns at the best of all wrong places, less that at the best of those where the
+"""Light in common with the partner columns at the best of all wrong places, minus that at the best of those where the
 planes put it, over that with the next row; the sum over the four partners. Maps have -0.65 in dense fog to -3 in clear
-air; shuffled or reversed columns have -0.4 to 2."""
+air; shuffled or reversed columns have -0.4 to 2.
+"""
 LEAST_LIGHT: Final = 12.0
 """Light in common with the next row, in standard deviations, below which nothing is said of where it moves to."""
 MARGIN: Final = 3.5

@@ -129,6 +129,6 @@ class Reconstructor:
         return self.geometry.bound_to(self._model, commands, sweep.velocity_per_s)
 
     def _fog(self, sweep: FrameTally, stripe: StripeTable) -> FogEstimate:
-        """Fog of the map; nothing where its estimator learns no haze, or without a geometry."""
+        """Fog of the map; nothing if its estimator learns no haze, or without a geometry."""
         state = self.estimator.used
         return FogEstimate() if state is None or self._model is None else read_fog(sweep, stripe, self.geometry, state)

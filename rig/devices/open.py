@@ -145,7 +145,7 @@ def _open(config: RigConfig, seed: int, tap: TapFile | None, stack: ExitStack) -
 
 
 def _create_surroundings(config: RigConfig, seed: int, stack: ExitStack, problems: list[str]) -> Surroundings | None:
-    """Clock and world; None where the world cannot be made, with lines in `problems`."""
+    """Clock and world; None if the world cannot be made, with lines in `problems`."""
     try:
         return surroundings_of(config, seed, stack)
     except DeviceError as error:  # a scene that is not there is the config's fault, not a device's

@@ -89,7 +89,7 @@ def _open(file: Path, *, packed: bool) -> _Cube:
 
 
 def _beside(file: Path) -> Mapping[str, Any]:
-    """The JSON that `rig export` or visionsim wrote beside a cube; empty where there is no such file."""
+    """The JSON that `rig export` or visionsim wrote beside a cube; empty if there is no such file."""
     for sidecar in (file.with_suffix(".json"), file.with_name(TRANSFORMS)):
         try:
             content = parse_json(sidecar.read_text(encoding="utf-8"))

@@ -33,7 +33,7 @@ class SweepGeometry:
     light is bent, those that meet the planes nearly where the true rays meet the light.
     plane: float64 (columns, 3), the plane as p.X = 1 (p = n/d), so that inverse depth is p.(u, v, 1).
     planes: float64 (columns, 4) as (n, d), |n| = 1.
-    x_lo, x_hi: int32 (rows, columns), first and last pixel of the search window; empty where x_lo > x_hi.
+    x_lo, x_hi: int32 (rows, columns), first and last pixel of the search window; empty if x_lo > x_hi.
     x0: int32 (columns,) first stored pixel; window: stored pixels per row, a multiple of 64.
     near_is_left: True if near points lie at smaller x than far ones (scanner on the left).
     depth_range_m: nearest and farthest depth. defects: bool (rows, width), True for pixels that must not be used.
@@ -61,9 +61,7 @@ class SweepGeometry:
         return (self.u, self.v) if self.light is None else (self.light.u, self.light.v)
 
     def bound_to(self, model: RigModel, commands: Float64, velocity_per_s: float) -> "SweepGeometry":
-        """The same windows are kept, with the light of a sweep whose columns were bound to `commands`, at this
-        velocity.
-        """
+        """This geometry with the light of a sweep whose columns were bound to `commands`, at this velocity."""
         planes = model.planes(commands)
         light = None if self.light is None else replace(self.light, commands=commands, velocity_per_s=velocity_per_s)
         return replace(self, planes=planes, plane=planes[:, :3] / planes[:, 3:], light=light)

@@ -232,7 +232,7 @@ def _stretches(numbers: NDArray[np.int64]) -> Iterator[tuple[int, int]]:
 
 
 def _objection(segment: SegmentReader, placed: Placed) -> str | None:
-    """Reason why a block with all its checksums cannot be what was recorded; None where it can."""
+    """Reason why a block with all its checksums cannot be what was recorded; None if it can."""
     end = placed.offset + placed.length
     if not TRAILER.unpack(segment.at(end - TRAILER_BYTES, TRAILER_BYTES).tobytes())[4]:  # no CRC, unless it is 0
         payload = segment.at(placed.offset + HEADER_BYTES, placed.length - HEADER_BYTES - TRAILER_BYTES)
@@ -272,7 +272,7 @@ def lost_ends(
 
 
 def _told_ranges(contents: Contents, runs: Sequence[Run]) -> dict[int, tuple[int, int]]:
-    """First and end frame of each run as the index says; empty where most index records are of something else."""
+    """First and end frame of each run as the index says; empty if most index records are of something else."""
     sound = {block.entry for run in runs for block in run}
     if len(contents.told) == 0 or 2 * sum(entry.tobytes() in sound for entry in contents.told) < len(sound):
         return {}

@@ -314,7 +314,7 @@ def _whole_sweeps(recording: RunRecording, run: RecordedRun, plan: ScanPlan) -> 
 
 
 def _end_block(recording: RunRecording, run: RecordedRun, *, last: bool) -> FrameBlock | None:
-    """The first or the last sound block of a start with a frame in it; None where there is none."""
+    """The first or the last sound block of a start with a frame in it; None if there is none."""
     entries = run.entries[::-1] if last else run.entries
     return next((b for entry in entries if (b := recording.read(run, entry)) is not None and b.n_frames), None)
 
@@ -380,7 +380,9 @@ def _part_learned(folder: Path, estimate: EstimateConfig, model: RigModel | None
 
 
 def _kept(file: Path, make: Callable[[dict[str, NDArray[Any]]], T]) -> T | None:
-    """Make something of the arrays kept of a map; None where there are none. DamagedRecordingError if unreadable."""
+    """Make something of the arrays kept of a map; None if there are none. Raises DamagedRecordingError if they are
+    unreadable.
+    """
     if not file.exists():
         return None
     try:

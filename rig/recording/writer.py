@@ -335,7 +335,7 @@ class Recorder:
                 self._on_failure()
 
     def _next(self) -> FrameBlock | None:
-        """The next block; None where none will come. An error of the source is reported by the counting thread."""
+        """The next block; None if none will come. An error of the source is reported by the counting thread."""
         try:
             return self._reader.next()
         except Exception:

@@ -234,7 +234,7 @@ class SavePolicy:
 
 
 def _renamed(folder: Path, target: Path) -> bool:
-    """Move a folder; False where something is at `target` already."""
+    """Move a folder; False if something is at `target` already."""
     try:
         folder.rename(target)
     except OSError:

@@ -70,7 +70,7 @@ def check_control(recorded: Path, now: Path, *, devices: Sequence[str], toleranc
 
 
 def _first_difference(device: str, what: str, said: list[Passed], says: list[Passed], *, tail: int) -> str | None:
-    """The first byte that differs, in words; None where none does."""
+    """The first byte that differs, in words; None if none does."""
     for number, (old, new) in enumerate(zip(said, says, strict=False)):
         if old.data != new.data:
             pairs = enumerate(zip(old.data, new.data, strict=False))

@@ -210,7 +210,7 @@ class SceneLimits:
 
 
 def _beside(row: TradeoffRow, limit: StatisticalLimit) -> TradeoffRow:
-    """Add the limit to a row; each figure is None where it is not known or would mislead."""
+    """Add the limit to a row; each figure is None if it is not known or would mislead."""
     wrong, least_wrong = 1.0 - row.within_1px, 1.0 - limit.within_1px
     bound_px, sd_px = limit.position_sd_px, row.local_sd_px
     local = LOCAL_SDS * bound_px <= LOCAL_PX

@@ -31,7 +31,7 @@ def airlight(setting: Setting) -> Array:
 
 
 def _path_m(setting: Setting) -> Array:
-    """Distance of each pixel's surface from the camera, infinity where there is none."""
+    """Distance of each pixel's surface from the camera, infinity if there is none."""
     view = setting.view
     with np.errstate(divide="ignore"):
         return np.asarray(np.sqrt(np.nan_to_num(view.u) ** 2 + np.nan_to_num(view.v) ** 2 + 1) / view.surface)

@@ -17,7 +17,7 @@ from sim_backend.effects.setting import Array, Setting
 from sim_backend.light.optics import Sensor
 
 _BODY_SD = 0.12
-"""Sd of ln(rate) of the ordinary pixels: the measured spread less that of the counting."""
+"""Sd of ln(rate) of the ordinary pixels: the measured spread minus that of the counting."""
 _TAIL_SHARE, _TAIL_AT = 0.01, 10.0
 _TAIL_START = 2.0
 _TAIL_POWER = math.log10(5)

@@ -122,7 +122,7 @@ def _add_lines(
 ) -> None:
     """Add the stripe, or, where light is turned, its blurred copy. light: scale, extinction, turns per m, their angle.
 
-    width: as of `line_width`.
+    width: as in `line_width`.
     """
     inverse, offset_m, x_stripe, _, _, _ = sheet
     scale, extinction_per_m, turned_per_m, angle_px = light

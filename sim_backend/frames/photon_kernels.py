@@ -179,7 +179,7 @@ def draw_frames(
 def _draw_anew(
     key: Key, levels: Levels, light: Light, first_frame: int, rows: Rows, first_word: Places, words: Words
 ) -> None:
-    """Draw the pixels that chance chooses anew; arguments as of `draw_frames`."""
+    """Draw the pixels that chance chooses anew; arguments as in `draw_frames`."""
     (stored, _), (first_row, last_row) = levels, rows
     steady, rate, exposure_s, power_w = light
     width, row_px = steady.shape[1], stored.shape[1] * WORD_PX

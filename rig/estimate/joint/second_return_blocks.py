@@ -2,7 +2,7 @@
 
 A block is BLOCK x BLOCK lines (rows of columns). Lines are added pixel by pixel of distance from the far end, without
 the pixels near their stripes. Both the ones counted and those expected from haze and ambient light are added. With K
-frames of a line, q the probability that ambient light gives a pixel no one and c that haze gives none,
+frames of a line, q the probability that ambient light leaves a pixel without a count and c that haze does,
 
     ones expected = sum over lines K (1 - q c) = sum over columns K (number of lines - c sum q)
 

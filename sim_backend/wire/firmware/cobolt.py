@@ -199,7 +199,7 @@ class CoboltModel:
         return "OK" if self._act(name, now_s) or self._set(name, value) else ILLEGAL
 
     def _query(self, command: str) -> str | None:
-        """The answer to a question; None where the laser does not know it."""
+        """The answer to a question; None if the laser does not know it."""
         answers = {
             "?": "OK",
             "sn?": self.serial,

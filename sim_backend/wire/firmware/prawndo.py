@@ -348,7 +348,7 @@ def _said(*lines: str) -> bytes:
 
 
 def _numbers(line: str, base: int, count: int) -> tuple[int, ...] | None:
-    """The arguments of a command; None where fewer than `count` can be read."""
+    """The arguments of a command; None if fewer than `count` can be read."""
     try:
         numbers = tuple(int(text, base) for text in line.split()[1 : count + 1])
     except ValueError:
