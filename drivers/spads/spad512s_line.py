@@ -72,7 +72,7 @@ class Spad512sLine:
     """The line, which is open once `connect` has returned. For use by one thread at a time."""
 
     def __init__(self, name: str, address: str, deadlines: Deadlines, tap: Tap | None = None) -> None:
-        """tap: notes commands and answers, not of pixels."""
+        """tap: notes commands and answers, but not pixels."""
         self.address = address
         self._tap = tap
         self._name = name
