@@ -51,4 +51,4 @@ class DivergedError(RigError):
 
 
 class DamagedRecordingError(RigError):
-    """Raised when the files of a recording are damaged. Nothing is made of them before 'rig repair'."""
+    """Raised when the files of a recording are damaged. They cannot be used before 'rig repair' has been run."""

@@ -5,7 +5,8 @@ which is black. The inner corners are numbered row by row, as in cv2.aruco.Charu
 printed, with lengths as text with a unit.
 
 A chessboard can look the same in more than one orientation. Its mirror image differs only if the numbers of squares
-along both sides are even and not equal. It can be told from itself upside down only if exactly one of them is even.
+along both sides are even and not equal. Turned by 180 degrees it differs only if exactly one of the two numbers is
+even.
 """
 
 import os

@@ -1,11 +1,11 @@
 """The passages of a sweep: when the laser line passed over each pixel, from the counts of the columns.
 
-This is done for many pixels, spread evenly over the picture. First the column is found at which the line stands out
-most from both sides (sums over columns, and their peak), then the maximum likelihood from the columns around it
-(`calibration.passages.fit`). Pixels without information are left out. The sd of a passage tells how far it can be
-trusted; within a flat top, where all frames are lit, it is large. The line must be visible in two columns or more. At
-columns wider than 2 pixels most pixels give nothing, so calibrate with many columns of few exposures rather than few
-columns of many.
+This is done for many pixels, spread evenly over the picture. The first step finds the column at which the line stands
+out most from both sides (sums over columns, and their peak). The second fits the passage by maximum likelihood to the
+columns around it (`calibration.passages.fit`). Pixels without information are left out. The sd of a passage says how
+far it can be trusted; within a flat top, where all frames are lit, it is large. The line must be visible in two columns
+or more. If columns are wider than 2 pixels, most pixels give no passage, so calibrate with many columns of few
+exposures rather than few columns of many.
 
 10 000 pixels of 500 columns take about 0.5 s.
 """

@@ -52,7 +52,7 @@ class Device(ABC):
 
     @property
     def identity(self) -> str:
-        """The device's name and what tells it from others of its kind: model, serial number, firmware."""
+        """The device's name and what distinguishes it from others of its kind: model, serial number, firmware."""
         return self._name
 
     @property

@@ -1,8 +1,9 @@
 """Commands and answers of a PrawnDO on its serial line, and how its outputs are taken low whatever is under way.
 
-The firmware frames nothing (docs/reference/hardware.md). So every command is sent between two lines of nonsense, new
-each time, which the firmware repeats in its complaint. This tells an answer from one that is late, repeated or missing.
-Answers that decide about light are asked for twice. Taking the outputs low overtakes all other commands.
+The firmware does not mark where an answer begins or ends (docs/reference/hardware.md). So every command is sent between
+two lines of nonsense, new each time, which the firmware repeats in its complaint. In this way an answer that is late,
+repeated or missing is recognised. Answers on which light depends are asked for twice. Taking the outputs low overtakes
+all other commands.
 """
 
 import logging

@@ -2,7 +2,7 @@
 
 `planes_report`, `camera_report`, `check_report`, `sync_report` and `pixel_page` make them from `page` and its tables,
 pictures and charts; nothing is loaded from elsewhere. Numbers have units and only the digits that are known. `subject`
-says what a report is about, so that printed reports can be told apart.
+says what a report is about, so that printed reports are not confused.
 """
 
 import base64

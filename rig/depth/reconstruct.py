@@ -28,8 +28,8 @@ from rig.threads import RowWorkers
 class MapResult:
     """One reconstructed map: stripe table, depth_m (rows, width) float32 with NaN, intensity (rows, width) uint32.
 
-    learned: the state that the estimator used, None if it learns nothing. doubts: sentences on what its own light says
-    against it (`rig.count.map_checks`).
+    learned: the state that the estimator used, None if it learns nothing. doubts: sentences on why the map may be
+    wrong, judged by its own light (`rig.count.map_checks`).
     """
 
     stripe: StripeTable

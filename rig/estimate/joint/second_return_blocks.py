@@ -92,10 +92,11 @@ def sum_lines(
     table: LineTable, inner: tuple[np.float32, np.float32, np.float32, np.float32], as_bytes: bool, clear: int,
     pixels: int, to_ones: int, to_expected: int,
 ) -> None:  # fmt: skip
-    """Compute the sums of a block.
+    """Write the sums of a block to the addresses to_ones and to_expected.
 
-    inner: first and last pixel between which all lines are left of their stripes, and the same for right of them;
-    as_bytes: whether counts are bytes, else float32. clear: address.
+    inner: first and last pixel between which all lines are left of their stripes, and the same for right of them.
+    as_bytes: whether counts are bytes, else float32. clear: address of the probabilities that haze leaves a pixel
+    without a count, left and right of the stripe.
     """
     none, order, one = zero_float32(), load_float32(table.order, 0), zero_float32() + np.float32(1.0)
     for v in range(0, pixels, LANES):
