@@ -1,9 +1,9 @@
 """The rig model and its mathematics: camera, light planes, triangulation, and the calibration file.
 
-Pure functions on arrays. This package imports nothing else of the project. Its parts, each knowing only those before
-it: `model` and `depth_error` are the rig and what errors are worth, `files` what is written; `board`, `pixel_map`,
-`passages` and `sync` go from frames to numbers; `camera_fit`, `rig_fit`, `check` and `guide` from those to a model and
-to more views; `diagnosis` says whether it will do.
+Pure functions on arrays. This package imports nothing else of the project. Each of its parts uses only those named
+before it. `model` and `depth_error` hold the rig and the effect of errors on depth; `files` reads and writes it;
+`board`, `pixel_map`, `passages` and `sync` turn frames into numbers; `camera_fit`, `rig_fit`, `check` and `guide` turn
+these into a model and advice on further views; `diagnosis` judges the result.
 """
 
 from calibration.errors import CalibrationError

@@ -1,4 +1,4 @@
-"""Types of arrays that stand in signatures all over the package, and the fields of frozen classes that hold some."""
+"""Array types used in signatures all over the package, and a helper for frozen classes that hold arrays."""
 
 from typing import Any
 
@@ -10,7 +10,7 @@ Mask = NDArray[np.bool_]
 
 
 def set_frozen(owner: object, **values: Any) -> None:
-    """Set fields of a frozen dataclass while it is made; arrays are read-only from then on."""
+    """Set fields of a frozen dataclass during its creation. Arrays become read-only."""
     for name, value in values.items():
         if isinstance(value, np.ndarray):
             value.flags.writeable = False

@@ -1,13 +1,12 @@
-"""The camera from corners of a board at several poses: OpenCV's calibration, made robust and told how well it knows.
+"""The camera from corners of a board at several poses: OpenCV's calibration, made robust and with an uncertainty.
 
-Three kinds of corners are left out and named: a view that does not fit the others (the board moved, its corners in
-another order), single corners that do not fit their view, and a view whose board is seen from behind, which is a mirror
-image. The fit is that of cv2.calibrateCamera on what is left. The covariance is s^2 (J^T J)^-1 with the poses free and
-s^2 the residuals' variance, so it counts what the lens model misses as noise.
+Three kinds of corners are left out and named: a view that does not fit the others (because the board moved or its
+corners are in another order), single corners that do not fit their view, and a view whose board is seen from behind,
+which is a mirror image. The fit to the others is that of cv2.calibrateCamera. The covariance is s^2 (J^T J)^-1 with the
+poses free and s^2 the residuals' variance, so it counts errors of the lens model as noise.
 
-Whether the corners determine a camera is decided by the normal equations, poses left free: their condition number and
-the sd they give the focal length. How far the boards are turned against each other only chooses the word for the
-refusal.
+The normal equations, with free poses, decide whether the corners determine a camera: by their condition number and by
+the sd of the focal length. The angles between the boards only decide how a refusal is worded.
 """
 
 from collections.abc import Sequence
@@ -31,14 +30,16 @@ _POSE = 6
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Normal:
-    """matrix: (p, p) float64, J^T J of the camera's parameters with every pose free; pixels and natural units."""
+    """Normal equations. matrix: (p, p) float64, J^T J of the camera's parameters with all poses free; pixels and
+    natural units.
+    """
 
     names: tuple[str, ...]
     matrix: Array
 
     @property
     def condition(self) -> float:
-        """Condition number of the matrix scaled to a unit diagonal; inf if singular."""
+        """Condition number of the matrix scaled to a unit diagonal; inf if it is singular."""
         scale = np.sqrt(np.diag(self.matrix))
         if not np.all(np.isfinite(scale)) or not np.all(scale > 0):
             return float("inf")
@@ -46,11 +47,13 @@ class Normal:
         return float(eigen[-1] / eigen[0]) if eigen[0] > 0 else float("inf")
 
     def first(self, count: int) -> "Normal":
-        """The normal equations of the first parameters alone, the others taken as known."""
+        """The normal equations of the first `count` parameters alone, with the others taken as known."""
         return Normal(self.names[:count], self.matrix[:count, :count])
 
     def covariance(self, variance_px2: float) -> Covariance:
-        """The covariance for corners of this variance. CalibrationError or LinAlgError where the matrix is singular."""
+        """The covariance if corners have this variance. Raises CalibrationError or LinAlgError if the matrix is
+        singular.
+        """
         scale = np.sqrt(np.diag(self.matrix))
         inverse = np.linalg.inv(self.matrix / np.outer(scale, scale)) / np.outer(scale, scale)
         return Covariance(self.names, variance_px2 * (inverse + inverse.T) / 2)
@@ -96,7 +99,7 @@ _FLAGS = {
 
 @dataclass(frozen=True, slots=True, eq=False)
 class CameraSolution:
-    """A camera, and of every view the pose and the residuals (n, 2), projected less seen."""
+    """A camera, and for every view the pose and the residuals (n, 2), projected minus seen."""
 
     matrix: Array
     """(3, 3) camera matrix, pixels."""
@@ -116,11 +119,11 @@ class CameraProblem:
     corners: Sequence[Corners]
 
     def points_m(self, view: int) -> Array:
-        """(n, 3) float64 of the view's corners on the board."""
+        """(n, 3) float64, the view's corners on the board."""
         return self.board.corners_m[self.corners[view].ids]
 
     def check(self, used: Sequence[Mask]) -> None:
-        """Raise Degenerate where there is one pose only."""
+        """Raise Degenerate if there is only one pose."""
         kept = [i for i, mask in enumerate(used) if mask.any()]
         matrix = self._guess(_GUESSED_FOCAL[0])
         poses = [self._pose(i, matrix, np.zeros(5)) for i in range(len(used))]
@@ -135,7 +138,7 @@ class CameraProblem:
         )
 
     def solve(self, used: Sequence[Mask]) -> CameraSolution:
-        """The least squares camera of the corners used, and the poses of all views. Raises Degenerate."""
+        """The least squares camera from the corners used, and the poses of all views. May raise Degenerate."""
         kept = [i for i, mask in enumerate(used) if mask.any()]
         points = [self.points_m(i)[used[i]].astype(np.float32) for i in kept]
         px = [self.corners[i].px[used[i]].astype(np.float32) for i in kept]
@@ -152,7 +155,9 @@ class CameraProblem:
         return CameraSolution(matrix, distortion, poses, residual)
 
     def judged(self, solution: CameraSolution, used: Sequence[Mask]) -> tuple[float, Normal]:
-        """(variance of a corner's coordinate in px^2, normal matrix); Degenerate where they determine no camera."""
+        """(variance of a corner's coordinate in px^2, normal matrix). Raises Degenerate if the corners determine no
+        camera.
+        """
         normal = self._normal(used, solution)
         off = np.concatenate([r[mask] for r, mask in zip(solution.residual_px, used, strict=True)])
         free = off.size - 6 * sum(bool(mask.any()) for mask in used) - len(normal.names)
@@ -240,7 +245,7 @@ class CameraProblem:
 
 
 def rms(residual_px: Array) -> float:
-    """Root of the mean of dx^2 + dy^2, the rms distance as OpenCV counts it."""
+    """Root of the mean of dx^2 + dy^2, which is the rms distance as OpenCV counts it."""
     return float(np.sqrt(np.mean(np.sum(residual_px**2, axis=-1)))) if len(residual_px) else float("nan")
 
 
@@ -261,11 +266,11 @@ _MAX_ROUNDS = 20
 
 @dataclass(frozen=True, slots=True, eq=False)
 class CameraFit:
-    """A camera and what it was made from. Sequences run over the views that have corners, named in `views`.
+    """A camera and the data it was fitted to. Sequences run over the views with corners, whose names are in `views`.
 
-    residual_px: (n, 2) float64 projected less seen, of every corner. used: (n,) bool, those in the fit. rms_px: of
-    those, of the distance. outliers: names of the views that do not fit, wholly or in more than one corner. condition:
-    of the normal equations at unit diagonal. spread_rad: largest angle between the boards that are in the fit.
+    residual_px: (n, 2) float64, projected minus seen, of every corner. used: (n,) bool, corners in the fit. rms_px: rms
+    distance of those. outliers: names of the views that do not fit, entirely or in more than one corner. condition:
+    condition number of the normal equations at unit diagonal. spread_rad: largest angle between the boards in the fit.
     """
 
     camera: Camera
@@ -281,31 +286,31 @@ class CameraFit:
 
     @property
     def kept(self) -> tuple[str, ...]:
-        """Names of the views that are in the fit, if only with a part of their corners."""
+        """Names of the views in the fit, even if only a part of their corners is."""
         return tuple(name for name, mask in zip(self.views, self.used, strict=True) if mask.any())
 
     @property
     def dropped(self) -> tuple[str, ...]:
-        """Names of the views of which no corner is in the fit."""
+        """Names of the views without any corner in the fit."""
         return tuple(name for name, mask in zip(self.views, self.used, strict=True) if not mask.any())
 
     @property
     def sd(self) -> dict[str, float]:
-        """Standard deviation of every parameter, by name: fx fy cx cy in pixels, the distortion's in its own units."""
+        """Standard deviation of every parameter by name: fx fy cx cy in pixels, the distortion's in its own units."""
         spread = np.sqrt(np.diag(self.covariance.matrix))
         return dict(zip(self.covariance.names, spread.tolist(), strict=True))
 
     @property
     def view_rms_px(self) -> Array:
-        """(views,) float64 of all corners of each view, those left out too."""
+        """(views,) float64, rms distance of all corners of each view, including those left out."""
         return np.array([rms(residual) for residual in self.residual_px])
 
 
 def fit_camera(views: Sequence[View], board: Board, size: tuple[int, int], *, distortion_terms: int = 5) -> CameraFit:
-    """The camera of pictures of `size` (width, height) from the corners in `views`.
+    """The camera for pictures of `size` (width, height), from the corners in `views`.
 
-    distortion_terms: 0, 4, 5, 8, 12 or 14, OpenCV's. What does not fit is left out.
-    Raises Degenerate: no-board, mirrored, one-pose, coplanar, too-few-poses; the message has the condition number.
+    distortion_terms: 0, 4, 5, 8, 12 or 14, as in OpenCV. Corners that do not fit are left out. Raises Degenerate with
+    no-board, mirrored, one-pose, coplanar or too-few-poses; the message gives the condition number.
     """
     seen = [(view, view.corners) for view in views if view.corners is not None]
     seen = [

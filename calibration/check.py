@@ -1,10 +1,10 @@
-"""A calibration judged by boards that it was not made with: are they flat, as large and at the angle that they are?
+"""A calibration judged by boards that were not used for it: do they come out flat, and of the right size and angle?
 
 A board at an unknown pose is scanned. The scanned points of each of its squares are averaged; the deviations of these
-averages from their best plane are the flatness error. The board's corners, put on that plane along their rays, are as
-far apart as the board says or not: the scale error. Two boards give the error of the angle between them. What the
-model's covariance and the scan's noise let expect of each stands beside it. With m the deviations (cells,), C their
-expected covariance and P what takes a plane off,
+averages from their best plane are the flatness error. The board's corners are put on that plane along their rays, and
+the ratio of their distances to those of the board is the scale error. Two boards give the error of the angle between
+them. Each result comes with the error expected from the model's covariance and the scan's noise. With m the deviations
+(cells,), C their expected covariance and P the projection that removes a plane,
 
     chi2 = (P m)' (P C P)^+ (P m)    with cells - 3 degrees of freedom.
 """
@@ -30,7 +30,7 @@ _FEWEST_IN_CELL = 5
 
 @dataclass(frozen=True, slots=True, eq=False)
 class BoardCells:
-    """A board's squares as the sweeps passed them: mean pixel and mean command of each square and sweep."""
+    """A board's squares as the sweeps crossed them: mean pixel and mean command of each square and sweep."""
 
     board_xy_m: Array  # (cells, 2)
     x_px: Array  # (sweeps, cells)
@@ -42,7 +42,7 @@ class BoardCells:
 
 
 def cells_of(model: RigModel, view: View, board: Board) -> BoardCells:
-    """Means over the squares that every sweep passed often enough."""
+    """Means over the squares with enough passages in every sweep."""
     if not view.passages:
         raise Degenerate("no-board", f"view {view.name} has no passages of the line; scan the board with the laser on")
     shape = (board.squares[1], board.squares[0])
@@ -83,7 +83,9 @@ def _points_of(model: RigModel, cells: BoardCells) -> Array:
 
 
 def noise_m2(model: RigModel, cells: BoardCells, normal: Array) -> float:
-    """Variance of a square's mean along the board's normal: from how far the sweeps differ, else as passages state."""
+    """Variance of a square's mean along the board's normal, from the differences between sweeps or else from the
+    passages' sd.
+    """
     found = _triangulated(model, cells.x_px, cells.y_px, cells.command, cells.velocity_per_s) @ normal
     sweeps = len(found)
     if sweeps > 1:
@@ -115,7 +117,7 @@ def _on_board(model: RigModel, view: View, board: Board, x_px: Array, y_px: Arra
 
 
 def corner_pixels(view: View) -> Array:
-    """(n, 2) the view's corners. Degenerate where they are too few to say where the board is."""
+    """(n, 2) the view's corners. Raises Degenerate if they are too few to locate the board."""
     if view.corners is None or len(view.corners.ids) < FEWEST_CORNERS:
         found = 0 if view.corners is None else len(view.corners.ids)
         raise Degenerate(
@@ -132,7 +134,7 @@ def _scanned_points(model: RigModel, passages: Passages) -> Array:
 
 
 def off_plane(xy: Array) -> Array:
-    """(cells, cells - 3) orthonormal basis of what is no plane."""
+    """(cells, cells - 3) orthonormal basis of all deviations that are no plane."""
     full = np.linalg.qr(np.column_stack([np.ones(len(xy)), xy]), mode="complete")[0]
     return full[:, 3:]
 
@@ -145,10 +147,11 @@ _PARALLEL = 1e-6
 class CheckedBoard:
     """The result of the scan of one board; lengths in metres.
 
-    distance_m: depth of its middle. flatness_rms_m, flatness_peak_m: of its squares' means off their plane; expected_m:
-    the rms that covariance and noise let expect. chi2, freedom: of the deviations. scale: size scanned over size
-    stated; scale_sd: its expected sd. cells_m: (squares down, across) deviations, NaN where a square was not scanned.
-    point_rms_m: of single passages off the plane.
+    distance_m: depth of its middle. flatness_rms_m, flatness_peak_m: deviations of its squares' means from their plane;
+    expected_m: the rms expected from covariance and noise. chi2, freedom: of the deviations. scale: scanned size over
+    stated size; scale_sd: its expected sd. cells_m: (squares down, across) deviations, NaN where a square was not
+    scanned.
+    point_rms_m: rms deviation of single passages from the plane.
     """
 
     name: str
@@ -166,7 +169,7 @@ class CheckedBoard:
 
 @dataclass(frozen=True, slots=True)
 class CheckedAngle:
-    """Angle between two boards as scanned, its sd as expected; rad."""
+    """Scanned angle between two boards and its expected sd, in rad."""
 
     angle_rad: float
     sd_rad: float
@@ -200,7 +203,7 @@ def _tilt_noise(model: RigModel, cells: BoardCells, other: BoardCells) -> float:
 
 
 def check_board(model: RigModel, view: View, board: Board) -> CheckedBoard:
-    """Check a view's board. Raises Degenerate where it or its passages are not there."""
+    """Check a view's board. Raises Degenerate if the board or its passages are missing."""
     cells = cells_of(model, view, board)
     points = _points_of(model, cells)
     corners = corner_pixels(view)

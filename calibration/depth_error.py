@@ -1,14 +1,14 @@
-"""The error of depth that a calibration leaves: by pixel, from its covariance to first order, and by which parameters.
+"""The depth error that a calibration leaves: by pixel, from its covariance to first order, and by groups of parameters.
 
     var z = J C J',    J = dz / d(parameters) of the pixel's ray on the light sheet of its mirror command.
 
-A group's part of it is the variance that would go if the parameters of that group were known exactly,
-J C_.g C_gg^-1 C_g. J': 0 at the least, all at the most, and the group's own variance where it is correlated with no
-other. Groups that are correlated share what they have in common, so parts may add up to more than the whole.
+The part of a group is the variance that would vanish if the parameters of that group were known exactly,
+J C_.g C_gg^-1 C_g. J'. It lies between 0 and the total, and is the group's own variance if the group is correlated with
+no other. Correlated groups share a part, so parts may add up to more than the total.
 
-Further: the covariance of any other number that follows from a model (`propagated`); what an error of the mirror's
-command or of the stripe's place is worth in depth (`sensitivity`); and, where a simulation knows the true model, by how
-much another one gets depths wrong (`depth_errors`).
+There is also the covariance of any other number that follows from a model (`propagated`), the effect on depth of an
+error in the mirror's command or in the stripe's position (`sensitivity`), and, if a simulation knows the true model,
+the depth errors of another model (`depth_errors`).
 """
 
 from collections.abc import Callable, Mapping
@@ -30,7 +30,7 @@ _STEP = 1e-6
 
 
 def propagated(model: RigModel, measure: Callable[[RigModel], Array]) -> tuple[Array, Array]:
-    """measure(model) (n,) and its covariance (n, n), to first order; of zeros for a model without a covariance."""
+    """measure(model) (n,) and its covariance (n, n) to first order, which is zero for a model without a covariance."""
     values = np.atleast_1d(measure(model)).astype(np.float64)
     if model.covariance is None:
         return values, np.zeros((values.size, values.size))
@@ -40,7 +40,7 @@ def propagated(model: RigModel, measure: Callable[[RigModel], Array]) -> tuple[A
 
 
 def by_parameter(model: RigModel, names: tuple[str, ...], measure: Callable[[RigModel], Array]) -> Array:
-    """(n, p): how measure(model) (n,) changes with the parameters `names`, by differences."""
+    """(n, p) derivatives of measure(model) (n,) by the parameters `names`, from differences."""
     slopes = np.empty((measure(model).size, len(names)))
     for i, name in enumerate(names):
         step = _STEPS.get(name, _STEP)
@@ -71,7 +71,7 @@ _INDEPENDENT = 1e-12
 
 
 def group_of(parameter: str) -> str:
-    """The group that a parameter counts to."""
+    """The group that a parameter belongs to."""
     if parameter in MATRIX or parameter in DISTORTION:
         return "camera"
     if parameter in TIMES:
@@ -84,7 +84,7 @@ class DepthUncertainty:
     """Standard deviation of the depth at one depth, over the picture.
 
     x_px (columns,), y_px (rows,): the pixels. sd_m: (rows, columns), NaN where no mirror command of the model lights
-    the pixel at this depth. part_m: by group, the square root of its part of the variance, the same shape.
+    the pixel at this depth. part_m: for each group, the square root of its part of the variance, of the same shape.
     """
 
     depth_m: float
@@ -94,7 +94,9 @@ class DepthUncertainty:
     part_m: Mapping[str, Array]
 
     def line(self) -> str:
-        """One line, 'at 5 m: 8 mm, 6 of them from the baseline': medians over the picture, and the largest part."""
+        """One line such as 'at 5 m: 8 mm, 6 of them from the baseline', with medians over the picture and the largest
+        part.
+        """
         at = f"at {self.depth_m:g} m"
         if not np.isfinite(self.sd_m).any():
             return f"{at}: not lit"
@@ -106,10 +108,10 @@ class DepthUncertainty:
 
 
 def depth_uncertainty(model: RigModel, depth_m: float, velocity_per_s: float | None = None) -> DepthUncertainty:
-    """The uncertainty of a depth over the picture.
+    """The uncertainty at a given depth over the picture.
 
-    velocity_per_s: of the command, signed, by which the lag counts; None: the fastest rise that the lag was measured
-    at, 0 where it was not. Raises CalibrationError for a model without covariance.
+    velocity_per_s: signed velocity of the command, which multiplies the lag. None: the fastest rise at which the lag
+    was measured, or 0 if it was not. Raises CalibrationError for a model without covariance.
     """
     covariance = _covariance(model)
     if velocity_per_s is None:
@@ -128,12 +130,15 @@ def depth_uncertainty(model: RigModel, depth_m: float, velocity_per_s: float | N
 def depth_sd_m(
     model: RigModel, x_px: ArrayLike, y_px: ArrayLike, command: ArrayLike, velocity_per_s: float = 0.0
 ) -> Array:
-    """Sd (m) of the depth at raw pixels for a mirror at `command`, NaN: none. CalibrationError: no covariance."""
+    """Sd (m) of the depth at raw pixels for a mirror at `command`; NaN where there is no depth.
+
+    Raises CalibrationError for a model without covariance.
+    """
     return np.sqrt(_variance(depth_jacobian(model, x_px, y_px, command, velocity_per_s), _covariance(model)))
 
 
 def command_at(model: RigModel, x_px: ArrayLike, y_px: ArrayLike, depth_m: ArrayLike) -> Array:
-    """Mirror command at which the light meets raw pixels at a depth; NaN where it does not within the range."""
+    """Mirror command at which the light reaches raw pixels at a depth; NaN if that is outside the command range."""
     z = np.asarray(depth_m, np.float64)
     u, v = model.camera.tangents_at(x_px, y_px)
     points = np.stack(np.broadcast_arrays(u * z, v * z, z), axis=-1)
@@ -163,10 +168,10 @@ def command_at(model: RigModel, x_px: ArrayLike, y_px: ArrayLike, depth_m: Array
 def depth_jacobian(
     model: RigModel, x_px: ArrayLike, y_px: ArrayLike, command: ArrayLike, velocity_per_s: float = 0.0
 ) -> Array:
-    """dz (m) at raw pixels and mirror commands (broadcast) by the parameters of the covariance: (..., p).
+    """Derivatives of z (m) at raw pixels and mirror commands (broadcast) by the parameters of the covariance: (..., p).
 
-    The mirror stands at `command` for the model as it is; by the lag and the row delay it would stand elsewhere. NaN
-    where there is no depth. Raises CalibrationError for a model without covariance.
+    The mirror stands at `command` in the unchanged model; a change of the lag or the row delay moves it. NaN where
+    there is no depth. Raises CalibrationError for a model without covariance.
     """
     names = _covariance(model).names
     x, y, at = np.broadcast_arrays(*(np.asarray(a, np.float64) for a in (x_px, y_px, command)))
@@ -189,7 +194,7 @@ def depth_jacobian(
 
 
 def explained(jacobian: Array, covariance: Covariance, names: list[str]) -> Array:
-    """Variance (...) that would go if the parameters `names` were known exactly. jacobian: (..., p)."""
+    """Variance (...) that would vanish if the parameters `names` were known exactly. jacobian: (..., p)."""
     if not names:
         return np.zeros(jacobian.shape[:-1])
     at = [covariance.names.index(name) for name in names]
@@ -224,14 +229,18 @@ _DISTANCES_M: Final = np.geomspace(0.05, 100.0, 60)
 
 @dataclass(frozen=True, slots=True)
 class Sensitivity:
-    """Depth by command (m per command unit) and by the stripe's place (m per pixel), medians where the line reaches."""
+    """Change of depth with the command (m per command unit) and with the stripe's position (m per pixel). Each is the
+    median over the pixels that the line reaches.
+    """
 
     per_command_m: float
     per_pixel_m: float
 
 
 def sensitivity(model: RigModel, at_m: float) -> Sensitivity:
-    """Look at a grid over the picture. CalibrationError where the line does not reach that depth."""
+    """The sensitivity at depth `at_m`, over a grid of pixels. Raises CalibrationError if the line does not reach that
+    depth.
+    """
     camera = model.camera
     x = np.linspace(0, camera.width - 1, _SENSITIVITY_GRID)
     y = np.linspace(0, camera.height - 1, _SENSITIVITY_GRID)[:, None]
@@ -265,7 +274,7 @@ _TRUTH_GRID = 32
 
 @dataclass(frozen=True, slots=True, eq=False)
 class DepthErrors:
-    """Errors at pixels that the true rig lights at one depth: error_m (n,) signed; sd_m (n,) predicted or NaN."""
+    """Errors at pixels that the true rig lights at one depth: error_m (n,) signed; sd_m (n,) predicted, or NaN."""
 
     depth_m: float
     error_m: Array
@@ -283,13 +292,13 @@ class DepthErrors:
 
     @property
     def ratio(self) -> float:
-        """Root mean square of errors in units of their predicted sd: 1 where the covariance is right, on average."""
+        """Root mean square of the errors in units of their predicted sd; 1 on average if the covariance is right."""
         known = self.sd_m > 0
         return float(np.sqrt(np.mean((self.error_m[known] / self.sd_m[known]) ** 2))) if known.any() else np.nan
 
 
 def depth_errors(model: RigModel, truth: RigModel, depth_m: float, velocity_per_s: float) -> DepthErrors:
-    """The errors of `model` at pixels that see the light at `depth_m`. velocity_per_s: of the command, signed."""
+    """The errors of `model` at pixels that see the light at `depth_m`. velocity_per_s: signed velocity of the command."""
     camera = truth.camera
     x, y = np.meshgrid(np.linspace(0, camera.width - 1, _TRUTH_GRID), np.linspace(0, camera.height - 1, _TRUTH_GRID))
     mirror = command_at(truth, x, y, depth_m)

@@ -1,14 +1,18 @@
-"""The errors of this package, and numbers in messages and tables: as many digits as are known, never a power of ten."""
+"""The errors of this package, and numbers in messages and tables: with the digits that are known, without powers of
+ten.
+"""
 
 import numpy as np
 
 
 class CalibrationError(ValueError):
-    """A rig model that cannot be used; in one line the thing, the value, the limit and the next step."""
+    """Raised for a rig model that cannot be used. One line names the thing, the value, the limit and the next step."""
 
 
 class Degenerate(CalibrationError):  # noqa: N818, the input is, not the program
-    """Input from which no model follows. `reason` is for machines: one of the words of the verdict, as 'one-pose'."""
+    """Raised for input from which no model follows. `reason` is for programs: one of the verdict's codes, such as
+    'one-pose'.
+    """
 
     def __init__(self, reason: str, message: str) -> None:
         """Take the reason, and the message: what is wrong, its value and limit, the condition number, the next step."""
@@ -17,7 +21,9 @@ class Degenerate(CalibrationError):  # noqa: N818, the input is, not the program
 
 
 class FileError(CalibrationError):
-    """A file that cannot be used. `problems` are all that is wrong with it, a line each; the message has the first."""
+    """Raised for a file that cannot be used. `problems` lists everything wrong with it, one line each; the message has
+    the first.
+    """
 
     MOST_TOLD = 5
 
@@ -29,7 +35,7 @@ class FileError(CalibrationError):
 
 
 def digits(value: float, count: int = 3) -> str:
-    """A number with so many digits that count: 1234.5 is '1230', 0.000012345 is '0.0000123'; '-' for nan."""
+    """A number rounded to that many significant digits: 1234.5 is '1230', 0.000012345 is '0.0000123'; '-' for nan."""
     if not np.isfinite(value):
         return "-" if np.isnan(value) else f"{value:g}"
     value = value + 0.0  # -0 is 0
@@ -37,15 +43,15 @@ def digits(value: float, count: int = 3) -> str:
 
 
 def condition_text(condition: float) -> str:
-    """A condition number, which matters by its powers of ten: '3.1e+07'; 'inf' where nothing is determined."""
+    """A condition number, of which the power of ten matters: '3.1e+07'; 'inf' if nothing is determined."""
     return f"{condition:.1e}" if np.isfinite(condition) else "inf"
 
 
 def in_mm(length_m: float) -> str:
-    """A length in millimetres, for a table whose head says so."""
+    """A length in millimetres without the unit, for a table whose head gives it."""
     return digits(1e3 * length_m)
 
 
 def mm(length_m: float) -> str:
-    """A length in a text, in millimetres."""
+    """A length in millimetres with the unit, for a text."""
     return f"{in_mm(length_m)} mm"

@@ -1,12 +1,12 @@
-"""Advice on the board's next pose, and why: the one after which the expected depth error is the least.
+"""Advice on the board's next pose, and why: the pose after which the expected depth error is smallest.
 
-Candidates stand on a grid of distance, place in the picture and tilt. The gain of each is forecast by the fit of the
-views so far (`Forecast`); before there is a fit, three poses begin that tell most about any camera. The same grid gives
-the sequence of poses that a simulated rig shows when nobody guides it.
+Candidates form a grid of distance, place in the picture and tilt. The gain of each is forecast from the fit of the
+views so far (`Forecast`). Before there is a fit, three poses are shown that tell most about any camera. The same grid
+gives the sequence of poses that a simulated rig shows without guidance.
 
-A pose that nobody has shown yet has no data, but its equations need none: where its corners and passages would lie, and
-how they change with the parameters, follows from the fit so far; how noisy they would be, from the noise of the others.
-Added to the information that there is, they give the covariance to expect.
+A pose that has not been shown has no data, but its equations need none. The fit so far gives the places of its corners
+and passages and their derivatives by the parameters; the other views give their noise. Added to the information already
+there, these equations give the expected covariance.
 """
 
 import math
@@ -85,7 +85,7 @@ class Candidate:
 
 @dataclass(frozen=True, slots=True)
 class Advice:
-    """The next pose. before_m, after_m: expected depth error now and once it was shown; NaN before there is a fit."""
+    """The next pose. before_m, after_m: expected depth error now and once it has been shown; NaN before there is a fit."""
 
     candidate: Candidate
     at_m: float
@@ -101,7 +101,7 @@ class Advice:
 
 
 def candidates(camera: Camera, board: Board, depth_range_m: tuple[float, float]) -> tuple[Candidate, ...]:
-    """All poses of the grid that show the whole board, its markers readable, within the range of depth."""
+    """All poses of the grid that show the whole board with readable markers, within the range of depth."""
     found = []
     readable_m = np.inf
     if board.marker_m is not None:
@@ -115,17 +115,17 @@ def candidates(camera: Camera, board: Board, depth_range_m: tuple[float, float])
 
 
 def next_pose(choices: Sequence[Candidate], at_m: float, now_m: float, forecast: ExpectedError) -> Advice:
-    """The pose to show next of some (one at least): the best by the forecast."""
+    """The best of the given poses (at least one) by the forecast, as the pose to show next."""
     errors = [forecast(candidate.pose) for candidate in choices]
     best = int(np.nanargmin(errors)) if np.isfinite(errors).any() else 0
     return Advice(choices[best], at_m, now_m, float(errors[best]))
 
 
 def sequence(choices: Sequence[Candidate], poses: int, seed: int = 0) -> tuple[Candidate, ...]:
-    """Poses, as many as asked for, that differ from one another as much as they can: near and far, all places, all
+    """As many poses as asked for that differ from one another as much as possible: near and far, in all places and
     tilts.
 
-    Each is the one farthest from those before it; the first is a tilted one, near. seed: which of equals comes first.
+    Each is the one farthest from those before it; the first is near and tilted. seed: chooses among equal ones.
     """
     rng = np.random.default_rng(seed)
     order = rng.permutation(len(choices)) if seed else np.arange(len(choices))
@@ -143,7 +143,7 @@ def sequence(choices: Sequence[Candidate], poses: int, seed: int = 0) -> tuple[C
 
 
 def rough_camera(size: tuple[int, int]) -> Camera:
-    """A camera to place boards with where none is known: 46 degrees across, no distortion."""
+    """A camera for placing boards if none is known: 46 degrees across, no distortion."""
     width, height = size
     focal = 1.2 * width
     matrix = np.array([[focal, 0, (width - 1) / 2], [0, focal, (height - 1) / 2], [0, 0, 1]])
@@ -153,7 +153,7 @@ def rough_camera(size: tuple[int, int]) -> Camera:
 def _candidate(
     camera: Camera, board: Board, fill: float, place: tuple[int, int], tilt: tuple[int, int]
 ) -> Candidate | None:
-    """The pose that brings the board to its place and no farther than the border; None where it does not fit."""
+    """The pose that brings the board to its place and no farther than the border; None if it does not fit."""
     rotation = TILT_RAD * np.array([tilt[0], tilt[1], 0.0])
     turn = cv2.Rodrigues(rotation)[0]
     width, height = camera.width - 1, camera.height - 1
@@ -190,7 +190,7 @@ BORDER_PX = 2.0
 
 
 class Forecast:
-    """The depth error to expect after one more pose: call it with the pose. now_m: without it."""
+    """The expected depth error after one more pose: call it with the pose. now_m: the error without another pose."""
 
     def __init__(self, fit: RigFit, at_m: float) -> None:
         """Prepare forecasts from a fit, for the depth error at `at_m`."""
@@ -230,7 +230,7 @@ class Forecast:
         return float(np.sqrt(np.median(variance))) if variance.size else math.nan
 
     def _seen(self, pose: BoardPose) -> Sighting | None:
-        """The corners and passages that a board there would give, without errors; None where they are too few."""
+        """The corners and passages that a board there would give, without errors; None if they are too few."""
         model, board = self._fit.model, self._fit.board
         corners_m = board.corners_m
         x, y, found = _inside(model, pose.to_camera(corners_m))

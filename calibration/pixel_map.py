@@ -1,25 +1,27 @@
-"""Pixels of a SPAD array in the dark and in light: rates, hot, dead and noisy ones, and how they have changed.
+"""Pixels of a SPAD array in the dark and in light: rates, hot, dead and noisy pixels, and how they have changed.
 
-Flux per exposure is -ln(1 - p), p the share of frames in which a pixel fired. Its sd from N frames is
+Flux per exposure is -ln(1 - p), with p the share of frames in which a pixel fired. Its sd from N frames is
 sqrt((e^flux - 1) / N); a pixel that never fired is given the sd of half a count.
 
-Hot pixels are told by what they cost. A frame tells of a stripe's s photons with the Fisher information
-1 / (e^(s + b) - 1) of a bit (b: all else that the pixel detects). The limit is the dark flux at which that falls to
-half of what the pixels around it tell: b = ln(2 e^(s + b0) - 1) - s, b0 theirs. A hot pixel must lie above it, and
-above what its neighbours' scatter explains. Fewer frames than `frames_for` cannot place pixels near the limit.
+Hot pixels are defined by the information they lose. A one-bit frame has the Fisher information 1 / (e^(s + b) - 1)
+about a stripe's s photons (b: everything else that the pixel detects). The limit is the dark flux at which this falls
+to half
+of that of the surrounding pixels: b = ln(2 e^(s + b0) - 1) - s, with b0 their flux. A hot pixel must lie above the
+limit, and above what its neighbours' scatter explains. Fewer frames than `frames_for` cannot classify pixels near the
+limit.
 
-A noisy pixel is one whose counts scatter over blocks of frames more than counting does, as they do where its rate jumps
-(random telegraph noise). Index of dispersion: sum (n - e)^2 / e over the blocks, e in proportion to what ordinary
-pixels count in them, so that a lamp or a warming sensor makes nobody noisy; chi-square with blocks - 1 degrees of
-freedom but for the 1 - p of bits. `FALSE_ALARM` is the probability by which a pixel without fault is called noisy.
+A noisy pixel is one whose counts scatter over blocks of frames more than counting statistics allow, as when its rate
+jumps (random telegraph noise). Index of dispersion: sum (n - e)^2 / e over the blocks, with e in proportion to the
+counts of ordinary pixels, so that a lamp or a warming sensor makes no pixel noisy. It is chi-square with blocks - 1
+degrees of freedom, except for the 1 - p of bits. `FALSE_ALARM` is the probability that a good pixel is called noisy.
 
-A dead pixel is one that hardly fires in light although its neighbours do. Without light nobody can tell.
+A dead pixel is one that hardly fires in light although its neighbours do. It cannot be recognised without light.
 
-Changes (`pixel_drift`) are told from frames of the same exposure in the same dark; dark rates double every 8 to 10 K,
-so a warmer sensor shows as a common factor and a faulty one pixel by pixel.
+Changes (`pixel_drift`) are found from frames of the same exposure in the same dark. Dark rates double every 8 to 10 K,
+so a warmer sensor shows as a common factor, and faulty pixels show one by one.
 
-`pixels.npz` holds the arrays of a `PixelMap` by their names (`dead` is left out where nobody could tell), and `about`,
-JSON text: format, version, created, parent, sensor, exposure_s, frames, judged, lit_judged, ordinary_per_s.
+`pixels.npz` holds the arrays of a `PixelMap` by their names (`dead` is left out if unknown), and `about`, JSON text:
+format, version, created, parent, sensor, exposure_s, frames, judged, lit_judged, ordinary_per_s.
 """
 
 import hashlib
@@ -51,9 +53,9 @@ _MANY, _MOST_COMMON = 100, 1.5
 
 
 class DarkTally:
-    """Adds up dark frames block by block; blocks follow one another in time and are best of equal length.
+    """Adds up dark frames block by block. Blocks must follow one another in time, and preferably have equal length.
 
-    Of many blocks neighbours are joined, so that no more than `MOST_BLOCKS` are kept.
+    If there are many blocks, neighbours are joined so that no more than `MOST_BLOCKS` are kept.
     """
 
     def __init__(self, shape: tuple[int, int]) -> None:
@@ -62,7 +64,7 @@ class DarkTally:
         self._blocks: list[tuple[NDArray[np.int32], NDArray[np.int32]]] = []
 
     def add(self, ones: NDArray[np.integer], frames: NDArray[np.integer] | int) -> None:
-        """Add a block: `ones` (rows, width) of the `frames` in which each pixel was read."""
+        """Add a block. ones (rows, width): counts of each pixel. frames: number of frames in which each pixel was read."""
         if len(self._blocks) == MOST_BLOCKS:
             pairs = zip(self._blocks[::2], self._blocks[1::2], strict=True)
             self._blocks = [(one[0] + other[0], one[1] + other[1]) for one, other in pairs]
@@ -72,7 +74,7 @@ class DarkTally:
         self.frames += block[1]
 
     def ordinary(self) -> Mask:
-        """Pixels that no count far above the others' sets apart."""
+        """Pixels whose counts are not far above those of the others."""
         seen = self.frames > 0
         kept = seen
         for _ in range(_ROUNDS):
@@ -128,12 +130,13 @@ _JUMP_SIGMA = 3.0
 class PixelMap:
     """The result for each pixel; arrays are (rows, width).
 
-    rate_per_s, rate_sd_per_s: float32, dark counts a second; NaN where no frame had the pixel. jump_per_s: float32, sd
-    of the rate from block to block beyond that of counting, 0 where there is none or nobody can tell. hot, noisy: bool.
-    dead: None where there was no light. judged, lit_judged: share of the pixels that fired often enough to tell whether
-    they are noisy, and that were lit well enough to tell whether they are dead. defects: hot, dead, or noisy and at
-    times as fast as hot ones. limit_per_s: float32, where hot begins. frames: most that a pixel had. ordinary_per_s:
-    mean dark rate of the pixels that nothing sets apart.
+    rate_per_s, rate_sd_per_s: float32, dark counts per second; NaN where no frame contained the pixel. jump_per_s:
+    float32, sd of the rate between blocks beyond that of counting, 0 if there is none or it is unknown. hot, noisy:
+    bool. dead: None if there was no light. judged, lit_judged: share of the pixels that fired often enough to tell
+    whether they are noisy, and that were lit well enough to tell whether they are dead. defects: pixels that are hot,
+    dead, or noisy and at times as fast as hot ones. limit_per_s: float32, the rate above which a pixel is hot. frames:
+    largest number of frames of a pixel.
+    ordinary_per_s: mean dark rate of the ordinary pixels.
     """
 
     rate_per_s: NDArray[np.float32]
@@ -159,7 +162,8 @@ def judge_pixels(
     signal: float = SIGNAL,
     false_alarm: float = FALSE_ALARM,
 ) -> PixelMap:
-    """Judge each pixel by the dark frames. lit: (ones, frames) with light on the sensor; without it nobody is dead.
+    """Judge each pixel by the dark frames. lit: (ones, frames) with light on the sensor; without it no pixel is called
+    dead.
 
     signal: photons per pixel and exposure of the weakest stripe. false_alarm: see `FALSE_ALARM`.
     """
@@ -199,7 +203,7 @@ def judge_pixels(
 
 
 def flux_of(ones: NDArray[np.integer], frames: NDArray[np.integer] | int) -> tuple[Array, Array]:
-    """Flux per exposure and its sd, NaN where there are no frames. One that fired in all is given half a count less."""
+    """Flux per exposure and its sd, NaN without frames. A pixel that fired in all frames is given half a count less."""
     n = np.broadcast_to(np.asarray(frames, np.float64), ones.shape)
     with np.errstate(divide="ignore", invalid="ignore"):
         flux = -np.log1p(-np.minimum(ones, n - 0.5) / n)
@@ -209,23 +213,24 @@ def flux_of(ones: NDArray[np.integer], frames: NDArray[np.integer] | int) -> tup
 
 
 def hot_flux(signal: float, level: Array | float) -> Array:
-    """Flux per exposure at which a pixel tells half as much of `signal` photons as one at `level`."""
+    """Flux per exposure at which a pixel has half as much information on `signal` photons as a pixel at `level`."""
     result: Array = np.log(2 * np.exp(signal + np.asarray(level, np.float64)) - 1) - signal
     return result
 
 
 def frames_for(limit_flux: float, precision: float = PRECISION) -> int:
-    """Frames that give a rate at the limit with this relative sd."""
+    """Number of frames that measure a rate at the limit with this relative sd."""
     return math.ceil(math.expm1(limit_flux) / (limit_flux * precision) ** 2)
 
 
 def dead_pixels(
     ones: NDArray[np.integer], frames: NDArray[np.integer] | int, *, false_alarm: float = FALSE_ALARM
 ) -> tuple[Mask, Mask]:
-    """Pixels (rows, width) with less than `DEAD_SHARE` of their neighbours' light, and those where it can be told.
+    """Pixels (rows, width) with less than `DEAD_SHARE` of their neighbours' light, and the pixels for which this can be
+    judged.
 
-    One with half of it would count so little with a probability under `false_alarm` (Chernoff's bound), so in too dim
-    a light nobody is dead.
+    A pixel with half of its neighbours' light would count so little with a probability below `false_alarm` (Chernoff's
+    bound). So in too dim a light no pixel is called dead.
     """
     around = _around(flux_of(ones, frames)[0])
     n = np.broadcast_to(np.asarray(frames, np.float64), ones.shape)
@@ -238,7 +243,7 @@ def dead_pixels(
 
 
 def light_leak(pixels: PixelMap) -> float:
-    """Correlation of ordinary neighbours' rates along the rows, a sign of light; 0 where chance explains it."""
+    """Correlation of ordinary neighbours' rates along the rows, a sign of stray light; 0 if chance explains it."""
     rate = np.where(pixels.defects, np.nan, pixels.rate_per_s.astype(np.float64))
     low, high = np.nanpercentile(rate, [1.0, 95.0])
     rate[(rate < low) | (rate > high)] = np.nan
@@ -293,11 +298,11 @@ _LEAST_HOT = 10
 class PixelDrift:
     """The change from an older map to a newer one.
 
-    became_hot, became_dead, recovered: (n, 2) row and column; hot ones where the change is more than chance. ratio: of
-    the ordinary pixels' rates, newer to older, with ratio_sigma, its distance from 1 in sd. changed: share of the
-    pixels whose rates differ by more than chance once that factor is taken out. correlation: of the logarithms of the
-    rates, NaN where either has none. alike: share of the old hot pixels that are hot still, None for too few.
-    new_defects: share of all pixels that became hot or dead.
+    became_hot, became_dead, recovered: (n, 2) row and column; hot ones only if the change is more than chance. ratio:
+    of the ordinary pixels' rates, newer to older; ratio_sigma: its distance from 1 in sd. changed: share of the pixels
+    whose rates differ by more than chance after this factor is removed. correlation: of the logarithms of the rates,
+    NaN if either map has none. alike: share of the old hot pixels that are still hot, None if too few. new_defects:
+    share of all pixels that became hot or dead.
     """
 
     became_hot: NDArray[np.int64]
@@ -312,7 +317,7 @@ class PixelDrift:
 
     @property
     def reasons(self) -> tuple[str, ...]:
-        """Codes of what makes the older map useless: other-sensor, dark-rate-drift, new-defects."""
+        """Codes of the changes that make the older map useless: other-sensor, dark-rate-drift, new-defects."""
         found = {
             "other-sensor": self.alike is not None and self.alike < LEAST_ALIKE,
             "dark-rate-drift": self.ratio_sigma > SIGNIFICANT and not 1 / MOST_RATIO < self.ratio < MOST_RATIO,
@@ -322,7 +327,7 @@ class PixelDrift:
 
 
 def pixel_drift(old: PixelMap, new: PixelMap) -> PixelDrift:
-    """Compare two maps of one sensor. CalibrationError where they differ in size."""
+    """Compare two maps of one sensor. Raises CalibrationError if they differ in size."""
     if old.rate_per_s.shape != new.rate_per_s.shape:
         (rows, width), (old_rows, old_width) = new.rate_per_s.shape, old.rate_per_s.shape
         raise CalibrationError(
@@ -386,10 +391,10 @@ _NEXT: Final = "name a pixels.npz that 'rig calibrate pixels' wrote"
 
 @dataclass(frozen=True, slots=True, eq=False)
 class PixelVersion:
-    """A map of the pixels in the row of those of its sensor.
+    """A pixel map as one version in the series of its sensor.
 
-    version: 1 for the first. created: ISO 8601 date and time. parent: id of the one that it was compared with. sensor:
-    model and serial number, as far as known.
+    version: 1 for the first. created: ISO 8601 date and time. parent: id of the version that it was compared with.
+    sensor: model and serial number, as far as known.
     """
 
     pixels: PixelMap
@@ -400,7 +405,7 @@ class PixelVersion:
 
     @property
     def id(self) -> str:
-        """Sixteen hexadecimal digits that change with its date and any number in it."""
+        """Sixteen hexadecimal digits that change with the date and with any number of the map."""
         digest = hashlib.sha256(f"{self.created} {self.version} {self.parent} {self.sensor}".encode())
         for name in _ARRAYS:
             digest.update(np.ascontiguousarray(getattr(self.pixels, name)).tobytes())
@@ -408,7 +413,7 @@ class PixelVersion:
 
 
 def save_pixels(version: PixelVersion, path: str | os.PathLike[str]) -> None:
-    """Write it, whole or not at all. Raises OSError."""
+    """Write a version to a file, completely or not at all. Raises OSError."""
     file, pixels = Path(path), version.pixels
     about = {"format": FORMAT, **{name: getattr(version, name) for name in ("version", "created", "parent", "sensor")}}
     about |= {name: getattr(pixels, name) for name in ("frames", *_NUMBERS)}
@@ -428,7 +433,7 @@ _DAMAGE = (
 
 
 def load_pixels(path: str | os.PathLike[str]) -> PixelVersion:
-    """Read one. CalibrationError where there is none."""
+    """Read a version from a file. Raises CalibrationError if the file holds none."""
     file = Path(path)
     try:
         with load_numpy(file) as archive:

@@ -1,4 +1,4 @@
-"""The verdict on a calibration: good enough for what was asked, or not, and for which reasons."""
+"""The verdict on a calibration: whether it is good enough for what was asked, and the reasons if not."""
 
 import math
 from collections.abc import Callable
@@ -21,7 +21,7 @@ AT_M: Final = 5.0
 
 @dataclass(frozen=True, slots=True)
 class AccuracyGoal:
-    """The quality asked of a calibration: sd of depth at a distance; the baseline where somebody has measured it."""
+    """The required quality of a calibration: sd of depth at a distance, and the baseline if somebody has measured it."""
 
     accuracy_m: float
     at_m: float = AT_M
@@ -30,7 +30,7 @@ class AccuracyGoal:
 
 @dataclass(frozen=True, slots=True)
 class Reason:
-    """A reason against a calibration: code for machines, text for people, value and limit in one unit."""
+    """A reason against a calibration: code for programs, text for people, value and limit in one unit."""
 
     code: str
     text: str
@@ -45,14 +45,14 @@ class Reason:
 
 @dataclass(frozen=True, slots=True)
 class Verdict:
-    """Whether a calibration may be used, and why not: the root cause first."""
+    """Whether a calibration may be used, and why not, with the root cause first."""
 
     passed: bool
     reasons: tuple[Reason, ...] = ()
 
     @property
     def word(self) -> VerdictWord:
-        """The verdict in a word."""
+        """The verdict as a single word."""
         return "passed" if self.passed else "failed"
 
     @property
@@ -90,18 +90,22 @@ _NEXT_STEP = {
 
 
 def reason_for(code: str, text: str, value: float = math.nan, limit: float = math.nan) -> Reason:
-    """A reason with the step that is taken where it has this code."""
+    """A reason with the next step that belongs to its code."""
     return Reason(code, text, value, limit, _NEXT_STEP.get(code, "show the board again"))
 
 
 def unguided(verdict: Verdict) -> Verdict:
-    """The verdict for a command that has no guided mode: no next step names one."""
+    """The verdict without next steps that name the guided mode, for a command that has none."""
     reasons = tuple(replace(reason, next_step=reason.next_step.replace(_GUIDED, "")) for reason in verdict.reasons)
     return replace(verdict, reasons=reasons)
 
 
 def more_poses(shown: int, what: str, found: tuple[float, float], asked: float, said: Callable[[float], str]) -> Reason:
-    """The reason where data are only too few; of errors (median, 95 %) the one farther off is named by `said`."""
+    """The reason if data are simply too few, with an estimate of how many poses would be enough.
+
+    found, asked: errors (median, 95 %) and the limit of the median; the text names the one that exceeds its limit more.
+    said: turns an error into text.
+    """
     over = [error / limit for error, limit in zip(found, (asked, WORST_TIMES * asked), strict=True)]
     worst = over[1] > over[0]
     text = f"{'in the worst 5 % of the picture ' if worst else ''}{what} {said(found[worst])}, asked for are "

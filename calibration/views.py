@@ -1,8 +1,8 @@
 """One view of a calibration board held still: where its corners lie, and when the line passed over each pixel.
 
-A pixel's passage is the mirror command at which the line's centre crosses it. Its albedo is the same in every column,
-so the board's print does not pull at the passage, as it would at a stripe sought along a row. Scatter is estimated by
-`robust_sd`, which a few wrong values do not move.
+A pixel's passage is the mirror command at which the line's centre crosses it. The pixel's albedo is the same in every
+column, so the board's print does not bias the passage, as it would bias a stripe sought along a row. Scatter is
+estimated by `robust_sd`, which a few wrong values do not affect.
 """
 
 from dataclasses import dataclass
@@ -27,7 +27,7 @@ class Corners:
     """Corners of a board in a picture.
 
     ids: (n,) int32, the board's numbers. px: (n, 2) float64 raw pixels, centres at integers. sd_px: (n,) float64, of
-    either coordinate, as the picture's noise makes it; None where nobody knows.
+    either coordinate, from the picture's noise; None if unknown.
     """
 
     ids: NDArray[np.int32]
@@ -36,7 +36,7 @@ class Corners:
 
     @property
     def likely_sd_px(self) -> Array:
-        """(n,) of either coordinate, above 0; the usual one where nobody knows."""
+        """(n,) sd of either coordinate, above 0; the usual one if unknown."""
         if self.sd_px is None:
             return np.full(len(self.ids), USUAL_CORNER_SD_PX)
         known = np.nan_to_num(self.sd_px, nan=USUAL_CORNER_SD_PX, posinf=1.0)
@@ -44,7 +44,9 @@ class Corners:
 
     @property
     def across_px(self) -> float:
-        """Root mean square distance from the line that the corners lie along best: none gives a pose without."""
+        """Root mean square distance of the corners from their best straight line. Without any such distance there is no
+        pose.
+        """
         if len(self.px) == 0 or not np.isfinite(self.px).all():
             return 0.0
         return float(np.linalg.svd(self.px - self.px.mean(axis=0), compute_uv=False)[-1] / np.sqrt(len(self.px)))
@@ -54,8 +56,8 @@ class Corners:
 class Passages:
     """Mirror commands at which the line's centre crossed the pixels of one sweep.
 
-    x_px, y_px: (m,) float64. command: (m,) float64, as commanded at that instant, without any lag. sd: (m,) float64 in
-    command units. direction: +1 while the command rises, else -1. speed_per_s: how fast it does, above 0.
+    x_px, y_px: (m,) float64. command: (m,) float64, the command at that instant, without any lag. sd: (m,) float64 in
+    command units. direction: +1 while the command rises, else -1. speed_per_s: size of the command's velocity, above 0.
     """
 
     x_px: Array
@@ -67,7 +69,7 @@ class Passages:
 
     @property
     def velocity_per_s(self) -> float:
-        """Velocity of the command, signed."""
+        """Signed velocity of the command."""
         return float(np.sign(self.direction)) * self.speed_per_s
 
 
@@ -83,7 +85,9 @@ class View:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class BoardPose:
-    """X_camera = R X_board + position. rotation: (3,) float64 Rodrigues vector in rad; position_m: (3,) float64."""
+    """The pose of a board: X_camera = R X_board + position. rotation: (3,) float64 Rodrigues vector in rad; position_m:
+    (3,) float64.
+    """
 
     rotation: Array
     position_m: Array
@@ -103,5 +107,7 @@ MAD_TO_SD: Final = 1.4826
 
 
 def robust_sd(deviations: ArrayLike) -> float:
-    """Standard deviation of deviations (n,) from zero, told from the median of their absolute values; n is above 0."""
+    """Standard deviation of deviations (n,) from zero, estimated from the median of their absolute values; n is above
+    0.
+    """
     return float(MAD_TO_SD * np.median(np.abs(deviations)))

@@ -9,7 +9,7 @@ NS_PER_S = 1_000_000_000
 
 @runtime_checkable
 class Clock(Protocol):
-    """Monotonic time and waiting. Passed in everywhere, so that code about time is tested in no time."""
+    """Monotonic time and waiting. It is passed in everywhere, so that tests of code that waits take no real time."""
 
     def now_ns(self) -> int:
         """Nanoseconds since an arbitrary start; never decreases."""
@@ -34,7 +34,7 @@ class SystemClock:
 
 
 class VirtualClock:
-    """A clock that stands still until somebody advances it. Thread-safe; waiting costs no real time."""
+    """A clock that stands still until somebody advances it. Thread-safe. Waiting on it takes no real time."""
 
     def __init__(self, start_ns: int = 0) -> None:
         self._lock = threading.Lock()
@@ -52,6 +52,6 @@ class VirtualClock:
                 self._now_ns += round(seconds * NS_PER_S)
 
     def advance_to_ns(self, t_ns: int) -> None:
-        """Advance to `t_ns`; a time already passed changes nothing, since the clock never runs backwards."""
+        """Advance to `t_ns`. A time that has already passed changes nothing, since the clock never runs backwards."""
         with self._lock:
             self._now_ns = max(self._now_ns, t_ns)

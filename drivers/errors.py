@@ -1,22 +1,22 @@
-"""The error tree of everything a device can do wrong: one class per cause, each message one line."""
+"""The errors that devices raise: one class per cause, with a message of one line."""
 
 # ruff: noqa: N818 - a class is named after what happened (`except InterlockOpen:`)
 
 
 class DeviceError(Exception):
-    """Root of the tree. Raised itself only where no subclass fits; `str(error)` is one line for the user."""
+    """Base class of all device errors. Raised itself only if no subclass fits; `str(error)` is one line for the user."""
 
 
 class DeviceNotFound(DeviceError):
-    """Raised by opening a device that is not attached or does not answer at its address."""
+    """Raised when a device to be opened is not attached or does not answer at its address."""
 
 
 class DeviceBusy(DeviceError):
-    """Raised by opening a device that another program holds."""
+    """Raised when a device to be opened is held by another program."""
 
 
 class DevicePermission(DeviceError):
-    """Raised by opening a device that is attached but that this user may not access."""
+    """Raised when a device to be opened is attached but this user may not access it."""
 
 
 class DeviceTimeout(DeviceError):
@@ -28,7 +28,7 @@ class DeviceDisconnected(DeviceError):
 
 
 class DeviceFault(DeviceError):
-    """Raised when a device reports a fault of its own or reads back another state than the one it was told."""
+    """Raised when a device reports a fault of its own, or reads back a state other than the one it was set to."""
 
 
 class InterlockOpen(DeviceError):
@@ -36,11 +36,15 @@ class InterlockOpen(DeviceError):
 
 
 class LimitExceeded(DeviceError):
-    """Raised before anything moves or lights when a request is outside a device's limits; names value and limit."""
+    """Raised when a request is outside a device's limits, before anything moves or lights. Names the value and the
+    limit.
+    """
 
 
 class WrongState(DeviceError):
-    """Raised by a verb that the device's present state does not allow; names the state and the verb to call first."""
+    """Raised when a method is called that the device's present state does not allow. Names the state and the method to
+    call first.
+    """
 
 
 class ProtocolError(DeviceError):
@@ -48,15 +52,19 @@ class ProtocolError(DeviceError):
 
 
 class CorruptBlock(ProtocolError):
-    """Raised by a block whose magic, checksum, sizes or trailer are wrong: its frames must not be used."""
+    """Raised when the magic, checksum, sizes or trailer of a block are wrong. Its frames must not be used."""
 
 
 class UnsupportedBlock(ProtocolError):
-    """Raised by a sound block of a sort this reader does not take: other major version, sparse, summed or skipping."""
+    """Raised when a sound block is of a kind this reader does not take: another major version, sparse, summed or
+    skipping.
+    """
 
 
 class GuardLost(DeviceError):
-    """Raised by a guarded laser or gate when the guard process that owns their ports is gone; says what was lowered."""
+    """Raised by a guarded laser or gate when the guard process that owns its port is gone. Says which devices were made
+    safe.
+    """
 
 
 class RingOverflow(DeviceError):
@@ -64,4 +72,4 @@ class RingOverflow(DeviceError):
 
 
 class UnknownKind(DeviceError):
-    """Raised when the registry knows no such kind of device; lists the kinds it knows."""
+    """Raised when the registry has no kind of that name. Lists the kinds it has."""

@@ -1,4 +1,4 @@
-"""Binary frames in memory: one record per frame and packed bits, a block of consecutive frames at a time."""
+"""Binary frames in memory. A block holds consecutive frames: a record and packed bits for each."""
 
 from dataclasses import dataclass
 from enum import IntEnum, IntFlag
@@ -22,7 +22,7 @@ SUBFRAME_MASK = 0xFF
 
 
 class Mark(IntFlag):
-    """Events of a frame's period (bits of `marks`)."""
+    """Events during a frame's period (bits of `marks`)."""
 
     GATE_HIGH = 1
     """The gate was high during the whole exposure: the frame is lit."""
@@ -66,13 +66,13 @@ def packed_row_bytes(width: int) -> int:
 
 
 def frame_bytes(width: int, height: int) -> int:
-    """Bytes of one frame of width x height pixels as it is sent and kept, its record included."""
+    """Bytes of one frame of width x height pixels as it is sent and stored, including its record."""
     return FRAME_RECORD.itemsize + packed_row_bytes(width) * height
 
 
 @dataclass(frozen=True, slots=True)
 class BlockHeader:
-    """Everything that holds for all frames of a block. Fields as in SPB1 1.0 (docs/reference/spb1.md)."""
+    """The values that all frames of a block share. The fields are those of SPB1 1.0 (docs/reference/spb1.md)."""
 
     flags: BlockFlag
     run_id: int
@@ -107,11 +107,11 @@ class BlockHeader:
 
 @dataclass(frozen=True, slots=True)
 class FrameBlock:
-    """Consecutive frames over one piece of memory. Valid until its ring slot is released; copy what must live longer.
+    """Consecutive frames in one piece of memory, valid until its ring slot is released. Copy what is needed for longer.
 
     records: (n,) of `FRAME_RECORD`.
-    bits: uint8 (n, height, row bytes), packed along the width, most significant bit first (numpy `packbits` order),
-    pad bits 0, row bytes a multiple of `ROW_ALIGN_BYTES`.
+    bits: uint8 (n, height, row bytes), packed along the width, most significant bit first (numpy `packbits` order). Pad
+    bits are 0; the row bytes are a multiple of `ROW_ALIGN_BYTES`.
     """
 
     header: BlockHeader

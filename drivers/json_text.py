@@ -1,4 +1,6 @@
-"""The one reader of JSON files: what nests too deep or counts beyond 64 bits is a ValueError like any other damage."""
+"""The only reader of JSON files. Text that nests too deep or holds integers beyond 64 bits raises ValueError like any
+other damage.
+"""
 
 import json
 from typing import Any, Final
@@ -10,7 +12,9 @@ _MOST_DIGITS: Final = 20
 
 
 def parse_json(text: str | bytes) -> Any:
-    """The content of a JSON text. ValueError, one line, where it is no JSON or goes beyond what this program takes."""
+    """The content of a JSON text. Raises ValueError, with one line, if it is not JSON or exceeds what this program
+    takes.
+    """
     try:
         content = json.loads(text, parse_int=_whole)
     except RecursionError:

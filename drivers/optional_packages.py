@@ -1,4 +1,4 @@
-"""The command that installs a package which only some of the program needs."""
+"""The command that installs a package which only parts of the program need."""
 
 import re
 import sys
@@ -6,7 +6,7 @@ from importlib.metadata import PackageNotFoundError, requires
 
 
 def install_command(package: str) -> str:
-    """One line for a shell: installs `package`, in a version that we can use, into the Python that runs."""
+    """A shell command that installs a usable version of `package` into the running Python."""
     try:
         needed = [one.partition(";")[0].strip() for one in requires("spadrig") or ()]
     except PackageNotFoundError:  # installed under another name, as distributions repackage it

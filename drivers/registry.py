@@ -18,7 +18,7 @@ SLOTS = ("spad", "scanner", "laser", "sync", "world")
 
 
 class KindConfig(BaseModel):
-    """Base of every kind's config: unknown keys are refused, values cannot change. `kind` names the entry point."""
+    """Base of every kind's config. Unknown keys are refused and values cannot change. `kind` names the entry point."""
 
     model_config = ConfigDict(extra="forbid", frozen=True)
 
@@ -30,7 +30,7 @@ class KindConfig(BaseModel):
 
 @dataclass(frozen=True, slots=True)
 class Surroundings:
-    """The things a device is created with. Real devices take clock and ports, simulated ones world and seed."""
+    """What a device needs besides its config. Real devices use clock and ports, simulated ones world and seed."""
 
     clock: Clock
     world: World | None
@@ -43,29 +43,30 @@ class Surroundings:
 
 @dataclass(frozen=True, slots=True)
 class Kind:
-    """The object an entry point loads: the config model of a kind and the function that creates the opened device.
+    """The object that an entry point loads: the config model of a kind and the function that creates the opened device.
 
     `create(config, surroundings)` gets an instance of `config` and returns a device of the slot's interface (or a
-    `World`); it raises a `DeviceError` when the device cannot be opened.
+    `World`); it raises a `DeviceError` if the device cannot be opened.
     """
 
     config: type[BaseModel]
     create: Callable[[Any, Surroundings], Any]
     check_files: Callable[[Any], object] | None = None
-    """Opens the files that its config names, as `create` does, without the device; `DeviceError` where one cannot be
-    used. None: it names none. A world needs none, it is created."""
+    """Opens the files that its config names, as `create` does, without the device; raises `DeviceError` if one cannot
+    be used. None: it names none. A world needs none, it is created.
+    """
     off: Callable[[Any], bytes] | None = None
     """The bytes that switch off the emission of a laser on a serial port, by its config, whatever it answers: sent
     where there is no time to open it first."""
 
 
 def kinds(slot: str) -> tuple[str, ...]:
-    """Names of the kinds installed for a slot, sorted. Imports none of them."""
+    """Names of the kinds installed for a slot, sorted. Does not import them."""
     return tuple(sorted({entry.name for entry in _entries(slot)}))
 
 
 def lookup(slot: str, kind: str) -> Kind:
-    """Load the kind of a slot. `UnknownKind` lists the choices, or says why the entry cannot be used."""
+    """Load the kind of a slot. Raises `UnknownKind`, with the choices or with the reason why the entry cannot be used."""
     found = {entry.value: entry for entry in _entries(slot) if entry.name == kind}
     if not found:
         choices = ", ".join(kinds(slot)) or "none installed"

@@ -1,11 +1,11 @@
 """The ring of block slots between one source thread and its readers: allocated once, no copies, no loss unsaid.
 
-The source claims free slots (several at once where USB transfers are queued), fills them and publishes them in the
-order of claiming; every reader gets every block in that order and holds its slot until it asks for the next, or for
-some more.
+The source claims free slots (several at once if USB transfers are queued), fills them and publishes them in the order
+of claiming. Every reader gets every block in that order and holds its slot until it asks for the next one, or for some
+blocks longer.
 
-What a source does that finds no free slot is said by the ring, `on_full`, so that drivers need to know no policy: they
-claim, and where they got nothing and `ring.waits` is False, they drop the block, count it as lost and say so.
+The ring's `on_full` says what happens when no slot is free, so drivers need not know the policy. They claim; if they
+get nothing and `ring.waits` is False, they drop the block, count it as lost and call `mark_overflow`.
 """
 
 import threading
@@ -26,7 +26,7 @@ _PAGE_BYTES = 4096
 
 
 class OnFull(Enum):
-    """Fate of a block for which there is no free slot."""
+    """What happens to a block for which there is no free slot."""
 
     WAIT = "wait"
     """The source waits until one comes free. A source that cannot drops the block all the same."""
@@ -37,10 +37,10 @@ class OnFull(Enum):
 
 
 class BlockRing:
-    """`slots` pieces of memory of `stride` bytes each; allocated and touched at once.
+    """`slots` pieces of memory of `stride` bytes each. They are allocated and touched at once, on creation.
 
     One source thread calls `claim`, `publish`, `discard`, `mark_overflow` and `finish`; each reader belongs to one
-    thread. holds_s: seconds of the stream that fill the ring, for the message of an overflow; None: not known.
+    thread. holds_s: seconds of the stream that fill the ring, for the message of an overflow; None if unknown.
     """
 
     def __init__(self, slots: int, stride: int, *, on_full: OnFull = OnFull.WAIT, holds_s: float | None = None) -> None:
@@ -72,7 +72,7 @@ class BlockRing:
 
     @property
     def waits(self) -> bool:
-        """Whether a source that can wait for a free slot is to do so; else it drops the block."""
+        """Whether a source that can wait should wait for a free slot. Otherwise it drops the block."""
         return self._on_full is OnFull.WAIT
 
     @property
@@ -86,12 +86,12 @@ class BlockRing:
         return self._finished
 
     def reader(self, name: str, *, required: bool = True, holds: int = 1) -> "RingReader":
-        """A new reader; before the first claim, so that all readers see all blocks.
+        """A new reader. Create it before the first claim, so that all readers see all blocks.
 
-        holds: blocks that it keeps at a time, the newest ones, for work that is still under way.
+        holds: number of blocks that it keeps, the newest ones, for work that is still under way.
 
-        A reader with required=False (a monitor) never makes the source wait: it holds one slot at most, gets the
-        newest block when it asks, and counts the ones it missed in `skipped`.
+        A reader with required=False (a monitor) never makes the source wait: it holds one slot at most, gets the newest
+        block when it asks, and counts the ones it missed in `skipped`.
         """
         with self._changed:
             if self._any_claimed:
@@ -108,7 +108,9 @@ class BlockRing:
             return reader
 
     def claim(self, timeout_s: float) -> NDArray[np.uint8] | None:
-        """Memory of a free slot, uint8 (stride,), old bytes in it; None: none came free in time, if `waits`."""
+        """Memory of a free slot, uint8 (stride,), with old bytes in it. None if no slot is free, after a wait if
+        `waits`.
+        """
         with self._changed:
             self._require_unfinished("claim")
             self._any_claimed = True
@@ -135,13 +137,13 @@ class BlockRing:
             self._changed.notify_all()
 
     def discard(self) -> None:
-        """Give the oldest claimed slot back unpublished: it held no frames (a heartbeat, a damaged block)."""
+        """Give the oldest claimed slot back unpublished, as when it held no frames (a heartbeat, a damaged block)."""
         with self._changed:
             self._free.append(self._oldest_claimed("discard"))
             self._changed.notify_all()
 
     def mark_overflow(self, n_frames: int = 0) -> None:
-        """Note that a block of `n_frames`, counted as lost, found no slot. RingOverflow where that ends the run."""
+        """Note that a block of `n_frames`, counted as lost, found no slot. Raises RingOverflow if that ends the run."""
         with self._changed:
             self.last_frame += n_frames
             self.dropped_blocks += 1
@@ -155,13 +157,17 @@ class BlockRing:
             )
 
     def end_waits(self) -> None:
-        """Let `claim` give its answer at once from now on: the source is to end, and readers may never come again."""
+        """Make `claim` return at once from now on. Call it when the source is to end and readers may never take blocks
+        again.
+        """
         with self._changed:
             self._patient = False
             self._changed.notify_all()
 
     def finish(self, error: BaseException | None = None) -> None:
-        """No more blocks: readers get what is left, then None, or `error` raised. A second call changes nothing."""
+        """Publish no more blocks. Readers get what is left, then None, or `error` is raised. A second call changes
+        nothing.
+        """
         with self._changed:
             if not self._finished:
                 self._finished = True
@@ -194,7 +200,7 @@ class BlockRing:
 
 
 class RingReader:
-    """One reader's place in the ring; `BlockRing.reader` makes it."""
+    """One reader's place in the ring, made by `BlockRing.reader`."""
 
     def __init__(self, ring: BlockRing, name: str, required: bool, holds: int) -> None:
         self.name = name
@@ -208,9 +214,10 @@ class RingReader:
         self._closed = False
 
     def next(self, timeout_s: float | None = None) -> FrameBlock | None:
-        """The next block, whose memory stays as it is for as many calls as the reader holds blocks.
+        """The next block. Its memory stays valid for as many further calls as the reader holds blocks.
 
-        None after the last block, or the source's error raised; `DeviceTimeout` after `timeout_s` (None: no limit).
+        Returns None after the last block, or raises the source's error. Raises `DeviceTimeout` after `timeout_s` (None:
+        no limit).
         """
         ring = self._ring
         with ring._changed:
@@ -228,12 +235,12 @@ class RingReader:
             return None
 
     def release(self) -> None:
-        """Give all blocks back before the next one is asked for; their memory is then the source's again."""
+        """Give all blocks back before the next one is asked for. The source may then overwrite their memory."""
         with self._ring._changed:
             self._release_held()
 
     def close(self) -> None:
-        """Release everything and get nothing more, so that the source no longer waits for this reader."""
+        """Release all blocks and take no more, so that the source no longer waits for this reader."""
         with self._ring._changed:
             self._closed = True
             self._release_held()

@@ -1,7 +1,7 @@
 """Quantities with units in config files: text such as "10 us" on disk, an SI number in code.
 
-A field typed `Seconds` takes "10 us" and nothing else: a bare number is refused, so is another dimension, NaN or an
-infinity. Values written back (`model_dump(mode="json")`) are text again and read back to the very same number.
+A field typed `Seconds` takes text such as "10 us" and nothing else. A bare number, another dimension, NaN and infinity
+are refused. Values written back (`model_dump(mode="json")`) are text again and read back to the very same number.
 """
 
 import math
@@ -29,7 +29,7 @@ _FAITHFUL = Context(prec=20)
 
 @dataclass(frozen=True, slots=True)
 class Dimension:
-    """One physical dimension: its units as multiples of the number in code, the preferred one first."""
+    """A physical dimension with its units as multiples of the number in code, the preferred one first."""
 
     name: str
     units: Mapping[str, Fraction]
@@ -77,7 +77,7 @@ DIMENSIONS: Mapping[str, Dimension] = {dimension.name: dimension for dimension i
 def parse_quantity(text: object, dimension: str) -> float:
     """The SI number that a text such as "10 us" means (ratio: 1 for 100 %; rain rate: m/h).
 
-    Correctly rounded: "0.1 us" gives the float 1e-07. ValueError, one line with an example, for anything else.
+    Correctly rounded: "0.1 us" gives the float 1e-07. Raises ValueError, one line with an example, for anything else.
     """
     exact = parse_exact(text, dimension)
     try:
@@ -90,7 +90,7 @@ def parse_quantity(text: object, dimension: str) -> float:
 
 
 def parse_exact(text: object, dimension: str) -> Fraction:
-    """Parse a quantity as `parse_quantity` does, but with nothing rounded; takes a fraction too ("100000/3 Hz")."""
+    """Parse a quantity as `parse_quantity` does, but without rounding. Takes a fraction too ("100000/3 Hz")."""
     known = DIMENSIONS[dimension]
     like = f'write the {known.name} with a unit, like "{known.example}"'
     if not isinstance(text, str):
@@ -111,10 +111,11 @@ def parse_exact(text: object, dimension: str) -> Fraction:
 
 
 def format_quantity(value: float | Fraction, dimension: str) -> str:
-    """A text with a unit, as people write it, that reads back to exactly `value`. ValueError where that is not finite.
+    """A text with a unit, as people write it, that reads back to exactly `value`. Raises ValueError if that is not
+    finite.
 
-    The shortest number from 0.1 to 1000, where there is one; a close race goes to the first unit, then to a number of
-    at least 1.
+    Chooses the shortest text whose number is between 0.1 and 1000, if there is one. Among texts of nearly the same
+    length it prefers the first unit, then a number of at least 1.
     """
     known = DIMENSIONS[dimension]
     if not math.isfinite(value):
@@ -165,13 +166,13 @@ def _shown(value: object) -> str:
 
 @dataclass(frozen=True, slots=True)
 class _Text:
-    """Tells pydantic that a field is such a text in files and a number in code."""
+    """Tells pydantic that a field is text with a unit in files and a number in code."""
 
     dimension: str
     exact: bool = False
 
     def written(self, value: float | Fraction) -> str:
-        """A number of such a field as it is written in a file."""
+        """The text that stands for the number in a file."""
         return format_quantity(value, self.dimension)
 
     def __get_pydantic_core_schema__(self, source: Any, handler: GetCoreSchemaHandler) -> CoreSchema:

@@ -1,6 +1,6 @@
 """Entry point of `rig` and `python -m rig`.
 
-Loading the program takes a moment, in which Ctrl-C ends it as at any other time: one line and exit code 4.
+Loading the program takes a moment. Ctrl-C during that time ends it as at any other time, with one line and exit code 4.
 """
 
 import sys

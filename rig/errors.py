@@ -1,7 +1,7 @@
-"""Errors of the application above the devices, each with the exit code that the command line ends with.
+"""Errors of the application above the devices, each with the exit code with which the command line ends.
 
 A message names the thing, the value, the limit and the next step. Several problems found together are one error with
-one line each, so that nobody repairs a config one key at a time.
+one line each, so that nobody has to correct a config one key at a time.
 """
 
 from collections.abc import Iterable
@@ -9,13 +9,13 @@ from typing import ClassVar
 
 
 class RigError(Exception):
-    """Root of the application's errors."""
+    """Base class of the application's errors."""
 
     exit_code: ClassVar[int] = 1
 
 
 class UsageError(RigError):
-    """The user asked for something that cannot be: a wrong option, config, plan or file."""
+    """Raised when the user asked for something impossible: a wrong option, config, plan or file."""
 
     exit_code = 2
 
@@ -25,29 +25,29 @@ class UsageError(RigError):
 
     @classmethod
     def of(cls, problems: Iterable[str]) -> "UsageError":
-        """One error for several problems, each on its own line, repeated ones once."""
+        """One error for several problems, each on its own line and only once."""
         return cls(*dict.fromkeys(problems))
 
 
 class PlanError(UsageError):
-    """The scan that was asked for cannot be done with this scanner, sensor or calibration."""
+    """Raised when the requested scan cannot be done with this scanner, sensor or calibration."""
 
 
 class DevicesError(RigError):
-    """One or more devices could not be opened, or failed while they were being stopped; one line per device."""
+    """Raised when devices could not be opened, or failed while they were being stopped; one line per device."""
 
     exit_code = 3
 
 
 class RecordingError(RigError):
-    """The recording that was asked for cannot be written; the run ends, and what was recorded is kept."""
+    """Raised when the requested recording cannot be written. The run ends, and what was recorded is kept."""
 
     exit_code = 3
 
 
 class DivergedError(RigError):
-    """A driver sent its device something else than in the recording that is played, or sent it at another time."""
+    """Raised when a driver sent its device something different from the recording that is played, or at another time."""
 
 
 class DamagedRecordingError(RigError):
-    """The files of a recording are not what was recorded; nothing is made of them before 'rig repair'."""
+    """Raised when the files of a recording are damaged. They cannot be used before 'rig repair' has been run."""

@@ -1,7 +1,7 @@
-"""Progress of a command: named stages, with a count where one is known, told to whoever listens.
+"""Progress of a command: named stages, with a count if one is known, reported to whoever listens.
 
-It goes the way of a log: from where the work is done to the listener of the calling thread, if there is one, without
-being handed down through calls.
+It works like a log: reports go from where the work is done to the listener of the calling thread, if there is one,
+without being passed down through calls.
 """
 
 from collections.abc import Callable, Iterator
@@ -21,10 +21,10 @@ PREPARING = "preparing"
 class Step:
     """One moment of a command.
 
-    total: None where the number is not known; otherwise `done` is never more.
+    total: None if the number is not known; otherwise `done` never exceeds it.
     unit: of the counts, in the plural.
     note: anything else to say.
-    part: piece of the whole that the stage belongs to, such as 'pose 3 of 12'.
+    part: the part of the whole that the stage belongs to, such as 'pose 3 of 12'.
     """
 
     stage: str
@@ -42,7 +42,7 @@ _part: ContextVar[str] = ContextVar("part", default="")
 
 
 def tell_stage(stage: str, done: int = 0, total: int | None = None, unit: str = "", note: str = "") -> None:
-    """Say which stage the work of this thread is at."""
+    """Report the present stage of this thread's work."""
     listener = _listener.get()
     if listener is not None:
         listener(Step(stage, done if total is None else min(done, total), total, unit, note, _part.get()))
@@ -61,7 +61,7 @@ def counted(stage: str, unit: str, progress: Progress | None = None) -> Progress
 
 @contextmanager
 def listening(listener: Listener) -> Iterator[None]:
-    """Within the context, `listener` hears all that is told on this thread."""
+    """A context in which `listener` gets all reports of this thread."""
     token = _listener.set(listener)
     try:
         yield
@@ -71,7 +71,7 @@ def listening(listener: Listener) -> Iterator[None]:
 
 @contextmanager
 def part(name: str) -> Iterator[None]:
-    """Within the context, everything told belongs to this part of the whole. It begins with the stage PREPARING."""
+    """A context in which all reports belong to this part of the whole. It begins with the stage PREPARING."""
     token = _part.set(name)
     tell_stage(PREPARING)
     try:

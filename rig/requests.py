@@ -1,4 +1,4 @@
-"""Requests of a user: one frozen dataclass a command, which the command line fills and `rig.api` takes.
+"""Requests of a user: one frozen dataclass for each command, which the command line fills and `rig.api` takes.
 
 A field has its type and a phrase that says what it is. `rig scan --help` prints the phrase, `help(ScanRequest)` has it
 for Python; `rig/cli/command.py` makes an option of each field. None leaves a setting to the config, whose defaults are
@@ -22,28 +22,28 @@ def option(
 ) -> Default:
     """Declare a field of a request.
 
-    about: a phrase that says what it is. unset: the value that holds where none is given, in words.
-    name: of the command line's option, where it is not the field's. read_as: the type that the command line reads,
-    where it is not the field's. least: the smallest value.
+    about: a phrase that describes it. unset: description of the value used if none is given.
+    name: of the command line's option, if it differs from the field's. read_as: the type that the command line reads,
+    if it differs from the field's. least: the smallest value.
     """
     told = {"about": about, "unset": unset, "name": name, "read_as": read_as, "least": least}
     return field(default=default, metadata=told)
 
 
 def path_option(about: str, unset: str) -> str | os.PathLike[str] | None:
-    """Declare a field that holds a file or folder, None where none is given."""
+    """Declare a field that holds a file or folder, None if none is given."""
     return option(None, about, unset=unset, read_as=Path | None)
 
 
 def options_of(request: type) -> "list[Field[Any]]":
-    """The fields of a request in the order of its help: those of its own before those that it inherits."""
+    """The fields of a request in the order of its help: its own fields before the inherited ones."""
     by_name = {each.name: each for each in fields(request)}
     names = (name for part in request.__mro__ for name in inspect.get_annotations(part))
     return [by_name[name] for name in dict.fromkeys(names)]
 
 
 def described(request: type[Request]) -> type[Request]:
-    """Complete the docstring of a request by a line for each field."""
+    """Add a line for each field to the docstring of a request."""
     told = [(each, each.metadata["unset"] or each.default) for each in options_of(request)]
     lines = [f"{each.name}: {each.metadata['about']} (default: {default})." for each, default in told]
     request.__doc__ = "\n".join([request.__doc__ or "", "", *lines])
@@ -81,7 +81,7 @@ def _board_scene() -> str | None:
 @described
 @dataclass(frozen=True, slots=True, kw_only=True)
 class ReconstructRequest:
-    """Depth maps of frames that exist (`rig reconstruct`)."""
+    """Depth maps of existing frames (`rig reconstruct`)."""
 
     estimator: str | None = option(None, "argmax, edge, likelihood or joint", unset="as configured, else likelihood")
     filter: str | None = option(None, "none or median (5 x 5)", unset="as configured, else none")
@@ -197,7 +197,7 @@ class ExportRequest:
 @described
 @dataclass(frozen=True, slots=True, kw_only=True)
 class CalibrationRequest:
-    """A calibration with a rig, or with frames that one has taken."""
+    """A calibration with a rig, or with frames taken with one."""
 
     seed: int = option(0, "seed of everything simulated")
     arm: bool = option(False, "let a real laser shine: the beam path is clear")
@@ -263,7 +263,7 @@ class SyncRequest(CalibrationRequest):
 @described
 @dataclass(frozen=True, slots=True, kw_only=True)
 class CheckRequest(BoardRequest):
-    """A check of a calibration by a board that it was not made with (`rig calibrate check`)."""
+    """A check of a calibration by a board that was not used for it (`rig calibrate check`)."""
 
     poses: int = option(1, "of the board, shown to a live rig; 2 or more for an angle")
     calibration: str | os.PathLike[str] | None = path_option("what to check", "the rig's own")

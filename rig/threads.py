@@ -1,6 +1,6 @@
 """Threads of the pipeline: `RowWorkers` share compiled work on image rows, `StageThread` is one stage of the pipeline.
 
-Kernels release the interpreter's lock while they run, so that row threads work at the same time.
+Kernels release the interpreter's lock while they run, so row threads work at the same time.
 """
 
 import os
@@ -21,11 +21,11 @@ _LEAST_URGENT = 19
 
 
 class RowWorkers:
-    """Threads that share the rows of a picture, each one always the same rows: what it touched is still in its cache.
+    """Threads that share the rows of a picture. Each always gets the same rows, which may still be in its cache.
 
-    Work can be left with them (`post`): each thread goes through it in order and none waits for the others. An error in
-    the work is raised at the next call, and work left behind it is not begun. With one thread everything is done at
-    once. The threads end with `close`, or when nothing refers to the workers any more.
+    Work can be queued (`post`): each thread goes through it in order and none waits for the others. An error in the
+    work is raised at the next call, and work queued after it is not begun. With one thread everything is done at once.
+    The threads end with `close`, or when nothing refers to the workers any more.
     """
 
     def __init__(self, threads: int) -> None:
@@ -36,12 +36,14 @@ class RowWorkers:
             threading.Thread(target=_run, args=(self._state, queue, i), name=f"rows {i}", daemon=True).start()
 
     def over(self, rows: int, work: Work) -> None:
-        """Call work(first, last) for ranges that cover rows 0..rows-1 once, behind all that was posted before."""
+        """Call work(first, last) for ranges that together cover rows 0..rows-1, after everything that was posted
+        before.
+        """
         self.post(rows, work)
         self.settle()
 
     def post(self, rows: int, work: Work) -> None:
-        """Hand over work as `over` does, without waiting for the work to be done."""
+        """Queue work as for `over`, without waiting until it is done."""
         state = self._state
         if not state.queues:
             if rows:
@@ -55,7 +57,7 @@ class RowWorkers:
             queue.put((work, first, last))
 
     def settle(self, under_way: int = 0) -> None:
-        """Wait until at most the last `under_way` posts are still at work; where one failed, wait for all.
+        """Wait until at most the last `under_way` posts are still being worked on; if one failed, wait for all.
 
         Raises the error of a post that failed.
         """
@@ -72,7 +74,7 @@ class RowWorkers:
             raise error
 
     def close(self) -> None:
-        """End the threads once all is done."""
+        """End the threads once all work is done."""
         self._ended()
 
     def __enter__(self) -> Self:
@@ -85,7 +87,7 @@ class RowWorkers:
 
 
 class _State:
-    """State that the threads share; it must not keep the workers themselves alive."""
+    """State that the threads share. It must not refer to the workers, so that they can be deleted."""
 
     def __init__(self, threads: int) -> None:
         self.queues: list[SimpleQueue[_Job | None]] = [SimpleQueue() for _ in range(threads)]
@@ -99,9 +101,9 @@ class _State:
 
 
 def yield_to_others() -> None:
-    """Let the calling thread work only while others leave a core idle, on systems that know priorities of threads.
+    """Let the calling thread work only while other threads leave a core idle, on systems with thread priorities.
 
-    Row threads work in step: one that shares its core with less urgent work slows all of them.
+    Row threads work in step, so one that shares its core with less urgent work slows all of them.
     """
     if sys.platform == "linux":
         os.setpriority(os.PRIO_PROCESS, threading.get_native_id(), _LEAST_URGENT)
@@ -131,20 +133,21 @@ def _end(state: _State) -> None:
 
 
 class StageThread:
-    """A thread that runs `run` once beside the caller; a program that ends does not wait for it.
+    """A thread that runs `run` once beside the caller. A program that ends does not wait for it.
 
-    `run` handles all that it raises. A stage may fail before its thread is started: `join` may come without `start`.
+    `run` must handle all its own errors. A stage may fail before its thread is started, so `join` may come without
+    `start`.
     """
 
     def __init__(self, run: Callable[[], None], name: str) -> None:
         self._thread = threading.Thread(target=run, name=name, daemon=True)
 
     def start(self) -> None:
-        """Begin."""
+        """Start the thread."""
         self._thread.start()
 
     def join(self, timeout_s: float) -> bool:
-        """Wait for its end; False where it does not come."""
+        """Wait for the thread's end; False if it does not come in time."""
         if self._thread.ident is not None:
             self._thread.join(timeout_s)
         return not self._thread.is_alive()

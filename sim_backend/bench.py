@@ -1,8 +1,9 @@
-"""The bench the simulated devices stand on: one clock, one mirror, one laser, one gate line.
+"""The bench that the simulated devices share: one clock, one mirror, one laser, one gate line.
 
-light(t) = emission AND gate, and the mirror stands where its command was a lag ago. Devices tell the bench what they
-were told; the SPAD asks it what happened during its frames. Verbs act at the clock's present time; frames that were
-made before stay as they are. Thread-safe."""
+light(t) = emission AND gate. The mirror is where its command was one lag earlier. Devices tell the bench what they do;
+the SPAD asks it what happened during its frames. Methods act at the clock's present time and do not change frames made
+before. Thread-safe.
+"""
 
 import threading
 from collections.abc import Sequence
@@ -23,10 +24,10 @@ from sim_backend.mirror_motion import Array, Jitter, Playing, resting
 class BenchState:
     """State of the bench during n frames.
 
-    mirror: (n,) mirror position, as a command, in the middle of each exposure. velocity_per_s: (n,) of it, NaN = not
-    known. share: (n,) part of the exposure with the gate high. edge: (n,) bool, the gate changed during the exposure.
-    backward: (n,) bool, direction level at the start. line_s, scan_s: times of marker edges. power_w: emitted power, 0
-    while paused. jitter: (n,) or 0, by how much the mirror is off that position.
+    mirror: (n,) mirror position, as a command, in the middle of each exposure. velocity_per_s: (n,) its velocity, NaN
+    if unknown. share: (n,) part of the exposure with the gate high. edge: (n,) bool, whether the gate changed during
+    the exposure. backward: (n,) bool, direction level at the start. line_s, scan_s: times of marker edges. power_w:
+    emitted power, 0 while paused. jitter: (n,) or 0, the mirror's deviation from that position.
     """
 
     mirror: Array
@@ -60,17 +61,17 @@ class Bench:
         return (self.clock.now_ns() - self._epoch_ns) / NS_PER_S
 
     def clock_ns(self, time_s: float) -> int:
-        """The clock's reading at a time of the bench."""
+        """The clock's reading at a given time of the bench."""
         return self._epoch_ns + round(time_s * NS_PER_S)
 
     def play(self, waveform: ScanWaveform, repeats: int, *, latency_s: float, rate_hz: float) -> None:
-        """Start the mirror, `latency_s` from now."""
+        """Start the mirror's waveform `latency_s` from now."""
         with self._lock:
             start_s = self.now_s() + latency_s
             self._motion = Playing(waveform, repeats, start_s, rate_hz, self.lag.forward, self.lag.backward)
 
     def rest(self, command: float) -> None:
-        """Stop the mirror now, at a command."""
+        """Stop the mirror now, at the given command."""
         with self._lock:
             self._motion = resting(command)
 
@@ -85,7 +86,7 @@ class Bench:
             return float(self._motion.mirror(np.array([self.now_s()]))[0])
 
     def emit(self, power_w: float) -> None:
-        """Set the laser's power behind the gate; 0 = no emission."""
+        """Set the laser's power behind the gate; 0 means no emission."""
         with self._lock:
             self._power_w = power_w
 
@@ -111,7 +112,7 @@ class Bench:
                 self._program.abort(self.now_s())
 
     def outputs(self) -> SyncStatus:
-        """State of the program and the levels of its outputs now."""
+        """State of the program and present levels of its outputs."""
         with self._lock:
             if self._program is None or self._aborted:
                 return SyncStatus("aborted" if self._aborted else "stopped", 0)
@@ -122,7 +123,7 @@ class Bench:
             return SyncStatus("waiting" if self._program.waiting else "running", word)
 
     def during(self, start_s: Array, exposure_s: float, period_s: float) -> BenchState:
-        """State during frames that start at start_s (n,), ascending, one period apart."""
+        """State during frames that start at start_s (n,), ascending, at intervals of period_s."""
         until_s = float(start_s[-1]) + period_s
         with self._lock:
             motion = self._motion

@@ -1,17 +1,18 @@
-"""Plans which effects to run: what the scene calls for, but for what provably changes next to no decision.
+"""Plans which effects to run: those the scene calls for, except those that provably change almost no decision.
 
 Let a pixel detect m photons in a column's K frames, on average, and m + D with an effect. Per exposure the divergence
 of its bits is at most (D/K)^2 / (2 (e^(m/K) - 1)), so that over pixels and frames it is at most eps = sum D^2 / (2 m),
 and the data differ in total variation by at most sqrt(eps/2) (Pinsker's inequality [1]). They also differ by no more
-than the probability that one of the D photons is seen at all, at most D: the better bound in the dark. Pixels with
-D < m are taken by the first, the others by the second, and the two add up (triangle inequality). No rule of decision on
-a row's data can then differ more often than that.
+than the probability that any of the D photons is seen, which is at most D: the better bound in the dark. The first
+bound is used for pixels with D < m, the second for the others, and the two add up (triangle inequality). No decision
+rule on a row's data can then differ more often than that.
 
-Both grow with power and exposure, so a plan for the most that a column gets holds for all that is less. Bounds of light
-that does not depend on the laser take it as off, and the worst row. The laser's effects are evaluated on sampled
-columns and rows that have a stripe, all other effects present: twice the mean. Where an effect's catalogue entry has a
-closed form that is small enough, its code is not even loaded. The smallest are left out first, until all that is left
-out together would change more than `MOST_CHANGED` of the decisions.
+Both bounds grow with power and exposure, so a plan for the largest power and exposure of a column holds for all smaller
+ones. For light that does not depend on the laser, the bound takes the laser as off and uses the worst row. The laser's
+effects are evaluated on sampled columns and rows that have a stripe, with all other effects present; the bound is twice
+the mean. If an effect's catalogue entry has a closed form that is small enough, its code is not even loaded. The
+smallest effects are left out first, as long as all that is left out together changes at most `MOST_CHANGED` of the
+decisions.
 
 [1] A. B. Tsybakov, "Introduction to nonparametric estimation", Springer 2009, section 2.4.
 """
@@ -43,7 +44,7 @@ SAMPLED_COLUMNS, SAMPLED_BANDS, BAND_ROWS = 16, 4, 8
 @dataclass(frozen=True, slots=True)
 class EffectDecision:
     """Whether an effect is run, and why. changes: the largest share of decisions that can differ without it, at most 1,
-    where it is known.
+    if known.
     """
 
     entry: Entry
@@ -54,7 +55,7 @@ class EffectDecision:
 
 @dataclass(frozen=True, slots=True)
 class EffectPlan:
-    """The decision on every effect of the catalogue. changes: the bound on all together that is left out."""
+    """The decision on every effect of the catalogue. changes: the bound for all effects together that are left out."""
 
     planned_for: PlannedFor
     decisions: tuple[EffectDecision, ...]
@@ -85,7 +86,7 @@ def plan_effects(
 
 
 def is_active(name: str, wanted: Wanted) -> bool:
-    """Whether an effect is to be run where the scene calls for it."""
+    """Whether an effect is to be run if the scene calls for it."""
     return wanted in ("planned", "all") or name in wanted
 
 
@@ -120,7 +121,7 @@ def _largest_set(
 
 
 class _Bounds:
-    """Bounds of what may be left out of a model, by evaluation."""
+    """Bounds of what may be left out of a model, found by evaluating its light."""
 
     def __init__(self, model: FluxModel, planes: Array, planned_for: PlannedFor) -> None:
         self._model = model

@@ -1,8 +1,8 @@
-"""A report on the effects of a world: on or off, why, each one's share of the photons, its cost; and a row's flux.
+"""A report on the effects of a world: whether each is on, why, its share of the photons and its cost; and a row's flux.
 
-An effect's light is the flux with it less the flux of the effects before it, so that the effects' lights add up to the
-flux. Costs are medians of one thread's time, measured when asked for: light per column, divided among the frames that
-share it, effects on the bits per whole frame; light that does not depend on the laser is made once for all.
+An effect's light is the flux with it minus the flux of the effects before it, so the effects' lights add up to the
+flux. Costs are medians of one thread's time, measured on request: light per column, divided among the frames that share
+it; effects on bits per whole frame. Light that does not depend on the laser is computed only once.
 """
 
 import time
@@ -31,13 +31,13 @@ SPARSITY = 6
 
 
 def effects_report(world: "SimulatedWorld", *, power_w: float, exposure_s: float, exposures: int) -> dict[str, Any]:
-    """The report for columns of `exposures` frames at a power.
+    """The report for columns of `exposures` frames at a given power.
 
     planned_for: power_w, exposure_s (of a column's frames together) and exposures that the plan holds for.
-    changed_decisions_bound: of all that was left out together. effects: one mapping for each of the catalogue, with
+    changed_decisions_bound: for all effects left out together. effects: one mapping for each of the catalogue, with
     effect, on, why, share (of the detected photons, before saturation, over 16 mirror positions),
-    changed_decisions_bound (None: unknown), removable (whether the world can do without), cost_us_per_frame (None: it
-    is worked in elsewhere).
+    changed_decisions_bound (None: unknown), removable (whether the world can do without it), cost_us_per_frame (None:
+    it is part of another effect).
     """
     plan, model = world.effect_plan, world.flux_model
     photons, laser_us = _light(world, model, power_w * exposure_s, exposure_s, exposures)
@@ -58,7 +58,7 @@ def effects_report(world: "SimulatedWorld", *, power_w: float, exposure_s: float
 def flux_row(
     world: "SimulatedWorld", row: int, command: float, power_w: float, exposure_s: float
 ) -> Mapping[str, Array]:
-    """Photons per exposure (width,) of a row by effect of light or dark counts, zeros for those that are off."""
+    """Photons per exposure (width,) of a row, by effect of light or dark counts; zeros for effects that are off."""
     model, view, limits = world.flux_model, world.setting.view, world.model.scanner.command_range
     (sheets,) = world.fan.sheets(world.model.sheets, np.array([command]), view.rows, [0.0], limits)
     lit: dict[str, Array] = {}

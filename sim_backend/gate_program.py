@@ -1,4 +1,4 @@
-"""The simulated pattern generator's outputs over time: a program of words that the scan marker steps on."""
+"""The simulated pattern generator's outputs over time: a program of words that the scan marker triggers."""
 
 from collections.abc import Callable, Sequence
 
@@ -13,7 +13,7 @@ Trigger = Callable[[float, float], float | None]
 
 
 class GateProgram:
-    """One run of a program from `start_s`. Output levels are known up to the time it was advanced to.
+    """One run of a program from `start_s`. Output levels are known up to the time to which it was advanced.
 
     A word without duration waits while the scan marker is low. After the last repeat all outputs are low.
     """
@@ -30,7 +30,7 @@ class GateProgram:
 
     @property
     def ended(self) -> bool:
-        """Whether the last word is over, as far as the program was advanced."""
+        """Whether the last word is over, at the time to which the program was advanced."""
         return self._words_left == 0
 
     @property
@@ -66,17 +66,19 @@ class GateProgram:
             self._levels.append(level)
 
     def lower_gate(self, at_s: float) -> None:
-        """Take the gate low from `at_s` for the rest of this run; the program plays on."""
+        """Take the gate low from `at_s` for the rest of this run. The program goes on."""
         self._mask = ~OUT_GATE
         self._cut(at_s, lambda level: level & ~OUT_GATE)
 
     def abort(self, at_s: float) -> None:
-        """Take all outputs low at `at_s`."""
+        """End the program at `at_s`, with all outputs low from then on."""
         self._words_left = 0
         self._cut(at_s, lambda level: 0)
 
     def levels(self, from_s: float, until_s: float) -> tuple[Array, NDArray[np.int64]]:
-        """Changes up to until_s, the one that made the level at from_s first: times (n,) and output words (n,)."""
+        """Level changes up to until_s, beginning with the one that set the level at from_s: times (n,) and output words
+        (n,).
+        """
         times = np.array(self._times)
         first = max(int(np.searchsorted(times, from_s, side="right")) - 1, 0)
         last = int(np.searchsorted(times, until_s, side="left"))
@@ -87,7 +89,7 @@ class GateProgram:
         return at, words
 
     def forget(self, before_s: float) -> None:
-        """Drop history that nobody will ask for any more."""
+        """Drop history before `before_s`, which nobody will ask for any more."""
         keep = 0
         while keep + 1 < len(self._times) and self._times[keep + 1] <= before_s:
             keep += 1
@@ -105,7 +107,7 @@ def gate_shares(
 ) -> tuple[Array, NDArray[np.bool_]]:
     """Part of each exposure (n,) with the gate high, and whether the gate changed during it.
 
-    times, words: (m,), outputs from each time on; the first is not after the first exposure's start.
+    times, words: (m,), outputs from each time on. The first time must not be later than the first exposure's start.
     """
     high = (words & OUT_GATE) != 0
     changes = times[1:][np.diff(high.astype(np.int8)) != 0]

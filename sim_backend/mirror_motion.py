@@ -1,7 +1,7 @@
 """The motion of the simulated mirror and the levels of the scanner's marker outputs, at any time.
 
-The command passes the value of point i at the start of point i and runs straight to the next one; the mirror follows it
-by the lag of the direction it runs in. Marker outputs have no lag. A real mirror also shakes. Times are seconds of the
+The command has the value of point i at the start of point i and goes linearly to the next one. The mirror follows it
+with the lag of its direction of motion. Marker outputs have no lag. A real mirror also shakes. Times are seconds of the
 bench.
 """
 
@@ -23,15 +23,15 @@ JITTER_HOLD_S = 1e-4
 
 @dataclass(frozen=True, slots=True)
 class Jitter:
-    """The mirror's random error: Gaussian, of standard deviation `rms` (in units of the command), a new one every
-    `JITTER_HOLD_S`. Which one depends on seed and time alone.
+    """The mirror's random error: Gaussian with standard deviation `rms` (in units of the command), drawn anew every
+    `JITTER_HOLD_S`. The error depends on seed and time alone.
     """
 
     rms: float
     seed: int
 
     def error(self, time_s: Array) -> Array:
-        """Errors at the times, same shape."""
+        """Errors at the given times, of the same shape."""
         if self.rms == 0:
             return np.zeros(time_s.shape)
         step = np.floor(time_s / JITTER_HOLD_S).astype(np.int64).view(np.uint64)
@@ -47,8 +47,8 @@ class Jitter:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Playing:
-    """A waveform played from `start_s` at `rate_hz` (the true rate, clock error included), then rest at its last
-    point.
+    """A waveform that is played from `start_s` at `rate_hz` (the true rate, clock error included), then rests at its
+    last point.
     """
 
     waveform: ScanWaveform
@@ -64,7 +64,7 @@ class Playing:
         return self.start_s + self.repeats * len(self.waveform.command) / self.rate_hz
 
     def mirror(self, time_s: Array) -> Array:
-        """Mirror position as the command it stands at, float64, same shape as the times; lag included."""
+        """Mirror position as a command, lag included, float64 of the same shape as the times."""
         forward = self._command(time_s - self.lag_forward_s)
         if self.lag_forward_s == self.lag_backward_s:
             return forward
@@ -76,8 +76,8 @@ class Playing:
         return self._high(LEVEL_BACKWARD, time_s)
 
     def first_high(self, bit: int, from_s: float, until_s: float) -> float | None:
-        """First time in [from_s, until_s) at which a marker output is high: at once where it is high then, else at its
-        next rising edge. None: it stays low.
+        """First time in [from_s, until_s) at which a marker output is high, which is from_s if it is high then. None if
+        it stays low.
         """
         if from_s < until_s and self._high(bit, np.array([from_s]))[0]:
             return from_s
@@ -94,7 +94,7 @@ class Playing:
     def edges(self, bit: int, from_s: float, until_s: float) -> Array:
         """Times of the rising edges of a marker output in [from_s, until_s), ascending.
 
-        A bit that stays high over several points is one edge, over the seam as well.
+        A bit that stays high over several points, or over the seam between repeats, makes one edge.
         """
         points = len(self.waveform.command)
         high = (self.waveform.markers & bit) != 0
@@ -109,7 +109,7 @@ class Playing:
         return times[(times >= from_s) & (times < until_s)]
 
     def moving(self, time_s: float) -> bool:
-        """Whether the last point has still to be played; a waveform counts as under way before its start already."""
+        """Whether the last point has still to be played. A waveform counts as under way even before its start."""
         return time_s < self.end_s
 
     def _command(self, time_s: Array) -> Array:
@@ -123,6 +123,6 @@ class Playing:
 
 
 def resting(command: float) -> Playing:
-    """A mirror that stands still: a waveform of one point, played no times."""
+    """A mirror that stands still: a waveform of one point with no repeats."""
     waveform = ScanWaveform(np.array([command]), np.zeros(1, np.uint8), Fraction(1))
     return Playing(waveform, 0, start_s=0.0, rate_hz=1.0, lag_forward_s=0.0, lag_backward_s=0.0)

@@ -1,22 +1,23 @@
 """Random bits and exponentials for compiled kernels.
 
-Random bits are counters enciphered by rounds of AES, which processors have instructions for. Counter-based numbers need
+Random bits are counters enciphered by rounds of AES, for which processors have instructions. Counter-based numbers need
 no state and no order (Salmon, Moraes, Dror, Shaw, "Parallel random numbers: as easy as 1, 2, 3", SC 2011).
 `counter_bits` is their ARS-5, which passes BigCrush there: five rounds whose keys step by a Weyl sequence (the last one
 mixes columns like the others, a bijection). Its 128 bits are the key of a few rows of a frame, under which `drawn_word`
-enciphers the numbers of blocks of 8 pixels with three rounds more. Block numbers of one key differ in a few bytes,
-which two rounds spread over all 16; after the third, bytes of two blocks agree as often as chance would have it, within
-1e-7. For single numbers that follow from a seed and a place there is SplitMix64 (Steele, Lea, Flood 2014).
+enciphers the numbers of blocks of 8 pixels with three more rounds. Block numbers of one key differ in a few bytes,
+which two rounds spread over all 16; after the third, bytes of two blocks agree as often as by chance, within 1e-7.
+Single numbers that follow from a seed and a place use SplitMix64 (Steele, Lea, Flood 2014).
 
-One AES round of 256 bits takes one cycle on x86 with VAES, two with AES-NI or on 64-bit ARM. Elsewhere it is table
-look-ups: the same bits, many times as slow.
+One AES round of 256 bits takes one cycle on x86 with VAES, two with AES-NI or on 64-bit ARM. Elsewhere table look-ups
+give the same bits, many times as slowly.
 
-Exponentials are straight-line, so that loops over them become vector instructions; libm's are calls. With k = round(t)
-and f = k - t, |f| <= 1/2:  2^-t = 2^-k 2^f, the latter by its Taylor series. Relative error against 50 digits:
-`power_of_half` 3e-13 (series to f^10) and what rounding t brings, `one_minus_exp_minus` 4e-16 (to r^13, with r = f ln 2
-in two parts). `one_minus_exp_minus_32` is for where six digits will do, in float32. The numbers that loops need come
-as a tuple that the kernel's caller hands over (`HALVING`, `ROUGHLY`): constants that it knows LLVM fetches anew
-for every vector, 24 of 59 instructions of a loop over `power_of_half`.
+Exponentials are written without branches or calls, so that loops over them become vector instructions. With
+k = round(t) and f = k - t, |f| <= 1/2:  2^-t = 2^-k 2^f, the latter by its Taylor series. Relative error against 50
+digits: for `power_of_half` 3e-13 (series to f^10) and the effect of rounding t; for `one_minus_exp_minus` 4e-16 (to
+r^13, with r = f ln 2 in two parts). `one_minus_exp_minus_32` is a float32 version for uses where six digits suffice.
+The numbers that loops need come as a tuple from the kernel's caller (`HALVING`, `ROUGHLY`). If they were constants,
+LLVM
+would load them anew for every vector: 24 of the 59 instructions of a loop over `power_of_half`.
 """
 
 import math
@@ -95,7 +96,7 @@ def _table(builder: Any) -> Any:
 
 
 def round_by_table(builder: Any, state: Any, key: Any) -> Any:
-    """One AES round of 128 bits without instructions for it."""
+    """One AES round of 128 bits by table look-ups, for processors without AES instructions."""
     table, given = _table(builder), builder.bitcast(state, _BYTES)
     mixed = ir.Constant(_COLUMNS, ir.Undefined)
     for column in range(4):
@@ -109,7 +110,7 @@ def round_by_table(builder: Any, state: Any, key: Any) -> Any:
 
 
 def round_by_arm(builder: Any, state: Any, key: Any) -> Any:
-    """One AES round of 128 bits on 64-bit ARM, which adds the key first."""
+    """One AES round of 128 bits on 64-bit ARM, whose instruction adds the key first."""
     given, nothing = builder.bitcast(state, _BYTES), ir.Constant(_BYTES, [0] * 16)
     substituted = _call(builder, "llvm.aarch64.crypto.aese", _BYTES, given, nothing)
     mixed = _call(builder, "llvm.aarch64.crypto.aesmc", _BYTES, substituted)
@@ -182,14 +183,14 @@ def _levels_at(builder: Any, address: Any) -> list[Any]:
 
 @numba.njit(cache=True)
 def block_numbers(words: int) -> NDArray[np.uint64]:
-    """Block numbers that `drawn_word` takes for each word of a row, uint64 (words, 16): that of each block, twice."""
+    """The block numbers that `drawn_word` takes for each word of a row, uint64 (words, 16): each block's number twice."""
     shape = words, 2 * WORD_PX // BLOCK_PX
     return np.repeat(np.arange(words * WORD_PX // BLOCK_PX), 2).astype(np.uint64).reshape(shape)
 
 
 @_intrinsic
 def drawn_word(typing: Any, key: Any, blocks: Any, levels: Any) -> _Code:
-    """drawn_word(key, blocks, levels): bits of 64 pixels, each 1 where its 16 random bits are above its level.
+    """drawn_word(key, blocks, levels): bits of 64 pixels, each 1 if its 16 random bits are above its level.
 
     key: two uint64. blocks: address of the word's `block_numbers`. levels: address of 64 int16 in the order `PLACE`,
     each 32767 minus 65536 times a probability.
@@ -213,7 +214,7 @@ def drawn_word(typing: Any, key: Any, blocks: Any, levels: Any) -> _Code:
 
 @_intrinsic
 def full_word(typing: Any, levels: Any) -> _Code:
-    """full_word(levels): bits of the pixels of a word whose level is the lowest, -32768; levels as in `drawn_word`."""
+    """full_word(levels): bits of a word, 1 for pixels with the lowest level, -32768. levels: as in `drawn_word`."""
 
     def code(context: Any, builder: Any, signature: Any, args: Any) -> Any:
         lowest = ir.Constant(_PIXELS, [-0x8000] * _VECTOR_PX)
@@ -224,8 +225,9 @@ def full_word(typing: Any, levels: Any) -> _Code:
 
 @_intrinsic
 def place_levels(typing: Any, values: Any, levels: Any) -> _Code:
-    """place_levels(values, levels): copy the levels of 64 pixels in their own order, at the first address, to the order
-    `PLACE` at the second."""
+    """place_levels(values, levels): copy the levels of 64 pixels from the first address, where they lie in pixel order,
+    to the second, in the order `PLACE`.
+    """
 
     def code(context: Any, builder: Any, signature: Any, args: Any) -> Any:
         word = ir.VectorType(_I16, WORD_PX)
@@ -247,7 +249,9 @@ _S27, _S30, _S31 = np.uint64(27), np.uint64(30), np.uint64(31)
 
 
 def mixed(z: Any) -> Any:
-    """64 bits, uint64 alone or as an array, each of which depends on all of z. Products wrap: see numpy's errstate."""
+    """64 bits, a uint64 or an array of them, each of which depends on all bits of z. Products wrap: see numpy's
+    errstate.
+    """
     z = (z ^ (z >> _S30)) * _MIX_1
     z = (z ^ (z >> _S27)) * _MIX_2
     return z ^ (z >> _S31)
@@ -299,7 +303,7 @@ def _power_of_half(typing: Any, rounded: Any) -> _Code:
 
 @numba.njit(inline="always", error_model="numpy")
 def power_of_half(t, halving):  # type: ignore[no-untyped-def]
-    """2^-t of a t >= 0; halving: `HALVING` of its precision."""
+    """2^-t for t >= 0. halving: `HALVING` of its precision."""
     most, rounder, e0, e1, e2, e3, e4, e5, e6, e7, e8, e9, e10 = halving
     t = min(t, most)
     rounded = t + rounder
@@ -312,7 +316,7 @@ def power_of_half(t, halving):  # type: ignore[no-untyped-def]
 
 @numba.njit(inline="always", error_model="numpy")
 def one_minus_exp_minus(t):  # type: ignore[no-untyped-def]
-    """1 - exp(-t) of a t >= 0, to the same relative error however small t is."""
+    """1 - exp(-t) for t >= 0, with the same relative error however small t is."""
     t = min(t, LARGEST)
     rounded = t * LOG2_E + _ROUNDER
     k = rounded - _ROUNDER
@@ -327,7 +331,7 @@ def one_minus_exp_minus(t):  # type: ignore[no-untyped-def]
 
 @numba.njit(inline="always", error_model="numpy")
 def one_minus_exp_minus_32(t, roughly):  # type: ignore[no-untyped-def]
-    """1 - exp(-t) of a float32 t >= 0 as float32, within 3e-7; roughly: `ROUGHLY`."""
+    """1 - exp(-t) for a float32 t >= 0, as float32, within 3e-7. roughly: `ROUGHLY`."""
     largest, log2_e, rounder, ln2, one, d2, d3, d4, d5, d6 = roughly
     t = min(t, largest)
     rounded = t * log2_e + rounder

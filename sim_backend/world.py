@@ -1,4 +1,4 @@
-"""The simulated world: a scene in front of a rig, the bench its devices stand on, and the truth of a sweep."""
+"""The simulated world: a scene in front of a rig, the bench that its devices share, and the truth of a sweep."""
 
 from collections.abc import Mapping, Sequence
 from functools import cached_property
@@ -53,7 +53,7 @@ def _known_fog(fog: object) -> object:
 
 
 class CommandGridConfig(Section):
-    """Mirror commands of the first and last column's centre, and the number of columns."""
+    """Number of columns, and the mirror commands at the centres of the first and the last."""
 
     first: float
     last: float
@@ -87,7 +87,7 @@ class WorldConfig(KindConfig):
 
     @property
     def has_board(self) -> bool:
-        """Whether there is a calibration board in the scene. DeviceError where the scene cannot be read."""
+        """Whether the scene contains a calibration board. Raises DeviceError if the scene cannot be read."""
         return bool(load_scene(self.scene)[0].boards)
 
 
@@ -95,7 +95,7 @@ class SimulatedWorld:
     """One scene, one rig, one bench. Reading is safe from any thread."""
 
     def __init__(self, config: WorldConfig, surroundings: Surroundings) -> None:
-        """DeviceError where the geometry, the scene or the focus cannot be used."""
+        """Raises DeviceError if the geometry, the scene or the focus cannot be used."""
         self.config = config
         wrong: list[str] = []
         try:
@@ -137,9 +137,9 @@ class SimulatedWorld:
             self.hold_columns(np.linspace(grid.first, grid.last, grid.columns))
 
     def plan_for(self, power_w: float, exposure_s: float, exposures: int) -> None:
-        """Choose the effects for frames of that exposure, so many to a column, at that power or less.
+        """Choose the effects for columns of `exposures` frames of that exposure, at that power or less.
 
-        To be called before the SPAD is configured; without it they are chosen for `MOST`.
+        Call it before the SPAD is configured. Otherwise the effects are chosen for `MOST`.
         """
         frames = exposures + 1  # as many as a column can get, since the clocks are independent
         # Photons of several lines add up: what can be left out of one with all their power can be left out of each.
@@ -150,7 +150,7 @@ class SimulatedWorld:
 
     @property
     def effect_plan(self) -> EffectPlan:
-        """The effects that are simulated and why, decided when first asked for: the devices are there by then."""
+        """The effects that are simulated and why. Decided when first asked for, after the devices have been made."""
         return self._plan()[0]
 
     @property
@@ -175,32 +175,36 @@ class SimulatedWorld:
         return self.model.camera.height, self.model.camera.width
 
     def project_lines(self, offsets: Sequence[float], *, shared: bool) -> None:
-        """Send out a line at each of these offsets (in units of the mirror command) from where a single one would be.
+        """Project several lines, each at one of these offsets (in units of the mirror command) from where a single line
+        would be.
 
-        shared: they share the laser's power; else each has all of it. To be called before the SPAD is configured.
+        shared: whether they share the laser's power; else each has all of it. Call it before the SPAD is configured.
         """
         self.fan = LineFan(tuple(offsets), 1 / len(offsets) if shared else 1.0)
 
     def hold_columns(self, commands: Array) -> None:
-        """Hold the flux in columns of these mirror commands (columns,): all frames of a column share one p.
+        """Hold the flux constant within columns at these mirror commands (columns,): all frames of a column share one
+        p.
 
-        To be called before the run; without it the stripe moves within a column, as the mirror does.
+        Call it before the run. Otherwise the stripe moves within a column, as the mirror does.
         """
         self.grid = column_grid(commands, self.model.scanner.command_range)
 
     def cover_lens(self) -> None:
-        """Let no more light in: what is left is the sensor's own, none of it left out however little it would matter.
+        """Let no more light in. Only the sensor's own counts are left, and none of its effects is left out, however
+        small.
 
-        To be called before the SPAD is configured; for good.
+        Call it before the SPAD is configured; it cannot be undone.
         """
         kept = [entry for entry in CATALOGUE if entry.of_sensor or entry.kind == "bits"]
         wanted = [e for e in kept if e.called(self.setting)[0] and is_active(e.name, self.config.effects)]
         self._planned = self._plan()[0], FluxModel(self.setting, wanted)
 
     def mirror_positions(self, state: BenchState, period_s: float) -> Array:
-        """Mirror positions whose light n frames see, one period apart, (n,): those of the columns, with the mirror's
-        jitter; or, where rows are exposed one after the other, (n, 2) of the first and the last row. NaN past the ends
-        of the grid.
+        """Mirror positions (n,) whose light n frames see, one period apart: those of the columns, with the mirror's
+        jitter.
+
+        If rows are exposed one after the other, (n, 2) for the first and the last row. NaN outside the grid.
         """
         low, high = self.model.scanner.command_range
         first = self.grid.hold(state.mirror, state.velocity_per_s * period_s) + state.jitter
@@ -215,13 +219,13 @@ class SimulatedWorld:
         return self.model.row_delay_s * (self.size[0] - 1)
 
     def true_model(self) -> RigModel:
-        """The rig as it really is: what a calibration should find."""
+        """The rig as it really is, which is what a calibration should find."""
         return self.model
 
     def truth(self, commands: Array, velocity_per_s: float = 0.0) -> SweepTruth:
-        """The true place of the stripe for each column (commands (columns,)), and the depth of every pixel.
+        """The true position of the stripe for each column (commands (columns,)), and the depth of every pixel.
 
-        velocity_per_s: of the command. Where surfaces move, the truth is that of the bench's time 0, before they did.
+        velocity_per_s: of the command. If surfaces move, the truth is that of the bench's time 0, before they moved.
         """
         view = self.setting.view.at(0.0)
         x_px = np.full((view.rows, len(commands)), np.nan, np.float32)
@@ -243,7 +247,7 @@ class SimulatedWorld:
         return effects_report(self, power_w=power_w, exposure_s=exposure_s, exposures=exposures)
 
     def flux_row(self, row: int, command: float, power_w: float, exposure_s: float) -> Mapping[str, Array]:
-        """Noise-free photons per exposure of an image row's pixels by effect, at a command of the mirror."""
+        """Noise-free photons per exposure of an image row's pixels, by effect, at a mirror command."""
         from sim_backend.effects_report import flux_row
 
         return flux_row(self, row, command, power_w, exposure_s)
@@ -283,13 +287,13 @@ def _load_geometry(path: Path) -> RigModel:
 
 
 def bench_of(surroundings: Surroundings) -> Bench:
-    """The shared bench; without a simulated world a bench nobody else sees, for a single device among real ones."""
+    """The shared bench. Without a simulated world, a new bench, for a single simulated device among real ones."""
     world = surroundings.world
     return world.bench if isinstance(world, SimulatedWorld) else Bench(surroundings.clock, Lag())
 
 
 def note_effect(surroundings: Surroundings, effect: str, why: str) -> None:
-    """Tell the world that a device has an effect of its own, one of the catalogue's of kind `within`, and which."""
+    """Tell the world that a device has an effect of its own, namely one of kind `within` in the catalogue, and why."""
     if isinstance(surroundings.world, SimulatedWorld):
         surroundings.world.setting.devices[effect] = why
 

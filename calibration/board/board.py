@@ -1,11 +1,12 @@
 """The calibration board, a ChArUco board or a plain chessboard, and its file.
 
 Board coordinates in metres: x right, y down, z into the board, origin at the top left corner of the top left square,
-which is black. The inner corners are numbered row by row, as cv2.aruco.CharucoBoard does. The board's file holds what
-was printed, lengths as text with a unit.
+which is black. The inner corners are numbered row by row, as in cv2.aruco.CharucoBoard. The board's file holds what was
+printed, with lengths as text with a unit.
 
-A chessboard looks the same from more than one side. Only with an even number of squares along both sides, and not the
-same number, does its mirror image differ; only with one of the two even can it be told from itself upside down.
+A chessboard can look the same in more than one orientation. Its mirror image differs only if the numbers of squares
+along both sides are even and not equal. Turned by 180 degrees it differs only if exactly one of the two numbers is
+even.
 """
 
 import os
@@ -68,11 +69,12 @@ _MOST_SQUARES = 100
 
 @dataclass(frozen=True, slots=True)
 class Board:
-    """A printed board: squares along (x, y), their side in metres and, on a ChArUco board, the side of its markers.
+    """A printed board: number of squares along (x, y), their side in metres and, on a ChArUco board, the side of its
+    markers.
 
-    dictionary: a name of OpenCV's, such as DICT_5X5_100. modules: (squares down, across, side, side), True where a
-    marker is black, its border included; empty squares are False. Raises CalibrationError on a board that cannot be
-    printed.
+    dictionary: the name of an OpenCV dictionary, such as DICT_5X5_100. modules: (squares down, across, side, side),
+    True where a marker is black, its border included; squares without a marker are False. Raises CalibrationError for a
+    board that cannot be printed.
     """
 
     kind: Literal["charuco", "chessboard"]
@@ -106,14 +108,14 @@ class Board:
 
     @property
     def corners_m(self) -> Array:
-        """(n, 3) float64 inner corners in the order of their ids; z = 0."""
+        """(n, 3) float64, inner corners in the order of their ids; z = 0."""
         across, down = self.grid
         y, x = np.mgrid[1 : down + 1, 1 : across + 1] * self.square_m
         return np.stack([x.ravel(), y.ravel(), np.zeros(x.size)], axis=-1)
 
     @property
     def grid(self) -> tuple[int, int]:
-        """Inner corners along (x, y)."""
+        """Number of inner corners along (x, y)."""
         return self.squares[0] - 1, self.squares[1] - 1
 
     @property
@@ -122,7 +124,9 @@ class Board:
         return self.squares[0] * self.square_m, self.squares[1] * self.square_m
 
     def albedo_at(self, x_m: ArrayLike, y_m: ArrayLike) -> Array:
-        """Reflectance at board positions (broadcast together); white paper around the squares, NaN off the paper."""
+        """Reflectance at board positions (broadcast together): white on the paper around the squares, NaN off the
+        paper.
+        """
         x, y = np.broadcast_arrays(np.asarray(x_m, np.float64), np.asarray(y_m, np.float64))
         x, y = x / self.square_m, y / self.square_m
         across, down = self.squares
@@ -135,7 +139,7 @@ class Board:
         return np.where(paper, np.where(inside & black, BLACK, WHITE), np.nan)
 
     def picture(self, px_per_square: int) -> NDArray[np.uint8]:
-        """The board with its white margin, 0 for black and 255 for white: to print, at any number of pixels."""
+        """The board with its white margin as a picture for printing, 0 for black and 255 for white."""
         side = 1 + 2 * MARGIN_SQUARES / np.array(self.squares)
         width, height = (np.round(side * self.squares * px_per_square)).astype(int)
         x = ((np.arange(width) + 0.5) / px_per_square - MARGIN_SQUARES) * self.square_m
@@ -143,7 +147,7 @@ class Board:
         return np.where(self.albedo_at(x, y[:, None]) > BLACK, np.uint8(255), np.uint8(0))
 
     def charuco(self) -> cv2.aruco.CharucoBoard:
-        """OpenCV's object for this board. CalibrationError for a chessboard."""
+        """OpenCV's object for this board. Raises CalibrationError for a chessboard."""
         if self.dictionary is None or self.marker_m is None:
             raise CalibrationError("a chessboard has no markers to look for; set kind: charuco")
         return cv2.aruco.CharucoBoard(self.squares, self.square_m, self.marker_m, _dictionary(self.dictionary))
@@ -185,7 +189,7 @@ class Board:
 
 
 def load_board(path: str | os.PathLike[str] = BUNDLED_BOARD) -> Board:
-    """The board that a YAML file describes. Raises CalibrationError, one line, where it describes none."""
+    """The board that a YAML file describes. Raises CalibrationError, with one line, if the file describes none."""
     file = Path(path)
     read = load_yaml(file, "a board", "kind: charuco")
     parsed = validated(BoardFile, read.content, ValueSources(str(file), read.lines))

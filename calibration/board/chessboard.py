@@ -1,14 +1,13 @@
-"""Finds a plain chessboard in a picture: OpenCV finds a grid, the squares around it say whether it is the board.
+"""Finds a plain chessboard in a picture. OpenCV finds a grid; the squares around it tell whether it is the board.
 
-OpenCV finds the grid that it is asked for in any larger print, and now and then in a smaller one, with corners that are
-none. So a grid counts as the board only where its print has as many corners as the board, no fewer and no more, as far
-as the picture shows.
+OpenCV finds the grid that it is asked for in any larger print too, and sometimes in a smaller one, with false corners.
+So a grid counts as the board only if its print has exactly as many corners as the board, as far as the picture shows.
 
-Where four squares meet, the light changes across the line between them above the corner and, the other way round, below
-it; along a row of corners the change turns about from one to the next. A row that was only guessed, or that lies on the
-edge of the print, shows no such change on its outer side, and one that follows outside the grid does. So a grid is cut
-down to the corners that are there, and grows while more of them follow (`known_lattice`). What lies outside the picture
-is not known.
+Where four squares meet, the light changes across the line between them, above the corner in one direction and below it
+in the other; along a row of corners the direction alternates. A row that was only guessed, or that lies on the edge of
+the print, shows no such change on its outer side. A row that continues outside the grid does show it. So a grid is cut
+down to the real corners, and extended while more of them follow (`known_lattice`). What lies outside the picture is
+unknown.
 """
 
 import itertools
@@ -44,9 +43,9 @@ _MOST = 100
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Lattice:
-    """Corners of a chessboard as far as they are seen.
+    """Corners of a chessboard as far as they are visible.
 
-    px: (down, across, 2) raw pixels. beyond: of its upper, right, lower and left side, the change of light in the next
+    px: (down, across, 2) raw pixels. beyond: for its upper, right, lower and left side, the change of light in the next
     row of squares as a share of the usual one; NaN where the picture does not show it.
     """
 
@@ -55,24 +54,26 @@ class Lattice:
 
     @property
     def grid(self) -> tuple[int, int]:
-        """Corners along (x, y)."""
+        """Number of corners along (x, y)."""
         return self.px.shape[1], self.px.shape[0]
 
     @property
     def least(self) -> tuple[int, int]:
-        """Corners along (x, y), counting rows that are seen to follow but could not be placed."""
+        """Smallest possible number of corners along (x, y), counting rows that follow but could not be located."""
         upper, right, lower, left = (change >= _GOES_ON for change in self.beyond)
         return self.px.shape[1] + left + right, self.px.shape[0] + upper + lower
 
     @property
     def known(self) -> tuple[bool, bool]:
-        """Whether the number along (x, y) is the print's: it is seen to end on both sides."""
+        """Whether the number along (x, y) is that of the whole print, because its end is visible on both sides."""
         upper, right, lower, left = (change < _GOES_ON for change in self.beyond)
         return left and right, upper and lower
 
 
 def known_lattice(picture: Picture, px: Array) -> Lattice | None:
-    """The corners that are there, from a grid (down, across, 2) some too many or too few; None: no chessboard there."""
+    """The real corners, from a grid (down, across, 2) that may have some too many or too few; None if it is no
+    chessboard.
+    """
     cut = _cut_down(picture, px)
     if cut is None:
         return None
@@ -86,8 +87,11 @@ def known_lattice(picture: Picture, px: Array) -> Lattice | None:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class _Seen:
-    """usual: change across a line, positive where the top left square is black. alike: share of the corners with one
-    like it. own: of the uppermost row, on its outer side, as a share of the usual; NaN where it cannot be seen.
+    """Light around the corners of a grid.
+
+    usual: usual change across a line, positive if the top left square is black. alike: share of the corners that have
+    such a change. own: change on the outer side of the uppermost row, as a share of the usual one; NaN where it is not
+    visible.
     """
 
     usual: float
@@ -149,7 +153,7 @@ def _seen_beyond(picture: Picture, px: Array) -> float:
 
 
 def _change(picture: Picture, board_map: BoardMap, x: NDArray[np.integer], y: NDArray[np.integer], side: int) -> Array:
-    """Light right of a lattice point less that left of it, above (side 1) or below (-1); NaN outside the picture."""
+    """Light right of a lattice point minus that left of it, above (side 1) or below (-1); NaN outside the picture."""
     along, up = np.meshgrid(np.concatenate([-_OFFSETS[::-1], _OFFSETS]), side * _OFFSETS)
     at = np.stack([x[..., None, None] + along, y[..., None, None] - up], axis=-1)
     px = board_map.to_px(at).astype(np.float32).reshape(-1, 2)
@@ -163,7 +167,7 @@ def _change(picture: Picture, board_map: BoardMap, x: NDArray[np.integer], y: ND
 
 
 def _row_above(picture: Picture, px: Array) -> Array | None:
-    """(across, 2) corners above the uppermost row; None where most of them are not found."""
+    """(across, 2) corners above the uppermost row; None if most of them are not found."""
     board_map, seen = _map(px), _seen(picture, px)
     if board_map is None or seen is None:
         return None
@@ -213,7 +217,7 @@ _NOTHING = MatchedPoints(np.zeros((0, 2)), np.zeros((0, 2)), 0)
 
 
 def find_chessboard(shown: Gray, board: Board) -> MatchedPoints:
-    """The board's inner corners, the first at its top left if that can be told; or a part of it, or another board."""
+    """The board's inner corners, beginning at its top left if that can be told; or a part of it, or another board."""
     seen: Lattice | None = None
     for form in FORMS:
         lattice = _lattice(shown, _grid(shown, board, form))

@@ -1,9 +1,9 @@
-"""Finds a board's corners in a picture: from counts summed to flux, noisy as they are, or from an image file.
+"""Finds a board's corners in a noisy picture of flux, from summed counts, or in an image file.
 
-Pixels that cannot be used are filled in from their neighbours first. OpenCV finds the markers, or the chessboard, in
-the picture as it is, enlarged and smoothed, whichever shows most; a smooth map through them says where all corners are,
-and each is then fitted on its own (registration.py). A picture that cannot be used is refused with the reason: no
-board, another one, half of one, its mirror image, two of them.
+Unusable pixels are first filled in from their neighbours. OpenCV looks for the markers, or the chessboard, in the
+picture as it is, enlarged and smoothed, and the version that shows most is used. A smooth map through what it found
+gives the places of all corners, and each corner is then fitted on its own (registration.py). A picture that cannot be
+used is refused with the reason: no board, the wrong board, half of one, its mirror image, or two boards.
 """
 
 from dataclasses import replace
@@ -25,7 +25,7 @@ _REACHES = (1, 2, 4)
 
 
 def repaired(picture: NDArray[np.generic], defects: NDArray[np.bool_] | None = None) -> NDArray[np.float32]:
-    """The picture with defects (True = unusable) and values that are no number replaced by their neighbours' median."""
+    """The picture with defects (True = unusable) and non-finite values replaced by the median of their neighbours."""
     values: NDArray[np.float32] = np.array(picture, dtype=np.float32)
     bad = ~np.isfinite(values)
     if defects is not None:
@@ -62,8 +62,8 @@ _LEAST_OUTLIER_SQUARES = 0.02
 def find_corners(picture: NDArray[np.generic], board: Board, defects: NDArray[np.bool_] | None = None) -> Corners:
     """The board's corners in a picture (height, width), float or uint8; defects: (height, width), True = unusable.
 
-    Raises Degenerate: no-board, wrong-board, board-half-out, mirrored, two-boards. A chessboard shows that it is
-    mirrored only with an even number of squares along both sides, and not the same number. About 0.2 s for 48 corners.
+    Raises Degenerate with no-board, wrong-board, board-half-out, mirrored or two-boards. A chessboard can be seen to be
+    mirrored only if the numbers of squares along both sides are even and not equal. Takes about 0.2 s for 48 corners.
     """
     values = repaired(picture, defects)
     shown = gray(values)

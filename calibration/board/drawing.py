@@ -1,10 +1,10 @@
 """A board drawn for comparison with a picture of it, and a smooth map from the board to the picture.
 
-The map is a homography and, with points enough, a polynomial on top of it for what a lens bends. It needs no camera: it
-is fitted to points whose board positions are known, and says where corners should be and how the board is drawn around
-one. The polynomial is one over the picture and not over the board: a lens bends the picture, by terms that are a
-polynomial there, whatever the board's tilt. Over a tilted board they are none, and fitting one there moves corners by
-less than 0.002 px, but alike in all pictures, which makes focal lengths wrong by 0.025 % at k1 = 0.2.
+The map is a homography and, if there are enough points, a polynomial for the distortion of the lens. It needs no camera
+model. It is fitted to points whose board positions are known, and tells where corners should be and how the board looks
+around each. The polynomial is a function of the position in the picture, not on the board. Lens distortion is a
+polynomial there, whatever the board's tilt; on a tilted board it is not. Fitting it on the board moves corners by less
+than 0.002 px, but equally in all pictures, which makes focal lengths wrong by 0.025 % at k1 = 0.2.
 """
 
 from dataclasses import dataclass
@@ -26,7 +26,7 @@ when drawn 134 to a square, and by 0.0009 px at 256."""
 
 @dataclass(frozen=True, slots=True)
 class Drawing:
-    """The board as drawn for the comparison: white is 1, black 0. margin_px: drawn around the squares."""
+    """The board as drawn for the comparison: white is 1, black 0. margin_px: width of the margin around the squares."""
 
     board: Board
     picture: NDArray[np.float32]
@@ -35,7 +35,9 @@ class Drawing:
 
     @classmethod
     def of(cls, board: Board, px_per_square: float) -> "Drawing":
-        """Draw it, so fine if it can be: every pixel is the white share of its area, exactly."""
+        """Draw the board at this resolution, or as near to it as is possible. Each pixel is exactly the white share of
+        its area.
+        """
         modules = board.modules
         down, across, side, _ = modules.shape
         least, most = _PX_PER_SQUARE
@@ -67,8 +69,10 @@ _LEAST_OUTLIER_PX = 0.3
 
 @dataclass(frozen=True, slots=True, eq=False)
 class BoardMap:
-    """Board positions (metres) to raw pixels. homography: (3, 3) float64, of positions from -1 to 1 over the board.
-    bend_px: (terms, 2) float64, x^i y^j of what it gives, from -1 to 1 over the board's picture.
+    """Maps board positions (metres) to raw pixels.
+
+    homography: (3, 3) float64, for positions scaled to -1..1 over the board. bend_px: (terms, 2) float64, coefficients
+    of x^i y^j of the homography's result, scaled to -1..1 over the board's picture.
     """
 
     homography: Array
@@ -91,7 +95,9 @@ class BoardMap:
 def fit_map(
     points_m: Array, px: Array, outlier_px: float, size_m: tuple[float, float]
 ) -> tuple[BoardMap, NDArray[np.bool_]] | None:
-    """The map through points (n, 2) seen at px (n, 2), and which lie on it within outlier_px; None: no four agree."""
+    """The map through points (n, 2) seen at px (n, 2), and which of them it fits within outlier_px; None if no four
+    agree.
+    """
     if len(points_m) < _FEWEST_POINTS:
         return None
     half = np.array(size_m) / 2

@@ -1,9 +1,9 @@
-"""Checks that markers stand as a board's file says: their places on the lattice of squares, told without their ids.
+"""Checks that markers stand as a board's file says. Their places on the lattice of squares are found without their ids.
 
-A marker's own outline says where the next squares are; from one to the next, all markers of a print get whole numbers
-(column, row). A layout gives each id its place; where another layout than the stated one puts clearly more of the
-markers where they are seen, the print is another board. Ids run row by row over the white squares, from 0 unless
-somebody chose otherwise; OpenCV before 4.6 began boards of an even number of rows with a white square.
+A marker's own outline tells where the neighbouring squares are. Going from one marker to the next gives all markers of
+a print whole-number places (column, row). A layout gives each id its place. If a layout other than the stated one fits
+clearly more of the markers, the print is another board. Ids run row by row over the white squares, starting from 0
+unless chosen otherwise; OpenCV before 4.6 began boards of an even number of rows with a white square.
 """
 
 from collections.abc import Iterator
@@ -47,14 +47,14 @@ class Markers:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class _Layout:
-    """Squares across; white_first: whether the top left one is white; the first marker's id."""
+    """Number of squares across; white_first: whether the top left one is white; the first marker's id."""
 
     across: int
     white_first: bool = False
     first_id: int = 0
 
     def places(self, ids: Places) -> Places:
-        """(n, 2) column and row of markers, those before the first one too."""
+        """(n, 2) column and row of markers, also for ids below the first one."""
         if self.across % 2 == 0:
             row, at = np.divmod(ids - self.first_id, self.across // 2)
             column = 2 * at + (row + (not self.white_first)) % 2
@@ -67,7 +67,7 @@ class _Layout:
 
 
 def contradiction(read: Markers, board: Board, shown: NDArray[np.uint8]) -> str | None:
-    """Words for how the markers read in the picture `shown` do not fit the board; None where they do."""
+    """Text on how the markers read in the picture `shown` do not fit the board; None if they do."""
     assert board.marker_m is not None, "asked of boards with markers"
     placed, lattice = _lattice(read.px, board.marker_m / board.square_m)
     ids, lattice = read.ids[placed], lattice[placed]
@@ -200,7 +200,7 @@ def _ends_early(board: Board, shown: NDArray[np.uint8], px: Array, places: Place
 
 
 def _seen(shown: NDArray[np.uint8], to_lattice: Array, column: Array, row: float) -> Array | None:
-    """The picture at places of the lattice; None where one lies outside."""
+    """The picture at places of the lattice; None if one lies outside."""
     at = np.stack([column, np.full(column.size, row)], axis=-1)[:, None]
     px = np.round(cv2.perspectiveTransform(at, np.linalg.inv(to_lattice))[:, 0]).astype(int)
     height, width = shown.shape
@@ -221,11 +221,11 @@ _DARKEST, _BRIGHTEST = 0.5, 99.5
 
 @dataclass(frozen=True, slots=True, eq=False)
 class MatchedPoints:
-    """Points of the board (n, 2) in metres and where they are seen, (n, 2) raw pixels, about half a pixel.
+    """Points of the board (n, 2) in metres and their places in the picture, (n, 2) raw pixels, to about half a pixel.
 
-    count: markers or corners read. chessboards: how many are in the picture. part: corners along (x, y) of what may be
-    a part of the chessboard. other: how the chessboard that is seen differs from the board. markers: all that were
-    read, the board's and others.
+    count: number of markers or corners read. chessboards: number of chessboards in the picture. part: corners along (x,
+    y) of what may be a part of the chessboard. other: how the visible chessboard differs from the board. markers: all
+    that were read, the board's and others.
     """
 
     points_m: Array
@@ -238,20 +238,20 @@ class MatchedPoints:
     markers: Markers | None = None
 
     def square_px(self, board: Board) -> float:
-        """Side of a square, from the points' spread."""
+        """Side of a square in pixels, from the points' spread."""
         spread_px = np.sqrt(np.prod(np.std(self.px, axis=0)))
         return float(max(spread_px / np.sqrt(np.prod(np.std(self.points_m, axis=0))) * board.square_m, 1.0))
 
 
 def gray(values: NDArray[np.float32]) -> Gray:
-    """The picture from 0 to 255, stretched between its darkest and brightest parts."""
+    """The picture scaled to 0..255 between its darkest and brightest parts."""
     low, high = np.percentile(values, [_DARKEST, _BRIGHTEST])
     span = max(float(high - low), 1e-12)
     return np.asarray(np.clip((values - low) * (255 / span), 0, 255), np.uint8)
 
 
 def find_markers(shown: Gray, board: Board) -> MatchedPoints:
-    """The board's markers; `mirrored` where the mirror image of the picture shows more of them."""
+    """The board's markers. `mirrored` is set if the mirror image of the picture shows more of them."""
     best = _most_markers(shown, board)
     if best.count <= 0.25 * len(board.charuco().getIds()):
         flipped = _most_markers(np.ascontiguousarray(shown[:, ::-1]), board)
@@ -261,7 +261,7 @@ def find_markers(shown: Gray, board: Board) -> MatchedPoints:
 
 
 def as_form(shown: Gray, scale: int, smooth: float) -> Gray:
-    """One of the forms; a pixel of it lies at (x + 0.5) / scale - 0.5 of the picture."""
+    """The picture enlarged and smoothed. Pixel x of the result lies at (x + 0.5) / scale - 0.5 of the picture."""
     smoothed = cv2.GaussianBlur(shown, (0, 0), smooth) if smooth else shown
     if scale == 1:
         return np.asarray(smoothed, np.uint8)

@@ -1,14 +1,15 @@
-"""Corners to a few hundredths of a pixel: the board, drawn as it should look around each, laid over the picture.
+"""Locates corners to a few hundredths of a pixel by matching the board, drawn as it should look around each, to the
+picture.
 
-Around a corner the picture is offset + gain * (1 + slopes) * drawn board, shifted by (dx, dy); the shift that fits
-best says where the corner is. All edges around it, those of the markers included, pull together, so that a picture of
-few photons gives a tenth of the error of cv2.cornerSubPix (docs/how-to/calibration.md). Weighted least squares by
-Gauss-Newton, the variance proportional to the light as photons have it; pixels far off (an unlisted hot pixel) do not
-count.
+Around a corner the picture is offset + gain * (1 + slopes) * drawn board, shifted by (dx, dy); the shift that fits best
+tells where the corner is. All edges around it, those of the markers included, contribute, so a picture of few photons
+gives a tenth of the error of cv2.cornerSubPix (docs/how-to/calibration.md). The fit is weighted least squares by
+Gauss-Newton, with a variance proportional to the light, as for photons. Pixels far off (such as an unlisted hot pixel)
+do not count.
 
-The drawing is bent as the map bends around each corner, and is as fine as what it is compared with: a homography in the
-place of the bend, or edges rounded to drawn pixels, move all corners of a picture alike by some 0.002 px, which no
-number of corners averages out. For the same reason the last fit of each corner looks at pixels of its own.
+The drawing is bent as the map bends around each corner, and is as fine as the picture it is compared with. A homography
+without the bend, or edges rounded to drawn pixels, would move all corners of a picture alike by some 0.002 px, which no
+number of corners averages out. For the same reason the last fit of each corner chooses its own pixels.
 """
 
 from dataclasses import dataclass
@@ -54,7 +55,7 @@ _DRAWING_SD_PX = 0.003
 
 @dataclass(frozen=True, slots=True, eq=False)
 class _Patch:
-    """The drawing around a corner on the pixels x0.. and y0.. of the picture; slopes per pixel of shift."""
+    """The drawing around a corner, on the pixels x0.. and y0.. of the picture. slopes: its change per pixel of shift."""
 
     drawn: Array
     along_x: Array
@@ -63,7 +64,9 @@ class _Patch:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class _Place:
-    """A corner's place: pixel, side of a square, half width of its patch, (4, 4, 2) powers for the drawing's place."""
+    """A corner's surroundings: its pixel, the side of a square, the half width of its patch, and (4, 4, 2) powers that
+    map the picture to the drawing.
+    """
 
     expected_px: Array
     side_px: float
@@ -79,7 +82,10 @@ def register(
     reach: float,
     search: bool,
 ) -> tuple[NDArray[np.int32], Array, Array]:
-    """Corners `ids` in the picture near the map: ids, px (n, 2), sd_px (n,). search: in whole pixels first."""
+    """Fit the corners `ids` near where the map puts them; returns their ids, px (n, 2) and sd_px (n,).
+
+    search: whether to search in whole pixels first.
+    """
     places = _places(drawing, board_map, ids, reach)
     found = [_register_one(picture, drawing, place, search) for place in places]
     good = np.array([one is not None for one in found], np.bool_)
@@ -88,7 +94,7 @@ def register(
 
 
 def sides_px(board: Board, board_map: BoardMap, corners_m: Array) -> Array:
-    """(n,) side of a square around positions (n, 2), in pixels: the shorter one."""
+    """(n,) side of a square around positions (n, 2), in pixels; the shorter one if they differ."""
     step = board.square_m / 2
     ends = board_map.to_px(corners_m[:, None] + np.array([[-step, 0], [step, 0], [0, -step], [0, step]]))
     sides: Array = np.linalg.norm(ends[:, 1::2] - ends[:, ::2], axis=-1).min(axis=1)
@@ -111,7 +117,7 @@ def _places(drawing: Drawing, board_map: BoardMap, ids: NDArray[np.int32], reach
 
 
 def _bent(at: Array, drawn: Array) -> Array | None:
-    """The polynomial from picture to drawing; None where a map gone astray squeezes the board into a line."""
+    """The polynomial from picture to drawing; None if a map gone astray squeezes the board into a line."""
     if not np.isfinite(at).all():
         return None
     i, j = np.array(_POWERS).T
@@ -126,7 +132,7 @@ def _bent(at: Array, drawn: Array) -> Array | None:
 def _register_one(
     picture: NDArray[np.float32], drawing: Drawing, place: _Place, search: bool
 ) -> tuple[float, float, float] | None:
-    """(x, y, sd) of one corner in pixels; None where the picture does not show it."""
+    """(x, y, sd) of one corner in pixels; None if the picture does not show it."""
     expected, side, reach, to_drawing = place.expected_px, place.side_px, place.reach, place.to_drawing
     farthest = _SEARCH_SQUARES * side + 1
     at = expected
@@ -183,7 +189,7 @@ def _draw(drawing: Drawing, place: _Place, to_drawing: Array, shift: Array, box:
 def _best_whole_shift(
     picture: NDArray[np.float32], drawing: Drawing, place: _Place, to_drawing: Array, search: int
 ) -> Array | None:
-    """The shift in whole pixels at which picture and drawing correlate best; None where they do not."""
+    """The shift in whole pixels at which picture and drawing correlate best; None if they do not."""
     x, y = (round(float(value)) for value in place.expected_px)
     height, width = picture.shape
     reach = min(place.reach, x, y, width - 1 - x, height - 1 - y)
@@ -200,7 +206,7 @@ def _best_whole_shift(
 
 
 def _shift(seen: Array, patch: _Patch) -> tuple[float, float, float] | None:
-    """(dx, dy, sd) that brings the drawing onto what is seen; None where the drawing is not there."""
+    """(dx, dy, sd) that brings the drawing onto what is seen; None if the drawing is not there."""
     rows, columns = seen.shape
     x, y = np.linspace(-1, 1, columns), np.linspace(-1, 1, rows)[:, None]
     drawn = patch.drawn

@@ -1,15 +1,17 @@
-"""Contradictions that no one rig can have made: waves of sweeps against each other, shifts of views.
+"""Contradictions that a single unmoved rig cannot produce: differences between sweeps (waves), and shifts between
+views.
 
-While the sweeps of a view were taken nothing moved, so their residuals, binned over the mirror's command, may differ by
-noise and by one constant for each direction (what is left of the lag). The rest are waves that each sweep has on its
-own, the sign of exposures that are not locked to the mirror. A view with a single sweep shows them against its own
-straight line. Medians in bins keep bad passages out.
+Nothing moved while the sweeps of a view were taken. So their residuals, binned over the mirror's command, may differ
+only by noise and by one constant for each direction (the remaining error of the lag). All other differences are waves
+of single sweeps, a sign that exposures are not locked to the mirror. In a view with a single sweep they are measured
+against the sweep's own straight line. Medians in bins keep bad passages out.
 
-A fit of everything may move a board by a millimetre to please the light. With every pose from the corners alone, and
-camera and mirror as fitted, passages lie off the light by what the views disagree: nothing but the noise of the poses
-where one rig saw them all, a shift of each view where camera or mirror moved in between.
+A fit of everything may move a board by a millimetre to fit the light. So each pose is taken from the corners alone,
+with camera and mirror as fitted. The passages are then off the light by what the views disagree on: only the noise of
+the poses if one rig saw them all, and a shift of each view if camera or mirror moved in between.
 
-Where few passages are left, as in bright room light, a mean square is noise: how large it may be is told too.
+If few passages are left, as in bright room light, a mean square is mostly noise; its largest plausible size is returned
+too.
 """
 
 import math
@@ -42,10 +44,11 @@ NOISE_SIGMAS = 4.0
 
 @dataclass(frozen=True, slots=True, eq=False)
 class SweepWaves:
-    """rms: of the waves in command units, noise taken off; NaN where there are too few passages to tell. noise: up to
-    here that may be noise.
+    """Waves of the sweeps of each view.
 
-    command: (BINS,) middles of bins; sweeps: (sweeps, BINS) medians, NaN where there are too few passages.
+    rms: of the waves in command units, without the noise; NaN if there are too few passages. noise: the largest rms
+    that may be noise. command: (BINS,) middles of bins. sweeps: (sweeps, BINS) medians, NaN where there are too few
+    passages.
     """
 
     rms: float
@@ -143,7 +146,7 @@ MOST_UNEXPLAINED = 0.35
 
 @dataclass(frozen=True, slots=True, eq=False)
 class ViewShift:
-    """Shift of one view in command units: median of its passages off the light, and its sd by the pose's noise."""
+    """Shift of one view in command units: the median of its passages off the light, and its sd from the pose's noise."""
 
     name: str
     shift: float
@@ -151,7 +154,7 @@ class ViewShift:
 
 
 def view_shifts(fit: RigFit, views: dict[str, View]) -> tuple[ViewShift, ...]:
-    """The shifts of all views of a fit that have passages; `views` by name."""
+    """The shifts of all views of a fit that have passages. views: by name."""
     model = fit.model
     posed = []
     for name, pose, sweeps in zip(fit.views, fit.poses, fit.sweeps, strict=True):
@@ -162,8 +165,10 @@ def view_shifts(fit: RigFit, views: dict[str, View]) -> tuple[ViewShift, ...]:
 
 
 def common_shift(shifts: tuple[ViewShift, ...], wave: float, sweeps: int) -> float:
-    """Root mean square of views against each other, without the noise of poses and of waves (rms `wave`, in command
-    units, each of `sweeps` sweeps of a view on its own); NaN for fewer than two views.
+    """Root mean square of the differences between views, without the noise of poses and waves; NaN for fewer than two
+    views.
+
+    wave: rms of the waves in command units. sweeps: number of sweeps of a view, each with its own wave.
     """
     if len(shifts) < 2:
         return np.nan
@@ -172,7 +177,7 @@ def common_shift(shifts: tuple[ViewShift, ...], wave: float, sweeps: int) -> flo
 
 
 def shift_noise(shifts: tuple[ViewShift, ...], wave: float, sweeps: int) -> float:
-    """Value up to which a `common_shift` of these may be noise of poses and waves; NaN for fewer than two views."""
+    """The largest `common_shift` of these views that may be noise of poses and waves; NaN for fewer than two views."""
     if len(shifts) < 2:
         return np.nan
     chance = float(np.sqrt(2 * np.sum(_variances(shifts, wave, sweeps) ** 2))) / len(shifts)
@@ -185,14 +190,14 @@ def _variances(shifts: tuple[ViewShift, ...], wave: float, sweeps: int) -> Array
 
 
 def counted(shifts: tuple[ViewShift, ...], outliers: tuple[str, ...], misfit: float = 1.0) -> tuple[ViewShift, ...]:
-    """The shifts that have to agree: all but a single outlier, unless it is the last or the others do not fit."""
+    """The shifts that have to agree. A single outlier is left out, unless it is the last view or the others do not fit."""
     if len(outliers) != 1 or not shifts or shifts[-1].name in outliers or misfit > MOST_MISFIT:
         return shifts
     return tuple(one for one in shifts if one.name not in outliers)
 
 
 def last_before_move(shifts: tuple[ViewShift, ...]) -> str | None:
-    """The view after which the rig moved, where one move between two views explains most of the shifts; else None."""
+    """The view after which the rig moved, if one move between two views explains most of the shifts; else None."""
     values = np.array([one.shift for one in shifts])
     if len(values) < _FEWEST_TO_SPLIT:
         return None

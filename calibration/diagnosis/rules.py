@@ -1,21 +1,22 @@
 """Is a calibration good enough, and if not, why: the evidence, and a verdict whose limits are depth errors.
 
-Each number of the evidence speaks for one way to go wrong: how many poses there were, how far they were tilted, how
-large the board was seen, how much of the picture it reached, how bright the room was, how long the baseline came out.
+Each number of the evidence reveals one possible mistake: how many poses there were, how far they were tilted, how large
+the board appeared, how much of the picture it reached, how bright the room was, how long the baseline came out.
 
-A calibration passes where the depth error that its covariance predicts is at most what was asked for, and where its
-data agree with each other and with what is known of the rig. The first reason is the root cause. Their order:
+A calibration passes if the depth error that its covariance predicts is at most what was asked for, and if its data
+agree with each other and with what is known of the rig. The first reason is the root cause. The order of reasons is:
 
-1. Causes of faults that are not there: room light that drowns the line, boards too far away to be placed.
-2. Data that no one rig can have made (planes that wave, a rig that moved): nothing else can be believed then.
-3. A baseline other than the stated one: everything is in proportion, only too large or too small.
-4. Data that say too little (room light, too few poses, no tilt, boards too far, corners in a part of the picture only):
-   a likely cause where the predicted error is too large; and where the covariance promises enough, but by the model
-   alone, with next to nothing left to check the model by.
+1. Conditions that make other faults appear: room light that hides the line, boards too far away to be located.
+2. Data that no single rig can have produced (waves, a rig that moved), since nothing else can be believed then.
+3. A baseline that differs from the stated one: the whole scene is then too large or too small.
+4. Too little data (room light, too few poses, no tilt, boards too far away, corners in only a part of the picture).
+This is a likely cause if the predicted error is too large. It also counts if the covariance is small enough, but only
+because of the model, and almost no data are left to check the model by.
 
-Where the error is too large and the data have none of these faults, there are simply too few of them. Last comes what
-the predicted error does not show: sweeps whose directions and speeds told no lag for one of the ways that a scan may
-go.
+If the error is too large and the data have none of these faults, there are simply too few of them. Last come faults
+that
+the predicted error does not show: sweeps whose directions and speeds do not determine a lag for a direction of the
+scan.
 """
 
 import math
@@ -44,12 +45,12 @@ _WHITE_PERCENT = 75
 
 @dataclass(frozen=True, slots=True)
 class ViewEvidence:
-    """Evidence of the views before anything is fitted; NaN where nothing tells.
+    """Evidence from the views before anything is fitted; NaN if unknown.
 
-    shown: number of poses. used: those of them that a fit can be checked by: with corners, and where a line is asked
-    for with the line on the board too. coverage: share of the picture within the outline of all corners. room_flux:
-    photons per pixel and exposure of white on the board (of the bright parts of the picture where there is no board),
-    median over the views. odd: names of those that do not fit the others and had no say.
+    shown: number of poses. used: number of them that can check a fit: with corners and, if the line is asked for, with
+    the line on the board. coverage: share of the picture within the outline of all corners. room_flux: photons per
+    pixel and exposure of white on the board (of the bright parts of the picture if there is no board), median over the
+    views. odd: names of views that do not fit the others and were not used.
     """
 
     shown: int
@@ -61,7 +62,9 @@ class ViewEvidence:
 
 @dataclass(frozen=True, slots=True)
 class PoseEvidence:
-    """Poses: largest angle between two boards, median distance, median angle that a board's longer side takes."""
+    """Evidence from the poses: largest angle between two boards, median distance, median angle that a board's longer
+    side fills.
+    """
 
     tilt_rad: float
     distance_m: float
@@ -71,8 +74,9 @@ class PoseEvidence:
 def view_evidence(
     views: Sequence[View], size: tuple[int, int], used: int, left_out: Collection[str] = ()
 ) -> ViewEvidence:
-    """Look at the views alone; size: (width, height) of the picture. used: as in the evidence. left_out: names of those
-    whose corners had no say.
+    """The evidence from the views alone. size: (width, height) of the picture. used: as in `ViewEvidence`.
+
+    left_out: names of views whose corners were not used.
     """
     counted = [view.corners for view in views if view.name not in left_out and view.corners is not None]
     found = [corners for corners in counted if len(corners.ids) > 2]
@@ -88,7 +92,7 @@ def view_evidence(
 
 
 def pose_evidence(poses: Sequence[BoardPose], board: Board) -> PoseEvidence:
-    """Look at where a fit found the boards."""
+    """The evidence from the poses at which a fit found the boards."""
     if not poses:
         return PoseEvidence(np.nan, np.nan, np.nan)
     middle = np.array([board.size_m[0] / 2, board.size_m[1] / 2, 0.0])
@@ -101,7 +105,7 @@ def pose_evidence(poses: Sequence[BoardPose], board: Board) -> PoseEvidence:
 
 
 def rough_poses(views: Sequence[View], board: Board, camera: Camera) -> list[BoardPose]:
-    """Poses of the boards by a camera that is known only roughly; views that give none are left out."""
+    """Poses of the boards from a camera that is known only roughly. Views without a pose are left out."""
     found = []
     for view in views:
         if view.corners is None or len(view.corners.ids) < FEWEST_CORNERS:
@@ -114,7 +118,7 @@ def rough_poses(views: Sequence[View], board: Board, camera: Camera) -> list[Boa
 
 
 def baseline_m(scanner: Scanner) -> float:
-    """Distance of the camera from the axis that the line turns about; NaN where the scanner is a table of planes."""
+    """Distance of the camera from the axis about which the line turns; NaN if the scanner is a table of planes."""
     return float(np.linalg.norm(fan_origin(scanner, None))) if isinstance(scanner, PivotScanner) else math.nan
 
 
@@ -164,9 +168,10 @@ on room light costs more than half of what a frame can tell of the line."""
 def data_lack(
     views: ViewEvidence, poses: PoseEvidence | None, *, imprecise: bool, photons: bool = True
 ) -> list[Reason]:
-    """Reasons why the data are too few, those of `hiding` left aside; stricter where the result is not precise enough.
+    """Reasons why the data are too few, except those of `hiding`.
 
-    poses: None where nothing tells. photons: whether pictures count photons; those from files do not.
+    imprecise: whether the result is not precise enough, which makes the limits stricter. poses: None if unknown.
+    photons: whether pictures count photons; pictures from files do not.
     """
     found = []
     bright = photons and MOST_ROOM_FLUX[imprecise] < views.room_flux <= MOST_ROOM_FLUX[0]
@@ -187,8 +192,8 @@ def data_lack(
 
 
 def hiding(views: ViewEvidence, poses: PoseEvidence | None, *, photons: bool = True) -> list[Reason]:
-    """Reasons that make other faults appear: room light in which frames hold little else, and boards so far away that
-    their corners do not say where they are. Arguments as for `data_lack`.
+    """Reasons that make other faults appear: room light so bright that frames hold little else, and boards so far away
+    that their corners do not locate them. Arguments as in `data_lack`.
     """
     found = []
     if photons and views.room_flux > MOST_ROOM_FLUX[0]:
@@ -240,7 +245,11 @@ _SPEEDS = "scan both ways (scan.bidirectional), at two speeds or more (scan.expo
 
 
 def lag_lack(velocities_per_s: Sequence[float], *, mean_will_do: bool) -> list[Reason]:
-    """Reasons why sweeps do not tell both lags. mean_will_do: of planes, which are right at one speed, both ways."""
+    """Reasons why sweeps do not determine both lags.
+
+    mean_will_do: whether the mean of the lags is enough, as for planes, which are then right at one speed in both
+    directions.
+    """
     ways = {velocity > 0 for velocity in velocities_per_s}
     if not ways:
         return []
@@ -267,14 +276,14 @@ by as much as sweeps differ, up to 1.35 times in 23 simulated calibrations."""
 
 @dataclass(frozen=True, slots=True)
 class FitEvidence:
-    """Evidence of a fit and of where its boards stood; NaN where it cannot tell.
+    """Evidence from a fit and the poses of its boards; NaN if unknown.
 
-    expected_m, worst_m: predicted sd of the depth at the distance asked, median and 95 % of the picture. wave_m: error
-    of one sweep against another of the same view there; wave_noise_m: up to here that may be noise. shift_m,
-    shift_noise_m: of a view against the others, and up to where that may be; moved_after: the view after which they
-    changed, where one move explains them. misfit: factor by which the expected variances grew because the data
-    contradict each other. baseline_m, baseline_sd_m: distance of camera and mirror axis. velocities_per_s: of the
-    sweeps, signed; empty: not known.
+    expected_m, worst_m: predicted sd of the depth at the distance asked, median and 95 % of the picture. wave_m: depth
+    error there of one sweep against another of the same view; wave_noise_m: its largest value that may be noise.
+    shift_m: depth error of a view against the others; shift_noise_m: its largest value that may be noise; moved_after:
+    the view after which the rig moved, if one move explains the shifts. misfit: factor by which the variances were
+    increased because the data contradict each other. baseline_m, baseline_sd_m: distance of camera and mirror axis.
+    velocities_per_s: of the sweeps, signed; empty if unknown.
     """
 
     poses: PoseEvidence
@@ -309,7 +318,9 @@ def judge(views: ViewEvidence, fit: FitEvidence, asked: AccuracyGoal) -> Verdict
 def judge_refusal(
     refused: Degenerate, views: ViewEvidence, poses: PoseEvidence | None = None, *, photons: bool = True
 ) -> Verdict:
-    """The verdict where no model could be fitted: what the views lack, else what the fit said; as `data_lack`."""
+    """The verdict if no model could be fitted: what the views lack, or else what the fit said. Arguments as in
+    `data_lack`.
+    """
     lacking = [*hiding(views, poses, photons=photons), *data_lack(views, poses, imprecise=True, photons=photons)]
     code = _REFUSED_FOR.get(refused.reason, refused.reason)
     own = reason_for(code, str(refused))

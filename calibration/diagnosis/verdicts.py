@@ -1,11 +1,11 @@
-"""The verdicts on a fit of the camera alone, on a fit of the rig, on lags, and of a check.
+"""The verdicts on a fit of the camera alone, on a fit of the rig, on lags, and on a check.
 
-A camera is judged by how well it knows where rays go, in pixels. One whose rays are all turned by one angle is as good
-as before, since the mirror is calibrated with it. So the error of a pixel is what is left of J C J' when the best
-common rotation of all rays is taken off J.
+A camera is judged by how accurately it knows the directions of rays, in pixels. A camera whose rays are all turned by
+one angle is as good as before, since the mirror is calibrated with it. So the error of a pixel is what remains of J C
+J' after the best common rotation of all rays is removed from J.
 
-Lag and row delay are judged by the depth error that their uncertainty makes. A check fails where its errors are larger
-than the covariance lets expect and than depth can bear.
+Lag and row delay are judged by the depth error that their uncertainty causes. A check fails if its errors are larger
+than expected from the covariance and larger than the accuracy asked for allows.
 """
 
 import math
@@ -61,7 +61,9 @@ _STEP = 1e-6
 
 @dataclass(frozen=True, slots=True, eq=False)
 class JudgedCamera:
-    """A verdict; sd of a pixel's place along the row (median, 95 %); share of the picture within all corners."""
+    """The verdict on a camera; sd of a pixel's place along the row (median, 95 %); share of the picture within all
+    corners.
+    """
 
     verdict: Verdict
     sd_px: float
@@ -69,12 +71,12 @@ class JudgedCamera:
     coverage: float
 
     def line(self) -> str:
-        """One line."""
+        """The result in one line."""
         return f"rays are known to {_px(self.sd_px)} (95 % of the picture: {_px(self.worst_px)})"
 
 
 def judge_camera(fit: CameraFit, views: Sequence[View], board: Board, *, photons: bool) -> JudgedCamera:
-    """Judge a fit of `views`. photons: whether their pictures count photons; grey levels tell nothing of the light."""
+    """Judge a fit of `views`. photons: whether their pictures count photons; grey levels do not measure the light."""
     camera = fit.camera
     sd = ray_sd_px(camera, fit.covariance)
     median, worst = float(np.median(sd)), float(np.percentile(sd, 95))
@@ -95,7 +97,7 @@ def _px(length_px: float) -> str:
 
 
 def ray_sd_px(camera: Camera, covariance: Covariance) -> Array:
-    """(n,) sd along the row of where rays of a grid over the picture are seen, a common rotation taken off."""
+    """(n,) sd in pixels along the row of the rays of a grid over the picture, after a common rotation is removed."""
     x, y = np.meshgrid(np.linspace(0, camera.width - 1, _GRID), np.linspace(0, camera.height - 1, _GRID))
     u, v = camera.tangents_at(x.ravel(), y.ravel())
     known = np.isfinite(u)
@@ -139,7 +141,9 @@ def judge_check(
     angle: CheckedAngle | None = None,
     stated_angle_rad: float | None = None,
 ) -> Verdict:
-    """Judge checked boards. asked: depth error that is good enough; at other distances it goes with their square."""
+    """Judge checked boards. asked: the required depth error; at other distances it scales with the square of the
+    distance.
+    """
     found: list[Reason] = []
     for board in boards:
         bearable_m = asked.accuracy_m * (board.distance_m / asked.at_m) ** 2
@@ -186,7 +190,7 @@ _WORST_PERCENT = 95
 
 @dataclass(frozen=True, slots=True, eq=False)
 class JudgedRig:
-    """A verdict and what it was made of."""
+    """A verdict on a rig and what it was based on."""
 
     verdict: Verdict
     asked: AccuracyGoal
@@ -200,7 +204,9 @@ class JudgedRig:
 def goal(
     worth: Sensitivity, accuracy_m: float | None = None, at_m: float = AT_M, stated_baseline_m: float | None = None
 ) -> AccuracyGoal:
-    """The accuracy asked: sd of depth at `at_m`, for which `worth` is; None: that of ACCURACY_PX."""
+    """The accuracy asked for: sd of depth at `at_m`, where `worth` was computed. accuracy_m: None for that of
+    ACCURACY_PX.
+    """
     return AccuracyGoal(ACCURACY_PX * worth.per_pixel_m if accuracy_m is None else accuracy_m, at_m, stated_baseline_m)
 
 
@@ -212,7 +218,9 @@ def judge_fit(
     accuracy_m: float | None = None,
     stated_baseline_m: float | None = None,
 ) -> JudgedRig:
-    """Judge a fit by the sd of depth asked for, None: that of ACCURACY_PX. CalibrationError: the line is not there."""
+    """Judge a fit by the sd of depth asked for (None: that of ACCURACY_PX). Raises CalibrationError if the line does
+    not reach `at_m`.
+    """
     model = fit.model
     worth = sensitivity(model, at_m)
     asked = goal(worth, accuracy_m, at_m, stated_baseline_m)
@@ -251,8 +259,9 @@ def judge_refused(
     photons: bool = True,
     line: bool = True,
 ) -> Verdict:
-    """Judge views of a picture of `size` (width, height) from which no model could be made. photons: `data_lack`. line:
-    whether the line was to be seen in them, or a camera alone was asked for.
+    """Judge views of a picture of `size` (width, height) from which no model could be made.
+
+    photons: as in `data_lack`. line: whether the views should show the line; False if only a camera was asked for.
     """
     poses = rough_poses(views, board, rough_camera(size))
     evidence = pose_evidence(poses, board) if poses else None
@@ -273,7 +282,9 @@ _STILL = "check that nothing moved between the sweeps, or calibrate at the speed
 def judge_sync(
     fit: SyncFit, model: RigModel | None, asked: AccuracyGoal | None, changed: Reason | None = None
 ) -> Verdict:
-    """Judge a fit; model, asked: None where nothing tells a lag's worth; changed: why the model is wrong with it."""
+    """Judge a fit of lags. model, asked: None if the lag's effect on depth is unknown. changed: why the model is wrong
+    with these lags, or None.
+    """
     found = []
     if not fit.steady:
         text = (

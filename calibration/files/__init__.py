@@ -1,1 +1,1 @@
-"""calibration.yaml and camera.yaml, read and written."""
+"""Reading and writing of calibration.yaml and camera.yaml."""

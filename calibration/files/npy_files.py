@@ -1,7 +1,7 @@
-"""Reading .npy and .npz files that anybody may have written: no header is taken at its word for the size of an array.
+"""Reading .npy and .npz files from any source. The size of an array that a header states is not trusted.
 
-numpy makes an array as large as its header says before it reads the first number. Here the header has to fit the bytes
-that are there first.
+numpy allocates an array as large as its header says before it reads the first number. Here the header must first agree
+with the number of bytes in the file.
 """
 
 import math
@@ -22,7 +22,9 @@ _DEFLATE_RATIO: Final = 1032
 
 
 def load_numpy(file: str | os.PathLike[str], mmap_mode: Literal["r"] | None = None) -> Any:
-    """An array, or an archive of them, never a pickle. OSError; ValueError or BadZipFile for what is no such file."""
+    """An array, or an archive of arrays; pickles are refused. Raises OSError, or ValueError or BadZipFile for other
+    files.
+    """
     with Path(file).open("rb") as stream:
         is_archive = stream.read(4) == b"PK\x03\x04"
         stream.seek(0)
@@ -44,7 +46,7 @@ def _check_archive(stream: IO[bytes]) -> None:
 
 
 def _check_array(stream: IO[bytes], size: int) -> None:
-    """ValueError unless the array of a file of `size` bytes, from where the stream is at, has room in it."""
+    """Raises ValueError unless the array of a file of `size` bytes, from where the stream is at, has room in it."""
     magic = stream.read(_MAGIC_BYTES)
     if len(magic) < _MAGIC_BYTES or not magic.startswith(np.lib.format.MAGIC_PREFIX):
         raise ValueError("it is no array of numpy's")

@@ -1,5 +1,5 @@
-"""Checks the content of a file against its model and says in one line each what is wrong: file, line, key, value, limit
-and what to write instead.
+"""Checks the content of a file against its model. Each problem becomes one line: file, line, key, value, limit and what
+to write instead.
 """
 
 import difflib
@@ -48,7 +48,7 @@ _WORDS = {True: "true", False: "false", None: "null"}
 
 @dataclass(frozen=True)
 class ValueSources:
-    """The origin of values: a file with each key's line, and the keys given as options, with their names there."""
+    """The origin of values: a file with the line of each key, and the keys given as options, with the options' names."""
 
     file: str
     lines_of: Callable[[], Mapping[Key, int]] = dict
@@ -61,11 +61,11 @@ class ValueSources:
         return self.lines_of()
 
     def line(self, key: Key) -> int | None:
-        """Line of a key, or of the nearest one that contains it."""
+        """Line of a key, or of the nearest section that contains it."""
         return next((self.lines[key[:n]] for n in range(len(key), 0, -1) if key[:n] in self.lines), None)
 
     def flag(self, key: Key) -> str | None:
-        """The option that the value of a key was given with, where it has a name of its own."""
+        """The option by which the value of a key was given, if that has a name of its own."""
         return self.flags.get(key) if self._is_option(key) else None
 
     def place(self, key: Key) -> str:
@@ -101,18 +101,18 @@ class _Schema:
         return here
 
     def of(self, name: str, info: FieldInfo, content: Any) -> type[BaseModel] | None:
-        """The model of what a field holds, where it holds mappings."""
+        """The model of a field's content, if it holds mappings."""
         models = (kind for kind in plain_types(info.annotation) if issubclass(kind, BaseModel))
         return self.kind_of(name, content) or next(models, None)
 
     def field(self, key: Key) -> FieldInfo | None:
-        """The field at `key`; for an item of a list, the list's."""
+        """The field at `key`. For an item of a list, the field of the list."""
         named = _named(key)
         section = self.section(named[:-1])
         return section.model_fields.get(named[-1]) if section is not None and named else None
 
     def keys_called(self, name: str) -> Iterator[Key]:
-        """Keys of that name that the model knows, the outermost first."""
+        """All keys of that name in the model, the outermost first."""
         level: list[tuple[Key, type[BaseModel], Any]] = [((), self.model, self.content)]
         while level:
             yield from ((*path, name) for path, model, _ in level if name in model.model_fields)
@@ -133,8 +133,8 @@ def validated(
 ) -> Model:
     """The content as a model. Raises FileError with a line for each problem, in the order of the file.
 
-    true and false are no numbers, and a number is finite, whatever pydantic takes. kind_of: gives the model of a
-    section whose model depends on its content, by the section's name and its content.
+    Stricter than pydantic: true and false are not numbers, and numbers must be finite. kind_of: gives the model of a
+    section whose model depends on its content, from the section's name and content.
     """
     schema = _Schema(model, content, kind_of)
     found: dict[Key, list[ErrorDetails]] = {}
@@ -198,7 +198,7 @@ def _leaves(value: Any, key: Key) -> Iterator[tuple[Key, Any]]:
 
 
 def _number_words(annotation: Any) -> str | None:
-    """Words for the number that a field asks for; None where it takes truth values or no numbers."""
+    """Words for the number that a field asks for; None if it takes truth values or no numbers."""
     kinds = set(plain_types(annotation))
     if bool in kinds or not kinds & {int, float}:
         return None
@@ -206,7 +206,7 @@ def _number_words(annotation: Any) -> str | None:
 
 
 def plain_types(annotation: Any) -> Iterator[type]:
-    """The types that a field's annotation is made of."""
+    """The types that a field's annotation consists of."""
     return (part for part in _parts(annotation) if isinstance(part, type) and not getattr(part, "__args__", ()))
 
 

@@ -1,4 +1,5 @@
-"""The calibration file, and the file of a camera alone, which a calibration of the light planes can begin with; YAML.
+"""The calibration file, and the file of a camera alone, from which a calibration of the light planes can start. Both
+are YAML.
 
     format: spadrig-calibration
     version: 1
@@ -14,15 +15,15 @@ or, instead of `planes`, a scanner with commands of its own:
 Optional: source_m, lag_s: {forward, backward}, speed_range_per_s: [low, high], row_delay_s, gate_delay_s,
 colour_skew_s, marker_rising, defects: a bool .npy, dark_rate: a float .npy, covariance: {names, file}, identity,
 provenance: any mapping, two of whose keys are read. Paths are relative to the file's folder;
-docs/reference/calibration-file.md says it all. Of a camera alone:
+docs/reference/calibration-file.md explains everything. The file of a camera alone:
 
     format: spadrig-camera
     version: 1
     camera: {width, height, matrix, distortion}              # as above
-    covariance: {names: [fx, fy, ...], matrix: [[...]]}      # how well that is known
-    views: [16 hexadecimal digits, ...]                      # corners it was made of: they must not count twice
-    verdict: passed or failed                                # left out: nobody judged it
-    reasons: [too-few-poses, ...]                            # why it failed, by their codes
+    covariance: {names: [fx, fy, ...], matrix: [[...]]}      # the uncertainty of these parameters
+    views: [16 hexadecimal digits, ...]                      # the corners used: they must not count twice
+    verdict: passed or failed                                # left out if nobody judged it
+    reasons: [too-few-poses, ...]                            # codes of why it failed
 """
 
 import hashlib
@@ -78,7 +79,7 @@ class _CameraFile(FileSection):
 
 @dataclass(frozen=True, slots=True, eq=False)
 class KnownCamera:
-    """A camera, how well it is known, the digests of the views that told it, its verdict (None: nobody judged it)."""
+    """A camera, its covariance, the digests of the views it was made from, and its verdict (None: nobody judged it)."""
 
     camera: Camera
     covariance: Covariance
@@ -88,7 +89,7 @@ class KnownCamera:
 
 
 def load_camera(path: Path) -> KnownCamera:
-    """Read a camera file. Raises CalibrationError, one line."""
+    """Read a camera file. Raises CalibrationError, with one line."""
     parsed = read_yaml_file(path, "a camera", CAMERA_FORMAT, CAMERA_VERSION, _CameraFile)
     covariance = Covariance(tuple(parsed.covariance.names), np.array(parsed.covariance.matrix, dtype=np.float64))
     camera = Camera(**parsed.camera.model_dump())
@@ -111,7 +112,7 @@ def camera_file_text(camera: Camera, covariance: Covariance, views: list[str], v
 
 
 def corners_digest(view: View) -> str:
-    """Sixteen hexadecimal digits of a view's corners; of none where it has none."""
+    """Sixteen hexadecimal digits that identify a view's corners, also if it has none."""
     digest = hashlib.sha256()
     if view.corners is not None:
         digest.update(np.ascontiguousarray(view.corners.ids, "<i4").tobytes())
@@ -136,7 +137,9 @@ _PLAIN = {"row_delay_s": 0.0, "gate_delay_s": 0.0, "colour_skew_s": 0.0, "marker
 
 
 def load_rig_model(path: str | os.PathLike[str]) -> RigModel:
-    """Read a calibration file; its paths are relative to its folder. CalibrationError, one line, where it is none."""
+    """Read a calibration file, whose paths are relative to its folder. Raises CalibrationError, with one line, if it is
+    invalid.
+    """
     file = Path(path)
     parsed = read_yaml_file(file, "a calibration", FORMAT, VERSION, CalibrationFile)
     try:
@@ -146,7 +149,9 @@ def load_rig_model(path: str | os.PathLike[str]) -> RigModel:
 
 
 def save_rig_model(model: RigModel, path: str | os.PathLike[str]) -> None:
-    """Write a model for `load_rig_model`, its arrays beside it, each file whole or not at all. Raises OSError."""
+    """Write a model for `load_rig_model`, with its arrays in files beside it. Each file is written completely or not at
+    all. Raises OSError.
+    """
     file = Path(path)
     content: dict[str, Any] = {
         "format": FORMAT,

@@ -1,6 +1,6 @@
-"""The sections of a calibration file and their limits, and the one reader of YAML files.
+"""The sections of a calibration file and their limits, and the only reader of YAML files.
 
-The reader is bounded in size, depth and repetition; keys are given once; errors are one line.
+The reader limits size, depth and repetition. A key may occur only once. Errors are one line.
 """
 
 from collections.abc import Iterator
@@ -26,7 +26,7 @@ PlaneRows = str | list[Row]
 
 
 class FileSection(BaseModel):
-    """A part of a file: what it does not know is refused."""
+    """A part of a file. Unknown keys are refused."""
 
     model_config = ConfigDict(extra="forbid", frozen=True)
 
@@ -41,14 +41,14 @@ class CameraSection(FileSection):
 
 
 class TableSection(FileSection):
-    """Planes at commands."""
+    """A table of light planes at mirror commands."""
 
     command: list[Number]
     planes: PlaneRows
 
 
 class PivotSection(FileSection):
-    """A mirror that turns about an axis, as `PivotScanner` has it."""
+    """A mirror that turns about an axis, with the fields of `PivotScanner`."""
 
     axis_point_m: Triple
     axis_direction: Triple
@@ -100,7 +100,7 @@ class IdentitySection(FileSection):
 
 
 class ProvenanceSection(BaseModel):
-    """The origin of a calibration: free notes, and the two that programs go by."""
+    """The origin of a calibration: free notes, and the two entries that programs use."""
 
     model_config = ConfigDict(extra="allow", frozen=True)
 
@@ -153,7 +153,7 @@ _MOST_SHOWN: Final = 40
 
 @dataclass(frozen=True, slots=True)
 class YamlFile:
-    """A file's keys and values, with the text and the nodes that they were read from."""
+    """A file's keys and values, with the text and the YAML nodes that they were read from."""
 
     content: dict[str, Any]
     text: str
@@ -165,7 +165,9 @@ class YamlFile:
 
 
 def load_yaml(file: Path, what: str, example: str, name: str | None = None) -> YamlFile:
-    """A file's keys and values; what: 'a calibration', for messages. FileError, also where a key is given twice."""
+    """A file's keys and values. what: its kind for messages, such as 'a calibration'. Raises FileError, also if a key
+    is given twice.
+    """
     name = str(file) if name is None else name
     try:
         size = file.stat().st_size
@@ -182,7 +184,7 @@ def load_yaml(file: Path, what: str, example: str, name: str | None = None) -> Y
 
 
 def parse_yaml(text: str, what: str, example: str, name: str) -> YamlFile:
-    """The keys and values of a file's text; as `load_yaml`."""
+    """The keys and values of a file's text. Arguments and errors as in `load_yaml`."""
     try:
         _require_bounded(text)
         loader = _Loader(text)
@@ -209,7 +211,9 @@ def parse_yaml(text: str, what: str, example: str, name: str) -> YamlFile:
 
 
 def read_yaml_file(file: Path, what: str, format_name: str, version: int, model: type[Content]) -> Content:
-    """The content of a file that must say that format and version. CalibrationError, one line, where it is none."""
+    """The content of a file that must state this format and version. Raises CalibrationError, with one line, if it
+    cannot be used.
+    """
     read = load_yaml(file, what, f"format: {format_name}")
     content = read.content
     if content.get("format") != format_name:
@@ -220,14 +224,14 @@ def read_yaml_file(file: Path, what: str, format_name: str, version: int, model:
 
 
 class _Refused(yaml.YAMLError):
-    """YAML that this program does not take; the text begins with the line."""
+    """Raised for YAML that this program does not take. The text begins with the line."""
 
     def __init__(self, mark: Any, why: str) -> None:
         super().__init__(f"{mark.line + 1}: {why}")
 
 
 class _Loader(getattr(yaml, "CSafeLoader", yaml.SafeLoader)):  # type: ignore[misc]
-    """Says in which line a value is that its tag or looks promise but that is none, as 2024-13-45."""
+    """Reports the line of a value that its tag or its form announces but that is invalid, such as 2024-13-45."""
 
     def construct_object(self, node: yaml.Node, deep: bool = False) -> Any:
         """The value of a node."""
@@ -248,7 +252,7 @@ def _cut(node: yaml.Node) -> str:
 
 @dataclass(slots=True)
 class _Open:
-    """A list or mapping that is being read: its anchor, how many values came before it, how deep it nests so far."""
+    """A list or mapping that is being read: its anchor, the number of values before it, and its depth of nesting."""
 
     anchor: str | None
     before: int

@@ -1,1 +1,1 @@
-"""The calibrated rig as numbers: camera, light planes, lags, their covariance; and where light meets a ray."""
+"""The calibrated rig as numbers: camera, light planes, lags and their covariance; and where light meets a ray."""

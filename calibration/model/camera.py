@@ -1,7 +1,7 @@
-"""The camera: raw pixels to rays and back, lens distortion included, no rectification.
+"""The camera: raw pixels to rays and back, including lens distortion, without rectification.
 
 A ray is (u, v, 1) in the camera frame (x right, y down, z forward). Pixel centres lie at integers. The lens model and
-the order of its terms are OpenCV's, so a calibration made with OpenCV is used as it is.
+the order of its terms are OpenCV's, so a calibration made with OpenCV can be used as it is.
 
 Forward model (OpenCV 'calib3d', projectPoints) on tangents (u, v) = (x/z, y/z), r2 = u^2 + v^2:
 
@@ -12,10 +12,10 @@ Forward model (OpenCV 'calib3d', projectPoints) on tangents (u, v) = (x/z, y/z),
 followed, with 14 terms, by the homography of a sensor tilted by (tau_x, tau_y). Order of the terms: k1 k2 p1 p2 [k3 [k4
 k5 k6 [s1 s2 s3 s4 [tau_x tau_y]]]].
 
-The model folds back on itself past some radius. A tangent counts as valid when the Jacobian determinant stays positive
-on the whole segment from the optical axis to it; only there is the inverse unique, and everything else is NaN. Where
-only k1 to k6 are used, the fold is a root of a polynomial in r2; else the segment is tested at points on it, among them
-one in every ring where k1 to k6 alone fold.
+Beyond some radius the model folds back on itself. A tangent is valid if the Jacobian determinant stays positive on the
+whole segment from the optical axis to it. Only there is the inverse unique; everything else is NaN. If only k1 to k6
+are used, the fold is a root of a polynomial in r2. Otherwise the segment is tested at several points, at least one of
+them in every ring where k1 to k6 alone fold.
 """
 
 from collections.abc import Sequence
@@ -49,7 +49,7 @@ _MAX_TANGENT = 20.0
 
 
 class Forward(NamedTuple):
-    """Distorted tangents and the Jacobian d(u', v') / d(u, v); all of the input's shape."""
+    """Distorted tangents and the Jacobian d(u', v') / d(u, v), all of the input's shape."""
 
     u: Array
     v: Array
@@ -87,7 +87,7 @@ class LensModel:
         self._untilt: Array = np.asarray(np.linalg.inv(self._tilt), dtype=np.float64)
 
     def forward(self, u: Array, v: Array) -> Forward:
-        """Lens distortion (without the tilt) of tangents and its Jacobian."""
+        """Lens distortion of tangents, without the sensor's tilt, and its Jacobian."""
         k1, k2, p1, p2, k3, k4, k5, k6, s1, s2, s3, s4 = self._terms[:12]
         r2 = u * u + v * v
         numerator = 1 + r2 * (k1 + r2 * (k2 + r2 * k3))
@@ -114,7 +114,7 @@ class LensModel:
         return np.where(keep, x, np.nan), np.where(keep, y, np.nan)
 
     def undistort(self, x: Array, y: Array) -> tuple[Array, Array]:
-        """Inverse of `distort`; NaN where no valid tangent is seen at (x, y)."""
+        """Inverse of `distort`; NaN where no valid tangent maps to (x, y)."""
         with np.errstate(all="ignore"):
             target_u, target_v, _ = _homography(self._untilt, x, y)
             if self._ideal:
@@ -195,7 +195,7 @@ class LensModel:
 
 
 def _folds(terms: Array) -> tuple[float, list[float]]:
-    """r2 of the first fold of k1 to k6 alone, inf where there is none, and an r2 within each ring that is folded.
+    """r2 of the first fold of k1 to k6 alone, inf if there is none, and an r2 within each ring that is folded.
 
     With g = n / d a ring is folded where n, d or the slope of r g, n d + 2 r2 (n' d - n d'), is not positive. Rings
     narrower than _RING are no lens's.
@@ -248,7 +248,7 @@ class Camera:
 
     matrix: (3, 3) float64, [[fx, 0, cx], [0, fy, cy], [0, 0, 1]] in pixels.
     distortion: (0, 4, 5, 8, 12 or 14) float64, OpenCV order k1 k2 p1 p2 k3 k4 k5 k6 s1 s2 s3 s4 tau_x tau_y.
-    Raises CalibrationError on a size, matrix or number of terms that describes no camera.
+    Raises CalibrationError for a size, matrix or number of terms that describes no camera.
     """
 
     width: int
@@ -290,14 +290,14 @@ class Camera:
         return u.reshape(x.shape), v.reshape(x.shape)
 
     def tangent_slopes(self, u: ArrayLike, v: ArrayLike) -> tuple[Array, Array]:
-        """(du/dx, dv/dx) per raw pixel along the row, at the rays (u, v)."""
+        """(du/dx, dv/dx) per raw pixel along the row, for the rays (u, v)."""
         u_, v_ = np.broadcast_arrays(np.asarray(u, np.float64), np.asarray(v, np.float64))
         du, _, dv, _ = self.lens.undistort_slope(u_, v_)
         fx = self.matrix[0, 0]
         return du / fx, dv / fx
 
     def project(self, points_m: ArrayLike) -> tuple[Array, Array]:
-        """Raw pixel (x_px, y_px) of points (..., 3) in metres; NaN behind the camera and past the lens model's fold."""
+        """Raw pixel (x_px, y_px) of points (..., 3) in metres; NaN behind the camera and beyond the lens model's fold."""
         points = np.asarray(points_m, np.float64)
         with np.errstate(all="ignore"):
             z = np.where(points[..., 2] > 0, points[..., 2], np.nan)

@@ -1,17 +1,18 @@
 """The sheet of light at one mirror command, flat or bowed, and the depth at which a pixel's ray meets it.
 
-A line lens spreads the beam into a fan of directions. Seen from the fan's origin O, with f the fan's middle, t across
-it (along the mirror's axis) and n the plane's normal, light leaves at the angle phi within the plane and, where the
-sheet is bowed, at the angle bow phi^2 out of it towards n. A point X with p = (X - O).f, q = (X - O).t lies on it where
+A line lens spreads the beam into a fan of directions from an origin O. Let f be the fan's middle, t the direction
+across it (along the mirror's axis) and n the plane's normal. Light leaves at an angle phi within the plane and, if the
+sheet is bowed, at the angle bow phi^2 out of it towards n. A point X with p = (X - O).f, q = (X - O).t lies on the
+sheet if
 
     n.X = d + tan(bow phi^2) hypot(p, q),    phi = atan2(q, p),
 
-whether O itself lies in the plane or a little beside it. O is the model's `source_m`; where that is unknown, the point
-of the mirror's axis that is nearest to the camera.
+whether O itself lies in the plane or slightly beside it. O is the model's `source_m`; if that is unknown, the point of
+the mirror's axis nearest to the camera.
 
-Ray r = (u, v, 1), plane n.X = d:  z = d / (n.r). Along an image row dz/dx = -(z^2 / d) (n . dr/dx), whose sign says on
-which side of the stripe the near points lie. Everything broadcasts; NaN is 'no depth', never inf, never a warning. n.r
-cancels where ray and plane are nearly parallel: `NEARLY_PARALLEL` keeps 1e-9 of z at the least.
+Ray r = (u, v, 1), plane n.X = d:  z = d / (n.r). Along an image row dz/dx = -(z^2 / d) (n . dr/dx), whose sign tells on
+which side of the stripe the near points lie. All arguments broadcast. NaN means 'no depth'; there are no infinities and
+no warnings. n.r cancels where ray and plane are nearly parallel: `NEARLY_PARALLEL` keeps at least 1e-9 of z.
 """
 
 from dataclasses import dataclass
@@ -31,7 +32,9 @@ LEAST_OFFSET_M: Final = 1e-6
 
 
 def inverse_depth(u: ArrayLike, v: ArrayLike, planes: ArrayLike) -> Array:
-    """1/z (1/m) of rays (u, v) on planes (..., 4), |n| = 1: below 0 behind, 0 parallel, NaN within LEAST_OFFSET_M."""
+    """1/z (1/m) of rays (u, v) on planes (..., 4), |n| = 1. Negative behind the camera, 0 if parallel, NaN within
+    LEAST_OFFSET_M.
+    """
     p = np.asarray(planes, np.float64)
     offset = p[..., 3]
     with np.errstate(all="ignore"):
@@ -66,7 +69,7 @@ def depth_slope(u: ArrayLike, v: ArrayLike, planes: ArrayLike, camera: Camera) -
 
 
 def near_side(u: ArrayLike, v: ArrayLike, planes: ArrayLike, camera: Camera) -> NDArray[np.int8]:
-    """Side of the stripe on which nearer points are seen (the scanner's): -1 smaller x, +1 larger x, 0 undefined."""
+    """Side of the stripe on which nearer points appear (the scanner's): -1 smaller x, +1 larger x, 0 undefined."""
     p = np.asarray(planes, np.float64)
     du, dv = camera.tangent_slopes(u, v)
     offset = np.where(np.abs(p[..., 3]) < LEAST_OFFSET_M, 0.0, p[..., 3])
@@ -92,7 +95,7 @@ class LightSheets:
     bow_per_rad: float
 
     def distance_m(self, points_m: ArrayLike) -> Array:
-        """Distance of points (..., 3) from their sheets along n, metres: 0 on the sheet."""
+        """Distance of points (..., 3) from their sheets along n, metres; 0 on the sheet."""
         points = np.asarray(points_m, np.float64)
         off: Array = np.sum(self.planes[..., :3] * points, axis=-1) - self.planes[..., 3]
         if self.bow_per_rad:
@@ -100,10 +103,10 @@ class LightSheets:
         return off
 
     def inverse_depth(self, u: ArrayLike, v: ArrayLike) -> Array:
-        """1/z (1/m) of rays (u, v), by the same rules as the module's `inverse_depth`, which it is for planes.
+        """1/z (1/m) of rays (u, v). For planes this is the module's `inverse_depth`; sheets follow the same rules.
 
-        With w = 1/z and the ray r it is n.r - d w = tan(bow phi^2) hypot(p, q) of r - w O: nearly linear in w, and
-        regular for rays that never meet the sheet. Newton's method begins at the plane.
+        With w = 1/z, the ray r satisfies n.r - d w = tan(bow phi^2) hypot(p, q), with p and q taken from r - w O. This
+        is nearly linear in w, and regular for rays that never meet the sheet. Newton's method starts from the plane.
         """
         w = inverse_depth(u, v, self.planes)
         if not self.bow_per_rad:
@@ -124,7 +127,7 @@ class LightSheets:
         return np.where(found, w, np.nan)
 
     def depth(self, u: ArrayLike, v: ArrayLike) -> Array:
-        """Depth z (m) of rays (u, v), by the same rules as the module's `depth`, which it is for planes."""
+        """Depth z (m) of rays (u, v). For planes this is the module's `depth`; sheets follow the same rules."""
         if not self.bow_per_rad:
             return depth(u, v, self.planes)
         w = self.inverse_depth(u, v)
@@ -147,7 +150,9 @@ class LightSheets:
 
 
 def light_sheets(scanner: Scanner, source_m: ArrayLike | None, commands: ArrayLike) -> LightSheets:
-    """The sheets (...) at commands (...). A table of planes has no bow. CalibrationError outside the range."""
+    """The sheets (...) at commands (...). A table of planes has no bow. Raises CalibrationError outside the command
+    range.
+    """
     if not isinstance(scanner, PivotScanner) or scanner.bow_per_rad == 0:
         planes = scanner.planes(commands)
         nothing = np.zeros_like(planes[..., :3])
@@ -162,7 +167,7 @@ def light_sheets(scanner: Scanner, source_m: ArrayLike | None, commands: ArrayLi
 
 
 def fan_origin(scanner: Scanner, source_m: ArrayLike | None) -> Array:
-    """The point (3,) from which the light spreads: the source, or the mirror axis' point nearest to the camera."""
+    """The point (3,) from which the light spreads: the source, or the point of the mirror's axis nearest to the camera."""
     if source_m is not None:
         return np.asarray(source_m, np.float64)
     if not isinstance(scanner, PivotScanner):

@@ -1,7 +1,7 @@
-"""A model's numbers as a list of parameters, local and minimal, for fits and covariances; the lags that sweeps tell.
+"""A model's numbers as a minimal list of local parameters, for fits and covariances; and which lags sweeps determine.
 
-Directions and points have fewer degrees of freedom than numbers, so those of the axis are changes: 0 for the model at
-hand, counted about and along two fixed directions across the axis, e1 = zero_normal and e2 = axis x zero_normal.
+Directions and points have fewer degrees of freedom than numbers. So the parameters of the axis are changes, 0 for the
+present model, about and along two fixed directions across the axis, e1 = zero_normal and e2 = axis x zero_normal.
 
     fx fy cx cy                     pixels
     k1 k2 p1 p2 k3 ... tau_y        distortion, those terms that the camera has
@@ -11,16 +11,16 @@ hand, counted about and along two fixed directions across the axis, e1 = zero_no
     offset_0, ..., cone, bow        m, ..., rad, rad per rad^2; terms of offset_m, cone_rad, bow_per_rad
     lag_forward, lag_backward, row_delay   s
 
-A table of planes has no parameters of its own: only the camera's and the lags' are given.
+A table of planes has no parameters of its own; only those of the camera and the lags exist.
 
-One rule says, for planes and for `calibration.sync`, which lags sweeps tell by the directions and speeds at which they
-ran. Where the line stands is not known beforehand. A sweep of signed velocity v sees it at
+One rule, for planes and for `calibration.sync`, says which lags follow from the directions and speeds of the sweeps.
+The position of the line is not known beforehand. A sweep of signed velocity v sees it at
 
     command = position + v lag_of_its_direction
 
-so that the position and two lags are told apart only where three sweeps differ: two speeds in one direction at least,
-and the other direction too. One speed each way tells v_up lag_forward + v_down lag_backward alone, whether the two
-speeds are the same or not; one way at one speed tells nothing of a lag.
+So the position and the two lags can be separated only by at least three different sweeps: two speeds in one direction,
+and a sweep in the other direction. One speed in each direction determines only v_up lag_forward + v_down lag_backward,
+whether the two speeds are equal or not. One direction at one speed determines no lag.
 """
 
 from collections.abc import Sequence
@@ -61,8 +61,8 @@ def parameters(model: RigModel) -> tuple[tuple[str, ...], Array]:
 def with_parameters(model: RigModel, names: Sequence[str], deltas: ArrayLike) -> RigModel:
     """The model with `deltas` (n,) added to the parameters `names`; the others stay.
 
-    Terms angle_i and offset_i beyond those of the model begin at 0. CalibrationError for a parameter that a model of
-    this kind does not have, and where the change leaves no valid model.
+    Terms angle_i and offset_i beyond those of the model start from 0. Raises CalibrationError for a parameter that a
+    model of this kind does not have, and if the changed model is not valid.
     """
     change = dict(zip(names, np.asarray(deltas, np.float64).tolist(), strict=True))
     camera = changed_camera(model.camera, change)
@@ -85,7 +85,7 @@ def with_parameters(model: RigModel, names: Sequence[str], deltas: ArrayLike) ->
 
 
 def changed_camera(camera: Camera, change: dict[str, float]) -> Camera:
-    """The camera with its part of the change, which is taken out."""
+    """The camera with its own part of the changes applied. These entries are removed from `change`."""
     matrix, distortion = camera.matrix.copy(), camera.distortion.copy()
     touched = False
     for name, at in MATRIX.items():
@@ -148,7 +148,9 @@ SPEED_MARGIN: Final = 0.05
 
 
 def lag_groups(velocities_per_s: ArrayLike) -> tuple[tuple[str, ...], ...]:
-    """The lags that sweeps tell, in groups of one value each: both in one where nothing tells them apart, or none."""
+    """The lags that sweeps determine, in groups with one value each. Both are in one group if they cannot be separated;
+    there is no group if neither can be determined.
+    """
     up, down = _speeds(velocities_per_s)
     several = _several(up) or _several(down)
     if several and up.size and down.size:
@@ -157,7 +159,7 @@ def lag_groups(velocities_per_s: ArrayLike) -> tuple[tuple[str, ...], ...]:
 
 
 def one_speed(velocities_per_s: ArrayLike) -> bool:
-    """Whether all ran at the same speed, whichever way."""
+    """Whether all sweeps ran at the same speed, in either direction."""
     return not _several(np.abs(np.asarray(velocities_per_s, np.float64)))
 
 
@@ -175,14 +177,14 @@ def untold(velocities_per_s: Sequence[float]) -> Array:
 
 
 def alike_speeds(speeds_per_s: ArrayLike) -> NDArray[np.int64]:
-    """(n,): a number for each speed, shared by all between which and it there is no gap, whichever way they went."""
+    """(n,): a group number for each speed. Speeds without a gap between them share a group, whatever their direction."""
     speeds, which = np.unique(np.abs(np.asarray(speeds_per_s, np.float64)), return_inverse=True)
     apart = np.diff(speeds, prepend=speeds[:1]) > ALIKE_SPEEDS * speeds
     return np.cumsum(apart, dtype=np.int64)[which.reshape(-1)]
 
 
 def speed_range(speeds_per_s: ArrayLike) -> tuple[float, float]:
-    """The speeds at which a lag measured at these holds."""
+    """The range of speeds for which a lag measured at these speeds holds."""
     speeds = np.asarray(speeds_per_s, np.float64)
     return float(speeds.min() * (1 - SPEED_MARGIN)), float(speeds.max() * (1 + SPEED_MARGIN))
 

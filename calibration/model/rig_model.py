@@ -1,4 +1,4 @@
-"""The rig model: the calibrated camera and scanner, what else is known of the rig, and the parameters' covariance."""
+"""The rig model: the calibrated camera and scanner, other known properties of the rig, and the parameters' covariance."""
 
 import hashlib
 from collections.abc import Mapping, Sequence
@@ -21,9 +21,10 @@ _ASYMMETRY = 1e-6
 
 @dataclass(frozen=True, eq=False)
 class Covariance:
-    """names: (p,) as `calibration.model.parameters` has them. matrix: (p, p) float64, each parameter in its own unit.
+    """Covariance of parameters. names: (p,) as in `calibration.model.parameters`. matrix: (p, p) float64, in the
+    parameters' units.
 
-    What is not named counts as known exactly. Raises CalibrationError for a matrix that is no covariance.
+    A parameter that is not named counts as exactly known. Raises CalibrationError for a matrix that is no covariance.
     """
 
     names: tuple[str, ...]
@@ -49,7 +50,7 @@ class Covariance:
         set_frozen(self, names=names, matrix=0.5 * (matrix + matrix.T))
 
     def of(self, names: Sequence[str]) -> Array:
-        """The matrix of some of the parameters, in this order."""
+        """The covariance of some of the parameters, in the given order."""
         at = [self.names.index(name) for name in names]
         return self.matrix[np.ix_(at, at)]
 
@@ -60,7 +61,7 @@ def _least(correlation: Array) -> float:
 
 
 class Lag(NamedTuple):
-    """Seconds by which the mirror follows its command, per sweep direction (forward: rising command)."""
+    """Seconds by which the mirror follows its command, for each sweep direction (forward: rising command)."""
 
     forward: float = 0.0
     backward: float = 0.0
@@ -68,11 +69,11 @@ class Lag(NamedTuple):
 
 @dataclass(frozen=True, slots=True)
 class Identity:
-    """The rig that a calibration is of, its date, and its verdict; compared before a model is used.
+    """The rig that a calibration belongs to, its date and its verdict. They are compared before a model is used.
 
-    rig: hash over what matters of the rig's config. name: the rig's name. created: date and time, ISO 8601. kinds,
-    serials: of the devices by slot (spad, scanner, ...), those that were known. verdict, reasons: of the calibration
-    and of the last check of it; None where there was none.
+    rig: hash of the relevant part of the rig's config. name: the rig's name. created: date and time, ISO 8601. kinds,
+    serials: of the devices by slot (spad, scanner, ...), if known. verdict, reasons: of the calibration and of its last
+    check; None if there was none.
     """
 
     rig: str
@@ -88,15 +89,15 @@ class Identity:
 class RigModel:
     """Camera, scanner, lag, defects and provenance of one rig.
 
-    speed_range_per_s: command speeds the lag was measured at, None where it was not measured.
-    source_m: (3,) where the light leaves the mirror, camera frame; None where unknown.
-    defects: (height, width) bool, True = pixel not to be used; None where unknown.
-    dark_rate_per_s: (height, width) float32 counts a second in the dark; None where unknown.
-    row_delay_s: by which every row is exposed later than the row above it. gate_delay_s: from the gate's edge until
-    the light follows. colour_skew_s: by which the scanner's gate output runs ahead of its mirror. marker_rising:
-    whether the edge of a scan marker that counts is the rising one.
-    covariance: of the parameters that were estimated, see `parameters`. identity: None where nobody wrote it down.
-    Raises CalibrationError for planes within 45 degrees of the search axis: along the row they give no position.
+    speed_range_per_s: command speeds at which the lag was measured, None if it was not measured.
+    source_m: (3,) where the light leaves the mirror, camera frame; None if unknown.
+    defects: (height, width) bool, True = pixel not to be used; None if unknown.
+    dark_rate_per_s: (height, width) float32, counts per second in the dark; None if unknown.
+    row_delay_s: delay of each row's exposure after that of the row above. gate_delay_s: delay of the light after the
+    gate's edge. colour_skew_s: time by which the scanner's gate output precedes its mirror. marker_rising: whether the
+    rising edge of a scan marker counts, rather than the falling one.
+    covariance: of the parameters that were estimated, see `parameters`. identity: None if nobody recorded it.
+    Raises CalibrationError for planes within 45 degrees of the search axis, since they give no position along the row.
     """
 
     camera: Camera
@@ -142,14 +143,15 @@ class RigModel:
         return self.scanner.planes(commands)
 
     def sheets(self, commands: ArrayLike) -> LightSheets:
-        """The light at mirror commands (...): `planes`, and how they bow."""
+        """The light at mirror commands (...): `planes` and their bow."""
         return light_sheets(self.scanner, self.source_m, commands)
 
     def mirror_command(self, commands: ArrayLike, y_px: ArrayLike, velocity_per_s: ArrayLike) -> Array:
-        """Position of the mirror, on the command's scale, when row y sees the light, for what is commanded then.
+        """Position of the mirror, on the command's scale, when row y sees the light.
 
-        'Then' is when the first row is exposed; a later row sees the mirror farther on. velocity_per_s: of the command,
-        positive where it rises; the lag is that of its direction. All broadcast.
+        commands: those at the time when the first row is exposed; a later row sees the mirror farther on.
+        velocity_per_s: of the command, positive while it rises; the lag is that of its direction. All arguments
+        broadcast.
         """
         velocity = np.asarray(velocity_per_s, np.float64)
         lag_s = np.where(velocity < 0, self.lag_s.backward, self.lag_s.forward)
@@ -175,7 +177,7 @@ class RigModel:
             )
 
     def fingerprint(self) -> str:
-        """Sixteen hexadecimal digits that change with any number the depth depends on."""
+        """Sixteen hexadecimal digits that change with any number on which the depth depends."""
         low, high = self.scanner.command_range
         commands = getattr(self.scanner, "command", np.linspace(low, high, 33))
         digest = hashlib.sha256()

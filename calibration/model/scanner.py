@@ -1,7 +1,7 @@
 """From mirror command to light plane (n, d), n.X = d, |n| = 1: a sampled table, or a mirror that turns about an axis.
 
-The command is what the calibration was made with: a galvo's normalised drive (-1 to 1), or the column of a bare cube.
-(n, d) and (-n, -d) are the same plane; results come with n_x > 0 wherever the plane crosses the rows.
+The command is the one used in the calibration: a galvo's normalised drive (-1 to 1), or the column number of a cube of
+frames. (n, d) and (-n, -d) are the same plane; results have n_x > 0 wherever the plane crosses the rows.
 """
 
 from dataclasses import dataclass, field
@@ -40,7 +40,7 @@ class Scanner(Protocol):
 
 @dataclass(frozen=True, eq=False)
 class PlaneTable:
-    """Planes at increasing commands (n,), linear in between: rows (n, 4) nx, ny, nz, d in metres, of any length."""
+    """Planes at increasing commands (n,), interpolated linearly: rows (n, 4) nx, ny, nz, d in metres, of any length."""
 
     command: Array
     rows: Array
@@ -87,15 +87,16 @@ class PlaneTable:
 
 @dataclass(frozen=True, eq=False)
 class PivotScanner:
-    """A line turned about a fixed axis, with what a real mirror and lens add to that.
+    """A line turned about a fixed axis, with the deviations of a real mirror and lens.
 
         n(a) = cos(cone) (n0 cos a + (axis x n0) sin a) + sin(cone) axis,    d(a) = n . axis_point + offset(a)
 
     axis_point_m, axis_direction, zero_normal: (3,) float64. angle_rad: (terms,) float64, the optical angle a as a
     polynomial in the command, constant term first. The part of zero_normal along the axis is dropped.
-    offset_m: (terms,) float64, how far the light passes the axis, a polynomial in the optical angle, constant first.
-    cone_rad: constant tilt of the normal towards the axis: the planes then touch a cone whose tip is axis_point_m.
-    bow_per_rad: a sheet that bends out of its plane by bow x (angle within the fan)^2, along n(a); see `light_sheet`.
+    offset_m: (terms,) float64, distance at which the light passes the axis, a polynomial in the optical angle, constant
+    first.
+    cone_rad: constant tilt of the normal towards the axis; the planes then touch a cone whose tip is axis_point_m.
+    bow_per_rad: bending of the sheet out of its plane by bow x (angle within the fan)^2, along n(a); see `light_sheet`.
     """
 
     axis_point_m: Array
@@ -149,7 +150,7 @@ class PivotScanner:
         return result
 
     def turned(self, commands: ArrayLike) -> Array:
-        """The planes with the sign of n(a), along which offset_m, cone_rad and bow_per_rad count."""
+        """The planes with the sign of n(a), which is the sign that offset_m, cone_rad and bow_per_rad refer to."""
         at = _inside(commands, self.command_range)
         angle = np.polynomial.polynomial.polyval(at, self.angle_rad)[..., None]
         normal = self.zero_normal * np.cos(angle) + np.cross(self.axis_direction, self.zero_normal) * np.sin(angle)

@@ -1,11 +1,11 @@
 """The passages of a sweep: when the laser line passed over each pixel, from the counts of the columns.
 
-For each of many pixels, spread evenly over the picture: first the column at which the line stands out most from what is
-on both sides (sums over columns, and their peak), then the maximum likelihood of the columns around it
-(`calibration.passages.fit`). A pixel that tells nothing is left out. The sd of a passage says how far it is to be
-trusted: within a flat top, where all frames are lit, it is large. The line has to be seen in two columns or more: at
-columns wider than 2 pixels most pixels tell nothing, so calibrate with many columns of few exposures rather than few
-columns of many.
+This is done for many pixels, spread evenly over the picture. The first step finds the column at which the line stands
+out most from both sides (sums over columns, and their peak). The second fits the passage by maximum likelihood to the
+columns around it (`calibration.passages.fit`). Pixels without information are left out. The sd of a passage says how
+far it can be trusted; within a flat top, where all frames are lit, it is large. The line must be visible in two columns
+or more. If columns are wider than 2 pixels, most pixels give no passage, so calibrate with many columns of few
+exposures rather than few columns of many.
 
 10 000 pixels of 500 columns take about 0.5 s.
 """
@@ -32,7 +32,9 @@ LEAST_SEEN = 3.0
 
 @dataclass(frozen=True, slots=True, eq=False)
 class ColumnSums:
-    """1s and frames up to, but without, each column: (columns + 1, pixels) int32; frames (…, 1) where alike for all."""
+    """Running sums of 1s and of frames before each column: (columns + 1, pixels) int32; frames (..., 1) if equal for
+    all pixels.
+    """
 
     ones: NDArray[np.int32]
     frames: NDArray[np.int32]
@@ -52,7 +54,9 @@ class ColumnSums:
         return ColumnSums(self.ones[:, which], self.frames if self.frames.shape[1] == 1 else self.frames[:, which])
 
     def between(self, begin: int, end: int) -> tuple[NDArray[np.float32], NDArray[np.float32]]:
-        """Share of 1s (columns, pixels), NaN without frames, in the columns `begin` to `end` away; frames."""
+        """Share of 1s (columns, pixels) in the columns `begin` to `end` away, NaN without frames; and the number of
+        frames.
+        """
         edges = np.arange(self.columns)
         first, last = (np.clip(edges + shift, 0, self.columns) for shift in (begin, end))
         frames = (self.frames[last] - self.frames[first]).astype(np.float32)
@@ -61,7 +65,7 @@ class ColumnSums:
             return ones / frames, frames
 
     def ranges(self, begin: NDArray[np.int64], end: NDArray[np.int64]) -> tuple[Array, Array]:
-        """1s and frames (pixels, n) in columns begin up to end, both (pixels, n), of each pixel."""
+        """1s and frames (pixels, n) in the columns from begin to before end of each pixel. begin, end: (pixels, n)."""
         first, last = (np.clip(edge, 0, self.columns) for edge in (begin, end))
         pixel = np.arange(len(begin))[:, None]
         alike = pixel if self.frames.shape[1] > 1 else 0
@@ -72,9 +76,10 @@ class ColumnSums:
 
 
 def brightest(sums: ColumnSums) -> tuple[Array, NDArray[np.bool_]]:
-    """Column at which the line stands out most (pixels,), and whether that is enough.
+    """Column at which the line stands out most (pixels,), and whether it stands out enough.
 
-    Flux within the core is compared with the brighter of two rings beside it: the haze has an edge there, but no peak.
+    Flux within the core is compared with the brighter of two rings beside it, since the haze has an edge there but no
+    peak.
     """
     pixels = sums.ones.shape[1]
     best, at = np.full(pixels, -np.inf), np.zeros(pixels)
@@ -97,10 +102,10 @@ def brightest(sums: ColumnSums) -> tuple[Array, NDArray[np.bool_]]:
 
 
 def evenly(mask: NDArray[np.bool_]) -> NDArray[np.int64]:
-    """(row, column) (n, 2) of the pixels in a mask (height, width), in the order of Bayer's dither matrix.
+    """(n, 2) row and column of the pixels in a mask (height, width), in the order of Bayer's dither matrix.
 
-    It visits every second, then every fourth pixel of both directions, and so on from coarse to fine: reading the bits
-    of y and of y xor x from the last to the first, in turn.
+    The order visits every second, then every fourth pixel in both directions, and so on from coarse to fine. It reads
+    the bits of y and of y xor x in turn, from the last to the first.
     """
     rows, columns = np.nonzero(mask)
     bits = max(1, int(max(mask.shape) - 1).bit_length())
@@ -146,8 +151,8 @@ class SweepCounts:
     """The counts of a sweep.
 
     counts: (columns, rows, window), 1s of each pixel over the frames of a column. n_frames: (columns,), frames of each.
-    command: (columns,), mean mirror command of them, without any lag; NaN where there are none. x0: (columns,), first
-    pixel of each column's window. width: of the picture, in pixels.
+    command: (columns,), their mean mirror command, without any lag; NaN for columns without frames. x0: (columns,),
+    first pixel of each column's window. width: of the picture, in pixels.
     """
 
     counts: Counts
@@ -158,7 +163,7 @@ class SweepCounts:
 
     @property
     def step(self) -> float:
-        """Command from a column to the next."""
+        """Change of the command from one column to the next."""
         there = np.flatnonzero(np.isfinite(self.command))
         if len(there) < 2:
             return np.nan
@@ -166,7 +171,7 @@ class SweepCounts:
 
     @property
     def position(self) -> Array:
-        """Position of each column (columns,), in columns: its number, moved to where its frames really lay."""
+        """Position of each column (columns,), in columns: its number, corrected for where its frames really were."""
         number = np.arange(len(self.command), dtype=np.float64)
         there = np.flatnonzero(np.isfinite(self.command))
         if len(there) < 2:
@@ -175,7 +180,9 @@ class SweepCounts:
         return np.where(np.isfinite(self.command), first + (self.command - self.command[first]) / self.step, number)
 
     def at_pixels(self, pixels: NDArray[np.int64]) -> tuple[NDArray[np.int32], NDArray[np.int32]]:
-        """1s (columns, pixels) of pixels (n, 2), and frames (columns, pixels or 1), none where a window ends before."""
+        """1s (columns, pixels) of pixels (n, 2), and frames (columns, pixels or 1), 0 where a window does not reach the
+        pixel.
+        """
         total, rows, window = self.counts.shape
         ones = np.zeros((total, len(pixels)), np.int32)
         n = self.n_frames.astype(np.int32)[:, None]
@@ -199,7 +206,9 @@ def find_passages(
     mask: NDArray[np.bool_] | None = None,
     most: int = MOST_PASSAGES,
 ) -> Passages:
-    """Passages of at most `most` pixels of a mask (rows, width), by default of any; none where the line is not seen."""
+    """Passages of at most `most` pixels of a mask (rows, width), by default of any pixels; empty if the line is not
+    visible.
+    """
     rows = sweep.counts.shape[1]
     pixels = evenly(np.ones((rows, sweep.width), np.bool_) if mask is None else mask)
     kept: list[tuple[NDArray[np.int64], Array, Array]] = [(pixels[:0], np.empty(0), np.empty(0))]
@@ -225,7 +234,7 @@ def find_passages(
 
 @dataclass(frozen=True, slots=True)
 class _Shape:
-    """Shape of a sweep's passages. near: columns on either side that the line reaches."""
+    """Shape of a sweep's passages. near: number of columns on either side that the line reaches."""
 
     near: int
     line: LineShape

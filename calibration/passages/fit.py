@@ -4,18 +4,19 @@ Of n frames in column t, y have a 1: y ~ Binomial(n, 1 - exp(-flux)), and around
 
     flux(t) = before + (after - before) Phi(z) + area phi(z) / sigma,   z = (t - c) / sigma
 
-with phi and Phi the normal density and its integral: the level of the haze before the line and behind it, and the line.
-Line, pixel and the line's travel within a column all blur the passage symmetrically; sigma stands for them together,
-and `LineShape.box`, the width of the latter two in widths of the line, for how flat that makes it. That is all where
-few frames are lit. Where many are, a line that moves on by a column while they are taken lights those of which it is
-near, and what is counted is the mean of their p, not that of their flux. With `LineShape.travels` sigma is of line and
-pixel alone, and with frames at places u of the column
+with phi and Phi the normal density and its integral. The terms are the level of the haze before the line, its change
+behind it, and the line. Line, pixel and the line's travel within a column all blur the passage symmetrically; sigma
+describes them together. `LineShape.box`, the width of the latter two in widths of the line, says how flat this makes
+the peak. That suffices if few frames are lit. If many are, a line that moves by a column during the frames lights those
+near it, and what is counted is the mean of their p, not p of their mean flux. With `LineShape.travels` sigma describes
+only line and pixel, and with frames at places u of the column
 
     flux(t) = levels - log mean over u of exp(-area line(t + u)),    |u| < 1/2
 
 theta: (pixels, 5): BEFORE, AFTER, AREA, CENTRE and the logarithm of SIGMA. Sigma is common to the pixels of a group (a
-part of the picture), the others are the pixel's own. Fisher scoring on all pixels at once, steps damped where they
-would make things worse (Levenberg and Marquardt); sigma's part of the information is a border of the pixels' blocks.
+part of the picture), the others belong to each pixel. The fit uses Fisher scoring on all pixels at once, with damping
+(Levenberg and Marquardt) for steps that would make things worse; sigma's part of the information is a border of the
+pixels' blocks.
 """
 
 from dataclasses import dataclass
@@ -35,14 +36,16 @@ BEFORE, AFTER, AREA, CENTRE, SIGMA = range(5)
 
 @dataclass(frozen=True, slots=True)
 class LineShape:
-    """Shape of the line. box: width of its part that is no Gaussian, in sigmas. travels: it moves within a column."""
+    """Shape of the line. box: width of its part that is not Gaussian, in sigmas. travels: whether it moves within a
+    column.
+    """
 
     box: float = 0.0
     travels: bool = False
 
 
 def light(theta: Array, at: Array, shape: LineShape) -> tuple[Array, Array]:
-    """Flux (pixels, columns), and its derivatives (pixels, 5, columns), by the logarithm of sigma the last one."""
+    """Flux (pixels, columns), and its derivatives (pixels, 5, columns), of which the last is by the logarithm of sigma."""
     before, after, area, centre, log_sigma = (theta[:, i, None] for i in range(5))
     sigma, away = np.exp(log_sigma), at - centre
     if shape.travels:
@@ -103,13 +106,13 @@ def score_of(ones: Array, frames: Array, flux: Array, slopes: Array, theta: Arra
 
 
 def residual_of(ones: Array, frames: Array, flux: Array) -> tuple[Array, Array]:
-    """Derivative of the log-likelihood by the flux, and its expected square; (pixels, columns)."""
+    """Derivative of the log-likelihood by the flux, and its expected square; both (pixels, columns)."""
     lit = -np.expm1(-flux)
     return ones / lit - frames, frames * (1 - lit) / lit
 
 
 def regular(information: Array) -> Array:
-    """The same with a diagonal that is never quite singular, whatever the units."""
+    """The information with a slightly larger diagonal, so that it is never singular, whatever the units."""
     size = information.shape[1]
     diagonal = np.einsum("pii->pi", information)
     regular: Array = information + (1e-9 * diagonal + 1e-12)[:, :, None] * np.eye(size)
@@ -117,7 +120,7 @@ def regular(information: Array) -> Array:
 
 
 def log_likelihood(ones: Array, frames: Array, flux: Array) -> Array:
-    """Log-likelihood of each pixel's counts (pixels,), without the part that no flux changes."""
+    """Log-likelihood of each pixel's counts (pixels,), without the part that does not depend on the flux."""
     result: Array = (ones * np.log(-np.expm1(-flux)) - (frames - ones) * flux).sum(axis=1)
     return result
 
@@ -154,9 +157,9 @@ SIGMA_SPREAD = 0.15
 class PassageFit:
     """One entry per pixel, in columns. centre, sd: of the passage. sigma: of the pixel's group.
 
-    significance: of the line, against levels alone, in standard deviations (the square root of twice the logarithm of
-    the likelihoods' ratio). misfit: Pearson's chi squared, as standard deviations above its mean. settled: whether the
-    scoring came to an end.
+    significance: of the line against levels alone, in standard deviations (the square root of twice the logarithm of
+    the likelihood ratio). misfit: Pearson's chi squared, as standard deviations above its mean. settled: whether the
+    scoring converged.
     """
 
     centre: Array
@@ -174,10 +177,11 @@ def fit_passages(
 ) -> PassageFit:  # fmt: skip
     """Fit the passages of pixels from their counts around them.
 
-    ones, frames, at: (pixels, columns) float64, 1s, frames and position of each column; frames 0 where there are none.
-    The first and the last one stand for all that is far away on their side. start: (pixels,) first guess of the
-    passage. group: (pixels,) part of the picture, from 0 on. shape: of the line's light. exact: not the parabola's
-    width at the top for `sd`, but that of the whole likelihood.
+    ones, frames, at: (pixels, columns) float64, 1s, frames and position of each column; frames are 0 if there are none.
+    The first and the last column stand for everything far away on their side. start: (pixels,) first guess of the
+    passage.
+    group: (pixels,) part of the picture, from 0 on. shape: of the line's light. exact: take `sd` from the whole
+    likelihood rather than from the parabola at its top.
     """
     theta = _start(ones, frames, at, start)
     damping = np.full(len(start), DAMPING)

@@ -1,14 +1,14 @@
 """The picture of a scene that a sweep saw, photons per pixel and exposure, from the counts of its columns.
 
-The response of one-bit pixels is inverted, flux = -ln(1 - share of 1s); a pixel lit in every frame is limited to that
-of half a frame without. Where room light alone gives a picture, the columns that the line lit a pixel in are left out:
-the line saturates on near boards, white and black alike, and leaves stripes where columns are wide. In the dark its own
-light is the picture, summed column by column. 512 x 512 pixels of 500 columns take about 0.4 s.
+The response of one-bit pixels is inverted, flux = -ln(1 - share of 1s). A pixel that is lit in every frame is treated
+as if half a frame were not. If room light alone gives a picture, the columns in which the line lit a pixel are left
+out, because the line saturates white and black alike on near boards and leaves stripes if columns are wide. In the dark
+the line's own light makes the picture, summed over columns. 512 x 512 pixels of 500 columns take about 0.4 s.
 
 `even_pixels` finds where a picture is even along its rows, away from edges of print that the line crosses. A pixel's
-passage is that of the light it gets. Where a lens or the pixel itself mixes white from one side with black from the
-other, that is the white's: up to a quarter of a pixel off. Edges along the row do no harm: the line runs across them,
-and lights both sides at once.
+passage is that of the light it receives. If a lens or the pixel itself mixes white from one side with black from the
+other, the white dominates and the passage is up to a quarter of a pixel off. Edges along the row do no harm, since the
+line crosses them and lights both sides at once.
 """
 
 import cv2
@@ -28,7 +28,7 @@ LEAST_COUNTS = 30.0
 
 
 def flux_picture(sweeps: tuple[SweepCounts, ...]) -> NDArray[np.float32]:
-    """Flux (rows, width) of the lit frames of sweeps over one scene, dark counts too; NaN where no window ever was."""
+    """Flux (rows, width) of the lit frames of sweeps over one scene, including dark counts; NaN outside all windows."""
     off = [_off_the_line(sweep) for sweep in sweeps]
     ones: Array = np.sum([part[0] for part in off], axis=0)
     frames: Array = np.sum([part[1] for part in off], axis=0)
@@ -111,7 +111,7 @@ AWAY_PX = 2
 
 
 def even_pixels(picture: NDArray[np.float32]) -> NDArray[np.bool_]:
-    """True (height, width) where the flux of a picture changes little along the row; noise is no edge."""
+    """True (height, width) where the flux of a picture changes little along the row; noise does not count as a change."""
     known = np.isfinite(picture)
     filled = np.where(known, np.maximum(picture, 0), 0).astype(np.float32)
     smooth = cv2.GaussianBlur(filled, (0, 0), BLUR_PX)

@@ -1,1 +1,1 @@
-"""One robust fit of camera, poses, mirror and lags to all views, with the covariance of everything."""
+"""One robust fit of camera, poses, mirror and lags to all views, with the joint covariance of all parameters."""

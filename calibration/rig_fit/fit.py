@@ -1,10 +1,10 @@
 """Bundle adjustment of a whole rig: camera, poses of the board, mirror and lag, from corners and passages together.
 
-Start values come from linear fits (`start`), the best values from robust least squares (`solve`) whose noise is told
-from the residuals themselves (`noise`). A round (`Rounds`) fits, looks at what is left, and ends with one decision at
-most (`misfit`): a term of the mirror that the data call for comes in, a lag below 0 is held, a view that does not
-belong loses its say. A lag that the sweeps' speeds and directions cannot tell is not fitted. The covariance is that of
-all parameters jointly.
+Start values come from linear fits (`start`), the best values from robust least squares (`solve`) with a noise estimated
+from the residuals themselves (`noise`). A round (`Rounds`) fits, examines the residuals, and ends with at most one
+decision (`misfit`): a mirror term that the data call for is added, a lag below 0 is fixed, or a view that does not fit
+the others is no longer used. A lag that the sweeps' speeds and directions do not determine is not fitted. The
+covariance covers all parameters jointly.
 """
 
 from collections.abc import Sequence
@@ -60,10 +60,10 @@ MOST_ODD_SHARE = 1 / 3
 
 @dataclass
 class Rounds:
-    """The state of fitting and deciding.
+    """The state of alternately fitting and deciding.
 
-    base: parameters that are free to begin with; free: now. decisions: the last ones about terms; kept: those that
-    changed the model.
+    base: parameters that are free at the beginning; free: those free now. decisions: the latest ones about terms; kept:
+    those that changed the model.
     """
 
     problem: RigProblem
@@ -166,8 +166,8 @@ def _settled(before: Noise, after: Noise) -> bool:
 class SweepFit:
     """The residuals of the passages of one sweep of a view; all float64 (m,), sorted by command.
 
-    command: the mirror's, as the model has it. residual, sd: in command units. distance_m: how far the point on the
-    board lies off the light.
+    command: the mirror's command in the model. residual, sd: in command units. distance_m: distance of the point on the
+    board from the light.
     """
 
     view: str
@@ -209,14 +209,14 @@ def sweep_fits(seen: Sighting, residual: Array, state: RigState, view: int) -> t
 
 @dataclass(frozen=True, slots=True, eq=False)
 class RigFit:
-    """A fitted rig. Per view, in the order of `views`: poses, corner_residual_px (n, 2) predicted less seen, sweeps.
+    """A fitted rig. Per view, in the order of `views`: poses, corner_residual_px (n, 2) predicted minus seen, sweeps.
 
-    left_out: names of views without corners; outliers: of views that do not fit the others, which had no say.
-    noise: what the residuals speak for; corner_scale: of the usual corner, by which its sd is the noise's. misfit: by
-    which variances were multiplied, 1 where the model describes all. condition: of the scaled equations of the shared
-    parameters. converged: False where data that contradict each other keep the fit from coming to rest. decisions:
-    about terms and lags. free: what was fitted, names of one group having one value; information: (free, free) about
-    it, the inverse of its covariance.
+    left_out: names of views without corners; outliers: names of views that do not fit the others and were not used.
+    noise: estimated from the residuals; corner_scale: scale of the usual corner, by which its sd is that of `noise`.
+    misfit: factor by which variances were multiplied, 1 if the model describes everything. condition: condition number
+    of the scaled equations of the shared parameters. converged: False if contradictory data keep the fit from
+    converging. decisions: about terms and lags. free: the fitted parameters, where the names of one group share a
+    value; information: (free, free), the inverse of their covariance.
     """
 
     model: RigModel
@@ -243,7 +243,7 @@ class RigFit:
 
     @property
     def used(self) -> tuple[str, ...]:
-        """Names of the views whose passages had a say."""
+        """Names of the views whose passages were used."""
         pairs = zip(self.views, self.sweeps, strict=True)
         return tuple(name for name, sweeps in pairs if sweeps and name not in self.outliers)
 
@@ -261,7 +261,9 @@ class RigFit:
 def result_of(
     fit: Rounds, left_out: tuple[str, ...], board: Board, start: RigModel | None, velocities: Array
 ) -> RigFit:
-    """The result of rounds that have run, its model else as `start` is. Degenerate where depth is next to unknown."""
+    """The result of rounds that have run; its model takes all else from `start`. Raises Degenerate if depth is almost
+    unknown.
+    """
     assert fit.solution is not None
     problem, solution, state = fit.problem, fit.solution, fit.state
     names = np.array(problem.terms.names)
@@ -333,11 +335,11 @@ def fit_rig(
 ) -> RigFit:
     """Fit a rig to views of a board; size: (width, height) of the picture.
 
-    camera: to start from (None: `start`'s or OpenCV's).
-    known: how well that camera is known from other pictures than these, by the names of its parameters; what has no
-    variance is known exactly and not fitted.
-    start: its mirror and lag are where the fit begins, its source, defects and command range are kept.
-    Raises Degenerate where the views do not make a model, with the reason, and CalibrationError.
+    camera: the start value of the camera (None: `start`'s or OpenCV's).
+    known: covariance of that camera from pictures other than these, by the names of its parameters. Parameters without
+    a variance are known exactly and not fitted.
+    start: its mirror and lag are the start values of the fit; its source, defects and command range are kept.
+    Raises Degenerate, with the reason, if the views do not determine a model, and CalibrationError.
     """
     shown = usable(views)
     if not shown:

@@ -1,11 +1,11 @@
-"""The misfit of a fitted rig: views that do not belong, slow misfit, and terms of the mirror that the data call for.
+"""The misfit of a fitted rig: views that do not fit, slow misfit, and mirror terms that the data call for.
 
-Terms are decided one at a time, each decision kept. A term that is not in the model is tried to first order: the
-equations say what value it would take and how sure that would be. It comes in where it would be SIGNIFICANT_SD of its
-own standard deviations and can be told from the others. The angle's polynomial grows by one order or two, since a
-symmetric mirror has no even terms. Of several that would come in the first is the one that leaves least unexplained: a
-term that is not there can stand for a part of one that is (light that passes beside the axis for an angle that bends),
-and may be surer of its value than the one it stands for.
+Terms are decided one at a time, and decisions are final. A term that is not in the model is tried to first order: the
+equations give the value it would take and its standard deviation. It is added if its value exceeds SIGNIFICANT_SD
+standard deviations and can be separated from the others. The angle's polynomial grows by one or two orders, since a
+symmetric mirror has no even terms. If several terms qualify, the one that leaves least unexplained is added first. A
+missing term can be imitated in part by another (light that passes beside the axis by an angle that bends), and the
+imitation may even have the smaller relative error.
 """
 
 from collections.abc import Callable, Sequence
@@ -30,8 +30,8 @@ LEAST_OWN_SHARE = 1e-7
 class TermDecision:
     """A decision about a term.
 
-    value, sd: what it is or would be, in its own unit; NaN where nothing tells. along: name and value of the terms that
-    would come in with it. gain: fall of chi2 with all of them.
+    value, sd: what it is or would be, in its own unit; NaN if unknown. along: name and value of the terms that would be
+    added with it. gain: decrease of chi2 with all of them.
     """
 
     name: str
@@ -46,7 +46,7 @@ class TermDecision:
 
 
 def with_free(problem: RigProblem, groups: Sequence[Sequence[str]]) -> RigProblem:
-    """The problem with these parameters free; those of one group have one value."""
+    """The problem with these parameters free. The parameters of one group share a value."""
     tie = np.zeros((len(problem.terms.names), len(groups)))
     for column, group in enumerate(groups):
         tie[problem.terms.at(group), column] = 1.0
@@ -54,7 +54,7 @@ def with_free(problem: RigProblem, groups: Sequence[Sequence[str]]) -> RigProble
 
 
 def candidates(free: Sequence[Sequence[str]], row_delay: bool) -> list[tuple[str, ...]]:
-    """Sets of terms that could come in next; of each set the last term is the one that is judged."""
+    """Sets of terms that could be added next. The last term of each set is the one that is judged."""
     names = {name for group in free for name in group}
     order = max(k for k in range(ANGLE_TERMS) if f"angle_{k}" in names)
     tried = [tuple(f"angle_{k}" for k in range(order + 1, top + 1)) for top in range(order + 1, order + 3)]
@@ -70,7 +70,10 @@ def candidates(free: Sequence[Sequence[str]], row_delay: bool) -> list[tuple[str
 def tried(
     problem: RigProblem, solution: RigSolution, new: Sequence[str], left_over: Callable[[float], float]
 ) -> TermDecision:
-    """The decision on the last of the new terms, all free. left_over: variances' factor were chi2 less by so much."""
+    """The decision on the last of the new terms, with all of them free.
+
+    left_over: gives the factor of the variances if chi2 were less by its argument.
+    """
     at = problem.terms.at(new)
     matrix, right = solution.matrix, solution.right
     tie = problem.tie
@@ -93,7 +96,7 @@ def tried(
 
 
 def best(decisions: Sequence[TermDecision]) -> int | None:
-    """Index of the decision that leaves least unexplained, of those that would be kept; None where there is none."""
+    """Index of the decision that leaves least unexplained among those that would be kept; None if there is none."""
     kept = [at for at, decision in enumerate(decisions) if decision.kept]
     return max(kept, key=lambda at: decisions[at].gain) if kept else None
 
@@ -101,7 +104,7 @@ def best(decisions: Sequence[TermDecision]) -> int | None:
 def lag_decisions(
     solution: RigSolution, problem: RigProblem, free: Sequence[Sequence[str]], timing: Array
 ) -> list[TermDecision]:
-    """The decisions on the lags, by what the directions and speeds told of them."""
+    """The decisions on the lags, from what the directions and speeds determine of them."""
     spread = np.sqrt(np.diag(solution.covariance(problem.tie)))
     told = {group[0]: group for group in free if group[0].startswith("lag")}
     decisions = []
@@ -117,7 +120,7 @@ def lag_decisions(
 
 
 def first_order(problem: RigProblem, solution: RigSolution, open_one: TermDecision) -> Array:
-    """(p,) by how much all shared parameters would change, were this term taken in, and those that go along."""
+    """(p,) change of all shared parameters if this term, and those that go along with it, were added."""
     taken = dict((*open_one.along, (open_one.name, open_one.value)))
     at, values = problem.terms.at(tuple(taken)), np.array(list(taken.values()))
     inverse, _ = scaled_inverse(problem.tie.T @ solution.matrix @ problem.tie)
@@ -127,7 +130,7 @@ def first_order(problem: RigProblem, solution: RigSolution, open_one: TermDecisi
 
 
 def corner_noise(problem: RigProblem, solution: RigSolution, noise: Noise) -> float:
-    """Corner sd (pixels) by the corners alone: passages that contradict them would only make them seem noisy."""
+    """Corner sd (pixels) from the corners alone. Passages that contradict the corners would only make them seem noisy."""
     p = len(problem.terms.names)
     shared: Array = np.zeros((p, p))
     right: Array = np.zeros(p)
@@ -169,12 +172,12 @@ MISFIT_SD = 3.0
 
 
 def odd_view(problem: RigProblem, solution: RigSolution, left: "Misfit") -> int | None:
-    """The view that would most like a scanner elsewhere, if it stands out, else None. left: the misfit of the fit.
+    """The view that most calls for another scanner position, if it stands out, else None. left: the misfit of the fit.
 
-    Each view's equations say how far chi2 would fall if the scanner had a place of its own for this view alone. Views
-    without passages say nothing of it: with their zeros any other would stand out. Where views are few, one that does
-    not belong bends the fit so far that all others want the scanner elsewhere too; but only with its own place does
-    nothing of the misfit remain.
+    Each view's equations tell how far chi2 would fall if the scanner had a separate position for this view alone. Views
+    without passages say nothing about it and are left out, since with their zeros any other view would stand out. With
+    few views, one that does not fit bends the fit so far that all others call for another position too; but only its
+    own separate position removes the misfit.
     """
     counted = np.flatnonzero(problem.counted & with_passages(problem))
     gains = np.array([_own_place(problem, solution, int(view)) for view in counted])
@@ -196,7 +199,7 @@ def _alone(left: "Misfit", gain: float, next_gain: float) -> bool:
 
 
 def with_passages(problem: RigProblem) -> NDArray[np.bool_]:
-    """(views,) True where the line was seen on the board."""
+    """(views,) True if the line was seen on the board."""
     return np.array([seen.command.size > 0 for seen in problem.sightings])
 
 
@@ -216,7 +219,7 @@ def _own_place(problem: RigProblem, solution: RigSolution, view: int) -> float:
 
 
 def widening(problem: RigProblem, solution: RigSolution, decisions: Sequence[TermDecision]) -> Array:
-    """(p, p) to add to the covariance, for the term that came nearest to being taken in: what it would change."""
+    """(p, p) to add to the covariance, for the effect of the term that came nearest to being added."""
     wider: Array = np.zeros_like(solution.matrix)
     open_ones = [d for d in decisions if not d.kept and np.isfinite(d.sd) and abs(d.value) > UNDECIDED_SD * d.sd]
     if open_ones:
@@ -227,14 +230,14 @@ def widening(problem: RigProblem, solution: RigSolution, decisions: Sequence[Ter
 
 
 class Misfit(NamedTuple):
-    """Chi2 and how much of it noise would make: of the corners, and of what varies slowly over the sweeps."""
+    """Chi2 and the part of it expected from noise, for the corners and for slow variations over the sweeps."""
 
     corners: tuple[float, float]
     slow: tuple[float, float]
 
     @property
     def factor(self) -> float:
-        """Factor by which variances are larger than the noise makes them; 1 where that may be chance."""
+        """Factor by which variances are larger than expected from noise; 1 if that may be chance."""
         found = [1.0]
         for chi2, free in self:
             if free >= 1 and chi2 > free + MISFIT_SD * np.sqrt(2 * free):
@@ -242,7 +245,7 @@ class Misfit(NamedTuple):
         return max(found)
 
     def without(self, gain: float) -> float:
-        """The factor that would be left if chi2 fell by this."""
+        """The factor that would remain if chi2 fell by `gain`."""
         excess = sum(max(chi2 - free, 0.0) for chi2, free in self)
         return max(1.0, 1 + (excess - gain) / max(self.slow[1], 1.0))
 

@@ -1,13 +1,13 @@
-"""The noise of corners and passages, told from their residuals.
+"""The noise of corners and passages, estimated from their residuals.
 
 Passages have three kinds of error: that of their own photons (their sd, times one factor), that of the mirror, which
-all pixels crossed in the same instant share (jitter), and what the model does not describe, which varies slowly over a
-sweep. The last is kept out of the first two: every sweep's own smooth part is taken off before. Then, in narrow bins of
-the command, products of different passages of a bin give the jitter's variance, products across bins how far it
-reaches, and the scatter within a bin the factor.
+all pixels crossed at the same instant share (jitter), and what the model does not describe, which varies slowly over a
+sweep. To keep the last out of the first two, each sweep's own smooth part is removed first. Then, in narrow bins of the
+command, products of different passages of a bin give the jitter's variance, products across bins its reach, and the
+scatter within a bin the factor.
 
-Before all that the sd are restated. A passage's sd is told from the same few photons as the passage: those that seem
-sharpest are so by chance in part, and a fit that believed them would think itself better than it is.
+Before all that the sd are corrected. A passage's sd is estimated from the same few photons as the passage itself. Those
+that seem most precise are so partly by chance, and a fit that believed them would underestimate its own error.
 """
 
 from collections.abc import Sequence
@@ -42,8 +42,10 @@ SIGNIFICANT_SD = 3.0
 
 @dataclass(frozen=True, slots=True)
 class Noise:
-    """corner_sd_px: of each coordinate of a corner of scale 1. passage_factor: by which passages' sd are multiplied.
-    jitter_sd: of the mirror, in command units; reach: commands as far apart as this share it.
+    """The noise of a fit. corner_sd_px: sd of each coordinate of a corner of scale 1. passage_factor: factor on
+    passages' sd.
+
+    jitter_sd: of the mirror, in command units; reach: largest difference of commands over which it is shared.
     """
 
     corner_sd_px: float
@@ -53,23 +55,23 @@ class Noise:
 
 
 def smooth_basis(command: Array, y_px: Array) -> Array:
-    """(m, 5): what is quadratic in the command and linear along the line."""
+    """(m, 5) basis functions: quadratic in the command and linear along the line."""
     c, y = _centred(command), _centred(y_px)
     return np.stack([np.ones_like(c), c, c * c, y, y * c], axis=-1)
 
 
 def smooth_part(command: Array, y_px: Array, residual: Array, weight: Array) -> Array:
-    """The part of a sweep's residuals (m,) that is as smooth as the basis."""
+    """The smooth part of a sweep's residuals (m,), as far as the basis describes it."""
     basis = smooth_basis(command, y_px)
     root = np.sqrt(weight)[:, None]
     return basis @ np.linalg.lstsq(basis * root, residual * root[:, 0], rcond=1e-9)[0]
 
 
 def restated(residuals: Sequence[Array], sightings: Sequence[Sighting]) -> tuple[Sighting, ...]:
-    """The sightings with sd a s^b in the place of each passage's sd s, a and b as the errors at each speed tell them.
+    """The sightings with sd a s^b instead of each passage's sd s, where a and b fit the errors at each speed.
 
-    Told from differences of neighbouring passages, in which what the model does not describe and most of the jitter are
-    gone. The sd's geometric mean stays as it is, for a factor to be told.
+    They are found from differences of neighbouring passages, in which most of the jitter and of the model's error
+    cancels. The geometric mean of the sd stays as it is; the factor is estimated later.
     """
     pairs: dict[int, list[tuple[Array, Array]]] = {}
     kinds = _kinds(sightings)
@@ -112,8 +114,9 @@ def _law(away: Array, sd: Array) -> tuple[float, float]:
 def passage_noise(residuals: Sequence[Array], sightings: Sequence[Sighting]) -> tuple[float, float, float]:
     """(factor, jitter sd, reach) from the passages' residuals of all views.
 
-    The mirror's error is taken to be held for a while, so that what two passages share falls as a straight line with
-    the commands between them; of all lengths the one is taken that stands out most from independent errors.
+    The mirror's error is assumed constant for a while, so the covariance of two passages falls linearly with the
+    difference of their commands. Of all lengths, the one that differs most significantly from independent errors is
+    taken.
     """
     width = _bin_width(sightings)
     pairs, shares = np.zeros(MOST_REACH_BINS), np.zeros(MOST_REACH_BINS)
@@ -158,7 +161,7 @@ def _inlying(residual: Array, command: Array, y_px: Array, sd: Array) -> tuple[A
 
 
 def bin_starts(seen: Sighting, reach: float) -> NDArray[np.int64]:
-    """Where, in a view's passages, each run begins that shares the mirror's jitter."""
+    """Indices in a view's passages at which each run begins that shares the mirror's jitter."""
     first = np.zeros(len(seen.command), bool)
     for sweep in seen.sweeps:
         command = seen.command[sweep]
@@ -168,7 +171,7 @@ def bin_starts(seen: Sighting, reach: float) -> NDArray[np.int64]:
 
 
 def tail_weight(normalised: Array, usual: float = 1 / MAD_TO_SD) -> Array:
-    """Weight of errors in sds, among others whose sizes' median is `usual`: where all are large, none is an outlier."""
+    """Weight of errors given in units of sd, whose usual median size is `usual`. If all are large, none is an outlier."""
     away = np.abs(normalised)
     if away.size:
         away = away / max(1.0, float(np.median(away)) / usual)

@@ -1,13 +1,13 @@
-"""Residuals of a rig and how they change with every parameter, exactly.
+"""Residuals of a rig and their exact derivatives by every parameter.
 
-A passage compares the mirror command at which the line crossed a pixel with the one, c, at which the light sheet meets
-the pixel's ray on the board. With F the distance of that point X from a sheet along its normal n (see `light_sheet`),
-F(c) = 0, and the residual, in units of the command, changes with a parameter p by (dF/dp) / (dF/dc). With the ray r,
-X = t r on the board's plane m.(X - P) = 0: a turn w and shift s of the board move X along r, which changes F by
-(n.r / m.r) (w.(m x (P - X)) + m.s), and a change dr of the ray changes it by t (n - (n.r / m.r) m).dr.
+A passage compares the mirror command at which the line crossed a pixel with the command c at which the light sheet
+meets the pixel's ray on the board. With F the distance of that point X from a sheet along its normal n (see
+`light_sheet`), F(c) = 0, and the residual, in units of the command, changes with a parameter p by (dF/dp) / (dF/dc).
+With the ray r, X = t r on the board's plane m.(X - P) = 0: a turn w and shift s of the board move X along r, which
+changes F by (n.r / m.r) (w.(m x (P - X)) + m.s), and a change dr of the ray changes it by t (n - (n.r / m.r) m).dr.
 
-Light on row y left a mirror that stood where the command was lag - row_delay y earlier. The order of the columns is
-that of `Terms.names`; the turns and shifts of the axis are those of `calibration.model.parameters`.
+Light on row y left a mirror that was where the command was lag - row_delay y earlier. The order of the columns is that
+of `Terms.names`; the turns and shifts of the axis are those of `calibration.model.parameters`.
 """
 
 from collections.abc import Sequence
@@ -33,7 +33,7 @@ OFFSET_TERMS = 2
 
 @dataclass(frozen=True, slots=True)
 class Terms:
-    """The parameters all views share, in the order of the columns. lens: how many terms of the lens are fitted."""
+    """The parameters that all views share, in the order of the columns. lens: number of lens terms that are fitted."""
 
     lens: int
 
@@ -56,13 +56,13 @@ class Terms:
         return (*self.camera, *self.scanner, *TIMES)
 
     def at(self, names: Sequence[str]) -> list[int]:
-        """The columns of some."""
+        """The column numbers of some parameters."""
         everything = self.names
         return [everything.index(name) for name in names]
 
 
 class Rows(NamedTuple):
-    """Residuals (n,); their derivatives for shared parameters (n, p) and for the turn and shift of the pose (n, 6)."""
+    """Residuals (n,); their derivatives by shared parameters (n, p) and by the turn and shift of the pose (n, 6)."""
 
     residual: Array
     shared: Array
@@ -70,7 +70,7 @@ class Rows(NamedTuple):
 
 
 class _Lit(NamedTuple):
-    """Points against the light of a mirror: F, dF/dangle and dF/dcommand (m,); the parts that derivatives need."""
+    """Points relative to the light of a mirror: F, dF/dangle and dF/dcommand (m,), and the parts that derivatives need."""
 
     distance_m: Array
     per_angle: Array
@@ -83,7 +83,7 @@ class _Lit(NamedTuple):
 
 
 class Sheet(NamedTuple):
-    """Points on the light that meets them: mirror command (m,), dF/dc (m,), normal (m, 3), dF/dp (m, terms)."""
+    """The light that meets given points: mirror command (m,), dF/dc (m,), normal (m, 3), dF/dp (m, terms)."""
 
     command: Array
     per_command: Array
@@ -94,7 +94,9 @@ class Sheet(NamedTuple):
 def sheet_rows(
     scanner: PivotScanner, source_m: Array | None, points_m: Array, command: Array, y_px: Array, velocity_per_s: Array
 ) -> Sheet:
-    """The light that meets points (m, 3), with derivatives for scanner and timing; command: the mirror's, near it."""
+    """The light that meets points (m, 3), with derivatives by scanner and timing. command: a start value of the
+    mirror's command.
+    """
     lit = _lit(scanner, source_m, points_m, command)
     met = command - lit.distance_m / lit.per_command
     lit = _lit(scanner, source_m, points_m, met)
@@ -119,7 +121,7 @@ def sheet_rows(
 
 
 def mirror_command(timing: Array, command: Array, y_px: Array, velocity_per_s: Array) -> Array:
-    """Position of the mirror, as `RigModel.mirror_command` has it, by `timing` (3,) instead of a model."""
+    """Position of the mirror, as in `RigModel.mirror_command`, with `timing` (3,) instead of a model."""
     delay_s: Array = np.where(velocity_per_s > 0, timing[0], timing[1]) - timing[2] * y_px
     return command - velocity_per_s * delay_s
 
@@ -148,7 +150,7 @@ def _lit(scanner: PivotScanner, source_m: Array | None, points_m: Array, command
 
 
 def ray_columns(camera: Camera, terms: Terms, u: Array, v: Array, by_u: Array, by_v: Array) -> Array:
-    """(m, camera terms): how what changes by by_u du + by_v dv with a pixel's ray changes with the camera."""
+    """(m, camera terms) derivatives by the camera of a quantity that changes by by_u du + by_v dv with a pixel's ray."""
     lens = camera.lens
     ux, uy, vx, vy = lens.undistort_slope(u, v)
     by_x, by_y = by_u * ux + by_v * vx, by_u * uy + by_v * vy
@@ -185,7 +187,7 @@ def passage_rows(
 
 
 def corner_rows(camera: Camera, terms: Terms, pose: BoardPose, corners_m: Array, corner_px: Array) -> Rows:
-    """Rows of corners (n, 3) seen at (n, 2): predicted less seen, in pixels, (2 n,) with all x first."""
+    """Rows of corners (n, 3) seen at (n, 2): predicted minus seen, in pixels, (2 n,) with all x first."""
     moved = corners_m @ pose.matrix.T
     points = moved + pose.position_m
     z = points[:, 2]
@@ -208,7 +210,7 @@ def corner_rows(camera: Camera, terms: Terms, pose: BoardPose, corners_m: Array,
 
 
 def refined_rays(camera: Camera, rays: Array, x_px: Array, y_px: Array) -> Array:
-    """Rays (2, m) of pixels, from those of a camera that differs little: two steps of Newton's method."""
+    """Rays (2, m) of pixels, from those of a camera that differs little, by two steps of Newton's method."""
     lens, matrix = camera.lens, camera.matrix
     x, y = (x_px - matrix[0, 2]) / matrix[0, 0], (y_px - matrix[1, 2]) / matrix[1, 1]
     u, v = rays

@@ -1,4 +1,4 @@
-"""The least squares of a rig's fit: Gauss-Newton steps, damped where they do not help, in scaled parameters.
+"""The least squares of a rig's fit: Gauss-Newton steps in scaled parameters, damped if they do not help.
 
 The normal equations take one view at a time and eliminate its pose.
 
@@ -6,9 +6,9 @@ Passages of one instant share the mirror's jitter s. For each bin
 
     V = D + s^2 11',    V^-1 = D^-1 - k (D^-1 1)(D^-1 1)',    k = s^2 / (1 + s^2 1'D^-1 1)
 
-so a bin adds the sum over its passages less k times a product of sums. A view's pose only touches that view: with
-N = [[A, B'], [B, C]] (A shared, C the pose's own) the view adds A - B'C^-1 B to the shared equations, and its pose
-follows from theirs.
+so a bin contributes the sum over its passages minus k times a product of sums. A view's pose affects only that view:
+with N = [[A, B'], [B, C]] (A shared, C the pose's own) the view adds A - B'C^-1 B to the shared equations, and its pose
+follows from their solution.
 """
 
 from collections.abc import Sequence
@@ -31,11 +31,11 @@ _USUAL_MISS = float(np.sqrt(np.log(2.0)))
 
 @dataclass(frozen=True, slots=True, eq=False)
 class ViewNormal:
-    """The normal equations of a view, its pose eliminated.
+    """The normal equations of a view after elimination of its pose.
 
     matrix (p, p), right (p,); pose_by_shared (6, p), pose_alone (6,) and pose_inverse (6, 6): the pose's change is
-    pose_alone - pose_by_shared @ shared. chi2 of (corners, passages). corner_part, passage_part: (p + 6, p + 6) what
-    each adds before the elimination; corner_right: (p + 6,).
+    pose_alone - pose_by_shared @ shared. chi2 of (corners, passages). corner_part, passage_part: (p + 6, p + 6), their
+    contributions before the elimination; corner_right: (p + 6,).
     """
 
     matrix: Array
@@ -49,7 +49,10 @@ class ViewNormal:
     passage_part: Array
 
     def joint(self, covariance: Array) -> Array:
-        """(p + 6, p + 6) covariance of the shared parameters, which have (p, p), and of this view's pose."""
+        """(p + 6, p + 6) covariance of the shared parameters together with this view's pose.
+
+        covariance: (p, p), that of the shared parameters.
+        """
         across = -covariance @ self.pose_by_shared.T
         own = self.pose_inverse - self.pose_by_shared @ across
         return np.block([[covariance, across], [across.T, own]])
@@ -57,7 +60,9 @@ class ViewNormal:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Weights:
-    """Per view: of corners' coordinates (2 n,), of passages (m,), starts of bins that share jitter; its variance."""
+    """Weights per view: of corners' coordinates (2 n,), of passages (m,); the starts of bins that share jitter; its
+    variance.
+    """
 
     corners: tuple[Array, ...]
     passages: tuple[Array, ...]
@@ -66,7 +71,7 @@ class Weights:
 
 
 def weights(rows: Sequence[tuple[Rows, Rows]], sightings: Sequence[Sighting], noise: Noise) -> Weights:
-    """Inverse variances, less for what lies in the tails."""
+    """Inverse variances, reduced for residuals in the tails."""
     corners, passages, starts = [], [], []
     for (corner, passage), seen in zip(rows, sightings, strict=True):
         sd_px = noise.corner_sd_px * seen.corner_scale
@@ -79,7 +84,7 @@ def weights(rows: Sequence[tuple[Rows, Rows]], sightings: Sequence[Sighting], no
 
 
 def corner_weights(residual_px: Array, sd_px: Array) -> Array:
-    """(n,) of either coordinate of corners that are off by (2, n); sd_px: (n,) of a coordinate."""
+    """(n,) weights of either coordinate, for corners with residuals (2, n). sd_px: (n,) of a coordinate."""
     miss = np.hypot(*residual_px) / (sd_px * np.sqrt(2.0))
     return tail_weight(miss, _USUAL_MISS) / sd_px**2
 
@@ -100,7 +105,7 @@ def normals(rows: Sequence[tuple[Rows, Rows]], weight: Weights) -> list[ViewNorm
 def view_normal(
     corners: Rows, passages: Rows, corner_weight: Array, weight: Array, starts: NDArray[np.int64], jitter: float
 ) -> ViewNormal:
-    """The normal equations of one view, its pose eliminated."""
+    """The normal equations of one view after elimination of its pose."""
     of_corners, corner_right, corner_chi2 = _products(corners, corner_weight)
     of_passages, passage_right, passage_chi2 = _products(passages, weight)
     if jitter and starts.size:
@@ -141,7 +146,7 @@ CONVERGED_CHI2 = 1e-3
 ROUGH_SHARE = 1e-4
 """Share of chi2 that the next step may still promise where a term is only looked for."""
 WORSE_CHI2 = 0.1
-"""Amount by which a step may raise chi2: derivatives are exact but for how a bow changes along the line."""
+"""Amount by which a step may raise chi2: derivatives are exact except for how a bow changes along the line."""
 MOST_DAMPING = 1e8
 MOST_CONDITION = 1e12
 """Largest condition number of the scaled equations; beyond it float64 leaves no digits of the worst direction."""
@@ -149,7 +154,7 @@ MOST_CONDITION = 1e12
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Prior:
-    """Knowledge of the camera from elsewhere: information (p, p), 0 for other parameters, at the values (p,)."""
+    """Knowledge of the camera from elsewhere: information (p, p), 0 for other parameters, around the values (p,)."""
 
     matrix: Array
     values: Array
@@ -159,8 +164,8 @@ class Prior:
 class RigProblem:
     """The data and the parameters of a fit.
 
-    tie: (p, q), shared parameters by free ones. counted: (views,), False where a view has a pose of its own but no say
-    in what all share. prior: on the camera's terms, or None.
+    tie: (p, q) maps free parameters to shared ones. counted: (views,), False if a view has its own pose but does not
+    influence the shared parameters. prior: on the camera's terms, or None.
     """
 
     sightings: tuple[Sighting, ...]
@@ -172,7 +177,9 @@ class RigProblem:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class RigSolution:
-    """A state with residuals, the equations of all shared parameters (p, p), (p,), the condition of the free ones."""
+    """A state with its residuals, the equations of all shared parameters (p, p), (p,), and the condition of the free
+    ones.
+    """
 
     state: RigState
     rows: list[tuple[Rows, Rows]]
@@ -184,13 +191,16 @@ class RigSolution:
     converged: bool
 
     def covariance(self, tie: Array) -> Array:
-        """(p, p) of the shared parameters, 0 where they are not free."""
+        """(p, p) covariance of the shared parameters, 0 for those that are not free."""
         inverse, _ = scaled_inverse(tie.T @ self.matrix @ tie)
         return tie @ inverse @ tie.T
 
 
 def solved(problem: RigProblem, state: RigState, noise: Noise, *, roughly: bool = False) -> RigSolution:
-    """The best state under this noise; roughly: as near as decisions need. Degenerate: there is no single one."""
+    """The best state for this noise. Raises Degenerate if the solution is not unique.
+
+    roughly: whether to stop once it is accurate enough for decisions.
+    """
     rows = all_rows(state, problem.sightings, problem.terms)
     damping = 0.0
     for step in range(MOST_STEPS):
@@ -222,7 +232,7 @@ def solved(problem: RigProblem, state: RigState, noise: Noise, *, roughly: bool 
 
 
 def equations(views: Sequence[ViewNormal], problem: RigProblem, state: RigState) -> tuple[Array, Array]:
-    """(matrix, right) of the shared parameters: all views and what was known before."""
+    """(matrix, right) of the shared parameters: the sum over all views and the prior."""
     counted = _counted(views, problem)
     matrix: Array = np.sum([view.matrix for view in counted], axis=0)
     right: Array = np.sum([view.right for view in counted], axis=0)
@@ -233,7 +243,7 @@ def equations(views: Sequence[ViewNormal], problem: RigProblem, state: RigState)
 
 
 def scaled_inverse(matrix: Array) -> tuple[Array, float]:
-    """(inverse, condition number) of an information matrix, scaled; Degenerate where there is none worth the name."""
+    """(inverse, condition number) of an information matrix, scaled. Raises Degenerate if it is practically singular."""
     weight = np.diag(matrix)
     if not np.all(np.isfinite(matrix)) or np.any(weight <= 0):
         raise Degenerate(
@@ -275,7 +285,7 @@ def _own_promise(view: ViewNormal) -> float:
 
 
 def _chi2(views: Sequence[ViewNormal], problem: RigProblem, state: RigState) -> float:
-    """Chi2; inf where it or its slopes are no numbers, as where a lens folds within the picture."""
+    """Chi2; inf if it or its slopes are no numbers, as where a lens folds within the picture."""
     if not all(np.isfinite(view.matrix).all() for view in views):
         return np.inf
     total = sum(sum(view.chi2) for view in _counted(views, problem))
@@ -290,7 +300,9 @@ def _counted(views: Sequence[ViewNormal], problem: RigProblem) -> list[ViewNorma
 
 
 def camera_prior(known: Covariance, camera: Camera, terms: Terms) -> Prior | None:
-    """The prior from a camera that other pictures told of, with their covariance; None where it is known exactly."""
+    """The prior from a camera that was calibrated from other pictures, with its covariance; None if it is known
+    exactly.
+    """
     variance = dict(zip(known.names, np.diag(known.matrix), strict=True))
     names = [name for name in known.names if name in terms.camera and variance[name] > 0]
     if not names:

@@ -1,11 +1,11 @@
 """First values for a rig's fit: poses from corners, planes from passages, the mirror's axis from the planes.
 
-With the poses known, every passage is a point of space that the light met at a command. For a line turned about an axis
-x = d(c) - b(c) y - e(c) z with d, b, e smooth in c: polynomials, found by one linear least squares over all points that
-a direction and speed of sweep gave. Their planes' normals lie across the axis, and the commands at which two sweeps
-reach the same angle differ by what the mirror lags.
+With the poses known, every passage is a point in space that the light met at a command. For a line turned about an
+axis, x = d(c) - b(c) y - e(c) z with smooth d, b, e. These are polynomials, found by one linear least squares fit over
+all points of one direction and speed of sweep. The normals of the planes lie across the axis. The commands at which two
+sweeps reach the same angle differ by the mirror's lag.
 
-Views that make no model of a rig are refused with the reason, what was measured, its limit and what to do.
+Views that determine no rig model are refused with the reason, the measured value, its limit and what to do.
 """
 
 import math
@@ -42,7 +42,7 @@ _STEP = 0.7
 
 @dataclass(frozen=True, slots=True, eq=False)
 class LitPoints:
-    """Points at which light met the board: (m, 3), command (m,), velocity (m,), the view of each (m,)."""
+    """Points at which light met the board: (m, 3), with command (m,), velocity (m,) and view (m,) of each."""
 
     points_m: Array
     command: Array
@@ -77,7 +77,7 @@ def board_points(camera: Camera, sightings: Sequence[Sighting], poses: Sequence[
 
 
 def first_scanner(points: LitPoints, command_range: tuple[float, float]) -> tuple[PivotScanner, Array]:
-    """A mirror and (lag forward, lag backward, 0); the lags are one where only their sum can be told, or 0."""
+    """A mirror and (lag forward, lag backward, 0). The lags are equal if only their sum is determined, or else 0."""
     velocities = _often_shown(points)
     curves = []
     axis, point, first = _pivot(_planes_of(points, velocities[np.argmax(_counts(points, velocities))])[1])
@@ -173,7 +173,7 @@ MOST_DEPTH_SD_SHARE = 0.2
 
 
 def check_views(views: Sequence[View], sightings: Sequence[Sighting]) -> None:
-    """Raise Degenerate unless two views show board and line, and the line moved."""
+    """Raise Degenerate unless two views show board and line, and the line moved across the board."""
     with_line = [seen for seen in sightings if seen.command.size]
     if len(sightings) == 0:
         raise Degenerate(
@@ -196,7 +196,7 @@ def check_views(views: Sequence[View], sightings: Sequence[Sighting]) -> None:
 
 
 def check_poses(points_m: Array, poses: Sequence[BoardPose]) -> None:
-    """Raise Degenerate where all points (m, 3) at which the light met the boards lie in one plane."""
+    """Raise Degenerate if all points (m, 3) at which the light met the boards lie in one plane."""
     middle = points_m.mean(axis=0)
     sizes = np.linalg.svd(points_m - middle, compute_uv=False) / np.sqrt(len(points_m))
     thickness = float(sizes[2] / np.linalg.norm(middle))
@@ -211,12 +211,14 @@ def check_poses(points_m: Array, poses: Sequence[BoardPose]) -> None:
 
 
 def reason_of(poses: Sequence[BoardPose]) -> str:
-    """The likeliest reason why boards at these poses fix too little: a guess, where `coplanar` is seen."""
+    """The likeliest reason why boards at these poses determine too little. Only `coplanar` is certain; others are
+    guesses.
+    """
     return "too-few-poses" if spread_rad(poses) >= LEAST_TILT_RAD and len(poses) < 6 else "no-tilt"
 
 
 def no_start(error: Exception, poses: Sequence[BoardPose]) -> Degenerate:
-    """The error for views from which not even a first guess makes a rig."""
+    """The error for views from which not even a first guess of a rig can be made."""
     return Degenerate(
         reason_of(poses),
         f"light on {len(poses)} boards fits no mirror: {error}; show the board at 8 or more poses, at several "
@@ -225,7 +227,7 @@ def no_start(error: Exception, poses: Sequence[BoardPose]) -> Degenerate:
 
 
 def unfit(names: Sequence[str]) -> str:
-    """Words for the views that had no say."""
+    """Text for the views that were not used."""
     return f"view{'s' if len(names) > 1 else ''} {', '.join(names)} left out: unlike the others"
 
 
@@ -237,7 +239,7 @@ def check_depth(
     misfit: float = 1.0,
     outliers: Sequence[str] = (),
 ) -> None:
-    """Raise Degenerate where poses tell next to nothing of depth, the misfit of contradictions taken off."""
+    """Raise Degenerate if the poses hardly determine depth, apart from the misfit of contradictory data."""
     camera = model.camera
     x, y = np.meshgrid(np.linspace(0.1, 0.9, 7) * camera.width, np.linspace(0.1, 0.9, 5) * camera.height)
     for at_m in (AT_M, float(np.median([np.linalg.norm(pose.position_m) for pose in poses]))):

@@ -1,4 +1,4 @@
-"""The state of a rig's fit (model, timing, poses, residuals), and the sightings that it is fitted to.
+"""The state of a rig's fit (model, timing, poses, residuals), and the sightings to which it is fitted.
 
 A sighting is a pose's corners and passages, cleaned and in the order that the fit needs.
 """
@@ -30,10 +30,10 @@ FEWEST_PASSAGES = 30
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Sighting:
-    """One view. corners_m (n, 3), corner_px (n, 2), corner_scale (n,): sd of a corner against that of the others.
+    """One view. corners_m (n, 3), corner_px (n, 2), corner_scale (n,): sd of a corner relative to the others.
 
     Per passage (m,), float64, sorted by sweep and command: x_px, y_px, command, sd, velocity_per_s (signed). starts:
-    (sweeps + 1,) where the sweeps begin and end.
+    (sweeps + 1,), indices at which the sweeps begin and end.
     """
 
     name: str
@@ -49,7 +49,7 @@ class Sighting:
 
     @property
     def sweeps(self) -> list[slice]:
-        """The passages of each sweep."""
+        """The slices of passages that belong to each sweep."""
         return [slice(int(a), int(b)) for a, b in zip(self.starts[:-1], self.starts[1:], strict=True)]
 
 
@@ -79,14 +79,14 @@ def sighting(view: View, board: Board, camera: Camera, pose: BoardPose) -> Sight
 
 
 def corner_scale(corners: Corners) -> Array:
-    """Relative sd of each corner, 1 where the picture did not tell."""
+    """Relative sd of each corner, 1 if the picture gave none."""
     if corners.sd_px is None:
         return np.ones(len(corners.ids))
     return np.hypot(corners.likely_sd_px, LEAST_CORNER_SD_PX) / USUAL_CORNER_SD_PX
 
 
 def usable(views: Sequence[View]) -> list[View]:
-    """The views that have corners enough for a pose, without corners that are nowhere."""
+    """The views with enough corners for a pose, without corners at invalid positions."""
     found = []
     for view in views:
         if view.corners is None:
@@ -101,7 +101,7 @@ def usable(views: Sequence[View]) -> list[View]:
 
 
 def shows_line(view: View) -> bool:
-    """Whether a sweep of a view has passages enough to be looked at."""
+    """Whether any sweep of a view has enough passages to be used."""
     return any(sweep.x_px.size >= FEWEST_PASSAGES for sweep in view.passages)
 
 
@@ -129,7 +129,7 @@ def _on_board(sweep: Passages, board: Board, camera: Camera, pose: BoardPose) ->
 
 @dataclass(frozen=True, slots=True, eq=False)
 class RigState:
-    """The model, its lags 0; timing (3,): both lags, row delay in s, any sign; per view poses, rays (2, m)."""
+    """The model with lags of 0; timing (3,): both lags and row delay in s, of any sign; per view poses and rays (2, m)."""
 
     model: RigModel
     timing: Array
@@ -143,7 +143,7 @@ class RigState:
         return self.model.scanner
 
     def rows(self, view: int, seen: Sighting, terms: Terms) -> tuple[Rows, Rows]:
-        """Residuals and derivatives of one view: of its corners (pixels) and of its passages (command units)."""
+        """Residuals and derivatives of one view, for its corners (pixels) and its passages (command units)."""
         pose = self.poses[view]
         corners = corner_rows(self.model.camera, terms, pose, seen.corners_m, seen.corner_px)
         passages = passage_rows(
@@ -152,7 +152,9 @@ class RigState:
         return corners, passages
 
     def stepped(self, terms: Terms, shared: Array, poses: Sequence[Array], sightings: Sequence[Sighting]) -> "RigState":
-        """The state moved by changes of shared parameters (p,) and of poses (6,). CalibrationError: no such model."""
+        """The state after changes of shared parameters (p,) and of poses (6,). Raises CalibrationError if there is no
+        such model.
+        """
         untimed = len(terms.names) - len(TIMES)
         moved = [name for name, change in zip(terms.names[:untimed], shared, strict=False) if change != 0]
         model = with_parameters(self.model, moved, [shared[terms.names.index(name)] for name in moved])
@@ -167,14 +169,14 @@ class RigState:
 
 
 def first_state(model: RigModel, timing: Array, poses: Sequence[BoardPose], sightings: Sequence[Sighting]) -> RigState:
-    """The state at a model, whose own lags are left aside."""
+    """The state for a model, without the model's own lags."""
     rays = tuple(np.stack(model.camera.tangents_at(seen.x_px, seen.y_px)) for seen in sightings)
     timeless = replace(model, lag_s=type(model.lag_s)(), row_delay_s=0.0, covariance=None)
     return RigState(timeless, np.asarray(timing, np.float64), tuple(poses), rays)
 
 
 def with_terms_of(state: RigState, groups: Sequence[Sequence[str]]) -> RigState:
-    """The state without those terms of the mirror that are not named: they are 0."""
+    """The state with all mirror terms that are not named set to 0."""
     named = {name for group in groups for name in group}
     scanner = state.scanner
     plain = replace(

@@ -1,9 +1,9 @@
-"""The moment at which the laser's light begins or ends, from the ones of the frames around it.
+"""The time at which the laser's light begins or ends, from the counts of the frames around it.
 
     ones of frame i = level + slope i + brightness r(share of the exposure that was lit),     r(0) = 0, r(1) = 1
 
-One frame at most is lit in part. All others give level, slope and brightness by least squares, and so how bright that
-one is, r, with its standard deviation. A pixel that fires with probability p when lit whole has
+At most one frame is partly lit. All others give level, slope and brightness by least squares, and so the response r of
+the partly lit frame, with its standard deviation. A pixel that fires with probability p when fully lit has
 
     1 - (1 - p)^s = s p + s (1 - s) / 2 p^2 + ...
 
@@ -12,8 +12,8 @@ response of a share s is therefore known within
 
     s + s (1 - s) m / 2 <= r(s) <= s + (1 - s) m
 
-For a weak line that is s; for one that saturates next to nothing is known within a frame, and edges that lie elsewhere
-within theirs have to tell. Ones scatter like photons, or more where the fit says so.
+For a weak line that is s. For a saturated line almost nothing is known within one frame, and the information must come
+from edges at other places within their frames. The ones scatter like photons, or more if the residuals show it.
 """
 
 from collections.abc import Sequence
@@ -29,9 +29,10 @@ SPARE_FRAMES = 2
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Edge:
-    """chi2: (times,) of the edge at each of the moments. brightness: ones that a lit frame has more; its sd.
+    """An edge of the light. chi2: (times,) if the edge is at each of the times. brightness, brightness_sd: extra ones
+    of a lit frame.
 
-    scatter: variance of the ones around the fit in units of that of photons; chi2 and the sd have it in them.
+    scatter: variance of the ones around the fit in units of that of photons; chi2 and the sd include it.
     """
 
     chi2: Array
@@ -43,10 +44,11 @@ class Edge:
 def fit_edge(
     ones: Array, start_s: Array, exposure_s: float, times_s: Array, *, rises: bool, saturation: float = 0.0
 ) -> Edge:
-    """Tell how well light that begins (rises) or ends at each of the moments (times,), ascending, explains some frames.
+    """Compute how well light that begins (rises) or ends at each of the times (times,), ascending, explains some
+    frames.
 
-    ones, start_s: (frames,), 1s of each and when its exposure began, at least 8 frames. saturation: m above. Moments
-    within two frames of either end are taken to be impossible.
+    ones, start_s: (frames,), 1s of each frame and start of its exposure, at least 8 frames. saturation: m above. Times
+    within two frames of either end are taken as impossible.
     """
     weight = 1 / max(float(ones.mean()), 1.0)
     first, last = np.searchsorted(start_s, times_s[[0, -1]], side="right") - 1
@@ -68,7 +70,7 @@ def fit_edge(
 
 
 def edge_time(edges: Sequence[Edge], times_s: Array) -> tuple[float, float]:
-    """The moment (s) that all edges share and its sd, larger where they disagree; times_s: (times,), even."""
+    """The time (s) that all edges share and its sd, which is larger if they disagree. times_s: (times,), evenly spaced."""
     chi2 = np.sum([edge.chi2 for edge in edges], axis=0)
     apart = (chi2.min() - sum(edge.chi2.min() for edge in edges)) / max(len(edges) - 1, 1)
     likely = np.exp(-0.5 * (chi2 - chi2.min()) / max(apart, 1.0))
@@ -84,7 +86,7 @@ _NO_LIGHT = 1e9
 
 @dataclass(frozen=True, slots=True)
 class _Step:
-    """The fit without the frame that is lit in part. response: r of that one."""
+    """The fit without the partly lit frame. response: r of that frame."""
 
     chi2: float
     brightness: float

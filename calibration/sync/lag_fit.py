@@ -1,24 +1,25 @@
-"""The lags of light, mirror and frames, from sweeps over one unmoved scene at several speeds, both ways.
+"""The lags of light, mirror and frames, from sweeps over one unmoved scene at several speeds, in both directions.
 
 A pixel sees the line at one mirror position, whatever the speed. In a sweep with direction s = +1 or -1 and speed v it
 sees it at (calibration/views.py)
 
     command = position + s v (lag_s - row_delay y)
 
-Positions drop out as each pixel's weighted mean (`SharedPixels`); what is left is linear in the two lags and the row
-delay. Passages that tremble together count together, since a mirror's jitter is common to all pixels that it passes
-then. No board is needed and no geometry, only pixels that tell of a passage in several of the sweeps: 2000 pixels of 4
+Positions are eliminated as each pixel's weighted mean (`SharedPixels`); the rest is linear in the two lags and the row
+delay. Passages close in time are treated as correlated, since a mirror's jitter is common to all pixels that it passes
+then. This needs neither a board nor geometry, only pixels with a passage in several of the sweeps: 2000 pixels of 4
 sweeps take 10 ms.
 
-What the sweeps can tell depends on them (`calibration.model.parameters`). One speed each way: a mean of the lags alone,
-both are taken to be it. Two speeds in one direction at least: the lag of each way that was scanned. Whether a lag is
-the same at all speeds shows with two speeds both ways, or three. The row delay needs rows, not speeds. One that is
-known from elsewhere counts with what the sweeps tell of it, unless they contradict it significantly; where nothing is
-known it is 0.
+The sweeps limit what can be determined (`calibration.model.parameters`). One speed in each direction gives only a mean
+of the lags, and both are set to it. At least two speeds in one direction give the lag of each direction that was
+scanned. Two speeds in both directions, or three speeds, show whether a lag is the same at all speeds. The row delay
+needs rows, not speeds. A row delay that is known from elsewhere is combined with that from the sweeps, unless they
+contradict each other significantly; if nothing is known it is 0.
 
 A constant delay of the markers behind the mirror's command (the scanner's colour outputs trail its mirror outputs by
-some microseconds, docs/reference/hardware.md) shortens both lags, which are then right for binding with these very
-markers. A marker of the wrong polarity shows in the binding; the gate's delay in the frames at its edges (`gate_fit`).
+some microseconds, docs/reference/hardware.md) shortens both lags, which are then right for binding with the same
+markers. A marker of the wrong polarity shows in the binding; the gate's delay shows in the frames at its edges
+(`gate_fit`).
 """
 
 from collections.abc import Sequence
@@ -46,7 +47,9 @@ MOST_OFF = 4.7
 
 @dataclass(frozen=True, slots=True, eq=False)
 class SharedPixels:
-    """Pixels that several sweeps share: command, weight (0: none) (pixels, sweeps), rows (pixels,), of sweeps."""
+    """Pixels that several sweeps share: command and weight (0: none) (pixels, sweeps), rows (pixels,), and the
+    direction and speed of each sweep.
+    """
 
     command: Array
     weight: Array
@@ -56,12 +59,12 @@ class SharedPixels:
 
     @property
     def velocity(self) -> Array:
-        """Velocities of the command, signed (sweeps,)."""
+        """Signed velocities of the command (sweeps,)."""
         return self.direction * self.speed
 
     @classmethod
     def of(cls, sweeps: Sequence[Passages]) -> "SharedPixels":
-        """Collect the pixels that sweeps share. Degenerate where they are too few."""
+        """Collect the pixels that sweeps share. Raises Degenerate if they are too few."""
         places = [np.stack([sweep.y_px, sweep.x_px], axis=1) for sweep in sweeps]
         every = np.concatenate([*places, np.empty((0, 2))])
         pixels, index = np.unique(every, axis=0, return_inverse=True)
@@ -86,8 +89,10 @@ class SharedPixels:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Solved:
-    """value, covariance: of the designs. residual: (pixels, sweeps), in command units. weight: what each counted.
-    design: (pixels, sweeps, designs), without what a pixel's own position takes.
+    """The result of a least squares fit. value, covariance: of the designs' coefficients.
+
+    residual: (pixels, sweeps), in command units. weight: weight of each passage. design: (pixels, sweeps, designs),
+    after elimination of each pixel's own position.
     """
 
     value: Array
@@ -98,7 +103,7 @@ class Solved:
     design: Array
 
     def with_last_near_0(self, sd: float) -> "Solved":
-        """The same, where the last design's value was known to be 0 with this standard deviation."""
+        """The solution if the coefficient of the last design is known to be 0 with this standard deviation."""
         gain = self.covariance[:, -1] / (self.covariance[-1, -1] + sd**2)
         moved = -gain * self.value[-1]
         return replace(
@@ -110,7 +115,9 @@ class Solved:
 
 
 def solve(seen: SharedPixels, designs: Sequence[Array]) -> Solved:
-    """Weighted least squares without pixels' own positions and outliers. Degenerate: designs cannot be told apart."""
+    """Weighted least squares without pixels' own positions and outliers. Raises Degenerate if designs cannot be
+    separated.
+    """
     basis = np.stack([np.broadcast_to(each, seen.command.shape) for each in designs], axis=2)
     weight, noise = seen.weight, 1.0
     for _ in range(6):
@@ -149,7 +156,7 @@ def _own(values: Array, weight: Array) -> Array:
 
 
 def clusters(seen: SharedPixels) -> NDArray[np.int64]:
-    """Number (pixels, sweeps) of the part of a sweep that each passage lies in."""
+    """Number (pixels, sweeps) of the part of a sweep in which each passage lies."""
     there = seen.weight > 0
     low, high = seen.command[there].min(), seen.command[there].max()
     part = np.clip((seen.command - low) / max(high - low, 1e-300) * CLUSTERS, 0, CLUSTERS - 1).astype(np.int64)
@@ -171,7 +178,7 @@ MOST_CHI2_SDS = 4.0
 
 @dataclass(frozen=True, slots=True)
 class SweepTiming:
-    """The timing that one sweep tells beside the others: its own lag_s, with sd_s."""
+    """The lag_s of one sweep relative to the others, with sd_s."""
 
     direction: int
     speed_per_s: float
@@ -187,13 +194,13 @@ class SweepTiming:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class SyncFit:
-    """lag_s, row_delay_s: as in `RigModel`. covariance: (3, 3), s^2, of the three.
+    """Fitted lags. lag_s, row_delay_s: as in `RigModel`. covariance: (3, 3), s^2, of the three.
 
-    speed_range_per_s: where they hold. common: whether the two lags could not be told apart. told: which directions
-    were scanned. row_told: whether the row delay is news; else it is the one known before, and its variance what the
-    sweeps alone would have had. sweeps: lag of each by itself, at the row delay found. chi2, dof: of those against
-    common lags; `steady`: whether they agree. noise: robust standard deviation of the residuals in units of what was
-    stated.
+    speed_range_per_s: the range in which they hold. common: whether the two lags could not be separated. told: which
+    directions were scanned. row_told: whether the row delay was determined; if not, it is the one known before, with
+    the variance that the sweeps alone would have given. sweeps: lag of each sweep by itself, at the fitted row delay.
+    chi2, dof: of those against common lags; `steady`: whether they agree. noise: robust standard deviation of the
+    residuals in units of the stated sd.
     """
 
     lag_s: Lag
@@ -210,24 +217,25 @@ class SyncFit:
 
     @property
     def sd_s(self) -> Array:
-        """Standard deviations (3,) of both lags and the row delay; NaN where the direction was not scanned."""
+        """Standard deviations (3,) of both lags and the row delay; NaN for a direction that was not scanned."""
         return np.sqrt(np.diag(self.covariance))
 
     @property
     def velocities_per_s(self) -> tuple[float, ...]:
-        """Velocities of the sweeps, signed."""
+        """Signed velocities of the sweeps."""
         return tuple(sweep.velocity_per_s for sweep in self.sweeps)
 
     @property
     def steady(self) -> bool:
-        """Whether the lag is the same at all speeds, as far as these can tell."""
+        """Whether the lag is the same at all speeds, as far as these sweeps can show."""
         return self.dof == 0 or bool(self.chi2 <= self.dof + MOST_CHI2_SDS * np.sqrt(2 * self.dof))
 
 
 def fit_sync(sweeps: Sequence[Passages], row_delay_s: float = 0.0, row_delay_sd_s: float = 0.0) -> SyncFit:
-    """Lags and row delay from the passages of one unmoved scene. row_delay_s, row_delay_sd_s: what is known of it.
+    """Lags and row delay from the passages of one unmoved scene. row_delay_s, row_delay_sd_s: previous knowledge of the
+    row delay.
 
-    Raises Degenerate where they cannot be told: one-speed, too-few-pixels, marker-polarity, negative-lag.
+    Raises Degenerate if they cannot be determined: one-speed, too-few-pixels, marker-polarity, negative-lag.
     """
     _require_speeds(sweeps)
     seen = SharedPixels.of(sweeps)
@@ -304,7 +312,7 @@ def _require_speeds(sweeps: Sequence[Passages]) -> None:
 
 
 def _require_one_way_round(seen: SharedPixels) -> None:
-    """Degenerate where the commands of one way run against those of the other: the level of one is taken for both."""
+    """Raises Degenerate if the commands of one way run against those of the other: the level of one is taken for both."""
     ahead, back = (seen.direction == way for way in (1, -1))
     if not (ahead.any() and back.any()):
         return

@@ -1,16 +1,17 @@
-"""A model with the lags that other sweeps told, and what follows from them for its mirror's angle.
+"""A model with lags from other sweeps, and the consequences for its mirror's angle.
 
-A mirror's angle was fitted together with lags, and given other lags it is another: by how much, their covariance C
-tells. Where the sweeps of the planes told no lags apart (`calibration.model.parameters`), any lags go with them, each
-with an angle of its own: C is wide open then. With x the lags, y all else, S the covariance of the new lags:
+A mirror's angle was fitted together with lags; with other lags it changes, by an amount that their covariance C gives.
+If the sweeps of the planes did not separate the lags (`calibration.model.parameters`), any lags are possible, each with
+its own angle, and C is very large in that direction. With x the lags, y everything else, S the covariance of the new
+lags:
 
     y | x = y0 + A (x - x0),    A = C_yx C_xx^-1,    cov y = (1 -A) C (1 -A)' + A S A',    cov (y, x) = A S
 
-It takes a mirror whose lags were then what they are now. Where both contradict each other, the lags have changed: the
-angle stays as it was, if it is known without them.
+This assumes that the mirror's lags were the same then as now. If old and new lags contradict each other, the lags have
+changed, and the angle stays as it was, provided it is known without them.
 
-The row delay goes with the lags where the sweeps told of it; the fit of the lags (`lag_fit`) was given what the model
-knows of it, and has both in its value.
+The row delay is transferred with the lags if the sweeps determined it. The fit of the lags (`lag_fit`) was given the
+model's knowledge of it, so its value contains both.
 """
 
 from dataclasses import replace
@@ -32,7 +33,7 @@ _AGAIN = "calibrate the planes again, both ways and at two speeds or more (--exp
 
 
 def known_row_delay(base: RigModel) -> tuple[float, float]:
-    """(value, sd) of a model's row delay, seconds; sd 0 where nothing is said of its error."""
+    """(value, sd) of a model's row delay in seconds; sd is 0 if its error is not stated."""
     covariance = base.covariance
     if covariance is None or ROW_DELAY not in covariance.names:
         return base.row_delay_s, 0.0
@@ -40,7 +41,9 @@ def known_row_delay(base: RigModel) -> tuple[float, float]:
 
 
 def with_lags(base: RigModel, fit: SyncFit) -> tuple[RigModel, Reason | None]:
-    """The model with these lags, fitted with its `known_row_delay`; why its angle cannot be right then, or None."""
+    """The model with these lags, which were fitted with its `known_row_delay`; and the reason why its angle cannot be
+    right then, or None.
+    """
     assert fit.row_told or fit.row_delay_s == base.row_delay_s, "lags of another row delay"
     told, spread = _told(fit)
     names, values = parameters(base)

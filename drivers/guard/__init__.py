@@ -1,12 +1,14 @@
-"""The guard: a small process that owns the ports of laser and gate, and ends the light when the application cannot.
+"""The guard: a small process that owns the ports of laser and gate, and switches the light off if the application
+cannot.
 
     with Guard(laser=config.laser, sync=config.sync, ports=ports) as guard:
         laser, sync = guard.laser, guard.sync      # a LineLaser and a SyncSource like any other
         ...                                        # on the source thread, for every block:
         guard.beat(last_frame_number)
 
-Between `sync.run()` and the low gate the guard wants to see frame numbers change. Gone, stopped or hung, an application
-loses its light within 100 ms and its life after that; `GuardLimits` says what counts as hung.
+Between `sync.run()` and the moment the gate goes low, the guard expects the frame number to keep changing. If the
+application has ended, was stopped or hangs, the guard switches the light off within 100 ms, then kills the
+application. `GuardLimits` says what counts as hanging.
 """
 
 from drivers.guard.client import Guard

@@ -1,4 +1,4 @@
-"""`python -m drivers.guard SOCKET PAGE`: started by `drivers.guard.client.Guard`, by nobody else."""
+"""`python -m drivers.guard SOCKET PAGE` runs the guard. Only `drivers.guard.client.Guard` starts it."""
 
 import os
 import sys

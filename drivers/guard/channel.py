@@ -1,10 +1,10 @@
 """Messages and heartbeat between the application and the guard.
 
-Messages are one JSON object a line over a socket pair, errors included. The end of the stream is a message too: the
-kernel sends it the moment the other process is gone.
+Each message, errors included, is one line of JSON over a socket pair. The end of the stream is a message too: the
+kernel sends it as soon as the other process is gone.
 
-The heartbeat is a page of memory that both share, in which the source thread writes. To beat is one store: no lock, no
-system call, nothing that a full pipe, a stopped guard or a slow disk could hold up.
+The heartbeat is a page of memory that both processes share; the source thread writes to it. A beat is a single store,
+without a lock or a system call, so that a full pipe, a stopped guard or a slow disk cannot delay it.
 """
 
 import json
@@ -26,7 +26,7 @@ _READ_BYTES = 65_536
 
 
 class Channel:
-    """One end of the connection. Sending is safe from any thread, receiving belongs to one."""
+    """One end of the connection. Any thread may send; only one thread may receive."""
 
     def __init__(self, end: socket.socket) -> None:
         end.setblocking(False)
@@ -40,14 +40,14 @@ class Channel:
         return self._end.fileno()
 
     def send(self, message: Message, within_s: float = 0.0) -> None:
-        """Queue a message and pass on what the socket takes in that time. A peer that is gone is no error here."""
+        """Queue a message and send what the socket takes within that time. A peer that is gone raises no error."""
         line = json.dumps(message, separators=(",", ":")).encode() + b"\n"
         with self._lock:
             self._unsent += line
         self.flush(within_s)
 
     def flush(self, within_s: float = 0.0) -> None:
-        """Pass on what is still unsent, as far as the socket takes it within that time."""
+        """Send what is still queued, as far as the socket takes it within that time."""
         ends_at = time.monotonic() + within_s
         with self._lock:
             while self._unsent:
@@ -62,7 +62,9 @@ class Channel:
                     self._unsent.clear()
 
     def receive(self) -> list[Message] | None:
-        """The messages that have come; None after the last one, when the other process is gone."""
+        """The messages that have arrived since the last call. None once the other process is gone and all were
+        returned.
+        """
         ended = False
         while not ended:
             try:
@@ -80,17 +82,17 @@ class Channel:
         return [json.loads(line) for line in lines]
 
     def close(self) -> None:
-        """Hang up; again: nothing happens."""
+        """Hang up; a second call does nothing."""
         self._end.close()
 
 
 def error_message(error: BaseException) -> list[str]:
-    """An error on its way: its class and its text."""
+    """The error as a message can carry it: its class and its text."""
     return [type(error).__name__, str(error)]
 
 
 def error_from(message: list[str]) -> DeviceError:
-    """The error that arrived. One that is not of our tree is a fault of the guard itself."""
+    """The error that a message carries. A class that is not a device error means a fault of the guard itself."""
     name, text = message
     kind = getattr(drivers.errors, name, None)
     if isinstance(kind, type) and issubclass(kind, DeviceError):
@@ -99,7 +101,7 @@ def error_from(message: list[str]) -> DeviceError:
 
 
 def plain_ports(ports: Mapping[str, Any]) -> dict[str, str]:
-    """Emulated ports by name, without those that exist in this process's memory only."""
+    """Emulated ports by name, without those that exist only in this process's memory."""
     return {name: port.address for name, port in ports.items() if port.usb_backend is None and port.serial_port is None}
 
 
@@ -108,7 +110,7 @@ _NO_FRAME = -1
 
 
 class Heartbeat:
-    """The shared page, in either process."""
+    """The shared page, as either process sees it."""
 
     def __init__(self, handle: int) -> None:
         """handle: of an anonymous file of at least a page."""
@@ -117,7 +119,7 @@ class Heartbeat:
 
     @classmethod
     def create(cls) -> "Heartbeat":
-        """A new page, in memory: pages of a file on a disk may block while the disk does."""
+        """A new page in memory. It is not in a file on a disk, since access to that could block when the disk does."""
         if not hasattr(os, "memfd_create"):
             raise DeviceError("the laser guard needs Linux; scan from a Linux machine")
         handle = os.memfd_create("spadrig-heartbeat")
@@ -128,7 +130,7 @@ class Heartbeat:
 
     @property
     def frame(self) -> int:
-        """The last frame number told; -1 before the first one."""
+        """The last frame number that was reported; -1 before the first one."""
         return int(_FRAME.unpack_from(self._page)[0])
 
     @frame.setter
@@ -137,7 +139,7 @@ class Heartbeat:
 
     @property
     def waited_s(self) -> float:
-        """Seconds for which the source thread says that it has asked the SPAD in vain since its last frames."""
+        """Seconds for which the source thread has been asking the SPAD for frames without getting any."""
         return float(_WAITED.unpack_from(self._page, _FRAME.size)[0])
 
     @waited_s.setter
@@ -145,7 +147,7 @@ class Heartbeat:
         _WAITED.pack_into(self._page, _FRAME.size, seconds)
 
     def close(self) -> None:
-        """Give the page back; again: nothing happens."""
+        """Give the page back; a second call does nothing."""
         if self.handle >= 0:
             self._page.close()
             os.close(self.handle)

@@ -1,4 +1,6 @@
-"""The application's side of the guard: starts it, talks to it, beats for it, and steps in where it is lost."""
+"""The application's side of the guard. It starts the guard, talks to it, sends heartbeats, and takes over if it is
+lost.
+"""
 
 import itertools
 import logging
@@ -84,7 +86,7 @@ class GuardedSync(_Guarded, SyncSource):
         return float(self._about["resolution_s"])
 
     def most_repeats(self, pulses: Sequence[Pulse]) -> int | None:
-        """The limit of the device behind the guard; None where it has none."""
+        """The limit of the device behind the guard; None if it has none."""
         most: int | None = self._ask("most_repeats", _plain(pulses))
         return most
 
@@ -130,10 +132,10 @@ _ENABLING = ("arm", "program", "run")
 
 
 class Guard:
-    """Owns laser and sync source in a process of its own, from its creation to `close`.
+    """Owns laser and sync source in a separate process, from its creation to `close`.
 
-    `laser` and `sync` raise what opening them raised, so that a rig can list all its troubles. A config of None is a
-    device that is not guarded. Thread-safe.
+    `laser` and `sync` raise what opening them raised, so that a rig can list all problems at once. A device whose
+    config is None is not guarded. Thread-safe.
     """
 
     def __init__(
@@ -145,7 +147,7 @@ class Guard:
         limits: GuardLimits | None = None,
         tap: TapFile | None = None,
     ) -> None:
-        """Start the guard, which opens the devices meanwhile. `UnknownKind` for a kind that is not installed."""
+        """Start the guard, which opens the devices meanwhile. Raises `UnknownKind` for a kind that is not installed."""
         configs = {slot: config for slot, config in (("laser", laser), ("sync", sync)) if config is not None}
         ports = ports or {}
         self._rescue = Rescue(configs, ports)
@@ -184,19 +186,19 @@ class Guard:
 
     @property
     def laser(self) -> LineLaser:
-        """The guarded laser. Waits until it is open; raises what opening it raised."""
+        """The guarded laser. Waits until it is open; raises the error if opening it failed."""
         proxy: LineLaser = self._proxy("laser", GuardedLaser)
         return proxy
 
     @property
     def sync(self) -> SyncSource:
-        """The guarded sync source. Waits until it is open; raises what opening it raised."""
+        """The guarded sync source. Waits until it is open; raises the error if opening it failed."""
         proxy: SyncSource = self._proxy("sync", GuardedSync)
         return proxy
 
     @property
     def failure(self) -> DeviceError | None:
-        """The reason why the guard took the light, or `GuardLost`; None while all is well."""
+        """The reason why the guard switched the light off, or `GuardLost`; None while all is well."""
         return self._failure
 
     @property
@@ -210,25 +212,27 @@ class Guard:
         return self._process.pid
 
     def beat(self, frame: int) -> None:
-        """Tell the last frame number received: one store, for every block. Raises `failure`, where there is one."""
+        """Report the last frame number received. It is called for every block and is a single store. Raises `failure`
+        if there is one.
+        """
         self._heartbeat.waited_s = 0.0
         self._heartbeat.frame = frame
         if self._failure is not None:
             raise self._failure
 
     def wait(self, waited_s: float) -> None:
-        """Tell for how long the SPAD has been asked in vain since its last frames. On the source thread."""
+        """Report for how long the SPAD has been asked for frames without giving any. Call it on the source thread."""
         self._heartbeat.waited_s = waited_s
 
     def expect(self, limits: GuardLimits) -> None:
-        """Set other limits from now on, as for a burst, which is silent until it is read out."""
+        """Apply other limits from now on, for example for a burst, which sends nothing until it is read out."""
         self._channel.send({"limits": asdict(limits)}, within_s=1.0)
 
     def ask(self, slot: str, verb: str, *arguments: Any) -> Any:
-        """Have the guard do a verb for a proxy; returns its result or raises its error.
+        """Have the guard call a device's method on behalf of a proxy; returns its result or raises its error.
 
-        `GuardLost` where there is no guard: at once, but for verbs that lower, which wait for the application's own
-        attempt at it.
+        Raises `GuardLost` if the guard is gone. Methods that make a device safe first wait until the application has
+        tried to do so itself.
         """
         if self._failure is not None and verb in _ENABLING:
             raise self._failure
@@ -252,7 +256,7 @@ class Guard:
         return self._told(answer, verb)["result"]
 
     def close(self) -> None:
-        """Close both devices, which leaves them safe, and end the guard; again: nothing happens."""
+        """Close both devices, which leaves them safe, and end the guard. A second call does nothing."""
         if self._closing:
             return
         self._closing = True

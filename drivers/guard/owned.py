@@ -1,4 +1,4 @@
-"""A device that the guard owns: opened from its config, asked by the application's messages, made safe at the end.
+"""A device that the guard owns: opened from its config, used through the application's messages, made safe at the end.
 
 Its `Lane` is a thread that does one job after the other for it, urgent ones first.
 """
@@ -24,7 +24,7 @@ Job = Callable[[], object]
 
 
 class Lane:
-    """A thread that does jobs, which must not raise, one after the other. A daemon: none keeps the process alive."""
+    """A daemon thread that does jobs one after the other. A job must not raise."""
 
     def __init__(self, name: str) -> None:
         self._jobs: queue.PriorityQueue[tuple[int, int, Job]] = queue.PriorityQueue()
@@ -32,7 +32,7 @@ class Lane:
         threading.Thread(target=self._work, name=name, daemon=True).start()
 
     def do(self, job: Job, *, first: bool = False) -> None:
-        """Queue a job; `first`: ahead of all that are not."""
+        """Queue a job. With `first` it goes ahead of all jobs queued without it."""
         self._jobs.put((0 if first else 1, next(self._order), job))
 
     @property
@@ -56,7 +56,7 @@ RETRY_S = 0.1
 
 
 class Owned:
-    """One slot of the rig, with a lane for its ordinary jobs and one for those that must not wait for them."""
+    """One device of the rig, with a lane for its ordinary jobs and another for jobs that must not wait for them."""
 
     def __init__(self, slot: str, config: dict[str, Any], ports: dict[str, str], tap: dict[str, Any] | None) -> None:
         """tap: fields of the `TapFile` that records its port; None: nothing is recorded."""
@@ -83,7 +83,7 @@ class Owned:
         self._create = partial(kind.create, model, surroundings)
 
     def open(self) -> dict[str, Any]:
-        """Open the device; returns what its proxy tells of it without asking. DeviceError."""
+        """Open the device; returns what its proxy can say without asking it. May raise DeviceError."""
         self.device = self._create()
         about: dict[str, Any] = {"name": self.device.name, "identity": self.device.identity}
         if isinstance(self.device, LineLaser):
@@ -94,20 +94,20 @@ class Owned:
         return about
 
     def flush(self) -> None:
-        """Wait until what passed its port is written, where that is recorded."""
+        """If the port's traffic is recorded, wait until what has passed so far is written."""
         if self._tap is not None:
             self._tap.flush()
 
     @property
     def port_lost(self) -> bool:
-        """Whether the device's port has hung up, as far as its driver can tell without asking it."""
+        """Whether the device's port has hung up, as far as its driver can tell without sending anything."""
         device = self.device
         if device is None or device.state is DeviceState.CLOSED:
             return False
         return bool(getattr(device, "port_lost", False))
 
     def call(self, verb: str, arguments: list[Any]) -> Any:
-        """Do what a proxy asks; the result as JSON. DeviceError."""
+        """Call the method that a proxy asks for; returns the result as JSON. May raise DeviceError."""
         device = self.device
         if isinstance(device, LineLaser):
             self.armed = (self.armed or verb == "arm") and verb != "disarm"
@@ -130,11 +130,13 @@ class Owned:
 
     @property
     def due(self) -> bool:
-        """Whether it is time to try (again), and nothing of it is under way."""
+        """Whether it is time for an attempt to make the device safe and none is under way."""
         return self.unsafe and not self.trying and time.monotonic() >= self._next_try
 
     def try_safe(self) -> None:
-        """Try once to make the device safe: all outputs low, or paused and, if it was armed, disarmed. On a lane."""
+        """Try once to make the device safe: all outputs low, or the laser paused and, if it was armed, disarmed. Runs
+        on a lane.
+        """
         try:
             if self.port_lost:
                 self.device = self._create()  # DeviceError while it is not plugged in again
@@ -152,7 +154,7 @@ class Owned:
             self.trying = False
 
     def calm(self) -> None:
-        """Make the device dark now, beside a verb that may end in light; `try_safe` follows it."""
+        """Make the device dark now, even while a method runs that may switch light on; `try_safe` follows it."""
         try:
             make_safe(self.device, disarm=False)
         except DeviceError as error:
@@ -160,7 +162,7 @@ class Owned:
 
 
 def make_safe(device: LineLaser | SyncSource, *, disarm: bool) -> None:
-    """Take all outputs low, or pause a laser and, where asked for, disarm it. DeviceError."""
+    """Take all outputs of a gate low, or pause a laser and, if asked, disarm it. May raise DeviceError."""
     if isinstance(device, SyncSource):
         device.abort()
         return

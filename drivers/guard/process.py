@@ -1,13 +1,13 @@
-"""The guard's own process: does what the application asks, and watches it meanwhile.
+"""The guard's own process: carries out what the application asks, and watches the application meanwhile.
 
-The main thread never touches a device: it reads messages, looks at the application every 10 ms and gives jobs to lanes.
-What ends the light ("trip"): the application ended, was stopped or takes no frames; a port hung up; the laser reports
-an open interlock or a fault, or stops answering. Then, at the same time: all outputs of the gate low, the laser paused.
-After it: an application that cannot help itself is killed, the laser disarmed, the ports closed. Where frames stop
-because the gate's program has come to its end, the laser is paused and nothing else happens.
+The main thread never touches a device. It reads messages, looks at the application every 10 ms and gives jobs to lanes.
+The light is ended (a "trip") when the application ends, is stopped or takes no frames; when a port hangs up; or when
+the laser reports an open interlock or a fault, or stops answering. In a trip all outputs of the gate go low and the
+laser is paused, both at the same time. Afterwards an application that cannot go on by itself is killed, the laser is
+disarmed and the ports are closed. If frames stop because the gate's program has ended, the laser is only paused.
 
-`Rescue` is for the opposite case, a guard that is gone: the application opens the ports, which are free now, and lowers
-what it can.
+`Rescue` is for the opposite case, when the guard is gone: the application opens the ports, which are free then, and
+makes the devices safe as far as it can.
 """
 
 import logging
@@ -50,7 +50,7 @@ _ENABLING = ("arm", "program", "run")
 
 
 class GuardProcess:
-    """The guard of one application. `run` returns the exit code: 0 after a normal end, 1 where the guard had to act."""
+    """The guard of one application. `run` returns the exit code: 0 after a normal end, 1 if the guard had to act."""
 
     def __init__(self, channel: Channel, heartbeat: Heartbeat) -> None:
         self._channel = channel
@@ -325,7 +325,7 @@ def _told(error: Exception) -> list[str]:
 
 
 def main(arguments: list[str]) -> int:
-    """arguments: handles of the socket and of the heartbeat's page."""
+    """Run the guard; returns its exit code. arguments: handles of the socket and of the heartbeat's page."""
     for number in (signal.SIGINT, signal.SIGHUP, signal.SIGPIPE):
         signal.signal(number, signal.SIG_IGN)
     logging.basicConfig(level=logging.WARNING, format="%(message)s", stream=sys.stderr)
@@ -343,7 +343,7 @@ OFF_TIMES, OFF_GAP_S = 2, 0.11
 
 
 class Rescue:
-    """Lowers gate and laser at the same time, each on a thread of its own."""
+    """Makes gate and laser safe at the same time, each on its own thread."""
 
     def __init__(self, configs: Mapping[str, Any], ports: Mapping[str, Endpoint]) -> None:
         """Find the drivers now: there will be no time to import them."""
@@ -358,7 +358,9 @@ class Rescue:
         self._outcome: dict[str, str] = {}
 
     def run(self, slots: set[str], armed: bool) -> str:
-        """Make the devices of these slots safe; returns what came of it, for a message. armed: the laser was."""
+        """Make the devices of these slots safe; returns the outcome as text for a message. armed: whether the laser was
+        armed.
+        """
         threads = [threading.Thread(target=self._save, args=(slot, armed), daemon=True) for slot in slots]
         for thread in threads:
             thread.start()

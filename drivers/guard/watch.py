@@ -1,13 +1,13 @@
-"""Decides whether an application that should be taking frames still does, and looks at its process from outside.
+"""Decides whether an application that should be taking frames still does, and inspects its process from outside.
 
-One deadline on frames would be too long for the laser or trip on a busy machine. So there are two: a short one for an
-application whose threads are all asleep, and a longer one for one at work or waiting for a processor or a disk. Work is
-no excuse where the source thread says that it has asked the SPAD in vain. The guard's own time counts in short steps
-only: what stops the guard as well is no silence of the application's.
+A single deadline on frames would either leave the laser on too long or trip on a busy machine. So there are two: a
+short one for an application whose threads are all asleep, and a longer one for one that works or waits for a processor
+or a disk. Work does not count when the source thread reports that the SPAD gives no frames. If the guard itself was
+held up, only a short step of that time counts, since what stops the guard may have stopped the application as well.
 
-A process's state comes from /proc (proc(5), the fields of `stat`; Documentation/scheduler/sched-stats.rst of Linux, the
-first two numbers of `schedstat`: nanoseconds on a processor and waiting for one) and from a pidfd, which names the
-process for good and tells its end at once, also where a child that it forked still holds its sockets open.
+The state of a process comes from /proc (proc(5), the fields of `stat`; Documentation/scheduler/sched-stats.rst of
+Linux, the first two numbers of `schedstat`: nanoseconds on a processor and waiting for one) and from a pidfd. The pidfd
+always names the same process and reports its end at once, even if a child that it forked still holds its sockets open.
 """
 
 import os
@@ -26,10 +26,11 @@ MAX_STEP_S = 0.03
 
 @dataclass(frozen=True, slots=True)
 class GuardLimits:
-    """Longest times without a new frame number while the gate may open. Light is gone within 50 ms after them.
+    """Longest times without a new frame number while the gate may open. The light is off within 50 ms after them.
 
-    The defaults suit a stream with several blocks in 10 ms. A burst, which is silent until it is read out, and blocks
-    that take longer need more: three times what passes between two blocks.
+    The defaults suit a stream with several blocks in 10 ms. A burst, which sends nothing until it is read out, and
+    blocks
+    that take longer need more: three times the time between two blocks.
     """
 
     frames_within_s: float = 0.05
@@ -52,7 +53,9 @@ class GuardLimits:
 
 
 class FrameWatch:
-    """The decision whether frames come as they should, from `start` to `stop`: fed with what was seen, and when."""
+    """Decides whether frames come as they should, between `start` and `stop`. The caller passes in observations and
+    times.
+    """
 
     def __init__(self, limits: GuardLimits) -> None:
         self.limits = limits
@@ -73,11 +76,11 @@ class FrameWatch:
 
     @property
     def quiet(self) -> bool:
-        """Whether the next frame is later than it may be for an application that sleeps."""
+        """Whether the next frame is later than allowed for an application that sleeps."""
         return self._watching and self._begun and self._silent_s > self.limits.frames_within_s
 
     def start(self, frame: int) -> None:
-        """Note that the gate may open from now on; `frame` is the last number told before."""
+        """Note that the gate may open from now on; `frame` is the last number reported before."""
         self._last, self._begun, self._silent_s, self._watching = frame, False, 0.0, True
 
     def stop(self) -> None:
@@ -87,10 +90,11 @@ class FrameWatch:
     def look(
         self, elapsed_s: float, frame: int, stopped: bool, busy: Callable[[], bool], waited_s: float = 0.0
     ) -> str | None:
-        """Look at the application, `elapsed_s` after the last look; returns a fault it shows, or None.
+        """Judge the application, `elapsed_s` after the last look; returns the fault it shows, or None.
 
-        stopped: whether the process is stopped while the laser may shine. busy: asked only in doubt, since it costs a
-        look at every thread. waited_s: for how long the source thread says that it has asked the SPAD in vain.
+        stopped: whether the process is stopped while the laser may shine. busy: called only in doubt, since it has to
+        look at every thread. waited_s: for how long the source thread has been asking the SPAD for frames without
+        getting any.
         """
         if stopped:
             return "is stopped"
@@ -122,10 +126,11 @@ service thread for microseconds now and then."""
 
 
 class WatchedProcess:
-    """One process of this user. Its own pidfd is closed with `close`.
+    """A process of this user, seen from outside. `close` closes the pidfd it holds.
 
-    idle_thread: number of a thread that wakes by itself. On a machine with too much to do it waits for a processor each
-    time, which is no work of the process's; but while it does, others may wait for the interpreter that it holds.
+    idle_thread: number of a thread that wakes up regularly by itself. On an overloaded machine it waits for a processor
+    each time. That does not count as work of the process, but meanwhile other threads may wait for the interpreter it
+    holds.
     """
 
     def __init__(self, pid: int, idle_thread: int | None = None) -> None:
@@ -136,7 +141,7 @@ class WatchedProcess:
         self._since = 0.0
         self._found_asleep = False
         self.handle: int | None = None
-        """Handle that is readable once the process has ended; None where the kernel has no pidfd (before Linux 5.3)."""
+        """Handle that is readable once the process has ended; None if the kernel has no pidfd (before Linux 5.3)."""
         if hasattr(os, "pidfd_open"):
             try:
                 self.handle = os.pidfd_open(pid)
@@ -147,7 +152,7 @@ class WatchedProcess:
 
     @property
     def ended(self) -> bool:
-        """Whether it is gone."""
+        """Whether the process has ended."""
         if not self._ended and self.handle is not None:
             ready = select.poll()
             ready.register(self.handle, select.POLLIN)
@@ -156,7 +161,7 @@ class WatchedProcess:
 
     @property
     def stopped(self) -> bool:
-        """Whether it is held, by a signal or a debugger."""
+        """Whether the process is stopped by a signal or a debugger."""
         return _state(f"/proc/{self._pid}/stat") in _STOPPED
 
     def note_progress(self) -> None:
@@ -166,10 +171,10 @@ class WatchedProcess:
         self._found_asleep = False
 
     def busy(self) -> bool:
-        """Whether its threads have worked since `note_progress`, or would have if they could, or are about to.
+        """Whether its threads have worked since `note_progress`, or wait for a processor or a disk.
 
-        It takes two looks in a row to say no: threads are looked at one after the other, and work may pass from one
-        that was not yet looked at to one that was.
+        The answer is False only after two looks in a row. Threads are looked at one after the other, and work may pass
+        from one that was not yet looked at to one that was.
         """
         asleep_before, self._found_asleep = self._found_asleep, self._asleep()
         return not (asleep_before and self._found_asleep)
@@ -192,7 +197,7 @@ class WatchedProcess:
             return []
 
     def kill(self) -> None:
-        """End the process; nothing happens where it has ended."""
+        """Kill the process. Does nothing if it has ended."""
         if self.ended:
             return
         with suppress(ProcessLookupError):
@@ -202,7 +207,7 @@ class WatchedProcess:
                 os.kill(self._pid, signal.SIGKILL)
 
     def close(self) -> None:
-        """Give the pidfd back; again: nothing happens."""
+        """Give the pidfd back; a second call does nothing."""
         if self.handle is not None:
             os.close(self.handle)
             self.handle = None

@@ -1,4 +1,4 @@
-"""The device interfaces the application is written against, one file each."""
+"""The interfaces of all devices, one file each. The application uses devices only through them."""
 
 from drivers.interfaces.device import Device as Device
 from drivers.interfaces.device import DeviceState as DeviceState

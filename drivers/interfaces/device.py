@@ -1,4 +1,4 @@
-"""The base of all devices: a name, a state, verbs that check the state, and a close that leaves things safe."""
+"""The base of all devices: a name, a state, methods that check the state, and a close that leaves the device safe."""
 
 import logging
 from abc import ABC, abstractmethod
@@ -35,10 +35,10 @@ OPEN_STATES = (DeviceState.READY, DeviceState.CONFIGURED, DeviceState.RUNNING)
 
 
 class Device(ABC):
-    """An open device. Creating one opens it (or raises); `close` or leaving the `with` block gives it back.
+    """An open device. Creating one opens it or raises; `close`, or leaving the `with` block, closes it.
 
-    The public verbs of the interfaces check state and arguments, log, and call one `_do_*` hook each; a driver writes
-    the hooks only and never touches the state. Verbs belong to one thread, except where a verb says otherwise.
+    The public methods of the interfaces check state and arguments, log, and call one `_do_*` hook each. A driver writes
+    only the hooks and never touches the state. Methods must be called from one thread unless they say otherwise.
     """
 
     def __init__(self, name: str) -> None:
@@ -52,21 +52,23 @@ class Device(ABC):
 
     @property
     def identity(self) -> str:
-        """The device's name, and what else tells it from others of its kind: model, serial number, firmware."""
+        """The device's name and what distinguishes it from others of its kind: model, serial number, firmware."""
         return self._name
 
     @property
     def serial(self) -> str | None:
-        """The device's serial number, or the lasting name of one that has none; None: it tells neither."""
+        """The device's serial number, or the permanent name of one without; None if it has neither."""
         return None
 
     @property
     def state(self) -> DeviceState:
-        """The state as far as the verbs called so far tell; a run that ended by itself may not be noticed yet."""
+        """The state that follows from the methods called so far. A run that ended by itself may not be noticed yet."""
         return self._state
 
     def close(self) -> None:
-        """Leave the device safe (laser paused, gate low, a mirror that moved parked) and give it back, once."""
+        """Leave the device safe (laser paused, gate low, a mirror that moved parked) and release it. A second call does
+        nothing.
+        """
         if self._state is DeviceState.CLOSED:
             return
         _log.info("%s: close", self._name)

@@ -1,4 +1,4 @@
-"""The line laser: armed, it sends light wherever the gate lets it out."""
+"""The line laser. Once armed, it emits whenever the gate is high."""
 
 import logging
 from abc import abstractmethod
@@ -12,7 +12,7 @@ _log = logging.getLogger(__name__)
 
 @dataclass(frozen=True, slots=True)
 class LaserLimits:
-    """Powers the laser may be armed at: the smaller of the device's own range and the config's."""
+    """Powers at which the laser may be armed: within the device's own range and the config's."""
 
     min_power_w: float
     max_power_w: float
@@ -20,7 +20,7 @@ class LaserLimits:
 
 @dataclass(frozen=True, slots=True)
 class LaserStatus:
-    """The laser's own report, asked afresh each time."""
+    """The laser's own report, read anew each time."""
 
     emission: bool
     """The laser emits whenever the gate is high (light = emission AND gate). False while paused or warming up."""
@@ -42,7 +42,7 @@ class LaserStatus:
 
 
 class LineLaser(Device):
-    """A laser that a TTL gate modulates. `pause` is the normal end of a scan, `disarm` is for faults and for good.
+    """A laser that a TTL gate modulates. `pause` ends a scan normally; `disarm` is for faults and for the end of work.
 
     READY = disarmed, RUNNING = armed, CONFIGURED = paused.
     """
@@ -50,18 +50,18 @@ class LineLaser(Device):
     @property
     @abstractmethod
     def limits(self) -> LaserLimits:
-        """Powers the laser may be armed at."""
+        """Powers at which the laser may be armed."""
 
     @property
     def status(self) -> LaserStatus:
-        """Ask the laser. `WrongState` after close. Any thread."""
+        """Ask the laser. Raises `WrongState` after close. May be called from any thread."""
         self._require("status", *OPEN_STATES)
         return self._do_status()
 
     def arm(self, power_w: float) -> None:
-        """Set the power and enable emission under the gate, which may follow later (`status.warming_up`).
+        """Set the power and enable emission under the gate. Light may come later (`status.warming_up`).
 
-        `LimitExceeded`, `InterlockOpen`, `DeviceFault`: refused before anything is enabled.
+        Raises `LimitExceeded`, `InterlockOpen` or `DeviceFault`, all before anything is enabled.
         """
         self._require("arm", *OPEN_STATES)
         limits = self.limits
@@ -76,9 +76,11 @@ class LineLaser(Device):
         self._state = DeviceState.RUNNING
 
     def pause(self) -> None:
-        """Stop emission in the way that needs no key to resume. In any state; does nothing where nothing is armed.
+        """Stop emission in a way that needs no key to resume. Allowed in any state; does nothing if the laser is not
+        armed.
 
-        Any thread, also while another one arms: whoever overtakes an `arm` in this way pauses again behind it.
+        May be called from any thread, even while another one arms. The `arm` that was interrupted then pauses once
+        more.
         """
         self._require("pause", *OPEN_STATES)
         _log.info("%s: pause", self._name)
@@ -87,7 +89,7 @@ class LineLaser(Device):
             self._state = DeviceState.CONFIGURED
 
     def disarm(self) -> None:
-        """Switch emission off for good; the laser may need its key turned before it arms again. In any state."""
+        """Switch emission off for good. The laser may need its key turned before it arms again. Allowed in any state."""
         self._require("disarm", *OPEN_STATES)
         _log.info("%s: disarm", self._name)
         self._do_disarm()
@@ -97,7 +99,7 @@ class LineLaser(Device):
         self.pause()
 
     def _check_health(self) -> None:
-        """Refuse a laser that must not be enabled. `InterlockOpen`, `DeviceFault`."""
+        """Refuse a laser that must not be enabled. May raise `InterlockOpen`, `DeviceFault`."""
         status = self._do_status()
         if not status.interlock_closed:
             raise InterlockOpen(f"{self._name}: the interlock is open; close it and arm again")

@@ -1,4 +1,4 @@
-"""The beam scanner: one mirror that plays a compiled waveform of drive commands with marker bits beside it."""
+"""The beam scanner: one mirror that plays a compiled waveform of drive commands, with marker bits beside them."""
 
 import logging
 from abc import abstractmethod
@@ -62,20 +62,21 @@ class ScanWaveform:
 
 @dataclass(frozen=True, slots=True)
 class ScannerStatus:
-    """The scanner's own report, asked afresh each time."""
+    """The scanner's own report, read anew each time."""
 
     moving: bool
     """A waveform is being played, or the mirror is on its way to rest."""
     fault: str | None
     """The fault in one line; None: there is none."""
     position: float | None
-    """Position of the mirror, normalised drive; None where the device does not say."""
+    """Position of the mirror, normalised drive; None if the device does not say."""
 
 
 class BeamScanner(Device):
-    """A galvanometer with its DAC. load -> start -> the waveform ends after its repeats, or stop -> park.
+    """A galvanometer with its DAC. Use: `load`, `start`, then `stop` or the waveform's end after its repeats, then
+    `park`.
 
-    Opening one moves nothing, and neither does closing it before the first `start` or `park`.
+    Opening it moves nothing, and neither does closing it before the first `start` or `park`.
     """
 
     _has_moved = False
@@ -87,12 +88,14 @@ class BeamScanner(Device):
 
     @property
     def status(self) -> ScannerStatus:
-        """Ask the scanner. `WrongState` after close. Any thread."""
+        """Ask the scanner. Raises `WrongState` after close. May be called from any thread."""
         self._require("status", *OPEN_STATES)
         return self._do_status()
 
     def point_clock(self, requested_hz: float) -> Fraction:
-        """The exact point rate nearest to `requested_hz` that the device can run; asking for that rate returns it."""
+        """The exact point rate nearest to `requested_hz` that the device can run. Asking for that rate again returns it
+        unchanged.
+        """
         self._require("point_clock", *OPEN_STATES)
         low, high = self.limits.point_rate_hz
         if not low <= requested_hz <= high:
@@ -103,9 +106,10 @@ class BeamScanner(Device):
         return self._do_point_clock(requested_hz)
 
     def load(self, waveform: ScanWaveform, repeats: int) -> Fraction:
-        """Load a waveform, to be played `repeats` times without a seam; returns the exact point clock it will run at.
+        """Load a waveform, to be played `repeats` times without a seam; returns the exact point clock at which it will
+        run.
 
-        `LimitExceeded` names the first limit that the waveform breaks, its value and the limit. Nothing moves.
+        Raises `LimitExceeded` with the first limit that the waveform breaks, the value and the limit. Nothing moves.
         """
         self._note_end()
         self._require("load", DeviceState.READY, DeviceState.CONFIGURED, first="stop")
@@ -122,7 +126,7 @@ class BeamScanner(Device):
         return clock_hz
 
     def start(self) -> None:
-        """Play the waveform. The mirror is brought to its first point within the limits beforehand."""
+        """Play the waveform. The mirror is first brought to the first point, within the limits."""
         self._note_end()
         self._require("start", DeviceState.CONFIGURED, first="load" if self._state is DeviceState.READY else "stop")
         _log.info("%s: start", self._name)
@@ -131,7 +135,9 @@ class BeamScanner(Device):
         self._state = DeviceState.RUNNING
 
     def stop(self) -> None:
-        """Bring the mirror to rest. The waveform stays loaded. Where nothing moves it does nothing. Any thread."""
+        """Bring the mirror to rest; the waveform stays loaded. Does nothing if nothing moves. May be called from any
+        thread.
+        """
         self._require("stop", *OPEN_STATES)
         if self._state is DeviceState.RUNNING:
             _log.info("%s: stop", self._name)
@@ -139,7 +145,7 @@ class BeamScanner(Device):
             self._state = DeviceState.CONFIGURED
 
     def park(self) -> None:
-        """Stop, and turn the mirror to where the beam is dumped. In any state. Any thread."""
+        """Stop, and turn the mirror to where the beam is dumped. Allowed in any state and from any thread."""
         self.stop()
         _log.info("%s: park", self._name)
         self._has_moved = True
@@ -174,9 +180,9 @@ class BeamScanner(Device):
 
 
 def check_waveform(waveform: ScanWaveform, limits: ScannerLimits, clock_hz: Fraction, *, seamless: bool) -> None:
-    """Raise `LimitExceeded` where a waveform at `clock_hz` is more than a mirror of these limits can follow.
+    """Raise `LimitExceeded` if a waveform played at `clock_hz` asks for more than these limits allow.
 
-    seamless: the waveform repeats, so that the way from its last point to its first is judged like any other.
+    seamless: whether the waveform repeats. The step from its last point to its first is then checked like any other.
     """
     command = waveform.command
     points = len(command)

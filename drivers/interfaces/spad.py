@@ -1,8 +1,8 @@
 """The SPAD array: takes binary frames and fills the ring with blocks of them.
 
-It may stream parts of its rows only, windows that move with the laser line and stand in a table on the device. The
-device steps through the table by the markers of the scanner and never by counting frames: a scan marker takes it to
-entry 0 of the next sweep, line marker j to entry j. A frame has one window, taken at its start: a marker that arrives
+It may send only a part of each row: a window that moves with the laser line. The windows stand in a table on the
+device. The device steps through the table by the scanner's markers and never by counting frames: a scan marker selects
+entry 0 of the next sweep, line marker j entry j. A frame has one window, fixed at its start; a marker that arrives
 during a frame moves the window of the next one.
 """
 
@@ -30,11 +30,12 @@ _SCAN, _LINE = int(Mark.SCAN), int(Mark.LINE)
 
 @dataclass(frozen=True, slots=True, eq=False)
 class WindowTable:
-    """Window of every frame by the markers seen before it.
+    """The window of a frame as a function of the markers seen before it.
 
-    width_px: pixels of every window. x0: for each sweep of the scan's period (one, or both directions) int32
-    (entries,), first pixel of the window: entry 0 from the scan marker to the first line marker, entry j from line
-    marker j on. The last one holds until the next scan marker, entry 0 of the first sweep before the first of all.
+    width_px: pixels of every window. x0: one int32 array (entries,) for each sweep of the scan's period (one, or both
+    directions) with the first pixel of each window. Entry 0 holds from the scan marker to the first line marker, entry
+    j from line marker j on, the last one until the next scan marker. Before the first scan marker of a run, entry 0 of
+    the first sweep holds.
     """
 
     width_px: int
@@ -54,8 +55,8 @@ class WindowTable:
     ) -> NDArray[np.int32]:
         """First pixel of each frame's window, int32 (n,).
 
-        marks, line: of the frames' records, which count markers up to and including their own frame. sweep: number of
-        the sweep they belong to from 0 on, -1 before the first scan marker.
+        marks, line: from the frames' records, which count markers up to and including their own frame. sweep: number of
+        the sweep that each frame belongs to, from 0 on, -1 before the first scan marker.
         """
         scan = (marks & _SCAN) != 0
         own = (marks & _LINE) != 0
@@ -68,9 +69,10 @@ class WindowTable:
         return x0
 
     def check(self, sensor_width: int, step_px: int) -> None:
-        """`LimitExceeded` for windows that a sensor cannot give: off the grid of its steps and words, or beyond it.
+        """Raises `LimitExceeded` for windows that a sensor cannot give: off its grid of steps and words, or beyond its
+        edge.
 
-        The last word of a row may reach beyond a sensor that is no whole number of words wide; its pad bits are 0.
+        The last word of a row may reach beyond a sensor whose width is not a whole number of words; its pad bits are 0.
         """
         grid = math.lcm(step_px, _WORD_PX)
         row = -(-sensor_width // _WORD_PX) * _WORD_PX
@@ -117,7 +119,7 @@ class StreamMode:
 
 @dataclass(frozen=True, slots=True)
 class SpadInfo:
-    """Properties and abilities of a SPAD array; constant while it is open."""
+    """Properties and abilities of a SPAD array. They do not change while it is open."""
 
     model: str
     serial: str
@@ -171,7 +173,7 @@ class SpadTiming:
 
 @dataclass(frozen=True, slots=True)
 class SpadCounters:
-    """Counts since `start`. None: the device does not say."""
+    """Counts since `start`. None means that the device does not report the value."""
 
     exposed: int | None
     delivered: int
@@ -186,7 +188,7 @@ class SpadCounters:
 
 @dataclass(frozen=True, slots=True)
 class SpadHealth:
-    """The sensor's own measurements of itself. A value that it does not measure is None, or missing."""
+    """The sensor's own measurements of itself. A value that it does not measure is None or missing."""
 
     temperatures_c: Mapping[str, float] = field(default_factory=dict)
     """Temperatures by the place where each is measured."""
@@ -199,7 +201,9 @@ class SpadHealth:
 
 
 class SpadArray(Device):
-    """A binary SPAD sensor. configure -> start -> fill until it returns False (or stop) -> start again."""
+    """A binary SPAD sensor. Use: `configure`, `start`, then `fill` until it returns False, or `stop`; then `start`
+    again.
+    """
 
     def __init__(self, name: str) -> None:
         super().__init__(name)
@@ -221,22 +225,22 @@ class SpadArray(Device):
 
     @property
     def serial(self) -> str | None:
-        """The serial number that `info` gives; None where it is empty."""
+        """The serial number that `info` gives; None if it is empty."""
         return self.info.serial or None
 
     @property
     def counters(self) -> SpadCounters:
-        """Counts of the present run, or of the last one; also after `close`. Any thread."""
+        """Counts of the present run or of the last one. May be called from any thread, and after `close`."""
         return self._do_counters()
 
     @property
     def health(self) -> SpadHealth:
-        """Ask the device. `WrongState` during a run: its line may be busy."""
+        """Ask the device. Raises `WrongState` during a run, when its line may be busy."""
         self._require("health", DeviceState.READY, DeviceState.CONFIGURED, first="stop")
         return self._do_health()
 
     def configure(self, request: SpadRequest) -> SpadTiming:
-        """Set the frame timing. `LimitExceeded` when the device cannot do it; nothing is rounded silently."""
+        """Set the frame timing. Raises `LimitExceeded` if the device cannot do it; nothing is rounded silently."""
         self._require("configure", DeviceState.READY, DeviceState.CONFIGURED, first="stop")
         self._check(request)
         timing = self._do_configure(request)
@@ -247,7 +251,7 @@ class SpadArray(Device):
         return timing
 
     def start(self, n_frames: int | None) -> None:
-        """Begin to expose, `n_frames` or (None) until `stop`. Frame numbers and counters start at 0."""
+        """Begin to expose `n_frames` frames, or until `stop` if it is None. Frame numbers and counters start at 0."""
         first = "configure" if self._state is DeviceState.READY else "stop"
         self._require("start", DeviceState.CONFIGURED, first=first)
         if n_frames is not None and n_frames < 1:
@@ -264,13 +268,12 @@ class SpadArray(Device):
         self._state = DeviceState.RUNNING
 
     def fill(self, ring: BlockRing, timeout_s: float) -> bool:
-        """Claim, fill and publish at least one block; True while more may come, False once the run has ended.
+        """Claim, fill and publish at least one block. True while more may come, False once the run has ended.
 
-        Runs on the application's source thread and waits at most `timeout_s` (`DeviceTimeout`) for frames. Where the
-        ring is full, a source that can wait does so within the same time as long as `ring.waits`; else, and where it
-        cannot wait, it drops the block, counts its frames as lost and then calls `ring.mark_overflow` with their
-        number, which may raise to end the run. Calls after the end return False. `stop` may come from another thread
-        meanwhile: then the call returns False early.
+        Called on the application's source thread; waits at most `timeout_s` for frames, then raises `DeviceTimeout`. If
+        the ring is full and `ring.waits`, a source that can wait does so within the same time. Otherwise it drops the
+        block, counts its frames as lost and calls `ring.mark_overflow` with their number, which may raise to end the
+        run. Calls after the end return False. If another thread calls `stop` meanwhile, the call returns False early.
         """
         if not (self._run_opened and self._state is DeviceState.CONFIGURED):
             self._require("fill", DeviceState.RUNNING, first="start")
@@ -282,7 +285,7 @@ class SpadArray(Device):
         return more and self._state is DeviceState.RUNNING
 
     def stop(self) -> None:
-        """End the run; frames not yet published are dropped and counted as lost. Without a run it does nothing."""
+        """End the run. Frames not yet published are dropped and counted as lost. Does nothing without a run."""
         self._require("stop", *OPEN_STATES)
         if self._state is DeviceState.RUNNING:
             _log.info("%s: stop", self._name)

@@ -24,10 +24,11 @@ HOLD_S = 0.5e-3
 
 @dataclass(frozen=True, slots=True)
 class Pulse:
-    """One word of a program: hold the outputs (OR of `OUT_*`) for a duration, or (None) while the scan marker is low.
+    """One word of a program: hold the outputs (OR of `OUT_*`) for a duration, or, if it is None, while the scan marker
+    is low.
 
-    held: the gate stays high only as long as the scan marker does, which the source looks at every `HOLD_S`: the light
-    of a scanner that stopped, was unplugged or lost its program is gone then, whoever else has noticed.
+    held: the gate stays high only as long as the scan marker does; the source checks that every `HOLD_S`. If a scanner
+    stops, is unplugged or loses its program, the light therefore goes off even if nobody else has noticed.
     """
 
     outputs: int
@@ -41,7 +42,7 @@ def slices(duration_s: float) -> int:
 
 
 def sliced(pulses: Sequence[Pulse]) -> list[Pulse]:
-    """The pulses with every held one as its parts, each behind one wait: how a source plays it."""
+    """The pulses as a source plays them: each held one is split into its parts, with a wait before each part."""
     played: list[Pulse] = []
     for pulse in pulses:
         if not pulse.held or pulse.duration_s is None:
@@ -56,7 +57,7 @@ def sliced(pulses: Sequence[Pulse]) -> list[Pulse]:
 
 @dataclass(frozen=True, slots=True)
 class SyncStatus:
-    """The device's own report, asked afresh each time."""
+    """The device's own report, read anew each time."""
 
     state: Literal["stopped", "waiting", "running", "aborted"]
     """State of the program; "running" also where the device cannot tell that its program waits for the scan marker."""
@@ -65,28 +66,28 @@ class SyncStatus:
 
 
 class SyncSource(Device):
-    """A digital pattern generator. program -> run -> the program ends with all outputs low, or abort."""
+    """A digital pattern generator. Use: `program`, `run`, then the program's end with all outputs low, or `abort`."""
 
     @property
     @abstractmethod
     def resolution_s(self) -> float:
-        """Step of durations: they are rounded to multiples of it."""
+        """Time step of the device: durations are rounded to multiples of it."""
 
     def most_repeats(self, pulses: Sequence[Pulse]) -> int | None:
-        """Largest number of times that one program can repeat `pulses`; None: there is no limit."""
+        """Largest number of times that one program can repeat `pulses`; None if there is no limit."""
         return None
 
     @property
     def status(self) -> SyncStatus:
-        """Ask the device. `WrongState` after close. Any thread."""
+        """Ask the device. Raises `WrongState` after close. May be called from any thread."""
         self._require("status", *OPEN_STATES)
         return self._do_status()
 
     def program(self, pulses: Sequence[Pulse], repeats: int) -> None:
-        """Load `pulses`, played `repeats` times and then all outputs low; nothing is played before `run`.
+        """Load `pulses`, to be played `repeats` times, after which all outputs go low. Nothing is played before `run`.
 
-        `LimitExceeded`: a word that waits with the gate high (a scanner at rest would be burnt upon for as long as it
-        rests), a duration under half the resolution, no pulses at all, or more than the device holds.
+        Raises `LimitExceeded` for a word that waits with the gate high (it would burn one spot for as long as the
+        scanner rests), a duration below half the resolution, no pulses at all, or more than the device holds.
         """
         self._note_end()
         self._require("program", DeviceState.READY, DeviceState.CONFIGURED, first="abort")
@@ -104,14 +105,18 @@ class SyncSource(Device):
         self._state = DeviceState.RUNNING
 
     def gate_low(self) -> None:
-        """Take the gate low now, in any state, until the next `run`. Any thread. `DeviceFault`: it reads back high."""
+        """Take the gate low until the next `run`. Allowed in any state and from any thread. Raises `DeviceFault` if it
+        reads back high.
+        """
         self._require("gate_low", *OPEN_STATES)
         _log.info("%s: gate low", self._name)
         self._do_gate_low()
         self._check_low(OUT_GATE, "gate_low")
 
     def abort(self) -> None:
-        """Take all outputs low, in any state; the program stays loaded. Any thread. `DeviceFault`: one reads high."""
+        """Take all outputs low; the program stays loaded. Allowed in any state and from any thread. Raises
+        `DeviceFault` if one reads back high.
+        """
         self._require("abort", *OPEN_STATES)
         _log.info("%s: abort", self._name)
         self._do_abort()

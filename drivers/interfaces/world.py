@@ -9,7 +9,7 @@ from numpy.typing import NDArray
 
 @dataclass(frozen=True, slots=True)
 class SweepTruth:
-    """The truth of one sweep, to judge an estimate by after it was made.
+    """The truth of one sweep, against which a finished estimate is judged.
 
     x_px: float32 (rows, columns), true stripe position per image row and column, raw pixels; NaN = no stripe.
     depth_m: float32 (rows, width), true z per camera pixel; NaN = nothing there.
@@ -23,8 +23,8 @@ class World(Protocol):
     """The scene that the simulated devices of a rig share."""
 
     def truth(self, commands: NDArray[np.float64], velocity_per_s: float = 0.0) -> SweepTruth:
-        """The truth for the scanner commands (columns,) of a sweep's columns, at which its first row was exposed.
+        """The truth of a sweep whose columns had the scanner commands (columns,) when their first row was exposed.
 
-        velocity_per_s: of the command during the sweep, negative where it fell.
+        velocity_per_s: of the command during the sweep, negative if it fell.
         """
         ...

@@ -1,4 +1,4 @@
 """Line lasers on serial ports: Cobolt and OBIS.
 
-A driver takes its device's config and gives a `drivers.interfaces.LineLaser`. `serial_laser` is what they share.
+A driver takes its device's config and gives a `drivers.interfaces.LineLaser`. `serial_laser` holds what they share.
 """

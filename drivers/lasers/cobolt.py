@@ -1,12 +1,14 @@
 """The Cobolt (Huebner) 06-01 line laser, gated by its digital modulation input.
 
-Its bytes are in docs/reference/hardware.md; from cobolt-lasers/pycobolt 1333e53 (2025-09) and python-microscope
-`lights/cobolt.py`. Old firmware may put junk before a reply. It judges its temperatures itself: fault 1.
+Commands and replies are in docs/reference/hardware.md. Sources: cobolt-lasers/pycobolt 1333e53 (2025-09) and
+python-microscope `lights/cobolt.py`. Old firmware may send junk before a reply. The laser monitors its temperatures
+itself and reports fault 1.
 
-06-MLD speaks one language, newer lasers an SCPI-like one; 06-DPL is refused, since its power follows a gate up to about
-1 kHz only. The laser is kept dark by a power of 0 and not by `l0`: after `l0` its key must be turned (pycobolt issue
-6), and a power of 0 can be read back, by the next program too. Pause = power 0 (and `las:paus 1`): no key is needed to
-resume. Disarm = the same, then `l0`: with autostart enabled the key must be turned off and on before it starts again.
+The 06-MLD has its own command language, newer lasers an SCPI-like one. A 06-DPL is refused, since its power follows a
+gate only up to about 1 kHz. The laser is kept dark by a power of 0 and not by `l0`: after `l0` its key must be turned
+(pycobolt issue 6), whereas a power of 0 can be read back, by the next program too. `pause` sets the power to 0 (and
+sends `las:paus 1`), so no key is needed to resume. `disarm` does the same and sends `l0`; with autostart enabled the
+key must then be turned off and on before the laser starts again.
 """
 
 import logging
@@ -49,11 +51,11 @@ class CoboltFraming:
         return reply == DONE
 
     def encode(self, command: str) -> bytes:
-        """The command's bytes, ended by CR."""
+        """The command's bytes, terminated by CR."""
         return command.encode("ascii") + b"\r"
 
     def read(self, command: str, read_line: Callable[[], str]) -> str:
-        """The line that follows the command, without junk, and without the echo, should it be on."""
+        """The reply to the command, without junk before it and without the echo if that is on."""
         for _ in range(_MOST_LINES):
             reply = _JUNK.sub("", read_line().rpartition(command)[2].strip())
             if reply:
@@ -61,13 +63,13 @@ class CoboltFraming:
         return ""
 
     def refusal(self, reply: str) -> str | None:
-        """The laser's own words where it refuses the command; None: it does not."""
+        """The laser's own words if it refuses the command; None if it does not."""
         return reply if _REFUSED.fullmatch(reply) else None
 
 
 @dataclass(frozen=True, slots=True)
 class Dialect:
-    """The words of one language of the laser. Pairs: a command without its value, and the question of it."""
+    """The words of one of the laser's command languages. Pairs are a command without its value and the query for it."""
 
     mode: str
     """Question of the mode; the answer has the form `mode_form`."""
@@ -132,7 +134,7 @@ DIALECTS = {"06-MLD": MLD, "06-01": SCPI}
 
 
 def classify(model: str) -> str:
-    """The family that a model number means, as pycobolt sorts them: "06-01", "06-MLD", "06-DPL" or "unknown"."""
+    """The laser family of a model number, sorted as in pycobolt: "06-01", "06-MLD", "06-DPL" or "unknown"."""
     if re.search(r"-06-(5|9).*-\d{3,4}(-C)?$", model):
         return "06-DPL"  # in either language its power follows a gate up to 1 kHz only
     if re.search(r"-06-.*-1\d{3}(-C)?$", model):
@@ -153,7 +155,7 @@ class CoboltConfig(SerialLaserConfig):
 
 
 class CoboltLaser(SerialLaser):
-    """A Cobolt 06-01. `status` takes almost a second: at most ten commands a second are allowed."""
+    """A Cobolt 06-01. `status` takes almost a second, since the laser allows at most ten commands a second."""
 
     def __init__(self, line: Dialogue, dialect: Dialect, name: str, limits: LaserLimits, autostart: bool) -> None:
         super().__init__(name, line, limits)

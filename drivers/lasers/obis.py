@@ -1,14 +1,14 @@
 """The Coherent OBIS LX/LS line laser, gated by its digital modulation input (`SOUR:AM:EXT DIG`).
 
-Its bytes are in docs/reference/hardware.md; from python-microscope `lights/obis.py` (69625e0), the bit tables of
-`obis.h`, the operator's manual (appendix C) and mmCoreAndDevices PRs 645 and 531. Limits of the base plate's
-temperature, `SOUR:TEMP:PROT:BAS:LOW?` and `HIGH?`, are in `obis.cpp` and in Micro-Manager's `CoherentOBIS.cpp`.
+Commands and replies are in docs/reference/hardware.md. Sources: python-microscope `lights/obis.py` (69625e0), the bit
+tables of `obis.h`, the operator's manual (appendix C) and mmCoreAndDevices PRs 645 and 531. The limits of the base
+plate's temperature, `SOUR:TEMP:PROT:BAS:LOW?` and `HIGH?`, are in `obis.cpp` and in Micro-Manager's `CoherentOBIS.cpp`.
 
-Arming. `AM:STAT ON` during warm-up is deferred, light may come minutes later. So `arm` waits until the laser is ready
-and only then says ON; where the wait ends in any other way it says OFF. With CDRH the emission follows ON by 5 s. Modes
-cannot be changed while it is on. Pause = `AM:STAT OFF`, confirmed by the emission bit; no key is needed to resume.
-Disarm = the same, and least power. With the handshake off a set answers nothing at all: so the handshake is asked for
-first and never changed, and every setting is read back.
+`AM:STAT ON` sent during warm-up is deferred, and light may come minutes later. So `arm` waits until the laser is ready
+and only then sends ON; if the wait ends in any other way it sends OFF. With CDRH the emission follows ON by 5 s. Modes
+cannot be changed while the laser is on. `pause` sends `AM:STAT OFF`, confirmed by the emission bit; no key is needed to
+resume. `disarm` does the same and sets the least power. With the handshake off, a set command gets no answer at all. So
+the handshake is read first and never changed, and every setting is read back.
 """
 
 import re
@@ -62,7 +62,7 @@ ERRORS = {
 
 
 class ObisFraming:
-    """The form of an OBIS's commands and replies. channel: its slot in a Remote; None: it is on the port itself."""
+    """The form of an OBIS's commands and replies. channel: its slot in a Remote; None if it is on the port itself."""
 
     def __init__(self, channel: int | None) -> None:
         self._suffix = "" if channel is None else str(channel)
@@ -72,11 +72,11 @@ class ObisFraming:
 
     @property
     def ping(self) -> str:
-        """The question who the laser is; before all else, whether the handshake is on."""
+        """A query that is always answered: first whether the handshake is on, afterwards the laser's identity."""
         return _HANDSHAKE if self._handshake is None else "*IDN?"
 
     def greets(self, reply: str) -> bool:
-        """Whether `reply` answers the ping; the first one tells whether the handshake is on."""
+        """Whether `reply` answers the ping. The first reply also tells whether the handshake is on."""
         if self._handshake is not None:
             return reply == self.identity or (not self.identity and TEXT.fullmatch(reply) is not None)
         if SWITCH.fullmatch(reply) is None:
@@ -85,12 +85,12 @@ class ObisFraming:
         return True
 
     def encode(self, command: str) -> bytes:
-        """The bytes of a command, addressed, with CRLF."""
+        """The bytes of a command, with its address and CRLF."""
         addressed = command if command == _HANDSHAKE else _ADDRESSED.sub(rf"\g<1>{self._suffix}", command)
         return addressed.encode("ascii") + b"\r\n"
 
     def read(self, command: str, read_line: Callable[[], str]) -> str:
-        """The reply to a command. A set that answers nothing counts as done: how it reads back will tell."""
+        """The reply to a command. A set command without an answer counts as done; reading back will tell."""
         if not command.endswith("?"):
             return read_line() if self._handshake else DONE
         reply = read_line()
@@ -100,7 +100,7 @@ class ObisFraming:
         return reply
 
     def refusal(self, reply: str) -> str | None:
-        """Number and meaning of the error; None: the reply is none."""
+        """Number and meaning of the error; None if the reply is not an error."""
         error = _ERROR.fullmatch(reply)
         return f"{reply} ({ERRORS.get(int(error[1]), 'no known number')})" if error is not None else None
 
@@ -266,7 +266,7 @@ class ObisLaser(SerialLaser):
         self._set_power(self._limits.min_power_w)
 
     def _switch_off(self) -> None:
-        """Switch off, a deferred ON too. `DeviceFault` where the laser still emits."""
+        """Switch off, a deferred ON too. Raises `DeviceFault` if the laser still emits."""
         self._switch("SOUR:AM:STAT", "OFF")
         self._told_on = False
         if self._bits() & EMISSION:
@@ -276,7 +276,7 @@ class ObisLaser(SerialLaser):
         return int(self._line.ask_surely("SYST:STAT?", BITS), 16)
 
     def _fault(self, bits: int, base_c: float | None = None) -> str | None:
-        """The faults that the laser reports, and a base plate outside its range; None where all is well."""
+        """The faults that the laser reports, and a base plate outside its range; None if all is well."""
         said = []
         word = int(self._line.ask_surely("SYST:FAUL?", BITS), 16)
         if word:
@@ -291,7 +291,7 @@ class ObisLaser(SerialLaser):
         return "; ".join(said) or None
 
     def _out_of_range(self, base_c: float) -> TemperatureRange | None:
-        """The range that the base plate is outside of; None where it is inside."""
+        """The range that the base plate is outside of; None if it is inside."""
         allowed = self._base_range
         return None if allowed is None or allowed[0] <= base_c <= allowed[1] else allowed
 

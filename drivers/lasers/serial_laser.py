@@ -1,7 +1,7 @@
 """The common part of all lasers on a serial line: config with limits, a port that may get lost, serial number.
 
-Also `PlainLaser`, a line laser without key or warm-up, whose emission follows `arm` and `pause` at once: simulated, or
-recorded.
+`PlainLaser` is a line laser without key or warm-up, whose emission follows `arm` and `pause` at once. Simulated and
+recorded lasers use it.
 """
 
 from collections.abc import Callable
@@ -30,7 +30,7 @@ class SerialLaserConfig(KindConfig):
 
 
 class SerialLaser(LineLaser):
-    """A laser that is spoken with over `self._line`."""
+    """A laser that communicates through `self._line`."""
 
     def __init__(self, name: str, line: Dialogue, limits: LaserLimits) -> None:
         super().__init__(name)
@@ -42,33 +42,33 @@ class SerialLaser(LineLaser):
         """Whether pause or disarm was called since arm began: other threads may."""
 
     def arm(self, power_w: float) -> None:
-        """See `LineLaser`. `WrongState`: ended by a pause from another thread."""
+        """See `LineLaser`. Raises `WrongState` if a pause from another thread ended it."""
         self._stopped = False
         super().arm(power_w)
 
     def pause(self) -> None:
-        """See `LineLaser`. An `arm` under way on another thread ends."""
+        """See `LineLaser`. Ends an `arm` that is under way on another thread."""
         self._stopped = True
         super().pause()
 
     def disarm(self) -> None:
-        """See `LineLaser`. An `arm` under way on another thread ends."""
+        """See `LineLaser`. Ends an `arm` that is under way on another thread."""
         self._stopped = True
         super().disarm()
 
     def _require_no_stop(self) -> None:
-        """`WrongState` where a pause has come while arming: what is to be lit must stay dark."""
+        """Raises `WrongState` if a pause has come while arming: what is to be lit must stay dark."""
         if self._stopped:
             raise WrongState(f"{self._name}: arm was ended by a pause; arm again")
 
     @property
     def limits(self) -> LaserLimits:
-        """The laser's least power to the smaller of its own and the config's maximum."""
+        """From the laser's least power to the smaller of its own maximum and the config's."""
         return self._limits
 
     @property
     def port_lost(self) -> bool:
-        """Whether the port is gone, told without a word on the wire. Any thread."""
+        """Whether the port is gone, found out without sending anything. May be called from any thread."""
         return self._line.port_lost
 
     def _do_close(self) -> None:
@@ -86,9 +86,10 @@ def open_laser(
     timing: LineTiming,
     identify: Callable[[Dialogue], _Laser],
 ) -> _Laser:
-    """Open the port, get into step and identify the laser; gives the port back where any of it fails.
+    """Open the port, synchronise with the laser and identify it. Closes the port again if any of it fails.
 
-    make: what messages call it. `DeviceNotFound` where nothing of that make answers; what `identify` raises.
+    make: name of the make in messages. Raises `DeviceNotFound` if nothing of that make answers, and what `identify`
+    raises.
     """
     port = SerialPort(f"{make} laser", resolve(config.port, surroundings.ports), surroundings.tap)
     try:
@@ -106,7 +107,7 @@ def open_laser(
 
 
 def require_serial_number(make: str, config: SerialLaserConfig, found: str) -> None:
-    """`DeviceNotFound` where the config names another laser than was found."""
+    """Raises `DeviceNotFound` if the config names another laser than the one found."""
     if config.serial_number not in (None, found):
         raise DeviceNotFound(
             f"{make} laser on {config.port} has serial number {found}, not {config.serial_number}; correct "
@@ -117,7 +118,7 @@ def require_serial_number(make: str, config: SerialLaserConfig, found: str) -> N
 class PlainLaser(LineLaser):
     """A laser that takes any power up to `max_power_w`.
 
-    emit: called with the power that it emits under the gate, in W, whenever that changes.
+    emit: called with the power in W that it emits under the gate, whenever that changes.
     """
 
     def __init__(self, name: str, max_power_w: float, emit: Callable[[float], None] | None = None) -> None:

@@ -1,12 +1,12 @@
 """The contents of a recording: which blocks it holds, and where.
 
-The index `frames.idx` has 64 bytes of header, then a record of 64 bytes for each block, in the order of writing, each
-with a CRC of its own: a torn or damaged record is known as such and costs no other. A record counts where its CRC is
-right, its place exists and the first and last block of its segment are what they say. Stretches that the records leave
-out are searched for blocks; where the records do not fit, the whole segment is. Payloads are not read here.
+The index `frames.idx` has a header of 64 bytes, then a record of 64 bytes for each block, in the order of writing. Each
+record has its own CRC, so a torn or damaged one is recognised and affects no other. A record counts if its CRC is
+right, its place exists, and the first and last block of its segment are as recorded. Stretches that no record covers
+are searched for blocks; if the records do not fit, the whole segment is searched. Payloads are not read here.
 
-The index only tells where to look; the blocks themselves hold everything, so that a lost index is no loss (`rig repair`
-writes it anew from them).
+The index only tells where to look. The blocks themselves hold everything, so a lost index can be rebuilt from them
+(`rig repair`).
 """
 
 import struct
@@ -51,7 +51,7 @@ _CRC: Final = struct.Struct("<I")
 
 
 def segment_name(number: int) -> str:
-    """File of a segment: frames-000000.spb, ..."""
+    """File name of a segment: frames-000000.spb, ..."""
     return f"frames-{number:06d}.spb"
 
 
@@ -61,7 +61,7 @@ def index_header() -> bytes:
 
 
 def index_of(block: FrameBlock, segment: int, offset: int, length: int | None = None) -> bytes:
-    """The record, 64 bytes, of a block at byte `offset` of `segment`. length: None for that of `block_parts`."""
+    """The 64-byte record of a block that lies at byte `offset` of `segment`. length: if None, that of `block_parts`."""
     header = block.header
     length = length or BlockLayout(block.n_frames, header.width, header.height).block_bytes
     place = segment, int(header.flags), offset, length
@@ -76,9 +76,9 @@ def _signed(record: bytes) -> bytes:
 
 
 def decode_index(buffer: NDArray[np.uint8]) -> tuple[NDArray[np.void], NDArray[np.bool_]]:
-    """Records (n,) of `INDEX_RECORD` over the memory of `buffer` (uint8 (bytes,)), and which of them are sound (n,).
+    """Records (n,) of `INDEX_RECORD`, as a view of `buffer` (uint8 (bytes,)), and which of them are sound (n,).
 
-    A torn record at the end is left out. Raises CorruptBlock where the header is no sound header of an index.
+    A torn record at the end is left out. Raises CorruptBlock if the buffer does not begin with a sound index header.
     """
     head = buffer[:HEADER_BYTES].tobytes()
     if len(head) < HEADER_BYTES or head[:4] != MAGIC or zlib.crc32(head[: -_CRC.size]) != _CRC.unpack(head[-4:])[0]:
@@ -102,9 +102,10 @@ PAGE_BYTES: Final = 4096
 
 @dataclass(slots=True)
 class Contents:
-    """entries: the blocks in the order of their frames, run after run. problems: a line for each thing that is wrong.
+    """The blocks of a recording and what is wrong with it.
 
-    told: the sound records of the index, in the order of places, whether what they tell of is there or not.
+    entries: the blocks in the order of their frames, run after run. problems: one line for each thing that is wrong.
+    told: the sound records of the index, ordered by place, whether or not the blocks they describe are there.
     """
 
     entries: Entries
@@ -113,7 +114,9 @@ class Contents:
 
 
 def find_blocks(segments: Sequence[SegmentReader], folder: Path) -> Contents:
-    """The blocks of a recording. Nothing is raised for damage: it is in `problems`, and costs what it hit."""
+    """The blocks of a recording. Damage raises nothing: it is listed in `problems`, and only the blocks it hit are
+    missing.
+    """
     by_number = {segment.number: segment for segment in segments}
     problems: list[str] = []
     told = _told(folder, problems)
@@ -139,7 +142,7 @@ def find_blocks(segments: Sequence[SegmentReader], folder: Path) -> Contents:
 
 
 def read_entry(segment: SegmentReader, entry: Any) -> FrameBlock:
-    """The block that an entry tells of, its payload checked. CorruptBlock where there is another one, or none."""
+    """The block that an entry describes, payload checked. Raises CorruptBlock if another block, or none, is there."""
     block = _block_at(segment, entry, check_payload=True)
     if block is None:
         raise CorruptBlock(f"not block {entry['block_seq']} of run {entry['run_id']}, of which {INDEX_FILE} tells")
@@ -147,7 +150,7 @@ def read_entry(segment: SegmentReader, entry: Any) -> FrameBlock:
 
 
 def _told(folder: Path, problems: list[str]) -> Entries | None:
-    """Sound index records, sorted by place; None where there is no index."""
+    """Sound index records, sorted by place; None if there is no index."""
     if not folder.is_dir():  # a single file has none
         return None
     try:
@@ -204,7 +207,7 @@ def _fits(records: Entries, segment: SegmentReader) -> bool:
 
 
 def _block_at(segment: SegmentReader, entry: Any, *, check_payload: bool) -> FrameBlock | None:
-    """The block at an entry's place; None where its header is not what the entry says."""
+    """The block at an entry's place; None if its header is not what the entry says."""
     offset, length = int(entry["offset"]), int(entry["length"])
     block = parse_block(segment.at(offset, length), check_payload=check_payload)
     return block if index_of(block, segment.number, offset, length) == entry.tobytes() else None
@@ -224,10 +227,10 @@ def _search(segment: SegmentReader, known: Entries, problems: list[str]) -> Iter
 
 
 def round_up_to_page(size: Any) -> Any:
-    """The next multiple of `PAGE_BYTES`, of a number or of each of an array."""
+    """The next multiple of `PAGE_BYTES`, for a number or for each element of an array."""
     return -(-size // PAGE_BYTES) * PAGE_BYTES
 
 
 def damage_line(segment: SegmentReader, damage: Damage) -> str:
-    """The line that tells people of a damage."""
+    """The line that describes a piece of damage to the user."""
     return f"{segment.path.name}, bytes {damage.offset} to {damage.offset + damage.length}: {damage.reason}"

@@ -1,8 +1,8 @@
-"""The commands in a recording of control traffic that do something, apart from the questions between them.
+"""The commands in recorded control traffic that do something, without the queries between them.
 
-How often a driver asks depends on the host's moment, and so do the tokens that number its questions: neither is
-compared. Commands of the drivers may be sent again where a reply was lost, so that repeats count once. Questions are
-those of the drivers here: Helios, LaserCube, Cobolt, OBIS and PrawnDO (docs/reference/hardware.md).
+How often a driver queries a device depends on the host's timing, and so do the tokens that number the queries; neither
+is compared. The drivers may send a command again when a reply was lost, so repeats count once. The queries known here
+are those of Helios, LaserCube, Cobolt, OBIS and PrawnDO (docs/reference/hardware.md).
 """
 
 import re
@@ -28,14 +28,14 @@ BEGIN, END = (b"run", b"swr"), b"abt"
 
 @dataclass(frozen=True, slots=True)
 class Spoken:
-    """The commands that went to a rig, each with its time, by device, and the buffers of points of each scan."""
+    """The commands sent to a rig, each with its time, by device, and the point buffers of each scan."""
 
     commands: dict[str, list[Passed]]
     scans: list[list[Passed]]
 
     @classmethod
     def of(cls, passed: Iterable[Passed]) -> "Spoken":
-        """Sort out the pieces that passed the taps, given in order of time."""
+        """Sort the pieces of traffic that the taps recorded, given in order of time."""
         sent: dict[tuple[str, str], list[Passed]] = defaultdict(list)
         for one in passed:
             if one.direction == OUT:

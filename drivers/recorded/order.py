@@ -1,7 +1,7 @@
-"""The order of a recording's blocks, and which of them cannot be what they say: a false number costs its own block.
+"""The order of a recording's blocks, and which of them contradict the others. A wrong number costs only its own block.
 
-Within a run numbers of blocks and of frames, ticks and sweeps all rise. Of blocks that contradict each other the fewest
-are left out, and of as few those that agree least with their neighbours and with the index.
+Within a run the numbers of blocks, frames, ticks and sweeps all rise. If blocks contradict each other, as few as
+possible are left out; among equal choices, those that agree least with their neighbours and with the index.
 """
 
 from bisect import bisect_left, bisect_right
@@ -24,10 +24,11 @@ _OUTLIERS: Final = 4
 
 
 def in_order(entries: Entries, told: Entries, problems: list[str], *, folder: bool) -> tuple[Entries, bool]:
-    """The blocks run after run, with rising numbers, without those that cannot be; whether they lie so too.
+    """The blocks run after run with rising numbers, without contradictory ones; and whether they also lie in this
+    order.
 
-    told: the sound records of the index, in the order of places; they tell the order of the runs. folder: the segments
-    are of a run's folder, where each holds blocks of one run only.
+    told: the sound records of the index, ordered by place; they give the order of the runs. folder: whether the
+    segments are those of a run's folder, where each holds blocks of one run only.
     """
     if len(entries) == 0:
         return entries, True

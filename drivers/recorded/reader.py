@@ -1,7 +1,7 @@
-"""Reading a recording: its runs, and their blocks by frame number, each checked before anybody sees it.
+"""Reading a recording: its runs, and their blocks by frame number. Each block is checked before it is handed out.
 
-Blocks are read ahead by threads, which check the payloads' CRC without the interpreter's lock, so that reading keeps
-up with the disk. What is damaged is left out, as frames that were lost, and told in `problems`.
+Threads read blocks ahead and check the CRC of their payloads without the interpreter's lock, so reading keeps up with
+the disk. Damaged blocks are left out, like lost frames, and listed in `problems`.
 """
 
 import logging
@@ -39,11 +39,9 @@ _log = logging.getLogger(__name__)
 
 @dataclass(frozen=True, slots=True)
 class RecordedRun:
-    """The blocks of one start of the SPAD. entries: (n,) of `INDEX_RECORD`.
+    """The blocks of one start of the SPAD. Frame numbers count from that start, so the first one need not be 0.
 
-    header: of its first sound block, where that is of the size and clock of the others.
-
-    Frame numbers of the run are counted from the SPAD's start, so that the first need not be 0.
+    entries: (n,) of `INDEX_RECORD`. header: that of the first sound block whose size and clock agree with the others'.
     """
 
     number: int
@@ -57,18 +55,18 @@ class RecordedRun:
 
     @property
     def end_frame(self) -> int:
-        """One behind the number of its last frame."""
+        """Number of the last frame plus one."""
         return int(self.entries["first_frame"][-1]) + int(self.entries["n_frames"][-1])
 
     @property
     def frames(self) -> int:
-        """Frames recorded."""
+        """Number of frames recorded."""
         return int(self.entries["n_frames"].sum())
 
     def frame_at(self, seconds: float) -> int:
-        """Number of the first frame, lost ones included, that begins `seconds` or later after the run's first one.
+        """Number of the first frame, lost ones included, that begins `seconds` or more after the run's first one.
 
-        Where frames are triggered from outside, the first one of a block stands for all of it.
+        If frames are triggered from outside, all frames of a block count as beginning with its first one.
         """
         since = self.entries["t0_ticks"].astype(np.int64)
         since -= since[0]
@@ -80,7 +78,7 @@ class RecordedRun:
         return min(int(self.entries["first_frame"][at]) + behind, next_block)
 
     def gaps(self) -> list[tuple[int, int]]:
-        """(first, last) numbers of the frames that lie between its blocks and are in none."""
+        """(first, last) frame numbers of each stretch between its blocks that is in none of them."""
         begins = self.entries["first_frame"].astype(np.int64)
         ends = begins + self.entries["n_frames"]
         where = np.flatnonzero(begins[1:] > ends[:-1])
@@ -88,10 +86,10 @@ class RecordedRun:
 
 
 class RunRecording:
-    """A recording to be read: a run's folder, or one `.spb` file. Any number of threads may read it.
+    """A recording opened for reading: a run's folder or one `.spb` file. Any number of threads may read it.
 
-    runs: in the order in which they were taken. problems: what is wrong with it, a line each; reading may add some.
-    Raises `DeviceNotFound` where there is none and `ProtocolError` where no frame of it is left.
+    runs: in the order in which they were taken. problems: one line for each thing that is wrong; reading may add some.
+    Raises `DeviceNotFound` if there is no recording and `ProtocolError` if no frame of it is left.
     """
 
     def __init__(self, path: Path) -> None:
@@ -107,15 +105,15 @@ class RunRecording:
 
     @property
     def frames(self) -> int:
-        """Frames of all runs."""
+        """Number of frames of all runs."""
         return sum(run.frames for run in self.runs)
 
     def blocks(
         self, run: RecordedRun, first_frame: int | None = None, end_frame: int | None = None
     ) -> Iterator[FrameBlock]:
-        """The frames of a run from `first_frame` to before `end_frame`, all where None, in the blocks they lie in.
+        """The frames of a run from `first_frame` to before `end_frame` (None: all), in the blocks as recorded.
 
-        The first and the last block are cut to size. Blocks stay valid as long as somebody holds them.
+        The first and the last block are cut to size. Blocks stay valid as long as something refers to them.
         """
         first = run.first_frame if first_frame is None else first_frame
         end = run.end_frame if end_frame is None else end_frame
@@ -125,7 +123,7 @@ class RunRecording:
             yield block_part(block, first, end)
 
     def read(self, run: RecordedRun, entry: Any) -> FrameBlock | None:
-        """The block of one entry of a run; None, and a problem more, where it is damaged."""
+        """The block of one entry of a run. If it is damaged, returns None and adds a line to `problems`."""
         segment = self._segments[int(entry["segment"])]
         try:
             block = read_entry(segment, entry)
@@ -180,7 +178,7 @@ class RunRecording:
         return runs
 
     def _header(self, entries: Entries) -> BlockHeader | None:
-        """A header of the size and clock that most of several sound blocks have; None where no block is sound."""
+        """A header of the size and clock that most of several sound blocks have; None if no block is sound."""
         headers: list[BlockHeader] = []
         for at in _spread(len(entries)):
             with suppress(ProtocolError):
@@ -196,7 +194,9 @@ class RunRecording:
 
 
 def block_part(block: FrameBlock, first_frame: int, end_frame: int) -> FrameBlock:
-    """The frames of a block from `first_frame` to before `end_frame`, as a block; itself where that is all of it."""
+    """The frames of a block from `first_frame` to before `end_frame`, as a block; the block itself if that is all of
+    it.
+    """
     header = block.header
     begin = max(0, first_frame - header.first_frame)
     end = min(block.n_frames, end_frame - header.first_frame)
@@ -221,12 +221,12 @@ def block_part(block: FrameBlock, first_frame: int, end_frame: int) -> FrameBloc
 
 
 def is_of_run(header: BlockHeader, other: BlockHeader) -> bool:
-    """Whether a block can be of the run that another one is of."""
+    """Whether a block with this header can belong to the same run as a block with the other header."""
     return _run_kind(header) == _run_kind(other)
 
 
 def usual_header(headers: Sequence[BlockHeader]) -> BlockHeader:
-    """The first of several headers that has the size and clock that most of them have."""
+    """The first of several headers that has the most frequent size and clock."""
     kinds = Counter(map(_run_kind, headers))
     return max(headers, key=lambda header: kinds[_run_kind(header)])
 

@@ -1,12 +1,12 @@
-"""The segments of a recording: `frames-000000.spb`, or `frames-000000.spb.zst` where it was compressed after the run.
+"""The segments of a recording: `frames-000000.spb`, or `frames-000000.spb.zst` if it was compressed after the run.
 
-Offsets are those of the plain segment in both, so that one index holds for both. A plain segment is mapped into memory
+In both cases offsets are those of the plain segment, so one index serves both. A plain segment is mapped into memory
 and its blocks are used where they lie.
 
-A compressed segment is in the seekable format of zstd, one zstd frame for each block, so that it can be read at any
-place. It is a `.zst` file like any other (`zstd -d` gives the plain segment back), with a skippable frame at its end
-that lists the lengths of the frames, packed and unpacked. Where that table is damaged the frames are found one after
-the other. Source of the layout: zstd_seekable_compression_format.md, version 0.1.0, in contrib/seekable_format of
+A compressed segment is in the seekable format of zstd, one zstd frame for each block, so that reading can start
+anywhere. It is a `.zst` file like any other (`zstd -d` gives the plain segment back), with a skippable frame at its end
+that lists the packed and unpacked lengths of the frames. If that table is damaged, the frames are found one after the
+other. Source of the layout: zstd_seekable_compression_format.md, version 0.1.0, in contrib/seekable_format of
 facebook/zstd. The package zstandard is optional: the extra `compress`.
 """
 
@@ -44,14 +44,14 @@ Bytes = NDArray[np.uint8]
 
 @dataclass(frozen=True, slots=True)
 class FrameTable:
-    """Offsets at which each frame begins, packed and unpacked: int64 (frames + 1,), the last ones being the end."""
+    """Offsets at which each frame begins, packed and unpacked: int64 (frames + 1,). The last ones are the ends."""
 
     packed: NDArray[np.int64]
     plain: NDArray[np.int64]
 
     @classmethod
     def read(cls, data: Bytes) -> "FrameTable":
-        """Read the table of a whole file (uint8 (bytes,)); where it is damaged, make it from the frames themselves."""
+        """Read the table of a whole file (uint8 (bytes,)). If the table is damaged, make it from the frames themselves."""
         sizes = _stated_sizes(data)
         if sizes is None:
             sizes = np.array(list(_found_sizes(data)), np.int64).reshape(-1, 2)
@@ -72,18 +72,18 @@ class FrameTable:
         return range(first, int(np.searchsorted(self.plain, min(end, self.size), "left")))
 
     def places(self, frame: int) -> tuple[int, int, int, int]:
-        """The places at which a frame begins and ends, in the file and in the plain segment."""
+        """The begin and end of a frame, first in the file, then in the plain segment."""
         return (*self.packed[frame : frame + 2].tolist(), *self.plain[frame : frame + 2].tolist())
 
 
 def table_bytes(sizes: Sequence[tuple[int, int]]) -> bytes:
-    """The skippable frame that ends a file: (packed, plain) bytes of its frames."""
+    """The skippable frame at the end of a file. sizes: (packed, plain) bytes of each frame."""
     entries = np.array(sizes, "<u4").reshape(-1, 2).tobytes()
     return _HEAD.pack(SKIPPABLE_MAGIC, len(entries) + _FOOT.size) + entries + _FOOT.pack(len(sizes), 0, SEEKABLE_MAGIC)
 
 
 def unpack_frame(packed: Bytes, size: int) -> Bytes:
-    """The `size` plain bytes of one frame; CorruptBlock where it does not hold them."""
+    """The `size` plain bytes of one frame. Raises CorruptBlock if it does not hold exactly these."""
     zstandard = zstandard_or_error()
     raw = packed.tobytes()
     try:
@@ -95,7 +95,7 @@ def unpack_frame(packed: Bytes, size: int) -> Bytes:
 
 
 def zstandard_or_error() -> Any:
-    """The package zstandard. `ProtocolError` with the command that installs it where it is not there."""
+    """The package zstandard. If it is not installed, raises `ProtocolError` with the command that installs it."""
     try:
         import zstandard
     except ImportError:
@@ -105,7 +105,7 @@ def zstandard_or_error() -> Any:
 
 
 def _stated_sizes(data: Bytes) -> NDArray[np.int64] | None:
-    """(packed, plain) of each frame as the table says, None where it cannot be."""
+    """(packed, plain) of each frame as the table says, None if it cannot be."""
     if len(data) < _HEAD.size + _FOOT.size:
         return None
     frames, descriptor, magic = _FOOT.unpack(data[-_FOOT.size :].tobytes())
@@ -163,7 +163,7 @@ class PlainSegment:
         self._bytes: Bytes = np.frombuffer(self._map or b"", np.uint8)
 
     def at(self, offset: int, length: int) -> Bytes:
-        """Bytes from `offset` on, fewer at the end, over the file's memory; valid as long as somebody holds them."""
+        """Bytes from `offset` on, fewer at the end, as a view of the file; valid as long as something refers to them."""
         return self._bytes[offset : offset + length]
 
     def walk(self, start: int, end: int, *, check_payload: bool) -> Iterator[Placed | Damage]:
@@ -171,7 +171,7 @@ class PlainSegment:
         return _shifted(self._bytes[start:end], start, check_payload)
 
     def expect(self, offset: int, length: int) -> None:
-        """Announce that so many bytes will be read soon: the system reads ahead."""
+        """Announce that these bytes will be read soon, so that the system reads ahead."""
         if self._map is not None and hasattr(mmap, "MADV_WILLNEED") and offset < self.size:
             begin = offset - offset % mmap.PAGESIZE
             self._map.madvise(mmap.MADV_WILLNEED, begin, min(length + offset - begin, self.size - begin))
@@ -188,7 +188,7 @@ class PackedSegment:
         self.size = self._table.size
 
     def at(self, offset: int, length: int) -> Bytes:
-        """Bytes from `offset` on, fewer at the end, unpacked. CorruptBlock where they cannot be."""
+        """Unpacked bytes from `offset` on, fewer at the end. Raises CorruptBlock if they cannot be unpacked."""
         parts = []
         for frame in self._table.frames_at(offset, offset + length):
             _, _, start, _ = self._table.places(frame)
@@ -196,7 +196,7 @@ class PackedSegment:
         return parts[0] if len(parts) == 1 else np.concatenate([np.empty(0, np.uint8), *parts])
 
     def walk(self, start: int, end: int, *, check_payload: bool) -> Iterator[Placed | Damage]:
-        """Blocks and damage between two offsets, at the beginnings of which there are frames of the compression."""
+        """Blocks and damage between two offsets. A block is looked for where each compressed frame begins."""
         for frame in self._table.frames_at(start, end):
             _, _, begin, stop = self._table.places(frame)
             try:
@@ -207,7 +207,7 @@ class PackedSegment:
             yield from _shifted(data[max(0, start - begin) : end - begin], max(start, begin), check_payload)
 
     def expect(self, offset: int, length: int) -> None:
-        """Announce that so many bytes will be read soon."""
+        """Announce that these bytes will be read soon."""
         for frame in self._table.frames_at(offset, offset + 1):
             begin, end, _, _ = self._table.places(frame)
             self._file.expect(begin, end - begin)
@@ -222,7 +222,7 @@ SegmentReader = PlainSegment | PackedSegment
 
 
 def open_segments(path: Path) -> list[SegmentReader]:
-    """The segments of a recording's folder in order, or of one file. `DeviceNotFound` where there are none."""
+    """The segments of a recording's folder in order, or of a single file. Raises `DeviceNotFound` if there are none."""
     files = segment_files(path)
     if not files:
         raise DeviceNotFound(f"{path} {NO_SEGMENT}")
@@ -233,7 +233,7 @@ def open_segments(path: Path) -> list[SegmentReader]:
 
 
 def segment_files(path: Path) -> dict[int, Path]:
-    """Files of the segments by their numbers; of a segment that is there twice the plain one."""
+    """The segment files by number. If a segment exists both plain and compressed, the plain one is taken."""
     if path.is_file():
         return {0: path}
     found: dict[int, Path] = {}

@@ -1,1 +1,3 @@
-"""A recording in place of the devices: `spad` plays the frames, `stand_ins` the others, `pace` keeps the clock."""
+"""A recording in place of the devices: `spad` plays the frames, `stand_ins` replace the other devices, `pace` keeps
+time.
+"""

@@ -1,8 +1,8 @@
-"""The clock of a replay: when the frames of a recording come due, in the time of the clock that is passed in.
+"""The clock of a replay: when each recorded frame is due, in the time of the clock that is passed in.
 
-`realtime` holds the frame clock of the recording, `x4` and `x0.1` multiples of it, `max` waits for nothing, `step` for
-somebody's word. Time that a full ring cost moves the clock on, and is counted: behind it frames come at their pace
-again and not all at once.
+`realtime` plays at the frame clock of the recording, `x4` and `x0.1` at multiples of it, `max` never waits, and `step`
+waits for a call for each step. Time lost to a full ring shifts all later frames and is counted, so that frames then
+come at their normal pace again and not all at once.
 """
 
 import math
@@ -24,7 +24,7 @@ _TIMES = re.compile(r"x(\d+(?:\.\d*)?|\.\d+)")
 
 @dataclass(frozen=True, slots=True)
 class ReplayClock:
-    """The replay clock that `--clock` asks for. speed: recorded seconds per second; None: as taken, or in steps."""
+    """The clock that `--clock` asks for. speed: recorded seconds per second; None for as fast as taken, or in steps."""
 
     speed: float | None = None
     steps: bool = False
@@ -32,7 +32,7 @@ class ReplayClock:
 
     @classmethod
     def parse(cls, text: str) -> "ReplayClock":
-        """The clock that a text means: realtime, max, step or xN. ValueError for anything else."""
+        """The clock named by a text: realtime, max, step or xN. Raises ValueError for anything else."""
         named = {"realtime": cls(1.0), "max": cls(), "step": cls(steps=True)}
         if text in named:
             return named[text]
@@ -48,7 +48,7 @@ class ReplayClock:
 
 @dataclass(frozen=True, slots=True)
 class PaceReport:
-    """Lateness of `blocks` against their own times. held_s: for how long a full ring held up the replay."""
+    """Lateness of `blocks` blocks against their own times. held_s: for how long a full ring held up the replay."""
 
     blocks: int = 0
     late_mean_s: float = 0.0
@@ -58,7 +58,7 @@ class PaceReport:
 
 
 class Pace:
-    """Lets blocks pass when they are due. `wait` belongs to the source thread, `step`, `run_on` and `halt` to any."""
+    """Lets blocks pass when they are due. Call `wait` on the source thread; `step`, `run_on` and `halt` on any thread."""
 
     def __init__(self, what: ReplayClock, clock: Clock) -> None:
         self.speed = what.speed
@@ -84,11 +84,11 @@ class Pace:
 
     @property
     def stepping(self) -> bool:
-        """Whether frames wait for somebody's word."""
+        """Whether frames wait for calls of `step`."""
         return not self._run_on
 
     def most_frames(self, period_s: Fraction) -> float:
-        """Frames that a block may have at most, so that one comes every now and then at a slow clock too."""
+        """Largest number of frames in a block, chosen so that blocks come regularly at a slow clock too."""
         return math.inf if self.speed is None else max(1.0, _PIECE_S * self.speed / float(period_s))
 
     def start(self) -> None:
@@ -97,7 +97,7 @@ class Pace:
         self._origin_ns = self._clock.now_ns()
 
     def step(self) -> None:
-        """Allow one step more."""
+        """Allow one more step."""
         with self._changed:
             self._steps += 1
             self._changed.notify_all()
@@ -115,7 +115,7 @@ class Pace:
             self._changed.notify_all()
 
     def wait_for_step(self, timeout_s: float) -> bool:
-        """Take a step; False where none came in time or the run was stopped."""
+        """Take a step. False if none was allowed in time or the run was stopped."""
         with self._changed:
             self._changed.wait_for(lambda: self._steps > 0 or self._run_on or self.halted, timeout_s)
             if self.halted or not (self._run_on or self._steps):
@@ -124,7 +124,7 @@ class Pace:
             return True
 
     def hold(self, due_s: float, waited_s: float) -> None:
-        """Note that a full ring held up for `waited_s` a block that was due `due_s` after the run's start."""
+        """Note that a full ring held up a block for `waited_s` that was due `due_s` after the run's start."""
         if self.speed is None:
             return
         late_ns = self._clock.now_ns() - self._due_ns(due_s, self.speed)
@@ -133,7 +133,7 @@ class Pace:
         self._held_ns += held_ns
 
     def wait(self, due_s: float, timeout_s: float) -> bool:
-        """Wait until what is due `due_s` (recorded time) after the run's start; False where that is not in time."""
+        """Wait until `due_s` of recorded time after the run's start. False if the timeout or `halt` comes first."""
         if self.speed is None:
             return not self.halted
         at_ns = self._due_ns(due_s, self.speed)
@@ -154,7 +154,7 @@ class Pace:
 
 @dataclass(slots=True)
 class _Lateness:
-    """Mean, sum of squares about it, and most of what was noted (Welford 1962: no difference of large sums)."""
+    """Mean, sum of squares about the mean, and maximum of the values noted (Welford 1962: no difference of large sums)."""
 
     blocks: int = 0
     mean: float = 0.0
@@ -162,7 +162,7 @@ class _Lateness:
     most: float = 0.0
 
     def note(self, late_s: float) -> None:
-        """Take up one more value."""
+        """Add one more value."""
         self.blocks += 1
         off = late_s - self.mean
         self.mean += off / self.blocks

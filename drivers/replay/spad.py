@@ -1,9 +1,9 @@
-"""A SPAD array that plays a recording: every recorded frame with its record, in the same starts, gaps as gaps.
+"""A SPAD array that plays a recording: every frame with its record, with the same starts and the same gaps.
 
-The blocks played need not be those of the recording: consecutive frames are cut or joined to the length that is asked
-for, so that results can be shown not to depend on it. Frames are copied into the ring, their checksums tested before; a
-damaged block is left out, a gap like any other. The properties of the sensor come from the recording's manifest, or as
-far as possible from the frames.
+The blocks need not be those of the recording. Consecutive frames are cut or joined to the requested block length, which
+shows that results do not depend on it. Checksums are tested before frames are copied into the ring. A damaged block is
+left out and becomes a gap like any other. The properties of the sensor come from the recording's manifest, or else, as
+far as possible, from the frames.
 """
 
 import threading
@@ -34,7 +34,9 @@ MANIFEST = "manifest.json"
 
 
 def recorded_device(recording: Path, slot: str) -> dict[str, Any] | None:
-    """The manifest's entry on a device of a recording; None where there is none. `ProtocolError`: it cannot be read."""
+    """The manifest's entry on a device of a recording; None if there is none. Raises `ProtocolError` if it cannot be
+    read.
+    """
     file = recording / MANIFEST
     try:
         content = parse_json(file.read_text(encoding="utf-8"))
@@ -48,7 +50,7 @@ def recorded_device(recording: Path, slot: str) -> dict[str, Any] | None:
 
 
 def recorded_info(recording: RunRecording) -> SpadInfo:
-    """The SPAD that took the frames; only that a recording can always wait."""
+    """Properties of the SPAD that took the frames, except that a recording can always wait."""
     noted = recorded_device(recording.path, "spad")
     told = _told_by(recording)
     if noted is None:
@@ -116,7 +118,10 @@ Piece = tuple[FrameBlock, int, int]
 
 
 class Cursor:
-    """A reading of one start to its end, or to frame number `n_frames`. by_block: steps are blocks. For one thread."""
+    """A position while reading one start to its end, or to frame number `n_frames`. For use by one thread at a time.
+
+    by_block: whether a step is a block.
+    """
 
     def __init__(self, recording: RunRecording, run: RecordedRun, n_frames: int | None, *, by_block: bool) -> None:
         begins = run.entries["first_frame"].astype(np.int64)
@@ -144,7 +149,7 @@ class Cursor:
         return block.header.first_frame + end >= self._end_frame
 
     def gather(self, most: int, *, to_marker: bool) -> list[Piece]:
-        """The next consecutive frames, at most so many; up to a scan marker and no further where asked for."""
+        """The next consecutive frames, at most `most`. With `to_marker` they end with the first scan marker."""
         pieces: list[Piece] = []
         n, index = 0, 0
         while n < most and self._look_ahead(index):
@@ -173,7 +178,7 @@ class Cursor:
             self._at = 0
 
     def close(self) -> None:
-        """Read no further ahead."""
+        """Stop reading ahead."""
         self._blocks.close()
 
     def _look_ahead(self, index: int) -> bool:
@@ -240,11 +245,11 @@ class ReplaySpad(SpadArray):
 
     @property
     def info(self) -> SpadInfo:
-        """The SPAD that took the frames; only that a recording can wait."""
+        """Properties of the SPAD that took the frames, except that a recording can wait."""
         return self._info
 
     def leave_out(self, runs: Collection[int]) -> None:
-        """Do not play these starts, by their numbers."""
+        """Skip the starts of these numbers."""
         self._runs = [run for run in self.recording.runs if run.number not in runs]
 
     def _do_configure(self, request: SpadRequest) -> SpadTiming:
@@ -341,7 +346,7 @@ class ReplaySpad(SpadArray):
         return self._counters
 
     def _not_yet(self, why: str) -> bool:
-        """Raise DeviceTimeout with the reason why nothing was published; False where the run was stopped meanwhile."""
+        """Raise DeviceTimeout with the reason why nothing was published; False if the run was stopped meanwhile."""
         if self.pace.halted:
             return False
         raise DeviceTimeout(f"{self.name}: {why}")
@@ -406,7 +411,7 @@ def create(config: ReplaySpadConfig, surroundings: Surroundings) -> ReplaySpad:
 
 
 def check_files(config: ReplaySpadConfig) -> None:
-    """Open the recording, where one is named. `DeviceError` where it cannot be played."""
+    """Open the recording, if one is named, as a test. Raises `DeviceError` if it cannot be played."""
     if config.recording is not None:
         recorded_info(RunRecording(config.recording))
 

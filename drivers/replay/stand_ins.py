@@ -1,6 +1,6 @@
-"""Stand-ins for the scanner, laser and sync source of a recording: what they did is in the frames already.
+"""Stand-ins for the scanner, laser and sync source of a recording, whose effect is in the frames already.
 
-They take every verb, within wide limits, and do nothing: nothing moves, nothing shines.
+They accept every call, within wide limits, and do nothing: nothing moves or emits light.
 """
 
 from collections.abc import Sequence
@@ -37,7 +37,7 @@ class StandInConfig(KindConfig):
 
 
 class RecordedScanner(BeamScanner):
-    """A scanner that has scanned already: it takes its time and moves nothing."""
+    """A scanner that only takes the time a scan needs and moves nothing."""
 
     def __init__(self, clock: Clock) -> None:
         super().__init__("recorded scanner")
@@ -47,7 +47,7 @@ class RecordedScanner(BeamScanner):
 
     @property
     def limits(self) -> ScannerLimits:
-        """Wide ones."""
+        """Limits wider than those of any real scanner."""
         return LIMITS
 
     def _do_status(self) -> ScannerStatus:
@@ -82,7 +82,7 @@ class RecordedSync(SyncSource):
 
     @property
     def resolution_s(self) -> float:
-        """Finer than any device's."""
+        """A resolution finer than any device's."""
         return RESOLUTION_S
 
     def _do_program(self, pulses: Sequence[Pulse], repeats: int) -> None:

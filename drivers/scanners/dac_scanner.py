@@ -1,9 +1,9 @@
-"""A beam scanner that is a galvo behind a DAC on USB: everything that is the same whatever the DAC.
+"""The common part of all beam scanners that are a galvo behind a USB DAC.
 
-The mirror moves only when it is started or parked, always along ramps; opening a scanner asks the board who it is, no
-more. A run is the way to the first point, the waveform, and the way to rest. A thread feeds its points to the DAC slice
-by slice, and knows where the mirror rests. Nothing is laid out beforehand: a waveform of a million points repeated for
-hours takes the memory of the waveform.
+The mirror moves only when it is started or parked, always along ramps; opening a scanner only asks the board for its
+identity. A run consists of the way to the first point, the waveform, and the way to rest. A thread feeds the points to
+the DAC slice by slice and keeps track of where the mirror rests. Nothing is computed in advance: a waveform of a
+million points repeated for hours takes only the memory of the waveform.
 """
 
 import logging
@@ -38,7 +38,9 @@ _NO_WAVE = ScanWaveform(np.zeros(1), np.zeros(1, np.uint8), Fraction(1))
 
 @dataclass(frozen=True, slots=True, eq=False)
 class PointSlice:
-    """Points: command float64 (n,), markers uint8 (n,), lit bool (n,), which is part of the waveform and no ramp."""
+    """Points: command float64 (n,), markers uint8 (n,), lit bool (n,), True for points of the waveform, False for
+    ramps.
+    """
 
     command: NDArray[np.float64]
     markers: NDArray[np.uint8]
@@ -50,22 +52,22 @@ class PointSlice:
 
     @property
     def steps(self) -> NDArray[np.uint16]:
-        """The commands as the boards' converters of 12 bits take them."""
+        """The commands as steps of the boards' 12-bit converters."""
         return np.rint((self.command + 1) / 2 * FULL_SCALE).astype(np.uint16)
 
     def level(self, bit: int) -> NDArray[np.uint8]:
-        """A colour output that follows a marker."""
+        """Values of a colour output that follows a marker."""
         return colour(self.markers & bit)
 
 
 def colour(high: NDArray[Any]) -> NDArray[np.uint8]:
-    """Full brightness of a colour output at the points that are not 0."""
+    """Values of a colour output: full brightness at the points where `high` is not 0."""
     return np.where(high, 255, 0).astype(np.uint8)
 
 
 class PointSource:
     """Gives the points of a run in order: the way from rest at `position` to `end`, then `repeats` of a waveform that
-    begins there. One thread.
+    begins there. For use by one thread.
     """
 
     def __init__(
@@ -88,21 +90,23 @@ class PointSource:
 
     @property
     def left(self) -> int:
-        """Points not taken yet."""
+        """Number of points not taken yet."""
         return self._end - self._at
 
     def pad_start(self, points: int = 1) -> None:
-        """Add points at the very beginning, where the mirror rests. Before the first `take`."""
+        """Add points at the very beginning, at the mirror's rest position. Call it before the first `take`."""
         self._way = np.concatenate([np.full(points, self.last), self._way])
         self._end += points
 
     def pad_end(self) -> None:
-        """Add one more point at the end of a way to rest, where the mirror rests then. After `stop`, before `take`."""
+        """Add one more point at the end of a way to rest, at the final position. Call it after `stop` and before
+        `take`.
+        """
         self._way = np.append(self._way, self._way[-1])
         self._end += 1
 
     def take(self, most: int) -> PointSlice:
-        """The next points, at most so many."""
+        """The next points, at most `most` of them."""
         self._former = self._at, self._before, self.last
         at = np.arange(self._at, min(self._at + most, self._end))
         self._at += len(at)
@@ -117,18 +121,18 @@ class PointSource:
         return PointSlice(command, markers, lit)
 
     def give_back(self) -> None:
-        """Undo the last `take`: its points were not played."""
+        """Undo the last `take`, whose points were not played."""
         self._at, self._before, self.last = self._former
 
     def stop(self) -> None:
-        """Replace what is left by the shortest way to rest."""
+        """Replace the remaining points by the shortest way to rest."""
         if self.left:
             self._way = brake(self.last, (self.last - self._before) * self._rate_hz, self._limits, self._rate_hz)
             self._at, self._end = 0, len(self._way)
 
 
 class DacRun(Protocol):
-    """One run on a certain device. Every wait inside has an end."""
+    """One run on one device. Every wait in it has a time limit."""
 
     source: PointSource
 
@@ -136,11 +140,11 @@ class DacRun(Protocol):
         """Send the first points; they play at once."""
 
     def feed(self, stopping: threading.Event) -> None:
-        """Send the rest; returns when the mirror rests. Brakes once `stopping` is set."""
+        """Send the other points; returns when the mirror rests. Brakes once `stopping` is set."""
 
 
 class Dac(Protocol):
-    """An open board. Powered up its mirror stands at the centre, drive 0."""
+    """An open board. When it is powered up, its mirror stands at the centre, drive 0."""
 
     name: str
     identity: str
@@ -152,23 +156,23 @@ class Dac(Protocol):
     """Drive that the mirror jumps to when the board is given back; None: it stays."""
 
     def point_clock(self, requested_hz: float, low_hz: float, high_hz: float) -> Fraction:
-        """The exact rate nearest to the requested one, within low to high."""
+        """The exact rate nearest to the requested one, between low and high."""
 
     def run(self, source: PointSource, clock_hz: Fraction) -> DacRun:
-        """A run of these points at a rate that `point_clock` returned."""
+        """A run of these points, at a rate that `point_clock` returned."""
 
     def check(self) -> None:
-        """Raise where the board does not answer. Any thread."""
+        """Raise an error if the board does not answer. May be called from any thread."""
 
     def halt(self) -> float:
-        """End what the board plays, in an emergency; returns where the mirror rests then."""
+        """Stop what the board plays, in an emergency; returns the position at which the mirror then rests."""
 
     def close(self) -> None:
         """Make the outputs safe and give the board back."""
 
 
 class DacScanner(BeamScanner):
-    """One mirror axis. While a waveform is played a thread of its own does the talking."""
+    """One mirror axis. While a waveform is played, a separate thread communicates with the board."""
 
     def __init__(self, dac: Dac, config: GalvoConfig) -> None:
         """`dac` is its own from here on."""
@@ -191,7 +195,7 @@ class DacScanner(BeamScanner):
 
     @property
     def serial(self) -> str | None:
-        """Serial number of the board; the mirror behind it has none that could be asked for."""
+        """Serial number of the board. The mirror behind it cannot be asked for one."""
         return self._dac.serial
 
     @property
@@ -289,7 +293,7 @@ def open_scanner(
     surroundings: Surroundings,
     identify: Callable[[UsbDevice], Dac],
 ) -> DacScanner:
-    """The scanner at the config's port. identify: makes the `Dac` of an open device, or raises."""
+    """The scanner at the config's port. identify: makes the `Dac` of an open device, or raises an error."""
     endpoint = resolve(config.port, surroundings.ports)
     usb = open_device(wanted, endpoint.address, alternates, endpoint.usb_backend, surroundings.tap)
     try:

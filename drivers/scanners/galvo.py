@@ -1,12 +1,12 @@
-"""A galvo behind a DAC: its config and limits, and its ways between two commands within them.
+"""A galvo behind a DAC: its config, its limits, and paths between two commands that keep within them.
 
-The ways are those to the first point, to a stop and to the dump angle:
+The paths lead to the first point, to a stop and to the dump angle:
 
     ramp   x(t) = a + (b - a) (1 - cos(pi t / T)) / 2      peaks: v = |b - a| pi / 2T, a = |b - a| pi^2 / 2T^2
-    brake  constant deceleration from the speed that the mirror has
+    brake  constant deceleration from the mirror's present speed
 
-DACs hand the steps of their input to the galvo as they are: a full-range jump at every point can overheat it
-(docs/reference/hardware.md, Helios), so that nothing ever jumps.
+DACs pass the steps of their input to the galvo as they are, and a full-range jump at every point can overheat it
+(docs/reference/hardware.md, Helios). So no path contains a jump.
 """
 
 import math
@@ -30,7 +30,7 @@ Drive = Annotated[float, Field(ge=-1, le=1)]
 
 
 class GalvoConfig(KindConfig):
-    """Limits of the galvo; they are in its data sheet. The DAC itself would follow anything."""
+    """Limits of the galvo, from its data sheet. The DAC itself would play anything."""
 
     port: str = "usb"
     """Port: usb; where several are attached usb:serial=ABC, or usb:path=1-2 for a Helios, which has none;
@@ -57,7 +57,7 @@ class GalvoConfig(KindConfig):
         return self
 
     def limits(self, highest_rate_hz: float) -> ScannerLimits:
-        """The limits, on a DAC that runs up to that rate."""
+        """The limits of the galvo on a DAC that runs at up to that rate."""
         return ScannerLimits(
             command_range=self.command_range,
             velocity_per_s=self.max_velocity,
@@ -74,7 +74,9 @@ _HEADROOM = 0.9
 
 
 def ramp(start: float, end: float, limits: ScannerLimits, rate_hz: float) -> NDArray[np.float64]:
-    """Commands from `start` (excluded) to `end` (included), at rest on both sides. float64 (n,); n = 0 at no way."""
+    """Commands from `start` (excluded) to `end` (included), at rest on both sides. float64 (n,); n = 0 if they are
+    equal.
+    """
     way = abs(end - start)
     if way == 0:
         return np.empty(0)
@@ -92,8 +94,8 @@ def ramp(start: float, end: float, limits: ScannerLimits, rate_hz: float) -> NDA
 def brake(position: float, velocity_per_s: float, limits: ScannerLimits, rate_hz: float) -> NDArray[np.float64]:
     """Commands from `position` (excluded) to rest at a constant deceleration, inside the range. float64 (n,).
 
-    Decelerates harder than `limits` only where the range leaves no room, which a waveform within the limits never
-    asks for.
+    The deceleration exceeds `limits` only if the range leaves no room otherwise, which no waveform within the limits
+    requires.
     """
     step = velocity_per_s / rate_hz
     if step == 0:

@@ -5,19 +5,19 @@ SDK v11).
 
 The device plays frames of up to 4095 points from two buffers, one playing and one pending, and has neither a trigger
 nor a clock output: synchronisation comes from the markers in the SPAD's stream. A thread keeps the pending buffer full.
-Every frame is SINGLE: a dead host leaves a mirror that stands after two frames, not one that scans for ever. STOP
-centres the mirror in one jump, so that it is for emergencies and for the end; scans end with a brake ramp. The shutter
-pin is never raised.
+Every frame is SINGLE, so that the mirror stops after two frames if the host dies, and does not scan for ever. STOP
+centres the mirror in one jump, so it is used only in emergencies and at the end; scans end with a brake ramp. The
+shutter pin is never raised.
 
-Whether the buffers ever ran dry is judged from the device's status, which tells only when the pending buffer falls
-free. Between the last status 'full' and the first 'free' the pending frame began to play; that bounds when it ends. A
-frame that arrives after the earliest such end may have left the mirror standing: the run ends with a fault. A buffer
-that falls free before the playing frame can have ended means that the device dropped a frame in silence. Only the
-markers in the SPAD's stream tell what was really played.
+The device's status tells only when the pending buffer becomes free; from it follows whether the buffers ever ran empty.
+The pending frame began to play between the last status 'full' and the first 'free', which bounds the time at which it
+ends. If a frame arrives after the earliest such time, the mirror may have stood still, and the run ends with a fault.
+If a buffer becomes free before the playing frame can have ended, the device has silently dropped a frame. What was
+really played is known only from the markers in the SPAD's stream.
 
-Sources of the bytes: `Grix/helios_dac` 0952a2a, firmware/AtmelStudio_helios/lasdac_mainfirmware/src/main.c and
-sdk/cpp/HeliosDac.cpp (read for facts; no code taken). Only the opcodes below exist here: DE would jump to the
-bootloader, 06 wears the flash, and 02 is sent with 0 only. A point takes floor(112e6 / pps) + 1 cycles of 112 MHz.
+Sources of the protocol: `Grix/helios_dac` 0952a2a, firmware/AtmelStudio_helios/lasdac_mainfirmware/src/main.c and
+sdk/cpp/HeliosDac.cpp (read for facts; no code taken). Only the opcodes below are used: DE would jump to the bootloader,
+06 wears the flash, and 02 is sent with 0 only. A point takes floor(112e6 / pps) + 1 cycles of 112 MHz.
 """
 
 import logging
@@ -62,17 +62,17 @@ FLAG_START, FLAG_SINGLE = 1, 2
 
 
 def rate_of(pps: int) -> Fraction:
-    """The rate that the device runs at when asked for `pps`: always a little slower, or a different one."""
+    """The rate at which the device really runs if `pps` is requested, which is always a little slower."""
     return Fraction(SYSTICK_HZ, SYSTICK_HZ // pps + 1)
 
 
 def pps_of(rate_hz: Fraction) -> int:
-    """The integer to ask for so that the device runs at a rate that `rate_of` gave: 25 001 for 25 000 Hz."""
+    """The integer to request so that the device runs at a rate that `rate_of` gave: 25 001 for 25 000 Hz."""
     return math.floor(rate_hz) + 1
 
 
 def nearest_rate(requested_hz: float, low_hz: float, high_hz: float) -> Fraction:
-    """The true rate nearest to `requested_hz`, within low to high."""
+    """The true rate nearest to `requested_hz`, between low and high."""
     near = math.floor(requested_hz)
     cycles = round(SYSTICK_HZ / requested_hz)
     # n cycles are what floor(112e6 / (n - 1)) asks for, where any whole number does.
@@ -82,16 +82,17 @@ def nearest_rate(requested_hz: float, low_hz: float, high_hz: float) -> Fraction
 
 
 def sendable(points: int) -> bool:
-    """Whether the firmware completes a frame of so many points.
+    """Whether the firmware completes a frame of that many points.
 
-    7 n + 5 bytes are whole packets of 64 at n = 45, 109, 173 ...: no short packet ends the transfer, and the firmware
-    waits for ever (issue 6 of the vendor's repository).
+    A frame of 7 n + 5 bytes fills whole packets of 64 at n = 45, 109, 173 ... Then no short packet ends the transfer,
+    and the firmware waits for ever (issue 6 of the vendor's repository).
     """
     return points % 64 != 45
 
 
 def slice_points(left: int, most: int) -> int:
-    """Points of the next frame out of `left`; `most` is sendable, and so is a `left` that is not more than `most`.
+    """Number of points of the next frame out of `left`. Requires that `most` is sendable, and `left` too if it is at
+    most `most`.
 
     The last two frames share what is left: a short frame in the middle would end before its successor arrives.
     """
@@ -104,7 +105,7 @@ def slice_points(left: int, most: int) -> int:
 
 
 def encode(points: PointSlice, axis: str, pps: int, flags: int) -> bytes:
-    """One frame. R: lit, G: line marker, B: scan marker, I: backward; the axis that does not scan stands at centre."""
+    """The bytes of one frame. R: lit, G: line marker, B: scan marker, I: backward. The unused axis stays at the centre."""
     centre = np.full(len(points), CENTRE, np.uint16)
     x, y = (points.steps, centre) if axis == "x" else (centre, points.steps)
     frame = np.empty((len(points), 7), np.uint8)
@@ -152,9 +153,9 @@ class HeliosConfig(GalvoConfig):
 
 
 class HeliosDac:
-    """A Helios as a `Dac`: its commands, one at a time. Any thread.
+    """A Helios as a `Dac`: its commands, one at a time. May be called from any thread.
 
-    STOP and the alternate setting without endpoints leave the mirror at the centre.
+    STOP leaves the mirror at the centre, and so does the alternate setting without endpoints.
     """
 
     closes_at: float | None = 0.0
@@ -188,17 +189,17 @@ class HeliosDac:
         return HeliosRun(self, self._clock, source, clock_hz, frame_s=config.frame, axis=config.axis)
 
     def check(self) -> None:
-        """Check that the board answers; DeviceTimeout where it is asked twice in vain."""
+        """Check that the board answers. Raises DeviceTimeout if two queries get no answer."""
         if self.free() is None and self.free() is None:
             raise DeviceTimeout(f"{self.name}: gives no status; unplug it and plug it in again")
 
     def halt(self) -> float:
-        """Send STOP: the mirror is at the centre then, in one jump."""
+        """Send STOP, which brings the mirror to the centre in one jump; returns that position."""
         self.stop()
         return 0.0
 
     def free(self) -> bool | None:
-        """Whether a frame can be sent; None where the device gave no proper status, which means no as well."""
+        """Whether a frame can be sent. None if the device gave no valid status, which also means no."""
         with self._lock:
             try:
                 if self._out_of_step:
@@ -212,17 +213,17 @@ class HeliosDac:
         return answer
 
     def send_frame(self, frame: bytes) -> None:
-        """Send one frame, after `free` said True."""
+        """Send one frame, after `free` returned True."""
         with self._lock:
             self._link.write(_FRAMES, frame, _FRAME_S)
 
     def stop(self) -> None:
-        """Blank at once, centre the mirror in one jump 100 ms later; returns when frames are taken again."""
+        """Blank at once and centre the mirror in one jump 100 ms later; returns when frames are accepted again."""
         self._send(_STOP, 0)
         self._clock.sleep(_AFTER_STOP_S)
 
     def close(self) -> None:
-        """Stop, take the shutter pin low (the firmware never does), go back to 'disabled', give the device back."""
+        """Stop, take the shutter pin low (the firmware never does), go back to 'disabled' and give the device back."""
         try:
             self.stop()
             self._send(_SHUTTER, 0)
@@ -261,7 +262,7 @@ _WIRE_BYTES_PER_S = 1.216e6
 
 
 class HeliosRun:
-    """One run: `begin`, then `feed`. Every wait has an end: at most two frames and two seconds."""
+    """One run: `begin`, then `feed`. No wait is longer than two frames and two seconds."""
 
     def __init__(
         self, link: HeliosDac, clock: Clock, source: PointSource, clock_hz: Fraction, *, frame_s: float, axis: str
@@ -285,7 +286,7 @@ class HeliosRun:
             source.pad_start()
 
     def begin(self) -> None:
-        """Send the first frame; it plays once it is whole."""
+        """Send the first frame, which plays once it is complete."""
         self._wait_until_idle()
         first, duration_s = self._made(FLAG_SINGLE | FLAG_START)
         earliest_s, arrived_s = self._send(first)
@@ -295,7 +296,7 @@ class HeliosRun:
         self._next = self._made() if self.source.left else None
 
     def feed(self, stopping: threading.Event) -> None:
-        """Send all that is left; returns when the mirror rests. Brakes once `stopping` is set."""
+        """Send all remaining points; returns when the mirror rests. Brakes once `stopping` is set."""
         stopped = False
         while self._next is not None:
             if not stopped and stopping.is_set():
@@ -367,7 +368,7 @@ class HeliosRun:
             self._clock.sleep(POLL_S)
 
     def _wait_until_free(self, stopping: threading.Event | None) -> bool:
-        """True once the pending buffer is free; False where a stop came first."""
+        """True once the pending buffer is free; False if a stop came first."""
         heard_s, full_s = self._now_s(), self._earliest_end_s
         while stopping is None or not stopping.is_set():
             asked_s = self._now_s()

@@ -1,21 +1,21 @@
 """Scanner kind `lasercube`: a galvo behind a LaserCube / LaserDock USB board (docs/reference/hardware.md).
 
     outputs   X (or Y): mirror. With `colours: markers` R: backward. G: line marker. B: scan marker. X is not
-              turned round as the vendor's program does: which way a command leads is for the calibration to say
+              reversed as in the vendor's program: the calibration tells in which direction a command leads
 
-The board has a ring of samples that is topped up by a thread: no frames, no seams. Its colour outputs drive lasers of
-its own unless these are unplugged, so that they stay off until the config says where they lead. Clear and disable are
-its only stop; nothing at all happens when the host dies, so that the gate must not depend on it.
+The board has a ring of samples that a thread keeps filled, without frames or seams. Its colour outputs drive lasers of
+its own unless these are unplugged, so they stay off until the config says where they lead. It can be stopped only with
+'clear' and 'disable'. It does nothing when the host dies, so the laser's gate must not depend on it.
 
-Whether each sample was played once is judged from the answers to 'how many are queued'. Each answer bounds the moment
-at which the first sample was played, if none was lost, played twice or waited for: the moments that all answers allow
-must have one in common. Samples go out in whole transfers, so that a lost one stands out. A run begins with copies of
-its first point, so that a sample lost before the first answer is one of them. It ends with copies of its last: what the
-device does when its ring runs empty is not documented (hold or repeat), so that the ring is cleared while they are
-played.
+Whether each sample was played exactly once is judged from the answers to 'how many are queued'. Each answer bounds the
+time at which the first sample was played, assuming that no sample was lost, repeated or delayed; the intervals of all
+answers must have a time in common. Samples are sent in whole transfers, so that a lost one is noticed. A run begins
+with copies of its first point, so that a sample lost before the first answer is one of them. It ends with copies of its
+last point, and the ring is cleared while they are played, because it is not documented whether the device holds or
+repeats its output when the ring runs empty.
 
-Source of the bytes: `Wickedlasers/laserdocklib` 51d13bc, lib/src/LaserdockDevice*.cpp (read for facts; no code taken).
-The USB ids are shared with Lasershark boards, so that the product string decides.
+Source of the protocol: `Wickedlasers/laserdocklib` 51d13bc, lib/src/LaserdockDevice*.cpp (read for facts; no code
+taken). Lasershark boards share the USB ids, so the product string decides.
 """
 
 import math
@@ -76,9 +76,9 @@ class LaserCubeConfig(GalvoConfig):
 
 
 class LaserCubeDac:
-    """A LaserCube as a `Dac`: its commands, one at a time. Any thread.
+    """A LaserCube as a `Dac`: its commands, one at a time. May be called from any thread.
 
-    It cannot tell where its mirror stands: the first run begins at the centre.
+    The board cannot report the mirror's position; the first run begins at the centre.
     """
 
     closes_at: float | None = None
@@ -107,7 +107,7 @@ class LaserCubeDac:
             )
 
     def point_clock(self, requested_hz: float, low_hz: float, high_hz: float) -> Fraction:
-        """The nearest whole number of Hz, which is all that the device can be told; a run reads it back."""
+        """The nearest whole number of Hz, since the device takes nothing else. A run reads it back."""
         return Fraction(min(max(round(requested_hz), int(low_hz)), int(high_hz)))
 
     def run(self, source: PointSource, clock_hz: Fraction) -> "LaserCubeRun":
@@ -117,16 +117,16 @@ class LaserCubeDac:
         return LaserCubeRun(self, source, int(clock_hz), buffer_s=config.buffer, axis=config.axis, markers=markers)
 
     def check(self) -> None:
-        """Check that the board answers; any question will do."""
+        """Check that the board answers a query."""
         self.queued()
 
     def halt(self) -> float:
-        """Clear the ring. Where that leaves the mirror nobody knows: the next run goes to the centre in one jump."""
+        """Clear the ring. The mirror's position is unknown afterwards, and the next run goes to the centre in one jump."""
         self.safe()
         return 0.0
 
     def safe(self) -> None:
-        """Switch the colours off, then leave nothing to play."""
+        """Switch the colours off, then clear the ring."""
         self.enable(False)
         self.clear()
 
@@ -135,18 +135,18 @@ class LaserCubeDac:
         self._ask(bytes((_ENABLE, on)))
 
     def clear(self) -> None:
-        """Empty the ring: the mirror stands where it is."""
+        """Empty the ring; the mirror stays where it is."""
         self._ask(bytes((_CLEAR, 0)))
 
     def set_rate(self, rate_hz: int) -> None:
-        """Set the sample rate and read it back; `DeviceFault` where it is another."""
+        """Set the sample rate and read it back. Raises `DeviceFault` if it reads back different."""
         self._ask(bytes((_SET_RATE,)) + rate_hz.to_bytes(4, "little"))
         actual_hz = self._number(_GET_RATE)
         if actual_hz != rate_hz:
             raise DeviceFault(f"{self.name}: runs at {actual_hz} Hz instead of {rate_hz} Hz; choose another point rate")
 
     def queued(self) -> int:
-        """Samples in the ring that were not played yet."""
+        """Number of samples in the ring that were not played yet."""
         free = self._number(_RING_FREE)
         if free > self.ring_points:
             raise ProtocolError(f"{self.name}: {free} of {self.ring_points} samples free; check the cable")
@@ -191,7 +191,7 @@ class LaserCubeDac:
 
 
 def encode(points: PointSlice, axis: str, *, markers: bool) -> bytes:
-    """The bytes of samples. With markers: R backward, G line marker, B scan marker; else dark."""
+    """The bytes of samples. With markers: R backward, G line marker, B scan marker. Without, all colours are dark."""
     samples = np.full((len(points), 4), CENTRE, "<u2")
     samples[:, :2] = 0
     if markers:
@@ -210,7 +210,7 @@ counting."""
 
 
 class LaserCubeRun:
-    """One run: `begin`, then `feed`. Every wait has an end: the queued samples and a second."""
+    """One run: `begin`, then `feed`. No wait is longer than the queued samples and a second."""
 
     def __init__(
         self, link: LaserCubeDac, source: PointSource, rate_hz: int, *, buffer_s: float, axis: str, markers: bool
@@ -234,7 +234,7 @@ class LaserCubeRun:
         self._asked_s = 0.0
 
     def begin(self) -> None:
-        """Begin with copies of the first point; they play at once."""
+        """Send copies of the first point, which play at once."""
         self._link.clear()
         self._link.set_rate(self._rate_hz)
         self._link.enable(self._markers)
@@ -244,7 +244,7 @@ class LaserCubeRun:
         self._send(self.source.take(self._most - self._hold))
 
     def feed(self, stopping: threading.Event) -> None:
-        """Send all that is left; returns when the mirror rests. Brakes once `stopping` is set."""
+        """Send all remaining points; returns when the mirror rests. Brakes once `stopping` is set."""
         stopped = False
         while self.source.left:
             queued = self._queued()
@@ -291,7 +291,7 @@ class LaserCubeRun:
         raise DeviceFault(f"{self._link.name}: the points ran dry; lengthen buffer or unload the host")
 
     def _queued(self) -> int:
-        """Samples not yet played; `DeviceFault` where their number cannot be."""
+        """Samples not yet played; raises `DeviceFault` if their number cannot be."""
         before_s = self._now_s()
         queued = self._link.queued()
         after_s = self._now_s()

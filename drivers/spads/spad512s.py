@@ -1,17 +1,16 @@
 """Pi Imaging SPAD512S (SPAD512^2) through its vendor's program, which serves commands and pixels on a local TCP port.
 
-Facts and their sources: docs/reference/hardware.md; `spad512s_line` speaks with the program. In short:
+Facts and their sources: docs/reference/hardware.md. `spad512s_line` talks to the program. In short:
 
 - The vendor's program must run, on this computer or behind a bridge; it serves one client.
-- `PU,0` goes before every acquisition. `I,1,tInt,n,trigger,overlap,sparse,1` takes n frames of 1 bit, tInt in
-  microseconds (at 1 and 4 bits; milliseconds from 6 bits on).
-- The answer is 32 768 bytes a frame (65 536 of a 1M sensor), most significant bit first; then `DONE`, or text that ends
-  with `ERROR`, anywhere. Pixels may well read the same: the exact length decides, and the text behind it.
+- `PU,0` goes before every acquisition. `I,1,tInt,n,trigger,overlap,sparse,1` takes n frames of 1 bit. tInt is in
+  microseconds at 1 and 4 bits, in milliseconds from 6 bits on.
+- The answer is 32 768 bytes a frame (65 536 for a 1M sensor), most significant bit first; then `DONE`. Text that ends
+  with `ERROR` may come at any point. Pixels may look like such text, so the exact length decides, and what follows it.
 - Frames lie on their side: the vendor's samples turn them by 90 degrees counter-clockwise (`rotation`).
-- Frames carry neither ticks nor markers: the records' ticks are nominal. Nor have they number or checksum: pixels
-  handed over twice have the right length, so that no frame may be the very same as one before.
-- `STOP` is known from other people's code only; a run that does not end soon after it is left by closing the
-  connection.
+- Frames carry neither ticks nor markers; the ticks in the records are nominal. Frames have no number or checksum
+  either. Pixels handed over twice would have the right length, so a frame identical to an earlier one is an error.
+- `STOP` is known only from other people's code. If a run does not end soon after it, the connection is closed.
 """
 
 import threading
@@ -47,7 +46,7 @@ _UNIFORM = (0x00, 0xFF)
 
 
 class Spad512sRun:
-    """Takes a run block by block; the memory it gives out is good until the next one is asked for."""
+    """Receives a run block by block. The memory it returns is valid until the next block is asked for."""
 
     def __init__(self, name: str, line: Spad512sLine, n_frames: int, block_frames: int, frame_bytes: int) -> None:
         """Allocate the memory; the command that starts the run is the caller's."""
@@ -70,18 +69,19 @@ class Spad512sRun:
 
     @property
     def next_n(self) -> int:
-        """Frames of the block that comes next; 0: the run is over."""
+        """Number of frames of the next block; 0 if the run is over."""
         return min(self._block_frames, self.n_frames - self.next_frame)
 
     @property
     def ends(self) -> bool:
-        """Whether the block that comes next is the last."""
+        """Whether the next block is the last."""
         return self.next_frame + self.next_n == self.n_frames
 
     def receive(self, ends_at: float, timeout_s: float, stopped: Callable[[], bool]) -> NDArray[np.uint8] | None:
-        """Pixels of the next block, uint8 (n * frame bytes,), once it is safe; None: stopped. Goes on where it was.
+        """Pixels of the next block, uint8 (n * frame bytes,), once their length is confirmed; None if stopped.
 
-        `DeviceTimeout` at `ends_at` (of `time.monotonic`); `DeviceFault` with the device's own words; `ProtocolError`.
+        A call continues where the last one ended. Raises `DeviceTimeout` at `ends_at` (of `time.monotonic`),
+        `DeviceFault` with the device's own words, or `ProtocolError`.
         """
         pixel_bytes = self.next_n * self._frame_bytes
         wanted = pixel_bytes + (len(DONE) if self.ends else GUARD_BYTES)
@@ -96,7 +96,7 @@ class Spad512sRun:
         return pixels
 
     def go_on(self) -> None:
-        """Drop the block, which was dealt with: the bytes that guarded it begin the next one."""
+        """Drop the block, once it has been used. The bytes that were read beyond its end begin the next one."""
         used = self.next_n * self._frame_bytes
         self._memory[: self._got - used] = self._memory[used : self._got]
         self._got -= used
@@ -128,7 +128,7 @@ class Spad512sRun:
         )
 
     def _require_new(self, frames: NDArray[np.uint8]) -> None:
-        """ProtocolError for a frame that was there before, unless all dark or all bright. frames: (n, 2, half)."""
+        """Raises ProtocolError for a frame that was there before, unless all dark or all bright. frames: (n, 2, half)."""
         for number, (one, other) in enumerate(frames, self.next_frame):
             before = self._seen.setdefault((zlib.crc32(one), zlib.crc32(other)), number)
             if before != number and not (one[0] in _UNIFORM and (one == one[0]).all() and (other == one[0]).all()):
@@ -182,7 +182,7 @@ class Spad512sConfig(KindConfig):
 
 
 class Spad512s(SpadArray):
-    """A SPAD512S, connected."""
+    """A connected SPAD512S."""
 
     def __init__(
         self, config: Spad512sConfig, endpoint: Endpoint, deadlines: Deadlines | None = None, tap: Tap | None = None
@@ -281,7 +281,7 @@ class Spad512s(SpadArray):
     def _connect_where_lost(self) -> None:
         """Connect again after the program was restarted or left, which listens again a moment after its one client.
 
-        DeviceFault where another device answers now.
+        Raises DeviceFault if another device answers now.
         """
         ends_at = time.monotonic() + self._deadlines.listens_s
         while not self._line.is_open:
@@ -344,7 +344,7 @@ class Spad512s(SpadArray):
         return seal_block(memory, self._header(run), layout, payload_crc=False)
 
     def _claim(self, ring: BlockRing, ends_at: float, timeout_s: float) -> NDArray[np.uint8] | None:
-        """A free slot; None where there is none and the ring does not wait."""
+        """A free slot; None if there is none and the ring does not wait."""
         while True:
             memory = ring.claim(min(SLICE_S, max(0.0, ends_at - time.monotonic())))
             if memory is not None or not ring.waits:

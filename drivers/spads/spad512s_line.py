@@ -1,11 +1,11 @@
-"""The connection to a SPAD512S's vendor program: text commands and their answers, and who answers
+"""The connection to a SPAD512S's vendor program: text commands, their answers, and the device's identity
 (docs/reference/hardware.md).
 
 Sources there: `nirrafa/SPAD512S-remote-gui` theoretical_info/piimaging_examples and docs/, `cwseitz/SPAD512`
-SPAD512/instruments/SPAD512S.py. There is no framing, no request number and one client; one command at a time, answers
-of no stated length. A connection greets with a banner whose first word is the sort of detector. The first `D` may say
-that a calibration of the breakdown voltage starts: then nothing may be sent before "The breakdown is around", and `D`
-is asked again.
+SPAD512/instruments/SPAD512S.py. The protocol has neither framing nor request numbers, and serves one client. Commands
+go one at a time, and the length of an answer is not announced. On connection the program sends a banner whose first
+word is the detector type. The first `D` may report that a calibration of the breakdown voltage starts. Then nothing may
+be sent before "The breakdown is around", and `D` is sent again.
 """
 
 import logging
@@ -69,10 +69,10 @@ class Spad512sIdentity:
 
 
 class Spad512sLine:
-    """The line, open once `connect` returned. For one thread at a time."""
+    """The line, which is open once `connect` has returned. For use by one thread at a time."""
 
     def __init__(self, name: str, address: str, deadlines: Deadlines, tap: Tap | None = None) -> None:
-        """tap: told of commands and answers, not of pixels."""
+        """tap: notes commands and answers, but not pixels."""
         self.address = address
         self._tap = tap
         self._name = name
@@ -81,11 +81,11 @@ class Spad512sLine:
 
     @property
     def is_open(self) -> bool:
-        """Whether a run or an answer can come."""
+        """Whether the connection is open."""
         return self._stream is not None
 
     def connect(self) -> Spad512sIdentity:
-        """Connect: banner, D, the calibration where one runs, D again."""
+        """Connect: read the banner, send `D`, wait for a calibration if one runs, then send `D` again."""
         self._stream = TcpStream(self._name, self.address)
         try:
             return self._greet(self._stream)
@@ -94,18 +94,18 @@ class Spad512sLine:
             raise
 
     def hang_up(self) -> None:
-        """Give the connection back; again: nothing happens."""
+        """Close the connection; a second call does nothing."""
         stream, self._stream = self._stream, None
         if stream is not None:
             stream.close()
 
     def tell(self, command: str) -> None:
-        """Send a command whose answer is pixels, or none."""
+        """Send a command whose answer is pixels, or that has none."""
         with self._given_up_on_silence():
             self._send(self._open(), command)
 
     def ask(self, command: str) -> str:
-        """Send a command and return its answer; DeviceFault where that is an ERROR."""
+        """Send a command and return its answer. Raises DeviceFault if that is an ERROR."""
         answer_s = self._deadlines.answer_s
         with self._given_up_on_silence():
             stream = self._open()
@@ -129,7 +129,7 @@ class Spad512sLine:
             raise
 
     def ask_numbers(self, command: str, n: int) -> list[float]:
-        """The first n numbers of an answer; newer programs and emulations send more behind them."""
+        """The first n numbers of an answer. Newer programs and emulations send more numbers after them."""
         fields = self.ask(command).replace("\n", ",").split(",")
         try:
             return [float(fields[i]) for i in range(n)]
@@ -137,15 +137,15 @@ class Spad512sLine:
             raise ProtocolError(f"{self._name} answers {command} with {fields!r}, not with {n} numbers") from None
 
     def receive_into(self, view: memoryview, wait_s: float) -> int:
-        """Bytes of a run; 0 where none came. `DeviceDisconnected`."""
+        """Receive bytes of a run; returns their number, 0 if none came. May raise `DeviceDisconnected`."""
         return self._open().receive_into(view, wait_s)
 
     def rest(self) -> bytes:
-        """The end of what still comes of a run."""
+        """The end of what the program still sends of a run."""
         return self._open().drain(4 * QUIET_S, self._deadlines.stop_s)
 
     def leave_run(self) -> None:
-        """Ask the device to stop and take what still comes; where that is no end, close the connection."""
+        """Ask the device to stop and read what it still sends. If the run does not end, close the connection."""
         if self._stream is None:
             return
         try:
@@ -227,7 +227,7 @@ class Spad512sLine:
             self._tap.note("tcp", direction, data)
 
     def _read_text(self, stream: TcpStream, deadline_s: float) -> str:
-        """The text until the line is quiet or says DONE, at most for `deadline_s`; empty where nothing came."""
+        """The text until the line is quiet or says DONE, at most for `deadline_s`; empty if nothing came."""
         ends_at = time.monotonic() + deadline_s
         data = stream.receive(deadline_s)
         while data and not data.endswith(DONE) and time.monotonic() < ends_at:

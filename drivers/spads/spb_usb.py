@@ -1,8 +1,8 @@
-"""A SPAD array on USB that speaks SPB1 (docs/reference/spb1-usb.md): behind a Cypress FX3 or an FT601.
+"""A SPAD array on USB that speaks SPB1 (docs/reference/spb1-usb.md), behind a Cypress FX3 or an FT601.
 
 The protocol is this project's own proposal. Opening checks product string, identity registers and a test pattern. The
-device counts and time-stamps frames itself, follows its window table by the line markers, and drops its gate where no
-PING comes for `heartbeat`. Pings are sent by `fill`, between two blocks: a source thread that hangs ends the light.
+device counts and time-stamps frames itself, follows its window table by the line markers, and takes its gate low if no
+PING comes for `heartbeat`. Pings are sent by `fill`, between two blocks, so the light ends if the source thread hangs.
 """
 
 import logging
@@ -279,7 +279,7 @@ class SpbUsb(SpadArray):
 
 
 def open_link(config: SpbUsbConfig, endpoint: Endpoint) -> BulkLink:
-    """The link to the device at an endpoint. An emulator's own backend can do plain reads only."""
+    """The link to the device at an endpoint. An emulator's own backend supports plain reads only."""
     wiring = WIRINGS[config.chip]
     listing = find_device(wiring.usb, endpoint.address, endpoint.usb_backend)
     queued = config.reads == "queued" and endpoint.usb_backend is None

@@ -2,10 +2,10 @@
 
 Facts: docs/reference/hardware.md and docs/reference/spb1-usb.md.
 
-The USB chips differ in ids and endpoints, and an FT601 wants a session. Sources: `VicidominiLab` BrightEyes-TTM 8f8d8d8
+The USB chips differ in ids and endpoints, and an FT601 needs a session. Sources: `VicidominiLab` BrightEyes-TTM 8f8d8d8
 (FX3 with the AN65974 firmware, 04B4:00F1, bulk IN 0x81); `apertus-open-source-cinema/ft60x-rs` and
-`lambdaconcept/ft60x_driver` (0403:601F, session commands on 0x01, stream on 0x82). Both ids are shared by unrelated
-gear, so the product string must fit too.
+`lambdaconcept/ft60x_driver` (0403:601F, session commands on 0x01, stream on 0x82). Unrelated devices share both ids, so
+the product string must match too.
 """
 
 import struct
@@ -51,7 +51,9 @@ class SensorIdentity:
 
 
 def identify(control: ControlChannel, name: str) -> SensorIdentity:
-    """Read the identity registers. `DeviceNotFound`: it does not speak SPB1. `DeviceFault`: another version."""
+    """Read the identity registers. Raises `DeviceNotFound` if the device does not speak SPB1, `DeviceFault` for another
+    version.
+    """
     # A program that died may have left a run behind, which would drown the answers.
     control.forget_run()
     try:
@@ -100,7 +102,7 @@ _PATTERN_S = 1.0
 
 @dataclass(frozen=True, slots=True)
 class RunSetup:
-    """The registers of a run but for its length. Windows: None for full frames."""
+    """The registers of a run except for its length. Windows are None for full frames."""
 
     period_ticks: int
     exposure_ticks: int
@@ -136,13 +138,15 @@ class RunSetup:
 
 
 def write_length(control: ControlChannel, n_frames: int | None) -> None:
-    """Have the run end behind so many frames; None: at STOP."""
+    """Make the run end after `n_frames` frames; None: at STOP."""
     n = n_frames or 0
     control.write_all(((Register.N_FRAMES, n & 0xFFFFFFFF), (Register.N_FRAMES + 4, n >> 32)))
 
 
 def block_size(identity: SensorIdentity, width: int, block_frames: int, name: str) -> tuple[int, int]:
-    """Stride and frames of a block: as many as were asked for, or as many as fit. `LimitExceeded` where none does."""
+    """Stride and number of frames of a block: as many as requested, or as many as fit. Raises `LimitExceeded` if none
+    fits.
+    """
     height = identity.info.height
     try:
         n = min(block_frames, frames_per_block(identity.max_stride, width, height))
@@ -152,7 +156,7 @@ def block_size(identity: SensorIdentity, width: int, block_frames: int, name: st
 
 
 def require_windows(identity: SensorIdentity, window: WindowTable, name: str) -> None:
-    """`LimitExceeded` where the device moves no windows, or not so many."""
+    """Raises `LimitExceeded` if the device cannot move windows, or not that many."""
     if Feature.WINDOWS not in identity.features:
         raise LimitExceeded(f"{name}: its firmware moves no windows; ask for full frames or a lower frame_rate")
     entries = sum(len(x0) for x0 in window.x0)
@@ -166,7 +170,7 @@ def require_windows(identity: SensorIdentity, window: WindowTable, name: str) ->
 def require_order(
     control: ControlChannel, link: BulkLink, stream_in: int, identity: SensorIdentity, heartbeat_s: float
 ) -> None:
-    """Check a few frames of the test pattern: bits or rows in another order than SPB1's would go unnoticed (8.4, 6)."""
+    """Check a few frames of the test pattern. A wrong order of bits or rows would otherwise go unnoticed (8.4, 6)."""
     if Feature.TEST_PATTERN not in identity.features:
         return
     info, name, period = identity.info, link.label, identity.min_period_ticks
@@ -210,7 +214,9 @@ _CONFIG_REQUEST, _CONFIG_BYTES = 0xCF, 152
 
 @dataclass(frozen=True, slots=True)
 class Wiring:
-    """The endpoints of a USB chip. ack_in: a board without this one acknowledges in its stream."""
+    """The endpoints of a USB chip. ack_in: the endpoint of acknowledgements; None for a board that sends them in its
+    stream.
+    """
 
     usb: UsbId
     interfaces: tuple[int, ...]
@@ -221,7 +227,7 @@ class Wiring:
     """Whether the chip streams only within a session that is opened by commands."""
 
     def open_session(self, link: BulkLink) -> None:
-        """Clear what a session left that was not closed, then tell the FT601 to stream."""
+        """Clear what an unclosed session left behind, then tell the FT601 to stream."""
         if not self.has_session:
             return
         found = len(link.control_in(0xC0, _CONFIG_REQUEST, 1, 0, _CONFIG_BYTES, 1.0))
@@ -231,7 +237,7 @@ class Wiring:
             self._tell(link, command)
 
     def close_session(self, link: BulkLink) -> None:
-        """End the session: without it the FT601 answers nobody until it is plugged in anew."""
+        """End the session. Otherwise the FT601 answers nobody until it is plugged in again."""
         if self.has_session:
             for command in (_ABORT, _CLEAR):
                 self._tell(link, command)

@@ -1,7 +1,7 @@
-"""The control plane of an SPB1 device: commands, their acknowledgements, registers (docs/reference/spb1-usb.md).
+"""The control plane of an SPB1 device: commands, acknowledgements and registers (docs/reference/spb1-usb.md).
 
-A command is 16 bytes on a bulk OUT endpoint (docs/reference/spb1-usb.md), several may share a transfer. Every one is
-acknowledged with 16 bytes, in order: on an IN endpoint of their own, or as payload of control blocks in the stream.
+A command is 16 bytes on a bulk OUT endpoint; several may share a transfer. Each is acknowledged with 16 bytes, in
+order: on a separate IN endpoint, or as payload of control blocks in the stream.
 """
 
 import struct
@@ -35,7 +35,7 @@ TEXT_BYTES: Final = 64
 
 
 class Op(IntEnum):
-    """Operations that a command can ask for."""
+    """Operations of a command."""
 
     READ = 1
     WRITE = 2
@@ -80,7 +80,7 @@ class Feature(IntFlag):
 
 
 class Register(IntEnum):
-    """Addresses of 32-bit registers, in bytes. 64-bit values take two, the low half first."""
+    """Addresses of 32-bit registers, in bytes. A 64-bit value takes two, the low half first."""
 
     MAGIC = 0x0000
     PROTOCOL = 0x0004
@@ -154,7 +154,7 @@ class Ack(NamedTuple):
 
 
 def read_acks(data: bytes) -> list[Ack]:
-    """The acknowledgements in `data`, which is nothing else. `ProtocolError` where it is."""
+    """The acknowledgements in `data`. Raises `ProtocolError` if it holds anything else."""
     if len(data) % ACK.size:
         raise ProtocolError(f"{len(data)} bytes of acknowledgements, no multiple of {ACK.size}")
     acks = []
@@ -166,7 +166,7 @@ def read_acks(data: bytes) -> list[Ack]:
 
 
 def require_ok(label: str, command: Command, ack: Ack) -> None:
-    """`DeviceFault` where a command was refused."""
+    """Raises `DeviceFault` if the acknowledgement says that the command was refused."""
     if ack.status != AckStatus.OK:
         why, name = _REFUSALS.get(ack.status, f"answers status {ack.status}"), Op(command.op).name
         raise DeviceFault(f"{label}: {name} 0x{command.address:04x} = {command.value}: the device {why}")
@@ -207,9 +207,10 @@ TAP_PORT = "control"
 
 
 class ControlChannel:
-    """The control plane over a link. For one thread at a time. ack_in: None where acknowledgements come as blocks.
+    """The control plane over a link. For use by one thread at a time.
 
-    tap: told of commands and acknowledgements; what is left of a run in their way is not for it.
+    ack_in: the endpoint of acknowledgements, None if they come as blocks. tap: notes commands and acknowledgements, but
+    not what a run left in front of them.
     """
 
     def __init__(
@@ -227,12 +228,12 @@ class ControlChannel:
         """Called for each piece of a wait in vain, with its seconds."""
 
     def now_s(self) -> float:
-        """The time on the clock of its deadlines."""
+        """The present time on the clock used for deadlines."""
         return self._clock.now_ns() / NS_PER_S
 
     @property
     def has_acks(self) -> bool:
-        """Whether it can answer while a run streams."""
+        """Whether acknowledgements can be read while a run streams."""
         return self._ack_in is not None
 
     def read(self, register: int) -> int:
@@ -240,7 +241,7 @@ class ControlChannel:
         return self.read_all((register,))[0]
 
     def read_all(self, registers: Sequence[int]) -> list[int]:
-        """The values of several registers, each asked for twice: they have no checksum. `ProtocolError`."""
+        """The values of several registers. Each is read twice, as they have no checksum. May raise `ProtocolError`."""
         for _ in range(_TRIES):
             values = [ack.value for ack in self._ask([(Op.READ, register, 0) for register in (*registers, *registers)])]
             if values[: len(registers)] == values[len(registers) :]:
@@ -248,38 +249,38 @@ class ControlChannel:
         raise ProtocolError(f"{self._link.label}: two answers to the same question differ; check cable and firmware")
 
     def read64(self, register: int) -> int:
-        """A value of 64 bits."""
+        """The value of a 64-bit register."""
         low, high = self.read_all((register, register + 4))
         return low | high << 32
 
     def read_text(self, register: int, size: int) -> str:
-        """Zero-padded text."""
+        """The text in registers that hold it padded with zeros."""
         words = self.read_all([register + at for at in range(0, size, 4)])
         raw = b"".join(word.to_bytes(4, "little") for word in words)
         return raw.split(b"\0")[0].decode("utf-8", "replace").strip()
 
     def write_all(self, values: Iterable[tuple[int, int]]) -> None:
-        """Write several registers. `DeviceFault` where the device refuses one."""
+        """Write several registers. Raises `DeviceFault` if the device refuses one."""
         self._ask([(Op.WRITE, register, value) for register, value in values])
 
     def send(self, op: Op, value: int = 0) -> Ack:
-        """Send one command. `DeviceFault` where the device refuses it."""
+        """Send one command. Raises `DeviceFault` if the device refuses it."""
         return self._ask([(op, 0, value)])[0]
 
     def send_in_run(self, op: Op, value: int = 0) -> None:
-        """Send one command while the stream runs; its answer is waited for unless it comes in the stream."""
+        """Send one command while the stream runs. Waits for the answer unless it comes in the stream."""
         if self._ack_in is not None:
             self.send(op, value)
         else:
             self._tell([self._command(op, 0, value)])
 
     def forget_run(self) -> None:
-        """Abort a run, if there is one, and drop what it sent; the answer among it."""
+        """Abort a run, if there is one, and drop what it sent, including the answer to the abort."""
         self._tell([self._command(Op.ABORT, 0, 0)])
         self.drain()
 
     def drain(self) -> None:
-        """Drop what lies ready on the stream. `ProtocolError` where it does not end."""
+        """Read and drop what the stream still sends. Raises `ProtocolError` if it does not end."""
         ends_at = self.now_s() + _DRAIN_S
         while self.now_s() < ends_at:
             try:

@@ -1,8 +1,8 @@
 """The layout of an SPB1 block (SPB1 1.0 wire layout, docs/reference/spb1.md) and its checksum.
 
 Little-endian: header 96 B, records 16 B per frame, zeros to a multiple of 64, packed pixels, trailer 32 B, zeros to the
-stride. The checksum is CRC-32 as zlib defines it, from ISA-L where that is installed (12 GB/s on a core, zlib's own
-3.5). Both read large buffers without the interpreter's lock.
+stride. The checksum is CRC-32 as zlib defines it. It is computed by ISA-L if that is installed (12 GB/s on a core),
+else by zlib (3.5 GB/s). Both release the interpreter's lock for large buffers.
 """
 
 import struct
@@ -40,14 +40,14 @@ IDLE: Final = 0x7F
 
 @dataclass(frozen=True, slots=True)
 class BlockLayout:
-    """A block of `n_frames` windows of width x height pixels. Offsets and sizes in bytes."""
+    """A block of `n_frames` windows of width x height pixels. Offsets and sizes are in bytes."""
 
     n_frames: int
     width: int
     height: int
 
     def __post_init__(self) -> None:
-        """ValueError for sizes that the header's fields cannot say."""
+        """Raises ValueError for sizes that the header's fields cannot say."""
         if not 0 <= self.n_frames <= MAX_FRAMES:
             raise ValueError(f"{self.n_frames} frames in a block; SPB1 holds 0 to {MAX_FRAMES}")
         if not (1 <= self.width <= 0xFFFF and 1 <= self.height <= 0xFFFF):
@@ -55,12 +55,12 @@ class BlockLayout:
 
     @property
     def row_bytes(self) -> int:
-        """One packed row, padded to whole 64-bit words."""
+        """Bytes of one packed row, padded to whole 64-bit words."""
         return packed_row_bytes(self.width)
 
     @property
     def frame_bytes(self) -> int:
-        """The pixels of one frame."""
+        """Bytes of the pixels of one frame."""
         return self.height * self.row_bytes
 
     @property
@@ -70,12 +70,12 @@ class BlockLayout:
 
     @property
     def payload_bytes(self) -> int:
-        """Records, padding and pixels."""
+        """Bytes of records, padding and pixels together."""
         return self.pixels_offset - HEADER_BYTES + self.n_frames * self.frame_bytes
 
     @property
     def block_bytes(self) -> int:
-        """Header, payload and trailer."""
+        """Bytes of header, payload and trailer together."""
         return HEADER_BYTES + self.payload_bytes + TRAILER_BYTES
 
     @property
@@ -85,7 +85,7 @@ class BlockLayout:
 
 
 def frames_per_block(stride: int, width: int, height: int) -> int:
-    """Number of frames that fit into a stride. ValueError where the stride is bad or holds no frame."""
+    """Number of frames that fit into a stride. Raises ValueError if the stride is bad or holds no frame."""
     check_stride(stride)
     one = BlockLayout(1, width, height)
     room = stride - HEADER_BYTES - TRAILER_BYTES
@@ -98,9 +98,9 @@ def frames_per_block(stride: int, width: int, height: int) -> int:
 
 
 def block_views(buffer: NDArray[np.uint8], layout: BlockLayout) -> tuple[NDArray[np.void], NDArray[np.uint8]]:
-    """The places in `buffer` (uint8 (bytes,)) where a source writes: records (n,), bits (n, height, row bytes).
+    """The parts of `buffer` (uint8 (bytes,)) that a source fills: records (n,) and bits (n, height, row bytes).
 
-    Views, not copies. ValueError where the buffer is too short. Pad bits are for the source to clear.
+    They are views, not copies. The source must clear the pad bits. Raises ValueError if the buffer is too short.
     """
     if len(buffer) < layout.block_bytes:
         raise ValueError(f"a buffer of {len(buffer)} bytes for a block of {layout.block_bytes}")
@@ -110,7 +110,7 @@ def block_views(buffer: NDArray[np.uint8], layout: BlockLayout) -> tuple[NDArray
 def views_at(
     buffer: NDArray[np.uint8], layout: BlockLayout, records_offset: int, pixels_offset: int
 ) -> tuple[NDArray[np.void], NDArray[np.uint8]]:
-    """Records and bits at given offsets, which a header longer than ours moves."""
+    """Records and bits at given offsets, which differ from ours if a block's header is longer."""
     n = layout.n_frames
     records: NDArray[np.void] = buffer[records_offset : records_offset + n * FRAME_RECORD.itemsize].view(FRAME_RECORD)
     pixels = buffer[pixels_offset : pixels_offset + n * layout.frame_bytes]
@@ -118,13 +118,13 @@ def views_at(
 
 
 def check_stride(stride: int) -> None:
-    """ValueError unless `stride` is a positive multiple of `ALIGN`."""
+    """Raises ValueError unless `stride` is a positive multiple of `ALIGN`."""
     if stride < ALIGN or stride % ALIGN:
         raise ValueError(f"stride {stride} is no positive multiple of {ALIGN} bytes")
 
 
 def round_up(size: int, step: int) -> int:
-    """The smallest multiple of `step` not under `size`."""
+    """The smallest multiple of `step` that is not less than `size`."""
     return -(-size // step) * step
 
 

@@ -1,7 +1,7 @@
-"""Reading SPB1 blocks: one over the memory it lies in, or a stream of them, damage and all.
+"""Reading SPB1 blocks: a single one in its memory, or a stream of them that may be damaged.
 
-Header and trailer are always checked in full; the payload's CRC on request, since it reads every byte: at full rate
-that would cost a live path a good part of a core. Nothing damaged is passed on, nothing is passed over in silence.
+Header and trailer are always checked in full. The payload's CRC is checked on request, since it reads every byte, which
+at full rate would cost a live stream much of a core. No damaged block is passed on, and nothing is skipped silently.
 """
 
 from collections.abc import Iterator
@@ -57,7 +57,7 @@ _BITS_REVERSED: Final = np.packbits(np.unpackbits(np.arange(256, dtype=np.uint8)
 
 @dataclass(frozen=True, slots=True)
 class HeaderFields:
-    """A header whose magic and CRC are right, with everything that places the parts. Offsets and sizes in bytes."""
+    """A header whose magic and CRC are right, with the places of the block's parts. Offsets and sizes are in bytes."""
 
     block: BlockHeader
     version: int
@@ -69,12 +69,12 @@ class HeaderFields:
 
     @property
     def trailer_offset(self) -> int:
-        """Directly behind the payload."""
+        """Offset of the trailer, which follows the payload directly."""
         return self.header_bytes + self.payload_bytes
 
     @property
     def block_bytes(self) -> int:
-        """Header, payload and trailer."""
+        """Bytes of header, payload and trailer together."""
         return self.trailer_offset + TRAILER_BYTES
 
     @property
@@ -84,17 +84,17 @@ class HeaderFields:
 
 
 def parse_block(buffer: NDArray[np.uint8], *, check_payload: bool) -> FrameBlock:
-    """The block at the start of `buffer` (uint8 (bytes,), contiguous, may be longer), over the same memory.
+    """The block at the start of `buffer` (uint8 (bytes,), contiguous, may be longer), as views of the same memory.
 
-    `CorruptBlock` where anything is wrong with it; `UnsupportedBlock` where it is sound but sparse, summed, skipping,
-    of another major version or without frames. A truncated block gives its whole frames. Blocks sent with the least
-    significant bit first are copied, and delivered like all others, without the LSB_FIRST flag.
+    Raises `CorruptBlock` if anything is wrong with it, `UnsupportedBlock` if it is sound but sparse, summed, skipping,
+    of another major version or without frames. A truncated block gives its complete frames. Blocks sent with the least
+    significant bit first are copied and delivered like all others, without the LSB_FIRST flag.
     """
     return read_frames(buffer, read_header(buffer), check_payload=check_payload)
 
 
 def read_header(buffer: NDArray[np.uint8]) -> HeaderFields:
-    """The header at the start of `buffer`. `CorruptBlock` where magic or CRC are wrong, nothing else is judged."""
+    """The header at the start of `buffer`. Raises `CorruptBlock` if magic or CRC are wrong; nothing else is checked."""
     if len(buffer) < HEADER_BYTES:
         raise CorruptBlock(f"{len(buffer)} bytes left, too few for a block header of {HEADER_BYTES}")
     raw = buffer.data[:HEADER_BYTES]
@@ -115,7 +115,7 @@ def read_header(buffer: NDArray[np.uint8]) -> HeaderFields:
 
 
 def read_frames(buffer: NDArray[np.uint8], fields: HeaderFields, *, check_payload: bool) -> FrameBlock:
-    """The frames behind a header that was read. Errors as of `parse_block`."""
+    """The frames that follow a header already read. Errors as in `parse_block`."""
     _refuse_unsupported(fields)
     layout = _checked_layout(fields, len(buffer))
     status, valid_bytes, payload_crc = _read_trailer(buffer, fields)
@@ -131,7 +131,7 @@ def read_frames(buffer: NDArray[np.uint8], fields: HeaderFields, *, check_payloa
 
 
 def read_control(buffer: NDArray[np.uint8], fields: HeaderFields) -> bytes:
-    """The payload of a control block whose header was read, its CRC checked. `CorruptBlock` where it is damaged."""
+    """The payload of a control block whose header was read. Raises `CorruptBlock` if its CRC is wrong."""
     if fields.block_bytes > len(buffer):
         raise CorruptBlock(f"control block cut off: {len(buffer)} of {fields.block_bytes} bytes")
     _, valid_bytes, payload_crc = _read_trailer(buffer, fields)
@@ -220,9 +220,9 @@ _SEARCH_BYTES = 16 * 2**20
 
 @dataclass(frozen=True, slots=True)
 class Damage:
-    """A piece of a stream that gave no block: where, how much (0 where only padding is missing) and why.
+    """A piece of a stream that gave no block: where it is, its length (0 if only padding is missing) and why.
 
-    unsupported: a header with the right CRC tells of a block that this reader does not take.
+    unsupported: whether a header with the right CRC describes a block that this reader does not take.
     """
 
     offset: int
@@ -232,12 +232,12 @@ class Damage:
 
 
 def walk_blocks(buffer: NDArray[np.uint8], stride: int | None, *, check_payload: bool) -> Iterator[FrameBlock | Damage]:
-    """Blocks and damage of `buffer` (uint8 (bytes,), contiguous) in order, the blocks over the same memory.
+    """Blocks and damage of `buffer` (uint8 (bytes,), contiguous) in order, the blocks as views of the same memory.
 
-    stride: bytes from block to block; None where it is not known or changes: each block ends then at its own size and
-    zeros up to the next one are padding. After damage the next header with the right CRC on a multiple of `ALIGN`
-    counts. A block whose number does not rise within its run was sent or written twice: damage too. Control blocks
-    are passed over. `UnsupportedBlock` where the stream is of another sort than this reader takes.
+    stride: bytes from block to block. None if it is unknown or changes: then each block ends at its own size, and zeros
+    up to the next one are padding. After damage, reading resumes at the next header with the right CRC on a multiple of
+    `ALIGN`. A block whose number does not rise within its run was sent or written twice and counts as damage. Control
+    blocks are skipped. Raises `UnsupportedBlock` if the stream is of a kind this reader does not take.
     """
     last: FrameBlock | None = None
     for item in walk_placed(buffer, stride, check_payload=check_payload):
@@ -257,7 +257,7 @@ def walk_blocks(buffer: NDArray[np.uint8], stride: int | None, *, check_payload:
 
 @dataclass(frozen=True, slots=True)
 class Placed:
-    """A sound block and where it lies: from byte `offset` on, `length` bytes, the next one at `end` or behind it."""
+    """A sound block and its place: `length` bytes from byte `offset` on, the next block at `end` or later."""
 
     offset: int
     length: int
@@ -266,7 +266,7 @@ class Placed:
 
 
 def walk_placed(buffer: NDArray[np.uint8], stride: int | None, *, check_payload: bool) -> Iterator[Placed | Damage]:
-    """The blocks with their places, in whatever order they come, even twice; what is of another sort is damage."""
+    """The blocks with their places, in any order and even twice. Blocks of an unsupported kind are damage."""
     if stride is not None:
         check_stride(stride)
     offset = 0

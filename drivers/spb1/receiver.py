@@ -1,9 +1,9 @@
-"""The receiving end of a live SPB1 stream (docs/reference/spb1-usb.md): queued reads that point into ring slots.
+"""The receiving end of a live SPB1 stream (docs/reference/spb1-usb.md): queued reads straight into ring slots.
 
-Reads of one stride each are kept in flight, into slots claimed in order. A block is taken where it lies, or refused and
-counted; after damage the next sound header on a multiple of 1024 bytes tells where blocks begin, and one short read
-restores the step. Where the ring has no free slot, reads go on into spare memory so that the device's FIFO does not
-starve: what comes there is copied where a slot came free meanwhile, else dropped and counted.
+Reads of one stride each are kept in flight, into slots claimed in order. A block is used where it lies, or refused and
+counted. After damage, the next sound header on a multiple of 1024 bytes tells where blocks begin, and one short read
+brings the reads back in step. If the ring has no free slot, reads go on into spare memory so that the device's FIFO
+does not overflow. Such a block is copied into a slot if one has become free meanwhile, else dropped and counted.
 """
 
 import logging
@@ -60,7 +60,9 @@ class Took(Enum):
 
 @dataclass(slots=True)
 class _Item:
-    """A read in flight. slot: into the ring's oldest claimed slot but those of the items before; use: of the data."""
+    """A read in flight. slot: whether it goes into a claimed ring slot, in the order of claiming; use: whether its data
+    is used.
+    """
 
     buffer: Buffer
     slot: bool
@@ -68,7 +70,7 @@ class _Item:
 
 
 class BlockReceiver:
-    """The stream of one run. For one thread."""
+    """The stream of one run. For use by one thread at a time."""
 
     def __init__(self, link: BulkLink, endpoint: int, armed: Armed, label: str) -> None:
         self.delivered = 0
@@ -100,7 +102,7 @@ class BlockReceiver:
         self._row_px = 8 * packed_row_bytes(armed.sensor_width)
 
     def take(self, ring: BlockRing, timeout_s: float) -> Took:
-        """Wait for the next read and deal with it. May raise what `ring.mark_overflow` raises, frames counted."""
+        """Wait for the next read and process it. May raise what `ring.mark_overflow` raises, after counting the frames."""
         self._ring = ring
         self._top_up(ring)
         reaped = self._link.reap(timeout_s)
@@ -113,7 +115,7 @@ class BlockReceiver:
         return self._judge(item, item.buffer[: reaped[1]])
 
     def drain(self, timeout_s: float) -> bool:
-        """Read on without publishing, for at most one wait of `timeout_s`; True once the last block came."""
+        """Read on without publishing, for at most one wait of `timeout_s`. True once the last block has come."""
         if not self._items:
             self._submit(self._spare(), slot=False)
         reaped = self._link.reap(timeout_s)
@@ -129,7 +131,7 @@ class BlockReceiver:
         return self.ended
 
     def close(self) -> None:
-        """Give up the reads in flight and give their slots back."""
+        """Cancel the reads in flight and give their slots back."""
         self._link.cancel()
         if self._held is not None:
             self._items.append(_Item(self._held, slot=True))
@@ -198,7 +200,7 @@ class BlockReceiver:
         return took
 
     def _require_armed(self, fields: HeaderFields) -> None:
-        """CorruptBlock for a sound block that cannot be the next of this run."""
+        """Raises CorruptBlock for a sound block that cannot be the next of this run."""
         block, armed = fields.block, self._armed
         found = (block.width, block.height, block.sensor_width, block.sensor_height)
         if found != (armed.width, armed.height, armed.sensor_width, armed.sensor_height):
@@ -212,7 +214,7 @@ class BlockReceiver:
             raise CorruptBlock(f"block {block.block_seq} reaches beyond the {armed.n_frames} frames of the run")
 
     def _require_windows(self, block: FrameBlock) -> None:
-        """CorruptBlock where a window lies off the words or beyond the row: what counts bits must not trip over it."""
+        """Raises CorruptBlock if a window lies off the words or beyond the row: what counts bits must not trip over it."""
         if block.n_frames == 0:
             return
         x0 = block.records["x0"]

@@ -1,4 +1,4 @@
-"""Writing SPB1 blocks: sealed round records and pixels that are in place already, or in parts for a file."""
+"""Writing SPB1 blocks, either around records and pixels that are already in place or in parts for a file."""
 
 import struct
 from typing import Any
@@ -33,11 +33,12 @@ def seal_block(
     status: int = BlockStatus.OK,
     payload_crc: bool,
 ) -> FrameBlock:
-    """Write all but records and pixels, which `block_views` gave out to fill; the block over the same memory.
+    """Write everything except records and pixels, which the source filled in through `block_views`; returns the block.
 
-    buffer: uint8 (stride,), contiguous; zeroed behind the trailer. payload_crc: compute the payload's CRC, which reads
-    every byte; else the trailer says 'not computed'. Copies nothing.
-    ValueError where the header contradicts the layout or has no packed SPB1 1.0 form.
+    The block is a view of `buffer`, uint8 (stride,), contiguous; nothing is copied. The bytes after the trailer are
+    zeroed.
+    payload_crc: whether to compute the payload's CRC, which reads every byte; else the trailer says 'not computed'.
+    Raises ValueError if the header contradicts the layout or has no packed SPB1 1.0 form.
     """
     _check(header, layout)
     records, bits = block_views(buffer, layout)
@@ -51,7 +52,7 @@ def seal_block(
 
 
 def seal_control(buffer: NDArray[np.uint8], payload_type: int, run_id: int, payload: bytes) -> None:
-    """Write a control block (`REGISTER_ACK`, `IDLE`) without frames. buffer: uint8 (stride,), all of it is written."""
+    """Write a control block (`REGISTER_ACK`, `IDLE`), which has no frames. buffer: uint8 (stride,), written completely."""
     end = HEADER_BYTES + len(payload)
     raw = buffer.data
     sizes = len(payload), round_up(end, PIXELS_ALIGN)
@@ -65,10 +66,10 @@ def seal_control(buffer: NDArray[np.uint8], payload_type: int, run_id: int, payl
 
 
 def block_parts(block: FrameBlock) -> tuple[memoryview, ...]:
-    """The bytes of a block in order, with the payload's CRC and zeros to the next multiple of `ALIGN`, for a file.
+    """The bytes of a block in order, for a file, with the payload's CRC and zeros up to the next multiple of `ALIGN`.
 
-    Records and pixels are views of the block's memory, wherever it lies, and as valid as that. Reads every byte,
-    without the interpreter's lock. ValueError as of `seal_block`.
+    Records and pixels are views of the block's memory and valid as long as that is. Reads every byte, without the
+    interpreter's lock. Raises ValueError as `seal_block` does.
     """
     header = block.header
     layout = BlockLayout(block.n_frames, header.width, header.height)

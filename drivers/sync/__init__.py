@@ -1,1 +1,1 @@
-"""Pulse generators that play gate and markers: the Prawn DO."""
+"""Pulse generators that play gate and markers: the PrawnDO."""

@@ -1,13 +1,13 @@
 """PrawnDO, a pulse generator on a Raspberry Pi Pico: sixteen outputs, 10 ns steps, a trigger, text over USB serial.
 
-Facts: docs/reference/hardware.md; from `prawn_do/prawn_do.{c,pio}` of labscript-suite/prawn_digital_output 3fecbdd
+Facts: docs/reference/hardware.md, from `prawn_do/prawn_do.{c,pio}` of labscript-suite/prawn_digital_output 3fecbdd
 (BSD). Outputs (docs/reference/hardware.md, Wiring and timing): GPIO0 triggers the SPAD, GPIO1 is the laser's gate,
 GPIO2 marks records.
 
-The firmware has no loops and no watchdog. So programs are written out in full and end on two words that hold everything
-low, whatever happens to the host. It cannot read its pins while a program runs, nor tell a wait from play. The trigger
-is a level, so that a wait passes at once while it is high: that is how a held pulse looks at the scan marker. Pulses
-that the board would play otherwise than written are refused.
+The firmware has neither loops nor a watchdog. So programs are written out in full and end with two words that hold
+everything low, whatever happens to the host. The firmware cannot read its pins while a program runs, nor report whether
+it waits or plays. The trigger is a level, so a wait passes at once while it is high; a held pulse checks the scan
+marker in this way. Pulses that the board would play differently from what was written are refused.
 """
 
 import logging
@@ -47,7 +47,9 @@ class ProgramLimits:
 
 
 def compile_program(pulses: Sequence[Pulse], repeats: int, board: ProgramLimits) -> NDArray[np.void]:
-    """The words of the whole program, repeats written out and the end with all outputs low. `LimitExceeded`."""
+    """The words of the whole program, with repeats written out and an end with all outputs low. May raise
+    `LimitExceeded`.
+    """
     _check_waits(_words(pulses, board), repeats, board)
     period = _words(sliced(pulses), board)
     # A wait beside the end's own zeros would be the end, on that wait's outputs: a shortest word parts them.
@@ -62,7 +64,7 @@ def compile_program(pulses: Sequence[Pulse], repeats: int, board: ProgramLimits)
 
 
 def most_repeats(pulses: Sequence[Pulse], board: ProgramLimits) -> int:
-    """Number of times a period fits into the board's memory beside the words at the end."""
+    """Number of periods that fit into the board's memory beside the words at the end."""
     return (board.max_words - 3) // len(sliced(pulses))
 
 
@@ -139,7 +141,7 @@ class PrawnDoConfig(KindConfig):
 
 
 class PrawnDo(SyncSource):
-    """A PrawnDO board. Opening it takes all outputs low first, whatever the board was doing."""
+    """A PrawnDO board. Opening it first takes all outputs low, whatever the board was doing."""
 
     def __init__(self, config: PrawnDoConfig, surroundings: Surroundings, timing: PrawnDoTiming = USUAL_TIMING) -> None:
         super().__init__("PrawnDO")
@@ -166,16 +168,16 @@ class PrawnDo(SyncSource):
 
     @property
     def resolution_s(self) -> float:
-        """One cycle of the clock: 10 ns on the board's own."""
+        """One cycle of the clock: 10 ns with the board's own clock."""
         return 1 / self._board.clock_hz
 
     @property
     def port_lost(self) -> bool:
-        """Whether the port is gone, told without a word on the wire. Any thread."""
+        """Whether the port is gone, found out without sending anything. May be called from any thread."""
         return self._line.port_lost
 
     def most_repeats(self, pulses: Sequence[Pulse]) -> int:
-        """The number of times `pulses` fit into the board's memory: there are no loops."""
+        """Number of times that `pulses` fit into the board's memory, as the firmware has no loops."""
         return most_repeats(pulses, self._board)
 
     def _do_program(self, pulses: Sequence[Pulse], repeats: int) -> None:
@@ -217,7 +219,7 @@ class PrawnDo(SyncSource):
         self._line.close()
 
     def _identify(self) -> tuple[str, int]:
-        """Firmware, and words that the board holds; ProtocolError where its firmware is too old."""
+        """Firmware, and words that the board holds; raises ProtocolError if its firmware is too old."""
         version = "".join(self._line.transact("ver")).removeprefix("Version: ")
         try:
             numbers = tuple(int(part) for part in version.split(".")[:2])

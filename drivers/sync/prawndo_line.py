@@ -1,8 +1,9 @@
-"""Commands and answers of a PrawnDO on its serial line, and the way to low outputs through whatever is under way.
+"""Commands and answers of a PrawnDO on its serial line, and how its outputs are taken low whatever is under way.
 
-The firmware frames nothing (docs/reference/hardware.md). So every command goes between two lines of nonsense that
-differ each time and that the firmware repeats in its complaint: an answer can be told from one that came late, twice or
-never. What decides about light is asked twice. Lowering the outputs overtakes all other commands.
+The firmware does not mark where an answer begins or ends (docs/reference/hardware.md). So every command is sent between
+two lines of nonsense, new each time, which the firmware repeats in its complaint. In this way an answer that is late,
+repeated or missing is recognised. Answers on which light depends are asked for twice. Taking the outputs low overtakes
+all other commands.
 """
 
 import logging
@@ -35,7 +36,7 @@ _SLICE_S = 0.02
 
 @dataclass(frozen=True, slots=True)
 class PrawnDoTiming:
-    """Deadlines of the line. Over USB a reply takes 1 ms; the rest is for a loaded host."""
+    """Deadlines of the line. A reply over USB takes 1 ms; the rest is a margin for a busy host."""
 
     reply_s: float = 0.5
     """Deadline for a reply."""
@@ -51,7 +52,7 @@ USUAL_TIMING = PrawnDoTiming()
 
 
 class PrawnDoLine:
-    """Asks and tells, one command at a time, from any thread. Owns the port."""
+    """Sends commands and queries, one at a time, from any thread. Owns the port."""
 
     def __init__(self, name: str, port: SerialPort, timing: PrawnDoTiming) -> None:
         self._name = name
@@ -69,7 +70,7 @@ class PrawnDoLine:
 
     @property
     def port_lost(self) -> bool:
-        """Whether the port has hung up. Any thread."""
+        """Whether the port has hung up. May be called from any thread."""
         return self._port.lost
 
     def close(self) -> None:
@@ -77,9 +78,10 @@ class PrawnDoLine:
         self._port.close()
 
     def connect(self, most_words: int) -> None:
-        """Take all outputs low, before anything else is asked, whatever state a former host left the board in.
+        """Take all outputs low before anything else is asked, whatever state an earlier host left the board in.
 
-        most_words: of any board. `ProtocolError` where something else answers, `DeviceTimeout` where nothing does.
+        most_words: the largest memory of any board, in words. Raises `ProtocolError` if something else answers,
+        `DeviceTimeout` if nothing does.
         """
         try:
             self.lower()
@@ -92,9 +94,9 @@ class PrawnDoLine:
             self._free_wedged(most_words)
 
     def transact(self, command: str, deadline_s: float | None = None, *, urgent: bool = False) -> list[str]:
-        """Send a command; returns the lines of its answer, without blank ones.
+        """Send a command; returns the lines of its answer without blank ones.
 
-        urgent: it does not give way to low outputs, as it is on the way to them.
+        urgent: whether the command is part of taking the outputs low, for which all others give way.
         """
         deadline_s = self._timing.reply_s if deadline_s is None else deadline_s
         with self.lock:
@@ -104,13 +106,13 @@ class PrawnDoLine:
             return self._until(lambda lines: bool(lines) and after in lines[-1], before, deadline_s, urgent)[:-1]
 
     def command(self, command: str) -> None:
-        """Send a command that answers `ok`. `DeviceFault` for any other answer."""
+        """Send a command that is answered with `ok`. Raises `DeviceFault` for any other answer."""
         lines = self.transact(command)
         if lines != ["ok"]:
             raise DeviceFault(f"{self._name}: {command} was answered {lines}, not ok")
 
     def run_status(self, deadline_s: float | None = None, *, urgent: bool = False) -> tuple[int, bool]:
-        """`run-status`, and whether the external clock is in use."""
+        """The number of `run-status`, and whether the external clock is in use."""
 
         def parse(line: str) -> tuple[int, bool]:
             run, clock = (part.split(":") for part in line.split(" "))
@@ -121,11 +123,11 @@ class PrawnDoLine:
         return self._ask_twice("sts", parse, deadline_s, urgent)
 
     def pins(self, deadline_s: float | None = None, *, urgent: bool = False) -> int:
-        """Levels of the outputs; only in a state of `IDLE`."""
+        """Levels of the outputs. They can be read only in state `IDLE`."""
         return self._ask_twice("gto", lambda line: int(line, 16), deadline_s, urgent)
 
     def load(self, payload: bytes) -> None:
-        """Replace the program by these words of six bytes. `DeviceFault` for any answer but `ok` (pitfall 2)."""
+        """Replace the program by these six-byte words. Raises `DeviceFault` for any answer but `ok` (pitfall 2)."""
         with self.lock:
             before, after = self._token(), self._token()
             self._pay_debt()
@@ -146,8 +148,8 @@ class PrawnDoLine:
         """End the program and take all outputs low; returns as soon as they read back low.
 
         `abt` alone leaves the outputs as they are, and `man` is executed only once the state machine has stopped
-        (pitfall 3). Both are sent before anybody waits for anything; then it is checked and said again until it is so.
-        `DeviceTimeout` where the board does not answer: whether the gate is low is then unknown.
+        (pitfall 3). Both are sent at once; then the outputs are checked and the commands repeated until they are low.
+        Raises `DeviceTimeout` if the board does not answer; whether the gate is low is then unknown.
         """
         self._gate_first.set()
         try:

@@ -1,1 +1,1 @@
-"""Transports of bytes between a driver and its device: serial ports, USB and TCP, with deadlines and our own errors."""
+"""Byte transports between a driver and its device: serial ports, USB and TCP, with deadlines and this project's errors."""

@@ -1,7 +1,8 @@
-"""A USB device that streams: commands and answers, and reads that are queued so that its FIFO never starves.
+"""A USB device that streams: commands, answers, and reads that are queued so that its FIFO never overflows.
 
-tests/benchmarks/spb_usb.py compares the two links. Both have a deadline on every call and our errors. A queue belongs
-to one thread at a time. Buffers are whole packets long and stay the caller's until `reap` or `cancel` gives them back.
+tests/benchmarks/spb_usb.py compares the two links. Both have a deadline on every call and raise this project's errors.
+A queue belongs to one thread at a time. Buffers are whole packets long and must be left alone until `reap` or `cancel`
+gives them back.
 """
 
 import array
@@ -40,7 +41,7 @@ _ERRNO = {
 
 
 class PlainLink(UsbDevice):
-    """A streaming USB device read through pyusb, one piece after the other, with a gap between two."""
+    """A streaming USB device read through pyusb, one piece after the other, with a gap between them."""
 
     def __init__(self, listing: UsbListing, label: str, interfaces: tuple[int, ...]) -> None:
         """Open the device of a listing and claim its interfaces."""
@@ -50,12 +51,12 @@ class PlainLink(UsbDevice):
         self._got = 0
 
     def submit(self, endpoint: int, buffer: Buffer) -> bool:
-        """Remember the buffer for `reap`."""
+        """Keep the buffer for `reap`."""
         self._queue.append((endpoint, buffer))
         return True
 
     def reap(self, timeout_s: float) -> tuple[Buffer, int] | None:
-        """Read the oldest queued buffer now. What a time-out interrupts goes on with the next call."""
+        """Read the oldest queued buffer now. A read interrupted by the timeout continues in the next call."""
         if not self._queue:
             return None
         endpoint, buffer = self._queue[0]
@@ -76,7 +77,7 @@ class PlainLink(UsbDevice):
         return buffer, got
 
     def cancel(self) -> None:
-        """Forget what is queued."""
+        """Forget all queued buffers."""
         self._queue.clear()
         self._got = 0
 
@@ -84,7 +85,7 @@ class PlainLink(UsbDevice):
 class QueuedLink:
     """A streaming USB device with many reads in flight, which libusb writes straight into the caller's memory.
 
-    Module `usb1` of package libusb1; its events are handled inside `reap`, on the caller's thread.
+    Uses module `usb1` of package libusb1. Its events are handled inside `reap`, on the caller's thread.
     """
 
     def __init__(self, listing: UsbListing, label: str, interfaces: tuple[int, ...]) -> None:
@@ -112,16 +113,16 @@ class QueuedLink:
             raise
 
     def write(self, endpoint: int, data: bytes, timeout_s: float) -> None:
-        """One OUT transfer. `DeviceTimeout` where not all of it went out."""
+        """Make one OUT transfer. Raises `DeviceTimeout` if not all of it went out."""
         with self._translated(endpoint, timeout_s):
             sent = self._handle.bulkWrite(endpoint, data, milliseconds(timeout_s))
         if sent != len(data):
             raise DeviceTimeout(f"{self.label}: {sent} of {len(data)} bytes went out within {timeout_s:g} s")
 
     def read(self, endpoint: int, size: int, timeout_s: float) -> bytes:
-        """One IN transfer of at most `size` bytes, whole packets. `DeviceTimeout` where nothing came.
+        """Make one IN transfer of at most `size` bytes, in whole packets. Raises `DeviceTimeout` if nothing came.
 
-        Bytes that came before a time-out are kept: libusb1's own read loses them (its issue 42).
+        Bytes that came before a timeout are kept; libusb1's own read loses them (its issue 42).
         """
         buffer = np.zeros(size, np.uint8)
         read = _Read(self._transfer(), buffer)
@@ -139,12 +140,12 @@ class QueuedLink:
     def control_in(
         self, request_type: int, request: int, value: int, index: int, length: int, timeout_s: float
     ) -> bytes:
-        """A control transfer that reads."""
+        """Make a control transfer that reads."""
         with self._translated(0, timeout_s):
             return bytes(self._handle.controlRead(request_type, request, value, index, length, milliseconds(timeout_s)))
 
     def submit(self, endpoint: int, buffer: Buffer) -> bool:
-        """Queue a read of the whole buffer; False where the kernel takes no more and at least one is in flight."""
+        """Queue a read of the whole buffer. False if the kernel takes no more and at least one is in flight."""
         read = _Read(self._transfer(), buffer)
         with self._translated(endpoint):
             try:
@@ -159,7 +160,9 @@ class QueuedLink:
         return True
 
     def reap(self, timeout_s: float) -> tuple[Buffer, int] | None:
-        """The oldest queued read once it is over, and its bytes; None where it is not within the time."""
+        """The buffer of the oldest queued read and its number of bytes, once it is complete; None if the time is over
+        first.
+        """
         if not self._queue or not self._wait(self._queue[0], timeout_s):
             return None
         read = self._queue.popleft()
@@ -169,7 +172,7 @@ class QueuedLink:
         return read.buffer, read.got
 
     def cancel(self) -> None:
-        """End all reads and drop what they hold; waits until the kernel has let go of their memory. Never raises."""
+        """End all reads and drop what they hold; waits until the kernel has released their memory. Never raises."""
         for read in reversed(self._queue):  # the newest first, so that none of them begins meanwhile
             with suppress(self._usb1.USBError):
                 read.transfer.cancel()
@@ -184,7 +187,7 @@ class QueuedLink:
         self._queue.clear()
 
     def close(self) -> None:
-        """Cancel and give the device back; again: nothing happens."""
+        """Cancel all reads and give the device back; a second call does nothing."""
         if self._handle is not None:
             self.cancel()
             for transfer in self._spare:

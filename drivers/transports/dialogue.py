@@ -1,12 +1,13 @@
-"""A dialogue with a device that answers one command at a time: paced, checked, and back in step after a lost reply.
+"""A dialogue with a device that answers one command at a time: paced, checked, and synchronised again after a lost
+reply.
 
-Nothing on a laser's line checks or numbers a reply (docs/reference/hardware.md, lasers): one that comes late is taken
-for the answer to the next command. So the input is dropped before each command, and each reply must have the form that
-its command calls for. After one that has not, or none at all, the line is drained and a question asked whose answer is
-known. The form of a make's commands and replies is its `Framing`.
+Nothing on a laser's line checks or numbers a reply (docs/reference/hardware.md, lasers), so a late one would be taken
+for the answer to the next command. Therefore the input is dropped before each command, and each reply must have the
+form that its command calls for. If it has not, or if none comes, the line is drained and a query is sent whose answer
+is known. The form of a make's commands and replies is its `Framing`.
 
-Threads take turns by a `FairLock`: a thread that polls a slow device takes its lock again as soon as it gave it back,
-and with a plain lock the thread that wants to switch the laser off may wait for ever.
+Threads take turns through a `FairLock`. A thread that polls a slow device takes its lock again as soon as it has
+released it; with a plain lock the thread that wants to switch the laser off could wait for ever.
 """
 
 import re
@@ -21,7 +22,7 @@ from drivers.transports.serial_port import SerialPort
 
 
 class FairLock:
-    """A lock for `with`, not re-entrant: whoever waits gets it before the thread that had it last."""
+    """A lock for `with`, not re-entrant. A waiting thread gets it before the thread that had it last."""
 
     def __init__(self) -> None:
         self._turn = threading.Lock()
@@ -47,7 +48,7 @@ _ATTEMPTS = 3
 
 @dataclass(frozen=True, slots=True)
 class LineTiming:
-    """Times of the line. The defaults suit a laser; tests with emulators run the same code faster."""
+    """Times of the line. The defaults suit a laser; tests with emulators run the same code with shorter ones."""
 
     gap_s: float = 0.0
     """Shortest time between a reply and the next command."""
@@ -60,7 +61,7 @@ class LineTiming:
 
 
 class CommandRefused(ProtocolError):  # noqa: N818 - named after what happened, as all device errors
-    """Raised by a command that this device does not know, or not in its present state."""
+    """Raised when the device does not know a command, or refuses it in its present state."""
 
 
 class Framing(Protocol):
@@ -68,7 +69,7 @@ class Framing(Protocol):
 
     @property
     def ping(self) -> str:
-        """A question that may be asked at any time."""
+        """A query that may be sent at any time."""
 
     def greets(self, reply: str) -> bool:
         """Whether `reply` answers the ping."""
@@ -77,14 +78,16 @@ class Framing(Protocol):
         """The bytes of a command."""
 
     def read(self, command: str, read_line: Callable[[], str]) -> str:
-        """The reply to a command, from as many lines as it has; "" where they do not go together."""
+        """The reply to a command, read with as many calls of `read_line` as it has lines; "" if the lines do not belong
+        together.
+        """
 
     def refusal(self, reply: str) -> str | None:
-        """The reason for which `reply` refuses its command; None: it does not."""
+        """The reason for which `reply` refuses its command; None if it does not."""
 
 
 class Dialogue:
-    """Asks and tells, one command at a time, from any thread. Owns the port."""
+    """Sends commands and queries, one at a time, from any thread. Owns the port."""
 
     def __init__(self, name: str, port: SerialPort, framing: Framing, clock: Clock, timing: LineTiming) -> None:
         self.name = name
@@ -96,17 +99,18 @@ class Dialogue:
         self._quiet_since_ns = clock.now_ns()
 
     def connect(self) -> None:
-        """Get into step with the device. `DeviceTimeout` or `ProtocolError`: nothing of this make answers.
+        """Synchronise with the device. Raises `DeviceTimeout` or `ProtocolError` if nothing of this make answers.
 
-        The port was just opened, so that nothing is owed: the line need not be quiet for as long as after a fault.
+        The port was just opened, so no reply is outstanding and the line need not be quiet for as long as after a
+        fault.
         """
         with self._lock:
             self._resync(self._timing.quiet_s / 3)
 
     def tell(self, command: str) -> None:
-        """Have something done. `CommandRefused`, `DeviceTimeout`, `ProtocolError`, `DeviceDisconnected`.
+        """Send a command. May raise `CommandRefused`, `DeviceTimeout`, `ProtocolError` or `DeviceDisconnected`.
 
-        A command whose reply was lost is sent again: all commands of the drivers may come twice.
+        If the reply is lost, the command is sent again; all commands of the drivers may be repeated.
         """
         self.ask(command, _DONE)
 
@@ -131,15 +135,15 @@ class Dialogue:
             raise ProtocolError(f"{self.name} answered {command!r} with {reply[:40]!r}; check its cable and firmware")
 
     def ask_flag(self, command: str) -> bool:
-        """A reply of 0 or 1."""
+        """The reply to a query that is answered with 0 or 1."""
         return self.ask(command, FLAG) == "1"
 
     def ask_number(self, command: str) -> float:
-        """A reply that is a number."""
+        """The reply to a query that is answered with a number."""
         return float(self.ask(command, NUMBER))
 
     def ask_surely(self, command: str, form: re.Pattern[str]) -> str:
-        """Ask until two replies in a row agree: nothing else guards an answer that is kept against a flipped bit."""
+        """Ask until two replies in a row agree. Nothing else protects an answer that is kept against a flipped bit."""
         last = self.ask(command, form)
         for _ in range(_ATTEMPTS):
             reply = self.ask(command, form)
@@ -149,7 +153,9 @@ class Dialogue:
         raise ProtocolError(f"{self.name} answers {command!r} differently each time; check its cable")
 
     def tell_and_check(self, command: str, query: str, form: re.Pattern[str], wanted: Callable[[str], bool]) -> None:
-        """Set something and read it back, which alone counts. `DeviceFault` where it reads back as something else."""
+        """Set a value and read it back; only what reads back counts. Raises `DeviceFault` if it reads back as something
+        else.
+        """
         reply = ""
         for _ in range(_ATTEMPTS):  # a bit may flip in the answer as well as in the command
             refused: CommandRefused | None = None
@@ -166,7 +172,7 @@ class Dialogue:
 
     @property
     def port_lost(self) -> bool:
-        """Whether the port has hung up. Any thread."""
+        """Whether the port has hung up. May be called from any thread."""
         return self._port.lost
 
     def close(self) -> None:

@@ -16,7 +16,7 @@ EMULATED_PREFIX = "emulated:"
 
 @dataclass(frozen=True, slots=True)
 class Endpoint:
-    """An address that a transport opens."""
+    """An address that a transport can open."""
 
     address: str
     usb_backend: object | None = None
@@ -27,14 +27,15 @@ class Endpoint:
 
 
 def one_line(error: Exception) -> str:
-    """The text of another library's error without its line ends."""
+    """The text of another library's error as a single line."""
     return " ".join(str(error).split())
 
 
 def resolve(port: str, ports: Mapping[str, Endpoint]) -> Endpoint:
-    """The endpoint that a config's `port` means. ports: what the emulating world created, by name.
+    """The endpoint that a config's `port` means. ports: those that the emulating world created, by name.
 
-    `DeviceNotFound` for an emulated port that is not among them; a real address is not looked at before it is opened.
+    Raises `DeviceNotFound` for an emulated port that is not among them. A real address is not checked before it is
+    opened.
     """
     if not port.startswith(EMULATED_PREFIX):
         return Endpoint(port)

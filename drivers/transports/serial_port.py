@@ -1,8 +1,8 @@
 """A serial port with a deadline on every call, and one typed error for each way in which it can fail.
 
-Wraps pyserial. What a lost port raises there depends on the call, so that everything is caught around every call.
-Deadlines are in the host's time, since pyserial waits in no other; an emulated port (`Endpoint.serial_port`) brings the
-clock that it waits on. Network ports are refused: pyserial's (3.5) have writes without a deadline and leaks.
+Wraps pyserial. What that raises for a lost port depends on the call, so every exception is caught around every call.
+Deadlines are in the host's time, since pyserial waits in no other; an emulated port (`Endpoint.serial_port`) brings its
+own clock. Network ports are refused, because those of pyserial 3.5 write without a deadline and leak.
 """
 
 import errno
@@ -49,11 +49,11 @@ _HELD = (errno.EBUSY, errno.EAGAIN)
 class SerialPort:
     """An open serial port, held exclusively, 8N1 without flow control. `close` is idempotent.
 
-    Not thread-safe: a driver that is polled from several threads locks around a whole command and reply.
+    Not thread-safe: a driver that is polled from several threads must lock around a whole command and reply.
     """
 
     def __init__(self, name: str, endpoint: Endpoint, tap: Tap | None = None) -> None:
-        """Open the port. name: the device's name in messages. tap: told of all that passes.
+        """Open the port. name: the device's name in messages. tap: notes all that passes.
 
         Addresses: a path or COM port, "serial=ABC" (serial number of the USB device) or "usb=VVVV:PPPP" (hexadecimal
         vendor and product, the only one attached). Raises `DeviceNotFound`, `DevicePermission` or `DeviceBusy`.
@@ -69,7 +69,7 @@ class SerialPort:
 
     @property
     def lost(self) -> bool:
-        """Whether the port has hung up, told by the kernel without a word on the wire. Any thread."""
+        """Whether the port has hung up. The kernel knows, so nothing is sent. May be called from any thread."""
         if not hasattr(select, "poll"):
             return False  # Windows tells with the next read
         try:
@@ -80,7 +80,7 @@ class SerialPort:
             return True
 
     def write(self, data: bytes) -> None:
-        """Send all of `data`. `DeviceTimeout` where the device takes none for a second, `DeviceDisconnected`."""
+        """Send all of `data`. Raises `DeviceTimeout` if the device takes none for a second, or `DeviceDisconnected`."""
         self._note(OUT, data)
         with self._translated():
             try:
@@ -91,7 +91,9 @@ class SerialPort:
                 ) from None
 
     def read_line(self, terminator: bytes, deadline_s: float) -> bytes:
-        """The next line without its terminator. `DeviceTimeout` after `deadline_s`: what came is kept for the next."""
+        """The next line without its terminator. Raises `DeviceTimeout` after `deadline_s`; the part received is kept
+        for the next call.
+        """
         ends_at = self._now_s() + deadline_s
         searched = 0
         while (end := self._received.find(terminator, searched)) < 0:
@@ -106,7 +108,7 @@ class SerialPort:
         return self._take(end, len(terminator))
 
     def reset_input(self) -> bytes:
-        """Drop everything received so far and not read; returns what it was. More may be on its way: see `drain`."""
+        """Drop everything received so far and not read; returns what was dropped. More may still arrive: see `drain`."""
         with self._translated():
             data = self._port.read(self._port.in_waiting)
         self._note(IN, data)
@@ -114,7 +116,7 @@ class SerialPort:
         return self._take(len(self._received), 0)
 
     def drain(self, quiet_s: float, deadline_s: float) -> bytes:
-        """Drop all that comes until the line is quiet for `quiet_s`, at most for `deadline_s`; returns what it was."""
+        """Drop what arrives until the line is quiet for `quiet_s`, at most for `deadline_s`; returns what was dropped."""
         ends_at = self._now_s() + deadline_s
         quiet_at = self._now_s() + quiet_s
         while self._now_s() < min(quiet_at, ends_at):
@@ -123,7 +125,7 @@ class SerialPort:
         return self._take(len(self._received), 0)
 
     def close(self) -> None:
-        """Give the port back; again: nothing happens. Never raises: a lost port is closed all the same."""
+        """Close the port; a second call does nothing. Never raises: a lost port counts as closed."""
         with suppress(*_FOREIGN):  # the port is gone, and with it all that could be given back
             self._port.close()
 

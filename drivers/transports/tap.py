@@ -1,8 +1,9 @@
 """A tap on the ports of a rig: every piece of bytes that goes out to a device or comes in from it, with its time.
 
-`control.jsonl` has a line for each: {"t_ns": 1234, "device": "laser", "port": "serial", "dir": ">", "bytes": "3f0d"},
-t_ns from the run's start on the host's monotonic clock, ">" towards the device. Several processes may write one file:
-each line is one write at its end. Of the SPAD it is the control traffic alone; its frames are in the recording.
+`control.jsonl` has one line for each piece:
+{"t_ns": 1234, "device": "laser", "port": "serial", "dir": ">", "bytes": "3f0d"}. t_ns counts from the run's start on
+the host's monotonic clock; ">" means towards the device. Several processes may write to one file, since each line is a
+single write at its end. For the SPAD only the control traffic is recorded here; its frames are in the recording.
 """
 
 import logging
@@ -29,14 +30,14 @@ _Lines = SimpleQueue[bytes | threading.Event | None]
 
 @dataclass(frozen=True, slots=True)
 class TapFile:
-    """The file to which taps write, and the time that counts as 0 (`time.monotonic_ns`); for any process."""
+    """The file to which taps write, and the time that counts as 0 (`time.monotonic_ns`). Any process may use it."""
 
     path: str
     start_ns: int
 
     @classmethod
     def begin(cls, path: Path) -> "TapFile":
-        """Begin now: the present time counts as 0."""
+        """A new tap file whose time 0 is now."""
         return cls(str(path.absolute()), time.monotonic_ns())
 
     def tap(self, device: str) -> "Tap":
@@ -44,7 +45,7 @@ class TapFile:
         return Tap(self, device)
 
     def sync(self) -> None:
-        """Have the disk keep what was written."""
+        """Force what was written onto the disk."""
         try:
             handle = os.open(self.path, os.O_RDONLY)
         except FileNotFoundError:
@@ -56,7 +57,9 @@ class TapFile:
 
 
 class Tap:
-    """Notes what passes a device's ports. Any thread; a thread of its own writes, so that no disk holds a device up."""
+    """Notes what passes a device's ports, from any thread. A separate thread writes, so a slow disk never delays a
+    device.
+    """
 
     def __init__(self, file: TapFile, device: str) -> None:
         self._file = file
@@ -81,7 +84,7 @@ class Tap:
                     self._writer.start()
 
     def flush(self, timeout_s: float = FLUSH_S) -> None:
-        """Wait until all that was noted so far is written, but no longer than that."""
+        """Wait until everything noted so far is written, at most for `timeout_s`."""
         if self._writer.ident is not None:
             written = threading.Event()
             self._lines.put(written)
@@ -123,7 +126,9 @@ class Passed:
 
 
 def read_taps(file: Path) -> list[Passed]:
-    """Everything that passed, in order of time, but for a torn last line. `ProtocolError` for another sort of file."""
+    """All pieces that passed, in order of time, without a torn last line. Raises `ProtocolError` for another kind of
+    file.
+    """
     *lines, _ = file.read_bytes().split(b"\n")
     found = []
     for number, line in enumerate(lines, 1):

@@ -1,7 +1,7 @@
 """A TCP connection with a deadline on every call, and one typed error for each way in which it can fail.
 
-Wraps the standard library's sockets. Looking up a host name is the one thing without a deadline of ours: the resolver
-has its own, so give addresses as numbers where that matters.
+Wraps the standard library's sockets. Only looking up a host name has no deadline of ours. The resolver has its own, so
+give numeric addresses if that matters.
 """
 
 import errno
@@ -20,7 +20,7 @@ _CHUNK_BYTES = 65_536
 
 
 class TcpStream:
-    """An open connection. `close` is idempotent. For one thread, but for `close`."""
+    """An open connection. `close` is idempotent and may be called from any thread; all else from one thread."""
 
     def __init__(self, name: str, address: str, *, connect_s: float = 5.0) -> None:
         """Connect. name: the device's name in messages; address: "host:port".
@@ -39,7 +39,9 @@ class TcpStream:
             self._socket.setsockopt(socket.IPPROTO_TCP, socket.TCP_NODELAY, 1)
 
     def send(self, data: bytes, deadline_s: float) -> None:
-        """Send all of `data`. `DeviceTimeout` where the other side takes none for so long, `DeviceDisconnected`."""
+        """Send all of `data`. Raises `DeviceTimeout` if the other side takes none for `deadline_s`, or
+        `DeviceDisconnected`.
+        """
         ends_at = time.monotonic() + deadline_s
         rest = memoryview(data)
         while rest:
@@ -50,12 +52,14 @@ class TcpStream:
                     rest = rest[self._socket.send(rest) :]
 
     def receive(self, deadline_s: float, limit: int = _CHUNK_BYTES) -> bytes:
-        """The bytes that have come, at least one; b"" where nothing came within the deadline. `DeviceDisconnected`."""
+        """The bytes that have come, at least one; b"" if nothing came within the deadline. May raise
+        `DeviceDisconnected`.
+        """
         buffer = bytearray(limit)
         return bytes(buffer[: self.receive_into(memoryview(buffer), deadline_s)])
 
     def receive_into(self, view: memoryview, deadline_s: float) -> int:
-        """Receive bytes into `view`; returns their number, 0 past the deadline. `DeviceDisconnected`."""
+        """Receive bytes into `view`; returns their number, 0 after the deadline. May raise `DeviceDisconnected`."""
         ends_at = time.monotonic() + deadline_s
         while True:
             with self._translated():
@@ -70,7 +74,7 @@ class TcpStream:
             return n
 
     def drain(self, quiet_s: float, deadline_s: float) -> bytes:
-        """Take, to be dropped, all that comes until the line is quiet for `quiet_s`, at most for `deadline_s`."""
+        """Read all that comes until the line is quiet for `quiet_s`, at most for `deadline_s`; returns it."""
         ends_at = time.monotonic() + deadline_s
         dropped = bytearray()
         while (left_s := ends_at - time.monotonic()) > 0 and (data := self.receive(min(quiet_s, left_s))):
@@ -79,7 +83,7 @@ class TcpStream:
         return bytes(dropped)
 
     def close(self) -> None:
-        """Give the connection back; again: nothing happens. Never raises."""
+        """Close the connection; a second call does nothing. Never raises."""
         with suppress(OSError):
             self._socket.close()
 

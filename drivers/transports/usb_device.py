@@ -1,11 +1,11 @@
-"""One USB device, opened and claimed through pyusb: every call has a deadline, every failure is one of ours.
+"""One USB device, opened and claimed through pyusb. Every call has a deadline; every failure raises an error of ours.
 
 Addresses: "usb" (the only one attached), "usb:serial=ABC", "usb:path=1-2.4" (bus and hub ports, as in
 /sys/bus/usb/devices; for devices without a serial string). `backend` is pyusb's: None for the real libusb, an
 emulator's object otherwise. Between two reads nothing is queued; `bulk_link` has what a stream needs.
 
-Errors are numbered by libusb 1.0 and mean what Linux means by them: unplugging shows as ENODEV, EIO or ESHUTDOWN; a
-read shorter than a packet overflows and loses the packet; the sum of all queued transfers is limited by
+Errors have the numbers of libusb 1.0 and the meanings that Linux gives them. Unplugging shows as ENODEV, EIO or
+ESHUTDOWN. A read shorter than a packet overflows and loses the packet. The sum of all queued transfers is limited by
 `usbfs_memory_mb` (16).
 """
 
@@ -41,13 +41,13 @@ _LOST = (errno.ENODEV, errno.EIO, errno.ESHUTDOWN, errno.ENOTCONN)
 
 
 def no_permission(label: str) -> str:
-    """The error for a device that is there and may not be opened."""
+    """The error text for a device that is attached but may not be opened."""
     return f"{label}: no permission to open it; install {UDEV_RULES} (its first lines say how) and plug it in again"
 
 
 @contextmanager
 def translated(label: str, endpoint: int | None = None, timeout_s: float | None = None) -> Iterator[None]:
-    """Turn what pyusb raises inside into one line and one class of `drivers.errors`."""
+    """Turn what pyusb raises inside the `with` block into an error of `drivers.errors` with one line of text."""
     try:
         yield
     except usb.core.USBError as error:
@@ -59,7 +59,7 @@ def translated(label: str, endpoint: int | None = None, timeout_s: float | None 
 def usb_failure(
     label: str, number: int | None, text: str, endpoint: int | None = None, timeout_s: float | None = None
 ) -> DeviceError:
-    """The error of ours for an errno of libusb's, None where it has none; `text` is libusb's own."""
+    """The error of ours for an errno of libusb, which is None if it has none. text: libusb's own message."""
     where = "" if endpoint is None else f" on endpoint 0x{endpoint:02x}"
     if number in _LOST:
         return DeviceDisconnected(f"{label}: the device is gone ({text}); check cable and power, open again")
@@ -77,7 +77,7 @@ def usb_failure(
 
 @dataclass(frozen=True, slots=True)
 class UsbId:
-    """The ids of a sort of device. Vendors share numbers: one of `product_names` must be part of its product string."""
+    """The ids of a kind of device. Vendors share numbers, so one of `product_names` must be part of its product string."""
 
     label: str
     vendor: int
@@ -87,7 +87,7 @@ class UsbId:
 
 @dataclass(frozen=True, slots=True)
 class UsbListing:
-    """A device on the bus as far as it can be known without claiming it. Strings are None where it may not be asked."""
+    """A device on the bus, as far as it can be known without claiming it. Strings are None if it may not be asked."""
 
     path: str
     serial: str | None
@@ -96,12 +96,12 @@ class UsbListing:
 
     @property
     def address(self) -> str:
-        """The shortest address that means this device only."""
+        """The shortest address that means only this device."""
         return f"usb:serial={self.serial}" if self.serial else f"usb:path={self.path}"
 
 
 def attached(wanted: UsbId, backend: object | None = None) -> list[UsbListing]:
-    """The attached devices of one sort, ordered by path. Claims nothing and changes nothing."""
+    """The attached devices of one kind, ordered by path. Claims nothing and changes nothing."""
     ids = {"idVendor": wanted.vendor, "idProduct": wanted.product}
     devices = usb.core.find(find_all=True, backend=backend or _libusb(), **ids)
     with translated(wanted.label):
@@ -114,13 +114,13 @@ def attached(wanted: UsbId, backend: object | None = None) -> list[UsbListing]:
 class UsbDevice:
     """An open device with its interfaces claimed and in the wanted alternate settings. Calls are safe from any thread.
 
-    Transfers on one endpoint are the caller's to serialise; `close` waits for none of them (end your threads first).
+    The caller must serialise transfers on one endpoint. `close` waits for none of them, so end your threads first.
     """
 
     def __init__(self, listing: UsbListing, label: str, alternates: Mapping[int, int], tap: Tap | None = None) -> None:
         """Claim and set `alternates`, {interface: alternate setting}. Use `open_device` to find the listing.
 
-        tap: told of what `write` and `read` pass.
+        tap: notes what `write` and `read` pass.
         """
         self.listing = listing
         self.label = f"{label} at {listing.address}"
@@ -153,7 +153,9 @@ class UsbDevice:
             self._device.set_interface_altsetting(interface, alternate)
 
     def write(self, endpoint: int, data: bytes, timeout_s: float) -> None:
-        """One OUT transfer, interrupt or bulk as the descriptor says. `DeviceTimeout` where not all of it went out."""
+        """Make one OUT transfer, interrupt or bulk as the descriptor says. Raises `DeviceTimeout` if not all of it went
+        out.
+        """
         if self._tap is not None:
             self._tap.note(f"{endpoint:02x}", OUT, data)
         with translated(self.label, endpoint, timeout_s):
@@ -164,7 +166,9 @@ class UsbDevice:
             )
 
     def read(self, endpoint: int, size: int, timeout_s: float) -> bytes:
-        """One IN transfer of at most `size` bytes, a whole number of packets. `DeviceTimeout` where nothing came."""
+        """Make one IN transfer of at most `size` bytes, a whole number of packets. Raises `DeviceTimeout` if nothing
+        came.
+        """
         with translated(self.label, endpoint, timeout_s):
             data = bytes(self._device.read(endpoint, size, milliseconds(timeout_s)))
         if self._tap is not None:
@@ -172,14 +176,14 @@ class UsbDevice:
         return data
 
     def read_into(self, endpoint: int, buffer: "array.array[int]", timeout_s: float) -> int:
-        """Read into an existing array (its own size in whole packets); returns the number of bytes read."""
+        """Read into an existing array, whose size is whole packets; returns the number of bytes read."""
         with translated(self.label, endpoint, timeout_s):
             return int(self._device.read(endpoint, buffer, milliseconds(timeout_s)))
 
     def drain(self, endpoint: int, size: int, timeout_s: float, most: int = 1000) -> int:
-        """Read and drop until nothing comes for `timeout_s`; returns the transfers dropped.
+        """Read and drop until nothing comes for `timeout_s`; returns the number of transfers dropped.
 
-        `ProtocolError` after `most` of them: a device that never falls silent follows another protocol.
+        Raises `ProtocolError` after `most` of them, as a device that never falls silent follows another protocol.
         """
         for dropped in range(most):
             try:
@@ -191,7 +195,7 @@ class UsbDevice:
     def control_in(
         self, request_type: int, request: int, value: int, index: int, length: int, timeout_s: float
     ) -> bytes:
-        """A control transfer that reads. `DeviceFault` where the device refuses it (stall)."""
+        """Make a control transfer that reads. Raises `DeviceFault` if the device refuses it (stall)."""
         with translated(self.label, 0, timeout_s):
             reply = self._device.ctrl_transfer(request_type, request, value, index, length, milliseconds(timeout_s))
         return bytes(reply)
@@ -204,7 +208,7 @@ class UsbDevice:
         return frozenset(endpoint.bEndpointAddress for interface in interfaces for endpoint in interface)
 
     def close(self) -> None:
-        """Give the interfaces and the device back; again: nothing happens. Raises nothing: the device may be gone."""
+        """Give the interfaces and the device back; a second call does nothing. Never raises, as the device may be gone."""
         with self._lock:
             if not self._open:
                 return
@@ -228,16 +232,16 @@ def open_device(
     backend: object | None = None,
     tap: Tap | None = None,
 ) -> UsbDevice:
-    """Find, open, configure and claim.
+    """Find, open, configure and claim a device.
 
-    `DeviceNotFound`: none, or none at that address. `DeviceError`: several equal ones and the address does not choose.
-    `DevicePermission` names the udev rule. `DeviceBusy`: claimed by another program.
+    Raises `DeviceNotFound` if there is none, or none at that address; `DeviceError` if there are several equal ones and
+    the address does not choose; `DevicePermission`, with the udev rule; `DeviceBusy` if another program has claimed it.
     """
     return UsbDevice(find_device(wanted, address, backend), wanted.label, alternates, tap)
 
 
 def find_device(wanted: UsbId, address: str, backend: object | None = None) -> UsbListing:
-    """The one device that an address means. Errors as of `open_device`, but for those of claiming it."""
+    """The one device that an address means. Errors as in `open_device`, except for those of claiming it."""
     return _choose(attached(wanted, backend), wanted, address)
 
 
@@ -283,7 +287,7 @@ def _listing(device: Any) -> UsbListing:
 
 
 def _string(device: Any, index: int) -> str | None:
-    """A string of the device; None where there is none or it may not be asked."""
+    """A string of the device; None if there is none or it may not be asked."""
     try:
         text = usb.util.get_string(device, index)
     except (usb.core.USBError, ValueError, NotImplementedError):  # ValueError: pyusb's 'no languages', mostly EACCES
@@ -299,5 +303,5 @@ def _libusb() -> Any:
 
 
 def milliseconds(timeout_s: float) -> int:
-    """The time in milliseconds, at least 1: libusb takes 0 as 'for ever', which no call here may ask for."""
+    """The time in milliseconds, at least 1, since libusb takes 0 as 'for ever', which no call here may ask for."""
     return max(1, round(timeout_s * 1000))

@@ -1,16 +1,16 @@
 """The calls that calibrate a rig: camera, light planes, timing and bad pixels, and the check of a finished calibration.
 
 `sources` may be a rig (a config, the name of a bundled one, or its file), folders of runs taken with `record`, folders
-of earlier calibrations (for their views) and, for the camera alone, pictures. Without any it is the bundled simulated
-rig, whose world moves the board. What is asked for is a request of `rig.requests`, or given by the names of its
-fields: `calibrate_camera(terms=4)`.
+of earlier calibrations (for their views) and, for the camera alone, pictures. The default is the bundled simulated rig,
+whose world moves the board. Options are given as a request of `rig.requests`, or by the names of its fields:
+`calibrate_camera(terms=4)`.
 
 `ask` is called to have the board of a real rig moved, and returns once that is done; `tell` gets a line about each
 view.
 
-All of them raise CalibrationError where the views make no calibration (Degenerate, with `.reason`, where more or other
-views would help), UsageError for a request that cannot be met, and DeviceError or DevicesError where devices fail.
-Views that were taken by then are in `out`.
+All of them raise CalibrationError if the views give no calibration (Degenerate, with `.reason`, if more or other views
+would help), UsageError for a request that cannot be met, and DeviceError or DevicesError if devices fail. Views that
+were taken by then are in `out`.
 """
 
 from collections.abc import Callable
@@ -50,7 +50,7 @@ def calibrate_camera(
     tell: TellLine | None = None,
     **changes: Any,
 ) -> CalibrationResult:
-    """Calibrate the camera alone (`rig calibrate camera`); `sources` may be pictures, and folders of them, as well."""
+    """Calibrate the camera alone (`rig calibrate camera`). `sources` may also be pictures, and folders of them."""
     return run_camera(sources, replace(request or CameraRequest(), **changes), ask=ask, tell=tell)
 
 
@@ -65,7 +65,7 @@ def calibrate_pixels(
     """Map hot, dead and noisy pixels and the dark rate from dark frames (`rig calibrate pixels`).
 
     source: a rig, or the folder of a recorded run.
-    covered: called where a person has to cover the lens; it returns once that is done.
+    covered: called when a person has to cover the lens; it returns once that is done.
     """
     return run_pixels(source, replace(request or PixelsRequest(), **changes), covered=covered, progress=progress)
 
@@ -77,7 +77,7 @@ def calibrate_sync(
     tell: TellLine | None = None,
     **changes: Any,
 ) -> CalibrationResult:
-    """Measure the mirror's lag each way and the rows' delay from one unmoved scene (`rig calibrate sync`)."""
+    """Measure the mirror's lag in each direction and the rows' delay from one unmoved scene (`rig calibrate sync`)."""
     return run_sync(sources, replace(request or SyncRequest(), **changes), tell=tell)
 
 
@@ -89,5 +89,5 @@ def calibrate_check(
     tell: TellLine | None = None,
     **changes: Any,
 ) -> CalibrationResult:
-    """Judge a calibration by a flat board that it was not made with (`rig calibrate check`)."""
+    """Judge a calibration by a flat board that was not used for it (`rig calibrate check`)."""
     return run_check(sources, replace(request or CheckRequest(), **changes), ask=ask, tell=tell)

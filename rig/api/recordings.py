@@ -1,4 +1,4 @@
-"""The calls for recordings: check, mend, describe, cut and compress them, and exchange them with other programs."""
+"""The calls for recordings: verify, repair, describe, cut and compress them, and exchange them with other programs."""
 
 from collections.abc import Sequence
 from dataclasses import replace
@@ -23,7 +23,7 @@ def verify(run: PathLike) -> verifying.Verification:
 
 
 def repair(run: PathLike) -> mending.Repair:
-    """Make a torn recording whole; no frame is changed and no byte thrown away (`rig repair`)."""
+    """Make a torn recording whole. No frame is changed and no byte thrown away (`rig repair`)."""
     return mending.repair(Path(run))
 
 
@@ -35,14 +35,14 @@ def recording_info(run: PathLike) -> opening.RecordingInfo:
 def cut(run: PathLike, out: PathLike, request: CutRequest | None = None, **changes: Any) -> dict[str, Any]:
     """Write a part of a recording to the folder `out` and return the manifest of the part (`rig cut`).
 
-    request, changes: the part, as a `CutRequest` or by the names of its fields: `cut("run", "part", maps="0:2")`.
+    request, changes: which part, as a `CutRequest` or by the names of its fields: `cut("run", "part", maps="0:2")`.
     """
     asked = replace(request or CutRequest(), **changes)
     return cutting.cut(Path(run), Path(out), maps=asked.maps, frames=asked.frames, time=asked.time, run=asked.start)
 
 
 def compress(run: PathLike) -> compressing.Compression:
-    """Compress a recording with zstd; it is read as any other (`rig compress`). Needs the extra `compress`."""
+    """Compress a recording with zstd. It can be read like any other (`rig compress`). Needs the extra `compress`."""
     return compressing.compress(Path(run))
 
 
@@ -60,7 +60,7 @@ def import_frames(
     kind: pi-imaging, swissspad2 or photoncube.
     files: in order; a folder stands for the files in it.
     request, changes: how they are read, as an `ImportRequest` or by the names of its fields.
-    progress: called with frames done and frames to do.
+    progress: called with the number of frames done and the total.
     Raises UsageError, one line per problem.
     """
     return importing.import_frames(kind, files, out, replace(request or ImportRequest(), **changes), progress)
@@ -78,8 +78,8 @@ def export_run(
     """Write a run for other programs (`rig export`): npy, hdf5, ply, png or mp4.
 
     request, changes: what pictures and films show, as an `ExportRequest` or by the names of its fields.
-    out: where to; None is RUN-KIND beside the run.
-    progress: called with frames done and frames to do.
-    Raises UsageError where the run has nothing of that kind.
+    out: the folder to write; None is RUN-KIND beside the run.
+    progress: called with the number of frames done and the total.
+    Raises UsageError if the run has nothing of that kind.
     """
     return exporting.export_run(run, kind, out, replace(request or ExportRequest(), **changes), progress)

@@ -1,4 +1,4 @@
-"""The calls about a rig and its computer: check a config, look at devices and scenes, laser off, benchmarks."""
+"""The calls about a rig and its computer: check a config, list devices and effects, laser off, benchmarks."""
 
 from pathlib import Path
 from typing import TYPE_CHECKING
@@ -15,7 +15,7 @@ if TYPE_CHECKING:
 
 
 def check_config(config: Config = SIMULATED) -> "RigConfig":
-    """Return the config once every file that it names was opened as a scan opens it (`rig config check`).
+    """Return the config after opening every file that it names in the way a scan does (`rig config check`).
 
     Raises UsageError with one line per problem.
     """
@@ -29,10 +29,10 @@ def check_config(config: Config = SIMULATED) -> "RigConfig":
 def effects(
     config: Config = SIMULATED, *, scene: str | None = None, trials: bool = True, progress: Progress | None = None
 ) -> "SceneEffects":
-    """List the physical effects that a simulated scene calls for, why, and what each is worth (`rig effects`).
+    """List the physical effects that a simulated scene calls for, why, and how much each matters (`rig effects`).
 
     trials: measure how much each effect changes the stripe error, in pairs of short scans; takes seconds.
-    progress: called with scans done and scans to do.
+    progress: called with the number of scans done and the total.
     """
     from rig.tradeoff.effects import scene_effects
 
@@ -71,7 +71,7 @@ def devices() -> "list[Attached]":
 def laser_off(config: Config = SIMULATED) -> list[str]:
     """Take the gate low, disarm the laser, and return lines that say what was done (`rig laser off`).
 
-    Raises DevicesError where a device does not answer.
+    Raises DevicesError if a device does not answer.
     """
     from rig.devices.doctor import laser_off as switch_off
 
@@ -81,8 +81,8 @@ def laser_off(config: Config = SIMULATED) -> list[str]:
 def bench(*, threads: int | None = None, progress: Progress | None = None) -> "SpeedReport":
     """Measure how fast this machine counts and estimates, within a minute (`rig bench`).
 
-    threads: the most threads to measure with; None is one for each core.
-    progress: called with rows done and rows to do, over all rounds.
+    threads: the largest number of threads to measure with; None is one for each core.
+    progress: called with the number of rows done and the total, over all rounds.
     """
     from rig.bench.speed import measure_speed
 

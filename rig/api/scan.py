@@ -1,4 +1,4 @@
-"""The calls that make depth maps: `scan` with a rig, `replay` and `reconstruct` from frames that exist; `plan_scan`."""
+"""The calls that make depth maps: `scan` with a rig; `replay` and `reconstruct` from existing frames; `plan_scan`."""
 
 from collections.abc import Callable, Sequence
 from dataclasses import replace
@@ -47,15 +47,15 @@ def scan(
 ) -> RunResult:
     """Scan with a rig and return its depth maps (`rig scan`).
 
-    request, changes: what is asked for, as a `ScanRequest` or by the names of its fields: `scan("lab", exposures=3)`.
+    request, changes: options, as a `ScanRequest` or by the names of its fields: `scan("lab", exposures=3)`.
     progress: called several times a second with frames done and frames planned.
     live: called as often with a `ScanProgress`, which has the figures of every stage.
     monitor: called with the newest frames as a `MonitorView`, at most ten times a second and on a thread of its own;
       the run never waits for it.
     on_space: called before anything moves with a `Space`: the most that the recording will take on the disk.
 
-    Raises UsageError for a request that cannot be met, DeviceError or DevicesError where devices fail; maps that were
-    whole by then are in `out`. An interrupt ends the scan after its last whole map, with verdict 'aborted'.
+    Raises UsageError for a request that cannot be met, DeviceError or DevicesError if devices fail; maps finished by
+    then are in `out`. An interrupt ends the scan after its last complete map, with verdict 'aborted'.
     """
     request = replace(request or ScanRequest(), **changes)
     settings = _configured(config, request)
@@ -75,9 +75,9 @@ def plan_scan(
 ) -> ScanPlan:
     """Compile the plan of a scan and check it against the limits of its devices (`rig scan --dry-run`).
 
-    Everything is as in `scan` and checked as there, the room on the disk too. Devices are opened, asked for their
-    limits and closed again: nothing moves and no light leaves, so that `arm` is not needed. Raises DevicesError, one
-    line per device, where real ones are not there.
+    Options and checks are those of `scan`, including the room on the disk. Devices are opened, asked for their limits
+    and closed again. Nothing moves and no light leaves, so `arm` is not needed. Raises DevicesError, one line per
+    device, if real ones are missing.
     """
     request = replace(request or ScanRequest(), **changes)
     settings = _configured(config, request)
@@ -109,17 +109,17 @@ def replay(
     steps: Callable[[Pace], None] | None = None,
     **changes: Any,
 ) -> RunResult:
-    """Play a recording through the live stack; the depth is the same, bit for bit, at any clock (`rig replay`).
+    """Play a recording through the live stack. The depth is the same, bit for bit, at any clock (`rig replay`).
 
     run: folder of a run taken with `record`.
-    request, changes: what is asked for, as a `ReplayRequest` or by the names of its fields.
+    request, changes: options, as a `ReplayRequest` or by the names of its fields.
     calibration: file made since the recording; None is the recording's own.
-    steps: called before the start with an object whose `step()` and `run_on()` may be called from any thread; for the
-      clock 'step'.
+    steps: for the clock 'step', called before the start with an object whose `step()` and `run_on()` may be called from
+      any thread.
     Everything else is as in `scan`.
 
-    Raises UsageError where there is no recording, and DivergedError where drivers sent something else than in the
-    recording or sent it more than 2 ms from its time.
+    Raises UsageError if there is no recording, and DivergedError if drivers sent something different from the
+    recording, or sent it more than 2 ms from its time.
     """
     request = replace(request or ReplayRequest(), **changes)
     played = ReplayOptions(request.clock, request.loop, request.block_frames)
@@ -200,14 +200,14 @@ def reconstruct(
     """Make depth maps of a recording, or of packed frames that any program wrote (`rig reconstruct`).
 
     source: folder of a run taken with `record`; or frames alone: an .npy of uint8 (maps x columns x exposures, height,
-      ceil(width/8)), or the folder that `rig import` made of such.
+      ceil(width/8)), or the folder that `rig import` made of such frames.
     plan, calibration: both are needed for frames alone. A run has its own; it may be given a calibration file that was
       made since.
-    request, changes: what is asked for, as a `ReconstructRequest` or by the names of its fields.
-    progress: called with frames or maps done and to do.
+    request, changes: options, as a `ReconstructRequest` or by the names of its fields.
+    progress: called with the number of frames or maps done and the total.
 
     Raises UsageError, one line per problem, for files that do not fit together. An interrupt ends the run after its
-    last whole map, with verdict 'aborted'.
+    last complete map, with verdict 'aborted'.
     """
     request = replace(request or ReconstructRequest(), **changes)
     source = Path(source)

@@ -29,12 +29,12 @@ def tradeoff(
 ) -> Tradeoff:
     """Scan a simulated rig with all combinations of settings and score them by the world's truth (`rig tradeoff`).
 
-    request, changes: what is asked for, as a `TradeoffRequest` or by the names of its fields:
-      `tradeoff(exposures=(1, 3), time_budget="20 ms")`. A calibration is judged for the rig with the number of lines
-      that its config has.
-    progress: called with frames done and frames to do.
+    request, changes: options, as a `TradeoffRequest` or by the names of its fields:
+      `tradeoff(exposures=(1, 3), time_budget="20 ms")`. A calibration is checked against the rig with the number of
+      lines in its config.
+    progress: called with the number of frames done and the total.
 
-    Raises UsageError, one line per problem. An interrupt ends it after the last whole row, with verdict 'aborted'.
+    Raises UsageError, one line per problem. An interrupt ends it after the last complete row, with verdict 'aborted'.
     """
     request = replace(request or TradeoffRequest(), **changes)
     loaded = configure(config)

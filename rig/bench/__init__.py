@@ -1,6 +1,6 @@
-"""`rig bench`: how fast this machine counts and estimates, beside how fast it reads its memory, in one run.
+"""`rig bench`: measures in one run how fast this machine counts and estimates, and how fast it reads its memory.
 
 `speed` measures the rows, `latency` the time from a column's last frame to its estimate, `soak` a long stream through
 the acquisition itself. Figures are medians over rounds in which everything is measured in turn, so that a machine that
-slows down or has other work slows all of them alike; ratios are of one run.
+slows down or has other work slows all of them alike. Ratios are of figures from one run.
 """

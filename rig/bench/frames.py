@@ -1,8 +1,9 @@
-"""Made-up frames of a known truth, enough of them that they come from memory and not from a cache.
+"""Synthetic frames with a known truth, enough of them that they come from memory and not from a cache.
 
-Haze falls off with distance and ends, but for a tenth, at a stripe whose place and brightness are drawn anew on every
-row for every `PLACE_FRAMES` frames. The light is that of the working point `report` (docs/results/README.md). For the
-rows that make whole maps there is one surface, as frames of a sweep and as a pair of pictures of the same disparities.
+Haze falls off with distance and drops to a tenth at a stripe. Place and brightness of the stripe are drawn anew for
+every row and every `PLACE_FRAMES` frames. The light is that of the working point `report` (docs/results/README.md).
+Rows that make complete maps use a single surface, as frames of a sweep and as a pair of pictures of the same
+disparities.
 """
 
 from dataclasses import dataclass
@@ -22,7 +23,7 @@ BITS_OF_CHANCE = 16
 
 @numba.njit(cache=True, nogil=True)
 def read_all(words: NDArray[np.uint64]) -> int:
-    """Read every word once; what comes back only keeps the compiler from leaving it out."""
+    """Read every word once. The result only keeps the compiler from leaving the reading out."""
     total = np.uint64(0)
     for i in range(words.shape[0]):
         total ^= words[i]
@@ -31,7 +32,7 @@ def read_all(words: NDArray[np.uint64]) -> int:
 
 @numba.njit(cache=True, nogil=True)
 def draw_frames(threshold: NDArray[np.uint32], seed: int, frames: NDArray[np.uint8]) -> None:
-    """Draw frames (n, rows, window / 8) of pixels that detect where a 16-bit number is below threshold (rows, window).
+    """Draw frames (n, rows, window / 8) of pixels that detect if a 16-bit number is below threshold (rows, window).
 
     The numbers are SplitMix64's (Steele, Lea, Flood, "Fast splittable pseudorandom number generators", OOPSLA 2014).
     """
@@ -62,7 +63,7 @@ def count_columns(
     first_chunk: int,
     last_chunk: int,
 ) -> None:
-    """Count whole columns of frames, one after the other, into bit planes that the next column takes over.
+    """Count whole columns of frames, one after the other, into bit planes that the next column reuses.
 
     words: (all words,) of frames of `rows` rows; planes: see `new_planes`. Expanding counts is part of an estimate.
     """
@@ -104,9 +105,8 @@ NEAR_W, FAR_W = 1.0, 0.125
 class BenchFrames:
     """Frames of one window size.
 
-    bits: uint8 (n, rows, row bytes), n a multiple of BLOCK_FRAMES. truth_px: float32 (places, rows), where the stripe
-    of frames PLACE_FRAMES i and on is. window: searched pixels, which begin at geometry.x0; rows of frames may be
-    longer.
+    bits: uint8 (n, rows, row bytes), n a multiple of BLOCK_FRAMES. truth_px: float32 (places, rows), stripe position
+    from frame PLACE_FRAMES i on. window: searched pixels, which begin at geometry.x0; rows of frames may be longer.
     """
 
     window: int
@@ -120,13 +120,13 @@ class BenchFrames:
         return int(self.bits.shape[1] * self.bits.shape[2])
 
     def layout(self, exposures: int) -> SweepLayout:
-        """The sweep of these frames at so many exposures a column."""
+        """The layout of a sweep of these frames with this number of exposures per column."""
         used_px = self.window if self.bits.shape[2] * 8 < WIDTH else None
         return SweepLayout(COLUMNS, ROWS, WIDTH, self.geometry.x0, self.window, exposures, used_px, dark=True)
 
 
 def window_frames(window: int, workers: RowWorkers, n_bytes: int = FRAMES_BYTES) -> BenchFrames:
-    """Frames that carry just the window."""
+    """Frames that hold only the window."""
     places = BLOCK_PLACES * max(1, n_bytes // (BLOCK_FRAMES * ROWS * window // 8))
     bits = np.empty((places * PLACE_FRAMES, ROWS, window // 8), np.uint8)
     distinct = min(places, DISTINCT)
@@ -149,7 +149,7 @@ def window_frames(window: int, workers: RowWorkers, n_bytes: int = FRAMES_BYTES)
 
 
 def full_frames(narrow: BenchFrames, n_bytes: int = FRAMES_BYTES) -> BenchFrames:
-    """Whole frames of the sensor; the window lies in them where its geometry says, the rest is like it."""
+    """Whole frames of the sensor. The window lies in them as its geometry says; the other pixels are similar."""
     copies = WIDTH // narrow.window
     places = BLOCK_PLACES * max(1, n_bytes // (BLOCK_FRAMES * narrow.frame_bytes * copies))
     bits = np.tile(narrow.bits[: places * PLACE_FRAMES], (1, 1, copies))
@@ -157,7 +157,7 @@ def full_frames(narrow: BenchFrames, n_bytes: int = FRAMES_BYTES) -> BenchFrames
 
 
 def bench_geometry(window: int, rows: int = ROWS, columns: int = COLUMNS) -> SweepGeometry:
-    """Columns whose planes all cross the depth range over just `window` pixels, which begin at a multiple of it."""
+    """Columns whose planes all cross the depth range over exactly `window` pixels, beginning at a multiple of it."""
     x0 = min(window, WIDTH - window)
     u = np.broadcast_to(np.linspace(-0.5, 0.5, WIDTH, dtype=np.float32), (rows, WIDTH)).copy()
     tangents_per_px = 1.0 / (WIDTH - 1)
@@ -190,7 +190,7 @@ PATCH = 16
 
 @dataclass(frozen=True, slots=True, eq=False)
 class BenchSurface:
-    """place_px: float32 (columns, rows), the stripe's place in its window; photons: of the stripe, the same shape."""
+    """place_px: float32 (columns, rows), the stripe's place in its window; photons: of the stripe, of the same shape."""
 
     place_px: NDArray[np.float32]
     photons: NDArray[np.float32]
@@ -201,12 +201,14 @@ class BenchSurface:
         return np.ascontiguousarray(self.place_px.T) + np.float32(self.geometry.x0[0])
 
     def layout(self, exposures: int) -> SweepLayout:
-        """The sweep of frames that carry just the window."""
+        """The layout of a sweep of frames that hold only the window."""
         columns, rows = self.place_px.shape
         return SweepLayout(columns, rows, WIDTH, self.geometry.x0, WINDOW, exposures, WINDOW)
 
     def frames(self, exposures: int, workers: RowWorkers) -> NDArray[np.uint8]:
-        """Packed frames (columns x exposures, rows, row bytes), column after column, light as in `rig.bench.frames`."""
+        """Packed frames (columns x exposures, rows, row bytes), column after column, with the light of
+        `rig.bench.frames`.
+        """
         columns, rows = self.place_px.shape
         bits = np.empty((columns * exposures, rows, WINDOW // 8), np.uint8)
 
@@ -219,7 +221,9 @@ class BenchSurface:
         return bits
 
     def pictures(self) -> tuple[NDArray[np.uint8], NDArray[np.uint8]]:
-        """Left and right picture (rows, columns) of a texture; what left shows at x is at x - place in right."""
+        """Left and right picture (rows, columns) of a texture. The point at x in the left one is at x - place in the
+        right one.
+        """
         import cv2
 
         disparity = np.ascontiguousarray(self.place_px.T)
@@ -230,7 +234,7 @@ class BenchSurface:
 
 
 def bench_surface(rows: int = ROWS, columns: int = COLUMNS) -> BenchSurface:
-    """A wavy slope, and a wall that stands before the middle of it."""
+    """A wavy slope with a wall in front of its middle."""
     c, y = np.linspace(0.0, 1.0, columns)[:, None], np.linspace(0.0, 1.0, rows)
     place = 0.55 + 0.3 * c + 0.1 * np.sin(4 * np.pi * y)
     wall = (np.abs(c - 0.5) < 0.2) & (np.abs(y - 0.5) < 0.3)
@@ -250,6 +254,6 @@ def count_surface(surface: BenchSurface, bits: NDArray[np.uint8], exposures: int
 def sweep_frames(
     geometry: SweepGeometry, exposures: int
 ) -> tuple[NDArray[np.int32], NDArray[np.float64], NDArray[np.int32]]:
-    """Bins and fractional columns of a sweep's frames, and where the window of each begins."""
+    """Bins and fractional columns of a sweep's frames, and the first pixel of each frame's window."""
     bins = np.repeat(np.arange(len(geometry.x0), dtype=np.int32), exposures)
     return bins, bins.astype(np.float64), np.repeat(geometry.x0, exposures)

@@ -1,10 +1,11 @@
-"""Time from a column's last frame until its estimate is there.
+"""Time from a column's last frame until its estimate is ready.
 
-A source thread copies blocks of 5 ms into the ring and publishes each when its last frame has been exposed, at
-100 kHz. The other thread takes them from the ring and judges them with the workers it was given; where a sweep ends it
-takes the result and clears the counter for the next, as a scan does. A frame's time is its block's minus the frames
-behind it: the wait for the block to fill is included, and so is that of a block's last column for the next block, whose
-first frame says that the column is complete. Binding frames to columns and making the map are not included.
+A source thread copies blocks of 5 ms into the ring and publishes each when its last frame would have been exposed, at
+100 kHz. Another thread takes them from the ring and estimates with the given workers; at the end of a sweep it takes
+the result and clears the counter for the next, as a scan does. A frame's time is its block's minus the frames after it.
+So the latency includes the wait for the block to fill. For a block's last column it also includes the wait for the next
+block, whose first frame shows that the column is complete. Binding frames to columns and making the map are not
+included.
 """
 
 import threading
@@ -29,7 +30,7 @@ PERIOD_TICKS = 1000
 
 
 def recording_of(frames: BenchFrames) -> tuple[NDArray[np.uint8], int]:
-    """The frames as an SPB1 recording in blocks as large as a scan's; the bytes from block to block.
+    """The frames as an SPB1 recording with blocks as large as a scan's, and the number of bytes from block to block.
 
     The recording is uint8 (all bytes,), with payload checksums.
     """
@@ -48,7 +49,7 @@ def recording_of(frames: BenchFrames) -> tuple[NDArray[np.uint8], int]:
 
 
 def header_of(seq: int, frames: int, width: int) -> BlockHeader:
-    """The header of block number `seq`, of `frames` frames of the bench's sensor as all others."""
+    """The header of block number `seq`, with `frames` frames of the bench's sensor."""
     first = seq * frames
     return BlockHeader(
         flags=BlockFlag(0), run_id=1, block_seq=seq, first_frame=first, t0_ticks=first * PERIOD_TICKS, lost_before=0,
@@ -67,7 +68,7 @@ SPIN_S = 2e-4
 
 @dataclass(frozen=True, slots=True)
 class Latency:
-    """Microseconds from a column's last frame to its estimate. late_max_us: latest block behind its own time."""
+    """Microseconds from a column's last frame to its estimate. late_max_us: largest lateness of a block."""
 
     median: float
     p999: float
@@ -78,9 +79,9 @@ class Latency:
 
     @property
     def kept_up(self) -> bool:
-        """Whether the estimate kept up with the stream, so that the figures are of it and not of a queue.
+        """Whether the estimate kept up with the stream, so that the figures are not those of a queue.
 
-        A median of more than ten blocks is that of a queue which grows.
+        A median of more than ten blocks is taken as the sign of a growing queue.
         """
         return (
             self.late_max_us < 1e6 * SLOTS * BLOCK_FRAMES * FRAME_S and self.median < 1e6 * 10 * BLOCK_FRAMES * FRAME_S
@@ -90,7 +91,7 @@ class Latency:
 def measure_latency(
     frames: BenchFrames, exposures: int, workers: RowWorkers, likelihood: Likelihood, seconds: float = SECONDS
 ) -> Latency:
-    """Latency of a stream of `seconds` at 100 kHz."""
+    """Latency for a stream of `seconds` at 100 kHz."""
     n_blocks = max(2, round(seconds / (BLOCK_FRAMES * FRAME_S)))
     ring = BlockRing(SLOTS, BLOCK_FRAMES * frames.frame_bytes)
     reader = ring.reader("counting")

@@ -11,7 +11,7 @@ _CACHES = Path("/sys/devices/system/cpu/cpu0/cache")
 
 
 def machine() -> dict[str, Any]:
-    """Processor, cores, caches by level as the system names their sizes, load and versions."""
+    """Processor, cores, cache sizes by level as the system reports them, load and versions."""
     import numba
     import numpy as np
 

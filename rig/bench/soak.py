@@ -1,8 +1,9 @@
-"""A long stream at the sensor's rate through the acquisition of `rig scan`, from memory: what is lost, what grows.
+"""A long stream from memory at the sensor's rate through the acquisition of `rig scan`, to see what is lost and what
+grows.
 
 The bundled simulated rig records a few sweeps, once. A SPAD that cannot wait plays them in real time, with running
-frame numbers; all else is as in a scan: ring, binding, counting, estimation, maps, a monitor, and the overload policy.
-Copying a block into its ring slot stands for the transfer that a device does by itself.
+frame numbers. Everything else is as in a scan: ring, binding, counting, estimation, maps, a monitor, and the overload
+policy. Copying a block into its ring slot stands for the transfer that a device does by itself.
 """
 
 import logging
@@ -47,9 +48,9 @@ LEAD_FRAMES = 200
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Loop:
-    """Frames of whole sweeps, from the frame of one scan marker to that before another's.
+    """Frames of whole sweeps, from the frame with one scan marker to just before the frame with another.
 
-    records: (n,) of `FRAME_RECORD`; bits: uint8 (n, rows, row bytes); sweeps: how many they are.
+    records: (n,) of `FRAME_RECORD`; bits: uint8 (n, rows, row bytes); sweeps: their number.
     """
 
     records: NDArray[np.void]
@@ -69,7 +70,7 @@ class Loop:
 
 
 class LoopedSpad(SpadArray):
-    """Plays a loop. timing: that the frames were taken with; info: as of the SPAD that took them."""
+    """A SPAD that plays a loop. timing: as configured when the frames were taken; info: of the SPAD that took them."""
 
     def __init__(self, loop: Loop, info: SpadInfo, timing: SpadTiming) -> None:
         super().__init__("looped SPAD")
@@ -199,7 +200,7 @@ _STATM = Path("/proc/self/statm")
 class SoakFrames:
     """Frames by the SPAD's own count (exposed = received + lost) and by that of the sweeps, from marker to marker.
 
-    agree: whether both add up, and the SPAD lost what the ring dropped, to the frame.
+    agree: whether both counts add up and the SPAD lost exactly the frames that the ring dropped.
     """
 
     exposed: int
@@ -215,10 +216,11 @@ class SoakFrames:
 class SoakReport:
     """Findings of a soak.
 
-    seconds: of stream played. maps: of maps_planned. times_real_time: time that the frames received took over that in
-    which they were bound, counted and made maps of, without the first map. resident_*: memory of the process when a
-    tenth of the maps was made, and at the end; None where the system does not say. source_late_max_s: latest block
-    behind its own time. ended_by: what ended the run early.
+    seconds: of stream played. maps: number made, of maps_planned. times_real_time: time span of the received frames
+    over the time spent on binding, counting and making maps of them, without the first map. resident_*: memory of the
+    process after a tenth of the maps and at the end; None if the system does not report it. source_late_max_s: largest
+    lateness of a block.
+    ended_by: what ended the run early.
     """
 
     seconds: float
@@ -239,7 +241,7 @@ class SoakReport:
 
     @property
     def exit_code(self) -> int:
-        """The exit code, as of a scan: 3 where the ring ended the stream, 1 where frames were lost or do not add up."""
+        """The exit code, as for a scan: 3 if the ring ended the stream, 1 if frames were lost or do not add up."""
         if self.ended_by is not None:
             return EXIT_DEVICE
         return int(self.frames.lost > 0 or not self.frames.agree)
@@ -261,7 +263,7 @@ def soak(
     on_overload: as in `rig.api.scan`; a stream that is ended by it gives a report too.
     progress: called with frames done and frames planned.
 
-    Raises UsageError for what cannot be asked for.
+    Raises UsageError for invalid arguments.
     """
     policy = Overload.parse(on_overload)
     if not (seconds > 0 and slow_consumer_s >= 0):

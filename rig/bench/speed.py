@@ -1,7 +1,7 @@
 """The rows of `rig bench`: every stage at every window, number of exposures and of threads, measured in turn.
 
-A round measures each row for a moment, and the memory beside them; figures are medians over the rounds. Each moment
-begins behind the frames of the one before it, so that frames come from memory.
+A round measures each row for a short time, and the memory beside them; figures are medians over the rounds. Each
+measurement begins after the frames of the previous one, so that frames come from memory.
 """
 
 import os
@@ -64,9 +64,9 @@ Workers = Mapping[int, RowWorkers]
 class Extent:
     """Amount of work that is measured.
 
-    moment_s, count_moment_s: of each row in each of the `rounds`, those of `count` being fast. latency_s: of the stream
-    for the latency. frames_bytes, read_bytes: memory of the frames of each window, and for the plain read. map_rows,
-    map_columns: of the maps that are made as a whole.
+    moment_s, count_moment_s: time for each row in each of the `rounds`; the latter is for the fast rows `count`.
+    latency_s: length of the stream for the latency. frames_bytes, read_bytes: memory of the frames of each window, and
+    for the plain read. map_rows, map_columns: size of the complete maps.
     """
 
     windows: tuple[int, ...] = WINDOWS
@@ -82,13 +82,13 @@ class Extent:
 
     @property
     def usual_window(self) -> int:
-        """Window of the rows that are not measured at every one."""
+        """Window of the rows that are measured at only one window."""
         return WINDOW if WINDOW in self.windows else self.windows[0]
 
 
 @dataclass(frozen=True, slots=True)
 class Case:
-    """A row to be measured. frame_bytes: read from memory per frame; None where that means nothing."""
+    """A row to be measured. frame_bytes: bytes read from memory per frame; None if that has no meaning."""
 
     stage: str
     window: int
@@ -100,10 +100,10 @@ class Case:
 
 @dataclass(frozen=True, slots=True)
 class SpeedRow:
-    """One figure. exposures: None where columns play no part; None as well where a speed or quotient means nothing.
+    """One figure. exposures: None if columns play no part. A speed or quotient is None if it has no meaning.
 
-    ms_per_map: of stages that make whole maps. times_sgbm: of `joint`, the time of a map over that of one of
-    StereoSGBM's on as many threads, made by turns.
+    ms_per_map: of stages that make complete maps. times_sgbm: for `joint`, the time of a map over that of a StereoSGBM
+    map on as many threads, measured alternately.
     """
 
     stage: str
@@ -123,8 +123,9 @@ class SpeedRow:
 
 @dataclass(frozen=True, slots=True)
 class WorkingPoint:
-    """Whether an estimator keeps up with the sensor, counting included. maps_per_s: of COLUMNS columns; needed_per_s:
-    as many as frames at REAL_TIME_HZ make.
+    """Whether an estimator keeps up with the sensor, including counting.
+
+    maps_per_s: of COLUMNS columns; needed_per_s: the number that frames at REAL_TIME_HZ make.
     """
 
     estimator: str
@@ -172,7 +173,7 @@ class SpeedReport:
         )
 
     def as_json(self) -> dict[str, Any]:
-        """For programs."""
+        """The findings as plain values, for programs."""
         points = [{**asdict(point), "keeps_up": point.keeps_up} for point in self.working_points]
         return {"advice": [str(point) for point in self.working_points], "working_points": points, **asdict(self)}
 
@@ -180,7 +181,9 @@ class SpeedReport:
 def measure_speed(
     threads: int | None = None, extent: Extent | None = None, progress: Progress | None = None
 ) -> SpeedReport:
-    """Measure everything. threads: the most; by default one for each core. progress: told rows done and all."""
+    """Measure everything. threads: the largest number, by default one for each core. progress: called with rows done
+    and in all.
+    """
     begun = time.perf_counter()
     extent = extent or Extent()
     most = threads or os.cpu_count() or 1
@@ -204,7 +207,7 @@ def measure_speed(
 
 
 def warm_bench() -> None:
-    """Compile what the bench alone needs."""
+    """Compile what only the bench needs."""
     with RowWorkers(1) as workers:
         frames = window_frames(WINDOWS[0], workers, 1)
         stages.count_stage(frames, Walk(frames), PLACE_FRAMES, workers)(0.0)

@@ -1,8 +1,8 @@
-"""The stages that are measured: each works on frames for a moment and says how many it did in how long.
+"""The stages that are measured. Each works on frames for a short time and returns how many it did in which time.
 
-docs/results/speed.md says what each of them is. What is done once a sweep is not timed, but for `whole_sweeps`. Of
-figures that were measured one after the other a machine with other work makes any quotient: so `joint` and StereoSGBM
-make maps by turns. Nothing is learned meanwhile, and each begins with a map that is not timed.
+docs/results/speed.md explains each of them. Work that is done once a sweep is not timed, except in `whole_sweeps`. On a
+machine with other work, quotients of figures measured one after the other are meaningless, so `joint` and StereoSGBM
+make maps alternately. Nothing is learned meanwhile, and each begins with a map that is not timed.
 """
 
 import time
@@ -46,7 +46,7 @@ NUMPY_PIECE = 20
 
 @dataclass(frozen=True, slots=True)
 class StripeError:
-    """Distance of estimates from the truth, over rows x columns; missing: share without an estimate."""
+    """Difference of estimates from the truth, over rows x columns; missing: share without an estimate."""
 
     mean_abs_px: float
     median_abs_px: float
@@ -55,9 +55,9 @@ class StripeError:
 
 @dataclass(frozen=True, slots=True)
 class Measured:
-    """Work of one moment; error where it estimates, maps where it makes whole ones.
+    """Work of one measurement, with the error if it estimates and the number of maps if it makes complete ones.
 
-    times_sgbm: time of a map over that of one of StereoSGBM's, where those were made by turns.
+    times_sgbm: time of a map over that of a StereoSGBM map, if the two were made alternately.
     """
 
     frames: int
@@ -81,14 +81,14 @@ class Walk:
         self._at = 0
 
     def next(self, places: int = 1) -> int:
-        """The first of the next places, each of PLACE_FRAMES frames; they follow one another."""
+        """The first of the next places, which follow one another, each of PLACE_FRAMES frames."""
         at = self._at if self._at + places <= self._places else 0
         self._at = (at + places) % self._places
         return at
 
 
 def count_stage(frames: BenchFrames, walk: Walk, exposures: int, workers: RowWorkers) -> Stage:
-    """Counting alone."""
+    """The stage that only counts."""
     _, rows, row_bytes = frames.bits.shape
     row_words = row_bytes // 8
     chunks = -(-rows // rows_of_chunk(row_words))
@@ -110,7 +110,7 @@ def count_stage(frames: BenchFrames, walk: Walk, exposures: int, workers: RowWor
 
 
 def numpy_stage(frames: BenchFrames, walk: Walk, exposures: int) -> Stage:
-    """The naive way, one thread."""
+    """The stage that counts naively with numpy on one thread."""
     columns = max(NUMPY_PIECE // exposures, 1)
     n = columns * exposures
     rows = frames.bits.shape[1]
@@ -141,7 +141,7 @@ def from_memory(frames: BenchFrames, walk: Walk) -> Iterator[tuple[int, Bits]]:
 
 
 def from_file(path: Path, stride: int) -> Blocks:
-    """A source of the same blocks that reads them from a recording; header checksums are checked."""
+    """A source of the same blocks that reads them from a recording and checks header checksums."""
 
     def blocks(frames: BenchFrames, walk: Walk) -> Iterator[tuple[int, Bits]]:
         # Copy-on-write: kernels are compiled for memory that may be written.
@@ -167,7 +167,9 @@ def search_stage(
     *,
     whole_sweeps: bool = False,
 ) -> Stage:
-    """Counting and `likelihood`. whole_sweeps: time also what is done once a sweep."""
+    """The stage that counts and runs `likelihood`. whole_sweeps: whether to time also the work that is done once a
+    sweep.
+    """
     bins, column, x0 = sweep_frames(frames.geometry, exposures)
     layout = frames.layout(exposures)
 
@@ -205,7 +207,7 @@ def search_stage(
 
 
 def stripe_error(difference: NDArray[np.float32]) -> StripeError:
-    """The error of stripes by their differences from the truth, NaN where there is no estimate."""
+    """The error of stripes from their differences to the truth, NaN where there is no estimate."""
     found = np.abs(difference[np.isfinite(difference)])
     if not len(found):
         return StripeError(float("nan"), float("nan"), 1.0)
@@ -231,7 +233,7 @@ def learn_joint(surface: BenchSurface, exposures: int, threads: int) -> RowModel
 
 
 def joint_stage(surface: BenchSurface, volume: CountVolume, threads: int, model: RowModel) -> Stage:
-    """`joint` from counts."""
+    """The stage that runs `joint` on counts."""
     pictures = surface.pictures()
 
     def measure(seconds: float) -> Measured:
@@ -250,7 +252,7 @@ def joint_stage(surface: BenchSurface, volume: CountVolume, threads: int, model:
 
 
 def joint_sweep_stage(surface: BenchSurface, bits: Bits, exposures: int, threads: int, model: RowModel) -> Stage:
-    """Counting and `joint`, one after the other."""
+    """The stage that counts and runs `joint`, one after the other."""
     bins, column, x0 = sweep_frames(surface.geometry, exposures)
 
     def measure(seconds: float) -> Measured:
@@ -272,7 +274,7 @@ def joint_sweep_stage(surface: BenchSurface, bits: Bits, exposures: int, threads
 
 
 def sgbm_stage(surface: BenchSurface, threads: int) -> Stage:
-    """OpenCV's StereoSGBM."""
+    """The stage that runs OpenCV's StereoSGBM."""
     pictures = surface.pictures()
 
     def measure(seconds: float) -> Measured:
@@ -286,7 +288,9 @@ def sgbm_stage(surface: BenchSurface, threads: int) -> Stage:
 
 @contextmanager
 def matching(pictures: tuple[Bits, Bits], threads: int) -> Iterator[Callable[[], NDArray[np.int16]]]:
-    """StereoSGBM of left and right picture on so many threads, a map a call: disparities in SGBM_STEPS to the pixel."""
+    """StereoSGBM of left and right picture on `threads` threads. Each call makes a map: disparities in 1 / SGBM_STEPS
+    px.
+    """
     import cv2
 
     area = SGBM_BLOCK_PX**2

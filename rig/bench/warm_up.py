@@ -1,6 +1,6 @@
-"""Compiles every kernel that a rig's scans can need: estimators and filters, and, where it is simulated, its world's.
+"""Compiles every kernel that a rig's scans can need: estimators, filters and, if it is simulated, its world.
 
-Each is run once on little; what numba compiles it keeps on disk, so that a second time takes seconds.
+Each is run once on little data. numba keeps the compiled code on disk, so that a second time takes seconds.
 """
 
 import time
@@ -24,7 +24,7 @@ ENOUGH_FRAMES = 1000
 
 
 def warm_rig(config: RigConfig) -> float:
-    """Compile everything; the seconds it took. Real devices are not opened."""
+    """Compile everything and return the seconds it took. Real devices are not opened."""
     begun = time.perf_counter()
     for done, estimator in enumerate(ESTIMATORS):
         tell_stage("warming up", done, len(ESTIMATORS), "estimators")
@@ -40,7 +40,7 @@ def warm_rig(config: RigConfig) -> float:
 
 
 class _EnoughError(Exception):
-    """Enough frames were simulated."""
+    """Raised when enough frames were simulated."""
 
 
 def _simulate(rig: OpenRig) -> None:

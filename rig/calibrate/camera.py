@@ -39,7 +39,9 @@ FEWEST_VIEWS = 3
 def run_camera(
     sources: SourcesLike, request: CameraRequest, *, ask: AskPerson | None = None, tell: TellLine | None = None
 ) -> CalibrationResult:
-    """Calibrate the camera; Degenerate, with notes why, root cause first, where the views make none."""
+    """Calibrate the camera. Raises Degenerate if the views give no calibration, with the root cause and notes on all
+    causes.
+    """
     si_values(request)
     if request.terms not in (0, *TERM_COUNTS):
         known = ", ".join(map(str, TERM_COUNTS))
@@ -75,7 +77,7 @@ def run_camera(
 
 
 def _fitted(taken: ViewCollection, board: Board, terms: int) -> CameraFit:
-    """Fit the camera; Degenerate where it would hang on so few views that they cannot contradict each other."""
+    """Fit the camera; raises Degenerate if it would hang on so few views that they cannot contradict each other."""
     fit = fit_camera(taken.views, board, taken.size, distortion_terms=terms)
     if len(fit.kept) < FEWEST_VIEWS:
         raise Degenerate(

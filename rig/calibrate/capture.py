@@ -1,19 +1,20 @@
 """Takes one view of the board from a scan of it: the board's picture, its corners, and the passages of every sweep.
 
-`capture_view` scans a live rig, `capture_recorded` reads a recorded run. The scan is done without the calibration that
-there is, so that nothing of it enters the new one: whole rows are counted, and a passage is the command at that instant
-as if the mirror had no lag. A SPAD that cannot send or keep whole frames fast enough sends the windows of that
-calibration, though, and the plan allows for its lag; neither changes the passages, except that a line outside the
-windows is not seen.
+`capture_view` scans a live rig, `capture_recorded` reads a recorded run. An existing calibration is not used in the
+scan, so that nothing of it enters the new one: whole rows are counted, and a passage is the command at that instant as
+if the mirror had no lag. Only if a SPAD cannot send or keep whole frames fast enough does it send the windows of that
+calibration, and the plan then allows for its lag. Neither changes the passages, except that a line outside the windows
+is not seen.
 
-Passages are kept of pixels spread evenly over the board, away from the edges of its print; over the whole picture where
-no board was found. The first half millisecond of a sweep is left out: the mirror, which follows late, is still
+Passages are kept for pixels spread evenly over the board, away from the edges of its print, or over the whole picture
+if no board was found. The first half millisecond of a sweep is left out, because the mirror lags and is still
 accelerating then.
 
-`shown` gets the board where it is wanted: a person is asked to hold it there, or the simulated world moves it.
-`SpeedRotation` scans the poses by turns at several exposures per column, so that the mirror is seen at several speeds.
-A speed that the rig cannot do is left out. Where one does not show the line on the board, the pose is scanned again at
-the slowest, before the board is moved; a speed that never showed the line where the slowest did is left out too.
+`shown` brings the board to the wanted pose: a person is asked to hold it there, or the simulated world moves it.
+`SpeedRotation` scans successive poses at different numbers of exposures per column, so that the mirror is seen at
+several speeds. A speed that the rig cannot do is left out. If a speed does not show the line on the board, the pose is
+scanned again at the slowest one before the board is moved. A speed that never showed the line when the slowest did is
+left out too.
 """
 
 from collections.abc import Callable, Sequence
@@ -60,7 +61,7 @@ MOST_SWEEPS = 4
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Capture:
-    """A view as it was taken, the reason why it has no corners (None: it has), the rig that took it."""
+    """A view, the reason why it has no corners (None if it has), and the rig that took it."""
 
     view: View
     refused: Degenerate | None
@@ -81,13 +82,14 @@ def capture_view(
 ) -> Capture:
     """Scan once, in both directions, and take the view.
 
-    board: None where none is to be looked for; passages are then of the whole picture.
+    board: None if none is to be looked for; passages are then of the whole picture.
     seed: of everything simulated.
     exposures: per column; None is as the config says.
-    arm: must be True where laser or gate are real.
+    arm: must be True if laser or gate are real.
     defects: (rows, width), pixels that are not used.
     out: folder to record the scan into; None writes nothing.
-    Raises UsageError for a scan that cannot be, DeviceError or DevicesError where devices fail, as `rig.api.scan`.
+    Raises UsageError for a scan that cannot be done, DeviceError or DevicesError if devices fail, as `rig.api.scan`
+    does.
     """
     settings = _settings(config, exposures, bidirectional=bidirectional)
     if problems := require_simulated_or_armed(settings, arm):
@@ -103,7 +105,7 @@ def capture_view(
 
 
 def capture_recorded(run: Path, name: str, board: Board | None, *, defects: NDArray[np.bool_] | None = None) -> Capture:
-    """Take the view from the first sweeps of a recorded run. UsageError where there is none."""
+    """Take the view from the first sweeps of a recorded run. Raises UsageError if there is none."""
     config = replay_config(run, ReplayOptions("max"), None, {"estimator": "argmax", "filter": "none"})
     if not read_plan(run).windowed:
         config = config.model_copy(update={"calibration": None})
@@ -113,13 +115,13 @@ def capture_recorded(run: Path, name: str, board: Board | None, *, defects: NDAr
 
 
 def plain(config: RigConfig) -> RigConfig:
-    """The config of a scan whose maps nobody wants: its estimator leaves the counts whole."""
+    """The config of a scan of which only the counts are wanted: its estimator keeps them complete."""
     update = {"estimator": "argmax", "filter": "none", "temporal_prior": False}
     return config.model_copy(update={"estimate": config.estimate.model_copy(update=update)})
 
 
 def _settings(config: RigConfig, exposures: int | None, *, bidirectional: bool) -> RigConfig:
-    """The config of a capture. UsageError for a rig of several lines."""
+    """The config of a capture. Raises UsageError for a rig of several lines."""
     if len(config.line_offsets) > 1:
         raise UsageError(
             f"{config.name} has {len(config.line_offsets)} lines (line_offsets); a pixel cannot tell which one passed: "
@@ -233,7 +235,9 @@ def with_board_pose(config: RigConfig, pose: BoardPose) -> RigConfig:
 
 
 def require_live(config: RigConfig | None, ask: AskPerson | None, arm: bool) -> None:
-    """Raise UsageError where a live rig may not shine, or nobody is there to move its board; None is no live rig."""
+    """Raise UsageError if a live rig is not allowed to emit light, or if nobody can move its board. None means no live
+    rig.
+    """
     if config is None:
         return
     problems = require_simulated_or_armed(config, arm)
@@ -247,7 +251,7 @@ def require_live(config: RigConfig | None, ask: AskPerson | None, arm: bool) -> 
 
 
 def shown(config: RigConfig, what: str, pose: Candidate, ask: AskPerson | None, tell: TellLine | None) -> RigConfig:
-    """Get the board to the next pose, which `what` describes, and return the config to capture it with."""
+    """Bring the board to the next pose, which `what` describes, and return the config to capture it with."""
     if world_moves_board(config):
         if tell is not None:
             tell(what)
@@ -258,11 +262,11 @@ def shown(config: RigConfig, what: str, pose: Candidate, ask: AskPerson | None, 
 
 
 Scan = Callable[[int | None], Capture]
-"""A function that takes a view at so many exposures per column; None: the config's. PlanError: it cannot."""
+"""A function that takes a view at so many exposures per column; None: the config's. Raises PlanError if it cannot."""
 
 
 class SpeedRotation:
-    """Takes the views at several speeds by turns."""
+    """Takes successive views at different speeds in turn."""
 
     def __init__(self, exposures: Sequence[int], sees: Callable[[Capture], bool], tell: TellLine | None = None) -> None:
         """Take the exposures per column, none: the config's; `sees` says whether a capture has what it is taken for."""
@@ -272,7 +276,7 @@ class SpeedRotation:
         self._shown: set[int] = set()
 
     def capture(self, pose: int, scan: Scan) -> Capture:
-        """Take the view of a pose at the speed whose turn it is, by the number of the pose."""
+        """Take the view of a pose at the speed whose turn it is. pose: its number, which determines the speed."""
         exposures, capture = self._in_turn(pose, scan)
         if exposures is None or capture.refused is not None:
             return capture

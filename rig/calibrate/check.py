@@ -1,4 +1,4 @@
-"""`rig calibrate check`: judges a calibration by scans of a flat board that it was not made with."""
+"""`rig calibrate check`: judges a calibration by scans of a flat board that was not used for it."""
 
 import math
 from collections.abc import Sequence
@@ -40,7 +40,10 @@ SEED_APART = 1 << 20
 def run_check(
     sources: SourcesLike, request: CheckRequest, *, ask: AskPerson | None = None, tell: TellLine | None = None
 ) -> CalibrationResult:
-    """Check a calibration, note the result beside it. Degenerate: no board; UsageError: views it is made of."""
+    """Check a calibration and note the result beside it.
+
+    Raises Degenerate if the board cannot be used, UsageError if the views were used for the calibration.
+    """
     values = si_values(request)
     stated_rad = values.pop("angle_rad", None)
     found, board = sort_sources(sources, scene=request.scene), read_board(request.board)
@@ -103,7 +106,7 @@ def _require_others(views: Sequence[View], model: RigModel) -> None:
 
 
 def _with_board(taken: ViewCollection, least: int) -> list[View]:
-    """The views that show the board. Degenerate, with the trouble of each view, where they are too few."""
+    """The views that show the board. Raises Degenerate, with the trouble of each view, if they are too few."""
     views = [view for view in taken.views if view.corners is not None]
     if len(views) < least:
         reason = next((why.reason for why in taken.refused.values()), "no-board")

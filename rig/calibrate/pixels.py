@@ -1,11 +1,11 @@
 """`rig calibrate pixels`: maps the pixels from dark frames and compares the map with the last one.
 
 Frames come from the SPAD alone, or are the dark and lit ones of a recorded run. In the dark nothing moves and no light
-leaves: the gate is low, the laser is not armed, the scanner stands. The frames come in short starts spread over a
-while, since rates that jump do so within milliseconds or minutes.
+leaves: the gate is low, the laser is not armed, the scanner rests. The frames come in short starts spread over some
+time, since rates that jump do so within milliseconds or minutes.
 
-The folder: pixels.npz (the map with its version), calibration.yaml (that of the config with the new defects and dark
-rates, where it has one), dark_rate.png, report.html, summary.json. The statistics are in `calibration.pixel_map`.
+The folder has pixels.npz (the map with its version), calibration.yaml (that of the config, if any, with the new defects
+and dark rates), dark_rate.png, report.html and summary.json. The statistics are in `calibration.pixel_map`.
 """
 
 import logging
@@ -87,7 +87,7 @@ Sums = tuple[NDArray[np.int64], NDArray[np.int64]]
 
 @runtime_checkable
 class CoversLens(Protocol):
-    """A world that can put the cap on the lens."""
+    """A world that can cover the lens."""
 
     def cover_lens(self) -> None:
         """Let no light in any more."""
@@ -96,7 +96,7 @@ class CoversLens(Protocol):
 
 @dataclass(slots=True)
 class SweepSums:
-    """Adds up the dark and the lit frames of counted sweeps; `add` fits the `sweeps` option of a scan."""
+    """Adds up the dark and the lit frames of counted sweeps. `add` can be passed as the `sweeps` option of a scan."""
 
     tally: DarkTally | None = None
     lit: Sums | None = None
@@ -121,7 +121,10 @@ def take_dark(
     progress: Progress | None = None,
     covered: Callable[[], None] | None = None,
 ) -> tuple[DarkTally, float]:
-    """Take at least so many frames in the dark, once the lens is `covered`; also their exposure in s. DeviceError."""
+    """Take at least `frames` frames in the dark, once the lens is `covered`; returns also their exposure in s.
+
+    May raise DeviceError.
+    """
     if isinstance(rig.world, CoversLens):
         rig.world.cover_lens()
     elif covered is not None:
@@ -152,7 +155,7 @@ def take_dark(
 
 
 def take_sweeps(rig: OpenRig, maps: int | None = None, progress: Progress | None = None) -> SweepSums:
-    """Take the frames of a scan with light, or of all sweeps of a recording. An interrupt is raised again."""
+    """Take the frames of a scan with light, or of all sweeps of a recording. An interrupt is raised again at the end."""
     scan, sums = rig.config.scan, SweepSums()
 
     def live(now: ScanProgress) -> None:
@@ -228,7 +231,7 @@ class PixelResult:
 
     drift: change since the older map `against`; None without one.
     leak: correlation of neighbouring pixels' rates, a sign of light in the dark frames.
-    folder, calibration: where everything, and the changed calibration, was written; None where it was not.
+    folder, calibration: paths of the folder and of the changed calibration; None if they were not written.
     """
 
     found: PixelVersion
@@ -241,7 +244,7 @@ class PixelResult:
 
     @property
     def exit_code(self) -> int:
-        """Exit code of the command line: 1 where the map is not to be trusted, or the last one no longer holds."""
+        """Exit code of the command line: 1 if the map cannot be trusted or the last one no longer holds."""
         return 0 if self.verdict.passed else EXIT_NOT_TRUSTWORTHY
 
     def rows(self) -> list[tuple[str, str]]:
@@ -349,7 +352,9 @@ def run_pixels(
     progress: Progress | None = None,
     covered: Callable[[], None] | None = None,
 ) -> PixelResult:
-    """Map the pixels of a rig, its lens `covered`, or of a recorded run's frames. Raises UsageError, DeviceError."""
+    """Map the pixels of a rig, once its lens is `covered`, or of a recorded run's frames. Raises UsageError or
+    DeviceError.
+    """
     recorded, frames = _recorded(source), request.frames
     config = plain(replay_config(recorded, ReplayOptions(), None, {}) if recorded else configure(source))
     problems = [] if not request.light or recorded else require_simulated_or_armed(config, request.arm)
@@ -408,7 +413,7 @@ def _sensor(rig: OpenRig) -> str:
 
 
 def _last(against: PathLike | None, config: RigConfig, recorded: Path | None) -> PixelVersion | None:
-    """The older map to compare with; None where there is none. UsageError where a file was named that is no map."""
+    """The older map to compare with; None if there is none. Raises UsageError if a file was named that is no map."""
     if against is not None:
         path = Path(against)
         path = path / PIXELS_FILE if path.is_dir() else path
@@ -444,7 +449,7 @@ def _note(config: RigConfig, drift: PixelDrift) -> None:
 
 
 def _written(result: PixelResult, folder: RunFolder, calibration: Path | None) -> PixelResult:
-    """Write the folder's files. UsageError where they cannot be written."""
+    """Write the folder's files. Raises UsageError if they cannot be written."""
     pixels = result.found.pixels
     try:
         save_pixels(result.found, folder.place(PIXELS_FILE))

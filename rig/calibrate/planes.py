@@ -1,7 +1,7 @@
 """`rig calibrate planes`: calibrates the whole rig, camera, mirror and lag together, from views of a board.
 
-In the guided mode (`PoseGuide`) the rig is fitted after each view, and the pose is asked for that lowers the expected
-error most.
+In the guided mode (`PoseGuide`) the rig is fitted after each view, and the pose that lowers the expected error most is
+asked for next.
 """
 
 from collections.abc import Callable, Mapping, Sequence
@@ -53,7 +53,9 @@ the line in bright light only, so that it is tried only where it is the config's
 def run_planes(
     sources: SourcesLike, request: PlanesRequest, *, ask: AskPerson | None = None, tell: TellLine | None = None
 ) -> CalibrationResult:
-    """Calibrate the planes; the base's defects are kept. Degenerate, with notes why, where the views make none."""
+    """Calibrate the planes; the defects of the base calibration are kept. Raises Degenerate, with notes why, if the
+    views give none.
+    """
     values = si_values(request)
     found = sort_sources(sources, scene=request.scene)
     camera = None if request.camera is None else camera_use(Path(request.camera), accept=request.accept_calibration)
@@ -104,7 +106,7 @@ def run_planes(
 
 
 def speeds_of(live: RigConfig) -> tuple[int, ...]:
-    """Exposures per column for a rig's views, by turns."""
+    """Numbers of exposures per column for a rig's views, to be used in turn."""
     return tuple(dict.fromkeys(max(least, round(times * live.scan.exposures)) for times, least in SPEEDS))
 
 
@@ -235,7 +237,7 @@ START_POSES = 3
 
 
 class PoseGuide:
-    """Chooses poses by how much they lower the expected error, until the accuracy asked for is expected."""
+    """Chooses poses by how much they lower the expected error, until that reaches the required accuracy."""
 
     def __init__(
         self, start: ChoosePose, board: Board, depth_range_m: tuple[float, float], taken: ViewCollection,
@@ -251,7 +253,7 @@ class PoseGuide:
         self._asked: set[tuple[float, tuple[int, int], tuple[int, int]]] = set()
 
     def next(self, views: Sequence[View]) -> Advice | None:
-        """The next pose; None where the expected error is small enough."""
+        """The next pose; None once the expected error is small enough."""
         known = self._taken.views
         told = self._told() if len(known) >= START_POSES else None
         if told is None:
@@ -275,7 +277,7 @@ class PoseGuide:
         return advice
 
     def _told(self) -> tuple[RigFit, JudgedRig] | None:
-        """Fit and judge the views so far; None where they make no model yet, or its line misses the distance asked."""
+        """Fit and judge the views so far; None if they make no model yet, or its line misses the distance asked."""
         try:
             fit = self._fitted()
             return fit, self._judged(fit)

@@ -1,8 +1,8 @@
 """Writes the reports of `rig calibrate`, one HTML file each: verdict and reasons first, then the pictures.
 
-`planes_report`, `camera_report`, `check_report`, `sync_report` and `pixel_page` make them from `page`, its tables,
-pictures and charts; nothing is loaded from elsewhere. Numbers have their units and as many digits as are known.
-`subject` says what a report is of, so that two of them on a desk can be told apart.
+`planes_report`, `camera_report`, `check_report`, `sync_report` and `pixel_page` make them from `page` and its tables,
+pictures and charts; nothing is loaded from elsewhere. Numbers have units and only the digits that are known. `subject`
+says what a report is about, so that printed reports are not confused.
 """
 
 import base64
@@ -65,7 +65,7 @@ def page(
     sections: Sequence[ReportSection],
     about: Sequence[tuple[str, str]] = (),
 ) -> str:
-    """Make the HTML file: verdict with its reasons, the one line that matters, the figures, `about`, the sections."""
+    """Make the HTML file: verdict with its reasons, a summary line, the figures, `about`, the sections."""
     parts = [
         f'<!DOCTYPE html>\n<html lang="en"><head><meta charset="utf-8"><title>{escape(title)}</title>',
         f"<style>{_STYLE}</style></head><body><h1>{escape(title)}</h1>",
@@ -84,7 +84,7 @@ def paragraph(text: str, *, small: bool = False) -> str:
 
 
 def table(head: Sequence[str], rows: Sequence[Sequence[str]]) -> str:
-    """Make a table; columns whose cells are all numbers, or dashes in their place, are aligned right."""
+    """Make a table. Columns of numbers (or dashes in their place) are aligned right."""
     numbers = [bool(rows) and all(_NUMBER.fullmatch(row[i]) for row in rows) for i in range(len(head))]
 
     def cells(row: Sequence[str], tag: str) -> str:
@@ -97,7 +97,7 @@ def table(head: Sequence[str], rows: Sequence[Sequence[str]]) -> str:
 
 
 def picture(pixels: Picture, caption: str) -> str:
-    """Show a picture, BGR or grey, with a caption below it."""
+    """Embed a picture, BGR or grey, with a caption below it."""
     data = base64.b64encode(png_bytes(pixels)).decode()
     return f'<img alt="{escape(caption)}" src="data:image/png;base64,{data}">{paragraph(caption, small=True)}'
 
@@ -118,7 +118,7 @@ _UNITS = {
 
 
 def measured(name: str, value: float, sd: float) -> tuple[str, str, str]:
-    """Value and standard deviation of a model's term, to the second digit of the latter, and their unit."""
+    """Value and standard deviation of a model's term, rounded to two digits of the latter, and their unit."""
     first = name.split("/", maxsplit=1)[0]
     kind, _, order = first.rpartition("_") if first[-1].isdigit() else (first, "", "")
     unit, times = next((_UNITS[key] for key in (first, kind, kind.split("_")[0]) if key in _UNITS), ("", 1.0))
@@ -130,7 +130,7 @@ def measured(name: str, value: float, sd: float) -> tuple[str, str, str]:
 
 
 def in_mm_with_sign(length_m: float) -> str:
-    """A length with its sign in millimetres, such as '+3.1', for a table whose head names the unit."""
+    """A length with its sign in millimetres, such as '+3.1', for a table whose head gives the unit."""
     return f"+{in_mm(length_m)}" if length_m > 0 else in_mm(length_m)
 
 
@@ -180,7 +180,7 @@ def view_colour(view: int) -> tuple[int, int, int]:
 
 
 def coverage_picture(names: Sequence[str], corners_px: Sequence[Array], size: tuple[int, int]) -> Picture:
-    """Draw the corners of all views in the outline of the picture (width, height), in colours and with names."""
+    """Draw the corners of all views within the outline of the picture (width, height), with colours and names."""
     picture, scale = _sheet(size)
     for i, (name, corners) in enumerate(zip(names, corners_px, strict=True)):
         for x, y in corners:
@@ -194,7 +194,7 @@ def coverage_picture(names: Sequence[str], corners_px: Sequence[Array], size: tu
 def residual_picture(
     corners_px: Sequence[Array], residuals_px: Sequence[Array], size: tuple[int, int]
 ) -> tuple[Picture, int]:
-    """Draw arrows from corners along their residuals; returns also how many times too long they are drawn."""
+    """Draw arrows from corners along their residuals; returns also the factor by which they are enlarged."""
     picture, scale = _sheet(size)
     lengths = np.concatenate([np.hypot(*residual.T) for residual in residuals_px if len(residual)] or [np.ones(1)])
     typical = float(np.percentile(lengths, 90)) * scale
@@ -208,14 +208,14 @@ def residual_picture(
 
 
 def error_picture(uncertainty: DepthUncertainty) -> Picture:
-    """Draw the expected depth error, red where it is large, black where the scan does not reach at this depth."""
+    """Draw the expected depth error, red where it is large, black where the scan does not reach this depth."""
     large = _enlarged_mm(uncertainty.sd_m)
     limits = depth_limits(large)
     return depth_picture(large, None if limits is None else (limits[1], limits[0]), unit="mm")  # red: large
 
 
 def cells_picture(cells_m: Array) -> Picture:
-    """Draw how far a board's squares lie off their plane: red in front of it, black where they were not scanned."""
+    """Draw the deviations of a board's squares from their plane: red in front of it, black where they were not scanned."""
     large = _enlarged_mm(cells_m)
     known = large[np.isfinite(large)]
     most = max(float(np.abs(known).max()), 1e-3) if known.size else 1.0
@@ -244,7 +244,9 @@ _WAYS = {1: "rising command", -1: "falling command"}
 
 
 def plane_residuals(waves: SweepWaves, sweeps: Sequence[SweepFit], metres_per_command: float, at_m: float) -> str:
-    """Chart (SVG) of each sweep's median residuals over the command, in mm of depth at `at_m`, a panel each way."""
+    """Chart (SVG) of each sweep's median residuals over the command, in mm of depth at `at_m`, with a panel per
+    direction.
+    """
     views = list(dict.fromkeys(sweep.view for sweep in sweeps))
     panels = [
         Panel(
@@ -283,7 +285,7 @@ Figures = Sequence[tuple[str, str]]
 def planes_report(
     fit: RigFit, views: Sequence[View], judged: JudgedRig, line: str, figures: Figures, about: Figures = ()
 ) -> str:
-    """Report on a calibration of camera and planes. about: rows of `subject`, as in the other reports."""
+    """Make the report on a calibration of camera and planes. about: rows of `subject`, as in the other reports."""
     by_name = {view.name: view for view in views}
     used = [by_name[name] for name in fit.views]
     planes = plane_residuals(judged.waves, fit.every_sweep, judged.sensitivity.per_command_m, judged.asked.at_m)
@@ -298,7 +300,7 @@ def planes_report(
 
 
 def camera_sections(camera: Camera, views: Sequence[View], residuals_px: Sequence[Array]) -> list[ReportSection]:
-    """Sections with the places where corners were seen and their distances from the model's."""
+    """Sections that show where corners were seen and their distances from the model's corners."""
     size = (camera.width, camera.height)
     seen = [corners_px(view) for view in views]
     coverage = coverage_picture([view.name for view in views], seen, size)
@@ -327,7 +329,7 @@ def camera_report(
     figures: Figures,
     about: Figures = (),
 ) -> str:
-    """Report on a calibration of the camera alone. views: those that the fit used."""
+    """Make the report on a calibration of the camera alone. views: those that the fit used."""
     seen = [corners_px(view) for view in views]
     rows = [
         (
@@ -352,7 +354,7 @@ def check_report(
     figures: Figures,
     about: Figures = (),
 ) -> str:
-    """Report on a check of a calibration."""
+    """Make the report on a check of a calibration."""
     sections = []
     for board in boards:
         caption = "How far the board's squares lie off their plane, negative and red: in front; black: not scanned."
@@ -371,7 +373,7 @@ def check_report(
 
 
 def sync_report(fit: SyncFit, verdict: Verdict, line: str, figures: Figures, about: Figures = ()) -> str:
-    """Report on lags and delays."""
+    """Make the report on a calibration of lags and delays."""
     rows = [
         (
             "up" if sweep.direction > 0 else "down",
@@ -439,7 +441,9 @@ _DEAD_BGR = (0, 0, 0)
 
 
 def dark_rate_picture(pixels: PixelMap) -> NDArray[np.uint8]:
-    """Dark rates (rows, width, 3) BGR, logarithmic from a third of the usual rate on; dead pixels black."""
+    """Dark rates as a picture (rows, width, 3) BGR, logarithmic from a third of the usual rate on; dead pixels are
+    black.
+    """
     rate = np.nan_to_num(pixels.rate_per_s, nan=0.0).astype(np.float64)
     low = max(pixels.ordinary_per_s / 3, 1e-3)
     high = max(float(rate.max(initial=0.0)), 10 * low)
@@ -457,7 +461,7 @@ def pixel_page(
     drift: PixelDrift | None,
     against: PixelVersion | None,
 ) -> str:
-    """Report on a map of the pixels: the map, the distribution of the rates beside the older one, and what changed."""
+    """Make the report on a map of the pixels: the map, the distribution of rates beside the older one, and the changes."""
     middle = pixels.ordinary_per_s
     fastest = float(np.nanmax(pixels.rate_per_s))
     caption = f"Dark rate of each pixel, {digits(middle / 3)} to {digits(fastest)} counts/s on a logarithmic scale."
@@ -478,7 +482,7 @@ def pixel_page(
 
 
 def rate_chart(pixels: PixelMap, older: PixelMap | None = None) -> str:
-    """Chart (SVG) of how many pixels have which dark rate, and from where on they are hot."""
+    """Chart (SVG) of the number of pixels by dark rate, with the limit above which they are hot."""
     maps = [(pixels, "this map", _NEW), *([(older, "the last one", _OLD)] if older is not None else [])]
     rates = [one.rate_per_s[np.isfinite(one.rate_per_s)].astype(np.float64) for one, _, _ in maps]
     # Pixels that never fired stand at half a count.

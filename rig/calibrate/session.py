@@ -1,15 +1,15 @@
-"""The folder of a calibration: its views are written as they come and stay, whatever becomes of the rest.
+"""The folder of a calibration. Views are written as they come and are kept even if the calibration fails.
 
     views/000.npz ...  rig.json (whose they are)  board.yaml (of what)  calibration.yaml (+ .npy)  report.html
     summary.json
 
-`Session` writes it, `CalibrationResult` is what a calibration gives back. A session that was interrupted, or whose
-views made no calibration, leaves its views, which are a source for the next. A view's file, `views/000.npz`, has all
-that a fit needs of a pose, and is there whole or not at all:
+`Session` writes it; `CalibrationResult` is what a calibration returns. A session that was interrupted, or whose views
+gave no calibration, leaves its views, which can be a source for the next. A view's file, `views/000.npz`, has all that
+a fit needs of a pose. It is written completely or not at all:
 
-    format_version () int   name () str   picture (height, width) float32, where there is one
-    corner_ids (n,) int32   corner_px (n, 2) float64   corner_sd_px (n,) float64, where the board was found passages_0
-    (4, m) float64: x_px, y_px, command, sd   sweep_0 (2,) float64: direction, speed_per_s   passages_1 ...
+    format_version () int   name () str   picture (height, width) float32, if there is one
+    corner_ids (n,) int32   corner_px (n, 2) float64   corner_sd_px (n,) float64, if the board was found
+    passages_0 (4, m) float64: x_px, y_px, command, sd   sweep_0 (2,) float64: direction, speed_per_s   passages_1 ...
 """
 
 import io
@@ -48,7 +48,7 @@ BOARD_FILE = "board.yaml"
 
 
 def session_rig(folder: Path) -> Identity | None:
-    """The rig that the views of a session are of; None where it does not say."""
+    """The rig of a session's views; None if the session does not say."""
     try:
         content = parse_json((folder / RIG_FILE).read_text(encoding="utf-8"))
         return Identity(**{**content, "reasons": tuple(content["reasons"])})
@@ -59,23 +59,23 @@ def session_rig(folder: Path) -> Identity | None:
 
 
 def session_board(folder: Path) -> Board | None:
-    """The board that a session's corners are of; None where no board was looked for."""
+    """The board of a session's corners; None if no board was looked for."""
     file = folder / BOARD_FILE
     return load_board(file) if file.is_file() else None
 
 
 class Session:
-    """Writes the views of a calibration one by one, then what was made of them."""
+    """Writes the views of a calibration one by one, then the result."""
 
     def __init__(self, out: OutFolder, board: Board | None = None) -> None:
-        """Claim the folder; None writes nothing. board: what the views show. UsageError where it cannot be claimed."""
+        """Claim the folder; None writes nothing. board: what the views show. Raises UsageError if it cannot be claimed."""
         self._board = board
         self._folder = None if out is None else RunFolder(out, in_place=True)
         self._views = 0
 
     @property
     def path(self) -> Path | None:
-        """Path of the folder; None where nothing is written."""
+        """Path of the folder; None if nothing is written."""
         return None if self._folder is None else self._folder.path
 
     def __enter__(self) -> Self:
@@ -96,7 +96,7 @@ class Session:
         self._folder.discard()
 
     def note_rig(self, identity: Identity) -> None:
-        """Write which rig the views are of."""
+        """Write to which rig the views belong."""
         if self._folder is not None:
             self._folder.write_json(RIG_FILE, asdict(identity))
 
@@ -118,7 +118,7 @@ class Session:
     def finish(
         self, summary: dict[str, Any], report: str, model: RigModel | None, made_from: LoadedCalibration | None = None
     ) -> Path | None:
-        """Write what was made of the views, with notes on the calibration it was made from; return its file, if any."""
+        """Write the result, with notes on the calibration it was made from; return the new calibration's file, if any."""
         if self._folder is None:
             return None
         file = None
@@ -152,11 +152,11 @@ EXIT_NOT_TRUSTWORTHY = 1
 class CalibrationResult:
     """Result of `rig calibrate camera`, `planes`, `sync` and `check`.
 
-    line: the one line that matters, such as 'at 5 m: 8 mm, 6 of them from the baseline'.
+    line: the result in one line, such as 'at 5 m: 8 mm, 6 of them from the baseline'.
     figures: for people, (name, text).
-    summary: for programs; what summary.json holds.
-    model: the calibrated or checked model; None where only a camera was calibrated.
-    folder, calibration: where they were written; None where they were not.
+    summary: for programs; the content of summary.json.
+    model: the calibrated or checked model; None if only a camera was calibrated.
+    folder, calibration: where they were written; None if they were not.
     """
 
     verdict: Verdict
@@ -169,7 +169,7 @@ class CalibrationResult:
 
     @property
     def exit_code(self) -> int:
-        """Exit code of the command line: 0 for a calibration to be used, 1 for one whose verdict failed."""
+        """Exit code of the command line: 0 for a usable calibration, 1 if its verdict failed."""
         return 0 if self.verdict.passed else EXIT_NOT_TRUSTWORTHY
 
     def rows(self) -> list[tuple[str, str]]:
@@ -182,12 +182,12 @@ class CalibrationResult:
 
 
 def named(names: Sequence[str]) -> str:
-    """The number of these names, and the names, as text."""
+    """The number of these names, followed by the names, as text."""
     return f"{len(names)} ({', '.join(names)})" if names else "0"
 
 
 def true_model(live: RigConfig) -> RigModel | None:
-    """The rig as its world knows it; None for a real one. It is asked after everything was estimated."""
+    """The rig as its world knows it; None for a real one. Called only after everything was estimated."""
     if live.world is None:
         return None
     with open_rig(live.model_copy(update={"calibration": None})) as rig:
@@ -195,7 +195,7 @@ def true_model(live: RigConfig) -> RigModel | None:
 
 
 def true_errors(model: RigModel, live: RigConfig, at_m: float) -> DepthErrors | None:
-    """Errors of depth against the rig's world; None for a real rig."""
+    """True depth errors, from the rig's world; None for a real rig."""
     truth = true_model(live)
     if truth is None:
         return None
@@ -204,7 +204,7 @@ def true_errors(model: RigModel, live: RigConfig, at_m: float) -> DepthErrors | 
 
 
 def truth_content(errors: DepthErrors) -> dict[str, Any]:
-    """Describe the true errors for the summary."""
+    """The true errors as plain values for the summary."""
     return {
         "at_m": errors.depth_m,
         "median_m": errors.median_m,
@@ -218,7 +218,7 @@ Arrays = Mapping[str, NDArray[Any]]
 
 
 def save_view(view: View, file: Path) -> None:
-    """Write a view, in one step. UsageError where it cannot be written."""
+    """Write a view in one step. Raises UsageError if it cannot be written."""
     stream = io.BytesIO()
     np.savez_compressed(stream, allow_pickle=False, **_arrays(view))
     part = file.with_name(f".{file.name}.part")
@@ -233,7 +233,7 @@ def save_view(view: View, file: Path) -> None:
 
 
 def load_view(file: Path) -> View:
-    """Read a view. UsageError where the file holds none."""
+    """Read a view. Raises UsageError if the file holds none."""
     try:
         with load_numpy(file) as arrays:
             version = int(arrays["format_version"])
@@ -245,7 +245,7 @@ def load_view(file: Path) -> View:
 
 
 def load_views(folder: Path) -> tuple[View, ...]:
-    """Read all views of a folder, in the order of their files. UsageError without any, or for a damaged one."""
+    """Read all views of a folder, in the order of their files. Raises UsageError if there are none or one is damaged."""
     files = sorted(folder.glob("*.npz"))
     if not files:
         raise UsageError(f"{folder} holds no view (*.npz); name the folder of an earlier calibration")

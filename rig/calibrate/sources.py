@@ -1,7 +1,7 @@
-"""Reads what a calibrating call is given: sources of views, files and quantities. All problems are listed together.
+"""Reads the inputs of a calibration: sources of views, files and quantities. All problems are listed together.
 
 A source is a live or simulated rig, a recorded run, a session with views kept earlier, or a file of pictures.
-`camera_use` decides by its verdict whether a camera of its own may go into a calibration of the planes.
+`camera_use` decides by its verdict whether a separately calibrated camera may be used to calibrate the planes.
 """
 
 import os
@@ -35,7 +35,9 @@ SourcesLike = Config | Sequence[Config]
 
 @dataclass(frozen=True, slots=True)
 class ViewSources:
-    """Sources of views in the order in which they were named; the rig, if any, that takes new ones; lines on them."""
+    """Sources of views in the order in which they were named; the rig, if any, that takes new ones; and messages about
+    them.
+    """
 
     live: RigConfig | None
     sessions: tuple[Path, ...] = ()
@@ -45,10 +47,10 @@ class ViewSources:
 
 
 def sort_sources(sources: SourcesLike, *, pictures: bool = False, scene: str | None = None) -> ViewSources:
-    """Tell what each source is; without any it is the bundled simulated rig.
+    """Find out what each source is. Without any, the bundled simulated rig is used.
 
-    scene: of a simulated rig; None is its own or, where that has no board, the bundled one with a board. Raises
-    UsageError with a line per problem, DeviceError where a scene cannot be read.
+    scene: of a simulated rig. None is its own or, if that has no board, the bundled one with a board. Raises UsageError
+    with a line per problem, DeviceError if a scene cannot be read.
     """
     live: list[RigConfig] = []
     sessions: list[Path] = []
@@ -136,7 +138,7 @@ _QUANTITIES = {
 
 
 def si_values(request: CalibrationRequest) -> dict[str, float]:
-    """The quantities that a request states, in SI units. UsageError, a line per problem: those that cannot be."""
+    """The quantities that a request states, in SI units. Raises UsageError with a line for each that cannot be used."""
     exposures, poses = getattr(request, "exposures", ()), getattr(request, "poses", 1)
     problems = [f"exposures has {k}; it must be at least 1" for k in exposures if k < 1]
     if poses < 1:
@@ -161,18 +163,20 @@ def si_values(request: CalibrationRequest) -> dict[str, float]:
 
 @dataclass(frozen=True, slots=True)
 class CameraUse:
-    """A camera that is known from elsewhere. accepted: reasons in spite of which it is used."""
+    """A camera that was calibrated before. accepted: reasons in spite of which it is used."""
 
     known: KnownCamera
     accepted: tuple[Refusal, ...] = ()
 
     def content(self) -> dict[str, Any]:
-        """Describe it for the provenance of a calibration made with it."""
+        """The camera's use as plain values, for the provenance of a calibration made with it."""
         return check_content("unchecked" if self.known.verdict is None else "passed", self.accepted)
 
 
 def camera_use(file: Path, *, accept: bool = False) -> CameraUse:
-    """Read a camera file. UsageError where its verdict failed, unless `accept`; without one it is used unchecked."""
+    """Read a camera file. Raises UsageError if its verdict failed, unless `accept`. A file without a verdict is used
+    unchecked.
+    """
     known = load_camera(file)
     found = failed_verdict(known.verdict, known.reasons)
     require_accepted(f"camera {file}", found, {each.code for each in found} if accept else ())

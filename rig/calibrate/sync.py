@@ -1,13 +1,14 @@
-"""`rig calibrate sync`: lag of the mirror each way and delay of the rows, from one unmoved scene at several speeds.
+"""`rig calibrate sync`: lag of the mirror in each direction and delay of the rows, from one unmoved scene at several
+speeds.
 
-`run_sync` measures them. `gate_delay` measures how late the light follows the gate, from the frames of a recorded run
-at the two ends of its sweeps. The plan says when the gate opens and closes after the scan marker; the frames say when
-the light does. A pattern generator, a long cable and a laser's driver each add to that. What is seen is the sum, on the
-SPAD's clock; the line has to be in the picture where the gate opens or closes.
+`run_sync` measures them. `gate_delay` measures how much later than the gate the light comes and goes, from the frames
+of a recorded run at both ends of its sweeps. The plan says when the gate opens and closes after the scan marker; the
+frames show when the light does. A pattern generator, a long cable and a laser's driver each add to the delay. Only
+their sum is seen, on the SPAD's clock. The line must be in the picture when the gate opens or closes.
 
-A line so bright that pixels saturate makes a frame that is lit for a part of its exposure look lit for more, and tells
-little of the moment within it. Saturation shows in the pixels that fire in two frames in succession; the line's motion
-from one frame to the next makes these fewer, by as much as the frame after the next one shows.
+If the line is so bright that pixels saturate, a frame lit for part of its exposure looks lit for longer, and tells
+little about the time within it. Saturation shows in the pixels that fire in two successive frames. The motion of the
+line from frame to frame reduces their number; the frame after the next one shows by how much.
 """
 
 import math
@@ -65,9 +66,9 @@ MOST_SWEEPS = 20
 
 @dataclass(frozen=True, slots=True)
 class GateDelay:
-    """Delay of the light against the gate of a plan, in seconds.
+    """Delay of the light after the gate of a plan, in seconds.
 
-    opens_s, closes_s: how much later than planned; NaN where the line was not in the picture then. opens_sd_s,
+    opens_s, closes_s: how much later than planned; NaN if the line was not in the picture then. opens_sd_s,
     closes_sd_s: their standard deviations. edges: number of edges seen.
     """
 
@@ -79,17 +80,20 @@ class GateDelay:
 
     @property
     def delay_s(self) -> float:
-        """Mean of both delays; NaN where one was not seen."""
+        """Mean of both delays; NaN if one was not seen."""
         return (self.opens_s + self.closes_s) / 2
 
     @property
     def sd_s(self) -> float:
-        """Standard deviation of the mean; NaN where one was not seen."""
+        """Standard deviation of the mean; NaN if one was not seen."""
         return math.hypot(self.opens_sd_s, self.closes_sd_s) / 2
 
 
 def run_sync(sources: SourcesLike, request: SyncRequest, *, tell: TellLine | None = None) -> CalibrationResult:
-    """Measure the lags, for a copy of the model if there is one. Degenerate, CalibrationError: they cannot be told."""
+    """Measure the lags and put them into a copy of the model, if there is one.
+
+    Raises Degenerate or CalibrationError if they cannot be determined.
+    """
     values = si_values(request)
     found, file = sort_sources(sources, scene=request.scene), request.calibration
     live = found.live
@@ -213,7 +217,7 @@ def _figures(fit: SyncFit, gate: GateDelay | None, truth: RigModel | None) -> Se
 
 
 def gate_delay(run: Path) -> GateDelay | None:
-    """Measure the gate's delay in a recorded run; None without markers, where the light itself gives the time."""
+    """Measure the gate's delay in a recorded run; None without markers, since the light itself then gives the time."""
     plan = read_plan(run)
     if plan.blanking is not None:
         return None

@@ -1,8 +1,8 @@
-"""Takes views from all sources: kept as they come, none of them twice, all of one rig.
+"""Takes views from all sources. They are stored as they come; no view is taken twice, and all must be of one rig.
 
 `ViewCollection` holds them. `take_live` takes them with a live rig, pose by pose, as `LiveViewOptions` says;
 `take_kept` takes those of earlier sessions, recorded runs and pictures. `told` and `refusal` are the messages about
-views, and about views that make no calibration.
+views, and about views that give no calibration.
 """
 
 import math
@@ -38,7 +38,7 @@ from rig.progress import part, tell_stage
 
 
 class ViewCollection:
-    """The views taken so far; those without corners with the reason; the rig they are of (None: not known)."""
+    """The views taken so far; the reasons for those without corners; and the rig they belong to (None if unknown)."""
 
     def __init__(self, session: Session, tell: TellLine | None = None, of_camera: Collection[str] = ()) -> None:
         """Take what keeps the views, what gets a line on each, and the digests of views that a camera was made of."""
@@ -57,7 +57,7 @@ class ViewCollection:
         identity: Identity | None = None,
         source: Path | None = None,
     ) -> None:
-        """Add a view from a file or run, with a name of its own. UsageError for one that would count twice."""
+        """Add a view from a file or run under a name of its own. Raises UsageError for one that would count twice."""
         self._require_new(view, str(source or view.name))
         if view.name in [known.name for known in self.views]:
             view = replace(view, name=f"{view.name}-{len(self.views)}")
@@ -102,12 +102,12 @@ class ViewCollection:
         self.identity = identity
 
     def add_capture(self, capture: Capture, source: Path | None = None) -> None:
-        """Add the view of a scan; source: the run, where it was recorded."""
+        """Add the view of a scan. source: the run, if it was recorded."""
         self.add(capture.view, capture.refused, capture.identity, source)
 
     @property
     def size(self) -> tuple[int, int]:
-        """(width, height) of the pictures. UsageError where views are of different sizes."""
+        """(width, height) of the pictures. Raises UsageError if views differ in size."""
         sizes = {view.picture.shape[::-1] for view in self.views if view.picture is not None}
         if len(sizes) != 1:
             named = ", ".join(f"{width} x {height}" for width, height in sorted(sizes)) or "none"
@@ -128,16 +128,16 @@ LASTING = (["wrong-board"] * 3, ["mirrored"] * 3)
 
 
 ChoosePose = Callable[[Sequence[View]], Advice | None]
-"""A function that says which pose to show after these views; None where no more are needed."""
+"""A function that says which pose to show after these views; None if no more are needed."""
 
 
 def in_order(poses: Sequence[Advice]) -> ChoosePose:
-    """Choose the poses of a sequence one after the other."""
+    """A function that chooses the poses of a sequence one after the other."""
     return lambda views: poses[len(views)] if len(views) < len(poses) else None
 
 
 def require_poses(taken: ViewCollection, poses: int) -> None:
-    """Raise UsageError where so many poses, with the views taken already, are too few whatever they show."""
+    """Raise UsageError if this number of poses, with the views taken already, is too small whatever they show."""
     there = sum(view.corners is not None for view in taken.views)
     if there + poses < FEWEST_POSES:
         beside = f" and {there} view{'s' * (there > 1)} taken before" if there else ""
@@ -147,7 +147,7 @@ def require_poses(taken: ViewCollection, poses: int) -> None:
 
 
 def good_poses(config: RigConfig, board: Board, poses: int, at_m: float, seed: int, behind: int = 0) -> list[Advice]:
-    """Choose poses that tell most about any rig, some to spare; `behind` of the sequence were shown before."""
+    """Poses that tell most about any rig, with some to spare. behind: number of poses of the sequence already shown."""
     choices = candidates(first_camera(config), board, config.scan.depth_range)
     if not choices:
         raise UsageError(f"no pose of a board of {board.size_m[0]:g} x {board.size_m[1]:g} m fits the picture within "
@@ -157,7 +157,7 @@ def good_poses(config: RigConfig, board: Board, poses: int, at_m: float, seed: i
 
 
 def first_camera(config: RigConfig) -> Camera:
-    """A camera to place boards with: that of the config's calibration, or a rough one of the sensor's size."""
+    """A camera for placing boards: that of the config's calibration, or a rough one of the sensor's size."""
     if config.calibration is not None:
         try:
             return load_rig_model(config.calibration).camera
@@ -171,9 +171,9 @@ def first_camera(config: RigConfig) -> Camera:
 class LiveViewOptions:
     """Settings of `take_live`: views with a live rig.
 
-    poses: number of good views wanted. choose: chooses the poses. ask: gets a person to move the board.
-    exposures: per column, by turns, so that the mirror is seen at several speeds; speeds that the rig cannot do are
-      left out, and those that never show the line where more exposures do; empty is as the config says.
+    poses: number of good views wanted. choose: chooses the poses. ask: asks a person to move the board.
+    exposures: per column, used in turn, so that the mirror is seen at several speeds; speeds that the rig cannot do are
+      left out, and those that never show the line although more exposures do; empty is as the config says.
     line: whether the line has to be seen on the board. defects: (rows, width), pixels that are not used. seed: of
       everything simulated.
     """
@@ -189,7 +189,7 @@ class LiveViewOptions:
     line: bool = True
 
     def sees(self, capture: Capture) -> bool:
-        """Whether a capture has what it was taken for."""
+        """Whether a capture shows the board and, if required, the line."""
         return capture.refused is None and (not self.line or shows_line(capture.view))
 
 
@@ -228,7 +228,9 @@ def _scan(
 def take_kept(
     taken: ViewCollection, sources: ViewSources, board: Board | None, defects: NDArray[np.bool_] | None = None
 ) -> None:
-    """Take the views that need no live rig, without `defects` (rows, width). board: None where nothing moves."""
+    """Take the views that need no live rig. defects: (rows, width), pixels that are not used. board: None if nothing
+    moves.
+    """
     for note in sources.notes:
         taken.say(note)
     for folder in sources.sessions:
@@ -282,7 +284,10 @@ def _pictured(file: Path, board: Board | None) -> tuple[View, Degenerate | None]
 def refusal(
     refused: Degenerate, taken: ViewCollection, board: Board, *, photons: bool = True, line: bool = True
 ) -> Degenerate:
-    """The error for views that make no calibration: its root cause; notes: all else. Others: as `judge_refused`."""
+    """The error for views that give no calibration, with its root cause, and everything else in notes.
+
+    The other arguments are as in `judge_refused`.
+    """
     refused = _of_views(refused, taken)
     reasons = judge_refused(refused, taken.views, board, taken.size, photons=photons, line=line).reasons
     error = Degenerate(reasons[0].code, str(reasons[0]))
@@ -296,7 +301,7 @@ def refusal(
 
 
 def note_views(error: Degenerate, taken: ViewCollection) -> None:
-    """Add the trouble of single views as notes, unless it was told when they were taken."""
+    """Add the problems of single views as notes, unless they were reported when the views were taken."""
     for name, why in taken.refused.items() if taken.tell is None else ():
         error.add_note(f"view {name}: {why}")
 
@@ -310,7 +315,7 @@ def _of_views(refused: Degenerate, taken: ViewCollection) -> Degenerate:
 
 
 def told(view: View, refused: Degenerate | None) -> str:
-    """Describe a view in one line: what is seen in it or, where it was `refused`, why it has no corners."""
+    """Describe a view in one line: what is seen in it or, if it was `refused`, why it has no corners."""
     if refused is not None:
         return f"view {view.name}: {refused}"
     parts = [] if view.corners is None else [f"{len(view.corners.ids)} corners"]

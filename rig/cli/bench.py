@@ -52,7 +52,7 @@ def bench_command(
 
 
 def warmup_command(config: ConfigArgument = "simulated", as_json: JsonOption = False) -> int:
-    """Compile everything that is compiled, so that no scan waits for it."""
+    """Compile all code that needs compiling, so that no scan waits for it."""
     with progress():
         seconds = api.warm_up(config)
     if as_json:

@@ -26,7 +26,7 @@ SourcesArgument = Annotated[
 
 
 def ask_at_terminal() -> "AskPerson | None":
-    """A callback that asks the person at the terminal; None where nobody is there."""
+    """A callback that asks the person at the terminal; None if there is no terminal."""
     if not sys.stdin.isatty():
         return None
 
@@ -96,7 +96,7 @@ def planes_command(request: PlanesRequest, sources: SourcesArgument = None, as_j
 
 @asks(SyncRequest)
 def sync_command(request: SyncRequest, sources: SourcesArgument = None, as_json: JsonOption = False) -> int:
-    """Measure the mirror's lag each way and the rows' delay, from one unmoved scene at several speeds."""
+    """Measure the mirror's lag in each direction and the rows' delay, from one unmoved scene at several speeds."""
     with progress():
         result = api.calibrate_sync(sources or (), request, tell=say)
     return print_report(result, as_json)

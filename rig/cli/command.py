@@ -1,4 +1,4 @@
-"""The frame of every command: errors become lines and exit codes, results become text or one JSON object.
+"""The common part of every command: errors become lines and exit codes, results become text or one JSON object.
 
 Options that several commands have are defined here too.
 """
@@ -28,7 +28,7 @@ if TYPE_CHECKING:
 else:
 
     class _Api:
-        """The module `rig.api`, which is imported where a command first calls something of it."""
+        """The module `rig.api`, imported when a command first uses it."""
 
         def __getattr__(self, name: str) -> Any:
             return getattr(import_module("rig.api"), name)
@@ -91,7 +91,7 @@ def command(function: Callable[P, int]) -> Callable[P, None]:
 
 
 def split_option(option: str, given: list[str] | None) -> list[str]:
-    """Split an option that may be given several times and with commas. UsageError where it names nothing."""
+    """Split an option that may be given several times and with commas. Raises UsageError if no value is left."""
     parts = (part.strip() for value in given or () for part in value.split(","))
     named = list(dict.fromkeys(part for part in parts if part))
     if given and not named:
@@ -100,7 +100,7 @@ def split_option(option: str, given: list[str] | None) -> list[str]:
 
 
 def whole_numbers(option: str, given: list[str] | None) -> list[int]:
-    """Split an option as `split_option` does, into whole numbers. UsageError for anything else."""
+    """Split an option as `split_option` does, into whole numbers. Raises UsageError for anything else."""
     parts = split_option(option, given)
     wrong = [part for part in parts if not part.isdecimal()]
     if wrong:
@@ -117,7 +117,7 @@ _MANY = {Sequence[str]: split_option, Sequence[int]: whole_numbers}
 def asks(request_type: type[Any]) -> Callable[[Callable[..., int]], Callable[..., int]]:
     """Give a command an option for each field of a request; it gets them together, as its argument `request`.
 
-    A field that the command has an option of its own for is left to it.
+    A field for which the command already has its own option is left out.
     """
 
     def decorate(function: Callable[..., int]) -> Callable[..., int]:
@@ -168,7 +168,7 @@ def _read(field: "Field[Any]", value: Any) -> Any:
 
 
 def refused_file(error: BaseException) -> str | None:
-    """One line about a file or disk that the system refused to a command; None for every other error."""
+    """One line about a file or disk to which the system refused access; None for every other error."""
     if not isinstance(error, OSError) or (error.filename is None and error.errno not in _STEPS):
         return None
     step = _STEPS.get(error.errno or 0, "check the path")
@@ -187,7 +187,7 @@ _STEPS = {
 
 
 def fail(code: int, problems: Sequence[str], notes: Sequence[str], as_json: object) -> int:
-    """Say why a command has no result, to people on stderr and to programs as its one JSON object; returns the code."""
+    """Say why a command has no result, to people on stderr or to programs as its one JSON object; returns the code."""
     for problem in problems:
         say(f"error: {problem}")
     for note in notes:

@@ -1,7 +1,7 @@
-"""The names that a shell completes at Tab: bundled rigs and scenes, estimators, filters.
+"""The names that a shell completes with Tab: bundled rigs and scenes, estimators, filters.
 
-Where no name fits, the shell completes files. Names come without the sentences of `rig scenes`: fish takes the second
-line of a long one for another name.
+If no name fits, the shell completes file names. Names come without the descriptions of `rig scenes`, because fish takes
+the second line of a long description for another name.
 """
 
 from collections.abc import Callable, Iterable
@@ -10,28 +10,28 @@ Names = Callable[[], Iterable[str]]
 
 
 def rig_names() -> Iterable[str]:
-    """The bundled rigs."""
+    """Names of the bundled rigs."""
     from rig.config.bundled import bundled_rigs
 
     return (one.name for one in bundled_rigs())
 
 
 def scene_names() -> Iterable[str]:
-    """The bundled scenes."""
+    """Names of the bundled scenes."""
     from rig.config.bundled import bundled_scenes
 
     return (one.name for one in bundled_scenes())
 
 
 def estimator_names() -> Iterable[str]:
-    """The estimators."""
+    """Names of the estimators."""
     from rig.estimate.registry import ESTIMATORS
 
     return ESTIMATORS
 
 
 def filter_names() -> Iterable[str]:
-    """The filters."""
+    """Names of the filters."""
     from rig.estimate.registry import FILTERS
 
     return FILTERS
@@ -47,7 +47,7 @@ def one_of(names: Names) -> Callable[[str], list[str]]:
 
 
 def some_of(names: Names) -> Callable[[str], list[str]]:
-    """A completer for the last of several `names` with commas between them."""
+    """A completer for the last of several `names` separated by commas."""
 
     def complete(incomplete: str) -> list[str]:
         before, comma, last = incomplete.rpartition(",")

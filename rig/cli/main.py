@@ -4,8 +4,8 @@ Each command is one call of `rig.api` and some printing. Results go to stdout, e
 done, 1 result not trustworthy, 2 bad usage or config, 3 device error, 4 aborted, 70 an error in the program itself.
 Nothing heavy is imported before a command runs.
 
-Service accounts and containers often have no folder that numba can keep compiled kernels in, and numba then refuses to
-compile at all: `ensure_kernel_cache` names one.
+Service accounts and containers often have no folder in which numba can store compiled kernels, and numba then refuses
+to compile at all. `ensure_kernel_cache` provides one.
 """
 
 import logging
@@ -172,7 +172,7 @@ VARIABLE = "NUMBA_CACHE_DIR"
 
 
 def ensure_kernel_cache() -> None:
-    """Name a private temporary folder to numba where it would find none; to be called before numba is imported."""
+    """Give numba a private temporary folder if it would find none. Call it before numba is imported."""
     package = Path(__file__).parent
     home = Path(os.environ.get("XDG_CACHE_HOME") or Path("~/.cache").expanduser())
     if VARIABLE in os.environ or _writable(package / "__pycache__") or _writable(home):

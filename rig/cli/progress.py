@@ -1,4 +1,4 @@
-"""Shows on stderr how far a command is: one line with a clock at a terminal, otherwise a line where a stage begins."""
+"""Shows on stderr the progress of a command: a running line at a terminal, otherwise a line when a stage begins."""
 
 import logging
 import math
@@ -25,7 +25,7 @@ _live: ContextVar["Live | None"] = ContextVar("live", default=None)
 
 
 class ProgressLine:
-    """The present progress of a command, as text. It may be told and asked on any thread."""
+    """The present progress of a command, as text. It may be updated and read on any thread."""
 
     def __init__(self) -> None:
         """Start the clock."""
@@ -35,22 +35,22 @@ class ProgressLine:
         self.step = Step(PREPARING)
 
     def heard(self, step: Step) -> None:
-        """Take the newest step."""
+        """Note the newest step."""
         self.step = step
         self._compiling = self._compilers > 0
 
     def compiler_began(self) -> None:
-        """Note that code is being compiled, on some thread."""
+        """Note that code is being compiled on some thread."""
         self._compilers += 1
         self._compiling = True
 
     def compiler_ended(self) -> None:
-        """Note that a compilation is over; the stage stays 'compiling' until the next step: more usually follows."""
+        """Note that a compilation is over. The stage stays 'compiling' until the next step, since more usually follows."""
         self._compilers -= 1
 
     @property
     def stage(self) -> str:
-        """Name of the stage that the command is at."""
+        """Name of the command's present stage."""
         return COMPILING if self._compiling else self.step.stage
 
     @property
@@ -88,7 +88,7 @@ class ProgressLine:
 
 
 class _Announcer:
-    """Says each stage once, and each part once, as soon as the command has taken `PATIENCE_S`."""
+    """Prints each stage once, and each part once, as soon as the command has taken `PATIENCE_S`."""
 
     def __init__(self, line: ProgressLine) -> None:
         self._line = line
@@ -108,7 +108,7 @@ class _Announcer:
         self._timer.cancel()
 
     def changed(self) -> None:
-        """Handle a step that was told, or a compilation that began."""
+        """Handle a new step, or a compilation that began."""
         with self._lock:
             line = self._line
             key = line.step.part if line.step.part and line.stage != COMPILING else line.stage
@@ -124,7 +124,7 @@ class _Announcer:
 
 @contextmanager
 def progress(*, compiles: bool = True) -> Iterator[None]:
-    """Within the context, stderr says how far the work is. compiles: whether any of it is compiled code."""
+    """A context in which stderr shows the progress of the work. compiles: whether any of it is compiled code."""
     line = ProgressLine()
     with ExitStack() as stack:
         if sys.stderr.isatty():
@@ -152,7 +152,7 @@ def progress(*, compiles: bool = True) -> Iterator[None]:
 
 @contextmanager
 def paused() -> Iterator[None]:
-    """Within the context no line is drawn, so that a person can be asked something."""
+    """A context in which no progress line is drawn, so that a person can be asked something."""
     live = _live.get()
     if live is None:
         yield

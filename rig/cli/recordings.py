@@ -20,7 +20,7 @@ MOST_LINES = 20
 
 
 def verify_command(run: RunArgument, as_json: JsonOption = False) -> int:
-    """Read every byte of a recording and say whether it is what was recorded; exit code 1 where it is not."""
+    """Read every byte of a recording and say whether it is what was recorded; exit code 1 if it is not."""
     with progress(compiles=False):
         found = api.verify(run)
     if as_json:
@@ -31,7 +31,7 @@ def verify_command(run: RunArgument, as_json: JsonOption = False) -> int:
 
 
 def repair_command(run: RunArgument, as_json: JsonOption = False) -> int:
-    """Make a torn recording whole: cut torn tails off, write a lost index or manifest anew; frames stay as they are."""
+    """Make a torn recording whole: cut off torn ends and rewrite a lost index or manifest. Frames stay as they are."""
     with progress(compiles=False):
         made = api.repair(run)
     if as_json:
@@ -73,7 +73,7 @@ def cut_command(
 
 
 def compress_command(run: RunArgument, as_json: JsonOption = False) -> int:
-    """Compress a recording with zstd; every command reads it as any other."""
+    """Compress a recording with zstd. All commands read it like any other."""
     with progress(compiles=False):
         made = api.compress(run)
     if as_json:

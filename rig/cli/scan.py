@@ -111,7 +111,7 @@ def effects_command(
     ] = None,
     as_json: JsonOption = False,
 ) -> int:
-    """List which physical effects a scene calls for, why, and what each is worth; or the flux of an image row.
+    """List which physical effects a scene calls for, why, and how much each matters; or the flux of an image row.
 
     With --row and --column, print the noise-free flux of that row instead.
     """

@@ -47,7 +47,7 @@ _NEXT_STEP = {
 
 
 def console(width: int | None = None) -> Console:
-    """A console that writes to stdout; into a file or a pipe nothing is wrapped, unless a width is given."""
+    """A console that writes to stdout. In a file or a pipe nothing is wrapped, unless a width is given."""
     return Console(highlight=False, width=width or (None if sys.stdout.isatty() else WIDE))
 
 
@@ -96,7 +96,7 @@ def _advice(result: RunResult) -> str | None:
 
 
 def effects_table(scene: SceneEffects) -> None:
-    """Print which effects are on, what each is worth and why, to stdout."""
+    """Print to stdout which effects are on, how much each matters and why."""
     # Narrow enough that a terminal of 80 columns has room for the reasons, which are wrapped.
     table = Table(box=None, pad_edge=False, padding=(0, 1, 0, 0))
     table.add_column("effect", max_width=_NAME_CELLS if sys.stdout.isatty() else None)
@@ -252,7 +252,7 @@ _LEFT = ("estimator", "filter", "")
 
 
 def tradeoff_table(done: Tradeoff) -> None:
-    """Print a trade-off to stdout, the setting to take first.
+    """Print a trade-off to stdout, beginning with the setting to use.
 
     * marks rows on the front of error over sensor time, + those on the front over compute time.
     """
@@ -380,7 +380,7 @@ def soak_table(report: SoakReport) -> None:
 
 
 def print_machine(console: Console, found: dict[str, object]) -> None:
-    """Print the processor with its caches and the versions of what computes."""
+    """Print the processor with its caches, and the versions of Python, numpy and numba."""
     caches = found["caches"]
     assert isinstance(caches, dict)
     named = ", ".join(f"{level} {size}" for level, size in caches.items())
@@ -389,7 +389,7 @@ def print_machine(console: Console, found: dict[str, object]) -> None:
 
 
 def print_result(result: "CalibrationResult | PixelResult", line: str = "") -> None:
-    """Print the verdict and its reasons, the one line, the figures and the files to stdout."""
+    """Print the verdict with its reasons, the summary line, the figures and the paths of the files to stdout."""
     pairs = [("verdict", "passed" if result.verdict.passed else "failed")]
     pairs += [("", str(reason)) for reason in result.verdict.reasons]
     pairs += [("in short", line)] if line else []

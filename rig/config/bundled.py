@@ -1,6 +1,6 @@
-"""The rigs and scenes that travel with the program: their names, their files, and a sentence on each.
+"""The rigs and scenes that come with the program: their names, their files, and a sentence on each.
 
-Light to import: shells ask for the names at every Tab.
+This module imports little, since shells ask for the names at every Tab.
 """
 
 import re
@@ -15,7 +15,7 @@ SCENES = BUNDLED / "scenes"
 
 @dataclass(frozen=True, slots=True)
 class Bundled:
-    """A rig or a scene that travels with the program; about: the first sentence of its file's first comment."""
+    """A rig or a scene that comes with the program; about: the first sentence of its file's first comment."""
 
     name: str
     about: str

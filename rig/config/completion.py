@@ -1,4 +1,4 @@
-"""Fills in the text of a YAML file: what it leaves out is added where it belongs, what is written stays as it is."""
+"""Completes the text of a YAML file: missing keys are added in their places, and existing text stays as it is."""
 
 from collections.abc import Iterator, Mapping
 from typing import Any, NamedTuple
@@ -18,7 +18,7 @@ class _Edit(NamedTuple):
 
 
 def completed(text: str, node: yaml.MappingNode, values: Mapping[str, Any], full: Mapping[str, Any]) -> str:
-    """Give the text the values of `values` where it has others, and add the keys of `full` that it lacks.
+    """Change the text where `values` differ from it, and add the keys of `full` that it lacks.
 
     node: parsed node of the text. values: has the text's keys.
     """
@@ -78,7 +78,7 @@ def _end(node: yaml.Node) -> int:
 
 
 def block_text(content: Mapping[str, Any], indent: str = "") -> str:
-    """Keys and values, each on a line of its own."""
+    """The text of keys and values, each on its own line."""
     lines = []
     for key, value in content.items():
         if isinstance(value, Mapping) and value:

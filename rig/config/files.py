@@ -1,4 +1,4 @@
-"""Finds and reads config files: bundled ones by name, others by path, with options laid over them.
+"""Finds and reads config files: bundled ones by name, others by path, with options overriding their values.
 
 All problems are listed at once, each by the name under which the user gave the value: a key of the file or an option.
 """
@@ -37,7 +37,7 @@ FLAGS: Mapping[Key, str] = {
 
 
 def kind_of(slot: str, content: Any) -> type[BaseModel] | None:
-    """The config model of the kind that a slot's content names; None where it names none."""
+    """The config model of the kind that a slot's content names; None if it names none."""
     if slot not in SLOTS or not isinstance(content, Mapping):
         return None
     try:
@@ -67,7 +67,7 @@ Model = TypeVar("Model", bound=BaseModel)
 
 
 def load_config(name_or_path: str | Path = "simulated", overrides: Mapping[str, object] | None = None) -> RigConfig:
-    """Load the rig config of a bundled name ("simulated") or a file, with `overrides` laid over it.
+    """Load the rig config of a bundled name ("simulated") or a file, with values replaced by `overrides`.
 
     overrides: value by dotted key, e.g. {"scan.exposures": 4, "world.scene": "street"}; None values are skipped. Paths
     in the file are relative to its folder, those in overrides to the working directory. Raises UsageError with one line
@@ -94,10 +94,10 @@ def load_cube_plan(path: str | Path) -> CubePlan:
 
 
 def completed_text(name_or_path: str | Path) -> str:
-    """The text of a config, its comments included, with every default filled in and every path absolute.
+    """The text of a config, including comments, with every default filled in and every path absolute.
 
-    It means the same in a file of any folder. Where aliases or the like leave no place to fill defaults in, the text is
-    made anew without comments. Raises UsageError as `load_config` does.
+    It has the same meaning in a file of any folder. If aliases or the like prevent filling in defaults, the text is
+    written anew without comments. Raises UsageError as `load_config` does.
     """
     path = find_config(name_or_path)
     read = read_config(path)
@@ -117,7 +117,7 @@ def completed_text(name_or_path: str | Path) -> str:
 
 
 def config_content(text: str) -> dict[str, Any]:
-    """The keys and values of a config's text. Raises UsageError where it is not one."""
+    """The keys and values of a config's text. Raises UsageError if it is not one."""
     try:
         return parse_yaml(text, *_CONFIG, "config").content
     except FileError as error:
@@ -125,7 +125,8 @@ def config_content(text: str) -> dict[str, Any]:
 
 
 def parse_config(content: Mapping[str, object], folder: Path | None = None, options: Iterable[str] = ()) -> RigConfig:
-    """Validate a config from a mapping, such as a notebook's or a manifest's. UsageError with one line per problem.
+    """Validate a config from a mapping, such as a notebook's or a manifest's. Raises UsageError with one line per
+    problem.
 
     options: dotted keys whose values were given as options, so that problems name the options.
     """
@@ -137,7 +138,7 @@ def _keys(dotted: Iterable[str]) -> frozenset[Key]:
 
 
 def portable_content(config: RigConfig) -> dict[str, Any]:
-    """A config as plain values that mean the same in a file of any folder: every path in it is absolute.
+    """A config as plain values that have the same meaning in a file of any folder: every path in it is absolute.
 
     The paths of a loaded config are absolute or relative to the working directory.
     """
@@ -150,12 +151,12 @@ def portable_content(config: RigConfig) -> dict[str, Any]:
 
 
 def bundled_configs() -> tuple[str, ...]:
-    """Names of the rigs that travel with the program, sorted."""
+    """Names of the rigs that come with the program, sorted."""
     return tuple(one.name for one in bundled_rigs())
 
 
 def find_config(name_or_path: str | Path) -> Path:
-    """Find the file that a name or path means. Raises UsageError where there is none."""
+    """Find the file that a name or path means. Raises UsageError if there is none."""
     path = Path(name_or_path)
     if os.path.isfile(path):  # unlike Path.is_file, it takes any text for a name
         return path
@@ -196,7 +197,7 @@ def config_schema() -> dict[str, Any]:
 
 
 def read_config(path: Path) -> YamlFile:
-    """Read a config file without filling anything in. Raises UsageError, for a key given twice as well."""
+    """Read a config file without filling anything in. Raises UsageError, also for a key given twice."""
     return _read(path, *_CONFIG)
 
 

@@ -1,10 +1,10 @@
 """The config of a rig: which devices, which calibration, what scan and which estimate; validated with units and limits.
 
 Times, rates and lengths are text with a unit in YAML ("10 us", "100 kHz", "8 m"). Slots of devices hold the config
-model of their kind, which stands beside its driver. Files are read by `rig.config.files`.
+model of their kind, which is defined with its driver. Files are read by `rig.config.files`.
 
-A rig may send out several lines at once. With L lines the mirror sweeps one L-th of the field, so a map takes one L-th
-of the frames. `scan.command_range` is what the mirror does, and line l's columns lie at its commands plus
+A rig may project several lines at once. With L lines the mirror sweeps one L-th of the field, so a map takes one L-th
+of the frames. `scan.command_range` is the range of the mirror, and line l's columns lie at its commands plus
 `line_offsets[l]`.
 """
 
@@ -65,7 +65,7 @@ Filter = Literal["none", "median"]
 
 
 class ConfigSection(BaseModel):
-    """Base of the config's sections: unknown keys are refused, values cannot change."""
+    """Base of the config's sections. Unknown keys are refused and values cannot change."""
 
     model_config = ConfigDict(extra="forbid", frozen=True)
 
@@ -128,7 +128,7 @@ class ScanConfig(ConfigSection):
 
     @property
     def exposure_s(self) -> float:
-        """Exposure of a frame; without a setting the whole frame period."""
+        """Exposure of a frame; if it is not set, the whole frame period."""
         return float(1 / self.frame_rate) if self.exposure is None else self.exposure
 
     @model_validator(mode="after")
@@ -142,7 +142,7 @@ class ScanConfig(ConfigSection):
 
 
 class EstimateConfig(ConfigSection):
-    """Settings of the estimate: how depth follows from the counts."""
+    """Settings of the estimate, which turns counts into depth."""
 
     estimator: Estimator = Field(
         default="likelihood", description="how the stripe is found on each row", examples=["likelihood"]
@@ -202,7 +202,7 @@ def _beside_config(value: Path | None, info: ValidationInfo) -> Path | None:
 
 
 class RigConfig(ConfigSection):
-    """A whole rig and the scan it does."""
+    """A whole rig and the scan that it makes."""
 
     name: str = Field(min_length=1, description="name of the rig, for people", examples=["lab"])
     calibration: Annotated[Path | None, AfterValidator(_beside_config)] = Field(
@@ -238,7 +238,7 @@ class RigConfig(ConfigSection):
 
 
 class CubePlan(ConfigSection):
-    """`plan.yaml` of `rig reconstruct`: how the frames of a bare cube were taken."""
+    """`plan.yaml` of `rig reconstruct`: how the frames of a cube without records were taken."""
 
     columns: Columns
     exposures: Exposures
@@ -247,7 +247,7 @@ class CubePlan(ConfigSection):
 
 
 def line_problems(offsets: Sequence[float], columns: int, command_range: tuple[float, float]) -> list[str]:
-    """Problems with taking a map of so many columns by these lines while the mirror sweeps `command_range`."""
+    """Problems with scanning this number of columns with these lines while the mirror sweeps `command_range`."""
     lines = len(offsets)
     problems = []
     if columns % lines:

@@ -1,4 +1,4 @@
-"""The config that a call is made with: loaded, changed by the call's options, validated."""
+"""The config of a call: loaded, changed by the call's options, validated."""
 
 import os
 from collections.abc import Mapping
@@ -32,10 +32,10 @@ def configure(
 
     config: the name of a bundled rig, a file or a RigConfig.
     scene: of a simulated rig, a bundled name or a path.
-    fog: in place of the scene's, a visibility such as '20 m', or 'clear'.
+    fog: replaces the scene's fog: a visibility such as '20 m', or 'clear'.
     exposures: frames per column.
     estimator, filter, min_confidence: as in the config's `estimate`.
-    temporal_prior: have `joint` hold each map to the last one a little.
+    temporal_prior: make `joint` use the last map as a weak prior for the next.
     Raises UsageError with one line per problem.
     """
     options: dict[str, object | None] = {
@@ -60,7 +60,7 @@ def configure(
 
 
 def seed_problems(seed: int) -> list[str]:
-    """Problems with a seed; empty where it is usable."""
+    """Problems with a seed; empty if it is usable."""
     if 0 <= seed <= MAX_SEED:
         return []
     return [f"seed is {seed}; it must be 0 or more and at most 2^63 - 1 ({MAX_SEED})"]
@@ -75,9 +75,9 @@ def _changed(config: RigConfig, options: Mapping[str, object]) -> RigConfig:
 
 
 def with_lines(config: RigConfig, lines: int, power: LinePower = "shared") -> RigConfig:
-    """The config of this rig and field with so many evenly spaced lines; the mirror sweeps the share left to it.
+    """The config of this rig and field with `lines` evenly spaced lines; the mirror sweeps the share of one line.
 
-    config: of one line. Columns are rounded down to a multiple of `lines`. Raises UsageError where that cannot be.
+    config: of one line. Columns are rounded down to a multiple of `lines`. Raises UsageError if that is not possible.
     """
     if len(config.line_offsets) > 1:
         raise UsageError(f"{config.name} has {len(config.line_offsets)} lines already; name a config with one")

@@ -1,14 +1,14 @@
-"""Binds frames to columns by the markers in their own stream, never by host time or by counting.
+"""Assigns frames to columns ("binds" them) by the markers in their own stream, never by host time or by counting.
 
-Where the SPAD puts no markers into its frames, `rig.count.blanking` finds the sweeps in their light and marks them.
+If the SPAD puts no markers into its frames, `rig.count.blanking` finds the sweeps in their light and marks them.
 
-Each frame is placed from the latest marker at or before it: that marker's point of the scanner clock is known from the
-plan, the way on from there is the SPAD's own clock times the ratio of the two clocks, which is fitted to the markers of
-every sweep and used in the next one. So a frame's column depends on earlier frames only and not on the size of blocks.
-A compiled walk (`rig.count.bind_kernels`) places the frames; Python runs once a block and where a sweep begins.
+Each frame is placed from the latest marker at or before it. The plan gives that marker's point of the scanner clock.
+The distance from there is the SPAD's own clock times the ratio of the two clocks, which is fitted to the markers of
+every sweep and used in the next one. So a frame's column depends only on earlier frames, not on the size of blocks. A
+compiled walk (`rig.count.bind_kernels`) places the frames; Python runs once a block and at the begin of each sweep.
 
-The lit frames of a sweep run through its columns in order. One that would fall back to a column already left, as it can
-by the residual where a marker corrects the way from the one before, is not used.
+The lit frames of a sweep run through its columns in order. A frame that would fall back to a column already left is not
+used. This can happen, by the size of the residual, when a marker corrects the extrapolation from the one before.
 """
 
 import math
@@ -51,8 +51,8 @@ class BoundFrames:
     """Sweep, column and bin of each frame of a block.
 
     sweep: -1 before the first marker. column: fractional, at the middle of the exposure; NaN before the first marker,
-    continued linearly outside the lit part. bins: column index, BIN_DARK or BIN_UNUSABLE. starts: indices of frames, 0
-    and those with which a sweep begins.
+    continued linearly outside the lit part. bins: column index, BIN_DARK or BIN_UNUSABLE. starts: frame indices: 0, and
+    those at which a sweep begins.
     """
 
     sweep: NDArray[np.int32]
@@ -65,12 +65,14 @@ class BoundFrames:
 class SweepClock:
     """Clock of one finished sweep.
 
-    clock_error: relative excess of the scanner's clock over nominal, in the SPAD's time. residual_columns: largest
-    distance of a marker from the fitted line, NaN with fewer than two markers; or that of the pattern behind the sweep
-    from the line of those before it, its standard deviation where that is more, NaN where it was not found. markers:
-    markers or patterns that the clock rests on. first_frame, end_frame: frames from this sweep's scan marker to before
-    the next one's. wrong_way: lit frames whose direction level was not the plan's. detection: chance that a blanking
-    pattern as bright as this sweep's is found, 0 where it was not; None: bound by markers.
+    clock_error: relative excess of the scanner's clock over nominal, in the SPAD's time. residual_columns: with
+    markers, the largest distance of a marker from the fitted line, NaN with fewer than two markers. With patterns, the
+    distance of the pattern after the sweep from the line of those before it, or its standard deviation if that is
+    larger; NaN if it was not found. markers: number of markers or patterns that the clock rests on. first_frame,
+    end_frame: frames from this sweep's scan marker to before the next one's. wrong_way: number of lit frames whose
+    direction level was not the plan's.
+    detection: chance that a blanking pattern as bright as this sweep's is found, 0 if it was not; None if markers were
+    used.
     """
 
     sweep: int
@@ -93,7 +95,7 @@ class SweepClock:
 
 
 class PlanTerms(NamedTuple):
-    """Numbers of a plan for the walk; arrays (legs,). most_in_column: frames that a column may use."""
+    """Numbers of a plan for the walk; arrays (legs,). most_in_column: largest number of frames that a column may use."""
 
     columns: int
     column_s: float
@@ -119,8 +121,8 @@ class BlockTerms(NamedTuple):
 class FrameBinder:
     """Binds the blocks of one run, in order. Records count markers up to and including their own frame.
 
-    clock_ratio: of the scanner's clock to nominal, before the first sweep. first_sweep: number of the first whole one;
-    a piece of one fits no clock. end_sweep: one behind the last sweep that is wanted; None: all that there are.
+    clock_ratio: of the scanner's clock to nominal, before the first sweep. first_sweep: number of the first whole
+    sweep; an incomplete one fits no clock. end_sweep: number after that of the last sweep wanted; None for all.
     """
 
     def __init__(
@@ -157,7 +159,9 @@ class FrameBinder:
         self._light = None if plan.blanking is None else BlankingSync(plan, end_sweep)
 
     def bind(self, block: FrameBlock) -> tuple[BoundFrames, list[SweepClock]]:
-        """Places of the block's frames, and the clocks of the sweeps whose closing scan marker lies in the block."""
+        """Sweep, column and bin of the block's frames, and the clocks of the sweeps whose closing scan marker lies in
+        the block.
+        """
         header, n = block.header, block.n_frames
         if self._t0 is None:
             self._t0 = header.t0_ticks
@@ -198,7 +202,7 @@ class FrameBinder:
         return BoundFrames(*places, tuple(starts)), closed
 
     def compile(self) -> None:
-        """Compile the walk, by placing no frames."""
+        """Compile the walk by placing zero frames."""
         terms = BlockTerms(0, 0, 1, 1, 1.0)
         self._walk(self._records[:0], 0, terms, self._terms, self._carried, self._edges, *_new_places(0))
 

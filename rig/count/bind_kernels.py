@@ -1,7 +1,7 @@
 """Compiled walk along the records of a block, which gives every frame its sweep, column and bin.
 
-It goes frame by frame because each frame decides what may be done with the next. What it has to remember lies in one
-record (`CARRIED` in `rig.count.bind`), so that it goes on in the next block where it left off in this one.
+It goes frame by frame because each frame decides what may be done with the next. Its state is kept in one record
+(`CARRIED` in `rig.count.bind`), so that it continues in the next block.
 """
 
 from typing import Any, Final
@@ -74,10 +74,10 @@ def walk(
     column: NDArray[np.float64],
     bins: NDArray[np.int32],
 ) -> Any:
-    """Place frames `at` and on; returns the index of the first frame of a new sweep, or the number of records.
+    """Place frames from index `at` on; returns the index of the first frame of a new sweep, or the number of records.
 
-    carried: (1,) of `CARRIED`. edges: (2, enough) point and time of the running sweep's markers. The others are
-    filled, as in `BoundFrames`.
+    carried: (1,) of `CARRIED`. edges: (2, enough) point and time of the present sweep's markers. The other arrays are
+    filled as in `BoundFrames`.
     """
     now = carried[0]
     for i in range(at, len(records)):
@@ -116,10 +116,10 @@ def walk(
 def cover(
     bins: NDArray[np.int32], x0: NDArray[np.int32], used_px: int, column_x0: NDArray[np.int32], window: int
 ) -> tuple[int, int]:
-    """Take the bin of frames whose used pixels do not hold all that their column counts.
+    """Take frames out of their bin if their used pixels do not cover all pixels that their column counts.
 
     x0: (n,) first of the `used_px` pixels of each frame. column_x0: (columns,) first of the `window` pixels of each
-    column. Returns the numbers of frames that are left on columns and in the dark.
+    column. Returns the numbers of frames left on columns and in the dark.
     """
     lit = dark = 0
     for i in range(len(bins)):

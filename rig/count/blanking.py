@@ -1,20 +1,20 @@
-"""Finds the sweeps of frames that carry no marks by the blanking pattern in their light, and writes their marks.
+"""Finds the sweeps of frames without markers by the blanking pattern in their light, and writes the missing marks.
 
-The pattern (`PatternSearch`). Model of the ones n_i in frame i, about a pattern that begins at t (in frames, frame i
-being exposed from i on):
+Finding the pattern (`PatternSearch`). The model of the ones n_i in frame i, for a pattern that begins at t (in frames,
+frame i being exposed from i on), is
 
     n_i = level + drift i + brightness g_i(t),     g_i = share of frame i's exposure with the gate open
 
-For every t it is fitted by least squares (float64); the best t is where it explains most. Photons of the laser, of
-daylight and of the dark all scatter alike, so nothing needs to be known about them. `score` is brightness over its
-standard deviation; what remains beyond the scatter of photons must be less than what the pattern explains, which tells
-it from other light that comes and goes.
+For every t it is fitted by least squares (float64); the best t is the one that explains most. Photons of the laser, of
+daylight and dark counts all scatter alike, so nothing needs to be known about them. `score` is brightness over its
+standard deviation. To distinguish the pattern from other light that comes and goes, the residual beyond the scatter of
+photons must be smaller than what the pattern explains.
 
-The sweeps (`BlankingSync`). Scan markers lie on a straight line of time, which is fitted to all patterns found so far
-(`MarkerLine`): one that is missing, because frames were lost or nothing was in the light's way, is taken from that
-line. A sweep begins, for those who count, with the frame at which its pattern has surely passed, just before the gate
-opens for the lit part. All of that depends on the frames before it only, not on the size of blocks, and never on the
-host's time or the device's word for its clock.
+Finding the sweeps (`BlankingSync`). Scan markers lie on a straight line in time, which is fitted to all patterns found
+so far (`MarkerLine`). If a pattern is missing, because frames were lost or nothing reflected the light, its place is
+taken from that line. For counting, a sweep begins with the frame at which its pattern has certainly passed, just before
+the gate opens for the lit part. All this depends only on the frames before, not on the size of blocks, and never on the
+host's time or on the clock that the device states.
 """
 
 import logging
@@ -54,7 +54,9 @@ _GRAIN = 64
 
 @dataclass(frozen=True, slots=True)
 class PatternFit:
-    """place: frames, of the pattern's first edge; sd: its standard deviation. brightness: ones a lit frame has more."""
+    """A fitted pattern. place: its first edge, in frames; sd: its standard deviation. brightness: extra ones of a lit
+    frame.
+    """
 
     place: float
     sd: float
@@ -65,18 +67,20 @@ class PatternFit:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class PatternShape:
-    """flashes: (m, 2) open and close of each, in frames from the first edge. exposure: share of a frame's period."""
+    """A blanking pattern. flashes: (m, 2) open and close of each, in frames from the first edge. exposure: share of a
+    frame's period.
+    """
 
     flashes: Array
     exposure: float
 
     @property
     def length(self) -> float:
-        """Frames from the first edge to the last."""
+        """Number of frames from the first edge to the last."""
         return float(self.flashes[-1, 1])
 
     def shares(self, places: Array, frames: Array) -> Array:
-        """Share of each frame's exposure with the gate open, (places, frames), of a pattern at each place."""
+        """Share of each frame's exposure with the gate open, (places, frames), for a pattern at each place."""
         opened, closed = (places[:, None, None] + self.flashes[:, edge] for edge in (0, 1))
         start = frames[None, :, None]
         lit: Array = np.minimum(start + self.exposure, closed) - np.maximum(start, opened)
@@ -96,7 +100,7 @@ class PatternSearch:
         self._shares = np.round(shares * _GRAIN)
 
     def scores(self, ones: Array) -> tuple[Array, NDArray[np.bool_]]:
-        """Best score in each window of `ones` (n,), NaN where a frame is lost, and whether it may be the pattern."""
+        """Best score in each window of `ones` (n,), NaN if a frame is lost; and whether it may be the pattern."""
         n = self.window
         windows = sliding_window_view(ones, n)
         mean, drift = windows.sum(axis=1) / n, windows @ self._time
@@ -115,9 +119,9 @@ class PatternSearch:
             return score, (score >= LEAST_SCORE) & (unexplained <= MOST_UNEXPLAINED)
 
     def measure(self, ones: Array, first: int, place: float, radius: float) -> PatternFit | None:
-        """The pattern within `radius` frames of `place`; None where it is not there.
+        """The pattern within `radius` frames of `place`; None if it is not there.
 
-        ones: of frames `first`, first + 1, ... , NaN where missing; they must span `span(place, radius)`.
+        ones: of frames `first`, first + 1, ... , NaN if missing; they must span `span(place, radius)`.
         """
         begin, end = self.span(place, radius)
         if begin < first or end > first + len(ones):
@@ -132,7 +136,7 @@ class PatternSearch:
         return _best(self._shape.shares(places, frames[got]), places, frames[got], here[got])
 
     def span(self, place: float, radius: float) -> tuple[int, int]:
-        """First frame, and the one behind the last, that `measure` needs."""
+        """Number of the first frame that `measure` needs, and of the frame after the last."""
         return (
             math.floor(place - radius) - EDGE_FRAMES,
             math.ceil(place + radius + self._shape.length) + EDGE_FRAMES,
@@ -173,7 +177,7 @@ def _best(shares: Array, places: Array, frames: Array, ones: Array) -> PatternFi
 
 
 def detection_probability(score: float) -> float:
-    """Chance that a pattern that stands out so clearly on average is found."""
+    """Chance that a pattern with this score on average is found."""
     return 0.5 * math.erfc((LEAST_SCORE - score) / math.sqrt(2))
 
 
@@ -183,7 +187,9 @@ LEAST_SD_FRAMES = 1e-3
 
 @dataclass(slots=True)
 class MarkerLine:
-    """Scan markers found so far: index of each one's sweep, its place in frames, and that one's standard deviation."""
+    """Scan markers found so far: the index of each one's sweep, its place in frames, and the place's standard
+    deviation.
+    """
 
     index: list[int] = field(default_factory=list)
     place: list[float] = field(default_factory=list)
@@ -222,9 +228,9 @@ class SweepPlace:
     """Place of a sweep among the frames.
 
     frame: the first one that counts. scan_frame: place of its scan marker, in frames. ratio: of the scanner's clock to
-    nominal, in the SPAD's time, from so many patterns. found: its own; None: the place is taken from the line of the
-    others. residual_frames: distance of its pattern from where the ones before it put it, or its standard deviation
-    where that is more; NaN without one.
+    nominal, in the SPAD's time, with the number of patterns it rests on. found: its own pattern; None if the place is
+    taken from the line of the others. residual_frames: distance of its pattern from the place predicted by earlier
+    ones, or its standard deviation if that is larger; NaN without a pattern.
     """
 
     number: int
@@ -237,14 +243,14 @@ class SweepPlace:
 
     @property
     def detection(self) -> float:
-        """Chance that a pattern as bright as this one is found; 0: it was not."""
+        """Chance that a pattern as bright as this one is found; 0 if it was not."""
         return 0.0 if self.found is None else detection_probability(self.found.score)
 
 
 class BlankingSync:
     """Finds the sweeps of one run, block by block. Indices count sweeps of the waveform, numbers those of the maps.
 
-    end_sweep: number of the last sweep that is marked, the one behind all that are wanted; None: all are.
+    end_sweep: number of the last sweep that is marked, which follows all wanted ones; None to mark all.
     """
 
     def __init__(self, plan: ScanPlan, end_sweep: int | None = None) -> None:
@@ -282,7 +288,7 @@ class BlankingSync:
     def mark(self, block: FrameBlock, records: NDArray[np.void]) -> None:
         """Fill marks, line and sweep of the block's `records` (n,).
 
-        DeviceFault where the run, or `SEARCH_S`, ends without two patterns a sweep apart.
+        Raises DeviceFault if the run, or `SEARCH_S`, ends without two patterns that are one sweep apart.
         """
         header, n = block.header, block.n_frames
         self._count(block)
@@ -299,7 +305,7 @@ class BlankingSync:
             self._give_up(header, last)
 
     def places(self, first: int, last: int) -> list[SweepPlace]:
-        """Places of the sweeps of maps `first` to `last`; all but the last one are forgotten."""
+        """Places of the sweeps of maps `first` to `last`. All but the last one are dropped afterwards."""
         return [*(self._places.pop(number) for number in range(first, last)), self._places[last]]
 
     def _count(self, block: FrameBlock) -> None:

@@ -1,11 +1,11 @@
-"""Counting of packed frames, compiled: bits are added 64 pixels to a word into counters that lie in bit planes.
+"""Compiled counting of packed frames: bits are added 64 pixels at a time into counters that are stored as bit planes.
 
-A counter of a pixel is sum over i of 2^i (bit of plane i); planes are uint64, PLANES of them hold up to MOST_FRAMES
+A counter of a pixel is sum over i of 2^i (bit of plane i). Planes are uint64; PLANES of them hold up to MOST_FRAMES
 frames. Seven frames at a time go through a tree of full adders (Harley and Seal; see Muła, Kurz, Lemire, "Faster
-population counts using AVX2 instructions", 2018) and into the planes as one 3-bit number; without the tree, frame after
-frame, it takes about twice as long. The planes of `CHUNK` words lie side by side, so that they stay in the fastest
-cache while frames are added, and at distances known to the compiler, which then needs no check that they do not
-overlap.
+population counts using AVX2 instructions", 2018) and into the planes as one 3-bit number. Adding frame after frame
+without the tree takes about twice as long. The planes of `CHUNK` words lie side by side, so that they stay in the
+fastest cache while frames are added. Their distances are known to the compiler, which then need not check that they do
+not overlap.
 """
 
 from typing import Final
@@ -31,12 +31,12 @@ FEW_FRAMES: Final = 15
 
 @numba.njit(cache=True, nogil=True)
 def rows_of_chunk(row_words: int) -> int:
-    """Rows of so many words that are counted together."""
+    """Number of rows of `row_words` words that are counted together."""
     return max(CHUNK // row_words, 1)
 
 
 def new_planes(chunks: int) -> NDArray[np.uint64]:
-    """Counters, all zero, for so many chunks of a frame: (chunks, PLANES + 1, CHUNK); the last plane is scratch."""
+    """Counters, all zero, for a number of chunks of a frame: (chunks, PLANES + 1, CHUNK); the last plane is scratch."""
     size = chunks * (PLANES + 1) * CHUNK
     # Kernels read 16 bytes at a time, beyond the end too.
     return aligned_zeros((size + 2,), np.uint64)[:size].reshape(chunks, PLANES + 1, CHUNK)
@@ -44,7 +44,7 @@ def new_planes(chunks: int) -> NDArray[np.uint64]:
 
 @numba.njit(cache=True, nogil=True)
 def planes_for(frames: int) -> int:
-    """Number of planes that hold the counts of so many frames: 1, 2, 4 or 8."""
+    """Number of planes that hold the counts of that many frames: 1, 2, 4 or 8."""
     if frames <= 1:
         return 1
     if frames <= 3:
@@ -176,8 +176,8 @@ def add_frames(
 ) -> None:
     """Add words at..at+n-1 of frames first..last-1 to counters that have counted `counted` frames so far.
 
-    words: (all words,), `frame` of them a frame; n: at most CHUNK; planes: ((PLANES + 1) * CHUNK,), one chunk's, of
-    which only as many are valid as `planes_for` says: before the first frame none.
+    words: (all words,), with `frame` words per frame; n: at most CHUNK; planes: ((PLANES + 1) * CHUNK,) of one chunk,
+    of which only `planes_for(counted)` are valid, none before the first frame.
     """
     f, all_frames = first, counted + last - first
     if counted == 0:
@@ -222,9 +222,9 @@ def add_runs(
 ) -> None:
     """Add frames to `counts` (columns, rows, window), or to `dark` (rows, PAIRS, lanes + LANES, 2) in lane order.
 
-    words: (all words,), `row_words` a row; first_word: (n,), word of the sensor at which a frame's used pixels begin,
-    used_words of them; bins: (n,), -1 dark, -2 skip, else a row of columns_at (bins, lines), the columns that a frame
-    is counted for, one of every line; without lines lit frames are passed over. x0: (columns,). Only rows
+    words: (all words,), with `row_words` per row; first_word: (n,), word of the sensor at which a frame's used pixels
+    begin, used_words of them; bins: (n,), -1 dark, -2 skip, else a row of columns_at (bins, lines), the columns for
+    which a frame is counted, one for every line; without lines lit frames are skipped. x0: (columns,). Only rows
     first_row..last_row-1 are touched, so that threads may share the outputs.
     """
     rows, width_words = dark.shape[0], (dark.shape[2] - LANES) * STEPS // WORD_PX

@@ -1,8 +1,8 @@
-"""Counts of a row in lane order: the order that bit planes turn into with shifts and masks alone.
+"""Counts of a row in lane order, which is the order into which bit planes turn with shifts and masks alone.
 
-Lane i of pair q holds the bytes of pixels 8 i + 2 q and 8 i + 2 q + 1, as the bits of packed bytes lie. A row of counts
-is uint8 (PAIRS, lanes + 2 PAD, 2): PAD zero lanes on both sides of each pair's, so that the pair before and behind any
-is one load away. Two neighbouring counts side by side are what an x86 processor multiplies and adds in one instruction.
+Lane i of pair q holds the bytes of pixels 8 i + 2 q and 8 i + 2 q + 1, in the order of bits in packed bytes. A row of
+counts is uint8 (PAIRS, lanes + 2 PAD, 2). There are PAD zero lanes on both sides of each pair's lanes, so that the pair
+before or after any is one load away. An x86 processor multiplies and adds two neighbouring counts in one instruction.
 """
 
 from typing import Final
@@ -25,7 +25,7 @@ PAD: Final = 8
 
 @numba.njit(cache=True, nogil=True)
 def padded_lanes(pixels: int) -> int:
-    """Lanes of a row of so many pixels, whole vectors."""
+    """Number of lanes for a row of `pixels` pixels, in whole vectors."""
     return -(-pixels // (STEPS * LANES)) * LANES
 
 
@@ -43,13 +43,13 @@ def new_counts(rows: int, lanes: int) -> NDArray[np.uint8]:
 
 @numba.njit(forceinline=True)
 def place_of(x, lanes):  # type: ignore[no-untyped-def]
-    """Index of pixel x in a row of counts of so many lanes; from -STEPS * PAD on."""
+    """Index of pixel x in a row of counts with `lanes` lanes; x may be as low as -STEPS * PAD."""
     return ((x & 7) >> 1) * pair_bytes(lanes) + 2 * (PAD + (x >> 3)) + (x & 1)
 
 
 @numba.njit(cache=True, nogil=True)
 def places_of(x: NDArray[np.int64], lanes: int) -> NDArray[np.int32]:
-    """Index of each of many pixels (n,) in a row of counts of so many lanes."""
+    """Index of each of many pixels (n,) in a row of counts with `lanes` lanes."""
     places = np.empty(x.shape[0], np.int32)
     for i in range(x.shape[0]):
         places[i] = place_of(x[i], lanes)
@@ -70,10 +70,10 @@ def _nibbles(b0, b1, b2, b3):  # type: ignore[no-untyped-def]
 def read_planes(
     planes: int, first: int, second: int, plane_bytes: int, n_planes: int, window: int, n: int, lanes: int
 ) -> None:
-    """Counts of two rows of `window` pixels, to n and to the row behind it, from their bit planes.
+    """Write the counts of two rows of `window` pixels to n and to the row after it, from their bit planes.
 
-    planes, n: addresses. first, second: bytes at which the rows begin; planes lie `plane_bytes` apart, n_planes: 1, 2,
-    4 or 8 of them. Reads 16 bytes at a time, whatever the window.
+    planes, n: addresses. first, second: bytes at which the rows begin; planes lie `plane_bytes` apart. n_planes: number
+    of planes, 1, 2, 4 or 8. Reads 16 bytes at a time, whatever the window.
     """
     pair = pair_bytes(lanes)
     for v in range(0, lanes, LANES):
@@ -130,9 +130,10 @@ def _fine_share(x, times, turn):  # type: ignore[no-untyped-def]
 
 @numba.njit(cache=True, nogil=True)
 def read_counts(counts: NDArray[np.unsignedinteger], halved: int, n: int, lanes: int, turn: int = 0) -> None:
-    """Counts of a row in pixel order (window,) to address n, divided by 2^halved, as `halve_counts` does up to 8.
+    """Write the counts of a row in pixel order (window,) to address n, divided by 2^halved.
 
-    turn: a number that differs between the columns in which a pixel is read.
+    The rounding is that of `halve_counts` for divisors up to 8. turn: a number that differs between the columns in
+    which a pixel is read.
     """
     for x in range(counts.shape[0]):
         share = _share(x, halved) if halved <= 3 else _fine_share(x, halved, turn)
@@ -152,7 +153,9 @@ def write_counts(n: NDArray[np.uint8], counts: NDArray[np.unsignedinteger]) -> N
 
 @numba.njit(cache=True, nogil=True)
 def halve_counts(n: int, lanes: int, times: int) -> None:
-    """Divide all counts of the row at address n by 2^times, rounded up or down by turns: few counts keep their mean."""
+    """Divide all counts of the row at address n by 2^times. Rounding alternates between up and down, so that small
+    counts keep their mean.
+    """
     rest = (1 << times) - 1
     for q in range(PAIRS):
         # The sum of a byte and its share may not fit: what is left over is looked at by itself.
@@ -165,7 +168,7 @@ def halve_counts(n: int, lanes: int, times: int) -> None:
 
 @numba.njit(forceinline=True)
 def sum_counts(n: int, lanes: int, sums: int) -> None:
-    """Add the counts of the row at address n to bytes (PAIRS, lanes, 2) at address `sums`."""
+    """Add the counts of the row at address n to the bytes (PAIRS, lanes, 2) at address `sums`."""
     for v in range(0, 2 * lanes, 2 * LANES):
         for q in range(PAIRS):
             at = 2 * q * lanes + v
@@ -173,6 +176,6 @@ def sum_counts(n: int, lanes: int, sums: int) -> None:
 
 
 def pixel_order(sums: NDArray[np.generic], width: int) -> NDArray[np.generic]:
-    """Sums in lane order (rows, PAIRS, lanes, 2) as (rows, width)."""
+    """Sums in lane order (rows, PAIRS, lanes, 2) rearranged to pixel order (rows, width)."""
     rows = sums.shape[0]
     return np.ascontiguousarray(sums.transpose(0, 2, 1, 3).reshape(rows, -1)[:, :width])

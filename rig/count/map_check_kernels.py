@@ -4,11 +4,11 @@ With n ones of a pixel in K frames and r its usual rate, a line of counts k is t
 
     z = (n - K r) / sqrt(K r),    e_k(j) = mean of z over 3 px around j - mean of z over 3 to 8 px to both sides
 
-and the light in common with a partner at pixel distance s is sum over j of e_0(j) (sum of e_k over j + s - LAGS_PX to
-j + s + LAGS_PX, less the mean of the same BESIDE_PX to either side). Smoothness is the sum of products of neighbouring
-pixels. Lines are int32 (partners, points, window), results float64 (points, 3 + orders).
+The light in common with a partner at pixel distance s is the sum over j of e_0(j) times (the sum of e_k from
+j + s - LAGS_PX to j + s + LAGS_PX, minus the mean of the same sum BESIDE_PX to either side). Smoothness is the sum of
+products of neighbouring pixels. Lines are int32 (partners, points, window), results float64 (points, 3 + orders).
 
-Light of all widths, haze above all, is compared by sums of BIN_PX of z, less the line's mean of z:
+Light of all widths, mainly haze, is compared by sums of z over BIN_PX, minus the line's mean of z:
 
     a_k(i) = sum over bin i of (z - mean of z),    shared(partner, o) = sum over points and i of a_0(i) a_k(i + s + o)
 """
@@ -67,13 +67,13 @@ def compare_lines(
 
     lines: (3, points, window) counts of each point's line and its first two partners; exposures, row, column: (3 or
     more, points). shift: (2 or more, points), pixels from a stripe of the line to the partner's. usual: (rows, width),
-    mean ones per exposure of each pixel over the sweep, NaN where it is not to be used; least: what a lower one counts
-    as. orders: (orders, WORD_PX), pixels of each word.
+    mean ones per exposure of each pixel over the sweep, NaN for unusable pixels; least: value used for lower ones.
+    orders: (orders, WORD_PX), pixels of each word.
 
-    Out come the light in common with each partner, 0 on average for noise, haze and whatever stands still; by how much
-    LEAST_SHARED of what single pixels have in common with the next row is above what their own frames have in common
-    with each other, below 0 since frames of one column show the same line; and by how much the sum of products of
-    neighbouring pixels grows when they are taken in each order.
+    The first two outputs are the light in common with each partner, which is 0 on average for noise, haze and anything
+    that stands still. The third is LEAST_SHARED times the light that single pixels have in common with the next row,
+    minus the light that their own frames have in common. It is negative, since frames of one column show the same line.
+    The others are the increase of the sum of products of neighbouring pixels when they are taken in each order.
     """
     window = lines.shape[2]
     line = np.zeros((3, window))
@@ -174,13 +174,13 @@ def follow_lines(
     shared: NDArray[np.float64],
     noise: NDArray[np.float64],
 ) -> None:
-    """Add up what points have in common with their partners, by how far from the expected place it is.
+    """Add up what points have in common with their partners, as a function of the distance from the expected place.
 
     lines to x_hi: as for `compare_lines`. usual, weight: (rows, width), mean ones r per exposure of each pixel over the
-    sweep and 1 / sqrt(r); both 0 where a pixel is not to be used. rows: (partner columns, 5), light in common with the
-    next row, 2 bins to either side of where it is expected, of those points whose partner column has frames. shared:
-    (partner columns, 2 SPAN + 1), that with the partner column, from SPAN bins short of where the planes put it to as
-    many beyond. noise: (partner columns,), the variance of each of these sums by the noise of photons.
+    sweep and 1 / sqrt(r); both 0 for unusable pixels. rows: (partner columns, 5), light in common with the next row, up
+    to 2 bins to either side of where it is expected, for points whose partner column has frames. shared: (partner
+    columns, 2 SPAN + 1), light in common with the partner column, from SPAN bins short of the place that the planes
+    predict to SPAN bins beyond. noise: (partner columns,), variance of each of these sums from photon noise.
     """
     window = lines.shape[2]
     bins = window // BIN_PX

@@ -1,17 +1,20 @@
-"""Checks of a map's counts and answers by its own light, which no scene fails, whatever it looks like.
+"""Checks of a map's counts and answers by its own light, which no correctly taken scene fails, whatever it looks like.
 
-They ask a few thousand points, each a row and column with partners: the next row, and four columns by whose times the
-line has moved 6 to 64 px. A stripe is seen at all of them, at places that the planes tell, and no noise is.
+They use a few thousand points, each a row and column with partners: the next row, and four columns at whose times the
+line has moved by 6 to 64 px. A stripe appears at all of them, at places that the planes predict; noise does not.
 
-- Pixels of a row: light falls on neighbours alike, so that no other order of the pixels is smoother than the right one.
-- Rows: a line of light stands where it stands on the next row.
-- Frames: those of one column show the line in one place, pixel by pixel, as two rows do.
-- Columns: it moves from column to column as the planes do; so does all other light of the sweep, haze above all.
-- Answers of estimators that know their confidence: an answer that is sure, 0.9 for one place of some 150, rests on
-  seven nats. At most 7 x 7 lines have a say in it, so that each brings a seventh at least, which is a mean of half a
-  standard deviation: so much more light must stand at the answers than behind them, on lines that did not give them.
+- Pixels of a row: light falls on neighbours alike, so no other order of the pixels is smoother than the right one.
+- Rows: a line of light is at the same place on the next row.
+- Frames: those of one column show the line at one place, pixel by pixel, just as two rows do.
+- Columns: the line moves from column to column as the planes predict; so does all other light of the sweep, mainly
+  haze.
+- Answers of estimators that state a probability as confidence: a confident answer, 0.9 for one place of some 150, needs
+  evidence of seven nats. At most 7 x 7 lines contribute to it, so each contributes at least a seventh, which is on
+  average half a standard deviation. So there must be that much more light at the answers than behind them, on lines
+  that did not give them.
 
-Limits are in standard deviations taken from the points themselves; where these are too few a check says nothing.
+Limits are in standard deviations estimated from the points themselves. If there are too few points, a check says
+nothing.
 """
 
 from collections.abc import Iterator
@@ -48,9 +51,10 @@ LEAST_FOLLOWING: Final = 0.25
 """Least light in common with the other column, over that with the next row: scenes have 0.8 and more, clutter such as
 fences half of it; columns that do not follow one another have none."""
 MOST_AMISS: Final = -0.45
-"""Light in common with the partner columns at the best of all wrong places, less that at the best of those where the
+"""Light in common with the partner columns at the best of all wrong places, minus that at the best of those where the
 planes put it, over that with the next row; the sum over the four partners. Maps have -0.65 in dense fog to -3 in clear
-air; shuffled or reversed columns have -0.4 to 2."""
+air; shuffled or reversed columns have -0.4 to 2.
+"""
 LEAST_LIGHT: Final = 12.0
 """Light in common with the next row, in standard deviations, below which nothing is said of where it moves to."""
 MARGIN: Final = 3.5
@@ -75,7 +79,7 @@ ORDERS: Final = ("the bits of each byte", *(f"the bytes of {bits}-bit words" for
 
 
 class Points(NamedTuple):
-    """Rows and columns that are looked at, with their partners: on the next row, and APART_PX on.
+    """Rows and columns that are checked, with their partners: on the next row, and APART_PX further on.
 
     row, column: int32 (2 + partner columns, points). shift: int32 (1 + partner columns, points), pixels from a stripe
     to the partner's, on one surface.
@@ -87,7 +91,7 @@ class Points(NamedTuple):
 
 
 def check_points(geometry: SweepGeometry, points: int = POINTS) -> Points:
-    """Up to `points` points spread evenly over the map; none where no column has a partner."""
+    """Up to `points` points spread evenly over the map; none if no column has a partner."""
     reference = geometry.reference_px()
     steps = np.abs(np.diff(reference, axis=1))
     step_px = float(np.median(steps)) if steps.size else 0.0
@@ -124,9 +128,10 @@ class MapChecks:
         self._orders = _orders()
 
     def doubts(self, sweep: Any, intensity: NDArray[np.uint32], stripe: StripeTable) -> tuple[str, ...]:
-        """Doubts about a map, a sentence each that says what to look at; empty where nothing speaks against it.
+        """Doubts about a map, each a sentence that says what to look at; empty if nothing speaks against it.
 
-        sweep: a `CountVolume`, or one with `checked`, the counts of the POINTS. stripe: the estimator's own answers.
+        sweep: a `CountVolume`, or a sweep with `checked`, the counts of the POINTS. stripe: the estimator's own
+        answers.
         """
         most = VOLUME_POINTS if isinstance(sweep, CountVolume) else POINTS
         if most not in self._points:
@@ -283,7 +288,7 @@ class MapChecks:
 
 
 class _Counts:
-    """Counts of a sweep at points, wherever they are kept."""
+    """Counts of a sweep at points, wherever they are stored."""
 
     def __init__(self, sweep: Any, geometry: SweepGeometry, points: Points) -> None:
         self._sweep = sweep
@@ -293,7 +298,7 @@ class _Counts:
         self.exposures: NDArray[np.int32] = sweep.n_frames[points.column]
 
     def exposures_seen(self) -> Array:
-        """Frames in whose window each pixel of a row was, (width,)."""
+        """Number of frames in whose window each pixel of a row was, (width,)."""
         geometry, n_frames = self._geometry, self._sweep.n_frames
         steps = np.zeros(geometry.width + geometry.window + 1)
         np.add.at(steps, np.minimum(geometry.x0, geometry.width), n_frames)
@@ -301,7 +306,7 @@ class _Counts:
         return np.asarray(np.cumsum(steps)[: geometry.width])
 
     def lit(self) -> NDArray[np.int64]:
-        """Points that have frames, as their NEAREST partners have."""
+        """Points that have frames and whose NEAREST partners have frames too."""
         return np.flatnonzero((self.exposures[:NEAREST] > 0).all(axis=0))
 
     def lines(self, chosen: NDArray[np.int64], most: int) -> NDArray[np.int32]:
@@ -315,7 +320,7 @@ class _Counts:
     def mean(
         self, partner: int, chosen: NDArray[np.int64], x: NDArray[np.int64], away: int, reach_px: tuple[int, int]
     ) -> Array:
-        """Mean ones per exposure around x, NaN where part of that was not searched; reach_px: first and last pixel."""
+        """Mean ones per exposure around x, NaN if part of that was not searched; reach_px: first and last pixel."""
         geometry = self._geometry
         y, c = self.points.row[partner, chosen], self.points.column[partner, chosen]
         px = x[:, None] + away * np.arange(reach_px[0], reach_px[1] + 1)

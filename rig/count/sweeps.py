@@ -1,4 +1,4 @@
-"""Blocks in, sweeps out: binds and counts the frames of a run, and keeps account of those that are missing."""
+"""From blocks to sweeps: binds and counts the frames of a run, and keeps account of those that are missing."""
 
 import logging
 import math
@@ -28,7 +28,7 @@ Gap = tuple[int, int]
 
 @dataclass(frozen=True, slots=True)
 class FrameCounts:
-    """Frames of a sweep from its scan marker to the next one: expected = received + lost.
+    """Number of frames of a sweep from its scan marker to the next one: expected = received + lost.
 
     lit: frames that fell on columns; dark: frames with the gate low throughout.
     """
@@ -42,9 +42,9 @@ class FrameCounts:
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class SweepAccount:
-    """Account of a sweep, kept when its counts are gone.
+    """Account of a sweep, kept after its counts are dropped.
 
-    direction: +1 where the mirror command rose, -1 where it fell; column indices mean the same commands both ways.
+    direction: +1 if the mirror command rose, -1 if it fell; column indices mean the same commands in both directions.
     gaps: (first, last) numbers of frames exposed but not received. The others are as in `SweepClock`.
     """
 
@@ -62,7 +62,7 @@ class SweepAccount:
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class SweepData(SweepAccount):
-    """One sweep, counted. count_s: wall time spent on binding and counting."""
+    """One counted sweep. count_s: wall time spent on binding and counting."""
 
     volume: FrameTally
     count_s: float
@@ -74,9 +74,9 @@ class SweepData(SweepAccount):
 
 @dataclass(frozen=True, slots=True)
 class SweepStart:
-    """First sweep of a run that becomes a map: number 0, but for a part that was cut from a recording.
+    """First sweep of a run that becomes a map: number 0, except in a part that was cut from a recording.
 
-    clock_ratio: as of `FrameBinder`. Frames of sweeps before it are not counted.
+    clock_ratio: as in `FrameBinder`. Frames of earlier sweeps are not counted.
     """
 
     sweep: int = 0
@@ -114,7 +114,7 @@ class SweepAssembler:
         """Whether the scan marker that closes the last map has been seen."""
 
     def add(self, block: FrameBlock) -> Iterator[SweepData]:
-        """Count a block; yields the sweeps that end in it. Stop adding once `complete`."""
+        """Count a block; yields the sweeps that end in it. Stop calling it once `complete`."""
         self._check(block)
         first = block.header.first_frame
         if self._next_frame is not None and first > self._next_frame:

@@ -1,8 +1,8 @@
 """Counts per column from packed frames: bits are added in bit-sliced form and never unpacked outside the window.
 
 `rig.count.kernels` does the adding. `SweepCounter` keeps the counts of a whole sweep, unsigned integers (columns, rows,
-window), and `LineCounter` those of a rig with several lines; estimators that judge a column as soon as it is complete
-bring a counter of their own, which keeps less (`Counter`). All of them note a `FrameTally` besides.
+window), and `LineCounter` those of a rig with several lines. Estimators that judge a column as soon as it is complete
+have their own counter, which keeps less (`Counter`). All of them also record a `FrameTally`.
 """
 
 from dataclasses import dataclass, replace
@@ -34,8 +34,8 @@ Counts = NDArray[np.unsignedinteger[Any]]
 class SweepLayout:
     """Pixels of each column that are counted: `window` from x0 (columns,) on, on a sensor of rows x width pixels.
 
-    exposures: frames nominally taken per column. used_px: pixels of each frame that are used; None: whole rows. dark:
-    whether there will be frames with the gate low.
+    exposures: frames nominally taken per column. used_px: pixels of each frame that are used; None for whole rows.
+    dark: whether there will be frames with the gate low.
     """
 
     columns: int
@@ -56,23 +56,23 @@ class SweepLayout:
 
     @property
     def padded_width(self) -> int:
-        """Pixels of a row as it lies in memory."""
+        """Pixels of a row as stored in memory, including padding."""
         return -(-self.width // WORD_PX) * WORD_PX
 
     @property
     def used_words(self) -> int:
-        """Words of each row that are used."""
+        """Number of words of each row that are used."""
         return (self.padded_width if self.used_px is None else self.used_px) // WORD_PX
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class FrameTally:
-    """Frames of a sweep, as every counter notes them besides the counts.
+    """Frames of a sweep, which every counter records besides the counts.
 
-    n_frames: (columns,), in each column's bin. column: (columns,), mean fractional column of those frames, NaN where
-    there are none. dark_counts: (rows, width) over n_dark frames with the gate low, None where there are none. width:
-    of the sensor, pixels. dark_frames: (width,), those of the n_dark frames in which a pixel was used; None: all of
-    them. velocity_per_s: of the mirror command over the columns, negative where it fell, 0 where nobody says.
+    n_frames: (columns,), in each column's bin. column: (columns,), mean fractional column of those frames, NaN if there
+    are none. dark_counts: (rows, width) over n_dark frames with the gate low, None if there are none. width: of the
+    sensor, pixels. dark_frames: (width,), number of the n_dark frames in which a pixel was used; None for all.
+    velocity_per_s: of the mirror command over the columns, negative if it fell, 0 if unknown.
     """
 
     n_frames: NDArray[np.int32]
@@ -88,7 +88,7 @@ class FrameTally:
         raise NotImplementedError
 
     def bound_column(self) -> NDArray[np.float64]:
-        """Fractional column of each bin (columns,), its own centre where it has no frames."""
+        """Fractional column of each bin (columns,), its own centre if it has no frames."""
         return np.where(self.n_frames > 0, self.column, np.arange(len(self.column), dtype=np.float64))
 
 
@@ -114,7 +114,9 @@ class CountVolume(FrameTally):
 
 
 class Counter(Protocol):
-    """Takes the frames of one sweep after the other. Results depend neither on threads nor on the size of blocks."""
+    """Takes the frames of sweeps, one sweep after the other. Results depend neither on threads nor on the size of
+    blocks.
+    """
 
     def reset(self) -> None:
         """Begin the next sweep."""
@@ -124,17 +126,17 @@ class Counter(Protocol):
     ) -> None:
         """Add packed frames `bits` (n, rows, row bytes) to `bins` (n,); `column` (n,): each frame's fractional column.
 
-        Row bytes are a multiple of 8; bins are a column index, BIN_DARK or BIN_UNUSABLE; the frames of a column follow
-        one another. x0: (n,), first used pixel of each frame, a multiple of 64; with rows shorter than the sensor's,
-        their first pixel. The used pixels of a frame on a column must hold that column's window. The frames may be
-        read on after this returns, see `settle`.
+        Row bytes are a multiple of 8. Bins are a column index, BIN_DARK or BIN_UNUSABLE; the frames of a column follow
+        one another. x0: (n,), first used pixel of each frame, a multiple of 64; if rows are shorter than the sensor's,
+        their first pixel. The used pixels of a frame on a column must contain that column's window. The frames may
+        still be read after this returns, see `settle`.
         """
 
     def settle(self, under_way: int = 0) -> None:
         """Wait until the frames of all but the last `under_way` calls of `add` have been read."""
 
     def finish(self) -> FrameTally:
-        """The counted sweep; the counter must be `reset` before the next one."""
+        """The counted sweep. Call `reset` before the next one."""
         ...
 
 
@@ -159,7 +161,7 @@ class SweepTally:
         self._dark_frames = np.zeros(self._layout.padded_width, np.int32)
 
     def note(self, bins: NDArray[np.int32], column: NDArray[np.float64], first_word: NDArray[np.int32]) -> None:
-        """Note the frames of a block; first_word: (n,), word at which each one's used pixels begin."""
+        """Record the frames of a block. first_word: (n,), word at which each one's used pixels begin."""
         lit = bins >= 0
         if lit.any():
             here, columns = bins[lit], self._layout.columns
@@ -187,7 +189,7 @@ class SweepTally:
 
 
 def with_room(counts: Counts, n_frames: NDArray[np.int32]) -> Counts:
-    """The counts, as wide as so many frames of a column need before they can overflow."""
+    """The counts in a type wide enough for `n_frames` frames of a column without overflow."""
     most = int(n_frames.max(initial=0))
     for wider in (np.uint16, np.uint32):
         if most <= np.iinfo(counts.dtype).max:
@@ -197,7 +199,7 @@ def with_room(counts: Counts, n_frames: NDArray[np.int32]) -> Counts:
 
 
 class SweepCounter:
-    """The `Counter` that keeps the counts of a whole sweep: a `CountVolume`."""
+    """A `Counter` that keeps the counts of a whole sweep: a `CountVolume`."""
 
     def __init__(self, layout: SweepLayout, workers: RowWorkers) -> None:
         self._layout = layout
@@ -217,7 +219,7 @@ class SweepCounter:
     def add(
         self, bits: NDArray[np.uint8], bins: NDArray[np.int32], column: NDArray[np.float64], x0: NDArray[np.int32]
     ) -> None:
-        """Add frames, see `Counter`."""
+        """Add frames as in `Counter`."""
         from rig.count.kernels import add_runs
 
         layout, first_word = self._layout, x0 // np.int32(WORD_PX)
@@ -234,7 +236,7 @@ class SweepCounter:
         self._workers.over(layout.rows, work)
 
     def settle(self, under_way: int = 0) -> None:
-        """Nothing is left over by `add`."""
+        """Do nothing, since `add` leaves no work unfinished."""
 
     def finish(self) -> CountVolume:
         """The counts so far."""
@@ -247,9 +249,10 @@ class SweepCounter:
 
 
 class LineCounter(SweepCounter):
-    """The counter of a rig with several lines, whose bins are places of the mirror and whose frames are whole rows.
+    """The counter of a rig with several lines. Its bins are places of the mirror, and its frames are whole rows.
 
-    Frames of a place are added once and each line's window is read from that. layout, and the volume: of all columns.
+    Frames of a place are added once, and each line's window is read from the result. layout, and the volume: of all
+    columns.
     """
 
     def __init__(self, layout: SweepLayout, grid: LineGrid, workers: RowWorkers) -> None:
@@ -260,7 +263,7 @@ class LineCounter(SweepCounter):
         self.reset()
 
     def finish(self) -> CountVolume:
-        """The counts so far; a column's frames are those of its place, as far off its centre as they were off that."""
+        """The counts so far. A column's frames are those of its place, with the same offset from the centre."""
         place, volume = self._grid.place, super().finish()
         column = np.arange(len(place)) + (volume.column - np.arange(self._grid.places))[place]
         return replace(volume, n_frames=volume.n_frames[place], column=column)

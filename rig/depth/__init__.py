@@ -1,4 +1,5 @@
-"""Stripe positions to depth: triangulation on the camera's grid, and the fog that a map's haze tells.
+"""From stripe positions to depth: triangulation on the camera's grid, and the fog density that follows from a map's
+haze.
 
-Enters: a stripe table, the geometry of the sweep. Leaves: depth in metres per camera pixel, and the extinction.
+Input: a stripe table and the geometry of the sweep. Output: depth in metres per camera pixel, and the extinction.
 """

@@ -2,9 +2,9 @@
 
 Depth is z in metres, float32 (rows, width), NaN where there is none (`depth_map`; the rule is in `rig.depth.kernels`).
 
-With several lines, columns that are lit together may take one and the same stripe for theirs: an estimator looks at one
-column at a time, sees the others' stripes too where windows overlap, and the brightest wins in each. At most one of
-them is right. So answers of one row and place of the mirror that coincide share what they are worth (`share_claims`).
+With several lines, columns that are lit together may claim the same stripe. An estimator looks at one column at a time,
+sees the others' stripes too if windows overlap, and in each the brightest wins. At most one of the claims is right. So
+coinciding answers of one row and place of the mirror share their confidence (`share_claims`).
 """
 
 from dataclasses import replace
@@ -23,8 +23,8 @@ def depth_map(
 ) -> Float32:
     """Depth z in metres (rows, width) float32, NaN where two confident neighbouring stripes do not enclose the pixel.
 
-    Only stripes of at least `min_confidence` take part; nothing else is filled. Depth outside the depth range by more
-    than a tenth is no estimate either.
+    Only stripes of at least `min_confidence` are used, and nothing else is filled. Depth that lies outside the depth
+    range by more than a tenth is also NaN.
     """
     from rig.depth.kernels import fill_rows
 
@@ -55,7 +55,8 @@ SAME_PX = 1.5
 
 
 def share_claims(stripes: StripeTable, grid: LineGrid) -> StripeTable:
-    """The table with the confidence c of coinciding answers multiplied with c over their sum; equal ones are halved.
+    """The table in which the confidence c of coinciding answers is multiplied by c over their sum; equal ones are
+    halved.
 
     Positions stay as they are.
     """

@@ -1,23 +1,26 @@
-"""The fog meter: how dense the medium is and how much light it and the sun bring, from the counts of one map alone.
+"""The fog meter: how dense the medium is, and the light it scatters and the ambient light, from the counts of a single
+map.
 
-The rows of a map whose stripe is beyond doubt say what lies before it and behind it. With s the mean of the path
-lengths from scanner and camera in metres, and G the geometry factor of the haze (`rig.estimate.row.inputs`),
+Rows whose stripe is beyond doubt show the light before it and behind it. With s the mean of the path lengths from
+scanner and camera in metres, and G the geometry factor of the haze (`rig.estimate.row.inputs`),
 
     flux = ambient + offset + haze G exp(-2 extinction s)           before the stripe
          = ambient + offset + rest haze G exp(-2 extinction s)      behind it
 
-is fitted by maximum likelihood of the counts, binned by s (float64 sums (blocks, 2, bins, 4), see `add_clear_rows`):
-haze, extinction, the share `rest` that was scattered more than once, and by what the learned ambient light is off.
+is fitted by maximum likelihood of the counts, binned by s (float64 sums (blocks, 2, bins, 4), see `add_clear_rows`).
+The parameters are haze, extinction, the share `rest` that was scattered more than once, and the error of the learned
+ambient light.
 
-Error bars are those of the sandwich, H^-1 (sum of g g^T) H^-1, g the likelihood's slope from each block of rows and
-columns: what the model leaves out shows as scatter between them, as in a jackknife, of which this is the first order.
-To them comes what no scatter shows: light scattered more than once flattens the decay all over the picture, so
+Error bars are those of the sandwich, H^-1 (sum of g g^T) H^-1, with g the likelihood's slope from each block of rows
+and columns. What the model leaves out shows as scatter between blocks, as in a jackknife, of which this is the first
+order.
+One error shows in no scatter: light scattered more than once flattens the decay all over the picture. Therefore
 REST_SHARE of `rest` is added to the extinction's relative error.
 
-Limits. Nothing is carried on from map to map: a reading is that of its map, and the same whenever the map is estimated
-again. Where the fog lays a halo around the stripes (`halo` of the model), its light falls off on both sides of them as
-haze would, and neither extinction nor veil is stated. Nor are they of several lines at once: the other lines' haze ends
-at stripes of their own, where is not known, and takes the form of the decay with it.
+Limits. Nothing is carried over between maps: a reading depends on its map only, and is the same whenever the map is
+estimated again. If the fog forms a halo around the stripes (`halo` of the model), its light falls off on both sides of
+them as haze would, and neither extinction nor veil is given. They are not given for several lines at once either,
+because the other lines' haze ends at their own stripes, at unknown places, which changes the form of the decay.
 """
 
 import math
@@ -58,10 +61,10 @@ class FogFit:
 
 
 def fit_fog(sums: Float64, path_m: Float64) -> FogFit | None:
-    """Fit of block sums (blocks, 2, bins, 4) over bins of mean path; None where too little was seen before stripes.
+    """Fit of block sums (blocks, 2, bins, 4) over bins of mean path; None if too little was seen before stripes.
 
-    Levenberg's steps from the likeliest of several extinctions. The covariance is that of the counts, widened number
-    by number to the sandwich's.
+    Levenberg's steps start from the likeliest of several extinctions. The covariance is that of the counts; each
+    parameter's error is widened to the sandwich's.
     """
     blocks, _, bins, _ = sums.shape
     used = sums[..., 1].sum(0).ravel() > LEAST_EXPOSURES
@@ -104,7 +107,9 @@ def _inverse(information: Float64) -> Float64:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class _Data:
-    """Sums of the fit, (blocks, cells) each; path_m, behind: (cells,), off the middle path, and side of the stripe."""
+    """Sums of the fit, (blocks, cells) each; path_m, behind: (cells,), distance from the middle path, and side of the
+    stripe.
+    """
 
     ones: Float64
     exposures: Float64
@@ -114,7 +119,7 @@ class _Data:
     behind: Bools
 
     def started(self, extinction_per_m: float) -> Float64:
-        """Parameters of this extinction with the haze that gives the ones before stripes."""
+        """Parameters for this extinction, with the haze that gives the ones before stripes."""
         shape = self.gain * np.exp(np.minimum(-2.0 * extinction_per_m * self.path_m, 50.0))
         shape, before = (each[:, ~self.behind] for each in (shape, self.exposures))
         rate = np.minimum(self.ones[:, ~self.behind].sum() / before.sum(), 0.999)
@@ -128,13 +133,13 @@ class _Data:
         return shape, part, np.clip(self.ambient + value[2] + value[0] * shape * part, FLUX_MIN, FLUX_MAX)
 
     def evidence(self, value: Float64) -> float:
-        """Log-likelihood of the counts, and of the weak prior."""
+        """Log-likelihood of the counts, with the weak prior."""
         flux = self._light(value)[2]
         likelihood = float(np.sum(self.ones * np.log(np.expm1(flux)) - self.exposures * flux))
         return likelihood - 0.5 * float(self.prior(value) @ value)
 
     def prior(self, value: Float64) -> Float64:
-        """Slope of the weak prior, downwards."""
+        """Negative slope of the weak prior's logarithm."""
         return np.array([0.0, 1e-3, 0.0, REST_PRIOR]) * value
 
     def slopes(self, value: Float64) -> tuple[Float64, Float64]:
@@ -169,13 +174,13 @@ is flatter by 25 to 40 % where `rest` is 0.35 to 0.45 (Mitsuba rows, docs/explan
 
 @dataclass(frozen=True, slots=True)
 class FogEstimate:
-    """Fog and light of a map, each with its standard deviation; None where it is not resolved.
+    """Fog and light of a map, each with its standard deviation; None if it is not resolved.
 
-    visibility_m: 3.912 / extinction; its standard deviation is half of what two standard deviations less of extinction
-    add to it.
+    visibility_m: 3.912 / extinction; its standard deviation is half of the change for an extinction that is two
+    standard deviations smaller.
     ambient_per_exposure: photons per pixel and exposure that are not the laser's: surfaces, airlight and dark counts,
     mean over the pixels read. veil_per_exposure: the laser's light that the medium sends back, per pixel just before
-    the stripe, mean over the rows read; veil_to_signal: over their stripes' light.
+    the stripe, mean over the rows read; veil_to_signal: ratio to their stripes' light.
     """
 
     extinction_per_m: float | None = None
@@ -189,7 +194,7 @@ class FogEstimate:
     veil_to_signal: float | None = None
 
     def brief(self) -> str:
-        """The visibility in three words, nothing where it is not resolved."""
+        """The visibility in three words, empty if it is not resolved."""
         if self.visibility_m is None or self.visibility_sd_m is None:
             return ""
         return f"visibility {digits(self.visibility_m)} +- {digits(self.visibility_sd_m, 2)} m"
@@ -198,7 +203,8 @@ class FogEstimate:
 def read_fog(sweep: Any, stripe: StripeTable, geometry: SweepGeometry, state: Any) -> FogEstimate:
     """The fog of one map.
 
-    sweep: a `CountVolume`, or a sweep with `lines` of counts. stripe: of its estimator, made with the `RowModel` state.
+    sweep: a `CountVolume`, or a sweep with `lines` of counts. stripe: its stripe table, made with the `RowModel`
+    `state`.
     """
     from rig.depth.kernels import SUMS, add_clear_rows
     from rig.estimate.row.em import lines_of, next_lattice

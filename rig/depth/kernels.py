@@ -1,12 +1,12 @@
-"""Compiled steps behind the stripe table: the depth map on the camera grid, and the sums of the fog meter.
+"""Compiled steps after the stripe table: the depth map on the camera grid, and the sums of the fog meter.
 
 `fill_rows`: between the stripes xa and xb of columns a and b on one row, on one surface, a pixel at x has
 
     inverse depth = (1 - f) p_a.(u, v, 1) + f p_b.(u, v, 1),    f = (x - xa) / (xb - xa)
 
 with planes p float64 (columns, 3) and rays u, v float32 (rows, width); inverse depth is float32 (rows, width).
-`add_clear_rows`: ones, exposures and exposures weighted with geometry factor and flux, of pixels clearly before and
-clearly behind the stripes of a sweep, float64 per block, side and bin of path.
+`add_clear_rows` sums ones, exposures, and exposures weighted with geometry factor and flux, of pixels clearly before
+and clearly behind the stripes of a sweep, float64 per block, side and bin of path.
 """
 
 from typing import Final
@@ -33,7 +33,7 @@ def fill_rows(
 
     Also writes the mirror's command there, from the columns' `commands`, unless `command` is empty.
 
-    Two stripes of one row lie on one surface when their columns are at most MAX_COLUMN_GAP apart and their spacing is
+    Two stripes of one row lie on one surface if their columns are at most MAX_COLUMN_GAP apart and their spacing is
     that of equal depth within 1 px + 3 sd. Between them the column is linear in x. The more confident pair wins.
     """
     rows, columns = x_px.shape
@@ -84,10 +84,10 @@ def add_clear_rows(
     sweep: Sweep, state: RowState, lines: Lines, x_px: Float32, clear: Bools, block: Int32, clear_px: float,
     hot_flux: float, sums: Float64, at_stripe: Float64,
 ) -> None:  # fmt: skip
-    """Add the pixels of clear lines that are clear_px and more before or behind their stripe at x_px.
+    """Add the pixels of clear lines that are clear_px or more before or behind their stripe at x_px.
 
     sums: (blocks, 2, bins, SUMS), before and behind. at_stripe (lines, 2): path in metres and geometry factor of the
-    haze at the stripe, unchanged for other lines. Pixels of more ambient flux than hot_flux take no part.
+    haze at the stripe, unchanged for other lines. Pixels with more ambient flux than hot_flux are left out.
     """
     row = row_buffers(sweep.window, state.amplitude.shape[0])
     step = 1 if sweep.near_is_left else -1

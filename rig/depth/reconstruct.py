@@ -28,8 +28,8 @@ from rig.threads import RowWorkers
 class MapResult:
     """One reconstructed map: stripe table, depth_m (rows, width) float32 with NaN, intensity (rows, width) uint32.
 
-    learned: the state that the estimator used, None where it learns nothing. doubts: what its own light has against it,
-    a sentence each (`rig.count.map_checks`).
+    learned: the state that the estimator used, None if it learns nothing. doubts: sentences on why the map may be
+    wrong, judged by its own light (`rig.count.map_checks`).
     """
 
     stripe: StripeTable
@@ -44,9 +44,9 @@ class MapResult:
 class Reconstructor:
     """Turns counted sweeps into maps, one after the other; estimators that learn carry their state from map to map.
 
-    model: rig model, None for an uncalibrated rig (stripes only), whose sensor (rows, width) must be given.
-    column_commands: (columns,) mirror command of each column's centre. learned: states of earlier maps to use.
-    lines: which line lights which column where there are several. Raises UsageError without model and sensor.
+    model: rig model; None for an uncalibrated rig, which gives stripes only and needs sensor (rows, width).
+    column_commands: (columns,) mirror command of each column's centre. learned: states of earlier maps to use. lines:
+    which line lights which column, if there are several. Raises UsageError without model and sensor.
     """
 
     def __init__(
@@ -84,7 +84,7 @@ class Reconstructor:
         self._checks = MapChecks(self.geometry, calibrated=model is not None, knows=estimate.estimator in LEARNING)
 
     def counter(self, layout: SweepLayout) -> Counter:
-        """A counter whose sweeps `map` takes, one after the other and each before frames of the next are added."""
+        """A counter whose sweeps go to `map`, one after the other and each before frames of the next are added."""
         if self._lines is not None:
             return LineCounter(layout, self._lines, self._workers)
         return self.estimator.counter(layout, self.geometry)
@@ -92,14 +92,14 @@ class Reconstructor:
     def map(self, sweep: Any) -> MapResult:
         """Stripe table, depth and intensity of one counted sweep, with the time that estimation took.
 
-        sweep: what a `counter` gave, or a `CountVolume`.
+        sweep: the result of a `counter`, or a `CountVolume`.
         """
         begun = time.perf_counter()
         stripe = self.estimator.estimate(sweep, self.geometry)
         return self.complete(stripe, sweep, self._filter, time.perf_counter() - begun)
 
     def complete(self, stripe: StripeTable, sweep: FrameTally, filter: str, estimate_s: float) -> MapResult:
-        """The map of a sweep whose stripe table the estimator gave, in `estimate_s`: filter, depth and intensity."""
+        """The map of a sweep whose stripe table the estimator made in `estimate_s`, with filter, depth and intensity."""
         begun = time.perf_counter() - estimate_s
         geometry, fog, intensity = self._bound(sweep), self._fog(sweep, stripe), sweep.intensity()
         doubts = self._checks.doubts(sweep, intensity, stripe)
@@ -128,6 +128,6 @@ class Reconstructor:
         return self.geometry.bound_to(self._model, commands, sweep.velocity_per_s)
 
     def _fog(self, sweep: FrameTally, stripe: StripeTable) -> FogEstimate:
-        """Fog of the map; nothing where its estimator learns no haze, or without a geometry."""
+        """Fog of the map; nothing if its estimator learns no haze, or without a geometry."""
         state = self.estimator.used
         return FogEstimate() if state is None or self._model is None else read_fog(sweep, stripe, self.geometry, state)

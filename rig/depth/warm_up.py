@@ -1,4 +1,4 @@
-"""Compiles the kernels of an estimate before a run, so that its times are those of the work alone (`rig warmup`)."""
+"""Compiles the kernels of an estimate before a run, so that its times do not include compiling (`rig warmup`)."""
 
 import numpy as np
 
@@ -18,9 +18,9 @@ MAPS = 2
 
 
 def warm_up(estimator: str, filter: str, exposures: int, *, dark: bool) -> None:
-    """Estimate two small made-up maps at so many exposures, and throw them away.
+    """Estimate two small synthetic maps with this number of exposures, and throw them away.
 
-    dark: whether the run will have dark frames. Compiled code is kept on disk by numba: only the first run ever waits.
+    dark: whether the run will have dark frames. numba keeps compiled code on disk, so only the first run ever waits.
     """
     rng = np.random.default_rng(0)
     geometry = uncalibrated_geometry(ROWS, WORD_PX, COLUMNS)
@@ -52,7 +52,7 @@ def warm_up(estimator: str, filter: str, exposures: int, *, dark: bool) -> None:
 
 
 def warm_binding(plan: ScanPlan) -> None:
-    """Compile what binds frames to this plan's columns."""
+    """Compile the code that binds frames to this plan's columns."""
     from rig.count.bind_kernels import cover
 
     FrameBinder(plan).compile()

@@ -1,10 +1,9 @@
 """Decides whether a calibration may be used: whether it is of this rig, passed its checks, and is not too old.
 
-A calibration that was estimated says of which devices it is, when it was made and with what verdict
-(`calibration.Identity`); one written by hand says nothing, and is used unchecked. What depth depends on is compared:
-kinds and serial numbers of sensor and scanner, how they are mounted, the laser lines; of a simulated rig, its geometry.
-Settings of a scan are not. A recording is compared with the devices that it was taken with, at the date on which it was
-taken.
+A measured calibration states its devices, its date and its verdict (`calibration.Identity`). One written by hand states
+nothing and is used unchecked. Everything that affects depth is compared: kinds and serial numbers of sensor and
+scanner, how they are mounted, and the laser lines; for a simulated rig, its geometry. Settings of a scan are not
+compared. A recording's calibration is compared with the devices and the date of the recording.
 
 Each reason against a calibration is a `Refusal`, which the user may accept. A check that fails later is noted in a file
 beside the calibration (`note_check`, `notes_on`); the calibration itself stays as it is.
@@ -55,23 +54,23 @@ _CHECKS: Final = {"check": "rig calibrate check", "pixels": "rig calibrate pixel
 
 @runtime_checkable
 class KnowsRig(Protocol):
-    """A world that knows the rig as it truly is."""
+    """A world that knows the true rig."""
 
     def true_model(self) -> RigModel:
-        """Camera, scanner and lag of the rig, as a calibration is to find them."""
+        """The true camera, scanner and lag, which a calibration should find."""
         ...
 
 
 @dataclass(frozen=True, slots=True)
 class CalibrationUse:
-    """The calibration of a run. checked: it says of which rig it is. accepted: reasons in spite of which it is used."""
+    """The calibration of a run. checked: whether it states its rig. accepted: reasons in spite of which it is used."""
 
     model: RigModel
     checked: bool
     accepted: tuple[Refusal, ...] = ()
 
     def content(self) -> dict[str, Any]:
-        """Describe it for the manifest."""
+        """The calibration's use as plain values for the manifest."""
         return {
             "id": self.model.fingerprint(),
             "provenance": dict(self.model.provenance),
@@ -82,7 +81,7 @@ class CalibrationUse:
 def identity_of(rig: OpenRig) -> Identity:
     """Identity of an open rig, for a calibration of it that is made now.
 
-    A rig that plays a recording has the identity of the rig that was recorded.
+    A rig that plays a recording has the identity of the recorded rig.
     """
     if isinstance(rig.spad, ReplaySpad):
         return recorded_identity(rig.spad.recording.path)
@@ -103,7 +102,7 @@ def identity_of(rig: OpenRig) -> Identity:
 
 
 def recorded_identity(run: Path) -> Identity:
-    """Identity of the rig that a recording was taken with, as far as its manifest says; `created` is that date."""
+    """Identity of the rig that made a recording, as far as its manifest says. `created` is the date of the recording."""
     noted = (read_manifest(run) or {}).get("rig") or {}
     kinds, serials = noted.get("kinds") or {}, noted.get("serials") or {}
     return _identity(str(noted.get("name", "")), kinds, serials, str(noted.get("taken", "")))
@@ -116,7 +115,7 @@ def same_rig(one: Identity, other: Identity) -> bool:
 
 
 def rig_content(identity: Identity) -> dict[str, Any]:
-    """Describe the rig of a run for its manifest; `recorded_identity` reads it."""
+    """The rig of a run as plain values for its manifest; `recorded_identity` reads it."""
     return {
         "name": identity.name,
         "id": identity.rig,
@@ -127,10 +126,11 @@ def rig_content(identity: Identity) -> dict[str, Any]:
 
 
 def calibration_use(rig: OpenRig, *, accept: bool = False, here: Identity | None = None) -> CalibrationUse | None:
-    """The calibration of an open rig, compared with it; None where it has none. UsageError, a line for each reason.
+    """The calibration of an open rig, compared with it; None if it has none. Raises UsageError with a line for each
+    reason.
 
-    accept: use it in spite of the reasons. here: identity of the rig, where the caller has it. Reasons that were
-    accepted when a recording was taken stay accepted for the recording's own calibration.
+    accept: whether to use it in spite of the reasons. here: identity of the rig, if the caller has it. Reasons that
+    were accepted when a recording was taken stay accepted for the recording's own calibration.
     """
     if rig.model is None:
         return None
@@ -141,7 +141,9 @@ def calibration_use(rig: OpenRig, *, accept: bool = False, here: Identity | None
 
 
 def cube_calibration_use(model: RigModel, file: Path | None, *, accept: bool = False) -> CalibrationUse:
-    """The calibration of a bare cube, of whose rig nothing is known: its verdict and checks count. UsageError."""
+    """The calibration of a cube of frames whose rig is unknown. Only its verdict and checks count. May raise
+    UsageError.
+    """
     found = refusals(model, file, None, None)
     return _used(model, file, found, frozenset(r.code for r in found) if accept else frozenset())
 
@@ -149,7 +151,7 @@ def cube_calibration_use(model: RigModel, file: Path | None, *, accept: bool = F
 def refusals(
     model: RigModel, file: Path | None, here: Identity | None, max_age_s: float | None = None
 ) -> tuple[Refusal, ...]:
-    """Reasons against a calibration for the rig `here` at the time `here.created`; None is a rig that is not known."""
+    """Reasons against a calibration for the rig `here` at the time `here.created`. None means an unknown rig."""
     found: list[Refusal] = []
     identity = model.identity
     if identity is not None:
@@ -240,7 +242,7 @@ def accepted_by(use: CalibrationUse | None) -> tuple[str, ...]:
 
 
 def failed_verdict(verdict: str | None, reasons: Sequence[str]) -> list[Refusal]:
-    """The reason that a calibration's own verdict gives: none where it passed, or where nobody judged it (None)."""
+    """The reason that follows from a calibration's own verdict; none if it passed or nobody judged it (None)."""
     if verdict != "failed":
         return []
     why = ", ".join(reasons) or "no reason noted"
@@ -254,14 +256,14 @@ def require_accepted(name: str, found: Sequence[Refusal], accepted: Container[st
 
 
 def check_content(checked: str, accepted: Sequence[Refusal]) -> dict[str, Any]:
-    """Describe for a manifest how the comparison ended: `checked`, or 'accepted' with the reasons accepted."""
+    """The outcome of the comparison for a manifest: `checked`, or 'accepted' with the reasons accepted."""
     if not accepted:
         return {"check": checked}
     return {"check": "accepted", "accepted": [[each.code, each.text] for each in accepted]}
 
 
 def note_check(file: Path, model: RigModel, what: str, *, passed: bool, reasons: tuple[str, ...] = ()) -> Path:
-    """Note beside a calibration file how a check of it ended; `what`: check or pixels. Raises OSError."""
+    """Note the outcome of a check in a file beside the calibration. what: check or pixels. Raises OSError."""
     beside = _beside(file)
     notes = _read_notes(beside)
     date = datetime.now(UTC).isoformat(timespec="seconds")
@@ -275,7 +277,7 @@ def note_check(file: Path, model: RigModel, what: str, *, passed: bool, reasons:
 def carry_notes(old: Path, before: RigModel, new: Path, after: RigModel, *, new_pixels: bool = False) -> None:
     """Copy the notes on failed checks from a calibration to the one that was made from it. Raises OSError.
 
-    new_pixels: the new one has pixels of its own, so that notes on the old ones do not apply.
+    new_pixels: whether the new one has a pixel map of its own, so that notes on the old one do not apply.
     """
     failed = {what: note for what, note in notes_on(old, before).items() if not note.get("passed", True)}
     if new_pixels:
@@ -289,7 +291,7 @@ def _beside(file: Path) -> Path:
 
 
 def notes_on(file: Path | None, model: RigModel) -> dict[str, dict[str, Any]]:
-    """Notes on this very calibration, by the name of the check; empty where there is no file."""
+    """Notes on this very calibration, by the name of the check; empty if there is no file."""
     if file is None:
         return {}
     notes = _read_notes(_beside(file))

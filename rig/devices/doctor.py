@@ -1,8 +1,8 @@
 """Examines whether a scan could run (`rig doctor`), lists attached devices, and switches the laser off.
 
-`examine` opens everything and looks at frames of a sweep with the gate low: what the SPAD sends meanwhile, and whether
-the scan marker reaches the sync source. The mirror moves, as in a scan; no light leaves: the gate is low
-throughout and the laser is never armed.
+`examine` opens everything and looks at the frames of a sweep with the gate low: what the SPAD sends, and whether the
+scan marker reaches the sync source. The mirror moves as in a scan, but no light leaves: the gate is low throughout and
+the laser is never armed.
 """
 
 import os
@@ -54,7 +54,7 @@ _LEAST_LINES = 3
 
 @dataclass(frozen=True, slots=True)
 class LineMarkers:
-    """The line markers of a sweep against its plan. clock_error: of the scanner, in the SPAD's time."""
+    """The line markers of a sweep, compared with its plan. clock_error: of the scanner, in the SPAD's time."""
 
     rate_hz: float
     jitter_columns: float
@@ -65,9 +65,9 @@ class LineMarkers:
 class DarkLook:
     """Frames of a sweep with the gate low, and what came with them.
 
-    records: (n,), records of all frames. dark_share: share of ones. n_bytes: bytes of pixels; seconds: time to send
-      them.
-    counters: the SPAD's own, before it was stopped. triggered: the sync source's program ran to its end.
+    records: (n,), records of all frames. dark_share: share of ones. n_bytes: bytes of pixels; seconds: time taken to
+    send them.
+    counters: the SPAD's own, before it was stopped. triggered: whether the sync source's program ran to its end.
     """
 
     records: NDArray[np.void]
@@ -88,7 +88,7 @@ class DarkLook:
         return _count(self.records, Mark.LINE)
 
     def lines(self, plan: ScanPlan) -> LineMarkers | None:
-        """The line markers behind the first scan marker, as far as they were seen; None where there are too few."""
+        """The line markers after the first scan marker, as far as they were seen; None if there are too few."""
         marks = self.records["marks"].astype(np.int64)
         scans, at = (np.flatnonzero(marks & int(mark)) for mark in (Mark.SCAN, Mark.LINE))
         planned_s = np.flatnonzero(plan.waveform.markers & MARKER_LINE) / float(plan.point_rate_hz)
@@ -146,7 +146,7 @@ def _count(records: NDArray[np.void], mark: Mark) -> int:
 
 @dataclass(frozen=True, slots=True)
 class Finding:
-    """Result of one examination. ok: False where a scan could not run like this."""
+    """Result of one examination. ok: False if a scan could not run like this."""
 
     name: str
     ok: bool
@@ -307,7 +307,7 @@ KNOWN = (("helios", HELIOS), ("lasercube", LASERCUBE), *(("spb-usb", one) for on
 class Attached:
     """One attached device.
 
-    address: what a config's `port` says to mean it. kind: kind of its driver; None for a serial port of any kind.
+    address: the value of a config's `port` for it. kind: kind of its driver; None for a serial port of any kind.
     """
 
     address: str
@@ -329,9 +329,9 @@ def attached() -> list[Attached]:
 
 
 def laser_off(config: RigConfig) -> list[str]:
-    """Take the gate low and switch emission off; return what was done.
+    """Take the gate low and switch emission off; returns what was done.
 
-    Both are tried, whatever the other did; DevicesError names the failures.
+    Both are tried even if one fails. Raises DevicesError with the failures.
     """
     done: list[str] = []
     trouble: list[str] = []

@@ -1,6 +1,6 @@
 """Opens all devices of a rig together, lists every failure at once, and closes them gate first, whatever happens.
 
-Here is also who may let light out: a real laser or gate needs the user's word, a simulated one none.
+This module also decides who may let light out: a real laser or gate needs the user's consent, a simulated one does not.
 """
 
 from collections.abc import Iterator, Mapping, Sequence
@@ -30,7 +30,7 @@ DEVICES = ("spad", "scanner", "laser", "sync")
 
 @dataclass(frozen=True, slots=True)
 class OpenRig:
-    """The open devices of a rig. world: None on a real rig; model: None where it is not calibrated."""
+    """The open devices of a rig. world: None for a real rig; model: None if it is not calibrated."""
 
     config: RigConfig
     clock: Clock
@@ -48,24 +48,24 @@ class OpenRig:
 
 @runtime_checkable
 class ProjectsLines(Protocol):
-    """A world whose laser can send out several lines at once."""
+    """A world whose laser can project several lines at once."""
 
     def project_lines(self, offsets: Sequence[float], *, shared: bool) -> None:
-        """Send out a line at each of these offsets, in units of the mirror command."""
+        """Project a line at each of these offsets, in units of the mirror command."""
         ...
 
 
 @runtime_checkable
 class EmulatesDevices(Protocol):
-    """A world that plugs in devices of its own, until it is closed."""
+    """A world that provides devices of its own, until it is closed."""
 
     @property
     def ports(self) -> Mapping[str, Endpoint]:
-        """Endpoints of the devices, by the names that `port: emulated:NAME` means."""
+        """Endpoints of the devices, by the NAME in `port: emulated:NAME`."""
         ...
 
     def close(self) -> None:
-        """Unplug them."""
+        """Unplug all devices."""
         ...
 
 
@@ -75,8 +75,8 @@ def open_rig(config: RigConfig, seed: int = 0, tap: TapFile | None = None) -> It
 
     A simulated rig has virtual time, a real one the host's.
     seed: of everything simulated.
-    tap: file that records what passes the ports of all devices; of the SPAD, its control traffic.
-    Raises UsageError where config or calibration are at fault, DevicesError where devices are; each lists all problems.
+    tap: file that records what passes the ports of all devices; for the SPAD, only its control traffic.
+    Raises UsageError for faults of config or calibration, DevicesError for faults of devices; each lists all problems.
     """
     with ExitStack() as stack:
         yield _open(config, seed, tap, stack)
@@ -84,7 +84,7 @@ def open_rig(config: RigConfig, seed: int = 0, tap: TapFile | None = None) -> It
 
 @contextmanager
 def open_light(config: RigConfig, trouble: list[str]) -> Iterator[tuple[SyncSource | None, LineLaser | None]]:
-    """Open the gate and the laser alone, without a guard; None, with a line in `trouble`, for one that fails."""
+    """Open only the gate and the laser, without a guard. One that fails is None and adds a line to `trouble`."""
     with ExitStack() as stack:
         surroundings = surroundings_of(config, 0, stack)
         opened: dict[str, Any] = {"sync": None, "laser": None}
@@ -97,7 +97,9 @@ def open_light(config: RigConfig, trouble: list[str]) -> Iterator[tuple[SyncSour
 
 
 def check_files(config: RigConfig) -> None:
-    """Open every file that a config names, as `open_rig` does, but no device. UsageError with a line per problem."""
+    """Open every file that a config names, as `open_rig` does, but no device. Raises UsageError with a line per
+    problem.
+    """
     problems: list[str] = []
     _load_model(config, problems)
     with ExitStack() as stack:
@@ -143,7 +145,7 @@ def _open(config: RigConfig, seed: int, tap: TapFile | None, stack: ExitStack) -
 
 
 def _create_surroundings(config: RigConfig, seed: int, stack: ExitStack, problems: list[str]) -> Surroundings | None:
-    """Clock and world; None where the world cannot be made, with lines in `problems`."""
+    """Clock and world; None if the world cannot be made, with lines in `problems`."""
     try:
         return surroundings_of(config, seed, stack)
     except DeviceError as error:  # a scene that is not there is the config's fault, not a device's
@@ -152,7 +154,7 @@ def _create_surroundings(config: RigConfig, seed: int, stack: ExitStack, problem
 
 
 def surroundings_of(config: RigConfig, seed: int, stack: ExitStack) -> Surroundings:
-    """Clock and world of the config, with the devices that the world plugs in. DeviceError where it cannot be made."""
+    """Clock and world of the config, with the devices that the world provides. Raises DeviceError if it cannot be made."""
     virtual = config.world is not None and not config.world.real_time
     clock = VirtualClock() if virtual else SystemClock()
     bare = Surroundings(clock, None, seed)
@@ -222,7 +224,7 @@ def _pause_if_emitting(laser: LineLaser) -> list[str]:
 
 
 def require_simulated_or_armed(config: RigConfig, arm: bool) -> list[str]:
-    """Problems with letting light out: every real laser and gate needs the user's word."""
+    """Problems with letting light out: every real laser and gate needs the user's consent (`arm`)."""
     devices = {slot: getattr(config, slot) for slot in GUARDED}
     real = [
         slot

@@ -1,6 +1,6 @@
 """Prepares open devices for a scan: the plan is compiled once and the SPAD configured for it, before anything moves.
 
-Here is also how a burst shares a SPAD's memory between the time until the scanner has started and the maps.
+This module also divides a SPAD's burst memory between the time until the scanner has started and the maps.
 """
 
 import math
@@ -30,21 +30,21 @@ class HoldsColumns(Protocol):
     """A world that can give all frames of a column the same light, so that it is computed once for them."""
 
     def hold_columns(self, commands: NDArray[np.float64]) -> None:
-        """Hold the light within columns of these mirror commands (columns,)."""
+        """Hold the light constant within columns at these mirror commands (columns,)."""
         ...
 
 
 @runtime_checkable
 class PlansEffects(Protocol):
-    """A world that leaves out what makes no difference to a scan."""
+    """A world that leaves out effects that make no difference to a scan."""
 
     def plan_for(self, power_w: float, exposure_s: float, exposures: int) -> None:
-        """Choose what is simulated, for frames of that exposure, so many to a column, at that power or less."""
+        """Choose the simulated effects for columns of `exposures` frames of that exposure, at that power or less."""
         ...
 
 
 def prepare(rig: OpenRig) -> tuple[ScanPlan, SpadTiming]:
-    """Compile the plan and configure the SPAD for it; nothing moves and no light leaves."""
+    """Compile the plan and configure the SPAD for it. Nothing moves and no light leaves."""
     scan = rig.config.scan
     if isinstance(rig.spad, ReplaySpad):  # what was scanned is bound by the plan that it was scanned with
         return replay_plan(rig.spad, rig.spad.recording, scan, rig.model)
@@ -89,19 +89,20 @@ A busy host starts its devices late.
 
 
 def lead_s(rig: OpenRig) -> float:
-    """Seconds of a burst before its first scan marker."""
+    """Duration in seconds of the part of a burst before its first scan marker."""
     return BURST_LEAD_S if isinstance(rig.clock, VirtualClock) else HOST_LEAD_S
 
 
 def spare_lead_s(rig: OpenRig) -> float:
-    """Further seconds before the first marker that a burst may have room for."""
+    """Additional seconds before the first marker for which a burst may have room."""
     return 0.0 if isinstance(rig.clock, VirtualClock) or not rig.spad.info.markers else SPARE_LEAD_S
 
 
 def most_sweeps(rig: OpenRig, plan: ScanPlan) -> int | None:
-    """The most sweeps of one start that fit a burst's memory and the sync source's program; None: any number.
+    """Largest number of sweeps of one start that fit a burst's memory and the sync source's program; None for any
+    number.
 
-    At least 1, which either may still refuse.
+    At least 1, which either of them may still refuse.
     """
     legs = plan.sweeps_per_period
     repeats = rig.sync.most_repeats(sync_program(plan, legs)[0])
@@ -113,7 +114,7 @@ def most_sweeps(rig: OpenRig, plan: ScanPlan) -> int | None:
 
 
 def require_memory(rig: OpenRig, plan: ScanPlan) -> None:
-    """Raise PlanError where the SPAD's memory would be full before one map is whole."""
+    """Raise PlanError if the SPAD's memory would be full before one map is complete."""
     if plan.burst_frames is None:
         return
     need = math.ceil(plan.frames_for(1) + lead_s(rig) * float(plan.frame_rate_hz))

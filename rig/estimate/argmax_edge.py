@@ -1,9 +1,9 @@
-"""Estimators `argmax` (brightest pixel of the row, the naive reference) and `edge` (the report's), rows compiled.
+"""Compiled estimators `argmax` (brightest pixel of the row, the naive reference) and `edge` (that of the report).
 
-`argmax`: the largest count inside the window, ties to the smallest x. `edge`: an exponential background is fitted to
-the near side of the row, then the largest (count - background) counts, weighted with the drop of the level from the
-8 px before to the 8 px behind. Counts are integers (columns, rows, window); answers float32 (rows, columns), refined
-to sub-pixel with the two neighbours. Both are told nothing and learn nothing.
+`argmax` takes the largest count inside the window, and the smallest x among equal ones. `edge` fits an exponential
+background to the near side of the row and takes the largest (count - background), weighted with the drop of the level
+from the 8 px before to the 8 px behind. Counts are integers (columns, rows, window); answers are float32 (rows,
+columns), refined to sub-pixel positions with the two neighbours. Neither uses a model or learns one.
 """
 
 from dataclasses import dataclass
@@ -30,9 +30,9 @@ NEAR_SHARE: Final = 0.25
 
 @numba.njit(cache=True, nogil=True)
 def sub_pixel(weight: Float64, peak: int, length: int) -> float:
-    """Offset of the peak in -0.5..0.5 from its two neighbours: centroid of what rises above the lower of them.
+    """Offset of the peak in -0.5..0.5 from its two neighbours: centroid of the part above the lower of them.
 
-    A flat top or a peak at the end of the row has no offset.
+    A flat top, or a peak at the end of the row, has no offset.
     """
     if peak <= 0 or peak >= length - 1:
         return 0.0
@@ -48,9 +48,9 @@ def sub_pixel(weight: Float64, peak: int, length: int) -> float:
 def peak_confidence(weight: Float64, counts: Float64, k: float, peak: int, length: int) -> tuple[float, float]:
     """(P(the true peak is within 1 px of `peak`), mean count away from it).
 
-    The row is read as 'one pixel at the peak's rate, the others at the mean rate of the rest', whose likelihood at x is
-    weight[x] (logit p_peak - logit p_rest) + k log((1 - p_peak) / (1 - p_rest)) against 'no stripe', which has a prior
-    of NO_STRIPE; rates are kept off 0 and 1 by half a count. A row without a count is no stripe.
+    The row is modelled as 'one pixel at the peak's rate, the others at the mean rate of the rest', whose likelihood at
+    x is weight[x] (logit p_peak - logit p_rest) + k log((1 - p_peak) / (1 - p_rest)). The alternative 'no stripe' has
+    the prior NO_STRIPE. Half a count keeps rates off 0 and 1. A row without a count has no stripe.
     """
     if counts[peak] <= 0.0:
         return 0.0, 0.0
@@ -106,7 +106,9 @@ def peak_rows(
     counts: Counts, n_frames: Int32, x0: Int32, x_lo: Int32, x_hi: Int32, near_is_left: bool, defects: Bools,
     with_edge: bool, first_row: int, last_row: int, out: Float32,
 ) -> None:  # fmt: skip
-    """`argmax` (with_edge False) or `edge` on rows first_row..last_row-1; out (5, rows, columns) as in StripeTable."""
+    """Run `argmax` (with_edge False) or `edge` on rows first_row..last_row-1; out: (5, rows, columns) as in
+    StripeTable.
+    """
     window = counts.shape[2]
     n = np.empty(window + 2 * MARGIN_PX, np.float64)
     score = np.empty(window + 2 * MARGIN_PX, np.float64)
@@ -194,7 +196,7 @@ def _flux(count: float, k: float) -> float:
 
 @dataclass(frozen=True, slots=True)
 class Peaks:
-    """Peak search on every row; `with_edge` weighs peaks with the drop behind them."""
+    """Peak search on every row. with_edge: whether peaks are weighted with the drop behind them."""
 
     with_edge: bool
     threads: int = 2

@@ -1,9 +1,10 @@
-"""Estimator `likelihood`: maximum likelihood of 'haze, stripe, then less' on every row, told nothing of the medium.
+"""Estimator `likelihood`: maximum likelihood of 'haze, stripe, then less' on every row, without knowledge of the
+medium.
 
 The likelihood itself: `rig.estimate.row.likelihood`; the search along a row: `rig.estimate.search.rows`; the model and
 how it is learned: `rig.estimate.row.model`, `rig.estimate.row.em`, `rig.estimate.search.online_learning`. The first map
-is counted whole and estimated twice: the first pass finds which pixels were quiet behind the stripe. Every later map is
-judged column by column while its frames come in, under a model learned from earlier maps alone.
+is counted completely and estimated twice, because the first pass finds which pixels were quiet behind the stripe. Every
+later map is judged column by column while its frames come in, with a model learned from earlier maps alone.
 """
 
 from rig.count.volume import BYTE_EXPOSURES, Counter, CountVolume, SweepCounter, SweepLayout
@@ -20,7 +21,7 @@ from rig.threads import RowWorkers
 
 
 class Likelihood:
-    """Row likelihood with the state it has learned so far; `model` is None before a map that taught.
+    """Row likelihood with the state it has learned so far; `model` is None until a map was good enough to learn from.
 
     Pass `model` to estimate a map again with the state that it was estimated with: the result is the same bit for bit.
     learns: whether later maps change that state.
@@ -34,7 +35,7 @@ class Likelihood:
 
     @property
     def model(self) -> RowModel | None:
-        """The state that the next map will be estimated with."""
+        """The state with which the next map will be estimated."""
         return self._lessons.model
 
     @model.setter
@@ -42,11 +43,11 @@ class Likelihood:
         self._lessons.model = model
 
     def counter(self, layout: SweepLayout, geometry: SweepGeometry) -> Counter:
-        """A counter whose sweeps `estimate` takes; geometry: nominal, as of every sweep."""
+        """A counter whose sweeps `estimate` takes. geometry: the nominal one, which holds for every sweep."""
         return _LikelihoodCounter(self, layout, geometry, self._workers)
 
     def estimate(self, sweep: CountVolume | SearchedSweep, geometry: SweepGeometry) -> StripeTable:
-        """Stripe table of one sweep; afterwards `model` is what the next sweep will be estimated with."""
+        """Stripe table of one sweep. Afterwards `model` is the state for the next sweep."""
         if isinstance(sweep, SearchedSweep):
             assert self.model is not None, "a sweep is judged under a model"
             used, stripes = self.model, sweep.stripe
@@ -73,7 +74,7 @@ def _judge(setting: LearningSetting, workers: RowWorkers) -> SearchTables:
 
 
 class _LikelihoodCounter:
-    """Counts the first sweep whole; judges the columns of every later one as they come."""
+    """Counts the first sweep completely, and judges the columns of every later one as they come."""
 
     def __init__(self, of: Likelihood, layout: SweepLayout, geometry: SweepGeometry, workers: RowWorkers) -> None:
         self._of, self._layout, self._geometry, self._workers = of, layout, geometry, workers
@@ -85,7 +86,7 @@ class _LikelihoodCounter:
         self._counter = None
 
     def add(self, bits: Uint8, bins: Int32, column: Float64, x0: Int32) -> None:
-        """Add frames, see `Counter`."""
+        """Add frames as in `Counter`."""
         self._present().add(bits, bins, column, x0)
 
     def settle(self, under_way: int = 0) -> None:
@@ -94,7 +95,7 @@ class _LikelihoodCounter:
             self._counter.settle(under_way)
 
     def finish(self) -> CountVolume | SearchedSweep:
-        """Counts of the sweep, or its stripes where its columns were judged on the way."""
+        """Counts of the sweep, or its stripes if its columns were judged on the way."""
         return self._present().finish()
 
     def _present(self) -> SweepCounter | ColumnJudge:

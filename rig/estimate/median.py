@@ -1,6 +1,6 @@
-"""Filter `median`: the report's 5x5 median, taken on disparity so that the slant of columns does not matter.
+"""Filter `median`: the report's 5x5 median, applied to disparity so that the slant of columns does not matter.
 
-Disparity is x minus the mean position of its column; missing answers (NaN) take no part, and none is filled in.
+Disparity is x minus the mean position of its column. Missing answers (NaN) are ignored and not filled in.
 """
 
 from dataclasses import replace
@@ -61,10 +61,10 @@ def _median_rows(disparity: Float32, confidence: Float32, coupled: bool, out: Fl
 def median_filter(stripes: StripeTable, reference_px: Float64, *, coupled: bool = False) -> StripeTable:
     """Stripe table with x_px replaced by the 5x5 median of its disparity; reference_px (rows, columns), NaN allowed.
 
-    The reference is where the column's line stands at a fixed depth. Confidence becomes the share of the neighbours'
-    confidence that lies within 1 px of the median, times the probability that one of those at least is right; coupled:
-    times their mean, since answers that go by each other agree where nothing is lit too. x_sd_px becomes the standard
-    deviation of a median of those neighbours.
+    The reference is the position of the column's line at a fixed depth. Confidence becomes the share of the neighbours'
+    confidence that lies within 1 px of the median, times the probability that at least one of those is right. If
+    coupled, it is times their mean instead, since answers that influence each other also agree where nothing is lit.
+    x_sd_px becomes the standard deviation of a median of those neighbours.
     """
     reference = reference_px.astype(np.float32)
     out = np.full((3, *stripes.x_px.shape), np.nan, np.float32)

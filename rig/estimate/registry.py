@@ -1,7 +1,7 @@
-"""Stripe estimators by name: counts of a sweep in, a stripe table out.
+"""Stripe estimators by name, which turn the counts of a sweep into a stripe table.
 
-`create_estimator` makes a fresh one. `recalling` makes one that is given the states that maps were once estimated with,
-one for each map, and so estimates these maps again bit for bit.
+`create_estimator` makes a fresh one. `recalling` makes one that is given the states with which maps were estimated, one
+for each map, and so estimates these maps again bit for bit.
 """
 
 from collections.abc import Sequence
@@ -24,7 +24,7 @@ COUPLED = frozenset({"joint"})
 
 
 class Learned(Protocol):
-    """State that an estimator has learned; its extinction is NaN where the haze does not resolve it."""
+    """State that an estimator has learned. Its extinction is NaN if the haze does not resolve it."""
 
     @property
     def extinction_per_m(self) -> float:
@@ -42,7 +42,7 @@ class Learned(Protocol):
 
 
 class Estimator(Protocol):
-    """An estimator. used: the state the last map was estimated with, None where none is learned."""
+    """An estimator. used: the state with which the last map was estimated, None if it learns none."""
 
     @property
     def used(self) -> Learned | None:
@@ -50,30 +50,30 @@ class Estimator(Protocol):
         ...
 
     def counter(self, layout: "SweepLayout", geometry: "SweepGeometry") -> "Counter":
-        """A counter whose sweeps `estimate` takes; geometry: as of every sweep, with columns at their centres."""
+        """A counter whose sweeps `estimate` takes. geometry: that of every sweep, with columns at their centres."""
         ...
 
     def estimate(self, sweep: Any, geometry: "SweepGeometry") -> "StripeTable":
-        """Stripe table of what `counter` gave of one sweep, or of a `CountVolume`."""
+        """Stripe table of the sweep that `counter` returned, or of a `CountVolume`."""
         ...
 
 
 class LearnsFromStream(Estimator, Protocol):
-    """An estimator out of LEARNING: its model can be set, to go on from a kept state."""
+    """An estimator in LEARNING. Its model can be set, to continue from a kept state."""
 
     model: Any
     """The state that the next map will be estimated with, None before a map that taught."""
 
 
 def recalling(name: str, learned: Sequence[Learned], threads: int = 2, *, temporal_prior: bool = False) -> Estimator:
-    """Estimator of a name in LEARNING that estimates each map with a state out of `learned`, and learns nothing."""
+    """Estimator of a name in LEARNING that estimates each map with its own state from `learned`, and learns nothing."""
     return Recalled(_learning(name, threads, learns=False, temporal_prior=temporal_prior), learned)
 
 
 def create_estimator(name: str, threads: int = 2, *, temporal_prior: bool = False) -> Estimator:
-    """Estimator of a name out of ESTIMATORS, fresh, for up to `threads` threads; KeyError for any other name.
+    """A fresh estimator of a name in ESTIMATORS, for up to `threads` threads; KeyError for any other name.
 
-    temporal_prior: whether `joint` holds each map to the last one a little; the others estimate every map by itself.
+    temporal_prior: whether `joint` uses the last map as a weak prior; the others estimate every map by itself.
     """
     if name in LEARNING:
         return _learning(name, threads, learns=True, temporal_prior=temporal_prior)
@@ -93,7 +93,7 @@ def _learning(name: str, threads: int, *, learns: bool, temporal_prior: bool) ->
 
 
 class Recalled:
-    """Estimates each map with a state of its own, later maps with the last; of: an estimator that learns nothing."""
+    """Estimates each map with its own state, and further maps with the last one. of: an estimator that learns nothing."""
 
     def __init__(self, of: LearnsFromStream, states: Sequence[Learned]) -> None:
         self._states, self._of = list(states), of

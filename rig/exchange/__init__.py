@@ -1,1 +1,1 @@
-"""Recordings from and for other programs: `rig import`, `rig export` (docs/how-to/exchange.md)."""
+"""Exchange of recordings with other programs: `rig import`, `rig export` (docs/how-to/exchange.md)."""

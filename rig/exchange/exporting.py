@@ -31,7 +31,7 @@ FRAMES_PER_PICTURE: Final = 100
 
 @dataclass(frozen=True, slots=True)
 class ExportResult:
-    """Result of an export. gaps: missing frames, [run id, first, last]. damage: a line for each part not readable."""
+    """Result of an export. gaps: missing frames, [run id, first, last]. damage: a line for each unreadable part."""
 
     folder: Path
     kind: str
@@ -43,11 +43,11 @@ class ExportResult:
 
     @property
     def exit_code(self) -> int:
-        """Exit code of the command line: 1 where parts of the recording are missing in what was written."""
+        """Exit code of the command line: 1 if parts of the recording are missing in the output."""
         return 1 if self.damage else 0
 
     def as_json(self) -> dict[str, Any]:
-        """Return it as plain values."""
+        """The result as plain values."""
         return {name: getattr(self, name) for name in self.__slots__}
 
 
@@ -58,9 +58,10 @@ def export_run(
     request: ExportRequest,
     progress: Progress | None = None,
 ) -> ExportResult:
-    """Write `run` in another form to a new folder: `out`, or RUN-KIND beside the run; it appears whole or not at all.
+    """Write `run` in another form to a new folder: `out`, or RUN-KIND beside the run. The folder appears only once it
+    is complete.
 
-    Raises UsageError where the run has nothing of that kind, or h5py is not installed.
+    Raises UsageError if the run has nothing of that kind, or h5py is not installed.
     """
     run = Path(run)
     _check(run, kind, request)
@@ -82,7 +83,7 @@ def export_run(
 
 
 class _Export:
-    """An export under way: a method for each kind."""
+    """An export under way, with a method for each kind."""
 
     def __init__(self, run: Path, folder: RunFolder, request: ExportRequest, progress: Progress | None) -> None:
         self._run, self._folder, self._asked = run, folder, request
@@ -101,7 +102,7 @@ class _Export:
         self.log = write_npy(self._blocks(), self._folder, source, None if model is None else model.camera)
 
     def write_hdf5(self) -> None:
-        """Write frames and maps to one file, as far as there are any."""
+        """Write frames and maps, if there are any, to one file."""
         if not self._maps.indices and not self._recorded:
             require_recording(self._run)
         blocks = self._blocks() if self._recorded else iter(())
@@ -119,7 +120,7 @@ class _Export:
         self.n_maps = len(clouds)
 
     def write_png(self) -> None:
-        """Write single pictures."""
+        """Write pictures as separate files."""
         self._write_pictures(lambda shown, view: pictures.write_pngs(shown, self._folder, view))
 
     def write_mp4(self) -> None:
@@ -156,7 +157,7 @@ class _Export:
         self.damage += recording.problems
 
     def _manifest(self) -> dict[str, Any]:
-        """The run's manifest; empty where there is none or it is damaged, which is noted."""
+        """The run's manifest; empty if there is none or it is damaged, which is noted."""
         try:
             return read_manifest(self._run) or {}
         except DamagedRecordingError as error:
@@ -164,7 +165,7 @@ class _Export:
             return {}
 
     def _view(self) -> View:
-        """The view to show. UsageError where the run has nothing of it."""
+        """The view to show. Raises UsageError if the run has nothing of it."""
         there = {
             "depth": bool(self._maps.files("depth", ".npy")),
             "intensity": bool(self._maps.files("intensity", ".png")),
@@ -181,7 +182,7 @@ class _Export:
         return view
 
     def _make_maps(self) -> str:
-        """The next step where there are no maps. UsageError where there are no frames to make maps of either."""
+        """The next step where there are no maps. Raises UsageError if there are no frames to make maps of either."""
         require_recording(self._run)
         return f"make them first: {reconstruct_line(self._run)}, and export that folder"
 

@@ -1,4 +1,4 @@
-"""Frames in the file of another program, in the form in which every importer returns them."""
+"""Frames from files of other programs, in the form in which every importer returns them."""
 
 import os
 import re
@@ -22,9 +22,10 @@ CHUNK_BYTES: Final = 16 << 20
 class ForeignFrames:
     """Frames of one size in their order.
 
-    chunks: gives them, uint8 (any number, height, ceil(width / 8)), most significant bit = leftmost pixel. origin: for
-    the manifest. ranges: [first frame, frames] of consecutive numbers, where the file tells of lost ones. hints: lines
-    for the user about what may be wrong.
+    chunks: returns the frames in pieces, uint8 (any number, height, ceil(width / 8)), most significant bit = leftmost
+    pixel.
+    origin: for the manifest. ranges: [first frame, frames] of consecutive numbers, if the file records lost ones.
+    hints: lines for the user about what may be wrong.
     """
 
     width: int
@@ -38,9 +39,10 @@ class ForeignFrames:
 
 
 def gather(files: Iterable[str | os.PathLike[str]], suffix: str) -> list[Path]:
-    """List the given files in that order; a folder stands for all its files with `suffix`, in inner folders too.
+    """List the given files in that order. A folder stands for all files with `suffix` in it and its subfolders.
 
-    A folder's files come in natural order (2 before 10), as the cameras number them. UsageError where one is missing.
+    A folder's files come in natural order (2 before 10), as the cameras number them. Raises UsageError if one is
+    missing.
     """
 
     def natural(file: Path) -> list[tuple[int, str]]:
@@ -59,7 +61,7 @@ def gather(files: Iterable[str | os.PathLike[str]], suffix: str) -> list[Path]:
 
 
 def open_each(files: Iterable[Path], open_one: Callable[[Path], T]) -> list[T]:
-    """Open all files. UsageError, a line per file, where some cannot be."""
+    """Open all files. Raises UsageError, with a line for each file that cannot be opened."""
     opened: list[T] = []
     problems: list[str] = []
     for file in files:
@@ -73,7 +75,7 @@ def open_each(files: Iterable[Path], open_one: Callable[[Path], T]) -> list[T]:
 
 
 def bytes_of(file: Path) -> NDArray[np.uint8]:
-    """The file's bytes, mapped into memory; UsageError where it cannot be read."""
+    """The file's bytes, mapped into memory. Raises UsageError if it cannot be read."""
     try:
         return np.memmap(file, np.uint8, mode="r") if file.stat().st_size else np.zeros(0, np.uint8)
     except OSError as error:
@@ -81,7 +83,7 @@ def bytes_of(file: Path) -> NDArray[np.uint8]:
 
 
 def chunks_of(frames: NDArray[np.uint8]) -> Iterator[NDArray[np.uint8]]:
-    """Give `frames` (n, ...) in pieces of `CHUNK_BYTES`."""
+    """Yield `frames` (n, ...) in pieces of `CHUNK_BYTES`."""
     step = max(1, CHUNK_BYTES // max(1, frames[:1].nbytes))
     for first in range(0, len(frames), step):
         yield frames[first : first + step]

@@ -1,11 +1,12 @@
-"""Writes a run as one HDF5 file, which h5py opens, and MATLAB with `h5read` or, as a MAT-file of version 7.3, `load`.
+"""Writes a run as one HDF5 file. h5py opens it, and so does MATLAB with `h5read` or, as a MAT-file of version 7.3,
+`load`.
 
     /frames/bits uint8 (frames, height, row bytes)  /frames/number run ticks time_s marks x0 y0 line sweep (1, frames)
     /maps/depth_m float32 (maps, height, width)  /maps/x_px confidence x_sd_px signal haze (maps, rows, columns)
     /maps/number (1, maps)  /clock/tick_hz frame_period_ticks exposure_ticks (1, 1)  /manifest UTF-16 (n, 1)
 
-MATLAB sees dimensions in reverse order and has no arrays below two. A MAT-file has 512 bytes of header before the HDF5
-part, and the name of a MATLAB class with each array and group (MAT-file format 7.3, as MATLAB writes it).
+MATLAB sees dimensions in reverse order, and its arrays have at least two. A MAT-file has 512 bytes of header before the
+HDF5 part, and the name of a MATLAB class with each array and group (MAT-file format 7.3, as MATLAB writes it).
 """
 
 import errno
@@ -40,7 +41,7 @@ _ROOM_BYTES: Final = 16 << 20
 
 
 def require_h5py() -> Any:
-    """The h5py module; UsageError with the command that installs it."""
+    """The h5py module. If it is missing, raises UsageError with the command that installs it."""
     try:
         import h5py
     except ImportError as error:

@@ -1,7 +1,8 @@
-"""`rig import`: makes a recording of the frames of another program.
+"""`rig import`: makes a recording from the frames of another program.
 
-Foreign files carry pixels and little else. What they do not say stays open in the recording: no markers, and without a
-frame rate no clock (`frame_period_ticks` 0, one tick a frame). The pixels are the files' own, bit by bit.
+Foreign files contain pixels and little else. What they do not say is left open in the recording: there are no markers,
+and without a frame rate no clock (`frame_period_ticks` 0, one tick per frame). The pixels are those of the files, bit
+by bit.
 """
 
 import os
@@ -71,7 +72,7 @@ class ImportResult:
     hints: tuple[str, ...]
 
     def as_json(self) -> dict[str, Any]:
-        """Return it as plain values."""
+        """The result as plain values."""
         return {name: getattr(self, name) for name in self.__slots__}
 
 
@@ -82,7 +83,7 @@ def import_frames(
     request: ImportRequest,
     progress: Progress | None = None,
 ) -> ImportResult:
-    """Write the frames of `files` to a new run folder `out`; it appears whole or not at all.
+    """Write the frames of `files` to a new run folder `out`, which appears only once it is complete.
 
     Raises UsageError, a line per problem, for files or options that cannot be used.
     """

@@ -1,8 +1,8 @@
 """Writes a recording as a photon cube: `frames.npy` for `photoncube`, `visionsim` and `rig reconstruct`, and its JSON.
 
-The array is uint8 (frames, height, ceil(width / 8)), most significant bit first, the frames that were received one
-after the other. `frames.json` says what it cannot: clock, numbers and gaps, markers, windows, which `FrameLog`
-gathers block by block. `transforms.json`, where there is a camera, makes it a data set of visionsim.
+The array is uint8 (frames, height, ceil(width / 8)), most significant bit first, with the received frames one after the
+other. `frames.json` has what the array cannot hold: clock, numbers and gaps, markers, windows, collected block by block
+by `FrameLog`. If there is a camera, `transforms.json` makes it a data set for visionsim.
 """
 
 import json
@@ -30,7 +30,7 @@ _POSE: Final = "[[1,0,0,0],[0,1,0,0],[0,0,1,0],[0,0,0,1]]"
 
 
 class FrameLog:
-    """The records of all frames in order; UsageError where a block has another size or clock than the first one."""
+    """The records of all frames in order. Raises UsageError if a block has another size or clock than the first one."""
 
     def __init__(self) -> None:
         self._header: BlockHeader | None = None
@@ -57,7 +57,7 @@ class FrameLog:
 
     @property
     def header(self) -> BlockHeader:
-        """The first block's header; UsageError where there was no block."""
+        """The first block's header. Raises UsageError if there was no block."""
         if self._header is None:
             raise UsageError("the recording holds no whole block of frames; see rig verify")
         return self._header
@@ -96,7 +96,7 @@ class FrameLog:
         ]
 
     def content(self) -> dict[str, Any]:
-        """Describe, for a JSON file, all that an array of the pixels cannot say. Places are indices of the array."""
+        """Everything for a JSON file that an array of pixels cannot hold. Places are indices of the array."""
         header, columns = self.header, self.columns()
         marks = columns["marks"]
         return {
@@ -139,7 +139,7 @@ def _changes(values: NDArray[np.integer[Any]]) -> Iterator[tuple[int, int]]:
 def write_npy(
     blocks: Iterable[FrameBlock], folder: RunFolder, source: Mapping[str, Any], camera: Camera | None
 ) -> FrameLog:
-    """Write the cube of `blocks` and the files beside it. UsageError where the blocks do not make one array."""
+    """Write the cube of `blocks` and the files beside it. Raises UsageError if the blocks do not make one array."""
     log = FrameLog()
     with folder.place(CUBE).open("wb") as file:
         for block in blocks:
@@ -176,18 +176,18 @@ def _transforms(camera: Camera, n_frames: int) -> str:
 
 
 class MapFiles:
-    """The maps of a run as `docs/reference/run-folder.md` describes them; a run that only recorded has none."""
+    """The maps of a run, as docs/reference/run-folder.md describes them. A run that was only recorded has none."""
 
     def __init__(self, run: Path) -> None:
         self._run = run
         self.indices = sorted(int(file.stem) for file in run.glob("stripe/*.npz") if file.stem.isdigit())
 
     def files(self, folder: str, suffix: str) -> list[Path]:
-        """Files of one kind, in order of the maps: depth, .npy; intensity, .png; cloud, .ply."""
+        """Files of one kind in order of the maps: depth, .npy; intensity, .png; cloud, .ply."""
         return sorted(self._run.glob(f"{folder}/*{suffix}"))
 
     def arrays(self, index: int) -> dict[str, NDArray[np.float32]]:
-        """Stripe table of a map, (rows, columns) each, and its depth_m (height, width) where the rig is calibrated."""
+        """Stripe table of a map, (rows, columns) each, and its depth_m (height, width) if the rig is calibrated."""
         with load(self._run / "stripe" / f"{index:06d}.npz") as table:
             arrays = dict(table)
         file = self._run / "depth" / f"{index:06d}.npy"
@@ -195,7 +195,7 @@ class MapFiles:
 
 
 def load(file: Path) -> Any:
-    """Load a file with numpy; UsageError, one line, where that fails."""
+    """Load a file with numpy. Raises UsageError, with one line, if that fails."""
     try:
         return load_numpy(file)
     except (OSError, ValueError, EOFError, zipfile.BadZipFile) as error:

@@ -1,7 +1,8 @@
 """Photon cubes: `.npy` uint8 (frames, height, width / 8) of `photoncube` and `visionsim` (docs/reference/hardware.md).
 
-Packed along the width, most significant bit first (`numpy.packbits(axis=2)`). What the array cannot say, a file beside
-it may: `NAME.json` of `rig export` (width, frame rate, frame numbers) or visionsim's `transforms.json` (width).
+They are packed along the width, most significant bit first (`numpy.packbits(axis=2)`). A file beside the array may add
+what it cannot hold: `NAME.json` of `rig export` (width, frame rate, frame numbers) or visionsim's `transforms.json`
+(width).
 """
 
 from collections.abc import Iterator, Mapping, Sequence
@@ -38,9 +39,10 @@ class _Cube:
 
 
 def open_photoncube(files: Sequence[Path], asked: ImportRequest) -> ForeignFrames:
-    """Open cubes as frames one after the other. UsageError, a line per problem, for files that are no such cubes.
+    """Open cubes as frames one after the other. Raises UsageError, a line per problem, for files that are not such
+    cubes.
 
-    Where all bytes are 0 or 1 they must be asked for as packed.
+    If all bytes are 0 or 1, the user must state that they are packed.
     """
     cubes = open_each(files, lambda file: _open(file, packed=asked.form == "packed"))
     if len({(cube.width, cube.frames.shape[1:]) for cube in cubes}) > 1:
@@ -87,7 +89,7 @@ def _open(file: Path, *, packed: bool) -> _Cube:
 
 
 def _beside(file: Path) -> Mapping[str, Any]:
-    """The JSON that `rig export` or visionsim wrote beside a cube; empty where there is no such file."""
+    """The JSON that `rig export` or visionsim wrote beside a cube; empty if there is no such file."""
     for sidecar in (file.with_suffix(".json"), file.with_name(TRANSFORMS)):
         try:
             content = parse_json(sidecar.read_text(encoding="utf-8"))

@@ -24,7 +24,7 @@ Picture = NDArray[np.uint8]
 
 
 def map_pictures(maps: MapFiles, view: View) -> Iterator[Picture]:
-    """Make one picture of each map, all of the same size; the colours of the first depth map hold for all."""
+    """Make one picture of each map, all of the same size. The colour scale of the first depth map is used for all."""
     if view == "intensity":
         import cv2
 
@@ -42,9 +42,9 @@ def map_pictures(maps: MapFiles, view: View) -> Iterator[Picture]:
 
 
 def frame_pictures(blocks: Iterable[FrameBlock], frames_per_picture: int) -> Iterator[Picture]:
-    """Sum so many received frames at a time on the whole sensor, square-root grey; a rest at the end is left out.
+    """Sum received frames in groups on the whole sensor, in square-root grey. An incomplete last group is left out.
 
-    White is where the brightest pixels of the first picture are, so that a film does not flicker.
+    White is the level of the brightest pixels of the first picture, so that a film does not flicker.
     """
     white = 0.0
     for counts in _sums(blocks, frames_per_picture):
@@ -53,7 +53,7 @@ def frame_pictures(blocks: Iterable[FrameBlock], frames_per_picture: int) -> Ite
 
 
 def write_pngs(pictures: Iterable[Picture], folder: RunFolder, name: str) -> int:
-    """Write NAME-000000.png and so on; returns how many there were."""
+    """Write NAME-000000.png and so on; returns the number of files."""
     n = 0
     for n, picture in enumerate(pictures, start=1):
         folder.place(f"{name}-{n - 1:06d}.png").write_bytes(png_bytes(picture))
@@ -61,7 +61,7 @@ def write_pngs(pictures: Iterable[Picture], folder: RunFolder, name: str) -> int
 
 
 def write_mp4(pictures: Iterable[Picture], path: Path, pictures_per_s: float) -> int:
-    """Write a film (MPEG-4 part 2) and return its number of pictures. UsageError where OpenCV cannot write it here."""
+    """Write a film (MPEG-4 part 2); returns its number of pictures. Raises UsageError if OpenCV cannot write it here."""
     import cv2
 
     film = None

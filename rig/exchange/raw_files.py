@@ -1,13 +1,13 @@
 """Raw `.bin` files of two cameras, whose frames have no header (docs/reference/hardware.md).
 
-SPAD512S (Pi Imaging): 1-bit RAW files, dumps of the TCP stream, sparse lists. Packed: rows of 64 bytes, most
-significant bit first; a dump of the stream may end with `DONE`, which pixels may read as well: the length counts.
-Sparse: u32 little-endian numbers of the pixels that fired, row by row; the number of pixels closes a frame.
+SPAD512S (Pi Imaging): 1-bit RAW files, dumps of the TCP stream, sparse lists. Packed files have rows of 64 bytes, most
+significant bit first. A dump of the stream may end with `DONE`; as pixels may have the same bytes, the length decides.
+Sparse lists are u32 little-endian numbers of the pixels that fired, row by row; the number of pixels closes a frame.
 
 SwissSPAD2: least significant bit first. Half array: 256 rows of 512 pixels, 512 frames in the camera's files of 8 MiB.
 Full array: 512 x 512, 256 frames a file, read out as 256 rows of 1024 pixels in 8 zones of 128: a quarter of the upper
 half's row, the same quarter of the lower half's row counted from the bottom, the next quarter, ...
-(WISION-Lab/photoncube2video, src/cube.rs). Nothing in a file says which it is.
+(WISION-Lab/photoncube2video, src/cube.rs). Nothing in a file says which of the two it is.
 """
 
 from collections.abc import Iterator, Sequence
@@ -41,9 +41,9 @@ _JUDGED_SIGMAS: Final = 10.0
 
 
 def open_pi_imaging(files: Sequence[Path], asked: ImportRequest) -> ForeignFrames:
-    """Open files as frames one after the other, whose form is seen from each file where it is not asked for.
+    """Open files as frames one after the other. The form of each file is recognised unless the request states it.
 
-    UsageError, a line per file, for contents that are no whole number of frames.
+    Raises UsageError, a line per file, for contents that are not a whole number of frames.
     """
     form, rows = asked.form, asked.rows or ROWS
     opened = open_each(files, lambda file: _open_pi_imaging(file, form, rows))
@@ -112,7 +112,9 @@ def _sparse(content: NDArray[np.uint8], rows: int) -> Iterator[NDArray[np.uint8]
 
 
 def open_swissspad2(files: Sequence[Path], asked: ImportRequest) -> ForeignFrames:
-    """Open files as frames one after the other, half unless asked for. UsageError, a line per file, for other sizes."""
+    """Open files as frames one after the other, as half arrays unless the request says full. Raises UsageError, a line
+    per file, for other sizes.
+    """
     full = asked.form == "full"
     frame_bytes = _HALF_BYTES * (2 if full else 1)
 
@@ -144,7 +146,7 @@ def open_swissspad2(files: Sequence[Path], asked: ImportRequest) -> ForeignFrame
 
 
 def full_frames(raw: NDArray[np.uint8]) -> NDArray[np.uint8]:
-    """(n, 512, 64), most significant bit first, of full frames as read out (n, 32768)."""
+    """(n, 512, 64), most significant bit first, from full frames as read out (n, 32768)."""
     zones = _LSB_FIRST[raw.reshape(-1, HALF_ROWS, _QUARTERS, 2, _ZONE_BYTES)]
     frames = np.empty((len(zones), 2 * HALF_ROWS, _ROW_BYTES), np.uint8)
     halves = frames.reshape(len(zones), 2, HALF_ROWS, _QUARTERS, _ZONE_BYTES)

@@ -1,3 +1,3 @@
 """The geometry of a sweep: search windows of every row and column from calibration and depth range, bent light sheets,
-the columns of a fan of lines, and the stripe table.
+the columns of several lines, and the stripe table.
 """

@@ -1,10 +1,10 @@
-"""Light that is no plane at one column: sheets that bow, and rows that are read one after the other.
+"""Light that is no plane within a column: sheets that bow, and rows that are read one after the other.
 
-Windows, estimators and the joining of stripes take planes and rays (u, v, 1). So they are given rays bent sideways by
-what the bow does in the middle of the depth range. What is left of it, and the delay of the rows, is below a pixel or
-two: the windows are wider by that (`beside_px`), and the depth of a map is put right afterwards, exactly, from each
-pixel's command (`BentLight.inverse_depth`). `calibration.model.light_sheet` has the formula of a bowed sheet. Rays are
-float32 (rows, width), commands and sheets float64.
+Windows, estimators and the joining of stripes work with planes and rays (u, v, 1). So they are given rays that are bent
+sideways by the effect of the bow in the middle of the depth range. The remaining error, together with the delay of the
+rows, is below a pixel or two. The windows are wider by that (`beside_px`), and the depth of a map is corrected
+afterwards, exactly, from each pixel's command (`BentLight.inverse_depth`). `calibration.model.light_sheet` has the
+formula of a bowed sheet. Rays are float32 (rows, width), commands and sheets float64.
 """
 
 import math
@@ -26,10 +26,10 @@ _SAMPLED_ROWS = 16
 
 @dataclass(frozen=True, slots=True, eq=False)
 class BentLight:
-    """Rays and sheets that turn a map's commands into depth where the light is bent.
+    """Rays and sheets that turn a map's commands into depth if the light is bent.
 
     u, v: float32 (rows, width), true rays. commands: (columns,) of the columns. velocity_per_s: of the command during
-    the sweep, negative where it fell. sheets: (samples, 10), what the kernel reads of the model.
+    the sweep, negative if it fell. sheets: (samples, 10), the model's sheets as the kernel reads them.
     """
 
     model: RigModel
@@ -40,7 +40,7 @@ class BentLight:
     velocity_per_s: float = 0.0
 
     def inverse_depth(self, command: Float64, first_row: int = 0) -> Float32:
-        """Inverse depth where the mirror was bound to commands (rows, width) from a row on; NaN stays NaN."""
+        """Inverse depth where the mirror was bound to commands (rows, width), from first_row on; NaN stays NaN."""
         from rig.geometry.kernels import bent_inverse_depth
 
         model, rows = self.model, slice(first_row, first_row + len(command))
@@ -54,7 +54,7 @@ class BentLight:
 
 
 def bent_light(model: RigModel, u: Float32, v: Float32, commands: Float64) -> BentLight:
-    """The bent light of a model, its kernel compiled: u, v, commands as in `BentLight`."""
+    """The bent light of a model, with its kernel compiled; u, v, commands as in `BentLight`."""
     sheets = model.sheets(np.linspace(*model.scanner.command_range, _SAMPLED_SHEETS))
     light = BentLight(model, u, v, commands, np.hstack([sheets.planes, sheets.middle, sheets.across]))
     light.inverse_depth(np.zeros((0, u.shape[1])))
@@ -62,19 +62,19 @@ def bent_light(model: RigModel, u: Float32, v: Float32, commands: Float64) -> Be
 
 
 def bow_per_rad(model: RigModel) -> float:
-    """Bow of the model's sheets, per radian; 0 for one that has none."""
+    """Bow of the model's sheets, per radian; 0 if there is none."""
     return float(getattr(model.scanner, "bow_per_rad", 0.0))
 
 
 def is_bent(model: RigModel) -> bool:
-    """Whether planes and rays alone do not give this model's depth."""
+    """Whether this model's depth needs more than planes and rays."""
     return model.row_delay_s != 0 or bow_per_rad(model) != 0
 
 
 def bent_u(model: RigModel, u: Float64, v: Float64, depth_m: float) -> Float64:
-    """The u (rows, width) that rays would need to meet the planes where, at this depth, they meet the bowed sheets.
+    """The u (rows, width) with which rays meet the planes where, at this depth, the true rays meet the bowed sheets.
 
-    Offset and cone are left out of where the planes stand: they change this by less than the windows' margin.
+    The positions of the planes leave out offset and cone, which change the result by less than the windows' margin.
     """
     scanner = model.scanner
     if not isinstance(scanner, PivotScanner) or scanner.bow_per_rad == 0:
@@ -92,9 +92,10 @@ def bent_u(model: RigModel, u: Float64, v: Float64, depth_m: float) -> Float64:
 def beside_px(
     model: RigModel, rays: tuple[Float64, Float64], bent: Float64, commands: Float64, depth_range_m: tuple[float, float]
 ) -> int:
-    """Most pixels that stripes stand beside the place that planes and bent rays give, within the depth range.
+    """Largest distance in pixels of stripes from the place that planes and bent rays give, within the depth range.
 
-    rays: u and v (rows, width); bent: u as of `bent_u`. For sweeps either way, as fast as the lag was measured.
+    rays: u and v (rows, width); bent: u as from `bent_u`. Holds for sweeps in both directions at the fastest speed at
+    which the lag was measured.
     """
     u, v, bent = (each[::_SAMPLED_ROWS] for each in (*rays, bent))
     y = np.arange(0, len(rays[0]), _SAMPLED_ROWS)[:, None]

@@ -1,9 +1,9 @@
-"""Compiled geometry: the pixel interval that a depth range leaves on a row, and the depth of pixels on bowed sheets.
+"""Compiled geometry: the pixel interval of a depth range on a row, and the depth of pixels on bowed sheets.
 
-`row_windows`: inverse depth w = p.(u, v, 1) is monotone along a row, so that both ends of far <= w <= near are found by
-bisection; u, v float32 (rows, width), planes p float64 (columns, 3), ends int32 (rows, columns).
-`bent_inverse_depth`: Newton's steps from the plane on for the sheet of `calibration.model.light_sheet`; float64 within,
-inverse depth float32 (rows, width).
+`row_windows`: inverse depth w = p.(u, v, 1) is monotone along a row, so both ends of far <= w <= near are found by
+bisection; u, v float32 (rows, width), planes p float64 (columns, 3), ends int32 (rows, columns). `bent_inverse_depth`
+takes Newton's steps, starting from the plane, for the sheet of `calibration.model.light_sheet`; it computes in float64,
+and inverse depth is float32 (rows, width).
 """
 
 from typing import Final
@@ -53,7 +53,7 @@ def row_windows(u: Float32, v: Float32, plane: Float64, w_far: float, w_near: fl
 
 @numba.njit(inline="always")
 def with_rays(u, y, first, last):  # type: ignore[no-untyped-def]
-    """First and last of those pixels of a row, without the ones at its ends that have no ray; one is always left."""
+    """First and last of those pixels of a row, without pixels at its ends that have no ray. At least one pixel is left."""
     while first < last and np.isnan(u[y, first]):
         first += 1
     while last > first and np.isnan(u[y, last]):
@@ -73,8 +73,9 @@ def bent_inverse_depth(
 ) -> None:  # fmt: skip
     """Write inverse depth (rows, width) where the mirror was bound to `command`; NaN where there is none.
 
-    ahead: (rows,) by how much the command is past that. sheets: (samples, 10) float64, n, d, middle and across of the
-    sheets at even steps of the command from low to high; in between they are linear, for closely enough spaced ones.
+    ahead: (rows,) difference of the command from that when the row is exposed. sheets: (samples, 10) float64, n, d,
+    middle and across of the sheets at even steps of the command from low to high, close enough to be interpolated
+    linearly.
     """
     rows, width = command.shape
     per_command = (len(sheets) - 1) / (high - low)

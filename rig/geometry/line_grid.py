@@ -1,8 +1,8 @@
 """Several lines at once: which column of the map each of them lights at every place of the mirror.
 
 The mirror passes columns / lines places. A frame taken at one of them serves as many columns as there are lines, each
-with its own plane and window. Columns are numbered across the field in the direction of the mirror's sweep, as those of
-a single line are; where the lines' parts of the field overlap they interleave.
+with its own plane and window. Columns are numbered across the field in the direction of the mirror's sweep, as for a
+single line. Where the lines' parts of the field overlap, their columns interleave.
 """
 
 from collections.abc import Sequence
@@ -46,23 +46,23 @@ class LineGrid:
         return columns
 
     def others(self, plane: Float64) -> Float64:
-        """Planes of the columns that are lit together with each: (columns, lines - 1, 3); plane: (columns, 3)."""
+        """Planes of the columns that are lit together with each column: (columns, lines - 1, 3); plane: (columns, 3)."""
         together = self.columns_at()[self.place]
         own = together == np.arange(len(self.place))[:, None]
         result: Float64 = plane[together[~own].reshape(len(self.place), self.lines - 1)]
         return result
 
     def bound_commands(self, commands: Float64, column: Float64) -> Float64:
-        """Commands at which the lines of all columns stood when the mirror bound them to `column`, both (columns,).
+        """Commands of the lines of all columns when the mirror was bound to `column`, both (columns,).
 
-        commands: of the columns' centres. Fractional columns count from each one's own number.
+        commands: of the columns' centres. Fractional columns count from each column's own number.
         """
         result: Float64 = commands + (column - np.arange(len(commands))) * self.step
         return result
 
 
 def line_grid(offsets: Sequence[float], columns: int, command_range: tuple[float, float]) -> tuple[LineGrid, Float64]:
-    """The grid of a map of so many columns, a multiple of the lines, and the commands (columns,) of their centres."""
+    """The grid of a map with `columns` columns, a multiple of the lines, and the commands (columns,) of their centres."""
     lines = len(offsets)
     places = columns // lines
     first, last = command_range
@@ -75,7 +75,7 @@ def line_grid(offsets: Sequence[float], columns: int, command_range: tuple[float
 
 
 def window_overlap(grid: LineGrid, geometry: SweepGeometry) -> float:
-    """Mean share of a column's search window, on rows that it is seen on, that those of other lines cover."""
+    """Mean share of a column's search window, on rows where it is visible, that windows of other lines cover."""
     columns, covered, whole = grid.columns_at(), 0, 0
     for line in range(grid.lines):
         own, others = columns[:, line], np.delete(columns, line, axis=1)

@@ -1,6 +1,6 @@
-"""The stripe table: where the laser line was seen on every row and column, how sure that is, and its errors.
+"""The stripe table: where the laser line was seen on every row and column, with what certainty, and its errors.
 
-All arrays are (rows, columns). The errors are against a truth that a world or a test knows.
+All arrays are (rows, columns). The errors are relative to a truth that a world or a test knows.
 """
 
 from dataclasses import dataclass, fields
@@ -14,13 +14,14 @@ from rig.simd import Float32, Float64
 class StripeTable:
     """Result of an estimator for one sweep; all arrays float32 (rows, columns).
 
-    x_px: sub-pixel stripe position in raw pixels, centres at integers; NaN only where the row has no data there.
+    x_px: sub-pixel stripe position in raw pixels, centres at integers; NaN only where the row has no data.
     confidence: probability that x_px is within 1 px of the truth, 0 to 1 (0 where x_px is NaN).
     x_sd_px: standard deviation of x_px given that it is the right stripe.
     signal: photons per exposure of the stripe, summed across it; haze: photons per exposure and pixel just before it.
     x2_px: position of a second stripe beside it, nearer or farther (a pane before a wall), NaN where no light stands
-    out; confidence2: probability that there is one within 1 px of it, 0 where it is NaN. Both are None where an
-    estimator looks for none.
+    out;
+    confidence2: probability that there is one within 1 px of it, 0 where it is NaN. Both are None if an estimator does
+    not look for one.
     """
 
     x_px: Float32
@@ -32,7 +33,7 @@ class StripeTable:
     confidence2: Float32 | None = None
 
     def arrays(self) -> dict[str, Float32]:
-        """Every array that there is, by its name."""
+        """All arrays that are not None, by name."""
         values = {field.name: getattr(self, field.name) for field in fields(self)}
         return {name: value for name, value in values.items() if value is not None}
 
@@ -50,8 +51,8 @@ MISSING_PX = 10.0
 def stripe_errors(x_px: Float32, true_x_px: Float32) -> dict[str, float | None]:
     """Errors in pixels over the (row, column) that have a true stripe; both arrays (rows, columns), NaN = none.
 
-    `missing`: share of those without an estimate; `mean_abs`, `median_abs`: over the estimated (None where there are
-    none); `within_1px`: over all, a missing one counts as wrong.
+    `missing`: share of those without an estimate; `mean_abs`, `median_abs`: over the estimated ones (None if there are
+    none); `within_1px`: over all, where a missing one counts as wrong.
     """
     scored = np.isfinite(true_x_px)
     error = np.abs(x_px[scored].astype(np.float64) - true_x_px[scored])
@@ -63,8 +64,8 @@ def stripe_errors(x_px: Float32, true_x_px: Float32) -> dict[str, float | None]:
 
 
 def charged_errors(x_px: Float32, true_x_px: Float32) -> Float64:
-    """Error of every (row, column) in pixels, NaN where there is no true stripe; a missing answer, or one farther off,
-    counts as `MISSING_PX`.
+    """Error of every (row, column) in pixels, NaN where there is no true stripe. Missing answers and larger errors
+    count as `MISSING_PX`.
     """
     error = np.abs(x_px.astype(np.float64) - true_x_px)
     charged = np.where(np.isfinite(x_px), np.minimum(error, MISSING_PX), MISSING_PX)
@@ -72,7 +73,7 @@ def charged_errors(x_px: Float32, true_x_px: Float32) -> Float64:
 
 
 def depth_errors(depth_m: Float32, true_depth_m: Float32) -> dict[str, float | None]:
-    """Mean and median absolute depth error in metres over pixels that have both; None where no pixel has."""
+    """Mean and median absolute depth error in metres over pixels that have both depths; None if no pixel has."""
     error = np.abs(depth_m.astype(np.float64) - true_depth_m)
     return _sizes(error[np.isfinite(error)])
 

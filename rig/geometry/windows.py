@@ -1,8 +1,8 @@
 """Search windows of a column's stripe on every image row, from the depth range, and the geometry of each pixel.
 
-A light plane n.X = d meets the ray (u, v, 1) of a pixel at inverse depth w = (n.r)/d: along a row w is monotone in x,
-so the depth range becomes one interval of pixels, int32 (rows, columns). No rectification is assumed; with distortion,
-roll or tilted planes the interval moves from row to row.
+A light plane n.X = d meets the ray r = (u, v, 1) of a pixel at inverse depth w = (n.r)/d. Along a row w is monotone in
+x, so the depth range becomes one interval of pixels, int32 (rows, columns). No rectification is assumed; with
+distortion, roll or tilted planes the interval moves from row to row.
 """
 
 from dataclasses import dataclass, replace
@@ -29,16 +29,16 @@ _GOLDEN: Final = 0.6180339887
 class SweepGeometry:
     """Rays, planes and search windows of one sweep.
 
-    u, v: float32 (rows, width) ray tangents of every raw pixel, NaN where the camera model is not invertible; where the
-    light is bent those that meet the planes nearly where the true rays meet the light.
+    u, v: float32 (rows, width) ray tangents of every raw pixel, NaN where the camera model is not invertible; if the
+    light is bent, those that meet the planes nearly where the true rays meet the light.
     plane: float64 (columns, 3), the plane as p.X = 1 (p = n/d), so that inverse depth is p.(u, v, 1).
     planes: float64 (columns, 4) as (n, d), |n| = 1.
-    x_lo, x_hi: int32 (rows, columns), first and last pixel of the search window; empty where x_lo > x_hi.
+    x_lo, x_hi: int32 (rows, columns), first and last pixel of the search window; empty if x_lo > x_hi.
     x0: int32 (columns,) first stored pixel; window: stored pixels per row, a multiple of 64.
-    near_is_left: True where near points lie at smaller x than far ones (scanner on the left).
-    depth_range_m: nearest and farthest depth. defects: bool (rows, width), True where a pixel is not to be used.
-    others: float64 (columns, lines - 1, 3), `plane` of the columns that other lines light together with each; None: a
-    line is alone. light: what is to be put right in depths from planes; None: nothing.
+    near_is_left: True if near points lie at smaller x than far ones (scanner on the left).
+    depth_range_m: nearest and farthest depth. defects: bool (rows, width), True for pixels that must not be used.
+    others: float64 (columns, lines - 1, 3), `plane` of the columns that other lines light together with each; None if
+    there is only one line. light: corrects depths that were computed from planes; None if not needed.
     """
 
     u: Float32
@@ -61,14 +61,14 @@ class SweepGeometry:
         return (self.u, self.v) if self.light is None else (self.light.u, self.light.v)
 
     def bound_to(self, model: RigModel, commands: Float64, velocity_per_s: float) -> "SweepGeometry":
-        """The same windows with the light of a sweep whose columns were bound to `commands`, at this velocity."""
+        """This geometry with the light of a sweep whose columns were bound to `commands`, at this velocity."""
         planes = model.planes(commands)
         light = None if self.light is None else replace(self.light, commands=commands, velocity_per_s=velocity_per_s)
         return replace(self, planes=planes, plane=planes[:, :3] / planes[:, 3:], light=light)
 
     @property
     def rows(self) -> int:
-        """Image rows."""
+        """Number of image rows."""
         return int(self.u.shape[0])
 
     @property
@@ -78,13 +78,13 @@ class SweepGeometry:
 
     @property
     def columns(self) -> int:
-        """Laser line positions of the sweep."""
+        """Number of laser line positions of the sweep."""
         return int(self.plane.shape[0])
 
     def reference_px(self) -> Float64:
         """Position of each column's line at the middle inverse depth, (rows, columns) px, as if without distortion.
 
-        Only its differences between neighbouring rows and columns matter; it may lie outside the picture.
+        Only its differences between neighbouring rows and columns matter. It may lie outside the picture.
         """
         near_m, far_m = self.depth_range_m
         w = 0.5 * (1.0 / near_m + 1.0 / far_m)
@@ -103,7 +103,7 @@ class SweepGeometry:
 def sweep_geometry(model: RigModel, commands: Float64, depth_range_m: tuple[float, float]) -> SweepGeometry:
     """Search windows of the light at mirror commands (columns,), for a camera and a depth range in metres.
 
-    UsageError where a plane passes through the camera, or where no column can be seen within the depth range.
+    Raises UsageError if a plane passes through the camera, or if no column can be seen within the depth range.
     """
     from rig.geometry.kernels import row_windows
 
@@ -155,7 +155,7 @@ def sweep_geometry(model: RigModel, commands: Float64, depth_range_m: tuple[floa
 
 
 def uncalibrated_geometry(rows: int, width: int, columns: int) -> SweepGeometry:
-    """Geometry of a rig without a model: the whole row is searched and near is taken to be left; depth means nothing.
+    """Geometry of a rig without a model: the whole row is searched, near is taken to be left, and depth has no meaning.
 
     Inverse depth falls linearly from 1.5 to 0.5 across the picture, so that the estimators' haze profile has a scale.
     """
@@ -171,7 +171,7 @@ def uncalibrated_geometry(rows: int, width: int, columns: int) -> SweepGeometry:
 
 
 def evenly_spread(n: int, most: int) -> NDArray[np.int64]:
-    """Up to `most` of the indices 0 to n - 1, spread evenly in a fixed pattern; all of them where they are no more."""
+    """At most `most` of the indices 0 to n - 1, spread evenly in a fixed pattern; all of them if n is not larger."""
     if n <= most:
         return np.arange(n)
     i, step = np.arange(most), n / most

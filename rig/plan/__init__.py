@@ -1,5 +1,5 @@
 """The compiled scan: mirror command, gate, markers and sensor windows over time, checked against all devices' limits.
 
-Enters: config, calibration, limits of scanner and sensor. Leaves: a `rig.plan.scan_plan.ScanPlan`, which says for every
+Input: config, calibration, limits of scanner and sensor. Output: a `rig.plan.scan_plan.ScanPlan`, which says for every
 frame time where the mirror is. `compile` makes it.
 """

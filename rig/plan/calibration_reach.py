@@ -1,7 +1,7 @@
-"""Checks whether a calibration holds for a scan: its sensor, its mirror's speed and the commands it passes.
+"""Checks whether a calibration is valid for a scan: for its sensor, its mirror's speed and its range of commands.
 
-`recalibrated` adapts the plan of a recording to a calibration made since: what was scanned stays, where it is seen may
-change.
+`recalibrated` adapts the plan of a recording to a calibration made since. What was scanned does not change, but where
+it is seen may.
 """
 
 import math
@@ -26,7 +26,7 @@ MOST_TIMES = 1000.0
 def model_problems(
     scan: ScanConfig, model: RigModel | None, info: SpadInfo, speed_per_s: float, line_offsets: Sequence[float]
 ) -> list[str]:
-    """Reasons why a calibration does not fit this scan: sensor, speed, commands; none where there is no calibration."""
+    """Reasons why a calibration does not fit this scan: sensor, speed, commands; empty if there is no calibration."""
     if model is None:
         return []
     problems = []
@@ -44,10 +44,10 @@ def model_problems(
 
 
 def require_speed(model: RigModel, speed_per_s: float, exposures: int) -> None:
-    """Raise CalibrationError where the lag was not measured around this speed, with the command that measures it.
+    """Raise CalibrationError if the lag was not measured near this speed, with the command that measures it.
 
-    A sweep is as many times faster as it has fewer exposures. The command names this scan's exposures and those of the
-    farther end of the old range, so that scans that were possible stay possible.
+    The speed of a sweep is inversely proportional to its exposures. The command names this scan's exposures and those
+    of the farther end of the old range, so that scans that were possible stay possible.
     """
     try:
         model.check_speed(speed_per_s)
@@ -61,16 +61,16 @@ def require_speed(model: RigModel, speed_per_s: float, exposures: int) -> None:
 
 
 def whole_rows(plan: ScanPlan) -> ScanPlan:
-    """The plan with whole frames, for a rig without calibration: any pixel may see any column."""
+    """The plan with whole frames, for a rig without calibration, in which any pixel may see any column."""
     padded = -(-plan.width // WORD_PX) * WORD_PX
     return replace(plan, x0=np.zeros_like(plan.x0), window=padded, windows=None)
 
 
 def recalibrated(plan: ScanPlan, model: RigModel) -> ScanPlan:
-    """The plan with the lag and the windows of `model`; it is unchanged where it was compiled for that model.
+    """The plan with the lag and the windows of `model`; unchanged if it was compiled for that model.
 
-    Mirror, gate and markers stay as they were, and so do the pixels that the SPAD sent: frames that do not hold a
-    column's window do not count for it. UsageError where the calibration is not one of this rig and scan.
+    Mirror, gate and markers stay as they were, and so do the pixels that the SPAD sent. Frames that do not contain a
+    column's window do not count for it. Raises UsageError if the calibration is not of this rig and scan.
     """
     try:
         model.check_sensor(plan.width, plan.rows)

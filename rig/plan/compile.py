@@ -1,6 +1,6 @@
 """Compiles a scan: checks it against scanner, SPAD and calibration, all together, before anything moves.
 
-`compile_plan` makes the `ScanPlan`, `spad_request` asks the SPAD for its frames.
+`compile_plan` makes the `ScanPlan`; `spad_request` makes the request for the SPAD.
 """
 
 from collections.abc import Callable, Sequence
@@ -61,7 +61,7 @@ def compile_plan(
     """Compile the plan of a scan and check it.
 
     point_clock: the scanner's exact clock for a requested rate (`BeamScanner.point_clock`).
-    model: None where the rig is not calibrated; there is then no lag and the window is the whole row.
+    model: None if the rig is not calibrated; there is then no lag and the window is the whole row.
     line_offsets: of the rig, which fit the scan.
     Raises PlanError with one line per problem.
     """
@@ -119,7 +119,7 @@ def _draft(
 
 
 def path_demand(scan: ScanConfig, places: int, model: RigModel | None, *, markers: bool) -> PathDemand:
-    """The demand of a scan of so many line positions on the mirror. markers: whether the SPAD has any."""
+    """The demand on the mirror of a scan with `places` line positions. markers: whether the SPAD has any."""
     frame_rate = scan.frame_rate
     blanking = None if markers else blanking_for(places, scan.exposures, frame_rate)
     return PathDemand(

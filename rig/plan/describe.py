@@ -1,4 +1,4 @@
-"""Describes a plan, for people and for programs, and the frame rates that sensor and link can do."""
+"""Descriptions of a plan for people and for programs, and the frame rates that sensor and link can reach."""
 
 import math
 from collections.abc import Callable, Iterator
@@ -85,7 +85,7 @@ _OF_LEG = ("direction", "lag_s", "gate_open_s", "gate_close_s")
 
 
 def plan_content(plan: ScanPlan) -> dict[str, Any]:
-    """Describe a plan for the manifest and for programs."""
+    """The plan as plain values for the manifest and for programs."""
     return {
         **{name: getattr(plan, name) for name in _TIMING},
         "window_px": plan.window,
@@ -107,7 +107,7 @@ def rounded(value: float) -> str:
 
 
 def beyond_sensor(scan: ScanConfig, info: SpadInfo) -> Iterator[tuple[float, str]]:
-    """The highest frame rate of the sensor and the problem with the asked one, where there is one."""
+    """The sensor's highest frame rate and, if the requested one is higher, the problem."""
     if scan.frame_rate > info.max_frame_rate_hz:
         most = float(info.max_frame_rate_hz)
         yield (
@@ -118,7 +118,7 @@ def beyond_sensor(scan: ScanConfig, info: SpadInfo) -> Iterator[tuple[float, str
 
 
 def beyond_link(plan: ScanPlan, info: SpadInfo, draft_at: Callable[[Fraction], ScanPlan | None]) -> tuple[float, str]:
-    """The highest frame rate that the link carries, whole hertz, and the problem with the asked one."""
+    """The highest frame rate that the link carries, in whole hertz, and the problem with the requested one."""
     rate, have = float(plan.frame_rate_hz), plan.link_bytes_per_s or 0.0
     made = f"{rounded(rate * frame_bytes(plan.width, plan.rows) / 1e6)} MB/s of full frames"
     if plan.windows is not None:

@@ -1,6 +1,6 @@
 """The program of the sync source: when the gate opens, sweep by sweep, and the blanking pattern before it.
 
-`unseen_pattern` checks whether the camera sees that pattern, for which the line stands beside the first column.
+`unseen_pattern` checks whether the camera sees that pattern, during which the line is beside the first column.
 """
 
 import numpy as np
@@ -14,7 +14,8 @@ from rig.plan.scan_plan import ScanPlan
 def sync_program(plan: ScanPlan, maps: int) -> tuple[tuple[Pulse, ...], int]:
     """Pulses and repeats that open the gate once in each of `maps` sweeps and then leave it low.
 
-    Where the plan has a blanking pattern, it comes in each of these sweeps, in the pilots before and the sweep behind.
+    If the plan has a blanking pattern, it comes in each of these sweeps, in the pilot sweeps before and in the sweep
+    after.
     """
     if plan.blanking is not None:
         lit = range(plan.pilots, plan.pilots + maps)
@@ -50,7 +51,7 @@ COMMANDS_TRIED = 256
 
 
 def unseen_pattern(plan: ScanPlan, model: RigModel | None) -> list[str]:
-    """Problems with a blanking pattern of which the camera sees no light within the depth range."""
+    """Problems with a blanking pattern whose light the camera does not see within the depth range."""
     if plan.blanking is None or model is None:
         return []
     u, _ = model.camera.tangents()

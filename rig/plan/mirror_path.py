@@ -1,9 +1,9 @@
 """The mirror's path over one sweep: run-in, constant velocity, run-out, fly-back, rest, all with bounded acceleration.
 
 Ramps raise the velocity along half a cosine, v(t) = v (1 - cos(pi t/T))/2, so the acceleration starts and ends at zero
-and peaks at pi v/(2 T). Moves from rest to rest are cycloids, x(t) = D (t/T - sin(2 pi t/T)/(2 pi)), peak velocity 2
-D/T, peak acceleration 2 pi D/T^2. Every segment lasts a whole number of points, so a sweep does too and nothing drifts;
-the lit part lies in the middle of the cruise and lasts exactly as long as its frames.
+and peaks at pi v/(2 T). Moves from rest to rest are cycloids, x(t) = D (t/T - sin(2 pi t/T)/(2 pi)), with peak velocity
+2 D/T and peak acceleration 2 pi D/T^2. Every segment lasts a whole number of points, so a sweep does too and nothing
+drifts. The lit part lies in the middle of the constant velocity and lasts exactly as long as its frames.
 
 `find_path` finds the quickest path that a scanner can follow for a scan, or the problems; `remedy` says what helps.
 """
@@ -43,7 +43,7 @@ class PathSegment:
     distance: float = 0.0
 
     def command(self, at: Array) -> Array:
-        """Command at `at` points after the sweep's start; outside the segment its formula is continued."""
+        """Command at `at` points after the sweep's start. Outside the segment its formula is continued."""
         t = at - self.start_point
         if self.kind == "cruise":
             return self.start + self.v0 * t
@@ -86,7 +86,7 @@ class SweepPath:
         return math.sqrt(total / self.points)
 
     def command(self, at: Array) -> Array:
-        """Command at `at` points (any shape) after the scan marker, taken within one sweep."""
+        """Command at `at` points (any shape) after the scan marker, within one sweep."""
         at = np.asarray(at, np.float64)
         starts = np.array([s.start_point for s in self.segments[1:]], np.float64)
         index = np.searchsorted(starts, at, side="right")
@@ -107,11 +107,11 @@ class MirrorLimits:
     least_ramp_s: float = 0.0
 
     def ramp_points(self, velocity_per_s: float) -> int:
-        """Points of the ramp from rest to a velocity."""
+        """Number of points of the ramp from rest to a velocity."""
         return self._whole(max(math.pi * abs(velocity_per_s) / (2 * self.acceleration_per_s2), self.least_ramp_s))
 
     def move_points(self, distance: float) -> int:
-        """Points of the fastest cycloid over a distance."""
+        """Number of points of the fastest cycloid over a distance."""
         d = abs(distance)
         return self._whole(max(2 * d / self.velocity_per_s, math.sqrt(2 * math.pi * d / self.acceleration_per_s2)))
 
@@ -130,10 +130,10 @@ def sweep_path(
 ) -> SweepPath:
     """Make the path that crosses `edges` (commands of the first and last lit edge) at constant velocity in `lit_s`.
 
-    margin_s: time that the constant velocity lasts before the first edge and, likewise, after the last.
+    margin_s: duration of the constant velocity before the first edge and, equally, after the last.
     fly_back: return to the start before the sweep ends (unidirectional); otherwise the sweep ends where the return
       begins.
-    least_points: least length of the sweep; a rest makes up the difference.
+    least_points: minimum length of the sweep; a rest makes up the difference.
     """
     rate = motion.point_rate_hz
     lit_points = lit_s * rate
@@ -163,7 +163,9 @@ def sweep_path(
 
 
 def mirrored(path: SweepPath) -> SweepPath:
-    """The way back: the same path in time, reflected so that it begins where `path` ends and ends where it begins."""
+    """The way back: the path reflected so that it begins where `path` ends and ends where it begins, with the same
+    timing.
+    """
     total = path.low + path.high
     segments = tuple(
         PathSegment(s.kind, s.start_point, s.points, total - s.start, -s.v0, -s.v1, -s.distance) for s in path.segments
@@ -214,19 +216,21 @@ class PathDemand:
 
     @property
     def gate_margin_s(self) -> float:
-        """Time the gate is open before the first and after the last column: the guard, and the drift of its clock."""
+        """Time for which the gate is open before the first and after the last column: the guard, and the drift of its
+        clock.
+        """
         # Counted from the scan marker; the run-in is shorter than the lit part wherever it matters.
         return self.guard_s + self.clock_tolerance * 2 * float(self.lit_s)
 
     @property
     def cruise_margin_s(self) -> float:
-        """Time at constant velocity beyond the lit part: there the lag is steady while the gate is open."""
+        """Time at constant velocity beyond the lit part, so that the lag is steady while the gate is open."""
         return self.lag_s + self.gate_margin_s + self.lead_s
 
 
 @dataclass(frozen=True, slots=True)
 class PathFound:
-    """A path with its point clock, or the problems with it, each without the remedy."""
+    """A path with its point clock, or the problems with it, without remedies."""
 
     path: SweepPath | None
     rate_hz: Fraction
@@ -234,7 +238,7 @@ class PathFound:
 
 
 def find_path(demand: PathDemand, limits: ScannerLimits, point_clock: Callable[[float], Fraction]) -> PathFound:
-    """Find the quickest path within the limits, on the fastest point clock that its points fit in."""
+    """Find the quickest path within the limits, on the fastest point clock for which the device holds its points."""
     low_hz, high_hz = limits.point_rate_hz
     asked = high_hz
     sweeps = 2 if demand.bidirectional else 1
@@ -299,7 +303,7 @@ def _path(demand: PathDemand, motion: MirrorLimits) -> SweepPath:
 
 
 def remedy(demand: PathDemand, exposures: int, limits: ScannerLimits, point_clock: Callable[[float], Fraction]) -> str:
-    """Say what to change so that the scanner can follow: the fewest exposures, or the widest range, that work."""
+    """Say what to change so that the scanner can follow: the fewest exposures, or the widest range, that are possible."""
 
     def works(changed: PathDemand) -> bool:
         return not find_path(changed, limits, point_clock).problems
@@ -335,7 +339,7 @@ def remedy(demand: PathDemand, exposures: int, limits: ScannerLimits, point_cloc
 
 
 def narrowed(edges: tuple[float, float], share: float, limits: tuple[float, float]) -> tuple[float, float]:
-    """A share of the range of `edges` about its middle, which is moved inside the scanner's range if need be."""
+    """A share of the range of `edges` about its middle, moved inside the scanner's range if necessary."""
     half = (edges[1] - edges[0]) / 2 * share
     low, high = limits
     middle = min(max((edges[0] + edges[1]) / 2, low + abs(half)), max(high - abs(half), low + abs(half)))

@@ -1,17 +1,17 @@
-"""The compiled scan: what the mirror, the gate and the SPAD do over time, and which column a moment belongs to.
+"""The compiled scan: what the mirror, the gate and the SPAD do over time, and to which column each time belongs.
 
-Times within a sweep count from its scan marker on the scanner's point clock; every sweep lasts `sweep_points` points,
-so times of any sweep are exact rationals and do not drift. The command passes the value of point i at the start of
-point i and runs straight to the next; through the lit part it runs linearly. The mirror follows `lag_s` later. Column c
-spans c - 0.5 to c + 0.5; column 0 begins at `command_range[0]`, the last ends at `command_range[1]`, on the way back
+Times within a sweep count from its scan marker on the scanner's point clock. Every sweep lasts `sweep_points` points,
+so times of any sweep are exact rationals and do not drift. The command has the value of point i at the start of point i
+and goes linearly to the next; it is linear through the whole lit part. The mirror follows `lag_s` later. Column c spans
+c - 0.5 to c + 0.5. Column 0 begins at `command_range[0]` and the last one ends at `command_range[1]`, on the way back
 too.
 
-`Blanking` is a pattern of flashes in each sweep's run-in, by which frames without markers are bound to columns. The
+`Blanking` is a pattern of flashes in each sweep's run-in, by which frames without markers are assigned to columns. The
 sync source waits for the scan marker and then opens the gate in a known order of flashes, before it opens it for the
 lit part. The mirror moves at constant velocity by then, a few columns before the first one. The place of the pattern
-among the frames says when the scan marker came; the time from one sweep's pattern to the next gives the ratio of the
-scanner's clock and the SPAD's. A chip is not a whole number of frames: the edges of the flashes then fall on all parts
-of a frame, so that their place is known to a small part of a frame whatever the phase of the two clocks.
+among the frames gives the time of the scan marker; the time from one sweep's pattern to the next gives the ratio of the
+scanner's clock and the SPAD's. A chip is not a whole number of frames. The edges of the flashes therefore fall on all
+parts of a frame, and their place is known to a small part of a frame whatever the phase of the two clocks.
 """
 
 import math
@@ -55,23 +55,23 @@ class Blanking:
 
     @property
     def length_s(self) -> float:
-        """Seconds from the first edge to the last."""
+        """Seconds from the pattern's first edge to its last."""
         return len(CODE) * self.chip_s
 
     @property
     def lead_s(self) -> float:
-        """Seconds of run-in that it takes before the gate opens for the lit part."""
+        """Seconds of run-in that the pattern takes before the gate opens for the lit part."""
         return self.length_s + self.guard_s
 
     def flashes_s(self, leg: int) -> tuple[tuple[float, float], ...]:
-        """(open, close) of each flash from the pattern's first edge; the way back has the code backward."""
+        """(open, close) of each flash, from the pattern's first edge. On the way back the code is reversed."""
         code = CODE[::-1] if leg % 2 else CODE
         edges = [i for i in range(len(code) + 1) if (code[i - 1 : i] or "0") != (code[i : i + 1] or "0")]
         return tuple((a * self.chip_s, b * self.chip_s) for a, b in zip(edges[::2], edges[1::2], strict=True))
 
 
 def blanking_for(columns: int, exposures: int, frame_rate_hz: Fraction) -> Blanking:
-    """Make the pattern for a scan, whose clocks may differ by up to `MAX_CLOCK_ERROR`."""
+    """Make the pattern for a scan. The clocks of scanner and SPAD may differ by up to `MAX_CLOCK_ERROR`."""
     frame_s = 1 / float(frame_rate_hz)
     chip = min(max(1, round(exposures / CHIPS_PER_COLUMN)), MOST_CHIP_FRAMES) + VERNIER_FRAMES
     # From one pattern to the next; sweeps are rarely longer than twice their lit part.
@@ -86,7 +86,7 @@ Array = NDArray[np.float64]
 class Leg:
     """One direction of the scan. A unidirectional period has one leg, a bidirectional one two.
 
-    direction: +1 where the command rises while lit, -1 where it falls.
+    direction: +1 if the command rises while lit, -1 if it falls.
     columns_rise: whether column numbers rise with time.
     lag_s: the mirror is where the command was this much earlier.
     gate_open_s, gate_close_s: seconds from the scan marker.
@@ -107,15 +107,15 @@ class ScanPlan:
     frame_rate_hz, point_rate_hz: exact nominal rates of SPAD and scanner.
     sweep_points: points from one scan marker to the next.
     marker_points: int64 (markers,), point of line marker j within a sweep. It marks the command of the edge j *
-      columns_per_marker columns into the lit part; markers behind the lit part only move the window in the dark.
+      columns_per_marker columns into the lit part; markers after the lit part only move the window in the dark.
     commands: float64 (columns,), mirror command of each column's centre.
     x0: int32 (columns,), first stored pixel of each column's window. window: stored pixels per row. Both are multiples
       of 64.
-    link_bytes_per_s: rate that the SPAD's link carries; None where it cannot stream.
-    windows: the pixels of each frame that are used, by the markers before it; None: all.
+    link_bytes_per_s: rate that the SPAD's link carries; None if it cannot stream.
+    windows: the pixels of each frame that are used, by the markers before it; None for all.
     windowed: whether the SPAD sends only these.
-    blanking: the pattern that binds frames where the SPAD has no markers; None where it has.
-    lines: which line lights which column where there are several; None: one lights all.
+    blanking: the pattern that binds frames if the SPAD has no markers; None if it has.
+    lines: which line lights which column, if there are several; None if one lights all.
     """
 
     columns: int
@@ -146,12 +146,12 @@ class ScanPlan:
 
     @property
     def places(self) -> int:
-        """Positions of the mirror in a sweep: as many as columns where one line lights them all."""
+        """Number of positions of the mirror in a sweep, which is the number of columns if one line lights them all."""
         return self.columns if self.lines is None else self.lines.places
 
     @property
     def sweeps_per_period(self) -> int:
-        """Sweeps in one repetition of the waveform."""
+        """Number of sweeps in one repetition of the waveform."""
         return len(self.legs)
 
     @property
@@ -161,7 +161,7 @@ class ScanPlan:
 
     @property
     def column_s(self) -> Fraction:
-        """Exact seconds the line takes over one column."""
+        """Exact seconds that the line takes to cross one column."""
         return self.exposures / self.frame_rate_hz
 
     @property
@@ -171,12 +171,12 @@ class ScanPlan:
 
     @property
     def frames_per_sweep(self) -> Fraction:
-        """Frames from one scan marker to the next; rarely a whole number, since the two clocks are independent."""
+        """Number of frames from one scan marker to the next; rarely an integer, since the two clocks are independent."""
         return self.sweep_s * self.frame_rate_hz
 
     @property
     def dark_fraction(self) -> float:
-        """Least share of a sweep's frames taken wholly with the gate low."""
+        """Smallest share of a sweep's frames that are taken entirely with the gate low."""
         lead_s = 0.0 if self.blanking is None else self.blanking.lead_s
         gate_s = max(leg.gate_close_s - leg.gate_open_s for leg in self.legs) + lead_s
         return max(0.0, 1 - (gate_s + 2 / float(self.frame_rate_hz)) / float(self.sweep_s))
@@ -187,7 +187,7 @@ class ScanPlan:
         return abs(self.command_range[1] - self.command_range[0]) / float(self.places * self.column_s)
 
     def velocity_per_s(self, direction: int) -> float:
-        """Velocity of the command over the lit part of a sweep up (+1) or down (-1), signed."""
+        """Signed velocity of the command over the lit part of a sweep up (+1) or down (-1)."""
         return direction * self.speed_per_s
 
     @property
@@ -197,7 +197,7 @@ class ScanPlan:
 
     @property
     def used_px(self) -> int | None:
-        """Pixels per row of a frame that are used, from `window_x0` on; None: all."""
+        """Pixels per row of a frame that are used, from `window_x0` on; None for all."""
         return None if self.windows is None else self.windows.width_px
 
     @property
@@ -207,7 +207,7 @@ class ScanPlan:
 
     @property
     def frame_bytes(self) -> int:
-        """Bytes of one frame as the SPAD sends it, its record included."""
+        """Bytes of one frame as the SPAD sends it, including its record."""
         return frame_bytes(self.frame_width, self.rows)
 
     @property
@@ -217,12 +217,12 @@ class ScanPlan:
 
     @property
     def full_frames_hz(self) -> float | None:
-        """Highest rate of full frames that the link carries; None where there is no stream."""
+        """Highest rate of full frames that the link carries; None if there is no stream."""
         return None if self.link_bytes_per_s is None else self.link_bytes_per_s / frame_bytes(self.width, self.rows)
 
     @property
     def windows_hz(self) -> float | None:
-        """Highest rate of this plan's windows that the link carries; None where there are no windows or no stream."""
+        """Highest rate of this plan's windows that the link carries; None if there are no windows or no stream."""
         if self.windows is None or self.link_bytes_per_s is None:
             return None
         return self.link_bytes_per_s / frame_bytes(self.windows.width_px, self.rows)
@@ -232,7 +232,7 @@ class ScanPlan:
     ) -> NDArray[np.int32]:
         """First used pixel of each frame, int32 (n,), from marks and line of its record and the number of its sweep.
 
-        It does not depend on whether the SPAD sent the frame whole or only its window. sweep is -1 before the first
+        It does not depend on whether the SPAD sent the whole frame or only its window. sweep is -1 before the first
         marker.
         """
         if self.windows is None:
@@ -259,7 +259,8 @@ class ScanPlan:
         return float(leg.path.lit_start / self.point_rate_hz) + leg.lag_s
 
     def column(self, tau_s: Array, leg: Leg) -> Array:
-        """Fractional column (of several lines: place) of the mirror `tau_s` after the scan marker of a sweep of a leg.
+        """Fractional column (with several lines: place) of the mirror `tau_s` after the scan marker of a sweep of a
+        leg.
 
         Continued linearly outside the lit part (below -0.5, above places - 0.5), where the mirror is on no column.
         """
@@ -267,16 +268,16 @@ class ScanPlan:
         return done - 0.5 if leg.columns_rise else self.places - 0.5 - done
 
     def command_at(self, column: Array) -> Array:
-        """Mirror command of fractional places, any shape, NaN staying NaN."""
+        """Mirror command of fractional places, of any shape; NaN stays NaN."""
         return column_command(column, self.command_range, self.places)
 
     def line_commands(self, column: Array) -> Array:
-        """Commands (columns,) at which a single line would stand where each column's line did, at its bound column."""
+        """Commands (columns,) at which a single line would be where each column's line was, at its bound column."""
         return self.command_at(column) if self.lines is None else self.lines.bound_commands(self.commands, column)
 
     @property
     def pilots(self) -> int:
-        """Number of sweeps with the blanking pattern alone, before the first map; they help to find the clock ratio."""
+        """Number of sweeps with only the blanking pattern, before the first map; they help to find the clock ratio."""
         return 0 if self.blanking is None else len(self.legs)
 
     def pattern_s(self, leg: Leg) -> float:
@@ -284,7 +285,7 @@ class ScanPlan:
         return leg.gate_open_s - (0.0 if self.blanking is None else self.blanking.lead_s)
 
     def frames_for(self, maps: int) -> float:
-        """Frames from the first scan marker until the end of `maps` maps is known, nominally."""
+        """Nominal number of frames from the first scan marker until the end of `maps` maps is known."""
         frames = (self.pilots + maps) * float(self.frames_per_sweep)
         if self.blanking is None:
             return frames
@@ -292,16 +293,16 @@ class ScanPlan:
         return frames + known_s * float(self.frame_rate_hz)
 
     def scanner_repeats(self, maps: int) -> int:
-        """Repetitions of the waveform that hold pilots, `maps` sweeps and the marker that closes the last one."""
+        """Number of repetitions of the waveform for pilots, `maps` sweeps and the marker that closes the last one."""
         return -(-(self.pilots + maps + 1) // len(self.legs))
 
     def readout_s(self, frames: int) -> float:
-        """Seconds to read `frames` out after a burst; 0 for a stream, which sends them as it goes."""
+        """Seconds to read `frames` out after a burst; 0 for a stream, which sends them at once."""
         return frames * self.frame_bytes / self.readout_bytes_per_s if self.readout_bytes_per_s else 0.0
 
 
 def column_command(column: ArrayLike, command_range: tuple[float, float], columns: int) -> Array:
-    """Mirror command of fractional columns, any shape, where `columns` of them share the range evenly."""
+    """Mirror command of fractional columns, of any shape, if `columns` of them share the range evenly."""
     first, last = command_range
     result: Array = first + (np.asarray(column, np.float64) + 0.5) * ((last - first) / columns)
     return result

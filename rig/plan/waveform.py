@@ -1,12 +1,12 @@
-"""The scanner's waveform: commands and markers of every point, when the gate opens on the way, and the SPAD's windows.
+"""The scanner's waveform: commands and markers of every point, when the gate opens meanwhile, and the SPAD's windows.
 
-`waveform_of` makes commands and markers. `moving_windows` makes the table of windows that a scan needs of its SPAD:
-which pixels of a row from one line marker to the next.
+`waveform_of` makes commands and markers. `moving_windows` makes the table of windows that a scan needs of its SPAD,
+with the pixels of a row from one line marker to the next.
 
-A frame is bound to the column in the middle of its exposure, so an entry of the table holds what every column needs
-that the mirror, its lag included, passes between one marker and the next, and the frame that a marker falls into. After
-the lit part, in the dark, markers of their own move the window over all pixels that columns use: these too need dark
-frames. A mirror that turns round at once leaves little room for that.
+A frame is bound to the column in the middle of its exposure. So an entry of the table holds the pixels of every column
+that the mirror, including its lag, passes between one marker and the next, and during the frame into which a marker
+falls. After the lit part, in the dark, further markers move the window over all pixels that columns use, since these
+need dark frames too. A mirror that turns round at once leaves little room for that.
 """
 
 import math
@@ -33,7 +33,7 @@ Pixels = NDArray[np.int64]
 
 
 def legs_of(path: SweepPath, scan: ScanConfig, lag: Lag, margin_s: float, rate: Fraction) -> tuple[Leg, ...]:
-    """The scan's one or two directions; the gate is open `margin_s` before and behind their lit part."""
+    """The scan's one or two directions. The gate is open `margin_s` before and after their lit part."""
     rising = scan.command_range[1] > scan.command_range[0]
 
     def leg(path: SweepPath, rises: bool, columns_rise: bool) -> Leg:
@@ -79,9 +79,9 @@ def waveform_of(legs: tuple[Leg, ...], marker_points: NDArray[np.int64], rate: F
 
 
 def moving_windows(plan: ScanPlan, step_px: int) -> tuple[WindowTable, NDArray[np.int64]] | None:
-    """The table of a plan that has the markers of its lit part, and the points of the markers in the dark.
+    """The table of windows for a plan that has the markers of its lit part, and the points of the markers in the dark.
 
-    step_px: grid of the sensor's windows. None where windows would be as wide as the sensor.
+    step_px: grid of the sensor's windows. None if windows would be as wide as the sensor.
     """
     _, row, grid = window_widths(plan, step_px)
     spans = [_spans(plan, leg, grid) for leg in plan.legs]
@@ -99,7 +99,7 @@ def moving_windows(plan: ScanPlan, step_px: int) -> tuple[WindowTable, NDArray[n
 
 
 def window_widths(plan: ScanPlan, step_px: int) -> tuple[int, int, int]:
-    """Narrowest window, end (the whole row, in words) and step of the widths that windows can have, in pixels."""
+    """Narrowest and widest (a whole row, in words) possible width of a window, and the step between widths, in pixels."""
     grid = math.lcm(step_px, WORD_PX)
     return grid, -(-plan.width // WORD_PX) * WORD_PX, grid
 

@@ -1,7 +1,7 @@
-"""Reads every byte of a recording: which blocks are sound, what is damaged, and whether frames follow on frames.
+"""Reads every byte of a recording and finds which blocks are sound, what is damaged, and whether frames are missing.
 
 `check_segments` finds the sound blocks, `Continuity` the gaps between them, which show in the blocks' numbers. Gaps at
-the ends of a recording show only in what else is known of the run: `lost_ends` looks at index, manifest and part.
+the ends of a recording show only in other knowledge of the run: `lost_ends` looks at index, manifest and part.
 """
 
 import zlib
@@ -37,11 +37,11 @@ _FEW: Final = 4
 
 @dataclass(frozen=True, slots=True)
 class SoundBlock:
-    """A block whose every byte is right.
+    """A block in which every byte is right.
 
-    entry: its index record. first_tick, last_tick: of its frames; 0 where it has none. last_sweep: number of scan
-    markers up to its last frame. repeated: (first, last) numbers of frames whose ticks do not rise; they count as
-    lost. objection: why the block cannot be what was recorded; None where it can.
+    entry: its index record. first_tick, last_tick: of its frames; 0 if it has none. last_sweep: number of scan markers
+    up to its last frame. repeated: (first, last) numbers of frames whose ticks do not rise; they count as lost.
+    objection: why the block cannot be what was recorded; None if it can.
     """
 
     entry: bytes
@@ -55,7 +55,7 @@ class SoundBlock:
 
     @property
     def block_seq(self) -> int:
-        """Its number, low 32 bits, as the index has it."""
+        """Number of the block, low 32 bits, as in the index."""
         return self.header.block_seq & 0xFFFFFFFF
 
     @property
@@ -65,7 +65,7 @@ class SoundBlock:
 
     @property
     def end_frame(self) -> int:
-        """Number of the frame behind its last one."""
+        """Number of its last frame plus one."""
         return self.first_frame + self.n_frames
 
 
@@ -73,7 +73,7 @@ Run = Sequence[SoundBlock]
 
 
 def check_segments(segments: Sequence[SegmentReader]) -> tuple[list[SoundBlock], list[str]]:
-    """Find all sound blocks, by place, and write a line for each piece that is damaged."""
+    """Find all sound blocks, in order of their places; returns also a line for each damaged piece."""
     if sum(segment.size for segment in segments) < _STEP_BYTES:  # threads would take longer to start
         found = list(map(_check, segments))
     else:
@@ -86,7 +86,7 @@ def check_segments(segments: Sequence[SegmentReader]) -> tuple[list[SoundBlock],
 
 
 def merged_gaps(gaps: Iterable[RunGap]) -> list[RunGap]:
-    """The gaps of each run in order; those that overlap or meet are one, and one without a frame is none."""
+    """The gaps of each run in order. Gaps that overlap or touch are joined, and empty ones dropped."""
     merged: list[RunGap] = []
     for number, first, last in sorted(gap for gap in gaps if gap[1] <= gap[2]):
         if merged and merged[-1][0] == number and first <= merged[-1][2] + 1:
@@ -100,9 +100,9 @@ def merged_gaps(gaps: Iterable[RunGap]) -> list[RunGap]:
 class Continuity:
     """Gaps and problems between the blocks of a recording.
 
-    known: gaps that a repair found and noted; None where there was no repair.
-    gaps: frames that the device lost, or that a repair found missing, and that the recording says are lost.
-    missing: frames that are not there and of which nothing is said.
+    known: gaps that a repair found and noted; None if there was no repair.
+    gaps: frames that the recording says are lost, because the device lost them or a repair found them missing.
+    missing: frames that are missing although the recording does not say so.
     """
 
     known: Collection[RunGap] | None
@@ -112,13 +112,13 @@ class Continuity:
 
     @property
     def lost(self) -> int:
-        """Frames in the gaps, each counted once."""
+        """Number of frames in the gaps, each counted once."""
         return sum(last + 1 - first for _, first, last in merged_gaps(self.gaps))
 
     def follow(self, number: int, run: Run, *, is_part: bool) -> None:
-        """Check whether the blocks of a run follow on each other, apart from frames that the device says it lost.
+        """Check whether the blocks of a run follow one another, except for frames that the device says it lost.
 
-        is_part: the recording was cut from another one, so that it need not begin with the first block.
+        is_part: whether the recording was cut from another one, so that it need not begin with the first block.
         """
         first = run[0]
         self.gaps += [
@@ -172,7 +172,7 @@ class Continuity:
 
 
 def in_step(frames: int, ticks: int, header: BlockHeader) -> bool:
-    """Whether so many frames can be so many ticks apart; always true where frames are triggered from outside."""
+    """Whether this number of frames can be `ticks` apart; always true if frames are triggered from outside."""
     period = header.frame_period_ticks
     return not period or abs(ticks - frames * period) <= period * (0.5 + _CLOCK_SHARE * abs(frames))
 
@@ -180,7 +180,7 @@ def in_step(frames: int, ticks: int, header: BlockHeader) -> bool:
 def out_of_step(run: Run) -> list[SoundBlock]:
     """Blocks of a run whose ticks or sweep disagree with their frame numbers, judged by their neighbours.
 
-    Empty where those would be more than a few: then the device counts differently.
+    Empty if there would be more than a few, since the device then counts differently.
     """
     votes = [0] * len(run)
     for i, block in enumerate(run):
@@ -232,7 +232,7 @@ def _stretches(numbers: NDArray[np.int64]) -> Iterator[tuple[int, int]]:
 
 
 def _objection(segment: SegmentReader, placed: Placed) -> str | None:
-    """Reason why a block with all its checksums cannot be what was recorded; None where it can."""
+    """Reason why a block with all its checksums cannot be what was recorded; None if it can."""
     end = placed.offset + placed.length
     if not TRAILER.unpack(segment.at(end - TRAILER_BYTES, TRAILER_BYTES).tobytes())[4]:  # no CRC, unless it is 0
         payload = segment.at(placed.offset + HEADER_BYTES, placed.length - HEADER_BYTES - TRAILER_BYTES)
@@ -248,10 +248,10 @@ def _objection(segment: SegmentReader, placed: Placed) -> str | None:
 def lost_ends(
     contents: Contents, runs: Sequence[Run], joined: Continuity, manifest: dict[str, Any] | None
 ) -> list[RunGap]:
-    """Frames that are gone at either end of each run; starts of which nothing is left come behind the others.
+    """Frames that are missing at either end of each run. Starts of which nothing is left come last.
 
-    They show in index records of blocks that are gone, in the range of frames of a part, and in the number of frames
-    that the device delivered.
+    They show in index records of missing blocks, in the range of frames of a part, and in the number of frames that the
+    device delivered.
     """
     cut = (manifest or {}).get("cut")
     ranges = _told_ranges(contents, runs)
@@ -272,7 +272,7 @@ def lost_ends(
 
 
 def _told_ranges(contents: Contents, runs: Sequence[Run]) -> dict[int, tuple[int, int]]:
-    """First and end frame of each run as the index says; empty where most index records are of something else."""
+    """First and end frame of each run as the index says; empty if most index records are of something else."""
     sound = {block.entry for run in runs for block in run}
     if len(contents.told) == 0 or 2 * sum(entry.tobytes() in sound for entry in contents.told) < len(sound):
         return {}

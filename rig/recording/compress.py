@@ -1,4 +1,4 @@
-"""Compresses a recording once it is over: each block by itself, so that any of them can be read alone.
+"""Compresses a finished recording, each block by itself, so that any of them can be read alone.
 
 `frames-000000.spb` becomes `frames-000000.spb.zst`; the index stays as it is. Each segment is replaced only once the
 compressed one is on the disk and unpacks to the same bytes.
@@ -41,10 +41,11 @@ class Compression:
 
 
 def compress(folder: Path) -> Compression:
-    """Compress the segments of a recording (`rig compress`); compressed ones stay as they are.
+    """Compress the segments of a recording (`rig compress`). Segments that are compressed already stay as they are.
 
-    UsageError where there is no recording, or the package zstandard is missing; DamagedRecordingError where it is not
-    whole; RecordingError where the disk is full, with every segment plain or compressed as a whole.
+    Raises UsageError if there is no recording or the package zstandard is missing, DamagedRecordingError if the
+    recording is not whole, and RecordingError if the disk is full. Each segment is then still plain or completely
+    compressed.
     """
     try:
         zstandard_or_error()

@@ -1,9 +1,9 @@
-"""A bare cube of packed frames, made by any program: checked against its plan, counted map by map.
+"""A cube of packed frames without records, made by any program: checked against its plan, counted map by map.
 
 The frames are in a .npy file: uint8 (maps x columns x exposures, height, ceil(width / 8)), packed along the width, most
-significant bit first (`numpy.packbits(frames, axis=2)`). Or they are in a recording of frames alone, as `rig import`
-writes it, with gaps in their numbers perhaps. Frame f of a map belongs to column f // exposures, exactly; there are no
-dark frames.
+significant bit first (`numpy.packbits(frames, axis=2)`). Or they are in a recording without plan and markers, as
+`rig import` writes it, possibly with gaps in their numbers. Frame f of a map belongs to column f // exposures, exactly;
+there are no dark frames.
 """
 
 import os
@@ -39,9 +39,10 @@ Piece = tuple[int, NDArray[np.uint8]]
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Cube:
-    """Checked frames of whole maps. first_frame: number of the first map's first frame. maps: whole sweeps.
+    """Checked frames of whole maps. first_frame: number of the first map's first frame. maps: number of whole sweeps.
 
-    between: gives the frames that exist from a first one to before an end, so many at most at a time, from the disk.
+    between: reads the frames that exist from a first one to before an end, at most a given number at a time, from the
+    disk.
     """
 
     path: Path
@@ -54,12 +55,12 @@ class Cube:
 
     @property
     def frames_per_map(self) -> int:
-        """Frames of one sweep, lost ones included."""
+        """Number of frames of one sweep, including lost ones."""
         return self.plan.columns * self.plan.exposures
 
 
 def open_cube(path: str | os.PathLike[str], plan: CubePlan, model: RigModel) -> Cube:
-    """Open a .npy file, or the folder of a recording; UsageError where it disagrees with its plan and calibration."""
+    """Open a .npy file, or the folder of a recording. Raises UsageError if it disagrees with its plan and calibration."""
     file = Path(path)
     camera = model.camera
     if file.is_dir():
@@ -90,7 +91,7 @@ def _recorded(recording: RunRecording, run: RecordedRun, first: int, end: int, s
 
 
 def cube_columns(model: RigModel) -> int | None:
-    """Columns of the bare cube that a model with `planes` is for; None where its commands are a mirror's."""
+    """Number of columns of the cube for which a model with `planes` was made; None if its commands are a mirror's."""
     scanner = model.scanner
     if isinstance(scanner, PlaneTable) and np.array_equal(scanner.command, np.arange(len(scanner.command))):
         return len(scanner.command)
@@ -98,12 +99,12 @@ def cube_columns(model: RigModel) -> int | None:
 
 
 def column_commands(plan: CubePlan) -> NDArray[np.float64]:
-    """Commands of a cube's columns: their index, which is what the `planes` of its calibration are sampled at."""
+    """Commands of a cube's columns. They are the column numbers, at which the `planes` of its calibration are sampled."""
     return np.arange(plan.columns, dtype=np.float64)
 
 
 def count_map(cube: Cube, index: int, counter: Counter) -> tuple[FrameTally, list[Gap]]:
-    """Count one map by a counter made for the cube's columns and size; return counts and the gaps in its frames."""
+    """Count one map with a counter made for the cube's columns and size; returns the counts and the gaps in its frames."""
     counter.reset()
     first = cube.first_frame + index * cube.frames_per_map
     end = first + cube.frames_per_map
@@ -208,7 +209,7 @@ _UNREADABLE: Final = (ValueError, EOFError, SyntaxError, OverflowError, MemoryEr
 
 
 def open_array(file: Path) -> NDArray[Any]:
-    """The array of a `.npy` file, mapped into memory. UsageError, one line, where it holds none."""
+    """The array of a `.npy` file, mapped into memory. Raises UsageError, with one line, if it holds none."""
     try:
         if zipfile.is_zipfile(file):
             raise UsageError(f"{file} is an archive of arrays; a cube is one array, written with numpy.save")
@@ -222,7 +223,7 @@ def open_array(file: Path) -> NDArray[Any]:
 
 
 def holds_bits(frames: NDArray[Any]) -> bool:
-    """Whether every value is 0 or 1, and one is 1, as in frames that are not packed."""
+    """Whether every value is 0 or 1, and at least one is 1, as in frames that are not packed."""
     step = max(1, LOOK_BYTES // max(1, frames[:1].nbytes))
     seen = False
     for first in range(0, len(frames), step):
@@ -234,7 +235,7 @@ def holds_bits(frames: NDArray[Any]) -> bool:
 
 
 def pack_line(frames: str, dtype: np.dtype[Any]) -> str:
-    """The line of numpy that packs frames of one number a pixel."""
+    """A line of numpy code that packs frames with one number per pixel."""
     return f"numpy.packbits({frames}, axis=2)" if dtype.kind in "biu" else f"numpy.packbits({frames} != 0, axis=2)"
 
 

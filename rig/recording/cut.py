@@ -1,7 +1,8 @@
 """Cuts a part out of a recording, as a recording of its own: by maps, by frames of a run, or by time.
 
-Frames keep their run and number, so that maps of a part are bound and named as in the whole. What is needed to estimate
-its maps again comes along: plan, calibration, learned states and, where it was known, the truth.
+Frames keep their run and number, so that maps of a part are bound and named as in the whole. The part includes
+everything
+needed to estimate its maps again: plan, calibration, learned states and, if known, the truth.
 """
 
 import math
@@ -30,7 +31,7 @@ _VERDICT_WITHOUT_GAPS: Final = {RunVerdict.GAPS: RunVerdict.COMPLETE, UNFINISHED
 
 @dataclass(frozen=True, slots=True)
 class Part:
-    """Frames of one run. first_map, end_map: the maps that lie in it as a whole, by their numbers in the recording."""
+    """Frames of one run. first_map, end_map: the maps that lie completely in it, by their numbers in the recording."""
 
     run: RecordedRun
     first_frame: int
@@ -51,9 +52,9 @@ def cut(
     """Write a part of a recording to a new folder and return its manifest (`rig cut`).
 
     Give exactly one of: maps 'A:B', frames 'A:B' of run number `run`, time 'A:B' in seconds of its frame clock from its
-    first frame; each from A to before B, either left out for the first or the end; a single number means one map or
-    frame. Raises UsageError for a part that does not exist, or where `out` cannot be written, DamagedRecordingError
-    where the recording is not as it was recorded, RecordingError where the disk is full.
+    first frame. Each is from A to before B; a missing A or B means the first or the end; a single number means one map
+    or frame. Raises UsageError for a part that does not exist or an `out` that cannot be written, DamagedRecordingError
+    if the recording is damaged, RecordingError if the disk is full.
     """
     recording = open_recording(folder)
     manifest, trouble = manifest_or_none(folder)

@@ -1,8 +1,8 @@
-"""Plan and calibration beside the frames of a recording, which give them meaning without the rig.
+"""Plan and calibration beside the frames of a recording, which are needed to interpret them without the rig.
 
 `to_plain` and `from_plain` turn dataclasses into plain values for YAML and JSON and back, exactly: fractions become
-text ("100000/3"), arrays their dtype and values. Fields that a dataclass computes for itself (init=False) are left out,
-and so are fields marked `SINCE` while they have no value, so that older files can still be read.
+text ("100000/3"), arrays their dtype and values. Fields that a dataclass computes itself (init=False) are left out, and
+so are fields marked `SINCE` while they have no value, so that older files can still be read.
 """
 
 import re
@@ -36,7 +36,7 @@ MOST_PIXELS: Final = 0xFFFF
 
 
 def write_inputs(folder: Path, plan: ScanPlan, model: RigModel | None) -> None:
-    """Write the compiled plan, every number of it, and the calibration, where there is one. Raises OSError."""
+    """Write the compiled plan with every number, and the calibration, if there is one. Raises OSError."""
     content = {"format": PLAN_FORMAT, "version": PLAN_VERSION, "plan": to_plain(plan)}
     dumper = getattr(yaml, "CSafeDumper", yaml.SafeDumper)
     text = yaml.dump(content, Dumper=dumper, sort_keys=False, default_flow_style=None, width=120)
@@ -46,7 +46,7 @@ def write_inputs(folder: Path, plan: ScanPlan, model: RigModel | None) -> None:
 
 
 def read_plan(folder: Path, name: str = PLAN_FILE) -> ScanPlan:
-    """Read the plan that a recording was taken with. UsageError where there is none that this program reads."""
+    """Read the plan with which a recording was taken. Raises UsageError if there is none that this program reads."""
     file = folder / name
     try:
         content = load_yaml(file, "a plan", f"format: {PLAN_FORMAT}").content
@@ -105,9 +105,10 @@ def _require_sizes(plan: ScanPlan) -> None:
 
 
 def holds_frames_alone(folder: Path) -> bool:
-    """Whether a recording has no plan and never had one, as imported frames: no manifest and no marker tells of one.
+    """Whether a recording has no plan and never had one, as with imported frames: neither manifest nor markers indicate
+    one.
 
-    DamagedRecordingError where the manifest is damaged.
+    Raises DamagedRecordingError if the manifest is damaged.
     """
     if (folder / PLAN_FILE).exists() or PLAN_FILE in ((read_manifest(folder) or {}).get("inputs") or {}):
         return False
@@ -115,14 +116,14 @@ def holds_frames_alone(folder: Path) -> bool:
 
 
 def reconstruct_line(folder: Path) -> str:
-    """The command that makes depth of a recording, with options for the files that are missing beside its frames."""
+    """The command that makes depth from a recording, with options for the files that are missing beside its frames."""
     plan = " --plan PLAN" if holds_frames_alone(folder) else ""
     calibration = "" if (folder / CALIBRATION_FILE).exists() else " --calibration CALIBRATION"
     return f"rig reconstruct {folder}{plan}{calibration} --out DIR"
 
 
 def read_model(folder: Path) -> RigModel | None:
-    """Read the calibration that a recording was taken with; None where it has none. UsageError where it is damaged."""
+    """Read the calibration with which a recording was taken; None if it has none. Raises UsageError if it is damaged."""
     file = folder / CALIBRATION_FILE
     if not file.exists():
         return None
@@ -139,7 +140,7 @@ SINCE = "since"
 
 
 def to_plain(value: Any) -> Any:
-    """Numbers, text, lists and mappings that `from_plain` reads. TypeError for a value that has no such form."""
+    """The value as numbers, text, lists and mappings that `from_plain` reads. Raises TypeError if it has no such form."""
     if is_dataclass(value):
         kept = [(field, getattr(value, field.name)) for field in fields(value) if field.init]
         return {field.name: to_plain(one) for field, one in kept if one is not None or SINCE not in field.metadata}
@@ -159,7 +160,7 @@ def to_plain(value: Any) -> Any:
 
 
 def from_plain(kind: type[T], content: Any) -> T:
-    """The value of type `kind` that `to_plain` wrote. ValueError where `content` is not one."""
+    """The value of type `kind` that `to_plain` wrote. Raises ValueError if `content` is not one."""
     value: T = _read(kind, content, kind.__name__)
     return value
 

@@ -1,4 +1,4 @@
-"""Opens recordings for the commands that read one, and says what they hold and which frames belong to which map."""
+"""Opens recordings for the commands that read one, and finds what they hold and which frames belong to which map."""
 
 from collections.abc import Iterator, Sequence
 from dataclasses import asdict, dataclass
@@ -23,7 +23,7 @@ SEGMENTS: Final = "frames-*.spb"
 
 
 def open_recording(folder: Path) -> RunRecording:
-    """Open the recording of a run. UsageError without one, DamagedRecordingError where nothing of it is left."""
+    """Open the recording of a run. Raises UsageError without one, DamagedRecordingError if nothing of it is left."""
     require_recording(folder)
     try:
         return RunRecording(folder)
@@ -34,7 +34,7 @@ def open_recording(folder: Path) -> RunRecording:
 
 
 def require_recording(path: Path) -> None:
-    """Raise UsageError where a path is no folder with a recording, saying what it is instead."""
+    """Raise UsageError if a path is not a folder with a recording, saying what it is instead."""
     if not (path.is_dir() and segment_files(path)):
         raise UsageError(f"{path} {_instead(path)}")
 
@@ -66,7 +66,7 @@ def _instead(path: Path) -> str:
 
 
 def manifest_or_none(folder: Path) -> tuple[dict[str, Any] | None, str | None]:
-    """The manifest, or the reason why there is none."""
+    """The manifest and None, or None and the reason why there is no manifest."""
     try:
         manifest = read_manifest(folder)
     except DamagedRecordingError as error:
@@ -76,7 +76,7 @@ def manifest_or_none(folder: Path) -> tuple[dict[str, Any] | None, str | None]:
 
 @dataclass(frozen=True, slots=True)
 class MapSpan:
-    """Frames of a map: of one run, from the frame with its scan marker to before the frame with the next."""
+    """Frames of a map: those of one run, from the frame with its scan marker to before the frame with the next."""
 
     run: int
     first_frame: int
@@ -133,13 +133,13 @@ def _sweep_begins(recording: RunRecording, run: RecordedRun) -> Iterator[int]:
 
 
 def markers_seen(block: FrameBlock) -> NDArray[np.int64]:
-    """Number of scan markers in the run up to each frame: a record's low 16 bits, continued from the header's 32."""
+    """Number of scan markers in the run up to each frame: the record's low 16 bits, extended with the header's 32."""
     sweep = block.header.sweep
     return np.asarray(sweep + ((block.records["sweep"].astype(np.int64) - sweep) & 0xFFFF))
 
 
 def begins_sweep(block: FrameBlock) -> bool:
-    """Whether the first frame of a block has a scan marker of its own."""
+    """Whether the first frame of a block has a scan marker itself."""
     return bool(int(block.records["marks"][0]) & Mark.SCAN)
 
 
@@ -147,9 +147,10 @@ def begins_sweep(block: FrameBlock) -> bool:
 class RunInfo:
     """One start of the SPAD, with frames first_frame to end_frame - 1 and maps first_map to end_map - 1.
 
-    gaps: number of missing pieces between its frames and, as a repair found, at its ends. lost: frames in these.
-    width, height: pixels of a frame. duration_s: from the first frame to the end of the last one; without a frame
-    period, to the last block's start.
+    gaps: number of missing pieces between its frames and, if a repair found some, at its ends. lost: frames in these.
+    width,
+    height: pixels of a frame. duration_s: from the first frame to the end of the last one; without a frame period, to
+    the last block's start.
     """
 
     run_id: int
@@ -172,7 +173,7 @@ class RunInfo:
 class RecordingInfo:
     """Contents of a recording.
 
-    verdict: the run's own. compressed: number of compressed segments. bytes: size on the disk. problems: a line each,
+    verdict: the run's own. compressed: number of compressed segments. bytes: size on the disk. problems: one line each,
     as far as they can be seen without reading the frames.
     """
 
@@ -191,12 +192,12 @@ class RecordingInfo:
     problems: list[str]
 
     def as_json(self) -> dict[str, Any]:
-        """Return it as plain values."""
+        """The contents as plain values."""
         return {**asdict(self), "folder": str(self.folder)}
 
 
 def info(folder: Path) -> RecordingInfo:
-    """Describe a recording (`rig info`). UsageError where there is none."""
+    """Describe a recording (`rig info`). Raises UsageError if there is none."""
     recording = open_recording(folder)
     manifest, trouble = manifest_or_none(folder)
     spans = map_spans(recording, manifest)
@@ -254,7 +255,7 @@ def _run_info(run: RecordedRun, spans: Sequence[MapSpan], known: Sequence[RunGap
 
 
 def fitted_ratio(ratio: float, sweeps: Sequence[dict[str, Any]]) -> float:
-    """Ratio of the scanner's clock to nominal after these sweeps of a manifest; `ratio` is the one before the first."""
+    """Ratio of the scanner's clock to nominal after these sweeps of a manifest. ratio: the one before the first."""
     for i, sweep in enumerate(sweeps):
         if i and sweep["first_frame"] < sweeps[i - 1]["end_frame"]:
             ratio = 1.0  # another start of the SPAD

@@ -1,7 +1,7 @@
-"""Makes a torn recording whole: nothing but sound blocks, with an index and a manifest that say so.
+"""Makes a torn recording whole: only sound blocks are left, with an index and a manifest that agree with them.
 
-No frame is changed and no byte is thrown away: what is no sound block goes to `frames-000000.torn`, at the place where
-it was in the segment, a damaged compressed segment to `frames-000000.torn.zst` and a damaged manifest to
+No frame is changed and no byte thrown away. Bytes that are not part of a sound block go to `frames-000000.torn`, at the
+place they had in the segment, a damaged compressed segment to `frames-000000.torn.zst` and a damaged manifest to
 `manifest.damaged.json`. Another repair leaves these files as they are.
 """
 
@@ -31,7 +31,7 @@ Range = tuple[int, int]
 
 @dataclass(frozen=True, slots=True)
 class Repair:
-    """Result of a repair: a line for each thing done, and what `verify` says afterwards."""
+    """Result of a repair: a line for each thing done, and the result of a `verify` afterwards."""
 
     done: list[str]
     after: Verification
@@ -40,7 +40,7 @@ class Repair:
 def repair(folder: Path) -> Repair:
     """Make a recording whole as far as possible (`rig repair`).
 
-    UsageError where there is none, RecordingError where it cannot be written.
+    Raises UsageError if there is none, RecordingError if it cannot be written.
     """
     if is_held(folder / INDEX_FILE):
         raise UsageError(f"{folder} is still being recorded; let the run end, or end it, and repair it then")

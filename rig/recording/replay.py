@@ -1,7 +1,7 @@
-"""Prepares a recording for the live stack: its plan and its starts, with other devices recorded, emulated or real.
+"""Prepares a recording for the live stack: its plan and its starts, with the other devices recorded, emulated or real.
 
-Frames are bound by the plan that they were taken with (`plan.yaml`), never by one compiled anew, and each start of the
-SPAD is played as one: so a map is made of the very same frames in the very same order, at any clock.
+Frames are bound by the plan with which they were taken (`plan.yaml`), never by a newly compiled one, and each start of
+the SPAD is played as one start. So a map is made from exactly the same frames in the same order, at any clock.
 """
 
 import itertools
@@ -57,7 +57,7 @@ class ReplayOptions:
     """Options of playing a recording.
 
     clock: 'realtime', 'max', a factor such as 'x4', or 'step'. loop: play it again and again.
-    block_frames: most frames of a block; None is as the plan says.
+    block_frames: largest number of frames in a block; None is as the plan says.
     """
 
     clock: str = "max"
@@ -75,10 +75,10 @@ class ReplayOptions:
 
 
 def replay_config(run: Path, options: ReplayOptions, others: RigConfig | None, estimate: dict[str, Any]) -> RigConfig:
-    """Make the config of the rig that plays a recording. UsageError where there is none.
+    """Make the config of the rig that plays a recording. Raises UsageError if there is no recording.
 
-    others: rig whose world, scanner, laser and sync source take part; None plays the recorded ones.
-    estimate: settings laid over those of the recording.
+    others: rig whose world, scanner, laser and sync source take part; None to use the recorded ones.
+    estimate: settings that replace those of the recording.
     """
     require_recording(run)
     plan = read_plan(run)
@@ -110,9 +110,10 @@ def replay_config(run: Path, options: ReplayOptions, others: RigConfig | None, e
 def replay_plan(
     spad: SpadArray, recording: RunRecording, scan: ScanConfig, model: RigModel | None
 ) -> tuple[ScanPlan, SpadTiming]:
-    """The plan that the frames were taken with, for the present calibration, and the timing of the configured SPAD.
+    """The plan with which the frames were taken, adapted to the present calibration, and the timing of the configured
+    SPAD.
 
-    DamagedRecordingError where the frames are of another size than the plan's, which counters are made by.
+    Raises DamagedRecordingError if the frames differ in size from the plan's, for which counters are made.
     """
     from rig.plan.calibration_reach import recalibrated, whole_rows
 
@@ -134,7 +135,7 @@ def replay_plan(
 
 
 class ReplaySource:
-    """Facts about a recording for the run that plays it. maps: how many the run will take; None: all there are."""
+    """Facts about a recording for the run that plays it. maps: number of maps that the run will take; None for all."""
 
     def __init__(self, spad: ReplaySpad, plan: ScanPlan, maps: int | None) -> None:
         self._spad = spad
@@ -156,41 +157,45 @@ class ReplaySource:
 
     @classmethod
     def of(cls, spad: SpadArray, plan: ScanPlan, maps: int | None) -> "ReplaySource | None":
-        """Make it for a SPAD that plays a recording; None for any other. UsageError where there are too few maps."""
+        """Make it for a SPAD that plays a recording; None for any other. Raises UsageError if there are too few maps."""
         return cls(spad, plan, maps) if isinstance(spad, ReplaySpad) else None
 
     @property
     def report(self) -> PaceReport:
-        """Report on how the clock was kept."""
+        """The report on how well the clock was kept."""
         return self._spad.pace.report
 
     @property
     def silence_s(self) -> float:
-        """Longest silence of the SPAD that is allowed: more at a slow clock, and no limit while it waits for steps."""
+        """Longest silence of the SPAD that is allowed. It is longer at a slow clock, and unlimited while it waits for
+        steps.
+        """
         pace = self._spad.pace
         return 1e6 if pace.stepping else SILENCE_S / min(1.0, pace.speed or 1.0)
 
     def groups(self) -> Iterator[int]:
-        """Give the number of sweeps of each start, one after the other."""
+        """Yield the number of sweeps of each start, one after the other."""
         sweeps = [start.sweeps for start in self._played]
         return itertools.cycle(sweeps) if self._spad.loops else iter(sweeps)
 
     def starts_for(self, maps: int) -> int:
-        """The most starts that it takes for so many maps."""
+        """Largest number of starts needed for this number of maps."""
         return -(-maps // self._there) * len(self._played)
 
     def starts(self) -> Iterator[SweepStart]:
-        """The sweep that each of the starts begins with."""
+        """Yield the sweep with which each start begins."""
         found = [start.begin for start in self._played]
         return itertools.cycle(found) if self._spad.loops else iter(found)
 
     def learned(self, estimate: EstimateConfig, model: RigModel | None) -> Sequence[Learned]:
-        """States that the maps of a part were estimated with; empty where they are to be learned anew."""
+        """States with which the maps of a part were estimated; empty if they are to be learned anew."""
         learned = _part_learned(self._spad.recording.path, estimate, model)
         return [learned[number] for number in self._numbers if number < len(learned)]
 
     def truth(self, index: int) -> SweepTruth | None:
-        """Truth of a map that was recorded with it; None where it was not kept. DamagedRecordingError if of others."""
+        """Truth that was recorded with a map; None if it was not kept. Raises DamagedRecordingError if it belongs to
+        other maps.
+        """
         file = self._spad.recording.path / "truth" / f"{self._numbers[index % self._there]:06d}.npz"
         truth = _kept(file, lambda arrays: SweepTruth(x_px=arrays["x_px"], depth_m=arrays["depth_m"]))
         if truth is not None and (truth.x_px.shape, truth.depth_m.shape) != self._shapes:
@@ -201,7 +206,7 @@ class ReplaySource:
         return truth
 
     def lost_outside(self, sweeps: Sequence[SweepAccount]) -> list[Gap]:
-        """Frames (first, last) gone outside all these sweeps; empty where fewer maps were asked for than there are."""
+        """Frames (first, last) lost outside all these sweeps; empty if fewer maps were asked for than there are."""
         if not self._all:
             return []
         spans = _by_start(sweeps, [start.number for start in self._played])
@@ -218,8 +223,8 @@ class ReplaySource:
 class RecordedStart:
     """One start of the SPAD in a recording.
 
-    begin: the sweep that its whole maps begin with. first_map: number of the first of these in the recording. sweeps:
-    how many there are. gone: frames at its ends that the manifest tells of and no block has.
+    begin: the sweep with which its whole maps begin. first_map: number of the first of these in the recording. sweeps:
+    their number. gone: frames at its ends that the manifest mentions but no block contains.
     """
 
     number: int
@@ -232,7 +237,7 @@ class RecordedStart:
 def recorded_sweeps(recording: RunRecording, plan: ScanPlan) -> list[RecordedStart]:
     """The whole sweeps of each start of the SPAD, as the run took them, as far as their frames are there.
 
-    DamagedRecordingError where a start is missing: its maps would be taken for those of others.
+    Raises DamagedRecordingError if a start is missing, since its maps would be confused with those of others.
     """
     manifest = read_manifest(recording.path) or {}
     begins = _part_starts(recording)
@@ -308,7 +313,7 @@ def _whole_sweeps(recording: RunRecording, run: RecordedRun, plan: ScanPlan) -> 
 
 
 def _end_block(recording: RunRecording, run: RecordedRun, *, last: bool) -> FrameBlock | None:
-    """The first or the last sound block of a start with a frame in it; None where there is none."""
+    """The first or the last sound block of a start with a frame in it; None if there is none."""
     entries = run.entries[::-1] if last else run.entries
     return next((b for entry in entries if (b := recording.read(run, entry)) is not None and b.n_frames), None)
 
@@ -374,7 +379,9 @@ def _part_learned(folder: Path, estimate: EstimateConfig, model: RigModel | None
 
 
 def _kept(file: Path, make: Callable[[dict[str, NDArray[Any]]], T]) -> T | None:
-    """Make something of the arrays kept of a map; None where there are none. DamagedRecordingError if unreadable."""
+    """Make something of the arrays kept of a map; None if there are none. Raises DamagedRecordingError if they are
+    unreadable.
+    """
     if not file.exists():
         return None
     try:

@@ -1,8 +1,9 @@
 """Writes one segment of a recording: SPB1 blocks one after the other, each padded with zeros to whole pages.
 
-Blocks are written past the page cache where the system can (O_DIRECT), several at a time, pixels straight from where
-they lie: 0.3 s of CPU a GB, nearly all of it for the checksum, where the page cache takes 2 s. What is written is then
-on the disk, and a sync has little to do. `Space` is the room that a recorded run will take at most.
+Blocks bypass the page cache if the system allows it (O_DIRECT), several at a time, with pixels straight from their
+memory. This takes 0.3 s of CPU per GB, nearly all of it for the checksum, compared with 2 s through the page cache.
+Written data is then already on the disk, and a sync has little to do. `Space` is the room that a recorded run will take
+at most.
 """
 
 import errno
@@ -34,7 +35,7 @@ _sync_data = getattr(os, "fdatasync", os.fsync)
 
 
 class Staging(threading.local):
-    """Page-aligned memory of each thread, for the parts of a block that do not lie on pages."""
+    """Page-aligned memory of each thread, for the parts of a block that are not page-aligned."""
 
     def __init__(self) -> None:
         self._memory = mmap.mmap(-1, PAGE_BYTES)
@@ -47,7 +48,7 @@ class Staging(threading.local):
 
 
 class OpenSegment:
-    """A segment that blocks are written to. One thread places them in order, any thread writes them."""
+    """A segment to which blocks are written. One thread places them in order, any thread writes them."""
 
     def __init__(self, folder: Path, number: int, name: str, reserve_bytes: int) -> None:
         """Make the file; set `reserve_bytes` aside for it as far as the disk has them. Raises OSError."""
@@ -69,13 +70,13 @@ class OpenSegment:
         return self.end == self.placed
 
     def place(self, size: int) -> int:
-        """Place the next block, of `size` bytes with padding, and return its offset."""
+        """Reserve the place of the next block, of `size` bytes with padding; returns its offset."""
         offset = self.placed
         self.placed += size
         return offset
 
     def write(self, block: FrameBlock, offset: int, staging: Staging) -> None:
-        """Write a block at its place; its memory must not change until this returns. Raises OSError."""
+        """Write a block at its place. Its memory must not change until this returns. Raises OSError."""
         pieces = _pieces(block, staging)
         while pieces:
             written = self._write(pieces, offset)
@@ -86,14 +87,14 @@ class OpenSegment:
                 pieces[0] = pieces[0][written:]
 
     def sync(self) -> None:
-        """Make sure that what is written survives a loss of power. Raises OSError."""
+        """Make sure that written data survives a loss of power. Raises OSError."""
         if self.synced != self.end:
             end = self.end
             _sync_data(self._fd)
             self.synced = end
 
     def close(self) -> None:
-        """End the file behind its last whole block; without a block it is removed. Raises OSError."""
+        """End the file after its last whole block; without any block it is removed. Raises OSError."""
         if self._fd < 0:
             return
         fd, self._fd = self._fd, -1
@@ -119,7 +120,7 @@ class OpenSegment:
 
 
 def paged(size: int) -> int:
-    """Bytes of the whole pages that `size` bytes take."""
+    """Size in bytes of the whole pages that `size` bytes take."""
     return -(-size // PAGE_BYTES) * PAGE_BYTES
 
 
@@ -180,7 +181,7 @@ BYTES_PER_PIXEL: Final = 40
 
 @dataclass(frozen=True, slots=True)
 class Space:
-    """Bytes that the frames and the maps of a run will take at most, and what the disk of its folder has free."""
+    """Largest number of bytes that the frames and the maps of a run will take, and the free space on its disk."""
 
     folder: Path
     recording_bytes: int
@@ -189,12 +190,12 @@ class Space:
 
     @classmethod
     def on_disk_of(cls, folder: Path, recording_bytes: int, map_bytes: int) -> "Space":
-        """Look at the disk of a folder, given as an absolute path, which need not exist."""
+        """Determine the space on the disk of a folder, given as an absolute path, which need not exist."""
         there = next(path for path in (folder, *folder.parents) if path.is_dir())
         return cls(folder, recording_bytes, map_bytes, shutil.disk_usage(there).free)
 
     def require(self) -> None:
-        """Raise UsageError where the disk has not enough room."""
+        """Raise UsageError if the disk has not enough room."""
         if self.recording_bytes + self.map_bytes > self.free_bytes:
             raise UsageError(
                 f"the recording will take at most {_gb(self.recording_bytes)} and the maps {_gb(self.map_bytes)}, the "
@@ -203,7 +204,7 @@ class Space:
             )
 
     def content(self) -> dict[str, Any]:
-        """Return it as plain values."""
+        """The numbers as plain values."""
         return {**asdict(self), "folder": str(self.folder)}
 
     def __str__(self) -> str:
@@ -217,9 +218,9 @@ class Space:
 def recording_bytes(
     plan: ScanPlan, request: SpadRequest, timing: SpadTiming, maps: int, *, starts: int, spare_s: float
 ) -> int:
-    """The most bytes that the segments take.
+    """Largest number of bytes that the segments take.
 
-    starts: of the SPAD. spare_s: time of each start before its first marker and behind its last one.
+    starts: number of starts of the SPAD. spare_s: time of each start before its first marker and after its last one.
     """
     frames = plan.frames_for(maps) + (starts - 1) * plan.frames_for(0) + starts * spare_s * float(plan.frame_rate_hz)
     if plan.burst_frames is not None:

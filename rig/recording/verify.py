@@ -43,11 +43,11 @@ class Integrity(StrEnum):
 
 @dataclass(frozen=True, slots=True)
 class Verification:
-    """Verdict on a recording, and what it rests on.
+    """Verdict on a recording, with its evidence.
 
     blocks, frames, bytes: number of sound ones. lost: frames that the device lost or a repair found missing. gaps:
-    where these are, [run, first, last]. problems: a line each. run: the verdict of the run that was recorded. ended:
-    reason why the recording ended before the run; None where it did not.
+    their ranges, [run, first, last]. problems: one line each. run: the verdict of the run that was recorded. ended:
+    reason why the recording ended before the run; None if it did not.
     """
 
     verdict: Integrity
@@ -68,13 +68,13 @@ class Verification:
         return 0 if self.verdict is Integrity.INTACT else 1
 
     def as_json(self) -> dict[str, Any]:
-        """Return it as plain values."""
+        """The verification as plain values."""
         return {**asdict(self), "verdict": self.verdict.value}
 
 
 @dataclass(frozen=True, slots=True)
 class Examination:
-    """All that can be known of a recording. runs: the sound blocks of each run, in order of their frames."""
+    """Everything that can be found out about a recording. runs: the sound blocks of each run, in order of their frames."""
 
     segments: list[SegmentReader]
     runs: list[list[SoundBlock]]
@@ -94,7 +94,7 @@ class Examination:
 
 
 def verify(folder: Path) -> Verification:
-    """Read all of a recording (`rig verify`). UsageError where there is none; damage is in the result."""
+    """Read all of a recording (`rig verify`). Raises UsageError if there is none; damage is reported in the result."""
     found = examine(folder)
     blocks = [block for run in found.runs for block in run]
     manifest = found.manifest or {}
@@ -120,7 +120,7 @@ def verify(folder: Path) -> Verification:
 
 
 def examine(folder: Path) -> Examination:
-    """Find out everything that `verify` and `repair` need to know. UsageError where there is no recording."""
+    """Find out everything that `verify` and `repair` need to know. Raises UsageError if there is no recording."""
     require_recording(folder)
     try:
         segments = open_segments(folder)

@@ -1,12 +1,13 @@
-"""Writes a recording: segments of SPB1 blocks and their index, whole to the last block whatever ends the program.
+"""Writes a recording: segments of SPB1 blocks and their index, complete to the last block however the program ends.
 
-A block counts once all its bytes and those of every block before it are with the system; then its index record is
-written. So a killed program loses no block that counted, and a loss of power none older than `SYNC_INTERVAL_S`: a
-thread makes the disk keep what was written, blocks before index.
+A block counts once the system has all its bytes and those of every block before it; then its index record is written.
+So a killed program loses no block that counted. A loss of power loses at most blocks younger than `SYNC_INTERVAL_S`,
+since a thread makes the disk keep what was written, blocks before index.
 
-`Recording` is that. `Recorder` is the pipeline's thread that hands the blocks of one start of the SPAD to it, which its
-threads write, several at a time, from the slots they lie in. It has a required place in the ring: where the disk is
-slower than the stream, the ring fills and the overload policy decides.
+`Recording` does this. `Recorder` is the pipeline's thread that passes the blocks of one start of the SPAD to it. The
+recording's threads write them, several at a time, from their slots in the ring. The recorder is a required reader of
+the
+ring: if the disk is slower than the stream, the ring fills and the overload policy decides.
 """
 
 import errno
@@ -44,7 +45,7 @@ RESERVE_BYTES: Final = 1 << 20
 
 @dataclass(slots=True, eq=False)
 class _Placed:
-    """A block on its way to its place. end: offset of the block's end in its segment."""
+    """A block that is being written. end: offset of the block's end in its segment."""
 
     segment: OpenSegment
     end: int
@@ -54,17 +55,17 @@ class _Placed:
 
 @dataclass(slots=True)
 class Start:
-    """One start of the SPAD. sweeps: how many it was to give. segment: number of its first segment."""
+    """One start of the SPAD. sweeps: the number it was to give. segment: number of its first segment."""
 
     sweeps: int
     segment: int
 
 
 class Recording:
-    """A recording that grows block by block in a folder; whatever fails, it ends behind a whole block.
+    """A recording that grows block by block in a folder; whatever fails, it ends after a whole block.
 
-    One thread submits and appends. expected_bytes: so much is set aside on the disk, where it is known. on_begin:
-    called where a start of the SPAD begins. Raises RecordingError where the folder cannot be written.
+    One thread submits and appends. expected_bytes: room to reserve on the disk, if known. on_begin: called when a start
+    of the SPAD begins. Raises RecordingError if the folder cannot be written.
     """
 
     def __init__(
@@ -115,7 +116,7 @@ class Recording:
         self._syncing.start()
 
     def begin(self, sweeps: int) -> None:
-        """Begin a start of the SPAD that is to give `sweeps` sweeps: its blocks come next, in segments of their own."""
+        """Begin a start of the SPAD that is to give `sweeps` sweeps. Its blocks come next, in segments of their own."""
         self.starts.append(Start(sweeps, len(self.files)))
         with self._lock:
             self._segment = None
@@ -123,13 +124,13 @@ class Recording:
             self._on_begin()
 
     def append(self, block: FrameBlock) -> None:
-        """Write a block behind the others and wait until it counts. Raises RecordingError where it did not fit."""
+        """Write a block after the others and wait until it counts. Raises RecordingError if it could not be written."""
         self.submit(block).result()
 
     def submit(self, block: FrameBlock) -> "Future[None]":
-        """Begin to write a block behind the others; its memory must not change until the result is there.
+        """Begin to write a block after the others. Its memory must not change until the result is available.
 
-        The result, or this call, raises RecordingError where a block could not be written: none counts from it on.
+        The result, or this call, raises RecordingError if a block could not be written; from that block on none counts.
         """
         header = block.header
         size = paged(BlockLayout(block.n_frames, header.width, header.height).block_bytes)
@@ -148,7 +149,9 @@ class Recording:
         self._companions.append(companion)
 
     def close(self) -> None:
-        """Wait until everything is written, end the files and sync them, once. RecordingError where that fails."""
+        """Wait until everything is written, end the files and sync them. A second call does nothing. Raises
+        RecordingError if that fails.
+        """
         if self._closed.is_set():
             return
         self._pool.shutdown()
@@ -171,7 +174,7 @@ class Recording:
             self.files = [name for name in self.files if (self.folder / name).exists()]
 
     def content(self) -> dict[str, object]:
-        """Describe the recording for the manifest."""
+        """The recording as plain values for the manifest."""
         return {
             "files": list(self.files),
             "index": INDEX_FILE,
@@ -281,7 +284,7 @@ def _reason(error: BaseException) -> str:
 class Recorder:
     """Thread that records the blocks of one start of the SPAD, up to the last one.
 
-    reader: holds as many blocks as are to be written at a time. on_failure: called on this thread.
+    reader: holds as many blocks as may be written at a time. on_failure: called on this thread.
     """
 
     def __init__(self, reader: RingReader, recording: Recording, on_failure: Callable[[], None]) -> None:
@@ -294,7 +297,7 @@ class Recorder:
 
     @property
     def busy_s(self) -> float:
-        """Seconds of all writers together, for checksums and writing."""
+        """Total seconds of all writers, for checksums and writing."""
         return self._recording.busy_s - self._before[0]
 
     @property
@@ -312,7 +315,7 @@ class Recorder:
         self._thread.start()
 
     def join(self, timeout_s: float) -> bool:
-        """Wait until everything is written; False where that takes longer."""
+        """Wait until everything is written. False if that takes longer than `timeout_s`."""
         return self._thread.join(timeout_s)
 
     def _run(self) -> None:
@@ -332,7 +335,7 @@ class Recorder:
                 self._on_failure()
 
     def _next(self) -> FrameBlock | None:
-        """The next block; None where none will come. An error of the source is reported by the counting thread."""
+        """The next block; None if none will come. An error of the source is reported by the counting thread."""
         try:
             return self._reader.next()
         except Exception:

@@ -29,7 +29,8 @@ Point = tuple[float, float]
 class Series:
     """A curve or points. Points that are not finite, or that a logarithmic axis cannot show, are left out.
 
-    intervals: (low, high) in y of each point. names: small text beside each point. step: drawn as a histogram.
+    intervals: (low, high) in y of each point. names: small text beside each point. step: whether to draw it as a
+    histogram.
     """
 
     label: str
@@ -45,7 +46,7 @@ class Series:
 
 @dataclass(frozen=True, slots=True)
 class ChartMark:
-    """A cross at a place of a chart, with words beside it."""
+    """A cross at a place of a chart, with text beside it."""
 
     at: Point
     text: str
@@ -60,7 +61,7 @@ class Drawable(Protocol):
         ...
 
     def svg(self) -> str:
-        """Draw the SVG elements from (0, 0) on."""
+        """Draw the SVG elements with the origin at (0, 0)."""
         ...
 
 
@@ -76,7 +77,7 @@ class Axis:
 
     @classmethod
     def over(cls, values: Sequence[float], log: bool, start_px: float, end_px: float) -> "Axis":
-        """Make an axis that shows all values, with some room; a logarithmic one shows those above zero."""
+        """Make an axis that shows all values, with some margin. A logarithmic one shows those above zero."""
         shown = [value for value in values if math.isfinite(value) and (value > 0 or not log)] or [1.0]
         low, high = min(shown), max(shown)
         if log:
@@ -86,14 +87,14 @@ class Axis:
         return cls(0.0 if 0 <= low < room * 8 else low - room, high + room, False, start_px, end_px)
 
     def px(self, value: float) -> float:
-        """Pixel of a value; NaN where it cannot be shown."""
+        """Pixel of a value; NaN if it cannot be shown."""
         if not math.isfinite(value) or (self.log and value <= 0):
             return math.nan
         low, high, at = (math.log(v) if self.log else v for v in (self.low, self.high, value))
         return self.start_px + (at - low) / (high - low) * (self.end_px - self.start_px)
 
     def ticks(self) -> list[float]:
-        """Round values to label."""
+        """Round values at which to put labels."""
         if not self.log:
             return round_values(self.low, self.high, 5)
         first, last = math.floor(math.log10(self.low)), math.ceil(math.log10(self.high))
@@ -104,7 +105,7 @@ class Axis:
 
 @dataclass(frozen=True, slots=True)
 class Panel:
-    """Curves over one pair of axes. front: points of a broad band behind them, by rising x."""
+    """Curves over one pair of axes. front: points of a broad band behind the curves, by rising x."""
 
     title: str
     x_label: str

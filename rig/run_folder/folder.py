@@ -1,11 +1,11 @@
-"""The folder of a run: every output in one place, whole or not there at all.
+"""The folder of a run: every output in one place, either complete or not there at all.
 
     depth/000000.npy  depth/000000.png  intensity/000000.png  stripe/000000.npz  cloud/000000.ply
-    learned/000000.npz (what the map was estimated with, where the estimator learns)
-    truth/000000.npz (where a world knows it)  manifest.json  summary.json
+    learned/000000.npz (the state used for the map, if the estimator learns)
+    truth/000000.npz (if a world knows it)  manifest.json  summary.json
 
-Everything is written beside the folder under a hidden name and moved in one step at the end; the folder of a recording
-is there from the start and grows in place. What `replace_file` and `sync_folder` wrote survives a loss of power.
+Everything is written beside the folder under a hidden name and moved in one step at the end. The folder of a recording
+is there from the start and grows in place. Data written with `replace_file` and `sync_folder` survives a loss of power.
 """
 
 import io
@@ -39,10 +39,10 @@ Rays = tuple[NDArray[np.floating], NDArray[np.floating]]
 
 
 class RunFolder:
-    """Collects the outputs of a run; `publish` makes them appear as `path`, leaving without it removes every trace.
+    """Collects the outputs of a run. `publish` makes them appear as `path`; leaving without it removes every trace.
 
-    in_place: the outputs can be seen at `path` from the start.
-    Raises UsageError, one line, where the folder exists with something in it or cannot be written.
+    in_place: whether the outputs can be seen at `path` from the start.
+    Raises UsageError, with one line, if the folder exists with something in it or cannot be written.
     """
 
     def __init__(self, path: str | os.PathLike[str], *, in_place: bool = False) -> None:
@@ -69,9 +69,9 @@ class RunFolder:
         self.discard()
 
     def write_map(self, index: int, result: MapResult, rays: Rays | None) -> None:
-        """Write all files of one map; `rays` (u, v) of the camera, None for an uncalibrated rig (no depth, no cloud).
+        """Write all files of one map. rays: (u, v) of the camera, None for an uncalibrated rig (no depth, no cloud).
 
-        Where one cannot be written (disk full), the map's other files are removed too and UsageError says why.
+        If one cannot be written (disk full), the map's other files are removed too, and UsageError says why.
         """
         name = f"{index:06d}"
         files = {
@@ -105,7 +105,7 @@ class RunFolder:
             file.unlink(missing_ok=True)
 
     def write_json(self, name: str, content: Mapping[str, Any]) -> None:
-        """Write `name` (manifest.json, summary.json) as strict JSON; a reader sees the old file or the new one."""
+        """Write `name` (manifest.json, summary.json) as strict JSON. A reader sees either the old file or the new one."""
         text = json_text(content)
         text = sealed_text(text) if name == MANIFEST else text
         file = self.place(name)
@@ -121,13 +121,15 @@ class RunFolder:
         self._write({name: text.encode()})
 
     def keep(self) -> None:
-        """Leave everything as it is: what a run recorded is kept even where the run does not come to its end."""
+        """Keep everything as it is, so that a recording is kept even if the run does not come to its end."""
         assert self._in_place, "a run folder that is no recording appears whole or not at all"
         self._scratch = None
         self._made_parents.clear()
 
     def publish(self) -> Path:
-        """Make the folder appear and return its path: its name, or NAME-2 and so on where somebody else was faster."""
+        """Make the folder appear and return its path: its name, or NAME-2 and so on if the name has been taken
+        meanwhile.
+        """
         scratch = self._scratch
         assert scratch is not None, "a run folder is published once"
         try:
@@ -203,13 +205,13 @@ class RunFolder:
 
 
 def json_text(content: Mapping[str, Any]) -> str:
-    """Write strict JSON: NaN and infinities become null, arrays lists, paths text."""
+    """Write strict JSON: NaN and infinities become null, arrays become lists, paths become text."""
     return json.dumps(_plain(content), indent=1, allow_nan=False, ensure_ascii=False)
 
 
 @dataclass(frozen=True, slots=True)
 class SavePolicy:
-    """The maps of a run that are written (`--save`). step: maps 0, step, 2 step, ...; None: only the last."""
+    """Which maps of a run are written (`--save`). step: maps 0, step, 2 step, ...; None for only the last."""
 
     step: int | None = 1
 
@@ -222,16 +224,16 @@ class SavePolicy:
         return cls(None if match[2] else int(match[3] or 1))
 
     def count(self, maps: int) -> int:
-        """Number of maps written of a run of `maps` maps."""
+        """Number of maps that are written in a run of `maps` maps."""
         return min(maps, 1) if self.step is None else -(-maps // self.step)
 
     def keeps(self, index: int) -> bool:
-        """Whether map `index` is written as soon as it is there."""
+        """Whether map `index` is written as soon as it is ready."""
         return self.step is not None and index % self.step == 0
 
 
 def _renamed(folder: Path, target: Path) -> bool:
-    """Move a folder; False where something is at `target` already."""
+    """Move a folder; False if something is at `target` already."""
     try:
         folder.rename(target)
     except OSError:
@@ -275,13 +277,13 @@ except ImportError:  # Windows lets nobody else change a file that is open
 
 
 def hold(fd: int) -> None:
-    """Hold an open file for as long as it is open. Raises OSError where another process holds it."""
+    """Lock an open file for as long as it is open. Raises OSError if another process holds the lock."""
     if fcntl is not None:
         fcntl.flock(fd, fcntl.LOCK_EX | fcntl.LOCK_NB)
 
 
 def is_held(file: Path) -> bool:
-    """Whether a process holds a file; False where there is no such file."""
+    """Whether a process has locked a file; False if there is no such file."""
     if fcntl is None or not file.exists():
         return False
     with file.open("rb") as stream:
@@ -293,7 +295,9 @@ def is_held(file: Path) -> bool:
 
 
 def replace_file(file: Path, data: bytes) -> None:
-    """Write a file in one step: whatever ends the program, it is there as a whole, or as it was. Raises OSError."""
+    """Write a file in one step. However the program ends, the file has either its old or its complete new content.
+    Raises OSError.
+    """
     scratch = file.with_name(f"{file.name}.part")
     try:
         with scratch.open("wb") as stream:

@@ -1,7 +1,7 @@
-"""The manifest of a run, `manifest.json`: sealed with a checksum, since depth depends on what it says.
+"""The manifest of a run, `manifest.json`. It is sealed with a checksum, since depth depends on its content.
 
-`crc32` is the CRC-32 (zlib) of the rest of it as JSON without spaces and with sorted keys: a digit that changed on the
-disk is found, other line breaks are not.
+`crc32` is the CRC-32 (zlib) of its other content as JSON without spaces and with sorted keys. So a digit that changed
+on the disk is detected, but different line breaks are accepted.
 """
 
 import json
@@ -31,7 +31,7 @@ RunGap = tuple[int, int, int]
 
 
 class _Part(BaseModel):
-    """The keys of a part of the manifest that commands read; others may stand beside them."""
+    """The keys of a part of the manifest that commands read. Other keys are allowed."""
 
     model_config = ConfigDict(strict=True, extra="ignore")
 
@@ -82,7 +82,7 @@ class _Rig(_Part):
 
 
 class _Manifest(_Part):
-    """The form of the manifest, as far as commands read it. What a device counted is judged by `device_counters`."""
+    """The form of the manifest, as far as commands read it. A device's own counts are checked by `device_counters`."""
 
     verdict: str = ""
     maps: int | None = None
@@ -107,7 +107,9 @@ def sealed_text(text: str) -> str:
 
 
 def read_manifest(folder: Path) -> dict[str, Any] | None:
-    """Read the manifest of a run without its seal; None where there is none. DamagedRecordingError if damaged."""
+    """Read the manifest of a run without its seal; None if there is none. Raises DamagedRecordingError if it is
+    damaged.
+    """
     try:
         raw = (folder / MANIFEST).read_bytes()
     except FileNotFoundError:
@@ -131,12 +133,12 @@ def read_manifest(folder: Path) -> dict[str, Any] | None:
 
 
 def is_cut_short(manifest: Mapping[str, Any]) -> bool:
-    """Whether frames behind the first maps are known to be possibly gone: the disk was full, or it was repaired."""
+    """Whether frames after the first maps may be missing, because the disk was full or the recording was repaired."""
     return "repaired" in manifest or ended_early(manifest) is not None
 
 
 def ended_early(manifest: Mapping[str, Any]) -> str | None:
-    """Reason why a recording ended before its run, such as a full disk; None where it did not or was repaired since."""
+    """Reason why a recording ended before its run, such as a full disk; None if it did not or was repaired since."""
     if "repaired" in manifest:
         return None
     failed = (manifest.get("recording") or {}).get("failed")
@@ -144,20 +146,20 @@ def ended_early(manifest: Mapping[str, Any]) -> str | None:
 
 
 def ended_before_last_map(manifest: Mapping[str, Any]) -> bool:
-    """Whether a run ended before it had made maps of all sweeps: whole ones may lie behind those of the manifest."""
+    """Whether a run ended before it had made maps of all sweeps. There may be whole sweeps after those of the manifest."""
     starts = (manifest.get("recording") or {}).get("starts") or []
     return len(manifest.get("sweeps") or []) < sum(int(start["sweeps"]) for start in starts)
 
 
 def known_missing(manifest: Mapping[str, Any] | None) -> list[RunGap] | None:
-    """Frames that a repair found missing; None where there was no repair."""
+    """Frames that a repair found missing; None if there was no repair."""
     if manifest is None or "repaired" not in manifest:
         return None
     return [(int(run), int(first), int(last)) for run, first, last in manifest.get("missing") or []]
 
 
 def device_counters(manifest: Mapping[str, Any]) -> tuple[dict[str, int], list[str]]:
-    """The SPAD's own counts of a run's frames that are possible, and a line for each that is not."""
+    """The SPAD's own counts of a run's frames, as far as they are possible, and a line for each that is not."""
     counters = {key: value for key, value in (manifest.get("counters") or {}).items() if value is not None}
     sane = {key: value for key, value in counters.items() if isinstance(value, int) and 0 <= value < MOST_RUN_FRAMES}
     return sane, [
@@ -177,7 +179,7 @@ def file_crc32(path: Path) -> int:
 
 
 def inputs_problems(folder: Path, manifest: Mapping[str, Any]) -> list[str]:
-    """List the files beside the frames that are not what the manifest says, a line each."""
+    """Lines on the files beside the frames that differ from what the manifest says."""
     problems = []
     for name, stated in (manifest.get("inputs") or {}).items():
         try:
@@ -189,9 +191,11 @@ def inputs_problems(folder: Path, manifest: Mapping[str, Any]) -> list[str]:
 
 
 def require_playable(folder: Path, manifest: Mapping[str, Any]) -> None:
-    """Raise DamagedRecordingError, a line each, for files beside the frames that are not what the manifest says.
+    """Raise DamagedRecordingError, with one line each, for files beside the frames that differ from what the manifest
+    says.
 
-    UsageError for a recording whose maps spadrig 0.1 took in several passes over part of the columns each.
+    Raises UsageError for a recording of spadrig 0.1 whose maps were taken in several passes over part of the columns
+    each.
     """
     if problems := inputs_problems(folder, manifest):
         raise DamagedRecordingError("\n".join(f"{line}; take it from a copy of the recording" for line in problems))

@@ -17,7 +17,7 @@ _LABELS = 6
 
 
 def depth_limits(depth_m: NDArray[np.float32]) -> tuple[float, float] | None:
-    """Depths (m) between which colours run: all but the outermost 1 % on each side; None where there is no depth."""
+    """Depths (m) at the ends of the colour scale: all but the outermost 1 % on each side; None if there is no depth."""
     known = depth_m[np.isfinite(depth_m)]
     if not known.size:
         return None
@@ -29,7 +29,7 @@ def depth_limits(depth_m: NDArray[np.float32]) -> tuple[float, float] | None:
 def depth_picture(
     depth_m: NDArray[np.float32], limits: tuple[float, float] | None, unit: str = "m"
 ) -> NDArray[np.uint8]:
-    """Depth in colours between its limits, red to blue, with a scale at the right; BGR, black where there is none."""
+    """Depth in colours between its limits, red to blue, with a scale at the right; BGR, black without depth."""
     import cv2
 
     rows, width = depth_m.shape
@@ -53,7 +53,7 @@ def depth_picture(
 
 
 def intensity_picture(intensity: NDArray[np.uint32]) -> NDArray[np.uint8]:
-    """Summed counts as grey, square-root scaled (shot noise looks alike in dark and bright); (rows, width)."""
+    """Summed counts as grey, square-root scaled (shot noise then looks alike in dark and bright); (rows, width)."""
     level = _without_window_steps(intensity)
     # Hot pixels and glints beyond the brightest 0.5 % must not darken the rest, nor haze everywhere wash it out.
     low, high = np.percentile(level, [1, 99.5])
@@ -112,7 +112,7 @@ def cloud(
     v: NDArray[np.floating],
     intensity: NDArray[np.uint32],
 ) -> NDArray[np.void]:
-    """One POINT per pixel that has a depth. All arguments (rows, width); (u, v, 1) is each pixel's ray."""
+    """One POINT for each pixel with a depth. All arguments are (rows, width); (u, v, 1) is each pixel's ray."""
     known = np.isfinite(depth_m) & np.isfinite(u) & np.isfinite(v)
     z = depth_m[known]
     points = np.empty(z.size, POINT)

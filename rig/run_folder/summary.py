@@ -1,4 +1,4 @@
-"""The summary of a run, as `--json` prints and summary.json holds it: frames, times, fog, errors and a verdict."""
+"""The summary of a run, as in `--json` and summary.json: frames, times, fog, errors and a verdict."""
 
 import statistics
 from collections.abc import Mapping, Sequence
@@ -20,13 +20,15 @@ _LARGEST = {"ring_slots", "ring_bytes", "ring_high_water", "map_queue", "map_que
 
 @dataclass(frozen=True, slots=True)
 class PipelineStats:
-    """Figures of a pipeline at one moment or at its end. Times are wall time in seconds; None: there is no such stage.
+    """Figures of a pipeline during a run or at its end. Times are wall time in seconds; None means that there is no
+    such stage.
 
     source_fill_s: in the SPAD's `fill`, without source_wait_s, which is spent waiting for a free slot of the ring.
-    ring_high_water: most slots in use at one time, of ring_slots, which take ring_bytes together. dropped_blocks,
-    dropped_frames: found no free slot. counting_s: binding and counting. estimation_s: from counts to map. map_wait_s:
-    waiting for room among the maps that the caller has not taken yet; map_queue is that room, and at most
-    map_queue_high_water maps waited. recorder_s: computing checksums and writing. monitor_updates: views shown.
+    ring_high_water: largest number of slots in use at one time, of ring_slots, which take ring_bytes together.
+    dropped_blocks, dropped_frames: those that found no free slot. counting_s: binding and counting. estimation_s: from
+    counts to map. map_wait_s: waiting for room among the maps that the caller has not taken yet; map_queue is that
+    room, and at most map_queue_high_water maps waited. recorder_s: computing checksums and writing. monitor_updates:
+    views shown.
     monitor_skipped_blocks: blocks that the monitor did not look at.
     """
 
@@ -49,7 +51,7 @@ class PipelineStats:
     monitor_skipped_blocks: int | None = None
 
     def and_then(self, later: "PipelineStats") -> "PipelineStats":
-        """Figures of both together, for runs that start the SPAD several times."""
+        """Combined figures of both, for runs that start the SPAD several times."""
         joined: dict[str, Any] = {}
         for name in (each.name for each in fields(self)):
             values = [value for each in (self, later) if (value := getattr(each, name)) is not None]
@@ -58,7 +60,7 @@ class PipelineStats:
 
 
 class RunVerdict(StrEnum):
-    """Verdict on a run; any but `complete` means that the result is not to be trusted as it is."""
+    """Verdict on a run. Any but `complete` means that the result cannot be trusted as it is."""
 
     COMPLETE = "complete"
     GAPS = "gaps"
@@ -75,10 +77,10 @@ class RunVerdict(StrEnum):
 
 @dataclass(frozen=True, slots=True)
 class RunFrames:
-    """Frames between the first and the last scan marker, dark and fly-back ones too; expected = received + lost.
+    """Frames between the first and the last scan marker, including dark and fly-back ones; expected = received + lost.
 
-    Where a run ended before its last map these are all that came, while lit counts those of its whole maps.
-    crc_errors: blocks refused for their checksum; None where the source does not say. lit: frames that fell on columns.
+    If a run ended before its last map these are all frames that came, while lit counts those of its whole maps.
+    crc_errors: blocks refused for their checksum; None if the source does not say. lit: frames that fell on columns.
     """
 
     expected: int = 0
@@ -92,8 +94,8 @@ class RunFrames:
 class Synchronisation:
     """The binding of a run's frames to columns: by what, and how well.
 
-    residual_columns, clock_error: the largest of its sweeps; None where one could not be checked.
-    detection_probability: the least, of a blanking pattern as bright as a sweep's; None where markers bound the frames.
+    residual_columns, clock_error: the largest of its sweeps; None if one could not be checked. detection_probability:
+    the smallest, for a blanking pattern as bright as a sweep's; None if markers bound the frames.
     """
 
     by: Literal["markers", "blanking pattern"]
@@ -123,9 +125,11 @@ class TruthErrors:
 
 @dataclass(frozen=True, slots=True)
 class Summary:
-    """A run in figures. Times in seconds of sensor and computer, fractions of camera pixels; None = no value.
+    """A run in figures. Times are in seconds of sensor and computer, fractions are of camera pixels; None means no
+    value.
 
-    verdict_reasons: against maps, found in the maps themselves. accepted_calibration: what the user accepted of it.
+    verdict_reasons: reasons against maps, found in the maps themselves. accepted_calibration: reasons against the
+    calibration that the user accepted.
     """
 
     maps: int
@@ -149,7 +153,7 @@ class Summary:
     accepted_calibration: tuple[str, ...] = ()
 
     def as_json(self) -> dict[str, Any]:
-        """Return the summary as plain values; `truth` only where it is known, some only for a scan or a replay."""
+        """The summary as plain values. `truth` is there only if known, some other keys only for a scan or a replay."""
         content = asdict(self)
         content["verdict"] = self.verdict.value
         optional = ("truth", "stages", "sync", "replay", "verdict_reasons", "accepted_calibration")
@@ -182,7 +186,7 @@ class MapTally:
 
     @property
     def doubts(self) -> tuple[Doubt, ...]:
-        """Reasons against maps, each with its maps; empty where there are none."""
+        """Reasons against maps, each with its maps; empty if there are none."""
         of_reason: dict[str, list[int]] = {}
         for index, each in enumerate(self._maps):
             for reason in each.doubts:
@@ -190,7 +194,7 @@ class MapTally:
         return tuple(Doubt(reason, tuple(maps)) for reason, maps in of_reason.items())
 
     def add(self, result: MapResult, compute_s: float, truth: SweepTruth | None = None) -> None:
-        """Count one map; `compute_s` is the wall time of its counting and estimation."""
+        """Count one map. compute_s: wall time of its counting and estimation."""
         valid = float(np.isfinite(result.depth_m).mean())
         errors = None
         if truth is not None:

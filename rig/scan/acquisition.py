@@ -1,7 +1,7 @@
 """Runs a scan: starts the devices in order, takes maps from their frames, and makes everything safe.
 
-The `Pipeline` does the work between the SPAD and the caller. As soon as all frames are there, or anything fails, the
-rig is made safe, on the caller's thread; what is in the ring by then is still counted and estimated.
+The `Pipeline` does the work between the SPAD and the caller. As soon as all frames have come, or anything fails, the
+rig is made safe on the caller's thread. What is in the ring by then is still counted and estimated.
 """
 
 import logging
@@ -46,13 +46,14 @@ class AcquisitionRequest:
     """An acquisition of `maps` maps.
 
     policy: for frames that come too fast.
-    first_alone: take the first map with a start of its own, so that a SPAD that cannot wait stands still while the
-      estimator learns from that map.
+    first_alone: take the first map with a separate start, so that a SPAD that cannot wait stands still while the
+    estimator learns from that map.
     learns: whether the estimator learns from the first map.
-    groups: sweeps of each start, where the scan is not free to choose. starts: the sweep that each start begins with.
+    groups: number of sweeps of each start, if the scan may not choose it. starts: the sweep with which each start
+    begins.
     silence_s: a SPAD that sends nothing for this long, with the ring empty, has failed.
     recording: takes every block; None records nothing.
-    listeners: told of what is going on.
+    listeners: callbacks that are informed of the progress.
     """
 
     maps: int
@@ -67,11 +68,11 @@ class AcquisitionRequest:
 
 
 class Acquisition:
-    """A scan with an open rig, and with the plan and timing that `rig.devices.prepare` gave. Iterate once over `run()`.
+    """A scan with an open rig, and with the plan and timing from `rig.devices.prepare`. Iterate once over `run()`.
 
     maker: makes the maps, on the counting thread; a `rig.depth.reconstruct.Reconstructor`.
 
-    Raises UsageError where the SPAD cannot do what the policy asks, PlanError where its memory is too small for a map.
+    Raises UsageError if the SPAD cannot do what the policy asks, PlanError if its memory is too small for a map.
     """
 
     def __init__(
@@ -96,21 +97,21 @@ class Acquisition:
 
     @property
     def counters(self) -> SpadCounters:
-        """The SPAD's own counts over all its starts so far. May be asked on any thread."""
+        """The SPAD's own counts over all its starts so far. May be called from any thread."""
         if self._pipeline is None:
             return self._counters_before
         return added_counters(self._counters_before, self._rig.spad.counters)
 
     @property
     def stages(self) -> PipelineStats:
-        """Figures of each stage so far. May be asked on any thread."""
+        """Figures of each stage so far. May be called from any thread."""
         return self._stats_before if self._pipeline is None else self._stats_before.and_then(self._pipeline.stats())
 
     def run(self) -> Generator[AcquiredMap, None, None]:
         """Scan; yields the maps in order. However the iteration ends, gate, laser, scanner and SPAD are made safe.
 
-        Raises DeviceError where a device fails, RingOverflow where frames came too fast, RecordingError where the disk
-        is full, each after the maps that were whole by then; DevicesError where devices could not all be made safe.
+        Raises DeviceError if a device fails, RingOverflow if frames came too fast, RecordingError if the disk is full,
+        each after the maps that were complete by then; DevicesError if not all devices could be made safe.
         """
         plan = self._plan
         counter = self._maker.counter(
@@ -284,7 +285,7 @@ class Acquisition:
 
 
 def added_counters(before: SpadCounters, now: SpadCounters) -> SpadCounters:
-    """Sum of the counts of two starts; None where the device does not say."""
+    """Sum of the counts of two starts; None for counts that the device does not report."""
     counts = (
         None if (a := getattr(before, field.name)) is None or (b := getattr(now, field.name)) is None else a + b
         for field in fields(SpadCounters)

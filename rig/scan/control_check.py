@@ -1,9 +1,9 @@
-"""Compares what drivers said to their devices in a replay with the recording: the commands, and when each was sent.
+"""Compares what drivers sent to their devices in a replay with the recording: the commands, and when each was sent.
 
-Commands are compared byte by byte. Buffers of points are compared in their time as well: how much later than in the
-recording each was sent, relative to the middle of its scan, since the host chooses when a scan begins. Where a scan was
-stopped depends on the host's timing too: a last buffer that only one of the two had sent is not compared, nor how the
-mirror was parked.
+Commands are compared byte by byte. For buffers of points the time is compared too: how much later than in the recording
+each was sent, relative to the middle of its scan, since the host chooses when a scan begins. The point at which a scan
+was stopped also depends on the host's timing. So a last buffer that only one of the two had sent is not compared, nor
+how the mirror was parked.
 """
 
 import statistics
@@ -26,7 +26,7 @@ _SHOWN = 24
 class ControlCheck:
     """Result of a comparison. worst_swap_s: lateness of the buffer, of `swaps`, that is furthest from its time.
 
-    problems: one line each; empty where the two agree.
+    problems: one line each; empty if the two agree.
     """
 
     commands: int
@@ -70,7 +70,7 @@ def check_control(recorded: Path, now: Path, *, devices: Sequence[str], toleranc
 
 
 def _first_difference(device: str, what: str, said: list[Passed], says: list[Passed], *, tail: int) -> str | None:
-    """The first byte that differs, in words; None where none does."""
+    """The first byte that differs, in words; None if none does."""
     for number, (old, new) in enumerate(zip(said, says, strict=False)):
         if old.data != new.data:
             pairs = enumerate(zip(old.data, new.data, strict=False))

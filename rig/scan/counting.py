@@ -1,4 +1,4 @@
-"""The counting thread: blocks in, maps out. It alone counts and estimates, one sweep after the other.
+"""The counting thread, which turns blocks into maps. It alone counts and estimates, one sweep after the other.
 
 `MapQueue` is the bounded queue from it to the caller, which also says when the stream is over.
 """
@@ -27,8 +27,8 @@ from rig.threads import StageThread
 class AcquiredMap:
     """A map and the account of its sweep, without the counts, which are large.
 
-    column: float64 (columns,), the place at which the frames of each column were bound.
-    compute_s: wall time of binding, counting and estimation.
+    column: float64 (columns,), the place to which the frames of each column were bound. compute_s: wall time of
+    binding, counting and estimation.
     """
 
     sweep: SweepAccount
@@ -38,11 +38,11 @@ class AcquiredMap:
 
 
 class MapQueue:
-    """At most `room` maps that wait for the caller. One thread puts, one takes; any may end the stream.
+    """At most `room` maps that wait for the caller. One thread puts, one takes; any thread may end the stream.
 
     streaming: whether the rig still has to be kept running.
     closed: whether nobody will take maps any more.
-    high_water: most maps that waited at one time.
+    high_water: largest number of maps that waited at one time.
     """
 
     def __init__(self, room: int) -> None:
@@ -60,7 +60,7 @@ class MapQueue:
         return self._ended and not self._maps
 
     def put(self, found: AcquiredMap) -> None:
-        """Add a map, once there is room. In a closed queue the map is dropped."""
+        """Add a map once there is room. In a closed queue the map is dropped."""
         with self._changed:
             self._changed.wait_for(lambda: len(self._maps) < self.room or self.closed)
             self._maps.append(found)
@@ -68,29 +68,29 @@ class MapQueue:
             self._changed.notify_all()
 
     def end_stream(self) -> None:
-        """Say that the rig can be made safe: all frames are there, or something failed. Maps may still come."""
+        """Note that the rig can be made safe, because all frames have come or something failed. Maps may still come."""
         with self._changed:
             self.streaming = False
             self._changed.notify_all()
 
     def end(self) -> None:
-        """Say that no more maps will come."""
+        """Note that no more maps will come."""
         with self._changed:
             self.streaming, self._ended = False, True
             self._changed.notify_all()
 
     def close(self) -> None:
-        """Say that nobody takes maps any more, which frees a thread that waits to put one."""
+        """Note that nobody takes maps any more. This frees a thread that waits to put one."""
         with self._changed:
             self.closed = True
             self._changed.notify_all()
 
     def take_streaming(self, timeout_s: float) -> AcquiredMap | None:
-        """The next map; None after `timeout_s`, or at once when the stream is over: the rig is made safe first."""
+        """The next map. None after `timeout_s`, or at once when the stream is over, so that the rig is made safe first."""
         return self._take(timeout_s, lambda: not self.streaming)
 
     def take_rest(self, timeout_s: float) -> AcquiredMap | None:
-        """The next map; None after `timeout_s`, or at once where none will come."""
+        """The next map; None after `timeout_s`, or at once if none will come."""
         return self._take(timeout_s, lambda: self.drained)
 
     def _take(self, timeout_s: float, over: Callable[[], bool]) -> AcquiredMap | None:
@@ -104,7 +104,7 @@ class MapQueue:
 
 
 class MakesMaps(Protocol):
-    """The part of a `Reconstructor` that the counting thread uses; no other thread does."""
+    """The part of a `Reconstructor` that the counting thread uses. No other thread uses it."""
 
     def counter(self, layout: SweepLayout) -> Counter:
         """Make a counter whose sweeps `map` takes."""
@@ -131,14 +131,14 @@ class CountingRequest:
 
 
 class CountingThread:
-    """Thread that counts the blocks of one start of the SPAD and estimates each sweep where it ends.
+    """Thread that counts the blocks of one start of the SPAD and estimates each sweep at its end.
 
-    A sweep is estimated before any frame behind it is counted.
+    A sweep is estimated before any frame after it is counted.
 
     on_complete: called on this thread as soon as the marker that closes the last sweep is counted; the last map is
       estimated after that.
 
-    Maps go to `queue`, which ends with this thread; `error` says why, where it ended too early.
+    Maps go to `queue`, which ends with this thread. If it ended too early, `error` says why.
     """
 
     def __init__(
@@ -168,7 +168,7 @@ class CountingThread:
         self._thread.start()
 
     def join(self, timeout_s: float) -> bool:
-        """Wait for the thread; False where it does not end."""
+        """Wait for the thread; False if it does not end in time."""
         return self._thread.join(timeout_s)
 
     def _run(self) -> None:

@@ -1,9 +1,9 @@
-"""News of a run while it goes on: its progress, and for a monitor its newest frames.
+"""Information on a run while it goes on: its progress and, for a monitor, its newest frames.
 
-`Listeners` are the callbacks. The monitor is a thread that shows the newest frames at most ten times a second and
-never holds anybody up. It has an optional place in the ring, copies what it shows and gives the block back before the
-callback sees it. A callback that is slow sees fewer blocks, one that raises is told of once and called no more, one
-that hangs is left behind at the end of the run. Summing 16 frames of 512 x 512 takes 3 to 10 ms.
+`Listeners` are the callbacks. The monitor is a thread that shows the newest frames at most ten times a second and never
+delays other threads. It is an optional reader of the ring, copies what it shows and gives the block back before the
+callback sees it. A slow callback sees fewer blocks. One that raises is reported once and not called again. One that
+hangs is abandoned at the end of the run. Summing 16 frames of 512 x 512 takes 3 to 10 ms.
 """
 
 import logging
@@ -37,9 +37,10 @@ MOST_FRAMES = 16
 class MonitorView:
     """A small picture of the newest block.
 
-    first_frame: number of the first frame summed. frames: how many frames were summed.
-    counts: uint16 (rows, width) of the sensor, the ones of each pixel in those frames, where their window covers it.
-    stages: the figures of the pipeline at this moment.
+    first_frame: number of the first frame summed. frames: number of frames summed.
+    counts: uint16 (rows, width) of the sensor, the ones of each pixel in those frames, as far as their window covers
+    it.
+    stages: the present figures of the pipeline.
     """
 
     first_frame: int
@@ -58,14 +59,15 @@ MonitorCallback = Callable[[MonitorView], object]
 
 @dataclass(frozen=True, slots=True)
 class ScanProgress:
-    """Progress of a run, told several times a second and at its end.
+    """Progress of a run, reported several times a second and at its end.
 
-    frames: frames received, at most frames_planned, which the plan takes from the first scan marker to the last.
+    frames: frames received, at most frames_planned, the number that the plan takes from the first scan marker to the
+    last.
     lost: frames lost by the SPAD's own count.
     sweeps: sweeps counted, of `maps`.
-    stages: what each stage has done so far.
+    stages: the figures of each stage so far.
     fog: estimate from the newest map; None before the first.
-    stage: 'rendering' where frames are simulated, otherwise 'scanning' or 'replaying'; 'learning' while the estimator
+    stage: 'rendering' if frames are simulated, otherwise 'scanning' or 'replaying'; 'learning' while the estimator
       learns from the first map, 'estimating' while another map is made.
     """
 
@@ -81,10 +83,10 @@ class ScanProgress:
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Listeners:
-    """Callbacks of a run; None is nobody.
+    """Callbacks of a run; None for no callback.
 
     live: called with the progress several times a second, on the caller's thread.
-    monitor: called with the newest frames, on a thread of its own.
+    monitor: called with the newest frames, on a separate thread.
     sweeps: called with each counted sweep before its map is made, on the counting thread.
     on_space: called with the room that a recording will take, before anything moves, once it is known to fit.
     """
@@ -130,7 +132,7 @@ class Monitor:
 
     @property
     def skipped(self) -> int:
-        """Blocks that were not looked at."""
+        """Number of blocks that were not looked at."""
         return self._reader.skipped
 
     def start(self) -> None:
@@ -138,7 +140,7 @@ class Monitor:
         self._thread.start()
 
     def end(self, timeout_s: float) -> bool:
-        """Show no more; False where the callback does not return, and is left behind with its thread."""
+        """Show no more. False if the callback does not return; it is then abandoned with its thread."""
         self._over.set()
         ended = self._thread.join(timeout_s)
         if not ended:

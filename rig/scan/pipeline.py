@@ -1,10 +1,10 @@
 """The threads between a SPAD and the caller: source -> ring -> {counting + estimation, recorder, monitor} -> maps.
 
 One pipeline serves one start of the SPAD. Nothing in it can wait for ever: the source waits for the ring, the ring for
-counting and recorder, counting for the caller, and `end_source` and `close` let go of each. The monitor is never waited
-for.
+counting and recorder, counting for the caller, and `end_source` and `close` end each of these waits. Nothing ever waits
+for the monitor.
 
-`Overload` is the user's policy for frames that come faster than they can be worked on, and `ring_for` makes the ring
+`Overload` is the user's policy for frames that come faster than they can be processed, and `ring_for` makes the ring
 that the policy asks for.
 """
 
@@ -37,7 +37,7 @@ MONITOR_S = 0.5
 class Pipeline:
     """The threads of one start of the SPAD: source -> ring -> {counting + estimation, recorder, monitor} -> maps.
 
-    recording: takes every block; None is no recorder. on_frame: as in `Source`.
+    recording: takes every block; None for no recorder. on_frame: as in `Source`.
     """
 
     def __init__(
@@ -66,11 +66,11 @@ class Pipeline:
 
     @property
     def estimating(self) -> bool:
-        """Whether a map is being made just now. May be asked on any thread."""
+        """Whether a map is being made at this moment. May be called from any thread."""
         return self._counting.estimating
 
     def stats(self) -> PipelineStats:
-        """The figures of this moment. May be asked on any thread."""
+        """The present figures. May be called from any thread."""
         ring, counting, recorder, monitor = self._ring, self._counting, self._recorder, self._monitor
         return PipelineStats(
             source_fill_s=self._source.fill_s,
@@ -102,11 +102,11 @@ class Pipeline:
         self._source.start()
 
     def end_source(self, why: BaseException | None = None) -> None:
-        """Stop filling the ring; returns at once. why: error that the readers get behind the last block."""
+        """Stop filling the ring; returns at once. why: error that the readers get after the last block."""
         self._source.end(why)
 
     def join_source(self) -> bool:
-        """Wait for the source thread after the SPAD was stopped; False where it hangs."""
+        """Wait for the source thread after the SPAD was stopped; False if it hangs."""
         return self._source.join(JOIN_S)
 
     def error(self) -> BaseException | None:
@@ -122,7 +122,7 @@ class Pipeline:
         return self._counting.error
 
     def close(self) -> None:
-        """End all threads, whatever they are doing. Maps not taken are gone; what is left in the ring is recorded."""
+        """End all threads, whatever they are doing. Maps not taken are lost; what is left in the ring is recorded."""
         try:
             self._source.end()
             self.maps.close()
@@ -166,7 +166,7 @@ class Overload(StrEnum):
 
 
 def require_policy(policy: Overload, info: SpadInfo) -> None:
-    """Raise UsageError where the policy makes a source wait that cannot."""
+    """Raise UsageError if the policy makes a source wait that cannot."""
     if policy is Overload.BLOCK and not info.can_wait:
         raise UsageError(
             f"--on-overload is 'block', but the {info.model} SPAD cannot wait while it exposes; "
@@ -179,7 +179,7 @@ def ring_for(
 ) -> BlockRing:
     """Allocate the ring between this SPAD and its readers and touch its memory.
 
-    keeps_time: the SPAD can wait, but should not need to.
+    keeps_time: whether the SPAD can wait but should not need to.
     """
     few = info.can_wait and not keeps_time
     slots = FEWEST_SLOTS if few else min(max(RING_BYTES // timing.stride, FEWEST_SLOTS), MOST_SLOTS)

@@ -1,4 +1,4 @@
-"""Makes depth maps of a bare cube of frames, map by map."""
+"""Makes depth maps from a cube of frames without records, map by map."""
 
 import time
 
@@ -18,9 +18,9 @@ from rig.scan.run import OutFolder, Run, RunResult
 def reconstruct_cube(
     cube: Cube, calibration: CalibrationUse, estimate: EstimateConfig, out: OutFolder, progress: Progress | None = None
 ) -> RunResult:
-    """Make all maps of a checked cube; those that lack frames have them noted as gaps.
+    """Make all maps of a checked cube. Missing frames are noted as gaps of their maps.
 
-    An interrupt ends the run after its last whole map, with verdict 'aborted'.
+    An interrupt ends the run after its last complete map, with verdict 'aborted'.
     """
     plan, model = cube.plan, calibration.model
     reconstructor = Reconstructor(model, column_commands(plan), plan.depth_range, estimate)

@@ -1,4 +1,4 @@
-"""Plays a recording: opens its devices, scans, and compares what drivers said with what they had said."""
+"""Plays a recording: opens its devices, scans, and compares what drivers sent with what they sent in the recording."""
 
 import tempfile
 from collections.abc import Callable, Sequence
@@ -28,8 +28,8 @@ def play(
 ) -> RunResult:
     """Play a recording with the rig of `replay_config`; `run` takes the maps.
 
-    Where drivers take part and the recording has control traffic, the two are compared once the rig is closed, also
-    where it failed. Raises DivergedError where they differ; what the run wrote is kept.
+    If drivers take part and the recording has control traffic, the two are compared once the rig is closed, even if it
+    failed. Raises DivergedError if they differ; what the run wrote is kept.
     """
     drivers = [slot for slot in RECORDED if getattr(config, slot).real_time]
     compared = bool(drivers) and (recording / CONTROL_FILE).exists()

@@ -1,4 +1,4 @@
-"""One run from its first map to its folder: what `rig scan` and `rig reconstruct` have in common.
+"""One run from its first map to its folder: the common part of `rig scan` and `rig reconstruct`.
 
 `Run` takes the maps and writes the folder. The functions below it add up the sweeps of a scan: frames, synchronisation,
 verdict, and an account of each sweep for the manifest.
@@ -36,10 +36,10 @@ OutFolder = str | os.PathLike[str] | None
 class RunResult:
     """Result of a run.
 
-    last: the last map; None where the run ended before its first.
-    truth: the truth of that map, where a world knows it.
-    folder: where everything was written; None where nothing was.
-    control: for a replay with drivers, the comparison of what they said with the recording.
+    last: the last map; None if the run ended before its first.
+    truth: the truth of that map, if a world knows it.
+    folder: where everything was written; None if nothing was.
+    control: for a replay with drivers, the comparison of what they sent with the recording.
     """
 
     summary: Summary
@@ -49,7 +49,9 @@ class RunResult:
     control: ControlCheck | None = None
 
     def uninterrupted(self) -> Self:
-        """Return itself, for callers that need the whole run; KeyboardInterrupt where an interrupt ended it."""
+        """Return the result itself, for callers that need the whole run. Raises KeyboardInterrupt if an interrupt ended
+        it.
+        """
         if self.summary.verdict is RunVerdict.ABORTED:
             raise KeyboardInterrupt
         return self
@@ -58,9 +60,9 @@ class RunResult:
 class Run:
     """Takes the maps of a run one by one, writes those to be kept, and closes with manifest and summary.
 
-    Leaving the context without `finish` removes everything that was written, except a recording with a block in it.
+    Leaving the context without `finish` removes everything that was written, except a recording that contains a block.
 
-    out: folder; None writes nothing. record: the folder is that of a recording.
+    out: folder; None writes nothing. record: whether the folder is that of a recording.
     rays: the camera's (u, v) of every pixel, to be set before the first map; None for an uncalibrated rig.
     """
 
@@ -78,7 +80,7 @@ class Run:
         self._tap: TapFile | None = None
 
     def start_tap(self) -> TapFile:
-        """Record from now on what passes the ports of the devices, and return the file that it goes to."""
+        """Start to record what passes the ports of the devices, and return the file with it."""
         assert self._folder is not None, "asked for with a recording, which needs a folder"
         self._tap = TapFile.begin(self._folder.place(CONTROL_FILE))
         return self._tap
@@ -91,7 +93,7 @@ class Run:
     def space(self, recording_bytes: int, map_bytes: int, maps: int) -> Space:
         """Room that a recorded run of `maps` maps takes, and the room on its disk.
 
-        recording_bytes: of all frames. map_bytes: of one map. Raises UsageError where the run has no folder.
+        recording_bytes: of all frames. map_bytes: of one map. Raises UsageError if the run has no folder.
         """
         if self._folder is None:
             raise UsageError("record writes the frames into the run's folder; name one with out")
@@ -109,7 +111,7 @@ class Run:
           each start of the SPAD.
         write_inputs: writes the files that have to lie beside the frames.
         space: room that all of it will take.
-        Raises UsageError where the disk has less room, RecordingError where the recording cannot be written.
+        Raises UsageError if the disk has less room, RecordingError if the recording cannot be written.
         """
         folder = self._folder
         assert folder is not None, "its space was looked at"
@@ -154,7 +156,7 @@ class Run:
                 self._folder.discard()
 
     def add(self, result: MapResult, compute_s: float, truth: SweepTruth | None = None) -> None:
-        """Take the next map: as a whole, or not at all where anything ends it before it is counted."""
+        """Take the next map. If anything interrupts this, the map counts either completely or not at all."""
         index = self.tally.maps
         before = self._last
         try:
@@ -181,7 +183,7 @@ class Run:
         replay: PaceReport | None = None,
         accepted_calibration: tuple[str, ...] = (),
     ) -> RunResult:
-        """Write manifest and summary and make the folder appear; none is left without a map or a recorded block."""
+        """Write manifest and summary and make the folder appear. Without a map or a recorded block no folder is left."""
         summary = self.tally.summary(frames, sensor_time_s, verdict, stages, sync, replay)
         summary = replace(summary, accepted_calibration=accepted_calibration)
         index, result, truth = self._last or (None, None, None)
@@ -220,8 +222,8 @@ def versions() -> dict[str, str]:
 def frames_of(sweeps: list[SweepAccount], crc_errors: int | None, outside: Sequence[Gap] = ()) -> RunFrames:
     """Add up the frames of the sweeps.
 
-    crc_errors: as the SPAD counts them; None where it does not. outside: ranges (first, last) of frames known to be
-    lost outside the sweeps.
+    crc_errors: as the SPAD counts them; None if it does not. outside: ranges (first, last) of frames known to be lost
+    outside the sweeps.
     """
     beside = sum(last + 1 - first for first, last in outside)
     return RunFrames(
@@ -234,7 +236,7 @@ def frames_of(sweeps: list[SweepAccount], crc_errors: int | None, outside: Seque
 
 
 def frames_that_came(of_maps: RunFrames, counters: SpadCounters, dropped: int) -> RunFrames:
-    """Frames of a run that ended before its last map: all that came, those behind its last whole map too.
+    """Frames of a run that ended before its last map: all that came, including those after its last whole map.
 
     counters: the SPAD's own. dropped: frames that found no free slot, for a SPAD that does not count lost frames.
     """
@@ -243,7 +245,7 @@ def frames_that_came(of_maps: RunFrames, counters: SpadCounters, dropped: int) -
 
 
 def synchronisation_of(sweeps: list[SweepAccount]) -> Synchronisation | None:
-    """Summarise how well the sweeps were bound: the worst of each figure; None without sweeps."""
+    """Summary of how well the sweeps were bound: the worst of each figure; None without sweeps."""
     if not sweeps:
         return None
     residuals = [sweep.residual_columns for sweep in sweeps]
@@ -264,7 +266,9 @@ def verdict_of(
     doubtful: bool,
     outside: Sequence[Gap] = (),
 ) -> RunVerdict:
-    """The gravest verdict that applies. doubtful: a map's own light speaks against it. outside: as in `frames_of`."""
+    """The gravest verdict that applies. doubtful: whether a map's own light speaks against it. outside: as in
+    `frames_of`.
+    """
     if aborted:
         return RunVerdict.ABORTED
     if not all(sweep.synchronised or _markers_lost(sweep) for sweep in sweeps):
@@ -282,7 +286,7 @@ def _markers_lost(sweep: SweepAccount) -> bool:
 
 
 def sweep_content(sweep: SweepAccount) -> dict[str, Any]:
-    """Describe one sweep for the manifest."""
+    """The account of one sweep as plain values for the manifest."""
     return {
         "direction": sweep.direction,
         "first_frame": sweep.first_frame,

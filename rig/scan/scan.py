@@ -46,12 +46,12 @@ def run_scan(
 ) -> RunResult:
     """Scan with an open rig; `run` takes the maps.
 
-    request: its `maps` (None is all that a recording holds which takes the SPAD's place), `on_overload`, `record` and
-      `accept_calibration`; the rest has served to open the rig and to make `run`.
-    prepared: what `prepare` gave for this rig, where the caller has called it.
+    request: its `maps` (None takes all maps of a recording that replaces the SPAD), `on_overload`, `record` and
+      `accept_calibration` are used; its other fields were used to open the rig and to make `run`.
+    prepared: the result of `prepare` for this rig, if the caller has called it.
 
-    An interrupt ends the scan after its last whole map, with verdict 'aborted'. So does an error, which is raised again
-    once the whole maps and the recording are safe; where there is neither, nothing is left.
+    An interrupt ends the scan after its last complete map, with verdict 'aborted'. So does an error, which is raised
+    again once the complete maps and the recording are safe; if there is neither, nothing is left.
     """
     policy, maps = Overload.parse(request.on_overload), request.maps
     require_policy(policy, rig.spad.info)
@@ -140,9 +140,9 @@ def run_scan(
 def recorded_bytes(
     rig: OpenRig, plan: ScanPlan, timing: SpadTiming, maps: int, starts: int | None = None
 ) -> tuple[int, int]:
-    """The most bytes that the frames of a scan take, and the bytes of one map.
+    """Largest number of bytes that the frames of a scan take, and the bytes of one map.
 
-    starts: number of starts of the SPAD, where the scan is not free to choose.
+    starts: number of starts of the SPAD, if the scan may not choose it.
     """
     request = spad_request(rig.config.scan, plan)
     spare_s = lead_s(rig) + spare_lead_s(rig)
@@ -162,7 +162,7 @@ def _first_alone(rig: OpenRig) -> bool:
 def make_reconstructor(
     rig: OpenRig, plan: ScanPlan, estimate: EstimateConfig | None = None, learned: Sequence[Learned] = ()
 ) -> Reconstructor:
-    """Make the reconstructor for the maps of a plan. estimate: its settings, where they are not those of the config."""
+    """Make the reconstructor for the maps of a plan. estimate: its settings, if they differ from those of the config."""
     estimate, sensor = estimate or rig.config.estimate, (plan.rows, plan.width)
     return Reconstructor(
         rig.model, plan.commands, plan.depth_range_m, estimate, sensor=sensor, learned=learned, lines=plan.lines

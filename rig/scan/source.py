@@ -1,4 +1,4 @@
-"""The source thread, which lets the SPAD fill the ring, and `blocks`, which gives the blocks to a reader."""
+"""The source thread, in which the SPAD fills the ring, and `blocks`, which passes the blocks to a reader."""
 
 import threading
 import time
@@ -18,9 +18,8 @@ class Source:
     """The thread that fills the ring.
 
     on_end: called on that thread when it ends, for whatever reason.
-    on_frame: called on that thread with the number of the last frame whenever there are new ones; what it raises ends
-      the source.
-    What the SPAD raises is handed to the readers, behind the blocks that came before it.
+    on_frame: called on that thread with the number of the last frame whenever there are new ones; if it raises, the
+    source ends. Errors of the SPAD are passed to the readers, after the blocks that came before.
     """
 
     def __init__(
@@ -58,13 +57,15 @@ class Source:
         self._thread.start()
 
     def end(self, why: BaseException | None = None) -> None:
-        """Stop filling after the present block. Any thread; returns at once. why: error for the readers behind it."""
+        """Stop filling after the present block. May be called from any thread; returns at once. why: error for the
+        readers.
+        """
         self._why = self._why or why
         self._over.set()
         self._ring.end_waits()
 
     def join(self, timeout_s: float) -> bool:
-        """Wait for the thread; False where it does not end. Readers get no more blocks in either case."""
+        """Wait for the thread; False if it does not end in time. Readers get no more blocks in either case."""
         ended = self._thread.join(timeout_s)
         self._ring.finish()
         return ended
@@ -96,7 +97,7 @@ class Source:
 
 
 def blocks(reader: RingReader, source: Source, silence_s: float) -> Iterator[FrameBlock]:
-    """The blocks of the run. DeviceTimeout, in the SPAD's own words, where it is silent while the ring is empty."""
+    """The blocks of the run. Raises DeviceTimeout, in the SPAD's own words, if it is silent while the ring is empty."""
     while True:
         heard = len(source.silences)
         waited_s = 0.0

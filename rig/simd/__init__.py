@@ -1,6 +1,6 @@
 """Vector operations for compiled kernels: sixteen lanes of 8, 16 or 32 bits, written as LLVM instructions.
 
-Here are short names for the arrays that kernels take.
+This module defines short names for the arrays that kernels take.
 """
 
 import numpy as np

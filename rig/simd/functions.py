@@ -1,11 +1,11 @@
-"""Logarithm, powers of e and 2, and the error function of LANES float32 at once: a call of the C library takes one.
+"""Logarithm, powers of e and 2, and the error function of LANES float32 at once, where the C library computes only one.
 
 `logarithm` and `exponential` split numbers into powers of two and mantissas; `error_function` is Abramowitz and Stegun
 7.1.28. Each states its error.
 
-`powers` turns scores into likelihoods: a score is a whole number of units (int16), 128 >> shift to the octave, and
-2^(score / units) is read off the bits of a bfloat16, which is linear between powers of two. A term is exact at whole
-octaves above nothing, elsewhere up to 6 % too large, 4 % on average (`MEAN_EXCESS`).
+`powers` turns scores into likelihoods. A score is a whole number of units (int16), 128 >> shift to the octave, and
+2^(score / units) is read from the bits of a bfloat16, which is linear between powers of two. The result is exact at
+whole octaves above the zero level, and elsewhere up to 6 % too large, 4 % on average (`MEAN_EXCESS`).
 """
 
 import math
@@ -68,7 +68,7 @@ power_of_two = emitted(FLOAT32(FLOAT32), _power)
 
 @numba.njit(forceinline=True)
 def logarithm(a):  # type: ignore[no-untyped-def]
-    """Natural logarithm of positive lanes, to 2e-7 of it or of 1."""
+    """Natural logarithm of positive lanes, with an error of 2e-7 of its value or of 1, whichever is larger."""
     part = mantissas(a)
     ratio = (part - 1.0) / (part + 1.0)
     square = ratio * ratio
@@ -78,7 +78,7 @@ def logarithm(a):  # type: ignore[no-untyped-def]
 
 @numba.njit(forceinline=True)
 def exponential(a):  # type: ignore[no-untyped-def]
-    """e to the lanes, cut at -87 and 88, to 1e-5 of it at the ends and 3e-7 around 1."""
+    """e to the power of the lanes, which are limited to -87..88. Relative error: 1e-5 at the ends, 3e-7 around 1."""
     steps = smaller_float(larger_float(a, _LEAST), _MOST) * _LOG2_E
     whole = steps + _TO_WHOLE - _TO_WHOLE
     rest = (steps - whole) * _LN_2
@@ -90,7 +90,7 @@ def exponential(a):  # type: ignore[no-untyped-def]
 
 @numba.njit(forceinline=True)
 def error_function(a):  # type: ignore[no-untyped-def]
-    """erf of lanes from 0 on, to 1e-6."""
+    """erf of lanes that are not negative, with an error of 1e-6."""
     grown = smaller_float(a, 4.0) * _ERF[0] + _ERF[1]
     for more in _ERF[2:]:
         grown = grown * smaller_float(a, 4.0) + more
@@ -109,7 +109,9 @@ MEAN_EXCESS: Final = np.float32(1.040684)
 
 @numba.njit(inline="always")
 def lift_to_powers(best, shift):  # type: ignore[no-untyped-def]
-    """Number to add to scores so that 0 stands for nothing: 127 octaves below each lane's best score, or the lowest."""
+    """Number to add to scores so that 0 is the zero level: 127 octaves below each lane's best score, or the lowest
+    number.
+    """
     return add_saturated(sub_saturated(zero_int16(), best), np.int16(np.int64(BIAS) >> shift))
 
 
@@ -117,12 +119,12 @@ def lift_to_powers(best, shift):  # type: ignore[no-untyped-def]
 def powers(scores, lift, shift):  # type: ignore[no-untyped-def]
     """2^(score / units) of 16-bit lanes as float32 in the order UNPACKED, up to a factor common to all.
 
-    lift: see `lift_to_powers`; what is below nothing is 0.
+    lift: see `lift_to_powers`; scores below the zero level give 0.
     """
     return from_bfloat16_unpacked(larger(add_saturated(scores, lift), np.int16(0)) << shift)
 
 
 @numba.njit(inline="always")
 def powers_in_order(scores, lift, shift):  # type: ignore[no-untyped-def]
-    """2^(score / units) as `powers` gives it, but lane by lane in order."""
+    """2^(score / units) as `powers` computes it, but with the lanes in order."""
     return from_bfloat16(larger(add_saturated(scores, lift), np.int16(0)) << shift)

@@ -1,10 +1,10 @@
-"""Reads and writes of lanes and numbers in memory that is named by its address, and arrays that begin at a cache line.
+"""Reads and writes of lanes and numbers in memory that is given by its address, and arrays that begin at a cache line.
 
-Addresses instead of arrays: numba counts references to every array that a compiled function is handed, and on the way
-through the functions of one image row that takes many times as long as the work itself. So a caller makes a named tuple
-of arrays, keeps it alive and hands over its `pointers`; inside a kernel there is `address_of`. Nothing here checks that
-an index lies inside the array. A vector of 32 bytes in an array that begins at a cache line (`aligned_zeros`) never
-lies across two lines, which would be read twice.
+Addresses are used instead of arrays because numba counts references to every array that a compiled function gets. In
+the functions for one image row that takes many times as long as the work itself. So a caller makes a named tuple of
+arrays, keeps it alive and passes its `pointers`; inside a kernel there is `address_of`. Nothing here checks that an
+index lies inside the array. In an array that begins at a cache line (`aligned_zeros`), a vector of 32 bytes never lies
+across two cache lines, which would have to be read separately.
 """
 
 from typing import Any, Final, TypeVar
@@ -24,9 +24,9 @@ Arrays = TypeVar("Arrays", bound=tuple[Any, ...])
 
 
 def pointers(arrays: Arrays) -> Arrays:
-    """A named tuple of arrays and numbers as kernels take it: with the address of each array in its place.
+    """A named tuple of arrays and numbers as kernels take it, with each array replaced by its address.
 
-    Tuples within it become pointers too. Arrays must be C-contiguous, and the caller keeps them alive.
+    Tuples within it are converted too. Arrays must be C-contiguous, and the caller must keep them alive.
     """
     return type(arrays)(*map(_pointer_to, arrays))
 
@@ -39,7 +39,7 @@ def _pointer_to(value: Any) -> Any:
 
 @numba.njit(inline="always")
 def address_of(array):  # type: ignore[no-untyped-def]
-    """Address of an array's first element, signed: sums of signed and unsigned numbers would be floats."""
+    """Address of an array's first element. It is signed, since sums of signed and unsigned numbers would be floats."""
     return np.int64(array.ctypes.data)
 
 
@@ -96,7 +96,7 @@ write_byte, write_int16, write_int32, write_int64, write_float32 = (_writer(kind
 
 @numba.njit(cache=True, nogil=True)
 def copy_floats(source: int, to: int, number: int) -> None:
-    """Copy so many float32 from one address to another: numba copies slices number by number."""
+    """Copy `number` float32 from one address to another, since numba copies slices number by number."""
     whole = number - number % LANES
     for i in range(0, whole, LANES):
         store_float32(to, i, load_float32(source, i))

@@ -1,8 +1,10 @@
-"""Operations across lanes: shuffles, sums along the lanes, masks with a bit for each lane, turned blocks of numbers.
+"""Operations across lanes: shuffles, sums along the lanes, masks with a bit for each lane, transposed blocks of
+numbers.
 
-Reductions (`largest_of_rows`, `totals_of_rows`) take LANES rows at once and give one number a row, which then is one
-lane of the answer: row by row every step would wait for the one before. `fetch_eights` and `spread_eights` take eight
-numbers from each of LANES places and turn them, so that lane i of eight vectors holds those of place i.
+Reductions (`largest_of_rows`, `totals_of_rows`) take LANES rows at once and give one number per row, which becomes one
+lane of the answer. If they went row by row, every step would wait for the one before. `fetch_eights` and
+`spread_eights` take eight numbers from each of LANES places and transpose them, so that lane i of eight vectors holds
+those of place i.
 """
 
 from collections.abc import Callable, Sequence
@@ -199,7 +201,7 @@ _EIGHT_FLOATS = ir.VectorType(ir.FloatType(), EIGHT)
 
 
 def _turned(builder: Any, rows: list[Any]) -> list[Any]:
-    """Columns of eight rows of eight, in steps that stay within halves but for the last: those are the quick ones."""
+    """Columns of eight rows of eight, in steps that stay within halves except for the last: those are the quick ones."""
 
     def mixed(a: Any, b: Any, places: list[int]) -> Any:
         return builder.shuffle_vector(a, b, place_list([*places, *(i + EIGHT // 2 for i in places)]))

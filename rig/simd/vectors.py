@@ -1,11 +1,11 @@
-"""Sixteen lanes as one numba value: the vector arithmetic of the hot path, spelled out.
+"""Sixteen lanes as one numba value: explicit vector arithmetic for the code that takes most of the time.
 
-LLVM's own vectoriser gives up on the search along a row (several short loops over one small buffer), so its kernels say
-what they mean: `Lanes` is an LLVM vector of 16 numbers, legalised to whatever the processor has (AVX2, AVX-512, NEON).
-Everything here is for code compiled with `numba.njit`; lanes live in registers and cannot leave a kernel. They come
-from memory and go there with `rig.simd.memory`; `rig.simd.shuffles` has what goes from lane to lane.
+LLVM's own vectoriser fails on the search along a row (several short loops over one small buffer), so its kernels use
+vectors explicitly: `Lanes` is an LLVM vector of 16 numbers, which LLVM maps to the processor's instructions (AVX2,
+AVX-512, NEON). Everything here is for code compiled with `numba.njit`. Lanes live in registers and cannot leave a
+kernel. `rig.simd.memory` reads and writes them; `rig.simd.shuffles` moves numbers between lanes.
 
-A bfloat16 is the upper half of a float32: two bytes with 8 bits of precision and all of the range.
+A bfloat16 is the upper half of a float32: two bytes with 8 bits of precision and the full range.
 """
 
 import operator
@@ -47,7 +47,7 @@ class Lanes(types.Type):
 
 @register_model(Lanes)
 class _LanesModel(models.PrimitiveModel):
-    """Lanes are passed about as the LLVM vector itself."""
+    """Data model in which lanes are the LLVM vector itself."""
 
     def __init__(self, manager: Any, lanes: Lanes) -> None:
         super().__init__(manager, lanes, lanes.llvm)  # type: ignore[no-untyped-call]
@@ -70,32 +70,32 @@ def _splat(context: Any, builder: Any, lanes: Lanes, number_type: Any, number: A
 
 
 def everywhere(builder: Any, number: Any, count: int) -> Any:
-    """A vector of so many of one number."""
+    """A vector with `count` copies of one number."""
     nothing = ir.Constant(ir.VectorType(number.type, count), ir.Undefined)
     first = builder.insert_element(nothing, number, ir.Constant(_INT32, 0))
     return builder.shuffle_vector(first, nothing, place_list([0] * count))
 
 
 def place_list(indices: Iterable[int]) -> Any:
-    """Indices of the elements that a shuffle takes, as an LLVM constant."""
+    """The indices of the elements that a shuffle takes, as an LLVM constant."""
     places = list(indices)
     return ir.Constant(ir.VectorType(_INT32, len(places)), places)
 
 
 def vector_name(vector: ir.VectorType) -> str:
-    """Name of a vector type in the names of LLVM's intrinsics."""
+    """The name of a vector type as it appears in names of LLVM's intrinsics."""
     return f"v{vector.count}" + ("f32" if isinstance(vector.element, ir.FloatType) else f"i{vector.element.width}")
 
 
 def called(builder: Any, name: str, result: Any, *args: Any) -> Any:
-    """The result of a call of an LLVM intrinsic."""
+    """The result of a call to an LLVM intrinsic."""
     function_type = ir.FunctionType(result, [arg.type for arg in args])
     function = cgutils.get_or_insert_function(builder.module, function_type, name)  # type: ignore[no-untyped-call]
     return builder.call(function, args)
 
 
 def emitted(signature: Any, emit: Callable[..., Any]) -> Any:
-    """An intrinsic of that signature; emit(builder, *arguments) writes its LLVM code, and returns the result if any."""
+    """An intrinsic of that signature. emit(builder, *arguments) writes its LLVM code and returns the result, if any."""
 
     def operation(typing: Any, *types_given: Any) -> VectorCode:
         def code(context: Any, builder: Any, signature: Any, args: Any) -> Any:
@@ -185,7 +185,7 @@ WIDE = ir.VectorType(_INT32, LANES)
 
 
 def wide(number: int) -> Any:
-    """A whole number in 32-bit lanes, as an LLVM constant."""
+    """An integer in 32-bit lanes, as an LLVM constant."""
     return ir.Constant(WIDE, [number] * LANES)
 
 
@@ -244,7 +244,7 @@ zero_four = _constant(FOUR, 0.0)
 
 @intrinsic_of
 def smallest_byte(typing: Any, a: Any) -> VectorCode:
-    """smallest_byte(a): the smallest one of unsigned bytes."""
+    """smallest_byte(a): the smallest of the unsigned bytes."""
 
     def code(context: Any, builder: Any, signature: Any, args: Any) -> Any:
         return called(builder, f"llvm.vector.reduce.umin.{vector_name(args[0].type)}", ir.IntType(8), args[0])
@@ -279,7 +279,9 @@ where_small = emitted(FLOAT32(FLOAT32, FLOAT32, types.float32), _where_small)
 
 @intrinsic_of
 def where_below(typing: Any, values: Any, others: Any, sizes: Any, limits: Any) -> VectorCode:
-    """where_below(values, others, sizes, limits): float32 lanes, of `values` where the size is below the limit."""
+    """where_below(values, others, sizes, limits): float32 lanes, `values` if the size is below the limit, else
+    `others`.
+    """
 
     def code(context: Any, builder: Any, signature: Any, args: Any) -> Any:
         limit = args[3]

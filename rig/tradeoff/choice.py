@@ -1,7 +1,7 @@
-"""Chooses the setting to use: the least error within a time, or the least time within an error.
+"""Chooses the setting to use: the smallest error within a time, or the shortest time within an error.
 
-A setting is judged by its worst among the scenes and fogs that were tried, since what is asked for has to hold in all
-of them.
+A setting is judged by its worst result among the scenes and fogs that were tried, since the requirement has to hold in
+all of them.
 """
 
 import re
@@ -21,7 +21,7 @@ WORTH = 1.5
 
 @dataclass(frozen=True, slots=True)
 class Wish:
-    """The user's wish: exactly one of a time and an error. of: whose time counts."""
+    """The user's requirement: exactly one of a time and an error. of: whether sensor or computer time counts."""
 
     time_ms: float | None = None
     error_px: float | None = None
@@ -36,7 +36,7 @@ class Wish:
 
 @dataclass(frozen=True, slots=True)
 class Choice:
-    """The setting to use or, where none fulfils the wish, the nearest; with the figures of its worst scene and fog."""
+    """The setting to use or, if none meets the requirement, the nearest; with the figures of its worst scene and fog."""
 
     wish: Wish
     fits: bool
@@ -54,21 +54,21 @@ class Choice:
 
     @property
     def figures(self) -> str:
-        """Error and times, in words."""
+        """Error and times as text."""
         return (
             f"{digits(self.mean_abs_px)} px in {digits(self.sensor_ms)} ms of sensor and "
             f"{digits(self.compute_ms)} ms of computing a map"
         )
 
     def as_json(self) -> dict[str, Any]:
-        """Return it as plain values."""
+        """The choice as plain values."""
         wish = {"time_budget_ms": self.wish.time_ms, "error_px": self.wish.error_px, "of": self.wish.of}
         figures = {name: getattr(self, name) for name in ("mean_abs_px", "sensor_ms", "compute_ms")}
         return {"asked": wish, "fits": self.fits, **asdict(self.setting), **figures}
 
 
 def wish_of(time_budget: str | None, error: str | None, of: str) -> Wish | None:
-    """Parse the options of a wish; None where neither time nor error is given. UsageError, a line per problem."""
+    """The requirement in the options; None if neither time nor error is given. Raises UsageError, a line per problem."""
     problems = []
     time_ms = error_px = None
     if of not in ("sensor", "compute"):
@@ -97,7 +97,7 @@ def wish_of(time_budget: str | None, error: str | None, of: str) -> Wish | None:
 
 
 def choose(rows: Sequence[TradeoffRow], wish: Wish) -> Choice | None:
-    """Choose the setting to use; None where every setting leaves too many answers out."""
+    """Choose the setting to use; None if every setting leaves too many answers out."""
     by_setting: dict[TrialSetting, list[TradeoffRow]] = {}
     for row in rows:
         by_setting.setdefault(row.setting, []).append(row)
@@ -123,8 +123,8 @@ def choose(rows: Sequence[TradeoffRow], wish: Wish) -> Choice | None:
 def advice(rows: Sequence[TradeoffRow], wish: Wish | None, answer: Choice | None) -> str:
     """Say in a sentence which setting to take.
 
-    It is the one that was asked for or, without a wish, the shortest scan with an error of at most `WORTH` times the
-    least of all. answer: the choice for the wish.
+    It is the one that was asked for or, without a requirement, the shortest scan with an error of at most `WORTH` times
+    the smallest of all. answer: the choice for the requirement.
     """
     if wish is not None and answer is not None:
         return f"take {answer.setting}: {answer.figures}, the best for {wish}" if answer.fits else str(answer)

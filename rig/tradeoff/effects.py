@@ -1,4 +1,4 @@
-"""Tells which physical effects a simulated scene calls for, as its world says, and measures what each is worth."""
+"""Finds which physical effects a simulated scene calls for, according to its world, and measures how much each matters."""
 
 from collections.abc import Iterator, Mapping
 from contextlib import ExitStack, contextmanager
@@ -33,18 +33,18 @@ TRIAL_COLUMNS = 40
 
 @runtime_checkable
 class ReportsEffects(World, Protocol):
-    """A world that can say what its effects are worth."""
+    """A world that can report how much its effects matter."""
 
     def effects_report(self, power_w: float, exposure_s: float, exposures: int) -> Mapping[str, Any]:
         """Report on the effects: planned_for, changed_decisions_bound, and effects, a mapping for each.
 
-        A mapping's keys are the first fields of `Effect`, and `removable`: whether `effects` of the world's config may
-        leave it out.
+        A mapping's keys are the first fields of `Effect`, and `removable`: whether the effect can be left out with
+        `effects` in the world's config.
         """
         ...
 
     def plan_for(self, power_w: float, exposure_s: float, exposures: int) -> None:
-        """Choose what is simulated, for a scan with frames of that exposure, so many to a column, at that power."""
+        """Choose the simulated effects for columns of `exposures` frames of that exposure, at that power."""
         ...
 
     def flux_row(self, row: int, command: float, power_w: float, exposure_s: float) -> Mapping[str, Array]:
@@ -63,12 +63,12 @@ class Effect:
 
     on, why: whether it is simulated, and the reason.
     share: share of all detected photons.
-    changed_decisions_bound: largest share of decisions that can change without it; None where there is no bound.
-    cost_us_per_frame: of one thread; None where it is worked in elsewhere.
+    changed_decisions_bound: largest share of decisions that can change without it; None if there is no bound.
+    cost_us_per_frame: of one thread; None if it is part of another effect.
     stripe_error_change_px: how much larger the mean stripe error is with it than without it, with its standard error;
-      None where neither is known.
-    basis: 'trial' where that was measured in a pair of trial scans, 'bound' where it is the bound of an effect that is
-      left out.
+      None if neither is known.
+    basis: 'trial' if that was measured in a pair of trial scans, 'bound' if it is the bound of an effect that is left
+      out.
     """
 
     effect: str
@@ -86,8 +86,8 @@ class Effect:
 class SceneEffects:
     """The effects of a scene.
 
-    planned_for: the most power_w, exposure_s and exposures of a column that the choice of effects holds for.
-    changed_decisions_bound: bound for all that it leaves out together.
+    planned_for: the largest power_w, exposure_s and exposures of a column for which the choice of effects holds.
+    changed_decisions_bound: bound for all effects together that are left out.
     """
 
     planned_for: Mapping[str, float]
@@ -100,9 +100,11 @@ class SceneEffects:
 
 
 def scene_effects(config: RigConfig, *, trials: bool = True, progress: Progress | None = None) -> SceneEffects:
-    """Find the effects of a config's scene at its scan's power, exposure and exposures. UsageError without a world.
+    """Find the effects of a config's scene at its scan's power, exposure and exposures. Raises UsageError without a
+    world.
 
-    trials: measure by how much each effect changes the stripe error. progress: called with trial scans done and to do.
+    trials: whether to measure how much each effect changes the stripe error. progress: called with the number of trial
+    scans done and the total.
     """
     scan = config.scan
     with open_world(config) as (world, power_w):
@@ -122,7 +124,7 @@ def flux_row(config: RigConfig, row: int, column: int) -> Flux:
     """Noise-free photons per exposure of one image row while the line is at a column's centre.
 
     x_px: pixels (width,); total; and by name the share of each effect of light and dark counts, zeros for effects that
-    are off. The shares add up to the total. UsageError for a row or column that does not exist.
+    are off. The shares add up to the total. Raises UsageError for a row or column that does not exist.
     """
     scan = config.scan
     with open_world(config) as (world, power_w):

@@ -24,7 +24,7 @@ SETTING_FILE = "setting.yaml"
 def write_files(folder: RunFolder, done: Tradeoff, setting: RigConfig | None) -> Tradeoff:
     """Write everything, make the folder appear and return the trade-off with its folder.
 
-    setting: config with the chosen setting; None where there is none.
+    setting: config with the chosen setting; None if there is none.
     """
     folder.write_json("tradeoff.json", {**done.as_json(), "versions": versions()})
     folder.write_text("tradeoff.csv", csv_text(done.rows))
@@ -41,7 +41,7 @@ def write_files(folder: RunFolder, done: Tradeoff, setting: RigConfig | None) ->
 
 
 def csv_text(rows: Sequence[TradeoffRow]) -> str:
-    """Rows as CSV, a line each, columns as in the JSON; the interval takes two columns."""
+    """Rows as CSV, one line each, with the columns of the JSON; the interval takes two columns."""
     stream = io.StringIO()
     writer: csv.DictWriter[str] | None = None
     for row in rows:
@@ -79,7 +79,7 @@ def tradeoff_svg(rows: Sequence[TradeoffRow], ci95_by: str) -> str:
 
 
 def colour_of(estimator: str) -> str:
-    """Colour of an estimator, the same in every picture."""
+    """Colour of an estimator, which is the same in every picture."""
     return COLOURS.get(estimator, OTHER_COLOUR)
 
 

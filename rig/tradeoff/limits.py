@@ -1,11 +1,12 @@
-"""The statistical limit: the least error that any estimator can have on a scene, however well it knows the light.
+"""The statistical limit: the smallest error that any estimator can have on a scene, however well it knows the light.
 
-The ideal is told haze, ambient light, the line's width and how bright the stripe is, and asked only where it is. Where
-stripes are spread evenly over the search, no answer has a smaller mean |error| than the median of the posterior, which
-`bayes_errors` takes of drawn counts, at 5 ms a row for four numbers of exposures. M neighbours on one surface count as
-M times the exposures. `chernoff_exponent` and `position_sd_px` say how often at least, and by how much, a row's photons
-lead to the wrong position; the formulas are in docs/explanation/limits.md. A pixel fires in an exposure with
-probability p = 1 - exp(-flux), all of them independently; q = 1 - p, and p', q' are those of another position.
+The ideal estimator knows haze, ambient light, the line's width and the brightness of the stripe, and has to find only
+its position. If stripes are spread evenly over the search, no answer has a smaller mean |error| than the median of the
+posterior. `bayes_errors` computes it from drawn counts, at 5 ms a row for four numbers of exposures. M neighbours on
+one surface count as M times the exposures. `chernoff_exponent` and `position_sd_px` give lower bounds on how often, and
+by how much, a row's photons lead to the wrong position; the formulas are in docs/explanation/limits.md. A pixel fires
+in an exposure with probability p = 1 - exp(-flux), all independently; q = 1 - p, and p', q' are those of another
+position.
 """
 
 import math
@@ -22,7 +23,9 @@ from rig.tradeoff.rows import LOCAL_PX, Place, TradeoffRow
 
 
 def least_exponent(light: RowLight) -> float:
-    """The smallest C to a whole-pixel place more than 1 px off, by which such errors get rarer; inf without one."""
+    """The smallest C to a whole-pixel place more than 1 px off, the rate at which such errors become rarer; inf if
+    there is no such place.
+    """
     places = light.whole_positions()
     exponent = chernoff_exponent(light.flux(places), light.flux(np.array([light.position])))
     return float(exponent[np.abs(places - light.position) > 1.5].min(initial=np.inf))
@@ -31,8 +34,8 @@ def least_exponent(light: RowLight) -> float:
 def position_information(light: RowLight) -> float:
     """Fisher information of the position per exposure, 1/px^2, from the stripe's flanks and from where the haze ends.
 
-    None comes from a pixel that always fires: a stripe so bright and narrow that it saturates the two pixels beside
-    the border that it is centred on has information 0.
+    Pixels that always fire give none. A stripe so bright and narrow that it saturates the two pixels beside the border
+    on which it is centred has information 0.
     """
     pixel = np.arange(len(light.before), dtype=np.float64)
     away = pixel - light.position
@@ -48,10 +51,11 @@ def position_information(light: RowLight) -> float:
 
 
 def position_sd_px(light: RowLight, exposures: float) -> float:
-    """Cramer-Rao bound on the position's standard deviation from K exposures (of M like rows: M K); inf without any.
+    """Cramer-Rao bound on the position's standard deviation from K exposures (of M equal rows: M K); inf without
+    information.
 
-    It is for answers without bias near the true stripe. Where rows are so dark that other positions rival, no answer
-    comes near it.
+    It holds for unbiased answers near the true stripe. In rows so dark that other positions compete, no answer comes
+    near it.
     """
     information = exposures * position_information(light)
     return 1.0 / math.sqrt(information) if information > 0 else math.inf
@@ -68,7 +72,7 @@ FINE_SHARE: Final = 8.0
 
 
 def bayes_errors(light: RowLight, exposures: Sequence[int], draws: int, rng: np.random.Generator) -> Array:
-    """|error| in px of the posterior median for `draws` drawn rows of each number of exposures, (exposures, draws)."""
+    """|error| in px of the posterior median for `draws` simulated rows at each number of exposures, (exposures, draws)."""
     places, spacing = _places(light, max(exposures))
     flux = np.maximum(light.flux(places), FLUX_MIN)
     here = np.maximum(light.flux(np.array([light.position]))[0], FLUX_MIN)
@@ -109,10 +113,10 @@ def _medians(score: Array, places: Array, spacing: Array) -> Array:
 class StatisticalLimit:
     """Limits of rows of a scene at a number of exposures; means over its rows.
 
-    mean_abs_px, mean_abs_se_px: least mean |error| of any answer from one row, or from `averaged` like ones, and its
-      standard error.
+    mean_abs_px, mean_abs_se_px: smallest mean |error| of any answer from one row, or from `averaged` equal ones, and
+    its standard error.
     within_1px: share of those answers within 1 px.
-    exponent: median over rows of the least Chernoff exponent per exposure to a position more than 1 px off.
+    exponent: median over rows of the smallest Chernoff exponent per exposure to a position more than 1 px off.
     position_sd_px: median Cramer-Rao bound.
     """
 
@@ -130,9 +134,10 @@ def limits(
 ) -> list[StatisticalLimit]:
     """Compute the limit of each number of exposures over some rows of a scene; the same seed gives the same limit.
 
-    averaged: neighbours of equal disparity that each row may be seen together with; 1 for an estimator of single rows.
-    draws: of each row. 200 rows take a second for four numbers of exposures, and EXPONENT_ROWS of them a second for
-      their exponents.
+    averaged: number of neighbours of equal disparity with which each row may be seen; 1 for an estimator of single
+    rows.
+    draws: per row. 200 rows take a second for four numbers of exposures, and EXPONENT_ROWS of them a second for their
+      exponents.
     """
     if not lights:
         raise ValueError("a limit needs at least one row of light")
@@ -168,7 +173,7 @@ LOCAL_SDS = 3.0
 
 
 class SceneLimits:
-    """Limits of scenes and fogs, each computed once. exposures: all that will be tried."""
+    """Limits of scenes and fogs, each computed once. exposures: all numbers that will be tried."""
 
     def __init__(self, exposures: Sequence[int]) -> None:
         self._exposures = tuple(exposures)
@@ -204,7 +209,7 @@ class SceneLimits:
 
 
 def _beside(row: TradeoffRow, limit: StatisticalLimit) -> TradeoffRow:
-    """Add the limit to a row; each figure is None where it is not known or would mislead."""
+    """Add the limit to a row; each figure is None if it is not known or would mislead."""
     wrong, least_wrong = 1.0 - row.within_1px, 1.0 - limit.within_1px
     bound_px, sd_px = limit.position_sd_px, row.local_sd_px
     local = LOCAL_SDS * bound_px <= LOCAL_PX
@@ -231,9 +236,10 @@ SERIES_BELOW: Final = 0.05
 
 
 def chernoff_exponent(flux: Array, other: Array) -> Array:
-    """C per exposure of telling rows of light `flux` from rows of `other`, (..., pixels) each; 0 where they are alike.
+    """Chernoff's exponent C per exposure for separating rows of light `flux` from rows of `other`, (..., pixels) each;
+    0 if equal.
 
-    The probability that `other` is the likelier one although `flux` is true is at most exp(-K C), either way round.
+    The probability that `other` is the likelier one although `flux` is true, or the reverse, is at most exp(-K C).
     """
     first, second = np.broadcast_arrays(np.maximum(flux, FLUX_MIN), np.maximum(other, FLUX_MIN))
     low, high = np.minimum(first, second), np.maximum(first, second)
@@ -248,7 +254,7 @@ def chernoff_exponent(flux: Array, other: Array) -> Array:
 
 
 def log_fired(flux: Array) -> Array:
-    """Logarithm of the chance that a pixel of this flux fires."""
+    """Logarithm of the probability that a pixel with this flux fires."""
     return np.asarray(np.log(-np.expm1(-flux)))
 
 

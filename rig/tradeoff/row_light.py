@@ -1,6 +1,6 @@
-"""The light that an image row is expected to have, with everything known except where the stripe lies.
+"""The expected light of an image row, with everything known except the position of the stripe.
 
-`scene_lights` takes it from the world of a simulated scene, for `rig.tradeoff.limits`; no estimator is ever told.
+`scene_lights` takes it from the world of a simulated scene, for `rig.tradeoff.limits`. No estimator ever gets it.
 """
 
 import math
@@ -60,7 +60,7 @@ class RowLight:
         return np.asarray(haze + (self.stripe * strength)[:, None] * pixel_share(away, self.sigma_px))
 
     def whole_positions(self) -> Array:
-        """Positions within the search that are whole pixels off the true one."""
+        """Positions within the search that differ from the true one by whole pixels."""
         least, most = math.ceil(self.first - self.position), math.floor(self.last - self.position)
         steps = np.arange(least, most + 1, dtype=np.float64)
         return np.asarray(self.position + steps[steps != 0])
@@ -92,9 +92,9 @@ CLEAR_SIGMAS = 4.0
 def scene_lights(config: RigConfig, *, rows: int = 200, seed: int = 0) -> list[RowLight]:
     """Light of some rows of a config's scene, drawn at random over rows and columns; the same for the same seed.
 
-    Halo, drops and ambient light are taken as they are at the true position. Rows whose stripe is split, hidden or
-    outside the depth range are left out. UsageError without a world, a calibration or any stripe, and for a rig of
-    several lines at once.
+    Halo, drops and ambient light are those at the true position. Rows whose stripe is split, hidden or outside the
+    depth range are left out. Raises UsageError without a world, a calibration or any stripe, and for a rig of several
+    lines at once.
     """
     if len(config.line_offsets) > 1:
         raise UsageError(
@@ -141,7 +141,7 @@ def _lights(
 def row_light(parts: Mapping[str, Array], geometry: SweepGeometry, row: int, column: int) -> RowLight | None:
     """Light of one row from its parts by effect, (width,) photons per exposure each; None without a stripe of its own.
 
-    The haze of places that the object hides is that of an exponential fitted to the haze before it.
+    The haze of places that the object hides is extrapolated with an exponential fitted to the haze before it.
     """
     stripe, haze = (np.asarray(parts[name], np.float64) for name in (STRIPE, HAZE))
     others = sum((np.asarray(parts[name], np.float64) for name in parts if name not in (STRIPE, HAZE)), 0.0 * haze)

@@ -3,9 +3,9 @@
 `score_map` scores one map, `row_of` makes the row of a setting, `with_fronts` marks the Pareto fronts.
 
 95 % confidence intervals of a mean are over repeats by Student's t, or over one map by a bootstrap over blocks of it.
-The two answer different questions. Repeats of a scan differ in their photons: the interval is of this scene. Blocks of
-a map differ in what they look at too: the interval is of scenes like it, and wider. Errors of neighbours are
-correlated, since filters and coupled estimators share them out; so whole blocks are drawn and not single answers.
+The two answer different questions. Repeats of a scan differ only in their photons, so the interval is for this scene.
+Blocks of a map also differ in what they show, so the interval is for scenes like it, and wider. Errors of neighbours
+are correlated, since filters and coupled estimators spread them; so whole blocks are drawn and not single answers.
 """
 
 import math
@@ -40,7 +40,7 @@ Clock = Literal["sensor", "compute"]
 
 @dataclass(frozen=True, slots=True)
 class TrialSetting:
-    """A setting that can be chosen: estimator, filter, exposures of a column and lines at once."""
+    """A setting that can be chosen: estimator, filter, exposures per column, and number of lines at once."""
 
     estimator: str
     filter: str
@@ -56,7 +56,7 @@ class TrialSetting:
 
 @dataclass(frozen=True, slots=True)
 class MapScore:
-    """Errors of one map against the world's truth, over every (row, column) with a true stripe, and its times.
+    """Errors of one map relative to the world's truth, over every (row, column) with a true stripe, and its times.
 
     mean_abs_px: a missing answer counts as `MISSING_PX`.
     within_1px, missing: shares of the true stripes.
@@ -82,16 +82,16 @@ class TradeoffRow:
     fog: a visibility or 'clear'; None is as the scene says.
     sensor_ms: of one map, with dark frames and fly-back.
     compute_ms: of a map after the first, with counting and everything else.
-    depth_mm: mean depth error; None where no pixel has a depth.
+    depth_mm: mean depth error; None if no pixel has a depth.
     ci95: confidence interval of mean_abs_px.
-    local_sd_px: standard deviation of the errors of answers within LOCAL_PX.
-    pareto, pareto_compute: whether no other setting in the same scene and fog has less error in as little time of
-      sensor or computer, and no less time.
+    local_sd_px: standard deviation of the errors of answers within LOCAL_PX, from their median; None without any.
+    pareto, pareto_compute: whether no other setting in the same scene and fog is at least as good in error and in time
+    (of sensor or computer) and better in one of them.
 
-    The others compare it with what the light allows (`rig.tradeoff.limits`); each is None where that is not known.
+    The other fields compare it with the statistical limit (`rig.tradeoff.limits`); each is None if that is not known.
     times_limit: mean_abs_px over the statistical limit.
     exponent_nats: Chernoff's exponent per exposure. times_wrong_limit: share of answers more than 1 px off over the
-      ideal's.
+      ideal estimator's.
     position_sd_px: Cramer-Rao's bound. times_position_limit: local_sd_px over that.
     """
 
@@ -119,12 +119,12 @@ class TradeoffRow:
 
     @property
     def counts(self) -> bool:
-        """Whether so few answers are missing that its error says something."""
+        """Whether few enough answers are missing for its error to be meaningful."""
         return self.missing <= MOST_MISSING
 
     @property
     def place(self) -> Place:
-        """Scene and fog."""
+        """Scene and fog of this row."""
         return self.scene, self.fog
 
     @property
@@ -138,7 +138,7 @@ class TradeoffRow:
 
 
 def score_map(result: MapResult, truth: SweepTruth, sensor_ms: float, compute_ms: float) -> MapScore:
-    """Score a map. UsageError where the world has no stripe to be found."""
+    """Score a map. Raises UsageError if the world has no stripe to be found."""
     true_px = truth.x_px.astype(np.float64)
     if not np.isfinite(true_px).any():
         raise UsageError("the line is nowhere seen in this scene; check the scene and scan.command_range")
@@ -210,7 +210,7 @@ _T = {1: 12.7062, 2: 4.3027, 3: 3.1824, 4: 2.7764, 5: 2.5706}
 
 
 def repeats_interval(means: Sequence[float]) -> Interval:
-    """Interval of the mean of at least two independent means of absolute errors; so it is never below zero."""
+    """Interval of the mean of at least two independent means of absolute errors; therefore never below zero."""
     half = t_quantile(len(means) - 1) * statistics.stdev(means) / math.sqrt(len(means))
     middle = statistics.fmean(means)
     return max(0.0, middle - half), middle + half
@@ -220,7 +220,7 @@ def blocks_interval(sums: NDArray[np.float64], numbers: NDArray[np.int64], seed:
     """Interval of the mean error sum(sums) / sum(numbers).
 
     sums, numbers: (blocks,), sum and number of the errors in each block. The interval is between percentiles of the
-    means of drawn blocks (Efron and Tibshirani, 'An introduction to the bootstrap', 1993, chapters 8 and 13).
+    means of randomly drawn blocks (Efron and Tibshirani, 'An introduction to the bootstrap', 1993, chapters 8 and 13).
     """
     some = numbers > 0
     sums, numbers = sums[some], numbers[some]
@@ -231,7 +231,7 @@ def blocks_interval(sums: NDArray[np.float64], numbers: NDArray[np.int64], seed:
 
 
 def blocks_of(errors: NDArray[np.float64]) -> tuple[NDArray[np.float64], NDArray[np.int64]]:
-    """Sum and number of the errors (rows, columns) in each block, arrays (blocks,); NaN is no error."""
+    """Sum and number of the errors (rows, columns) in each block, arrays (blocks,); NaN means no error value."""
     rows, columns = errors.shape
     down, across = np.arange(0, rows, BLOCK_ROWS), np.arange(0, columns, BLOCK_COLUMNS)
     known = np.isfinite(errors)

@@ -1,8 +1,8 @@
-"""One simulated scan that serves several estimators: its frames are kept, and every estimator makes its maps of them.
+"""One simulated scan that serves several estimators: its frames are kept, and every estimator makes its maps from them.
 
 Estimators learn from the first map. The frames of the last one are counted and estimated when the SPAD stands still, so
-that times are those of the work alone, as on a rig whose frames are not computed by the same machine. Only the pixels
-that the plan uses are kept, as a SPAD that sends windows would send them. `score_methods` does it.
+that times do not include the simulation, as on a rig whose frames are not computed by the same machine. Only the pixels
+that the plan uses are kept, as with a SPAD that sends windows. `score_methods` does it.
 """
 
 import statistics
@@ -66,12 +66,12 @@ class FrameKeeper:
     def add(
         self, bits: NDArray[np.uint8], bins: NDArray[np.int32], column: NDArray[np.float64], x0: NDArray[np.int32]
     ) -> None:
-        """Keep frames, see `Counter`."""
+        """Keep frames, with arguments as in `Counter`."""
         self._tally.note(bins, column, x0 // np.int32(WORD_PX))
         self._blocks.append((self._used(bits, x0), bins.copy(), column.copy(), x0.copy()))
 
     def settle(self, under_way: int = 0) -> None:
-        """Do nothing: `add` leaves nothing to be read later."""
+        """Do nothing, since `add` leaves nothing to be read later."""
 
     def finish(self) -> KeptSweep:
         """The sweep with its frames."""
@@ -95,7 +95,7 @@ class FrameKeeper:
 
 
 class ManyMakers:
-    """Makes the maps of several estimators and filters from the same frames; takes the place of a `Reconstructor`."""
+    """Makes the maps of several estimators and filters from the same frames, in place of a `Reconstructor`."""
 
     def __init__(self, makers: Mapping[str, Reconstructor], filters: Sequence[str]) -> None:
         self._makers = makers
@@ -157,9 +157,10 @@ def score_methods(
     seed: int,
     tell: Callable[[float], None],
 ) -> dict[Method, MapScore]:
-    """Scan once with a simulated rig and score what each estimator, with each filter, makes of the same frames.
+    """Scan once with a simulated rig and score the maps that each estimator, with each filter, makes from the same
+    frames.
 
-    tell: called with the share of the frames that are taken.
+    tell: called with the share of the frames that have been taken.
     """
     with open_rig(config, seed=seed) as rig:
         assert rig.world is not None, "only simulated rigs are tried"
@@ -186,7 +187,7 @@ def score_methods(
 
 
 def require_plan(config: RigConfig) -> None:
-    """Raise UsageError where the config's scan cannot be done, or has too many frames to be kept."""
+    """Raise UsageError if the config's scan cannot be done, or has too many frames to be kept."""
     with open_rig(config) as rig:
         plan, _ = prepare(rig)
     frame = plan.rows * (plan.used_px or plan.width) // 8

@@ -1,4 +1,4 @@
-"""Scans a simulated rig over settings and scores the maps by the world's truth: what accuracy costs in time."""
+"""Scans a simulated rig over settings and scores the maps by the world's truth, to show what accuracy costs in time."""
 
 from collections.abc import Callable, Iterable, Iterator, Sequence
 from dataclasses import asdict, dataclass
@@ -46,15 +46,17 @@ class Trials:
         return starmap(Trial, product(scenes, fogs, asked.exposures, lines))
 
     def first(self) -> Trial:
-        """The first trial, with the lines that the config has."""
+        """The first trial, with the number of lines in the config."""
         return next(iter(self))._replace(lines=None)
 
     def configs(self) -> dict[Trial, RigConfig]:
-        """Make the config of each trial. UsageError with all problems of all of them."""
+        """Make the config of each trial. Raises UsageError with all problems of all of them."""
         return _all_or_problems(self, self.config_of)
 
     def require_plans(self) -> None:
-        """Raise UsageError with all problems of such scans; the fewest and the most exposures are tried everywhere."""
+        """Raise UsageError with all problems of these scans. The smallest and the largest number of exposures are tried
+        everywhere.
+        """
         ends = {min(self.asked.exposures), max(self.asked.exposures)}
         configs = self.configs()
         _all_or_problems(
@@ -80,9 +82,9 @@ class Tradeoff:
     """Result of a trade-off: the rows of all settings.
 
     ci95_by: what the intervals are over.
-    answer: the setting to use, where one was asked for and any counts.
-    verdict: 'aborted' where an interrupt ended it; the rows are then those that were whole.
-    folder: where everything was written; None where nothing was.
+    answer: the setting to use, if one was asked for and any counts.
+    verdict: 'aborted' if an interrupt ended it; the rows are then those that were complete.
+    folder: where everything was written; None if nothing was.
     accepted_calibration: reasons in spite of which the calibration was used.
     """
 
@@ -101,7 +103,7 @@ class Tradeoff:
         return of + advice(self.rows, self.wish, self.answer)
 
     def as_json(self) -> dict[str, Any]:
-        """Return it as plain values; `answer` only where a setting was asked for."""
+        """The result as plain values; `answer` only if a setting was asked for."""
         content: dict[str, Any] = {
             "advice": self.advice,
             "rows": [asdict(row) for row in self.rows],
@@ -115,9 +117,10 @@ class Tradeoff:
 
 
 def run_tradeoff(trials: Trials, wish: Wish | None, progress: Progress | None = None) -> Tradeoff:
-    """Scan and score all trials. progress: called with frames done and to do, counting those on columns.
+    """Scan and score all trials. progress: called with the number of frames done and the total, counting those on
+    columns.
 
-    An interrupt ends it after the last whole row; before there is one it is raised.
+    An interrupt ends it after the last complete row; before there is one it is raised.
     """
     rows: list[TradeoffRow] = []
     verdict: Literal["complete", "aborted"] = "complete"

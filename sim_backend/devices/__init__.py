@@ -1,1 +1,1 @@
-"""The simulated devices: peers of the real ones, sharing one bench."""
+"""The simulated devices. They have the interfaces of the real ones and share one bench."""

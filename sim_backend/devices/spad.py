@@ -3,11 +3,11 @@
 On a `VirtualClock` time passes as frames are made; on any other clock a block comes when its last frame has been
 exposed.
 
-On the way to the computer some frames get lost, some come twice: pixels, markers, counters and ticks are those of the
-frame before, and the frame itself is gone. Its number is the next one all the same, since blocks count what they hold;
-only its ticks tell. Which frames follows from seed and number.
+On the way to the computer some frames are lost and replaced by a copy of the frame before, with its pixels, markers,
+counters and ticks. The copy's number is still the next one, since blocks count what they hold; only its ticks show the
+loss. The seed and the frame number determine which frames are lost.
 
-The tick counter runs on a crystal of its own (`clock_error`, `clock_wander`), off by a constant, and wandering:
+The tick counter runs on its own crystal (`clock_error`, `clock_wander`), with a constant error and a random walk:
 
     dt/dtick = 1 / (tick_hz (1 + y)),    y = error + W,    W a random walk: var W(t) = wander^2 t
 
@@ -48,9 +48,9 @@ STEP_S = 1e-3
 
 
 class MarkerInputs:
-    """Counts marker edges since START. Counters of a frame include the edges that fall into its period.
+    """Counts marker edges since START. The counters of a frame include the edges that fall into its period.
 
-    A scan marker sets the line counter to 0; a line marker at the same moment counts as the first of the new sweep.
+    A scan marker sets the line counter to 0; a line marker at the same time counts as the first of the new sweep.
     """
 
     def __init__(self) -> None:
@@ -60,7 +60,7 @@ class MarkerInputs:
     def record(self, state: BenchState, start_s: Array, period_s: float, records: NDArray[np.void]) -> int:
         """Fill marks, line and sweep of consecutive frames that start at start_s (n,), about one period apart.
 
-        Returns the scan markers since START at the first of them, which the records' own counters cut to 16 bits.
+        Returns the number of scan markers since START at the first frame, which the records hold only to 16 bits.
         """
         lit = np.where(state.edge, int(Mark.GATE_EDGE), np.where(state.share > 0, int(Mark.GATE_HIGH), 0))
         marks = lit | np.where(state.backward, int(Mark.BACKWARD), 0)
@@ -83,7 +83,7 @@ class MarkerInputs:
 
 
 def windows_at(window: WindowTable | None, first_sweep: int, records: NDArray[np.void]) -> NDArray[np.int32]:
-    """First pixel of each frame's window (n,), 0 without a table; first_sweep: what `MarkerInputs.record` returned."""
+    """First pixel of each frame's window (n,), 0 without a table. first_sweep: what `MarkerInputs.record` returned."""
     if window is None:
         return np.zeros(len(records), np.int32)
     since = first_sweep + ((records["sweep"].astype(np.int64) - first_sweep) & 0xFFFF)
@@ -91,7 +91,9 @@ def windows_at(window: WindowTable | None, first_sweep: int, records: NDArray[np
 
 
 class TickClock:
-    """Counts from 0 at `start_s` of the bench. error: relative, positive is fast. wander: per root second."""
+    """A tick counter that starts from 0 at `start_s` of the bench. error: relative, positive is fast. wander: per root
+    second.
+    """
 
     def __init__(self, tick_s: float, start_s: float, error: float, wander: float, seed: list[int]) -> None:
         """tick_s: nominal."""
@@ -105,9 +107,7 @@ class TickClock:
         self._error = [error]
 
     def times_s(self, first_tick: int, period_ticks: int, n: int) -> Array:
-        """Times at which the counter is at n ticks, one period apart, float64 (n,). Not before the first of the last
-        call.
-        """
+        """Times of n ticks, one period apart, float64 (n,). The first tick must not be before that of the last call."""
         ticks = first_tick + period_ticks * np.arange(n)
         step = ticks // self._step_ticks
         while self._step + len(self._error) <= step[-1]:
@@ -157,7 +157,7 @@ class SimulatedSpadConfig(KindConfig):
 
 
 class SimulatedSpad(SpadArray):
-    """Makes frames of the world."""
+    """A SPAD array that draws frames of the simulated world."""
 
     def __init__(self, config: SimulatedSpadConfig, world: SimulatedWorld, seed: int) -> None:
         super().__init__("simulated SPAD")
@@ -373,7 +373,7 @@ class SimulatedSpad(SpadArray):
 
 
 def create(config: SimulatedSpadConfig, surroundings: Surroundings) -> SimulatedSpad:
-    """The SPAD that looks at the world. DeviceError where the rig has none."""
+    """The SPAD that looks at the world. Raises DeviceError if the rig has no simulated world."""
     if not isinstance(surroundings.world, SimulatedWorld):
         raise DeviceError(
             "simulated SPAD has nothing to look at: the rig has no simulated world; add world: {kind: simulated}"

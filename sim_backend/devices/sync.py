@@ -1,4 +1,4 @@
-"""The simulated pattern generator: its gate output lets laser light out, its trigger input hears the scan marker."""
+"""The simulated pattern generator. Its gate output lets laser light out; its trigger input reads the scan marker."""
 
 from collections.abc import Sequence
 from typing import ClassVar, Literal

@@ -1,1 +1,1 @@
-"""Effects on the light between laser and sensor; a module that no scene calls for is not imported."""
+"""Effects on the light between laser and sensor. A module is imported only if a scene calls for its effect."""

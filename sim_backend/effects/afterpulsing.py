@@ -1,9 +1,9 @@
 """Afterpulsing and dead time: what a detection does to the same pixel's next frame.
 
-One-bit frames of exposure T, one period P = T + gap after the other; a detection falls anywhere in its exposure, as it
-does at low flux. Within that exposure neither matters: the pixel is 1 already.
+One-bit frames have exposure T and period P = T + gap. A detection falls anywhere in its exposure with equal chance, as
+it does at low flux. Neither effect matters within that exposure, where the pixel is 1 already.
 
-Afterpulse: a trap lets go a carrier with probability a in all, after a time that is exponential with mean tau (Cova et
+Afterpulse: a trap releases a carrier with total probability a, after a time that is exponential with mean tau (Cova et
 al., IEEE Electron Device Letters 12, 685, 1991). The chance that it does so within the next exposure is
 
     a/T int_0^T [exp(-(P-t)/tau) - exp(-(P-t+T)/tau)] dt = a (tau/T) exp(-gap/tau) (1 - exp(-T/tau))^2
@@ -13,10 +13,9 @@ detection there falls into the blind part with probability
 
     1/T^2 int_0^T min(T, max(0, t + d - P)) dt = s^2 / (2 T^2),    s = d - gap between 0 and T
 
-These are the chances that the pixel's next bit is set, or is cleared, where its bit is 1: 5e-5 each with a = 0.5 %,
-tau = d = 100 ns and frames of 10 us without a gap. Exposures later than the next, and afterpulses of afterpulses, are
-left out. Exact draws; cost per frame of 512 x 512: 0.8 us at these figures, and the photons of the frame before each
-block.
+If the pixel's bit is 1, these are the chances that its next bit is set or cleared: 5e-5 each with a = 0.5 %,
+tau = d = 100 ns and frames of 10 us without a gap. Later exposures, and afterpulses of afterpulses, are left out. Draws
+are exact. Cost per frame of 512 x 512: 0.8 us at these figures, and for each block the drawing of the frame before it.
 """
 
 import math
@@ -33,7 +32,7 @@ _AFTER, _BLIND = np.uint64(0x9FB21C651E98DF25), np.uint64(0xD6E8FEB86659FD93)
 
 
 class Afterpulsing:
-    """Acts on the bits of photons and dark counts, the first of all."""
+    """Changes the bits of photons and dark counts, before all other effects on bits."""
 
     reads_before = True
 
@@ -56,7 +55,7 @@ def after_probability(afterpulsing: float, lifetime_s: float, times: FrameTimes)
 
 
 def blind_probability(dead_time_s: float, times: FrameTimes) -> float:
-    """Chance that a detection behind one in the frame before falls into that one's dead time."""
+    """Chance that a detection in the frame after another falls into that one's dead time."""
     reach = (dead_time_s - times.gap_s) / times.exposure_s
     if reach > 1:  # the whole of the exposure for the later ones of those detections
         return 1 - max(0.0, 2 - reach) ** 2 / 2

@@ -1,8 +1,8 @@
 """Ambient light: on the surfaces, and scattered into the pixel by the medium in front of them.
 
-Surfaces have the radiance rho/pi E exp(-sigma |X|), E the irradiance within the filter's band (Lambert, Beer-Lambert).
-The medium has L_inf (1 - exp(-sigma |X|)) (Koschmieder) with L_inf = (scattering share) E/pi: a thick layer of a medium
-that does not absorb looks like a white surface in the same diffuse light.
+Surfaces have the radiance rho/pi E exp(-sigma |X|), where E is the irradiance within the filter's band (Lambert,
+Beer-Lambert). The medium has L_inf (1 - exp(-sigma |X|)) (Koschmieder) with L_inf = (scattering share) E/pi: a thick
+layer of a medium that does not absorb looks like a white surface in the same diffuse light.
 """
 
 import math
@@ -31,7 +31,7 @@ def airlight(setting: Setting) -> Array:
 
 
 def _path_m(setting: Setting) -> Array:
-    """Distance of each pixel's surface from the camera, infinity where there is none."""
+    """Distance of each pixel's surface from the camera, infinity if there is none."""
     view = setting.view
     with np.errstate(divide="ignore"):
         return np.asarray(np.sqrt(np.nan_to_num(view.u) ** 2 + np.nan_to_num(view.v) ** 2 + 1) / view.surface)

@@ -1,4 +1,4 @@
-"""The effects there are, when a scene calls for each, and where its code is; code is loaded only when called for."""
+"""All effects, when a scene calls for each, and where its code is. Code is loaded only when it is needed."""
 
 import math
 from collections.abc import Callable
@@ -17,8 +17,8 @@ simulated device, another effect or the gain, which hold its code."""
 
 @dataclass(frozen=True, slots=True)
 class Entry:
-    """One effect: its name, what it acts on, what makes it as module:name ("" where it is worked in elsewhere), and the
-    rule that calls for it.
+    """One effect: its name, what it acts on, its factory as module:name ("" if it is part of another), and the rule
+    that calls for it.
 
     why(setting): the reason in words why it is called for, None where it is not; absent: then the reason why not, ""
     where that is the sensor.
@@ -37,12 +37,12 @@ class Entry:
     of_sensor: bool = False
 
     def called(self, setting: Setting) -> tuple[bool, str]:
-        """Whether the setting calls for it, and why or why not."""
+        """Whether the setting calls for the effect, and why or why not."""
         why = self.why(setting)
         return why is not None, why or self.absent or f"the sensor has no {self.name}"
 
     def load(self) -> Callable[..., Any]:
-        """The factory of a `Setting`'s effect, imported now."""
+        """The function that makes the effect from a `Setting`, imported now."""
         module, _, name = self.code.partition(":")
         loaded: Callable[..., Any] = getattr(import_module(f"sim_backend.effects.{module}"), name)
         return loaded

@@ -7,13 +7,13 @@ With J = P/F the power per radian of fan and n.X = d the sheet, a ray q = (u, v,
 For a rectified rig all powers of z cancel: sigma_s p I0 du |q_p||q_c|/b exp(-sigma z (|q_p| + |q_c|)). The phase
 function p is constant (`backscatter`: scattering angles are all near 180 degrees) or a sum of Henyey-Greenstein terms
 at the cosine -(z q - S).q/(r |q|). The haze ends where the sheet's light ends: at the object, blurred like the stripe,
-and in the sheet's own shadow along the row. Called for by `medium`.
+and in the sheet's own shadow along the row. `medium` switches it on.
 
-Per row everything is straight-line over the lit pixels, so that it becomes vector instructions, and only those under
-the blurred end are walked one by one: 0.36 ms a mirror position for 512 x 512 pixels, half of them lit, in float64 and
-0.19 in float32. Kernels run in the precision of what they add to. In float32 the haze is right to 1e-5 at
-an optical depth of 10: by the divergence of `sim_backend.effect_planner` that is 1e-8 for a row's pixels in a column,
-of 2e-4.
+Along a row the loop over lit pixels has no branches, so it becomes vector instructions; only the pixels under the
+blurred end are done one by one. Cost per mirror position for 512 x 512 pixels, half of them lit: 0.36 ms in float64,
+0.19 ms in float32. Kernels use the precision of the array they add to. In float32 the haze is right to 1e-5 at an
+optical depth of 10. By the divergence of `sim_backend.effect_planner` that is 1e-8 for a row's pixels in a column, of
+2e-4 allowed.
 """
 
 import math

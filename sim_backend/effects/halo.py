@@ -1,19 +1,20 @@
 """Light that the medium scatters more than once: a halo around the stripe, and a pedestal behind it.
 
-A fit to path tracing (walls at tau 0.5, 1 and 2, forward-peaked and isotropic), not a closed form:
+This is a fit to path tracing (walls at tau 0.5, 1 and 2, forward-peaked and isotropic), not a closed form:
 
     halo(r) = eta (e^(2 tau) - 1) k(r)    times the ballistic stripe, per pixel of row at the distance r from it
 
-with eta = 0.76 - 0.13 tau (0.7, 0.64, 0.5 at tau 0.5, 1, 2) where the medium scatters forward, 0.12 + 0.06 tau, at most
-0.18, where it does so evenly, in between by the mean cosine over 0.85; k, of integral 1, half of it exponential of 1.7
-degrees, half of 6 (in pixels as in the middle of the picture). 2 tau is taken along the light's own way, without what
-is only turned a little (`forward_share`), which blurs the stripe itself.
+where eta = 0.76 - 0.13 tau (0.7, 0.64, 0.5 at tau 0.5, 1, 2) if the medium scatters forward, and 0.12 + 0.06 tau, at
+most 0.18, if it scatters evenly; between the two it is interpolated by the mean cosine over 0.85. k has integral 1,
+half of it exponential of 1.7 degrees and half of 6 degrees (in pixels as in the middle of the picture). 2 tau is taken
+along the light's own way, without light that is turned only a little (`forward_share`), which blurs the stripe itself.
 
-The haze, too, is scattered further: P = 0.16 (e^(1.5 tau) - 1) of its level at its end lies over all that is behind it,
-and before it P (1 + 0.8 (1 - e^(-r / 6 degrees))). 10 pixels before the stripe of the traced scene, P is 0.11, 0.23
+The haze, too, is scattered further: P = 0.16 (e^(1.5 tau) - 1) of its level at its end is added to everything behind
+it, and P (1 + 0.8 (1 - e^(-r / 6 degrees))) before it. 10 pixels before the stripe of the traced scene, P is 0.11, 0.23
 and 0.45 of the haze at tau 0.5, 1 and 2 (traced: 0.08-0.13, 0.18-0.32, 0.35-0.45). In isotropic fog at tau 0.5 and 1
-what is scattered more than once is right within 30 % all along the traced rows. About 0.2 ms per mirror position for
-512 x 512 pixels."""
+the light scattered more than once is right within 30 % all along the traced rows. Cost: about 0.2 ms per mirror
+position for 512 x 512 pixels.
+"""
 
 import math
 from typing import Any
@@ -37,7 +38,7 @@ PEDESTAL, PEDESTAL_RISE, BEFORE = 0.16, 1.5, 0.8
 
 
 class Halo:
-    """Adds a sheet's light of more than one scattering."""
+    """Adds the light of a sheet that is scattered more than once."""
 
     def __init__(self, setting: Setting) -> None:
         medium = setting.scene.medium
@@ -61,7 +62,7 @@ class Halo:
 
 @numba.njit(cache=True, nogil=True)
 def halo_share(way_depth: float, peaked: float) -> float:
-    """The halo's light over that of the ballistic stripe, for the optical depth there and back; peaked: 0 to 1."""
+    """Ratio of the halo's light to the ballistic stripe's, for the optical depth there and back. peaked: 0 to 1."""
     tau = 0.5 * way_depth
     even = min(0.12 + 0.06 * tau, MOST_EVEN)
     forward = max(0.76 - 0.13 * tau, even)

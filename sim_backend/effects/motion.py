@@ -2,12 +2,13 @@
 
 All surfaces are shifted together by D = velocity x time. A surface's facet m.X = 1 becomes m.(X - D) = 1, that is m /
 (1 + m.D), so the inverse depth of a ray q = (u, v, 1) is m.q / (1 + m.D) with m of the pixel at which the point was at
-time 0. That pixel is searched with two starts, from the nearest surface and from the one that is seen there at time 0;
-the nearer result wins, which is right but for a pixel or two along edges. What is uncovered continues what is behind,
-and what comes in at the borders what is there. Albedo is that of the nearest pixel.
+time 0. That pixel is searched from two starting points, the nearest surface and the surface seen there at time 0; the
+nearer result wins, which is right except for a pixel or two along edges. Newly uncovered areas continue the surface
+behind, and what enters at the borders continues the surface there. Albedo is that of the nearest pixel.
 
-The picture is made anew every `HOLD_S`, in which a surface at 10 m/s moves by 1 cm: about 40 ms each for 512 x 512
-pixels. Light that does not come from the laser stays that of time 0."""
+The view is computed anew every `HOLD_S`, in which a surface at 10 m/s moves by 1 cm. This takes about 40 ms for
+512 x 512 pixels. Light that does not come from the laser stays that of time 0.
+"""
 
 import math
 import threading
@@ -29,7 +30,7 @@ SEARCH_STEPS = 3
 
 
 class MovingSurfaces:
-    """Makes the view at a time, and keeps the latest: threads that draw rows are not all at the same time."""
+    """Makes the view at a time and keeps the latest ones, since threads that draw rows are at different times."""
 
     def __init__(self, velocity_m_per_s: Sequence[float]) -> None:
         """velocity: x (right), y (down), z (away from the camera)."""
@@ -38,7 +39,7 @@ class MovingSurfaces:
         self._views: dict[int, CameraView] = {}
 
     def view(self, still: CameraView, time_s: float) -> CameraView:
-        """The view that holds at the time."""
+        """The view at a given time."""
         step = math.floor(time_s / HOLD_S + 1e-6)
         with self._lock:
             if step not in self._views:
@@ -49,7 +50,7 @@ class MovingSurfaces:
 
 
 class Motion:
-    """Brings no light of its own, and says how often the light changes."""
+    """Adds no light of its own, and says how often the light changes."""
 
     hold_s = HOLD_S
 
@@ -57,11 +58,11 @@ class Motion:
         assert setting.view.motion is not None, "the world lets its surfaces move"
 
     def add(self, sheet: LightSheet, first_row: int, last_row: int, rate: Array) -> None:
-        """Add nothing: the effects that make the light ask `View.at`."""
+        """Add nothing. The effects that make the light ask `View.at` for the view."""
 
 
 def shifted(still: CameraView, shift_m: Array) -> CameraView:
-    """The view of the same surfaces shifted by (3,) metres."""
+    """The view of the same surfaces, shifted by `shift_m` (3,)."""
     surface, facet, albedo = (np.zeros_like(part) for part in (still.surface, still.facet, still.albedo))
     _shift(still.u, still.v, still.surface, still.facet, still.albedo, shift_m, (surface, facet, albedo))
     return replace(still, surface=surface, facet=facet, albedo=albedo, motion=None)

@@ -1,20 +1,21 @@
-"""Rain and snow: drops and flakes flash up where they cross the sheet, and have fallen on by the next sweep.
+"""Rain and snow: drops and flakes flash up where they cross the sheet, and have fallen further by the next sweep.
 
-Sizes, extinction and fall speed are in `sim_backend.scenes.medium`. There are density x thickness x area of them in the
-sheet (drops at 20 mm/h and 2 mm: 7 per m^2), bright as 1/z^3; what rain takes out of the beam, next to nothing below
-20 m, is in the extinction of stripe and haze. A flake is taken as a diffuse sphere of albedo 0.9 and 4.5 times its
-melted cross-section: seen from the side it is lit from, it sends 8/3 of the mean of all directions back, at equal
-melted diameter eight times as much light as a drop.
+Sizes, extinction and fall speed are in `sim_backend.scenes.medium`. The sheet contains density x thickness x area
+particles (drops at 20 mm/h and 2 mm: 7 per m^2), whose brightness goes as 1/z^3. What rain takes out of the beam, next
+to nothing below 20 m, is in the extinction of stripe and haze. A flake is modelled as a diffuse sphere of albedo 0.9
+with 4.5 times its melted cross-section. Seen from the side it is lit from, it sends back 8/3 of the mean over all
+directions, which is eight times the light of a drop of equal melted diameter.
 
 A particle at X in a sheet of Gaussian thickness, s = n.X - d off its middle, gets J/r N(s; thickness/4) W/m^2 with
 J = P/fan, sends back that times its `back_m2_per_sr`, and is seen as a point of this intensity: a pixel of solid angle
-w sees the radiance I/(|X|^2 w). It is blurred like the line, and drawn out to a streak by what it falls in `HOLD_S`.
+w sees the radiance I/(|X|^2 w). It is blurred like the line, and drawn as a streak of the length that it falls in
+`HOLD_S`.
 
-The particles are a fixed set in the cone that the camera sees: each has its depth, and its direction runs on with its
-speed and comes in again at the other side, so that they are spread evenly at any time and a time says where all of them
-are. Those too faint (diameter below k z^1.5, brightness goes with D^2/z^3) are left out: k is that of 0.5 mm at 8 m, or
-more where more than `MOST` were left. With 50 mW and the default optics that is 5 thousandths of a photon per exposure
-for the brightest left out. 0.6 to 0.8 ms per mirror position and thread for `MOST` of them.
+The particles are a fixed set in the cone that the camera sees. Each keeps its depth; its direction moves with its speed
+and re-enters at the other side of the cone. So they are spread evenly at any time, and the time alone determines where
+all of them are. The faintest are left out (diameter below k z^1.5, since brightness goes as D^2/z^3): k is that of
+0.5 mm at 8 m, or more if more than `MOST` would be left. With 50 mW and the default optics the brightest one left out
+gives 5 thousandths of a photon per exposure. Cost: 0.6 to 0.8 ms per mirror position and thread for `MOST` particles.
 """
 
 import math
@@ -41,9 +42,9 @@ HOLD_S = 2e-4
 
 @numba.njit(cache=True, nogil=True)
 def find_pixel(u: Array, v: Array, at_u: float, at_v: float) -> tuple[float, float, float]:
-    """Pixel (x, y) whose ray has the tangents, and the area of a pixel in tangents there; NaN where there is none.
+    """Pixel (x, y) whose ray has the given tangents, and the area of a pixel in tangents there; NaN if there is none.
 
-    Newton's method on the maps of tangents (rows, width), continued straight past their borders.
+    Uses Newton's method on the maps of tangents (rows, width), extended linearly beyond their borders.
     """
     rows, width = u.shape
     x, y, area = 0.5 * (width - 1), 0.5 * (rows - 1), np.nan
@@ -150,8 +151,8 @@ Precipitation = Rain | Snow
 class Particles:
     """n particles in the cone ((2, 2): low and span of the tangents u and v).
 
-    z_m, back_m2_per_sr: (n,). at, per_s: (n, 2), where they are along u and v at time 0 and how fast they run, as
-    shares of the cone's width.
+    z_m, back_m2_per_sr: (n,). at, per_s: (n, 2), position along u and v at time 0 and speed, as shares of the cone's
+    width.
     """
 
     cone: Array
@@ -169,7 +170,7 @@ class Particles:
 
 
 def make_particles(what: Precipitation, cone: Array, farthest_m: float, rng: np.random.Generator) -> Particles:
-    """The particles in the cone ((2, 2): low and span of u and v) up to a depth."""
+    """Random particles in the cone ((2, 2): low and span of u and v) up to a depth."""
     z = np.linspace(min(NEAREST_M, farthest_m), farthest_m, DEPTH_STEPS)
     volume = z**2 * cone[0, 1] * cone[1, 1]
     faintest = FAINTEST_MM / FAINTEST_AT_M**1.5

@@ -1,13 +1,13 @@
 """Faults that a sensor adds to the bits of one frame: crosstalk, hot and dead pixels, errors of the read-out.
 
-Rare random events are drawn exactly by the gaps between them: they cost what they are, not what the pixels are. Where
-each of the places 0, 1, 2, ... is hit with probability p, as many as
+Rare random events are drawn exactly, through the gaps between them, so the cost depends on the number of events and not
+of pixels. If each of the places 0, 1, 2, ... is hit with probability p,
 
     gap = floor(ln U / ln(1 - p)),    U uniform in (0, 1)
 
-are left out before the next hit (geometric distribution; Devroye, Non-Uniform Random Variate Generation, 1986, X.2). U
-has 53 bits and comes from a counter, keyed by seed, effect and frame as the photons are: what is hit in a frame depends
-on these alone, not on blocks or threads. Measured: 17 ns a hit.
+places are skipped before the next hit (geometric distribution; Devroye, Non-Uniform Random Variate Generation, 1986,
+X.2). U has 53 bits and comes from a counter, keyed by seed, effect and frame as the photons are. The hits in a frame
+depend on these alone, not on blocks or threads. Measured: 17 ns a hit.
 """
 
 import math
@@ -26,13 +26,13 @@ _DEFECTS = 2
 
 
 def log_miss(probability: float) -> float:
-    """ln(1 - p), which `next_hit` takes."""
+    """ln(1 - p), as `next_hit` takes it."""
     return -math.inf if probability >= 1 else math.log1p(-probability)
 
 
 @numba.njit(cache=True, nogil=True, error_model="numpy")
 def next_hit(place: float, key: np.uint64, draw: int, log_miss: float) -> float:
-    """The hit behind `place` (-1: from the start), infinity where p is 0. draw: 0, 1, 2, ... of this key's stream."""
+    """The hit after `place` (-1: from the start), infinity if p is 0. draw: 0, 1, 2, ... of this key's stream."""
     uniform = (float(frame_key(key, np.uint64(draw)) >> np.uint64(11)) + 0.5) * 2.0**-53
     return place + 1.0 + math.floor(math.log(uniform) / log_miss) if log_miss < 0.0 else math.inf
 
@@ -52,16 +52,16 @@ def packed(pixels: NDArray[np.bool_]) -> Words:
 
 
 class Crosstalk:
-    """A detection sets off a neighbouring pixel, by the light of its own avalanche.
+    """A detection triggers a neighbouring pixel by the light of its own avalanche.
 
     Acts on the bits of photons, dark counts and afterpulses. Each detection of a frame fires each of its 4 neighbours
-    with probability c / 4, all independently; what is fired this way sets off nobody, which would be of order c^2. A
-    pixel whose own chance is p and whose neighbours fired in m cases is 1 with probability 1 - (1 - p)(1 - c/4)^m; over
-    a flat picture of small p that is p (1 + c). At the border the light is lost. c is 0.1 to 0.2 % in 512 x 512 arrays
-    of large pitch; the share beyond the 4 neighbours is not modelled.
+    with probability c / 4, all independently. Pixels fired in this way trigger no others, which would be of order c^2.
+    A pixel whose own chance is p, and of whose neighbours m fired, is 1 with probability 1 - (1 - p)(1 - c/4)^m; in a
+    flat picture of small p that is p (1 + c). Light that crosses the border is lost. c is 0.1 to 0.2 % in 512 x 512
+    arrays of large pitch; the share beyond the 4 neighbours is not modelled.
 
-    Exact for any c: of the 4 x pixels of a frame, in the order pixel by pixel (up, down, left, right), those that would
-    pass are drawn by their gaps. Cost per frame of 512 x 512: 9 us at 0.15 %, in proportion to c.
+    Exact for any c. Each pixel has four possible transfers (up, down, left, right), taken pixel by pixel; those that
+    occur are drawn by their gaps. Cost per frame of 512 x 512: 9 us at 0.15 %, in proportion to c.
     """
 
     reads_before = False
@@ -98,14 +98,14 @@ def _spark_over(words: Words, width: int, seed: np.uint64, first_frame: int, log
 
 
 class Defects:
-    """Hot and dead pixels, whose electronics read 1, or 0, in every frame, whatever their diode does.
+    """Hot and dead pixels, whose electronics read 1 or 0 in every frame, whatever their diode does.
 
-    Acts on the bits as the pixels' memories hold them, after all that diodes do to one another. A real colour SPAD has
-    4 % of defective pixels (crop of 254 x 496, public data of wision-lab/photoncube), in no clusters: pairs of
-    neighbours are as frequent as chance has it (0.98 times along the row, 0.92 along the column, each +-0.07). So a
-    pixel is dead with probability `dead_share`, hot with `hot_share`, never both, and independent of all others; which
-    ones they are follows from `pixel_seed`. Diodes that fire too often are the tail of the dark counts. Cost per frame
-    of 512 x 512: 3 us.
+    Acts on the bits in the pixels' memories, after crosstalk and all other effects between diodes. A real colour SPAD
+    has 4 % of defective pixels (crop of 254 x 496, public data of wision-lab/photoncube) without clusters: pairs of
+    neighbours are as frequent as by chance (0.98 times along the row, 0.92 along the column, each +-0.07). So a pixel
+    is dead with probability `dead_share`, hot with `hot_share`, never both, and independent of all others; `pixel_seed`
+    determines which ones. Diodes that fire too often are the tail of the dark counts. Cost per frame of 512 x 512: 3
+    us.
     """
 
     reads_before = False
@@ -126,10 +126,11 @@ class Defects:
 class BitErrors:
     """Each pixel of a frame is read wrongly with probability e, 0 as 1 and 1 as 0: P(1) = p (1 - e) + (1 - p) e.
 
-    Acts on the bits as they are read, the last of all. Errors happen inside the sensor, on the way from the pixels to
-    the logic that packs frames: checksums are made of the wrong bits, so no CRC tells of them, and neither does a
-    recording's `verify`; errors behind the checksum, on the cable, are those of `sim_backend.wire.serve.wire_server`.
-    Exact; cost per frame of 512 x 512: 5 us at 0.1 %, in proportion to e.
+    Acts on the bits as they are read, after all other effects. These errors happen inside the sensor, between the
+    pixels and the logic that packs frames. Checksums are computed from the wrong bits, so neither a CRC nor a
+    recording's `verify` detects them. Errors after the checksum, on the cable, are those of
+    `sim_backend.wire.serve.wire_server`. Exact; cost
+    per frame of 512 x 512: 5 us at 0.1 %, in proportion to e.
     """
 
     reads_before = False

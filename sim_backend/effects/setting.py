@@ -17,8 +17,8 @@ Words = NDArray[np.uint64]
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Setting:
-    """The rig in its scene. gain: detections per second of a pixel per W/(m^2 sr). devices: by effect, what simulated
-    devices said they do when they were made.
+    """The rig in its scene. gain: detections per second of a pixel per W/(m^2 sr). devices: effects that simulated
+    devices reported when they were made, with the reason.
     """
 
     view: CameraView
@@ -32,8 +32,8 @@ class Setting:
 
 @dataclass(frozen=True, slots=True)
 class PlannedFor:
-    """The most that a column of frames gets in what is planned for: laser power in W, exposure of all its frames
-    together in s, and how many they are.
+    """The largest values that a plan holds for: laser power in W, exposure of a column's frames together in s, and the
+    number of these frames.
     """
 
     power_w: float
@@ -60,24 +60,23 @@ class LaserEffect(Protocol):
     def add(self, sheet: LightSheet, first_row: int, last_row: int, rate: Array) -> None:
         """Add detections per second and watt to `rate` (rows, width), rows first_row..last_row-1. Releases the GIL.
 
-        rate is float64, or float32 where frames are drawn: seven digits of the light are more than photons can tell.
+        rate is float64, or float32 when frames are drawn, whose seven digits are more than photons can show.
         """
         ...
 
 
 class BitEffect(Protocol):
-    """A change of the photons' bits by the sensor."""
+    """A change that the sensor makes to the photons' bits."""
 
     reads_before: bool
     """Whether `before` is read: what one frame does to the next costs the frame before each block's first."""
 
     def apply(self, seed: np.uint64, first_frame: int, words: Words, before: Words, times: FrameTimes) -> None:
         """Change whole frames first_frame, first_frame + 1, ... in place: `words` (frames, rows, words) uint64 in
-        packbits order (`sim_backend.frames.photon_kernels`), pad bits stay 0.
+        packbits order (`sim_backend.frames.photon_kernels`). Pad bits stay 0.
 
-        seed: of the run. before: (rows, words), the bits of frame first_frame - 1 as this effect found them, zeros
-        where there is none. The outcome for a frame depends on seed, its number, its own and its predecessor's bits
-        only, not on how frames come in blocks.
-        Releases the GIL.
+        seed: of the run. before: (rows, words), the bits of frame first_frame - 1 as this effect received them, zeros
+        if there is none. The result for a frame depends only on the seed, its number, its own bits and its
+        predecessor's, not on how frames are grouped in blocks. Releases the GIL.
         """
         ...

@@ -1,13 +1,14 @@
 """Speckle: laser light comes back grainy from a rough surface; a pixel averages the grains it covers.
 
 The light of M independent grains is gamma distributed with mean 1 and contrast (standard deviation over mean)
-1/sqrt(M). A diode of area A and grains of area (4/pi) (wavelength N)^2 behind an f-number N make 1 + A / grain of them,
-twice that as a diffuse surface depolarises (Goodman, "Speckle phenomena in optics", 2007, sections 4.2 and 4.6). With
-the default sensor at f/2 the contrast is 0.15.
+1/sqrt(M). A diode of area A covers 1 + A / grain of them, where a grain has the area (4/pi) (wavelength N)^2 behind an
+f-number N; twice that, as a diffuse surface depolarises (Goodman, "Speckle phenomena in optics", 2007, sections 4.2 and
+4.6). With the default sensor at f/2 the contrast is 0.15.
 
-Acts on the stripe, as the light before this effect; the grains belong to the pixel and to where the sheet is, in steps
-of the line's width, so they stay for all exposures of a column and come again in every sweep. About 0.4 ms per mirror
-position for 512 rows."""
+Acts on the stripe, the light added before this effect. The grains depend on the pixel and on the position of the sheet
+in steps of the line's width, so they stay for all exposures of a column and return in every sweep. Cost: about 0.4 ms
+per mirror position for 512 rows.
+"""
 
 import math
 
@@ -37,7 +38,7 @@ class Speckle:
         self._widths_per_tangent = setting.view.focal_px / setting.line.sigma_px
 
     def add(self, sheet: LightSheet, first_row: int, last_row: int, rate: Array) -> None:
-        """Multiply the light that the stripe brought."""
+        """Multiply the light of the stripe by the grains."""
         # Of a bowed sheet `inverse` changes while rows are drawn, by threads; the plane that it bows from does not.
         by_u, _, ahead = sheet.inverse[0] if sheet.bowed is None else sheet.bowed.planes[0][:3]
         with np.errstate(divide="ignore", invalid="ignore"):
@@ -53,7 +54,7 @@ def _uniform(key: np.uint64, number: int) -> float:
 
 @numba.njit(cache=True, nogil=True)
 def gamma_of(key: np.uint64, shape: float) -> float:
-    """A gamma variate of mean 1 and the shape, at least 1, that belongs to the key (Marsaglia and Tsang 2000)."""
+    """A gamma variate of mean 1 and the given shape, at least 1, determined by the key (Marsaglia and Tsang 2000)."""
     d = shape - 1.0 / 3.0
     c = 1.0 / math.sqrt(9.0 * d)
     number = 0

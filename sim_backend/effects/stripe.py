@@ -6,18 +6,20 @@ along the row:
 
     integral of L dx = (rho/pi) (J/r) |N.e| / |d(n.X)/dx| exp(-sigma (r + |X|))          per pixel of row
 
-n.X taken on the surface along the row. For a rectified rig this is the camera-side cosine law
+with n.X taken on the surface along the row. For a rectified rig this is the camera-side cosine law
 (rho/pi) I0 du |N.q| / Z^2 exp(-sigma Z (|q_p| + |q_c|)), with I0 du = J sqrt(1 + u_p^2)/|q_p|^2. The surface is the
 facet m.X = 1 through the point: |N.e| = |1 - m.S|/(|m| r) for a source at S. The profile across the row is a Gaussian
 integrated over each pixel, of the width that `sim_backend.light.line` gives.
 
 Half of what droplets take out of the beam (`medium: {forward_share: 0.5}`) is diffraction within 1 to 2 degrees. The
-stripe's extinction counts it as lost; `ForwardBlur` brings it back as a wider copy. On a way of length l the number of
-such turns is Poisson of mean t = f sigma_s l, so there is exp(t) - 1 times the ballistic light more. A turn by an angle
-of standard deviation s per axis at the share x of the way to or from the surface shifts the light by (1 - x) of the
-angle, of variance s^2/3 on average over x; light that was turned at all was turned t / (1 - exp(-t)) times. The blur is
-one Gaussian of that variance (small-angle scattering as a random walk, Ishimaru, "Wave propagation and scattering in
-random media", 1978, chapter 13). About 0.5 ms per mirror position for 512 rows."""
+stripe's extinction counts it as lost; `ForwardBlur` brings it back as a wider copy. On a path of length l the number of
+such deflections is Poisson of mean t = f sigma_s l, so the extra light is exp(t) - 1 times the ballistic light. A
+deflection by an angle of standard deviation s per axis, at the share x of the path to or from the surface, shifts the
+light by (1 - x) of the angle, of variance s^2/3 on average over x. Light that was deflected at all was deflected
+t / (1 - exp(-t)) times on average. The blur is one Gaussian of the resulting variance (small-angle scattering as a
+random walk, Ishimaru, "Wave propagation and scattering in random media", 1978, chapter 13). Cost: about 0.5 ms per
+mirror position for 512 rows.
+"""
 
 import math
 
@@ -39,7 +41,7 @@ MOST_TURNS = 600.0
 
 
 class Stripe:
-    """Adds the stripe of a sheet, the light that nothing has turned."""
+    """Adds the stripe of a sheet, from light that was not deflected."""
 
     def __init__(self, setting: Setting) -> None:
         self._view = setting.view
@@ -54,7 +56,7 @@ class Stripe:
 
 
 class ForwardBlur(Stripe):
-    """Adds the blurred copy: light that was turned a little."""
+    """Adds the blurred copy of the stripe, from light that was deflected a little."""
 
     def __init__(self, setting: Setting) -> None:
         super().__init__(setting)
@@ -72,10 +74,10 @@ def _between(values: Array, y: int, x: int, t: float) -> float:
 def row_light(
     view: Arrays, inverse: Array, offset_m: Array, extinction_per_m: float, y: int, centre: float
 ) -> tuple[float, float, float, float]:
-    """The light of the stripe at pixel `centre` of row y, integrated along the row, that nothing has turned on its way.
+    """The undeflected light of the stripe at pixel `centre` of row y, integrated along the row.
 
-    As rho |N.e| / (r |d(n.X)/dx|) exp(-sigma way), for J/pi = 1; then the way in metres, the distance from the mirror,
-    and the inverse depth.
+    Returns rho |N.e| / (r |d(n.X)/dx|) exp(-sigma way), for J/pi = 1; the length of the light's path in metres; the
+    distance from the mirror; and the inverse depth.
     """
     u, v, u_x, v_x, facet, albedo, source = view
     k = min(y, len(inverse) - 1)
@@ -103,7 +105,7 @@ def row_light(
 
 @numba.njit(inline="always")
 def spread_line(total: float, centre: float, sigma: float, row: Array) -> None:
-    """Add a Gaussian line of that much light to a row, integrated over each pixel."""
+    """Add a Gaussian line with `total` light to a row, integrated over each pixel."""
     reach = REACH_SIGMAS * sigma
     unit = 1.0 / sigma
     first, last = max(0, math.ceil(centre - reach - 0.5)), min(len(row) - 1, math.floor(centre + reach + 0.5))
@@ -120,7 +122,7 @@ def _add_lines(
 ) -> None:
     """Add the stripe, or, where light is turned, its blurred copy. light: scale, extinction, turns per m, their angle.
 
-    width: as of `line_width`.
+    width: as in `line_width`.
     """
     inverse, offset_m, x_stripe, _, _, _ = sheet
     scale, extinction_per_m, turned_per_m, angle_px = light

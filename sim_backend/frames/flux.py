@@ -2,11 +2,13 @@
 
     lambda = exposure (steady + share power sheet),     p = 1 - exp(-lambda)
 
-share is the part of the exposure during which the gate let light out. `steady` is made once, `sheet` once per command.
+share is the part of the exposure during which the gate let light out. `steady` is computed once, `sheet` once per
+command.
 
-Tracing the light costs more than drawing a frame, so the frames that the mirror spends in one cell of a grid
-(`CommandGrid`) all get their mean position: a mean over a column's frames is then that of a mirror that moves on. Told
-the columns' commands the cells are the columns; not told, the range is divided finely, four cells per pixel of width.
+Tracing the light costs more than drawing a frame. So the frames that the mirror spends in one cell of a grid
+(`CommandGrid`) all get their mean position; the mean over a column's frames is then that of a mirror that moves on. If
+the columns' commands are known the cells are the columns; otherwise the range is divided into four cells per pixel of
+width.
 """
 
 from collections.abc import Collection, Mapping, Sequence
@@ -21,7 +23,7 @@ from sim_backend.light.sheet import LightSheet
 
 
 class FluxModel:
-    """Sums the effects of one rig in one scene. Reads only; any thread may use it."""
+    """Sums the effects of one rig in one scene. Any thread may use it, since it only reads."""
 
     def __init__(self, setting: Setting, entries: Sequence[Entry] | None = None) -> None:
         """entries: the effects to use, in the catalogue's order; by default all that the scene calls for."""
@@ -41,11 +43,11 @@ class FluxModel:
 
     @property
     def hold_s(self) -> float:
-        """Time for which the sheet's light may be taken as constant; 0: nothing moves, it is constant for ever."""
+        """Time for which the sheet's light may be taken as constant; 0 if nothing moves and it is always constant."""
         return min((held for effect in self.laser.values() if (held := hold_s(effect)) > 0), default=0.0)
 
     def without(self, names: Collection[str]) -> "FluxModel":
-        """The model with fewer effects; those that stay are not made anew."""
+        """The model with fewer effects. The remaining effects are not created again."""
         fewer = copy(self)
         fewer.laser = {name: effect for name, effect in self.laser.items() if name not in names}
         fewer.steady = {name: rate for name, rate in self.steady.items() if name not in names}
@@ -68,7 +70,7 @@ class FluxModel:
 
 
 def hold_s(effect: LaserEffect) -> float:
-    """Time for which an effect's light stands still; 0: it does not move."""
+    """Time for which an effect's light may be taken as constant; 0 if it never changes."""
     return float(getattr(effect, "hold_s", 0.0))
 
 
@@ -81,8 +83,8 @@ _SLACK = 1e-6
 
 @dataclass(frozen=True, slots=True, eq=False)
 class CommandGrid:
-    """Ascending positions (n,) float64; a cell is what is nearest to one, edges (n - 1,) are between them. `low`,
-    `high`: what still belongs to the ends.
+    """A grid of ascending positions (n,) float64. The cell of a position is all that is nearest to it; edges (n - 1,)
+    lie between cells. `low` and `high` bound the first and the last cell.
     """
 
     positions: Array
@@ -91,10 +93,10 @@ class CommandGrid:
     high: float
 
     def hold(self, commands: Array, steps: Array) -> Array:
-        """Mean positions of the frames that share a cell with these, at commands (n,), NaN past the ends of the grid.
+        """Mean positions of the frames that share a cell with frames at commands (n,); NaN outside the grid.
 
-        steps: (n,) how far the mirror moves from one frame to the next, 0: the frame is alone, as where one step leads
-        out of the cell; NaN: not known, it is held at the cell's own position.
+        steps: (n,) how far the mirror moves from one frame to the next. 0 means that the frame is alone, as when one
+        step leaves the cell. NaN means unknown: the frame is held at the cell's own position.
         """
         if len(self.positions) == 0:
             return np.full(commands.shape, np.nan)
@@ -120,7 +122,7 @@ def column_grid(commands: Array, limits: tuple[float, float]) -> CommandGrid:
 
 
 def fine_grid(width: int, limits: tuple[float, float]) -> CommandGrid:
-    """Grid for a bench that knows no columns."""
+    """Grid for a bench that has not been told the columns."""
     return _grid(np.linspace(*limits, FINE_POSITIONS_PER_PX * width + 1), limits)
 
 

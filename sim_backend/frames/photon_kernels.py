@@ -1,17 +1,17 @@
 """Compiled exact Bernoulli sampling of packed binary frames, 16 pixels at a time.
 
-A bit is 1 where a random number of 16 bits is below the pixel's level, about 2^16 p. The rest of p comes from drawing
-anew: each pixel is chosen with chance c = 3 x 2^-16, about twelve of a frame, and its bit drawn afresh with chance s,
+A bit is 1 if a random number of 16 bits is below the pixel's level, about 2^16 p. The rest of p comes from a second
+draw: each pixel is chosen with chance c = 3 x 2^-16, about twelve per frame, and its bit is drawn again with chance s,
 where
 
     p = (1 - c) level / 2^16 + c s,     0 <= s <= 1 for every level within [2^16 (p - c) / (1 - c), 2^16 p / (1 - c)]
 
-That interval is three levels wide, so that levels may be computed in float32 while every p is exact to the last bit of
-a float64; 0 never fires and 1 always. The highest level that 16 bits hold stands for 2^16 itself: its pixels are 1
-whatever the random number, so they are set afterwards. Random numbers are functions of seed, frame, row and place alone
-(`sim_backend.random_numbers`): windows, threads and blocks do not matter.
+That interval is three levels wide. So levels may be computed in float32 while every p is exact to the last bit of a
+float64; 0 never fires and 1 always does. The highest 16-bit level stands for 2^16 itself: its pixels are 1 whatever the
+random number, so they are set afterwards. Random numbers depend only on seed, frame, row and place
+(`sim_backend.random_numbers`), not on windows, threads or blocks.
 
-Measured, 512 x 512 on one core: 12 us a frame, 0.12 ms for new levels where half of the words are lit.
+Measured for 512 x 512 on one core: 12 us a frame, and 0.12 ms for new levels when half of the words are lit.
 """
 
 import math
@@ -87,9 +87,9 @@ def set_levels(
 ) -> None:  # fmt: skip
     """Levels of rows for p = 1 - exp(-(steady + exposure_w_s rate)).
 
-    steady: photons per exposure; rate: per second and watt, both (rows, width), not negative; exposure_w_s: of power
-    and time. Words of 64 pixels before the first and behind the last with light take their levels from `dark`, unless
-    that has no rows; lit (rows, words) says which of `levels` are not those of `dark`, before and after the call.
+    steady: photons per exposure; rate: per second and watt, both (rows, width), not negative; exposure_w_s: power times
+    time. Words of 64 pixels before the first and after the last with light take their levels from `dark`, unless that
+    has no rows. lit (rows, words) says which of `levels` differ from those of `dark`, before and after the call.
     """
     rates, constants = (rate, rate.view(np.uint32), np.float32(exposure_w_s)), (ROUGHLY, _LEVELING)
     _set_levels(steady, rates, rows, dark, lit, levels, constants)
@@ -147,8 +147,8 @@ def draw_frames(
 ) -> None:
     """Draw rows of frames first_frame, first_frame + 1, ... into `words` (frames, rows, words).
 
-    levels: as `set_levels` made them of the light. first_word: (frames,), word of the row at which each frame's window
-    begins; its bits are those of the whole frame.
+    levels: as `set_levels` computed them for the light. first_word: (frames,), word of the row at which each frame's
+    window begins; the window has the same bits as that part of the whole frame.
     """
     first_row, last_row = rows
     frames, _, n_words = words.shape
@@ -179,7 +179,7 @@ def draw_frames(
 def _draw_anew(
     key: Key, levels: Levels, light: Light, first_frame: int, rows: Rows, first_word: Places, words: Words
 ) -> None:
-    """Draw the pixels that chance chooses anew; arguments as of `draw_frames`."""
+    """Draw the pixels that chance chooses anew; arguments as in `draw_frames`."""
     (stored, _), (first_row, last_row) = levels, rows
     steady, rate, exposure_s, power_w = light
     width, row_px = steady.shape[1], stored.shape[1] * WORD_PX

@@ -1,10 +1,13 @@
 """Binary frames from flux: exact Bernoulli bits, packed as in SPB1, the same for any block size and number of threads.
 
-Frames that share light, one mirror position, power and time, form a span: the sheet is traced, its flux summed, p
-turned into levels; then each frame is drawn from the levels. Rows are split over threads, each of which goes through
-all spans of a block by itself; every step works row by row, so the split does not matter. What the sensor does to the
-bits acts on whole frames, of which windows are cut afterwards. Measured, 512 x 512, the street in fog: 12 us a frame
-and 0.45 ms per mirror position on one core, 6.4 us and 0.26 ms on two (`python -m tests.benchmarks.simulator`)."""
+Consecutive frames with the same light (one mirror position, power and time) form a span. For a span the sheet is
+traced, its flux summed and p turned into levels; then each frame is drawn from the levels. Rows are split over threads,
+each of which goes through all spans of a block by itself; every step works row by row, so the split does not matter.
+The sensor's effects on bits act on whole frames, and windows are cut out afterwards. Measured for 512 x 512, the street
+in
+fog: 12 us a frame and 0.45 ms per mirror position on one core, 6.4 us and 0.26 ms on two
+(`python -m tests.benchmarks.simulator`).
+"""
 
 from collections.abc import Callable, Iterable
 from concurrent.futures import ThreadPoolExecutor, wait
@@ -30,8 +33,9 @@ _SLACK = 1e-6
 
 @dataclass(frozen=True, slots=True, eq=False)
 class _Span:
-    """Frames first..last-1 of a block. moment_s: of the bench, for what moves. power_w: 0 in the dark. sheets: of all
-    lines, to be traced first, None = those of the span before. fresh: whether levels change."""
+    """Frames first..last-1 of a block. moment_s: time of the bench, for what moves. power_w: 0 in the dark. sheets: of
+    all lines, still to be traced; None if those of the span before hold. fresh: whether levels change.
+    """
 
     first: int
     last: int
@@ -42,7 +46,7 @@ class _Span:
 
 
 class PhotonSource:
-    """Draws the frames of one run. One thread calls it; it uses `threads` of its own."""
+    """Draws the frames of one run. It is called from one thread and uses `threads` of its own."""
 
     def __init__(
         self,
@@ -83,9 +87,10 @@ class PhotonSource:
     ) -> None:
         """Fill `bits` (n, rows, row bytes) with windows of frames first_frame, first_frame + 1, ...
 
-        held: (n,) mirror positions, NaN = the light goes nowhere; or (n, 2), while the first and the last row are
-        exposed. power_w: (n,) averaged over each exposure. x0: (n,) first pixel of each window, a multiple of 64.
-        time_s: (n,) when each exposure begins, of the bench, for scenes that move.
+        held: mirror positions (n,), or (n, 2) for the exposure of the first and the last row; NaN if the light goes
+        nowhere.
+        power_w: (n,) averaged over each exposure. x0: (n,) first pixel of each window, a multiple of 64. time_s: (n,)
+        start of each exposure in the bench's time, for scenes that move.
         """
         words = bits.view(np.uint64)
         first_word = x0 // np.int32(WORD_PX)

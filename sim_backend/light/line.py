@@ -1,23 +1,24 @@
-"""The laser lines in the picture: their places beside one another, their part of the power, their width at each depth.
+"""The laser lines in the picture: their positions, their shares of the power, and their width at each depth.
 
-A diffractive element splits one laser's power among them; more lasers bring their own. All leave the same mirror, so
-line l is where a single one would be at the mirror's command plus its offset. Flux of a frame, each line's stripe and
-haze ending at its own object:
+A diffractive element splits one laser's power among the lines; several lasers bring their own. All lines leave the same
+mirror, so line l is where a single line would be at the mirror's command plus the offset of l. The flux of a frame, in
+which each line's stripe and haze end at its own object, is
 
     lambda = exposure (steady + power sum over lines of share sheet_l)
 
-The width is the line's own, that of a sheet that spreads, and defocus:
+The width combines the line's own width, the spread of the sheet, and defocus:
 
     sigma^2 = sigma_px^2 + (f spread/4 r/z)^2 + (c/4)^2,      c = f^2 |1/z - 1/z0| / (N pitch (1 - f/z0))
 
-f in pixels in the second term (a sheet's 1/e^2 full width is 4 sigma; r from the mirror, z depth), in metres in c, the
-diameter in pixels of the disc that a lens of f-number N focused at z0 makes of a point (thin lens); a disc has a
-variance of c^2/16 along the row. Called for by `optics: {focus: 3 m}` and `line: {spread: 1 mrad}`; without them the
-width is `sigma_px` at every depth. The haze's end is blurred by `sigma_px` alone.
+f is in pixels in the second term (a sheet's 1/e^2 full width is 4 sigma; r is the distance from the mirror, z the
+depth) and in metres in c. c is the diameter in pixels of the disc that a lens of f-number N focused at z0 makes of a
+point (thin lens); a disc has a variance of c^2/16 along the row. Both terms are switched on by `optics: {focus: 3 m}`
+and `line: {spread: 1 mrad}`; without them the width is `sigma_px` at every depth. The haze's end is blurred by
+`sigma_px` alone.
 
 The blurred edge of a Gaussian, Phi(a), and its integral, a Phi(a) + phi(a), come from a table, three times as fast as
-erf and exp: cubic Hermite interpolation between values and slopes a 64th of a standard deviation apart, absolute error
-below 1e-10; beyond seven standard deviations the limits, 0, 1 and a.
+erf and exp. The table is interpolated by cubic Hermite polynomials between values and slopes a 64th of a standard
+deviation apart, with an absolute error below 1e-10. Beyond seven standard deviations the limits 0, 1 and a are used.
 """
 
 import math
@@ -42,7 +43,9 @@ EVERYWHERE: Limits = (-np.inf, np.inf)
 
 @dataclass(frozen=True, slots=True)
 class LineFan:
-    """offsets: of the lines, in units of the mirror command. share: of the laser's power that each of them gets."""
+    """Several laser lines. offsets: in units of the mirror command. share: the share of the laser's power that each
+    line gets.
+    """
 
     offsets: tuple[float, ...] = (0.0,)
     share: float = 1.0
@@ -50,10 +53,10 @@ class LineFan:
     def sheets(
         self, sheets_of: SheetsOf, held: Array, rows: int, moment_s: Sequence[float], limits: Limits = EVERYWHERE
     ) -> list[list[LightSheet]]:
-        """Sheets of the lines at each of the mirror positions (n,), or (n, 2) while the first and the last row are
-        exposed, not traced yet; moment_s: (n,) times of the bench.
+        """Sheets of the lines, not traced yet, at mirror positions (n,), or (n, 2) for the exposure of the first and
+        last row.
 
-        A line past the rig model's range goes nowhere: there are fewer then.
+        moment_s: (n,) times of the bench. A line beyond the rig model's range gives no sheet.
         """
         ends = held if held.ndim == 2 else held[:, None]
         down = np.linspace(0, 1, rows) if ends.shape[1] > 1 else np.zeros(1)
@@ -81,9 +84,9 @@ def _of_rows(sheets: LightSheets, index: int, rows: int) -> LightSheets:
 
 
 def line_width(view: CameraView, optics: Optics, sensor: Sensor, line: Line) -> Array:
-    """The numbers that `sigma_px` takes: (4,) variance in px^2, spread in px, defocus in px m, inverse focus in 1/m.
+    """The values that `sigma_px` takes: (4,) variance in px^2, spread in px, defocus in px m, inverse focus in 1/m.
 
-    DeviceError where the focus lies within the focal length: a lens makes no picture of what is there.
+    Raises DeviceError if the focus lies within the focal length, since the lens forms no image of such points.
     """
     focal_px, defocus, inverse_focus = view.focal_px, 0.0, 0.0
     if optics.focus is not None:

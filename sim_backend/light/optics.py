@@ -31,7 +31,7 @@ class Optics(Section):
 
 
 class Sensor(Section):
-    """The SPAD array's pixels. Defaults: 512 x 512 class at 520 nm."""
+    """The SPAD array's pixels. The defaults describe the 512 x 512 class at 520 nm."""
 
     pitch: Annotated[Metres, Field(gt=0)] = 16.38e-6
     fill_factor: float = Field(default=0.105, gt=0, le=1)

@@ -1,13 +1,14 @@
-"""The light sheet of one mirror command in a scene: where on each row it is seen, and where it ends.
+"""The light sheet of one mirror command in a scene: where it is seen on each row, and where it ends.
 
-A world is 2.5-D: one depth per pixel, shadows along rows. Light that has gone behind a surface stays behind it. A row
-sees its sheet as a plane: all rows the same one, or, where the sheet bows or rows are exposed one after the other, each
-its own: that of the mirror at its time, and the tangent of the bowed sheet where the row sees it.
+A world is 2.5-D: one depth per pixel, with shadows along rows. Light that has gone behind a surface stays behind it. A
+row sees its sheet as a plane. All rows share one plane unless the sheet bows or rows are exposed one after the other.
+Then each row has its own: that of the mirror at the row's time, and the tangent of the bowed sheet where the row sees
+it.
 
-A compiled walk follows the light along each row and tells whether it ends as a stripe. On a row the sheet's inverse
+A compiled walk follows the light along each row and finds whether it ends as a stripe. On a row the sheet's inverse
 depth w(x) = n.(u, v, 1)/d falls in the direction in which its light travels outward. The walk starts at the near edge
 of the picture and ends where w passes the surface's inverse depth. Spans of 32 pixels in which even the least w lies
-before the nearest surface are passed at once: about 0.05 ms for 512 x 512 pixels, half of them lit.
+before the nearest surface are skipped at once. Cost: about 0.05 ms for 512 x 512 pixels, half of them lit.
 """
 
 from dataclasses import dataclass, replace
@@ -30,13 +31,16 @@ _TANGENT_STEP_M = 1e-4
 
 @dataclass(frozen=True, slots=True, eq=False)
 class LightSheet:
-    """The planes n.X = d of a sheet, k = 1 for all rows or one for each, and what their light does on every row.
+    """The planes n.X = d of a sheet, k = 1 for all rows or one for each row, and what their light does on every row.
 
     normal: (k, 3) float64 unit vectors; offset_m: (k,) d; inverse: (k, 3) n/d, so that 1/z = inverse.(u, v, 1).
     x_stripe_px: (rows,) float64, sub-pixel stripe position, NaN = no stripe.
     x_end_px: (rows,) float64, end of the lit part, NaN = nothing lit.
     start_px, step: (rows,) int64, first pixel on the light's way and its direction along the row (+1, -1, 0 = not
-    seen). time_s: of the bench, for what moves. bowed: what the planes are made to touch; None: they are the sheet."""
+    seen).
+    time_s: time of the bench, for what moves.
+    bowed: the bowed sheets that the planes are tangent to; None if the sheet itself is flat.
+    """
 
     normal: Array
     offset_m: Array
@@ -50,7 +54,7 @@ class LightSheet:
 
     @property
     def traced(self) -> Traced:
-        """The sheet for kernels."""
+        """The sheet's arrays as the kernels take them."""
         return self.inverse, self.offset_m, self.x_stripe_px, self.x_end_px, self.start_px, self.step
 
     def touch(self, u: Array, v: Array, first_row: int, last_row: int) -> None:
@@ -82,7 +86,7 @@ class LightSheet:
 def empty_sheet(planes: Array, rows: int, time_s: float = 0.0, bowed: LightSheets | None = None) -> LightSheet:
     """A sheet that has not been traced on any row yet. planes: (4,) nx, ny, nz, d of all rows, or (rows, 4).
 
-    bowed: (rows,) sheets whose planes these are, None where they are flat.
+    bowed: (rows,) the bowed sheets that the planes belong to, None if they are flat.
     """
     planes = np.array(planes if planes.ndim == 2 else planes[None])
     offset = planes[:, 3]
@@ -102,10 +106,12 @@ SPAN_PX = 32
 
 @numba.njit(cache=True, nogil=True)
 def trace_rows(u: Array, v: Array, surface: Array, bounds: Array, sheet: Traced, first_row: int, last_row: int) -> None:
-    """Trace rows first_row..last_row-1 of a sheet: write where its stripe, its end and its way are on each of them.
+    """Trace rows first_row..last_row-1 of a sheet, and write where its stripe and its end are and which way its light
+    goes.
 
     surface: inverse depth of the scene (rows, width), 0 = open sky. bounds: see `span_bounds`. step is +1 where the
-    light travels towards larger x (scanner on the left)."""
+    light travels towards larger x (scanner on the left).
+    """
     plane, _, x_stripe, x_end, start, step = sheet
     width = u.shape[1]
     for y in range(first_row, last_row):
@@ -156,8 +162,9 @@ def trace_rows(u: Array, v: Array, surface: Array, bounds: Array, sheet: Traced,
 
 @numba.njit(cache=True)
 def span_bounds(u: Array, v: Array, surface: Array) -> Array:
-    """Least and largest u, least and largest v, and largest inverse depth of every span, (rows, spans, 5); infinite
-    inverse depth where a ray is NaN."""
+    """Smallest and largest u, smallest and largest v, and largest inverse depth of every span, (rows, spans, 5). The
+    inverse depth is infinite where a ray is NaN.
+    """
     rows, width = u.shape
     bounds = np.zeros((rows, -(-width // SPAN_PX), 5))
     bounds[:, :, 0], bounds[:, :, 1], bounds[:, :, 2], bounds[:, :, 3] = np.inf, -np.inf, np.inf, -np.inf

@@ -1,4 +1,4 @@
-"""The camera's view of a scene, per pixel, as the light transport needs it: rays, inverse depth, facets, albedo."""
+"""The camera's view of a scene, pixel by pixel, as needed for tracing the light: rays, inverse depth, facets, albedo."""
 
 from collections.abc import Callable
 from dataclasses import dataclass, field
@@ -15,11 +15,12 @@ Moves = Callable[["CameraView", float], "CameraView"]
 
 @dataclass(frozen=True, slots=True, eq=False)
 class CameraView:
-    """Rays and surfaces on the camera's pixel grid. All maps float64 (rows, width).
+    """Rays and surfaces on the camera's pixel grid. All maps are float64 (rows, width).
 
     u, v: ray tangents, NaN where the lens has no inverse. u_x, v_x: their slopes per pixel along the row.
     surface: inverse depth in 1/m (0: nothing there). facet: (rows, width, 3), the plane m.X = 1 through each surface
-    point. albedo: 0..1. source_m: (3,) where the light leaves the mirror. motion: None where nothing moves."""
+    point. albedo: 0..1. source_m: (3,) where the light leaves the mirror. motion: None if nothing moves.
+    """
 
     u: Array
     v: Array
@@ -37,17 +38,17 @@ class CameraView:
         object.__setattr__(self, "bounds", span_bounds(self.u, self.v, self.surface))
 
     def at(self, time_s: float) -> "CameraView":
-        """The view at a time of the bench."""
+        """The view at a given time of the bench."""
         return self if self.motion is None else self.motion(self, time_s)
 
     @property
     def arrays(self) -> Arrays:
-        """The arrays that kernels take: u, v, u_x, v_x, facet, albedo and source_m."""
+        """The arrays as the kernels take them: u, v, u_x, v_x, facet, albedo and source_m."""
         return self.u, self.v, self.u_x, self.v_x, self.facet, self.albedo, self.source_m
 
     @property
     def rows(self) -> int:
-        """Image rows."""
+        """Number of image rows."""
         return int(self.u.shape[0])
 
     @property
@@ -62,7 +63,7 @@ class CameraView:
 
     @property
     def median_depth_m(self) -> float:
-        """Median depth of the surfaces in the picture; 0 where there is none."""
+        """Median depth of the surfaces in the picture; 0 if there is none."""
         lit = self.surface[self.surface > 0]
         return 1.0 / float(np.median(lit)) if len(lit) else 0.0
 
@@ -73,7 +74,7 @@ class CameraView:
         return sheet
 
     def trace(self, sheet: LightSheet, first_row: int, last_row: int) -> None:
-        """Trace rows first_row..last_row-1 of a sheet in place. Releases the GIL, but for sheets that bow."""
+        """Trace rows first_row..last_row-1 of a sheet in place. Releases the GIL, except for sheets that bow."""
         now = self.at(sheet.time_s)
         given = now.u, now.v, now.surface, now.bounds, sheet.traced, first_row, last_row
         trace_rows(*given)
@@ -92,7 +93,8 @@ def make_view(
 ) -> CameraView:
     """View of the surfaces through the model's camera. The model must know where its light comes from (`source_m`).
 
-    rays: the camera's tangents (u, v), where they are known already."""
+    rays: the camera's tangents (u, v), if already known.
+    """
     assert model.source_m is not None, "checked by the world"
     u, v = model.camera.tangents() if rays is None else rays
     u_x, v_x = _slope(u, 1), _slope(v, 1)

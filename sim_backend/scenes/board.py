@@ -1,8 +1,9 @@
 """Calibration boards in front of a wall.
 
-A pixel's albedo is the mean over its area, as a sensor's pixel sees print finer than itself: that of a few rays where
-it sees no edge of the print, else of many on a Fibonacci lattice that lies elsewhere in every pixel. Its depth is that
-of the ray through its centre. The wall is square to the camera's axis.
+A pixel's albedo is the mean over its area, as a real pixel averages print finer than itself. A few rays are enough for
+a pixel that contains no edge of the print; otherwise many rays are used, on a Fibonacci lattice that is placed
+differently in every pixel. Its depth is that of the ray through its centre. The wall is perpendicular to the camera's
+axis.
 """
 
 from collections.abc import Sequence
@@ -34,7 +35,7 @@ WALL_ALBEDO = 0.5
 
 @dataclass(frozen=True, slots=True, eq=False)
 class BoardAtPose:
-    """A board held at a pose. mirrored: printed the wrong way round."""
+    """A board held at a pose. mirrored: whether it is printed the wrong way round."""
 
     board: Board
     pose: BoardPose
@@ -54,7 +55,7 @@ class BoardAtPose:
 
 
 def load_boards(shown: Sequence[SceneBoard], folder: Path) -> list[BoardAtPose]:
-    """The boards of a scene file whose paths start at `folder`. DeviceError where a board's file is no board's."""
+    """The boards of a scene file whose paths start at `folder`. Raises DeviceError if a board's file cannot be used."""
     try:
         return [
             BoardAtPose(
@@ -69,7 +70,7 @@ def load_boards(shown: Sequence[SceneBoard], folder: Path) -> list[BoardAtPose]:
 
 
 def board_scene(u: Array, v: Array, boards: Sequence[BoardAtPose], wall_m: float) -> Surfaces:
-    """The boards, the nearer ones in front, before a wall `wall_m` away, for a camera of rays (u, v), (rows, width)."""
+    """The boards, nearer ones in front, before a wall `wall_m` away, for a camera of rays (u, v), each (rows, width)."""
     depth, albedo = np.full(u.shape, wall_m), np.full(u.shape, WALL_ALBEDO)
     slopes = [(np.gradient(tangent, axis=1), np.gradient(tangent, axis=0)) for tangent in (u, v)]
     for shown in sorted(boards, key=lambda one: -float(one.pose.position_m[2])):

@@ -3,13 +3,13 @@
 Henyey and Greenstein (1941): p(theta) = (1 - g^2) / (4 pi (1 + g^2 - 2 g cos theta)^1.5), in 1/sr, of integral 1 over
 all directions and mean cosine g; at 180 degrees (1 - g) / (4 pi (1 + g)^2).
 
-Rain (Marshall and Palmer 1948): N(D) = 8000 exp(-L D) per m^3 and mm, L = 4.1 R^-0.21 /mm; twice the cross-section is
-taken out (diffraction included), so sigma = 2 (pi/4) 8000 2/L^3 mm^2/m^3 = 3.65e-4 R^0.63 /m; fall speed 9.65 - 10.3
-exp(-0.6 D) m/s (Atlas, Srivastava and Sekhon 1973).
+Rain (Marshall and Palmer 1948): N(D) = 8000 exp(-L D) per m^3 and mm, L = 4.1 R^-0.21 /mm. Drops take out twice their
+cross-section (diffraction included), so sigma = 2 (pi/4) 8000 2/L^3 mm^2/m^3 = 3.65e-4 R^0.63 /m. Fall speed:
+9.65 - 10.3 exp(-0.6 D) m/s (Atlas, Srivastava and Sekhon 1973).
 
-Snow (Gunn and Marshall 1958), by melted diameter: N(D) = 3800 R^-0.87 exp(-L D), L = 2.55 R^-0.48 /mm; a flake has 4.5
-times its melted cross-section and falls at 1.6 (D/10)^0.31 m/s (aggregates of dendrites, Langleben 1954). R in mm/h of
-water, D in mm.
+Snow (Gunn and Marshall 1958), by melted diameter: N(D) = 3800 R^-0.87 exp(-L D), L = 2.55 R^-0.48 /mm. A flake has 4.5
+times its melted cross-section and falls at 1.6 (D/10)^0.31 m/s (aggregates of dendrites, Langleben 1954). R is in mm/h
+of water, D in mm.
 """
 
 import math
@@ -63,19 +63,19 @@ def henyey_greenstein(cosine: float, g: float) -> float:
 
 
 class Section(BaseModel):
-    """Part of a config or a scene file: unknown keys are refused."""
+    """Part of a config or a scene file. Unknown keys are refused."""
 
     model_config = ConfigDict(extra="forbid", frozen=True)
 
 
 class Fog(Section):
-    """Fog by how far one sees in it (2 % contrast)."""
+    """Fog, given by its visibility (2 % contrast)."""
 
     visibility: Annotated[Metres, Field(gt=0, examples=["30 m"])]
 
 
 class Smoke(Section):
-    """Smoke by its extinction or by how far one sees in it (2 % contrast)."""
+    """Smoke, given by its extinction or its visibility (2 % contrast)."""
 
     extinction: Annotated[PerMetre, Field(gt=0)] | None = Field(default=None, examples=["0.5 /m"])
     visibility: Annotated[Metres, Field(gt=0)] | None = Field(default=None, examples=["30 m"])
@@ -145,7 +145,7 @@ class Medium(Section):
 
     @property
     def extinction_per_m(self) -> float:
-        """Extinction coefficient in 1/m, of light that must not be turned at all."""
+        """Extinction coefficient in 1/m of light that must not be deflected at all."""
         seen = self.fog or self.smoke
         if seen is not None and seen.visibility is not None:
             return KOSCHMIEDER / seen.visibility
@@ -160,12 +160,12 @@ class Medium(Section):
 
     @property
     def forward_per_m(self) -> float:
-        """The part of the scattering that only turns light a little, in 1/m."""
+        """The part of the scattering coefficient that deflects light only a little, in 1/m."""
         return self.forward_share * self.scattering_per_m
 
     @property
     def phase_terms(self) -> tuple[tuple[float, float], ...] | None:
-        """(weight, g) of the Henyey-Greenstein terms; None: `backscatter` at all angles near 180 degrees."""
+        """(weight, g) of the Henyey-Greenstein terms; None if `backscatter` holds at all angles near 180 degrees."""
         if self.phase is None:
             return None
         if isinstance(self.phase, str):
@@ -206,7 +206,7 @@ class Sizes:
     slope_per_mm: float
 
     def density_per_m3(self, above_mm: float = 0.0) -> float:
-        """Number of particles above a diameter."""
+        """Number of particles per m^3 above a diameter."""
         return self.n0_per_m3_mm / self.slope_per_mm * math.exp(-self.slope_per_mm * above_mm)
 
     @property
@@ -216,7 +216,7 @@ class Sizes:
 
 
 class Rain(Section):
-    """Rain by the water that falls."""
+    """Rain, given by the amount of water that falls."""
 
     rate: Annotated[MetresPerHour, Field(gt=0, le=0.3, examples=["20 mm/h"])]
     backscatter: PerSteradian = DROPLET_BACKSCATTER
@@ -235,16 +235,16 @@ class Rain(Section):
         return DIFFRACTION * self.sizes.area_per_m
 
     def back_m2_per_sr(self, diameter_mm: Array) -> Array:
-        """Light that a drop sends back, W/sr per W/m^2."""
+        """Light that a drop sends back, in W/sr per W/m^2."""
         return DIFFRACTION * _disc_m2(diameter_mm) * self.backscatter
 
     def fall_m_per_s(self, diameter_mm: Array) -> Array:
-        """Fall speed."""
+        """Fall speed of drops by diameter."""
         return np.asarray(np.maximum(9.65 - 10.3 * np.exp(-0.6 * diameter_mm), 0.0))
 
 
 class Snow(Section):
-    """Snow by the water that falls."""
+    """Snow, given by the amount of water that falls."""
 
     rate: Annotated[MetresPerHour, Field(gt=0, le=0.05, examples=["2 mm/h"])]
     albedo: float = Field(default=0.9, ge=0, le=1, examples=["0.9"])
@@ -263,11 +263,11 @@ class Snow(Section):
         return DIFFRACTION * FLAKE_AREA * self.sizes.area_per_m
 
     def back_m2_per_sr(self, diameter_mm: Array) -> Array:
-        """Light that a flake, a diffuse sphere, sends back, W/sr per W/m^2."""
+        """Light that a flake, a diffuse sphere, sends back, in W/sr per W/m^2."""
         return FLAKE_AREA * _disc_m2(diameter_mm) * self.albedo * LAMBERT_SPHERE_BACK
 
     def fall_m_per_s(self, diameter_mm: Array) -> Array:
-        """Fall speed."""
+        """Fall speed of flakes by melted diameter."""
         return np.asarray(1.6 * (diameter_mm / 10.0) ** 0.31)
 
 

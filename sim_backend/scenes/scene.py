@@ -1,4 +1,4 @@
-"""The scene file: surfaces, medium, weather, ambient light, motion; docs/reference/config.md says what keys mean."""
+"""The scene file: surfaces, medium, weather, ambient light, motion. docs/reference/config.md explains the keys."""
 
 import difflib
 import os
@@ -32,14 +32,14 @@ class AmbientLight(Section):
 
 
 class SceneMotion(Section):
-    """Motion of the surfaces, all of them together and straight on, from the bench's time 0 on."""
+    """Uniform motion of all surfaces together, from the bench's time 0 on."""
 
     velocity: tuple[MetresPerSecond, MetresPerSecond, MetresPerSecond] = Field(examples=["[0 m/s, 0 m/s, -2 m/s]"])
     """Velocity along x (right), y (down), z (away from the camera)."""
 
 
 class BoardPlace(Section):
-    """Pose of a calibration board, as `calibration.views.BoardPose` has it."""
+    """Pose of a calibration board, with the fields of `calibration.views.BoardPose`."""
 
     rotation: tuple[Radians, Radians, Radians] = Field(examples=["[20 deg, 0 deg, 0 deg]"])
     """Rotation vector; all 0: square to the camera's axis."""
@@ -92,12 +92,14 @@ class SceneFile(Section):
 
     @property
     def extinction_per_m(self) -> float:
-        """Extinction coefficient in 1/m of all that is in the air, 0 in clear air."""
+        """Extinction coefficient in 1/m of everything in the air, 0 in clear air."""
         return sum((part.extinction_per_m for part in (self.medium, self.rain, self.snow) if part is not None), 0.0)
 
     @property
     def diffuse_extinction_per_m(self) -> float:
-        """The same for light that may be turned a little on its way: what haze, airlight and ambient light feel."""
+        """Extinction coefficient in 1/m of light that may be deflected a little on its way: haze, airlight and ambient
+        light.
+        """
         return self.extinction_per_m - (0.0 if self.medium is None else self.medium.forward_per_m)
 
 
@@ -107,10 +109,12 @@ def bundled_scenes() -> tuple[str, ...]:
 
 
 def load_scene(name: str) -> tuple[SceneFile, Path]:
-    """The scene of a bundled name, a scene file or a folder of surfaces, and the folder its paths are relative to.
+    """A scene given by a bundled name, a scene file or a folder of surfaces; and the folder that its paths are relative
+    to.
 
-    A bare folder is its surfaces in clear, dark air. DeviceError where there is no such scene or it is wrong, a line
-    for each problem of its file."""
+    A folder alone means its surfaces in clear, dark air. Raises DeviceError if there is no such scene or its file is
+    wrong, with a line for each problem.
+    """
     bundled = SCENE_FOLDER / f"{name}.yaml"
     path = Path(name).expanduser()
     file = bundled if name in bundled_scenes() else path
@@ -131,7 +135,9 @@ def load_scene(name: str) -> tuple[SceneFile, Path]:
 
 
 def with_fog(scene: SceneFile, visibility: str) -> SceneFile:
-    """The scene in another fog: of that visibility (text with a unit), or CLEAR; how it scatters is as in the scene."""
+    """The scene with another fog: of the given visibility (text with a unit), or CLEAR. Its phase function stays the
+    same.
+    """
     if visibility == CLEAR:
         return scene.model_copy(update={"medium": None})
     fog = Fog(visibility=visibility)  # type: ignore[arg-type]
@@ -142,7 +148,7 @@ def with_fog(scene: SceneFile, visibility: str) -> SceneFile:
 
 
 def with_board_at(scene: SceneFile, place: BoardPlace) -> SceneFile:
-    """The scene with its board, the first where there are several, held elsewhere. DeviceError where there is none."""
+    """The scene with its board, or the first of several, moved to another place. Raises DeviceError if it has no board."""
     if not scene.boards:
         raise DeviceError(
             "board_pose moves the board of a scene, this one has none; choose a scene with 'surfaces: board'"
@@ -152,7 +158,7 @@ def with_board_at(scene: SceneFile, place: BoardPlace) -> SceneFile:
 
 
 def load_surfaces(scene: SceneFile, folder: Path, u: Array, v: Array) -> Surfaces:
-    """The scene's surfaces for the rays (u, v), each (rows, width); relative folders start at `folder`."""
+    """The scene's surfaces as seen along the rays (u, v), each (rows, width). Relative folders start at `folder`."""
     if scene.surfaces == "street":
         from sim_backend.scenes.street import street
 
@@ -170,9 +176,9 @@ def load_surfaces(scene: SceneFile, folder: Path, u: Array, v: Array) -> Surface
 
 
 def load_folder(folder: Path, size: tuple[int, int]) -> Surfaces:
-    """Surfaces of a folder for a camera of size (rows, width). DeviceError where it holds no scene of that size.
+    """Surfaces from a folder for a camera of size (rows, width). Raises DeviceError if it holds no scene of that size.
 
-    `world.npz` holds `depth_m`, `albedo` and, where some depths were guessed, `trusted`.
+    `world.npz` holds `depth_m`, `albedo` and, if some depths were guessed, `trusted`.
     """
     path = folder / WORLD_FILE
     if not path.is_file():

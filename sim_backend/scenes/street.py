@@ -1,6 +1,6 @@
 """The built-in street: road and pavement, a house front, a wall across the end, a lamp post, people, a parked car.
 
-Made by formula for whatever camera looks at it, depth about 1.5 to 8 m. The camera stands 1.3 m above the road.
+It is computed for whatever camera looks at it, with depths of about 1.5 to 8 m. The camera stands 1.3 m above the road.
 Frame: x right, y down, z forward, metres.
 """
 
@@ -22,7 +22,7 @@ END_Z = 7.6
 
 
 def street(u: Array, v: Array) -> Surfaces:
-    """The street seen along rays (u, v), each float64 (rows, width). Rays without a direction (NaN) look straight
+    """The street as seen along rays (u, v), each float64 (rows, width). Rays without a direction (NaN) look straight
     ahead.
     """
     u, v = np.nan_to_num(u), np.nan_to_num(v)

@@ -1,8 +1,9 @@
-"""Bodies and surfaces: rays against simple bodies, depth and albedo on the camera's pixel grid, procedural texture.
+"""Bodies and surfaces: where rays meet simple bodies, depth and albedo on the camera's pixel grid, procedural texture.
 
-Bodies are convex solids, upright cylinders and ellipsoids; a ray gives the depth z, inf where it misses. A ray is t (u,
-v, 1), so t is the depth z itself. Frame: x right, y down, z forward, metres. Depth and albedo by pixel are all that a
-2.5-D world is made of. Texture is smooth noise from hashed lattice points, the same on every machine.
+Bodies are convex solids, upright cylinders and ellipsoids. The functions return the depth z at which a ray meets the
+body, inf if it misses. A ray is t (u, v, 1), so t is the depth z itself. Frame: x right, y down, z forward, metres. A
+2.5-D world consists only of depth and albedo by pixel. Texture is smooth noise from hashed lattice points, the same on
+every machine.
 """
 
 from collections.abc import Sequence
@@ -19,7 +20,7 @@ Face = tuple[float, float, float, float]
 
 
 def convex(u: Array, v: Array, faces: Sequence[Face]) -> Array:
-    """Depth of the solid {X: n.X <= d for all faces}."""
+    """Depth at which rays meet the solid {X: n.X <= d for all faces}."""
     enter, leave = np.full_like(u, 1e-6), np.full_like(u, np.inf)
     for nx, ny, nz, d in faces:
         along = nx * u + ny * v + nz
@@ -32,13 +33,13 @@ def convex(u: Array, v: Array, faces: Sequence[Face]) -> Array:
 
 
 def box(u: Array, v: Array, x: tuple[float, float], y: tuple[float, float], z: tuple[float, float]) -> Array:
-    """Depth of an axis-parallel box."""
+    """Depth at which rays meet an axis-parallel box."""
     faces = [(1, 0, 0, x[1]), (-1, 0, 0, -x[0]), (0, 1, 0, y[1]), (0, -1, 0, -y[0]), (0, 0, 1, z[1]), (0, 0, -1, -z[0])]
     return convex(u, v, faces)
 
 
 def post(u: Array, v: Array, x: float, z: float, radius: float, y: tuple[float, float]) -> Array:
-    """Depth of the mantle of an upright cylinder between two heights."""
+    """Depth at which rays meet the mantle of an upright cylinder between two heights."""
     a, b, c = u * u + 1, x * u + z, x * x + z * z - radius * radius
     root = b * b - a * c
     with np.errstate(invalid="ignore"):
@@ -47,7 +48,7 @@ def post(u: Array, v: Array, x: float, z: float, radius: float, y: tuple[float, 
 
 
 def ellipsoid(u: Array, v: Array, centre: tuple[float, float, float], half: tuple[float, float, float]) -> Array:
-    """Depth of an ellipsoid with half axes along x, y, z."""
+    """Depth at which rays meet an ellipsoid with half axes along x, y, z."""
     du, dv, dw = u / half[0], v / half[1], np.full_like(u, 1 / half[2])
     cx, cy, cz = (c / h for c, h in zip(centre, half, strict=True))
     a, b = du * du + dv * dv + dw * dw, du * cx + dv * cy + dw * cz
@@ -71,7 +72,7 @@ class Surfaces:
 
 
 def checked(name: str, depth_m: object, albedo: object, trusted: object, size: tuple[int, int]) -> Surfaces:
-    """Surfaces from arrays of any float type. DeviceError where one is impossible; size is (rows, width)."""
+    """Surfaces from arrays of any float type. Raises DeviceError if a value is impossible. size: (rows, width)."""
     depth, light = np.asarray(depth_m, dtype=np.float32), np.asarray(albedo, dtype=np.float32)
     trust = np.asarray(trusted, dtype=bool)
     for key, array in (("depth_m", depth), ("albedo", light), ("trusted", trust)):

@@ -1,11 +1,11 @@
-"""The simulated world behind emulated devices: real drivers on emulated wires, one scene in front of them.
+"""The simulated world behind emulated devices: real drivers on emulated wires, with one scene in front of them.
 
     rig -> real driver -> pyusb, pyserial -> emulated bus, pseudo terminal -> device model
                                                                                 |
     light = laser's emission AND sync source's gate; mirror = scanner's output; frames = SPAD's exposures
 
-Everything runs in the host's time. Frames are drawn when the host takes them, of what the rig did while they were
-exposed; the SPAD's memory has room for a simulation that takes longer than that.
+Everything runs in the host's time. Frames are drawn when the host takes them, from what the rig did while they were
+exposed. If the simulation takes longer than that, they wait in the SPAD's memory.
 """
 
 import os
@@ -55,15 +55,15 @@ KEPT_FRAMES = 1_000_000_000
 
 
 class UsbBus(Protocol):
-    """A USB bus, in this process or for other ones."""
+    """A USB bus, either in this process or one that other processes can use."""
 
     def plug(self, model: UsbModel) -> AttachedDevice:
-        """Attach a model."""
+        """Attach a model to the bus."""
         ...
 
 
 class EmulatedWorldConfig(WorldConfig):
-    """Config of the world with emulated devices; `port: emulated:laser`, `gate`, `scanner`, `spad` mean them."""
+    """Config of the world with emulated devices, whose ports are `emulated:laser`, `gate`, `scanner` and `spad`."""
 
     real_time: ClassVar[bool] = True
 
@@ -77,10 +77,10 @@ class EmulatedWorldConfig(WorldConfig):
 
 
 class EmulatedWorld(SimulatedWorld):
-    """One scene and the devices that look at it, plugged in from its creation to `close`."""
+    """One scene and the devices that look at it. They are plugged in from its creation to `close`."""
 
     def __init__(self, config: EmulatedWorldConfig, surroundings: Surroundings, bus: UsbBus | None = None) -> None:
-        """DeviceError where the geometry or the scene cannot be used.
+        """Raises DeviceError if the geometry or the scene cannot be used.
 
         bus: where the USB devices are plugged in, and who closes it is its maker; by default one within this process.
         """
@@ -119,7 +119,7 @@ class EmulatedWorld(SimulatedWorld):
             self._wires.append(wire)
 
     def close(self) -> None:
-        """Unplug everything and end the threads; again: nothing happens."""
+        """Unplug everything and end the threads; a second call does nothing."""
         for wire in self._wires:
             wire.close()
         self._frames.close()
@@ -137,9 +137,10 @@ class EmulatedWorld(SimulatedWorld):
             source.expose(0, held, power_w, x0, bits, np.zeros(1))
 
     def during(self, start_s: Array, exposure_s: float, period_s: float) -> tuple[BenchState, Array]:
-        """Events during frames that start at start_s (n,), ascending, one period apart, and the laser's power.
+        """State of the bench during frames that start at start_s (n,), ascending, one period apart, and the laser's
+        power.
 
-        Times are the host's; power_w (n,) of each exposure's middle.
+        Times are the host's. power_w: (n,), in the middle of each exposure.
         """
         middle, until_s = start_s + 0.5 * exposure_s, float(start_s[-1]) + period_s
         history, lag = self.scanner.history, self.model.lag_s
@@ -160,9 +161,9 @@ class EmulatedWorld(SimulatedWorld):
         return BenchState(mirror, unknown, share, edge, backward, line_s, scan_s, float(power_w[0])), power_w
 
     def light(self, from_s: float, until_s: float) -> list[tuple[float, float]]:
-        """(start, end) of every time with light in [from_s, until_s], ascending: emission AND gate.
+        """(start, end) of every period with light (emission AND gate) in [from_s, until_s], ascending.
 
-        Of the host's time, at most until now; the last `KEPT_S` are known.
+        Times are the host's, at most until now; only the last `KEPT_S` are known.
         """
         with self.gate_wire.lock:
             self.sync.advance(until_s)
@@ -180,12 +181,12 @@ class EmulatedWorld(SimulatedWorld):
         return found
 
     def emission(self) -> list[tuple[float, float]]:
-        """(time, power) of every change of what would come out through an open gate, in W; the first one is 'never'."""
+        """(time, power) of every change of the power in W behind an open gate. The first entry has the time 'never'."""
         with self._emission_lock:
             return list(self._emission)
 
     def mirror(self, time_s: Array) -> Array:
-        """Command, normalised, to which the scanner's output drives the mirror at times (n,)."""
+        """Normalised command to which the scanner's output drives the mirror at times (n,)."""
         with self.scanner_plug.lock:
             self.scanner.advance(float(time_s[-1]))
             return self.scanner.history.command(time_s)
@@ -213,7 +214,7 @@ class EmulatedWorld(SimulatedWorld):
 
 
 class WorldFrames:
-    """The `FrameSource` of the emulated SPAD: the simulated world in front of it."""
+    """The `FrameSource` of the emulated SPAD, which takes its frames from the simulated world."""
 
     def __init__(self, world: EmulatedWorld) -> None:
         self._world = world
@@ -239,14 +240,14 @@ class WorldFrames:
         return sweep
 
     def whole(self, first_frame: int, start_s: float, period_s: float, n: int) -> NDArray[np.uint8]:
-        """Whole frames of a SPAD without records, exposed all of their period; upright, (n, height, row bytes)."""
+        """Whole frames of a SPAD without records, exposed during their entire period; upright, (n, height, row bytes)."""
         rows, width = self._world.size
         bits = np.zeros((n, rows, packed_row_bytes(width)), np.uint8)
         self.expose(Span(first_frame, n, start_s, period_s, period_s, None), np.zeros(n, FRAME_RECORD), bits)
         return bits
 
     def close(self) -> None:
-        """End the threads that draw; again: nothing happens."""
+        """End the drawing threads; a second call does nothing."""
         if self._photons is not None:
             self._photons.close()
             self._photons = None

@@ -1,4 +1,5 @@
-"""The stripe table of `joint`, compiled: light of each answer, and how probably it lies within a pixel of a stripe.
+"""The stripe table of `joint`, compiled: light of each answer, and the probability that it lies within a pixel of a
+stripe.
 
 Three things can be wrong with an answer, and each has its factor:
 
@@ -7,30 +8,32 @@ Three things can be wrong with an answer, and each has its factor:
                / (1 + exp(C - D ln contrast' + hole            there is no stripe: haze ends, nothing shines
                           + g (E - F ln odds) + H ((1 - g)^2 missing + e unseen)))
 
-- margin: by how much the next best place is worse, or what neighbours say for this one where there was a vote, over
-  UNITS of cost. apart: share of the pairs of opposite neighbours that put the answer elsewhere (`apart_row`).
+- margin: how much worse the next best place is or, after a vote, how much neighbours favour this one, in cost over
+  UNITS. apart: share of the pairs of opposite neighbours that put the answer elsewhere (`apart_row`).
 - contrast: light that 3 x 3 neighbours on the surface have in common above the *whole* haze before the stripe, over its
-  noise; contrast' = max(contrast + 3, 1). Where haze just ends, an answer can lie a little before the end, and half of
-  the haze would pass for light. hole: by how much contrast is below -FAR_BELOW, 30 at most.
-- odds: of answers around that agree to those that do not. They count as far as there is haze, g = k / (k + SOME_HAZE),
-  k photons of it in all exposures: in clear air nothing but a stripe makes a margin, and small things, whose
-  surroundings do not agree, are as sure as others.
-- missing: max(ln((1 + bright) / (1 + light)) - DARKER - CLEARLY max(contrast, 0), 0), light: photons of all that
-  contrast sums, bright: what the model's largest amplitude would bring. Where a dark stripe would still shine, no light
-  is no stripe, and light over its noise cannot tell that.
+  noise; contrast' = max(contrast + 3, 1). If haze merely ends, an answer can lie a little before the end, and half of
+  the haze would be taken for light. hole: by how much contrast is below -FAR_BELOW, 30 at most.
+- odds: ratio of answers around that agree to those that do not. They count in proportion to the haze, g = k / (k +
+  SOME_HAZE) with k photons of it in all exposures. In clear air only a stripe gives a margin, and small things, whose
+  surroundings do not agree, are as certain as others.
+- missing: max(ln((1 + bright) / (1 + light)) - DARKER - CLEARLY max(contrast, 0), 0), with light: photons of all pixels
+  in the contrast, bright: photons for the model's largest amplitude. If even a dark stripe would be visible, the
+  absence of light means that there is no stripe, which light over its noise cannot show.
 - unseen: max(AT_END - CLEARLY max(contrast, 0), 0), with e = 1 up to 1 px from the far end of the depth range and 0
-  from 3 px on. Haze that goes on ends there for want of places, so evenly that answers agree.
+  from 3 px on. Haze that continues beyond the range seems to end there, so evenly that answers agree.
 
-Agreement tells a surface from nothing at all: where there is no stripe every row finds what its noise looks most like,
-and four paths tie those answers into streaks but not into surfaces. Each answer has a number of 5 x 5 neighbours on the
-same surface (`count_neighbours`); odds come from the sum of these numbers over 7 x 7 answers (`agreement_row`). Thin
-and slanted things have few such neighbours, but a wrong answer is mostly not where those opposite each other put it.
+Agreement distinguishes a surface from nothing at all. Without a stripe every row finds the place where its noise looks
+most like one, and four paths tie those answers into streaks but not into surfaces. Each answer has a number of 5 x 5
+neighbours on the same surface (`count_neighbours`); odds come from the sum of these numbers over 7 x 7 answers
+(`agreement_row`). Thin and slanted things have few such neighbours, but a wrong answer is usually not where those
+opposite each other put it.
 
 Arrays are float32 (rows, columns), numbers of neighbours int16. Source of the constants: WIDER, B, C, D, E and F are
-fitted by maximum likelihood to random cluttered scenes of a second simulator, K = 1 to 30 in air and fog, all answers
-counted. A and G are chosen on random scenes of the tests' simulator: fitted ones believe stripes too little where there
-is no doubt about haze. H, DARKER, CLEARLY and AT_END are chosen by the likelihood of random scenes that are open to the
-sky in part (`tests.reference.tables.open_scenes`): larger ones take too much from dim stripes in clear air.
+fitted by maximum likelihood to random cluttered scenes of a second simulator, K = 1 to 30 in air and fog, with all
+answers counted. A and G are chosen on random scenes of the tests' simulator, since fitted values trust stripes too
+little where haze is not in question. H, DARKER, CLEARLY and AT_END are chosen by the likelihood of random scenes that
+are partly open to the sky (`tests.reference.tables.open_scenes`); larger values take too much from dim stripes in clear
+air.
 """
 
 import math
@@ -62,9 +65,9 @@ ASKED: Final = 4 * len(OPPOSITE)
 
 
 class Neighbours(NamedTuple):
-    """Numbers of neighbours on the surface of each answer, and numbers of pairs that can be asked.
+    """Number of neighbours on the surface of each answer, and number of pairs that can be compared.
 
-    number: int16 (rows, columns) with AROUND rows and LANES columns around, 0 there. pairs: of `pairs_to_ask`.
+    number: int16 (rows, columns) with a margin of AROUND rows and LANES columns that holds 0. pairs: of `pairs_to_ask`.
     """
 
     number: Int16
@@ -72,15 +75,15 @@ class Neighbours(NamedTuple):
 
 
 def new_neighbours(pairs: Float32) -> Neighbours:
-    """Room for a map with so many pairs to ask."""
+    """Memory for the neighbours of a map. pairs: of `pairs_to_ask`."""
     rows, columns = pairs.shape
     return Neighbours(np.zeros((rows + 2 * AROUND, (-(-columns // LANES) + 2) * LANES), np.int16), pairs)
 
 
 def pairs_to_ask(there: Bools) -> Float32:
-    """Number of pairs of neighbours around each place (rows, columns) that are both there; at least 1.
+    """Number of pairs of neighbours around each place (rows, columns) that both exist; at least 1.
 
-    there: whether a place is searched and has frames; others have no say.
+    there: whether a place is searched and has frames; other places do not count.
     """
     weight = there.astype(np.float32)
     return np.maximum(_around(weight * _around(weight, NEIGHBOURS), AROUND), np.float32(1))
@@ -94,7 +97,9 @@ def _around(number: Float32, reach: int) -> Float32:
 
 @numba.njit(cache=True, nogil=True)
 def count_neighbours(distance: Float32, first_row: int, last_row: int, out: Neighbours) -> None:
-    """Fill number of rows first_row..last_row-1; distance: (rows, columns) of answers from the far end, NaN: none."""
+    """Fill the numbers of rows first_row..last_row-1; distance: (rows, columns) of answers from the far end, NaN if
+    none.
+    """
     for band in range(first_row, last_row, COPIED_ROWS):
         end = min(band + COPIED_ROWS, last_row)
         copy = with_margin(distance, band, end)
@@ -117,9 +122,9 @@ def _count_row(distance: Float32, row: int, number: Int16) -> None:
 
 @numba.njit(cache=True, nogil=True)
 def agreement_row(number: Int16, y: int, line: Int16, out: Float32) -> None:
-    """Write the pairs that agree around each answer of row y.
+    """Write the number of pairs that agree around each answer of row y.
 
-    number: as in `Neighbours`; line: as wide, room whose margins are 0.
+    number: as in `Neighbours`; line: working memory of the same width, whose margins are 0.
     """
     columns = number.shape[1] - 2 * LANES
     own = line[LANES:]
@@ -137,7 +142,7 @@ def agreement_row(number: Int16, y: int, line: Int16, out: Float32) -> None:
 
 @numba.njit(cache=True, nogil=True)
 def apart_row(placed: Float32, row: int, out: Float32) -> None:
-    """Write the pairs of opposite neighbours whose mean is not within SAME_PX of the answer between them.
+    """Write the number of pairs of opposite neighbours whose mean is not within SAME_PX of the answer between them.
 
     placed: a copy `with_margin` of final distances; row: of the copy.
     """
@@ -158,9 +163,9 @@ def light_row(
     distance: Float32, light: Float32, row: int, number: Float32,
     total: Float32,
 ) -> None:  # fmt: skip
-    """Write numbers of 3 x 3 neighbours on the surface of each answer of a row, and their light.
+    """Write the number of 3 x 3 neighbours on the surface of each answer of a row, and their total light.
 
-    distance, light: copies `with_margin`; row: of theirs.
+    distance, light: copies `with_margin`; row: of these copies.
     """
     columns, nothing = distance.shape[1] - 2 * LANES, np.float32(0.0)
     own = distance[row, LANES:]
@@ -222,7 +227,8 @@ def confidences(
 ) -> None:  # fmt: skip
     """Fill confidence, signal and haze of rows first_row..last_row-1, all (rows, columns).
 
-    Where x_px is NaN the confidence is 0 and the others, sd_px too, are made NaN. Neighbours must have been counted.
+    Where x_px is NaN the confidence is set to 0 and the others, including sd_px, to NaN. `count_neighbours` must have
+    run.
     """
     nothing = np.float32(np.nan)
     # Local names: each use of the tuple itself in the loop would count references to all of its arrays.
@@ -345,7 +351,7 @@ def stripe_table(
     x_px: Float32, sd_px: Float32, n_frames: Int32, answer: LabelAnswers, places: Places, pairs: Float32,
     bright: Brightness, workers: RowWorkers,
 ) -> StripeTable:  # fmt: skip
-    """The table of a map; arrays (rows, columns), x_px NaN where there are no data. pairs: of `pairs_to_ask`."""
+    """The stripe table of a map; arrays (rows, columns), x_px NaN without data. pairs: of `pairs_to_ask`."""
     confidence, signal, haze = (np.empty_like(x_px) for _ in range(3))
     neighbours = new_neighbours(pairs)
 

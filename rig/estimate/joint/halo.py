@@ -1,25 +1,25 @@
 """Learns haze and halo from the stripes of a sweep: the light of each stripe first, then one linear fit.
 
-The light of stripes (`likeliest_light`). A halo is told by what a stripe brings beside itself, over its own light. The
-light of `rig.estimate.joint.place.light` adds up each pixel's own flux, which ends where pixels are full: bright
-stripes would pass for dimmer ones with so much more halo. Here the counts n of K frames of all pixels around a stripe
-and around its 5 x 5 neighbours on the same surface are explained by one amplitude a,
+The light of stripes (`likeliest_light`). A halo is measured by the light beside a stripe, relative to the stripe's own
+light. The light of `rig.estimate.joint.place.light` adds up each pixel's own flux, which is limited when pixels
+saturate; bright stripes would be taken for dimmer ones with a stronger halo. Here the counts n of K frames of all
+pixels around a stripe and around its 5 x 5 neighbours on the same surface are explained by one amplitude a,
 
     flux = base + a scale (share + glow),   log-likelihood = sum n log(1 - exp(-flux)) - (K - n) flux
 
-with haze and ambient light as base. It is concave in a; Newton's steps come from below, since the slope is convex. Full
-pixels tell nothing, those beside them do. Where the amplitude is hardly more than its noise, or neighbours do not agree
-on it, the light of a stripe is not known, and it teaches nothing.
+with haze and ambient light as base. It is concave in a. Newton's steps start from below, since the slope is convex.
+Saturated pixels give no information, those beside them do. If the amplitude is hardly more than its noise, or
+neighbours do not agree on it, the light of a stripe is unknown and the stripe is not used.
 
-The fit (`add_equations`, `solve`). What is counted beside a stripe of s photons, at the distance d along the row, is
+The fit (`add_equations`, `solve`). The counts beside a stripe of s photons, at the distance d along the row, show
 
     flux = ambient + offset + G haze(w)                 before the stripe
          = ambient + offset + share(w) G haze(w)        behind it,      on both sides + s rho(w, d)
 
 with rho as in `rig.estimate.row.inputs`. That is linear in haze (BINS), share (HALO_NODES), halo (HALO_NODES, reaches)
-and offset, so that one weighted fit of least squares (float64, no number negative) tells them apart: the halo follows
-the brightness of each stripe, haze does not. Means over the pixels behind and before stripes could not do that. Later
-maps are asked whether there still is a halo, or one now.
+and offset, so one weighted least squares fit (float64, no number negative) separates them: the halo follows the
+brightness of each stripe, the haze does not. Means over the pixels behind and before stripes could not do that. Later
+maps are tested for whether a halo is still there, or has appeared.
 """
 
 import math
@@ -67,11 +67,11 @@ def add_equations(
     lines: Lines, light: Float32, sweep: Sweep, state: RowState, halo: Float32, hot_flux: float, first_line: int,
     last_line: int, matrix: Float64, right: Float64,
 ) -> None:  # fmt: skip
-    """Add the normal equations of lines first_line..last_line-1, weighted as the present state expects counts.
+    """Add the normal equations of lines first_line..last_line-1, weighted by the counts that the present state expects.
 
-    Unknown: haze in each profile bin; its share behind the stripe at each node; halo at each node and reach; ambient
-    light that the state has too little of. halo: (BINS, pixels) of `halo_shares`; light: of each line's stripe at its
-    x_px, photons. Only one half of the matrix is filled, rows from columns on.
+    Unknowns: haze in each profile bin; its share behind the stripe at each node; halo at each node and reach; ambient
+    light missing in the state. halo: (BINS, pixels) of `halo_shares`; light: of each line's stripe at its x_px,
+    photons. Only one half of the matrix is filled, rows from columns on.
     """
     bins, number = state.profile.shape[0], len(_REACHES)
     first_share, first_halo, last = bins, bins + HALO_NODES, matrix.shape[0] - 1
@@ -125,7 +125,9 @@ def add_equations(
 
 @numba.njit(cache=True, nogil=True)
 def solve(matrix: Float64, right: Float64, free: int) -> Float64:
-    """The x that minimises x' matrix x - 2 right' x, no number below 0 but number `free`; one number at a time."""
+    """The x that minimises x' matrix x - 2 right' x with no number below 0 except number `free`, found one number at a
+    time.
+    """
     x, slope = np.zeros_like(right), -right
     for _ in range(MOST_SWEEPS):
         largest = 0.0
@@ -166,7 +168,7 @@ def likeliest_light(
     counts: Counts, n_frames: Int32, sweep: Sweep, state: RowState, shares: Float32, x_px: Float32, places: Places,
     rows: Int32, columns: Int32, first_line: int, last_line: int, light: Float32, known: Bools,
 ) -> None:  # fmt: skip
-    """Fill light, photons per exposure, and known of stripes first_line..last_line-1 of those at (rows, columns).
+    """Fill light, photons per exposure, and known for stripes first_line..last_line-1 of those at (rows, columns).
 
     counts: (columns, rows, window); shares: of `profile_table`; x_px: (rows, columns), of all stripes.
     """
@@ -244,7 +246,7 @@ _SIZE = _HALO + HALO_NODES * len(HALO_REACHES_PX) + 1
 
 
 class BrightLines(NamedTuple):
-    """Lines with a clear stripe, which can teach of a halo, and the light of each stripe in photons."""
+    """Lines with a clear stripe, from which a halo can be learned, and the light of each stripe in photons."""
 
     lines: Lines
     light: Float32
@@ -271,9 +273,9 @@ def learn_first_halo(
     volume: CountVolume, geometry: SweepGeometry, model: RowModel, ambient: Float32, tables: JointTables,
     stripes: StripeTable, places: Places, workers: RowWorkers,
 ) -> RowModel:  # fmt: skip
-    """The first map's model with the halo of `learn_halo`; to be called again with the map that is made under it.
+    """The first map's model with the halo of `learn_halo`. Call it again with the map that is made with that model.
 
-    With several lines at once the model stays as it is: the other lines' haze would be taken for a halo.
+    With several lines at once the model stays as it is, since the other lines' haze would be taken for a halo.
     """
     if geometry.others is not None:
         return model
@@ -283,10 +285,10 @@ def learn_first_halo(
 
 
 def learn_next_halo(setting: LearningSetting, seen: BrightLines, workers: RowWorkers) -> RowModel:
-    """The model of a later lesson: with a halo where the map begins to show one, without where it shows none.
+    """The model of a later lesson. A halo is added when the map begins to show one, and removed when it shows none.
 
-    A halo that stays is left as it was found: learned anew from so few lines, lesson after lesson, halo, haze and the
-    level behind stripes drift against each other (in steady fog errors grow by 10 to 25 % in eight maps).
+    A halo that stays is not changed. If it were learned anew from so few lines in lesson after lesson, halo, haze and
+    the level behind stripes would drift against each other (in steady fog errors grow by 10 to 25 % in eight maps).
     """
     model = setting.model
     if setting.geometry.others is not None or (not model.halo.any() and np.isnan(model.extinction_per_m)):
@@ -298,10 +300,10 @@ def learn_next_halo(setting: LearningSetting, seen: BrightLines, workers: RowWor
 def learn_halo(
     seen: BrightLines, geometry: SweepGeometry, model: RowModel, ambient: Float32, workers: RowWorkers, *, dark: bool
 ) -> RowModel:
-    """The model with the halo that these stripes have, and the haze under it; without a halo where they have none.
+    """The model with the halo that these stripes show, and the haze under it; without a halo if they show none.
 
-    The scale of stripes stays that of the model, which their light goes by. ambient: of each pixel, (rows, width), that
-    the fit begins with. dark: whether there are dark frames.
+    The scale of stripes stays that of the model, on which their light is based. ambient: of each pixel, (rows, width),
+    the start value of the fit. dark: whether there are dark frames.
     """
     matrix, right = _equations(seen, geometry, replace(model, ambient=ambient), workers)
     free = -1 if dark else _SIZE - 1

@@ -1,12 +1,12 @@
 """Estimator `joint`: the row likelihood tied across rows and columns, for a whole map at a time.
 
 Each label (candidate position) of a row and column (`rig.estimate.joint.labels.grid`) gets a cost from the counts
-(`rig.estimate.joint.labels.costs`, a fast form of `rig.estimate.row.likelihood`), with the halo where there is one
-(`rig.estimate.joint.labels.halo_rows`) and the map before where that is asked for (`rig.estimate.joint.temporal`).
-Costs are tied to those of the neighbours along four paths (`rig.estimate.joint.paths`); weak answers are put to the
-vote of all neighbours (`rig.estimate.joint.vote`); the best label of each is placed between labels by what neighbours
-on its surface know (`rig.estimate.joint.place.place`), judged (`rig.estimate.joint.confidence`) and searched for a
-second line (`rig.estimate.joint.second_returns`). The model of light and medium is learned row by row first, as by
+(`rig.estimate.joint.labels.costs`, a fast form of `rig.estimate.row.likelihood`). It includes the halo, if there is one
+(`rig.estimate.joint.labels.halo_rows`), and the previous map, if requested (`rig.estimate.joint.temporal`). Costs are
+tied to those of the neighbours along four paths (`rig.estimate.joint.paths`); weak answers are decided by a vote of all
+neighbours (`rig.estimate.joint.vote`). The best label of each row and column is placed between labels with the help of
+neighbours on its surface (`rig.estimate.joint.place.place`), judged (`rig.estimate.joint.confidence`) and searched for
+a second line (`rig.estimate.joint.second_returns`). The model of light and medium is learned row by row first, as by
 `likelihood`, then from the map's own stripes.
 """
 
@@ -47,7 +47,7 @@ class Joint:
     """The row likelihood tied to the neighbours', with the state it has learned so far.
 
     Pass `model` to estimate a map again with the state that it was estimated with: the result is the same bit for bit.
-    learns: whether later maps change that state. temporal_prior: whether each map is held to the last one a little.
+    learns: whether later maps change that state. temporal_prior: whether the last map is a weak prior for the next.
     """
 
     def __init__(
@@ -64,7 +64,7 @@ class Joint:
 
     @property
     def model(self) -> RowModel | None:
-        """The state that the next map will be estimated with."""
+        """The state with which the next map will be estimated."""
         model, before = self._lessons.model, self._prior.before
         return model if model is None or before is None else replace(model, before=before)
 
@@ -74,15 +74,15 @@ class Joint:
         self._lessons.model = model if model.before is None else replace(model, before=None)
 
     def counter(self, layout: SweepLayout, geometry: SweepGeometry) -> Counter:
-        """A counter whose sweeps `estimate` takes; geometry: nominal, as of every sweep.
+        """A counter whose sweeps `estimate` takes. geometry: the nominal one, which holds for every sweep.
 
-        UsageError where its maps would take too much memory: before any light is let out.
+        Raises UsageError if its maps would take too much memory; no light has been let out by then.
         """
         grid_of(geometry)
         return SweepCounter(layout, self._workers)
 
     def estimate(self, sweep: CountVolume, geometry: SweepGeometry) -> StripeTable:
-        """Stripe table of one sweep; afterwards `model` is what the next sweep will be estimated with."""
+        """Stripe table of one sweep. Afterwards `model` is the state for the next sweep."""
         model = self._lessons.model_for(lambda: self._first_model(sweep, geometry))
         setting = LearningSetting(model, geometry, sweep.exposures, sweep.dark_counts is not None)
         tables = self._lessons.tables(setting, self._workers)

@@ -1,17 +1,18 @@
-"""Reads a map's answers and what they teach, compiled: positions, trust in each, and pixels quiet behind them.
+"""Reads a map's answers and what can be learned from them, compiled: positions, trust in each, and quiet pixels behind
+them.
 
-How far the lessons of the first map believe an answer (`fill_trust`, float32 (rows, columns)):
+The trust of the first map's lessons in an answer (`fill_trust`, float32 (rows, columns)) is
 
     trust = erf(3 px / (sqrt 2 sd)) / (1 + exp(A - B margin)) / (1 + C z^-D)
 
-This is the confidence of `rig.estimate.joint.confidence` but for z, the stripe's light over its noise, pooled over
-neighbours, above half of the haze; whether answers around agree does not count, and it asks for the right surface,
-within 3 px. Later lessons go by the table's confidence, for by then the model is known.
+This is the confidence of `rig.estimate.joint.confidence` with three changes: z is the stripe's light over its noise,
+pooled over neighbours, above half of the haze; agreement of answers around does not count; and it asks for the right
+surface, within 3 px. Later lessons use the table's confidence, since the model is known by then.
 
 B, C and D are fitted by maximum likelihood to lessons on random scenes of a second simulator, in clear air, thin and
-dense fog, under a halo and with hot pixels at 1 to 10 exposures, places without a stripe counted as wrong. A is half of
-its fitted value: lessons that believe so little teach worse, since an answer that is not believed goes by its own row,
-and those left out are those that show what the model does not know yet.
+dense fog, under a halo and with hot pixels at 1 to 10 exposures, with places without a stripe counted as wrong. A is
+half of its fitted value. Lessons with too little trust teach worse: a distrusted answer is judged by its own row alone,
+and the answers left out are those that show what the model does not know yet.
 """
 
 import math
@@ -72,10 +73,11 @@ def read_positions(
     x_far: Float64, n_frames: Int32, side: int, width: int, answer: LabelAnswers, first_row: int, last_row: int,
     x_px: Float32, distance: Float32,
 ) -> None:  # fmt: skip
-    """x_px (rows, columns) of the answers' labels, and its distance from x_far; NaN where there are no data.
+    """Fill x_px (rows, columns) of the answers' labels, and its distance from x_far; NaN without data.
 
-    An answer in the outer half of the first or last of `width` pixels loses its margin in `answer`: beyond it a stripe
-    is as dark as one that is not there, no label says so, and darkness makes the outermost one the best by far.
+    An answer in the outer half of the first or last of `width` pixels gets margin 0 in `answer`. A stripe beyond that
+    pixel is as dark as a missing one and has no label, so darkness makes the outermost label seem far better than all
+    others.
     """
     label, margin, nothing = answer.label, answer.margin, np.float32(np.nan)
     for y in range(first_row, last_row):
@@ -94,10 +96,10 @@ def add_quiet(
 ) -> None:  # fmt: skip
     """Add to quiet (2, rows, width) the ones and exposures of pixels behind clear stripes, of some columns.
 
-    Pixels without a ray are left out. halo: (BINS, pixels) of `halo_shares`, without pixels where there is none. With a
-    halo it is not dark behind a stripe of `signal` photons, and the expected halo and pedestal are taken off the ones.
-    Pixels where these are more than `most_light`, photons per exposure, are left out, and so are stripes that fill
-    their pixels, whose halo is brighter than it seems: what is not taken off would pass for ambient light.
+    Pixels without a ray are left out. halo: (BINS, pixels) of `halo_shares`, without pixels if there is none. With a
+    halo it is not dark behind a stripe of `signal` photons, and the expected halo and pedestal are subtracted from the
+    ones. Pixels where these exceed `most_light`, photons per exposure, are left out. So are stripes that saturate their
+    pixels: their halo is brighter than it seems, and the remainder would be taken for ambient light.
     """
     width = sweep.u.shape[1]
     for y in range(first_row, last_row):

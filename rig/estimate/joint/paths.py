@@ -6,12 +6,12 @@ Along a path, from the pixel q before p,
     m(p, l) = min(L(q, l), L(q, l +- 1) + P1, L(q, l +- 2) + P2, L(q, l +- 3) + P3, min L(q) + J) - min L(q)
 
 and the total of a label is C plus the messages m of the four paths, left, right, up and down (Hirschmueller, PAMI 30,
-2008, with steps of up to three labels). C, m and totals are uint8 (rows, columns, labels); all sums stop at 255.
-`along_rows` leaves the messages of two paths; `along_columns` adds the other two and reads answers off the totals
+2008, with steps of up to three labels). C, m and totals are uint8 (rows, columns, labels); all sums saturate at 255.
+`along_rows` leaves the messages of two paths; `along_columns` adds the other two and reads the answers from the totals
 (`rig.estimate.joint.winner`).
 
-Labels stay in order in memory and neighbours are unaligned loads from the first cache: shuffling them in registers
-gains nothing. Several paths are under way at once, because each step of a path waits for the one before.
+Labels stay in order in memory, and neighbours are unaligned loads from the first cache, since shuffling them in
+registers gains nothing. Several paths are processed at once, because each step of a path waits for the one before.
 """
 
 from typing import Final
@@ -129,7 +129,7 @@ def _along_row(cost: int, message: int, columns: int, labels: int, paths: int) -
 
 @numba.njit(cache=True, nogil=True)
 def along_rows(cost: Uint8, message: Uint8, first_row: int, last_row: int) -> None:
-    """Sums of the messages from the left and from the right, for rows first_row..last_row-1.
+    """Write the sums of the messages from the left and from the right, for rows first_row..last_row-1.
 
     cost, message: (rows, columns, labels), C-contiguous; labels: a multiple of VECTOR.
     """

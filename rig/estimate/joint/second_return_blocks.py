@@ -1,12 +1,12 @@
 """Sums of light over blocks of rows and columns at equal distances from the far end, compiled, for second returns.
 
 A block is BLOCK x BLOCK lines (rows of columns). Lines are added pixel by pixel of distance from the far end, without
-the pixels near their stripes: the ones counted, and those that haze and ambient light bring. With K frames of a line,
-q the probability that ambient light brings a pixel no one and c that haze brings none,
+the pixels near their stripes. Both the ones counted and those expected from haze and ambient light are added. With K
+frames of a line, q the probability that ambient light leaves a pixel without a count and c that haze does,
 
     ones expected = sum over lines K (1 - q c) = sum over columns K (number of lines - c sum q)
 
-so that lines only add up what is theirs, left and right of the stripe; the block's haze is multiplied with the sums.
+so that lines only add up their own parts, left and right of the stripe; the block's haze is multiplied with the sums.
 Sums are float32 (block rows, block columns, pixels of distance), sixteen pixels to a vector.
 """
 
@@ -69,7 +69,7 @@ def line_places(sweep: Sweep, x_far: Float64, side: int, pixels: int) -> Int16:
     """Places of the lines of all rows and columns, int16 (rows, columns, PLACES); made once per model.
 
     PLACE_X: x of pixel 0 of distance, the leftmost of `pixels`, NOWHERE where nothing is searched; PLACE_BEGIN,
-    PLACE_END: pixels of distance that are searched and were stored, from and up to.
+    PLACE_END: first pixel of distance that is searched and was stored, and the one after the last.
     """
     rows, columns = x_far.shape
     out, width = np.zeros((rows, columns, PLACES), np.int16), sweep.u.shape[1]
@@ -92,10 +92,11 @@ def sum_lines(
     table: LineTable, inner: tuple[np.float32, np.float32, np.float32, np.float32], as_bytes: bool, clear: int,
     pixels: int, to_ones: int, to_expected: int,
 ) -> None:  # fmt: skip
-    """The sums of a block.
+    """Write the sums of a block to the addresses to_ones and to_expected.
 
-    inner: pixels from which on, and up to which, all lines are left of their stripes, and right of them; as_bytes:
-    counts are bytes, or else float32. clear: address.
+    inner: first and last pixel between which all lines are left of their stripes, and the same for right of them.
+    as_bytes: whether counts are bytes, else float32. clear: address of the probabilities that haze leaves a pixel
+    without a count, left and right of the stripe.
     """
     none, order, one = zero_float32(), load_float32(table.order, 0), zero_float32() + np.float32(1.0)
     for v in range(0, pixels, LANES):
@@ -144,9 +145,9 @@ _IN_ORDER: Final = np.arange(LANES, dtype=np.float32)
 
 
 class Blocks(NamedTuple):
-    """Sums per block: float32 (block rows, block columns, pixels of distance): ones, and those that were expected.
+    """Sums per block: float32 (block rows, block columns, pixels of distance), of ones and of expected ones.
 
-    Pixels: a multiple of LANES.
+    The number of pixels is a multiple of LANES.
     """
 
     ones: Float32
@@ -154,7 +155,7 @@ class Blocks(NamedTuple):
 
 
 class _Map(NamedTuple):
-    """Addresses of the arrays that lines are looked up in.
+    """Addresses of the arrays in which lines are looked up.
 
     x_px, place, x0, n_frames, counts: first elements; still: pixel 0 of the first row.
     """
@@ -180,8 +181,8 @@ def sum_blocks(
 ) -> None:  # fmt: skip
     """Fill the sums of rows of blocks first_block..last_block-1, without what lies within `apart` px of stripes x_px.
 
-    Haze is that in the middle of HAZE_BLOCKS blocks, or of the block where there is nothing to search there. state,
-    still: see `SecondLight`; place: of `line_places`.
+    Haze is that in the middle of HAZE_BLOCKS blocks, or of the block itself if nothing is searched there. state, still:
+    see `SecondLight`; place: of `line_places`.
     """
     rows, columns = x_px.shape
     pixels, across, aside, x0 = out.ones.shape[2], out.ones.shape[1], np.float32(apart), sweep.x0

@@ -1,16 +1,17 @@
 """Second returns: a second line of light beside the stripe, from a pane before a wall, a twig, a flake of snow.
 
-In haze a row cannot answer with both surfaces: the light behind the nearer one excludes that the haze ends there. So
-its light is looked for in the counts. It stands off the haze by too little for a row alone; light is summed over blocks
-of rows and columns first (`rig.estimate.joint.second_return_blocks`) and compared with what haze and ambient light
-bring, pixel by pixel of distance from the far end. Then each row is asked itself, with its neighbours. In standard
-deviations of the light that a candidate shows over its own neighbourhood (own) and its block's (block), it is right by
+In haze a row cannot answer with both surfaces, because the light behind the nearer one excludes that the haze ends
+there. So the light of the nearer one is looked for in the counts. It exceeds the haze by too little to be seen in a
+single row. Light is first summed over blocks of rows and columns (`rig.estimate.joint.second_return_blocks`) and
+compared with the light expected from haze and ambient light, pixel by pixel of distance from the far end. Then each row
+is examined itself, with its neighbours. Let own and block be the light of a candidate in standard deviations, over its
+own neighbourhood and in its block. The probability that it is right is
 
     logit confidence2 = LOG_ODDS . (1, own, block)
 
 Positions x2_px and confidence2 are float32 (rows, columns), NaN and 0 where nothing stands out. LOG_ODDS are fitted to
-maps with a pane over a third of them and to maps without any. Limits: light within APART_PX plus LINE_SIGMAS widths
-of the line from a stripe is its own, so that closer surfaces are not told apart.
+maps with a pane over a third of them and to maps without any. Limits: light within APART_PX plus LINE_SIGMAS widths of
+the line from a stripe counts as the stripe's own, so closer surfaces are not separated.
 """
 
 from typing import Final, NamedTuple
@@ -51,8 +52,8 @@ _AROUND: Final = -(-(RING_PX + GAP_PX + 6) // LANES) * LANES
 class Candidates(NamedTuple):
     """The light that stands out most in each block and its neighbours, float32 (block rows, block columns) each.
 
-    distance: from the far end in px, NaN where nothing does; sure: standard deviations by which its light does; haze:
-    how much stronger haze is there than was learned, at least 1.
+    distance: from the far end in px, NaN if nothing stands out; sure: its significance in standard deviations; haze:
+    ratio of the haze there to the learned haze, at least 1.
     """
 
     distance: Float32
@@ -63,8 +64,9 @@ class Candidates(NamedTuple):
 class Seconds(NamedTuple):
     """Candidates of second returns, float32 (rows, columns) each.
 
-    distance: from the far end in px, NaN where there is no candidate; ones, expected: within the line's reach of it;
-    light, moment: ones above those expected, and that times the distance in px; moved: see `move_seconds`.
+    distance: from the far end in px, NaN if there is no candidate; ones, expected: within the line's reach of it;
+    light,
+    moment: ones above those expected, and that times the distance in px; moved: see `move_seconds`.
     """
 
     distance: Float32
@@ -77,7 +79,7 @@ class Seconds(NamedTuple):
 
 @numba.njit(cache=True, nogil=True, error_model="numpy")
 def find_candidates(blocks: Blocks, reach: int, side: int, first_block: int, last_block: int, out: Candidates) -> None:
-    """Fill rows of blocks first_block..last_block-1. reach: of the line's light, px."""
+    """Fill rows of blocks first_block..last_block-1. reach: half-width of the line's light, px."""
     rows, columns, pixels = blocks.ones.shape
     three = np.zeros((2, columns, pixels), np.float32)
     nine, above = np.zeros((2, pixels + 2 * _AROUND), np.float32), np.empty(pixels, np.float32)
@@ -150,7 +152,8 @@ def measure_seconds(
     counts: Counts, n_frames: Int32, sweep: Sweep, state: RowState, still: Float32, x_far: Float64, side: int,
     apart: float, reach: int, x_px: Float32, haze: Float32, first_row: int, last_row: int, out: Seconds,
 ) -> None:  # fmt: skip
-    """Fill all but distance of candidates of rows first_row..last_row-1; zeros near a stripe and where none is asked.
+    """Fill everything but distance for candidates of rows first_row..last_row-1; 0 near a stripe and without a
+    candidate.
 
     state, still: see `SecondLight`; haze: of `Candidates`.
     """
@@ -210,8 +213,8 @@ def judge_seconds(
 ) -> None:  # fmt: skip
     """Fill x2_px and confidence2 of rows first_row..last_row-1; NaN and 0 where nothing stands out.
 
-    A candidate's light, pooled over neighbours, stands out by the signed root of twice the gain in log-likelihood of
-    Poisson counts, in standard deviations: right for few photons, too. sure: of `Candidates`.
+    The significance of a candidate's light, pooled over neighbours, is the signed root of twice the gain in
+    log-likelihood of Poisson counts, in standard deviations, which holds for few photons too. sure: of `Candidates`.
     """
     distance = with_margin(seconds.distance, first_row, last_row)
     ones, expected = with_margin(seconds.ones, first_row, last_row), with_margin(seconds.expected, first_row, last_row)
@@ -240,9 +243,10 @@ class SecondLight(NamedTuple):
     """Inputs of the search for second returns from a model; made once per model by `second_light`.
 
     state: without ambient light. still: float32, (rows x width) between LANES numbers at either end, probability of no
-    one by ambient light alone; LEFT_OUT of pixels that always fire or are not to be used, which show nothing of
-    haze or stripes. place: of `line_places`. apart: px from a stripe within which light is its own. reach: px to
-    either side of a line.
+    one from ambient light alone; LEFT_OUT for pixels that always fire or must not be used, which show neither haze nor
+    stripes.
+    place: of `line_places`. apart: px from a stripe within which light counts as its own. reach: px to either side of a
+    line.
     """
 
     state: RowState
@@ -253,7 +257,7 @@ class SecondLight(NamedTuple):
 
 
 def second_light(state: RowState, line_sigma_px: float, grid: LabelGrid, sweep: Sweep) -> SecondLight:
-    """The light that haze and ambient bring under `state`."""
+    """The inputs of the search under `state`: light of haze and ambient light."""
     still = np.where(hot_in_bands(state.ambient), LEFT_OUT, np.exp(-state.ambient))
     return SecondLight(
         state._replace(ambient=np.zeros_like(state.ambient)),
@@ -265,7 +269,7 @@ def second_light(state: RowState, line_sigma_px: float, grid: LabelGrid, sweep: 
 
 
 class SecondRoom(NamedTuple):
-    """Room for the search in one map after the other, since new memory is slow."""
+    """Working memory for the search, reused from map to map, since new memory is slow."""
 
     blocks: Blocks
     candidates: Candidates
@@ -273,7 +277,7 @@ class SecondRoom(NamedTuple):
 
 
 def second_room(grid: LabelGrid) -> SecondRoom:
-    """Room for maps of these labels."""
+    """Working memory for maps of these labels."""
     rows, columns = grid.x_far.shape
     shape = -(-rows // BLOCK), -(-columns // BLOCK)
     return SecondRoom(
@@ -287,7 +291,7 @@ def second_returns(
     volume: CountVolume, grid: LabelGrid, sweep: Sweep, light: SecondLight, x_px: Float32, room: SecondRoom,
     workers: RowWorkers,
 ) -> tuple[Float32, Float32]:  # fmt: skip
-    """x2_px and confidence2 (rows, columns) beside stripes at x_px: NaN and 0 where nothing stands out."""
+    """x2_px and confidence2 (rows, columns) beside stripes at x_px; NaN and 0 where nothing stands out."""
     rows, columns = x_px.shape
     blocks, candidates, seconds = room
     # Read by address: another kind of number would be read as nonsense.

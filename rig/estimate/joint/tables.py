@@ -25,7 +25,7 @@ MOST_BYTES = 4 << 30
 
 
 class JointTables(NamedTuple):
-    """Everything that is made once per model, and what it is made of; see the module that makes each."""
+    """Everything that is made once per model, with its inputs; see the module that makes each."""
 
     grid: LabelGrid
     costs: Costs
@@ -41,7 +41,9 @@ class JointTables(NamedTuple):
 
 
 class Memory(NamedTuple):
-    """Room for one map after the other: costs and messages (rows, columns, labels) uint8, and the answers."""
+    """Memory that is reused for one map after the other: costs and messages (rows, columns, labels) uint8, and the
+    answers.
+    """
 
     cost: Uint8
     message: Uint8
@@ -51,12 +53,12 @@ class Memory(NamedTuple):
     seconds: SecondRoom
 
     def fits(self, grid: LabelGrid) -> bool:
-        """Whether maps of this grid have their room in it."""
+        """Whether maps of this grid fit into it."""
         return self.cost.shape == (*grid.x_far.shape, grid.labels)
 
 
 def memory_for(grid: LabelGrid) -> Memory:
-    """Room for maps of a grid."""
+    """Memory for maps of a grid."""
     rows, columns = grid.x_far.shape
     cost, message = (aligned_zeros((rows, columns, grid.labels), np.uint8) for _ in range(2))
     return Memory(
@@ -66,7 +68,7 @@ def memory_for(grid: LabelGrid) -> Memory:
 
 
 def grid_of(geometry: SweepGeometry) -> LabelGrid:
-    """The labels of a geometry. UsageError where their costs would take too much memory."""
+    """The labels of a geometry. Raises UsageError if their costs would take too much memory."""
     grid = label_grid(geometry)
     rows, columns = grid.x_far.shape
     if (needed := 2 * rows * columns * grid.labels) > MOST_BYTES:
@@ -79,7 +81,7 @@ def grid_of(geometry: SweepGeometry) -> LabelGrid:
 
 
 def tables_of(setting: LearningSetting, workers: RowWorkers) -> JointTables:
-    """The tables of a model, for a geometry and so many exposures a column."""
+    """The tables of a model, for a geometry and a number of exposures per column."""
     model, geometry, grid = setting.model, setting.geometry, grid_of(setting.geometry)
     costs = costs_of(model, geometry, grid, setting.exposures, workers)
     state, sigma_px, sweep = state_of(model), model.line_sigma_px, sweep_of(geometry)

@@ -1,8 +1,8 @@
 """Temporal prior of `joint`: where a surface was clear in the last map, places far from it cost a little more.
 
-A label l costs min(SLOPE max(|l - b| - FREE, 0), c MOST) more than the last map's label b, c from 0 to 1 with the
-confidence that the last answer had. At most MOST, far less than a jump between neighbours and than what the photons of
-a stripe say: where something has moved, its rows outvote what they are told of before. Nothing adds up over maps.
+If the last map's label was b, a label l costs min(SLOPE max(|l - b| - FREE, 0), c MOST) more, where c is between 0 and
+1 by the confidence of the last answer. MOST is far less than the cost of a jump between neighbours and than the
+evidence of a stripe's photons, so where something has moved its rows outvote the prior. Nothing accumulates over maps.
 """
 
 import numba
@@ -29,10 +29,10 @@ LEAST_SURE = 0.5
 
 
 class TemporalPrior:
-    """Memory of the last map for the next one; `on`: whether maps leave anything.
+    """Memory of the last map for the next one. on: whether maps leave anything.
 
-    before: uint16 (2, rows, columns), the last map's labels and the most that others cost more (0: nothing is known);
-    None where there is nothing, as behind a map without frames and before the first of a geometry.
+    before: uint16 (2, rows, columns), the last map's labels and the largest extra cost of others (0: nothing is known).
+    None if there is nothing, as after a map without frames and before the first map of a geometry.
     """
 
     def __init__(self, on: bool) -> None:
@@ -42,11 +42,11 @@ class TemporalPrior:
         self._ramps: Uint8 | None = None
 
     def recall(self, before: NDArray[np.uint16] | None) -> None:
-        """Go on from what was kept with a map."""
+        """Continue from the state that was kept with a map."""
         self.before, self._of = before, None
 
     def begin(self, geometry: SweepGeometry, grid: LabelGrid) -> None:
-        """Get ready for a map's costs: forget a map of another geometry."""
+        """Prepare for a map's costs. A map of another geometry is forgotten."""
         if self.before is not None:
             other = self._of is not None and self._of is not geometry
             if other or self.before.shape[1:] != grid.x_far.shape:
@@ -61,7 +61,7 @@ class TemporalPrior:
             _add_ramps(self.before, volume.n_frames, self._ramps, first, last, cost)
 
     def leave(self, stripes: StripeTable, grid: LabelGrid) -> None:
-        """Keep of a map what it leaves to the next."""
+        """Keep the part of a map that the next one uses."""
         if not self.on:
             self.before = None
             return

@@ -1,14 +1,14 @@
-"""Vote on weak answers of the aggregation, compiled: what the neighbours on all sides together say.
+"""Vote on weak answers of the aggregation, compiled: the common opinion of the neighbours on all sides.
 
-Four paths carry evidence along rows and columns only. Where few photons come back, single rows or columns go astray
-as a whole, in streaks. So an answer whose margin is below WEAK is put to the vote: of its own label and those of the
-four nearest neighbours the one is taken that has least
+Four paths carry evidence along rows and columns only. If few photons come back, single rows or columns are wrong as a
+whole and form streaks. So an answer whose margin is below WEAK is put to the vote. Candidates are its own label and
+those of the four nearest neighbours; the winner is the one with the least
 
     sum over 5 x 5 neighbours of margin min(|label - its label|, FAR),
 
-unless the row's own counts make it worse than the old one by more than OBJECTION. Its margin is then what the
-neighbours say for the label less what they say for others, over their number: what streaks disagree on is not sure.
-Labels are int16, margins uint8 in units of cost; sums fit 16 bits (SHARE).
+unless the row's own counts make it worse than the old one by more than OBJECTION. The new margin is the neighbours'
+average support for the label minus that for others, so labels on which streaks disagree are not certain. Labels are
+int16, margins uint8 in units of cost; sums fit 16 bits (SHARE).
 """
 
 from typing import Final, NamedTuple
@@ -44,9 +44,9 @@ NOWHERE: Final = 30000
 
 
 class Ballots(NamedTuple):
-    """Labels and votes of a map with REACH rows and columns without votes around, as long as a vote lasts.
+    """Labels and votes of a map, used during a vote, with a margin of REACH rows and columns without votes.
 
-    label: float32 as answered; whole: int16, the nearest whole one; votes: int16, the margin over SHARE.
+    label: float32 as answered; whole: int16, the nearest integer; votes: int16, the margin over SHARE.
     """
 
     label: Float32
@@ -55,14 +55,14 @@ class Ballots(NamedTuple):
 
 
 def new_ballots(rows: int, columns: int) -> Ballots:
-    """Room for the ballots of a map."""
+    """Memory for the ballots of a map."""
     shape = rows + 2 * REACH, -(-columns // LANES) * LANES + LANES
     return Ballots(np.zeros(shape, np.float32), np.full(shape, NOWHERE, np.int16), np.zeros(shape, np.int16))
 
 
 @numba.njit(cache=True, nogil=True)
 def collect(answer: LabelAnswers, first_column: int, last_column: int, out: Ballots) -> None:
-    """The ballots of columns first_column..last_column-1."""
+    """Fill the ballots of columns first_column..last_column-1."""
     # Local names: each use of the tuple itself in the loop would count references to all of its arrays.
     labels, margins, label, whole, votes = answer.label, answer.margin, out.label, out.whole, out.votes
     for y in range(labels.shape[0]):
@@ -88,8 +88,8 @@ _CANDIDATES: Final = 5
 class _Hall(NamedTuple):
     """Arrays that a vote reads and writes; kernels get `pointers` to them.
 
-    elected: int16 (width,), of a row's answers first the candidate, then the label. against: int16 (candidates, LANES).
-    share: float32 (width,), 1 over the columns that vote. width: of the ballots.
+    elected: int16 (width,), for each of a row's answers first the candidate, then the label. against: int16
+    (candidates, LANES). share: float32 (width,), 1 over the number of voting columns. width: of the ballots.
     """
 
     ballots: Ballots
@@ -104,7 +104,7 @@ class _Hall(NamedTuple):
 
 
 def vote(ballots: Ballots, cost: Uint8, first_row: int, last_row: int, answer: LabelAnswers) -> None:
-    """Mend the answers of rows first_row..last_row-1; cost: (rows, columns, labels), C-contiguous.
+    """Correct the answers of rows first_row..last_row-1; cost: (rows, columns, labels), C-contiguous.
 
     The ballots of all columns must have been collected before.
     """

@@ -1,12 +1,12 @@
-"""Answers read off the totals of all labels, compiled: sub-label position and margin of each pixel.
+"""Answers read from the totals of all labels, compiled: sub-label position and margin of each pixel.
 
-With S(l) the totals of a pixel (uint8, LARGEST where a label is excluded) and l* the label of the least one,
+With S(l) the totals of a pixel (uint8, LARGEST if a label is excluded) and l* the label with the least total,
 
     label  = sum of l w(l) / sum of w(l) over |l - l*| <= r,     w(l) = exp(-beta (S(l) - S(l*)) / UNITS)
     margin = min of S(l) over |l - l*| >= MARGIN_FROM  -  S(l*)
 
-r is REACH, or less where labels on either side are excluded. label is float32, margin uint8, (rows, columns). Some
-columns of a row are read at a time, in short rounds over the columns, so that while one waits others go on.
+r is REACH, or less if labels on either side are excluded. label is float32, margin uint8, (rows, columns). Several
+columns of a row are read at a time, in short rounds over the columns, so that others proceed while one waits.
 """
 
 from typing import Final, NamedTuple
@@ -58,9 +58,10 @@ BETA: Final = 0.5
 class AnswerSettings(NamedTuple):
     """Number of labels that are stripes, 0..stripes-1, and the tables of `answer_settings`.
 
-    weights: float32 (256,), of a total's excess over the least. powers: float32 (REACH + 1, TAPS, POWERS), powers of
-    the distance for each reach, 0 at taps beyond it. reach: uint8 (2^TAPS,), how far labels reach where the taps of the
-    set bits are excluded. near: uint8 (VECTOR,) with the winner at MIDDLE, LARGEST where the margin does not count.
+    weights: float32 (256,), by a total's excess over the least. powers: float32 (REACH + 1, TAPS, POWERS), powers of
+    the distance for each reach, 0 at taps beyond it. reach: uint8 (2^TAPS,), the reach if the taps of the set bits are
+    excluded.
+    near: uint8 (VECTOR,) with the winner at MIDDLE, LARGEST for labels that do not count for the margin.
     """
 
     stripes: int
@@ -73,9 +74,9 @@ class AnswerSettings(NamedTuple):
 class LabelAnswers(NamedTuple):
     """Answers, (rows, columns) each. Positions are counted in labels, costs in units (`UNITS`).
 
-    label: float32, mean of the labels around the winner, the stripe of the least total (ties: the smaller label), only
-    as far as both sides have labels: one side alone would draw every answer to it. margin: uint8, the least total at
-    least MARGIN_FROM labels away less the winner's.
+    label: float32, mean of the labels around the one with the least total (the smaller of equal ones). The mean extends
+    only as far as both sides have labels, since a single side would draw every answer to it. margin: uint8, the least
+    total at least MARGIN_FROM labels away minus the winner's.
     """
 
     label: Float32
@@ -83,12 +84,12 @@ class LabelAnswers(NamedTuple):
 
 
 def new_answer(rows: int, columns: int) -> LabelAnswers:
-    """Room for the answers of a map."""
+    """Memory for the answers of a map."""
     return LabelAnswers(np.zeros((rows, columns), np.float32), np.zeros((rows, columns), np.uint8))
 
 
 def answer_settings(stripes: int) -> AnswerSettings:
-    """Settings for so many stripe labels."""
+    """Settings for this number of stripe labels."""
     weights = np.exp(-BETA / UNITS * np.arange(LARGEST + 1)).astype(np.float32)
     distance = np.arange(-REACH, REACH + 1)
     powers = np.zeros((REACH + 1, TAPS, POWERS), np.float32)
@@ -106,12 +107,14 @@ _BLOCK: Final = BLOCK.count
 
 
 class Readout(NamedTuple):
-    """Arrays and sizes that columns are answered with, of one thread; kernels get `pointers` to them.
+    """Arrays and sizes with which a thread answers columns; kernels get `pointers` to them.
 
     end: labels up to the end of the last block with stripes; size: bytes from the totals of a column to the next.
-    around: uint8, totals of the columns, with a vector of LARGEST at least before and behind each; totals: address of
-    the first one's. hidden: uint8 (labels,), LARGEST where there is no stripe. Of each column: least_label: int32, of
-    the least total; least: uint8, that total; moments: float32 (columns, POWERS).
+    around: uint8, totals of the columns, with at least a vector of LARGEST before and after each; totals: address of
+    the first one's.
+    hidden: uint8 (labels,), LARGEST for labels that are no stripe. Per column: least_label: int32, label of the least
+    total;
+    least: uint8, that total; moments: float32 (columns, POWERS).
     """
 
     settings: AnswerSettings
@@ -128,7 +131,7 @@ class Readout(NamedTuple):
 
 
 def new_readout(settings: AnswerSettings, answer: LabelAnswers, columns: int, labels: int) -> Readout:
-    """Room to answer so many columns at a time."""
+    """Working memory for answering this number of columns at a time."""
     size = -(-labels // _BLOCK) * _BLOCK + 2 * VECTOR
     around = aligned_zeros((columns * size + VECTOR,), np.uint8)
     around[:] = LARGEST
@@ -202,7 +205,7 @@ def _write_answers(pixel, columns, desk):  # type: ignore[no-untyped-def]
 
 @numba.njit(cache=True, nogil=True, error_model="numpy")
 def answer_columns(pixel: int, columns: int, desk: Readout) -> None:
-    """Answer columns from their totals, which are overwritten; pixel: place of the first one's answer."""
+    """Answer columns from their totals, which are overwritten. pixel: place of the first one's answer."""
     _find_winners(columns, desk)
     _weigh(columns, desk)
     _hide_winners(columns, desk)
@@ -211,7 +214,7 @@ def answer_columns(pixel: int, columns: int, desk: Readout) -> None:
 
 @numba.njit(forceinline=True)
 def fetch_answers(pixel, columns, desk):  # type: ignore[no-untyped-def]
-    """Prefetch the places of answers."""
+    """Prefetch the memory of the answers."""
     answer = desk.answer
     for at in (pixel, pixel + columns - 1):
         prefetch(answer.label + 4 * at)

@@ -1,8 +1,8 @@
 """Ambient light and dark counts of every pixel, from dark frames, quiet pixels behind stripes and sums over columns.
 
 Both are constant for a pixel over the columns of a sweep, so the counts summed over all columns show them: a pixel that
-fires far more often than its neighbours while the laser crosses the whole picture is hot, whatever the scene. Where
-there are few counts, the estimate is drawn to the mean of the pixels around.
+fires far more often than its neighbours while the laser crosses the whole picture is hot, whatever the scene. If there
+are few counts, the estimate is drawn towards the mean of the pixels around.
 """
 
 import cv2
@@ -28,7 +28,7 @@ def ambient_map(
     """Photons per exposure (rows, width) float32 from dark frames, `quiet` (2, rows, width) counts and hot pixels.
 
     intensity: (rows, width), ones of each pixel within the windows. quiet: ones and exposures of each pixel while
-    clearly behind the stripe; None before any stripe is known. Ones less the light of a halo may lie below 0.
+    clearly behind the stripe; None before any stripe is known. Ones minus the light of a halo may be negative.
     """
     ones = np.zeros((geometry.rows, geometry.width))
     exposures = np.zeros_like(ones)

@@ -1,10 +1,10 @@
 """Learns the row model from the counts of a sweep by expectation-maximisation over a lattice of rows and columns.
 
-Each round the row likelihood says, with its posterior P(j) over positions, how much of every pixel's evidence lay
-before and behind the stripe: pixel t lies before it with the probability that the stripe is farther, sum over j > t of
-P(j). Ones and exposures are added with these weights per bin of path inverse depth (`learn_rows`); haze, pedestal, row
-gains, amplitudes and line width are set to what those float64 sums say. Nothing of the medium or the light is assumed
-beyond 'haze falls with the path length', and that only where data are few.
+In each round the row likelihood's posterior P(j) over positions gives the share of every pixel's evidence before and
+behind the stripe: pixel t lies before it with the probability that the stripe is farther, sum over j > t of P(j). Ones
+and exposures are added with these weights per bin of path inverse depth (`learn_rows`). Haze, pedestal, row gains,
+amplitudes and line width are then set from those float64 sums. Nothing is assumed about the medium or the light except
+that haze falls with the path length, and that only where data are few.
 """
 
 from dataclasses import replace
@@ -63,7 +63,7 @@ class Expectation(NamedTuple):
     evidence: float
 
     def plus(self, other: "Expectation") -> "Expectation":
-        """Sums of both."""
+        """Sums of both together."""
         both: Any = zip(self, other, strict=True)
         return Expectation(*(one + more for one, more in both))
 
@@ -74,7 +74,7 @@ class Expectation(NamedTuple):
 
 
 def lattice(geometry: SweepGeometry, lines: int) -> tuple[Int32, Int32]:
-    """About `lines` (row, column) pairs spread evenly over those with a window: a fixed pattern, no chance in it."""
+    """About `lines` (row, column) pairs spread evenly over those with a window, in a fixed pattern without randomness."""
     y, c = np.nonzero(geometry.x_lo <= geometry.x_hi)
     pick = evenly_spread(len(y), lines)
     return y[pick].astype(np.int32), c[pick].astype(np.int32)
@@ -83,7 +83,7 @@ def lattice(geometry: SweepGeometry, lines: int) -> tuple[Int32, Int32]:
 def lines_of(volume: CountVolume, where: tuple[Int32, Int32], known: StripeTable | None = None) -> Lines:
     """The counts of a volume at (rows, columns), each one row of its column's window.
 
-    known: stripes of which the neighbours' counts have had a say.
+    known: stripes that were estimated with the help of the neighbours' counts.
     """
     rows, columns = where
     x_px, trust = (np.zeros(len(rows), np.float32) for _ in range(2))
@@ -123,7 +123,7 @@ def _expect_piece(sweep: Sweep, state: RowState, lines: Lines, geometry: SweepGe
 
 
 def learn_first(volume: CountVolume, geometry: SweepGeometry, ambient: Float32, workers: RowWorkers) -> RowModel:
-    """Row model of a sweep that nothing is known about: several starts, the likeliest one refined."""
+    """Row model of a sweep about which nothing is known: several starts are tried, and the likeliest one is refined."""
     lines = lines_of(volume, lattice(geometry, LATTICE_LINES))
     few = lines_of(volume, lattice(geometry, LATTICE_LINES // 4))
     guessed = volume.dark_counts is None
@@ -143,7 +143,7 @@ def learn_first(volume: CountVolume, geometry: SweepGeometry, ambient: Float32, 
 
 
 def next_lattice(geometry: SweepGeometry) -> tuple[Int32, Int32]:
-    """The (rows, columns) that carry a model on from sweep to sweep, sorted by column."""
+    """The (rows, columns) from which a model is updated from sweep to sweep, sorted by column."""
     rows, columns = lattice(geometry, NEXT_LINES)
     order = np.lexsort((rows, columns))
     return rows[order], columns[order]
@@ -152,10 +152,10 @@ def next_lattice(geometry: SweepGeometry) -> tuple[Int32, Int32]:
 def learn_next(
     lines: Lines, geometry: SweepGeometry, model: RowModel, before: Expectation | None, workers: RowWorkers
 ) -> tuple[RowModel, Expectation]:
-    """The model carried on by the lines of `next_lattice` of one more sweep.
+    """The model updated with the lines of `next_lattice` of one more sweep.
 
-    before: what the sweeps before it taught; it is returned with this one's added, and fades by half a sweep. The
-    line's width stays where neighbours say where the line is: their say depends on the width.
+    before: what was learned from earlier sweeps. It is returned with this sweep's added, and fades by half per sweep.
+    The line width is not changed if neighbours say where the line is, since their answer depends on the width.
     """
     seen = expect(lines, geometry, model, workers)
     if before is not None:
@@ -181,7 +181,7 @@ def learn_again(
 
 
 def fit_line_width(lines: Lines, geometry: SweepGeometry, model: RowModel, workers: RowWorkers) -> RowModel:
-    """Move the line width one step up or down where that makes the counts likelier, and clearly so."""
+    """Change the line width by one step if that makes the counts clearly likelier."""
     tried = [
         replace(model, line_sigma_px=float(np.clip(model.line_sigma_px * f, 0.25, 2.4))) for f in (0.87, 1.0, 1.15)
     ]
@@ -230,17 +230,18 @@ def _near_level(volume: CountVolume, geometry: SweepGeometry) -> float:
 
 
 def flux(ones: float, exposures: float) -> float:
-    """Photons per exposure from ones among exposures; finite at all-ones, 0 where there are no exposures."""
+    """Photons per exposure from ones among exposures; finite if all are ones, 0 without exposures."""
     return float(np.log1p(ones / (exposures - ones + 0.5))) if exposures > 0 else 0.0
 
 
 def maximise(
     model: RowModel, seen: Expectation, *, spread: bool, free_ambient: bool = False, gains: bool = True
 ) -> RowModel:
-    """Model that explains the weighted counts best.
+    """The model that explains the weighted counts best.
 
-    spread: the amplitude grid may move; free_ambient: the level of ambient light was guessed and is learned as well;
-    gains: the strength of the haze per row and column is learned, which must not go on from map to map (it drifts).
+    spread: whether the amplitude grid may move. free_ambient: whether the level of ambient light was guessed and is
+    learned as well. gains: whether to learn the strength of the haze per row and column; learned from map to map, it
+    drifts.
     """
     if model.halo.any():
         # Row by row a halo is taken for haze: `rig.estimate.joint.halo` tells one from the other.
@@ -383,11 +384,12 @@ def learn_rows(
 ) -> float:  # fmt: skip
     """Expectation step over some lines; returns the log evidence.
 
-    Adds to levels (bins, 14): ones, exposures, and exposures weighted with geometry factor and with ambient flux, of
-    pixels before the stripe, then of those behind it, each with the probability of being there, then of those well
-    before a stripe beyond doubt; then stripes, and stripes if all positions were alike. To rows_seen (rows, 2) and
-    columns_seen (columns, 2): ones before the stripe, and those expected. To amplitude_mass (M + 1,): rows per
-    amplitude, the last entry 'no stripe'. Pixels with more ambient flux than hot_flux are left out.
+    Adds to levels (bins, 14): ones, exposures, and exposures weighted with geometry factor and with ambient flux, first
+    of pixels before the stripe and then of pixels behind it, each weighted by the probability of being there, then of
+    pixels well before a stripe beyond doubt; then stripes, and stripes if all positions were equally likely. Adds to
+    rows_seen (rows, 2) and columns_seen (columns, 2): ones before the stripe, and those expected. Adds to
+    amplitude_mass (M + 1,): rows per amplitude, the last entry 'no stripe'. Pixels with more ambient flux than hot_flux
+    are left out.
     """
     amplitudes = state.amplitude.shape[0]
     row = row_buffers(sweep.window, amplitudes)

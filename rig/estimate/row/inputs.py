@@ -1,20 +1,20 @@
 """Inputs of the compiled row likelihood: the sweep, the learned state, and one row's fluxes in near-to-far order.
 
-For a pixel at the point where its ray meets the column's light plane, with paths c from the camera and p from the
-scanner to it, G = row gain x column gain x c x p (both per unit of depth), w' = 2 w / (c + p) the path inverse depth
+A pixel sees the point where its ray meets the column's light plane. With paths c from the camera and p from the scanner
+to this point, G = row gain x column gain x c x p (both per unit of depth), w' = 2 w / (c + p) the path inverse depth,
 and haze, rest, S the profiles of `rig.estimate.row.model` at w',
 
     before = ambient + G haze(w') + others,    behind = ambient + G rest(w') + others,    scale = S(w')
 
-in photons per exposure; `others` is the haze of lines lit at the same time (`others_at`). All float32, fluxes cut to
-FLUX_MIN..FLUX_MAX. `judge_line` fills them in and gives the row's posterior.
+in photons per exposure; `others` is the haze of lines lit at the same time (`others_at`). All are float32, and fluxes
+are limited to FLUX_MIN..FLUX_MAX. `judge_line` fills them in and gives the row's posterior.
 
 Fog scatters the stripe's own light once more, into a halo on both sides of it. At the distance d along the row from a
-stripe of s photons stand, per pixel,
+stripe of s photons the halo has, per pixel,
 
     s rho(w', d),   rho(w', d) = sum over k of halo(w', k) exp(-|d| / HALO_REACHES_PX[k]) / (2 HALO_REACHES_PX[k])
 
-photons; halo is learned (`rig.estimate.joint.halo`) at HALO_NODES path inverse depths, with straight lines in between.
+photons. The halo is learned (`rig.estimate.joint.halo`) at HALO_NODES path inverse depths and interpolated linearly.
 """
 
 from typing import NamedTuple
@@ -31,7 +31,7 @@ from rig.simd import Float32, Float64, Int32
 
 
 def halo_shares(model: RowModel, pixels: int) -> Float32:
-    """rho at each profile bin and 0 to pixels - 1 px from the stripe, (BINS, pixels); zeros where there is no halo."""
+    """rho at each profile bin and 0 to pixels - 1 px from the stripe, (BINS, pixels); 0 if there is no halo."""
     reach = np.array(HALO_REACHES_PX)[:, None]
     shape = np.exp(-np.arange(pixels) / reach) / (2 * reach)
     return np.asarray(over_bins(np.asarray(model.halo), len(model.profile)) @ shape, np.float32)
@@ -49,7 +49,7 @@ TABLE = logit_table()
 
 
 class Sweep(NamedTuple):
-    """Geometry of a sweep; arrays as in SweepGeometry, depth range as inverse depths."""
+    """Geometry of a sweep; arrays as in SweepGeometry, with the depth range as inverse depths."""
 
     window: int
     x0: Int32
@@ -68,7 +68,7 @@ class Lines(NamedTuple):
     """Some rows of some columns, with their counts.
 
     counts: (lines, window) integers; row, column: int32 (lines,); exposures: int32 (lines,). x_px, trust: float32
-    (lines,), where neighbours say the stripe is and how probably so; with a trust of 0 the line stands alone.
+    (lines,), the stripe position according to neighbours and its probability; a line with trust 0 is judged alone.
     """
 
     counts: NDArray[np.integer]
@@ -104,8 +104,9 @@ class RowBuffers(NamedTuple):
     """Buffers of one row, filled by `row_fluxes` and `judge_line`, nearest pixel first; made once per thread.
 
     n: ones; before, behind: flux of each pixel in front of and behind the stripe; scale: stripe photons at amplitude 1;
-    cell: nearest profile bin; gain: geometry factor of the haze; others: flux of other lines' haze, in before and
-    behind; w: inverse depth; log_prior: of positions; the rest: see `row_scores` and `row_posterior`.
+    cell: nearest profile bin; gain: geometry factor of the haze; others: flux of other lines' haze, included in before
+    and behind;
+    w: inverse depth; log_prior: of positions; the rest: see `row_scores` and `row_posterior`.
     """
 
     n: Float32
@@ -125,7 +126,7 @@ class RowBuffers(NamedTuple):
 
 
 def sweep_of(geometry: SweepGeometry) -> Sweep:
-    """Kernel input of a sweep's geometry."""
+    """A sweep's geometry as the kernels take it."""
     near_m, far_m = geometry.depth_range_m
     # Kernels read most of them by their addresses.
     x0, x_lo, x_hi = (np.ascontiguousarray(a, np.int32) for a in (geometry.x0, geometry.x_lo, geometry.x_hi))
@@ -137,7 +138,7 @@ def sweep_of(geometry: SweepGeometry) -> Sweep:
 
 
 def state_of(model: RowModel) -> RowState:
-    """Kernel input of a learned state."""
+    """A learned state as the kernels take it."""
     return RowState(
         model.profile, model.w_lo, model.per_w, model.row_gain, model.column_gain, model.ambient, model.amplitude,
         np.log(np.maximum(model.weight, 1e-6)).astype(np.float32), model.none_weight, line_profile(model.line_sigma_px),
@@ -168,7 +169,9 @@ def path_to_plane(px, py, pz, vy):  # type: ignore[no-untyped-def]
 
 @numba.njit(inline="always")
 def profile_place(px, py, pz, ux, vx, path_p, w_lo, per_w, bins):  # type: ignore[no-untyped-def]
-    """Path from the camera to a plane's point, per unit of depth; its inverse depth and place among the bins."""
+    """Path from the camera to a plane's point, per unit of depth; the point's path inverse depth and place among the
+    bins.
+    """
     path_c = np.sqrt(np.float32(1.0) + ux * ux + vx * vx)
     w = px * ux + py * vx + pz
     return path_c, w, min(max((w * 2.0 / (path_p + path_c) - w_lo) * per_w, 0.0), bins - 1.001)
@@ -176,7 +179,9 @@ def profile_place(px, py, pz, ux, vx, path_p, w_lo, per_w, bins):  # type: ignor
 
 @numba.njit(inline="always")
 def flux_between(ambient, gain, one, other, part):  # type: ignore[no-untyped-def]
-    """Flux of ambient light plus gain times the profile, from `one` in a bin to `other` in the next at `part` of it."""
+    """Flux of ambient light plus gain times the profile, interpolated between `one` of a bin and `other` of the next by
+    `part`.
+    """
     return min(max(ambient + gain * (one + part * (other - one)), FLUX_MIN), FLUX_MAX)
 
 
@@ -184,7 +189,7 @@ def flux_between(ambient, gain, one, other, part):  # type: ignore[no-untyped-de
 def line_light(sweep, state, y, c, middle):  # type: ignore[no-untyped-def]
     """Length of the light's path to the plane's points on row y per unit of depth, and the strength of the haze there.
 
-    middle: pixel of the row that its v is taken from.
+    middle: pixel of the row whose v is used.
     """
     plane = sweep.plane[c]
     path_p = path_to_plane(plane[0], plane[1], plane[2], sweep.v[y, middle])
@@ -193,10 +198,10 @@ def line_light(sweep, state, y, c, middle):  # type: ignore[no-untyped-def]
 
 @numba.njit(inline="always")
 def others_at(sweep, state, y, c, x):  # type: ignore[no-untyped-def]
-    """Haze of the lines that are lit together with column c, at one pixel, whichever side of c's stripe it lies on.
+    """Haze at one pixel from the lines that are lit together with column c, on whichever side of c's stripe it lies.
 
-    Where their own stripes lie is not known: their haze has not ended there with the probability that is the share of
-    the depth range behind the pixel's point on their plane.
+    The places of their own stripes are unknown. The probability that their haze has not ended there is taken as the
+    share of the depth range behind the pixel's point on their plane.
     """
     profile, light = state.profile, 0.0
     ux, vx = np.float64(sweep.u[y, x]), np.float64(sweep.v[y, x])
@@ -216,8 +221,8 @@ def others_at(sweep, state, y, c, x):  # type: ignore[no-untyped-def]
 
 @numba.njit(inline="always")
 def fluxes_at(sweep, state, y, x, c, path_p, strength):  # type: ignore[no-untyped-def]
-    """Flux before and behind column c's stripe, its scale, geometry factor, inverse depth and bin of one pixel, and
-    what other lines' haze brings to both fluxes.
+    """Flux before and behind column c's stripe, its scale, geometry factor, inverse depth and bin for one pixel, and
+    the contribution of other lines' haze to both fluxes.
     """
     plane, profile = sweep.plane[c], state.profile
     path_c, w, b = profile_place(
@@ -238,10 +243,10 @@ def fluxes_at(sweep, state, y, x, c, path_p, strength):  # type: ignore[no-untyp
 
 @numba.njit(cache=True, nogil=True)
 def row_fluxes(sweep: Sweep, state: RowState, row: RowBuffers, y: int, c: int) -> tuple[int, int, int, int]:
-    """Fill before to log_prior of `row` for row y of column c: what is expected there, whatever was counted.
+    """Fill before to log_prior of `row` for row y of column c, which do not depend on the counts.
 
-    Returns (length, first and last index that a stripe may have, x of index 0); pixel t is x + t where near is left,
-    else x - t. The length is 0 where there is nothing to search.
+    Returns (length, first and last index that a stripe may have, x of index 0); pixel t is x + t if near is left, else
+    x - t. The length is 0 if there is nothing to search.
     """
     lo, hi, x0 = sweep.x_lo[y, c], sweep.x_hi[y, c], sweep.x0[c]
     if lo > hi:
@@ -276,10 +281,10 @@ def row_fluxes(sweep: Sweep, state: RowState, row: RowBuffers, y: int, c: int) -
 def judge_line(
     sweep: Sweep, state: RowState, row: RowBuffers, lines: Lines, i: int
 ) -> tuple[int, int, int, int, float, float, float]:
-    """Posterior of line i, in `row`.
+    """Compute the posterior of line i in `row`.
 
-    Returns what `row_fluxes` does, then the probability of 'no stripe', the share of its prior that the picture's
-    border accounts for, and the log evidence.
+    Returns the values of `row_fluxes`, then the probability of 'no stripe', the share of its prior that is due to the
+    picture's border, and the log evidence.
     """
     c = lines.column[i]
     length, first, last, start = row_fluxes(sweep, state, row, lines.row[i], c)

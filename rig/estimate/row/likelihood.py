@@ -1,29 +1,30 @@
 """The likelihood of one image row, exact: the specification of everything that `likelihood` and `joint` compute.
 
-Along a row, from near to far, the light is 'haze, stripe, then less'. The counts n_t of pixels t = 0..L-1 are ones in
-K one-bit frames. Hypothesis (j, m), 'the stripe stands at pixel j with amplitude a_m', expects photons per exposure of
+Along a row, from near to far, the light is 'haze, stripe, then less'. The counts n_t of pixels t = 0..L-1 are ones in K
+one-bit frames. Hypothesis (j, m), 'the stripe is at pixel j with amplitude a_m', expects photons per exposure of
 
     flux_t = base_t + a_m psi_|t-j| scale_t                   psi: share of the line at 0..T px from its centre
     base_t = before_t for t < j                               haze and ambient light
            = behind_t for t > j                               pedestal and ambient light
            = (before_t + behind_t) / 2 at t = j
 
-A pixel fires with p' = (1 - e)(1 - exp(-flux)) + e/2; the floor e (FLOOR) bounds what a single pixel can say. Then
+A pixel fires with p' = (1 - e)(1 - exp(-flux)) + e/2; the floor e (FLOOR) bounds the evidence of a single pixel. Then
 
     log-likelihood(j, m) = sum over t of n_t logit p'_t + K log(1 - p'_t)
 
 is linear in the counts, so that all positions of a row cost one cumulative sum (pixels before and behind j) and 2T + 1
-taps (pixels around j). Beside the stripes stand three hypotheses without one: the row lies before its stripe all along,
-or behind it, or its haze ends between two pixels and nothing shines there. With priors over positions and amplitudes,
+taps (pixels around j). Besides the stripes there are three hypotheses without one: the whole row lies before its
+stripe, or behind it, or its haze ends between two pixels and nothing shines there. With priors over positions and
+amplitudes,
 
     P(j) ~ prior_j sum over m of weight_m exp(log-likelihood(j, m))
 
 `row_scores` is the log-likelihood, `row_posterior` the sum over amplitudes, `mode_of` the answer: read them in this
-order. Arrays of a row are float32 (L,), scores float32 (M, L). Where `before`, `behind`, `scale` and the priors come
-from is told in `rig.estimate.row.inputs` and `rig.estimate.row.model`. Only `logit_table` and LOST approximate.
+order. Arrays of a row are float32 (L,), scores float32 (M, L). `rig.estimate.row.inputs` and `rig.estimate.row.model`
+explain where `before`, `behind`, `scale` and the priors come from. Only `logit_table` and LOST are approximations.
 
 `rig.estimate.search` and `rig.estimate.joint.labels` are fast forms of this and are tested against it.
-tests/unit/rig/estimate/row/test_likelihood.py holds this module itself against direct sums, in 50 digits and float64.
+tests/unit/rig/estimate/row/test_likelihood.py compares this module with direct sums, in 50 digits and float64.
 """
 
 from typing import Any, Final
@@ -58,7 +59,7 @@ LOST: Final = np.float32(24.0)
 def logit_table() -> Float32:
     """Table (2, cells) float32 of logit p' and log(1 - p') over flux: 256 cells an octave, value at the cell's middle.
 
-    The largest error, half a cell, changes a log-likelihood by 0.002 per count: far below its own noise.
+    The largest error, half a cell, changes a log-likelihood by 0.002 per count, far below its own noise.
     """
     cells = (EXPONENT_HIGH - EXPONENT_LOW) << CELL_BITS
     i = np.arange(cells)
@@ -71,7 +72,7 @@ def logit_table() -> Float32:
 
 @numba.njit(inline="always")
 def cell_of(flux):  # type: ignore[no-untyped-def]
-    """Cell of `logit_table` that a float32 flux of FLUX_MIN to FLUX_MAX lies in; unsigned, for the vectoriser."""
+    """Cell of `logit_table` for a float32 flux of FLUX_MIN to FLUX_MAX; unsigned, for the vectoriser."""
     return np.uint64((np.float32(flux).view(np.uint32) >> TABLE_SHIFT) - TABLE_BASE)
 
 
@@ -79,7 +80,8 @@ def cell_of(flux):  # type: ignore[no-untyped-def]
 def add_evidence(
     n: Float32, k: Real, base: Float32, light: Real, scale: Float32, own: Float32, table: Float32, score: Float32
 ) -> None:
-    """score += log-likelihood of n ones in k frames at flux base + light * scale, less `own`; all arrays alike long.
+    """score += log-likelihood of n ones in k frames at flux base + light * scale, minus `own`; all arrays have equal
+    length.
 
     Fluxes must be at least FLUX_MIN. Written for the vectoriser: no branch, unsigned table index, slices from zero.
     """
@@ -95,10 +97,10 @@ def row_scores(
     n: Float32, k: Real, before: Float32, behind: Float32, scale: Float32, length: int, amplitude: Float32,
     psi: Float32, table: Float32, taps: Float32, edge: Float32, score: Float32,
 ) -> None:  # fmt: skip
-    """Log-likelihood of every position and amplitude against 'everything is behind'.
+    """Log-likelihood of every position and amplitude relative to 'everything is behind'.
 
-    psi: (T + 1,) share of the stripe at 0..T px from its centre. Writes score (M, length), edge (length + 1,), the
-    score of a change from before to behind at t without any stripe, and taps (3, length): each pixel's own
+    psi: (T + 1,) share of the stripe at 0..T px from its centre. Writes score (M, length); edge (length + 1,), the
+    score of a change from before to behind at t without any stripe; and taps (3, length): each pixel's own
     log-likelihood before and behind, and the flux between the two.
     """
     n, before, behind, scale = n[:length], before[:length], behind[:length], scale[:length]
@@ -152,9 +154,9 @@ def row_posterior(
     score: Float32, edge: Float32, length: int, first: int, last: int, log_weight: Float32, log_prior: Float32,
     none: tuple[float, float, float], posterior: Float32, by_amplitude: Float64,
 ) -> tuple[float, float]:  # fmt: skip
-    """Posterior (length,) over positions, summed over amplitudes; by_amplitude (M,) sums the other way.
+    """Posterior (length,) over positions, summed over amplitudes; by_amplitude (M,) is summed over positions.
 
-    none: prior of a row that is behind its stripe all along (nearer than the picture), of one that is before it, and of
+    none: prior of a row that is entirely behind its stripe (nearer than the picture), of one that is before it, and of
     one whose haze ends somewhere without a stripe. log_prior: of positions, up to a constant; log_weight: of
     amplitudes. Returns (probability of 'no stripe', log evidence of the row).
     """
@@ -204,7 +206,7 @@ def row_posterior(
 
 @numba.njit(cache=True, nogil=True)
 def mode_of(posterior: Float32, first: int, last: int) -> tuple[int, float]:
-    """Most probable position, ties to the smaller index, and the probability of lying within 1 px of it."""
+    """Most probable position, the smaller index among equal ones, and the probability of lying within 1 px of it."""
     mode = first
     for j in range(first, last + 1):
         if posterior[j] > posterior[mode]:

@@ -1,9 +1,10 @@
-"""The learned model of light and medium that the row likelihood goes by; all of it comes from counts.
+"""The learned model of light and medium for the row likelihood. All of it is learned from counts.
 
-Path inverse depth w is 1 over the mean of the two path lengths, scanner to point and point to camera. Over BINS bins of
-it stand two profiles, haze before the stripe and the level behind it, each times a gain per row and per column:
-single-scattered haze depends on the two path lengths only. A stripe carries a S(w) photons, a out of AMPLITUDES learned
-amplitudes (reflectance and laser power), S = w^2 exp(-2 extinction / w), scaled to 1 in the middle bin.
+Path inverse depth w is 1 over the mean of the two path lengths, scanner to point and point to camera. There are two
+profiles over BINS bins of w, haze before the stripe and the level behind it, each multiplied by a gain per row and per
+column, since single-scattered haze depends on the two path lengths only. A stripe carries a S(w) photons, with a one of
+AMPLITUDES learned amplitudes (reflectance and laser power) and S = w^2 exp(-2 extinction / w), scaled to 1 in the
+middle bin.
 
 The line is a Gaussian of learned width, integrated over pixels (`pixel_shares`).
 """
@@ -41,10 +42,12 @@ class RowModel:
     behind it in photons per exposure and pixel at unit geometry factor, the stripe scale S, and the log prior of
     positions. row_gain: (rows,) and column_gain: (columns,) float32, strength of the haze on each. ambient: (rows,
     width) float32, photons per exposure of ambient light and dark counts. amplitude, weight: (AMPLITUDES,), photons at
-    S = 1 and their probability. none_weight: probability of a row without stripe. line_sigma_px: width of the line.
-    extinction_per_m and its standard deviation: NaN where the haze does not resolve it. halo: (HALO_NODES, reaches)
-    float32, light of the stripe's halo over its own (`rig.estimate.row.inputs`), zeros where there is none. before:
-    labels that the map before left to this one (`rig.estimate.joint.temporal`), None where it left none.
+    S = 1 and their probability.
+    none_weight: probability of a row without stripe. line_sigma_px: width of the line. extinction_per_m and its
+    standard
+    deviation: NaN if the haze does not resolve it. halo: (HALO_NODES, reaches) float32, light of the stripe's halo over
+    its own (`rig.estimate.row.inputs`), 0 if there is none. before: labels that the previous map left to this one
+    (`rig.estimate.joint.temporal`), None if it left none.
     """
 
     profile: Float32
@@ -69,7 +72,9 @@ class RowModel:
 
     @classmethod
     def from_arrays(cls, arrays: Mapping[str, NDArray[np.generic]]) -> "RowModel":
-        """The state that `arrays` gave, bit for bit. KeyError where one is missing that was always there."""
+        """The state from which `arrays` came, bit for bit. Raises KeyError if a field is missing that every version
+        has.
+        """
         kept = {
             field.name: arrays[field.name]
             for field in fields(cls)
@@ -79,7 +84,7 @@ class RowModel:
         return cls(**values)
 
     def hot_flux(self) -> float:
-        """Ambient light in photons per exposure above which a pixel teaches nothing of the medium."""
+        """Ambient light in photons per exposure above which a pixel is not used to learn the medium."""
         return 5.0 * float(np.median(self.ambient)) + 1e-3
 
     def path_m(self) -> Float64:
@@ -128,10 +133,10 @@ class HazeFit:
 
 
 def fit_haze(path_m: Float64, flux: Float64, variance: Float64) -> HazeFit | None:
-    """Weighted fit of an exponential to haze flux (bins,) with its variance (bins,); None where there is no haze.
+    """Weighted fit of an exponential to haze flux (bins,) with its variance (bins,); None if there is no haze.
 
-    Gauss-Newton on amplitude and extinction, the latter kept in 0 to EXTINCTION_MAX_PER_M and OPTICAL_DEPTH_MAX at the
-    nearest haze.
+    Gauss-Newton on amplitude and extinction. The extinction is kept between 0 and EXTINCTION_MAX_PER_M, and below
+    OPTICAL_DEPTH_MAX at the nearest haze.
     """
     used = np.isfinite(flux) & np.isfinite(variance) & (variance > 0)
     if used.sum() < 4:
@@ -144,7 +149,7 @@ def fit_haze(path_m: Float64, flux: Float64, variance: Float64) -> HazeFit | Non
     candidates = np.concatenate([[0.0], np.geomspace(min(0.005, most), most, 60)])
 
     def fitted(extinction: float) -> tuple[float, Float64]:
-        """Best amplitude at an extinction, and the shape of the haze."""
+        """Best amplitude for an extinction, and the shape of the haze."""
         shape = np.exp(-2.0 * extinction * (s - s.min()))
         return float(np.sum(weight * shape * h) / np.sum(weight * shape**2)), shape
 
@@ -153,7 +158,7 @@ def fit_haze(path_m: Float64, flux: Float64, variance: Float64) -> HazeFit | Non
         return float(np.sum(weight * (h - amplitude * shape) ** 2))
 
     def linear(extinction: float) -> tuple[float, Float64, Float64]:
-        """Amplitude, slopes of the haze by amplitude and extinction, and the matrix of the normal equations."""
+        """Amplitude, derivatives of the haze by amplitude and extinction, and the matrix of the normal equations."""
         amplitude, shape = fitted(extinction)
         design = np.stack([shape, -2.0 * (s - s.min()) * amplitude * shape])
         return amplitude, design, (design * weight) @ design.T

@@ -1,11 +1,11 @@
 """Close look at the best position of a row, compiled: a fast form of `rig.estimate.row.likelihood`, tested against it.
 
-It tells where within the pixel the line lies, from LABELS lines LABEL_PX apart, one label to a lane of a vector. With L
-and R the flux left and right of the line, s its light and f_i,t its share in pixel t at label i,
+It finds the position of the line within the pixel from LABELS lines LABEL_PX apart, with one label per lane of a
+vector. With L and R the flux left and right of the line, s its light and f_i,t its share in pixel t at label i,
 
     score_i = K constant_i + sum over t of n_t weight_i,t,   from flux_i,t = share L + (1 - share) R + s f_i,t
 
-in units of 1 / (128 >> shift) octaves of likelihood, saturating int16; the position is the posterior mean over labels,
+in units of 1 / (128 >> shift) octaves of likelihood, saturating int16. The position is the posterior mean over labels,
 float32. weight (int8) and constant (float32) are tabled over two fluxes, haze and line, two levels an octave; s is
 taken from the counts themselves.
 """
@@ -49,9 +49,9 @@ class Closeup(NamedTuple):
     """Tables of the close look.
 
     weight: int8 (LEVELS, LEVELS, 2, R + 1, LANES, 2) over haze, line, last bit of the pixel looked at, pair of pixels
-    from `first_px` on, label: units per count; constant: float32 (LEVELS, LEVELS, LANES), units per exposure. Both less
-    their mean over the labels. Units are 128 >> shift an octave. label, square: float32 (LANES,), number of the label
-    from the middle one, and squared, in the order UNPACKED.
+    from `first_px` on, label: units per count; constant: float32 (LEVELS, LEVELS, LANES), units per exposure. The mean
+    over the labels is subtracted from both. Units are 128 >> shift an octave. label, square: float32 (LANES,), number
+    of the label from the middle one, and its square, in the order UNPACKED.
     """
 
     weight: NDArray[np.int8]
@@ -66,8 +66,9 @@ def label_weights(
 ) -> tuple[Float32, Float32]:
     """Weight of a count for each label, (LEVELS, LEVELS, F, LABELS), and of an exposure, (LEVELS, LEVELS, LABELS).
 
-    Both in octaves of likelihood, less their mean over the labels. ambient: photons per exposure; share: the pedestal's
-    over the haze; fine: (LABELS, F) as `fine_profiles` of `rig.estimate.row.model`; table: `logit_table`.
+    Both are in octaves of likelihood, with the mean over the labels subtracted. ambient: photons per exposure; share:
+    level of the pedestal over that of the haze; fine: (LABELS, F) as `fine_profiles` of `rig.estimate.row.model`;
+    table: `logit_table`.
     """
     pixels = fine.shape[1]
     reach = (pixels - 1) // 2
@@ -94,7 +95,7 @@ def label_weights(
 
 
 def closeup_tables(weight: Float32, constant: Float32, units: int) -> Closeup:
-    """Tables in so many units an octave, from `label_weights`."""
+    """Tables with `units` units an octave, from `label_weights`."""
     pixels = weight.shape[2]
     reach = (pixels - 1) // 2
     whole = _cut(weight, units).astype(np.int8)
@@ -112,7 +113,7 @@ def closeup_tables(weight: Float32, constant: Float32, units: int) -> Closeup:
 
 
 def largest_score(weight: Float32, units: int) -> float:
-    """Largest sum of the weights of a label, in so many units an octave, from `label_weights`."""
+    """Largest sum of the weights of a label, with `units` units an octave, from `label_weights`."""
     return float(np.abs(_cut(weight, units)).sum(axis=2).max())
 
 
@@ -123,7 +124,9 @@ def _cut(weight: Float32, units: int) -> Float32:
 
 @numba.njit(inline="always")
 def first_px(odd, reach):  # type: ignore[no-untyped-def]
-    """First pixel of the pairs that hold `reach` pixels around one, from that one on; odd: its last bit."""
+    """First pixel of the pairs that cover `reach` pixels around a pixel, relative to that pixel. odd: the pixel's last
+    bit.
+    """
     return (odd - reach) // 2 * 2 - odd
 
 
@@ -135,7 +138,7 @@ def level_flux(level):  # type: ignore[no-untyped-def]
 
 @numba.njit(inline="always")
 def levels_of(before, signal):  # type: ignore[no-untyped-def]
-    """Index of the two levels among the tables', of float32 lanes of fluxes: 16-bit lanes."""
+    """Index of the two levels in the tables, 16-bit lanes, for fluxes in float32 lanes."""
     return _level_of_each(before) * np.int16(LEVELS) + _level_of_each(signal)
 
 
@@ -150,7 +153,7 @@ def _level_of_each(flux):  # type: ignore[no-untyped-def]
 def label_scores(search, r, x, exposures, weight, constant, pairs):  # type: ignore[no-untyped-def]
     """Score of each label, 16-bit lanes, for a line near pixel x of row r of the batch.
 
-    weight: address of the weights of the two levels, for even x; constant: of theirs; pairs: R + 1.
+    weight: address of the weights of the two levels, for even x; constant: address of their constants; pairs: R + 1.
     """
     n = search.n + r * search.n_bytes
     score = to_int16(larger_float(load_float32(constant, 0) * np.float32(exposures), LOWEST_SCORE))
@@ -164,10 +167,11 @@ def label_scores(search, r, x, exposures, weight, constant, pairs):  # type: ign
 
 @numba.njit(forceinline=True)
 def offsets(mass, moment, square, label_px):  # type: ignore[no-untyped-def]
-    """Offset of each line from the middle of its pixel in px, to the right, and its standard deviation; float32 lanes.
+    """Offset of each line from the middle of its pixel in px, positive to the right, and its standard deviation;
+    float32 lanes.
 
-    mass, moment, square: sums over the labels of their likelihoods, times their numbers, times those squared; label_px:
-    from one to the next.
+    mass, moment, square: sums over the labels of their likelihoods, of these times the labels' numbers, and times the
+    squared numbers; label_px: distance from one label to the next.
     """
     mean = moment / mass
     variance = larger_float(square / mass - mean * mean, np.float32(0.0))

@@ -1,8 +1,9 @@
-"""Decides when an estimator learns, and holds the model that it goes by until then.
+"""Decides when an estimator learns, and holds the model that it uses until then.
 
-The first map is estimated with a model learned from that map itself. A later map teaches when enough frames have come
-since the last lesson (TEACH_FRAMES), on a thread beside the stream. The new model is used a fixed number of frames
-later (LAG_FRAMES), so that a live scan hardly ever waits and results do not depend on the speed of the machine.
+The first map is estimated with a model learned from that map itself. A later map is used for learning when enough
+frames have come since the last lesson (TEACH_FRAMES), on a thread beside the stream. The new model is used a fixed
+number of frames later (LAG_FRAMES), so that a live scan hardly ever waits and results do not depend on the speed of the
+machine.
 """
 
 from collections.abc import Callable
@@ -40,7 +41,8 @@ Tables = TypeVar("Tables")
 
 @dataclass(frozen=True, slots=True, eq=False)
 class LearningSetting:
-    """A model and the kind of sweep that tables are made for. UsageError where it was learned from one of another size.
+    """A model and the kind of sweep for which tables are made. Raises UsageError if it was learned from one of another
+    size.
 
     exposures: of most columns; dark: whether sweeps have dark frames.
     """
@@ -63,14 +65,15 @@ class LearningSetting:
             )
 
     def same(self, other: "LearningSetting") -> bool:
-        """Whether the other has the same tables."""
+        """Whether the other one has the same tables."""
         alike = (self.exposures, self.dark) == (other.exposures, other.dark)
         return alike and self.model is other.model and self.geometry is other.geometry
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Seen:
-    """The part of a sweep that teaches: its tally, ones and exposures behind clear stripes, some lines of counts.
+    """The part of a sweep that is used for learning: its tally, ones and exposures behind clear stripes, some lines of
+    counts.
 
     intensity: of the tally, taken when the map was made. more: input of the estimator's own `learn_more`, see
     `OnlineLearner`.
@@ -84,10 +87,10 @@ class Seen:
 
 
 class OnlineLearner(Generic[Tables]):
-    """The model that an estimator goes by, `None` before a map that taught, and the tables made under it.
+    """The model that an estimator uses, None before the first lesson, and the tables made for it.
 
-    make: makes tables. learn_more: learns from `more` of a `Seen`, on top of what every estimator learns. Both are
-    called on the thread beside the stream too. learns: whether later maps change the model.
+    make: makes tables. learn_more: learns from `more` of a `Seen`, in addition to what every estimator learns. Both are
+    also called on the thread beside the stream. learns: whether later maps change the model.
     """
 
     def __init__(
@@ -110,7 +113,7 @@ class OnlineLearner(Generic[Tables]):
         """Lit frames since the last map that taught."""
 
     def model_for(self, first: Callable[[], RowModel]) -> RowModel:
-        """The model to estimate a sweep with; first: learns it from the sweep where there is none yet."""
+        """The model to estimate a sweep with. first: learns it from the sweep if there is none yet."""
         return self.model if self.model is not None else first()
 
     def tables(self, setting: LearningSetting, workers: RowWorkers) -> Tables:
@@ -121,7 +124,9 @@ class OnlineLearner(Generic[Tables]):
         return self._made[1]
 
     def attend(self, stripes: StripeTable, used: RowModel, frames: int, see: Callable[[], Seen]) -> None:
-        """Note a map of so many lit frames, estimated with `used`; `see` is called only where the map is to teach."""
+        """Note a map of that many lit frames, estimated with `used`. `see` is called only if the map is to be used for
+        learning.
+        """
         self._frames_since += frames
         sure = bool(np.mean(stripes.confidence > 0.5) >= LEAST_SURE)
         if sure and self.model is None:
@@ -152,7 +157,7 @@ class OnlineLearner(Generic[Tables]):
 
 
 def first_model(volume: CountVolume, geometry: SweepGeometry, workers: RowWorkers) -> RowModel:
-    """Learn from the first sweep; it is searched once to find which pixels were quiet behind the stripe."""
+    """Learn from the first sweep, which is searched once to find which pixels were quiet behind the stripe."""
     intensity = volume.intensity()
     model = learn_first(volume, geometry, ambient_map(volume, intensity, geometry, None), workers)
     dark = volume.dark_counts is not None

@@ -1,8 +1,8 @@
 """Makes the tables of the search along a row, per column and band of rows, from a model and a geometry.
 
-The search is a fast form of `rig.estimate.row.likelihood`, tested against it. Here it is decided how many rows share a
-table (`rows_of_band`), into how fine units likelihood is divided so that no 16-bit sum runs over, and how often counts
-are halved (`judge_of`); tests/unit/rig/estimate/search/test_prepare.py checks those bounds.
+The search is a fast form of `rig.estimate.row.likelihood`, tested against it. This module decides how many rows share a
+table (`rows_of_band`), and how fine the units of likelihood are and how often counts are halved so that no 16-bit sum
+overflows (`judge_of`). tests/unit/rig/estimate/search/test_prepare.py checks those bounds.
 """
 
 from typing import Any
@@ -62,9 +62,9 @@ LEAST_VEIL = 0.1
 def judge_of(
     model: RowModel, geometry: SweepGeometry, exposures: int, workers: RowWorkers, *, dark: bool
 ) -> SearchTables:
-    """All that the search needs to judge a sweep under `model`, for columns of about `exposures` frames.
+    """All tables that the search needs to judge a sweep under `model`, for columns of about `exposures` frames.
 
-    dark: whether the sweep has dark frames, so that fewer columns need to teach the ambient light.
+    dark: whether the sweep has dark frames; fewer columns are then needed to learn the ambient light.
     """
     band_rows = rows_of_band(geometry)
     sweep, state = _banded(sweep_of(geometry), state_of(model), band_rows)
@@ -141,7 +141,7 @@ def nothing_found(geometry: SweepGeometry, lines: tuple[Int32, Int32] | None) ->
 
 
 def clear_found(found: RowAnswers) -> None:
-    """Make `found` as `nothing_found` gave it."""
+    """Reset `found` to the state in which `nothing_found` returns it."""
     found.stripe.fill(np.nan)
     found.stripe[:, 1] = 0.0
     for sums in (found.quiet, found.quiet_exposures, found.light, found.quiet_here, found.light_here, found.lines):
@@ -157,7 +157,7 @@ def stripes_of(found: RowAnswers, judge: SearchTables, workers: RowWorkers) -> S
 
 
 def quiet_of(found: RowAnswers, width: int) -> Float64:
-    """Ones and exposures of pixels while clearly behind a stripe, float64 (2, rows, width); both as halved."""
+    """Ones and exposures of pixels while clearly behind a stripe, float64 (2, rows, width); both of the halved counts."""
     exposures = np.repeat(np.cumsum(found.quiet_exposures[:, :-1], axis=1), STEPS, axis=1)[:, :width]
     return np.stack([pixel_order(found.quiet, width), exposures / EXPOSURE_PARTS])
 
@@ -173,7 +173,7 @@ def _limits(geometry: SweepGeometry) -> Int16:
 
 
 def rows_of_band(geometry: SweepGeometry) -> int:
-    """The most rows out of BAND_ROWS that a column's window crosses without shifting by more than BAND_SHEAR_PX."""
+    """The largest of BAND_ROWS for which a column's window shifts by at most BAND_SHEAR_PX over the band."""
     inside = (geometry.x_lo <= geometry.x_hi) & (geometry.x_lo > 0) & (geometry.x_hi < geometry.width - 1)
     for rows in BAND_ROWS:
         first = np.arange(0, geometry.rows, rows)

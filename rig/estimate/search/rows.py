@@ -1,11 +1,11 @@
 """Estimate of image rows, compiled: a fast form of `rig.estimate.row.likelihood`, tested against it.
 
-Every position is scored, the best looked at closely, and what the row teaches noted. BATCH rows of one column go
-together through 16-bit scores (`rig.estimate.search.scores`, tables of `rig.estimate.search.tables`), with SCREENS
-amplitudes instead of all, one table for a band of rows and counts of 6 bits. `SearchTables` go in, `RowAnswers`
-come out, float32 (FIELDS, rows) per column; kernels get `SearchPointers` to both.
+Every position is scored, the best one examined closely, and what can be learned from the row is recorded. BATCH rows of
+one column go together through 16-bit scores (`rig.estimate.search.scores`, tables of `rig.estimate.search.tables`),
+with SCREENS amplitudes instead of all, one table for a band of rows and counts of 6 bits. The input is `SearchTables`,
+the output `RowAnswers`, float32 (FIELDS, rows) per column; kernels get `SearchPointers` to both.
 
-`judge_rows` serves frames as they come and counts of whole sweeps (`rig.estimate.search.stream`).
+`judge_rows` serves both frames as they come and counts of whole sweeps (`rig.estimate.search.stream`).
 """
 
 from typing import Final, NamedTuple
@@ -60,16 +60,17 @@ FIELDS: Final = 5
 
 
 class SearchTables(NamedTuple):
-    """Inputs of the search in the rows of a sweep, fixed while the sweep lasts.
+    """Inputs of the search in the rows of a sweep, which do not change during the sweep.
 
     x0: int32 (columns,), first stored pixel; window: stored pixels; limits: int16 (columns, 2, rows + LANES), first and
-    last stored pixel of each search window, the first behind the last where there is none. rows: of the picture.
+    last stored pixel of each search window, with the first after the last if there is none. rows: of the picture.
     ambient: float32 (bands, width padded to whole words). hot_start: int32 (words, rows + 1), for windows that begin at
-    each word the first entry of each row in hot_at, int16, stored pixels whose counts say nothing, and hot_place,
-    int32, their places in the counts of all rows of the picture. nominal: exposures the tables are for. faintest,
-    brightest: photons of a stripe at scale 1. reach: half the line's width in px. shift: units of the scores are
-    128 >> shift an octave, close_shift: of the close-up's. most: largest count. quiet_step: one column in so many
-    teaches the ambient light. flux: see `count_fluxes`.
+    each word the first entry of each row in hot_at and hot_place; hot_at: int16, stored pixels whose counts are not
+    used; hot_place: int32, their places in the counts of all rows of the picture. nominal: exposures for which the
+    tables are made. faintest, brightest: photons of a stripe at scale 1. reach: half the line's width in px. shift:
+    units of the scores are 128 >> shift an octave;
+    close_shift: the same for the close-up. most: largest count. quiet_step: one of this number of columns is used to
+    learn the ambient light. flux: see `count_fluxes`.
     """
 
     tables: ScreenTables
@@ -98,12 +99,13 @@ class SearchTables(NamedTuple):
 class RowAnswers(NamedTuple):
     """Answers of a sweep, to be filled.
 
-    stripe: float32 (columns, FIELDS, rows), NaN and confidence 0 where there is nothing. quiet: int32 (rows, PAIRS,
-    lanes of the sensor + LANES, 2), ones of pixels while clearly behind a stripe, in lane order; quiet_exposures: int32
+    stripe: float32 (columns, FIELDS, rows), NaN and confidence 0 if there is nothing. quiet: int32 (rows, PAIRS, lanes
+    of the sensor + LANES, 2), ones of pixels while clearly behind a stripe, in lane order; quiet_exposures: int32
     (rows, lanes + 1), their exposures in 1/EXPOSURE_PARTS as steps up and down. light: int32, like quiet, ones of every
-    pixel within the windows. The latest ones of both are still in quiet_here and light_here, uint8 (rows, PAIRS, lanes
-    of the window, 2). lines: int32 (lines, window), counts of the rows that the learning reads; line_start:
-    int32 (columns + 1,) and line_row: int32, the rows of each column in order.
+    pixel within the windows. The most recent ones of both are still in quiet_here and light_here, uint8 (rows, PAIRS,
+    lanes of the window, 2).
+    lines: int32 (lines, window), counts of the rows used for learning; line_start: int32 (columns + 1,) and line_row:
+    int32, the rows of each column in order.
     """
 
     stripe: Float32
@@ -120,9 +122,10 @@ class RowAnswers(NamedTuple):
 class SearchPointers(NamedTuple):
     """Pointers (`rig.simd.memory.pointers`) to tables, answers and a thread's memory, with the sizes of their arrays.
 
-    bands, taps: tables of a column, and pairs that a table has taps for; weight_pairs: the same of the close-up.
-    lanes: of the window, sum_lanes: of the sums over the picture. limit_rows: of `limits`. ambient: that of the
-    tables where they have it (several_lines), else of the bands, ambient_px wide.
+    bands, taps: number of tables of a column, and of pairs of a table with taps; weight_pairs: the latter for the
+    close-up.
+    lanes: of the window, sum_lanes: of the sums over the picture. limit_rows: of `limits`. ambient: that of the tables
+    if they have it (several_lines), else of the bands, ambient_px wide.
     """
 
     judge: SearchTables
@@ -140,7 +143,7 @@ class SearchPointers(NamedTuple):
 
 
 def pointers_of(judge: SearchTables, found: RowAnswers, memory: Uint8) -> SearchPointers:
-    """Pointers to everything; the arrays must outlive them. memory: of a thread, see `search_memory`."""
+    """Pointers to everything. The arrays must outlive them. memory: of a thread, see `search_memory`."""
     tables = judge.tables
     several_lines = tables.ambient.shape[0] > 0
     ambient = tables.ambient if several_lines else judge.ambient
@@ -153,10 +156,10 @@ def pointers_of(judge: SearchTables, found: RowAnswers, memory: Uint8) -> Search
 
 
 def count_fluxes() -> Float32:
-    """Photons per exposure that n ones in k exposures speak for, float32: log (k + 1/2) / (k - n + 1/2).
+    """Photons per exposure estimated from n ones in k exposures, float32: log (k + 1/2) / (k - n + 1/2).
 
-    Nearly unbiased, finite also at n = k. Rows are k in steps of 1/EXPOSURE_PARTS, columns n: up to one more than
-    COUNT_LIMIT, since halved counts are rounded up.
+    Nearly unbiased, and finite also at n = k. Rows are k in steps of 1/EXPOSURE_PARTS; columns are n, up to one more
+    than COUNT_LIMIT, since halved counts are rounded up.
     """
     parts, n = np.mgrid[: EXPOSURE_PARTS * (COUNT_LIMIT + 1), : COUNT_LIMIT + 2]
     k = parts / EXPOSURE_PARTS
@@ -177,7 +180,7 @@ USUAL_PAIRS: Final = 4
 
 @numba.njit(cache=True, nogil=True)
 def halvings(exposures: int, most: int) -> int:
-    """Number of times that counts of so many exposures are halved, so that none exceeds `most`."""
+    """Number of times that counts of this many exposures are halved, so that none exceeds `most`."""
     times = 0
     while (exposures >> times) > most:
         times += 1
@@ -205,7 +208,7 @@ def _fetch_ahead(desk: SearchPointers, pixels: int, table: int) -> None:
 
 @numba.njit(forceinline=True)
 def table_for(desk: SearchPointers, search: Search, c: int, b: int, exposures: float) -> ScreenTable:
-    """Make the table of column c and band b ready for columns of so many exposures."""
+    """The table of column c and band b, made ready for columns with this number of exposures."""
     judge, tables = desk.judge, desk.judge.tables
     pixels, table = STEPS * search.lanes, c * desk.bands + b
     constant = tables.position + 2 * SCREENS * pixels * table
@@ -273,9 +276,9 @@ def _unmute_hot(desk, search, first, rows, x0):  # type: ignore[no-untyped-def]
 def judge_rows(
     desk: SearchPointers, search: Search, table: ScreenTable, first: int, rows: int, c: int, exposures: float
 ) -> None:
-    """Estimate rows first..first+rows-1 (at most BATCH) of column c, all of the band that `table` is of.
+    """Estimate rows first..first+rows-1 (at most BATCH) of column c, all in the band to which `table` belongs.
 
-    Their counts are the rows of the batch.
+    Their counts must be in the rows of the batch.
     """
     if not table.searched:
         return
@@ -429,7 +432,7 @@ def keep_line(n: int, lanes: int, window: int, to: int) -> None:
 
 @numba.njit(cache=True, nogil=True)
 def turned(stripe: Float32, limits: Int16, first_row: int, last_row: int, out: Float32) -> None:
-    """Rows first_row..last_row-1 of answers (columns, FIELDS, rows) as (FIELDS, rows, columns).
+    """Write rows first_row..last_row-1 of answers (columns, FIELDS, rows) to out as (FIELDS, rows, columns).
 
     limits: as in `SearchTables`; rows without a search window have no answer.
     """

@@ -1,6 +1,6 @@
 """Scores of all positions of a row, compiled: a fast form of `rig.estimate.row.likelihood`, tested against it.
 
-Log-likelihoods less that of 'everything is right of the stripe', the best one, and how sure it is:
+Computes log-likelihoods relative to 'everything is right of the stripe', the best one, and its certainty:
 
     score_m(x) = K constant_m(x) + sum over pixels left of x of n edge + sum over pixels t around x of n_t tap_m,t(x)
 
@@ -48,7 +48,9 @@ START: Final = -12000
 
 @numba.njit(cache=True, nogil=True)
 def fit_positions(position: int, slope: int, places: int, more: float, to: int) -> None:
-    """Constants of a table's positions for columns of `more` exposures than nominal; all but the numbers addresses."""
+    """Write the constants of a table's positions for columns with `more` exposures than nominal. All arguments but
+    numbers are addresses.
+    """
     for i in range(places):
         constant = np.float32(read_int16(position, i)) + more / np.float32(SLOPE) * np.float32(read_int16(slope, i))
         inside = read_int16(position, i) > OUTSIDE
@@ -58,7 +60,7 @@ def fit_positions(position: int, slope: int, places: int, more: float, to: int) 
 
 @numba.njit(forceinline=True)
 def fit_lanes(per_exposure: int, exposures: float, change: float, first: int, last: int, search: Search) -> None:
-    """Constants of the lanes; per_exposure: address of the table's, which are sums up to each lane.
+    """Write the constants of the lanes. per_exposure: address of the table's constants, which are sums up to each lane.
 
     change: score of a change without a stripe, in the lanes first..last that hold pixels of the column.
     """
@@ -73,7 +75,7 @@ def fit_lanes(per_exposure: int, exposures: float, change: float, first: int, la
 
 @numba.njit(forceinline=True)
 def score_rows(table: ScreenTable, reach: int, search: Search, rows: int) -> None:
-    """Score every position of the batch's first rows; reach: T of the table's taps."""
+    """Score every position of the batch's first rows. reach: T of the table's taps."""
     for r in range(rows):
         _sum_edges(table, search, r)
     # Apart from the sums, which wait for one another: those of several rows are under way at once.
@@ -192,7 +194,7 @@ MOST_OCTAVES: Final = 60
 def find_best(search: Search, rows: int, shift: int) -> None:
     """Fill best, lift, ceiling and x of the batch's first rows.
 
-    Of pixels that share the best score the one of the lowest lane counts, of its steps the first.
+    Among pixels with the same best score, the one of the lowest lane and there of the first step is taken.
     """
     lanes = search.lanes
     best = largest_of_rows(search.tops)
@@ -224,9 +226,11 @@ def _lane_with(score: int, lanes: int, wanted: np.int16) -> int:
 
 @numba.njit(forceinline=True)
 def add_likelihoods(table: ScreenTable, search: Search, rows: int, window: int, shift: int) -> None:
-    """Fill mass, left and right of the batch's first rows, after `find_best`.
+    """Fill mass, left and right of the batch's first rows. Call it after `find_best`.
 
-    mass: likelihoods of all positions, and of a change without a stripe at each lane, up to a factor for each row.
+    mass: sum of the likelihoods of all positions, and of a change without a stripe at each lane, up to a factor for
+    each row.
+    left, right: scores beside the best position.
     """
     lanes = search.lanes
     for r in range(rows):
@@ -256,7 +260,7 @@ def add_likelihoods(table: ScreenTable, search: Search, rows: int, window: int, 
 
 @numba.njit(forceinline=True)
 def certainties(table: ScreenTable, search: Search, shift: int):  # type: ignore[no-untyped-def]
-    """Probability of each row of the batch to have its stripe within 1 px of x, float32 lanes."""
+    """Probability that each row of the batch has its stripe within 1 px of x, float32 lanes."""
     lift, ceiling = load_int16(search.lift, 0), load_int16(search.ceiling, 0)
     all_left = add_saturated(load_int16(search.all_left, 0), table.all_left)
     all_right = zero_int16() + table.all_right

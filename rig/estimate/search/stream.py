@@ -1,10 +1,11 @@
-"""A sweep judged while its frames come in, by `rig.estimate.search.rows`: the very bits of judging it afterwards.
+"""A sweep judged by `rig.estimate.search.rows` while its frames come in, with the same result bit for bit as
+afterwards.
 
 `ColumnJudge` is the counter of `likelihood`: it judges each column as soon as it is complete and keeps no counts of it.
-Rows are worked through in chunks, so that counts never leave the cache. A chunk's counters, uint64 bit planes
-(`rig.count.kernels`), take the frames of a column as they come; with the first frame of the next column the rows of the
-finished one are read out of the planes into registers, judged, and forgotten. Where a column goes on in the next block
-its counters wait in memory. `search_volume` judges the counts of a whole sweep, integers (columns, rows, window).
+Rows are processed in chunks, so that counts never leave the cache. A chunk's counters, uint64 bit planes
+(`rig.count.kernels`), take the frames of a column as they come. At the first frame of the next column the rows of the
+finished one are read out of the planes into registers, judged, and dropped. If a column continues in the next block,
+its counters stay in memory. `search_volume` judges the counts of a whole sweep, integers (columns, rows, window).
 """
 
 from dataclasses import dataclass
@@ -53,10 +54,10 @@ SUM_LIMIT: Final = BYTE_FRAMES
 
 
 class OpenColumn(NamedTuple):
-    """The column whose frames are being counted; the same for every chunk between two blocks.
+    """The column whose frames are being counted. Between two blocks it is the same for all chunks.
 
-    column: -1 where none is open. first_word: of the frames' window. frames: counted so far. sums_x0: where the window
-    of `RowAnswers.light_here` and `quiet_here` begins; summed: exposures that they hold.
+    column: -1 if none is open. first_word: of the frames' window. frames: counted so far. sums_x0: begin of the window
+    of `RowAnswers.light_here` and `quiet_here`; summed: exposures that they hold.
     """
 
     column: int
@@ -79,7 +80,7 @@ def _move_window(by, row_words, n, planes):  # type: ignore[no-untyped-def]
 
 @numba.njit(cache=True, nogil=True)
 def carry_sums(desk: SearchPointers, x0: int, first_row: int, last_row: int) -> None:
-    """Add the light of the window that began at x0 to the picture's, and begin anew."""
+    """Add the light of the window that began at x0 to the picture's, and start again from 0."""
     _carry(desk.found.light_here, desk.lanes, desk.found.light, desk.sum_lanes, x0 // STEPS, first_row, last_row)
     _carry(desk.found.quiet_here, desk.lanes, desk.found.quiet, desk.sum_lanes, x0 // STEPS, first_row, last_row)
 
@@ -149,11 +150,11 @@ def search_frames(
     words: NDArray[np.uint64], bins: Int32, first_word: Int32, row_words: int, open_column: OpenColumn, end: bool,
     desk: SearchPointers, planes: NDArray[np.uint64], first_chunk: int, last_chunk: int,
 ) -> OpenColumn:  # fmt: skip
-    """Count and judge a block; returns the column that is open behind it.
+    """Count and judge a block; returns the column that is open after it.
 
-    words: (all words,) of the block's frames; bins: (n,), column of each frame, negative ones are passed over;
-    first_word: (n,) of each frame's window; row_words: words of a row; end: the sweep ends here, nothing stays open;
-    desk: with a thread's own memory; planes: see `new_planes`. Only chunks first_chunk..last_chunk-1 are touched.
+    words: (all words,) of the block's frames; bins: (n,), column of each frame, negative ones are skipped; first_word:
+    (n,) of each frame's window; row_words: words of a row; end: whether the sweep ends here, so that no column stays
+    open; desk: with a thread's own memory; planes: see `new_planes`. Only chunks first_chunk..last_chunk-1 are touched.
     """
     rows = desk.judge.rows
     frame = rows * row_words
@@ -201,7 +202,7 @@ def _after(state: OpenColumn, desk: SearchPointers, column: int, first_word: int
 
 @numba.njit(cache=True, nogil=True)
 def search_counts(counts: Counts, n_frames: Int32, desk: SearchPointers, first_row: int, last_row: int) -> None:
-    """Judge rows first_row..last_row-1 of counts (columns, rows, window); no light and no lines are kept."""
+    """Judge rows first_row..last_row-1 of counts (columns, rows, window), without collecting light and lines."""
     judge, search = desk.judge, search_in(desk.memory, desk.lanes)
     sums_x0, pending = np.int64(0), 0
     for c in range(counts.shape[0]):
@@ -234,8 +235,8 @@ class SearchedSweep(FrameTally):
     """A sweep whose columns have been judged.
 
     stripe: the stripe table. light: uint32 (rows, width), counts summed over the columns. quiet: float64 (2, rows,
-    width), ones and exposures of pixels while clearly behind a stripe. lines: what the learning reads. checked: int32
-    (partners, points, window), counts of the `check_points`.
+    width), ones and exposures of pixels while clearly behind a stripe. lines: the counts used for learning. checked:
+    int32 (partners, points, window), counts of the `check_points`.
     """
 
     stripe: StripeTable
@@ -250,9 +251,9 @@ class SearchedSweep(FrameTally):
 
 
 class ColumnJudge:
-    """The `Counter` that judges: counts and estimates one sweep after the other, each under one `SearchTables`.
+    """The `Counter` that judges: counts and estimates one sweep after the other, each with one `SearchTables`.
 
-    Its memory is made once; `begin` clears it for the next sweep.
+    Its memory is allocated once; `begin` clears it for the next sweep.
     """
 
     def __init__(self, layout: SweepLayout, geometry: SweepGeometry, judge: SearchTables, workers: RowWorkers) -> None:
@@ -279,7 +280,7 @@ class ColumnJudge:
         self._no_counts = np.zeros((0, layout.rows, layout.window), np.uint8)
 
     def begin(self, judge: SearchTables) -> None:
-        """Begin the next sweep, under `judge`."""
+        """Begin the next sweep, with the tables `judge`."""
         self._workers.settle()
         self._judge = judge
         clear_found(self._found)
@@ -287,7 +288,7 @@ class ColumnJudge:
         self._open, self._desks, self._row_words = {}, {}, 0
 
     def add(self, bits: Uint8, bins: Int32, column: Float64, x0: Int32) -> None:
-        """Add frames, see `Counter`; columns that they complete are judged."""
+        """Add frames as in `Counter`; columns that they complete are judged."""
         first_word = x0 // np.int32(WORD_PX)
         self._tally.note(bins, column, first_word)
         words, row_words = bits.reshape(-1).view(np.uint64), bits.shape[2] // WORD_BYTES
@@ -309,7 +310,7 @@ class ColumnJudge:
         self._workers.settle(under_way)
 
     def finish(self) -> SearchedSweep:
-        """Judge the last column; the sweep with all its columns judged."""
+        """Judge the last column; returns the sweep with all its columns judged."""
         layout, found = self._layout, self._found
         if self._row_words:
             nothing = np.zeros(0, np.int32)
@@ -369,7 +370,7 @@ class ColumnJudge:
 def search_volume(
     volume: CountVolume, geometry: SweepGeometry, judge: SearchTables, workers: RowWorkers
 ) -> tuple[StripeTable, Float64]:
-    """Stripes as `judge` sees them, and the ones and exposures of pixels behind clear stripes (2, rows, width)."""
+    """The stripes found with `judge`, and the ones and exposures of pixels behind clear stripes (2, rows, width)."""
     found = nothing_found(geometry, None)
 
     def work(first: int, last: int) -> None:

@@ -1,15 +1,15 @@
 """Tables of the search along a row, per column and band of rows, and a thread's buffers.
 
-They hold the terms of `rig.estimate.row.likelihood` in whole numbers of units, `units` to an octave of likelihood: with
-p'_L and p'_R of a pixel left and right of the stripe and p'_S of one that it lights,
+They hold the terms of `rig.estimate.row.likelihood` in integers, with `units` units to an octave of likelihood. With
+p'_L and p'_R of a pixel left and right of the stripe and p'_S of a pixel that it lights,
 
     edge = logit p'_L - logit p'_R                  int8: a count at a pixel left of position x
     tap  = logit p'_S - logit p'_L or R             int8: a count at a pixel around x, for SCREENS amplitudes
     constant: the same of log(1 - p'), per exposure, since the number of frames differs from column to column
 
-Where near is left, left is haze and ambient light and right is the pedestal; with the scanner on the other side it is
-the other way round. Haze and pedestal vary slowly from row to row, so the rows of a band share one table per column.
-8-bit weights are what a processor multiplies and adds at once. `ScreenTables` has the shapes.
+If near is left, left is haze and ambient light and right is the pedestal; with the scanner on the other side it is the
+other way round. Haze and pedestal vary slowly from row to row, so the rows of a band share one table per column.
+Processors multiply and add 8-bit weights in one instruction. `ScreenTables` has the shapes.
 """
 
 from typing import Final, NamedTuple
@@ -48,14 +48,15 @@ class ScreenTables(NamedTuple):
     tap: int8 (columns, bands, SCREENS, STEPS, T + 1, lanes, 2), weights at each position of the counts of T + 1 pairs
     from `first_pair` on, which hold those T px around it; at odd positions that of the pixel before as left as well.
     position: int16 (columns, bands, SCREENS, P), units of position x at the nominal number of exposures, its prior
-    included; slope: int16, the same shape, by how many 1 / SLOPE of a unit it grows with each exposure more.
-    lane: float32 (columns, bands, lanes), units per exposure of all pixels up to a lane's last lying left.
+    included; slope: int16, the same shape, increase with each further exposure in 1 / SLOPE of a unit.
+    lane: float32 (columns, bands, lanes), units per exposure if all pixels up to a lane's last lie left.
     none: float32 (columns, bands, NONE), units of 'no stripe': all as right, all as left, a change somewhere (per
     lane); first and last lane with pixels of the column.
-    neutral: float32 (columns, bands, P), ones per exposure that say nothing, in pixel order.
+    neutral: float32 (columns, bands, P), ones per exposure that carry no information, in pixel order.
     before, scale: float32 (columns, bands, P) as in `RowBuffers`, in pixel order.
     first, last: int32 (columns, bands), first and last position in stored pixels.
-    ambient: float32 (columns, bands, P), ambient light and other lines' haze where there are any, else no columns.
+    ambient: float32 (columns, bands, P), ambient light and other lines' haze if there are any; otherwise without
+    columns.
     """
 
     edge: NDArray[np.int8]
@@ -77,10 +78,10 @@ def fill_tables(
     sweep: Sweep, state: RowState, light: Float32, log_share: Float32, units: float, nominal: float, first_band: int,
     last_band: int, out: ScreenTables,
 ) -> None:  # fmt: skip
-    """Tables of bands first_band..last_band-1.
+    """Fill the tables of bands first_band..last_band-1.
 
-    sweep, state: as of a sweep whose rows are the bands (`rig.estimate.search.prepare`). light, log_share:
-    (SCREENS,), amplitudes of the search and the logarithm of their probability. units: per octave. nominal: exposures.
+    sweep, state: of a sweep whose rows are the bands (`rig.estimate.search.prepare`). light, log_share: (SCREENS,),
+    amplitudes of the search and the logarithm of their probability. units: per octave. nominal: exposures.
     """
     columns = sweep.plane.shape[0]
     lanes = out.lane.shape[2]
@@ -208,7 +209,7 @@ def _pair(x):  # type: ignore[no-untyped-def]
 
 @numba.njit(inline="always")
 def first_pair(s, reach):  # type: ignore[no-untyped-def]
-    """First pair of the taps of step s, in pairs from that of the step itself on; reach: px on either side."""
+    """First pair of the taps of step s, relative to the step's own pair. reach: px on either side."""
     return ((s - reach) >> 1) - (s >> 1)
 
 
@@ -222,8 +223,9 @@ class ScreenTable(NamedTuple):
     """One table made ready for a number of exposures.
 
     Addresses, in lane order: edge, tap as in `ScreenTables`, constant as in `Search`; in pixel order, float32 of the
-    stored pixels: before, scale, ambient. Numbers: all_right, all_left: scores of 'no stripe' as in
-    `ScreenTables.none`; that of all pixels lying right is complete. searched: whether there is any position to find.
+    stored
+    pixels: before, scale, ambient. Numbers: all_right, all_left: scores of 'no stripe' as in `ScreenTables.none`;
+    all_right is complete. searched: whether there is any position to find.
     """
 
     edge: int
@@ -241,14 +243,14 @@ class Search(NamedTuple):
     """Addresses of a thread's buffers for BATCH rows of `lanes` lanes, and the bytes from row to row of each.
 
     n: counts, see `rig.count.lane_order`. int16: score (STEPS, lanes); start (lanes,), score of a change at the lane's
-    first pixel; tops (LANES,), best scores of some lanes each; constant (SCREENS, STEPS, lanes), the tables' part per
-    exposure times the exposures; lane (lanes,), the same; change (lanes,), score added by a change without a stripe in
-    the lane; label (LANES,), scores of the close-up; place: index of pixel -PLACE_BEFORE on in a row of counts.
-    neutral, muted: bytes, counts of hot pixels, see `rig.estimate.search.rows`. Of each row of the batch, int16:
-    all_left, score of all pixels lying left; best, x: best score and its pixel; left, right: the scores beside it;
+    first pixel; tops (LANES,), best scores in each of some lanes; constant (SCREENS, STEPS, lanes), the tables' part
+    per exposure times the exposures; lane (lanes,), the same for lanes; change (lanes,), score added by a change
+    without a stripe in the lane; label (LANES,), scores of the close-up; place: index of pixel -PLACE_BEFORE in a row
+    of counts. neutral, muted: bytes, counts of hot pixels, see `rig.estimate.search.rows`. For each row of the batch,
+    int16: all_left, score if all pixels lie left; best, x: best score and its pixel; left, right: the scores beside it;
     levels: of the close-up; lift: see `lift_to_powers`; ceiling: largest score. float32: light, before, scale, ambient:
-    see `rig.estimate.search.rows`; answer: one field of the answers on its way out. Folded (`rig.simd.shuffles`): mass,
-    sum of all likelihoods; moment, square: sums of the close-up.
+    see `rig.estimate.search.rows`; answer: one field of the answers before it is written. Folded (`rig.simd.shuffles`):
+    mass, sum of all likelihoods; moment, square: sums of the close-up.
     """
 
     lanes: int
@@ -312,7 +314,7 @@ def _search_at(n, lanes):  # type: ignore[no-untyped-def]
 
 @numba.njit(cache=True, nogil=True)
 def search_memory(lanes: int) -> Uint8:
-    """Memory for the buffers of a `Search`, at whole cache lines."""
+    """Memory for the buffers of a `Search`, beginning at a cache line."""
     _, end = _search_at(0, lanes)
     whole = np.zeros(end + CACHE_LINE, np.uint8)
     begin = -address_of(whole) % CACHE_LINE
@@ -331,5 +333,5 @@ def search_in(memory: int, lanes: int) -> Search:
 
 @numba.njit(forceinline=True)
 def count_place(search: Search, x: int) -> int:
-    """Index of pixel x in a row of counts, from -PLACE_BEFORE on."""
+    """Index of pixel x in a row of counts; x may be as low as -PLACE_BEFORE."""
     return np.int64(read_int16(search.place, x + PLACE_BEFORE))

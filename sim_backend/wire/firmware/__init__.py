@@ -1,1 +1,1 @@
-"""Models of the devices' firmware: bytes in, bytes out, made from manuals and public sources."""
+"""Models of the devices' firmware: bytes in, bytes out, written from manuals and public sources."""

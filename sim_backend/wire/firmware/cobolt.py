@@ -1,8 +1,9 @@
 """Model of a Cobolt 06-01 laser's firmware: 06-MLD or the newer SCPI-like language, key, autostart, interlock, faults.
 
-docs/reference/hardware.md (cobolt-lasers/pycobolt 1333e53). Commands end with CR, replies with CRLF. Traps kept: no
-answer to a command sooner than 100 ms after the last reply, key needed after `l0`, `l1` refused while autostart is
-enabled, powers in W (`p`) and mW (`slmp`), `ilk?` 1 = open, junk before replies, silent `!e` and `!d`.
+Source: docs/reference/hardware.md (cobolt-lasers/pycobolt 1333e53). Commands end with CR, replies with CRLF. The model
+has the traps of the real laser: no answer to a command sooner than 100 ms after the last reply, key needed after `l0`,
+`l1` refused while autostart is enabled, powers in W (`p`) and mW (`slmp`), `ilk?` 1 = open, junk before replies, silent
+`!e` and `!d`.
 """
 
 import re
@@ -55,7 +56,7 @@ _POWERS: dict[Family, dict[str, tuple[str, float]]] = {
 
 
 class CoboltModel:
-    """The laser. Its attributes are the truth that tests look at; the driver sees only what it says.
+    """The laser. Its attributes are the truth, for tests to look at; the driver sees only the replies.
 
     on_emission(emits, now_s) is called whenever power or emission change.
     """
@@ -113,7 +114,7 @@ class CoboltModel:
 
     @property
     def power_w(self) -> float:
-        """Light that comes out now, through an open gate where it is gated, in W."""
+        """Power of the light that comes out now, in W; through an open gate if the laser is gated."""
         if not self.on or self.paused or self.interlock_open or self.fault:
             return 0.0
         match self.mode:
@@ -130,14 +131,14 @@ class CoboltModel:
         return self.power_w > 0
 
     def shine(self, power_w: float, *, gated: bool = True) -> None:
-        """Put the laser on, as somebody before us may have left it."""
+        """Switch the laser on, as an earlier user may have left it."""
         self.on = True
         self.mode = "modulation" if gated else "constant power"
         self.digital = gated
         self.modulation_power_w = self.constant_power_w = power_w
 
     def turn_key(self, on: bool, now_s: float) -> None:
-        """A hand at the key."""
+        """Turn the key on or off by hand."""
         self.key_on = on
         if not on:
             self._stop()
@@ -150,14 +151,14 @@ class CoboltModel:
         self._tell(now_s)
 
     def open_interlock(self, now_s: float) -> None:
-        """Open a door: the laser goes off, and fault 3 stays until it is cleared."""
+        """Open the interlock: the laser goes off, and fault 3 stays until it is cleared."""
         self.interlock_open = True
         self.fault = 3
         self._stop()
         self._tell(now_s)
 
     def receive(self, data: bytes, now_s: float) -> bytes:
-        """Commands in, replies out."""
+        """Take bytes of commands; returns the replies."""
         self.tick(now_s)
         self._pending += data
         out = b""
@@ -168,7 +169,7 @@ class CoboltModel:
         return out
 
     def tick(self, now_s: float) -> bytes:
-        """Warm-up ends; the laser never speaks unasked."""
+        """Let time pass, so that warm-up can end. The laser never sends anything unasked."""
         if self._ready_at_s is not None and now_s >= self._ready_at_s:
             self._ready_at_s = None
             self.on = not self.interlock_open and not self.fault
@@ -198,7 +199,7 @@ class CoboltModel:
         return "OK" if self._act(name, now_s) or self._set(name, value) else ILLEGAL
 
     def _query(self, command: str) -> str | None:
-        """The answer to a question; None where the laser does not know it."""
+        """The answer to a question; None if the laser does not know it."""
         answers = {
             "?": "OK",
             "sn?": self.serial,

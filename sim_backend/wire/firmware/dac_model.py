@@ -1,6 +1,6 @@
 """The common part of emulated scanner boards: commands and replies, points, and a record of the outputs.
 
-An emulated world and tests look at that record.
+Emulated worlds and tests read that record.
 """
 
 import threading
@@ -21,7 +21,7 @@ KEEP_S = 20.0
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Played:
-    """Points played from start_s at one point every period_s; cut off at end_s.
+    """Points played from start_s on, one every period_s, cut off at end_s.
 
     command: float64 (n,), normalised drive. levels: uint8 (n, lines), colour outputs.
     """
@@ -34,7 +34,7 @@ class Played:
 
 
 class DacHistory:
-    """Output over time: what was played, and rests in between with the colours low. Thread-safe."""
+    """Output over time: what was played, with rests in between during which the colours are low. Thread-safe."""
 
     def __init__(self, command: float, lines: int) -> None:
         self._lock = threading.Lock()
@@ -44,7 +44,7 @@ class DacHistory:
         """(from, command): where the mirror command stands when nothing is played, ascending."""
 
     def play(self, played: Played) -> None:
-        """Append what is played; it starts where the former ended, or later."""
+        """Append what is played. It must start at the end of the previous piece or later."""
         with self._lock:
             self._played.append(played)
             self._rests.append((played.end_s, float(played.command[-1])))
@@ -54,7 +54,7 @@ class DacHistory:
                 self._rests.popleft()
 
     def cut(self, time_s: float, command: float | None = None) -> None:
-        """Play nothing from that time on; the command holds, or jumps to `command`."""
+        """Play nothing from that time on. The command holds, or jumps to `command` if given."""
         here = float(self.command(np.array([time_s]))[0])
         with self._lock:
             while self._played and self._played[-1].start_s >= time_s:
@@ -66,7 +66,7 @@ class DacHistory:
             self._rests.append((time_s, here if command is None else command))
 
     def command(self, time_s: Array) -> Array:
-        """Normalised drive at the times: the DAC's stairs, no mirror lag."""
+        """Normalised drive at the given times, in the steps of the DAC and without the mirror's lag."""
         with self._lock:
             starts, values = np.array(self._rests).T
             result: Array = values[np.maximum(np.searchsorted(starts, time_s, side="right") - 1, 0)]
@@ -75,7 +75,7 @@ class DacHistory:
             return result
 
     def level(self, line: int, time_s: Array) -> NDArray[np.uint8]:
-        """An output's level at the times; 0 where nothing is played."""
+        """Level of an output at the given times; 0 when nothing is played."""
         result = np.zeros(time_s.shape, np.uint8)
         with self._lock:
             for one, inside, at in self._at(time_s):
@@ -83,7 +83,9 @@ class DacHistory:
         return result
 
     def rising(self, line: int, from_s: float, until_s: float) -> Array:
-        """Times of an output's rising edges in [from_s, until_s), ascending; one that stays high over a seam is one."""
+        """Times of an output's rising edges in [from_s, until_s), ascending. An output that stays high over a seam has
+        one edge.
+        """
         edges: list[Array] = []
         with self._lock:
             high_until = -np.inf
@@ -114,7 +116,7 @@ CENTRE = 0x800 / DAC_STEPS * 2 - 1
 
 
 class DacModel(UsbModel):
-    """Base of the boards. `history` is what its outputs did; times are the transport's."""
+    """Base of the boards. `history` records what its outputs did; times are the transport's."""
 
     def __init__(self, spec: DeviceSpec, *, commands: int, replies: int, points: int) -> None:
         """commands, replies, points: its endpoints."""
@@ -127,11 +129,11 @@ class DacModel(UsbModel):
         self._replies: deque[bytes] = deque()
 
     def leave_reply(self, reply: bytes) -> None:
-        """Leave a reply that an earlier program never read."""
+        """Leave a reply in the endpoint, as if an earlier program had not read it."""
         self._replies.append(reply)
 
     def out(self, endpoint: int, data: bytes, now_s: float) -> int | Stall | None:
-        """Commands and points."""
+        """Take commands and points from the host."""
         self.advance(now_s)
         if self.deaf:
             return None
@@ -141,13 +143,13 @@ class DacModel(UsbModel):
         return self._take_points(data, now_s) if endpoint == self.points_endpoint else STALL
 
     def inp(self, endpoint: int, length: int, now_s: float) -> Answer:
-        """Replies, one a transfer."""
+        """Give replies to the host, one per transfer."""
         self.advance(now_s)
         ready = endpoint == self._replies_endpoint and self._replies and not self.deaf
         return self._replies.popleft() if ready else None
 
     def unplugged(self, now_s: float) -> None:
-        """Let the outputs fall to 0 V without power, which is the centre."""
+        """Let the outputs fall to 0 V, which is the centre, since the power is gone."""
         self.advance(now_s)
         self._halt(now_s)
         self.history.cut(now_s, CENTRE)

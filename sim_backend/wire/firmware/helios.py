@@ -1,8 +1,9 @@
 """A Helios laser DAC as its firmware behaves, traps included (docs/reference/hardware.md; vendor's firmware v6,
 0952a2a).
 
-Two buffers, one playing and one pending; status polled with 03; a frame of whole packets never completes; a frame that
-is refused is refused in silence; frames within 100 ms of STOP are dropped; a frame without SINGLE repeats for ever.
+There are two buffers, one playing and one pending, and a status polled with 03. A frame of whole packets never
+completes. A refused frame is refused silently. Frames within 100 ms of STOP are dropped. A frame without SINGLE repeats
+for ever.
 """
 
 import struct
@@ -58,7 +59,7 @@ class _Frame:
 
 
 class HeliosModel(DacModel):
-    """The firmware. As far as its buffers go, `history` may be asked about times to come."""
+    """The firmware. `history` also covers future times, as far as the buffers reach."""
 
     def __init__(self, *, name: str = "Helios 1", version: int = 6, clock_error: float = 0.0, axis: str = "x") -> None:
         """clock_error: of its crystal. axis: the one whose mirror the history follows."""
@@ -82,7 +83,9 @@ class HeliosModel(DacModel):
         self._dead_until_s = -1.0
 
     def set_interface(self, interface: int, alternate: int, now_s: float) -> None:
-        """Alternate 1 enables the DAC: blank, the mirror stays. Anything else stops it: blank and centre."""
+        """Alternate 1 enables the DAC, blank and with the mirror where it is. Any other stops it, blank and at the
+        centre.
+        """
         self.advance(now_s)
         self._halt(now_s)
         if alternate != 1:
@@ -90,7 +93,7 @@ class HeliosModel(DacModel):
         self._armed = alternate == 1
 
     def advance(self, now_s: float) -> None:
-        """Play on until now: pending frames follow without a seam, single ones end with the colours low."""
+        """Play on until now. Pending frames follow without a seam; single ones end with the colours low."""
         while self._playing is not None and now_s >= self._ends_s:
             following = self._pending
             if following is None and not self._playing.single:

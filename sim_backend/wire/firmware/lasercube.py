@@ -1,7 +1,8 @@
 """A LaserCube / LaserDock board as its firmware behaves (docs/reference/hardware.md; vendor's library 51d13bc).
 
-One ring of samples, played at the set rate as soon as there are any; commands with replies of 64 bytes. What happens
-when the ring runs empty is not documented: this model holds the last sample or repeats the last ones, as it is told.
+It has one ring of samples, played at the set rate as soon as there are any, and commands with replies of 64 bytes. What
+happens when the ring runs empty is not documented: this model holds the last sample or repeats the last ones, as
+configured.
 """
 
 from collections import deque
@@ -20,7 +21,7 @@ _REPEATED_SAMPLES = 64
 
 
 class LaserCubeModel(DacModel):
-    """The firmware."""
+    """The firmware of the board."""
 
     def __init__(
         self,

@@ -1,9 +1,9 @@
 """Model of a Coherent OBIS laser's firmware: handshake on or off, warm-up, CDRH delay, interlock, key, fault words.
 
-docs/reference/hardware.md (operator's manual, appendix C; `obis.h`; mmCoreAndDevices PR 645). Commands end with CR or
-LF, replies with CRLF. Traps kept: sets are silent with the handshake off, ON during warm-up is deferred, emission
-follows ON by the CDRH delay, modes are refused while it is on (ERR-200), behind a Remote only numbered commands reach
-it.
+Source: docs/reference/hardware.md (operator's manual, appendix C; `obis.h`; mmCoreAndDevices PR 645). Commands end with
+CR or LF, replies with CRLF. The model has the traps of the real laser: set commands get no answer with the handshake
+off, ON during warm-up is deferred, emission follows ON by the CDRH delay, mode changes are refused while the laser is
+on (ERR-200), and behind a Remote only numbered commands reach it.
 """
 
 import re
@@ -20,9 +20,10 @@ _SWITCHES = {"SYST:CDRH": "cdrh", "SYST:AUT": "autostart", "SOUR:TEMP:APR": "tec
 
 
 class ObisModel:
-    """The laser. Its attributes are the truth that tests look at; the driver sees only what it says.
+    """The laser. Its attributes are the truth, for tests to look at; the driver sees only the replies.
 
-    on_emission(emits, now_s) is called whenever power or emission change. channel: it hangs on a Remote, in this slot.
+    on_emission(emits, now_s) is called whenever power or emission change. channel: the laser's slot, if it is on a
+    Remote.
     """
 
     def __init__(
@@ -87,25 +88,25 @@ class ObisModel:
 
     @property
     def power_w(self) -> float:
-        """Light that comes out now, through an open gate where it is gated, in W."""
+        """Power of the light that comes out now, in W; through an open gate if the laser is gated."""
         return self.set_power_w if self.emitting else 0.0
 
     def shine(self, power_w: float, *, gated: bool = True) -> None:
-        """Put the laser on, as somebody before us may have left it."""
+        """Switch the laser on, as an earlier user may have left it."""
         self.state_on = True
         self._warm_at_s = self._lit_at_s = float("-inf")
         self.mode = "DIGITAL" if gated else "CWP"
         self.set_power_w = power_w
 
     def open_interlock(self, now_s: float) -> None:
-        """Open a door: the laser is off until somebody says ON again."""
+        """Open the interlock: the laser is off until ON is sent again."""
         self.tick(now_s)
         self.interlock_open = True
         self._switch(False)
         self._tell()
 
     def receive(self, data: bytes, now_s: float) -> bytes:
-        """Commands in, replies out."""
+        """Take bytes of commands; returns the replies."""
         self.tick(now_s)
         self._pending += data.decode("ascii", "replace")
         out = ""
@@ -116,7 +117,7 @@ class ObisModel:
         return out.encode("ascii")
 
     def tick(self, now_s: float) -> bytes:
-        """Let time pass: warm-up and delay end; the laser never speaks unasked."""
+        """Let time pass, so that warm-up and delay can end. The laser never sends anything unasked."""
         self._now_s = now_s
         if self._warm_at_s is None:
             self._warm_at_s = now_s + self._warm_up_s

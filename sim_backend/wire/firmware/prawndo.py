@@ -1,8 +1,8 @@
 """The PrawnDO firmware 1.3 as a model: its commands, its program player and the levels of its outputs over time.
 
-Facts: docs/reference/hardware.md; from `prawn_do/prawn_do.{c,pio}` of labscript-suite/prawn_digital_output 3fecbdd
-(BSD). Its traps are here on purpose: a level trigger, short words that become waits, `abt` that leaves the outputs
-alone, `adm` that swallows everything until its last byte has come, an external clock that is taken on trust.
+Facts: docs/reference/hardware.md, from `prawn_do/prawn_do.{c,pio}` of labscript-suite/prawn_digital_output 3fecbdd
+(BSD). Its traps are modelled too: a level trigger, short words that become waits, `abt` that leaves the outputs alone,
+`adm` that swallows everything until its last byte has come, an external clock that is not checked.
 """
 
 from bisect import bisect_right
@@ -33,13 +33,13 @@ Trigger = Callable[[float, float], float | None]
 
 
 class TriggerLine:
-    """A trigger input that is switched by hand, in order of time."""
+    """A trigger input that is switched by hand. Calls must be in order of time."""
 
     def __init__(self) -> None:
         self._edges: list[tuple[float, bool]] = []
 
     def pulse(self, at_s: float, width_s: float) -> None:
-        """Hold the line high for `width_s` from `at_s` on, which is not before the last pulse."""
+        """Hold the line high for `width_s` from `at_s` on, which must not be before the last pulse."""
         self._edges += [(at_s, True), (at_s + width_s, False)]
 
     def __call__(self, from_s: float, until_s: float) -> float | None:
@@ -62,7 +62,7 @@ class PrawnDoModel:
     """The firmware and the pins. Times are seconds of whatever clock the wire runs on; they never decrease.
 
     trigger: what drives GPIO16. board: 1 for a Pico, 2 for a Pico 2. external_clock_hz: what is connected to GPIO20.
-    on_gate: told each change of the gate output and its time, in order, as soon as the model has been advanced over it.
+    on_gate: called with each change of the gate output and its time, in order, once the model is advanced past it.
     """
 
     def __init__(
@@ -121,7 +121,7 @@ class PrawnDoModel:
         return answer
 
     def tick(self, now_s: float) -> bytes:
-        """Play on to `now_s`; returns what the firmware prints of its own accord."""
+        """Play on to `now_s`; returns what the firmware prints unasked."""
         self._settle(now_s)
         unasked, self._unasked = self._unasked, b""
         return unasked
@@ -129,11 +129,11 @@ class PrawnDoModel:
     # The pins
 
     def outputs_at(self, at_s: float) -> int:
-        """Levels of the sixteen outputs at a time that the model has been advanced to."""
+        """Levels of the sixteen outputs at a time to which the model has been advanced."""
         return self._levels[bisect_right(self._times, at_s) - 1]
 
     def gate_level(self, at_s: float) -> bool:
-        """Whether the gate output is high then."""
+        """Whether the gate output is high at that time."""
         return bool(self.outputs_at(at_s) & OUT_GATE)
 
     def changes(self, from_s: float, until_s: float) -> list[tuple[float, int]]:
@@ -143,23 +143,21 @@ class PrawnDoModel:
         return [(from_s, self._levels[first - 1]), *zip(self._times[first:last], self._levels[first:last], strict=True)]
 
     def forget(self, before_s: float) -> None:
-        """Drop history that nobody asks for any more."""
+        """Drop history before `before_s`, which nobody asks for any more."""
         keep = bisect_right(self._times, before_s) - 1
         del self._times[:keep], self._levels[:keep]
 
     # What happens to the device
 
     def power_cycle(self, at_s: float) -> None:
-        """Take the power away and give it back: pull-downs hold the outputs low until the firmware drives them low
-        again.
-        """
+        """Switch the power off and on. Pull-downs hold the outputs low until the firmware drives them low."""
         self.advance(at_s)
         self._restart()
         self._set_outputs(0, at_s)
         self._unasked = BANNER
 
     def lose_external_clock(self) -> None:
-        """Let the clock on GPIO20 die: the firmware goes on with its own and says so, unasked."""
+        """Stop the clock on GPIO20. The firmware goes on with its own and reports that unasked."""
         self.external_clock_hz = None
         if self.clock_external:
             self._resuscitate()
@@ -350,7 +348,7 @@ def _said(*lines: str) -> bytes:
 
 
 def _numbers(line: str, base: int, count: int) -> tuple[int, ...] | None:
-    """The arguments of a command; None where fewer than `count` can be read."""
+    """The arguments of a command; None if fewer than `count` can be read."""
     try:
         numbers = tuple(int(text, base) for text in line.split()[1 : count + 1])
     except ValueError:

@@ -1,7 +1,7 @@
 """The vendor's program of a SPAD512S as seen from its TCP port (docs/reference/hardware.md), traps included.
 
-A pure state machine: commands in, text and pixels out, time passed in. It takes frames of 1 bit only; what lies in them
-comes from `frames`, upright, and is turned onto the sensor's side as the real one delivers it.
+A pure state machine: it gets commands and the time, and gives text and pixels. It takes frames of 1 bit only. Their
+content comes upright from `frames` and is turned onto its side, as the real sensor delivers it.
 """
 
 from collections.abc import Callable
@@ -28,10 +28,11 @@ _FRAMES_AT_ONCE = 8
 
 
 class Spad512sModel:
-    """The program and its device. calibration_s: how long it calibrates after a first connection; 0: not at all.
+    """The program and its device. calibration_s: duration of the calibration after a first connection; 0: none.
 
-    glued_done: text answers end with DONE, as one emulation has it and the real program may or may not. extra_fields:
-    `R` answers eight fields instead of six. paced: pixels come no earlier than the sensor exposes them.
+    glued_done: whether text answers end with DONE, as in one emulation; the real program's behaviour is unknown.
+    extra_fields: whether `R` answers eight fields instead of six. paced: whether pixels come no earlier than the sensor
+    exposes them.
     """
 
     def __init__(
@@ -83,11 +84,13 @@ class Spad512sModel:
         self._out.clear()
 
     def restarted(self) -> None:
-        """End the program and start it anew."""
+        """End the program and start it again."""
         self._calibrated = self._calibration_s == 0
 
     def receive(self, data: bytes, now_s: float) -> None:
-        """One command: there is no framing, so two that come together are none, as with the real program."""
+        """Take one command. Without framing, two commands that arrive together are not understood, as with the real
+        program.
+        """
         command = data.decode("ascii", "replace").strip()
         self.commands.append(command)
         if self._calibrating_until is not None:
@@ -99,7 +102,7 @@ class Spad512sModel:
             self._obey(command, now_s)
 
     def send(self, limit: int, now_s: float) -> bytes:
-        """Text first, then the pixels of the run."""
+        """The next bytes for the client: text first, then the pixels of the run."""
         if self._calibrating_until is not None and now_s >= self._calibrating_until:
             self._calibrating_until = None
             self._calibrated = True

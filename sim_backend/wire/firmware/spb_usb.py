@@ -1,8 +1,8 @@
 """An SPB1 device on USB (docs/reference/spb1-usb.md): control plane, states, heartbeat, watchdog.
 
-Comes as a Cypress FX3 board (commands on 0x01, stream on 0x81, acknowledgements on 0x82) or behind an FTDI
-FT601 (session commands on 0x01, commands on 0x02, stream on 0x82; acknowledgements on 0x83 where it has a
-second channel, else in the stream). A pure state machine: what the sensor sees comes from `source`.
+It is either a Cypress FX3 board (commands on 0x01, stream on 0x81, acknowledgements on 0x82) or behind an FTDI FT601
+(session commands on 0x01, commands on 0x02, stream on 0x82; acknowledgements on 0x83 if it has a second channel, else
+in the stream). A pure state machine: what the sensor sees comes from `source`.
 """
 
 import struct
@@ -31,7 +31,7 @@ FT601_CONFIG_BYTES: Final = 152
 
 
 class SpbUsbModel(UsbModel):
-    """The device. mangle: what becomes of each block of the stream on its way (damage for tests)."""
+    """The device. mangle: called with each block of the stream, to damage it for tests."""
 
     def __init__(self, source: FrameSource, board: SpbUsbBoard) -> None:
         self.chip: Chip = board.chip
@@ -57,14 +57,14 @@ class SpbUsbModel(UsbModel):
     # The bus
 
     def unplugged(self, now_s: float) -> None:
-        """Take note that bus power is gone."""
+        """Note that the bus power is gone."""
         self._reset()
 
     def set_interface(self, interface: int, alternate: int, now_s: float) -> None:
-        """Do nothing: hosts choose the setting that is there."""
+        """Do nothing, since hosts choose the setting that is there."""
 
     def control(self, setup: Setup, data: bytes, now_s: float) -> Answer:
-        """FT601: its configuration (0xCF) and its own firmware version (0xF1)."""
+        """Answer the FT601's requests for its configuration (0xCF) and its own firmware version (0xF1)."""
         if self.chip != "ft601" or not setup.request_type & 0x80:
             return STALL
         if setup.request == 0xCF and setup.value == 1:
@@ -72,7 +72,7 @@ class SpbUsbModel(UsbModel):
         return b"\x09\x01\x00\x00" if setup.request == 0xF1 else STALL
 
     def out(self, endpoint: int, data: bytes, now_s: float) -> int | Stall | None:
-        """Commands, of the FT601's session or ours."""
+        """Take commands: those of the FT601's session, or SPB1's."""
         self._watch(now_s)
         if self.deaf:
             return len(data)
@@ -85,7 +85,7 @@ class SpbUsbModel(UsbModel):
         return len(data)
 
     def inp(self, endpoint: int, length: int, now_s: float) -> Answer:
-        """Acknowledgements or the stream."""
+        """Give acknowledgements or the stream."""
         self._watch(now_s)
         if self.deaf:
             return None

@@ -36,16 +36,20 @@ class Span:
 
 
 class FrameSource(Protocol):
-    """The scene before the sensor and the markers that reach it. Asked for every frame of a run, once and in order."""
+    """The scene in front of the sensor and the markers that reach it. It is asked for every frame of a run, once and in
+    order.
+    """
 
     def started(self) -> None:
-        """A run begins: counters of markers are 0."""
+        """Begin a run, with all marker counters at 0."""
         ...
 
     def expose(self, span: Span, records: NDArray[np.void], bits: NDArray[np.uint8] | None) -> int:
-        """Fill `marks`, `x0`, `line`, `sweep` of the records (n,) and the bits; None: the frames get lost.
+        """Fill `marks`, `x0`, `line`, `sweep` of the records (n,), and the bits unless they are None because the frames
+        get lost.
 
-        bits: (n, height, row bytes), with old bytes in it. Returns scan markers since START at the first frame.
+        bits: (n, height, row bytes), with old bytes in it. Returns the number of scan markers since START at the first
+        frame.
         """
         ...
 
@@ -55,7 +59,7 @@ Chip = Literal["fx3", "ft601"]
 
 @dataclass(frozen=True, slots=True)
 class SpbUsbBoard:
-    """The board that is emulated: its sensor, its chip and its abilities."""
+    """The emulated board: its sensor, its chip and its abilities."""
 
     width: int
     height: int
@@ -85,7 +89,7 @@ class SpbUsbBoard:
 
 
 class BlockMemory:
-    """Buffers that no transport holds any more."""
+    """A pool of block buffers. It gives out again those that no transport holds any more."""
 
     def __init__(self) -> None:
         self._buffers: deque[NDArray[np.uint8]] = deque()
@@ -117,7 +121,7 @@ class EmulatedRun:
         memory: BlockMemory,
         now_s: float,
     ) -> None:
-        """ValueError where the stride holds no frame."""
+        """Raises ValueError if the stride holds no frame."""
         self.next_frame = 0
         self.pinged_s = now_s
         self.over = False
@@ -138,16 +142,16 @@ class EmulatedRun:
         self._just_lost = False
 
     def stop(self) -> None:
-        """End the run: no frame more."""
+        """End the run without any further frame."""
         self._n_frames = self.next_frame
 
     def end(self, status: BlockStatus, flag: BlockFlag) -> memoryview:
-        """The last block, without frames."""
+        """The last block, which holds no frames."""
         self.over = True
         return self._block(0, BlockFlag.LAST | flag, status)
 
     def next_block(self, now_s: float) -> memoryview | None:
-        """The next block, if there is one by now."""
+        """The next block, if one is ready at that time."""
         if self._n_frames is not None and self.next_frame >= self._n_frames:
             return self.end(BlockStatus.OK, BlockFlag(0))  # stopped just behind a whole block
         n = self._block_frames if self._n_frames is None else min(self._block_frames, self._n_frames - self.next_frame)
@@ -160,7 +164,7 @@ class EmulatedRun:
         return self._block(n, BlockFlag.LAST if self.over else BlockFlag(0), BlockStatus.OK)
 
     def lose(self, n: int) -> None:
-        """The next frames are exposed and never sent."""
+        """Expose the next n frames without sending them."""
         if self._n_frames is not None:
             n = min(n, self._n_frames - self.next_frame)
         self._source.expose(self._span(n), np.zeros(n, FRAME_RECORD), None)
@@ -263,7 +267,9 @@ WRITABLE: Final = frozenset(
 
 
 def device_spec(chip: Chip, acks: str, serial: str | None, product_name: str) -> DeviceSpec:
-    """FX3: 04B4:00F1, one interface. FT601: 0403:601F, interface 0 for its session, interface 1 for data."""
+    """The USB descriptors. FX3: 04B4:00F1, one interface. FT601: 0403:601F, interface 0 for its session, interface 1
+    for data.
+    """
     addresses = ((0x01, 0x81, 0x82) if chip == "fx3" else (0x02, 0x82, 0x83))[: 3 if acks == "endpoint" else 2]
     bulk = tuple(EndpointSpec(address, "bulk", _PACKET) for address in addresses)
     if chip == "fx3":
@@ -274,7 +280,7 @@ def device_spec(chip: Chip, acks: str, serial: str | None, product_name: str) ->
 
 
 def registers_at_power_up(board: SpbUsbBoard) -> dict[int, int]:
-    """The registers by address; those that nobody wrote yet are 0."""
+    """The registers by address. Those that nobody has written yet are 0."""
     registers = dict.fromkeys(WRITABLE, 0)
     registers |= {
         Register.MAGIC: IDENTITY_MAGIC,

@@ -1,3 +1,3 @@
 """Transports that serve the firmware models to the real drivers: pseudo-terminals, TCP, an emulated USB bus; with
-faults on order.
+faults on request.
 """

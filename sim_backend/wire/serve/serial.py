@@ -1,9 +1,9 @@
 """Serial lines to a model of a device: `SerialWire` within this process, `SerialServer` on a pseudo terminal.
 
 Replies leave at 10 bits a character, as through a UART (a virtual COM port is faster, and no driver may depend on
-that). A `SerialWire` takes the place of pyserial and keeps the time of its clock: a test on virtual time says the same
-on any machine, however much else that has to do. A pseudo terminal is opened by the real pyserial, from any process,
-and keeps the host's time; it ignores the baud rate. Its path is a link that survives unplugging and plugging in again.
+that). A `SerialWire` replaces pyserial and runs on the model's clock, so a test on virtual time gives the same result
+on any machine, however busy it is. A pseudo terminal is opened by the real pyserial, from any process, and runs in the
+host's time; it ignores the baud rate. Its path is a link that survives unplugging and plugging in again.
 """
 
 import errno
@@ -35,7 +35,7 @@ _IDLE_S = 0.01
 
 
 class SerialModel(Protocol):
-    """The firmware of a serial device: a pure state machine fed with bytes and a time. No threads, no waiting."""
+    """The firmware of a serial device: a pure state machine that is given bytes and a time. No threads, no waiting."""
 
     def receive(self, data: bytes, now_s: float) -> bytes:
         """Take bytes from the host, in pieces of any size; returns what the device answers."""
@@ -45,7 +45,7 @@ class SerialModel(Protocol):
 
 
 class _SerialLine(Wire[SerialModel]):
-    """The line itself, wherever it leads: it takes what came, lets the model answer and sends what is due."""
+    """The serial line itself: it passes received bytes to the model and sends the replies when they are due."""
 
     def __init__(
         self,
@@ -92,7 +92,7 @@ class _SerialLine(Wire[SerialModel]):
 
 
 class SerialWire(_SerialLine):
-    """A serial device within this process, whose ports wait on the clock of its model, where time may be virtual."""
+    """A serial device within this process. Its ports wait on the clock of the model, whose time may be virtual."""
 
     _plugged = False
     _port: "EmulatedPort | None" = None
@@ -100,11 +100,11 @@ class SerialWire(_SerialLine):
 
     @property
     def endpoint(self) -> Endpoint:
-        """The endpoint that opens such ports; its address is for messages."""
+        """The endpoint that opens such ports. Its address only serves for messages."""
         return Endpoint(f"/dev/emulated-{id(self):x}", serial_port=self._open)
 
     def plug(self) -> None:
-        """Put the cable in."""
+        """Plug the cable in."""
         self._plugged = True
 
     def unplug(self) -> None:
@@ -127,7 +127,7 @@ class SerialWire(_SerialLine):
             return self._port
 
     def exchange(self, port: "EmulatedPort", data: bytes = b"") -> None:
-        """Let the device act, now and on what its host has to say. SerialException where the port is lost."""
+        """Let the device act, at the present time and on the host's data. Raises SerialException if the port is lost."""
         with self.lock:
             if self._port is not port:
                 raise serial.SerialException(errno.EIO, "the cable was pulled or the port closed")
@@ -139,7 +139,7 @@ class SerialWire(_SerialLine):
                 self._turn()
 
     def release(self, port: "EmulatedPort") -> None:
-        """Take a port back from its host."""
+        """Forget a port that its host has closed."""
         with self.lock:
             if self._port is port:
                 self._port = None
@@ -156,7 +156,7 @@ class SerialWire(_SerialLine):
 
 
 class EmulatedPort:
-    """The host's end of a `SerialWire`: what drivers use of `serial.Serial`."""
+    """The host's end of a `SerialWire`, with the part of `serial.Serial` that drivers use."""
 
     def __init__(self, wire: SerialWire, clock: Clock) -> None:
         self.clock = clock
@@ -172,7 +172,7 @@ class EmulatedPort:
         return len(self.received)
 
     def read(self, size: int) -> bytes:
-        """At most `size` bytes; none after one slice of waiting."""
+        """At most `size` bytes; none if nothing comes within one slice of waiting."""
         ends_ns = self.clock.now_ns() + round(_SLICE_S * NS_PER_S)
         while not self.in_waiting and self.clock.now_ns() < ends_ns:
             self.clock.sleep(_TURN_S)
@@ -182,21 +182,21 @@ class EmulatedPort:
         return data
 
     def write(self, data: bytes) -> None:
-        """Send all of it."""
+        """Send all of `data`."""
         self._wire.exchange(self, data)
 
     def fileno(self) -> int:
-        """A file descriptor that hangs up with the cable."""
+        """A file descriptor that reports a hang-up when the cable is pulled."""
         return self._end
 
     def hang_up(self) -> None:
-        """Act as a port whose cable is pulled; again: nothing happens."""
+        """Behave as a port whose cable is pulled. A second call does nothing."""
         if self._far_end >= 0:
             os.close(self._far_end)
             self._far_end = -1
 
     def close(self) -> None:
-        """Give the port back; again: nothing happens."""
+        """Close the port; a second call does nothing."""
         self._wire.release(self)
         self.hang_up()
         if self._end >= 0:
@@ -232,12 +232,12 @@ class SerialServer(_SerialLine, WireServer[SerialModel]):
         return Endpoint(self.path)
 
     def close(self) -> None:
-        """Unplug it for good; again: nothing happens."""
+        """Unplug the device for good; a second call does nothing."""
         super().close()
         self._folder.cleanup()
 
     def plug(self) -> None:
-        """Put the cable in."""
+        """Plug the cable in."""
         with self.lock:
             if self._master is not None:
                 return
@@ -247,7 +247,7 @@ class SerialServer(_SerialLine, WireServer[SerialModel]):
             os.symlink(os.ttyname(self._slave), self.path)
 
     def unplug(self) -> None:
-        """Pull the cable: the open port is lost, bytes on their way with it."""
+        """Pull the cable. The open port is lost, and so are bytes on their way."""
         with self.lock:
             if self._master is None or self._slave is None:
                 return

@@ -1,6 +1,6 @@
 """Serves a model of a program that speaks TCP: the real driver connects to it with a real socket, on this computer.
 
-One client at a time, as vendors' programs have it: while one is served nobody listens, and others are refused.
+It serves one client at a time, as vendors' programs do. Meanwhile it does not listen, and other clients are refused.
 """
 
 import select
@@ -21,19 +21,19 @@ _TURN_S = 0.002
 
 
 class TcpModel(Protocol):
-    """A program behind a port: a pure state machine fed with bytes and a time. No threads, no waiting."""
+    """A program behind a port: a pure state machine that is given bytes and a time. No threads, no waiting."""
 
     def connected(self, now_s: float) -> None:
-        """A client connected."""
+        """Note that a client has connected."""
 
     def receive(self, data: bytes, now_s: float) -> None:
         """Take bytes from the client, in pieces of any size."""
 
     def send(self, limit: int, now_s: float) -> bytes:
-        """The next bytes for the client, at most `limit`; b"" where there are none yet."""
+        """The next bytes for the client, at most `limit`; b"" if there are none yet."""
 
     def disconnected(self, now_s: float) -> None:
-        """The client is gone."""
+        """Note that the client is gone."""
 
 
 class TcpServer(WireServer[TcpModel]):
@@ -56,13 +56,13 @@ class TcpServer(WireServer[TcpModel]):
         return Endpoint(self.address)
 
     def plug(self) -> None:
-        """The program runs: it listens, on the same port as before."""
+        """Start the program, which listens on the same port as before."""
         with self.lock:
             if self._listener is None and self._client is None:
                 self._listen()
 
     def unplug(self) -> None:
-        """The program ends: the client's connection is reset, new ones are refused."""
+        """End the program. The client's connection is reset, and new ones are refused."""
         with self.lock:
             if self._listener is not None:
                 self._listener.close()

@@ -4,8 +4,8 @@
     device = bus.plug(HeliosModel())
     usb.core.find(backend=bus, idVendor=0x1209)     # or open_device(..., backend=bus)
 
-The fastest and most portable way to run a driver; what it leaves out is libusb (no transfers in flight) and the kernel.
-Device models are in `usb_model`, and so are the errors, which are pyusb's own.
+This is the fastest and most portable way to run a driver. It does without libusb (no transfers in flight) and without
+the kernel. Device models are in `usb_model`, and so are the errors, which are pyusb's own.
 """
 
 import errno
@@ -59,7 +59,7 @@ class _Handle:
 
 
 class EmulatedUsb(usb.backend.IBackend):  # type: ignore[misc] # pyusb carries no types
-    """A bus. `plug` and `unplug` at any time, from any thread. Waiting goes through the clock."""
+    """A bus. `plug` and `unplug` may be called at any time from any thread. Waiting uses the clock that is passed in."""
 
     def __init__(self, clock: Clock) -> None:
         super().__init__()
@@ -69,7 +69,7 @@ class EmulatedUsb(usb.backend.IBackend):  # type: ignore[misc] # pyusb carries n
         self._ports = 0
 
     def plug(self, model: UsbModel) -> AttachedDevice:
-        """Attach a model at the next free port; plugging in again gives a new address, as on a real bus."""
+        """Attach a model at the next free port. Plugging in again gives a new address, as on a real bus."""
         with self._lock:
             self._ports += 1
             device = AttachedDevice(model, _BUS, self._ports, self._now_s)
@@ -93,7 +93,7 @@ class EmulatedUsb(usb.backend.IBackend):  # type: ignore[misc] # pyusb carries n
             return iter(list(self._devices))
 
     def get_device_descriptor(self, dev: AttachedDevice) -> SimpleNamespace:
-        """The device descriptor, and where the device is."""
+        """The device descriptor, with the device's bus, port and address."""
         place = {"address": dev.address, "bus": dev.bus, "port_number": dev.port, "port_numbers": (dev.port,)}
         descriptor = dev.spec.device_descriptor()
         return _named(_DEVICE_FIELDS, DEVICE_FORM, descriptor, **place, speed=_SPEED[dev.spec.speed])
@@ -118,12 +118,12 @@ class EmulatedUsb(usb.backend.IBackend):  # type: ignore[misc] # pyusb carries n
         return _named(_ENDPOINT_FIELDS, ENDPOINT_FORM, descriptor, bRefresh=0, bSynchAddress=0, extra_descriptors=[])
 
     def open_device(self, dev: AttachedDevice) -> _Handle:
-        """A handle of the device."""
+        """A handle of the opened device."""
         dev.open()
         return _Handle(dev)
 
     def close_device(self, dev_handle: _Handle) -> None:
-        """Close the device; the interfaces that were claimed fall free."""
+        """Close the device and release the interfaces that were claimed."""
         dev_handle.device.close(dev_handle)
 
     def set_configuration(self, dev_handle: _Handle, config_value: int) -> None:
@@ -218,7 +218,7 @@ def _named(fields: str, form: str, descriptor: bytes, **more: object) -> SimpleN
 
 
 def _or_timeout(passed: int) -> int:
-    """The bytes that passed within the time. USBTimeoutError where none did."""
+    """The bytes that passed within the time. Raises USBTimeoutError if none did."""
     if passed == 0:
         raise usb.core.USBTimeoutError("Operation timed out", -7, errno.ETIMEDOUT)
     return passed

@@ -1,6 +1,6 @@
 """An emulated USB device, whatever transport serves it: descriptors, answers, and the rules of the bus.
 
-A device model is a pure state machine: the transport tells it what the host did and the time, and it answers. It has no
+A device model is a pure state machine: the transport tells it the time and what the host did, and it answers. It has no
 thread and never waits. `AttachedDevice` puts the bus around it: claims, settings, packets, stalls, unplugging.
 `DeviceSpec` gives its descriptors (endpoints, alternate settings, strings) as bytes (USB 2.0 chapter 9.6).
 """
@@ -31,7 +31,7 @@ DEVICE_FORM, CONFIGURATION_FORM, INTERFACE_FORM, ENDPOINT_FORM = "<BBHBBBBHHHBBB
 
 @dataclass(frozen=True, slots=True)
 class EndpointSpec:
-    """An endpoint; bit 7 of the address set = IN."""
+    """An endpoint. Bit 7 of the address is set for IN."""
 
     address: int
     kind: Literal["bulk", "interrupt"]
@@ -39,21 +39,21 @@ class EndpointSpec:
     interval: int = 0
 
     def descriptor(self) -> bytes:
-        """7 bytes, USB 2.0 table 9-13."""
+        """The endpoint descriptor: 7 bytes, USB 2.0 table 9-13."""
         kind = 2 if self.kind == "bulk" else 3
         return struct.pack(ENDPOINT_FORM, 7, _ENDPOINT, self.address, kind, self.packet_bytes, self.interval)
 
 
 @dataclass(frozen=True, slots=True)
 class AlternateSpec:
-    """One alternate setting of an interface, vendor-specific class."""
+    """One alternate setting of an interface of vendor-specific class."""
 
     interface: int
     alternate: int
     endpoints: tuple[EndpointSpec, ...] = ()
 
     def descriptor(self) -> bytes:
-        """9 bytes, USB 2.0 table 9-12."""
+        """The interface descriptor: 9 bytes, USB 2.0 table 9-12."""
         head = 9, _INTERFACE, self.interface, self.alternate, len(self.endpoints)
         return struct.pack(INTERFACE_FORM, *head, 0xFF, 0xFF, 0xFF, 0)
 
@@ -74,11 +74,11 @@ class DeviceSpec:
 
     @property
     def strings(self) -> tuple[str, ...]:
-        """Strings from index 1 on."""
+        """The strings, from index 1 on."""
         return (self.manufacturer, self.product_name) + ((self.serial,) if self.serial is not None else ())
 
     def device_descriptor(self) -> bytes:
-        """18 bytes, USB 2.0 table 9-8."""
+        """The device descriptor: 18 bytes, USB 2.0 table 9-8."""
         usb = {"full": 0x0110, "high": 0x0200, "super": 0x0300}[self.speed]
         packet = 9 if self.speed == "super" else 64  # USB 3: an exponent
         serial = 3 if self.serial is not None else 0
@@ -99,7 +99,7 @@ class DeviceSpec:
         return struct.pack(CONFIGURATION_FORM, 9, CONFIGURATION, 9 + len(body), interfaces, 1, 0, 0x80, power) + body
 
     def string_descriptor(self, index: int) -> bytes | None:
-        """Index 0 lists the languages; None where there is no such string."""
+        """The string descriptor of an index. Index 0 lists the languages; None if there is no such string."""
         if index == 0:
             return struct.pack("<BBH", 4, STRING, _LANGUAGE_EN_US)
         if index > len(self.strings):
@@ -112,7 +112,7 @@ _GET_STATUS, _GET_DESCRIPTOR, _GET_CONFIGURATION, _GET_INTERFACE = 0, 6, 8, 10
 
 
 class Stall(Enum):
-    """The answer 'refused' (EPIPE at the host); a bulk or interrupt endpoint stays halted until it is cleared."""
+    """The answer 'refused' (EPIPE at the host). A bulk or interrupt endpoint stays halted until it is cleared."""
 
     STALL = "stall"
 
@@ -155,23 +155,26 @@ class Setup:
 
 
 class UsbModel:
-    """Base of device models: refuses every transfer. Times are seconds of the transport's clock, never decreasing."""
+    """Base of device models, which refuses every transfer. Times are seconds of the transport's clock and never
+    decrease.
+    """
 
     spec: DeviceSpec
     gone: bool = False
     """Whether the device cut its own connection: the transport unplugs it at the next call."""
 
     def set_interface(self, interface: int, alternate: int, now_s: float) -> None:
-        """Take note that the host chose an alternate setting; 0 also when it released the interface or died."""
+        """Note that the host chose an alternate setting. It is 0 also when the host released the interface or died."""
 
     def control(self, setup: Setup, data: bytes, now_s: float) -> Answer:
-        """A class or vendor request. IN: the reply; OUT: b"" is 'taken'. None: not ready."""
+        """Answer a class or vendor request: the reply for IN, b"" ('taken') for OUT, None while not ready."""
         return STALL
 
     def out(self, endpoint: int, data: bytes, now_s: float) -> int | Stall | None:
-        """One OUT transfer, whole; its last packet is short unless the length is a multiple of the packet size.
+        """Take one complete OUT transfer. Its last packet is short unless the length is a multiple of the packet size.
 
-        Returns the bytes taken (fewer: the rest is offered again, until the host's timeout); None: not ready (NAK).
+        Returns the number of bytes taken; if fewer, the rest is offered again until the host's timeout. None: not ready
+        (NAK).
         """
         return STALL
 
@@ -180,11 +183,11 @@ class UsbModel:
         return STALL
 
     def unplugged(self, now_s: float) -> None:
-        """The cable is out: bus power is gone."""
+        """Note that the cable was pulled and the bus power is gone."""
 
 
 class AttachedDevice:
-    """A model on the bus. Enforces what a kernel and a host controller enforce. Thread-safe."""
+    """A model on the bus. Enforces the rules of a kernel and a host controller. Thread-safe."""
 
     def __init__(self, model: UsbModel, bus: int, port: int, now: Callable[[], float]) -> None:
         self.model = model
@@ -212,19 +215,19 @@ class AttachedDevice:
                 self.model.unplugged(self._now())
 
     def open(self) -> None:
-        """Open the device. EACCES where this user may not."""
+        """Open the device. Raises EACCES if this user may not."""
         with self._alive():
             if self.denied:
                 raise UsbFailure(errno.EACCES)
 
     def close(self, owner: object) -> None:
-        """Deal with a host that closed its handle or died: interfaces fall free and back to alternate 0."""
+        """Handle a host that closed its handle or died: its interfaces are released and go back to alternate 0."""
         with self.lock:
             for interface in [number for number, holder in self._claims.items() if holder is owner]:
                 self._give_back(interface)
 
     def set_configuration(self, value: int) -> None:
-        """Choose a configuration. EBUSY while an interface is claimed, ENOENT for an unknown one."""
+        """Choose a configuration. Raises EBUSY while an interface is claimed, ENOENT for an unknown one."""
         with self._alive():
             if self._claims:
                 raise UsbFailure(errno.EBUSY)
@@ -235,7 +238,7 @@ class AttachedDevice:
             self._halted.clear()
 
     def claim(self, interface: int, owner: object) -> None:
-        """Claim an interface. EBUSY where another holds it."""
+        """Claim an interface. Raises EBUSY if another owner holds it."""
         with self._alive():
             if all(one.interface != interface for one in self.spec.alternates):
                 raise UsbFailure(errno.ENOENT)
@@ -244,13 +247,13 @@ class AttachedDevice:
             self._claims[interface] = owner
 
     def release(self, interface: int, owner: object) -> None:
-        """Give an interface back. As Linux does, the device returns to alternate setting 0."""
+        """Release an interface. As on Linux, the device returns to alternate setting 0."""
         with self._alive():
             self._require_claim(interface, owner)
             self._give_back(interface)
 
     def set_alternate(self, interface: int, alternate: int, owner: object) -> None:
-        """Choose an alternate setting. ENOENT for an unknown one or an interface that is not claimed."""
+        """Choose an alternate setting. Raises ENOENT for an unknown one or an interface that is not claimed."""
         with self._alive():
             self._require_claim(interface, owner)
             if all((one.interface, one.alternate) != (interface, alternate) for one in self.spec.alternates):
@@ -265,7 +268,7 @@ class AttachedDevice:
             self._halted.discard(endpoint)
 
     def control(self, setup: Setup, data: bytes) -> bytes | None:
-        """A control transfer: the reply (b"" for OUT), or None while the device is not ready."""
+        """Make a control transfer. Returns the reply (b"" for OUT), or None while the device is not ready."""
         with self._alive():
             if setup.request_type & 0x60 == 0:
                 answer = self._standard(setup)
@@ -277,7 +280,7 @@ class AttachedDevice:
             return None if answer is None else bytes(answer[: setup.length])
 
     def out(self, endpoint: int, data: bytes, owner: object) -> int:
-        """Bytes that the device takes now."""
+        """Offer bytes to an OUT endpoint; returns the number that the device takes now."""
         with self._alive():
             self._usable(endpoint, owner)
             taken = self.model.out(endpoint, data, self._now())
@@ -287,7 +290,7 @@ class AttachedDevice:
             return taken or 0
 
     def inp(self, endpoint: int, room: int, owner: object) -> bytes | memoryview | None:
-        """Data that the device has now, or None. EOVERFLOW where its packet is larger than the room left."""
+        """Data that the device has now, or None. Raises EOVERFLOW if its packet is larger than the room left."""
         with self._alive():
             packet = self._usable(endpoint, owner).packet_bytes
             answer = self.model.inp(endpoint, -(-room // packet) * packet, self._now())
@@ -299,7 +302,7 @@ class AttachedDevice:
             return answer
 
     def ends_transfer(self, endpoint: int, received: int) -> bool:
-        """Whether an IN transfer ends after a burst of that many bytes: the last packet was short."""
+        """Whether an IN transfer ends after that many bytes, because the last packet was short."""
         return received % self._endpoint(endpoint)[1].packet_bytes != 0 or received == 0
 
     @contextmanager

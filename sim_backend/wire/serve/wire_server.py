@@ -1,8 +1,7 @@
-"""The base of emulated wires to a model: a cable that can be pulled, firmware that can hang, and faults that strike.
+"""The base of emulated wires to a model: a cable that can be pulled, firmware that can hang, and faults on purpose.
 
-Faults are the things that can go wrong on a wire: late, split, merged, cut, corrupt, repeated or lost replies, stalls,
-unplugging, hangs. One seeded schedule decides, reply by reply, which fault strikes; the transports (serial, TCP, USB)
-act it out.
+Faults are what can go wrong on a wire: late, split, merged, cut, corrupt, repeated or lost replies, stalls, unplugging,
+hangs. A seeded schedule decides for each reply which fault strikes; the transports (serial, TCP, USB) carry it out.
 """
 
 import threading
@@ -21,8 +20,9 @@ from drivers.transports.endpoints import Endpoint
 
 
 class Fault(Enum):
-    """One thing that goes wrong with one reply, acted out by `FaultSchedule.shape`; the last three strike the whole
-    device and are the transport's to act out."""
+    """One thing that goes wrong with one reply, carried out by `FaultSchedule.shape`. The last three strike the whole
+    device and are carried out by the transport.
+    """
 
     LATE = "late"
     """The reply comes whole, after `late_s`."""
@@ -48,17 +48,17 @@ class Fault(Enum):
 
 @dataclass(frozen=True, slots=True)
 class Delivery:
-    """Bytes that reach the host a while after the device sent them."""
+    """Bytes that reach the host some time after the device sent them."""
 
     delay_s: float
     data: bytes
 
 
 class FaultSchedule:
-    """The decision on each reply. Seeded, so that a sequence that failed can be run again.
+    """Decides for each reply which fault strikes it. Seeded, so that a failed sequence can be run again.
 
-    probability: that a reply meets a fault at all. kinds: which ones, equally often. skip: so many replies come
-    unharmed first (the opening of a device, say). most: faults in all; None: no end.
+    probability: of a fault on any one reply. kinds: which faults, equally often. skip: number of first replies that
+    come unharmed (for example the opening of a device). most: total number of faults; None for no limit.
     """
 
     def __init__(
@@ -84,7 +84,7 @@ class FaultSchedule:
         """Faults that struck so far, in order."""
 
     def next(self) -> Fault | None:
-        """The fault that strikes the next reply."""
+        """The fault that strikes the next reply; None if it comes unharmed."""
         if self._skip > 0:
             self._skip -= 1
             return None
@@ -97,7 +97,7 @@ class FaultSchedule:
         return fault
 
     def shape(self, fault: Fault | None, reply: bytes) -> tuple[Delivery, ...]:
-        """The deliveries in place of `reply`; a reply held back to be merged comes with the next one."""
+        """The deliveries that replace `reply`. A reply held back for merging comes with the next one."""
         if fault is Fault.MERGED:
             self._held += reply
             return ()
@@ -129,14 +129,14 @@ class FaultSchedule:
 
 
 class FaultScript(FaultSchedule):
-    """Faults in a given order, one a reply (None: the reply comes unharmed); none after the last."""
+    """Faults in a given order, one for each reply; None leaves a reply unharmed. After the last there are no more."""
 
     def __init__(self, *script: Fault | None, late_s: float = 0.3, stall_s: float = 1.5) -> None:
         super().__init__(0, late_s=late_s, stall_s=stall_s)
         self._script = list(script)
 
     def next(self) -> Fault | None:
-        """The next of the script."""
+        """The next fault of the script."""
         fault = self._script.pop(0) if self._script else None
         if fault is not None:
             self.struck.append(fault)
@@ -147,7 +147,7 @@ Model = TypeVar("Model")
 
 
 class Wire(ABC, Generic[Model]):
-    """A device on a wire of its own, from entering the `with` block (or `start`) to leaving it (`close`).
+    """A device on its own wire, from entering the `with` block (or `start`) to leaving it (`close`).
 
     The model's time comes from a clock, so that a warm-up of minutes costs a test nothing.
     """
@@ -169,12 +169,12 @@ class Wire(ABC, Generic[Model]):
         """The endpoint at which a host finds the device while it is plugged in, for `Surroundings.ports`."""
 
     def start(self) -> Self:
-        """Plug it in."""
+        """Plug the device in."""
         self.plug()
         return self
 
     def close(self) -> None:
-        """Unplug it for good; again: nothing happens."""
+        """Unplug the device for good; a second call does nothing."""
         self.unplug()
 
     def __enter__(self) -> Self:
@@ -187,14 +187,14 @@ class Wire(ABC, Generic[Model]):
 
     @abstractmethod
     def plug(self) -> None:
-        """Put the cable in. The device kept its power: its state is what it was."""
+        """Plug the cable in. The device kept its power, so its state is unchanged."""
 
     @abstractmethod
     def unplug(self) -> None:
-        """Pull the cable: the open port is lost, bytes on their way with it."""
+        """Pull the cable. The open port is lost, and so are bytes on their way."""
 
     def hang(self) -> None:
-        """Let the firmware hang: nothing is taken and nothing said, outputs stay as they are."""
+        """Let the firmware hang: it takes and sends nothing, and outputs stay as they are."""
         with self.lock:
             self._hung = True
             self._outbox.clear()
@@ -237,7 +237,7 @@ class Wire(ABC, Generic[Model]):
 
 
 class WireServer(Wire[Model]):
-    """A device that a thread serves on a wire of the operating system's, on which replies travel in the host's time."""
+    """A device that a thread serves on a wire of the operating system, on which replies travel in the host's time."""
 
     def __init__(self, model: Model, clock: Clock | None, faults: FaultSchedule | None) -> None:
         super().__init__(model, clock, faults)
@@ -245,13 +245,13 @@ class WireServer(Wire[Model]):
         self._thread = threading.Thread(target=self._serve, name=type(self).__name__, daemon=True)
 
     def start(self) -> Self:
-        """Plug it in and serve it on a thread of its own."""
+        """Plug the device in and serve it on a separate thread."""
         super().start()
         self._thread.start()
         return self
 
     def close(self) -> None:
-        """Unplug it for good; again: nothing happens."""
+        """Unplug the device for good; a second call does nothing."""
         self._ending.set()
         if self._thread.ident is not None:
             self._thread.join()

@@ -1,16 +1,17 @@
 """Label costs of a batch of rows, compiled: a fast form of `rig.estimate.row.likelihood`, tested against it.
 
-Counts are read, edges summed, positions scored and costs written in saturating int16, LANES pixels to a vector. Against
-'everything is before the stripe', with weights and constants of `rig.estimate.joint.labels.tables` in units,
+Counts are read, edges summed, positions scored and costs written in saturating int16, LANES pixels to a vector.
+Relative to 'everything is before the stripe', with weights and constants of `rig.estimate.joint.labels.tables` in
+units,
 
     sums(p)  = sum over pixels p' < p of (n edge + constant edge)        evidence of all pixels behind
     score(x) = sums + max over LIGHTS of (constant + sum over taps n tap)
     cost(x)  = (best score of the row - score(x)) / 2^down               uint8, at most COST_LIMIT
 
-Counts n are int16 fractions of what they can be (COUNT_BITS). The two phases of a pixel make the low and the high byte
-of the same 16 bits, which is their order. BATCH rows of a column go through each part together. Parts are functions of
-their own, not inlined: in one function the compiler keeps a register for every address. The loop over taps is unrolled
-for the usual width of the line.
+Counts n are int16 fractions of their maximum (COUNT_BITS). The two phases of a pixel are the low and the high byte of
+the same 16 bits, in this order. BATCH rows of a column go through each part together. Parts are separate functions and
+not inlined, because in a single function the compiler keeps a register for every address. The loop over taps is
+unrolled for the usual width of the line.
 """
 
 from typing import Final, NamedTuple
@@ -93,10 +94,10 @@ def read_bytes(
     counts: int, begin: int, places: int, stored: tuple[int, int, int, int], side: int, pixels: int, times: int,
     b: Buffers, batch: int,
 ) -> None:  # fmt: skip
-    """Fill n, from far to near; what lies outside the stored pixels is of any value.
+    """Fill n, from far to near. Pixels outside the stored ones may get any value.
 
-    counts: address of the first of all, begin: place of the first row's. stored: first pixel, pixels of a row, all
-    counts, counts of a column. times: factor on counts.
+    counts: address of the first count, begin: place of the first row's counts. stored: first pixel, pixels of a row,
+    number of all counts, counts of a column. times: factor on counts.
     """
     x0, window, size, column = stored
     factor = np.int16(times)
@@ -126,9 +127,9 @@ def read_bytes(
 
 @numba.njit(cache=True, nogil=True)
 def mend_rows(at: LabelTables, places: int, y: int, per_nat: float, side: int, b: Buffers, batch: int) -> None:
-    """Give pixels that the table weighs, but that the row lacks, or that are hot, a count that says nothing.
+    """Give pixels that the table weighs, but that are hot or missing in the row, a count without information.
 
-    y: row of the first; per_nat: units times exposures.
+    y: number of the first row; per_nat: units times exposures.
     """
     for r in range(batch):
         i, place = read_int32(b.here, r), places + 2 * PLACES * r
@@ -203,9 +204,10 @@ def _score_row(sums, n, tap, constant, score, vectors, taps):  # type: ignore[no
 
 @numba.njit(cache=True, nogil=True)
 def score_rows(at: LabelTables, constants: int, which: int, taps: int, b: Buffers, batch: int) -> None:
-    """Fill score and top; constants: address of those of positions, which: of the number of each row among them.
+    """Fill score and top. constants: address of the constants of positions; which: address of each row's number among
+    them.
 
-    taps: pixels around a position.
+    taps: number of pixels around a position.
     """
     for r in range(batch):
         i = read_int32(b.here, r)
@@ -226,7 +228,7 @@ def score_rows(at: LabelTables, constants: int, which: int, taps: int, b: Buffer
 
 @numba.njit(cache=True, nogil=True)
 def cost_rows(at: LabelTables, ways: Ways, b: Buffers, batch: int) -> None:
-    """Fill cost of all that may be a label."""
+    """Fill cost for all possible labels."""
     half = (1 << ways.down) >> 1
     for r in range(batch):
         cost, score = b.cost + r * b.cost_row, b.score + 2 * r * b.score_row
@@ -244,7 +246,7 @@ def cost_rows(at: LabelTables, ways: Ways, b: Buffers, batch: int) -> None:
 
 @numba.njit(cache=True, nogil=True)
 def write_rows(places: int, ways: Ways, b: Buffers, batch: int, out: int, row_bytes: int) -> None:
-    """Write the costs of labels to address out, rows `row_bytes` apart."""
+    """Write the costs of labels to address out, with rows `row_bytes` apart."""
     for r in range(batch):
         here, cost, to = places + 2 * PLACES * r, b.cost + r * b.cost_row, out + r * row_bytes
         low, high = read_int16(here, LABEL), read_int16(here, LABEL_END)
@@ -262,7 +264,7 @@ def write_rows(places: int, ways: Ways, b: Buffers, batch: int, out: int, row_by
 
 
 class CostRoom(NamedTuple):
-    """Tables and buffers of `fill_costs` and `fit_tables`, which get `pointers` to them."""
+    """Tables and buffers of `fill_costs` and `fit_tables`, which take `pointers` to them."""
 
     at: LabelTables
     halo: HaloRoom
@@ -270,7 +272,7 @@ class CostRoom(NamedTuple):
 
 
 def room_for(tables: LabelTables, halo: HaloTables, labels: int) -> CostRoom:
-    """The tables with buffers for one thread."""
+    """The tables with the working memory of one thread."""
     return CostRoom(tables, new_halo_room(halo, tables.constants), new_buffers(tables, labels))
 
 
@@ -376,7 +378,7 @@ def _fetch_table(at: LabelTables, i: int, fitted: Fitted) -> None:
 
 @numba.njit(cache=True, nogil=True)
 def fit_tables(room: CostRoom, ways: Ways, first: int, last: int) -> None:
-    """Fill the fitted parts of tables first..last-1, which are for the usual number of exposures; room: pointers."""
+    """Fill the fitted parts of tables first..last-1, for the usual number of exposures. room: pointers."""
     fitted = Fitted(room.at.fitted_constant, room.at.fitted_edge)
     for i in range(first, last):
         _fit_table(room.at, i, i, ways.units * ways.exposures, fitted, room.buffers.through)

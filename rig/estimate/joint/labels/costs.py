@@ -1,13 +1,14 @@
 """Cost of every label on every row and column: a fast form of `rig.estimate.row.likelihood`, tested against it.
 
-It tells how much less likely a label makes the counts than the best one does: with the line's profile at the label's
-own eighth of a pixel, LIGHTS amplitudes, and tables that the rows of a band share (`rig.estimate.joint.labels.tables`),
+The cost says how much less likely a label makes the counts than the best label does. It uses the line's profile at the
+label's own eighth of a pixel, LIGHTS amplitudes, and tables that the rows of a band share
+(`rig.estimate.joint.labels.tables`),
 
     cost(l) = units_per_nat (max log-likelihood - log-likelihood(l)),   uint8 (rows, columns, labels), <= COST_LIMIT
     units_per_nat = UNITS / (1 + K / SHARP) for K exposures
 
-or less where 16 bits would not hold the scores. EXCLUDED marks labels that cannot be. 'No stripe' is not among the
-labels, since a row that is taken for empty would pass nothing on from its neighbours.
+or less if 16 bits would not hold the scores. EXCLUDED marks impossible labels. 'No stripe' is not among the labels,
+since a row taken for empty would pass nothing on from its neighbours.
 """
 
 from dataclasses import dataclass
@@ -72,7 +73,7 @@ QUARTILES: Final = (0.25, 0.75)
 class Costs:
     """Gives the costs of a sweep's counts under one model; made once per model by `costs_of`.
 
-    units_per_nat: of cost; UNITS / (1 + exposures / SHARP), or less where 16 bits do not hold what haze says.
+    units_per_nat: of cost; UNITS / (1 + exposures / SHARP), or less if 16 bits do not hold the scores of haze.
     """
 
     grid: LabelGrid
@@ -83,14 +84,14 @@ class Costs:
     units_per_nat: float
 
     def room(self) -> CostRoom:
-        """Room for one thread to fill costs in, one band of rows after the other."""
+        """Working memory for one thread, reused for one band of rows after the other."""
         return room_for(self.tables, self.halo, self.grid.labels)
 
     def fill(self, volume: CountVolume, first: int, last: int, room: CostRoom, out: Uint8) -> None:
         """Write the costs of rows first..last-1 to out, uint8 (rows, columns, labels) of all rows.
 
-        Rows without frames, or with nothing to search, cost 0 everywhere. Best called with 16 rows or more at a time;
-        threads may fill different rows at once, each in its own room.
+        Rows without frames, or with nothing to search, cost 0 everywhere. Best called with 16 rows or more at a time.
+        Threads may fill different rows at once, each with its own working memory.
         """
         fill_costs(
             volume.counts, volume.n_frames, volume.x0, self.place, self.tables, pointers(room), self.ways, first, last,
@@ -99,7 +100,7 @@ class Costs:
 
 
 def costs_of(model: RowModel, geometry: SweepGeometry, grid: LabelGrid, exposures: int, workers: RowWorkers) -> Costs:
-    """All that `Costs.fill` reads, for columns of about `exposures` frames under `model`."""
+    """The costs under `model` for columns of about `exposures` frames, with all their tables."""
     sweep, state = sweep_of(geometry), state_of(model)
     reach = len(state.psi) - 1
     light = _lights(model)
@@ -204,7 +205,7 @@ def _lights(model: RowModel) -> Float32:
 
 
 def hot_in_bands(ambient: Float32) -> Bools:
-    """Pixels (rows, width) that are far brighter than those of their column in the band."""
+    """Pixels (rows, width) that are far brighter than the pixels of their column in the band."""
     bands = np.arange(BAND_ROWS, ambient.shape[0], BAND_ROWS)
     return np.concatenate([part > HOT_FACTOR * np.median(part, axis=0) + HOT_FLUX for part in np.split(ambient, bands)])
 

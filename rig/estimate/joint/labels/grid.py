@@ -1,16 +1,16 @@
 """Positions as labels that neighbours on one surface share: steps of disparity from the far end of the depth range.
 
-On a surface of even depth the stripe of the next column stands one column spacing further on, so that positions in
-pixels tell nothing about neighbours; distances from where the stripe would stand at the far end do. Label l of a row
-and column is at
+On a surface of constant depth the stripe of the next column is one column spacing further on. So positions in pixels
+say nothing about neighbours, but distances from where the stripe would be at the far end do. Label l of a row and
+column is at
 
     x = x_far - side l / PER_PX,     x_far: float64 (rows, columns), side: 1 where near is left, else -1
 
-Where labels lie in the pixels of each row is tabled once per geometry (`places_of`, int16 (columns, rows, PLACES)).
-Pixels are numbered from far to near: pixel p of a row is at x = START - side p, and FAR_PX of them come before the one
-that label 0 is in, so that neighbouring rows of a leaning line have the same depth at the same p. A pixel holds two
-labels, half a pixel apart, of phase 0 (its far half) and 1 (its near half); where between the pixels they lie is the
-variant, in eighths of a pixel: 0 to 3.
+A table, made once per geometry, says where labels lie in the pixels of each row (`places_of`, int16 (columns, rows,
+PLACES)). Pixels are numbered from far to near: pixel p of a row is at x = START - side p, and FAR_PX pixels come before
+the one that contains label 0, so that neighbouring rows of a leaning line have the same depth at the same p. A pixel
+holds two labels, half a pixel apart, of phase 0 (its far half) and 1 (its near half). Their exact position in the pixel
+is the variant, in eighths of a pixel: 0 to 3.
 """
 
 from dataclasses import dataclass
@@ -40,7 +40,7 @@ class LabelGrid:
     """Label l of a row and column is at x_far - side * l / PER_PX, for l from 0 to stripes - 1.
 
     x_far: float64 (rows, columns), NaN where nothing is searched. side: 1 where near is left, else -1. labels: a
-    multiple of VECTOR; those from stripes on mean nothing. column_px: from a column to the next, as a rule.
+    multiple of VECTOR; those from stripes on are unused. column_px: usual distance from one column to the next.
     """
 
     x_far: Float64
@@ -70,7 +70,7 @@ def label_grid(geometry: SweepGeometry) -> LabelGrid:
 def far_ends(u: Float32, v: Float32, plane: Float64, x_lo: Int32, x_hi: Int32, w_far: float) -> Float64:
     """Position of each column's line on each row at inverse depth w_far: (rows, columns) pixels.
 
-    Interpolated between pixels, continued outside the picture along its last two; NaN where x_lo > x_hi.
+    Interpolated between pixels, and extrapolated outside the picture from its last two; NaN where x_lo > x_hi.
     """
     rows, columns = x_lo.shape
     width = u.shape[1]
@@ -114,12 +114,12 @@ PLACES: Final = 8
 
 
 def label_pixels(grid: LabelGrid) -> int:
-    """Number of pixels that labels lie in."""
+    """Number of pixels in which labels lie."""
     return grid.stripes // PHASES + 1
 
 
 def places_of(sweep: Sweep, grid: LabelGrid) -> Int16:
-    """The numbers of each row of each column, int16 (columns, rows, PLACES)."""
+    """The numbers that place labels in each row of each column, int16 (columns, rows, PLACES)."""
     out = np.zeros((*grid.x_far.T.shape, PLACES), np.int16)
     _fill_places(sweep, grid.x_far, grid.side, grid.stripes, label_pixels(grid), out)
     return out

@@ -1,9 +1,9 @@
 """The halo's part of the label costs, compiled: a fast form of `rig.estimate.row.likelihood`, tested against it.
 
-The halo of `rig.estimate.row.inputs` is in every hypothesis. The tables of `rig.estimate.joint.labels.tables` take the
-halo for as bright everywhere as it is at the stripe, which is right where the stripe's place is decided. The difference
-elsewhere varies slowly with the stripe's place and from pixel to pixel. So it is tabled for stripes BLOCK_PX apart,
-with straight lines in between, and for the mean counts of blocks of as many pixels (`HaloTables`: int16 weights,
+The halo of `rig.estimate.row.inputs` is part of every hypothesis. The tables of `rig.estimate.joint.labels.tables`
+treat the halo as equally bright everywhere as at the stripe, which is right where the stripe's place is decided. The
+difference elsewhere varies slowly with the stripe's place and from pixel to pixel. So it is tabled for stripes BLOCK_PX
+apart, with linear interpolation, and for the mean counts of blocks of as many pixels (`HaloTables`: int16 weights,
 float32 constants in nats per exposure).
 """
 
@@ -39,11 +39,12 @@ _FULL: Final = 32768.0
 
 
 class HaloTables(NamedTuple):
-    """Blocks of pixels are counted from FIRST_PX on; places of the stripe from the far end of the first label's pixel.
+    """Tables of the halo. Blocks of pixels are counted from FIRST_PX on, places of the stripe from the far end of label
+    0's pixel.
 
     weight: int16 (bands, columns, blocks, LIGHTS, places), of the counts of a block over BLOCK_PX. constant: float32
-    (bands, columns, LIGHTS, places), nats per exposure. ramp: int16 (phases, 3, LANES), parts that the three places
-    around a vector of labels have in each, of 2^15. Without a halo all but `ramp` are empty.
+    (bands, columns, LIGHTS, places), nats per exposure. ramp: int16 (phases, 3, LANES), interpolation weights of the
+    three places around a vector of labels, in 2^-15. Without a halo all but `ramp` are empty.
     """
 
     weight: Int16
@@ -52,7 +53,7 @@ class HaloTables(NamedTuple):
 
 
 def halo_tables(tables: LabelTables, there: bool) -> HaloTables:
-    """Room for the tables of a halo, if there is one."""
+    """Memory for the tables of a halo, if there is one."""
     bands, columns, _ = tables.at.shape
     blocks = -(-(tables.edge.shape[1] - FIRST_PX) // BLOCK_PX)
     places = -(-(LANES // BLOCK_PX * tables.tap.shape[1] + 1) // LANES) * LANES
@@ -75,7 +76,7 @@ def fill_halo(
     sweep: Sweep, state: RowState, place: Int16, ambient: Float32, hot: Bools, light: Float32, halo: Float32,
     per_nat: float, first_band: int, last_band: int, tables: LabelTables, out: HaloTables,
 ) -> None:  # fmt: skip
-    """Fill bands first_band..last_band-1; arguments as of `rig.estimate.joint.labels.tables.fill_tables`.
+    """Fill bands first_band..last_band-1; arguments as in `rig.estimate.joint.labels.tables.fill_tables`.
 
     halo: (BINS, pixels) of `halo_shares`.
     """
@@ -139,17 +140,17 @@ _POSSIBLE: Final = np.int16(28000)
 
 @numba.njit(forceinline=True)
 def rounded(a):  # type: ignore[no-untyped-def]
-    """Parts of scores, float32 lanes, as the nearest 16-bit ones."""
+    """Parts of scores, float32 lanes, rounded to 16-bit ones."""
     a = larger_float(smaller_float(a, np.float32(HIGHEST)), np.float32(-HIGHEST))
     return to_int16(a + _TO_UNSIGNED) + np.int16(-32768)
 
 
 class HaloRoom(NamedTuple):
-    """The tables with their numbers of blocks and places, and room for a column and a batch of rows, int16 unless said.
+    """The tables with their numbers of blocks and places, and working memory for a column and a batch of rows.
 
-    fitted: (LIGHTS, places), constants of all places for a column's exposures; mean: (blocks,), counts of blocks;
-    level: (LIGHTS, places), evidence of the halo for a stripe at each place; constant: of the positions, of each row of
-    a batch; which: int32 (BATCH,), its number there.
+    All int16 unless said. fitted: (LIGHTS, places), constants of all places for a column's exposures; mean: (blocks,),
+    counts of blocks; level: (LIGHTS, places), evidence of the halo for a stripe at each place; constant: of the
+    positions, for each row of a batch; which: int32 (BATCH,), each row's index there.
     """
 
     tables: HaloTables
@@ -163,7 +164,7 @@ class HaloRoom(NamedTuple):
 
 
 def new_halo_room(halo: HaloTables, constants: int) -> HaloRoom:
-    """Room for rows of so many constants of positions."""
+    """Working memory for rows with this number of constants of positions."""
     blocks, places = halo.weight.shape[2], halo.weight.shape[4]
     return HaloRoom(
         tables=halo, blocks=blocks, places=places, fitted=aligned_zeros((LIGHTS, places), np.int16),
@@ -174,7 +175,7 @@ def new_halo_room(halo: HaloTables, constants: int) -> HaloRoom:
 
 @numba.njit(cache=True, nogil=True)
 def fit_halo(halo: HaloRoom, column: int, per_nat: float) -> None:
-    """Fill fitted for a column's exposures; column: its number among all bands', per_nat: units x exposures."""
+    """Fill fitted for a column's exposures. column: its number among all bands; per_nat: units x exposures."""
     numbers = LIGHTS * halo.places
     for j in range(0, numbers, LANES):
         nats = load_float32(halo.tables.constant + 4 * column * numbers, j) * np.float32(per_nat)
@@ -183,7 +184,7 @@ def fit_halo(halo: HaloRoom, column: int, per_nat: float) -> None:
 
 @numba.njit(cache=True, nogil=True)
 def halo_rows(halo: HaloRoom, column: int, at: LabelTables, fitted: Fitted, b: Buffers, batch: int) -> None:
-    """Fill constant: the constants of the rows' tables plus the evidence of the halo."""
+    """Fill constant with the constants of the rows' tables plus the evidence of the halo."""
     vectors = b.score_row // (PHASES * LANES)
     weights = halo.tables.weight + 2 * column * halo.blocks * LIGHTS * halo.places
     for r in range(batch):

@@ -1,7 +1,7 @@
-"""Tables of the label costs, per column, band of rows and variant, and the buffers to work in.
+"""Tables of the label costs, per column, band of rows and variant, and the working memory.
 
-They hold the terms of `rig.estimate.row.likelihood`, relative to 'everything is before the stripe': with p'_B and p'_E
-of a pixel before and behind the stripe, p'_S of one that it lights,
+They hold the terms of `rig.estimate.row.likelihood`, relative to 'everything is before the stripe'. With p'_B and p'_E
+of a pixel before and behind the stripe, and p'_S of a pixel that it lights,
 
     edge = logit p'_E - logit p'_B                  int16: a count at a pixel behind the stripe
     tap  = logit p'_S - logit of the above          int16: a count at a pixel around a label, for LIGHTS amplitudes
@@ -10,8 +10,8 @@ of a pixel before and behind the stripe, p'_S of one that it lights,
 Haze, pedestal and ambient light vary slowly along a line, so the rows of a band share a table for each variant of
 `rig.estimate.joint.labels.grid` that occurs among them. Weights are for counts as `scaled` multiplies them.
 
-The stripe's brightness is not known: of two lights, the quartiles of what was learned, the likelier one counts. The
-learned prior of positions does not enter, since it makes errors larger.
+The stripe's brightness is unknown. Two values are tried, the quartiles of the learned brightness, and the likelier one
+counts. The learned prior of positions is not used, since it makes errors larger.
 """
 
 from typing import Final, NamedTuple
@@ -54,17 +54,17 @@ class LabelTables(NamedTuple):
 
     P: pixels of a row, V: vectors of pixels that hold labels, the first one being pixel FAR_PX.
 
-    at: int32 (bands, columns, VARIANTS), index of the table, -1 where there is none.
-    edge: int16 (tables, P), weight of a count behind the stripe. edge_sum: float32 (tables, P), nats per exposure of
-    the pixels up to and including each lying behind.
+    at: int32 (bands, columns, VARIANTS), index of the table, -1 if there is none.
+    edge: int16 (tables, P), weight of a count behind the stripe. edge_sum: float32 (tables, P), nats per exposure if
+    all pixels up to and including each lie behind.
     tap: int16 (tables, V, taps, PHASES, LIGHTS, LANES), weight of the counts of the pixels around each position.
     constant: float32 (tables, V, PHASES, LIGHTS, LANES), nats per exposure of each position.
-    span: int16 (tables, 2), pixels whose weights are not 0: from and up to.
+    span: int16 (tables, 2), first pixel with a weight other than 0, and the one after the last.
     used: int16 (tables,), vectors up to the last one that holds a label of any row.
     fitted_constant, fitted_edge: int16, units of constant and of each pixel's share of edge_sum, for the usual number
     of exposures.
     hot_x: int16, x of hot pixels, those of row y from hot_start[y] to hot_start[y + 1], int32.
-    pixels, taps, constants: numbers of edge, tap and constant that a table has.
+    pixels, taps, constants: number of edge, tap and constant entries of a table.
     """
 
     at: Int32
@@ -85,7 +85,7 @@ class LabelTables(NamedTuple):
 
 @numba.njit(cache=True, nogil=True)
 def number_tables(place: Int16, at: Int32) -> int:
-    """Fill `at` of LabelTables with the numbers of the tables that the rows need; returns how many those are."""
+    """Fill `at` of LabelTables with the numbers of the tables that the rows need; returns the number of tables."""
     tables = 0
     at[:] = -1
     for b in range(at.shape[0]):
@@ -103,9 +103,9 @@ def fill_tables(
     sweep: Sweep, state: RowState, place: Int16, ambient: Float32, hot: Bools, light: Float32, shares: Float32,
     beside: Float32, per_nat: float, most: float, first_band: int, last_band: int, out: LabelTables,
 ) -> None:  # fmt: skip
-    """Tables of bands first_band..last_band-1.
+    """Fill the tables of bands first_band..last_band-1.
 
-    state: without ambient light, which is in `ambient` (rows, width), of pixels that are not `hot`. light: (LIGHTS,)
+    state: without ambient light, which is in `ambient` (rows, width), for pixels that are not `hot`. light: (LIGHTS,)
     photons at unit scale. shares: (FRACTIONS, taps) of the line in the pixels around centres -4/8 to 3/8 px off.
     per_nat: units of weight; most: largest sum of a position's weights.
     """
@@ -151,7 +151,7 @@ def fill_tables(
 
 @numba.njit(cache=True, nogil=True)
 def mark_rows(place: Int16, hot: Bools, side: int, tables: LabelTables) -> None:
-    """Set MEND of rows whose tables weigh pixels that the rows do not have, or that are hot."""
+    """Set MEND for rows whose tables weigh pixels that are hot or missing in the row."""
     for c in range(place.shape[0]):
         for y in range(place.shape[1]):
             here = place[c, y]
@@ -166,9 +166,10 @@ def mark_rows(place: Int16, hot: Bools, side: int, tables: LabelTables) -> None:
 
 @numba.njit(cache=True, nogil=True)
 def middle_row(place: Int16, c: int, rows: tuple[int, int], variant: int) -> tuple[int, int, int]:
-    """The row of a variant, -1: of any, nearest the band's middle, -1: none; first and end position of all its rows.
+    """The row of a variant (-1: of any) nearest the band's middle, or -1; and the first and end position of all its
+    rows.
 
-    Positions count two a pixel, from the pixel that holds label 0 on.
+    There are two positions per pixel, counted from the pixel that holds label 0.
     """
     middle = (rows[0] + rows[1]) // 2
     best, first, end = -1, 1 << 15, 0
@@ -187,7 +188,7 @@ def mean_ambient(
     place: Int16, ambient: Float32, hot: Bools, side: int, c: int,
     rows: tuple[int, int], mean: Float32, number: Int32,
 ) -> None:  # fmt: skip
-    """Mean ambient light of the band's rows at each pixel p; where none is to be had, that of the pixel before."""
+    """Mean ambient light of the band's rows at each pixel p. A pixel without a value takes that of the pixel before."""
     mean[:] = 0.0
     number[:] = 0
     for y in range(rows[0], rows[1]):
@@ -281,9 +282,9 @@ POSITION: Final = PHASES * LIGHTS * LANES
 class Ways(NamedTuple):
     """Units and limits of scores and costs.
 
-    units: of scores per nat, of columns with the usual number of `exposures`; bits: of the largest count; most: what a
-    column's exposures may count as; sharp: exposures at which a nat is worth half as many units; down: power of two
-    that scores are divided by to be costs; reach: taps on either side; side, stripes: as in `LabelGrid`.
+    units: of scores per nat, for columns with the usual number of `exposures`; bits: of the largest count; most: upper
+    limit of a column's exposures; sharp: number of exposures at which a nat is worth half as many units; down: power of
+    two that turns scores into costs; reach: taps on either side; side, stripes: as in `LabelGrid`.
     """
 
     units: float
@@ -298,21 +299,21 @@ class Ways(NamedTuple):
 
 
 class Fitted(NamedTuple):
-    """Addresses of constants and edges at a number of exposures, int16: of all tables, or of a column's variants."""
+    """Addresses of constants and edges for a number of exposures, int16: of all tables, or of a column's variants."""
 
     constant: int
     edge: int
 
 
 class Buffers(NamedTuple):
-    """Room for BATCH rows, int16 (BATCH, n_row or the like) unless said.
+    """Working memory for BATCH rows, int16 (BATCH, n_row or the like) unless said.
 
     n: counts of pixels from far to near; sums: score of a change at each pixel from SUMS_FROM on, the first one BASE;
-    score: of pixel and phase; top: largest ones of some lanes each, later of all. cost: uint8, of labels, from that of
-    the first pixel's phase 0 on.
-    Of all rows: mask: uint8 (labels,), EXCLUDED or 0; constant: of positions, edge: of pixels, for each variant;
-    through: sums on the way to edge. int32: table: of variants from -1 on, -1 where there is none; here: that of each
-    row of the batch; fitted: place of it in `Fitted`; shown: labels that the mask is for, from and up to.
+    score: of pixel and phase; top: largest scores in each of some lanes, later of all. cost: uint8, of labels, from
+    that of the first pixel's phase 0 on.
+    For all rows: mask: uint8 (labels,), EXCLUDED or 0; constant: of positions, edge: of pixels, for each variant;
+    through: intermediate sums for edge. int32: table: of variants from -1 on, -1 if there is none; here: that of each
+    row of the batch; fitted: its place in `Fitted`; shown: first label of the mask, and the one after the last.
     """
 
     n: Int16
@@ -335,7 +336,7 @@ class Buffers(NamedTuple):
 
 
 def new_buffers(tables: LabelTables, labels: int) -> Buffers:
-    """Buffers for so many labels, each beginning at a cache line."""
+    """Buffers for this number of labels, each beginning at a cache line."""
     pixels, vectors = tables.pixels, tables.tap.shape[1]
     n_row = _whole(max(pixels, FAR_PX + vectors * LANES + LANES) + LANES)
     score_row = vectors * PHASES * LANES

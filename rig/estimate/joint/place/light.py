@@ -5,16 +5,16 @@ half of that behind (`measure_light`),
 
     light = (sum over t of log (K + 1/2) / (K - n_t + 1/2) - ambient_t - haze) / (1 + (2 LIGHT_PX + 1) glow)
 
-photons per exposure: one logarithm of a product. Blind pixels count as the expected light. Haze is looked up between
-bins of its profile, from a table with all that is wanted of a bin beside one another.
+in photons per exposure, computed as one logarithm of a product. Blind pixels count with the expected light. Haze is
+interpolated between bins of its profile, from a table in which all values of a bin lie side by side.
 
 With the flux of each of the TAPS pixels around a stripe of `light` photons, and D = 1 / (e^flux - 1) (`score_places`),
 
     slope = light d share / dx (and the step of haze at the centre),
     g = sum slope (n D - (K - n)),    h = sum K slope^2 D
 
-are the slope of the log-likelihood in the stripe's place and its Fisher information, 1/px and 1/px^2. A pixel that the
-row does not have, or that is not to be used, is given light in which nothing can be seen. Arrays are float32 (rows,
+are the slope of the log-likelihood in the stripe's place and its Fisher information, 1/px and 1/px^2. A pixel that is
+missing in the row or must not be used is given so much light that it carries no information. Arrays are float32 (rows,
 columns), see `Places` (`rig.estimate.joint.place.places`).
 """
 
@@ -66,7 +66,7 @@ def measure_light(
     n_frames: Int32, sweep: Sweep, state: RowState, around: Counts, x_px: Float32, first_row: int, last_row: int,
     out: Places,
 ) -> None:  # fmt: skip
-    """Fill light, scale, haze, rest and glow of rows first_row..last_row-1 for stripes at x_px; zeros where none is.
+    """Fill light, scale, haze, rest and glow of rows first_row..last_row-1 for stripes at x_px; 0 where there is none.
 
     around: of `fetch_counts`. Haze is that of the nearest pixel that is searched.
     """
@@ -210,7 +210,7 @@ def score_places(
     """Fill score and known of rows first_row..last_row-1 for stripes at x_px.
 
     shares: (FRACTIONS, 2, EIGHT), share of the line in each of the TAPS pixels around the one that holds its centre,
-    and by how much that grows with every pixel that the centre moves on. around: of `fetch_counts`.
+    and the derivative of the share by the centre's position in pixels. around: of `fetch_counts`.
     """
     window, (pixels, columns) = sweep.window, (state.ambient.shape[1], x_px.shape[1])
     side, half, one = 1 if sweep.near_is_left else -1, np.float32(0.5), np.float32(1.0)

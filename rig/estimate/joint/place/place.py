@@ -1,7 +1,7 @@
 """Sub-pixel places of stripes whose labels are known: their light, their pooled places, and the width of the line.
 
 Steps: light of each stripe, pooled brightness, score and information of its place, the place pooled over neighbours,
-then joined by pairs of opposite neighbours. The formulas are in `rig.estimate.joint.place.places` and
+then combined with pairs of opposite neighbours. The formulas are in `rig.estimate.joint.place.places` and
 `rig.estimate.joint.place.pool`. Positions are float32 (rows, columns) in px, moved by at most MOST_MOVED_PX.
 """
 
@@ -58,7 +58,7 @@ def profile_table(sigma_px: float) -> Float32:
 
 
 def new_places(rows: int, columns: int) -> Places:
-    """Room for the places of a map: one piece, so that the system gives it large pages.
+    """Memory for the places of a map, in one piece so that the system gives it large pages.
 
     Kernels may read a vector that goes beyond the end of any field but the last.
     """
@@ -76,10 +76,10 @@ def place(
     *,
     lesson: bool = False,
 ) -> Float32:
-    """Move x_px, whose distances from the far end are in `places`, to where neighbours together put it.
+    """Move x_px, whose distances from the far end are in `places`, to the positions pooled over neighbours.
 
-    lesson: whether they are to teach the first map. Returns its standard deviation in px; light and haze are left in
-    `places`, with all that was found on the way. The last steps are only posted, see `weigh_light`.
+    lesson: whether the first map's lessons will use them. Returns the standard deviation in px. Light, haze and
+    intermediate results are left in `places`. The last steps are only queued, see `weigh_light`.
     """
     sd = np.empty_like(x_px)
     around = weigh_light(volume, sweep, state, x_px, places, workers)
@@ -108,10 +108,10 @@ def place(
 def weigh_light(
     volume: CountVolume, sweep: Sweep, state: RowState, x_px: Float32, places: Places, workers: RowWorkers
 ) -> Counts:
-    """Fill light, scale, haze and amplitude of `places` for stripes at x_px, as `state` sees them.
+    """Fill light, scale, haze and amplitude of `places` for stripes at x_px, as `state` describes them.
 
-    Returns the counts around the stripes, see `fetch_counts`. Amplitudes are only posted: the same rows' next work can
-    go by them, others settle first.
+    Returns the counts around the stripes, see `fetch_counts`. Amplitudes are only queued: later work on the same rows
+    can use them; all other users must call `settle` first.
     """
     faintest, brightest = float(state.amplitude[0]) / BEYOND, float(state.amplitude[-1]) * BEYOND
     around = np.empty((*x_px.shape, EIGHT), volume.counts.dtype)
@@ -129,7 +129,9 @@ def weigh_light(
 def line_width(
     volume: CountVolume, sweep: Sweep, state: RowState, stripes: StripeTable, workers: RowWorkers
 ) -> float | None:
-    """Standard deviation of the line in px, from the light of clear stripes around their places; None: too little."""
+    """Standard deviation of the line in px, from the light of clear stripes around their places; None if there is too
+    little.
+    """
     sums = np.zeros((stripes.x_px.shape[0], 2))
     clear = stripes.x_px, stripes.x_sd_px, stripes.confidence, stripes.signal
     seen = volume.counts, volume.n_frames, sweep, state, *clear
@@ -142,7 +144,7 @@ def line_width(
 
 
 def amplitudes_of(places: Places) -> tuple[Float32, Float64]:
-    """Four amplitudes that stand for those of a map's stripes, pooled over neighbours, and their shares."""
+    """Four amplitudes that represent those of a map's stripes, pooled over neighbours, and their shares."""
     found = places.amplitude[places.scale > 0]
     edges, shares = (0.0, 0.2, 0.5, 0.8, 1.0), np.array([0.2, 0.3, 0.3, 0.2])
     if len(found) == 0:

@@ -1,16 +1,16 @@
-"""Sub-pixel placing of stripes: one step of Fisher scoring, pooled over neighbours on the same surface; counts around.
+"""Sub-pixel placing of stripes by one step of Fisher scoring, pooled over neighbours on the same surface.
 
-At its answer each row says how much likelier its counts become with the stripe a little further on (the score g), and
-how much it knows of that at all (the information h), `rig.estimate.joint.place.light`. Neighbours on one surface share
-its distance d from the far end, float32 px:
+At its answer each row gives the slope of its log-likelihood with the stripe's position (the score g) and its Fisher
+information h, `rig.estimate.joint.place.light`. Neighbours on one surface share its distance d from the far end,
+float32 px. The pooled value
 
     d = sum (h d_n + g_n) / sum h
 
-over them is as good as the maximum of their common likelihood, and 1 / sqrt(sum h) its standard deviation. A stripe's
-brightness is pooled in the same way before: on its own a dark row is taken for a brighter one that stands on haze.
+is as good as the maximum of their common likelihood, with 1 / sqrt(sum h) as its standard deviation. A stripe's
+brightness is pooled in the same way before; otherwise a dark row would be taken for a brighter one that stands on haze.
 
-Counts lie column by column, answers are worked on row by row, LANES columns to a vector. So the counts around all
-stripes are brought into the order of the answers once, in tiles of rows and columns (`fetch_counts`).
+Counts are stored column by column, but answers are processed row by row, LANES columns to a vector. So the counts
+around all stripes are brought into the order of the answers once, in tiles of rows and columns (`fetch_counts`).
 """
 
 from typing import Final, NamedTuple
@@ -48,10 +48,10 @@ FEW_FRAMES_FLUX: Final = 0.5
 class Places(NamedTuple):
     """Light and place of each stripe, float32 (rows, columns) each.
 
-    distance: x from the far end in px, NaN where there is none; light: photons per exposure above haze and ambient;
-    scale: those of amplitude 1; haze, rest: before and behind it; glow: of the halo at the stripe, photons per pixel
-    over those of the stripe; known: h of the module; score: h times distance, plus g; placed: the final distance;
-    joined, joined_sd: distance and its standard deviation on the way there.
+    distance: x from the far end in px, NaN if there is none; light: photons per exposure above haze and ambient; scale:
+    light of amplitude 1; haze, rest: before and behind it; glow: of the halo at the stripe, photons per pixel over
+    those of the stripe; known: h of the module; score: h times distance, plus g; placed: the final distance; joined,
+    joined_sd: intermediate distance and its standard deviation.
     """
 
     distance: Float32
@@ -70,7 +70,9 @@ class Places(NamedTuple):
 
 @numba.njit(inline="always")
 def most_shown(frames):  # type: ignore[no-untyped-def]
-    """Flux up to which the counts of so many frames tell well how bright a pixel is: DARK_FRAMES of them stay dark."""
+    """Flux up to which the counts of this number of frames measure a pixel's brightness well: DARK_FRAMES of them stay
+    dark.
+    """
     return np.log(frames / DARK_FRAMES) if frames > FEW_FRAMES else FEW_FRAMES_FLUX
 
 
@@ -79,10 +81,12 @@ def add_moments(
     counts: Counts, n_frames: Int32, sweep: Sweep, state: RowState, x_px: Float32, sd_px: Float32, confidence: Float32,
     signal: Float32, first_row: int, last_row: int, sums: Float64,
 ) -> None:  # fmt: skip
-    """Add to sums (rows, 2) the light of clear stripes within REACH_PX, and that times its squared distance less sd^2.
+    """Add to sums (rows, 2) the light of clear stripes within REACH_PX, and the light times (its squared distance -
+    sd^2).
 
-    Light above haze, halo and ambient, photons; what is added to a row of sums comes from that row of the picture.
-    Where there is a halo stripes that fill their pixels are left out: it would pass for the flanks that they lack.
+    Light is above haze, halo and ambient, in photons. A row of sums gets only contributions from the same row of the
+    picture. With a halo, stripes that saturate their pixels are left out, since the halo would be taken for their
+    missing flanks.
     """
     for y in range(first_row, last_row):
         for c in range(x_px.shape[1]):
@@ -136,10 +140,11 @@ _TILE: Final = 16
 
 @numba.njit(cache=True, nogil=True)
 def fetch_counts(counts: Counts, x0: Int32, x_px: Float32, first_row: int, last_row: int, around: Counts) -> None:
-    """Fill around (rows, columns, EIGHT) of rows first_row..last_row-1: counts from REACH_PX before each stripe on.
+    """Fill around (rows, columns, EIGHT) of rows first_row..last_row-1 with the counts from REACH_PX before each stripe
+    on.
 
-    counts: (columns, rows, window), C-contiguous; around: of the same type. 0 where no pixel was stored, of any value
-    where there is no stripe.
+    counts: (columns, rows, window), C-contiguous; around: of the same type. Values are 0 where no pixel was stored, and
+    arbitrary where there is no stripe.
     """
     columns, rows, window = counts.shape
     size, column = counts.itemsize, rows * window * counts.itemsize
@@ -165,16 +170,16 @@ def fetch_counts(counts: Counts, x0: Int32, x_px: Float32, first_row: int, last_
 
 @numba.njit(inline="always")
 def nearest_pixel(x):  # type: ignore[no-untyped-def]
-    """The pixel that holds x."""
+    """The pixel that contains x."""
     return int(np.floor(x + np.float32(0.5)))
 
 
 @numba.njit(forceinline=True)
 def ambient_place(ambient, width, y, x, x0, window, spare):  # type: ignore[no-untyped-def]
-    """Address of the ambient light from REACH_PX before pixel x on; it is written to `spare` where it is not all there.
+    """Address of the ambient light from REACH_PX before pixel x on. It is copied to `spare` if a part of it is missing.
 
-    ambient: address of rows of `width` pixels; spare: that of EIGHT numbers, given MOST_FLUX at pixels that were not
-    stored or that the picture does not have.
+    ambient: address of rows of `width` pixels; spare: address of EIGHT numbers, set to MOST_FLUX for pixels that were
+    not stored or lie outside the picture.
     """
     first, low, high = x - REACH_PX, max(x0, 0), min(x0 + window, width)
     if low <= first <= high - EIGHT:
@@ -187,7 +192,9 @@ def ambient_place(ambient, width, y, x, x0, window, spare):  # type: ignore[no-u
 
 @numba.njit(forceinline=True)
 def counts_of(around, at, y, c, to):  # type: ignore[no-untyped-def]
-    """Write EIGHT vectors of the counts of stripes c..c+LANES-1, see `fetch_counts`, to address `to`; at: of around."""
+    """Write EIGHT vectors of the counts of stripes c..c+LANES-1, see `fetch_counts`, to address `to`. at: address of
+    `around`.
+    """
     if around.itemsize == 1 and c + LANES <= around.shape[1]:
         spread_eights(at + (y * around.shape[1] + c) * EIGHT, to)
         return

@@ -1,18 +1,18 @@
-"""Sums over neighbours on one surface, and places joined by pairs of opposite neighbours, LANES stripes to a vector.
+"""Sums over neighbours on one surface, and places combined with pairs of opposite neighbours, LANES stripes to a
+vector.
 
-Pooling: a neighbour whose distance from the far end differs by more than SAME_PX is left out, one by one, so that no
-running sums will do. Rows are worked on in copies with a margin of stripes that lie nowhere (`with_margin`, NaN): no
-neighbour has to be asked for. All arrays are float32 (rows, columns).
+Pooling: a neighbour whose distance from the far end differs by more than SAME_PX is left out, one by one, so running
+sums cannot be used. Rows are processed in copies with a margin of NaN (`with_margin`), so that no bounds need checking.
+All arrays are float32 (rows, columns).
 
-Joining: the mean of two places that lie opposite each other on a plane is the place between them, whatever the plane's
-slope. So a stripe is joined by its opposite neighbours some stripes away, each placed with its own neighbourhood
-before, where their mean m agrees with its own place d: within SAME_PX, and within SIGMAS of what the standard
-deviations of both let expect,
+Joining: on a plane of any slope, the mean of two places opposite each other is the place between them. So a stripe is
+combined with opposite neighbours some stripes away, each already placed with its own neighbourhood, if their mean m
+agrees with its own place d: within SAME_PX, and within SIGMAS of the standard deviation expected for the difference,
 
     d' = (d / s^2 + sum m / v) / (1 / s^2 + sum 1 / v),    v = (s1^2 + s2^2) / 4
 
 Where a surface ends or bends they do not agree, and the stripe stays where it is. Two such rounds reach as far as 25 x
-25 neighbours for the work of 16. Neighbourhoods overlap, so that pairs know less than the sum of what each knows:
+25 neighbours for the work of 16. Neighbourhoods overlap, so pairs contain less information than the sum of its parts:
 `share` of it, which makes the standard deviation right where all agree.
 """
 
@@ -67,8 +67,8 @@ def with_margin(array: Float32, first_row: int, last_row: int) -> Float32:
 def pool_row(distance: Float32, first: Float32, second: Float32, y: int, reach: int, sums: Float32) -> None:
     """Sums of `first` and `second` over the neighbours of row y on the same surface, itself included.
 
-    distance, first, second: of `with_margin`, y: counted from their first row that is no margin. sums: (2, columns), of
-    a number of columns that is a multiple of LANES.
+    distance, first, second: of `with_margin`; y: counted from their first row after the margin. sums: (2, columns),
+    where the number of columns is a multiple of LANES.
     """
     sums[:] = 0.0
     at = address_of(distance), address_of(first), address_of(second)
@@ -79,7 +79,7 @@ def pool_row(distance: Float32, first: Float32, second: Float32, y: int, reach: 
 def widen_row(at: tuple[int, int, int], width: int, y: int, inner: int, reach: int, enough: float, sums: int) -> None:
     """Add those neighbours that are more than `inner` rows or columns away, up to `reach`.
 
-    Stripes whose second sum is `enough` already may be left as they are. at, sums: addresses; width: of copies.
+    Stripes whose second sum already reaches `enough` may be left as they are. at, sums: addresses; width: of copies.
     """
     columns = width - 2 * LANES
     for c in range(0, columns, LANES):
@@ -132,9 +132,9 @@ def pool_amplitude(
 def pool_places(
     places: Places, reaches: tuple[int, ...], enough: float, first_row: int, last_row: int, moved: Float32, sd: Float32
 ) -> None:
-    """Fill moved, by how far in x each stripe is to move, and sd, the standard deviation of its place then, in px.
+    """Fill moved, the shift of each stripe in x, and sd, the standard deviation of its place afterwards, both in px.
 
-    reaches: sizes of the neighbourhood, smallest first; the first one that knows `enough` (1/px^2) is taken.
+    reaches: sizes of the neighbourhood, smallest first; the first one with `enough` information (1/px^2) is taken.
     """
     columns = moved.shape[1]
     # Two sums, by how far to move, and the standard deviation, negative where it is not known yet.
@@ -192,8 +192,9 @@ def join_pairs(
 ) -> None:  # fmt: skip
     """Fill the outputs, (rows, columns) as the inputs, of rows first_row..last_row-1.
 
-    distance: from the far end in px, NaN where there is no stripe; sd_px: at most 1, which is to know nothing. step:
-    rows and columns to the neighbours, at most MARGIN. enough: 1/px^2, from which on a stripe stays where it is.
+    distance: from the far end in px, NaN where there is no stripe; sd_px: at most 1, which means no information. step:
+    number of rows and columns to the neighbours, at most MARGIN. enough: information, 1/px^2, above which a stripe
+    stays where it is.
     """
     columns = distance.shape[1]
     to_distance, to_sd = address_of(out_distance), address_of(out_sd_px)
