@@ -3,6 +3,7 @@
 import copy
 import json
 from collections.abc import Callable
+from functools import partial
 from pathlib import Path
 from types import SimpleNamespace
 from typing import Any
@@ -18,6 +19,7 @@ from rig.devices.doctor import Finding
 from rig.errors import PlanError
 from sim_backend.wire.emulated_world import EmulatedWorld
 from sim_backend.wire.firmware.helios import GREEN
+from sim_backend.wire.firmware.spb_usb_run import SpbUsbBoard
 from tests.system.conftest import Rig
 from tests.system.small_rig import config, write_rig
 
@@ -82,6 +84,12 @@ def test_it_shows_who_is_there_and_how_they_are(examine: Examine) -> None:
         assert all(word in found[name].text for word in words), found[name]
     rate_hz = float(found["markers"].text.split(" lines a second")[0].split()[-1])
     assert rate_hz == pytest.approx(12_500 / 10, rel=0.01)
+
+
+def test_a_burst_is_read_out_as_fast_as_the_link_goes(examine: Examine, monkeypatch: pytest.MonkeyPatch) -> None:
+    slow = partial(SpbUsbBoard, link_bytes_per_s=5_000_000)
+    monkeypatch.setattr("sim_backend.wire.emulated_world.SpbUsbBoard", slow)
+    assert "read out at 5 MB/s" in examine()["plan"].text
 
 
 def hot_and_locked_out(world: EmulatedWorld) -> None:

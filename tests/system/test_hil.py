@@ -13,6 +13,7 @@ from rig import api
 from rig.config.files import load_config
 from rig.errors import DivergedError, UsageError
 from rig.scan import replay as replay_run
+from sim_backend.wire.firmware.obis import ObisModel
 from tests.system.small_rig import config, write_rig
 
 LASER = {"kind": "obis", "port": "emulated:laser", "max_power": "50 mW"}
@@ -81,20 +82,36 @@ def test_drivers_in_the_loop_say_what_they_said_and_the_depth_is_the_same(taken:
     assert (tmp_path / "again" / depth).read_bytes() == (taken / depth).read_bytes()
 
 
-@pytest.mark.usefixtures("patient")
-def test_the_first_byte_that_was_not_recorded_fails_the_replay_and_is_shown(taken: Path, tmp_path: Path) -> None:
-    other = tmp_path / "other"
-    other.mkdir()
+@pytest.fixture(scope="module")
+def altered(taken: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """The recording, but for a letter of the first command that the laser got."""
+    other = tmp_path_factory.mktemp("other")
     for file in taken.iterdir():
         if file.is_file():
             (other / file.name).write_bytes(file.read_bytes())
     lines = [json.loads(line) for line in (taken / "control.jsonl").read_text().splitlines()]
-    power = next(one for one in lines if bytes.fromhex(one["bytes"]).startswith(b"SOUR:POW:LEV:IMM:AMPL 0.0"))
-    changed = bytes.fromhex(power["bytes"]).replace(b"AMPL 0.0", b"AMPL 0.1")
-    power["bytes"] = changed.hex()
+    first = next(one for one in lines if bytes.fromhex(one["bytes"]).startswith(b"SOUR:AM:STAT OFF"))
+    first["bytes"] = bytes.fromhex(first["bytes"]).replace(b"OFF", b"0FF").hex()
     (other / "control.jsonl").write_text("".join(json.dumps(one) + "\n" for one in lines))
-    with pytest.raises(DivergedError, match=r"laser: command \d+: byte 24 is 0x30, recorded was 0x31 .*AMPL 0\.0"):
-        api.replay(other, config=hil(taken.parent, LASER))
+    return other
+
+
+DIFFERENCE = r"laser: command 0: byte 13 is 0x4f, recorded was 0x30 .*STAT OFF"
+
+
+@pytest.mark.usefixtures("patient")
+def test_the_first_byte_that_was_not_recorded_fails_the_replay_and_is_shown(taken: Path, altered: Path) -> None:
+    with pytest.raises(DivergedError, match=DIFFERENCE):
+        api.replay(altered, config=hil(taken.parent, LASER))
+
+
+def test_a_difference_is_shown_where_the_replay_fails_for_another_reason(
+    taken: Path, altered: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    opened = property(lambda laser: True, lambda laser, value: None)
+    monkeypatch.setattr(ObisModel, "interlock_open", opened, raising=False)
+    with pytest.raises(DivergedError, match=rf"{DIFFERENCE}(.*\n)+.*the interlock is open"):
+        api.replay(altered, config=hil(taken.parent, LASER))
 
 
 def test_no_light_is_let_out_without_a_word(taken: Path) -> None:

@@ -71,6 +71,16 @@ def test_the_dry_run_of_the_bundled_rig_prints_what_lines_share(rig: Rig) -> Non
     assert "21% of a column's window is other lines' too" in ran.out
 
 
+def test_a_row_of_flux_holds_the_stripes_of_all_lines_that_are_lit_at_once() -> None:
+    first, last = (
+        api.flux_row("simulated-4-lines", scene="street-clear", row=256, column=column)["stripe"]
+        for column in (60, 435)  # of the first line and of the fourth, 125 columns each
+    )
+    peaks = (first[1:-1] > first[:-2]) & (first[1:-1] >= first[2:]) & (first[1:-1] > 0.05 * first.max())
+    assert peaks.sum() == 4
+    np.testing.assert_array_equal(first, last)
+
+
 def test_lines_that_leave_gaps_are_a_usage_error(two_lines: Path, rig: Rig) -> None:
     content = yaml.safe_load(two_lines.read_text())
     content["scan"]["command_range"] = [-0.2, 0.2]

@@ -8,7 +8,7 @@ import pytest
 
 from drivers.clock import VirtualClock
 from drivers.errors import DeviceBusy, DeviceDisconnected, DeviceError, DeviceNotFound, DevicePermission, DeviceTimeout
-from sim_backend.wire.firmware.dac_model import DAC_STEPS
+from sim_backend.wire.firmware.dac_model import DAC_STEPS, KEEP_S, DacHistory, Played
 from sim_backend.wire.serve.usb import EmulatedUsb
 from tests.wire.scanners import (
     HeliosRecorder,
@@ -163,3 +163,12 @@ def test_absent_busy_forbidden_and_two_equal_ones_are_one_line_each(kind: Kind) 
     bus.plug(kind.board(**second))
     with pytest.raises(DeviceError, match=f"2 are attached; set port to one of {addresses}"):
         open_scanner(kind.name, bus, clock)
+
+
+def test_what_was_played_long_ago_is_forgotten() -> None:
+    history = DacHistory(0.5, 1)
+    for second in range(60):
+        history.play(Played(second, second + 1, 0.5, np.full(2, second / 60), np.array([[1], [0]], np.uint8)))
+    oldest = 59 - KEEP_S - 1
+    assert history.rising(0, 0, 60).tolist() == np.arange(oldest, 60).tolist()
+    assert history.command(np.array([0.0, oldest])).tolist() == [(oldest - 1) / 60, oldest / 60]  # stood, and plays

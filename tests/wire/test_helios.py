@@ -154,6 +154,18 @@ def test_a_frame_that_the_device_drops_in_silence_is_a_fault() -> None:
         assert "dropped a frame in silence" in str(device.status.fault)
 
 
+def test_a_refused_frame_disarms_the_endpoint_until_the_next_status_question() -> None:
+    model = HeliosModel()
+    with open_device(HELIOS, "usb", {0: 1}, plug(model, VirtualClock()).bus) as link:
+        link.write(FRAMES, bytes(7 * 44) + struct.pack("<HHB", 25001, 43, 3), 0.5)  # says 43, has 44
+        sound = bytes(7 * 44) + struct.pack("<HHB", 25001, 44, 3)
+        with pytest.raises(DeviceTimeout):
+            link.write(FRAMES, sound, 0.5)
+        link.write(COMMANDS, b"\x03\x00", 0.1)
+        link.write(FRAMES, sound, 0.5)
+        assert (model.refused, model.played) == (1, 1)
+
+
 def test_frames_hold_at_most_4095_points_however_long_they_may_last() -> None:
     model = HeliosRecorder()
     with opened("helios", model, frame="500 ms") as (device, _):

@@ -126,6 +126,7 @@ def test_the_fingerprint_changes_with_what_depth_depends_on() -> None:
         ("format: spadrig-calibration\nversion: 2\n", "has version 2; this program reads version 1"),
         (HEAD + ROWS, "'camera' is missing"),
         (HEAD + CAMERA, "exactly one of 'planes' and 'scanner'"),
+        (HEAD + CAMERA + "scanner: {}\n", "exactly one of 'table' and 'pivot'"),
         (HEAD + CAMERA + ROWS + "plane: 3\n", "unknown key 'plane'"),
         (HEAD + CAMERA.replace("512", "wide", 1) + ROWS, "camera.width is 'wide'"),
         (HEAD + CAMERA.replace("-0.1, ", "") + ROWS + "lag_s: {forward: .nan}\n", "lag_s.forward is nan"),

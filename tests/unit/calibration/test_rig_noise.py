@@ -53,6 +53,14 @@ def test_a_passage_that_is_sharp_by_chance_gets_no_more_than_its_due(spread: flo
     assert np.mean(np.log(after)) == pytest.approx(np.mean(np.log(stated)))
 
 
+def test_a_speed_whose_sd_are_all_too_large_is_put_right() -> None:
+    rng = np.random.default_rng(2)
+    true = np.full((len(SPEEDS), PER_SWEEP), 3e-4)
+    (changed,) = restated([rng.normal(size=true.size) * true.ravel()], [seen(true * [[1.0], [1.0], [1.5]], rng)])
+    level = changed.sd.reshape(true.shape).mean(axis=1)
+    assert level[2] / level[0] == pytest.approx(1, abs=0.12)
+
+
 def trembling(views: int, sweep: float, reach: float, jitter: float, seed: int) -> tuple[list[Array], list[Sighting]]:
     """Residuals and views whose sweeps are `sweep` of the command long, anywhere; the mirror is off by an error of sd
     `jitter` that it holds for `reach` at a time.

@@ -1,7 +1,7 @@
 """Each mistake is named as the first reason, and a sound calibration passes."""
 
 from dataclasses import replace
-from math import radians
+from math import nan, radians
 
 import numpy as np
 import pytest
@@ -67,6 +67,7 @@ def test_a_sound_calibration_passes() -> None:
         ("room-light", replace(VIEWS, room_flux=1.5), replace(IMPRECISE, wave_m=0.02, wave_noise_m=0.04)),
         ("too-few-poses", replace(VIEWS, shown=3, used=3), FIT),
         ("too-few-poses", replace(VIEWS, used=2, coverage=0.2), IMPRECISE),
+        ("too-few-poses", VIEWS, replace(FIT, expected_m=nan)),
         ("room-light", replace(VIEWS, used=2, room_flux=1.5), IMPRECISE),
         ("no-tilt", VIEWS, replace(IMPRECISE, poses=replace(FIT.poses, tilt_rad=radians(3)))),
         ("board-too-far", VIEWS, replace(IMPRECISE, shift_m=0.3, poses=replace(FIT.poses, board_rad=0.08))),

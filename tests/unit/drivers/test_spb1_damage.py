@@ -182,6 +182,8 @@ def test_damage_says_where_and_why() -> None:
     blocks, damage = walked(np.frombuffer(raw, np.uint8), None)  # zeros are padding then
     assert [block.header.block_seq for block in blocks] == [2, 4, 5]
     assert [(item.offset, item.length) for item in damage] == [(1024, 1024)]
+    torn = np.frombuffer(golden_block(payload_type=0x7F, tick_hz=0)[:200], np.uint8)
+    assert "control block cut off: 200 of " in walked(torn, None)[1][0].reason
 
 
 def test_a_block_that_comes_twice_is_delivered_once() -> None:

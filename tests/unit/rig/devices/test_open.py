@@ -64,10 +64,10 @@ NO_WORLD = load_config("simulated").model_copy(update={"world": None})
 
 def test_all_devices_that_do_not_open_are_listed_and_the_others_closed(fake_kinds):
     log: list[str] = []
-    fake_kinds |= {slot: Opened(slot, log) for slot in DEVICES}
+    fake_kinds |= {slot: Opened(slot, log) for slot in ("world", *DEVICES)}  # a world that is told nothing of lines
     fake_kinds["scanner"] = DeviceNotFound("no Helios attached")
     fake_kinds["sync"] = DeviceBusy("port is taken")
-    with pytest.raises(DevicesError) as caught, open_rig(NO_WORLD):
+    with pytest.raises(DevicesError) as caught, open_rig(load_config("simulated")):
         pass
     assert str(caught.value).splitlines() == ["scanner: no Helios attached", "sync: port is taken"]
     assert caught.value.exit_code == 3

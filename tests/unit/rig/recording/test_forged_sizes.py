@@ -134,10 +134,11 @@ def test_a_plan_of_another_sensor_makes_no_counters(tmp_path: Path) -> None:
         reconstruct(folder)
 
 
-def npy(shape: tuple[int, ...], dtype: str, data: bytes = b"") -> bytes:
+def npy(shape: tuple[int, ...], dtype: str, data: bytes = b"", version: str = "1_0") -> bytes:
     """A .npy file whose header says what it likes."""
     stream = io.BytesIO()
-    np.lib.format.write_array_header_1_0(stream, {"descr": dtype, "fortran_order": False, "shape": shape})
+    write = getattr(np.lib.format, f"write_array_header_{version}")
+    write(stream, {"descr": dtype, "fortran_order": False, "shape": shape})
     return stream.getvalue() + data
 
 
@@ -156,6 +157,7 @@ LARGE = (2**20, 2**14)
     "content",
     [
         npy(LARGE, "<f4"),
+        npy(LARGE, "<f4", version="2_0"),
         npy((2**40, 2**40), "<f4"),
         npy((1,), "<U100000000", b"\0" * 4),
         npy((2**62,), "|V0"),

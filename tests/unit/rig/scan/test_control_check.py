@@ -91,6 +91,7 @@ def with_program(program: bytes) -> Talk:
         (scan().add(300, "laser", "serial", b"l0\r"), "laser: command 1 was not recorded: 'l0'"),
         (scan(buffers=BUFFERS[:3]), None),  # the last buffer of a scan that is stopped may not have been sent
         (scan(buffers=BUFFERS[:2]), "scan 0, buffer 2 is missing"),
+        (Talk([line for line in scan().lines if line[2] != "02"]), "scanner: 1 scans were recorded, 0 were run"),
     ],
 )
 def test_the_first_difference_is_shown(tmp_path: Path, now: Talk, problem: str | None) -> None:

@@ -174,6 +174,8 @@ def test_rows_without_a_stripe_are_left_out() -> None:
     assert row_light(split, sweep.geometry, 3, 50) is None
 
 
-def test_a_rig_of_several_lines_is_refused() -> None:
+def test_a_rig_of_several_lines_and_no_rows_at_all_are_refused() -> None:
     with pytest.raises(UsageError, match="lines at once"):
         scene_lights(configure("simulated-4-lines"))
+    with pytest.raises(ValueError, match="at least one row"):
+        limits([], [1])
