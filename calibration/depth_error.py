@@ -298,7 +298,8 @@ class DepthErrors:
 
 
 def depth_errors(model: RigModel, truth: RigModel, depth_m: float, velocity_per_s: float) -> DepthErrors:
-    """The errors of `model` at pixels that see the light at `depth_m`. velocity_per_s: signed velocity of the command."""
+    """The errors of `model` at pixels that see the light at `depth_m`. velocity_per_s: signed velocity of the
+    command."""
     camera = truth.camera
     x, y = np.meshgrid(np.linspace(0, camera.width - 1, _TRUTH_GRID), np.linspace(0, camera.height - 1, _TRUTH_GRID))
     mirror = command_at(truth, x, y, depth_m)

@@ -85,7 +85,8 @@ class Candidate:
 
 @dataclass(frozen=True, slots=True)
 class Advice:
-    """The next pose. before_m, after_m: expected depth error now and once it has been shown; NaN before there is a fit."""
+    """The next pose. before_m, after_m: expected depth error now and once it has been shown; NaN before there
+    is a fit."""
 
     candidate: Candidate
     at_m: float

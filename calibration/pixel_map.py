@@ -64,7 +64,8 @@ class DarkTally:
         self._blocks: list[tuple[NDArray[np.int32], NDArray[np.int32]]] = []
 
     def add(self, ones: NDArray[np.integer], frames: NDArray[np.integer] | int) -> None:
-        """Add a block. ones (rows, width): counts of each pixel. frames: number of frames in which each pixel was read."""
+        """Add a block. ones (rows, width): counts of each pixel. frames: number of frames in which each pixel
+        was read."""
         if len(self._blocks) == MOST_BLOCKS:
             pairs = zip(self._blocks[::2], self._blocks[1::2], strict=True)
             self._blocks = [(one[0] + other[0], one[1] + other[1]) for one, other in pairs]

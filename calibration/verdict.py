@@ -21,7 +21,8 @@ AT_M: Final = 5.0
 
 @dataclass(frozen=True, slots=True)
 class AccuracyGoal:
-    """The required quality of a calibration: sd of depth at a distance, and the baseline if somebody has measured it."""
+    """The required quality of a calibration: sd of depth at a distance, and the baseline if somebody has
+    measured it."""
 
     accuracy_m: float
     at_m: float = AT_M

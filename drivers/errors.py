@@ -4,7 +4,8 @@
 
 
 class DeviceError(Exception):
-    """Base class of all device errors. Raised itself only if no subclass fits; `str(error)` is one line for the user."""
+    """Base class of all device errors. Raised itself only if no subclass fits; `str(error)` is one line for the
+    user."""
 
 
 class DeviceNotFound(DeviceError):

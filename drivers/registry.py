@@ -66,7 +66,8 @@ def kinds(slot: str) -> tuple[str, ...]:
 
 
 def lookup(slot: str, kind: str) -> Kind:
-    """Load the kind of a slot. Raises `UnknownKind`, with the choices or with the reason why the entry cannot be used."""
+    """Load the kind of a slot. Raises `UnknownKind`, with the choices or with the reason why the entry cannot
+    be used."""
     found = {entry.value: entry for entry in _entries(slot) if entry.name == kind}
     if not found:
         choices = ", ".join(kinds(slot)) or "none installed"

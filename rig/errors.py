@@ -46,7 +46,8 @@ class RecordingError(RigError):
 
 
 class DivergedError(RigError):
-    """Raised when a driver sent its device something different from the recording that is played, or at another time."""
+    """Raised when a driver sent its device something different from the recording that is played, or at another
+    time."""
 
 
 class DamagedRecordingError(RigError):

@@ -183,7 +183,8 @@ def _levels_at(builder: Any, address: Any) -> list[Any]:
 
 @numba.njit(cache=True)
 def block_numbers(words: int) -> NDArray[np.uint64]:
-    """The block numbers that `drawn_word` takes for each word of a row, uint64 (words, 16): each block's number twice."""
+    """The block numbers that `drawn_word` takes for each word of a row, uint64 (words, 16): each block's number
+    twice."""
     shape = words, 2 * WORD_PX // BLOCK_PX
     return np.repeat(np.arange(words * WORD_PX // BLOCK_PX), 2).astype(np.uint64).reshape(shape)
 

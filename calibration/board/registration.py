@@ -55,7 +55,8 @@ _DRAWING_SD_PX = 0.003
 
 @dataclass(frozen=True, slots=True, eq=False)
 class _Patch:
-    """The drawing around a corner, on the pixels x0.. and y0.. of the picture. slopes: its change per pixel of shift."""
+    """The drawing around a corner, on the pixels x0.. and y0.. of the picture. slopes: its change per pixel of
+    shift."""
 
     drawn: Array
     along_x: Array

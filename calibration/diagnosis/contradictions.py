@@ -146,7 +146,8 @@ MOST_UNEXPLAINED = 0.35
 
 @dataclass(frozen=True, slots=True, eq=False)
 class ViewShift:
-    """Shift of one view in command units: the median of its passages off the light, and its sd from the pose's noise."""
+    """Shift of one view in command units: the median of its passages off the light, and its sd from the pose's
+    noise."""
 
     name: str
     shift: float
@@ -190,7 +191,8 @@ def _variances(shifts: tuple[ViewShift, ...], wave: float, sweeps: int) -> Array
 
 
 def counted(shifts: tuple[ViewShift, ...], outliers: tuple[str, ...], misfit: float = 1.0) -> tuple[ViewShift, ...]:
-    """The shifts that have to agree. A single outlier is left out, unless it is the last view or the others do not fit."""
+    """The shifts that have to agree. A single outlier is left out, unless it is the last view or the others do
+    not fit."""
     if len(outliers) != 1 or not shifts or shifts[-1].name in outliers or misfit > MOST_MISFIT:
         return shifts
     return tuple(one for one in shifts if one.name not in outliers)

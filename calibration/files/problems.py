@@ -48,7 +48,8 @@ _WORDS = {True: "true", False: "false", None: "null"}
 
 @dataclass(frozen=True)
 class ValueSources:
-    """The origin of values: a file with the line of each key, and the keys given as options, with the options' names."""
+    """The origin of values: a file with the line of each key, and the keys given as options, with the options'
+    names."""
 
     file: str
     lines_of: Callable[[], Mapping[Key, int]] = dict

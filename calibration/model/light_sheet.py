@@ -167,7 +167,8 @@ def light_sheets(scanner: Scanner, source_m: ArrayLike | None, commands: ArrayLi
 
 
 def fan_origin(scanner: Scanner, source_m: ArrayLike | None) -> Array:
-    """The point (3,) from which the light spreads: the source, or the point of the mirror's axis nearest to the camera."""
+    """The point (3,) from which the light spreads: the source, or the point of the mirror's axis nearest to the
+    camera."""
     if source_m is not None:
         return np.asarray(source_m, np.float64)
     if not isinstance(scanner, PivotScanner):

@@ -177,7 +177,8 @@ def untold(velocities_per_s: Sequence[float]) -> Array:
 
 
 def alike_speeds(speeds_per_s: ArrayLike) -> NDArray[np.int64]:
-    """(n,): a group number for each speed. Speeds without a gap between them share a group, whatever their direction."""
+    """(n,): a group number for each speed. Speeds without a gap between them share a group, whatever their
+    direction."""
     speeds, which = np.unique(np.abs(np.asarray(speeds_per_s, np.float64)), return_inverse=True)
     apart = np.diff(speeds, prepend=speeds[:1]) > ALIKE_SPEEDS * speeds
     return np.cumsum(apart, dtype=np.int64)[which.reshape(-1)]

@@ -1,4 +1,5 @@
-"""The rig model: the calibrated camera and scanner, other known properties of the rig, and the parameters' covariance."""
+"""The rig model: the calibrated camera and scanner, other known properties of the rig, and the parameters'
+covariance."""
 
 import hashlib
 from collections.abc import Mapping, Sequence

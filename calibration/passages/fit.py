@@ -45,7 +45,8 @@ class LineShape:
 
 
 def light(theta: Array, at: Array, shape: LineShape) -> tuple[Array, Array]:
-    """Flux (pixels, columns), and its derivatives (pixels, 5, columns), of which the last is by the logarithm of sigma."""
+    """Flux (pixels, columns), and its derivatives (pixels, 5, columns), of which the last is by the logarithm
+    of sigma."""
     before, after, area, centre, log_sigma = (theta[:, i, None] for i in range(5))
     sigma, away = np.exp(log_sigma), at - centre
     if shape.travels:

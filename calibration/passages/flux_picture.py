@@ -111,7 +111,8 @@ AWAY_PX = 2
 
 
 def even_pixels(picture: NDArray[np.float32]) -> NDArray[np.bool_]:
-    """True (height, width) where the flux of a picture changes little along the row; noise does not count as a change."""
+    """True (height, width) where the flux of a picture changes little along the row; noise does not count as a
+    change."""
     known = np.isfinite(picture)
     filled = np.where(known, np.maximum(picture, 0), 0).astype(np.float32)
     smooth = cv2.GaussianBlur(filled, (0, 0), BLUR_PX)

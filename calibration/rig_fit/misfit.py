@@ -130,7 +130,8 @@ def first_order(problem: RigProblem, solution: RigSolution, open_one: TermDecisi
 
 
 def corner_noise(problem: RigProblem, solution: RigSolution, noise: Noise) -> float:
-    """Corner sd (pixels) from the corners alone. Passages that contradict the corners would only make them seem noisy."""
+    """Corner sd (pixels) from the corners alone. Passages that contradict the corners would only make them seem
+    noisy."""
     p = len(problem.terms.names)
     shared: Array = np.zeros((p, p))
     right: Array = np.zeros(p)

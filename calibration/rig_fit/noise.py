@@ -171,7 +171,8 @@ def bin_starts(seen: Sighting, reach: float) -> NDArray[np.int64]:
 
 
 def tail_weight(normalised: Array, usual: float = 1 / MAD_TO_SD) -> Array:
-    """Weight of errors given in units of sd, whose usual median size is `usual`. If all are large, none is an outlier."""
+    """Weight of errors given in units of sd, whose usual median size is `usual`. If all are large, none is an
+    outlier."""
     away = np.abs(normalised)
     if away.size:
         away = away / max(1.0, float(np.median(away)) / usual)

@@ -70,7 +70,8 @@ class Rows(NamedTuple):
 
 
 class _Lit(NamedTuple):
-    """Points relative to the light of a mirror: F, dF/dangle and dF/dcommand (m,), and the parts that derivatives need."""
+    """Points relative to the light of a mirror: F, dF/dangle and dF/dcommand (m,), and the parts that
+    derivatives need."""
 
     distance_m: Array
     per_angle: Array
@@ -150,7 +151,8 @@ def _lit(scanner: PivotScanner, source_m: Array | None, points_m: Array, command
 
 
 def ray_columns(camera: Camera, terms: Terms, u: Array, v: Array, by_u: Array, by_v: Array) -> Array:
-    """(m, camera terms) derivatives by the camera of a quantity that changes by by_u du + by_v dv with a pixel's ray."""
+    """(m, camera terms) derivatives by the camera of a quantity that changes by by_u du + by_v dv with a
+    pixel's ray."""
     lens = camera.lens
     ux, uy, vx, vy = lens.undistort_slope(u, v)
     by_x, by_y = by_u * ux + by_v * vx, by_u * uy + by_v * vy

@@ -129,7 +129,8 @@ def _on_board(sweep: Passages, board: Board, camera: Camera, pose: BoardPose) ->
 
 @dataclass(frozen=True, slots=True, eq=False)
 class RigState:
-    """The model with lags of 0; timing (3,): both lags and row delay in s, of any sign; per view poses and rays (2, m)."""
+    """The model with lags of 0; timing (3,): both lags and row delay in s, of any sign; per view poses and rays
+    (2, m)."""
 
     model: RigModel
     timing: Array

@@ -70,7 +70,8 @@ def fit_edge(
 
 
 def edge_time(edges: Sequence[Edge], times_s: Array) -> tuple[float, float]:
-    """The time (s) that all edges share and its sd, which is larger if they disagree. times_s: (times,), evenly spaced."""
+    """The time (s) that all edges share and its sd, which is larger if they disagree. times_s: (times,), evenly
+    spaced."""
     chi2 = np.sum([edge.chi2 for edge in edges], axis=0)
     apart = (chi2.min() - sum(edge.chi2.min() for edge in edges)) / max(len(edges) - 1, 1)
     likely = np.exp(-0.5 * (chi2 - chi2.min()) / max(apart, 1.0))

@@ -312,7 +312,8 @@ def _require_speeds(sweeps: Sequence[Passages]) -> None:
 
 
 def _require_one_way_round(seen: SharedPixels) -> None:
-    """Raises Degenerate if the commands of one way run against those of the other: the level of one is taken for both."""
+    """Raises Degenerate if the commands of one way run against those of the other: the level of one is taken
+    for both."""
     ahead, back = (seen.direction == way for way in (1, -1))
     if not (ahead.any() and back.any()):
         return

@@ -89,7 +89,8 @@ class LineLaser(Device):
             self._state = DeviceState.CONFIGURED
 
     def disarm(self) -> None:
-        """Switch emission off for good. The laser may need its key turned before it arms again. Allowed in any state."""
+        """Switch emission off for good. The laser may need its key turned before it arms again. Allowed in any
+        state."""
         self._require("disarm", *OPEN_STATES)
         _log.info("%s: disarm", self._name)
         self._do_disarm()

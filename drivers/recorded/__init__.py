@@ -1,4 +1,5 @@
-"""Recordings on disk: segments of SPB1 blocks and their index, and the one reader that replay and everything else uses."""
+"""Recordings on disk: segments of SPB1 blocks and their index, and the one reader that replay and everything
+else uses."""
 
 from drivers.recorded.contents import INDEX_FILE, segment_name
 from drivers.recorded.reader import RecordedRun, RunRecording

@@ -51,7 +51,8 @@ class FrameTable:
 
     @classmethod
     def read(cls, data: Bytes) -> "FrameTable":
-        """Read the table of a whole file (uint8 (bytes,)). If the table is damaged, make it from the frames themselves."""
+        """Read the table of a whole file (uint8 (bytes,)). If the table is damaged, make it from the frames
+        themselves."""
         sizes = _stated_sizes(data)
         if sizes is None:
             sizes = np.array(list(_found_sizes(data)), np.int64).reshape(-1, 2)
@@ -163,7 +164,8 @@ class PlainSegment:
         self._bytes: Bytes = np.frombuffer(self._map or b"", np.uint8)
 
     def at(self, offset: int, length: int) -> Bytes:
-        """Bytes from `offset` on, fewer at the end, as a view of the file; valid as long as something refers to them."""
+        """Bytes from `offset` on, fewer at the end, as a view of the file; valid as long as something refers to
+        them."""
         return self._bytes[offset : offset + length]
 
     def walk(self, start: int, end: int, *, check_payload: bool) -> Iterator[Placed | Damage]:

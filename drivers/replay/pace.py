@@ -58,7 +58,8 @@ class PaceReport:
 
 
 class Pace:
-    """Lets blocks pass when they are due. Call `wait` on the source thread; `step`, `run_on` and `halt` on any thread."""
+    """Lets blocks pass when they are due. Call `wait` on the source thread; `step`, `run_on` and `halt` on any
+    thread."""
 
     def __init__(self, what: ReplayClock, clock: Clock) -> None:
         self.speed = what.speed
@@ -154,7 +155,8 @@ class Pace:
 
 @dataclass(slots=True)
 class _Lateness:
-    """Mean, sum of squares about the mean, and maximum of the values noted (Welford 1962: no difference of large sums)."""
+    """Mean, sum of squares about the mean, and maximum of the values noted (Welford 1962: no difference of
+    large sums)."""
 
     blocks: int = 0
     mean: float = 0.0

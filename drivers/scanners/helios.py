@@ -105,7 +105,8 @@ def slice_points(left: int, most: int) -> int:
 
 
 def encode(points: PointSlice, axis: str, pps: int, flags: int) -> bytes:
-    """The bytes of one frame. R: lit, G: line marker, B: scan marker, I: backward. The unused axis stays at the centre."""
+    """The bytes of one frame. R: lit, G: line marker, B: scan marker, I: backward. The unused axis stays at the
+    centre."""
     centre = np.full(len(points), CENTRE, np.uint16)
     x, y = (points.steps, centre) if axis == "x" else (centre, points.steps)
     frame = np.empty((len(points), 7), np.uint8)

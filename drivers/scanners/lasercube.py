@@ -121,7 +121,8 @@ class LaserCubeDac:
         self.queued()
 
     def halt(self) -> float:
-        """Clear the ring. The mirror's position is unknown afterwards, and the next run goes to the centre in one jump."""
+        """Clear the ring. The mirror's position is unknown afterwards, and the next run goes to the centre in
+        one jump."""
         self.safe()
         return 0.0
 

@@ -128,7 +128,8 @@ class Spad512sRun:
         )
 
     def _require_new(self, frames: NDArray[np.uint8]) -> None:
-        """Raises ProtocolError for a frame that was there before, unless all dark or all bright. frames: (n, 2, half)."""
+        """Raises ProtocolError for a frame that was there before, unless all dark or all bright. frames: (n, 2,
+        half)."""
         for number, (one, other) in enumerate(frames, self.next_frame):
             before = self._seen.setdefault((zlib.crc32(one), zlib.crc32(other)), number)
             if before != number and not (one[0] in _UNIFORM and (one == one[0]).all() and (other == one[0]).all()):

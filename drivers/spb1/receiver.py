@@ -102,7 +102,8 @@ class BlockReceiver:
         self._row_px = 8 * packed_row_bytes(armed.sensor_width)
 
     def take(self, ring: BlockRing, timeout_s: float) -> Took:
-        """Wait for the next read and process it. May raise what `ring.mark_overflow` raises, after counting the frames."""
+        """Wait for the next read and process it. May raise what `ring.mark_overflow` raises, after counting the
+        frames."""
         self._ring = ring
         self._top_up(ring)
         reaped = self._link.reap(timeout_s)
@@ -214,7 +215,8 @@ class BlockReceiver:
             raise CorruptBlock(f"block {block.block_seq} reaches beyond the {armed.n_frames} frames of the run")
 
     def _require_windows(self, block: FrameBlock) -> None:
-        """Raises CorruptBlock if a window lies off the words or beyond the row: what counts bits must not trip over it."""
+        """Raises CorruptBlock if a window lies off the words or beyond the row: what counts bits must not trip
+        over it."""
         if block.n_frames == 0:
             return
         x0 = block.records["x0"]

@@ -52,7 +52,8 @@ def seal_block(
 
 
 def seal_control(buffer: NDArray[np.uint8], payload_type: int, run_id: int, payload: bytes) -> None:
-    """Write a control block (`REGISTER_ACK`, `IDLE`), which has no frames. buffer: uint8 (stride,), written completely."""
+    """Write a control block (`REGISTER_ACK`, `IDLE`), which has no frames. buffer: uint8 (stride,), written
+    completely."""
     end = HEADER_BYTES + len(payload)
     raw = buffer.data
     sizes = len(payload), round_up(end, PIXELS_ALIGN)

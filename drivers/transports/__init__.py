@@ -1,1 +1,2 @@
-"""Byte transports between a driver and its device: serial ports, USB and TCP, with deadlines and this project's errors."""
+"""Byte transports between a driver and its device: serial ports, USB and TCP, with deadlines and this project's
+errors."""

@@ -108,7 +108,8 @@ class SerialPort:
         return self._take(end, len(terminator))
 
     def reset_input(self) -> bytes:
-        """Drop everything received so far and not read; returns what was dropped. More may still arrive: see `drain`."""
+        """Drop everything received so far and not read; returns what was dropped. More may still arrive: see
+        `drain`."""
         with self._translated():
             data = self._port.read(self._port.in_waiting)
         self._note(IN, data)
@@ -116,7 +117,8 @@ class SerialPort:
         return self._take(len(self._received), 0)
 
     def drain(self, quiet_s: float, deadline_s: float) -> bytes:
-        """Drop what arrives until the line is quiet for `quiet_s`, at most for `deadline_s`; returns what was dropped."""
+        """Drop what arrives until the line is quiet for `quiet_s`, at most for `deadline_s`; returns what was
+        dropped."""
         ends_at = self._now_s() + deadline_s
         quiet_at = self._now_s() + quiet_s
         while self._now_s() < min(quiet_at, ends_at):

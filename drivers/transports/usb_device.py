@@ -77,7 +77,8 @@ def usb_failure(
 
 @dataclass(frozen=True, slots=True)
 class UsbId:
-    """The ids of a kind of device. Vendors share numbers, so one of `product_names` must be part of its product string."""
+    """The ids of a kind of device. Vendors share numbers, so one of `product_names` must be part of its product
+    string."""
 
     label: str
     vendor: int
@@ -208,7 +209,8 @@ class UsbDevice:
         return frozenset(endpoint.bEndpointAddress for interface in interfaces for endpoint in interface)
 
     def close(self) -> None:
-        """Give the interfaces and the device back; a second call does nothing. Never raises, as the device may be gone."""
+        """Give the interfaces and the device back; a second call does nothing. Never raises, as the device may
+        be gone."""
         with self._lock:
             if not self._open:
                 return

@@ -190,7 +190,8 @@ PATCH = 16
 
 @dataclass(frozen=True, slots=True, eq=False)
 class BenchSurface:
-    """place_px: float32 (columns, rows), the stripe's place in its window; photons: of the stripe, of the same shape."""
+    """place_px: float32 (columns, rows), the stripe's place in its window; photons: of the stripe, of the same
+    shape."""
 
     place_px: NDArray[np.float32]
     photons: NDArray[np.float32]

@@ -155,7 +155,8 @@ def take_dark(
 
 
 def take_sweeps(rig: OpenRig, maps: int | None = None, progress: Progress | None = None) -> SweepSums:
-    """Take the frames of a scan with light, or of all sweeps of a recording. An interrupt is raised again at the end."""
+    """Take the frames of a scan with light, or of all sweeps of a recording. An interrupt is raised again at
+    the end."""
     scan, sums = rig.config.scan, SweepSums()
 
     def live(now: ScanProgress) -> None:

@@ -215,7 +215,8 @@ def error_picture(uncertainty: DepthUncertainty) -> Picture:
 
 
 def cells_picture(cells_m: Array) -> Picture:
-    """Draw the deviations of a board's squares from their plane: red in front of it, black where they were not scanned."""
+    """Draw the deviations of a board's squares from their plane: red in front of it, black where they were not
+    scanned."""
     large = _enlarged_mm(cells_m)
     known = large[np.isfinite(large)]
     most = max(float(np.abs(known).max()), 1e-3) if known.size else 1.0
@@ -461,7 +462,8 @@ def pixel_page(
     drift: PixelDrift | None,
     against: PixelVersion | None,
 ) -> str:
-    """Make the report on a map of the pixels: the map, the distribution of rates beside the older one, and the changes."""
+    """Make the report on a map of the pixels: the map, the distribution of rates beside the older one, and the
+    changes."""
     middle = pixels.ordinary_per_s
     fastest = float(np.nanmax(pixels.rate_per_s))
     caption = f"Dark rate of each pixel, {digits(middle / 3)} to {digits(fastest)} counts/s on a logarithmic scale."

@@ -68,7 +68,8 @@ class Session:
     """Writes the views of a calibration one by one, then the result."""
 
     def __init__(self, out: OutFolder, board: Board | None = None) -> None:
-        """Claim the folder; None writes nothing. board: what the views show. Raises UsageError if it cannot be claimed."""
+        """Claim the folder; None writes nothing. board: what the views show. Raises UsageError if it cannot be
+        claimed."""
         self._board = board
         self._folder = None if out is None else RunFolder(out, in_place=True)
         self._views = 0
@@ -118,7 +119,8 @@ class Session:
     def finish(
         self, summary: dict[str, Any], report: str, model: RigModel | None, made_from: LoadedCalibration | None = None
     ) -> Path | None:
-        """Write the result, with notes on the calibration it was made from; return the new calibration's file, if any."""
+        """Write the result, with notes on the calibration it was made from; return the new calibration's file,
+        if any."""
         if self._folder is None:
             return None
         file = None
@@ -245,7 +247,8 @@ def load_view(file: Path) -> View:
 
 
 def load_views(folder: Path) -> tuple[View, ...]:
-    """Read all views of a folder, in the order of their files. Raises UsageError if there are none or one is damaged."""
+    """Read all views of a folder, in the order of their files. Raises UsageError if there are none or one is
+    damaged."""
     files = sorted(folder.glob("*.npz"))
     if not files:
         raise UsageError(f"{folder} holds no view (*.npz); name the folder of an earlier calibration")

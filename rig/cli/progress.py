@@ -45,7 +45,8 @@ class ProgressLine:
         self._compiling = True
 
     def compiler_ended(self) -> None:
-        """Note that a compilation is over. The stage stays 'compiling' until the next step, since more usually follows."""
+        """Note that a compilation is over. The stage stays 'compiling' until the next step, since more usually
+        follows."""
         self._compilers -= 1
 
     @property

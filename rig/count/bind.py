@@ -95,7 +95,8 @@ class SweepClock:
 
 
 class PlanTerms(NamedTuple):
-    """Numbers of a plan for the walk; arrays (legs,). most_in_column: largest number of frames that a column may use."""
+    """Numbers of a plan for the walk; arrays (legs,). most_in_column: largest number of frames that a column
+    may use."""
 
     columns: int
     column_s: float

@@ -99,7 +99,8 @@ class Reconstructor:
         return self.complete(stripe, sweep, self._filter, time.perf_counter() - begun)
 
     def complete(self, stripe: StripeTable, sweep: FrameTally, filter: str, estimate_s: float) -> MapResult:
-        """The map of a sweep whose stripe table the estimator made in `estimate_s`, with filter, depth and intensity."""
+        """The map of a sweep whose stripe table the estimator made in `estimate_s`, with filter, depth and
+        intensity."""
         begun = time.perf_counter() - estimate_s
         geometry, fog, intensity = self._bound(sweep), self._fog(sweep, stripe), sweep.intensity()
         doubts = self._checks.doubts(sweep, intensity, stripe)

@@ -102,7 +102,8 @@ def identity_of(rig: OpenRig) -> Identity:
 
 
 def recorded_identity(run: Path) -> Identity:
-    """Identity of the rig that made a recording, as far as its manifest says. `created` is the date of the recording."""
+    """Identity of the rig that made a recording, as far as its manifest says. `created` is the date of the
+    recording."""
     noted = (read_manifest(run) or {}).get("rig") or {}
     kinds, serials = noted.get("kinds") or {}, noted.get("serials") or {}
     return _identity(str(noted.get("name", "")), kinds, serials, str(noted.get("taken", "")))

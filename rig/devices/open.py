@@ -154,7 +154,8 @@ def _create_surroundings(config: RigConfig, seed: int, stack: ExitStack, problem
 
 
 def surroundings_of(config: RigConfig, seed: int, stack: ExitStack) -> Surroundings:
-    """Clock and world of the config, with the devices that the world provides. Raises DeviceError if it cannot be made."""
+    """Clock and world of the config, with the devices that the world provides. Raises DeviceError if it cannot
+    be made."""
     virtual = config.world is not None and not config.world.real_time
     clock = VirtualClock() if virtual else SystemClock()
     bare = Surroundings(clock, None, seed)

@@ -93,7 +93,8 @@ def _learning(name: str, threads: int, *, learns: bool, temporal_prior: bool) ->
 
 
 class Recalled:
-    """Estimates each map with its own state, and further maps with the last one. of: an estimator that learns nothing."""
+    """Estimates each map with its own state, and further maps with the last one. of: an estimator that learns
+    nothing."""
 
     def __init__(self, of: LearnsFromStream, states: Sequence[Learned]) -> None:
         self._states, self._of = list(states), of

@@ -61,7 +61,8 @@ def write_pngs(pictures: Iterable[Picture], folder: RunFolder, name: str) -> int
 
 
 def write_mp4(pictures: Iterable[Picture], path: Path, pictures_per_s: float) -> int:
-    """Write a film (MPEG-4 part 2); returns its number of pictures. Raises UsageError if OpenCV cannot write it here."""
+    """Write a film (MPEG-4 part 2); returns its number of pictures. Raises UsageError if OpenCV cannot write it
+    here."""
     import cv2
 
     film = None

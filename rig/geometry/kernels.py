@@ -53,7 +53,8 @@ def row_windows(u: Float32, v: Float32, plane: Float64, w_far: float, w_near: fl
 
 @numba.njit(inline="always")
 def with_rays(u, y, first, last):  # type: ignore[no-untyped-def]
-    """First and last of those pixels of a row, without pixels at its ends that have no ray. At least one pixel is left."""
+    """First and last of those pixels of a row, without pixels at its ends that have no ray. At least one pixel
+    is left."""
     while first < last and np.isnan(u[y, first]):
         first += 1
     while last > first and np.isnan(u[y, last]):

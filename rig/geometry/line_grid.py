@@ -46,7 +46,8 @@ class LineGrid:
         return columns
 
     def others(self, plane: Float64) -> Float64:
-        """Planes of the columns that are lit together with each column: (columns, lines - 1, 3); plane: (columns, 3)."""
+        """Planes of the columns that are lit together with each column: (columns, lines - 1, 3); plane:
+        (columns, 3)."""
         together = self.columns_at()[self.place]
         own = together == np.arange(len(self.place))[:, None]
         result: Float64 = plane[together[~own].reshape(len(self.place), self.lines - 1)]
@@ -62,7 +63,8 @@ class LineGrid:
 
 
 def line_grid(offsets: Sequence[float], columns: int, command_range: tuple[float, float]) -> tuple[LineGrid, Float64]:
-    """The grid of a map with `columns` columns, a multiple of the lines, and the commands (columns,) of their centres."""
+    """The grid of a map with `columns` columns, a multiple of the lines, and the commands (columns,) of their
+    centres."""
     lines = len(offsets)
     places = columns // lines
     first, last = command_range

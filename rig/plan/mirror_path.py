@@ -303,7 +303,8 @@ def _path(demand: PathDemand, motion: MirrorLimits) -> SweepPath:
 
 
 def remedy(demand: PathDemand, exposures: int, limits: ScannerLimits, point_clock: Callable[[float], Fraction]) -> str:
-    """Say what to change so that the scanner can follow: the fewest exposures, or the widest range, that are possible."""
+    """Say what to change so that the scanner can follow: the fewest exposures, or the widest range, that are
+    possible."""
 
     def works(changed: PathDemand) -> bool:
         return not find_path(changed, limits, point_clock).problems

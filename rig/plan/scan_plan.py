@@ -171,7 +171,8 @@ class ScanPlan:
 
     @property
     def frames_per_sweep(self) -> Fraction:
-        """Number of frames from one scan marker to the next; rarely an integer, since the two clocks are independent."""
+        """Number of frames from one scan marker to the next; rarely an integer, since the two clocks are
+        independent."""
         return self.sweep_s * self.frame_rate_hz
 
     @property

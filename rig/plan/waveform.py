@@ -99,7 +99,8 @@ def moving_windows(plan: ScanPlan, step_px: int) -> tuple[WindowTable, NDArray[n
 
 
 def window_widths(plan: ScanPlan, step_px: int) -> tuple[int, int, int]:
-    """Narrowest and widest (a whole row, in words) possible width of a window, and the step between widths, in pixels."""
+    """Narrowest and widest (a whole row, in words) possible width of a window, and the step between widths, in
+    pixels."""
     grid = math.lcm(step_px, WORD_PX)
     return grid, -(-plan.width // WORD_PX) * WORD_PX, grid
 

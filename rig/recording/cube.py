@@ -60,7 +60,8 @@ class Cube:
 
 
 def open_cube(path: str | os.PathLike[str], plan: CubePlan, model: RigModel) -> Cube:
-    """Open a .npy file, or the folder of a recording. Raises UsageError if it disagrees with its plan and calibration."""
+    """Open a .npy file, or the folder of a recording. Raises UsageError if it disagrees with its plan and
+    calibration."""
     file = Path(path)
     camera = model.camera
     if file.is_dir():
@@ -99,12 +100,14 @@ def cube_columns(model: RigModel) -> int | None:
 
 
 def column_commands(plan: CubePlan) -> NDArray[np.float64]:
-    """Commands of a cube's columns. They are the column numbers, at which the `planes` of its calibration are sampled."""
+    """Commands of a cube's columns. They are the column numbers, at which the `planes` of its calibration are
+    sampled."""
     return np.arange(plan.columns, dtype=np.float64)
 
 
 def count_map(cube: Cube, index: int, counter: Counter) -> tuple[FrameTally, list[Gap]]:
-    """Count one map with a counter made for the cube's columns and size; returns the counts and the gaps in its frames."""
+    """Count one map with a counter made for the cube's columns and size; returns the counts and the gaps in its
+    frames."""
     counter.reset()
     first = cube.first_frame + index * cube.frames_per_map
     end = first + cube.frames_per_map

@@ -123,7 +123,8 @@ def reconstruct_line(folder: Path) -> str:
 
 
 def read_model(folder: Path) -> RigModel | None:
-    """Read the calibration with which a recording was taken; None if it has none. Raises UsageError if it is damaged."""
+    """Read the calibration with which a recording was taken; None if it has none. Raises UsageError if it is
+    damaged."""
     file = folder / CALIBRATION_FILE
     if not file.exists():
         return None
@@ -140,7 +141,8 @@ SINCE = "since"
 
 
 def to_plain(value: Any) -> Any:
-    """The value as numbers, text, lists and mappings that `from_plain` reads. Raises TypeError if it has no such form."""
+    """The value as numbers, text, lists and mappings that `from_plain` reads. Raises TypeError if it has no
+    such form."""
     if is_dataclass(value):
         kept = [(field, getattr(value, field.name)) for field in fields(value) if field.init]
         return {field.name: to_plain(one) for field, one in kept if one is not None or SINCE not in field.metadata}

@@ -157,7 +157,8 @@ class ReplaySource:
 
     @classmethod
     def of(cls, spad: SpadArray, plan: ScanPlan, maps: int | None) -> "ReplaySource | None":
-        """Make it for a SPAD that plays a recording; None for any other. Raises UsageError if there are too few maps."""
+        """Make it for a SPAD that plays a recording; None for any other. Raises UsageError if there are too few
+        maps."""
         return cls(spad, plan, maps) if isinstance(spad, ReplaySpad) else None
 
     @property

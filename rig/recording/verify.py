@@ -74,7 +74,8 @@ class Verification:
 
 @dataclass(frozen=True, slots=True)
 class Examination:
-    """Everything that can be found out about a recording. runs: the sound blocks of each run, in order of their frames."""
+    """Everything that can be found out about a recording. runs: the sound blocks of each run, in order of their
+    frames."""
 
     segments: list[SegmentReader]
     runs: list[list[SoundBlock]]

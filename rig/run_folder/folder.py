@@ -105,7 +105,8 @@ class RunFolder:
             file.unlink(missing_ok=True)
 
     def write_json(self, name: str, content: Mapping[str, Any]) -> None:
-        """Write `name` (manifest.json, summary.json) as strict JSON. A reader sees either the old file or the new one."""
+        """Write `name` (manifest.json, summary.json) as strict JSON. A reader sees either the old file or the
+        new one."""
         text = json_text(content)
         text = sealed_text(text) if name == MANIFEST else text
         file = self.place(name)

@@ -146,7 +146,8 @@ def ended_early(manifest: Mapping[str, Any]) -> str | None:
 
 
 def ended_before_last_map(manifest: Mapping[str, Any]) -> bool:
-    """Whether a run ended before it had made maps of all sweeps. There may be whole sweeps after those of the manifest."""
+    """Whether a run ended before it had made maps of all sweeps. There may be whole sweeps after those of the
+    manifest."""
     starts = (manifest.get("recording") or {}).get("starts") or []
     return len(manifest.get("sweeps") or []) < sum(int(start["sweeps"]) for start in starts)
 

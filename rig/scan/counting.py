@@ -86,7 +86,8 @@ class MapQueue:
             self._changed.notify_all()
 
     def take_streaming(self, timeout_s: float) -> AcquiredMap | None:
-        """The next map. None after `timeout_s`, or at once when the stream is over, so that the rig is made safe first."""
+        """The next map. None after `timeout_s`, or at once when the stream is over, so that the rig is made
+        safe first."""
         return self._take(timeout_s, lambda: not self.streaming)
 
     def take_rest(self, timeout_s: float) -> AcquiredMap | None:

@@ -183,7 +183,8 @@ class Run:
         replay: PaceReport | None = None,
         accepted_calibration: tuple[str, ...] = (),
     ) -> RunResult:
-        """Write manifest and summary and make the folder appear. Without a map or a recorded block no folder is left."""
+        """Write manifest and summary and make the folder appear. Without a map or a recorded block no folder is
+        left."""
         summary = self.tally.summary(frames, sensor_time_s, verdict, stages, sync, replay)
         summary = replace(summary, accepted_calibration=accepted_calibration)
         index, result, truth = self._last or (None, None, None)

@@ -162,7 +162,8 @@ def _first_alone(rig: OpenRig) -> bool:
 def make_reconstructor(
     rig: OpenRig, plan: ScanPlan, estimate: EstimateConfig | None = None, learned: Sequence[Learned] = ()
 ) -> Reconstructor:
-    """Make the reconstructor for the maps of a plan. estimate: its settings, if they differ from those of the config."""
+    """Make the reconstructor for the maps of a plan. estimate: its settings, if they differ from those of the
+    config."""
     estimate, sensor = estimate or rig.config.estimate, (plan.rows, plan.width)
     return Reconstructor(
         rig.model, plan.commands, plan.depth_range_m, estimate, sensor=sensor, learned=learned, lines=plan.lines

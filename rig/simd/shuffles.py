@@ -201,7 +201,8 @@ _EIGHT_FLOATS = ir.VectorType(ir.FloatType(), EIGHT)
 
 
 def _turned(builder: Any, rows: list[Any]) -> list[Any]:
-    """Columns of eight rows of eight, in steps that stay within halves except for the last: those are the quick ones."""
+    """Columns of eight rows of eight, in steps that stay within halves except for the last: those are the quick
+    ones."""
 
     def mixed(a: Any, b: Any, places: list[int]) -> Any:
         return builder.shuffle_vector(a, b, place_list([*places, *(i + EIGHT // 2 for i in places)]))

@@ -36,7 +36,8 @@ class Wish:
 
 @dataclass(frozen=True, slots=True)
 class Choice:
-    """The setting to use or, if none meets the requirement, the nearest; with the figures of its worst scene and fog."""
+    """The setting to use or, if none meets the requirement, the nearest; with the figures of its worst scene
+    and fog."""
 
     wish: Wish
     fits: bool
@@ -68,7 +69,8 @@ class Choice:
 
 
 def wish_of(time_budget: str | None, error: str | None, of: str) -> Wish | None:
-    """The requirement in the options; None if neither time nor error is given. Raises UsageError, a line per problem."""
+    """The requirement in the options; None if neither time nor error is given. Raises UsageError, a line per
+    problem."""
     problems = []
     time_ms = error_px = None
     if of not in ("sensor", "compute"):

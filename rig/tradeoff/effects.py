@@ -1,4 +1,5 @@
-"""Finds which physical effects a simulated scene calls for, according to its world, and measures how much each matters."""
+"""Finds which physical effects a simulated scene calls for, according to its world, and measures how much each
+matters."""
 
 from collections.abc import Iterator, Mapping
 from contextlib import ExitStack, contextmanager

@@ -72,7 +72,8 @@ FINE_SHARE: Final = 8.0
 
 
 def bayes_errors(light: RowLight, exposures: Sequence[int], draws: int, rng: np.random.Generator) -> Array:
-    """|error| in px of the posterior median for `draws` simulated rows at each number of exposures, (exposures, draws)."""
+    """|error| in px of the posterior median for `draws` simulated rows at each number of exposures, (exposures,
+    draws)."""
     places, spacing = _places(light, max(exposures))
     flux = np.maximum(light.flux(places), FLUX_MIN)
     here = np.maximum(light.flux(np.array([light.position]))[0], FLUX_MIN)

@@ -1,4 +1,5 @@
-"""The simulated galvanometer. It plays a waveform on its own, slightly wrong clock; the mirror lags behind the command."""
+"""The simulated galvanometer. It plays a waveform on its own, slightly wrong clock; the mirror lags behind the
+command."""
 
 import math
 from fractions import Fraction

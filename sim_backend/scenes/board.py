@@ -70,7 +70,8 @@ def load_boards(shown: Sequence[SceneBoard], folder: Path) -> list[BoardAtPose]:
 
 
 def board_scene(u: Array, v: Array, boards: Sequence[BoardAtPose], wall_m: float) -> Surfaces:
-    """The boards, nearer ones in front, before a wall `wall_m` away, for a camera of rays (u, v), each (rows, width)."""
+    """The boards, nearer ones in front, before a wall `wall_m` away, for a camera of rays (u, v), each (rows,
+    width)."""
     depth, albedo = np.full(u.shape, wall_m), np.full(u.shape, WALL_ALBEDO)
     slopes = [(np.gradient(tangent, axis=1), np.gradient(tangent, axis=0)) for tangent in (u, v)]
     for shown in sorted(boards, key=lambda one: -float(one.pose.position_m[2])):

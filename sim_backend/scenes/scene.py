@@ -148,7 +148,8 @@ def with_fog(scene: SceneFile, visibility: str) -> SceneFile:
 
 
 def with_board_at(scene: SceneFile, place: BoardPlace) -> SceneFile:
-    """The scene with its board, or the first of several, moved to another place. Raises DeviceError if it has no board."""
+    """The scene with its board, or the first of several, moved to another place. Raises DeviceError if it has
+    no board."""
     if not scene.boards:
         raise DeviceError(
             "board_pose moves the board of a scene, this one has none; choose a scene with 'surfaces: board'"

@@ -240,7 +240,8 @@ class WorldFrames:
         return sweep
 
     def whole(self, first_frame: int, start_s: float, period_s: float, n: int) -> NDArray[np.uint8]:
-        """Whole frames of a SPAD without records, exposed during their entire period; upright, (n, height, row bytes)."""
+        """Whole frames of a SPAD without records, exposed during their entire period; upright, (n, height, row
+        bytes)."""
         rows, width = self._world.size
         bits = np.zeros((n, rows, packed_row_bytes(width)), np.uint8)
         self.expose(Span(first_frame, n, start_s, period_s, period_s, None), np.zeros(n, FRAME_RECORD), bits)

@@ -74,7 +74,8 @@ class Expectation(NamedTuple):
 
 
 def lattice(geometry: SweepGeometry, lines: int) -> tuple[Int32, Int32]:
-    """About `lines` (row, column) pairs spread evenly over those with a window, in a fixed pattern without randomness."""
+    """About `lines` (row, column) pairs spread evenly over those with a window, in a fixed pattern without
+    randomness."""
     y, c = np.nonzero(geometry.x_lo <= geometry.x_hi)
     pick = evenly_spread(len(y), lines)
     return y[pick].astype(np.int32), c[pick].astype(np.int32)

@@ -157,7 +157,8 @@ def stripes_of(found: RowAnswers, judge: SearchTables, workers: RowWorkers) -> S
 
 
 def quiet_of(found: RowAnswers, width: int) -> Float64:
-    """Ones and exposures of pixels while clearly behind a stripe, float64 (2, rows, width); both of the halved counts."""
+    """Ones and exposures of pixels while clearly behind a stripe, float64 (2, rows, width); both of the halved
+    counts."""
     exposures = np.repeat(np.cumsum(found.quiet_exposures[:, :-1], axis=1), STEPS, axis=1)[:, :width]
     return np.stack([pixel_order(found.quiet, width), exposures / EXPOSURE_PARTS])
 

@@ -127,7 +127,8 @@ class SerialWire(_SerialLine):
             return self._port
 
     def exchange(self, port: "EmulatedPort", data: bytes = b"") -> None:
-        """Let the device act, at the present time and on the host's data. Raises SerialException if the port is lost."""
+        """Let the device act, at the present time and on the host's data. Raises SerialException if the port is
+        lost."""
         with self.lock:
             if self._port is not port:
                 raise serial.SerialException(errno.EIO, "the cable was pulled or the port closed")

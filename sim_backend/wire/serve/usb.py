@@ -59,7 +59,8 @@ class _Handle:
 
 
 class EmulatedUsb(usb.backend.IBackend):  # type: ignore[misc] # pyusb carries no types
-    """A bus. `plug` and `unplug` may be called at any time from any thread. Waiting uses the clock that is passed in."""
+    """A bus. `plug` and `unplug` may be called at any time from any thread. Waiting uses the clock that is
+    passed in."""
 
     def __init__(self, clock: Clock) -> None:
         super().__init__()
