@@ -2,7 +2,7 @@
 PYTHON ?= $(shell command -v python3.11 || command -v python3)
 BIN := .venv/bin
 
-.PHONY: demo help install test lint types layers house unit clean
+.PHONY: demo help install test checks kernels lint types layers house unit clean
 .PHONY: accuracy accuracy-rows accuracy-joint accuracy-calibration
 .PHONY: campaign campaign-devices campaign-guard campaign-recording campaign-simulation campaign-calibration
 .DELETE_ON_ERROR:
@@ -15,7 +15,14 @@ install: .venv/.installed-tests  ## set up .venv with everything that tests need
 help:  ## this list
 	@awk -F' *## ' '/^[a-z-]+:.*## / { sub(/:.*/, "", $$1); printf "%-21s %s\n", $$1, $$2 }' Makefile
 
-test: lint types layers house unit  ## lint, types, import layers, the tree's figures and all tests
+# The kernels are compiled once, while one core checks types: four workers that start cold would each compile them.
+test: .venv/.installed-tests  ## lint, types, import layers, the tree's figures and all tests
+	$(MAKE) --jobs=2 --output-sync=target checks kernels
+	$(MAKE) unit
+
+checks: lint types layers house
+kernels: .venv/.installed-tests
+	$(BIN)/rig warmup
 
 lint: .venv/.installed-tests
 	$(BIN)/ruff check .
