@@ -123,7 +123,7 @@ def next_pose(choices: Sequence[Candidate], at_m: float, now_m: float, forecast:
 
 
 def sequence(choices: Sequence[Candidate], poses: int, seed: int = 0) -> tuple[Candidate, ...]:
-    """As many poses as asked for that differ from one another as much as possible: near and far, in all places and
+    """The requested number of poses, which differ from one another as much as possible: near and far, in all places and
     tilts.
 
     Each is the one farthest from those before it; the first is near and tilted. seed: chooses among equal ones.

@@ -30,7 +30,9 @@ class KindConfig(BaseModel):
 
 @dataclass(frozen=True, slots=True)
 class Surroundings:
-    """What a device needs besides its config. Real devices use clock and ports, simulated ones world and seed."""
+    """The things that a device needs besides its config. Real devices use clock and ports, simulated ones world and
+    seed.
+    """
 
     clock: Clock
     world: World | None

@@ -26,7 +26,7 @@ _PAGE_BYTES = 4096
 
 
 class OnFull(Enum):
-    """What happens to a block for which there is no free slot."""
+    """Fate of a block for which there is no free slot."""
 
     WAIT = "wait"
     """The source waits until one comes free. A source that cannot drops the block all the same."""

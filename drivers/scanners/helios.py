@@ -263,7 +263,7 @@ _WIRE_BYTES_PER_S = 1.216e6
 
 
 class HeliosRun:
-    """One run: `begin`, then `feed`. No wait is longer than two frames and two seconds."""
+    """One run: `begin`, then `feed`. No wait is longer than two frames plus two seconds."""
 
     def __init__(
         self, link: HeliosDac, clock: Clock, source: PointSource, clock_hz: Fraction, *, frame_s: float, axis: str

@@ -211,7 +211,7 @@ counting."""
 
 
 class LaserCubeRun:
-    """One run: `begin`, then `feed`. No wait is longer than the queued samples and a second."""
+    """One run: `begin`, then `feed`. No wait is longer than the queued samples take plus one second."""
 
     def __init__(
         self, link: LaserCubeDac, source: PointSource, rate_hz: int, *, buffer_s: float, axis: str, markers: bool

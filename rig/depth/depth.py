@@ -2,9 +2,10 @@
 
 Depth is z in metres, float32 (rows, width), NaN where there is none (`depth_map`; the rule is in `rig.depth.kernels`).
 
-With several lines, columns that are lit together may claim the same stripe. An estimator looks at one column at a time,
-sees the others' stripes too if windows overlap, and in each the brightest wins. At most one of the claims is right. So
-coinciding answers of one row and place of the mirror share their confidence (`share_claims`).
+With several lines, columns that are lit together may claim the same stripe. An estimator looks at one column at a time.
+If search windows overlap it also sees the stripes of the other columns, and may take the brightest one for its own. At
+most one of the claims is right. So coinciding answers of one row and place of the mirror share their confidence
+(`share_claims`).
 """
 
 from dataclasses import replace

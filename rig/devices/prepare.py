@@ -102,7 +102,7 @@ def most_sweeps(rig: OpenRig, plan: ScanPlan) -> int | None:
     """Largest number of sweeps of one start that fit a burst's memory and the sync source's program; None for any
     number.
 
-    At least 1, which either of them may still refuse.
+    The number is at least 1. SPAD and sync source may still refuse a start with 1.
     """
     legs = plan.sweeps_per_period
     repeats = rig.sync.most_repeats(sync_program(plan, legs)[0])

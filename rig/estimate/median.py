@@ -62,9 +62,9 @@ def median_filter(stripes: StripeTable, reference_px: Float64, *, coupled: bool 
     """Stripe table with x_px replaced by the 5x5 median of its disparity; reference_px (rows, columns), NaN allowed.
 
     The reference is the position of the column's line at a fixed depth. Confidence becomes the share of the neighbours'
-    confidence that lies within 1 px of the median, times the probability that at least one of those is right. If
-    coupled, it is times their mean instead, since answers that influence each other also agree where nothing is lit.
-    x_sd_px becomes the standard deviation of a median of those neighbours.
+    confidence that lies within 1 px of the median, times the probability that at least one of those is right. For
+    coupled answers their mean confidence takes the place of that probability, since answers that influence each other
+    also agree where nothing is lit. x_sd_px becomes the standard deviation of a median of those neighbours.
     """
     reference = reference_px.astype(np.float32)
     out = np.full((3, *stripes.x_px.shape), np.nan, np.float32)

@@ -1,4 +1,4 @@
-"""The scanner's waveform: commands and markers of every point, when the gate opens meanwhile, and the SPAD's windows.
+"""The scanner's waveform: commands and markers of every point, the times when the gate opens, and the SPAD's windows.
 
 `waveform_of` makes commands and markers. `moving_windows` makes the table of windows that a scan needs of its SPAD,
 with the pixels of a row from one line marker to the next.

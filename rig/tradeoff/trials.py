@@ -54,8 +54,8 @@ class Trials:
         return _all_or_problems(self, self.config_of)
 
     def require_plans(self) -> None:
-        """Raise UsageError with all problems of these scans. The smallest and the largest number of exposures are tried
-        everywhere.
+        """Raise UsageError with all problems of these scans. Only the smallest and the largest number of exposures are
+        checked.
         """
         ends = {min(self.asked.exposures), max(self.asked.exposures)}
         configs = self.configs()

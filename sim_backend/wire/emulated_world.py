@@ -181,7 +181,7 @@ class EmulatedWorld(SimulatedWorld):
         return found
 
     def emission(self) -> list[tuple[float, float]]:
-        """(time, power) of every change of the power in W behind an open gate. The first entry has the time 'never'."""
+        """(time, power) of every change of the power in W behind an open gate. The first entry is at -inf."""
         with self._emission_lock:
             return list(self._emission)
 
