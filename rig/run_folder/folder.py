@@ -212,8 +212,8 @@ def json_text(content: Mapping[str, Any]) -> str:
 
 @dataclass(frozen=True, slots=True)
 class SavePolicy:
-    """The choice of maps of a run that are written (`--save`). step: maps 0, step, 2 step, ...; None for only the last.
-    """
+    """The choice of maps of a run that are written (`--save`). step: maps 0, step, 2 step, ...; None for only
+    the last."""
 
     step: int | None = 1
 
