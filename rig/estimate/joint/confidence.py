@@ -50,8 +50,8 @@ from rig.estimate.row.model import RowModel
 from rig.geometry.stripe_table import StripeTable
 from rig.simd import Bools, Float32, Int16, Int32
 from rig.simd.functions import error_function, exponential, logarithm
-from rig.simd.memory import address_of, copy_floats, load_float32, store_float32
-from rig.simd.vectors import LANES, larger_float, smaller_float, square_root, zero_float32
+from rig.simd.memory import address_of, copy_floats, load_float32, store_float32, store_int16
+from rig.simd.vectors import LANES, larger_float, smaller_float, square_root, to_int16, where_small, zero_float32
 from rig.threads import RowWorkers
 
 NEIGHBOURS: Final = 2
@@ -62,6 +62,8 @@ OPPOSITE: Final = 2, 4
 """Rows and columns to the neighbours that lie opposite each other."""
 ASKED: Final = 4 * len(OPPOSITE)
 """Pairs of opposite neighbours: along rows, columns and both diagonals."""
+_ANYWHERE: Final = np.float32(1e6)
+"""Pixels: more than any two answers are apart."""
 
 
 class Neighbours(NamedTuple):
@@ -110,14 +112,14 @@ def count_neighbours(distance: Float32, first_row: int, last_row: int, out: Neig
 @numba.njit(cache=True, nogil=True)
 def _count_row(distance: Float32, row: int, number: Int16) -> None:
     """Count the neighbours in a row of a copy `with_margin`."""
-    columns = distance.shape[1] - 2 * LANES
-    own = distance[row, LANES:]
-    number[:columns] = 0
-    for line in range(row - NEIGHBOURS, row + NEIGHBOURS + 1):
-        for left in range(LANES - NEIGHBOURS, LANES + NEIGHBOURS + 1):
-            near = distance[line, left:]
-            for c in range(columns):
-                number[c] += np.int16(abs(near[c] - own[c]) <= SAME_PX)
+    width, at, one = distance.shape[1], address_of(distance), zero_float32() + np.float32(1.0)
+    for c in range(0, width - 2 * LANES, LANES):
+        here = row * width + LANES + c
+        own, same = load_float32(at, here), zero_float32()
+        for line in range(here - NEIGHBOURS * width, here + NEIGHBOURS * width + 1, width):
+            for near in range(line - NEIGHBOURS, line + NEIGHBOURS + 1):
+                same = same + where_small(one, load_float32(at, near) - own, SAME_PX)
+        store_int16(address_of(number), c, to_int16(same))
 
 
 @numba.njit(cache=True, nogil=True)
@@ -146,16 +148,16 @@ def apart_row(placed: Float32, row: int, out: Float32) -> None:
 
     placed: a copy `with_margin` of final distances; row: of the copy.
     """
-    columns, half = placed.shape[1] - 2 * LANES, np.float32(0.5)
-    own = placed[row, LANES:]
-    out[:columns] = 0.0
-    for step in OPPOSITE:
-        for down, right in ((0, step), (step, -step), (step, 0), (step, step)):
-            before, behind = placed[row - down, LANES - right :], placed[row + down, LANES + right :]
-            for c in range(columns):
-                off = abs((before[c] + behind[c]) * half - own[c])
-                # NaN where one of them is missing.
-                out[c] += np.float32(off > SAME_PX)
+    width, at, one, half = placed.shape[1], address_of(placed), zero_float32() + np.float32(1.0), np.float32(0.5)
+    for c in range(0, width - 2 * LANES, LANES):
+        here = row * width + LANES + c
+        own, apart = load_float32(at, here), zero_float32()
+        for step in OPPOSITE:
+            for away in (1, width - 1, width, width + 1):
+                off = (load_float32(at, here - step * away) + load_float32(at, here + step * away)) * half - own
+                # Neither counts if one of them is missing, NaN.
+                apart = apart + where_small(one, off, _ANYWHERE) - where_small(one, off, SAME_PX)
+        store_float32(address_of(out), c, apart)
 
 
 @numba.njit(cache=True, nogil=True)
@@ -167,17 +169,18 @@ def light_row(
 
     distance, light: copies `with_margin`; row: of these copies.
     """
-    columns, nothing = distance.shape[1] - 2 * LANES, np.float32(0.0)
-    own = distance[row, LANES:]
-    number[:columns], total[:columns] = 0.0, 0.0
-    for line in range(row - 1, row + 2):
-        for left in range(LANES - 1, LANES + 2):
-            near, value = distance[line, left:], light[line, left:]
-            for c in range(columns):
-                number[c] += np.float32(abs(near[c] - own[c]) <= SAME_PX)
-            for c in range(columns):
-                more = value[c]
-                total[c] += more if abs(near[c] - own[c]) <= SAME_PX else nothing
+    width, one = distance.shape[1], zero_float32() + np.float32(1.0)
+    at, to_add = address_of(distance), address_of(light)
+    for c in range(0, width - 2 * LANES, LANES):
+        here = row * width + LANES + c
+        own, same, lit = load_float32(at, here), zero_float32(), zero_float32()
+        for line in range(here - width, here + width + 1, width):
+            for near in range(line - 1, line + 2):
+                off = load_float32(at, near) - own
+                same = same + where_small(one, off, SAME_PX)
+                lit = lit + where_small(load_float32(to_add, near), off, SAME_PX)
+        store_float32(address_of(number), c, same)
+        store_float32(address_of(total), c, lit)
 
 
 WIDER: Final = 1.556
