@@ -20,7 +20,8 @@ Three things can be wrong with an answer, and each has its factor:
   in the contrast, bright: photons for the model's largest amplitude. If even a dark stripe would be visible, the
   absence of light means that there is no stripe, which light over its noise cannot show.
 - unseen: max(AT_END - CLEARLY max(contrast, 0), 0), with e = 1 up to 1 px from the far end of the depth range and 0
-  from 3 px on. Haze that continues beyond the range seems to end there, so evenly that answers agree.
+  from 3 px on. Haze that continues beyond the range seems to end there, so evenly that answers agree; a stripe so far
+  away must be seen by its own light.
 
 Agreement distinguishes a surface from nothing at all. Without a stripe every row finds the place where its noise looks
 most like one, and four paths tie those answers into streaks but not into surfaces. Each answer has a number of 5 x 5
@@ -99,8 +100,9 @@ def _around(number: Float32, reach: int) -> Float32:
 
 @numba.njit(cache=True, nogil=True)
 def count_neighbours(distance: Float32, first_row: int, last_row: int, out: Neighbours) -> None:
-    """Fill the numbers of rows first_row..last_row-1; distance: (rows, columns) of answers from the far end, NaN if
-    none.
+    """Fill the numbers of rows first_row..last_row-1.
+
+    distance: (rows, columns), of answers from the far end in px, NaN if there is none.
     """
     for band in range(first_row, last_row, COPIED_ROWS):
         end = min(band + COPIED_ROWS, last_row)
@@ -155,16 +157,13 @@ def apart_row(placed: Float32, row: int, out: Float32) -> None:
         for step in OPPOSITE:
             for away in (1, width - 1, width, width + 1):
                 off = (load_float32(at, here - step * away) + load_float32(at, here + step * away)) * half - own
-                # Neither counts if one of them is missing, NaN.
+                # A pair of which one is missing, NaN, counts in neither term.
                 apart = apart + where_small(one, off, _ANYWHERE) - where_small(one, off, SAME_PX)
         store_float32(address_of(out), c, apart)
 
 
 @numba.njit(cache=True, nogil=True)
-def light_row(
-    distance: Float32, light: Float32, row: int, number: Float32,
-    total: Float32,
-) -> None:  # fmt: skip
+def light_row(distance: Float32, light: Float32, row: int, number: Float32, total: Float32) -> None:
     """Write the number of 3 x 3 neighbours on the surface of each answer of a row, and their total light.
 
     distance, light: copies `with_margin`; row: of these copies.
