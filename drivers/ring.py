@@ -80,11 +80,6 @@ class BlockRing:
         """Whether there is no free slot at this moment."""
         return not self._free
 
-    @property
-    def finished(self) -> bool:
-        """Whether the source published its last block."""
-        return self._finished
-
     def reader(self, name: str, *, required: bool = True, holds: int = 1) -> "RingReader":
         """A new reader. Create it before the first claim, so that all readers see all blocks.
 

@@ -19,10 +19,10 @@ from drivers.sync.prawndo import PrawnDoConfig
 from sim_backend.wire.firmware.cobolt import CoboltModel
 from sim_backend.wire.firmware.dac_model import DacModel
 from sim_backend.wire.firmware.helios import HeliosModel
-from sim_backend.wire.firmware.lasercube import LaserCubeModel
 from sim_backend.wire.firmware.obis import ObisModel
 from sim_backend.wire.serve.serial import SerialServer
 from tests.conformance.cases import LaserCase, ScannerCase, SyncCase
+from tests.wire.lasercube import LaserCubeModel
 from tests.wire.lasers import eventually, open_cobolt, open_obis, wire
 from tests.wire.scanners import opened
 from tests.wire.syncs import Board, board

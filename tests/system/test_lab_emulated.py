@@ -8,6 +8,7 @@ from fractions import Fraction
 import numpy as np
 import pytest
 
+from drivers.interfaces import OUT_GATE
 from drivers.spb1.control import Op
 from rig import api
 from rig.config.overrides import configure
@@ -29,7 +30,7 @@ def worlds(monkeypatch):
             seen.append((world, now_s))
             with world.gate_wire.lock, world.laser_wire.lock:
                 world.sync.advance(now_s)
-                assert not (world.sync.gate_level(now_s) and world.laser.emitting)
+                assert not (world.sync.outputs_at(now_s) & OUT_GATE and world.laser.emitting)
         close(world)
 
     monkeypatch.setattr(EmulatedWorld, "close", look)

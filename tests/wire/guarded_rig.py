@@ -44,13 +44,12 @@ class GuardedRig:
     laser: SerialServer
     sync: SerialServer
     emission: Line
-    gate: Line
 
 
 @contextmanager
 def guarded_rig() -> Iterator[GuardedRig]:
-    emission, gate = Line(), Line()
+    emission = Line()
     laser = ObisModel(cdrh_delay_s=0.0, on_emission=emission)  # a Cobolt takes 4 s to be asked about and armed
-    sync = PrawnDoModel(sweeping, board=2, on_gate=gate)
+    sync = PrawnDoModel(sweeping, board=2)
     with SerialServer(laser) as laser_server, SerialServer(sync, baud=USB_BAUD) as sync_server:
-        yield GuardedRig(laser_server, sync_server, emission, gate)
+        yield GuardedRig(laser_server, sync_server, emission)

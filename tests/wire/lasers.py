@@ -14,8 +14,9 @@ from drivers.interfaces import LineLaser
 from drivers.lasers import cobolt, obis
 from drivers.registry import Surroundings
 from drivers.transports.dialogue import LineTiming
-from sim_backend.wire.serve.serial import SerialModel, SerialWire
-from sim_backend.wire.serve.wire_server import FaultSchedule
+from sim_backend.wire.serve.serial import SerialModel
+from tests.wire.faults import FaultSchedule
+from tests.wire.serial_wire import SerialWire
 
 PATIENCE_S = 60.0
 """Longest wait for what comes for sure, however much else the machine has to do."""

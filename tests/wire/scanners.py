@@ -13,9 +13,9 @@ from drivers.registry import Surroundings, lookup
 from drivers.transports.endpoints import Endpoint
 from sim_backend.wire.firmware.dac_model import DacModel
 from sim_backend.wire.firmware.helios import HeliosModel
-from sim_backend.wire.firmware.lasercube import LaserCubeModel
 from sim_backend.wire.serve.usb import EmulatedUsb
 from sim_backend.wire.serve.usb_model import AttachedDevice, Stall, UsbModel
+from tests.wire.lasercube import LaserCubeModel
 from tests.wire.lasers import eventually
 
 GALVO = {"max_velocity": "2000 /s", "max_acceleration": "2e6 /s2"}

@@ -1,5 +1,6 @@
 """The real PrawnDO driver on an emulated wire."""
 
+from bisect import bisect_right
 from collections.abc import Iterator
 from contextlib import contextmanager
 from typing import Any
@@ -9,13 +10,32 @@ from drivers.interfaces import OUT_GATE, Pulse
 from drivers.registry import Surroundings
 from drivers.sync.prawndo import PrawnDo, PrawnDoConfig
 from drivers.sync.prawndo_line import USUAL_TIMING, PrawnDoTiming
-from sim_backend.wire.firmware.prawndo import PrawnDoModel, TriggerLine
-from sim_backend.wire.serve.serial import SerialServer, SerialWire
-from sim_backend.wire.serve.wire_server import FaultSchedule
+from sim_backend.wire.firmware.prawndo import PrawnDoModel
+from sim_backend.wire.serve.serial import SerialServer
+from tests.wire.faults import FaultSchedule
+from tests.wire.serial_wire import SerialWire
 
 USB_BAUD = 8_000_000
 """A virtual COM port over USB full speed carries about 0.8 MB/s."""
 SWEEP = (Pulse(0, None), Pulse(0, 1e-3), Pulse(OUT_GATE, 5e-3), Pulse(0, 1e-5))
+
+
+class TriggerLine:
+    """A trigger input that is switched by hand. Calls must be in order of time."""
+
+    def __init__(self) -> None:
+        self._edges: list[tuple[float, bool]] = []
+
+    def pulse(self, at_s: float, width_s: float) -> None:
+        """Hold the line high for `width_s` from `at_s` on, which must not be before the last pulse."""
+        self._edges += [(at_s, True), (at_s + width_s, False)]
+
+    def __call__(self, from_s: float, until_s: float) -> float | None:
+        """First time in [from_s, until_s) at which the line is high; None: it is low until then."""
+        index = bisect_right(self._edges, from_s, key=lambda edge: edge[0]) - 1
+        if index >= 0 and self._edges[index][1]:
+            return from_s
+        return next((at for at, high in self._edges[index + 1 :] if high and at < until_s), None)
 
 
 class Board:
@@ -25,8 +45,10 @@ class Board:
         self.clock = VirtualClock()
         self.trigger = TriggerLine()
         self.model = PrawnDoModel(self.trigger, **settings)
-        served = SerialServer if terminal else SerialWire
-        self.server: SerialServer | SerialWire = served(self.model, clock=self.clock, baud=USB_BAUD, faults=faults)
+        settings = {"clock": self.clock, "baud": USB_BAUD}
+        self.server: SerialServer = (
+            SerialServer(self.model, **settings) if terminal else SerialWire(self.model, faults=faults, **settings)
+        )
 
     @property
     def now_s(self) -> float:

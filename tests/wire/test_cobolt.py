@@ -9,7 +9,7 @@ from drivers.errors import DeviceFault, InterlockOpen, ProtocolError, WrongState
 from drivers.lasers.cobolt import CoboltConfig, classify
 from drivers.lasers.cobolt import create as create_cobolt
 from sim_backend.wire.firmware.cobolt import MODELS, CoboltModel, Family
-from sim_backend.wire.serve.wire_server import Fault, FaultScript
+from tests.wire.faults import Fault, FaultScript
 from tests.wire.lasers import bring_up, now_s, open_cobolt, overtaken_arm, wire
 
 FAMILIES: tuple[Family, ...] = ("06-MLD", "06-01")

@@ -123,7 +123,7 @@ def test_unplugging_during_a_run_is_a_disconnection(kind: Kind) -> None:
     device = open_scanner(kind.name, plugged.bus, clock)
     device.load(cosine(device), 100_000)
     device.start()
-    plugged.bus.unplug(plugged.attached)
+    plugged.attached.unplug()
     with pytest.raises(DeviceDisconnected, match="cable"):
         finish(device)
     with pytest.raises(DeviceDisconnected):

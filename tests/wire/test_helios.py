@@ -127,7 +127,7 @@ def test_old_replies_are_drained_before_the_first_question() -> None:
     def with_leftovers(interface: int, alternate: int, now_s: float) -> None:
         enable(interface, alternate, now_s)
         for _ in range(3):
-            model.leave_reply(b"\x84\x01\x00\x00\x00")
+            model._replies.append(b"\x84\x01\x00\x00\x00")
 
     model.set_interface = with_leftovers  # type: ignore[method-assign]
     with opened("helios", model) as (device, _):
@@ -138,7 +138,7 @@ def test_old_replies_are_drained_before_the_first_question() -> None:
 def test_any_other_reply_than_83_01_is_not_ready(junk: bytes) -> None:
     model = HeliosRecorder()
     with opened("helios", model) as (device, _):
-        model.leave_reply(junk)
+        model._replies.append(junk)
         play(device, 1)
         asked = [data for _, endpoint, data in model.log if endpoint in (COMMANDS, FRAMES)]
         first = asked.index(model.sent(FRAMES)[0])
@@ -308,7 +308,7 @@ def test_park_ends_at_the_dump_angle_with_a_frame_not_with_stop() -> None:
 def test_a_foreign_firmware_is_one_line(reply: bytes) -> None:
     class Foreign(HeliosModel):
         def _command(self, data: bytes, now_s: float) -> None:
-            self.leave_reply(reply)
+            self._replies.append(reply)
 
     plugged = plug(Foreign(), VirtualClock())
     with pytest.raises(ProtocolError, match="no Helios firmware") as refused:

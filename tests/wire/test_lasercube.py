@@ -9,8 +9,8 @@ from drivers.errors import DeviceError, DeviceFault, DeviceNotFound, LimitExceed
 from drivers.interfaces import LEVEL_BACKWARD, MARKER_LINE, MARKER_SCAN
 from drivers.scanners.dac_scanner import PointSlice
 from drivers.scanners.lasercube import encode
-from sim_backend.wire.firmware.lasercube import BLUE, COMMANDS, GREEN, RED, SAMPLES, LaserCubeModel
 from sim_backend.wire.serve.usb_model import Stall
+from tests.wire.lasercube import BLUE, COMMANDS, GREEN, RED, SAMPLES, LaserCubeModel
 from tests.wire.scanners import LaserCubeRecorder, cosine, opened, play
 
 
@@ -113,7 +113,7 @@ def test_the_reply_s_first_byte_does_not_matter_but_its_second_does() -> None:
 
 def test_a_reply_left_by_another_program_is_dropped() -> None:
     model = LaserCubeModel()
-    model.leave_reply(bytes(64))
+    model._replies.append(bytes(64))
     with opened("lasercube", model) as (device, _):
         assert device._dac.firmware == (0, 12)  # type: ignore[attr-defined]
 

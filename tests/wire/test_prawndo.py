@@ -16,9 +16,9 @@ from drivers.errors import (
 from drivers.interfaces import HOLD_S, OUT_FRAME, OUT_GATE, OUT_MARKER, Pulse
 from drivers.sync.prawndo import ProgramLimits, compile_program, most_repeats
 from drivers.sync.prawndo_line import PrawnDoTiming
-from sim_backend.wire.firmware.prawndo import PrawnDoModel, TriggerLine
+from sim_backend.wire.firmware.prawndo import PrawnDoModel
 from tests.wire.lasers import PATIENCE_S, Silent, eventually
-from tests.wire.syncs import SWEEP, board
+from tests.wire.syncs import SWEEP, TriggerLine, board
 
 # The emulator, against bytes written by hand from docs/reference/hardware.md
 

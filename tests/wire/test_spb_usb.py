@@ -249,7 +249,7 @@ def test_a_firmware_that_hangs_is_a_timeout_and_unplugging_a_disconnection() -> 
             while spad.fill(ring, 0.1):
                 pass
         device.deaf = False
-        bus.unplug(attached)
+        attached.unplug()
         with pytest.raises(DeviceDisconnected):
             finish(spad, ring)
         assert spad.counters.delivered > 0

@@ -86,7 +86,7 @@ def test_a_device_plugged_in_again_is_found_again_and_left_in_alternate_setting_
     bus = EmulatedUsb(VirtualClock())
     first, model = bus.plug(LoopbackModel()), LoopbackModel()
     open_device(LOOPBACK, "usb", {0: 1}, bus).close()
-    bus.unplug(first)
+    first.unplug()
     assert attached(LOOPBACK, bus) == []
     bus.plug(model)
     with open_device(LOOPBACK, "usb", {0: 1}, bus):

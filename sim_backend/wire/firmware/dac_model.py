@@ -128,10 +128,6 @@ class DacModel(UsbModel):
         self._commands_endpoint, self._replies_endpoint = commands, replies
         self._replies: deque[bytes] = deque()
 
-    def leave_reply(self, reply: bytes) -> None:
-        """Leave a reply in the endpoint, as if an earlier program had not read it."""
-        self._replies.append(reply)
-
     def out(self, endpoint: int, data: bytes, now_s: float) -> int | Stall | None:
         """Take commands and points from the host."""
         self.advance(now_s)

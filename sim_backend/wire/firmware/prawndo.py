@@ -11,8 +11,6 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from drivers.interfaces import OUT_GATE
-
 STOPPED, STARTING, RUNNING, ABORT_REQUESTED, ABORTED = 0, 1, 2, 3, 5
 """Values of `run-status` that an onlooker can meet."""
 
@@ -32,24 +30,6 @@ Trigger = Callable[[float, float], float | None]
 """The first time in [from, until) at which the trigger input is high; None: it stays low."""
 
 
-class TriggerLine:
-    """A trigger input that is switched by hand. Calls must be in order of time."""
-
-    def __init__(self) -> None:
-        self._edges: list[tuple[float, bool]] = []
-
-    def pulse(self, at_s: float, width_s: float) -> None:
-        """Hold the line high for `width_s` from `at_s` on, which must not be before the last pulse."""
-        self._edges += [(at_s, True), (at_s + width_s, False)]
-
-    def __call__(self, from_s: float, until_s: float) -> float | None:
-        """First time in [from_s, until_s) at which the line is high; None: it is low until then."""
-        index = bisect_right(self._edges, from_s, key=lambda edge: edge[0]) - 1
-        if index >= 0 and self._edges[index][1]:
-            return from_s
-        return next((at for at, high in self._edges[index + 1 :] if high and at < until_s), None)
-
-
 @dataclass(slots=True)
 class _Run:
     """A program being played. Its present word began at `since_s`; before the first one, `index` is -1."""
@@ -61,8 +41,8 @@ class _Run:
 class PrawnDoModel:
     """The firmware and the pins. Times are seconds of whatever clock the wire runs on; they never decrease.
 
-    trigger: what drives GPIO16. board: 1 for a Pico, 2 for a Pico 2. external_clock_hz: what is connected to GPIO20.
-    on_gate: called with each change of the gate output and its time, in order, once the model is advanced past it.
+    trigger: what drives GPIO16; None: nothing. board: 1 for a Pico, 2 for a Pico 2. external_clock_hz: what is
+    connected to GPIO20.
     """
 
     def __init__(
@@ -72,13 +52,11 @@ class PrawnDoModel:
         board: int = 1,
         version: str = "1.3.1",
         external_clock_hz: int | None = None,
-        on_gate: Callable[[bool, float], None] | None = None,
     ) -> None:
-        self._trigger = trigger or TriggerLine()
+        self._trigger = trigger or (lambda from_s, until_s: None)
         self._board = board
         self._version = version
         self.external_clock_hz = external_clock_hz
-        self._on_gate = on_gate
         self._times: list[float] = [float("-inf")]
         self._levels: list[int] = [0]
         self._restart()
@@ -131,10 +109,6 @@ class PrawnDoModel:
     def outputs_at(self, at_s: float) -> int:
         """Levels of the sixteen outputs at a time to which the model has been advanced."""
         return self._levels[bisect_right(self._times, at_s) - 1]
-
-    def gate_level(self, at_s: float) -> bool:
-        """Whether the gate output is high at that time."""
-        return bool(self.outputs_at(at_s) & OUT_GATE)
 
     def changes(self, from_s: float, until_s: float) -> list[tuple[float, int]]:
         """The level at `from_s`, then each change before `until_s`: (time, outputs)."""
@@ -195,16 +169,13 @@ class PrawnDoModel:
             self.status = STOPPED
 
     def _set_outputs(self, level: int, at_s: float) -> None:
-        before = self._levels[-1]
-        if level == before:
+        if level == self._levels[-1]:
             return
         if self._times[-1] == at_s and self._levels[-2] == level:  # a level that lasted no time was none
             del self._times[-1], self._levels[-1]
             return
         self._times.append(at_s)
         self._levels.append(level)
-        if self._on_gate is not None and (level ^ before) & OUT_GATE:
-            self._on_gate(bool(level & OUT_GATE), at_s)
 
     def _settle(self, now_s: float) -> None:
         """The second core acts on what the first one asked of it before the next bytes came."""

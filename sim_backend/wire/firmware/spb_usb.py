@@ -60,9 +60,6 @@ class SpbUsbModel(UsbModel):
         """Note that the bus power is gone."""
         self._reset()
 
-    def set_interface(self, interface: int, alternate: int, now_s: float) -> None:
-        """Do nothing, since hosts choose the setting that is there."""
-
     def control(self, setup: Setup, data: bytes, now_s: float) -> Answer:
         """Answer the FT601's requests for its configuration (0xCF) and its own firmware version (0xF1)."""
         if self.chip != "ft601" or not setup.request_type & 0x80:

@@ -1,3 +1,1 @@
-"""Transports that serve the firmware models to the real drivers: pseudo-terminals, TCP, an emulated USB bus; with
-faults on request.
-"""
+"""Transports that serve the firmware models to the real drivers: pseudo-terminals, TCP, an emulated USB bus."""

@@ -11,7 +11,7 @@ from typing import Protocol
 
 from drivers.clock import Clock
 from drivers.transports.endpoints import Endpoint
-from sim_backend.wire.serve.wire_server import FaultSchedule, WireServer
+from sim_backend.wire.serve.wire_server import WireServer
 
 HOST = "127.0.0.1"
 CHUNK_BYTES = 65_536
@@ -39,8 +39,8 @@ class TcpModel(Protocol):
 class TcpServer(WireServer[TcpModel]):
     """A program that serves one client."""
 
-    def __init__(self, model: TcpModel, *, clock: Clock | None = None, faults: FaultSchedule | None = None) -> None:
-        super().__init__(model, clock, faults)
+    def __init__(self, model: TcpModel, *, clock: Clock | None = None) -> None:
+        super().__init__(model, clock)
         self._port = 0
         self._listener: socket.socket | None = None
         self._client: socket.socket | None = None

@@ -59,29 +59,20 @@ class _Handle:
 
 
 class EmulatedUsb(usb.backend.IBackend):  # type: ignore[misc] # pyusb carries no types
-    """A bus. `plug` and `unplug` may be called at any time from any thread. Waiting uses the clock that is
-    passed in."""
+    """A bus. `plug` may be called at any time from any thread. Waiting uses the clock that is passed in."""
 
     def __init__(self, clock: Clock) -> None:
         super().__init__()
         self._clock = clock
         self._lock = threading.Lock()
         self._devices: list[AttachedDevice] = []
-        self._ports = 0
 
     def plug(self, model: UsbModel) -> AttachedDevice:
         """Attach a model at the next free port. Plugging in again gives a new address, as on a real bus."""
         with self._lock:
-            self._ports += 1
-            device = AttachedDevice(model, _BUS, self._ports, self._now_s)
+            device = AttachedDevice(model, _BUS, len(self._devices) + 1, self._now_s)
             self._devices.append(device)
             return device
-
-    def unplug(self, device: AttachedDevice) -> None:
-        """Pull the cable."""
-        with self._lock:
-            self._devices = [one for one in self._devices if one is not device]
-        device.unplug()
 
     def _now_s(self) -> float:
         return self._clock.now_ns() / NS_PER_S
@@ -91,7 +82,7 @@ class EmulatedUsb(usb.backend.IBackend):  # type: ignore[misc] # pyusb carries n
     def enumerate_devices(self) -> Iterator[AttachedDevice]:
         """The devices on the bus."""
         with self._lock:
-            return iter(list(self._devices))
+            return iter([one for one in self._devices if one.present])
 
     def get_device_descriptor(self, dev: AttachedDevice) -> SimpleNamespace:
         """The device descriptor, with the device's bus, port and address."""

@@ -18,9 +18,6 @@ import usb.core
 
 Speed = Literal["full", "high", "super"]
 
-SPEED_MBIT: Final = {"full": 12, "high": 480, "super": 5000}
-"""Speeds in Mbit/s, as in the file `speed` of /sys/bus/usb/devices."""
-
 DEVICE, CONFIGURATION, STRING = 1, 2, 3
 """Types of descriptors that a host asks for."""
 _INTERFACE, _ENDPOINT, _COMPANION = 4, 5, 0x30

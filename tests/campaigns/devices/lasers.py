@@ -18,9 +18,9 @@ from drivers.registry import Surroundings
 from drivers.transports.dialogue import LineTiming
 from sim_backend.wire.firmware.cobolt import CoboltModel, Family
 from sim_backend.wire.firmware.obis import ObisModel
-from sim_backend.wire.serve.serial import SerialWire
-from sim_backend.wire.serve.wire_server import Fault, FaultSchedule
 from tests.campaigns.outcomes import Ending, Verbs
+from tests.wire.faults import Fault, FaultSchedule
+from tests.wire.serial_wire import SerialWire
 
 LIMIT_W = 0.08
 DEADLINE_S = 10.0

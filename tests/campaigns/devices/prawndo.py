@@ -11,8 +11,8 @@ from drivers.interfaces import OUT_FRAME, OUT_GATE, Pulse
 from drivers.registry import Surroundings
 from drivers.sync.prawndo import PrawnDo, PrawnDoConfig
 from drivers.sync.prawndo_line import PrawnDoTiming
-from sim_backend.wire.serve.wire_server import Fault, FaultSchedule
 from tests.campaigns.outcomes import Ending, Verbs
+from tests.wire.faults import Fault, FaultSchedule
 from tests.wire.syncs import Board
 
 TIMING = PrawnDoTiming(reply_s=0.06, hasty_s=0.03, lower_s=0.15, load_s=0.3)

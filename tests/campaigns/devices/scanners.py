@@ -15,12 +15,12 @@ from numpy.typing import NDArray
 
 from drivers.clock import VirtualClock
 from drivers.interfaces import MARKER_LINE, MARKER_SCAN, BeamScanner, ScanWaveform
-from sim_backend.wire.firmware import helios, lasercube
+from sim_backend.wire.firmware import helios
 from sim_backend.wire.firmware.dac_model import DacHistory, DacModel
-from sim_backend.wire.serve.wire_server import Fault, FaultSchedule
 from tests.campaigns.outcomes import Ending, ending
+from tests.wire import lasercube
+from tests.wire.faults import Fault, FaultSchedule, FaultyUsb
 from tests.wire.scanners import Plugged, finish, open_scanner, plug
-from tests.wire.usb.faulty_usb import FaultyUsb
 
 POINTS, LINE_POINTS, RATE_HZ = 700, 50, 25_000.0
 DEADLINE_S = 30.0

@@ -17,8 +17,8 @@ from drivers.spads.spad512s import Spad512s, Spad512sConfig
 from drivers.spads.spad512s_line import Deadlines
 from sim_backend.wire.firmware.spad512s import Spad512sModel
 from sim_backend.wire.serve.tcp import TcpServer
-from sim_backend.wire.serve.wire_server import Fault, FaultSchedule
 from tests.campaigns.outcomes import Ending, ending
+from tests.wire.faults import Fault, FaultSchedule, FaultyTcpServer
 
 KINDS = tuple(kind for kind in Fault if kind is not Fault.CORRUPTED)
 REQUEST = SpadRequest(Fraction(50_000), 20e-6, "burst", block_frames=2)
@@ -45,7 +45,7 @@ def sequence(seed: int) -> Ending:
         model.fail_at_byte = rng.randrange(n_frames * 32_768)
 
     def act() -> str:
-        with TcpServer(model, faults=schedule) as server:
+        with FaultyTcpServer(model, faults=schedule) as server:
             return _take(server, n_frames)
 
     ended = ending(act, time.monotonic, DEADLINE_S)

@@ -121,7 +121,7 @@ def _open_and_run(device: FaultyModel, rng: random.Random, clock: VirtualClock) 
             reader = ring.reader("campaign")
             spad.start(n_frames)
             try:
-                _fill_to_the_end(spad, ring, lambda: bus.unplug(attached) if device.unplug_now else None)
+                _fill_to_the_end(spad, ring, lambda: attached.unplug() if device.unplug_now else None)
             finally:
                 spad.stop()
                 ring.finish()

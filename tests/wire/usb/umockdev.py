@@ -30,7 +30,7 @@ from pathlib import Path
 from typing import Self
 
 from drivers.clock import NS_PER_S, Clock
-from sim_backend.wire.serve.usb_model import SPEED_MBIT, AttachedDevice, Setup, UsbFailure, UsbModel
+from sim_backend.wire.serve.usb_model import AttachedDevice, Setup, UsbFailure, UsbModel
 
 _REQUEST, _DONE, _READ_MEMORY, _WRITE_MEMORY = 1, 3, 5, 6
 _MESSAGE = struct.Struct("=QQQ")
@@ -270,7 +270,7 @@ def write_tree(device: AttachedDevice, root: Path) -> Path:
         ),
         "busnum": f"{device.bus}\n",
         "devnum": f"{device.address}\n",
-        "speed": f"{SPEED_MBIT[spec.speed]}\n",
+        "speed": f"{ {'full': 12, 'high': 480, 'super': 5000}[spec.speed] }\n",
         "bConfigurationValue": f"{device.configuration}\n",
     }
     for file, text in texts.items():
