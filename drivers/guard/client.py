@@ -15,7 +15,7 @@ import time
 from collections.abc import Mapping, Sequence
 from dataclasses import asdict
 from pathlib import Path
-from typing import Any, ClassVar, Self
+from typing import Any, ClassVar, Self, TypeVar, cast
 
 from drivers.errors import DeviceError, DeviceTimeout, GuardLost
 from drivers.guard.channel import Channel, Heartbeat, Message, error_from, plain_ports
@@ -106,6 +106,9 @@ class GuardedSync(_Guarded, SyncSource):
         return SyncStatus(**self._ask("status"))
 
 
+_Proxy = TypeVar("_Proxy", GuardedLaser, GuardedSync)
+
+
 def _plain(pulses: Sequence[Pulse]) -> list[list[Any]]:
     return [[pulse.outputs, pulse.duration_s, pulse.held] for pulse in pulses]
 
@@ -158,7 +161,8 @@ class Guard:
         self._opening = {slot: threading.Event() for slot in configs}
         self._proxies: dict[str, Any] = {}
         self._armed = False
-        self._failure: DeviceError | None = None
+        self.failure: DeviceError | None = None
+        """The reason why the guard switched the light off, or `GuardLost`; None while all is well."""
         self._lost = threading.Event()
         self._rescued = threading.Event()
         self._outcome = ""
@@ -187,19 +191,12 @@ class Guard:
     @property
     def laser(self) -> LineLaser:
         """The guarded laser. Waits until it is open; raises the error if opening it failed."""
-        proxy: LineLaser = self._proxy("laser", GuardedLaser)
-        return proxy
+        return self._proxy("laser", GuardedLaser)
 
     @property
     def sync(self) -> SyncSource:
         """The guarded sync source. Waits until it is open; raises the error if opening it failed."""
-        proxy: SyncSource = self._proxy("sync", GuardedSync)
-        return proxy
-
-    @property
-    def failure(self) -> DeviceError | None:
-        """The reason why the guard switched the light off, or `GuardLost`; None while all is well."""
-        return self._failure
+        return self._proxy("sync", GuardedSync)
 
     @property
     def lost(self) -> bool:
@@ -217,8 +214,8 @@ class Guard:
         """
         self._heartbeat.waited_s = 0.0
         self._heartbeat.frame = frame
-        if self._failure is not None:
-            raise self._failure
+        if self.failure is not None:
+            raise self.failure
 
     def wait(self, waited_s: float) -> None:
         """Report for how long the SPAD has been asked for frames without giving any. Call it on the source thread."""
@@ -234,8 +231,8 @@ class Guard:
         Raises `GuardLost` if the guard is gone. Methods that make a device safe first wait until the application has
         tried to do so itself.
         """
-        if self._failure is not None and verb in _ENABLING:
-            raise self._failure
+        if self.failure is not None and verb in _ENABLING:
+            raise self.failure
         self._armed = self._armed or verb == "arm"
         number = next(self._numbers)
         inbox: queue.SimpleQueue[Message | None] = queue.SimpleQueue()
@@ -282,7 +279,7 @@ class Guard:
         """Close, whatever happened."""
         self.close()
 
-    def _proxy(self, slot: str, make: Any) -> Any:
+    def _proxy(self, slot: str, make: type[_Proxy]) -> _Proxy:
         if slot not in self._opening:
             raise DeviceError(f"{slot}: not guarded; open it by itself")
         if not self._opening[slot].wait(OPEN_S):
@@ -291,7 +288,7 @@ class Guard:
         with self._lock:
             if slot not in self._proxies:
                 self._proxies[slot] = make(self, about)
-            return self._proxies[slot]
+            return cast(_Proxy, self._proxies[slot])
 
     def _told(self, answer: Message | None, verb: str) -> Message:
         """The answer, unless it is an error, or there is none since the guard is gone."""
@@ -345,7 +342,7 @@ class Guard:
             self._opened[message["opened"]] = message
             self._opening[message["opened"]].set()
         elif "tripped" in message:
-            self._failure = error_from(message["tripped"])
+            self.failure = error_from(message["tripped"])
         elif "id" in message:
             with self._lock:
                 inbox = self._answers.get(message["id"])
@@ -359,7 +356,7 @@ class Guard:
         if self._parted:
             self._lost.set()
         else:
-            self._failure = self._failure or GuardLost("the process that guards the laser is gone; check the laser")
+            self.failure = self.failure or GuardLost("the process that guards the laser is gone; check the laser")
             self._lost.set()
             self._release()
             sys.setswitchinterval(_RESCUE_SWITCH_S)

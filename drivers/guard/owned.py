@@ -18,7 +18,7 @@ from drivers.errors import DeviceError
 from drivers.interfaces import DeviceState, LineLaser, Pulse, SyncSource
 from drivers.registry import Surroundings, lookup
 from drivers.transports.endpoints import Endpoint
-from drivers.transports.tap import TapFile
+from drivers.transports.tap import Tap, TapFile
 
 Job = Callable[[], object]
 
@@ -77,7 +77,7 @@ class Owned:
         self._trouble = ""
         kind = lookup(slot, config["kind"])
         endpoints = {name: Endpoint(address) for name, address in ports.items()}
-        self._tap = None if tap is None else TapFile(**tap).tap(slot)
+        self._tap = None if tap is None else Tap(TapFile(**tap), slot)
         surroundings = Surroundings(SystemClock(), None, 0, endpoints, self._tap)
         model = kind.config.model_validate(config)
         self._create = partial(kind.create, model, surroundings)

@@ -59,33 +59,25 @@ class FrameWatch:
 
     def __init__(self, limits: GuardLimits) -> None:
         self.limits = limits
-        self._watching = False
-        self._begun = False
-        self._last = 0
-        self._silent_s = 0.0
-
-    @property
-    def watching(self) -> bool:
+        self.watching = False
         """Whether frames are expected."""
-        return self._watching
-
-    @property
-    def last(self) -> int:
+        self.last = 0
         """The last frame number seen."""
-        return self._last
+        self._begun = False
+        self._silent_s = 0.0
 
     @property
     def quiet(self) -> bool:
         """Whether the next frame is later than allowed for an application that sleeps."""
-        return self._watching and self._begun and self._silent_s > self.limits.frames_within_s
+        return self.watching and self._begun and self._silent_s > self.limits.frames_within_s
 
     def start(self, frame: int) -> None:
         """Note that the gate may open from now on; `frame` is the last number reported before."""
-        self._last, self._begun, self._silent_s, self._watching = frame, False, 0.0, True
+        self.last, self._begun, self._silent_s, self.watching = frame, False, 0.0, True
 
     def stop(self) -> None:
         """Note that the gate is low."""
-        self._watching = False
+        self.watching = False
 
     def look(
         self, elapsed_s: float, frame: int, stopped: bool, busy: Callable[[], bool], waited_s: float = 0.0
@@ -98,10 +90,10 @@ class FrameWatch:
         """
         if stopped:
             return "is stopped"
-        if not self._watching:
+        if not self.watching:
             return None
-        if frame != self._last:
-            self._last, self._begun, self._silent_s = frame, True, 0.0
+        if frame != self.last:
+            self.last, self._begun, self._silent_s = frame, True, 0.0
             return None
         self._silent_s += min(elapsed_s, MAX_STEP_S)
         limits = self.limits
@@ -117,7 +109,6 @@ class FrameWatch:
         return f"took no frame for {self._silent_s * 1e3:.0f} ms after frame {frame}"
 
 
-_STOPPED = ("T", "t")
 _AT_WORK = ("R", "D")
 """States of a thread at work: running or waiting for a processor; waiting for a disk."""
 _BUSY_SHARE = 0.15
@@ -145,10 +136,8 @@ class WatchedProcess:
         if hasattr(os, "pidfd_open"):
             try:
                 self.handle = os.pidfd_open(pid)
-            except ProcessLookupError:
-                self._ended = True
-            except OSError:
-                self.handle = None
+            except OSError as error:
+                self._ended = isinstance(error, ProcessLookupError)
 
     @property
     def ended(self) -> bool:
@@ -162,7 +151,7 @@ class WatchedProcess:
     @property
     def stopped(self) -> bool:
         """Whether the process is stopped by a signal or a debugger."""
-        return _state(f"/proc/{self._pid}/stat") in _STOPPED
+        return _state(f"/proc/{self._pid}/stat") in ("T", "t")
 
     def note_progress(self) -> None:
         """Count work from now on."""

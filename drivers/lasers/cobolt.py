@@ -133,15 +133,17 @@ SCPI = Dialect(
 DIALECTS = {"06-MLD": MLD, "06-01": SCPI}
 
 
+FAMILIES = {
+    "06-DPL": r"-06-(5|9).*-\d{3,4}(-C)?$",  # in either language its power follows a gate up to 1 kHz only
+    "06-01": r"-06-.*-1\d{3}(-C)?$",
+    "06-MLD": r"-06-0",
+}
+"""Model numbers of each family; the first one that fits, sorted as in pycobolt."""
+
+
 def classify(model: str) -> str:
-    """The laser family of a model number, sorted as in pycobolt: "06-01", "06-MLD", "06-DPL" or "unknown"."""
-    if re.search(r"-06-(5|9).*-\d{3,4}(-C)?$", model):
-        return "06-DPL"  # in either language its power follows a gate up to 1 kHz only
-    if re.search(r"-06-.*-1\d{3}(-C)?$", model):
-        return "06-01"
-    if re.search(r"-06-0", model):
-        return "06-MLD"
-    return "unknown"
+    """The laser family of a model number; "unknown" if it is of none."""
+    return next((family for family, numbers in FAMILIES.items() if re.search(numbers, model)), "unknown")
 
 
 FAULTS = {1: "temperature", 3: "interlock was open", 4: "constant power timed out"}
@@ -319,7 +321,13 @@ def _identify(config: CoboltConfig, line: Dialogue) -> CoboltLaser:
         raise DeviceFault(
             f"cobolt laser on {config.port} does not know its model, as -04- types do not; use an 06-01 laser"
         ) from None
-    dialect = _dialect(model)
+    family = classify(model)
+    if family == "06-DPL":
+        raise DeviceFault(
+            f"cobolt laser {model} is an 06-DPL: its power follows a gate up to 1 kHz only; use an 06-MLD"
+        )
+    if family not in DIALECTS:
+        raise DeviceFault(f"cobolt laser {model} is no 06-01 type; this driver runs 06-MLD and newer 06-01 lasers")
     serial = line.ask_surely("sn?", NAME)
     require_serial_number("cobolt", config, serial)
     limit_w = float(line.ask_surely("gmlp?", NUMBER)) * 1e-3
@@ -327,18 +335,7 @@ def _identify(config: CoboltConfig, line: Dialogue) -> CoboltLaser:
         raise ProtocolError(f"{line.name} says that its most power is {limit_w:g} W; check its cable and firmware")
     autostart = line.ask_surely("@cobas?", FLAG) == "1"
     limits = LaserLimits(0.0, min(config.max_power, limit_w))
-    return CoboltLaser(line, dialect, f"Cobolt {model} {serial}", limits, autostart)
-
-
-def _dialect(model: str) -> Dialect:
-    family = classify(model)
-    if family in DIALECTS:
-        return DIALECTS[family]
-    if family == "06-DPL":
-        raise DeviceFault(
-            f"cobolt laser {model} is an 06-DPL: its power follows a gate up to 1 kHz only; use an 06-MLD"
-        )
-    raise DeviceFault(f"cobolt laser {model} is no 06-01 type; this driver runs 06-MLD and newer 06-01 lasers")
+    return CoboltLaser(line, DIALECTS[family], f"Cobolt {model} {serial}", limits, autostart)
 
 
 def _off(config: CoboltConfig) -> bytes:

@@ -69,10 +69,10 @@ class SerialLaser(LineLaser):
     @property
     def port_lost(self) -> bool:
         """Whether the port is gone, found out without sending anything. May be called from any thread."""
-        return self._line.port_lost
+        return self._line.port.lost
 
     def _do_close(self) -> None:
-        self._line.close()
+        self._line.port.close()
 
 
 _Laser = TypeVar("_Laser", bound=SerialLaser)

@@ -126,8 +126,9 @@ class Cursor:
     def __init__(self, recording: RunRecording, run: RecordedRun, n_frames: int | None, *, by_block: bool) -> None:
         begins = run.entries["first_frame"].astype(np.int64)
         self._begins = begins if n_frames is None else begins[begins < n_frames]
-        self._end_frame = run.end_frame if n_frames is None else min(n_frames, run.end_frame)
-        self._blocks = cast(Generator[FrameBlock, None, None], recording.blocks(run, None, self._end_frame))
+        self.end_frame = run.end_frame if n_frames is None else min(n_frames, run.end_frame)
+        """One past the last frame there is."""
+        self._blocks = cast(Generator[FrameBlock, None, None], recording.blocks(run, None, self.end_frame))
         self._ahead: deque[FrameBlock] = deque()
         self._at = 0
         self._taken = 0
@@ -143,10 +144,6 @@ class Cursor:
     def over(self) -> bool:
         """Whether no frame is left."""
         return not self._look_ahead(0)
-
-    def ends_with(self, block: FrameBlock, end: int) -> bool:
-        """Whether the frames before `end` of this block are the last ones."""
-        return block.header.first_frame + end >= self._end_frame
 
     def gather(self, most: int, *, to_marker: bool) -> list[Piece]:
         """The next consecutive frames, at most `most`. With `to_marker` they end with the first scan marker."""
@@ -206,18 +203,13 @@ _WHOLE = np.dtype((np.void, FRAME_RECORD.itemsize))
 _COMPUTED = BlockFlag.FIRST | BlockFlag.LAST | BlockFlag.LOST_BEFORE
 
 
-def _a_clock(value: str) -> str:
-    ReplayClock.parse(value)
-    return value
-
-
 class ReplaySpadConfig(KindConfig):
     """Config of a recording that takes the place of the SPAD array."""
 
     kind: Literal["replay"] = "replay"
     recording: Path | None = None
     """Folder of a run taken with --record, relative to this file; `rig replay RUN` fills it in."""
-    clock: Annotated[str, AfterValidator(_a_clock)] = "realtime"
+    clock: Annotated[str, AfterValidator(lambda text: ReplayClock.parse(text) and text)] = "realtime"
     """Speed: realtime, max, step, or a multiple of real time: x4, x0.1."""
     loop: bool = False
     """Whether to begin again behind the last frame."""
@@ -389,7 +381,7 @@ class ReplaySpad(SpadArray):
             flags |= block.header.flags & ~_COMPUTED
         flags |= BlockFlag.FIRST if self._published == 0 else BlockFlag(0)
         flags |= BlockFlag.LOST_BEFORE if lost > self._lost_at_last else BlockFlag(0)
-        flags |= BlockFlag.LAST if reading.ends_with(last, end) else BlockFlag(0)
+        flags |= BlockFlag.LAST if last.header.first_frame + end >= reading.end_frame else BlockFlag(0)
         header = replace(
             first.header,
             flags=flags,

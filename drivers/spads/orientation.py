@@ -4,7 +4,7 @@ A quarter turn transposes the bits of every 8x8 pixels inside a 64-bit word (H. 
 7-3) and then moves whole bytes, without unpacking anything. Speed: about 0.5 GB/s on one core.
 """
 
-from typing import Literal, get_args
+from typing import Literal
 
 import numpy as np
 from numpy.typing import NDArray
@@ -36,8 +36,6 @@ def turn_packed(bits: NDArray[np.uint8], turn_deg: QuarterTurn, out: NDArray[np.
 
     Most significant bit = leftmost pixel. Width and height are multiples of 8. `out` must not overlap `bits`.
     """
-    if turn_deg not in get_args(QuarterTurn):
-        raise ValueError(f"a turn by {turn_deg} degrees; frames turn by 0, 90, 180 or 270")
     for first in range(0, len(bits), _BATCH_FRAMES):
         _turn(bits[first : first + _BATCH_FRAMES], turn_deg, out[first : first + _BATCH_FRAMES])
 

@@ -209,7 +209,7 @@ class SpbUsb(SpadArray):
     def _has_ended(self) -> bool:
         """Whether the device runs no more: then its last block got lost."""
         self._heard_at = self._now_s()
-        return self._control.has_acks and self._control.read(Register.STATE) not in (
+        return self._control.ack_in is not None and self._control.read(Register.STATE) not in (
             SensorState.RUNNING,
             SensorState.DRAINING,
         )

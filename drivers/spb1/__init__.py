@@ -4,12 +4,12 @@ from drivers.spb1.layout import ALIGN as ALIGN
 from drivers.spb1.layout import HEADER_BYTES as HEADER_BYTES
 from drivers.spb1.layout import TRAILER_BYTES as TRAILER_BYTES
 from drivers.spb1.layout import BlockLayout as BlockLayout
+from drivers.spb1.layout import block_parts as block_parts
 from drivers.spb1.layout import block_views as block_views
 from drivers.spb1.layout import frames_per_block as frames_per_block
+from drivers.spb1.layout import seal_block as seal_block
 from drivers.spb1.reader import Damage as Damage
 from drivers.spb1.reader import Placed as Placed
 from drivers.spb1.reader import parse_block as parse_block
 from drivers.spb1.reader import walk_blocks as walk_blocks
 from drivers.spb1.reader import walk_placed as walk_placed
-from drivers.spb1.writer import block_parts as block_parts
-from drivers.spb1.writer import seal_block as seal_block

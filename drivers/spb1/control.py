@@ -165,13 +165,6 @@ def read_acks(data: bytes) -> list[Ack]:
     return acks
 
 
-def require_ok(label: str, command: Command, ack: Ack) -> None:
-    """Raises `DeviceFault` if the acknowledgement says that the command was refused."""
-    if ack.status != AckStatus.OK:
-        why, name = _REFUSALS.get(ack.status, f"answers status {ack.status}"), Op(command.op).name
-        raise DeviceFault(f"{label}: {name} 0x{command.address:04x} = {command.value}: the device {why}")
-
-
 _REFUSALS: Final[dict[int, str]] = {
     AckStatus.UNKNOWN_OP: "does not know it",
     AckStatus.BAD_ADDRESS: "has no such register",
@@ -209,8 +202,8 @@ TAP_PORT = "control"
 class ControlChannel:
     """The control plane over a link. For use by one thread at a time.
 
-    ack_in: the endpoint of acknowledgements, None if they come as blocks. tap: notes commands and acknowledgements, but
-    not what a run left in front of them.
+    ack_in: the endpoint of acknowledgements, None if they come as blocks, which cannot be read while a run streams.
+    tap: notes commands and acknowledgements, but not what a run left in front of them.
     """
 
     def __init__(
@@ -220,7 +213,7 @@ class ControlChannel:
         self._clock = clock
         self._tap = tap
         self._command_out = command_out
-        self._ack_in = ack_in
+        self.ack_in = ack_in
         self._stream_in = stream_in
         self._request_id = 0
         self._received: list[Ack] = []
@@ -230,11 +223,6 @@ class ControlChannel:
     def now_s(self) -> float:
         """The present time on the clock used for deadlines."""
         return self._clock.now_ns() / NS_PER_S
-
-    @property
-    def has_acks(self) -> bool:
-        """Whether acknowledgements can be read while a run streams."""
-        return self._ack_in is not None
 
     def read(self, register: int) -> int:
         """The value of a register."""
@@ -269,7 +257,7 @@ class ControlChannel:
 
     def send_in_run(self, op: Op, value: int = 0) -> None:
         """Send one command while the stream runs. Waits for the answer unless it comes in the stream."""
-        if self._ack_in is not None:
+        if self.ack_in is not None:
             self.send(op, value)
         else:
             self._tell([self._command(op, 0, value)])
@@ -312,7 +300,10 @@ class ControlChannel:
             ends_at = self.now_s() + _ANSWER_S
             for command in commands:
                 ack = self._answer(command, ends_at)
-                require_ok(self._link.label, command, ack)
+                if ack.status != AckStatus.OK:
+                    why, name = _REFUSALS.get(ack.status, f"answers status {ack.status}"), Op(command.op).name
+                    where = f"{self._link.label}: {name} 0x{command.address:04x} = {command.value}"
+                    raise DeviceFault(f"{where}: the device {why}")
                 acks.append(ack)
         return acks
 
@@ -337,8 +328,8 @@ class ControlChannel:
                     self.on_wait(slice_s)
 
     def _read_acks(self, left_s: float) -> list[Ack]:
-        if self._ack_in is not None:
-            acks = self._link.read(self._ack_in, _ACK_READ_BYTES, left_s)
+        if self.ack_in is not None:
+            acks = self._link.read(self.ack_in, _ACK_READ_BYTES, left_s)
             self._note(IN, acks)
             return read_acks(acks)
         data = np.frombuffer(self._link.read(self._stream_in, ACK_BLOCK_BYTES, left_s), np.uint8)

@@ -63,11 +63,6 @@ def compile_program(pulses: Sequence[Pulse], repeats: int, board: ProgramLimits)
     return np.concatenate([np.tile(period, repeats), end])
 
 
-def most_repeats(pulses: Sequence[Pulse], board: ProgramLimits) -> int:
-    """Number of periods that fit into the board's memory beside the words at the end."""
-    return (board.max_words - 3) // len(sliced(pulses))
-
-
 def _words(pulses: Sequence[Pulse], board: ProgramLimits) -> NDArray[np.void]:
     return np.array([(pulse.outputs, _cycles(index, pulse, board)) for index, pulse in enumerate(pulses)], WORD)
 
@@ -157,7 +152,7 @@ class PrawnDo(SyncSource):
             self._set_clock()
             self._line.command("cls")
         except BaseException:
-            self._line.close()
+            self._line.port.close()
             raise
 
     @property
@@ -174,11 +169,11 @@ class PrawnDo(SyncSource):
     @property
     def port_lost(self) -> bool:
         """Whether the port is gone, found out without sending anything. May be called from any thread."""
-        return self._line.port_lost
+        return self._line.port.lost
 
     def most_repeats(self, pulses: Sequence[Pulse]) -> int:
-        """Number of times that `pulses` fit into the board's memory, as the firmware has no loops."""
-        return most_repeats(pulses, self._board)
+        """Number of times that `pulses` fit into the board's memory beside the words at the end: it has no loops."""
+        return (self._board.max_words - 3) // len(sliced(pulses))
 
     def _do_program(self, pulses: Sequence[Pulse], repeats: int) -> None:
         words = compile_program(pulses, repeats, self._board)
@@ -216,7 +211,7 @@ class PrawnDo(SyncSource):
             return SyncStatus(_STATES[state], self._line.pins() if state in IDLE else None)
 
     def _do_close(self) -> None:
-        self._line.close()
+        self._line.port.close()
 
     def _identify(self) -> tuple[str, int]:
         """Firmware, and words that the board holds; raises ProtocolError if its firmware is too old."""

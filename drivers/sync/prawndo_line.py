@@ -52,11 +52,11 @@ USUAL_TIMING = PrawnDoTiming()
 
 
 class PrawnDoLine:
-    """Sends commands and queries, one at a time, from any thread. Owns the port."""
+    """Sends commands and queries, one at a time, from any thread. Close the `port` to give it back."""
 
     def __init__(self, name: str, port: SerialPort, timing: PrawnDoTiming) -> None:
         self._name = name
-        self._port = port
+        self.port = port
         self.clock = port.clock
         """The clock of its deadlines."""
         self._timing = timing
@@ -67,15 +67,6 @@ class PrawnDoLine:
         self._serial_number = 0
         self._owed_bytes = 0
         self._last_heard = ""
-
-    @property
-    def port_lost(self) -> bool:
-        """Whether the port has hung up. May be called from any thread."""
-        return self._port.lost
-
-    def close(self) -> None:
-        """Give the port back."""
-        self._port.close()
 
     def connect(self, most_words: int) -> None:
         """Take all outputs low before anything else is asked, whatever state an earlier host left the board in.
@@ -88,7 +79,7 @@ class PrawnDoLine:
         except DeviceTimeout:
             if self._last_heard:
                 raise ProtocolError(
-                    f"{self._name}: what answers on {self._port.path} is no PrawnDO (it says "
+                    f"{self._name}: what answers on {self.port.path} is no PrawnDO (it says "
                     f"{self._last_heard[:40]!r}); correct 'port'"
                 ) from None
             self._free_wedged(most_words)
@@ -102,7 +93,7 @@ class PrawnDoLine:
         with self.lock:
             self._pay_debt()
             before, after = self._token(), self._token()
-            self._port.write(f"{before}\n{command}\n{after}\n".encode())
+            self.port.write(f"{before}\n{command}\n{after}\n".encode())
             return self._until(lambda lines: bool(lines) and after in lines[-1], before, deadline_s, urgent)[:-1]
 
     def command(self, command: str) -> None:
@@ -133,13 +124,13 @@ class PrawnDoLine:
             self._pay_debt()
             with self._in_one_piece:
                 self._owed_bytes = len(payload)  # `adm` cannot be left before all bytes have come
-                self._port.write(f"{before}\nadm 0 {len(payload) // BYTES_PER_WORD:x}\n".encode())
+                self.port.write(f"{before}\nadm 0 {len(payload) // BYTES_PER_WORD:x}\n".encode())
                 self._until(lambda lines: lines[-1] == "ready", before, self._timing.reply_s, urgent=False)
                 for at in range(0, len(payload), _CHUNK_BYTES):
                     piece = payload[at : at + _CHUNK_BYTES]
-                    self._port.write(piece)
+                    self.port.write(piece)
                     self._owed_bytes -= len(piece)
-                self._port.write(f"{after}\n".encode())
+                self.port.write(f"{after}\n".encode())
             lines = self._until(lambda lines: after in lines[-1], None, self._timing.load_s, urgent=False)[:-1]
         if lines != ["ok"]:
             raise DeviceFault(f"{self._name}: the program was answered {lines}, not ok; load it again")
@@ -155,7 +146,7 @@ class PrawnDoLine:
         try:
             if self._in_one_piece.acquire(blocking=False):  # nothing runs while a program is being loaded
                 try:
-                    self._port.write(_LOWER)
+                    self.port.write(_LOWER)
                 finally:
                     self._in_one_piece.release()
             with self.lock:
@@ -175,7 +166,7 @@ class PrawnDoLine:
                 trouble = error
             if self._now_s() > ends_at:
                 raise trouble
-            self._port.write(_LOWER)
+            self.port.write(_LOWER)
 
     def _try_to_lower(self) -> bool:
         """One round; each question has its own round trip, in which the board's second core does what it was told."""
@@ -192,18 +183,18 @@ class PrawnDoLine:
 
         Zeros are words that wait with all outputs low (5.1, pitfall 4).
         """
-        _log.warning("%s does not answer on %s; trying to end an unfinished program", self._name, self._port.path)
-        self._port.write(b"\nend\n")
+        _log.warning("%s does not answer on %s; trying to end an unfinished program", self._name, self.port.path)
+        self.port.write(b"\nend\n")
         piece = bytes(BYTES_PER_WORD * _CHUNK_BYTES)
         for _ in range(BYTES_PER_WORD * most_words // len(piece) + 2):
-            self._port.write(piece + b"\n")
+            self.port.write(piece + b"\n")
             try:
                 self.transact("sts", 2 * self._timing.hasty_s)
             except (DeviceTimeout, ProtocolError):
                 continue
             self.lower()
             return
-        raise DeviceTimeout(f"{self._name} does not answer on {self._port.path}; unplug it, plug it in and start again")
+        raise DeviceTimeout(f"{self._name} does not answer on {self.port.path}; unplug it, plug it in and start again")
 
     def _ask_twice(self, command: str, parse: Callable[[str], _T], deadline_s: float | None, urgent: bool) -> _T:
         """Ask until two answers in a row agree: a flipped bit makes a low gate of a high one."""
@@ -239,12 +230,12 @@ class PrawnDoLine:
             if self._gate_first.is_set() and not urgent:
                 raise DeviceFault(f"{self._name}: given up, since the gate has to go low")
             try:
-                self._last_heard = self._port.read_line(_CRLF, _SLICE_S).decode("latin-1").strip()
+                self._last_heard = self.port.read_line(_CRLF, _SLICE_S).decode("latin-1").strip()
                 return self._last_heard
             except DeviceTimeout:
                 if self._now_s() >= ends_at:
                     raise DeviceTimeout(
-                        f"{self._name} did not answer within {deadline_s:g} s on {self._port.path}; check its cable"
+                        f"{self._name} did not answer within {deadline_s:g} s on {self.port.path}; check its cable"
                     ) from None
 
     def _now_s(self) -> float:
@@ -259,4 +250,4 @@ class PrawnDoLine:
         """Fill up a program that was broken off, with words that wait low, so that commands are heard again."""
         if self._owed_bytes:
             owed, self._owed_bytes = self._owed_bytes, 0
-            self._port.write(bytes(owed) + b"\n")
+            self.port.write(bytes(owed) + b"\n")

@@ -107,7 +107,7 @@ class QueuedLink:
                 self._handle = found.open()
                 for interface in interfaces:
                     self._handle.claimInterface(interface)
-                self.endpoints = frozenset(_endpoints(found))
+                self.endpoints = frozenset(end.getAddress() for setting in found.iterSettings() for end in setting)
         except BaseException:
             self.close()
             raise
@@ -272,12 +272,6 @@ class _Read:
         self.got = transfer.getActualLength()
         self.status = transfer.getStatus()
         self.over = True
-
-
-def _endpoints(device: Any) -> Iterator[int]:
-    for setting in device.iterSettings():
-        for endpoint in setting:
-            yield endpoint.getAddress()
 
 
 BulkLink = PlainLink | QueuedLink

@@ -87,11 +87,11 @@ class Framing(Protocol):
 
 
 class Dialogue:
-    """Sends commands and queries, one at a time, from any thread. Owns the port."""
+    """Sends commands and queries, one at a time, from any thread. Close the `port` to give it back."""
 
     def __init__(self, name: str, port: SerialPort, framing: Framing, clock: Clock, timing: LineTiming) -> None:
         self.name = name
-        self._port = port
+        self.port = port
         self._framing = framing
         self._clock = clock
         self._timing = timing
@@ -170,38 +170,29 @@ class Dialogue:
                 raise refused
         raise DeviceFault(f"{self.name}: told {command!r}, {query!r} says {reply}; power-cycle the device")
 
-    @property
-    def port_lost(self) -> bool:
-        """Whether the port has hung up. May be called from any thread."""
-        return self._port.lost
-
-    def close(self) -> None:
-        """Give the port back."""
-        self._port.close()
-
     def _once(self, command: str) -> str:
         """One command and its reply."""
         passed_s = (self._clock.now_ns() - self._quiet_since_ns) / NS_PER_S
         self._clock.sleep(self._timing.gap_s - passed_s)
-        if self._port.reset_input().strip():  # a reply that nobody asked for, and perhaps its other half comes yet
-            self._port.drain(self._timing.quiet_s, self._timing.drain_s)
-        self._port.write(self._framing.encode(command))
+        if self.port.reset_input().strip():  # a reply that nobody asked for, and perhaps its other half comes yet
+            self.port.drain(self._timing.quiet_s, self._timing.drain_s)
+        self.port.write(self._framing.encode(command))
         try:
-            return self._framing.read(command, self._read_line)
+            reply_s = self._timing.reply_s
+            return self._framing.read(
+                command, lambda: self.port.read_line(b"\n", reply_s).decode("ascii", "replace").strip()
+            )
         finally:
             self._quiet_since_ns = self._clock.now_ns()
-
-    def _read_line(self) -> str:
-        return self._port.read_line(b"\n", self._timing.reply_s).decode("ascii", "replace").strip()
 
     def _resync(self, quiet_s: float) -> None:
         """Drop what comes late, then ask what only one reply can answer."""
         for attempt in range(_ATTEMPTS):
-            self._port.drain(quiet_s, self._timing.drain_s)
+            self.port.drain(quiet_s, self._timing.drain_s)
             ping = self._framing.ping
             try:
                 # Quiet afterwards: that was the answer to this question and not to one before.
-                if self._framing.greets(self._once(ping)) and not self._port.drain(quiet_s, self._timing.drain_s):
+                if self._framing.greets(self._once(ping)) and not self.port.drain(quiet_s, self._timing.drain_s):
                     return
             except DeviceTimeout:
                 if attempt == _ATTEMPTS - 1:

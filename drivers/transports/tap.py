@@ -40,10 +40,6 @@ class TapFile:
         """A new tap file whose time 0 is now."""
         return cls(str(path.absolute()), time.monotonic_ns())
 
-    def tap(self, device: str) -> "Tap":
-        """The tap of one device, by its slot in the rig."""
-        return Tap(self, device)
-
     def sync(self) -> None:
         """Force what was written onto the disk."""
         try:
@@ -62,6 +58,7 @@ class Tap:
     """
 
     def __init__(self, file: TapFile, device: str) -> None:
+        """device: its slot in the rig."""
         self._file = file
         self._device = device
         self._lines: _Lines = SimpleQueue()

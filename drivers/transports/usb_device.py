@@ -11,11 +11,11 @@ ESHUTDOWN. A read shorter than a packet overflows and loses the packet. The sum 
 
 import array
 import errno
-from collections.abc import Callable, Iterator, Mapping
+from collections.abc import Iterator, Mapping
 from contextlib import contextmanager, suppress
 from dataclasses import dataclass, field
 from threading import RLock
-from typing import Any, Self
+from typing import Any
 
 import usb.backend.libusb1
 import usb.core
@@ -218,14 +218,6 @@ class UsbDevice:
             with suppress(usb.core.USBError, NotImplementedError):
                 usb.util.dispose_resources(self._device)
 
-    def __enter__(self) -> Self:
-        """The device itself."""
-        return self
-
-    def __exit__(self, *_: object) -> None:
-        """Close."""
-        self.close()
-
 
 def open_device(
     wanted: UsbId,
@@ -244,15 +236,14 @@ def open_device(
 
 def find_device(wanted: UsbId, address: str, backend: object | None = None) -> UsbListing:
     """The one device that an address means. Errors as in `open_device`, except for those of claiming it."""
-    return _choose(attached(wanted, backend), wanted, address)
-
-
-def _choose(listings: list[UsbListing], wanted: UsbId, address: str) -> UsbListing:
+    listings = attached(wanted, backend)
     ids = f"{wanted.vendor:04x}:{wanted.product:04x}"
     if not listings:
         raise DeviceNotFound(f"{wanted.label}: no USB device {ids} is attached; plug it in and switch it on")
-    fits = _matcher(address)
-    chosen = [one for one in listings if fits(one)]
+    key, _, value = address.removeprefix("usb:").partition("=")
+    if address != "usb" and not (address.startswith("usb:") and key in ("serial", "path") and value):
+        raise DeviceError(f"port {address!r} is no USB address; write usb, usb:serial=ABC or usb:path=1-2")
+    chosen = [one for one in listings if address == "usb" or getattr(one, key) == value]
     choices = ", ".join(one.address for one in listings)
     if not chosen:
         hidden = any(one.serial is None and one.product_name is None for one in listings)
@@ -262,18 +253,6 @@ def _choose(listings: list[UsbListing], wanted: UsbId, address: str) -> UsbListi
     if len(chosen) > 1:
         raise DeviceError(f"{wanted.label}: {len(chosen)} are attached; set port to one of {choices}")
     return chosen[0]
-
-
-def _matcher(address: str) -> Callable[[UsbListing], bool]:
-    sort, _, which = address.partition(":")
-    key, _, value = which.partition("=")
-    if address == "usb":
-        return lambda one: True
-    if sort == "usb" and key == "serial" and value:
-        return lambda one: one.serial == value
-    if sort == "usb" and key == "path" and value:
-        return lambda one: one.path == value
-    raise DeviceError(f"port {address!r} is no USB address; write usb, usb:serial=ABC or usb:path=1-2")
 
 
 def _listing(device: Any) -> UsbListing:

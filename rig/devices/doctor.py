@@ -77,16 +77,6 @@ class DarkLook:
     counters: SpadCounters
     triggered: bool
 
-    @property
-    def scans(self) -> int:
-        """Number of scan markers."""
-        return _count(self.records, Mark.SCAN)
-
-    @property
-    def line_markers(self) -> int:
-        """Number of line markers, of all sweeps and parts of sweeps."""
-        return _count(self.records, Mark.LINE)
-
     def lines(self, plan: ScanPlan) -> LineMarkers | None:
         """The line markers after the first scan marker, as far as they were seen; None if there are too few."""
         marks = self.records["marks"].astype(np.int64)
@@ -196,15 +186,9 @@ def _health(rig: OpenRig) -> list[str]:
 
 def _laser(rig: OpenRig) -> Finding:
     status = rig.laser.status
-    trouble = [
-        text
-        for bad, text in (
-            (not status.interlock_closed, "interlock open"),
-            (status.fault is not None, f"fault {status.fault}"),
-            (status.key_on is False, "key off"),
-        )
-        if bad
-    ]
+    trouble = [] if status.interlock_closed else ["interlock open"]
+    trouble += [] if status.fault is None else [f"fault {status.fault}"]
+    trouble += ["key off"] if status.key_on is False else []
     state = ", ".join(trouble) or f"interlock closed, no fault, input {status.input_mode}"
     warm = "" if status.temperature_c is None else f", {status.temperature_c:.1f} C"
     most = f", up to {rig.laser.limits.max_power_w * 1e3:g} mW"
@@ -255,14 +239,14 @@ def _markers(seen: DarkLook, plan: ScanPlan) -> Finding:
     if plan.blanking is not None:
         return Finding("markers", True, "none: a scan finds its columns by a blanking pattern of the laser")
     lines = seen.lines(plan)
+    markers = f"{_count(seen.records, Mark.SCAN)} scan and {_count(seen.records, Mark.LINE)} line markers"
     if lines is None:
-        text = f"{seen.scans} scan and {seen.line_markers} line markers seen; check the scanner's marker lines"
-        return Finding("markers", False, text)
+        return Finding("markers", False, f"{markers} seen; check the scanner's marker lines")
     return Finding(
         "markers",
         lines.jitter_columns <= MOST_JITTER and abs(lines.clock_error) <= MAX_CLOCK_ERROR,
-        f"{seen.scans} scan and {seen.line_markers} line markers, {lines.rate_hz:.6g} lines a second, jitter "
-        f"{lines.jitter_columns:.3g} columns, scanner's clock {lines.clock_error * 1e6:+.0f} ppm against the SPAD's",
+        f"{markers}, {lines.rate_hz:.6g} lines a second, jitter {lines.jitter_columns:.3g} columns, scanner's clock "
+        f"{lines.clock_error * 1e6:+.0f} ppm against the SPAD's",
     )
 
 
@@ -336,12 +320,14 @@ def laser_off(config: RigConfig) -> list[str]:
     done: list[str] = []
     trouble: list[str] = []
     with open_light(config, trouble) as (sync, laser):
-        for slot, device, what in (("sync", sync, "all outputs low"), ("laser", laser, "emission off")):
-            if device is None:
-                continue
+        for slot, device, switch, what in (
+            ("sync", sync, "abort", "all outputs low"),
+            ("laser", laser, "disarm", "emission off"),
+        ):
             try:
-                (sync.abort if device is sync else laser.disarm)()  # type: ignore[union-attr]
-                done.append(f"{device.name}: {what}")
+                if device is not None:
+                    getattr(device, switch)()
+                    done.append(f"{device.name}: {what}")
             except DeviceError as error:
                 trouble.append(f"{slot}: {error}")
     if trouble:

@@ -17,7 +17,7 @@ from drivers.guard import Guard
 from drivers.interfaces import BeamScanner, LineLaser, SpadArray, SyncSource, World
 from drivers.registry import KindConfig, Surroundings, lookup
 from drivers.transports.endpoints import EMULATED_PREFIX, Endpoint
-from drivers.transports.tap import TapFile
+from drivers.transports.tap import Tap, TapFile
 from rig.config.models import RigConfig
 from rig.errors import DevicesError, UsageError
 from rig.recording.cube import cube_columns
@@ -124,13 +124,16 @@ def _open(config: RigConfig, seed: int, tap: TapFile | None, stack: ExitStack) -
     opened: dict[str, Any] = {}
     guard: Guard | None = None
     if surroundings is not None:
-        guard = _guard_of(config, surroundings.ports, tap, stack)
+        light = {slot: kind for slot in GUARDED if (kind := getattr(config, slot)).real_time}
+        guard = stack.enter_context(Guard(**light, ports=surroundings.ports, tap=tap)) if light else None
         # Closing runs backwards: the gate goes low before the laser pauses, the mirror parks and the SPAD stops.
         for slot in DEVICES:
             try:
-                opened[slot] = stack.enter_context(
-                    _open_device(slot, getattr(config, slot), _tapped(surroundings, slot, tap, stack), guard)
-                )
+                if guard is not None and slot in light:
+                    device: Any = guard.laser if slot == "laser" else guard.sync
+                else:
+                    device = _create(slot, getattr(config, slot), _tapped(surroundings, slot, tap, stack))
+                opened[slot] = stack.enter_context(device)
             except DeviceError as error:
                 devices.append(f"{slot}: {error}")
     if "laser" in opened:
@@ -175,21 +178,9 @@ def _tapped(surroundings: Surroundings, slot: str, file: TapFile | None, stack: 
     """Surroundings with a tap for a slot's device, where traffic is recorded; written once the device is closed."""
     if file is None:
         return surroundings
-    tap = file.tap(slot)
+    tap = Tap(file, slot)
     stack.callback(tap.flush)
     return replace(surroundings, tap=tap)
-
-
-def _guard_of(config: RigConfig, ports: Mapping[str, Endpoint], tap: TapFile | None, stack: ExitStack) -> Guard | None:
-    """The guard of a laser and a gate that are not simulated, at work until the rig is closed; None without such."""
-    guarded = {slot: kind for slot in GUARDED if (kind := getattr(config, slot)).real_time}
-    return stack.enter_context(Guard(**guarded, ports=ports, tap=tap)) if guarded else None
-
-
-def _open_device(slot: str, kind: KindConfig, surroundings: Surroundings, guard: Guard | None) -> Any:
-    if guard is not None and slot in GUARDED and kind.real_time:
-        return guard.laser if slot == "laser" else guard.sync
-    return _create(slot, kind, surroundings)
 
 
 def _create(slot: str, kind: KindConfig, surroundings: Surroundings) -> Any:

@@ -10,9 +10,8 @@ exposed. If the simulation takes longer than that, they wait in the SPAD's memor
 
 import os
 import threading
-from bisect import bisect_right
 from contextlib import closing
-from typing import ClassVar, Literal, Protocol
+from typing import Any, ClassVar, Literal
 
 import numpy as np
 from numpy.typing import NDArray
@@ -20,7 +19,6 @@ from pydantic import Field
 
 from drivers.errors import DeviceError
 from drivers.frames import FRAME_RECORD, packed_row_bytes
-from drivers.interfaces import OUT_GATE
 from drivers.registry import Kind, Surroundings
 from drivers.transports.endpoints import Endpoint
 from sim_backend.bench import BenchState
@@ -39,7 +37,6 @@ from sim_backend.wire.firmware.spb_usb_run import Span, SpbUsbBoard
 from sim_backend.wire.serve.serial import SerialServer
 from sim_backend.wire.serve.tcp import TcpServer
 from sim_backend.wire.serve.usb import EmulatedUsb
-from sim_backend.wire.serve.usb_model import AttachedDevice, UsbModel
 from sim_backend.world import SimulatedWorld, WorldConfig
 
 Array = NDArray[np.float64]
@@ -52,14 +49,6 @@ KEPT_S = 20.0
 """Time after which the past of gate and mirror is forgotten."""
 KEPT_FRAMES = 1_000_000_000
 """Most frames that wait for the host."""
-
-
-class UsbBus(Protocol):
-    """A USB bus, either in this process or one that other processes can use."""
-
-    def plug(self, model: UsbModel) -> AttachedDevice:
-        """Attach a model to the bus."""
-        ...
 
 
 class EmulatedWorldConfig(WorldConfig):
@@ -79,10 +68,11 @@ class EmulatedWorldConfig(WorldConfig):
 class EmulatedWorld(SimulatedWorld):
     """One scene and the devices that look at it. They are plugged in from its creation to `close`."""
 
-    def __init__(self, config: EmulatedWorldConfig, surroundings: Surroundings, bus: UsbBus | None = None) -> None:
+    def __init__(self, config: EmulatedWorldConfig, surroundings: Surroundings, bus: Any = None) -> None:
         """Raises DeviceError if the geometry or the scene cannot be used.
 
-        bus: where the USB devices are plugged in, and who closes it is its maker; by default one within this process.
+        bus: where the USB devices are plugged in by its method `plug`, and who closes it is its maker; by default an
+        `EmulatedUsb`, within this process.
         """
         super().__init__(config, surroundings)
         if self.model.row_delay_s != 0:
@@ -94,6 +84,7 @@ class EmulatedWorld(SimulatedWorld):
         clock, self._seed = surroundings.clock, surroundings.seed
         self._emission_lock = threading.Lock()
         self._emission: list[tuple[float, float]] = [(-np.inf, 0.0)]
+        """(time, power) of every change of the power in W behind an open gate."""
         self.laser = (CoboltModel if config.laser == "cobolt" else ObisModel)(on_emission=self._note_emission)
         self._draw_once()
         self.sync = PrawnDoModel(self._scan_marker, board=PICO_2)
@@ -160,43 +151,9 @@ class EmulatedWorld(SimulatedWorld):
         unknown = np.full(len(mirror), np.nan)  # of the DAC's stairs
         return BenchState(mirror, unknown, share, edge, backward, line_s, scan_s, float(power_w[0])), power_w
 
-    def light(self, from_s: float, until_s: float) -> list[tuple[float, float]]:
-        """(start, end) of every period with light (emission AND gate) in [from_s, until_s], ascending.
-
-        Times are the host's, at most until now; only the last `KEPT_S` are known.
-        """
-        with self.gate_wire.lock:
-            self.sync.advance(until_s)
-            gate = [(at, bool(word & OUT_GATE)) for at, word in self.sync.changes(from_s, until_s)]
-        emission = [(max(at, from_s), power_w > 0) for at, power_w in self.emission() if at < until_s]
-        both = sorted([(at, 0, high) for at, high in gate] + [(at, 1, emits) for at, emits in emission])
-        levels, begun_s, found = [False, False], 0.0, []
-        for at_s, which, level in [*both, (until_s, 0, False)]:
-            was_lit = all(levels)
-            levels[which] = level
-            if all(levels) and not was_lit:
-                begun_s = at_s
-            elif was_lit and not all(levels) and at_s > begun_s:
-                found.append((begun_s, at_s))
-        return found
-
-    def emission(self) -> list[tuple[float, float]]:
-        """(time, power) of every change of the power in W behind an open gate. The first entry is at -inf."""
-        with self._emission_lock:
-            return list(self._emission)
-
-    def mirror(self, time_s: Array) -> Array:
-        """Normalised command to which the scanner's output drives the mirror at times (n,)."""
-        with self.scanner_plug.lock:
-            self.scanner.advance(float(time_s[-1]))
-            return self.scanner.history.command(time_s)
-
     def _power(self, time_s: Array) -> Array:
         with self._emission_lock:
-            at = [bisect_right(self._emission, (float(t), np.inf)) - 1 for t in time_s[[0, -1]]]
-            if at[0] == at[1]:
-                return np.full(len(time_s), self._emission[at[0]][1])
-            times, power = (np.array(column) for column in zip(*self._emission, strict=True))
+            times, power = np.array(self._emission).T
         found: Array = power[np.searchsorted(times, time_s, side="right") - 1]
         return found
 

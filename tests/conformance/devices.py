@@ -17,8 +17,7 @@ from drivers.lasers.obis import ObisConfig
 from drivers.registry import Surroundings, lookup
 from drivers.sync.prawndo import PrawnDoConfig
 from sim_backend.wire.firmware.cobolt import CoboltModel
-from sim_backend.wire.firmware.dac_model import DacModel
-from sim_backend.wire.firmware.helios import HeliosModel
+from sim_backend.wire.firmware.helios import DacModel, HeliosModel
 from sim_backend.wire.firmware.obis import ObisModel
 from sim_backend.wire.serve.serial import SerialServer
 from tests.conformance.cases import LaserCase, ScannerCase, SyncCase

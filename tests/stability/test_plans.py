@@ -13,7 +13,7 @@ from hypothesis import strategies as st
 
 from calibration import CalibrationError, RigModel
 from drivers.interfaces import LEVEL_BACKWARD, ScanWaveform
-from drivers.scanners.galvo import brake, ramp
+from drivers.scanners.dac_scanner import brake, ramp
 from rig.count.blanking import PatternSearch, PatternShape, detection_probability
 from rig.errors import PlanError
 from rig.plan import waveform

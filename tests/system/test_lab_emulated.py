@@ -14,6 +14,7 @@ from rig import api
 from rig.config.overrides import configure
 from rig.devices import prepare
 from sim_backend.wire.emulated_world import KEPT_S, EmulatedWorld
+from tests.wire.scan_rig import light, mirror
 
 TRUE_EXTINCTION_PER_M = 0.087
 
@@ -62,7 +63,7 @@ def test_a_scan_over_emulated_wires_ends_in_a_depth_map_through_fog(scan_slowly,
     assert summary["fog"]["extinction_per_m"] == pytest.approx(TRUE_EXTINCTION_PER_M, abs=0.02)
     ((world, ended_s),) = worlds
     # What is known of the light is forgotten by frames, not by time: a slow machine may estimate for long after them.
-    assert world.light(ended_s - 60 * KEPT_S, ended_s)
+    assert light(world, ended_s - 60 * KEPT_S, ended_s)
     assert not [thread for thread in threading.enumerate() if thread.name.startswith("photons")]
 
 
@@ -86,6 +87,6 @@ def test_a_dry_run_opens_every_device_and_neither_moves_nor_shines(worlds):
     ((world, ended_s),) = worlds
     assert len(world.laser.commands) > 5
     assert Op.READ in [op for op, _, _ in world.spad.commands]
-    assert not any(power_w for _, power_w in world.emission())
-    assert world.light(begun_s, ended_s) == []
-    assert np.ptp(world.mirror(np.linspace(begun_s, ended_s, 1000))) == 0
+    assert not any(power_w for _, power_w in world._emission)
+    assert light(world, begun_s, ended_s) == []
+    assert np.ptp(mirror(world, np.linspace(begun_s, ended_s, 1000))) == 0

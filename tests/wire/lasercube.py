@@ -11,7 +11,7 @@ from typing import Literal
 import numpy as np
 from numpy.typing import NDArray
 
-from sim_backend.wire.firmware.dac_model import DAC_STEPS, DacModel, Played
+from sim_backend.wire.firmware.helios import DAC_STEPS, DacModel, Played
 from sim_backend.wire.serve.usb_model import AlternateSpec, DeviceSpec, EndpointSpec
 
 COMMANDS, REPLIES, SAMPLES = 0x01, 0x81, 0x03

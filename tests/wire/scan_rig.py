@@ -24,8 +24,10 @@ from typing import Any
 
 import numpy as np
 import yaml
+from numpy.typing import NDArray
 
 from drivers.clock import SystemClock
+from drivers.interfaces import OUT_GATE
 from drivers.registry import Surroundings
 from sim_backend.wire.emulated_world import EmulatedWorld, EmulatedWorldConfig
 from tests.system.small_rig import calibration
@@ -42,6 +44,34 @@ FIRST_LIGHT_S = 120.0
 
 class ScanFailedError(Exception):
     """Raised where a scan never came to light; with all that it said."""
+
+
+def light(world: EmulatedWorld, from_s: float, until_s: float) -> list[tuple[float, float]]:
+    """(start, end) of every period with light (emission AND gate) in [from_s, until_s], ascending.
+
+    Times are the host's, at most until now; only the last `KEPT_S` are known.
+    """
+    with world.gate_wire.lock:
+        world.sync.advance(until_s)
+        gate = [(at, 0, bool(word & OUT_GATE)) for at, word in world.sync.changes(from_s, until_s)]
+    with world._emission_lock:
+        emission = [(max(at, from_s), 1, power_w > 0) for at, power_w in world._emission if at < until_s]
+    levels, begun_s, found = [False, False], 0.0, []
+    for at_s, which, level in [*sorted(gate + emission), (until_s, 0, False)]:
+        was_lit = all(levels)
+        levels[which] = level
+        if all(levels) and not was_lit:
+            begun_s = at_s
+        elif was_lit and not all(levels) and at_s > begun_s:
+            found.append((begun_s, at_s))
+    return found
+
+
+def mirror(world: EmulatedWorld, time_s: NDArray[np.float64]) -> NDArray[np.float64]:
+    """Normalised command to which the scanner's output drives the mirror at times (n,)."""
+    with world.scanner_plug.lock:
+        world.scanner.advance(float(time_s[-1]))
+        return world.scanner.history.command(time_s)
 
 
 class Applications:
@@ -128,7 +158,7 @@ class ScanBench:
 
     def light(self, since_s: float) -> list[tuple[float, float]]:
         """Times of light from then to now."""
-        return self.world.light(since_s, time.monotonic())
+        return light(self.world, since_s, time.monotonic())
 
     def light_at_rest(self, since_s: float) -> list[float]:
         """Times of light on a mirror at rest from then to now, `STEP_S` each."""
@@ -136,13 +166,13 @@ class ScanBench:
         for begun_s, ended_s in self.light(since_s):
             at = np.arange(begun_s, ended_s, STEP_S)
             if len(at):
-                drive = self.world.mirror((at[:, None] - np.linspace(0, STILL_S, 5)).ravel()).reshape(len(at), -1)
+                drive = mirror(self.world, (at[:, None] - np.linspace(0, STILL_S, 5)).ravel()).reshape(len(at), -1)
                 found += at[np.ptp(drive, axis=1) == 0].tolist()
         return found
 
     def dark_s(self, since_s: float) -> float:
         """Seconds from then to the end of emission, through an open gate or not; inf: it goes on."""
-        changed_s, power_w = self.world.emission()[-1]
+        changed_s, power_w = self.world._emission[-1]
         return float("inf") if power_w else max(changed_s - since_s, 0.0)
 
 

@@ -11,8 +11,7 @@ from drivers.clock import NS_PER_S, Clock, VirtualClock
 from drivers.interfaces import LEVEL_BACKWARD, MARKER_LINE, MARKER_SCAN, BeamScanner, ScanWaveform
 from drivers.registry import Surroundings, lookup
 from drivers.transports.endpoints import Endpoint
-from sim_backend.wire.firmware.dac_model import DacModel
-from sim_backend.wire.firmware.helios import HeliosModel
+from sim_backend.wire.firmware.helios import DacModel, HeliosModel
 from sim_backend.wire.serve.usb import EmulatedUsb
 from sim_backend.wire.serve.usb_model import AttachedDevice, Stall, UsbModel
 from tests.wire.lasercube import LaserCubeModel

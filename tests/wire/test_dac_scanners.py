@@ -8,7 +8,7 @@ import pytest
 
 from drivers.clock import VirtualClock
 from drivers.errors import DeviceBusy, DeviceDisconnected, DeviceError, DeviceNotFound, DevicePermission, DeviceTimeout
-from sim_backend.wire.firmware.dac_model import DAC_STEPS, KEEP_S, DacHistory, Played
+from sim_backend.wire.firmware.helios import DAC_STEPS, KEEP_S, DacHistory, Played
 from sim_backend.wire.serve.usb import EmulatedUsb
 from tests.wire.scanners import (
     HeliosRecorder,

@@ -3,6 +3,7 @@
 import logging
 import struct
 from collections.abc import Callable
+from contextlib import closing
 from fractions import Fraction
 
 import numpy as np
@@ -62,7 +63,7 @@ def test_a_frame_of_45_mod_64_points_never_completes_in_the_firmware() -> None:
     model = HeliosModel()
     bus = EmulatedUsb(clock)
     bus.plug(model)
-    with open_device(HELIOS, "usb", {0: 1}, bus) as link:
+    with closing(open_device(HELIOS, "usb", {0: 1}, bus)) as link:
         for points, played in ((45, False), (109, False), (173, False), (44, True), (46, True)):
             model.set_interface(0, 1, clock.now_ns() / 1e9)
             model._received = b""
@@ -156,7 +157,7 @@ def test_a_frame_that_the_device_drops_in_silence_is_a_fault() -> None:
 
 def test_a_refused_frame_disarms_the_endpoint_until_the_next_status_question() -> None:
     model = HeliosModel()
-    with open_device(HELIOS, "usb", {0: 1}, plug(model, VirtualClock()).bus) as link:
+    with closing(open_device(HELIOS, "usb", {0: 1}, plug(model, VirtualClock()).bus)) as link:
         link.write(FRAMES, bytes(7 * 44) + struct.pack("<HHB", 25001, 43, 3), 0.5)  # says 43, has 44
         sound = bytes(7 * 44) + struct.pack("<HHB", 25001, 44, 3)
         with pytest.raises(DeviceTimeout):

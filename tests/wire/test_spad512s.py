@@ -115,7 +115,7 @@ def test_trap_bits_come_most_significant_first_and_frames_lie_on_their_side(tmp_
     pixels = bytearray(2 * FRAME_BYTES)
     pixels[63] = 0x01
     pixels[FRAME_BYTES + 511 * 64] = 0x80  # frame 1: left end of the last row, which comes to the bottom right
-    tap = TapFile.begin(tmp_path / CONTROL_FILE).tap("spad")
+    tap = Tap(TapFile.begin(tmp_path / CONTROL_FILE), "spad")
     with answering(2, bytes(pixels) + b"DONE", tap) as device:
         (block,) = take(device, 2)
     image = np.unpackbits(block.bits, axis=2)

@@ -2,6 +2,7 @@
 
 import errno
 from collections.abc import Callable
+from contextlib import closing
 
 import pytest
 import usb.core
@@ -64,7 +65,7 @@ def test_two_equal_devices_ask_for_serial_or_path(serials: tuple[str | None, ...
     bus = bus_of(*serials)
     with pytest.raises(DeviceError, match=f"2 are attached; set port to one of {choices}"):
         open_device(LOOPBACK, "usb", {0: 1}, bus)
-    with open_device(LOOPBACK, address, {0: 1}, bus) as device:
+    with closing(open_device(LOOPBACK, address, {0: 1}, bus)) as device:
         assert device.listing.address == address
 
 
@@ -89,7 +90,7 @@ def test_a_device_plugged_in_again_is_found_again_and_left_in_alternate_setting_
     first.unplug()
     assert attached(LOOPBACK, bus) == []
     bus.plug(model)
-    with open_device(LOOPBACK, "usb", {0: 1}, bus):
+    with closing(open_device(LOOPBACK, "usb", {0: 1}, bus)):
         assert model.alternate == 1
     assert model.alternate == 0
 

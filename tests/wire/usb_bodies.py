@@ -5,8 +5,8 @@ failed}; the last one pulls the cable.
 """
 
 import array
-import contextlib
 from collections.abc import Callable
+from contextlib import closing, suppress
 from functools import partial
 
 import pytest
@@ -47,7 +47,7 @@ def found_by_numbers_and_by_serial(backend: object | None) -> None:
 
 
 def alternate_setting_0_has_no_endpoints(backend: object | None) -> None:
-    with open_device(LOOPBACK, "usb", {0: 0}, backend) as device:
+    with closing(open_device(LOOPBACK, "usb", {0: 0}, backend)) as device:
         with pytest.raises(ProtocolError):
             device.write(0x06, b"x", DEADLINE_S)
         device.set_alternate(0, 1)
@@ -55,7 +55,7 @@ def alternate_setting_0_has_no_endpoints(backend: object | None) -> None:
 
 
 def control_transfers_carry_data_and_a_refused_one_is_a_fault(backend: object | None) -> None:
-    with opened(backend) as device:
+    with closing(opened(backend)) as device:
         assert device.control_in(VENDOR_IN, ECHO_IN, 0x1234, 0, 2, DEADLINE_S) == b"\x34\x12"
         with pytest.raises(DeviceFault, match="stall"):
             device.control_in(VENDOR_IN, 0x7E, 0, 0, 2, DEADLINE_S)
@@ -63,7 +63,7 @@ def control_transfers_carry_data_and_a_refused_one_is_a_fault(backend: object | 
 
 
 def interrupt_endpoints_carry_both_ways(backend: object | None) -> None:
-    with opened(backend) as device:
+    with closing(opened(backend)) as device:
         for text in (b"\x03\x00", bytes(range(32))):
             device.write(0x06, text, DEADLINE_S)
             assert device.read(0x83, 32, DEADLINE_S) == text
@@ -71,7 +71,7 @@ def interrupt_endpoints_carry_both_ways(backend: object | None) -> None:
 
 def a_read_without_an_answer_ends_at_its_deadline(backend: object | None) -> None:
     clock = backend._clock if isinstance(backend, EmulatedUsb) else SystemClock()
-    with opened(backend) as device:
+    with closing(opened(backend)) as device:
         began_s = now_s(clock)
         with pytest.raises(DeviceTimeout, match="0x83"):
             device.read(0x83, 32, SHORT_S)
@@ -80,7 +80,7 @@ def a_read_without_an_answer_ends_at_its_deadline(backend: object | None) -> Non
 
 def bulk_endpoints_carry_long_transfers(backend: object | None) -> None:
     text = bytes(range(256)) * 100
-    with opened(backend) as device:
+    with closing(opened(backend)) as device:
         device.write(0x02, text + b"end", DEADLINE_S)
         assert device.read(0x81, 64 * 1024, DEADLINE_S) == text + b"end"
         device.write(0x02, text, DEADLINE_S)
@@ -90,12 +90,12 @@ def bulk_endpoints_carry_long_transfers(backend: object | None) -> None:
 
 
 def a_timeout_that_brought_data_gives_the_data(backend: object | None) -> None:
-    with opened(backend) as device:
+    with closing(opened(backend)) as device:
         device.write(0x02, bytes(128), DEADLINE_S)  # whole packets: nothing says that the transfer is over
         came: list[bytes] = []
 
         def come() -> bool:
-            with contextlib.suppress(DeviceTimeout):
+            with suppress(DeviceTimeout):
                 came.append(device.read(0x81, 1024, SHORT_S))
             return bool(came)
 
@@ -104,7 +104,7 @@ def a_timeout_that_brought_data_gives_the_data(backend: object | None) -> None:
 
 
 def an_out_endpoint_that_takes_nothing_ends_at_its_deadline(backend: object | None) -> None:
-    with opened(backend) as device:
+    with closing(opened(backend)) as device:
         steer(device, DEAF, 1)
         with pytest.raises(DeviceTimeout, match="0x02"):
             device.write(0x02, bytes(64), SHORT_S)
@@ -114,7 +114,7 @@ def an_out_endpoint_that_takes_nothing_ends_at_its_deadline(backend: object | No
 
 
 def a_stalled_endpoint_is_a_fault_until_it_is_cleared(backend: object | None) -> None:
-    with opened(backend) as device:
+    with closing(opened(backend)) as device:
         steer(device, STALL_BULK_IN)
         for _ in range(2):
             with pytest.raises(DeviceFault, match="0x81"):
@@ -125,14 +125,14 @@ def a_stalled_endpoint_is_a_fault_until_it_is_cleared(backend: object | None) ->
 
 
 def an_overlong_packet_is_refused(backend: object | None) -> None:
-    with opened(backend) as device:
+    with closing(opened(backend)) as device:
         steer(device, OVERLONG)
         with pytest.raises(ProtocolError, match="more bytes"):
             device.read(0x83, 8, DEADLINE_S)
 
 
 def draining_ends_with_silence(backend: object | None) -> None:
-    with opened(backend) as device:
+    with closing(opened(backend)) as device:
         for _ in range(3):
             device.write(0x06, b"old", DEADLINE_S)
         dropped = [0]
@@ -140,14 +140,14 @@ def draining_ends_with_silence(backend: object | None) -> None:
 
 
 def a_claimed_device_is_busy(backend: object | None) -> None:
-    with opened(backend), pytest.raises(DeviceBusy, match="another program"):
+    with closing(opened(backend)), pytest.raises(DeviceBusy, match="another program"):
         opened(backend)
     opened(backend).close()
 
 
 def unplugging_is_a_disconnection(backend: object | None) -> None:
-    with opened(backend) as device:
-        with contextlib.suppress(DeviceDisconnected):  # the request may or may not be answered on the way down
+    with closing(opened(backend)) as device:
+        with suppress(DeviceDisconnected):  # the request may or may not be answered on the way down
             steer(device, GONE)
         with pytest.raises(DeviceDisconnected):
             device.read(0x83, 32, DEADLINE_S)

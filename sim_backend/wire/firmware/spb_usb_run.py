@@ -13,8 +13,7 @@ from drivers.frames import FRAME_RECORD, BlockFlag, BlockHeader, BlockStatus, fr
 from drivers.interfaces import WindowTable
 from drivers.spb1 import BlockLayout, block_views, frames_per_block, seal_block
 from drivers.spb1.control import IDENTITY_MAGIC, TEXT_BYTES, Feature, Register, pattern_row
-from drivers.spb1.layout import IDLE
-from drivers.spb1.writer import seal_control
+from drivers.spb1.layout import IDLE, seal_control
 from sim_backend.wire.serve.usb_model import AlternateSpec, DeviceSpec, EndpointSpec
 
 IDLE_S: Final = 0.1

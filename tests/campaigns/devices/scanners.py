@@ -16,7 +16,7 @@ from numpy.typing import NDArray
 from drivers.clock import VirtualClock
 from drivers.interfaces import MARKER_LINE, MARKER_SCAN, BeamScanner, ScanWaveform
 from sim_backend.wire.firmware import helios
-from sim_backend.wire.firmware.dac_model import DacHistory, DacModel
+from sim_backend.wire.firmware.helios import DacHistory, DacModel
 from tests.campaigns.outcomes import Ending, ending
 from tests.wire import lasercube
 from tests.wire.faults import Fault, FaultSchedule, FaultyUsb

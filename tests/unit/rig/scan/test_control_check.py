@@ -11,7 +11,7 @@ import pytest
 
 from drivers.errors import ProtocolError
 from drivers.recorded.control_words import Spoken
-from drivers.transports.tap import CONTROL_FILE, IN, OUT, TapFile, read_taps
+from drivers.transports.tap import CONTROL_FILE, IN, OUT, Tap, TapFile, read_taps
 from rig.scan.control_check import ControlCheck, check_control
 
 MS = 1_000_000
@@ -112,7 +112,7 @@ def test_swaps_are_timed_from_the_scan_and_the_second_buffer_is_not(tmp_path: Pa
 
 def test_taps_of_several_devices_write_one_file_and_are_read_in_time(tmp_path: Path) -> None:
     file = TapFile.begin(tmp_path / CONTROL_FILE)
-    laser, scanner = file.tap("laser"), file.tap("scanner")
+    laser, scanner = Tap(file, "laser"), Tap(file, "scanner")
     laser.note("serial", OUT, b"?\r")
     scanner.note("02", OUT, bytes(range(256)))
     laser.note("serial", IN, b"")
@@ -137,7 +137,7 @@ def test_taps_of_several_devices_write_one_file_and_are_read_in_time(tmp_path: P
 @pytest.mark.skipif(not hasattr(os, "mkfifo"), reason="a pipe with a name stands for a disk that does not answer")
 def test_a_disk_that_hangs_holds_no_device_up_and_loses_nothing(tmp_path: Path) -> None:
     os.mkfifo(tmp_path / CONTROL_FILE)  # opening it waits for somebody who reads
-    tap = TapFile.begin(tmp_path / CONTROL_FILE).tap("sync")
+    tap = Tap(TapFile.begin(tmp_path / CONTROL_FILE), "sync")
     begun = time.monotonic()
     for command in (b"abt\n", b"man 0\n"):
         tap.note("serial", OUT, command)
