@@ -20,6 +20,11 @@ class Clock(Protocol):
         ...
 
 
+def now_s(clock: Clock) -> float:
+    """The present time of a clock, in seconds."""
+    return clock.now_ns() / NS_PER_S
+
+
 class SystemClock:
     """The host's monotonic clock."""
 

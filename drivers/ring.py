@@ -243,11 +243,9 @@ class RingReader:
                 self._ring._release(self._waiting.popleft()[0])
 
     def __enter__(self) -> Self:
-        """The reader itself."""
         return self
 
     def __exit__(self, *_: object) -> None:
-        """Close."""
         self.close()
 
     def __iter__(self) -> Iterator[FrameBlock]:

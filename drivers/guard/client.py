@@ -272,11 +272,9 @@ class Guard:
             self._seen.close()
 
     def __enter__(self) -> Self:
-        """The guard, at work."""
         return self
 
     def __exit__(self, *_: object) -> None:
-        """Close, whatever happened."""
         self.close()
 
     def _proxy(self, slot: str, make: type[_Proxy]) -> _Proxy:

@@ -79,12 +79,10 @@ class Device(ABC):
             self._do_close()
 
     def __enter__(self) -> Self:
-        """The device itself, open."""
         self._require("enter", *OPEN_STATES)
         return self
 
     def __exit__(self, *_: object) -> None:
-        """Close, whatever happened."""
         self.close()
 
     def _require(self, verb: str, *allowed: DeviceState, first: str = "") -> None:

@@ -130,7 +130,10 @@ class RunRecording:
             if not is_of_run(block.header, run.header):
                 raise ProtocolError(f"block {block.header.block_seq} is of another size or clock than its run")
         except ProtocolError as error:
-            self._add_problem(f"{segment.path.name}, byte {entry['offset']}: {error}")
+            line = f"{segment.path.name}, byte {entry['offset']}: {error}"
+            if line not in self.problems:
+                self.problems.append(line)
+                _log.warning("%s: %s", self.path, line)
             return None
         return block
 
@@ -186,11 +189,6 @@ class RunRecording:
             if len(headers) == _WITNESSES:
                 break
         return usual_header(headers) if headers else None
-
-    def _add_problem(self, line: str) -> None:
-        if line not in self.problems:
-            self.problems.append(line)
-            _log.warning("%s: %s", self.path, line)
 
 
 def block_part(block: FrameBlock, first_frame: int, end_frame: int) -> FrameBlock:

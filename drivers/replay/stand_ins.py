@@ -7,7 +7,7 @@ from collections.abc import Sequence
 from fractions import Fraction
 from typing import ClassVar, Literal
 
-from drivers.clock import NS_PER_S, Clock
+from drivers.clock import Clock, now_s
 from drivers.interfaces import BeamScanner, Pulse, ScannerLimits, ScannerStatus, ScanWaveform, SyncSource, SyncStatus
 from drivers.lasers.serial_laser import PlainLaser
 from drivers.registry import Kind, KindConfig
@@ -51,7 +51,7 @@ class RecordedScanner(BeamScanner):
         return LIMITS
 
     def _do_status(self) -> ScannerStatus:
-        return ScannerStatus(moving=self._now_s() < self._ends_s, fault=None, position=None)
+        return ScannerStatus(moving=now_s(self._clock) < self._ends_s, fault=None, position=None)
 
     def _do_point_clock(self, requested_hz: float) -> Fraction:
         return Fraction(requested_hz).limit_denominator(_LARGEST_DIVISOR)
@@ -60,7 +60,7 @@ class RecordedScanner(BeamScanner):
         self._takes_s = float(repeats * len(waveform.command) / clock_hz)
 
     def _do_start(self) -> None:
-        self._ends_s = self._now_s() + self._takes_s
+        self._ends_s = now_s(self._clock) + self._takes_s
 
     def _do_stop(self) -> None:
         self._ends_s = 0.0
@@ -70,9 +70,6 @@ class RecordedScanner(BeamScanner):
 
     def _do_close(self) -> None:
         pass  # no handles
-
-    def _now_s(self) -> float:
-        return self._clock.now_ns() / NS_PER_S
 
 
 class RecordedSync(SyncSource):

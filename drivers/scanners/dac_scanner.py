@@ -146,7 +146,6 @@ class PointSlice:
     lit: NDArray[np.bool_]
 
     def __len__(self) -> int:
-        """Points of the slice."""
         return len(self.command)
 
     @property

@@ -30,7 +30,7 @@ from typing import Annotated, Literal
 import numpy as np
 from pydantic import Field
 
-from drivers.clock import NS_PER_S, Clock
+from drivers.clock import Clock, now_s
 from drivers.errors import DeviceFault, DeviceNotFound, DeviceTimeout, ProtocolError
 from drivers.interfaces import LEVEL_BACKWARD, MARKER_LINE, MARKER_SCAN
 from drivers.registry import Kind, Surroundings
@@ -303,14 +303,17 @@ class HeliosRun:
         while self._next is not None:
             if not stopped and stopping.is_set():
                 stopped = True
-                self._brake()
+                self.source.give_back()
+                self.source.stop()
+                if self._unsendable():
+                    self.source.pad_end()
             elif self._wait_until_free(None if stopped else stopping):
                 self._append(*self._next)
             else:
                 continue
             self._next = self._made() if self.source.left else None
         latest_s = self._latest_end_s + self._pending_s * (1 + DRIFT)
-        self._clock.sleep(latest_s - self._now_s())
+        self._clock.sleep(latest_s - now_s(self._clock))
 
     def _append(self, frame: bytes, duration_s: float) -> None:
         """Send one more frame, behind the playing one."""
@@ -327,11 +330,11 @@ class HeliosRun:
     def _check_kept(self) -> None:
         """Check that a frame that was taken was kept: the status must then be 'full' until the playing one ends."""
         free = None
-        while free is None and self._now_s() < self._earliest_end_s:
+        while free is None and now_s(self._clock) < self._earliest_end_s:
             free = self._link.free()
         if free is False:
             return
-        if self._now_s() < self._earliest_end_s:
+        if now_s(self._clock) < self._earliest_end_s:
             self._raise_dropped()
         raise DeviceFault(
             f"{self._link.name}: answered too late to tell whether it kept frame {self._sent}; "
@@ -348,42 +351,36 @@ class HeliosRun:
 
     def _send(self, frame: bytes) -> tuple[float, float]:
         """Send a frame; returns the host's times between which it arrived."""
-        began_s = self._now_s()
+        began_s = now_s(self._clock)
         self._link.send_frame(frame)
         self._sent += 1
-        return began_s + len(frame) / _WIRE_BYTES_PER_S, self._now_s()
-
-    def _brake(self) -> None:
-        self.source.give_back()
-        self.source.stop()
-        if self._unsendable():
-            self.source.pad_end()
+        return began_s + len(frame) / _WIRE_BYTES_PER_S, now_s(self._clock)
 
     def _unsendable(self) -> bool:
         return self.source.left <= self._most and not sendable(self.source.left)
 
     def _wait_until_idle(self) -> None:
-        end_s = self._now_s() + _SILENT_S
+        end_s = now_s(self._clock) + _SILENT_S
         while not self._link.free():
-            if self._now_s() > end_s:
+            if now_s(self._clock) > end_s:
                 raise DeviceTimeout(f"{self._link.name}: takes no frame; unplug it and plug it in again")
             self._clock.sleep(POLL_S)
 
     def _wait_until_free(self, stopping: threading.Event | None) -> bool:
         """True once the pending buffer is free; False if a stop came first."""
-        heard_s, full_s = self._now_s(), self._earliest_end_s
+        heard_s, full_s = now_s(self._clock), self._earliest_end_s
         while stopping is None or not stopping.is_set():
-            asked_s = self._now_s()
+            asked_s = now_s(self._clock)
             free = self._link.free()
-            now_s = self._now_s()
+            answered_s = now_s(self._clock)
             if free:
-                self._note_swap(max(full_s, self._earliest_end_s), now_s)
+                self._note_swap(max(full_s, self._earliest_end_s), answered_s)
                 return True
-            if free is None and now_s - heard_s > _SILENT_S:
+            if free is None and answered_s - heard_s > _SILENT_S:
                 raise DeviceTimeout(f"{self._link.name}: gives no status; unplug it and plug it in again")
             if free is False:
-                heard_s, full_s = now_s, asked_s
-            if now_s > self._latest_end_s + PATIENCE_S:
+                heard_s, full_s = answered_s, asked_s
+            if answered_s > self._latest_end_s + PATIENCE_S:
                 raise DeviceFault(f"{self._link.name}: its frame buffer stays full; unplug it and plug it in again")
             self._clock.sleep(POLL_S)
         return False
@@ -397,9 +394,6 @@ class HeliosRun:
         self._playing_s, self._pending_s = self._pending_s, 0.0
         self._earliest_end_s = earliest_s + self._playing_s * (1 - DRIFT)
         self._latest_end_s = min(latest_s, self._latest_end_s) + self._playing_s * (1 + DRIFT)
-
-    def _now_s(self) -> float:
-        return self._clock.now_ns() / NS_PER_S
 
 
 def create(config: HeliosConfig, surroundings: Surroundings) -> DacScanner:

@@ -26,7 +26,7 @@ from typing import Annotated, Literal
 import numpy as np
 from pydantic import Field
 
-from drivers.clock import NS_PER_S, Clock
+from drivers.clock import Clock, now_s
 from drivers.errors import DeviceFault, DeviceTimeout, ProtocolError
 from drivers.interfaces import LEVEL_BACKWARD, MARKER_LINE, MARKER_SCAN
 from drivers.registry import Kind, Surroundings
@@ -240,7 +240,7 @@ class LaserCubeRun:
         self._link.clear()
         self._link.set_rate(self._rate_hz)
         self._link.enable(self._markers)
-        self._asked_s = self._now_s()
+        self._asked_s = now_s(self._link.clock)
         self._send(self.source.take(self._hold))
         self._queued()
         self._send(self.source.take(self._most - self._hold))
@@ -262,16 +262,16 @@ class LaserCubeRun:
         """Send copies of the last point, and find an end among them."""
         hold = self._hold + -(len(self._waiting) // 8) % SAMPLES_PER_TRANSFER
         self._send(PointSlice(np.full(hold, self.source.last), np.zeros(hold, np.uint8), np.zeros(hold, bool)))
-        end_s = self._now_s() + (self._most + hold) / self._rate_hz * (1 + DRIFT) + PATIENCE_S
+        end_s = now_s(self._link.clock) + (self._most + hold) / self._rate_hz * (1 + DRIFT) + PATIENCE_S
         seen = False
         while True:
-            asked_s = self._now_s()
+            asked_s = now_s(self._link.clock)
             queued = self._queued()
             # An answer that took long bounds nothing: one quick answer must have vouched for the last points.
-            seen = seen or self._now_s() - asked_s < _TOLERANCE_POINTS / self._rate_hz
+            seen = seen or now_s(self._link.clock) - asked_s < _TOLERANCE_POINTS / self._rate_hz
             if queued < self._hold - _TOLERANCE_POINTS:
                 break
-            if self._now_s() > end_s:
+            if now_s(self._link.clock) > end_s:
                 raise DeviceFault(f"{self._link.name}: its buffer does not empty; unplug it and plug it in again")
             self._link.clock.sleep(POLL_S)
         self._link.safe()
@@ -284,7 +284,7 @@ class LaserCubeRun:
         whole = len(self._waiting) // (8 * SAMPLES_PER_TRANSFER) * 8 * SAMPLES_PER_TRANSFER
         self._link.send(self._waiting[:whole])
         empty_s = min(self._start_s) + self._sent / self._rate_hz
-        if whole and np.isfinite(empty_s) and self._now_s() > empty_s:
+        if whole and np.isfinite(empty_s) and now_s(self._link.clock) > empty_s:
             self._raise_dry()
         self._waiting = self._waiting[whole:]
         self._sent += whole // 8
@@ -294,9 +294,9 @@ class LaserCubeRun:
 
     def _queued(self) -> int:
         """Samples not yet played; raises `DeviceFault` if their number cannot be."""
-        before_s = self._now_s()
+        before_s = now_s(self._link.clock)
         queued = self._link.queued()
-        after_s = self._now_s()
+        after_s = now_s(self._link.clock)
         if queued == 0:
             self._raise_dry()
         played_s = (self._sent - queued) / self._rate_hz
@@ -311,9 +311,6 @@ class LaserCubeRun:
             )
         self._start_s = (earliest_s, latest_s)
         return queued
-
-    def _now_s(self) -> float:
-        return self._link.clock.now_ns() / NS_PER_S
 
 
 def create(config: LaserCubeConfig, surroundings: Surroundings) -> DacScanner:

@@ -13,7 +13,6 @@ up a host name has no deadline of ours. The resolver has its own, so give numeri
 
 import errno
 import logging
-import select
 import socket
 import time
 from collections.abc import Iterator
@@ -42,17 +41,17 @@ QUIET_S = 0.05
 _MOST_TEXT_BYTES = 65_536
 _CALIBRATION_STARTS = ("will start soon", "has started")
 _CALIBRATION_ENDS = "The breakdown is around"
-
-
 _FORBIDDEN = (errno.EACCES, errno.EPERM)
 _CHUNK_BYTES = 65_536
 """Largest number of bytes that `receive` takes at a time."""
+_CONNECT_S = 5.0
+"""Longest wait for a connection."""
 
 
 class TcpStream:
     """An open connection. `close` is idempotent and may be called from any thread; all else from one thread."""
 
-    def __init__(self, name: str, address: str, *, connect_s: float = 5.0) -> None:
+    def __init__(self, name: str, address: str) -> None:
         """Connect. name: the device's name in messages; address: "host:port".
 
         Raises `DeviceNotFound` (refused, unreachable, silent or no such host) or `DevicePermission`.
@@ -61,10 +60,9 @@ class TcpStream:
         self._address = address
         host, port = _split(name, address)
         try:
-            self._socket = socket.create_connection((host, port), connect_s)
+            self._socket = socket.create_connection((host, port), _CONNECT_S)
         except OSError as error:
-            raise self._refused(error, connect_s) from None
-        self._socket.setblocking(False)
+            raise self._refused(error) from None
         with suppress(OSError):  # a hint: commands are single small packets
             self._socket.setsockopt(socket.IPPROTO_TCP, socket.TCP_NODELAY, 1)
 
@@ -72,36 +70,33 @@ class TcpStream:
         """Send all of `data`. Raises `DeviceTimeout` if the other side takes none for `deadline_s`, or
         `DeviceDisconnected`.
         """
-        ends_at = time.monotonic() + deadline_s
-        rest = memoryview(data)
-        while rest:
-            with self._translated():
-                if not select.select([], [self._socket], [], max(0.0, ends_at - time.monotonic()))[1]:
-                    raise DeviceTimeout(f"{self._name} took no data for {deadline_s:g} s on {self._address}; it hangs")
-                with suppress(BlockingIOError):
-                    rest = rest[self._socket.send(rest) :]
+        with self._translated():
+            self._socket.settimeout(deadline_s)
+            try:
+                self._socket.sendall(data)
+            except TimeoutError:
+                raise DeviceTimeout(
+                    f"{self._name} took no data for {deadline_s:g} s on {self._address}; it hangs"
+                ) from None
 
-    def receive(self, deadline_s: float, limit: int = _CHUNK_BYTES) -> bytes:
+    def receive(self, deadline_s: float) -> bytes:
         """The bytes that have come, at least one; b"" if nothing came within the deadline. May raise
         `DeviceDisconnected`.
         """
-        buffer = bytearray(limit)
+        buffer = bytearray(_CHUNK_BYTES)
         return bytes(buffer[: self.receive_into(memoryview(buffer), deadline_s)])
 
     def receive_into(self, view: memoryview, deadline_s: float) -> int:
         """Receive bytes into `view`; returns their number, 0 after the deadline. May raise `DeviceDisconnected`."""
-        ends_at = time.monotonic() + deadline_s
-        while True:
-            with self._translated():
-                if not select.select([self._socket], [], [], max(0.0, ends_at - time.monotonic()))[0]:
-                    return 0
-                try:
-                    n = self._socket.recv_into(view)
-                except BlockingIOError:
-                    continue
-            if n == 0:
-                raise DeviceDisconnected(f"{self._name}: {self._address} closed the connection")
-            return n
+        with self._translated():
+            self._socket.settimeout(deadline_s)
+            try:
+                n = self._socket.recv_into(view)
+            except (TimeoutError, BlockingIOError):  # the second where the deadline is now
+                return 0
+        if n == 0:
+            raise DeviceDisconnected(f"{self._name}: {self._address} closed the connection")
+        return n
 
     def drain(self, quiet_s: float, deadline_s: float) -> bytes:
         """Read all that comes until the line is quiet for `quiet_s`, at most for `deadline_s`; returns it."""
@@ -117,7 +112,7 @@ class TcpStream:
         with suppress(OSError):
             self._socket.close()
 
-    def _refused(self, error: OSError, connect_s: float) -> DeviceError:
+    def _refused(self, error: OSError) -> DeviceError:
         where = f"{self._name}: {self._address}"
         if isinstance(error, ConnectionRefusedError):
             return DeviceNotFound(
@@ -127,7 +122,7 @@ class TcpStream:
         if error.errno in _FORBIDDEN:
             return DevicePermission(f"{where} may not be connected to by this user; ask for a firewall rule")
         if isinstance(error, TimeoutError):
-            return DeviceNotFound(f"{where} did not answer within {connect_s:g} s; check cable and address")
+            return DeviceNotFound(f"{where} did not answer within {_CONNECT_S:g} s; check cable and address")
         return DeviceNotFound(f"{where} cannot be reached ({one_line(error)}); correct 'port'")
 
     @contextmanager
@@ -135,8 +130,7 @@ class TcpStream:
         """Raise our error for all that a socket raises about an open connection: it means that this is gone."""
         try:
             yield
-        except (OSError, ValueError) as error:
-            # ValueError: what select makes of a socket that was closed by another thread.
+        except OSError as error:
             raise DeviceDisconnected(
                 f"{self._name}: the connection to {self._address} is lost ({one_line(error)})"
             ) from None
@@ -177,7 +171,6 @@ class Spad512sIdentity:
     flavour: str
 
     def __str__(self) -> str:
-        """The identity as a text for people."""
         return (
             f"{self.detector} {self.flavour}, FPGAs {self.master_serial} and {self.slave_serial}, software "
             f"{self.software}, firmware {self.firmware}, hardware {self.hardware}"

@@ -11,7 +11,7 @@ from typing import Annotated, Literal
 
 from pydantic import Field
 
-from drivers.clock import NS_PER_S, Clock
+from drivers.clock import Clock, now_s
 from drivers.errors import DeviceError, DeviceFault, DeviceTimeout, LimitExceeded
 from drivers.frames import frame_bytes
 from drivers.interfaces import SpadArray, SpadCounters, SpadHealth, SpadInfo, SpadRequest, SpadTiming
@@ -150,7 +150,7 @@ class SpbUsb(SpadArray):
             armed = Armed(run_id, self._timing.stride, *frames, n_frames, self._check_payload)
             self._receiver = BlockReceiver(self._link, self._wiring.stream_in, armed, self.name)
             self._counters = SpadCounters(0, 0, 0, 0, 0)
-            self._pinged_at = self._heard_at = self._now_s()
+            self._pinged_at = self._heard_at = now_s(self._clock)
             self._waited_s = 0.0
 
     def _do_fill(self, ring: BlockRing, timeout_s: float) -> bool:
@@ -167,18 +167,18 @@ class SpbUsb(SpadArray):
                 raise
 
     def _fill(self, receiver: BlockReceiver, ring: BlockRing, timeout_s: float) -> bool:
-        ends_at = self._now_s() + timeout_s
+        ends_at = now_s(self._clock) + timeout_s
         took = Took.NOTHING
         while took is not Took.FRAMES and not receiver.ended:
             self._ping_when_due(receiver)
-            asked_at = self._now_s()
+            asked_at = now_s(self._clock)
             try:
                 took = receiver.take(ring, min(_SLICE_S, max(0.0, ends_at - asked_at)))
             finally:
                 self._count(receiver)
             if self._halt.is_set():
                 return False
-            now = self._now_s()
+            now = now_s(self._clock)
             if took is Took.FRAMES:
                 self._waited_s = 0.0
             else:
@@ -203,19 +203,16 @@ class SpbUsb(SpadArray):
         if self.on_wait is not None:
             self.on_wait(self._waited_s)
 
-    def _now_s(self) -> float:
-        return self._clock.now_ns() / NS_PER_S
-
     def _has_ended(self) -> bool:
         """Whether the device runs no more: then its last block got lost."""
-        self._heard_at = self._now_s()
+        self._heard_at = now_s(self._clock)
         return self._control.ack_in is not None and self._control.read(Register.STATE) not in (
             SensorState.RUNNING,
             SensorState.DRAINING,
         )
 
     def _ping_when_due(self, receiver: BlockReceiver) -> None:
-        now = self._now_s()
+        now = now_s(self._clock)
         if now - self._pinged_at >= self._config.heartbeat / _PINGS_PER_HEARTBEAT:
             self._pinged_at = now
             self._control.send_in_run(Op.PING, max(0, receiver.next_frame - 1) & 0xFFFFFFFF)
@@ -257,8 +254,8 @@ class SpbUsb(SpadArray):
         exposed: int | None = None
         try:
             self._control.send_in_run(Op.ABORT)
-            ends_at = self._now_s() + _STOP_S
-            while not receiver.drain(_SLICE_S) and self._now_s() < ends_at:
+            ends_at = now_s(self._clock) + _STOP_S
+            while not receiver.drain(_SLICE_S) and now_s(self._clock) < ends_at:
                 pass
         except DeviceError as error:
             _log.warning("%s: while ending the run: %s", self.name, error)

@@ -9,7 +9,6 @@ the product string must match too.
 """
 
 import struct
-from collections.abc import Callable
 from dataclasses import dataclass
 from fractions import Fraction
 from typing import Literal
@@ -17,6 +16,7 @@ from typing import Literal
 import numpy as np
 from numpy.typing import NDArray
 
+from drivers.clock import Clock, now_s
 from drivers.errors import CorruptBlock, DeviceFault, DeviceNotFound, DeviceTimeout, LimitExceeded, ProtocolError
 from drivers.frames import BlockFlag, frame_bytes
 from drivers.interfaces import BurstMode, SpadInfo, StreamMode, WindowTable
@@ -180,7 +180,7 @@ def require_order(
     write_length(control, n)
     control.send(Op.START)
     try:
-        block = parse_block(_read_block(link, stream_in, stride, control.now_s), check_payload=True)
+        block = parse_block(_read_block(link, stream_in, stride, control.clock), check_payload=True)
     except CorruptBlock as error:
         raise ProtocolError(f"{name}: the test pattern came damaged ({error}); check cable and firmware") from None
     finally:
@@ -193,10 +193,10 @@ def require_order(
         raise ProtocolError(f"{name}: the test pattern differs; bits or rows come in another order: wrong firmware?")
 
 
-def _read_block(link: BulkLink, stream_in: int, stride: int, now_s: Callable[[], float]) -> NDArray[np.uint8]:
-    ends_at = now_s() + _PATTERN_S
+def _read_block(link: BulkLink, stream_in: int, stride: int, clock: Clock) -> NDArray[np.uint8]:
+    ends_at = now_s(clock) + _PATTERN_S
     got = b""
-    while len(got) < stride and now_s() < ends_at:
+    while len(got) < stride and now_s(clock) < ends_at:
         got += link.read(stream_in, stride - len(got), _PATTERN_S)
     return np.frombuffer(got, np.uint8)
 

@@ -11,7 +11,7 @@ from typing import Final, NamedTuple
 
 import numpy as np
 
-from drivers.clock import NS_PER_S, Clock
+from drivers.clock import Clock, now_s
 from drivers.errors import CorruptBlock, DeviceFault, DeviceTimeout, ProtocolError
 from drivers.spb1.layout import REGISTER_ACK
 from drivers.spb1.reader import read_control, read_header
@@ -210,7 +210,8 @@ class ControlChannel:
         self, link: BulkLink, command_out: int, ack_in: int | None, stream_in: int, clock: Clock, tap: Tap | None
     ) -> None:
         self._link = link
-        self._clock = clock
+        self.clock = clock
+        """The clock of its deadlines."""
         self._tap = tap
         self._command_out = command_out
         self.ack_in = ack_in
@@ -219,10 +220,6 @@ class ControlChannel:
         self._received: list[Ack] = []
         self.on_wait: Callable[[float], None] | None = None
         """Called for each piece of a wait in vain, with its seconds."""
-
-    def now_s(self) -> float:
-        """The present time on the clock used for deadlines."""
-        return self._clock.now_ns() / NS_PER_S
 
     def read(self, register: int) -> int:
         """The value of a register."""
@@ -269,8 +266,8 @@ class ControlChannel:
 
     def drain(self) -> None:
         """Read and drop what the stream still sends. Raises `ProtocolError` if it does not end."""
-        ends_at = self.now_s() + _DRAIN_S
-        while self.now_s() < ends_at:
+        ends_at = now_s(self.clock) + _DRAIN_S
+        while now_s(self.clock) < ends_at:
             try:
                 self._link.read(self._stream_in, _DRAIN_BYTES, _QUIET_S)
             except DeviceTimeout:
@@ -297,7 +294,7 @@ class ControlChannel:
             commands = [self._command(*request) for request in requests[at : at + _AT_ONCE]]
             self._received.clear()  # late answers to what was given up
             self._tell(commands)
-            ends_at = self.now_s() + _ANSWER_S
+            ends_at = now_s(self.clock) + _ANSWER_S
             for command in commands:
                 ack = self._answer(command, ends_at)
                 if ack.status != AckStatus.OK:
@@ -314,7 +311,7 @@ class ControlChannel:
                 ack = self._received.pop(0)
                 if (ack.request_id, ack.op) == (command.request_id, command.op):
                     return ack
-            left_s = ends_at - self.now_s()
+            left_s = ends_at - now_s(self.clock)
             if left_s <= 0:
                 raise DeviceTimeout(
                     f"{self._link.label} did not acknowledge {Op(command.op).name} within {_ANSWER_S:g} s; "

@@ -183,7 +183,9 @@ class PrawnDo(SyncSource):
             self._line.command("cls")
             try:
                 self._line.load(words.tobytes())
-                self._require_length(len(words))
+                lines = self._line.transact("len")
+                if f"Number of instructions: {len(words)}" not in lines:
+                    raise DeviceFault(f"{self.name}: {lines} after a program of {len(words)} words; load it again")
             except DeviceError:
                 try:  # nothing of what did not arrive whole may ever be run
                     self._line.command("cls")
@@ -202,8 +204,7 @@ class PrawnDo(SyncSource):
     def _do_gate_low(self) -> None:
         self._line.lower()
 
-    def _do_abort(self) -> None:
-        self._line.lower()
+    _do_abort = _do_gate_low
 
     def _do_status(self) -> SyncStatus:
         with self._line.lock:
@@ -249,11 +250,6 @@ class PrawnDo(SyncSource):
                 f"{self.name}: its clock runs at {hz:g} Hz, not {self._board.clock_hz:g} Hz; check the clock on "
                 "GPIO20 and 'external_clock'"
             )
-
-    def _require_length(self, n_words: int) -> None:
-        lines = self._line.transact("len")
-        if f"Number of instructions: {n_words}" not in lines:
-            raise DeviceFault(f"{self.name}: {lines} after a program of {n_words} words; load it again")
 
     def _check_clock(self) -> None:
         _, external = self._line.run_status()

@@ -12,7 +12,7 @@ from collections.abc import Callable
 from dataclasses import dataclass
 from typing import TypeVar
 
-from drivers.clock import NS_PER_S
+from drivers.clock import now_s
 from drivers.errors import DeviceError, DeviceFault, DeviceTimeout, ProtocolError
 from drivers.transports.serial_port import SerialPort
 
@@ -156,7 +156,7 @@ class PrawnDoLine:
             self._gate_first.clear()
 
     def _lower_surely(self) -> None:
-        ends_at = self._now_s() + self._timing.lower_s
+        ends_at = now_s(self.clock) + self._timing.lower_s
         while True:
             try:
                 if self._try_to_lower():
@@ -164,7 +164,7 @@ class PrawnDoLine:
                 trouble: DeviceError = DeviceFault(f"{self._name}: its outputs do not go low")
             except (DeviceTimeout, ProtocolError) as error:
                 trouble = error
-            if self._now_s() > ends_at:
+            if now_s(self.clock) > ends_at:
                 raise trouble
             self.port.write(_LOWER)
 
@@ -211,7 +211,7 @@ class PrawnDoLine:
         self, done: Callable[[list[str]], bool], before: str | None, deadline_s: float, urgent: bool
     ) -> list[str]:
         """The lines that follow the one with `before` (None: all), up to and with the one that makes it `done`."""
-        ends_at = self._now_s() + deadline_s
+        ends_at = now_s(self.clock) + deadline_s
         lines: list[str] = []
         begun = before is None
         while True:
@@ -233,13 +233,10 @@ class PrawnDoLine:
                 self._last_heard = self.port.read_line(_CRLF, _SLICE_S).decode("latin-1").strip()
                 return self._last_heard
             except DeviceTimeout:
-                if self._now_s() >= ends_at:
+                if now_s(self.clock) >= ends_at:
                     raise DeviceTimeout(
                         f"{self._name} did not answer within {deadline_s:g} s on {self.port.path}; check its cable"
                     ) from None
-
-    def _now_s(self) -> float:
-        return self.clock.now_ns() / NS_PER_S
 
     def _token(self) -> str:
         """A line that is no command and that no other line contains."""

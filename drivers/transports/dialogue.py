@@ -16,7 +16,7 @@ from collections.abc import Callable
 from dataclasses import dataclass
 from typing import Protocol
 
-from drivers.clock import NS_PER_S, Clock
+from drivers.clock import Clock, now_s
 from drivers.errors import DeviceFault, DeviceTimeout, ProtocolError
 from drivers.transports.serial_port import SerialPort
 
@@ -96,7 +96,7 @@ class Dialogue:
         self._clock = clock
         self._timing = timing
         self._lock = FairLock()
-        self._quiet_since_ns = clock.now_ns()
+        self._quiet_since_s = now_s(clock)
 
     def connect(self) -> None:
         """Synchronise with the device. Raises `DeviceTimeout` or `ProtocolError` if nothing of this make answers.
@@ -172,7 +172,7 @@ class Dialogue:
 
     def _once(self, command: str) -> str:
         """One command and its reply."""
-        passed_s = (self._clock.now_ns() - self._quiet_since_ns) / NS_PER_S
+        passed_s = now_s(self._clock) - self._quiet_since_s
         self._clock.sleep(self._timing.gap_s - passed_s)
         if self.port.reset_input().strip():  # a reply that nobody asked for, and perhaps its other half comes yet
             self.port.drain(self._timing.quiet_s, self._timing.drain_s)
@@ -183,7 +183,7 @@ class Dialogue:
                 command, lambda: self.port.read_line(b"\n", reply_s).decode("ascii", "replace").strip()
             )
         finally:
-            self._quiet_since_ns = self._clock.now_ns()
+            self._quiet_since_s = now_s(self._clock)
 
     def _resync(self, quiet_s: float) -> None:
         """Drop what comes late, then ask what only one reply can answer."""

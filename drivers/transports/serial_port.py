@@ -14,7 +14,7 @@ from typing import Any
 import serial
 from serial.tools import list_ports
 
-from drivers.clock import NS_PER_S, Clock, SystemClock
+from drivers.clock import Clock, SystemClock, now_s
 from drivers.errors import (
     DeviceBusy,
     DeviceDisconnected,
@@ -94,13 +94,13 @@ class SerialPort:
         """The next line without its terminator. Raises `DeviceTimeout` after `deadline_s`; the part received is kept
         for the next call.
         """
-        ends_at = self._now_s() + deadline_s
+        ends_at = now_s(self.clock) + deadline_s
         searched = 0
         while (end := self._received.find(terminator, searched)) < 0:
             if len(self._received) > _MAX_LINE_BYTES:
                 raise ProtocolError(f"{self._name} sent {len(self._received)} bytes without an end of line: noise")
             searched = max(0, len(self._received) - len(terminator) + 1)
-            if not self._receive_some() and self._now_s() >= ends_at:
+            if not self._receive_some() and now_s(self.clock) >= ends_at:
                 raise DeviceTimeout(
                     f"{self._name} did not send a whole line within {deadline_s:g} s on {self.path} "
                     f"({len(self._received)} bytes came); check its power and cable"
@@ -119,11 +119,11 @@ class SerialPort:
     def drain(self, quiet_s: float, deadline_s: float) -> bytes:
         """Drop what arrives until the line is quiet for `quiet_s`, at most for `deadline_s`; returns what was
         dropped."""
-        ends_at = self._now_s() + deadline_s
-        quiet_at = self._now_s() + quiet_s
-        while self._now_s() < min(quiet_at, ends_at):
+        ends_at = now_s(self.clock) + deadline_s
+        quiet_at = now_s(self.clock) + quiet_s
+        while now_s(self.clock) < min(quiet_at, ends_at):
             if self._receive_some():
-                quiet_at = self._now_s() + quiet_s
+                quiet_at = now_s(self.clock) + quiet_s
         return self._take(len(self._received), 0)
 
     def close(self) -> None:
@@ -163,9 +163,6 @@ class SerialPort:
         self._note(IN, data)
         self._received += data
         return bool(data)
-
-    def _now_s(self) -> float:
-        return self.clock.now_ns() / NS_PER_S
 
     def _note(self, direction: str, data: bytes) -> None:
         if self._tap is not None:

@@ -137,16 +137,14 @@ def calibration_use(rig: OpenRig, *, accept: bool = False, here: Identity | None
         return None
     here = here or identity_of(rig)
     found = refusals(rig.model, rig.config.calibration, here, rig.config.calibration_max_age)
-    before = _accepted_before(rig) if isinstance(rig.spad, ReplaySpad) else frozenset[str]()
-    return _used(rig.model, rig.config.calibration, found, frozenset(r.code for r in found) if accept else before)
+    return _used(rig.model, rig.config.calibration, found, accept, _accepted_before(rig))
 
 
 def cube_calibration_use(model: RigModel, file: Path | None, *, accept: bool = False) -> CalibrationUse:
     """The calibration of a cube of frames whose rig is unknown. Only its verdict and checks count. May raise
     UsageError.
     """
-    found = refusals(model, file, None, None)
-    return _used(model, file, found, frozenset(r.code for r in found) if accept else frozenset())
+    return _used(model, file, refusals(model, file, None), accept)
 
 
 def refusals(
@@ -174,8 +172,11 @@ def _identity(name: str, kinds: Mapping[str, str], serials: Mapping[str, str], c
     return Identity(rig=digest, created=created, name=name, kinds=kinds, serials=serials)
 
 
-def _used(model: RigModel, file: Path | None, found: tuple[Refusal, ...], accepted: frozenset[str]) -> CalibrationUse:
-    require_accepted("calibration" if file is None else f"calibration {file}", found, accepted)
+def _used(
+    model: RigModel, file: Path | None, found: tuple[Refusal, ...], accept: bool, before: Container[str] = ()
+) -> CalibrationUse:
+    if not accept:
+        require_accepted("calibration" if file is None else f"calibration {file}", found, before)
     return CalibrationUse(model, model.identity is not None, found)
 
 
@@ -229,9 +230,8 @@ def _date(text: str) -> datetime | None:
 
 def _accepted_before(rig: OpenRig) -> frozenset[str]:
     """Codes of the reasons that were accepted for a recording's own calibration when it was taken."""
-    assert isinstance(rig.spad, ReplaySpad)
-    run = rig.spad.recording.path
-    if rig.config.calibration is None or rig.config.calibration.resolve() != (run / CALIBRATION_FILE).resolve():
+    file, run = rig.config.calibration, rig.spad.recording.path if isinstance(rig.spad, ReplaySpad) else None
+    if file is None or run is None or file.resolve() != (run / CALIBRATION_FILE).resolve():
         return frozenset()
     noted = (read_manifest(run) or {}).get("calibration") or {}
     return frozenset(str(code) for code, _ in noted.get("accepted") or ())

@@ -154,7 +154,8 @@ def examine(config: RigConfig, folder: Path) -> list[Finding]:
             rig.sync.program(*sync_program(plan, plan.sweeps_per_period))
             findings.append(_plan(plan))
             findings += _frames(look(rig, plan, timing.stride), plan)
-            findings += _memory(rig)
+            if (most := rig.spad.health.memory_high_water_bytes) is not None:
+                findings.append(Finding("memory", True, f"at most {digits(most / 1e6)} MB waited in the SPAD"))
     except (RigError, DeviceError) as error:
         findings += [Finding("devices", False, line) for line in str(error).splitlines()]
     findings.append(_disk(folder))
@@ -255,11 +256,6 @@ def _trigger(seen: DarkLook) -> Finding:
         return Finding("trigger", True, "the scanner's scan marker starts the sync source's program")
     text = "no scan marker came to the sync source's trigger input, its gate would stay low; check that line"
     return Finding("trigger", False, text)
-
-
-def _memory(rig: OpenRig) -> list[Finding]:
-    most = rig.spad.health.memory_high_water_bytes
-    return [] if most is None else [Finding("memory", True, f"at most {digits(most / 1e6)} MB waited in the SPAD")]
 
 
 def _disk(folder: Path) -> Finding:

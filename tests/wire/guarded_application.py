@@ -16,8 +16,9 @@ from drivers.guard import Guard
 from drivers.interfaces import OUT_GATE, Pulse
 from drivers.lasers.obis import ObisConfig
 from drivers.sync.prawndo import PrawnDoConfig
-from tests.wire.guarded_rig import POWER_W, SWEEP_S
 
+POWER_W = 0.02
+SWEEP_S = 0.012
 SWEEP = (Pulse(0, None), Pulse(0, 0.001), Pulse(OUT_GATE, SWEEP_S - 0.003), Pulse(0, 0.001))
 
 

@@ -8,7 +8,7 @@ from typing import Any
 
 import pytest
 
-from drivers.clock import NS_PER_S, Clock, VirtualClock
+from drivers.clock import Clock, VirtualClock
 from drivers.errors import DeviceError
 from drivers.interfaces import LineLaser
 from drivers.lasers import cobolt, obis
@@ -44,10 +44,6 @@ def open_cobolt(surroundings: Surroundings, **config: Any) -> LineLaser:
 
 def open_obis(surroundings: Surroundings, **config: Any) -> LineLaser:
     return obis.create(obis.ObisConfig.model_validate(USUAL | config), surroundings, QUICK_OBIS)
-
-
-def now_s(clock: Clock) -> float:
-    return clock.now_ns() / NS_PER_S
 
 
 def bring_up(laser: LineLaser, clock: Clock, power_w: float = 0.05) -> None:

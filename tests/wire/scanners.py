@@ -7,7 +7,7 @@ from typing import Any
 
 import numpy as np
 
-from drivers.clock import NS_PER_S, Clock, VirtualClock
+from drivers.clock import Clock, VirtualClock, now_s
 from drivers.interfaces import LEVEL_BACKWARD, MARKER_LINE, MARKER_SCAN, BeamScanner, ScanWaveform
 from drivers.registry import Surroundings, lookup
 from drivers.transports.endpoints import Endpoint
@@ -87,7 +87,7 @@ class Plugged:
     clock: Clock
 
     def now_s(self) -> float:
-        return self.clock.now_ns() / NS_PER_S
+        return now_s(self.clock)
 
 
 def plug(model: UsbModel, clock: Clock) -> Plugged:

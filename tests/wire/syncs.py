@@ -5,7 +5,7 @@ from collections.abc import Iterator
 from contextlib import contextmanager
 from typing import Any
 
-from drivers.clock import NS_PER_S, VirtualClock
+from drivers.clock import VirtualClock, now_s
 from drivers.interfaces import OUT_GATE, Pulse
 from drivers.registry import Surroundings
 from drivers.sync.prawndo import PrawnDo, PrawnDoConfig
@@ -52,7 +52,7 @@ class Board:
 
     @property
     def now_s(self) -> float:
-        return self.clock.now_ns() / NS_PER_S
+        return now_s(self.clock)
 
     @property
     def pins(self) -> int:

@@ -5,12 +5,13 @@ from typing import Any
 
 import pytest
 
+from drivers.clock import now_s
 from drivers.errors import DeviceFault, InterlockOpen, ProtocolError, WrongState
 from drivers.lasers.cobolt import CoboltConfig, classify
 from drivers.lasers.cobolt import create as create_cobolt
 from sim_backend.wire.firmware.cobolt import MODELS, CoboltModel, Family
 from tests.wire.faults import Fault, FaultScript
-from tests.wire.lasers import bring_up, now_s, open_cobolt, overtaken_arm, wire
+from tests.wire.lasers import bring_up, open_cobolt, overtaken_arm, wire
 
 FAMILIES: tuple[Family, ...] = ("06-MLD", "06-01")
 
@@ -181,7 +182,7 @@ def test_a_fault_is_named_and_refuses_to_arm(number: int, text: str) -> None:
     model.fault = number
     with wire(model) as (_, surroundings), open_cobolt(surroundings) as laser:
         assert text in str(laser.status.fault)
-        with pytest.raises(DeviceFault, match=text):
+        with pytest.raises(DeviceFault, match=rf"fault .*{text}.*; clear it at the laser and arm again"):
             laser.arm(0.05)
     assert not model.emitting
 

@@ -7,6 +7,7 @@ import sys
 import tempfile
 import time
 from collections.abc import Callable, Iterator
+from dataclasses import dataclass, field
 
 import pytest
 
@@ -17,19 +18,56 @@ from drivers.lasers.obis import ObisConfig
 from drivers.registry import Surroundings
 from drivers.sync.prawndo import PrawnDo, PrawnDoConfig
 from sim_backend.wire.firmware.obis import ObisModel
+from sim_backend.wire.firmware.prawndo import PrawnDoModel
 from sim_backend.wire.serve.serial import SerialServer
-from tests.wire.guarded_application import SWEEP
-from tests.wire.guarded_rig import POWER_W, GuardedRig, guarded_rig
+from tests.wire.guarded_application import POWER_W, SWEEP, SWEEP_S
 from tests.wire.lasers import PATIENCE_S, eventually
+from tests.wire.syncs import USB_BAUD
 
 DARK_S = 0.3
 """A laser that is dark for so long stays dark."""
 
 
+MARKER_S = 20e-6
+
+
+def sweeping(from_s: float, until_s: float) -> float | None:
+    """The scan marker of a mirror that sweeps for ever, as the trigger of a PrawnDO."""
+    into_s = from_s % SWEEP_S
+    first = from_s if into_s < MARKER_S else from_s - into_s + SWEEP_S
+    return first if first < until_s else None
+
+
+@dataclass
+class Line:
+    """A level over time, from the callbacks of a model."""
+
+    times: list[float] = field(default_factory=lambda: [float("-inf")])
+    levels: list[bool] = field(default_factory=lambda: [False])
+
+    def __call__(self, level: bool, at_s: float) -> None:
+        self.times.append(at_s)
+        self.levels.append(level)
+
+    def dark_for(self, seconds: float) -> bool:
+        """Whether it has been low for so long."""
+        return not self.levels[-1] and time.monotonic() - self.times[-1] >= seconds
+
+
+@dataclass
+class GuardedRig:
+    laser: SerialServer
+    sync: SerialServer
+    emission: Line
+
+
 @pytest.fixture
 def rig() -> Iterator[GuardedRig]:
-    with guarded_rig() as made:
-        yield made
+    emission = Line()
+    laser = ObisModel(cdrh_delay_s=0.0, on_emission=emission)  # a Cobolt takes 4 s to be asked about and armed
+    sync = PrawnDoModel(sweeping, board=2)
+    with SerialServer(laser) as laser_server, SerialServer(sync, baud=USB_BAUD) as sync_server:
+        yield GuardedRig(laser_server, sync_server, emission)
 
 
 Blow = Callable[[GuardedRig, "subprocess.Popen[str]", int], None]

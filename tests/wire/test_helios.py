@@ -2,14 +2,13 @@
 
 import logging
 import struct
-from collections.abc import Callable
 from contextlib import closing
 from fractions import Fraction
 
 import numpy as np
 import pytest
 
-from drivers.clock import SystemClock, VirtualClock
+from drivers.clock import VirtualClock
 from drivers.errors import DeviceError, DeviceNotFound, DeviceTimeout, ProtocolError
 from drivers.interfaces import LEVEL_BACKWARD, MARKER_LINE, MARKER_SCAN, ScanWaveform
 from drivers.scanners.dac_scanner import PointSlice
@@ -18,9 +17,7 @@ from drivers.transports.usb_device import open_device
 from sim_backend.wire.firmware.helios import BLUE, COMMANDS, FRAMES, GREEN, INTENSITY, RED, REPLIES, HeliosModel
 from sim_backend.wire.serve.usb import EmulatedUsb
 from sim_backend.wire.serve.usb_model import Answer
-from tests.wire import helios_over_libusb
 from tests.wire.scanners import HeliosRecorder, cosine, finish, open_scanner, opened, play, plug
-from tests.wire.usb.umockdev import UmockdevBus, missing
 
 TOLERANCE_S = 1e-6
 
@@ -344,10 +341,3 @@ def test_another_name_than_the_configured_one_is_refused() -> None:
 def test_a_config_that_cannot_be_is_refused(config: dict[str, object]) -> None:
     with pytest.raises(ValueError, match="command_range"):
         open_scanner("helios", EmulatedUsb(VirtualClock()), VirtualClock(), **config)
-
-
-@pytest.mark.skipif(bool(missing()), reason=missing())
-@pytest.mark.parametrize("body", helios_over_libusb.BODIES, ids=lambda body: body.__name__)
-def test_through_real_libusb(body: Callable[[UmockdevBus], None]) -> None:
-    with UmockdevBus(SystemClock()) as bus:
-        body(bus)

@@ -3,6 +3,7 @@ trap."""
 
 import pytest
 
+from drivers.clock import now_s
 from drivers.errors import (
     DeviceFault,
     DeviceNotFound,
@@ -16,7 +17,7 @@ from drivers.guard import Guard
 from drivers.lasers.obis import FAULTS, ObisConfig
 from sim_backend.wire.firmware.obis import ObisModel
 from sim_backend.wire.serve.serial import SerialServer
-from tests.wire.lasers import bring_up, eventually, now_s, open_obis, overtaken_arm, wire
+from tests.wire.lasers import bring_up, eventually, open_obis, overtaken_arm, wire
 
 HANDSHAKES = (True, False)
 

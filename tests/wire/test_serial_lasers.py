@@ -9,6 +9,7 @@ from typing import Any
 import pytest
 from pydantic import ValidationError
 
+from drivers.clock import now_s
 from drivers.errors import DeviceBusy, DeviceDisconnected, DeviceNotFound, DeviceTimeout, LimitExceeded
 from drivers.interfaces import LineLaser
 from drivers.lasers import cobolt as cobolt_framing
@@ -23,7 +24,7 @@ from rig.errors import DevicesError
 from sim_backend.wire.firmware.cobolt import CoboltModel
 from sim_backend.wire.firmware.obis import ObisModel
 from sim_backend.wire.serve.serial import SerialServer
-from tests.wire.lasers import Babble, Silent, bring_up, eventually, now_s, open_cobolt, open_obis, wire
+from tests.wire.lasers import Babble, Silent, bring_up, eventually, open_cobolt, open_obis, wire
 
 
 @dataclass(frozen=True)
@@ -155,18 +156,6 @@ def test_the_line_goes_to_who_waits_before_who_had_it_last() -> None:
         order.append("who had it")
     thread.join()
     assert order == ["who waited", "who had it"]
-
-
-@each_make
-def test_emission_is_told_to_the_world_with_its_time(make: Make) -> None:
-    told: list[tuple[bool, float]] = []
-    model = make.model(on_emission=lambda emits, at_s: told.append((emits, at_s)))
-    with wire(model) as (_, surroundings), make.open(surroundings) as laser:
-        bring_up(laser, surroundings.clock)
-        surroundings.clock.sleep(1.0)
-        laser.pause()
-    assert [emits for emits, _ in told] == [True, False]
-    assert 0 < told[0][1] < told[1][1]
 
 
 def test_trap_a_tenth_of_a_second_was_too_little_for_a_reply() -> None:

@@ -150,7 +150,7 @@ def test_trap_time_in_microseconds_for_one_bit() -> None:
     with connected(model) as (device, _):
         device.configure(SpadRequest(Fraction(10_000), 100e-6, "burst", 16))
         device.start(10_000)
-        eventually(lambda: model.running)  # commands that come together are none
+        eventually(lambda: model._run is not None)  # commands that come together are none
         device.stop()
         assert model.commands[2:] == ["I,1,100,10000,0,1,0,1", "STOP"]
 
@@ -218,7 +218,7 @@ def test_trap_done_glued_to_answers_commands_never_pipelined_and_pile_up_before_
         early = False
 
         def receive(self, data: bytes, now_s: float) -> None:
-            self.early = self.early or bool(self._out) or self.running
+            self.early = self.early or bool(self._out) or self._run is not None
             super().receive(data, now_s)
 
     model = Strict(noise, glued_done=True, extra_fields=True)

@@ -15,13 +15,9 @@ IDS = sorted(
 )
 
 
-def test_a_rule_names_each_device() -> None:
+def test_a_rule_names_each_device_and_its_head_says_how_to_install_it() -> None:
     rules = (ROOT / UDEV_RULES).read_text(encoding="utf-8")
     assert ("1209", "e500") in IDS
     for vendor, product in IDS:
         assert f'ATTR{{idVendor}}=="{vendor}", ATTR{{idProduct}}=="{product}"' in rules
-
-
-def test_it_says_how_to_install_it_in_one_line() -> None:
-    first = (ROOT / UDEV_RULES).read_text(encoding="utf-8").splitlines()[:3]
-    assert any(line.startswith("#") and "/etc/udev/rules.d/" in line for line in first)
+    assert any(line.startswith("#") and "/etc/udev/rules.d/" in line for line in rules.splitlines()[:3])

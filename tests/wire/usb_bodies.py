@@ -11,12 +11,12 @@ from functools import partial
 
 import pytest
 
-from drivers.clock import SystemClock
+from drivers.clock import SystemClock, now_s
 from drivers.errors import DeviceBusy, DeviceDisconnected, DeviceFault, DeviceNotFound, DeviceTimeout, ProtocolError
 from drivers.transports.usb_device import UsbDevice, UsbId, attached, open_device, translated
 from sim_backend.wire.serve.usb import EmulatedUsb
 from tests.wire.bodies import report
-from tests.wire.lasers import PATIENCE_S, eventually, now_s
+from tests.wire.lasers import PATIENCE_S, eventually
 from tests.wire.usb.loopback import DEAF, ECHO_IN, GONE, OVERLONG, STALL_BULK_IN
 
 LOOPBACK = UsbId("loopback", 0x1209, 0x0001)

@@ -68,11 +68,6 @@ class Spad512sModel:
         self._out = bytearray()
         self._run: _Run | None = None
 
-    @property
-    def running(self) -> bool:
-        """Whether a run is under way."""
-        return self._run is not None
-
     def connected(self, now_s: float) -> None:
         """Greet the client."""
         self._out = bytearray(BANNER.encode())

@@ -3,7 +3,6 @@
 It serves one client at a time, as vendors' programs do. Meanwhile it does not listen, and other clients are refused.
 """
 
-import select
 import socket
 import struct
 from contextlib import suppress
@@ -77,13 +76,9 @@ class TcpServer(WireServer[TcpModel]):
     def _serve(self) -> None:
         while not self._ending.is_set():
             with self.lock:
-                moved = False if self._hung else self._turn()
-                readers = [one for one in (self._client, self._listener) if one is not None]
-            if self._hung or not readers:
+                moved = not self._hung and self._turn()
+            if not moved:
                 self._ending.wait(_TURN_S)
-            elif not moved:
-                with suppress(OSError, ValueError):  # closed while waiting
-                    select.select(readers, [], [], _TURN_S)
 
     def _turn(self) -> bool:
         """Accept, take, answer; whether anything moved."""

@@ -13,13 +13,14 @@ import struct
 import threading
 from collections.abc import Iterator
 from dataclasses import dataclass
+from functools import partial
 from types import SimpleNamespace
 from typing import Any
 
 import usb.backend
 import usb.core
 
-from drivers.clock import NS_PER_S, Clock
+from drivers.clock import Clock, now_s
 from sim_backend.wire.serve.usb_model import (
     CONFIGURATION_FORM,
     DEVICE_FORM,
@@ -70,12 +71,9 @@ class EmulatedUsb(usb.backend.IBackend):  # type: ignore[misc] # pyusb carries n
     def plug(self, model: UsbModel) -> AttachedDevice:
         """Attach a model at the next free port. Plugging in again gives a new address, as on a real bus."""
         with self._lock:
-            device = AttachedDevice(model, _BUS, len(self._devices) + 1, self._now_s)
+            device = AttachedDevice(model, _BUS, len(self._devices) + 1, partial(now_s, self._clock))
             self._devices.append(device)
             return device
-
-    def _now_s(self) -> float:
-        return self._clock.now_ns() / NS_PER_S
 
     # What pyusb calls. Names and arguments are pyusb's; a transfer returns the bytes that passed, fewer on a time-out.
 
@@ -191,9 +189,9 @@ class EmulatedUsb(usb.backend.IBackend):  # type: ignore[misc] # pyusb carries n
         """Yield now and then until the time is over, at least once."""
         if timeout_ms <= 0:
             raise ValueError("a timeout of 0 waits for ever in libusb; give the transfer a deadline")
-        end_s, poll_s = self._now_s() + timeout_ms / 1000, FIRST_POLL_S
+        end_s, poll_s = now_s(self._clock) + timeout_ms / 1000, FIRST_POLL_S
         yield
-        while self._now_s() < end_s:
+        while now_s(self._clock) < end_s:
             self._clock.sleep(poll_s)
             poll_s = min(2 * poll_s, LONGEST_POLL_S)
             yield

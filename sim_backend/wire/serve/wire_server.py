@@ -6,7 +6,7 @@ from abc import ABC, abstractmethod
 from collections import deque
 from typing import Generic, Self, TypeVar
 
-from drivers.clock import NS_PER_S, Clock, SystemClock
+from drivers.clock import Clock, SystemClock, now_s
 from drivers.transports.endpoints import Endpoint
 
 Model = TypeVar("Model")
@@ -50,11 +50,9 @@ class WireServer(ABC, Generic[Model]):
         self.unplug()
 
     def __enter__(self) -> Self:
-        """The wire, in use."""
         return self.start()
 
     def __exit__(self, *_: object) -> None:
-        """Close."""
         self.close()
 
     @abstractmethod
@@ -82,7 +80,7 @@ class WireServer(ABC, Generic[Model]):
 
     def _now_s(self) -> float:
         """The model's time."""
-        return self._clock.now_ns() / NS_PER_S
+        return now_s(self._clock)
 
     def _wire_s(self) -> float:
         """The time in which replies travel."""

@@ -11,7 +11,7 @@ from typing import Any
 import numpy as np
 import pytest
 
-from drivers.errors import DeviceDisconnected, DeviceError, DeviceFault, InterlockOpen, LimitExceeded, WrongState
+from drivers.errors import DeviceDisconnected, DeviceFault, LimitExceeded, WrongState
 from drivers.interfaces import (
     OUT_GATE,
     BurstMode,
@@ -32,15 +32,12 @@ from drivers.interfaces import (
 )
 from drivers.ring import BlockRing
 
-DARK = LaserStatus(False, False, True, None, True, False, "digital")
-
 
 class TroubledLaser(LineLaser):
-    """A laser whose status and pause are for the test to spoil."""
+    """A laser whose pause is for the test to spoil."""
 
-    def __init__(self, status: LaserStatus = DARK, pause_error: Exception | None = None) -> None:
+    def __init__(self, pause_error: Exception | None) -> None:
         super().__init__("lamp")
-        self.status_now = status
         self.pause_error = pause_error
         self.calls: list[str] = []
 
@@ -49,7 +46,7 @@ class TroubledLaser(LineLaser):
         return LaserLimits(0.001, 0.05)
 
     def _do_status(self) -> LaserStatus:
-        return self.status_now
+        return LaserStatus(False, False, True, None, True, False, "digital")
 
     def _do_arm(self, power_w: float) -> None:
         self.calls.append(f"arm {power_w}")
@@ -64,23 +61,6 @@ class TroubledLaser(LineLaser):
 
     def _do_close(self) -> None:
         self.calls.append("close")
-
-
-@pytest.mark.parametrize(
-    ("status", "error", "said"),
-    [
-        (replace(DARK, interlock_closed=False), InterlockOpen, "lamp: the interlock is open; close it"),
-        (replace(DARK, fault="diode too hot"), DeviceFault, "lamp: fault diode too hot; clear it"),
-    ],
-)
-def test_an_open_interlock_or_a_fault_keeps_the_laser_off_and_is_told(
-    status: LaserStatus, error: type[DeviceError], said: str
-) -> None:
-    laser = TroubledLaser(status)
-    with pytest.raises(error, match=said):
-        laser.arm(0.01)
-    assert laser.calls == []
-    assert laser.state is DeviceState.READY
 
 
 @pytest.mark.parametrize("fails", [False, True])
