@@ -194,7 +194,10 @@ class FaultyUsb(UsbModel):
             queue.extend((now_s + delay_s, data) for delay_s, data in self._schedule.shape(fault, bytes(answer)))
         if not queue or queue[0][0] > now_s or now_s < self._silent_until_s or self._hung or self.gone:
             return None
-        return queue.popleft()[1]
+        at_s, data = queue.popleft()
+        if len(data) > length:
+            queue.appendleft((at_s, data[length:]))
+        return data[:length]
 
     def _strike(self, fault: Fault | None, now_s: float) -> None:
         if fault is Fault.UNPLUG:
