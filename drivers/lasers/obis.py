@@ -19,7 +19,7 @@ from typing import Annotated, Literal
 
 from pydantic import Field
 
-from drivers.clock import NS_PER_S, Clock
+from drivers.clock import NS_PER_S
 from drivers.errors import DeviceError, DeviceFault, DeviceNotFound, DeviceTimeout, InterlockOpen, LimitExceeded
 from drivers.interfaces import LaserLimits, LaserStatus
 from drivers.lasers.serial_laser import SerialLaser, SerialLaserConfig, open_laser, require_serial_number
@@ -162,18 +162,10 @@ TemperatureRange = tuple[float, float]
 class ObisLaser(SerialLaser):
     """An OBIS. `arm` waits while the laser warms up; `pause` and `disarm` from another thread end that wait."""
 
-    def __init__(
-        self,
-        line: Dialogue,
-        clock: Clock,
-        name: str,
-        limits: LaserLimits,
-        base_range: TemperatureRange | None,
-        warm_up_s: float,
-    ) -> None:
+    def __init__(self, line: Dialogue, name: str, limits: LaserLimits, warm_up_s: float) -> None:
         super().__init__(name, line, limits)
-        self._clock = clock
-        self._base_range = base_range
+        self._clock = line.clock
+        self._base_range = _base_range(line)
         self._warm_up_s = warm_up_s
         self._told_on = False
 
@@ -302,11 +294,10 @@ class ObisLaser(SerialLaser):
 def create(config: ObisConfig, surroundings: Surroundings, timing: LineTiming = USUAL_TIMING) -> ObisLaser:
     """Open the laser and identify it; changes nothing about it."""
     framing = ObisFraming(config.channel)
-    identify = partial(_identify, config, surroundings.clock, framing)
-    return open_laser("obis", config, surroundings, framing, timing, identify)
+    return open_laser("obis", config, surroundings, framing, timing, partial(_identify, config, framing))
 
 
-def _identify(config: ObisConfig, clock: Clock, framing: ObisFraming, line: Dialogue) -> ObisLaser:
+def _identify(config: ObisConfig, framing: ObisFraming, line: Dialogue) -> ObisLaser:
     where = f"obis laser on {config.port}"
     framing.identity = line.ask_surely("*IDN?", TEXT)
     if "OBIS" not in framing.identity.upper():
@@ -322,8 +313,7 @@ def _identify(config: ObisConfig, clock: Clock, framing: ObisFraming, line: Dial
             f"{where}: max_power {config.max_power * 1e3:g} mW is below the least it can give, {least_w * 1e3:g} mW; "
             "use a weaker laser or an attenuator"
         )
-    limits = LaserLimits(least_w, most_w)
-    return ObisLaser(line, clock, f"{model} {serial}", limits, _base_range(line), config.warm_up)
+    return ObisLaser(line, f"{model} {serial}", LaserLimits(least_w, most_w), config.warm_up)
 
 
 def _base_range(line: Dialogue) -> TemperatureRange | None:

@@ -119,7 +119,7 @@ class RunRecording:
         end = run.end_frame if end_frame is None else end_frame
         begins = run.entries["first_frame"].astype(np.int64)
         wanted = run.entries[(begins < end) & (begins + run.entries["n_frames"] > first)]
-        for block in self._read(wanted, run.header):
+        for block in self._read(run, wanted):
             yield block_part(block, first, end)
 
     def read(self, run: RecordedRun, entry: Any) -> FrameBlock | None:
@@ -137,8 +137,7 @@ class RunRecording:
             return None
         return block
 
-    def _read(self, entries: Entries, header: BlockHeader) -> Iterator[FrameBlock]:
-        run = RecordedRun(0, header, entries)
+    def _read(self, run: RecordedRun, entries: Entries) -> Iterator[FrameBlock]:
         if int(entries["length"].sum()) < READ_AHEAD_BYTES:  # threads would take longer to start
             yield from (block for entry in entries if (block := self.read(run, entry)) is not None)
             return

@@ -166,9 +166,9 @@ class HeliosDac:
         """Wait until the firmware is enabled, drop old replies, learn version and name."""
         self.name = link.label
         self.highest_rate_hz = config.max_point_rate
-        self._config = config
+        self.config = config
         self._link = link
-        self._clock = clock
+        self.clock = clock
         self._lock = threading.RLock()
         self._out_of_step = False
         """A reply came late or was another's: what is read next may answer an older question."""
@@ -187,8 +187,7 @@ class HeliosDac:
 
     def run(self, source: PointSource, clock_hz: Fraction) -> "HeliosRun":
         """See `Dac`."""
-        config = self._config
-        return HeliosRun(self, self._clock, source, clock_hz, frame_s=config.frame, axis=config.axis)
+        return HeliosRun(self, source, clock_hz)
 
     def check(self) -> None:
         """Check that the board answers. Raises DeviceTimeout if two queries get no answer."""
@@ -222,7 +221,7 @@ class HeliosDac:
     def stop(self) -> None:
         """Blank at once and centre the mirror in one jump 100 ms later; returns when frames are accepted again."""
         self._send(_STOP, 0)
-        self._clock.sleep(_AFTER_STOP_S)
+        self.clock.sleep(_AFTER_STOP_S)
 
     def close(self) -> None:
         """Stop, take the shutter pin low (the firmware never does), go back to 'disabled' and give the device back."""
@@ -266,16 +265,13 @@ _WIRE_BYTES_PER_S = 1.216e6
 class HeliosRun:
     """One run: `begin`, then `feed`. No wait is longer than two frames plus two seconds."""
 
-    def __init__(
-        self, link: HeliosDac, clock: Clock, source: PointSource, clock_hz: Fraction, *, frame_s: float, axis: str
-    ) -> None:
+    def __init__(self, link: HeliosDac, source: PointSource, clock_hz: Fraction) -> None:
         self.source = source
         self._link = link
-        self._clock = clock
+        self._clock = link.clock
         self._pps = pps_of(clock_hz)
         self._rate_hz = float(clock_hz)
-        self._axis = axis
-        most = min(MOST_POINTS, max(2, round(frame_s * self._rate_hz)))
+        most = min(MOST_POINTS, max(2, round(link.config.frame * self._rate_hz)))
         self._most = most if sendable(most) else most - 1
         self._sent = 0
         self._playing_s = self._pending_s = 0.0
@@ -347,7 +343,7 @@ class HeliosRun:
     def _made(self, flags: int = FLAG_SINGLE) -> tuple[bytes, float]:
         """The next frame and its duration."""
         points = self.source.take(slice_points(self.source.left, self._most))
-        return encode(points, self._axis, self._pps, flags), len(points) / self._rate_hz
+        return encode(points, self._link.config.axis, self._pps, flags), len(points) / self._rate_hz
 
     def _send(self, frame: bytes) -> tuple[float, float]:
         """Send a frame; returns the host's times between which it arrived."""

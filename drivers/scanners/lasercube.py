@@ -89,7 +89,7 @@ class LaserCubeDac:
         self.name = link.label
         self.serial = link.listing.serial
         self.clock = clock
-        self._config = config
+        self.config = config
         self._link = link
         self._lock = threading.RLock()
         self._out_of_step = True
@@ -113,9 +113,7 @@ class LaserCubeDac:
 
     def run(self, source: PointSource, clock_hz: Fraction) -> "LaserCubeRun":
         """See `Dac`."""
-        config = self._config
-        markers = config.colours == "markers"
-        return LaserCubeRun(self, source, int(clock_hz), buffer_s=config.buffer, axis=config.axis, markers=markers)
+        return LaserCubeRun(self, source, int(clock_hz))
 
     def check(self) -> None:
         """Check that the board answers a query."""
@@ -214,18 +212,17 @@ counting."""
 class LaserCubeRun:
     """One run: `begin`, then `feed`. No wait is longer than the queued samples take plus one second."""
 
-    def __init__(
-        self, link: LaserCubeDac, source: PointSource, rate_hz: int, *, buffer_s: float, axis: str, markers: bool
-    ) -> None:
+    def __init__(self, link: LaserCubeDac, source: PointSource, rate_hz: int) -> None:
+        config = link.config
         self.source = source
         self._link = link
         self._rate_hz = rate_hz
-        self._axis = axis
-        self._markers = markers
-        wanted = math.ceil(max(_HOLD_S, buffer_s / 2) * rate_hz / SAMPLES_PER_TRANSFER)
+        self._axis = config.axis
+        self._markers = config.colours == "markers"
+        wanted = math.ceil(max(_HOLD_S, config.buffer / 2) * rate_hz / SAMPLES_PER_TRANSFER)
         # In whole transfers, and at most a quarter of the ring.
         self._hold = max(1, min(wanted, link.ring_points // 4 // SAMPLES_PER_TRANSFER)) * SAMPLES_PER_TRANSFER
-        self._most = min(round(buffer_s * rate_hz), link.ring_points - 2 * self._hold)
+        self._most = min(round(config.buffer * rate_hz), link.ring_points - 2 * self._hold)
         if source.left:
             source.pad_start(self._hold)
         self._waiting = b""

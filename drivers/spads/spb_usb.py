@@ -92,7 +92,7 @@ class SpbUsb(SpadArray):
             self._control.on_wait = self._note_wait
             self._identity = identify(self._control, self.name)
             if config.test_pattern:
-                require_order(self._control, link, wiring.stream_in, self._identity, config.heartbeat)
+                require_order(self._control, self._identity, config.heartbeat)
         except BaseException:
             self._do_close()
             raise

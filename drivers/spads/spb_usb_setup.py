@@ -16,7 +16,7 @@ from typing import Literal
 import numpy as np
 from numpy.typing import NDArray
 
-from drivers.clock import Clock, now_s
+from drivers.clock import now_s
 from drivers.errors import CorruptBlock, DeviceFault, DeviceNotFound, DeviceTimeout, LimitExceeded, ProtocolError
 from drivers.frames import BlockFlag, frame_bytes
 from drivers.interfaces import BurstMode, SpadInfo, StreamMode, WindowTable
@@ -167,20 +167,18 @@ def require_windows(identity: SensorIdentity, window: WindowTable, name: str) ->
         )
 
 
-def require_order(
-    control: ControlChannel, link: BulkLink, stream_in: int, identity: SensorIdentity, heartbeat_s: float
-) -> None:
+def require_order(control: ControlChannel, identity: SensorIdentity, heartbeat_s: float) -> None:
     """Check a few frames of the test pattern. A wrong order of bits or rows would otherwise go unnoticed (8.4, 6)."""
     if Feature.TEST_PATTERN not in identity.features:
         return
-    info, name, period = identity.info, link.label, identity.min_period_ticks
+    info, name, period = identity.info, control.link.label, identity.min_period_ticks
     stride, n = block_size(identity, info.width, _PATTERN_FRAMES, name)
     RunSetup(period, period, info.stream is None, stride, n, heartbeat_s).write(control)
     control.write_all(((Register.TEST_PATTERN, 1),))
     write_length(control, n)
     control.send(Op.START)
     try:
-        block = parse_block(_read_block(link, stream_in, stride, control.clock), check_payload=True)
+        block = parse_block(_read_block(control, stride), check_payload=True)
     except CorruptBlock as error:
         raise ProtocolError(f"{name}: the test pattern came damaged ({error}); check cable and firmware") from None
     finally:
@@ -193,11 +191,11 @@ def require_order(
         raise ProtocolError(f"{name}: the test pattern differs; bits or rows come in another order: wrong firmware?")
 
 
-def _read_block(link: BulkLink, stream_in: int, stride: int, clock: Clock) -> NDArray[np.uint8]:
-    ends_at = now_s(clock) + _PATTERN_S
+def _read_block(control: ControlChannel, stride: int) -> NDArray[np.uint8]:
+    ends_at = now_s(control.clock) + _PATTERN_S
     got = b""
-    while len(got) < stride and now_s(clock) < ends_at:
-        got += link.read(stream_in, stride - len(got), _PATTERN_S)
+    while len(got) < stride and now_s(control.clock) < ends_at:
+        got += control.link.read(control.stream_in, stride - len(got), _PATTERN_S)
     return np.frombuffer(got, np.uint8)
 
 

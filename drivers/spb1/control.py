@@ -209,13 +209,13 @@ class ControlChannel:
     def __init__(
         self, link: BulkLink, command_out: int, ack_in: int | None, stream_in: int, clock: Clock, tap: Tap | None
     ) -> None:
-        self._link = link
+        self.link = link
         self.clock = clock
         """The clock of its deadlines."""
         self._tap = tap
         self._command_out = command_out
         self.ack_in = ack_in
-        self._stream_in = stream_in
+        self.stream_in = stream_in
         self._request_id = 0
         self._received: list[Ack] = []
         self.on_wait: Callable[[float], None] | None = None
@@ -231,7 +231,7 @@ class ControlChannel:
             values = [ack.value for ack in self._ask([(Op.READ, register, 0) for register in (*registers, *registers)])]
             if values[: len(registers)] == values[len(registers) :]:
                 return values[: len(registers)]
-        raise ProtocolError(f"{self._link.label}: two answers to the same question differ; check cable and firmware")
+        raise ProtocolError(f"{self.link.label}: two answers to the same question differ; check cable and firmware")
 
     def read64(self, register: int) -> int:
         """The value of a 64-bit register."""
@@ -269,10 +269,10 @@ class ControlChannel:
         ends_at = now_s(self.clock) + _DRAIN_S
         while now_s(self.clock) < ends_at:
             try:
-                self._link.read(self._stream_in, _DRAIN_BYTES, _QUIET_S)
+                self.link.read(self.stream_in, _DRAIN_BYTES, _QUIET_S)
             except DeviceTimeout:
                 return
-        raise ProtocolError(f"{self._link.label}: sends without being asked; wrong firmware, or unplug it once")
+        raise ProtocolError(f"{self.link.label}: sends without being asked; wrong firmware, or unplug it once")
 
     def _command(self, op: int, address: int, value: int) -> Command:
         self._request_id = (self._request_id + 1) & 0xFFFF
@@ -281,7 +281,7 @@ class ControlChannel:
     def _tell(self, commands: Iterable[Command]) -> None:
         data = b"".join(command.packed() for command in commands)
         self._note(OUT, data)
-        self._link.write(self._command_out, data, _ANSWER_S)
+        self.link.write(self._command_out, data, _ANSWER_S)
 
     def _note(self, direction: str, data: bytes) -> None:
         if self._tap is not None:
@@ -299,7 +299,7 @@ class ControlChannel:
                 ack = self._answer(command, ends_at)
                 if ack.status != AckStatus.OK:
                     why, name = _REFUSALS.get(ack.status, f"answers status {ack.status}"), Op(command.op).name
-                    where = f"{self._link.label}: {name} 0x{command.address:04x} = {command.value}"
+                    where = f"{self.link.label}: {name} 0x{command.address:04x} = {command.value}"
                     raise DeviceFault(f"{where}: the device {why}")
                 acks.append(ack)
         return acks
@@ -314,7 +314,7 @@ class ControlChannel:
             left_s = ends_at - now_s(self.clock)
             if left_s <= 0:
                 raise DeviceTimeout(
-                    f"{self._link.label} did not acknowledge {Op(command.op).name} within {_ANSWER_S:g} s; "
+                    f"{self.link.label} did not acknowledge {Op(command.op).name} within {_ANSWER_S:g} s; "
                     "power-cycle it"
                 )
             slice_s = min(left_s, _SLICE_S)
@@ -326,10 +326,10 @@ class ControlChannel:
 
     def _read_acks(self, left_s: float) -> list[Ack]:
         if self.ack_in is not None:
-            acks = self._link.read(self.ack_in, _ACK_READ_BYTES, left_s)
+            acks = self.link.read(self.ack_in, _ACK_READ_BYTES, left_s)
             self._note(IN, acks)
             return read_acks(acks)
-        data = np.frombuffer(self._link.read(self._stream_in, ACK_BLOCK_BYTES, left_s), np.uint8)
+        data = np.frombuffer(self.link.read(self.stream_in, ACK_BLOCK_BYTES, left_s), np.uint8)
         try:
             fields = read_header(data)
             if not fields.is_control or fields.block.payload_type != REGISTER_ACK:

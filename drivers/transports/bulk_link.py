@@ -12,6 +12,7 @@ import time
 from collections import deque
 from collections.abc import Iterator
 from contextlib import contextmanager, suppress
+from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
@@ -251,16 +252,16 @@ class QueuedLink:
             raise usb_failure(self.label, _ERRNO.get(error.value), str(error), endpoint, timeout_s) from None
 
 
+@dataclass(slots=True, eq=False)
 class _Read:
     """A queued read."""
 
-    def __init__(self, transfer: Any, buffer: Buffer) -> None:
-        self.transfer = transfer
-        self.buffer = buffer
-        self.endpoint = 0
-        self.over = False
-        self.got = 0
-        self.status = -1
+    transfer: Any
+    buffer: Buffer
+    endpoint: int = 0
+    over: bool = False
+    got: int = 0
+    status: int = -1
 
     def begin(self, endpoint: int, timeout_ms: int) -> None:
         """Hand the read to libusb."""

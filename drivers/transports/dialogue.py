@@ -93,7 +93,7 @@ class Dialogue:
         self.name = name
         self.port = port
         self._framing = framing
-        self._clock = clock
+        self.clock = clock
         self._timing = timing
         self._lock = FairLock()
         self._quiet_since_s = now_s(clock)
@@ -172,8 +172,8 @@ class Dialogue:
 
     def _once(self, command: str) -> str:
         """One command and its reply."""
-        passed_s = now_s(self._clock) - self._quiet_since_s
-        self._clock.sleep(self._timing.gap_s - passed_s)
+        passed_s = now_s(self.clock) - self._quiet_since_s
+        self.clock.sleep(self._timing.gap_s - passed_s)
         if self.port.reset_input().strip():  # a reply that nobody asked for, and perhaps its other half comes yet
             self.port.drain(self._timing.quiet_s, self._timing.drain_s)
         self.port.write(self._framing.encode(command))
@@ -183,7 +183,7 @@ class Dialogue:
                 command, lambda: self.port.read_line(b"\n", reply_s).decode("ascii", "replace").strip()
             )
         finally:
-            self._quiet_since_s = now_s(self._clock)
+            self._quiet_since_s = now_s(self.clock)
 
     def _resync(self, quiet_s: float) -> None:
         """Drop what comes late, then ask what only one reply can answer."""

@@ -227,7 +227,8 @@ def test_trap_an_external_clock_that_dies_is_noticed_before_the_next_run() -> No
         device.program(SWEEP, 1)
         assert wire.model.words[1] == (0, 10_000)
         with wire.server.lock:
-            wire.model.lose_external_clock()
+            wire.model.external_clock_hz = None
+            wire.model._resuscitate()
         with pytest.raises(DeviceFault, match="GPIO20"):
             device.run()
         device.abort()

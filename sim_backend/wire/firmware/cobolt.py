@@ -8,6 +8,7 @@ has the traps of the real laser: no answer to a command sooner than 100 ms after
 
 import re
 from collections.abc import Callable
+from dataclasses import KW_ONLY, dataclass, field
 from typing import Literal
 
 Family = Literal["06-MLD", "06-01"]
@@ -55,57 +56,47 @@ _POWERS: dict[Family, dict[str, tuple[str, float]]] = {
 """Commands that set a flag, or a power in a unit of so many watts, and the model's attribute for it."""
 
 
+@dataclass(eq=False)
 class CoboltModel:
     """The laser. Its attributes are the truth, for tests to look at; the driver sees only the replies.
 
     on_emission(emits, now_s) is called whenever power or emission change.
     """
 
-    def __init__(
-        self,
-        family: Family = "06-MLD",
-        *,
-        model: str | None = None,
-        serial: str = "16328",
-        firmware: str = "4.1.3",
-        autostart: bool = True,
-        warm_up_s: float = 3.0,
-        junk: bytes = b"",
-        gap_s: float = GAP_S,
-        on_emission: Callable[[bool, float], None] | None = None,
-    ) -> None:
-        self.family = family
-        self.model = MODELS[family] if model is None else model
-        self.serial = serial
-        self.firmware = firmware
-        self.max_power_w = 0.1
-        self.autostart = autostart
-        self.warm_up_s = warm_up_s
-        self.junk = junk
-        self.on_emission = on_emission
-        self.key_on = True
-        self.key_needed = False
-        self.waiting_for_key = False
-        self.interlock_open = False
-        self.fault = 0
-        self.on = False
-        self.paused = False
-        self.mode: Mode = "constant power"
-        self.constant_power_w = 0.0
-        self.modulation_power_w = 0.0
-        self.current_ma = 0.0
-        self.digital = False
-        self.analog = False
-        self.modulator = "external"
-        self.forbidden: list[str] = []
-        """Commands received that no driver may send."""
-        self.commands: list[str] = []
-        """All commands received."""
-        self._gap_s = gap_s
-        self._ready_at_s: float | None = None
-        self._quiet_since_s = float("-inf")
-        self._pending = b""
-        self._shown: tuple[bool, float] = (False, 0.0)
+    family: Family = "06-MLD"
+    _: KW_ONLY
+    model: str = ""
+    """Its model number; empty: the usual one of the family."""
+    serial: str = "16328"
+    firmware: str = "4.1.3"
+    autostart: bool = True
+    warm_up_s: float = 3.0
+    junk: bytes = b""
+    gap_s: float = GAP_S
+    on_emission: Callable[[bool, float], None] | None = None
+    max_power_w: float = 0.1
+    key_on: bool = True
+    key_needed: bool = False
+    waiting_for_key: bool = False
+    interlock_open: bool = False
+    fault: int = 0
+    on: bool = False
+    paused: bool = False
+    mode: Mode = "constant power"
+    constant_power_w: float = 0.0
+    modulation_power_w: float = 0.0
+    current_ma: float = 0.0
+    digital: bool = False
+    analog: bool = False
+    modulator: str = "external"
+    forbidden: list[str] = field(default_factory=list)
+    """Commands received that no driver may send."""
+    commands: list[str] = field(default_factory=list)
+    """All commands received."""
+    _ready_at_s: float | None = None
+    _quiet_since_s: float = float("-inf")
+    _pending: bytes = b""
+    _shown: tuple[bool, float] = (False, 0.0)
 
     @property
     def gated(self) -> bool:
@@ -180,7 +171,7 @@ class CoboltModel:
         self.commands.append(command)
         if FORBIDDEN.fullmatch(command):
             self.forbidden.append(command)
-        if now_s < self._quiet_since_s + self._gap_s:
+        if now_s < self._quiet_since_s + self.gap_s:
             return b""  # still busy with the last one
         if command.startswith("!"):
             return b""  # command modulation never replies
@@ -213,7 +204,7 @@ class CoboltModel:
             "pa?": f"{self.power_w:.4f}",
         }
         if "." in self.firmware:  # -04- types have no dot there, and do not know it
-            answers["glm?"] = self.model
+            answers["glm?"] = self.model or MODELS[self.family]
         number, name = _MODES[self.mode]
         modulation = f"{self.modulation_power_w * 1e3:.4f}"
         if self.family == "06-MLD":

@@ -8,6 +8,7 @@ on (ERR-200), and behind a Remote only numbered commands reach it.
 
 import re
 from collections.abc import Callable
+from dataclasses import dataclass, field
 
 OFF_BITS = 0xC800_0000
 """Bits of every sample status in docs/reference/hardware.md."""
@@ -19,6 +20,7 @@ _SWITCHES = {"SYST:CDRH": "cdrh", "SYST:AUT": "autostart", "SOUR:TEMP:APR": "tec
 """Commands that switch one of the model's attributes."""
 
 
+@dataclass(eq=False, kw_only=True)
 class ObisModel:
     """The laser. Its attributes are the truth, for tests to look at; the driver sees only the replies.
 
@@ -26,45 +28,33 @@ class ObisModel:
     Remote.
     """
 
-    def __init__(
-        self,
-        *,
-        handshake: bool = True,
-        channel: int | None = None,
-        serial: str = "123456789012",
-        least_power_w: float = 0.002,
-        max_power_w: float = 0.11,
-        warm_up_s: float = 0.0,
-        cdrh_delay_s: float = 5.0,
-        on_emission: Callable[[bool, float], None] | None = None,
-    ) -> None:
-        self.handshake = handshake
-        self.channel = channel
-        self.serial = serial
-        self.least_power_w = least_power_w
-        self.max_power_w = max_power_w
-        self.cdrh_delay_s = cdrh_delay_s
-        self.on_emission = on_emission
-        self.key_on = True
-        self.interlock_open = False
-        self.fault = 0
-        self.state_on = False
-        self.mode = "CWP"
-        self.set_power_w = least_power_w
-        self.cdrh = True
-        self.autostart = False
-        self.tec = True
-        self.base_c = 24.6
-        self.base_range_c: tuple[float, float] | None = (10.0, 50.0)
-        """Range of the base plate's temperature that this unit states; None: it states none."""
-        self.forbidden: list[str] = []
-        self.commands: list[str] = []
-        self._warm_up_s = warm_up_s
-        self._warm_at_s: float | None = None
-        self._lit_at_s: float | None = None
-        self._now_s = 0.0
-        self._pending = ""
-        self._shown = (False, 0.0)
+    handshake: bool = True
+    channel: int | None = None
+    serial: str = "123456789012"
+    least_power_w: float = 0.002
+    max_power_w: float = 0.11
+    warm_up_s: float = 0.0
+    cdrh_delay_s: float = 5.0
+    on_emission: Callable[[bool, float], None] | None = None
+    key_on: bool = True
+    interlock_open: bool = False
+    fault: int = 0
+    state_on: bool = False
+    mode: str = "CWP"
+    set_power_w: float = 0.002
+    cdrh: bool = True
+    autostart: bool = False
+    tec: bool = True
+    base_c: float = 24.6
+    base_range_c: tuple[float, float] | None = (10.0, 50.0)
+    """Range of the base plate's temperature that this unit states; None: it states none."""
+    forbidden: list[str] = field(default_factory=list)
+    commands: list[str] = field(default_factory=list)
+    _warm_at_s: float | None = None
+    _lit_at_s: float | None = None
+    _now_s: float = 0.0
+    _pending: str = ""
+    _shown: tuple[bool, float] = (False, 0.0)
 
     @property
     def warm(self) -> bool:
@@ -120,7 +110,7 @@ class ObisModel:
         """Let time pass, so that warm-up and delay can end. The laser never sends anything unasked."""
         self._now_s = now_s
         if self._warm_at_s is None:
-            self._warm_at_s = now_s + self._warm_up_s
+            self._warm_at_s = now_s + self.warm_up_s
         if self.state_on and self._lit_at_s is None and self.warm and self.able:
             self._lit_at_s = now_s + (self.cdrh_delay_s if self.cdrh else 0.0)
         self._tell()

@@ -130,12 +130,6 @@ class PrawnDoModel:
         self._set_outputs(0, at_s)
         self._unasked = BANNER
 
-    def lose_external_clock(self) -> None:
-        """Stop the clock on GPIO20. The firmware goes on with its own and reports that unasked."""
-        self.external_clock_hz = None
-        if self.clock_external:
-            self._resuscitate()
-
     # The player
 
     def advance(self, until_s: float) -> None:
@@ -303,6 +297,7 @@ class PrawnDoModel:
         return _said("ok")
 
     def _resuscitate(self) -> None:
+        """Go on with the board's own clock, as there is none on GPIO20, and report that unasked."""
         self.clock_external = False
         self.clock_hz = INTERNAL_HZ
         self._unasked += _said("System Clock Resus'd")
