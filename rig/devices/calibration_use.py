@@ -23,6 +23,7 @@ from drivers.json_text import parse_json
 from drivers.replay.spad import ReplaySpad
 from rig.devices.open import OpenRig
 from rig.errors import UsageError
+from rig.run_folder.folder import replace_file
 from rig.run_folder.manifest import read_manifest
 
 NEXT: Final = "calibrate again, or add --accept-calibration to use it all the same"
@@ -269,9 +270,7 @@ def note_check(file: Path, model: RigModel, what: str, *, passed: bool, reasons:
     notes = _read_notes(beside)
     date = datetime.now(UTC).isoformat(timespec="seconds")
     notes[what] = {"calibration": model.fingerprint(), "date": date, "passed": passed, "reasons": list(reasons)}
-    scratch = beside.with_name(f".{beside.name}.part")
-    scratch.write_text(json.dumps(notes, indent=1) + "\n", encoding="utf-8")
-    scratch.replace(beside)
+    replace_file(beside, (json.dumps(notes, indent=1) + "\n").encode())
     return beside
 
 

@@ -5,20 +5,15 @@ import pytest
 from drivers.errors import LimitExceeded
 from drivers.interfaces import DeviceState
 from tests.conformance.cases import LaserCase, require_final
+from tests.wire.lasers import bring_up
 
 WARM_UP_S = 600.0
-POLL_S = 0.1
 
 
 def arm(case: LaserCase) -> None:
     """Arm at a usual power and wait for emission, which may follow late: a warm-up, a safety delay."""
     limits = case.device.limits
-    case.device.arm((limits.min_power_w + limits.max_power_w) / 2)
-    waited_s = 0.0
-    while not case.device.status.emission:
-        assert waited_s < WARM_UP_S, "no emission"
-        case.clock.sleep(POLL_S)
-        waited_s += POLL_S
+    bring_up(case.device, case.clock, (limits.min_power_w + limits.max_power_w) / 2)
 
 
 def check_dark(case: LaserCase, *, armed: bool) -> None:

@@ -2,6 +2,7 @@
 
 from collections import deque
 from collections.abc import Sequence
+from dataclasses import KW_ONLY, dataclass, field
 from enum import Enum
 from typing import Any
 
@@ -31,37 +32,35 @@ class Fault(Enum):
     """The firmware takes and says nothing from now on; its outputs stay as they are."""
 
 
+@dataclass
 class FaultSchedule:
     """probability: of a fault on any one reply. kinds: which faults, equally often. skip: number of first replies that
     come unharmed (for example the opening of a device). most: total number of faults; None for no limit."""
 
-    def __init__(
-        self,
-        seed: int,
-        probability: float = 0.2,
-        kinds: Sequence[Fault] = tuple(Fault),
-        *,
-        skip: int = 0,
-        most: int | None = None,
-        late_s: float = 0.3,
-        stall_s: float = 1.5,
-    ) -> None:
-        self._random = np.random.default_rng(seed)
-        self._probability, self._kinds, self._skip, self._left = probability, tuple(kinds), skip, most
-        self._late_s, self.stall_s = late_s, stall_s
-        self._held = b""
-        self.struck: list[Fault] = []
+    seed: int
+    probability: float = 0.2
+    kinds: Sequence[Fault] = tuple(Fault)
+    _: KW_ONLY
+    skip: int = 0
+    most: int | None = None
+    late_s: float = 0.3
+    stall_s: float = 1.5
+    struck: list[Fault] = field(default_factory=list)
+    _held: bytes = b""
+
+    def __post_init__(self) -> None:
+        self._random = np.random.default_rng(self.seed)
 
     def next(self) -> Fault | None:
         """The fault that strikes the next reply; None if it comes unharmed."""
-        if self._skip > 0:
-            self._skip -= 1
+        if self.skip > 0:
+            self.skip -= 1
             return None
-        if self._left == 0 or self._random.random() >= self._probability:
+        if self.most == 0 or self._random.random() >= self.probability:
             return None
-        if self._left is not None:
-            self._left -= 1
-        self.struck.append(self._kinds[int(self._random.integers(len(self._kinds)))])
+        if self.most is not None:
+            self.most -= 1
+        self.struck.append(self.kinds[int(self._random.integers(len(self.kinds)))])
         return self.struck[-1]
 
     def shape(self, fault: Fault | None, reply: bytes) -> tuple[tuple[float, bytes], ...]:
@@ -74,10 +73,10 @@ class FaultSchedule:
             return ()
         match fault:
             case Fault.LATE:
-                return ((self._random.uniform(0.1, 1.0) * self._late_s, whole),)
+                return ((self._random.uniform(0.1, 1.0) * self.late_s, whole),)
             case Fault.SPLIT:
                 cut = int(self._random.integers(len(whole) + 1))
-                return (0.0, whole[:cut]), (self._random.uniform(0.0, 0.2) * self._late_s, whole[cut:])
+                return (0.0, whole[:cut]), (self._random.uniform(0.0, 0.2) * self.late_s, whole[cut:])
             case Fault.TRUNCATED:
                 whole = whole[: int(self._random.integers(len(whole)))]
             case Fault.CORRUPTED:
