@@ -146,9 +146,10 @@ class Joint:
         def tie_rows(first: int, last: int) -> None:
             # Rows that share tables: those are fetched once, and costs are tied along rows while the cache has them.
             room = tables.costs.room()
+            room_at = pointers(room)
             for band in range(first, last, BAND_ROWS):
                 end = min(band + BAND_ROWS, last)
-                tables.costs.fill(volume, band, end, room, memory.cost)
+                tables.costs.fill(volume, band, end, room_at, memory.cost)
                 self._prior.add(volume, band, end, memory.cost)
                 along_rows(memory.cost, memory.message, band, end)
 

@@ -264,36 +264,41 @@ def write_rows(places: int, ways: Ways, b: Buffers, batch: int, out: int, row_by
 
 
 class CostRoom(NamedTuple):
-    """Tables and buffers of `fill_costs` and `fit_tables`, which take `pointers` to them."""
+    """Tables and buffers of `fill_costs` and `fit_tables`, which take `pointers` to them.
+
+    read: pixels of a row that weigh anything: those beyond the last vector of any table and its taps belong to no
+    label, and only halos weigh them.
+    """
 
     at: LabelTables
     halo: HaloRoom
     buffers: Buffers
+    read: int
 
 
 def room_for(tables: LabelTables, halo: HaloTables, labels: int) -> CostRoom:
     """The tables with the working memory of one thread."""
-    return CostRoom(tables, new_halo_room(halo, tables.constants), new_buffers(tables, labels))
+    room, read = new_halo_room(halo, tables.constants), tables.pixels
+    if room.blocks == 0 and tables.used.size > 0:
+        reach = tables.tap.shape[2] // 2
+        read = min(read, -(-(FAR_PX + LANES * int(tables.used.max()) + reach) // LANES) * LANES)
+    return CostRoom(tables, room, new_buffers(tables, labels), read)
 
 
 @numba.njit(cache=True, nogil=True)
 def fill_costs(
-    counts: Counts, n_frames: Int32, x0: Int32, place: Int16, tables: LabelTables, room: CostRoom, ways: Ways,
+    counts: Counts, n_frames: Int32, x0: Int32, place: Int16, numbers: Int32, room: CostRoom, ways: Ways,
     first_row: int, last_row: int, out: Uint8,
 ) -> None:  # fmt: skip
     """Costs of rows first_row..last_row-1, see `Costs.fill` in `rig.estimate.joint.labels.costs`.
 
-    room: pointers to the tables and a thread's buffers.
+    numbers: `at` of the tables. room: pointers to the tables and a thread's buffers.
     """
     at, around, b, labels = room.at, room.halo, room.buffers, out.shape[2]
     rows, columns = out.shape[0], out.shape[1]
     usually, unusually = Fitted(at.fitted_constant, at.fitted_edge), Fitted(b.constant, b.edge)
     place_at, out_at, counts_at = address_of(place), address_of(out), address_of(counts)
     window, in_bytes = counts.shape[2], counts.itemsize == 1
-    # Pixels beyond the last vector of any table and its taps belong to no label; only halos weigh them.
-    read = at.pixels
-    if around.blocks == 0 and tables.used.size > 0:
-        read = min(read, -(-(FAR_PX + LANES * int(tables.used.max()) + ways.reach) // LANES) * LANES)
     write_int32(b.table, 0, np.int32(-1))
     write_int32(b.shown, 0, np.int32(-1))
     for band in range(first_row // BAND_ROWS, -(-last_row // BAND_ROWS)):
@@ -306,12 +311,12 @@ def fill_costs(
             usual = exposures == ways.exposures
             fitted = usually if usual else unusually
             for variant in range(VARIANTS):
-                i = int(tables.at[band, c, variant]) if exposures > 0 else -1
+                i = int(numbers[band, c, variant]) if exposures > 0 else -1
                 write_int32(b.table, 1 + variant, np.int32(i))
                 if i >= 0 and not usual:
                     _fit_table(at, i, variant, per_nat, fitted, b.through)
-                if c + 1 < columns and tables.at[band, c + 1, variant] >= 0:
-                    _fetch_table(at, int(tables.at[band, c + 1, variant]), usually)
+                if c + 1 < columns and numbers[band, c + 1, variant] >= 0:
+                    _fetch_table(at, int(numbers[band, c + 1, variant]), usually)
             column = band * columns + c
             if around.blocks > 0:
                 fit_halo(around, column, per_nat)
@@ -333,9 +338,9 @@ def fill_costs(
                     write_int32(b.fitted, r, i if usual else np.int32(variant))
                 if in_bytes and times >= 1.0:
                     at_row = (c * rows + y) * window
-                    read_bytes(counts_at, at_row, places, stored, ways.side, read, int(times), b, batch)
+                    read_bytes(counts_at, at_row, places, stored, ways.side, room.read, int(times), b, batch)
                 else:
-                    _read_any(counts, c, y, places, stored[0], ways.side, read, times, b, batch)
+                    _read_any(counts, c, y, places, stored[0], ways.side, room.read, times, b, batch)
                 if mend:
                     mend_rows(at, places, y, per_nat, ways.side, b, batch)
                 sum_edges(at, fitted, b, batch)

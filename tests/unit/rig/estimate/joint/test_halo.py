@@ -23,6 +23,7 @@ from rig.estimate.row.inputs import halo_shares, row_buffers, row_fluxes, state_
 from rig.estimate.row.likelihood import FLOOR
 from rig.estimate.row.model import BINS, HALO_NODES, RowModel, pixel_shares
 from rig.estimate.search.online_learning import LearningSetting
+from rig.simd.memory import pointers
 from rig.simd.vectors import LANES
 from rig.threads import RowWorkers
 from tests.stability.inventory import covers
@@ -61,7 +62,8 @@ def test_costs_are_those_of_a_stripe_with_its_halo(apart):
     model = replace(model, amplitude=model.amplitude * np.array([1 / apart, 1 / apart, apart, apart], np.float32))
     costs = costs_of(model, geometry, label_grid(geometry), 10, WORKERS)
     out = np.zeros((geometry.rows, geometry.columns, costs.grid.labels), np.uint8)
-    costs.fill(volume, 0, geometry.rows, costs.room(), out)
+    room = costs.room()
+    costs.fill(volume, 0, geometry.rows, pointers(room), out)
     off = []
     for c in range(4, 44, 5):
         row = row_fluxes(sweep_of(geometry), state_of(model), row_buffers(geometry.window, 1), y, c)

@@ -14,6 +14,7 @@ from rig.estimate.joint.labels.grid import PER_PX, label_grid
 from rig.estimate.row.inputs import row_buffers, row_fluxes, state_of, sweep_of
 from rig.estimate.row.likelihood import FLOOR
 from rig.estimate.row.model import BINS, RowModel, pixel_shares, stripe_scale
+from rig.simd.memory import pointers
 from rig.threads import RowWorkers
 from tests.stability.inventory import covers
 from tests.unit.small_maps import simulated, volume_of
@@ -54,7 +55,8 @@ def filled(model, geometry, volume, exposures, pieces=1):
     out = np.full((geometry.rows, geometry.columns, grid.labels), 7, np.uint8)
     edges = np.linspace(0, geometry.rows, pieces + 1).astype(int)
     for first, last in pairwise(edges):
-        costs.fill(volume, first, last, costs.room(), out)
+        room = costs.room()
+        costs.fill(volume, first, last, pointers(room), out)
     return out, costs
 
 
