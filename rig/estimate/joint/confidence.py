@@ -118,7 +118,8 @@ def _count_row(distance: Float32, row: int, number: Int16) -> None:
     for c in range(0, width - 2 * LANES, LANES):
         here = row * width + LANES + c
         own, same = load_float32(at, here), zero_float32()
-        for line in range(here - NEIGHBOURS * width, here + NEIGHBOURS * width + 1, width):
+        for away in range(-NEIGHBOURS, NEIGHBOURS + 1):
+            line = here + away * width
             for near in range(line - NEIGHBOURS, line + NEIGHBOURS + 1):
                 same = same + where_small(one, load_float32(at, near) - own, SAME_PX)
         store_int16(address_of(number), c, to_int16(same))
@@ -258,8 +259,7 @@ def confidences(
             agreement_row(number, y, pairs, lines[_PAIRS])
             light_row(distance, light, row, lines[_LIT], lines[_LIGHT_SUM])
             apart_row(placed, row, lines[_APART])
-            for c in range(columns):
-                lines[_OFF, c] = distance[row, LANES + c]
+            copy_floats(address_of(distance[row, LANES:]), at + 4 * _OFF * width, columns)
             for source, line in sources:
                 copy_floats(source + 4 * columns * y, at + 4 * line * width, columns)
             for c in range(columns):

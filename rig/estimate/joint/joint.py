@@ -25,7 +25,7 @@ from rig.estimate.joint.second_returns import second_returns
 from rig.estimate.joint.tables import JointTables, Memory, grid_of, memory_for, tables_of
 from rig.estimate.joint.temporal import TemporalPrior
 from rig.estimate.joint.vote import NEIGHBOURS_PX, collect, vote
-from rig.estimate.joint.winner import answer_settings, new_readout
+from rig.estimate.joint.winner import new_readout
 from rig.estimate.row.ambient import ambient_map
 from rig.estimate.row.em import learn_again, lines_of, next_lattice
 from rig.estimate.row.inputs import state_of
@@ -141,12 +141,13 @@ class Joint:
         grid, workers = tables.grid, self._workers
         rows, columns = grid.x_far.shape
         memory = self._room(grid)
-        settings = answer_settings(grid.stripes)
 
         def tie_rows(first: int, last: int) -> None:
             # Rows that share tables: those are fetched once, and costs are tied along rows while the cache has them.
-            room = tables.costs.room()
-            room_at = pointers(room)
+            if first not in tables.rooms:
+                room = tables.costs.room()
+                tables.rooms[first] = room, pointers(room)
+            _, room_at = tables.rooms[first]
             for band in range(first, last, BAND_ROWS):
                 end = min(band + BAND_ROWS, last)
                 tables.costs.fill(volume, band, end, room_at, memory.cost)
@@ -154,7 +155,7 @@ class Joint:
                 along_rows(memory.cost, memory.message, band, end)
 
         def tie_columns(first: int, last: int) -> None:
-            desk = new_readout(settings, memory.answer, CHUNK, grid.labels)
+            desk = new_readout(tables.settings, memory.answer, CHUNK, grid.labels)
             along_columns(memory.cost, memory.message, first, last, pointers(desk))
 
         x_px, neighbours = np.empty((rows, columns), np.float32), grid.column_px <= NEIGHBOURS_PX

@@ -65,11 +65,14 @@ def collect(answer: LabelAnswers, first_column: int, last_column: int, out: Ball
     """Fill the ballots of columns first_column..last_column-1."""
     # Local names: each use of the tuple itself in the loop would count references to all of its arrays.
     labels, margins, label, whole, votes = answer.label, answer.margin, out.label, out.whole, out.votes
+    to = slice(first_column + REACH, last_column + REACH)
     for y in range(labels.shape[0]):
-        for c in range(first_column, last_column):
-            label[y + REACH, c + REACH] = labels[y, c]
-            whole[y + REACH, c + REACH] = np.int16(labels[y, c] + np.float32(0.5))
-            votes[y + REACH, c + REACH] = margins[y, c] >> SHARE_BITS
+        own, margin = labels[y, first_column:last_column], margins[y, first_column:last_column]
+        to_label, to_whole, to_votes = label[y + REACH, to], whole[y + REACH, to], votes[y + REACH, to]
+        for c in range(own.shape[0]):
+            to_label[c] = own[c]
+            to_whole[c] = np.int16(own[c] + np.float32(0.5))
+            to_votes[c] = margin[c] >> SHARE_BITS
 
 
 NEIGHBOURS_PX: Final = 3.0

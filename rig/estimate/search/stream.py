@@ -282,10 +282,11 @@ class ColumnJudge:
     def begin(self, judge: SearchTables) -> None:
         """Begin the next sweep, with the tables `judge`."""
         self._workers.settle()
-        self._judge = judge
+        if judge is not self._judge:  # else the addresses hold: made anew they would take 0.1 ms of each thread
+            self._judge, self._desks = judge, {}
         clear_found(self._found)
         self._tally.reset()
-        self._open, self._desks, self._row_words = {}, {}, 0
+        self._open, self._row_words = {}, 0
 
     def add(self, bits: Uint8, bins: Int32, column: Float64, x0: Int32) -> None:
         """Add frames as in `Counter`; columns that they complete are judged."""

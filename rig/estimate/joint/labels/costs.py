@@ -92,7 +92,7 @@ class Costs:
 
         Rows without frames, or with nothing to search, cost 0 everywhere. Best called with 16 rows or more at a time.
         Threads may fill different rows at once, each with its own working memory. room: `pointers` to that, which the
-        caller keeps alive: made for each band of rows they would take 0.1 ms.
+        caller keeps alive.
         """
         fill_costs(
             volume.counts, volume.n_frames, volume.x0, self.place, self.tables.at, room, self.ways, first, last, out
