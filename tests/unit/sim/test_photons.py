@@ -8,6 +8,7 @@ from sim_backend.frames import photon_kernels, photons
 from sim_backend.frames.flux import CommandGrid, FluxModel, column_grid, fine_grid
 from sim_backend.frames.photon_kernels import CHANCE, LEVELS, NEVER, Levels, dropped_frames, new_levels, set_levels
 from sim_backend.light.line import SheetsOf
+from sim_backend.light.optics import Sensor
 from sim_backend.random_numbers import PLACE
 from tests.stability.inventory import covers
 from tests.unit.sim.rigs import drawn, rig, setting, wall
@@ -46,22 +47,33 @@ def test_what_is_drawn_anew_makes_every_probability_exact_while_lit_words_come_a
         assert lit.any() == (last > first)
 
 
-def _model(size: tuple[int, int]) -> tuple[FluxModel, SheetsOf]:
-    model = rig(size=size)
-    return FluxModel(setting(model, wall(model, (0.1, 0, 1), 2.0), medium={"extinction": "0.1 /m"})), model.sheets
+SENSOR = {
+    "dark_rate": "200 kcps", "afterpulsing": "30 %", "trap_lifetime": "1 us", "dead_time": "500 ns",
+    "crosstalk": "20 %", "dead_share": "3 %", "hot_share": "2 %", "bit_error_rate": "1 %",
+}  # fmt: skip
+"""Every effect on bits, which act on whole frames."""
 
 
+def _model(size: tuple[int, int], sensor: dict[str, str] | None = None) -> tuple[FluxModel, SheetsOf]:
+    model, keys = rig(size=size), Sensor.model_validate(sensor or {})
+    setup = setting(model, wall(model, (0.1, 0, 1), 2.0), sensor=keys, medium={"extinction": "0.1 /m"})
+    return FluxModel(setup), model.sheets
+
+
+@pytest.mark.parametrize("sensor", [{}, SENSOR], ids=["light alone", "effects on bits"])
 @pytest.mark.parametrize(("block", "threads"), [(1, 1), (7, 3), (40, 2)])
-def test_bits_do_not_depend_on_block_size_or_threads(block: int, threads: int) -> None:
+def test_bits_do_not_depend_on_block_size_or_threads(sensor: dict[str, str], block: int, threads: int) -> None:
     held, power, time_s = np.repeat([np.nan, 0.1, 0.2, 0.1, np.nan], 8), np.full(40, 0.5), np.arange(40) * 1e-5
     power[11], power[20:23] = 0.2, 0.0
-    args = *_model((21, 70)), held, power
+    args = *_model((21, 70), sensor), held, power
     cut = drawn(*args, first=100, time_s=time_s, block=block, threads=threads)
     assert np.array_equal(cut, drawn(*args, first=100, time_s=time_s, threads=1))
+    assert not np.unpackbits(cut, axis=2)[:, :, 70:].any(), "pad bits"
 
 
-def test_a_window_has_the_very_bits_of_the_whole_frame() -> None:
-    args = *_model((9, 200)), np.repeat([np.nan, 0.1, 0.2], 4), 0.5
+@pytest.mark.parametrize("sensor", [{}, SENSOR], ids=["light alone", "effects on bits"])
+def test_a_window_has_the_very_bits_of_the_whole_frame(sensor: dict[str, str]) -> None:
+    args = *_model((9, 200), sensor), np.repeat([np.nan, 0.1, 0.2], 4), 0.5
     x0 = np.array([0, 64, 128, 0] * 3, np.int32)
     whole, window = drawn(*args, first=7), drawn(*args, first=7, x0=x0, window_px=128)
     assert whole.any()

@@ -11,10 +11,9 @@ from sim_backend.effects import afterpulsing, sensor_bits, setting
 from sim_backend.effects.afterpulsing import Afterpulsing, after_probability, blind_probability
 from sim_backend.effects.sensor_bits import BitErrors, Crosstalk, Defects, packed
 from sim_backend.effects.setting import BitEffect, FrameTimes, Setting
-from sim_backend.frames.flux import FluxModel
 from sim_backend.light.optics import Sensor
 from tests.stability.inventory import covers
-from tests.unit.sim.rigs import drawn, rig, wall
+from tests.unit.sim.rigs import rig, wall
 from tests.unit.sim.rigs import setting as setting_of
 
 covers(afterpulsing, sensor_bits, setting)
@@ -24,17 +23,6 @@ TIMES, FAST, CLOSE = FrameTimes(10e-6, 10e-6), FrameTimes(1e-6, 1.2e-6), FrameTi
 TRIES = 400_000
 WIDTH, ROWS = 150, 20
 """Rows that end within a word."""
-FRAMES, FIRST = 40, 100
-EVERYTHING = {
-    "dark_rate": "200 kcps",
-    "afterpulsing": "30 %",
-    "trap_lifetime": "1 us",
-    "dead_time": "500 ns",
-    "crosstalk": "20 %",
-    "dead_share": "3 %",
-    "hot_share": "2 %",
-    "bit_error_rate": "1 %",
-}
 
 
 def sensor_setting(**sensor: str | int) -> Setting:
@@ -164,24 +152,3 @@ def test_the_same_whatever_the_blocks_and_another_for_another_seed(
     whole = acted_on(made, bits, times=FAST)
     assert np.array_equal(acted_on(made, bits, block=7, times=FAST), whole)
     assert not np.array_equal(acted_on(made, bits, seed=6, times=FAST), whole)
-
-
-def _frames(block: int = FRAMES, threads: int = 1, x0: NDArray[np.int32] | None = None) -> NDArray[np.uint8]:
-    """Frames FIRST, FIRST + 1, ... packed: whole ones, or windows of 64 pixels from x0 (FRAMES,)."""
-    held, model = np.repeat([np.nan, 0.1, 0.2, 0.1, np.nan], FRAMES // 5), FluxModel(sensor_setting(**EVERYTHING))
-    sheets = rig(size=(ROWS, WIDTH)).sheets
-    return drawn(model, sheets, held, 5.0, times=CLOSE, first=FIRST, block=block, threads=threads, x0=x0)
-
-
-@pytest.mark.parametrize(("block", "threads"), [(1, 1), (7, 3), (40, 2)])
-def test_bits_do_not_depend_on_blocks_or_threads_and_pad_bits_stay_zero(block: int, threads: int) -> None:
-    bits = _frames(block, threads)
-    assert np.array_equal(bits, _frames())
-    assert not np.unpackbits(bits, axis=2)[:, :, WIDTH:].any()
-
-
-def test_a_window_has_the_very_bits_of_the_whole_frame() -> None:
-    x0 = np.tile([0, 64, 128, 64], FRAMES // 4).astype(np.int32)
-    whole, windows = _frames(), _frames(x0=x0)
-    for f in range(FRAMES):
-        assert np.array_equal(windows[f], whole[f, :, x0[f] // 8 : x0[f] // 8 + 8])
