@@ -19,6 +19,8 @@ from rig.geometry.windows import WORD_PX
 from rig.simd.memory import address_of, aligned_zeros
 from rig.simd.vectors import LANES
 
+Words = NDArray[np.uint64]
+"""Packed bits of frames, or bit planes of counters."""
 WORD_BYTES: Final = 8
 CHUNK: Final = 256
 """Words of a frame that are counted together; their planes fill half of a 32 KiB cache."""
@@ -35,7 +37,7 @@ def rows_of_chunk(row_words: int) -> int:
     return max(CHUNK // row_words, 1)
 
 
-def new_planes(chunks: int) -> NDArray[np.uint64]:
+def new_planes(chunks: int) -> Words:
     """Counters, all zero, for a number of chunks of a frame: (chunks, PLANES + 1, CHUNK); the last plane is scratch."""
     size = chunks * (PLANES + 1) * CHUNK
     # Kernels read 16 bytes at a time, beyond the end too.
@@ -164,16 +166,7 @@ def _carry_on(n, p):  # type: ignore[no-untyped-def]
 
 
 @numba.njit(cache=True, nogil=True)
-def add_frames(
-    words: NDArray[np.uint64],
-    frame: int,
-    at: int,
-    first: int,
-    last: int,
-    n: int,
-    counted: int,
-    planes: NDArray[np.uint64],
-) -> None:
+def add_frames(words: Words, frame: int, at: int, first: int, last: int, n: int, counted: int, planes: Words) -> None:
     """Add words at..at+n-1 of frames first..last-1 to counters that have counted `counted` frames so far.
 
     words: (all words,), with `frame` words per frame; n: at most CHUNK; planes: ((PLANES + 1) * CHUNK,) of one chunk,
@@ -208,7 +201,7 @@ def add_frames(
 
 @numba.njit(cache=True, nogil=True)
 def add_runs(
-    words: NDArray[np.uint64],
+    words: Words,
     first_word: NDArray[np.int32],
     row_words: int,
     used_words: int,
