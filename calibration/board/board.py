@@ -188,9 +188,11 @@ class Board:
         return modules
 
 
-def load_board(path: str | os.PathLike[str] = BUNDLED_BOARD) -> Board:
-    """The board that a YAML file describes. Raises CalibrationError, with one line, if the file describes none."""
-    file = Path(path)
+def load_board(path: str | os.PathLike[str] | None = None) -> Board:
+    """The board that a YAML file describes; None: the bundled one. Raises CalibrationError, with one line, if the file
+    describes none.
+    """
+    file = BUNDLED_BOARD if path is None else Path(path)
     read = load_yaml(file, "a board", "kind: charuco")
     parsed = validated(BoardFile, read.content, ValueSources(str(file), read.lines))
     try:

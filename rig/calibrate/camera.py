@@ -1,11 +1,10 @@
 """`rig calibrate camera`: calibrates the camera alone, from views of a board or from picture files."""
 
-from datetime import UTC, datetime
 from typing import Any
 
 import numpy as np
 
-from calibration.board.board import Board
+from calibration.board.board import Board, load_board
 from calibration.camera_fit import CameraFit, fit_camera
 from calibration.diagnosis.verdicts import ACCURACY_PX, JudgedCamera, judge_camera
 from calibration.errors import Degenerate, condition_text, digits
@@ -13,23 +12,13 @@ from calibration.files.rig_file import camera_content, camera_file_text, corners
 from calibration.model.camera import TERM_COUNTS
 from calibration.verdict import AT_M
 from rig.calibrate.capture import AskPerson, TellLine, require_live
-from rig.calibrate.report import camera_report, subject
-from rig.calibrate.session import CalibrationResult, Session, named
-from rig.calibrate.sources import SourcesLike, read_board, si_values, sort_sources
-from rig.calibrate.views import (
-    LiveViewOptions,
-    ViewCollection,
-    good_poses,
-    in_order,
-    refusal,
-    require_poses,
-    take_kept,
-    take_live,
-)
+from rig.calibrate.report import camera_report, named
+from rig.calibrate.session import CalibrationResult, Session
+from rig.calibrate.sources import SourcesLike, si_values, sort_sources
+from rig.calibrate.views import good_poses, refusal, require_poses, take_kept, take_live
 from rig.errors import UsageError
 from rig.progress import tell_stage
 from rig.requests import CameraRequest
-from rig.scan.run import versions
 
 CAMERA_FILE = "camera.yaml"
 FEWEST_VIEWS = 3
@@ -46,57 +35,51 @@ def run_camera(
     if request.terms not in (0, *TERM_COUNTS):
         known = ", ".join(map(str, TERM_COUNTS))
         raise UsageError(f"terms is {request.terms}; OpenCV's lens models have 0, {known}")
-    found = sort_sources(sources, pictures=True, scene=request.scene)
-    board = read_board(request.board)
+    found, board = sort_sources(sources, pictures=True, scene=request.scene), load_board(request.board)
     live, photons = found.live, not found.pictures
     require_live(live, ask, request.arm)
-    with Session(request.out, board) as session:
-        taken = ViewCollection(session, tell)
-        take_kept(taken, found, board)
+    with Session(request.out, board, tell) as session:
+        take_kept(session, found)
         if live is not None:
-            require_poses(taken, request.poses)
-            choose = in_order(good_poses(live, board, request.poses, AT_M, request.seed, len(taken.views)))
-            options = LiveViewOptions(live, request.poses, choose, ask, seed=request.seed, arm=request.arm, line=False)
-            take_live(taken, options, board)
-        tell_stage("fitting", len(taken.views), unit="views")
+            require_poses(session, request.poses)
+            choose = good_poses(live, board, request.poses, AT_M, request.seed, len(session.views))
+            take_live(session, live, request, choose, ask, line=False)
+        tell_stage("fitting", len(session.views), unit="views")
         try:
-            fit = _fitted(taken, board, request.terms)
+            fit = _fitted(session, board, request.terms)
         except Degenerate as refused:
-            raise refusal(refused, taken, board, photons=photons, line=False) from refused
-        judged = judge_camera(fit, taken.views, board, photons=photons)
-        summary = {"command": "camera", **_summary(fit, judged, taken), "versions": versions()}
+            raise refusal(refused, session, board, photons=photons, line=False) from refused
+        judged = judge_camera(fit, session.views, board, photons=photons)
         tell_stage("writing the report")
-        figures = tuple(_figures(fit, judged, taken))
-        used = [view for view in taken.views if view.name in fit.views]
-        about = subject(taken.identity, board, summary["versions"], datetime.now(UTC))
-        report = camera_report(fit, used, judged, board, figures, about)
+        figures, summary = _figures(fit, judged, session), _summary(fit, judged, session)
+        result = CalibrationResult(judged.verdict, judged.line(), tuple(figures), summary)
+        used = [view for view in session.views if view.name in fit.views]
         digests = [corners_digest(view) for view in used if view.name in fit.kept]
         session.write_text(CAMERA_FILE, camera_file_text(fit.camera, fit.covariance, digests, judged.verdict))
-        session.finish(summary, report, None)
-        return CalibrationResult(judged.verdict, judged.line(), figures, summary, None, session.path)
+        return session.finish("camera", result, camera_report(fit, used, board))
 
 
-def _fitted(taken: ViewCollection, board: Board, terms: int) -> CameraFit:
+def _fitted(session: Session, board: Board, terms: int) -> CameraFit:
     """Fit the camera; raises Degenerate if it would hang on so few views that they cannot contradict each other."""
-    fit = fit_camera(taken.views, board, taken.size, distortion_terms=terms)
+    fit = fit_camera(session.views, board, session.size, distortion_terms=terms)
     if len(fit.kept) < FEWEST_VIEWS:
         raise Degenerate(
             "too-few-poses",
-            f"{len(fit.kept)} of {len(taken.views)} views could be used (condition number "
+            f"{len(fit.kept)} of {len(session.views)} views could be used (condition number "
             f"{condition_text(fit.condition)}): a camera takes {FEWEST_VIEWS} poses or more; show the board tilted to "
             "both sides, near and far",
         )
     return fit
 
 
-def _summary(fit: CameraFit, judged: JudgedCamera, taken: ViewCollection) -> dict[str, Any]:
+def _summary(fit: CameraFit, judged: JudgedCamera, session: Session) -> dict[str, Any]:
     return {
         "verdict": judged.verdict.as_json(),
         "views": {
-            "shown": len(taken.views),
+            "shown": len(session.views),
             "used": len(fit.kept),
             "outliers": list(fit.outliers),
-            "refused": {name: str(why) for name, why in taken.refused.items()},
+            "refused": {name: str(why) for name, why in session.refused.items()},
             "rms_px": dict(zip(fit.views, fit.view_rms_px.tolist(), strict=True)),
         },
         "camera": camera_content(fit.camera),
@@ -108,11 +91,11 @@ def _summary(fit: CameraFit, judged: JudgedCamera, taken: ViewCollection) -> dic
     }
 
 
-def _figures(fit: CameraFit, judged: JudgedCamera, taken: ViewCollection) -> list[tuple[str, str]]:
-    matrix, sd, refused = fit.camera.matrix, fit.sd, tuple(taken.refused)
+def _figures(fit: CameraFit, judged: JudgedCamera, session: Session) -> list[tuple[str, str]]:
+    matrix, sd, refused = fit.camera.matrix, fit.sd, tuple(session.refused)
     terms = ", ".join(digits(term, 4) for term in fit.camera.distortion) or "none"
     return [
-        ("views", f"{len(fit.kept)} of {len(taken.views)} used, {named(fit.outliers)} outliers, {named(refused)} "
+        ("views", f"{len(fit.kept)} of {len(session.views)} used, {named(fit.outliers)} outliers, {named(refused)} "
                   "refused"),
         ("rays", f"{digits(judged.sd_px, 2)} px, at the worst 5 % of the picture {digits(judged.worst_px, 2)} px, "
                  f"asked {ACCURACY_PX:g} px"),

@@ -26,6 +26,7 @@ from numpy.typing import NDArray
 from pydantic import ValidationError
 
 from calibration.board.board import Board
+from calibration.board.detect import find_corners
 from calibration.errors import Degenerate
 from calibration.guide import Candidate
 from calibration.model.rig_model import Identity
@@ -75,7 +76,6 @@ def capture_view(
     *,
     seed: int = 0,
     exposures: int | None = None,
-    bidirectional: bool = True,
     arm: bool = False,
     defects: NDArray[np.bool_] | None = None,
     out: OutFolder = None,
@@ -91,13 +91,13 @@ def capture_view(
     Raises UsageError for a scan that cannot be done, DeviceError or DevicesError if devices fail, as `rig.api.scan`
     does.
     """
-    settings = _settings(config, exposures, bidirectional=bidirectional)
+    settings = _settings(config, exposures)
     if problems := require_simulated_or_armed(settings, arm):
         raise UsageError.of(problems)
     for known in (None, config.calibration):
         try:
             with open_rig(settings.model_copy(update={"calibration": known}), seed=seed) as rig:
-                return _captured(rig, name, board, 2 if bidirectional else 1, defects, out)
+                return _captured(rig, name, board, 2, defects, out)
         except PlanError:
             if known == config.calibration:
                 raise
@@ -120,14 +120,14 @@ def plain(config: RigConfig) -> RigConfig:
     return config.model_copy(update={"estimate": config.estimate.model_copy(update=update)})
 
 
-def _settings(config: RigConfig, exposures: int | None, *, bidirectional: bool) -> RigConfig:
+def _settings(config: RigConfig, exposures: int | None) -> RigConfig:
     """The config of a capture. Raises UsageError for a rig of several lines."""
     if len(config.line_offsets) > 1:
         raise UsageError(
             f"{config.name} has {len(config.line_offsets)} lines (line_offsets); a pixel cannot tell which one passed: "
             "cover all but one and set line_offsets to [0]"
         )
-    scan = config.scan.model_copy(update={"bidirectional": bidirectional})
+    scan = config.scan.model_copy(update={"bidirectional": True})
     if exposures is not None:
         try:
             scan = type(scan).model_validate({**scan.model_dump(mode="json"), "exposures": exposures})
@@ -147,14 +147,16 @@ def _captured(
     # A simulated world is not asked for the truth, nor to hold its light within columns: it moves as the mirror does.
     rig = replace(rig, world=None)
     plan, timing = prepare(rig)
-    sweeps = _sweeps(rig, plan, timing, maps, out)
+    sweeps: list[SweepData] = []
+    scan_sweeps(rig, maps, Listeners(sweeps=sweeps.append), out, (plan, timing))
     counts = tuple(_sweep_counts(sweep, plan) for sweep in sweeps)
     picture = flux_picture(counts)
-    bad = np.zeros(picture.shape, np.bool_) if defects is None else defects
     if board is not None:
         tell_stage("finding the board")
-    corners, refused = _corners(picture, board, defects)
-    mask = even_pixels(picture) & ~bad
+    corners, refused = corners_in(picture, board, defects)
+    mask = even_pixels(picture)
+    if defects is not None:
+        mask &= ~defects
     if corners is not None and board is not None:
         mask &= board_pixels(corners, board, picture.shape)
     tell_stage("finding the line")
@@ -166,16 +168,20 @@ def _captured(
     return Capture(View(name, corners, passages, picture), refused, identity_of(rig))
 
 
-def _sweeps(rig: OpenRig, plan: ScanPlan, timing: SpadTiming, maps: int, out: OutFolder) -> list[SweepData]:
-    """Count the sweeps of a scan. An interrupt is raised again, once the rig is safe."""
-    found: list[SweepData] = []
+def scan_sweeps(
+    rig: OpenRig,
+    maps: int | None,
+    listeners: Listeners,
+    out: OutFolder = None,
+    prepared: tuple[ScanPlan, SpadTiming] | None = None,
+) -> None:
+    """Scan for what the listeners get alone. An interrupt is raised again, once the rig is safe."""
     scan, estimate = rig.config.scan, rig.config.estimate
     tally = MapTally(scan.columns, scan.exposures, estimate.estimator, estimate.filter)
     request = RunRequest(maps=maps, record=out is not None, accept_calibration=True)
     with Run(out, tally, record=request.record) as run:
-        result = run_scan(rig, run, request, Listeners(sweeps=found.append), (plan, timing))
+        result = run_scan(rig, run, request, listeners, prepared)
     result.uninterrupted()
-    return found
 
 
 def _sweep_counts(sweep: SweepData, plan: ScanPlan) -> SweepCounts:
@@ -200,13 +206,12 @@ def _steady(passages: Passages, plan: ScanPlan) -> Passages:
     return replace(passages, **arrays)
 
 
-def _corners(
-    picture: NDArray[np.float32], board: Board | None, defects: NDArray[np.bool_] | None
+def corners_in(
+    picture: NDArray[np.float32], board: Board | None, defects: NDArray[np.bool_] | None = None
 ) -> tuple[Corners | None, Degenerate | None]:
+    """The board's corners in a picture, or why there are none; neither if there is no board to look for."""
     if board is None:
         return None, None
-    from calibration.board.detect import find_corners
-
     try:
         return find_corners(picture, board, defects), None
     except Degenerate as error:
@@ -261,8 +266,8 @@ def shown(config: RigConfig, what: str, pose: Candidate, ask: AskPerson | None, 
     return config
 
 
-Scan = Callable[[int | None], Capture]
-"""A function that takes a view at so many exposures per column; None: the config's. Raises PlanError if it cannot."""
+Scan = Callable[..., Capture]
+"""A function that takes a view at so many `exposures` per column; None: the config's. Raises PlanError if it cannot."""
 
 
 class SpeedRotation:
@@ -290,7 +295,7 @@ class SpeedRotation:
         while True:
             exposures = self.turns[pose % len(self.turns)] if self.turns else None
             try:
-                return exposures, scan(exposures)
+                return exposures, scan(exposures=exposures)
             except PlanError:
                 if exposures is None or len(self.turns) < 2:
                     raise
@@ -300,7 +305,7 @@ class SpeedRotation:
         """Take the pose again at the slowest speed; returns the first capture where the rig cannot do that."""
         self._say(f"at {_of(exposures)} the line does not stand out on the board: again at {slowest}")
         try:
-            again = scan(slowest)
+            again = scan(exposures=slowest)
         except PlanError:
             self.turns.remove(slowest)
             return capture

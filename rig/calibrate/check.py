@@ -2,12 +2,13 @@
 
 import math
 from collections.abc import Sequence
-from datetime import UTC, datetime
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 
+from calibration.board.board import load_board
 from calibration.check import CheckedAngle, CheckedBoard, check_angle, check_board
 from calibration.depth_error import DepthUncertainty, depth_uncertainty, sensitivity
 from calibration.diagnosis.verdicts import goal, judge_check
@@ -17,15 +18,14 @@ from calibration.model.rig_model import RigModel
 from calibration.verdict import AccuracyGoal, Verdict
 from calibration.views import View
 from rig.calibrate.capture import AskPerson, TellLine, require_live
-from rig.calibrate.report import check_report, subject
+from rig.calibrate.report import check_report
 from rig.calibrate.session import CalibrationResult, Session, true_errors, truth_content
-from rig.calibrate.sources import SourcesLike, read_board, si_values, sort_sources
-from rig.calibrate.views import LiveViewOptions, ViewCollection, good_poses, in_order, note_views, take_kept, take_live
+from rig.calibrate.sources import SourcesLike, si_values, sort_sources
+from rig.calibrate.views import good_poses, note_views, take_kept, take_live
 from rig.devices.calibration_use import note_check
 from rig.errors import UsageError
 from rig.progress import tell_stage
 from rig.requests import CheckRequest
-from rig.scan.run import versions
 
 _BOARD_KEYS = (
     "distance_m", "flatness_rms_m", "flatness_peak_m", "expected_m", "chi2", "freedom", "scale", "scale_sd",
@@ -46,7 +46,7 @@ def run_check(
     """
     values = si_values(request)
     stated_rad = values.pop("angle_rad", None)
-    found, board = sort_sources(sources, scene=request.scene), read_board(request.board)
+    found, board = sort_sources(sources, scene=request.scene), load_board(request.board)
     live = found.live
     file = Path(request.calibration) if request.calibration is not None else None if live is None else live.calibration
     if file is None:
@@ -55,43 +55,39 @@ def run_check(
     views_needed = 1 if stated_rad is None else 2
     require_live(live, ask, request.arm)
     wanted = goal(sensitivity(model, values["at_m"]), **values)
-    with Session(request.out, board) as session:
-        taken = ViewCollection(session, tell)
-        take_kept(taken, found, board, model.defects)
-        _require_others(taken.views, model)
+    with Session(request.out, board, tell) as session:
+        take_kept(session, found, model.defects)
+        _require_others(session.views, model)
         if live is not None:
-            seed, poses = request.seed + SEED_APART, max(request.poses, views_needed)
-            choose = in_order(good_poses(live, board, poses, wanted.at_m, seed))
-            options = LiveViewOptions(live, poses, choose, ask, seed=seed, arm=request.arm, defects=model.defects)
-            take_live(taken, options, board)
-        views = _with_board(taken, views_needed)
-        model.check_sensor(*taken.size)
+            asked = replace(request, seed=request.seed + SEED_APART, poses=max(request.poses, views_needed))
+            choose = good_poses(live, board, asked.poses, wanted.at_m, asked.seed)
+            take_live(session, live, asked, choose, ask, defects=model.defects)
+        views = _with_board(session, views_needed)
+        model.check_sensor(*session.size)
         tell_stage("judging", len(views), unit="views")
         boards = [check_board(model, view, board) for view in views]
         angle = None if stated_rad is None else check_angle(model, views[0], views[1], board)
         verdict = judge_check(boards, wanted, board.size_m[0], angle, stated_rad)
         uncertainty = None if model.covariance is None else depth_uncertainty(model, wanted.at_m)
         line = NO_COVARIANCE if uncertainty is None else uncertainty.line()
-        truth = None if live is None else true_errors(model, live, wanted.at_m)
+        consequence = _consequence(verdict, model, file)
         summary = {
-            "command": "check",
             "verdict": verdict.as_json(),
             "calibration": str(file),
             **_summary(boards, wanted, uncertainty),
             "angle": None
             if angle is None
             else {"rad": angle.angle_rad, "sd_rad": angle.sd_rad, "stated_rad": stated_rad},
-            "scans_refuse_it": bool(_consequence(verdict, model, file)),
-            "truth": None if truth is None else truth_content(truth),
-            "versions": versions(),
+            "scans_refuse_it": bool(consequence),
+            "truth": truth_content(true_errors(model, live, wanted.at_m)),
         }
         tell_stage("writing the report")
-        figures = tuple(_figures(boards, angle) + _consequence(verdict, model, file))
-        about = subject(taken.identity or model.identity, board, summary["versions"], datetime.now(UTC))
-        session.finish(summary, check_report(boards, uncertainty, verdict, line, figures, about), None)
+        session.identity = session.identity or model.identity
+        result = CalibrationResult(verdict, line, (*_figures(boards, angle), *consequence), summary)
+        result = session.finish("check", result, check_report(boards, uncertainty))
         if model.identity is not None:
             note_check(file, model, "check", passed=verdict.passed, reasons=verdict.codes)
-        return CalibrationResult(verdict, line, figures, summary, model, session.path)
+        return replace(result, model=model)
 
 
 def _require_others(views: Sequence[View], model: RigModel) -> None:
@@ -105,14 +101,14 @@ def _require_others(views: Sequence[View], model: RigModel) -> None:
         )
 
 
-def _with_board(taken: ViewCollection, least: int) -> list[View]:
+def _with_board(session: Session, least: int) -> list[View]:
     """The views that show the board. Raises Degenerate, with the trouble of each view, if they are too few."""
-    views = [view for view in taken.views if view.corners is not None]
+    views = [view for view in session.views if view.corners is not None]
     if len(views) < least:
-        reason = next((why.reason for why in taken.refused.values()), "no-board")
+        reason = next((why.reason for why in session.refused.values()), "no-board")
         few = "1 view shows" if len(views) == 1 else f"{len(views)} views show"
         error = Degenerate(reason, f"{reason}: {few} the board, at least {least} must; show it again")
-        note_views(error, taken)
+        note_views(error, session)
         raise error
     return views
 

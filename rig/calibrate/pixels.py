@@ -21,10 +21,8 @@ from typing import Any, Final, Protocol, runtime_checkable
 import numpy as np
 from numpy.typing import NDArray
 
-from calibration.arrays import Mask
 from calibration.errors import CalibrationError, digits
 from calibration.files.rig_file import CALIBRATION_FILE, load_rig_model, save_rig_model
-from calibration.model.rig_model import RigModel
 from calibration.pixel_map import (
     LEAST_ALIKE,
     MOST_NEW_DEFECTS,
@@ -47,7 +45,7 @@ from drivers.frames import FrameBlock, frame_bytes
 from drivers.interfaces import SpadInfo, SpadMode, SpadRequest
 from drivers.recorded.segments import segment_files
 from drivers.ring import BlockRing
-from rig.calibrate.capture import plain
+from rig.calibrate.capture import plain, scan_sweeps
 from rig.calibrate.report import dark_rate_picture, pixel_page
 from rig.calibrate.session import EXIT_NOT_TRUSTWORTHY
 from rig.config.models import RigConfig, ScanConfig
@@ -61,14 +59,11 @@ from rig.geometry.windows import WORD_PX
 from rig.progress import Progress, counted
 from rig.recording.inputs import read_plan
 from rig.recording.replay import ReplayOptions, replay_config
-from rig.requests import PixelsRequest, RunRequest
+from rig.requests import PixelsRequest
 from rig.run_folder.folder import RunFolder
 from rig.run_folder.pictures import png_bytes
-from rig.run_folder.summary import MapTally
 from rig.scan.monitor import Listeners, ScanProgress
 from rig.scan.pipeline import JOIN_S
-from rig.scan.run import Run
-from rig.scan.scan import run_scan
 from rig.scan.source import Source, blocks
 from rig.threads import RowWorkers
 
@@ -136,7 +131,9 @@ def take_dark(
     timing = rig.spad.configure(request)
     rig.sync.gate_low()
     workers = RowWorkers(rig.config.estimate.threads or os.cpu_count() or 1)
-    counter = SweepCounter(_layout(info.height, info.width), workers)
+    # A layout for dark frames only: no column will ever be counted.
+    layout = SweepLayout(1, info.height, info.width, np.zeros(1, np.int32), WORD_PX, 1)
+    counter = SweepCounter(layout, workers)
     tally = DarkTally((info.height, info.width))
     starts = math.ceil(frames / per_start)
     rest_s = max(0.0, (SPREAD_S - frames / float(request.frame_rate_hz)) / max(starts - 1, 1))
@@ -146,7 +143,8 @@ def take_dark(
             rig.clock.sleep(rest_s)
         counter.reset()
         for block in _blocks(rig, per_start, timing.stride, request.block_frames):
-            _count(counter, block)
+            if n := block.n_frames:
+                counter.add(block.bits, np.full(n, BIN_DARK, np.int32), np.zeros(n), np.zeros(n, np.int32))
         sums = counter.finish()
         if sums.dark_counts is not None:
             tally.add(sums.dark_counts.astype(np.int64), sums.n_dark)
@@ -157,23 +155,16 @@ def take_dark(
 def take_sweeps(rig: OpenRig, maps: int | None = None, progress: Progress | None = None) -> SweepSums:
     """Take the frames of a scan with light, or of all sweeps of a recording. An interrupt is raised again at
     the end."""
-    scan, sums = rig.config.scan, SweepSums()
+    sums = SweepSums()
 
     def live(now: ScanProgress) -> None:
         if progress is not None:
             progress(now.frames, now.frames_planned)
 
-    with Run(None, MapTally(scan.columns, scan.exposures, "argmax", "none")) as run:
-        request = RunRequest(maps=maps, accept_calibration=True)
-        run_scan(rig, run, request, Listeners(sweeps=sums.add, live=live)).uninterrupted()
+    scan_sweeps(rig, maps, Listeners(sweeps=sums.add, live=live))
     if sums.tally is None:
         raise UsageError(f"{rig.spad.name} gave no sweep with dark frames in one piece; scan again")
     return sums
-
-
-def recorded_exposure_s(run: Path) -> float:
-    """Exposure of a recording's frames, seconds."""
-    return float(read_plan(run).exposure_s)
 
 
 def _request(scan: ScanConfig, info: SpadInfo, frames: int) -> SpadRequest:
@@ -183,11 +174,6 @@ def _request(scan: ScanConfig, info: SpadInfo, frames: int) -> SpadRequest:
         rate = min(rate, Fraction(math.floor(info.stream.bytes_per_s / frame_bytes(info.width, info.height))))
     mode: SpadMode = "burst" if info.stream is None else "stream"
     return SpadRequest(rate, scan.exposure_s, mode, min(BLOCK_FRAMES, frames))
-
-
-def _layout(rows: int, width: int) -> SweepLayout:
-    """Layout for dark frames only: no column will ever be counted."""
-    return SweepLayout(1, rows, width, np.zeros(1, np.int32), WORD_PX, 1)
 
 
 def _blocks(rig: OpenRig, frames: int, stride: int, block_frames: int) -> Iterator[FrameBlock]:
@@ -203,12 +189,6 @@ def _blocks(rig: OpenRig, frames: int, stride: int, block_frames: int) -> Iterat
             source.end()
             rig.spad.stop()
             source.join(JOIN_S)
-
-
-def _count(counter: SweepCounter, block: FrameBlock) -> None:
-    n = block.n_frames
-    if n:
-        counter.add(block.bits, np.full(n, BIN_DARK, np.int32), np.zeros(n), np.zeros(n, np.int32))
 
 
 def _frames_in_windows(volume: CountVolume) -> NDArray[np.int64]:
@@ -272,13 +252,14 @@ class PixelResult:
     def as_json(self) -> dict[str, Any]:
         """Return what summary.json holds, as plain values."""
         pixels, drift = self.found.pixels, self.drift
+        masks = {"hot": pixels.hot, "noisy": pixels.noisy, "dead": pixels.dead, "defects": pixels.defects}
         return {
             **{key: getattr(self.found, key) for key in ("sensor", "version", "id", "parent", "created")},
             "frames": pixels.frames,
             "exposure_s": pixels.exposure_s,
             "dark_rate_per_s": pixels.ordinary_per_s,
             "limit_per_s": float(np.nanmedian(pixels.limit_per_s)),
-            **{key: _total(getattr(pixels, key)) for key in ("hot", "noisy", "dead", "defects")},
+            **{key: None if mask is None else int(mask.sum()) for key, mask in masks.items()},
             "judged": pixels.judged,
             "lit_judged": pixels.lit_judged,
             "light_leak": self.leak,
@@ -286,10 +267,6 @@ class PixelResult:
             "calibration": None if self.calibration is None else str(self.calibration),
             "verdict": self.verdict.as_json(),
         }
-
-
-def _total(mask: Mask | None) -> int | None:
-    return None if mask is None else int(mask.sum())
 
 
 def pixel_verdict(pixels: PixelMap, drift: PixelDrift | None, leak: float) -> Verdict:
@@ -356,7 +333,8 @@ def run_pixels(
     """Map the pixels of a rig, once its lens is `covered`, or of a recorded run's frames. Raises UsageError or
     DeviceError.
     """
-    recorded, frames = _recorded(source), request.frames
+    path, frames = None if isinstance(source, RigConfig) else Path(source), request.frames
+    recorded = path if path is not None and path.is_dir() and segment_files(path) else None
     config = plain(replay_config(recorded, ReplayOptions(), None, {}) if recorded else configure(source))
     problems = [] if not request.light or recorded else require_simulated_or_armed(config, request.arm)
     if frames is not None and frames < 1:
@@ -369,7 +347,7 @@ def run_pixels(
         lit_sums = None if request.lit is None else _recorded_sums(Path(request.lit), progress)[1]
         if recorded:
             tally, own, sensor = _recorded_sums(recorded, progress)
-            lit_sums, exposure_s = lit_sums or own, recorded_exposure_s(recorded)
+            lit_sums, exposure_s = lit_sums or own, float(read_plan(recorded).exposure_s)
         else:
             if request.light:
                 with open_rig(config, seed=request.seed) as rig:
@@ -378,27 +356,22 @@ def run_pixels(
                 sensor = _sensor(rig)
                 wanted = frames or frames_for(float(hot_flux(SIGNAL, 0.0)))
                 tally, exposure_s = take_dark(rig, wanted, progress=progress, covered=covered)
-        found = _version(judge_pixels(tally, exposure_s, lit=lit_sums), last, sensor)
+        pixels = judge_pixels(tally, exposure_s, lit=lit_sums)
+        created = datetime.now(UTC).isoformat(timespec="seconds")
+        number, parent = (1, None) if last is None else (last.version + 1, last.id)
+        found = PixelVersion(pixels, number, created, parent, sensor)
         try:
-            drift = None if last is None else pixel_drift(last.pixels, found.pixels)
+            drift = None if last is None else pixel_drift(last.pixels, pixels)
         except CalibrationError as error:
             raise UsageError(str(error)) from error
-        leak = 0.0 if recorded else light_leak(found.pixels)
-        result = PixelResult(found, drift, last, pixel_verdict(found.pixels, drift, leak), leak)
+        leak = 0.0 if recorded else light_leak(pixels)
+        result = PixelResult(found, drift, last, pixel_verdict(pixels, drift, leak), leak)
         if request.against is None and drift is not None:
             _note(config, drift)
         return result if folder is None else _written(result, folder, None if recorded else config.calibration)
     finally:
         if folder is not None:
             folder.discard()
-
-
-def _recorded(source: Config) -> Path | None:
-    """The folder of a recorded run; None for a rig."""
-    if isinstance(source, RigConfig):
-        return None
-    path = Path(source)
-    return path if path.is_dir() and segment_files(path) else None
 
 
 def _recorded_sums(run: Path, progress: Progress | None) -> tuple[DarkTally, Sums | None, str]:
@@ -428,13 +401,6 @@ def _last(against: PathLike | None, config: RigConfig, recorded: Path | None) ->
         return load_pixels(path)
     except CalibrationError as error:
         raise UsageError(str(error)) from error
-
-
-def _version(pixels: PixelMap, last: PixelVersion | None, sensor: str) -> PixelVersion:
-    created = datetime.now(UTC).isoformat(timespec="seconds")
-    if last is None:
-        return PixelVersion(pixels, 1, created, None, sensor)
-    return PixelVersion(pixels, last.version + 1, created, last.id, sensor)
 
 
 def _note(config: RigConfig, drift: PixelDrift) -> None:
@@ -471,7 +437,7 @@ def _written(result: PixelResult, folder: RunFolder, calibration: Path | None) -
 
 def _save_calibration(old: Path, pixels: PixelMap, file: Path) -> None:
     """Write the config's calibration with the new map of the pixels, and carry over notes that speak against it."""
-    before: RigModel = load_rig_model(old)
+    before = load_rig_model(old)
     rate = np.nan_to_num(pixels.rate_per_s, nan=pixels.ordinary_per_s).astype(np.float32)
     after = replace(before, defects=pixels.defects, dark_rate_per_s=rate)
     save_rig_model(after, file)

@@ -1,6 +1,6 @@
 """`rig calibrate planes`: calibrates the whole rig, camera, mirror and lag together, from views of a board.
 
-In the guided mode (`PoseGuide`) the rig is fitted after each view, and the pose that lowers the expected error most is
+In the guided mode (`guided`) the rig is fitted after each view, and the pose that lowers the expected error most is
 asked for next.
 """
 
@@ -13,7 +13,7 @@ from typing import Any
 
 import numpy as np
 
-from calibration.board.board import Board
+from calibration.board.board import Board, load_board
 from calibration.depth_error import DepthErrors
 from calibration.diagnosis.verdicts import JudgedRig, judge_fit
 from calibration.errors import CalibrationError, Degenerate, condition_text, mm
@@ -23,24 +23,14 @@ from calibration.model.rig_model import Identity, RigModel
 from calibration.rig_fit.fit import RigFit, fit_rig
 from calibration.views import View
 from rig.calibrate.capture import AskPerson, TellLine, require_live
-from rig.calibrate.report import planes_report, subject
-from rig.calibrate.session import CalibrationResult, Session, named, true_errors, truth_content
-from rig.calibrate.sources import CameraUse, SourcesLike, camera_use, read_board, si_values, sort_sources
-from rig.calibrate.views import (
-    ChoosePose,
-    LiveViewOptions,
-    ViewCollection,
-    good_poses,
-    in_order,
-    refusal,
-    require_poses,
-    take_kept,
-    take_live,
-)
+from rig.calibrate.report import named, planes_report
+from rig.calibrate.session import CalibrationResult, Session, true_errors, truth_content
+from rig.calibrate.sources import SourcesLike, known_camera, si_values, sort_sources
+from rig.calibrate.views import ChoosePose, good_poses, refusal, require_poses, take_kept, take_live
 from rig.config.models import RigConfig
+from rig.devices.calibration_use import Refusal, check_content
 from rig.progress import tell_stage
 from rig.requests import PlanesRequest
-from rig.scan.run import versions
 
 SPEEDS = ((1.0, 1), (0.3, 2), (2.0, 4))
 """Exposures per column by turns: factors of the config's, and the least number for each.
@@ -58,51 +48,44 @@ def run_planes(
     """
     values = si_values(request)
     found = sort_sources(sources, scene=request.scene)
-    camera = None if request.camera is None else camera_use(Path(request.camera), accept=request.accept_calibration)
-    board = read_board(request.board)
+    known, accepted = None, list[Refusal]()
+    if request.camera is not None:
+        known, accepted = known_camera(Path(request.camera), accept=request.accept_calibration)
+    board = load_board(request.board)
     base = None if request.calibration is None else load_rig_model(request.calibration)
-    live, known = found.live, None if camera is None else camera.known
+    live, told = found.live, frozenset[str]() if known is None else known.views
     require_live(live, ask, request.arm)
-    with Session(request.out, board) as session:
-        taken = ViewCollection(session, tell, () if known is None else known.views)
+    with Session(request.out, board, tell, told) as session:
         defects = None if base is None else base.defects
-        take_kept(taken, found, board, defects)
+        take_kept(session, found, defects)
+        fit_all, judge = partial(_fit, session, board, base, known), partial(_judged, session, values)
         if live is not None:
-            require_poses(taken, request.poses)
-            start = in_order(good_poses(live, board, request.poses, values["at_m"], request.seed, len(taken.views)))
-            fit_and_judge = partial(_fit, taken, board, base, known), partial(_judged, taken, values)
-            guide = PoseGuide(start, board, live.scan.depth_range, taken, *fit_and_judge)
-            options = LiveViewOptions(
-                live,
-                request.poses,
-                guide.next if request.guided else start,
-                ask,
-                exposures=request.exposures or speeds_of(live),
-                seed=request.seed,
-                arm=request.arm,
-                defects=defects,
-            )
-            take_live(taken, options, board)
-        fit = _fitted(taken, board, base, known)
-        judged = _judged(taken, values, fit)
-        told = () if known is None else known.views
-        digests = sorted({*told, *(corners_digest(view) for view in taken.views if view.name in fit.views)})
-        model = _signed(fit, judged, taken.identity, digests, camera)
+            require_poses(session, request.poses)
+            choose = good_poses(live, board, request.poses, values["at_m"], request.seed, len(session.views))
+            if request.guided:
+                choose = guided(choose, board, live.scan.depth_range, session, fit_all, judge)
+            exposures = request.exposures or speeds_of(live)
+            take_live(session, live, request, choose, ask, exposures=exposures, defects=defects)
+        try:
+            fit = fit_all()
+        except CalibrationError as error:
+            refused = error if isinstance(error, Degenerate) else Degenerate("no-model", str(error))
+            raise refusal(refused, session, board) from refused
+        judged = judge(fit)
+        digests = sorted({*told, *(corners_digest(view) for view in session.views if view.name in fit.views)})
+        model = _signed(fit, judged, session.identity, digests)
+        if known is not None:
+            used = check_content("unchecked" if known.verdict is None else "passed", tuple(accepted))
+            model = replace(model, provenance={**model.provenance, "camera": used})
         tell_stage("writing the report")
-        truth = None if live is None else true_errors(model, live, values["at_m"])
-        line = judged.uncertainty.line()
-        summary = {
-            "command": "planes",
-            **_summary(fit, judged, taken),
-            **_accepted(camera),
-            "truth": None if truth is None else truth_content(truth),
-            "versions": versions(),
-        }
-        figures = tuple(_figures(fit, judged, truth, camera))
-        about = subject(taken.identity, board, summary["versions"], datetime.now(UTC))
-        report = planes_report(fit, taken.views, judged, line, figures, about)
-        calibration = session.finish(summary, report, model)
-        return CalibrationResult(judged.verdict, line, figures, summary, model, session.path, calibration)
+        truth = true_errors(model, live, values["at_m"])
+        summary = _summary(fit, judged, session)
+        if accepted:  # in the form of a scan's summary
+            summary["accepted_calibration"] = [str(each) for each in accepted]
+        summary["truth"] = truth_content(truth)
+        figures = _figures(fit, judged, truth, accepted)
+        result = CalibrationResult(judged.verdict, judged.uncertainty.line(), tuple(figures), summary, model)
+        return session.finish("planes", result, planes_report(fit, session.views, judged))
 
 
 def speeds_of(live: RigConfig) -> tuple[int, ...]:
@@ -110,36 +93,26 @@ def speeds_of(live: RigConfig) -> tuple[int, ...]:
     return tuple(dict.fromkeys(max(least, round(times * live.scan.exposures)) for times, least in SPEEDS))
 
 
-def _fit(taken: ViewCollection, board: Board, base: RigModel | None, camera: KnownCamera | None) -> RigFit:
+def _fit(session: Session, board: Board, base: RigModel | None, camera: KnownCamera | None) -> RigFit:
     """Fit the rig to the views so far, with all that is known from elsewhere."""
-    tell_stage("fitting", len(taken.views), unit="views")
+    tell_stage("fitting", len(session.views), unit="views")
     return fit_rig(
-        taken.views,
+        session.views,
         board,
-        taken.size,
+        session.size,
         camera=None if camera is None else camera.camera,
         known=None if camera is None else camera.covariance,
         start=base,
     )
 
 
-def _judged(taken: ViewCollection, values: Mapping[str, float], fit: RigFit) -> JudgedRig:
+def _judged(session: Session, values: Mapping[str, float], fit: RigFit) -> JudgedRig:
     """Judge the fit by the accuracy asked for. values: `si_values` of the request."""
     tell_stage("judging")
-    return judge_fit(fit, taken.views, **values)
+    return judge_fit(fit, session.views, **values)
 
 
-def _fitted(taken: ViewCollection, board: Board, base: RigModel | None, camera: KnownCamera | None) -> RigFit:
-    try:
-        return _fit(taken, board, base, camera)
-    except CalibrationError as error:
-        refused = error if isinstance(error, Degenerate) else Degenerate("no-model", str(error))
-        raise refusal(refused, taken, board) from refused
-
-
-def _signed(
-    fit: RigFit, judged: JudgedRig, identity: Identity | None, digests: list[str], camera: CameraUse | None
-) -> RigModel:
+def _signed(fit: RigFit, judged: JudgedRig, identity: Identity | None, digests: list[str]) -> RigModel:
     """The model with its verdict, its rig, and the digests of its corners, which must not be used to check it."""
     verdict = judged.verdict
     created = datetime.now(UTC).isoformat(timespec="seconds")
@@ -158,27 +131,20 @@ def _signed(
         "reasons": [str(reason) for reason in verdict.reasons],
         CORNERS: digests,
     }
-    if camera is not None:
-        provenance["camera"] = camera.content()
     return replace(fit.model, identity=identity, provenance=provenance)
 
 
-def _accepted(camera: CameraUse | None) -> dict[str, list[str]]:
-    """Accepted reasons against the camera, in the form of a scan's summary."""
-    return {"accepted_calibration": [str(each) for each in camera.accepted]} if camera and camera.accepted else {}
-
-
-def _summary(fit: RigFit, judged: JudgedRig, taken: ViewCollection) -> dict[str, Any]:
+def _summary(fit: RigFit, judged: JudgedRig, session: Session) -> dict[str, Any]:
     evidence, uncertainty = judged.evidence, judged.uncertainty
     return {
         "verdict": judged.verdict.as_json(),
         "views": {
-            "shown": len(taken.views),
+            "shown": len(session.views),
             "used": len(fit.used),
             "without_board": list(fit.left_out),
             "without_line": list(fit.without_line),
             "outliers": list(fit.outliers),
-            "refused": {name: str(why) for name, why in taken.refused.items()},
+            "refused": {name: str(why) for name, why in session.refused.items()},
         },
         "depth_error": {
             "at_m": judged.asked.at_m,
@@ -207,7 +173,7 @@ def _summary(fit: RigFit, judged: JudgedRig, taken: ViewCollection) -> dict[str,
 
 
 def _figures(
-    fit: RigFit, judged: JudgedRig, truth: DepthErrors | None, camera: CameraUse | None
+    fit: RigFit, judged: JudgedRig, truth: DepthErrors | None, accepted: Sequence[Refusal]
 ) -> list[tuple[str, str]]:
     evidence, matrix = judged.evidence, fit.model.camera.matrix
     lag = fit.model.lag_s
@@ -224,8 +190,7 @@ def _figures(
                       f"differ by {mm(evidence.shift_m)} at {asked.at_m:g} m"),
         ("condition", condition_text(fit.condition) + ("" if fit.converged else "; the fit did not come to rest")),
     ]  # fmt: skip
-    if camera is not None:
-        rows += [("camera file", f"accepted in spite of {each}") for each in camera.accepted]
+    rows += [("camera file", f"accepted in spite of {each}") for each in accepted]
     if truth is not None:
         rows.append(("truth", f"median {mm(truth.median_m)}, worst {mm(truth.worst_m)} at "
                               f"{truth.depth_m:g} m, {truth.ratio:.2f} of the expected sd"))  # fmt: skip
@@ -236,50 +201,33 @@ START_POSES = 3
 """Number of poses that are shown before anything is fitted."""
 
 
-class PoseGuide:
-    """Chooses poses by how much they lower the expected error, until that reaches the required accuracy."""
+def guided(
+    start: ChoosePose, board: Board, depth_range_m: tuple[float, float], session: Session,
+    fit: Callable[[], RigFit], judge: Callable[[RigFit], JudgedRig],
+) -> ChoosePose:  # fmt: skip
+    """Chooses poses by how much they lower the expected error, until that reaches the required accuracy.
 
-    def __init__(
-        self, start: ChoosePose, board: Board, depth_range_m: tuple[float, float], taken: ViewCollection,
-        fit: Callable[[], RigFit], judge: Callable[[RigFit], JudgedRig],
-    ) -> None:  # fmt: skip
-        """Take poses for as long as no fit can be judged, all views so far, how they will be fitted and judged."""
-        self._start = start
-        self._board = board
-        self._depth_range_m = depth_range_m
-        self._taken = taken
-        self._fitted = fit
-        self._judged = judge
-        self._asked: set[tuple[float, tuple[int, int], tuple[int, int]]] = set()
+    start: chooses for as long as no fit of the session's views can be judged. fit, judge: as they will be in the end.
+    """
+    asked: set[tuple[float, tuple[int, int], tuple[int, int]]] = set()
 
-    def next(self, views: Sequence[View]) -> Advice | None:
-        """The next pose; None once the expected error is small enough."""
-        known = self._taken.views
-        told = self._told() if len(known) >= START_POSES else None
-        if told is None:
-            return self._start(views)
-        fit, judged = told
+    def choose(views: Sequence[View]) -> Advice | None:
+        if len(session.views) < START_POSES:
+            return start(views)
+        try:
+            found = fit()
+            judged = judge(found)
+        except CalibrationError:  # no model yet, or its line misses the distance asked
+            return start(views)
         at_m = judged.asked.at_m
-        now_m = judged.evidence.expected_m
-        self._taken.say(f"expected error {judged.uncertainty.line()}; asked {mm(judged.asked.accuracy_m)}")
-        if judged.verdict.passed:
+        session.say(f"expected error {judged.uncertainty.line()}; asked {mm(judged.asked.accuracy_m)}")
+        every = candidates(found.model.camera, board, depth_range_m)
+        choices = [choice for choice in every if (choice.fill, choice.place, choice.tilt) not in asked]
+        if judged.verdict.passed or not choices:
             return None
-        choices = [
-            choice
-            for choice in candidates(fit.model.camera, self._board, self._depth_range_m)
-            if (choice.fill, choice.place, choice.tilt) not in self._asked
-        ]
-        if not choices:
-            return None
-        advice = next_pose(choices, at_m, now_m, Forecast(fit, at_m))
+        advice = next_pose(choices, at_m, judged.evidence.expected_m, Forecast(found, at_m))
         chosen = advice.candidate
-        self._asked.add((chosen.fill, chosen.place, chosen.tilt))  # a board that was not found there will not be again
+        asked.add((chosen.fill, chosen.place, chosen.tilt))  # a board that was not found there will not be again
         return advice
 
-    def _told(self) -> tuple[RigFit, JudgedRig] | None:
-        """Fit and judge the views so far; None if they make no model yet, or its line misses the distance asked."""
-        try:
-            fit = self._fitted()
-            return fit, self._judged(fit)
-        except CalibrationError:
-            return None
+    return choose

@@ -1,14 +1,13 @@
 """Writes the reports of `rig calibrate`, one HTML file each: verdict and reasons first, then the pictures.
 
-`planes_report`, `camera_report`, `check_report`, `sync_report` and `pixel_page` make them from `page` and its tables,
-pictures and charts; nothing is loaded from elsewhere. Numbers have units and only the digits that are known. `subject`
-says what a report is about, so that printed reports are not confused.
+`planes_report`, `camera_report`, `check_report` and `sync_report` make their parts of tables, pictures and charts,
+`page` the file; nothing is loaded from elsewhere. Numbers have units and only the digits that are known. `subject` says
+what a report is about, so that printed reports are not confused.
 """
 
 import base64
 import re
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
 from datetime import UTC, datetime
 from html import escape
 
@@ -21,8 +20,7 @@ from calibration.board.board import Board
 from calibration.camera_fit import CameraFit, rms
 from calibration.check import CheckedBoard
 from calibration.depth_error import DepthUncertainty
-from calibration.diagnosis.contradictions import SweepWaves
-from calibration.diagnosis.verdicts import JudgedCamera, JudgedRig
+from calibration.diagnosis.verdicts import JudgedRig
 from calibration.errors import digits, in_mm, mm
 from calibration.model.camera import Camera
 from calibration.model.rig_model import Identity
@@ -49,29 +47,22 @@ _NUMBER = re.compile(r"-|[-+]?[\d.]+(e[-+]?\d+)?( of \d+)?")
 Picture = NDArray[np.uint8]
 
 
-@dataclass(frozen=True, slots=True)
-class ReportSection:
-    """A part of a report. body: its HTML."""
+Section = tuple[str, str]
+"""A part of a report: its title, and its HTML."""
+Report = tuple[str, Sequence[Section]]
+"""A report's title and its parts."""
+Rows = Sequence[tuple[str, str]]
 
-    title: str
-    body: str
 
-
-def page(
-    title: str,
-    verdict: Verdict,
-    line: str,
-    figures: Sequence[tuple[str, str]],
-    sections: Sequence[ReportSection],
-    about: Sequence[tuple[str, str]] = (),
-) -> str:
-    """Make the HTML file: verdict with its reasons, a summary line, the figures, `about`, the sections."""
+def page(report: Report, verdict: Verdict, line: str, rows: Rows) -> str:
+    """Make the HTML file: verdict with its reasons, a summary line, a table of the rows, the sections."""
+    title, sections = report
     parts = [
         f'<!DOCTYPE html>\n<html lang="en"><head><meta charset="utf-8"><title>{escape(title)}</title>',
         f"<style>{_STYLE}</style></head><body><h1>{escape(title)}</h1>",
         _verdict(verdict, line),
-        table(("", ""), [*figures, *about]) if figures or about else "",
-        *(f"<h2>{escape(section.title)}</h2>\n{section.body}" for section in sections),
+        table(("", ""), rows) if rows else "",
+        *(f"<h2>{escape(name)}</h2>\n{body}" for name, body in sections),
         "</body></html>\n",
     ]
     return "\n".join(parts)
@@ -129,19 +120,19 @@ def measured(name: str, value: float, sd: float) -> tuple[str, str, str]:
     return f"{value:.{digits}f}", f"{sd:.{digits}f}", unit
 
 
-def in_mm_with_sign(length_m: float) -> str:
-    """A length with its sign in millimetres, such as '+3.1', for a table whose head gives the unit."""
-    return f"+{in_mm(length_m)}" if length_m > 0 else in_mm(length_m)
+def named(names: Sequence[str]) -> str:
+    """The number of these names, followed by the names, as text."""
+    return f"{len(names)} ({', '.join(names)})" if names else "0"
 
 
-def subject(
-    identity: Identity | None, board: Board | None, versions: Mapping[str, str], now: datetime
-) -> list[tuple[str, str]]:
+def subject(identity: Identity | None, board: Board | None, versions: Mapping[str, str], now: datetime) -> Rows:
     """Rows that name rig and serial numbers, board, date and versions; `identity` and `board` may be None."""
     rows = []
     if identity is not None:
+        slots = dict.fromkeys([*identity.kinds, *identity.serials])
+        devices = [(slot, identity.kinds.get(slot), identity.serials.get(slot)) for slot in slots]
         rows.append(("rig", identity.name or "unnamed"))
-        rows.append(("devices", ", ".join(_devices(identity)) or "not known"))
+        rows.append(("devices", ", ".join(" ".join(filter(None, words)) for words in devices) or "not known"))
     if board is not None:
         rows.append(("board", board_words(board)))
     rows.append(("date", now.astimezone(UTC).strftime("%Y-%m-%d %H:%M UTC")))
@@ -155,14 +146,6 @@ def board_words(board: Board) -> str:
     if board.marker_m is None:
         return f"chessboard, {squares}"
     return f"ChArUco, {squares}, markers of {board.marker_m * 1e3:.6g} mm, {board.dictionary}"
-
-
-def _devices(identity: Identity) -> list[str]:
-    slots = dict.fromkeys([*identity.kinds, *identity.serials])
-    return [
-        " ".join(word for word in (slot, identity.kinds.get(slot, ""), identity.serials.get(slot, "")) if word)
-        for slot in slots
-    ]
 
 
 _WIDTH_PX = 640
@@ -207,13 +190,6 @@ def residual_picture(
     return picture, times
 
 
-def error_picture(uncertainty: DepthUncertainty) -> Picture:
-    """Draw the expected depth error, red where it is large, black where the scan does not reach this depth."""
-    large = _enlarged_mm(uncertainty.sd_m)
-    limits = depth_limits(large)
-    return depth_picture(large, None if limits is None else (limits[1], limits[0]), unit="mm")  # red: large
-
-
 def cells_picture(cells_m: Array) -> Picture:
     """Draw the deviations of a board's squares from their plane: red in front of it, black where they were not
     scanned."""
@@ -244,35 +220,24 @@ def _at(x: float, y: float, scale: float) -> tuple[int, int]:
 _WAYS = {1: "rising command", -1: "falling command"}
 
 
-def plane_residuals(waves: SweepWaves, sweeps: Sequence[SweepFit], metres_per_command: float, at_m: float) -> str:
-    """Chart (SVG) of each sweep's median residuals over the command, in mm of depth at `at_m`, with a panel per
-    direction.
+def plane_residuals(judged: JudgedRig, sweeps: Sequence[SweepFit]) -> str:
+    """Chart (SVG) of each sweep's median residuals over the command, in mm of depth at the distance asked, with a panel
+    per direction.
     """
-    views = list(dict.fromkeys(sweep.view for sweep in sweeps))
-    panels = [
-        Panel(
-            title=title,
-            x_label="mirror command",
-            y_label=f"depth at {at_m:g} m, mm",
-            series=[
-                Series(
-                    label="",
-                    colour="#{2:02x}{1:02x}{0:02x}".format(*view_colour(views.index(sweep.view))),
-                    points=[
-                        (float(command), float(value) * metres_per_command * 1e3)
-                        for command, value in zip(waves.command, values, strict=True)
-                    ],
-                    marker=False,
-                )
-                for sweep, values in zip(sweeps, waves.sweeps, strict=True)
-                if sweep.direction == way
-            ],
-            x_log=False,
-            y_log=False,
-        )
-        for way, title in _WAYS.items()
-        if any(sweep.direction == way for sweep in sweeps)
-    ]
+    views, waves = list(dict.fromkeys(sweep.view for sweep in sweeps)), judged.waves
+
+    def curve(sweep: SweepFit, values: Array) -> Series:
+        colour = "#{2:02x}{1:02x}{0:02x}".format(*view_colour(views.index(sweep.view)))
+        depth_mm = values * judged.sensitivity.per_command_m * 1e3
+        return Series("", colour, list(zip(waves.command.tolist(), depth_mm.tolist(), strict=True)), marker=False)
+
+    panels = []
+    for way, title in _WAYS.items():
+        pairs = zip(sweeps, waves.sweeps, strict=True)
+        curves = [curve(sweep, values) for sweep, values in pairs if sweep.direction == way]
+        if curves:
+            y_label = f"depth at {judged.asked.at_m:g} m, mm"
+            panels.append(Panel(title, "mirror command", y_label, curves, x_log=False, y_log=False))
     notes = [
         "A curve for each sweep, in its view's colour above. What all curves share is the scanner model's misfit;",
         "waves that differ from sweep to sweep come from exposures that are not locked to the scan.",
@@ -280,58 +245,46 @@ def plane_residuals(waves: SweepWaves, sweeps: Sequence[SweepFit], metres_per_co
     return chart_svg(panels, title="By how much depth misses the board, sweep by sweep", notes=notes) if panels else ""
 
 
-Figures = Sequence[tuple[str, str]]
-
-
-def planes_report(
-    fit: RigFit, views: Sequence[View], judged: JudgedRig, line: str, figures: Figures, about: Figures = ()
-) -> str:
-    """Make the report on a calibration of camera and planes. about: rows of `subject`, as in the other reports."""
+def planes_report(fit: RigFit, views: Sequence[View], judged: JudgedRig) -> Report:
+    """Make the report on a calibration of camera and planes."""
     by_name = {view.name: view for view in views}
     used = [by_name[name] for name in fit.views]
-    planes = plane_residuals(judged.waves, fit.every_sweep, judged.sensitivity.per_command_m, judged.asked.at_m)
-    sections = [
+    return "Calibration of camera and planes", [
         *camera_sections(fit.model.camera, used, fit.corner_residual_px),
-        ReportSection("Residuals of the planes", planes),
+        ("Residuals of the planes", plane_residuals(judged, fit.every_sweep)),
         uncertainty_section(judged.uncertainty),
         _views_section(fit, judged),
         _decisions_section(fit),
     ]
-    return page("Calibration of camera and planes", judged.verdict, line, figures, sections, about)
 
 
-def camera_sections(camera: Camera, views: Sequence[View], residuals_px: Sequence[Array]) -> list[ReportSection]:
+def camera_sections(camera: Camera, views: Sequence[View], residuals_px: Sequence[Array]) -> list[Section]:
     """Sections that show where corners were seen and their distances from the model's corners."""
     size = (camera.width, camera.height)
     seen = [corners_px(view) for view in views]
     coverage = coverage_picture([view.name for view in views], seen, size)
     arrows, times = residual_picture(seen, residuals_px, size)
     return [
-        ReportSection("Coverage", picture(coverage, "Corners of all views, each named at its first corner.")),
-        ReportSection("Residuals of the corners", picture(arrows, f"Drawn {times} times longer than they are.")),
+        ("Coverage", picture(coverage, "Corners of all views, each named at its first corner.")),
+        ("Residuals of the corners", picture(arrows, f"Drawn {times} times longer than they are.")),
     ]
 
 
-def uncertainty_section(uncertainty: DepthUncertainty) -> ReportSection:
-    """Section with a map of the expected depth error."""
+def uncertainty_section(uncertainty: DepthUncertainty) -> Section:
+    """Section with a map of the expected depth error, red where it is large, black where the scan does not reach."""
     if not np.isfinite(uncertainty.sd_m).any():
-        return ReportSection("Expected depth error", paragraph(f"The scan does not reach {uncertainty.depth_m:g} m."))
+        return "Expected depth error", paragraph(f"The scan does not reach {uncertainty.depth_m:g} m.")
     caption = f"Standard deviation of the depth at {uncertainty.depth_m:g} m; black: not reached by the scan."
+    large = _enlarged_mm(uncertainty.sd_m)
+    limits = depth_limits(large)
+    drawn = depth_picture(large, None if limits is None else (limits[1], limits[0]), unit="mm")  # red: large
     rows = [(name, in_mm(float(np.nanmedian(part)))) for name, part in uncertainty.part_m.items()]
     said = paragraph("Its parts, each the median over the picture:") + table(("from", "mm"), rows)
-    return ReportSection("Expected depth error", picture(error_picture(uncertainty), caption) + said)
+    return "Expected depth error", picture(drawn, caption) + said
 
 
-def camera_report(
-    fit: CameraFit,
-    views: Sequence[View],
-    judged: JudgedCamera,
-    board: Board,
-    figures: Figures,
-    about: Figures = (),
-) -> str:
+def camera_report(fit: CameraFit, views: Sequence[View], board: Board) -> Report:
     """Make the report on a calibration of the camera alone. views: those that the fit used."""
-    seen = [corners_px(view) for view in views]
     rows = [
         (
             name + (" (outlier)" if name in fit.outliers else ""),
@@ -342,19 +295,11 @@ def camera_report(
         for name, pose, used, off_px in zip(fit.views, fit.poses, fit.used, fit.view_rms_px, strict=True)
     ]
     head = ("view", "distance, m", "tilt, degrees", "corners used", "rms, px")
-    shown = [view for view, px in zip(views, seen, strict=True) if len(px)]
-    sections = [*camera_sections(fit.camera, shown, fit.residual_px), ReportSection("Views", table(head, rows))]
-    return page("Calibration of the camera", judged.verdict, judged.line(), figures, sections, about)
+    sections = camera_sections(fit.camera, views, fit.residual_px)
+    return "Calibration of the camera", [*sections, ("Views", table(head, rows))]
 
 
-def check_report(
-    boards: Sequence[CheckedBoard],
-    uncertainty: DepthUncertainty | None,
-    verdict: Verdict,
-    line: str,
-    figures: Figures,
-    about: Figures = (),
-) -> str:
+def check_report(boards: Sequence[CheckedBoard], uncertainty: DepthUncertainty | None) -> Report:
     """Make the report on a check of a calibration."""
     sections = []
     for board in boards:
@@ -367,13 +312,13 @@ def check_report(
             ("distance", f"{board.distance_m:.3f} m"),
         ]  # fmt: skip
         shown = picture(cells_picture(board.cells_m), caption)
-        sections.append(ReportSection(f"View {board.name}", table(("", ""), rows) + shown))
+        sections.append((f"View {board.name}", table(("", ""), rows) + shown))
     if uncertainty is not None:
         sections.append(uncertainty_section(uncertainty))
-    return page("Check of a calibration", verdict, line, figures, sections, about)
+    return "Check of a calibration", sections
 
 
-def sync_report(fit: SyncFit, verdict: Verdict, line: str, figures: Figures, about: Figures = ()) -> str:
+def sync_report(fit: SyncFit) -> Report:
     """Make the report on a calibration of lags and delays."""
     rows = [
         (
@@ -386,8 +331,7 @@ def sync_report(fit: SyncFit, verdict: Verdict, line: str, figures: Figures, abo
         for sweep in fit.sweeps
     ]
     head = ("sweep", "speed, 1/s", "lag, us", "sd, us", "passages")
-    sections = [ReportSection("Sweeps", table(head, rows))]
-    return page("Calibration of lag and delays", verdict, line, figures, sections, about)
+    return "Calibration of lag and delays", [("Sweeps", table(head, rows))]
 
 
 def corners_px(view: View) -> Array:
@@ -405,7 +349,7 @@ def pose_words(pose: BoardPose, board: Board) -> tuple[str, str]:
     return f"{middle[2]:.2f}", f"{tilt:.0f}"
 
 
-def _views_section(fit: RigFit, judged: JudgedRig) -> ReportSection:
+def _views_section(fit: RigFit, judged: JudgedRig) -> Section:
     rows = []
     worth = judged.sensitivity.per_command_m
     shifts = {one.name: one.shift for one in judged.shifts}
@@ -418,21 +362,21 @@ def _views_section(fit: RigFit, judged: JudgedRig) -> ReportSection:
                 str(len(residual)),
                 f"{rms(residual):.3f}",
                 str(sum(len(sweep.residual) for sweep in sweeps)),
-                in_mm_with_sign(shift),
+                ("+" if shift > 0 else "") + in_mm(shift),
             )
         )
     head = ("view", "distance, m", "tilt, degrees", "corners", "rms, px", "passages", "shift, mm")
     left_out = paragraph(f"Without a board: {', '.join(fit.left_out)}.", small=True) if fit.left_out else ""
-    return ReportSection("Views", table(head, rows) + left_out)
+    return "Views", table(head, rows) + left_out
 
 
-def _decisions_section(fit: RigFit) -> ReportSection:
+def _decisions_section(fit: RigFit) -> Section:
     rows = [
         (one.name, "kept" if one.kept else "left out", *measured(one.name, one.value, one.sd), one.reason)
         for one in fit.decisions
     ]
     note = paragraph("The mirror command has no unit; terms are those of calibration.yaml.", small=True)
-    return ReportSection("Terms of the model", table(("term", "", "value", "sd", "unit", "why"), rows) + note)
+    return "Terms of the model", table(("term", "", "value", "sd", "unit", "why"), rows) + note
 
 
 _NEW, _OLD, _LIMIT = "#0072b2", "#7b8896", "#d55e00"
@@ -457,7 +401,7 @@ def dark_rate_picture(pixels: PixelMap) -> NDArray[np.uint8]:
 
 def pixel_page(
     pixels: PixelMap,
-    rows: Sequence[tuple[str, str]],
+    rows: Rows,
     verdict: Verdict,
     drift: PixelDrift | None,
     against: PixelVersion | None,
@@ -468,8 +412,8 @@ def pixel_page(
     fastest = float(np.nanmax(pixels.rate_per_s))
     caption = f"Dark rate of each pixel, {digits(middle / 3)} to {digits(fastest)} counts/s on a logarithmic scale."
     sections = [
-        ReportSection("Dark rate", picture(dark_rate_picture(pixels), caption)),
-        ReportSection("Distribution", rate_chart(pixels, None if against is None else against.pixels)),
+        ("Dark rate", picture(dark_rate_picture(pixels), caption)),
+        ("Distribution", rate_chart(pixels, None if against is None else against.pixels)),
     ]
     if drift is not None:
         changes = [
@@ -478,9 +422,9 @@ def pixel_page(
                                  ("recovered", drift.recovered))
         ]  # fmt: skip
         said = paragraph(f"Row and column of up to {_MOST_LISTED} pixels each.", small=True)
-        sections.append(ReportSection("Changed since the last map", table(("", ""), changes) + said))
+        sections.append(("Changed since the last map", table(("", ""), changes) + said))
     line = f"{int(pixels.defects.sum())} of {pixels.defects.size} pixels are not to be used."
-    return page("Pixels", verdict, line, rows, sections)
+    return page(("Pixels", sections), verdict, line, rows)
 
 
 def rate_chart(pixels: PixelMap, older: PixelMap | None = None) -> str:

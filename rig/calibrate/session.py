@@ -3,9 +3,9 @@
     views/000.npz ...  rig.json (whose they are)  board.yaml (of what)  calibration.yaml (+ .npy)  report.html
     summary.json
 
-`Session` writes it; `CalibrationResult` is what a calibration returns. A session that was interrupted, or whose views
-gave no calibration, leaves its views, which can be a source for the next. A view's file, `views/000.npz`, has all that
-a fit needs of a pose. It is written completely or not at all:
+`Session` holds the views and writes it all; `CalibrationResult` is what a calibration returns. A session that was
+interrupted, or whose views gave no calibration, leaves its views, which can be a source for the next. A view's file,
+`views/000.npz`, has all that a fit needs of a pose. It is written completely or not at all:
 
     format_version () int   name () str   picture (height, width) float32, if there is one
     corner_ids (n,) int32   corner_px (n, 2) float64   corner_sd_px (n,) float64, if the board was found
@@ -14,8 +14,9 @@ a fit needs of a pose. It is written completely or not at all:
 
 import io
 import zipfile
-from collections.abc import Mapping, Sequence
-from dataclasses import asdict, dataclass
+from collections.abc import Collection, Mapping
+from dataclasses import asdict, dataclass, replace
+from datetime import UTC, datetime
 from pathlib import Path
 from types import TracebackType
 from typing import Any, Final, Self
@@ -26,19 +27,23 @@ from numpy.typing import NDArray
 
 from calibration.board.board import Board, load_board
 from calibration.depth_error import DepthErrors, depth_errors
+from calibration.errors import Degenerate
 from calibration.files.npy_files import load_numpy
-from calibration.files.rig_file import CALIBRATION_FILE, save_rig_model
+from calibration.files.rig_file import CALIBRATION_FILE, corners_digest, save_rig_model
 from calibration.model.rig_model import Identity, RigModel
+from calibration.rig_fit.state import FEWEST_PASSAGES, shows_line
 from calibration.verdict import Verdict
 from calibration.views import Corners, Passages, View
 from drivers.json_text import parse_json
+from rig.calibrate.capture import Capture, TellLine
+from rig.calibrate.report import Report, page, subject
 from rig.calibrate.sources import VIEWS
 from rig.config.models import RigConfig
-from rig.devices.calibration_use import KnowsRig, carry_notes
+from rig.devices.calibration_use import KnowsRig, carry_notes, same_rig
 from rig.devices.open import open_rig
 from rig.errors import UsageError
 from rig.run_folder.folder import RunFolder
-from rig.scan.run import OutFolder
+from rig.scan.run import OutFolder, versions
 
 LoadedCalibration = tuple[Path, RigModel]
 """A calibration: its file, and what it holds."""
@@ -62,89 +67,6 @@ def session_board(folder: Path) -> Board | None:
     """The board of a session's corners; None if no board was looked for."""
     file = folder / BOARD_FILE
     return load_board(file) if file.is_file() else None
-
-
-class Session:
-    """Writes the views of a calibration one by one, then the result."""
-
-    def __init__(self, out: OutFolder, board: Board | None = None) -> None:
-        """Claim the folder; None writes nothing. board: what the views show. Raises UsageError if it cannot be
-        claimed."""
-        self._board = board
-        self._folder = None if out is None else RunFolder(out, in_place=True)
-        self._views = 0
-
-    @property
-    def path(self) -> Path | None:
-        """Path of the folder; None if nothing is written."""
-        return None if self._folder is None else self._folder.path
-
-    def __enter__(self) -> Self:
-        """The session itself."""
-        return self
-
-    def __exit__(
-        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
-    ) -> None:
-        """Keep what was written if there is a view among it, and say so where something went wrong."""
-        if self._folder is None:
-            return
-        if self._views:
-            self._folder.keep()
-            if error is not None:
-                kept = "1 view is" if self._views == 1 else f"{self._views} views are"
-                error.add_note(f"{kept} in {self._folder.path}, which can be given as a source")
-        self._folder.discard()
-
-    def note_rig(self, identity: Identity) -> None:
-        """Write to which rig the views belong."""
-        if self._folder is not None:
-            self._folder.write_json(RIG_FILE, asdict(identity))
-
-    def add(self, view: View) -> None:
-        """Write a view."""
-        if self._folder is not None:
-            folder = self._folder.place(VIEWS)
-            folder.mkdir(exist_ok=True)
-            if self._board is not None and not self._views:
-                self.write_text(BOARD_FILE, _board_text(self._board))
-            save_view(view, folder / f"{self._views:03d}.npz")
-            self._views += 1
-
-    def write_text(self, name: str, text: str) -> None:
-        """Write a file of text."""
-        if self._folder is not None:
-            self._folder.write_text(name, text)
-
-    def finish(
-        self, summary: dict[str, Any], report: str, model: RigModel | None, made_from: LoadedCalibration | None = None
-    ) -> Path | None:
-        """Write the result, with notes on the calibration it was made from; return the new calibration's file,
-        if any."""
-        if self._folder is None:
-            return None
-        file = None
-        if model is not None:
-            file = self._folder.place(CALIBRATION_FILE)
-            save_rig_model(model, file)
-            if made_from is not None:
-                carry_notes(*made_from, file, model)
-        self._folder.write_text("report.html", report)
-        self._folder.write_json("summary.json", summary)
-        self._folder.publish()
-        return None if file is None else self._folder.path / CALIBRATION_FILE
-
-
-def _board_text(board: Board) -> str:
-    """A board as YAML that `load_board` reads."""
-    content: dict[str, Any] = {"kind": board.kind, "squares": list(board.squares), "square": _mm(board.square_m)}
-    if board.marker_m is not None:
-        content |= {"marker": _mm(board.marker_m), "dictionary": board.dictionary}
-    return yaml.safe_dump(content, sort_keys=False, default_flow_style=None)
-
-
-def _mm(length_m: float) -> str:
-    return f"{length_m * 1e3:.10g} mm"
 
 
 EXIT_NOT_TRUSTWORTHY = 1
@@ -183,20 +105,195 @@ class CalibrationResult:
         return self.summary
 
 
-def named(names: Sequence[str]) -> str:
-    """The number of these names, followed by the names, as text."""
-    return f"{len(names)} ({', '.join(names)})" if names else "0"
+class Session:
+    """The views of a calibration, written one by one as they are taken, and then its result.
+
+    views: those taken so far. refused: the reasons for those without corners, by name. identity: the rig they belong to
+    (None if unknown).
+    """
+
+    def __init__(
+        self,
+        out: OutFolder,
+        board: Board | None = None,
+        tell: TellLine | None = None,
+        of_camera: Collection[str] = (),
+    ) -> None:
+        """Claim the folder; None writes nothing. Raises UsageError if it cannot be claimed.
+
+        board: what the views show. tell: gets a line on each. of_camera: digests of those that a camera was made of.
+        """
+        self.views: list[View] = []
+        self.refused: dict[str, Degenerate] = {}
+        self.identity: Identity | None = None
+        self.board = board
+        self.tell = tell
+        self._of_camera = of_camera
+        self._seen: dict[str, str] = {}
+        self._folder = None if out is None else RunFolder(out, in_place=True)
+
+    @property
+    def size(self) -> tuple[int, int]:
+        """(width, height) of the pictures. Raises UsageError if views differ in size."""
+        sizes = {view.picture.shape[::-1] for view in self.views if view.picture is not None}
+        if len(sizes) != 1:
+            named = ", ".join(f"{width} x {height}" for width, height in sorted(sizes)) or "none"
+            raise UsageError(f"pictures of the views have sizes {named}; views of one sensor make a calibration")
+        width, height = sizes.pop()
+        return width, height
+
+    def __enter__(self) -> Self:
+        """The session itself."""
+        return self
+
+    def __exit__(
+        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
+    ) -> None:
+        """Keep what was written if there is a view among it, and say so where something went wrong."""
+        if self._folder is None:
+            return
+        if self.views:
+            self._folder.keep()
+            if error is not None:
+                kept = "1 view is" if len(self.views) == 1 else f"{len(self.views)} views are"
+                error.add_note(f"{kept} in {self._folder.path}, which can be given as a source")
+        self._folder.discard()
+
+    def add_capture(self, capture: Capture, source: Path | None = None) -> None:
+        """Add the view of a scan. source: the run, if it was recorded."""
+        self.add(capture.view, capture.refused, capture.identity, source)
+
+    def say(self, line: str) -> None:
+        """Pass a line on to `tell`, if there is one."""
+        if self.tell is not None:
+            self.tell(line)
+
+    def add(
+        self,
+        view: View,
+        refused: Degenerate | None = None,
+        identity: Identity | None = None,
+        source: Path | None = None,
+    ) -> None:
+        """Add a view from a file or run under a name of its own. Raises UsageError for one that would count twice."""
+        self._require_new(view, str(source or view.name))
+        if view.name in [known.name for known in self.views]:
+            view = replace(view, name=f"{view.name}-{len(self.views)}")
+        if identity is not None:
+            self._require_of_rig(identity)
+        self._write(view)
+        self.views.append(view)
+        if refused is not None:
+            self.refused[view.name] = refused
+        self.say(told(view, refused))
+
+    def _require_new(self, view: View, where: str) -> None:
+        if view.corners is None:
+            return
+        digest = corners_digest(view)
+        if digest in self._of_camera:
+            raise UsageError(
+                f"{where} holds a view that the camera was made of; a view must not count twice: give other views "
+                "(of a simulated rig: another --seed), or leave the camera out"
+            )
+        if digest in self._seen:
+            raise UsageError(
+                f"{where} holds the very corners of {self._seen[digest]}; a view must not count twice: name it once, "
+                "or show the board again"
+            )
+        self._seen[digest] = where
+
+    def _require_of_rig(self, identity: Identity) -> None:
+        known = self.identity
+        if known is None and self._folder is not None:
+            self._folder.write_json(RIG_FILE, asdict(identity))
+        if known is not None and not same_rig(known, identity):
+            one, other = (f"{each.name} ({', '.join(_devices(each))})" for each in (known, identity))
+            raise UsageError(f"views are of two rigs: {one} and {other}; calibrate each with its own")
+        self.identity = identity
+
+    def _write(self, view: View) -> None:
+        if self._folder is not None:
+            folder = self._folder.place(VIEWS)
+            folder.mkdir(exist_ok=True)
+            if self.board is not None and not self.views:
+                self.write_text(BOARD_FILE, _board_text(self.board))
+            save_view(view, folder / f"{len(self.views):03d}.npz")
+
+    def write_text(self, name: str, text: str) -> None:
+        """Write a file of text."""
+        if self._folder is not None:
+            self._folder.write_text(name, text)
+
+    def finish(
+        self, command: str, result: CalibrationResult, report: Report, made_from: LoadedCalibration | None = None
+    ) -> CalibrationResult:
+        """Write the result with its model, if it has one, and notes on the calibration that was made from.
+
+        Returns the result with its whole summary and with the paths of what was written.
+        """
+        summary = {"command": command, **result.summary, "versions": versions()}
+        result = replace(result, summary=summary)
+        if self._folder is None:
+            return result
+        if result.model is not None:
+            file = self._folder.place(CALIBRATION_FILE)
+            save_rig_model(result.model, file)
+            if made_from is not None:
+                carry_notes(*made_from, file, result.model)
+            result = replace(result, calibration=self._folder.path / CALIBRATION_FILE)
+        about = subject(self.identity, self.board, summary["versions"], datetime.now(UTC))
+        self._folder.write_text("report.html", page(report, result.verdict, result.line, [*result.figures, *about]))
+        self._folder.write_json("summary.json", summary)
+        self._folder.publish()
+        return replace(result, folder=self._folder.path)
 
 
-def true_model(live: RigConfig) -> RigModel | None:
+def _devices(identity: Identity) -> list[str]:
+    return [*identity.kinds.values(), *identity.serials.values()]
+
+
+def _board_text(board: Board) -> str:
+    """A board as YAML that `load_board` reads."""
+    content: dict[str, Any] = {"kind": board.kind, "squares": list(board.squares), "square": _mm(board.square_m)}
+    if board.marker_m is not None:
+        content |= {"marker": _mm(board.marker_m), "dictionary": board.dictionary}
+    return yaml.safe_dump(content, sort_keys=False, default_flow_style=None)
+
+
+def _mm(length_m: float) -> str:
+    return f"{length_m * 1e3:.10g} mm"
+
+
+def told(view: View, refused: Degenerate | None) -> str:
+    """Describe a view in one line: what is seen in it or, if it was `refused`, why it has no corners."""
+    if refused is not None:
+        return f"view {view.name}: {refused}"
+    parts = [] if view.corners is None else [f"{len(view.corners.ids)} corners"]
+    if view.passages:
+        counts = ", ".join(str(len(sweep.command)) for sweep in view.passages)
+        parts.append(f"{counts} passages of the line" + ("" if shows_line(view) else _too_few(view)))
+    return f"view {view.name}: {', '.join(parts) or 'neither corners nor passages'}"
+
+
+def _too_few(view: View) -> str:
+    """Say why so few passages are as good as none, and what to do about it."""
+    where = "" if view.corners is None else ", or hold the board where the line passes"
+    return (
+        f", too few to count (limit {FEWEST_PASSAGES} a sweep): the line does not stand out in single pixels; give it "
+        f"more exposures per column (2 to 5 do in a dark room) or more power{where}"
+    )
+
+
+def true_model(live: RigConfig | None) -> RigModel | None:
     """The rig as its world knows it; None for a real one. Called only after everything was estimated."""
-    if live.world is None:
+    if live is None or live.world is None:
         return None
     with open_rig(live.model_copy(update={"calibration": None})) as rig:
         return rig.world.true_model() if isinstance(rig.world, KnowsRig) else None
 
 
-def true_errors(model: RigModel, live: RigConfig, at_m: float) -> DepthErrors | None:
+def true_errors(model: RigModel, live: RigConfig | None, at_m: float) -> DepthErrors | None:
     """True depth errors, from the rig's world; None for a real rig."""
     truth = true_model(live)
     if truth is None:
@@ -205,14 +302,11 @@ def true_errors(model: RigModel, live: RigConfig, at_m: float) -> DepthErrors | 
     return depth_errors(model, truth, at_m, speed)
 
 
-def truth_content(errors: DepthErrors) -> dict[str, Any]:
+def truth_content(errors: DepthErrors | None) -> dict[str, Any] | None:
     """The true errors as plain values for the summary."""
-    return {
-        "at_m": errors.depth_m,
-        "median_m": errors.median_m,
-        "worst_m": errors.worst_m,
-        "ratio_to_sd": errors.ratio,
-    }
+    if errors is None:
+        return None
+    return {"at_m": errors.depth_m, "median_m": errors.median_m, "worst_m": errors.worst_m, "ratio_to_sd": errors.ratio}
 
 
 VERSION: Final = 1

@@ -1,27 +1,23 @@
 """Reads the inputs of a calibration: sources of views, files and quantities. All problems are listed together.
 
 A source is a live or simulated rig, a recorded run, a session with views kept earlier, or a file of pictures.
-`camera_use` decides by its verdict whether a separately calibrated camera may be used to calibrate the planes.
+`known_camera` decides by its verdict whether a separately calibrated camera may be used to calibrate the planes.
 """
 
 import os
 from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
 
 from calibration.files.rig_file import KnownCamera, load_camera
 from drivers.units import parse_quantity
 from rig.config.files import NO_CONFIG
 from rig.config.models import RigConfig
-from rig.config.overrides import SIMULATED, Config, PathLike, configure, seed_problems
-from rig.devices.calibration_use import Refusal, check_content, failed_verdict, require_accepted
+from rig.config.overrides import SIMULATED, Config, configure, seed_problems
+from rig.devices.calibration_use import Refusal, failed_verdict, require_accepted
 from rig.errors import UsageError
 from rig.requests import CalibrationRequest
 from rig.run_folder.manifest import MANIFEST
-
-if TYPE_CHECKING:
-    from calibration.board.board import Board
 
 VIEWS = "views"
 """Folder of a session that holds its views."""
@@ -121,13 +117,6 @@ def _live(source: Config, scene: str | None, notes: list[str]) -> RigConfig:
     return configure(loaded, scene=BOARD_SCENE)
 
 
-def read_board(file: PathLike | None) -> "Board":
-    """Read a board's file; None is the bundled board. Raises CalibrationError."""
-    from calibration.board.board import BUNDLED_BOARD, load_board
-
-    return load_board(BUNDLED_BOARD if file is None else file)
-
-
 _QUANTITIES = {
     "accuracy": ("accuracy_m", "length"),
     "at": ("at_m", "length"),
@@ -161,23 +150,11 @@ def si_values(request: CalibrationRequest) -> dict[str, float]:
     return values
 
 
-@dataclass(frozen=True, slots=True)
-class CameraUse:
-    """A camera that was calibrated before. accepted: reasons in spite of which it is used."""
-
-    known: KnownCamera
-    accepted: tuple[Refusal, ...] = ()
-
-    def content(self) -> dict[str, Any]:
-        """The camera's use as plain values, for the provenance of a calibration made with it."""
-        return check_content("unchecked" if self.known.verdict is None else "passed", self.accepted)
-
-
-def camera_use(file: Path, *, accept: bool = False) -> CameraUse:
-    """Read a camera file. Raises UsageError if its verdict failed, unless `accept`. A file without a verdict is used
-    unchecked.
+def known_camera(file: Path, *, accept: bool = False) -> tuple[KnownCamera, list[Refusal]]:
+    """Read a camera file; returns also the reasons in spite of which it is used. Raises UsageError if its verdict
+    failed, unless `accept`. A file without a verdict is used unchecked.
     """
     known = load_camera(file)
     found = failed_verdict(known.verdict, known.reasons)
     require_accepted(f"camera {file}", found, {each.code for each in found} if accept else ())
-    return CameraUse(known, tuple(found))
+    return known, found

@@ -35,17 +35,16 @@ from drivers.frames import FrameBlock
 from drivers.recorded import RunRecording
 from rig.calibrate.capture import TellLine, capture_view
 from rig.calibrate.planes import speeds_of
-from rig.calibrate.report import subject, sync_report
+from rig.calibrate.report import sync_report
 from rig.calibrate.session import CalibrationResult, LoadedCalibration, Session, true_model
 from rig.calibrate.sources import SourcesLike, si_values, sort_sources
-from rig.calibrate.views import ViewCollection, take_kept
+from rig.calibrate.views import take_kept
 from rig.config.models import RigConfig
 from rig.count.bind import FrameBinder
 from rig.plan.scan_plan import ScanPlan
 from rig.progress import part, tell_stage
 from rig.recording.inputs import read_plan
 from rig.requests import SyncRequest
-from rig.scan.run import versions
 
 AROUND_FRAMES = 12
 """Frames looked at on either side of the planned place of an edge."""
@@ -100,28 +99,28 @@ def run_sync(sources: SourcesLike, request: SyncRequest, *, tell: TellLine | Non
     made_from = _own(live) if file is None else (Path(file), load_rig_model(file))
     base = None if made_from is None else made_from[1]
     wanted = None if base is None else goal(sensitivity(base, values["at_m"]), **values)
-    with Session(request.out) as session:
-        taken = ViewCollection(session, tell)
-        take_kept(taken, found, None)
+    with Session(request.out, None, tell) as session:
+        take_kept(session, found)
         gates = [gate_delay(run) for run in found.recorded]
         if live is not None:
-            gates.append(_scanned(live, request, taken))
+            gates.append(_scanned(live, request, session))
         gate = min((one for one in gates if one is not None and one.sd_s > 0), key=lambda one: one.sd_s, default=None)
-        tell_stage("fitting", len(taken.views), unit="views")
-        fit = _fitted(taken, base)
+        tell_stage("fitting", len(session.views), unit="views")
+        known = (0.0, 0.0) if base is None else known_row_delay(base)
+        try:
+            fit = fit_sync([sweep for view in session.views for sweep in view.passages], *known)
+        except Degenerate as refused:
+            raise Degenerate(refused.reason, f"{refused.reason}: {refused}") from refused
         given, changed = (None, None) if base is None else with_lags(base, fit)
         verdict = judge_sync(fit, base, wanted, changed)
         model = None if given is None else _signed(given, gate, verdict)
-        truth = None if live is None else true_model(live)
-        line = _line(fit)
-        summary = {"command": "sync", **_summary(fit, gate, verdict, truth), "versions": versions()}
-        figures = tuple(_figures(fit, gate, truth))
-        about = subject(taken.identity, None, summary["versions"], datetime.now(UTC))
-        written = session.finish(summary, sync_report(fit, verdict, line, figures, about), model, made_from)
-        return CalibrationResult(verdict, line, figures, summary, model, session.path, written)
+        truth = true_model(live)
+        figures, summary = _figures(fit, gate, truth), _summary(fit, gate, verdict, truth)
+        result = CalibrationResult(verdict, _line(fit), tuple(figures), summary, model)
+        return session.finish("sync", result, sync_report(fit), made_from)
 
 
-def _scanned(live: RigConfig, request: SyncRequest, taken: ViewCollection) -> GateDelay | None:
+def _scanned(live: RigConfig, request: SyncRequest, session: Session) -> GateDelay | None:
     """Scan at every speed; the gate's delay comes from the fastest sweeps, which are recorded for it."""
     speeds = request.exposures or speeds_of(live)
     gate = None
@@ -131,17 +130,9 @@ def _scanned(live: RigConfig, request: SyncRequest, taken: ViewCollection) -> Ga
             name, seed = f"{exposures} exposures", request.seed + at
             with part(f"speed {at + 1} of {len(speeds)}"):
                 capture = capture_view(live, name, None, seed=seed, exposures=exposures, arm=request.arm, out=run)
-            taken.add_capture(capture)
+            session.add_capture(capture)
             gate = gate if run is None else gate_delay(run)
     return gate
-
-
-def _fitted(taken: ViewCollection, base: RigModel | None) -> SyncFit:
-    known = (0.0, 0.0) if base is None else known_row_delay(base)
-    try:
-        return fit_sync([sweep for view in taken.views for sweep in view.passages], *known)
-    except Degenerate as refused:
-        raise Degenerate(refused.reason, f"{refused.reason}: {refused}") from refused
 
 
 def _own(live: RigConfig | None) -> LoadedCalibration | None:
@@ -158,20 +149,10 @@ def _signed(model: RigModel, gate: GateDelay | None, verdict: Verdict) -> RigMod
     identity = model.identity
     if identity is not None and not verdict.passed:
         identity = replace(identity, verdict="failed", reasons=(*identity.reasons, *verdict.codes))
-    provenance = {
-        **model.provenance,
-        "sync": {
-            "by": "rig calibrate sync",
-            "created": datetime.now(UTC).isoformat(timespec="seconds"),
-            "verdict": verdict.word,
-        },
-    }
-    return replace(
-        model,
-        gate_delay_s=model.gate_delay_s if gate is None else gate.delay_s,
-        identity=identity,
-        provenance=provenance,
-    )
+    created = datetime.now(UTC).isoformat(timespec="seconds")
+    sync = {"by": "rig calibrate sync", "created": created, "verdict": verdict.word}
+    gate_delay_s = model.gate_delay_s if gate is None else gate.delay_s
+    return replace(model, gate_delay_s=gate_delay_s, identity=identity, provenance={**model.provenance, "sync": sync})
 
 
 def _line(fit: SyncFit) -> str:

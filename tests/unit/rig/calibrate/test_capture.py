@@ -1,5 +1,6 @@
 """Poses are scanned at several speeds by turns, but for those that do not show the line."""
 
+from operator import attrgetter
 from types import SimpleNamespace
 from typing import Any
 
@@ -15,20 +16,16 @@ def taken(exposures: tuple[int, ...], least: int, poses: int, *, most: int = 99)
     scanned: list[int | None] = []
     told: list[str] = []
 
-    def scan(at: int | None) -> Any:
-        if at is not None and at > most:
+    def scan(exposures: int | None) -> Any:
+        if exposures is not None and exposures > most:
             raise PlanError("too slow")
-        scanned.append(at)
-        return SimpleNamespace(refused=None, seen=at is None or at >= least)
+        scanned.append(exposures)
+        return SimpleNamespace(refused=None, seen=exposures is None or exposures >= least)
 
-    turns = SpeedRotation(exposures, _seen, told.append)
+    turns = SpeedRotation(exposures, attrgetter("seen"), told.append)
     for pose in range(poses):
         turns.capture(pose, scan)
     return scanned, told
-
-
-def _seen(capture: Any) -> bool:
-    return bool(capture.seen)
 
 
 def test_speeds_take_turns_and_those_that_cannot_be_are_left_out() -> None:

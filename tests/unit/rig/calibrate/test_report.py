@@ -2,49 +2,28 @@
 
 import re
 from datetime import UTC, datetime
-from functools import cache
 from html import escape
 
 import numpy as np
-import pytest
 
 from calibration.board.board import Board
-from calibration.diagnosis.verdicts import JudgedRig, judge_fit
+from calibration.diagnosis.verdicts import judge_fit
 from calibration.model.rig_model import Identity
-from calibration.rig_fit.fit import RigFit, fit_rig
+from calibration.rig_fit.fit import fit_rig
 from calibration.verdict import Verdict
-from calibration.views import View
-from rig.calibrate.report import (
-    ReportSection,
-    measured,
-    page,
-    paragraph,
-    planes_report,
-    subject,
-)
-from tests.reference.boards import calibration_data as data
+from rig.calibrate.report import measured, page, paragraph, planes_report, subject
+from tests.reference.boards.calibration_data import BOARD, Seen, TrueRig, random_views
 
 
-@cache
-def _fitted() -> tuple[list[View], RigFit]:
-    rng = np.random.default_rng(1)
-    rig = data.TrueRig()
-    views = data.random_views(rng, rig, 8, data.Seen(passages=200), (35.2, -35.2))
-    return views, fit_rig(views, data.BOARD, (512, 512))
-
-
-@pytest.fixture(name="judged")
-def _judged() -> JudgedRig:
-    views, fit = _fitted()
-    return judge_fit(fit, views, stated_baseline_m=0.3)
-
-
-def test_the_report_of_planes_shows_text_first_then_the_four_pictures(judged: JudgedRig) -> None:
-    views, fit = _fitted()
-    html = planes_report(fit, views, judged, judged.uncertainty.line(), [("baseline", "300 mm")])
+def test_the_report_of_planes_shows_text_first_then_the_four_pictures() -> None:
+    views = random_views(np.random.default_rng(1), TrueRig(), 8, Seen(passages=200), (35.2, -35.2))
+    fit = fit_rig(views, BOARD, (512, 512))
+    judged = judge_fit(fit, views, stated_baseline_m=0.3)
+    report, line = planes_report(fit, views, judged), judged.uncertainty.line()
+    html = page(report, judged.verdict, line, [("baseline", "300 mm")])
     text = html[: html.index("<img")]
     assert "PASSED" in text
-    assert escape(judged.uncertainty.line()) in text
+    assert escape(line) in text
     assert "300 mm" in text
     for title in ("Coverage", "Residuals of the corners", "Residuals of the planes", "Expected depth error", "Views"):
         assert f"<h2>{title}</h2>" in html
@@ -56,21 +35,17 @@ def test_the_report_of_planes_shows_text_first_then_the_four_pictures(judged: Ju
     assert not re.search(r'(src|href)="(?!data:)', html)
 
 
-def test_a_report_says_what_it_is_of(judged: JudgedRig) -> None:
-    views, fit = _fitted()
+def test_a_report_says_what_it_is_of() -> None:
     rig = Identity("1f", "", "lab", {"spad": "spb-usb", "scanner": "helios"}, {"spad": "SN-0042"})
     board = Board("charuco", (9, 7), 0.06, 0.047, "DICT_4X4_50")
     about = subject(rig, board, {"spadrig": "1.2"}, datetime(2026, 11, 22, 9, 5, tzinfo=UTC))
-    html = planes_report(fit, views, judged, "", [], about)
-    text = html[: html.index("<h2>")]
-    for said in (
-        "lab",
-        "spad spb-usb SN-0042, scanner helios",
-        "ChArUco, 9 x 7 squares of 60 mm, markers of 47 mm, DICT_4X4_50",
-        "2026-11-22 09:05 UTC",
-        "spadrig 1.2",
-    ):
-        assert said in text
+    assert about == [
+        ("rig", "lab"),
+        ("devices", "spad spb-usb SN-0042, scanner helios"),
+        ("board", "ChArUco, 9 x 7 squares of 60 mm, markers of 47 mm, DICT_4X4_50"),
+        ("date", "2026-11-22 09:05 UTC"),
+        ("versions", "spadrig 1.2"),
+    ]
     assert subject(None, Board("chessboard", (10, 7), 0.0251), {}, datetime.now(UTC))[0] == (
         "board",
         "chessboard, 10 x 7 squares of 25.1 mm",
@@ -87,7 +62,7 @@ def test_terms_of_the_model_have_units_and_the_digits_that_are_known() -> None:
 
 
 def test_whatever_users_name_is_escaped() -> None:
-    html = page("a < b", Verdict(True), "x & y", [("<i>", "1")], [ReportSection("<b>", paragraph("<script>"))])
+    html = page(("a < b", [("<b>", paragraph("<script>"))]), Verdict(True), "x & y", [("<i>", "1")])
     assert "<script>" not in html
     assert "&lt;script&gt;" in html
     assert "<title>a &lt; b</title>" in html
