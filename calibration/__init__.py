@@ -5,23 +5,3 @@ before it. `model` and `depth_error` hold the rig and the effect of errors on de
 `board`, `pixel_map`, `passages` and `sync` turn frames into numbers; `camera_fit`, `rig_fit`, `check` and `guide` turn
 these into a model and advice on further views; `diagnosis` judges the result.
 """
-
-from calibration.errors import CalibrationError
-from calibration.files.rig_file import load_rig_model, save_rig_model
-from calibration.model.camera import Camera
-from calibration.model.rig_model import Covariance, Identity, Lag, RigModel
-from calibration.model.scanner import PivotScanner, PlaneTable, Scanner
-
-__all__ = [
-    "CalibrationError",
-    "Camera",
-    "Covariance",
-    "Identity",
-    "Lag",
-    "PivotScanner",
-    "PlaneTable",
-    "RigModel",
-    "Scanner",
-    "load_rig_model",
-    "save_rig_model",
-]

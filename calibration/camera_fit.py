@@ -11,6 +11,7 @@ the sd of the focal length. The angles between the boards only decide how a refu
 
 from collections.abc import Sequence
 from dataclasses import dataclass
+from typing import TypeVar
 
 import cv2
 import numpy as np
@@ -24,6 +25,7 @@ from calibration.model.parameters import DISTORTION, MATRIX
 from calibration.model.rig_model import Covariance
 from calibration.views import LEAST_ACROSS_PX, NO_POSE, BoardPose, Corners, View, robust_sd
 
+Kind = TypeVar("Kind")
 _POSE = 6
 """OpenCV's columns: rotation, position, then fx fy cx cy and the distortion."""
 
@@ -46,10 +48,6 @@ class Normal:
         eigen = np.linalg.eigvalsh(self.matrix / np.outer(scale, scale))
         return float(eigen[-1] / eigen[0]) if eigen[0] > 0 else float("inf")
 
-    def first(self, count: int) -> "Normal":
-        """The normal equations of the first `count` parameters alone, with the others taken as known."""
-        return Normal(self.names[:count], self.matrix[:count, :count])
-
     def covariance(self, variance_px2: float) -> Covariance:
         """The covariance if corners have this variance. Raises CalibrationError or LinAlgError if the matrix is
         singular.
@@ -57,23 +55,6 @@ class Normal:
         scale = np.sqrt(np.diag(self.matrix))
         inverse = np.linalg.inv(self.matrix / np.outer(scale, scale)) / np.outer(scale, scale)
         return Covariance(self.names, variance_px2 * (inverse + inverse.T) / 2)
-
-
-def camera_normal(
-    points_m: Sequence[Array], poses: Sequence[BoardPose], matrix: Array, distortion: Array, terms: int
-) -> Normal:
-    """The normal equations of a camera with `terms` of distortion that saw points (n, 3) of the board at each pose."""
-    total = np.zeros((4 + terms, 4 + terms))
-    given = np.zeros(max(len(distortion), 5)) if terms <= 5 else np.zeros(14 if terms > 8 else 8)
-    given[: len(distortion)] = distortion
-    for points, pose in zip(points_m, poses, strict=True):
-        _, slopes = cv2.projectPoints(points, pose.rotation, pose.position_m, matrix, given)
-        pose_part, camera_part = slopes[:, :_POSE], slopes[:, _POSE : _POSE + 4 + terms]
-        # What a change of the camera does that no change of the pose undoes (Schur complement by QR).
-        basis, _ = np.linalg.qr(pose_part)
-        rest = camera_part - basis @ (basis.T @ camera_part)
-        total += rest.T @ rest
-    return Normal((*MATRIX, *DISTORTION[:terms]), total)
 
 
 LEAST_SD_PX = 0.01
@@ -99,12 +80,12 @@ _FLAGS = {
 
 @dataclass(frozen=True, slots=True, eq=False)
 class CameraSolution:
-    """A camera, and for every view the pose and the residuals (n, 2), projected minus seen."""
+    """A camera: its matrix (3, 3) in pixels and the terms of its distortion in OpenCV's order; and for every view the
+    pose and the residuals (n, 2), projected minus seen.
+    """
 
     matrix: Array
-    """(3, 3) camera matrix, pixels."""
     distortion: Array
-    """Terms of the distortion in OpenCV's order."""
     poses: tuple[BoardPose, ...]
     residual_px: tuple[Array, ...]
 
@@ -124,17 +105,17 @@ class CameraProblem:
 
     def check(self, used: Sequence[Mask]) -> None:
         """Raise Degenerate if there is only one pose."""
-        kept = [i for i, mask in enumerate(used) if mask.any()]
-        matrix = self._guess(_GUESSED_FOCAL[0])
-        poses = [self._pose(i, matrix, np.zeros(5)) for i in range(len(used))]
-        if len(kept) > 1 and not self._one_place([poses[i] for i in kept]):
+        rough = self._rough(used)
+        shown = _of_used(rough.poses, used)
+        places = np.stack([pose.to_camera(np.array([*self.board.size_m, 0.0]) / 2) for pose in shown])
+        off = np.linalg.norm(places - places[0], axis=1).max()
+        if not (spread_rad(shown) < _PARALLEL_RAD and off < _SAME_PLACE * np.linalg.norm(places[0])):
             return
-        condition = self._normal(used, CameraSolution(matrix, np.zeros(self.terms), tuple(poses), ())).condition
         raise Degenerate(
             "one-pose",
-            f"{len(kept)} view{'s' * (len(kept) > 1)} of the board, all at one pose (condition number "
-            f"{condition_text(condition)}): a camera takes three poses or more; show the board tilted to both sides, "
-            "near and far",
+            f"{len(shown)} view{'s' * (len(shown) > 1)} of the board, all at one pose (condition number "
+            f"{condition_text(self._normal(used, rough).condition)}): a camera takes three poses or more; show the "
+            "board tilted to both sides, near and far",
         )
 
     def solve(self, used: Sequence[Mask]) -> CameraSolution:
@@ -144,15 +125,15 @@ class CameraProblem:
         px = [self.corners[i].px[used[i]].astype(np.float32) for i in kept]
         found = self._calibrated(points, px)
         if found is None:
-            matrix = self._guess(_GUESSED_FOCAL[0])
-            poses = tuple(self._pose(i, matrix, np.zeros(5)) for i in range(len(used)))
-            normal = self._normal(used, CameraSolution(matrix, np.zeros(self.terms), poses, ()))
-            raise self._refusal(used, poses, normal, "no camera fits")
+            raise self._refusal(used, self._rough(used), "no camera fits")
         matrix, distortion, of_kept = found
         at = dict(zip(kept, of_kept, strict=True))
         poses = tuple(at[i] if i in at else self._pose(i, matrix, distortion) for i in range(len(used)))
-        residual = tuple(self._residual(i, matrix, distortion, pose) for i, pose in enumerate(poses))
-        return CameraSolution(matrix, distortion, poses, residual)
+        residual = []
+        for i, pose in enumerate(poses):
+            expected, _ = cv2.projectPoints(self.points_m(i), pose.rotation, pose.position_m, matrix, distortion)
+            residual.append(np.asarray(expected.reshape(-1, 2) - self.corners[i].px, np.float64))
+        return CameraSolution(matrix, distortion, poses, tuple(residual))
 
     def judged(self, solution: CameraSolution, used: Sequence[Mask]) -> tuple[float, Normal]:
         """(variance of a corner's coordinate in px^2, normal matrix). Raises Degenerate if the corners determine no
@@ -160,25 +141,25 @@ class CameraProblem:
         """
         normal = self._normal(used, solution)
         off = np.concatenate([r[mask] for r, mask in zip(solution.residual_px, used, strict=True)])
-        free = off.size - 6 * sum(bool(mask.any()) for mask in used) - len(normal.names)
+        names = normal.names
+        free = off.size - 6 * sum(bool(mask.any()) for mask in used) - len(names)
         if free < 1 or not np.isfinite(off).all():
-            raise self._refusal(
-                used, solution.poses, normal, f"{off.size // 2} corners for {len(normal.names)} parameters"
-            )
+            raise self._refusal(used, solution, f"{off.size // 2} corners for {len(names)} parameters")
         variance = max(float(np.sum(off**2)) / free, LEAST_SD_PX**2)
         if not normal.condition < _MOST_CONDITION:
-            if normal.first(4 + min(self.terms, 5)).condition < _MOST_CONDITION:
+            fewer = 4 + min(self.terms, 5)
+            if Normal(names[:fewer], normal.matrix[:fewer, :fewer]).condition < _MOST_CONDITION:
                 raise Degenerate(
                     "too-few-poses",
                     f"{self.terms} terms of distortion are more than these views determine (condition "
                     f"number {condition_text(normal.condition)}, {condition_text(_MOST_CONDITION)} at most); take 5, "
                     "or fill the picture",
                 )
-            raise self._refusal(used, solution.poses, normal, "the focal length cannot be told from the distance")
+            raise self._refusal(used, solution, "the focal length cannot be told from the distance")
         sd = np.sqrt(np.diag(normal.covariance(variance).matrix))[:2] / np.diag(solution.matrix)[:2]
         if not sd.max() < _MOST_FOCAL_SD:
             said = f"the focal length is known to {sd.max():.1%} only ({_MOST_FOCAL_SD:.0%} at most)"
-            raise self._refusal(used, solution.poses, normal, said)
+            raise self._refusal(used, solution, said)
         return variance, normal
 
     def _calibrated(
@@ -199,7 +180,7 @@ class CameraProblem:
                 for r, t in zip(turns, shifts, strict=True)
             ]
             terms = np.ravel(distortion)[: self.terms].astype(np.float64)
-            sound = [matrix, terms, *(pose.rotation for pose in poses), *(pose.position_m for pose in poses)]
+            sound = [matrix, terms, *turns, *shifts]
             if all(np.isfinite(part).all() for part in sound) and min(matrix[0, 0], matrix[1, 1]) > 0:
                 return np.asarray(matrix, np.float64), terms, poses
         return None
@@ -213,35 +194,47 @@ class CameraProblem:
             raise Degenerate("no-board", NO_POSE) from error
         return BoardPose(np.ravel(turn), np.ravel(shift))
 
-    def _residual(self, view: int, matrix: Array, distortion: Array, pose: BoardPose) -> Array:
-        expected, _ = cv2.projectPoints(self.points_m(view), pose.rotation, pose.position_m, matrix, distortion)
-        return np.asarray(expected.reshape(-1, 2) - self.corners[view].px, np.float64)
+    def _rough(self, used: Sequence[Mask]) -> CameraSolution:
+        """A guessed camera, and the poses of all views that it sees."""
+        matrix = self._guess(_GUESSED_FOCAL[0])
+        poses = tuple(self._pose(i, matrix, np.zeros(5)) for i in range(len(used)))
+        return CameraSolution(matrix, np.zeros(self.terms), poses, ())
 
     def _normal(self, used: Sequence[Mask], solution: CameraSolution) -> Normal:
-        kept = [i for i, mask in enumerate(used) if mask.any()]
-        points = [self.points_m(i)[used[i]] for i in kept]
-        poses = [solution.poses[i] for i in kept]
-        return camera_normal(points, poses, solution.matrix, solution.distortion, self.terms)
+        """The normal equations of the camera, with as many terms of distortion as are looked for."""
+        terms, distortion = self.terms, solution.distortion
+        total = np.zeros((4 + terms, 4 + terms))
+        given = np.zeros(max(len(distortion), 5)) if terms <= 5 else np.zeros(14 if terms > 8 else 8)
+        given[: len(distortion)] = distortion
+        for i, (mask, pose) in enumerate(zip(used, solution.poses, strict=True)):
+            if mask.any():
+                points = self.points_m(i)[mask]
+                _, slopes = cv2.projectPoints(points, pose.rotation, pose.position_m, solution.matrix, given)
+                camera_part = slopes[:, _POSE : _POSE + 4 + terms]
+                # What a change of the camera does that no change of the pose undoes (Schur complement by QR).
+                basis, _ = np.linalg.qr(slopes[:, :_POSE])
+                rest = camera_part - basis @ (basis.T @ camera_part)
+                total += rest.T @ rest
+        return Normal((*MATRIX, *DISTORTION[:terms]), total)
 
     def _guess(self, focal_widths: float) -> Array:
         width, height = self.size
         focal = focal_widths * width
         return np.array([[focal, 0, (width - 1) / 2], [0, focal, (height - 1) / 2], [0, 0, 1]], np.float64)
 
-    def _one_place(self, poses: Sequence[BoardPose]) -> bool:
-        """True where all boards are parallel and at the same place."""
-        places = np.stack([pose.to_camera(np.array([*self.board.size_m, 0.0]) / 2) for pose in poses])
-        off = np.linalg.norm(places - places[0], axis=1).max()
-        return spread_rad(poses) < _PARALLEL_RAD and bool(off < _SAME_PLACE * np.linalg.norm(places[0]))
-
-    def _refusal(self, used: Sequence[Mask], poses: Sequence[BoardPose], normal: Normal, why: str) -> Degenerate:
-        shown = [pose for pose, mask in zip(poses, used, strict=True) if mask.any()]
+    def _refusal(self, used: Sequence[Mask], solution: CameraSolution, why: str) -> Degenerate:
+        shown = _of_used(solution.poses, used)
         spread = spread_rad(shown)
-        said = f"{why} (condition number {condition_text(normal.condition)}) from {len(shown)} views, turned by up to "
-        said += f"{np.degrees(spread):.1f} degrees against each other"
+        said = f"{why} (condition number {condition_text(self._normal(used, solution).condition)}) from {len(shown)} "
+        said += f"views, turned by up to {np.degrees(spread):.1f} degrees against each other"
         if spread < 3 * _PARALLEL_RAD:
             return Degenerate("coplanar", f"the boards are parallel: {said}; tilt the board by 30 degrees to all sides")
         return Degenerate("too-few-poses", f"too few poses: {said}; show the board at more poses, all over the picture")
+
+
+def _of_used(of_views: Sequence[Kind], used: Sequence[Mask]) -> tuple[Kind, ...]:
+    """Those of the views that have a corner in use."""
+    return tuple(each for each, mask in zip(of_views, used, strict=True) if mask.any())
 
 
 def rms(residual_px: Array) -> float:
@@ -287,12 +280,12 @@ class CameraFit:
     @property
     def kept(self) -> tuple[str, ...]:
         """Names of the views in the fit, even if only a part of their corners is."""
-        return tuple(name for name, mask in zip(self.views, self.used, strict=True) if mask.any())
+        return _of_used(self.views, self.used)
 
     @property
     def dropped(self) -> tuple[str, ...]:
         """Names of the views without any corner in the fit."""
-        return tuple(name for name, mask in zip(self.views, self.used, strict=True) if not mask.any())
+        return tuple(name for name in self.views if name not in self.kept)
 
     @property
     def sd(self) -> dict[str, float]:
@@ -312,18 +305,13 @@ def fit_camera(views: Sequence[View], board: Board, size: tuple[int, int], *, di
     distortion_terms: 0, 4, 5, 8, 12 or 14, as in OpenCV. Corners that do not fit are left out. Raises Degenerate with
     no-board, mirrored, one-pose, coplanar or too-few-poses; the message gives the condition number.
     """
-    seen = [(view, view.corners) for view in views if view.corners is not None]
-    seen = [
-        (view, corners)
-        for view, corners in seen
-        if len(corners.ids) >= _FEWEST_CORNERS and corners.across_px >= LEAST_ACROSS_PX
-    ]
+    every = [(view.name, view.corners) for view in views if view.corners is not None]
+    seen = [one for one in every if len(one[1].ids) >= _FEWEST_CORNERS and one[1].across_px >= LEAST_ACROSS_PX]
     if not seen:
         raise Degenerate(
             "no-board", f"none of {len(views)} views shows the board; show all of it, closer or with more light"
         )
-    names = [view.name for view, _ in seen]
-    corners = [found for _, found in seen]
+    names, corners = zip(*seen, strict=True)
     behind = np.array([_is_mirrored(found, board) for found in corners])
     if behind.all():
         raise Degenerate("mirrored", "the board is mirrored in every view; turn the print or correct the orientation")
@@ -333,10 +321,9 @@ def fit_camera(views: Sequence[View], board: Board, size: tuple[int, int], *, di
     solution = problem.solve(used)
     solution, used = _without_outliers(problem, solution, used)
     variance, normal = problem.judged(solution, used)
-    kept = [i for i, mask in enumerate(used) if mask.any()]
     return CameraFit(
         camera=Camera(size[0], size[1], solution.matrix, solution.distortion),
-        views=tuple(names),
+        views=names,
         poses=solution.poses,
         residual_px=solution.residual_px,
         used=tuple(used),
@@ -344,7 +331,7 @@ def fit_camera(views: Sequence[View], board: Board, size: tuple[int, int], *, di
         covariance=normal.covariance(variance),
         condition=normal.condition,
         outliers=tuple(n for n, mask in zip(names, used, strict=True) if (~mask).sum() > _FEW_CORNERS),
-        spread_rad=spread_rad([solution.poses[i] for i in kept]),
+        spread_rad=spread_rad(_of_used(solution.poses, used)),
     )
 
 
@@ -361,12 +348,11 @@ def _without_outliers(
         inside = [i for i in range(len(used)) if i not in dropped]
         usual = max(float(np.median(scale[inside])), LEAST_SD_PX)
         worst = max(inside, key=lambda i: scale[i])
-        again = {i for i in dropped - behind if scale[i] <= _VIEW_LIMIT * usual}
         if scale[worst] > _VIEW_LIMIT * usual and len(inside) > _FEWEST_VIEWS:
             dropped = dropped | {worst}
             new = [mask & (i != worst) for i, mask in enumerate(used)]
         else:
-            dropped = dropped - again
+            dropped = {i for i in dropped if i in behind or scale[i] > _VIEW_LIMIT * usual}
             new = [_close(residual, usual) & (i not in dropped) for i, residual in enumerate(scaled)]
         if all(np.array_equal(one, other) for one, other in zip(new, used, strict=True)):
             break

@@ -57,8 +57,8 @@ def _changed(model: RigModel, name: str, step: float) -> tuple[float, RigModel]:
         return 0.0, model
 
 
-GROUPS: Final = ("baseline", "camera", "angle", "lag")
-_SAID = {"baseline": "the baseline", "camera": "the camera", "angle": "the mirror's angle", "lag": "the lag"}
+GROUPS: Final = {"baseline": "the baseline", "camera": "the camera", "angle": "the mirror's angle", "lag": "the lag"}
+"""Groups of parameters, each with the words for it."""
 _GRID = 48
 """Pixels looked at along the longer side of a map."""
 _SEARCH_STEPS = 60
@@ -104,7 +104,7 @@ class DepthUncertainty:
         group, part = max(((name, float(np.nanmedian(m))) for name, m in self.part_m.items()), key=lambda item: item[1])
         unit, scale = ("mm", 1e3) if sd >= 1e-3 or sd == 0 else ("um", 1e6)
         whole, of_them = (digits(value * scale, 2) for value in (sd, part))
-        return f"{at}: {whole} {unit}, {of_them} of them from {_SAID[group]}"
+        return f"{at}: {whole} {unit}, {of_them} of them from {GROUPS[group]}"
 
 
 def depth_uncertainty(model: RigModel, depth_m: float, velocity_per_s: float | None = None) -> DepthUncertainty:
@@ -272,29 +272,18 @@ def _said_reach(model: RigModel, x: Array, y: Array) -> str:
 _TRUTH_GRID = 32
 
 
-@dataclass(frozen=True, slots=True, eq=False)
+@dataclass(frozen=True, slots=True)
 class DepthErrors:
-    """Errors at pixels that the true rig lights at one depth: error_m (n,) signed; sd_m (n,) predicted, or NaN."""
+    """Errors over the pixels that the true rig lights at one depth, NaN without any.
+
+    median_m, worst_m: of the absolute errors. ratio: root mean square in units of the predicted sd; 1 on average if the
+    covariance is right.
+    """
 
     depth_m: float
-    error_m: Array
-    sd_m: Array
-
-    @property
-    def median_m(self) -> float:
-        """Median of the absolute errors."""
-        return float(np.median(np.abs(self.error_m))) if self.error_m.size else np.nan
-
-    @property
-    def worst_m(self) -> float:
-        """Largest absolute error."""
-        return float(np.abs(self.error_m).max()) if self.error_m.size else np.nan
-
-    @property
-    def ratio(self) -> float:
-        """Root mean square of the errors in units of their predicted sd; 1 on average if the covariance is right."""
-        known = self.sd_m > 0
-        return float(np.sqrt(np.mean((self.error_m[known] / self.sd_m[known]) ** 2))) if known.any() else np.nan
+    median_m: float
+    worst_m: float
+    ratio: float
 
 
 def depth_errors(model: RigModel, truth: RigModel, depth_m: float, velocity_per_s: float) -> DepthErrors:
@@ -302,14 +291,17 @@ def depth_errors(model: RigModel, truth: RigModel, depth_m: float, velocity_per_
     command."""
     camera = truth.camera
     x, y = np.meshgrid(np.linspace(0, camera.width - 1, _TRUTH_GRID), np.linspace(0, camera.height - 1, _TRUTH_GRID))
-    mirror = command_at(truth, x, y, depth_m)
-    lag_s = truth.lag_s.backward if velocity_per_s < 0 else truth.lag_s.forward
-    commanded = mirror + velocity_per_s * (lag_s - truth.row_delay_s * y)
+    commanded = command_at(truth, x, y, depth_m) - truth.mirror_command(0, y, velocity_per_s)
     found = model.mirror_command(commanded, y, velocity_per_s)
     low, high = model.scanner.command_range
     lit = np.isfinite(found) & (found >= low) & (found <= high)
     x, y, found = x[lit], y[lit], found[lit]
-    z = model.sheets(found).depth(*model.camera.tangents_at(x, y))
-    sd = np.full(z.shape, np.nan) if model.covariance is None else depth_sd_m(model, x, y, found, velocity_per_s)
-    known = np.isfinite(z)
-    return DepthErrors(depth_m, z[known] - depth_m, sd[known])
+    error = model.sheets(found).depth(*model.camera.tangents_at(x, y)) - depth_m
+    sd = np.full(error.shape, np.nan) if model.covariance is None else depth_sd_m(model, x, y, found, velocity_per_s)
+    off, known = np.abs(error[np.isfinite(error)]), np.isfinite(error) & (sd > 0)
+    return DepthErrors(
+        depth_m,
+        median_m=float(np.median(off)) if off.size else np.nan,
+        worst_m=float(off.max()) if off.size else np.nan,
+        ratio=float(np.sqrt(np.mean((error[known] / sd[known]) ** 2))) if known.any() else np.nan,
+    )

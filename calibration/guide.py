@@ -21,7 +21,7 @@ from numpy.typing import NDArray
 from calibration.arrays import Array
 from calibration.board.board import Board
 from calibration.depth_error import command_at, depth_jacobian
-from calibration.errors import CalibrationError, Degenerate, mm
+from calibration.errors import Degenerate, mm
 from calibration.model.camera import Camera
 from calibration.model.rig_model import RigModel
 from calibration.rig_fit.fit import RigFit
@@ -103,16 +103,13 @@ class Advice:
 
 def candidates(camera: Camera, board: Board, depth_range_m: tuple[float, float]) -> tuple[Candidate, ...]:
     """All poses of the grid that show the whole board with readable markers, within the range of depth."""
-    found = []
     readable_m = np.inf
     if board.marker_m is not None:
         module_m = board.marker_m / (board.charuco().getDictionary().markerSize + 2)
         readable_m = camera.matrix[0, 0] * module_m * math.cos(TILT_RAD) / LEAST_MODULE_PX
-    for fill, place, tilt in product(FILLS, PLACES, TILTS):
-        candidate = _candidate(camera, board, fill, place, tilt)
-        if candidate is not None and depth_range_m[0] <= candidate.distance_m <= min(depth_range_m[1], readable_m):
-            found.append(candidate)
-    return tuple(found)
+    nearest_m, farthest_m = depth_range_m[0], min(depth_range_m[1], readable_m)
+    found = (_candidate(camera, board, *choice) for choice in product(FILLS, PLACES, TILTS))
+    return tuple(one for one in found if one is not None and nearest_m <= one.distance_m <= farthest_m)
 
 
 def next_pose(choices: Sequence[Candidate], at_m: float, now_m: float, forecast: ExpectedError) -> Advice:
@@ -138,7 +135,7 @@ def sequence(choices: Sequence[Candidate], poses: int, seed: int = 0) -> tuple[C
         away = np.sum((traits - traits[chosen[-1]]) ** 2, axis=1)
         nearest = np.minimum(nearest, away)
         if nearest.max() == 0:  # all were shown: from the beginning
-            nearest = np.sum((traits - traits[chosen[-1]]) ** 2, axis=1)
+            nearest = away
         chosen.append(int(np.argmax(nearest)))
     return tuple(choices[order[i]] for i in chosen[:poses])
 
@@ -197,9 +194,7 @@ class Forecast:
         """Prepare forecasts from a fit, for the depth error at `at_m`."""
         self._fit = fit
         self._terms = Terms(fit.model.camera.distortion.size)
-        self._tie = np.zeros((len(self._terms.names), len(fit.free)))
-        for column, group in enumerate(fit.free):
-            self._tie[self._terms.at(group), column] = 1.0
+        self._tie = self._terms.tied(fit.free)
         self._jacobian = _depth_by_free(fit, at_m)
         sweeps = fit.every_sweep
         self._velocities = _next_velocities(fit)
@@ -267,7 +262,7 @@ def _next_velocities(fit: RigFit) -> tuple[float, ...]:
     """The velocities of the next pose, which take turns: those whose turn is the longest ago."""
     shown = [tuple(sweep.direction * sweep.speed_per_s for sweep in view) for view in fit.sweeps if view]
     last = {velocities: turn for turn, velocities in enumerate(shown)}
-    return min(last, key=lambda velocities: last[velocities])
+    return min(last, key=last.__getitem__)
 
 
 def _inside(model: RigModel, points: Array) -> tuple[Array, Array, NDArray[np.bool_]]:
@@ -282,8 +277,7 @@ def _inside(model: RigModel, points: Array) -> tuple[Array, Array, NDArray[np.bo
 def _depth_by_free(fit: RigFit, at_m: float) -> Array:
     """(points, free parameters): how the depth at places all over the picture changes with what was fitted."""
     model = fit.model
-    if model.covariance is None:
-        raise CalibrationError("the fit has no covariance; fit the rig again")
+    assert model.covariance is not None, "a fit has one"
     names = model.covariance.names
     across, down = ((np.arange(n) + 0.5) / n for n in _CELLS)
     x, y = np.meshgrid(across * model.camera.width - 0.5, down * model.camera.height - 0.5)

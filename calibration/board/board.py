@@ -142,8 +142,7 @@ class Board:
         """The board with its white margin as a picture for printing, 0 for black and 255 for white."""
         side = 1 + 2 * MARGIN_SQUARES / np.array(self.squares)
         width, height = (np.round(side * self.squares * px_per_square)).astype(int)
-        x = ((np.arange(width) + 0.5) / px_per_square - MARGIN_SQUARES) * self.square_m
-        y = ((np.arange(height) + 0.5) / px_per_square - MARGIN_SQUARES) * self.square_m
+        x, y = (((np.arange(n) + 0.5) / px_per_square - MARGIN_SQUARES) * self.square_m for n in (width, height))
         return np.where(self.albedo_at(x, y[:, None]) > BLACK, np.uint8(255), np.uint8(0))
 
     def charuco(self) -> cv2.aruco.CharucoBoard:
@@ -164,8 +163,7 @@ class Board:
         i, j = (np.floor(((at - 0.5) / share + 0.5) * side).astype(np.int64) for at in (along, below))
         in_marker = ~black & (i >= 0) & (i < side) & (j >= 0) & (j < side)
         i, j = np.clip(i, 0, side - 1), np.clip(j, 0, side - 1)
-        printed: NDArray[np.bool_] = black | (in_marker & self.modules[row, column, j, i])
-        return printed
+        return np.asarray(black | (in_marker & self.modules[row, column, j, i]))
 
     def _drawn_modules(self) -> NDArray[np.bool_]:
         """The markers, one in every white square, row by row."""

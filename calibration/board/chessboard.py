@@ -16,7 +16,7 @@ from dataclasses import dataclass, replace
 
 import cv2
 import numpy as np
-from numpy.typing import NDArray
+from numpy.typing import ArrayLike, NDArray
 
 from calibration.arrays import Array
 from calibration.board.board import Board
@@ -50,7 +50,7 @@ class Lattice:
     """
 
     px: Array
-    beyond: tuple[float, float, float, float]
+    beyond: tuple[float, ...]
 
     @property
     def grid(self) -> tuple[int, int]:
@@ -81,19 +81,19 @@ def known_lattice(picture: Picture, px: Array) -> Lattice | None:
     seen = _seen(picture, grown)
     if seen is None or seen.alike < _LEAST_ALIKE:
         return None
-    upper, right, lower, left = (_seen_beyond(picture, np.rot90(grown, turn)) for turn in range(4))
-    return Lattice(grown, (upper, right, lower, left))
+    return Lattice(grown, tuple(_seen_beyond(picture, np.rot90(grown, turn)) for turn in range(4)))
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class _Seen:
     """Light around the corners of a grid.
 
-    usual: usual change across a line, positive if the top left square is black. alike: share of the corners that have
-    such a change. own: change on the outer side of the uppermost row, as a share of the usual one; NaN where it is not
-    visible.
+    map: to pixels from squares, counted from the outer corner of the grid's top left one. usual: usual change across a
+    line, positive if the top left square is black. alike: share of the corners that have such a change. own: change on
+    the outer side of the uppermost row, as a share of the usual one; NaN where it is not visible.
     """
 
+    map: BoardMap
     usual: float
     alike: float
     own: float
@@ -139,16 +139,16 @@ def _seen(picture: Picture, px: Array) -> _Seen | None:
     if usual == 0:
         return None
     alike = float(np.mean(both[np.isfinite(both)] / usual > _THERE))
-    return _Seen(usual, alike, _median(above[0] / usual))
+    return _Seen(board_map, usual, alike, _median(above[0] / usual))
 
 
 def _seen_beyond(picture: Picture, px: Array) -> float:
     """The change in the row of squares above the grid's uppermost, as a share of the usual; NaN where not seen."""
-    board_map, seen = _map(px), _seen(picture, px)
-    if board_map is None or seen is None:
+    seen = _seen(picture, px)
+    if seen is None:
         return np.nan
     x = np.arange(1, px.shape[1] + 1)
-    change = _change(picture, board_map, x, np.zeros_like(x), 1)
+    change = _change(picture, seen.map, x, np.zeros_like(x), 1)
     return _median(np.where(x % 2 == 0, 1.0, -1.0) * change / seen.usual)
 
 
@@ -159,21 +159,21 @@ def _change(picture: Picture, board_map: BoardMap, x: NDArray[np.integer], y: ND
     px = board_map.to_px(at).astype(np.float32).reshape(-1, 2)
     height, width = picture.shape
     inside = ((px >= 0) & (px <= np.array([width - 1, height - 1]))).all(axis=1)
-    light = cv2.remap(picture, np.where(inside, px.T, 0)[0], np.where(inside, px.T, 0)[1], cv2.INTER_LINEAR).ravel()
+    at_x, at_y = np.where(inside, px.T, 0)
+    light = cv2.remap(picture, at_x, at_y, cv2.INTER_LINEAR).ravel()
     light = np.where(inside, light, np.nan).reshape(*at.shape[:-1])
     half = len(_OFFSETS)
-    change: Array = light[..., half:].mean(axis=(-1, -2)) - light[..., :half].mean(axis=(-1, -2))
-    return change
+    return np.asarray(light[..., half:].mean(axis=(-1, -2)) - light[..., :half].mean(axis=(-1, -2)))
 
 
 def _row_above(picture: Picture, px: Array) -> Array | None:
     """(across, 2) corners above the uppermost row; None if most of them are not found."""
-    board_map, seen = _map(px), _seen(picture, px)
-    if board_map is None or seen is None:
+    seen = _seen(picture, px)
+    if seen is None:
         return None
     down, across = px.shape[:2]
     x = np.arange(1, across + 1)
-    expected = board_map.to_px(np.stack([x, np.zeros_like(x)], axis=-1))
+    expected = seen.map.to_px(np.stack([x, np.zeros_like(x)], axis=-1))
     taller = _map(np.concatenate([expected[None], px]))
     if taller is None:
         return None
@@ -223,7 +223,7 @@ def find_chessboard(shown: Gray, board: Board) -> MatchedPoints:
         lattice = _lattice(shown, _grid(shown, board, form))
         if lattice is not None and _is_whole(lattice, board):
             return _found(lattice, shown, board, form)
-        seen = _larger(seen, lattice)
+        seen = max(seen, lattice, key=lambda one: 0 if one is None else one.px.size)
         if seen is not None and math.prod(seen.least) > len(board.corners_m):
             break
     if seen is not None:
@@ -239,32 +239,26 @@ def _lattice(shown: Gray, px: Array | None) -> Lattice | None:
     return None if px is None else known_lattice(shown.astype(np.float32), px)
 
 
-def _larger(one: Lattice | None, other: Lattice | None) -> Lattice | None:
-    return max((one, other), key=lambda lattice: 0 if lattice is None else lattice.px.size)
+def _as_grid(corners: ArrayLike, shape: tuple[int, ...], scale: int) -> Array:
+    """Corners in an enlarged picture as a grid (down, across, 2) in pixels of the picture itself."""
+    return (np.asarray(corners, np.float64).reshape(*shape, 2) + 0.5) / scale - 0.5
 
 
 def _grid(shown: Gray, board: Board, form: tuple[int, float]) -> Array | None:
-    """A grid with as many corners as the board, (down, across, 2) in pixels of the picture."""
-    px = _whole_chessboard(as_form(shown, *form), board.grid)
-    return None if px is None else (px + 0.5) / form[0] - 0.5
+    """A grid with as many corners as the board."""
+    flags = cv2.CALIB_CB_ADAPTIVE_THRESH | cv2.CALIB_CB_NORMALIZE_IMAGE | cv2.CALIB_CB_FAST_CHECK
+    picture = as_form(shown, *form)
+    found, corners = cv2.findChessboardCorners(picture, board.grid, flags=flags)
+    if not found:
+        found, corners = cv2.findChessboardCornersSB(picture, board.grid, flags=cv2.CALIB_CB_NORMALIZE_IMAGE)
+    return _as_grid(corners, board.grid[::-1], form[0]) if found else None
 
 
 def _part(shown: Gray, form: tuple[int, float], smallest: tuple[int, int]) -> Array | None:
     """A grid of any number of corners."""
     flags = cv2.CALIB_CB_LARGER | cv2.CALIB_CB_EXHAUSTIVE
     found, corners, meta = cv2.findChessboardCornersSBWithMeta(as_form(shown, *form), smallest, flags)
-    if not found:
-        return None
-    return (np.asarray(corners, np.float64).reshape(*meta.shape[:2], 2) + 0.5) / form[0] - 0.5
-
-
-def _whole_chessboard(form: Gray, grid: tuple[int, int]) -> Array | None:
-    """(down, across, 2) inner corners in pixels of the form, or None."""
-    flags = cv2.CALIB_CB_ADAPTIVE_THRESH | cv2.CALIB_CB_NORMALIZE_IMAGE | cv2.CALIB_CB_FAST_CHECK
-    found, corners = cv2.findChessboardCorners(form, grid, flags=flags)
-    if not found:
-        found, corners = cv2.findChessboardCornersSB(form, grid, flags=cv2.CALIB_CB_NORMALIZE_IMAGE)
-    return np.asarray(corners, np.float64).reshape(grid[1], grid[0], 2) if found else None
+    return _as_grid(corners, meta.shape[:2], form[0]) if found else None
 
 
 def _found(lattice: Lattice, shown: Gray, board: Board, form: tuple[int, float]) -> MatchedPoints:
@@ -286,21 +280,17 @@ def _is_whole(lattice: Lattice, board: Board) -> bool:
     return sorted(lattice.least) == sorted(lattice.grid) == sorted(board.grid)
 
 
-def _may_be(lattice: Lattice, board: Board) -> bool:
-    """Whether the board, either way round, has as many corners as are seen, or more where they may go on."""
-    return any(
+def _unlike(lattice: Lattice, board: Board) -> MatchedPoints:
+    """A part of the board, or another one."""
+    count = lattice.px.size // 2
+    may_be = any(  # either way round it has as many corners as are seen, or more where they may go on
         all(
             seen == has if known else seen <= has
             for seen, known, has in zip(lattice.least, lattice.known, grid, strict=True)
         )
         for grid in (board.grid, board.grid[::-1])
     )
-
-
-def _unlike(lattice: Lattice, board: Board) -> MatchedPoints:
-    """A part of the board, or another one."""
-    count = lattice.px.size // 2
-    if _may_be(lattice, board):
+    if may_be:
         return replace(_NOTHING, count=count, part=lattice.grid)
     size, looked_for = (f"{max(grid)} x {min(grid)}" for grid in (lattice.grid, board.grid))
     more = "" if all(lattice.known) else " or more"
@@ -316,8 +306,8 @@ def _from_top_left(px: Array, shown: Gray, board: Board) -> tuple[Array, bool]:
     half a turn where the top left square would be white. With both sides even, or both odd, a half turn changes no
     colour: then x runs to the right. With the same even number along both sides a quarter turn does.
     """
-    along, below = px[:, -1] - px[:, 0], px[-1] - px[0]
-    if np.mean(along, axis=0)[0] * np.mean(below, axis=0)[1] < np.mean(along, axis=0)[1] * np.mean(below, axis=0)[0]:
+    (along_x, along_y), (below_x, below_y) = np.mean(px[:, -1] - px[:, 0], axis=0), np.mean(px[-1] - px[0], axis=0)
+    if along_x * below_y < along_y * below_x:
         px = px[::-1]
     across, down = board.squares
     if (across + down) % 2:
@@ -347,5 +337,4 @@ def _outline(px: Array, board: Board) -> NDArray[np.int32]:
     homography, _ = cv2.findHomography(board.corners_m[:, :2], px)
     width, height = board.size_m
     ends = np.array([[[0, 0], [width, 0], [width, height], [0, height]]], np.float64)
-    seen = np.asarray(cv2.perspectiveTransform(ends, homography), np.float64)
-    return np.asarray(np.round(seen[0]), np.int32)
+    return np.asarray(np.round(cv2.perspectiveTransform(ends, homography)[0]), np.int32)

@@ -70,9 +70,14 @@ def find_corners(picture: NDArray[np.generic], board: Board, defects: NDArray[np
     sighting = find_chessboard(shown, board) if board.kind == "chessboard" else find_markers(shown, board)
     wrong = sighting.other if sighting.markers is None else contradiction(sighting.markers, board, shown)
     if wrong is not None:
-        raise _wrong(wrong)
-    board_map = _map_of(sighting, board)
-    if sighting.chessboards > 1 or (board_map is not None and _another(sighting, board)):
+        raise Degenerate(
+            "wrong-board",
+            f"the picture shows another board than the one looked for: {wrong}; name the board that is shown "
+            "(--board), or print that one",
+        )
+    limit_px = _MAP_OUTLIER_SQUARES * sighting.square_px(board) if len(sighting.px) else 0.0
+    found = fit_map(sighting.points_m, sighting.px, limit_px, board.size_m)
+    if sighting.chessboards > 1 or (found is not None and _another(sighting, ~found[1], limit_px, board)):
         raise Degenerate(
             "two-boards",
             f"the picture shows two boards alike ({len(sighting.points_m)} corners of squares or markers, more than "
@@ -84,32 +89,20 @@ def find_corners(picture: NDArray[np.generic], board: Board, defects: NDArray[np
             "the board is mirrored: it is found only in the picture's mirror image; turn the print over, take the "
             "mirror out of the path, or correct the sensor's orientation in the config",
         )
-    if board_map is None:
+    if found is None:
         raise _not_found(sighting, board)
-    ids, px, sd = _refined(values, board, board_map, sighting)
+    ids, px, sd = _refined(values, board, found[0], sighting)
     if len(ids) <= LEAST_SHARE * len(board.corners_m):
-        raise _too_few(len(ids), board, board_map, values.shape)
+        raise _too_few(len(ids), board, found[0], values.shape)
     order = np.argsort(ids)
     return Corners(ids[order], px[order], sd[order])
 
 
-def _map_of(sighting: MatchedPoints, board: Board) -> BoardMap | None:
-    if len(sighting.points_m) < 4:
-        return None
-    found = fit_map(sighting.points_m, sighting.px, _MAP_OUTLIER_SQUARES * sighting.square_px(board), board.size_m)
-    return None if found is None else found[0]
-
-
-def _another(sighting: MatchedPoints, board: Board) -> bool:
-    """True where points off the best board lie on a second one."""
-    limit = _MAP_OUTLIER_SQUARES * sighting.square_px(board)
-    found = fit_map(sighting.points_m, sighting.px, limit, board.size_m)
-    if found is None:
-        return False
-    rest = ~found[1]
+def _another(sighting: MatchedPoints, rest: NDArray[np.bool_], limit_px: float, board: Board) -> bool:
+    """True where points off the best board, `rest`, lie on a second one."""
     if rest.sum() < 4 * _SECOND_BOARD_MARKERS:
         return False
-    second = fit_map(sighting.points_m[rest], sighting.px[rest], limit, board.size_m)
+    second = fit_map(sighting.points_m[rest], sighting.px[rest], limit_px, board.size_m)
     return second is not None and int(second[1].sum()) >= 4 * _SECOND_BOARD_MARKERS
 
 
@@ -148,17 +141,9 @@ def _close_to(known_m: Array, board: Board) -> NDArray[np.int32]:
     return np.flatnonzero(away <= _GROWTH_SQUARES * board.square_m).astype(np.int32)
 
 
-def _wrong(how: str) -> Degenerate:
-    return Degenerate(
-        "wrong-board",
-        f"the picture shows another board than the one looked for: {how}; name the board that is shown (--board), or "
-        "print that one",
-    )
-
-
 def _not_found(sighting: MatchedPoints, board: Board) -> Degenerate:
-    whole = len(board.charuco().getIds()) if board.kind == "charuco" else len(board.corners_m)
-    what = "markers" if board.kind == "charuco" else "corners"
+    markers = board.kind == "charuco"
+    whole, what = (len(board.charuco().getIds()), "markers") if markers else (len(board.corners_m), "corners")
     if sighting.part is not None:
         seen, all_of_them = (f"{max(grid)} x {min(grid)}" for grid in (sighting.part, board.grid))
         return Degenerate(

@@ -131,12 +131,8 @@ def _projected(homography: Array, at: Array) -> Array:
     return seen[..., :2] / seen[..., 2:]
 
 
-def _powers(degree: int) -> list[tuple[int, int]]:
-    return [(i, j) for i in range(degree + 1) for j in range(degree + 1 - i)]
-
-
 def _terms(at: Array, degree: int) -> Array:
     across = np.polynomial.polynomial.polyvander(at[..., 0], degree)
     down = np.polynomial.polynomial.polyvander(at[..., 1], degree)
-    i, j = np.array(_powers(degree)).T
+    i, j = np.array([(i, j) for i in range(degree + 1) for j in range(degree + 1 - i)]).T
     return across[..., i] * down[..., j]

@@ -54,16 +54,6 @@ _DRAWING_SD_PX = 0.003
 
 
 @dataclass(frozen=True, slots=True, eq=False)
-class _Patch:
-    """The drawing around a corner, on the pixels x0.. and y0.. of the picture. slopes: its change per pixel of
-    shift."""
-
-    drawn: Array
-    along_x: Array
-    along_y: Array
-
-
-@dataclass(frozen=True, slots=True, eq=False)
 class _Place:
     """A corner's surroundings: its pixel, the side of a square, the half width of its patch, and (4, 4, 2) powers that
     map the picture to the drawing.
@@ -98,8 +88,7 @@ def sides_px(board: Board, board_map: BoardMap, corners_m: Array) -> Array:
     """(n,) side of a square around positions (n, 2), in pixels; the shorter one if they differ."""
     step = board.square_m / 2
     ends = board_map.to_px(corners_m[:, None] + np.array([[-step, 0], [step, 0], [0, -step], [0, step]]))
-    sides: Array = np.linalg.norm(ends[:, 1::2] - ends[:, ::2], axis=-1).min(axis=1)
-    return sides
+    return np.asarray(np.linalg.norm(ends[:, 1::2] - ends[:, ::2], axis=-1).min(axis=1))
 
 
 def _places(drawing: Drawing, board_map: BoardMap, ids: NDArray[np.int32], reach_squares: float) -> list[_Place]:
@@ -152,7 +141,7 @@ def _register_one(
         if min(x1 - x0, y1 - y0) < _LEAST_REACH_PX:
             return None
         patch = _draw(drawing, place, to_drawing, at - expected, (x0, y0, x1, y1))
-        solved = _shift(picture[y0:y1, x0:x1].astype(np.float64), patch)
+        solved = _shift(picture[y0:y1, x0:x1].astype(np.float64), *patch)
         if solved is None:
             return None
         at, sd = at + solved[:2], solved[2]
@@ -163,8 +152,12 @@ def _register_one(
     return None if sd > _MOST_SD_PX else (float(at[0]), float(at[1]), float(np.hypot(sd, _DRAWING_SD_PX)))
 
 
-def _draw(drawing: Drawing, place: _Place, to_drawing: Array, shift: Array, box: tuple[int, int, int, int]) -> _Patch:
-    """The drawing on pixels x0:x1, y0:y1 with everything moved by `shift`, averaged over each pixel's area."""
+def _draw(
+    drawing: Drawing, place: _Place, to_drawing: Array, shift: Array, box: tuple[int, int, int, int]
+) -> tuple[Array, Array, Array]:
+    """The drawing on pixels x0:x1, y0:y1 with everything moved by `shift`, averaged over each pixel's area; and its
+    changes per pixel of shift along x and y.
+    """
     x0, y0, x1, y1 = box
     n = SUBPIXELS
     half = n // 2
@@ -180,11 +173,8 @@ def _draw(drawing: Drawing, place: _Place, to_drawing: Array, shift: Array, box:
         cut = fine[down : down + (y1 - y0) * n, right : right + (x1 - x0) * n]
         return np.asarray(cv2.resize(cut, (x1 - x0, y1 - y0), interpolation=cv2.INTER_AREA), np.float64)
 
-    return _Patch(
-        drawn=averaged(half, half),
-        along_x=averaged(2 * half, half) - averaged(0, half),
-        along_y=averaged(half, 2 * half) - averaged(half, 0),
-    )
+    along_x, along_y = averaged(2 * half, half) - averaged(0, half), averaged(half, 2 * half) - averaged(half, 0)
+    return averaged(half, half), along_x, along_y
 
 
 def _best_whole_shift(
@@ -196,21 +186,20 @@ def _best_whole_shift(
     reach = min(place.reach, x, y, width - 1 - x, height - 1 - y)
     if reach < _LEAST_REACH_PX:
         return None
-    patch = _draw(drawing, place, to_drawing, np.zeros(2), (x - reach, y - reach, x + reach + 1, y + reach + 1))
+    drawn, _, _ = _draw(drawing, place, to_drawing, np.zeros(2), (x - reach, y - reach, x + reach + 1, y + reach + 1))
     left, top = max(x - reach - search, 0), max(y - reach - search, 0)
     region = picture[top : y + reach + search + 1, left : x + reach + search + 1]
-    match = cv2.matchTemplate(region, patch.drawn.astype(np.float32), cv2.TM_CCOEFF_NORMED)
+    match = cv2.matchTemplate(region, drawn.astype(np.float32), cv2.TM_CCOEFF_NORMED)
     _, best, _, found = cv2.minMaxLoc(match)
     if best < _LEAST_MATCH:
         return None
     return np.array([left + found[0] - (x - reach), top + found[1] - (y - reach)], np.float64)
 
 
-def _shift(seen: Array, patch: _Patch) -> tuple[float, float, float] | None:
+def _shift(seen: Array, drawn: Array, along_x: Array, along_y: Array) -> tuple[float, float, float] | None:
     """(dx, dy, sd) that brings the drawing onto what is seen; None if the drawing is not there."""
     rows, columns = seen.shape
     x, y = np.linspace(-1, 1, columns), np.linspace(-1, 1, rows)[:, None]
-    drawn = patch.drawn
     light = np.stack([np.ones_like(drawn), drawn, drawn * x, drawn * y], axis=-1).reshape(-1, 4)
     values = seen.ravel()
     try:
@@ -220,7 +209,7 @@ def _shift(seen: Array, patch: _Patch) -> tuple[float, float, float] | None:
     gain = level[1]
     if not gain > 0:
         return None
-    terms = np.concatenate([light, -gain * patch.along_x.reshape(-1, 1), -gain * patch.along_y.reshape(-1, 1)], axis=1)
+    terms = np.concatenate([light, -gain * along_x.reshape(-1, 1), -gain * along_y.reshape(-1, 1)], axis=1)
     weights = 1 / np.maximum(light @ level, _DARK_SHARE * gain)
     for _ in range(2):
         weighted = terms * weights[:, None]

@@ -160,7 +160,8 @@ class LensModel:
                 good &= at.sound & (at.determinant > 0)
         return good
 
-    def _newton(self, u: Array, v: Array, target_u: Array, target_v: Array, steps: int) -> tuple[Array, Array]:
+    def newton(self, u: Array, v: Array, target_u: Array, target_v: Array, steps: int) -> tuple[Array, Array]:
+        """Tangents that `forward` puts on the targets, by this many steps of Newton's method or fewer."""
         for _ in range(steps):
             at = self.forward(u, v)
             miss_u, miss_v = at.u - target_u, at.v - target_v
@@ -173,7 +174,7 @@ class LensModel:
         return u, v
 
     def _solve(self, u: Array, v: Array, target_u: Array, target_v: Array) -> tuple[Array, Array, NDArray[np.bool_]]:
-        u, v = self._newton(u, v, target_u, target_v, steps=10)
+        u, v = self.newton(u, v, target_u, target_v, steps=10)
         at = self.forward(u, v)
         miss = np.abs(at.u - target_u) + np.abs(at.v - target_v)
         limit = _RESIDUAL_LIMIT * np.maximum(1, np.abs(target_u) + np.abs(target_v))

@@ -151,7 +151,8 @@ def lag_groups(velocities_per_s: ArrayLike) -> tuple[tuple[str, ...], ...]:
     """The lags that sweeps determine, in groups with one value each. Both are in one group if they cannot be separated;
     there is no group if neither can be determined.
     """
-    up, down = _speeds(velocities_per_s)
+    velocity = np.asarray(velocities_per_s, np.float64)
+    up, down = velocity[velocity > 0], -velocity[velocity < 0]
     several = _several(up) or _several(down)
     if several and up.size and down.size:
         return ((FORWARD,), (BACKWARD,))
@@ -188,12 +189,6 @@ def speed_range(speeds_per_s: ArrayLike) -> tuple[float, float]:
     """The range of speeds for which a lag measured at these speeds holds."""
     speeds = np.asarray(speeds_per_s, np.float64)
     return float(speeds.min() * (1 - SPEED_MARGIN)), float(speeds.max() * (1 + SPEED_MARGIN))
-
-
-def _speeds(velocities_per_s: ArrayLike) -> tuple[Array, Array]:
-    """(up, down)."""
-    velocity = np.asarray(velocities_per_s, np.float64)
-    return velocity[velocity > 0], -velocity[velocity < 0]
 
 
 def _several(speeds: Array) -> bool:

@@ -127,8 +127,7 @@ class RigModel:
         for what, pixels in (("defect", self.defects), ("dark rate", self.dark_rate_per_s)):
             if pixels is not None and pixels.shape != size:
                 raise CalibrationError(f"{what} map is {_size(pixels.shape)} pixels, the camera {_size(size)}")
-        low, high = self.scanner.command_range
-        commands = getattr(self.scanner, "command", np.linspace(low, high, 33))
+        commands = self._commands()
         planes = self.scanner.planes(commands)
         flat = np.abs(planes[:, 0]) <= np.abs(planes[:, 1])
         if np.any(flat):
@@ -138,6 +137,10 @@ class RigModel:
                 f"light plane at command {commands[at]:g} lies {angle:.1f} degrees from the search axis (image row); "
                 "it must be more than 45: turn the line, or mount the sensor sideways"
             )
+
+    def _commands(self) -> Array:
+        """Commands over the whole range: those of a table, or a few."""
+        return np.asarray(getattr(self.scanner, "command", np.linspace(*self.scanner.command_range, 33)))
 
     def planes(self, commands: ArrayLike) -> Array:
         """Light planes (..., 4) = nx, ny, nz, d (metres) for mirror commands (...)."""
@@ -180,7 +183,7 @@ class RigModel:
     def fingerprint(self) -> str:
         """Sixteen hexadecimal digits that change with any number on which the depth depends."""
         low, high = self.scanner.command_range
-        commands = getattr(self.scanner, "command", np.linspace(low, high, 33))
+        commands = self._commands()
         digest = hashlib.sha256()
         parts: tuple[ArrayLike, ...] = (
             [self.camera.width, self.camera.height],

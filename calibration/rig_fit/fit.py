@@ -17,7 +17,7 @@ from calibration.board.board import Board
 from calibration.camera_fit import fit_camera, rms
 from calibration.errors import CalibrationError, Degenerate, digits
 from calibration.model.camera import Camera
-from calibration.model.parameters import SWEPT, lag_groups, speed_range
+from calibration.model.parameters import AXIS, SWEPT, lag_groups, speed_range
 from calibration.model.rig_model import Covariance, Lag, RigModel
 from calibration.model.scanner import PivotScanner
 from calibration.rig_fit.misfit import (
@@ -30,11 +30,10 @@ from calibration.rig_fit.misfit import (
     odd_view,
     tried,
     widening,
-    with_free,
     with_passages,
 )
 from calibration.rig_fit.noise import Noise, passage_noise, restated
-from calibration.rig_fit.rows import ANGLE_TERMS, LENS_TERMS, OFFSET_TERMS, Terms, mirror_command, sheet_rows
+from calibration.rig_fit.rows import ANGLE_TERMS, LENS_TERMS, OFFSET_TERMS, Terms, mirror_command
 from calibration.rig_fit.solve import RigProblem, RigSolution, all_rows, camera_prior, solved
 from calibration.rig_fit.start import (
     board_points,
@@ -71,7 +70,7 @@ class Rounds:
     state: RigState
     noise: Noise
     free: list[tuple[str, ...]] = field(init=False)
-    solution: RigSolution | None = None
+    solution: RigSolution = field(init=False)
     decisions: tuple[TermDecision, ...] = ()
     kept: tuple[TermDecision, ...] = ()
 
@@ -85,7 +84,9 @@ class Rounds:
         for _ in range(MOST_ROUNDS):
             self.solution = solved(self.problem, self.state, self.noise, roughly=idle == 0)
             self.state = self.solution.state
-            before, self.noise = self.noise, self._noise()
+            residuals = [rows.residual for _, rows in self.solution.rows]
+            corner_sd_px = corner_noise(self.problem, self.solution, self.noise)
+            before, self.noise = self.noise, Noise(corner_sd_px, *passage_noise(residuals, self.problem.sightings))
             there = self.solution.converged and idle > 0
             last = idle + 1 == MOST_IDLE_ROUNDS
             if self._with_new_term() or ((there or last) and self._without_negative_lag()) or self._without_odd_view():
@@ -95,13 +96,7 @@ class Rounds:
             if last or (there and _settled(before, self.noise)):
                 return
 
-    def _noise(self) -> Noise:
-        assert self.solution is not None
-        factor, jitter, reach = passage_noise([rows.residual for _, rows in self.solution.rows], self.problem.sightings)
-        return Noise(corner_noise(self.problem, self.solution, self.noise), factor, jitter, reach)
-
     def _without_odd_view(self) -> bool:
-        assert self.solution is not None
         if np.count_nonzero(~self.problem.counted) + 1 > MOST_ODD_SHARE * np.count_nonzero(with_passages(self.problem)):
             return False
         odd = odd_view(self.problem, self.solution, misfit(self.problem, self.solution))
@@ -111,12 +106,11 @@ class Rounds:
         counted[odd] = False
         # What it made the fit take in is decided again without it.
         self.free, self.kept = list(self.base), ()
-        self.problem = replace(with_free(self.problem, self.free), counted=counted)
+        self.problem = replace(self.problem, tie=self.problem.terms.tied(self.free), counted=counted)
         self.state = with_terms_of(self.state, self.base)
         return True
 
     def _without_negative_lag(self) -> bool:
-        assert self.solution is not None
         spread = np.sqrt(np.diag(self.solution.covariance(self.problem.tie)))
         for group in self.free:
             at = self.problem.terms.at(group)[0] - len(self.problem.terms.names)
@@ -133,13 +127,12 @@ class Rounds:
             timing[[self.problem.terms.at([name])[0] - len(self.problem.terms.names) for name in group]] = 0.0
             self.state = replace(self.state, timing=timing)
             self.free.remove(group)
-            self.problem = with_free(self.problem, self.free)
+            self.problem = replace(self.problem, tie=self.problem.terms.tied(self.free))
             self.kept += (TermDecision("/".join(group), False, value, sd, "not below 0 for any mirror: held at 0"),)
             return True
         return False
 
     def _with_new_term(self) -> bool:
-        assert self.solution is not None
         timed = any(group[0].startswith("lag") for group in self.free)
         tries = candidates(self.free, row_delay=timed)
         left_over = misfit(self.problem, self.solution).without
@@ -148,26 +141,21 @@ class Rounds:
         if chosen is None:
             return False
         self.free += [(name,) for name in tries[chosen]]
-        self.problem = with_free(self.problem, self.free)
+        self.problem = replace(self.problem, tie=self.problem.terms.tied(self.free))
         self.kept += (self.decisions[chosen],)
         return True
 
 
 def _settled(before: Noise, after: Noise) -> bool:
-    def near(a: float, b: float) -> bool:
-        return abs(a - b) <= SETTLED_SHARE * max(a, b)
-
-    return near(before.corner_sd_px, after.corner_sd_px) and near(
-        np.hypot(before.passage_factor, before.jitter_sd), np.hypot(after.passage_factor, after.jitter_sd)
-    )
+    sizes = ((n.corner_sd_px, float(np.hypot(n.passage_factor, n.jitter_sd))) for n in (before, after))
+    return all(abs(a - b) <= SETTLED_SHARE * max(a, b) for a, b in zip(*sizes, strict=True))
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class SweepFit:
     """The residuals of the passages of one sweep of a view; all float64 (m,), sorted by command.
 
-    command: the mirror's command in the model. residual, sd: in command units. distance_m: distance of the point on the
-    board from the light.
+    command: the mirror's command in the model. residual, sd: in command units.
     """
 
     view: str
@@ -177,33 +165,17 @@ class SweepFit:
     y_px: Array
     command: Array
     residual: Array
-    distance_m: Array
     sd: Array
 
 
-def sweep_fits(seen: Sighting, residual: Array, state: RigState, view: int) -> tuple[SweepFit, ...]:
-    """The fits of a view's sweeps, from the residuals of its passages."""
-    command = mirror_command(state.timing, seen.command, seen.y_px, seen.velocity_per_s)
-    points = board_points(state.model.camera, [seen], [state.poses[view]]).points_m
-    per_command_m = sheet_rows(
-        state.scanner, state.model.source_m, points, command, seen.y_px, seen.velocity_per_s
-    ).per_command
+def sweep_fits(seen: Sighting, residual: Array, timing: Array) -> tuple[SweepFit, ...]:
+    """The fits of a view's sweeps, from the residuals of its passages. timing: (3,) as in `RigState`."""
+    command = mirror_command(timing, seen.command, seen.y_px, seen.velocity_per_s)
     found = []
     for sweep in seen.sweeps:
-        velocity = seen.velocity_per_s[sweep]
-        found.append(
-            SweepFit(
-                view=seen.name,
-                direction=1 if velocity[0] > 0 else -1,
-                speed_per_s=float(abs(velocity[0])),
-                x_px=seen.x_px[sweep],
-                y_px=seen.y_px[sweep],
-                command=command[sweep],
-                residual=residual[sweep],
-                distance_m=residual[sweep] * per_command_m[sweep],
-                sd=seen.sd[sweep],
-            )
-        )
+        velocity = float(seen.velocity_per_s[sweep.start])
+        arrays = (values[sweep] for values in (seen.x_px, seen.y_px, command, residual, seen.sd))
+        found.append(SweepFit(seen.name, 1 if velocity > 0 else -1, abs(velocity), *arrays))
     return tuple(found)
 
 
@@ -264,13 +236,13 @@ def result_of(
     """The result of rounds that have run; its model takes all else from `start`. Raises Degenerate if depth is almost
     unknown.
     """
-    assert fit.solution is not None
     problem, solution, state = fit.problem, fit.solution, fit.state
     names = np.array(problem.terms.names)
     unexplained = misfit(problem, solution).factor
     matrix = unexplained * solution.covariance(problem.tie) + widening(problem, solution, fit.decisions)
     fitted = np.flatnonzero(np.diag(matrix) > 0)
     covariance = Covariance(tuple(names[fitted].tolist()), matrix[np.ix_(fitted, fitted)])
+    shown = [seen.velocity_per_s for seen, counts in zip(problem.sightings, problem.counted, strict=True) if counts]
     scanner = state.scanner
     scanner = replace(scanner, angle_rad=_trimmed(scanner.angle_rad, 2), offset_m=_trimmed(scanner.offset_m, 0))
     model = replace(
@@ -280,7 +252,7 @@ def result_of(
         covariance=covariance,
         lag_s=Lag(*(max(float(lag), 0.0) for lag in state.timing[:2])),
         row_delay_s=float(state.timing[2]),
-        provenance={SWEPT: _swept(problem)},
+        provenance={SWEPT: np.unique(np.concatenate(shown)).tolist()},
         speed_range_per_s=speed_range(np.abs(velocities)),
     )
     counted = problem.counted
@@ -294,8 +266,8 @@ def result_of(
         poses=state.poses,
         corner_residual_px=tuple(rows.residual.reshape(2, -1).T for rows, _ in solution.rows),
         sweeps=tuple(
-            sweep_fits(seen, rows.residual, state, view)
-            for view, (seen, (_, rows)) in enumerate(zip(problem.sightings, solution.rows, strict=True))
+            sweep_fits(seen, rows.residual, state.timing)
+            for seen, (_, rows) in zip(problem.sightings, solution.rows, strict=True)
         ),
         left_out=left_out,
         outliers=outliers,
@@ -309,13 +281,6 @@ def result_of(
         free=tuple(fit.free),
         information=problem.tie.T @ solution.matrix @ problem.tie / unexplained,
     )
-
-
-def _swept(problem: RigProblem) -> list[float]:
-    """Signed velocities of the sweeps that had a say."""
-    shown = [seen.velocity_per_s for seen, counts in zip(problem.sightings, problem.counted, strict=True) if counts]
-    swept: list[float] = np.unique(np.concatenate(shown)).tolist()
-    return swept
 
 
 def _trimmed(terms: Array, least: int) -> Array:
@@ -359,11 +324,11 @@ def fit_rig(
     velocities = np.unique(np.concatenate([seen.velocity_per_s for seen in sightings]))
     exact = () if known is None else tuple(np.array(known.names)[np.diag(known.matrix) == 0])
     groups: list[tuple[str, ...]] = [(name,) for name in terms.camera if name not in exact]
-    groups += [(name,) for name in ("axis_turn_1", "axis_turn_2", "axis_shift_1", "axis_shift_2", "angle_0", "angle_1")]
+    groups += [(name,) for name in (*AXIS, "angle_0", "angle_1")]
     groups += lag_groups(velocities)
     state = with_terms_of(state, groups)
     prior = None if known is None else camera_prior(known, camera, terms)
-    problem = with_free(RigProblem(sightings, terms, np.zeros((0, 0)), np.ones(len(shown), bool), prior), groups)
+    problem = RigProblem(sightings, terms, terms.tied(groups), np.ones(len(shown), bool), prior)
     problem, noise = _first_noise(problem, state)
     fit = Rounds(problem, tuple(groups), state, noise)
     try:
@@ -399,7 +364,8 @@ def _first_state(
 ) -> RigState:
     points = board_points(camera, sightings, poses)
     check_poses(points.points_m, poses)
-    low, high = _command_range(sightings, start)
+    low, high = (-1.0, 1.0) if start is None else start.scanner.command_range
+    low, high = min(low, float(points.command.min())), max(high, float(points.command.max()))
     if start is not None and isinstance(start.scanner, PivotScanner):
         scanner, timing = start.scanner, np.array([*start.lag_s, start.row_delay_s])
     else:
@@ -410,15 +376,6 @@ def _first_state(
     scanner = replace(scanner, angle_rad=angle, offset_m=offset, command_range=(low, high))
     source = None if start is None else start.source_m
     return first_state(RigModel(camera, scanner, source_m=source), timing, poses, sightings)
-
-
-def _command_range(sightings: Sequence[Sighting], start: RigModel | None) -> tuple[float, float]:
-    """The usual one, or the start's, made wide enough for what was seen."""
-    low, high = (-1.0, 1.0) if start is None else start.scanner.command_range
-    for seen in sightings:
-        if seen.command.size:
-            low, high = min(low, float(seen.command.min())), max(high, float(seen.command.max()))
-    return low, high
 
 
 def _first_noise(problem: RigProblem, state: RigState) -> tuple[RigProblem, Noise]:

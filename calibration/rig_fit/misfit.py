@@ -8,18 +8,18 @@ missing term can be imitated in part by another (light that passes beside the ax
 imitation may even have the smaller relative error.
 """
 
-from collections.abc import Callable, Sequence
-from dataclasses import dataclass, replace
+from collections.abc import Callable, Iterator, Sequence
+from dataclasses import dataclass
 from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
 
 from calibration.arrays import Array
-from calibration.model.parameters import TIMES
+from calibration.model.parameters import AXIS, TIMES
 from calibration.rig_fit.noise import Noise, smooth_basis
 from calibration.rig_fit.rows import ANGLE_TERMS
-from calibration.rig_fit.solve import RigProblem, RigSolution, scaled_inverse
+from calibration.rig_fit.solve import RigProblem, RigSolution, ViewNormal, scaled_inverse
 
 SIGNIFICANT_SD = 5.0
 LEAST_OWN_SHARE = 1e-7
@@ -45,14 +45,6 @@ class TermDecision:
     gain: float = 0.0
 
 
-def with_free(problem: RigProblem, groups: Sequence[Sequence[str]]) -> RigProblem:
-    """The problem with these parameters free. The parameters of one group share a value."""
-    tie = np.zeros((len(problem.terms.names), len(groups)))
-    for column, group in enumerate(groups):
-        tie[problem.terms.at(group), column] = 1.0
-    return replace(problem, tie=tie)
-
-
 def candidates(free: Sequence[Sequence[str]], row_delay: bool) -> list[tuple[str, ...]]:
     """Sets of terms that could be added next. The last term of each set is the one that is judged."""
     names = {name for group in free for name in group}
@@ -75,14 +67,8 @@ def tried(
     left_over: gives the factor of the variances if chi2 were less by its argument.
     """
     at = problem.terms.at(new)
-    matrix, right = solution.matrix, solution.right
-    tie = problem.tie
-    inverse, _ = scaled_inverse(tie.T @ matrix @ tie)
-    across = tie.T @ matrix[:, at]
-    own = matrix[np.ix_(at, at)]
-    left = own - across.T @ inverse @ across
-    wanted = right[at] - across.T @ inverse @ (tie.T @ right)
-    weight = np.diag(own)
+    left, wanted = _beside_free(problem, solution, solution, at)
+    weight = np.diag(solution.matrix)[at]
     share = np.linalg.eigvalsh(left / np.sqrt(np.outer(weight, weight)))[0] if np.all(weight > 0) else 0.0
     if not share > LEAST_OWN_SHARE:
         return TermDecision(new[-1], False, np.nan, np.nan, "cannot be told from the other terms")
@@ -93,6 +79,17 @@ def tried(
     kept = abs(value) > SIGNIFICANT_SD * sd
     said = f"{abs(value) / sd:.1f} sd from 0, limit {SIGNIFICANT_SD:g}"
     return TermDecision(new[-1], kept, value, sd, said, tuple(zip(new[:-1], values[:-1], strict=True)), gain)
+
+
+def _beside_free(
+    problem: RigProblem, solution: RigSolution, own: RigSolution | ViewNormal, at: list[int]
+) -> tuple[Array, Array]:
+    """(matrix, right) of the equations `own` for the parameters `at`, once all that is free has followed them."""
+    tie = problem.tie
+    inverse, _ = scaled_inverse(tie.T @ solution.matrix @ tie)
+    across = tie.T @ own.matrix[:, at]
+    left = own.matrix[np.ix_(at, at)] - across.T @ inverse @ across
+    return left, own.right[at] - across.T @ inverse @ (tie.T @ solution.right)
 
 
 def best(decisions: Sequence[TermDecision]) -> int | None:
@@ -152,7 +149,7 @@ def corner_noise(problem: RigProblem, solution: RigSolution, noise: Noise) -> fl
     return noise.corner_sd_px * float(np.sqrt(max(chi2, 0.0) / max(count - tie.shape[1], 1.0)))
 
 
-SCANNER_MOVES = ("axis_turn_1", "axis_turn_2", "axis_shift_1", "axis_shift_2", "angle_0")
+SCANNER_MOVES = (*AXIS, "angle_0")
 """Parameters that change when a scanner is knocked: five of six, since a shift along the axis changes nothing."""
 ODD_CHI2 = 60.0
 """Least fall of chi2 when an odd view has its own place of the scanner: 20 is one in a thousand."""
@@ -206,12 +203,8 @@ def with_passages(problem: RigProblem) -> NDArray[np.bool_]:
 
 def _own_place(problem: RigProblem, solution: RigSolution, view: int) -> float:
     """Fall of chi2, to first order, when the view has its own place of the scanner."""
-    at = problem.terms.at(SCANNER_MOVES)
-    tie, own = problem.tie, solution.views[view]
-    inverse, _ = scaled_inverse(tie.T @ solution.matrix @ tie)
-    across = tie.T @ own.matrix[:, at]
-    left = own.matrix[np.ix_(at, at)] - across.T @ inverse @ across
-    wanted = own.right[at] - across.T @ inverse @ (tie.T @ solution.right)
+    at, own = problem.terms.at(SCANNER_MOVES), solution.views[view]
+    left, wanted = _beside_free(problem, solution, own, at)
     scale = 1 / np.sqrt(np.maximum(np.diag(own.matrix)[at], 1e-300))
     values, vectors = np.linalg.eigh(left * scale[:, None] * scale)
     told = values > 1e-6
@@ -253,50 +246,32 @@ class Misfit(NamedTuple):
 
 def misfit(problem: RigProblem, solution: RigSolution) -> Misfit:
     """The contradictions of corners and passages with each other, and of passages among themselves."""
-    return Misfit(_of_corners(problem, solution), _of_sweeps(problem, solution))
-
-
-def _of_corners(problem: RigProblem, solution: RigSolution) -> tuple[float, float]:
-    """chi2 and degrees of freedom of the corners, with the noise that they alone speak for."""
     covariance = solution.covariance(problem.tie)
-    chi2 = free = 0.0
-    for view, (rows, _), counts in zip(solution.views, solution.rows, problem.counted, strict=True):
-        if counts:
-            chi2 += view.chi2[0]
-            free += rows.residual.size - float(np.sum(view.joint(covariance) * view.corner_part))
-    return chi2, free
+    corner_chi2 = corner_free = slow_chi2 = slow_free = taken = 0.0
+    for view, own in enumerate(solution.views):
+        if problem.counted[view]:
+            joint = own.joint(covariance)
+            corner_chi2 += own.chi2[0]  # with the noise that the corners alone speak for
+            corner_free += solution.rows[view][0].residual.size - float(np.sum(joint * own.corner_part))
+            for chi2, count in _of_sweeps(problem, solution, view):
+                slow_chi2, slow_free = slow_chi2 + chi2, slow_free + count
+            taken += float(np.sum(joint * own.passage_part))  # parameters that the passages determine, not the corners
+    return Misfit((corner_chi2, corner_free), (slow_chi2, slow_free - taken))
 
 
-def _of_sweeps(problem: RigProblem, solution: RigSolution) -> tuple[float, float]:
-    """chi2 and number of degrees of freedom of the smooth part of each sweep's residuals."""
-    chi2, count = 0.0, 0
-    jitter = solution.weight.jitter
-    for view, seen in enumerate(problem.sightings):
-        if not problem.counted[view]:
-            continue
-        residual, weight = solution.rows[view][1].residual, solution.weight.passages[view]
-        starts = solution.weight.starts[view]
-        for sweep in seen.sweeps:
-            basis = smooth_basis(seen.command[sweep], seen.y_px[sweep])
-            inside = starts[(starts >= sweep.start) & (starts < sweep.stop)] - sweep.start
-            whole = np.hstack([basis, residual[sweep, None]]) * weight[sweep, None]
-            products = basis.T @ whole
-            if jitter:
-                sums = np.add.reduceat(whole, inside)
-                share = jitter / (1 + jitter * np.add.reduceat(weight[sweep], inside))
-                products = products - (sums[:, :-1] * share[:, None]).T @ sums
-            chi2 += float(products[:, -1] @ np.linalg.lstsq(products[:, :-1], products[:, -1], rcond=1e-9)[0])
-            count += basis.shape[1]
-    return chi2, count - _taken(problem, solution)
-
-
-def _taken(problem: RigProblem, solution: RigSolution) -> float:
-    """Number of parameters that the passages, rather than the corners, determine."""
-    covariance = solution.covariance(problem.tie)
-    return float(
-        sum(
-            np.sum(view.joint(covariance) * view.passage_part)
-            for view, counts in zip(solution.views, problem.counted, strict=True)
-            if counts
-        )
-    )
+def _of_sweeps(problem: RigProblem, solution: RigSolution, view: int) -> Iterator[tuple[float, int]]:
+    """chi2 and number of the terms of the smooth part of each of a view's sweeps."""
+    seen, jitter = problem.sightings[view], solution.weight.jitter
+    residual, weight = solution.rows[view][1].residual, solution.weight.passages[view]
+    starts = solution.weight.starts[view]
+    for sweep in seen.sweeps:
+        basis = smooth_basis(seen.command[sweep], seen.y_px[sweep])
+        inside = starts[(starts >= sweep.start) & (starts < sweep.stop)] - sweep.start
+        whole = np.hstack([basis, residual[sweep, None]]) * weight[sweep, None]
+        products = basis.T @ whole
+        if jitter:
+            sums = np.add.reduceat(whole, inside)
+            share = jitter / (1 + jitter * np.add.reduceat(weight[sweep], inside))
+            products = products - (sums[:, :-1] * share[:, None]).T @ sums
+        chi2 = products[:, -1] @ np.linalg.lstsq(products[:, :-1], products[:, -1], rcond=1e-9)[0]
+        yield float(chi2), basis.shape[1]

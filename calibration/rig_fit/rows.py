@@ -60,6 +60,13 @@ class Terms:
         everything = self.names
         return [everything.index(name) for name in names]
 
+    def tied(self, groups: Sequence[Sequence[str]]) -> Array:
+        """(p, groups) matrix that maps free parameters to all of them. The parameters of one group share a value."""
+        tie = np.zeros((len(self.names), len(groups)))
+        for column, group in enumerate(groups):
+            tie[self.at(group), column] = 1.0
+        return tie
+
 
 class Rows(NamedTuple):
     """Residuals (n,); their derivatives by shared parameters (n, p) and by the turn and shift of the pose (n, 6)."""
@@ -213,25 +220,19 @@ def corner_rows(camera: Camera, terms: Terms, pose: BoardPose, corners_m: Array,
 
 def refined_rays(camera: Camera, rays: Array, x_px: Array, y_px: Array) -> Array:
     """Rays (2, m) of pixels, from those of a camera that differs little, by two steps of Newton's method."""
-    lens, matrix = camera.lens, camera.matrix
+    matrix = camera.matrix
     x, y = (x_px - matrix[0, 2]) / matrix[0, 0], (y_px - matrix[1, 2]) / matrix[1, 1]
     u, v = rays
-    for _ in range(2):
-        at = lens.forward(u, v)
-        miss_u, miss_v, det = at.u - x, at.v - y, at.determinant
-        u, v = u - (at.vv * miss_u - at.uv * miss_v) / det, v - (at.uu * miss_v - at.vu * miss_u) / det
-    return np.stack([u, v])
+    return np.stack(camera.lens.newton(u, v, x, y, steps=2))
 
 
 def _lens_columns(lens: LensModel, distortion: Array, terms: int, u: Array, v: Array) -> tuple[Array, Array, Array]:
     """Distorted tangents (2, m), and how they change with the first terms of the lens: (m, terms) each."""
     seen = lens.forward(u, v)
-    k4, k5, k6 = (*distortion, *np.zeros(8))[5:8] if distortion.size > 5 else (0.0, 0.0, 0.0)
-    k = np.zeros(14)
-    k[: distortion.size] = distortion
+    k1, k2, _, _, k3, k4, k5, k6 = (*distortion, *np.zeros(8))[:8]
     r2 = u * u + v * v
     denominator = 1 + r2 * (k4 + r2 * (k5 + r2 * k6))
-    g = (1 + r2 * (k[0] + r2 * (k[1] + r2 * k[4]))) / denominator
+    g = (1 + r2 * (k1 + r2 * (k2 + r2 * k3))) / denominator
     r4, r6, none = r2 * r2, r2 * r2 * r2, np.zeros_like(r2)
     radial = [r2 / denominator, r4 / denominator, none, none, r6 / denominator]
     radial += [-g * r2 / denominator, -g * r4 / denominator, -g * r6 / denominator]
@@ -240,8 +241,4 @@ def _lens_columns(lens: LensModel, distortion: Array, terms: int, u: Array, v: A
     by_v[2], by_v[3] = r2 + 2 * v * v, 2 * u * v
     by_u += [r2, r4, none, none]
     by_v += [none, none, r2, r4]
-    chosen_u, chosen_v = by_u[:terms], by_v[:terms]
-    shape = (len(u), terms)
-    u_terms = np.stack(chosen_u, axis=-1) if terms else np.zeros(shape)
-    v_terms = np.stack(chosen_v, axis=-1) if terms else np.zeros(shape)
-    return np.stack([seen.u, seen.v]), u_terms, v_terms
+    return np.stack([seen.u, seen.v]), np.array(by_u).T[:, :terms], np.array(by_v).T[:, :terms]

@@ -208,10 +208,15 @@ def solved(problem: RigProblem, state: RigState, noise: Noise, *, roughly: bool 
             weight = weights(rows, problem.sightings, noise)
         views = normals(rows, weight)
         chi2 = _chi2(views, problem, state)
-        matrix, right = equations(views, problem, state)
+        counted = _counted(views, problem)
+        matrix: Array = np.sum([view.matrix for view in counted], axis=0)
+        right: Array = np.sum([view.right for view in counted], axis=0)
+        if problem.prior is not None:
+            matrix = matrix + problem.prior.matrix
+            right = right + problem.prior.matrix @ _off(problem.prior, problem.terms, state)
         inverse, condition = scaled_inverse(problem.tie.T @ matrix @ problem.tie)
         free = problem.tie.T @ right
-        promised = float(free @ inverse @ free) + sum(_own_promise(view) for view in _counted(views, problem))
+        promised = float(free @ inverse @ free) + sum(_own_promise(view) for view in counted)
         there = promised < (1 + ROUGH_SHARE * chi2 if roughly else CONVERGED_CHI2)
         solution = RigSolution(state, rows, weight, views, matrix, right, condition, there)
         if there:
@@ -229,17 +234,6 @@ def solved(problem: RigProblem, state: RigState, noise: Noise, *, roughly: bool 
             break
         state = tried
     return solution
-
-
-def equations(views: Sequence[ViewNormal], problem: RigProblem, state: RigState) -> tuple[Array, Array]:
-    """(matrix, right) of the shared parameters: the sum over all views and the prior."""
-    counted = _counted(views, problem)
-    matrix: Array = np.sum([view.matrix for view in counted], axis=0)
-    right: Array = np.sum([view.right for view in counted], axis=0)
-    if problem.prior is not None:
-        matrix = matrix + problem.prior.matrix
-        right = right + problem.prior.matrix @ _off(problem.prior, problem.terms, state)
-    return matrix, right
 
 
 def scaled_inverse(matrix: Array) -> tuple[Array, float]:

@@ -79,11 +79,10 @@ def board_points(camera: Camera, sightings: Sequence[Sighting], poses: Sequence[
 def first_scanner(points: LitPoints, command_range: tuple[float, float]) -> tuple[PivotScanner, Array]:
     """A mirror and (lag forward, lag backward, 0). The lags are equal if only their sum is determined, or else 0."""
     velocities = _often_shown(points)
-    curves = []
-    axis, point, first = _pivot(_planes_of(points, velocities[np.argmax(_counts(points, velocities))])[1])
-    for velocity in velocities:
-        commands, planes = _planes_of(points, velocity)
-        curves.append((commands, _angles(planes, axis, first)))
+    counts = [np.count_nonzero(points.velocity_per_s == velocity) for velocity in velocities]
+    swept = [_planes_of(points, velocity) for velocity in velocities]
+    axis, point, first = _pivot(swept[int(np.argmax(counts))][1])
+    curves = [(commands, _angles(planes, axis, first)) for commands, planes in swept]
     lags = np.clip(_lags(velocities, curves), 0.0, MOST_FIRST_LAG_S)
     mirror = points.command - points.velocity_per_s * np.where(points.velocity_per_s > 0, lags[0], lags[1])
     one = LitPoints(points.points_m, mirror, np.ones_like(mirror), points.view)
@@ -98,10 +97,6 @@ def _often_shown(points: LitPoints) -> Array:
     velocities = np.unique(points.velocity_per_s)
     shown = np.array([np.unique(points.view[points.velocity_per_s == velocity]).size for velocity in velocities])
     return velocities[shown >= min(POSES_FOR_PLANES, int(shown.max()))]
-
-
-def _counts(points: LitPoints, velocities: Array) -> Array:
-    return np.array([np.count_nonzero(points.velocity_per_s == velocity) for velocity in velocities])
 
 
 def _planes_of(points: LitPoints, velocity: float) -> tuple[Array, Array]:

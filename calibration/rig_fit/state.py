@@ -6,6 +6,7 @@ A sighting is a pose's corners and passages, cleaned and in the order that the f
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 
+import cv2
 import numpy as np
 from numpy.typing import NDArray
 
@@ -63,7 +64,6 @@ def sighting(view: View, board: Board, camera: Camera, pose: BoardPose) -> Sight
         return np.concatenate([np.zeros(0), *(getattr(sweep, name) for sweep in sweeps)])
 
     sizes = [sweep.x_px.size for sweep in sweeps]
-    velocity = [np.full(sweep.x_px.size, sweep.velocity_per_s) for sweep in sweeps]
     return Sighting(
         name=view.name,
         corners_m=board.corners_m[view.corners.ids],
@@ -73,7 +73,7 @@ def sighting(view: View, board: Board, camera: Camera, pose: BoardPose) -> Sight
         y_px=joined("y_px"),
         command=joined("command"),
         sd=joined("sd"),
-        velocity_per_s=np.concatenate([np.zeros(0), *velocity]),
+        velocity_per_s=np.repeat([sweep.velocity_per_s for sweep in sweeps], np.array(sizes, np.int64)),
         starts=np.cumsum([0, *sizes]),
     )
 
@@ -107,7 +107,7 @@ def shows_line(view: View) -> bool:
 
 def _on_board(sweep: Passages, board: Board, camera: Camera, pose: BoardPose) -> Passages:
     """The passages of a sweep within the board's outline, sorted by command."""
-    x, y, command, sd = (np.asarray(values, np.float64) for values in (sweep.x_px, sweep.y_px, sweep.command, sweep.sd))
+    x, y, command, sd = (np.asarray(of, np.float64) for of in (sweep.x_px, sweep.y_px, sweep.command, sweep.sd))
     keep = np.isfinite(x) & np.isfinite(y) & np.isfinite(command) & np.isfinite(sd) & (sd > 0)
     u, v = camera.tangents_at(x, y)
     ray = np.stack([u, v, np.ones_like(u)], axis=-1)
@@ -192,7 +192,5 @@ def with_terms_of(state: RigState, groups: Sequence[Sequence[str]]) -> RigState:
 
 
 def _moved(pose: BoardPose, change: Array) -> BoardPose:
-    import cv2
-
     turned = cv2.Rodrigues(cv2.Rodrigues(change[:3])[0] @ pose.matrix)[0]
     return BoardPose(np.asarray(turned, np.float64).ravel(), pose.position_m + change[3:])

@@ -11,7 +11,8 @@ import pytest
 from hypothesis import assume, given
 from hypothesis import strategies as st
 
-from calibration import CalibrationError, RigModel
+from calibration.errors import CalibrationError
+from calibration.model.rig_model import RigModel
 from drivers.interfaces import LEVEL_BACKWARD, ScanWaveform
 from drivers.scanners.dac_scanner import brake, ramp
 from rig.count.blanking import PatternSearch, PatternShape, detection_probability

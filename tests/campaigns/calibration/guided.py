@@ -62,7 +62,7 @@ def session(seed: int) -> Iterator[Step]:
             if np.isfinite(forecast_m):
                 yield Step(len(views), forecast_m, expected_m)
             choices = rng.permutation(np.array(candidates(fit.model.camera, BOARD, DEPTH_RANGE_M), object))[:CHOICES]
-            advice = next_pose(len(views), list(choices), AT_M, expected_m, Forecast(fit, AT_M))
+            advice = next_pose(list(choices), AT_M, expected_m, Forecast(fit, AT_M))
             pose, forecast_m = advice.candidate.pose, advice.after_m
         swept = speed * SPEEDS[len(views) % len(SPEEDS)]
         views.append(seen_view(rng, rig, pose.rotation, pose.position_m, seen, (swept, -swept), f"{len(views):03d}"))

@@ -2,7 +2,7 @@
 
 import numpy as np
 
-from calibration import Camera
+from calibration.model.camera import Camera
 
 MATRIX = np.array([[600.0, 0, 255.5], [0, 600.0, 255.5], [0, 0, 1]])
 

@@ -4,7 +4,8 @@ import cv2
 import numpy as np
 import pytest
 
-from calibration import CalibrationError, Camera
+from calibration.errors import CalibrationError
+from calibration.model.camera import Camera
 from tests.unit.calibration.cameras import LENSES, MATRIX, camera
 
 

@@ -3,8 +3,9 @@
 import numpy as np
 import pytest
 
-from calibration import CalibrationError, PivotScanner, PlaneTable
+from calibration.errors import CalibrationError
 from calibration.model.light_sheet import depth, light_sheets
+from calibration.model.scanner import PivotScanner, PlaneTable
 from tests.unit.calibration.fans import Fan
 
 ANGLE = [0.1, 0.4, 0.02]

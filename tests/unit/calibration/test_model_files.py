@@ -7,19 +7,12 @@ import numpy as np
 import pytest
 import yaml
 
-from calibration import (
-    CalibrationError,
-    Camera,
-    Covariance,
-    Identity,
-    Lag,
-    PivotScanner,
-    PlaneTable,
-    RigModel,
-    load_rig_model,
-    save_rig_model,
-)
+from calibration.errors import CalibrationError
 from calibration.files import problems, sections
+from calibration.files.rig_file import load_rig_model, save_rig_model
+from calibration.model.camera import Camera
+from calibration.model.rig_model import Covariance, Identity, Lag, RigModel
+from calibration.model.scanner import PivotScanner, PlaneTable
 from tests.stability.inventory import covers
 from tests.unit.calibration.cameras import MATRIX, camera
 

@@ -4,8 +4,10 @@ import cv2
 import numpy as np
 import pytest
 
-from calibration import CalibrationError, Lag, PivotScanner, PlaneTable, RigModel
+from calibration.errors import CalibrationError
 from calibration.model.parameters import parameters, with_parameters
+from calibration.model.rig_model import Lag, RigModel
+from calibration.model.scanner import PivotScanner, PlaneTable
 from tests.unit.calibration.cameras import camera
 
 COMMANDS = np.linspace(-1, 1, 9)

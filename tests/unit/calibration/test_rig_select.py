@@ -4,7 +4,7 @@ from types import SimpleNamespace
 
 import numpy as np
 
-from calibration.rig_fit.misfit import TermDecision, best, first_order, tried, with_free
+from calibration.rig_fit.misfit import TermDecision, best, first_order, tried
 from calibration.rig_fit.rows import Terms
 from calibration.rig_fit.solve import RigProblem
 
@@ -18,7 +18,7 @@ def test_a_term_changes_all_that_it_would_with_those_that_come_along() -> None:
     root = rng.normal(size=(len(names), 3 * len(names)))
     matrix, right = root @ root.T, np.zeros(len(names))
     right[terms.at(new)] = rng.normal(size=2)  # of what is free nothing is left to gain
-    problem = with_free(RigProblem((), terms, np.zeros((0, 0)), np.ones(0, bool)), free)
+    problem = RigProblem((), terms, terms.tied(free), np.ones(0, bool))
     solution = SimpleNamespace(matrix=matrix, right=right)
     decision = tried(problem, solution, new, lambda gain: 1.0)
     everything = terms.at([*(name for (name,) in free), *new])

@@ -3,7 +3,8 @@
 import numpy as np
 import pytest
 
-from calibration import CalibrationError, PivotScanner, PlaneTable
+from calibration.errors import CalibrationError
+from calibration.model.scanner import PivotScanner, PlaneTable
 
 
 def vertical_planes(tangents: np.ndarray, baseline_m: float = 0.3) -> np.ndarray:

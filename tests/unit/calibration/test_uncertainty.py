@@ -5,7 +5,6 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from calibration import CalibrationError, Covariance, Lag, PivotScanner, RigModel
 from calibration.depth_error import (
     GROUPS,
     command_at,
@@ -15,7 +14,10 @@ from calibration.depth_error import (
     explained,
     group_of,
 )
+from calibration.errors import CalibrationError
 from calibration.model.parameters import parameters, with_parameters
+from calibration.model.rig_model import Covariance, Lag, RigModel
+from calibration.model.scanner import PivotScanner
 from tests.unit.calibration.cameras import camera
 
 SD = {"f": 0.3, "c": 0.3, "k": 1e-3, "p": 1e-4, "a": 2e-5, "o": 2e-5, "b": 2e-5, "l": 1e-7, "r": 1e-10}

@@ -150,7 +150,7 @@ def test_views_tell_coverage_and_room_light() -> None:
 
 
 def swept(view: str, direction: int, command: np.ndarray, residual: np.ndarray) -> SweepFit:
-    return SweepFit(view, direction, 35.2, command, command, command, residual, residual, residual)
+    return SweepFit(view, direction, 35.2, command, command, command, residual, residual)
 
 
 def _sweeps(

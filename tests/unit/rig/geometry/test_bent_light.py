@@ -3,7 +3,9 @@
 import numpy as np
 import pytest
 
-from calibration import Camera, Lag, PivotScanner, RigModel
+from calibration.model.camera import Camera
+from calibration.model.rig_model import Lag, RigModel
+from calibration.model.scanner import PivotScanner
 from rig.config.models import EstimateConfig
 from rig.count.volume import CountVolume
 from rig.depth.depth import depth_map

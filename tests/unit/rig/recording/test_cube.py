@@ -8,7 +8,9 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from calibration import Camera, PivotScanner, PlaneTable, RigModel
+from calibration.model.camera import Camera
+from calibration.model.rig_model import RigModel
+from calibration.model.scanner import PivotScanner, PlaneTable
 from rig.api import import_frames
 from rig.config.models import CubePlan
 from rig.count.volume import SweepCounter, SweepLayout
