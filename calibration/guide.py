@@ -28,7 +28,7 @@ from calibration.rig_fit.fit import RigFit
 from calibration.rig_fit.noise import bin_starts
 from calibration.rig_fit.rows import Terms
 from calibration.rig_fit.solve import scaled_inverse, view_normal
-from calibration.rig_fit.state import Sighting, first_state
+from calibration.rig_fit.start import Sighting, first_state
 from calibration.views import FEWEST_CORNERS, BoardPose
 
 FILLS = (0.6, 0.45, 0.32, 0.22)

@@ -273,8 +273,7 @@ def _around(flux: Array) -> Array:
 
 
 def _share(ones: NDArray[np.integer], frames: NDArray[np.integer]) -> Array:
-    share: Array = ones / np.maximum(frames, 1)
-    return share
+    return np.asarray(ones / np.maximum(frames, 1))
 
 
 def _chi_square_limit(dof: NDArray[np.int64], probability: float) -> Array:

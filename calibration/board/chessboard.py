@@ -20,9 +20,8 @@ from numpy.typing import ArrayLike, NDArray
 
 from calibration.arrays import Array
 from calibration.board.board import Board
-from calibration.board.drawing import BoardMap, Drawing, fit_map
 from calibration.board.markers import FORMS, Gray, MatchedPoints, as_form
-from calibration.board.registration import SUBPIXELS, WIDE, register, sides_px
+from calibration.board.registration import SUBPIXELS, WIDE, BoardMap, Drawing, fit_map, register, sides_px
 
 Picture = NDArray[np.float32]
 

@@ -14,9 +14,8 @@ from numpy.typing import NDArray
 from calibration.arrays import Array
 from calibration.board.board import Board
 from calibration.board.chessboard import find_chessboard
-from calibration.board.drawing import BoardMap, Drawing, fit_map
 from calibration.board.markers import MatchedPoints, contradiction, find_markers, gray
-from calibration.board.registration import OWN, SUBPIXELS, WIDE, register, sides_px
+from calibration.board.registration import OWN, SUBPIXELS, WIDE, BoardMap, Drawing, fit_map, register, sides_px
 from calibration.errors import Degenerate
 from calibration.views import Corners
 

@@ -25,7 +25,7 @@ from calibration.arrays import Array
 from calibration.model.rig_model import RigModel
 from calibration.rig_fit.fit import RigFit, SweepFit
 from calibration.rig_fit.solve import corner_weights
-from calibration.rig_fit.state import corner_scale
+from calibration.rig_fit.start import corner_scale
 from calibration.views import FEWEST_CORNERS, BoardPose, View, robust_sd
 
 BINS = 24

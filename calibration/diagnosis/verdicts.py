@@ -48,7 +48,7 @@ from calibration.model.camera import Camera
 from calibration.model.parameters import SWEPT, changed_camera
 from calibration.model.rig_model import Covariance, RigModel
 from calibration.rig_fit.fit import RigFit
-from calibration.rig_fit.state import shows_line, usable
+from calibration.rig_fit.start import shows_line, usable
 from calibration.sync.lag_fit import SyncFit
 from calibration.verdict import AT_M, SIGMAS, WORST_TIMES, AccuracyGoal, Reason, Verdict, more_poses, unguided
 from calibration.views import View
@@ -124,8 +124,7 @@ def ray_sd_px(camera: Camera, covariance: Covariance) -> Array:
     left = slopes[sound] - basis @ (basis.T @ slopes[sound])
     along_row = np.flatnonzero(sound) < len(rays)
     variance = np.einsum("ni,ij,nj->n", left, covariance.matrix, left)[along_row]
-    result: Array = np.sqrt(np.maximum(variance, 0.0))
-    return result
+    return np.asarray(np.sqrt(np.maximum(variance, 0.0)))
 
 
 UNLIKELY_SDS: Final = 4.0

@@ -231,8 +231,7 @@ def _tilt_homography(tau_x: float, tau_y: float) -> Array:
     flatten = np.array([[rotation[2, 2], 0, -rotation[0, 2]], [0, rotation[2, 2], -rotation[1, 2]], [0, 0, 1]])
     if rotation[2, 2] <= 0:
         raise CalibrationError(f"sensor tilt ({tau_x:g}, {tau_y:g}) rad reaches 90 degrees; it must stay well below")
-    result: Array = flatten @ rotation
-    return result
+    return np.asarray(flatten @ rotation)
 
 
 def _homography(matrix: Array, u: Array, v: Array) -> tuple[Array, Array, Array]:

@@ -81,8 +81,7 @@ class PlaneTable:
         """Planes (..., 4) for commands (...). Raises CalibrationError outside the table."""
         at = _inside(commands, self.command_range)
         between = np.stack([np.interp(at, self.command, self.rows[:, i]) for i in range(4)], axis=-1)
-        result: Array = between / np.linalg.norm(between[..., :3], axis=-1, keepdims=True)
-        return result
+        return np.asarray(between / np.linalg.norm(between[..., :3], axis=-1, keepdims=True))
 
 
 @dataclass(frozen=True, eq=False)
@@ -146,8 +145,7 @@ class PivotScanner:
     def planes(self, commands: ArrayLike) -> Array:
         """Planes (..., 4) for commands (...). Raises CalibrationError outside command_range."""
         planes = self.turned(commands)
-        result: Array = np.where(planes[..., :1] < 0, -planes, planes)
-        return result
+        return np.asarray(np.where(planes[..., :1] < 0, -planes, planes))
 
     def turned(self, commands: ArrayLike) -> Array:
         """The planes with the sign of n(a), which is the sign that offset_m, cone_rad and bow_per_rad refer to."""
@@ -185,8 +183,7 @@ def _vector(value: ArrayLike, name: str) -> Array:
 def _near_one(values: Array, vectors: Array) -> Array:
     """Values (..., m) by the power of two that brings the vectors (..., n) to length about one: their bits stay."""
     _, exponent = np.frexp(np.abs(vectors).max(axis=-1, keepdims=True))
-    result: Array = np.ldexp(values, -exponent)
-    return result
+    return np.asarray(np.ldexp(values, -exponent))
 
 
 def _across(normal: Array, axis: Array) -> Array:

@@ -91,8 +91,7 @@ def _travelled(area: Array, sigma: Array, away: Array, box: float) -> tuple[Arra
 
 def _normal_integral(z: Array) -> Array:
     """Integral of the normal density up to z, to 2e-4 (E. Page, Applied Statistics 26, 1977)."""
-    result: Array = 0.5 * (1 + np.tanh(np.sqrt(2 / np.pi) * (z + 0.044715 * z**3)))
-    return result
+    return np.asarray(0.5 * (1 + np.tanh(np.sqrt(2 / np.pi) * (z + 0.044715 * z**3))))
 
 
 def score_of(ones: Array, frames: Array, flux: Array, slopes: Array, theta: Array) -> tuple[Array, Array]:
@@ -116,14 +115,12 @@ def regular(information: Array) -> Array:
     """The information with a slightly larger diagonal, so that it is never singular, whatever the units."""
     size = information.shape[1]
     diagonal = np.einsum("pii->pi", information)
-    regular: Array = information + (1e-9 * diagonal + 1e-12)[:, :, None] * np.eye(size)
-    return regular
+    return np.asarray(information + (1e-9 * diagonal + 1e-12)[:, :, None] * np.eye(size))
 
 
 def log_likelihood(ones: Array, frames: Array, flux: Array) -> Array:
     """Log-likelihood of each pixel's counts (pixels,), without the part that does not depend on the flux."""
-    result: Array = (ones * np.log(-np.expm1(-flux)) - (frames - ones) * flux).sum(axis=1)
-    return result
+    return np.asarray((ones * np.log(-np.expm1(-flux)) - (frames - ones) * flux).sum(axis=1))
 
 
 FITTED_BESIDES = 3
@@ -322,8 +319,7 @@ def _width_step(log_sigma: Array, score: Array, information: Array, group: NDArr
     mean = (sure * wanted).sum() / max(sure.sum(), 1e-12)
     target = (weight * wanted + mean / SIGMA_SPREAD**2) / (weight + 1 / SIGMA_SPREAD**2)
     step = np.clip(target - now, -MOST_STEP, MOST_STEP)
-    result: Array = (np.clip(now + step, np.log(LEAST_SIGMA), np.log(MOST_SIGMA)) - now)[group]
-    return result
+    return np.asarray((np.clip(now + step, np.log(LEAST_SIGMA), np.log(MOST_SIGMA)) - now)[group])
 
 
 def _significance(ones: Array, frames: Array, at: Array, centre: Array, flux: Array) -> Array:
@@ -333,8 +329,7 @@ def _significance(ones: Array, frames: Array, at: Array, centre: Array, flux: Ar
         share = ((ones * side).sum(axis=1) + LEVEL_COUNTS) / ((frames * side).sum(axis=1) + 2 * LEVEL_COUNTS)
         level += side * -np.log1p(-share)[:, None]
     gain = log_likelihood(ones, frames, flux) - log_likelihood(ones, frames, level)
-    result: Array = np.sqrt(2 * np.maximum(gain, 0))
-    return result
+    return np.asarray(np.sqrt(2 * np.maximum(gain, 0)))
 
 
 def _misfit(ones: Array, frames: Array, flux: Array) -> Array:
@@ -344,5 +339,4 @@ def _misfit(ones: Array, frames: Array, flux: Array) -> Array:
     there = frames > 0
     chi2 = (there * (ones - frames * p) ** 2 / variance).sum(axis=1)
     spread = (there * np.maximum(2 + (1 - 6 * p * (1 - p)) / variance, 0)).sum(axis=1)
-    result: Array = (chi2 - there.sum(axis=1)) / np.sqrt(np.maximum(spread, 1e-12))
-    return result
+    return np.asarray((chi2 - there.sum(axis=1)) / np.sqrt(np.maximum(spread, 1e-12)))

@@ -36,15 +36,20 @@ from calibration.rig_fit.noise import Noise, passage_noise, restated
 from calibration.rig_fit.rows import ANGLE_TERMS, LENS_TERMS, OFFSET_TERMS, Terms, mirror_command
 from calibration.rig_fit.solve import RigProblem, RigSolution, all_rows, camera_prior, solved
 from calibration.rig_fit.start import (
+    RigState,
+    Sighting,
     board_points,
     check_depth,
     check_poses,
     check_views,
     first_pose,
     first_scanner,
+    first_state,
     no_start,
+    sighting,
+    usable,
+    with_terms_of,
 )
-from calibration.rig_fit.state import RigState, Sighting, first_state, sighting, usable, with_terms_of
 from calibration.views import BoardPose, View, robust_sd
 
 MOST_ROUNDS = 16

@@ -18,7 +18,7 @@ from numpy.typing import NDArray
 
 from calibration.arrays import Array
 from calibration.model.parameters import alike_speeds
-from calibration.rig_fit.state import Sighting
+from calibration.rig_fit.start import Sighting
 from calibration.views import MAD_TO_SD, robust_sd
 
 BINS = 1024

@@ -151,8 +151,7 @@ def solve(seen: SharedPixels, designs: Sequence[Array]) -> Solved:
 def _own(values: Array, weight: Array) -> Array:
     """Values (pixels, sweeps, n) less their weighted mean over a pixel's sweeps."""
     total = np.maximum(weight.sum(axis=1), 1e-300)[:, None, None]
-    result: Array = values - (weight[:, :, None] * values).sum(axis=1, keepdims=True) / total
-    return result
+    return np.asarray(values - (weight[:, :, None] * values).sum(axis=1, keepdims=True) / total)
 
 
 def clusters(seen: SharedPixels) -> NDArray[np.int64]:
@@ -160,8 +159,7 @@ def clusters(seen: SharedPixels) -> NDArray[np.int64]:
     there = seen.weight > 0
     low, high = seen.command[there].min(), seen.command[there].max()
     part = np.clip((seen.command - low) / max(high - low, 1e-300) * CLUSTERS, 0, CLUSTERS - 1).astype(np.int64)
-    cluster: NDArray[np.int64] = part + CLUSTERS * np.arange(len(seen.speed))
-    return cluster
+    return np.asarray(part + CLUSTERS * np.arange(len(seen.speed)))
 
 
 def clustered(values: Array, cluster: NDArray[np.int64]) -> Array:

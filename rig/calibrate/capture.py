@@ -30,8 +30,7 @@ from calibration.board.detect import find_corners
 from calibration.errors import Degenerate
 from calibration.guide import Candidate
 from calibration.model.rig_model import Identity
-from calibration.passages.find import SweepCounts, find_passages
-from calibration.passages.flux_picture import board_pixels, even_pixels, flux_picture
+from calibration.passages.find import SweepCounts, board_pixels, even_pixels, find_passages, flux_picture
 from calibration.views import BoardPose, Corners, Passages, View
 from drivers.interfaces import SpadTiming
 from drivers.units import format_quantity

@@ -31,7 +31,7 @@ from calibration.errors import Degenerate
 from calibration.files.npy_files import load_numpy
 from calibration.files.rig_file import CALIBRATION_FILE, corners_digest, save_rig_model
 from calibration.model.rig_model import Identity, RigModel
-from calibration.rig_fit.state import FEWEST_PASSAGES, shows_line
+from calibration.rig_fit.start import FEWEST_PASSAGES, shows_line
 from calibration.verdict import Verdict
 from calibration.views import Corners, Passages, View
 from drivers.json_text import parse_json

@@ -21,7 +21,7 @@ from calibration.errors import CalibrationError, Degenerate
 from calibration.files.rig_file import load_rig_model
 from calibration.guide import Advice, candidates, rough_camera, sequence
 from calibration.model.camera import Camera
-from calibration.rig_fit.state import shows_line
+from calibration.rig_fit.start import shows_line
 from calibration.views import View
 from rig.calibrate.capture import AskPerson, Capture, SpeedRotation, capture_recorded, capture_view, corners_in, shown
 from rig.calibrate.session import BOARD_FILE, Session, load_views, session_board, session_rig

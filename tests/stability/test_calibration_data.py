@@ -8,8 +8,7 @@ from calibration.board.board import Board, load_board
 from calibration.board.detect import find_corners
 from calibration.camera_fit import fit_camera
 from calibration.errors import CalibrationError, Degenerate
-from calibration.passages.find import SweepCounts, find_passages
-from calibration.passages.flux_picture import flux_picture
+from calibration.passages.find import SweepCounts, find_passages, flux_picture
 from calibration.rig_fit.fit import fit_rig
 from calibration.views import Corners, Passages, View
 from tests.stability.inventory import EXAMPLES, covers

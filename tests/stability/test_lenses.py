@@ -65,7 +65,7 @@ def test_past_the_first_fold_nothing_is_seen(radial) -> None:
     np.testing.assert_array_equal(np.isfinite(x) & np.isfinite(y), r < fold)
 
 
-@covers(LensModel.undistort, LensModel.distort)
+@covers(LensModel.undistort, LensModel.newton, LensModel.distort)
 @EXAMPLES
 @given(terms=LENS)
 def test_what_is_seen_leads_back_to_its_ray(terms) -> None:

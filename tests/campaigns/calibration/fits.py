@@ -17,8 +17,7 @@ from calibration.errors import CalibrationError
 from calibration.rig_fit.fit import RigFit, fit_rig
 from calibration.views import MAD_TO_SD
 from tests.campaigns.calibration.asked import INSIDE, RATIO, Figure, exit_code
-from tests.reference.boards.calibration_data import BOARD, Seen, random_rig, random_views
-from tests.reference.boards.fitted_depth import depth_errors
+from tests.reference.boards.calibration_data import BOARD, Seen, depth_errors, random_rig, random_views
 
 AT_M = 5.0
 

@@ -34,8 +34,7 @@ from calibration.depth_error import command_at, depth_sd_m
 from calibration.errors import CalibrationError, Degenerate
 from calibration.model.light_sheet import depth_slope
 from calibration.model.rig_model import RigModel
-from calibration.passages.find import SweepCounts, evenly, find_passages
-from calibration.passages.flux_picture import board_pixels, even_pixels
+from calibration.passages.find import SweepCounts, board_pixels, even_pixels, evenly, find_passages
 from calibration.rig_fit.fit import RigFit, fit_rig
 from calibration.views import Passages, View, robust_sd
 from rig.calibrate.session import load_views, save_view

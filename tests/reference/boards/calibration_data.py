@@ -2,7 +2,8 @@
 
 A yardstick for `calibration.rig_fit.fit`: its own lens, rotations and light, nothing shared with what it judges but the
 data classes it hands over. Light leaves the mirror in sheets that turn about an axis; a sheet may pass the axis at a
-distance, lie on a cone and bow.
+distance, lie on a cone and bow. `depth_errors` compares a fitted rig's depth with the true one's: same pixels, same
+instants.
 """
 
 from __future__ import annotations
@@ -14,6 +15,8 @@ from numpy.typing import NDArray
 
 from calibration.arrays import Array
 from calibration.board.board import Board
+from calibration.depth_error import depth_sd_m
+from calibration.model.rig_model import RigModel
 from calibration.views import Corners, Passages, View
 
 BOARD = Board("chessboard", (9, 7), 0.06)
@@ -215,3 +218,21 @@ def points_at(rng: np.random.Generator, rig: TrueRig, depth: float, count: int) 
     points = np.hstack([rng.uniform(-reach, reach, (4 * count, 2)), np.full((4 * count, 1), depth)])
     x, y = rig.project(points)
     return points[rig.inside(x, y) & (np.abs(rig.mirror_at(points)) < 0.9)][:count]
+
+
+def normalised(model: RigModel, rig: TrueRig, depth_m: float, velocity_per_s: float) -> float:
+    """Root mean square of the errors in units of their stated sd: 1 where the covariance is right, on average."""
+    error, sd = depth_errors(model, rig, depth_m, velocity_per_s)
+    return float(np.sqrt(np.mean((error / sd) ** 2)))
+
+
+def depth_errors(
+    model: RigModel, rig: TrueRig, depth_m: float, velocity_per_s: float, seed: int = 0, count: int = 60
+) -> tuple[Array, Array]:
+    """(errors, sd that the model states) in metres, at points all over the picture."""
+    points = points_at(np.random.default_rng(seed), rig, depth_m, count)
+    x, y = rig.project(points)
+    mirror = model.mirror_command(rig.command_at(points, velocity_per_s), y, velocity_per_s)
+    mirror = np.clip(mirror, *model.scanner.command_range)
+    u, v = model.camera.tangents_at(x, y)
+    return model.sheets(mirror).depth(u, v) - depth_m, depth_sd_m(model, x, y, mirror, velocity_per_s)

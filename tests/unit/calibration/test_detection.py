@@ -3,13 +3,15 @@
 import cv2
 import numpy as np
 import pytest
+from numpy.typing import NDArray
 
 from calibration import views
-from calibration.board import board, chessboard, detect, drawing, markers, registration
+from calibration.board import board, chessboard, detect, markers, registration
 from calibration.board.board import BLACK, WHITE, Board
 from calibration.board.chessboard import known_lattice
 from calibration.board.detect import find_corners, repaired
-from calibration.board.drawing import Drawing, fit_map
+from calibration.board.markers import Markers, contradiction
+from calibration.board.registration import Drawing, fit_map
 from calibration.errors import Degenerate
 from calibration.model.camera import Camera
 from calibration.views import BoardPose
@@ -19,7 +21,7 @@ from tests.reference.boards.board_pictures import CHARUCO, CHESSBOARD, SIZE, WAL
 from tests.reference.boards.chessboards import FOLDER
 from tests.stability.inventory import covers
 
-covers(board, drawing, detect, markers, chessboard, registration, views)
+covers(board, detect, markers, chessboard, registration, views)
 
 TURNED = pose(CHARUCO, 0.9, (0.03, -0.02), (0.35, -0.3, 0.1))
 FRAMES = 5000
@@ -265,3 +267,72 @@ def test_noise_and_a_bare_wall_have_no_lattice():
     wall = np.full((240, 320), WALL)
     assert known_lattice(exposed(wall, 0.05, 5000, 1), grid(range(8), range(5))) is None
     assert known_lattice(wall.astype(np.float32), grid(range(8), range(5))) is None
+
+
+PRINTED = charuco(9, 7)
+WHITE_PICTURE = np.full((480, 640), 255, np.uint8)
+TILTED = np.array([[30.0, 3.0, 200.0], [-2.0, 31.0, 150.0], [1e-3, 8e-3, 1.0]])
+"""From squares to pixels."""
+
+
+def markers_of(
+    squares: tuple[int, int], first_id: int = 0, at: tuple[int, int] = (0, 0), white_first: bool = False
+) -> Markers:
+    """The markers of a print as a tilted camera sees them, half a pixel off."""
+    places = [(x, y) for y in range(squares[1]) for x in range(squares[0]) if (x + y + white_first) % 2]
+    outline = np.array([(-1, -1), (1, -1), (1, 1), (-1, 1)]) * (PRINTED.marker_m or 0) / PRINTED.square_m / 2
+    corners = (np.array(places) + at)[:, None] + outline
+    seen = np.concatenate([corners, np.ones((*corners.shape[:2], 1))], axis=-1) @ TILTED.T
+    px: NDArray[np.float64] = seen[..., :2] / seen[..., 2:] + np.random.default_rng(0).normal(0, 0.5, corners.shape)
+    return Markers(np.arange(len(places)) + first_id, px)
+
+
+def _both(one: Markers, other: Markers) -> Markers:
+    return Markers(np.concatenate([one.ids, other.ids]), np.concatenate([one.px, other.px]))
+
+
+WHOLE = markers_of((9, 7))
+MISREAD = WHOLE.ids.copy()
+MISREAD[[5, 17]] = 44, 3
+IN_THE_ROOM = np.array([[9.0, 9.0], [29, 14], [24, 34], [4, 29]]) + np.array([[[0.0, 0.0]], [[60, 9]], [[5, 70]]])
+
+
+@pytest.mark.parametrize(
+    "read",
+    [
+        WHOLE,
+        Markers(WHOLE.ids[::3], WHOLE.px[::3]),
+        Markers(MISREAD, WHOLE.px),
+        _both(WHOLE, markers_of((9, 7), at=(-11, 3))),
+        _both(WHOLE, Markers(np.array([41, 42, 43]), IN_THE_ROOM)),
+    ],
+    ids=["whole", "a third", "two misread", "a second one on the same lattice", "other markers in the room"],
+)
+def test_the_stated_print_is_not_contradicted(read: Markers) -> None:
+    assert contradiction(read, PRINTED, WHITE_PICTURE) is None
+
+
+@pytest.mark.parametrize(
+    ("read", "said"),
+    [
+        *((markers_of((width, 7)), f"it is {width} squares wide, the board 9") for width in (8, 10)),
+        *(
+            (markers_of((9, 7), first_id=first), f"its markers are numbered from {first} on, those of the board from 0")
+            for first in (5, 400)
+        ),
+        # As rows 88 to 94 of a board of that width.
+        (markers_of((9, 7), first_id=396), "its markers are 396 to 426, those of the board are 0 to 30: "),
+        (
+            markers_of((9, 11)),
+            "its markers are 0 to 48, those of the board are 0 to 30: its rows are more, or numbered",
+        ),
+    ],
+)
+def test_another_print_is_told(read: Markers, said: str) -> None:
+    assert (contradiction(read, PRINTED, WHITE_PICTURE) or "").startswith(said)
+
+
+@pytest.mark.parametrize("across", [8, 9])
+def test_a_board_that_begins_with_white_is_told(across: int) -> None:
+    said = contradiction(markers_of((across, 6), white_first=True), charuco(across, 6), WHITE_PICTURE)
+    assert "OpenCV before 4.6" in (said or "")

@@ -18,8 +18,16 @@ from calibration.sync.lag_fit import SyncFit, fit_sync
 from calibration.sync.transfer import known_row_delay, with_lags
 from calibration.verdict import AccuracyGoal
 from calibration.views import Passages, View
-from tests.reference.boards.calibration_data import BOARD, Seen, TrueRig, random_pose, random_views, seen_view
-from tests.reference.boards.fitted_depth import depth_errors, normalised
+from tests.reference.boards.calibration_data import (
+    BOARD,
+    Seen,
+    TrueRig,
+    depth_errors,
+    normalised,
+    random_pose,
+    random_views,
+    seen_view,
+)
 from tests.stability.inventory import covers
 
 covers(parameters, rules, transfer)

@@ -1,4 +1,4 @@
-"""The calibration file: what is written is read back, and what is wrong is said in one line."""
+"""The files of a calibration and of a camera: what is written is read back, what is wrong said in one line."""
 
 from dataclasses import fields, is_dataclass, replace
 from pathlib import Path
@@ -9,10 +9,11 @@ import yaml
 
 from calibration.errors import CalibrationError
 from calibration.files import problems, sections
-from calibration.files.rig_file import load_rig_model, save_rig_model
+from calibration.files.rig_file import KnownCamera, camera_file_text, load_camera, load_rig_model, save_rig_model
 from calibration.model.camera import Camera
 from calibration.model.rig_model import Covariance, Identity, Lag, RigModel
 from calibration.model.scanner import PivotScanner, PlaneTable
+from calibration.verdict import Verdict, reason_for
 from tests.stability.inventory import covers
 from tests.unit.calibration.cameras import MATRIX, camera
 
@@ -182,3 +183,30 @@ def test_planes_along_the_search_axis_are_refused_whatever_their_sign() -> None:
         else:
             with pytest.raises(CalibrationError, match=r"44\.0 degrees from the search axis"):
                 RigModel(camera([]), scanner)
+
+
+KNOWN = Covariance(("fx", "fy"), np.diag([0.04, 0.09]))
+
+
+def read_back(folder: Path, text: str) -> KnownCamera:
+    file = folder / "camera.yaml"
+    file.write_text(text)
+    return load_camera(file)
+
+
+@pytest.mark.parametrize("codes", [(), ("no-tilt", "poor-coverage")])
+def test_the_verdict_and_its_reasons_are_read_back_with_the_camera(tmp_path: Path, codes: tuple[str, ...]) -> None:
+    verdict = Verdict(not codes, tuple(reason_for(code, "said") for code in codes))
+    lens = camera([-0.1, 0.02, 0, 0, 0])
+    known = read_back(tmp_path, camera_file_text(lens, KNOWN, ["0" * 16], verdict))
+    assert (known.verdict, known.reasons) == ("failed" if codes else "passed", codes)
+    assert np.array_equal(known.camera.distortion, lens.distortion)
+    assert known.views == {"0" * 16}
+
+
+def test_a_file_of_old_is_one_that_nobody_judged(tmp_path: Path) -> None:
+    text = camera_file_text(camera([]), KNOWN, [], Verdict(True))
+    known = read_back(tmp_path, text.replace("verdict: passed\n", ""))
+    assert (known.verdict, known.reasons) == (None, ())
+    with pytest.raises(CalibrationError, match="verdict is 'good'"):
+        read_back(tmp_path, text.replace("verdict: passed\n", "verdict: good\n"))

@@ -1,17 +1,78 @@
 """Passages of the line over pixels: no bias, honest standard deviations, and nothing where nothing is to be told."""
 
+import math
+from dataclasses import dataclass
+
 import mpmath
 import numpy as np
 import pytest
+from numpy.typing import NDArray
 
+from calibration.board.board import Board
 from calibration.passages import find as finding
-from calibration.passages import fit, flux_picture
-from calibration.passages.find import SweepCounts, evenly, find_passages
+from calibration.passages import fit
+from calibration.passages.find import (
+    AWAY_PX,
+    SweepCounts,
+    board_pixels,
+    even_pixels,
+    evenly,
+    find_passages,
+    flux_picture,
+)
 from calibration.passages.fit import LineShape, fit_passages, light
+from calibration.views import Corners
 from tests.stability.inventory import covers
-from tests.unit.calibration.passed_lines import Light, passed, sweep_of, true_at
 
-covers(fit, finding, flux_picture)
+covers(fit, finding)
+
+ROWS = 30
+_INTEGRAL = np.vectorize(lambda z: 0.5 * (1 + math.erf(z / math.sqrt(2))))
+
+
+@dataclass(frozen=True)
+class Light:
+    """sigma: of the line, columns. light: flux times columns. wedge: haze just before the line, its slope per column
+    away from it, its most, and what is left behind the line."""
+
+    sigma: float
+    light: float
+    ambient: float = 0.05
+    wedge: tuple[float, float, float, float] | None = None
+    pixel: float = 1.0
+    travels: bool = False
+
+
+def passed(rng, light: Light, exposures: int, pixels: int = 1500, columns: int = 60):
+    """Counts (columns, ROWS, width) and the true passages (ROWS, width), in columns."""
+    centre = rng.uniform(15, columns - 16, pixels)
+    within = (np.arange(exposures) + 0.5) / exposures - 0.5 if light.travels else np.zeros(1)
+    inside = (np.arange(9) + 0.5) / 9 - 0.5
+    counts = np.zeros((columns, pixels), np.uint16)
+    for part in within:
+        away = np.arange(columns)[:, None] + part - centre
+        z = (away[None] - light.pixel * inside[:, None, None]) / light.sigma
+        flux = light.ambient + light.light * np.exp(-0.5 * z * z).mean(axis=0) / (math.sqrt(2 * math.pi) * light.sigma)
+        if light.wedge is not None:
+            near, slope, most, behind = light.wedge
+            gone = _INTEGRAL(away / light.sigma)
+            flux = flux + (1 - gone) * np.minimum(near * np.exp(slope * np.maximum(-away, 0)), most) + gone * behind
+        frames = 1 if light.travels else exposures
+        counts += rng.binomial(frames, -np.expm1(-flux)).astype(np.uint16)
+    return counts.reshape(columns, ROWS, -1), centre.reshape(ROWS, -1)
+
+
+def sweep_of(counts, exposures, step=1.0, first=0.0) -> SweepCounts:
+    """Counts (columns, rows, width) as a sweep of columns at commands `first`, `first + step`, ..."""
+    columns, _, width = counts.shape
+    frames = np.full(columns, exposures)
+    return SweepCounts(counts, frames, first + step * np.arange(columns), np.zeros(columns, np.int32), width)
+
+
+def true_at(centre: NDArray[np.float64], passages) -> NDArray[np.float64]:
+    """The true passage of each pixel that was given."""
+    return centre[passages.y_px.astype(int), passages.x_px.astype(int)]
+
 
 CASES = {
     "clear": (Light(0.6, 4.0), 10, 0.9),
@@ -146,3 +207,65 @@ def test_a_line_that_moves_lights_the_mean_of_a_columns_frames(sigma, area, with
     lit = [float(1 - mpmath.exp(mpmath.mpf("-0.02")) * dark(away)) for away in at[0].tolist()]
     assert np.abs(-np.expm1(-flux[0]) - lit).max() < within
     assert np.isfinite(slopes).all()
+
+
+HIGH, WIDTH, COLUMNS = 24, 64, 80
+
+
+def _sweep(rng, ambient, line, exposures=10):
+    """A line of flux `line` times the albedo that crosses a pixel per column, over a picture `ambient`."""
+    at = np.arange(COLUMNS)[:, None] - 8 - np.arange(WIDTH)
+    passing = line * np.exp(-0.5 * (at / 0.7) ** 2)[:, None, :] * ambient / ambient.max()
+    counts = rng.binomial(exposures, -np.expm1(-(ambient + passing))).astype(np.uint8)
+    frames = np.full(COLUMNS, exposures)
+    return SweepCounts(counts, frames, np.arange(float(COLUMNS)), np.zeros(COLUMNS, int), WIDTH)
+
+
+def _print(white, black):
+    picture = np.full((HIGH, WIDTH), white)
+    picture[:, 20:40] = black
+    return picture
+
+
+def test_room_light_alone_makes_the_picture_however_bright_the_line():
+    rng = np.random.default_rng(1)
+    ambient = _print(0.4, 0.05)
+    picture = flux_picture((_sweep(rng, ambient, 50.0), _sweep(rng, ambient, 50.0)))
+    assert picture.dtype == np.float32
+    assert picture[:, 25:35].mean() == pytest.approx(0.05, rel=0.06)
+    assert picture[:, 45:].mean() == pytest.approx(0.4, rel=0.03)
+
+
+def test_in_the_dark_the_line_makes_the_picture():
+    rng = np.random.default_rng(2)
+    picture = flux_picture((_sweep(rng, _print(1e-4, 2e-5), 3.0),))
+    assert picture[:, 45:].mean() > 3 * picture[:, 25:35].mean()
+
+
+def test_pixels_that_no_window_held_are_nan():
+    counts = np.full((COLUMNS, HIGH, 32), 5, np.uint8)
+    frames, x0 = np.full(COLUMNS, 10), np.where(np.arange(COLUMNS) < 40, 0, 16)
+    picture = flux_picture((SweepCounts(counts, frames, np.arange(float(COLUMNS)), x0, WIDTH),))
+    assert np.isnan(picture[:, 48:]).all()
+    assert np.allclose(picture[:, 20:30], np.log(2), rtol=0.02)
+
+
+def test_edges_that_the_line_crosses_are_kept_clear_of_and_noise_is_none():
+    rng = np.random.default_rng(4)
+    picture = _print(0.4, 0.05)
+    picture[12:, :20] = 0.05  # an edge along the row
+    picture = (rng.poisson(500 * picture) / 500).astype(np.float32)
+    even = even_pixels(picture)
+    for edge in (20, 40):
+        assert not even[:10, edge - AWAY_PX : edge + AWAY_PX].any()
+    assert even[:, 4:14].mean() > 0.95
+    assert even[:, 46:].mean() > 0.95
+
+
+def test_a_board_is_its_squares_and_the_paper_around_them():
+    board = Board("chessboard", (8, 5), 0.03)
+    at = board.corners_m
+    corners = Corners(np.arange(len(at), dtype=np.int32), at[:, :2] / 0.03 * 20 + [60, 50])  # 20 px a square
+    mask = board_pixels(corners, board, (240, 320))
+    y, x = np.nonzero(mask)
+    assert (x.min(), x.max(), y.min(), y.max()) == (52, 228, 42, 158)

@@ -10,9 +10,22 @@ import pytest
 from calibration.diagnosis.verdicts import judge_fit
 from calibration.rig_fit import misfit
 from calibration.rig_fit.fit import fit_rig
+from calibration.rig_fit.misfit import TermDecision, best, first_order, tried
+from calibration.rig_fit.rows import Terms
+from calibration.rig_fit.solve import RigProblem
 from calibration.views import Passages
-from tests.reference.boards.calibration_data import BOARD, points_at, random_pose, rotation, seen_view
-from tests.reference.boards.fitted_depth import depth_errors, normalised
+from tests.reference.boards.calibration_data import (
+    BOARD,
+    Seen,
+    TrueRig,
+    depth_errors,
+    normalised,
+    points_at,
+    random_pose,
+    random_rig,
+    rotation,
+    seen_view,
+)
 from tests.unit.calibration.fitted_rigs import EXACT, RIG, SEEN, SIZE, held
 
 
@@ -111,3 +124,73 @@ def with_more(sweep: Passages, points: np.ndarray, px: np.ndarray) -> Passages:
         command=np.append(sweep.command, command),
         sd=np.append(sweep.sd, np.full(len(points), EXACT.passage)),
     )
+
+
+STEADY = TrueRig(lens=(-0.1, 0.03, 5e-4, -3e-4, 0.0), angle=(0.09, 0.53))
+PLAIN = Seen(passages=200)
+
+
+def test_views_with_poor_corners_and_single_wrong_ones_are_no_moved_rig() -> None:
+    rng = np.random.default_rng(1)
+    views = []
+    for i in range(10):
+        sd_px = 1.0 if i in (2, 5, 8) else 0.05
+        view = seen_view(rng, STEADY, *random_pose(rng, STEADY), replace(PLAIN, corner_px=sd_px), name=str(i))
+        corners = replace(view.corners, sd_px=np.full(len(view.corners.ids), sd_px))
+        if i == 4:
+            corners.px[3] += [8.0, 2.4]
+        views.append(replace(view, corners=corners))
+    judged = judge_fit(fit_rig(views, BOARD, SIZE), views)
+    assert judged.verdict.passed, judged.verdict
+    assert max(abs(one.shift) / one.sd for one in judged.shifts) < 4
+
+
+def test_a_knock_is_named_that_the_fit_has_nearly_made_up_for() -> None:
+    """What views contradict each other by is less than the accuracy asked, and depth off by three times as much."""
+    rng = np.random.default_rng(34)
+    rig, seen = random_rig(rng), Seen(passages=200, corner_px=0.02, passage=5e-4)
+    moved = rig.moved(np.array([0.001, 0, 0.002]), np.zeros(3))
+    views = [seen_view(rng, moved if i >= 4 else rig, *random_pose(rng, rig), seen, name=str(i)) for i in range(9)]
+    fit = fit_rig(views, BOARD, SIZE)
+    judged = judge_fit(fit, views)
+    assert judged.verdict.codes == ("moved-rig",)
+    assert judged.evidence.shift_m < 0.6 * judged.asked.accuracy_m
+    assert np.median(np.abs(depth_errors(fit.model, moved, 5.0, 35.2)[0])) > 2 * judged.asked.accuracy_m
+
+
+def test_a_rig_that_moved_is_named_with_the_last_view_before() -> None:
+    rng = np.random.default_rng(2)
+    moved = STEADY.moved(np.array([0.002, 0, 0]), np.radians([0, 0.2, 0]))
+    views = [
+        seen_view(rng, moved if i >= 5 else STEADY, *random_pose(rng, STEADY), PLAIN, name=str(i)) for i in range(10)
+    ]
+    judged = judge_fit(fit_rig(views, BOARD, SIZE), views)
+    assert judged.verdict.codes[0] == "moved-rig"
+    assert judged.evidence.moved_after == "4"
+
+
+def test_a_term_changes_all_that_it_would_with_those_that_come_along() -> None:
+    rng = np.random.default_rng(0)
+    terms = Terms(0)
+    names = terms.names
+    free = [(name,) for name in ("axis_turn_1", "axis_shift_1", "angle_0", "angle_1")]
+    new = ("angle_2", "angle_3")
+    root = rng.normal(size=(len(names), 3 * len(names)))
+    matrix, right = root @ root.T, np.zeros(len(names))
+    right[terms.at(new)] = rng.normal(size=2)  # of what is free nothing is left to gain
+    problem = RigProblem((), terms, terms.tied(free), np.ones(0, bool))
+    solution = SimpleNamespace(matrix=matrix, right=right)
+    decision = tried(problem, solution, new, lambda gain: 1.0)
+    everything = terms.at([*(name for (name,) in free), *new])
+    step = np.zeros(len(names))
+    step[everything] = np.linalg.solve(matrix[np.ix_(everything, everything)], right[everything])
+    assert np.isclose(decision.value, step[terms.at(["angle_3"])[0]])
+    assert np.allclose(first_order(problem, solution, decision), step)
+
+
+def test_the_term_that_leaves_least_unexplained_comes_in_first() -> None:
+    sure = TermDecision("offset_0", True, -0.76, 0.037, "", gain=98257.0)
+    right = TermDecision("angle_3", True, -0.0109, 0.0006, "", (("angle_2", -0.006),), 111647.0)
+    left_out = TermDecision("bow", False, 0.02, 0.015, "", gain=2e5)
+    assert best([sure, right, left_out]) == 1
+    assert best([left_out]) is None

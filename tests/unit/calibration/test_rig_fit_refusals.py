@@ -12,8 +12,7 @@ from calibration.model.scanner import PivotScanner
 from calibration.rig_fit.fit import fit_rig
 from calibration.rig_fit.start import check_depth
 from calibration.views import BoardPose, View
-from tests.reference.boards.calibration_data import BOARD, random_views, seen_view
-from tests.reference.boards.fitted_depth import depth_errors, normalised
+from tests.reference.boards.calibration_data import BOARD, depth_errors, normalised, random_views, seen_view
 from tests.unit.calibration.fitted_rigs import RIG, SEEN, SIZE, fitted, held
 
 

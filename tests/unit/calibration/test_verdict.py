@@ -1,13 +1,14 @@
 """Each mistake is named as the first reason, and a sound calibration passes."""
 
 from dataclasses import replace
-from math import nan, radians
+from math import inf, nan, radians
 
 import numpy as np
 import pytest
 
-from calibration import verdict
+from calibration import errors, verdict
 from calibration.board.board import Board
+from calibration.check import CheckedBoard
 from calibration.diagnosis import contradictions, verdicts
 from calibration.diagnosis.contradictions import (
     ViewShift,
@@ -24,15 +25,19 @@ from calibration.diagnosis.rules import (
     judge_refusal,
     view_evidence,
 )
-from calibration.diagnosis.verdicts import judge_fit
-from calibration.errors import Degenerate
+from calibration.diagnosis.verdicts import judge_check, judge_fit, judge_sync
+from calibration.errors import Degenerate, condition_text, digits, in_mm, mm
+from calibration.model.rig_model import Lag, RigModel
+from calibration.model.scanner import PivotScanner
 from calibration.rig_fit.fit import SweepFit, fit_rig
+from calibration.sync.lag_fit import SweepTiming, SyncFit
 from calibration.verdict import AccuracyGoal, Verdict, unguided
 from calibration.views import Corners, View
 from tests.reference.boards.calibration_data import BOARD, Seen, TrueRig, random_views
 from tests.stability.inventory import covers
+from tests.unit.calibration.cameras import camera
 
-covers(verdict, verdicts, contradictions)
+covers(verdict, verdicts, contradictions, errors)
 
 ASKED = AccuracyGoal(accuracy_m=0.014, at_m=5.0, stated_baseline_m=0.3)
 VIEWS = ViewEvidence(shown=12, used=12, coverage=0.8, room_flux=0.2)
@@ -208,3 +213,47 @@ def test_one_move_between_views_is_found() -> None:
     assert last_before_move(calm) is None
     assert common_shift(calm, 0.0, 2) < 1e-4
     assert np.isnan(common_shift(calm[:1], 0.0, 2))
+
+
+@pytest.mark.parametrize(
+    ("length_m", "said"),
+    [(1.4812, "1480"), (0.0123456, "12.3"), (150.0, "150000"), (1.2345e-8, "0.0000123"), (-0.2, "-200"), (0.0, "0"),
+     (-0.0, "0"), (nan, "-"), (inf, "inf"), (-inf, "-inf")],
+)  # fmt: skip
+def test_lengths_are_no_powers_of_ten(length_m: float, said: str) -> None:
+    assert in_mm(length_m) == said
+    assert mm(length_m) == f"{said} mm"
+
+
+def test_as_many_digits_as_are_asked_for_count() -> None:
+    assert [digits(1234.5, count) for count in (1, 2, 3)] == ["1000", "1200", "1230"]
+
+
+def test_a_condition_number_is_a_power_of_ten() -> None:
+    assert [condition_text(value) for value in (1.0, 3.14e7, 2e18, inf, nan)] == [
+        "1.0e+00",
+        "3.1e+07",
+        "2.0e+18",
+        "inf",
+        "inf",
+    ]
+
+
+FAR_OFF = CheckedBoard("000", 9.0, 1.2345, 3.0, 0.4, 900.0, 60, 1.0, 0.01, 0.1, np.zeros((2, 2)))
+
+
+def test_a_board_metres_off_a_plane() -> None:
+    (reason,) = judge_check([FAR_OFF], AccuracyGoal(0.35), 0.5).reasons
+    assert "lie 1230 mm (rms) off a plane, expected are 400 mm, the limit at 9 m is 1130 mm" in reason.text
+
+
+def test_lags_that_cost_metres() -> None:
+    mirror = PivotScanner(np.array([-0.3, 0, 0.0]), np.array([0, 1.0, 0]), np.array([1.0, 0, 0]), np.array([0.1, 0.4]))
+    model = RigModel(camera([]), mirror)
+    sweeps = tuple(SweepTiming(way, speed, 2e-4, 1e-4, 99) for way, speed in ((1, 400.0), (-1, 400.0), (1, 15.0)))
+    known = np.diag([1e-3, 1e-3, 1e-11]) ** 2
+    fit = SyncFit(Lag(2e-4, 2e-4), 0.0, known, (15.0, 400.0), False, (1, -1), False, sweeps, 0.0, 1, 1.0)
+    verdict = judge_sync(fit, model, AccuracyGoal(1.5))
+    (reason,) = verdict.reasons
+    assert reason.value > 1
+    assert f"highest speed {float(f'{reason.value * 1e3:.3g}'):.0f} mm of depth, asked for are 1500 mm" in reason.text
