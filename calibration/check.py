@@ -10,6 +10,7 @@ them. Each result comes with the error expected from the model's covariance and 
 """
 
 import math
+from collections.abc import Iterator
 from dataclasses import dataclass
 
 import cv2
@@ -21,7 +22,7 @@ from calibration.board.board import Board
 from calibration.depth_error import propagated
 from calibration.errors import Degenerate
 from calibration.model.rig_model import RigModel
-from calibration.views import FEWEST_CORNERS, Passages, View
+from calibration.views import FEWEST_CORNERS, Corners, Passages, View
 
 _FEWEST_CELLS = 8
 """Scanned squares of a board; three of them already go into its plane."""
@@ -47,9 +48,8 @@ def cells_of(model: RigModel, view: View, board: Board) -> BoardCells:
         raise Degenerate("no-board", f"view {view.name} has no passages of the line; scan the board with the laser on")
     shape = (board.squares[1], board.squares[0])
     sums = []
-    for sweep in view.passages:
-        xy = _on_board(model, view, board, sweep.x_px, sweep.y_px)
-        inside = np.isfinite(xy).all(axis=1) & np.isfinite(_scanned_points(model, sweep)[:, 2])
+    for sweep, xy, points in _scanned(model, view, board):
+        inside = np.isfinite(xy).all(axis=1) & np.isfinite(points[:, 2])
         column, row = (np.floor(xy[inside] / board.square_m)).astype(np.intp).T
         index = row * shape[1] + column
         columns = [xy[inside, 0], xy[inside, 1], sweep.x_px[inside], sweep.y_px[inside], sweep.command[inside]]
@@ -78,8 +78,7 @@ def cells_of(model: RigModel, view: View, board: Board) -> BoardCells:
 
 def _points_of(model: RigModel, cells: BoardCells) -> Array:
     """(cells, 3): each square's point, the mean of the sweeps'."""
-    points = _triangulated(model, cells.x_px, cells.y_px, cells.command, cells.velocity_per_s)
-    return np.asarray(points.mean(axis=0))
+    return np.asarray(_triangulated(model, cells.x_px, cells.y_px, cells.command, cells.velocity_per_s).mean(axis=0))
 
 
 def noise_m2(model: RigModel, cells: BoardCells, normal: Array) -> float:
@@ -104,33 +103,28 @@ def _triangulated(model: RigModel, x_px: Array, y_px: Array, command: Array, vel
     return np.stack([u * z, v * z, z], axis=-1)
 
 
-def _on_board(model: RigModel, view: View, board: Board, x_px: Array, y_px: Array) -> Array:
-    """(m, 2) where pixels lie on the board, metres; NaN off its squares. Rays see a plane by a homography."""
-    corners = corner_pixels(view)
-    assert view.corners is not None, "checked with the corner's pixels"
-    seen = np.stack(model.camera.tangents_at(corners[:, 0], corners[:, 1]), axis=-1)
-    to_board, _ = cv2.findHomography(seen, board.corners_m[view.corners.ids, :2])
-    rays = np.stack([*model.camera.tangents_at(x_px, y_px), np.ones(len(x_px))], axis=-1) @ to_board.T
-    xy = rays[:, :2] / rays[:, 2:]
-    inside = np.all((xy >= 0) & (xy < np.array(board.size_m)), axis=1)
-    return np.where(inside[:, None], xy, np.nan)
+def _scanned(model: RigModel, view: View, board: Board) -> Iterator[tuple[Passages, Array, Array]]:
+    """Each sweep of a view; where its pixels lie on the board (m, 2), metres, NaN off its squares; and its points
+    (m, 3) in the camera's frame, NaN where the command lies outside the model's range.
 
-
-def corner_pixels(view: View) -> Array:
-    """(n, 2) the view's corners. Raises Degenerate if they are too few to locate the board."""
-    if view.corners is None or len(view.corners.ids) < FEWEST_CORNERS:
-        found = 0 if view.corners is None else len(view.corners.ids)
+    Rays see a plane by a homography. Raises Degenerate if the corners are too few to locate the board.
+    """
+    found = 0 if view.corners is None else len(view.corners.ids)
+    if view.corners is None or found < FEWEST_CORNERS:
         raise Degenerate(
             "no-board",
             f"view {view.name}: {found} corners of the board were found, {FEWEST_CORNERS} are needed; show the whole "
             "board, lit evenly",
         )
-    return view.corners.px
-
-
-def _scanned_points(model: RigModel, passages: Passages) -> Array:
-    """(m, 3) points of passages in the camera's frame; NaN where the command lies outside the model's range."""
-    return _triangulated(model, passages.x_px, passages.y_px, passages.command, passages.velocity_per_s)
+    seen = np.stack(model.camera.tangents_at(*view.corners.px.T), axis=-1)
+    to_board, _ = cv2.findHomography(seen, board.corners_m[view.corners.ids, :2])
+    for sweep in view.passages:
+        rays = np.stack([*model.camera.tangents_at(sweep.x_px, sweep.y_px), np.ones(len(sweep.x_px))], axis=-1)
+        rays = rays @ to_board.T
+        xy = rays[:, :2] / rays[:, 2:]
+        inside = np.all((xy >= 0) & (xy < np.array(board.size_m)), axis=1)
+        points = _triangulated(model, sweep.x_px, sweep.y_px, sweep.command, sweep.velocity_per_s)
+        yield sweep, np.where(inside[:, None], xy, np.nan), points
 
 
 def off_plane(xy: Array) -> Array:
@@ -206,13 +200,14 @@ def check_board(model: RigModel, view: View, board: Board) -> CheckedBoard:
     """Check a view's board. Raises Degenerate if the board or its passages are missing."""
     cells = cells_of(model, view, board)
     points = _points_of(model, cells)
-    corners = corner_pixels(view)
+    corners = view.corners
+    assert corners is not None, "its squares were found by them"
     count = len(cells.board_xy_m)
 
     def measure(tried: RigModel) -> Array:
         found = _points_of(tried, cells)
         normal, offset = _plane(points)  # the same reference for all
-        return np.append(found @ normal - offset, _scale(tried, found, view, board, corners))
+        return np.append(found @ normal - offset, _scale(tried, found, corners, board))
 
     values, covariance = propagated(model, measure)
     deviations, scale = values[:count], float(values[count])
@@ -223,10 +218,7 @@ def check_board(model: RigModel, view: View, board: Board) -> CheckedBoard:
     rest = basis.T @ deviations
     field = np.full((board.squares[1], board.squares[0]), np.nan)
     field[cells.at] = deviations
-    on_board = [
-        _scanned_points(model, sweep)[np.isfinite(_on_board(model, view, board, sweep.x_px, sweep.y_px)).all(axis=1)]
-        for sweep in view.passages
-    ]
+    on_board = [points[np.isfinite(xy).all(axis=1)] for _, xy, points in _scanned(model, view, board)]
     of_points = np.concatenate(on_board) @ normal - offset
     return CheckedBoard(
         name=view.name,
@@ -243,16 +235,14 @@ def check_board(model: RigModel, view: View, board: Board) -> CheckedBoard:
     )
 
 
-def _scale(model: RigModel, points: Array, view: View, board: Board, corners: Array) -> float:
+def _scale(model: RigModel, points: Array, corners: Corners, board: Board) -> float:
     """Size of the corners' pattern, put on the scanned plane along their rays, over its size on the board."""
-    assert view.corners is not None, "checked with the corner's pixels"
     normal, offset = _plane(points)
-    u, v = model.camera.tangents_at(corners[:, 0], corners[:, 1])
+    u, v = model.camera.tangents_at(*corners.px.T)
     rays = np.stack([u, v, np.ones_like(u)], axis=-1)
     placed = rays * (offset / (rays @ normal))[:, None]
-    stated = board.corners_m[view.corners.ids]
-    spread = [float(np.sum((points_ - points_.mean(axis=0)) ** 2)) for points_ in (placed, stated)]
-    return math.sqrt(spread[0] / spread[1])
+    of_placed, of_stated = (float(np.sum((at - at.mean(axis=0)) ** 2)) for at in (placed, board.corners_m[corners.ids]))
+    return math.sqrt(of_placed / of_stated)
 
 
 def _plane(points: Array) -> tuple[Array, float]:

@@ -27,7 +27,7 @@ from calibration.model.rig_model import RigModel
 from calibration.rig_fit.fit import RigFit
 from calibration.rig_fit.noise import bin_starts
 from calibration.rig_fit.rows import Terms
-from calibration.rig_fit.solve import scaled_inverse, view_normal
+from calibration.rig_fit.solve import Weights, scaled_inverse, view_normal
 from calibration.rig_fit.start import Sighting, first_state
 from calibration.views import FEWEST_CORNERS, BoardPose
 
@@ -127,8 +127,10 @@ def sequence(choices: Sequence[Candidate], poses: int, seed: int = 0) -> tuple[C
     """
     rng = np.random.default_rng(seed)
     order = rng.permutation(len(choices)) if seed else np.arange(len(choices))
-    traits = np.array([_traits(choices[i]) for i in order])
-    tilted = [i for i in range(len(order)) if choices[order[i]].tilt != (0, 0)]
+    # Coordinates of poses among others: distance, place, tilt, in steps that matter about as much.
+    shown = [choices[i] for i in order]
+    traits = np.array([[1.5 * math.log(one.distance_m), *(0.7 * np.array(one.place)), *one.tilt] for one in shown])
+    tilted = [i for i, one in enumerate(shown) if one.tilt != (0, 0)]
     chosen = [min(tilted or [0], key=lambda i: traits[i, 0])]
     nearest = np.full(len(order), np.inf)
     while len(chosen) < poses:
@@ -137,7 +139,7 @@ def sequence(choices: Sequence[Candidate], poses: int, seed: int = 0) -> tuple[C
         if nearest.max() == 0:  # all were shown: from the beginning
             nearest = away
         chosen.append(int(np.argmax(nearest)))
-    return tuple(choices[order[i]] for i in chosen[:poses])
+    return tuple(shown[i] for i in chosen[:poses])
 
 
 def rough_camera(size: tuple[int, int]) -> Camera:
@@ -174,11 +176,6 @@ def _candidate(
     return Candidate(fill, float(distance), place, tilt, pose) if inside.all() else None
 
 
-def _traits(candidate: Candidate) -> Array:
-    """Coordinates of a pose among others: distance, place, tilt, in steps that matter about as much."""
-    return np.array([1.5 * math.log(candidate.distance_m), *(0.7 * np.array(candidate.place)), *candidate.tilt])
-
-
 BOARD_POINTS = 14
 """Points along either side of the board where passages are looked at; each stands for as many as there will be."""
 _CELLS = (9, 7)
@@ -213,8 +210,8 @@ class Forecast:
         corner_weight = np.full(corners.residual.size, 1 / (fit.corner_scale * fit.noise.corner_sd_px) ** 2)
         each = self._count * len(seen.sweeps) / max(seen.sd.size, 1)
         weight = each / (fit.noise.passage_factor * seen.sd) ** 2
-        starts = bin_starts(seen, fit.noise.reach)
-        normal = view_normal(corners, passages, corner_weight, weight, starts, fit.noise.jitter_sd**2)
+        weights = Weights(corner_weight, weight, bin_starts(seen, fit.noise.reach))
+        normal = view_normal(corners, passages, weights, fit.noise.jitter_sd**2)
         return self._expected(fit.information + self._tie.T @ normal.matrix @ self._tie / fit.misfit)
 
     def _expected(self, information: Array) -> float:

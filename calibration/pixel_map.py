@@ -177,7 +177,7 @@ def judge_pixels(
     noisy = judged & (index > _chi_square_limit(dof, false_alarm))
     # Counts of a block scatter by their mean times what the index has above its expectation.
     per_block = ones / np.maximum(dof + 1, 1)
-    jump = np.sqrt(np.maximum(index / dof - 1, 0.0) * per_block * (1 - _share(ones, frames)))
+    jump = np.sqrt(np.maximum(index / dof - 1, 0.0) * per_block * (1 - ones / np.maximum(frames, 1)))
     jump_flux = np.where(noisy, jump * (dof + 1) / np.maximum(frames, 1), 0.0)
     dead, lit_judged = (None, np.zeros(1)) if lit is None else dead_pixels(*lit, false_alarm=false_alarm)
     defects = hot | (noisy & (flux + _JUMP_SIGMA * jump_flux > limit))
@@ -270,10 +270,6 @@ def _around(flux: Array) -> Array:
     seen = np.isfinite(flux)
     overall = float(np.median(flux[seen])) if seen.any() else 0.0
     return np.asarray(cv2.medianBlur(np.where(seen, flux, overall).astype(np.float32), 5), np.float64)
-
-
-def _share(ones: NDArray[np.integer], frames: NDArray[np.integer]) -> Array:
-    return np.asarray(ones / np.maximum(frames, 1))
 
 
 def _chi_square_limit(dof: NDArray[np.int64], probability: float) -> Array:

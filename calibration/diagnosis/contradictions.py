@@ -66,11 +66,10 @@ def sweep_waves(sweeps: Sequence[SweepFit]) -> SweepWaves:
         mine = np.array([sweep.direction == direction for sweep in sweeps], dtype=bool)
         if np.isfinite(middle[mine]).any():
             left[mine] -= np.nanmedian(middle[mine])
-    views = [
-        [i for i, sweep in enumerate(sweeps) if sweep.view == name]
-        for name in dict.fromkeys(sweep.view for sweep in sweeps)
-    ]
-    square, sd = _between(left, variance, views)
+    views: dict[str, list[int]] = {}
+    for i, sweep in enumerate(sweeps):
+        views.setdefault(sweep.view, []).append(i)
+    square, sd = _between(left, variance, list(views.values()))
     if np.isnan(square):
         square, sd = _off_lines(left, variance)
     return SweepWaves(
@@ -156,13 +155,12 @@ class ViewShift:
 
 def view_shifts(fit: RigFit, views: dict[str, View]) -> tuple[ViewShift, ...]:
     """The shifts of all views of a fit that have passages. views: by name."""
-    model = fit.model
-    posed = []
+    shifts = []
     for name, pose, sweeps in zip(fit.views, fit.poses, fit.sweeps, strict=True):
-        found = _corner_pose(model, fit, views[name], pose)
+        found = _corner_pose(fit, views[name], pose)
         if found is not None and sweeps:
-            posed.append((name, *found, sweeps))
-    return tuple(_shift(model, *of_view) for of_view in posed)
+            shifts.append(_shift(fit.model, name, *found, sweeps))
+    return tuple(shifts)
 
 
 def common_shift(shifts: tuple[ViewShift, ...], wave: float, sweeps: int) -> float:
@@ -209,7 +207,7 @@ def last_before_move(shifts: tuple[ViewShift, ...]) -> str | None:
     return shifts[best].name if parts[best] < MOST_UNEXPLAINED * spread else None
 
 
-def _corner_pose(model: RigModel, fit: RigFit, view: View, start: BoardPose) -> tuple[BoardPose, Array] | None:
+def _corner_pose(fit: RigFit, view: View, start: BoardPose) -> tuple[BoardPose, Array] | None:
     """Pose by the corners alone, which count as they do in the fit, and its covariance (6, 6)."""
     if view.corners is None:
         return None
@@ -217,7 +215,7 @@ def _corner_pose(model: RigModel, fit: RigFit, view: View, start: BoardPose) -> 
     known = np.isfinite(px).all(axis=1)
     if np.count_nonzero(known) < FEWEST_CORNERS:
         return None
-    points, px, camera = fit.board.corners_m[view.corners.ids[known]], px[known], model.camera
+    points, px, camera = fit.board.corners_m[view.corners.ids[known]], px[known], fit.model.camera
     sd_px = fit.noise.corner_sd_px * corner_scale(view.corners)[known]
     pose = np.concatenate([start.rotation, start.position_m]).astype(np.float64)
     for _ in range(_ROUNDS):

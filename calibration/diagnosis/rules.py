@@ -28,7 +28,6 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from calibration.arrays import Array
 from calibration.board.board import Board, spread_rad
 from calibration.errors import Degenerate, mm
 from calibration.model.camera import Camera
@@ -81,11 +80,12 @@ def view_evidence(
     counted = [view.corners for view in views if view.name not in left_out and view.corners is not None]
     found = [corners for corners in counted if len(corners.ids) > 2]
     area = float(size[0] * size[1])
+    outline = cv2.contourArea(cv2.convexHull(np.concatenate([c.px for c in found]).astype(np.float32))) if found else 0
     fluxes = [_room_flux(view) for view in views if view.picture is not None]
     return ViewEvidence(
         shown=len(views),
         used=used,
-        coverage=_outline_area(np.concatenate([corners.px for corners in found])) / area if found else 0.0,
+        coverage=outline / area if found else 0.0,
         room_flux=float(np.median(fluxes)) if fluxes else np.nan,
         odd=tuple(left_out),
     )
@@ -120,10 +120,6 @@ def rough_poses(views: Sequence[View], board: Board, camera: Camera) -> list[Boa
 def baseline_m(scanner: Scanner) -> float:
     """Distance of the camera from the axis about which the line turns; NaN if the scanner is a table of planes."""
     return float(np.linalg.norm(fan_origin(scanner, None))) if isinstance(scanner, PivotScanner) else math.nan
-
-
-def _outline_area(px: Array) -> float:
-    return float(cv2.contourArea(cv2.convexHull(px.astype(np.float32))))
 
 
 def _room_flux(view: View) -> float:
@@ -183,7 +179,15 @@ def data_lack(
     if views.used < _FEWEST_TO_JUDGE:
         return found
     if poses is not None:
-        found += _poses_lack(poses, imprecise)
+        tilt_rad, board_rad = LEAST_TILT_RAD[imprecise], LEAST_BOARD_RAD[imprecise]
+        if poses.tilt_rad < tilt_rad:
+            text = (
+                f"no two boards are tilted more than {math.degrees(poses.tilt_rad):.0f} degrees against each other, "
+                f"{math.degrees(tilt_rad):.0f} are needed"
+            )
+            found.append(reason_for("no-tilt", text, poses.tilt_rad, tilt_rad))
+        if LEAST_BOARD_RAD[0] <= poses.board_rad < board_rad:
+            found.append(_too_far(poses, board_rad))
     least = LEAST_COVERAGE[imprecise]
     if views.coverage < least:
         text = f"corners reach {views.coverage:.0%} of the picture, {least:.0%} are needed"
@@ -212,20 +216,6 @@ def _too_few(views: ViewEvidence) -> Reason:
     text = f"{shown}, {views.used or 'none'} of them could be used{odd}, {limit}"
     step = _SHOW_ANEW if views.used + len(views.odd) == views.shown else _MEND_VIEWS
     return replace(reason_for("too-few-poses", text, views.used, FEWEST_POSES), next_step=step)
-
-
-def _poses_lack(poses: PoseEvidence, imprecise: bool) -> list[Reason]:
-    found = []
-    least = LEAST_TILT_RAD[imprecise]
-    if poses.tilt_rad < least:
-        text = (
-            f"no two boards are tilted more than {math.degrees(poses.tilt_rad):.0f} degrees against each other, "
-            f"{math.degrees(least):.0f} are needed"
-        )
-        found.append(reason_for("no-tilt", text, poses.tilt_rad, least))
-    if LEAST_BOARD_RAD[0] <= poses.board_rad < LEAST_BOARD_RAD[imprecise]:
-        found.append(_too_far(poses, LEAST_BOARD_RAD[imprecise]))
-    return found
 
 
 def _too_far(poses: PoseEvidence, least: float) -> Reason:
@@ -351,15 +341,8 @@ def _contradictions(fit: FitEvidence, asked: AccuracyGoal, imprecise: bool) -> l
     moved = fit.shift_m > max(most_shift, WAVES_MOVE * fit.wave_m if waves else 0.0)
     found = []
     if waves:
-        found.append(
-            reason_for(
-                "exposure-not-locked",
-                f"planes wave: sweeps of one view differ by {mm(fit.wave_m)} of depth at {asked.at_m:g} m, the limit "
-                f"is {mm(limit)}",
-                fit.wave_m,
-                limit,
-            )
-        )
+        text = f"planes wave: sweeps of one view differ by {mm(fit.wave_m)} of depth at {asked.at_m:g} m, the limit is "
+        found.append(reason_for("exposure-not-locked", text + mm(limit), fit.wave_m, limit))
     if moved:
         named = f" (the rig moved after view {fit.moved_after})" if fit.moved_after else ""
         text = f"views contradict each other by {mm(fit.shift_m)} of depth at {asked.at_m:g} m{named}"

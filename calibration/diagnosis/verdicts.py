@@ -106,21 +106,15 @@ def ray_sd_px(camera: Camera, covariance: Covariance) -> Array:
     def seen(tried: Camera, points: Array) -> Array:
         return np.concatenate(tried.project(points))
 
-    slopes = np.stack(
-        [
-            (seen(changed_camera(camera, {name: _STEP}), rays) - seen(changed_camera(camera, {name: -_STEP}), rays))
-            / (2 * _STEP)
-            for name in covariance.names
-        ],
-        axis=-1,
-    )
-    still = seen(camera, rays)
-    turned = np.stack(
-        [(seen(camera, rays + _STEP * np.cross(axis, rays)) - still) / _STEP for axis in np.eye(3)],
-        axis=-1,
-    )
-    sound = np.isfinite(slopes).all(axis=1) & np.isfinite(turned).all(axis=1)
-    basis = np.linalg.qr(turned[sound])[0]
+    changes = []
+    for name in covariance.names:
+        more, less = (seen(changed_camera(camera, {name: step}), rays) for step in (_STEP, -_STEP))
+        changes.append((more - less) / (2 * _STEP))
+    still, slopes = seen(camera, rays), np.stack(changes, axis=-1)
+    turned = [(seen(camera, rays + _STEP * np.cross(axis, rays)) - still) / _STEP for axis in np.eye(3)]
+    turns = np.stack(turned, axis=-1)
+    sound = np.isfinite(slopes).all(axis=1) & np.isfinite(turns).all(axis=1)
+    basis = np.linalg.qr(turns[sound])[0]
     left = slopes[sound] - basis @ (basis.T @ slopes[sound])
     along_row = np.flatnonzero(sound) < len(rays)
     variance = np.einsum("ni,ij,nj->n", left, covariance.matrix, left)[along_row]

@@ -31,7 +31,7 @@ import os
 import zipfile
 from dataclasses import asdict, dataclass
 from pathlib import Path
-from typing import Any, Final, Literal
+from typing import Any, Final, Literal, TypeVar, get_args
 
 import numpy as np
 import yaml
@@ -39,15 +39,15 @@ from numpy.typing import NDArray
 
 from calibration.errors import CalibrationError
 from calibration.files.npy_files import load_numpy
+from calibration.files.problems import ValueSources, validated
 from calibration.files.sections import (
     FORMAT,
-    VERSION,
     CalibrationFile,
     CameraSection,
     FileSection,
     Number,
     PlaneRows,
-    read_yaml_file,
+    load_yaml,
 )
 from calibration.model.camera import Camera
 from calibration.model.parameters import with_parameters
@@ -57,7 +57,8 @@ from calibration.verdict import Verdict, VerdictWord
 from calibration.views import View
 
 CAMERA_FORMAT = "spadrig-camera"
-CAMERA_VERSION = 1
+VERSION = 1
+"""Version of both formats."""
 CORNERS = "corners"
 """Key in the provenance of a rig's calibration: digests of the views it was made of, those of its camera too."""
 
@@ -88,9 +89,23 @@ class KnownCamera:
     reasons: tuple[str, ...] = ()
 
 
+File = TypeVar("File", bound=CalibrationFile | _CameraFile)
+
+
+def _read(file: Path, what: str, model: type[File]) -> File:
+    """The content of a file that must state its model's format and version. Raises CalibrationError, with one line."""
+    (name,) = get_args(model.model_fields["format"].annotation)
+    read = load_yaml(file, what, f"format: {name}")
+    if read.content.get("format") != name:
+        raise CalibrationError(f"{file} is not {what}: its first entry must be 'format: {name}'")
+    if (version := read.content.get("version")) != VERSION:
+        raise CalibrationError(f"{file} has version {version!r}; this program reads version {VERSION}")
+    return validated(model, read.content, ValueSources(str(file), read.lines))
+
+
 def load_camera(path: Path) -> KnownCamera:
     """Read a camera file. Raises CalibrationError, with one line."""
-    parsed = read_yaml_file(path, "a camera", CAMERA_FORMAT, CAMERA_VERSION, _CameraFile)
+    parsed = _read(path, "a camera", _CameraFile)
     covariance = Covariance(tuple(parsed.covariance.names), np.array(parsed.covariance.matrix, dtype=np.float64))
     camera = Camera(**parsed.camera.model_dump())
     return KnownCamera(camera, covariance, frozenset(parsed.views), parsed.verdict, parsed.reasons)
@@ -100,7 +115,7 @@ def camera_file_text(camera: Camera, covariance: Covariance, views: list[str], v
     """The text of a camera file."""
     content: dict[str, Any] = {
         "format": CAMERA_FORMAT,
-        "version": CAMERA_VERSION,
+        "version": VERSION,
         "camera": camera_content(camera),
         "covariance": {"names": list(covariance.names), "matrix": covariance.matrix.tolist()},
         "views": views,
@@ -141,7 +156,7 @@ def load_rig_model(path: str | os.PathLike[str]) -> RigModel:
     invalid.
     """
     file = Path(path)
-    parsed = read_yaml_file(file, "a calibration", FORMAT, VERSION, CalibrationFile)
+    parsed = _read(file, "a calibration", CalibrationFile)
     try:
         return _build(parsed, file.parent)
     except CalibrationError as error:
@@ -192,19 +207,9 @@ def _save_beside(file: Path, what: str, array: NDArray[Any]) -> str:
 
 
 def _build(parsed: CalibrationFile, folder: Path) -> RigModel:
-    defects = None
-    if parsed.defects is not None:
-        defects = _load_array(folder / parsed.defects, "defects")
-        if defects.dtype != np.bool_:
-            raise CalibrationError(f"defects {parsed.defects} holds {defects.dtype}; it must be bool, True = unusable")
-    dark_rate = None
-    if parsed.dark_rate is not None:
-        dark_rate = _load_array(folder / parsed.dark_rate, "dark_rate")
-        if dark_rate.dtype.kind != "f":
-            raise CalibrationError(
-                f"dark_rate {parsed.dark_rate} holds {dark_rate.dtype}; it must be float32, counts/s"
-            )
-    speed, identity = parsed.speed_range_per_s, parsed.identity
+    defects = None if parsed.defects is None else _array(folder, parsed.defects, "defects")
+    dark_rate = None if parsed.dark_rate is None else _array(folder, parsed.dark_rate, "dark_rate")
+    speed, known, identity = parsed.speed_range_per_s, parsed.covariance, parsed.identity
     model = RigModel(
         camera=Camera(**parsed.camera.model_dump()),
         scanner=_build_scanner(parsed, folder),
@@ -214,31 +219,16 @@ def _build(parsed: CalibrationFile, folder: Path) -> RigModel:
         defects=defects,
         provenance=parsed.provenance.model_dump(exclude_unset=True),
         dark_rate_per_s=dark_rate,
-        covariance=_build_covariance(parsed, folder),
+        covariance=None if known is None else Covariance(tuple(known.names), _array(folder, known.file, "covariance")),
         identity=None if identity is None else Identity(**identity.model_dump() | {"reasons": tuple(identity.reasons)}),
         **{name: getattr(parsed, name) for name in _PLAIN},
     )
-    if model.covariance is not None:
-        _check_names(model, model.covariance)
+    if known is not None:
+        try:  # a fit may have tried more terms than the model kept: their uncertainty counts
+            with_parameters(model, known.names, np.zeros(len(known.names)))
+        except CalibrationError as error:
+            raise CalibrationError(f"covariance.names: {error}") from error
     return model
-
-
-def _check_names(model: RigModel, covariance: Covariance) -> None:
-    """A fit may have tried more terms than the model kept: their uncertainty counts."""
-    try:
-        with_parameters(model, covariance.names, np.zeros(len(covariance.names)))
-    except CalibrationError as error:
-        raise CalibrationError(f"covariance.names: {error}") from error
-
-
-def _build_covariance(parsed: CalibrationFile, folder: Path) -> Covariance | None:
-    section = parsed.covariance
-    if section is None:
-        return None
-    matrix = _load_array(folder / section.file, "covariance.file")
-    if matrix.dtype.kind not in "fiu":
-        raise CalibrationError(f"covariance {section.file} holds {matrix.dtype}; it must be float64 (names, names)")
-    return Covariance(tuple(section.names), matrix)
 
 
 def _build_scanner(parsed: CalibrationFile, folder: Path) -> Scanner:
@@ -256,26 +246,37 @@ def _build_scanner(parsed: CalibrationFile, folder: Path) -> Scanner:
 
 def _plane_rows(planes: PlaneRows, folder: Path) -> NDArray[np.float64]:
     if isinstance(planes, str):
-        rows = _load_array(folder / planes, "planes")
-        if rows.dtype.kind not in "fiu" or rows.ndim != 2 or rows.shape[1] != 4:
-            raise CalibrationError(
-                f"planes {planes} holds {rows.dtype} {rows.shape}; it must be float64 (columns, 4): nx, ny, nz, d"
-            )
-        return rows.astype(np.float64)
+        return _array(folder, planes, "planes").astype(np.float64)
     return np.array(planes, dtype=np.float64).reshape(-1, 4)
 
 
-def _load_array(file: Path, what: str) -> NDArray[Any]:
+_ARRAYS = {
+    "defects": ("b", "bool, True = unusable"),
+    "dark_rate": ("f", "float32, counts/s"),
+    "covariance": ("fiu", "float64 (names, names)"),
+    "planes": ("fiu", "float64 (columns, 4): nx, ny, nz, d"),
+}
+"""Kinds of dtype that a file's arrays may have, and what they must be, in words."""
+
+
+def _array(folder: Path, name: str, what: str) -> NDArray[Any]:
+    """The array of a file beside the calibration. Raises CalibrationError if it is not what it must be."""
+    file, key = folder / name, "covariance.file" if what == "covariance" else what
     try:
         array = load_numpy(file)
     except FileNotFoundError as error:
         raise CalibrationError(
-            f"{what} names {file}, which does not exist; paths are relative to the calibration file"
+            f"{key} names {file}, which does not exist; paths are relative to the calibration file"
         ) from error
     except (OSError, ValueError, EOFError, zipfile.BadZipFile) as error:
-        raise CalibrationError(f"{what} {file} is not a readable .npy array; write it with numpy.save") from error
+        raise CalibrationError(f"{key} {file} is not a readable .npy array; write it with numpy.save") from error
     if not isinstance(array, np.ndarray):
-        raise CalibrationError(f"{what} {file} is an archive, not a single .npy array; write it with numpy.save")
+        raise CalibrationError(f"{key} {file} is an archive, not a single .npy array; write it with numpy.save")
+    kinds, must = _ARRAYS[what]
+    rows = what == "planes" and array.shape[1:] != (4,)
+    if array.dtype.kind not in kinds or rows:
+        shape = f" {array.shape}" if what == "planes" else ""
+        raise CalibrationError(f"{what} {name} holds {array.dtype}{shape}; it must be {must}")
     return array
 
 

@@ -6,17 +6,16 @@ The reader limits size, depth and repetition. A key may occur only once. Errors 
 from collections.abc import Iterator
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Annotated, Any, Final, Literal, TypeVar
+from typing import Annotated, Any, Final, Literal
 
 import yaml
 from pydantic import BaseModel, ConfigDict, Field, model_validator
 
-from calibration.errors import CalibrationError, FileError
-from calibration.files.problems import Key, ValueSources, validated
+from calibration.errors import FileError
+from calibration.files.problems import Key
 from calibration.verdict import VerdictWord
 
 FORMAT = "spadrig-calibration"
-VERSION = 1
 
 Number = Annotated[float, Field(allow_inf_nan=False)]
 Triple = Annotated[list[Number], Field(min_length=3, max_length=3)]
@@ -136,8 +135,6 @@ class CalibrationFile(FileSection):
         return self
 
 
-Content = TypeVar("Content", bound=BaseModel)
-
 MAX_BYTES: Final = 64 << 20
 """Largest file: the plan of a long scan takes a hundredth of that."""
 MAX_DEPTH: Final = 64
@@ -208,19 +205,6 @@ def parse_yaml(text: str, what: str, example: str, name: str) -> YamlFile:
     if twice:
         raise FileError(*(f"{name}:{line}: '{'.'.join(key)}' is given twice; keep one" for key, line in twice))
     return YamlFile(content, text, node)
-
-
-def read_yaml_file(file: Path, what: str, format_name: str, version: int, model: type[Content]) -> Content:
-    """The content of a file that must state this format and version. Raises CalibrationError, with one line, if it
-    cannot be used.
-    """
-    read = load_yaml(file, what, f"format: {format_name}")
-    content = read.content
-    if content.get("format") != format_name:
-        raise CalibrationError(f"{file} is not {what}: its first entry must be 'format: {format_name}'")
-    if content.get("version") != version:
-        raise CalibrationError(f"{file} has version {content.get('version')!r}; this program reads version {version}")
-    return validated(model, content, ValueSources(str(file), read.lines))
 
 
 class _Refused(yaml.YAMLError):

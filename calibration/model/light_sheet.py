@@ -44,10 +44,14 @@ def inverse_depth(u: ArrayLike, v: ArrayLike, planes: ArrayLike) -> Array:
 
 def depth(u: ArrayLike, v: ArrayLike, planes: ArrayLike) -> Array:
     """Depth z (m) of rays (u, v) on planes (..., 4), |n| = 1; NaN where nearly parallel or behind the camera."""
-    inverse = inverse_depth(u, v, planes)
+    return _met(u, v, inverse_depth(u, v, planes), _along(u, v, planes))
+
+
+def _met(u: ArrayLike, v: ArrayLike, inverse: Array, along: Array) -> Array:
+    """Depth z (m) of rays from 1/z and from n.r on the plane that they meet, with the rules of `depth`."""
     with np.errstate(all="ignore"):
         length = np.sqrt(np.square(np.asarray(u, np.float64)) + np.square(np.asarray(v, np.float64)) + 1)
-        met = (inverse > 0) & (np.abs(_along(u, v, planes)) >= NEARLY_PARALLEL * length)
+        met = (inverse > 0) & (np.abs(along) >= NEARLY_PARALLEL * length)
         z: Array = 1.0 / np.where(met, inverse, np.nan)
     return z
 
@@ -131,11 +135,7 @@ class LightSheets:
         if not self.bow_per_rad:
             return depth(u, v, self.planes)
         w = self.inverse_depth(u, v)
-        with np.errstate(all="ignore"):
-            length = np.sqrt(np.square(np.asarray(u, np.float64)) + np.square(np.asarray(v, np.float64)) + 1)
-            met = (w > 0) & (np.abs(self.planes[..., 3] * w) >= NEARLY_PARALLEL * length)
-            z: Array = 1.0 / np.where(met, w, np.nan)
-        return z
+        return _met(u, v, w, self.planes[..., 3] * w)
 
     def _bowed(self, seen: Array) -> tuple[Array, Array, NDArray[np.bool_]]:
         """The bow for X - O, or that over z: distance off the plane, slope by w, whether it lies ahead of the fan."""

@@ -261,9 +261,8 @@ def misfit(problem: RigProblem, solution: RigSolution) -> Misfit:
 
 def _of_sweeps(problem: RigProblem, solution: RigSolution, view: int) -> Iterator[tuple[float, int]]:
     """chi2 and number of the terms of the smooth part of each of a view's sweeps."""
-    seen, jitter = problem.sightings[view], solution.weight.jitter
-    residual, weight = solution.rows[view][1].residual, solution.weight.passages[view]
-    starts = solution.weight.starts[view]
+    seen, jitter, residual = problem.sightings[view], solution.jitter, solution.rows[view][1].residual
+    _, weight, starts = solution.weight[view]
     for sweep in seen.sweeps:
         basis = smooth_basis(seen.command[sweep], seen.y_px[sweep])
         inside = starts[(starts >= sweep.start) & (starts < sweep.stop)] - sweep.start

@@ -118,7 +118,8 @@ def passage_noise(residuals: Sequence[Array], sightings: Sequence[Sighting]) -> 
     difference of their commands. Of all lengths, the one that differs most significantly from independent errors is
     taken.
     """
-    width = _bin_width(sightings)
+    shown = [seen.command for seen in sightings if seen.command.size]
+    width = (max(float(command.max()) for command in shown) - min(float(command.min()) for command in shown)) / BINS
     pairs, shares = np.zeros(MOST_REACH_BINS), np.zeros(MOST_REACH_BINS)
     spread = within = 0.0
     lengths = []
@@ -188,12 +189,6 @@ def _robust_smooth(command: Array, y_px: Array, residual: Array, weight: Array) 
             break
         part = smooth_part(command, y_px, residual, weight * tail_weight(left / scale))
     return part
-
-
-def _bin_width(sightings: Sequence[Sighting]) -> float:
-    low = min(float(seen.command.min()) for seen in sightings if seen.command.size)
-    high = max(float(seen.command.max()) for seen in sightings if seen.command.size)
-    return (high - low) / BINS
 
 
 def _centred(values: Array) -> Array:

@@ -43,17 +43,10 @@ class Terms:
         return (*MATRIX, *LENS_TERMS[: self.lens])
 
     @property
-    def scanner(self) -> tuple[str, ...]:
-        """Names of the mirror's parameters."""
-        return (
-            *AXIS,
-            *(f"angle_{k}" for k in range(ANGLE_TERMS)), *(f"offset_{k}" for k in range(OFFSET_TERMS)), "cone", "bow",
-        )  # fmt: skip
-
-    @property
     def names(self) -> tuple[str, ...]:
         """Names of all columns."""
-        return (*self.camera, *self.scanner, *TIMES)
+        angle, offset = (f"angle_{k}" for k in range(ANGLE_TERMS)), (f"offset_{k}" for k in range(OFFSET_TERMS))
+        return (*self.camera, *AXIS, *angle, *offset, "cone", "bow", *TIMES)
 
     def at(self, names: Sequence[str]) -> list[int]:
         """The column numbers of some parameters."""

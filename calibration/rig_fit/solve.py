@@ -13,6 +13,7 @@ follows from their solution.
 
 from collections.abc import Sequence
 from dataclasses import dataclass
+from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -58,29 +59,24 @@ class ViewNormal:
         return np.block([[covariance, across], [across.T, own]])
 
 
-@dataclass(frozen=True, slots=True, eq=False)
-class Weights:
-    """Weights per view: of corners' coordinates (2 n,), of passages (m,); the starts of bins that share jitter; its
-    variance.
-    """
+class Weights(NamedTuple):
+    """Weights in a view: of corners' coordinates (2 n,), of passages (m,); and the starts of bins that share jitter."""
 
-    corners: tuple[Array, ...]
-    passages: tuple[Array, ...]
-    starts: tuple[NDArray[np.int64], ...]
-    jitter: float
+    corners: Array
+    passages: Array
+    starts: NDArray[np.int64]
 
 
-def weights(rows: Sequence[tuple[Rows, Rows]], sightings: Sequence[Sighting], noise: Noise) -> Weights:
-    """Inverse variances, reduced for residuals in the tails."""
-    corners, passages, starts = [], [], []
+def weights(rows: Sequence[tuple[Rows, Rows]], sightings: Sequence[Sighting], noise: Noise) -> list[Weights]:
+    """Inverse variances in each view, reduced for residuals in the tails."""
+    found = []
     for (corner, passage), seen in zip(rows, sightings, strict=True):
-        sd_px = noise.corner_sd_px * seen.corner_scale
-        corners.append(np.tile(corner_weights(corner.residual.reshape(2, -1), sd_px), 2))
+        corners = np.tile(corner_weights(corner.residual.reshape(2, -1), noise.corner_sd_px * seen.corner_scale), 2)
         own = (noise.passage_factor * seen.sd) ** 2
         away = passage.residual / np.sqrt(own + noise.jitter_sd**2)
-        passages.append(np.concatenate([np.zeros(0), *(tail_weight(away[sweep]) for sweep in seen.sweeps)]) / own)
-        starts.append(bin_starts(seen, noise.reach))
-    return Weights(tuple(corners), tuple(passages), tuple(starts), noise.jitter_sd**2)
+        passages = np.concatenate([np.zeros(0), *(tail_weight(away[sweep]) for sweep in seen.sweeps)]) / own
+        found.append(Weights(corners, passages, bin_starts(seen, noise.reach)))
+    return found
 
 
 def corner_weights(residual_px: Array, sd_px: Array) -> Array:
@@ -94,24 +90,19 @@ def all_rows(state: RigState, sightings: Sequence[Sighting], terms: Terms) -> li
     return [state.rows(view, seen, terms) for view, seen in enumerate(sightings)]
 
 
-def normals(rows: Sequence[tuple[Rows, Rows]], weight: Weights) -> list[ViewNormal]:
-    """The normal equations of each view."""
-    return [
-        view_normal(corner, passage, weight.corners[view], weight.passages[view], weight.starts[view], weight.jitter)
-        for view, (corner, passage) in enumerate(rows)
-    ]
+def normals(rows: Sequence[tuple[Rows, Rows]], weight: Sequence[Weights], jitter: float) -> list[ViewNormal]:
+    """The normal equations of each view. jitter: variance."""
+    return [view_normal(*pair, of_view, jitter) for pair, of_view in zip(rows, weight, strict=True)]
 
 
-def view_normal(
-    corners: Rows, passages: Rows, corner_weight: Array, weight: Array, starts: NDArray[np.int64], jitter: float
-) -> ViewNormal:
+def view_normal(corners: Rows, passages: Rows, weight: Weights, jitter: float) -> ViewNormal:
     """The normal equations of one view after elimination of its pose."""
-    of_corners, corner_right, corner_chi2 = _products(corners, corner_weight)
-    of_passages, passage_right, passage_chi2 = _products(passages, weight)
-    if jitter and starts.size:
+    of_corners, corner_right, corner_chi2 = _products(corners, weight.corners)
+    of_passages, passage_right, passage_chi2 = _products(passages, weight.passages)
+    if jitter and weight.starts.size:
         whole = np.hstack([passages.shared, passages.pose, passages.residual[:, None]])
-        sums = np.add.reduceat(whole * weight[:, None], starts)
-        share = jitter / (1 + jitter * np.add.reduceat(weight, starts))
+        sums = np.add.reduceat(whole * weight.passages[:, None], weight.starts)
+        share = jitter / (1 + jitter * np.add.reduceat(weight.passages, weight.starts))
         less = (sums * share[:, None]).T @ sums
         of_passages, passage_right = of_passages - less[:-1, :-1], passage_right - less[:-1, -1]
         passage_chi2 -= float(less[-1, -1])
@@ -183,7 +174,8 @@ class RigSolution:
 
     state: RigState
     rows: list[tuple[Rows, Rows]]
-    weight: Weights
+    weight: list[Weights]
+    jitter: float
     views: list[ViewNormal]
     matrix: Array
     right: Array
@@ -202,11 +194,11 @@ def solved(problem: RigProblem, state: RigState, noise: Noise, *, roughly: bool 
     roughly: whether to stop once it is accurate enough for decisions.
     """
     rows = all_rows(state, problem.sightings, problem.terms)
-    damping = 0.0
+    damping, jitter = 0.0, noise.jitter_sd**2
     for step in range(MOST_STEPS):
         if step < WEIGHED_STEPS:
             weight = weights(rows, problem.sightings, noise)
-        views = normals(rows, weight)
+        views = normals(rows, weight, jitter)
         chi2 = _chi2(views, problem, state)
         counted = _counted(views, problem)
         matrix: Array = np.sum([view.matrix for view in counted], axis=0)
@@ -218,7 +210,7 @@ def solved(problem: RigProblem, state: RigState, noise: Noise, *, roughly: bool 
         free = problem.tie.T @ right
         promised = float(free @ inverse @ free) + sum(_own_promise(view) for view in counted)
         there = promised < (1 + ROUGH_SHARE * chi2 if roughly else CONVERGED_CHI2)
-        solution = RigSolution(state, rows, weight, views, matrix, right, condition, there)
+        solution = RigSolution(state, rows, weight, jitter, views, matrix, right, condition, there)
         if there:
             break
         tried = None
@@ -227,7 +219,7 @@ def solved(problem: RigProblem, state: RigState, noise: Noise, *, roughly: bool 
             tried = _tried(problem, state, shared, views)
             if tried is not None:
                 rows = all_rows(tried, problem.sightings, problem.terms)
-                if _chi2(normals(rows, weight), problem, tried) > chi2 + WORSE_CHI2:
+                if _chi2(normals(rows, weight, jitter), problem, tried) > chi2 + WORSE_CHI2:
                     tried = None
             damping = max(10 * damping, 1e-4) if tried is None else damping / 10 if damping > 1e-5 else 0.0
         if tried is None:

@@ -263,10 +263,8 @@ def fit_sync(sweeps: Sequence[Passages], row_delay_s: float = 0.0, row_delay_sd_
     which = {way: 0 if common else told.index(way) for way in told}
     kept = [which.get(way) for way in (1, -1)]
     covariance = np.full((3, 3), np.nan)
-    for a, i in enumerate([*kept, len(lags) if row_told else None]):
-        for b, j in enumerate([*kept, len(lags) if row_told else None]):
-            if i is not None and j is not None:
-                covariance[a, b] = solved.covariance[i, j]
+    places = {at: i for at, i in enumerate([*kept, len(lags) if row_told else None]) if i is not None}
+    covariance[np.ix_(list(places), list(places))] = solved.covariance[np.ix_(*2 * [list(places.values())])]
     if not row_told:
         covariance[2, 2] = row_variance
     lag_s = {way: float(solved.value[i]) for way, i in which.items()}

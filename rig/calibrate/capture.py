@@ -187,8 +187,7 @@ def _sweep_counts(sweep: SweepData, plan: ScanPlan) -> SweepCounts:
     """The counts of a sweep, with the commands of its columns as if the plan knew of no lag."""
     volume = sweep.volume
     assert isinstance(volume, CountVolume), "what argmax has counted"
-    lag_s = _leg(plan, sweep.direction).lag_s
-    command = plan.command_at(volume.column) + plan.velocity_per_s(sweep.direction) * lag_s
+    command = plan.command_at(volume.column) + plan.velocity_per_s(sweep.direction) * _leg(plan, sweep.direction).lag_s
     return SweepCounts(volume.counts, volume.n_frames, command, volume.x0, volume.width)
 
 
@@ -286,9 +285,9 @@ class SpeedRotation:
             return capture
         if self._sees(capture):
             self._shown.add(exposures)
-            return capture
-        slowest = max(self.turns)
-        return capture if exposures >= slowest else self._again(capture, exposures, slowest, scan)
+        elif exposures < (slowest := max(self.turns)):
+            return self._again(capture, exposures, slowest, scan)
+        return capture
 
     def _in_turn(self, pose: int, scan: Scan) -> tuple[int | None, Capture]:
         while True:

@@ -231,7 +231,6 @@ class PixelResult:
     def rows(self) -> list[tuple[str, str]]:
         """Figures for people, by name."""
         pixels = self.found.pixels
-        share = f"{pixels.defects.mean():.2%} of all"
         dead = "not judged: no lit frames"
         if pixels.dead is not None:
             dead = f"{int(pixels.dead.sum())}; {pixels.lit_judged:.1%} are lit well enough to be judged"
@@ -243,7 +242,7 @@ class PixelResult:
             ("hot", f"{int(pixels.hot.sum())} above {digits(float(np.nanmedian(pixels.limit_per_s)))} counts/s"),
             ("noisy", f"{int(pixels.noisy.sum())} jump; {pixels.judged:.1%} fire often enough to be judged"),
             ("dead", dead),
-            ("defects", f"{int(pixels.defects.sum())} pixels, {share}"),
+            ("defects", f"{int(pixels.defects.sum())} pixels, {pixels.defects.mean():.2%} of all"),
         ]
         if self.drift is not None and self.against is not None:
             rows += _drift_rows(self.drift, self.against)
@@ -421,8 +420,12 @@ def _written(result: PixelResult, folder: RunFolder, calibration: Path | None) -
     try:
         save_pixels(result.found, folder.place(PIXELS_FILE))
         folder.place("dark_rate.png").write_bytes(png_bytes(dark_rate_picture(pixels)))
-        if calibration is not None:
-            _save_calibration(calibration, pixels, folder.place(CALIBRATION_FILE))
+        if calibration is not None:  # the config's with the new map, and the notes that speak against it
+            before, file = load_rig_model(calibration), folder.place(CALIBRATION_FILE)
+            rate = np.nan_to_num(pixels.rate_per_s, nan=pixels.ordinary_per_s).astype(np.float32)
+            after = replace(before, defects=pixels.defects, dark_rate_per_s=rate)
+            save_rig_model(after, file)
+            carry_notes(calibration, before, file, after, new_pixels=True)
     except CalibrationError as error:
         raise UsageError(f"calibration: {error}") from error
     except OSError as error:
@@ -433,12 +436,3 @@ def _written(result: PixelResult, folder: RunFolder, calibration: Path | None) -
     folder.write_text("report.html", pixel_page(pixels, result.rows(), result.verdict, result.drift, result.against))
     folder.write_json("summary.json", written.as_json())
     return replace(written, folder=folder.publish())
-
-
-def _save_calibration(old: Path, pixels: PixelMap, file: Path) -> None:
-    """Write the config's calibration with the new map of the pixels, and carry over notes that speak against it."""
-    before = load_rig_model(old)
-    rate = np.nan_to_num(pixels.rate_per_s, nan=pixels.ordinary_per_s).astype(np.float32)
-    after = replace(before, defects=pixels.defects, dark_rate_per_s=rate)
-    save_rig_model(after, file)
-    carry_notes(old, before, file, after, new_pixels=True)

@@ -271,18 +271,14 @@ def told(view: View, refused: Degenerate | None) -> str:
         return f"view {view.name}: {refused}"
     parts = [] if view.corners is None else [f"{len(view.corners.ids)} corners"]
     if view.passages:
-        counts = ", ".join(str(len(sweep.command)) for sweep in view.passages)
-        parts.append(f"{counts} passages of the line" + ("" if shows_line(view) else _too_few(view)))
+        parts.append(f"{', '.join(str(len(sweep.command)) for sweep in view.passages)} passages of the line")
+        if not shows_line(view):  # so few are as good as none
+            where = "" if view.corners is None else ", or hold the board where the line passes"
+            parts.append(
+                f"too few to count (limit {FEWEST_PASSAGES} a sweep): the line does not stand out in single pixels; "
+                f"give it more exposures per column (2 to 5 do in a dark room) or more power{where}"
+            )
     return f"view {view.name}: {', '.join(parts) or 'neither corners nor passages'}"
-
-
-def _too_few(view: View) -> str:
-    """Say why so few passages are as good as none, and what to do about it."""
-    where = "" if view.corners is None else ", or hold the board where the line passes"
-    return (
-        f", too few to count (limit {FEWEST_PASSAGES} a sweep): the line does not stand out in single pixels; give it "
-        f"more exposures per column (2 to 5 do in a dark room) or more power{where}"
-    )
 
 
 def true_model(live: RigConfig | None) -> RigModel | None:

@@ -48,12 +48,8 @@ def sort_sources(sources: SourcesLike, *, pictures: bool = False, scene: str | N
     scene: of a simulated rig. None is its own or, if that has no board, the bundled one with a board. Raises UsageError
     with a line per problem, DeviceError if a scene cannot be read.
     """
-    live: list[RigConfig] = []
-    sessions: list[Path] = []
-    recorded: list[Path] = []
-    found: list[Path] = []
-    problems: list[str] = []
-    notes: list[str] = []
+    live, problems, notes = list[RigConfig](), list[str](), list[str]()
+    sessions, recorded, found = list[Path](), list[Path](), list[Path]()
     if isinstance(sources, RigConfig | str | os.PathLike):
         sources = [sources]
     for source in sources or (SIMULATED,):
@@ -87,21 +83,15 @@ def sort_sources(sources: SourcesLike, *, pictures: bool = False, scene: str | N
         problems.append(
             f"{found[0]} is a picture, which serves 'rig calibrate camera' only; name runs taken with --record"
         )
-    problems += _named_twice([*sessions, *recorded, *found])
-    if problems:
-        raise UsageError.of(problems)
-    return ViewSources(live[0] if live else None, tuple(sessions), tuple(recorded), tuple(found), tuple(notes))
-
-
-def _named_twice(paths: Sequence[Path]) -> list[str]:
-    """A line for each source that was named before."""
-    problems, known = [], dict[Path, Path]()
-    for path in paths:
+    known = dict[Path, Path]()
+    for path in (*sessions, *recorded, *found):
         first = known.setdefault(path.resolve(), path)
         if first is not path:
             also = "" if str(first) == str(path) else f" (the first time as {first})"
             problems.append(f"{path} is named twice{also}; what is in it must count once: name it once")
-    return problems
+    if problems:
+        raise UsageError.of(problems)
+    return ViewSources(live[0] if live else None, tuple(sessions), tuple(recorded), tuple(found), tuple(notes))
 
 
 def _live(source: Config, scene: str | None, notes: list[str]) -> RigConfig:

@@ -1,6 +1,6 @@
 """Decides whether a calibration may be used: whether it is of this rig, passed its checks, and is not too old.
 
-A measured calibration states its devices, its date and its verdict (`calibration.Identity`). One written by hand states
+A measured calibration states its devices, its date and its verdict (`Identity`). One written by hand states
 nothing and is used unchecked. Everything that affects depth is compared: kinds and serial numbers of sensor and
 scanner, how they are mounted, and the laser lines; for a simulated rig, its geometry. Settings of a scan are not
 compared. A recording's calibration is compared with the devices and the date of the recording.

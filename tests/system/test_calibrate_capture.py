@@ -42,7 +42,6 @@ def captured(tmp_path_factory):
 def test_the_board_is_found_where_it_is(captured):
     _, capture, _ = captured
     assert capture.refused is None
-    assert capture.view.corners is not None
     assert len(capture.view.corners.ids) == 48
     assert capture.view.picture is not None
     assert capture.view.picture.shape == (512, 512)
@@ -106,7 +105,6 @@ def test_a_picture_without_a_board_is_kept_with_the_reason():
     capture = capture_view(config, "000", load_board())
     assert capture.view.corners is None
     assert capture.view.picture is not None
-    assert capture.refused is not None
     assert capture.refused.reason == "no-board"
 
 
@@ -119,7 +117,6 @@ def test_rigs_of_several_lines_and_real_light_are_refused():
 
 def test_the_simulated_gate_has_no_delay(captured):
     delay = gate_delay(captured[2])
-    assert delay is not None
     assert delay.edges == 4  # two sweeps
     for late_s, sd_s in ((delay.opens_s, delay.opens_sd_s), (delay.closes_s, delay.closes_sd_s)):
         assert abs(late_s) < 3 * sd_s

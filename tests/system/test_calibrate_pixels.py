@@ -53,7 +53,6 @@ def test_hot_and_dead_pixels_and_dark_rates_are_those_of_the_sensor(mapped: tupl
     pixels = mapped[1].found.pixels
     rate, stuck, dead = truth()
     assert pixels.frames >= FRAMES
-    assert pixels.dead is not None
     assert (pixels.dead & dead).sum() >= 0.9 * dead.sum()
     assert not (pixels.dead & ~dead).any()
     hot = (rate > pixels.limit_per_s) & ~dead | stuck
@@ -67,7 +66,6 @@ def test_hot_and_dead_pixels_and_dark_rates_are_those_of_the_sensor(mapped: tupl
 
 def test_the_folder_holds_the_map_the_calibration_and_the_report(mapped: tuple[Path, PixelResult]) -> None:
     _, result = mapped
-    assert result.folder is not None
     assert result.verdict.passed
     assert result.exit_code == 0
     assert {file.name for file in result.folder.iterdir()} >= {
@@ -79,9 +77,7 @@ def test_the_folder_holds_the_map_the_calibration_and_the_report(mapped: tuple[P
     assert summary["drift"] is None
     assert summary["defects"] == int(result.found.pixels.defects.sum())
     model = load_rig_model(result.folder / "calibration.yaml")
-    assert model.defects is not None
     assert np.array_equal(model.defects, result.found.pixels.defects)
-    assert model.dark_rate_per_s is not None
     assert model.dark_rate_per_s.shape == (HEIGHT, WIDTH)
     assert load_pixels(result.folder / "pixels.npz").id == result.found.id
     page = (result.folder / "report.html").read_text()
@@ -96,10 +92,8 @@ def test_the_next_map_knows_the_last_one_and_says_what_changed(
     mapped: tuple[Path, PixelResult], tmp_path: Path
 ) -> None:
     file, first = mapped
-    assert first.folder is not None
     again = calibrate_pixels(file, seed=4, against=first.folder)
     assert (again.found.version, again.found.parent) == (2, first.found.id)
-    assert again.drift is not None
     assert again.drift.reasons == ()
     assert again.drift.ratio == pytest.approx(1, abs=0.02)
     assert again.as_json()["drift"]["became_hot"] == []
@@ -119,7 +113,6 @@ def test_a_recorded_run_gives_its_dark_and_lit_frames(tmp_path: Path) -> None:
     result = calibrate_pixels(tmp_path / "run", out=tmp_path / "out")
     rate, stuck, dead = truth()
     pixels = result.found.pixels
-    assert pixels.dead is not None
     assert not (pixels.dead & ~dead).any()
     assert (pixels.dead & dead).sum() > 0.8 * dead.sum()
     assert pixels.hot[stuck].all()
@@ -134,7 +127,6 @@ def test_the_default_map_to_compare_with_lies_beside_the_calibration_and_a_bad_d
 ) -> None:
     file = rig_of(tmp_path / "rig")
     first = calibrate_pixels(file, out=tmp_path / "out")
-    assert first.folder is not None
     assert first.drift is None
     for name in ("pixels.npz", "calibration.yaml", "calibration-defects.npy", "calibration-dark-rate.npy"):
         (first.folder / name).replace(tmp_path / "rig" / name)
@@ -191,9 +183,7 @@ def test_marking_the_defects_never_worsens_a_scan_and_helps_the_naive_estimators
         content["world"]["sensor"] = {**SENSOR, **MANY}
         content["calibration"], content["scan"]["columns"] = f"{name}.yaml", 120
         run = api.scan(write_rig(folder, content), estimator=estimator, seed=2)
-        assert run.summary.truth is not None
         within = run.summary.truth.stripe_error_px["within_1px"]
-        assert within is not None
         wrong.append(1 - within)
     assert wrong[1] <= wrong[0] + 0.003
     if estimator == "argmax":

@@ -13,8 +13,6 @@ import numpy as np
 from numpy.typing import NDArray
 
 from calibration.arrays import Array
-from calibration.board.board import MARGIN_SQUARES, Board
-from calibration.views import BoardPose
 from rig.count.volume import CountVolume, SweepCounter, SweepLayout
 from rig.threads import RowWorkers
 from sim_backend.effects.dark_counts import dark_rates
@@ -26,7 +24,7 @@ from sim_backend.light.view import make_view
 from sim_backend.mirror_motion import Jitter
 from sim_backend.scenes.board import BoardAtPose, board_scene
 from sim_backend.scenes.scene import SceneFile
-from tests.reference.boards.random_rigs import COMMAND_REACH, RandomRig
+from tests.reference.boards.random_rigs import COMMAND_REACH, RandomRig, paper
 
 FRAME_S = 1e-5
 COLUMNS = 800
@@ -97,7 +95,7 @@ def take_sweeps(
     ambient = {"ambient": {"illuminance": f"{rig.illuminance_lux!r} lux"}}
     optics, sensor, line = Optics(), stand.sensor, Line()
     gain = detections_per_radiance(optics, sensor, line)
-    points = np.concatenate([_paper(one.board, one.pose) for one in shown])
+    points = np.concatenate([paper(one.board, one.pose) for one in shown])
     wall_m = max(WALL_M, float(points[:, 2].max()) + BEHIND_M)
     view = make_view(rig.model, board_scene(*stand.rays, shown, wall_m), rays=stand.rays)
     light = FluxModel(Setting(view, SceneFile.model_validate(ambient), optics, sensor, line, gain))
@@ -157,11 +155,3 @@ def _where(rig: RandomRig, points: Array) -> tuple[int, int, int, int]:
     # A column's light comes from where the mirror was a lag ago: up to 6 columns at the fastest.
     first, last = int(met.min()) - SPARE_COLUMNS, int(met.max()) + SPARE_COLUMNS
     return max(0, first), min(COLUMNS - 1, last), x0, end - x0
-
-
-def _paper(board: Board, pose: BoardPose) -> Array:
-    margin = MARGIN_SQUARES * board.square_m
-    x = np.linspace(-margin, board.size_m[0] + margin, 9)
-    y = np.linspace(-margin, board.size_m[1] + margin, 9)
-    grid: Array = pose.to_camera(np.stack([*np.meshgrid(x, y), np.zeros((9, 9))], axis=-1).reshape(-1, 3))
-    return grid

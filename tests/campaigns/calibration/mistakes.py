@@ -24,7 +24,6 @@ from calibration.board.detect import find_corners
 from calibration.diagnosis.rules import baseline_m
 from calibration.diagnosis.verdicts import judge_fit, judge_refused
 from calibration.errors import Degenerate
-from calibration.model.scanner import PivotScanner
 from calibration.rig_fit.fit import fit_rig
 from calibration.views import BoardPose, View
 from sim_backend.scenes.board import BoardAtPose
@@ -61,7 +60,7 @@ class Session:
 
     def pose(self, **how: object) -> BoardPose:
         """A random one."""
-        return random_pose(self.rng, self.stand.rig.model.camera, BOARD, **how)  # type: ignore[arg-type]
+        return random_pose(self.rng, self.stand.rig.model.camera, BOARD, **how)
 
     def distance_m(self, board: Board, seen_px: tuple[float, float]) -> tuple[float, float]:
         """Between which distances the board's width is seen at these sizes in pixels."""
@@ -143,7 +142,6 @@ def room_light(session: Session, good: list[View]) -> str:
 def wrong_square(session: Session, good: list[View]) -> str:
     """A print 2 to 5 % larger or smaller than stated; somebody has measured the baseline to a millimetre."""
     scale = 1 + session.rng.choice([-1, 1]) * session.rng.uniform(0.02, 0.05)
-    assert BOARD.marker_m is not None
     stated = replace(BOARD, square_m=scale * BOARD.square_m, marker_m=scale * BOARD.marker_m)
     return session.named(good, stated, round(baseline_m(session.stand.rig.model.scanner), 3))
 
@@ -159,7 +157,6 @@ def moved(session: Session, good: list[View]) -> str:
     """Somebody knocks the scanner in the middle: 2 to 5 mm or 0.3 to 1 degree from some view on."""
     rng, model = session.rng, session.stand.rig.model
     scanner = model.scanner
-    assert isinstance(scanner, PivotScanner)
     if rng.random() < 0.5:
         across = np.cross(scanner.axis_direction, rng.normal(size=3))
         shift = rng.uniform(2e-3, 5e-3) * across / np.linalg.norm(across)

@@ -34,7 +34,7 @@ from calibration.depth_error import command_at, depth_sd_m
 from calibration.errors import CalibrationError, Degenerate
 from calibration.model.light_sheet import depth_slope
 from calibration.model.rig_model import RigModel
-from calibration.passages.find import SweepCounts, board_pixels, even_pixels, evenly, find_passages
+from calibration.passages.find import SweepCounts, board_pixels, even_pixels, evenly, find_passages, flux_picture
 from calibration.rig_fit.fit import RigFit, fit_rig
 from calibration.views import Passages, View, robust_sd
 from rig.calibrate.session import load_views, save_view
@@ -85,6 +85,16 @@ class Outcome:
     compared: Compared | None = None
     fit: RigFit | None = None
 
+    def __str__(self) -> str:
+        """One line."""
+        c = self.compared
+        if c is None:
+            return f"{self.seed}: {self.trouble} ({self.seconds:.1f} s)"
+        return (
+            f"{self.seed}: error {1e3 * np.median(np.abs(c.error_m)):.2f} mm, sd {1e3 * np.median(c.sd_m):.2f} mm, "
+            f"ratio {np.sqrt(np.mean((c.error_m / c.sd_m) ** 2)):.2f} ({self.seconds:.1f} s)"
+        )
+
 
 def compare(fitted: RigModel, true: RigModel) -> Compared:
     """The fitted model's depth against the true one's, for the same pixels and commands."""
@@ -125,7 +135,7 @@ def summary(outcomes: Iterable[Outcome]) -> str:
     said += [
         f"depth error at {FAR_M:g} m, mm: median of the rigs' medians {1e3 * np.median(medians):.2f}, of their worst "
         f"{1e3 * np.median(worst):.2f}; worst of all {1e3 * worst.max():.1f}",
-        f"error over stated sd: median {median_ratio(z):.3f}, rms {np.sqrt(np.mean(z**2)):.3f}, a rig's "
+        f"error over stated sd: median {robust_sd(z):.3f}, rms {np.sqrt(np.mean(z**2)):.3f}, a rig's "
         f"rms {np.median(spread):.3f} (median), {np.percentile(spread, 95):.2f} (95 %), {spread.max():.2f} (worst)",
         f"true depth in the stated 95 % interval: {np.mean(np.abs(z) < SURE):.1%} of points; a rig's share "
         f"{np.percentile(inside, 5):.0%} (5 %)",
@@ -146,11 +156,6 @@ def in_sds(compared: Iterable[Compared]) -> Array:
     return np.concatenate([np.empty(0), *(c.error_m / c.sd_m for c in compared)])
 
 
-def median_ratio(z: Array) -> float:
-    """Actual to stated errors, 1 for a normal distribution of these standard deviations; nan of none."""
-    return robust_sd(z) if len(z) else np.nan
-
-
 def added_px(compared: Iterable[Compared], exposures: int) -> Array:
     """Pixels that each model adds to a scan's error, each way."""
     return np.array([c.added_px[exposures, direction] for c in compared for direction in (1, -1)])
@@ -158,29 +163,24 @@ def added_px(compared: Iterable[Compared], exposures: int) -> Array:
 
 def figures(compared: Sequence[Compared]) -> list[Figure]:
     """Figures beside what is asked for."""
-    z = in_sds(compared)
-    inside = float(np.mean(np.abs(z) < SURE)) if len(z) else np.nan
+    lost = 0.0 if compared else np.nan
+    z = in_sds(compared) if compared else np.full(1, lost)
+    inside = float(np.mean(np.abs(z) < SURE)) + lost
     return [
-        Figure("depth error over its stated sd (median)", median_ratio(z), RATIO),
+        Figure("depth error over its stated sd (median)", robust_sd(z), RATIO),
         Figure("share of true depths in the stated 95 % intervals", inside, INSIDE),
         *(
             Figure(
-                f"px added to a scan at K = {exposures} (worst rig)", _worst(added_px(compared, exposures)), ADDED_PX
+                f"px added to a scan at K = {k} (worst rig)", float(np.max([*added_px(compared, k), lost])), ADDED_PX
             )
-            for exposures in SCANNED
+            for k in SCANNED
         ),
     ]
-
-
-def _worst(values: Array) -> float:
-    return float(values.max()) if len(values) else np.nan
 
 
 PIXELS = 500
 """Pixels of a sweep that are looked at for passages."""
 SLOW_EVERY, OTHER_SPEED = 4, 3
-OFF_LINE = 8
-"""Columns on either side of the line that do not count for the picture."""
 
 
 def view_of(name: str, stand: Stand, taken: Sequence[SweepTaken], board: Board) -> View:
@@ -195,25 +195,15 @@ def view_of(name: str, stand: Stand, taken: Sequence[SweepTaken], board: Board) 
     return View(name, corners, tuple(_passages(sweep, usable) for sweep in taken), picture)
 
 
+def counts_of(taken: SweepTaken) -> SweepCounts:
+    """The counts in the form in which passages and pictures are found in them."""
+    volume = taken.volume
+    return SweepCounts(volume.counts, volume.n_frames, taken.command, volume.x0, volume.width)
+
+
 def room_picture(stand: Stand, taken: Sequence[SweepTaken]) -> NDArray[np.float32]:
-    """Picture in the room's light (rows, width), photons per exposure, NaN outside the window: as
-    `calibration.passages.flux_picture` has it but for its care of windows that move."""
-    ones, frames = np.zeros(taken[0].volume.counts.shape[1:], np.int64), 0
-    for sweep in taken:
-        counts, n = sweep.volume.counts, sweep.asked.exposures
-        most, at = np.zeros_like(counts[0]), np.zeros(counts[0].shape, np.int64)
-        for column, here in enumerate(counts):
-            ones += here
-            at[here > most] = column
-            np.maximum(most, here, out=most)
-        frames += n * (len(counts) - 2 * OFF_LINE - 1)
-        for shift in range(-OFF_LINE, OFF_LINE + 1):
-            ones -= np.take_along_axis(counts, np.clip(at + shift, 0, len(counts) - 1)[None], axis=0)[0]
-    picture = np.full(stand.rays[0].shape, np.nan, np.float32)
-    x0, window = int(taken[0].volume.x0[0]), taken[0].volume.counts.shape[2]
-    inside = np.s_[:, x0 : x0 + window]
-    room = -np.log1p(-np.clip(ones, 0, frames - 0.5) / frames)
-    picture[inside] = room[:, : picture[inside].shape[1]]
+    """The picture (rows, width) of the sweeps, photons per exposure without dark counts, NaN outside the window."""
+    picture = flux_picture(tuple(counts_of(sweep) for sweep in taken))
     return (picture - FRAME_S * stand.dark_per_s).astype(np.float32)
 
 
@@ -229,7 +219,6 @@ def views_of(stand: Stand, board: Board, poses: int, rng: np.random.Generator) -
 
 def found_anew(view: View, sensor: Sensor) -> View:
     """A kept view with the corners that are found in its picture today."""
-    assert view.picture is not None
     try:
         corners = find_corners(view.picture, BOARD, dark_rates(sensor, view.picture.shape) > HOT_PER_S)
     except Degenerate:
@@ -267,11 +256,9 @@ def _keep(views: Sequence[View], folder: Path) -> None:
 
 
 def _passages(taken: SweepTaken, usable: NDArray[np.bool_]) -> Passages:
-    volume, asked = taken.volume, taken.asked
-    counts = SweepCounts(volume.counts, volume.n_frames, taken.command, volume.x0, volume.width)
     thinned = np.zeros_like(usable)
     thinned[tuple(evenly(usable)[:PIXELS].T)] = True
-    return find_passages(counts, asked.direction, asked.speed_per_s, thinned)
+    return find_passages(counts_of(taken), taken.asked.direction, taken.asked.speed_per_s, thinned)
 
 
 def main() -> int:
@@ -286,20 +273,9 @@ def main() -> int:
     with ProcessPoolExecutor(asked.processes) as pool:
         for outcome in pool.map(partial(calibrated, kept=asked.views), range(asked.first, asked.first + asked.rigs)):
             outcomes.append(outcome)
-            print(_line(outcome), flush=True)
+            print(outcome, flush=True)
     print(summary(outcomes))
     return exit_code(figures([o.compared for o in outcomes if o.compared is not None]))
-
-
-def _line(outcome: Outcome) -> str:
-    if outcome.compared is None:
-        return f"{outcome.seed}: {outcome.trouble} ({outcome.seconds:.1f} s)"
-    c = outcome.compared
-    z = np.sqrt(np.mean((c.error_m / c.sd_m) ** 2))
-    return (
-        f"{outcome.seed}: error {1e3 * np.median(np.abs(c.error_m)):.2f} mm, sd {1e3 * np.median(c.sd_m):.2f} mm, "
-        f"ratio {z:.2f} ({outcome.seconds:.1f} s)"
-    )
 
 
 if __name__ == "__main__":

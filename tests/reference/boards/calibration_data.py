@@ -2,13 +2,14 @@
 
 A yardstick for `calibration.rig_fit.fit`: its own lens, rotations and light, nothing shared with what it judges but the
 data classes it hands over. Light leaves the mirror in sheets that turn about an axis; a sheet may pass the axis at a
-distance, lie on a cone and bow. `depth_errors` compares a fitted rig's depth with the true one's: same pixels, same
-instants.
+distance, lie on a cone and bow. `fitted` and `depth_errors`, at the end,
+fit such views and compare the depth with the true rig's: same pixels, same instants.
 """
 
 from __future__ import annotations
 
 from dataclasses import dataclass, field, replace
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -16,7 +17,9 @@ from numpy.typing import NDArray
 from calibration.arrays import Array
 from calibration.board.board import Board
 from calibration.depth_error import depth_sd_m
-from calibration.model.rig_model import RigModel
+from calibration.model.camera import Camera
+from calibration.model.rig_model import Covariance, RigModel
+from calibration.rig_fit.fit import RigFit, fit_rig
 from calibration.views import Corners, Passages, View
 
 BOARD = Board("chessboard", (9, 7), 0.06)
@@ -236,3 +239,25 @@ def depth_errors(
     mirror = np.clip(mirror, *model.scanner.command_range)
     u, v = model.camera.tangents_at(x, y)
     return model.sheets(mirror).depth(u, v) - depth_m, depth_sd_m(model, x, y, mirror, velocity_per_s)
+
+
+SIZE = (512, 512)
+SEEN = Seen(passages=200, passage=1e-3, corner_px=0.04)
+EXACT = Seen(passages=200, passage=1e-3, factor=1e-6, corner_px=1e-7)
+RIG = TrueRig(lens=(-0.1, 0.03, 5e-4, -3e-4, 0.0), angle=(0.09, 0.53, 0.02), lag=(1.5e-4, 2.5e-4))
+
+
+def fitted(rig: TrueRig, seed: int, seen: Seen = SEEN, poses: int = 8, **given: object) -> RigFit:
+    velocities = given.pop("velocities", (35.2, -35.2))
+    views = random_views(np.random.default_rng(seed), rig, poses, seen, velocities)
+    return fit_rig(views, BOARD, SIZE, **given)
+
+
+def held(rig: TrueRig) -> dict[str, Any]:
+    """What is given to a fit of a rig whose camera is known exactly."""
+    names = ("fx", "fy", "cx", "cy", "k1", "k2", "p1", "p2", "k3")
+    return {"camera": true_camera(rig), "known": Covariance(names, np.zeros((9, 9)))}
+
+
+def true_camera(rig: TrueRig) -> Camera:
+    return Camera(*SIZE, np.array([[rig.fx, 0, rig.cx], [0, rig.fy, rig.cy], [0, 0, 1.0]]), np.array(rig.lens))

@@ -21,14 +21,10 @@ FOLDER = Path(__file__).parents[3].parent / "shared" / "calibration-images"
 BOARD = Board("chessboard", (10, 7), 0.025)
 
 
-def pairs(side: str, every: int = 1, folder: Path = FOLDER) -> tuple[Board, list[View], tuple[int, int]]:
-    """The board, the views of one camera and the size of its pictures."""
-    views, size = [], (0, 0)
-    for file in sorted(folder.glob(f"{side}*.jpg"))[::every]:
-        picture = cv2.imread(str(file), cv2.IMREAD_GRAYSCALE)
-        size = (picture.shape[1], picture.shape[0])
-        views.append(View(file.stem, find_corners(picture, BOARD)))
-    return BOARD, views, size
+def views_of(side: str, folder: Path) -> list[View]:
+    """The views of one camera."""
+    pictures = {file.stem: cv2.imread(str(file), cv2.IMREAD_GRAYSCALE) for file in sorted(folder.glob(f"{side}*.jpg"))}
+    return [View(name, find_corners(picture, BOARD), picture=picture) for name, picture in pictures.items()]
 
 
 def opencv_rms(views: list[View], size: tuple[int, int]) -> tuple[float, float]:
@@ -39,15 +35,11 @@ def opencv_rms(views: list[View], size: tuple[int, int]) -> tuple[float, float]:
     return rms, matrix[0, 0]
 
 
-def subpixel(views: list[View], folder: Path, half: int) -> list[View]:
+def subpixel(view: View, half: int) -> View:
     """The corners as moved by cv2.cornerSubPix with windows of half width `half`."""
-    found = []
-    for view in views:
-        picture = cv2.imread(str(folder / f"{view.name}.jpg"), cv2.IMREAD_GRAYSCALE)
-        start = view.corners.px.astype(np.float32).reshape(-1, 1, 2)
-        px = cv2.cornerSubPix(picture, start, (half, half), (-1, -1), (3, 100, 1e-4)).reshape(-1, 2)
-        found.append(View(view.name, Corners(view.corners.ids, px.astype(np.float64))))
-    return found
+    start = view.corners.px.astype(np.float32).reshape(-1, 1, 2)
+    px = cv2.cornerSubPix(view.picture, start, (half, half), (-1, -1), (3, 100, 1e-4)).reshape(-1, 2)
+    return View(view.name, Corners(view.corners.ids, px.astype(np.float64)))
 
 
 def corrupted(view: View, kind: str, rng: np.random.Generator) -> View:
@@ -70,12 +62,10 @@ def main() -> None:
     parser.add_argument("--trials", type=int, default=40)
     asked = parser.parse_args()
     for side in ("left", "right"):
-        _, views, size = pairs(side, folder=asked.folder)
-        for name, with_corners in {
-            "ours": views,
-            "cornerSubPix 5": subpixel(views, asked.folder, 5),
-            "cornerSubPix 11": subpixel(views, asked.folder, 11),
-        }.items():
+        views = views_of(side, asked.folder)
+        size = views[0].picture.shape[::-1]
+        moved = {f"cornerSubPix {half}": [subpixel(view, half) for view in views] for half in (5, 11)}
+        for name, with_corners in {"ours": views, **moved}.items():
             fit, (rms, fx) = fit_camera(with_corners, BOARD, size), opencv_rms(with_corners, size)
             print(
                 f"{side:6}{name:16} views {len(views)}  ours {fit.rms_px:.4f} px  "

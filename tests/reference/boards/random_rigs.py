@@ -93,7 +93,7 @@ def random_pose(
         z = float(np.exp(rng.uniform(np.log(low), np.log(high))))
         u, v = camera.tangents_at(*at)
         turn = _turn(rng.uniform(-tilt_rad, tilt_rad), rng.uniform(-tilt_rad, tilt_rad), rng.uniform(-0.26, 0.26))
-        pose = BoardPose(_vector(turn), z * np.array([float(u), float(v), 1.0]) - turn @ middle)
+        pose = BoardPose(cv2.Rodrigues(turn)[0].ravel(), z * np.array([float(u), float(v), 1.0]) - turn @ middle)
         if _all_seen(camera, board, pose):
             return pose
     raise ValueError(f"a board of {board.size_m} m does not fit the picture between {low:.2f} and {high:.2f} m")
@@ -132,28 +132,23 @@ def _readable_m(camera: Camera, board: Board) -> tuple[float, float]:
     return min(low, 0.9 * high), high
 
 
-def _turn(about_x: float, about_y: float, about_z: float) -> Array:
-    vectors = np.diag([about_x, about_y, about_z])
-    about = [np.asarray(cv2.Rodrigues(vector)[0], np.float64) for vector in vectors]
-    turned: Array = about[0] @ about[1] @ about[2]
-    return turned
+def _turn(*about_rad: float) -> Array:
+    """Rotation about z, then y, then x."""
+    about_x, about_y, about_z = (cv2.Rodrigues(vector)[0] for vector in np.diag(about_rad))
+    return about_x @ about_y @ about_z
 
 
-def _vector(turn: Array) -> Array:
-    """The rotation vector of a rotation (3, 3)."""
-    return np.asarray(cv2.Rodrigues(turn)[0], np.float64).ravel()
+def paper(board: Board, pose: BoardPose) -> Array:
+    """Points (n, 3) all over the board's paper, in the camera's frame."""
+    margin = MARGIN_SQUARES * board.square_m
+    along, down = (np.linspace(-margin, side + margin, 9) for side in board.size_m)
+    return pose.to_camera(np.stack([*np.meshgrid(along, down), np.zeros((9, 9))], axis=-1).reshape(-1, 3))
 
 
 def _all_seen(camera: Camera, board: Board, pose: BoardPose) -> bool:
     """Whether all of the paper is in the picture, front to the camera."""
-    width, height = board.size_m
-    margin = MARGIN_SQUARES * board.square_m
-    along, down = np.linspace(-margin, width + margin, 9), np.linspace(-margin, height + margin, 9)
-    edge = [(x, y, 0.0) for x in along for y in (down[0], down[-1])]
-    edge += [(x, y, 0.0) for y in down for x in (along[0], along[-1])]
-    points = pose.to_camera(np.array(edge))
+    points = paper(board, pose)
     if points[:, 2].min() < 0.3 or pose.matrix[:, 2] @ points[0] <= 0:
         return False
-    x, y = camera.project(points)
-    inside = (x > _INSIDE_PX) & (x < camera.width - 1 - _INSIDE_PX)
-    return bool(np.all(inside & (y > _INSIDE_PX) & (y < camera.height - 1 - _INSIDE_PX)))
+    px = np.stack(camera.project(points), axis=-1)
+    return bool(np.all((px > _INSIDE_PX) & (px < np.array([camera.width, camera.height]) - 1 - _INSIDE_PX)))

@@ -1,18 +1,19 @@
-"""Corners from pictures of few photons, and pictures that are refused."""
+"""The board as OpenCV knows it and its file; its corners in pictures of few photons; and pictures that are refused."""
 
 import cv2
 import numpy as np
 import pytest
+import yaml
 from numpy.typing import NDArray
 
 from calibration import views
 from calibration.board import board, chessboard, detect, markers, registration
-from calibration.board.board import BLACK, WHITE, Board
+from calibration.board.board import BLACK, WHITE, Board, load_board
 from calibration.board.chessboard import known_lattice
 from calibration.board.detect import find_corners, repaired
 from calibration.board.markers import Markers, contradiction
 from calibration.board.registration import Drawing, fit_map
-from calibration.errors import Degenerate
+from calibration.errors import CalibrationError, Degenerate
 from calibration.model.camera import Camera
 from calibration.views import BoardPose
 from sim_backend.scenes.board import BoardAtPose, board_scene
@@ -92,7 +93,6 @@ def test_a_lens_bends_a_tilted_boards_picture_as_the_map_says(bend: float, tilt:
         return np.stack(camera.project(stands.to_camera(points_m)), axis=-1)
 
     found = fit_map(board.corners_m[:, :2], seen(board.corners_m), 5.0, board.size_m)
-    assert found is not None
     assert found[1].all()
     between_m = board.corners_m + board.square_m * np.array([0.25, -0.25, 0.0])
     assert np.abs(found[0].to_px(between_m[:, :2]) - seen(between_m)).max() < 0.03
@@ -119,11 +119,11 @@ def test_hot_pixels_become_their_neighbours_median():
 
 
 def charuco(*squares: int) -> Board:
-    return Board("charuco", squares, 0.06, 0.047, "DICT_4X4_100")  # type: ignore[arg-type]
+    return Board("charuco", squares, 0.06, 0.047, "DICT_4X4_100")
 
 
 def chess(*squares: int) -> Board:
-    return Board("chessboard", squares, 0.06)  # type: ignore[arg-type]
+    return Board("chessboard", squares, 0.06)
 
 
 def inverted() -> np.ndarray:
@@ -239,7 +239,6 @@ ACROSS = corners_px(CHESSBOARD, STANDS).reshape(5, 8, 2)
 def grid(columns: range, rows: range) -> np.ndarray:
     """Corners as the print has them and as it would if it went on, (down, across, 2)."""
     through = fit_map(CHESSBOARD.corners_m[:, :2], corners_px(CHESSBOARD, STANDS), 5.0, CHESSBOARD.size_m)
-    assert through is not None
     x, y = np.meshgrid(np.array(columns) + 1, np.array(rows) + 1)
     return through[0].to_px(np.stack([x, y], axis=-1) * CHESSBOARD.square_m)
 
@@ -249,7 +248,6 @@ def grid(columns: range, rows: range) -> np.ndarray:
 )
 def test_rows_that_are_not_there_go_and_those_that_follow_come(columns, rows):
     found = known_lattice(shown(CHESSBOARD, STANDS, flux=0.02), grid(columns, rows))
-    assert found is not None
     assert found.grid == found.least == (8, 5)
     assert found.known == (True, True)
     assert np.abs(found.px - ACROSS).max() < 1
@@ -258,7 +256,6 @@ def test_rows_that_are_not_there_go_and_those_that_follow_come(columns, rows):
 def test_what_lies_outside_the_picture_is_not_known():
     cut = int(ACROSS[:, -1, 0].min())
     found = known_lattice(shown(CHESSBOARD, STANDS, flux=0.02)[:, : cut - 1], grid(range(5), range(5)))
-    assert found is not None
     assert found.grid[1] == 5
     assert found.known == (False, True)
 
@@ -336,3 +333,69 @@ def test_another_print_is_told(read: Markers, said: str) -> None:
 def test_a_board_that_begins_with_white_is_told(across: int) -> None:
     said = contradiction(markers_of((across, 6), white_first=True), charuco(across, 6), WHITE_PICTURE)
     assert "OpenCV before 4.6" in (said or "")
+
+
+GIVEN = {"kind": "charuco", "squares": [9, 7], "square": "60 mm", "marker": "45 mm", "dictionary": "DICT_4X4_50"}
+
+
+@pytest.fixture(name="parsed")
+def _parsed(tmp_path):
+    """Reads a board's file with the given keys."""
+
+    def of(**changed) -> Board:
+        (tmp_path / "board.yaml").write_text(yaml.safe_dump({**GIVEN, **changed}))
+        return load_board(tmp_path / "board.yaml")
+
+    return of
+
+
+def test_corners_are_opencv_s_in_opencv_s_order(parsed):
+    board = parsed(square="7 cm", marker="0.0441 m")
+    assert board.square_m == 0.07  # the nearest float
+    assert np.abs(board.corners_m - board.charuco().getChessboardCorners()).max() < 1e-7
+
+
+def test_the_print_is_opencv_s(parsed):
+    board = parsed()
+    drawn = board.picture(80)  # 10 pixels a module: no edge between pixels
+    expected = board.charuco().generateImage((9 * 80, 7 * 80), marginSize=0, borderBits=1)
+    assert np.array_equal(drawn[40:-40, 40:-40], expected)
+    assert (drawn[:40] == 255).all()
+
+
+def test_albedo_is_black_white_and_nothing():
+    board = Board("chessboard", (4, 3), 0.1)
+    seen = board.albedo_at([0.05, 0.15, -0.04, -0.06, 0.44, np.nan], 0.05)
+    np.testing.assert_array_equal(seen, [BLACK, WHITE, WHITE, np.nan, WHITE, np.nan])
+
+
+@pytest.mark.parametrize(
+    ("changed", "said"),
+    [
+        ({"square": 60}, "square: 60 is no length; write it with a unit"),
+        ({"square": "60 inch"}, "with a unit"),
+        ({"square": "0 mm"}, "measure the print"),
+        ({"marker": "61 mm"}, "must be smaller"),
+        ({"marker": None}, "needs marker and dictionary"),
+        ({"kind": "chessboard"}, "has no markers"),
+        ({"squares": [9, 2]}, "9 x 2 squares"),
+        ({"squares": [20, 20]}, "needs 200 markers; DICT_4X4_50 has 50"),
+        ({"dictionary": "DICT_9"}, "no dictionary 'DICT_9'"),
+        ({"colour": "red"}, "unknown key 'colour'"),
+        ({"kind": "dots"}, "kind is 'dots'"),
+    ],
+)
+def test_a_board_that_cannot_be_is_refused(parsed, changed, said):
+    with pytest.raises(CalibrationError, match=said):
+        parsed(**changed)
+
+
+def test_a_file_that_is_none_is_refused_by_name(tmp_path):
+    with pytest.raises(CalibrationError, match=r"cannot read board .*none\.yaml"):
+        load_board(tmp_path / "none.yaml")
+    (tmp_path / "list.yaml").write_text("- 1\n")
+    with pytest.raises(CalibrationError, match="keys and values"):
+        load_board(tmp_path / "list.yaml")
+    (tmp_path / "bad.yaml").write_text("kind: charuco\n")
+    with pytest.raises(CalibrationError, match=r"bad\.yaml: 'squares' is missing; .*bad\.yaml: 'square' is missing"):
+        load_board(tmp_path / "bad.yaml")

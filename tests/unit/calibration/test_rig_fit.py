@@ -17,17 +17,23 @@ from calibration.rig_fit.start import Sighting, first_state, sighting
 from calibration.views import BoardPose
 from tests.reference.boards.calibration_data import (
     BOARD,
+    EXACT,
+    RIG,
+    SEEN,
+    SIZE,
     Seen,
     TrueRig,
     depth_errors,
+    fitted,
+    held,
     normalised,
     random_pose,
     random_rig,
     rotation,
     seen_view,
+    true_camera,
 )
 from tests.stability.inventory import covers
-from tests.unit.calibration.fitted_rigs import EXACT, RIG, SEEN, SIZE, fitted, held, true_camera
 
 covers(start, rows, solve, noise, misfit, fit)
 
@@ -71,7 +77,6 @@ def test_a_term_that_is_neither_there_nor_not_widens_the_covariance() -> None:
     rig, seen = replace(RIG, angle=(0.09, 0.53, 0.0, -0.002)), replace(SEEN, passages=100)
     fit = fitted(rig, 7, seen, poses=6, **held(rig))
     (open_one,) = (d for d in fit.decisions if not d.kept and abs(d.value) > 2.5 * d.sd)
-    assert fit.model.covariance is not None
     variance = np.diag(fit.model.covariance.of([group[0] for group in fit.free]))
     narrow = np.diag(np.linalg.inv(fit.information))
     assert open_one.name == "angle_3"
@@ -93,7 +98,6 @@ def test_a_term_comes_in_where_the_views_call_for_it(changed: dict[str, float], 
     fit = fitted(rig, 5, replace(SEEN, passage=3e-4), poses=12)
     assert term in kept(fit)
     covariance = fit.model.covariance
-    assert covariance is not None
     sd = np.sqrt(np.diag(covariance.of([term])))[0]
     model = fit.model
     found = {

@@ -1,7 +1,8 @@
-"""How well depth is known, against models drawn from the covariance."""
+"""How well depth is known, against models drawn from the covariance; parameters do what their names say."""
 
 from dataclasses import replace
 
+import cv2
 import numpy as np
 import pytest
 
@@ -17,7 +18,7 @@ from calibration.depth_error import (
 from calibration.errors import CalibrationError
 from calibration.model.parameters import parameters, with_parameters
 from calibration.model.rig_model import Covariance, Lag, RigModel
-from calibration.model.scanner import PivotScanner
+from calibration.model.scanner import PivotScanner, PlaneTable
 from tests.unit.calibration.cameras import camera
 
 SD = {"f": 0.3, "c": 0.3, "k": 1e-3, "p": 1e-4, "a": 2e-5, "o": 2e-5, "b": 2e-5, "l": 1e-7, "r": 1e-10}
@@ -45,7 +46,6 @@ def covariance_of(bare: RigModel, correlated: float = 0.4) -> Covariance:
 
 def test_the_sd_is_that_of_models_drawn_from_the_covariance() -> None:
     base, rng = model(), np.random.default_rng(7)
-    assert base.covariance is not None
     y, x = (a.ravel().astype(float) for a in np.mgrid[30:512:110, 40:512:110])
     command = command_at(base, x, y, 5.0)
     spread = np.linalg.cholesky(base.covariance.matrix)
@@ -98,7 +98,6 @@ def test_what_no_command_lights_is_not_known_and_the_rest_is() -> None:
 def test_parts_are_what_would_go_if_a_group_were_known() -> None:
     base = model()
     covariance = base.covariance
-    assert covariance is not None
     x, y = np.array([100.0, 400.0]), np.array([200.0, 300.0])
     jacobian = depth_jacobian(base, x, y, command_at(base, x, y, 5.0), 50.0)
     whole = depth_sd_m(base, x, y, command_at(base, x, y, 5.0), 50.0) ** 2
@@ -142,3 +141,56 @@ def test_one_line_says_how_well_depth_is_known_and_what_from() -> None:
 def test_a_covariance_that_is_none_is_refused(names, matrix, said: str) -> None:
     with pytest.raises(CalibrationError, match=said):
         Covariance(names, np.array(matrix, float))
+
+
+COMMANDS = np.linspace(-1, 1, 9)
+
+
+def bent_model(**changes) -> RigModel:
+    scanner = PivotScanner(
+        np.array([-0.3, 0.1, 0.02]), np.array([0.02, 1, -0.05]), np.array([1, 0, 0.1]), np.array([0.1, 0.4, 1e-3]),
+        offset_m=np.array([1e-3, 2e-4]), cone_rad=0.01, bow_per_rad=0.02,
+    )  # fmt: skip
+    return RigModel(camera([-0.3, 0.1, 1e-3, 1e-3, 0.01]), scanner, Lag(2e-4, 3e-4), row_delay_s=1e-8, **changes)
+
+
+def test_every_parameter_is_named_once_with_its_value() -> None:
+    names, values = parameters(bent_model())
+    assert len(set(names)) == len(names) == len(values)
+    assert names[:6] == ("fx", "fy", "cx", "cy", "k1", "k2")
+    said = dict(zip(names, values, strict=True))
+    assert said["k3"] == 0.01
+    assert said["axis_turn_1"] == said["axis_shift_2"] == 0
+    assert (said["angle_2"], said["offset_1"], said["cone"], said["bow"]) == (1e-3, 2e-4, 0.01, 0.02)
+    assert (said["lag_forward"], said["lag_backward"], said["row_delay"]) == (2e-4, 3e-4, 1e-8)
+
+
+def test_axis_turns_and_shifts_move_all_planes_as_one_body() -> None:
+    base = bent_model()
+    mirror = base.scanner
+    e1, e2 = mirror.zero_normal, np.cross(mirror.axis_direction, mirror.zero_normal)
+    turn = cv2.Rodrigues(0.02 * e1 - 0.03 * e2)[0]
+    shift = 0.004 * e1 - 0.002 * e2
+    names = ("axis_turn_1", "axis_turn_2", "axis_shift_1", "axis_shift_2")
+    moved = with_parameters(base, names, [0.02, -0.03, 0.004, -0.002]).planes(COMMANDS)
+    planes = base.planes(COMMANDS)
+    normal = planes[:, :3] @ turn.T
+    about = planes[:, 3] - planes[:, :3] @ mirror.axis_point_m  # of a plane turned about the axis point, the same
+    assert moved[:, :3] == pytest.approx(normal, abs=1e-14)
+    assert moved[:, 3] == pytest.approx(about + normal @ (mirror.axis_point_m + shift), abs=1e-14)
+
+
+def test_terms_beyond_those_of_the_model_begin_at_zero() -> None:
+    longer = with_parameters(bent_model(), ["angle_4", "offset_3"], [1e-4, 2e-5]).scanner
+    assert longer.angle_rad.tolist() == [0.1, 0.4, 1e-3, 0, 1e-4]
+    assert longer.offset_m.tolist() == [1e-3, 2e-4, 0, 2e-5]
+
+
+def test_what_a_model_does_not_have_is_refused_with_what_it_has() -> None:
+    table = RigModel(camera([]), PlaneTable(np.zeros(1), np.array([[1, 0, 0, -0.3]])))
+    assert "angle_0" not in parameters(table)[0]
+    for name in ("angle_0", "k1", "nonsense"):
+        with pytest.raises(CalibrationError, match=f"no parameter {name}; it has fx, fy"):
+            with_parameters(table, [name], [0.1])
+    with pytest.raises(CalibrationError, match="lag_s"):
+        with_parameters(table, ["lag_forward"], [-1.0])
