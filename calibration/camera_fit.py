@@ -285,7 +285,7 @@ class CameraFit:
     @property
     def dropped(self) -> tuple[str, ...]:
         """Names of the views without any corner in the fit."""
-        return tuple(name for name in self.views if name not in self.kept)
+        return tuple(name for name, mask in zip(self.views, self.used, strict=True) if not mask.any())
 
     @property
     def sd(self) -> dict[str, float]:
@@ -341,7 +341,9 @@ def _without_outliers(
     """The fit without what does not fit: the worst view at a time, then single corners, until nothing changes."""
     dropped = {i for i, mask in enumerate(used) if not mask.any()}
     behind = frozenset(dropped)
-    relative = _relative_sds(problem.corners)
+    sds = [found.likely_sd_px for found in problem.corners]
+    usual_sd = float(np.median(np.concatenate(sds)))
+    relative = [(sd / usual_sd)[:, None] for sd in sds]
     for _ in range(_MAX_ROUNDS):
         scaled = [residual / sd for residual, sd in zip(solution.residual_px, relative, strict=True)]
         scale = np.array([robust_sd(residual) for residual in scaled])
@@ -359,13 +361,6 @@ def _without_outliers(
         used = new
         solution = problem.solve(used)
     return solution, used
-
-
-def _relative_sds(corners: Sequence[Corners]) -> list[Array]:
-    """(n, 1) of every view: its corners' sds against the usual one."""
-    sds = [found.likely_sd_px for found in corners]
-    usual = float(np.median(np.concatenate(sds)))
-    return [(sd / usual)[:, None] for sd in sds]
 
 
 def _close(residual_px: Array, sd_px: float) -> Mask:

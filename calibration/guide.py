@@ -26,9 +26,9 @@ from calibration.model.camera import Camera
 from calibration.model.rig_model import RigModel
 from calibration.rig_fit.fit import RigFit
 from calibration.rig_fit.noise import bin_starts
+from calibration.rig_fit.rig_state import Sighting, first_state
 from calibration.rig_fit.rows import Terms
 from calibration.rig_fit.solve import Weights, scaled_inverse, view_normal
-from calibration.rig_fit.start import Sighting, first_state
 from calibration.views import FEWEST_CORNERS, BoardPose
 
 FILLS = (0.6, 0.45, 0.32, 0.22)

@@ -74,7 +74,7 @@ def find_corners(picture: NDArray[np.generic], board: Board, defects: NDArray[np
             f"the picture shows another board than the one looked for: {wrong}; name the board that is shown "
             "(--board), or print that one",
         )
-    limit_px = _MAP_OUTLIER_SQUARES * sighting.square_px(board) if len(sighting.px) else 0.0
+    limit_px = _MAP_OUTLIER_SQUARES * sighting.square_px(board) if len(sighting.px) >= 4 else 0.0
     found = fit_map(sighting.points_m, sighting.px, limit_px, board.size_m)
     if sighting.chessboards > 1 or (found is not None and _another(sighting, ~found[1], limit_px, board)):
         raise Degenerate(

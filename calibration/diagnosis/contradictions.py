@@ -24,8 +24,8 @@ import numpy as np
 from calibration.arrays import Array
 from calibration.model.rig_model import RigModel
 from calibration.rig_fit.fit import RigFit, SweepFit
+from calibration.rig_fit.rig_state import corner_scale
 from calibration.rig_fit.solve import corner_weights
-from calibration.rig_fit.start import corner_scale
 from calibration.views import FEWEST_CORNERS, BoardPose, View, robust_sd
 
 BINS = 24
@@ -59,7 +59,9 @@ class SweepWaves:
 
 def sweep_waves(sweeps: Sequence[SweepFit]) -> SweepWaves:
     """Compare the sweeps of each view."""
-    edges = _edges(sweeps)
+    commands = [sweep.command for sweep in sweeps if sweep.command.size]
+    low, high = (min(map(np.min, commands)), max(map(np.max, commands))) if commands else (-1.0, 1.0)
+    edges = np.linspace(low, high if high > low else low + 1, BINS + 1)
     middle, variance = _binned(sweeps, edges)
     left = middle.copy()
     for direction in (-1, 1):
@@ -78,12 +80,6 @@ def sweep_waves(sweeps: Sequence[SweepFit]) -> SweepWaves:
         command=(edges[1:] + edges[:-1]) / 2,
         sweeps=middle,
     )
-
-
-def _edges(sweeps: Sequence[SweepFit]) -> Array:
-    commands = [sweep.command for sweep in sweeps if sweep.command.size]
-    low, high = (min(map(np.min, commands)), max(map(np.max, commands))) if commands else (-1.0, 1.0)
-    return np.linspace(low, high if high > low else low + 1, BINS + 1)
 
 
 def _binned(sweeps: Sequence[SweepFit], edges: Array) -> tuple[Array, Array]:
@@ -163,29 +159,18 @@ def view_shifts(fit: RigFit, views: dict[str, View]) -> tuple[ViewShift, ...]:
     return tuple(shifts)
 
 
-def common_shift(shifts: tuple[ViewShift, ...], wave: float, sweeps: int) -> float:
-    """Root mean square of the differences between views, without the noise of poses and waves; NaN for fewer than two
-    views.
+def common_shift(shifts: tuple[ViewShift, ...], wave: float, sweeps: int) -> tuple[float, float]:
+    """Root mean square of the differences between views, without the noise of poses and waves, and the largest one that
+    may be such noise; NaN for fewer than two views.
 
     wave: rms of the waves in command units. sweeps: number of sweeps of a view, each with its own wave.
     """
     if len(shifts) < 2:
-        return np.nan
-    square = float(np.mean([one.shift**2 for one in shifts])) - float(np.mean(_variances(shifts, wave, sweeps)))
-    return math.sqrt(max(square, 0.0))
-
-
-def shift_noise(shifts: tuple[ViewShift, ...], wave: float, sweeps: int) -> float:
-    """The largest `common_shift` of these views that may be noise of poses and waves; NaN for fewer than two views."""
-    if len(shifts) < 2:
-        return np.nan
-    chance = float(np.sqrt(2 * np.sum(_variances(shifts, wave, sweeps) ** 2))) / len(shifts)
-    return math.sqrt(NOISE_SIGMAS * chance)
-
-
-def _variances(shifts: tuple[ViewShift, ...], wave: float, sweeps: int) -> Array:
-    """Variances of the views' shifts (views,) from the noise of the poses and from waves."""
-    return np.array([one.sd**2 for one in shifts]) + (wave**2 / max(sweeps, 1) if np.isfinite(wave) else 0.0)
+        return np.nan, np.nan
+    variances = np.array([one.sd**2 for one in shifts]) + (wave**2 / max(sweeps, 1) if np.isfinite(wave) else 0.0)
+    square = float(np.mean([one.shift**2 for one in shifts])) - float(np.mean(variances))
+    chance = float(np.sqrt(2 * np.sum(variances**2))) / len(shifts)
+    return math.sqrt(max(square, 0.0)), math.sqrt(NOISE_SIGMAS * chance)
 
 
 def counted(shifts: tuple[ViewShift, ...], outliers: tuple[str, ...], misfit: float = 1.0) -> tuple[ViewShift, ...]:

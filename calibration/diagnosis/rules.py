@@ -34,7 +34,7 @@ from calibration.model.camera import Camera
 from calibration.model.light_sheet import fan_origin
 from calibration.model.parameters import lag_groups, one_speed
 from calibration.model.scanner import PivotScanner, Scanner
-from calibration.rig_fit.start import unfit
+from calibration.rig_fit.rig_state import unfit
 from calibration.verdict import SIGMAS, WORST_TIMES, AccuracyGoal, Reason, Verdict, more_poses, reason_for
 from calibration.views import FEWEST_CORNERS, BoardPose, Corners, View
 

@@ -20,35 +20,14 @@ from calibration.board.board import Board
 from calibration.camera_fit import CameraFit
 from calibration.check import CheckedAngle, CheckedBoard
 from calibration.depth_error import DepthUncertainty, Sensitivity, depth_uncertainty, propagated, sensitivity
-from calibration.diagnosis.contradictions import (
-    SweepWaves,
-    ViewShift,
-    common_shift,
-    counted,
-    last_before_move,
-    shift_noise,
-    sweep_waves,
-    view_shifts,
-)
-from calibration.diagnosis.rules import (
-    FitEvidence,
-    baseline_m,
-    data_lack,
-    hiding,
-    judge,
-    judge_refusal,
-    lag_lack,
-    pose_evidence,
-    rough_poses,
-    view_evidence,
-)
+from calibration.diagnosis import contradictions, rules
 from calibration.errors import Degenerate, digits, mm
 from calibration.guide import rough_camera
 from calibration.model.camera import Camera
 from calibration.model.parameters import SWEPT, changed_camera
 from calibration.model.rig_model import Covariance, RigModel
 from calibration.rig_fit.fit import RigFit
-from calibration.rig_fit.start import shows_line, usable
+from calibration.rig_fit.rig_state import shows_line, usable
 from calibration.sync.lag_fit import SyncFit
 from calibration.verdict import AT_M, SIGMAS, WORST_TIMES, AccuracyGoal, Reason, Verdict, more_poses, unguided
 from calibration.views import View
@@ -82,10 +61,10 @@ def judge_camera(fit: CameraFit, views: Sequence[View], board: Board, *, photons
     median, worst = float(np.median(sd)), float(np.percentile(sd, 95))
     imprecise = not (median <= ACCURACY_PX and worst <= WORST_TIMES * ACCURACY_PX)
     pairs = zip(fit.views, fit.poses, strict=True)
-    evidence = view_evidence(views, (camera.width, camera.height), len(fit.kept), fit.dropped)
-    poses = pose_evidence([pose for name, pose in pairs if name in fit.kept], board)
-    lacking = data_lack(evidence, poses, imprecise=imprecise, photons=photons)
-    reasons = [*hiding(evidence, poses, photons=photons), *lacking]
+    evidence = rules.view_evidence(views, (camera.width, camera.height), len(fit.kept), fit.dropped)
+    poses = rules.pose_evidence([pose for name, pose in pairs if name in fit.kept], board)
+    lacking = rules.data_lack(evidence, poses, imprecise=imprecise, photons=photons)
+    reasons = [*rules.hiding(evidence, poses, photons=photons), *lacking]
     if imprecise and not reasons:
         found = median, worst
         reasons = [more_poses(len(fit.kept), "rays are known to", found, ACCURACY_PX, _px)]
@@ -187,9 +166,9 @@ class JudgedRig:
 
     verdict: Verdict
     asked: AccuracyGoal
-    evidence: FitEvidence
-    waves: SweepWaves
-    shifts: tuple[ViewShift, ...]
+    evidence: rules.FitEvidence
+    waves: contradictions.SweepWaves
+    shifts: tuple[contradictions.ViewShift, ...]
     uncertainty: DepthUncertainty
     sensitivity: Sensitivity
 
@@ -217,30 +196,31 @@ def judge_fit(
     model = fit.model
     worth = sensitivity(model, at_m)
     asked = goal(worth, accuracy_m, at_m, stated_baseline_m)
-    waves = sweep_waves(fit.every_sweep)
-    shifts = view_shifts(fit, {view.name: view for view in views})
-    agreeing = counted(shifts, fit.outliers, fit.misfit)
+    waves = contradictions.sweep_waves(fit.every_sweep)
+    shifts = contradictions.view_shifts(fit, {view.name: view for view in views})
+    agreeing = contradictions.counted(shifts, fit.outliers, fit.misfit)
     sweeps = max((len(of_view) for of_view in fit.sweeps), default=1)
+    shift, shift_noise = contradictions.common_shift(agreeing, waves.rms, sweeps)
     uncertainty = depth_uncertainty(model, at_m)
-    baseline, baseline_sd = _baseline(model)
+    baselines, variance = propagated(model, lambda tried: np.array([rules.baseline_m(tried.scanner)]))
     known = uncertainty.sd_m[np.isfinite(uncertainty.sd_m)]
     said = [pose for name, pose in zip(fit.views, fit.poses, strict=True) if name not in fit.outliers]
-    evidence = FitEvidence(
-        poses=pose_evidence(said, fit.board),
+    evidence = rules.FitEvidence(
+        poses=rules.pose_evidence(said, fit.board),
         expected_m=float(np.median(known)) if known.size else np.nan,
         worst_m=float(np.percentile(known, _WORST_PERCENT)) if known.size else np.nan,
         wave_m=waves.rms * worth.per_command_m,
         wave_noise_m=waves.noise * worth.per_command_m,
-        shift_m=common_shift(agreeing, waves.rms, sweeps) * worth.per_command_m,
-        shift_noise_m=shift_noise(agreeing, waves.rms, sweeps) * worth.per_command_m,
-        moved_after=last_before_move(agreeing),
+        shift_m=shift * worth.per_command_m,
+        shift_noise_m=shift_noise * worth.per_command_m,
+        moved_after=contradictions.last_before_move(agreeing),
         misfit=fit.misfit,
-        baseline_m=baseline,
-        baseline_sd_m=baseline_sd,
+        baseline_m=float(baselines[0]),
+        baseline_sd_m=float(np.sqrt(variance[0, 0])),
         velocities_per_s=tuple(model.provenance[SWEPT]),
     )
-    seen = view_evidence(views, (model.camera.width, model.camera.height), len(fit.used), fit.outliers)
-    return JudgedRig(judge(seen, evidence, asked), asked, evidence, waves, shifts, uncertainty, worth)
+    seen = rules.view_evidence(views, (model.camera.width, model.camera.height), len(fit.used), fit.outliers)
+    return JudgedRig(rules.judge(seen, evidence, asked), asked, evidence, waves, shifts, uncertainty, worth)
 
 
 def judge_refused(
@@ -256,17 +236,11 @@ def judge_refused(
 
     photons: as in `data_lack`. line: whether the views should show the line; False if only a camera was asked for.
     """
-    poses = rough_poses(views, board, rough_camera(size))
-    evidence = pose_evidence(poses, board) if poses else None
+    poses = rules.rough_poses(views, board, rough_camera(size))
+    evidence = rules.pose_evidence(poses, board) if poses else None
     used = sum(not line or shows_line(view) for view in usable(views))
-    verdict = judge_refusal(refused, view_evidence(views, size, used), evidence, photons=photons)
+    verdict = rules.judge_refusal(refused, rules.view_evidence(views, size, used), evidence, photons=photons)
     return verdict if line else unguided(verdict)
-
-
-def _baseline(model: RigModel) -> tuple[float, float]:
-    """Distance of camera and mirror axis, and its sd, metres; NaN for a table of planes."""
-    values, covariance = propagated(model, lambda tried: np.array([baseline_m(tried.scanner)]))
-    return float(values[0]), float(np.sqrt(covariance[0, 0]))
 
 
 _STILL = "check that nothing moved between the sweeps, or calibrate at the speed of your scans"
@@ -285,7 +259,7 @@ def judge_sync(
             "holds for the speeds scanned only"
         )
         found.append(Reason("lag-by-speed", text, fit.chi2, float(fit.dof), _STILL))
-    found += lag_lack(fit.velocities_per_s, mean_will_do=False)
+    found += rules.lag_lack(fit.velocities_per_s, mean_will_do=False)
     if model is not None and asked is not None:
         worth_m = sensitivity(model, asked.at_m).per_command_m * fit.speed_range_per_s[1]
         error_m = worth_m * float(max(fit.sd_s[:2][fit.sd_s[:2] >= 0], default=0.0))

@@ -4,7 +4,7 @@ to write instead.
 
 import difflib
 import math
-from collections.abc import Callable, Iterable, Iterator, Mapping
+from collections.abc import Callable, Iterator, Mapping
 from dataclasses import dataclass, field
 from functools import cached_property
 from typing import Any, TypeVar
@@ -153,19 +153,15 @@ def validated(
             told.append((key, f"{dotted} is {_shown(value)}, it must be {words}{then}"))
     keys = [*found, *(key for key, _ in told)]
     for key, problems in found.items():
-        if not _is_met_below(key, problems, keys):
+        # Of a value of one of several shapes, the problems of the others say nothing where its own lie within it.
+        shape = all(one["type"] == "literal_error" or one["type"].endswith("_type") for one in problems)
+        if not (shape and any(len(other) > len(key) and other[: len(key)] == key for other in keys)):
             told.append((key, _text(problems, key, schema, sources.flag(key))))
     if result is not None and not told:
         return result
     told.sort(key=lambda item: sources.line(item[0]) or 0)
     lines = [text if sources.flag(key) else f"{sources.place(key)} {text}" for key, text in told]
     raise FileError(*dict.fromkeys(lines))
-
-
-def _is_met_below(key: Key, problems: Iterable[ErrorDetails], found: Iterable[Key]) -> bool:
-    """Whether a value is of one of several shapes, the problems are those of the others, and its own lie within it."""
-    shape = all(problem["type"] == "literal_error" or problem["type"].endswith("_type") for problem in problems)
-    return shape and any(len(other) > len(key) and other[: len(key)] == key for other in found)
 
 
 def _no_numbers(
@@ -179,14 +175,12 @@ def _no_numbers(
         below = schema.of(name, info, value)
         words = _number_words(info.annotation)
         for key, leaf in _leaves(value, (*path, name)):
-            if isinstance(leaf, Mapping):
-                if below is not None:
-                    yield from _no_numbers(schema, below, leaf, key)
-            elif words is not None:
-                if isinstance(leaf, bool):
-                    yield key, leaf, words
-                elif isinstance(leaf, float) and not math.isfinite(leaf):
-                    yield key, leaf, "a finite number"
+            if isinstance(leaf, Mapping) and below is not None:
+                yield from _no_numbers(schema, below, leaf, key)
+            elif words is not None and isinstance(leaf, bool):
+                yield key, leaf, words
+            elif words is not None and isinstance(leaf, float) and not math.isfinite(leaf):
+                yield key, leaf, "a finite number"
 
 
 def _leaves(value: Any, key: Key) -> Iterator[tuple[Key, Any]]:
@@ -223,13 +217,9 @@ def _key(problem: ErrorDetails, content: Any) -> Key:
     key: list[str] = []
     for i, part in enumerate(problem["loc"]):
         last = i == len(problem["loc"]) - 1
-        if isinstance(part, int) and isinstance(content, list | tuple):
-            known = True
-        elif isinstance(content, Mapping):
-            known = part in content or (last and problem["type"] == "missing")
-        else:
-            known = False
-        if known:
+        in_list = isinstance(part, int) and isinstance(content, list | tuple)
+        missing = last and problem["type"] == "missing"
+        if in_list or (isinstance(content, Mapping) and (part in content or missing)):
             key.append(str(part))
             content = _below(content, part)
     return tuple(key)

@@ -38,17 +38,9 @@ import yaml
 from numpy.typing import NDArray
 
 from calibration.errors import CalibrationError
+from calibration.files import sections
 from calibration.files.npy_files import load_numpy
 from calibration.files.problems import ValueSources, validated
-from calibration.files.sections import (
-    FORMAT,
-    CalibrationFile,
-    CameraSection,
-    FileSection,
-    Number,
-    PlaneRows,
-    load_yaml,
-)
 from calibration.model.camera import Camera
 from calibration.model.parameters import with_parameters
 from calibration.model.rig_model import Covariance, Identity, Lag, RigModel
@@ -63,15 +55,15 @@ CORNERS = "corners"
 """Key in the provenance of a rig's calibration: digests of the views it was made of, those of its camera too."""
 
 
-class _CovarianceRows(FileSection):
+class _CovarianceRows(sections.FileSection):
     names: list[str]
-    matrix: list[list[Number]]
+    matrix: list[list[sections.Number]]
 
 
-class _CameraFile(FileSection):
+class _CameraFile(sections.FileSection):
     format: Literal["spadrig-camera"]
     version: Literal[1]
-    camera: CameraSection
+    camera: sections.CameraSection
     covariance: _CovarianceRows
     views: tuple[str, ...] = ()
     verdict: VerdictWord | None = None
@@ -89,13 +81,13 @@ class KnownCamera:
     reasons: tuple[str, ...] = ()
 
 
-File = TypeVar("File", bound=CalibrationFile | _CameraFile)
+File = TypeVar("File", bound=sections.CalibrationFile | _CameraFile)
 
 
 def _read(file: Path, what: str, model: type[File]) -> File:
     """The content of a file that must state its model's format and version. Raises CalibrationError, with one line."""
     (name,) = get_args(model.model_fields["format"].annotation)
-    read = load_yaml(file, what, f"format: {name}")
+    read = sections.load_yaml(file, what, f"format: {name}")
     if read.content.get("format") != name:
         raise CalibrationError(f"{file} is not {what}: its first entry must be 'format: {name}'")
     if (version := read.content.get("version")) != VERSION:
@@ -156,7 +148,7 @@ def load_rig_model(path: str | os.PathLike[str]) -> RigModel:
     invalid.
     """
     file = Path(path)
-    parsed = _read(file, "a calibration", CalibrationFile)
+    parsed = _read(file, "a calibration", sections.CalibrationFile)
     try:
         return _build(parsed, file.parent)
     except CalibrationError as error:
@@ -169,7 +161,7 @@ def save_rig_model(model: RigModel, path: str | os.PathLike[str]) -> None:
     """
     file = Path(path)
     content: dict[str, Any] = {
-        "format": FORMAT,
+        "format": sections.FORMAT,
         "version": VERSION,
         "camera": camera_content(model.camera),
         "scanner": _scanner_content(model.scanner),
@@ -183,7 +175,8 @@ def save_rig_model(model: RigModel, path: str | os.PathLike[str]) -> None:
     if model.provenance:
         content["provenance"] = dict(model.provenance)
     if model.identity is not None:
-        content["identity"] = _identity_content(model.identity)
+        known = {name: value for name, value in asdict(model.identity).items() if value}
+        content["identity"] = {**known, "reasons": list(known["reasons"])} if "reasons" in known else known
     if model.defects is not None:
         content["defects"] = _save_beside(file, "defects", model.defects)
     if model.dark_rate_per_s is not None:
@@ -206,7 +199,7 @@ def _save_beside(file: Path, what: str, array: NDArray[Any]) -> str:
     return beside.name
 
 
-def _build(parsed: CalibrationFile, folder: Path) -> RigModel:
+def _build(parsed: sections.CalibrationFile, folder: Path) -> RigModel:
     defects = None if parsed.defects is None else _array(folder, parsed.defects, "defects")
     dark_rate = None if parsed.dark_rate is None else _array(folder, parsed.dark_rate, "dark_rate")
     speed, known, identity = parsed.speed_range_per_s, parsed.covariance, parsed.identity
@@ -231,7 +224,7 @@ def _build(parsed: CalibrationFile, folder: Path) -> RigModel:
     return model
 
 
-def _build_scanner(parsed: CalibrationFile, folder: Path) -> Scanner:
+def _build_scanner(parsed: sections.CalibrationFile, folder: Path) -> Scanner:
     if parsed.planes is not None:
         rows = _plane_rows(parsed.planes, folder)
         return PlaneTable(command=np.arange(len(rows), dtype=np.float64), rows=rows)
@@ -244,7 +237,7 @@ def _build_scanner(parsed: CalibrationFile, folder: Path) -> Scanner:
     return PivotScanner(**pivot.model_dump())
 
 
-def _plane_rows(planes: PlaneRows, folder: Path) -> NDArray[np.float64]:
+def _plane_rows(planes: sections.PlaneRows, folder: Path) -> NDArray[np.float64]:
     if isinstance(planes, str):
         return _array(folder, planes, "planes").astype(np.float64)
     return np.array(planes, dtype=np.float64).reshape(-1, 4)
@@ -287,8 +280,3 @@ def _scanner_content(scanner: Scanner) -> dict[str, Any]:
         pivot = {name: np.asarray(value).tolist() for name, value in asdict(scanner).items()}
         return {"pivot": {name: value for name, value in pivot.items() if value not in ([], 0.0)}}
     raise CalibrationError(f"a scanner of type {type(scanner).__name__} has no form in a calibration file")
-
-
-def _identity_content(identity: Identity) -> dict[str, Any]:
-    said = asdict(identity)
-    return {name: list(value) if isinstance(value, tuple) else value for name, value in said.items() if value}

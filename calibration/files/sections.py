@@ -234,53 +234,42 @@ def _cut(node: yaml.Node) -> str:
     return text if len(text) <= _MOST_SHOWN else f"{text[:_MOST_SHOWN]}..."
 
 
-@dataclass(slots=True)
-class _Open:
-    """A list or mapping that is being read: its anchor, the number of values before it, and its depth of nesting."""
-
-    anchor: str | None
-    before: int
-    height: int = 0
-
-
 def _require_bounded(text: str) -> None:
     """Raise a YAMLError where the text nests or repeats too much, before anything is made of it."""
     known: dict[str | None, tuple[int, int]] = {}  # of what is anchored: its values, and how deep they nest
-    opened: list[_Open] = []
     written = repeated = 0
-    for event in yaml.parse(text, Loader=_Loader):
-        size, height = 1, 0
-        if isinstance(event, yaml.CollectionStartEvent):
-            opened.append(_Open(event.anchor, written + repeated))
-            written += 1
-            if len(opened) > MAX_DEPTH:
-                raise _Refused(event.start_mark, f"nested more than {MAX_DEPTH} deep; write it flatter")
-            continue
-        if isinstance(event, yaml.ScalarEvent):
-            written += 1
-        elif isinstance(event, yaml.AliasEvent):
-            if any(event.anchor == one.anchor for one in opened):
+    events = yaml.parse(text, Loader=_Loader)
+
+    def measured(event: Any, opened: tuple[str | None, ...]) -> tuple[int, int]:
+        """The values of a node, and how deep they nest; opened: anchors of what it stands within."""
+        nonlocal written, repeated
+        size, height = 1, int(isinstance(event, yaml.CollectionStartEvent))
+        if isinstance(event, yaml.AliasEvent):
+            if event.anchor in opened:
                 raise _Refused(
                     event.start_mark, f"'*{event.anchor}' stands within what it repeats; write out what is meant"
                 )
             size, height = known.get(event.anchor, (1, 0))
             repeated += size
-        elif isinstance(event, yaml.CollectionEndEvent):
-            closed = opened.pop()
-            size, height = written + repeated - closed.before, closed.height + 1
         else:
-            continue
+            written += 1
         if len(opened) + height > MAX_DEPTH:
             raise _Refused(event.start_mark, f"nested more than {MAX_DEPTH} deep; write it flatter")
         if written > MAX_NODES:
             raise _Refused(event.start_mark, f"more than {MAX_NODES} values; put arrays into .npy files")
         if repeated > MAX_REPEATED:
             raise _Refused(event.start_mark, f"aliases repeat more than {MAX_REPEATED} values; write out what is meant")
-        if opened:
-            opened[-1].height = max(opened[-1].height, height)
-        anchor = closed.anchor if isinstance(event, yaml.CollectionEndEvent) else getattr(event, "anchor", None)
-        if not isinstance(event, yaml.AliasEvent) and anchor is not None:
-            known[anchor] = size, height
+        if isinstance(event, yaml.CollectionStartEvent):
+            while not isinstance(inner := next(events), yaml.CollectionEndEvent):
+                below = measured(inner, (*opened, event.anchor))
+                size, height = size + below[0], max(height, below[1] + 1)
+        if event.anchor is not None and not isinstance(event, yaml.AliasEvent):
+            known[event.anchor] = size, height
+        return size, height
+
+    for event in events:
+        if isinstance(event, yaml.NodeEvent):
+            measured(event, ())
 
 
 def _places(node: yaml.Node, path: Key) -> Iterator[tuple[Key, int]]:

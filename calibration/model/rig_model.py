@@ -46,7 +46,8 @@ class Covariance:
             raise CalibrationError("covariance must be finite with variances of 0 or more; fit the model again")
         scale = np.sqrt(np.outer(variance, variance))
         unit = np.divide(matrix, scale, out=np.zeros_like(matrix), where=scale > 0)
-        if np.any(np.abs(unit - unit.T) > _ASYMMETRY) or np.any(matrix[scale == 0]) or _least(unit) < -_ASYMMETRY:
+        least = np.linalg.eigvalsh(unit)[0] if len(unit) else 0.0
+        if np.any(np.abs(unit - unit.T) > _ASYMMETRY) or np.any(matrix[scale == 0]) or least < -_ASYMMETRY:
             raise CalibrationError("covariance is not symmetric and positive, as one must be; fit the model again")
         set_frozen(self, names=names, matrix=0.5 * (matrix + matrix.T))
 
@@ -54,11 +55,6 @@ class Covariance:
         """The covariance of some of the parameters, in the given order."""
         at = [self.names.index(name) for name in names]
         return self.matrix[np.ix_(at, at)]
-
-
-def _least(correlation: Array) -> float:
-    """The smallest eigenvalue; 0 of nothing."""
-    return float(np.linalg.eigvalsh(correlation)[0]) if len(correlation) else 0.0
 
 
 class Lag(NamedTuple):

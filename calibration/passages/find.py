@@ -263,7 +263,8 @@ def _passages(
     pixels, start, sums = pixels[seen], start[seen], sums.some(seen)
     if not len(pixels):
         return (pixels, np.empty(0), np.empty(0)), shape
-    group = _groups(pixels, (sweep.counts.shape[1], sweep.width))
+    parts = pixels * GROUPS // np.array([sweep.counts.shape[1], sweep.width])
+    group = parts[:, 0] * GROUPS + parts[:, 1]
 
     def fit(shape: _Shape, first: int | None = None, *, exact: bool = True) -> PassageFit:
         some = slice(None, first)
@@ -293,12 +294,6 @@ def _around(sums: ColumnSums, position: Array, start: Array, near: int) -> tuple
     at = position[np.clip(begin, 0, sums.columns - 1)]
     at[:, 0], at[:, -1] = -FAR, FAR
     return ones, frames, at
-
-
-def _groups(pixels: NDArray[np.int64], size: tuple[int, int]) -> NDArray[np.int64]:
-    """Part of the picture that each pixel is in."""
-    parts = pixels * GROUPS // np.array(size)
-    return np.asarray(parts[:, 0] * GROUPS + parts[:, 1])
 
 
 LEFT_OUT = 10

@@ -1,9 +1,9 @@
 """Bundle adjustment of a whole rig: camera, poses of the board, mirror and lag, from corners and passages together.
 
-Start values come from linear fits (`start`), the best values from robust least squares (`solve`) with a noise estimated
-from the residuals themselves (`noise`). A round (`Rounds`) fits, examines the residuals, and ends with at most one
-decision (`misfit`): a mirror term that the data call for is added, a lag below 0 is fixed, or a view that does not fit
-the others is no longer used. A lag that the sweeps' speeds and directions do not determine is not fitted. The
+Start values come from linear fits (`rig_state`), the best values from robust least squares (`solve`) with a noise
+estimated from the residuals themselves (`noise`). A round (`Rounds`) fits, examines the residuals, and ends with at
+most one decision (`misfit`): a mirror term that the data call for is added, a lag below 0 is fixed, or a view that does
+not fit the others is no longer used. A lag that the sweeps' speeds and directions do not determine is not fitted. The
 covariance covers all parameters jointly.
 """
 
@@ -20,36 +20,11 @@ from calibration.model.camera import Camera
 from calibration.model.parameters import AXIS, SWEPT, lag_groups, speed_range
 from calibration.model.rig_model import Covariance, Lag, RigModel
 from calibration.model.scanner import PivotScanner
-from calibration.rig_fit.misfit import (
-    TermDecision,
-    best,
-    candidates,
-    corner_noise,
-    lag_decisions,
-    misfit,
-    odd_view,
-    tried,
-    widening,
-    with_passages,
-)
+from calibration.rig_fit import misfit, rig_state
+from calibration.rig_fit.misfit import TermDecision
 from calibration.rig_fit.noise import Noise, passage_noise, restated
 from calibration.rig_fit.rows import ANGLE_TERMS, LENS_TERMS, OFFSET_TERMS, Terms, mirror_command
 from calibration.rig_fit.solve import RigProblem, RigSolution, all_rows, camera_prior, solved
-from calibration.rig_fit.start import (
-    RigState,
-    Sighting,
-    board_points,
-    check_depth,
-    check_poses,
-    check_views,
-    first_pose,
-    first_scanner,
-    first_state,
-    no_start,
-    sighting,
-    usable,
-    with_terms_of,
-)
 from calibration.views import BoardPose, View, robust_sd
 
 MOST_ROUNDS = 16
@@ -72,7 +47,7 @@ class Rounds:
 
     problem: RigProblem
     base: tuple[tuple[str, ...], ...]
-    state: RigState
+    state: rig_state.RigState
     noise: Noise
     free: list[tuple[str, ...]] = field(init=False)
     solution: RigSolution = field(init=False)
@@ -90,7 +65,7 @@ class Rounds:
             self.solution = solved(self.problem, self.state, self.noise, roughly=idle == 0)
             self.state = self.solution.state
             residuals = [rows.residual for _, rows in self.solution.rows]
-            corner_sd_px = corner_noise(self.problem, self.solution, self.noise)
+            corner_sd_px = misfit.corner_noise(self.problem, self.solution, self.noise)
             before, self.noise = self.noise, Noise(corner_sd_px, *passage_noise(residuals, self.problem.sightings))
             there = self.solution.converged and idle > 0
             last = idle + 1 == MOST_IDLE_ROUNDS
@@ -102,9 +77,11 @@ class Rounds:
                 return
 
     def _without_odd_view(self) -> bool:
-        if np.count_nonzero(~self.problem.counted) + 1 > MOST_ODD_SHARE * np.count_nonzero(with_passages(self.problem)):
+        if np.count_nonzero(~self.problem.counted) + 1 > MOST_ODD_SHARE * np.count_nonzero(
+            misfit.with_passages(self.problem)
+        ):
             return False
-        odd = odd_view(self.problem, self.solution, misfit(self.problem, self.solution))
+        odd = misfit.odd_view(self.problem, self.solution, misfit.of_fit(self.problem, self.solution))
         if odd is None:
             return False
         counted = self.problem.counted.copy()
@@ -112,7 +89,7 @@ class Rounds:
         # What it made the fit take in is decided again without it.
         self.free, self.kept = list(self.base), ()
         self.problem = replace(self.problem, tie=self.problem.terms.tied(self.free), counted=counted)
-        self.state = with_terms_of(self.state, self.base)
+        self.state = rig_state.with_terms_of(self.state, self.base)
         return True
 
     def _without_negative_lag(self) -> bool:
@@ -139,10 +116,10 @@ class Rounds:
 
     def _with_new_term(self) -> bool:
         timed = any(group[0].startswith("lag") for group in self.free)
-        tries = candidates(self.free, row_delay=timed)
-        left_over = misfit(self.problem, self.solution).without
-        self.decisions = tuple(tried(self.problem, self.solution, new, left_over) for new in tries)
-        chosen = best(self.decisions)
+        tries = misfit.candidates(self.free, row_delay=timed)
+        left_over = misfit.of_fit(self.problem, self.solution).without
+        self.decisions = tuple(misfit.tried(self.problem, self.solution, new, left_over) for new in tries)
+        chosen = misfit.best(self.decisions)
         if chosen is None:
             return False
         self.free += [(name,) for name in tries[chosen]]
@@ -173,7 +150,7 @@ class SweepFit:
     sd: Array
 
 
-def sweep_fits(seen: Sighting, residual: Array, timing: Array) -> tuple[SweepFit, ...]:
+def sweep_fits(seen: rig_state.Sighting, residual: Array, timing: Array) -> tuple[SweepFit, ...]:
     """The fits of a view's sweeps, from the residuals of its passages. timing: (3,) as in `RigState`."""
     command = mirror_command(timing, seen.command, seen.y_px, seen.velocity_per_s)
     found = []
@@ -243,8 +220,8 @@ def result_of(
     """
     problem, solution, state = fit.problem, fit.solution, fit.state
     names = np.array(problem.terms.names)
-    unexplained = misfit(problem, solution).factor
-    matrix = unexplained * solution.covariance(problem.tie) + widening(problem, solution, fit.decisions)
+    unexplained = misfit.of_fit(problem, solution).factor
+    matrix = unexplained * solution.covariance(problem.tie) + misfit.widening(problem, solution, fit.decisions)
     fitted = np.flatnonzero(np.diag(matrix) > 0)
     covariance = Covariance(tuple(names[fitted].tolist()), matrix[np.ix_(fitted, fitted)])
     shown = [seen.velocity_per_s for seen, counts in zip(problem.sightings, problem.counted, strict=True) if counts]
@@ -264,7 +241,7 @@ def result_of(
     fastest = float(velocities[np.argmax(np.abs(velocities))])
     outliers = tuple(seen.name for seen, counts in zip(problem.sightings, counted, strict=True) if not counts)
     said = [pose for pose, counts in zip(state.poses, counted, strict=True) if counts]
-    check_depth(model, said, solution.condition, fastest, unexplained, outliers)
+    rig_state.check_depth(model, said, solution.condition, fastest, unexplained, outliers)
     return RigFit(
         model=model,
         views=tuple(seen.name for seen in problem.sightings),
@@ -281,7 +258,7 @@ def result_of(
         misfit=unexplained,
         condition=solution.condition,
         converged=solution.converged,
-        decisions=(*fit.kept, *fit.decisions, *lag_decisions(solution, problem, fit.free, state.timing)),
+        decisions=(*fit.kept, *fit.decisions, *misfit.lag_decisions(solution, problem, fit.free, state.timing)),
         board=board,
         free=tuple(fit.free),
         information=problem.tie.T @ solution.matrix @ problem.tie / unexplained,
@@ -311,27 +288,27 @@ def fit_rig(
     start: its mirror and lag are the start values of the fit; its source, defects and command range are kept.
     Raises Degenerate, with the reason, if the views do not determine a model, and CalibrationError.
     """
-    shown = usable(views)
+    shown = rig_state.usable(views)
     if not shown:
-        check_views(views, ())
+        rig_state.check_views(views, ())
     camera = _first_camera(shown, board, size, camera, start)
     seen = [view.corners for view in shown if view.corners is not None]
-    poses = [first_pose(camera, board.corners_m[one.ids], np.asarray(one.px, np.float64)) for one in seen]
-    sightings = tuple(sighting(view, board, camera, pose) for view, pose in zip(shown, poses, strict=True))
-    check_views(views, sightings)
+    poses = [rig_state.first_pose(camera, board.corners_m[one.ids], np.asarray(one.px, np.float64)) for one in seen]
+    sightings = tuple(rig_state.sighting(view, board, camera, pose) for view, pose in zip(shown, poses, strict=True))
+    rig_state.check_views(views, sightings)
     terms = Terms(camera.distortion.size)
     try:
         state = _first_state(camera, poses, sightings, start)
     except Degenerate:
         raise
     except (CalibrationError, np.linalg.LinAlgError) as error:
-        raise no_start(error, poses) from error
+        raise rig_state.no_start(error, poses) from error
     velocities = np.unique(np.concatenate([seen.velocity_per_s for seen in sightings]))
     exact = () if known is None else tuple(np.array(known.names)[np.diag(known.matrix) == 0])
     groups: list[tuple[str, ...]] = [(name,) for name in terms.camera if name not in exact]
     groups += [(name,) for name in (*AXIS, "angle_0", "angle_1")]
     groups += lag_groups(velocities)
-    state = with_terms_of(state, groups)
+    state = rig_state.with_terms_of(state, groups)
     prior = None if known is None else camera_prior(known, camera, terms)
     problem = RigProblem(sightings, terms, terms.tied(groups), np.ones(len(shown), bool), prior)
     problem, noise = _first_noise(problem, state)
@@ -339,7 +316,7 @@ def fit_rig(
     try:
         fit.run()
     except np.linalg.LinAlgError as error:
-        raise no_start(error, poses) from error
+        raise rig_state.no_start(error, poses) from error
     left_out = tuple(view.name for view in views if view.name not in {used.name for used in shown})
     return result_of(fit, left_out, board, start, velocities)
 
@@ -365,25 +342,25 @@ def _first_camera(
 
 
 def _first_state(
-    camera: Camera, poses: Sequence[BoardPose], sightings: Sequence[Sighting], start: RigModel | None
-) -> RigState:
-    points = board_points(camera, sightings, poses)
-    check_poses(points.points_m, poses)
+    camera: Camera, poses: Sequence[BoardPose], sightings: Sequence[rig_state.Sighting], start: RigModel | None
+) -> rig_state.RigState:
+    points = rig_state.board_points(camera, sightings, poses)
+    rig_state.check_poses(points.points_m, poses)
     low, high = (-1.0, 1.0) if start is None else start.scanner.command_range
     low, high = min(low, float(points.command.min())), max(high, float(points.command.max()))
     if start is not None and isinstance(start.scanner, PivotScanner):
         scanner, timing = start.scanner, np.array([*start.lag_s, start.row_delay_s])
     else:
-        scanner, timing = first_scanner(points, (low, high))
+        scanner, timing = rig_state.first_scanner(points, (low, high))
     angle, offset = np.zeros(ANGLE_TERMS), np.zeros(OFFSET_TERMS)
     angle[: scanner.angle_rad.size] = scanner.angle_rad[:ANGLE_TERMS]
     offset[: scanner.offset_m.size] = scanner.offset_m[:OFFSET_TERMS]
     scanner = replace(scanner, angle_rad=angle, offset_m=offset, command_range=(low, high))
     source = None if start is None else start.source_m
-    return first_state(RigModel(camera, scanner, source_m=source), timing, poses, sightings)
+    return rig_state.first_state(RigModel(camera, scanner, source_m=source), timing, poses, sightings)
 
 
-def _first_noise(problem: RigProblem, state: RigState) -> tuple[RigProblem, Noise]:
+def _first_noise(problem: RigProblem, state: rig_state.RigState) -> tuple[RigProblem, Noise]:
     """The problem with the sd that the passages' errors speak for, and how noisy all is."""
     rows = all_rows(state, problem.sightings, problem.terms)
     corners, passages = ([pair[which].residual for pair in rows] for which in (0, 1))

@@ -244,7 +244,7 @@ class Misfit(NamedTuple):
         return max(1.0, 1 + (excess - gain) / max(self.slow[1], 1.0))
 
 
-def misfit(problem: RigProblem, solution: RigSolution) -> Misfit:
+def of_fit(problem: RigProblem, solution: RigSolution) -> Misfit:
     """The contradictions of corners and passages with each other, and of passages among themselves."""
     covariance = solution.covariance(problem.tie)
     corner_chi2 = corner_free = slow_chi2 = slow_free = taken = 0.0

@@ -18,7 +18,7 @@ from numpy.typing import NDArray
 
 from calibration.arrays import Array
 from calibration.model.parameters import alike_speeds
-from calibration.rig_fit.start import Sighting
+from calibration.rig_fit.rig_state import Sighting
 from calibration.views import MAD_TO_SD, robust_sd
 
 BINS = 1024
@@ -58,13 +58,6 @@ def smooth_basis(command: Array, y_px: Array) -> Array:
     """(m, 5) basis functions: quadratic in the command and linear along the line."""
     c, y = _centred(command), _centred(y_px)
     return np.stack([np.ones_like(c), c, c * c, y, y * c], axis=-1)
-
-
-def smooth_part(command: Array, y_px: Array, residual: Array, weight: Array) -> Array:
-    """The smooth part of a sweep's residuals (m,), as far as the basis describes it."""
-    basis = smooth_basis(command, y_px)
-    root = np.sqrt(weight)[:, None]
-    return basis @ np.linalg.lstsq(basis * root, residual * root[:, 0], rcond=1e-9)[0]
 
 
 def restated(residuals: Sequence[Array], sightings: Sequence[Sighting]) -> tuple[Sighting, ...]:
@@ -125,7 +118,10 @@ def passage_noise(residuals: Sequence[Array], sightings: Sequence[Sighting]) -> 
     lengths = []
     for residual, seen in zip(residuals, sightings, strict=True):
         for sweep in seen.sweeps:
-            left, command, weight = _inlying(residual[sweep], seen.command[sweep], seen.y_px[sweep], seen.sd[sweep])
+            command, sd = seen.command[sweep], seen.sd[sweep]
+            left = residual[sweep] - _robust_smooth(command, seen.y_px[sweep], residual[sweep], 1 / sd**2)
+            inlying = np.abs(left) <= CUT_SD * robust_sd(left / sd) * sd
+            left, command, weight = left[inlying], command[inlying], 1 / sd[inlying] ** 2
             at = np.floor((command - command[0]) / width).astype(np.int64)
             n = int(at[-1]) + 1
             lengths.append(n * width)
@@ -151,14 +147,6 @@ def passage_noise(residuals: Sequence[Array], sightings: Sequence[Sighting]) -> 
     # The smooth part that was taken off had three terms along the command, and took the jitter of three reaches.
     taken = min(3 * reach / float(np.mean(lengths)), 0.6)
     return factor, float(np.sqrt((shape[best] @ pairs) / told[best] / (1 - taken))), reach
-
-
-def _inlying(residual: Array, command: Array, y_px: Array, sd: Array) -> tuple[Array, Array, Array]:
-    """(residuals without their smooth part, commands, weights) of a sweep's passages that are no outliers."""
-    left = residual - _robust_smooth(command, y_px, residual, 1 / sd**2)
-    scale = robust_sd(left / sd)
-    inlying = np.abs(left) <= CUT_SD * scale * sd
-    return left[inlying], command[inlying], 1 / sd[inlying] ** 2
 
 
 def bin_starts(seen: Sighting, reach: float) -> NDArray[np.int64]:
@@ -187,7 +175,8 @@ def _robust_smooth(command: Array, y_px: Array, residual: Array, weight: Array) 
         scale = robust_sd(left)
         if scale == 0:
             break
-        part = smooth_part(command, y_px, residual, weight * tail_weight(left / scale))
+        basis, root = smooth_basis(command, y_px), np.sqrt(weight * tail_weight(left / scale))[:, None]
+        part = basis @ np.linalg.lstsq(basis * root, residual * root[:, 0], rcond=1e-9)[0]
     return part
 
 

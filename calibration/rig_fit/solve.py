@@ -23,8 +23,8 @@ from calibration.errors import CalibrationError, Degenerate, condition_text
 from calibration.model.camera import Camera
 from calibration.model.rig_model import Covariance
 from calibration.rig_fit.noise import Noise, bin_starts, tail_weight
+from calibration.rig_fit.rig_state import RigState, Sighting
 from calibration.rig_fit.rows import Rows, Terms
-from calibration.rig_fit.start import RigState, Sighting
 
 _USUAL_MISS = float(np.sqrt(np.log(2.0)))
 """Median of a distance in a plane (Rayleigh's distribution), its mean square 1."""

@@ -275,12 +275,20 @@ class SpeedRotation:
         """Take the exposures per column, none: the config's; `sees` says whether a capture has what it is taken for."""
         self.turns = list(exposures)
         self._sees = sees
-        self._tell = tell
+        self._tell = tell or (lambda line: None)
         self._shown: set[int] = set()
 
     def capture(self, pose: int, scan: Scan) -> Capture:
         """Take the view of a pose at the speed whose turn it is. pose: its number, which determines the speed."""
-        exposures, capture = self._in_turn(pose, scan)
+        while True:
+            exposures = self.turns[pose % len(self.turns)] if self.turns else None
+            try:
+                capture = scan(exposures=exposures)
+                break
+            except PlanError:
+                if exposures is None or len(self.turns) < 2:
+                    raise
+                self.turns.remove(exposures)
         if exposures is None or capture.refused is not None:
             return capture
         if self._sees(capture):
@@ -289,19 +297,9 @@ class SpeedRotation:
             return self._again(capture, exposures, slowest, scan)
         return capture
 
-    def _in_turn(self, pose: int, scan: Scan) -> tuple[int | None, Capture]:
-        while True:
-            exposures = self.turns[pose % len(self.turns)] if self.turns else None
-            try:
-                return exposures, scan(exposures=exposures)
-            except PlanError:
-                if exposures is None or len(self.turns) < 2:
-                    raise
-                self.turns.remove(exposures)
-
     def _again(self, capture: Capture, exposures: int, slowest: int, scan: Scan) -> Capture:
         """Take the pose again at the slowest speed; returns the first capture where the rig cannot do that."""
-        self._say(f"at {_of(exposures)} the line does not stand out on the board: again at {slowest}")
+        self._tell(f"at {_of(exposures)} the line does not stand out on the board: again at {slowest}")
         try:
             again = scan(exposures=slowest)
         except PlanError:
@@ -311,12 +309,8 @@ class SpeedRotation:
             self._shown.add(slowest)
             if exposures not in self._shown:
                 self.turns.remove(exposures)
-                self._say(f"scans at {_of(exposures)} are left out from now on")
+                self._tell(f"scans at {_of(exposures)} are left out from now on")
         return again
-
-    def _say(self, what: str) -> None:
-        if self._tell is not None:
-            self._tell(what)
 
 
 def _of(exposures: int) -> str:

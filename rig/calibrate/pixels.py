@@ -21,25 +21,9 @@ from typing import Any, Final, Protocol, runtime_checkable
 import numpy as np
 from numpy.typing import NDArray
 
+from calibration import pixel_map
 from calibration.errors import CalibrationError, digits
 from calibration.files.rig_file import CALIBRATION_FILE, load_rig_model, save_rig_model
-from calibration.pixel_map import (
-    LEAST_ALIKE,
-    MOST_NEW_DEFECTS,
-    MOST_RATIO,
-    SIGNAL,
-    DarkTally,
-    PixelDrift,
-    PixelMap,
-    PixelVersion,
-    frames_for,
-    hot_flux,
-    judge_pixels,
-    light_leak,
-    load_pixels,
-    pixel_drift,
-    save_pixels,
-)
 from calibration.verdict import Reason, Verdict
 from drivers.frames import FrameBlock, frame_bytes
 from drivers.interfaces import SpadInfo, SpadMode, SpadRequest
@@ -93,7 +77,7 @@ class CoversLens(Protocol):
 class SweepSums:
     """Adds up the dark and the lit frames of counted sweeps. `add` can be passed as the `sweeps` option of a scan."""
 
-    tally: DarkTally | None = None
+    tally: pixel_map.DarkTally | None = None
     lit: Sums | None = None
 
     def add(self, sweep: SweepData) -> None:
@@ -102,7 +86,7 @@ class SweepSums:
         if not isinstance(volume, CountVolume) or volume.dark_counts is None:
             return
         shape = volume.dark_counts.shape
-        self.tally = self.tally or DarkTally((shape[0], shape[1]))
+        self.tally = self.tally or pixel_map.DarkTally((shape[0], shape[1]))
         dark_frames = volume.n_dark if volume.dark_frames is None else volume.dark_frames
         self.tally.add(volume.dark_counts.astype(np.int64), np.asarray(dark_frames, np.int64))
         ones, frames = self.lit or (np.zeros(shape, np.int64), np.zeros(shape, np.int64))
@@ -115,7 +99,7 @@ def take_dark(
     *,
     progress: Progress | None = None,
     covered: Callable[[], None] | None = None,
-) -> tuple[DarkTally, float]:
+) -> tuple[pixel_map.DarkTally, float]:
     """Take at least `frames` frames in the dark, once the lens is `covered`; returns also their exposure in s.
 
     May raise DeviceError.
@@ -134,7 +118,7 @@ def take_dark(
     # A layout for dark frames only: no column will ever be counted.
     layout = SweepLayout(1, info.height, info.width, np.zeros(1, np.int32), WORD_PX, 1)
     counter = SweepCounter(layout, workers)
-    tally = DarkTally((info.height, info.width))
+    tally = pixel_map.DarkTally((info.height, info.width))
     starts = math.ceil(frames / per_start)
     rest_s = max(0.0, (SPREAD_S - frames / float(request.frame_rate_hz)) / max(starts - 1, 1))
     told = counted("taking dark frames", "frames", progress)
@@ -215,9 +199,9 @@ class PixelResult:
     folder, calibration: paths of the folder and of the changed calibration; None if they were not written.
     """
 
-    found: PixelVersion
-    drift: PixelDrift | None
-    against: PixelVersion | None
+    found: pixel_map.PixelVersion
+    drift: pixel_map.PixelDrift | None
+    against: pixel_map.PixelVersion | None
     verdict: Verdict
     leak: float
     folder: Path | None = None
@@ -251,6 +235,11 @@ class PixelResult:
     def as_json(self) -> dict[str, Any]:
         """Return what summary.json holds, as plain values."""
         pixels, drift = self.found.pixels, self.drift
+        changes = None
+        if drift is not None:
+            changes = {key: np.asarray(value).tolist() for key, value in asdict(drift).items()}
+            changes |= {"correlation": None if np.isnan(drift.correlation) else drift.correlation}
+            changes |= {"reasons": list(drift.reasons)}
         masks = {"hot": pixels.hot, "noisy": pixels.noisy, "dead": pixels.dead, "defects": pixels.defects}
         return {
             **{key: getattr(self.found, key) for key in ("sensor", "version", "id", "parent", "created")},
@@ -262,19 +251,19 @@ class PixelResult:
             "judged": pixels.judged,
             "lit_judged": pixels.lit_judged,
             "light_leak": self.leak,
-            "drift": None if drift is None else _drift_json(drift),
+            "drift": changes,
             "calibration": None if self.calibration is None else str(self.calibration),
             "verdict": self.verdict.as_json(),
         }
 
 
-def pixel_verdict(pixels: PixelMap, drift: PixelDrift | None, leak: float) -> Verdict:
+def pixel_verdict(pixels: pixel_map.PixelMap, drift: pixel_map.PixelDrift | None, leak: float) -> Verdict:
     """Judge whether map and drift may be believed; the root cause comes first."""
     reasons = []
     if leak > MOST_LEAK:
         said = f"the rates of neighbouring pixels correlate by {leak:.2f}, in the dark by {MOST_LEAK:g} at most"
         reasons.append(Reason("room-light", said, leak, MOST_LEAK, "cover the lens and start again"))
-    least = frames_for(float(hot_flux(SIGNAL, 0.0)), WORST_PRECISION)
+    least = pixel_map.frames_for(float(pixel_map.hot_flux(pixel_map.SIGNAL, 0.0)), WORST_PRECISION)
     if pixels.frames < least:
         said = f"{pixels.frames} dark frames cannot tell hot pixels, at least {least} can"
         reasons.append(Reason("too-few-frames", said, pixels.frames, least, "take more frames"))
@@ -283,22 +272,21 @@ def pixel_verdict(pixels: PixelMap, drift: PixelDrift | None, leak: float) -> Ve
     return Verdict(not reasons, tuple(reasons))
 
 
-def _drift_reasons(drift: PixelDrift) -> list[Reason]:
+def _drift_reasons(drift: pixel_map.PixelDrift) -> list[Reason]:
     again = "scan with the calibration written here"
     alike = 1.0 if drift.alike is None else drift.alike
+    ratio, new = drift.ratio, drift.new_defects
     told = {
         "other-sensor": (
-            f"{alike:.0%} of the hot pixels are hot again", alike, LEAST_ALIKE, "compare maps of one sensor",
+            f"{alike:.0%} of the hot pixels are hot again", alike, pixel_map.LEAST_ALIKE, "compare maps of one sensor",
         ),
-        "dark-rate-drift": (f"dark rates are {drift.ratio:.3g} times those before", drift.ratio, MOST_RATIO, again),
-        "new-defects": (
-            f"{drift.new_defects:.2%} of the pixels became defects", drift.new_defects, MOST_NEW_DEFECTS, again,
-        ),
+        "dark-rate-drift": (f"dark rates are {ratio:.3g} times those before", ratio, pixel_map.MOST_RATIO, again),
+        "new-defects": (f"{new:.2%} of the pixels became defects", new, pixel_map.MOST_NEW_DEFECTS, again),
     }  # fmt: skip
     return [Reason(code, *told[code]) for code in drift.reasons]
 
 
-def _drift_rows(drift: PixelDrift, against: PixelVersion) -> list[tuple[str, str]]:
+def _drift_rows(drift: pixel_map.PixelDrift, against: pixel_map.PixelVersion) -> list[tuple[str, str]]:
     alike = "" if drift.alike is None else f", {drift.alike:.0%} of its hot pixels are hot again"
     return [
         ("against", f"version {against.version}, id {against.id}, {against.created}{alike}"),
@@ -307,12 +295,6 @@ def _drift_rows(drift: PixelDrift, against: PixelVersion) -> list[tuple[str, str
         ("changed", f"{len(drift.became_hot)} became hot, {len(drift.became_dead)} dead, {len(drift.recovered)} "
                     "recovered"),
     ]  # fmt: skip
-
-
-def _drift_json(drift: PixelDrift) -> dict[str, Any]:
-    content = {key: value.tolist() if isinstance(value, np.ndarray) else value for key, value in asdict(drift).items()}
-    content["correlation"] = None if np.isnan(drift.correlation) else drift.correlation
-    return {**content, "reasons": list(drift.reasons)}
 
 
 _log = logging.getLogger(__name__)
@@ -353,17 +335,17 @@ def run_pixels(
                     lit_sums = take_sweeps(rig, math.ceil(LIT_FRAMES / config.scan.exposures), progress).lit
             with open_rig(config, seed=request.seed) as rig:
                 sensor = _sensor(rig)
-                wanted = frames or frames_for(float(hot_flux(SIGNAL, 0.0)))
+                wanted = frames or pixel_map.frames_for(float(pixel_map.hot_flux(pixel_map.SIGNAL, 0.0)))
                 tally, exposure_s = take_dark(rig, wanted, progress=progress, covered=covered)
-        pixels = judge_pixels(tally, exposure_s, lit=lit_sums)
+        pixels = pixel_map.judge_pixels(tally, exposure_s, lit=lit_sums)
         created = datetime.now(UTC).isoformat(timespec="seconds")
         number, parent = (1, None) if last is None else (last.version + 1, last.id)
-        found = PixelVersion(pixels, number, created, parent, sensor)
+        found = pixel_map.PixelVersion(pixels, number, created, parent, sensor)
         try:
-            drift = None if last is None else pixel_drift(last.pixels, pixels)
+            drift = None if last is None else pixel_map.pixel_drift(last.pixels, pixels)
         except CalibrationError as error:
             raise UsageError(str(error)) from error
-        leak = 0.0 if recorded else light_leak(pixels)
+        leak = 0.0 if recorded else pixel_map.light_leak(pixels)
         result = PixelResult(found, drift, last, pixel_verdict(pixels, drift, leak), leak)
         if request.against is None and drift is not None:
             _note(config, drift)
@@ -373,7 +355,7 @@ def run_pixels(
             folder.discard()
 
 
-def _recorded_sums(run: Path, progress: Progress | None) -> tuple[DarkTally, Sums | None, str]:
+def _recorded_sums(run: Path, progress: Progress | None) -> tuple[pixel_map.DarkTally, Sums | None, str]:
     """Dark and lit sums of a recording's sweeps, and the sensor that took them."""
     with open_rig(plain(replay_config(run, ReplayOptions(), None, {}))) as rig:
         sums, sensor = take_sweeps(rig, progress=progress), _sensor(rig)
@@ -385,7 +367,7 @@ def _sensor(rig: OpenRig) -> str:
     return f"{rig.spad.info.model} {rig.spad.info.serial}"
 
 
-def _last(against: PathLike | None, config: RigConfig, recorded: Path | None) -> PixelVersion | None:
+def _last(against: PathLike | None, config: RigConfig, recorded: Path | None) -> pixel_map.PixelVersion | None:
     """The older map to compare with; None if there is none. Raises UsageError if a file was named that is no map."""
     if against is not None:
         path = Path(against)
@@ -397,12 +379,12 @@ def _last(against: PathLike | None, config: RigConfig, recorded: Path | None) ->
     else:
         return None
     try:
-        return load_pixels(path)
+        return pixel_map.load_pixels(path)
     except CalibrationError as error:
         raise UsageError(str(error)) from error
 
 
-def _note(config: RigConfig, drift: PixelDrift) -> None:
+def _note(config: RigConfig, drift: pixel_map.PixelDrift) -> None:
     """Note beside the calibration in use whether its map of the pixels still holds."""
     assert config.calibration is not None, "the older map lies beside it"
     try:
@@ -418,7 +400,7 @@ def _written(result: PixelResult, folder: RunFolder, calibration: Path | None) -
     """Write the folder's files. Raises UsageError if they cannot be written."""
     pixels = result.found.pixels
     try:
-        save_pixels(result.found, folder.place(PIXELS_FILE))
+        pixel_map.save_pixels(result.found, folder.place(PIXELS_FILE))
         folder.place("dark_rate.png").write_bytes(png_bytes(dark_rate_picture(pixels)))
         if calibration is not None:  # the config's with the new map, and the notes that speak against it
             before, file = load_rig_model(calibration), folder.place(CALIBRATION_FILE)

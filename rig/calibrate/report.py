@@ -134,18 +134,14 @@ def subject(identity: Identity | None, board: Board | None, versions: Mapping[st
         rows.append(("rig", identity.name or "unnamed"))
         rows.append(("devices", ", ".join(" ".join(filter(None, words)) for words in devices) or "not known"))
     if board is not None:
-        rows.append(("board", board_words(board)))
+        what = "chessboard" if board.marker_m is None else "ChArUco"
+        what += f", {board.squares[0]} x {board.squares[1]} squares of {board.square_m * 1e3:.6g} mm"
+        if board.marker_m is not None:
+            what += f", markers of {board.marker_m * 1e3:.6g} mm, {board.dictionary}"
+        rows.append(("board", what))
     rows.append(("date", now.astimezone(UTC).strftime("%Y-%m-%d %H:%M UTC")))
     rows.append(("versions", ", ".join(f"{name} {number}" for name, number in versions.items())))
     return rows
-
-
-def board_words(board: Board) -> str:
-    """Describe a board in one line."""
-    squares = f"{board.squares[0]} x {board.squares[1]} squares of {board.square_m * 1e3:.6g} mm"
-    if board.marker_m is None:
-        return f"chessboard, {squares}"
-    return f"ChArUco, {squares}, markers of {board.marker_m * 1e3:.6g} mm, {board.dictionary}"
 
 
 _WIDTH_PX = 640
@@ -162,34 +158,6 @@ def view_colour(view: int) -> tuple[int, int, int]:
     return _COLOURS[view % len(_COLOURS)]
 
 
-def coverage_picture(names: Sequence[str], corners_px: Sequence[Array], size: tuple[int, int]) -> Picture:
-    """Draw the corners of all views within the outline of the picture (width, height), with colours and names."""
-    picture, scale = _sheet(size)
-    for i, (name, corners) in enumerate(zip(names, corners_px, strict=True)):
-        for x, y in corners:
-            cv2.circle(picture, _at(x, y, scale), 3, view_colour(i), -1, cv2.LINE_AA)
-        if len(corners):
-            x, y = _at(float(corners[0, 0]), float(corners[0, 1]), scale)
-            cv2.putText(picture, name, (x + 5, y - 5), cv2.FONT_HERSHEY_SIMPLEX, 0.4, _INK, 1, cv2.LINE_AA)
-    return picture
-
-
-def residual_picture(
-    corners_px: Sequence[Array], residuals_px: Sequence[Array], size: tuple[int, int]
-) -> tuple[Picture, int]:
-    """Draw arrows from corners along their residuals; returns also the factor by which they are enlarged."""
-    picture, scale = _sheet(size)
-    lengths = np.concatenate([np.hypot(*residual.T) for residual in residuals_px if len(residual)] or [np.ones(1)])
-    typical = float(np.percentile(lengths, 90)) * scale
-    times = next((factor for factor in ARROW_TIMES if typical * factor < _WIDTH_PX / 25), 1)
-    for corners, residuals in zip(corners_px, residuals_px, strict=True):
-        for (x, y), (dx, dy) in zip(corners, residuals, strict=True):
-            end = _at(x + times * dx, y + times * dy, scale)
-            cv2.line(picture, _at(x, y, scale), end, _ERROR, 1, cv2.LINE_AA)
-            cv2.circle(picture, _at(x, y, scale), 2, _INK, -1, cv2.LINE_AA)
-    return picture, times
-
-
 def cells_picture(cells_m: Array) -> Picture:
     """Draw the deviations of a board's squares from their plane: red in front of it, black where they were not
     scanned."""
@@ -203,14 +171,6 @@ def _enlarged_mm(values_m: Array) -> NDArray[np.float32]:
     rows, columns = values_m.shape
     size = (_WIDTH_PX, max(1, round(_WIDTH_PX * rows / columns)))
     return np.asarray(cv2.resize(values_m * 1e3, size, interpolation=cv2.INTER_NEAREST), np.float32)
-
-
-def _sheet(size: tuple[int, int]) -> tuple[Picture, float]:
-    width, height = size
-    scale = _WIDTH_PX / width
-    picture = np.full((round(height * scale), _WIDTH_PX, 3), _GROUND, np.uint8)
-    cv2.rectangle(picture, (0, 0), (_WIDTH_PX - 1, picture.shape[0] - 1), _RIM, 1)
-    return picture, scale
 
 
 def _at(x: float, y: float, scale: float) -> tuple[int, int]:
@@ -259,11 +219,26 @@ def planes_report(fit: RigFit, views: Sequence[View], judged: JudgedRig) -> Repo
 
 
 def camera_sections(camera: Camera, views: Sequence[View], residuals_px: Sequence[Array]) -> list[Section]:
-    """Sections that show where corners were seen and their distances from the model's corners."""
-    size = (camera.width, camera.height)
-    seen = [corners_px(view) for view in views]
-    coverage = coverage_picture([view.name for view in views], seen, size)
-    arrows, times = residual_picture(seen, residuals_px, size)
+    """Sections that show where corners were seen, with the views' colours and names, and how far they are from the
+    model's, by arrows that are enlarged.
+    """
+    scale = _WIDTH_PX / camera.width
+    coverage = np.full((round(camera.height * scale), _WIDTH_PX, 3), _GROUND, np.uint8)
+    cv2.rectangle(coverage, (0, 0), (_WIDTH_PX - 1, coverage.shape[0] - 1), _RIM, 1)
+    arrows = coverage.copy()
+    lengths = np.concatenate([np.hypot(*residual.T) for residual in residuals_px if len(residual)] or [np.ones(1)])
+    typical = float(np.percentile(lengths, 90)) * scale
+    times = next((factor for factor in ARROW_TIMES if typical * factor < _WIDTH_PX / 25), 1)
+    for i, (view, residuals) in enumerate(zip(views, residuals_px, strict=True)):
+        corners = corners_px(view)
+        for (x, y), (dx, dy) in zip(corners, residuals, strict=True):
+            at, end = _at(x, y, scale), _at(x + times * dx, y + times * dy, scale)
+            cv2.circle(coverage, at, 3, view_colour(i), -1, cv2.LINE_AA)
+            cv2.line(arrows, at, end, _ERROR, 1, cv2.LINE_AA)
+            cv2.circle(arrows, at, 2, _INK, -1, cv2.LINE_AA)
+        if len(corners):
+            x, y = _at(float(corners[0, 0]), float(corners[0, 1]), scale)
+            cv2.putText(coverage, view.name, (x + 5, y - 5), cv2.FONT_HERSHEY_SIMPLEX, 0.4, _INK, 1, cv2.LINE_AA)
     return [
         ("Coverage", picture(coverage, "Corners of all views, each named at its first corner.")),
         ("Residuals of the corners", picture(arrows, f"Drawn {times} times longer than they are.")),

@@ -25,13 +25,13 @@ import numpy as np
 import yaml
 from numpy.typing import NDArray
 
-from calibration.board.board import Board, load_board
+from calibration.board.board import Board
 from calibration.depth_error import DepthErrors, depth_errors
 from calibration.errors import Degenerate
 from calibration.files.npy_files import load_numpy
 from calibration.files.rig_file import CALIBRATION_FILE, corners_digest, save_rig_model
 from calibration.model.rig_model import Identity, RigModel
-from calibration.rig_fit.start import FEWEST_PASSAGES, shows_line
+from calibration.rig_fit.rig_state import FEWEST_PASSAGES, shows_line
 from calibration.verdict import Verdict
 from calibration.views import Corners, Passages, View
 from drivers.json_text import parse_json
@@ -61,12 +61,6 @@ def session_rig(folder: Path) -> Identity | None:
         return None
     except (OSError, ValueError, TypeError, KeyError) as error:
         raise UsageError(f"{folder / RIG_FILE} does not say which rig it is of ({error}); remove it") from error
-
-
-def session_board(folder: Path) -> Board | None:
-    """The board of a session's corners; None if no board was looked for."""
-    file = folder / BOARD_FILE
-    return load_board(file) if file.is_file() else None
 
 
 EXIT_NOT_TRUSTWORTHY = 1

@@ -209,15 +209,11 @@ def gate_delay(run: Path) -> GateDelay | None:
         leg = plan.leg(sweep)
         for rises, planned_s in ((True, leg.gate_open_s), (False, leg.gate_close_s)):
             edge = _edge(ones, middle_s - planned_s, late_s, plan, rises=rises)
-            if edge is not None and _is_told(edge):
-                found[rises].append(edge)
+            if edge is not None and edge.brightness > LEAST_BRIGHTNESS_SDS * edge.brightness_sd:
+                found[rises] += [edge] if edge.scatter < MOST_SCATTER else []
     nan = math.nan, math.nan
     opens, closes = (edge_time(found[rises], late_s) if found[rises] else nan for rises in (True, False))
     return GateDelay(*opens, *closes, edges=len(found[True]) + len(found[False]))
-
-
-def _is_told(edge: Edge) -> bool:
-    return edge.brightness > LEAST_BRIGHTNESS_SDS * edge.brightness_sd and edge.scatter < MOST_SCATTER
 
 
 def _edge(ones: Array, middle_s: Array, late_s: Array, plan: ScanPlan, *, rises: bool) -> Edge | None:

@@ -14,17 +14,17 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from calibration.board.board import Board
+from calibration.board.board import Board, load_board
 from calibration.diagnosis.rules import FEWEST_POSES, FEWEST_WHY
 from calibration.diagnosis.verdicts import judge_refused
 from calibration.errors import CalibrationError, Degenerate
 from calibration.files.rig_file import load_rig_model
 from calibration.guide import Advice, candidates, rough_camera, sequence
 from calibration.model.camera import Camera
-from calibration.rig_fit.start import shows_line
+from calibration.rig_fit.rig_state import shows_line
 from calibration.views import View
 from rig.calibrate.capture import AskPerson, Capture, SpeedRotation, capture_recorded, capture_view, corners_in, shown
-from rig.calibrate.session import BOARD_FILE, Session, load_views, session_board, session_rig
+from rig.calibrate.session import BOARD_FILE, Session, load_views, session_rig
 from rig.calibrate.sources import VIEWS, ViewSources
 from rig.config.models import RigConfig
 from rig.devices.open import open_rig
@@ -138,9 +138,10 @@ def take_kept(session: Session, sources: ViewSources, defects: NDArray[np.bool_]
 
 def _require_alike(folder: Path, board: Board | None) -> None:
     """Raise UsageError where a session shows another board; the side of the squares may have been measured anew."""
-    known = session_board(folder)
-    if known is None:
+    file = folder / BOARD_FILE
+    if not file.is_file():  # no board was looked for
         return
+    known = load_board(file)
     if board is None:
         raise UsageError(
             f"{folder} holds views of a board that was moved, lags are told by what stands still; name a rig, runs of "
@@ -149,7 +150,7 @@ def _require_alike(folder: Path, board: Board | None) -> None:
     if _print(known) != _print(board):
         raise UsageError(
             f"{folder} holds views of a {_print(known)}, looked for is a {_print(board)}; name the board that was "
-            f"shown: --board {folder / BOARD_FILE}"
+            f"shown: --board {file}"
         )
 
 

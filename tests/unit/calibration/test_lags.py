@@ -19,31 +19,22 @@ from calibration.sync.lag_fit import SyncFit, fit_sync
 from calibration.sync.transfer import known_row_delay, with_lags
 from calibration.verdict import AccuracyGoal
 from calibration.views import Passages, View
-from tests.reference.boards.calibration_data import (
-    BOARD,
-    Seen,
-    TrueRig,
-    depth_errors,
-    normalised,
-    random_pose,
-    random_views,
-    seen_view,
-)
+from tests.reference.boards import calibration_data as data
 from tests.stability.inventory import covers
 
 covers(parameters, rules, transfer, lag_fit, gate_fit)
 
 SIZE = (512, 512)
 LAG = Lag(1.5e-4, 2.5e-4)
-RIG = TrueRig(lens=(-0.1, 0.03, 5e-4, -3e-4, 0.0), angle=(0.09, 0.53, 0.02), lag=LAG)
+RIG = data.TrueRig(lens=(-0.1, 0.03, 5e-4, -3e-4, 0.0), angle=(0.09, 0.53, 0.02), lag=LAG)
 APART = (("lag_forward",), ("lag_backward",))
 ONE = (("lag_forward", "lag_backward"),)
 
 
 @cache
 def planes(*velocities: float, seed: int = 3) -> tuple[RigFit, list[View]]:
-    views = random_views(np.random.default_rng(seed), RIG, 7, Seen(passages=150), velocities)
-    return fit_rig(views, BOARD, SIZE), views
+    views = data.random_views(np.random.default_rng(seed), RIG, 7, data.Seen(passages=150), velocities)
+    return fit_rig(views, data.BOARD, SIZE), views
 
 
 def found(lag: Lag = LAG, sd_s: float = 3e-7) -> SyncFit:
@@ -106,7 +97,7 @@ def test_planes_say_which_way_was_never_seen(velocities: tuple[float, ...], code
     assert judge_fit(fit, views, accuracy_m=0.05).verdict.codes == codes
     assert fit.model.provenance[SWEPT] == sorted(velocities)
     for v in velocities:
-        assert normalised(fit.model, RIG, 5.0, v) < 2.5
+        assert data.normalised(fit.model, RIG, 5.0, v) < 2.5
 
 
 @pytest.mark.parametrize("velocities", [(35.2,), (35.2, -70.4)])
@@ -118,7 +109,7 @@ def test_new_lags_turn_the_angle_that_went_with_the_old_ones(velocities: tuple[f
     assert model.speed_range_per_s == (15.0, 400.0)
     assert SWEPT not in model.provenance  # all is told now
     for v in (35.2, -35.2, 176.0, -176.0):
-        error, sd = depth_errors(model, RIG, 5.0, v)
+        error, sd = data.depth_errors(model, RIG, 5.0, v)
         assert np.sqrt(np.mean((error / sd) ** 2)) < 2.5
         assert np.median(sd) < 0.015
 
@@ -169,12 +160,12 @@ def test_a_line_that_does_not_reach_the_distance_asked_is_refused_with_its_reach
     rng = np.random.default_rng(5)
     views: list[View] = []
     while len(views) < 8:
-        view = seen_view(
-            rng, near, *random_pose(rng, near, 0.5, 0.9), Seen(passages=200), (35.2, -35.2), str(rng.random())
+        view = data.seen_view(
+            rng, near, *data.random_pose(rng, near, 0.5, 0.9), data.Seen(passages=200), (35.2, -35.2), str(rng.random())
         )
         if min(len(sweep.x_px) for sweep in view.passages) > 100:
             views.append(view)
-    fit = fit_rig(views, BOARD, SIZE)
+    fit = fit_rig(views, data.BOARD, SIZE)
     with pytest.raises(CalibrationError, match=r"does not reach 5 m, it reaches 0\.\d+ to \d\.\d+ m; .*--at"):
         judge_fit(fit, views)
     assert judge_fit(fit, views, at_m=0.7).verdict.passed

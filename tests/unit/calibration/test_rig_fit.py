@@ -9,33 +9,16 @@ from calibration.arrays import Array
 from calibration.model.camera import Camera
 from calibration.model.rig_model import Covariance, RigModel
 from calibration.model.scanner import PivotScanner
-from calibration.rig_fit import fit, misfit, noise, rows, solve, start
+from calibration.rig_fit import fit, misfit, noise, rig_state, rows, solve
 from calibration.rig_fit.fit import RigFit, fit_rig
 from calibration.rig_fit.noise import passage_noise, restated
+from calibration.rig_fit.rig_state import Sighting, first_state, sighting
 from calibration.rig_fit.rows import Rows, Terms
-from calibration.rig_fit.start import Sighting, first_state, sighting
 from calibration.views import BoardPose
-from tests.reference.boards.calibration_data import (
-    BOARD,
-    EXACT,
-    RIG,
-    SEEN,
-    SIZE,
-    Seen,
-    TrueRig,
-    depth_errors,
-    fitted,
-    held,
-    normalised,
-    random_pose,
-    random_rig,
-    rotation,
-    seen_view,
-    true_camera,
-)
+from tests.reference.boards import calibration_data as data
 from tests.stability.inventory import covers
 
-covers(start, rows, solve, noise, misfit, fit)
+covers(rig_state, rows, solve, noise, misfit, fit)
 
 
 def kept(fit: RigFit) -> set[str]:
@@ -43,39 +26,39 @@ def kept(fit: RigFit) -> set[str]:
 
 
 def test_exact_views_give_the_rig_back() -> None:
-    fit = fitted(RIG, 1, EXACT)
-    error, _ = depth_errors(fit.model, RIG, 5.0, 35.2)
+    fit = data.fitted(data.RIG, 1, data.EXACT)
+    error, _ = data.depth_errors(fit.model, data.RIG, 5.0, 35.2)
     assert np.abs(error).max() < 1e-5
     scanner = fit.model.scanner
     assert abs(np.linalg.norm(scanner.axis_point_m - (scanner.axis_point_m @ scanner.axis_direction) *
                               scanner.axis_direction) - 0.3) < 1e-6  # fmt: skip
-    assert abs(fit.model.camera.matrix[0, 0] - RIG.fx) < 1e-3
+    assert abs(fit.model.camera.matrix[0, 0] - data.RIG.fx) < 1e-3
     assert (fit.outliers, fit.misfit, fit.converged) == ((), 1, True)
 
 
 def test_the_depth_error_is_what_the_covariance_says() -> None:
-    rig = random_rig(np.random.default_rng(3))
-    fit = fitted(rig, 3, replace(SEEN, outliers=0.1))
-    error, sd = depth_errors(fit.model, rig, 5.0, 35.2)
+    rig = data.random_rig(np.random.default_rng(3))
+    fit = data.fitted(rig, 3, replace(data.SEEN, outliers=0.1))
+    error, sd = data.depth_errors(fit.model, rig, 5.0, 35.2)
     assert 0.15 < np.sqrt(np.mean((error / sd) ** 2)) < 2.5
     assert np.median(sd) < 0.02
-    assert abs(fit.noise.corner_sd_px / SEEN.corner_px - 1) < 0.1
+    assert abs(fit.noise.corner_sd_px / data.SEEN.corner_px - 1) < 0.1
     assert abs(fit.noise.passage_factor - 1) < 0.1
 
 
 def test_over_rigs_the_depth_error_is_neither_larger_nor_smaller_than_stated() -> None:
-    rig, seen = replace(RIG, angle=(0.09, 0.53)), replace(SEEN, passages=100)
+    rig, seen = replace(data.RIG, angle=(0.09, 0.53)), replace(data.SEEN, passages=100)
     squares = []
     for seed in range(500, 508):
-        fit = fitted(rig, seed, seen, poses=6, **held(rig))
-        error, sd = depth_errors(fit.model, rig, 5.0, 35.2)
+        fit = data.fitted(rig, seed, seen, poses=6, **data.held(rig))
+        error, sd = data.depth_errors(fit.model, rig, 5.0, 35.2)
         squares.append(np.mean((error / sd) ** 2))
     assert 0.7 < np.sqrt(np.mean(squares)) < 1.4
 
 
 def test_a_term_that_is_neither_there_nor_not_widens_the_covariance() -> None:
-    rig, seen = replace(RIG, angle=(0.09, 0.53, 0.0, -0.002)), replace(SEEN, passages=100)
-    fit = fitted(rig, 7, seen, poses=6, **held(rig))
+    rig, seen = replace(data.RIG, angle=(0.09, 0.53, 0.0, -0.002)), replace(data.SEEN, passages=100)
+    fit = data.fitted(rig, 7, seen, poses=6, **data.held(rig))
     (open_one,) = (d for d in fit.decisions if not d.kept and abs(d.value) > 2.5 * d.sd)
     variance = np.diag(fit.model.covariance.of([group[0] for group in fit.free]))
     narrow = np.diag(np.linalg.inv(fit.information))
@@ -94,8 +77,8 @@ def test_a_term_that_is_neither_there_nor_not_widens_the_covariance() -> None:
     ],
 )
 def test_a_term_comes_in_where_the_views_call_for_it(changed: dict[str, float], term: str, value: float) -> None:
-    rig = replace(RIG, **changed)
-    fit = fitted(rig, 5, replace(SEEN, passage=3e-4), poses=12)
+    rig = replace(data.RIG, **changed)
+    fit = data.fitted(rig, 5, replace(data.SEEN, passage=3e-4), poses=12)
     assert term in kept(fit)
     covariance = fit.model.covariance
     sd = np.sqrt(np.diag(covariance.of([term])))[0]
@@ -106,11 +89,11 @@ def test_a_term_comes_in_where_the_views_call_for_it(changed: dict[str, float], 
     }  # fmt: skip
     if term != "angle_3":  # which depends on where the zero of the angle was put
         assert abs(abs(found[term]) - abs(value)) < 4 * sd
-    assert normalised(model, rig, 5.0, 35.2) < 2.5
+    assert data.normalised(model, rig, 5.0, 35.2) < 2.5
 
 
 def test_no_term_comes_in_that_is_not_there() -> None:
-    fit = fitted(replace(RIG, angle=(0.09, 0.53)), 6)
+    fit = data.fitted(replace(data.RIG, angle=(0.09, 0.53)), 6)
     assert kept(fit) == {"lag_forward/lag_backward"}
     assert {decision.name for decision in fit.decisions} >= {"angle_2", "offset_0", "cone", "bow", "row_delay"}
 
@@ -118,50 +101,52 @@ def test_no_term_comes_in_that_is_not_there() -> None:
 def test_light_that_passes_the_axis_does_not_stand_in_for_an_angle_that_bends() -> None:
     """It did here: the fit never came to rest, 35 mm off at 5 m, the baseline known to 84 mm."""
     rng = np.random.default_rng([46, 5])
-    rig = TrueRig(fx=860.0, fy=860.0, angle=(0.09, 0.33, *rng.choice([-1, 1], 2) * [0.006, 0.01]))
-    seen = Seen(passages=200, passage=8e-4, corner_px=0.01)
-    views = [seen_view(rng, rig, *random_pose(rng, rig, 1.6, 3.2), seen, (88.0, -88.0), str(i)) for i in range(8)]
-    fit = fit_rig(views, BOARD, SIZE)
+    rig = data.TrueRig(fx=860.0, fy=860.0, angle=(0.09, 0.33, *rng.choice([-1, 1], 2) * [0.006, 0.01]))
+    seen = data.Seen(passages=200, passage=8e-4, corner_px=0.01)
+    views = [
+        data.seen_view(rng, rig, *data.random_pose(rng, rig, 1.6, 3.2), seen, (88.0, -88.0), str(i)) for i in range(8)
+    ]
+    fit = fit_rig(views, data.BOARD, data.SIZE)
     assert kept(fit) == {"angle_3", "lag_forward/lag_backward"}
     assert fit.converged
-    error, sd = depth_errors(fit.model, rig, 5.0, 88.0)
+    error, sd = data.depth_errors(fit.model, rig, 5.0, 88.0)
     assert np.sqrt(np.mean((error / sd) ** 2)) < 2.5
     assert np.median(sd) < 0.01
 
 
 def test_one_speed_tells_the_sum_of_the_lags_and_two_tell_both() -> None:
-    one = fitted(RIG, 8, EXACT, poses=6)
+    one = data.fitted(data.RIG, 8, data.EXACT, poses=6)
     assert one.model.lag_s.forward == one.model.lag_s.backward
     assert abs(one.model.lag_s.forward - 2e-4) < 1e-9
     low, high = one.model.speed_range_per_s or (0, 0)
     assert low < 35.2 < high < 40
-    two = fitted(RIG, 8, EXACT, poses=6, velocities=(35.2, -35.2, 88.0, -88.0))
+    two = data.fitted(data.RIG, 8, data.EXACT, poses=6, velocities=(35.2, -35.2, 88.0, -88.0))
     assert abs(two.model.lag_s.forward - 1.5e-4) < 1e-9
     assert abs(two.model.lag_s.backward - 2.5e-4) < 1e-9
     assert two.model.speed_range_per_s == pytest.approx((35.2 * 0.95, 88 * 1.05))
 
 
 def test_one_direction_at_one_speed_leaves_the_lag_as_it_was() -> None:
-    fit = fitted(RIG, 9, EXACT, poses=6, velocities=(35.2,))
+    fit = data.fitted(data.RIG, 9, data.EXACT, poses=6, velocities=(35.2,))
     assert fit.model.lag_s == (0, 0)
-    assert np.abs(depth_errors(fit.model, RIG, 5.0, 35.2)[0]).max() < 1e-5
-    again = fitted(RIG, 9, EXACT, poses=6, velocities=(35.2,), start=fit.model)
+    assert np.abs(data.depth_errors(fit.model, data.RIG, 5.0, 35.2)[0]).max() < 1e-5
+    again = data.fitted(data.RIG, 9, data.EXACT, poses=6, velocities=(35.2,), start=fit.model)
     assert again.model.lag_s == (0, 0)
 
 
 def test_what_other_pictures_told_of_the_camera_counts() -> None:
     names = ("fx", "fy", "cx", "cy", "k1", "k2", "p1", "p2", "k3")
     known = Covariance(names, np.diag(np.array([0.05, 0.05, 0.05, 0.05, 1e-4, 1e-4, 1e-5, 1e-5, 1e-4]) ** 2))
-    alone = fitted(RIG, 10, poses=6)
-    told = fitted(RIG, 10, poses=6, camera=true_camera(RIG), known=known)
-    error, sd = depth_errors(told.model, RIG, 5.0, 35.2)
-    assert np.median(sd) < 0.8 * np.median(depth_errors(alone.model, RIG, 5.0, 35.2)[1])
+    alone = data.fitted(data.RIG, 10, poses=6)
+    told = data.fitted(data.RIG, 10, poses=6, camera=data.true_camera(data.RIG), known=known)
+    error, sd = data.depth_errors(told.model, data.RIG, 5.0, 35.2)
+    assert np.median(sd) < 0.8 * np.median(data.depth_errors(alone.model, data.RIG, 5.0, 35.2)[1])
     assert np.sqrt(np.mean((error / sd) ** 2)) < 2.5
-    assert abs(told.model.camera.matrix[0, 0] - RIG.fx) < 0.2
+    assert abs(told.model.camera.matrix[0, 0] - data.RIG.fx) < 0.2
 
 
 def test_jitter_that_pixels_share_is_told_from_their_own_noise() -> None:
-    fit = fitted(RIG, 11, replace(SEEN, jitter=1e-3, passage=5e-4))
+    fit = data.fitted(data.RIG, 11, replace(data.SEEN, jitter=1e-3, passage=5e-4))
     assert 0.6e-3 < fit.noise.jitter_sd < 1.3e-3
     assert abs(fit.noise.passage_factor - 1) < 0.3
     assert fit.misfit < 2
@@ -169,14 +154,14 @@ def test_jitter_that_pixels_share_is_told_from_their_own_noise() -> None:
 
 def test_a_lag_that_noise_made_negative_is_held_even_where_a_fit_does_not_rest(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr("calibration.rig_fit.fit.MOST_IDLE_ROUNDS", 1)
-    fit = fitted(replace(RIG, lag=(-1e-6, -1e-6)), 20, replace(SEEN, passage=3e-3), poses=5)
+    fit = data.fitted(replace(data.RIG, lag=(-1e-6, -1e-6)), 20, replace(data.SEEN, passage=3e-3), poses=5)
     assert any(decision.reason.endswith("held at 0") for decision in fit.decisions)
     assert fit.model.lag_s == (0, 0)
 
 
 def test_a_light_that_passes_the_axis_is_seen() -> None:
-    fit = fitted(replace(RIG, offset=0.02), 7, replace(SEEN, passage=2e-4), poses=10)
-    assert normalised(fit.model, replace(RIG, offset=0.02), 5.0, 35.2) < 2.5
+    fit = data.fitted(replace(data.RIG, offset=0.02), 7, replace(data.SEEN, passage=2e-4), poses=10)
+    assert data.normalised(fit.model, replace(data.RIG, offset=0.02), 5.0, 35.2) < 2.5
 
 
 LENSES = {
@@ -191,16 +176,16 @@ def test_every_derivative_is_that_of_the_residual(lens: int) -> None:
     turn, position = np.array([0.3, -0.4, 0.1]), np.array([-0.3, -0.2, 1.4])
     scanner = PivotScanner(
         axis_point_m=np.array([-0.3, 0.01, 0.02]),
-        axis_direction=rotation(np.array([0.05, 0, 0.03])) @ [0, 1, 0],
+        axis_direction=data.rotation(np.array([0.05, 0, 0.03])) @ [0, 1, 0],
         zero_normal=np.array([1.0, 0, 0]),
         angle_rad=np.array([0.09, 0.53, 0.02, 0, 0, 0]),
         offset_m=np.array([2e-3, 1e-3]),
         cone_rad=0.02,
     )
-    rig = TrueRig()
-    view = seen_view(np.random.default_rng(0), rig, turn, position, Seen(passages=60, passage=1e-3))
+    rig = data.TrueRig()
+    view = data.seen_view(np.random.default_rng(0), rig, turn, position, data.Seen(passages=60, passage=1e-3))
     pose = BoardPose(turn, position)
-    seen = sighting(view, BOARD, camera, pose)
+    seen = sighting(view, data.BOARD, camera, pose)
     terms = Terms(lens)
     state = first_state(RigModel(camera, scanner), np.array([2e-4, 1e-4, 2e-8]), [pose], [seen])
     # Passages that the light meets exactly: elsewhere, only the model's own place of the light counts.

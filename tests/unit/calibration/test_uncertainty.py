@@ -6,15 +6,7 @@ import cv2
 import numpy as np
 import pytest
 
-from calibration.depth_error import (
-    GROUPS,
-    command_at,
-    depth_jacobian,
-    depth_sd_m,
-    depth_uncertainty,
-    explained,
-    group_of,
-)
+from calibration import depth_error
 from calibration.errors import CalibrationError
 from calibration.model.parameters import parameters, with_parameters
 from calibration.model.rig_model import Covariance, Lag, RigModel
@@ -47,7 +39,7 @@ def covariance_of(bare: RigModel, correlated: float = 0.4) -> Covariance:
 def test_the_sd_is_that_of_models_drawn_from_the_covariance() -> None:
     base, rng = model(), np.random.default_rng(7)
     y, x = (a.ravel().astype(float) for a in np.mgrid[30:512:110, 40:512:110])
-    command = command_at(base, x, y, 5.0)
+    command = depth_error.command_at(base, x, y, 5.0)
     spread = np.linalg.cholesky(base.covariance.matrix)
     velocity = np.array([100.0, -100.0, 0.0])[:, None]
     drawn = []
@@ -58,7 +50,7 @@ def test_the_sd_is_that_of_models_drawn_from_the_covariance() -> None:
         other = with_parameters(base, base.covariance.names, spread @ draw)
         at = command + other.mirror_command(0, y, velocity) - base.mirror_command(0, y, velocity)
         drawn.append(other.sheets(at).depth(*other.camera.tangents_at(x, y)))
-    predicted = np.stack([depth_sd_m(base, x, y, command, float(each)) for each in velocity[:, 0]])
+    predicted = np.stack([depth_error.depth_sd_m(base, x, y, command, float(each)) for each in velocity[:, 0]])
     ratio = np.std(drawn, axis=0) / predicted
     assert np.abs(ratio - 1).max() < 0.02  # what is left bends
 
@@ -67,7 +59,7 @@ def test_the_sd_is_that_of_models_drawn_from_the_covariance() -> None:
 def test_the_command_found_lights_the_pixel_at_that_depth(depth_m: float) -> None:
     base = model()
     x, y = np.arange(0.0, 512, 37), np.arange(0.0, 512, 41)[:, None]
-    command = command_at(base, x, y, depth_m)
+    command = depth_error.command_at(base, x, y, depth_m)
     lit = np.isfinite(command)
     assert lit.mean() > 0.3
     u, v = (tangent[lit] for tangent in base.camera.tangents_at(x, y))
@@ -84,37 +76,37 @@ def test_the_command_found_lights_the_pixel_at_that_depth(depth_m: float) -> Non
 def test_what_no_command_lights_is_not_known_and_the_rest_is() -> None:
     narrow = replace(model().scanner, command_range=(-0.2, 0.2))
     base = replace(model(), scanner=narrow)
-    found = depth_uncertainty(base, 5.0)
+    found = depth_error.depth_uncertainty(base, 5.0)
     dark = np.isnan(found.sd_m)
     assert 0.1 < dark.mean() < 0.9
     for part in found.part_m.values():
         assert np.array_equal(np.isnan(part), dark)
-    assert np.isnan(depth_sd_m(base, [10.0], [np.nan], [0.0])).all()
+    assert np.isnan(depth_error.depth_sd_m(base, [10.0], [np.nan], [0.0])).all()
     with pytest.raises(CalibrationError, match="no covariance"):
-        depth_uncertainty(model(known=False), 3.0)
-    assert depth_uncertainty(base, 0.01).line() == "at 0.01 m: not lit"
+        depth_error.depth_uncertainty(model(known=False), 3.0)
+    assert depth_error.depth_uncertainty(base, 0.01).line() == "at 0.01 m: not lit"
 
 
 def test_parts_are_what_would_go_if_a_group_were_known() -> None:
     base = model()
     covariance = base.covariance
     x, y = np.array([100.0, 400.0]), np.array([200.0, 300.0])
-    jacobian = depth_jacobian(base, x, y, command_at(base, x, y, 5.0), 50.0)
-    whole = depth_sd_m(base, x, y, command_at(base, x, y, 5.0), 50.0) ** 2
-    for group in GROUPS:
-        names = [name for name in covariance.names if group_of(name) == group]
-        part = explained(jacobian, covariance, names)
+    jacobian = depth_error.depth_jacobian(base, x, y, depth_error.command_at(base, x, y, 5.0), 50.0)
+    whole = depth_error.depth_sd_m(base, x, y, depth_error.command_at(base, x, y, 5.0), 50.0) ** 2
+    for group in depth_error.GROUPS:
+        names = [name for name in covariance.names if depth_error.group_of(name) == group]
+        part = depth_error.explained(jacobian, covariance, names)
         rest = [i for i, name in enumerate(covariance.names) if name not in names]
         # The covariance of the others once these are known, by the inverse of their block of the information.
         left = np.linalg.inv(np.linalg.inv(covariance.matrix)[np.ix_(rest, rest)])
         assert whole - part == pytest.approx(np.einsum("ni,ij,nj->n", jacobian[:, rest], left, jacobian[:, rest]))
-    assert explained(jacobian, covariance, list(covariance.names)) == pytest.approx(whole)
+    assert depth_error.explained(jacobian, covariance, list(covariance.names)) == pytest.approx(whole)
 
 
 def test_one_line_says_how_well_depth_is_known_and_what_from() -> None:
     base = model()
     only = Covariance(("axis_shift_1", "fx", "lag_forward"), np.diag([3e-4, 1e-3, 1e-9]) ** 2)
-    found = depth_uncertainty(replace(base, covariance=only), 5.0)
+    found = depth_error.depth_uncertainty(replace(base, covariance=only), 5.0)
     share = np.nanmedian(found.sd_m) * 1e3
     assert (
         found.line()
@@ -123,8 +115,12 @@ def test_one_line_says_how_well_depth_is_known_and_what_from() -> None:
     # A relative error of the baseline of 1e-3 is one of the depth: 5 mm, but for the tilt of the planes.
     assert 4.5 < share < 6
     exact = Covariance(("fx",), np.zeros((1, 1)))
-    assert depth_uncertainty(replace(base, covariance=exact), 5.0).line().startswith("at 5 m: 0 mm, 0 of them from")
-    slow = depth_uncertainty(replace(base, covariance=only), 5.0, 0.0)
+    assert (
+        depth_error.depth_uncertainty(replace(base, covariance=exact), 5.0)
+        .line()
+        .startswith("at 5 m: 0 mm, 0 of them from")
+    )
+    slow = depth_error.depth_uncertainty(replace(base, covariance=only), 5.0, 0.0)
     assert np.nanmax(slow.part_m["lag"]) == 0 < np.nanmax(found.part_m["lag"])
 
 

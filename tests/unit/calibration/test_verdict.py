@@ -9,22 +9,7 @@ import pytest
 from calibration import errors, verdict
 from calibration.board.board import Board
 from calibration.check import CheckedBoard
-from calibration.diagnosis import contradictions, verdicts
-from calibration.diagnosis.contradictions import (
-    ViewShift,
-    common_shift,
-    counted,
-    last_before_move,
-    sweep_waves,
-)
-from calibration.diagnosis.rules import (
-    FitEvidence,
-    PoseEvidence,
-    ViewEvidence,
-    judge,
-    judge_refusal,
-    view_evidence,
-)
+from calibration.diagnosis import contradictions, rules, verdicts
 from calibration.diagnosis.verdicts import judge_check, judge_fit, judge_sync
 from calibration.errors import Degenerate, condition_text, digits, in_mm, mm
 from calibration.model.rig_model import Lag, RigModel
@@ -40,9 +25,9 @@ from tests.unit.calibration.cameras import camera
 covers(verdict, verdicts, contradictions, errors)
 
 ASKED = AccuracyGoal(accuracy_m=0.014, at_m=5.0, stated_baseline_m=0.3)
-VIEWS = ViewEvidence(shown=12, used=12, coverage=0.8, room_flux=0.2)
-FIT = FitEvidence(
-    PoseEvidence(tilt_rad=radians(60), distance_m=1.6, board_rad=0.35),
+VIEWS = rules.ViewEvidence(shown=12, used=12, coverage=0.8, room_flux=0.2)
+FIT = rules.FitEvidence(
+    rules.PoseEvidence(tilt_rad=radians(60), distance_m=1.6, board_rad=0.35),
     expected_m=0.004,
     worst_m=0.012,
     wave_m=0.002,
@@ -54,8 +39,8 @@ IMPRECISE = replace(FIT, expected_m=0.03, worst_m=0.2)
 
 
 def test_a_sound_calibration_passes() -> None:
-    assert judge(VIEWS, FIT, ASKED).codes == ()
-    assert judge(VIEWS, replace(FIT, shift_m=0.005, shift_noise_m=0.006, baseline_sd_m=0.004), ASKED).passed
+    assert rules.judge(VIEWS, FIT, ASKED).codes == ()
+    assert rules.judge(VIEWS, replace(FIT, shift_m=0.005, shift_noise_m=0.006, baseline_sd_m=0.004), ASKED).passed
 
 
 @pytest.mark.parametrize(
@@ -80,8 +65,8 @@ def test_a_sound_calibration_passes() -> None:
         ("too-few-poses", VIEWS, IMPRECISE),  # nothing wrong with the data but their number
     ],
 )
-def test_each_mistake_is_the_first_reason(code: str, views: ViewEvidence, fit: FitEvidence) -> None:
-    verdict = judge(views, fit, ASKED)
+def test_each_mistake_is_the_first_reason(code: str, views: rules.ViewEvidence, fit: rules.FitEvidence) -> None:
+    verdict = rules.judge(views, fit, ASKED)
     assert not verdict.passed
     assert verdict.codes[0] == code
     first = verdict.reasons[0]
@@ -90,17 +75,17 @@ def test_each_mistake_is_the_first_reason(code: str, views: ViewEvidence, fit: F
 
 
 def test_what_is_too_large_is_what_is_named() -> None:
-    worst = judge(VIEWS, replace(FIT, expected_m=0.01, worst_m=0.08), ASKED).reasons[0]
+    worst = rules.judge(VIEWS, replace(FIT, expected_m=0.01, worst_m=0.08), ASKED).reasons[0]
     assert worst.text == (
         "in the worst 5 % of the picture the expected depth error at 5 m is 80 mm, asked for are 56 mm: about 25 poses "
         "would do"
     )
-    usual = judge(VIEWS, replace(FIT, expected_m=0.02, worst_m=0.06), ASKED).reasons[0]
+    usual = rules.judge(VIEWS, replace(FIT, expected_m=0.02, worst_m=0.06), ASKED).reasons[0]
     assert usual.text == "the expected depth error at 5 m is 20 mm, asked for are 14 mm: about 25 poses would do"
 
 
 def test_poses_that_tell_next_to_nothing_are_not_to_be_shown_eight_hundred_times() -> None:
-    dim = judge(VIEWS, replace(FIT, expected_m=0.115, worst_m=0.2), ASKED).reasons[0]
+    dim = rules.judge(VIEWS, replace(FIT, expected_m=0.115, worst_m=0.2), ASKED).reasons[0]
     assert dim.text == (
         "the expected depth error at 5 m is 115 mm, asked for are 14 mm, 8.2 times less: more poses like these 12 will "
         "not do"
@@ -117,17 +102,17 @@ def test_boards_seen_to_be_parallel_come_before_what_they_leave_of_the_picture(
     reason: str, codes: tuple[str, ...]
 ) -> None:
     """Rough poses may have them tilted; a guess of the fit comes last."""
-    verdict = judge_refusal(Degenerate(reason, "in one plane"), replace(VIEWS, coverage=0.15))
+    verdict = rules.judge_refusal(Degenerate(reason, "in one plane"), replace(VIEWS, coverage=0.15))
     assert verdict.codes == codes
-    dark = judge_refusal(Degenerate(reason, "in one plane"), replace(VIEWS, coverage=0.15, room_flux=7.0))
+    dark = rules.judge_refusal(Degenerate(reason, "in one plane"), replace(VIEWS, coverage=0.15, room_flux=7.0))
     assert dark.codes == ("room-light", *codes)
 
 
 def test_views_that_cannot_be_used_do_not_count_as_poses() -> None:
-    (reason,) = judge(replace(VIEWS, shown=8, used=4), FIT, ASKED).reasons
+    (reason,) = rules.judge(replace(VIEWS, shown=8, used=4), FIT, ASKED).reasons
     assert str(reason).startswith("too-few-poses: 8 poses were shown, 4 of them could be used, 6 are the fewest")
     assert (reason.value, reason.limit) == (4, 6)
-    refused = judge_refusal(Degenerate("no-line", "0 of 8 views show both"), replace(VIEWS, shown=8, used=0))
+    refused = rules.judge_refusal(Degenerate("no-line", "0 of 8 views show both"), replace(VIEWS, shown=8, used=0))
     assert refused.codes[0] == "no-line"  # which is why none of them could be
 
 
@@ -148,7 +133,7 @@ def test_views_tell_coverage_and_room_light() -> None:
     picture[130:230, 130:270] = 2.0
     seen = View("a", Corners(np.arange(len(px), dtype=np.int32), px), picture=picture)
     unseen = View("b", None, picture=np.full((300, 400), 2.0, np.float32))
-    evidence = view_evidence([seen, unseen], (400, 300), 1)
+    evidence = rules.view_evidence([seen, unseen], (400, 300), 1)
     assert (evidence.shown, evidence.used) == (2, 1)
     assert evidence.coverage == pytest.approx(120 * 80 / (400 * 300))
     assert evidence.room_flux == pytest.approx(2.0)
@@ -175,7 +160,7 @@ def _sweeps(
 
 @pytest.mark.parametrize("wave", [0.0, 1e-4, 1e-3])
 def test_waves_are_what_tells_sweeps_of_a_view_apart(wave: float) -> None:
-    waves = sweep_waves(_sweeps(np.random.default_rng(3), wave=wave, lag=5e-4))
+    waves = contradictions.sweep_waves(_sweeps(np.random.default_rng(3), wave=wave, lag=5e-4))
     assert waves.rms == pytest.approx(wave, rel=0.25, abs=3e-5)
 
 
@@ -183,7 +168,8 @@ def test_what_few_passages_are_off_may_be_noise() -> None:
     """Bright room light leaves a few dozen: what they were off was taken for exposures that are not locked."""
     seeds = [np.random.default_rng(seed) for seed in range(40)]
     still, waving = (
-        [sweep_waves(_sweeps(rng, wave=wave, views=2, passages=120)) for rng in seeds] for wave in (0.0, 2e-3)
+        [contradictions.sweep_waves(_sweeps(rng, wave=wave, views=2, passages=120)) for rng in seeds]
+        for wave in (0.0, 2e-3)
     )
     assert np.mean([waves.rms > waves.noise for waves in still]) < 0.1
     assert all(waves.rms > waves.noise for waves in waving)
@@ -193,26 +179,31 @@ def test_a_bin_that_a_sweep_hardly_reaches_tells_nothing() -> None:
     """The few passages in it are those whose noise led them there."""
     wide, narrow = np.linspace(0, 2.4, 4800), np.linspace(0, 1, 2000)
     noise = 0.005 * np.random.default_rng(5).normal(size=2000)
-    waves = sweep_waves([swept("a", 1, wide, 0 * wide), swept("b", 1, narrow + noise, noise)])
+    waves = contradictions.sweep_waves([swept("a", 1, wide, 0 * wide), swept("b", 1, narrow + noise, noise)])
     assert np.isfinite(waves.sweeps[1]).sum() == 10
     assert np.nanmax(np.abs(waves.sweeps[1])) < 0.002
 
 
 def test_without_sweeps_nothing_is_told() -> None:
-    assert np.isnan(sweep_waves([]).rms)
+    assert np.isnan(contradictions.sweep_waves([]).rms)
 
 
 def test_one_move_between_views_is_found() -> None:
-    shifts = tuple(ViewShift(str(i), 1e-3 if i < 4 else -2e-3, 1e-4) for i in range(9))
-    assert last_before_move(shifts) == "3"
-    assert counted(shifts, ("2",)) == (*shifts[:2], *shifts[3:])
-    assert counted(shifts, ("8",)) == counted(shifts, ("2",), 9.0) == counted(shifts, ("2", "3")) == shifts
-    assert common_shift(shifts, 0.0, 2) == pytest.approx(1.63e-3, rel=0.01)
+    shifts = tuple(contradictions.ViewShift(str(i), 1e-3 if i < 4 else -2e-3, 1e-4) for i in range(9))
+    assert contradictions.last_before_move(shifts) == "3"
+    assert contradictions.counted(shifts, ("2",)) == (*shifts[:2], *shifts[3:])
+    assert (
+        contradictions.counted(shifts, ("8",))
+        == contradictions.counted(shifts, ("2",), 9.0)
+        == contradictions.counted(shifts, ("2", "3"))
+        == shifts
+    )
+    assert contradictions.common_shift(shifts, 0.0, 2)[0] == pytest.approx(1.63e-3, rel=0.01)
     rng = np.random.default_rng(5)
-    calm = tuple(ViewShift(str(i), 1e-4 * rng.standard_normal(), 1e-4) for i in range(12))
-    assert last_before_move(calm) is None
-    assert common_shift(calm, 0.0, 2) < 1e-4
-    assert np.isnan(common_shift(calm[:1], 0.0, 2))
+    calm = tuple(contradictions.ViewShift(str(i), 1e-4 * rng.standard_normal(), 1e-4) for i in range(12))
+    assert contradictions.last_before_move(calm) is None
+    assert contradictions.common_shift(calm, 0.0, 2)[0] < 1e-4
+    assert np.isnan(contradictions.common_shift(calm[:1], 0.0, 2)).all()
 
 
 @pytest.mark.parametrize(

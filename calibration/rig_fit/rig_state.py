@@ -267,7 +267,10 @@ def board_points(camera: Camera, sightings: Sequence[Sighting], poses: Sequence[
 
 def first_scanner(points: LitPoints, command_range: tuple[float, float]) -> tuple[PivotScanner, Array]:
     """A mirror and (lag forward, lag backward, 0). The lags are equal if only their sum is determined, or else 0."""
-    velocities = _often_shown(points)
+    # The signed speeds at which enough boards were swept to tell their planes; where none was, the most swept.
+    velocities = np.unique(points.velocity_per_s)
+    shown = np.array([np.unique(points.view[points.velocity_per_s == velocity]).size for velocity in velocities])
+    velocities = velocities[shown >= min(POSES_FOR_PLANES, int(shown.max()))]
     counts = [np.count_nonzero(points.velocity_per_s == velocity) for velocity in velocities]
     swept = [_planes_of(points, velocity) for velocity in velocities]
     axis, point, first = _pivot(swept[int(np.argmax(counts))][1])
@@ -279,13 +282,6 @@ def first_scanner(points: LitPoints, command_range: tuple[float, float]) -> tupl
     axis, point, first = _pivot(planes)
     angle: Array = polynomial.polyfit(commands, _angles(planes, axis, first), 1).astype(np.float64)
     return PivotScanner(point, axis, first, angle, command_range), np.array([*lags, 0.0])
-
-
-def _often_shown(points: LitPoints) -> Array:
-    """The signed speeds at which enough boards were swept to tell their planes; where none was, the most swept."""
-    velocities = np.unique(points.velocity_per_s)
-    shown = np.array([np.unique(points.view[points.velocity_per_s == velocity]).size for velocity in velocities])
-    return velocities[shown >= min(POSES_FOR_PLANES, int(shown.max()))]
 
 
 def _planes_of(points: LitPoints, velocity: float) -> tuple[Array, Array]:
