@@ -260,17 +260,16 @@ def test_a_lag_that_depends_on_speed_is_seen():
         (lambda rng: _sweeps(rng, (35.0,), ways=(1,)), "one-speed"),
         (lambda rng: _sweeps(rng, (35.0, 90.0), pixels=40), "too-few-pixels"),
         (lambda rng: _sweeps(rng, (35.0, 90.0), lag_s={1: -5e-5, -1: 1e-4}), "negative-lag"),
-        (lambda rng: [_reversed(s) if s.direction < 0 else s for s in _sweeps(rng, (35.0, 90.0))], "marker-polarity"),
+        (
+            lambda rng: [replace(s, command=s.direction * s.command) for s in _sweeps(rng, (35.0, 90.0))],
+            "marker-polarity",
+        ),
     ],
 )
 def test_what_cannot_be_told_is_refused(sweeps, reason):
     with pytest.raises(Degenerate) as refused:
         fit_sync(sweeps(np.random.default_rng(7)))
     assert refused.value.reason == reason
-
-
-def _reversed(sweep):
-    return Passages(sweep.x_px, sweep.y_px, -sweep.command, sweep.sd, sweep.direction, sweep.speed_per_s)
 
 
 def test_a_sweep_without_passages_says_nothing_of_its_speed():
