@@ -35,8 +35,7 @@ def propagated(model: RigModel, measure: Callable[[RigModel], Array]) -> tuple[A
     if model.covariance is None:
         return values, np.zeros((values.size, values.size))
     slopes = by_parameter(model, model.covariance.names, lambda tried: np.atleast_1d(measure(tried)))
-    covariance: Array = slopes @ model.covariance.matrix @ slopes.T
-    return values, covariance
+    return values, slopes @ model.covariance.matrix @ slopes.T
 
 
 def by_parameter(model: RigModel, names: tuple[str, ...], measure: Callable[[RigModel], Array]) -> Array:
@@ -203,13 +202,11 @@ def explained(jacobian: Array, covariance: Covariance, names: list[str]) -> Arra
     scale = np.divide(1.0, sd, out=np.zeros_like(sd), where=sd > 0)
     inverse = np.linalg.pinv(inner * np.outer(scale, scale), rcond=_INDEPENDENT, hermitian=True)
     shared = jacobian @ covariance.matrix[:, at] * scale
-    variance: Array = np.maximum(np.einsum("...i,ij,...j", shared, inverse, shared), 0.0)
-    return variance
+    return np.asarray(np.maximum(np.einsum("...i,ij,...j", shared, inverse, shared), 0.0))
 
 
 def _variance(jacobian: Array, covariance: Covariance) -> Array:
-    variance: Array = np.maximum(np.einsum("...i,ij,...j", jacobian, covariance.matrix, jacobian), 0.0)
-    return variance
+    return np.asarray(np.maximum(np.einsum("...i,ij,...j", jacobian, covariance.matrix, jacobian), 0.0))
 
 
 def _covariance(model: RigModel) -> Covariance:

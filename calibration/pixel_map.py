@@ -5,10 +5,9 @@ sqrt((e^flux - 1) / N); a pixel that never fired is given the sd of half a count
 
 Hot pixels are defined by the information they lose. A one-bit frame has the Fisher information 1 / (e^(s + b) - 1)
 about a stripe's s photons (b: everything else that the pixel detects). The limit is the dark flux at which this falls
-to half
-of that of the surrounding pixels: b = ln(2 e^(s + b0) - 1) - s, with b0 their flux. A hot pixel must lie above the
-limit, and above what its neighbours' scatter explains. Fewer frames than `frames_for` cannot classify pixels near the
-limit.
+to half of that of the surrounding pixels: b = ln(2 e^(s + b0) - 1) - s, with b0 their flux. A hot pixel must lie above
+the limit, and above what its neighbours' scatter explains. Fewer frames than `frames_for` cannot classify pixels near
+the limit.
 
 A noisy pixel is one whose counts scatter over blocks of frames more than counting statistics allow, as when its rate
 jumps (random telegraph noise). Index of dispersion: sum (n - e)^2 / e over the blocks, with e in proportion to the
@@ -136,8 +135,7 @@ class PixelMap:
     bool. dead: None if there was no light. judged, lit_judged: share of the pixels that fired often enough to tell
     whether they are noisy, and that were lit well enough to tell whether they are dead. defects: pixels that are hot,
     dead, or noisy and at times as fast as hot ones. limit_per_s: float32, the rate above which a pixel is hot. frames:
-    largest number of frames of a pixel.
-    ordinary_per_s: mean dark rate of the ordinary pixels.
+    largest number of frames of a pixel. ordinary_per_s: mean dark rate of the ordinary pixels.
     """
 
     rate_per_s: NDArray[np.float32]
@@ -215,8 +213,7 @@ def flux_of(ones: NDArray[np.integer], frames: NDArray[np.integer] | int) -> tup
 
 def hot_flux(signal: float, level: Array | float) -> Array:
     """Flux per exposure at which a pixel has half as much information on `signal` photons as a pixel at `level`."""
-    result: Array = np.log(2 * np.exp(signal + np.asarray(level, np.float64)) - 1) - signal
-    return result
+    return np.asarray(np.log(2 * np.exp(signal + np.asarray(level, np.float64)) - 1) - signal)
 
 
 def frames_for(limit_flux: float, precision: float = PRECISION) -> int:

@@ -206,8 +206,7 @@ def _folds(terms: Array) -> tuple[float, list[float]]:
     slope = n * d + Polynomial([0, 2]) * (n.deriv() * d - n * d.deriv())
 
     def folded(r: Array) -> NDArray[np.bool_]:
-        inside: NDArray[np.bool_] = ~np.all([p(r * r) > 0 for p in (n, d, slope)], axis=0)
-        return inside
+        return np.asarray(~np.all([p(r * r) > 0 for p in (n, d, slope)], axis=0))
 
     radii = np.arange(0, _MAX_TANGENT, _RING)
     inside = folded(radii)

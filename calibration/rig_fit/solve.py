@@ -247,8 +247,7 @@ def scaled_inverse(matrix: Array) -> tuple[Array, float]:
             f"{condition_text(MOST_CONDITION)}; show the board at more poses, at other distances and tilted "
             "differently",
         )
-    inverse: Array = (vectors / values) @ vectors.T * scale[:, None] * scale
-    return inverse, condition
+    return (vectors / values) @ vectors.T * scale[:, None] * scale, condition
 
 
 def _damped(matrix: Array, right: Array, damping: float) -> Array:
