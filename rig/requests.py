@@ -265,7 +265,7 @@ class SyncRequest(CalibrationRequest):
 class CheckRequest(BoardRequest):
     """A check of a calibration by a board that was not used for it (`rig calibrate check`)."""
 
-    poses: int = option(1, "of the board, shown to a live rig; 2 or more for an angle")
+    poses: int = option(1, "of the board, shown to a live rig; at least 2 with --angle")
     calibration: str | os.PathLike[str] | None = path_option("what to check", "the rig's own")
     angle: str | None = option(
         None, "between the boards of the first two views, as stated: '30 deg'", unset="not known"

@@ -20,7 +20,7 @@ from rig.estimate.registry import ESTIMATORS, FILTERS
 from rig.plan.scan_plan import ScanPlan
 from rig.progress import Progress
 from rig.recording.cube import open_cube
-from rig.recording.inputs import holds_frames_alone
+from rig.recording.inputs import PLAN_FILE, holds_frames_alone
 from rig.recording.open import require_recording
 from rig.recording.replay import ReplayOptions, replay_config
 from rig.recording.segment import Space
@@ -214,7 +214,7 @@ def reconstruct(
     if source.is_dir():
         require_recording(source)
     if source.is_dir() and not holds_frames_alone(source):
-        if plan is not None:
+        if plan is not None and (source / PLAN_FILE).exists():
             raise UsageError(f"{source} is a recording, which has the plan it was taken with; leave --plan out")
         if isinstance(calibration, RigModel):
             raise UsageError("the calibration for a recording is a file; calibration.save_rig_model writes one")
@@ -225,7 +225,7 @@ def reconstruct(
             said = "does not exist; name the folder of a run taken with --record, or an .npy of frames"
             raise UsageError(f"{source} {said}")
         missing = [name for name, given in (("--plan", plan), ("--calibration", calibration)) if given is None]
-        raise UsageError(f"{source} holds frames alone; add {' and '.join(missing)}, which say how they were taken")
+        raise UsageError(f"{source} holds frames alone; add {' and '.join(missing)} to say how they were taken")
     estimate = _estimate(request)
     cube_plan = plan if isinstance(plan, CubePlan) else load_cube_plan(Path(plan))
     file = None if isinstance(calibration, RigModel) else Path(calibration)

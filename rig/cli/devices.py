@@ -45,7 +45,7 @@ def laser_off_command(config: ConfigArgument = "simulated") -> int:
 
 
 def check_command(config: ConfigArgument = "simulated", as_json: JsonOption = False) -> int:
-    """Say whether a config is valid and the files that it names can be used; list all problems at once."""
+    """Say whether a config is valid and the files that it names can be read; list all problems at once."""
     checked = api.check_config(config)
     if as_json:
         print_json({"config": config, "name": checked.name, "valid": True})

@@ -88,8 +88,11 @@ def load_config(name_or_path: str | Path = "simulated", overrides: Mapping[str, 
 def load_cube_plan(path: str | Path) -> CubePlan:
     """Load the `plan.yaml` of a bare cube. Raises UsageError with one line per problem."""
     read = _read(Path(path), "a plan", "columns: 500")
+    keys = f"the plan of frames alone has {', '.join(CubePlan.model_fields)}"
+    if {"spad", "scanner"} <= read.content.keys():
+        raise UsageError(f"{path} is the config of a rig; {keys}")
     leave = "leave --plan out; " if read.content.get("format") == PLAN_FORMAT else ""
-    _refuse_others(path, read.content, f"{leave}the plan of frames alone has {', '.join(CubePlan.model_fields)}")
+    _refuse_others(path, read.content, f"{leave}{keys}")
     return _validated(CubePlan, read.content, ValueSources(_shown(Path(path)), read.lines), Path(path).parent)
 
 

@@ -11,7 +11,7 @@ of the frames. `scan.command_range` is the range of the mirror, and line l's col
 from collections.abc import Sequence
 from itertools import pairwise
 from pathlib import Path
-from typing import Annotated, Literal, Self
+from typing import Annotated, Any, Literal, Self
 
 from pydantic import (
     AfterValidator,
@@ -130,6 +130,15 @@ class ScanConfig(ConfigSection):
     def exposure_s(self) -> float:
         """Exposure of a frame; if it is not set, the whole frame period."""
         return float(1 / self.frame_rate) if self.exposure is None else self.exposure
+
+    @model_validator(mode="before")
+    @classmethod
+    def _has_no_passes(cls, content: Any) -> Any:
+        if not isinstance(content, dict) or "adaptive" not in content:
+            return content
+        if content["adaptive"] is not None:
+            raise ValueError("adaptive scans in passes are no longer made; leave the key 'adaptive' out")
+        return {key: value for key, value in content.items() if key != "adaptive"}
 
     @model_validator(mode="after")
     def _exposure_fits(self) -> Self:

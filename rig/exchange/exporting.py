@@ -199,8 +199,11 @@ def _check(run: Path, kind: str, request: ExportRequest) -> None:
         (view in VIEWS and no_pictures, f"view {view!r} is of pictures, {no_pictures}"),
         (summed is not None and no_pictures, f"--frames {summed} are summed for pictures, {no_pictures}"),
         (summed is not None and summed < 1, f"{summed} frames make no picture; sum at least 1"),
-        (per_s is not None and no_film, f"--fps {per_s} is of a film, {kind} is none; export mp4, or leave it out"),
-        (per_s is not None and not 0 < per_s <= 1000, f"a film of {per_s} pictures a second; choose up to 1000"),
+        (per_s is not None and no_film, f"--fps {per_s:g} is of a film, {kind} is none; export mp4, or leave it out"),
+        (
+            per_s is not None and not 0 < per_s <= 1000,
+            f"a film of {per_s:g} pictures a second; choose 1000 or less, above 0",
+        ),
     ]
     if problems := [line for wrong, line in checks if wrong]:
         raise UsageError.of(problems)

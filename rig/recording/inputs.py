@@ -25,7 +25,7 @@ from rig.errors import UsageError
 from rig.geometry.windows import WORD_PX
 from rig.plan.scan_plan import MOST_CHIP_FRAMES, Blanking, ScanPlan
 from rig.recording.open import open_recording
-from rig.run_folder.manifest import read_manifest
+from rig.run_folder.manifest import MANIFEST, inputs_problems, read_manifest
 
 PLAN_FILE: Final = "plan.yaml"
 PLAN_VERSION: Final = 1
@@ -59,7 +59,8 @@ def read_plan(folder: Path, name: str = PLAN_FILE) -> ScanPlan:
                 f"{reconstruct_line(folder)}"
             ) from None
         raise UsageError(
-            f"{folder} has no {name}, by which its frames are bound to columns; take it from a copy of the recording"
+            f"{folder} has no {name}, by which its frames are bound to columns; take it from a copy of the recording, "
+            f"or 'rig export {folder} npy' the frames and 'rig reconstruct' those with a plan and a calibration"
         ) from None
     if (content.get("format"), content.get("version")) != (PLAN_FORMAT, PLAN_VERSION):
         raise UsageError(f"{file} is not the plan of a recording ('format: {PLAN_FORMAT}', version {PLAN_VERSION})")
@@ -67,7 +68,9 @@ def read_plan(folder: Path, name: str = PLAN_FILE) -> ScanPlan:
         plan = from_plain(ScanPlan, content.get("plan"))
         _require_sizes(plan)
     except (ValueError, TypeError, KeyError, ArithmeticError) as error:
-        raise UsageError(f"{file}: {error}; take it from a copy of the recording") from error
+        manifest = read_manifest(folder) if (folder / MANIFEST).exists() else {}
+        altered = [line for line in inputs_problems(folder, manifest or {}) if line.startswith(f"{name} ")]
+        raise UsageError(f"{file}: {(altered or [str(error)])[0]}; take it from a copy of the recording") from error
     return plan
 
 

@@ -12,6 +12,7 @@ from numpy.typing import NDArray
 from drivers.errors import DeviceNotFound, ProtocolError
 from drivers.frames import FrameBlock, Mark
 from drivers.recorded import RecordedRun, RunRecording
+from drivers.recorded.contents import INDEX_FILE
 from drivers.recorded.segments import PACKED_SUFFIX, segment_files
 from rig.count.bind import MAX_RESIDUAL_COLUMNS
 from rig.errors import DamagedRecordingError, UsageError
@@ -50,6 +51,8 @@ def _instead(path: Path) -> str:
     if inside:
         more = "" if len(inside) == 1 else f" or another of {len(inside)} in it"
         return f"is a folder without a recording ({SEGMENTS}) of its own; name {inside[0]}{more}"
+    if (path / INDEX_FILE).exists():
+        return f"has an index of recorded frames ({INDEX_FILE}), but no {SEGMENTS}; bring them back from a copy"
     if (path / MANIFEST).exists() or (path / "stripe").is_dir():
         return (
             f"holds no recording ({SEGMENTS}): the frames of this run were not recorded; take it again with "

@@ -89,7 +89,6 @@ def replay_config(run: Path, options: ReplayOptions, others: RigConfig | None, e
     recorded = manifest.get("config") or {}
     calibration = run / CALIBRATION_FILE
     given = {key: value for key, value in estimate.items() if value is not None}
-    scan = {key: value for key, value in (recorded.get("scan") or _scan_of(plan)).items() if key != "adaptive"}
     content: dict[str, Any] = {
         "name": f"replay of {recorded.get('name') or run.name}",
         "calibration": str(calibration.absolute()) if calibration.exists() else None,
@@ -97,7 +96,7 @@ def replay_config(run: Path, options: ReplayOptions, others: RigConfig | None, e
         "world": None,
         "spad": {"kind": "replay", "recording": str(run.absolute()), **asdict(options)},
         **{slot: {"kind": "replay"} for slot in RECORDED},
-        "scan": scan,
+        "scan": recorded.get("scan") or _scan_of(plan),
         "estimate": {**(recorded.get("estimate") or {}), **given},
     }
     if content["estimate"].get("estimator") != "joint":  # another estimator than that of the scan, which had a prior
