@@ -152,17 +152,26 @@ class PhotonSource:
         try:
             # What moves is where it is at one time: its picture is made once, for all bands.
             for _, together in groupby(spans, lambda span: span.moment_s):
-                self._each_band(partial(band, list(together)))
+                group = list(together)
+                bowed = [sheet for span in group for sheet in span.sheets or () if sheet.bowed is not None]
+                if bowed:  # all rows first: drops and flakes read the planes of rows that other bands trace
+                    self._each_band(partial(self._trace, bowed))
+                self._each_band(partial(band, group))
         except BaseException:
             self._traced = None
             raise
+
+    def _trace(self, sheets: list[LightSheet], a: int, b: int) -> None:
+        for sheet in sheets:
+            self._model.setting.view.trace(sheet, a, b)
 
     def _set_rate(self, sheets: list[LightSheet], a: int, b: int) -> None:
         """Detections per second and watt of all sheets, rows a..b-1."""
         model, rate, of_line = self._model, self._rate, self._of_line
         rate[a:b] = 0
         for sheet in sheets:
-            model.setting.view.trace(sheet, a, b)
+            if sheet.bowed is None:
+                self._trace([sheet], a, b)
             if of_line is None:
                 model.add_sheet(sheet, a, b, rate)
                 continue

@@ -1,5 +1,6 @@
 """Sheets that bow and rows that are late, as the simulated rig draws them, against light traced ray by ray."""
 
+from collections.abc import Callable, Iterable
 from dataclasses import replace
 
 import numpy as np
@@ -8,6 +9,7 @@ import pytest
 from calibration.model.rig_model import RigModel
 from sim_backend.effects.particles import rain_drops
 from sim_backend.frames.flux import FluxModel
+from sim_backend.frames.photons import PhotonSource
 from sim_backend.light.line import ONE_LINE
 from sim_backend.light.sheet import LightSheet
 from sim_backend.world import DEFAULT_GEOMETRY
@@ -106,3 +108,19 @@ def test_the_world_says_that_light_is_bent_and_where_late_rows_see_it(tmp_path) 
     assert np.nanmedian((up - down)[500:]) == pytest.approx(2 * 2e-3 * 0.5315 * 600, rel=0.3)
     assert np.nanmax(np.abs(up - down)[0]) < 1e-6
     assert np.array_equal(plain.truth(commands, 200.0).x_px, plain.truth(commands).x_px, equal_nan=True)
+
+
+def test_drops_in_bowed_light_do_not_depend_on_which_band_of_rows_is_drawn_first(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    _, model = bent(bow=0.1)
+    flux = FluxModel(setting(model, wall(model, (0, 0, 1), 2.0), rain={"rate": "50 mm/h"}))
+    held = np.linspace(-0.3, 0.3, 40)
+
+    def last_band_first(self: PhotonSource, jobs: Iterable[Callable[[], None]]) -> None:
+        for job in reversed(list(jobs)):
+            job()
+
+    before = drawn(flux, model.sheets, held, 50.0, threads=1)
+    monkeypatch.setattr(PhotonSource, "_each", last_band_first)
+    assert np.array_equal(drawn(flux, model.sheets, held, 50.0, threads=4), before)
