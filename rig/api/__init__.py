@@ -6,14 +6,20 @@ result.last.depth_m, result.summary.truth
 """
 
 from rig.api.calibrate import calibrate_camera, calibrate_check, calibrate_pixels, calibrate_planes, calibrate_sync
-from rig.api.recordings import compress, cut, export_run, import_frames, recording_info, repair, verify
-from rig.api.rig import bench, check_config, devices, doctor, effects, flux_row, laser_off, warm_up
+from rig.api.rig import bench, check_config, devices, doctor, laser_off, warm_up
 from rig.api.scan import plan_scan, reconstruct, replay, scan
 from rig.api.tradeoff import tradeoff
 from rig.bench.soak import soak
 from rig.config.bundled import bundled_rigs, bundled_scenes
 from rig.config.overrides import MAX_SEED, SIMULATED, Config, PathLike, configure
+from rig.exchange.exporting import export_run
+from rig.exchange.importing import import_frames
 from rig.plan.describe import plan_text
+from rig.recording.compress import compress
+from rig.recording.cut import cut
+from rig.recording.open import info as recording_info
+from rig.recording.repair import repair
+from rig.recording.verify import verify
 from rig.requests import (
     CameraRequest,
     CheckRequest,
@@ -26,6 +32,8 @@ from rig.requests import (
     TradeoffRequest,
 )
 from rig.scan.run import RunResult
+from rig.tradeoff.effects import flux_row
+from rig.tradeoff.effects import scene_effects as effects
 
 __all__ = [
     "MAX_SEED",

@@ -1,4 +1,4 @@
-"""The calls about a rig and its computer: check a config, list devices and effects, laser off, benchmarks."""
+"""The calls about a rig and its computer: check a config, list devices, laser off, benchmarks."""
 
 from pathlib import Path
 from typing import TYPE_CHECKING
@@ -11,7 +11,6 @@ if TYPE_CHECKING:
     from rig.bench.speed import SpeedReport
     from rig.config.models import RigConfig
     from rig.devices.doctor import Attached, Finding
-    from rig.tradeoff.effects import Flux, SceneEffects
 
 
 def check_config(config: Config = SIMULATED) -> "RigConfig":
@@ -24,31 +23,6 @@ def check_config(config: Config = SIMULATED) -> "RigConfig":
     checked = configure(config)
     check_files(checked)
     return checked
-
-
-def effects(
-    config: Config = SIMULATED, *, scene: str | None = None, trials: bool = True, progress: Progress | None = None
-) -> "SceneEffects":
-    """List the physical effects that a simulated scene calls for, why, and how much each matters (`rig effects`).
-
-    trials: measure how much each effect changes the stripe error, in pairs of short scans; takes seconds.
-    progress: called with the number of scans done and the total.
-    """
-    from rig.tradeoff.effects import scene_effects
-
-    return scene_effects(configure(config, scene=scene), trials=trials, progress=progress)
-
-
-def flux_row(config: Config = SIMULATED, *, scene: str | None = None, row: int | None, column: int | None) -> "Flux":
-    """Noise-free photons per exposure of one image row while the line is at a column's centre (`rig effects --row`).
-
-    The result has float arrays (width,): x_px, total, and the share of each effect by its name.
-    """
-    from rig.tradeoff.effects import flux_row as row_of
-
-    if row is None or column is None:
-        raise UsageError("the flux is that of one image row at one column of the scan; give both --row and --column")
-    return row_of(configure(config, scene=scene), row, column)
 
 
 def doctor(config: Config = SIMULATED, *, out: PathLike = "runs") -> "list[Finding]":

@@ -1,9 +1,8 @@
 """`rig export`: writes a run for other programs, as arrays, one HDF5 file, point clouds, pictures or a film."""
 
-import os
 import shutil
 from collections.abc import Callable, Iterator
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any, Final
 
@@ -11,6 +10,7 @@ from drivers.errors import ProtocolError
 from drivers.frames import FrameBlock
 from drivers.recorded import RunRecording
 from drivers.recorded.segments import segment_files
+from rig.config.overrides import PathLike
 from rig.errors import DamagedRecordingError, UsageError
 from rig.exchange import hdf5, pictures
 from rig.exchange.npy import FrameLog, MapFiles, write_npy
@@ -52,18 +52,22 @@ class ExportResult:
 
 
 def export_run(
-    run: str | os.PathLike[str],
+    run: PathLike,
     kind: str,
-    out: str | os.PathLike[str] | None,
-    request: ExportRequest,
+    request: ExportRequest | None = None,
+    *,
+    out: PathLike | None = None,
     progress: Progress | None = None,
+    **changes: Any,
 ) -> ExportResult:
-    """Write `run` in another form to a new folder: `out`, or RUN-KIND beside the run. The folder appears only once it
-    is complete.
+    """Write a run for other programs (`rig export`): npy, hdf5, ply, png or mp4.
 
+    request, changes: what pictures and films show, as an `ExportRequest` or by the names of its fields.
+    out: the folder to write, which appears only once it is complete; None is RUN-KIND beside the run.
+    progress: called with the number of frames done and the total.
     Raises UsageError if the run has nothing of that kind, or h5py is not installed.
     """
-    run = Path(run)
+    run, request = Path(run), replace(request or ExportRequest(), **changes)
     _check(run, kind, request)
     target = Path(out) if out is not None else run.absolute().with_name(f"{run.absolute().name}-{kind}")
     with RunFolder(target) as folder:

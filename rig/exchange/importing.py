@@ -5,11 +5,10 @@ and without a frame rate no clock (`frame_period_ticks` 0, one tick per frame). 
 by bit.
 """
 
-import os
 import shutil
 from collections.abc import Callable, Iterable, Iterator
 from contextlib import closing
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from fractions import Fraction
 from itertools import pairwise
 from pathlib import Path
@@ -23,6 +22,7 @@ from drivers.frames import FRAME_RECORD, BlockFlag, BlockHeader, FrameBlock, fra
 from drivers.spads.orientation import QuarterTurn, turn_packed, turned_size
 from drivers.spb1 import BlockLayout, frames_per_block
 from drivers.units import parse_exact
+from rig.config.overrides import PathLike
 from rig.errors import UsageError
 from rig.exchange import photoncube, raw_files
 from rig.exchange.foreign import ForeignFrames, gather
@@ -78,15 +78,22 @@ class ImportResult:
 
 def import_frames(
     kind: str,
-    files: Iterable[str | os.PathLike[str]],
-    out: str | os.PathLike[str],
-    request: ImportRequest,
+    files: Iterable[PathLike],
+    out: PathLike,
+    request: ImportRequest | None = None,
+    *,
     progress: Progress | None = None,
+    **changes: Any,
 ) -> ImportResult:
-    """Write the frames of `files` to a new run folder `out`, which appears only once it is complete.
+    """Make a recording from the frames of another program (`rig import`); it appears only once it is complete.
 
-    Raises UsageError, a line per problem, for files or options that cannot be used.
+    kind: pi-imaging, swissspad2 or photoncube.
+    files: in order; a folder stands for the files in it.
+    request, changes: how they are read, as an `ImportRequest` or by the names of its fields.
+    progress: called with the number of frames done and the total.
+    Raises UsageError, one line per problem, for files or options that cannot be used.
     """
+    request = replace(request or ImportRequest(), **changes)
     asked = request.frame_rate
     try:
         given = parse_exact(asked, "frequency") if isinstance(asked, str) else asked

@@ -21,6 +21,7 @@ from drivers.recorded.segments import (
     unpack_frame,
     zstandard_or_error,
 )
+from rig.config.overrides import PathLike
 from rig.errors import DamagedRecordingError, RecordingError, UsageError
 from rig.progress import tell_stage
 from rig.recording.verify import Integrity, examine
@@ -40,13 +41,16 @@ class Compression:
     bytes_after: int
 
 
-def compress(folder: Path) -> Compression:
-    """Compress the segments of a recording (`rig compress`). Segments that are compressed already stay as they are.
+def compress(run: PathLike) -> Compression:
+    """Compress a recording with zstd; it can be read like any other (`rig compress`). Needs the extra `compress`.
+
+    Segments that are compressed already stay as they are.
 
     Raises UsageError if there is no recording or the package zstandard is missing, DamagedRecordingError if the
     recording is not whole, and RecordingError if the disk is full. Each segment is then still plain or completely
     compressed.
     """
+    folder = Path(run)
     try:
         zstandard_or_error()
     except ProtocolError as error:

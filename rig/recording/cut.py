@@ -10,15 +10,17 @@ import re
 import shutil
 from collections.abc import Sequence
 from contextlib import closing
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any, Final
 
 from drivers.recorded import RecordedRun, RunRecording
+from rig.config.overrides import PathLike
 from rig.errors import DamagedRecordingError, RecordingError, UsageError
 from rig.progress import tell_stage
 from rig.recording.open import MapSpan, fitted_ratio, manifest_or_none, map_spans, open_recording
 from rig.recording.writer import Recording
+from rig.requests import CutRequest
 from rig.run_folder.folder import RunFolder
 from rig.run_folder.manifest import MANIFEST, UNFINISHED, known_missing, manifest_crc32, require_playable
 from rig.run_folder.summary import RunVerdict
@@ -40,29 +42,23 @@ class Part:
     end_map: int
 
 
-def cut(
-    folder: Path,
-    out: Path,
-    *,
-    maps: str | None = None,
-    frames: str | None = None,
-    time: str | None = None,
-    run: int = 0,
-) -> dict[str, Any]:
-    """Write a part of a recording to a new folder and return its manifest (`rig cut`).
+def cut(run: PathLike, out: PathLike, request: CutRequest | None = None, **changes: Any) -> dict[str, Any]:
+    """Write a part of a recording to the folder `out` and return the manifest of the part (`rig cut`).
 
-    Give exactly one of: maps 'A:B', frames 'A:B' of run number `run`, time 'A:B' in seconds of its frame clock from its
-    first frame. Each is from A to before B; a missing A or B means the first or the end; a single number means one map
-    or frame. Raises UsageError for a part that does not exist or an `out` that cannot be written, DamagedRecordingError
-    if the recording is damaged, RecordingError if the disk is full.
+    request, changes: which part, as a `CutRequest` or by the names of its fields: `cut("run", "part", maps="0:2")`. A
+      missing A or B means the first or the end; a single number means one map or frame.
+
+    Raises UsageError for a part that does not exist or an `out` that cannot be written, DamagedRecordingError if the
+    recording is damaged, RecordingError if the disk is full.
     """
+    folder, asked = Path(run), replace(request or CutRequest(), **changes)
     recording = open_recording(folder)
     manifest, trouble = manifest_or_none(folder)
     if manifest is None:
         raise DamagedRecordingError(f"{folder}: {trouble}")
     require_playable(folder, manifest)
     spans = map_spans(recording, manifest)
-    parts = _parts(recording, spans, maps, frames, time, run)
+    parts = _parts(recording, spans, asked)
     with RunFolder(out) as target:
         lost: list[list[int]] = []
         with closing(Recording(target.place("."), expected_bytes=0)) as written:
@@ -89,17 +85,16 @@ def cut(
     return content
 
 
-def _parts(
-    recording: RunRecording, spans: Sequence[MapSpan], maps: str | None, frames: str | None, time: str | None, run: int
-) -> list[Part]:
-    given = {"--maps": maps, "--frames": frames, "--time": time}
-    asked = [(name, text) for name, text in given.items() if text is not None]
-    if len(asked) != 1:
-        raise UsageError(f"say what to cut by exactly one of {', '.join(given)}; {len(asked)} were given")
+def _parts(recording: RunRecording, spans: Sequence[MapSpan], asked: CutRequest) -> list[Part]:
+    ways = {"--maps": asked.maps, "--frames": asked.frames, "--time": asked.time}
+    given = [(name, text) for name, text in ways.items() if text is not None]
+    if len(given) != 1:
+        raise UsageError(f"say what to cut by exactly one of {', '.join(ways)}; {len(given)} were given")
+    run = asked.start
     if not 0 <= run < len(recording.runs):
         raise UsageError(f"--start {run} is not in {recording.path}; it has {len(recording.runs)}, counted from 0")
     of = recording.runs[run]
-    name, text = asked[0]
+    name, text = given[0]
     if name == "--maps":
         return _map_parts(recording, spans, *_range(name, text, 0, len(spans)))
     first, end = _range(name, text, of.first_frame, of.end_frame) if name == "--frames" else _time_range(text, of)

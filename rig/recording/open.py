@@ -14,6 +14,7 @@ from drivers.frames import FrameBlock, Mark
 from drivers.recorded import RecordedRun, RunRecording
 from drivers.recorded.contents import INDEX_FILE
 from drivers.recorded.segments import PACKED_SUFFIX, segment_files
+from rig.config.overrides import PathLike
 from rig.count.bind import MAX_RESIDUAL_COLUMNS
 from rig.errors import DamagedRecordingError, UsageError
 from rig.plan.scan_plan import MAX_CLOCK_ERROR
@@ -199,8 +200,12 @@ class RecordingInfo:
         return {**asdict(self), "folder": str(self.folder)}
 
 
-def info(folder: Path) -> RecordingInfo:
-    """Describe a recording (`rig info`). Raises UsageError if there is none."""
+def info(run: PathLike) -> RecordingInfo:
+    """Describe a recording from its index and manifest, without reading the frames (`rig info`).
+
+    Raises UsageError if there is none.
+    """
+    folder = Path(run)
     recording = open_recording(folder)
     manifest, trouble = manifest_or_none(folder)
     spans = map_spans(recording, manifest)

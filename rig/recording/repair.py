@@ -17,6 +17,7 @@ import numpy as np
 from drivers.errors import CorruptBlock
 from drivers.recorded.contents import INDEX_FILE, index_header, round_up_to_page
 from drivers.recorded.segments import PACKED_SUFFIX, PlainSegment, SegmentReader
+from rig.config.overrides import PathLike
 from rig.errors import RecordingError, UsageError
 from rig.recording.verify import Examination, Verification, examine, verify
 from rig.recording.writer import RESERVE_FILE
@@ -37,11 +38,12 @@ class Repair:
     after: Verification
 
 
-def repair(folder: Path) -> Repair:
-    """Make a recording whole as far as possible (`rig repair`).
+def repair(run: PathLike) -> Repair:
+    """Make a torn recording whole as far as possible. No frame is changed and no byte thrown away (`rig repair`).
 
     Raises UsageError if there is none, RecordingError if it cannot be written.
     """
+    folder = Path(run)
     if is_held(folder / INDEX_FILE):
         raise UsageError(f"{folder} is still being recorded; let the run end, or end it, and repair it then")
     found = examine(folder)

@@ -14,6 +14,7 @@ from drivers.recorded.contents import INDEX_FILE, INDEX_RECORD, Contents, find_b
 from drivers.recorded.order import in_order
 from drivers.recorded.reader import is_of_run, usual_header
 from drivers.recorded.segments import PACKED_SUFFIX, SegmentReader, open_segments
+from rig.config.overrides import PathLike
 from rig.errors import DamagedRecordingError, UsageError
 from rig.progress import tell_stage
 from rig.recording.check import CHECKING, Continuity, Run, SoundBlock, check_segments, lost_ends, out_of_step
@@ -94,9 +95,12 @@ class Examination:
         return np.frombuffer(b"".join(block.entry for run in self.runs for block in run), INDEX_RECORD)
 
 
-def verify(folder: Path) -> Verification:
-    """Read all of a recording (`rig verify`). Raises UsageError if there is none; damage is reported in the result."""
-    found = examine(folder)
+def verify(run: PathLike) -> Verification:
+    """Read every byte of a recording and report whether it is what was recorded (`rig verify`).
+
+    Raises UsageError if there is no recording.
+    """
+    found = examine(Path(run))
     blocks = [block for run in found.runs for block in run]
     manifest = found.manifest or {}
     ended = ended_early(manifest)

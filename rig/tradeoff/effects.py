@@ -13,6 +13,7 @@ from drivers.errors import DeviceError
 from drivers.interfaces import World
 from drivers.registry import lookup
 from rig.config.models import RigConfig
+from rig.config.overrides import SIMULATED, Config, configure
 from rig.devices.open import DEVICES, open_rig, surroundings_of
 from rig.errors import PlanError, UsageError
 from rig.geometry.line_grid import line_grid
@@ -100,13 +101,17 @@ class SceneEffects:
         return iter(self.effects)
 
 
-def scene_effects(config: RigConfig, *, trials: bool = True, progress: Progress | None = None) -> SceneEffects:
-    """Find the effects of a config's scene at its scan's power, exposure and exposures. Raises UsageError without a
-    world.
+def scene_effects(
+    config: Config = SIMULATED, *, scene: str | None = None, trials: bool = True, progress: Progress | None = None
+) -> SceneEffects:
+    """List the physical effects that a simulated scene calls for, why, and how much each matters (`rig effects`).
 
-    trials: whether to measure how much each effect changes the stripe error. progress: called with the number of trial
-    scans done and the total.
+    They are those at the power, exposure and exposures of the config's scan.
+    trials: measure how much each effect changes the stripe error, in pairs of short scans; takes seconds.
+    progress: called with the number of trial scans done and the total.
+    Raises UsageError without a simulated world.
     """
+    config = configure(config, scene=scene)
     scan = config.scan
     with open_world(config) as (world, power_w):
         report = world.effects_report(power_w, scan.exposure_s, scan.exposures)
@@ -121,12 +126,15 @@ def scene_effects(config: RigConfig, *, trials: bool = True, progress: Progress 
     return SceneEffects(report["planned_for"], report["changed_decisions_bound"], tuple(effects))
 
 
-def flux_row(config: RigConfig, row: int, column: int) -> Flux:
-    """Noise-free photons per exposure of one image row while the line is at a column's centre.
+def flux_row(config: Config = SIMULATED, *, scene: str | None = None, row: int | None, column: int | None) -> Flux:
+    """Noise-free photons per exposure of one image row while the line is at a column's centre (`rig effects --row`).
 
     x_px: pixels (width,); total; and by name the share of each effect of light and dark counts, zeros for effects that
     are off. The shares add up to the total. Raises UsageError for a row or column that does not exist.
     """
+    if row is None or column is None:
+        raise UsageError("the flux is that of one image row at one column of the scan; give both --row and --column")
+    config = configure(config, scene=scene)
     scan = config.scan
     with open_world(config) as (world, power_w):
         rows, width = world.size

@@ -105,7 +105,7 @@ def test_maps_are_cut_out_with_their_closing_marker(tmp_path: Path, runs: Runs) 
 )
 def test_frames_and_times_are_cut_out(tmp_path: Path, runs: Runs, asked: dict[str, str], first: int, end: int) -> None:
     folder = record(tmp_path / "run", runs)
-    cut(folder, tmp_path / "part", run=1, **asked)
+    cut(folder, tmp_path / "part", start=1, **asked)
     part = RunRecording(tmp_path / "part")
     assert frames_in(part, 0, 0, 10_000) == frames_in(RunRecording(folder), 1, first, end)
     assert not verify(tmp_path / "part").problems
@@ -114,7 +114,7 @@ def test_frames_and_times_are_cut_out(tmp_path: Path, runs: Runs, asked: dict[st
 def test_a_part_is_over_and_has_its_own_verdict(tmp_path: Path, runs: Runs) -> None:
     folder = record(tmp_path / "run", runs, verdict="gaps")
     assert cut(folder, tmp_path / "without", frames=":20")["verdict"] == "complete"
-    assert cut(folder, tmp_path / "with", frames="100:200", run=1)["verdict"] == "gaps"
+    assert cut(folder, tmp_path / "with", frames="100:200", start=1)["verdict"] == "gaps"
     killed = record(tmp_path / "killed", runs, verdict="recording")
     assert cut(killed, tmp_path / "part", frames=":20")["verdict"] == "aborted"
     assert verify(tmp_path / "part").verdict is Integrity.INTACT
@@ -123,10 +123,10 @@ def test_a_part_is_over_and_has_its_own_verdict(tmp_path: Path, runs: Runs) -> N
 def test_what_a_repair_found_missing_is_known_to_be_missing_in_a_part(tmp_path: Path, runs: Runs) -> None:
     folder = record(tmp_path / "run", [runs[0], [*runs[1][:2], *runs[1][3:]]])
     repair(folder)
-    cut(folder, tmp_path / "around", frames="10:100", run=1)
+    cut(folder, tmp_path / "around", frames="10:100", start=1)
     found = verify(tmp_path / "around")
     assert (found.verdict, found.gaps) == (Integrity.GAPS, [(0, 32, 47)])
-    cut(folder, tmp_path / "behind", frames="40:100", run=1)
+    cut(folder, tmp_path / "behind", frames="40:100", start=1)
     assert verify(tmp_path / "behind").verdict is Integrity.INTACT
 
 
