@@ -162,7 +162,7 @@ def test_maps_cannot_be_cut_where_there_are_no_markers(tmp_path: Path, runs: Run
         ({"maps": "0", "time": "0:1"}, "2 were given"),
         ({"maps": "4:9"}, "it has 6"),
         ({"maps": "x"}, "no range"),
-        ({"frames": "1", "run": 2}, "it has 2"),
+        ({"frames": "1", "start": 2}, "it has 2"),
         ({"time": "1:2:3"}, "no range"),
         ({"time": "nan:1"}, "no range"),
         ({"time": "1e300:"}, "holds no frame"),
