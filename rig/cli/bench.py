@@ -5,7 +5,7 @@ from typing import Annotated
 
 import typer
 
-from rig.cli.command import Commands, ConfigArgument, JsonOption, api, print_json
+from rig.cli.command import Answer, Commands, ConfigArgument, api, tables
 from rig.cli.progress import progress
 
 
@@ -24,8 +24,7 @@ def bench_command(
     on_overload: Annotated[
         str, typer.Option("--on-overload", help="soak: frames come too fast: abort, drop or block")
     ] = "abort",
-    as_json: JsonOption = False,
-) -> int:
+) -> Answer:
     """Measure how fast this machine counts and estimates, beside how fast it reads its memory."""
     from rig.errors import UsageError
 
@@ -39,27 +38,23 @@ def bench_command(
             )  # fmt: skip
     with progress():
         report = api.bench(threads=threads)
-    if as_json:
-        print_json(report.as_json() | ({} if stream is None else {"soak": asdict(stream)}))
-    else:
-        from rig.cli.tables import soak_table, speed_table
+    if stream is None:
+        return Answer(report.as_json(), lambda: tables.speed_table(report))
 
-        speed_table(report)
-        if stream is not None:
-            print()
-            soak_table(stream)
-    return 0 if stream is None else stream.exit_code
+    def show() -> None:
+        tables.speed_table(report)
+        print()
+        tables.soak_table(stream)
+
+    return Answer({**report.as_json(), "soak": asdict(stream)}, show, stream.exit_code)
 
 
-def warmup_command(config: ConfigArgument = "simulated", as_json: JsonOption = False) -> int:
+def warmup_command(config: ConfigArgument = "simulated") -> Answer:
     """Compile all code that needs compiling, so that no scan waits for it."""
     with progress():
         seconds = api.warm_up(config)
-    if as_json:
-        print_json({"seconds": seconds})
-    else:
-        print(f"warm after {seconds:.1f} s; compiled code is kept on disk, once more takes seconds")
-    return 0
+    said = f"warm after {seconds:.1f} s; compiled code is kept on disk, once more takes seconds"
+    return Answer({"seconds": seconds}, lambda: print(said))
 
 
 COMMANDS: Commands = {"bench": bench_command, "warmup": warmup_command}

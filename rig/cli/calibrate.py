@@ -5,7 +5,7 @@ from typing import TYPE_CHECKING, Annotated
 
 import typer
 
-from rig.cli.command import Commands, JsonOption, api, asks, print_json, say
+from rig.cli.command import Answer, Commands, api, asks, say, tables
 from rig.cli.completion import one_of, rig_names
 from rig.cli.progress import paused, progress
 from rig.requests import CameraRequest, CheckRequest, PixelsRequest, PlanesRequest, SyncRequest
@@ -40,15 +40,8 @@ def ask_at_terminal() -> "AskPerson | None":
     return ask
 
 
-def print_report(result: "CalibrationResult", as_json: bool) -> int:
-    """Print a result, for programs or people, and return its exit code."""
-    if as_json:
-        print_json(result.as_json())
-    else:
-        from rig.cli.tables import print_result
-
-        print_result(result, result.line)
-    return result.exit_code
+def _of_result(result: "CalibrationResult") -> Answer:
+    return Answer(result.as_json(), lambda: tables.print_result(result, result.line), result.exit_code)
 
 
 @asks(PixelsRequest)
@@ -63,51 +56,44 @@ def pixels_command(
             autocompletion=one_of(rig_names),
         ),
     ] = "simulated",
-    as_json: JsonOption = False,
-) -> int:
+) -> Answer:
     """Map hot, dead and noisy pixels and the dark rate, from dark frames."""
-    from rig.cli.tables import print_result
-
     ask = ask_at_terminal()
     with progress():
         result = api.calibrate_pixels(source, request, covered=None if ask is None else lambda: ask("cover the lens"))
-    if as_json:
-        print_json(result.as_json())
-    else:
-        print_result(result)
-    return result.exit_code
+    return Answer(result.as_json(), lambda: tables.print_result(result), result.exit_code)
 
 
 @asks(CameraRequest)
-def camera_command(request: CameraRequest, sources: SourcesArgument = None, as_json: JsonOption = False) -> int:
+def camera_command(request: CameraRequest, sources: SourcesArgument = None) -> Answer:
     """Calibrate the camera alone, from views of a board or from pictures."""
     with progress():
         result = api.calibrate_camera(sources or (), request, ask=ask_at_terminal(), tell=say)
-    return print_report(result, as_json)
+    return _of_result(result)
 
 
 @asks(PlanesRequest)
-def planes_command(request: PlanesRequest, sources: SourcesArgument = None, as_json: JsonOption = False) -> int:
+def planes_command(request: PlanesRequest, sources: SourcesArgument = None) -> Answer:
     """Calibrate camera, light planes and lag from views of a board."""
     with progress():
         result = api.calibrate_planes(sources or (), request, ask=ask_at_terminal(), tell=say)
-    return print_report(result, as_json)
+    return _of_result(result)
 
 
 @asks(SyncRequest)
-def sync_command(request: SyncRequest, sources: SourcesArgument = None, as_json: JsonOption = False) -> int:
+def sync_command(request: SyncRequest, sources: SourcesArgument = None) -> Answer:
     """Measure the mirror's lag in each direction and the rows' delay, from one unmoved scene at several speeds."""
     with progress():
         result = api.calibrate_sync(sources or (), request, tell=say)
-    return print_report(result, as_json)
+    return _of_result(result)
 
 
 @asks(CheckRequest)
-def check_command(request: CheckRequest, sources: SourcesArgument = None, as_json: JsonOption = False) -> int:
+def check_command(request: CheckRequest, sources: SourcesArgument = None) -> Answer:
     """Judge a calibration by scans of a flat board: flatness, scale, angle."""
     with progress():
         result = api.calibrate_check(sources or (), request, ask=ask_at_terminal(), tell=say)
-    return print_report(result, as_json)
+    return _of_result(result)
 
 
 COMMANDS: Commands = {

@@ -9,11 +9,11 @@ import inspect
 import os
 import sys
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import Field
+from dataclasses import Field, dataclass
 from datetime import datetime
 from importlib import import_module
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Any, ParamSpec
+from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
@@ -23,17 +23,21 @@ from rig.requests import options_of
 
 if TYPE_CHECKING:
     from rig import api as api
+    from rig.cli import tables as tables
     from rig.recording.segment import Space
     from rig.scan.run import RunResult
 else:
 
-    class _Api:
-        """The module `rig.api`, imported when a command first uses it."""
+    class _Later:
+        """A module that is imported when a command first uses it."""
+
+        def __init__(self, module: str) -> None:
+            self._module = module
 
         def __getattr__(self, name: str) -> Any:
-            return getattr(import_module("rig.api"), name)
+            return getattr(import_module(self._module), name)
 
-    api = _Api()
+    api, tables = _Later("rig.api"), _Later("rig.cli.tables")
 
 EXIT_USAGE = 2
 EXIT_DEVICE = 3
@@ -41,9 +45,7 @@ EXIT_ABORTED = 4
 EXIT_SOFTWARE = 70
 """An error in the program itself: EX_SOFTWARE of sysexits.h."""
 
-P = ParamSpec("P")
-
-Commands = Mapping[str, "Callable[..., int] | tuple[str, Commands]"]
+Commands = Mapping[str, "Callable[..., int | Answer] | tuple[str, Commands]"]
 """Commands by name; a group is its help and the commands in it."""
 
 ConfigArgument = Annotated[
@@ -55,7 +57,24 @@ ConfigArgument = Annotated[
         autocompletion=one_of(rig_names),
     ),
 ]
-JsonOption = Annotated[bool, typer.Option("--json", help="print exactly one JSON object to stdout, errors too")]
+_JSON = inspect.Parameter(
+    "as_json",
+    inspect.Parameter.KEYWORD_ONLY,
+    default=False,
+    annotation=Annotated[bool, typer.Option("--json", help="print exactly one JSON object to stdout, errors too")],
+)
+
+
+@dataclass(frozen=True, slots=True)
+class Answer:
+    """Result of a command. content: printed with --json. show: prints it for people. code: the exit code. note: said
+    afterwards on stderr.
+    """
+
+    content: Mapping[str, Any]
+    show: Callable[[], None]
+    code: int = 0
+    note: str = ""
 
 
 def add_commands(app: typer.Typer, commands: Commands) -> None:
@@ -69,24 +88,35 @@ def add_commands(app: typer.Typer, commands: Commands) -> None:
             app.command(name)(command(given))
 
 
-def command(function: Callable[P, int]) -> Callable[P, None]:
-    """Wrap a command so that its user's mistakes and its devices' faults become lines and exit codes."""
+def command(function: Callable[..., int | Answer]) -> Callable[..., None]:
+    """Wrap a command: its answer is printed, with the option --json for programs; its user's mistakes and its devices'
+    faults become lines and exit codes.
+    """
+    signature = inspect.signature(function)
 
     @functools.wraps(function)
-    def wrapped(*args: P.args, **kwargs: P.kwargs) -> None:
+    def wrapped(*, as_json: bool = False, **values: Any) -> None:
         try:
-            code = function(*args, **kwargs)
+            answer = function(**values)
+            if isinstance(answer, Answer):
+                print_json(answer.content) if as_json else answer.show()
+                if answer.note:
+                    say(answer.note)
+            code = answer.code if isinstance(answer, Answer) else answer
         except KeyboardInterrupt as interrupt:
-            code = fail(EXIT_ABORTED, [], ["aborted", *getattr(interrupt, "__notes__", [])], kwargs.get("as_json"))
+            code = fail(EXIT_ABORTED, [], ["aborted", *getattr(interrupt, "__notes__", [])], as_json)
         except Exception as error:
             refused = refused_file(error)
             found = EXIT_USAGE if refused else _code_of(error)
             if found is None:
                 raise
             said, notes = (refused or str(error)).splitlines(), getattr(error, "__notes__", [])
-            code = fail(found, said, notes, kwargs.get("as_json"))
+            code = fail(found, said, notes, as_json)
         raise typer.Exit(code)
 
+    if signature.return_annotation is Answer:
+        parameters = [*signature.parameters.values(), _JSON]
+        wrapped.__signature__ = signature.replace(parameters=parameters)  # type: ignore[attr-defined]
     return wrapped
 
 
@@ -114,26 +144,26 @@ _MANY = {Sequence[str]: split_option, Sequence[int]: whole_numbers}
 """Readers of options that may be given several times and with commas, by the type of their field."""
 
 
-def asks(request_type: type[Any]) -> Callable[[Callable[..., int]], Callable[..., int]]:
+def asks(request_type: type[Any]) -> Callable[[Callable[..., Answer]], Callable[..., Answer]]:
     """Give a command an option for each field of a request; it gets them together, as its argument `request`.
 
     A field for which the command already has its own option is left out.
     """
 
-    def decorate(function: Callable[..., int]) -> Callable[..., int]:
+    def decorate(function: Callable[..., Answer]) -> Callable[..., Answer]:
         plain = inspect.signature(function).parameters
         asked = [each for each in options_of(request_type) if each.name not in plain]
         given = [_parameter(each) for each in asked]
 
         @functools.wraps(function)
-        def filled(**values: Any) -> int:
+        def filled(**values: Any) -> Answer:
             read = {each.name: _read(each, values.pop(each.name)) for each in asked}
             return function(request=request_type(**read), **values)
 
         shown: list[inspect.Parameter] = []
         for name, parameter in plain.items():
             shown += given if name == "request" else [parameter.replace(kind=inspect.Parameter.KEYWORD_ONLY)]
-        filled.__signature__ = inspect.Signature(shown)  # type: ignore[attr-defined]
+        filled.__signature__ = inspect.Signature(shown, return_annotation=Answer)  # type: ignore[attr-defined]
         return filled
 
     return decorate
@@ -209,19 +239,13 @@ def _code_of(error: Exception) -> int | None:
     return EXIT_DEVICE if isinstance(error, DeviceError) else None
 
 
-def report(result: "RunResult", as_json: bool) -> int:
-    """Print a run's summary, for programs or people, and return its exit code."""
+def report(result: "RunResult") -> Answer:
+    """The answer of a command that made a run: its summary, and the exit code of its verdict."""
     from rig.run_folder.summary import RunVerdict
 
     if result.summary.valid_fraction == 0 and result.summary.verdict is not RunVerdict.UNCALIBRATED:
         say("warning: no pixel has a depth; raise --exposures, lower --min-confidence or check the depth range")
-    if as_json:
-        print_json(result.summary.as_json())
-    else:
-        from rig.cli.tables import run_table
-
-        run_table(result)
-    return result.summary.verdict.exit_code
+    return Answer(result.summary.as_json(), lambda: tables.run_table(result), result.summary.verdict.exit_code)
 
 
 def print_json(content: Mapping[str, Any]) -> None:

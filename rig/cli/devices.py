@@ -6,35 +6,27 @@ from typing import Annotated
 
 import typer
 
-from rig.cli.command import EXIT_DEVICE, Commands, ConfigArgument, JsonOption, api, print_json
+from rig.cli.command import EXIT_DEVICE, Answer, Commands, ConfigArgument, api, print_json
 
 
 def doctor_command(
     config: ConfigArgument = "simulated",
     out: Annotated[Path, typer.Option("--out", help="folder that a scan would write to")] = Path("runs"),
-    as_json: JsonOption = False,
-) -> int:
+) -> Answer:
     """Open everything, look at the stream with the gate low, and say whether a scan could run."""
     findings = api.doctor(config, out=out)
-    if as_json:
-        print_json({"could_scan": all(one.ok for one in findings), "findings": [asdict(one) for one in findings]})
-    else:
-        for one in findings:
-            print(f"{'ok  ' if one.ok else 'FAIL'}  {one.name:<12}{one.text}")
-    return 0 if all(one.ok for one in findings) else EXIT_DEVICE
+    could_scan = all(one.ok for one in findings)
+    lines = [f"{'ok  ' if one.ok else 'FAIL'}  {one.name:<12}{one.text}" for one in findings]
+    content = {"could_scan": could_scan, "findings": [asdict(one) for one in findings]}
+    return Answer(content, lambda: print("\n".join(lines)), 0 if could_scan else EXIT_DEVICE)
 
 
-def devices_command(as_json: JsonOption = False) -> int:
+def devices_command() -> Answer:
     """List what is attached: USB devices that a driver knows, and serial ports."""
     found = api.devices()
-    if as_json:
-        print_json({"devices": [asdict(one) for one in found]})
-    else:
-        for one in found:
-            print(f"{one.address:<32}{one.what}")
-        if not found:
-            print("no known USB device and no serial port is attached")
-    return 0
+    lines = [f"{one.address:<32}{one.what}" for one in found]
+    said = "\n".join(lines or ["no known USB device and no serial port is attached"])
+    return Answer({"devices": [asdict(one) for one in found]}, lambda: print(said))
 
 
 def laser_off_command(config: ConfigArgument = "simulated") -> int:
@@ -44,26 +36,19 @@ def laser_off_command(config: ConfigArgument = "simulated") -> int:
     return 0
 
 
-def check_command(config: ConfigArgument = "simulated", as_json: JsonOption = False) -> int:
+def check_command(config: ConfigArgument = "simulated") -> Answer:
     """Say whether a config is valid and the files that it names can be read; list all problems at once."""
     checked = api.check_config(config)
-    if as_json:
-        print_json({"config": config, "name": checked.name, "valid": True})
-    else:
-        print(f"{config}: valid, rig '{checked.name}'")
-    return 0
+    content = {"config": config, "name": checked.name, "valid": True}
+    return Answer(content, lambda: print(f"{config}: valid, rig '{checked.name}'"))
 
 
-def show_command(config: ConfigArgument = "simulated", as_json: JsonOption = False) -> int:
+def show_command(config: ConfigArgument = "simulated") -> Answer:
     """Print a config as it is written, with every default filled in and every path absolute."""
     from rig.config.files import completed_text, config_content
 
     text = completed_text(config)
-    if as_json:
-        print_json(config_content(text))
-    else:
-        print(text, end="")
-    return 0
+    return Answer(config_content(text), lambda: print(text, end=""))
 
 
 def schema_command() -> int:
@@ -74,18 +59,18 @@ def schema_command() -> int:
     return 0
 
 
-def scenes_command(as_json: JsonOption = False) -> int:
+def scenes_command() -> Answer:
     """List the bundled scenes (--scene) and rigs (CONFIG), with a sentence on each."""
     listed = {"scenes": api.bundled_scenes(), "rigs": api.bundled_rigs()}
-    if as_json:
-        print_json({group: [asdict(one) for one in members] for group, members in listed.items()})
-        return 0
     wide = max(len(one.name) for members in listed.values() for one in members)
-    for group, members in listed.items():
-        print(f"{group}:")
-        for one in members:
-            print(f"  {one.name:<{wide}}  {one.about}")
-    return 0
+
+    def show() -> None:
+        for group, members in listed.items():
+            print(f"{group}:")
+            for one in members:
+                print(f"  {one.name:<{wide}}  {one.about}")
+
+    return Answer({group: [asdict(one) for one in members] for group, members in listed.items()}, show)
 
 
 SCENES: Commands = {

@@ -1,11 +1,13 @@
 """Commands for recordings: `rig verify`, `repair`, `info`, `cut`, `compress`, `import` and `export`."""
 
+from collections.abc import Iterable
+from dataclasses import asdict
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
 
 import typer
 
-from rig.cli.command import Commands, JsonOption, api, asks, print_json, say
+from rig.cli.command import Answer, Commands, api, asks, say
 from rig.cli.progress import progress
 from rig.requests import CutRequest, ExportRequest, ImportRequest
 
@@ -19,38 +21,29 @@ MOST_LINES = 20
 """Most problems that are shown to people; `--json` has all."""
 
 
-def verify_command(run: RunArgument, as_json: JsonOption = False) -> int:
+def verify_command(run: RunArgument) -> Answer:
     """Read every byte of a recording and say whether it is what was recorded; exit code 1 if it is not."""
     with progress(compiles=False):
         found = api.verify(run)
-    if as_json:
-        print_json(found.as_json())
-    else:
-        _show_verification(found)
-    return found.exit_code
+    return Answer(found.as_json(), lambda: _show_verification(found), found.exit_code)
 
 
-def repair_command(run: RunArgument, as_json: JsonOption = False) -> int:
+def repair_command(run: RunArgument) -> Answer:
     """Make a torn recording whole: cut off torn ends and rewrite a lost index or manifest. Frames stay as they are."""
     with progress(compiles=False):
         made = api.repair(run)
-    if as_json:
-        print_json({"done": made.done, "after": made.after.as_json()})
-    else:
-        for line in made.done or ["nothing was to be done"]:
-            print(line)
+
+    def show() -> None:
+        print("\n".join(made.done or ["nothing was to be done"]))
         _show_verification(made.after)
-    return made.after.exit_code
+
+    return Answer({"done": made.done, "after": made.after.as_json()}, show, made.after.exit_code)
 
 
-def info_command(run: RunArgument, as_json: JsonOption = False) -> int:
+def info_command(run: RunArgument) -> Answer:
     """Describe what a recording holds."""
     found = api.recording_info(run)
-    if as_json:
-        print_json(found.as_json())
-    else:
-        _show_info(found)
-    return 0
+    return Answer(found.as_json(), lambda: _show_info(found))
 
 
 @asks(CutRequest)
@@ -58,30 +51,24 @@ def cut_command(
     request: CutRequest,
     run: RunArgument,
     out: Annotated[Path, typer.Option("--out", help="folder to write, new or empty", show_default=False)],
-    as_json: JsonOption = False,
-) -> int:
+) -> Answer:
     """Write a part of a recording to a folder of its own, with all that is needed to reconstruct it."""
     with progress(compiles=False):
         content = api.cut(run, out, request)
-    if as_json:
-        print_json({"out": str(out), "recording": content["recording"], "cut": content["cut"]})
-    else:
-        first, end = content["cut"]["maps"]
-        held = f"maps {first} to before {end}" if end > first else "no whole map"
-        print(f"{out}: {content['recording']['blocks']} blocks, {held}")
-    return 0
+    first, end = content["cut"]["maps"]
+    held = f"maps {first} to before {end}" if end > first else "no whole map"
+    said = f"{out}: {content['recording']['blocks']} blocks, {held}"
+    told = {"out": str(out), "recording": content["recording"], "cut": content["cut"]}
+    return Answer(told, lambda: print(said))
 
 
-def compress_command(run: RunArgument, as_json: JsonOption = False) -> int:
+def compress_command(run: RunArgument) -> Answer:
     """Compress a recording with zstd. All commands read it like any other."""
     with progress(compiles=False):
         made = api.compress(run)
-    if as_json:
-        print_json({"segments": made.segments, "bytes_before": made.bytes_before, "bytes_after": made.bytes_after})
-    else:
-        share = made.bytes_after / max(1, made.bytes_before)
-        print(f"{made.segments} segments, {_megabytes(made.bytes_after)} ({share:.0%} of before)")
-    return 0
+    share = made.bytes_after / max(1, made.bytes_before)
+    said = f"{made.segments} segments, {_megabytes(made.bytes_after)} ({share:.0%} of before)"
+    return Answer(asdict(made), lambda: print(said))
 
 
 def _show_verification(found: "Verification") -> None:
@@ -137,21 +124,15 @@ def import_command(
         list[Path], typer.Argument(metavar="FILES", help="files in order, or folders of them", show_default=False)
     ],
     out: Annotated[Path, typer.Option("--out", help="folder to write, new or empty", show_default=False)],
-    as_json: JsonOption = False,
-) -> int:
+) -> Answer:
     """Make a recording from the frames in another program's files."""
     with progress(compiles=False):
         result = api.import_frames(kind, files, out, request)
     for hint in result.hints:
         say(f"warning: {hint}")
-    if as_json:
-        print_json(result.as_json())
-    else:
-        rate = "no frame rate" if result.frame_rate_hz is None else f"{result.frame_rate_hz:g} Hz"
-        print(f"{result.frames} frames of {result.width} x {result.height} pixels, {rate}: {result.folder}")
-        for first, last in result.gaps:
-            print(f"frames {first} to {last} are missing")
-    return 0
+    rate = "no frame rate" if result.frame_rate_hz is None else f"{result.frame_rate_hz:g} Hz"
+    said = f"{result.frames} frames of {result.width} x {result.height} pixels, {rate}: {result.folder}"
+    return Answer(asdict(result), lambda: _show_with_gaps(said, result.gaps))
 
 
 @asks(ExportRequest)
@@ -162,22 +143,23 @@ def export_command(
     out: Annotated[
         Path | None, typer.Option("--out", help="folder to write, new or empty", show_default="RUN-KIND")
     ] = None,
-    as_json: JsonOption = False,
-) -> int:
+) -> Answer:
     """Write a run in a form that other programs read."""
     with progress(compiles=False):
         result = api.export_run(run, kind, request, out=out)
     for line in result.damage:
         say(f"warning: {line}")
-    if as_json:
-        print_json(result.as_json())
-    else:
-        what = [f"{n} {name}" for n, name in ((result.frames, "frames"), (result.maps, "maps")) if n]
-        files = ", ".join(result.files) if len(result.files) <= 3 else f"{len(result.files)} files"
-        print(f"{' and '.join(what)} as {files}: {result.folder}")
-        for _, first, last in result.gaps:
-            print(f"frames {first} to {last} are missing")
-    return result.exit_code
+    what = [f"{n} {name}" for n, name in ((result.frames, "frames"), (result.maps, "maps")) if n]
+    files = ", ".join(result.files) if len(result.files) <= 3 else f"{len(result.files)} files"
+    said = f"{' and '.join(what)} as {files}: {result.folder}"
+    gaps = [(first, last) for _, first, last in result.gaps]
+    return Answer(asdict(result), lambda: _show_with_gaps(said, gaps), 1 if result.damage else 0)
+
+
+def _show_with_gaps(said: str, gaps: Iterable[tuple[int, int]]) -> None:
+    print(said)
+    for first, last in gaps:
+        print(f"frames {first} to {last} are missing")
 
 
 COMMANDS: Commands = {

@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING, Annotated
 
 import typer
 
-from rig.cli.command import Commands, JsonOption, api, asks, report, say, say_space
+from rig.cli.command import Answer, Commands, api, asks, report, say, say_space
 from rig.cli.progress import progress
 from rig.requests import ReplayRequest
 
@@ -25,8 +25,7 @@ _LOOK_S = 0.2
 def replay_command(
     request: ReplayRequest,
     run: Annotated[Path, typer.Argument(metavar="RUN", help="a run taken with --record", show_default=False)],
-    as_json: JsonOption = False,
-) -> int:
+) -> Answer:
     """Play a recording through the live stack, at any clock."""
     if request.loop and request.save is None:
         request = replace(request, save="last")
@@ -35,7 +34,7 @@ def replay_command(
         result = api.replay(run, request, on_space=say_space, steps=steps)
     if result.control is not None:
         say(f"control: {result.control}")
-    return report(result, as_json)
+    return report(result)
 
 
 def _step_by_keys(pace: "Pace") -> None:

@@ -6,16 +6,7 @@ from typing import TYPE_CHECKING, Annotated
 
 import typer
 
-from rig.cli.command import (
-    Commands,
-    ConfigArgument,
-    JsonOption,
-    api,
-    asks,
-    print_json,
-    report,
-    say_space,
-)
+from rig.cli.command import Answer, Commands, ConfigArgument, api, asks, report, say_space, tables
 from rig.cli.completion import one_of, rig_names, scene_names
 from rig.cli.progress import progress
 from rig.requests import ReconstructRequest, ScanRequest
@@ -30,29 +21,23 @@ def scan_command(
     request: ScanRequest,
     config: ConfigArgument = "simulated",
     dry_run: Annotated[bool, typer.Option("--dry-run", help="compile and print the plan; nothing moves")] = False,
-    as_json: JsonOption = False,
-) -> int:
+) -> Answer:
     """Acquire and reconstruct depth maps."""
     if dry_run:
         spaces: list[Space] = []
         plan = api.plan_scan(config, request, on_space=spaces.append)
-        return _show_plan(plan, spaces[0] if spaces else None, as_json)
+        return _of_plan(plan, spaces[0] if spaces else None)
     with progress():
         result = api.scan(config, request, on_space=say_space)
-    return report(result, as_json)
+    return report(result)
 
 
-def _show_plan(plan: "ScanPlan", space: "Space | None", as_json: bool) -> int:
+def _of_plan(plan: "ScanPlan", space: "Space | None") -> Answer:
     from rig.plan.describe import plan_content, plan_text
 
-    if as_json:
-        recording = {} if space is None else {"recording": space.content()}
-        print_json({"plan": plan_content(plan), **recording})
-    else:
-        print(plan_text(plan))
-        if space is not None:
-            print(f"recording   {space}")
-    return 0
+    recording = {} if space is None else {"recording": space.content()}
+    said = plan_text(plan) + ("" if space is None else f"\nrecording   {space}")
+    return Answer({"plan": plan_content(plan), **recording}, lambda: print(said))
 
 
 @asks(ReconstructRequest)
@@ -71,12 +56,11 @@ def reconstruct_command(
     calibration: Annotated[
         Path | None, typer.Option("--calibration", help="calibration.yaml", show_default="the recording's own")
     ] = None,
-    as_json: JsonOption = False,
-) -> int:
+) -> Answer:
     """Make depth maps from a recording, from imported frames or from a packed .npy cube of them."""
     with progress():
         result = api.reconstruct(source, plan, calibration, replace(request, out=out))
-    return report(result, as_json)
+    return report(result)
 
 
 def effects_command(
@@ -109,29 +93,18 @@ def effects_command(
     column: Annotated[
         int | None, typer.Option("--column", help="of the scan, from 0: where the line is", show_default=False)
     ] = None,
-    as_json: JsonOption = False,
-) -> int:
+) -> Answer:
     """List which physical effects a scene calls for, why, and how much each matters; or the flux of an image row.
 
     With --row and --column, print the noise-free flux of that row instead.
     """
-    from rig.cli.tables import effects_table, flux_table
-
     chosen = config if config_option is None else config_option
     if row is not None or column is not None:
         flux = api.flux_row(chosen, scene=scene, row=row, column=column)
-        if as_json:
-            print_json(flux)
-        else:
-            flux_table(flux)
-        return 0
+        return Answer(flux, lambda: tables.flux_table(flux))
     with progress():
         effects = api.effects(chosen, scene=scene, trials=trials)
-    if as_json:
-        print_json(asdict(effects))
-    else:
-        effects_table(effects)
-    return 0
+    return Answer(asdict(effects), lambda: tables.effects_table(effects))
 
 
 COMMANDS: Commands = {"scan": scan_command, "reconstruct": reconstruct_command, "effects": effects_command}

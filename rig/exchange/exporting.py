@@ -41,15 +41,6 @@ class ExportResult:
     gaps: tuple[tuple[int, int, int], ...] = ()
     damage: tuple[str, ...] = ()
 
-    @property
-    def exit_code(self) -> int:
-        """Exit code of the command line: 1 if parts of the recording are missing in the output."""
-        return 1 if self.damage else 0
-
-    def as_json(self) -> dict[str, Any]:
-        """The result as plain values."""
-        return {name: getattr(self, name) for name in self.__slots__}
-
 
 def export_run(
     run: PathLike,

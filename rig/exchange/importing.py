@@ -71,10 +71,6 @@ class ImportResult:
     bytes: int
     hints: tuple[str, ...]
 
-    def as_json(self) -> dict[str, Any]:
-        """The result as plain values."""
-        return {name: getattr(self, name) for name in self.__slots__}
-
 
 def import_frames(
     kind: str,
