@@ -22,7 +22,7 @@ from rig.progress import Progress
 from rig.recording.cube import open_cube
 from rig.recording.inputs import PLAN_FILE, holds_frames_alone
 from rig.recording.open import require_recording
-from rig.recording.replay import ReplayOptions, replay_config
+from rig.recording.replay import replay_config
 from rig.recording.segment import Space
 from rig.requests import ReconstructRequest, ReplayRequest, RunRequest, ScanRequest
 from rig.run_folder.folder import SavePolicy
@@ -32,7 +32,7 @@ from rig.scan.pipeline import Overload, require_policy
 from rig.scan.reconstruct import reconstruct_cube
 from rig.scan.replay import play
 from rig.scan.run import Run, RunResult
-from rig.scan.scan import recorded_bytes, run_scan
+from rig.scan.scan import LiveSource, recorded_bytes, run_scan
 
 
 def scan(
@@ -89,7 +89,7 @@ def plan_scan(
         plan, timing = prepare(rig)
         require_memory(rig, plan)
         if request.record and request.out is not None:
-            frames_bytes, map_bytes = recorded_bytes(rig, plan, timing, maps)
+            frames_bytes, map_bytes = recorded_bytes(rig, plan, timing, LiveSource(rig, plan, maps))
             space = Space.on_disk_of(Path(request.out).absolute(), frames_bytes, map_bytes * save.count(maps))
             space.require()
             if on_space is not None:
@@ -122,10 +122,7 @@ def replay(
     recording, or sent it more than 2 ms from its time.
     """
     request = replace(request or ReplayRequest(), **changes)
-    played = ReplayOptions(request.clock, request.loop, request.block_frames)
-    others = None if request.config is None else configure(request.config)
-    estimate = _chosen(request, "estimator", "filter", "min_confidence", "threads")
-    settings = replay_config(Path(run), played, others, estimate)
+    settings = replay_config(Path(run), request, None if request.config is None else configure(request.config))
     if calibration is not None:
         settings = settings.model_copy(update={"calibration": Path(calibration)})
     listeners = _listeners(progress, live, monitor, on_space)

@@ -45,8 +45,8 @@ from rig.errors import PlanError, UsageError
 from rig.plan.scan_plan import Leg, ScanPlan
 from rig.progress import tell_stage
 from rig.recording.inputs import read_plan
-from rig.recording.replay import ReplayOptions, replay_config
-from rig.requests import RunRequest
+from rig.recording.replay import replay_config
+from rig.requests import ReplayRequest, RunRequest
 from rig.run_folder.manifest import read_manifest
 from rig.run_folder.summary import MapTally
 from rig.scan.monitor import Listeners
@@ -105,7 +105,7 @@ def capture_view(
 
 def capture_recorded(run: Path, name: str, board: Board | None, *, defects: NDArray[np.bool_] | None = None) -> Capture:
     """Take the view from the first sweeps of a recorded run. Raises UsageError if there is none."""
-    config = replay_config(run, ReplayOptions("max"), None, {"estimator": "argmax", "filter": "none"})
+    config = replay_config(run, ReplayRequest(clock="max", estimator="argmax", filter="none"))
     if not read_plan(run).windowed:
         config = config.model_copy(update={"calibration": None})
     maps = int((read_manifest(run) or {}).get("maps") or 1)
@@ -185,7 +185,7 @@ def scan_sweeps(
 
 def _sweep_counts(sweep: SweepData, plan: ScanPlan) -> SweepCounts:
     """The counts of a sweep, with the commands of its columns as if the plan knew of no lag."""
-    volume = sweep.volume
+    volume = sweep.tally
     assert isinstance(volume, CountVolume), "what argmax has counted"
     command = plan.command_at(volume.column) + plan.velocity_per_s(sweep.direction) * _leg(plan, sweep.direction).lag_s
     return SweepCounts(volume.counts, volume.n_frames, command, volume.x0, volume.width)

@@ -42,8 +42,8 @@ from rig.errors import UsageError
 from rig.geometry.windows import WORD_PX
 from rig.progress import Progress, counted
 from rig.recording.inputs import read_plan
-from rig.recording.replay import ReplayOptions, replay_config
-from rig.requests import PixelsRequest
+from rig.recording.replay import replay_config
+from rig.requests import PixelsRequest, ReplayRequest
 from rig.run_folder.folder import RunFolder
 from rig.run_folder.pictures import png_bytes
 from rig.scan.monitor import Listeners, ScanProgress
@@ -82,7 +82,7 @@ class SweepSums:
 
     def add(self, sweep: SweepData) -> None:
         """Add a sweep; its dark frames are one block."""
-        volume = sweep.volume
+        volume = sweep.tally
         if not isinstance(volume, CountVolume) or volume.dark_counts is None:
             return
         shape = volume.dark_counts.shape
@@ -166,7 +166,7 @@ def _blocks(rig: OpenRig, frames: int, stride: int, block_frames: int) -> Iterat
     source = Source(rig.spad, ring, SILENCE_S, lambda: None)
     with ring.reader("pixels") as reader:
         rig.spad.start(frames)
-        source.start()
+        source.thread.start()
         try:
             yield from blocks(reader, source, SILENCE_S)
         finally:
@@ -316,7 +316,7 @@ def run_pixels(
     """
     path, frames = None if isinstance(source, RigConfig) else Path(source), request.frames
     recorded = path if path is not None and path.is_dir() and segment_files(path) else None
-    config = plain(replay_config(recorded, ReplayOptions(), None, {}) if recorded else configure(source))
+    config = plain(replay_config(recorded, ReplayRequest(clock="max")) if recorded else configure(source))
     problems = [] if not request.light or recorded else require_simulated_or_armed(config, request.arm)
     if frames is not None and frames < 1:
         problems.append(f"frames is {frames}; it must be at least 1")
@@ -357,7 +357,7 @@ def run_pixels(
 
 def _recorded_sums(run: Path, progress: Progress | None) -> tuple[pixel_map.DarkTally, Sums | None, str]:
     """Dark and lit sums of a recording's sweeps, and the sensor that took them."""
-    with open_rig(plain(replay_config(run, ReplayOptions(), None, {}))) as rig:
+    with open_rig(plain(replay_config(run, ReplayRequest(clock="max")))) as rig:
         sums, sensor = take_sweeps(rig, progress=progress), _sensor(rig)
     assert sums.tally is not None, "else it would have been refused"
     return sums.tally, sums.lit, sensor

@@ -62,9 +62,9 @@ class SweepAccount:
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class SweepData(SweepAccount):
-    """One counted sweep. count_s: wall time spent on binding and counting."""
+    """One counted sweep. tally: as its counter gives it. count_s: wall time spent on binding and counting."""
 
-    volume: FrameTally
+    tally: FrameTally
     count_s: float
 
     def account(self) -> SweepAccount:
@@ -164,12 +164,12 @@ class SweepAssembler:
         self._gaps = [gap for gap in self._gaps if gap[1] >= clock.end_frame]
         begun = time.perf_counter()
         direction = self._plan.leg(clock.sweep).direction
-        volume = replace(self._counter.finish(), velocity_per_s=self._plan.velocity_per_s(direction))
+        tally = replace(self._counter.finish(), velocity_per_s=self._plan.velocity_per_s(direction))
         self._count_s += time.perf_counter() - begun
         data = SweepData(
             index=self._first_index + clock.sweep - self._start.sweep,
             direction=direction,
-            volume=volume,
+            tally=tally,
             residual_columns=clock.residual_columns,
             clock_error=clock.clock_error,
             synchronised=clock.synchronised,

@@ -4,7 +4,6 @@ import os
 import time
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
-from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -89,7 +88,7 @@ class Reconstructor:
             return LineCounter(layout, self._lines, self._workers)
         return self.estimator.counter(layout, self.geometry)
 
-    def map(self, sweep: Any) -> MapResult:
+    def map(self, sweep: FrameTally) -> MapResult:
         """Stripe table, depth and intensity of one counted sweep, with the time that estimation took.
 
         sweep: the result of a `counter`, or a `CountVolume`.

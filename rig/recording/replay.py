@@ -5,9 +5,10 @@ the SPAD is played as one start. So a map is made from exactly the same frames i
 """
 
 import itertools
+import logging
 import zipfile
-from collections.abc import Callable, Iterator, Sequence
-from dataclasses import asdict, dataclass, replace
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any, TypeVar
 
@@ -33,6 +34,7 @@ from rig.plan.scan_plan import ScanPlan
 from rig.recording.check import merged_gaps
 from rig.recording.inputs import PLAN_FILE, read_plan
 from rig.recording.open import begins_sweep, fitted_ratio, markers_seen, require_recording
+from rig.requests import ReplayRequest
 from rig.run_folder.manifest import (
     MANIFEST,
     RunGap,
@@ -44,6 +46,7 @@ from rig.run_folder.manifest import (
 )
 
 T = TypeVar("T")
+_log = logging.getLogger(__name__)
 SILENCE_S = 5.0
 """Silence after which a SPAD has failed, as for a live one, in the time of the recording."""
 ENDLESS = 1_000_000_000
@@ -52,34 +55,18 @@ RECORDED = ("scanner", "laser", "sync")
 """Slots whose devices a recording can play as well."""
 
 
-@dataclass(frozen=True, slots=True)
-class ReplayOptions:
-    """Options of playing a recording.
+def replay_config(run: Path, request: ReplayRequest, others: RigConfig | None = None) -> RigConfig:
+    """Make the config of the rig that plays a recording. Raises UsageError if there is none, or for an unknown clock.
 
-    clock: 'realtime', 'max', a factor such as 'x4', or 'step'. loop: play it again and again.
-    block_frames: largest number of frames in a block; None is as the plan says.
-    """
-
-    clock: str = "max"
-    loop: bool = False
-    block_frames: int | None = None
-
-    def __post_init__(self) -> None:
-        """Raise UsageError for an unknown clock."""
-        try:
-            ReplayClock.parse(self.clock)
-        except ValueError as error:
-            raise UsageError(f"--{error}") from None
-        if self.block_frames is not None and self.block_frames < 1:
-            raise UsageError(f"block_frames is {self.block_frames}; it must be at least 1")
-
-
-def replay_config(run: Path, options: ReplayOptions, others: RigConfig | None, estimate: dict[str, Any]) -> RigConfig:
-    """Make the config of the rig that plays a recording. Raises UsageError if there is no recording.
-
+    request: its settings of the estimate replace those of the recording.
     others: rig whose world, scanner, laser and sync source take part; None to use the recorded ones.
-    estimate: settings that replace those of the recording.
     """
+    try:
+        ReplayClock.parse(request.clock)
+    except ValueError as error:
+        raise UsageError(f"--{error}") from None
+    if request.block_frames is not None and request.block_frames < 1:
+        raise UsageError(f"block_frames is {request.block_frames}; it must be at least 1")
     require_recording(run)
     plan = read_plan(run)
     manifest = read_manifest(run)
@@ -88,13 +75,18 @@ def replay_config(run: Path, options: ReplayOptions, others: RigConfig | None, e
     require_playable(run, manifest)
     recorded = manifest.get("config") or {}
     calibration = run / CALIBRATION_FILE
-    given = {key: value for key, value in estimate.items() if value is not None}
+    settings = ("estimator", "filter", "min_confidence", "threads")
+    given = {name: value for name in settings if (value := getattr(request, name)) is not None}
     content: dict[str, Any] = {
         "name": f"replay of {recorded.get('name') or run.name}",
         "calibration": str(calibration.absolute()) if calibration.exists() else None,
         "calibration_max_age": recorded.get("calibration_max_age"),
         "world": None,
-        "spad": {"kind": "replay", "recording": str(run.absolute()), **asdict(options)},
+        "spad": {
+            "kind": "replay",
+            "recording": str(run.absolute()),
+            **{name: getattr(request, name) for name in ("clock", "loop", "block_frames")},
+        },
         **{slot: {"kind": "replay"} for slot in RECORDED},
         "scan": recorded.get("scan") or _scan_of(plan),
         "estimate": {**(recorded.get("estimate") or {}), **given},
@@ -134,9 +126,17 @@ def replay_plan(
 
 
 class ReplaySource:
-    """Facts about a recording for the run that plays it. maps: number of maps that the run will take; None for all."""
+    """Facts about a recording for the run that plays it, as `rig.scan.scan.LiveSource` has them for a live one.
 
-    def __init__(self, spad: ReplaySpad, plan: ScanPlan, maps: int | None) -> None:
+    maps: number of maps that the run will take; None for all. starts: those of the SPAD, one after the other. learned:
+    states with which the maps of a part were estimated; empty if they are to be learned anew.
+    """
+
+    command = "replay"
+
+    def __init__(
+        self, spad: ReplaySpad, plan: ScanPlan, maps: int | None, estimate: EstimateConfig, model: RigModel | None
+    ) -> None:
         self._spad = spad
         self._shapes = (plan.rows, plan.columns), (plan.rows, plan.width)
         self._all = maps is None
@@ -153,12 +153,17 @@ class ReplaySource:
         if maps is not None and maps > there and not spad.loops:
             raise UsageError(f"--maps is {maps}, {spad.recording.path} holds {there}; ask for fewer, or add --loop")
         self.maps: int = maps or (ENDLESS if spad.loops else there)
+        self.starts = itertools.cycle(self._played) if spad.loops else iter(self._played)
+        learned = _part_learned(spad.recording.path, estimate, model)
+        self.learned: Sequence[Learned] = [learned[number] for number in self._numbers if number < len(learned)]
 
     @classmethod
-    def of(cls, spad: SpadArray, plan: ScanPlan, maps: int | None) -> "ReplaySource | None":
+    def of(
+        cls, spad: SpadArray, plan: ScanPlan, maps: int | None, estimate: EstimateConfig, model: RigModel | None
+    ) -> "ReplaySource | None":
         """Make it for a SPAD that plays a recording; None for any other. Raises UsageError if there are too few
         maps."""
-        return cls(spad, plan, maps) if isinstance(spad, ReplaySpad) else None
+        return cls(spad, plan, maps, estimate, model) if isinstance(spad, ReplaySpad) else None
 
     @property
     def report(self) -> PaceReport:
@@ -173,29 +178,16 @@ class ReplaySource:
         pace = self._spad.pace
         return 1e6 if pace.stepping else SILENCE_S / min(1.0, pace.speed or 1.0)
 
-    def groups(self) -> Iterator[int]:
-        """Yield the number of sweeps of each start, one after the other."""
-        sweeps = [start.sweeps for start in self._played]
-        return itertools.cycle(sweeps) if self._spad.loops else iter(sweeps)
+    def count_starts(self) -> int:
+        """Largest number of starts needed for the maps."""
+        return -(-self.maps // self._there) * len(self._played)
 
-    def starts_for(self, maps: int) -> int:
-        """Largest number of starts needed for this number of maps."""
-        return -(-maps // self._there) * len(self._played)
+    def truth(self, sweep: SweepAccount, column: NDArray[np.float64]) -> SweepTruth | None:
+        """Truth that was recorded with the map of a sweep; None if it was not kept.
 
-    def starts(self) -> Iterator[SweepStart]:
-        """Yield the sweep with which each start begins."""
-        found = [start.begin for start in self._played]
-        return itertools.cycle(found) if self._spad.loops else iter(found)
-
-    def learned(self, estimate: EstimateConfig, model: RigModel | None) -> Sequence[Learned]:
-        """States with which the maps of a part were estimated; empty if they are to be learned anew."""
-        learned = _part_learned(self._spad.recording.path, estimate, model)
-        return [learned[number] for number in self._numbers if number < len(learned)]
-
-    def truth(self, index: int) -> SweepTruth | None:
-        """Truth that was recorded with a map; None if it was not kept. Raises DamagedRecordingError if it belongs to
-        other maps.
+        Raises DamagedRecordingError if it belongs to other maps.
         """
+        index = sweep.index
         file = self._spad.recording.path / "truth" / f"{self._numbers[index % self._there]:06d}.npz"
         truth = _kept(file, lambda arrays: SweepTruth(x_px=arrays["x_px"], depth_m=arrays["depth_m"]))
         if truth is not None and (truth.x_px.shape, truth.depth_m.shape) != self._shapes:
@@ -216,6 +208,8 @@ class ReplaySource:
                 if first < min(begin, last + 1):
                     lost.append((first, min(begin, last + 1) - 1))
                 first = max(first, end)
+        if n_lost := sum(last + 1 - first for first, last in lost):
+            _log.warning("%d frames are gone from the recording, beside its whole maps", n_lost)
         return lost
 
 

@@ -282,7 +282,7 @@ def _reason(error: BaseException) -> str:
 
 
 class Recorder:
-    """Thread that records the blocks of one start of the SPAD, up to the last one.
+    """Thread that records the blocks of one start of the SPAD, up to the last one; it ends once everything is written.
 
     reader: holds as many blocks as may be written at a time. on_failure: called on this thread.
     """
@@ -291,7 +291,7 @@ class Recorder:
         self._reader = reader
         self._recording = recording
         self._on_failure = on_failure
-        self._thread = StageThread(self._run, "recorder")
+        self.thread = StageThread(self._run, "recorder")
         self._before = recording.busy_s, recording.blocks, recording.bytes
         self.error: BaseException | None = None
 
@@ -309,14 +309,6 @@ class Recorder:
     def bytes(self) -> int:
         """Bytes that the blocks of this start take in the recording."""
         return self._recording.bytes - self._before[2]
-
-    def start(self) -> None:
-        """Begin to record."""
-        self._thread.start()
-
-    def join(self, timeout_s: float) -> bool:
-        """Wait until everything is written. False if that takes longer than `timeout_s`."""
-        return self._thread.join(timeout_s)
 
     def _run(self) -> None:
         with self._reader:

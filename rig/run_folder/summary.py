@@ -210,6 +210,7 @@ class MapTally:
         stages: PipelineStats | None = None,
         sync: Synchronisation | None = None,
         replay: PaceReport | None = None,
+        accepted_calibration: tuple[str, ...] = (),
     ) -> Summary:
         """Make the summary of the run so far."""
         errors = [each.errors for each in self._maps if each.errors is not None]
@@ -234,6 +235,7 @@ class MapTally:
             sync=sync,
             replay=replay,
             verdict_reasons=self.doubts,
+            accepted_calibration=accepted_calibration,
         )
 
 

@@ -24,6 +24,7 @@ from rig.devices.prepare import lead_s, most_sweeps, require_memory, spare_lead_
 from rig.errors import DevicesError
 from rig.plan.gate_pulses import sync_program
 from rig.plan.scan_plan import ScanPlan
+from rig.recording.replay import RecordedStart
 from rig.recording.writer import Recording
 from rig.run_folder.summary import PipelineStats
 from rig.scan.counting import AcquiredMap, CountingRequest, MakesMaps
@@ -49,8 +50,7 @@ class AcquisitionRequest:
     first_alone: take the first map with a separate start, so that a SPAD that cannot wait stands still while the
     estimator learns from that map.
     learns: whether the estimator learns from the first map.
-    groups: number of sweeps of each start, if the scan may not choose it. starts: the sweep with which each start
-    begins.
+    starts: those of a recording, if the scan may not choose how many sweeps each takes.
     silence_s: a SPAD that sends nothing for this long, with the ring empty, has failed.
     recording: takes every block; None records nothing.
     listeners: callbacks that are informed of the progress.
@@ -60,8 +60,7 @@ class AcquisitionRequest:
     policy: Overload = Overload.ABORT
     first_alone: bool = False
     learns: bool = False
-    groups: Iterator[int] | None = None
-    starts: Iterator[SweepStart] | None = None
+    starts: Iterator[RecordedStart] | None = None
     silence_s: float = SILENCE_S
     recording: Recording | None = None
     listeners: Listeners = NOBODY
@@ -81,7 +80,7 @@ class Acquisition:
         if request.maps < 1:
             raise ValueError(f"{request.maps} maps; ask for at least 1")
         require_policy(request.policy, rig.spad.info)
-        if request.groups is None:
+        if request.starts is None:
             require_memory(rig, plan)
         self._rig = rig
         self._plan = plan
@@ -119,21 +118,23 @@ class Acquisition:
         )
         done = 0
         while done < self._asked.maps:
-            group = self._group(done)
-            start = None if self._asked.starts is None else next(self._asked.starts)
-            assembler = SweepAssembler(plan, counter, group, done, start)
+            group, begin = self._next_start(self._asked.maps - done)
+            assembler = SweepAssembler(plan, counter, group, done, begin)
             counter.reset()
             yield from self._run_group(assembler, group, done)
             done += group
 
-    def _group(self, done: int) -> int:
-        """Sweeps of the next start: as many as the SPAD's memory holds in a burst and the sync source's program."""
-        if self._asked.groups is not None:
-            return min(self._asked.maps - done, next(self._asked.groups))
-        if self._asked.first_alone and done == 0:
-            return 1
-        left, most = self._asked.maps - done, most_sweeps(self._rig, self._plan)
-        return left if most is None else min(left, most)
+    def _next_start(self, left: int) -> tuple[int, SweepStart]:
+        """Number of sweeps of the next start, of so many that are left, and the sweep with which it begins.
+
+        As recorded, or else as many as the SPAD's memory holds in a burst and the sync source's program.
+        """
+        if self._asked.starts is not None:
+            start = next(self._asked.starts)
+            return min(left, start.sweeps), start.begin
+        if self._asked.first_alone and left == self._asked.maps:
+            return 1, SweepStart()
+        return min(left, most_sweeps(self._rig, self._plan) or left), SweepStart()
 
     def _burst_frames(self, sweeps: int) -> int | None:
         if self._plan.burst_frames is None:
@@ -151,7 +152,7 @@ class Acquisition:
             )
         rig.sync.program(*sync_program(plan, sweeps))
         asked = self._asked
-        ring = ring_for(asked.policy, rig.spad.info, plan, self._timing, keeps_time=asked.groups is not None)
+        ring = ring_for(asked.policy, rig.spad.info, plan, self._timing, keeps_time=asked.starts is not None)
         work = CountingRequest(assembler, sweeps, self._maker, asked.silence_s, self._listeners.sweeps)
         on_frame = None if rig.guard is None else rig.guard.beat
         pipeline = Pipeline(rig.spad, ring, work, asked.recording, self._listeners.monitor, on_frame)

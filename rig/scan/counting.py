@@ -155,7 +155,7 @@ class CountingThread:
         self._queue = queue
         self._source = source
         self._on_complete = on_complete
-        self._thread = StageThread(self._run, "counting")
+        self.thread = StageThread(self._run, "counting")
         self.counting_s = 0.0
         self.estimation_s = 0.0
         self.wait_s = 0.0
@@ -163,14 +163,6 @@ class CountingThread:
         self.estimating = False
         """Whether the map of a counted sweep is being made just now."""
         self.error: BaseException | None = None
-
-    def start(self) -> None:
-        """Begin to count."""
-        self._thread.start()
-
-    def join(self, timeout_s: float) -> bool:
-        """Wait for the thread; False if it does not end in time."""
-        return self._thread.join(timeout_s)
 
     def _run(self) -> None:
         try:
@@ -219,9 +211,9 @@ class CountingThread:
         self.estimating = True
         if self._asked.on_sweep is not None:
             self._asked.on_sweep(sweep)
-        result = self._asked.maker.map(sweep.volume)
+        result = self._asked.maker.map(sweep.tally)
         self.estimating = False
-        column = sweep.volume.bound_column()
+        column = sweep.tally.bound_column()
         found = AcquiredMap(sweep.account(), column, result, sweep.count_s + result.compute_s)
         estimated = time.perf_counter()
         self.estimation_s += estimated - begun

@@ -125,7 +125,7 @@ class Monitor:
         self._stats = stats
         self._interval_s = interval_s
         self._over = threading.Event()
-        self._thread = StageThread(self._run, "monitor")
+        self.thread = StageThread(self._run, "monitor")
         self.updates = 0
         self.failed = False
         """Whether the callback raised."""
@@ -135,14 +135,10 @@ class Monitor:
         """Number of blocks that were not looked at."""
         return self._reader.skipped
 
-    def start(self) -> None:
-        """Begin to show."""
-        self._thread.start()
-
     def end(self, timeout_s: float) -> bool:
         """Show no more. False if the callback does not return; it is then abandoned with its thread."""
         self._over.set()
-        ended = self._thread.join(timeout_s)
+        ended = self.thread.join(timeout_s)
         if not ended:
             _log.warning("the monitor hangs in its callback and is left behind; nothing of the run is lost")
         return ended

@@ -94,12 +94,9 @@ class Pipeline:
 
     def start(self) -> None:
         """Start all threads, the source last."""
-        self._counting.start()
-        if self._recorder is not None:
-            self._recorder.start()
-        if self._monitor is not None:
-            self._monitor.start()
-        self._source.start()
+        for stage in (self._counting, self._recorder, self._monitor, self._source):
+            if stage is not None:
+                stage.thread.start()
 
     def end_source(self, why: BaseException | None = None) -> None:
         """Stop filling the ring; returns at once. why: error that the readers get after the last block."""
@@ -112,7 +109,7 @@ class Pipeline:
     def error(self) -> BaseException | None:
         """The error that ended the pipeline too early, once it is drained; waits until the recording is written."""
         recorder = self._recorder
-        if recorder is not None and not recorder.join(DRAIN_S):
+        if recorder is not None and not recorder.thread.join(DRAIN_S):
             return RecordingError(
                 f"the disk did not take what was left in the ring within {DRAIN_S:g} s; name a folder on another disk "
                 "with --out"
@@ -128,10 +125,10 @@ class Pipeline:
             self.maps.close()
             if self._monitor is not None:
                 self.monitor_lost = not self._monitor.end(MONITOR_S) or self._monitor.failed
-            self._counting.join(LEAVE_S)
+            self._counting.thread.join(LEAVE_S)
         finally:  # a second Ctrl-C ends the wait for an estimate, not for what was received
             if self._recorder is not None:
-                self._recorder.join(DRAIN_S)
+                self._recorder.thread.join(DRAIN_S)
 
     def _complete(self) -> None:
         """End the source when all frames are there: the ring must not fill up while the last map is estimated."""

@@ -66,6 +66,6 @@ def reconstruct_cube(
             "gaps": [list(gap) for gap in gaps_of_run],
         }
         frames = RunFrames(expected=n, received=n - lost, lost=lost, crc_errors=None, lit=n - lost)
-        return run.finish(
-            frames, n / float(plan.frame_rate), verdict, manifest, accepted_calibration=accepted_by(calibration)
-        )
+        time_s = n / float(plan.frame_rate)
+        accepted = accepted_by(calibration)
+        return run.finish(tally.summary(frames, time_s, verdict, accepted_calibration=accepted), manifest)

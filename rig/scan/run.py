@@ -16,7 +16,6 @@ from typing import Any, Self
 
 from calibration.model.rig_model import RigModel
 from drivers.interfaces import SpadCounters, SweepTruth
-from drivers.replay.pace import PaceReport
 from drivers.transports.tap import CONTROL_FILE, TapFile
 from rig.count.sweeps import Gap, SweepAccount
 from rig.depth.reconstruct import MapResult
@@ -26,7 +25,7 @@ from rig.recording.segment import Space
 from rig.recording.writer import Recording
 from rig.run_folder.folder import Rays, RunFolder, SavePolicy
 from rig.run_folder.manifest import UNFINISHED, file_crc32
-from rig.run_folder.summary import MapTally, PipelineStats, RunFrames, RunVerdict, Summary, Synchronisation
+from rig.run_folder.summary import MapTally, RunFrames, RunVerdict, Summary, Synchronisation
 from rig.scan.control_check import ControlCheck
 
 OutFolder = str | os.PathLike[str] | None
@@ -172,28 +171,16 @@ class Run:
                     self._folder.remove_map(index)
             raise
 
-    def finish(
-        self,
-        frames: RunFrames,
-        sensor_time_s: float,
-        verdict: RunVerdict,
-        manifest: Mapping[str, Any],
-        stages: PipelineStats | None = None,
-        sync: Synchronisation | None = None,
-        replay: PaceReport | None = None,
-        accepted_calibration: tuple[str, ...] = (),
-    ) -> RunResult:
+    def finish(self, summary: Summary, manifest: Mapping[str, Any]) -> RunResult:
         """Write manifest and summary and make the folder appear. Without a map or a recorded block no folder is
         left."""
-        summary = self.tally.summary(frames, sensor_time_s, verdict, stages, sync, replay)
-        summary = replace(summary, accepted_calibration=accepted_calibration)
         index, result, truth = self._last or (None, None, None)
         folder = None
         if self._folder is not None and self.worth_keeping:
             tell_stage("writing")
             if self._save.step is None and index is not None and result is not None:
                 self._write(index, result, truth)
-            content = {"versions": versions(), **manifest, "verdict": verdict.value}
+            content = {"versions": versions(), **manifest, "verdict": summary.verdict.value}
             if self._recording is not None:
                 self._recording.close()
                 content |= {"inputs": self._inputs, "recording": self._recording.content()}

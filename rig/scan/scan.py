@@ -4,16 +4,19 @@
 at the end what came and what was lost. `devices_content` describes the devices for the manifest.
 """
 
-import logging
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 from contextlib import closing
 from dataclasses import asdict
 from typing import Any
 
+import numpy as np
+from numpy.typing import NDArray
+
 from drivers.errors import DeviceError
 from drivers.interfaces import SpadTiming, SweepTruth
+from drivers.replay.pace import PaceReport
 from rig.config.models import EstimateConfig
-from rig.count.sweeps import SweepAccount
+from rig.count.sweeps import Gap, SweepAccount
 from rig.depth.reconstruct import Reconstructor
 from rig.depth.warm_up import warm_binding, warm_up
 from rig.devices.calibration_use import accepted_by, calibration_use, identity_of, rig_content
@@ -26,15 +29,13 @@ from rig.plan.describe import plan_content
 from rig.plan.scan_plan import ScanPlan
 from rig.progress import tell_stage
 from rig.recording.inputs import to_plain, write_inputs
-from rig.recording.replay import ReplaySource
+from rig.recording.replay import RecordedStart, ReplaySource
 from rig.recording.segment import map_bytes, recording_bytes
 from rig.requests import RunRequest
 from rig.scan.acquisition import SILENCE_S, Acquisition, AcquisitionRequest
 from rig.scan.monitor import NOBODY, Listeners
 from rig.scan.pipeline import FEWEST_SLOTS, Overload, require_policy
 from rig.scan.run import Run, RunResult, frames_of, frames_that_came, sweep_content, synchronisation_of, verdict_of
-
-_log = logging.getLogger(__name__)
 
 
 def run_scan(
@@ -53,47 +54,41 @@ def run_scan(
     An interrupt ends the scan after its last complete map, with verdict 'aborted'. So does an error, which is raised
     again once the complete maps and the recording are safe; if there is neither, nothing is left.
     """
-    policy, maps = Overload.parse(request.on_overload), request.maps
+    policy = Overload.parse(request.on_overload)
     require_policy(policy, rig.spad.info)
     here = identity_of(rig)
     calibration = calibration_use(rig, accept=request.accept_calibration, here=here)
     plan, timing = prepared or prepare(rig)
-    replayed = ReplaySource.of(rig.spad, plan, maps)
-    maps = (maps or 1) if replayed is None else replayed.maps
-    recalled = () if replayed is None else replayed.learned(rig.config.estimate, rig.model)
-    reconstructor = make_reconstructor(rig, plan, learned=recalled)
-    geometry = reconstructor.geometry
-    run.rays = geometry.rays if rig.model is not None else None
-
     estimate = rig.config.estimate
+    source = ReplaySource.of(rig.spad, plan, request.maps, estimate, rig.model) or LiveSource(rig, plan, request.maps)
+    reconstructor = make_reconstructor(rig, plan, learned=source.learned)
+    run.rays = reconstructor.geometry.rays if rig.model is not None else None
     warm_up(estimate.estimator, estimate.filter, plan.exposures, dark=True)
     warm_binding(plan)
     manifest: dict[str, Any] = {
-        "command": "scan" if replayed is None else "replay",
+        "command": source.command,
         "config": rig.config.model_dump(mode="json"),
         "plan": plan_content(plan),
         "calibration": None if calibration is None else calibration.content(),
         "rig": rig_content(here),
         "devices": devices_content(rig, plan, timing),
         "seed": rig.seed,
-        "maps": maps,
+        "maps": source.maps,
         "on_overload": policy.value,
     }
     recording = None
     if request.record:
-        starts = None if replayed is None else replayed.starts_for(maps)
-        space = run.space(*recorded_bytes(rig, plan, timing, maps, starts), maps)
+        space = run.space(*recorded_bytes(rig, plan, timing, source), source.maps)
         recording = run.start_recording(manifest, lambda folder: write_inputs(folder, plan, rig.model), space)
         if listeners.on_space is not None:
             listeners.on_space(space)
     asked = AcquisitionRequest(
-        maps=maps,
+        maps=source.maps,
         policy=policy,
         first_alone=_first_alone(rig),
-        learns=estimate.estimator in LEARNING and not recalled,
-        groups=None if replayed is None else replayed.groups(),
-        starts=None if replayed is None else replayed.starts(),
-        silence_s=SILENCE_S if replayed is None else replayed.silence_s,
+        learns=estimate.estimator in LEARNING and not source.learned,
+        starts=source.starts,
+        silence_s=source.silence_s,
         recording=recording,
         listeners=listeners,
     )
@@ -101,57 +96,90 @@ def run_scan(
     sweeps: list[SweepAccount] = []
     ended_by: BaseException | None = None
     try:
-        _collect(acquisition, rig, plan, run, sweeps, replayed)
+        with closing(acquisition.run()) as running:
+            for found in running:
+                truth = source.truth(found.sweep, found.column)
+                sweeps.append(found.sweep)  # before its map: whatever ends the run, no map is without its account
+                run.add(found.result, found.compute_s, truth)
     except (KeyboardInterrupt, DeviceError, RigError) as error:
         if not run.worth_keeping and not isinstance(error, KeyboardInterrupt):
             raise
         ended_by = error
     del sweeps[run.tally.maps :]
     counters, stages = acquisition.counters, acquisition.stages
-    outside = [] if replayed is None or ended_by is not None else replayed.lost_outside(sweeps)
-    if outside:
-        _log.warning("%d frames are gone from the recording, beside its whole maps", sum(b + 1 - a for a, b in outside))
+    outside = [] if ended_by is not None else source.lost_outside(sweeps)
     frames = frames_of(sweeps, counters.crc_errors, outside)
-    result = run.finish(
+    summary = run.tally.summary(
         frames=frames if ended_by is None else frames_that_came(frames, counters, stages.dropped_frames),
         sensor_time_s=frames.expected / float(plan.frame_rate_hz) + plan.readout_s(frames.expected),
         verdict=verdict_of(
             sweeps, rig.model, aborted=ended_by is not None, doubtful=bool(run.tally.doubts), outside=outside
         ),
-        manifest={
-            **manifest,
-            "sweeps": [sweep_content(sweep) for sweep in sweeps],
-            "gaps": [list(gap) for gap in (*(gap for sweep in sweeps for gap in sweep.gaps), *outside)],
-            "counters": asdict(counters),
-        },
         stages=stages,
         sync=synchronisation_of(sweeps),
-        replay=None if replayed is None else replayed.report,
+        replay=source.report,
         accepted_calibration=accepted_by(calibration),
     )
+    manifest |= {
+        "sweeps": [sweep_content(sweep) for sweep in sweeps],
+        "gaps": [list(gap) for gap in (*(gap for sweep in sweeps for gap in sweep.gaps), *outside)],
+        "counters": asdict(counters),
+    }
+    result = run.finish(summary, manifest)
     if ended_by is not None and not isinstance(ended_by, KeyboardInterrupt):
         if result.folder is not None:
-            whole = f"{len(sweeps)} of {maps} maps were whole and are" if sweeps else "no map was whole; frames are"
-            ended_by.add_note(f"{whole} in {result.folder}")
+            whole = f"{len(sweeps)} of {source.maps} maps were whole and" if sweeps else "no map was whole; frames"
+            ended_by.add_note(f"{whole} are in {result.folder}")
         raise ended_by
     return result
 
 
-def recorded_bytes(
-    rig: OpenRig, plan: ScanPlan, timing: SpadTiming, maps: int, starts: int | None = None
-) -> tuple[int, int]:
-    """Largest number of bytes that the frames of a scan take, and the bytes of one map.
+class LiveSource:
+    """Facts for a run about frames that are exposed now. `ReplaySource` has those about a recording.
 
-    starts: number of starts of the SPAD, if the scan may not choose it.
+    maps: number of maps that the run will take. learned: states of the estimator to begin with. starts: None lets the
+    scan choose the starts of the SPAD. silence_s: longest silence of the SPAD.
     """
+
+    command = "scan"
+    learned: Sequence[Learned] = ()
+    starts: Iterator[RecordedStart] | None = None
+    silence_s = SILENCE_S
+    report: PaceReport | None = None
+
+    def __init__(self, rig: OpenRig, plan: ScanPlan, maps: int | None) -> None:
+        self._rig, self._plan, self.maps = rig, plan, maps or 1
+
+    def count_starts(self) -> int:
+        """Largest number of starts of the SPAD."""
+        most = most_sweeps(self._rig, self._plan) or self.maps
+        return -(-self.maps // most) + (_first_alone(self._rig) and self.maps > 1)
+
+    def truth(self, sweep: SweepAccount, column: NDArray[np.float64]) -> SweepTruth | None:
+        """Truth of the world, if it knows it, for a sweep bound to `column`. It is asked only after the estimate, which
+        must never see it.
+        """
+        if self._rig.world is None:
+            return None
+        tell_stage("comparing with the truth")
+        velocity_per_s = self._plan.velocity_per_s(sweep.direction)
+        return self._rig.world.truth(self._plan.line_commands(column), velocity_per_s)
+
+    def lost_outside(self, sweeps: Sequence[SweepAccount]) -> list[Gap]:
+        """Frames (first, last) lost outside all these sweeps: none that anybody knows of."""
+        return []
+
+
+def recorded_bytes(
+    rig: OpenRig, plan: ScanPlan, timing: SpadTiming, source: LiveSource | ReplaySource
+) -> tuple[int, int]:
+    """Largest number of bytes that the frames of a scan take, and the bytes of one map."""
     request = spad_request(rig.config.scan, plan)
     spare_s = lead_s(rig) + spare_lead_s(rig)
     if rig.spad.info.can_wait:  # on virtual time the SPAD may be a whole ring ahead of what is counted
         spare_s += FEWEST_SLOTS * request.block_frames / float(plan.frame_rate_hz)
-    if starts is None:
-        most = most_sweeps(rig, plan) or maps
-        starts = -(-maps // most) + (_first_alone(rig) and maps > 1)
-    return recording_bytes(plan, request, timing, maps, starts=starts, spare_s=spare_s), map_bytes(plan)
+    starts = source.count_starts()
+    return recording_bytes(plan, request, timing, source.maps, starts=starts, spare_s=spare_s), map_bytes(plan)
 
 
 def _first_alone(rig: OpenRig) -> bool:
@@ -168,28 +196,6 @@ def make_reconstructor(
     return Reconstructor(
         rig.model, plan.commands, plan.depth_range_m, estimate, sensor=sensor, learned=learned, lines=plan.lines
     )
-
-
-def _collect(
-    acquisition: Acquisition,
-    rig: OpenRig,
-    plan: ScanPlan,
-    run: Run,
-    sweeps: list[SweepAccount],
-    replayed: ReplaySource | None,
-) -> None:
-    running = acquisition.run()
-    with closing(running):
-        for found in running:
-            truth: SweepTruth | None = None
-            if replayed is not None:
-                truth = replayed.truth(found.sweep.index)
-            elif rig.world is not None:  # asked only now: no estimate ever sees it
-                tell_stage("comparing with the truth")
-                velocity_per_s = plan.velocity_per_s(found.sweep.direction)
-                truth = rig.world.truth(plan.line_commands(found.column), velocity_per_s)
-            sweeps.append(found.sweep)  # before its map: whatever ends the run, no map is without its account
-            run.add(found.result, found.compute_s, truth)
 
 
 def devices_content(rig: OpenRig, plan: ScanPlan, timing: SpadTiming) -> dict[str, Any]:

@@ -37,7 +37,7 @@ class Source:
         self._on_frame = on_frame
         self._over = threading.Event()
         self._why: BaseException | None = None
-        self._thread = StageThread(self._run, "spad source")
+        self.thread = StageThread(self._run, "spad source")
         self._busy_s = 0.0
         self.silences: list[DeviceTimeout] = []
         """The SPAD's own messages, one for each time that it had nothing for half of `silence_s`."""
@@ -52,10 +52,6 @@ class Source:
         """Seconds spent in the SPAD's `fill`, without waiting for a free slot."""
         return max(0.0, self._busy_s - self._ring.waited_s)
 
-    def start(self) -> None:
-        """Begin to fill."""
-        self._thread.start()
-
     def end(self, why: BaseException | None = None) -> None:
         """Stop filling after the present block. May be called from any thread; returns at once. why: error for the
         readers.
@@ -66,7 +62,7 @@ class Source:
 
     def join(self, timeout_s: float) -> bool:
         """Wait for the thread; False if it does not end in time. Readers get no more blocks in either case."""
-        ended = self._thread.join(timeout_s)
+        ended = self.thread.join(timeout_s)
         self._ring.finish()
         return ended
 

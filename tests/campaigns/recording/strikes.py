@@ -104,7 +104,7 @@ def record(folder: str, note_file: str, seed: int) -> None:
 def _stream(blocks: list[FrameBlock], recording: Recording) -> None:
     ring = BlockRing(SLOTS, STRIDE)
     recorder = Recorder(ring.reader("recorder", holds=WRITERS), recording, lambda: None)
-    recorder.start()
+    recorder.thread.start()
     for block in blocks:
         layout = BlockLayout(block.n_frames, WIDTH, HEIGHT)
         memory = ring.claim(10.0)
@@ -113,7 +113,7 @@ def _stream(blocks: list[FrameBlock], recording: Recording) -> None:
         records[:], bits[:] = block.records, block.bits
         ring.publish(seal_block(memory, block.header, layout, payload_crc=False))
     ring.finish()
-    recorder.join(60)
+    recorder.thread.join(60)
     if recorder.error is not None:
         raise recorder.error
 

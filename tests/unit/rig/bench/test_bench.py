@@ -249,7 +249,7 @@ def test_frames_go_on_across_the_ends_of_the_loop_in_real_time(in_no_time):
     assert all(sweep.frames.lost == 0 and sweep.frames.expected == sweep.frames.received for sweep in found)
     assert found[0].first_frame == lead
     assert found[SWEEPS].first_frame - found[0].first_frame == len(loop.records)
-    np.testing.assert_array_equal(found[0].volume.counts, found[SWEEPS].volume.counts)
+    np.testing.assert_array_equal(found[0].tally.counts, found[SWEEPS].tally.counts)
     assert spad.late_max_s == pytest.approx(0, abs=1e-6)
     spad.close()
 

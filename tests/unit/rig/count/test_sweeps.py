@@ -47,7 +47,7 @@ def test_frames_beyond_what_a_column_may_use_are_received_but_not_lit():
     stream = stream_of(plan, 1)
     stand_still(stream, 700)
     (sweep,) = sweeps(plan, stream.blocks(itertools.repeat(100)))
-    bins = np.array(sweep.volume.bins)
+    bins = np.array(sweep.tally.bins)
     assert np.bincount(bins[bins >= 0]).max() == 255
     assert sweep.frames.lit == np.count_nonzero(bins >= 0)
     assert sweep.frames.dark == np.count_nonzero(bins == BIN_DARK)
@@ -92,7 +92,7 @@ def test_maps_of_a_part_begin_with_the_sweep_that_is_whole():
     kept = [block_part(block, first, 10**6) for block in blocks if block.header.first_frame + block.n_frames > first]
     found = [sweep for block in kept for sweep in part.add(block)]
     assert [sweep.index for sweep in found] == [0, 1]
-    assert [sweep.volume.bins for sweep in found] == [sweep.volume.bins for sweep in whole[1:]]
+    assert [sweep.tally.bins for sweep in found] == [sweep.tally.bins for sweep in whole[1:]]
     assert part.complete
 
 
@@ -107,8 +107,8 @@ def test_a_frame_that_comes_twice_is_lost_where_it_comes_again_whatever_the_bloc
         (sweep,) = sweeps(plan, doubled.blocks(itertools.repeat(size)))
         assert sweep.frames == missed.frames
         assert [gap for first, last in sweep.gaps for gap in range(first, last + 1)] == twice
-        bins = np.array(sweep.volume.bins)
-        assert bins[bins != BIN_UNUSABLE].tolist() == [found for found in missed.volume.bins if found != BIN_UNUSABLE]
+        bins = np.array(sweep.tally.bins)
+        assert bins[bins != BIN_UNUSABLE].tolist() == [found for found in missed.tally.bins if found != BIN_UNUSABLE]
 
 
 def sweeps(plan, blocks, maps=1):
@@ -124,4 +124,4 @@ def test_sweeps_know_how_fast_and_which_way_the_command_ran():
     lit_s = 30 * float(plan.column_s)
     assert [sweep.direction for sweep in found] == [1, -1, 1]
     for sweep in found:
-        assert np.isclose(sweep.volume.velocity_per_s, sweep.direction * abs(last - first) / lit_s)
+        assert np.isclose(sweep.tally.velocity_per_s, sweep.direction * abs(last - first) / lit_s)

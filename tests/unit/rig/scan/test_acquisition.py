@@ -223,7 +223,7 @@ def test_counted_sweeps_do_not_depend_on_the_size_of_blocks(sizes, lost):
             if field.name not in ("volume", "count_s"):
                 assert a == b or a != a, field.name
         for name in ("counts", "x0", "n_frames", "column", "dark_counts"):
-            np.testing.assert_array_equal(getattr(one.volume, name), getattr(other.volume, name))
+            np.testing.assert_array_equal(getattr(one.tally, name), getattr(other.tally, name))
 
 
 def test_blocks_of_another_run_or_size_are_refused():
