@@ -7,7 +7,6 @@ import math
 from collections.abc import Sequence
 from dataclasses import dataclass
 from html import escape
-from typing import Protocol
 
 from rig.run_folder.pictures import round_values
 
@@ -29,8 +28,7 @@ Point = tuple[float, float]
 class Series:
     """A curve or points. Points that are not finite, or that a logarithmic axis cannot show, are left out.
 
-    intervals: (low, high) in y of each point. names: small text beside each point. step: whether to draw it as a
-    histogram.
+    intervals: (low, high) in y of each point. names: small text beside each point.
     """
 
     label: str
@@ -41,28 +39,6 @@ class Series:
     dashed: bool = False
     line: bool = True
     marker: bool = True
-    step: bool = False
-
-
-@dataclass(frozen=True, slots=True)
-class ChartMark:
-    """A cross at a place of a chart, with text beside it."""
-
-    at: Point
-    text: str
-
-
-class Drawable(Protocol):
-    """A panel of a chart, as `chart_svg` places it."""
-
-    @property
-    def legend(self) -> Sequence[Series]:
-        """Series that the legend explains."""
-        ...
-
-    def svg(self) -> str:
-        """Draw the SVG elements with the origin at (0, 0)."""
-        ...
 
 
 @dataclass(frozen=True, slots=True)
@@ -114,25 +90,22 @@ class Panel:
     x_log: bool = True
     y_log: bool = True
     front: Sequence[Point] = ()
-    marks: Sequence[ChartMark] = ()
 
-    @property
-    def legend(self) -> Sequence[Series]:
-        """The curves."""
-        return self.series
-
-    def svg(self) -> str:
-        """Axes, band, curves and marks."""
-        points = [point for series in self.series for point in series.points] + [mark.at for mark in self.marks]
+    def axes(self) -> tuple[Axis, Axis]:
+        """The two axes, which show all points."""
+        points = [point for series in self.series for point in series.points]
         ends = [(math.nan, y) for series in self.series for interval in series.intervals for y in interval if y > 0]
         width, height = PANEL_PX
         x = Axis.over([point[0] for point in points], self.x_log, _LEFT, width - _RIGHT)
-        y = Axis.over([point[1] for point in points + ends], self.y_log, height - _BOTTOM, _TOP)
+        return x, Axis.over([point[1] for point in points + ends], self.y_log, height - _BOTTOM, _TOP)
+
+    def svg(self) -> str:
+        """Axes, band and curves as SVG elements, with the origin at (0, 0)."""
+        x, y = self.axes()
         parts = [_axes(x, y, self)]
         if self.front:
             parts.append(f'<path d="{_path(x, y, self.front)}" stroke="{FRONT}" stroke-width="9" {_ROUND}/>')
         parts += [_curve(x, y, series) for series in self.series]
-        parts += [_mark(x, y, mark) for mark in self.marks]
         return "".join(parts)
 
 
@@ -140,7 +113,7 @@ _ROUND = 'fill="none" stroke-linejoin="round" stroke-linecap="round" opacity="0.
 
 
 def chart_svg(
-    panels: Sequence[Drawable],
+    panels: Sequence[Panel],
     *,
     title: str,
     across: int = 2,
@@ -151,7 +124,7 @@ def chart_svg(
     across = min(across, len(panels))
     down = -(-len(panels) // across)
     width, panel_height = across * panel_px[0], panel_px[1]
-    entries = list({series.label: series for panel in panels for series in panel.legend if series.label}.values())
+    entries = list({series.label: series for panel in panels for series in panel.series if series.label}.values())
     in_row = max(1, width // 190)
     legend_top = _TITLE_PX + down * panel_height
     notes_top = legend_top + -(-len(entries) // in_row) * _LEGEND_PX + 8
@@ -199,8 +172,9 @@ def _curve(x: Axis, y: Axis, series: Series) -> str:
     parts = []
     dashes = ' stroke-dasharray="5 4"' if series.dashed else ""
     if series.line and len(series.points) > 1:
-        path = _path(x, y, series.points, step=series.step)
-        parts.append(f'<path d="{path}" fill="none" stroke="{series.colour}" stroke-width="1.8"{dashes}/>')
+        parts.append(
+            f'<path d="{_path(x, y, series.points)}" fill="none" stroke="{series.colour}" stroke-width="1.8"{dashes}/>'
+        )
     for (at, _), (low, high) in zip(series.points, series.intervals, strict=False):
         ends = x.px(at), y.px(max(low, y.low)), y.px(high)
         if all(map(math.isfinite, ends)):
@@ -219,26 +193,10 @@ def _curve(x: Axis, y: Axis, series: Series) -> str:
     return "".join(parts)
 
 
-def _mark(x: Axis, y: Axis, mark: ChartMark) -> str:
-    px = x.px(mark.at[0]), y.px(mark.at[1])
-    if not all(map(math.isfinite, px)):
-        return ""
-    cross = f"M{px[0] - 4:.1f} {px[1] - 4:.1f}l8 8m0 -8l-8 8"
-    left = px[0] < (x.start_px + x.end_px) / 2
-    text = _text(px[0] + (8 if left else -8), px[1] + 4, mark.text, size=11, anchor="start" if left else "end")
-    around = 'stroke="#ffffff" stroke-width="3" stroke-linejoin="round"'  # so that it can be read on curves
-    return f'<path d="{cross}" stroke="{INK}" stroke-width="2"/><g {around}>{text}</g>{text}'
-
-
-def _path(x: Axis, y: Axis, points: Sequence[Point], *, step: bool = False) -> str:
+def _path(x: Axis, y: Axis, points: Sequence[Point]) -> str:
     placed = [(x.px(a), y.px(b)) for a, b in points]
-    placed = [point for point in placed if all(map(math.isfinite, point))]
-    if not placed:
-        return ""
-    if not step:
-        return "M" + "L".join(f"{a:.1f} {b:.1f}" for a, b in placed)
-    half = (placed[-1][0] - placed[0][0]) / max(len(placed) - 1, 1) / 2
-    return f"M{placed[0][0] - half:.1f} {placed[0][1]:.1f}" + "".join(f"V{b:.1f}H{a + half:.1f}" for a, b in placed)
+    shown = [f"{a:.1f} {b:.1f}" for a, b in placed if math.isfinite(a) and math.isfinite(b)]
+    return "M" + "L".join(shown) if shown else ""
 
 
 def _text(

@@ -16,7 +16,7 @@ import json
 import sys
 from base64 import b64encode
 from collections.abc import Collection, Iterator, Sequence
-from dataclasses import asdict, dataclass
+from dataclasses import asdict, dataclass, replace
 from html import escape
 from itertools import product
 from pathlib import Path
@@ -27,7 +27,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from rig.estimate.registry import ESTIMATORS, FILTERS
-from rig.run_folder.charts import INK, ChartMark, Drawable, Panel, Series, chart_svg
+from rig.run_folder.charts import INK, Panel, Point, Series, chart_svg
 from rig.tradeoff.files import colour_of
 from tests.reference.adapter import reconstruct
 from tests.reference.scene import Scene
@@ -38,7 +38,7 @@ from tests.reference.working_point import CLEAR, DENSE, POINTS, REPORT, WorkingP
 COLUMNS, FRAME_RATE_HZ = 500, 100_000
 EXPOSURES = (1, 3, 5, 10, 20)
 SEED = 1
-CLAIMS = (ChartMark((10, 1.0), "report: < 1 px"), ChartMark((20, 0.1), "report: about 0.1 px"))
+CLAIMS = (((10, 1.0), "report: < 1 px"), ((20, 0.1), "report: about 0.1 px"))
 """Mean error of the report by exposures, on truth rounded to whole pixels."""
 SHARE = "within_1px"
 ROW = 250
@@ -93,7 +93,7 @@ def figure_3(scene: Scene) -> str:
         point = WorkingPoint(scene, light)
         column, x = _column_of(point)
         flux = point.flux_of_column(column)[ROW]
-        series = Series("expected photons", colour_of("likelihood"), _around(x, flux), marker=False, step=True)
+        series = Series("expected photons", colour_of("likelihood"), _stepped(_around(x, flux)), marker=False)
         panels.append(_row_panel(name, "photons an exposure", [series], (x, float(flux[round(x)]))))
     return chart_svg(panels, title=f"One image row of scene {scene.name}: haze, step and stripe", across=3)
 
@@ -107,7 +107,7 @@ def figure_4(scene: Scene) -> str:
     for k in (1, 10, 100):
         share = point.counts(k, SEED)[column, ROW] / k
         curves = [
-            Series("detected", colour_of("edge"), _around(x, share), marker=False, step=True),
+            Series("detected", colour_of("edge"), _stepped(_around(x, share)), marker=False),
             Series("expected", colour_of("likelihood"), _around(x, expected), marker=False),
         ]
         title = f"{k} exposure{'s' * (k > 1)}"
@@ -120,7 +120,7 @@ def figure_6(scene: Scene) -> str:
     point = WorkingPoint(scene, REPORT)
     known = scene.depth_m[np.isfinite(scene.depth_m)]
     limits = float(np.percentile(known, 1)), float(np.percentile(known, 99))
-    panels: list[Drawable] = [DepthMap("truth", scene.depth_m, limits)]
+    panels = [DepthMap("truth", scene.depth_m, limits)]
     for k, estimator, filter in (
         (1, "edge", "median"), (10, "edge", "none"), (10, "edge", "median"),
         (1, "joint", "none"), (10, "joint", "none"),
@@ -138,9 +138,9 @@ def figure_of_exposures(figures: Sequence[Figure], filter: str) -> str:
         here = [figure for figure in figures if figure.point == point and figure.filter == filter]
         if here:
             title = f"{point}: extinction {light.extinction_per_m:g} /m"
-            marks = CLAIMS if point == "report" else ()
+            error = Panel(title, "exposures of a column", "mean error, px", list(_curves(here)))
             panels += [
-                Panel(title, "exposures of a column", "mean error, px", list(_curves(here)), marks=marks),
+                _marked(error, CLAIMS) if point == "report" else error,
                 Panel(title, "exposures of a column", "share within 1 px", list(_curves(here, SHARE)), y_log=False),
             ]
     filtered = "without filter" if filter == "none" else "with the 5 x 5 median"
@@ -151,7 +151,7 @@ def figure_9(figures: Sequence[Figure]) -> str:
     """Error over map rate, and the share within 1 px: what speed costs."""
     here = [figure for figure in figures if figure.point == "report"]
     rates = {k: FRAME_RATE_HZ / (COLUMNS * k) for k in {figure.exposures for figure in here}}
-    marks = [ChartMark((20.0, 1.0), "report: 20 maps/s, < 1 px"), ChartMark((10.0, 0.1), "report: 0.1 px")]
+    marks = [((20.0, 1.0), "report: 20 maps/s, < 1 px"), ((10.0, 0.1), "report: 0.1 px")]
 
     def curves(value: str) -> list[Series]:
         found = []
@@ -164,7 +164,7 @@ def figure_9(figures: Sequence[Figure]) -> str:
 
     label = "maps a second of 500 columns at 100 kHz"
     panels = [
-        Panel("error", label, "mean error, px", curves("mean_px"), marks=marks),
+        _marked(Panel("error", label, "mean error, px", curves("mean_px")), marks),
         Panel("answers within 1 px", label, "share", curves(SHARE), y_log=False),
     ]
     notes = [
@@ -222,9 +222,44 @@ def _around(x: float, values: np.ndarray) -> list[tuple[float, float]]:
     return list(enumerate(map(float, values)))[max(0, round(x) - 130) : round(x) + 40]
 
 
-def _row_panel(title: str, light: str, curves: Sequence[Series], stripe: tuple[float, float]) -> Panel:
-    marks = [ChartMark(stripe, "stripe")]
-    return Panel(title, "pixel of the row", light, curves, x_log=False, y_log=False, marks=marks)
+def _stepped(points: Sequence[Point]) -> list[Point]:
+    return [(x + side, y) for x, y in points for side in (-0.5, 0.5)]
+
+
+@dataclass(frozen=True, slots=True)
+class MarkedPanel:
+    """A panel with crosses at places of it, and text beside each."""
+
+    panel: Panel
+    marks: Sequence[tuple[Point, str]]
+
+    @property
+    def series(self) -> Sequence[Series]:
+        """The curves."""
+        return self.panel.series
+
+    def svg(self) -> str:
+        """The panel, and above it the marks, which can be read on curves."""
+        x, y = self.panel.axes()
+        parts = [self.panel.svg()]
+        for at, words in self.marks:
+            left, top = x.px(at[0]), y.px(at[1])
+            parts.append(f'<path d="M{left - 4:.1f} {top - 4:.1f}l8 8m0 -8l-8 8" stroke="{INK}" stroke-width="2"/>')
+            side = 8 if left < (x.start_px + x.end_px) / 2 else -8
+            place = f'x="{left + side:.1f}" y="{top + 4:.1f}" text-anchor="{"start" if side > 0 else "end"}"'
+            around = 'paint-order="stroke" stroke="#ffffff" stroke-width="3" stroke-linejoin="round"'
+            parts.append(f'<text {place} font-size="11" fill="{INK}" {around}>{escape(words)}</text>')
+        return "".join(parts)
+
+
+def _marked(panel: Panel, marks: Sequence[tuple[Point, str]]) -> MarkedPanel:
+    """The panel with marks, for which its axes have room."""
+    room = Series("", INK, [at for at, _ in marks], line=False, marker=False)
+    return MarkedPanel(replace(panel, series=[*panel.series, room]), marks)
+
+
+def _row_panel(title: str, light: str, curves: Sequence[Series], stripe: tuple[float, float]) -> MarkedPanel:
+    return _marked(Panel(title, "pixel of the row", light, curves, x_log=False, y_log=False), [(stripe, "stripe")])
 
 
 def _column_of(point: WorkingPoint) -> tuple[int, float]:
@@ -243,10 +278,7 @@ class DepthMap:
     depth_m: NDArray[np.floating]
     limits: tuple[float, float]
 
-    @property
-    def legend(self) -> Sequence[Series]:
-        """Nothing to explain."""
-        return ()
+    series: Sequence[Series] = ()
 
     def svg(self) -> str:
         """The map in a place of a chart, depth in words below it."""
