@@ -1,6 +1,6 @@
 """The rows of a trade-off: error and time of a setting, with a confidence interval, and whether another one beats it.
 
-`score_map` scores one map, `row_of` makes the row of a setting, `with_fronts` marks the Pareto fronts.
+`score_map` makes the row of one map, `over_repeats` that of several, `with_fronts` marks the Pareto fronts.
 
 95 % confidence intervals of a mean are over repeats by Student's t, or over one map by a bootstrap over blocks of it.
 The two answer different questions. Repeats of a scan differ only in their photons, so the interval is for this scene.
@@ -55,35 +55,16 @@ class TrialSetting:
 
 
 @dataclass(frozen=True, slots=True)
-class MapScore:
-    """Errors of one map relative to the world's truth, over every (row, column) with a true stripe, and its times.
-
-    mean_abs_px: a missing answer counts as `MISSING_PX`.
-    within_1px, missing: shares of the true stripes.
-    sensor_ms, compute_ms: times of the map.
-    ci95: confidence interval of mean_abs_px over blocks of the map.
-    local_sd_px: standard deviation of the errors of answers within LOCAL_PX, from their median; None without any.
-    """
-
-    mean_abs_px: float
-    within_1px: float
-    missing: float
-    depth_mm: float | None
-    sensor_ms: float
-    compute_ms: float
-    ci95: Interval
-    local_sd_px: float | None = None
-
-
-@dataclass(frozen=True, slots=True)
 class TradeoffRow:
-    """A setting in one scene and fog, over all repeats.
+    """A setting in one scene and fog, over all repeats: errors relative to the world's truth, and times.
 
     fog: a visibility or 'clear'; None is as the scene says.
     sensor_ms: of one map, with dark frames and fly-back.
     compute_ms: of a map after the first, with counting and everything else.
+    mean_abs_px: over every (row, column) with a true stripe; a missing answer counts as `MISSING_PX`.
+    within_1px, missing: shares of the true stripes.
     depth_mm: mean depth error; None if no pixel has a depth.
-    ci95: confidence interval of mean_abs_px.
+    ci95: confidence interval of mean_abs_px, over repeats or else over blocks of the map.
     local_sd_px: standard deviation of the errors of answers within LOCAL_PX, from their median; None without any.
     pareto, pareto_compute: whether no other setting in the same scene and fog is at least as good in error and in time
     (of sensor or computer) and better in one of them.
@@ -137,8 +118,10 @@ class TradeoffRow:
         return self.sensor_ms if of == "sensor" else self.compute_ms
 
 
-def score_map(result: MapResult, truth: SweepTruth, sensor_ms: float, compute_ms: float) -> MapScore:
-    """Score a map. Raises UsageError if the world has no stripe to be found."""
+def score_map(
+    place: Place, setting: TrialSetting, result: MapResult, truth: SweepTruth, sensor_ms: float, compute_ms: float
+) -> TradeoffRow:
+    """Make the row of one map. Raises UsageError if the world has no stripe to be found."""
     true_px = truth.x_px.astype(np.float64)
     if not np.isfinite(true_px).any():
         raise UsageError("the line is nowhere seen in this scene; check the scene and scan.command_range")
@@ -149,7 +132,9 @@ def score_map(result: MapResult, truth: SweepTruth, sensor_ms: float, compute_ms
     sums, numbers = blocks_of(errors)
     total = int(numbers.sum())
     depth_m = depth_errors(result.depth_m, truth.depth_m)["mean_abs"]
-    return MapScore(
+    return TradeoffRow(
+        *place,
+        **asdict(setting),
         mean_abs_px=float(sums.sum() / total),
         within_1px=float(np.count_nonzero(near) / total),
         missing=float(np.count_nonzero(missing) / total),
@@ -161,25 +146,15 @@ def score_map(result: MapResult, truth: SweepTruth, sensor_ms: float, compute_ms
     )
 
 
-def row_of(scene: str, fog: str | None, setting: TrialSetting, scores: Sequence[MapScore]) -> TradeoffRow:
-    """Make the row of a setting from the maps of its repeats."""
-    mean = statistics.fmean
-    errors = [score.mean_abs_px for score in scores]
-    depths = [score.depth_mm for score in scores if score.depth_mm is not None]
-    local = [score.local_sd_px for score in scores if score.local_sd_px is not None]
-    return TradeoffRow(
-        scene=scene,
-        fog=fog,
-        **asdict(setting),
-        sensor_ms=mean(score.sensor_ms for score in scores),
-        compute_ms=statistics.median(score.compute_ms for score in scores),
-        mean_abs_px=mean(errors),
-        within_1px=mean(score.within_1px for score in scores),
-        missing=mean(score.missing for score in scores),
-        depth_mm=mean(depths) if depths else None,
-        local_sd_px=mean(local) if local else None,
-        ci95=repeats_interval(errors) if len(errors) > 1 else scores[0].ci95,
-    )
+def over_repeats(rows: Sequence[TradeoffRow]) -> TradeoffRow:
+    """Make the row of a setting from those of its repeats."""
+    averaged: dict[str, float | None] = {}
+    for name in ("sensor_ms", "mean_abs_px", "within_1px", "missing", "depth_mm", "local_sd_px"):
+        known = [value for row in rows if (value := getattr(row, name)) is not None]
+        averaged[name] = statistics.fmean(known) if known else None
+    compute_ms = statistics.median(row.compute_ms for row in rows)
+    interval = repeats_interval([row.mean_abs_px for row in rows]) if len(rows) > 1 else rows[0].ci95
+    return replace(rows[0], **averaged, compute_ms=compute_ms, ci95=interval)  # type: ignore[arg-type]
 
 
 def with_fronts(rows: Sequence[TradeoffRow]) -> tuple[TradeoffRow, ...]:

@@ -10,6 +10,7 @@ import time
 from collections.abc import Callable, Mapping, Sequence
 from contextlib import closing
 from dataclasses import dataclass, replace
+from itertools import product
 
 import numpy as np
 from numpy.typing import NDArray
@@ -24,10 +25,11 @@ from rig.errors import UsageError
 from rig.estimate.registry import LEARNING
 from rig.geometry.stripe_table import StripeTable
 from rig.geometry.windows import WORD_PX
+from rig.requests import TradeoffRequest
 from rig.scan.acquisition import Acquisition, AcquisitionRequest
 from rig.scan.monitor import Listeners
 from rig.scan.scan import make_reconstructor
-from rig.tradeoff.rows import MapScore, score_map
+from rig.tradeoff.rows import Place, TradeoffRow, TrialSetting, score_map
 
 MAPS = 2
 """Maps of a scan: estimators learn from the first one, the last one is scored."""
@@ -151,12 +153,8 @@ class ManyMakers:
 
 
 def score_methods(
-    config: RigConfig,
-    estimators: Sequence[str],
-    filters: Sequence[str],
-    seed: int,
-    tell: Callable[[float], None],
-) -> dict[Method, MapScore]:
+    config: RigConfig, place: Place, asked: TradeoffRequest, seed: int, tell: Callable[[float], None]
+) -> list[TradeoffRow]:
     """Scan once with a simulated rig and score the maps that each estimator, with each filter, makes from the same
     frames.
 
@@ -165,25 +163,26 @@ def score_methods(
     with open_rig(config, seed=seed) as rig:
         assert rig.world is not None, "only simulated rigs are tried"
         plan, timing = prepare(rig)
-        for estimator in estimators:
-            for filter in filters:
-                warm_up(estimator, filter, plan.exposures, dark=True)
+        for method in product(asked.estimators, asked.filters):
+            warm_up(*method, plan.exposures, dark=True)
         warm_binding(plan)
         estimate = rig.config.estimate
-        settings = {name: estimate.model_copy(update={"estimator": name}) for name in estimators}
-        maker = ManyMakers({name: make_reconstructor(rig, plan, each) for name, each in settings.items()}, filters)
+        settings = {name: estimate.model_copy(update={"estimator": name}) for name in asked.estimators}
+        makers = {name: make_reconstructor(rig, plan, each) for name, each in settings.items()}
+        maker = ManyMakers(makers, asked.filters)
         listeners = Listeners(live=lambda now: tell(now.frames / max(now.frames_planned, 1)))
-        request = AcquisitionRequest(maps=MAPS, learns=not LEARNING.isdisjoint(estimators), listeners=listeners)
+        request = AcquisitionRequest(maps=MAPS, learns=not LEARNING.isdisjoint(asked.estimators), listeners=listeners)
         running = Acquisition(rig, plan, timing, maker, request).run()
         with closing(running):
             last = [found for found in running][-1]
         truth = rig.world.truth(plan.line_commands(last.column), plan.velocity_per_s(last.sweep.direction))
     expected = last.sweep.frames.expected
     sensor_ms = 1e3 * (expected / float(plan.frame_rate_hz) + plan.readout_s(expected))
-    return {
-        method: score_map(result, truth, sensor_ms, 1e3 * compute_s)
+    exposures, lines = config.scan.exposures, len(config.line_offsets)
+    return [
+        score_map(place, TrialSetting(*method, exposures, lines), result, truth, sensor_ms, 1e3 * compute_s)
         for method, (result, compute_s) in maker.results.items()
-    }
+    ]
 
 
 def require_plan(config: RigConfig) -> None:

@@ -13,8 +13,8 @@ from rig.progress import Progress, part, tell_stage
 from rig.requests import TradeoffRequest
 from rig.tradeoff.choice import Choice, Wish, advice, choose
 from rig.tradeoff.limits import SceneLimits
-from rig.tradeoff.rows import MapScore, TradeoffRow, TrialSetting, row_of, with_fronts
-from rig.tradeoff.scan import MAPS, Method, require_plan, score_methods
+from rig.tradeoff.rows import TradeoffRow, over_repeats, with_fronts
+from rig.tradeoff.scan import MAPS, require_plan, score_methods
 
 Made = TypeVar("Made")
 
@@ -164,20 +164,14 @@ def _rows(trials: Trials, progress: Progress | None) -> Iterator[list[TradeoffRo
             progress(round(done + share * _frames_of(config)), frames_of_all)
 
     for trial, config in configs.items():
-        scores: dict[Method, list[MapScore]] = {}
+        scene = str(getattr(config.world, "scene", "")) if trial.scene is None else trial.scene
+        repeats: list[list[TradeoffRow]] = []
         for seed in range(asked.seed, asked.seed + asked.repeat):
             with part(f"scan {next(numbers)} of {len(configs) * asked.repeat}"):
-                found = score_methods(config, asked.estimators, asked.filters, seed, tell)
-            for method, score in found.items():
-                scores.setdefault(method, []).append(score)
+                repeats.append(score_methods(config, (scene, trial.fog), asked, seed, tell))
             done += _frames_of(config)
             tell()
-        scene = str(getattr(config.world, "scene", "")) if trial.scene is None else trial.scene
-        lines = len(config.line_offsets)
-        rows = [
-            row_of(scene, trial.fog, TrialSetting(*method, trial.exposures, lines), each)
-            for method, each in scores.items()
-        ]
+        rows = list(map(over_repeats, zip(*repeats, strict=True)))
         if asked.limits:
             tell_stage("finding what the light allows")
         yield limits.beside(rows, config) if asked.limits else rows

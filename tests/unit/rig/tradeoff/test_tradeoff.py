@@ -27,13 +27,12 @@ from rig.tradeoff.rows import (
     BLOCK_COLUMNS,
     BLOCK_ROWS,
     MOST_MISSING,
-    MapScore,
     TradeoffRow,
     TrialSetting,
     blocks_interval,
     blocks_of,
+    over_repeats,
     repeats_interval,
-    row_of,
     score_map,
     t_quantile,
     with_fronts,
@@ -160,13 +159,14 @@ def test_missing_answers_are_charged_and_repeats_averaged():
     stripe = StripeTable(x_px, none, none, none, none)
     depth_m = np.array([[2.01, 1.97, np.nan, np.nan]], np.float32)
     result = MapResult(stripe, depth_m, none.astype(np.uint32), FogEstimate(None, None, None), 0.0)
-    score = score_map(result, truth, 50.0, 20.0)
+    score = score_map(("street", "clear"), TrialSetting("edge", "none", 10), result, truth, 50.0, 20.0)
     assert score.mean_abs_px == pytest.approx((0.5 + 25 + 10) / 3)
     assert (score.within_1px, score.missing) == (pytest.approx(1 / 3), pytest.approx(1 / 3))
     assert score.depth_mm == pytest.approx(20, rel=1e-4)
     assert score.local_sd_px == pytest.approx(1.4826 * 0.5)
     better = replace(score, mean_abs_px=score.mean_abs_px - 1, compute_ms=22.0)
-    row = row_of("street", "clear", TrialSetting("edge", "none", 10), [score, better])
+    row = over_repeats([score, better])
+    assert (row.setting, row.place) == (TrialSetting("edge", "none", 10), ("street", "clear"))
     assert row.mean_abs_px == pytest.approx(score.mean_abs_px - 0.5)
     assert row.ci95 == (pytest.approx(max(0, row.mean_abs_px - 12.7062 * 0.5)), row.mean_abs_px + 12.7062 * 0.5)
     assert not row.counts
@@ -202,10 +202,10 @@ def test_an_interrupt_leaves_the_rows_that_are_whole(monkeypatch, whole):
     )
     done = iter(range(whole))
 
-    def scanned(config, estimators, filters, seed, tell):
+    def scanned(config, place, asked, seed, tell):
         if next(done, None) is None:
             raise KeyboardInterrupt
-        return {("edge", "none"): MapScore(0.5, 0.9, 0.0, 10.0, 50.0, 20.0, (0.4, 0.6))}
+        return [replace(ROW, exposures=config.scan.exposures)]
 
     monkeypatch.setattr("rig.tradeoff.trials.score_methods", scanned)
     if not whole:
