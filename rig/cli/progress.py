@@ -5,7 +5,7 @@ import math
 import sys
 import threading
 import time
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from contextlib import ExitStack, contextmanager
 from contextvars import ContextVar
 from typing import TYPE_CHECKING, Any
@@ -24,6 +24,10 @@ BAR_CELLS = 20
 _live: ContextVar["Live | None"] = ContextVar("live", default=None)
 
 
+def _ignore() -> None:
+    """Nobody listens."""
+
+
 class ProgressLine:
     """The present progress of a command, as text. It may be updated and read on any thread."""
 
@@ -33,16 +37,20 @@ class ProgressLine:
         self._compilers = 0
         self._compiling = False
         self.step = Step(PREPARING)
+        self.on_change: Callable[[], None] = _ignore
+        """Called after each step, and when a compilation begins."""
 
     def heard(self, step: Step) -> None:
         """Note the newest step."""
         self.step = step
         self._compiling = self._compilers > 0
+        self.on_change()
 
     def compiler_began(self) -> None:
         """Note that code is being compiled on some thread."""
         self._compilers += 1
         self._compiling = True
+        self.on_change()
 
     def compiler_ended(self) -> None:
         """Note that a compilation is over. The stage stays 'compiling' until the next step, since more usually
@@ -88,67 +96,44 @@ class ProgressLine:
         return line
 
 
-class _Announcer:
-    """Prints each stage once, and each part once, as soon as the command has taken `PATIENCE_S`."""
-
-    def __init__(self, line: ProgressLine) -> None:
-        self._line = line
-        self._lock = threading.Lock()
-        self._said: set[str] = set()
-        self._patient = PATIENCE_S > 0
-        self._timer = threading.Timer(PATIENCE_S, self._speak)
-        self._timer.daemon = True
-
-    def start(self) -> None:
-        if self._patient:
-            self._timer.start()
-
-    def stop(self) -> None:
-        with self._lock:
-            self._patient = True
-        self._timer.cancel()
-
-    def changed(self) -> None:
-        """Handle a new step, or a compilation that began."""
-        with self._lock:
-            line = self._line
-            key = line.step.part if line.step.part and line.stage != COMPILING else line.stage
-            if not self._patient and key not in self._said:
-                self._said.add(key)
-                print(f"{line.clock} {line.text()}", file=sys.stderr, flush=True)
-
-    def _speak(self) -> None:
-        with self._lock:
-            self._patient = False
-        self.changed()
-
-
 @contextmanager
 def progress(*, compiles: bool = True) -> Iterator[None]:
     """A context in which stderr shows the progress of the work. compiles: whether any of it is compiled code."""
     line = ProgressLine()
     with ExitStack() as stack:
-        if sys.stderr.isatty():
-            stack.enter_context(_drawn(line))
-            stack.enter_context(listening(line.heard))
-            begins = line.compiler_began
-        else:
-            announcer = _Announcer(line)
-
-            def heard(step: Step) -> None:
-                line.heard(step)
-                announcer.changed()
-
-            def begins() -> None:
-                line.compiler_began()
-                announcer.changed()
-
-            announcer.start()
-            stack.callback(announcer.stop)
-            stack.enter_context(listening(heard))
+        stack.enter_context(_drawn(line) if sys.stderr.isatty() else _announced(line))
+        stack.enter_context(listening(line.heard))
         if compiles:
-            stack.enter_context(_watched_compiler(begins, line.compiler_ended))
+            stack.enter_context(_watched_compiler(line))
         yield
+
+
+@contextmanager
+def _announced(line: ProgressLine) -> Iterator[None]:
+    """Within the context each stage is printed once, and each part once, as soon as the command has taken
+    `PATIENCE_S`.
+    """
+    lock, said, speaks = threading.Lock(), set[str](), PATIENCE_S <= 0
+
+    def speak(begin: bool = False) -> None:
+        nonlocal speaks
+        with lock:
+            speaks = speaks or begin
+            key = line.step.part if line.step.part and line.stage != COMPILING else line.stage
+            if speaks and key not in said:
+                said.add(key)
+                print(f"{line.clock} {line.text()}", file=sys.stderr, flush=True)
+
+    line.on_change = speak
+    timer = threading.Timer(PATIENCE_S, speak, (True,))
+    timer.daemon = True
+    timer.start()
+    try:
+        yield
+    finally:
+        timer.cancel()
+        with lock:
+            line.on_change = _ignore
 
 
 @contextmanager
@@ -189,16 +174,16 @@ def _drawn(line: ProgressLine) -> Iterator[None]:
 
 
 @contextmanager
-def _watched_compiler(began: Any, ended: Any) -> Iterator[None]:
-    """Within the context both are called for each kernel that numba finds in none of its caches."""
+def _watched_compiler(line: ProgressLine) -> Iterator[None]:
+    """Within the context the line is told of each kernel that numba finds in none of its caches."""
     from numba.core import event
 
     class Watch(event.Listener):
         def on_start(self, event: Any) -> None:
-            began()
+            line.compiler_began()
 
         def on_end(self, event: Any) -> None:
-            ended()
+            line.compiler_ended()
 
     with event.install_listener("numba:compile", Watch()):
         yield

@@ -25,7 +25,7 @@ def verify_command(run: RunArgument) -> Answer:
     """Read every byte of a recording and say whether it is what was recorded; exit code 1 if it is not."""
     with progress(compiles=False):
         found = api.verify(run)
-    return Answer(found.as_json(), lambda: _show_verification(found), found.exit_code)
+    return Answer(asdict(found), lambda: _show_verification(found), found.exit_code)
 
 
 def repair_command(run: RunArgument) -> Answer:
@@ -37,13 +37,13 @@ def repair_command(run: RunArgument) -> Answer:
         print("\n".join(made.done or ["nothing was to be done"]))
         _show_verification(made.after)
 
-    return Answer({"done": made.done, "after": made.after.as_json()}, show, made.after.exit_code)
+    return Answer(asdict(made), show, made.after.exit_code)
 
 
 def info_command(run: RunArgument) -> Answer:
     """Describe what a recording holds."""
     found = api.recording_info(run)
-    return Answer(found.as_json(), lambda: _show_info(found))
+    return Answer(asdict(found), lambda: _show_info(found))
 
 
 @asks(CutRequest)

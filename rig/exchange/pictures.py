@@ -12,6 +12,7 @@ from rig.errors import UsageError
 from rig.exchange.npy import MapFiles, load
 from rig.run_folder.folder import RunFolder
 from rig.run_folder.pictures import depth_limits, depth_picture, png_bytes
+from rig.scan.monitor import add_frames
 
 View = Literal["depth", "intensity", "frames"]
 VIEWS: Final[tuple[View, ...]] = get_args(View)
@@ -92,9 +93,7 @@ def _sums(blocks: Iterable[FrameBlock], n: int) -> Iterator[NDArray[np.uint32]]:
     counts: NDArray[np.uint32] | None = None
     missing = n
     for block in blocks:
-        header = block.header
-        x0, y0 = block.records["x0"].astype(np.int64), block.records["y0"].astype(np.int64)
-        at = 0
+        header, at = block.header, 0
         while at < block.n_frames:
             if counts is None:
                 size = header.sensor_height, header.sensor_width
@@ -104,12 +103,8 @@ def _sums(blocks: Iterable[FrameBlock], n: int) -> Iterator[NDArray[np.uint32]]:
                         f"{_MOST_PIXELS}; 'rig export' the frames as npy, which are only as large as their windows"
                     )
                 counts = np.zeros(size, np.uint32)
-            same = (x0[at:] == x0[at]) & (y0[at:] == y0[at])
-            take = min(missing, len(same) if same.all() else int(np.argmin(same)))
-            part = np.unpackbits(block.bits[at : at + take], axis=2, count=header.width).sum(axis=0, dtype=np.uint32)
-            # The last window of a row may end in the padding of the sensor.
-            place = counts[y0[at] : y0[at] + header.height, x0[at] : x0[at] + header.width]
-            place += part[: place.shape[0], : place.shape[1]]
+            take = min(missing, block.n_frames - at)
+            add_frames(counts, block, at, at + take)
             at, missing = at + take, missing - take
             if missing == 0:
                 yield counts

@@ -45,15 +45,11 @@ class PathSegment:
     def command(self, at: Array) -> Array:
         """Command at `at` points after the sweep's start. Outside the segment its formula is continued."""
         t = at - self.start_point
-        if self.kind == "cruise":
-            return self.start + self.v0 * t
-        if self.kind == "ramp":
-            smooth = t / 2 - self.points / (2 * math.pi) * np.sin(math.pi / self.points * t)
-            return self.start + self.v0 * t + (self.v1 - self.v0) * smooth
         if self.kind == "move":
             x = t / self.points
             return self.start + self.distance * (x - np.sin(2 * math.pi * x) / (2 * math.pi))
-        return np.full_like(t, self.start)
+        smooth = t / 2 - self.points / (2 * math.pi) * np.sin(math.pi / self.points * t)
+        return self.start + self.v0 * t + (self.v1 - self.v0) * smooth
 
 
 @dataclass(frozen=True, slots=True)
@@ -79,10 +75,8 @@ class SweepPath:
         """Root-mean-square acceleration over the sweep, command per point squared."""
         total = 0.0
         for s in self.segments:
-            if s.kind == "ramp":
-                total += (math.pi * (s.v1 - s.v0) / (2 * s.points)) ** 2 / 2 * s.points
-            elif s.kind == "move":
-                total += (2 * math.pi * s.distance / s.points**2) ** 2 / 2 * s.points
+            ramp, move = math.pi * (s.v1 - s.v0) / (2 * s.points), 2 * math.pi * s.distance / s.points**2
+            total += (move if s.kind == "move" else ramp) ** 2 / 2 * s.points
         return math.sqrt(total / self.points)
 
     def command(self, at: Array) -> Array:

@@ -1,7 +1,7 @@
 """Opens recordings for the commands that read one, and finds what they hold and which frames belong to which map."""
 
 from collections.abc import Iterator, Sequence
-from dataclasses import asdict, dataclass
+from dataclasses import dataclass
 from itertools import pairwise
 from pathlib import Path
 from typing import Any, Final
@@ -194,10 +194,6 @@ class RecordingInfo:
     devices: dict[str, str]
     versions: dict[str, str]
     problems: list[str]
-
-    def as_json(self) -> dict[str, Any]:
-        """The contents as plain values."""
-        return {**asdict(self), "folder": str(self.folder)}
 
 
 def info(run: PathLike) -> RecordingInfo:

@@ -129,7 +129,8 @@ class ReplaySource:
     """Facts about a recording for the run that plays it, as `rig.scan.scan.LiveSource` has them for a live one.
 
     maps: number of maps that the run will take; None for all. starts: those of the SPAD, one after the other. learned:
-    states with which the maps of a part were estimated; empty if they are to be learned anew.
+    states with which the maps of a part were estimated; empty if they are to be learned anew. Raises UsageError if
+    there are too few maps.
     """
 
     command = "replay"
@@ -140,30 +141,24 @@ class ReplaySource:
         self._spad = spad
         self._shapes = (plan.rows, plan.columns), (plan.rows, plan.width)
         self._all = maps is None
-        starts = recorded_sweeps(spad.recording, plan)
+        manifest = read_manifest(spad.recording.path) or {}
+        starts = recorded_sweeps(spad.recording, plan, manifest)
         self._played = [start for start in starts if start.sweeps]
         self._numbers = [start.first_map + i for start in starts for i in range(start.sweeps)]
         spad.leave_out({run.number for run in spad.recording.runs} - {start.number for start in self._played})
-        self._gone = merged_gaps([*_end_gaps(spad.recording), *(gap for start in starts for gap in start.gone)])
+        gone = [gap for start in starts for gap in start.gone]
+        self._gone = merged_gaps([*_end_gaps(spad.recording, manifest), *gone])
         there = self._there = len(self._numbers)
         if there == 0:
             lost = sum(last + 1 - first for _, first, last in self._gone)
-            gone = f" ({lost} frames of it are gone)" if lost else ""
-            raise UsageError(f"{spad.recording.path} holds no whole sweep{gone}, so there is no map to be made of it")
+            of_it = f" ({lost} frames of it are gone)" if lost else ""
+            raise UsageError(f"{spad.recording.path} holds no whole sweep{of_it}, so there is no map to be made of it")
         if maps is not None and maps > there and not spad.loops:
             raise UsageError(f"--maps is {maps}, {spad.recording.path} holds {there}; ask for fewer, or add --loop")
         self.maps: int = maps or (ENDLESS if spad.loops else there)
         self.starts = itertools.cycle(self._played) if spad.loops else iter(self._played)
-        learned = _part_learned(spad.recording.path, estimate, model)
+        learned = _part_learned(spad.recording.path, manifest, estimate, model)
         self.learned: Sequence[Learned] = [learned[number] for number in self._numbers if number < len(learned)]
-
-    @classmethod
-    def of(
-        cls, spad: SpadArray, plan: ScanPlan, maps: int | None, estimate: EstimateConfig, model: RigModel | None
-    ) -> "ReplaySource | None":
-        """Make it for a SPAD that plays a recording; None for any other. Raises UsageError if there are too few
-        maps."""
-        return cls(spad, plan, maps, estimate, model) if isinstance(spad, ReplaySpad) else None
 
     @property
     def report(self) -> PaceReport:
@@ -228,13 +223,12 @@ class RecordedStart:
     gone: tuple[RunGap, ...] = ()
 
 
-def recorded_sweeps(recording: RunRecording, plan: ScanPlan) -> list[RecordedStart]:
+def recorded_sweeps(recording: RunRecording, plan: ScanPlan, manifest: dict[str, Any]) -> list[RecordedStart]:
     """The whole sweeps of each start of the SPAD, as the run took them, as far as their frames are there.
 
     Raises DamagedRecordingError if a start is missing, since its maps would be confused with those of others.
     """
-    manifest = read_manifest(recording.path) or {}
-    begins = _part_starts(recording)
+    begins = _part_starts(recording, manifest.get("cut"))
     starts = (manifest.get("recording") or {}).get("starts")
     if not starts:
         planned = [_whole_sweeps(recording, run, plan) for run in recording.runs]
@@ -320,10 +314,9 @@ def _readable_range(recording: RunRecording, run: RecordedRun) -> tuple[int, int
     return first.header.first_frame, last.header.first_frame + last.n_frames
 
 
-def _end_gaps(recording: RunRecording) -> list[RunGap]:
+def _end_gaps(recording: RunRecording, manifest: dict[str, Any]) -> list[RunGap]:
     """Gaps that a repair found, and the frames of damaged blocks at the ends of starts."""
-    known = known_missing(read_manifest(recording.path)) if recording.path.is_dir() else None
-    gaps = list(dict.fromkeys(known or ()))
+    gaps = list(dict.fromkeys(known_missing(manifest) or ()))
     for run in recording.runs:
         first, end = _readable_range(recording, run)
         gaps += [(run.number, run.first_frame, first - 1)] if first > run.first_frame else []
@@ -331,9 +324,8 @@ def _end_gaps(recording: RunRecording) -> list[RunGap]:
     return sorted(gaps)
 
 
-def _part_starts(recording: RunRecording) -> list[SweepStart]:
+def _part_starts(recording: RunRecording, cut: dict[str, Any] | None) -> list[SweepStart]:
     """The sweep that the maps of each run begin with: the first one, except in a part."""
-    cut = (read_manifest(recording.path) or {}).get("cut") if recording.path.is_dir() else None
     if cut is None:
         return [SweepStart() for _ in recording.runs]
     ratios = cut.get("clock_ratios") or []
@@ -350,12 +342,13 @@ def _part_starts(recording: RunRecording) -> list[SweepStart]:
     return starts
 
 
-def _part_learned(folder: Path, estimate: EstimateConfig, model: RigModel | None) -> list[RowModel]:
+def _part_learned(
+    folder: Path, manifest: dict[str, Any], estimate: EstimateConfig, model: RigModel | None
+) -> list[RowModel]:
     """States that the maps of a part were estimated with, where it is estimated as the whole was; otherwise none.
 
     None for a whole recording either: it learns the same again from its first map on.
     """
-    manifest: dict[str, Any] = (read_manifest(folder) or {}) if folder.is_dir() else {}
     before = (manifest.get("config") or {}).get("estimate") or {}
     same = before.get("estimator") == estimate.estimator and estimate.estimator in LEARNING
     if estimate.estimator == "joint":  # recordings from before there was a prior have none

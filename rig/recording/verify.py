@@ -1,7 +1,7 @@
 """Verifies a recording: every byte of it, its index, its manifest and the device's own counts."""
 
 from collections.abc import Sequence
-from dataclasses import asdict, dataclass
+from dataclasses import dataclass
 from enum import StrEnum
 from pathlib import Path
 from typing import Any
@@ -67,10 +67,6 @@ class Verification:
     def exit_code(self) -> int:
         """Exit code of the command line."""
         return 0 if self.verdict is Integrity.INTACT else 1
-
-    def as_json(self) -> dict[str, Any]:
-        """The verification as plain values."""
-        return {**asdict(self), "verdict": self.verdict.value}
 
 
 @dataclass(frozen=True, slots=True)

@@ -163,22 +163,24 @@ class Monitor:
         if block.n_frames == 0:
             return True
         first, frames = block.header.first_frame, min(block.n_frames, MOST_FRAMES)
-        counts = sum_image(block, frames)
+        counts = np.zeros((block.header.sensor_height, block.header.sensor_width), np.uint16)
+        add_frames(counts, block, 0, frames)
         self._reader.release()
         self._callback(MonitorView(first, frames, counts, self._stats()))
         self.updates += 1
         return True
 
 
-def sum_image(block: FrameBlock, n: int) -> NDArray[np.uint16]:
-    """1s of each pixel of the sensor over the first n frames of a block, each at the place of its window."""
+def add_frames(counts: NDArray[np.unsignedinteger], block: FrameBlock, first: int, end: int) -> None:
+    """Add the 1s of each pixel over frames first to end - 1 of a block to `counts` (sensor height, sensor width), each
+    at the place of its window.
+    """
     header = block.header
-    out = np.zeros((header.sensor_height, header.sensor_width), np.uint16)
-    corners = np.stack([block.records["x0"][:n], block.records["y0"][:n]], axis=1).astype(np.int64)
-    starts = [0, *(np.flatnonzero(np.any(np.diff(corners, axis=0), axis=1)) + 1).tolist(), n]
-    for a, b in pairwise(starts):
+    corners = np.stack([block.records["x0"], block.records["y0"]], axis=1).astype(np.int64)
+    moves = np.flatnonzero(np.any(np.diff(corners[first:end], axis=0), axis=1)) + 1 + first
+    for a, b in pairwise([first, *moves.tolist(), end]):
         x0, y0 = (int(value) for value in corners[a])
         pixels = np.unpackbits(block.bits[a:b], axis=2, count=header.width)
-        window = out[y0 : y0 + header.height, x0 : x0 + header.width]
-        window += pixels.sum(axis=0, dtype=np.uint16)[: window.shape[0], : window.shape[1]]
-    return out
+        # The last window of a row may end in the padding of the sensor.
+        window = counts[y0 : y0 + header.height, x0 : x0 + header.width]
+        window += pixels.sum(axis=0, dtype=counts.dtype)[: window.shape[0], : window.shape[1]]

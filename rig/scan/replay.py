@@ -1,5 +1,6 @@
 """Plays a recording: opens its devices, scans, and compares what drivers sent with what they sent in the recording."""
 
+import logging
 import tempfile
 from collections.abc import Callable, Sequence
 from contextlib import ExitStack
@@ -7,18 +8,23 @@ from dataclasses import replace
 from pathlib import Path
 
 from drivers.errors import DeviceError
+from drivers.recorded import RunRecording
 from drivers.replay.pace import Pace
 from drivers.replay.spad import ReplaySpad
 from drivers.transports.tap import CONTROL_FILE, TapFile
 from rig.config.models import RigConfig
 from rig.devices.open import open_rig
 from rig.errors import DivergedError, RigError
-from rig.recording.replay import RECORDED
+from rig.recording.inputs import read_plan
+from rig.recording.replay import RECORDED, recorded_sweeps
 from rig.requests import RunRequest
+from rig.run_folder.manifest import read_manifest
 from rig.scan.control_check import SWAP_TOLERANCE_S, ControlCheck, check_control
 from rig.scan.monitor import Listeners
 from rig.scan.run import Run, RunResult
 from rig.scan.scan import run_scan
+
+_log = logging.getLogger(__name__)
 
 Steps = Callable[[Pace], None]
 
@@ -29,7 +35,8 @@ def play(
     """Play a recording with the rig of `replay_config`; `run` takes the maps.
 
     If drivers take part and the recording has control traffic, the two are compared once the rig is closed, even if it
-    failed. Raises DivergedError if they differ; what the run wrote is kept.
+    failed; but not if the recorded scan was to make other sweeps. Raises DivergedError if they differ; what the run
+    wrote is kept.
     """
     drivers = [slot for slot in RECORDED if getattr(config, slot).real_time]
     compared = bool(drivers) and (recording / CONTROL_FILE).exists()
@@ -43,6 +50,7 @@ def play(
         try:
             with open_rig(config, tap=tap) as rig:
                 assert isinstance(rig.spad, ReplaySpad), "as `replay_config` says"
+                compared = compared and _asks_for_the_same(rig.spad.recording, request.maps)
                 pace = rig.spad.pace
                 if steps is not None:
                     steps(pace)
@@ -58,6 +66,22 @@ def play(
     if check.problems:
         raise _diverged(check.problems, result.folder)
     return replace(result, control=check)
+
+
+def _asks_for_the_same(recording: RunRecording, maps: int | None) -> bool:
+    """Whether a replay tells its devices of as many sweeps as the recorded scan did, which may have ended before its
+    last; logs the difference. maps: None for all of the recording.
+    """
+    manifest = read_manifest(recording.path) or {}
+    told = sum(int(start["sweeps"]) for start in (manifest.get("recording") or {}).get("starts") or [])
+    there = sum(start.sweeps for start in recorded_sweeps(recording, read_plan(recording.path), manifest))
+    if told in (0, maps or there):
+        return True
+    _log.warning(
+        "what drivers say is not compared with the recording: its devices were told of %d sweeps, those of this replay "
+        "are told of %d", told, maps or there,
+    )  # fmt: skip
+    return False
 
 
 def _check(recording: Path, tap: TapFile, drivers: Sequence[str], tolerance_s: float | None) -> ControlCheck:

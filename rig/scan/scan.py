@@ -15,6 +15,7 @@ from numpy.typing import NDArray
 from drivers.errors import DeviceError
 from drivers.interfaces import SpadTiming, SweepTruth
 from drivers.replay.pace import PaceReport
+from drivers.replay.spad import ReplaySpad
 from rig.config.models import EstimateConfig
 from rig.count.sweeps import Gap, SweepAccount
 from rig.depth.reconstruct import Reconstructor
@@ -60,7 +61,9 @@ def run_scan(
     calibration = calibration_use(rig, accept=request.accept_calibration, here=here)
     plan, timing = prepared or prepare(rig)
     estimate = rig.config.estimate
-    source = ReplaySource.of(rig.spad, plan, request.maps, estimate, rig.model) or LiveSource(rig, plan, request.maps)
+    source: LiveSource | ReplaySource = LiveSource(rig, plan, request.maps)
+    if isinstance(rig.spad, ReplaySpad):
+        source = ReplaySource(rig.spad, plan, request.maps, estimate, rig.model)
     reconstructor = make_reconstructor(rig, plan, learned=source.learned)
     run.rays = reconstructor.geometry.rays if rig.model is not None else None
     warm_up(estimate.estimator, estimate.filter, plan.exposures, dark=True)

@@ -1,6 +1,7 @@
 """Hardware in the loop: a recording plays while real drivers run, and what they say is held against it."""
 
 import json
+import shutil
 from pathlib import Path
 from typing import Any
 
@@ -12,6 +13,7 @@ from drivers.transports.tap import IN, OUT, read_taps
 from rig import api
 from rig.config.files import load_config
 from rig.errors import DivergedError, UsageError
+from rig.run_folder.manifest import MANIFEST, read_manifest, sealed_text
 from rig.scan import replay as replay_run
 from sim_backend.wire.firmware.obis import ObisModel
 from tests.system.small_rig import config, write_rig
@@ -112,6 +114,19 @@ def test_a_difference_is_shown_where_the_replay_fails_for_another_reason(
     monkeypatch.setattr(ObisModel, "interlock_open", opened, raising=False)
     with pytest.raises(DivergedError, match=rf"{DIFFERENCE}(.*\n)+.*the interlock is open"):
         api.replay(altered, config=hil(taken.parent, LASER))
+
+
+def test_a_scan_that_ended_before_its_last_map_is_not_taken_for_drivers_that_diverge(
+    taken: Path, altered: Path, tmp_path: Path, caplog: pytest.LogCaptureFixture
+) -> None:
+    half = shutil.copytree(altered, tmp_path / "half")
+    manifest = read_manifest(half)
+    assert manifest is not None
+    manifest["recording"]["starts"][0]["sweeps"] = 4
+    (half / MANIFEST).write_text(sealed_text(json.dumps(manifest)))
+    result = api.replay(half, config=hil(taken.parent, LASER))
+    assert (result.summary.maps, result.control) == (1, None)
+    assert "were told of 4 sweeps, those of this replay are told of 1" in caplog.text
 
 
 def test_no_light_is_let_out_without_a_word(taken: Path) -> None:

@@ -26,6 +26,7 @@ from rig.recording.open import info
 from rig.recording.repair import repair
 from rig.recording.replay import recorded_sweeps
 from rig.recording.verify import verify
+from rig.run_folder.manifest import read_manifest
 from tests.unit.rig.count.streams import plan_of, rig_model, scan
 from tests.unit.rig.recording.forging import forge_index
 from tests.unit.rig.recording.recorded import record, run_blocks
@@ -86,9 +87,10 @@ def test_a_header_takes_no_memory_and_no_time(tmp_path: Path, change: dict[str, 
 def test_no_more_sweeps_are_made_than_there_are_frames(tmp_path: Path) -> None:
     folder = forged(tmp_path / "run", lambda i, _: {"sweep": 2**32 - 1}, recording={})
     recording = RunRecording(folder)
-    assert [start.sweeps for start in recorded_sweeps(recording, plan_of(scan()))] == [recording.frames]
+    assert [start.sweeps for start in recorded_sweeps(recording, plan_of(scan()), {})] == [recording.frames]
     folder = forged(tmp_path / "other", lambda i, _: {}, recording={"starts": [{"sweeps": 10**12, "segment": 0}]})
-    assert sum(start.sweeps for start in recorded_sweeps(RunRecording(folder), plan_of(scan()))) <= recording.frames
+    starts = recorded_sweeps(RunRecording(folder), plan_of(scan()), read_manifest(folder))
+    assert sum(start.sweeps for start in starts) <= recording.frames
 
 
 def test_sweeps_that_nobody_wants_are_not_bound() -> None:

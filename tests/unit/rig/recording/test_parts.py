@@ -64,7 +64,7 @@ def test_info_tells_what_there_is(tmp_path: Path, runs: Runs) -> None:
     assert (found.maps, found.config, found.devices) == (2 * MAPS, "small", {"spad": "SPAD 7"})
     assert [(run.run_id, run.first_map, run.end_map, run.gaps) for run in found.runs] == [(1, 0, 3, 0), (2, 3, 6, 1)]
     assert found.runs[0].duration_s == pytest.approx(found.runs[0].frames * 1e-5)
-    assert found.as_json()["folder"] == str(tmp_path)
+    assert found.folder == tmp_path
 
 
 def test_maps_are_cut_out_with_their_closing_marker(tmp_path: Path, runs: Runs) -> None:
