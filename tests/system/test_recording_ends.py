@@ -14,10 +14,10 @@ import pytest
 from drivers.errors import DeviceFault
 from rig.api import recording_info, verify
 from rig.depth.reconstruct import MapResult, Reconstructor
-from rig.recording.writer import Recorder
 from rig.run_folder.folder import RunFolder
 from rig.scan.acquisition import Acquisition
-from rig.scan.counting import AcquiredMap, CountingThread, MapQueue
+from rig.scan.counting import AcquiredMap, MapQueue
+from rig.threads import StageThread
 from tests.system.conftest import Rig
 
 SCAN = ("--maps", 20, "--record", "--out", "run")
@@ -139,19 +139,18 @@ def test_a_second_ctrl_c_still_waits_for_what_was_received(
     rig: Rig, small: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     interrupt_while_estimating(1, monkeypatch)
-    join, joined = Recorder.join, []
+    join, joined = StageThread.join, {}
 
-    def again(self: CountingThread, timeout_s: float) -> bool:
-        raise KeyboardInterrupt
+    def again(self: StageThread, timeout_s: float) -> bool:
+        name = self._thread.name
+        if name == "counting":
+            raise KeyboardInterrupt
+        joined[name] = join(self, timeout_s)
+        return joined[name]
 
-    def noted(self: Recorder, timeout_s: float) -> bool:
-        joined.append(join(self, timeout_s))
-        return joined[-1]
-
-    monkeypatch.setattr(CountingThread, "join", again)
-    monkeypatch.setattr(Recorder, "join", noted)
+    monkeypatch.setattr(StageThread, "join", again)
     assert rig("scan", small, *SCAN).code == 4
-    assert joined == [True]
+    assert joined["recorder"] is True
     assert content("manifest.json")["counters"]["delivered"] == recording_info("run").frames
     assert verify("run").verdict.value == "intact"
 
