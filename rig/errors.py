@@ -4,8 +4,12 @@ A message names the thing, the value, the limit and the next step. Several probl
 one line each, so that nobody has to correct a config one key at a time.
 """
 
-from collections.abc import Iterable
-from typing import ClassVar
+from collections.abc import Callable, Iterable, Iterator
+from contextlib import contextmanager
+from typing import ClassVar, TypeVar
+
+Item = TypeVar("Item")
+Made = TypeVar("Made")
 
 
 class RigError(Exception):
@@ -27,6 +31,27 @@ class UsageError(RigError):
     def of(cls, problems: Iterable[str]) -> "UsageError":
         """One error for several problems, each on its own line and only once."""
         return cls(*dict.fromkeys(problems))
+
+
+@contextmanager
+def noted(problems: list[str]) -> Iterator[None]:
+    """A context that a UsageError leaves without being raised; its problems are added to the list."""
+    try:
+        yield
+    except UsageError as error:
+        problems += error.problems
+
+
+def each_or_problems(items: Iterable[Item], make: Callable[[Item], Made]) -> list[Made]:
+    """Make something of each item. Raises UsageError with all problems of all of them."""
+    made: list[Made] = []
+    problems: list[str] = []
+    for item in items:
+        with noted(problems):
+            made.append(make(item))
+    if problems:
+        raise UsageError.of(problems)
+    return made
 
 
 class PlanError(UsageError):

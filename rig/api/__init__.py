@@ -3,13 +3,24 @@
 from rig.api import scan
 result = scan(exposures=4, seed=1)
 result.last.depth_m, result.summary.truth
+
+For a calibration `sources` may be a rig (a config, the name of a bundled one, or its file), folders of runs taken with
+`record`, folders of earlier calibrations (for their views) and, for the camera alone, pictures. The default is the
+bundled simulated rig, whose world moves the board. `ask` is called to have the board of a real rig moved, and returns
+once that is done; `tell` gets a line about each view. All of them raise CalibrationError if the views give no
+calibration (Degenerate, with `.reason`, if more or other views would help), UsageError for a request that cannot be
+met, and DeviceError or DevicesError if devices fail. Views that were taken by then are in `out`.
 """
 
-from rig.api.calibrate import calibrate_camera, calibrate_check, calibrate_pixels, calibrate_planes, calibrate_sync
 from rig.api.rig import bench, check_config, devices, doctor, laser_off, warm_up
 from rig.api.scan import plan_scan, reconstruct, replay, scan
 from rig.api.tradeoff import tradeoff
 from rig.bench.soak import soak
+from rig.calibrate.camera import calibrate_camera
+from rig.calibrate.check import calibrate_check
+from rig.calibrate.pixels import calibrate_pixels
+from rig.calibrate.planes import calibrate_planes
+from rig.calibrate.sync import calibrate_sync
 from rig.config.bundled import bundled_rigs, bundled_scenes
 from rig.config.overrides import MAX_SEED, SIMULATED, Config, PathLike, configure
 from rig.exchange.exporting import export_run

@@ -15,7 +15,7 @@ from rig.config.overrides import SIMULATED, Config, PathLike, configure, seed_pr
 from rig.devices.calibration_use import calibration_use, cube_calibration_use
 from rig.devices.open import open_rig, require_simulated_or_armed
 from rig.devices.prepare import prepare, require_memory
-from rig.errors import UsageError
+from rig.errors import UsageError, noted
 from rig.estimate.registry import ESTIMATORS, FILTERS
 from rig.plan.scan_plan import ScanPlan
 from rig.progress import Progress
@@ -172,14 +172,10 @@ def _checked(request: RunRequest, others: Sequence[str] = ()) -> SavePolicy:
     if isinstance(request, ScanRequest):
         problems += seed_problems(request.seed)
     save = SavePolicy()
-    try:
+    with noted(problems):
         save = SavePolicy.parse(request.save or "all")
-    except UsageError as error:
-        problems += error.problems
-    try:
+    with noted(problems):
         Overload.parse(request.on_overload)
-    except UsageError as error:
-        problems += error.problems
     if problems:
         raise UsageError.of(problems)
     return save

@@ -7,7 +7,7 @@ from rig.config.models import RigConfig
 from rig.config.overrides import MAX_SEED, SIMULATED, Config, configure, with_lines
 from rig.devices.calibration_use import accepted_by, calibration_use
 from rig.devices.open import open_rig
-from rig.errors import UsageError
+from rig.errors import UsageError, noted
 from rig.estimate.registry import ESTIMATORS, FILTERS
 from rig.progress import Progress
 from rig.requests import TradeoffRequest
@@ -57,10 +57,8 @@ def tradeoff(
     if not 0 <= request.seed <= most_seed:
         problems.append(f"seed is {request.seed}; it must be 0 or more and at most {most_seed}")
     wish = None
-    try:
+    with noted(problems):
         wish = wish_of(request.time_budget, request.error, request.of)
-    except UsageError as wrong:
-        problems += wrong.problems
     if problems:
         raise UsageError.of(problems)
 

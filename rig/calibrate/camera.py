@@ -1,5 +1,6 @@
 """`rig calibrate camera`: calibrates the camera alone, from views of a board or from picture files."""
 
+from dataclasses import replace
 from typing import Any
 
 import numpy as np
@@ -25,12 +26,19 @@ FEWEST_VIEWS = 3
 """Fewest views of a camera: with fewer, one view takes up whatever is wrong with the other."""
 
 
-def run_camera(
-    sources: SourcesLike, request: CameraRequest, *, ask: AskPerson | None = None, tell: TellLine | None = None
+def calibrate_camera(
+    sources: SourcesLike = (),
+    request: CameraRequest | None = None,
+    *,
+    ask: AskPerson | None = None,
+    tell: TellLine | None = None,
+    **changes: Any,
 ) -> CalibrationResult:
-    """Calibrate the camera. Raises Degenerate if the views give no calibration, with the root cause and notes on all
-    causes.
+    """Calibrate the camera alone (`rig calibrate camera`). `sources` may also be pictures, and folders of them.
+
+    Raises Degenerate if the views give no calibration, with the root cause and notes on all causes.
     """
+    request = replace(request or CameraRequest(), **changes)
     si_values(request)
     if request.terms not in (0, *TERM_COUNTS):
         known = ", ".join(map(str, TERM_COUNTS))

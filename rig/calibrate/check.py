@@ -37,13 +37,20 @@ SEED_APART = 1 << 20
 """Offset of a check's seeds from a calibration's: a simulated rig then shows other poses and other photons."""
 
 
-def run_check(
-    sources: SourcesLike, request: CheckRequest, *, ask: AskPerson | None = None, tell: TellLine | None = None
+def calibrate_check(
+    sources: SourcesLike = (),
+    request: CheckRequest | None = None,
+    *,
+    ask: AskPerson | None = None,
+    tell: TellLine | None = None,
+    **changes: Any,
 ) -> CalibrationResult:
-    """Check a calibration and note the result beside it.
+    """Judge a calibration by a flat board that was not used for it, and note the result beside it (`rig calibrate
+    check`).
 
     Raises Degenerate if the board cannot be used, UsageError if the views were used for the calibration.
     """
+    request = replace(request or CheckRequest(), **changes)
     values = si_values(request)
     stated_rad = values.pop("angle_rad", None)
     found, board = sort_sources(sources, scene=request.scene), load_board(request.board)

@@ -33,7 +33,7 @@ from rig.calibrate.capture import plain, scan_sweeps
 from rig.calibrate.report import dark_rate_picture, pixel_page
 from rig.calibrate.session import EXIT_NOT_TRUSTWORTHY
 from rig.config.models import RigConfig, ScanConfig
-from rig.config.overrides import Config, PathLike, configure
+from rig.config.overrides import SIMULATED, Config, PathLike, configure
 from rig.count.sweeps import SweepData
 from rig.count.volume import BIN_DARK, CountVolume, SweepCounter, SweepLayout
 from rig.devices.calibration_use import carry_notes, note_check
@@ -304,16 +304,20 @@ LIT_FRAMES: Final = 100
 """Exposures taken with the line on each pixel: enough to judge one that sees a photon in a third of them."""
 
 
-def run_pixels(
-    source: Config,
-    request: PixelsRequest,
+def calibrate_pixels(
+    source: Config = SIMULATED,
+    request: PixelsRequest | None = None,
     *,
-    progress: Progress | None = None,
     covered: Callable[[], None] | None = None,
+    progress: Progress | None = None,
+    **changes: Any,
 ) -> PixelResult:
-    """Map the pixels of a rig, once its lens is `covered`, or of a recorded run's frames. Raises UsageError or
-    DeviceError.
+    """Map hot, dead and noisy pixels and the dark rate from dark frames (`rig calibrate pixels`).
+
+    source: a rig, or the folder of a recorded run.
+    covered: called when a person has to cover the lens; it returns once that is done.
     """
+    request = replace(request or PixelsRequest(), **changes)
     path, frames = None if isinstance(source, RigConfig) else Path(source), request.frames
     recorded = path if path is not None and path.is_dir() and segment_files(path) else None
     config = plain(replay_config(recorded, ReplayRequest(clock="max")) if recorded else configure(source))

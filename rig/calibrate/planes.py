@@ -40,12 +40,19 @@ the line in bright light only, so that it is tried only where it is the config's
 """
 
 
-def run_planes(
-    sources: SourcesLike, request: PlanesRequest, *, ask: AskPerson | None = None, tell: TellLine | None = None
+def calibrate_planes(
+    sources: SourcesLike = (),
+    request: PlanesRequest | None = None,
+    *,
+    ask: AskPerson | None = None,
+    tell: TellLine | None = None,
+    **changes: Any,
 ) -> CalibrationResult:
-    """Calibrate the planes; the defects of the base calibration are kept. Raises Degenerate, with notes why, if the
-    views give none.
+    """Calibrate camera, light planes and lag together from views of a board (`rig calibrate planes`).
+
+    The defects of the base calibration are kept. Raises Degenerate, with notes why, if the views give none.
     """
+    request = replace(request or PlanesRequest(), **changes)
     values = si_values(request)
     found = sort_sources(sources, scene=request.scene)
     known, accepted = None, list[Refusal]()

@@ -1,9 +1,9 @@
 """`rig calibrate sync`: lag of the mirror in each direction and delay of the rows, from one unmoved scene at several
 speeds.
 
-`run_sync` measures them. `gate_delay` measures how much later than the gate the light comes and goes, from the frames
-of a recorded run at both ends of its sweeps. The plan says when the gate opens and closes after the scan marker; the
-frames show when the light does. A pattern generator, a long cable and a laser's driver each add to the delay. Only
+`calibrate_sync` measures them. `gate_delay` measures how much later than the gate the light comes and goes, from the
+frames of a recorded run at both ends of its sweeps. The plan says when the gate opens and closes after the scan marker;
+the frames show when the light does. A pattern generator, a long cable and a laser's driver each add to the delay. Only
 their sum is seen, on the SPAD's clock. The line must be in the picture when the gate opens or closes.
 
 If the line is so bright that pixels saturate, a frame lit for part of its exposure looks lit for longer, and tells
@@ -88,11 +88,19 @@ class GateDelay:
         return math.hypot(self.opens_sd_s, self.closes_sd_s) / 2
 
 
-def run_sync(sources: SourcesLike, request: SyncRequest, *, tell: TellLine | None = None) -> CalibrationResult:
-    """Measure the lags and put them into a copy of the model, if there is one.
+def calibrate_sync(
+    sources: SourcesLike = (),
+    request: SyncRequest | None = None,
+    *,
+    tell: TellLine | None = None,
+    **changes: Any,
+) -> CalibrationResult:
+    """Measure the mirror's lag in each direction and the rows' delay from one unmoved scene (`rig calibrate sync`).
 
-    Raises Degenerate or CalibrationError if they cannot be determined.
+    The lags are put into a copy of the model, if there is one. Raises Degenerate or CalibrationError if they cannot be
+    determined.
     """
+    request = replace(request or SyncRequest(), **changes)
     values = si_values(request)
     found, file = sort_sources(sources, scene=request.scene), request.calibration
     live = found.live

@@ -6,7 +6,7 @@ from typing import TYPE_CHECKING, Annotated
 import typer
 
 from rig.cli.command import Answer, Commands, api, asks, say, tables
-from rig.cli.completion import one_of, rig_names
+from rig.cli.completion import one_of
 from rig.cli.progress import paused, progress
 from rig.requests import CameraRequest, CheckRequest, PixelsRequest, PlanesRequest, SyncRequest
 
@@ -20,7 +20,7 @@ SourcesArgument = Annotated[
         metavar="[SOURCE]...",
         help="a rig (config), runs taken with --record, folders of earlier calibrations; for the camera pictures too",
         show_default="simulated",
-        autocompletion=one_of(rig_names),
+        autocompletion=one_of("config"),
     ),
 ]
 
@@ -53,7 +53,7 @@ def pixels_command(
             metavar="[CONFIG|RUN]",
             help="a rig, or a run taken with --record",
             show_default=True,
-            autocompletion=one_of(rig_names),
+            autocompletion=one_of("config"),
         ),
     ] = "simulated",
 ) -> Answer:

@@ -13,11 +13,11 @@ from dataclasses import Field, dataclass
 from datetime import datetime
 from importlib import import_module
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Any
+from typing import TYPE_CHECKING, Annotated, Any, get_args
 
 import typer
 
-from rig.cli.completion import estimator_names, filter_names, one_of, rig_names, scene_names, some_of
+from rig.cli.completion import Kind, one_of, some_of
 from rig.errors import UsageError
 from rig.requests import options_of
 
@@ -54,7 +54,7 @@ ConfigArgument = Annotated[
         metavar="[CONFIG]",
         help="a bundled rig's name or a YAML file",
         show_default=True,
-        autocompletion=one_of(rig_names),
+        autocompletion=one_of("config"),
     ),
 ]
 _JSON = inspect.Parameter(
@@ -138,8 +138,6 @@ def whole_numbers(option: str, given: list[str] | None) -> list[int]:
     return [int(part) for part in parts]
 
 
-_NAMES = {"scene": scene_names, "estimator": estimator_names, "filter": filter_names, "config": rig_names}
-"""Names that a shell completes, by the field of a request."""
 _MANY = {Sequence[str]: split_option, Sequence[int]: whole_numbers}
 """Readers of options that may be given several times and with commas, by the type of their field."""
 
@@ -176,13 +174,13 @@ def _option_name(field: "Field[Any]") -> str:
 def _parameter(field: "Field[Any]") -> inspect.Parameter:
     """The parameter of a command that typer makes the option of a field from."""
     told, name, many = field.metadata, _option_name(field), field.type in _MANY
-    names = _NAMES.get(field.name.removesuffix("s"))
+    kind_of_name = next((one for one in get_args(Kind) if one == field.name.removesuffix("s")), None)
     option = typer.Option(
         name if field.default is not True and field.type != bool | None else f"{name}/--no-{name[2:]}",
         help=told["about"],
         show_default="runs/DATE-TIME" if field.name == "out" else told["unset"] or field.default is not None,
         min=told["least"],
-        autocompletion=None if names is None else (some_of if many else one_of)(names),
+        autocompletion=None if kind_of_name is None else (some_of if many else one_of)(kind_of_name),
     )
     kind = list[str] | None if many else told["read_as"] or field.type
     default = None if many else field.default

@@ -5,52 +5,36 @@ the second line of a long description for another name.
 """
 
 from collections.abc import Callable, Iterable
+from typing import Literal
 
-Names = Callable[[], Iterable[str]]
-
-
-def rig_names() -> Iterable[str]:
-    """Names of the bundled rigs."""
-    from rig.config.bundled import bundled_rigs
-
-    return (one.name for one in bundled_rigs())
+Kind = Literal["config", "scene", "estimator", "filter"]
 
 
-def scene_names() -> Iterable[str]:
-    """Names of the bundled scenes."""
-    from rig.config.bundled import bundled_scenes
+def names(kind: Kind) -> Iterable[str]:
+    """Names of the bundled rigs or scenes, of the estimators or filters."""
+    if kind in ("config", "scene"):
+        from rig.config.bundled import bundled_rigs, bundled_scenes
 
-    return (one.name for one in bundled_scenes())
+        return (one.name for one in (bundled_rigs if kind == "config" else bundled_scenes)())
+    from rig.estimate.registry import ESTIMATORS, FILTERS
 
-
-def estimator_names() -> Iterable[str]:
-    """Names of the estimators."""
-    from rig.estimate.registry import ESTIMATORS
-
-    return ESTIMATORS
+    return ESTIMATORS if kind == "estimator" else FILTERS
 
 
-def filter_names() -> Iterable[str]:
-    """Names of the filters."""
-    from rig.estimate.registry import FILTERS
-
-    return FILTERS
-
-
-def one_of(names: Names) -> Callable[[str], list[str]]:
-    """A completer for a value that is one of `names`."""
+def one_of(kind: Kind) -> Callable[[str], list[str]]:
+    """A completer for a value that is one name of a kind."""
 
     def complete(incomplete: str) -> list[str]:
-        return [name for name in names() if name.startswith(incomplete)]
+        return [name for name in names(kind) if name.startswith(incomplete)]
 
     return complete
 
 
-def some_of(names: Names) -> Callable[[str], list[str]]:
-    """A completer for the last of several `names` separated by commas."""
+def some_of(kind: Kind) -> Callable[[str], list[str]]:
+    """A completer for the last of several names separated by commas."""
 
     def complete(incomplete: str) -> list[str]:
         before, comma, last = incomplete.rpartition(",")
-        return [before + comma + name for name in one_of(names)(last)]
+        return [before + comma + name for name in one_of(kind)(last)]
 
     return complete

@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING, Annotated
 import typer
 
 from rig.cli.command import Answer, Commands, ConfigArgument, api, asks, report, say_space, tables
-from rig.cli.completion import one_of, rig_names, scene_names
+from rig.cli.completion import one_of
 from rig.cli.progress import progress
 from rig.requests import ReconstructRequest, ScanRequest
 
@@ -72,7 +72,7 @@ def effects_command(
             metavar="CONFIG",
             help="the same as CONFIG",
             show_default=False,
-            autocompletion=one_of(rig_names),
+            autocompletion=one_of("config"),
         ),
     ] = None,
     scene: Annotated[
@@ -81,7 +81,7 @@ def effects_command(
             "--scene",
             help="a bundled scene, a scene file or a folder",
             show_default="the config's",
-            autocompletion=one_of(scene_names),
+            autocompletion=one_of("scene"),
         ),
     ] = None,
     trials: Annotated[

@@ -6,14 +6,13 @@ from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from fractions import Fraction
 from pathlib import Path
-from typing import Any, Final, TypeVar
+from typing import Any, Final
 
 import numpy as np
 from numpy.typing import NDArray
 
-from rig.errors import UsageError
+from rig.errors import UsageError, each_or_problems
 
-T = TypeVar("T")
 CHUNK_BYTES: Final = 16 << 20
 """Bytes of the pieces that files are read in, about."""
 
@@ -54,24 +53,10 @@ def gather(files: Iterable[str | os.PathLike[str]], suffix: str) -> list[Path]:
             raise UsageError(f"{file} holds no {suffix} file" if file.is_dir() else f"{file} does not exist")
         return found
 
-    found = [file for part in open_each(map(Path, files), inside) for file in part]
+    found = [file for part in each_or_problems(map(Path, files), inside) for file in part]
     if not found:
         raise UsageError(f"no file was named; name {suffix} files, or the folder that holds them")
     return found
-
-
-def open_each(files: Iterable[Path], open_one: Callable[[Path], T]) -> list[T]:
-    """Open all files. Raises UsageError, with a line for each file that cannot be opened."""
-    opened: list[T] = []
-    problems: list[str] = []
-    for file in files:
-        try:
-            opened.append(open_one(file))
-        except UsageError as error:
-            problems += error.problems
-    if problems:
-        raise UsageError.of(problems)
-    return opened
 
 
 def bytes_of(file: Path) -> NDArray[np.uint8]:

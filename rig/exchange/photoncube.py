@@ -15,8 +15,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from drivers.json_text import parse_json
-from rig.errors import UsageError
-from rig.exchange.foreign import ForeignFrames, chunks_of, open_each
+from rig.errors import UsageError, each_or_problems
+from rig.exchange.foreign import ForeignFrames, chunks_of
 from rig.recording.cube import holds_bits, open_array, pack_line
 from rig.requests import ImportRequest
 
@@ -44,7 +44,7 @@ def open_photoncube(files: Sequence[Path], asked: ImportRequest) -> ForeignFrame
 
     If all bytes are 0 or 1, the user must state that they are packed.
     """
-    cubes = open_each(files, lambda file: _open(file, packed=asked.form == "packed"))
+    cubes = each_or_problems(files, lambda file: _open(file, packed=asked.form == "packed"))
     if len({(cube.width, cube.frames.shape[1:]) for cube in cubes}) > 1:
         sizes = ", ".join(
             f"{file.name} {cube.width} x {cube.frames.shape[1]}" for file, cube in zip(files, cubes, strict=True)

@@ -17,8 +17,8 @@ from typing import Final
 import numpy as np
 from numpy.typing import NDArray
 
-from rig.errors import UsageError
-from rig.exchange.foreign import ForeignFrames, bytes_of, chunks_of, open_each
+from rig.errors import UsageError, each_or_problems
+from rig.exchange.foreign import ForeignFrames, bytes_of, chunks_of
 from rig.requests import ImportRequest
 
 COLUMNS: Final = 512
@@ -46,7 +46,7 @@ def open_pi_imaging(files: Sequence[Path], asked: ImportRequest) -> ForeignFrame
     Raises UsageError, a line per file, for contents that are not a whole number of frames.
     """
     form, rows = asked.form, asked.rows or ROWS
-    opened = open_each(files, lambda file: _open_pi_imaging(file, form, rows))
+    opened = each_or_problems(files, lambda file: _open_pi_imaging(file, form, rows))
     forms = sorted({kind for kind, _ in opened})
 
     def chunks() -> Iterator[NDArray[np.uint8]]:
@@ -127,7 +127,7 @@ def open_swissspad2(files: Sequence[Path], asked: ImportRequest) -> ForeignFrame
             )
         return content
 
-    contents = open_each(files, open_one)
+    contents = each_or_problems(files, open_one)
 
     def chunks() -> Iterator[NDArray[np.uint8]]:
         for content in contents:

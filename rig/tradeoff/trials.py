@@ -1,13 +1,13 @@
 """Scans a simulated rig over settings and scores the maps by the world's truth, to show what accuracy costs in time."""
 
-from collections.abc import Callable, Iterable, Iterator, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from dataclasses import asdict, dataclass
 from itertools import count, product, starmap
 from pathlib import Path
-from typing import Any, Literal, NamedTuple, TypeVar
+from typing import Any, Literal, NamedTuple
 
 from rig.config.models import RigConfig
-from rig.errors import UsageError
+from rig.errors import each_or_problems
 from rig.estimate.registry import ESTIMATORS, FILTERS
 from rig.progress import Progress, part, tell_stage
 from rig.requests import TradeoffRequest
@@ -15,8 +15,6 @@ from rig.tradeoff.choice import Choice, Wish, advice, choose
 from rig.tradeoff.limits import SceneLimits
 from rig.tradeoff.rows import TradeoffRow, over_repeats, with_fronts
 from rig.tradeoff.scan import MAPS, require_plan, score_methods
-
-Made = TypeVar("Made")
 
 
 class Trial(NamedTuple):
@@ -51,30 +49,14 @@ class Trials:
 
     def configs(self) -> dict[Trial, RigConfig]:
         """Make the config of each trial. Raises UsageError with all problems of all of them."""
-        return _all_or_problems(self, self.config_of)
+        return dict(zip(self, each_or_problems(self, self.config_of), strict=True))
 
     def require_plans(self) -> None:
         """Raise UsageError with all problems of these scans. Only the smallest and the largest number of exposures are
         checked.
         """
         ends = {min(self.asked.exposures), max(self.asked.exposures)}
-        configs = self.configs()
-        _all_or_problems(
-            [trial for trial in self if trial.exposures in ends], lambda trial: require_plan(configs[trial])
-        )
-
-
-def _all_or_problems(trials: Iterable[Trial], make: Callable[[Trial], Made]) -> dict[Trial, Made]:
-    found: dict[Trial, Made] = {}
-    problems: list[str] = []
-    for trial in trials:
-        try:
-            found[trial] = make(trial)
-        except UsageError as error:
-            problems += error.problems
-    if problems:
-        raise UsageError.of(problems)
-    return found
+        each_or_problems([config for trial, config in self.configs().items() if trial.exposures in ends], require_plan)
 
 
 @dataclass(frozen=True, slots=True)
