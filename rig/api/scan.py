@@ -32,7 +32,7 @@ from rig.scan.pipeline import Overload, require_policy
 from rig.scan.reconstruct import reconstruct_cube
 from rig.scan.replay import play
 from rig.scan.run import Run, RunResult
-from rig.scan.scan import LiveSource, recorded_bytes, run_scan
+from rig.scan.scan import LiveSource, recording_space, run_scan
 
 
 def scan(
@@ -82,15 +82,14 @@ def plan_scan(
     request = replace(request or ScanRequest(), **changes)
     settings = _configured(config, request)
     save = _checked(request)
-    maps = request.maps or 1
     with open_rig(settings) as rig:
         require_policy(Overload.parse(request.on_overload), rig.spad.info)
         calibration_use(rig, accept=request.accept_calibration)
         plan, timing = prepare(rig)
         require_memory(rig, plan)
         if request.record and request.out is not None:
-            frames_bytes, map_bytes = recorded_bytes(rig, plan, timing, LiveSource(rig, plan, maps))
-            space = Space.on_disk_of(Path(request.out).absolute(), frames_bytes, map_bytes * save.count(maps))
+            source = LiveSource(rig, plan, request.maps)
+            space = recording_space(rig, plan, timing, source, Path(request.out).absolute(), save)
             space.require()
             if on_space is not None:
                 on_space(space)

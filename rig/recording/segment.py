@@ -7,7 +7,6 @@ at most.
 """
 
 import errno
-import math
 import mmap
 import os
 import shutil
@@ -21,10 +20,8 @@ import numpy as np
 
 from calibration.errors import digits
 from drivers.frames import FrameBlock
-from drivers.interfaces import SpadRequest, SpadTiming
-from drivers.spb1 import BlockLayout, block_parts, frames_per_block
+from drivers.spb1 import block_parts
 from rig.errors import UsageError
-from rig.plan.scan_plan import ScanPlan
 
 PAGE_BYTES: Final = 4096
 """Unit of places and sizes of what is written past the page cache, in the file and in memory."""
@@ -175,10 +172,6 @@ def _reserve(path: Path, size: int) -> None:
         os.close(fd)
 
 
-BYTES_PER_PIXEL: Final = 40
-"""Bytes that all files of a map take for every pixel of the camera or of the stripe table, whichever is more."""
-
-
 @dataclass(frozen=True, slots=True)
 class Space:
     """Largest number of bytes that the frames and the maps of a run will take, and the free space on its disk."""
@@ -213,26 +206,6 @@ class Space:
             f"at most {_gb(self.recording_bytes)} of frames and {_gb(self.map_bytes)} of maps, which fit: the disk of "
             f"{self.folder} has {_gb(self.free_bytes)} free"
         )
-
-
-def recording_bytes(
-    plan: ScanPlan, request: SpadRequest, timing: SpadTiming, maps: int, *, starts: int, spare_s: float
-) -> int:
-    """Largest number of bytes that the segments take.
-
-    starts: number of starts of the SPAD. spare_s: time of each start before its first marker and after its last one.
-    """
-    frames = plan.frames_for(maps) + (starts - 1) * plan.frames_for(0) + starts * spare_s * float(plan.frame_rate_hz)
-    if plan.burst_frames is not None:
-        frames = min(frames, starts * plan.burst_frames)
-    block_frames = min(request.block_frames, frames_per_block(timing.stride, plan.frame_width, plan.rows))
-    block_bytes = paged(BlockLayout(block_frames, plan.frame_width, plan.rows).block_bytes)
-    return (math.ceil(frames / block_frames) + starts) * block_bytes
-
-
-def map_bytes(plan: ScanPlan) -> int:
-    """Bytes of the files of one map."""
-    return BYTES_PER_PIXEL * plan.rows * max(plan.width, plan.columns)
 
 
 def _gb(size: int) -> str:

@@ -72,7 +72,7 @@ class Run:
         self.tally = tally
         self._folder = None if out is None else RunFolder(out, in_place=record)
         self.rays: Rays | None = None
-        self._save = save or SavePolicy()
+        self.save = save or SavePolicy()
         self._last: tuple[int, MapResult, SweepTruth | None] | None = None
         self._recording: Recording | None = None
         self._inputs: dict[str, int] = {}
@@ -89,14 +89,10 @@ class Run:
         """Whether there is a whole map or a recorded block."""
         return self.tally.maps > 0 or (self._recording is not None and self._recording.blocks > 0)
 
-    def space(self, recording_bytes: int, map_bytes: int, maps: int) -> Space:
-        """Room that a recorded run of `maps` maps takes, and the room on its disk.
-
-        recording_bytes: of all frames. map_bytes: of one map. Raises UsageError if the run has no folder.
-        """
-        if self._folder is None:
-            raise UsageError("record writes the frames into the run's folder; name one with out")
-        return Space.on_disk_of(self._folder.path, recording_bytes, map_bytes * self._save.count(maps))
+    @property
+    def path(self) -> Path | None:
+        """The run's folder; None if nothing is written."""
+        return None if self._folder is None else self._folder.path
 
     def start_recording(
         self,
@@ -159,7 +155,7 @@ class Run:
         index = self.tally.maps
         before = self._last
         try:
-            if self._folder is not None and self._save.keeps(index):
+            if self._folder is not None and self.save.keeps(index):
                 tell_stage("writing")
                 self._write(index, result, truth)
             self._last = index, result, truth
@@ -178,7 +174,7 @@ class Run:
         folder = None
         if self._folder is not None and self.worth_keeping:
             tell_stage("writing")
-            if self._save.step is None and index is not None and result is not None:
+            if self.save.step is None and index is not None and result is not None:
                 self._write(index, result, truth)
             content = {"versions": versions(), **manifest, "verdict": summary.verdict.value}
             if self._recording is not None:

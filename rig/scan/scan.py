@@ -4,10 +4,12 @@
 at the end what came and what was lost. `devices_content` describes the devices for the manifest.
 """
 
+import math
 from collections.abc import Iterator, Sequence
 from contextlib import closing
 from dataclasses import asdict
-from typing import Any
+from pathlib import Path
+from typing import Any, Final
 
 import numpy as np
 from numpy.typing import NDArray
@@ -16,6 +18,7 @@ from drivers.errors import DeviceError
 from drivers.interfaces import SpadTiming, SweepTruth
 from drivers.replay.pace import PaceReport
 from drivers.replay.spad import ReplaySpad
+from drivers.spb1 import BlockLayout, frames_per_block
 from rig.config.models import EstimateConfig
 from rig.count.sweeps import Gap, SweepAccount
 from rig.depth.reconstruct import Reconstructor
@@ -31,12 +34,16 @@ from rig.plan.scan_plan import ScanPlan
 from rig.progress import tell_stage
 from rig.recording.inputs import to_plain, write_inputs
 from rig.recording.replay import RecordedStart, ReplaySource
-from rig.recording.segment import map_bytes, recording_bytes
+from rig.recording.segment import Space, paged
 from rig.requests import RunRequest
+from rig.run_folder.folder import SavePolicy
 from rig.scan.acquisition import SILENCE_S, Acquisition, AcquisitionRequest
 from rig.scan.monitor import NOBODY, Listeners
 from rig.scan.pipeline import FEWEST_SLOTS, Overload, require_policy
 from rig.scan.run import Run, RunResult, frames_of, frames_that_came, sweep_content, synchronisation_of, verdict_of
+
+BYTES_PER_PIXEL: Final = 40
+"""Bytes that all files of a map take for every pixel of the camera or of the stripe table, whichever is more."""
 
 
 def run_scan(
@@ -81,7 +88,8 @@ def run_scan(
     }
     recording = None
     if request.record:
-        space = run.space(*recorded_bytes(rig, plan, timing, source), source.maps)
+        assert run.path is not None, "a recording is asked for with a folder"
+        space = recording_space(rig, plan, timing, source, run.path, run.save)
         recording = run.start_recording(manifest, lambda folder: write_inputs(folder, plan, rig.model), space)
         if listeners.on_space is not None:
             listeners.on_space(space)
@@ -173,16 +181,27 @@ class LiveSource:
         return []
 
 
-def recorded_bytes(
-    rig: OpenRig, plan: ScanPlan, timing: SpadTiming, source: LiveSource | ReplaySource
-) -> tuple[int, int]:
-    """Largest number of bytes that the frames of a scan take, and the bytes of one map."""
-    request = spad_request(rig.config.scan, plan)
-    spare_s = lead_s(rig) + spare_lead_s(rig)
+def recording_space(
+    rig: OpenRig,
+    plan: ScanPlan,
+    timing: SpadTiming,
+    source: LiveSource | ReplaySource,
+    folder: Path,
+    save: SavePolicy,
+) -> Space:
+    """Room that the frames and the maps of a recorded scan take at most, and the room on the disk of its folder."""
+    request, rate_hz, starts = spad_request(rig.config.scan, plan), float(plan.frame_rate_hz), source.count_starts()
+    spare_s = lead_s(rig) + spare_lead_s(rig)  # of each start, before its first marker and after its last one
     if rig.spad.info.can_wait:  # on virtual time the SPAD may be a whole ring ahead of what is counted
-        spare_s += FEWEST_SLOTS * request.block_frames / float(plan.frame_rate_hz)
-    starts = source.count_starts()
-    return recording_bytes(plan, request, timing, source.maps, starts=starts, spare_s=spare_s), map_bytes(plan)
+        spare_s += FEWEST_SLOTS * request.block_frames / rate_hz
+    frames = plan.frames_for(source.maps) + (starts - 1) * plan.frames_for(0) + starts * spare_s * rate_hz
+    if plan.burst_frames is not None:
+        frames = min(frames, starts * plan.burst_frames)
+    block_frames = min(request.block_frames, frames_per_block(timing.stride, plan.frame_width, plan.rows))
+    block_bytes = paged(BlockLayout(block_frames, plan.frame_width, plan.rows).block_bytes)
+    map_bytes = BYTES_PER_PIXEL * plan.rows * max(plan.width, plan.columns)
+    frames_bytes = (math.ceil(frames / block_frames) + starts) * block_bytes
+    return Space.on_disk_of(folder, frames_bytes, map_bytes * save.count(source.maps))
 
 
 def _first_alone(rig: OpenRig) -> bool:
