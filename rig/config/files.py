@@ -127,13 +127,13 @@ def config_content(text: str) -> dict[str, Any]:
         raise UsageError(*error.problems) from error
 
 
-def parse_config(content: Mapping[str, object], folder: Path | None = None, options: Iterable[str] = ()) -> RigConfig:
+def parse_config(content: Mapping[str, object], options: Iterable[str] = ()) -> RigConfig:
     """Validate a config from a mapping, such as a notebook's or a manifest's. Raises UsageError with one line per
     problem.
 
     options: dotted keys whose values were given as options, so that problems name the options.
     """
-    return _validated(RigConfig, dict(content), ValueSources("config", options=_keys(options), flags=FLAGS), folder)
+    return _validated(RigConfig, dict(content), ValueSources("config", options=_keys(options), flags=FLAGS))
 
 
 def _keys(dotted: Iterable[str]) -> frozenset[Key]:
@@ -217,7 +217,9 @@ def _refuse_others(path: str | Path, content: Mapping[str, Any], then: str) -> N
         raise UsageError(f"{path} is {what}; {then}")
 
 
-def _validated(model: type[Model], content: Mapping[str, Any], sources: ValueSources, folder: Path | None) -> Model:
+def _validated(
+    model: type[Model], content: Mapping[str, Any], sources: ValueSources, folder: Path | None = None
+) -> Model:
     try:
         return validated(model, content, sources, kind_of, {"folder": folder})
     except FileError as error:

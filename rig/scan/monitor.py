@@ -113,17 +113,10 @@ NOBODY = Listeners()
 class Monitor:
     """Thread that shows the blocks of one start of the SPAD to `callback`, with the figures that `stats` gives."""
 
-    def __init__(
-        self,
-        reader: RingReader,
-        callback: MonitorCallback,
-        stats: Callable[[], PipelineStats],
-        interval_s: float = INTERVAL_S,
-    ) -> None:
+    def __init__(self, reader: RingReader, callback: MonitorCallback, stats: Callable[[], PipelineStats]) -> None:
         self._reader = reader
         self._callback = callback
         self._stats = stats
-        self._interval_s = interval_s
         self._over = threading.Event()
         self.thread = StageThread(self._run, "monitor")
         self.updates = 0
@@ -147,7 +140,7 @@ class Monitor:
         with self._reader:
             try:
                 while not self._over.is_set() and self._show_next():
-                    self._over.wait(self._interval_s)
+                    self._over.wait(INTERVAL_S)
             except BaseException as error:  # it is the watcher's, and no reason to end a run
                 self.failed = True
                 _log.warning("the monitor ends: its callback raised %s", type(error).__name__, exc_info=error)

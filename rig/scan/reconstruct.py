@@ -11,8 +11,8 @@ from rig.devices.calibration_use import CalibrationUse, accepted_by
 from rig.estimate.registry import LEARNING
 from rig.progress import Progress, counted, tell_stage
 from rig.recording.cube import Cube, column_commands, count_map
-from rig.run_folder.summary import MapTally, RunFrames, RunVerdict
-from rig.scan.run import OutFolder, Run, RunResult
+from rig.run_folder.summary import MapTally, RunFrames
+from rig.scan.run import OutFolder, Run, RunResult, verdict_of
 
 
 def reconstruct_cube(
@@ -35,7 +35,7 @@ def reconstruct_cube(
     gaps: list[list[Gap]] = []
     with Run(out, tally) as run:
         run.rays = geometry.rays
-        verdict = RunVerdict.COMPLETE
+        aborted = False
         told = counted("estimating", "maps", progress)
         try:
             for index in range(cube.maps):
@@ -49,14 +49,11 @@ def reconstruct_cube(
                 run.add(result, count_s + result.compute_s)
                 told(tally.maps, cube.maps)
         except KeyboardInterrupt:
-            verdict = RunVerdict.ABORTED
-        if verdict is RunVerdict.COMPLETE and tally.doubts:
-            verdict = RunVerdict.DOUBTFUL
+            aborted = True
         gaps_of_run = [gap for of_map in gaps[: tally.maps] for gap in of_map]
         lost = sum(last - first + 1 for first, last in gaps_of_run)
         n = tally.maps * cube.frames_per_map
-        if lost and verdict is RunVerdict.COMPLETE:
-            verdict = RunVerdict.GAPS
+        verdict = verdict_of([], model, aborted=aborted, doubtful=bool(tally.doubts), outside=gaps_of_run)
         manifest = {
             "command": "reconstruct",
             "cube": cube.path.absolute(),

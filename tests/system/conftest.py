@@ -1,14 +1,20 @@
 """Runs the command line inside the test's own process."""
 
+import errno
+import os
 import shutil
 from collections.abc import Callable
 from dataclasses import dataclass
+from itertools import count
 from pathlib import Path
 
 import pytest
 
 from rig import api
 from rig.cli.main import main
+from rig.count.volume import FrameTally
+from rig.depth.reconstruct import MapResult, Reconstructor
+from rig.run_folder.folder import RunFolder
 from tests.system.small_rig import write_rig
 
 
@@ -66,3 +72,47 @@ def run(scanned: Path, tmp_path: Path) -> Path:
 def small(tmp_path: Path) -> Path:
     """Config file of a small simulated rig."""
     return write_rig(tmp_path / "small-rig")
+
+
+def at_map(index: int, act: Callable[[], object], monkeypatch: pytest.MonkeyPatch) -> None:
+    """Do something as soon as the estimation of a map begins, and again at the next one where it raises."""
+    estimate = Reconstructor.map
+    begun: list[FrameTally] = []
+
+    def acting(self: Reconstructor, sweep: FrameTally) -> MapResult:
+        if len(begun) == index:
+            act()
+        begun.append(sweep)
+        return estimate(self, sweep)
+
+    monkeypatch.setattr(Reconstructor, "map", acting)
+
+
+def stop_at_map(index: int, error: BaseException, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Let the estimation of a map raise."""
+
+    def fail() -> None:
+        raise error
+
+    at_map(index, fail, monkeypatch)
+
+
+def fill_disk_at_map(index: int, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Let writing fail half done, as on a full disk, behind the third file of a map."""
+    write_map, write = RunFolder.write_map, Path.write_bytes
+
+    def limited(self: RunFolder, number: int, *rest: object) -> None:
+        files = count()
+
+        def full(file: Path, data: bytes) -> int:
+            if next(files) < 3:
+                return write(file, data)
+            write(file, data[: len(data) // 2])
+            raise OSError(errno.ENOSPC, os.strerror(errno.ENOSPC))
+
+        with monkeypatch.context() as patch:
+            if number == index:
+                patch.setattr(Path, "write_bytes", full)
+            write_map(self, number, *rest)  # type: ignore[arg-type]
+
+    monkeypatch.setattr(RunFolder, "write_map", limited)

@@ -1,7 +1,6 @@
 """How `rig scan` ends where it does not end well: lost frames, full disks, interrupts, mistakes of the program."""
 
 import dataclasses
-import errno
 import os
 import signal
 import subprocess
@@ -14,7 +13,7 @@ import pytest
 
 from rig.depth.reconstruct import MapResult, Reconstructor
 from rig.run_folder.folder import RunFolder
-from tests.system.conftest import Rig
+from tests.system.conftest import Rig, fill_disk_at_map, stop_at_map
 from tests.system.run_files import FILES, files, strict
 from tests.system.small_rig import config, write_rig
 
@@ -111,50 +110,12 @@ def test_a_map_without_any_depth_is_warned_of(rig: Rig, small: Path, monkeypatch
 
 
 def test_a_disk_that_fills_later_keeps_the_whole_maps(rig: Rig, small: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    write_map = RunFolder.write_map
-
-    def limited(self: RunFolder, index: int, *rest: object) -> None:
-        if index == 2:
-            with monkeypatch.context() as patch:
-                fill_disk_after(3, patch)
-                write_map(self, index, *rest)  # type: ignore[arg-type]
-        write_map(self, index, *rest)  # type: ignore[arg-type]
-
-    monkeypatch.setattr(RunFolder, "write_map", limited)
+    fill_disk_at_map(2, monkeypatch)
     ran = rig("scan", small, "--maps", 4, "--out", "run")
     assert ran.code == 2
     assert "2 of 4 maps were whole" in ran.err
     assert not [name for name in files(Path("run")) if "000002" in name]
     assert strict(Path("run/summary.json").read_text())["verdict"] == "aborted"
-
-
-def stop_at_map(index: int, error: BaseException, monkeypatch: pytest.MonkeyPatch) -> None:
-    """Let the estimation of a map raise."""
-    estimate = Reconstructor.map
-    done: list[int] = []
-
-    def limited(self: Reconstructor, volume: object) -> MapResult:
-        if len(done) == index:
-            raise error
-        done.append(1)
-        return estimate(self, volume)  # type: ignore[arg-type]
-
-    monkeypatch.setattr(Reconstructor, "map", limited)
-
-
-def fill_disk_after(files: int, monkeypatch: pytest.MonkeyPatch) -> None:
-    """Let every write but the first few fail, half done, as on a full disk."""
-    write = Path.write_bytes
-    done: list[int] = []
-
-    def limited(self: Path, data: bytes) -> int:
-        done.append(1)
-        if len(done) <= files:
-            return write(self, data)
-        write(self, data[: len(data) // 2])
-        raise OSError(errno.ENOSPC, os.strerror(errno.ENOSPC))
-
-    monkeypatch.setattr(Path, "write_bytes", limited)
 
 
 @pytest.mark.parametrize(

@@ -1,11 +1,8 @@
 """A recording whose run ended early: whatever ended it, every whole sweep on the disk is found, as after a crash."""
 
-import errno
 import json
-import os
 import shutil
 import threading
-from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
@@ -13,12 +10,10 @@ import pytest
 
 from drivers.errors import DeviceFault
 from rig.api import recording_info, verify
-from rig.depth.reconstruct import MapResult, Reconstructor
-from rig.run_folder.folder import RunFolder
 from rig.scan.acquisition import Acquisition
 from rig.scan.counting import AcquiredMap, MapQueue
 from rig.threads import StageThread
-from tests.system.conftest import Rig
+from tests.system.conftest import Rig, at_map, fill_disk_at_map, stop_at_map
 
 SCAN = ("--maps", 20, "--record", "--out", "run")
 
@@ -27,20 +22,6 @@ def content(name: str, folder: str = "run") -> dict[str, Any]:
     """A JSON file of a run."""
     found: dict[str, Any] = json.loads((Path(folder) / name).read_text())
     return found
-
-
-def at_map(index: int, act: Callable[[], object], monkeypatch: pytest.MonkeyPatch) -> None:
-    """Do something as soon as the estimation of a map begins."""
-    estimate = Reconstructor.map
-    done: list[int] = []
-
-    def acting(self: Reconstructor, volume: object) -> MapResult:
-        if len(done) == index:
-            act()
-        done.append(1)
-        return estimate(self, volume)  # type: ignore[arg-type]
-
-    monkeypatch.setattr(Reconstructor, "map", acting)
 
 
 def interrupt_while_estimating(index: int, monkeypatch: pytest.MonkeyPatch) -> None:
@@ -98,11 +79,8 @@ def test_ctrl_c_leaves_every_whole_sweep_that_was_recorded(
 def test_an_error_leaves_every_whole_sweep_that_was_recorded(
     rig: Rig, small: Path, monkeypatch: pytest.MonkeyPatch, error: Exception, code: int
 ) -> None:
-    def fail() -> None:
-        raise error
-
     with monkeypatch.context() as patch:
-        at_map(1, fail, patch)
+        stop_at_map(1, error, patch)
         assert rig("scan", small, *SCAN).code == code
     assert_as_after_a_crash(rig, 1)
 
@@ -110,17 +88,8 @@ def test_an_error_leaves_every_whole_sweep_that_was_recorded(
 def test_a_disk_without_room_for_a_map_leaves_every_whole_sweep_that_was_recorded(
     rig: Rig, small: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    write_map = RunFolder.write_map
-
-    def full(self: RunFolder, index: int, *rest: object) -> None:
-        if index == 1:
-            with monkeypatch.context() as patch:
-                patch.setattr(Path, "write_bytes", _no_room)
-                write_map(self, index, *rest)  # type: ignore[arg-type]
-        write_map(self, index, *rest)  # type: ignore[arg-type]
-
     with monkeypatch.context() as patch:
-        patch.setattr(RunFolder, "write_map", full)
+        fill_disk_at_map(1, patch)
         assert rig("scan", small, *SCAN).code == 2
     assert content("summary.json")["maps"] == 1
     assert_as_after_a_crash(rig, 1)
@@ -153,7 +122,3 @@ def test_a_second_ctrl_c_still_waits_for_what_was_received(
     assert joined["recorder"] is True
     assert content("manifest.json")["counters"]["delivered"] == recording_info("run").frames
     assert verify("run").verdict.value == "intact"
-
-
-def _no_room(self: Path, data: bytes) -> int:
-    raise OSError(errno.ENOSPC, os.strerror(errno.ENOSPC))
