@@ -151,7 +151,7 @@ def examine(config: RigConfig, folder: Path) -> list[Finding]:
             findings += [*_devices(rig), _calibration(rig)]
             plan, timing = prepare(rig)
             require_memory(rig, plan)
-            rig.sync.program(*sync_program(plan, plan.sweeps_per_period))
+            rig.sync.program(*sync_program(plan, len(plan.legs)))
             findings.append(_plan(plan))
             findings += _frames(look(rig, plan, timing.stride), plan)
             if (most := rig.spad.health.memory_high_water_bytes) is not None:

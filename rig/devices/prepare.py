@@ -104,7 +104,7 @@ def most_sweeps(rig: OpenRig, plan: ScanPlan) -> int | None:
 
     The number is at least 1. SPAD and sync source may still refuse a start with 1.
     """
-    legs = plan.sweeps_per_period
+    legs = len(plan.legs)
     repeats = rig.sync.most_repeats(sync_program(plan, legs)[0])
     limits = [] if repeats is None else [repeats * legs]
     if plan.burst_frames is not None:

@@ -150,11 +150,6 @@ class ScanPlan:
         return self.columns if self.lines is None else self.lines.places
 
     @property
-    def sweeps_per_period(self) -> int:
-        """Number of sweeps in one repetition of the waveform."""
-        return len(self.legs)
-
-    @property
     def sweep_s(self) -> Fraction:
         """Exact seconds from one scan marker to the next."""
         return self.sweep_points / self.point_rate_hz

@@ -17,7 +17,7 @@ import time
 from collections import deque
 from collections.abc import Callable
 from concurrent.futures import Future, ThreadPoolExecutor
-from dataclasses import asdict, dataclass
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Final
 
@@ -53,19 +53,12 @@ class _Placed:
     done: bool = False
 
 
-@dataclass(slots=True)
-class Start:
-    """One start of the SPAD. sweeps: the number it was to give. segment: number of its first segment."""
-
-    sweeps: int
-    segment: int
-
-
 class Recording:
     """A recording that grows block by block in a folder; whatever fails, it ends after a whole block.
 
     One thread submits and appends. expected_bytes: room to reserve on the disk, if known. on_begin: called when a start
-    of the SPAD begins. Raises RecordingError if the folder cannot be written.
+    of the SPAD begins. on_sync: called with every sync, on its thread, and when the recording is closed. Raises
+    RecordingError if the folder cannot be written.
     """
 
     def __init__(
@@ -75,6 +68,7 @@ class Recording:
         expected_bytes: int | None = None,
         segment_bytes: int = SEGMENT_BYTES,
         on_begin: Callable[[], None] | None = None,
+        on_sync: Callable[[], None] | None = None,
     ) -> None:
         self.folder = folder
         self.blocks = 0
@@ -84,19 +78,20 @@ class Recording:
         self.busy_s = 0.0
         """Time of all writers together, for checksums and writing."""
         self.files: list[str] = []
-        self.starts: list[Start] = []
+        self.starts: list[dict[str, int]] = []
+        """Of each start of the SPAD: `sweeps` that it was to give, and the number of its first `segment`."""
         self.longest_unsynced_s = 0.0
         """Longest time from one sync's beginning to the next one's end."""
         self._expected_bytes = expected_bytes
         self._segment_bytes = segment_bytes
         self._on_begin = on_begin
+        self._on_sync = on_sync
         self._segment: OpenSegment | None = None
         self._segment_is_for: tuple[int, int] | None = None
         self._open: list[OpenSegment] = []
         self._order: deque[_Placed] = deque()
         self._lock = threading.Lock()
         self._failure: BaseException | None = None
-        self._companions: list[Callable[[], None]] = []
         self._staging = Staging()
         self._closed = threading.Event()
         self._reserve = folder / RESERVE_FILE
@@ -117,7 +112,7 @@ class Recording:
 
     def begin(self, sweeps: int) -> None:
         """Begin a start of the SPAD that is to give `sweeps` sweeps. Its blocks come next, in segments of their own."""
-        self.starts.append(Start(sweeps, len(self.files)))
+        self.starts.append({"sweeps": sweeps, "segment": len(self.files)})
         with self._lock:
             self._segment = None
         if self._on_begin is not None:
@@ -144,10 +139,6 @@ class Recording:
             self._order.append(placed)
         return self._pool.submit(self._write, block, placed, offset)
 
-    def also_sync(self, companion: Callable[[], None]) -> None:
-        """Call `companion` with every sync, on its thread, and when the recording is closed."""
-        self._companions.append(companion)
-
     def close(self) -> None:
         """Wait until everything is written, end the files and sync them. A second call does nothing. Raises
         RecordingError if that fails.
@@ -163,8 +154,8 @@ class Recording:
             self._index.truncate(HEADER_BYTES + self.blocks * RECORD_BYTES)
             os.fsync(self._index.fileno())
             sync_folder(self.folder)
-            for companion in self._companions:
-                companion()
+            if self._on_sync is not None:
+                self._on_sync()
         except OSError as error:
             raise self._failed(error) from error
         finally:
@@ -183,7 +174,7 @@ class Recording:
             "sync_interval_s": SYNC_INTERVAL_S,
             "longest_unsynced_s": self.longest_unsynced_s,
             "failed": None if self._failure is None else _reason(self._failure),
-            "starts": [asdict(start) for start in self.starts],
+            "starts": list(self.starts),
         }
 
     def _segment_for(self, size: int, is_for: tuple[int, int]) -> OpenSegment:
@@ -263,8 +254,8 @@ class Recording:
         if blocks != self._indexed_at_sync:
             os.fsync(self._index.fileno())
             self._indexed_at_sync = blocks
-        for companion in self._companions:
-            companion()
+        if self._on_sync is not None:
+            self._on_sync()
         self.longest_unsynced_s = max(self.longest_unsynced_s, time.monotonic() - self._last_sync)
         self._last_sync = begun
 
@@ -292,23 +283,7 @@ class Recorder:
         self._recording = recording
         self._on_failure = on_failure
         self.thread = StageThread(self._run, "recorder")
-        self._before = recording.busy_s, recording.blocks, recording.bytes
         self.error: BaseException | None = None
-
-    @property
-    def busy_s(self) -> float:
-        """Total seconds of all writers, for checksums and writing."""
-        return self._recording.busy_s - self._before[0]
-
-    @property
-    def blocks(self) -> int:
-        """Number of blocks of this start that are written."""
-        return self._recording.blocks - self._before[1]
-
-    @property
-    def bytes(self) -> int:
-        """Bytes that the blocks of this start take in the recording."""
-        return self._recording.bytes - self._before[2]
 
     def _run(self) -> None:
         with self._reader:

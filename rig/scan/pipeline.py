@@ -54,6 +54,7 @@ class Pipeline:
         self._source = Source(spad, ring, work.silence_s, self.maps.end_stream, on_frame)
         reader = ring.reader("counting", holds=max(1, min(MOST_UNDER_WAY, ring.slots // 4)))
         self._counting = CountingThread(reader, work, self.maps, self._source, self._complete)
+        self._recording = recording
         self._recorder: Recorder | None = None
         if recording is not None:
             reader = ring.reader("recorder", holds=max(1, min(WRITERS, ring.slots // 4)))
@@ -71,7 +72,7 @@ class Pipeline:
 
     def stats(self) -> PipelineStats:
         """The present figures. May be called from any thread."""
-        ring, counting, recorder, monitor = self._ring, self._counting, self._recorder, self._monitor
+        ring, counting, recording, monitor = self._ring, self._counting, self._recording, self._monitor
         return PipelineStats(
             source_fill_s=self._source.fill_s,
             source_wait_s=ring.waited_s,
@@ -85,9 +86,9 @@ class Pipeline:
             map_wait_s=counting.wait_s,
             map_queue=self.maps.room,
             map_queue_high_water=self.maps.high_water,
-            recorder_s=None if recorder is None else recorder.busy_s,
-            recorder_blocks=None if recorder is None else recorder.blocks,
-            recorder_bytes=None if recorder is None else recorder.bytes,
+            recorder_s=None if recording is None else recording.busy_s,
+            recorder_blocks=None if recording is None else recording.blocks,
+            recorder_bytes=None if recording is None else recording.bytes,
             monitor_updates=None if monitor is None else monitor.updates,
             monitor_skipped_blocks=None if monitor is None else monitor.skipped,
         )

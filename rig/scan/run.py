@@ -127,9 +127,9 @@ class Run:
             }
         except OSError as error:
             raise UsageError(f"cannot write {folder.path}: {error.strerror or error}; name another --out") from error
-        self._recording = Recording(folder.path, expected_bytes=space.recording_bytes, on_begin=begun)
-        if self._tap is not None:
-            self._recording.also_sync(self._tap.sync)
+        sync = None if self._tap is None else self._tap.sync
+        expected = space.recording_bytes
+        self._recording = Recording(folder.path, expected_bytes=expected, on_begin=begun, on_sync=sync)
         begun()
         return self._recording
 

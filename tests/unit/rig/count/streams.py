@@ -158,7 +158,7 @@ def stream_of(
         marks[edge] |= np.uint32(Mark.GATE_EDGE)
         position[edge] = 128  # the latest edge may be the gate's
     records["marks"] = marks | (position << 8)
-    assert points == plan.sweep_points * plan.sweeps_per_period
+    assert points == plan.sweep_points * len(plan.legs)
     return Stream(records, ticks, mirror, scan_frames, exposure, period)
 
 

@@ -103,14 +103,13 @@ def test_what_was_recorded_is_synced_in_time_blocks_before_index(
 
     monkeypatch.setattr(segment_module, "_sync_data", partial(noted, sync))
     monkeypatch.setattr(os, "fsync", partial(noted, fsync))
-    recording = Recording(tmp_path)
     synced = threading.Semaphore(0)
 
     def companion() -> None:
         order.append("companion")
         synced.release()
 
-    recording.also_sync(companion)
+    recording = Recording(tmp_path, on_sync=companion)
     order.clear()
     recording.append(BLOCKS[0])
     for _ in range(3):  # the first of them may have begun before
