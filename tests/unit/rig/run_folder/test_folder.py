@@ -10,7 +10,6 @@ import pytest
 
 from drivers.interfaces import SweepTruth
 from rig.depth.reconstruct import FogEstimate, MapResult
-from rig.errors import UsageError
 from rig.geometry.stripe_table import StripeTable
 from rig.run_folder.folder import RunFolder, json_text
 from rig.run_folder.pictures import SCALE_PX, depth_picture
@@ -173,19 +172,6 @@ def test_an_empty_folder_is_filled_stays_when_nothing_comes_of_it_and_is_left_to
     assert published(out, a_map()) == out
     assert {file.name for file in out.iterdir()} == {"depth", "intensity", "stripe", "cloud"}
     assert published(tmp_path / "deep/er/run", a_map()).exists()
-
-
-@pytest.mark.parametrize("name", ["file", "file/below", "full"])
-def test_a_folder_that_cannot_be_is_refused_and_nothing_changes(tmp_path: Path, name: str) -> None:
-    (tmp_path / "file").write_text("mine")
-    (tmp_path / "full").mkdir()
-    (tmp_path / "full/notes").write_text("mine")
-    before = sorted(tmp_path.rglob("*"))
-    with pytest.raises(UsageError) as caught:
-        RunFolder(tmp_path / name)
-    assert str(tmp_path / name) in str(caught.value)
-    assert len(caught.value.problems) == 1
-    assert sorted(tmp_path.rglob("*")) == before
 
 
 def test_json_is_strict() -> None:

@@ -62,16 +62,6 @@ def test_leaving_the_iteration_early_makes_the_rig_safe(error):
     assert log == START + STOP
 
 
-def test_an_interrupt_while_maps_are_awaited_makes_the_rig_safe():
-    def told(progress):
-        raise KeyboardInterrupt
-
-    rig, log = rig_of(5)
-    with pytest.raises(KeyboardInterrupt):
-        list(acquisition(rig, PLAN, 5, live=told).run())
-    assert log == START + STOP
-
-
 @pytest.mark.parametrize("verb", ["sync.gate_low", "laser.arm", "spad.start", "sync.run", "scanner.start"])
 def test_a_device_that_fails_to_start_leaves_all_of_them_safe(verb):
     device, name = verb.split(".")
