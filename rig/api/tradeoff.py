@@ -4,7 +4,7 @@ from dataclasses import replace
 from typing import Any
 
 from rig.config.models import RigConfig
-from rig.config.overrides import MAX_SEED, SIMULATED, Config, configure, with_lines
+from rig.config.overrides import MAX_SEED, SIMULATED, Config, configure
 from rig.devices.calibration_use import accepted_by, calibration_use
 from rig.devices.open import open_rig
 from rig.errors import UsageError, noted
@@ -14,7 +14,7 @@ from rig.requests import TradeoffRequest
 from rig.run_folder.folder import RunFolder
 from rig.tradeoff.choice import wish_of
 from rig.tradeoff.files import write_files
-from rig.tradeoff.trials import Tradeoff, Trial, Trials, require_methods, run_tradeoff
+from rig.tradeoff.trials import Tradeoff, require_methods, run_tradeoff, trials_of
 
 EXPOSURES = (1, 3, 10)
 """Exposures per column that are tried where the caller names none."""
@@ -62,17 +62,13 @@ def tradeoff(
     if problems:
         raise UsageError.of(problems)
 
-    def config_of(trial: Trial) -> RigConfig:
-        tried = configure(config, scene=trial.scene, fog=trial.fog, exposures=trial.exposures)
-        return tried if trial.lines is None else with_lines(tried, trial.lines)
-
-    trials = Trials(config_of, request)
-    trials.require_plans()  # before a folder is claimed
-    with open_rig(config_of(trials.first())) as rig:
+    trials = trials_of(config, request)  # before a folder is claimed
+    first = next(iter(trials))._replace(lines=None)
+    with open_rig(first.config(config)) as rig:
         accepted = accepted_by(calibration_use(rig, accept=request.accept_calibration))
 
     def run() -> Tradeoff:
-        return replace(run_tradeoff(trials, wish, progress), accepted_calibration=accepted)
+        return replace(run_tradeoff(trials, request, wish, progress), accepted_calibration=accepted)
 
     if request.out is None:
         return run()
@@ -82,8 +78,8 @@ def tradeoff(
         if done.answer is not None and done.answer.fits:
             setting = done.answer.setting
             lines = setting.lines if request.lines else None
-            trial = trials.first()._replace(exposures=setting.exposures, lines=lines)
-            chosen = configure(config_of(trial), estimator=setting.estimator, filter=setting.filter)  # type: ignore[arg-type]
+            chosen = first._replace(exposures=setting.exposures, lines=lines).config(config)
+            chosen = configure(chosen, estimator=setting.estimator, filter=setting.filter)  # type: ignore[arg-type]
         return write_files(folder, done, chosen)
 
 

@@ -1,12 +1,13 @@
 """Scans a simulated rig over settings and scores the maps by the world's truth, to show what accuracy costs in time."""
 
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import asdict, dataclass
 from itertools import count, product, starmap
 from pathlib import Path
 from typing import Any, Literal, NamedTuple
 
 from rig.config.models import RigConfig
+from rig.config.overrides import Config, configure, with_lines
 from rig.errors import each_or_problems
 from rig.estimate.registry import ESTIMATORS, FILTERS
 from rig.progress import Progress, part, tell_stage
@@ -25,38 +26,26 @@ class Trial(NamedTuple):
     exposures: int
     lines: int | None
 
+    def config(self, config: Config) -> RigConfig:
+        """The config with these settings."""
+        tried = configure(config, scene=self.scene, fog=self.fog, exposures=self.exposures)
+        return tried if self.lines is None else with_lines(tried, self.lines)
 
-@dataclass(frozen=True, slots=True)
-class Trials:
-    """Settings to try: every scene in every fog, with every number of exposures and lines, estimator and filter.
 
-    config_of: makes the config of a trial. asked: the settings, with at least one number of exposures, estimator and
-    filter.
+Trials = Mapping[Trial, RigConfig]
+"""Every trial once, with its config; its repeats are scans of their own."""
+
+
+def trials_of(config: Config, asked: TradeoffRequest) -> Trials:
+    """Every scene in every fog, with every number of exposures and lines. Raises UsageError with all problems of all of
+    them, and then of their plans, of which those for the smallest and the largest number of exposures are checked.
     """
-
-    config_of: Callable[[Trial], RigConfig]
-    asked: TradeoffRequest
-
-    def __iter__(self) -> Iterator[Trial]:
-        """Give every trial once; its repeats are scans of their own."""
-        asked = self.asked
-        scenes, fogs, lines = asked.scenes or (None,), asked.fogs or (None,), asked.lines or (None,)
-        return starmap(Trial, product(scenes, fogs, asked.exposures, lines))
-
-    def first(self) -> Trial:
-        """The first trial, with the number of lines in the config."""
-        return next(iter(self))._replace(lines=None)
-
-    def configs(self) -> dict[Trial, RigConfig]:
-        """Make the config of each trial. Raises UsageError with all problems of all of them."""
-        return dict(zip(self, each_or_problems(self, self.config_of), strict=True))
-
-    def require_plans(self) -> None:
-        """Raise UsageError with all problems of these scans. Only the smallest and the largest number of exposures are
-        checked.
-        """
-        ends = {min(self.asked.exposures), max(self.asked.exposures)}
-        each_or_problems([config for trial, config in self.configs().items() if trial.exposures in ends], require_plan)
+    scenes, fogs, lines = asked.scenes or (None,), asked.fogs or (None,), asked.lines or (None,)
+    trials = list(starmap(Trial, product(scenes, fogs, asked.exposures, lines)))
+    configs = dict(zip(trials, each_or_problems(trials, lambda trial: trial.config(config)), strict=True))
+    ends = {min(asked.exposures), max(asked.exposures)}
+    each_or_problems([made for trial, made in configs.items() if trial.exposures in ends], require_plan)
+    return configs
 
 
 @dataclass(frozen=True, slots=True)
@@ -98,16 +87,19 @@ class Tradeoff:
         return {**content, "verdict": self.verdict}
 
 
-def run_tradeoff(trials: Trials, wish: Wish | None, progress: Progress | None = None) -> Tradeoff:
-    """Scan and score all trials. progress: called with the number of frames done and the total, counting those on
-    columns.
+def run_tradeoff(
+    trials: Trials, asked: TradeoffRequest, wish: Wish | None, progress: Progress | None = None
+) -> Tradeoff:
+    """Scan and score all trials, with at least one estimator and filter.
+
+    progress: called with the number of frames done and the total, counting those on columns.
 
     An interrupt ends it after the last complete row; before there is one it is raised.
     """
     rows: list[TradeoffRow] = []
     verdict: Literal["complete", "aborted"] = "complete"
     try:
-        for found in _rows(trials, progress):
+        for found in _rows(trials, asked, progress):
             rows += found
     except KeyboardInterrupt:
         if not rows:
@@ -116,7 +108,7 @@ def run_tradeoff(trials: Trials, wish: Wish | None, progress: Progress | None = 
     done = with_fronts(rows)
     return Tradeoff(
         rows=done,
-        ci95_by="repeats" if trials.asked.repeat > 1 else "blocks of a map",
+        ci95_by="repeats" if asked.repeat > 1 else "blocks of a map",
         wish=wish,
         answer=None if wish is None else choose(done, wish),
         verdict=verdict,
@@ -133,10 +125,9 @@ def require_methods(estimators: Sequence[str], filters: Sequence[str]) -> list[s
     ]
 
 
-def _rows(trials: Trials, progress: Progress | None) -> Iterator[list[TradeoffRow]]:
+def _rows(trials: Trials, asked: TradeoffRequest, progress: Progress | None) -> Iterator[list[TradeoffRow]]:
     """Give the rows of one trial after the other."""
-    configs, asked = trials.configs(), trials.asked
-    frames_of_all = asked.repeat * sum(map(_frames_of, configs.values()))
+    frames_of_all = asked.repeat * sum(map(_frames_of, trials.values()))
     done = 0
     limits = SceneLimits(asked.exposures)
     numbers = count(1)
@@ -145,11 +136,11 @@ def _rows(trials: Trials, progress: Progress | None) -> Iterator[list[TradeoffRo
         if progress is not None:
             progress(round(done + share * _frames_of(config)), frames_of_all)
 
-    for trial, config in configs.items():
+    for trial, config in trials.items():
         scene = str(getattr(config.world, "scene", "")) if trial.scene is None else trial.scene
         repeats: list[list[TradeoffRow]] = []
         for seed in range(asked.seed, asked.seed + asked.repeat):
-            with part(f"scan {next(numbers)} of {len(configs) * asked.repeat}"):
+            with part(f"scan {next(numbers)} of {len(trials) * asked.repeat}"):
                 repeats.append(score_methods(config, (scene, trial.fog), asked, seed, tell))
             done += _frames_of(config)
             tell()

@@ -38,7 +38,7 @@ from rig.tradeoff.rows import (
     with_fronts,
 )  # fmt: skip
 from rig.tradeoff.scan import FrameKeeper
-from rig.tradeoff.trials import Tradeoff, Trials, run_tradeoff
+from rig.tradeoff.trials import Tradeoff, run_tradeoff, trials_of
 from tests.stability.inventory import covers
 
 covers(rows_module)
@@ -196,10 +196,8 @@ def test_what_is_kept_of_frames_counts_as_the_frames_do():
 
 @pytest.mark.parametrize("whole", [0, 2])
 def test_an_interrupt_leaves_the_rows_that_are_whole(monkeypatch, whole):
-    trials = Trials(
-        lambda trial: load_config("simulated", {"scan.exposures": trial.exposures}),
-        TradeoffRequest(fogs=["clear"], exposures=[1, 3, 10], estimators=["edge"], filters=["none"], limits=False),
-    )
+    asked = TradeoffRequest(exposures=[1, 3, 10], estimators=["edge"], filters=["none"], limits=False)
+    trials = trials_of("simulated", asked)
     done = iter(range(whole))
 
     def scanned(config, place, asked, seed, tell):
@@ -210,10 +208,10 @@ def test_an_interrupt_leaves_the_rows_that_are_whole(monkeypatch, whole):
     monkeypatch.setattr("rig.tradeoff.trials.score_methods", scanned)
     if not whole:
         with pytest.raises(KeyboardInterrupt):
-            run_tradeoff(trials, None)
+            run_tradeoff(trials, asked, None)
         return
     told = []
-    found = run_tradeoff(trials, None, lambda *frames: told.append(frames))
+    found = run_tradeoff(trials, asked, None, lambda *frames: told.append(frames))
     assert [row.exposures for row in found.rows] == [1, 3]
     assert found.verdict == found.as_json()["verdict"] == "aborted"
     assert told == [(1000, 14000), (4000, 14000)]
