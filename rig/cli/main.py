@@ -23,7 +23,7 @@ from typing import Annotated
 
 import typer
 
-from rig.cli import bench, calibrate, devices, recordings, replay, scan, tradeoff
+from rig.cli import bench, calibrate, devices, recordings, scan
 from rig.cli.command import EXIT_ABORTED, EXIT_SOFTWARE, EXIT_USAGE, add_commands, fail, refused_file, say
 
 _ENDING = ("SIGTERM", "SIGHUP", "SIGBREAK")
@@ -42,9 +42,7 @@ app = typer.Typer(
 for _commands in (
     devices.SCENES,
     recordings.COMMANDS,
-    replay.COMMANDS,
     scan.COMMANDS,
-    tradeoff.COMMANDS,
     calibrate.COMMANDS,
     devices.COMMANDS,
     bench.COMMANDS,

@@ -1,22 +1,29 @@
-"""Commands for recordings: `rig verify`, `repair`, `info`, `cut`, `compress`, `import` and `export`."""
+"""Commands for recordings: `rig verify`, `repair`, `info`, `cut`, `compress`, `import`, `export` and `replay`."""
 
+import os
+import select
+import sys
+import threading
 from collections.abc import Iterable
-from dataclasses import asdict
+from dataclasses import asdict, replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
 
 import typer
 
-from rig.cli.command import Answer, Commands, api, asks, say
+from rig.cli.command import Answer, Commands, api, asks, report, say, say_space
 from rig.cli.progress import progress
-from rig.requests import CutRequest, ExportRequest, ImportRequest
+from rig.requests import CutRequest, ExportRequest, ImportRequest, ReplayRequest
 
 if TYPE_CHECKING:
+    from drivers.replay.pace import Pace
     from rig.recording.open import RecordingInfo
     from rig.recording.verify import Verification
 
 RunArgument = Annotated[Path, typer.Argument(metavar="RUN", help="folder of a recorded run", show_default=False)]
 
+_LOOK_S = 0.2
+"""Seconds of one wait for a key."""
 MOST_LINES = 20
 """Most problems that are shown to people; `--json` has all."""
 
@@ -162,6 +169,41 @@ def _show_with_gaps(said: str, gaps: Iterable[tuple[int, int]]) -> None:
         print(f"frames {first} to {last} are missing")
 
 
+@asks(ReplayRequest)
+def replay_command(
+    request: ReplayRequest,
+    run: Annotated[Path, typer.Argument(metavar="RUN", help="a run taken with --record", show_default=False)],
+) -> Answer:
+    """Play a recording through the live stack, at any clock."""
+    if request.loop and request.save is None:
+        request = replace(request, save="last")
+    steps = _step_by_keys if request.clock == "step" else None
+    with progress():
+        result = api.replay(run, request, on_space=say_space, steps=steps)
+    if result.control is not None:
+        say(f"control: {result.control}")
+    return report(result)
+
+
+def _step_by_keys(pace: "Pace") -> None:
+    """Make a step for each line of the standard input, on a thread; at its end, play the rest at full speed."""
+    if sys.stdin.isatty():
+        say("Enter: one sweep more; Ctrl-C ends")
+    threading.Thread(target=_follow, args=(pace, sys.stdin.fileno()), name="steps", daemon=True).start()
+
+
+def _follow(pace: "Pace", handle: int) -> None:
+    while not pace.closed:
+        # Not through sys.stdin: a thread that holds its lock would hang the interpreter at its end.
+        if select.select([handle], [], [], _LOOK_S)[0]:
+            data = os.read(handle, 4096)
+            for _ in range(data.count(b"\n")):
+                pace.step()
+            if not data:
+                pace.run_on()
+                return
+
+
 COMMANDS: Commands = {
     "verify": verify_command,
     "repair": repair_command,
@@ -170,4 +212,5 @@ COMMANDS: Commands = {
     "compress": compress_command,
     "import": import_command,
     "export": export_command,
+    "replay": replay_command,
 }

@@ -1,4 +1,4 @@
-"""Commands that make depth maps, and one on what to expect of a scene: `rig scan`, `reconstruct`, `effects`."""
+"""Commands that make depth maps, and two on what a scene allows: `rig scan`, `reconstruct`, `effects`, `tradeoff`."""
 
 from dataclasses import asdict, replace
 from pathlib import Path
@@ -6,10 +6,10 @@ from typing import TYPE_CHECKING, Annotated
 
 import typer
 
-from rig.cli.command import Answer, Commands, ConfigArgument, api, asks, report, say_space, tables
+from rig.cli.command import EXIT_ABORTED, Answer, Commands, ConfigArgument, api, asks, report, say_space, tables
 from rig.cli.completion import one_of
 from rig.cli.progress import progress
-from rig.requests import ReconstructRequest, ScanRequest
+from rig.requests import ReconstructRequest, ScanRequest, TradeoffRequest
 
 if TYPE_CHECKING:
     from rig.plan.scan_plan import ScanPlan
@@ -107,4 +107,25 @@ def effects_command(
     return Answer(asdict(effects), lambda: tables.effects_table(effects))
 
 
-COMMANDS: Commands = {"scan": scan_command, "reconstruct": reconstruct_command, "effects": effects_command}
+@asks(TradeoffRequest)
+def tradeoff_command(request: TradeoffRequest, config: ConfigArgument = "simulated") -> Answer:
+    """Scan a simulated rig with many settings: error over sensor time and compute time, and which setting to use."""
+    with progress():
+        done = api.tradeoff(config, request)
+    code, note = 0 if done.wish is None or (done.answer is not None and done.answer.fits) else 1, ""
+    if done.verdict == "aborted":
+        code, note = EXIT_ABORTED, "aborted: these are the rows that were whole by then"
+    elif done.wish is not None and done.answer is None:
+        note = (
+            f"error: every setting leaves more than 5 % of the answers out, so that none can be named for {done.wish}; "
+            "raise --exposures"
+        )
+    return Answer(done.as_json(), lambda: tables.tradeoff_table(done), code, note)
+
+
+COMMANDS: Commands = {
+    "scan": scan_command,
+    "reconstruct": reconstruct_command,
+    "effects": effects_command,
+    "tradeoff": tradeoff_command,
+}
