@@ -41,17 +41,14 @@ def write_files(folder: RunFolder, done: Tradeoff, setting: RigConfig | None) ->
 
 
 def csv_text(rows: Sequence[TradeoffRow]) -> str:
-    """Rows as CSV, one line each, with the columns of the JSON; the interval takes two columns."""
+    """Rows, at least one, as CSV, one line each, with the columns of the JSON; the interval takes two columns."""
+    lines = [asdict(row) for row in rows]
+    for line in lines:
+        line["ci95_low"], line["ci95_high"] = line.pop("ci95")
     stream = io.StringIO()
-    writer: csv.DictWriter[str] | None = None
-    for row in rows:
-        content = asdict(row)
-        low, high = content.pop("ci95")
-        line = {**content, "ci95_low": low, "ci95_high": high}
-        if writer is None:
-            writer = csv.DictWriter(stream, line.keys(), lineterminator="\n")
-            writer.writeheader()
-        writer.writerow(line)
+    writer = csv.DictWriter(stream, lines[0], lineterminator="\n")
+    writer.writeheader()
+    writer.writerows(lines)
     return stream.getvalue()
 
 

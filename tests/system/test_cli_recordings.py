@@ -23,6 +23,8 @@ def test_a_recorded_scan_is_intact_until_it_is_damaged_and_whole_once_repaired(r
     assert (found["verdict"], found["problems"], found["run"]) == ("intact", [], "complete")
     summary = json.loads((run / "summary.json").read_text())
     assert found["frames"] >= summary["frames"]["received"]
+    assert found["blocks"] == summary["stages"]["recorder_blocks"]
+    assert found["bytes"] == summary["stages"]["recorder_bytes"] == (run / "frames-000000.spb").stat().st_size
     damage(run, (run / "frames-000000.spb").stat().st_size // 2)
     ran = rig("verify", run)
     assert (ran.code, "damaged: " in ran.out) == (1, True)

@@ -6,8 +6,6 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from drivers.frames import FrameBlock
-from drivers.spb1 import walk_blocks
 from tests.system.conftest import Rig
 from tests.system.run_files import FILES, files, strict
 from tests.system.small_rig import HEIGHT, WIDTH
@@ -57,23 +55,6 @@ def test_the_same_seed_gives_the_same_depth_however_it_is_taken_and_another_one_
     assert "stripe error" in ran.out
     assert "complete" in ran.out
     assert str(Path("run2/depth/000000.png").absolute()) in ran.out
-
-
-def test_a_recording_holds_every_frame_of_the_scan(rig: Rig, small: Path) -> None:
-    summary = strict(rig("scan", small, "--maps", 2, "--record", "--json", "--out", "run").out)
-    assert files(Path("run")) > {"frames-000000.spb", "summary.json"}
-    blocks = list(walk_blocks(np.fromfile("run/frames-000000.spb", np.uint8), None, check_payload=True))
-    assert all(isinstance(block, FrameBlock) for block in blocks)
-    numbers = np.concatenate([block.frame_numbers for block in blocks])  # type: ignore[union-attr]
-    assert numbers.tolist() == list(range(len(numbers)))
-    assert len(numbers) >= summary["frames"]["received"]  # type: ignore[index]
-    stages, recording = summary["stages"], strict(Path("run/manifest.json").read_text())["recording"]
-    assert isinstance(stages, dict)
-    assert isinstance(recording, dict)
-    assert (recording["files"], recording["blocks"]) == (["frames-000000.spb"], stages["recorder_blocks"])
-    assert recording["sync_interval_s"] == 0.2
-    assert recording["bytes"] == Path("run/frames-000000.spb").stat().st_size
-    assert recording["starts"] == [{"sweeps": 2, "segment": 0}]
 
 
 @pytest.mark.parametrize(("save", "kept"), [(["last"], [2]), (["every", "2"], [0, 2])])
