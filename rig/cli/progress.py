@@ -127,7 +127,8 @@ def _announced(line: ProgressLine) -> Iterator[None]:
     line.on_change = speak
     timer = threading.Timer(PATIENCE_S, speak, (True,))
     timer.daemon = True
-    timer.start()
+    if not speaks:
+        timer.start()
     try:
         yield
     finally:
