@@ -185,6 +185,7 @@ class _Export:
 def _check(run: Path, kind: str, request: ExportRequest) -> None:
     known, view = kind in EXPORT_KINDS, request.view
     summed, per_s = request.frames_per_picture, request.pictures_per_s
+    fps = f"{per_s or 0.0:g}"
     no_pictures = f"{kind} has none; export png or mp4, or leave it out" if known and kind not in PICTURE_KINDS else ""
     no_film = known and kind != "mp4"
     checks = [
@@ -194,10 +195,10 @@ def _check(run: Path, kind: str, request: ExportRequest) -> None:
         (view in VIEWS and no_pictures, f"view {view!r} is of pictures, {no_pictures}"),
         (summed is not None and no_pictures, f"--frames {summed} are summed for pictures, {no_pictures}"),
         (summed is not None and summed < 1, f"{summed} frames make no picture; sum at least 1"),
-        (per_s is not None and no_film, f"--fps {per_s:g} is of a film, {kind} is none; export mp4, or leave it out"),
+        (per_s is not None and no_film, f"--fps {fps} is of a film, {kind} is none; export mp4, or leave it out"),
         (
             per_s is not None and not 0 < per_s <= 1000,
-            f"a film of {per_s:g} pictures a second; choose 1000 or less, above 0",
+            f"a film of {fps} pictures a second; choose 1000 or less, above 0",
         ),
     ]
     if problems := [line for wrong, line in checks if wrong]:
