@@ -1,4 +1,4 @@
-"""What the counts of a sweep's columns tell: its passages, when the laser line passed over each pixel, and its picture.
+"""Finds in the counts of a sweep's columns its passages, when the laser line passed over each pixel, and its picture.
 
 Passages are found for many pixels, spread evenly over the picture. The first step finds the column at which the line
 stands out most from both sides (sums over columns, and their peak). The second fits the passage by maximum likelihood

@@ -79,7 +79,7 @@ class Recording:
         """Time of all writers together, for checksums and writing."""
         self.files: list[str] = []
         self.starts: list[dict[str, int]] = []
-        """Of each start of the SPAD: `sweeps` that it was to give, and the number of its first `segment`."""
+        """Each start of the SPAD has the `sweeps` that it was to give and the number of its first `segment`."""
         self.longest_unsynced_s = 0.0
         """Longest time from one sync's beginning to the next one's end."""
         self._expected_bytes = expected_bytes

@@ -91,7 +91,7 @@ class RunFolder:
         self._write(files)
 
     def place(self, name: str) -> Path:
-        """Where a file of the run is written; to be closed before `publish`. "" is the folder itself."""
+        """Path at which a file of the run is written; to be closed before `publish`. "" is the folder itself."""
         assert self._scratch is not None, "the run folder is published or discarded already"
         return self._scratch / name
 
