@@ -74,7 +74,9 @@ class TcpStream:
             self._socket.settimeout(deadline_s)
             try:
                 self._socket.sendall(data)
-            except TimeoutError:
+            except TimeoutError as error:
+                if error.errno is not None:
+                    raise  # of the connection: the other side is lost
                 raise DeviceTimeout(
                     f"{self._name} took no data for {deadline_s:g} s on {self._address}; it hangs"
                 ) from None
@@ -92,7 +94,9 @@ class TcpStream:
             self._socket.settimeout(deadline_s)
             try:
                 n = self._socket.recv_into(view)
-            except (TimeoutError, BlockingIOError):  # the second where the deadline is now
+            except (TimeoutError, BlockingIOError) as error:  # the second where the deadline is now
+                if isinstance(error, TimeoutError) and error.errno is not None:
+                    raise  # of the connection: the other side is lost
                 return 0
         if n == 0:
             raise DeviceDisconnected(f"{self._name}: {self._address} closed the connection")

@@ -209,7 +209,9 @@ def reconstruct(
         if plan is not None and (source / PLAN_FILE).exists():
             raise UsageError(f"{source} is a recording, which has the plan it was taken with; leave --plan out")
         if isinstance(calibration, RigModel):
-            raise UsageError("the calibration for a recording is a file; calibration.save_rig_model writes one")
+            raise UsageError(
+                "the calibration for a recording is a file; calibration.files.rig_file.save_rig_model writes one"
+            )
         asked = _chosen(request, "estimator", "filter", "min_confidence", "accept_calibration", "out")
         return replay(source, clock="max", calibration=calibration, progress=progress, **asked)
     if plan is None or calibration is None:
