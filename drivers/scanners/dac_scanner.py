@@ -1,128 +1,29 @@
-"""The common part of all beam scanners that are a galvo behind a USB DAC: limits, paths within them, runs.
+"""The common part of all beam scanners that are a galvo behind a USB DAC: how it runs.
 
 The mirror moves only when it is started or parked, always along ramps; opening a scanner only asks the board for its
 identity. A run consists of the way to the first point, the waveform, and the way to rest. A thread feeds the points to
 the DAC slice by slice and keeps track of where the mirror rests. Nothing is computed in advance: a waveform of a
-million points repeated for hours takes only the memory of the waveform. The paths to the first point, to a stop and to
-the dump angle are
-
-    ramp   x(t) = a + (b - a) (1 - cos(pi t / T)) / 2      peaks: v = |b - a| pi / 2T, a = |b - a| pi^2 / 2T^2
-    brake  constant deceleration from the mirror's present speed
-
-DACs pass the steps of their input to the galvo as they are, and a full-range jump at every point can overheat it
-(docs/reference/hardware.md, Helios). So no path contains a jump.
+million points repeated for hours takes only the memory of the waveform.
 """
 
 import logging
-import math
 import threading
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 from fractions import Fraction
-from typing import Annotated, Any, Literal, Protocol, Self
+from typing import Any, Protocol
 
 import numpy as np
 from numpy.typing import NDArray
-from pydantic import Field, model_validator
 
 from drivers.errors import DeviceDisconnected, DeviceError
 from drivers.interfaces import BeamScanner, ScannerLimits, ScannerStatus, ScanWaveform
-from drivers.registry import KindConfig, Surroundings
+from drivers.registry import Surroundings
+from drivers.scanners.galvo import GalvoConfig, brake, ramp
 from drivers.transports.endpoints import resolve
 from drivers.transports.usb_device import UsbDevice, UsbId, open_device
-from drivers.units import PerSecond, PerSecondSquared
 
 _log = logging.getLogger(__name__)
-
-LOWEST_RATE_HZ = 1000.0
-"""Lowest point rate: slower than that a mirror shows every point as a step."""
-MOST_WAVEFORM_POINTS = 1_000_000
-"""Most points of a waveform, which stays in the host's memory, 9 bytes a point."""
-
-Drive = Annotated[float, Field(ge=-1, le=1)]
-"""Normalised drive: -1 to 1 is the DAC's range."""
-
-
-class GalvoConfig(KindConfig):
-    """Limits of the galvo, from its data sheet. The DAC itself would play anything."""
-
-    port: str = "usb"
-    """Port: usb; where several are attached usb:serial=ABC, or usb:path=1-2 for a Helios, which has none;
-    emulated:NAME."""
-    axis: Literal["x", "y"] = "x"
-    max_velocity: Annotated[PerSecond, Field(gt=0, le=1e6)]
-    """Speed of the normalised drive, whose full range is 2."""
-    max_acceleration: Annotated[PerSecondSquared, Field(gt=0, le=1e10)]
-    max_step: Annotated[float, Field(gt=0, le=2)] = 0.1
-    """Largest change of the drive from one point to the next."""
-    rms_duty: Annotated[float, Field(gt=0, le=1)] = 0.5
-    """Largest root-mean-square acceleration as a share of max_acceleration: the galvo's heat."""
-    command_range: tuple[Drive, Drive] = (-1.0, 1.0)
-    park: Drive = -1.0
-    """Drive at which the beam hits the dump; within command_range."""
-
-    @model_validator(mode="after")
-    def _check(self) -> Self:
-        low, high = self.command_range
-        if not low < high:
-            raise ValueError(f"command_range {low:g} to {high:g} is empty; give the lower end first")
-        if not low <= self.park <= high:
-            raise ValueError(f"park {self.park:g} is outside command_range {low:g} to {high:g}; move it inside")
-        return self
-
-    def limits(self, highest_rate_hz: float) -> ScannerLimits:
-        """The limits of the galvo on a DAC that runs at up to that rate."""
-        return ScannerLimits(
-            command_range=self.command_range,
-            velocity_per_s=self.max_velocity,
-            acceleration_per_s2=self.max_acceleration,
-            step=self.max_step,
-            rms_duty=self.rms_duty,
-            max_points=MOST_WAVEFORM_POINTS,
-            point_rate_hz=(LOWEST_RATE_HZ, highest_rate_hz),
-        )
-
-
-_HEADROOM = 0.9
-"""Share of a limit that a ramp uses."""
-
-
-def ramp(start: float, end: float, limits: ScannerLimits, rate_hz: float) -> NDArray[np.float64]:
-    """Commands from `start` (excluded) to `end` (included), at rest on both sides. float64 (n,); n = 0 if they are
-    equal.
-    """
-    way = abs(end - start)
-    if way == 0:
-        return np.empty(0)
-    velocity = min(limits.velocity_per_s, limits.step * rate_hz) * _HEADROOM
-    # The root mean square of a cosine is its peak / sqrt 2: below a duty of 0.7 that is the stricter limit.
-    acceleration = limits.acceleration_per_s2 * min(1.0, limits.rms_duty * math.sqrt(2)) * _HEADROOM
-    least_s = max(way * math.pi / (2 * velocity), math.pi * math.sqrt(way / (2 * acceleration)))
-    points = max(2, math.ceil(least_s * rate_hz))
-    phase = np.arange(1, points + 1) / points
-    commands: NDArray[np.float64] = start + (end - start) * (1 - np.cos(math.pi * phase)) / 2
-    commands[-1] = end
-    return commands
-
-
-def brake(position: float, velocity_per_s: float, limits: ScannerLimits, rate_hz: float) -> NDArray[np.float64]:
-    """Commands from `position` (excluded) to rest at a constant deceleration, inside the range. float64 (n,).
-
-    The deceleration exceeds `limits` only if the range leaves no room otherwise, which no waveform within the limits
-    requires.
-    """
-    step = velocity_per_s / rate_hz
-    if step == 0:
-        return np.empty(0)
-    low, high = limits.command_range
-    room = max((high - position) if step > 0 else (position - low), 0.0)
-    # Steps s (1 - k / m): each is shorter than the last by s / m, and together they are s (m - 1) / 2 long.
-    decrements = math.ceil(abs(step) * rate_hz**2 / (limits.acceleration_per_s2 * _HEADROOM))
-    decrements = int(min(decrements, 1 + 2 * room / abs(step)))
-    steps = step * (1 - np.arange(1, decrements) / decrements)
-    commands: NDArray[np.float64] = position + np.cumsum(steps)
-    return np.clip(commands, low, high)
-
 
 FULL_SCALE, CENTRE = 4095, 0x800
 """Largest value of the converters, and the one at which the mirror stands without power."""

@@ -37,16 +37,15 @@ from drivers.registry import Kind, Surroundings
 from drivers.scanners.dac_scanner import (
     CENTRE,
     DRIFT,
-    LOWEST_RATE_HZ,
     PATIENCE_S,
     POLL_S,
     DacScanner,
-    GalvoConfig,
     PointSlice,
     PointSource,
     colour,
     open_scanner,
 )
+from drivers.scanners.galvo import LOWEST_RATE_HZ, GalvoConfig
 from drivers.transports.usb_device import UsbDevice, UsbId
 from drivers.units import Hertz, Seconds
 

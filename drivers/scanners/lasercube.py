@@ -34,15 +34,14 @@ from drivers.scanners.dac_scanner import (
     CENTRE,
     DRIFT,
     FULL_SCALE,
-    LOWEST_RATE_HZ,
     PATIENCE_S,
     POLL_S,
     DacScanner,
-    GalvoConfig,
     PointSlice,
     PointSource,
     open_scanner,
 )
+from drivers.scanners.galvo import LOWEST_RATE_HZ, GalvoConfig
 from drivers.transports.usb_device import UsbDevice, UsbId
 from drivers.units import Hertz, Seconds
 

@@ -14,7 +14,7 @@ from hypothesis import strategies as st
 from calibration.errors import CalibrationError
 from calibration.model.rig_model import RigModel
 from drivers.interfaces import LEVEL_BACKWARD, ScanWaveform
-from drivers.scanners.dac_scanner import brake, ramp
+from drivers.scanners.galvo import brake, ramp
 from rig.count.blanking import PatternSearch, PatternShape, detection_probability
 from rig.errors import PlanError
 from rig.plan import waveform

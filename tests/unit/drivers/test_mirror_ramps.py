@@ -10,7 +10,8 @@ from hypothesis import strategies as st
 
 from drivers.interfaces import MARKER_LINE, MARKER_SCAN, ScannerLimits, ScanWaveform
 from drivers.interfaces.scanner import check_waveform
-from drivers.scanners.dac_scanner import PointSource, brake, ramp
+from drivers.scanners.dac_scanner import PointSource
+from drivers.scanners.galvo import brake, ramp
 
 RATE_HZ = 25_000.0
 LIMITS = ScannerLimits(

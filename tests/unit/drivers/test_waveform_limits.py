@@ -11,7 +11,7 @@ from numpy.typing import ArrayLike
 from drivers.errors import LimitExceeded
 from drivers.interfaces import ScannerLimits, ScanWaveform
 from drivers.interfaces.scanner import check_waveform
-from drivers.scanners.dac_scanner import GalvoConfig
+from drivers.scanners.galvo import GalvoConfig
 from tests.stability.inventory import covers
 
 covers(GalvoConfig.limits)
