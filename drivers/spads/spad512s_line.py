@@ -75,7 +75,7 @@ class TcpStream:
             try:
                 self._socket.sendall(data)
             except TimeoutError as error:
-                if error.errno is not None:
+                if error.errno == errno.ETIMEDOUT:
                     raise  # of the connection: the other side is lost
                 raise DeviceTimeout(
                     f"{self._name} took no data for {deadline_s:g} s on {self._address}; it hangs"
@@ -95,7 +95,7 @@ class TcpStream:
             try:
                 n = self._socket.recv_into(view)
             except (TimeoutError, BlockingIOError) as error:  # the second where the deadline is now
-                if isinstance(error, TimeoutError) and error.errno is not None:
+                if error.errno == errno.ETIMEDOUT:
                     raise  # of the connection: the other side is lost
                 return 0
         if n == 0:

@@ -24,8 +24,8 @@ from rig.config.files import PLAN_FORMAT
 from rig.errors import UsageError
 from rig.geometry.windows import WORD_PX
 from rig.plan.scan_plan import MOST_CHIP_FRAMES, Blanking, ScanPlan
-from rig.recording.open import open_recording
-from rig.run_folder.manifest import MANIFEST, inputs_problems, read_manifest
+from rig.recording.open import manifest_or_none, open_recording
+from rig.run_folder.manifest import inputs_problems, read_manifest
 
 PLAN_FILE: Final = "plan.yaml"
 PLAN_VERSION: Final = 1
@@ -68,7 +68,7 @@ def read_plan(folder: Path, name: str = PLAN_FILE) -> ScanPlan:
         plan = from_plain(ScanPlan, content.get("plan"))
         _require_sizes(plan)
     except (ValueError, TypeError, KeyError, ArithmeticError) as error:
-        manifest = read_manifest(folder) if (folder / MANIFEST).exists() else {}
+        manifest, _ = manifest_or_none(folder)
         altered = [line for line in inputs_problems(folder, manifest or {}) if line.startswith(f"{name} ")]
         raise UsageError(f"{file}: {(altered or [str(error)])[0]}; take it from a copy of the recording") from error
     return plan

@@ -2,6 +2,7 @@
 
 import copy
 import json
+import re
 import shutil
 from contextlib import suppress
 from pathlib import Path
@@ -72,6 +73,17 @@ def test_a_folder_without_a_recording_is_called_what_it_is_by_every_command(rig:
         assert (ran.code, len(ran.problems), ran.err.count("\n")) == (2, 1, 1), (command, ran.err)
         assert f"{run} holds no recording (frames-*.spb): the frames of this run were not recorded" in ran.err
     assert not list(Path().iterdir())
+
+
+def test_a_plan_that_cannot_be_is_told_by_its_checksum_where_there_is_one(rig: Rig, run: Path) -> None:
+    plan = run / "plan.yaml"
+    plan.write_text(re.sub(r"columns: \d+", "columns: 0", plan.read_text()))
+    ran = rig("reconstruct", run, "--out", "new")
+    assert (ran.code, "plan.yaml is not as it was written, its checksum does not fit" in ran.err) == (2, True), ran.err
+    (run / "manifest.json").write_text("{")
+    ran = rig("reconstruct", run, "--out", "new")
+    assert ran.err.count("\n") == 1, ran.err
+    assert ran.code in (2, 3)
 
 
 @pytest.mark.parametrize(("block", "kept"), [(0, (1, 2)), (-1, (0, 1))], ids=["first", "last"])
