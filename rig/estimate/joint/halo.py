@@ -232,6 +232,9 @@ def _ask(counts, n_frames, sweep, state, shares, x_px, places, y, c, a):  # type
 
 CLEAR: Final = np.float32(0.5)
 """Confidence of stripes that teach."""
+MOST_PEAK: Final = 2.0
+"""Photons per exposure in one pixel from which on a stripe's light is guessed from its flanks: a line a little wider than
+thought would be a dimmer stripe with a stronger halo."""
 FIRST_LINES: Final = LATTICE_LINES // 4
 """Rows x columns that tell whether there is a halo at all, and of later maps; once there is one in the first map, twice
 LATTICE_LINES measure it."""
@@ -266,6 +269,7 @@ def bright_lines(
     light, known = np.empty(len(rows), np.float32), np.empty(len(rows), np.bool_)
     seen = volume.counts, volume.n_frames, tables.sweep, tables.state, tables.shares, stripes.x_px, places
     workers.over(len(rows), lambda first, last: likeliest_light(*seen, rows, columns, first, last, light, known))
+    known &= light * tables.state.psi[0] < MOST_PEAK
     return BrightLines(lines_of(volume, (rows[known], columns[known]), stripes), light[known])
 
 

@@ -17,6 +17,7 @@ import numpy as np
 from rig.count.volume import Counter, CountVolume, SweepCounter, SweepLayout
 from rig.estimate.joint.confidence import pairs_to_ask, stripe_table
 from rig.estimate.joint.halo import bright_lines, learn_first_halo, learn_next_halo
+from rig.estimate.joint.labels.contrast import cost_contrast
 from rig.estimate.joint.labels.grid import BAND_ROWS, LabelGrid
 from rig.estimate.joint.lesson import add_quiet, fill_trust, read_positions
 from rig.estimate.joint.paths import CHUNK, along_columns, along_rows
@@ -33,12 +34,13 @@ from rig.estimate.row.model import RowModel
 from rig.estimate.search.online_learning import LearningSetting, OnlineLearner, Seen, first_model
 from rig.geometry.stripe_table import StripeTable
 from rig.geometry.windows import SweepGeometry
-from rig.simd import Float64
+from rig.simd import Float32, Float64
 from rig.simd.memory import pointers
 from rig.threads import RowWorkers
 
 FIRST_ROUNDS = 3
 """Times that the first map's stripes teach the model that they are then estimated with again."""
+AGREE_PX = np.float32(1.0)
 QUIET_COLUMNS = 8
 """One column in so many teaches the ambient light where there are dark frames too."""
 
@@ -105,25 +107,48 @@ class Joint:
     def _first_model(self, volume: CountVolume, geometry: SweepGeometry) -> RowModel:
         """Learn from the first sweep: row by row, then from stripes that all rows together show far better."""
         self._prior.recall(None)  # of maps that taught nothing
-        model = first_model(volume, geometry, self._workers)
-        exposures, dark = volume.exposures, volume.dark_counts is not None
-        for _ in range(FIRST_ROUNDS):
-            tables = tables_of(LearningSetting(model, geometry, exposures, dark), self._workers)
-            stripes = self._teaching(volume, tables, self._stripes(volume, tables, lesson=True))
-            quiet = self._quiet(volume, geometry, tables, stripes)
-            ambient = ambient_map(volume, volume.intensity(), geometry, quiet)
-            width = line_width(volume, tables.sweep, tables.state, stripes, self._workers)
-            model = replace(model, line_sigma_px=width or model.line_sigma_px)
-            model = learn_again(volume, geometry, model, ambient, stripes, self._workers)
-            assert self._memory is not None, "a map has been estimated"
-            places = self._memory.places
-            model = learn_first_halo(volume, geometry, model, ambient, tables, stripes, places, self._workers)
-            # Amplitudes are relative to the scale of the model that they are written into.
-            weigh_light(volume, tables.sweep, state_of(model), stripes.x_px, places, self._workers)
-            self._workers.settle()
-            amplitude, weight = amplitudes_of(places)
-            model = replace(model, amplitude=amplitude, weight=weight)
+        model = start = first_model(volume, geometry, self._workers)
+        beside, rounds = None, 0
+        while rounds < FIRST_ROUNDS:
+            model, rounds = self._taught(volume, geometry, model, beside), rounds + 1
+            if beside is None and model.halo.any():
+                # What is scattered many times has misled these lessons: begin again with a second teacher.
+                beside, model, rounds = self._beside(volume, geometry, model), start, 0
         return model
+
+    def _taught(
+        self, volume: CountVolume, geometry: SweepGeometry, model: RowModel, beside: Float32 | None
+    ) -> RowModel:
+        """The model that stripes estimated with `model` teach. beside: x_px of `_beside`, which these must confirm."""
+        setting = LearningSetting(model, geometry, volume.exposures, volume.dark_counts is not None)
+        tables = tables_of(setting, self._workers, contrast=beside is not None)
+        stripes = self._teaching(volume, tables, self._stripes(volume, tables, lesson=True))
+        if beside is not None:
+            with np.errstate(invalid="ignore"):
+                agree = np.abs(stripes.x_px - beside) <= AGREE_PX
+            stripes = replace(stripes, confidence=np.where(agree, stripes.confidence, np.float32(0)))
+        quiet = self._quiet(volume, geometry, tables, stripes)
+        ambient = ambient_map(volume, volume.intensity(), geometry, quiet)
+        width = line_width(volume, tables.sweep, tables.state, stripes, self._workers)
+        model = replace(model, line_sigma_px=width or model.line_sigma_px)
+        model = learn_again(volume, geometry, model, ambient, stripes, self._workers)
+        assert self._memory is not None, "a map has been estimated"
+        places = self._memory.places
+        model = learn_first_halo(volume, geometry, model, ambient, tables, stripes, places, self._workers)
+        # Amplitudes are relative to the scale of the model that they are written into.
+        weigh_light(volume, tables.sweep, state_of(model), stripes.x_px, places, self._workers)
+        self._workers.settle()
+        amplitude, weight = amplitudes_of(places, None if beside is None else stripes.confidence > 0.5)
+        return replace(model, amplitude=amplitude, weight=weight)
+
+    def _beside(self, volume: CountVolume, geometry: SweepGeometry, model: RowModel) -> Float32:
+        """x_px (rows, columns) that the surroundings of labels alone tell."""
+        setting = LearningSetting(model, geometry, volume.exposures, volume.dark_counts is not None)
+        tables = tables_of(setting, self._workers)
+        x_px = np.empty(tables.grid.x_far.shape, np.float32)
+        self._read(volume, tables, x_px, alone=True)
+        self._workers.settle()
+        return x_px
 
     def _teaching(self, volume: CountVolume, tables: JointTables, stripes: StripeTable) -> StripeTable:
         """The table with the trust that lessons put into each answer instead of its confidence."""
@@ -137,9 +162,14 @@ class Joint:
         )  # fmt: skip
         return replace(stripes, confidence=trust)
 
-    def _stripes(self, volume: CountVolume, tables: JointTables, *, lesson: bool = False) -> StripeTable:
+    def _read(self, volume: CountVolume, tables: JointTables, x_px: Float32, *, alone: bool = False) -> None:
+        """Fill x_px (rows, columns) with the labels of least cost, and the answers in memory. The last step is only
+        queued.
+
+        alone: whether labels are costed by their surroundings only.
+        """
         grid, workers = tables.grid, self._workers
-        rows, columns = grid.x_far.shape
+        rows, columns = x_px.shape
         memory = self._room(grid)
 
         def tie_rows(first: int, last: int) -> None:
@@ -151,6 +181,8 @@ class Joint:
             for band in range(first, last, BAND_ROWS):
                 end = min(band + BAND_ROWS, last)
                 tables.costs.fill(volume, band, end, room_at, memory.cost)
+                if tables.contrast is not None:
+                    cost_contrast(volume, tables.contrast, band, end, memory.cost, alone=alone)
                 self._prior.add(volume, band, end, memory.cost)
                 along_rows(memory.cost, memory.message, band, end)
 
@@ -158,7 +190,7 @@ class Joint:
             desk = new_readout(tables.settings, memory.answer, CHUNK, grid.labels)
             along_columns(memory.cost, memory.message, first, last, pointers(desk))
 
-        x_px, neighbours = np.empty((rows, columns), np.float32), grid.column_px <= NEIGHBOURS_PX
+        neighbours = grid.column_px <= NEIGHBOURS_PX
 
         def read(first: int, last: int) -> None:
             if neighbours:
@@ -174,6 +206,11 @@ class Joint:
             workers.post(columns, lambda first, last: collect(memory.answer, first, last, memory.ballots))
         workers.settle()
         workers.post(rows, read)  # what is placed next is of the same rows
+
+    def _stripes(self, volume: CountVolume, tables: JointTables, *, lesson: bool = False) -> StripeTable:
+        grid, workers, memory = tables.grid, self._workers, self._room(tables.grid)
+        x_px = np.empty(grid.x_far.shape, np.float32)
+        self._read(volume, tables, x_px)
         seen = volume, tables.sweep, tables.state
         sd = place(*seen, tables.shares, x_px, memory.places, workers, lesson=lesson)
         lit = volume.n_frames > 0

@@ -7,6 +7,7 @@ import numpy as np
 from rig.errors import UsageError
 from rig.estimate.joint.confidence import Brightness, brightness_of, pairs_to_ask
 from rig.estimate.joint.labels.cost_rows import CostRoom
+from rig.estimate.joint.labels.contrast import Contrast, contrast_of
 from rig.estimate.joint.labels.costs import Costs, costs_of
 from rig.estimate.joint.labels.grid import LabelGrid, label_grid
 from rig.estimate.joint.place.place import new_places, profile_table
@@ -30,6 +31,7 @@ class JointTables(NamedTuple):
 
     grid: LabelGrid
     costs: Costs
+    contrast: Contrast | None
     sweep: Sweep
     state: RowState
     shares: Float32
@@ -84,13 +86,19 @@ def grid_of(geometry: SweepGeometry) -> LabelGrid:
     return grid
 
 
-def tables_of(setting: LearningSetting, workers: RowWorkers) -> JointTables:
-    """The tables of a model, for a geometry and a number of exposures per column."""
+def tables_of(setting: LearningSetting, workers: RowWorkers, *, contrast: bool = False) -> JointTables:
+    """The tables of a model, for a geometry and a number of exposures per column.
+
+    contrast: whether labels are also costed by their surroundings; under a halo they always are.
+    """
     model, geometry, grid = setting.model, setting.geometry, grid_of(setting.geometry)
     costs = costs_of(model, geometry, grid, setting.exposures, workers)
     state, sigma_px, sweep = state_of(model), model.line_sigma_px, sweep_of(geometry)
+    beside = None
+    if contrast or model.halo.any():
+        beside = contrast_of(costs, sigma_px)
     return JointTables(
-        grid, costs, sweep, state, profile_table(sigma_px),
+        grid, costs, beside, sweep, state, profile_table(sigma_px),
         halo_shares(model, geometry.width if model.halo.any() else 0), second_light(state, sigma_px, grid, sweep),
         brightness_of(model), setting.dark, answer_settings(grid.stripes), {},
         pairs_to_ask(np.isfinite(grid.x_far)),

@@ -5,7 +5,7 @@ Relative to 'everything is before the stripe', with weights and constants of `ri
 units,
 
     sums(p)  = sum over pixels p' < p of (n edge + constant edge)        evidence of all pixels behind
-    score(x) = sums + max over LIGHTS of (constant + sum over taps n tap)
+    score(x) = sums + max over brightnesses of (constant + sum over taps n tap)
     cost(x)  = (best score of the row - score(x)) / 2^down               uint8, at most COST_LIMIT
 
 Counts n are int16 fractions of their maximum (COUNT_BITS). The two phases of a pixel are the low and the high byte of
@@ -179,26 +179,35 @@ def sum_edges(at: LabelTables, fitted: Fitted, b: Buffers, batch: int) -> None:
 
 
 @numba.njit(forceinline=True)
-def _score_row(sums, n, tap, constant, score, vectors, taps):  # type: ignore[no-untyped-def]
+def _likelier_lights(n, tap, constant, taps):  # type: ignore[no-untyped-def]
+    """Scores of a vector of pixels, of the far and the near phase, for the likelier one of a pair of brightnesses."""
+    far_dim, far_bright = load_int16(constant, 0), load_int16(constant, LANES)
+    near_dim, near_bright = load_int16(constant, 2 * LANES), load_int16(constant, 3 * LANES)
+    for d in range(taps):
+        counts, of_tap = load_int16(n, d), d * POSITION
+        far_dim = far_dim + scaled(counts, load_int16(tap, of_tap))
+        far_bright = far_bright + scaled(counts, load_int16(tap, of_tap + LANES))
+        near_dim = near_dim + scaled(counts, load_int16(tap, of_tap + 2 * LANES))
+        near_bright = near_bright + scaled(counts, load_int16(tap, of_tap + 3 * LANES))
+    return larger(far_dim, far_bright), larger(near_dim, near_bright)
+
+
+@numba.njit(forceinline=True)
+def _score_row(sums, n, tap, constant, score, vectors, taps, pairs):  # type: ignore[no-untyped-def]
     """The scores of a row, and the largest one of each lane."""
     best = zero_int16() + np.int16(-32768)
     for _ in range(vectors):
-        far_dim, far_bright = load_int16(constant, 0), load_int16(constant, LANES)
-        near_dim, near_bright = load_int16(constant, 2 * LANES), load_int16(constant, 3 * LANES)
-        for d in range(taps):
-            counts, of_tap = load_int16(n, d), d * POSITION
-            far_dim = far_dim + scaled(counts, load_int16(tap, of_tap))
-            far_bright = far_bright + scaled(counts, load_int16(tap, of_tap + LANES))
-            near_dim = near_dim + scaled(counts, load_int16(tap, of_tap + 2 * LANES))
-            near_bright = near_bright + scaled(counts, load_int16(tap, of_tap + 3 * LANES))
+        far, near = _likelier_lights(n, tap, constant, taps)
+        for pair in range(1, pairs):
+            others = _likelier_lights(n, tap + 2 * POSITION * taps * pair, constant + 2 * POSITION * pair, taps)
+            far, near = larger(far, others[0]), larger(near, others[1])
         level = load_int16(sums, 0)
-        far = add_saturated(level, larger(far_dim, far_bright))
-        near = add_saturated(level, larger(near_dim, near_bright))
+        far, near = add_saturated(level, far), add_saturated(level, near)
         store_int16(score, 0, far)
         store_int16(score, LANES, near)
         best = larger(best, larger(far, near))
-        n, sums, score, constant = n + 2 * LANES, sums + 2 * LANES, score + 4 * LANES, constant + 2 * POSITION
-        tap += 2 * POSITION * taps
+        n, sums, score, constant = n + 2 * LANES, sums + 2 * LANES, score + 4 * LANES, constant + 2 * POSITION * pairs
+        tap += 2 * POSITION * taps * pairs
     return best
 
 
@@ -218,10 +227,10 @@ def score_rows(at: LabelTables, constants: int, which: int, taps: int, b: Buffer
         constant = constants + 2 * at.constants * read_int32(which, r)
         vectors = read_int16(at.used, i)
         # With a usual width of the line the loop over its taps is unrolled.
-        if taps == _USUAL_TAPS:
-            best = _score_row(sums, n, tap, constant, score, vectors, _USUAL_TAPS)
+        if taps == _USUAL_TAPS and at.pairs == 1:
+            best = _score_row(sums, n, tap, constant, score, vectors, _USUAL_TAPS, 1)
         else:
-            best = _score_row(sums, n, tap, constant, score, vectors, taps)
+            best = _score_row(sums, n, tap, constant, score, vectors, taps, at.pairs)
         store_int16(b.top, r * LANES, best)
     store_int16(b.top, 0, largest_of_rows(b.top))
 
@@ -280,7 +289,7 @@ def room_for(tables: LabelTables, halo: HaloTables, labels: int) -> CostRoom:
     """The tables with the working memory of one thread."""
     room, read = new_halo_room(halo, tables.constants), tables.pixels
     if room.blocks == 0 and tables.used.size > 0:
-        reach = tables.tap.shape[2] // 2
+        reach = tables.tap.shape[3] // 2
         read = min(read, -(-(FAR_PX + LANES * int(tables.used.max()) + reach) // LANES) * LANES)
     return CostRoom(tables, room, new_buffers(tables, labels), read)
 

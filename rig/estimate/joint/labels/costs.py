@@ -1,7 +1,7 @@
 """Cost of every label on every row and column: a fast form of `rig.estimate.row.likelihood`, tested against it.
 
 The cost says how much less likely a label makes the counts than the best label does. It uses the line's profile at the
-label's own eighth of a pixel, LIGHTS amplitudes, and tables that the rows of a band share
+label's own eighth of a pixel, some amplitudes, and tables that the rows of a band share
 (`rig.estimate.joint.labels.tables`),
 
     cost(l) = units_per_nat (max log-likelihood - log-likelihood(l)),   uint8 (rows, columns, labels), <= COST_LIMIT
@@ -65,8 +65,14 @@ FRAMES_OVER_HALF_MORE: Final = 4
 """The counts of a column weigh no more than those of one and a half times the nominal exposures plus this many."""
 LOOKED_AT: Final = 32
 """Number of columns, and of rows, whose rise decides the units of all."""
-QUARTILES: Final = (0.25, 0.75)
+QUANTILES: Final = (0.25, 0.75)
 """Shares of the learned amplitudes below those that the costs try."""
+HALO_QUANTILES: Final = (0.1, 0.35, 0.65, 0.9)
+"""The same under a halo. It is many times brighter than its stripe, so that a stripe between two amplitudes is drawn to
+a distance where the halo of one of them fits."""
+HALO_TRUST: Final = 0.9
+"""Part of the halo's evidence that counts: it is summed over many pixels, all of which have the error of what was learned
+in common."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -109,7 +115,7 @@ def costs_of(model: RowModel, geometry: SweepGeometry, grid: LabelGrid, exposure
     bands = -(-geometry.rows // BAND_ROWS)
     at = np.empty((bands, geometry.columns, VARIANTS), np.int32)
     ambient, hot = model.ambient, hot_in_bands(model.ambient)
-    tables = _empty_tables(at, number_tables(place, at), grid, 2 * reach + 1, hot)
+    tables = _empty_tables(at, number_tables(place, at), grid, 2 * reach + 1, hot, len(light) // LIGHTS)
     distance = np.arange(-reach, reach + 1) - (np.arange(FRACTIONS)[:, None] - FRACTIONS // 2) / FRACTIONS
     shares = pixel_shares(model.line_sigma_px, distance)
     beside = np.ascontiguousarray(halo_shares(model, BLOCK_PX // 2 + 1)[:, -1])
@@ -125,8 +131,9 @@ def costs_of(model: RowModel, geometry: SweepGeometry, grid: LabelGrid, exposure
 
     if halo.weight.size > 0:
         shares_of_halo = halo_shares(model, tables.edge.shape[1] + FAR_PX)
-        around = *seen, shares_of_halo, ways.units * scale
+        around = *seen, shares_of_halo, ways.units * scale * HALO_TRUST
         workers.over(bands, lambda first, last: fill_halo(*around, first, last, tables, halo))
+        np.multiply(halo.constant, np.float32(HALO_TRUST), out=halo.constant)
 
     def fit(first: int, last: int) -> None:
         room = room_for(tables, halo, grid.labels)
@@ -181,27 +188,29 @@ def _largest(sweep: Sweep, state: RowState, row: RowBuffers, light: float) -> tu
     return rise, gain
 
 
-def _empty_tables(at: Int32, tables: int, grid: LabelGrid, taps: int, hot: Bools) -> LabelTables:
+def _empty_tables(at: Int32, tables: int, grid: LabelGrid, taps: int, hot: Bools, pairs: int) -> LabelTables:
     y, x = np.nonzero(hot)
     vectors = -(-label_pixels(grid) // LANES)
     pixels = -(-(FAR_PX + label_pixels(grid) + MARGIN_PX) // LANES) * LANES
     return LabelTables(
         at=at, edge=aligned_zeros((tables, pixels), np.int16), edge_sum=aligned_zeros((tables, pixels), np.float32),
-        tap=aligned_zeros((tables, vectors, taps, PHASES, LIGHTS, LANES), np.int16),
-        constant=aligned_zeros((tables, vectors, PHASES, LIGHTS, LANES), np.float32),
+        tap=aligned_zeros((tables, vectors, pairs, taps, PHASES, LIGHTS, LANES), np.int16),
+        constant=aligned_zeros((tables, vectors, pairs, PHASES, LIGHTS, LANES), np.float32),
         span=np.zeros((tables, 2), np.int16), used=np.zeros(tables, np.int16),
-        fitted_constant=aligned_zeros((tables, vectors, PHASES, LIGHTS, LANES), np.int16),
+        fitted_constant=aligned_zeros((tables, vectors, pairs, PHASES, LIGHTS, LANES), np.int16),
         fitted_edge=aligned_zeros((tables, pixels), np.int16),
         hot_start=np.searchsorted(y, np.arange(len(hot) + 1)).astype(np.int32), hot_x=x.astype(np.int16), pixels=pixels,
-        taps=vectors * taps * PHASES * LIGHTS * LANES, constants=vectors * PHASES * LIGHTS * LANES,
+        taps=vectors * pairs * taps * PHASES * LIGHTS * LANES, constants=vectors * pairs * PHASES * LIGHTS * LANES,
+        pairs=pairs,
     )  # fmt: skip
 
 
 def _lights(model: RowModel) -> Float32:
-    """The quartiles of the learned amplitudes."""
+    """Quantiles of the learned amplitudes."""
     weight = np.maximum(model.weight, 1e-6)
     middle = (np.cumsum(weight) - 0.5 * weight) / weight.sum()
-    return np.exp(np.interp(QUARTILES, middle, np.log(model.amplitude.astype(np.float64)))).astype(np.float32)
+    quantiles = HALO_QUANTILES if model.halo.any() else QUANTILES
+    return np.exp(np.interp(quantiles, middle, np.log(model.amplitude.astype(np.float64)))).astype(np.float32)
 
 
 def hot_in_bands(ambient: Float32) -> Bools:

@@ -42,8 +42,8 @@ class HaloTables(NamedTuple):
     """Tables of the halo. Blocks of pixels are counted from FIRST_PX on, places of the stripe from the far end of label
     0's pixel.
 
-    weight: int16 (bands, columns, blocks, LIGHTS, places), of the counts of a block over BLOCK_PX. constant: float32
-    (bands, columns, LIGHTS, places), nats per exposure. ramp: int16 (phases, 3, LANES), interpolation weights of the
+    weight: int16 (bands, columns, blocks, lights, places), of the counts of a block over BLOCK_PX. constant: float32
+    (bands, columns, lights, places), nats per exposure. ramp: int16 (phases, 3, LANES), interpolation weights of the
     three places around a vector of labels, in 2^-15. Without a halo all but `ramp` are empty.
     """
 
@@ -54,13 +54,13 @@ class HaloTables(NamedTuple):
 
 def halo_tables(tables: LabelTables, there: bool) -> HaloTables:
     """Memory for the tables of a halo, if there is one."""
-    bands, columns, _ = tables.at.shape
+    (bands, columns, _), lights = tables.at.shape, LIGHTS * tables.pairs
     blocks = -(-(tables.edge.shape[1] - FIRST_PX) // BLOCK_PX)
     places = -(-(LANES // BLOCK_PX * tables.tap.shape[1] + 1) // LANES) * LANES
     if not there:
         bands = blocks = places = 0
-    weight = aligned_zeros((bands, columns, blocks, LIGHTS, places), np.int16)
-    return HaloTables(weight, aligned_zeros((bands, columns, LIGHTS, places), np.float32), _ramps())
+    weight = aligned_zeros((bands, columns, blocks, lights, places), np.int16)
+    return HaloTables(weight, aligned_zeros((bands, columns, lights, places), np.float32), _ramps())
 
 
 def _ramps() -> Int16:
@@ -115,7 +115,7 @@ def fill_halo(
             # No label lies around the places behind these, which fill up a vector: `halo` need not reach so far.
             for j in range(LANES // BLOCK_PX * tables.tap.shape[1] + 1):
                 t = min(max(to_t - FAR_PX - BLOCK_PX * j, 0), length - 1)
-                for m in range(LIGHTS):
+                for m in range(light.shape[0]):
                     s = light[m] * row.scale[t]
                     for k in range(level.shape[1]):
                         if size[k] == 0:
@@ -146,15 +146,16 @@ def rounded(a):  # type: ignore[no-untyped-def]
 
 
 class HaloRoom(NamedTuple):
-    """The tables with their numbers of blocks and places, and working memory for a column and a batch of rows.
+    """The tables with their numbers of blocks, brightnesses and places, and working memory for a column and a batch of rows.
 
-    All int16 unless said. fitted: (LIGHTS, places), constants of all places for a column's exposures; mean: (blocks,),
-    counts of blocks; level: (LIGHTS, places), evidence of the halo for a stripe at each place; constant: of the
+    All int16 unless said. fitted: (lights, places), constants of all places for a column's exposures; mean: (blocks,),
+    counts of blocks; level: (lights, places), evidence of the halo for a stripe at each place; constant: of the
     positions, for each row of a batch; which: int32 (BATCH,), each row's index there.
     """
 
     tables: HaloTables
     blocks: int
+    lights: int
     places: int
     fitted: Int16
     mean: Int16
@@ -165,10 +166,10 @@ class HaloRoom(NamedTuple):
 
 def new_halo_room(halo: HaloTables, constants: int) -> HaloRoom:
     """Working memory for rows with this number of constants of positions."""
-    blocks, places = halo.weight.shape[2], halo.weight.shape[4]
+    _, _, blocks, lights, places = halo.weight.shape
     return HaloRoom(
-        tables=halo, blocks=blocks, places=places, fitted=aligned_zeros((LIGHTS, places), np.int16),
-        mean=aligned_zeros((blocks,), np.int16), level=aligned_zeros((LIGHTS, places), np.int16),
+        tables=halo, blocks=blocks, lights=lights, places=places, fitted=aligned_zeros((lights, places), np.int16),
+        mean=aligned_zeros((blocks,), np.int16), level=aligned_zeros((lights, places), np.int16),
         constant=aligned_zeros((BATCH if blocks else 0, constants), np.int16), which=np.arange(BATCH, dtype=np.int32),
     )  # fmt: skip
 
@@ -176,7 +177,7 @@ def new_halo_room(halo: HaloTables, constants: int) -> HaloRoom:
 @numba.njit(cache=True, nogil=True)
 def fit_halo(halo: HaloRoom, column: int, per_nat: float) -> None:
     """Fill fitted for a column's exposures. column: its number among all bands; per_nat: units x exposures."""
-    numbers = LIGHTS * halo.places
+    numbers = halo.lights * halo.places
     for j in range(0, numbers, LANES):
         nats = load_float32(halo.tables.constant + 4 * column * numbers, j) * np.float32(per_nat)
         store_int16(halo.fitted, j, rounded(nats))
@@ -185,8 +186,8 @@ def fit_halo(halo: HaloRoom, column: int, per_nat: float) -> None:
 @numba.njit(cache=True, nogil=True)
 def halo_rows(halo: HaloRoom, column: int, at: LabelTables, fitted: Fitted, b: Buffers, batch: int) -> None:
     """Fill constant with the constants of the rows' tables plus the evidence of the halo."""
-    vectors = b.score_row // (PHASES * LANES)
-    weights = halo.tables.weight + 2 * column * halo.blocks * LIGHTS * halo.places
+    vectors, numbers = b.score_row // (PHASES * LANES), halo.lights * halo.places
+    weights = halo.tables.weight + 2 * column * halo.blocks * numbers
     for r in range(batch):
         i = read_int32(b.here, r)
         if i < 0:
@@ -197,16 +198,17 @@ def halo_rows(halo: HaloRoom, column: int, at: LabelTables, fitted: Fitted, b: B
             for p in range(max(begin, first), min(begin + BLOCK_PX, end)):
                 total += read_int16(n, p)
             write_int16(halo.mean, k, np.int16(total // BLOCK_PX))
-        for j in range(0, LIGHTS * halo.places, LANES):
+        for j in range(0, numbers, LANES):
             says = load_int16(halo.fitted, j)
             for k in range(halo.blocks):
                 mean = zero_int16() + read_int16(halo.mean, k)
-                says = add_saturated(says, scaled(mean, load_int16(weights, k * LIGHTS * halo.places + j)))
+                says = add_saturated(says, scaled(mean, load_int16(weights, k * numbers + j)))
             store_int16(halo.level, j, says)
         source = fitted.constant + 2 * at.constants * read_int32(b.fitted, r)
         to = halo.constant + 2 * at.constants * r
         for v in range(vectors):
-            for m in range(LIGHTS):
+            for m in range(halo.lights):
+                pair = v * at.pairs + m // LIGHTS
                 place = m * halo.places + LANES // BLOCK_PX * v
                 first = zero_int16() + read_int16(halo.level, place)
                 second = zero_int16() + read_int16(halo.level, place + 1)
@@ -215,7 +217,7 @@ def halo_rows(halo: HaloRoom, column: int, at: LabelTables, fitted: Fitted, b: B
                     ramp = halo.tables.ramp + 2 * 3 * LANES * phase
                     says = scaled(first, load_int16(ramp, 0)) + scaled(second, load_int16(ramp, LANES))
                     says = says + scaled(third, load_int16(ramp, 2 * LANES))
-                    j = v * POSITION + (phase * LIGHTS + m) * LANES
+                    j = pair * POSITION + (phase * LIGHTS + m % LIGHTS) * LANES
                     constant = load_int16(source, j)
                     # Positions without a label stay so whatever the halo says.
                     never = smaller(constant + _POSSIBLE, np.int16(0)) << 4

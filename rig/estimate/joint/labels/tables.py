@@ -41,7 +41,7 @@ from rig.simd.memory import CACHE_LINE, aligned_zeros
 from rig.simd.vectors import LANES
 
 LIGHTS: Final = 2
-"""Stripe brightnesses of which the likelier one counts."""
+"""Stripe brightnesses that are scored together; of all of them, one pair or more, the likeliest counts."""
 WEIGHT_LIMIT: Final = 32767
 """Largest weight: a count that would say more says this much."""
 IMPOSSIBLE: Final = np.float32(-1e9)
@@ -57,14 +57,14 @@ class LabelTables(NamedTuple):
     at: int32 (bands, columns, VARIANTS), index of the table, -1 if there is none.
     edge: int16 (tables, P), weight of a count behind the stripe. edge_sum: float32 (tables, P), nats per exposure if
     all pixels up to and including each lie behind.
-    tap: int16 (tables, V, taps, PHASES, LIGHTS, LANES), weight of the counts of the pixels around each position.
-    constant: float32 (tables, V, PHASES, LIGHTS, LANES), nats per exposure of each position.
+    tap: int16 (tables, V, pairs, taps, PHASES, LIGHTS, LANES), weight of the counts of the pixels around each position.
+    constant: float32 (tables, V, pairs, PHASES, LIGHTS, LANES), nats per exposure of each position.
     span: int16 (tables, 2), first pixel with a weight other than 0, and the one after the last.
     used: int16 (tables,), vectors up to the last one that holds a label of any row.
     fitted_constant, fitted_edge: int16, units of constant and of each pixel's share of edge_sum, for the usual number
     of exposures.
     hot_x: int16, x of hot pixels, those of row y from hot_start[y] to hot_start[y + 1], int32.
-    pixels, taps, constants: number of edge, tap and constant entries of a table.
+    pixels, taps, constants: number of edge, tap and constant entries of a table. pairs: of brightnesses.
     """
 
     at: Int32
@@ -81,6 +81,7 @@ class LabelTables(NamedTuple):
     pixels: int
     taps: int
     constants: int
+    pairs: int
 
 
 @numba.njit(cache=True, nogil=True)
@@ -105,8 +106,8 @@ def fill_tables(
 ) -> None:  # fmt: skip
     """Fill the tables of bands first_band..last_band-1.
 
-    state: without ambient light, which is in `ambient` (rows, width), for pixels that are not `hot`. light: (LIGHTS,)
-    photons at unit scale. shares: (FRACTIONS, taps) of the line in the pixels around centres -4/8 to 3/8 px off.
+    state: without ambient light, which is in `ambient` (rows, width), for pixels that are not `hot`. light: (LIGHTS
+    pairs,) photons at unit scale. shares: (FRACTIONS, taps) of the line in the pixels around centres -4/8 to 3/8 px off.
     per_nat: units of weight; most: largest sum of a position's weights.
     """
     side = 1 if sweep.near_is_left else -1
@@ -235,11 +236,11 @@ def _fill_taps(
         for phase in range(PHASES):
             inside = span[0] <= p < span[1] and labels[0] <= PHASES * q + phase < labels[1]
             off = variant - VARIANTS * (1 - phase)
-            for m in range(LIGHTS):
-                total, largest = np.float32(0.0), 0.0
-                for d in range(2 * reach + 1):
-                    tap[vector, d, phase, m, lane] = 0
-                constant[vector, phase, m, lane] = IMPOSSIBLE
+            for m in range(light.shape[0]):
+                total, largest, pair, own_light = np.float32(0.0), 0.0, m // LIGHTS, m % LIGHTS
+                weights = tap[vector, pair, :, phase, own_light, lane]
+                weights[:] = 0
+                constant[vector, pair, phase, own_light, lane] = IMPOSSIBLE
                 if not inside:
                     continue
                 halo = (light[m] - middle_light) * scale[to_t - p] * glow[p]
@@ -257,13 +258,13 @@ def _fill_taps(
                     around = light[m] * scale[to_t - p] * near_glow[p] - middle_light * scale[to_t - at] * glow[at]
                     told = cell_of(min(max(flux[own, at] + around, FLUX_MIN), FLUX_MAX))
                     weight = _weight((table[0, cell] - table[0, told]) * per_nat)
-                    tap[vector, d + reach, phase, m, lane] = weight
+                    weights[d + reach] = weight
                     largest += abs(weight)
                     total += table[1, cell] - table[1, told]
-                constant[vector, phase, m, lane] = total
+                constant[vector, pair, phase, own_light, lane] = total
                 if largest > most:
                     for d in range(2 * reach + 1):
-                        tap[vector, d, phase, m, lane] = np.int16(tap[vector, d, phase, m, lane] * most / largest)
+                        weights[d] = np.int16(weights[d] * most / largest)
 
 
 @numba.njit(inline="always")
@@ -276,7 +277,7 @@ BATCH: Final = LANES
 SUMS_FROM: Final = LANES - 1
 """Sums up to and including a pixel belong to the next one: so they are written at whole vectors."""
 POSITION: Final = PHASES * LIGHTS * LANES
-"""Numbers that a vector of pixels has in a table."""
+"""Numbers that a vector of pixels has in a table for a pair of brightnesses."""
 
 
 class Ways(NamedTuple):

@@ -16,7 +16,7 @@ from rig.estimate.joint.place.pool import join_pairs, pool_amplitude, pool_place
 from rig.estimate.row.inputs import RowState, Sweep
 from rig.estimate.row.model import pixel_shares
 from rig.geometry.stripe_table import StripeTable
-from rig.simd import Float32, Float64
+from rig.simd import Bools, Float32, Float64
 from rig.simd.memory import aligned_zeros
 from rig.simd.shuffles import EIGHT
 from rig.threads import RowWorkers
@@ -143,9 +143,12 @@ def line_width(
     return float(np.sqrt(np.clip(moment / light - pixel_variance, *LINE_SIGMA_PX**2)))
 
 
-def amplitudes_of(places: Places) -> tuple[Float32, Float64]:
-    """Four amplitudes that represent those of a map's stripes, pooled over neighbours, and their shares."""
-    found = places.amplitude[places.scale > 0]
+def amplitudes_of(places: Places, trusted: Bools | None = None) -> tuple[Float32, Float64]:
+    """Four amplitudes that represent those of a map's stripes, pooled over neighbours, and their shares.
+
+    trusted: (rows, columns), which stripes count; None for all.
+    """
+    found = places.amplitude[places.scale > 0 if trusted is None else trusted & (places.scale > 0)]
     edges, shares = (0.0, 0.2, 0.5, 0.8, 1.0), np.array([0.2, 0.3, 0.3, 0.2])
     if len(found) == 0:
         return np.ones(4, np.float32), shares

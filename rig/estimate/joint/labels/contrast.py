@@ -1,0 +1,224 @@
+"""Cost of every label from its own surroundings alone: a stripe is brighter than what lies beside it.
+
+With counts n of K frames at the pixels t around a label, shares w_t of the line in them (of sum 1), and p0 the share of
+firing pixels in BESIDE_PX to both sides over 2 ROWS + 1 rows,
+
+    p = sum w_t n_t / K,    N = K / sum w_t^2
+    score = N (p log(p / p0) + (1 - p) log((1 - p) / (1 - p0))) where p > p0, else 0,    in nats
+
+the log-likelihood ratio of 'p' over 'p0' for N frames, pooled as a matched filter pools them. As in
+`rig.estimate.joint.labels.costs`,
+
+    cost(l) = units_per_nat (largest score of the row - score(l)),    uint8 (rows, columns, labels), <= COST_LIMIT
+
+These costs use no learned number but the width of the line. Where fog scatters light many times, a learned haze and
+halo can explain a wrong place, but they cannot mislead these; which in turn know nothing of haze that ends.
+"""
+
+from typing import Final, NamedTuple
+
+import numba
+import numpy as np
+
+from rig.count.volume import Counts, CountVolume
+from rig.estimate.joint.labels.cost_rows import COST_LIMIT, EXCLUDED
+from rig.estimate.joint.labels.costs import Costs
+from rig.estimate.joint.labels.grid import FAR_PX, FRACTIONS, LABEL, LABEL_END, ODD, PHASES, START, VARIANT, VARIANTS
+from rig.estimate.row.model import pixel_shares
+from rig.simd import Float32, Int16, Int32, Uint8
+from rig.simd.functions import logarithm
+from rig.simd.memory import CACHE_LINE, address_of, load_float32, prefetch_to_write, store_bytes, store_float32
+from rig.simd.shuffles import reversed_lanes
+from rig.simd.vectors import LANES, as_bytes, larger_float, smaller_float, to_int16, zero_float32
+
+ROWS: Final = 6
+"""Rows to either side whose pixels beside a label are its surroundings too."""
+BESIDE_PX: Final = 4, 10
+"""Pixels to either side of a label that are its surroundings, from and to."""
+REACH_PX: Final = 2
+"""Pixels to either side of a label that its line falls on."""
+LEAST_ONES: Final = np.float32(0.5)
+"""Surroundings without a one are taken to have had so many."""
+MOST_SHARE: Final = np.float32(1.0 - 1e-4)
+"""Largest share of firing pixels: scores stay finite."""
+_AHEAD: Final = 2
+"""Rows ahead of which memory is asked for."""
+
+
+class Contrast(NamedTuple):
+    """Settings of these costs under one model.
+
+    place: int16 (columns, rows, PLACES) of `places_of`. hot_start, hot_x: as in `LabelTables`, of pixels that count
+    what the one beside them counts. shares: float32 (2, FRACTIONS, taps) of the line in the pixels around centres -4/8
+    to 3/8 px off towards near, from far to near and from near to far. frames: float32 (FRACTIONS,), N for one frame.
+    side: 1 where near is left, else -1.
+    """
+
+    place: Int16
+    hot_start: Int32
+    hot_x: Int16
+    shares: Float32
+    frames: Float32
+    side: int
+    units_per_nat: float
+
+
+def contrast_of(costs: Costs, line_sigma_px: float) -> Contrast:
+    """Settings for a line of this width, with the places, hot pixels and units of a model's costs."""
+    distance = np.arange(-REACH_PX, REACH_PX + 1) - (np.arange(FRACTIONS)[:, None] - FRACTIONS // 2) / FRACTIONS
+    shares = pixel_shares(line_sigma_px, distance)
+    shares /= shares.sum(axis=1, keepdims=True)
+    return Contrast(
+        costs.place, costs.tables.hot_start, costs.tables.hot_x, np.stack([shares, shares[:, ::-1]]),
+        1.0 / np.square(shares).sum(axis=1), costs.grid.side, costs.units_per_nat,
+    )  # fmt: skip
+
+
+def cost_contrast(volume: CountVolume, contrast: Contrast, first: int, last: int, cost: Uint8, *, alone: bool) -> None:
+    """Write these costs over those of rows first..last-1, or (not alone) the mean of both.
+
+    cost: uint8 (rows, columns, labels) of all rows. Labels that are EXCLUDED stay so, and so do columns without frames.
+    Threads may fill different rows at once.
+    """
+    _fill(volume.counts, volume.n_frames, volume.x0, contrast, first, last, alone, cost)
+
+
+@numba.njit(cache=True, nogil=True, error_model="numpy")
+def _fill(
+    counts: Counts, n_frames: Int32, x0: Int32, contrast: Contrast, first_row: int, last_row: int, alone: bool,
+    cost: Uint8,
+) -> None:  # fmt: skip
+    (columns, rows, window), labels, side = counts.shape, cost.shape[2], contrast.side
+    # Whole vectors may begin at any pixel, and end behind the last one.
+    total, running = np.zeros(window, np.float32), np.zeros(window + 2 * BESIDE_PX[1] + LANES, np.float32)
+    n, pixels = np.zeros(window + 2 * REACH_PX + LANES, np.float32), pixels_beside(window)
+    score, own = np.zeros((PHASES, window + 2 * LANES), np.float32), np.zeros(PHASES * (window + LANES), np.uint8)
+    for c in range(columns):
+        frames, begin = n_frames[c], max(first_row - ROWS, 0)
+        if frames == 0:
+            continue
+        total[:] = 0.0
+        for y in range(begin, min(first_row + ROWS, rows)):
+            for t in range(window):
+                total[t] += np.float32(counts[c, y, t])
+        for y in range(first_row, last_row):
+            if y + ROWS < rows:
+                for t in range(window):
+                    total[t] += np.float32(counts[c, y + ROWS, t])
+            if y - ROWS > begin:
+                for t in range(window):
+                    total[t] -= np.float32(counts[c, y - ROWS - 1, t])
+            here = contrast.place[c, y]
+            if here[VARIANT] < 0 or here[LABEL] >= here[LABEL_END]:
+                continue
+            # Of the pixels that hold labels, those that were stored, low..high-1.
+            far = int(here[START]) - x0[c] - side * (FAR_PX + (here[LABEL] + here[ODD]) // PHASES)
+            near = int(here[START]) - x0[c] - side * (FAR_PX + (here[LABEL_END] - 1 + here[ODD]) // PHASES)
+            low, high = max(min(far, near), 0), min(max(far, near) + 1, window)
+            if low >= high:
+                continue
+            for line in range(0, labels, CACHE_LINE):
+                prefetch_to_write(address_of(cost) + (min(y + _AHEAD, rows - 1) * columns + c) * labels + line)
+            for t in range(window):
+                n[t + REACH_PX] = counts[c, y, t]
+            for h in range(contrast.hot_start[y], contrast.hot_start[y + 1]):
+                t = contrast.hot_x[h] - x0[c]
+                if 0 <= t < window:
+                    n[t + REACH_PX] = counts[c, y, t - 1 if t > 0 else t + 1]
+            add_up(total, running)
+            around = min(y + ROWS, rows - 1) - max(y - ROWS, 0) + 1
+            for phase in range(PHASES):
+                off = here[VARIANT] + VARIANTS * phase
+                score_pixels(
+                    n, running, pixels, contrast.shares[1 if side > 0 else 0, off], np.float32(around * frames),
+                    np.float32(frames), np.float32(contrast.frames[off] * frames), low, high, score[phase],
+                )  # fmt: skip
+            none = write_own(score, low, high, side, np.float32(contrast.units_per_nat), own)
+            # `own` begins with the first stored pixel: so much before that is label 0.
+            skipped = far - (high - 1) if side > 0 else low - far
+            shift = (here[LABEL] + here[ODD]) % PHASES - PHASES * skipped - here[LABEL]
+            first, end = max(int(here[LABEL]), -shift), min(int(here[LABEL_END]), PHASES * (high - low) - shift)
+            write_costs(own[first + shift :], alone, cost[y, c, first:end])
+            own[:] = none
+            write_costs(own, alone, cost[y, c, here[LABEL] : first])
+            write_costs(own, alone, cost[y, c, end : here[LABEL_END]])
+
+
+@numba.njit(cache=True, nogil=True)
+def pixels_beside(window: int) -> Float32:
+    """One over the number of pixels of a row that are the surroundings of each, and a vector of ones."""
+    out, (begin, end) = np.ones(window + LANES, np.float32), BESIDE_PX
+    for t in range(window):
+        left = max(t - begin + 1, 0) - max(t - end, 0)
+        right = min(t + end + 1, window) - min(t + begin, window)
+        out[t] = 1.0 / max(left + right, 1)
+    return out
+
+
+@numba.njit(cache=True, nogil=True)
+def add_up(total: Float32, running: Float32) -> None:
+    """Fill the running sums of total (window,), from BESIDE_PX[1] pixels before it to as many behind it and more.
+
+    float32 is exact for sums below 2^24.
+    """
+    ones = np.float32(0.0)
+    for t in range(total.shape[0]):
+        ones += total[t]
+        running[BESIDE_PX[1] + t + 1] = ones
+    running[BESIDE_PX[1] + total.shape[0] + 1 :] = ones
+
+
+@numba.njit(cache=True, nogil=True, error_model="numpy")
+def score_pixels(
+    n: Float32, running: Float32, pixels: Float32, shares: Float32, seen: float, frames: float, pooled: float,
+    low: int, high: int, score: Float32,
+) -> None:  # fmt: skip
+    """Fill score, LANES places further on, of pixels low..high-1, and 0 up to a whole vector.
+
+    n: counts from REACH_PX before the window on. seen: frames times rows around. pooled: N of the module.
+    """
+    at, sums, one_over, to = address_of(n), address_of(running), address_of(pixels), address_of(score)
+    (begin, end), one, none = BESIDE_PX, np.float32(1.0), zero_float32()
+    per_frame, per_seen = one / frames, one / seen
+    for t in range(low, high, LANES):
+        # Sums up to pixel t are `end` places further on.
+        ones = load_float32(sums, t + end - begin + 1) - load_float32(sums, t)
+        ones = ones + load_float32(sums, t + 2 * end + 1) - load_float32(sums, t + end + begin)
+        p0 = larger_float(ones, none + LEAST_ONES) * load_float32(one_over, t) * per_seen
+        p0 = smaller_float(p0, none + MOST_SHARE)
+        p = load_float32(at, t) * shares[0]
+        for d in range(1, 2 * REACH_PX + 1):
+            p = p + load_float32(at, t + d) * shares[d]
+        p = smaller_float(larger_float(p * per_frame, p0), none + MOST_SHARE)
+        q, q0 = none + one - p, none + one - p0
+        store_float32(to, t + LANES, (p * logarithm(p / p0) + q * logarithm(q / q0)) * pooled)
+    score[high + LANES : high + 2 * LANES] = 0.0
+
+
+@numba.njit(cache=True, nogil=True, error_model="numpy")
+def write_own(score: Float32, low: int, high: int, side: int, units: float, own: Uint8) -> int:
+    """Fill own with the costs of pixels low..high-1 from far to near, two each. Returns the cost of score 0."""
+    width, at, to, best = score.shape[1], address_of(score), address_of(own), zero_float32()
+    for t in range(low + LANES, high + LANES, LANES):
+        best = larger_float(best, larger_float(load_float32(at, t), load_float32(at, width + t)))
+    store_float32(at, 0, best)
+    largest = score[0, :LANES].max()
+    most = zero_float32() + np.float32(COST_LIMIT)
+    level, per_nat = zero_float32() + largest, zero_float32() + units
+    for i in range(0, high - low, LANES):
+        t = high - i if side > 0 else low + LANES + i
+        far = to_int16(smaller_float((level - load_float32(at, t)) * per_nat, most))
+        near = to_int16(smaller_float((level - load_float32(at, width + t)) * per_nat, most))
+        if side > 0:
+            far, near = reversed_lanes(far), reversed_lanes(near)
+        store_bytes(to, PHASES * i, as_bytes(far | near << 8))
+    return int(min(largest * units, np.float32(COST_LIMIT)))
+
+
+@numba.njit(cache=True, nogil=True)
+def write_costs(own: Uint8, alone: bool, cost: Uint8) -> None:
+    """Write own, or its mean with cost, to cost (labels,), but for labels that are EXCLUDED."""
+    for label in range(cost.shape[0]):
+        before = cost[label]
+        mean = np.uint8((np.uint16(before) + np.uint16(own[label]) + np.uint16(1)) >> np.uint16(1))
+        cost[label] = before if before == EXCLUDED else own[label] if alone else mean
