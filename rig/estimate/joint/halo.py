@@ -233,8 +233,8 @@ def _ask(counts, n_frames, sweep, state, shares, x_px, places, y, c, a):  # type
 CLEAR: Final = np.float32(0.5)
 """Confidence of stripes that teach."""
 MOST_PEAK: Final = 2.0
-"""Photons per exposure in one pixel from which on a stripe's light is guessed from its flanks: a line a little wider than
-thought would be a dimmer stripe with a stronger halo."""
+"""Photons per exposure in one pixel from which on a stripe's light is known by its flanks only: a line a little wider
+than thought would be a dimmer stripe with a stronger halo."""
 FIRST_LINES: Final = LATTICE_LINES // 4
 """Rows x columns that tell whether there is a halo at all, and of later maps; once there is one in the first map, twice
 LATTICE_LINES measure it."""

@@ -2,7 +2,8 @@
 
 Each label (candidate position) of a row and column (`rig.estimate.joint.labels.grid`) gets a cost from the counts
 (`rig.estimate.joint.labels.costs`, a fast form of `rig.estimate.row.likelihood`). It includes the halo, if there is one
-(`rig.estimate.joint.labels.halo_rows`), and the previous map, if requested (`rig.estimate.joint.temporal`). Costs are
+(`rig.estimate.joint.labels.halo_rows`), and the previous map, if requested (`rig.estimate.joint.temporal`). Under a
+halo it is averaged with a cost that knows no medium (`rig.estimate.joint.labels.contrast`). Costs are
 tied to those of the neighbours along four paths (`rig.estimate.joint.paths`); weak answers are decided by a vote of all
 neighbours (`rig.estimate.joint.vote`). The best label of each row and column is placed between labels with the help of
 neighbours on its surface (`rig.estimate.joint.place.place`), judged (`rig.estimate.joint.confidence`) and searched for
@@ -41,6 +42,9 @@ from rig.threads import RowWorkers
 FIRST_ROUNDS = 3
 """Times that the first map's stripes teach the model that they are then estimated with again."""
 AGREE_PX = np.float32(1.0)
+"""Under a halo a stripe teaches only if its surroundings alone put it within so many pixels."""
+TRUSTED = np.float32(0.5)
+"""Trust from which on a stripe's brightness counts for the model under a halo."""
 QUIET_COLUMNS = 8
 """One column in so many teaches the ambient light where there are dark frames too."""
 
@@ -138,7 +142,7 @@ class Joint:
         # Amplitudes are relative to the scale of the model that they are written into.
         weigh_light(volume, tables.sweep, state_of(model), stripes.x_px, places, self._workers)
         self._workers.settle()
-        amplitude, weight = amplitudes_of(places, None if beside is None else stripes.confidence > 0.5)
+        amplitude, weight = amplitudes_of(places, None if beside is None else stripes.confidence > TRUSTED)
         return replace(model, amplitude=amplitude, weight=weight)
 
     def _beside(self, volume: CountVolume, geometry: SweepGeometry, model: RowModel) -> Float32:

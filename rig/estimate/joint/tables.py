@@ -6,8 +6,8 @@ import numpy as np
 
 from rig.errors import UsageError
 from rig.estimate.joint.confidence import Brightness, brightness_of, pairs_to_ask
-from rig.estimate.joint.labels.cost_rows import CostRoom
 from rig.estimate.joint.labels.contrast import Contrast, contrast_of
+from rig.estimate.joint.labels.cost_rows import CostRoom
 from rig.estimate.joint.labels.costs import Costs, costs_of
 from rig.estimate.joint.labels.grid import LabelGrid, label_grid
 from rig.estimate.joint.place.place import new_places, profile_table

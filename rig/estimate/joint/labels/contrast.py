@@ -91,7 +91,7 @@ def _fill(
     (columns, rows, window), labels, side = counts.shape, cost.shape[2], contrast.side
     # Whole vectors may begin at any pixel, and end behind the last one.
     total, running = np.zeros(window, np.float32), np.zeros(window + 2 * BESIDE_PX[1] + LANES, np.float32)
-    n, pixels = np.zeros(window + 2 * REACH_PX + LANES, np.float32), pixels_beside(window)
+    n, pixels = np.zeros(window + 2 * REACH_PX + LANES, np.float32), _pixels_beside(window)
     score, own = np.zeros((PHASES, window + 2 * LANES), np.float32), np.zeros(PHASES * (window + LANES), np.uint8)
     for c in range(columns):
         frames, begin = n_frames[c], max(first_row - ROWS, 0)
@@ -125,27 +125,27 @@ def _fill(
                 t = contrast.hot_x[h] - x0[c]
                 if 0 <= t < window:
                     n[t + REACH_PX] = counts[c, y, t - 1 if t > 0 else t + 1]
-            add_up(total, running)
+            _add_up(total, running)
             around = min(y + ROWS, rows - 1) - max(y - ROWS, 0) + 1
             for phase in range(PHASES):
                 off = here[VARIANT] + VARIANTS * phase
-                score_pixels(
-                    n, running, pixels, contrast.shares[1 if side > 0 else 0, off], np.float32(around * frames),
-                    np.float32(frames), np.float32(contrast.frames[off] * frames), low, high, score[phase],
+                _score_pixels(
+                    n, running, pixels, contrast.shares[1 if side > 0 else 0, off], around * frames, frames,
+                    contrast.frames[off] * frames, low, high, score[phase],
                 )  # fmt: skip
-            none = write_own(score, low, high, side, np.float32(contrast.units_per_nat), own)
+            none = _write_own(score, low, high, side, contrast.units_per_nat, own)
             # `own` begins with the first stored pixel: so much before that is label 0.
             skipped = far - (high - 1) if side > 0 else low - far
             shift = (here[LABEL] + here[ODD]) % PHASES - PHASES * skipped - here[LABEL]
             first, end = max(int(here[LABEL]), -shift), min(int(here[LABEL_END]), PHASES * (high - low) - shift)
-            write_costs(own[first + shift :], alone, cost[y, c, first:end])
+            _write_costs(own[first + shift :], alone, cost[y, c, first:end])
             own[:] = none
-            write_costs(own, alone, cost[y, c, here[LABEL] : first])
-            write_costs(own, alone, cost[y, c, end : here[LABEL_END]])
+            _write_costs(own, alone, cost[y, c, here[LABEL] : first])
+            _write_costs(own, alone, cost[y, c, end : here[LABEL_END]])
 
 
 @numba.njit(cache=True, nogil=True)
-def pixels_beside(window: int) -> Float32:
+def _pixels_beside(window: int) -> Float32:
     """One over the number of pixels of a row that are the surroundings of each, and a vector of ones."""
     out, (begin, end) = np.ones(window + LANES, np.float32), BESIDE_PX
     for t in range(window):
@@ -156,7 +156,7 @@ def pixels_beside(window: int) -> Float32:
 
 
 @numba.njit(cache=True, nogil=True)
-def add_up(total: Float32, running: Float32) -> None:
+def _add_up(total: Float32, running: Float32) -> None:
     """Fill the running sums of total (window,), from BESIDE_PX[1] pixels before it to as many behind it and more.
 
     float32 is exact for sums below 2^24.
@@ -169,7 +169,7 @@ def add_up(total: Float32, running: Float32) -> None:
 
 
 @numba.njit(cache=True, nogil=True, error_model="numpy")
-def score_pixels(
+def _score_pixels(
     n: Float32, running: Float32, pixels: Float32, shares: Float32, seen: float, frames: float, pooled: float,
     low: int, high: int, score: Float32,
 ) -> None:  # fmt: skip
@@ -179,7 +179,7 @@ def score_pixels(
     """
     at, sums, one_over, to = address_of(n), address_of(running), address_of(pixels), address_of(score)
     (begin, end), one, none = BESIDE_PX, np.float32(1.0), zero_float32()
-    per_frame, per_seen = one / frames, one / seen
+    per_frame, per_seen, nats = one / np.float32(frames), one / np.float32(seen), np.float32(pooled)
     for t in range(low, high, LANES):
         # Sums up to pixel t are `end` places further on.
         ones = load_float32(sums, t + end - begin + 1) - load_float32(sums, t)
@@ -191,12 +191,12 @@ def score_pixels(
             p = p + load_float32(at, t + d) * shares[d]
         p = smaller_float(larger_float(p * per_frame, p0), none + MOST_SHARE)
         q, q0 = none + one - p, none + one - p0
-        store_float32(to, t + LANES, (p * logarithm(p / p0) + q * logarithm(q / q0)) * pooled)
+        store_float32(to, t + LANES, (p * logarithm(p / p0) + q * logarithm(q / q0)) * nats)
     score[high + LANES : high + 2 * LANES] = 0.0
 
 
 @numba.njit(cache=True, nogil=True, error_model="numpy")
-def write_own(score: Float32, low: int, high: int, side: int, units: float, own: Uint8) -> int:
+def _write_own(score: Float32, low: int, high: int, side: int, units: float, own: Uint8) -> int:
     """Fill own with the costs of pixels low..high-1 from far to near, two each. Returns the cost of score 0."""
     width, at, to, best = score.shape[1], address_of(score), address_of(own), zero_float32()
     for t in range(low + LANES, high + LANES, LANES):
@@ -204,7 +204,7 @@ def write_own(score: Float32, low: int, high: int, side: int, units: float, own:
     store_float32(at, 0, best)
     largest = score[0, :LANES].max()
     most = zero_float32() + np.float32(COST_LIMIT)
-    level, per_nat = zero_float32() + largest, zero_float32() + units
+    level, per_nat = zero_float32() + largest, zero_float32() + np.float32(units)
     for i in range(0, high - low, LANES):
         t = high - i if side > 0 else low + LANES + i
         far = to_int16(smaller_float((level - load_float32(at, t)) * per_nat, most))
@@ -212,11 +212,11 @@ def write_own(score: Float32, low: int, high: int, side: int, units: float, own:
         if side > 0:
             far, near = reversed_lanes(far), reversed_lanes(near)
         store_bytes(to, PHASES * i, as_bytes(far | near << 8))
-    return int(min(largest * units, np.float32(COST_LIMIT)))
+    return int(min(largest * np.float32(units), np.float32(COST_LIMIT)))
 
 
 @numba.njit(cache=True, nogil=True)
-def write_costs(own: Uint8, alone: bool, cost: Uint8) -> None:
+def _write_costs(own: Uint8, alone: bool, cost: Uint8) -> None:
     """Write own, or its mean with cost, to cost (labels,), but for labels that are EXCLUDED."""
     for label in range(cost.shape[0]):
         before = cost[label]

@@ -71,8 +71,8 @@ HALO_QUANTILES: Final = (0.1, 0.35, 0.65, 0.9)
 """The same under a halo. It is many times brighter than its stripe, so that a stripe between two amplitudes is drawn to
 a distance where the halo of one of them fits."""
 HALO_TRUST: Final = 0.9
-"""Part of the halo's evidence that counts: it is summed over many pixels, all of which have the error of what was learned
-in common."""
+"""Part of the halo's evidence that counts: it is summed over many pixels, which have the errors of the learned halo in
+common."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)

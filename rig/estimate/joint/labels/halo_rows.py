@@ -146,7 +146,8 @@ def rounded(a):  # type: ignore[no-untyped-def]
 
 
 class HaloRoom(NamedTuple):
-    """The tables with their numbers of blocks, brightnesses and places, and working memory for a column and a batch of rows.
+    """The tables with their numbers of blocks, brightnesses and places, and working memory for a column and a batch of
+    rows.
 
     All int16 unless said. fitted: (lights, places), constants of all places for a column's exposures; mean: (blocks,),
     counts of blocks; level: (lights, places), evidence of the halo for a stripe at each place; constant: of the

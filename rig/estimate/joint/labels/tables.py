@@ -106,9 +106,9 @@ def fill_tables(
 ) -> None:  # fmt: skip
     """Fill the tables of bands first_band..last_band-1.
 
-    state: without ambient light, which is in `ambient` (rows, width), for pixels that are not `hot`. light: (LIGHTS
-    pairs,) photons at unit scale. shares: (FRACTIONS, taps) of the line in the pixels around centres -4/8 to 3/8 px off.
-    per_nat: units of weight; most: largest sum of a position's weights.
+    state: without ambient light, which is in `ambient` (rows, width), for pixels that are not `hot`. light: (LIGHTS x
+    pairs,) photons at unit scale. shares: (FRACTIONS, taps) of the line in the pixels around centres -4/8 to 3/8 px
+    off. per_nat: units of weight; most: largest sum of a position's weights.
     """
     side = 1 if sweep.near_is_left else -1
     pixels = out.edge.shape[1]

@@ -9,6 +9,7 @@ import pytest
 from rig.estimate.joint import halo
 from rig.estimate.joint.halo import bright_lines, learn_next_halo, likeliest_light, solve
 from rig.estimate.joint.joint import Joint
+from rig.estimate.joint.labels import costs as costs_module
 from rig.estimate.joint.labels import halo_rows
 from rig.estimate.joint.labels.cost_rows import EXCLUDED
 from rig.estimate.joint.labels.costs import _lights, costs_of
@@ -55,7 +56,8 @@ def flux_of(label, model, geometry, row, y, c, light):
 
 
 @pytest.mark.parametrize("apart", [1, 4])
-def test_costs_are_those_of_a_stripe_with_its_halo(apart):
+def test_costs_are_those_of_a_stripe_with_its_halo(apart, monkeypatch):
+    monkeypatch.setattr(costs_module, "HALO_TRUST", 1.0)
     swept, y = simulated("halo", 10, rows=20, columns=48), 7
     model, geometry, volume = replace(known_model(swept.geometry), halo=HALO), swept.geometry, swept.volume
     # However far apart the brightnesses are that stripes can have.
@@ -72,7 +74,7 @@ def test_costs_are_those_of_a_stripe_with_its_halo(apart):
         given = out[y, c, : costs.grid.stripes].astype(float)
         labels = np.flatnonzero(given != EXCLUDED)
         labels = labels[(labels > 4) & (labels < labels[-1] - 4)]
-        scores = np.full((len(labels), 2), -np.inf)
+        scores = np.full((len(labels), len(_lights(model))), -np.inf)
         for i, label in enumerate(labels):
             for m, light in enumerate(_lights(model).astype(float)):
                 p = (1 - FLOOR) * -np.expm1(-flux_of(label, model, geometry, row, y, c, light)) + FLOOR / 2
