@@ -122,6 +122,27 @@ def test_first_and_later_maps_tell_whether_there_is_a_halo(light, other):
     assert learn_next_halo(replace(setting, model=clear), seen, WORKERS) is clear, "without haze there is no halo"
 
 
+@pytest.mark.parametrize("exposures", [3, 10])
+def test_surroundings_hold_a_map_whose_halo_was_learned_three_times_too_strong(exposures):
+    swept, joint = simulated("halo", exposures, rows=48, columns=240), Joint(2, learns=False)
+    joint.estimate(swept.volume, swept.geometry)
+    model = replace(joint.used, halo=joint.used.halo * np.float32(3))
+    tables = tables_of(LearningSetting(model, swept.geometry, exposures, False), RowWorkers(2))
+    within, without = (
+        np.mean(swept.errors(joint._stripes(swept.volume, each).x_px) <= 1.0)
+        for each in (tables, tables._replace(contrast=None))
+    )
+    assert within > 0.92
+    assert within > without + 0.08
+
+
+def test_without_a_halo_labels_cost_what_the_model_says():
+    swept, joint, _ = first_map("halo-less")
+    setting = LearningSetting(joint.used, swept.geometry, 5, False)
+    assert tables_of(setting, WORKERS).contrast is None
+    assert tables_of(replace(setting, model=replace(joint.used, halo=HALO)), WORKERS).contrast is not None
+
+
 def test_pixels_are_not_quiet_in_the_halo_of_a_stripe_whose_light_is_not_known():
     swept = simulated("halo", 10, rows=20, columns=48)
     g, volume = swept.geometry, swept.volume

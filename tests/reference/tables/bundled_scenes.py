@@ -1,0 +1,66 @@
+"""Bundled scenes as a user scans them: errors, what the sure answers are worth, and the verdict.
+
+    python -m tests.reference.tables.bundled_scenes --scenes street-dense-fog --estimators joint --seeds 3
+
+Each line is one `rig scan --scene SCENE --estimator E --exposures K --seed S` with one map. Errors are of the stripe's
+place, in px, over all stripes that the camera sees; `sure` answers have a confidence of 0.9 and more, and one where
+there is no stripe is wrong; `empty believed`: share of the places without a stripe that have a confidence above 0.5.
+"""
+
+from __future__ import annotations
+
+import sys
+from collections.abc import Sequence
+
+import numpy as np
+
+from rig.api.scan import scan
+from tests.reference.tables.printed import Table, parser_of
+
+SCENES = "street,street-light-fog,street-dense-fog,street-smoke,street-rain,street-snow,street-everything"
+FIRST_SEED = 11
+SURE, BELIEVED = 0.9, 0.5
+TITLES = (
+    "scene", "estimator", "K", "seed", "verdict", "mean px", "within 1 px", "sure", "of them right", "claimed",
+    "empty believed", "depth error, m", "extinction, 1/m",
+)  # fmt: skip
+
+
+def cells_of(scene: str, estimator: str, exposures: int, seed: int) -> list[object]:
+    """The cells of one scan."""
+    result = scan("simulated", scene=scene, estimator=estimator, exposures=exposures, seed=seed)
+    assert result.last is not None, "one map was asked for"
+    assert result.truth is not None, "a simulated world knows it"
+    stripe, truth, learned = result.last.stripe, result.truth.x_px, result.last.learned
+    error, lit = np.abs(stripe.x_px - truth), np.isfinite(truth)
+    sure, given = stripe.confidence >= SURE, np.isfinite(error)
+    depth = np.abs(result.last.depth_m - result.truth.depth_m)
+    extinction = getattr(learned, "extinction_per_m", np.nan)
+    return [
+        scene, estimator, exposures, seed, result.summary.verdict.value, f"{error[given].mean():.2f}",
+        f"{(error[lit] <= 1.0).mean():.3f}", f"{sure.mean():.3f}", f"{(error[sure] <= 1.0).mean():.4f}",
+        f"{stripe.confidence[sure].mean():.4f}", f"{(stripe.confidence[~lit] > BELIEVED).mean():.3f}",
+        f"{depth[np.isfinite(depth)].mean():.3f}", f"{extinction:.3f}",
+    ]  # fmt: skip
+
+
+def main(arguments: Sequence[str] | None = None) -> int:
+    """Print a line for every scan as it comes; write the table where wanted."""
+    parser = parser_of("tests.reference.tables.bundled_scenes", __doc__)
+    parser.set_defaults(scenes=SCENES)
+    parser.add_argument("--estimators", default="joint,likelihood")
+    parser.add_argument("--exposures", default="1,3,10,20,50")
+    parser.add_argument("--seeds", type=int, default=10, help=f"scans of each kind, from seed {FIRST_SEED} on")
+    options = parser.parse_args(arguments)
+    table = Table(TITLES)
+    for scene in options.scenes.split(","):
+        for exposures in map(int, options.exposures.split(",")):
+            for seed in range(FIRST_SEED, FIRST_SEED + options.seeds):
+                for estimator in options.estimators.split(","):
+                    table.add(cells_of(scene, estimator, exposures, seed))
+    table.write(options.markdown)
+    return 0
+
+
+if __name__ == "__main__":
+    sys.exit(main())
