@@ -68,8 +68,8 @@ LOOKED_AT: Final = 32
 QUANTILES: Final = (0.25, 0.75)
 """Shares of the learned amplitudes below those that the costs try."""
 HALO_QUANTILES: Final = (0.1, 0.35, 0.65, 0.9)
-"""The same under a halo. It is many times brighter than its stripe, so that a stripe between two amplitudes is drawn to
-a distance where the halo of one of them fits."""
+"""Shares of the amplitudes that are tried under a halo. It is many times brighter than its stripe, so that a stripe
+between two amplitudes would be drawn to a distance where the halo of one of them fits."""
 HALO_TRUST: Final = 0.9
 """Part of the halo's evidence that counts: it is summed over many pixels, which have the errors of the learned halo in
 common."""
