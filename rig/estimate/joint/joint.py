@@ -39,7 +39,7 @@ from rig.simd import Float32, Float64
 from rig.simd.memory import pointers
 from rig.threads import RowWorkers
 
-FIRST_ROUNDS = 3
+FIRST_ROUNDS = 2
 """Times that the first map's stripes teach the model that they are then estimated with again."""
 AGREE_PX = np.float32(1.0)
 """Under a halo a stripe teaches only if its surroundings alone put it within so many pixels."""

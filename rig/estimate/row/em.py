@@ -25,18 +25,20 @@ from rig.geometry.windows import SweepGeometry, evenly_spread
 from rig.simd import Float32, Float64, Int32
 from rig.threads import RowWorkers
 
-LATTICE_LINES = 8192
-"""Rows x columns of a sweep that a learning round reads: about 10^6 pixels."""
+LATTICE_LINES = 4096
+"""Rows x columns of a sweep that a learning round reads: about 500 000 pixels."""
+FEW_LINES = 2048
+"""Lines read by the earlier rounds of a first sweep."""
+START_LINES = 512
+"""Lines that tell which start is the likeliest, and which width of the line is."""
 NEXT_LINES = 2048
 """Lines read of a sweep that carries a model on; what the sweeps before it taught fades by FADE with each."""
 FADE = 0.7
-WIDTH_STEP = 4
-"""Every 4th of those lines is asked for the line's width."""
 WIDTH_EVIDENCE = 3.0
 """Natural logarithm of the odds from which the width moves."""
 FIRST_ROUNDS = 8
-LAST_ROUNDS = 3
-"""Rounds of a first sweep: with a quarter of the lines and the line's width, then with all lines."""
+LAST_ROUNDS = 2
+"""Rounds of a first sweep: with FEW_LINES and the line's width, then with LATTICE_LINES."""
 MOST_TRUST = np.float32(0.98)
 """Largest trust in what neighbours say of a stripe, however sure they are: its own row may know better."""
 LEVELS = 14
@@ -115,6 +117,11 @@ def _some(lines: Lines, part: slice) -> Lines:
     return Lines(*some)
 
 
+def _every(lines: Lines, wanted: int) -> Lines:
+    """About `wanted` of the lines, evenly spread."""
+    return _some(lines, slice(None, None, max(len(lines.row) // wanted, 1)))
+
+
 def _expect_piece(sweep: Sweep, state: RowState, lines: Lines, geometry: SweepGeometry, hot_flux: float) -> Expectation:
     levels = np.zeros((BINS, LEVELS))
     rows_seen, columns_seen = np.zeros((geometry.rows, 2)), np.zeros((geometry.columns, 2))
@@ -126,18 +133,19 @@ def _expect_piece(sweep: Sweep, state: RowState, lines: Lines, geometry: SweepGe
 def learn_first(volume: CountVolume, geometry: SweepGeometry, ambient: Float32, workers: RowWorkers) -> RowModel:
     """Row model of a sweep about which nothing is known: several starts are tried, and the likeliest one is refined."""
     lines = lines_of(volume, lattice(geometry, LATTICE_LINES))
-    few = lines_of(volume, lattice(geometry, LATTICE_LINES // 4))
+    few = lines_of(volume, lattice(geometry, FEW_LINES))
+    fewest = _every(few, START_LINES)
     guessed = volume.dark_counts is None
     starts = []
     for extinction in START_EXTINCTIONS_PER_M:
         model = _start(volume, geometry, ambient, extinction)
         for _ in range(2):
-            model = maximise(model, expect(few, geometry, model, workers), spread=True, free_ambient=guessed)
-        starts.append((expect(few, geometry, model, workers).evidence, model))
+            model = maximise(model, expect(fewest, geometry, model, workers), spread=True, free_ambient=guessed)
+        starts.append((expect(fewest, geometry, model, workers).evidence, model))
     model = max(starts, key=itemgetter(0))[1]
     for _ in range(FIRST_ROUNDS):
         model = maximise(model, expect(few, geometry, model, workers), spread=True, free_ambient=guessed)
-        model = fit_line_width(few, geometry, model, workers)
+        model = fit_line_width(fewest, geometry, model, workers)
     for _ in range(LAST_ROUNDS):
         model = maximise(model, expect(lines, geometry, model, workers), spread=False, free_ambient=guessed)
     return model
@@ -164,7 +172,7 @@ def learn_next(
     model = maximise(model, seen, spread=False, gains=False)
     if lines.trust.any():
         return model, seen
-    return fit_line_width(_some(lines, slice(None, None, WIDTH_STEP)), geometry, model, workers), seen
+    return fit_line_width(_every(lines, START_LINES), geometry, model, workers), seen
 
 
 def learn_again(

@@ -220,25 +220,31 @@ def others_at(sweep, state, y, c, x):  # type: ignore[no-untyped-def]
 
 
 @numba.njit(inline="always")
-def fluxes_at(sweep, state, y, x, c, path_p, strength):  # type: ignore[no-untyped-def]
-    """Flux before and behind column c's stripe, its scale, geometry factor, inverse depth and bin for one pixel, and
-    the contribution of other lines' haze to both fluxes.
+def fluxes_of(plane, ux, vx, ambient, profile, w_lo, per_w, path_p, strength):  # type: ignore[no-untyped-def]
+    """Flux before and behind the stripe, its scale, geometry factor, inverse depth and bin for one pixel, whose ray is
+    (ux, vx), without other lines.
     """
-    plane, profile = sweep.plane[c], state.profile
-    path_c, w, b = profile_place(
-        plane[0], plane[1], plane[2], sweep.u[y, x], sweep.v[y, x], path_p, state.w_lo, state.per_w, profile.shape[0]
-    )
+    path_c, w, b = profile_place(plane[0], plane[1], plane[2], ux, vx, path_p, w_lo, per_w, profile.shape[0])
     i = int(b)
     f = np.float32(b - i)
     gain = strength * path_c
-    ambient = state.ambient[y, x]
     before = flux_between(ambient, gain, profile[i, 0], profile[i + 1, 0], f)
     behind = flux_between(ambient, gain, profile[i, 1], profile[i + 1, 1], f)
+    return before, behind, profile[i, 2] + f * (profile[i + 1, 2] - profile[i, 2]), gain, w, int(b + 0.5)
+
+
+@numba.njit(inline="always")
+def fluxes_at(sweep, state, y, x, c, path_p, strength):  # type: ignore[no-untyped-def]
+    """`fluxes_of` of one pixel for column c's stripe, with the contribution of other lines' haze to both fluxes."""
+    before, behind, scale, gain, w, cell = fluxes_of(
+        sweep.plane[c], sweep.u[y, x], sweep.v[y, x], state.ambient[y, x], state.profile, state.w_lo, state.per_w,
+        path_p, strength,
+    )  # fmt: skip
     others = np.float32(0.0)
     if sweep.others.shape[1] > 0:
         others = others_at(sweep, state, y, c, x)
         before, behind = min(before + others, FLUX_MAX), min(behind + others, FLUX_MAX)
-    return before, behind, profile[i, 2] + f * (profile[i + 1, 2] - profile[i, 2]), gain, w, int(b + 0.5), others
+    return before, behind, scale, gain, w, cell, others
 
 
 @numba.njit(cache=True, nogil=True)
@@ -263,17 +269,23 @@ def row_fluxes(sweep: Sweep, state: RowState, row: RowBuffers, y: int, c: int) -
     if begin > end:
         return 0, 0, -1, 0
     path_p, strength = line_light(sweep, state, y, c, (first + last) // 2)
+    # Local names: each use of a tuple in the loop would count references to all of its arrays.
+    v, ambient, w_lo, per_w = sweep.v, state.ambient, state.w_lo, state.per_w
+    plane = sweep.plane[c, 0], sweep.plane[c, 1], sweep.plane[c, 2]
+    to_before, to_behind, to_scale, to_cell, to_gain = row.before, row.behind, row.scale, row.cell, row.gain
+    to_others, to_w, to_prior = row.others, row.w, row.log_prior
     for t in range(length):
         x = start + step * t
-        before, behind, scale, gain, w, cell, others = fluxes_at(sweep, state, y, x, c, path_p, strength)
-        row.before[t] = before
-        row.behind[t] = behind
-        row.scale[t] = scale
-        row.cell[t] = cell
-        row.gain[t] = gain
-        row.others[t] = others
-        row.w[t] = w
-        row.log_prior[t] = profile[cell, 3]
+        before, behind, scale, gain, w, cell = fluxes_of(
+            plane, u[y, x], v[y, x], ambient[y, x], profile, w_lo, per_w, path_p, strength
+        )
+        to_before[t], to_behind[t], to_scale[t], to_cell[t], to_gain[t] = before, behind, scale, cell, gain
+        to_others[t], to_w[t], to_prior[t] = 0.0, w, profile[cell, 3]
+    if sweep.others.shape[1] > 0:
+        for t in range(length):
+            others = others_at(sweep, state, y, c, start + step * t)
+            to_others[t] = others
+            to_before[t], to_behind[t] = min(to_before[t] + others, FLUX_MAX), min(to_behind[t] + others, FLUX_MAX)
     return length, begin, end, start
 
 
