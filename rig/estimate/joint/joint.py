@@ -41,6 +41,8 @@ from rig.threads import RowWorkers
 
 FIRST_ROUNDS = 2
 """Times that the first map's stripes teach the model that they are then estimated with again."""
+HALO_ROUNDS = 3
+"""The same where a halo was found."""
 AGREE_PX = np.float32(1.0)
 """Under a halo a stripe teaches only if its surroundings alone put it within so many pixels."""
 TRUSTED = np.float32(0.5)
@@ -113,7 +115,7 @@ class Joint:
         self._prior.recall(None)  # of maps that taught nothing
         model = start = first_model(volume, geometry, self._workers)
         beside, rounds = None, 0
-        while rounds < FIRST_ROUNDS:
+        while rounds < (FIRST_ROUNDS if beside is None else HALO_ROUNDS):
             model, rounds = self._taught(volume, geometry, model, beside), rounds + 1
             if beside is None and model.halo.any():
                 # What is scattered many times has misled these lessons: begin again with a second teacher.

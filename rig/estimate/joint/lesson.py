@@ -25,7 +25,8 @@ from rig.count.volume import Counts
 from rig.estimate.joint.labels.grid import PER_PX
 from rig.estimate.joint.place.places import LIGHT_PX, Places, most_shown
 from rig.estimate.joint.winner import UNITS, LabelAnswers
-from rig.estimate.row.inputs import RowState, Sweep, fluxes_at, line_light
+from rig.estimate.row.inputs import RowState, Sweep, fluxes_at, fluxes_of, line_light, others_at
+from rig.estimate.row.likelihood import FLUX_MAX
 from rig.geometry.kernels import with_rays
 from rig.simd import Float32, Float64, Int32, Uint8
 
@@ -101,7 +102,9 @@ def add_quiet(
     ones. Pixels where these exceed `most_light`, photons per exposure, are left out. So are stripes that saturate their
     pixels: their halo is brighter than it seems, and the remainder would be taken for ambient light.
     """
-    width = sweep.u.shape[1]
+    width, several = sweep.u.shape[1], sweep.others.shape[1] > 0
+    # Local names: each use of a tuple in the loop would count references to all of its arrays.
+    u, v, ambient, profile, w_lo, per_w = sweep.u, sweep.v, state.ambient, state.profile, state.w_lo, state.per_w
     for y in range(first_row, last_row):
         for c in range(0, x_px.shape[1], column_step):
             if not confidence[y, c] > QUIET or sweep.x_lo[y, c] > sweep.x_hi[y, c]:
@@ -126,11 +129,14 @@ def add_quiet(
             at = min(max(x, sweep.x_lo[y, c]), sweep.x_hi[y, c])
             path_p, strength = line_light(sweep, state, y, c, at)
             _, _, _, _, _, cell, _ = fluxes_at(sweep, state, y, at, c, path_p, strength)
+            plane = sweep.plane[c, 0], sweep.plane[c, 1], sweep.plane[c, 2]
             for t in range(begin, end):
-                _, behind, _, _, _, _, _ = fluxes_at(sweep, state, y, t, c, path_p, strength)
-                ambient = state.ambient[y, t]
+                own = ambient[y, t]
+                _, behind, _, _, _, _ = fluxes_of(plane, u[y, t], v[y, t], own, profile, w_lo, per_w, path_p, strength)
+                if several:
+                    behind = min(behind + others_at(sweep, state, y, c, t), FLUX_MAX)
                 total = behind + signal[y, c] * halo[cell, min(abs(t - x), halo.shape[1] - 1)]
-                if total - ambient > most_light:
+                if total - own > most_light:
                     continue
-                quiet[0, y, t] += counts[c, y, t - x0] - n_frames[c] * (np.exp(-ambient) - np.exp(-total))
+                quiet[0, y, t] += counts[c, y, t - x0] - n_frames[c] * (np.exp(-own) - np.exp(-total))
                 quiet[1, y, t] += n_frames[c]

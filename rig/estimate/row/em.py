@@ -25,8 +25,8 @@ from rig.geometry.windows import SweepGeometry, evenly_spread
 from rig.simd import Float32, Float64, Int32
 from rig.threads import RowWorkers
 
-LATTICE_LINES = 4096
-"""Rows x columns of a sweep that a learning round reads: about 500 000 pixels."""
+LATTICE_LINES = 8192
+"""Rows x columns of a sweep that a learning round reads: about 10^6 pixels."""
 FEW_LINES = 2048
 """Lines read by the earlier rounds of a first sweep."""
 START_LINES = 512
