@@ -1,6 +1,8 @@
 # Two commands a newcomer needs: `make demo` and `make test`. Each sets itself up in .venv. `make help` lists the others.
 PYTHON ?= $(shell command -v python3.11 || command -v python3)
 BIN := .venv/bin
+# As `rig` does itself: threads of numpy's linear algebra only get into each other's way.
+export OPENBLAS_NUM_THREADS ?= 1
 
 .PHONY: demo help install test checks kernels lint types layers house unit clean
 .PHONY: accuracy accuracy-rows accuracy-joint accuracy-calibration

@@ -34,7 +34,7 @@ from rig.estimate.joint.place.light import FRACTIONS
 from rig.estimate.joint.place.places import BLIND_FLUX, REACH_PX, Places
 from rig.estimate.joint.place.pool import SAME_PX
 from rig.estimate.joint.tables import JointTables
-from rig.estimate.row.em import LATTICE_LINES, PIECES, lattice, lines_of
+from rig.estimate.row.em import AGAIN_LINES, PIECES, lattice, lines_of
 from rig.estimate.row.inputs import (
     Lines,
     RowState,
@@ -235,9 +235,9 @@ CLEAR: Final = np.float32(0.5)
 MOST_PEAK: Final = 2.0
 """Photons per exposure in one pixel from which on a stripe's light is known by its flanks only: a line a little wider
 than thought would be a dimmer stripe with a stronger halo."""
-FIRST_LINES: Final = LATTICE_LINES // 4
+FIRST_LINES: Final = AGAIN_LINES // 4
 """Rows x columns that tell whether there is a halo at all, and of later maps; once there is one in the first map, twice
-LATTICE_LINES measure it."""
+AGAIN_LINES measure it."""
 LEAST_EVIDENCE: Final = 50.0
 """Least chi squared that a halo must take off the fit: where there is none it takes off 2 to 10, in fog of optical
 depth 1 it takes off 4000 to 30000."""
@@ -283,7 +283,7 @@ def learn_first_halo(
     """
     if geometry.others is not None:
         return model
-    number = 2 * LATTICE_LINES if model.halo.any() else FIRST_LINES
+    number = 2 * AGAIN_LINES if model.halo.any() else FIRST_LINES
     seen = bright_lines(volume, geometry, tables, stripes, places, workers, number)
     return learn_halo(seen, geometry, model, ambient, workers, dark=volume.dark_counts is not None)
 

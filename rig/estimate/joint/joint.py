@@ -14,6 +14,7 @@ a second line (`rig.estimate.joint.second_returns`). The model of light and medi
 from dataclasses import replace
 
 import numpy as np
+from numpy.typing import NDArray
 
 from rig.count.volume import Counter, CountVolume, SweepCounter, SweepLayout
 from rig.estimate.joint.confidence import pairs_to_ask, stripe_table
@@ -114,18 +115,22 @@ class Joint:
         """Learn from the first sweep: row by row, then from stripes that all rows together show far better."""
         self._prior.recall(None)  # of maps that taught nothing
         model = start = first_model(volume, geometry, self._workers)
-        beside, rounds = None, 0
+        beside, rounds, intensity = None, 0, volume.intensity()
         while rounds < (FIRST_ROUNDS if beside is None else HALO_ROUNDS):
-            model, rounds = self._taught(volume, geometry, model, beside), rounds + 1
+            model, rounds = self._taught(volume, intensity, geometry, model, beside), rounds + 1
             if beside is None and model.halo.any():
                 # What is scattered many times has misled these lessons: begin again with a second teacher.
                 beside, model, rounds = self._beside(volume, geometry, model), start, 0
         return model
 
     def _taught(
-        self, volume: CountVolume, geometry: SweepGeometry, model: RowModel, beside: Float32 | None
-    ) -> RowModel:
-        """The model that stripes estimated with `model` teach. beside: x_px of `_beside`, which these must confirm."""
+        self, volume: CountVolume, intensity: NDArray[np.uint32], geometry: SweepGeometry, model: RowModel,
+        beside: Float32 | None,
+    ) -> RowModel:  # fmt: skip
+        """The model that stripes estimated with `model` teach.
+
+        intensity: of the volume. beside: x_px of `_beside`, which the stripes must confirm.
+        """
         setting = LearningSetting(model, geometry, volume.exposures, volume.dark_counts is not None)
         tables = tables_of(setting, self._workers, contrast=beside is not None)
         stripes = self._teaching(volume, tables, self._stripes(volume, tables, lesson=True))
@@ -134,7 +139,7 @@ class Joint:
                 agree = np.abs(stripes.x_px - beside) <= AGREE_PX
             stripes = replace(stripes, confidence=np.where(agree, stripes.confidence, np.float32(0)))
         quiet = self._quiet(volume, geometry, tables, stripes)
-        ambient = ambient_map(volume, volume.intensity(), geometry, quiet)
+        ambient = ambient_map(volume, intensity, geometry, quiet)
         width = line_width(volume, tables.sweep, tables.state, stripes, self._workers)
         model = replace(model, line_sigma_px=width or model.line_sigma_px)
         model = learn_again(volume, geometry, model, ambient, stripes, self._workers)

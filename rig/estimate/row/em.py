@@ -25,20 +25,21 @@ from rig.geometry.windows import SweepGeometry, evenly_spread
 from rig.simd import Float32, Float64, Int32
 from rig.threads import RowWorkers
 
-LATTICE_LINES = 8192
-"""Rows x columns of a sweep that a learning round reads: about 10^6 pixels."""
-FEW_LINES = 2048
-"""Lines read by the earlier rounds of a first sweep."""
 START_LINES = 512
-"""Lines that tell which start is the likeliest, and which width of the line is."""
+"""Lines (rows x columns) that tell which start of a first sweep is the likeliest, and how wide the light line is."""
+FIRST_LINES = 2048
+LAST_LINES = 4096
+"""Lines that the first and the last rounds over a first sweep read: 250 000 and 500 000 pixels."""
+AGAIN_LINES = 8192
+"""Lines that teach once more when neighbours have told where their stripes are."""
 NEXT_LINES = 2048
 """Lines read of a sweep that carries a model on; what the sweeps before it taught fades by FADE with each."""
 FADE = 0.7
 WIDTH_EVIDENCE = 3.0
 """Natural logarithm of the odds from which the width moves."""
 FIRST_ROUNDS = 8
-LAST_ROUNDS = 2
-"""Rounds of a first sweep: with FEW_LINES and the line's width, then with LATTICE_LINES."""
+LAST_ROUNDS = 3
+"""Rounds over a first sweep: with FIRST_LINES and the line's width, then with LAST_LINES."""
 MOST_TRUST = np.float32(0.98)
 """Largest trust in what neighbours say of a stripe, however sure they are: its own row may know better."""
 LEVELS = 14
@@ -132,22 +133,21 @@ def _expect_piece(sweep: Sweep, state: RowState, lines: Lines, geometry: SweepGe
 
 def learn_first(volume: CountVolume, geometry: SweepGeometry, ambient: Float32, workers: RowWorkers) -> RowModel:
     """Row model of a sweep about which nothing is known: several starts are tried, and the likeliest one is refined."""
-    lines = lines_of(volume, lattice(geometry, LATTICE_LINES))
-    few = lines_of(volume, lattice(geometry, FEW_LINES))
-    fewest = _every(few, START_LINES)
+    first, last = (lines_of(volume, lattice(geometry, lines)) for lines in (FIRST_LINES, LAST_LINES))
+    few = _every(first, START_LINES)
     guessed = volume.dark_counts is None
     starts = []
     for extinction in START_EXTINCTIONS_PER_M:
         model = _start(volume, geometry, ambient, extinction)
         for _ in range(2):
-            model = maximise(model, expect(fewest, geometry, model, workers), spread=True, free_ambient=guessed)
-        starts.append((expect(fewest, geometry, model, workers).evidence, model))
+            model = maximise(model, expect(few, geometry, model, workers), spread=True, free_ambient=guessed)
+        starts.append((expect(few, geometry, model, workers).evidence, model))
     model = max(starts, key=itemgetter(0))[1]
     for _ in range(FIRST_ROUNDS):
-        model = maximise(model, expect(few, geometry, model, workers), spread=True, free_ambient=guessed)
-        model = fit_line_width(fewest, geometry, model, workers)
+        model = maximise(model, expect(first, geometry, model, workers), spread=True, free_ambient=guessed)
+        model = fit_line_width(few, geometry, model, workers)
     for _ in range(LAST_ROUNDS):
-        model = maximise(model, expect(lines, geometry, model, workers), spread=False, free_ambient=guessed)
+        model = maximise(model, expect(last, geometry, model, workers), spread=False, free_ambient=guessed)
     return model
 
 
@@ -184,7 +184,7 @@ def learn_again(
     workers: RowWorkers,
 ) -> RowModel:
     """The model of a first sweep once its stripes are known better than row by row."""
-    lines = lines_of(volume, lattice(geometry, LATTICE_LINES), known)
+    lines = lines_of(volume, lattice(geometry, AGAIN_LINES), known)
     seen = expect(lines, geometry, replace(model, ambient=ambient), workers)
     return maximise(replace(model, ambient=ambient), seen, spread=True, free_ambient=volume.dark_counts is None)
 
