@@ -78,7 +78,7 @@ class Applications:
     """The process that forks those that scan."""
 
     def __init__(self) -> None:
-        environment = {**os.environ, "LD_PRELOAD": PRELOAD}
+        environment = {**os.environ, "LD_PRELOAD": PRELOAD, "OPENBLAS_NUM_THREADS": "1"}
         self._process = subprocess.Popen(
             [sys.executable, "-m", "tests.wire.scanning_application"],
             stdin=subprocess.PIPE,
