@@ -20,7 +20,7 @@ help:  ## this list
 # The kernels are compiled once, while one core checks types: four workers that start cold would each compile them.
 test: .venv/.installed-tests  ## lint, types, import layers, the tree's figures and all tests
 	$(MAKE) --jobs=2 --output-sync=target checks kernels
-	$(MAKE) unit
+	$(PYTEST) --durations=25
 
 checks: lint types layers house
 kernels: .venv/.installed-tests
@@ -37,8 +37,9 @@ house: .venv/.installed-tests
 	$(BIN)/python -m tests.reference.house --limits
 # Files of tests go to the workers whole: what they prepare once is prepared once.
 WORKERS ?= 4
-unit: .venv/.installed-tests
-	$(BIN)/pytest -n $(WORKERS) --dist loadfile --durations=25
+PYTEST = $(BIN)/pytest -n $(WORKERS) --dist loadfile
+unit: .venv/.installed-tests  ## the quick tests of single modules, for while you develop (90 s)
+	$(PYTEST) -m "not slow" tests/unit
 
 # Over the scenes of ../shared/scenes or, where there are none, the built-in one.
 accuracy: accuracy-rows accuracy-joint accuracy-calibration  ## the three below: tables of docs/results/ (hours)

@@ -22,6 +22,8 @@ from tests.reference.boards.board_pictures import CHARUCO, CHESSBOARD, SIZE, WAL
 from tests.reference.boards.chessboards import FOLDER
 from tests.stability.inventory import covers
 
+pytestmark = pytest.mark.slow
+
 covers(board, detect, markers, chessboard, registration, views)
 
 TURNED = pose(CHARUCO, 0.9, (0.03, -0.02), (0.35, -0.3, 0.1))

@@ -22,6 +22,8 @@ from calibration.views import Passages, View
 from tests.reference.boards import calibration_data as data
 from tests.stability.inventory import covers
 
+pytestmark = pytest.mark.slow
+
 covers(parameters, rules, transfer, lag_fit, gate_fit)
 
 SIZE = (512, 512)

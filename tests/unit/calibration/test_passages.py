@@ -24,6 +24,8 @@ from calibration.passages.fit import LineShape, fit_passages, light
 from calibration.views import Corners
 from tests.stability.inventory import covers
 
+pytestmark = pytest.mark.slow
+
 covers(fit, finding)
 
 ROWS = 30

@@ -18,6 +18,8 @@ from calibration.views import BoardPose
 from tests.reference.boards import calibration_data as data
 from tests.stability.inventory import covers
 
+pytestmark = pytest.mark.slow
+
 covers(rig_state, rows, solve, noise, misfit, fit)
 
 

@@ -21,6 +21,8 @@ from calibration.rig_fit.solve import RigProblem
 from calibration.views import BoardPose, Passages, View
 from tests.reference.boards import calibration_data as data
 
+pytestmark = pytest.mark.slow
+
 
 def seen_by(rng: np.random.Generator, *rigs: data.TrueRig, seen: data.Seen = data.SEEN) -> list[View]:
     """A view by each of several rigs, which have the same camera."""

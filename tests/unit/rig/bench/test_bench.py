@@ -34,6 +34,8 @@ from rig.errors import UsageError
 from rig.threads import RowWorkers
 from tests.unit.rig.count.streams import SPAD, plan_of, scan, stream_of
 
+pytestmark = pytest.mark.slow
+
 SMALL = Extent(
     windows=(128,), exposures=(1, 10), rounds=1, moment_s=1e-3, count_moment_s=1e-3, latency_s=0.02,
     frames_bytes=2**22, read_bytes=2**20, map_rows=64, map_columns=128,

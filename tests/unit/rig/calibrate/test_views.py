@@ -26,6 +26,8 @@ from rig.errors import PlanError, UsageError
 from rig.requests import PlanesRequest
 from tests.reference.boards.calibration_data import BOARD, SIZE, Seen, TrueRig, random_views, true_camera
 
+pytestmark = pytest.mark.slow
+
 
 def shown(
     monkeypatch: pytest.MonkeyPatch,

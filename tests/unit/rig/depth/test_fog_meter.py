@@ -14,6 +14,8 @@ from tests.reference.tables.fog_coverage import veil
 from tests.reference.working_point import Light, WorkingPoint
 from tests.unit.small_maps import RIGS, Sweep, geometry_of, street, volume_of
 
+pytestmark = pytest.mark.slow
+
 ROWS, COLUMNS = 24, 64
 PATH_M = 1.0 / np.linspace(0.08, 1.1, BINS)
 

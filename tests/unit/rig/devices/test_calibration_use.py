@@ -19,6 +19,8 @@ from rig.devices.open import open_rig
 from rig.errors import UsageError
 from tests.system.small_rig import config, write_rig
 
+pytestmark = pytest.mark.slow
+
 Change = Callable[[Identity], Identity]
 
 

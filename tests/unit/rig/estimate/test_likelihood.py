@@ -7,6 +7,8 @@ from rig.estimate.likelihood import Likelihood
 from rig.estimate.search import online_learning as lessons
 from tests.unit.small_maps import assert_same, simulated, volume_of
 
+pytestmark = pytest.mark.slow
+
 
 @cache
 def estimated(light="report", exposures=10, rig="left"):

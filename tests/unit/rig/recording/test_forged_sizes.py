@@ -31,6 +31,8 @@ from tests.unit.rig.count.streams import plan_of, rig_model, scan
 from tests.unit.rig.recording.forging import forge_index
 from tests.unit.rig.recording.recorded import record, run_blocks
 
+pytestmark = pytest.mark.slow
+
 MOST_BYTES = 100_000_000
 """Of what is done with a recording of a megabyte; what forged numbers ask for is gigabytes."""
 

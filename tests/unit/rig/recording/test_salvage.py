@@ -26,6 +26,8 @@ from tests.unit.rig.recording.forging import (
 )
 from tests.unit.rig.recording.recorded import Runs, flip, read, record, run_blocks
 
+pytestmark = pytest.mark.slow
+
 MIDDLE = 9
 """Number of a block amid those of a start."""
 Files = dict[str, bytes]
@@ -113,17 +115,17 @@ def forgeries(part: str, name: str, header: dict[str, int]) -> Iterator[Callable
     """Changes of a block, each of which gives a field of one of its parts a false value."""
     if part == "header":
         most, old = most_of(HEADER, HEADER_FIELDS, name), header[name]
-        values = {0, 1, old - 1, old + 1, old + 17, old * 2, most // 2 + 1, most}
+        values = {0, 1, old + 1, old + 17, most // 2 + 1, most}
         if name == "payload_type":
             values |= {PACKED, SPARSE, SUMMED, REGISTER_ACK, IDLE, 5}
         yield from (partial(forge_header, **{name: value}) for value in values if 0 <= value <= most and value != old)
     elif part == "trailer":
         most, end = most_of(TRAILER, TRAILER_FIELDS, name), header["header_len"] + header["payload_len"]
-        for value in (0, 1, 700, most // 2, most):
+        for value in (0, 700, most):
             yield lambda data, at, value=value: forge_trailer(data, at + end, **{name: value})
     else:
-        for frames in (slice(0, 1), slice(-1, None), slice(None)):
-            for value in (0, 1, np.iinfo(np.uint32 if name in ("marks", "ticks") else np.uint16).max):
+        for frames in (slice(0, 1), slice(None)):
+            for value in (0, np.iinfo(np.uint32 if name in ("marks", "ticks") else np.uint16).max):
                 yield partial(forge_payload, name=name, frames=frames, value=value)
 
 
@@ -157,7 +159,7 @@ def test_a_forged_header_in_the_middle_costs_its_block_alone_without_an_index_to
 )
 def test_a_forged_record_of_the_index_costs_nothing(tmp_path: Path, pristine: Files, runs: Runs, name: str) -> None:
     for number in (0, 4, -1):
-        for value in (0, 2, 3, 17, 4096, 65_536, 2**31):
+        for value in (0, 3, 65_536, 2**31):
             folder = copied(pristine, tmp_path / f"{number}-{value}")
             forge_index(folder, number, name, value)
             reader = content([block for run in read(RunRecording(folder)) for block in run])

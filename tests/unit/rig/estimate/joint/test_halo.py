@@ -32,6 +32,8 @@ from tests.unit.rig.estimate.joint.test_label_volume import known_model
 from tests.unit.rig.estimate.joint.test_place import COLUMNS, ROWS, wall
 from tests.unit.small_maps import simulated
 
+pytestmark = pytest.mark.slow
+
 covers(halo, halo_rows, inputs)
 
 WORKERS = RowWorkers(1)

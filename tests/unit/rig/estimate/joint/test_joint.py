@@ -18,6 +18,8 @@ from tests.reference.working_point import POINTS, WorkingPoint
 from tests.stability.inventory import covers
 from tests.unit.small_maps import assert_same, geometry_of, simulated, street, volume_of
 
+pytestmark = pytest.mark.slow
+
 covers(confidence, lesson)
 
 

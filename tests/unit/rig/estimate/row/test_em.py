@@ -13,6 +13,8 @@ from tests.reference.geometry import Geometry
 from tests.stability.inventory import covers
 from tests.unit.small_maps import RIGS, geometry_of, simulated, volume_of
 
+pytestmark = pytest.mark.slow
+
 covers(em, RowModel)
 
 WORKERS = RowWorkers(1)

@@ -24,6 +24,8 @@ from tests.reference.geometry import Geometry
 from tests.stability.inventory import covers
 from tests.unit.small_maps import geometry_of, learned_from, simulated, volume_of
 
+pytestmark = pytest.mark.slow
+
 covers(scores_module, rows, tables, judging, stream)
 
 WORKERS = RowWorkers(1)

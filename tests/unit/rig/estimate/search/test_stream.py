@@ -17,6 +17,8 @@ from rig.threads import RowWorkers
 from tests.stability.inventory import covers
 from tests.unit.small_maps import Sweep, assert_same, learned_from, simulated
 
+pytestmark = pytest.mark.slow
+
 covers(likelihood)
 
 ROWS, COLUMNS = 72, 24
