@@ -1,6 +1,5 @@
 """The doctor on a small rig with emulated devices, and what a user sees of devices without one."""
 
-import copy
 import json
 from collections.abc import Callable
 from functools import partial
@@ -21,28 +20,9 @@ from sim_backend.wire.emulated_world import EmulatedWorld
 from sim_backend.wire.firmware.helios import GREEN
 from sim_backend.wire.firmware.spb_usb_run import SpbUsbBoard
 from tests.system.conftest import Rig
-from tests.system.small_rig import config, write_rig
+from tests.system.small_rig import emulated, write_rig
 
 Examine = Callable[..., dict[str, Finding]]
-
-EMULATED: dict[str, Any] = {
-    **config(),
-    "world": {"kind": "emulated", "geometry": "./rig.yaml", "scene": "street-clear", "laser": "obis"},
-    "spad": {"kind": "spb-usb", "port": "emulated:spad", "reads": "plain"},
-    "scanner": {
-        "kind": "helios",
-        "port": "emulated:scanner",
-        "max_velocity": "4000 /s",
-        "max_acceleration": "4e6 /s2",
-        "rms_duty": 1.0,
-        "frame": "500 ms",
-        "max_point_rate": "10 kHz",
-    },
-    "laser": {"kind": "obis", "port": "emulated:laser", "max_power": "50 mW"},
-    "sync": {"kind": "prawndo", "port": "emulated:gate"},
-}
-EMULATED["scan"] = {**EMULATED["scan"], "columns": 40, "exposures": 10, "frame_rate": "12.5 kHz"}
-
 
 @pytest.fixture
 def examine(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Examine:
@@ -56,7 +36,8 @@ def examine(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Examine:
             alter(world)
 
         monkeypatch.setattr(EmulatedWorld, "__init__", altered)
-        content = copy.deepcopy(EMULATED)
+        content = emulated()
+        content["scan"] |= {"columns": 40, "exposures": 10, "frame_rate": "12.5 kHz"}
         for section, changes in sections.items():
             content[section] |= changes
         return {one.name: one for one in api.doctor(write_rig(tmp_path / "rig", content), out=tmp_path)}
