@@ -40,8 +40,6 @@ RIGS: dict[str, dict[str, Any]] = {
     "narrow": {},  # a third of the others' sweep, as finely
 }
 EXPOSURES = (1, 3, 10, 20)
-
-
 FAULTS: dict[str, faults.Change] = {
     "bits of bytes reversed": faults.least_significant_first,
     "exposures before columns": faults.exposures_first,
@@ -62,10 +60,7 @@ def _scene(rng: np.random.Generator) -> Scene:
     pick = int(rng.integers(2 * len(fixed)))
     whole = fixed[pick] if pick < len(fixed) else random_scene(int(rng.integers(400, 500)))
     first = int(rng.integers(0, whole.shape[0] - ROWS))
-    part = slice(first, first + ROWS)
-    pane = None if whole.pane is None else replace(whole.pane, depth_m=whole.pane.depth_m[part])
-    depth, albedo, trusted = (np.ascontiguousarray(a[part]) for a in (whole.depth_m, whole.albedo, whole.trusted))
-    return Scene(whole.name, depth, albedo, trusted, pane)
+    return whole.part(slice(first, first + ROWS))
 
 
 def _one(seed: int, estimator: str, exposures: int, stream: bool) -> tuple[str, dict[str, tuple[str, ...]], float]:

@@ -24,6 +24,7 @@ from tests.system.small_rig import emulated, write_rig
 
 Examine = Callable[..., dict[str, Finding]]
 
+
 @pytest.fixture
 def examine(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Examine:
     """The findings about a rig by name; `alter` changes the world's devices before they are opened."""

@@ -226,7 +226,8 @@ def _config(laser: str, ports: dict[str, str], silence: str) -> dict[str, Any]:
     content["calibration"] = "calibration.yaml"
     # The emulated bus draws frames while a transfer is queued: 64 of them would take half a second.
     content["spad"]["silence"] = silence
-    content["scanner"] |= {"max_point_rate": "8 kHz", "frame": "250 ms"}  # a machine that has much else to do may be late
+    # A machine that has much else to do may be late.
+    content["scanner"] |= {"max_point_rate": "8 kHz", "frame": "250 ms"}
     content["laser"]["kind"] = laser
     content["scan"] |= {"columns": COLUMNS, "exposures": EXPOSURES, "frame_rate": "12.5 kHz", "power": "20 mW"}
     content["estimate"]["threads"] = 1
