@@ -2,6 +2,8 @@
 
 import json
 import shutil
+from collections.abc import Iterator
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -19,6 +21,14 @@ from sim_backend.wire.firmware.obis import ObisModel
 from tests.system.small_rig import emulated, write_rig
 
 EMULATED = emulated()
+
+
+@pytest.fixture(scope="module", autouse=True)
+def _quick_laser() -> Iterator[None]:
+    """Its light follows at once, not after five seconds."""
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr("sim_backend.wire.emulated_world.ObisModel", partial(ObisModel, cdrh_delay_s=0.2))
+        yield
 
 
 def lab() -> dict[str, Any]:
@@ -74,10 +84,7 @@ def test_drivers_in_the_loop_say_what_they_said_and_the_depth_is_the_same(taken:
 @pytest.fixture(scope="module")
 def altered(taken: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
     """The recording, but for a letter of the first command that the laser got."""
-    other = tmp_path_factory.mktemp("other")
-    for file in taken.iterdir():
-        if file.is_file():
-            (other / file.name).write_bytes(file.read_bytes())
+    other = shutil.copytree(taken, tmp_path_factory.mktemp("other") / "run")
     lines = [json.loads(line) for line in (taken / "control.jsonl").read_text().splitlines()]
     first = next(one for one in lines if bytes.fromhex(one["bytes"]).startswith(b"SOUR:AM:STAT OFF"))
     first["bytes"] = bytes.fromhex(first["bytes"]).replace(b"OFF", b"0FF").hex()
