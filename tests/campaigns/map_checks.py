@@ -29,6 +29,7 @@ from tests.reference.geometry import Geometry
 from tests.reference.made_scenes import pane_scene, thin_scene
 from tests.reference.random_scenes import random_scene
 from tests.reference.scene import Scene, load_scene, scene_names
+from tests.reference.tables.printed import Table
 from tests.reference.working_point import POINTS, WorkingPoint
 from tests.unit.rig.count import test_map_checks as faults
 
@@ -115,9 +116,9 @@ def main(arguments: Sequence[str] | None = None) -> int:
             found[fault][exposures] += bool(reasons)
         if doubts["none"]:
             print(f"doubted: {what}, {right:.2f} of the sure answers right: {doubts['none'][0]}", flush=True)
-    print("| fault | " + " | ".join(f"K = {k}" for k in EXPOSURES) + " |\n|---|" + "---|" * len(EXPOSURES))
+    table = Table(("fault", *(f"K = {k}" for k in EXPOSURES)))
     for fault, of in maps.items():
-        print(f"| {fault} | " + " | ".join(f"{found[fault][k]} of {of[k]}" for k in EXPOSURES) + " |")
+        table.add((fault, *(f"{found[fault][k]} of {of[k]}" for k in EXPOSURES)))
     return 1 if sum(found["none"].values()) else 0
 
 
