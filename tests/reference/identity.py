@@ -15,6 +15,7 @@ import hashlib
 import json
 import os
 import re
+import shlex
 import subprocess
 import sys
 import tempfile
@@ -36,7 +37,7 @@ Hashes = dict[str, str]
 """By file, or file:member."""
 Results = dict[str, dict[str, Hashes]]
 """By case and step."""
-Words = tuple[object, ...]
+Words = Sequence[object]
 """A command, without `rig`."""
 Task = tuple[str, str, Callable[[Path], Hashes]]
 """Case, step and what hashes it, given an empty folder."""
@@ -45,23 +46,6 @@ Content = dict[str, Any]
 RIG = Path(sys.executable).with_name("rig")
 ENVIRONMENT = os.environ | {"OPENCV_FOR_THREADS_NUM": "1"}
 """OpenCV 5.0 adds up in the order in which its threads end: `cv2.calibrateCamera` differs in its last bits."""
-ESTIMATES: dict[str, Words] = {
-    "argmax": ("--estimator", "argmax", "--filter", "none"),
-    "edge": ("--estimator", "edge", "--filter", "none"),
-    "median": ("--estimator", "edge", "--filter", "median"),
-    "likelihood": ("--estimator", "likelihood", "--filter", "none"),
-    "joint": ("--estimator", "joint", "--filter", "none"),
-}
-ONLY_JOINT = ("learning-K10",)
-"""Recorded with the temporal prior, which the other estimators refuse."""
-SCENES = tuple(f"street{kind}" for kind in ("", "-clear", "-light-fog", "-dense-fog", "-smoke", "-rain", "-snow"))
-CONFIGS = ("simulated", "simulated-4-lines", "lab-emulated", "lab-spad512s-emulated", "lab", "hil")
-PLANS = {"as it is": (), "K 1": ("--exposures", "1"), "K 20": ("--exposures", "20")}
-ACCURACY = ("--at", "3 m", "--accuracy", "20 mm")
-SEED = 11
-PARTS = ("config", "rig", "scene", "board")
-"""Files of a case, as far as it has them."""
-
 MOMENTS = {
     "compute_time_s", "realtime_factor", "stages", "rest_s", "wall_s", "replay", "created", "taken", "age_s", "folder",
     "compute_s", "seconds", "id",
@@ -82,7 +66,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
     if given.verb == "make":
         make(folder)
         return 0
-    results = run([task for task in all_tasks(folder, read_cases()) if given.only in task[0]])
+    results = run([task for task in all_tasks(folder) if given.only in task[0]])
     if given.write is not None:
         given.write.write_text(json.dumps(results, indent=1, sort_keys=True) + "\n")
     if given.against is None:
@@ -94,10 +78,10 @@ def main(arguments: Sequence[str] | None = None) -> int:
 
 
 def read_cases() -> dict[str, Content]:
-    """Cases by name, each with its parts complete."""
+    """Cases by name, those of rigs complete."""
     contents = yaml.safe_load(Path(__file__).with_name("identity_cases.yaml").read_text())
     base = contents.pop("base")
-    return {name: _changed(base, content) for name, content in contents.items()}
+    return {name: _changed(base, case) if "config" in case else case for name, case in contents.items()}
 
 
 def _changed(content: Content, changes: Mapping[str, Any]) -> Content:
@@ -108,24 +92,31 @@ def _changed(content: Content, changes: Mapping[str, Any]) -> Content:
 
 def make(folder: Path) -> None:
     """Write rigs, recordings, the cube and the views of a calibration into a new folder."""
-    cases = read_cases()
-    for name, case in cases.items():
-        write_rig(case, folder / name)
+    commands = []
+    for name, case in read_cases().items():
+        if "record" in case:
+            write_rig(case, folder / name)
+            commands.append([*words_of(case["record"], folder, name, case), "--out", folder / name / "run"])
     write_cube(folder / "cube")
-    commands = [(*recording(folder, name, case), "--out", folder / name / "run") for name, case in cases.items()]
     with ThreadPoolExecutor(os.cpu_count()) as pool:
         for ended, _ in pool.map(partial(rig, folder=folder), commands):
             if ended["exit code"] not in ("0", "1"):
                 raise SystemExit(ended["exit code"])
 
 
+def words_of(line: str, folder: Path, name: str, case: Content) -> list[str]:
+    """The words of a command of `identity_cases.yaml`."""
+    folders = {"folder": shlex.quote(str(folder)), "case": shlex.quote(str(folder / name))}
+    return shlex.split(line.format(name=name, maps=case.get("maps"), **folders))
+
+
 def write_rig(case: Content, folder: Path) -> None:
     """Write the files of a case's rig. defect_share: of its pixels, which the calibration known.yaml calls defects."""
     folder.mkdir(parents=True)
-    files = {part: case[part] for part in PARTS if part in case}
+    files = {part: case[part] for part in ("config", "rig", "scene", "board") if part in case}
     if share := case.get("defect_share"):
         size = case["rig"]["camera"]["height"], case["rig"]["camera"]["width"]
-        np.save(folder / "defects.npy", np.random.default_rng(SEED).random(size) < share)
+        np.save(folder / "defects.npy", np.random.default_rng(11).random(size) < share)
         files["known"] = case["rig"] | {"defects": "defects.npy"}
     for part, content in files.items():
         (folder / f"{part}.yaml").write_text(yaml.safe_dump(content, sort_keys=False))
@@ -139,60 +130,14 @@ def write_cube(folder: Path) -> None:
     np.save(folder / "cube.npy", np.concatenate(maps))
 
 
-def recording(folder: Path, name: str, case: Content) -> Words:
-    """The command that records a case: a scan, or the calibration of a rig that looks at a board."""
-    config, board, scene = (folder / name / f"{part}.yaml" for part in ("config", "board", "scene"))
-    if "board" not in case:
-        return ("scan", config, "--record", "--maps", case.get("maps", 1), "--seed", SEED)
-    options = ("--poses", 6, "--exposures", "3,6", *ACCURACY, "--stated-baseline", "300 mm", "--seed", SEED)
-    return ("calibrate", "planes", config, "--board", board, "--scene", scene, *options)
-
-
-def all_tasks(folder: Path, cases: Mapping[str, Content]) -> Iterator[Task]:
+def all_tasks(folder: Path) -> Iterator[Task]:
     """Everything that is hashed."""
-    for name, case in cases.items():
-        recorded = folder / name / "run"
-        if "board" in case:
-            continue
-        for step, options in ESTIMATES.items():
-            if step == "joint" or name not in ONLY_JOINT:
-                yield name, step, partial(made_by, ("reconstruct", recorded, *options))
-        options = ESTIMATES["joint" if name in ONLY_JOINT else "likelihood"]
-        yield name, "replay", partial(made_by, ("replay", recorded, "--clock", "max", *options))
-        yield name, "frames", partial(made_by, ("export", recorded, "npy"))
-        if case["config"]["world"]["kind"] == "simulated":  # emulated devices run in the host's time
-            yield name, "scan", partial(scanned, recording(folder, name, case))
-    cube = folder / "cube"
-    plan = ("--plan", cube / "plan.yaml", "--calibration", cube / "calibration.yaml")
-    for step, options in ESTIMATES.items():
-        yield "cube-K5", step, partial(made_by, ("reconstruct", cube / "cube.npy", *plan, *options))
-    first = folder / next(iter(cases)) / "config.yaml"
-    for scene in SCENES:
-        of_scene = (first, "--scene", scene)
-        yield scene, "scan", partial(scanned, ("scan", *of_scene, "--exposures", 3, "--record", "--seed", SEED + 1))
-        yield scene, "flux", partial(printed, ("effects", *of_scene, "--row", 30, "--column", 90, "--json"))
-    for name in CONFIGS:
-        yield f"config {name}", "shown", partial(printed, ("config", "show", name))
-        for step, choice in PLANS.items():
-            yield f"config {name}", step, partial(printed, ("scan", name, "--dry-run", *choice, "--json"))
-    for step, words in calibrations(folder, recording(folder, "board", cases["board"])).items():
-        yield "calibrate", step, partial(made_by, ("calibrate", *words))
-
-
-def calibrations(folder: Path, planes: Words) -> dict[str, Words]:
-    """Calibrations of live rigs and of views that are kept, by step; planes: the command that kept them."""
-    board, kept = folder / "board" / "config.yaml", folder / "board" / "run"
-    print_of = ("--board", board.with_name("board.yaml"))
-    scene = ("--scene", board.with_name("scene.yaml"))
-    found = ("--calibration", kept / "calibration.yaml")
-    return {
-        "planes": planes[1:],
-        "planes of views": ("planes", kept, *print_of, *ACCURACY),
-        "camera": ("camera", kept, *print_of),
-        "sync": ("sync", board, *found, *scene, "--exposures", "2,6", "--seed", SEED, *ACCURACY),
-        "check": ("check", board, *found, *print_of, *scene, "--seed", SEED + 1, *ACCURACY),
-        "pixels": ("pixels", folder / "dirty-sensor-K20" / "config.yaml", "--light", "--seed", SEED),
-    }
+    ways = {"made": made_by, "scanned": scanned, "printed": printed}
+    for name, case in read_cases().items():
+        for step, line in (case["steps"] or {}).items():
+            if line is not None:
+                way, *words = words_of(line, folder, name, case)
+                yield name, step, partial(ways[way], words)
 
 
 def run(tasks: Sequence[Task]) -> Results:
