@@ -177,12 +177,8 @@ class WorkingPoint:
         folder.mkdir(parents=True, exist_ok=True)
         g = self.geometry
         np.save(folder / "planes.npy", g.planes)
-        camera = {
-            "width": g.width,
-            "height": g.height,
-            "matrix": g.camera_matrix(),
-            "distortion": [g.k1, 0.0, 0.0, 0.0, 0.0],
-        }
+        size = {"width": g.width, "height": g.height}
+        camera = size | {"matrix": g.camera_matrix(), "distortion": [g.k1, 0.0, 0.0, 0.0, 0.0]}
         model = {"format": "spadrig-calibration", "version": 1, "camera": camera, "planes": "planes.npy"}
         path = folder / "calibration.yaml"
         path.write_text(yaml.safe_dump(model, sort_keys=False))
@@ -193,13 +189,9 @@ class WorkingPoint:
         folder = Path(folder)
         self.write_calibration(folder)
         g = self.geometry
-        near, far = DEPTH_RANGE_M
-        plan = {
-            "columns": g.columns,
-            "exposures": exposures,
-            "frame_rate": "100 kHz",
-            "depth_range": [f"{near:g} m", f"{far:g} m"],
-        }
+        depth_range = [f"{depth_m:g} m" for depth_m in DEPTH_RANGE_M]
+        frames = {"columns": g.columns, "exposures": exposures, "frame_rate": "100 kHz"}
+        plan = frames | {"depth_range": depth_range}
         (folder / "plan.yaml").write_text(yaml.safe_dump(plan, sort_keys=False))
         path = folder / "cube.npy"
         shape = (g.columns * exposures, g.height, -(-g.width // 8))
