@@ -14,7 +14,7 @@ from calibration.files.rig_file import load_rig_model
 from rig import api
 from rig.devices.calibration_use import note_check, refusals
 from rig.errors import UsageError
-from tests.system.board_rig import write_board_rig
+from tests.system.board_rig import BRIGHT, write_board_rig
 from tests.system.conftest import Rig
 
 POSES = 6
@@ -222,18 +222,8 @@ def test_two_pictures_that_show_the_board_are_no_camera_however_many_are_named(r
     assert not Path("camera/camera.yaml").exists()
 
 
-@pytest.fixture(scope="module")
-def bright(calibrated: Path) -> Path:
-    """Config of the same rig with a stronger laser, sweeping both ways over the board: one exposure shows the line."""
-    content = yaml.safe_load((calibrated / "board-rig.yaml").read_text())
-    content["laser"]["max_power"] = content["scan"]["power"] = "1 W"
-    content["scan"] |= {"command_range": [-0.5, 0.75], "bidirectional": True}
-    config = calibrated / "bright.yaml"
-    config.write_text(yaml.safe_dump(content))
-    return config
-
-
-def test_recorded_runs_are_sources_of_every_command(calibrated: Path, bright: Path, rig: Rig) -> None:
+def test_recorded_runs_are_sources_of_every_command(calibrated: Path, rig: Rig) -> None:
+    bright, _ = write_board_rig(Path("bright"), scan=BRIGHT)
     for exposures in (3, 6):
         run = f"run-{exposures}"
         ran = rig("scan", bright, "--maps", "2", "--exposures", exposures, "--record", "--out", run)
