@@ -21,12 +21,9 @@ class NumpyFrames:
         self._exposure_s = exposure_s
         self._rng = np.random.default_rng(seed)
 
+    @np.errstate(all="ignore")  # behind the camera, where nothing is lit
     def probability(self, plane: Array, power_w: float) -> Array:
         """Detection probability of every pixel (rows, width) with the mirror at a plane (4,) = nx, ny, nz, d."""
-        with np.errstate(all="ignore"):  # behind the camera, where nothing is lit
-            return self._probability(plane, power_w)
-
-    def _probability(self, plane: Array, power_w: float) -> Array:
         s, view = self._setting, self._setting.view
         inverse, offset_m = plane[:3] / plane[3], abs(float(plane[3]))
         x = np.arange(view.width)

@@ -12,9 +12,8 @@ random number for every pixel. Figures are medians over rounds in which all rows
 import argparse
 import os
 import time
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Mapping
 from contextlib import ExitStack, closing
-from dataclasses import dataclass
 from itertools import count
 
 import numpy as np
@@ -43,6 +42,7 @@ REAL_TIME_HZ = 100_000
 """Frames a second of the sensor."""
 COLUMNS = 50
 """Columns of the sweep that are handed over at a time, a block of some milliseconds, spread over its range."""
+ROUNDS, MOMENT_S = 5, 0.25
 SEED = 1
 Case = tuple[str, str, int]
 """Row, scene and number of threads."""
@@ -50,55 +50,37 @@ Frames = Callable[[], int]
 """Draws some frames, and says how many."""
 
 
-@dataclass(frozen=True, slots=True)
-class Row:
-    """One figure. times_numpy: over the numpy way to the same, in the foggy scene, one thread."""
-
-    stage: str
-    scene: str
-    threads: int
-    frames_per_s: float
-    times_numpy: float
-
-
 def main() -> None:
     """Print the rows."""
     argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter).parse_args()
     with progress():
-        rows = measure()
+        speeds = measure()
     console = Console(highlight=False, width=BENCH_WIDTH)
     print_machine(console, machine())
     table = Table("row", "scene", "threads", "kframes/s", "us/frame", "real time", "x numpy", box=None, pad_edge=False)
-    for row in rows:
-        speed = row.frames_per_s
-        figures = f"{speed / 1e3:.4g}", f"{1e6 / speed:.4g}", f"{speed / REAL_TIME_HZ:.2g}", f"{row.times_numpy:.3g}"
-        table.add_row(row.stage, row.scene, str(row.threads), *figures)
+    for (stage, scene, threads), speed in speeds.items():
+        of_numpy = speed / speeds[f"numpy-{stage.removeprefix('numpy-')}", BASELINE, 1]
+        figures = f"{speed / 1e3:.4g}", f"{1e6 / speed:.4g}", f"{speed / REAL_TIME_HZ:.2g}", f"{of_numpy:.3g}"
+        table.add_row(stage, scene, str(threads), *figures)
     console.print(table)
 
 
-def measure(
-    scenes: Sequence[str] = SCENES, threads: Sequence[int] = (), rounds: int = 5, moment_s: float = 0.25
-) -> list[Row]:
-    """Measure the scenes, each row for a moment in each of the rounds.
-
-    threads: by default 1, 2 (claims are for two) and as many as there are cores.
-    """
+def measure() -> dict[Case, float]:
+    """Frames a second of each case, on 1 and 2 threads (claims are for two) and as many as there are cores."""
     cases: dict[Case, Frames] = {}
     with ExitStack() as stack:
-        for scene in scenes:
+        for scene in SCENES:
             config = configure("simulated", scene=scene)
             world, power_w = stack.enter_context(open_world(config))
             assert isinstance(world, SimulatedWorld)
-            for number in threads or sorted({1, 2, os.cpu_count() or 1}):
+            for number in sorted({1, 2, os.cpu_count() or 1}):
                 for stage in ("ready", "fresh"):
-                    cases[stage, scene, number] = _compiled(
-                        stack, world, config.scan, power_w, number, stage == "fresh"
-                    )
+                    fresh = stage == "fresh"
+                    cases[stage, scene, number] = _compiled(stack, world, config.scan, power_w, number, fresh)
             if scene in NUMPY_SCENES:
                 for stage in ("ready", "fresh"):
                     cases[f"numpy-{stage}", scene, 1] = _plain(world, config.scan, power_w, stage == "fresh")
-        speeds = _in_turn(cases, rounds, moment_s)
-    return [Row(*case, speed, speed / speeds[f"numpy-{case[0][-5:]}", BASELINE, 1]) for case, speed in speeds.items()]
+        return _in_turn(cases)
 
 
 def _compiled(
@@ -135,15 +117,15 @@ def _plain(world: SimulatedWorld, scan: ScanConfig, power_w: float, fresh: bool)
     return some
 
 
-def _in_turn(cases: Mapping[Case, Frames], rounds: int, moment_s: float) -> dict[Case, float]:
-    """Frames a second of each case, medians over the rounds."""
+def _in_turn(cases: Mapping[Case, Frames]) -> dict[Case, float]:
+    """Frames a second of each case, medians over rounds with a moment of each."""
     for frames in cases.values():  # compiled code is loaded before anything is timed
         frames()
-    told, speeds = counted("measuring", "rows", None), np.zeros((rounds, len(cases)))
-    for done in range(rounds):
+    told, speeds = counted("measuring", "rows", None), np.zeros((ROUNDS, len(cases)))
+    for done in range(ROUNDS):
         for i, frames in enumerate(cases.values()):
             begun, drawn = time.perf_counter(), 0
-            while time.perf_counter() - begun < moment_s or drawn == 0:
+            while time.perf_counter() - begun < MOMENT_S or drawn == 0:
                 drawn += frames()
             speeds[done, i] = drawn / (time.perf_counter() - begun)
             told(done * len(cases) + i + 1, speeds.size)

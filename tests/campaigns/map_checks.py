@@ -29,6 +29,7 @@ from tests.reference.geometry import Geometry
 from tests.reference.made_scenes import pane_scene, thin_scene
 from tests.reference.random_scenes import random_scene
 from tests.reference.scene import Scene, load_scene, scene_names
+from tests.reference.tables.printed import Table
 from tests.reference.working_point import POINTS, WorkingPoint
 from tests.unit.rig.count import test_map_checks as faults
 
@@ -40,8 +41,6 @@ RIGS: dict[str, dict[str, Any]] = {
     "narrow": {},  # a third of the others' sweep, as finely
 }
 EXPOSURES = (1, 3, 10, 20)
-
-
 FAULTS: dict[str, faults.Change] = {
     "bits of bytes reversed": faults.least_significant_first,
     "exposures before columns": faults.exposures_first,
@@ -62,10 +61,7 @@ def _scene(rng: np.random.Generator) -> Scene:
     pick = int(rng.integers(2 * len(fixed)))
     whole = fixed[pick] if pick < len(fixed) else random_scene(int(rng.integers(400, 500)))
     first = int(rng.integers(0, whole.shape[0] - ROWS))
-    part = slice(first, first + ROWS)
-    pane = None if whole.pane is None else replace(whole.pane, depth_m=whole.pane.depth_m[part])
-    depth, albedo, trusted = (np.ascontiguousarray(a[part]) for a in (whole.depth_m, whole.albedo, whole.trusted))
-    return Scene(whole.name, depth, albedo, trusted, pane)
+    return whole.part(slice(first, first + ROWS))
 
 
 def _one(seed: int, estimator: str, exposures: int, stream: bool) -> tuple[str, dict[str, tuple[str, ...]], float]:
@@ -120,9 +116,9 @@ def main(arguments: Sequence[str] | None = None) -> int:
             found[fault][exposures] += bool(reasons)
         if doubts["none"]:
             print(f"doubted: {what}, {right:.2f} of the sure answers right: {doubts['none'][0]}", flush=True)
-    print("| fault | " + " | ".join(f"K = {k}" for k in EXPOSURES) + " |\n|---|" + "---|" * len(EXPOSURES))
+    table = Table(("fault", *(f"K = {k}" for k in EXPOSURES)))
     for fault, of in maps.items():
-        print(f"| {fault} | " + " | ".join(f"{found[fault][k]} of {of[k]}" for k in EXPOSURES) + " |")
+        table.add((fault, *(f"{found[fault][k]} of {of[k]}" for k in EXPOSURES)))
     return 1 if sum(found["none"].values()) else 0
 
 

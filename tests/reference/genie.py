@@ -62,7 +62,7 @@ class Genie:
 
 
 def albedo_histogram(point: WorkingPoint, bins: int) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
-    """Mean and share of each non-empty logarithmic bin of the scene's albedo (times the cosine where it acts)."""
+    """Mean and share of each non-empty logarithmic bin of the scene's albedo."""
     values = point.strength[point.strength > 1e-4]
     edges = np.geomspace(values.min() * (1 - 1e-9), values.max() * (1 + 1e-9), bins + 1)
     total, _ = np.histogram(values, edges, weights=values)

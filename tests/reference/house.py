@@ -46,6 +46,8 @@ WORDS_FILE = Path(__file__).with_name("field_words.txt")
 Function = ast.FunctionDef | ast.AsyncFunctionDef
 Definition = Function | ast.ClassDef
 Graph = dict[str, set[str]]
+LOCALS = "<locals>"
+"""Of a function: what is defined there is nobody else's business."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -235,26 +237,18 @@ def bound_names(tree: ast.AST) -> Iterator[str]:
 
 def lone_importers(imports: Graph) -> list[str]:
     """Modules that one module alone imports, each with it."""
-    importers: dict[str, list[str]] = defaultdict(list)
-    for name, targets in imports.items():
-        for target in targets:
-            importers[target].append(name)
+    importers = grouped((target, name) for name, targets in imports.items() for target in targets)
     return sorted(f"{name} by {by[0]}" for name, by in importers.items() if len(by) == 1)
 
 
 def circles_of(graph: Graph) -> list[list[str]]:
     """Groups of two or more modules that reach each other, by name."""
 
-    def reached(start: str) -> set[str]:
-        seen: set[str] = set()
-        ahead = [*graph[start]]
-        while ahead:
-            if (name := ahead.pop()) not in seen:
-                seen.add(name)
-                ahead += graph[name]
-        return seen
-
-    reach = {name: reached(name) for name in graph}
+    reach = {name: {*graph[name]} for name in graph}
+    for between in graph:
+        for seen in reach.values():
+            if between in seen:
+                seen |= reach[between]
     groups = {tuple(sorted(other for other in reach[name] if name in reach[other])) for name in graph}
     return sorted([*group] for group in groups if len(group) > 1)
 
@@ -284,11 +278,12 @@ def parameters(node: Function) -> int:
 
 
 def definitions(tree: ast.AST, path: tuple[str, ...] = ()) -> Iterator[tuple[tuple[str, ...], Definition]]:
-    """Functions and classes at any depth, with their names from the outside in."""
+    """Functions and classes at any depth, with their names from the outside in, `<locals>` behind a function's."""
     for node in ast.iter_child_nodes(tree):
         if isinstance(node, Definition):
             yield (*path, node.name), node
-            yield from definitions(node, (*path, node.name))
+            within = (node.name, LOCALS) if isinstance(node, Function) else (node.name,)
+            yield from definitions(node, (*path, *within))
         else:
             yield from definitions(node, path)
 
@@ -341,19 +336,8 @@ def public_names(modules: Sequence[Module]) -> Iterator[tuple[str, str]]:
         if not own.startswith("_"):
             yield module.name, own
         for path, node in definitions(module.tree):
-            if is_public(path) and not node.name.startswith("__") and not _within_function(module.tree, path):
+            if is_public(path) and not node.name.startswith("__") and LOCALS not in path:
                 yield f"{module.name}.{'.'.join(path)}", node.name
-
-
-def _within_function(tree: ast.Module, path: Sequence[str]) -> bool:
-    """Whether a definition lies in a function, where its name is nobody else's business."""
-    body: list[ast.stmt] = tree.body
-    for name in path[:-1]:
-        outer = next((node for node in body if isinstance(node, Definition) and node.name == name), None)
-        if not isinstance(outer, ast.ClassDef):
-            return outer is not None
-        body = outer.body
-    return False
 
 
 def words_in(name: str) -> list[str]:
@@ -368,10 +352,15 @@ def words_of(file: Path) -> set[str]:
 
 def shared_names(named: Iterable[tuple[str, str]]) -> list[str]:
     """Names that stand for two or more things, with where."""
-    places: dict[str, list[str]] = defaultdict(list)
-    for name, place in named:
-        places[name].append(place)
-    return sorted(f"{name}: {', '.join(where)}" for name, where in places.items() if len(where) > 1)
+    return sorted(f"{name}: {', '.join(where)}" for name, where in grouped(named).items() if len(where) > 1)
+
+
+def grouped(pairs: Iterable[tuple[str, str]]) -> dict[str, list[str]]:
+    """The second of each pair by the first."""
+    groups: dict[str, list[str]] = defaultdict(list)
+    for key, value in pairs:
+        groups[key].append(value)
+    return groups
 
 
 def _names_all(node: ast.stmt) -> bool:

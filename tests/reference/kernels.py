@@ -74,8 +74,8 @@ def stream_of(seed, column, row):  # type: ignore[no-untyped-def]
 def find_stripes(u, v, depth, strength, planes, scanner, extinction, c0, c1, x_true, x_end, stripe):  # type: ignore[no-untyped-def]
     """Find where the sheet ends on each row: fills x_true, x_end, stripe (H, columns) for columns c0..c1.
 
-    `strength` (H, W): albedo, times the cosine where wanted. x_true: sub-pixel stripe, NaN where none. x_end: where
-    the haze ends (beyond the picture where it never does). stripe: strength / Z^2 * extinction, 0 where none.
+    `strength` (H, W): albedo. x_true: sub-pixel stripe, NaN where none. x_end: where the haze ends (beyond the picture
+    where it never does). stripe: strength / Z^2 * extinction, 0 where none.
     """
     height, width = depth.shape
     for c in range(c0, c1):

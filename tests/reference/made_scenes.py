@@ -1,5 +1,7 @@
 """Scenes made for one question each: are thin objects found, how good is the sub-pixel place, is a pane seen twice."""
 
+from dataclasses import replace
+
 import numpy as np
 from numpy.typing import NDArray
 
@@ -49,8 +51,7 @@ def pane_scene(height: int = 512, width: int = 512) -> Scene:
     inside = (np.abs(u) < 0.25) & (np.abs(v) < 0.3)
     pane = Pane(np.where(inside, 2.5 + 0.2 * u, np.inf).astype(np.float32), albedo=0.1, passes=0.8)
     depth = 4.5 + 0.5 * u
-    wall = _scene("pane", depth, np.full(depth.shape, WALL_ALBEDO))
-    return Scene(wall.name, wall.depth_m, wall.albedo, wall.trusted, pane)
+    return replace(_scene("pane", depth, np.full(depth.shape, WALL_ALBEDO)), pane=pane)
 
 
 def _rays(height: int, width: int) -> tuple[NDArray[np.float64], NDArray[np.float64]]:

@@ -51,10 +51,14 @@ class Scene:
         top, left = (self.shape[0] - height) // 2, (self.shape[1] - width) // 2
         if min(top, left) < 0:
             raise ValueError(f"crop {height} x {width} is larger than the scene {self.shape}")
-        part = np.s_[top : top + height, left : left + width]
-        pane = None if self.pane is None else replace(self.pane, depth_m=self.pane.depth_m[part])
-        depth_m, albedo = np.ascontiguousarray(self.depth_m[part]), np.ascontiguousarray(self.albedo[part])
-        return Scene(self.name, depth_m, albedo, np.ascontiguousarray(self.trusted[part]), pane)
+        return self.part(slice(top, top + height), slice(left, left + width))
+
+    def part(self, rows: slice, columns: slice = slice(None)) -> Scene:
+        """These pixels."""
+        at = rows, columns
+        pane = None if self.pane is None else replace(self.pane, depth_m=self.pane.depth_m[at])
+        arrays = {name: np.ascontiguousarray(getattr(self, name)[at]) for name in ("depth_m", "albedo", "trusted")}
+        return replace(self, pane=pane, **arrays)
 
 
 def scene_names() -> tuple[str, ...]:

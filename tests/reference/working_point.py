@@ -3,7 +3,7 @@
 Every figure is per exposure and in detected photons. Stripe, summed across it (Gaussian of 0.6 px integrated over the
 pixels, centred on the sub-pixel truth):
 
-    S0 albedo [cosine] / Z^2 exp(-extinction Z (|q_p| + |q_c|)),   S0: median over the scene's stripes = `stripe`
+    S0 albedo / Z^2 exp(-extinction Z (|q_p| + |q_c|)),   S0: median over the scene's stripes = `stripe`
 
 Haze where the sheet is free, in front of the object and not in a shadow:
 
@@ -11,7 +11,7 @@ Haze where the sheet is free, in front of the object and not in a shadow:
 
 |q_p|, |q_c|: distances to scanner and camera over z. Hot and uneven pixels: `dark_map`; light of more than one
 scattering: `scattering`; a surface that lets light pass: `Pane`. Counts are Binomial(K, 1 - exp(-flux)). The cosine of
-the camera's side is left out unless asked for: normals of the prepared depth maps carry their quantisation, and the
+the camera's side is left out: normals of the prepared depth maps carry their quantisation, and the
 working point fixes the median stripe, not its parts.
 """
 
@@ -48,7 +48,6 @@ class Light:
     ambient: float = 0.005
     extinction_per_m: float = 0.05
     sigma_px: float = 0.6
-    cosine: bool = False
     optical_depth: float | None = None
     multiple_scattering: bool = False
     uneven: float = 0.0
@@ -86,8 +85,6 @@ class WorkingPoint:
             raise ValueError(f"the geometry is {self.geometry.height} x {self.geometry.width}, the scene {scene.shape}")
         g = self.geometry
         self.strength = scene.albedo.astype(np.float64)
-        if light.cosine:
-            self.strength = self.strength * camera_cosine(scene.depth_m.astype(np.float64), g.u, g.v)
         if light.optical_depth is not None:
             light = replace(light, extinction_per_m=light.optical_depth / float(np.median(scene.depth_m)))
             self.light = light
@@ -180,12 +177,8 @@ class WorkingPoint:
         folder.mkdir(parents=True, exist_ok=True)
         g = self.geometry
         np.save(folder / "planes.npy", g.planes)
-        camera = {
-            "width": g.width,
-            "height": g.height,
-            "matrix": g.camera_matrix(),
-            "distortion": [g.k1, 0.0, 0.0, 0.0, 0.0],
-        }
+        size = {"width": g.width, "height": g.height}
+        camera = size | {"matrix": g.camera_matrix(), "distortion": [g.k1, 0.0, 0.0, 0.0, 0.0]}
         model = {"format": "spadrig-calibration", "version": 1, "camera": camera, "planes": "planes.npy"}
         path = folder / "calibration.yaml"
         path.write_text(yaml.safe_dump(model, sort_keys=False))
@@ -196,13 +189,9 @@ class WorkingPoint:
         folder = Path(folder)
         self.write_calibration(folder)
         g = self.geometry
-        near, far = DEPTH_RANGE_M
-        plan = {
-            "columns": g.columns,
-            "exposures": exposures,
-            "frame_rate": "100 kHz",
-            "depth_range": [f"{near:g} m", f"{far:g} m"],
-        }
+        depth_range = [f"{depth_m:g} m" for depth_m in DEPTH_RANGE_M]
+        frames = {"columns": g.columns, "exposures": exposures, "frame_rate": "100 kHz"}
+        plan = frames | {"depth_range": depth_range}
         (folder / "plan.yaml").write_text(yaml.safe_dump(plan, sort_keys=False))
         path = folder / "cube.npy"
         shape = (g.columns * exposures, g.height, -(-g.width // 8))
@@ -266,17 +255,6 @@ def mean_free_haze(geometry: Geometry, extinction_per_m: float) -> float:
     if number == 0:
         raise ValueError(f"no plane passes the picture at z = {HAZE_REFERENCE_M:g} m")
     return total / number
-
-
-def camera_cosine(depth_m: NDArray[np.float64], u: NDArray[np.float64], v: NDArray[np.float64]) -> NDArray[np.float64]:
-    """|N.q_c| (H, W) with q_c = (u, v, 1), N from central differences smoothed over 5 px; at most |q_c|."""
-    kernel = np.ones(5) / 5
-    smooth = np.apply_along_axis(np.convolve, 0, np.pad(depth_m, 2, mode="edge"), kernel, "valid")
-    smooth = np.apply_along_axis(np.convolve, 1, smooth, kernel, "valid")
-    points = np.stack([u * smooth, v * smooth, smooth], axis=-1)
-    normal = np.cross(np.gradient(points, axis=1), np.gradient(points, axis=0))
-    normal /= np.linalg.norm(normal, axis=-1, keepdims=True)
-    return np.asarray(np.abs(normal[..., 0] * u + normal[..., 1] * v + normal[..., 2]))
 
 
 def score(x_est: NDArray[np.floating], x_true: NDArray[np.floating], trusted: NDArray[np.bool_]) -> dict[str, float]:

@@ -7,6 +7,7 @@ from collections.abc import Callable
 from dataclasses import dataclass
 from itertools import count
 from pathlib import Path
+from unittest.mock import Mock
 
 import pytest
 
@@ -90,11 +91,7 @@ def at_map(index: int, act: Callable[[], object], monkeypatch: pytest.MonkeyPatc
 
 def stop_at_map(index: int, error: BaseException, monkeypatch: pytest.MonkeyPatch) -> None:
     """Let the estimation of a map raise."""
-
-    def fail() -> None:
-        raise error
-
-    at_map(index, fail, monkeypatch)
+    at_map(index, Mock(side_effect=error), monkeypatch)
 
 
 def fill_disk_at_map(index: int, monkeypatch: pytest.MonkeyPatch) -> None:

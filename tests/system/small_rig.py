@@ -54,6 +54,30 @@ def config() -> dict[str, Any]:
     }
 
 
+def emulated(**ports: str) -> dict[str, Any]:
+    """The config with real drivers on the emulated world, but for the slots that get another port.
+
+    An OBIS is quicker to ask than a Cobolt. The scanner's buffers are long: a machine that runs other tests at the same
+    time is late by tens of milliseconds.
+    """
+    port = {slot: f"emulated:{slot}" for slot in ("spad", "scanner", "laser", "gate")} | ports
+    return config() | {
+        "world": {"kind": "emulated", "geometry": "./rig.yaml", "scene": "street-clear", "laser": "obis"},
+        "spad": {"kind": "spb-usb", "port": port["spad"], "reads": "plain"},
+        "scanner": {
+            "kind": "helios",
+            "port": port["scanner"],
+            "max_velocity": "4000 /s",
+            "max_acceleration": "4e6 /s2",
+            "rms_duty": 1.0,
+            "frame": "500 ms",
+            "max_point_rate": "10 kHz",
+        },
+        "laser": {"kind": "obis", "port": port["laser"], "max_power": "50 mW"},
+        "sync": {"kind": "prawndo", "port": port["gate"]},
+    }
+
+
 def write_rig(folder: Path, content: dict[str, Any] | None = None, *, width: int = WIDTH, height: int = HEIGHT) -> Path:
     """Write calibration and config; the config's path."""
     folder.mkdir(parents=True, exist_ok=True)

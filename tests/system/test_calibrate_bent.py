@@ -16,7 +16,7 @@ from numpy.typing import NDArray
 
 from calibration.model.rig_model import RigModel
 from rig import api
-from tests.system.board_rig import FOCAL_PX, SIZE, write_board_rig
+from tests.system.board_rig import BRIGHT, FOCAL_PX, SIZE, write_board_rig
 
 BOW, ROW_DELAY_S = 0.02, 1e-7
 """Over the 256 rows of 300 px focal length: three pixels, and two and a half columns of one exposure."""
@@ -37,15 +37,11 @@ class Calibrated(NamedTuple):
 def calibrated(tmp_path_factory: pytest.TempPathFactory) -> Calibrated:
     """The rig's folder, and its calibration."""
     folder = tmp_path_factory.mktemp("bent")
-    config, board = write_board_rig(folder)
+    config, board = write_board_rig(folder, scan=BRIGHT)
     true = yaml.safe_load((folder / "rig.yaml").read_text())
     true["scanner"]["pivot"]["bow_per_rad"], true["row_delay_s"] = BOW, ROW_DELAY_S
     (folder / "true.yaml").write_text(yaml.safe_dump(true))
-    content = yaml.safe_load(config.read_text())
-    content["world"]["geometry"] = "./true.yaml"
-    content["laser"]["max_power"] = content["scan"]["power"] = "1 W"
-    content["scan"] |= {"bidirectional": True, "command_range": [-0.5, 0.75], "columns": 220}
-    config.write_text(yaml.safe_dump(content))
+    config.write_text(config.read_text().replace("geometry: ./rig.yaml", "geometry: ./true.yaml"))
     scene = str(folder / "scene.yaml")
     planes = api.calibrate_planes(
         config, board=board, scene=scene, poses=6, exposures=(1, 3), at="3 m", out=folder / "1"
@@ -92,11 +88,8 @@ def added_px(depth_m: NDArray[np.float32], true_m: NDArray[np.float32]) -> NDArr
 
 def test_planes_are_found_in_fog_and_their_error_is_known(tmp_path: Path) -> None:
     """In clear air the median is 1.5 mm at 3 m, in this fog 5, and it says so."""
-    config, board = write_board_rig(tmp_path)
-    config.write_text(config.read_text().replace("columns: 220", "columns: 300"))
-    scene = yaml.safe_load((tmp_path / "scene.yaml").read_text())
-    scene["medium"] = {"extinction": "0.1 /m"}
-    (tmp_path / "scene.yaml").write_text(yaml.safe_dump(scene))
+    fog = {"medium": {"extinction": "0.1 /m"}}
+    config, board = write_board_rig(tmp_path, scan={"columns": 300}, scene=fog)
     result = api.calibrate_planes(
         config, board=board, scene=str(tmp_path / "scene.yaml"), poses=6, exposures=(3,), at="3 m",
         accuracy="20 mm", stated_baseline="300 mm", out=tmp_path / "out",

@@ -17,6 +17,7 @@ from rig import api
 from rig.api import calibrate_pixels
 from rig.calibrate.pixels import PixelResult
 from rig.errors import UsageError
+from sim_backend.bench import Bench
 from sim_backend.devices.spad import SimulatedSpad
 from sim_backend.effects.dark_counts import dark_rates
 from sim_backend.light.optics import Sensor
@@ -27,10 +28,11 @@ MANY = {"hot_share": "2 %", "dead_share": "2 %"}
 SENSOR: dict[str, Any] = {"dark_rate": "200 cps", "dead_share": "0.5 %", "hot_share": "0.5 %", "pixel_seed": 7}
 
 
-def rig_of(folder: Path, **sensor: object) -> Path:
+def rig_of(folder: Path, calibration: str = "rig.yaml", columns: int = 200, **sensor: object) -> Path:
     """The small rig with a faulty sensor in room light."""
     content = config()
     content["world"]["sensor"] = {**SENSOR, **sensor}
+    content["calibration"], content["scan"]["columns"] = calibration, columns
     return write_rig(folder, content)
 
 
@@ -130,10 +132,7 @@ def test_the_default_map_to_compare_with_lies_beside_the_calibration_and_a_bad_d
     assert first.drift is None
     for name in ("pixels.npz", "calibration.yaml", "calibration-defects.npy", "calibration-dark-rate.npy"):
         (first.folder / name).replace(tmp_path / "rig" / name)
-    content = config()
-    content["world"]["sensor"] = {**SENSOR, "pixel_seed": 8}  # somebody put in another sensor
-    content["calibration"] = "calibration.yaml"
-    changed = write_rig(tmp_path / "rig", content)
+    changed = rig_of(tmp_path / "rig", "calibration.yaml", pixel_seed=8)  # somebody put in another sensor
     second = calibrate_pixels(changed)
     assert second.found.version == 2
     assert second.verdict.codes[0] == "other-sensor"
@@ -143,8 +142,6 @@ def test_the_default_map_to_compare_with_lies_beside_the_calibration_and_a_bad_d
 
 
 def test_no_light_is_let_out_and_nothing_moves(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    from sim_backend.bench import Bench
-
     def never(*_: object, **__: object) -> None:
         raise AssertionError("the laser was armed, the gate opened or the mirror moved")
 
@@ -179,12 +176,8 @@ def test_marking_the_defects_never_worsens_a_scan_and_helps_the_naive_estimators
     wrong = []
     for name, model in (("plain", plain), ("marked", replace(plain, defects=defects))):
         save_rig_model(model, folder / f"{name}.yaml")
-        content = config()
-        content["world"]["sensor"] = {**SENSOR, **MANY}
-        content["calibration"], content["scan"]["columns"] = f"{name}.yaml", 120
-        run = api.scan(write_rig(folder, content), estimator=estimator, seed=2)
-        within = run.summary.truth.stripe_error_px["within_1px"]
-        wrong.append(1 - within)
+        run = api.scan(rig_of(folder, f"{name}.yaml", 120, **MANY), estimator=estimator, seed=2)
+        wrong.append(1 - run.summary.truth.stripe_error_px["within_1px"])
     assert wrong[1] <= wrong[0] + 0.003
     if estimator == "argmax":
         assert wrong[1] < 0.7 * wrong[0]

@@ -2,6 +2,8 @@
 
 import json
 import shutil
+from collections.abc import Iterator
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -16,26 +18,23 @@ from rig.errors import DivergedError, UsageError
 from rig.run_folder.manifest import MANIFEST, read_manifest, sealed_text
 from rig.scan import replay as replay_run
 from sim_backend.wire.firmware.obis import ObisModel
-from tests.system.small_rig import config, write_rig
+from tests.system.small_rig import emulated, write_rig
 
-LASER = {"kind": "obis", "port": "emulated:laser", "max_power": "50 mW"}
-"""Quicker to ask than a Cobolt."""
-SCANNER = {"frame": "500 ms", "max_point_rate": "10 kHz"}
-"""Long buffers: a machine that runs other tests at the same time is late by tens of milliseconds."""
+EMULATED = emulated()
+
+
+@pytest.fixture(scope="module", autouse=True)
+def _quick_laser() -> Iterator[None]:
+    """Its light follows at once, not after five seconds."""
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr("sim_backend.wire.emulated_world.ObisModel", partial(ObisModel, cdrh_delay_s=0.2))
+        yield
 
 
 def lab() -> dict[str, Any]:
-    """The small rig with emulated devices."""
-    content = config()
-    hil = load_config("hil").model_dump(mode="json")
-    content |= {slot: hil[slot] for slot in ("sync",)}
-    content["world"] = {"kind": "emulated", "geometry": "./rig.yaml", "scene": "street-clear", "laser": "obis"}
-    content["spad"] = {"kind": "spb-usb", "port": "emulated:spad", "reads": "plain"}
-    content["scanner"] = hil["scanner"] | SCANNER
-    content["laser"] = LASER
-    content["scan"] |= {"frame_rate": "4 kHz", "columns": 100}
-    content["scan"]["command_range"] = [-0.5, 0.5]
-    return content
+    """The small rig with emulated devices and a slow scan."""
+    scan = {"frame_rate": "4 kHz", "columns": 100, "command_range": [-0.5, 0.5]}
+    return EMULATED | {"scan": EMULATED["scan"] | scan}
 
 
 @pytest.fixture(scope="module")
@@ -52,14 +51,12 @@ def patient(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(replay_run, "SWAP_TOLERANCE_S", 60.0)
 
 
-def hil(folder: Path, laser: dict[str, Any]) -> Path:
+def hil(taken: Path) -> Path:
     """The bundled config with the devices of `taken`."""
-    content = load_config("hil").model_dump(mode="json")
-    content["world"] = {"kind": "emulated", "geometry": str(folder / "rig" / "rig.yaml"), "laser": "obis"}
-    content["scanner"] |= SCANNER
-    content["laser"] = laser
-    file = folder / f"hil-{laser['max_power'].split()[0]}.yaml"
-    file.write_text(yaml.safe_dump(content))
+    world = {"kind": "emulated", "geometry": str(taken.parent / "rig" / "rig.yaml"), "laser": "obis"}
+    devices = {"world": world, "scanner": EMULATED["scanner"], "laser": EMULATED["laser"]}
+    file = taken.parent / "hil.yaml"
+    file.write_text(yaml.safe_dump(load_config("hil").model_dump(mode="json") | devices))
     return file
 
 
@@ -75,7 +72,7 @@ def test_what_passed_the_ports_of_a_scan_is_recorded_with_it(taken: Path) -> Non
 
 @pytest.mark.usefixtures("patient")
 def test_drivers_in_the_loop_say_what_they_said_and_the_depth_is_the_same(taken: Path, tmp_path: Path) -> None:
-    result = api.replay(taken, config=hil(taken.parent, LASER), out=tmp_path / "again")
+    result = api.replay(taken, config=hil(taken), out=tmp_path / "again")
     assert result.control is not None
     assert result.control.problems == ()
     assert result.control.commands > 20
@@ -87,10 +84,7 @@ def test_drivers_in_the_loop_say_what_they_said_and_the_depth_is_the_same(taken:
 @pytest.fixture(scope="module")
 def altered(taken: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
     """The recording, but for a letter of the first command that the laser got."""
-    other = tmp_path_factory.mktemp("other")
-    for file in taken.iterdir():
-        if file.is_file():
-            (other / file.name).write_bytes(file.read_bytes())
+    other = shutil.copytree(taken, tmp_path_factory.mktemp("other") / "run")
     lines = [json.loads(line) for line in (taken / "control.jsonl").read_text().splitlines()]
     first = next(one for one in lines if bytes.fromhex(one["bytes"]).startswith(b"SOUR:AM:STAT OFF"))
     first["bytes"] = bytes.fromhex(first["bytes"]).replace(b"OFF", b"0FF").hex()
@@ -104,7 +98,7 @@ DIFFERENCE = r"laser: command 0: byte 13 is 0x4f, recorded was 0x30 .*STAT OFF"
 @pytest.mark.usefixtures("patient")
 def test_the_first_byte_that_was_not_recorded_fails_the_replay_and_is_shown(taken: Path, altered: Path) -> None:
     with pytest.raises(DivergedError, match=DIFFERENCE):
-        api.replay(altered, config=hil(taken.parent, LASER))
+        api.replay(altered, config=hil(taken))
 
 
 def test_a_difference_is_shown_where_the_replay_fails_for_another_reason(
@@ -113,7 +107,7 @@ def test_a_difference_is_shown_where_the_replay_fails_for_another_reason(
     opened = property(lambda laser: True, lambda laser, value: None)
     monkeypatch.setattr(ObisModel, "interlock_open", opened, raising=False)
     with pytest.raises(DivergedError, match=rf"{DIFFERENCE}(.*\n)+.*the interlock is open"):
-        api.replay(altered, config=hil(taken.parent, LASER))
+        api.replay(altered, config=hil(taken))
 
 
 def test_a_scan_that_ended_before_its_last_map_is_not_taken_for_drivers_that_diverge(
@@ -124,7 +118,7 @@ def test_a_scan_that_ended_before_its_last_map_is_not_taken_for_drivers_that_div
     assert manifest is not None
     manifest["recording"]["starts"][0]["sweeps"] = 4
     (half / MANIFEST).write_text(sealed_text(json.dumps(manifest)))
-    result = api.replay(half, config=hil(taken.parent, LASER))
+    result = api.replay(half, config=hil(taken))
     assert (result.summary.maps, result.control) == (1, None)
     assert "were told of 4 sweeps, those of this replay are told of 1" in caplog.text
 

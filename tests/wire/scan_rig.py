@@ -30,7 +30,7 @@ from drivers.clock import SystemClock
 from drivers.interfaces import OUT_GATE
 from drivers.registry import Surroundings
 from sim_backend.wire.emulated_world import EmulatedWorld, EmulatedWorldConfig
-from tests.system.small_rig import calibration
+from tests.system.small_rig import calibration, emulated
 from tests.wire.usb.umockdev import PRELOAD, UmockdevBus
 
 WIDTH, HEIGHT = 64, 16
@@ -220,29 +220,15 @@ def _end(bench: ScanBench) -> None:
 
 
 def _config(laser: str, ports: dict[str, str], silence: str) -> dict[str, Any]:
-    return {
-        "name": "struck",
-        "calibration": "calibration.yaml",
-        # The emulated bus draws frames while a transfer is queued: 64 of them would take half a second.
-        "spad": {"kind": "spb-usb", "port": ports["spad"], "reads": "plain", "silence": silence},
-        "scanner": {
-            "kind": "helios",
-            "port": ports["scanner"],
-            "max_velocity": "4000 /s",
-            "max_acceleration": "4e6 /s2",
-            "rms_duty": 1.0,
-            "max_point_rate": "8 kHz",
-            "frame": "250 ms",  # a machine that has much else to do may be late
-        },
-        "laser": {"kind": laser, "port": ports["laser"], "max_power": "50 mW"},
-        "sync": {"kind": "prawndo", "port": ports["gate"]},
-        "scan": {
-            "columns": COLUMNS,
-            "exposures": EXPOSURES,
-            "frame_rate": "12.5 kHz",
-            "depth_range": ["1 m", "15 m"],
-            "command_range": [-0.8, 0.8],
-            "power": "20 mW",
-        },
-        "estimate": {"estimator": "argmax", "threads": 1},
-    }
+    """The config of a rig with real ports; its world is outside of it."""
+    content = emulated(**ports)
+    del content["world"]
+    content["calibration"] = "calibration.yaml"
+    # The emulated bus draws frames while a transfer is queued: 64 of them would take half a second.
+    content["spad"]["silence"] = silence
+    # A machine that has much else to do may be late.
+    content["scanner"] |= {"max_point_rate": "8 kHz", "frame": "250 ms"}
+    content["laser"]["kind"] = laser
+    content["scan"] |= {"columns": COLUMNS, "exposures": EXPOSURES, "frame_rate": "12.5 kHz", "power": "20 mW"}
+    content["estimate"]["threads"] = 1
+    return content

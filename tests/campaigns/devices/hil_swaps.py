@@ -14,7 +14,7 @@ from pathlib import Path
 from rig import api
 from rig.errors import DivergedError
 from tests.system.small_rig import write_rig
-from tests.system.test_hil import LASER, hil, lab
+from tests.system.test_hil import hil, lab
 
 MAPS = 24
 """Some 2.6 s: 14 buffers of 0.2 s."""
@@ -28,10 +28,11 @@ def main() -> int:
     diverged = 0
     with tempfile.TemporaryDirectory() as name:
         folder = Path(name)
-        api.scan(write_rig(folder / "rig", lab()), out=folder / "run", record=True, maps=MAPS, save="last")
+        taken = folder / "run"
+        api.scan(write_rig(folder / "rig", lab()), out=taken, record=True, maps=MAPS, save="last")
         for run in range(options.runs):
             try:
-                print(api.replay(folder / "run", config=hil(folder, LASER), out=folder / str(run), save="last").control)
+                print(api.replay(taken, config=hil(taken), out=folder / str(run), save="last").control)
             except DivergedError as error:
                 diverged += 1
                 print(f"diverged: {error}", flush=True)

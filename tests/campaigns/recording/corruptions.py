@@ -88,14 +88,7 @@ def frames_of(recording: RunRecording) -> Frames:
 
 
 def wound(files: dict[str, bytes], rng: np.random.Generator) -> str:
-    """Damage one file, or two; what was done."""
-    while (what := _wounded(files, rng)) is None:
-        pass
-    return what
-
-
-def _wounded(files: dict[str, bytes], rng: np.random.Generator) -> str | None:
-    """One try; None where nothing is changed by it."""
+    """Damage one file, or two, trying until something is changed by it; what was done."""
     segments = sorted(name for name in files if name.startswith("frames-"))
     target = str(rng.choice([*segments, *segments, INDEX_FILE, MANIFEST, "files"]))
     if target == "files":
@@ -107,7 +100,7 @@ def _wounded(files: dict[str, bytes], rng: np.random.Generator) -> str | None:
         return "files swapped"
     before = files.get(target)
     if not before:
-        return None
+        return wound(files, rng)
     kind, data = str(rng.choice(["flipped", "cut off", "doubled", "swapped", "zeroed"])), bytearray(before)
     piece, at = _piece(data, rng), _piece(data, rng).start
     other = slice(at, at + piece.stop - piece.start)
@@ -123,7 +116,7 @@ def _wounded(files: dict[str, bytes], rng: np.random.Generator) -> str | None:
     elif other.stop <= len(data) and (other.stop <= piece.start or piece.stop <= other.start):
         data[piece], data[other] = data[other], data[piece]
     files[target] = bytes(data)
-    return kind if files[target] != before else None
+    return kind if files[target] != before else wound(files, rng)
 
 
 def _piece(data: bytearray, rng: np.random.Generator) -> slice:

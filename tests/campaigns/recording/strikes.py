@@ -20,7 +20,7 @@ from drivers.frames import BlockFlag, BlockHeader, FrameBlock
 from drivers.recorded import RunRecording
 from drivers.ring import BlockRing
 from drivers.spb1 import BlockLayout, block_views, seal_block
-from rig.errors import RigError, UsageError
+from rig.errors import RigError
 from rig.recording.repair import repair
 from rig.recording.writer import WRITERS, Recorder, Recording
 from rig.run_folder.folder import RunFolder
@@ -174,10 +174,8 @@ def judge(folder: Path, seed: int, counted: int) -> tuple[int, str | None]:
     try:
         after = repair(folder).after
         recording = RunRecording(folder)
-    except UsageError as error:  # no segment yet
-        return 0, None if counted == 0 else f"{counted} blocks counted, but: {error}"
-    except (RigError, OSError, ValueError) as error:
-        return 0, None if counted == 0 else f"{type(error).__name__}: {error}"
+    except (RigError, OSError, ValueError) as error:  # as it is where there is no segment yet
+        return 0, None if counted == 0 else f"{counted} blocks counted, but {type(error).__name__}: {error}"
     if after.problems:
         return after.blocks, "; ".join(after.problems)
     found = [block for run in recording.runs for block in recording.blocks(run)]

@@ -160,7 +160,7 @@ def test_a_camera_that_is_known_counts_in_what_the_guide_expects() -> None:
     before = []
     for camera in (None, KnownCamera(lens, known, frozenset())):
         session, fit, judge = three_views({"accuracy_m": 1e-4, "at_m": 5.0}, camera)
-        advice = guided(lambda views: None, BOARD, (0.5, 4.0), session, fit, judge)(session.views)
+        advice = guided(lambda views: None, BOARD, (1.0, 1.3), session, fit, judge)(session.views)
         before.append(advice.before_m)
     told = fit_rig(session.views, BOARD, SIZE, camera=lens, known=known)
     assert before[1] == judge(told).evidence.expected_m

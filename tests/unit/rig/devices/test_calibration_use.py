@@ -80,7 +80,7 @@ OTHER_SCAN = {"columns": 60, "exposures": 6, "command_range": [-0.5, 0.5], "bidi
     ids=["other settings of the scan", "within its age", "a device without serial number"],
 )
 def test_a_calibration_is_used_with(tmp_path: Path, change: Change, sections: dict[str, Any]) -> None:
-    api.scan(calibrated(tmp_path, change, **sections))
+    api.plan_scan(calibrated(tmp_path, change, **sections))
 
 
 @pytest.mark.parametrize(
@@ -166,9 +166,9 @@ def test_a_check_that_failed_since_then_speaks_against_a_calibration_until_one_p
     model = load_rig_model(file)
     note_check(file, model, "check", passed=False, reasons=("moved-rig",))
     with pytest.raises(UsageError, match=r"'rig calibrate check' of .* failed \(moved-rig\) since it was made"):
-        api.scan(rig)
+        api.plan_scan(rig)
     note_check(file, model, "check", passed=True)
-    api.scan(rig)
+    api.plan_scan(rig)
 
 
 def test_notes_are_on_one_calibration_and_go_with_what_is_made_from_it(tmp_path: Path) -> None:
