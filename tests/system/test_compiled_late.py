@@ -31,7 +31,7 @@ EMULATED: dict[str, Any] = {
         "max_velocity": "4000 /s",
         "max_acceleration": "4e6 /s2",
         "rms_duty": 1.0,
-        "frame": "250 ms",
+        "frame": "500 ms",
     },
     "laser": {"kind": "obis", "port": "emulated:laser", "max_power": "50 mW"},
     "sync": {"kind": "prawndo", "port": "emulated:gate"},
