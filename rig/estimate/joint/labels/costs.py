@@ -214,9 +214,13 @@ def _lights(model: RowModel) -> Float32:
 
 
 def hot_in_bands(ambient: Float32) -> Bools:
-    """Pixels (rows, width) that are far brighter than the pixels of their column in the band."""
-    bands = np.arange(BAND_ROWS, ambient.shape[0], BAND_ROWS)
-    return np.concatenate([part > HOT_FACTOR * np.median(part, axis=0) + HOT_FLUX for part in np.split(ambient, bands)])
+    """Pixels (rows, width) that are far brighter than their column is in the band, or in a band's rows up to the last."""
+    rows, hot = len(ambient), np.empty(ambient.shape, np.bool_)
+    for first in range(0, rows, BAND_ROWS):
+        band = ambient[first : first + BAND_ROWS]
+        around = ambient[max(min(first, rows - BAND_ROWS), 0) : first + BAND_ROWS]
+        hot[first : first + BAND_ROWS] = band > HOT_FACTOR * np.median(around, axis=0) + HOT_FLUX
+    return hot
 
 
 def _band_means(gain: Float32) -> Float32:

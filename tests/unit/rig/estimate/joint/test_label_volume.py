@@ -9,8 +9,8 @@ import pytest
 
 from rig.estimate.joint.labels import cost_rows, costs, grid, tables
 from rig.estimate.joint.labels.cost_rows import COST_LIMIT, COUNT_BITS, EXCLUDED, _times
-from rig.estimate.joint.labels.costs import SHARP, _lights, costs_of
-from rig.estimate.joint.labels.grid import PER_PX, label_grid
+from rig.estimate.joint.labels.costs import SHARP, _lights, costs_of, hot_in_bands
+from rig.estimate.joint.labels.grid import BAND_ROWS, PER_PX, label_grid
 from rig.estimate.row.inputs import row_buffers, row_fluxes, state_of, sweep_of
 from rig.estimate.row.likelihood import FLOOR
 from rig.estimate.row.model import BINS, RowModel, pixel_shares, stripe_scale
@@ -208,3 +208,9 @@ def test_no_column_counts_for_more_than_the_longest_that_tables_are_made_for(usu
     whole = times >= 1
     np.testing.assert_array_equal(times[whole], np.rint(times[whole]))
     assert _times(usual, ways) == 2.0 ** (COUNT_BITS - ways.bits)
+
+
+def test_a_hot_pixel_of_a_short_last_band_is_found_beside_the_rows_before_it():
+    ambient = np.full((2 * BAND_ROWS + 1, 6), 0.01, np.float32)
+    ambient[[3, -1], [2, 4]] = 5.0
+    assert np.argwhere(hot_in_bands(ambient)).tolist() == [[3, 2], [2 * BAND_ROWS, 4]]
