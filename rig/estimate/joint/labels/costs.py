@@ -214,7 +214,7 @@ def _lights(model: RowModel) -> Float32:
 
 
 def hot_in_bands(ambient: Float32) -> Bools:
-    """Pixels (rows, width) that are far brighter than their column is in the band, or in a band's rows up to the last."""
+    """Pixels (rows, width) far brighter than the median of their column over BAND_ROWS rows, their band or the last."""
     rows, hot = len(ambient), np.empty(ambient.shape, np.bool_)
     for first in range(0, rows, BAND_ROWS):
         band = ambient[first : first + BAND_ROWS]
