@@ -54,7 +54,7 @@ def main(argv: Sequence[str] | None = None) -> None:
     """Entry point of `rig`; ends the process with the exit code."""
     arguments = _join_save(list(sys.argv[1:] if argv is None else argv))
     logging.basicConfig(level=logging.WARNING, stream=sys.stderr, format="%(levelname)s: %(message)s")
-    # Matrices are small here: numpy's own threads wait for each other longer than they work, 30 times on two cores.
+    # Matrices are small here: on two cores numpy's own threads made some steps take up to 30 times as long.
     os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
     ensure_kernel_cache()
     with _signals_interrupt():
