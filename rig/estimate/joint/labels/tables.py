@@ -10,7 +10,7 @@ of a pixel before and behind the stripe, and p'_S of a pixel that it lights,
 Haze, pedestal and ambient light vary slowly along a line, so the rows of a band share a table for each variant of
 `rig.estimate.joint.labels.grid` that occurs among them. Weights are for counts as `scaled` multiplies them.
 
-The stripe's brightness is unknown. Two values are tried, under a halo four, quantiles of the learned brightness, and the likelier one
+The stripe's brightness is unknown. Two quantiles of the learned one are tried, under a halo four, and the likeliest
 counts. The learned prior of positions is not used, since it makes errors larger.
 """
 
