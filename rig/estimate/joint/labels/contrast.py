@@ -99,15 +99,12 @@ def _fill(
             continue
         total[:] = 0.0
         for y in range(begin, min(first_row + ROWS, rows)):
-            for t in range(window):
-                total[t] += np.float32(counts[c, y, t])
+            total += _mended(counts[c, y], contrast, y, x0[c], n)
         for y in range(first_row, last_row):
             if y + ROWS < rows:
-                for t in range(window):
-                    total[t] += np.float32(counts[c, y + ROWS, t])
+                total += _mended(counts[c, y + ROWS], contrast, y + ROWS, x0[c], n)
             if y - ROWS > begin:
-                for t in range(window):
-                    total[t] -= np.float32(counts[c, y - ROWS - 1, t])
+                total -= _mended(counts[c, y - ROWS - 1], contrast, y - ROWS - 1, x0[c], n)
             here = contrast.place[c, y]
             if here[VARIANT] < 0 or here[LABEL] >= here[LABEL_END]:
                 continue
@@ -119,12 +116,7 @@ def _fill(
                 continue
             for line in range(0, labels, CACHE_LINE):
                 prefetch_to_write(address_of(cost) + (min(y + _AHEAD, rows - 1) * columns + c) * labels + line)
-            for t in range(window):
-                n[t + REACH_PX] = counts[c, y, t]
-            for h in range(contrast.hot_start[y], contrast.hot_start[y + 1]):
-                t = contrast.hot_x[h] - x0[c]
-                if 0 <= t < window:
-                    n[t + REACH_PX] = counts[c, y, t - 1 if t > 0 else t + 1]
+            _mended(counts[c, y], contrast, y, x0[c], n)
             _add_up(total, running)
             around = min(y + ROWS, rows - 1) - max(y - ROWS, 0) + 1
             for phase in range(PHASES):
@@ -142,6 +134,20 @@ def _fill(
             own[:] = none
             _write_costs(own, alone, cost[y, c, here[LABEL] : first])
             _write_costs(own, alone, cost[y, c, end : here[LABEL_END]])
+
+
+@numba.njit(cache=True, nogil=True)
+def _mended(counts: Counts, contrast: Contrast, y: int, x0: int, n: Float32) -> Float32:
+    """Counts of a row as n holds them from REACH_PX on, hot pixels with those of the pixel beside them."""
+    window = counts.shape[0]
+    mended = n[REACH_PX : REACH_PX + window]
+    for t in range(window):
+        mended[t] = counts[t]
+    for h in range(contrast.hot_start[y], contrast.hot_start[y + 1]):
+        t = contrast.hot_x[h] - x0
+        if 0 <= t < window:
+            mended[t] = mended[t - 1 if t > 0 else t + 1]
+    return mended
 
 
 @numba.njit(cache=True, nogil=True)
