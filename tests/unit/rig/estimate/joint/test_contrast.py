@@ -83,3 +83,21 @@ def test_nothing_and_everything_have_finite_costs():
         same = replace(volume, counts=counts)
         fill(same, contrast_of(costs, SIGMA_PX), 0, geometry.rows, cost, alone=True)
         assert cost.max() == 0, "no label is better than another"
+
+
+def test_a_hot_pixel_changes_no_cost_of_the_rows_around_it():
+    swept = simulated("halo", 10)
+    volume, geometry, grid = swept.volume, swept.geometry, label_grid(swept.geometry)
+    costs = costs_of(known_model(geometry), geometry, grid, 10, RowWorkers(1))
+    y, x, rows = 15, int(volume.x0.min()) + 30, geometry.rows
+    hot_start = np.repeat([0, 1], [y + 1, rows - y]).astype(costs.tables.hot_start.dtype)
+    hot = contrast_of(costs, SIGMA_PX)._replace(hot_start=hot_start, hot_x=np.array([x], costs.tables.hot_x.dtype))
+    filled = []
+    for level in (0, 10):
+        counts = volume.counts.copy()
+        for c in range(geometry.columns):
+            if 0 <= x - volume.x0[c] < counts.shape[2]:
+                counts[c, y, x - volume.x0[c]] = level
+        filled.append(np.full((rows, geometry.columns, grid.labels), 100, np.uint8))
+        fill(replace(volume, counts=counts), hot, 0, rows, filled[-1], alone=True)
+    np.testing.assert_array_equal(*filled)
