@@ -96,7 +96,7 @@ def tables_of(setting: LearningSetting, workers: RowWorkers, *, contrast: bool =
     state, sigma_px, sweep = state_of(model), model.line_sigma_px, sweep_of(geometry)
     beside = None
     if contrast or model.halo.any():
-        beside = contrast_of(costs, sigma_px)
+        beside = contrast_of(costs, sigma_px, geometry.width)
     return JointTables(
         grid, costs, beside, sweep, state, profile_table(sigma_px),
         halo_shares(model, geometry.width if model.halo.any() else 0), second_light(state, sigma_px, grid, sweep),

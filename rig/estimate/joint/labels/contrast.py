@@ -51,7 +51,7 @@ class Contrast(NamedTuple):
     place: int16 (columns, rows, PLACES) of `places_of`. hot_start, hot_x: as in `LabelTables`, of pixels that count
     what the one beside them counts. shares: float32 (2, FRACTIONS, taps) of the line in the pixels around centres -4/8
     to 3/8 px off towards near, from far to near and from near to far. frames: float32 (FRACTIONS,), N for one frame.
-    side: 1 where near is left, else -1.
+    side: 1 where near is left, else -1. width: pixels of a sensor's row; what is stored behind them is padding.
     """
 
     place: Int16
@@ -60,17 +60,18 @@ class Contrast(NamedTuple):
     shares: Float32
     frames: Float32
     side: int
+    width: int
     units_per_nat: float
 
 
-def contrast_of(costs: Costs, line_sigma_px: float) -> Contrast:
-    """Settings for a line of this width, with the places, hot pixels and units of a model's costs."""
+def contrast_of(costs: Costs, line_sigma_px: float, width: int) -> Contrast:
+    """Settings for a line and a sensor of these widths, with the places, hot pixels and units of a model's costs."""
     distance = np.arange(-REACH_PX, REACH_PX + 1) - (np.arange(FRACTIONS)[:, None] - FRACTIONS // 2) / FRACTIONS
     shares = pixel_shares(line_sigma_px, distance)
     shares /= shares.sum(axis=1, keepdims=True)
     return Contrast(
         costs.place, costs.tables.hot_start, costs.tables.hot_x, np.stack([shares, shares[:, ::-1]]),
-        1.0 / np.square(shares).sum(axis=1), costs.grid.side, costs.units_per_nat,
+        1.0 / np.square(shares).sum(axis=1), costs.grid.side, width, costs.units_per_nat,
     )  # fmt: skip
 
 
@@ -91,12 +92,15 @@ def _fill(
     (columns, rows, window), labels, side = counts.shape, cost.shape[2], contrast.side
     # Whole vectors may begin at any pixel, and end behind the last one.
     total, running = np.zeros(window, np.float32), np.zeros(window + 2 * BESIDE_PX[1] + LANES, np.float32)
-    n, pixels = np.zeros(window + 2 * REACH_PX + LANES, np.float32), _pixels_beside(window)
+    n, pixels, seen = np.zeros(window + 2 * REACH_PX + LANES, np.float32), np.ones(window + LANES, np.float32), 0
     score, own = np.zeros((PHASES, window + 2 * LANES), np.float32), np.zeros(PHASES * (window + LANES), np.uint8)
     for c in range(columns):
         frames, begin = n_frames[c], max(first_row - ROWS, 0)
         if frames == 0:
             continue
+        if seen != min(window, contrast.width - x0[c]):
+            seen = min(window, contrast.width - x0[c])
+            _note_pixels_beside(seen, pixels)
         total[:] = 0.0
         for y in range(begin, min(first_row + ROWS, rows)):
             total += _mended(counts[c, y], contrast, y, x0[c], n)
@@ -151,14 +155,13 @@ def _mended(counts: Counts, contrast: Contrast, y: int, x0: int, n: Float32) -> 
 
 
 @numba.njit(cache=True, nogil=True)
-def _pixels_beside(window: int) -> Float32:
-    """One over the number of pixels of a row that are the surroundings of each, and a vector of ones."""
-    out, (begin, end) = np.ones(window + LANES, np.float32), BESIDE_PX
-    for t in range(window):
+def _note_pixels_beside(seen: int, pixels: Float32) -> None:
+    """Fill pixels with one over the number of a row's first `seen` pixels that are the surroundings of each."""
+    begin, end = BESIDE_PX
+    for t in range(seen):
         left = max(t - begin + 1, 0) - max(t - end, 0)
-        right = min(t + end + 1, window) - min(t + begin, window)
-        out[t] = 1.0 / max(left + right, 1)
-    return out
+        right = min(t + end + 1, seen) - min(t + begin, seen)
+        pixels[t] = 1.0 / max(left + right, 1)
 
 
 @numba.njit(cache=True, nogil=True)

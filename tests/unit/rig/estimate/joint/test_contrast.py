@@ -22,7 +22,7 @@ covers(module)
 SIGMA_PX = 0.7
 
 
-def costs_written_out(volume, geometry, grid, place, units, y, c):
+def costs_written_out(volume, width, grid, place, units, y, c):
     """Costs of a row's labels; NaN for those that cannot be."""
     counts, frames, window = volume.counts[c].astype(float), volume.n_frames[c], volume.counts.shape[2]
     scores = np.full(grid.stripes, np.nan)
@@ -31,16 +31,18 @@ def costs_written_out(volume, geometry, grid, place, units, y, c):
         x = round((grid.x_far[y, c] - grid.side * label / PER_PX) * 8) / 8 - volume.x0[c]
         # Half way between two pixels the one nearer to the scanner has it.
         t = int(np.floor(x + 0.5)) if grid.side < 0 else int(np.ceil(x - 0.5))
-        if not 0 <= t < window:
+        if not 0 <= t < window:  # what was not stored
             scores[label] = 0.0
             continue
-        pixels = np.arange(window)
+        if t >= width - volume.x0[c]:
+            continue
+        pixels = np.arange(min(window, width - volume.x0[c]))
         w = pixel_shares(SIGMA_PX, np.arange(t - REACH_PX, t + REACH_PX + 1) - x).astype(float)
         inside = (np.arange(t - REACH_PX, t + REACH_PX + 1) >= 0) & (np.arange(t - REACH_PX, t + REACH_PX + 1) < window)
         w /= w.sum()
         n = np.where(inside, counts[y, np.clip(np.arange(t - REACH_PX, t + REACH_PX + 1), 0, window - 1)], 0.0)
         beside = (abs(pixels - t) >= BESIDE_PX[0]) & (abs(pixels - t) <= BESIDE_PX[1])
-        p0 = max(near_rows[:, beside].sum(), LEAST_ONES) / (near_rows.shape[0] * beside.sum() * frames)
+        p0 = max(near_rows[:, pixels[beside]].sum(), LEAST_ONES) / (near_rows.shape[0] * beside.sum() * frames)
         p0 = min(p0, MOST_SHARE)
         p = min(max((w * n).sum() / frames, p0), MOST_SHARE)
         pooled = frames / np.square(w).sum()
@@ -48,12 +50,17 @@ def costs_written_out(volume, geometry, grid, place, units, y, c):
     return np.minimum((np.nanmax(scores, initial=0.0) - scores) * units, COST_LIMIT)
 
 
-@pytest.mark.parametrize("rig", ["left", "right"])
-def test_costs_are_those_written_out_and_mix_with_others(rig):
+@pytest.mark.parametrize(("rig", "padding"), [("left", 0), ("right", 0), ("right", 9)])
+def test_costs_are_those_written_out_and_mix_with_others(rig, padding):
     swept = simulated("halo", 10, rig=rig)
     volume, geometry, grid = swept.volume, swept.geometry, label_grid(swept.geometry)
+    width, counts = geometry.width - padding, swept.volume.counts.copy()
+    if padding:
+        # Without light in the last pixels no label behind them has a score.
+        counts[volume.x0[:, None, None] + np.arange(counts.shape[2]) + np.zeros_like(counts, int) >= width - 5] = 0
+        volume = replace(volume, counts=counts)
     costs = costs_of(known_model(geometry), geometry, grid, 10, RowWorkers(1))
-    contrast = contrast_of(costs, SIGMA_PX)
+    contrast = contrast_of(costs, SIGMA_PX, width)
     alone, mixed = (np.full((geometry.rows, geometry.columns, grid.labels), 100, np.uint8) for _ in range(2))
     alone[:, :, 7] = mixed[:, :, 7] = EXCLUDED
     for first, last in ((0, 20), (20, geometry.rows)):
@@ -64,7 +71,7 @@ def test_costs_are_those_written_out_and_mix_with_others(rig):
         for c in range(0, geometry.columns, 7):
             if costs.place[c, y, VARIANT] < 0:
                 continue
-            wanted = costs_written_out(volume, geometry, grid, costs.place, costs.units_per_nat, y, c)
+            wanted = costs_written_out(volume, width, grid, costs.place, costs.units_per_nat, y, c)
             given = np.flatnonzero(np.isfinite(wanted) & (np.arange(grid.stripes) != 7))
             assert np.abs(alone[y, c, given] - wanted[given]).max() < 1.01, (y, c)
             assert (mixed[y, c, given] == (alone[y, c, given].astype(int) + 101) // 2).all()
@@ -81,7 +88,7 @@ def test_nothing_and_everything_have_finite_costs():
         counts = np.full_like(volume.counts, value)
         cost = np.zeros((geometry.rows, geometry.columns, grid.labels), np.uint8)
         same = replace(volume, counts=counts)
-        fill(same, contrast_of(costs, SIGMA_PX), 0, geometry.rows, cost, alone=True)
+        fill(same, contrast_of(costs, SIGMA_PX, geometry.width), 0, geometry.rows, cost, alone=True)
         assert cost.max() == 0, "no label is better than another"
 
 
@@ -91,7 +98,9 @@ def test_a_hot_pixel_changes_no_cost_of_the_rows_around_it():
     costs = costs_of(known_model(geometry), geometry, grid, 10, RowWorkers(1))
     y, x, rows = 15, int(volume.x0.min()) + 30, geometry.rows
     hot_start = np.repeat([0, 1], [y + 1, rows - y]).astype(costs.tables.hot_start.dtype)
-    hot = contrast_of(costs, SIGMA_PX)._replace(hot_start=hot_start, hot_x=np.array([x], costs.tables.hot_x.dtype))
+    hot = contrast_of(costs, SIGMA_PX, geometry.width)._replace(
+        hot_start=hot_start, hot_x=np.array([x], costs.tables.hot_x.dtype)
+    )
     filled = []
     for level in (0, 10):
         counts = volume.counts.copy()
