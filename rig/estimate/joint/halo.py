@@ -9,7 +9,8 @@ pixels around a stripe and around its 5 x 5 neighbours on the same surface are e
 
 with haze and ambient light as base. It is concave in a. Newton's steps start from below, since the slope is convex.
 Saturated pixels give no information, those beside them do. If the amplitude is hardly more than its noise, or
-neighbours do not agree on it, the light of a stripe is unknown and the stripe is not used.
+neighbours do not agree on it, the light of a stripe is unknown and the stripe is not used. Nor is one that brings 2
+photons or more to a pixel.
 
 The fit (`add_equations`, `solve`). The counts beside a stripe of s photons, at the distance d along the row, show
 
