@@ -1,5 +1,7 @@
 """Compiles the kernels of an estimate before a run, so that its times do not include compiling (`rig warmup`)."""
 
+from dataclasses import replace
+
 import numpy as np
 
 from rig.count.bind import FrameBinder
@@ -44,6 +46,11 @@ def warm_up(estimator: str, filter: str, exposures: int, *, dark: bool) -> None:
         checks.doubts(sweep, sweep.intensity(), stripe)
         if maker.used is not None:
             read_fog(sweep, stripe, geometry, maker.used)
+    if maker.used is not None and estimator in COUPLED:
+        from rig.estimate.joint.joint import Joint
+
+        # A halo, which may turn up in any map, needs further kernels.
+        Joint(1, replace(maker.used, halo=np.full_like(maker.used.halo, 1e-3))).estimate(sweep, geometry)
     if filter == "median":
         from rig.estimate.median import median_filter
 

@@ -236,9 +236,12 @@ CLEAR: Final = np.float32(0.5)
 MOST_PEAK: Final = 2.0
 """Photons per exposure in one pixel from which on a stripe's light is known by its flanks only: a line a little wider
 than thought would be a dimmer stripe with a stronger halo."""
-FIRST_LINES: Final = AGAIN_LINES // 4
-"""Rows x columns that tell whether there is a halo at all, and of later maps; once there is one in the first map, twice
-AGAIN_LINES measure it."""
+DETECT_LINES: Final = AGAIN_LINES // 4
+"""Rows x columns that tell whether there is a halo."""
+MEASURE_LINES: Final = 2 * AGAIN_LINES
+"""Rows x columns that measure it, once the first map has one."""
+FEWEST_LIGHTS: Final = 64
+"""Stripes of known light without which a later map says nothing about a halo."""
 LEAST_EVIDENCE: Final = 50.0
 """Least chi squared that a halo must take off the fit: where there is none it takes off 2 to 10, in fog of optical
 depth 1 it takes off 4000 to 30000."""
@@ -258,7 +261,7 @@ class BrightLines(NamedTuple):
 
 def bright_lines(
     volume: CountVolume, geometry: SweepGeometry, tables: JointTables, stripes: StripeTable, places: Places,
-    workers: RowWorkers, number: int = FIRST_LINES,
+    workers: RowWorkers, number: int = DETECT_LINES,
 ) -> BrightLines:  # fmt: skip
     """Lines of a map whose light is known, out of about `number`.
 
@@ -284,19 +287,22 @@ def learn_first_halo(
     """
     if geometry.others is not None:
         return model
-    number = 2 * AGAIN_LINES if model.halo.any() else FIRST_LINES
+    number = MEASURE_LINES if model.halo.any() else DETECT_LINES
     seen = bright_lines(volume, geometry, tables, stripes, places, workers, number)
     return learn_halo(seen, geometry, model, ambient, workers, dark=volume.dark_counts is not None)
 
 
 def learn_next_halo(setting: LearningSetting, seen: BrightLines, workers: RowWorkers) -> RowModel:
     """The model of a later lesson. A halo is added when the map begins to show one, and removed when it shows none.
+    A map with hardly a stripe of known light changes nothing.
 
     A halo that stays is not changed. If it were learned anew from so few lines in lesson after lesson, halo, haze and
     the level behind stripes would drift against each other (in steady fog errors grow by 10 to 25 % in eight maps).
     """
     model = setting.model
     if setting.geometry.others is not None or (not model.halo.any() and np.isnan(model.extinction_per_m)):
+        return model
+    if len(seen.light) < FEWEST_LIGHTS:
         return model
     found = learn_halo(seen, setting.geometry, model, model.ambient, workers, dark=setting.dark)
     return model if found.halo.any() == model.halo.any() else found

@@ -40,9 +40,9 @@ from rig.simd import Float32, Float64
 from rig.simd.memory import pointers
 from rig.threads import RowWorkers
 
-FIRST_ROUNDS = 2
+LESSONS = 2
 """Times that the first map's stripes teach the model that they are then estimated with again."""
-HALO_ROUNDS = 3
+HALO_LESSONS = 3
 """The same where a halo was found."""
 AGREE_PX = np.float32(1.0)
 """Under a halo a stripe teaches only if its surroundings alone put it within so many pixels."""
@@ -115,28 +115,28 @@ class Joint:
         """Learn from the first sweep: row by row, then from stripes that all rows together show far better."""
         self._prior.recall(None)  # of maps that taught nothing
         model = start = first_model(volume, geometry, self._workers)
-        beside, rounds, intensity = None, 0, volume.intensity()
-        while rounds < (FIRST_ROUNDS if beside is None else HALO_ROUNDS):
-            model, rounds = self._taught(volume, intensity, geometry, model, beside), rounds + 1
-            if beside is None and model.halo.any():
+        witness_px, lessons, intensity = None, 0, volume.intensity()
+        while lessons < (LESSONS if witness_px is None else HALO_LESSONS):
+            model, lessons = self._taught(volume, intensity, geometry, model, witness_px), lessons + 1
+            if witness_px is None and model.halo.any():
                 # What is scattered many times has misled these lessons: begin again with a second teacher.
-                beside, model, rounds = self._beside(volume, geometry, model), start, 0
+                witness_px, model, lessons = self._by_contrast(volume, geometry, model), start, 0
         return model
 
     def _taught(
         self, volume: CountVolume, intensity: NDArray[np.uint32], geometry: SweepGeometry, model: RowModel,
-        beside: Float32 | None,
+        witness_px: Float32 | None,
     ) -> RowModel:  # fmt: skip
         """The model that stripes estimated with `model` teach.
 
-        intensity: of the volume. beside: x_px of `_beside`, which the stripes must confirm.
+        intensity: of the volume. witness_px: x_px of `_by_contrast`, which the stripes must confirm.
         """
         setting = LearningSetting(model, geometry, volume.exposures, volume.dark_counts is not None)
-        tables = tables_of(setting, self._workers, contrast=beside is not None)
+        tables = tables_of(setting, self._workers, contrast=witness_px is not None)
         stripes = self._teaching(volume, tables, self._stripes(volume, tables, lesson=True))
-        if beside is not None:
+        if witness_px is not None:
             with np.errstate(invalid="ignore"):
-                agree = np.abs(stripes.x_px - beside) <= AGREE_PX
+                agree = np.abs(stripes.x_px - witness_px) <= AGREE_PX
             stripes = replace(stripes, confidence=np.where(agree, stripes.confidence, np.float32(0)))
         quiet = self._quiet(volume, geometry, tables, stripes)
         ambient = ambient_map(volume, intensity, geometry, quiet)
@@ -149,13 +149,13 @@ class Joint:
         # Amplitudes are relative to the scale of the model that they are written into.
         weigh_light(volume, tables.sweep, state_of(model), stripes.x_px, places, self._workers)
         self._workers.settle()
-        amplitude, weight = amplitudes_of(places, None if beside is None else stripes.confidence > TRUSTED)
+        amplitude, weight = amplitudes_of(places, None if witness_px is None else stripes.confidence > TRUSTED)
         return replace(model, amplitude=amplitude, weight=weight)
 
-    def _beside(self, volume: CountVolume, geometry: SweepGeometry, model: RowModel) -> Float32:
+    def _by_contrast(self, volume: CountVolume, geometry: SweepGeometry, model: RowModel) -> Float32:
         """x_px (rows, columns) that the surroundings of labels alone tell."""
         setting = LearningSetting(model, geometry, volume.exposures, volume.dark_counts is not None)
-        tables = tables_of(setting, self._workers)
+        tables = tables_of(setting, self._workers, contrast=True)
         x_px = np.empty(tables.grid.x_far.shape, np.float32)
         self._read(volume, tables, x_px, alone=True)
         self._workers.settle()

@@ -94,11 +94,9 @@ def tables_of(setting: LearningSetting, workers: RowWorkers, *, contrast: bool =
     model, geometry, grid = setting.model, setting.geometry, grid_of(setting.geometry)
     costs = costs_of(model, geometry, grid, setting.exposures, workers)
     state, sigma_px, sweep = state_of(model), model.line_sigma_px, sweep_of(geometry)
-    beside = None
-    if contrast or model.halo.any():
-        beside = contrast_of(costs, sigma_px, geometry.width)
+    by_contrast = contrast_of(costs, sigma_px, geometry.width) if contrast or model.halo.any() else None
     return JointTables(
-        grid, costs, beside, sweep, state, profile_table(sigma_px),
+        grid, costs, by_contrast, sweep, state, profile_table(sigma_px),
         halo_shares(model, geometry.width if model.halo.any() else 0), second_light(state, sigma_px, grid, sweep),
         brightness_of(model), setting.dark, answer_settings(grid.stripes), {},
         pairs_to_ask(np.isfinite(grid.x_far)),

@@ -3,7 +3,7 @@
 from rig.config.files import load_config
 from rig.config.models import EstimateConfig
 from rig.count import bind_kernels as binding_kernels
-from rig.depth.warm_up import warm_binding
+from rig.depth.warm_up import warm_binding, warm_up
 from rig.devices.open import open_rig
 from rig.devices.prepare import prepare
 
@@ -21,3 +21,13 @@ def test_binding_compiles_nothing_more_behind_it():
         maker = Reconstructor(rig.model, plan.commands, plan.depth_range_m, estimate)
         list(Acquisition(rig, plan, timing, maker, AcquisitionRequest(maps=1)).run())
         assert made == [len(kernel.signatures) for kernel in (binding_kernels.walk, binding_kernels.cover)]
+
+
+def test_kernels_of_a_halo_are_compiled_for_joint_before_a_map_shows_one(monkeypatch):
+    from rig.estimate.joint import joint
+
+    seen = []
+    cost_contrast = joint.cost_contrast
+    monkeypatch.setattr(joint, "cost_contrast", lambda *args, **named: (seen.append(1), cost_contrast(*args, **named)))
+    warm_up("joint", "none", 3, dark=False)
+    assert seen
