@@ -118,6 +118,8 @@ def test_first_and_later_maps_tell_whether_there_is_a_halo(light, other):
     assert learn_next_halo(setting, seen, WORKERS) is joint.used
     wrong = first_map(other)[1].used
     assert learn_next_halo(replace(setting, model=wrong), seen, WORKERS).halo.any() == (light == "halo")
+    few = seen._replace(light=seen.light[:10])
+    assert learn_next_halo(replace(setting, model=wrong), few, WORKERS) is wrong, "so few stripes tell nothing"
     several = replace(setting.geometry, others=setting.geometry.plane[:, None])
     assert learn_next_halo(replace(setting, model=wrong, geometry=several), seen, WORKERS) is wrong
     clear = replace(first_map("halo-less")[1].used, extinction_per_m=np.nan)
