@@ -23,7 +23,8 @@ from rig.simd.memory import aligned_zeros
 from rig.threads import RowWorkers
 
 MOST_BYTES = 4 << 30
-"""Costs and messages of a map may take so much: room for 1000 columns, each searched over all of 1024 x 1024 pixels."""
+"""Costs and messages of a map may take so much: room for 1000 columns, each searched over all of 1024 x 1024 pixels.
+Tables of a halo come on top, half as much there."""
 
 
 class JointTables(NamedTuple):
