@@ -6,10 +6,11 @@ import numpy as np
 
 from rig.count.bind import FrameBinder
 from rig.count.map_checks import MapChecks
-from rig.count.volume import BIN_DARK, SweepLayout
+from rig.count.volume import BIN_DARK, CountVolume, SweepLayout
 from rig.depth.depth import depth_map
 from rig.depth.fog_meter import read_fog
 from rig.estimate.registry import COUPLED, create_estimator
+from rig.estimate.row.model import RowModel
 from rig.geometry.windows import WORD_PX, uncalibrated_geometry
 from rig.plan.scan_plan import ScanPlan
 
@@ -46,10 +47,10 @@ def warm_up(estimator: str, filter: str, exposures: int, *, dark: bool) -> None:
         checks.doubts(sweep, sweep.intensity(), stripe)
         if maker.used is not None:
             read_fog(sweep, stripe, geometry, maker.used)
-    if maker.used is not None and estimator in COUPLED:
+    if estimator in COUPLED and isinstance(maker.used, RowModel) and isinstance(sweep, CountVolume):
         from rig.estimate.joint.joint import Joint
 
-        # A halo, which may turn up in any map, needs further kernels.
+        # A halo, which may turn up in any map of `joint`, needs further kernels.
         Joint(1, replace(maker.used, halo=np.full_like(maker.used.halo, 1e-3))).estimate(sweep, geometry)
     if filter == "median":
         from rig.estimate.median import median_filter
