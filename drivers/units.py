@@ -29,7 +29,7 @@ _FAITHFUL = Context(prec=20)
 
 @dataclass(frozen=True, slots=True)
 class Dimension:
-    """A physical dimension with its units as multiples of the number in code, the preferred one first."""
+    """A physical dimension. `units` gives the size of each unit in SI; the first is preferred for output."""
 
     name: str
     units: Mapping[str, Fraction]

@@ -193,8 +193,9 @@ class SweepCounts:
         return np.where(np.isfinite(self.command), first + (self.command - self.command[first]) / self.step, number)
 
     def at_pixels(self, pixels: NDArray[np.int64]) -> tuple[NDArray[np.int32], NDArray[np.int32]]:
-        """1s (columns, pixels) of pixels (n, 2), and frames (columns, pixels or 1), 0 where a window does not reach the
-        pixel.
+        """Returns, for n pixels (row, x), the number of ones (columns, n) and of frames (columns, n) or (columns, 1).
+
+        Both are 0 where a column's window does not reach the pixel.
         """
         total, rows, window = self.counts.shape
         ones = np.zeros((total, len(pixels)), np.int32)

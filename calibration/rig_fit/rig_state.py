@@ -266,7 +266,10 @@ def board_points(camera: Camera, sightings: Sequence[Sighting], poses: Sequence[
 
 
 def first_scanner(points: LitPoints, command_range: tuple[float, float]) -> tuple[PivotScanner, Array]:
-    """A mirror and (lag forward, lag backward, 0). The lags are equal if only their sum is determined, or else 0."""
+    """A mirror and (lag forward, lag backward, 0): the fit of all sweeps begins with them.
+
+    Lags that the sweeps cannot tell apart get one value; if they determine neither, both are 0.
+    """
     # The signed speeds at which enough boards were swept to tell their planes; where none was, the most swept.
     velocities = np.unique(points.velocity_per_s)
     shown = np.array([np.unique(points.view[points.velocity_per_s == velocity]).size for velocity in velocities])

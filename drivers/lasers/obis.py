@@ -100,7 +100,7 @@ class ObisFraming:
         return reply
 
     def refusal(self, reply: str) -> str | None:
-        """Number and meaning of the error; None if the reply is not an error."""
+        """Returns the error reply with its meaning; None if the reply is no error."""
         error = _ERROR.fullmatch(reply)
         return f"{reply} ({ERRORS.get(int(error[1]), 'no known number')})" if error is not None else None
 

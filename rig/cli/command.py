@@ -215,7 +215,7 @@ _STEPS = {
 
 
 def fail(code: int, problems: Sequence[str], notes: Sequence[str], as_json: object) -> int:
-    """Say why a command has no result, to people on stderr or to programs as its one JSON object; returns the code."""
+    """Say on stderr why a command has no result; with `as_json` also print it as one JSON object. Returns the code."""
     for problem in problems:
         say(f"error: {problem}")
     for note in notes:

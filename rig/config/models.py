@@ -247,7 +247,7 @@ class RigConfig(ConfigSection):
 
 
 class CubePlan(ConfigSection):
-    """`plan.yaml` of `rig reconstruct`: how the frames of a cube without records were taken."""
+    """`plan.yaml` of `rig reconstruct`: how frames from another program were taken."""
 
     columns: Columns
     exposures: Exposures

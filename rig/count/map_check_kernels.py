@@ -2,13 +2,14 @@
 
 With n ones of a pixel in K frames and r its usual rate, a line of counts k is turned into line-shaped excess,
 
-    z = (n - K r) / sqrt(K r),    e_k(j) = mean of z over 3 px around j - mean of z over 3 to 8 px to both sides
+    z = (n - K r) / sqrt(K r),    e_k(j) = mean of z over 3 px around j - mean of z 4 to 9 px away on both sides
 
 The light in common with a partner at pixel distance s is the sum over j of e_0(j) times (the sum of e_k from
 j + s - LAGS_PX to j + s + LAGS_PX, minus the mean of the same sum BESIDE_PX to either side). Smoothness is the sum of
-products of neighbouring pixels. Lines are int32 (partners, points, window), results float64 (points, 3 + orders).
+products of neighbouring pixels. Lines are int32 (line and partners, points, window); results are float64 (points, 3 +
+orders).
 
-Light of all widths, mainly haze, is compared by sums of z over BIN_PX, minus the line's mean of z:
+Broad light, mainly haze, is compared by sums of z over BIN_PX, minus the line's mean of z:
 
     a_k(i) = sum over bin i of (z - mean of z),    shared(partner, o) = sum over points and i of a_0(i) a_k(i + s + o)
 """

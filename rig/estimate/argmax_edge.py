@@ -30,9 +30,9 @@ NEAR_SHARE: Final = 0.25
 
 @numba.njit(cache=True, nogil=True)
 def sub_pixel(weight: Float64, peak: int, length: int) -> float:
-    """Offset of the peak in -0.5..0.5 from its two neighbours: centroid of the part above the lower of them.
+    """Sub-pixel offset of the peak, -0.5 to 0.5 px: centroid of the peak and its neighbours above the lower of these.
 
-    A flat top, or a peak at the end of the row, has no offset.
+    It is 0 where all three are equal, and at the end of the row.
     """
     if peak <= 0 or peak >= length - 1:
         return 0.0

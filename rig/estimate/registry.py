@@ -106,11 +106,11 @@ class Recalled:
         return self._of.used
 
     def counter(self, layout: "SweepLayout", geometry: "SweepGeometry") -> "Counter":
-        """See the estimator."""
+        """A counter of the estimator."""
         return self._of.counter(layout, geometry)
 
     def estimate(self, sweep: Any, geometry: "SweepGeometry") -> "StripeTable":
-        """See the estimator."""
+        """Estimate a map with its own state, then take the next state."""
         stripes = self._of.estimate(sweep, geometry)
         if self._states:
             self._of.model = self._states.pop(0)

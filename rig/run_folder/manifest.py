@@ -195,8 +195,8 @@ def require_playable(folder: Path, manifest: Mapping[str, Any]) -> None:
     """Raise DamagedRecordingError, with one line each, for files beside the frames that differ from what the manifest
     says.
 
-    Raises UsageError for a recording of spadrig 0.1 whose maps were taken in several passes over part of the columns
-    each.
+    Raises UsageError for an adaptive recording (`passes` in the manifest): each of its maps was put together from
+    several partial sweeps.
     """
     if problems := inputs_problems(folder, manifest):
         raise DamagedRecordingError("\n".join(f"{line}; take it from a copy of the recording" for line in problems))

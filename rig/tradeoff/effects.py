@@ -40,8 +40,8 @@ class ReportsEffects(World, Protocol):
     def effects_report(self, power_w: float, exposure_s: float, exposures: int) -> Mapping[str, Any]:
         """Report on the effects: planned_for, changed_decisions_bound, and effects, a mapping for each.
 
-        A mapping's keys are the first fields of `Effect`, and `removable`: whether the effect can be left out with
-        `effects` in the world's config.
+        A mapping's keys are the fields of `Effect` up to `cost_us_per_frame`, and `removable`: whether the effect can
+        be left out with `effects` in the world's config.
         """
         ...
 

@@ -91,8 +91,8 @@ def windows_at(window: WindowTable | None, first_sweep: int, records: NDArray[np
 
 
 class TickClock:
-    """A tick counter that starts from 0 at `start_s` of the bench. error: relative, positive is fast. wander: per root
-    second.
+    """A tick counter that starts from 0 at `start_s` of the bench. error: relative, positive is fast. wander: random
+    change of the error, per root second.
     """
 
     def __init__(self, tick_s: float, start_s: float, error: float, wander: float, seed: list[int]) -> None:

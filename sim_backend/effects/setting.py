@@ -55,7 +55,7 @@ class FrameTimes:
 
 
 class LaserEffect(Protocol):
-    """Light that comes from the laser's sheet."""
+    """Light that comes from the laser's sheet. One that moves has `hold_s`, the time for which it stands still."""
 
     def add(self, sheet: LightSheet, first_row: int, last_row: int, rate: Array) -> None:
         """Add detections per second and watt to `rate` (rows, width), rows first_row..last_row-1. Releases the GIL.

@@ -132,7 +132,7 @@ def _expect_piece(sweep: Sweep, state: RowState, lines: Lines, geometry: SweepGe
 
 
 def learn_first(volume: CountVolume, geometry: SweepGeometry, ambient: Float32, workers: RowWorkers) -> RowModel:
-    """Row model of a sweep about which nothing is known: several starts are tried, and the likeliest one is refined."""
+    """Learn the row model from a first sweep: try several starts and refine the likeliest."""
     first, last = (lines_of(volume, lattice(geometry, lines)) for lines in (FIRST_LINES, LAST_LINES))
     few = _every(first, START_LINES)
     guessed = volume.dark_counts is None

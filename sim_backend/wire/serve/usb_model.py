@@ -168,10 +168,10 @@ class UsbModel:
         return STALL
 
     def out(self, endpoint: int, data: bytes, now_s: float) -> int | Stall | None:
-        """Take one complete OUT transfer. Its last packet is short unless the length is a multiple of the packet size.
+        """Take one complete OUT transfer.
 
-        Returns the number of bytes taken; if fewer, the rest is offered again until the host's timeout. None: not ready
-        (NAK).
+        Returns the number of bytes taken (the rest is offered again until the host's timeout), None for not ready
+        (NAK), or STALL to refuse it, as here.
         """
         return STALL
 

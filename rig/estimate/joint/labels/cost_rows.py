@@ -213,10 +213,10 @@ def _score_row(sums, n, tap, constant, score, vectors, taps, pairs):  # type: ig
 
 @numba.njit(cache=True, nogil=True)
 def score_rows(at: LabelTables, constants: int, which: int, taps: int, b: Buffers, batch: int) -> None:
-    """Fill score and top. constants: address of the constants of positions; which: address of each row's number among
-    them.
+    """Fill `b.score`, a score per position, and `b.top`, the largest one, of the first `batch` rows in `b`.
 
-    taps: number of pixels around a position.
+    constants, which: addresses of the positions' constants, and of each row's number among them. taps: number of pixels
+    around a position.
     """
     for r in range(batch):
         i = read_int32(b.here, r)
