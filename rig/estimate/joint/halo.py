@@ -35,7 +35,7 @@ from rig.estimate.joint.place.light import FRACTIONS
 from rig.estimate.joint.place.places import BLIND_FLUX, REACH_PX, Places
 from rig.estimate.joint.place.pool import SAME_PX
 from rig.estimate.joint.tables import JointTables
-from rig.estimate.row.em import AGAIN_LINES, PIECES, lattice, lines_of
+from rig.estimate.row.em import AGAIN_LINES, PIECES, lines_of
 from rig.estimate.row.inputs import (
     Lines,
     RowState,
@@ -50,7 +50,7 @@ from rig.estimate.row.inputs import (
 from rig.estimate.row.model import BINS, HALO_NODES, HALO_REACHES_PX, RowModel, fit_haze
 from rig.estimate.search.online_learning import LearningSetting
 from rig.geometry.stripe_table import StripeTable
-from rig.geometry.windows import SweepGeometry
+from rig.geometry.windows import SweepGeometry, evenly_spread
 from rig.simd import Bools, Float32, Float64, Int32
 from rig.threads import RowWorkers
 
@@ -237,14 +237,15 @@ MOST_PEAK: Final = 2.0
 """Photons per exposure in one pixel from which on a stripe's light is known by its flanks only: a line a little wider
 than thought would be a dimmer stripe with a stronger halo."""
 DETECT_LINES: Final = AGAIN_LINES // 4
-"""Rows x columns that tell whether there is a halo."""
-MEASURE_LINES: Final = 2 * AGAIN_LINES
-"""Rows x columns that measure it, once the first map has one."""
+"""Clear stripes that tell whether there is a halo."""
+MEASURE_LINES: Final = AGAIN_LINES
+"""Clear stripes that measure it, once the first map has one."""
 FEWEST_LIGHTS: Final = 64
 """Stripes of known light without which a later map says nothing about a halo."""
-LEAST_EVIDENCE: Final = 50.0
-"""Least chi squared that a halo must take off the fit: where there is none it takes off 2 to 10, in fog of optical
-depth 1 it takes off 4000 to 30000."""
+LEAST_EVIDENCE, LEAST_PER_EXPOSURE = 30.0, 0.02
+"""Least chi squared that a halo must take off the fit, altogether and per stripe and exposure: noise takes off 2 to 10;
+the wings of a line that moves or is not sharp 0.01 per exposure, fog of optical depth 0.2 0.02 to 0.05, of 1 more than
+0.15."""
 SMOOTH_HAZE, SMOOTH_SHARE, SMOOTH_HALO, SMALL_HALO = 3e4, 300.0, 3.0, 0.1
 """Strengths of the smoothness: cost, over their squares, of bends of the haze, steps of its share behind the stripe,
 steps of the halo and the halo itself. They decide only where there are no data."""
@@ -260,16 +261,16 @@ class BrightLines(NamedTuple):
 
 
 def bright_lines(
-    volume: CountVolume, geometry: SweepGeometry, tables: JointTables, stripes: StripeTable, places: Places,
-    workers: RowWorkers, number: int = DETECT_LINES,
+    volume: CountVolume, tables: JointTables, stripes: StripeTable, places: Places, workers: RowWorkers,
+    number: int = DETECT_LINES,
 ) -> BrightLines:  # fmt: skip
-    """Lines of a map whose light is known, out of about `number`.
+    """Lines of a map whose light is known, out of about `number` with a clear stripe, evenly spread.
 
     tables: those that the map was made with; places: of its stripes.
     """
-    rows, columns = lattice(geometry, number)
-    clear = stripes.confidence[rows, columns] > CLEAR
-    rows, columns = rows[clear], columns[clear]
+    y, c = np.nonzero(stripes.confidence > CLEAR)
+    pick = evenly_spread(len(y), number)
+    rows, columns = y[pick].astype(np.int32), c[pick].astype(np.int32)
     light, known = np.empty(len(rows), np.float32), np.empty(len(rows), np.bool_)
     seen = volume.counts, volume.n_frames, tables.sweep, tables.state, tables.shares, stripes.x_px, places
     workers.over(len(rows), lambda first, last: likeliest_light(*seen, rows, columns, first, last, light, known))
@@ -288,7 +289,7 @@ def learn_first_halo(
     if geometry.others is not None:
         return model
     number = MEASURE_LINES if model.halo.any() else DETECT_LINES
-    seen = bright_lines(volume, geometry, tables, stripes, places, workers, number)
+    seen = bright_lines(volume, tables, stripes, places, workers, number)
     return learn_halo(seen, geometry, model, ambient, workers, dark=volume.dark_counts is not None)
 
 
@@ -326,7 +327,8 @@ def learn_halo(
     plain = np.r_[0:_HALO, _SIZE - 1]
     without = np.zeros(_SIZE)
     without[plain] = solve(smoothed[np.ix_(plain, plain)], right[plain], len(plain) - 1 if free >= 0 else -1)
-    if _misfit(matrix, right, without) - _misfit(matrix, right, found) < LEAST_EVIDENCE:
+    least = max(LEAST_EVIDENCE, LEAST_PER_EXPOSURE * float(seen.lines.exposures.sum()))
+    if _misfit(matrix, right, without) - _misfit(matrix, right, found) < least:
         return replace(model, halo=np.zeros_like(model.halo))
     halo = found[_HALO:-1].reshape(HALO_NODES, -1).astype(np.float32)
     profile = model.profile.copy()

@@ -238,7 +238,7 @@ class Joint:
         assert self._memory is not None, "a map has been estimated"
         quiet = self._quiet(volume, geometry, tables, stripes)
         lines = lines_of(volume, next_lattice(geometry), stripes)
-        bright = bright_lines(volume, geometry, tables, stripes, self._memory.places, self._workers)
+        bright = bright_lines(volume, tables, stripes, self._memory.places, self._workers)
         return Seen(volume, volume.intensity(), quiet, lines, bright)
 
     def _quiet(

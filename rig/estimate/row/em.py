@@ -39,7 +39,8 @@ WIDTH_EVIDENCE = 3.0
 """Natural logarithm of the odds from which the width moves."""
 FIRST_ROUNDS = 8
 LAST_ROUNDS = 3
-"""Rounds over a first sweep: with FIRST_LINES and the line's width, then with LAST_LINES."""
+"""Rounds over a first sweep: with FIRST_LINES and the line's width, then with LAST_LINES and the gains of rows and
+columns. Gains learned from fewer lines are noise, which the extinction cannot be told from."""
 MOST_TRUST = np.float32(0.98)
 """Largest trust in what neighbours say of a stripe, however sure they are: its own row may know better."""
 LEVELS = 14
@@ -140,11 +141,13 @@ def learn_first(volume: CountVolume, geometry: SweepGeometry, ambient: Float32, 
     for extinction in START_EXTINCTIONS_PER_M:
         model = _start(volume, geometry, ambient, extinction)
         for _ in range(2):
-            model = maximise(model, expect(few, geometry, model, workers), spread=True, free_ambient=guessed)
+            seen = expect(few, geometry, model, workers)
+            model = maximise(model, seen, spread=True, free_ambient=guessed, gains=False)
         starts.append((expect(few, geometry, model, workers).evidence, model))
     model = max(starts, key=itemgetter(0))[1]
     for _ in range(FIRST_ROUNDS):
-        model = maximise(model, expect(first, geometry, model, workers), spread=True, free_ambient=guessed)
+        seen = expect(first, geometry, model, workers)
+        model = maximise(model, seen, spread=True, free_ambient=guessed, gains=False)
         model = fit_line_width(few, geometry, model, workers)
     for _ in range(LAST_ROUNDS):
         model = maximise(model, expect(last, geometry, model, workers), spread=False, free_ambient=guessed)
@@ -249,8 +252,8 @@ def maximise(
     """The model that explains the weighted counts best.
 
     spread: whether the amplitude grid may move. free_ambient: whether the level of ambient light was guessed and is
-    learned as well. gains: whether to learn the strength of the haze per row and column; learned from map to map, it
-    drifts.
+    learned as well. gains: whether to learn the strength of the haze per row and column; learned from few lines, or
+    from map to map, it drifts.
     """
     if model.halo.any():
         # Row by row a halo is taken for haze: `rig.estimate.joint.halo` tells one from the other.

@@ -114,7 +114,7 @@ def test_first_and_later_maps_tell_whether_there_is_a_halo(light, other):
     assert np.isfinite(errors).mean() > 0.95
     setting = LearningSetting(joint.used, swept.geometry, 5, False)
     tables = tables_of(setting, WORKERS)
-    seen = bright_lines(swept.volume, swept.geometry, tables, stripes, joint._memory.places, WORKERS)
+    seen = bright_lines(swept.volume, tables, stripes, joint._memory.places, WORKERS)
     assert learn_next_halo(setting, seen, WORKERS) is joint.used
     wrong = first_map(other)[1].used
     assert learn_next_halo(replace(setting, model=wrong), seen, WORKERS).halo.any() == (light == "halo")
