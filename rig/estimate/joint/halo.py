@@ -238,7 +238,7 @@ MOST_PEAK: Final = 2.0
 than thought would be a dimmer stripe with a stronger halo."""
 DETECT_LINES: Final = AGAIN_LINES // 4
 """Clear stripes that tell whether there is a halo."""
-MEASURE_LINES: Final = AGAIN_LINES
+MEASURE_LINES: Final = 4 * AGAIN_LINES
 """Clear stripes that measure it, once the first map has one."""
 FEWEST_LIGHTS: Final = 64
 """Stripes of known light without which a later map says nothing about a halo."""
