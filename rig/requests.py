@@ -83,7 +83,7 @@ def _board_scene() -> str | None:
 class ReconstructRequest:
     """Depth maps of existing frames (`rig reconstruct`)."""
 
-    estimator: str | None = option(None, "argmax, edge, likelihood or joint", unset="as configured, else likelihood")
+    estimator: str | None = option(None, "auto, argmax, edge, likelihood or joint", unset="as configured, else auto")
     filter: str | None = option(None, "none or median (5 x 5)", unset="as configured, else none")
     min_confidence: float | None = option(None, "least confidence in the depth map", unset="as configured, else 0.5")
     accept_calibration: bool = _accept_calibration()

@@ -10,7 +10,7 @@ from calibration.files.rig_file import load_rig_model
 from calibration.model.rig_model import RigModel
 from drivers.replay.pace import Pace
 from rig.config.files import load_cube_plan
-from rig.config.models import CubePlan, EstimateConfig, RigConfig
+from rig.config.models import AUTO, CubePlan, EstimateConfig, RigConfig
 from rig.config.overrides import SIMULATED, Config, PathLike, configure, seed_problems
 from rig.devices.calibration_use import calibration_use, cube_calibration_use
 from rig.devices.open import open_rig, require_simulated_or_armed
@@ -233,11 +233,11 @@ def reconstruct(
 
 def _estimate(request: ReconstructRequest) -> EstimateConfig:
     """The settings for frames alone, which come with none."""
-    estimator, filter = request.estimator or "likelihood", request.filter or "none"
+    estimator, filter = request.estimator or AUTO, request.filter or "none"
     min_confidence = 0.5 if request.min_confidence is None else request.min_confidence
     problems = []
-    if estimator not in ESTIMATORS:
-        problems.append(f"estimator {estimator!r} is unknown; choose one of {', '.join(ESTIMATORS)}")
+    if estimator not in (AUTO, *ESTIMATORS):
+        problems.append(f"estimator {estimator!r} is unknown; choose one of {', '.join((AUTO, *ESTIMATORS))}")
     if filter not in FILTERS:
         problems.append(f"filter {filter!r} is unknown; choose one of {', '.join(FILTERS)}")
     if not 0 <= min_confidence <= 1:

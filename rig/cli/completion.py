@@ -18,7 +18,7 @@ def names(kind: Kind) -> Iterable[str]:
         return (one.name for one in (bundled_rigs if kind == "config" else bundled_scenes)())
     from rig.estimate.registry import ESTIMATORS, FILTERS
 
-    return ESTIMATORS if kind == "estimator" else FILTERS
+    return ("auto", *ESTIMATORS) if kind == "estimator" else FILTERS
 
 
 def one_of(kind: Kind) -> Callable[[str], list[str]]:

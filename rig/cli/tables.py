@@ -147,8 +147,9 @@ def _of_maps(maps: tuple[int, ...], of: int) -> str:
 
 def _rows(summary: Summary) -> list[tuple[str, str]]:
     frames = summary.frames
+    estimator = summary.estimator + (f" ({summary.estimator_why})" if summary.estimator_why else "")
     rows = [
-        ("maps", f"{summary.maps} of {summary.columns} columns x {summary.exposures} exposures, {summary.estimator}"),
+        ("maps", f"{summary.maps} of {summary.columns} columns x {summary.exposures} exposures, {estimator}"),
         ("frames", f"{frames.received} received, {frames.lost} lost, {frames.lit} on columns"),
         (
             "time",

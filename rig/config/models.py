@@ -60,7 +60,9 @@ LineOffsets = Annotated[
 MIN_DARK_FRACTION = 0.05
 """Share of a live sweep's frames that must be dark: the dark rate is learned from them."""
 
-Estimator = Literal["argmax", "edge", "likelihood", "joint"]
+AUTO = "auto"
+"""The estimator that stands for `joint` where it keeps up, else for `likelihood`."""
+Estimator = Literal["auto", "argmax", "edge", "likelihood", "joint"]
 Filter = Literal["none", "median"]
 
 
@@ -153,9 +155,7 @@ class ScanConfig(ConfigSection):
 class EstimateConfig(ConfigSection):
     """Settings of the estimate, which turns counts into depth."""
 
-    estimator: Estimator = Field(
-        default="likelihood", description="how the stripe is found on each row", examples=["likelihood"]
-    )
+    estimator: Estimator = Field(default=AUTO, description="how the stripe is found on each row", examples=["joint"])
     filter: Filter = Field(
         default="none", description="what is done to the stripe positions afterwards", examples=["median"]
     )

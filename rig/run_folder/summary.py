@@ -133,7 +133,7 @@ class Summary:
     value.
 
     verdict_reasons: reasons against maps, found in the maps themselves. accepted_calibration: reasons against the
-    calibration that the user accepted.
+    calibration that the user accepted. estimator_why: reason for the estimator, if the run chose it itself.
     """
 
     maps: int
@@ -155,12 +155,13 @@ class Summary:
     replay: PaceReport | None = None
     verdict_reasons: tuple[Doubt, ...] = ()
     accepted_calibration: tuple[str, ...] = ()
+    estimator_why: str = ""
 
     def as_json(self) -> dict[str, Any]:
         """The summary as plain values. `truth` is there only if known, some other keys only for a scan or a replay."""
         content = asdict(self)
         content["verdict"] = self.verdict.value
-        optional = ("truth", "stages", "sync", "replay", "verdict_reasons", "accepted_calibration")
+        optional = ("truth", "stages", "sync", "replay", "verdict_reasons", "accepted_calibration", "estimator_why")
         return {name: value for name, value in content.items() if value or name not in optional}
 
 
@@ -181,6 +182,7 @@ class MapTally:
     exposures: int
     estimator: str
     filter: str
+    estimator_why: str = ""
     _maps: list[_OfMap] = field(default_factory=list)
 
     @property
@@ -240,6 +242,7 @@ class MapTally:
             replay=replay,
             verdict_reasons=self.doubts,
             accepted_calibration=accepted_calibration,
+            estimator_why=self.estimator_why,
         )
 
 

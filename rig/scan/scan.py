@@ -7,7 +7,7 @@ at the end what came and what was lost. `devices_content` describes the devices 
 import math
 from collections.abc import Iterator, Sequence
 from contextlib import closing
-from dataclasses import asdict
+from dataclasses import asdict, replace
 from pathlib import Path
 from typing import Any, Final
 
@@ -19,7 +19,7 @@ from drivers.interfaces import SpadTiming, SweepTruth
 from drivers.replay.pace import PaceReport
 from drivers.replay.spad import ReplaySpad
 from drivers.spb1 import BlockLayout, frames_per_block
-from rig.config.models import EstimateConfig
+from rig.config.models import AUTO, EstimateConfig
 from rig.count.sweeps import Gap, SweepAccount
 from rig.depth.reconstruct import Reconstructor
 from rig.depth.warm_up import warm_binding, warm_up
@@ -38,6 +38,7 @@ from rig.recording.segment import Space, paged
 from rig.requests import RunRequest
 from rig.run_folder.folder import SavePolicy
 from rig.scan.acquisition import SILENCE_S, Acquisition, AcquisitionRequest
+from rig.scan.estimator import choose_estimator
 from rig.scan.monitor import NOBODY, Listeners
 from rig.scan.pipeline import FEWEST_SLOTS, Overload, require_policy
 from rig.scan.run import Run, RunResult, frames_of, frames_that_came, sweep_content, synchronisation_of, verdict_of
@@ -67,6 +68,7 @@ def run_scan(
     here = identity_of(rig)
     calibration = calibration_use(rig, accept=request.accept_calibration, here=here)
     plan, timing = prepared or prepare(rig)
+    rig = with_estimator(rig, run, plan, request.maps)
     estimate = rig.config.estimate
     source: LiveSource | ReplaySource = LiveSource(rig, plan, request.maps)
     if isinstance(rig.spad, ReplaySpad):
@@ -206,7 +208,27 @@ def recording_space(
 
 def _first_alone(rig: OpenRig) -> bool:
     """Whether the first map gets a start of its own: a live stream cannot stand still while its map is learned from."""
-    return rig.config.estimate.estimator in LEARNING and not rig.spad.info.can_wait
+    return rig.config.estimate.estimator in (AUTO, *LEARNING) and not rig.spad.info.can_wait
+
+
+def with_estimator(rig: OpenRig, run: Run, plan: ScanPlan, maps: int | None) -> OpenRig:
+    """The rig with the estimator that `auto` stands for in this run, which is told of it."""
+    asked = rig.config.estimate
+    if asked.estimator != AUTO:
+        return rig
+    joint = make_reconstructor(rig, plan, asked.model_copy(update={"estimator": "joint"}))
+    chosen = choose_estimator(
+        AUTO,
+        joint.geometry,
+        can_wait=rig.spad.info.can_wait,
+        maps=maps,
+        sweep_s=float(plan.sweep_s),
+        threads=asked.threads,
+    )
+    run.tally.estimator, run.tally.estimator_why = chosen.name, chosen.why
+    tell_stage(f"estimator {chosen.name}, {chosen.why}")
+    estimate = asked.model_copy(update={"estimator": chosen.name})
+    return replace(rig, config=rig.config.model_copy(update={"estimate": estimate}))
 
 
 def make_reconstructor(
