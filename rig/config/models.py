@@ -11,7 +11,7 @@ of the frames. `scan.command_range` is the range of the mirror, and line l's col
 from collections.abc import Sequence
 from itertools import pairwise
 from pathlib import Path
-from typing import Annotated, Any, Literal, Self
+from typing import Annotated, Any, Final, Literal, Self
 
 from pydantic import (
     AfterValidator,
@@ -60,7 +60,7 @@ LineOffsets = Annotated[
 MIN_DARK_FRACTION = 0.05
 """Share of a live sweep's frames that must be dark: the dark rate is learned from them."""
 
-AUTO = "auto"
+AUTO: Final = "auto"
 """The estimator that stands for `joint` where it keeps up, else for `likelihood`."""
 Estimator = Literal["auto", "argmax", "edge", "likelihood", "joint"]
 Filter = Literal["none", "median"]
@@ -179,7 +179,7 @@ class EstimateConfig(ConfigSection):
     @classmethod
     def _prior_is_of_joint(cls, value: bool, info: ValidationInfo) -> bool:
         estimator = info.data.get("estimator", "joint")  # absent where it is itself a problem
-        if value and estimator != "joint":
+        if value and estimator not in (AUTO, "joint"):
             raise ValueError(
                 f"is for the estimator joint, this is {estimator}; choose estimator joint or leave the prior off"
             )

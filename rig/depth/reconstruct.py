@@ -40,6 +40,19 @@ class MapResult:
     doubts: tuple[str, ...] = ()
 
 
+def map_geometry(
+    model: RigModel | None, column_commands: Sequence[float] | Float64, depth_range_m: tuple[float, float], *,
+    sensor: tuple[int, int] | None = None, lines: LineGrid | None = None,
+) -> SweepGeometry:  # fmt: skip
+    """Geometry of maps; arguments as of `Reconstructor`. Raises UsageError without model and sensor."""
+    if model is None:
+        if sensor is None:
+            raise UsageError("without a calibration the sensor size (rows, width) must be given")
+        return uncalibrated_geometry(*sensor, len(column_commands))
+    geometry = sweep_geometry(model, np.asarray(column_commands, dtype=np.float64), depth_range_m)
+    return geometry if lines is None else replace(geometry, others=lines.others(geometry.plane))
+
+
 class Reconstructor:
     """Turns counted sweeps into maps, one after the other; estimators that learn carry their state from map to map.
 
@@ -72,14 +85,7 @@ class Reconstructor:
             self.estimator = recalling(estimate.estimator, learned, threads, temporal_prior=prior)
         else:
             self.estimator = create_estimator(estimate.estimator, threads, temporal_prior=prior)
-        if model is not None:
-            self.geometry = sweep_geometry(model, self._commands, depth_range_m)
-            if lines is not None:
-                self.geometry = replace(self.geometry, others=lines.others(self.geometry.plane))
-        elif sensor is not None:
-            self.geometry = uncalibrated_geometry(*sensor, len(self._commands))
-        else:
-            raise UsageError("without a calibration the sensor size (rows, width) must be given")
+        self.geometry = map_geometry(model, self._commands, depth_range_m, sensor=sensor, lines=lines)
         self._checks = MapChecks(self.geometry, calibrated=model is not None, knows=estimate.estimator in LEARNING)
 
     def counter(self, layout: SweepLayout) -> Counter:

@@ -1,16 +1,14 @@
 """Makes depth maps from a cube of frames without records, map by map."""
 
-import math
 import time
 
 from rig.config.models import EstimateConfig
 from rig.count.sweeps import Gap
 from rig.count.volume import SweepLayout
-from rig.depth.reconstruct import Reconstructor
+from rig.depth.reconstruct import Reconstructor, map_geometry
 from rig.depth.warm_up import warm_up
 from rig.devices.calibration_use import CalibrationUse, accepted_by
 from rig.estimate.registry import LEARNING
-from rig.geometry.windows import sweep_geometry
 from rig.progress import Progress, counted, tell_stage
 from rig.recording.cube import Cube, column_commands, count_map
 from rig.run_folder.summary import MapTally, RunFrames
@@ -27,15 +25,11 @@ def reconstruct_cube(
     """
     plan, model = cube.plan, calibration.model
     commands = column_commands(plan)
-    chosen = choose_estimator(
-        estimate.estimator, sweep_geometry(model, commands, plan.depth_range), can_wait=True, maps=cube.maps,
-        sweep_s=math.inf, threads=estimate.threads,
-    )  # fmt: skip
-    estimate = estimate.model_copy(update={"estimator": chosen.name})
+    estimate, why = choose_estimator(estimate, map_geometry(model, commands, plan.depth_range))
     reconstructor = Reconstructor(model, commands, plan.depth_range, estimate)
     warm_up(estimate.estimator, estimate.filter, plan.exposures, dark=False)
     geometry = reconstructor.geometry
-    tally = MapTally(plan.columns, plan.exposures, chosen.name, estimate.filter, chosen.why)
+    tally = MapTally(plan.columns, plan.exposures, estimate.estimator, estimate.filter, why)
     counter = reconstructor.counter(
         SweepLayout(
             plan.columns, geometry.rows, geometry.width, geometry.x0, geometry.window, plan.exposures, dark=False

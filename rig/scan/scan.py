@@ -19,9 +19,9 @@ from drivers.interfaces import SpadTiming, SweepTruth
 from drivers.replay.pace import PaceReport
 from drivers.replay.spad import ReplaySpad
 from drivers.spb1 import BlockLayout, frames_per_block
-from rig.config.models import AUTO, EstimateConfig
+from rig.config.models import EstimateConfig
 from rig.count.sweeps import Gap, SweepAccount
-from rig.depth.reconstruct import Reconstructor
+from rig.depth.reconstruct import Reconstructor, map_geometry
 from rig.depth.warm_up import warm_binding, warm_up
 from rig.devices.calibration_use import accepted_by, calibration_use, identity_of, rig_content
 from rig.devices.open import OpenRig
@@ -68,8 +68,15 @@ def run_scan(
     here = identity_of(rig)
     calibration = calibration_use(rig, accept=request.accept_calibration, here=here)
     plan, timing = prepared or prepare(rig)
-    rig = with_estimator(rig, run, plan, request.maps)
-    estimate = rig.config.estimate
+    in_time_s = math.inf if rig.spad.info.can_wait or request.maps == 1 else float(plan.sweep_s)
+    geometry = map_geometry(
+        rig.model, plan.commands, plan.depth_range_m, sensor=(plan.rows, plan.width), lines=plan.lines
+    )
+    estimate, why = choose_estimator(rig.config.estimate, geometry, in_time_s)
+    if why:
+        tell_stage(f"{estimate.estimator}: {why}")
+    rig = replace(rig, config=rig.config.model_copy(update={"estimate": estimate}))
+    run.tally.estimator, run.tally.estimator_why = estimate.estimator, why
     source: LiveSource | ReplaySource = LiveSource(rig, plan, request.maps)
     if isinstance(rig.spad, ReplaySpad):
         source = ReplaySource(rig.spad, plan, request.maps, estimate, rig.model)
@@ -208,27 +215,7 @@ def recording_space(
 
 def _first_alone(rig: OpenRig) -> bool:
     """Whether the first map gets a start of its own: a live stream cannot stand still while its map is learned from."""
-    return rig.config.estimate.estimator in (AUTO, *LEARNING) and not rig.spad.info.can_wait
-
-
-def with_estimator(rig: OpenRig, run: Run, plan: ScanPlan, maps: int | None) -> OpenRig:
-    """The rig with the estimator that `auto` stands for in this run, which is told of it."""
-    asked = rig.config.estimate
-    if asked.estimator != AUTO:
-        return rig
-    joint = make_reconstructor(rig, plan, asked.model_copy(update={"estimator": "joint"}))
-    chosen = choose_estimator(
-        AUTO,
-        joint.geometry,
-        can_wait=rig.spad.info.can_wait,
-        maps=maps,
-        sweep_s=float(plan.sweep_s),
-        threads=asked.threads,
-    )
-    run.tally.estimator, run.tally.estimator_why = chosen.name, chosen.why
-    tell_stage(f"estimator {chosen.name}, {chosen.why}")
-    estimate = asked.model_copy(update={"estimator": chosen.name})
-    return replace(rig, config=rig.config.model_copy(update={"estimate": estimate}))
+    return rig.config.estimate.estimator in LEARNING and not rig.spad.info.can_wait
 
 
 def make_reconstructor(
