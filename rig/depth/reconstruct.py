@@ -58,7 +58,8 @@ class Reconstructor:
 
     model: rig model; None for an uncalibrated rig, which gives stripes only and needs sensor (rows, width).
     column_commands: (columns,) mirror command of each column's centre. learned: states of earlier maps to use. lines:
-    which line lights which column, if there are several. Raises UsageError without model and sensor.
+    which line lights which column, if there are several. The estimator must be named (`rig.scan.estimator` chooses for
+    `auto`). Raises UsageError without model and sensor.
     """
 
     def __init__(

@@ -130,7 +130,7 @@ def test_an_interrupt_exits_4(rig: Rig, wall: Path, monkeypatch: pytest.MonkeyPa
     [
         ({"columns": 183, "exposures": 1}, [], "61 planes, the plan 183 columns"),
         ({"depth_range": ["2 m", "2 m"]}, [], "depth_range runs from 2 m to 2 m; it must be [near, far]"),
-        ({}, ["--estimator", "best"], "estimator 'best' is unknown; choose one of argmax, edge, likelihood"),
+        ({}, ["--estimator", "best"], "estimator 'best' is unknown; choose one of auto, argmax, edge"),
         ({}, ["--filter", "best"], "filter 'best' is unknown; choose one of "),
         ({}, ["--min-confidence", "-0.1"], "min_confidence is -0.1; it is a probability from 0 to 1"),
     ],

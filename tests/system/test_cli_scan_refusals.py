@@ -64,7 +64,7 @@ def test_a_bad_config_is_refused_in_a_line_and_nothing_is_left(
         (["--seed", "-3"], "seed is -3; it must be 0 or more"),
         (["--seed", str(2**63)], "at most 2^63 - 1"),
         (["--dry-run", "--save", "never"], "write 'all', 'last' or 'every N'"),
-        (["--estimator", "best"], "choose 'argmax', 'edge'"),
+        (["--estimator", "best"], "choose 'auto', 'argmax'"),
         (["--save", "every", "0"], "'every N' with N of 1 or more"),
     ],
 )

@@ -91,7 +91,7 @@ def test_all_problems_are_listed_at_once_in_the_order_of_the_file(write):
         (("  frame_rate: 97.7 kHz\n", ""), "'scan.frame_rate' is missing; write for example 'frame_rate: 100 kHz'"),
         (("name: test", "estimate: {estimator: likelyhood}\nname: t"), "did you mean 'likelihood'?"),
         (
-            ("name: test", "estimate: {temporal_prior: true}\nname: t"),
+            ("name: test", "estimate: {estimator: edge, temporal_prior: true}\nname: t"),
             "estimate.temporal_prior is for the estimator joint",
         ),
         (("sync: {kind: simulated}", "sync: {}"), "sync has no 'kind'; add one of: prawndo, replay, simulated"),

@@ -5,19 +5,20 @@ import numpy as np
 import pytest
 
 from rig.config.models import EstimateConfig
-from rig.depth.reconstruct import MapResult, Reconstructor
+from rig.depth.reconstruct import MapResult, Reconstructor, map_geometry
 from rig.depth.warm_up import warm_up
 from rig.errors import UsageError
 from tests.reference.geometry import DEPTH_RANGE_M
 from tests.stability.inventory import covers
 from tests.unit.small_maps import rig_model, simulated, volume_of
 
-covers(Reconstructor, warm_up)
+covers(Reconstructor, map_geometry, warm_up)
 
 
 def reconstructor(sweep, **options) -> Reconstructor:
     g = sweep.point.geometry
-    return Reconstructor(rig_model(g), np.arange(g.columns), DEPTH_RANGE_M, EstimateConfig(threads=2, **options))
+    estimate = EstimateConfig(threads=2, **{"estimator": "likelihood", **options})
+    return Reconstructor(rig_model(g), np.arange(g.columns), DEPTH_RANGE_M, estimate)
 
 
 @cache
@@ -28,7 +29,7 @@ def mapped(light="report", exposures=10, rig="left", **options) -> MapResult:
 
 def test_without_a_model_the_sensor_size_is_asked_for():
     with pytest.raises(UsageError, match=re.escape("sensor size (rows, width) must be given")):
-        Reconstructor(None, np.arange(5), DEPTH_RANGE_M, EstimateConfig())
+        Reconstructor(None, np.arange(5), DEPTH_RANGE_M, EstimateConfig(estimator="edge"))
 
 
 @pytest.mark.parametrize("estimator", ["argmax", "edge", "likelihood", "joint"])
