@@ -42,7 +42,7 @@ from rig.threads import RowWorkers
 
 LESSONS = 2
 """Times that the first map's stripes teach the model that they are then estimated with again."""
-HALO_LESSONS = 3
+HALO_LESSONS = 4
 """The same where a halo was found."""
 AGREE_PX = np.float32(1.0)
 """Under a halo a stripe teaches only if its surroundings alone put it within so many pixels."""
