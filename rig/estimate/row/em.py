@@ -166,7 +166,7 @@ def learn_next(
 ) -> tuple[RowModel, Expectation]:
     """The model updated with the lines of `next_lattice` of one more sweep.
 
-    before: what was learned from earlier sweeps. It is returned with this sweep's added, and fades by half per sweep.
+    before: what was learned from earlier sweeps. It is returned with this sweep's added, and fades by FADE per sweep.
     The line width is not changed if neighbours say where the line is, since their answer depends on the width.
     """
     seen = expect(lines, geometry, model, workers)
