@@ -3,22 +3,17 @@
 Each command is one call of `rig.api` and some printing. Results go to stdout, everything else to stderr. Exit codes: 0
 done, 1 result not trustworthy, 2 bad usage or config, 3 device error, 4 aborted, 70 an error in the program itself.
 Nothing heavy is imported before a command runs.
-
-Service accounts and containers often have no folder in which numba can store compiled kernels, and numba then refuses
-to compile at all. `ensure_kernel_cache` provides one.
 """
 
 import logging
 import os
 import signal
 import sys
-import tempfile
 import threading
 import traceback
 from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
 from itertools import pairwise
-from pathlib import Path
 from typing import Annotated
 
 import typer
@@ -56,7 +51,6 @@ def main(argv: Sequence[str] | None = None) -> None:
     logging.basicConfig(level=logging.WARNING, stream=sys.stderr, format="%(levelname)s: %(message)s")
     # Matrices are small here: on two cores numpy's own threads made some steps take up to 30 times as long.
     os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
-    ensure_kernel_cache()
     with _signals_interrupt():
         try:
             _require_no_empty(arguments)
@@ -165,34 +159,3 @@ def _join_save(arguments: list[str]) -> list[str]:
         if arguments[i : i + 2] == ["--save", "every"]:
             return [*arguments[: i + 1], f"every {arguments[i + 2]}", *arguments[i + 3 :]]
     return arguments
-
-
-VARIABLE = "NUMBA_CACHE_DIR"
-"""Numba's own setting, see its manual; a value that the user has set is left alone."""
-
-
-def ensure_kernel_cache() -> None:
-    """Give numba a private temporary folder if it would find none. Call it before numba is imported."""
-    package = Path(__file__).parent
-    home = Path(os.environ.get("XDG_CACHE_HOME") or Path("~/.cache").expanduser())
-    if VARIABLE in os.environ or _writable(package / "__pycache__") or _writable(home):
-        return
-    os.environ[VARIABLE] = str(_private_folder())
-
-
-def _writable(folder: Path) -> bool:
-    """Whether the folder, or the nearest one above it that exists, can be written."""
-    while not folder.exists() and folder != folder.parent:
-        folder = folder.parent
-    return folder.is_dir() and os.access(folder, os.W_OK)
-
-
-def _private_folder() -> Path:
-    """A folder that only this user can write: kernels are code, and temporary folders are everybody's."""
-    user = os.getuid() if hasattr(os, "getuid") else 0
-    folder = Path(tempfile.gettempdir()) / f"spadrig-kernels-{user}"
-    folder.mkdir(mode=0o700, exist_ok=True)
-    seen = folder.lstat()
-    if hasattr(os, "getuid") and (seen.st_uid != user or seen.st_mode & 0o077 or folder.is_symlink()):
-        return Path(tempfile.mkdtemp(prefix="spadrig-kernels-"))
-    return folder

@@ -7,16 +7,19 @@ is counted completely and estimated twice, because the first pass finds which pi
 later map is judged column by column while its frames come in, with a model learned from earlier maps alone.
 """
 
+import numpy as np
+
 from rig.count.volume import BYTE_EXPOSURES, Counter, CountVolume, SweepCounter, SweepLayout
 from rig.estimate.row.em import lines_of, next_lattice
-from rig.estimate.row.model import RowModel
+from rig.estimate.row.model import RowModel, line_profile
+from rig.estimate.search.confidence import believed
 from rig.estimate.search.online_learning import LearningSetting, OnlineLearner, Seen, first_model
-from rig.estimate.search.prepare import judge_of
+from rig.estimate.search.prepare import judge_of, signal_reach
 from rig.estimate.search.rows import SearchTables
 from rig.estimate.search.stream import ColumnJudge, SearchedSweep, search_volume
 from rig.geometry.stripe_table import StripeTable
 from rig.geometry.windows import SweepGeometry
-from rig.simd import Float64, Int32, Uint8
+from rig.simd import Float32, Float64, Int32, Uint8
 from rig.threads import RowWorkers
 
 
@@ -30,6 +33,7 @@ class Likelihood:
     def __init__(self, threads: int = 2, model: RowModel | None = None, *, learns: bool = True) -> None:
         self._workers = RowWorkers(threads)
         self._lessons = OnlineLearner(_judge, model, learns=learns)
+        self._at: tuple[SweepGeometry, Float32] | None = None
         self.used: RowModel | None = None
         """The state that the last map was estimated with."""
 
@@ -58,10 +62,20 @@ class Likelihood:
             stripes, quiet = search_volume(sweep, geometry, self._lessons.tables(setting, self._workers), self._workers)
             lines = lines_of(sweep, next_lattice(geometry))
         self.used = used
+        stripes = believed(
+            stripes, self._reference(geometry), sweep.n_frames, float(np.median(used.ambient)),
+            2 * signal_reach(line_profile(used.line_sigma_px)) + 1, self._workers,
+        )  # fmt: skip
         self._lessons.attend(
             stripes, used, int(sweep.n_frames.sum()), lambda: Seen(sweep, sweep.intensity(), quiet, lines)
         )
         return stripes
+
+    def _reference(self, geometry: SweepGeometry) -> Float32:
+        """The geometry's `reference_px`, computed once while the geometry stays the same."""
+        if self._at is None or self._at[0] is not geometry:
+            self._at = geometry, geometry.reference_px().astype(np.float32)
+        return self._at[1]
 
     def judge(self, geometry: SweepGeometry, exposures: int, *, dark: bool) -> SearchTables:
         """Tables of the search under the present model; made once per model."""

@@ -8,6 +8,7 @@ the time of a sweep. How fast `joint` is on this machine and with these threads 
 import math
 import os
 import time
+from dataclasses import replace
 
 import numpy as np
 
@@ -15,12 +16,13 @@ from calibration.errors import digits
 from rig.config.models import AUTO, EstimateConfig
 from rig.count.volume import CountVolume
 from rig.errors import UsageError
-from rig.geometry.windows import SweepGeometry, uncalibrated_geometry
+from rig.geometry.windows import SweepGeometry
 
-KEPT_UP = 0.7
+KEPT_UP = 0.5
 """Share of a sweep's time that a map of `joint` may take; the rest is for counting and for a busy moment."""
-ROWS, COLUMNS, WIDTH, EXPOSURES = 128, 160, 128, 10
-"""Size of the map that is timed: some milliseconds."""
+ROWS, COLUMNS = 128, 160
+"""Part of the picture, at most, whose map is timed: some milliseconds."""
+MOST_EXPOSURES = 10
 TRIES = 3
 
 
@@ -43,35 +45,49 @@ def _choice(estimate: EstimateConfig, geometry: SweepGeometry, map_time_s: float
     if estimate.temporal_prior:
         return "joint", "it alone has a temporal prior"
     try:
-        labels = grid_of(geometry).x_far.size * grid_of(geometry).labels
+        grid_of(geometry)
     except UsageError:
         return "likelihood", "joint would take too much memory"
     if math.isinf(map_time_s):
         return "joint", "no frame waits for its maps"
-    took_s = labels * seconds_per_label(estimate.threads or os.cpu_count() or 1)
+    took_s = time_of_map(geometry, estimate.threads or os.cpu_count() or 1)
     name = "joint" if took_s <= KEPT_UP * map_time_s else "likelihood"
     return name, f"a map of joint takes {digits(1e3 * took_s, 2)} ms, a sweep {digits(1e3 * map_time_s, 2)} ms"
 
 
-def seconds_per_label(threads: int) -> float:
-    """Time that `joint` takes on this machine for one label of one row and column of a later map."""
+def time_of_map(geometry: SweepGeometry, threads: int) -> float:
+    """Seconds that a later map of `joint` takes on this machine, without a halo: a part of the picture is timed."""
     from rig.estimate.joint.joint import Joint
-    from rig.estimate.joint.tables import grid_of
+    from rig.estimate.row.em import start_model
 
-    geometry = uncalibrated_geometry(ROWS, WIDTH, COLUMNS)
-    rate = np.full((COLUMNS, ROWS, WIDTH), 0.05)
-    rate[:, :, WIDTH // 2] = 0.95
+    part = _middle(geometry)
+    rate = np.full((part.columns, part.rows, part.window), 0.05)
+    column, row = np.meshgrid(np.arange(part.columns), np.arange(part.rows), indexing="ij")
+    rate[column, row, (part.x_lo + part.x_hi).T // 2 - part.x0[:, None]] = 0.95
     sweep = CountVolume(
-        counts=np.random.default_rng(0).binomial(EXPOSURES, rate).astype(np.uint8), x0=geometry.x0,
-        n_frames=np.full(COLUMNS, EXPOSURES, np.int32), column=np.arange(float(COLUMNS)), dark_counts=None, n_dark=0,
-        width=WIDTH, exposures=EXPOSURES,
+        counts=np.random.default_rng(0).binomial(MOST_EXPOSURES, rate).astype(np.uint8), x0=part.x0,
+        n_frames=np.full(part.columns, MOST_EXPOSURES, np.int32), column=np.arange(float(part.columns)),
+        dark_counts=None, n_dark=0, width=part.width, exposures=MOST_EXPOSURES,
     )  # fmt: skip
-    first = Joint(threads)
-    first.estimate(sweep, geometry)
-    later, took_s = Joint(threads, first.used, learns=False), []
+    model = start_model(sweep, part, np.full((part.rows, part.width), 0.05, np.float32), 0.0)
+    later, took_s = Joint(threads, model, learns=False), []
     for _ in range(1 + TRIES):
         begun = time.perf_counter()
-        later.estimate(sweep, geometry)
+        later.estimate(sweep, part)
         took_s.append(time.perf_counter() - begun)
-    grid = grid_of(geometry)
-    return min(took_s[1:]) / (grid.x_far.size * grid.labels)
+    return min(took_s[1:]) * (geometry.rows * geometry.columns) / (part.rows * part.columns)
+
+
+def _middle(geometry: SweepGeometry) -> SweepGeometry:
+    """The middle rows and columns of a sweep, whole if it is small."""
+    rows, columns = (
+        slice((whole - min(whole, most)) // 2, (whole + min(whole, most)) // 2)
+        for whole, most in ((geometry.rows, ROWS), (geometry.columns, COLUMNS))
+    )
+    return replace(
+        geometry, u=geometry.u[rows], v=geometry.v[rows], plane=geometry.plane[columns],
+        planes=geometry.planes[columns], x_lo=np.ascontiguousarray(geometry.x_lo[rows, columns]),
+        x_hi=np.ascontiguousarray(geometry.x_hi[rows, columns]), x0=geometry.x0[columns],
+        defects=geometry.defects[rows], light=None,
+        others=None if geometry.others is None else geometry.others[columns],
+    )  # fmt: skip

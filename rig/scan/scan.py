@@ -19,7 +19,7 @@ from drivers.interfaces import SpadTiming, SweepTruth
 from drivers.replay.pace import PaceReport
 from drivers.replay.spad import ReplaySpad
 from drivers.spb1 import BlockLayout, frames_per_block
-from rig.config.models import EstimateConfig
+from rig.config.models import AUTO, EstimateConfig
 from rig.count.sweeps import Gap, SweepAccount
 from rig.depth.reconstruct import Reconstructor, map_geometry
 from rig.depth.warm_up import warm_binding, warm_up
@@ -68,11 +68,10 @@ def run_scan(
     here = identity_of(rig)
     calibration = calibration_use(rig, accept=request.accept_calibration, here=here)
     plan, timing = prepared or prepare(rig)
-    in_time_s = math.inf if rig.spad.info.can_wait or request.maps == 1 else float(plan.sweep_s)
     geometry = map_geometry(
         rig.model, plan.commands, plan.depth_range_m, sensor=(plan.rows, plan.width), lines=plan.lines
     )
-    estimate, why = choose_estimator(rig.config.estimate, geometry, in_time_s)
+    estimate, why = choose_estimator(rig.config.estimate, geometry, _map_time_s(rig, plan, request.maps))
     if why:
         tell_stage(f"{estimate.estimator}: {why}")
     rig = replace(rig, config=rig.config.model_copy(update={"estimate": estimate}))
@@ -213,9 +212,18 @@ def recording_space(
     return Space.on_disk_of(folder, frames_bytes, map_bytes * save.count(source.maps))
 
 
+def _map_time_s(rig: OpenRig, plan: ScanPlan, maps: int | None) -> float:
+    """Seconds in which each map must be made, infinite if no frame waits for it; a replay can have a clock to keep."""
+    speed = None if rig.spad.info.can_wait else 1.0
+    if isinstance(rig.spad, ReplaySpad):
+        speed = rig.spad.pace.speed
+    return math.inf if speed is None or maps == 1 else float(plan.sweep_s) / speed
+
+
 def _first_alone(rig: OpenRig) -> bool:
     """Whether the first map gets a start of its own: a live stream cannot stand still while its map is learned from."""
-    return rig.config.estimate.estimator in LEARNING and not rig.spad.info.can_wait
+    learns = rig.config.estimate.estimator in (AUTO, *LEARNING)  # `auto` becomes one of those
+    return learns and not rig.spad.info.can_wait
 
 
 def make_reconstructor(

@@ -26,9 +26,12 @@ def test_the_default_scan_is_accurate_and_stays_below_two_gib(tmp_path: Path) ->
     assert done.returncode == 0, done.stderr
     summary = json.loads(done.stdout)
     assert summary["verdict"] == "complete"
-    assert summary["truth"]["stripe_error_px"]["mean_abs"] < 0.5
+    assert (summary["estimator"], summary["estimator_why"]) == ("joint", "no frame waits for its maps")
+    assert summary["truth"]["stripe_error_px"]["mean_abs"] < 0.1
     assert summary["truth"]["stripe_error_px"]["missing"] <= 0.05
     (folder,) = (tmp_path / "runs").iterdir()
+    manifest = json.loads((folder / "manifest.json").read_text())
+    assert manifest["config"]["estimate"]["estimator"] == "joint"
     for name in ("depth/000000.png", "intensity/000000.png", "cloud/000000.ply", "learned/000000.npz"):
         assert (folder / name).stat().st_size > 1000
     assert int(done.stderr.splitlines()[-1]) < LARGEST_KIB

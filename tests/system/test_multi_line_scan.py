@@ -89,3 +89,12 @@ def test_lines_that_leave_gaps_are_a_usage_error(two_lines: Path, rig: Rig) -> N
     assert ran.code == 2
     assert len(ran.problems) == 1
     assert "what lies between them is never lit; widen it to 0.8" in ran.problems[0]
+
+
+def test_four_lines_at_few_exposures_are_told_apart() -> None:
+    """Which of four haze densities a first map begins with is decided on little light here."""
+    result = api.scan("simulated-4-lines", exposures=3)
+    assert result.last is not None
+    assert result.truth is not None
+    error = np.abs(result.last.stripe.x_px - result.truth.x_px)
+    assert np.nanmean(error) < 0.2

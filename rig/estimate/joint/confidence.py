@@ -45,9 +45,9 @@ import numba
 import numpy as np
 
 from rig.estimate.joint.place.places import LIGHT_PX, Places
-from rig.estimate.joint.place.pool import COPIED_ROWS, MARGIN, SAME_PX, with_margin
 from rig.estimate.joint.winner import UNITS, LabelAnswers
 from rig.estimate.row.model import RowModel
+from rig.estimate.row.neighbours import COPIED_ROWS, MARGIN, SAME_PX, with_margin
 from rig.geometry.stripe_table import StripeTable
 from rig.simd import Bools, Float32, Int16, Int32
 from rig.simd.functions import error_function, exponential, logarithm

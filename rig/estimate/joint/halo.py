@@ -33,7 +33,6 @@ import numpy as np
 from rig.count.volume import Counts, CountVolume
 from rig.estimate.joint.place.light import FRACTIONS
 from rig.estimate.joint.place.places import BLIND_FLUX, REACH_PX, Places
-from rig.estimate.joint.place.pool import SAME_PX
 from rig.estimate.joint.tables import JointTables
 from rig.estimate.row.em import AGAIN_LINES, PIECES, lines_of
 from rig.estimate.row.inputs import (
@@ -48,6 +47,7 @@ from rig.estimate.row.inputs import (
     sweep_of,
 )
 from rig.estimate.row.model import BINS, HALO_NODES, HALO_REACHES_PX, RowModel, fit_haze
+from rig.estimate.row.neighbours import SAME_PX
 from rig.estimate.search.online_learning import LearningSetting
 from rig.geometry.stripe_table import StripeTable
 from rig.geometry.windows import SweepGeometry, evenly_spread

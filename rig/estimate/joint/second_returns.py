@@ -22,9 +22,10 @@ import numpy as np
 from rig.count.volume import Counts, CountVolume
 from rig.estimate.joint.labels.costs import hot_in_bands
 from rig.estimate.joint.labels.grid import PER_PX, LabelGrid
-from rig.estimate.joint.place.pool import pool_row, with_margin
+from rig.estimate.joint.place.pool import pool_row
 from rig.estimate.joint.second_return_blocks import BLOCK, HAZE_STEP, LEFT_OUT, Blocks, line_places, sum_blocks
 from rig.estimate.row.inputs import RowState, Sweep, fluxes_at, line_light
+from rig.estimate.row.neighbours import with_margin
 from rig.geometry.kernels import with_rays
 from rig.simd import Float32, Float64, Int16, Int32
 from rig.simd.memory import address_of, aligned_zeros, load_float32, store_float32

@@ -25,8 +25,9 @@ from rig.geometry.windows import SweepGeometry, evenly_spread
 from rig.simd import Float32, Float64, Int32
 from rig.threads import RowWorkers
 
-START_LINES = 512
-"""Lines (rows x columns) that tell which start of a first sweep is the likeliest, and how wide the light line is."""
+START_LINES, START_FRAMES = 512, 8192
+"""Lines (rows x columns) that tell which start of a first sweep is the likeliest, and how wide the light line is; and
+the exposures that they have together at least, as far as there are FIRST_LINES."""
 FIRST_LINES = 2048
 LAST_LINES = 4096
 """Lines that the first and the last rounds over a first sweep read: 250 000 and 500 000 pixels."""
@@ -135,20 +136,25 @@ def _expect_piece(sweep: Sweep, state: RowState, lines: Lines, geometry: SweepGe
 def learn_first(volume: CountVolume, geometry: SweepGeometry, ambient: Float32, workers: RowWorkers) -> RowModel:
     """Learn the row model from a first sweep: try several starts and refine the likeliest."""
     first, last = (lines_of(volume, lattice(geometry, lines)) for lines in (FIRST_LINES, LAST_LINES))
-    few = _every(first, START_LINES)
+    few = _every(first, max(START_LINES, START_FRAMES // max(volume.exposures, 1)))
     guessed = volume.dark_counts is None
     starts = []
     for extinction in START_EXTINCTIONS_PER_M:
-        model = _start(volume, geometry, ambient, extinction)
+        model = start_model(volume, geometry, ambient, extinction)
         for _ in range(2):
             seen = expect(few, geometry, model, workers)
             model = maximise(model, seen, spread=True, free_ambient=guessed, gains=False)
         starts.append((expect(few, geometry, model, workers).evidence, model))
     model = max(starts, key=itemgetter(0))[1]
-    for _ in range(FIRST_ROUNDS):
+    moves = True
+    for i in range(FIRST_ROUNDS):
         seen = expect(first, geometry, model, workers)
         model = maximise(model, seen, spread=True, free_ambient=guessed, gains=False)
-        model = fit_line_width(few, geometry, model, workers)
+        # A width that stayed is looked at again only once the rest is nearly known.
+        if moves or i >= FIRST_ROUNDS - 2:
+            width = model.line_sigma_px
+            model = fit_line_width(few, geometry, model, workers)
+            moves = model.line_sigma_px != width
     for _ in range(LAST_ROUNDS):
         model = maximise(model, expect(last, geometry, model, workers), spread=False, free_ambient=guessed)
     return model
@@ -210,7 +216,9 @@ def _bins(geometry: SweepGeometry) -> tuple[float, float]:
     return w_lo, (BINS - 1) / (w_hi - w_lo)
 
 
-def _start(volume: CountVolume, geometry: SweepGeometry, ambient: Float32, extinction_per_m: float) -> RowModel:
+def start_model(
+    volume: CountVolume, geometry: SweepGeometry, ambient: Float32, extinction_per_m: float
+) -> RowModel:
     """Row model with haze of a guessed extinction that matches the mean level of the nearest pixels."""
     w_lo, per_w = _bins(geometry)
     path_m = 1.0 / (w_lo + np.arange(BINS) / per_w)

@@ -69,7 +69,7 @@ def judge_of(
     band_rows = rows_of_band(geometry)
     sweep, state = _banded(sweep_of(geometry), state_of(model), band_rows)
     light, log_share = _lights(model)
-    reach = max(1, int(np.count_nonzero(state.psi[1:] > TAP_SHARE)))
+    reach = _taps(state.psi)
     bands, columns = state.ambient.shape[0], geometry.columns
     veil = geometry.others is not None and model.profile[:, 0].max() > LEAST_VEIL * np.median(model.ambient)
     tables = _empty_tables(columns, bands, padded_lanes(geometry.window), reach, others=bool(veil))
@@ -101,9 +101,19 @@ def judge_of(
         tables=tables, closeup=closeup, band_rows=band_rows, x0=geometry.x0, window=geometry.window, rows=geometry.rows,
         limits=_limits(geometry), near_is_left=geometry.near_is_left, ambient=padded, hot_start=hot_start,
         hot_at=hot_at, hot_place=hot_place, nominal=np.float32(nominal), faintest=np.float32(model.amplitude[0]),
-        brightest=np.float32(model.amplitude[-1]), reach=max(SIGNAL_REACH_PX, reach), shift=shift,
+        brightest=np.float32(model.amplitude[-1]), reach=signal_reach(state.psi), shift=shift,
         close_shift=close_shift, most=most, quiet_step=QUIET_STEP if dark else 1, flux=count_fluxes(),
     )  # fmt: skip
+
+
+def _taps(psi: Float32) -> int:
+    """Pixels on either side of a line's centre that take part in the search. psi: share of the line in 0..T px."""
+    return max(1, int(np.count_nonzero(psi[1:] > TAP_SHARE)))
+
+
+def signal_reach(psi: Float32) -> int:
+    """Pixels on either side of a line's centre whose light is summed as the stripe's."""
+    return max(SIGNAL_REACH_PX, _taps(psi))
 
 
 def _hot_of_windows(hot: Bools, geometry: SweepGeometry) -> tuple[Int32, Int16, Int32]:

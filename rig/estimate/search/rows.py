@@ -56,7 +56,8 @@ COUNT_LIMIT: Final = 63
 EXPOSURE_PARTS: Final = 4
 """Steps per exposure: where counts are halved exposures become fractions, 65 become 32.5, 65535 become 63.999."""
 FIELDS: Final = 5
-"""Fields of an answer: x_px, confidence, x_sd_px, signal and haze, see `StripeTable`."""
+"""Fields of an answer: x_px, confidence, x_sd_px, signal and haze, see `StripeTable`. The confidence is the row's own,
+without its neighbours; a signal can be below zero."""
 
 
 class SearchTables(NamedTuple):
@@ -330,9 +331,9 @@ def _measure_light(desk, search, table, first, rows, c, exposures, stripe):  # t
     before, ambient = load_float32(search.before, 0), load_float32(search.ambient, 0)
     scale = load_float32(search.scale, 0)
     light = load_float32(search.light, 0) - (before + ambient) * np.float32(desk.judge.reach + 0.5)
-    signal = smaller_float(larger_float(light, scale * desk.judge.faintest), scale * desk.judge.brightest)
-    store_int16(search.levels, 0, levels_of(before, signal))
-    _answer(signal, stripe + 12 * desk.judge.rows, rows, search)
+    likely = smaller_float(larger_float(light, scale * desk.judge.faintest), scale * desk.judge.brightest)
+    store_int16(search.levels, 0, levels_of(before, likely))
+    _answer(light, stripe + 12 * desk.judge.rows, rows, search)
     _answer(larger_float(before - ambient, np.float32(0.0)), stripe + 16 * desk.judge.rows, rows, search)
 
 

@@ -22,6 +22,7 @@ import numba
 import numpy as np
 
 from rig.estimate.joint.place.places import Places
+from rig.estimate.row.neighbours import COPIED_ROWS, MARGIN, SAME_PX, with_margin
 from rig.simd import Float32
 from rig.simd.memory import address_of, copy_floats, load_float32, store_float32
 from rig.simd.vectors import (
@@ -36,31 +37,7 @@ from rig.simd.vectors import (
     zero_float32,
 )
 
-SAME_PX: Final = np.float32(1.0)
-"""Neighbours whose distances from the far end differ by no more lie on the same surface."""
-MARGIN: Final = 6
-"""Rows above and below that copies have more, as far as anything is pooled; to both sides they have LANES columns."""
-COPIED_ROWS: Final = 32
-"""Rows that are copied at once where that leaves the copies in the cache."""
 _LEAST: Final = np.float32(1e-12)
-
-
-@numba.njit(cache=True, nogil=True)
-def with_margin(array: Float32, first_row: int, last_row: int) -> Float32:
-    """Copy of rows first_row..last_row-1 with the rows and columns around them, NaN where there are none."""
-    rows, columns = array.shape
-    top, end = max(first_row - MARGIN, 0), min(last_row + MARGIN, rows)
-    width = (-(-columns // LANES) + 2) * LANES
-    copy, nowhere = np.empty((last_row - first_row + 2 * MARGIN, width), np.float32), np.float32(np.nan)
-    source, to = address_of(array), address_of(copy)
-    for y in range(first_row - MARGIN, last_row + MARGIN):
-        line = copy[y - first_row + MARGIN]
-        if top <= y < end:
-            line[:LANES], line[LANES + columns :] = nowhere, nowhere
-            copy_floats(source + 4 * columns * y, to + 4 * (width * (y - first_row + MARGIN) + LANES), columns)
-        else:
-            line[:] = nowhere
-    return copy
 
 
 @numba.njit(cache=True, nogil=True)

@@ -16,8 +16,8 @@ from rig.estimate.joint.confidence import (
     stripe_table,
 )
 from rig.estimate.joint.place.place import new_places
-from rig.estimate.joint.place.pool import SAME_PX
 from rig.estimate.joint.winner import UNITS, new_answer
+from rig.estimate.row.neighbours import SAME_PX
 from rig.simd.vectors import LANES
 from rig.threads import RowWorkers
 

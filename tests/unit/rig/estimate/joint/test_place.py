@@ -15,17 +15,15 @@ from rig.estimate.joint.place.light import LEAST_FLUX, _dark_over_lit
 from rig.estimate.joint.place.place import PAIRS, amplitudes_of, line_width, new_places, place, profile_table
 from rig.estimate.joint.place.places import BESIDE_PX, MOST_FLUX, REACH_PX
 from rig.estimate.joint.place.pool import (
-    MARGIN,
-    SAME_PX,
     SIGMAS,
     join_pairs,
     pool_places,
     pool_row,
     widen_row,
-    with_margin,
 )
 from rig.estimate.row.inputs import row_buffers, row_fluxes, state_of, sweep_of
 from rig.estimate.row.model import pixel_shares
+from rig.estimate.row.neighbours import MARGIN, SAME_PX, with_margin
 from rig.geometry.stripe_table import StripeTable
 from rig.simd.memory import address_of, load_float32, store_float32
 from rig.simd.vectors import LANES

@@ -1,0 +1,39 @@
+"""Copies of maps with a margin, in which compiled code compares the answers around each one without checking bounds.
+
+Answers are compared by their distance in px from where the line of their row and column is at one depth: neighbours
+whose distances are the same within SAME_PX lie on one surface. Arrays are float32 (rows, columns).
+"""
+
+from typing import Final
+
+import numba
+import numpy as np
+
+from rig.simd import Float32
+from rig.simd.memory import address_of, copy_floats
+from rig.simd.vectors import LANES
+
+SAME_PX: Final = np.float32(1.0)
+"""Neighbours whose distances differ by no more lie on the same surface."""
+MARGIN: Final = 6
+"""Rows above and below that copies have more, as far as anything is pooled; to both sides they have LANES columns."""
+COPIED_ROWS: Final = 32
+"""Rows that are copied at once where that leaves the copies in the cache."""
+
+
+@numba.njit(cache=True, nogil=True)
+def with_margin(array: Float32, first_row: int, last_row: int) -> Float32:
+    """Copy of rows first_row..last_row-1 with the rows and columns around them, NaN where there are none."""
+    rows, columns = array.shape
+    top, end = max(first_row - MARGIN, 0), min(last_row + MARGIN, rows)
+    width = (-(-columns // LANES) + 2) * LANES
+    copy, nowhere = np.empty((last_row - first_row + 2 * MARGIN, width), np.float32), np.float32(np.nan)
+    source, to = address_of(array), address_of(copy)
+    for y in range(first_row - MARGIN, last_row + MARGIN):
+        line = copy[y - first_row + MARGIN]
+        if top <= y < end:
+            line[:LANES], line[LANES + columns :] = nowhere, nowhere
+            copy_floats(source + 4 * columns * y, to + 4 * (width * (y - first_row + MARGIN) + LANES), columns)
+        else:
+            line[:] = nowhere
+    return copy

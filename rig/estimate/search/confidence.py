@@ -1,0 +1,112 @@
+"""Confidence of `likelihood`: the probability that an answer lies within a pixel of a stripe, from its neighbours.
+
+A row alone cannot tell a dim stripe from a place where the haze merely ends, behind the edge of something nearer: the
+counts of both look alike. Its neighbours can. They agree on a surface, and what they see there adds up:
+
+    confidence = 1 / (1 + exp(A - B ln odds - C ln max(contrast + 3, 1)))
+
+- odds: (agree - 1/2) / (others + 1/2). Of the answers up to REACH rows and columns away, itself among them, those that
+  `agree` lie on one surface: their distance from where the line is at one depth is the same, within SAME_PX. An answer
+  without neighbours has odds 1.
+- contrast: light above haze and ambient light that those which agree have on average, less the haze of one pixel, over
+  its noise. An answer may lie a pixel before the end of the haze, whose light it then takes for the stripe's.
+
+A, B and C are fitted by maximum likelihood to random scenes of the tests' simulator, at K = 1 to 30, with haze,
+ambient light and stripes of many strengths, with and without hot pixels; all answers count, those where there is no
+stripe as wrong ones. The probability that the row itself gives was tried as a fourth term and adds nothing.
+docs/results/confidence.md says how far it can be believed.
+"""
+
+from dataclasses import replace
+from typing import Final
+
+import cv2
+import numba
+import numpy as np
+
+from rig.estimate.row.neighbours import COPIED_ROWS, MARGIN, SAME_PX, with_margin
+from rig.geometry.stripe_table import StripeTable
+from rig.simd import Float32, Int32
+from rig.simd.functions import exponential, logarithm
+from rig.simd.memory import address_of, load_float32, store_float32
+from rig.simd.vectors import LANES, larger_float, square_root, where_small, zero_float32
+from rig.threads import RowWorkers
+
+A: Final = 5.457
+B: Final = 1.342
+C: Final = 3.639
+REACH: Final = 3
+MORE_NOISE: Final = 1.0 / 9.0
+"""Counts: the noise of light is not zero where nothing was counted."""
+
+
+@numba.njit(cache=True, nogil=True)
+def confidences(
+    distance: Float32, light: Float32, haze: Float32, there: Float32, exposures: Float32, ambient: float,
+    line_px: float, first_row: int, last_row: int, confidence: Float32,
+) -> None:  # fmt: skip
+    """Write the confidence of rows first_row..last_row-1, 0 where there is no answer.
+
+    All but `exposures` (columns,) and numbers are (rows, columns). distance: in px from where the line is at one depth,
+    NaN where there is no answer; light: photons per exposure above ambient light and half of the haze; there: number of
+    answers around each one, itself counted; ambient: usual light of a pixel behind the stripe; line_px: pixels that
+    light is summed over.
+    """
+    columns = confidence.shape[1]
+    k, line = with_margin(exposures.reshape(1, -1), 0, 1), np.empty(columns + LANES, np.float32)
+    for band in range(first_row, last_row, COPIED_ROWS):
+        end = min(band + COPIED_ROWS, last_row)
+        distances, lights = with_margin(distance, band, end), with_margin(light, band, end)
+        hazes, around = with_margin(haze, band, end), with_margin(there, band, end)
+        at = address_of(distances), address_of(lights), address_of(hazes), address_of(around)
+        for y in range(band, end):
+            begin = (y - band + MARGIN) * distances.shape[1] + LANES
+            for c in range(0, columns, LANES):
+                exposed = load_float32(address_of(k[MARGIN]), LANES + c)
+                judged = _judged(at, begin + c, distances.shape[1], exposed, ambient, line_px)
+                store_float32(address_of(line), c, judged)
+            for c in range(columns):
+                confidence[y, c] = 0.0 if np.isnan(distance[y, c]) else line[c]
+
+
+@numba.njit(forceinline=True)
+def _judged(at, here, width, exposed, ambient, line_px):  # type: ignore[no-untyped-def]
+    """Confidence of LANES answers, the first of which is element `here` of the copies at these addresses."""
+    distance, light, haze, there = at
+    none, one = zero_float32(), zero_float32() + np.float32(1.0)
+    own, agree, lit = load_float32(distance, here), none, none
+    for line in range(here - REACH * width, here + REACH * width + 1, width):
+        for near in range(line - REACH, line + REACH + 1):
+            off = load_float32(distance, near) - own
+            agree = agree + where_small(one, off, SAME_PX)
+            lit = lit + where_small(load_float32(light, near), off, SAME_PX)
+    agree = larger_float(agree, one)
+    mean, before = lit / agree, load_float32(haze, here)
+    below = (before + 2.0 * ambient) * (0.5 * line_px)
+    noise = larger_float(mean + below, none) + below + (none + MORE_NOISE) / exposed
+    contrast = (mean - before) * square_root(exposed * agree / noise)
+    odds = (agree - 0.5) / (larger_float(load_float32(there, here) - agree, none) + 0.5)
+    doubt = none + A - logarithm(odds) * B - logarithm(larger_float(contrast + 3.0, one)) * C
+    return one / (exponential(doubt) + one)
+
+
+def believed(
+    found: StripeTable, reference_px: Float32, exposures: Int32, ambient: float, line_px: int, workers: RowWorkers
+) -> StripeTable:
+    """A stripe table of the search with the confidence that neighbours give it, and without light below zero.
+
+    reference_px: (rows, columns), where the line is at one depth; the rest as for `confidences`.
+    """
+    distance, side = found.x_px - reference_px, 2 * REACH + 1
+    here = np.isfinite(distance).astype(np.float32)
+    there = cv2.boxFilter(here, -1, (side, side), normalize=False, borderType=cv2.BORDER_CONSTANT)
+    k = exposures.astype(np.float32)
+    confidence = np.empty_like(found.x_px)
+
+    def work(first: int, last: int) -> None:
+        confidences(
+            distance, found.signal, found.haze, there, k, ambient, float(line_px), first, last, confidence
+        )  # fmt: skip
+
+    workers.over(len(confidence), work)
+    return replace(found, confidence=confidence, signal=np.maximum(found.signal, np.float32(0.0)))

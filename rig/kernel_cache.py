@@ -1,0 +1,122 @@
+"""Where numba keeps compiled kernels, and which of those that are kept no longer hold.
+
+Service accounts and containers often have no folder in which numba can store kernels, and numba then refuses to compile
+at all: `prepare` provides one.
+
+numba compiles a kernel anew if its own file has changed, but not if another file has from which the kernel inlines
+functions. After an update old kernels would silently work on new tables. So `prepare` notes what each module of these
+packages is made of, itself and all that it imports, and removes the kernels of those that have changed. Looking whether
+any file has changed takes some milliseconds, and the rest a second.
+"""
+
+import ast
+import hashlib
+import json
+import os
+import tempfile
+from collections.abc import Iterator
+from pathlib import Path
+
+VARIABLE = "NUMBA_CACHE_DIR"
+"""Numba's own setting, see its manual; a value that the user has set is left alone."""
+PACKAGES = "calibration", "drivers", "rig", "sim_backend"
+TOP = Path(__file__).parent.parent
+NOTE = "spadrig-kernels.json"
+
+
+def prepare() -> None:
+    """Give numba a folder that it can write, and forget stale kernels. Call it before numba is imported."""
+    home = Path(os.environ.get("XDG_CACHE_HOME") or Path("~/.cache").expanduser())
+    if VARIABLE not in os.environ and not _writable(TOP / "rig" / "__pycache__"):
+        os.environ[VARIABLE] = str(home / "spadrig-kernels" if _writable(home) else _private_folder())
+    kept = os.environ.get(VARIABLE)
+    forget_stale(TOP, None if kept is None else Path(kept))
+
+
+def forget_stale(top: Path, kept: Path | None) -> None:
+    """Remove kernels of modules below `top` that, or whose imports, have changed since the last call.
+
+    kept: numba's folder; None if kernels lie beside their modules.
+    """
+    files = {_module_of(top, file): file for package in PACKAGES for file in _sources(top / package)}
+    stats = ((file, file.stat()) for file in files.values())
+    seen = _digest("".join(f"{file} {stat.st_mtime_ns} {stat.st_size}\n" for file, stat in stats).encode())
+    note = (kept or top / "rig" / "__pycache__") / NOTE
+    try:
+        before = json.loads(note.read_text())
+    except (OSError, ValueError):
+        before = {}
+    if before.get("seen") == seen:
+        return
+    now = _made_of(files)
+    for module, digest in now.items():
+        if before.get("modules", {}).get(module) != digest:
+            file = files[module]
+            folders = [file.parent / "__pycache__"] if kept is None else kept.glob(f"{file.parent.name}_*")
+            for folder in folders:
+                for kernel in folder.glob(f"{file.stem}.*.nb[ic]"):
+                    kernel.unlink(missing_ok=True)
+    note.parent.mkdir(parents=True, exist_ok=True)
+    with tempfile.NamedTemporaryFile("w", dir=note.parent, delete=False) as new:
+        json.dump({"seen": seen, "modules": now}, new)
+    os.replace(new.name, note)
+
+
+def _sources(package: Path) -> Iterator[Path]:
+    for folder, inner, names in os.walk(package):
+        inner[:] = sorted(name for name in inner if name != "__pycache__")
+        yield from (Path(folder, name) for name in sorted(names) if name.endswith(".py"))
+
+
+def _module_of(top: Path, file: Path) -> str:
+    parts = file.relative_to(top).with_suffix("").parts
+    return ".".join(parts[:-1] if parts[-1] == "__init__" else parts)
+
+
+def _made_of(files: dict[str, Path]) -> dict[str, str]:
+    """A digest of the source of each module and of all modules that it imports, directly or not."""
+    sources = {module: file.read_bytes() for module, file in files.items()}
+    imports = {module: _imported(source) & sources.keys() for module, source in sources.items()}
+    own = {module: _digest(source) for module, source in sources.items()}
+    made_of = {}
+    for module in sources:
+        reached, to_look_at = {module}, [module]
+        while to_look_at:
+            more = imports[to_look_at.pop()] - reached
+            reached |= more
+            to_look_at += more
+        made_of[module] = _digest("".join(f"{name} {own[name]}\n" for name in sorted(reached)).encode())
+    return made_of
+
+
+def _imported(source: bytes) -> set[str]:
+    """Names that may be modules: `a.b` and `a.b.c` of `from a.b import c`."""
+    found = set()
+    for node in ast.walk(ast.parse(source)):
+        if isinstance(node, ast.Import):
+            found |= {name.name for name in node.names}
+        elif isinstance(node, ast.ImportFrom) and node.module and not node.level:
+            found |= {node.module, *(f"{node.module}.{name.name}" for name in node.names)}
+    return found
+
+
+def _digest(data: bytes) -> str:
+    return hashlib.sha256(data).hexdigest()
+
+
+def _writable(folder: Path) -> bool:
+    """Whether the folder, or the nearest one above it that exists, can be written."""
+    while not folder.exists() and folder != folder.parent:
+        folder = folder.parent
+    return folder.is_dir() and os.access(folder, os.W_OK)
+
+
+def _private_folder() -> Path:
+    """A folder that only this user can write: kernels are code, and temporary folders are everybody's."""
+    user = os.getuid() if hasattr(os, "getuid") else 0
+    folder = Path(tempfile.gettempdir()) / f"spadrig-kernels-{user}"
+    folder.mkdir(mode=0o700, exist_ok=True)
+    seen = folder.lstat()
+    if hasattr(os, "getuid") and (seen.st_uid != user or seen.st_mode & 0o077 or folder.is_symlink()):
+        return Path(tempfile.mkdtemp(prefix="spadrig-kernels-"))
+    return folder

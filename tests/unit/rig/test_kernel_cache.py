@@ -1,0 +1,106 @@
+"""Kernels are kept where the user can write, nowhere that another user could, and only as long as they hold."""
+
+import os
+import stat
+import subprocess
+import sys
+
+import pytest
+
+from rig import kernel_cache
+
+posix = pytest.mark.skipif(not hasattr(os, "getuid"), reason="folders of users are a matter of POSIX")
+
+
+@pytest.fixture
+def _nothing_writable(monkeypatch, tmp_path):
+    monkeypatch.delenv(kernel_cache.VARIABLE, raising=False)
+    monkeypatch.setattr(kernel_cache, "_writable", lambda folder: False)
+    monkeypatch.setattr(kernel_cache.tempfile, "tempdir", str(tmp_path))
+    yield
+    os.environ.pop(kernel_cache.VARIABLE, None)
+
+
+@posix
+@pytest.mark.usefixtures("_nothing_writable")
+@pytest.mark.parametrize("open_to_all", [False, True])
+def test_a_private_folder_serves_where_nothing_can_be_written_and_one_open_to_others_is_not_trusted(
+    tmp_path, open_to_all
+):
+    usual = tmp_path / f"spadrig-kernels-{os.getuid()}"
+    if open_to_all:
+        usual.mkdir()
+        usual.chmod(0o777)
+    kernel_cache.prepare()
+    folder = os.environ[kernel_cache.VARIABLE]
+    assert (folder == str(usual)) is not open_to_all
+    assert stat.S_IMODE(os.stat(folder).st_mode) == 0o700
+
+
+@posix
+def test_the_users_own_setting_stays(monkeypatch, tmp_path):
+    monkeypatch.setenv(kernel_cache.VARIABLE, str(tmp_path))
+    monkeypatch.setattr(kernel_cache, "_writable", lambda folder: False)
+    kernel_cache.prepare()
+    assert os.environ[kernel_cache.VARIABLE] == str(tmp_path)
+
+
+@pytest.fixture
+def tree(tmp_path):
+    """Packages in which `rig.a` imports `rig.deep.b`, which imports `rig.deep.c`; `rig.d` imports nothing."""
+    for file, text in {
+        "rig/__init__.py": "", "rig/deep/__init__.py": "", "rig/a.py": "def late():\n    from rig.deep import b",
+        "rig/deep/b.py": "from rig.deep.c import (\n    one,\n)", "rig/deep/c.py": "one = 1", "rig/d.py": "",
+    }.items():  # fmt: skip
+        (tmp_path / file).parent.mkdir(parents=True, exist_ok=True)
+        (tmp_path / file).write_text(text)
+    return tmp_path
+
+
+def kernels_of(folder):
+    return {file.name.split(".")[0] for file in folder.rglob("*.nbi")}
+
+
+@pytest.mark.parametrize("own_folder", [False, True])
+def test_kernels_go_if_their_module_or_one_that_it_imports_has_changed(tree, tmp_path, own_folder):
+    kept = tmp_path / "kept" if own_folder else None
+
+    def compile_all():
+        for module in ("a", "deep/b", "deep/c", "d"):
+            file = tree / f"rig/{module}.py"
+            folder = file.parent / "__pycache__" if kept is None else kept / f"{file.parent.name}_0123"
+            folder.mkdir(parents=True, exist_ok=True)
+            (folder / f"{file.stem}.kernel-1.py311.nbi").touch()
+
+    def left():
+        kernel_cache.forget_stale(tree, kept)
+        return kernels_of(tree)
+
+    compile_all()
+    assert left() == set()  # nothing is known of them
+    compile_all()
+    assert left() == {"a", "b", "c", "d"}
+    (tree / "rig/deep/c.py").write_text("one = 2 ")
+    assert left() == {"d"}
+    compile_all()
+    (tree / "rig/d.py").write_text("one = 2")
+    assert left() == {"a", "b", "c"}
+
+
+def test_an_inlined_function_of_another_file_is_never_the_old_one(tree):
+    """numba alone keeps the kernel here: this is why there is a note."""
+    (tree / "rig/deep/c.py").write_text("import numba\n@numba.njit(inline='always')\ndef one():\n    return 1\n")
+    (tree / "rig/a.py").write_text(
+        "import numba\nfrom rig.deep.c import one\n@numba.njit(cache=True)\ndef both():\n    return one() + one()\n"
+    )
+    run = "import rig.a; print(rig.a.both())"
+
+    def both():
+        kernel_cache.forget_stale(tree, None)
+        environment = {name: value for name, value in os.environ.items() if name != kernel_cache.VARIABLE}
+        done = subprocess.run([sys.executable, "-c", run], cwd=tree, env=environment, capture_output=True, check=True)
+        return int(done.stdout)
+
+    assert both() == 2
+    (tree / "rig/deep/c.py").write_text("import numba\n@numba.njit(inline='always')\ndef one():\n    return 21\n")
+    assert both() == 42
