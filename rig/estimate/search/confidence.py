@@ -3,17 +3,18 @@
 A row alone cannot tell a dim stripe from a place where the haze merely ends, behind the edge of something nearer: the
 counts of both look alike. Its neighbours can. They agree on a surface, and what they see there adds up:
 
-    confidence = 1 / (1 + exp(A - B ln odds - C ln max(contrast + 3, 1)))
+    confidence = 1 / (1 + exp(A - B ln odds - C asinh contrast + D ln K))
 
 - odds: (agree - 1/2) / (others + 1/2). Of the answers up to REACH rows and columns away, itself among them, those that
   `agree` lie on one surface: their distance from where the line is at one depth is the same, within SAME_PX. An answer
   without neighbours has odds 1.
-- contrast: light above haze and ambient light that those which agree have on average, less the haze of one pixel, over
-  its noise. An answer may lie a pixel before the end of the haze, whose light it then takes for the stripe's.
+- contrast: light above half the haze and ambient light that those which agree have on average, less SPARED pixels of
+  haze, over its noise, at least LEAST. An answer may lie a little before the end of the haze, and then takes its light
+  for the stripe's.
+- K: exposures. The more there are, the more alike do neighbouring rows place the end of a haze.
 
-A, B and C are fitted by maximum likelihood to random scenes of the tests' simulator, at K = 1 to 30, with haze,
-ambient light and stripes of many strengths, with and without hot pixels; all answers count, those where there is no
-stripe as wrong ones. The probability that the row itself gives was tried as a fourth term and adds nothing.
+A, B, C and D are fitted by maximum likelihood to random scenes of the tests' simulator, at K = 1 to 30, with haze,
+ambient light and stripes of many strengths; all answers count, those where there is no stripe as wrong ones.
 docs/results/confidence.md says how far it can be believed.
 """
 
@@ -32,9 +33,12 @@ from rig.simd.memory import address_of, load_float32, store_float32
 from rig.simd.vectors import LANES, larger_float, square_root, where_small, zero_float32
 from rig.threads import RowWorkers
 
-A: Final = 5.457
-B: Final = 1.342
-C: Final = 3.639
+A: Final = 1.018
+B: Final = 1.698
+C: Final = 1.706
+D: Final = 0.515
+SPARED: Final = 0.75
+LEAST: Final = -30.0
 REACH: Final = 3
 MORE_NOISE: Final = 1.0 / 9.0
 """Counts: the noise of light is not zero where nothing was counted."""
@@ -84,9 +88,11 @@ def _judged(at, here, width, exposed, ambient, line_px):  # type: ignore[no-unty
     mean, before = lit / agree, load_float32(haze, here)
     below = (before + 2.0 * ambient) * (0.5 * line_px)
     noise = larger_float(mean + below, none) + below + (none + MORE_NOISE) / exposed
-    contrast = (mean - before) * square_root(exposed * agree / noise)
+    contrast = (mean - before * SPARED) * square_root(exposed * agree / noise)
+    contrast = larger_float(contrast, none + LEAST)
     odds = (agree - 0.5) / (larger_float(load_float32(there, here) - agree, none) + 0.5)
-    doubt = none + A - logarithm(odds) * B - logarithm(larger_float(contrast + 3.0, one)) * C
+    shines = logarithm(contrast + square_root(contrast * contrast + 1.0))  # asinh
+    doubt = none + A - logarithm(odds) * B - shines * C + logarithm(exposed) * D
     return one / (exponential(doubt) + one)
 
 

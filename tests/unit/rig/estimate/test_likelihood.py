@@ -5,6 +5,7 @@ import pytest
 
 from rig.estimate.likelihood import Likelihood
 from rig.estimate.search import online_learning as lessons
+from tests.reference.tables.answers import calibration_error
 from tests.unit.small_maps import assert_same, simulated, volume_of
 
 pytestmark = pytest.mark.slow
@@ -42,7 +43,7 @@ def test_the_saved_model_gives_the_very_same_table_again(monkeypatch):
     assert again.used is not saved
 
 
-def test_with_a_given_model_every_row_is_judged_alone():
+def test_with_a_given_model_every_row_is_judged_alone_and_only_confidence_comes_from_the_neighbours():
     sweep, model = simulated(seed=2), estimated()[1].model
     rng = np.random.default_rng(1)
     other = sweep.counts.copy()
@@ -51,8 +52,10 @@ def test_with_a_given_model_every_row_is_judged_alone():
     plain = Likelihood(model=model).estimate(sweep.volume, sweep.geometry)
     mixed = Likelihood(model=model).estimate(volume_of(other, sweep.geometry, 10), sweep.geometry)
     for name, values in plain.arrays().items():
-        np.testing.assert_array_equal(getattr(mixed, name)[kept], values[kept])
+        if name != "confidence":
+            np.testing.assert_array_equal(getattr(mixed, name)[kept], values[kept])
     assert not np.array_equal(mixed.x_px[~kept], plain.x_px[~kept])
+    assert mixed.confidence[kept].mean() < plain.confidence[kept].mean() - 0.2
 
 
 def test_counts_outside_the_search_windows_and_margins_do_not_matter():
@@ -95,25 +98,22 @@ def test_learned_extinction_is_the_fogs():
     assert model.extinction_sd_per_m < 0.3 * truth
 
 
-@pytest.mark.parametrize(("light", "exposures"), [("report", 10), ("dense", 1)])
-def test_confidence_is_the_share_of_right_answers(light, exposures):
-    # Two scans, each with a model of its own: what one of them learned by chance shows in all its answers.
+@pytest.mark.parametrize(("light", "exposures"), [("report", 10), ("dense", 1), ("dense", 10), ("clear", 3)])
+def test_confidence_is_the_share_of_right_answers_and_places_without_a_stripe_are_not_believed(light, exposures):
+    """All answers count, a quarter of them where there is no stripe. Few columns stand far apart here, so that true
+    surfaces agree less than usual: confidence may be too low, but not too high."""
     confidence, right = [], []
-    for seed in (1, 2):
+    for seed in (1, 2):  # each with a model of its own: what one of them learned by chance shows in all its answers
         sweep = simulated(light, exposures, seed=seed)
-        table = Likelihood().estimate(sweep.volume, sweep.geometry)
-        confidence.append(table.confidence[sweep.point.trusted].astype(float))
-        right.append(sweep.errors(table.x_px) <= 1.0)
+        table, lit = Likelihood().estimate(sweep.volume, sweep.geometry), np.isfinite(sweep.point.x_true)
+        used = sweep.point.trusted | (~lit & np.isfinite(table.x_px))
+        confidence.append(table.confidence[used].astype(float))
+        right.append(np.abs(np.where(lit, table.x_px - sweep.point.x_true, np.inf))[used] <= 1.0)
+        assert (table.confidence[~lit] > 0.5).mean() < 0.12
     confidence, right = np.concatenate(confidence), np.concatenate(right)
     assert np.all((confidence >= 0) & (confidence <= 1))
-    judged = 0
-    for low in np.arange(0, 1, 0.2):
-        here = (confidence >= low) & (confidence < low + 0.2 + 1e-9)
-        if here.sum() >= 100:
-            judged += 1
-            assert abs(right[here].mean() - confidence[here].mean()) < 0.15
-    assert judged >= 3
-    assert abs(right.mean() - confidence.mean()) < 0.1
+    assert calibration_error(confidence, right) < 0.1
+    assert right[confidence > 0.9].mean() > confidence[confidence > 0.9].mean() - 0.03
 
 
 def test_stated_sd_matches_the_errors_of_sure_answers():

@@ -33,7 +33,7 @@ from tests.stability.inventory import covers
 from tests.unit.rig.estimate.joint.test_label_volume import known_model
 from tests.unit.small_maps import RIGS, geometry_of, volume_of
 
-covers(light, pool, place_module)
+covers(light, pool, place_module, with_margin)
 
 WORKERS = RowWorkers(1)
 ROWS, COLUMNS = 24, 48
