@@ -54,22 +54,22 @@ class Likelihood:
         """Stripe table of one sweep. Afterwards `model` is the state for the next sweep."""
         if isinstance(sweep, SearchedSweep):
             assert self.model is not None, "a sweep is judged under a model"
-            used, stripes = self.model, sweep.stripe
+            used, found = self.model, sweep.stripe
             quiet, lines = sweep.quiet, sweep.lines
         else:
             used = self._lessons.model_for(lambda: first_model(sweep, geometry, self._workers))
             setting = LearningSetting(used, geometry, sweep.exposures, sweep.dark_counts is not None)
-            stripes, quiet = search_volume(sweep, geometry, self._lessons.tables(setting, self._workers), self._workers)
+            found, quiet = search_volume(sweep, geometry, self._lessons.tables(setting, self._workers), self._workers)
             lines = lines_of(sweep, next_lattice(geometry))
         self.used = used
-        stripes = believed(
-            stripes, self._reference(geometry), sweep.n_frames, float(np.median(used.ambient)),
+        # Lessons are of rows, and heed what a row is sure of itself.
+        self._lessons.attend(
+            found, used, int(sweep.n_frames.sum()), lambda: Seen(sweep, sweep.intensity(), quiet, lines)
+        )
+        return believed(
+            found, self._reference(geometry), sweep.n_frames, float(np.median(used.ambient)),
             2 * signal_reach(line_profile(used.line_sigma_px)) + 1, self._workers,
         )  # fmt: skip
-        self._lessons.attend(
-            stripes, used, int(sweep.n_frames.sum()), lambda: Seen(sweep, sweep.intensity(), quiet, lines)
-        )
-        return stripes
 
     def _reference(self, geometry: SweepGeometry) -> Float32:
         """The geometry's `reference_px`, computed once while the geometry stays the same."""

@@ -7,7 +7,7 @@ counts of both look alike. Its neighbours can. They agree on a surface, and what
 
 - odds: (agree - 1/2) / (others + 1/2). Of the answers up to REACH rows and columns away, itself among them, those that
   `agree` lie on one surface: their distance from where the line is at one depth is the same, within SAME_PX. An answer
-  without neighbours has odds 1.
+  without neighbours has odds 1. Odds above 1 count as far as there is light, min(max(contrast / SEEN, 0), 1).
 - contrast: light above half the haze and ambient light that those which agree have on average, less SPARED pixels of
   haze, over its noise, at least LEAST. An answer may lie a little before the end of the haze, and then takes its light
   for the stripe's.
@@ -30,7 +30,7 @@ from rig.geometry.stripe_table import StripeTable
 from rig.simd import Float32, Int32
 from rig.simd.functions import exponential, logarithm
 from rig.simd.memory import address_of, load_float32, store_float32
-from rig.simd.vectors import LANES, larger_float, square_root, where_small, zero_float32
+from rig.simd.vectors import LANES, larger_float, smaller_float, square_root, where_small, zero_float32
 from rig.threads import RowWorkers
 
 A: Final = 1.018
@@ -39,6 +39,8 @@ C: Final = 1.706
 D: Final = 0.515
 SPARED: Final = 0.75
 LEAST: Final = -30.0
+SEEN: Final = 3.0
+"""Contrast from which on agreement counts in full: rows without any light agree too, on the first place searched."""
 REACH: Final = 3
 MORE_NOISE: Final = 1.0 / 9.0
 """Counts: the noise of light is not zero where nothing was counted."""
@@ -92,7 +94,10 @@ def _judged(at, here, width, exposed, ambient, line_px):  # type: ignore[no-unty
     contrast = larger_float(contrast, none + LEAST)
     odds = (agree - 0.5) / (larger_float(load_float32(there, here) - agree, none) + 0.5)
     shines = logarithm(contrast + square_root(contrast * contrast + 1.0))  # asinh
-    doubt = none + A - logarithm(odds) * B - shines * C + logarithm(exposed) * D
+    agreed = logarithm(odds)
+    lit_up = smaller_float(larger_float(contrast * (1.0 / SEEN), none), one)
+    agreed = smaller_float(agreed, none) + larger_float(agreed, none) * lit_up
+    doubt = none + A - agreed * B - shines * C + logarithm(exposed) * D
     return one / (exponential(doubt) + one)
 
 

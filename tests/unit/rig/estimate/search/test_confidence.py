@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 
-from rig.estimate.search.confidence import LEAST, MORE_NOISE, REACH, SPARED, A, B, C, D, believed, confidences
+from rig.estimate.search.confidence import LEAST, MORE_NOISE, REACH, SEEN, SPARED, A, B, C, D, believed, confidences
 from rig.geometry.stripe_table import StripeTable
 from rig.threads import RowWorkers
 from tests.stability.inventory import covers
@@ -36,7 +36,9 @@ def direct(x, signal, haze, exposures, reference):
         n, others, k = same.sum(), there.sum() - same.sum(), exposures[c]
         mean, below = signal[block][same].mean(), LINE_PX / 2 * (haze[y, c] + 2 * AMBIENT)
         contrast = (mean - SPARED * haze[y, c]) * np.sqrt(k * n / (max(mean + below, 0) + below + MORE_NOISE / k))
-        doubt = A - B * np.log((n - 0.5) / (others + 0.5)) - C * np.arcsinh(max(contrast, LEAST)) + D * np.log(k)
+        odds = np.log((n - 0.5) / (others + 0.5))
+        odds *= np.clip(contrast / SEEN, 0, 1) if odds > 0 else 1
+        doubt = A - B * odds - C * np.arcsinh(max(contrast, LEAST)) + D * np.log(k)
         out[y, c] = 1 / (1 + np.exp(doubt))
     return out
 
@@ -64,7 +66,8 @@ def test_a_lit_surface_is_believed_an_end_of_haze_and_scattered_answers_are_not(
     assert ends.max() < 0.5 < judged(half, 0.5, 0.1, 10).confidence[half == wall].mean()
     assert judged(scattered, 0.5, 0.1, 10).confidence.mean() < 0.2
     # However many agree, less light than the haze alone would bring is a sign against them.
-    assert judged(wall, -0.25, 0.1, 10).confidence.max() < 0.7 < 0.9 < judged(wall, 0.1, 0.1, 10).confidence.min()
+    assert judged(wall, -0.25, 0.1, 10).confidence.max() < 0.1
+    assert judged(wall, 0.0, 0.0, 4).confidence.max() < 0.3
 
 
 def test_an_answer_without_neighbours_is_judged_by_its_light():
