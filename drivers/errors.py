@@ -9,7 +9,7 @@ class DeviceError(Exception):
 
 
 class DeviceNotFound(DeviceError):
-    """Raised when a device to be opened is not attached or does not answer at its address."""
+    """Raised when a device to be opened is not attached, or is silent at its address, or its recording is missing."""
 
 
 class DeviceBusy(DeviceError):
@@ -33,7 +33,7 @@ class DeviceFault(DeviceError):
 
 
 class InterlockOpen(DeviceError):
-    """Raised when the laser is armed while its interlock is open."""
+    """Raised when the interlock of a laser that is armed, or is to be armed, is open."""
 
 
 class LimitExceeded(DeviceError):
@@ -43,28 +43,29 @@ class LimitExceeded(DeviceError):
 
 
 class WrongState(DeviceError):
-    """Raised when a method is called that the device's present state does not allow. Names the state and the method to
-    call first.
+    """Raised when the device's state does not allow the method that is called, or another thread has ended that method.
+    Says what to do instead.
     """
 
 
 class ProtocolError(DeviceError):
-    """Raised when bytes from a device or a file do not follow their protocol."""
+    """Raised when bytes from a device or a file do not follow their protocol, or the package for them is
+    missing."""
 
 
 class CorruptBlock(ProtocolError):
-    """Raised when the magic, checksum, sizes or trailer of a block are wrong. Its frames must not be used."""
+    """Raised when the magic, checksum, sizes or trailer of a block, or of an index, are wrong. It must not be used."""
 
 
 class UnsupportedBlock(ProtocolError):
-    """Raised when a sound block is of a kind this reader does not take: another major version, sparse, summed or
-    skipping.
+    """Raised when a block is of a kind that this reader does not take: another major version, sparse, summed, with
+    every k-th frame only, or without frames.
     """
 
 
 class GuardLost(DeviceError):
-    """Raised by a guarded laser or gate when the guard process that owns its port is gone. Says which devices were made
-    safe.
+    """Raised when the guard process that owns the ports of laser and gate is gone. Says which devices were made safe,
+    if that is known by then.
     """
 
 
@@ -73,4 +74,4 @@ class RingOverflow(DeviceError):
 
 
 class UnknownKind(DeviceError):
-    """Raised when the registry has no kind of that name. Lists the kinds it has."""
+    """Raised when the registry has no usable kind of that name: lists those it has, or says why that one is not."""

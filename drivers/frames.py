@@ -11,7 +11,7 @@ FRAME_RECORD = np.dtype(
     [("marks", "<u4"), ("ticks", "<u4"), ("x0", "<u2"), ("y0", "<u2"), ("line", "<u2"), ("sweep", "<u2")]
 )
 """One frame's record, 16 bytes: marks (`Mark`), ticks since the block's `t0_ticks`, corner of the window in pixels,
-line markers since the last scan marker, scan markers since START (low 16 bits). SPB1 1.0 wire layout."""
+line markers since the last scan marker, scan markers since the run's start (low 16 bits). SPB1 1.0 wire layout."""
 
 ROW_ALIGN_BYTES = 8
 """Rows are padded to whole 64-bit words, on which the counting runs."""
@@ -76,22 +76,22 @@ class BlockHeader:
 
     flags: BlockFlag
     run_id: int
-    """Number of the run, 16 bit; changes at each START, so that stale data after a re-arm is recognised."""
+    """Number of the run, 16 bit; another one at each start, so that what is left from an earlier run is recognised."""
     block_seq: int
     """Number of the block in its run, from 0."""
     first_frame: int
-    """Number of the first frame; counts *exposed* frames since START, lost ones included."""
+    """Number of the first frame; counts *exposed* frames since the run's start, lost ones included."""
     t0_ticks: int
     """Start of the first frame's exposure."""
     lost_before: int
-    """Frames exposed since START that are not in the stream before this block."""
+    """Frames exposed since the run's start, before this block, that are not in the stream."""
     tick_hz: Fraction
     """Rate of the tick counter."""
     frame_period_ticks: int
     """Nominal period; 0 = triggered from outside."""
     exposure_ticks: int
     sweep: int
-    """Scan markers since START at the first frame."""
+    """Scan markers since the run's start, at the first frame."""
     frame_step: int
     """1, or k where the device keeps every k-th frame or sums k."""
     width: int
@@ -107,7 +107,8 @@ class BlockHeader:
 
 @dataclass(frozen=True, slots=True)
 class FrameBlock:
-    """Consecutive frames in one piece of memory, valid until its ring slot is released. Copy what is needed for longer.
+    """Consecutive frames in one piece of memory. If that is a slot of a ring, they are valid until it is released: copy
+    what is needed for longer.
 
     records: (n,) of `FRAME_RECORD`.
     bits: uint8 (n, height, row bytes), packed along the width, most significant bit first (numpy `packbits` order). Pad
@@ -126,7 +127,7 @@ class FrameBlock:
 
     @property
     def frame_numbers(self) -> NDArray[np.int64]:
-        """Numbers of the frames since START, int64 (n,)."""
+        """Numbers of the frames since the run's start, int64 (n,)."""
         return self.header.first_frame + np.arange(self.n_frames, dtype=np.int64) * self.header.frame_step
 
     @property

@@ -1,5 +1,5 @@
-"""The only reader of JSON files. Text that nests too deep or holds integers beyond 64 bits raises ValueError like any
-other damage.
+"""The only reader of JSON files. Text that nests too deep or holds integers of more than 20 digits raises ValueError
+like any other damage.
 """
 
 import json

@@ -23,15 +23,16 @@ class KindConfig(BaseModel):
     model_config = ConfigDict(extra="forbid", frozen=True)
 
     real_time: ClassVar[bool] = True
-    """Whether it lives in the host's time. A world that does not lets the whole rig run on virtual time."""
+    """Whether the kind runs in the host's time. A device's light then counts as real; a world that does not puts the
+    whole rig on virtual time."""
 
     kind: str
 
 
 @dataclass(frozen=True, slots=True)
 class Surroundings:
-    """The things that a device needs besides its config. Real devices use clock and ports, simulated ones world and
-    seed.
+    """The things that a device needs besides its config. Real devices use clock, ports and tap, simulated ones world
+    and seed.
     """
 
     clock: Clock
@@ -54,22 +55,22 @@ class Kind:
     config: type[BaseModel]
     create: Callable[[Any, Surroundings], Any]
     check_files: Callable[[Any], object] | None = None
-    """Opens the files that its config names, as `create` does, without the device; raises `DeviceError` if one cannot
-    be used. None: it names none. A world needs none, it is created.
+    """Function that opens the files which a config names, as `create` does, but no device. It raises `DeviceError` if
+    one cannot be used. None: the config names no file, or the kind is a world, which is created as the check.
     """
     off: Callable[[Any], bytes] | None = None
-    """The bytes that switch off the emission of a laser on a serial port, by its config, whatever it answers: sent
-    where there is no time to open it first."""
+    """Function that returns, for a config, the bytes that switch off a laser on a serial port in any state; they are
+    sent where there is no time to open it first."""
 
 
 def kinds(slot: str) -> tuple[str, ...]:
-    """Names of the kinds installed for a slot, sorted. Does not import them."""
+    """Names of the kinds installed for a slot, sorted. Does not import them. Raises ValueError for an unknown slot."""
     return tuple(sorted({entry.name for entry in _entries(slot)}))
 
 
 def lookup(slot: str, kind: str) -> Kind:
-    """Load the kind of a slot. Raises `UnknownKind`, with the choices or with the reason why the entry cannot
-    be used."""
+    """Load the kind of a slot. Raises `UnknownKind`, with the choices or with the reason why the entry cannot be used,
+    and ValueError for an unknown slot."""
     found = {entry.value: entry for entry in _entries(slot) if entry.name == kind}
     if not found:
         choices = ", ".join(kinds(slot)) or "none installed"

@@ -1,8 +1,8 @@
 """The ring of block slots between one source thread and its readers: allocated once, no copies, no loss unsaid.
 
 The source claims free slots (several at once if USB transfers are queued), fills them and publishes them in the order
-of claiming. Every reader gets every block in that order and holds its slot until it asks for the next one, or for some
-blocks longer.
+of claiming. Every reader gets the blocks in that order, all of them unless it is optional, and holds a slot until it
+asks for the next block, or for some blocks longer.
 
 The ring's `on_full` says what happens when no slot is free, so drivers need not know the policy. They claim; if they
 get nothing and `ring.waits` is False, they drop the block, count it as lost and call `mark_overflow`.
@@ -29,7 +29,7 @@ class OnFull(Enum):
     """Fate of a block for which there is no free slot."""
 
     WAIT = "wait"
-    """The source waits until one comes free. A source that cannot drops the block all the same."""
+    """The source waits until a slot comes free. A source that cannot wait drops the block all the same."""
     DROP = "drop"
     """The block is dropped and counted; the run goes on."""
     FAIL = "fail"
@@ -41,6 +41,7 @@ class BlockRing:
 
     One source thread calls `claim`, `publish`, `discard`, `mark_overflow` and `finish`; each reader belongs to one
     thread. holds_s: seconds of the stream that fill the ring, for the message of an overflow; None if unknown.
+    Raises ValueError if `slots` or `stride` is below 1.
     """
 
     def __init__(self, slots: int, stride: int, *, on_full: OnFull = OnFull.WAIT, holds_s: float | None = None) -> None:
@@ -81,12 +82,12 @@ class BlockRing:
         return not self._free
 
     def reader(self, name: str, *, required: bool = True, holds: int = 1) -> "RingReader":
-        """A new reader. Create it before the first claim, so that all readers see all blocks.
+        """A new reader. Raises `WrongState` after the first claim, since all readers are to see all blocks.
 
-        holds: number of blocks that it keeps, the newest ones, for work that is still under way.
-
-        A reader with required=False (a monitor) never makes the source wait: it holds one slot at most, gets the newest
-        block when it asks, and counts the ones it missed in `skipped`.
+        holds: number of blocks that it keeps, the newest ones, for work that is still under way. Raises ValueError if
+        the ring has too few slots for it.
+        A reader with required=False (a monitor) never makes the source wait. It takes one slot at most: the newest
+        block waits for it, but while it holds one it misses those that come. `skipped` counts the ones it missed.
         """
         with self._changed:
             if self._any_claimed:
@@ -103,8 +104,8 @@ class BlockRing:
             return reader
 
     def claim(self, timeout_s: float) -> NDArray[np.uint8] | None:
-        """Memory of a free slot, uint8 (stride,), with old bytes in it. None if no slot is free, after a wait if
-        `waits`.
+        """Memory of a free slot, uint8 (stride,), with old bytes in it. None if no slot is free, if
+        `waits` after at most `timeout_s`. Raises `WrongState` after `finish`.
         """
         with self._changed:
             self._require_unfinished("claim")
@@ -117,7 +118,7 @@ class BlockRing:
             return view
 
     def publish(self, block: FrameBlock) -> None:
-        """Hand the block in the oldest claimed slot to the readers."""
+        """Hand readers the block of the oldest claimed slot. Raises `WrongState` without one, or after `finish`."""
         with self._changed:
             self._require_unfinished("publish")
             slot = self._oldest_claimed("publish")
@@ -132,7 +133,7 @@ class BlockRing:
             self._changed.notify_all()
 
     def discard(self) -> None:
-        """Give the oldest claimed slot back unpublished, as when it held no frames (a heartbeat, a damaged block)."""
+        """Give the oldest claimed slot back unpublished, as when it holds no frames (a heartbeat, a damaged block)."""
         with self._changed:
             self._free.append(self._oldest_claimed("discard"))
             self._changed.notify_all()
@@ -160,7 +161,7 @@ class BlockRing:
             self._changed.notify_all()
 
     def finish(self, error: BaseException | None = None) -> None:
-        """Publish no more blocks. Readers get what is left, then None, or `error` is raised. A second call changes
+        """End the stream. Readers get the blocks that are left, then None, or `error` is raised. A second call changes
         nothing.
         """
         with self._changed:
@@ -170,7 +171,7 @@ class BlockRing:
                 self._changed.notify_all()
 
     def _wait_for_slot(self, timeout_s: float) -> bool:
-        """Whether a slot came free; the time it took counts. The ring's lock is held."""
+        """Wait for a slot and add the time to `waited_s`; returns whether one came free. The ring's lock is held."""
         if not self.waits:
             return False
         begun = time.perf_counter()
@@ -209,10 +210,10 @@ class RingReader:
         self._closed = False
 
     def next(self, timeout_s: float | None = None) -> FrameBlock | None:
-        """The next block. Its memory stays valid for as many further calls as the reader holds blocks.
+        """The next block. Its memory stays valid until the n-th call after this one, n = `holds`.
 
         Returns None after the last block, or raises the source's error. Raises `DeviceTimeout` after `timeout_s` (None:
-        no limit).
+        no limit) and `WrongState` after `close`.
         """
         ring = self._ring
         with ring._changed:
@@ -254,7 +255,7 @@ class RingReader:
             yield block
 
     def _offer(self, slot: int, block: FrameBlock) -> bool:
-        """Whether this reader takes the block, and so holds its slot. The ring's lock is held."""
+        """Take the block unless this reader has to skip it; returns whether it did. The ring's lock is held."""
         if self._closed:
             return False
         if not self.required:

@@ -29,7 +29,7 @@ _FAITHFUL = Context(prec=20)
 
 @dataclass(frozen=True, slots=True)
 class Dimension:
-    """A physical dimension. `units` gives the size of each unit in SI; the first is preferred for output."""
+    """A physical dimension. `units` gives the size of each unit in SI (rain rate: in m/h); output prefers the first."""
 
     name: str
     units: Mapping[str, Fraction]
@@ -39,7 +39,7 @@ class Dimension:
 
 
 _PREFIXES = {"G": 9, "M": 6, "k": 3, "": 0, "c": -2, "m": -3, "u": -6, "\u00b5": -6, "\u03bc": -6, "n": -9, "p": -12}
-"""Powers of ten; micro also by the sign of keyboards and by the Greek letter."""
+"""Powers of ten; micro is u, the micro sign of keyboards, or the Greek letter."""
 _SMALL = ("u", "\u00b5", "\u03bc", "n")
 
 
@@ -77,7 +77,8 @@ DIMENSIONS: Mapping[str, Dimension] = {dimension.name: dimension for dimension i
 def parse_quantity(text: object, dimension: str) -> float:
     """The SI number that a text such as "10 us" means (ratio: 1 for 100 %; rain rate: m/h).
 
-    Correctly rounded: "0.1 us" gives the float 1e-07. Raises ValueError, one line with an example, for anything else.
+    Correctly rounded: "0.1 us" gives the float 1e-07. Raises ValueError, in one line, for anything else and for what no
+    float can hold.
     """
     exact = parse_exact(text, dimension)
     try:
@@ -90,7 +91,7 @@ def parse_quantity(text: object, dimension: str) -> float:
 
 
 def parse_exact(text: object, dimension: str) -> Fraction:
-    """Parse a quantity as `parse_quantity` does, but without rounding. Takes a fraction too ("100000/3 Hz")."""
+    """Parse a quantity as `parse_quantity` does, without rounding or bounds. Both take fractions ("100000/3 Hz")."""
     known = DIMENSIONS[dimension]
     like = f'write the {known.name} with a unit, like "{known.example}"'
     if not isinstance(text, str):
@@ -111,8 +112,8 @@ def parse_exact(text: object, dimension: str) -> Fraction:
 
 
 def format_quantity(value: float | Fraction, dimension: str) -> str:
-    """A text with a unit, as people write it, that reads back to exactly `value`. Raises ValueError if that is not
-    finite.
+    """A text with a unit, as people write it, that reads back to exactly `value`. Raises ValueError if `value` is
+    not finite.
 
     Chooses the shortest text whose number is between 0.1 and 1000, if there is one. Among texts of nearly the same
     length it prefers the first unit, then a number of at least 1.

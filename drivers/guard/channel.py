@@ -3,7 +3,7 @@
 Each message, errors included, is one line of JSON over a socket pair. The end of the stream is a message too: the
 kernel sends it as soon as the other process is gone.
 
-The heartbeat is a page of memory that both processes share; the source thread writes to it. A beat is a single store,
+The heartbeat is a page of memory that both processes share; the source thread writes to it. A beat only stores numbers,
 without a lock or a system call, so that a full pipe, a stopped guard or a slow disk cannot delay it.
 """
 
@@ -92,7 +92,7 @@ def error_message(error: BaseException) -> list[str]:
 
 
 def error_from(message: list[str]) -> DeviceError:
-    """The error that a message carries. A class that is not a device error means a fault of the guard itself."""
+    """The error that a message carries. A class not in `drivers.errors` gives `ProtocolError` and blames the guard."""
     name, text = message
     kind = getattr(drivers.errors, name, None)
     if isinstance(kind, type) and issubclass(kind, DeviceError):
@@ -101,7 +101,7 @@ def error_from(message: list[str]) -> DeviceError:
 
 
 def plain_ports(ports: Mapping[str, Any]) -> dict[str, str]:
-    """Emulated ports by name, without those that exist only in this process's memory."""
+    """Addresses of the emulated ports by name, without those that exist only in this process's memory."""
     return {name: port.address for name, port in ports.items() if port.usb_backend is None and port.serial_port is None}
 
 
@@ -113,13 +113,13 @@ class Heartbeat:
     """The shared page, as either process sees it."""
 
     def __init__(self, handle: int) -> None:
-        """handle: of an anonymous file of at least a page."""
+        """handle: file descriptor of an anonymous file of at least a page."""
         self.handle = handle
         self._page = mmap.mmap(handle, mmap.PAGESIZE)
 
     @classmethod
     def create(cls) -> "Heartbeat":
-        """A new page in memory. It is not in a file on a disk, since access to that could block when the disk does."""
+        """A new page in memory, not in a file on a disk, which could block. Raises `DeviceError` outside Linux."""
         if not hasattr(os, "memfd_create"):
             raise DeviceError("the laser guard needs Linux; scan from a Linux machine")
         handle = os.memfd_create("spadrig-heartbeat")

@@ -28,7 +28,7 @@ from drivers.transports.tap import TapFile
 
 
 class _Guarded(Device):
-    """A device whose port the guard owns. about: what the guard read when it opened it."""
+    """A device whose port the guard owns. about: what the guard read when it opened the device."""
 
     _slot: ClassVar[str]
 
@@ -150,7 +150,7 @@ class Guard:
         limits: GuardLimits | None = None,
         tap: TapFile | None = None,
     ) -> None:
-        """Start the guard, which opens the devices meanwhile. Raises `UnknownKind` for a kind that is not installed."""
+        """Start the guard, which opens the devices meanwhile. Raises `UnknownKind`, or `DeviceError` outside Linux."""
         configs = {slot: config for slot, config in (("laser", laser), ("sync", sync)) if config is not None}
         ports = ports or {}
         self._rescue = Rescue(configs, ports)
@@ -190,12 +190,12 @@ class Guard:
 
     @property
     def laser(self) -> LineLaser:
-        """The guarded laser. Waits until it is open; raises the error if opening it failed."""
+        """The guarded laser. Waits until it is open; raises `DeviceError` if it is not guarded or cannot be opened."""
         return self._proxy("laser", GuardedLaser)
 
     @property
     def sync(self) -> SyncSource:
-        """The guarded sync source. Waits until it is open; raises the error if opening it failed."""
+        """The guarded sync source. Waits and raises errors as `laser` does."""
         return self._proxy("sync", GuardedSync)
 
     @property
@@ -209,8 +209,8 @@ class Guard:
         return self._process.pid
 
     def beat(self, frame: int) -> None:
-        """Report the last frame number received. It is called for every block and is a single store. Raises `failure`
-        if there is one.
+        """Report the last frame number received. It is called for every block and only writes to memory. Raises
+        `failure` if there is one.
         """
         self._heartbeat.waited_s = 0.0
         self._heartbeat.frame = frame
@@ -228,8 +228,8 @@ class Guard:
     def ask(self, slot: str, verb: str, *arguments: Any) -> Any:
         """Have the guard call a device's method on behalf of a proxy; returns its result or raises its error.
 
-        Raises `GuardLost` if the guard is gone. Methods that make a device safe first wait until the application has
-        tried to do so itself.
+        Raises `failure` instead of switching anything on, `DeviceTimeout` after `ANSWER_S`, and `GuardLost` if the
+        guard is gone; methods that make a device safe first wait until the application has tried to do so itself.
         """
         if self.failure is not None and verb in _ENABLING:
             raise self.failure
@@ -289,7 +289,7 @@ class Guard:
             return cast(_Proxy, self._proxies[slot])
 
     def _told(self, answer: Message | None, verb: str) -> Message:
-        """The answer, unless it is an error, or there is none since the guard is gone."""
+        """The answer. Raises the error that it carries, or `GuardLost` if there is none since the guard is gone."""
         if answer is None:
             raise self._gone(verb)
         if "error" in answer:
@@ -350,7 +350,7 @@ class Guard:
             self._parted = True
 
     def _end(self) -> None:
-        """Deal with the end of the guard: as asked, after it made all safe, or by force."""
+        """Deal with the end of the guard. If it said no goodbye, make the devices safe from here."""
         if self._parted:
             self._lost.set()
         else:

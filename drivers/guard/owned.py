@@ -1,6 +1,6 @@
 """A device that the guard owns: opened from its config, used through the application's messages, made safe at the end.
 
-Its `Lane` is a thread that does one job after the other for it, urgent ones first.
+Each of its two `Lane`s is a thread that does one job after the other for it, urgent ones first.
 """
 
 import itertools
@@ -107,7 +107,7 @@ class Owned:
         return bool(getattr(device, "port_lost", False))
 
     def call(self, verb: str, arguments: list[Any]) -> Any:
-        """Call the method that a proxy asks for; returns the result as JSON. May raise DeviceError."""
+        """Call the method that a proxy asks for; returns a result that JSON can carry. May raise DeviceError."""
         device = self.device
         if isinstance(device, LineLaser):
             self.armed = (self.armed or verb == "arm") and verb != "disarm"
@@ -134,8 +134,8 @@ class Owned:
         return self.unsafe and not self.trying and time.monotonic() >= self._next_try
 
     def try_safe(self) -> None:
-        """Try once to make the device safe: all outputs low, or the laser paused and, if it was armed, disarmed. Runs
-        on a lane.
+        """Try once to make the device safe: all outputs low, or the laser paused and, if it was armed, disarmed. A
+        lost port is opened again first. Runs on a lane.
         """
         try:
             if self.port_lost:
@@ -154,7 +154,7 @@ class Owned:
             self.trying = False
 
     def calm(self) -> None:
-        """Make the device dark now, even while a method runs that may switch light on; `try_safe` follows it."""
+        """Make the device dark, during a method that may switch light on or right behind it. Errors are only logged."""
         try:
             make_safe(self.device, disarm=False)
         except DeviceError as error:

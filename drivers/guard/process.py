@@ -1,10 +1,11 @@
 """The guard's own process: carries out what the application asks, and watches the application meanwhile.
 
 The main thread never touches a device. It reads messages, looks at the application every 10 ms and gives jobs to lanes.
-The light is ended (a "trip") when the application ends, is stopped or takes no frames; when a port hangs up; or when
-the laser reports an open interlock or a fault, or stops answering. In a trip all outputs of the gate go low and the
-laser is paused, both at the same time. Afterwards an application that cannot go on by itself is killed, the laser is
-disarmed and the ports are closed. If frames stop because the gate's program has ended, the laser is only paused.
+The light is ended (a "trip") when the application ends, is stopped or takes no frames; when a port hangs up; when the
+laser reports an open interlock or a fault, or stops answering; or when the guard is told to end. In a trip all outputs
+of the gate go low and the laser is paused, both at the same time. Afterwards an application that cannot go on by itself
+is killed, the laser is disarmed and the ports are closed. If frames stop because the gate's program has ended, the
+laser is only paused.
 
 `Rescue` is for the opposite case, when the guard is gone: the application opens the ports, which are free then, and
 makes the devices safe as far as it can.
@@ -43,7 +44,7 @@ END_CHECK_S = 0.2
 GATE_FIRST_S = 0.1
 """Longest time that a kill waits for the low gate: a mirror whose program dies must not be lit."""
 GIVE_UP_S = 10.0
-"""Time after which attempts to make a device safe that does not answer end."""
+"""Time after which the guard gives up making a device safe that does not answer."""
 
 _URGENT = ("gate_low", "abort", "pause", "disarm")
 _ENABLING = ("arm", "program", "run")
@@ -91,7 +92,7 @@ class GuardProcess:
     # Messages
 
     def _receive(self) -> list[Message]:
-        """Deal with the messages that come within a tick."""
+        """The messages that come within a tick. If the application is gone, trips and begins the end."""
         sources = [self._channel.fileno()]
         if self._application is not None and self._application.handle is not None:
             sources.append(self._application.handle)
@@ -120,7 +121,7 @@ class GuardProcess:
         for slot, config in message["open"].items():
             try:
                 owned = Owned(slot, config, message["ports"], message["tap"])
-            except Exception as error:  # a config of a kind that this process cannot make: told, not died of
+            except Exception as error:  # the application is told of a config that is no good here
                 self._channel.send({"opened": slot, "error": error_message(error)})
                 continue
             self._owned[slot] = owned
@@ -147,7 +148,7 @@ class GuardProcess:
             owned.lane.do(owned.calm)  # what the overtaken verb still does is undone behind it
 
     def _answer(self, owned: Owned, message: Message) -> None:
-        """Do a verb and answer with its result or error. Runs on the device's lane."""
+        """Do a verb and answer with its result or error. Runs on a lane of the device's."""
         verb = message["verb"]
         answer: Message = {"id": message["id"]}
         with self._trip_lock:
@@ -206,7 +207,7 @@ class GuardProcess:
                 application.kill()
 
     def _suspect(self, trouble: str, stopped: bool, now: float) -> None:
-        """Act on missing frames, unless the program has come to its end by itself, which its gate can tell."""
+        """Act on missing frames, unless the gate says, in time, that its program has ended by itself."""
         sync = self._owned.get("sync")
         if stopped or sync is None or (self._check_until is not None and now > self._check_until):
             self._trip_application(trouble, stopped)
@@ -221,7 +222,7 @@ class GuardProcess:
         self._check_until = None
 
     def _note_end(self, sync: Owned) -> bool:
-        """Whether the gate's program has come to its end; then the laser rests. On a lane of the gate's."""
+        """Ask the gate if its program has ended; if so, stop watching and pause the laser. Runs on a lane of it."""
         try:
             status = sync.device.status
         except DeviceError:
@@ -235,7 +236,7 @@ class GuardProcess:
         return True
 
     def _rest(self, laser: Owned) -> None:
-        """Pause the laser after the end of the gate's program. Runs on the laser's lane."""
+        """Pause the laser after the end of the gate's program. Runs on the laser's urgent lane."""
         try:
             laser.call("pause", [])
         except DeviceError as error:
@@ -261,7 +262,7 @@ class GuardProcess:
             try:
                 status = device.status
             except DeviceError as error:
-                if device.state is DeviceState.CLOSED:  # by what stood before this on the lane
+                if device.state is DeviceState.CLOSED:  # by an earlier job of the lane
                     return
                 if attempt:
                     self._trip(error)
@@ -300,7 +301,7 @@ class GuardProcess:
             lane.do(owned.try_safe, first=True)
 
     def _end(self) -> int:
-        """Make everything safe and close it."""
+        """Make safe what is not yet, and close everything; returns the exit code."""
         ends_at = time.monotonic() + GIVE_UP_S
         while any(owned.unsafe for owned in self._owned.values()) and time.monotonic() < ends_at:
             self._make_safe()

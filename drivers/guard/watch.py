@@ -29,8 +29,7 @@ class GuardLimits:
     """Longest times without a new frame number while the gate may open. The light is off within 50 ms after them.
 
     The defaults suit a stream with several blocks in 10 ms. A burst, which sends nothing until it is read out, and
-    blocks
-    that take longer need more: three times the time between two blocks.
+    blocks that take longer need more: three times the time between two blocks.
     """
 
     frames_within_s: float = 0.05
@@ -42,7 +41,7 @@ class GuardLimits:
     waits_within_s: float = 0.04
     """Limit for one at work whose source thread says that it has asked the SPAD for so long in vain."""
     first_wait_s: float = 0.3
-    """Limit of the wait for the first frame."""
+    """The same limit before the first frame."""
     first_frame_s: float = 1.0
     """Time from `run` to the first frame: SPAD, scanner and the scan marker come in between. An application at work
     gets `busy_within_s` on top, since devices that start and a machine with too much to do may come together."""
@@ -112,16 +111,16 @@ class FrameWatch:
 _AT_WORK = ("R", "D")
 """States of a thread at work: running or waiting for a processor; waiting for a disk."""
 _BUSY_SHARE = 0.15
-"""Share of a time that all threads together have run, or waited to, in a process at work. One that hangs wakes some
-service thread for microseconds now and then."""
+"""Share of a time for which all threads together have run, or waited for a processor, in a process at work. One that
+hangs wakes some service thread for microseconds now and then."""
 
 
 class WatchedProcess:
     """A process of this user, seen from outside. `close` closes the pidfd it holds.
 
     idle_thread: number of a thread that wakes up regularly by itself. On an overloaded machine it waits for a processor
-    each time. That does not count as work of the process, but meanwhile other threads may wait for the interpreter it
-    holds.
+    each time. Its time is not counted as work; but while it runs or waits for a processor the process is not asleep,
+    since other threads may wait for the interpreter that it holds.
     """
 
     def __init__(self, pid: int, idle_thread: int | None = None) -> None:
@@ -132,7 +131,7 @@ class WatchedProcess:
         self._since = 0.0
         self._found_asleep = False
         self.handle: int | None = None
-        """Handle that is readable once the process has ended; None if the kernel has no pidfd (before Linux 5.3)."""
+        """Handle that is readable once the process has ended; None if there is no pidfd (before Linux 5.3)."""
         if hasattr(os, "pidfd_open"):
             try:
                 self.handle = os.pidfd_open(pid)
@@ -141,7 +140,7 @@ class WatchedProcess:
 
     @property
     def ended(self) -> bool:
-        """Whether the process has ended."""
+        """Whether the process has ended, as far as there is a pidfd to tell."""
         if not self._ended and self.handle is not None:
             ready = select.poll()
             ready.register(self.handle, select.POLLIN)
@@ -160,7 +159,8 @@ class WatchedProcess:
         self._found_asleep = False
 
     def busy(self) -> bool:
-        """Whether its threads have worked since `note_progress`, or wait for a processor or a disk.
+        """Whether its threads worked for a good part of the time since `note_progress`, or run or wait for a processor
+        or a disk now.
 
         The answer is False only after two looks in a row. Threads are looked at one after the other, and work may pass
         from one that was not yet looked at to one that was.
@@ -203,7 +203,7 @@ class WatchedProcess:
 
 
 def _state(stat: str) -> str:
-    """The state in a `stat` file; "X" of what is gone."""
+    """The state in a `stat` file; "X" for a process or thread that is gone."""
     try:
         with open(stat, "rb") as file:
             return file.read().rpartition(b")")[2].split()[0].decode()
@@ -212,7 +212,7 @@ def _state(stat: str) -> str:
 
 
 def _work_ns(task: str) -> int:
-    """Nanoseconds that a thread ran or waited to; 0 of one that is gone, or where the kernel keeps no such count."""
+    """Nanoseconds for which a thread ran or waited to run; 0 if it is gone, or the kernel keeps no such count."""
     try:
         with open(f"{task}/schedstat", "rb") as file:
             ran, waited, *_ = file.read().split()

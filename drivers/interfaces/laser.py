@@ -61,7 +61,8 @@ class LineLaser(Device):
     def arm(self, power_w: float) -> None:
         """Set the power and enable emission under the gate. Light may come later (`status.warming_up`).
 
-        Raises `LimitExceeded`, `InterlockOpen` or `DeviceFault`, all before anything is enabled.
+        Raises `LimitExceeded`, `InterlockOpen` or `DeviceFault` before anything is enabled. If the laser then fails to
+        obey, raises `DeviceError` and tries to leave it dark.
         """
         self._require("arm", *OPEN_STATES)
         limits = self.limits
@@ -76,11 +77,9 @@ class LineLaser(Device):
         self._state = DeviceState.RUNNING
 
     def pause(self) -> None:
-        """Stop emission in a way that needs no key to resume. Allowed in any state; does nothing if the laser is not
-        armed.
+        """Stop emission in a way that needs no key to resume. Allowed until `close`, also if the laser is not armed.
 
-        May be called from any thread, even while another one arms. The `arm` that was interrupted then pauses once
-        more.
+        May be called from any thread, even while another one arms: the interrupted `arm` must leave the laser dark.
         """
         self._require("pause", *OPEN_STATES)
         _log.info("%s: pause", self._name)
@@ -89,8 +88,8 @@ class LineLaser(Device):
             self._state = DeviceState.CONFIGURED
 
     def disarm(self) -> None:
-        """Switch emission off for good. The laser may need its key turned before it arms again. Allowed in any
-        state."""
+        """Switch emission off for good. The laser may need its key turned before it arms again. Allowed until
+        `close`."""
         self._require("disarm", *OPEN_STATES)
         _log.info("%s: disarm", self._name)
         self._do_disarm()

@@ -94,7 +94,7 @@ class BeamScanner(Device):
 
     def point_clock(self, requested_hz: float) -> Fraction:
         """The exact point rate nearest to `requested_hz` that the device can run. Asking for that rate again returns it
-        unchanged.
+        unchanged. Raises `LimitExceeded` for a rate outside the limits.
         """
         self._require("point_clock", *OPEN_STATES)
         low, high = self.limits.point_rate_hz
@@ -109,7 +109,7 @@ class BeamScanner(Device):
         """Load a waveform, to be played `repeats` times without a seam; returns the exact point clock at which it will
         run.
 
-        Raises `LimitExceeded` with the first limit that the waveform breaks, the value and the limit. Nothing moves.
+        Raises `LimitExceeded` for the first limit that waveform or `repeats` break, with the value. Nothing moves.
         """
         self._note_end()
         self._require("load", DeviceState.READY, DeviceState.CONFIGURED, first="stop")
@@ -135,7 +135,7 @@ class BeamScanner(Device):
         self._state = DeviceState.RUNNING
 
     def stop(self) -> None:
-        """Bring the mirror to rest; the waveform stays loaded. Does nothing if nothing moves. May be called from any
+        """Bring the mirror to rest; the waveform stays loaded. Does nothing unless one was started. Allowed from any
         thread.
         """
         self._require("stop", *OPEN_STATES)
@@ -145,7 +145,7 @@ class BeamScanner(Device):
             self._state = DeviceState.CONFIGURED
 
     def park(self) -> None:
-        """Stop, and turn the mirror to where the beam is dumped. Allowed in any state and from any thread."""
+        """Stop, and turn the mirror to where the beam is dumped. Allowed until `close` and from any thread."""
         self.stop()
         _log.info("%s: park", self._name)
         self._has_moved = True
@@ -180,9 +180,9 @@ class BeamScanner(Device):
 
 
 def check_waveform(waveform: ScanWaveform, limits: ScannerLimits, clock_hz: Fraction, *, seamless: bool) -> None:
-    """Raise `LimitExceeded` if a waveform played at `clock_hz` asks for more than these limits allow.
+    """Raise `LimitExceeded` if a waveform is malformed or, played at `clock_hz`, asks for more than these limits allow.
 
-    seamless: whether the waveform repeats. The step from its last point to its first is then checked like any other.
+    seamless: whether the waveform repeats. The steps across its end are then checked like any other.
     """
     command = waveform.command
     points = len(command)

@@ -69,8 +69,8 @@ class WindowTable:
         return x0
 
     def check(self, sensor_width: int, step_px: int) -> None:
-        """Raises `LimitExceeded` for windows that a sensor cannot give: off its grid of steps and words, or beyond its
-        edge.
+        """Raise `LimitExceeded` for an empty table and for windows that a sensor cannot give: off its grid of steps and
+        words, or beyond its edge.
 
         The last word of a row may reach beyond a sensor whose width is not a whole number of words; its pad bits are 0.
         """
@@ -123,9 +123,9 @@ class SpadInfo:
 
     model: str
     serial: str
-    """Serial number, as far as the sensor has one."""
+    """Serial number; empty if the sensor has none."""
     width: int
-    """Pixels per row of the frames delivered, after the turn."""
+    """Pixels per row of the frames delivered, which are turned upright."""
     height: int
     rotation_deg: int
     """Angle at which the sensor is mounted; the frames that it delivers are upright already."""
@@ -220,7 +220,7 @@ class SpadArray(Device):
 
     @property
     def identity(self) -> str:
-        """Model and serial number."""
+        """The device's name, model and serial number."""
         return " ".join(part for part in (f"{self._name}:", self.info.model, self.info.serial) if part)
 
     @property
@@ -235,12 +235,12 @@ class SpadArray(Device):
 
     @property
     def health(self) -> SpadHealth:
-        """Ask the device. Raises `WrongState` during a run, when its line may be busy."""
+        """Ask the device. Raises `WrongState` during a run, when its line may be busy, and after `close`."""
         self._require("health", DeviceState.READY, DeviceState.CONFIGURED, first="stop")
         return self._do_health()
 
     def configure(self, request: SpadRequest) -> SpadTiming:
-        """Set the frame timing. Raises `LimitExceeded` if the device cannot do it; nothing is rounded silently."""
+        """Set timing, mode and windows; returns the exact timing. Raises `LimitExceeded` if the device cannot do it."""
         self._require("configure", DeviceState.READY, DeviceState.CONFIGURED, first="stop")
         self._check(request)
         timing = self._do_configure(request)
@@ -251,7 +251,9 @@ class SpadArray(Device):
         return timing
 
     def start(self, n_frames: int | None) -> None:
-        """Begin to expose `n_frames` frames, or until `stop` if it is None. Frame numbers and counters start at 0."""
+        """Expose `n_frames` frames, or until `stop` if it is None; frame numbers and counters start at 0. Raises
+        `LimitExceeded` below 1 frame, or for a burst that the device cannot store.
+        """
         first = "configure" if self._state is DeviceState.READY else "stop"
         self._require("start", DeviceState.CONFIGURED, first=first)
         if n_frames is not None and n_frames < 1:
@@ -268,7 +270,7 @@ class SpadArray(Device):
         self._state = DeviceState.RUNNING
 
     def fill(self, ring: BlockRing, timeout_s: float) -> bool:
-        """Claim, fill and publish at least one block. True while more may come, False once the run has ended.
+        """Claim, fill and publish a block or more. True while more may come, False once the run has ended.
 
         Called on the application's source thread; waits at most `timeout_s` for frames, then raises `DeviceTimeout`. If
         the ring is full and `ring.waits`, a source that can wait does so within the same time. Otherwise it drops the

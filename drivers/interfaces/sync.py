@@ -19,7 +19,7 @@ OUT_GATE = 2
 OUT_MARKER = 4
 """Output that marks the SPAD's records."""
 HOLD_S = 0.5e-3
-"""Longest that a held pulse outlasts the scan marker. A galvo needs about as long to come to rest."""
+"""Longest time by which a held pulse outlasts the scan marker. A galvo needs about as long to come to rest."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -87,7 +87,8 @@ class SyncSource(Device):
         """Load `pulses`, to be played `repeats` times, after which all outputs go low. Nothing is played before `run`.
 
         Raises `LimitExceeded` for a word that waits with the gate high (it would burn one spot for as long as the
-        scanner rests), a duration below half the resolution, no pulses at all, or more than the device holds.
+        scanner rests), other outputs than `OUT_*`, a duration below half the resolution or without end, no pulses or
+        repeats at all, or more than the device holds.
         """
         self._note_end()
         self._require("program", DeviceState.READY, DeviceState.CONFIGURED, first="abort")
@@ -105,8 +106,8 @@ class SyncSource(Device):
         self._state = DeviceState.RUNNING
 
     def gate_low(self) -> None:
-        """Take the gate low until the next `run`. Allowed in any state and from any thread. Raises `DeviceFault` if it
-        reads back high.
+        """Take the gate low until the next `run`. Allowed until `close` and from any thread. Raises `DeviceFault` if it
+        reads back high or cannot be read.
         """
         self._require("gate_low", *OPEN_STATES)
         _log.info("%s: gate low", self._name)
@@ -114,8 +115,8 @@ class SyncSource(Device):
         self._check_low(OUT_GATE, "gate_low")
 
     def abort(self) -> None:
-        """Take all outputs low; the program stays loaded. Allowed in any state and from any thread. Raises
-        `DeviceFault` if one reads back high.
+        """Take all outputs low; the program stays loaded. Allowed until `close` and from any thread. Raises
+        `DeviceFault` if one reads back high or they cannot be read.
         """
         self._require("abort", *OPEN_STATES)
         _log.info("%s: abort", self._name)

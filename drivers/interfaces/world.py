@@ -25,6 +25,6 @@ class World(Protocol):
     def truth(self, commands: NDArray[np.float64], velocity_per_s: float = 0.0) -> SweepTruth:
         """The truth of a sweep whose columns had the scanner commands (columns,) when their first row was exposed.
 
-        velocity_per_s: of the command during the sweep, negative if it fell.
+        velocity_per_s: speed of the command during the sweep, negative if it fell.
         """
         ...

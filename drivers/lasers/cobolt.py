@@ -7,8 +7,8 @@ itself and reports fault 1.
 The 06-MLD has its own command language, newer lasers an SCPI-like one. A 06-DPL is refused, since its power follows a
 gate only up to about 1 kHz. The laser is kept dark by a power of 0 and not by `l0`: after `l0` its key must be turned
 (pycobolt issue 6), whereas a power of 0 can be read back, by the next program too. `pause` sets the power to 0 (and
-sends `las:paus 1`), so no key is needed to resume. `disarm` does the same and sends `l0`; with autostart enabled the
-key must then be turned off and on before the laser starts again.
+sends `las:paus 1`), so no key is needed to resume; if no 0 reads back, it switches off. `disarm` does the
+same and sends `l0`; with autostart enabled the key must then be turned off and on before the laser starts again.
 """
 
 import logging
@@ -36,9 +36,9 @@ USUAL_TIMING = LineTiming(gap_s=0.1)
 _REFUSED = re.compile(r"syntax error.*", re.IGNORECASE)
 _JUNK = re.compile(r"^[^A-Za-z0-9+-]+")
 _MOST_LINES = 3
-"""A reply, and lines of nothing but junk before it."""
+"""Most lines of a reply: itself, and lines of nothing but junk or echo before it."""
 _POWER_STEP_MW = 0.1
-"""The finest power that every model keeps."""
+"""Finest step of power that every model keeps."""
 
 
 class CoboltFraming:
@@ -55,7 +55,7 @@ class CoboltFraming:
         return command.encode("ascii") + b"\r"
 
     def read(self, command: str, read_line: Callable[[], str]) -> str:
-        """The reply to the command, without junk before it and without the echo if that is on."""
+        """The reply to the command, without junk before it and without the echo if that is on; "" if there is none."""
         for _ in range(_MOST_LINES):
             reply = _JUNK.sub("", read_line().rpartition(command)[2].strip())
             if reply:
@@ -80,15 +80,15 @@ class Dialect:
     """...and that mode's name."""
     digital: tuple[str, str]
     analog: tuple[str, str]
-    """Whether the TTL input, and the analog one, govern the light there."""
+    """Whether the TTL input, and whether the analog one, governs the light in that mode: command and query."""
     set_power: str
     """Command of the power under the gate, in milliwatts."""
     powers: Mapping[str, tuple[str, float]]
     """Question of the power in each mode that knows one, and its unit in watts."""
     no_power: str
-    """Command that takes the power of the mode without input."""
+    """Command that takes the power of the constant-power mode to 0."""
     waits_for_key: tuple[str, re.Pattern[str], re.Pattern[str]]
-    """Question of its state, the answer's form, and the answers of a laser that starts only once its key is turned."""
+    """Question of the laser's state, the answer's form, and the answers if it starts only once its key is turned."""
     names: Mapping[str, str]
     """Names of modes without input, where the laser calls them by a number."""
     external: str = ""
@@ -129,7 +129,7 @@ SCPI = Dialect(
     external="laser:pm:dig:modulator external",
     pause="las:paus",
 )
-"""The newer 06-01 language. As "command" its modulator follows `!e` and `!d` without ever replying."""
+"""The newer 06-01 language. With its modulator on "command" the laser follows `!e` and `!d` and never answers them."""
 DIALECTS = {"06-MLD": MLD, "06-01": SCPI}
 
 
@@ -167,7 +167,7 @@ class CoboltLaser(SerialLaser):
 
     def _do_status(self) -> LaserStatus:
         line = self._line
-        # A flipped bit is a false alarm: what ends a scan is asked twice. One that hides an alarm lasts for one poll.
+        # A flipped bit may fake an alarm: what ends a scan is asked twice. If it hides one, the next poll finds it.
         interlock_open = line.ask_flag("ilk?") and line.ask_flag("ilk?")
         fault = self._fault()
         on = line.ask_flag("l?")
@@ -206,7 +206,7 @@ class CoboltLaser(SerialLaser):
         return "mixed" if digital else "analog" if analog else "modulation without input"
 
     def _power_w(self, mode: str) -> float | None:
-        """The power that the laser is set to in this mode. None: set by current, it cannot say."""
+        """The power in watts that the laser is set to in this mode. None: the mode knows none (current)."""
         if mode not in self._dialect.powers:
             return None
         question, unit_w = self._dialect.powers[mode]
@@ -267,7 +267,7 @@ class CoboltLaser(SerialLaser):
     def _darken(self) -> None:
         """Leave no light in any mode that knows a power, at once and without the key.
 
-        The power of the present mode first: this may be an emergency. The next program reads of the powers.
+        The power under the gate goes first: this may be an emergency. The next program can read the powers back.
         """
         if self._dialect.pause:
             self._line.tell(f"{self._dialect.pause} 1")
@@ -339,7 +339,8 @@ def _identify(config: CoboltConfig, line: Dialogue) -> CoboltLaser:
 
 
 def _off(config: CoboltConfig) -> bytes:
-    """Bytes that switch off. An empty command before them might count, and nothing is heeded for 0.1 s behind it."""
+    """The bytes that switch off. No CR goes before them: it might count as a command, after which none is heeded for
+    0.1 s."""
     return b"l0\r"
 
 

@@ -36,7 +36,7 @@ USUAL_TIMING = LineTiming()
 _ERROR = re.compile(r"ERR ?(-?\d{1,3})")
 _ADDRESSED = re.compile(r"^(SYST|SOUR)(?=:)")
 _HANDSHAKE = "SYST:COMM:HAND?"
-"""The setting is the port's, not a laser's behind a Remote."""
+"""Query of the handshake, which is a setting of the port and not of a laser behind a Remote."""
 
 ERRORS = {
     -100: "unknown command",
@@ -62,13 +62,13 @@ ERRORS = {
 
 
 class ObisFraming:
-    """The form of an OBIS's commands and replies. channel: its slot in a Remote; None if it is on the port itself."""
+    """The form of an OBIS's commands and replies. channel: the laser's slot in a Remote; None without one."""
 
     def __init__(self, channel: int | None) -> None:
         self._suffix = "" if channel is None else str(channel)
         self._handshake: bool | None = None
         self.identity = ""
-        """The reply to `*IDN?`, once it is known: from then on only the same one is in step."""
+        """The reply to `*IDN?`, once it is known: from then on only the same reply shows that the line is in step."""
 
     @property
     def ping(self) -> str:
@@ -85,12 +85,12 @@ class ObisFraming:
         return True
 
     def encode(self, command: str) -> bytes:
-        """The bytes of a command, with its address and CRLF."""
+        """The bytes of a command, with the laser's address behind a Remote and CRLF."""
         addressed = command if command == _HANDSHAKE else _ADDRESSED.sub(rf"\g<1>{self._suffix}", command)
         return addressed.encode("ascii") + b"\r\n"
 
     def read(self, command: str, read_line: Callable[[], str]) -> str:
-        """The reply to a command. A set command without an answer counts as done; reading back will tell."""
+        """The reply to a command. Without handshake a set command counts as done unanswered; reading back will tell."""
         if not command.endswith("?"):
             return read_line() if self._handshake else DONE
         reply = read_line()
@@ -100,7 +100,7 @@ class ObisFraming:
         return reply
 
     def refusal(self, reply: str) -> str | None:
-        """Returns the error reply with its meaning; None if the reply is no error."""
+        """The error reply with its meaning; None if the reply is no error."""
         error = _ERROR.fullmatch(reply)
         return f"{reply} ({ERRORS.get(int(error[1]), 'no known number')})" if error is not None else None
 
@@ -111,7 +111,7 @@ CDRH_DELAY = 0x10
 WARM_UP = 0x100
 KEY_OFF = 0x0200_0000
 INTERLOCK = 0x0400_0000
-"""Bits of `SYST:STAT?`; the last two are inferred from samples (docs/reference/hardware.md), less certain."""
+"""Bits of `SYST:STAT?`. The last two are less certain: inferred from samples (docs/reference/hardware.md)."""
 
 FAULTS = {
     0x1: "base temperature",
@@ -178,7 +178,7 @@ class ObisLaser(SerialLaser):
         on = line.ask("SOUR:AM:STAT?", SWITCH) == "ON"
         mode = line.ask("SOUR:AM:SOUR?", _MODE)
         emits = bool(bits & EMISSION)
-        # An ON that somebody else left pending may turn into light at any moment: that is emission, to be paused.
+        # An ON that another program left pending may turn into light at any moment: it counts as emission.
         pending = on and not emits
         return LaserStatus(
             emission=emits or (pending and not self._told_on),
@@ -231,7 +231,9 @@ class ObisLaser(SerialLaser):
         self._line.tell_and_check(f"{setting} {power_w:.5f}", f"{setting}?", NUMBER, is_power)
 
     def _await_ready(self) -> None:
-        """Wait until an ON acts at once: said earlier it would be deferred, and light come when nobody expects it."""
+        """Wait until an ON acts at once: sent earlier it would be deferred, and light come when nobody expects it.
+        Raises `DeviceFault`, `InterlockOpen`, `WrongState` after a pause, or `DeviceTimeout`.
+        """
         give_up_ns = self._clock.now_ns() + round(self._warm_up_s * NS_PER_S)
         while not (bits := self._bits()) & READY or bits & WARM_UP:
             fault = self._fault(bits)
@@ -268,7 +270,7 @@ class ObisLaser(SerialLaser):
         return int(self._line.ask_surely("SYST:STAT?", BITS), 16)
 
     def _fault(self, bits: int, base_c: float | None = None) -> str | None:
-        """The faults that the laser reports, and a base plate outside its range; None if all is well."""
+        """The faults that the laser reports, and a base plate at `base_c` outside its range; None if there are none."""
         said = []
         word = int(self._line.ask_surely("SYST:FAUL?", BITS), 16)
         if word:
@@ -317,7 +319,7 @@ def _identify(config: ObisConfig, framing: ObisFraming, line: Dialogue) -> ObisL
 
 
 def _base_range(line: Dialogue) -> TemperatureRange | None:
-    """The range that the base plate may be in. None: this unit states none; its own fault word judges then."""
+    """The range that the base plate may be in. None: the unit states no valid one; its own fault word judges then."""
     try:
         low, high = (line.ask_surely(f"SOUR:TEMP:PROT:BAS:{end}?", CELSIUS) for end in ("LOW", "HIGH"))
     except CommandRefused:
@@ -333,7 +335,7 @@ def _celsius(reply: str) -> float:
 
 
 def _off(config: ObisConfig) -> bytes:
-    """Bytes that switch off. The line end before them ends what a program that died had begun to say."""
+    """The bytes that switch off. The line end before them ends what a program that died had begun to send."""
     return b"\r\n" + ObisFraming(config.channel).encode("SOUR:AM:STAT OFF")
 
 

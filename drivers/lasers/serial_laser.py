@@ -1,4 +1,4 @@
-"""The common part of all lasers on a serial line: config with limits, a port that may get lost, serial number.
+"""The common part of all lasers on a serial line: config with limits, opening, a port that may get lost, serial number.
 
 `PlainLaser` is a line laser without key or warm-up, whose emission follows `arm` and `pause` at once. Simulated and
 recorded lasers use it.
@@ -24,7 +24,7 @@ class SerialLaserConfig(KindConfig):
     port: str
     """Serial port: a path or COM port, "serial=..." or "usb=VVVV:PPPP" of its USB device, or "emulated:NAME"."""
     max_power: Annotated[Watts, Field(gt=0)]
-    """The most this rig may ever send out; the laser's own maximum holds where it is smaller."""
+    """Most power, in watts, that this rig may ever send out; the laser's own maximum holds where that is smaller."""
     serial_number: str | None = None
     """Serial number of the laser; any other laser is refused. None: any laser will do."""
 
@@ -39,10 +39,10 @@ class SerialLaser(LineLaser):
         self._limits = limits
         self._armed = False
         self._stopped = False
-        """Whether pause or disarm was called since arm began: other threads may."""
+        """Whether pause or disarm was called since arm began, which other threads may do."""
 
     def arm(self, power_w: float) -> None:
-        """See `LineLaser`. Raises `WrongState` if a pause from another thread ended it."""
+        """See `LineLaser`. Raises `WrongState` if a pause or disarm from another thread ended it."""
         self._stopped = False
         super().arm(power_w)
 
@@ -57,7 +57,7 @@ class SerialLaser(LineLaser):
         super().disarm()
 
     def _require_no_stop(self) -> None:
-        """Raises `WrongState` if a pause has come while arming: what is to be lit must stay dark."""
+        """Raise `WrongState` if a pause or disarm has come while arming: the laser must then stay dark."""
         if self._stopped:
             raise WrongState(f"{self._name}: arm was ended by a pause; arm again")
 
@@ -88,8 +88,8 @@ def open_laser(
 ) -> _Laser:
     """Open the port, synchronise with the laser and identify it. Closes the port again if any of it fails.
 
-    make: name of the make in messages. Raises `DeviceNotFound` if nothing of that make answers, and what `identify`
-    raises.
+    make: name of the make in messages. Raises `DeviceNotFound` if nothing of that make answers, and what
+    `SerialPort` and `identify` raise.
     """
     port = SerialPort(f"{make} laser", resolve(config.port, surroundings.ports), surroundings.tap)
     try:
@@ -107,7 +107,7 @@ def open_laser(
 
 
 def require_serial_number(make: str, config: SerialLaserConfig, found: str) -> None:
-    """Raises `DeviceNotFound` if the config names another laser than the one found."""
+    """Raise `DeviceNotFound` if the config names another laser than the one found."""
     if config.serial_number not in (None, found):
         raise DeviceNotFound(
             f"{make} laser on {config.port} has serial number {found}, not {config.serial_number}; correct "
@@ -118,7 +118,7 @@ def require_serial_number(make: str, config: SerialLaserConfig, found: str) -> N
 class PlainLaser(LineLaser):
     """A laser that takes any power up to `max_power_w`.
 
-    emit: called with the power in W that it emits under the gate, whenever that changes.
+    emit: called with the power in W that it emits under the gate, whenever that is set.
     """
 
     def __init__(self, name: str, max_power_w: float, emit: Callable[[float], None] | None = None) -> None:
@@ -129,7 +129,7 @@ class PlainLaser(LineLaser):
 
     @property
     def limits(self) -> LaserLimits:
-        """Powers from 0 W on."""
+        """Powers from 0 W to `max_power_w`."""
         return self._limits
 
     def _do_status(self) -> LaserStatus:

@@ -2,8 +2,8 @@
 
 The index `frames.idx` has a header of 64 bytes, then a record of 64 bytes for each block, in the order of writing. Each
 record has its own CRC, so a torn or damaged one is recognised and affects no other. A record counts if its CRC is
-right, its place exists, and the first and last block of its segment are as recorded. Stretches that no record covers
-are searched for blocks; if the records do not fit, the whole segment is searched. Payloads are not read here.
+right and its place exists and is no other's. Stretches that no record covers are searched for blocks; if the first or
+last block of any segment is not as recorded, all segments are searched whole. `find_blocks` reads no payloads.
 
 The index only tells where to look. The blocks themselves hold everything, so a lost index can be rebuilt from them
 (`rig repair`).
@@ -61,7 +61,7 @@ def index_header() -> bytes:
 
 
 def index_of(block: FrameBlock, segment: int, offset: int, length: int | None = None) -> bytes:
-    """The 64-byte record of a block that lies at byte `offset` of `segment`. length: if None, that of `block_parts`."""
+    """The 64-byte record of a block at byte `offset` of `segment`. length: header to trailer; None: as we write it."""
     header = block.header
     length = length or BlockLayout(block.n_frames, header.width, header.height).block_bytes
     place = segment, int(header.flags), offset, length
@@ -78,7 +78,7 @@ def _signed(record: bytes) -> bytes:
 def decode_index(buffer: NDArray[np.uint8]) -> tuple[NDArray[np.void], NDArray[np.bool_]]:
     """Records (n,) of `INDEX_RECORD`, as a view of `buffer` (uint8 (bytes,)), and which of them are sound (n,).
 
-    A torn record at the end is left out. Raises CorruptBlock if the buffer does not begin with a sound index header.
+    A torn record at the end is left out. Raises CorruptBlock without a sound index header of this version at the start.
     """
     head = buffer[:HEADER_BYTES].tobytes()
     if len(head) < HEADER_BYTES or head[:4] != MAGIC or zlib.crc32(head[: -_CRC.size]) != _CRC.unpack(head[-4:])[0]:
@@ -97,7 +97,7 @@ def decode_index(buffer: NDArray[np.uint8]) -> tuple[NDArray[np.void], NDArray[n
 
 
 PAGE_BYTES: Final = 4096
-"""Blocks of a recording begin on multiples of this."""
+"""Blocks of a run's folder begin on multiples of this."""
 
 
 @dataclass(slots=True)
@@ -142,7 +142,7 @@ def find_blocks(segments: Sequence[SegmentReader], folder: Path) -> Contents:
 
 
 def read_entry(segment: SegmentReader, entry: Any) -> FrameBlock:
-    """The block that an entry describes, payload checked. Raises CorruptBlock if another block, or none, is there."""
+    """The block that an entry describes, payload checked. Raises CorruptBlock or UnsupportedBlock if not found."""
     block = _block_at(segment, entry, check_payload=True)
     if block is None:
         raise CorruptBlock(f"not block {entry['block_seq']} of run {entry['run_id']}, of which {INDEX_FILE} tells")
@@ -150,7 +150,7 @@ def read_entry(segment: SegmentReader, entry: Any) -> FrameBlock:
 
 
 def _told(folder: Path, problems: list[str]) -> Entries | None:
-    """Sound index records, sorted by place; None if there is no index."""
+    """Sound index records, sorted by place; None if there is no index that can be read."""
     if not folder.is_dir():  # a single file has none
         return None
     try:
@@ -227,7 +227,7 @@ def _search(segment: SegmentReader, known: Entries, problems: list[str]) -> Iter
 
 
 def round_up_to_page(size: Any) -> Any:
-    """The next multiple of `PAGE_BYTES`, for a number or for each element of an array."""
+    """The smallest multiple of `PAGE_BYTES` that is not less, for a number or for each element of an array."""
     return -(-size // PAGE_BYTES) * PAGE_BYTES
 
 

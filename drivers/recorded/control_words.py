@@ -1,8 +1,8 @@
 """The commands in recorded control traffic that do something, without the queries between them.
 
 How often a driver queries a device depends on the host's timing, and so do the tokens that number the queries; neither
-is compared. The drivers may send a command again when a reply was lost, so repeats count once. The queries known here
-are those of Helios, LaserCube, Cobolt, OBIS and PrawnDO (docs/reference/hardware.md).
+is compared. The drivers may send a command again when a reply was lost, so repeats on a serial line count once. The
+queries known here are those of Helios, LaserCube, Cobolt, OBIS and PrawnDO (docs/reference/hardware.md).
 """
 
 import re
@@ -21,9 +21,9 @@ _USB_QUESTIONS = {
     "01": (0x83, 0x84, 0x87, 0x88, 0x89, 0x8A, 0x8B, 0x8C),  # LaserCube: rates, range, ring, version
 }
 FRAME_PORTS = ("02", "03")
-"""Bulk endpoints that points go to: each transfer is a buffer of the device, sent when it has room."""
+"""Bulk endpoints that points go to: each transfer is a buffer for the device, sent when the device has room."""
 BEGIN, END = (b"run", b"swr"), b"abt"
-"""Commands of the sync source: between them a scan runs, behind the end the mirror is parked from wherever it is."""
+"""Commands of the sync source. A scan runs between them; after the end the mirror is parked from wherever it is."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -53,7 +53,7 @@ class Spoken:
 
 
 def _lines(pieces: list[Passed]) -> list[Passed]:
-    """The lines that are no questions, as pieces."""
+    """The lines that are no questions, each as a piece with the time of the one in which it ends."""
     stream = b"".join(piece.data for piece in pieces)
     ends = list(accumulate(len(piece.data) for piece in pieces))
     found, begin, piece = [], 0, 0
@@ -81,7 +81,7 @@ def _once(words: list[Passed]) -> list[Passed]:
 
 
 def _scans(sync: list[Passed] | None, buffers: list[Passed]) -> list[list[Passed]]:
-    """The buffers sent while a scan ran; without a sync source that says when, all of them."""
+    """The buffers sent during each scan that came to its end; without a sync source, all of them as one scan."""
     if not buffers:
         return []
     if sync is None:

@@ -1,7 +1,7 @@
 """The order of a recording's blocks, and which of them contradict the others. A wrong number costs only its own block.
 
-Within a run the numbers of blocks, frames, ticks and sweeps all rise. If blocks contradict each other, as few as
-possible are left out; among equal choices, those that agree least with their neighbours and with the index.
+Within a run the numbers of blocks, frames, ticks and sweeps all rise. If blocks contradict each other, those that
+together weigh most are kept: each counts, and more if it agrees with its neighbours and with the index.
 """
 
 from bisect import bisect_left, bisect_right
@@ -18,7 +18,8 @@ _NEIGHBOURS: Final = 2
 """Number of blocks on either side that are asked whether a block's numbers go with theirs."""
 _OF_BLOCK: Final = 16
 _OF_INDEX: Final = 8
-"""Weight of a block and its record in the index, beside 1 for each neighbour: fewer blocks never outweigh more."""
+"""Weights of a block and of its record in the index, beside 1 for each agreeing neighbour: one block never outweighs
+two."""
 _OUTLIERS: Final = 4
 """If more than one block in so many has the wrong ticks or sweep, the device counts so, and none is left out."""
 
@@ -27,8 +28,8 @@ def in_order(entries: Entries, told: Entries, problems: list[str], *, folder: bo
     """The blocks run after run with rising numbers, without contradictory ones; and whether they also lie in this
     order.
 
-    told: the sound records of the index, ordered by place; they give the order of the runs. folder: whether the
-    segments are those of a run's folder, where each holds blocks of one run only.
+    told: the sound records of the index, ordered by place; they give the order of the runs. problems: gets a line for
+    each sort of blocks left out. folder: whether the segments are those of a run's folder, each with blocks of one run.
     """
     if len(entries) == 0:
         return entries, True
@@ -70,7 +71,7 @@ def _foreign(by_place: Entries, told: Entries) -> NDArray[np.bool_]:
 
 
 def _runs(by_place: Entries, told: Entries) -> list[Ints]:
-    """Indices of each run's blocks, the runs in the order in which they were taken: that of most of their records."""
+    """Indices of each run's blocks; runs by their records' median place in the index, those without records last."""
     place = {run: float(np.median(at)) for run, at in _grouped(told["run_id"]).items()}
     mine = _grouped(by_place["run_id"])
     return [mine[run] for run in sorted(mine, key=lambda run: (run not in place, place.get(run, np.median(mine[run]))))]
@@ -104,7 +105,8 @@ def _rising(run: Entries, told: Entries) -> Ints:
 
 
 def _agreeing(seq: Ints, first: Ints, t0: Ints, n_frames: Ints) -> Ints:
-    """Number of neighbours, int64 (n,), with which each block agrees in its number, its frames and its ticks."""
+    """Number of neighbours, int64 (n,), with which each block agrees in number, frames or ticks, the least of
+    the three; 0 if its frames reach into those of the next block."""
     place = np.arange(len(seq))
     steps = np.diff(first)
     per_frame = float(np.median(np.diff(t0)[steps > 0] / steps[steps > 0])) if (steps > 0).any() else 0.0
@@ -122,7 +124,7 @@ def _agreeing(seq: Ints, first: Ints, t0: Ints, n_frames: Ints) -> Ints:
 
 
 def _heaviest(low: Ints, high: Ints, group: Ints, weight: Ints) -> Ints:
-    """Indices of the heaviest chain whose `low` is at least the `high` before; `group` (never falls) rises in it."""
+    """Indices of the heaviest chain in which each `low` is at least the `high` before and `group`, sorted, rises."""
     ends: list[int] = []  # of chains so far, rising, as do their weights
     totals: list[int] = []
     lasts: list[int] = []

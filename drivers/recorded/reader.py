@@ -41,7 +41,8 @@ _log = logging.getLogger(__name__)
 class RecordedRun:
     """The blocks of one start of the SPAD. Frame numbers count from that start, so the first one need not be 0.
 
-    entries: (n,) of `INDEX_RECORD`. header: that of the first sound block whose size and clock agree with the others'.
+    number: of the run in the recording, from 0. entries: (n,) of `INDEX_RECORD`. header: of a sound block with the size
+    and clock that most of up to three sound blocks have.
     """
 
     number: int
@@ -64,9 +65,8 @@ class RecordedRun:
         return int(self.entries["n_frames"].sum())
 
     def frame_at(self, seconds: float) -> int:
-        """Number of the first frame, lost ones included, that begins `seconds` or more after the run's first one.
-
-        If frames are triggered from outside, all frames of a block count as beginning with its first one.
+        """Number of the first frame, lost ones included, that begins `seconds` or more after the run's first one;
+        `end_frame` if none does. If frames are triggered from outside: the first frame of the block being taken then.
         """
         since = self.entries["t0_ticks"].astype(np.int64)
         since -= since[0]
@@ -89,7 +89,8 @@ class RunRecording:
     """A recording opened for reading: a run's folder or one `.spb` file. Any number of threads may read it.
 
     runs: in the order in which they were taken. problems: one line for each thing that is wrong; reading may add some.
-    Raises `DeviceNotFound` if there is no recording and `ProtocolError` if no frame of it is left.
+    Raises `DeviceNotFound` if there is no recording and `ProtocolError` if no frame of it is left, or if it is
+    compressed and zstandard is not installed.
     """
 
     def __init__(self, path: Path) -> None:
@@ -154,7 +155,7 @@ class RunRecording:
                     yield block
 
     def _expect(self, entries: Entries, i: int, told: int) -> int:
-        """Have the system read what comes, in pieces; index of the first entry it was not told of."""
+        """Have the system read what comes, in pieces; returns the index of the first entry that it was not told of."""
         if told > i:
             return told
         size, told = 0, i
@@ -229,7 +230,7 @@ def usual_header(headers: Sequence[BlockHeader]) -> BlockHeader:
 
 
 def _spread(n: int) -> Iterator[int]:
-    """0 to n - 1, the first and some from all over first."""
+    """The numbers 0 to n - 1, beginning with the first, the middle and the last one."""
     asked = np.unique(np.linspace(0, n - 1, _WITNESSES).astype(int)).tolist()
     yield from asked
     yield from (at for at in range(n) if at not in asked)

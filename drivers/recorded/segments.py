@@ -51,8 +51,8 @@ class FrameTable:
 
     @classmethod
     def read(cls, data: Bytes) -> "FrameTable":
-        """Read the table of a whole file (uint8 (bytes,)). If the table is damaged, make it from the frames
-        themselves."""
+        """Read the table of a whole file (uint8 (bytes,)). If it is damaged, make one from the frames, up to the first
+        damaged frame."""
         sizes = _stated_sizes(data)
         if sizes is None:
             sizes = np.array(list(_found_sizes(data)), np.int64).reshape(-1, 2)
@@ -78,13 +78,13 @@ class FrameTable:
 
 
 def table_bytes(sizes: Sequence[tuple[int, int]]) -> bytes:
-    """The skippable frame at the end of a file. sizes: (packed, plain) bytes of each frame."""
+    """The bytes of the skippable frame at the end of a file. sizes: (packed, plain) bytes of each frame."""
     entries = np.array(sizes, "<u4").reshape(-1, 2).tobytes()
     return _HEAD.pack(SKIPPABLE_MAGIC, len(entries) + _FOOT.size) + entries + _FOOT.pack(len(sizes), 0, SEEKABLE_MAGIC)
 
 
 def unpack_frame(packed: Bytes, size: int) -> Bytes:
-    """The `size` plain bytes of one frame. Raises CorruptBlock if it does not hold exactly these."""
+    """The `size` plain bytes of one frame. Raises CorruptBlock if it does not state that size or cannot be unpacked."""
     zstandard = zstandard_or_error()
     raw = packed.tobytes()
     try:
@@ -106,7 +106,7 @@ def zstandard_or_error() -> Any:
 
 
 def _stated_sizes(data: Bytes) -> NDArray[np.int64] | None:
-    """(packed, plain) of each frame as the table says, None if it cannot be."""
+    """(packed, plain) bytes of each frame, int64 (frames, 2), as the table says; None if that cannot be right."""
     if len(data) < _HEAD.size + _FOOT.size:
         return None
     frames, descriptor, magic = _FOOT.unpack(data[-_FOOT.size :].tobytes())
@@ -124,7 +124,7 @@ def _stated_sizes(data: Bytes) -> NDArray[np.int64] | None:
 
 
 def _found_sizes(data: Bytes) -> Iterator[tuple[int, int]]:
-    """(packed, plain) of each frame, found by unpacking one after the other; nothing behind the first damaged one."""
+    """(packed, plain) bytes of each frame, found by unpacking one after the other; up to the first damaged one."""
     zstandard = zstandard_or_error()
     at = 0
     while at < len(data) and data[at : at + len(FRAME_MAGIC)].tobytes() == FRAME_MAGIC:
@@ -150,7 +150,7 @@ NO_SEGMENT: Final = "holds no recording (frames-000000.spb); name the folder of 
 
 
 class PlainSegment:
-    """A segment as it was recorded, mapped into memory."""
+    """A segment as it was recorded, mapped into memory. Raises `DeviceNotFound` if the file cannot be read."""
 
     def __init__(self, path: Path, number: int) -> None:
         self.path = path
@@ -198,7 +198,7 @@ class PackedSegment:
         return parts[0] if len(parts) == 1 else np.concatenate([np.empty(0, np.uint8), *parts])
 
     def walk(self, start: int, end: int, *, check_payload: bool) -> Iterator[Placed | Damage]:
-        """Blocks and damage between two offsets. A block is looked for where each compressed frame begins."""
+        """Blocks and damage between two offsets. Each compressed frame is searched by itself, or is damage."""
         for frame in self._table.frames_at(start, end):
             _, _, begin, stop = self._table.places(frame)
             try:
@@ -209,7 +209,7 @@ class PackedSegment:
             yield from _shifted(data[max(0, start - begin) : end - begin], max(start, begin), check_payload)
 
     def expect(self, offset: int, length: int) -> None:
-        """Announce that these bytes will be read soon."""
+        """Announce that the compressed frame with byte `offset` will be read soon; later ones are not announced."""
         for frame in self._table.frames_at(offset, offset + 1):
             begin, end, _, _ = self._table.places(frame)
             self._file.expect(begin, end - begin)
@@ -220,7 +220,7 @@ class PackedSegment:
 
 
 SegmentReader = PlainSegment | PackedSegment
-"""A segment by its number and its `size`, in plain bytes."""
+"""A segment of either form; its `size` and all offsets are in plain bytes."""
 
 
 def open_segments(path: Path) -> list[SegmentReader]:

@@ -1,8 +1,8 @@
 """The common part of all beam scanners that are a galvo behind a USB DAC: how it runs.
 
-The mirror moves only when it is started or parked, always along ramps; opening a scanner only asks the board for its
-identity. A run consists of the way to the first point, the waveform, and the way to rest. A thread feeds the points to
-the DAC slice by slice and keeps track of where the mirror rests. Nothing is computed in advance: a waveform of a
+The mirror moves only when it is started, stopped, parked or closed, along ramps or brakes; only an emergency halt may
+let it jump. A run consists of the way to the first point, the waveform, and the way to rest. A thread feeds the points
+to the DAC slice by slice and keeps track of where the mirror rests. Nothing is computed in advance: a waveform of a
 million points repeated for hours takes only the memory of the waveform.
 """
 
@@ -28,9 +28,9 @@ _log = logging.getLogger(__name__)
 FULL_SCALE, CENTRE = 4095, 0x800
 """Largest value of the converters, and the one at which the mirror stands without power."""
 POLL_S = 0.002
-"""Time between two questions how far the board is."""
+"""Time between two questions of how far the board has played."""
 PATIENCE_S = 1.0
-"""Wait for a buffer to fall free, beyond the time that its points take."""
+"""Wait for a buffer to become free, beyond the time that its points take."""
 DRIFT = 1e-3
 """Largest relative difference between a board's crystal and the host's clock."""
 _NO_WAVE = ScanWaveform(np.zeros(1), np.zeros(1, np.uint8), Fraction(1))
@@ -164,7 +164,7 @@ class Dac(Protocol):
         """Raise an error if the board does not answer. May be called from any thread."""
 
     def halt(self) -> float:
-        """Stop what the board plays, in an emergency; returns the position at which the mirror then rests."""
+        """Stop what the board plays, in an emergency; returns the drive at which the next run is to begin."""
 
     def close(self) -> None:
         """Make the outputs safe and give the board back."""
@@ -174,7 +174,7 @@ class DacScanner(BeamScanner):
     """One mirror axis. While a waveform is played, a separate thread communicates with the board."""
 
     def __init__(self, dac: Dac, config: GalvoConfig) -> None:
-        """`dac` is its own from here on."""
+        """Take over `dac`, which is closed with the scanner."""
         super().__init__(dac.name)
         self._dac = dac
         self._park = config.park
@@ -247,7 +247,7 @@ class DacScanner(BeamScanner):
             self._dac.close()
 
     def _go(self, command: float) -> None:
-        """Bring the mirror to rest at `command`, as fast as the board plays."""
+        """Bring the mirror to rest at `command` by a ramp at the highest point rate."""
         clock_hz = self._do_point_clock(self._limits.point_rate_hz[1])
         run = self._dac.run(PointSource(self._rest(), command, self._limits, float(clock_hz)), clock_hz)
         if run.source.left:
@@ -270,14 +270,14 @@ class DacScanner(BeamScanner):
             _log.error("%s", error)
 
     def _rest(self) -> float:
-        """Wait for a run that is ending; returns where the mirror rests, after a fault by halting the device."""
+        """Wait for a run to end; returns the drive at which the mirror rests. If that is unknown, halts the board."""
         self._join()
         if self._position is None:
             self._position = self._dac.halt()
         return self._position
 
     def _join(self) -> None:
-        """Wait for the thread. Several may."""
+        """Wait for the thread that feeds the board. Several threads may wait at once."""
         thread = self._thread
         if thread is not None:
             thread.join()
@@ -292,7 +292,7 @@ def open_scanner(
     surroundings: Surroundings,
     identify: Callable[[UsbDevice], Dac],
 ) -> DacScanner:
-    """The scanner at the config's port. identify: makes the `Dac` of an open device, or raises an error."""
+    """Open the scanner at the config's port. identify: makes the `Dac` of an open device, or raises an error."""
     endpoint = resolve(config.port, surroundings.ports)
     usb = open_device(wanted, endpoint.address, alternates, endpoint.usb_backend, surroundings.tap)
     try:

@@ -33,7 +33,7 @@ class GalvoConfig(KindConfig):
     """Limits of the galvo, from its data sheet. The DAC itself would play anything."""
 
     port: str = "usb"
-    """Port: usb; where several are attached usb:serial=ABC, or usb:path=1-2 for a Helios, which has none;
+    """Port: usb; where several are attached usb:serial=ABC, or usb:path=1-2 for a Helios, which has no serial number;
     emulated:NAME."""
     axis: Literal["x", "y"] = "x"
     max_velocity: Annotated[PerSecond, Field(gt=0, le=1e6)]
@@ -70,7 +70,7 @@ class GalvoConfig(KindConfig):
 
 
 _HEADROOM = 0.9
-"""Share of a limit that a ramp uses."""
+"""Share of a limit that ramps and brakes use."""
 
 
 def ramp(start: float, end: float, limits: ScannerLimits, rate_hz: float) -> NDArray[np.float64]:

@@ -150,7 +150,7 @@ class HeliosConfig(GalvoConfig):
     max_point_rate: Annotated[Hertz, Field(gt=LOWEST_RATE_HZ, le=MOST_PPS)] = 65535.0
     """Most points per second. Lower it where the host's USB is busy: 40 kHz leaves a margin."""
     frame: Annotated[Seconds, Field(ge=0.01, le=0.5)] = 0.06
-    """Length of one frame: the host may be late by as much, and a stop takes twice as long."""
+    """Longest duration of one frame: the host may be late by as much, and a stop takes twice as long."""
 
 
 class HeliosDac:
@@ -170,7 +170,7 @@ class HeliosDac:
         self.clock = clock
         self._lock = threading.RLock()
         self._out_of_step = False
-        """A reply came late or was another's: what is read next may answer an older question."""
+        """Whether a reply came late or was no status: what is read next may answer an older question."""
         clock.sleep(_SETTLE_S)
         link.drain(_REPLIES, _REPLY_BYTES, _DRAIN_S)
         (version,) = struct.unpack("<I", self._ask(_VERSION, 0x84, 4)[:4])
@@ -311,7 +311,7 @@ class HeliosRun:
         self._clock.sleep(latest_s - now_s(self._clock))
 
     def _append(self, frame: bytes, duration_s: float) -> None:
-        """Send one more frame, behind the playing one."""
+        """Send one more frame, behind the playing one. Raises `DeviceFault` if it came too late or was dropped."""
         _, arrived_s = self._send(frame)
         late_s = arrived_s - self._earliest_end_s
         if late_s > 0:
@@ -340,7 +340,7 @@ class HeliosRun:
         raise DeviceFault(f"{self._link.name}: dropped a frame in silence; check the cable, then start again")
 
     def _made(self, flags: int = FLAG_SINGLE) -> tuple[bytes, float]:
-        """The next frame and its duration."""
+        """Take the points of the next frame; returns its bytes and its duration in seconds."""
         points = self.source.take(slice_points(self.source.left, self._most))
         return encode(points, self._link.config.axis, self._pps, flags), len(points) / self._rate_hz
 
@@ -362,7 +362,7 @@ class HeliosRun:
             self._clock.sleep(POLL_S)
 
     def _wait_until_free(self, stopping: threading.Event | None) -> bool:
-        """True once the pending buffer is free; False if a stop came first."""
+        """Wait until the pending buffer is free; False if a stop came first. Raises errors if it never is."""
         heard_s, full_s = now_s(self._clock), self._earliest_end_s
         while stopping is None or not stopping.is_set():
             asked_s = now_s(self._clock)

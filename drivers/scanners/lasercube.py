@@ -1,7 +1,7 @@
 """Scanner kind `lasercube`: a galvo behind a LaserCube / LaserDock USB board (docs/reference/hardware.md).
 
     outputs   X (or Y): mirror. With `colours: markers` R: backward. G: line marker. B: scan marker. X is not
-              reversed as in the vendor's program: the calibration tells in which direction a command leads
+              reversed, unlike in the vendor's program: the calibration tells in which direction a command leads
 
 The board has a ring of samples that a thread keeps filled, without frames or seams. Its colour outputs drive lasers of
 its own unless these are unplugged, so they stay off until the config says where they lead. It can be stopped only with
@@ -92,7 +92,7 @@ class LaserCubeDac:
         self._link = link
         self._lock = threading.RLock()
         self._out_of_step = True
-        """A reply came late, or an older program left one: what is read next may answer an older question."""
+        """Whether a reply, perhaps an older program's, may be outstanding: the next may answer an older question."""
         self.safe()
         self.firmware = (self._number(_MAJOR, 1), self._number(_MINOR, 1))
         self.identity = f"{self.name}, firmware {self.firmware[0]}.{self.firmware[1]}"
@@ -119,8 +119,8 @@ class LaserCubeDac:
         self.queued()
 
     def halt(self) -> float:
-        """Clear the ring. The mirror's position is unknown afterwards, and the next run goes to the centre in
-        one jump."""
+        """Switch the colours off and clear the ring; returns 0. The mirror's position is unknown afterwards, and the
+        next run goes to the centre in one jump."""
         self.safe()
         return 0.0
 
@@ -130,7 +130,7 @@ class LaserCubeDac:
         self.clear()
 
     def enable(self, on: bool) -> None:
-        """Enable the colour outputs."""
+        """Enable or disable the colour outputs."""
         self._ask(bytes((_ENABLE, on)))
 
     def clear(self) -> None:
@@ -228,11 +228,11 @@ class LaserCubeRun:
         """Samples short of a transfer."""
         self._sent = 0
         self._start_s = (-np.inf, np.inf)
-        """Earliest and latest time at which the first sample was played."""
+        """Earliest and latest time at which the first sample can have been played."""
         self._asked_s = 0.0
 
     def begin(self) -> None:
-        """Send copies of the first point, which play at once."""
+        """Send copies of the first point, which play at once, then points until the buffer is full."""
         self._link.clear()
         self._link.set_rate(self._rate_hz)
         self._link.enable(self._markers)
@@ -255,7 +255,7 @@ class LaserCubeRun:
         self._finish()
 
     def _finish(self) -> None:
-        """Send copies of the last point, and find an end among them."""
+        """Send copies of the last point and clear the ring while they play. Raises `DeviceFault` if that fails."""
         hold = self._hold + -(len(self._waiting) // 8) % SAMPLES_PER_TRANSFER
         self._send(PointSlice(np.full(hold, self.source.last), np.zeros(hold, np.uint8), np.zeros(hold, bool)))
         end_s = now_s(self._link.clock) + (self._most + hold) / self._rate_hz * (1 + DRIFT) + PATIENCE_S
@@ -289,7 +289,7 @@ class LaserCubeRun:
         raise DeviceFault(f"{self._link.name}: the points ran dry; lengthen buffer or unload the host")
 
     def _queued(self) -> int:
-        """Samples not yet played; raises `DeviceFault` if their number cannot be."""
+        """Number of samples not yet played. Raises `DeviceFault` if it is 0 or shows that samples were lost or late."""
         before_s = now_s(self._link.clock)
         queued = self._link.queued()
         after_s = now_s(self._link.clock)

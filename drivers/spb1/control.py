@@ -174,7 +174,7 @@ _REFUSALS: Final[dict[int, str]] = {
 
 
 def pattern_row(row: int, frame: int, width: int) -> bytes:
-    """Packed bytes of a row of the test pattern: the row's number in the first two, then one walking pixel."""
+    """Packed bytes of a row of the test pattern: its number (u16, little-endian), then one pixel that walks."""
     bits = bytearray(-(-width // 64) * 8)
     bits[0:2] = row.to_bytes(2, "little")
     x = 16 + frame % (width - 16)
@@ -183,9 +183,9 @@ def pattern_row(row: int, frame: int, width: int) -> bytes:
 
 
 _ANSWER_S = 1.0
-"""Longest wait for an acknowledgement..."""
+"""Longest wait for all acknowledgements of a transfer..."""
 _SLICE_S = 0.05
-"""...in pieces, after each of which `on_wait` is told."""
+"""...in pieces, after each of which, if nothing came, `on_wait` is called."""
 _AT_ONCE = 32
 """Commands that share a transfer."""
 _ACK_READ_BYTES = 1024
@@ -203,7 +203,8 @@ class ControlChannel:
     """The control plane over a link. For use by one thread at a time.
 
     ack_in: the endpoint of acknowledgements, None if they come as blocks, which cannot be read while a run streams.
-    tap: notes commands and acknowledgements, but not what a run left in front of them.
+    tap: notes commands and acknowledgements, but not what a run left in front of them. Calls raise `DeviceTimeout` if
+    the device does not acknowledge and `DeviceFault` if it refuses.
     """
 
     def __init__(
@@ -226,7 +227,8 @@ class ControlChannel:
         return self.read_all((register,))[0]
 
     def read_all(self, registers: Sequence[int]) -> list[int]:
-        """The values of several registers. Each is read twice, as they have no checksum. May raise `ProtocolError`."""
+        """The values of several registers, read twice, as they have no checksum. Raises `ProtocolError` if three pairs
+        differ."""
         for _ in range(_TRIES):
             values = [ack.value for ack in self._ask([(Op.READ, register, 0) for register in (*registers, *registers)])]
             if values[: len(registers)] == values[len(registers) :]:
@@ -260,7 +262,7 @@ class ControlChannel:
             self._tell([self._command(op, 0, value)])
 
     def forget_run(self) -> None:
-        """Abort a run, if there is one, and drop what it sent, including the answer to the abort."""
+        """Abort a run, if there is one, and drop what it sent. The answer to the abort is not waited for."""
         self._tell([self._command(Op.ABORT, 0, 0)])
         self.drain()
 

@@ -53,7 +53,7 @@ class BlockLayout:
     height: int
 
     def __post_init__(self) -> None:
-        """Raises ValueError for sizes that the header's fields cannot say."""
+        """Raise ValueError for sizes that the header's fields cannot hold."""
         if not 0 <= self.n_frames <= MAX_FRAMES:
             raise ValueError(f"{self.n_frames} frames in a block; SPB1 holds 0 to {MAX_FRAMES}")
         if not (1 <= self.width <= 0xFFFF and 1 <= self.height <= 0xFFFF):
@@ -116,7 +116,7 @@ def block_views(buffer: NDArray[np.uint8], layout: BlockLayout) -> tuple[NDArray
 def views_at(
     buffer: NDArray[np.uint8], layout: BlockLayout, records_offset: int, pixels_offset: int
 ) -> tuple[NDArray[np.void], NDArray[np.uint8]]:
-    """Records and bits at given offsets, which differ from ours if a block's header is longer."""
+    """Records and bits of `layout` as views at given offsets, which differ from ours if a block's header is longer."""
     n = layout.n_frames
     records: NDArray[np.void] = buffer[records_offset : records_offset + n * FRAME_RECORD.itemsize].view(FRAME_RECORD)
     pixels = buffer[pixels_offset : pixels_offset + n * layout.frame_bytes]
@@ -124,7 +124,7 @@ def views_at(
 
 
 def check_stride(stride: int) -> None:
-    """Raises ValueError unless `stride` is a positive multiple of `ALIGN`."""
+    """Raise ValueError unless `stride` is a positive multiple of `ALIGN`."""
     if stride < ALIGN or stride % ALIGN:
         raise ValueError(f"stride {stride} is no positive multiple of {ALIGN} bytes")
 
@@ -147,7 +147,7 @@ def seal_block(
     The block is a view of `buffer`, uint8 (stride,), contiguous; nothing is copied. The bytes after the trailer are
     zeroed.
     payload_crc: whether to compute the payload's CRC, which reads every byte; else the trailer says 'not computed'.
-    Raises ValueError if the header contradicts the layout or has no packed SPB1 1.0 form.
+    Raises ValueError if the buffer is too short, or the header contradicts the layout or has no packed SPB1 1.0 form.
     """
     _check(header, layout)
     records, bits = block_views(buffer, layout)
@@ -178,8 +178,8 @@ def seal_control(buffer: NDArray[np.uint8], payload_type: int, run_id: int, payl
 def block_parts(block: FrameBlock) -> tuple[memoryview, ...]:
     """The bytes of a block in order, for a file, with the payload's CRC and zeros up to the next multiple of `ALIGN`.
 
-    Records and pixels are views of the block's memory and valid as long as that is. Reads every byte, without the
-    interpreter's lock. Raises ValueError as `seal_block` does.
+    Records and pixels are views of the block's memory, where that is contiguous, and valid as long as it is. Reads
+    every byte, without the interpreter's lock. Raises ValueError for headers that `seal_block` refuses.
     """
     header = block.header
     layout = BlockLayout(block.n_frames, header.width, header.height)

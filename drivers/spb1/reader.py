@@ -1,7 +1,7 @@
 """Reading SPB1 blocks: a single one in its memory, or a stream of them that may be damaged.
 
 Header and trailer are always checked in full. The payload's CRC is checked on request, since it reads every byte, which
-at full rate would cost a live stream much of a core. No damaged block is passed on, and nothing is skipped silently.
+at full rate would cost a live stream much of a core. No block found damaged is passed on or skipped silently.
 """
 
 from collections.abc import Iterator
@@ -47,7 +47,7 @@ _PAYLOADS: Final = {
 }
 
 MAX_COUNT: Final = 2**63 - 2**32
-"""Frame numbers and ticks stay within int64 also after adding what a block's records span."""
+"""Largest number and tick of a block's first frame: with what its records span added, both stay within int64."""
 
 _LSB_FIRST: Final = int(BlockFlag.LSB_FIRST)
 """A plain number: arithmetic with flags takes microseconds, and this is done for every block."""
@@ -86,15 +86,17 @@ class HeaderFields:
 def parse_block(buffer: NDArray[np.uint8], *, check_payload: bool) -> FrameBlock:
     """The block at the start of `buffer` (uint8 (bytes,), contiguous, may be longer), as views of the same memory.
 
-    Raises `CorruptBlock` if anything is wrong with it, `UnsupportedBlock` if it is sound but sparse, summed, skipping,
-    of another major version or without frames. A truncated block gives its complete frames. Blocks sent with the least
-    significant bit first are copied and delivered like all others, without the LSB_FIRST flag.
+    Raises `UnsupportedBlock` if its header is sound but says sparse, summed, every k-th frame only, another major
+    version or control block; else `CorruptBlock` if anything is wrong with it (in the payload only if `check_payload`).
+    A truncated block gives its complete frames. Blocks with the least significant bit first are copied and delivered
+    like all others, without that flag.
     """
     return read_frames(buffer, read_header(buffer), check_payload=check_payload)
 
 
 def read_header(buffer: NDArray[np.uint8]) -> HeaderFields:
-    """The header at the start of `buffer`. Raises `CorruptBlock` if magic or CRC are wrong; nothing else is checked."""
+    """The header at the start of `buffer`. Raises `CorruptBlock` if it is cut off, or magic or CRC is wrong; nothing
+    else is checked."""
     if len(buffer) < HEADER_BYTES:
         raise CorruptBlock(f"{len(buffer)} bytes left, too few for a block header of {HEADER_BYTES}")
     raw = buffer.data[:HEADER_BYTES]
@@ -115,7 +117,7 @@ def read_header(buffer: NDArray[np.uint8]) -> HeaderFields:
 
 
 def read_frames(buffer: NDArray[np.uint8], fields: HeaderFields, *, check_payload: bool) -> FrameBlock:
-    """The frames that follow a header already read. Errors as in `parse_block`."""
+    """The block at the start of `buffer`, whose header was read already. Errors as in `parse_block`."""
     _refuse_unsupported(fields)
     layout = _checked_layout(fields, len(buffer))
     status, valid_bytes, payload_crc = _read_trailer(buffer, fields)
@@ -131,7 +133,7 @@ def read_frames(buffer: NDArray[np.uint8], fields: HeaderFields, *, check_payloa
 
 
 def read_control(buffer: NDArray[np.uint8], fields: HeaderFields) -> bytes:
-    """The payload of a control block whose header was read. Raises `CorruptBlock` if its CRC is wrong."""
+    """The payload of a control block whose header was read. Raises `CorruptBlock` if it is cut off or damaged."""
     if fields.block_bytes > len(buffer):
         raise CorruptBlock(f"control block cut off: {len(buffer)} of {fields.block_bytes} bytes")
     _, valid_bytes, payload_crc = _read_trailer(buffer, fields)
@@ -143,7 +145,7 @@ def read_control(buffer: NDArray[np.uint8], fields: HeaderFields) -> bytes:
 
 @lru_cache(maxsize=16)
 def _rate(tick_hz: int, denominator: int) -> Fraction:
-    """The same few rates come with every block; a fraction takes microseconds to make."""
+    """Ticks per second; 0 if the denominator is. Kept, since a fraction takes microseconds and the same few recur."""
     return Fraction(tick_hz, denominator) if denominator else Fraction(0)
 
 
@@ -237,7 +239,7 @@ def walk_blocks(buffer: NDArray[np.uint8], stride: int | None, *, check_payload:
     stride: bytes from block to block. None if it is unknown or changes: then each block ends at its own size, and zeros
     up to the next one are padding. After damage, reading resumes at the next header with the right CRC on a multiple of
     `ALIGN`. A block whose number does not rise within its run was sent or written twice and counts as damage. Control
-    blocks are skipped. Raises `UnsupportedBlock` if the stream is of a kind this reader does not take.
+    blocks are skipped. Raises `UnsupportedBlock` at a block of a kind that this reader does not take.
     """
     last: FrameBlock | None = None
     for item in walk_placed(buffer, stride, check_payload=check_payload):
@@ -257,7 +259,7 @@ def walk_blocks(buffer: NDArray[np.uint8], stride: int | None, *, check_payload:
 
 @dataclass(frozen=True, slots=True)
 class Placed:
-    """A sound block and its place: `length` bytes from byte `offset` on, the next block at `end` or later."""
+    """A sound block and its place: `length` bytes from byte `offset` on; the next block is sought from `end` on."""
 
     offset: int
     length: int
@@ -266,7 +268,7 @@ class Placed:
 
 
 def walk_placed(buffer: NDArray[np.uint8], stride: int | None, *, check_payload: bool) -> Iterator[Placed | Damage]:
-    """The blocks with their places, in any order and even twice. Blocks of an unsupported kind are damage."""
+    """Blocks with places, and damage, as they lie; numbers may fall or repeat. Unsupported blocks are damage."""
     if stride is not None:
         check_stride(stride)
     offset = 0
@@ -297,7 +299,7 @@ def walk_placed(buffer: NDArray[np.uint8], stride: int | None, *, check_payload:
 
 
 def _zeros(buffer: NDArray[np.uint8], offset: int) -> int:
-    """Bytes, whole pieces of `ALIGN`, that are zero from `offset` on; what is only allocated is passed quickly."""
+    """Number of bytes that are zero from `offset` on, in whole pieces of `ALIGN` or to the end; long runs go fast."""
     end, step = offset, ALIGN
     while end < len(buffer):
         piece = buffer[end : end + step]
@@ -308,7 +310,7 @@ def _zeros(buffer: NDArray[np.uint8], offset: int) -> int:
 
 
 def _next_header(buffer: NDArray[np.uint8], start: int, *, passed_over: int) -> int:
-    """Offset of the next sound header at or after `start`, or the buffer's end."""
+    """Offset of the next sound header at or after `start`, except at `passed_over`; the buffer's end without one."""
     for window in range(start, len(buffer), _SEARCH_BYTES):
         first_bytes = buffer[window : window + _SEARCH_BYTES : ALIGN]
         for index in np.flatnonzero(first_bytes == MAGIC[0]):

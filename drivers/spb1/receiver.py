@@ -102,8 +102,8 @@ class BlockReceiver:
         self._row_px = 8 * packed_row_bytes(armed.sensor_width)
 
     def take(self, ring: BlockRing, timeout_s: float) -> Took:
-        """Wait for the next read and process it. May raise what `ring.mark_overflow` raises, after counting the
-        frames."""
+        """Wait for the next read and process it. Raises the link's errors, `UnsupportedBlock`, and, after counting the
+        frames, what `ring.mark_overflow` raises."""
         self._ring = ring
         self._top_up(ring)
         reaped = self._link.reap(timeout_s)
@@ -141,7 +141,7 @@ class BlockReceiver:
             self._give_back(self._items.popleft())
 
     def _top_up(self, ring: BlockRing) -> None:
-        """Keep as many reads in flight as the ring has slots for, a few in any case."""
+        """Keep as many reads in flight as the ring has slots for, at most `_depth`; one or two in any case."""
         fewest = 2 if ring.slots >= _ROOMY_RING else 1
         if self._realign:
             if not self._submit(self._spare()[: self._realign], slot=False, use=False):
@@ -201,7 +201,7 @@ class BlockReceiver:
         return took
 
     def _require_armed(self, fields: HeaderFields) -> None:
-        """Raises CorruptBlock for a sound block that cannot be the next of this run."""
+        """Raise CorruptBlock for a sound block that cannot be the next of this run."""
         block, armed = fields.block, self._armed
         found = (block.width, block.height, block.sensor_width, block.sensor_height)
         if found != (armed.width, armed.height, armed.sensor_width, armed.sensor_height):
@@ -215,8 +215,8 @@ class BlockReceiver:
             raise CorruptBlock(f"block {block.block_seq} reaches beyond the {armed.n_frames} frames of the run")
 
     def _require_windows(self, block: FrameBlock) -> None:
-        """Raises CorruptBlock if a window lies off the words or beyond the row: what counts bits must not trip
-        over it."""
+        """Raise CorruptBlock if a window lies off the 64-bit words or beyond the row: the counting relies on
+        both."""
         if block.n_frames == 0:
             return
         x0 = block.records["x0"]
@@ -228,7 +228,7 @@ class BlockReceiver:
             raise CorruptBlock(f"block {block.header.block_seq}: a window lies beyond the row or off its words")
 
     def _note(self, fields: HeaderFields, n_frames: int) -> None:
-        """Count the frames that the header says were exposed."""
+        """Note how far the run has come by this block: its number, its last frame and its flags."""
         block = fields.block
         self._last_seq = max(self._last_seq, block.block_seq)
         self.next_frame = max(self.next_frame, block.first_frame + n_frames)
@@ -237,7 +237,7 @@ class BlockReceiver:
         self.gate_forced_low = self.gate_forced_low or bool(flags & _FORCED_LOW)
 
     def _hand_over(self, item: _Item, fields: HeaderFields, block: FrameBlock) -> None:
-        """Publish; a block that came into spare memory is copied or dropped."""
+        """Publish the block; one that came into spare memory is copied into a slot first, or dropped."""
         assert self._ring is not None, "set by take"
         if not item.slot:
             copied = self._copied(fields, item.buffer)
@@ -253,7 +253,7 @@ class BlockReceiver:
         self._published += 1
 
     def _copied(self, fields: HeaderFields, buffer: Buffer) -> FrameBlock | None:
-        """The block in a slot that came free; not where later blocks already have their slots: order is all."""
+        """The block, copied into a slot; None if none is free, or later reads hold slots, which come in order."""
         assert self._ring is not None, "set by take"
         if self._held is not None or any(item.slot for item in self._items):
             return None
@@ -264,7 +264,7 @@ class BlockReceiver:
         return read_frames(memory, fields, check_payload=False)
 
     def _as_received(self, block: FrameBlock) -> FrameBlock:
-        """Number and losses as they are behind this receiver, which may have refused or dropped blocks."""
+        """The block with number and losses as they are behind this receiver, which may have refused or dropped some."""
         header = block.header
         lost = header.first_frame - self.delivered
         flags = int(header.flags) & ~_LOST_BEFORE | (_LOST_BEFORE if lost > self._lost_at_last else 0)

@@ -31,7 +31,7 @@ _log = logging.getLogger(__name__)
 
 MIN_CYCLES = 5
 MAX_CYCLES = 2**32 - 1
-"""Length of a word; from 1 to 4 cycles the firmware makes a wait, 0 is one (5.1, pitfall 2)."""
+"""Shortest and longest word in cycles. 0 cycles are a wait, and the firmware turns 1 to 4 into 0."""
 WORD = np.dtype([("outputs", "<u2"), ("cycles", "<u4")])
 """Six bytes, as `adm` takes them."""
 
@@ -47,8 +47,8 @@ class ProgramLimits:
 
 
 def compile_program(pulses: Sequence[Pulse], repeats: int, board: ProgramLimits) -> NDArray[np.void]:
-    """The words of the whole program, with repeats written out and an end with all outputs low. May raise
-    `LimitExceeded`.
+    """The words of the whole program, `WORD` (n,), with repeats written out and an end with all outputs low. May
+    raise `LimitExceeded`.
     """
     _check_waits(_words(pulses, board), repeats, board)
     period = _words(sliced(pulses), board)
@@ -80,7 +80,8 @@ def _cycles(index: int, pulse: Pulse, board: ProgramLimits) -> int:
 
 
 def _check_waits(period: NDArray[np.void], repeats: int, board: ProgramLimits) -> None:
-    """Check that the program plays longer between two waits than a scan marker, which else ends both (pitfall 1)."""
+    """Raise `LimitExceeded` unless the program plays longer between two waits than a scan marker may last: as a level, it
+    would end both."""
     waits = np.flatnonzero(period["cycles"] == 0)
     if len(waits) == 0:
         return
@@ -215,7 +216,7 @@ class PrawnDo(SyncSource):
         self._line.port.close()
 
     def _identify(self) -> tuple[str, int]:
-        """Firmware, and words that the board holds; raises ProtocolError if its firmware is too old."""
+        """Firmware, and words that the board holds; raises ProtocolError if the firmware is too old or the board unknown."""
         version = "".join(self._line.transact("ver")).removeprefix("Version: ")
         try:
             numbers = tuple(int(part) for part in version.split(".")[:2])

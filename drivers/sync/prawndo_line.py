@@ -20,7 +20,7 @@ _log = logging.getLogger(__name__)
 _T = TypeVar("_T")
 
 IDLE = (0, 5)
-"""Values of `run-status`, stopped and aborted, in which everything but `sts`, `abt`, `ver` and `brd` is executed."""
+"""Values of `run-status`: stopped and aborted. In others only `sts`, `abt`, `ver` and `brd` are executed."""
 BYTES_PER_WORD = 6
 
 _CRLF = b"\r\n"
@@ -72,7 +72,7 @@ class PrawnDoLine:
         """Take all outputs low before anything else is asked, whatever state an earlier host left the board in.
 
         most_words: the largest memory of any board, in words. Raises `ProtocolError` if something else answers,
-        `DeviceTimeout` if nothing does.
+        `DeviceTimeout` if nothing does, `DeviceFault` if the outputs do not go low.
         """
         try:
             self.lower()
@@ -87,7 +87,8 @@ class PrawnDoLine:
     def transact(self, command: str, deadline_s: float | None = None, *, urgent: bool = False) -> list[str]:
         """Send a command; returns the lines of its answer without blank ones.
 
-        urgent: whether the command is part of taking the outputs low, for which all others give way.
+        urgent: whether the command is part of taking the outputs low, for which all others end with `DeviceFault`. Also
+        raises `DeviceTimeout` or `ProtocolError`.
         """
         deadline_s = self._timing.reply_s if deadline_s is None else deadline_s
         with self.lock:
@@ -118,7 +119,7 @@ class PrawnDoLine:
         return self._ask_twice("gto", lambda line: int(line, 16), deadline_s, urgent)
 
     def load(self, payload: bytes) -> None:
-        """Replace the program by these six-byte words. Raises `DeviceFault` for any answer but `ok` (pitfall 2)."""
+        """Replace the program by these six-byte words. Raises `DeviceFault` for another answer than `ok`."""
         with self.lock:
             before, after = self._token(), self._token()
             self._pay_debt()
@@ -138,9 +139,10 @@ class PrawnDoLine:
     def lower(self) -> None:
         """End the program and take all outputs low; returns as soon as they read back low.
 
-        `abt` alone leaves the outputs as they are, and `man` is executed only once the state machine has stopped
-        (pitfall 3). Both are sent at once; then the outputs are checked and the commands repeated until they are low.
-        Raises `DeviceTimeout` if the board does not answer; whether the gate is low is then unknown.
+        `abt` alone leaves the outputs as they are, and `man` is executed only once the state machine has stopped. Both
+        are sent at once; then the outputs are checked and the commands repeated until they are low. Raises
+        `DeviceTimeout` or `ProtocolError` if the board does not answer properly, in which case the gate may be high,
+        and `DeviceFault` if its outputs do not go low.
         """
         self._gate_first.set()
         try:
@@ -169,7 +171,7 @@ class PrawnDoLine:
             self.port.write(_LOWER)
 
     def _try_to_lower(self) -> bool:
-        """One round; each question has its own round trip, in which the board's second core does what it was told."""
+        """Try once; returns whether the outputs read back low. During each round trip the second core does its part."""
         hasty_s = self._timing.hasty_s
         self.transact("abt", hasty_s, urgent=True)
         if self.run_status(hasty_s, urgent=True)[0] not in IDLE:
@@ -178,10 +180,9 @@ class PrawnDoLine:
         return self.pins(hasty_s, urgent=True) == 0 and self.run_status(hasty_s, urgent=True)[0] in IDLE
 
     def _free_wedged(self, most_words: int) -> None:
-        """Free a board that a program which another host never finished sending keeps from hearing commands: give it
-        the rest.
+        """Free a board that hears no commands since another host never finished sending it a program: send the rest.
 
-        Zeros are words that wait with all outputs low (5.1, pitfall 4).
+        The rest is zeros, which are words that wait with all outputs low.
         """
         _log.warning("%s does not answer on %s; trying to end an unfinished program", self._name, self.port.path)
         self.port.write(b"\nend\n")
@@ -197,7 +198,8 @@ class PrawnDoLine:
         raise DeviceTimeout(f"{self._name} does not answer on {self.port.path}; unplug it, plug it in and start again")
 
     def _ask_twice(self, command: str, parse: Callable[[str], _T], deadline_s: float | None, urgent: bool) -> _T:
-        """Ask until two answers in a row agree: a flipped bit makes a low gate of a high one."""
+        """Ask twice in one go; returns the answer. Raises `ProtocolError` if the two differ, as by a flipped bit, which would
+        make a low gate of a high one."""
         lines = self.transact(f"{command}\n{command}", deadline_s, urgent=urgent)
         try:
             first, second = (parse(line) for line in lines)

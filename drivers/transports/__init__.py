@@ -1,2 +1,2 @@
-"""Byte transports between a driver and its device: serial ports, USB and TCP, with deadlines and this project's
+"""Byte transports between a driver and its device: serial ports and USB, with deadlines and this project's
 errors."""

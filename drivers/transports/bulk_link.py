@@ -1,8 +1,8 @@
 """A USB device that streams: commands, answers, and reads that are queued so that its FIFO never overflows.
 
-tests/benchmarks/spb_usb.py compares the two links. Both have a deadline on every call and raise this project's errors.
-A queue belongs to one thread at a time. Buffers are whole packets long and must be left alone until `reap` or `cancel`
-gives them back.
+tests/benchmarks/spb_usb.py compares `PlainLink` and `QueuedLink`. Both have a deadline on every call and raise this
+project's errors. A queue belongs to one thread at a time. Buffers are whole packets long and must be left alone until
+`reap` or `cancel` gives them back.
 """
 
 import array
@@ -57,7 +57,8 @@ class PlainLink(UsbDevice):
         return True
 
     def reap(self, timeout_s: float) -> tuple[Buffer, int] | None:
-        """Read the oldest queued buffer now. A read interrupted by the timeout continues in the next call."""
+        """Read into the oldest queued buffer now; returns it and its number of bytes. None: the next call goes on with
+        it."""
         if not self._queue:
             return None
         endpoint, buffer = self._queue[0]
@@ -86,7 +87,8 @@ class PlainLink(UsbDevice):
 class QueuedLink:
     """A streaming USB device with many reads in flight, which libusb writes straight into the caller's memory.
 
-    Uses module `usb1` of package libusb1. Its events are handled inside `reap`, on the caller's thread.
+    Uses module `usb1` of package libusb1. Its events are handled inside `read`, `reap` and `cancel`, on the thread that
+    calls them.
     """
 
     def __init__(self, listing: UsbListing, label: str, interfaces: tuple[int, ...]) -> None:
@@ -162,7 +164,7 @@ class QueuedLink:
 
     def reap(self, timeout_s: float) -> tuple[Buffer, int] | None:
         """The buffer of the oldest queued read and its number of bytes, once it is complete; None if the time is over
-        first.
+        first or nothing is queued.
         """
         if not self._queue or not self._wait(self._queue[0], timeout_s):
             return None

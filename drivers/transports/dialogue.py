@@ -143,7 +143,9 @@ class Dialogue:
         return float(self.ask(command, NUMBER))
 
     def ask_surely(self, command: str, form: re.Pattern[str]) -> str:
-        """Ask until two replies in a row agree. Nothing else protects an answer that is kept against a flipped bit."""
+        """Ask up to four times, until two replies in a row agree, and return that reply; else raise `ProtocolError`.
+        Nothing else protects a value that is kept from a flipped bit. Other errors as in `tell`.
+        """
         last = self.ask(command, form)
         for _ in range(_ATTEMPTS):
             reply = self.ask(command, form)
@@ -153,8 +155,8 @@ class Dialogue:
         raise ProtocolError(f"{self.name} answers {command!r} differently each time; check its cable")
 
     def tell_and_check(self, command: str, query: str, form: re.Pattern[str], wanted: Callable[[str], bool]) -> None:
-        """Set a value and read it back; only what reads back counts. Raises `DeviceFault` if it reads back as something
-        else.
+        """Set a value and read it back; only what reads back counts. If it is not `wanted`, raises `CommandRefused` if
+        the device refused the command, else `DeviceFault`.
         """
         reply = ""
         for _ in range(_ATTEMPTS):  # a bit may flip in the answer as well as in the command
@@ -171,10 +173,10 @@ class Dialogue:
         raise DeviceFault(f"{self.name}: told {command!r}, {query!r} says {reply}; power-cycle the device")
 
     def _once(self, command: str) -> str:
-        """One command and its reply."""
+        """Send one command and return its reply."""
         passed_s = now_s(self.clock) - self._quiet_since_s
         self.clock.sleep(self._timing.gap_s - passed_s)
-        if self.port.reset_input().strip():  # a reply that nobody asked for, and perhaps its other half comes yet
+        if self.port.reset_input().strip():  # a reply that nobody asked for; its other half may still come
             self.port.drain(self._timing.quiet_s, self._timing.drain_s)
         self.port.write(self._framing.encode(command))
         try:

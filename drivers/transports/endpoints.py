@@ -8,8 +8,8 @@ from typing import Any
 from drivers.errors import DeviceNotFound
 
 UDEV_RULES = str(Path(__file__).parents[2] / "config" / "udev" / "70-spadrig.rules")
-"""Gives devices and ports to group plugdev; messages about permissions name it, its first lines say how to install it.
-"""
+"""Path of the file that gives devices and ports to group plugdev. Its first lines say how to install it; messages about
+permissions name it."""
 EMULATED_PREFIX = "emulated:"
 """`port: emulated:laser` in a config means the endpoint that the rig's emulating world calls "laser"."""
 
@@ -22,8 +22,8 @@ class Endpoint:
     usb_backend: object | None = None
     """The `usb.backend.IBackend` that serves an emulated USB device; None: libusb."""
     serial_port: Callable[[], Any] | None = None
-    """Opens an emulated serial port, which is like a `serial.Serial` with a `clock` on which it waits; None: pyserial
-    opens the address."""
+    """Function that opens an emulated serial port, like a `serial.Serial` with a `clock` on which it waits; None:
+    pyserial opens the address."""
 
 
 def one_line(error: Exception) -> str:

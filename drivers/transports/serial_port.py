@@ -69,7 +69,7 @@ class SerialPort:
 
     @property
     def lost(self) -> bool:
-        """Whether the port has hung up. The kernel knows, so nothing is sent. May be called from any thread."""
+        """Whether the port has hung up; False on Windows. Sends nothing, the kernel knows. Allowed from any thread."""
         if not hasattr(select, "poll"):
             return False  # Windows tells with the next read
         try:
@@ -91,8 +91,8 @@ class SerialPort:
                 ) from None
 
     def read_line(self, terminator: bytes, deadline_s: float) -> bytes:
-        """The next line without its terminator. Raises `DeviceTimeout` after `deadline_s`; the part received is kept
-        for the next call.
+        """The next line without its terminator. Raises `DeviceTimeout` after `deadline_s`, and keeps the part received
+        for the next call; `ProtocolError` if no line ends within 64 KiB; `DeviceDisconnected`.
         """
         ends_at = now_s(self.clock) + deadline_s
         searched = 0

@@ -3,7 +3,7 @@
 `control.jsonl` has one line for each piece:
 {"t_ns": 1234, "device": "laser", "port": "serial", "dir": ">", "bytes": "3f0d"}. t_ns counts from the run's start on
 the host's monotonic clock; ">" means towards the device. Several processes may write to one file, since each line is a
-single write at its end. For the SPAD only the control traffic is recorded here; its frames are in the recording.
+single write at the file's end. For the SPAD only the control traffic is recorded here; its frames are in the recording.
 """
 
 import logging
@@ -88,12 +88,12 @@ class Tap:
             written.wait(timeout_s)
 
     def __del__(self) -> None:
-        """The writer ends with the last who holds this: devices are closed in any order, their threads after them."""
+        """End the writer once nobody holds the tap: devices are closed in any order, their threads end after them."""
         self._lines.put(None)
 
 
 def _write(path: str, lines: _Lines) -> None:
-    """The writer: one write for each line; None ends it."""
+    """Write each line by a single call, and set each event, until None comes. After an error, drop the lines."""
     handle: int | None = None
     full = False
     while (line := lines.get()) is not None:
@@ -123,8 +123,8 @@ class Passed:
 
 
 def read_taps(file: Path) -> list[Passed]:
-    """All pieces that passed, in order of time, without a torn last line. Raises `ProtocolError` for another kind of
-    file.
+    """All pieces that passed, in order of time, without a torn last line. Raises `ProtocolError` for a line of another
+    form, OSError if the file cannot be read.
     """
     *lines, _ = file.read_bytes().split(b"\n")
     found = []

@@ -77,8 +77,8 @@ def usb_failure(
 
 @dataclass(frozen=True, slots=True)
 class UsbId:
-    """The ids of a kind of device. Vendors share numbers, so one of `product_names` must be part of its product
-    string."""
+    """The ids of a kind of device. Vendors share numbers, so one of `product_names`, if there are any, must be part of
+    the product string, where that can be read."""
 
     label: str
     vendor: int
@@ -88,7 +88,7 @@ class UsbId:
 
 @dataclass(frozen=True, slots=True)
 class UsbListing:
-    """A device on the bus, as far as it can be known without claiming it. Strings are None if it may not be asked."""
+    """A device on the bus, as far as it can be known without claiming it. Strings are None if unset or forbidden."""
 
     path: str
     serial: str | None
@@ -97,7 +97,7 @@ class UsbListing:
 
     @property
     def address(self) -> str:
-        """The shortest address that means only this device."""
+        """The device's address by serial number, or by path if it states none."""
         return f"usb:serial={self.serial}" if self.serial else f"usb:path={self.path}"
 
 
@@ -228,8 +228,8 @@ def open_device(
 ) -> UsbDevice:
     """Find, open, configure and claim a device.
 
-    Raises `DeviceNotFound` if there is none, or none at that address; `DeviceError` if there are several equal ones and
-    the address does not choose; `DevicePermission`, with the udev rule; `DeviceBusy` if another program has claimed it.
+    Raises `DeviceNotFound` if there is none, or none at that address; `DeviceError` if the address is malformed or fits
+    several; `DevicePermission`, with the udev rule; `DeviceBusy` if another program has claimed it.
     """
     return UsbDevice(find_device(wanted, address, backend), wanted.label, alternates, tap)
 
