@@ -1,7 +1,7 @@
 """Reads every byte of a recording and finds which blocks are sound, what is damaged, and whether frames are missing.
 
 `check_segments` finds the sound blocks, `Continuity` the gaps between them, which show in the blocks' numbers. Gaps at
-the ends of a recording show only in other knowledge of the run: `lost_ends` looks at index, manifest and part.
+the ends of a run show only in what else is known of it: `lost_ends` looks at the index and the manifest.
 """
 
 import zlib
@@ -30,14 +30,14 @@ _STEP_BYTES: Final = 64 * 2**20
 _CLOCK_SHARE: Final = 0.01
 """Tolerance of ticks against frame numbers, as a share of the frames, beside half a frame."""
 _NEIGHBOURS: Final = 2
-"""Number of blocks before and behind that a block is compared with."""
+"""Number of blocks before it, and as many behind it, that a block is compared with."""
 _FEW: Final = 4
-"""At most one in so many blocks of a run is left out for its ticks or sweep."""
+"""At most one in so many blocks of a run, or one of three, is left out for its ticks or sweep."""
 
 
 @dataclass(frozen=True, slots=True)
 class SoundBlock:
-    """A block in which every byte is right.
+    """A block with all its checksums right, except that it may have none of its pixels (see `objection`).
 
     entry: its index record. first_tick, last_tick: of its frames; 0 if it has none. last_sweep: number of scan markers
     up to its last frame. repeated: (first, last) numbers of frames whose ticks do not rise; they count as lost.
@@ -116,7 +116,7 @@ class Continuity:
         return sum(last + 1 - first for _, first, last in merged_gaps(self.gaps))
 
     def follow(self, number: int, run: Run, *, is_part: bool) -> None:
-        """Check whether the blocks of a run follow one another, except for frames that the device says it lost.
+        """Note the gaps before and between the blocks of a run, and what is wrong with their numbers and ticks.
 
         is_part: whether the recording was cut from another one, so that it need not begin with the first block.
         """
@@ -137,7 +137,7 @@ class Continuity:
                 self._repeat(number, *frames, f"within block {block.block_seq}")
 
     def _repeat(self, number: int, first: int, last: int, where: str) -> None:
-        """Count frames whose ticks do not rise as lost, although they are there."""
+        """Count as lost the frames whose ticks do not rise, although they are there."""
         gap = number, first, last
         if gap in (self.known or ()):
             self.gaps.append(gap)
@@ -172,7 +172,7 @@ class Continuity:
 
 
 def in_step(frames: int, ticks: int, header: BlockHeader) -> bool:
-    """Whether this number of frames can be `ticks` apart; always true if frames are triggered from outside."""
+    """Whether frames whose numbers differ by `frames` can be `ticks` apart; always true if triggered from outside."""
     period = header.frame_period_ticks
     return not period or abs(ticks - frames * period) <= period * (0.5 + _CLOCK_SHARE * abs(frames))
 
@@ -180,7 +180,7 @@ def in_step(frames: int, ticks: int, header: BlockHeader) -> bool:
 def out_of_step(run: Run) -> list[SoundBlock]:
     """Blocks of a run whose ticks or sweep disagree with their frame numbers, judged by their neighbours.
 
-    Empty if there would be more than a few, since the device then counts differently.
+    Empty if there would be more than a few, since the device then counts differently, or if the run has at most two.
     """
     votes = [0] * len(run)
     for i, block in enumerate(run):
@@ -225,7 +225,7 @@ def _sound(segment: SegmentReader, placed: Placed) -> SoundBlock:
 
 
 def _stretches(numbers: NDArray[np.int64]) -> Iterator[tuple[int, int]]:
-    """(first, last) of each piece of numbers that follow on each other."""
+    """(first, last) of each stretch of consecutive numbers."""
     for piece in np.split(numbers, np.flatnonzero(np.diff(numbers) > 1) + 1):
         if len(piece):
             yield int(piece[0]), int(piece[-1])
@@ -248,10 +248,10 @@ def _objection(segment: SegmentReader, placed: Placed) -> str | None:
 def lost_ends(
     contents: Contents, runs: Sequence[Run], joined: Continuity, manifest: dict[str, Any] | None
 ) -> list[RunGap]:
-    """Frames that are missing at either end of each run. Starts of which nothing is left come last.
+    """Frames that are missing at the end of each run, in a part also at its beginning (`follow` finds other gaps).
 
     They show in index records of missing blocks, in the range of frames of a part, and in the number of frames that the
-    device delivered.
+    device delivered. Starts of which nothing is left get the numbers after those of `runs`.
     """
     cut = (manifest or {}).get("cut")
     ranges = _told_ranges(contents, runs)
@@ -272,7 +272,8 @@ def lost_ends(
 
 
 def _told_ranges(contents: Contents, runs: Sequence[Run]) -> dict[int, tuple[int, int]]:
-    """First and end frame of each run as the index says; empty if most index records are of something else."""
+    """First and end frame, by run id, of index records beyond the ends of a run or of a run of which nothing is left;
+    empty if the index tells of fewer than half of the sound blocks."""
     sound = {block.entry for run in runs for block in run}
     if len(contents.told) == 0 or 2 * sum(entry.tobytes() in sound for entry in contents.told) < len(sound):
         return {}

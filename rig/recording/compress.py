@@ -34,7 +34,7 @@ LEVEL: Final = 3
 
 @dataclass(frozen=True, slots=True)
 class Compression:
-    """Result of a compression: bytes of all segments before and after."""
+    """Result of a compression: number of segments, and bytes of all of them unpacked and compressed."""
 
     segments: int
     bytes_before: int
@@ -47,8 +47,8 @@ def compress(run: PathLike) -> Compression:
     Segments that are compressed already stay as they are.
 
     Raises UsageError if there is no recording or the package zstandard is missing, DamagedRecordingError if the
-    recording is not whole, and RecordingError if the disk is full. Each segment is then still plain or completely
-    compressed.
+    recording is damaged or its run not over, and RecordingError if a segment cannot be written or does not unpack to
+    the same bytes. Each segment is then still plain or completely compressed.
     """
     folder = Path(run)
     try:

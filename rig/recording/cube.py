@@ -60,8 +60,8 @@ class Cube:
 
 
 def open_cube(path: str | os.PathLike[str], plan: CubePlan, model: RigModel) -> Cube:
-    """Open a .npy file, or the folder of a recording. Raises UsageError if it disagrees with its plan and
-    calibration."""
+    """Open a .npy file, or the folder of a recording. Raises UsageError if it cannot be read or disagrees with plan or
+    calibration, DamagedRecordingError as `open_recording`."""
     file = Path(path)
     camera = model.camera
     if file.is_dir():

@@ -1,8 +1,7 @@
 """Cuts a part out of a recording, as a recording of its own: by maps, by frames of a run, or by time.
 
-Frames keep their run and number, so that maps of a part are bound and named as in the whole. The part includes
-everything
-needed to estimate its maps again: plan, calibration, learned states and, if known, the truth.
+Frames keep their run and number, so that the maps of a part, numbered from 0 again, are bound as in the whole. The part
+includes everything needed to estimate its maps again: plan, calibration, learned states and, if known, the truth.
 """
 
 import math
@@ -33,7 +32,7 @@ _VERDICT_WITHOUT_GAPS: Final = {RunVerdict.GAPS: RunVerdict.COMPLETE, UNFINISHED
 
 @dataclass(frozen=True, slots=True)
 class Part:
-    """Frames of one run. first_map, end_map: the maps that lie completely in it, by their numbers in the recording."""
+    """Frames of one run. first_map, end_map: the maps completely in it, as the recording numbers them; 0, 0 for none."""
 
     run: RecordedRun
     first_frame: int
@@ -45,8 +44,8 @@ class Part:
 def cut(run: PathLike, out: PathLike, request: CutRequest | None = None, **changes: Any) -> dict[str, Any]:
     """Write a part of a recording to the folder `out` and return the manifest of the part (`rig cut`).
 
-    request, changes: which part, as a `CutRequest` or by the names of its fields: `cut("run", "part", maps="0:2")`. A
-      missing A or B means the first or the end; a single number means one map or frame.
+    request, changes: which part, as a `CutRequest` or by the names of its fields: `cut("run", "part", maps="0:2")`. Of
+      a range `A:B` either may be left out, for the first or the end; a single number means one map or frame.
 
     Raises UsageError for a part that does not exist or an `out` that cannot be written, DamagedRecordingError if the
     recording is damaged, RecordingError if the disk is full.

@@ -46,7 +46,8 @@ def write_inputs(folder: Path, plan: ScanPlan, model: RigModel | None) -> None:
 
 
 def read_plan(folder: Path, name: str = PLAN_FILE) -> ScanPlan:
-    """Read the plan with which a recording was taken. Raises UsageError if there is none that this program reads."""
+    """Read the plan with which a recording was taken. Raises UsageError if there is none that this program reads, and
+    without a file also what `holds_frames_alone` raises."""
     file = folder / name
     try:
         content = load_yaml(file, "a plan", f"format: {PLAN_FORMAT}").content
@@ -108,10 +109,10 @@ def _require_sizes(plan: ScanPlan) -> None:
 
 
 def holds_frames_alone(folder: Path) -> bool:
-    """Whether a recording has no plan and never had one, as with imported frames: neither manifest nor markers indicate
+    """Whether a recording has no plan and never had one, as with imported frames: neither manifest nor markers tell of
     one.
 
-    Raises DamagedRecordingError if the manifest is damaged.
+    Raises UsageError if there is no recording, DamagedRecordingError if the manifest or every block is damaged.
     """
     if (folder / PLAN_FILE).exists() or PLAN_FILE in ((read_manifest(folder) or {}).get("inputs") or {}):
         return False
@@ -165,7 +166,8 @@ def to_plain(value: Any) -> Any:
 
 
 def from_plain(kind: type[T], content: Any) -> T:
-    """The value of type `kind` that `to_plain` wrote. Raises ValueError if `content` is not one."""
+    """The value of type `kind` that `to_plain` wrote. If `content` is not one, raises ValueError, TypeError, KeyError
+    or ArithmeticError."""
     value: T = _read(kind, content, kind.__name__)
     return value
 

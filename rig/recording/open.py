@@ -25,7 +25,7 @@ SEGMENTS: Final = "frames-*.spb"
 
 
 def open_recording(folder: Path) -> RunRecording:
-    """Open the recording of a run. Raises UsageError without one, DamagedRecordingError if nothing of it is left."""
+    """Open the recording of a run. Raises UsageError without one, DamagedRecordingError if no block can be read."""
     require_recording(folder)
     try:
         return RunRecording(folder)
@@ -149,12 +149,11 @@ def begins_sweep(block: FrameBlock) -> bool:
 
 @dataclass(frozen=True, slots=True)
 class RunInfo:
-    """One start of the SPAD, with frames first_frame to end_frame - 1 and maps first_map to end_map - 1.
+    """One start of the SPAD, with frames first_frame to end_frame - 1 and maps first_map to end_map - 1 (None: none).
 
     gaps: number of missing pieces between its frames and, if a repair found some, at its ends. lost: frames in these.
-    width,
-    height: pixels of a frame. duration_s: from the first frame to the end of the last one; without a frame period, to
-    the last block's start.
+    width, height: pixels of a frame. frame_rate_hz: None without a frame period. duration_s: from the first frame to
+    the end of the last one; without a frame period, to the last block's start.
     """
 
     run_id: int
@@ -177,8 +176,8 @@ class RunInfo:
 class RecordingInfo:
     """Contents of a recording.
 
-    verdict: the run's own. compressed: number of compressed segments. bytes: size on the disk. problems: one line each,
-    as far as they can be seen without reading the frames.
+    verdict: the run's own. compressed: number of compressed segments. bytes: of all segments on the disk. maps: number
+    that a replay can make. devices: names by slot. problems: one line each, as far as a look at a few blocks shows.
     """
 
     folder: Path
@@ -197,9 +196,9 @@ class RecordingInfo:
 
 
 def info(run: PathLike) -> RecordingInfo:
-    """Describe a recording from its index and manifest, without reading the frames (`rig info`).
+    """Describe a recording from its index, its manifest and a few of its blocks (`rig info`).
 
-    Raises UsageError if there is none.
+    Raises UsageError if there is none, DamagedRecordingError if no block can be read.
     """
     folder = Path(run)
     recording = open_recording(folder)
@@ -226,7 +225,7 @@ def info(run: PathLike) -> RecordingInfo:
 
 
 def _is_there(span: MapSpan, run: RecordedRun, manifest: dict[str, Any]) -> bool:
-    """Whether a map can be made of what a repair left: in a part, without frames before its maps, of a whole one."""
+    """Whether a map's last frame and the marker that closes it are there after a repair, in a part also its first."""
     if "repaired" not in manifest:
         return True
     begin = span.first_frame if "cut" in manifest else span.end_frame - 1

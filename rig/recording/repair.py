@@ -1,8 +1,8 @@
 """Makes a torn recording whole: only sound blocks are left, with an index and a manifest that agree with them.
 
-No frame is changed and no byte thrown away. Bytes that are not part of a sound block go to `frames-000000.torn`, at the
-place they had in the segment, a damaged compressed segment to `frames-000000.torn.zst` and a damaged manifest to
-`manifest.damaged.json`. Another repair leaves these files as they are.
+No frame is changed and no byte of a segment thrown away. Bytes that are not part of a sound block go to
+`frames-000000.torn`, at the place they had in the segment, a damaged compressed segment to `frames-000000.torn.zst` and
+a damaged manifest to `manifest.damaged.json`. Another repair adds to the first, numbers the second, replaces the third.
 """
 
 import json
@@ -39,9 +39,9 @@ class Repair:
 
 
 def repair(run: PathLike) -> Repair:
-    """Make a torn recording whole as far as possible. No frame is changed and no byte thrown away (`rig repair`).
+    """Make a torn recording whole as far as possible. No frame of it is changed or thrown away (`rig repair`).
 
-    Raises UsageError if there is none, RecordingError if it cannot be written.
+    Raises UsageError if there is no recording or its run still goes on, RecordingError if it cannot be written.
     """
     folder = Path(run)
     if is_held(folder / INDEX_FILE):
@@ -87,7 +87,9 @@ def _put_in_order(found: Examination, done: list[str]) -> bool:
 
 
 def _clear(segment: SegmentReader, blocks: list[Range], done: list[str]) -> None:
-    """Zero what is no sound block and end the segment behind the last one, after copying it to the torn file."""
+    """Copy what is no sound block to the torn file, zero it, and end the segment behind the last sound block.
+
+    A segment without a sound block is removed."""
     end = round_up_to_page(blocks[-1][1]) if blocks else 0
     others = [(a, used) for a, b in _between(blocks, segment.size) if (used := _used(segment, a, b)) > a]
     if others:
@@ -112,7 +114,7 @@ def _clear(segment: SegmentReader, blocks: list[Range], done: list[str]) -> None
 
 
 def _unpack(segment: SegmentReader, blocks: list[Range], done: list[str]) -> None:
-    """Write the sound blocks of a compressed segment plain where it holds anything else, and keep the old file."""
+    """If a compressed segment holds more than sound blocks, write these plain and keep the old file as torn."""
     end = round_up_to_page(blocks[-1][1]) if blocks else 0
     if blocks and segment.size == end and not any(_is_damaged(segment, a, b) for a, b in _between(blocks, end)):
         return
@@ -141,7 +143,7 @@ def _is_damaged(segment: SegmentReader, begin: int, stop: int) -> bool:
 
 
 def _between(blocks: list[Range], size: int) -> Iterator[Range]:
-    """Ranges between the blocks, in pieces."""
+    """Ranges before, between and behind the blocks, in pieces of at most `_PIECE_BYTES`."""
     begin = 0
     for start, stop in [*blocks, (size, size)]:
         for piece in range(begin, start, _PIECE_BYTES):
@@ -204,7 +206,7 @@ def _write_manifest(folder: Path, found: Examination, done: list[str]) -> None:
 
 
 def _recording(found: Examination) -> dict[str, Any]:
-    """Describe the recording as `Recording.content` does; its starts only where the manifest does not have them."""
+    """The part of `Recording.content` that a repair changes; the starts only if the manifest does not have them."""
     with_blocks = set(found.entries["segment"].tolist())
     content: dict[str, Any] = {
         "files": [s.path.name.removesuffix(PACKED_SUFFIX) for s in found.segments if s.number in with_blocks],

@@ -1,4 +1,4 @@
-"""Prepares a recording for the live stack: its plan and its starts, with the other devices recorded, emulated or real.
+"""Prepares a recording to be run like a scan: plan and starts; the other devices are recorded, emulated or real.
 
 Frames are bound by the plan with which they were taken (`plan.yaml`), never by a newly compiled one, and each start of
 the SPAD is played as one start. So a map is made from exactly the same frames in the same order, at any clock.
@@ -56,7 +56,8 @@ RECORDED = ("scanner", "laser", "sync")
 
 
 def replay_config(run: Path, request: ReplayRequest, others: RigConfig | None = None) -> RigConfig:
-    """Make the config of the rig that plays a recording. Raises UsageError if there is none, or for an unknown clock.
+    """Make the config of the rig that plays a recording. Raises UsageError if there is no recording that can be played,
+    or for a wrong request; DamagedRecordingError if the recording's manifest or other files are damaged.
 
     request: its settings of the estimate replace those of the recording.
     others: rig whose world, scanner, laser and sync source take part; None to use the recorded ones.
@@ -104,7 +105,7 @@ def replay_plan(
     """The plan with which the frames were taken, adapted to the present calibration, and the timing of the configured
     SPAD.
 
-    Raises DamagedRecordingError if the frames differ in size from the plan's, for which counters are made.
+    Raises UsageError as `read_plan`, and DamagedRecordingError if the frames differ in size from the plan's.
     """
     from rig.plan.calibration_reach import recalibrated, whole_rows
 
@@ -128,9 +129,9 @@ def replay_plan(
 class ReplaySource:
     """Facts about a recording for the run that plays it, as `rig.scan.scan.LiveSource` has them for a live one.
 
-    maps: number of maps that the run will take; None for all. starts: those of the SPAD, one after the other. learned:
-    states with which the maps of a part were estimated; empty if they are to be learned anew. Raises UsageError if
-    there are too few maps.
+    maps: number of maps to take; None for all. starts: those of the SPAD, one after the other. learned: states with
+    which the maps of a part were estimated; empty if they are to be learned anew. Raises UsageError if there are too
+    few maps and no loop, DamagedRecordingError if a start of the SPAD is missing or a kept state is unreadable.
     """
 
     command = "replay"
@@ -180,7 +181,7 @@ class ReplaySource:
     def truth(self, sweep: SweepAccount, column: NDArray[np.float64]) -> SweepTruth | None:
         """Truth that was recorded with the map of a sweep; None if it was not kept.
 
-        Raises DamagedRecordingError if it belongs to other maps.
+        Raises DamagedRecordingError if it is unreadable or of another size.
         """
         index = sweep.index
         file = self._spad.recording.path / "truth" / f"{self._numbers[index % self._there]:06d}.npz"
@@ -193,7 +194,7 @@ class ReplaySource:
         return truth
 
     def lost_outside(self, sweeps: Sequence[SweepAccount]) -> list[Gap]:
-        """Frames (first, last) lost outside all these sweeps; empty if fewer maps were asked for than there are."""
+        """Frames (first, last) lost outside all these sweeps; empty if the number of maps was given. Logs how many."""
         if not self._all:
             return []
         spans = _by_start(sweeps, [start.number for start in self._played])
@@ -212,8 +213,8 @@ class ReplaySource:
 class RecordedStart:
     """One start of the SPAD in a recording.
 
-    begin: the sweep with which its whole maps begin. first_map: number of the first of these in the recording. sweeps:
-    their number. gone: frames at its ends that the manifest mentions but no block contains.
+    begin: the sweep with which its whole maps begin. first_map: number of the first of these maps in the recording.
+    sweeps: how many they are. gone: frames at the start's ends that the manifest mentions but no block contains.
     """
 
     number: int
@@ -226,7 +227,7 @@ class RecordedStart:
 def recorded_sweeps(recording: RunRecording, plan: ScanPlan, manifest: dict[str, Any]) -> list[RecordedStart]:
     """The whole sweeps of each start of the SPAD, as the run took them, as far as their frames are there.
 
-    Raises DamagedRecordingError if a start is missing, since its maps would be confused with those of others.
+    Raises DamagedRecordingError if a start is missing but a later one is there, since their maps would be confused.
     """
     begins = _part_starts(recording, manifest.get("cut"))
     starts = (manifest.get("recording") or {}).get("starts")
@@ -274,13 +275,13 @@ def _what_is_left(
         if sweeps is not None:
             before = sum(int(sweep["first_frame"]) < first for sweep in sweeps)
             begin = replace(begin, clock_ratio=fitted_ratio(begin.clock_ratio, sweeps[:before]))
-        else:  # of a run that was killed nobody noted them; at a lost end a part lacks one map
+        else:  # a killed run noted no sweeps; if the end is lost too, one map is taken to be gone from the beginning
             before = maps - whole if end >= part_end else min(1, maps)
     return RecordedStart(run.number, begin, first_map + before, min(whole, maps - before), tuple(gone))
 
 
 def _by_start(sweeps: Sequence[SweepAccount], numbers: Sequence[int]) -> dict[int, list[Gap]]:
-    """Range of frames, from and to before, of the sweeps of each start; frame numbers begin anew with each."""
+    """(first frame, end frame) of each sweep, by the number of its start; frame numbers begin anew with each start."""
     spans: dict[int, list[Gap]] = {}
     at, end = 0, 0
     for sweep in sweeps:
@@ -292,7 +293,8 @@ def _by_start(sweeps: Sequence[SweepAccount], numbers: Sequence[int]) -> dict[in
 
 
 def _whole_sweeps(recording: RunRecording, run: RecordedRun, plan: ScanPlan) -> int:
-    """Complete sweeps of a start, by its markers or else by its frames; never more than these, whatever headers say."""
+    """Number of sweeps complete at the end of a start, by its markers or, with a blanking pattern, by its frames;
+    never more than it has frames, whatever headers say."""
     if plan.blanking is not None:
         frames = float(plan.frames_per_sweep)
         return min(run.frames, max(0, int((_readable_range(recording, run)[1] - plan.frames_for(0)) / frames)))
@@ -345,9 +347,9 @@ def _part_starts(recording: RunRecording, cut: dict[str, Any] | None) -> list[Sw
 def _part_learned(
     folder: Path, manifest: dict[str, Any], estimate: EstimateConfig, model: RigModel | None
 ) -> list[RowModel]:
-    """States that the maps of a part were estimated with, where it is estimated as the whole was; otherwise none.
+    """States that the maps of a part were estimated with, if estimator and calibration are the same; otherwise empty.
 
-    None for a whole recording either: it learns the same again from its first map on.
+    Empty for a whole recording too: it learns the same again from its first map on.
     """
     before = (manifest.get("config") or {}).get("estimate") or {}
     same = before.get("estimator") == estimate.estimator and estimate.estimator in LEARNING
@@ -366,9 +368,7 @@ def _part_learned(
 
 
 def _kept(file: Path, make: Callable[[dict[str, NDArray[Any]]], T]) -> T | None:
-    """Make something of the arrays kept of a map; None if there are none. Raises DamagedRecordingError if they are
-    unreadable.
-    """
+    """Make something of a file's arrays; None if there is no file. Raises DamagedRecordingError if it is unreadable."""
     if not file.exists():
         return None
     try:

@@ -26,7 +26,7 @@ from rig.errors import UsageError
 PAGE_BYTES: Final = 4096
 """Unit of places and sizes of what is written past the page cache, in the file and in memory."""
 _SHARE_OF_FREE: Final = 2
-"""At most this part (one half) of the free space is set aside at a time: maps go to the same disk."""
+"""The free space divided by this is the most that is set aside at a time: maps go to the same disk."""
 
 _sync_data = getattr(os, "fdatasync", os.fsync)
 
@@ -48,13 +48,13 @@ class OpenSegment:
     """A segment to which blocks are written. One thread places them in order, any thread writes them."""
 
     def __init__(self, folder: Path, number: int, name: str, reserve_bytes: int) -> None:
-        """Make the file; set `reserve_bytes` aside for it as far as the disk has them. Raises OSError."""
+        """Make a new file and set `reserve_bytes` aside for it, but at most half of the free space. Raises OSError."""
         self.number = number
         self.path = folder / name
         self.placed = 0
         """Offset of the next block, bytes."""
         self.end = 0
-        """End of the last block that is written, with all before it, bytes."""
+        """Offset of the end of the last block that is written and has only written ones before it, bytes."""
         self.synced = 0
         """Value of `end` at the beginning of the last sync."""
         self._lock = threading.Lock()
@@ -122,7 +122,8 @@ def paged(size: int) -> int:
 
 
 def _pieces(block: FrameBlock, staging: Staging) -> list[memoryview]:
-    """The bytes of a block with its padding: pages of pixels where they are, all else in `staging`."""
+    """The bytes of a block with its padding: whole pages of pixels in place if aligned, the rest copied to `staging`.
+    """
     *front, bits, tail = block_parts(block)
     front_bytes = sum(len(part) for part in front)
     before = min(paged(front_bytes) - front_bytes, len(bits))
@@ -197,11 +198,11 @@ class Space:
             )
 
     def content(self) -> dict[str, Any]:
-        """The numbers as plain values."""
+        """The folder and the numbers as plain values."""
         return {**asdict(self), "folder": str(self.folder)}
 
     def __str__(self) -> str:
-        """Say that there is enough room, for people."""
+        """Say in words that there is enough room, as `require` has found."""
         return (
             f"at most {_gb(self.recording_bytes)} of frames and {_gb(self.map_bytes)} of maps, which fit: the disk of "
             f"{self.folder} has {_gb(self.free_bytes)} free"

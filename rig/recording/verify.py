@@ -46,9 +46,9 @@ class Integrity(StrEnum):
 class Verification:
     """Verdict on a recording, with its evidence.
 
-    blocks, frames, bytes: number of sound ones. lost: frames that the device lost or a repair found missing. gaps:
-    their ranges, [run, first, last]. problems: one line each. run: the verdict of the run that was recorded. ended:
-    reason why the recording ended before the run; None if it did not.
+    blocks, frames: number of sound ones. bytes: those that sound blocks take in the segments. lost: frames that the
+    device lost or a repair found missing. gaps: their ranges, (run, first, last). problems: one line each. run: verdict
+    of the run that was recorded, None if unknown. ended: why the recording ended before the run; None if it did not.
     """
 
     verdict: Integrity
@@ -65,7 +65,7 @@ class Verification:
 
     @property
     def exit_code(self) -> int:
-        """Exit code of the command line."""
+        """Exit code of the command line: 0 only for an intact recording."""
         return 0 if self.verdict is Integrity.INTACT else 1
 
 
@@ -155,7 +155,7 @@ def examine(folder: Path) -> Examination:
 
 
 def _runs(contents: Contents, sound: Sequence[SoundBlock], problems: list[str]) -> list[list[SoundBlock]]:
-    """The sound blocks of each run, in order; a problem for each block that should be there and is not."""
+    """The sound blocks of each run, in order; adds a line to `problems` for each block that is left out or gone."""
     headers: dict[int, list[BlockHeader]] = {}
     for block in sound:
         headers.setdefault(block.header.run_id, []).append(block.header)

@@ -6,8 +6,7 @@ since a thread makes the disk keep what was written, blocks before index.
 
 `Recording` does this. `Recorder` is the pipeline's thread that passes the blocks of one start of the SPAD to it. The
 recording's threads write them, several at a time, from their slots in the ring. The recorder is a required reader of
-the
-ring: if the disk is slower than the stream, the ring fills and the overload policy decides.
+the ring: if the disk is slower than the stream, the ring fills and the overload policy decides.
 """
 
 import errno
@@ -33,9 +32,9 @@ from rig.threads import StageThread
 SEGMENT_BYTES: Final = 1 << 30
 """Most bytes of a segment, unless a single block is larger."""
 SYNC_INTERVAL_S: Final = 0.2
-"""Seconds after which a recorded block survives a loss of power."""
+"""Seconds after which a recorded block survives a loss of power, if a sync takes at most a quarter of this time."""
 _SYNC_EVERY_S: Final = SYNC_INTERVAL_S / 2
-"""Seconds from the end of one sync to the next: the other half is for the sync itself."""
+"""Seconds from the end of one sync to the next: a block may have to wait for the sync under way and for the next."""
 WRITERS: Final = 4
 """Number of blocks written at a time: one thread makes checksums for some 4 GB/s, and disks like a queue."""
 RESERVE_FILE: Final = ".recording.reserve"
@@ -56,9 +55,9 @@ class _Placed:
 class Recording:
     """A recording that grows block by block in a folder; whatever fails, it ends after a whole block.
 
-    One thread submits and appends. expected_bytes: room to reserve on the disk, if known. on_begin: called when a start
-    of the SPAD begins. on_sync: called with every sync, on its thread, and when the recording is closed. Raises
-    RecordingError if the folder cannot be written.
+    One thread submits and appends. expected_bytes: room to set aside for all segments; None: `segment_bytes` for each.
+    on_begin: called by `begin`. on_sync: called with every sync, on its thread, and when the recording is closed.
+    Raises RecordingError if the folder cannot be written.
     """
 
     def __init__(
@@ -74,7 +73,7 @@ class Recording:
         self.blocks = 0
         """Blocks that count."""
         self.bytes = 0
-        """Bytes that the blocks take in the segments."""
+        """Bytes that these blocks take in the segments, with padding."""
         self.busy_s = 0.0
         """Time of all writers together, for checksums and writing."""
         self.files: list[str] = []
@@ -119,7 +118,7 @@ class Recording:
             self._on_begin()
 
     def append(self, block: FrameBlock) -> None:
-        """Write a block after the others and wait until it counts. Raises RecordingError if it could not be written."""
+        """Write a block after the others and wait until it counts. Raises RecordingError as `submit` does."""
         self.submit(block).result()
 
     def submit(self, block: FrameBlock) -> "Future[None]":
@@ -140,9 +139,9 @@ class Recording:
         return self._pool.submit(self._write, block, placed, offset)
 
     def close(self) -> None:
-        """Wait until everything is written, end the files and sync them. A second call does nothing. Raises
-        RecordingError if that fails.
-        """
+        """Wait until everything is written, end the files and sync them. Raises RecordingError if that fails.
+
+        A second call does nothing."""
         if self._closed.is_set():
             return
         self._pool.shutdown()
@@ -178,7 +177,7 @@ class Recording:
         }
 
     def _segment_for(self, size: int, is_for: tuple[int, int]) -> OpenSegment:
-        """The segment that a block goes to: a new one where the old one is full, or of another run or width."""
+        """The segment for a block: a new one after `begin`, for another run or width, or if the old one has no room."""
         segment = self._segment
         fits = segment is not None and (segment.placed == 0 or segment.placed + size <= self._segment_bytes)
         if segment is not None and fits and self._segment_is_for == is_for:
@@ -275,7 +274,7 @@ def _reason(error: BaseException) -> str:
 class Recorder:
     """Thread that records the blocks of one start of the SPAD, up to the last one; it ends once everything is written.
 
-    reader: holds as many blocks as may be written at a time. on_failure: called on this thread.
+    reader: holds as many blocks as may be written at a time. on_failure: called on this thread when `error` is set.
     """
 
     def __init__(self, reader: RingReader, recording: Recording, on_failure: Callable[[], None]) -> None:
