@@ -61,7 +61,7 @@ def index_header() -> bytes:
 
 
 def index_of(block: FrameBlock, segment: int, offset: int, length: int | None = None) -> bytes:
-    """The 64-byte record of a block at byte `offset` of `segment`. length: header to trailer; None: as we write it."""
+    """The 64-byte record of a block at byte `offset` of `segment`. length: of header to trailer; None: as written."""
     header = block.header
     length = length or BlockLayout(block.n_frames, header.width, header.height).block_bytes
     place = segment, int(header.flags), offset, length
@@ -142,7 +142,7 @@ def find_blocks(segments: Sequence[SegmentReader], folder: Path) -> Contents:
 
 
 def read_entry(segment: SegmentReader, entry: Any) -> FrameBlock:
-    """The block that an entry describes, payload checked. Raises CorruptBlock or UnsupportedBlock if not found."""
+    """The block that an entry describes, payload checked. Raises a ProtocolError if it is not sound there."""
     block = _block_at(segment, entry, check_payload=True)
     if block is None:
         raise CorruptBlock(f"not block {entry['block_seq']} of run {entry['run_id']}, of which {INDEX_FILE} tells")

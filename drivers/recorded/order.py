@@ -105,8 +105,8 @@ def _rising(run: Entries, told: Entries) -> Ints:
 
 
 def _agreeing(seq: Ints, first: Ints, t0: Ints, n_frames: Ints) -> Ints:
-    """Number of neighbours, int64 (n,), with which each block agrees in number, frames or ticks, the least of
-    the three; 0 if its frames reach into those of the next block."""
+    """Number of neighbours, int64 (n,), with which each block agrees in number, frames or ticks, the least of the
+    three; 0 if its frames reach into those of the next block."""
     place = np.arange(len(seq))
     steps = np.diff(first)
     per_frame = float(np.median(np.diff(t0)[steps > 0] / steps[steps > 0])) if (steps > 0).any() else 0.0

@@ -198,7 +198,7 @@ class PackedSegment:
         return parts[0] if len(parts) == 1 else np.concatenate([np.empty(0, np.uint8), *parts])
 
     def walk(self, start: int, end: int, *, check_payload: bool) -> Iterator[Placed | Damage]:
-        """Blocks and damage between two offsets. Each compressed frame is searched by itself, or is damage."""
+        """Blocks and damage between two offsets. Each compressed frame is searched alone; a broken one is damage."""
         for frame in self._table.frames_at(start, end):
             _, _, begin, stop = self._table.places(frame)
             try:

@@ -110,7 +110,7 @@ class Pace:
             self._changed.notify_all()
 
     def halt(self) -> None:
-        """End the run: `wait` returns."""
+        """End the run: `wait` and `wait_for_step` return False."""
         with self._changed:
             self.halted = True
             self._changed.notify_all()
@@ -125,7 +125,8 @@ class Pace:
             return True
 
     def hold(self, due_s: float, waited_s: float) -> None:
-        """Note that a full ring held up a block for `waited_s` that was due `due_s` after the run's start."""
+        """Note that a block due at `due_s` of recorded time was held up by a full ring for `waited_s`. As far as that
+        made the block late, it shifts all later ones."""
         if self.speed is None:
             return
         late_ns = self._clock.now_ns() - self._due_ns(due_s, self.speed)

@@ -50,7 +50,8 @@ def recorded_device(recording: Path, slot: str) -> dict[str, Any] | None:
 
 
 def recorded_info(recording: RunRecording) -> SpadInfo:
-    """Properties of the SPAD that took the frames, except that a recording can always wait."""
+    """Properties of the SPAD that took the frames, except that a recording can always wait. Raises `ProtocolError` if
+    the manifest contradicts the frames or is none."""
     noted = recorded_device(recording.path, "spad")
     told = _told_by(recording)
     if noted is None:
@@ -136,7 +137,7 @@ class Cursor:
         self.next_frame = 0
         """One past the last frame that was played."""
         self.step_due = by_block
-        """Whether the frames that come next wait for a step: those behind a scan marker, or without markers all."""
+        """Whether the frames that come next wait for a step: those behind a scan marker, or all without markers."""
         self.damaged = 0
         """Blocks that could not be read, so far."""
 
@@ -179,7 +180,7 @@ class Cursor:
         self._blocks.close()
 
     def _look_ahead(self, index: int) -> bool:
-        """Whether there is a block at this place behind the present one, which is then in `_ahead`."""
+        """Read ahead until `_ahead` has a block at `index`; returns whether there is one."""
         while len(self._ahead) <= index:
             block = next(self._blocks, None)
             if block is None:
@@ -208,7 +209,7 @@ class ReplaySpadConfig(KindConfig):
 
     kind: Literal["replay"] = "replay"
     recording: Path | None = None
-    """Folder of a run taken with --record, relative to this file; `rig replay RUN` fills it in."""
+    """Folder of a run taken with --record, relative to the config file; `rig replay RUN` fills it in."""
     clock: Annotated[str, AfterValidator(lambda text: ReplayClock.parse(text) and text)] = "realtime"
     """Speed: realtime, max, step, or a multiple of real time: x4, x0.1."""
     loop: bool = False
@@ -362,7 +363,7 @@ class ReplaySpad(SpadArray):
         self._counters = SpadCounters(exposed, self._delivered, exposed - self._delivered, reading.damaged, 0)
 
     def _written(self, memory: NDArray[np.uint8], reading: "Cursor", pieces: list[Piece]) -> FrameBlock:
-        """The frames in a slot, with a header of this replay: numbered as what is really given, losses counted."""
+        """Write the frames into a slot; returns the block, whose header has this replay's block numbers and losses."""
         (first, begin, _), (last, _, end) = pieces[0], pieces[-1]
         n = sum(b - a for _, a, b in pieces)
         layout = BlockLayout(n, first.header.width, first.header.height)

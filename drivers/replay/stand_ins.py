@@ -25,7 +25,7 @@ LIMITS = ScannerLimits(
 MAX_POWER_W = 1e3
 RESOLUTION_S = 1e-9
 _LARGEST_DIVISOR = 100_000
-"""Point clocks are quotients of whole numbers up to some 50 000; a float says which."""
+"""Largest denominator of a point clock; a float then says which fraction it is."""
 
 
 class StandInConfig(KindConfig):

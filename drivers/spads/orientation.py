@@ -52,7 +52,7 @@ def _turn(bits: NDArray[np.uint8], turn_deg: QuarterTurn, out: NDArray[np.uint8]
 
 
 def _transposed(bits: NDArray[np.uint8]) -> NDArray[np.uint8]:
-    """(n, width, height / 8) of (n, height, width / 8)."""
+    """Frames (n, width, height / 8): those of `bits` (n, height, width / 8) with rows and columns exchanged."""
     n, height, row_bytes = bits.shape
     tiles = np.ascontiguousarray(bits.reshape(n, height // 8, 8, row_bytes).transpose(0, 3, 1, 2))
     words = tiles.view(">u8").astype(np.uint64)

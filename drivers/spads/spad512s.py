@@ -128,8 +128,8 @@ class Spad512sRun:
         )
 
     def _require_new(self, frames: NDArray[np.uint8]) -> None:
-        """Raises ProtocolError for a frame that was there before, unless all dark or all bright. frames: (n, 2,
-        half)."""
+        """Raise ProtocolError for a frame that came before, unless it is all dark or all bright. frames: uint8 (n, 2,
+        bytes of half a frame)."""
         for number, (one, other) in enumerate(frames, self.next_frame):
             before = self._seen.setdefault((zlib.crc32(one), zlib.crc32(other)), number)
             if before != number and not (one[0] in _UNIFORM and (one == one[0]).all() and (other == one[0]).all()):
@@ -139,7 +139,7 @@ class Spad512sRun:
                 )
 
     def _refuse_error_text(self, rest: bytes) -> None:
-        """DeviceFault with the device's own words where what came last is text that ends with ERROR."""
+        """Raise DeviceFault with the device's own words if what came last is text that ends with ERROR."""
         tail = self._memory[max(0, self._got - 2 * GUARD_BYTES) : self._got].tobytes() + rest
         text = tail.rstrip(b"\r\n\0 ").removesuffix(DONE).rstrip()
         if not text.endswith(ERROR):
@@ -156,12 +156,13 @@ class Spad512sRun:
 COLUMNS = 512
 ROW_BYTES = COLUMNS // 8
 TICK_HZ = 100_000_000
-"""Nominal: the vendor's stream carries no time. Where it does not divide the period, a multiple of the frame rate."""
+"""Nominal ticks per second: the stream carries no time. If a period is no whole number of ticks, it is divided into
+`TICKS_PER_FRAME` instead."""
 TICKS_PER_FRAME = 1024
 _TEMPERATURES = ("master FPGA", "slave FPGA", "board", "chip")
 """Names of the temperatures that `R` reports first, in its order."""
 _US_SLACK = 1e-6
-"""Microseconds by which a whole number of them may miss as a float in seconds."""
+"""Error in microseconds of a whole number of microseconds that is given as a float in seconds."""
 
 
 class Spad512sConfig(KindConfig):
@@ -175,7 +176,7 @@ class Spad512sConfig(KindConfig):
     trigger: Literal["free", "external"] = "free"
     """free: exposures follow one another; external: each starts at a pulse on the frame trigger input."""
     max_frame_rate: Annotated[ExactHertz, Field(gt=0)] = Fraction(100_000_000, 1024)
-    """97.7 kHz: the read-out of a frame takes 10.24 us, under the next exposure where that is as long."""
+    """97.7 kHz: the read-out of a frame takes 10.24 us, during the next exposure if that is as long."""
     burst_frames: int = Field(default=10_000, ge=1)
     """Frames that one run may have: what the memory of this unit holds, see its data sheet."""
     readout: Annotated[BytesPerSecond, Field(gt=0)] = 100e6
@@ -255,7 +256,7 @@ class Spad512s(SpadArray):
         return self._timing
 
     def _check_period(self, request: SpadRequest, exposure_us: int) -> None:
-        """Check that, running free, a frame begins once the one before is exposed and the one before that read out."""
+        """Raise `LimitExceeded` unless the period, running free, is the longer of exposure and read-out."""
         if self._config.trigger == "external":
             return
         period_s = max(Fraction(exposure_us, 1_000_000), 1 / self._info.max_frame_rate_hz)
@@ -280,9 +281,9 @@ class Spad512s(SpadArray):
             self._line.tell(f"I,1,{self._exposure_us},{n_frames},{external},1,0,1\n")
 
     def _connect_where_lost(self) -> None:
-        """Connect again after the program was restarted or left, which listens again a moment after its one client.
+        """Connect again if the connection is gone. The program may need a moment before it listens again.
 
-        Raises DeviceFault if another device answers now.
+        Raises DeviceFault if another device answers now, and what `Spad512sLine.connect` raises.
         """
         ends_at = time.monotonic() + self._deadlines.listens_s
         while not self._line.is_open:
@@ -345,7 +346,7 @@ class Spad512s(SpadArray):
         return seal_block(memory, self._header(run), layout, payload_crc=False)
 
     def _claim(self, ring: BlockRing, ends_at: float, timeout_s: float) -> NDArray[np.uint8] | None:
-        """A free slot; None if there is none and the ring does not wait."""
+        """A free slot; None if there is none and the ring does not wait. Raises `DeviceTimeout` if it waits in vain."""
         while True:
             memory = ring.claim(min(SLICE_S, max(0.0, ends_at - time.monotonic())))
             if memory is not None or not ring.waits:
@@ -395,7 +396,7 @@ class Spad512s(SpadArray):
 
 
 def create(config: Spad512sConfig, surroundings: Surroundings) -> Spad512s:
-    """The SPAD512S at the config's port."""
+    """Open the SPAD512S at the config's port."""
     return Spad512s(config, resolve(config.port, surroundings.ports), tap=surroundings.tap)
 
 

@@ -49,7 +49,7 @@ _CONNECT_S = 5.0
 
 
 class TcpStream:
-    """An open connection. `close` is idempotent and may be called from any thread; all else from one thread."""
+    """An open connection. `close` is idempotent and may be called from any thread, all other methods from one."""
 
     def __init__(self, name: str, address: str) -> None:
         """Connect. name: the device's name in messages; address: "host:port".
@@ -103,7 +103,7 @@ class TcpStream:
         return n
 
     def drain(self, quiet_s: float, deadline_s: float) -> bytes:
-        """Read all that comes until the line is quiet for `quiet_s`, at most for `deadline_s`; returns it."""
+        """Read until the line is quiet for `quiet_s`, at most for `deadline_s`; returns the last 64 KiB that came."""
         ends_at = time.monotonic() + deadline_s
         dropped = bytearray()
         while (left_s := ends_at - time.monotonic()) > 0 and (data := self.receive(min(quiet_s, left_s))):
@@ -131,7 +131,7 @@ class TcpStream:
 
     @contextmanager
     def _translated(self) -> Iterator[None]:
-        """Raise our error for all that a socket raises about an open connection: it means that this is gone."""
+        """Raise our error for all that a socket raises about an open connection: that means that it is gone."""
         try:
             yield
         except OSError as error:
@@ -164,7 +164,7 @@ class Deadlines:
 
 @dataclass(frozen=True, slots=True)
 class Spad512sIdentity:
-    """The device's description of itself (`D`)."""
+    """The device's description of itself: the banner's first word and the answer to `D`."""
 
     detector: str
     master_serial: str
@@ -203,7 +203,8 @@ class Spad512sLine:
         return self._stream is not None
 
     def connect(self) -> Spad512sIdentity:
-        """Connect: read the banner, send `D`, wait for a calibration if one runs, then send `D` again."""
+        """Connect: read the banner, send `D`, wait for a calibration if one runs, then send `D` again. Raises what
+        `TcpStream` raises, `DeviceBusy`, `DeviceTimeout`, `ProtocolError` or `DeviceFault`."""
         self._stream = TcpStream(self._name, self.address)
         try:
             return self._greet(self._stream)
@@ -223,7 +224,7 @@ class Spad512sLine:
             self._send(self._open(), command)
 
     def ask(self, command: str) -> str:
-        """Send a command and return its answer. Raises DeviceFault if that is an ERROR."""
+        """Send a command and return its answer. Raises DeviceFault if that is an ERROR, DeviceTimeout without one."""
         answer_s = self._deadlines.answer_s
         with self._given_up_on_silence():
             stream = self._open()
@@ -239,7 +240,7 @@ class Spad512sLine:
 
     @contextmanager
     def _given_up_on_silence(self) -> Iterator[None]:
-        """Close a connection that is gone or silent: a late answer could not be told from the next one's."""
+        """Close a connection that is gone or silent: a late answer could not be told from that to the next command."""
         try:
             yield
         except (DeviceTimeout, DeviceDisconnected):
@@ -247,7 +248,7 @@ class Spad512sLine:
             raise
 
     def ask_numbers(self, command: str, n: int) -> list[float]:
-        """The first n numbers of an answer. Newer programs and emulations send more numbers after them."""
+        """The first n numbers of an answer; newer programs and emulations send more. Raises ProtocolError for fewer."""
         fields = self.ask(command).replace("\n", ",").split(",")
         try:
             return [float(fields[i]) for i in range(n)]
@@ -259,7 +260,7 @@ class Spad512sLine:
         return self._open().receive_into(view, wait_s)
 
     def rest(self) -> bytes:
-        """The end of what the program still sends of a run."""
+        """Read what the program still sends of a run; returns the end of it."""
         return self._open().drain(4 * QUIET_S, self._deadlines.stop_s)
 
     def leave_run(self) -> None:
@@ -267,7 +268,7 @@ class Spad512sLine:
         if self._stream is None:
             return
         try:
-            # A pause first: a STOP that reached the program together with the `I` before it would be neither.
+            # A pause first: if a STOP reached the program together with the `I` before it, neither would be understood.
             came = self._stream.drain(QUIET_S, 2 * QUIET_S)
             if not _ended(came):
                 self.tell("STOP")

@@ -39,12 +39,13 @@ from drivers.units import Seconds
 _log = logging.getLogger(__name__)
 
 _CHECKED_BYTES_PER_S = 0.5e9
-"""Rate up to which payload CRCs are checked live; above, the recorder and `verify` do (section 8.2)."""
+"""Rate up to which payload CRCs are checked live; above, the recorder and `rig verify` do."""
 _SLICE_S = 0.05
 """One wait inside `fill`: how late a `stop` from another thread comes at most."""
 _PINGS_PER_HEARTBEAT = 4
 _SILENCE_S = 0.5
-"""Silence after which the device is asked whether it still runs; a run sends a heartbeat block every 100 ms."""
+"""Silence after which the device is asked whether it still runs; a run without frames sends a heartbeat block every
+100 ms."""
 _STOP_S = 1.0
 """Longest wait for the last block after ABORT."""
 
@@ -72,7 +73,7 @@ class SpbUsb(SpadArray):
     """An SPB1 SPAD over an open link."""
 
     def __init__(self, config: SpbUsbConfig, link: BulkLink, clock: Clock, tap: Tap | None = None) -> None:
-        """Check who is there and its test pattern. clock: of its deadlines, that on which the link waits."""
+        """Check the device's identity and test pattern. clock: that of the deadlines, on which the link waits too."""
         super().__init__(link.label)
         self._config = config
         self._link = link
@@ -134,7 +135,7 @@ class SpbUsb(SpadArray):
         return self._timing
 
     def _bytes_per_s(self, request: SpadRequest, width: int) -> float:
-        """Bytes a second that come in: of a burst, what the read-out gives."""
+        """Bytes a second that come in: of a burst, no more than the read-out gives."""
         exposed = float(request.frame_rate_hz) * frame_bytes(width, self.info.height)
         burst = self.info.burst if request.mode == "burst" else None
         return exposed if burst is None else min(exposed, burst.readout_bytes_per_s)
@@ -198,13 +199,13 @@ class SpbUsb(SpadArray):
         return False
 
     def _note_wait(self, seconds: float) -> None:
-        """Note for how long the device was asked in vain: the waiting itself, not how late this thread comes."""
+        """Add to the time for which the device was asked in vain, without this thread's own delays, and report it."""
         self._waited_s += seconds
         if self.on_wait is not None:
             self.on_wait(self._waited_s)
 
     def _has_ended(self) -> bool:
-        """Whether the device runs no more: then its last block got lost."""
+        """Ask whether the device has ended the run; its last block then got lost. False if it cannot be asked."""
         self._heard_at = now_s(self._clock)
         return self._control.ack_in is not None and self._control.read(Register.STATE) not in (
             SensorState.RUNNING,
@@ -224,7 +225,8 @@ class SpbUsb(SpadArray):
         )
 
     def _finish(self, receiver: BlockReceiver) -> None:
-        """End the run: the device is asked how much it exposed, since its last blocks may be lost."""
+        """End the run and ask the device how much it exposed, since its last blocks may be lost. Raises
+        `DeviceFault` if it does not say, or its watchdog ended the run."""
         self._receiver = None
         receiver.close()
         try:
@@ -284,7 +286,7 @@ def open_link(config: SpbUsbConfig, endpoint: Endpoint) -> BulkLink:
 
 
 def create(config: SpbUsbConfig, surroundings: Surroundings) -> SpbUsb:
-    """The SPAD at the config's port."""
+    """Open the SPAD at the config's port."""
     link = open_link(config, resolve(config.port, surroundings.ports))
     return SpbUsb(config, link, surroundings.clock, surroundings.tap)
 

@@ -45,14 +45,14 @@ class SensorIdentity:
     min_period_ticks: int
     """Shortest frame period."""
     window_entries: int
-    """Entries of all window tables together."""
+    """Most entries of all window tables together."""
     max_stride: int
     """Largest stride of a block."""
 
 
 def identify(control: ControlChannel, name: str) -> SensorIdentity:
     """Read the identity registers. Raises `DeviceNotFound` if the device does not speak SPB1, `DeviceFault` for another
-    version.
+    version, `ProtocolError` for impossible values.
     """
     # A program that died may have left a run behind, which would drown the answers.
     control.forget_run()
@@ -156,7 +156,7 @@ def block_size(identity: SensorIdentity, width: int, block_frames: int, name: st
 
 
 def require_windows(identity: SensorIdentity, window: WindowTable, name: str) -> None:
-    """Raises `LimitExceeded` if the device cannot move windows, or not that many."""
+    """Raise `LimitExceeded` if the device cannot move windows, or not that many."""
     if Feature.WINDOWS not in identity.features:
         raise LimitExceeded(f"{name}: its firmware moves no windows; ask for full frames or a lower frame_rate")
     entries = sum(len(x0) for x0 in window.x0)
@@ -168,7 +168,7 @@ def require_windows(identity: SensorIdentity, window: WindowTable, name: str) ->
 
 
 def require_order(control: ControlChannel, identity: SensorIdentity, heartbeat_s: float) -> None:
-    """Check a few frames of the test pattern. A wrong order of bits or rows would otherwise go unnoticed (8.4, 6)."""
+    """Raise `ProtocolError` if bits or rows of the test pattern, where the device has one, come in a wrong order."""
     if Feature.TEST_PATTERN not in identity.features:
         return
     info, name, period = identity.info, control.link.label, identity.min_period_ticks
@@ -212,7 +212,7 @@ _CONFIG_REQUEST, _CONFIG_BYTES = 0xCF, 152
 
 @dataclass(frozen=True, slots=True)
 class Wiring:
-    """The endpoints of a USB chip. ack_in: the endpoint of acknowledgements; None for a board that sends them in its
+    """The endpoints of a USB chip. ack_in: the endpoint of acknowledgements; a board without it sends them in its
     stream.
     """
 

@@ -80,8 +80,7 @@ def _cycles(index: int, pulse: Pulse, board: ProgramLimits) -> int:
 
 
 def _check_waits(period: NDArray[np.void], repeats: int, board: ProgramLimits) -> None:
-    """Raise `LimitExceeded` unless the program plays longer between two waits than a scan marker may last: as a
-    level, it
+    """Raise `LimitExceeded` unless the program plays longer between two waits than a scan marker may last: one marker
     would end both."""
     waits = np.flatnonzero(period["cycles"] == 0)
     if len(waits) == 0:
@@ -217,8 +216,7 @@ class PrawnDo(SyncSource):
         self._line.port.close()
 
     def _identify(self) -> tuple[str, int]:
-        """Firmware, and words that the board holds; raises ProtocolError if the firmware is too old or the board
-        unknown."""
+        """Firmware, and words that the board holds; raises ProtocolError for old firmware or an unknown board."""
         version = "".join(self._line.transact("ver")).removeprefix("Version: ")
         try:
             numbers = tuple(int(part) for part in version.split(".")[:2])

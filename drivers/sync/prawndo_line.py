@@ -198,9 +198,8 @@ class PrawnDoLine:
         raise DeviceTimeout(f"{self._name} does not answer on {self.port.path}; unplug it, plug it in and start again")
 
     def _ask_twice(self, command: str, parse: Callable[[str], _T], deadline_s: float | None, urgent: bool) -> _T:
-        """Ask twice in one go; returns the answer. Raises `ProtocolError` if the two differ, as by a flipped bit,
-        which would
-        make a low gate of a high one."""
+        """Ask twice in one go; returns the answer. Raises `ProtocolError` if the two differ: a flipped bit makes a low
+        gate of a high one."""
         lines = self.transact(f"{command}\n{command}", deadline_s, urgent=urgent)
         try:
             first, second = (parse(line) for line in lines)
