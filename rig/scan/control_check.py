@@ -71,7 +71,7 @@ def check_control(recorded: Path, now: Path, *, devices: Sequence[str], toleranc
 
 
 def _first_difference(device: str, what: str, said: list[Passed], says: list[Passed], *, tail: int) -> str | None:
-    """The first byte that differs, or command that one of them lacks, in words; None for neither or `tail` at most."""
+    """Say where the two differ first, by a byte or by more than `tail` commands that one of them lacks, or None."""
     for number, (old, new) in enumerate(zip(said, says, strict=False)):
         if old.data != new.data:
             pairs = enumerate(zip(old.data, new.data, strict=False))
