@@ -65,7 +65,7 @@ class DevicesError(RigError):
 
 
 class RecordingError(RigError):
-    """Raised when the requested recording cannot be written. The run ends, and what was recorded is kept."""
+    """Raised when a recording cannot be written, cut or mended. A run then ends, and what was recorded is kept."""
 
     exit_code = 3
 
@@ -76,4 +76,4 @@ class DivergedError(RigError):
 
 
 class DamagedRecordingError(RigError):
-    """Raised when the files of a recording are damaged. They cannot be used before 'rig repair' has been run."""
+    """Raised when the files of a recording are damaged. The message says what can help."""

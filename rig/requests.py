@@ -116,7 +116,7 @@ class ScanRequest(RunRequest):
 @described
 @dataclass(frozen=True, slots=True, kw_only=True)
 class ReplayRequest(RunRequest):
-    """A recording that is played through the live stack (`rig replay`)."""
+    """A recording that is played as if it were taken now (`rig replay`)."""
 
     clock: str = option("realtime", "realtime, max, x4 or x0.1, or step (Enter: one sweep more)")
     loop: bool = option(False, "play it again and again, until Ctrl-C or --maps")

@@ -1,4 +1,4 @@
-"""Threads of the pipeline: `RowWorkers` share compiled work on image rows, `StageThread` is one stage of the pipeline.
+"""Threads of a scan: `RowWorkers` share compiled work on image rows, `StageThread` is one stage of the pipeline.
 
 Kernels release the interpreter's lock while they run, so row threads work at the same time.
 """
@@ -24,7 +24,7 @@ class RowWorkers:
     """Threads that share the rows of a picture. Each always gets the same rows, which may still be in its cache.
 
     Work can be queued (`post`): each thread goes through it in order and none waits for the others. An error in the
-    work is raised at the next call, and work queued after it is not begun. With one thread everything is done at once.
+    work is raised at the next call, and no further work is begun until then. With one thread work is done at once.
     The threads end with `close`, or when nothing refers to the workers any more.
     """
 
@@ -101,7 +101,7 @@ class _State:
 
 
 def yield_to_others() -> None:
-    """Let the calling thread work only while other threads leave a core idle, on systems with thread priorities.
+    """Give the calling thread the lowest priority, so that it hardly works unless a core is idle. On Linux alone.
 
     Row threads work in step, so one that shares its core with less urgent work slows all of them.
     """

@@ -7,7 +7,7 @@ result.last.depth_m, result.summary.truth
 For a calibration `sources` may be a rig (a config, the name of a bundled one, or its file), folders of runs taken with
 `record`, folders of earlier calibrations (for their views) and, for the camera alone, pictures. The default is the
 bundled simulated rig, whose world moves the board. `ask` is called to have the board of a real rig moved, and returns
-once that is done; `tell` gets a line about each view. All of them raise CalibrationError if the views give no
+once that is done; `tell` gets a line about each view. All calibrations raise CalibrationError if the views give no
 calibration (Degenerate, with `.reason`, if more or other views would help), UsageError for a request that cannot be
 met, and DeviceError or DevicesError if devices fail. Views that were taken by then are in `out`.
 """

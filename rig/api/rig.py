@@ -55,7 +55,7 @@ def laser_off(config: Config = SIMULATED) -> list[str]:
 def bench(*, threads: int | None = None, progress: Progress | None = None) -> "SpeedReport":
     """Measure how fast this machine counts and estimates, within a minute (`rig bench`).
 
-    threads: the largest number of threads to measure with; None is one for each core.
+    threads: the largest number of threads to measure with; None is one for each core. Raises UsageError if below 1.
     progress: called with the number of rows done and the total, over all rounds.
     """
     from rig.bench.speed import measure_speed

@@ -54,8 +54,9 @@ def scan(
       the run never waits for it.
     on_space: called before anything moves with a `Space`: the most that the recording will take on the disk.
 
-    Raises UsageError for a request that cannot be met, DeviceError or DevicesError if devices fail; maps finished by
-    then are in `out`. An interrupt ends the scan after its last complete map, with verdict 'aborted'.
+    Raises UsageError for a request that cannot be met, DeviceError or DevicesError if devices fail, RecordingError if
+    frames cannot be written; maps finished by then are in `out`. An interrupt ends the scan after its last complete
+    map, with verdict 'aborted'.
     """
     request = replace(request or ScanRequest(), **changes)
     settings = _configured(config, request)
@@ -75,9 +76,9 @@ def plan_scan(
 ) -> ScanPlan:
     """Compile the plan of a scan and check it against the limits of its devices (`rig scan --dry-run`).
 
-    Options and checks are those of `scan`, including the room on the disk. Devices are opened, asked for their limits
-    and closed again. Nothing moves and no light leaves, so `arm` is not needed. Raises DevicesError, one line per
-    device, if real ones are missing.
+    Options and checks are those of `scan`, including the room on the disk, but not whether `out` is empty. Devices are
+    opened, asked for their limits and closed again. Nothing moves and no light leaves, so `arm` is not needed. Raises
+    UsageError for a scan that cannot be made, DevicesError, one line per device, if real ones are missing.
     """
     request = replace(request or ScanRequest(), **changes)
     settings = _configured(config, request)
@@ -108,7 +109,7 @@ def replay(
     steps: Callable[[Pace], None] | None = None,
     **changes: Any,
 ) -> RunResult:
-    """Play a recording through the live stack. The depth is the same, bit for bit, at any clock (`rig replay`).
+    """Play a recording as if it were taken now. The depth is the same, bit for bit, at any clock (`rig replay`).
 
     run: folder of a run taken with `record`.
     request, changes: options, as a `ReplayRequest` or by the names of its fields.
@@ -117,8 +118,8 @@ def replay(
       any thread.
     Everything else is as in `scan`.
 
-    Raises UsageError if there is no recording, and DivergedError if drivers sent something different from the
-    recording, or sent it more than 2 ms from its time.
+    Raises UsageError if there is no recording, DamagedRecordingError if it cannot be played as it is, and DivergedError
+    if drivers sent something else than was recorded or, in real time, a buffer of points more than 2 ms off its time.
     """
     request = replace(request or ReplayRequest(), **changes)
     settings = replay_config(Path(run), request, None if request.config is None else configure(request.config))
@@ -198,8 +199,8 @@ def reconstruct(
     request, changes: options, as a `ReconstructRequest` or by the names of its fields.
     progress: called with the number of frames or maps done and the total.
 
-    Raises UsageError, one line per problem, for files that do not fit together. An interrupt ends the run after its
-    last complete map, with verdict 'aborted'.
+    Raises UsageError, one line per problem, for files that do not fit together, DamagedRecordingError for damaged ones.
+    An interrupt ends the run after its last complete map, with verdict 'aborted'.
     """
     request = replace(request or ReconstructRequest(), **changes)
     source = Path(source)

@@ -34,7 +34,8 @@ def tradeoff(
       lines in its config.
     progress: called with the number of frames done and the total.
 
-    Raises UsageError, one line per problem. An interrupt ends it after the last complete row, with verdict 'aborted'.
+    Raises UsageError, one line per problem. An interrupt ends the trials after the last complete row, with verdict
+    'aborted'.
     """
     request = replace(request or TradeoffRequest(), **changes)
     loaded = configure(config)

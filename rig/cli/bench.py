@@ -31,7 +31,7 @@ def bench_command(
     if soak is None and (window or slow_consumer != 0 or on_overload != "abort"):
         raise UsageError("--window, --slow-consumer and --on-overload are of a soak; add --soak 30, or leave them out")
     stream = None
-    if soak is not None:  # before all that takes a minute: what it is asked for may be wrong
+    if soak is not None:  # before the bench, which takes a minute: the request for the soak may be wrong
         with progress():
             stream = api.soak(
                 soak, threads=threads, window=window, slow_consumer_s=slow_consumer / 1e3, on_overload=on_overload,

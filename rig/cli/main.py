@@ -96,7 +96,7 @@ def _signals_interrupt() -> Iterator[None]:
 
 
 def _say_why(error: BaseException, arguments: list[str]) -> int:
-    """Say what ended a command that did not handle it: click's usage error, an interrupt or a mistake of ours."""
+    """Say which error ended a command that did not handle it; returns the exit code, after an interrupt too."""
     as_json = "--json" in arguments
     if isinstance(error, KeyboardInterrupt) or isinstance(error.__cause__, KeyboardInterrupt):
         return _TYPER_INTERRUPTED
@@ -131,7 +131,7 @@ def _values(option: str, arguments: list[str]) -> list[str]:
 
 
 def _require_no_empty(arguments: list[str]) -> None:
-    """Raise UsageError for an argument without a character: an unset shell variable, which would mean '.'."""
+    """Raise BadParameter for an empty argument or `--NAME=`: an unset shell variable, which would mean '.'."""
     for before, word in pairwise(["rig", *arguments]):
         if not word or (word.startswith("--") and word.endswith("=")):
             place = f"the argument behind '{before}'" if not word else f"'{word}'"

@@ -25,7 +25,7 @@ _live: ContextVar["Live | None"] = ContextVar("live", default=None)
 
 
 def _ignore() -> None:
-    """Nobody listens."""
+    """Do nothing, since nobody listens."""
 
 
 class ProgressLine:
@@ -110,8 +110,8 @@ def progress(*, compiles: bool = True) -> Iterator[None]:
 
 @contextmanager
 def _announced(line: ProgressLine) -> Iterator[None]:
-    """Within the context each stage is printed once, and each part once, as soon as the command has taken
-    `PATIENCE_S`.
+    """Within the context each part is printed once, and each stage outside of parts once, as soon as the command has
+    taken `PATIENCE_S`.
     """
     lock, said, speaks = threading.Lock(), set[str](), PATIENCE_S <= 0
 

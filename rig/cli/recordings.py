@@ -25,7 +25,7 @@ RunArgument = Annotated[Path, typer.Argument(metavar="RUN", help="folder of a re
 _LOOK_S = 0.2
 """Seconds of one wait for a key."""
 MOST_LINES = 20
-"""Most problems that are shown to people; `--json` has all."""
+"""Most problems, and most gaps, that are shown to people; `--json` has all."""
 
 
 def verify_command(run: RunArgument) -> Answer:
@@ -174,7 +174,7 @@ def replay_command(
     request: ReplayRequest,
     run: Annotated[Path, typer.Argument(metavar="RUN", help="a run taken with --record", show_default=False)],
 ) -> Answer:
-    """Play a recording through the live stack, at any clock."""
+    """Play a recording as if it were taken now, at any clock."""
     if request.loop and request.save is None:
         request = replace(request, save="last")
     steps = _step_by_keys if request.clock == "step" else None

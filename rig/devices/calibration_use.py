@@ -5,8 +5,8 @@ nothing and is used unchecked. Everything that affects depth is compared: kinds 
 scanner, how they are mounted, and the laser lines; for a simulated rig, its geometry. Settings of a scan are not
 compared. A recording's calibration is compared with the devices and the date of the recording.
 
-Each reason against a calibration is a `Refusal`, which the user may accept. A check that fails later is noted in a file
-beside the calibration (`note_check`, `notes_on`); the calibration itself stays as it is.
+Each reason against a calibration is a `Refusal`, which the user may accept. The outcome of a later check is noted in a
+file beside the calibration (`note_check`, `notes_on`); the calibration itself stays as it is.
 """
 
 import hashlib
@@ -103,8 +103,8 @@ def identity_of(rig: OpenRig) -> Identity:
 
 
 def recorded_identity(run: Path) -> Identity:
-    """Identity of the rig that made a recording, as far as its manifest says. `created` is the date of the
-    recording."""
+    """Identity of the rig that made a recording, as far as its manifest says; `created` is the recording's date. Raises
+    DamagedRecordingError if the manifest is damaged."""
     noted = (read_manifest(run) or {}).get("rig") or {}
     kinds, serials = noted.get("kinds") or {}, noted.get("serials") or {}
     return _identity(str(noted.get("name", "")), kinds, serials, str(noted.get("taken", "")))
@@ -151,7 +151,8 @@ def cube_calibration_use(model: RigModel, file: Path | None, *, accept: bool = F
 def refusals(
     model: RigModel, file: Path | None, here: Identity | None, max_age_s: float | None = None
 ) -> tuple[Refusal, ...]:
-    """Reasons against a calibration for the rig `here` at the time `here.created`. None means an unknown rig."""
+    """Reasons against a calibration for the rig `here` at the time `here.created`; `here` is None for an unknown rig.
+    Raises UsageError if notes on the calibration cannot be read."""
     found: list[Refusal] = []
     identity = model.identity
     if identity is not None:
@@ -215,7 +216,7 @@ def _aged(made: Identity, here: Identity, max_age_s: float | None) -> list[Refus
 
 
 def _span(time_s: float) -> str:
-    """A time in the largest unit of the config of which it has at least one."""
+    """A time in days, hours or seconds: the largest unit of which it has at least one."""
     units = (("days", DAY_S), ("hours", 3600.0))
     unit, size = next((of for of in units if time_s >= of[1]), ("seconds", 1.0))
     return f"{time_s / size:.4g} {unit}"
@@ -265,7 +266,8 @@ def check_content(checked: str, accepted: Sequence[Refusal]) -> dict[str, Any]:
 
 
 def note_check(file: Path, model: RigModel, what: str, *, passed: bool, reasons: tuple[str, ...] = ()) -> Path:
-    """Note the outcome of a check in a file beside the calibration. what: check or pixels. Raises OSError."""
+    """Note the outcome of a check in a file beside the calibration; returns its path. what: check or pixels. Raises
+    OSError, or UsageError if older notes cannot be read."""
     beside = _beside(file)
     notes = _read_notes(beside)
     date = datetime.now(UTC).isoformat(timespec="seconds")
@@ -275,7 +277,7 @@ def note_check(file: Path, model: RigModel, what: str, *, passed: bool, reasons:
 
 
 def carry_notes(old: Path, before: RigModel, new: Path, after: RigModel, *, new_pixels: bool = False) -> None:
-    """Copy the notes on failed checks from a calibration to the one that was made from it. Raises OSError.
+    """Copy the notes on failed checks from a calibration to the one that was made from it. Raises as `note_check`.
 
     new_pixels: whether the new one has a pixel map of its own, so that notes on the old one do not apply.
     """
@@ -291,7 +293,7 @@ def _beside(file: Path) -> Path:
 
 
 def notes_on(file: Path | None, model: RigModel) -> dict[str, dict[str, Any]]:
-    """Notes on this very calibration, by the name of the check; empty if there is no file."""
+    """Notes on this very calibration by the check's name; empty without a file. Raises UsageError if unreadable."""
     if file is None:
         return {}
     notes = _read_notes(_beside(file))

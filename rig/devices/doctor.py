@@ -54,7 +54,8 @@ _LEAST_LINES = 3
 
 @dataclass(frozen=True, slots=True)
 class LineMarkers:
-    """The line markers of a sweep, compared with its plan. clock_error: of the scanner, in the SPAD's time."""
+    """The line markers of a sweep, compared with its plan. clock_error: relative excess of the scanner's clock over
+    nominal, in the SPAD's time. jitter_columns: standard deviation."""
 
     rate_hz: float
     jitter_columns: float
@@ -65,8 +66,8 @@ class LineMarkers:
 class DarkLook:
     """Frames of a sweep with the gate low, and what came with them.
 
-    records: (n,), records of all frames. dark_share: share of ones. n_bytes: bytes of pixels; seconds: time taken to
-    send them.
+    records: (n,), records of all frames. dark_share: share of ones in the first frames of the blocks. n_bytes: bytes of
+    pixels; seconds: time from the start of the mirror until all had come.
     counters: the SPAD's own, before it was stopped. triggered: whether the sync source's program ran to its end.
     """
 
@@ -144,7 +145,7 @@ class Finding:
 
 
 def examine(config: RigConfig, folder: Path) -> list[Finding]:
-    """Examine everything. folder: where a scan would write. A device's fault becomes a finding and is not raised."""
+    """Examine everything. folder: where a scan would write. Faults of config and devices become findings."""
     findings: list[Finding] = []
     try:
         with open_rig(config) as rig:
@@ -311,7 +312,7 @@ def attached() -> list[Attached]:
 def laser_off(config: RigConfig) -> list[str]:
     """Take the gate low and switch emission off; returns what was done.
 
-    Both are tried even if one fails. Raises DevicesError with the failures.
+    Both are tried even if one fails. Raises DevicesError with the failures, then with what was done.
     """
     done: list[str] = []
     trouble: list[str] = []

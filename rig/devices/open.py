@@ -51,7 +51,7 @@ class ProjectsLines(Protocol):
     """A world whose laser can project several lines at once."""
 
     def project_lines(self, offsets: Sequence[float], *, shared: bool) -> None:
-        """Project a line at each of these offsets, in units of the mirror command."""
+        """Project lines at these offsets, in units of the mirror command. shared: whether they share the power."""
         ...
 
 
@@ -73,7 +73,7 @@ class EmulatesDevices(Protocol):
 def open_rig(config: RigConfig, seed: int = 0, tap: TapFile | None = None) -> Iterator[OpenRig]:
     """Open every device of the config; on exit the sync source is closed first, then laser, scanner and SPAD.
 
-    A simulated rig has virtual time, a real one the host's.
+    A simulated rig has virtual time; a real one, or a simulated one that works in real time, has the host's.
     seed: of everything simulated.
     tap: file that records what passes the ports of all devices; for the SPAD, only its control traffic.
     Raises UsageError for faults of config or calibration, DevicesError for faults of devices; each lists all problems.
@@ -84,7 +84,9 @@ def open_rig(config: RigConfig, seed: int = 0, tap: TapFile | None = None) -> It
 
 @contextmanager
 def open_light(config: RigConfig, trouble: list[str]) -> Iterator[tuple[SyncSource | None, LineLaser | None]]:
-    """Open only the gate and the laser, without a guard. One that fails is None and adds a line to `trouble`."""
+    """Open only the gate and the laser, without a guard. One that fails is None and adds a line to `trouble`.
+
+    Raises DeviceError if the world, if there is one, cannot be made."""
     with ExitStack() as stack:
         surroundings = surroundings_of(config, 0, stack)
         opened: dict[str, Any] = {"sync": None, "laser": None}

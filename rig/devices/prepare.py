@@ -44,7 +44,8 @@ class PlansEffects(Protocol):
 
 
 def prepare(rig: OpenRig) -> tuple[ScanPlan, SpadTiming]:
-    """Compile the plan and configure the SPAD for it. Nothing moves and no light leaves."""
+    """Compile the plan and configure the SPAD for it. Nothing moves and no light leaves. Raises PlanError for a scan
+    that these devices cannot do, DeviceError if the SPAD refuses it; for a recording as `replay_plan`."""
     scan = rig.config.scan
     if isinstance(rig.spad, ReplaySpad):  # what was scanned is bound by the plan that it was scanned with
         return replay_plan(rig.spad, rig.spad.recording, scan, rig.model)

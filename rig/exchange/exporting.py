@@ -56,7 +56,8 @@ def export_run(
     request, changes: what pictures and films show, as an `ExportRequest` or by the names of its fields.
     out: the folder to write, which appears only once it is complete; None is RUN-KIND beside the run.
     progress: called with the number of frames done and the total.
-    Raises UsageError if the run has nothing of that kind, or h5py is not installed.
+    Raises UsageError if the run has nothing of that kind, a request does not fit it, `out` cannot be written or h5py is
+    not installed; DamagedRecordingError if no block of a recording can be read.
     """
     run, request = Path(run), replace(request or ExportRequest(), **changes)
     _check(run, kind, request)

@@ -40,8 +40,8 @@ class ForeignFrames:
 def gather(files: Iterable[str | os.PathLike[str]], suffix: str) -> list[Path]:
     """List the given files in that order. A folder stands for all files with `suffix` in it and its subfolders.
 
-    A folder's files come in natural order (2 before 10), as the cameras number them. Raises UsageError if one is
-    missing.
+    A folder's files come in natural order (2 before 10), as the cameras number them. Raises UsageError if a file is
+    missing, a folder holds none, or none is named.
     """
 
     def natural(file: Path) -> list[tuple[int, str]]:

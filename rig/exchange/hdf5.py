@@ -2,8 +2,9 @@
 `load`.
 
     /frames/bits uint8 (frames, height, row bytes)  /frames/number run ticks time_s marks x0 y0 line sweep (1, frames)
-    /maps/depth_m float32 (maps, height, width)  /maps/x_px confidence x_sd_px signal haze (maps, rows, columns)
-    /maps/number (1, maps)  /clock/tick_hz frame_period_ticks exposure_ticks (1, 1)  /manifest UTF-16 (n, 1)
+    /maps/depth_m float32 (maps, height, width)  /maps/number (1, maps)  /manifest UTF-16 (n, 1)
+    /maps/x_px confidence x_sd_px signal haze, also x2_px confidence2 if the estimator has them (maps, rows, columns)
+    /clock/tick_hz tick_hz_numerator tick_hz_denominator frame_period_ticks exposure_ticks (1, 1)
 
 MATLAB sees dimensions in reverse order, and its arrays have at least two. A MAT-file has 512 bytes of header before the
 HDF5 part, and the name of a MATLAB class with each array and group (MAT-file format 7.3, as MATLAB writes it).
@@ -50,7 +51,8 @@ def require_h5py() -> Any:
 
 
 def write_hdf5(blocks: Iterable[FrameBlock], maps: MapFiles, manifest: Mapping[str, Any], path: Path) -> FrameLog:
-    """Write frames, maps and manifest to a new file. A run without frames or without maps has no such group."""
+    """Write frames, maps and manifest to a new file. A run without frames or without maps has no such group. Raises
+    UsageError without h5py or if the frames do not make one array, OSError before the disk is full."""
     h5py = require_h5py()
     log = FrameLog()
     with h5py.File(path, "w", userblock_size=_USER_BLOCK) as file:

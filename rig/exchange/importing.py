@@ -87,7 +87,7 @@ def import_frames(
     files: in order; a folder stands for the files in it.
     request, changes: how they are read, as an `ImportRequest` or by the names of its fields.
     progress: called with the number of frames done and the total.
-    Raises UsageError, one line per problem, for files or options that cannot be used.
+    Raises UsageError, one line per problem, for files or options that cannot be used; RecordingError if writing fails.
     """
     request = replace(request or ImportRequest(), **changes)
     asked = request.frame_rate
@@ -170,7 +170,7 @@ def _checked_turn(kind: str, request: ImportRequest) -> QuarterTurn:
 
 
 def _turned(foreign: ForeignFrames, turn: QuarterTurn) -> Iterator[NDArray[np.uint8]]:
-    """Give upright chunks uint8 (n, height, row bytes), with rows padded to whole words and clean pad bits."""
+    """Yield upright chunks uint8 (n, height, row bytes), with rows padded to whole words and pad bits of 0."""
     width, height = turned_size(foreign.width, foreign.height, turn)
     last_byte = np.uint8(0xFF << (-foreign.width % 8) & 0xFF)
     for chunk in foreign.chunks():

@@ -2,7 +2,7 @@
 
 The array is uint8 (frames, height, ceil(width / 8)), most significant bit first, with the received frames one after the
 other. `frames.json` has what the array cannot hold: clock, numbers and gaps, markers, windows, collected block by block
-by `FrameLog`. If there is a camera, `transforms.json` makes it a data set for visionsim.
+by `FrameLog`. If the camera of whole frames is known, `transforms.json` makes it a data set for visionsim.
 """
 
 import json
@@ -24,7 +24,7 @@ from rig.run_folder.folder import RunFolder, json_text
 
 CUBE: Final = "frames.npy"
 Ranges = list[tuple[int, int, int]]
-"""[run id, first frame, frames] of consecutive numbers."""
+"""(run id, first frame, frames) of each stretch of consecutive numbers; as gaps (run id, first, last)."""
 _POSE: Final = "[[1,0,0,0],[0,1,0,0],[0,0,1,0],[0,0,0,1]]"
 """Pose for visionsim: the camera does not move, and its own frame is the world's."""
 
@@ -63,7 +63,7 @@ class FrameLog:
         return self._header
 
     def columns(self) -> dict[str, NDArray[Any]]:
-        """Arrays (frames,): number, run, ticks and the fields of the records."""
+        """Arrays (frames,): number, run, ticks and time_s of the SPAD's clock, and other fields of the records."""
         runs, *arrays = zip(*self._parts, strict=True)
         number, ticks, records = map(np.concatenate, arrays)
         return {

@@ -1,8 +1,8 @@
-"""Photon cubes: `.npy` uint8 (frames, height, width / 8) of `photoncube` and `visionsim` (docs/reference/hardware.md).
+"""Photon cubes of `photoncube` and `visionsim`: `.npy` uint8 (frames, height, ceil(width / 8)).
 
-They are packed along the width, most significant bit first (`numpy.packbits(axis=2)`). A file beside the array may add
-what it cannot hold: `NAME.json` of `rig export` (width, frame rate, frame numbers) or visionsim's `transforms.json`
-(width).
+They are packed along the width, most significant bit first (`numpy.packbits(axis=2)`; docs/reference/hardware.md). A
+fourth axis of length 1, the channel, is allowed. A file beside the array may add what it cannot hold: `NAME.json` of
+`rig export` (width, frame rate, frame numbers) or visionsim's `transforms.json` (width).
 """
 
 from collections.abc import Iterator, Mapping, Sequence
@@ -42,7 +42,7 @@ def open_photoncube(files: Sequence[Path], asked: ImportRequest) -> ForeignFrame
     """Open cubes as frames one after the other. Raises UsageError, a line per problem, for files that are not such
     cubes.
 
-    If all bytes are 0 or 1, the user must state that they are packed.
+    If all bytes are 0 or 1, the user, or a file beside the cube, must state that they are packed.
     """
     cubes = each_or_problems(files, lambda file: _open(file, packed=asked.form == "packed"))
     if len({(cube.width, cube.frames.shape[1:]) for cube in cubes}) > 1:

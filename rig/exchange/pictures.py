@@ -25,7 +25,9 @@ Picture = NDArray[np.uint8]
 
 
 def map_pictures(maps: MapFiles, view: View) -> Iterator[Picture]:
-    """Make one picture of each map, all of the same size. The colour scale of the first depth map is used for all."""
+    """Make one picture of each map, all of the same size. The colour scale of the first depth map is used for all.
+
+    Raises UsageError if a file cannot be read."""
     if view == "intensity":
         import cv2
 
@@ -62,8 +64,8 @@ def write_pngs(pictures: Iterable[Picture], folder: RunFolder, name: str) -> int
 
 
 def write_mp4(pictures: Iterable[Picture], path: Path, pictures_per_s: float) -> int:
-    """Write a film (MPEG-4 part 2); returns its number of pictures. Raises UsageError if OpenCV cannot write it
-    here."""
+    """Write a film (MPEG-4 part 2); returns its number of pictures. Raises UsageError if OpenCV cannot write it here,
+    or only a part of it."""
     import cv2
 
     film = None
@@ -89,7 +91,7 @@ def write_mp4(pictures: Iterable[Picture], path: Path, pictures_per_s: float) ->
 
 
 def _sums(blocks: Iterable[FrameBlock], n: int) -> Iterator[NDArray[np.uint32]]:
-    """Counts (sensor height, sensor width) of every n frames, each window at its place."""
+    """Yield the sums of n frames each, (sensor height, sensor width), with each window at its place."""
     counts: NDArray[np.uint32] | None = None
     missing = n
     for block in blocks:
@@ -97,7 +99,7 @@ def _sums(blocks: Iterable[FrameBlock], n: int) -> Iterator[NDArray[np.uint32]]:
         while at < block.n_frames:
             if counts is None:
                 size = header.sensor_height, header.sensor_width
-                if size[0] * size[1] > _MOST_PIXELS:  # only a header says so, and the picture is made of it
+                if size[0] * size[1] > _MOST_PIXELS:  # a damaged header may name any size
                     raise UsageError(
                         f"the recording says that its sensor has {size[1]} x {size[0]} pixels; pictures have at most "
                         f"{_MOST_PIXELS}; 'rig export' the frames as npy, which are only as large as their windows"

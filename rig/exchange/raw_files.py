@@ -43,7 +43,7 @@ _JUDGED_SIGMAS: Final = 10.0
 def open_pi_imaging(files: Sequence[Path], asked: ImportRequest) -> ForeignFrames:
     """Open files as frames one after the other. The form of each file is recognised unless the request states it.
 
-    Raises UsageError, a line per file, for contents that are not a whole number of frames.
+    Raises UsageError, a line per file, for contents that are not a whole number of frames or that fit both forms.
     """
     form, rows = asked.form, asked.rows or ROWS
     opened = each_or_problems(files, lambda file: _open_pi_imaging(file, form, rows))

@@ -32,8 +32,7 @@ _VERDICT_WITHOUT_GAPS: Final = {RunVerdict.GAPS: RunVerdict.COMPLETE, UNFINISHED
 
 @dataclass(frozen=True, slots=True)
 class Part:
-    """Frames of one run. first_map, end_map: the maps completely in it, as the recording numbers them; 0, 0 for
-    none."""
+    """Frames of one run. first_map, end_map: the maps completely in it, by the recording's numbers; 0, 0 for none."""
 
     run: RecordedRun
     first_frame: int

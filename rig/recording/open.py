@@ -177,7 +177,7 @@ class RecordingInfo:
     """Contents of a recording.
 
     verdict: the run's own. compressed: number of compressed segments. bytes: of all segments on the disk. maps: number
-    that a replay can make. devices: names by slot. problems: one line each, as far as a look at a few blocks shows.
+    of whole ones. devices: names by slot. problems: one line each, as far as a look at a few blocks shows.
     """
 
     folder: Path

@@ -1,7 +1,7 @@
 """Runs a scan: starts the devices in order, takes maps from their frames, and makes everything safe.
 
-The `Pipeline` does the work between the SPAD and the caller. As soon as all frames have come, or anything fails, the
-rig is made safe on the caller's thread. What is in the ring by then is still counted and estimated.
+The `Pipeline` works between SPAD and caller. When all frames have come, or anything fails, the rig is made safe on the
+caller's thread. What is in the ring by then is still counted and estimated, unless that thread itself failed.
 """
 
 import logging
@@ -71,7 +71,8 @@ class Acquisition:
 
     maker: makes the maps, on the counting thread; a `rig.depth.reconstruct.Reconstructor`.
 
-    Raises UsageError if the SPAD cannot do what the policy asks, PlanError if its memory is too small for a map.
+    Raises UsageError if the SPAD cannot do what the policy asks, PlanError if its memory is too small for a map,
+    ValueError for less than one map.
     """
 
     def __init__(
@@ -109,8 +110,8 @@ class Acquisition:
     def run(self) -> Generator[AcquiredMap, None, None]:
         """Scan; yields the maps in order. However the iteration ends, gate, laser, scanner and SPAD are made safe.
 
-        Raises DeviceError if a device fails, RingOverflow if frames came too fast, RecordingError if the disk is full,
-        each after the maps that were complete by then; DevicesError if not all devices could be made safe.
+        Raises DeviceError if a device fails, RingOverflow if frames came too fast, RecordingError if a block cannot be
+        written (on other threads: after all whole maps); DevicesError if not all devices could be made safe.
         """
         plan = self._plan
         counter = self._maker.counter(
@@ -127,7 +128,7 @@ class Acquisition:
     def _next_start(self, left: int) -> tuple[int, SweepStart]:
         """Number of sweeps of the next start, of so many that are left, and the sweep with which it begins.
 
-        As recorded, or else as many as the SPAD's memory holds in a burst and the sync source's program.
+        The number is the recorded one, 1 for a first map alone, or else as many as burst memory and sync program hold.
         """
         if self._asked.starts is not None:
             start = next(self._asked.starts)
@@ -214,7 +215,7 @@ class Acquisition:
         )
 
     def _silence_of_spad_s(self) -> float:
-        """Seconds for which the SPAD may have no answer while light may fall."""
+        """Seconds for which the SPAD may give no answer while light may fall."""
         spad, usual = self._rig.config.spad, GuardLimits()
         if str(getattr(spad, "port", "")).startswith(EMULATED_PREFIX):  # on the processors of this very process
             return usual.busy_within_s
@@ -247,7 +248,7 @@ class Acquisition:
         return "rendering" if isinstance(self._rig.clock, VirtualClock) else "scanning"
 
     def _arm(self) -> None:
-        """Arm the laser behind a gate that reads back low and wait for it; a started SPAD would overflow meanwhile."""
+        """Arm the laser behind a gate that reads back low and wait until it is warm, before the SPAD can overflow."""
         self._rig.sync.gate_low()
         laser, power_w = self._rig.laser, self._rig.config.scan.power
         laser.arm(laser.limits.max_power_w if power_w is None else power_w)
@@ -259,7 +260,8 @@ class Acquisition:
             waited_s += WARM_LOOK_S
 
     def _make_safe(self, pipeline: Pipeline) -> list[str]:
-        """Gate low, no more frames taken, laser paused, mirror parked, SPAD stopped: in this order, each one always."""
+        """Take the gate low, take no more frames, pause the laser, park the mirror and stop the SPAD, in this order,
+        whatever fails; returns a line for each failure. An interrupt meanwhile is raised at the end."""
         rig = self._rig
         trouble: list[str] = []
         interrupted: BaseException | None = None
@@ -286,7 +288,7 @@ class Acquisition:
 
 
 def added_counters(before: SpadCounters, now: SpadCounters) -> SpadCounters:
-    """Sum of the counts of two starts; None for counts that the device does not report."""
+    """Sum of the counts of two starts; None for counts that the device does not report in both."""
     counts = (
         None if (a := getattr(before, field.name)) is None or (b := getattr(now, field.name)) is None else a + b
         for field in fields(SpadCounters)

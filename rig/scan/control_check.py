@@ -24,7 +24,7 @@ _SHOWN = 24
 
 @dataclass(frozen=True, slots=True)
 class ControlCheck:
-    """Result of a comparison. worst_swap_s: lateness of the buffer, of `swaps`, that is furthest from its time.
+    """Result of a comparison. worst_swap_s: largest distance of a buffer, of `swaps`, from its time, either way.
 
     problems: one line each; empty if the two agree.
     """
@@ -45,7 +45,8 @@ class ControlCheck:
 def check_control(recorded: Path, now: Path, *, devices: Sequence[str], tolerance_s: float | None) -> ControlCheck:
     """Compare two files of control traffic.
 
-    devices: those that took part. tolerance_s: for the times of buffers; None does not compare times.
+    devices: those that took part. tolerance_s: for the times of buffers; None does not compare times. Raises
+    ProtocolError if a file is not one of control traffic.
     """
     before, after = Spoken.of(read_taps(recorded)), Spoken.of(read_taps(now) if now.exists() else ())
     problems: list[str] = []
@@ -70,7 +71,7 @@ def check_control(recorded: Path, now: Path, *, devices: Sequence[str], toleranc
 
 
 def _first_difference(device: str, what: str, said: list[Passed], says: list[Passed], *, tail: int) -> str | None:
-    """The first byte that differs, in words; None if none does."""
+    """Say where the two differ first, by a byte or by more than `tail` commands that one of them lacks, or None."""
     for number, (old, new) in enumerate(zip(said, says, strict=False)):
         if old.data != new.data:
             pairs = enumerate(zip(old.data, new.data, strict=False))
@@ -88,7 +89,7 @@ def _first_difference(device: str, what: str, said: list[Passed], says: list[Pas
 
 
 def _swaps_off(said: list[Passed], says: list[Passed]) -> list[float]:
-    """Seconds by which each buffer came later than recorded, less what the whole scan did.
+    """Seconds by which each buffer came later than recorded, less the median of its scan.
 
     The second one has no time of its own, since a device takes it as soon as the host has it: it gets 0.
     """

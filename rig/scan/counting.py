@@ -60,7 +60,7 @@ class MapQueue:
         return self._ended and not self._maps
 
     def put(self, found: AcquiredMap) -> None:
-        """Add a map once there is room. In a closed queue the map is dropped."""
+        """Add a map once there is room, or at once if the queue is closed and nobody will take it."""
         with self._changed:
             self._changed.wait_for(lambda: len(self._maps) < self.room or self.closed)
             self._maps.append(found)
@@ -105,7 +105,7 @@ class MapQueue:
 
 
 class MakesMaps(Protocol):
-    """The part of a `Reconstructor` that the counting thread uses. No other thread uses it."""
+    """The part of a `Reconstructor` that a scan uses; once the counting thread runs, no other thread uses it."""
 
     def counter(self, layout: SweepLayout) -> Counter:
         """Make a counter whose sweeps `map` takes."""

@@ -3,7 +3,7 @@
 `Listeners` are the callbacks. The monitor is a thread that shows the newest frames at most ten times a second and never
 delays other threads. It is an optional reader of the ring, copies what it shows and gives the block back before the
 callback sees it. A slow callback sees fewer blocks. One that raises is reported once and not called again. One that
-hangs is abandoned at the end of the run. Summing 16 frames of 512 x 512 takes 3 to 10 ms.
+hangs is abandoned when the SPAD has stopped. Summing 16 frames of 512 x 512 takes 3 to 10 ms.
 """
 
 import logging
@@ -63,12 +63,12 @@ class ScanProgress:
 
     frames: frames received, at most frames_planned, the number that the plan takes from the first scan marker to the
     last.
-    lost: frames lost by the SPAD's own count.
+    lost: frames lost by the SPAD's own count; if it has none, those that found no room in the ring.
     sweeps: sweeps counted, of `maps`.
     stages: the figures of each stage so far.
     fog: estimate from the newest map; None before the first.
-    stage: 'rendering' if frames are simulated, otherwise 'scanning' or 'replaying'; 'learning' while the estimator
-      learns from the first map, 'estimating' while another map is made.
+    stage: 'replaying', 'rendering' on virtual time, otherwise 'scanning'; 'learning' while the estimator learns from
+      the first map, 'estimating' while another map is made.
     """
 
     frames: int
@@ -141,7 +141,7 @@ class Monitor:
             try:
                 while not self._over.is_set() and self._show_next():
                     self._over.wait(INTERVAL_S)
-            except BaseException as error:  # it is the watcher's, and no reason to end a run
+            except BaseException as error:  # an error of the callback is no reason to end a run
                 self.failed = True
                 _log.warning("the monitor ends: its callback raised %s", type(error).__name__, exc_info=error)
 
@@ -149,7 +149,7 @@ class Monitor:
         """Show the newest block; False after the last one."""
         try:
             block = self._reader.next()
-        except Exception:  # of the source; others tell it
+        except Exception:  # of the source; the counting thread reports it
             return False
         if block is None:
             return False

@@ -108,7 +108,9 @@ class Pipeline:
         return self._source.join(JOIN_S)
 
     def error(self) -> BaseException | None:
-        """The error that ended the pipeline too early, once it is drained; waits until the recording is written."""
+        """The error that ended the drained pipeline too early, or None; waits until the recording is written.
+
+        If that takes longer than DRAIN_S, it is a RecordingError."""
         recorder = self._recorder
         if recorder is not None and not recorder.thread.join(DRAIN_S):
             return RecordingError(

@@ -19,7 +19,7 @@ from rig.scan.run import OutFolder, Run, RunResult, verdict_of
 def reconstruct_cube(
     cube: Cube, calibration: CalibrationUse, estimate: EstimateConfig, out: OutFolder, progress: Progress | None = None
 ) -> RunResult:
-    """Make all maps of a checked cube. Missing frames are noted as gaps of their maps.
+    """Make all maps of a checked cube. Missing frames are noted as gaps. Raises UsageError if `out` cannot be written.
 
     An interrupt ends the run after its last complete map, with verdict 'aborted'.
     """

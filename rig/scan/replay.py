@@ -1,4 +1,4 @@
-"""Plays a recording: opens its devices, scans, and compares what drivers sent with what they sent in the recording."""
+"""Plays a recording: opens its devices, scans, and compares what drivers sent with what was sent when it was taken."""
 
 import logging
 import tempfile
@@ -32,11 +32,12 @@ Steps = Callable[[Pace], None]
 def play(
     config: RigConfig, recording: Path, run: Run, request: RunRequest, listeners: Listeners, steps: Steps | None
 ) -> RunResult:
-    """Play a recording with the rig of `replay_config`; `run` takes the maps.
+    """Play a recording with the rig of `replay_config`; `run` takes the maps. steps: called with the replay's pace
+    before its first frame.
 
-    If drivers take part and the recording has control traffic, the two are compared once the rig is closed, even if it
-    failed; but not if the recorded scan was to make other sweeps. Raises DivergedError if they differ; what the run
-    wrote is kept.
+    If drivers take part and the recording has control traffic, what they sent is compared with it once the rig is
+    closed, also after a failure, but not if the recorded scan was to make another number of sweeps. Raises
+    DivergedError if the two differ; what the run wrote is kept.
     """
     drivers = [slot for slot in RECORDED if getattr(config, slot).real_time]
     compared = bool(drivers) and (recording / CONTROL_FILE).exists()
@@ -89,7 +90,7 @@ def _check(recording: Path, tap: TapFile, drivers: Sequence[str], tolerance_s: f
 
 
 def _require_no_difference(recording: Path, tap: TapFile, drivers: Sequence[str], error: Exception) -> None:
-    """Raise DivergedError where a run that failed had said something else; what it did not come to say is ignored."""
+    """Raise DivergedError if a run that failed had sent other bytes; what it did not come to send is ignored."""
     problems = [one for one in _check(recording, tap, drivers, None).problems if "byte" in one]
     if problems:
         raise _diverged((*problems, str(error)), None) from error

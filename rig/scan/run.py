@@ -106,7 +106,8 @@ class Run:
           each start of the SPAD.
         write_inputs: writes the files that have to lie beside the frames.
         space: room that all of it will take.
-        Raises UsageError if the disk has less room, RecordingError if the recording cannot be written.
+        Raises UsageError if the disk has less room or files beside the frames cannot be written, RecordingError if the
+        recording itself cannot be.
         """
         folder = self._folder
         assert folder is not None, "its space was looked at"
@@ -151,7 +152,8 @@ class Run:
                 self._folder.discard()
 
     def add(self, result: MapResult, compute_s: float, truth: SweepTruth | None = None) -> None:
-        """Take the next map. If anything interrupts this, the map counts either completely or not at all."""
+        """Take the next map; whatever interrupts this, it counts completely or not at all. Raises UsageError if it
+        cannot be written."""
         index = self.tally.maps
         before = self._last
         try:

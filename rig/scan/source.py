@@ -18,8 +18,8 @@ class Source:
     """The thread that fills the ring.
 
     on_end: called on that thread when it ends, for whatever reason.
-    on_frame: called on that thread with the number of the last frame whenever there are new ones; if it raises, the
-    source ends. Errors of the SPAD are passed to the readers, after the blocks that came before.
+    on_frame: called on that thread after each `fill` with the number of the last frame published or dropped; if it
+    raises, the source ends. Its errors and the SPAD's are passed to the readers, after the blocks that came before.
     """
 
     def __init__(
@@ -40,7 +40,7 @@ class Source:
         self.thread = StageThread(self._run, "spad source")
         self._busy_s = 0.0
         self.silences: list[DeviceTimeout] = []
-        """The SPAD's own messages, one for each time that it had nothing for half of `silence_s`."""
+        """The SPAD's own messages, one for each time that it had nothing for half of `silence_s` and the ring room."""
 
     @property
     def name(self) -> str:
@@ -61,7 +61,7 @@ class Source:
         self._ring.end_waits()
 
     def join(self, timeout_s: float) -> bool:
-        """Wait for the thread; False if it does not end in time. Readers get no more blocks in either case."""
+        """Wait for the thread; False if it does not end in time. Readers get only what is left, in either case."""
         ended = self.thread.join(timeout_s)
         self._ring.finish()
         return ended
@@ -77,7 +77,7 @@ class Source:
         self._on_end()
 
     def _fill(self) -> bool:
-        """Whether more may come."""
+        """Let the SPAD fill the ring once; whether more may come."""
         begun = time.perf_counter()
         try:
             more = self._spad.fill(self._ring, self._silence_s / 2)
@@ -93,7 +93,8 @@ class Source:
 
 
 def blocks(reader: RingReader, source: Source, silence_s: float) -> Iterator[FrameBlock]:
-    """The blocks of the run. Raises DeviceTimeout, in the SPAD's own words, if it is silent while the ring is empty."""
+    """Yield the blocks of the run. Raises the source's error after them, and DeviceTimeout if none comes: in the SPAD's
+    own words if it is silent while the ring is empty, in the ring's after HANG_S."""
     while True:
         heard = len(source.silences)
         waited_s = 0.0
