@@ -1,7 +1,7 @@
 """Reading .npy and .npz files from any source. The size of an array that a header states is not trusted.
 
-numpy allocates an array as large as its header says before it reads the first number. Here the header must first agree
-with the number of bytes in the file.
+numpy allocates an array as large as its header says before it reads the first number. Here an array of that size must
+first fit into the file.
 """
 
 import math
