@@ -195,7 +195,7 @@ class SweepCounts:
     def at_pixels(self, pixels: NDArray[np.int64]) -> tuple[NDArray[np.int32], NDArray[np.int32]]:
         """Returns, for n pixels (row, x), the number of ones (columns, n) and of frames (columns, n) or (columns, 1).
 
-        Both are 0 where a column's window does not reach the pixel. One window for all columns must reach all.
+        Both are 0 where a column's window does not reach the pixel; one that all columns share must reach it.
         """
         total, rows, window = self.counts.shape
         ones = np.zeros((total, len(pixels)), np.int32)

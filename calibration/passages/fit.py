@@ -30,7 +30,7 @@ _NODES = tuple((x / 2, w / 2) for x, w in zip(*np.polynomial.legendre.leggauss(3
 _TRAVEL = tuple((x / 2, w / 2) for x, w in zip(*np.polynomial.legendre.leggauss(4), strict=True))
 LEAST_FLUX = 1e-7
 LEVEL_COUNTS = 0.5
-"""Least number of 1s of a level: one without a single 1 is half a count over all its frames, not 0."""
+"""Prior of a level, as a number of 1s: one without a single 1 is half a count over all its frames, not 0."""
 BEFORE, AFTER, AREA, CENTRE, SIGMA = range(5)
 
 
@@ -95,7 +95,7 @@ def _normal_integral(z: Array) -> Array:
 
 
 def score_of(ones: Array, frames: Array, flux: Array, slopes: Array, theta: Array) -> tuple[Array, Array]:
-    """Gradient (pixels, 5) of the log-likelihood and expected information (pixels, 5, 5), with LEVEL_COUNTS."""
+    """Gradient (pixels, 5) and expected information (pixels, 5, 5) of the log-likelihood with the levels' prior."""
     residual, weight = residual_of(ones, frames, flux)
     score = (slopes @ residual[:, :, None])[:, :, 0]
     information = (slopes * weight[:, None, :]) @ slopes.transpose(0, 2, 1)
@@ -157,7 +157,7 @@ class PassageFit:
 
     significance: of the line against levels alone, in standard deviations (the square root of twice the logarithm of
     the likelihood ratio). misfit: Pearson's chi squared, as standard deviations above its mean. likelihood: its
-    logarithm. settled: whether the counts tell the centre, as far as was looked.
+    logarithm. settled: whether the counts tell the centre.
     """
 
     centre: Array

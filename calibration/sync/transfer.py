@@ -81,7 +81,7 @@ def _told(fit: SyncFit) -> tuple[dict[str, float], Array]:
 def _slopes(
     base: RigModel, known: Array, names: tuple[str, ...], lags: int, change: Array, spread: Array
 ) -> tuple[Array, Reason | None]:
-    """The slopes A (others, lags) of the other parameters by the lags (the last names); the reason if it is unknown."""
+    """The slopes A (others, lags) of the other parameters by the lags (the last names); the reason if none is known."""
     n = len(names) - lags
     slopes = np.zeros((n, lags))
     velocities = base.provenance.get(SWEPT) or ()
