@@ -383,7 +383,7 @@ BLUR_PX = 1.0
 LEAST_SLOPE = 0.1
 """Relative change of the flux per pixel from which on it counts as an edge."""
 NOISE_TIMES = 4.0
-"""The same in medians of the picture's relative change, which is mostly noise; the larger one counts."""
+"""Multiple of the picture's median relative change, which is mostly noise, that an edge must exceed as well."""
 AWAY_PX = 2
 """Pixels kept clear of an edge."""
 
