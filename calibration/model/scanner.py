@@ -150,7 +150,7 @@ class PivotScanner:
         return np.asarray(np.where(planes[..., :1] < 0, -planes, planes))
 
     def turned(self, commands: ArrayLike) -> Array:
-        """As `planes`, with the sign of n(a), which is the sign that offset_m, cone_rad and bow_per_rad refer to."""
+        """Planes (..., 4) with the sign of n(a), the sign that offset_m, cone_rad and bow_per_rad refer to."""
         at = _inside(commands, self.command_range)
         angle = np.polynomial.polynomial.polyval(at, self.angle_rad)[..., None]
         normal = self.zero_normal * np.cos(angle) + np.cross(self.axis_direction, self.zero_normal) * np.sin(angle)
