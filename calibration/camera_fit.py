@@ -1,12 +1,13 @@
 """The camera from corners of a board at several poses: OpenCV's calibration, made robust and with an uncertainty.
 
-Three kinds of corners are left out and named: a view that does not fit the others (because the board moved or its
-corners are in another order), single corners that do not fit their view, and a view whose board is seen from behind,
-which is a mirror image. The fit to the others is that of cv2.calibrateCamera. The covariance is s^2 (J^T J)^-1 with the
-poses free and s^2 the residuals' variance, so it counts errors of the lens model as noise.
+Left out are the corners of a view that does not fit the others (because the board moved or its corners are in another
+order), single corners that do not fit their view, and the corners of a board seen from behind, which is a mirror image.
+Views that lose more than one corner are named. The fit to the others is that of cv2.calibrateCamera. The covariance is
+s^2 (J^T J)^-1 with the poses free and s^2 the residuals' variance, so it counts errors of the lens model as noise.
 
 The normal equations, with free poses, decide whether the corners determine a camera: by their condition number and by
-the sd of the focal length. The angles between the boards only decide how a refusal is worded.
+the sd of the focal length. The angles between the boards only decide how a refusal is worded, and whether all
+views show one pose.
 """
 
 from collections.abc import Sequence
@@ -211,7 +212,7 @@ class CameraProblem:
                 points = self.points_m(i)[mask]
                 _, slopes = cv2.projectPoints(points, pose.rotation, pose.position_m, solution.matrix, given)
                 camera_part = slopes[:, _POSE : _POSE + 4 + terms]
-                # What a change of the camera does that no change of the pose undoes (Schur complement by QR).
+                # The effect of a change of the camera that no change of the pose undoes (Schur complement by QR).
                 basis, _ = np.linalg.qr(slopes[:, :_POSE])
                 rest = camera_part - basis @ (basis.T @ camera_part)
                 total += rest.T @ rest
@@ -259,7 +260,7 @@ _MAX_ROUNDS = 20
 
 @dataclass(frozen=True, slots=True, eq=False)
 class CameraFit:
-    """A camera and the data it was fitted to. Sequences run over the views with corners, whose names are in `views`.
+    """A camera and the data it was fitted to. Sequences run over the views with enough corners, which `views` names.
 
     residual_px: (n, 2) float64, projected minus seen, of every corner. used: (n,) bool, corners in the fit. rms_px: rms
     distance of those. outliers: names of the views that do not fit, entirely or in more than one corner. condition:
@@ -303,7 +304,7 @@ def fit_camera(views: Sequence[View], board: Board, size: tuple[int, int], *, di
     """The camera for pictures of `size` (width, height), from the corners in `views`.
 
     distortion_terms: 0, 4, 5, 8, 12 or 14, as in OpenCV. Corners that do not fit are left out. Raises Degenerate with
-    no-board, mirrored, one-pose, coplanar or too-few-poses; the message gives the condition number.
+    no-board, mirrored, one-pose, coplanar or too-few-poses; the last three give the condition number.
     """
     every = [(view.name, view.corners) for view in views if view.corners is not None]
     seen = [one for one in every if len(one[1].ids) >= _FEWEST_CORNERS and one[1].across_px >= LEAST_ACROSS_PX]

@@ -43,7 +43,7 @@ class BoardCells:
 
 
 def cells_of(model: RigModel, view: View, board: Board) -> BoardCells:
-    """Means over the squares with enough passages in every sweep."""
+    """Means over the squares with enough passages in every sweep. Raises Degenerate if there are too few."""
     if not view.passages:
         raise Degenerate("no-board", f"view {view.name} has no passages of the line; scan the board with the laser on")
     shape = (board.squares[1], board.squares[0])
@@ -134,14 +134,14 @@ def off_plane(xy: Array) -> Array:
 
 
 _PARALLEL = 1e-6
-"""Sine of the angle between boards that are not tilted towards each other in any direction."""
+"""Sine of the angle up to which two boards count as parallel: neither is tilted towards the other."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class CheckedBoard:
     """The result of the scan of one board; lengths in metres.
 
-    distance_m: depth of its middle. flatness_rms_m, flatness_peak_m: deviations of its squares' means from their plane;
+    distance_m: its mean depth. flatness_rms_m, flatness_peak_m: deviations of its squares' means from their plane;
     expected_m: the rms expected from covariance and noise. chi2, freedom: of the deviations. scale: scanned size over
     stated size; scale_sd: its expected sd. cells_m: (squares down, across) deviations, NaN where a square was not
     scanned.
@@ -170,7 +170,7 @@ class CheckedAngle:
 
 
 def check_angle(model: RigModel, first: View, second: View, board: Board) -> CheckedAngle:
-    """The angle between the boards of two views, 0 to pi/2."""
+    """The angle between the boards of two views, 0 to pi/2. Raises Degenerate as `check_board` does."""
     both = [(cells_of(model, view, board), view) for view in (first, second)]
 
     def measure(tried: RigModel) -> Array:
@@ -183,7 +183,7 @@ def check_angle(model: RigModel, first: View, second: View, board: Board) -> Che
 
 
 def _tilt_noise(model: RigModel, cells: BoardCells, other: BoardCells) -> float:
-    """Variance (rad^2) by the noise of a board's scan of how far it is tilted towards another one."""
+    """Variance (rad^2) of a board's tilt towards another one, from the noise of the scan of the former."""
     points = _points_of(model, cells)
     normal, _ = _plane(points)
     towards = _plane(_points_of(model, other))[0]
@@ -197,7 +197,7 @@ def _tilt_noise(model: RigModel, cells: BoardCells, other: BoardCells) -> float:
 
 
 def check_board(model: RigModel, view: View, board: Board) -> CheckedBoard:
-    """Check a view's board. Raises Degenerate if the board or its passages are missing."""
+    """Check a view's board. Raises Degenerate if too few of its corners or squares were found."""
     cells = cells_of(model, view, board)
     points = _points_of(model, cells)
     corners = view.corners

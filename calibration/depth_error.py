@@ -59,7 +59,7 @@ def _changed(model: RigModel, name: str, step: float) -> tuple[float, RigModel]:
 GROUPS: Final = {"baseline": "the baseline", "camera": "the camera", "angle": "the mirror's angle", "lag": "the lag"}
 """Groups of parameters, each with the words for it."""
 _GRID = 48
-"""Pixels looked at along the longer side of a map."""
+"""Least number of pixels looked at along the longer side of a map; all if it has fewer."""
 _SEARCH_STEPS = 60
 _FOUND_M = 1e-9
 """A mirror command is found when its sheet passes the point within this: a thousandth of any calibration's error."""
@@ -109,8 +109,8 @@ class DepthUncertainty:
 def depth_uncertainty(model: RigModel, depth_m: float, velocity_per_s: float | None = None) -> DepthUncertainty:
     """The uncertainty at a given depth over the picture.
 
-    velocity_per_s: signed velocity of the command, which multiplies the lag. None: the fastest rise at which the lag
-    was measured, or 0 if it was not. Raises CalibrationError for a model without covariance.
+    velocity_per_s: signed velocity of the command, which multiplies the lag. None: the fastest rise for which the lag
+    holds, or 0 if it was not measured. Raises CalibrationError for a model without covariance.
     """
     covariance = _covariance(model)
     if velocity_per_s is None:
@@ -271,10 +271,10 @@ _TRUTH_GRID = 32
 
 @dataclass(frozen=True, slots=True)
 class DepthErrors:
-    """Errors over the pixels that the true rig lights at one depth, NaN without any.
+    """Errors over the pixels that the true rig lights at one depth; NaN if there are none.
 
     median_m, worst_m: of the absolute errors. ratio: root mean square in units of the predicted sd; 1 on average if the
-    covariance is right.
+    covariance is right, NaN also if the model has none.
     """
 
     depth_m: float

@@ -1,12 +1,12 @@
-"""The errors of this package, and numbers in messages and tables: with the digits that are known, without powers of
-ten.
+"""The errors of this package, and numbers in messages and tables: with a few digits and, except for condition numbers,
+without powers of ten.
 """
 
 import numpy as np
 
 
 class CalibrationError(ValueError):
-    """Raised for a rig model that cannot be used. One line names the thing, the value, the limit and the next step."""
+    """Raised for input that cannot be used. One line names the thing, the value, the limit and the next step."""
 
 
 class Degenerate(CalibrationError):  # noqa: N818, the input is, not the program
@@ -22,7 +22,7 @@ class Degenerate(CalibrationError):  # noqa: N818, the input is, not the program
 
 class FileError(CalibrationError):
     """Raised for a file that cannot be used. `problems` lists everything wrong with it, one line each; the message has
-    the first.
+    the first `MOST_TOLD`.
     """
 
     MOST_TOLD = 5

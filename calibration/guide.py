@@ -32,7 +32,7 @@ from calibration.rig_fit.solve import Weights, scaled_inverse, view_normal
 from calibration.views import FEWEST_CORNERS, BoardPose
 
 FILLS = (0.6, 0.45, 0.32, 0.22)
-"""Share of the picture's width or height, whichever it meets first, that the board fills: its distance, by name."""
+"""Share of the picture's width or height, whichever is reached first, that the board fills; sets its distance."""
 PLACES = {
     (0, 0): "in the middle of the picture",
     (-1, 0): "at the left border",
@@ -143,7 +143,7 @@ def sequence(choices: Sequence[Candidate], poses: int, seed: int = 0) -> tuple[C
 
 
 def rough_camera(size: tuple[int, int]) -> Camera:
-    """A camera for placing boards if none is known: 46 degrees across, no distortion."""
+    """A camera for placing boards if none is known: 45 degrees across, no distortion."""
     width, height = size
     focal = 1.2 * width
     matrix = np.array([[focal, 0, (width - 1) / 2], [0, focal, (height - 1) / 2], [0, 0, 1]])
@@ -256,7 +256,7 @@ class Forecast:
 
 
 def _next_velocities(fit: RigFit) -> tuple[float, ...]:
-    """The velocities of the next pose, which take turns: those whose turn is the longest ago."""
+    """The next pose's velocities: views take turns with a few sets of them, and the set shown longest ago is next."""
     shown = [tuple(sweep.direction * sweep.speed_per_s for sweep in view) for view in fit.sweeps if view]
     last = {velocities: turn for turn, velocities in enumerate(shown)}
     return min(last, key=last.__getitem__)

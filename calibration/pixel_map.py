@@ -6,8 +6,8 @@ sqrt((e^flux - 1) / N); a pixel that never fired is given the sd of half a count
 Hot pixels are defined by the information they lose. A one-bit frame has the Fisher information 1 / (e^(s + b) - 1)
 about a stripe's s photons (b: everything else that the pixel detects). The limit is the dark flux at which this falls
 to half of that of the surrounding pixels: b = ln(2 e^(s + b0) - 1) - s, with b0 their flux. A hot pixel must lie above
-the limit, and above what its neighbours' scatter explains. Fewer frames than `frames_for` cannot classify pixels near
-the limit.
+the limit, and farther above its neighbours than counting and scatter explain. Fewer frames than `frames_for` cannot
+classify pixels near the limit.
 
 A noisy pixel is one whose counts scatter over blocks of frames more than counting statistics allow, as when its rate
 jumps (random telegraph noise). Index of dispersion: sum (n - e)^2 / e over the blocks, with e in proportion to the
@@ -46,7 +46,7 @@ LEAST_COUNTS = 10.0
 """A pixel's mean counts in a block from which on chi-square describes their scatter; quieter ones are not judged."""
 LEAST_BLOCKS, MOST_BLOCKS = 8, 64
 _APART, _ROUNDS = 6.0, 8
-"""Standard deviations of a count, and one more, beyond which a pixel is not ordinary; times that is asked."""
+"""Multiple of a count's sd plus 1 that an ordinary pixel may lie above the usual; rounds in which this is asked."""
 _MANY, _MOST_COMMON = 100, 1.5
 """Scatter that so many pixels have in common is no fault of theirs, up to this factor in variance."""
 
@@ -83,7 +83,7 @@ class DarkTally:
         return kept
 
     def scatter(self) -> tuple[Array, NDArray[np.int64], Mask]:
-        """Index of dispersion (rows, width), its degrees of freedom, and where it can be judged."""
+        """Index of dispersion (rows, width), 0 where it cannot be judged; its degrees of freedom; where it can."""
         ordinary = self.ordinary()
         blocks = np.zeros(self.ones.shape, np.int64)
         counts, expected, squares = (np.zeros(self.ones.shape) for _ in range(3))
@@ -116,14 +116,14 @@ class DarkTally:
 SIGNAL = 0.1
 """Photons per pixel and exposure of the weakest stripes that are looked for: ten frames see one."""
 PRECISION = 0.02
-"""Relative sd of a rate at the limit: misplaces 0.6 % of the hot pixels where those above r are as r^-0.7."""
+"""Relative sd of a rate at the limit: misplaces 0.6 % of the hot pixels if the number above r goes with r^-0.7."""
 FALSE_ALARM = 1e-6
 """Probability that a pixel without fault is called noisy, or dead: a quarter of one in 512 x 512."""
 DEAD_SHARE = 0.1
 """Share of its neighbours' light below which a pixel is dead."""
 _HOT_SIGMA = 6.0
 _JUMP_SIGMA = 3.0
-"""A noisy pixel is a defect where its rate goes beyond the limit by so many sd."""
+"""A noisy pixel is a defect if its rate plus so many sd of its jumps exceeds the limit."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -263,7 +263,7 @@ def _is_hot(flux: Array, frames: NDArray[np.int64], level: Array, limit: Array) 
 
 
 def _around(flux: Array) -> Array:
-    """Median of the 5 x 5 pixels around each; of all pixels where there are no data."""
+    """Median of the 5 x 5 pixels around each; those without data count as the median of all."""
     seen = np.isfinite(flux)
     overall = float(np.median(flux[seen])) if seen.any() else 0.0
     return np.asarray(cv2.medianBlur(np.where(seen, flux, overall).astype(np.float32), 5), np.float64)
@@ -291,10 +291,11 @@ _LEAST_HOT = 10
 class PixelDrift:
     """The change from an older map to a newer one.
 
-    became_hot, became_dead, recovered: (n, 2) row and column; hot ones only if the change is more than chance. ratio:
-    of the ordinary pixels' rates, newer to older; ratio_sigma: its distance from 1 in sd. changed: share of the pixels
-    whose rates differ by more than chance after this factor is removed. correlation: of the logarithms of the rates,
-    NaN if either map has none. alike: share of the old hot pixels that are still hot, None if too few. new_defects:
+    became_hot, became_dead, recovered: (n, 2) row and column; hot and recovered ones only if the change is more than
+    chance, dead ones only if both maps tell. ratio: of the ordinary pixels' rates, newer to older; ratio_sigma: its
+    distance from 1 in sd. changed: share of the pixels whose rates differ by more than chance after this factor is
+    removed. correlation: of the logarithms of the rates, NaN if fewer than two pixels have both or all
+    are equal. alike: share of the old hot pixels that are still hot, None if too few. new_defects:
     share of all pixels that became hot or dead.
     """
 
@@ -398,7 +399,7 @@ class PixelVersion:
 
     @property
     def id(self) -> str:
-        """Sixteen hexadecimal digits that change with the date and with any number of the map."""
+        """Sixteen hexadecimal digits that change with date, version, parent, sensor and any array but `dead`."""
         digest = hashlib.sha256(f"{self.created} {self.version} {self.parent} {self.sensor}".encode())
         for name in _ARRAYS:
             digest.update(np.ascontiguousarray(getattr(self.pixels, name)).tobytes())

@@ -10,7 +10,7 @@ from calibration.errors import digits
 VerdictWord = Literal["passed", "failed"]
 """A verdict as files have it."""
 SIGMAS: Final = 4.0
-"""Standard deviations by which a baseline must differ from the stated one."""
+"""Standard deviations by which a result, such as the baseline, must differ from the stated one to count as wrong."""
 WORST_TIMES: Final = 4.0
 """The picture's worst places (95 %) may have this many times the error asked for."""
 
@@ -104,7 +104,8 @@ def unguided(verdict: Verdict) -> Verdict:
 def more_poses(shown: int, what: str, found: tuple[float, float], asked: float, said: Callable[[float], str]) -> Reason:
     """The reason if data are simply too few, with an estimate of how many poses would be enough.
 
-    found, asked: errors (median, 95 %) and the limit of the median; the text names the one that exceeds its limit more.
+    shown: number of poses so far. what: words for the error, with the verb. found, asked: errors (median, 95 %) and the
+    limit of the median; the text names the one that exceeds its limit more.
     said: turns an error into text.
     """
     over = [error / limit for error, limit in zip(found, (asked, WORST_TIMES * asked), strict=True)]

@@ -44,8 +44,8 @@ class Corners:
 
     @property
     def across_px(self) -> float:
-        """Root mean square distance of the corners from their best straight line. Without any such distance there is no
-        pose.
+        """Root mean square distance of the corners from their best straight line; 0 without corners or with one
+        that is not finite. Below LEAST_ACROSS_PX they give no pose.
         """
         if len(self.px) == 0 or not np.isfinite(self.px).all():
             return 0.0

@@ -57,14 +57,14 @@ BLACK, WHITE = 0.05, 0.85
 """Reflectance of a laser printer's black and of matt white paper, rounded."""
 MARGIN_SQUARES = 0.5
 PAPER_SQUARES = 0.8 * MARGIN_SQUARES
-"""White paper around the squares."""
+"""Width, in squares, of the margin around the squares, and of that part of it which is surely white paper."""
 BUNDLED_BOARD = Path(__file__).parents[2] / "config" / "board.yaml"
 """The board that the commands take when none is named."""
 
 _FEWEST_SQUARES = 3
 """Fewest squares along a side; fewer leave less than 2 x 2 inner corners."""
 _MOST_SQUARES = 100
-"""Most squares along a side; no dictionary of markers goes further."""
+"""Most squares along a side; 100 x 100 need more markers than any dictionary has."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -73,7 +73,8 @@ class Board:
     markers.
 
     dictionary: the name of an OpenCV dictionary, such as DICT_5X5_100. modules: (squares down, across, side, side),
-    True where a marker is black, its border included; squares without a marker are False. Raises CalibrationError for a
+    True where a marker is black, its border included; squares without a marker are False. side: modules along a marker,
+    0 for a chessboard. Raises CalibrationError for a
     board that cannot be printed.
     """
 
@@ -207,6 +208,6 @@ def _dictionary(name: str) -> cv2.aruco.Dictionary:
 
 
 def spread_rad(poses: Sequence[BoardPose]) -> float:
-    """The largest angle between the normals of two boards."""
+    """The largest angle (rad) between the normals of any two of the boards; there must be one at least."""
     normals = np.stack([pose.matrix[:, 2] for pose in poses])
     return float(np.arccos(np.clip(normals @ normals.T, -1, 1)).max())

@@ -32,12 +32,12 @@ _GOES_ON = 0.5
 """Least change across a line outside the grid, as a share of that in the grid, for another row to follow there. In
 OpenCV's 26 chessboard pictures a row that is there has 0.75 to 1.15 of it, one that is not 0.09 at most."""
 _LEAST_ALIKE = 0.8
-"""Share of the corners that are there; in noise it is half of them."""
+"""Least share of a grid's corners that must show the change; in noise half of them do."""
 _FEWEST = 2
-"""Corners along a side, and changes that tell of a row."""
+"""Fewest corners along a side, and fewest changes that tell of a row."""
 _OUTLIER_SQUARES = 0.4
 _MOST = 100
-"""Corners along a side: as many as a board may have."""
+"""Most corners along a side: a board may have as many squares."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -99,7 +99,7 @@ class _Seen:
 
 
 def _cut_down(picture: Picture, px: Array) -> Array | None:
-    """The grid without outer rows that are not there."""
+    """The grid without outer rows that are not there; None if fewer than two rows or columns are left."""
     while min(px.shape[:2]) >= _FEWEST:
         sides = [_seen(picture, np.rot90(px, turn)) for turn in range(4)]
         own = [np.inf if side is None or not np.isfinite(side.own) else side.own for side in sides]
@@ -166,7 +166,7 @@ def _change(picture: Picture, board_map: BoardMap, x: NDArray[np.integer], y: ND
 
 
 def _row_above(picture: Picture, px: Array) -> Array | None:
-    """(across, 2) corners above the uppermost row; None if most of them are not found."""
+    """(across, 2) corners above the uppermost row, at their expected places where not found; None if most are not."""
     seen = _seen(picture, px)
     if seen is None:
         return None
@@ -177,7 +177,7 @@ def _row_above(picture: Picture, px: Array) -> Array | None:
     if taller is None:
         return None
     board = _board(across, down + 1)
-    # The drawing's top left square is black; that of the taller grid is where this one's is white.
+    # The drawing's top left square is black; that of the taller grid is black where this grid's is white.
     shown = picture if seen.usual < 0 else np.float32(picture.max()) - picture
     side = sides_px(board, taller, np.array([board.size_m]) / 2)[0]
     ids, found, _ = register(
@@ -203,7 +203,7 @@ def _board(across: int, down: int) -> Board:
 
 
 def _median(values: Array) -> float:
-    """NaN where fewer than half of them, or than two, are known."""
+    """The median of the known values; NaN if fewer than half of them, or fewer than two, are known."""
     known = values[np.isfinite(values)]
     return float(np.median(known)) if len(known) >= max(_FEWEST, len(values) / 2) else np.nan
 
@@ -216,7 +216,7 @@ _NOTHING = MatchedPoints(np.zeros((0, 2)), np.zeros((0, 2)), 0)
 
 
 def find_chessboard(shown: Gray, board: Board) -> MatchedPoints:
-    """The board's inner corners, beginning at its top left if that can be told; or a part of it, or another board."""
+    """The board's inner corners, from its top left if that can be told; or no points, but `part` or `other` if seen."""
     seen: Lattice | None = None
     for form in FORMS:
         lattice = _lattice(shown, _grid(shown, board, form))
@@ -244,7 +244,7 @@ def _as_grid(corners: ArrayLike, shape: tuple[int, ...], scale: int) -> Array:
 
 
 def _grid(shown: Gray, board: Board, form: tuple[int, float]) -> Array | None:
-    """A grid with as many corners as the board."""
+    """A grid with as many corners as the board; None if there is none."""
     flags = cv2.CALIB_CB_ADAPTIVE_THRESH | cv2.CALIB_CB_NORMALIZE_IMAGE | cv2.CALIB_CB_FAST_CHECK
     picture = as_form(shown, *form)
     found, corners = cv2.findChessboardCorners(picture, board.grid, flags=flags)
@@ -254,14 +254,14 @@ def _grid(shown: Gray, board: Board, form: tuple[int, float]) -> Array | None:
 
 
 def _part(shown: Gray, form: tuple[int, float], smallest: tuple[int, int]) -> Array | None:
-    """A grid of any number of corners."""
+    """A grid of any number of corners from `smallest` on; None if there is none."""
     flags = cv2.CALIB_CB_LARGER | cv2.CALIB_CB_EXHAUSTIVE
     found, corners, meta = cv2.findChessboardCornersSBWithMeta(as_form(shown, *form), smallest, flags)
     return _as_grid(corners, meta.shape[:2], form[0]) if found else None
 
 
 def _found(lattice: Lattice, shown: Gray, board: Board, form: tuple[int, float]) -> MatchedPoints:
-    """The board, whole; another one alike is looked for where it does not hide it."""
+    """The whole board, and whether the rest of the picture shows another one like it."""
     px = lattice.px if lattice.grid == board.grid else lattice.px.transpose(1, 0, 2)
     px, mirrored = _from_top_left(px, shown, board)
     points = board.corners_m[:, :2]

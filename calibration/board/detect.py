@@ -24,7 +24,7 @@ _REACHES = (1, 2, 4)
 
 
 def repaired(picture: NDArray[np.generic], defects: NDArray[np.bool_] | None = None) -> NDArray[np.float32]:
-    """The picture with defects (True = unusable) and non-finite values replaced by the median of their neighbours."""
+    """The picture with defects (True) and non-finite values replaced by the median of their neighbours, 0 if none."""
     values: NDArray[np.float32] = np.array(picture, dtype=np.float32)
     bad = ~np.isfinite(values)
     if defects is not None:
@@ -43,7 +43,7 @@ def repaired(picture: NDArray[np.generic], defects: NDArray[np.bool_] | None = N
 
 
 LEAST_SHARE = 0.5
-"""Share of the board's corners that a view must show more than; others are refused."""
+"""A view must show more than this share of the board's corners."""
 _SECOND_BOARD_MARKERS = 4
 """Markers that lie on a board of their own and are too many for misreadings."""
 _MAP_OUTLIER_SQUARES = 0.4
@@ -51,7 +51,7 @@ _MAP_OUTLIER_SQUARES = 0.4
 _GROWTH_SQUARES = 1.6
 """Distance from the known part of a board to the next corners; beyond, a map through a few markers leads astray."""
 _OUTLIER_SDS = 6.0
-"""Sds that a corner may lie off the map, or as many pixels and squares as follow: a lens bends more than the map."""
+"""Sds that a corner may lie off the map, or the two lengths below if larger: a lens bends more than the map."""
 _LEAST_OUTLIER_PX = 0.3
 _MOST_USUAL_SDS = 4.0
 """Largest ratio of a corner's sd to that of its neighbours: beyond, the drawing was laid over something else."""

@@ -1,6 +1,7 @@
-"""Checks that markers stand as a board's file says. Their places on the lattice of squares are found without their ids.
+"""Finds markers, and checks that they stand as a board's file says.
 
-A marker's own outline tells where the neighbouring squares are. Going from one marker to the next gives all markers of
+Their places on the lattice of squares are found without their ids. A marker's own outline tells where the neighbouring
+squares are. Going from one marker to the next gives all markers of
 a print whole-number places (column, row). A layout gives each id its place. If a layout other than the stated one fits
 clearly more of the markers, the print is another board. Ids run row by row over the white squares, starting from 0
 unless chosen otherwise; OpenCV before 4.6 began boards of an even number of rows with a white square.
@@ -19,7 +20,7 @@ from calibration.board.board import Board
 Places = NDArray[np.int64]
 
 _NEXT_SQUARES = 2.5
-"""Distance from a placed marker to the next while they are few, twice that then; markers are 1.4 squares apart."""
+"""Farthest from a placed marker to the next while few are placed, later twice that; they are 1.4 squares apart."""
 _OFF_SQUARES = 0.3
 """Farther from the middle of a square, a marker is none of this lattice."""
 _MOST_TURN_RAD = 0.6
@@ -34,7 +35,7 @@ _EDGE_SQUARES = 0.2
 _WHITE_PERCENT = 90
 """Percentile of the pixels among markers that counts as white; half of these pixels are white."""
 _FEWEST = 6
-"""Markers of which a share can be asked."""
+"""Fewest markers of which a share tells anything."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -164,7 +165,7 @@ def _grown(px: Array, start: int, marker_squares: float) -> tuple[NDArray[np.boo
 
 
 def _map_to_lattice(places: Places, px: Array, marker_squares: float) -> Array | None:
-    """(3, 3) from pixels to squares, (0, 0) the middle of the first; of few markers affine, whose errors grow less."""
+    """(3, 3) from pixels to squares, (0, 0) the middle of the first; affine for few markers: its errors grow less."""
     corners = np.array([[-1, -1], [1, -1], [1, 1], [-1, 1]]) * (marker_squares / 2)
     lattice, seen = (places[:, None] + corners).reshape(-1, 2), px.reshape(-1, 2)
     if len(places) < _FOR_HOMOGRAPHY:
@@ -223,9 +224,10 @@ _DARKEST, _BRIGHTEST = 0.5, 99.5
 class MatchedPoints:
     """Points of the board (n, 2) in metres and their places in the picture, (n, 2) raw pixels, to about half a pixel.
 
-    count: number of markers or corners read. chessboards: number of chessboards in the picture. part: corners along (x,
-    y) of what may be a part of the chessboard. other: how the visible chessboard differs from the board. markers: all
-    that were read, the board's and others.
+    count: number of markers or corners read. mirrored: whether only the picture's mirror image shows the board.
+    chessboards: number of chessboards in the picture. part: corners along (x, y) of what may be a part of
+    the chessboard. other: how the visible chessboard differs from the board. markers: all that were read, the board's
+    and others.
     """
 
     points_m: Array

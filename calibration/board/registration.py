@@ -57,7 +57,7 @@ class Drawing:
         fine = int(np.clip(np.nan_to_num(px_per_square), least, min(most, (_MOST_PX / squares) ** 0.5)))
         pad = round(MARGIN_SQUARES * fine)
         white = np.zeros((down, across, side + 2, side + 2), np.float32)
-        white[np.add.outer(np.arange(down), np.arange(across)) % 2 == 1] = 1  # quiet zone of the markers and all
+        white[np.add.outer(np.arange(down), np.arange(across)) % 2 == 1] = 1  # quiet zone of the markers too
         white[:, :, 1:-1, 1:-1] -= modules
         share = 0.0 if board.marker_m is None else board.marker_m / board.square_m
         edges = np.concatenate([[0.0], 0.5 + share * (np.arange(side + 1) / max(side, 1) - 0.5), [1.0]])
@@ -71,7 +71,7 @@ class Drawing:
 
 
 _BENDS = ((30, 3), (12, 2))
-"""(least number of points, degree of the polynomial): three points to a term at least."""
+"""(least number of points, degree of the polynomial): two points to a term at least."""
 _FEWEST_POINTS = 4
 _KEPT_SHARES = (0.8, 0.8, 1.0)
 """Shares of the points, the closest ones, that the polynomial is fitted to in turn: one far off must not bend it."""
@@ -107,8 +107,9 @@ class BoardMap:
 def fit_map(
     points_m: Array, px: Array, outlier_px: float, size_m: tuple[float, float]
 ) -> tuple[BoardMap, NDArray[np.bool_]] | None:
-    """The map through points (n, 2) seen at px (n, 2), and which of them it fits within outlier_px; None if no four
-    agree.
+    """The map through points (n, 2) seen at px (n, 2), and which of them it fits; None if no four agree.
+
+    outlier_px: most distance from the homography. With a polynomial, points within five times the usual distance fit.
     """
     if len(points_m) < _FEWEST_POINTS:
         return None
@@ -151,15 +152,15 @@ def _terms(at: Array, degree: int) -> Array:
 
 
 SUBPIXELS = 12
-"""Drawn per pixel and axis before they are averaged over the pixel's area; even. Drawings are as fine, within their
-limits (`drawing`): of squares wider than 21 pixels they are coarser, and interpolated.
+"""Samples drawn per pixel and axis before they are averaged over the pixel's area; even. A drawing is as fine, within
+_PX_PER_SQUARE: of squares wider than 21 pixels it is coarser, and interpolated.
 
-With 6 corners are off by 0.0020 px without noise, alike enough in all pictures to move focal lengths by 60 ppm; with 12
+Corners are off with 6 by 0.0020 px without noise, alike enough in all pictures to move focal lengths by 60 ppm; with 12
 by 0.0012 px, most of it the pictures' own drawing, and 30 ppm.
 """
 WIDE, OWN = 0.9, 0.5
-"""Distance, in squares, around a corner that is looked at: short of the next ones, to find it; halfway to them, so that
-no two corners share pixels and their errors, which a fit takes to be independent, are."""
+"""Reach of the patch around a corner, in squares. WIDE, to find it: short of the next corners. OWN: halfway to them, so
+that no two corners share pixels, and their errors are as independent as a fit takes them to be."""
 _MOST_REACH_PX = 16
 _LEAST_REACH_PX = 4
 _SEARCH_SQUARES = 0.25
@@ -167,7 +168,7 @@ _SEARCH_SQUARES = 0.25
 _POWERS = [(i, j) for i in range(4) for j in range(4 - i)]
 """Powers of x and y that place the drawing around a corner: a tilt and a lens bend no more over two squares."""
 _AROUND = np.stack(np.meshgrid(*2 * [np.linspace(-1.25, 1.25, 7)]), axis=-1).reshape(-1, 2)
-"""Points, in reaches, through which that polynomial goes; the patch and what a pixel more on every side needs."""
+"""Points, in units of the reach, that the polynomial is fitted to: over the patch and a pixel more on every side."""
 _STEPS = 4
 _SETTLED_SDS = 0.1
 """A step this small ends the iteration: what is left is a tenth of it."""
@@ -201,9 +202,9 @@ def register(
     reach: float,
     search: bool,
 ) -> tuple[NDArray[np.int32], Array, Array]:
-    """Fit the corners `ids` near where the map puts them; returns their ids, px (n, 2) and sd_px (n,).
+    """Fit the corners `ids` near where the map puts them; return ids, px (n, 2) and sd_px (n,) of those found.
 
-    search: whether to search in whole pixels first.
+    reach: half width of the patches, in squares. search: whether to search in whole pixels first.
     """
     places = _places(drawing, board_map, ids, reach)
     found = [_register_one(picture, drawing, place, search) for place in places]

@@ -3,8 +3,8 @@ views.
 
 Nothing moved while the sweeps of a view were taken. So their residuals, binned over the mirror's command, may differ
 only by noise and by one constant for each direction (the remaining error of the lag). All other differences are waves
-of single sweeps, a sign that exposures are not locked to the mirror. In a view with a single sweep they are measured
-against the sweep's own straight line. Medians in bins keep bad passages out.
+of single sweeps, a sign that exposures are not locked to the mirror. If no view has two sweeps, they are measured
+against each sweep's own straight line. Medians in bins keep bad passages out.
 
 A fit of everything may move a board by a millimetre to fit the light. So each pose is taken from the corners alone,
 with camera and mirror as fitted. The passages are then off the light by what the views disagree on: only the noise of
@@ -32,7 +32,7 @@ BINS = 24
 """Bins of the command range: wide enough for tens of passages each, narrow enough for a wave of several turns."""
 _FEWEST_IN_BIN = 5
 _LEAST_SHARE_IN_BIN = 0.25
-"""Share of a sweep's usual bin contents that a bin must hold: of a few, noise has chosen those that are in it."""
+"""Share of a sweep's usual bin contents that a bin must hold: noise has chosen the members of a nearly empty one."""
 _FEWEST_BINS = 4
 _MEDIAN_VARIANCE = np.pi / 2
 """Variance of a median in units of the mean's, normal distribution."""
@@ -112,7 +112,7 @@ def _between(left: Array, variance: Array, views: Sequence[Sequence[int]]) -> tu
 
 
 def _off_lines(left: Array, variance: Array) -> tuple[float, float]:
-    """Mean square of single sweeps off their straight lines, NaN where none is long enough; and its sd, as above."""
+    """Mean square of single sweeps off their straight lines, NaN if none is long enough; sd as in `_between`."""
     found = weight = chance = 0.0
     bins = np.arange(BINS)
     for values, noise in zip(left, variance, strict=True):
@@ -193,7 +193,7 @@ def last_before_move(shifts: tuple[ViewShift, ...]) -> str | None:
 
 
 def _corner_pose(fit: RigFit, view: View, start: BoardPose) -> tuple[BoardPose, Array] | None:
-    """Pose by the corners alone, which count as they do in the fit, and its covariance (6, 6)."""
+    """Pose by the corners alone, which count as they do in the fit, and its covariance (6, 6); None if they are few."""
     if view.corners is None:
         return None
     px = np.asarray(view.corners.px, np.float64)

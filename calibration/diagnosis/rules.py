@@ -8,14 +8,14 @@ agree with each other and with what is known of the rig. The first reason is the
 
 1. Conditions that make other faults appear: room light that hides the line, boards too far away to be located.
 2. Data that no single rig can have produced (waves, a rig that moved), since nothing else can be believed then.
-3. A baseline that differs from the stated one: the whole scene is then too large or too small.
+3. A baseline that differs from the stated one: the whole scene is then too large or too small. If the predicted error
+is too large, this comes after 4, since a baseline is only as good as the fit it comes from.
 4. Too little data (room light, too few poses, no tilt, boards too far away, corners in only a part of the picture).
 This is a likely cause if the predicted error is too large. It also counts if the covariance is small enough, but only
 because of the model, and almost no data are left to check the model by.
 
 If the error is too large and the data have none of these faults, there are simply too few of them. Last come faults
-that
-the predicted error does not show: sweeps whose directions and speeds do not determine a lag for a direction of the
+that the predicted error does not show: sweeps whose directions and speeds do not determine a lag for a direction of the
 scan.
 """
 
@@ -331,7 +331,7 @@ _SEEN_AT_ONCE = ("no-board", "wrong-board", "board-half-out", "mirrored", "two-b
 
 
 def _contradictions(fit: FitEvidence, asked: AccuracyGoal, imprecise: bool) -> list[Reason]:
-    """Reasons that no one rig can have made. If the misfit alone makes it imprecise, less than what is asked is one."""
+    """Reasons why no single rig can have made the data. Limits are lower if only the misfit makes it imprecise."""
     limit = asked.accuracy_m
     grown = math.sqrt(max(fit.misfit, 1.0))
     if imprecise and fit.expected_m <= limit * grown and fit.worst_m <= WORST_TIMES * limit * grown:

@@ -1,7 +1,7 @@
 """Reading .npy and .npz files from any source. The size of an array that a header states is not trusted.
 
-numpy allocates an array as large as its header says before it reads the first number. Here the header must first agree
-with the number of bytes in the file.
+numpy allocates an array as large as its header says before it reads the first number. Here an array of that size must
+first fit into the file.
 """
 
 import math
@@ -22,8 +22,8 @@ _DEFLATE_RATIO: Final = 1032
 
 
 def load_numpy(file: str | os.PathLike[str], mmap_mode: Literal["r"] | None = None) -> Any:
-    """An array, or an archive of arrays; pickles are refused. Raises OSError, or ValueError or BadZipFile for other
-    files.
+    """An array, or an archive of arrays; pickles are refused. Raises OSError; ValueError or BadZipFile for other
+    files; for a few damaged ones zlib.error, TokenError, TypeError or NotImplementedError.
     """
     with Path(file).open("rb") as stream:
         is_archive = stream.read(4) == b"PK\x03\x04"

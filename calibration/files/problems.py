@@ -62,7 +62,7 @@ class ValueSources:
         return self.lines_of()
 
     def line(self, key: Key) -> int | None:
-        """Line of a key, or of the nearest section that contains it."""
+        """Line of a key, or of the nearest section that contains it; None if the file has neither."""
         return next((self.lines[key[:n]] for n in range(len(key), 0, -1) if key[:n] in self.lines), None)
 
     def flag(self, key: Key) -> str | None:
@@ -70,7 +70,7 @@ class ValueSources:
         return self.flags.get(key) if self._is_option(key) else None
 
     def place(self, key: Key) -> str:
-        """The beginning of a message: the option, or the file with the line."""
+        """The beginning of a message: 'option:', or the file, with the line if it has one."""
         if self._is_option(key):
             return "option:"
         line = self.line(key)
@@ -147,13 +147,13 @@ def validated(
             found.setdefault(_key(problem, content), []).append(problem)
     told = []
     for key, value, words in _no_numbers(schema, model, content, ()):
-        if all(problem["type"] in _BOUNDS for problem in found.get(key, [])):  # true is at most 1, and NaN nothing
+        if all(problem["type"] in _BOUNDS for problem in found.get(key, [])):  # true counts as 1 there, NaN as nothing
             found.pop(key, None)
             dotted, then = sources.flag(key) or ".".join(key), _then(key, schema, sources.flag(key))
             told.append((key, f"{dotted} is {_shown(value)}, it must be {words}{then}"))
     keys = [*found, *(key for key, _ in told)]
     for key, problems in found.items():
-        # Of a value of one of several shapes, the problems of the others say nothing where its own lie within it.
+        # If a value may have several shapes and has problems within it, it tells nothing that it has not another shape.
         shape = all(one["type"] == "literal_error" or one["type"].endswith("_type") for one in problems)
         if not (shape and any(len(other) > len(key) and other[: len(key)] == key for other in keys)):
             told.append((key, _text(problems, key, schema, sources.flag(key))))
@@ -184,7 +184,7 @@ def _no_numbers(
 
 
 def _leaves(value: Any, key: Key) -> Iterator[tuple[Key, Any]]:
-    """Mappings, and what is neither a mapping nor a list."""
+    """The values in nested lists and tuples, each with its key. A mapping counts as one value."""
     if isinstance(value, list | tuple):
         for i, item in enumerate(value):
             yield from _leaves(item, (*key, str(i)))
@@ -241,8 +241,8 @@ def _named(key: Key) -> Key:
 
 
 def _text(problems: list[ErrorDetails], key: Key, schema: _Schema, flag: str | None) -> str:
-    """flag: the option that the value was given with."""
-    # Of a value with several shapes, what a shape that fits says of it is worth more than that others do not fit.
+    """The message for the problems of one key. flag: the option that the value was given with."""
+    # If a value may have several shapes, an objection by the one that fits is worth more than that others do not fit.
     problem = next((one for one in problems if one["type"] == "value_error"), problems[0])
     dotted = flag or ".".join(key)
     kind, context = problem["type"], problem.get("ctx", {})

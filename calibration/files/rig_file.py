@@ -3,14 +3,14 @@ are YAML.
 
     format: spadrig-calibration
     version: 1
-    camera: {width, height, matrix: 3 x 3 in pixels, distortion: 4, 5, 8, 12 or 14 OpenCV terms}
+    camera: {width, height, matrix: 3 x 3 in pixels, distortion: 0, 4, 5, 8, 12 or 14 OpenCV terms}
     planes: planes.npy             # (columns, 4) nx ny nz d (metres), command = column index; a path, or the rows
 
 or, instead of `planes`, a scanner with commands of its own:
 
     scanner: {table: {command: [...], planes: rows or path}}
     scanner: {pivot: {axis_point_m, axis_direction, zero_normal, angle_rad: [a0, a1, ...], command_range: [-1, 1],
-                      offset_m: [b0, b1, ...], cone_rad, bow_per_rad}}        # the last three: none
+                      offset_m: [b0, b1, ...], cone_rad, bow_per_rad}}        # the last three are optional
 
 Optional: source_m, lag_s: {forward, backward}, speed_range_per_s: [low, high], row_delay_s, gate_delay_s,
 colour_skew_s, marker_rising, defects: a bool .npy, dark_rate: a float .npy, covariance: {names, file}, identity,
@@ -21,7 +21,7 @@ docs/reference/calibration-file.md explains everything. The file of a camera alo
     version: 1
     camera: {width, height, matrix, distortion}              # as above
     covariance: {names: [fx, fy, ...], matrix: [[...]]}      # the uncertainty of these parameters
-    views: [16 hexadecimal digits, ...]                      # the corners used: they must not count twice
+    views: [16 hexadecimal digits, ...]                      # digests of the views used: none may count twice
     verdict: passed or failed                                # left out if nobody judged it
     reasons: [too-few-poses, ...]                            # codes of why it failed
 """
@@ -140,7 +140,7 @@ def camera_content(camera: Camera) -> dict[str, Any]:
 CALIBRATION_FILE: Final = "calibration.yaml"
 """Name of a calibration file wherever the project writes one."""
 _PLAIN = {"row_delay_s": 0.0, "gate_delay_s": 0.0, "colour_skew_s": 0.0, "marker_rising": True}
-"""Values of a model that its file has under the same name, and what they are where it does not."""
+"""Fields that a model and its file have under the same name, and the values of those that the file leaves out."""
 
 
 def load_rig_model(path: str | os.PathLike[str]) -> RigModel:
@@ -157,7 +157,7 @@ def load_rig_model(path: str | os.PathLike[str]) -> RigModel:
 
 def save_rig_model(model: RigModel, path: str | os.PathLike[str]) -> None:
     """Write a model for `load_rig_model`, with its arrays in files beside it. Each file is written completely or not at
-    all. Raises OSError.
+    all. Raises OSError, and CalibrationError for a scanner that is neither a table nor a pivot.
     """
     file = Path(path)
     content: dict[str, Any] = {
@@ -190,7 +190,7 @@ def save_rig_model(model: RigModel, path: str | os.PathLike[str]) -> None:
 
 
 def _save_beside(file: Path, what: str, array: NDArray[Any]) -> str:
-    """Write an array to `FILE-what.npy` and say its name."""
+    """Write an array beside the file, as `STEM-what.npy`, and return its name."""
     beside = file.with_name(f"{file.stem}-{what}.npy")
     scratch = beside.with_name(f".{beside.name}.part")
     with scratch.open("wb") as stream:

@@ -31,7 +31,7 @@ class FileSection(BaseModel):
 
 
 class CameraSection(FileSection):
-    """The camera, in pixels."""
+    """The camera: size and matrix in pixels, and OpenCV's distortion terms."""
 
     width: int
     height: int
@@ -73,7 +73,7 @@ class ScannerSection(FileSection):
 
 
 class LagSection(FileSection):
-    """The lags of the mirror behind a rising and a falling command."""
+    """The lags, in seconds, of the mirror behind a rising and a falling command."""
 
     forward: Number = 0.0
     backward: Number = 0.0
@@ -142,9 +142,9 @@ MAX_DEPTH: Final = 64
 MAX_NODES: Final = 4_000_000
 """Most values that a file may write out."""
 MAX_REPEATED: Final = 100_000
-"""Most values that aliases may repeat: anchors that name one another multiply, nine lines become a billion values."""
+"""Most values that aliases may repeat: anchors that name one another turn nine lines into a billion values."""
 MAX_WHOLE: Final = 1 << 64
-"""Whole numbers are below: what counts, identifies or seeds has at most 64 bits."""
+"""Size below which whole numbers must be: counts, identifiers and seeds have at most 64 bits."""
 _MOST_SHOWN: Final = 40
 
 
@@ -162,8 +162,8 @@ class YamlFile:
 
 
 def load_yaml(file: Path, what: str, example: str, name: str | None = None) -> YamlFile:
-    """A file's keys and values. what: its kind for messages, such as 'a calibration'. Raises FileError, also if a key
-    is given twice.
+    """A file's keys and values. what: its kind for messages, such as 'a calibration'. example: an entry, for messages.
+    name: of the file in messages, by default its path. Raises FileError, also if a key is given twice.
     """
     name = str(file) if name is None else name
     try:
@@ -187,7 +187,7 @@ def parse_yaml(text: str, what: str, example: str, name: str) -> YamlFile:
         loader = _Loader(text)
         try:
             node = loader.get_single_node()
-            twice = [] if node is None else _twice(node)  # before merge keys are resolved, which may repeat
+            twice = [] if node is None else _twice(node)  # before merge keys are resolved, since those may repeat keys
             content = None if node is None else loader.construct_document(node)
         finally:
             loader.dispose()
@@ -215,7 +215,7 @@ class _Refused(yaml.YAMLError):
 
 
 class _Loader(getattr(yaml, "CSafeLoader", yaml.SafeLoader)):  # type: ignore[misc]
-    """Reports the line of a value that its tag or its form announces but that is invalid, such as 2024-13-45."""
+    """Reads YAML, and reports the line of a value that is not what its tag or form says, such as 2024-13-45."""
 
     def construct_object(self, node: yaml.Node, deep: bool = False) -> Any:
         """The value of a node."""
@@ -235,13 +235,13 @@ def _cut(node: yaml.Node) -> str:
 
 
 def _require_bounded(text: str) -> None:
-    """Raise a YAMLError where the text nests or repeats too much, before anything is made of it."""
+    """Raise a YAMLError if the text holds, nests or repeats too much, before values are made of it."""
     known: dict[str | None, tuple[int, int]] = {}  # of what is anchored: its values, and how deep they nest
     written = repeated = 0
     events = yaml.parse(text, Loader=_Loader)
 
     def measured(event: Any, opened: tuple[str | None, ...]) -> tuple[int, int]:
-        """The values of a node, and how deep they nest; opened: anchors of what it stands within."""
+        """The number of values in a node, and how deep they nest; opened: anchors of the nodes around it."""
         nonlocal written, repeated
         size, height = 1, int(isinstance(event, yaml.CollectionStartEvent))
         if isinstance(event, yaml.AliasEvent):
@@ -286,7 +286,7 @@ def _places(node: yaml.Node, path: Key) -> Iterator[tuple[Key, int]]:
 
 
 def _twice(node: yaml.Node) -> list[tuple[Key, int]]:
-    """The keys that were there before, with their lines; of what is below such a key nothing more is said."""
+    """The keys that are given again, with the lines of their repetitions; keys below such a one are left out."""
     seen: set[Key] = set()
     found: list[tuple[Key, int]] = []
     for key, line in _places(node, ()):

@@ -13,7 +13,7 @@ followed, with 14 terms, by the homography of a sensor tilted by (tau_x, tau_y).
 k5 k6 [s1 s2 s3 s4 [tau_x tau_y]]]].
 
 Beyond some radius the model folds back on itself. A tangent is valid if the Jacobian determinant stays positive on the
-whole segment from the optical axis to it. Only there is the inverse unique; everything else is NaN. If only k1 to k6
+whole segment from the optical axis to it. Only there is the inverse unique; other tangents give NaN. If only k1 to k6
 are used, the fold is a root of a polynomial in r2. Otherwise the segment is tested at several points, at least one of
 them in every ring where k1 to k6 alone fold.
 """
@@ -69,7 +69,8 @@ class LensModel:
     """Distortion with 4, 5, 8, 12 or 14 terms (none: an ideal lens), forward and inverse, vectorised."""
 
     def __init__(self, terms: Sequence[float] | Array) -> None:
-        """Take the terms in OpenCV's order; CalibrationError for a number of terms it does not define."""
+        """Take the terms in OpenCV's order. Raises CalibrationError for a number of terms that OpenCV does not define,
+        a term that is not finite, and a tilt of 90 degrees or more."""
         values = np.asarray(terms, dtype=np.float64).ravel()
         if values.size not in (0, *TERM_COUNTS):
             allowed = ", ".join(map(str, TERM_COUNTS))
@@ -130,7 +131,7 @@ class LensModel:
         return u, v
 
     def undistort_slope(self, u: Array, v: Array) -> tuple[Array, Array, Array, Array]:
-        """(du/dx, du/dy, dv/dx, dv/dy) of `undistort` at the undistorted tangents (u, v)."""
+        """(du/dx, du/dy, dv/dx, dv/dy) of `undistort` at undistorted tangents (u, v); NaN where folded."""
         with np.errstate(all="ignore"):
             at = self.forward(u, v)
             x, y, w = _homography(self._tilt, at.u, at.v)
@@ -145,7 +146,7 @@ class LensModel:
             return yv / det, -xv / det, -yu / det, xu / det
 
     def valid(self, u: Array, v: Array) -> NDArray[np.bool_]:
-        """True where the lens model does not fold anywhere between the optical axis and (u, v)."""
+        """True where the lens does not fold between the optical axis and (u, v), and (u, v) is below _MAX_TANGENT."""
         good: NDArray[np.bool_] = np.isfinite(u) & np.isfinite(v)
         if self._ideal:
             return good
@@ -247,7 +248,7 @@ class Camera:
 
     matrix: (3, 3) float64, [[fx, 0, cx], [0, fy, cy], [0, 0, 1]] in pixels.
     distortion: (0, 4, 5, 8, 12 or 14) float64, OpenCV order k1 k2 p1 p2 k3 k4 k5 k6 s1 s2 s3 s4 tau_x tau_y.
-    Raises CalibrationError for a size, matrix or number of terms that describes no camera.
+    Raises CalibrationError for a size, matrix or distortion that describes no camera.
     """
 
     width: int

@@ -12,7 +12,7 @@ the mirror's axis nearest to the camera.
 
 Ray r = (u, v, 1), plane n.X = d:  z = d / (n.r). Along an image row dz/dx = -(z^2 / d) (n . dr/dx), whose sign tells on
 which side of the stripe the near points lie. All arguments broadcast. NaN means 'no depth'; there are no infinities and
-no warnings. n.r cancels where ray and plane are nearly parallel: `NEARLY_PARALLEL` keeps at least 1e-9 of z.
+no warnings. n.r loses digits where ray and plane are nearly parallel: `NEARLY_PARALLEL` keeps z right to 1e-9.
 """
 
 from dataclasses import dataclass
@@ -26,14 +26,14 @@ from calibration.model.camera import Camera
 from calibration.model.scanner import PivotScanner, Scanner
 
 NEARLY_PARALLEL: Final = 1e-6
-"""Sine of the angle between ray and plane below which there is no depth: 1e-3 px, finer than any calibration."""
+"""Sine of the angle between ray and plane below which there is no depth: 1e-3 px at f = 1000 px."""
 LEAST_OFFSET_M: Final = 1e-6
 """Least distance of a plane from the camera: all points of one that passes closer are seen on one line."""
 
 
 def inverse_depth(u: ArrayLike, v: ArrayLike, planes: ArrayLike) -> Array:
-    """1/z (1/m) of rays (u, v) on planes (..., 4), |n| = 1. Negative behind the camera, 0 if parallel, NaN within
-    LEAST_OFFSET_M.
+    """1/z (1/m) of rays (u, v) on planes (..., 4), |n| = 1. Negative behind the camera, 0 if parallel, NaN for
+    planes within LEAST_OFFSET_M of the camera.
     """
     p = np.asarray(planes, np.float64)
     offset = p[..., 3]
@@ -43,7 +43,8 @@ def inverse_depth(u: ArrayLike, v: ArrayLike, planes: ArrayLike) -> Array:
 
 
 def depth(u: ArrayLike, v: ArrayLike, planes: ArrayLike) -> Array:
-    """Depth z (m) of rays (u, v) on planes (..., 4), |n| = 1; NaN where nearly parallel or behind the camera."""
+    """Depth z (m) of rays (u, v) on planes (..., 4), |n| = 1; NaN where it is not positive or nearly parallel, and for
+    planes within LEAST_OFFSET_M of the camera."""
     return _met(u, v, inverse_depth(u, v, planes), _along(u, v, planes))
 
 
@@ -73,7 +74,7 @@ def depth_slope(u: ArrayLike, v: ArrayLike, planes: ArrayLike, camera: Camera) -
 
 
 def near_side(u: ArrayLike, v: ArrayLike, planes: ArrayLike, camera: Camera) -> NDArray[np.int8]:
-    """Side of the stripe on which nearer points appear (the scanner's): -1 smaller x, +1 larger x, 0 undefined."""
+    """The side of the stripe, the scanner's, on which nearer points appear: -1 smaller x, +1 larger x, 0 undefined."""
     p = np.asarray(planes, np.float64)
     du, dv = camera.tangent_slopes(u, v)
     offset = np.where(np.abs(p[..., 3]) < LEAST_OFFSET_M, 0.0, p[..., 3])
@@ -110,7 +111,8 @@ class LightSheets:
         """1/z (1/m) of rays (u, v). For planes this is the module's `inverse_depth`; sheets follow the same rules.
 
         With w = 1/z, the ray r satisfies n.r - d w = tan(bow phi^2) hypot(p, q), with p and q taken from r - w O. This
-        is nearly linear in w, and regular for rays that never meet the sheet. Newton's method starts from the plane.
+        is nearly linear in w, and regular for rays that never meet the sheet. Newton's method starts from the plane. A
+        bowed sheet also gives NaN behind the fan's origin, and where the method does not converge.
         """
         w = inverse_depth(u, v, self.planes)
         if not self.bow_per_rad:
@@ -138,7 +140,7 @@ class LightSheets:
         return _met(u, v, w, self.planes[..., 3] * w)
 
     def _bowed(self, seen: Array) -> tuple[Array, Array, NDArray[np.bool_]]:
-        """The bow for X - O, or that over z: distance off the plane, slope by w, whether it lies ahead of the fan."""
+        """For X - O, or (X - O) / z: the bow's distance off the plane, its slope by w, whether X lies ahead of O."""
         p, q = np.sum(seen * self.middle, axis=-1), np.sum(seen * self.across, axis=-1)
         dp, dq = -(self.middle @ self.origin_m), -(self.across @ self.origin_m)
         reach = np.hypot(p, q)
@@ -167,8 +169,8 @@ def light_sheets(scanner: Scanner, source_m: ArrayLike | None, commands: ArrayLi
 
 
 def fan_origin(scanner: Scanner, source_m: ArrayLike | None) -> Array:
-    """The point (3,) from which the light spreads: the source, or the point of the mirror's axis nearest to the
-    camera."""
+    """The point (3,) from which the light spreads: the source; if unknown, the point of the mirror's axis nearest to
+    the camera, or for a table of planes the camera itself."""
     if source_m is not None:
         return np.asarray(source_m, np.float64)
     if not isinstance(scanner, PivotScanner):

@@ -85,7 +85,7 @@ def with_parameters(model: RigModel, names: Sequence[str], deltas: ArrayLike) ->
 
 
 def changed_camera(camera: Camera, change: dict[str, float]) -> Camera:
-    """The camera with its own part of the changes applied. These entries are removed from `change`."""
+    """The camera with its own part of the changes, which are removed from `change`. Raises CalibrationError."""
     matrix, distortion = camera.matrix.copy(), camera.distortion.copy()
     touched = False
     for name, at in MATRIX.items():
@@ -100,7 +100,7 @@ def changed_camera(camera: Camera, change: dict[str, float]) -> Camera:
 
 
 def _pivot(scanner: PivotScanner, change: dict[str, float]) -> PivotScanner:
-    """The scanner with its part of the change, which is taken out."""
+    """The scanner with its own part of the changes, which are removed from `change`."""
     first, axis = scanner.zero_normal, scanner.axis_direction
     second = np.cross(axis, first)
     turn_1, turn_2, shift_1, shift_2 = (change.pop(name, 0.0) for name in AXIS)
@@ -118,7 +118,7 @@ def _pivot(scanner: PivotScanner, change: dict[str, float]) -> PivotScanner:
 
 
 def _terms(terms: Array, stem: str, change: dict[str, float]) -> Array:
-    """Polynomial terms with those changes whose names begin with the stem, as many as are needed."""
+    """The terms with the changes named stem0, stem1, ... added, which are removed from `change`; longer if needed."""
     asked = {i: f"{stem}{i}" for i in range(MOST_TERMS) if f"{stem}{i}" in change}
     result: Array = np.zeros(max([terms.size, *(i + 1 for i in asked)]))
     result[: terms.size] = terms
@@ -142,9 +142,9 @@ def _rotation(vector: Array) -> Array:
 SWEPT: Final = "velocities_per_s"
 """Key in a model's provenance: the signed velocities of the sweeps that its planes were found from."""
 ALIKE_SPEEDS: Final = 0.02
-"""Relative difference up to which two speeds are one: they would tell a lag 50 times worse than their own places."""
+"""Relative difference up to which two speeds count as one: a lag from them errs 50 times as much as a passage."""
 SPEED_MARGIN: Final = 0.05
-"""Share beyond the speeds at which it was measured for which a lag is taken to hold."""
+"""Share by which a speed may lie outside those at which a lag was measured, with the lag still taken to hold."""
 
 
 def lag_groups(velocities_per_s: ArrayLike) -> tuple[tuple[str, ...], ...]:
@@ -165,7 +165,7 @@ def one_speed(velocities_per_s: ArrayLike) -> bool:
 
 
 def untold(velocities_per_s: Sequence[float]) -> Array:
-    """(n, 3): changes of (position, lag forward, lag backward) that no sweep shows, each with a lag of 1 s."""
+    """(n, 3): changes of (position, lag forward, lag backward) that no sweep shows, the larger lag 1 s in size."""
     velocity = np.asarray(velocities_per_s, np.float64)
     if velocity.size == 0:
         return np.zeros((0, 3))

@@ -25,7 +25,8 @@ class Covariance:
     """Covariance of parameters. names: (p,) as in `calibration.model.parameters`. matrix: (p, p) float64, in the
     parameters' units.
 
-    A parameter that is not named counts as exactly known. Raises CalibrationError for a matrix that is no covariance.
+    A parameter that is not named counts as exactly known. Raises CalibrationError for a matrix that is no
+    covariance, and for a name given twice.
     """
 
     names: tuple[str, ...]
@@ -52,7 +53,7 @@ class Covariance:
         set_frozen(self, names=names, matrix=0.5 * (matrix + matrix.T))
 
     def of(self, names: Sequence[str]) -> Array:
-        """The covariance of some of the parameters, in the given order."""
+        """The covariance of some of the parameters, in the given order. Raises ValueError for one that is not named."""
         at = [self.names.index(name) for name in names]
         return self.matrix[np.ix_(at, at)]
 
@@ -70,7 +71,7 @@ class Identity:
 
     rig: hash of the relevant part of the rig's config. name: the rig's name. created: date and time, ISO 8601. kinds,
     serials: of the devices by slot (spad, scanner, ...), if known. verdict, reasons: of the calibration and of its last
-    check; None if there was none.
+    check; None and () if there was none.
     """
 
     rig: str
@@ -94,7 +95,8 @@ class RigModel:
     gate's edge. colour_skew_s: time by which the scanner's gate output precedes its mirror. marker_rising: whether the
     rising edge of a scan marker counts, rather than the falling one.
     covariance: of the parameters that were estimated, see `parameters`. identity: None if nobody recorded it.
-    Raises CalibrationError for planes within 45 degrees of the search axis, since they give no position along the row.
+    Raises CalibrationError for a lag below 0, a time that is not finite, a map of another size than the camera's, and
+    planes within 45 degrees of the search axis, since they give no position along the row.
     """
 
     camera: Camera
@@ -139,11 +141,11 @@ class RigModel:
         return np.asarray(getattr(self.scanner, "command", np.linspace(*self.scanner.command_range, 33)))
 
     def planes(self, commands: ArrayLike) -> Array:
-        """Light planes (..., 4) = nx, ny, nz, d (metres) for mirror commands (...)."""
+        """Light planes (..., 4) = nx, ny, nz, d (metres) for mirror commands (...). Raises as `Scanner.planes`."""
         return self.scanner.planes(commands)
 
     def sheets(self, commands: ArrayLike) -> LightSheets:
-        """The light at mirror commands (...): `planes` and their bow."""
+        """The light at mirror commands (...): `planes` and their bow. Raises CalibrationError outside the range."""
         return light_sheets(self.scanner, self.source_m, commands)
 
     def mirror_command(self, commands: ArrayLike, y_px: ArrayLike, velocity_per_s: ArrayLike) -> Array:
@@ -166,7 +168,7 @@ class RigModel:
             )
 
     def check_speed(self, speed_per_s: float) -> None:
-        """Raise CalibrationError unless the lag was measured around this command speed."""
+        """Raise CalibrationError if the lag was measured, but not around this command speed."""
         if self.speed_range_per_s is None:
             return
         low, high = self.speed_range_per_s

@@ -40,7 +40,8 @@ class Scanner(Protocol):
 
 @dataclass(frozen=True, eq=False)
 class PlaneTable:
-    """Planes at increasing commands (n,), interpolated linearly: rows (n, 4) nx, ny, nz, d in metres, of any length."""
+    """Planes at increasing commands (n,), interpolated linearly. rows: (n, 4) nx, ny, nz, d in metres; they are scaled
+    to |n| = 1. Raises CalibrationError for numbers that are no such table."""
 
     command: Array
     rows: Array
@@ -96,6 +97,7 @@ class PivotScanner:
     first.
     cone_rad: constant tilt of the normal towards the axis; the planes then touch a cone whose tip is axis_point_m.
     bow_per_rad: bending of the sheet out of its plane by bow x (angle within the fan)^2, along n(a); see `light_sheet`.
+    Raises CalibrationError for numbers that are no such mirror.
     """
 
     axis_point_m: Array
@@ -148,7 +150,7 @@ class PivotScanner:
         return np.asarray(np.where(planes[..., :1] < 0, -planes, planes))
 
     def turned(self, commands: ArrayLike) -> Array:
-        """The planes with the sign of n(a), which is the sign that offset_m, cone_rad and bow_per_rad refer to."""
+        """Planes (..., 4) with the sign of n(a), the sign that offset_m, cone_rad and bow_per_rad refer to."""
         at = _inside(commands, self.command_range)
         angle = np.polynomial.polynomial.polyval(at, self.angle_rad)[..., None]
         normal = self.zero_normal * np.cos(angle) + np.cross(self.axis_direction, self.zero_normal) * np.sin(angle)
@@ -181,7 +183,7 @@ def _vector(value: ArrayLike, name: str) -> Array:
 
 
 def _near_one(values: Array, vectors: Array) -> Array:
-    """Values (..., m) by the power of two that brings the vectors (..., n) to length about one: their bits stay."""
+    """Values (..., m) times the power of two that brings the vectors (..., n) to length about one: their bits stay."""
     _, exponent = np.frexp(np.abs(vectors).max(axis=-1, keepdims=True))
     return np.asarray(np.ldexp(values, -exponent))
 
@@ -204,5 +206,5 @@ def _unit(vector: Array, name: str) -> Array:
 
 
 def _exactly_one(length: Array) -> Array:
-    """Lengths; one up to rounding counts as exactly one, so a model read back from its file is the same bit for bit."""
+    """The lengths, with exactly 1 for those within rounding of 1: a model read back from its file stays the same."""
     return np.where(np.abs(length - 1) < _ROUNDING, 1.0, length)

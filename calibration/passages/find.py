@@ -1,4 +1,4 @@
-"""Finds in the counts of a sweep's columns its passages, when the laser line passed over each pixel, and its picture.
+"""Finds a sweep's passages (when the laser line passed over each pixel) and its picture in the counts of its columns.
 
 Passages are found for many pixels, spread evenly over the picture. The first step finds the column at which the line
 stands out most from both sides (sums over columns, and their peak). The second fits the passage by maximum likelihood
@@ -38,15 +38,15 @@ CORES = (1, 3)
 RING = 8
 """Columns on either side that it has to stand out from."""
 TOP = 0.95
-"""Columns that stand out by this much of the best are as good."""
+"""Share of the best column's score from which on a column stands out as well."""
 LEAST_SEEN = 3.0
 """Score above which a line is fitted: chance makes as much along a few dozen columns."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class ColumnSums:
-    """Running sums of 1s and of frames before each column: (columns + 1, pixels) int32; frames (..., 1) if equal for
-    all pixels.
+    """Running sums of 1s and of frames before each column: (columns + 1, pixels) int32; frames are
+    (columns + 1, 1) if equal for all pixels.
     """
 
     ones: NDArray[np.int32]
@@ -67,8 +67,8 @@ class ColumnSums:
         return ColumnSums(self.ones[:, which], self.frames if self.frames.shape[1] == 1 else self.frames[:, which])
 
     def between(self, begin: int, end: int) -> tuple[NDArray[np.float32], NDArray[np.float32]]:
-        """Share of 1s (columns, pixels) in the columns `begin` to `end` away, NaN without frames; and the number of
-        frames.
+        """Share of 1s (columns, pixels) in the columns from `begin` to before `end` away, NaN without frames; and the
+        number of frames, (columns, pixels or 1).
         """
         edges = np.arange(self.columns)
         first, last = (np.clip(edges + shift, 0, self.columns) for shift in (begin, end))
@@ -91,8 +91,8 @@ class ColumnSums:
 def brightest(sums: ColumnSums) -> tuple[Array, NDArray[np.bool_]]:
     """Column at which the line stands out most (pixels,), and whether it stands out enough.
 
-    Flux within the core is compared with the brighter of two rings beside it, since the haze has an edge there but no
-    peak.
+    The share of 1s within the core is compared with the larger one of two rings beside it, since the haze has an edge
+    there but no peak.
     """
     pixels = sums.ones.shape[1]
     best, at = np.full(pixels, -np.inf), np.zeros(pixels)
@@ -117,8 +117,8 @@ def brightest(sums: ColumnSums) -> tuple[Array, NDArray[np.bool_]]:
 def evenly(mask: NDArray[np.bool_]) -> NDArray[np.int64]:
     """(n, 2) row and column of the pixels in a mask (height, width), in the order of Bayer's dither matrix.
 
-    The order visits every second, then every fourth pixel in both directions, and so on from coarse to fine. It reads
-    the bits of y and of y xor x in turn, from the last to the first.
+    The order goes from coarse to fine: every fourth pixel in both directions comes before the rest of every second. It
+    reads the bits of y xor x and of y in turn, from the last to the first.
     """
     rows, columns = np.nonzero(mask)
     bits = max(1, int(max(mask.shape) - 1).bit_length())
@@ -176,7 +176,7 @@ class SweepCounts:
 
     @property
     def step(self) -> float:
-        """Change of the command from one column to the next."""
+        """Mean change of the command from one column to the next; NaN if fewer than two columns have frames."""
         there = np.flatnonzero(np.isfinite(self.command))
         if len(there) < 2:
             return np.nan
@@ -195,7 +195,7 @@ class SweepCounts:
     def at_pixels(self, pixels: NDArray[np.int64]) -> tuple[NDArray[np.int32], NDArray[np.int32]]:
         """Returns, for n pixels (row, x), the number of ones (columns, n) and of frames (columns, n) or (columns, 1).
 
-        Both are 0 where a column's window does not reach the pixel.
+        Both are 0 where a column's window does not reach the pixel; one that all columns share must reach it.
         """
         total, rows, window = self.counts.shape
         ones = np.zeros((total, len(pixels)), np.int32)
@@ -286,7 +286,7 @@ def _passages(
 
 
 def _around(sums: ColumnSums, position: Array, start: Array, near: int) -> tuple[Array, Array, Array]:
-    """1s, frames and positions (pixels, 2 near + 3) around the passages; what is farther away lies far on its side."""
+    """1s, frames and positions (pixels, 2 near + 3) around the passages; the ends sum up what is farther away."""
     middle = np.rint(start).astype(np.int64)[:, None]
     far = max(REACH, 2 * near)
     begin = np.concatenate([middle - far, middle + np.arange(-near, near + 2)], axis=1)
@@ -298,7 +298,7 @@ def _around(sums: ColumnSums, position: Array, start: Array, near: int) -> tuple
 
 
 LEFT_OUT = 10
-"""Columns on either side of the line's brightest, and at most the following share of all."""
+"""Columns left out on either side of the line's brightest one, at most MOST_LEFT_OUT of all columns."""
 MOST_LEFT_OUT = 1 / 12
 LEAST_COUNTS = 30.0
 """Detections per pixel that make a picture: the median over its brighter half."""
@@ -351,7 +351,7 @@ def _everything(sweep: SweepCounts) -> tuple[Array, Array]:
 
 
 def _brightest_column(sweep: SweepCounts) -> NDArray[np.int32]:
-    """Column (rows, width) in which a pixel and its neighbours' columns had most 1s."""
+    """Column (rows, width or more) that, with the columns before and after it, gave a pixel most 1s."""
     columns, rows, window = sweep.counts.shape
     size = (rows, int(sweep.x0.max(initial=0)) + window)
     most, at = np.zeros(size, np.uint32), np.zeros(size, np.int32)
@@ -381,15 +381,16 @@ def _by_column(sweep: SweepCounts) -> tuple[Array, Array]:
 
 BLUR_PX = 1.0
 LEAST_SLOPE = 0.1
-"""Relative change of the flux per pixel that counts as an edge, and least multiple of the picture's noise."""
+"""Relative change of the flux per pixel from which on it counts as an edge."""
 NOISE_TIMES = 4.0
+"""Multiple of the picture's median relative change, which is mostly noise, that an edge must exceed as well."""
 AWAY_PX = 2
 """Pixels kept clear of an edge."""
 
 
 def even_pixels(picture: NDArray[np.float32]) -> NDArray[np.bool_]:
-    """True (height, width) where the flux of a picture changes little along the row; noise does not count as a
-    change."""
+    """True (height, width) where a picture's flux changes little along the row, apart from noise; False beside unknown
+    pixels."""
     known = np.isfinite(picture)
     filled = np.where(known, np.maximum(picture, 0), 0).astype(np.float32)
     smooth = cv2.GaussianBlur(filled, (0, 0), BLUR_PX)
@@ -402,7 +403,7 @@ def even_pixels(picture: NDArray[np.float32]) -> NDArray[np.bool_]:
 
 
 def board_pixels(corners: Corners, board: Board, size: tuple[int, int]) -> NDArray[np.bool_]:
-    """True (height, width) on the squares of a board whose corners were found, and on the paper around them."""
+    """True (height, width) on the squares of a board whose corners were found (4 at least), and on the paper around."""
     at_m = board.corners_m[corners.ids][:, :2]
     homography, _ = cv2.findHomography(at_m, corners.px, method=0)
     mask = np.zeros(size, np.uint8)

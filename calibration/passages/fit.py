@@ -1,4 +1,4 @@
-"""Maximum likelihood of a pixel's counts over the columns: the command at which the line's centre crosses each pixel.
+"""Maximum likelihood of a pixel's counts over the columns: the column at which the line's centre crosses the pixel.
 
 Of n frames in column t, y have a 1: y ~ Binomial(n, 1 - exp(-flux)), and around the passage c
 
@@ -30,7 +30,7 @@ _NODES = tuple((x / 2, w / 2) for x, w in zip(*np.polynomial.legendre.leggauss(3
 _TRAVEL = tuple((x / 2, w / 2) for x, w in zip(*np.polynomial.legendre.leggauss(4), strict=True))
 LEAST_FLUX = 1e-7
 LEVEL_COUNTS = 0.5
-"""Least number of 1s of a level: one without a single 1 is half a count over all its frames, not 0."""
+"""Prior of a level, as a number of 1s: one without a single 1 is half a count over all its frames, not 0."""
 BEFORE, AFTER, AREA, CENTRE, SIGMA = range(5)
 
 
@@ -64,7 +64,7 @@ def light(theta: Array, at: Array, shape: LineShape) -> tuple[Array, Array]:
 
 
 def _line(sigma: Array, away: Array, box: float) -> tuple[Array, Array]:
-    """Share of the line's light per column, so far away from its centre, and how much more of it there is nearer by."""
+    """Share of the line's light per column, `away` columns from its centre, and its slope by the centre."""
     narrow = sigma / np.sqrt(1 + box * box / 12)
     line, slope = np.zeros(away.shape), np.zeros(away.shape)
     for node, weight in _NODES if box else ((0.0, 1.0),):
@@ -76,7 +76,7 @@ def _line(sigma: Array, away: Array, box: float) -> tuple[Array, Array]:
 
 
 def _travelled(area: Array, sigma: Array, away: Array, box: float) -> tuple[Array, Array, Array, Array]:
-    """Flux that makes as many 1s as the moving line; its slopes by area, centre, log sigma (these for an area of 1)."""
+    """Flux that makes as many 1s as the moving line; its slopes by area, centre, log sigma (the last two per area)."""
     places = np.array([place for place, _ in _TRAVEL])[:, None, None]
     moved = away + places
     line, slope = _line(sigma, moved, box)
@@ -95,7 +95,7 @@ def _normal_integral(z: Array) -> Array:
 
 
 def score_of(ones: Array, frames: Array, flux: Array, slopes: Array, theta: Array) -> tuple[Array, Array]:
-    """Gradient (pixels, 5) of the log-likelihood and its expected information (pixels, 5, 5)."""
+    """Gradient (pixels, 5) and expected information (pixels, 5, 5) of the log-likelihood with the levels' prior."""
     residual, weight = residual_of(ones, frames, flux)
     score = (slopes @ residual[:, :, None])[:, :, 0]
     information = (slopes * weight[:, None, :]) @ slopes.transpose(0, 2, 1)
@@ -142,7 +142,7 @@ SPAN, SPACING = 4, 0.8
 MOST_AT_END = 0.03
 """Most chance at an end of that: where there is more, the centre is not known."""
 ALIKE = 1.25
-"""Factor by which what was found may differ from what was looked for."""
+"""Factor by which the deviation found may differ from the one that was looked for."""
 LEAST_LOOK, MOST_LOOK = 0.01, 0.7
 """Bounds of the deviation that is looked for, in columns."""
 LEAST_SIGMA, MOST_SIGMA = 0.25, 12.0
@@ -156,8 +156,8 @@ class PassageFit:
     """One entry per pixel, in columns. centre, sd: of the passage. sigma: of the pixel's group.
 
     significance: of the line against levels alone, in standard deviations (the square root of twice the logarithm of
-    the likelihood ratio). misfit: Pearson's chi squared, as standard deviations above its mean. settled: whether the
-    scoring converged.
+    the likelihood ratio). misfit: Pearson's chi squared, as standard deviations above its mean. likelihood: its
+    logarithm. settled: whether the counts tell the centre.
     """
 
     centre: Array
@@ -252,7 +252,7 @@ def _moved(theta: Array, score: Array, information: Array, damping: Array) -> Ar
 
 
 def _few(frames: Array, flux: Array, slopes: Array, theta: Array) -> Array:
-    """Factor (pixels,) on the variance for the parameters that were fitted besides, to so many detections."""
+    """Factor (pixels,) on the variance: the line's detections over those left when FITTED_BESIDES are subtracted."""
     level = slopes[:, BEFORE] * theta[:, BEFORE, None] + slopes[:, AFTER] * theta[:, AFTER, None]
     detections = (frames * (np.exp(-level) - np.exp(-flux))).sum(axis=1)
     result: Array = np.maximum(detections / np.maximum(detections - FITTED_BESIDES, 1), 1)  # a dip has fewer than none
@@ -262,7 +262,7 @@ def _few(frames: Array, flux: Array, slopes: Array, theta: Array) -> Array:
 def _centred(
     ones: Array, frames: Array, at: Array, shape: LineShape, theta: Array, sd: Array
 ) -> tuple[Array, NDArray[np.bool_]]:
-    """Move the centres of `theta` to their means; gives back sd and `settled`. Looked at twice where first too near."""
+    """Move the centres of `theta` to their means; return sd and `settled`. Look twice where the sd was a bad guess."""
     sd, settled, again = sd.copy(), np.ones(len(sd), np.bool_), np.arange(len(sd))
     for _ in range(2):
         look = np.clip(sd[again], LEAST_LOOK, MOST_LOOK)
@@ -277,7 +277,7 @@ def _centred(
 def _posterior(
     ones: Array, frames: Array, at: Array, shape: LineShape, theta: Array, sd: Array
 ) -> tuple[Array, Array, NDArray[np.bool_]]:
-    """Mean and standard deviation of the centre (pixels,) where all else is known; whether both lie within the look.
+    """Mean and standard deviation of the centre (pixels,) for a known sigma; whether the places looked at hold them.
 
     Few photons make no parabola of the likelihood: its width at the top is then not what the centre errs by.
     """
@@ -307,7 +307,7 @@ def _posterior(
 
 
 def _width_step(log_sigma: Array, score: Array, information: Array, group: NDArray[np.int64]) -> Array:
-    """Step of each pixel's log sigma: that of its group, held to the mean of all groups, the others following."""
+    """Step of each pixel's log sigma: its group's, drawn to the mean of all groups; other parameters follow it."""
     border = information[:, :SIGMA, SIGMA]
     solved = np.linalg.solve(regular(information[:, :SIGMA, :SIGMA]), np.stack([score[:, :SIGMA], border], axis=2))
     effective = score[:, SIGMA] - (border * solved[:, :, 0]).sum(axis=1)

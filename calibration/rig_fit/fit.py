@@ -28,7 +28,7 @@ from calibration.rig_fit.solve import RigProblem, RigSolution, all_rows, camera_
 from calibration.views import BoardPose, View, robust_sd
 
 MOST_ROUNDS = 16
-"""Most rounds of fitting and deciding; every round but the last adds a term, drops a view or settles the noise."""
+"""Most rounds of fitting and deciding; all but the last add a term, fix a lag, drop a view or settle noise."""
 MOST_IDLE_ROUNDS = 4
 """Most rounds without a decision: data that contradict each other may keep a fit from coming to rest for ever."""
 SETTLED_SHARE = 0.02
@@ -86,7 +86,7 @@ class Rounds:
             return False
         counted = self.problem.counted.copy()
         counted[odd] = False
-        # What it made the fit take in is decided again without it.
+        # Terms that this view made the fit take in are decided again without it.
         self.free, self.kept = list(self.base), ()
         self.problem = replace(self.problem, tie=self.problem.terms.tied(self.free), counted=counted)
         self.state = rig_state.with_terms_of(self.state, self.base)
@@ -170,7 +170,7 @@ class RigFit:
     misfit: factor by which variances were multiplied, 1 if the model describes everything. condition: condition number
     of the scaled equations of the shared parameters. converged: False if contradictory data keep the fit from
     converging. decisions: about terms and lags. free: the fitted parameters, where the names of one group share a
-    value; information: (free, free), the inverse of their covariance.
+    value; information: (free, free), the inverse of their covariance before `misfit.widening`.
     """
 
     model: RigModel
@@ -215,8 +215,8 @@ class RigFit:
 def result_of(
     fit: Rounds, left_out: tuple[str, ...], board: Board, start: RigModel | None, velocities: Array
 ) -> RigFit:
-    """The result of rounds that have run; its model takes all else from `start`. Raises Degenerate if depth is almost
-    unknown.
+    """The result of rounds that have run. Its model takes what they do not determine from `start`, if there is one.
+    velocities: of all sweeps. Raises Degenerate if depth is almost unknown.
     """
     problem, solution, state = fit.problem, fit.solution, fit.state
     names = np.array(problem.terms.names)
@@ -266,7 +266,7 @@ def result_of(
 
 
 def _trimmed(terms: Array, least: int) -> Array:
-    """The terms without the zeros at the end."""
+    """The terms without the zeros at the end, but `least` of them."""
     used = np.flatnonzero(terms)
     return terms[: max(least, int(used[-1]) + 1 if used.size else 0)]
 
@@ -283,10 +283,12 @@ def fit_rig(
     """Fit a rig to views of a board; size: (width, height) of the picture.
 
     camera: the start value of the camera (None: `start`'s or OpenCV's).
-    known: covariance of that camera from pictures other than these, by the names of its parameters. Parameters without
-    a variance are known exactly and not fitted.
-    start: its mirror and lag are the start values of the fit; its source, defects and command range are kept.
-    Raises Degenerate, with the reason, if the views do not determine a model, and CalibrationError.
+    known: covariance of that camera from pictures other than these, by the names of its parameters. Parameters with a
+    variance of 0 are known exactly and not fitted.
+    start: its mirror and times are the start values of the fit, and what is not fitted is kept, such as source and
+    defects; its command range grows if passages lie outside.
+    Raises Degenerate, with the reason, if the views do not determine a model, and CalibrationError for another sensor's
+    or a tilted camera.
     """
     shown = rig_state.usable(views)
     if not shown:
@@ -361,7 +363,7 @@ def _first_state(
 
 
 def _first_noise(problem: RigProblem, state: rig_state.RigState) -> tuple[RigProblem, Noise]:
-    """The problem with the sd that the passages' errors speak for, and how noisy all is."""
+    """The problem with passages' sd restated from their errors, and a first estimate of the noise."""
     rows = all_rows(state, problem.sightings, problem.terms)
     corners, passages = ([pair[which].residual for pair in rows] for which in (0, 1))
     problem = replace(problem, sightings=restated(passages, problem.sightings))

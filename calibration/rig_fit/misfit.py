@@ -1,11 +1,11 @@
 """The misfit of a fitted rig: views that do not fit, slow misfit, and mirror terms that the data call for.
 
-Terms are decided one at a time, and decisions are final. A term that is not in the model is tried to first order: the
-equations give the value it would take and its standard deviation. It is added if its value exceeds SIGNIFICANT_SD
-standard deviations and can be separated from the others. The angle's polynomial grows by one or two orders, since a
-symmetric mirror has no even terms. If several terms qualify, the one that leaves least unexplained is added first. A
-missing term can be imitated in part by another (light that passes beside the axis by an angle that bends), and the
-imitation may even have the smaller relative error.
+Terms are decided one at a time, and for good unless a view is dropped later. A term that is not in the model is tried
+to first order: the equations give the value it would take and its standard deviation. It is added if its value exceeds
+SIGNIFICANT_SD standard deviations and the term can be separated from the others. The angle's polynomial grows by one or
+two orders, since a symmetric mirror has no even terms. If several terms qualify, the one that leaves least unexplained
+is added first. A missing term can be imitated in part by another (light that passes beside the axis by an angle that
+bends), and the imitation may even have the smaller relative error.
 """
 
 from collections.abc import Callable, Iterator, Sequence
@@ -154,7 +154,7 @@ SCANNER_MOVES = (*AXIS, "angle_0")
 ODD_CHI2 = 60.0
 """Least fall of chi2 when an odd view has its own place of the scanner: 20 is one in a thousand."""
 ODD_TIMES = 8.0
-"""Least such fall as a multiple of that for most views, should the model fit none of them well."""
+"""Least such fall as a multiple of the median one of the other views, should the model fit none of them well."""
 EXPLAINED_SHARE = 0.05
 """Alternatively: at most this share of the misfit is left when the view has its own place of the scanner,"""
 OTHERS_SHARE = 0.3
@@ -213,7 +213,7 @@ def _own_place(problem: RigProblem, solution: RigSolution, view: int) -> float:
 
 
 def widening(problem: RigProblem, solution: RigSolution, decisions: Sequence[TermDecision]) -> Array:
-    """(p, p) to add to the covariance, for the effect of the term that came nearest to being added."""
+    """(p, p) to add to the covariance, for the effect of the term that came nearest to being added; may be 0."""
     wider: Array = np.zeros_like(solution.matrix)
     open_ones = [d for d in decisions if not d.kept and np.isfinite(d.sd) and abs(d.value) > UNDECIDED_SD * d.sd]
     if open_ones:

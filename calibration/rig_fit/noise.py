@@ -25,17 +25,17 @@ BINS = 1024
 """Bins of the whole command range: some to a column, within which jitter hardly changes."""
 MOST_REACH_BINS = 96
 LEAST_FACTOR = 0.3
-"""Least factor of the passages' own sd; an sd that is stated more than three times too large is not believed to be."""
+"""Least factor of the passages' own sd; that an sd is stated more than three times too large is not believed."""
 TAIL_SD = 3.0
-"""Sds from which on an error counts as unlikely, and pulls no more than it would here."""
+"""Sds from which on an error counts as unlikely, and pulls no more than one of this size."""
 OUTLIER_SD = 6.0
 """Sds from which on a deviation is no error of this kind, and does not count."""
 CUT_SD = 4.0
-"""Errors beyond it are left out where the noise is told: the square of one outlier would be that of hundreds."""
+"""Sds beyond which errors are left out where noise is estimated: one outlier's square would outweigh hundreds."""
 FEWEST_PAIRS = 200
 """Fewest pairs of neighbouring passages that tell how errors go with their sd."""
 LEAST_SPREAD = 0.05
-"""Least spread of the logarithm of the sd that tells it."""
+"""Least spread of the logarithm of the sd that tells how errors go with it."""
 SIGNIFICANT_SD = 3.0
 """Significance for a jitter to be there; one overlooked makes a model look better than it is."""
 
@@ -109,7 +109,7 @@ def passage_noise(residuals: Sequence[Array], sightings: Sequence[Sighting]) -> 
 
     The mirror's error is assumed constant for a while, so the covariance of two passages falls linearly with the
     difference of their commands. Of all lengths, the one that differs most significantly from independent errors is
-    taken.
+    taken; the jitter is 0 if none is significant.
     """
     shown = [seen.command for seen in sightings if seen.command.size]
     width = (max(float(command.max()) for command in shown) - min(float(command.min()) for command in shown)) / BINS

@@ -54,7 +54,7 @@ FEWEST_PASSAGES = 30
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Sighting:
-    """One view. corners_m (n, 3), corner_px (n, 2), corner_scale (n,): sd of a corner relative to the others.
+    """One view. corners_m (n, 3), corner_px (n, 2), corner_scale (n,): sd of a corner over the usual one.
 
     Per passage (m,), float64, sorted by sweep and command: x_px, y_px, command, sd, velocity_per_s (signed). starts:
     (sweeps + 1,), indices at which the sweeps begin and end.
@@ -78,7 +78,7 @@ class Sighting:
 
 
 def sighting(view: View, board: Board, camera: Camera, pose: BoardPose) -> Sighting:
-    """The corners of a view and those of its passages that lie on the board's paper."""
+    """The corners of a view, and its passages on the board's paper in sweeps with FEWEST_PASSAGES of them or more."""
     assert view.corners is not None
     sweeps = [_on_board(sweep, board, camera, pose) for sweep in view.passages]
     sweeps = [sweep for sweep in sweeps if sweep.x_px.size >= FEWEST_PASSAGES]
@@ -200,7 +200,7 @@ def first_state(model: RigModel, timing: Array, poses: Sequence[BoardPose], sigh
 
 
 def with_terms_of(state: RigState, groups: Sequence[Sequence[str]]) -> RigState:
-    """The state with all mirror terms that are not named set to 0."""
+    """The state with those terms of angle, offset, cone, bow and row delay set to 0 that are not named."""
     named = {name for group in groups for name in group}
     scanner = state.scanner
     plain = replace(
@@ -226,7 +226,7 @@ POSES_FOR_PLANES = 5
 MOST_FIRST_LAG_S = 1e-3
 """Largest first value of a lag: ten times that of a small galvo."""
 _STEP = 0.7
-"""Share of its range by which a sweep's planes are sampled; the ends are worst known."""
+"""Share of a sweep's command range over which its planes are sampled; those at the ends are known worst."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -240,7 +240,7 @@ class LitPoints:
 
 
 def first_pose(camera: Camera, corners_m: Array, corner_px: Array) -> BoardPose:
-    """The pose of a board from its corners."""
+    """The pose of a board from its corners. Raises Degenerate if they are no picture of it."""
     try:
         _, turn, shift = cv2.solvePnP(
             corners_m, corner_px, camera.matrix, camera.distortion, flags=cv2.SOLVEPNP_ITERATIVE
@@ -344,11 +344,11 @@ def _lags(velocities: Array, curves: Sequence[tuple[Array, Array]]) -> tuple[flo
 
 
 LEAST_TILT_RAD = np.radians(5.0)
-"""Least tilt between two boards."""
+"""Tilt between boards below which a refusal is put down to it."""
 LEAST_THICKNESS = 0.01
 """Least thickness of the points about their best plane, as a share of their distance: less is one plane."""
 LEAST_SPAN = 0.02
-"""Least share of the mirror's command range: a line that hardly moved tells nothing of how it turns."""
+"""Least span of the commands, in command units: a line that hardly moved tells nothing of how it turns."""
 LEAST_LIT_SHARE = 0.1
 """Least share of the picture that must be lit for a distance to be judged at."""
 MOST_DEPTH_SD_SHARE = 0.2
@@ -422,7 +422,7 @@ def check_depth(
     misfit: float = 1.0,
     outliers: Sequence[str] = (),
 ) -> None:
-    """Raise Degenerate if the poses hardly determine depth, apart from the misfit of contradictory data."""
+    """Raise Degenerate if the poses hardly determine depth, misfit aside, or if the line reaches nothing."""
     camera = model.camera
     x, y = np.meshgrid(np.linspace(0.1, 0.9, 7) * camera.width, np.linspace(0.1, 0.9, 5) * camera.height)
     for at_m in (AT_M, float(np.median([np.linalg.norm(pose.position_m) for pose in poses]))):

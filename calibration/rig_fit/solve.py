@@ -2,7 +2,7 @@
 
 The normal equations take one view at a time and eliminate its pose.
 
-Passages of one instant share the mirror's jitter s. For each bin
+Passages of one instant share the mirror's jitter, of sd s. For each bin, with D the diagonal of their own variances,
 
     V = D + s^2 11',    V^-1 = D^-1 - k (D^-1 1)(D^-1 1)',    k = s^2 / (1 + s^2 1'D^-1 1)
 
@@ -135,7 +135,7 @@ WEIGHED_STEPS = 6
 CONVERGED_CHI2 = 1e-3
 """Gain in chi2 promised by the next step at which a fit is at rest: 0.03 sd along any parameter."""
 ROUGH_SHARE = 1e-4
-"""Share of chi2 that the next step may still promise where a term is only looked for."""
+"""Share of chi2 that the next step may still promise, besides 1, where a term is only looked for."""
 WORSE_CHI2 = 0.1
 """Amount by which a step may raise chi2: derivatives are exact except for how a bow changes along the line."""
 MOST_DAMPING = 1e8
@@ -189,7 +189,7 @@ class RigSolution:
 
 
 def solved(problem: RigProblem, state: RigState, noise: Noise, *, roughly: bool = False) -> RigSolution:
-    """The best state for this noise. Raises Degenerate if the solution is not unique.
+    """The best state for this noise. Raises Degenerate if it is not unique, LinAlgError if a view's pose is not.
 
     roughly: whether to stop once it is accurate enough for decisions.
     """

@@ -24,7 +24,7 @@ import numpy as np
 from calibration.arrays import Array
 
 SPARE_FRAMES = 2
-"""Frames at either end between which the edge is looked for."""
+"""Frames at either end in which no edge is looked for."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -48,7 +48,7 @@ def fit_edge(
     frames.
 
     ones, start_s: (frames,), 1s of each frame and start of its exposure, at least 8 frames. saturation: m above. Times
-    within two frames of either end are taken as impossible.
+    within two frames of either end are taken as impossible. Raises ValueError if all are.
     """
     weight = 1 / max(float(ones.mean()), 1.0)
     first, last = np.searchsorted(start_s, times_s[[0, -1]], side="right") - 1

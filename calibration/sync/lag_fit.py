@@ -1,13 +1,13 @@
 """The lags of light, mirror and frames, from sweeps over one unmoved scene at several speeds, in both directions.
 
-A pixel sees the line at one mirror position, whatever the speed. In a sweep with direction s = +1 or -1 and speed v it
-sees it at (calibration/views.py)
+A pixel sees the line at one mirror position, whatever the speed. In a sweep with direction s = +1 or -1 and speed v
+that is at the command (`Passages` in calibration/views.py)
 
     command = position + s v (lag_s - row_delay y)
 
 Positions are eliminated as each pixel's weighted mean (`SharedPixels`); the rest is linear in the two lags and the row
 delay. Passages close in time are treated as correlated, since a mirror's jitter is common to all pixels that it passes
-then. This needs neither a board nor geometry, only pixels with a passage in several of the sweeps: 2000 pixels of 4
+then. The fit needs neither a board nor geometry, only pixels with a passage in several of the sweeps: 2000 pixels of 4
 sweeps take 10 ms.
 
 The sweeps limit what can be determined (`calibration.model.parameters`). One speed in each direction gives only a mean
@@ -91,7 +91,8 @@ class SharedPixels:
 class Solved:
     """The result of a least squares fit. value, covariance: of the designs' coefficients.
 
-    residual: (pixels, sweeps), in command units. weight: weight of each passage. design: (pixels, sweeps, designs),
+    residual: (pixels, sweeps), in command units. weight: weight of each passage, 0 for an outlier. noise: robust sd of
+    the residuals in units of the stated sd. design: (pixels, sweeps, designs),
     after elimination of each pixel's own position.
     """
 
@@ -141,7 +142,7 @@ def solve(seen: SharedPixels, designs: Sequence[Array]) -> Solved:
         scaled = np.abs(error) * np.sqrt(seen.weight)
         noise = max(robust_sd(scaled[seen.weight > 0]), 1e-12)
         weight = seen.weight * (scaled < MOST_OFF * max(noise, 1.0))
-    # What trembles together counts together (a sandwich over parts of a sweep), and every sweep may be off as a whole.
+    # Passages that tremble together count together (sandwich over parts of a sweep); a sweep may be off as a whole.
     pulls = clustered(weight[:, :, None] * x * error[:, :, None], clusters(seen))
     by_sweep = np.einsum("ij,ija->ja", weight, x) * (SWEEP_ERROR_S * seen.speed)[:, None]
     covariance = inverse @ (pulls.T @ pulls + by_sweep.T @ by_sweep) @ inverse
@@ -176,7 +177,7 @@ MOST_CHI2_SDS = 4.0
 
 @dataclass(frozen=True, slots=True)
 class SweepTiming:
-    """The lag_s of one sweep relative to the others, with sd_s."""
+    """The lag of one sweep by itself: the fitted one plus the sweep's mean residual; sd_s: of the latter."""
 
     direction: int
     speed_per_s: float
@@ -238,7 +239,7 @@ def fit_sync(sweeps: Sequence[Passages], row_delay_s: float = 0.0, row_delay_sd_
     _require_speeds(sweeps)
     seen = SharedPixels.of(sweeps)
     heard = (seen.weight > 0).sum(axis=0).tolist()
-    if not all(heard):  # a sweep that saw the line nowhere else does says nothing, least of all of its speed
+    if not all(heard):  # a sweep that shares no pixel says nothing, least of all of its speed
         return fit_sync(
             [sweep for sweep, tells in zip(sweeps, heard, strict=True) if tells], row_delay_s, row_delay_sd_s
         )
@@ -259,7 +260,7 @@ def fit_sync(sweeps: Sequence[Passages], row_delay_s: float = 0.0, row_delay_sd_
     else:
         solved = solve(seen, lags)
 
-    # From what was solved for to the three: a common lag is both, one that was not scanned is not known.
+    # From the solution to both lags and the row delay: a common lag is both, one that was not scanned is not known.
     which = {way: 0 if common else told.index(way) for way in told}
     kept = [which.get(way) for way in (1, -1)]
     covariance = np.full((3, 3), np.nan)
@@ -308,8 +309,8 @@ def _require_speeds(sweeps: Sequence[Passages]) -> None:
 
 
 def _require_one_way_round(seen: SharedPixels) -> None:
-    """Raises Degenerate if the commands of one way run against those of the other: the level of one is taken
-    for both."""
+    """Raise Degenerate if the commands of one direction run against those of the other: the marker's level is taken
+    for the wrong one."""
     ahead, back = (seen.direction == way for way in (1, -1))
     if not (ahead.any() and back.any()):
         return

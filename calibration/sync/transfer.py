@@ -2,8 +2,8 @@
 
 A mirror's angle was fitted together with lags; with other lags it changes, by an amount that their covariance C gives.
 If the sweeps of the planes did not separate the lags (`calibration.model.parameters`), any lags are possible, each with
-its own angle, and C is very large in that direction. With x the lags, y everything else, S the covariance of the new
-lags:
+its own angle, and C is very large in that direction. With x the lags, y the other parameters, S the covariance of the
+new lags:
 
     y | x = y0 + A (x - x0),    A = C_yx C_xx^-1,    cov y = (1 -A) C (1 -A)' + A S A',    cov (y, x) = A S
 
@@ -26,9 +26,9 @@ from calibration.sync.lag_fit import SIGNIFICANT, SyncFit
 from calibration.verdict import Reason
 
 _OPEN_S = 1e-4, 1e-2
-"""Standard deviation of a lag that nothing tells: enough to follow it, and to be surprised by none."""
+"""Sds given to a lag that nothing tells: for the slopes, to follow it; for the test of a change, to accept any."""
 _LEAST_SHARE = 1e-9
-"""Least own share of the scaled covariance of lags; below it they were taken for one."""
+"""Least eigenvalue of the scaled covariance of lags; below it they were taken for one."""
 _AGAIN = "calibrate the planes again, both ways and at two speeds or more (--exposures)"
 
 
@@ -71,7 +71,7 @@ def with_lags(base: RigModel, fit: SyncFit) -> tuple[RigModel, Reason | None]:
 
 
 def _told(fit: SyncFit) -> tuple[dict[str, float], Array]:
-    """The values that the sweeps tell, by name, and their covariance: a lag that was not scanned is the other."""
+    """The values that the sweeps tell, by name, and their covariance; a lag that was not scanned equals the other."""
     ways = [at if np.isfinite(fit.covariance[at, at]) else 1 - at for at in (0, 1)]
     at = [*ways, 2] if fit.row_told else ways
     values = dict(zip(TIMES, (*fit.lag_s, fit.row_delay_s), strict=True))
@@ -81,7 +81,7 @@ def _told(fit: SyncFit) -> tuple[dict[str, float], Array]:
 def _slopes(
     base: RigModel, known: Array, names: tuple[str, ...], lags: int, change: Array, spread: Array
 ) -> tuple[Array, Reason | None]:
-    """The slopes A (others, lags) of all else by the lags (the last names), and the reason where nothing tells them."""
+    """The slopes A (others, lags) of the other parameters by the lags (the last names); the reason if none is known."""
     n = len(names) - lags
     slopes = np.zeros((n, lags))
     velocities = base.provenance.get(SWEPT) or ()

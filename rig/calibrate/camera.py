@@ -36,7 +36,8 @@ def calibrate_camera(
 ) -> CalibrationResult:
     """Calibrate the camera alone (`rig calibrate camera`). `sources` may also be pictures, and folders of them.
 
-    Raises Degenerate if the views give no calibration, with the root cause and notes on all causes.
+    Raises Degenerate if the views give no calibration, with the root cause and notes on the others,
+    and UsageError for a wrong request.
     """
     request = replace(request or CameraRequest(), **changes)
     si_values(request)

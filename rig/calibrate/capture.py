@@ -61,7 +61,7 @@ MOST_SWEEPS = 4
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Capture:
-    """A view, the reason why it has no corners (None if it has), and the rig that took it."""
+    """A view, the reason why it has no corners (None if it has, or none were sought), and the rig that took it."""
 
     view: View
     refused: Degenerate | None
@@ -104,7 +104,7 @@ def capture_view(
 
 
 def capture_recorded(run: Path, name: str, board: Board | None, *, defects: NDArray[np.bool_] | None = None) -> Capture:
-    """Take the view from the first sweeps of a recorded run. Raises UsageError if there is none."""
+    """Take the view from the first sweeps of a recorded run. Raises UsageError if it cannot be replayed."""
     config = replay_config(run, ReplayRequest(clock="max", estimator="argmax", filter="none"))
     if not read_plan(run).windowed:
         config = config.model_copy(update={"calibration": None})
@@ -174,7 +174,7 @@ def scan_sweeps(
     out: OutFolder = None,
     prepared: tuple[ScanPlan, SpadTiming] | None = None,
 ) -> None:
-    """Scan for what the listeners get alone. An interrupt is raised again, once the rig is safe."""
+    """Scan for the listeners and, with `out`, a recording alone. An interrupt is raised again, once the rig is safe."""
     scan, estimate = rig.config.scan, rig.config.estimate
     tally = MapTally(scan.columns, scan.exposures, estimate.estimator, estimate.filter)
     request = RunRequest(maps=maps, record=out is not None, accept_calibration=True)
@@ -298,7 +298,7 @@ class SpeedRotation:
         return capture
 
     def _again(self, capture: Capture, exposures: int, slowest: int, scan: Scan) -> Capture:
-        """Take the pose again at the slowest speed; returns the first capture where the rig cannot do that."""
+        """Take the pose again at the slowest speed; return the first capture if the rig cannot do that."""
         self._tell(f"at {_of(exposures)} the line does not stand out on the board: again at {slowest}")
         try:
             again = scan(exposures=slowest)

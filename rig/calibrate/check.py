@@ -45,10 +45,11 @@ def calibrate_check(
     tell: TellLine | None = None,
     **changes: Any,
 ) -> CalibrationResult:
-    """Judge a calibration by a flat board that was not used for it, and note the result beside it (`rig calibrate
-    check`).
+    """Judge a calibration by a flat board that was not used for it (`rig calibrate check`). The result is noted
+    beside it, if it says whose it is.
 
-    Raises Degenerate if the board cannot be used, UsageError if the views were used for the calibration.
+    Raises Degenerate if the board cannot be used, CalibrationError if the calibration cannot, and UsageError for a
+    wrong request and for views that the calibration was made of.
     """
     request = replace(request or CheckRequest(), **changes)
     values = si_values(request)

@@ -1,8 +1,8 @@
 """`rig calibrate pixels`: maps the pixels from dark frames and compares the map with the last one.
 
-Frames come from the SPAD alone, or are the dark and lit ones of a recorded run. In the dark nothing moves and no light
-leaves: the gate is low, the laser is not armed, the scanner rests. The frames come in short starts spread over some
-time, since rates that jump do so within milliseconds or minutes.
+Dark frames come from the SPAD alone or from a recorded run, lit ones from a scan or a run. In the dark nothing moves
+and no light leaves: the gate is low, the laser is not armed, the scanner rests. The frames come in short starts
+spread over some time, since rates that jump do so within milliseconds or minutes.
 
 The folder has pixels.npz (the map with its version), calibration.yaml (that of the config, if any, with the new defects
 and dark rates), dark_rate.png, report.html and summary.json. The statistics are in `calibration.pixel_map`.
@@ -52,7 +52,7 @@ from rig.scan.source import Source, blocks
 from rig.threads import RowWorkers
 
 STARTS: Final = 32
-"""Number of starts of the SPAD, and so of blocks whose counts are compared."""
+"""Starts of the SPAD, and so blocks whose counts are compared; more if its memory holds too few frames."""
 BLOCK_FRAMES: Final = 128
 SPARE_SLOTS: Final = 4
 """Slots of the ring beyond those needed, for a device that sends shorter blocks than asked for, and would drop some."""
@@ -75,13 +75,13 @@ class CoversLens(Protocol):
 
 @dataclass(slots=True)
 class SweepSums:
-    """Adds up the dark and the lit frames of counted sweeps. `add` can be passed as the `sweeps` option of a scan."""
+    """Adds up the dark and the lit frames of counted sweeps. `add` can be passed to a scan, as `Listeners.sweeps`."""
 
     tally: pixel_map.DarkTally | None = None
     lit: Sums | None = None
 
     def add(self, sweep: SweepData) -> None:
-        """Add a sweep; its dark frames are one block."""
+        """Add a sweep; its dark frames are one block. A sweep without whole counts of them is left out."""
         volume = sweep.tally
         if not isinstance(volume, CountVolume) or volume.dark_counts is None:
             return
@@ -100,7 +100,7 @@ def take_dark(
     progress: Progress | None = None,
     covered: Callable[[], None] | None = None,
 ) -> tuple[pixel_map.DarkTally, float]:
-    """Take at least `frames` frames in the dark, once the lens is `covered`; returns also their exposure in s.
+    """Take at least `frames` frames in the dark, once the lens is `covered`; return their tally and exposure in s.
 
     May raise DeviceError.
     """
@@ -138,7 +138,7 @@ def take_dark(
 
 def take_sweeps(rig: OpenRig, maps: int | None = None, progress: Progress | None = None) -> SweepSums:
     """Take the frames of a scan with light, or of all sweeps of a recording. An interrupt is raised again at
-    the end."""
+    the end. Raises UsageError if no sweep has dark frames."""
     sums = SweepSums()
 
     def live(now: ScanProgress) -> None:
@@ -195,7 +195,7 @@ class PixelResult:
     """A map of the pixels and its verdict.
 
     drift: change since the older map `against`; None without one.
-    leak: correlation of neighbouring pixels' rates, a sign of light in the dark frames.
+    leak: correlation of neighbouring pixels' rates, a sign of light in the dark frames; 0 for a recorded run.
     folder, calibration: paths of the folder and of the changed calibration; None if they were not written.
     """
 
@@ -258,7 +258,7 @@ class PixelResult:
 
 
 def pixel_verdict(pixels: pixel_map.PixelMap, drift: pixel_map.PixelDrift | None, leak: float) -> Verdict:
-    """Judge whether map and drift may be believed; the root cause comes first."""
+    """Judge whether the map may be believed and the older one still holds; the root cause comes first."""
     reasons = []
     if leak > MOST_LEAK:
         said = f"the rates of neighbouring pixels correlate by {leak:.2f}, in the dark by {MOST_LEAK:g} at most"
@@ -316,6 +316,7 @@ def calibrate_pixels(
 
     source: a rig, or the folder of a recorded run.
     covered: called when a person has to cover the lens; it returns once that is done.
+    Raises UsageError for a wrong request or file, DeviceError or DevicesError if devices fail.
     """
     request = replace(request or PixelsRequest(), **changes)
     path, frames = None if isinstance(source, RigConfig) else Path(source), request.frames
@@ -372,7 +373,7 @@ def _sensor(rig: OpenRig) -> str:
 
 
 def _last(against: PathLike | None, config: RigConfig, recorded: Path | None) -> pixel_map.PixelVersion | None:
-    """The older map to compare with; None if there is none. Raises UsageError if a file was named that is no map."""
+    """The older map to compare with; None if there is none. Raises UsageError if its file holds no map."""
     if against is not None:
         path = Path(against)
         path = path / PIXELS_FILE if path.is_dir() else path

@@ -50,7 +50,8 @@ def calibrate_planes(
 ) -> CalibrationResult:
     """Calibrate camera, light planes and lag together from views of a board (`rig calibrate planes`).
 
-    The defects of the base calibration are kept. Raises Degenerate, with notes why, if the views give none.
+    The defects of the base calibration are kept. Raises Degenerate, with notes why, if the views give no model,
+    CalibrationError for a file that cannot be used and a line that misses `at`, UsageError for a wrong request.
     """
     request = replace(request or PlanesRequest(), **changes)
     values = si_values(request)
@@ -212,9 +213,9 @@ def guided(
     start: ChoosePose, board: Board, depth_range_m: tuple[float, float], session: Session,
     fit: Callable[[], RigFit], judge: Callable[[RigFit], JudgedRig],
 ) -> ChoosePose:  # fmt: skip
-    """Chooses poses by how much they lower the expected error, until that reaches the required accuracy.
+    """Return a choice of poses by how much they lower the expected error, until the verdict passes or none is left.
 
-    start: chooses for as long as no fit of the session's views can be judged. fit, judge: as they will be in the end.
+    start: chooses for as long as no fit of the session's views can be judged. fit, judge: those of the final result.
     """
     asked: set[tuple[float, tuple[int, int], tuple[int, int]]] = set()
 

@@ -105,7 +105,7 @@ _UNITS = {
     "offset_0": ("mm", 1e3), "offset": ("mm/rad^{order}", 1e3),
     "lag": ("us", 1e6), "row_delay": ("ns/row", 1e9),
 }  # fmt: skip
-"""Unit of each term of the model, and how many of them make one of SI's; none in units of the mirror command."""
+"""Unit of each term of the model, and how many of it make the SI unit. The mirror command has no unit."""
 
 
 def measured(name: str, value: float, sd: float) -> tuple[str, str, str]:
@@ -310,7 +310,7 @@ def sync_report(fit: SyncFit) -> Report:
 
 
 def corners_px(view: View) -> Array:
-    """Corners of a view that were seen and used, (n, 2)."""
+    """Corners of a view (n, 2), without those at invalid positions."""
     if view.corners is None:
         return np.zeros((0, 2))
     px = np.asarray(view.corners.px, np.float64)
@@ -318,7 +318,7 @@ def corners_px(view: View) -> Array:
 
 
 def pose_words(pose: BoardPose, board: Board) -> tuple[str, str]:
-    """Distance of a board's middle in metres and its tilt from facing the camera in degrees, as text."""
+    """Depth of a board's middle in metres and its tilt from facing the camera in degrees, as text."""
     middle = pose.to_camera([board.size_m[0] / 2, board.size_m[1] / 2, 0.0])
     tilt = np.degrees(np.arccos(np.clip(pose.matrix[2, 2], -1, 1)))
     return f"{middle[2]:.2f}", f"{tilt:.0f}"

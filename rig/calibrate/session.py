@@ -1,7 +1,7 @@
 """The folder of a calibration. Views are written as they come and are kept even if the calibration fails.
 
-    views/000.npz ...  rig.json (whose they are)  board.yaml (of what)  calibration.yaml (+ .npy)  report.html
-    summary.json
+    views/000.npz ...  rig.json (the rig of the views)  board.yaml (their board)  calibration.yaml (+ .npy)  camera.yaml
+    report.html  summary.json
 
 `Session` holds the views and writes it all; `CalibrationResult` is what a calibration returns. A session that was
 interrupted, or whose views gave no calibration, leaves its views, which can be a source for the next. A view's file,
@@ -53,7 +53,7 @@ BOARD_FILE = "board.yaml"
 
 
 def session_rig(folder: Path) -> Identity | None:
-    """The rig of a session's views; None if the session does not say."""
+    """The rig of a session's views; None if the session has no file of it. Raises UsageError if that is damaged."""
     try:
         content = parse_json((folder / RIG_FILE).read_text(encoding="utf-8"))
         return Identity(**{**content, "reasons": tuple(content["reasons"])})
@@ -73,7 +73,7 @@ class CalibrationResult:
     line: the result in one line, such as 'at 5 m: 8 mm, 6 of them from the baseline'.
     figures: for people, (name, text).
     summary: for programs; the content of summary.json.
-    model: the calibrated or checked model; None if only a camera was calibrated.
+    model: the calibrated or checked model; None if only a camera was calibrated, or lags of no model.
     folder, calibration: where they were written; None if they were not.
     """
 
@@ -115,7 +115,7 @@ class Session:
     ) -> None:
         """Claim the folder; None writes nothing. Raises UsageError if it cannot be claimed.
 
-        board: what the views show. tell: gets a line on each. of_camera: digests of those that a camera was made of.
+        board: what the views show. tell: gets a line on each view. of_camera: digests of a camera's views.
         """
         self.views: list[View] = []
         self.refused: dict[str, Degenerate] = {}
@@ -169,7 +169,8 @@ class Session:
         identity: Identity | None = None,
         source: Path | None = None,
     ) -> None:
-        """Add a view from a file or run under a name of its own. Raises UsageError for one that would count twice."""
+        """Add a view from a file or run under a name of its own. Raises UsageError for one that would count
+        twice or is of another rig, and if it cannot be written."""
         self._require_new(view, str(source or view.name))
         if view.name in [known.name for known in self.views]:
             view = replace(view, name=f"{view.name}-{len(self.views)}")
@@ -222,7 +223,7 @@ class Session:
     def finish(
         self, command: str, result: CalibrationResult, report: Report, made_from: LoadedCalibration | None = None
     ) -> CalibrationResult:
-        """Write the result with its model, if it has one, and notes on the calibration that was made from.
+        """Write the result with its model, if it has one, and notes on the calibration that it was made from.
 
         Returns the result with its whole summary and with the paths of what was written.
         """

@@ -1,7 +1,7 @@
 """Reads the inputs of a calibration: sources of views, files and quantities. All problems are listed together.
 
 A source is a live or simulated rig, a recorded run, a session with views kept earlier, or a file of pictures.
-`known_camera` decides by its verdict whether a separately calibrated camera may be used to calibrate the planes.
+`known_camera` decides whether a separately calibrated camera may, by its verdict, be used to calibrate the planes.
 """
 
 import os
@@ -117,7 +117,8 @@ _QUANTITIES = {
 
 
 def si_values(request: CalibrationRequest) -> dict[str, float]:
-    """The quantities that a request states, in SI units. Raises UsageError with a line for each that cannot be used."""
+    """The quantities that a request states, in SI units. Raises UsageError with a line for each that is wrong,
+    and for wrong exposures, poses and seeds."""
     exposures, poses = getattr(request, "exposures", ()), getattr(request, "poses", 1)
     problems = [f"exposures has {k}; it must be at least 1" for k in exposures if k < 1]
     if poses < 1:
@@ -141,8 +142,8 @@ def si_values(request: CalibrationRequest) -> dict[str, float]:
 
 
 def known_camera(file: Path, *, accept: bool = False) -> tuple[KnownCamera, list[Refusal]]:
-    """Read a camera file; returns also the reasons in spite of which it is used. Raises UsageError if its verdict
-    failed, unless `accept`. A file without a verdict is used unchecked.
+    """Read a camera file, and return also the reasons in spite of which it is used. Raises UsageError if its verdict
+    failed, unless `accept`, and CalibrationError if it is no such file. Without a verdict it is used unchecked.
     """
     known = load_camera(file)
     found = failed_verdict(known.verdict, known.reasons)

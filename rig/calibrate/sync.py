@@ -97,8 +97,8 @@ def calibrate_sync(
 ) -> CalibrationResult:
     """Measure the mirror's lag in each direction and the rows' delay from one unmoved scene (`rig calibrate sync`).
 
-    The lags are put into a copy of the model, if there is one. Raises Degenerate or CalibrationError if they cannot be
-    determined.
+    The lags are put into a copy of the model, if there is one. Raises Degenerate if they cannot be determined,
+    CalibrationError for a model that cannot be used, UsageError for a wrong request.
     """
     request = replace(request or SyncRequest(), **changes)
     values = si_values(request)
@@ -149,7 +149,7 @@ def _own(live: RigConfig | None) -> LoadedCalibration | None:
     try:
         return live.calibration, load_rig_model(live.calibration)
     except CalibrationError:
-        return None  # what is wrong with it says the command that needs it
+        return None  # the command that needs it says what is wrong with it
 
 
 def _signed(model: RigModel, gate: GateDelay | None, verdict: Verdict) -> RigModel:
@@ -225,7 +225,7 @@ def gate_delay(run: Path) -> GateDelay | None:
 
 
 def _edge(ones: Array, middle_s: Array, late_s: Array, plan: ScanPlan, *, rises: bool) -> Edge | None:
-    """The edge at delays (delays,) among frames near its plan at 0, by `_ones` and middles; None: some are missing."""
+    """The edge, tried at delays (delays,), from `_ones` and middles (frames,) around its plan at 0; None: too few."""
     frame_s = float(1 / plan.frame_rate_hz)
     near = np.abs(middle_s) < AROUND_FRAMES * frame_s
     if min((near & (middle_s < 0)).sum(), (near & (middle_s > 0)).sum()) < LEAST_FRAMES:
@@ -266,7 +266,7 @@ def _sweeps(run: Path, plan: ScanPlan) -> list[tuple[int, Array, Array]]:
 
 
 def _ones(block: FrameBlock) -> Array:
-    """Ones of a frame, of it and the next, of it and the one after: (frames, 3), NaN where these do not follow."""
+    """(frames, 3): pixels that fired in a frame, also in the next one, also in the next but one; NaN without these."""
     bits, x0 = block.bits, block.records["x0"]
     ones = np.full((len(bits), 3), np.nan)
     for apart in range(3):

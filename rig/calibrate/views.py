@@ -54,9 +54,9 @@ def require_poses(session: Session, poses: int) -> None:
 
 
 def good_poses(config: RigConfig, board: Board, poses: int, at_m: float, seed: int, behind: int = 0) -> ChoosePose:
-    """Chooses poses that tell most about any rig, one after the other, with some to spare.
+    """Return a choice of poses that tell most about any rig, one after the other, with some to spare.
 
-    behind: number of poses of the sequence already shown.
+    behind: number of poses of the sequence already shown. Raises UsageError if no pose fits the picture.
     """
     choices = candidates(first_camera(config), board, config.scan.depth_range)
     if not choices:
@@ -172,7 +172,7 @@ def _pictured(file: Path, board: Board | None) -> tuple[View, Degenerate | None]
 def refusal(
     refused: Degenerate, session: Session, board: Board, *, photons: bool = True, line: bool = True
 ) -> Degenerate:
-    """The error for views that give no calibration, with its root cause, and everything else in notes.
+    """The error for views that give no calibration, with its root cause, and the other reasons in notes.
 
     The other arguments are as in `judge_refused`.
     """
