@@ -216,9 +216,7 @@ def _bins(geometry: SweepGeometry) -> tuple[float, float]:
     return w_lo, (BINS - 1) / (w_hi - w_lo)
 
 
-def start_model(
-    volume: CountVolume, geometry: SweepGeometry, ambient: Float32, extinction_per_m: float
-) -> RowModel:
+def start_model(volume: CountVolume, geometry: SweepGeometry, ambient: Float32, extinction_per_m: float) -> RowModel:
     """Row model with haze of a guessed extinction that matches the mean level of the nearest pixels."""
     w_lo, per_w = _bins(geometry)
     path_m = 1.0 / (w_lo + np.arange(BINS) / per_w)
