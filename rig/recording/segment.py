@@ -122,7 +122,7 @@ def paged(size: int) -> int:
 
 
 def _pieces(block: FrameBlock, staging: Staging) -> list[memoryview]:
-    """The bytes of a block with its padding: whole pages of pixels in place if aligned, the rest copied to `staging`."""
+    """A block's bytes with its padding: whole pages of pixels in place if aligned, the rest copied to `staging`."""
     *front, bits, tail = block_parts(block)
     front_bytes = sum(len(part) for part in front)
     before = min(paged(front_bytes) - front_bytes, len(bits))
