@@ -77,7 +77,7 @@ class GateProgram:
 
     def levels(self, from_s: float, until_s: float) -> tuple[Array, NDArray[np.int64]]:
         """Level changes before until_s, beginning with the one that set the level at from_s: times (n,) and output
-        words (n,). Before the program starts the level is 0, from from_s on.
+        words (n,). If the program starts later, the first is 0 at from_s.
         """
         times = np.array(self._times)
         first = max(int(np.searchsorted(times, from_s, side="right")) - 1, 0)
