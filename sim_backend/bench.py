@@ -26,8 +26,9 @@ class BenchState:
 
     mirror: (n,) mirror position, as a command, in the middle of each exposure. velocity_per_s: (n,) its velocity, NaN
     if unknown. share: (n,) part of the exposure with the gate high. edge: (n,) bool, whether the gate changed during
-    the exposure. backward: (n,) bool, direction level at the start. line_s, scan_s: times of marker edges. power_w:
-    emitted power, 0 while paused. jitter: (n,) or 0, the mirror's deviation from that position.
+    the exposure. backward: (n,) bool, direction level at the start. line_s, scan_s: times of the markers' rising edges
+    in these frames. power_w: power behind an open gate, 0 while paused. jitter: (n,) or 0, how far the mirror is off
+    `mirror`.
     """
 
     mirror: Array
@@ -76,22 +77,22 @@ class Bench:
             self._motion = resting(command)
 
     def moving(self) -> bool:
-        """Whether a waveform is being played."""
+        """Whether a waveform is being played or is about to start."""
         with self._lock:
             return self._motion.moving(self.now_s())
 
     def mirror(self) -> float:
-        """Present position of the mirror, as a command."""
+        """Present position of the mirror, as a command, without its jitter."""
         with self._lock:
             return float(self._motion.mirror(np.array([self.now_s()]))[0])
 
     def emit(self, power_w: float) -> None:
-        """Set the laser's power behind the gate; 0 means no emission."""
+        """Set the laser's power in W behind an open gate; 0 means no emission."""
         with self._lock:
             self._power_w = power_w
 
     def run_program(self, pulses: Sequence[Pulse], repeats: int) -> None:
-        """Start a program of gate words now."""
+        """Start a program of pulses, played `repeats` times, now."""
         with self._lock:
             self._aborted = False
             self._program = GateProgram(pulses, repeats, self.now_s())

@@ -35,9 +35,9 @@ Wanted = Literal["planned", "all"] | tuple[str, ...]
 MOST_CHANGED = 0.01
 """Share of decisions that may change by all that is left out: eps = 2e-4."""
 MOST = PlannedFor(power_w=1.0, exposure_s=1e-3, exposures=100)
-"""Plan where nobody says what is to be scanned: more than a line laser and an ordinary scan have."""
+"""Planned for where nobody says what is to be scanned: more than a line laser and an ordinary scan have."""
 SAFETY = 2.0
-"""Safety factor on the mean over sampled rows: their spread over rows and columns is less."""
+"""Safety factor on the mean over sampled rows and columns: the spread over them is less."""
 SAMPLED_COLUMNS, SAMPLED_BANDS, BAND_ROWS = 16, 4, 8
 
 
@@ -86,7 +86,7 @@ def plan_effects(
 
 
 def is_active(name: str, wanted: Wanted) -> bool:
-    """Whether an effect is to be run if the scene calls for it."""
+    """Whether an effect is wanted if the scene calls for it; with `planned` it may still prove negligible."""
     return wanted in ("planned", "all") or name in wanted
 
 
@@ -128,7 +128,8 @@ class _Bounds:
         self._seconds, self._joules = planned_for.exposure_s, planned_for.exposure_s * planned_for.power_w
         light = [name for name, effect in model.laser.items() if name != MEASURED and hold_s(effect) == 0]
         self.names = (*light, *model.steady)
-        """Names of the effects that can be bounded: light that stands still, and dark counts."""
+        """Names of the effects that can be bounded: laser light that stands still, except the stripe, and all that is
+        there without the laser."""
         view = model.setting.view
         self._bands = _bands(view.rows)
         self._sheets = [empty_sheet(plane, view.rows) for plane in planes] if light else []
@@ -164,7 +165,7 @@ class _Bounds:
 
 
 def _changed(change: Array, least: Array) -> Array:
-    """The bound above per row for photons (..., width) of a column: by how much they change, and the least they are."""
+    """The module's bound for each row (...), from a change and the least of a column's photons, both (..., width)."""
     small = change < least
     spread = np.divide(change * change, least, out=np.zeros_like(change), where=small)
     return np.asarray(0.5 * np.sqrt(spread.sum(axis=-1)) + np.where(small, 0.0, change).sum(axis=-1))

@@ -37,7 +37,7 @@ def effects_report(world: "SimulatedWorld", *, power_w: float, exposure_s: float
     changed_decisions_bound: for all effects left out together. effects: one mapping for each of the catalogue, with
     effect, on, why, share (of the detected photons, before saturation, over 16 mirror positions),
     changed_decisions_bound (None: unknown), removable (whether the world can do without it), cost_us_per_frame (None:
-    it is part of another effect).
+    it is part of a device, of another effect or of the gain).
     """
     plan, model = world.effect_plan, world.flux_model
     photons, laser_us = _light(world, model, power_w * exposure_s, exposure_s, exposures)
@@ -116,8 +116,8 @@ def _took_s(work: Callable[[], object]) -> float:
 def _parts(
     model: FluxModel, sheet: LightSheet, first_row: int, last_row: int, kind: type[np.floating[Any]] = np.float64
 ) -> dict[str, tuple[Array, float]]:
-    """The light that each effect of the laser adds, detections per second and watt (rows, width), and the seconds it
-    took.
+    """The light that each effect of the laser adds, detections per second and watt (their rows, width), and the seconds
+    it took.
     """
     rate: Any = np.zeros(model.steady_per_s.shape, kind)
     parts = {}

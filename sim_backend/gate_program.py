@@ -30,7 +30,7 @@ class GateProgram:
 
     @property
     def ended(self) -> bool:
-        """Whether the last word is over, at the time to which the program was advanced."""
+        """Whether the last word is over, at the time to which the program was advanced, or the program aborted."""
         return self._words_left == 0
 
     @property
@@ -58,7 +58,7 @@ class GateProgram:
             self._set(end_s, 0 if self.ended else self._pulses[self._index].outputs & self._mask)
 
     def _set(self, at_s: float, level: int) -> None:
-        """The outputs from then on. A level that lasts no time, as of a wait that passes at once, is none."""
+        """Set the outputs from `at_s` on. Drop a level that lasted no time, as in a wait that passed at once."""
         if self._times[-1] == at_s and len(self._times) > 1:
             del self._times[-1], self._levels[-1]
         if level != self._levels[-1]:
@@ -76,8 +76,8 @@ class GateProgram:
         self._cut(at_s, lambda level: 0)
 
     def levels(self, from_s: float, until_s: float) -> tuple[Array, NDArray[np.int64]]:
-        """Level changes up to until_s, beginning with the one that set the level at from_s: times (n,) and output words
-        (n,).
+        """Level changes before until_s, beginning with the one that set the level at from_s: times (n,) and output
+        words (n,). If the program starts later, the first is 0 at from_s.
         """
         times = np.array(self._times)
         first = max(int(np.searchsorted(times, from_s, side="right")) - 1, 0)

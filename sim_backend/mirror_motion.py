@@ -109,7 +109,7 @@ class Playing:
         return times[(times >= from_s) & (times < until_s)]
 
     def moving(self, time_s: float) -> bool:
-        """Whether the last point has still to be played. A waveform counts as under way even before its start."""
+        """Whether the last point has not ended yet. A waveform counts as under way even before its start."""
         return time_s < self.end_s
 
     def _command(self, time_s: Array) -> Array:

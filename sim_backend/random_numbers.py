@@ -16,8 +16,7 @@ k = round(t) and f = k - t, |f| <= 1/2:  2^-t = 2^-k 2^f, the latter by its Tayl
 digits: for `power_of_half` 3e-13 (series to f^10) and the effect of rounding t; for `one_minus_exp_minus` 4e-16 (to
 r^13, with r = f ln 2 in two parts). `one_minus_exp_minus_32` is a float32 version for uses where six digits suffice.
 The numbers that loops need come as a tuple from the kernel's caller (`HALVING`, `ROUGHLY`). If they were constants,
-LLVM
-would load them anew for every vector: 24 of the 59 instructions of a loop over `power_of_half`.
+LLVM would load them anew for every vector: 24 of the 59 instructions of a loop over `power_of_half`.
 """
 
 import math
@@ -64,7 +63,7 @@ _Code = tuple[Any, Callable[[Any, Any, Any, Any], Any]]
 
 
 def _has(feature: str) -> bool:
-    """Whether numba compiles for a processor with it: this one, unless its settings name another."""
+    """Whether numba compiles for a processor with the feature: this one, unless numba's settings name another."""
     settings: Any = config
     if settings.CPU_NAME is None and settings.CPU_FEATURES is None:
         return bool(binding.get_host_cpu_features().get(feature, False))
@@ -173,7 +172,7 @@ def _packed(builder: Any, pixels: list[Any]) -> Any:
 
 
 def _levels_at(builder: Any, address: Any) -> list[Any]:
-    """The levels of a word."""
+    """Load the levels of a word, as vectors of 16, from its address."""
     pointer, found = builder.inttoptr(address, _PIXELS.as_pointer()), []
     for part in range(WORD_PX // _VECTOR_PX):
         found.append(builder.load(builder.gep(pointer, [ir.Constant(_I64, part)])))
@@ -304,7 +303,7 @@ def _power_of_half(typing: Any, rounded: Any) -> _Code:
 
 @numba.njit(inline="always", error_model="numpy")
 def power_of_half(t, halving):  # type: ignore[no-untyped-def]
-    """2^-t for t >= 0. halving: `HALVING` of its precision."""
+    """2^-t for t >= 0. halving: `HALVING` of the precision of t."""
     most, rounder, e0, e1, e2, e3, e4, e5, e6, e7, e8, e9, e10 = halving
     t = min(t, most)
     rounded = t + rounder

@@ -67,15 +67,15 @@ class WorldConfig(KindConfig):
 
     kind: str = "simulated"
     geometry: str | None = None
-    """Rig-model file of the rig as it really is; the bundled simulated rig by default. Light that bows, passes the
-    axis or turns on a cone, and rows that are late, are simulated where this file has them.
+    """Rig-model file of the rig as it really is; the bundled simulated rig by default. Sheets that bow, pass beside the
+    mirror's axis or touch a cone, and rows that are exposed late, are simulated where this file has them.
     """
     scene: str = "street"
     """A bundled scene's name, a scene file, or a folder of surfaces."""
     fog: Annotated[str | None, BeforeValidator(_known_fog)] = None
     """Visibility in the scene's air, in place of the scene's own: a distance such as `20 m`, or `clear`."""
     board_pose: BoardPlace | None = None
-    """Pose of the scene's calibration board, in place of the scene's own."""
+    """Pose of the scene's (first) calibration board, in place of the scene's own."""
     optics: Optics = Field(default_factory=Optics)
     sensor: Sensor = Field(default_factory=Sensor)
     line: Line = Field(default_factory=Line)
@@ -83,7 +83,7 @@ class WorldConfig(KindConfig):
     """Effects that are simulated, of those that the scene calls for: all but those that provably change next to nothing
     (`planned`), `all`, or a list of names (for ablations)."""
     command_grid: CommandGridConfig | None = None
-    """Columns in which the flux is held, for use without an application that says `hold_columns`."""
+    """Columns in which the flux is held, for use without an application that calls `hold_columns`."""
 
     @property
     def has_board(self) -> bool:
@@ -95,7 +95,7 @@ class SimulatedWorld:
     """One scene, one rig, one bench. Reading is safe from any thread."""
 
     def __init__(self, config: WorldConfig, surroundings: Surroundings) -> None:
-        """Raises DeviceError if the geometry, the scene or the focus cannot be used."""
+        """Raises DeviceError if the geometry, the scene, its board's pose or the focus cannot be used."""
         self.config = config
         wrong: list[str] = []
         try:
@@ -178,7 +178,8 @@ class SimulatedWorld:
         """Project several lines, each at one of these offsets (in units of the mirror command) from where a single line
         would be.
 
-        shared: whether they share the laser's power; else each has all of it. Call it before the SPAD is configured.
+        shared: whether they share the laser's power; else each has all of it. Call it before `plan_for` and before
+        the SPAD is configured.
         """
         self.fan = LineFan(tuple(offsets), 1 / len(offsets) if shared else 1.0)
 
@@ -194,7 +195,7 @@ class SimulatedWorld:
         """Let no more light in. Only the sensor's own counts are left, and none of its effects is left out, however
         small.
 
-        Call it before the SPAD is configured; it cannot be undone.
+        Call it before the SPAD is configured. Only `plan_for` with other values than before undoes it.
         """
         kept = [entry for entry in CATALOGUE if entry.of_sensor or entry.kind == "bits"]
         wanted = [e for e in kept if e.called(self.setting)[0] and is_active(e.name, self.config.effects)]

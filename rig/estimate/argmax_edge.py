@@ -2,8 +2,9 @@
 
 `argmax` takes the largest count inside the window, and the smallest x among equal ones. `edge` fits an exponential
 background to the near side of the row and takes the largest (count - background), weighted with the drop of the level
-from the 8 px before to the 8 px behind. Counts are integers (columns, rows, window); answers are float32 (rows,
-columns), refined to sub-pixel positions with the two neighbours. Neither uses a model or learns one.
+from the 8 px before to the 8 px behind, and then the largest count within 2 px of it. Counts are integers (columns,
+rows, window); answers are float32 (rows, columns), refined to sub-pixel positions with the two neighbours. Neither uses
+a model or learns one.
 """
 
 from dataclasses import dataclass
@@ -32,7 +33,7 @@ NEAR_SHARE: Final = 0.25
 def sub_pixel(weight: Float64, peak: int, length: int) -> float:
     """Sub-pixel offset of the peak, -0.5 to 0.5 px: centroid of the peak and its neighbours above the lower of these.
 
-    It is 0 where all three are equal, and at the end of the row.
+    It is 0 where all three are equal, and at either end of the row.
     """
     if peak <= 0 or peak >= length - 1:
         return 0.0
@@ -48,9 +49,9 @@ def sub_pixel(weight: Float64, peak: int, length: int) -> float:
 def peak_confidence(weight: Float64, counts: Float64, k: float, peak: int, length: int) -> tuple[float, float]:
     """(P(the true peak is within 1 px of `peak`), mean count away from it).
 
-    The row is modelled as 'one pixel at the peak's rate, the others at the mean rate of the rest', whose likelihood at
-    x is weight[x] (logit p_peak - logit p_rest) + k log((1 - p_peak) / (1 - p_rest)). The alternative 'no stripe' has
-    the prior NO_STRIPE. Half a count keeps rates off 0 and 1. A row without a count has no stripe.
+    The row is modelled as 'one pixel at the peak's rate, the others at the mean rate of the rest'. Over k frames the
+    log-likelihood ratio of a stripe at x to 'no stripe', of prior NO_STRIPE, is weight[x] (logit p_peak - logit p_rest)
+    + k log((1 - p_peak) / (1 - p_rest)). Half a count keeps rates off 0 and 1. (0, 0) if the peak has no count.
     """
     if counts[peak] <= 0.0:
         return 0.0, 0.0
@@ -83,7 +84,8 @@ def peak_confidence(weight: Float64, counts: Float64, k: float, peak: int, lengt
 
 @numba.njit(cache=True, nogil=True)
 def _near_fit(n: Float64, length: int) -> tuple[float, float]:
-    """Level and decay per pixel of an exponential through the near part of a row, by its two halves' sums."""
+    """Level at the nearest pixel and decay per pixel, at least 0, of an exponential through the near part of a row, by
+    that part's two halves' sums. (0, 0) if the row is too short or the nearer half has no count."""
     half = max(int(length * NEAR_SHARE) // 2, 2)
     if 2 * half > length:
         return 0.0, 0.0
@@ -106,9 +108,9 @@ def peak_rows(
     counts: Counts, n_frames: Int32, x0: Int32, x_lo: Int32, x_hi: Int32, near_is_left: bool, defects: Bools,
     with_edge: bool, first_row: int, last_row: int, out: Float32,
 ) -> None:  # fmt: skip
-    """Run `argmax` (with_edge False) or `edge` on rows first_row..last_row-1; out: (5, rows, columns) as in
-    StripeTable.
-    """
+    """Run `argmax` (with_edge False) or `edge` on rows first_row..last_row-1.
+
+    out: (5, rows, columns) as in StripeTable, left as it is where a column has no frames or a row no window."""
     window = counts.shape[2]
     n = np.empty(window + 2 * MARGIN_PX, np.float64)
     score = np.empty(window + 2 * MARGIN_PX, np.float64)
@@ -169,7 +171,7 @@ def peak_rows(
 def _edge_scores(n: Float64, begin: int, length: int, background: float, decay: float, score: Float64) -> None:
     """(count - background) times the drop of the mean level from the 8 px before to the 8 px behind, both cut at 0.
 
-    n: counts with whatever lies beyond the window; score (length,) is of pixels begin..begin + length - 1.
+    n: counts, also beyond the window. score: its first `length` values become those of pixels begin, begin + 1, ...
     """
     for t in range(length):
         at = begin + t
@@ -190,7 +192,7 @@ def _edge_scores(n: Float64, begin: int, length: int, background: float, decay: 
 
 @numba.njit(cache=True, nogil=True)
 def _flux(count: float, k: float) -> float:
-    """Photons per exposure from a mean count over k exposures, finite at saturation."""
+    """Photons per exposure from the count of k exposures together, finite at saturation."""
     return float(np.log1p(count / (k - count + 0.5)))  # ln((k + 0.5) / (k - count + 0.5)), exact for few counts too
 
 

@@ -1,6 +1,6 @@
 """Filter `median`: the report's 5x5 median, applied to disparity so that the slant of columns does not matter.
 
-Disparity is x minus the mean position of its column. Missing answers (NaN) are ignored and not filled in.
+Disparity is x minus the position of the column's line at a fixed depth. Missing answers (NaN) are ignored, not filled.
 """
 
 from dataclasses import replace
@@ -20,7 +20,7 @@ SURE = np.float32(0.999999)
 
 @numba.njit(cache=True, nogil=True)
 def _median_rows(disparity: Float32, confidence: Float32, coupled: bool, out: Float32) -> None:
-    """Write median, agreement and standard deviation of every answer to out (3, rows, columns)."""
+    """Write every answer's median disparity, confidence and standard deviation to out (3, rows, columns)."""
     rows, columns = disparity.shape
     values = np.empty((2 * REACH + 1) ** 2, np.float32)
     weights = np.empty((2 * REACH + 1) ** 2, np.float32)
@@ -59,12 +59,13 @@ def _median_rows(disparity: Float32, confidence: Float32, coupled: bool, out: Fl
 
 
 def median_filter(stripes: StripeTable, reference_px: Float64, *, coupled: bool = False) -> StripeTable:
-    """Stripe table with x_px replaced by the 5x5 median of its disparity; reference_px (rows, columns), NaN allowed.
+    """Stripe table with x_px from the 5x5 median of its disparity, and with confidence and x_sd_px to match.
 
-    The reference is the position of the column's line at a fixed depth. Confidence becomes the share of the neighbours'
-    confidence that lies within 1 px of the median, times the probability that at least one of those is right. For
-    coupled answers their mean confidence takes the place of that probability, since answers that influence each other
-    also agree where nothing is lit. x_sd_px becomes the standard deviation of a median of those neighbours.
+    reference_px: (rows, columns), the position of the column's line at a fixed depth; an answer with NaN there is lost.
+    Confidence becomes the share of the neighbours' confidence that belongs to answers within 1 px of the median, times
+    the probability that at least one of those is right. For coupled answers their mean confidence takes the place of
+    that probability, since answers that influence each other also agree where nothing is lit. x_sd_px becomes the
+    standard deviation of a median of those answers.
     """
     reference = reference_px.astype(np.float32)
     out = np.full((3, *stripes.x_px.shape), np.nan, np.float32)

@@ -62,7 +62,7 @@ class LearnsFromStream(Estimator, Protocol):
     """An estimator in LEARNING. Its model can be set, to continue from a kept state."""
 
     model: Any
-    """The state that the next map will be estimated with, None before a map that taught."""
+    """The state that the next map will be estimated with, None until a map has taught one."""
 
 
 def recalling(name: str, learned: Sequence[Learned], threads: int = 2, *, temporal_prior: bool = False) -> Estimator:
@@ -73,7 +73,7 @@ def recalling(name: str, learned: Sequence[Learned], threads: int = 2, *, tempor
 def create_estimator(name: str, threads: int = 2, *, temporal_prior: bool = False) -> Estimator:
     """A fresh estimator of a name in ESTIMATORS, for up to `threads` threads; KeyError for any other name.
 
-    temporal_prior: whether `joint` uses the last map as a weak prior; the others estimate every map by itself.
+    temporal_prior: whether `joint` uses the last map as a weak prior; the others ignore it.
     """
     if name in LEARNING:
         return _learning(name, threads, learns=True, temporal_prior=temporal_prior)
@@ -94,7 +94,7 @@ def _learning(name: str, threads: int, *, learns: bool, temporal_prior: bool) ->
 
 class Recalled:
     """Estimates each map with its own state, and further maps with the last one. of: an estimator that learns
-    nothing."""
+    nothing. states: at least one."""
 
     def __init__(self, of: LearnsFromStream, states: Sequence[Learned]) -> None:
         self._states, self._of = list(states), of

@@ -1,11 +1,11 @@
 """The simulated SPAD array: asks the bench what happened during its frames and draws them, block by block.
 
-On a `VirtualClock` time passes as frames are made; on any other clock a block comes when its last frame has been
-exposed.
+On a `VirtualClock` time passes as frames are made; on any other clock a block comes when the period of its last frame
+is over.
 
-On the way to the computer some frames are lost and replaced by a copy of the frame before, with its pixels, markers,
-counters and ticks. The copy's number is still the next one, since blocks count what they hold; only its ticks show the
-loss. The seed and the frame number determine which frames are lost.
+On the way to the computer some frames get lost, which leaves a gap. Others are replaced by a copy of the frame before
+in their block, with its pixels, markers, counters and ticks. The copy's number is still the next one, since blocks
+count what they hold; only its ticks show it. The seed and the frame number determine which frames are struck.
 
 The tick counter runs on its own crystal (`clock_error`, `clock_wander`), with a constant error and a random walk:
 
@@ -96,7 +96,7 @@ class TickClock:
     """
 
     def __init__(self, tick_s: float, start_s: float, error: float, wander: float, seed: list[int]) -> None:
-        """tick_s: nominal."""
+        """tick_s: the nominal time between ticks."""
         self._tick_s = tick_s
         self._step_ticks = max(1, round(STEP_S / tick_s)) if wander else np.iinfo(np.int64).max
         self._sd = wander * np.sqrt(self._step_ticks * tick_s)
@@ -123,12 +123,12 @@ class TickClock:
 
 
 TICK_HZ = 100_000_000
-"""Tick rate where it divides the frame period; else a multiple of the frame rate near it: nothing is rounded."""
+"""Tick rate if a frame period is a whole number of its ticks; else it is `TICKS_PER_FRAME` times the frame rate."""
 TICKS_PER_FRAME = 1024
 MAX_THREADS = 4
 START_BITS = 48
 MOST_STARTS = 0x3FFF
-"""Mask of the number of a start. Photons are drawn by the number of a frame: those of the second start are numbered
+"""Mask of the number of a start. Photons are drawn by the number of a frame: frames of the second start are numbered
 from 2^48 on, and so on."""
 
 
@@ -141,7 +141,7 @@ class SimulatedSpadConfig(KindConfig):
     max_frame_rate: Annotated[ExactHertz, Field(gt=0)] = Fraction(100_000)
     link: Annotated[BytesPerSecond, Field(gt=0)] = 8e9
     """Bytes a second that the link to the computer carries; where full frames are too much for it, windows are sent. By
-    default more than any frame rate needs."""
+    default more than 512 x 512 pixels at 100 kHz need."""
     lost_frames: tuple[int, ...] = ()
     """Numbers of frames that get lost on the way, to try gaps with."""
     loss_probability: float = Field(default=0.0, ge=0, le=1)
@@ -323,7 +323,7 @@ class SimulatedSpad(SpadArray):
     def _draw(
         self, state: BenchState, start_s: Array, x0: NDArray[np.int32], bits: NDArray[np.uint8], first: int = 0
     ) -> None:
-        """Draw the next frames, without the first few, into `bits`."""
+        """Draw the next frames, from number `first` of them on, into `bits`."""
         assert self._photons is not None, "configured before started"
         held, power_w = self._world.mirror_positions(state, self._period_s), state.power_w * state.share
         number = self._first_draw + self._next_frame + first

@@ -15,7 +15,7 @@ detection there falls into the blind part with probability
 
 If the pixel's bit is 1, these are the chances that its next bit is set or cleared: 5e-5 each with a = 0.5 %,
 tau = d = 100 ns and frames of 10 us without a gap. Later exposures, and afterpulses of afterpulses, are left out. Draws
-are exact. Cost per frame of 512 x 512: 0.8 us at these figures, and for each block the drawing of the frame before it.
+are exact. Cost per frame of 512 x 512: 0.8 us at these figures; the last frame of each gap is drawn, too.
 """
 
 import math

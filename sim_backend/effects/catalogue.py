@@ -10,7 +10,7 @@ from sim_backend.effects.setting import PlannedFor, Setting
 from sim_backend.light.optics import ambient_irradiance
 
 EffectKind = Literal["laser", "steady", "bits", "within"]
-"""Target of an effect: the sheet's light (`LaserEffect`); light or counts that are there without it, a function that
+"""Target of an effect: the sheet's light (`LaserEffect`); light or counts without the sheet, from a function that
 returns detections per second, float64 (rows, width); the sensor's bits (`BitEffect`); `within`: it is worked into a
 simulated device, another effect or the gain, which hold its code."""
 
@@ -20,8 +20,8 @@ class Entry:
     """One effect: its name, what it acts on, its factory as module:name ("" if it is part of another), and the rule
     that calls for it.
 
-    why(setting): the reason in words why it is called for, None where it is not; absent: then the reason why not, ""
-    where that is the sensor.
+    why(setting): the reason in words why the effect is called for, None if it is not. absent: the reason why not; ""
+    means that the sensor has no such effect.
     of_sensor: light or counts that stay under a covered lens.
     changes(setting, planned_for), in closed form: the largest share of decisions on a row and column that can differ
     without the effect (may exceed 1). None: there is no such form; the planner then evaluates light and dark counts,

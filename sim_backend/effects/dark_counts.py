@@ -1,7 +1,7 @@
 """Dark counts: detections without light, a rate per pixel whose distribution has a long tail of hot pixels.
 
     ordinary pixels: ln(rate / median) normal with sd 0.12
-    hot pixels:      P(rate > r median) = 0.01 (r / 10)^-0.7 from r = 2 on
+    hot pixels:      P(rate > r median) = 0.01 (r / 10)^-0.7 from r = 2 to 1e5, where rates end
 
 The figures are from a 512 x 512 binary SPAD (50 x 50 pixels, 7650 frames of 10 us; public data of LabPresse/SP2T.jl).
 Its shares of pixels above 2, 3, 5, 10, 30 and 100 times the median are 3.4, 2.2, 1.4, 1.0, 0.5 and 0.2 %; the formula

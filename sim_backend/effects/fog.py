@@ -6,7 +6,7 @@ With J = P/F the power per radian of fan and n.X = d the sheet, a ray q = (u, v,
 
 For a rectified rig all powers of z cancel: sigma_s p I0 du |q_p||q_c|/b exp(-sigma z (|q_p| + |q_c|)). The phase
 function p is constant (`backscatter`: scattering angles are all near 180 degrees) or a sum of Henyey-Greenstein terms
-at the cosine -(z q - S).q/(r |q|). The haze ends where the sheet's light ends: at the object, blurred like the stripe,
+at the cosine -(z q - S).q/(r |q|). The haze ends where the sheet's light ends: at the object, blurred by `sigma_px`,
 and in the sheet's own shadow along the row. `medium` switches it on.
 
 Along a row the loop over lit pixels has no branches, so it becomes vector instructions; only the pixels under the
@@ -74,8 +74,8 @@ def _add_haze(
     sheet: Traced, light: tuple[Any, ...], numbers: Numbers, first_row: int, last_row: int, rate: Array
 ) -> None:
     """Add the haze of a sheet. light: the sheet's planes, scale of each of them, halvings per m, sigma_px."""
-    # What arrays and tuples are asked for stands before the loops: within, each would be counted a reference. Numbers
-    # come from outside, too: written here they would be float64.
+    # Arrays and tuples are taken apart before the loops: within them, each access would count a reference. Numbers come
+    # from outside, too: written here they would be float64.
     _, _, x_stripe, x_end, start, step = sheet
     inverse, scales, halvings_per_m, sigma_px = light
     (u, v, q, source), terms, halving, (zero, unit, two, least) = numbers

@@ -1,13 +1,14 @@
-"""Light that the medium scatters more than once: a halo around the stripe, and a pedestal behind it.
+"""Light that the medium scatters more than once: a halo around the stripe, and a pedestal under the whole row.
 
 This is a fit to path tracing (walls at tau 0.5, 1 and 2, forward-peaked and isotropic), not a closed form:
 
     halo(r) = eta (e^(2 tau) - 1) k(r)    times the ballistic stripe, per pixel of row at the distance r from it
 
-where eta = 0.76 - 0.13 tau (0.7, 0.64, 0.5 at tau 0.5, 1, 2) if the medium scatters forward, and 0.12 + 0.06 tau, at
-most 0.18, if it scatters evenly; between the two it is interpolated by the mean cosine over 0.85. k has integral 1,
-half of it exponential of 1.7 degrees and half of 6 degrees (in pixels as in the middle of the picture). 2 tau is taken
-along the light's own way, without light that is turned only a little (`forward_share`), which blurs the stripe itself.
+where eta = 0.76 - 0.13 tau, at least 0.18 (traced: 0.7, 0.64, 0.5 at tau 0.5, 1, 2), if the medium scatters forward,
+and 0.12 + 0.06 tau, at most 0.18, if it scatters evenly; between the two it is interpolated by the mean cosine over
+0.85. k has integral 1, half of it exponential of 1.7 degrees and half of 6 degrees (in pixels as in the middle of the
+picture). 2 tau is taken along the light's own way, without light that is turned only a little (`forward_share`), which
+blurs the stripe itself.
 
 The haze, too, is scattered further: P = 0.16 (e^(1.5 tau) - 1) of its level at its end is added to everything behind
 it, and P (1 + 0.8 (1 - e^(-r / 6 degrees))) before it. 10 pixels before the stripe of the traced scene, P is 0.11, 0.23
@@ -89,7 +90,7 @@ def _add_side(level: float, a: float, b: float, narrow: Array, wide: Array, side
 
 @numba.njit(cache=True, nogil=True)
 def _add_halo(view: Arrays, sheet: Traced, parts: tuple[Any, ...], first_row: int, last_row: int, rate: Array) -> None:
-    """Add halo and pedestal. parts: scales of the light, of the two exponentials in px, and their tables."""
+    """Add halo and pedestal. parts: `_light`, `_scales_px` and `_tables` of `Halo`."""
     u, v, _, _, _, _, source = view
     inverse, offset_m, x_stripe, x_end, _, step = sheet
     (stripe_scale, haze_scale, extinction_per_m, scattering_per_m, peaked), scales_px, tables = parts

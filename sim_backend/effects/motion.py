@@ -33,13 +33,13 @@ class MovingSurfaces:
     """Makes the view at a time and keeps the latest ones, since threads that draw rows are at different times."""
 
     def __init__(self, velocity_m_per_s: Sequence[float]) -> None:
-        """velocity: x (right), y (down), z (away from the camera)."""
+        """velocity_m_per_s: along x (right), y (down), z (away from the camera)."""
         self._velocity = np.array(velocity_m_per_s, dtype=np.float64)
         self._lock = threading.Lock()
         self._views: dict[int, CameraView] = {}
 
     def view(self, still: CameraView, time_s: float) -> CameraView:
-        """The view at a given time."""
+        """The view at a given time of the bench, the same for `HOLD_S`. still: the view at time 0."""
         step = math.floor(time_s / HOLD_S + 1e-6)
         with self._lock:
             if step not in self._views:
@@ -58,7 +58,7 @@ class Motion:
         assert setting.view.motion is not None, "the world lets its surfaces move"
 
     def add(self, sheet: LightSheet, first_row: int, last_row: int, rate: Array) -> None:
-        """Add nothing. The effects that make the light ask `View.at` for the view."""
+        """Add nothing. The effects that make the light ask `CameraView.at` for the view."""
 
 
 def shifted(still: CameraView, shift_m: Array) -> CameraView:
@@ -70,9 +70,9 @@ def shifted(still: CameraView, shift_m: Array) -> CameraView:
 
 @numba.njit(cache=True, nogil=True)
 def _source(u: Array, v: Array, y: int, x: int, w: float, shift: Array) -> tuple[int, int]:
-    """Pixel (row, column) of the point at time 0 that a ray now sees at inverse depth w; -1: it was behind the camera.
-
-    The tangents are taken as linear over the way."""
+    """Pixel (row, column) of the point at time 0 that a ray now sees at inverse depth w. -1: it was behind the camera,
+    or the rays have no slope. The tangents are taken as linear over the way.
+    """
     rows, width = u.shape
     scale = 1.0 - shift[2] * w
     left, right, up, down = max(x - 1, 0), min(x + 1, width - 1), max(y - 1, 0), min(y + 1, rows - 1)
@@ -120,7 +120,7 @@ def _shift(
 
 @numba.njit(cache=True, nogil=True)
 def _uncover(u: Array, v: Array, known: NDArray[np.bool_], surface: Array, facet: Array, albedo: Array) -> None:
-    """Continue the farther of its two neighbours over what nothing is known of, along one row."""
+    """Continue the farther of the known surfaces on both sides over each unknown pixel of a row."""
     width = len(u)
     for x in range(width):
         if known[x]:

@@ -4,12 +4,12 @@ Sizes, extinction and fall speed are in `sim_backend.scenes.medium`. The sheet c
 particles (drops at 20 mm/h and 2 mm: 7 per m^2), whose brightness goes as 1/z^3. What rain takes out of the beam, next
 to nothing below 20 m, is in the extinction of stripe and haze. A flake is modelled as a diffuse sphere of albedo 0.9
 with 4.5 times its melted cross-section. Seen from the side it is lit from, it sends back 8/3 of the mean over all
-directions, which is eight times the light of a drop of equal melted diameter.
+directions, which is 8.6 times the light of a drop of equal melted diameter.
 
-A particle at X in a sheet of Gaussian thickness, s = n.X - d off its middle, gets J/r N(s; thickness/4) W/m^2 with
-J = P/fan, sends back that times its `back_m2_per_sr`, and is seen as a point of this intensity: a pixel of solid angle
-w sees the radiance I/(|X|^2 w). It is blurred like the line, and drawn as a streak of the length that it falls in
-`HOLD_S`.
+A particle at X in a sheet of Gaussian thickness, s = n.X - d off its middle, gets J/r N(s; sd) W/m^2 with J = P/fan and
+sd^2 = (thickness/4)^2 + (r spread/4)^2. It sends back that times its `back_m2_per_sr`, and is seen as a point of this
+intensity I: a pixel of solid angle w sees the radiance I/(|X|^2 w). It is blurred like the line, and drawn as a streak
+of the length that it falls in `HOLD_S`.
 
 The particles are a fixed set in the cone that the camera sees. Each keeps its depth; its direction moves with its speed
 and re-enters at the other side of the cone. So they are spread evenly at any time, and the time alone determines where
@@ -86,8 +86,8 @@ def _add_particles(
 ) -> None:
     """Add the particles' light to rows first_row..last_row-1 of `rate`.
 
-    particles: cone, z, back, at, per_s, normal of the sheet's planes, `line_width`. light: detections per second per
-    W/rad and W/(m^2 sr), extinction per metre, time, sigma of the sheet at the mirror and per metre.
+    particles: cone, z, back, at, per_s, normal of the sheet's planes, `line_width`. light: gain over
+    the fan's angle, extinction per metre, time, sd of the sheet at the mirror and its growth per metre from there.
     """
     u, v, _, _, _, _, source = view
     cone, depth, back, at, per_s, normal, width = particles
@@ -135,7 +135,7 @@ def _add_particles(
 
 
 MOST = 100_000
-"""Particles that are kept, on average."""
+"""Most particles that are kept, on average."""
 NEAREST_M, FARTHEST_M = 0.1, 10.0
 """Depths between which particles are made."""
 FAINTEST_MM, FAINTEST_AT_M = 0.5, 8.0
@@ -151,8 +151,8 @@ Precipitation = Rain | Snow
 class Particles:
     """n particles in the cone ((2, 2): low and span of the tangents u and v).
 
-    z_m, back_m2_per_sr: (n,). at, per_s: (n, 2), position along u and v at time 0 and speed, as shares of the cone's
-    width.
+    z_m, diameter_mm (melted), back_m2_per_sr: (n,). at, per_s: (n, 2), position along u and v at time 0 and speed, as
+    shares of the cone's width.
     """
 
     cone: Array

@@ -104,8 +104,7 @@ class Defects:
     has 4 % of defective pixels (crop of 254 x 496, public data of wision-lab/photoncube) without clusters: pairs of
     neighbours are as frequent as by chance (0.98 times along the row, 0.92 along the column, each +-0.07). So a pixel
     is dead with probability `dead_share`, hot with `hot_share`, never both, and independent of all others; `pixel_seed`
-    determines which ones. Diodes that fire too often are the tail of the dark counts. Cost per frame of 512 x 512: 3
-    us.
+    determines which ones. Diodes that fire too often are the tail of the dark counts. Cost: 3 us per 512 x 512 frame.
     """
 
     reads_before = False
@@ -128,9 +127,9 @@ class BitErrors:
 
     Acts on the bits as they are read, after all other effects. These errors happen inside the sensor, between the
     pixels and the logic that packs frames. Checksums are computed from the wrong bits, so neither a CRC nor a
-    recording's `verify` detects them. Errors after the checksum, on the cable, are those of
-    `sim_backend.wire.serve.wire_server`. Exact; cost
-    per frame of 512 x 512: 5 us at 0.1 %, in proportion to e.
+    recording's `verify` detects them. Errors after the checksum, on the cable, are not
+    simulated; tests make them with `SpbUsbModel.mangle`. Exact; cost per frame of 512 x 512: 5 us at 0.1 %, in
+    proportion to e.
     """
 
     reads_before = False

@@ -69,7 +69,7 @@ class BitEffect(Protocol):
     """A change that the sensor makes to the photons' bits."""
 
     reads_before: bool
-    """Whether `before` is read: what one frame does to the next costs the frame before each block's first."""
+    """Whether `before` is read. If so, the last frame of every gap is drawn, too, though nobody receives it."""
 
     def apply(self, seed: np.uint64, first_frame: int, words: Words, before: Words, times: FrameTimes) -> None:
         """Change whole frames first_frame, first_frame + 1, ... in place: `words` (frames, rows, words) uint64 in

@@ -11,7 +11,7 @@ with n.X taken on the surface along the row. For a rectified rig this is the cam
 facet m.X = 1 through the point: |N.e| = |1 - m.S|/(|m| r) for a source at S. The profile across the row is a Gaussian
 integrated over each pixel, of the width that `sim_backend.light.line` gives.
 
-Half of what droplets take out of the beam (`medium: {forward_share: 0.5}`) is diffraction within 1 to 2 degrees. The
+Half of what droplets take out of the beam (`forward_share` f = 0.5) is diffraction within 1 to 2 degrees. The
 stripe's extinction counts it as lost; `ForwardBlur` brings it back as a wider copy. On a path of length l the number of
 such deflections is Poisson of mean t = f sigma_s l, so the extra light is exp(t) - 1 times the ballistic light. A
 deflection by an angle of standard deviation s per axis, at the share x of the path to or from the surface, shifts the

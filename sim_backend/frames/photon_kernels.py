@@ -40,13 +40,13 @@ from sim_backend.random_numbers import (
 
 LEVELS = 2**16
 NEVER = LEVELS // 2 - 1
-"""Level 0 as it is stored: a level is stored as this minus itself, the highest one is -32768."""
+"""Level 0 as it is stored: `NEVER` minus the level is stored, so the highest level is -32768."""
 CHANCE = 3.0 / LEVELS
 """Chance of a pixel to be drawn anew."""
 _LEVELING = tuple(np.float32(x) for x in (NEVER + 1.5, LEVELS / (1.0 - CHANCE), NEVER - LEVELS + 1, NEVER))
-"""Offset, slope, least and largest: what is stored is the offset minus the slope times p, within 16 bits, without its
-fraction. So the level is half of one at least inside its interval, on both sides. Where it is the highest of 16 bits,
-2^16 is within the interval, too."""
+"""Offset, slope, least and largest: the offset minus the slope times p is stored, within 16 bits, without its
+fraction. So the level lies at least half a level inside its interval, on both sides. Where it is the highest of 16
+bits, 2^16 is within the interval, too."""
 _TOGETHER = 8
 _KEY_ROWS, _ROW_SHIFT = 8, 16
 """Rows that share a key, and where their number stands in that of a block."""
@@ -85,7 +85,7 @@ def set_levels(
     steady: Single, rate: Single, exposure_w_s: float, rows: Rows, dark: Levels, lit: NDArray[np.bool_],
     levels: Levels,
 ) -> None:  # fmt: skip
-    """Levels of rows for p = 1 - exp(-(steady + exposure_w_s rate)).
+    """Set the levels of rows, in place, for p = 1 - exp(-(steady + exposure_w_s rate)).
 
     steady: photons per exposure; rate: per second and watt, both (rows, width), not negative; exposure_w_s: power times
     time. Words of 64 pixels before the first and after the last with light take their levels from `dark`, unless that

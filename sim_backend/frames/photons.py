@@ -2,11 +2,10 @@
 
 Consecutive frames with the same light (one mirror position, power and time) form a span. For a span the sheet is
 traced, its flux summed and p turned into levels; then each frame is drawn from the levels. Rows are split over threads,
-each of which goes through all spans of a block by itself; every step works row by row, so the split does not matter.
-The sensor's effects on bits act on whole frames, and windows are cut out afterwards. Measured for 512 x 512, the street
-in
-fog: 12 us a frame and 0.45 ms per mirror position on one core, 6.4 us and 0.26 ms on two
-(`python -m tests.benchmarks.simulator`).
+each of which goes by itself through all spans of a block (of one time, if things move); every step works row by row, so
+the split does not matter. The sensor's effects on bits act on whole frames, and windows are cut out afterwards.
+Measured for 512 x 512, the street in fog: 12 us a frame and 0.45 ms per mirror position on one core, 6.4 us and 0.26 ms
+on two (`python -m tests.benchmarks.simulator`).
 """
 
 from collections.abc import Callable, Iterable
@@ -34,7 +33,8 @@ _SLACK = 1e-6
 @dataclass(frozen=True, slots=True, eq=False)
 class _Span:
     """Frames first..last-1 of a block. moment_s: time of the bench, for what moves. power_w: 0 in the dark. sheets: of
-    all lines, still to be traced; None if those of the span before hold. fresh: whether levels change.
+    all lines, still to be traced; None in the dark, or if those of the lit span before hold. fresh: whether levels
+    change.
     """
 
     first: int
@@ -46,7 +46,7 @@ class _Span:
 
 
 class PhotonSource:
-    """Draws the frames of one run. It is called from one thread and uses `threads` of its own."""
+    """Draws the frames of a configured SPAD, called from one thread, in up to `threads` threads with that one."""
 
     def __init__(
         self,
@@ -58,7 +58,7 @@ class PhotonSource:
         fan: LineFan = ONE_LINE,
         command_range: tuple[float, float] = (-np.inf, np.inf),
     ) -> None:
-        """sheets_of: of mirror commands within `command_range`. fan: the lines there are."""
+        """sheets_of: makes sheets of mirror commands. command_range: a line outside is dark. fan: the laser lines."""
         rows, width = model.steady_per_s.shape
         words = -(-width // WORD_PX)
         self._model = model
@@ -88,9 +88,8 @@ class PhotonSource:
         """Fill `bits` (n, rows, row bytes) with windows of frames first_frame, first_frame + 1, ...
 
         held: mirror positions (n,), or (n, 2) for the exposure of the first and the last row; NaN if the light goes
-        nowhere.
-        power_w: (n,) averaged over each exposure. x0: (n,) first pixel of each window, a multiple of 64. time_s: (n,)
-        start of each exposure in the bench's time, for scenes that move.
+        nowhere. power_w: (n,) averaged over each exposure. x0: (n,) first pixel of each window, a multiple of 64.
+        time_s: (n,) start of each exposure in the bench's time, for scenes that move.
         """
         words = bits.view(np.uint64)
         first_word = x0 // np.int32(WORD_PX)
@@ -110,7 +109,7 @@ class PhotonSource:
         self._pool.shutdown()
 
     def _spans(self, held: Array, power_w: Array, time_s: Array) -> list[_Span]:
-        """The frames' light; what is remembered of it is then that of the last one."""
+        """Split the frames into spans; remembers position, time and power of the last lit one."""
         held = held if held.ndim == 2 else held[:, None]
         dark = np.isnan(held).any(axis=1) | (power_w == 0)
         power_w = np.where(dark, 0.0, power_w)
@@ -166,7 +165,7 @@ class PhotonSource:
             self._model.setting.view.trace(sheet, a, b)
 
     def _set_rate(self, sheets: list[LightSheet], a: int, b: int) -> None:
-        """Detections per second and watt of all sheets, rows a..b-1."""
+        """Set rows a..b-1 of `_rate`: detections per second and watt of all sheets."""
         model, rate, of_line = self._model, self._rate, self._of_line
         rate[a:b] = 0
         for sheet in sheets:

@@ -35,7 +35,7 @@ from sim_backend.light.sheet import Array, LightSheet, empty_sheet
 from sim_backend.light.view import CameraView
 
 SheetsOf = Callable[[Array], LightSheets]
-"""Mirror commands (...) to the light that they stand for."""
+"""A function from mirror commands (...) to their sheets of light."""
 Limits = tuple[float, float]
 """Least and largest command of the mirror."""
 EVERYWHERE: Limits = (-np.inf, np.inf)
@@ -43,7 +43,7 @@ EVERYWHERE: Limits = (-np.inf, np.inf)
 
 @dataclass(frozen=True, slots=True)
 class LineFan:
-    """Several laser lines. offsets: in units of the mirror command. share: the share of the laser's power that each
+    """The laser lines. offsets: in units of the mirror command. share: the share of the laser's power that each
     line gets.
     """
 

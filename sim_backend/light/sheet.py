@@ -84,7 +84,7 @@ class LightSheet:
 
 
 def empty_sheet(planes: Array, rows: int, time_s: float = 0.0, bowed: LightSheets | None = None) -> LightSheet:
-    """A sheet that has not been traced on any row yet. planes: (4,) nx, ny, nz, d of all rows, or (rows, 4).
+    """A sheet that has not been traced on any row yet. planes: (4,) or (1, 4) nx, ny, nz, d, or (rows, 4).
 
     bowed: (rows,) the bowed sheets that the planes belong to, None if they are flat.
     """

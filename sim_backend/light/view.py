@@ -121,7 +121,7 @@ def _facets(surface: Array, rays: tuple[Array, Array], slopes: tuple[Array, Arra
     """Planes m.X = 1 tangent to the surface, float64 (rows, width, 3).
 
     On a plane the inverse depth is w = m.(u, v, 1), so m = (w_u, w_v, w - u w_u - v w_v). Gradients are averaged over
-    two pixels to each side that lie on the same surface."""
+    two pixels to each side that lie on the same surface. Where rays have no gradient, m = (0, 0, w)."""
     (u, v), (u_x, v_x, u_y, v_y) = rays, slopes
     w_x, w_y = _surface_slope(surface, 1), _surface_slope(surface, 0)
     determinant = u_x * v_y - u_y * v_x

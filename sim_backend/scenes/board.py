@@ -24,11 +24,11 @@ from sim_backend.scenes.surfaces import Array, Surfaces, checked
 RAYS, TURNS = 233, 144
 """Neighbouring Fibonacci numbers: rays through a pixel that sees an edge, no two in line with its row or its column.
 
-What a lattice gets wrong, all edges of one direction would share, were it the same in all pixels: 34 rays had all
-corners of a picture off together by 0.0015 px, twice what the photons of a bright picture leave.
+If the lattice were the same in all pixels, all edges of one direction would share its error: with 34 rays, all corners
+of a picture would be off together by 0.0015 px, twice what the photons of a bright picture leave.
 """
 LOOK = 21
-"""The first of them, and the pixel's four corners, tell whether it sees an edge."""
+"""So many of these rays, evenly chosen, and the pixel's four corners tell whether it sees an edge."""
 WALL_ALBEDO = 0.5
 """Albedo of a painted wall, neither white nor dark."""
 
@@ -42,7 +42,8 @@ class BoardAtPose:
     mirrored: bool = False
 
     def trace(self, u: Array, v: Array) -> tuple[Array, Array]:
-        """(depth in metres, albedo) along rays (u, v); albedo NaN where a ray misses the board or meets its back."""
+        """(depth of the board's plane in m, albedo) along rays (u, v); albedo NaN where a ray misses the board or meets
+        its back."""
         turn, position = self.pose.matrix, np.asarray(self.pose.position_m, np.float64)
         with np.errstate(all="ignore"):
             along = turn[0, 2] * u + turn[1, 2] * v + turn[2, 2]

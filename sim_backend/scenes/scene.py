@@ -39,7 +39,7 @@ class SceneMotion(Section):
 
 
 class BoardPlace(Section):
-    """Pose of a calibration board, with the fields of `calibration.views.BoardPose`."""
+    """Pose of a calibration board, as in `calibration.views.BoardPose`."""
 
     rotation: tuple[Radians, Radians, Radians] = Field(examples=["[20 deg, 0 deg, 0 deg]"])
     """Rotation vector; all 0: square to the camera's axis."""
@@ -135,8 +135,8 @@ def load_scene(name: str) -> tuple[SceneFile, Path]:
 
 
 def with_fog(scene: SceneFile, visibility: str) -> SceneFile:
-    """The scene with another fog: of the given visibility (text with a unit), or CLEAR. Its phase function stays the
-    same.
+    """The scene with another fog, of the given visibility (text with a unit), or without a medium if that is CLEAR.
+    A medium's `backscatter`, `phase` and shares stay the same.
     """
     if visibility == CLEAR:
         return scene.model_copy(update={"medium": None})
@@ -159,7 +159,8 @@ def with_board_at(scene: SceneFile, place: BoardPlace) -> SceneFile:
 
 
 def load_surfaces(scene: SceneFile, folder: Path, u: Array, v: Array) -> Surfaces:
-    """The scene's surfaces as seen along the rays (u, v), each (rows, width). Relative folders start at `folder`."""
+    """The scene's surfaces along the rays (u, v), each (rows, width). Relative paths start at `folder`. Raises
+    DeviceError if the surfaces or a board's file cannot be used."""
     if scene.surfaces == "street":
         from sim_backend.scenes.street import street
 
@@ -177,7 +178,8 @@ def load_surfaces(scene: SceneFile, folder: Path, u: Array, v: Array) -> Surface
 
 
 def load_folder(folder: Path, size: tuple[int, int]) -> Surfaces:
-    """Surfaces from a folder for a camera of size (rows, width). Raises DeviceError if it holds no scene of that size.
+    """Surfaces from a folder for a camera of size (rows, width). Raises DeviceError unless they are sound
+    and of that size.
 
     `world.npz` holds `depth_m`, `albedo` and, if some depths were guessed, `trusted`.
     """

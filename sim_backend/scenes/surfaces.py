@@ -63,7 +63,7 @@ class Surfaces:
     """One surface point per pixel.
 
     depth_m: float32 (rows, width), z in metres; inf = nothing there. albedo: float32 (rows, width), 0..1.
-    trusted: bool (rows, width), False where the depth was guessed (score elsewhere).
+    trusted: bool (rows, width), False where the depth was guessed and no result should be scored.
     """
 
     depth_m: NDArray[np.float32]
@@ -72,7 +72,8 @@ class Surfaces:
 
 
 def checked(name: str, depth_m: object, albedo: object, trusted: object, size: tuple[int, int]) -> Surfaces:
-    """Surfaces from arrays of any float type. Raises DeviceError if a value is impossible. size: (rows, width)."""
+    """Surfaces from arrays of any float type and of `size` (rows, width). Raises DeviceError for another size or an
+    impossible value. name: of the scene, for messages."""
     depth, light = np.asarray(depth_m, dtype=np.float32), np.asarray(albedo, dtype=np.float32)
     trust = np.asarray(trusted, dtype=bool)
     for key, array in (("depth_m", depth), ("albedo", light), ("trusted", trust)):

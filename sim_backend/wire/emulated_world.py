@@ -5,7 +5,7 @@
     light = laser's emission AND sync source's gate; mirror = scanner's output; frames = SPAD's exposures
 
 Everything runs in the host's time. Frames are drawn when the host takes them, from what the rig did while they were
-exposed. If the simulation takes longer than that, they wait in the SPAD's memory.
+exposed. If the simulation takes longer than the exposures, frames wait in the SPAD's memory.
 """
 
 import os
@@ -46,7 +46,7 @@ USB_BAUD = 10_000_000
 """Baud of a virtual COM port, which is as fast as USB lets it be."""
 PICO_2 = 2
 KEPT_S = 20.0
-"""Time after which the past of gate and mirror is forgotten."""
+"""Time after which the past of the gate is forgotten."""
 KEPT_FRAMES = 1_000_000_000
 """Most frames that wait for the host."""
 
@@ -66,12 +66,12 @@ class EmulatedWorldConfig(WorldConfig):
 
 
 class EmulatedWorld(SimulatedWorld):
-    """One scene and the devices that look at it. They are plugged in from its creation to `close`."""
+    """One scene and the devices of the rig in front of it, which are plugged in when it is created."""
 
     def __init__(self, config: EmulatedWorldConfig, surroundings: Surroundings, bus: Any = None) -> None:
-        """Raises DeviceError if the geometry or the scene cannot be used.
+        """Raises DeviceError if the geometry, the scene or the focus cannot be used, or rows are exposed late.
 
-        bus: where the USB devices are plugged in by its method `plug`, and who closes it is its maker; by default an
+        bus: has a method `plug`, by which it takes the USB devices, and is closed by its maker; by default an
         `EmulatedUsb`, within this process.
         """
         super().__init__(config, surroundings)
@@ -110,7 +110,7 @@ class EmulatedWorld(SimulatedWorld):
             self._wires.append(wire)
 
     def close(self) -> None:
-        """Unplug everything and end the threads; a second call does nothing."""
+        """Unplug all but the USB devices and end the threads; a second call does nothing."""
         for wire in self._wires:
             wire.close()
         self._frames.close()
@@ -129,9 +129,9 @@ class EmulatedWorld(SimulatedWorld):
 
     def during(self, start_s: Array, exposure_s: float, period_s: float) -> tuple[BenchState, Array]:
         """State of the bench during frames that start at start_s (n,), ascending, one period apart, and the laser's
-        power.
+        power in W, (n,), in the middle of each exposure.
 
-        Times are the host's. power_w: (n,), in the middle of each exposure.
+        Times are the host's. The state's own power_w is that of the first frame.
         """
         middle, until_s = start_s + 0.5 * exposure_s, float(start_s[-1]) + period_s
         history, lag = self.scanner.history, self.model.lag_s
@@ -148,7 +148,7 @@ class EmulatedWorld(SimulatedWorld):
         times, words = np.array([t for t, _ in changes]), np.array([word for _, word in changes], np.int64)
         share, edge = gate_shares(times, words, start_s, exposure_s)
         power_w = self._power(middle)
-        unknown = np.full(len(mirror), np.nan)  # of the DAC's stairs
+        unknown = np.full(len(mirror), np.nan)  # the command goes in steps, which have no velocity
         return BenchState(mirror, unknown, share, edge, backward, line_s, scan_s, float(power_w[0])), power_w
 
     def _power(self, time_s: Array) -> Array:
@@ -162,7 +162,7 @@ class EmulatedWorld(SimulatedWorld):
             self._emission.append((now_s, self.laser.power_w if emits else 0.0))
 
     def _scan_marker(self, from_s: float, until_s: float) -> float | None:
-        """The sync source's trigger input hangs on the scanner's scan marker."""
+        """First time in [from_s, until_s) when the scan marker, which triggers the sync source, is high, or None."""
         with self.scanner_plug.lock:
             if self.scanner.history.level(BLUE, np.array([from_s]))[0]:
                 return from_s

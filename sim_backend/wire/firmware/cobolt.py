@@ -142,7 +142,7 @@ class CoboltModel:
         self._tell(now_s)
 
     def open_interlock(self, now_s: float) -> None:
-        """Open the interlock: the laser goes off, and fault 3 stays until it is cleared."""
+        """Open the interlock: the laser goes off, and `fault` stays 3 until a test sets it to 0."""
         self.interlock_open = True
         self.fault = 3
         self._stop()

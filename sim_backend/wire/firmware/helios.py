@@ -94,7 +94,7 @@ class DacHistory:
         edges: list[Array] = []
         with self._lock:
             high_until = -np.inf
-            # One point further back: its level tells whether what is high at from_s rose before.
+            # A piece that ended shortly before is taken too: it tells whether an output high at from_s rose before.
             for one in self._between(from_s - KEEP_S / 100, until_s):
                 high = one.levels[:, line] > 0
                 before = np.concatenate([[one.start_s - high_until < one.period_s / 2], high[:-1]])
@@ -104,14 +104,14 @@ class DacHistory:
         return np.concatenate(edges) if edges else np.empty(0)
 
     def _at(self, time_s: Array) -> Iterator[tuple[Played, NDArray[np.bool_], NDArray[np.int64]]]:
-        """All that was played at the times: at which of them, and its points then."""
+        """Each piece played at the times: the piece, a mask of its times, and the indices of its points at them."""
         for one in self._between(time_s.min(initial=np.inf), time_s.max(initial=-np.inf)):
             inside = (time_s >= one.start_s) & (time_s < one.end_s)
             at = np.floor((time_s[inside] - one.start_s) / one.period_s + 1e-9).astype(np.int64)
             yield one, inside, np.clip(at, 0, len(one.command) - 1)
 
     def _between(self, from_s: float, until_s: float) -> list[Played]:
-        """The points that were played in [from_s, until_s], ascending."""
+        """The pieces that were played in [from_s, until_s], ascending."""
         return [one for one in self._played if one.end_s > from_s and one.start_s <= until_s]
 
 
@@ -121,10 +121,10 @@ CENTRE = 0x800 / DAC_STEPS * 2 - 1
 
 
 class DacModel(UsbModel):
-    """Base of the boards. `history` records what its outputs did; times are the transport's."""
+    """Base of the scanner boards. `history` records what the outputs did; times are the transport's."""
 
     def __init__(self, spec: DeviceSpec, *, commands: int, replies: int, points: int) -> None:
-        """commands, replies, points: its endpoints."""
+        """commands, replies, points: addresses of the endpoints for them."""
         self.spec = spec
         self.history = DacHistory(CENTRE, lines=4)
         self.deaf = False
@@ -231,7 +231,7 @@ class HeliosModel(DacModel):
         self.played = 0
         """Frames whose playing began."""
         self.drop_next = 0
-        """Test knob: number of sound frames that are dropped in silence."""
+        """Test knob: number of next frames that are dropped in silence, sound or not."""
         self._name, self._version, self._axis = name, version, axis
         self._clock_error = clock_error
         self._playing: _Frame | None = None
@@ -243,7 +243,7 @@ class HeliosModel(DacModel):
         self._dead_until_s = -1.0
 
     def set_interface(self, interface: int, alternate: int, now_s: float) -> None:
-        """Alternate 1 enables the DAC, blank and with the mirror where it is. Any other stops it, blank and at the
+        """Enable the DAC (alternate 1), blank and with the mirror where it is, or stop it (any other), blank and at the
         centre.
         """
         self.advance(now_s)

@@ -89,7 +89,7 @@ class ObisModel:
         self.set_power_w = power_w
 
     def open_interlock(self, now_s: float) -> None:
-        """Open the interlock: the laser is off until ON is sent again."""
+        """Open the interlock: until it is closed and ON is sent again, the laser is off."""
         self.tick(now_s)
         self.interlock_open = True
         self._switch(False)
@@ -179,7 +179,7 @@ class ObisModel:
         return OFF_BITS | sum(bit for bit, is_set in bits.items() if is_set)
 
     def _set(self, command: str) -> int:
-        """Error number, 0 for none."""
+        """Obey a command that sets something; returns the error number, 0 for none."""
         name, _, value = command.partition(" ")
         if not value:
             return -109

@@ -62,7 +62,7 @@ class PrawnDoModel:
         self._restart()
 
     def _restart(self) -> None:
-        """State at power-up."""
+        """Set the state at power-up."""
         self.status = STOPPED
         self.clock_external = False
         self.clock_hz = INTERNAL_HZ
@@ -77,7 +77,7 @@ class PrawnDoModel:
     # The wire
 
     def receive(self, data: bytes, now_s: float) -> bytes:
-        """Take bytes from the host; returns the answers of all lines that are complete."""
+        """Take bytes from the host; returns the answers to all lines and words of `adm` that are complete."""
         self._settle(now_s)
         answer = b""
         while data:
@@ -111,7 +111,7 @@ class PrawnDoModel:
         return self._levels[bisect_right(self._times, at_s) - 1]
 
     def changes(self, from_s: float, until_s: float) -> list[tuple[float, int]]:
-        """The level at `from_s`, then each change before `until_s`: (time, outputs)."""
+        """The level at `from_s`, then each change up to and at `until_s`: (time, outputs)."""
         first = bisect_right(self._times, from_s)
         last = bisect_right(self._times, until_s)
         return [(from_s, self._levels[first - 1]), *zip(self._times[first:last], self._levels[first:last], strict=True)]
@@ -153,7 +153,7 @@ class PrawnDoModel:
         return self.words[index][1] == 0
 
     def _enter(self, index: int, at_s: float) -> None:
-        """The player reaches a word. Two words of zero cycles in a row end it on the level of the first one."""
+        """Let the player reach a word. Two words of zero cycles in a row end the program on the level of the first."""
         self._run = _Run(index, at_s)
         if index >= len(self.words):
             return
@@ -172,7 +172,7 @@ class PrawnDoModel:
         self._levels.append(level)
 
     def _settle(self, now_s: float) -> None:
-        """The second core acts on what the first one asked of it before the next bytes came."""
+        """Let the second core act on what the first one asked of it before the next bytes came."""
         if self.status == ABORT_REQUESTED:
             self.status = ABORTED
         self.advance(now_s)

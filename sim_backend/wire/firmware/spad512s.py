@@ -28,11 +28,11 @@ _FRAMES_AT_ONCE = 8
 
 
 class Spad512sModel:
-    """The program and its device. calibration_s: duration of the calibration after a first connection; 0: none.
+    """The program and its device. calibration_s: duration of the calibration that the first `D` starts; 0: none.
 
     glued_done: whether text answers end with DONE, as in one emulation; the real program's behaviour is unknown.
-    extra_fields: whether `R` answers eight fields instead of six. paced: whether pixels come no earlier than the sensor
-    exposes them.
+    extra_fields: whether `R` answers eight fields instead of six. heeds_stop: whether STOP ends a run. rotation: the
+    turn that makes its pixels upright. paced: whether pixels come no earlier than the sensor exposes them.
     """
 
     def __init__(
@@ -132,7 +132,7 @@ class Spad512sModel:
         self._out += (CALIBRATION_SOON + CALIBRATION_BEGUN).encode()
 
     def _acquire(self, arguments: list[str], now_s: float) -> None:
-        """I,bits,tInt,n,trigger,overlap,sparse,stream"""
+        """Begin the run of I,bits,tInt,n,trigger,overlap,sparse,stream, or say what is wrong with it."""
         try:
             bits, t_int, n, _, _, sparse, stream = (int(word) for word in arguments[:7])
         except ValueError:
@@ -148,7 +148,7 @@ class Spad512sModel:
         self._run = _Run(n, max(t_int * 1e-6, READ_OUT_S), now_s)  # microseconds: bits is 1
 
     def _expose(self, run: "_Run", now_s: float) -> None:
-        """The next frames onto the wire, and what ends the run."""
+        """Put the next frames onto the wire, if they are exposed, or what ends the run."""
         if run.aborted or run.next_frame == run.n_frames:
             self._out += b"ERROR" if run.aborted else b"DONE"
             self._run = None

@@ -1,8 +1,8 @@
 """An SPB1 device on USB (docs/reference/spb1-usb.md): control plane, states, heartbeat, watchdog.
 
 It is either a Cypress FX3 board (commands on 0x01, stream on 0x81, acknowledgements on 0x82) or behind an FTDI FT601
-(session commands on 0x01, commands on 0x02, stream on 0x82; acknowledgements on 0x83 if it has a second channel, else
-in the stream). A pure state machine: what the sensor sees comes from `source`.
+(session commands on 0x01, commands on 0x02, stream on 0x82, acknowledgements on 0x83). A board without the endpoint for
+acknowledgements sends them in the stream. A pure state machine: what the sensor sees comes from `source`.
 """
 
 import struct
@@ -31,7 +31,7 @@ FT601_CONFIG_BYTES: Final = 152
 
 
 class SpbUsbModel(UsbModel):
-    """The device. mangle: called with each block of the stream, to damage it for tests."""
+    """The device. mangle: makes of each block the pieces that the stream sends, to damage it for tests."""
 
     def __init__(self, source: FrameSource, board: SpbUsbBoard) -> None:
         self.chip: Chip = board.chip
@@ -135,7 +135,7 @@ class SpbUsbModel(UsbModel):
         if self._board.acks == "endpoint":
             self._acks.append(ack.packed())
             return
-        # That of START still has the stride of before the run: so the host knows where blocks of frames begin.
+        # START's own still has the stride of before the run: so the host knows where blocks of frames begin.
         in_run = self._run is not None and ack.op != Op.START
         stride = self._registers[Register.STRIDE] if in_run else ACK_BLOCK_BYTES
         self._send(None, self._memory.control_block(stride, REGISTER_ACK, self._run_id, ack.packed()))
@@ -193,7 +193,7 @@ class SpbUsbModel(UsbModel):
                 self.state = SensorState.DRAINING
 
     def _end(self, run: EmulatedRun, status: BlockStatus, flag: BlockFlag) -> None:
-        """End the run: gate low, FIFO flushed, a last block without frames, then idle."""
+        """End the run: gate low, FIFO flushed, a last block without frames, then armed."""
         self._queue.clear()
         self.gate_allowed = False
         self._send(run, run.end(status, flag))
@@ -205,8 +205,8 @@ class SpbUsbModel(UsbModel):
         self._acks.clear()
         self._session_open = self.chip == "fx3"
         self.gate_allowed = False
-        """The FPGA's own gate line: low from the moment the watchdog strikes or a run is aborted until the next START.
-        """
+        """Level of the FPGA's own gate line: low from an abort, a strike of the watchdog or a loss of bus power until
+        the next START."""
 
     def _watch(self, now_s: float) -> None:
         """Act as the watchdog: a run whose host sends no PING ends dark."""

@@ -88,13 +88,13 @@ class SpbUsbBoard:
 
 
 class BlockMemory:
-    """A pool of block buffers. It gives out again those that no transport holds any more."""
+    """A pool of `BUFFERS` block buffers, given out in turn; a transport must let go of each before its next turn."""
 
     def __init__(self) -> None:
         self._buffers: deque[NDArray[np.uint8]] = deque()
 
     def take(self, size: int) -> NDArray[np.uint8]:
-        """The buffer that was given out longest ago."""
+        """A buffer of `size` bytes: a new one, or once there are `BUFFERS`, the one given out longest ago."""
         memory = self._buffers.popleft() if len(self._buffers) == BUFFERS else np.zeros(size, np.uint8)
         if len(memory) != size:
             memory = np.zeros(size, np.uint8)
@@ -120,7 +120,7 @@ class EmulatedRun:
         memory: BlockMemory,
         now_s: float,
     ) -> None:
-        """Raises ValueError if the stride holds no frame."""
+        """Raises ValueError if the stride is bad or holds no frame."""
         self.next_frame = 0
         self.pinged_s = now_s
         self.over = False
@@ -178,7 +178,7 @@ class EmulatedRun:
         return self._memory.control_block(self._stride, IDLE, self._run_id, b"")
 
     def _lose_overrun(self, n: int, now_s: float) -> int:
-        """Frames of the next block that are exposed by now; what the FIFO cannot hold is lost first."""
+        """Frames of the next block, 0 until all are exposed; those that the FIFO cannot hold are lost first."""
         exposed = int((now_s - self._start_s) * self._board.tick_hz / self._period)
         if self._n_frames is not None:
             exposed = min(exposed, self._n_frames)
@@ -279,7 +279,7 @@ def device_spec(chip: Chip, acks: str, serial: str | None, product_name: str) ->
 
 
 def registers_at_power_up(board: SpbUsbBoard) -> dict[int, int]:
-    """The registers by address. Those that nobody has written yet are 0."""
+    """The registers by address. Those that a host writes are 0, except STRIDE, which is the largest."""
     registers = dict.fromkeys(WRITABLE, 0)
     registers |= {
         Register.MAGIC: IDENTITY_MAGIC,

@@ -2,7 +2,7 @@
 
 Replies leave at 10 bits a character, as through a UART (a virtual COM port is faster, and no driver may depend on
 that). The terminal is opened by the real pyserial, from any process, and runs in the host's time; it ignores the baud
-rate. Its path is a link that survives unplugging and plugging in again.
+rate. Its path is a link, gone while unplugged, and the same when plugged in again.
 """
 
 import os
@@ -107,7 +107,7 @@ class SerialServer(WireServer[SerialModel]):
         self._send_due()
 
     def _queue(self, at: float, data: bytes) -> None:
-        """No faster than the line carries them."""
+        """Queue bytes, to leave no faster than the line carries them."""
         super()._queue(at, data)
         self._free_at += len(data) / self._characters_per_s
 

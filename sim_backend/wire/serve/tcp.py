@@ -81,7 +81,7 @@ class TcpServer(WireServer[TcpModel]):
                 self._ending.wait(_TURN_S)
 
     def _turn(self) -> bool:
-        """Accept, take, answer; whether anything moved."""
+        """Accept, take, answer; returns whether anything moved."""
         now_s = self._now_s()
         if self._client is None:
             return self._accept(now_s)

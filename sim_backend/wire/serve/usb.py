@@ -4,8 +4,9 @@
     device = bus.plug(HeliosModel())
     usb.core.find(backend=bus, idVendor=0x1209)     # or open_device(..., backend=bus)
 
-This is the fastest and most portable way to run a driver. It does without libusb (no transfers in flight) and without
-the kernel. Device models are in `usb_model`, and so are the errors, which are pyusb's own.
+This is the fastest and most portable way to run a driver. It does without libusb, which would keep transfers in
+flight, and without the kernel. The base of device models is in `usb_model`, and so are the errors, which are pyusb's
+own.
 """
 
 import errno
@@ -75,7 +76,7 @@ class EmulatedUsb(usb.backend.IBackend):  # type: ignore[misc] # pyusb carries n
             self._devices.append(device)
             return device
 
-    # What pyusb calls. Names and arguments are pyusb's; a transfer returns the bytes that passed, fewer on a time-out.
+    # Called by pyusb. Names and arguments are pyusb's; a transfer returns the bytes that passed, fewer on a time-out.
 
     def enumerate_devices(self) -> Iterator[AttachedDevice]:
         """The devices on the bus."""
@@ -186,7 +187,7 @@ class EmulatedUsb(usb.backend.IBackend):  # type: ignore[misc] # pyusb carries n
         dev_handle.device.clear_halt(ep)
 
     def _until(self, timeout_ms: int) -> Iterator[None]:
-        """Yield now and then until the time is over, at least once."""
+        """Yield now and then until the time is over, at least once. Raises ValueError if there is no time."""
         if timeout_ms <= 0:
             raise ValueError("a timeout of 0 waits for ever in libusb; give the transfer a deadline")
         end_s, poll_s = now_s(self._clock) + timeout_ms / 1000, FIRST_POLL_S

@@ -184,7 +184,9 @@ class UsbModel:
 
 
 class AttachedDevice:
-    """A model on the bus. Enforces the rules of a kernel and a host controller. Thread-safe."""
+    """A model on the bus. Enforces the rules of a kernel and a host controller. Thread-safe. Errors are
+    `UsbFailure`: ENODEV without the device, EPIPE for a transfer that is refused or to a halted endpoint.
+    """
 
     def __init__(self, model: UsbModel, bus: int, port: int, now: Callable[[], float]) -> None:
         self.model = model
@@ -235,7 +237,7 @@ class AttachedDevice:
             self._halted.clear()
 
     def claim(self, interface: int, owner: object) -> None:
-        """Claim an interface. Raises EBUSY if another owner holds it."""
+        """Claim an interface. Raises EBUSY if another owner holds it, ENOENT for an unknown one."""
         with self._alive():
             if all(one.interface != interface for one in self.spec.alternates):
                 raise UsbFailure(errno.ENOENT)
@@ -244,7 +246,7 @@ class AttachedDevice:
             self._claims[interface] = owner
 
     def release(self, interface: int, owner: object) -> None:
-        """Release an interface. As on Linux, the device returns to alternate setting 0."""
+        """Release an interface; it returns to alternate setting 0, as on Linux. Raises ENOENT if it is not claimed."""
         with self._alive():
             self._require_claim(interface, owner)
             self._give_back(interface)
@@ -287,7 +289,7 @@ class AttachedDevice:
             return taken or 0
 
     def inp(self, endpoint: int, room: int, owner: object) -> bytes | memoryview | None:
-        """Data that the device has now, or None. Raises EOVERFLOW if its packet is larger than the room left."""
+        """Data that the device has now, or None. Raises EOVERFLOW if they are more than the room left."""
         with self._alive():
             packet = self._usable(endpoint, owner).packet_bytes
             answer = self.model.inp(endpoint, -(-room // packet) * packet, self._now())
@@ -304,7 +306,7 @@ class AttachedDevice:
 
     @contextmanager
     def _alive(self) -> Iterator[None]:
-        """Hold the lock. ENODEV where the device is no longer there."""
+        """Hold the lock. Raises ENODEV if the device is no longer there."""
         with self.lock:
             self._require_plugged()
             yield
@@ -336,7 +338,7 @@ class AttachedDevice:
         return end
 
     def _endpoint(self, address: int) -> tuple[int, EndpointSpec]:
-        """An endpoint of the present alternate settings, and its interface."""
+        """Interface and spec of an endpoint in the present alternate settings. Raises ENOENT for an unknown one."""
         for one in self.spec.alternates:
             for end in one.endpoints if one.alternate == self._alternates.get(one.interface, 0) else ():
                 if end.address == address:

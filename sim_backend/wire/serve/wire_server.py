@@ -76,7 +76,7 @@ class WireServer(ABC, Generic[Model]):
 
     @abstractmethod
     def _serve(self) -> None:
-        """The thread, until `_ending` is set."""
+        """Serve the model, in the thread, until `_ending` is set."""
 
     def _now_s(self) -> float:
         """The model's time."""
