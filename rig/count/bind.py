@@ -344,7 +344,7 @@ def _fit(
 ) -> tuple[float, float, int]:
     """Relative clock error, largest residual in columns and number of markers of a sweep's marker points and times."""
     count = len(point)
-    if count < 2:
+    if count < 2 or np.ptp(point) == 0 or np.ptp(time) == 0:  # damaged records can mark one point twice
         return 0.0, math.nan, count
     x, y = (values - values[0] - (values - values[0]).mean() for values in (point, time))
     units_per_point = float(x @ y / (x @ x))
