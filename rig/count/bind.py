@@ -161,7 +161,7 @@ class FrameBinder:
 
     def bind(self, block: FrameBlock) -> tuple[BoundFrames, list[SweepClock]]:
         """Sweep, column and bin of the block's frames, and the clocks of the sweeps that the block closes. Raises
-        ProtocolError (`_pass_over`), DeviceFault (`BlankingSync.mark`).
+        ProtocolError as `_pass_over` does and DeviceFault as `BlankingSync.mark` does.
         """
         header, n = block.header, block.n_frames
         if self._t0 is None:

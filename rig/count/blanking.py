@@ -102,7 +102,7 @@ class PatternSearch:
     def scores(self, ones: Array) -> tuple[Array, NDArray[np.bool_]]:
         """Best score in each window of `ones` (n,), NaN if a frame is lost, and whether it may be the pattern.
 
-        Both (n - window + 1,). Raises ValueError for fewer frames than a window has."""
+        Both are (n - window + 1,). Raises ValueError for fewer frames than a window has."""
         n = self.window
         windows = sliding_window_view(ones, n)
         mean, drift = windows.sum(axis=1) / n, windows @ self._time
@@ -204,7 +204,7 @@ class MarkerLine:
         self.sd.append(max(sd, LEAST_SD_FRAMES))
 
     def fit(self, index: int) -> tuple[float, float, float]:
-        """Place of the scan marker of sweep `index`, its standard deviation, and frames per sweep, from two or more."""
+        """Place of the scan marker of sweep `index`, its standard deviation, and frames per sweep; needs two markers."""
         weight = np.array(self.sd) ** -2.0
         x = np.array(self.index, np.float64) - index
         middle = float(weight @ x / weight.sum())
@@ -423,7 +423,7 @@ class BlankingSync:
         leg = self._plan.leg(now.number)
         since = first + np.arange(len(records)) - now.scan_frame
         opened, closed = leg.gate_open_s * self._rate, leg.gate_close_s * self._rate
-        # The gate is on the sync source's clock, of which the light says nothing: spare half a frame and its error.
+        # The gate is on the sync source's clock, of which the light says nothing: a margin of half a frame and its error.
         early, late = (0.5 + MAX_CLOCK_ERROR * at for at in (opened, closed))
         upcoming = self._period / now.ratio + self._delay[(now.number + 1) % len(self._delay)] - self._tolerance
         marks = np.full(len(records), int(Mark.GATE_EDGE), np.uint32)

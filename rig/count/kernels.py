@@ -126,7 +126,7 @@ def _add_1(words, at, n, few, p):  # type: ignore[no-untyped-def]
 
 @numba.njit(cache=True, nogil=True)
 def _set_first(words, at, frame, n, frames, p):  # type: ignore[no-untyped-def]
-    """Set planes to the counts of the first k of `frames` frames and return k: 1, 2, 3, 5 or 7, below 2^planes."""
+    """Set `planes_for(k)` planes to the counts of the first k of `frames` frames and return k: 1, 2, 3, 5 or 7."""
     a = words[at : at + n]
     if frames < 2:
         p[:n] = a

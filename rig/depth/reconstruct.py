@@ -60,7 +60,7 @@ class Reconstructor:
     model: rig model; None for an uncalibrated rig, which gives stripes only and needs sensor (rows, width).
     column_commands: (columns,) mirror command of each column's centre. learned: states of earlier maps to use. lines:
     which line lights which column, if there are several. The estimator must be named (`rig.scan.estimator` chooses for
-    `auto`), else KeyError is raised. Raises the errors of `map_geometry` too.
+    `auto`): without `learned` any other name raises KeyError. Raises the errors of `map_geometry` too.
     """
 
     def __init__(

@@ -208,7 +208,7 @@ def _windows(
     model: RigModel | None, commands: NDArray[np.float64], scan: ScanConfig, info: SpadInfo, lines: LineGrid | None
 ) -> tuple[NDArray[np.int32], int, LineGrid | None]:
     """First pixel of each column's window, the windows' width, and the lines with the overlap of their windows. Raises
-    PlanError if the depth range shows no column."""
+    PlanError where `sweep_geometry` raises UsageError."""
     if model is None:
         return np.zeros(scan.columns, np.int32), -(-info.width // 64) * 64, lines
     from rig.geometry.windows import sweep_geometry
