@@ -204,7 +204,7 @@ class MarkerLine:
         self.sd.append(max(sd, LEAST_SD_FRAMES))
 
     def fit(self, index: int) -> tuple[float, float, float]:
-        """Place of the scan marker of sweep `index`, its standard deviation, and frames per sweep; needs two markers."""
+        """Place of sweep `index`'s scan marker, its standard deviation, and frames per sweep; needs two markers."""
         weight = np.array(self.sd) ** -2.0
         x = np.array(self.index, np.float64) - index
         middle = float(weight @ x / weight.sum())
@@ -423,7 +423,7 @@ class BlankingSync:
         leg = self._plan.leg(now.number)
         since = first + np.arange(len(records)) - now.scan_frame
         opened, closed = leg.gate_open_s * self._rate, leg.gate_close_s * self._rate
-        # The gate is on the sync source's clock, of which the light says nothing: a margin of half a frame and its error.
+        # The gate is on the sync source's clock, of which the light says nothing: margin is half a frame and its error.
         early, late = (0.5 + MAX_CLOCK_ERROR * at for at in (opened, closed))
         upcoming = self._period / now.ratio + self._delay[(now.number + 1) % len(self._delay)] - self._tolerance
         marks = np.full(len(records), int(Mark.GATE_EDGE), np.uint32)
