@@ -15,7 +15,7 @@ SCENES = BUNDLED / "scenes"
 
 @dataclass(frozen=True, slots=True)
 class Bundled:
-    """A rig or a scene that comes with the program; about: the first sentence of its file's first comment."""
+    """A rig or a scene that comes with the program. about: first sentence of the comment that its file begins with."""
 
     name: str
     about: str

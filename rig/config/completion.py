@@ -18,7 +18,7 @@ class _Edit(NamedTuple):
 
 
 def completed(text: str, node: yaml.MappingNode, values: Mapping[str, Any], full: Mapping[str, Any]) -> str:
-    """Change the text where `values` differ from it, and add the keys of `full` that it lacks.
+    """The text with those strings changed that `values` gives otherwise, and with the keys of `full` that it lacks.
 
     node: parsed node of the text. values: has the text's keys.
     """
@@ -70,7 +70,7 @@ def _added_below(text: str, node: yaml.MappingNode, missing: Mapping[str, Any]) 
 
 
 def _end(node: yaml.Node) -> int:
-    """Behind the last character of what a node holds: the mark of one without brackets is farther on."""
+    """Index behind the last character of what a node holds; a node without brackets has its end mark farther on."""
     if isinstance(node, yaml.CollectionNode) and not node.flow_style and node.value:
         last = node.value[-1]
         return _end(last[1] if isinstance(last, tuple) else last)

@@ -57,7 +57,7 @@ _OTHERS = {
 """Other files of this program that are taken for configs, by their `format`."""
 _CONFIG = ("a config", "scan: {columns: 500}")
 MAX_PATH = 1000
-"""Characters; longer text is no path."""
+"""Characters from which on text is no path."""
 SCENE = ("world", "scene")
 """Key of the scene: a path, or a bundled scene's name."""
 NO_CONFIG = "no config"
@@ -70,8 +70,8 @@ def load_config(name_or_path: str | Path = "simulated", overrides: Mapping[str, 
     """Load the rig config of a bundled name ("simulated") or a file, with values replaced by `overrides`.
 
     overrides: value by dotted key, e.g. {"scan.exposures": 4, "world.scene": "street"}; None values are skipped. Paths
-    in the file are relative to its folder, those in overrides to the working directory. Raises UsageError with one line
-    per problem, all problems at once.
+    in the file, and `calibration` also in overrides, are relative to the file's folder, other paths in overrides to the
+    working directory. Raises UsageError with one line per problem, all problems at once.
     """
     path = find_config(name_or_path)
     read = read_config(path)
@@ -229,8 +229,8 @@ def _validated(
 def _anchor_paths(content: dict[str, Any], folder: Path) -> None:
     """Make relative paths in the slots of devices absolute: their kinds do not know the file's folder.
 
-    A path is a scene that is not bundled, what a kind's config holds as a path, and text that begins with a dot, ends
-    in .yaml, or has a slash and exists beside the file.
+    A path is a scene that is not bundled, what a kind's config holds as a path, and text that begins with ./ or ../,
+    ends in .yaml or .yml, or has a slash and exists beside the file; never what begins with ~.
     """
 
     def anchored(value: object) -> object:

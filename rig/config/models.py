@@ -58,7 +58,7 @@ LineOffsets = Annotated[
 
 
 MIN_DARK_FRACTION = 0.05
-"""Share of a live sweep's frames that must be dark: the dark rate is learned from them."""
+"""Least share of a live sweep's frames that must be dark: the dark rate is learned from them."""
 
 AUTO: Final = "auto"
 """The estimator that stands for `joint` where it keeps up, else for `likelihood`."""
@@ -187,7 +187,7 @@ class EstimateConfig(ConfigSection):
 
 
 def _of_slot(slot: str) -> BeforeValidator:
-    """Validate a mapping with the config model of the kind that it names."""
+    """A validator that reads a mapping, or a kind's config, as the config model of the kind that it names."""
 
     def validate(value: object, info: ValidationInfo) -> object:
         if isinstance(value, KindConfig):
@@ -264,7 +264,7 @@ def line_problems(offsets: Sequence[float], columns: int, command_range: tuple[f
         fits = f"{above}" if below == 0 else f"{below} or {above}"
         problems.append(f"scan.columns is {columns}, no multiple of the {lines} lines of line_offsets; make it {fits}")
     span = abs(command_range[1] - command_range[0])
-    spare = span * lines / columns  # a column: beyond its neighbours' reach nothing is lit
+    spare = span * lines / columns  # one place of the mirror: lines farther apart than span and this leave a gap
     for first, second in pairwise(offsets):
         apart = second - first
         told = f"line_offsets {first:g} and {second:g} are {apart:g} apart, scan.command_range spans {span:g}"

@@ -77,7 +77,8 @@ def _changed(config: RigConfig, options: Mapping[str, object]) -> RigConfig:
 def with_lines(config: RigConfig, lines: int, power: LinePower = "shared") -> RigConfig:
     """The config of this rig and field with `lines` evenly spaced lines; the mirror sweeps the share of one line.
 
-    config: of one line. Columns are rounded down to a multiple of `lines`. Raises UsageError if that is not possible.
+    config: of one line. Columns are rounded down to a multiple of `lines`, at least `lines`. Raises UsageError for a
+    config with several lines, for a number of lines out of range, and if the changed config is not valid.
     """
     if len(config.line_offsets) > 1:
         raise UsageError(f"{config.name} has {len(config.line_offsets)} lines already; name a config with one")

@@ -4,8 +4,9 @@ If the SPAD puts no markers into its frames, `rig.count.blanking` finds the swee
 
 Each frame is placed from the latest marker at or before it. The plan gives that marker's point of the scanner clock.
 The distance from there is the SPAD's own clock times the ratio of the two clocks, which is fitted to the markers of
-every sweep and used in the next one. So a frame's column depends only on earlier frames, not on the size of blocks. A
-compiled walk (`rig.count.bind_kernels`) places the frames; Python runs once a block and at the begin of each sweep.
+every sweep and used in the next one. So the column of a frame depends only on earlier frames, not on the size of blocks
+(unless its record is damaged). A compiled walk (`rig.count.bind_kernels`) places the frames; Python runs once a block
+and at the begin of each sweep.
 
 The lit frames of a sweep run through its columns in order. A frame that would fall back to a column already left is not
 used. This can happen, by the size of the residual, when a marker corrects the extrapolation from the one before.
@@ -33,7 +34,7 @@ MOST_OUT_OF_TURN = 1000
 Places = tuple[NDArray[np.int32], NDArray[np.float64], NDArray[np.int32]]
 """Sweep, column and bin of each frame."""
 UNITS_PER_TICK = 2 * (SUBFRAME_MASK + 1)
-"""Times are whole numbers (int64) of this part of a tick, in which markers and exposure middles are exact: a frame's
+"""Units in a tick. Times are whole numbers of units (int64), in which markers and exposure middles are exact: a frame's
 column is then the same to the last bit in whatever block it comes. Good for 200 days at 1 GHz."""
 CARRIED = np.dtype(
     [(name, np.int64) for name in ("sweep", "anchor_time", "anchor_point", "edges", "wrong_way", "column", "in_column")]
@@ -50,9 +51,9 @@ column, in_column: the column that the sweep has come to, -1 before the first, a
 class BoundFrames:
     """Sweep, column and bin of each frame of a block.
 
-    sweep: -1 before the first marker. column: fractional, at the middle of the exposure; NaN before the first marker,
-    continued linearly outside the lit part. bins: column index, BIN_DARK or BIN_UNUSABLE. starts: frame indices: 0, and
-    those at which a sweep begins.
+    sweep: -1 before the first marker. column: fractional, at the middle of the exposure, continued linearly outside the
+    lit part; NaN before the first usable marker and where a record names a sweep out of turn. bins: column index,
+    BIN_DARK or BIN_UNUSABLE. starts: frame indices: 0, and those at which a sweep begins.
     """
 
     sweep: NDArray[np.int32]
@@ -66,13 +67,12 @@ class SweepClock:
     """Clock of one finished sweep.
 
     clock_error: relative excess of the scanner's clock over nominal, in the SPAD's time. residual_columns: with
-    markers, the largest distance of a marker from the fitted line, NaN with fewer than two markers. With patterns, the
-    distance of the pattern after the sweep from the line of those before it, or its standard deviation if that is
-    larger; NaN if it was not found. markers: number of markers or patterns that the clock rests on. first_frame,
-    end_frame: frames from this sweep's scan marker to before the next one's. wrong_way: number of lit frames whose
-    direction level was not the plan's.
-    detection: chance that a blanking pattern as bright as this sweep's is found, 0 if it was not; None if markers were
-    used.
+    markers, the largest distance of a marker from the fitted line. With fewer than two markers they are 0 and NaN. With
+    patterns, the distance of the pattern after the sweep from the line of those before it, or the standard deviation of
+    that distance if it is larger; NaN if that pattern was not found. markers: number of markers or patterns that the
+    clock rests on. first_frame, end_frame: numbers of the first frame of this sweep and of the next one. wrong_way:
+    number of lit frames whose direction level was not the plan's. detection: chance that a blanking pattern as bright
+    as this sweep's is found, 0 if it was not; None if markers were used.
     """
 
     sweep: int
@@ -95,8 +95,8 @@ class SweepClock:
 
 
 class PlanTerms(NamedTuple):
-    """Numbers of a plan for the walk; arrays (legs,). most_in_column: largest number of frames that a column
-    may use."""
+    """Numbers of a plan for the walk. columns: places of the mirror. most_in_column: most frames that a column may use.
+    marker_points: (line markers of a sweep,); the other arrays (legs,)."""
 
     columns: int
     column_s: float
@@ -160,8 +160,8 @@ class FrameBinder:
         self._light = None if plan.blanking is None else BlankingSync(plan, end_sweep)
 
     def bind(self, block: FrameBlock) -> tuple[BoundFrames, list[SweepClock]]:
-        """Sweep, column and bin of the block's frames, and the clocks of the sweeps whose closing scan marker lies in
-        the block.
+        """Sweep, column and bin of the block's frames, and the clocks of the sweeps that the block closes. Raises
+        ProtocolError as `_pass_over` does and DeviceFault as `BlankingSync.mark` does.
         """
         header, n = block.header, block.n_frames
         if self._t0 is None:
@@ -172,7 +172,7 @@ class FrameBinder:
         if self._carried["edges"][0] + n + 1 > have:  # should there be a marker in each frame
             self._edges = np.concatenate([self._edges, np.empty((2, have + n), np.int64)], axis=1)
         records = self._records[:n]
-        # Always of one type, which memory of a ring, a file or a wire is not: each would be compiled by itself.
+        # Always of one type, which memory of a ring, a file or a wire is not: each type would be compiled by itself.
         records.view(_WHOLE)[:] = block.records.view(_WHOLE)
         if self._light is not None:
             self._light.mark(block, records)
@@ -210,8 +210,9 @@ class FrameBinder:
     def _out_of_turn(self, at: int, records: NDArray[np.void], terms: BlockTerms) -> bool:
         """Whether frame `at` names a sweep that cannot have begun, as one flipped bit does.
 
-        Its own scan marker makes it the next sweep; else the frame behind must say the same, and where sweeps are left
-        out, or no frame is behind, so must the time since the latest marker.
+        Its own scan marker confirms the next sweep. Else the frame behind must name the same one, and where sweeps are
+        left out, or no frame is behind, the time since the latest marker must allow it. Before the first sweep the last
+        of several frames needs a scan marker.
         """
         now = self._carried[0]
         running, number = int(now["sweep"]), _sweep_named(records[at], terms)
@@ -245,7 +246,8 @@ class FrameBinder:
         sweep[at], column[at], bins[at] = int(self._carried["sweep"][0]), np.nan, BIN_UNUSABLE
 
     def _begin(self, at: int, record: np.void, terms: BlockTerms, header: BlockHeader) -> list[SweepClock]:
-        """Close the sweep that ran, begin the next one at frame index `at`, where its scan marker is if received."""
+        """Close the sweep that ran and any missed; begin the next one at frame index `at`, where its scan marker is if
+        received. Returns the clocks of the closed ones."""
         now = self._carried[0]
         running, number = int(now["sweep"]), _sweep_named(record, terms)
         start = (int(record["ticks"]) + terms.start_ticks) * UNITS_PER_TICK
@@ -270,7 +272,7 @@ class FrameBinder:
         return closed
 
     def _begin_in_light(self, at: int, record: np.void, terms: BlockTerms, header: BlockHeader) -> list[SweepClock]:
-        """Begin a sweep where the light has told at which frame sweeps begin and when their scan markers came."""
+        """Do as `_begin` where the light has told at which frames sweeps begin and when their scan markers came."""
         assert self._light is not None, "asked for by the caller"
         now = self._carried[0]
         running, number = int(now["sweep"]), _sweep_named(record, terms)
@@ -342,7 +344,7 @@ def _period(header: BlockHeader) -> int:
 def _fit(
     point: NDArray[np.int64], time: NDArray[np.int64], points_per_unit: float, points_per_column: float
 ) -> tuple[float, float, int]:
-    """Relative clock error, largest residual in columns and number of markers of a sweep's marker points and times."""
+    """Relative clock error, largest residual in columns and number of a sweep's markers; 0 and NaN for fewer than 2."""
     count = len(point)
     if count < 2 or np.ptp(point) == 0 or np.ptp(time) == 0:  # damaged records can mark one point twice
         return 0.0, math.nan, count

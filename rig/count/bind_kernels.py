@@ -24,7 +24,7 @@ _WINDOW_LOST: Final = int(Mark.WINDOW_LOST)
 
 @numba.njit(cache=True, nogil=True)
 def _marker_point(marks, line, number, plan):  # type: ignore[no-untyped-def]
-    """Point since the first sweep of the marker in a frame of sweep `number`; -1: none that is usable."""
+    """Point of the marker in a frame of sweep `number`, counted from the first sweep on; -1: none that is usable."""
     # A record has room for one position, the latest edge's: beside a gate edge it is not surely the marker's.
     if marks & _GATE_EDGE:
         return -1
@@ -46,7 +46,7 @@ def _bin(marks, column, columns):  # type: ignore[no-untyped-def]
 
 @numba.njit(cache=True, nogil=True)
 def _in_order(bin, number, plan, carried):  # type: ignore[no-untyped-def]
-    """The bin of a lit frame, BIN_UNUSABLE where its sweep has left that column or has all the frames it may use."""
+    """Note a lit frame and return its bin, BIN_UNUSABLE if its sweep is past that column, or the column is full."""
     now = carried[0]
     if number != now.sweep:
         return BIN_UNUSABLE

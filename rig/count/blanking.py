@@ -8,7 +8,7 @@ frame i being exposed from i on), is
 For every t it is fitted by least squares (float64); the best t is the one that explains most. Photons of the laser, of
 daylight and dark counts all scatter alike, so nothing needs to be known about them. `score` is brightness over its
 standard deviation. To distinguish the pattern from other light that comes and goes, the residual beyond the scatter of
-photons must be smaller than what the pattern explains.
+photons must not exceed what the pattern explains.
 
 Finding the sweeps (`BlankingSync`). Scan markers lie on a straight line in time, which is fitted to all patterns found
 so far (`MarkerLine`). If a pattern is missing, because frames were lost or nothing reflected the light, its place is
@@ -36,26 +36,26 @@ LEAST_SCORE = 4.0
 """Standard deviations from which on light may be the pattern. Chance brings one in every other burst, but two at the
 right distance in one of some ten thousand, and then the pattern behind the first map does not bear them out."""
 MOST_UNEXPLAINED = 1.0
-"""Largest share, over what the pattern explains, of what photons do not. A pattern in the wrong place leaves 7."""
+"""Largest residual beyond the scatter of photons, over what the pattern explains. In the wrong place it leaves 7."""
 LEAST_SHARE = 0.7
-"""Share of a search's frames that must have been received."""
+"""Share of the frames of a measurement that must have been received."""
 EDGE_FRAMES = 2
 """Frames looked at before and behind the pattern."""
 STEPS = 8
 """Places tried per frame; the best is then found between them."""
 PHASES = np.arange(4) / 4
-"""Places tried per frame while nothing is known."""
+"""Places tried within each frame while nothing is known, in frames."""
 _FIT_STEPS = 4
 _NO_LIGHT = 1e-300
-"""Ones per frame that no frame has: where there are none at all, nothing stands out by 0 standard deviations."""
+"""Ones per frame, fewer than any light gives: in frames without a single one scores are 0 instead of 0/0."""
 _GRAIN = 64
-"""The rough search takes shares of a frame in whole parts of this: its sums are exact, in whatever order."""
+"""The rough search rounds shares of a frame to whole parts of 1/64: its sums are exact, in whatever order."""
 
 
 @dataclass(frozen=True, slots=True)
 class PatternFit:
-    """A fitted pattern. place: its first edge, in frames; sd: its standard deviation. brightness: extra ones of a lit
-    frame.
+    """A fitted pattern. place: its first edge, in frames; sd: the place's standard deviation. score: see the module.
+    level: ones of a frame without the pattern's light. brightness: extra ones of a lit frame.
     """
 
     place: float
@@ -100,7 +100,9 @@ class PatternSearch:
         self._shares = np.round(shares * _GRAIN)
 
     def scores(self, ones: Array) -> tuple[Array, NDArray[np.bool_]]:
-        """Best score in each window of `ones` (n,), NaN if a frame is lost; and whether it may be the pattern."""
+        """Best score in each window of `ones` (n,), NaN if a frame is lost, and whether it may be the pattern.
+
+        Both are (n - window + 1,). Raises ValueError for fewer frames than a window has."""
         n = self.window
         windows = sliding_window_view(ones, n)
         mean, drift = windows.sum(axis=1) / n, windows @ self._time
@@ -121,7 +123,7 @@ class PatternSearch:
     def measure(self, ones: Array, first: int, place: float, radius: float) -> PatternFit | None:
         """The pattern within `radius` frames of `place`; None if it is not there.
 
-        ones: of frames `first`, first + 1, ... , NaN if missing; they must span `span(place, radius)`.
+        ones: of frames `first`, first + 1, ... , NaN if missing. None too if they do not have enough of `span`.
         """
         begin, end = self.span(place, radius)
         if begin < first or end > first + len(ones):
@@ -202,7 +204,7 @@ class MarkerLine:
         self.sd.append(max(sd, LEAST_SD_FRAMES))
 
     def fit(self, index: int) -> tuple[float, float, float]:
-        """Place of the scan marker of sweep `index`, its standard deviation, and frames per sweep."""
+        """Place of sweep `index`'s scan marker, its standard deviation, and frames per sweep; needs two markers."""
         weight = np.array(self.sd) ** -2.0
         x = np.array(self.index, np.float64) - index
         middle = float(weight @ x / weight.sum())
@@ -220,7 +222,7 @@ SEARCH_S = 10.0
 CLEAR_SCORE = 2 * LEAST_SCORE
 """A pattern that stands out so clearly is surely one: where sweeps are not found, light is not what is missing."""
 ASIDE_PX = 64
-"""Pixels counted on both sides of the first column's window: in the run-in the stripe stands a little beside it."""
+"""Pixels counted on both sides of the window of a leg's first column: in the run-in the stripe is a bit beside it."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -228,9 +230,9 @@ class SweepPlace:
     """Place of a sweep among the frames.
 
     frame: the first one that counts. scan_frame: place of its scan marker, in frames. ratio: of the scanner's clock to
-    nominal, in the SPAD's time, with the number of patterns it rests on. found: its own pattern; None if the place is
-    taken from the line of the others. residual_frames: distance of its pattern from the place predicted by earlier
-    ones, or its standard deviation if that is larger; NaN without a pattern.
+    nominal, in the SPAD's time. patterns: how many it rests on. found: its own pattern; None if the place is taken from
+    the line of the others. residual_frames: distance of its pattern from the place predicted by earlier ones, or that
+    distance's standard deviation if larger; NaN without a pattern.
     """
 
     number: int
@@ -274,11 +276,11 @@ class BlankingSync:
         self._ones_first = 0
         self._origin: int | None = None
         self._best: tuple[float, int, int] | None = None
-        """Score, frame and leg of the best window since it first looked like a pattern."""
+        """Score, last frame and leg of the best of the latest windows that look like a pattern; None: there is none."""
         self._most: tuple[float, int] = (0.0, 0)
-        """Highest score of all, and its frame: to be told where nothing is found."""
+        """Highest score of all, and the first frame of its window: to be told if nothing is found."""
         self._pilots: list[tuple[int, PatternFit]] = []
-        """Index and pattern of what may be the first ones."""
+        """Patterns that may be the first of the run, each with the index of its sweep."""
         self._line = MarkerLine()
         self._next: int | None = None
         """Index of the sweep whose pattern is expected next; None: nothing is known yet."""
@@ -309,7 +311,7 @@ class BlankingSync:
         return [*(self._places.pop(number) for number in range(first, last)), self._places[last]]
 
     def _count(self, block: FrameBlock) -> None:
-        """The ones of each frame, where each leg's run-in is seen; lost frames are NaN."""
+        """Append the ones of each frame, where each leg's run-in is seen; lost frames are NaN."""
         first = block.header.first_frame
         if self._origin is None:
             self._origin = self._ones_first = first
@@ -413,7 +415,7 @@ class BlankingSync:
         return self._searches[leg].measure(self._ones[leg], self._ones_first, place, self._tolerance)
 
     def _write(self, records: NDArray[np.void], first: int) -> None:
-        """Marks of consecutive frames from `first` on, all of the present sweep."""
+        """Write sweep and marks of consecutive frames from number `first` on, all of the present sweep."""
         now = self._now
         if now is None or now.number < 0:
             records["sweep"], records["marks"] = 0, Mark.GATE_EDGE
@@ -421,7 +423,7 @@ class BlankingSync:
         leg = self._plan.leg(now.number)
         since = first + np.arange(len(records)) - now.scan_frame
         opened, closed = leg.gate_open_s * self._rate, leg.gate_close_s * self._rate
-        # The gate is on the sync source's clock, of which the light says nothing: half a frame, and what it may be off.
+        # The gate is on the sync source's clock, of which the light says nothing: margin is half a frame and its error.
         early, late = (0.5 + MAX_CLOCK_ERROR * at for at in (opened, closed))
         upcoming = self._period / now.ratio + self._delay[(now.number + 1) % len(self._delay)] - self._tolerance
         marks = np.full(len(records), int(Mark.GATE_EDGE), np.uint32)

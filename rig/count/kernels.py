@@ -28,7 +28,7 @@ PLANES: Final = 8
 """Bit planes of a counter."""
 MOST_FRAMES: Final = (1 << PLANES) - 1
 FEW_FRAMES: Final = 15
-"""Frames that four planes can count."""
+"""Most frames that four planes can count."""
 
 
 @numba.njit(cache=True, nogil=True)
@@ -81,7 +81,7 @@ def _sum_7(a, b, c, d, e, g, h):  # type: ignore[no-untyped-def]
 
 @numba.njit(inline="always")
 def _add_number(p, i, ones, twos, fours, few):  # type: ignore[no-untyped-def]
-    """Add a 3-bit number to the first four planes; what overflows them goes to the last one, unless there is none."""
+    """Add a 3-bit number to the first four planes; what overflows them goes to the last one, unless `few` is set."""
     x = p[i]
     p[i] = x ^ ones
     p[CHUNK + i], carry = _sum_3(p[CHUNK + i], twos, x & ones)
@@ -126,7 +126,7 @@ def _add_1(words, at, n, few, p):  # type: ignore[no-untyped-def]
 
 @numba.njit(cache=True, nogil=True)
 def _set_first(words, at, frame, n, frames, p):  # type: ignore[no-untyped-def]
-    """Set planes to the counts of the first frames, up to 7 of them; says of how many, and 2^planes is above that."""
+    """Set `planes_for(k)` planes to the counts of the first k of `frames` frames and return k: 1, 2, 3, 5 or 7."""
     a = words[at : at + n]
     if frames < 2:
         p[:n] = a
@@ -170,7 +170,7 @@ def add_frames(words: Words, frame: int, at: int, first: int, last: int, n: int,
     """Add words at..at+n-1 of frames first..last-1 to counters that have counted `counted` frames so far.
 
     words: (all words,), with `frame` words per frame; n: at most CHUNK; planes: ((PLANES + 1) * CHUNK,) of one chunk,
-    of which only `planes_for(counted)` are valid, none before the first frame.
+    of which only `planes_for(counted)` are valid, none before the first frame. Frames in all: at most MOST_FRAMES.
     """
     f, all_frames = first, counted + last - first
     if counted == 0:
@@ -215,10 +215,10 @@ def add_runs(
 ) -> None:
     """Add frames to `counts` (columns, rows, window), or to `dark` (rows, PAIRS, lanes + LANES, 2) in lane order.
 
-    words: (all words,), with `row_words` per row; first_word: (n,), word of the sensor at which a frame's used pixels
-    begin, used_words of them; bins: (n,), -1 dark, -2 skip, else a row of columns_at (bins, lines), the columns for
-    which a frame is counted, one for every line; without lines lit frames are skipped. x0: (columns,). Only rows
-    first_row..last_row-1 are touched, so that threads may share the outputs.
+    words: (all words,), with `row_words` per row; first_word: (n,), word of the sensor's row at which the used_words
+    words of a frame's used pixels begin; bins: (n,), -1 dark, -2 skip, else a row of columns_at (bins, lines), the
+    columns for which a frame is counted, one for every line; without lines lit frames are skipped. x0: (columns,). Only
+    rows first_row..last_row-1 are touched, so that threads may share the outputs.
     """
     rows, width_words = dark.shape[0], (dark.shape[2] - LANES) * STEPS // WORD_PX
     window = counts.shape[2]

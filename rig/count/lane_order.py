@@ -73,7 +73,7 @@ def read_planes(
     """Write the counts of two rows of `window` pixels to n and to the row after it, from their bit planes.
 
     planes, n: addresses. first, second: bytes at which the rows begin; planes lie `plane_bytes` apart. n_planes: number
-    of planes, 1, 2, 4 or 8. lanes: as of `pair_bytes`. Reads 16 bytes at a time, whatever the window.
+    of planes, 1, 2, 4 or 8. lanes: as in `pair_bytes`. Reads 16 bytes at a time, whatever the window.
     """
     pair = pair_bytes(lanes)
     for v in range(0, lanes, LANES):
@@ -121,7 +121,7 @@ def _share(x, times):  # type: ignore[no-untyped-def]
 
 @numba.njit(inline="always")
 def _fine_share(x, times, turn):  # type: ignore[no-untyped-def]
-    """Like `_share`, in 2048 steps and others on every turn: eight steps would not keep the mean of few counts.
+    """Like `_share`, in 2048 steps that differ from turn to turn: eight steps would not keep the mean of few counts.
 
     The multipliers are odd, so that 2048 pixels in a row, or turns, take every step once.
     """
@@ -130,7 +130,7 @@ def _fine_share(x, times, turn):  # type: ignore[no-untyped-def]
 
 @numba.njit(cache=True, nogil=True)
 def read_counts(counts: NDArray[np.unsignedinteger], halved: int, n: int, lanes: int, turn: int = 0) -> None:
-    """Write the counts of a row in pixel order (window,) to address n, divided by 2^halved.
+    """Write the counts (window,) of a row in pixel order, divided by 2^halved, to address n in lane order.
 
     The rounding is that of `halve_counts` for divisors up to 8. turn: a number that differs between the columns in
     which a pixel is read.

@@ -6,8 +6,8 @@ With n ones of a pixel in K frames and r its usual rate, a line of counts k is t
 
 The light in common with a partner at pixel distance s is the sum over j of e_0(j) times (the sum of e_k from
 j + s - LAGS_PX to j + s + LAGS_PX, minus the mean of the same sum BESIDE_PX to either side). Smoothness is the sum of
-products of neighbouring pixels. Lines are int32 (line and partners, points, window); results are float64 (points, 3 +
-orders).
+products of neighbouring pixels. Lines are int32 (line and partners, points, window); results of `compare_lines` are
+float64 (points, 3 + orders).
 
 Broad light, mainly haze, is compared by sums of z over BIN_PX, minus the line's mean of z:
 
@@ -44,7 +44,7 @@ def _searched(x_lo, x_hi, x0, window, width):  # type: ignore[no-untyped-def]
 
 @numba.njit(inline="always")
 def _around(total, j):  # type: ignore[no-untyped-def]
-    """Sum of the pixels up to LAGS_PX from pixel j; total: of all those before each, and of all."""
+    """Sum of the pixels up to LAGS_PX from pixel j. total: for each pixel the sum of those before it, and of all."""
     last = total.shape[0] - 1
     return total[min(max(j + LAGS_PX + 1, 0), last)] - total[min(max(j - LAGS_PX, 0), last)]
 
@@ -64,16 +64,16 @@ def compare_lines(
     orders: NDArray[np.int64],
     out: NDArray[np.float64],
 ) -> None:
-    """Compare points; out: (points, 3 + orders).
+    """Compare the line of each point with its first two partners; writes to out (points, 3 + orders).
 
     lines: (3, points, window) counts of each point's line and its first two partners; exposures, row, column: (3 or
     more, points). shift: (2 or more, points), pixels from a stripe of the line to the partner's. usual: (rows, width),
-    mean ones per exposure of each pixel over the sweep, NaN for unusable pixels; least: value used for lower ones.
+    mean ones per exposure of each pixel over the sweep, NaN for unusable pixels; least: replaces lower r in sqrt(K r).
     orders: (orders, WORD_PX), pixels of each word.
 
     The first two outputs are the light in common with each partner, which is 0 on average for noise, haze and anything
     that stands still. The third is LEAST_SHARED times the light that single pixels have in common with the next row,
-    minus the light that their own frames have in common. It is negative, since frames of one column show the same line.
+    minus the light that their own frames have in common. It is 0 for one frame, else negative: they show the same line.
     The others are the increase of the sum of products of neighbouring pixels when they are taken in each order.
     """
     window = lines.shape[2]
@@ -141,7 +141,8 @@ def _in_bins(px):  # type: ignore[no-untyped-def]
 
 @numba.njit
 def _add_products(a, b, margin, to, out):  # type: ignore[no-untyped-def]
-    """Add to out[o + reach] the sum over i of a(i) b(i + to + o), for o from -reach to reach; around a, b are zeros."""
+    """Add to out[o + reach] the sum over i of a(i) b(i + to + o), for o from -reach to reach; nothing if |to| > bins.
+    `margin` zeros stand before and behind the bins of a and b."""
     reach = out.shape[0] // 2
     bins = a.shape[0] - 2 * margin
     if abs(to) > bins:
@@ -177,11 +178,12 @@ def follow_lines(
 ) -> None:
     """Add up what points have in common with their partners, as a function of the distance from the expected place.
 
-    lines to x_hi: as for `compare_lines`. usual, weight: (rows, width), mean ones r per exposure of each pixel over the
-    sweep and 1 / sqrt(r); both 0 for unusable pixels. rows: (partner columns, 5), light in common with the next row, up
-    to 2 bins to either side of where it is expected, for points whose partner column has frames. shared: (partner
-    columns, 2 SPAN + 1), light in common with the partner column, from SPAN bins short of the place that the planes
-    predict to SPAN bins beyond. noise: (partner columns,), variance of each of these sums from photon noise.
+    lines to x_hi: as for `compare_lines`, with all partners. usual, weight: (rows, width), mean ones r per exposure of
+    each pixel over the sweep and 1 / sqrt(r), with a least r; both 0 for unusable pixels. rows: (partner columns, 5),
+    light in common with the next row, up to 2 bins to either side of where it is expected, for points whose partner
+    column has frames. shared: (partner columns, 2 SPAN + 1), light in common with the partner column, from SPAN bins
+    short of the place that the planes predict to SPAN bins beyond. noise: (partner columns,), variance of each sum of
+    `shared` from photon noise.
     """
     window = lines.shape[2]
     bins = window // BIN_PX

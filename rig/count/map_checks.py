@@ -1,7 +1,8 @@
 """Checks of a map's counts and answers by its own light, which no correctly taken scene fails, whatever it looks like.
 
-They use a few thousand points, each a row and column with partners: the next row, and four columns at whose times the
-line has moved by 6 to 64 px. A stripe appears at all of them, at places that the planes predict; noise does not.
+They use up to 512 or 8192 points, each a row and column with partners: the next row, and four columns at whose times
+the line has moved by 6 to 64 px (less where that is too much of the sweep). A stripe appears at all of them, at places
+that the planes predict; noise does not.
 
 - Pixels of a row: light falls on neighbours alike, so no other order of the pixels is smoother than the right one.
 - Rows: a line of light is at the same place on the next row.
@@ -46,7 +47,7 @@ FOLLOWED: Final = 256
 LIMIT: Final = 4.0
 """Standard deviations: one false alarm in 30 000 checks."""
 FEWEST_ROWS: Final = 24
-"""With fewer rows than this a mean over rows cannot be LIMIT deviations off."""
+"""With fewer rows than this a sum over rows can hardly be LIMIT deviations off: n rows reach sqrt(n) at most."""
 LEAST_FOLLOWING: Final = 0.25
 """Least light in common with the other column, over that with the next row: scenes have 0.8 and more, clutter such as
 fences half of it; columns that do not follow one another have none."""
@@ -58,11 +59,11 @@ air; shuffled or reversed columns have -0.4 to 2.
 LEAST_LIGHT: Final = 12.0
 """Light in common with the next row, in standard deviations, below which nothing is said of where it moves to."""
 MARGIN: Final = 3.5
-"""Standard deviations of a map's sum that it has to be above MOST_AMISS."""
+"""Standard deviations by which a map's sum must exceed MOST_AMISS for a doubt."""
 SATURATED: Final = 0.99
 """Share of ones among all pixels and frames from which on a map is full."""
 LEAST_WIDTH_PX: Final = 32
-"""Width of a sensor below which the line's motion over APART_PX, with the pixels to its sides, does not fit in."""
+"""Width of a sensor below which the line's motion to its nearest partner, with pixels beside it, does not fit in."""
 DIMMEST: Final = 0.1
 """Least mean rate of a pixel, over that of all, that its noise is reckoned with."""
 SURE: Final = 0.9
@@ -91,7 +92,7 @@ class Points(NamedTuple):
 
 
 def check_points(geometry: SweepGeometry, points: int = POINTS) -> Points:
-    """Up to `points` points spread evenly over the map; none if no column has a partner."""
+    """Up to `points` points spread evenly over the map; none if no row and column has all its partners."""
     reference = geometry.reference_px()
     steps = np.abs(np.diff(reference, axis=1))
     step_px = float(np.median(steps)) if steps.size else 0.0
@@ -130,8 +131,8 @@ class MapChecks:
     def doubts(self, sweep: Any, intensity: NDArray[np.uint32], stripe: StripeTable) -> tuple[str, ...]:
         """Doubts about a map, each a sentence that says what to look at; empty if nothing speaks against it.
 
-        sweep: a `CountVolume`, or a sweep with `checked`, the counts of the POINTS. stripe: the estimator's own
-        answers.
+        sweep: a `CountVolume`, or a sweep with `checked`, the counts of the POINTS (lines, points, window). intensity:
+        (rows, width). stripe: the estimator's own answers.
         """
         most = VOLUME_POINTS if isinstance(sweep, CountVolume) else POINTS
         if most not in self._points:
@@ -216,7 +217,7 @@ class MapChecks:
         return out
 
     def _amiss(self, counts: "_Counts", chosen: NDArray[np.int64], usual: NDArray[np.float32], least: float) -> bool:
-        """Whether light of all widths moves from column to column otherwise than the planes do; False where open."""
+        """Whether light of all widths moves from column to column otherwise than the planes; False if undecided."""
         from rig.count.map_check_kernels import BIN_PX, SPAN, follow_lines
 
         geometry, points = self._geometry, counts.points
@@ -306,7 +307,7 @@ class _Counts:
         return np.asarray(np.cumsum(steps)[: geometry.width])
 
     def lit(self) -> NDArray[np.int64]:
-        """Points that have frames and whose NEAREST partners have frames too."""
+        """Numbers of the points whose NEAREST lines, their own among them, all have frames."""
         return np.flatnonzero((self.exposures[:NEAREST] > 0).all(axis=0))
 
     def lines(self, chosen: NDArray[np.int64], most: int) -> NDArray[np.int32]:
@@ -320,7 +321,7 @@ class _Counts:
     def mean(
         self, partner: int, chosen: NDArray[np.int64], x: NDArray[np.int64], away: int, reach_px: tuple[int, int]
     ) -> Array:
-        """Mean ones per exposure around x, NaN if part of that was not searched; reach_px: first and last pixel."""
+        """Mean ones per exposure of the pixels x + away * (first to last of reach_px); NaN if not all were searched."""
         geometry = self._geometry
         y, c = self.points.row[partner, chosen], self.points.column[partner, chosen]
         px = x[:, None] + away * np.arange(reach_px[0], reach_px[1] + 1)

@@ -30,7 +30,7 @@ Gap = tuple[int, int]
 class FrameCounts:
     """Number of frames of a sweep from its scan marker to the next one: expected = received + lost.
 
-    lit: frames that fell on columns; dark: frames with the gate low throughout.
+    lit: frames that are counted for columns; dark: frames with the gate low throughout. Others are in neither.
     """
 
     expected: int
@@ -45,7 +45,7 @@ class SweepAccount:
     """Account of a sweep, kept after its counts are dropped.
 
     direction: +1 if the mirror command rose, -1 if it fell; column indices mean the same commands in both directions.
-    gaps: (first, last) numbers of frames exposed but not received. The others are as in `SweepClock`.
+    index: of its map. gaps: (first, last) numbers of frames lost or repeated. The others are as in `SweepClock`.
     """
 
     index: int
@@ -62,7 +62,7 @@ class SweepAccount:
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class SweepData(SweepAccount):
-    """One counted sweep. tally: as its counter gives it. count_s: wall time spent on binding and counting."""
+    """One counted sweep. tally: its counter's, with the velocity. count_s: wall time spent on binding and counting."""
 
     tally: FrameTally
     count_s: float
@@ -74,7 +74,7 @@ class SweepData(SweepAccount):
 
 @dataclass(frozen=True, slots=True)
 class SweepStart:
-    """First sweep of a run that becomes a map: number 0, except in a part that was cut from a recording.
+    """First sweep of a run to become a map: number 0, except in a part that was cut from a recording.
 
     clock_ratio: as in `FrameBinder`. Frames of earlier sweeps are not counted.
     """
@@ -114,7 +114,8 @@ class SweepAssembler:
         """Whether the scan marker that closes the last map has been seen."""
 
     def add(self, block: FrameBlock) -> Iterator[SweepData]:
-        """Count a block; yields the sweeps that end in it. Stop calling it once `complete`."""
+        """Count a block; yields the sweeps that end in it. Stop calling it once `complete`. Raises ProtocolError for a
+        block that is not of this run and plan, and the errors of `FrameBinder.bind`."""
         self._check(block)
         first = block.header.first_frame
         if self._next_frame is not None and first > self._next_frame:
@@ -189,7 +190,7 @@ class SweepAssembler:
         return data
 
     def _note_repeated(self, block: FrameBlock, bound: BoundFrames) -> NDArray[np.int64]:
-        """Indices of frames whose ticks do not rise: the one before them once more, in their place. They are lost."""
+        """Count frames whose ticks do not rise as lost: each is the one before it once more. Returns their indices."""
         ticks = block.start_ticks
         before = ticks[0] - 1 if self._last_tick is None else self._last_tick
         repeated = np.flatnonzero(np.diff(ticks, prepend=before) <= 0)
@@ -204,7 +205,8 @@ class SweepAssembler:
         return repeated
 
     def _windows(self, block: FrameBlock, bound: BoundFrames) -> NDArray[np.int32]:
-        """First pixel used of each frame, int32 (n,): what its record says, or for full frames what the plan says."""
+        """First pixel used of each frame, int32 (n,): what the plan says for full frames, else its record; 0 if that is
+        marked as lost. Raises ProtocolError for a window off whole words or the sensor."""
         records, plan = block.records, self._plan
         if block.header.width == plan.width:
             return plan.window_x0(records["marks"], records["line"], bound.sweep)
@@ -221,7 +223,7 @@ class SweepAssembler:
         return x0
 
     def _check(self, block: FrameBlock) -> None:
-        """Only blocks of this run, of whole frames or of the plan's windows, can be counted."""
+        """Raise ProtocolError for a block of another run or size of frames, or of frames before the next one."""
         header, plan = block.header, self._plan
         widths = {plan.width} if plan.windows is None else {plan.width, plan.windows.width_px}
         # Counters cannot go from one width to another in the middle of a column.

@@ -20,11 +20,11 @@ MOST_WIDTH_PX = WORD_PX * 256
 BIN_DARK = -1
 """Bin of a frame with the gate low during the whole exposure."""
 BIN_UNUSABLE = -2
-"""Bin of a frame that belongs to no column and is not dark (gate edge inside, outside the sweep)."""
+"""Bin of a frame that is not counted: gate edge inside, off all columns, out of order, repeated or window lost."""
 BYTE_FRAMES = 255
 """Most frames of a column that counters of 8 bits hold."""
 BYTE_EXPOSURES = 200
-"""Nominal exposures up to which such counters do: binding lets no column have more than BYTE_FRAMES then."""
+"""Nominal exposures up to which such counters suffice: binding lets no column have more than BYTE_FRAMES then."""
 
 Counts = NDArray[np.unsignedinteger[Any]]
 """uint8, uint16 or uint32, as wide as the counts need."""
@@ -34,7 +34,7 @@ Counts = NDArray[np.unsignedinteger[Any]]
 class SweepLayout:
     """Pixels of each column that are counted: `window` from x0 (columns,) on, on a sensor of rows x width pixels.
 
-    exposures: frames nominally taken per column. used_px: pixels of each frame that are used; None for whole rows.
+    exposures: frames nominally taken per column. used_px: pixels used per row of a frame; None for whole rows.
     dark: whether there will be frames with the gate low.
     """
 
@@ -71,7 +71,7 @@ class FrameTally:
 
     n_frames: (columns,), in each column's bin. column: (columns,), mean fractional column of those frames, NaN if there
     are none. dark_counts: (rows, width) over n_dark frames with the gate low, None if there are none. width: of the
-    sensor, pixels. dark_frames: (width,), number of the n_dark frames in which a pixel was used; None for all.
+    sensor, pixels. dark_frames: (width,), number of the n_dark frames in which a pixel was used; None: in all of them.
     velocity_per_s: of the mirror command over the columns, negative if it fell, 0 if unknown.
     """
 
@@ -84,7 +84,7 @@ class FrameTally:
     velocity_per_s: float = 0.0
 
     def intensity(self) -> NDArray[np.uint32]:
-        """Counts summed over the columns, (rows, width) uint32."""
+        """Counts summed over the columns, (rows, width) uint32, in a subclass that has them."""
         raise NotImplementedError
 
     def bound_column(self) -> NDArray[np.float64]:
@@ -149,7 +149,7 @@ class SweepTally:
 
         self._layout = layout
         self.dark = np.zeros((layout.rows, PAIRS, layout.padded_width // 8 + LANES, 2), np.int32)
-        """Ones of dark frames, in lane order, with room for a whole vector behind each row."""
+        """Ones of dark frames, which kernels add, in lane order, with room for a whole vector behind each row."""
         self.reset()
 
     def reset(self) -> None:
@@ -251,7 +251,7 @@ class SweepCounter:
 class LineCounter(SweepCounter):
     """The counter of a rig with several lines. Its bins are places of the mirror, and its frames are whole rows.
 
-    Frames of a place are added once, and each line's window is read from the result. layout, and the volume: of all
+    Frames of a place are added once, and each line's window is read from the result. layout and the volume are of all
     columns.
     """
 

@@ -22,10 +22,10 @@ from rig.threads import RowWorkers
 def depth_map(
     stripes: StripeTable, geometry: SweepGeometry, min_confidence: float, workers: RowWorkers | None = None
 ) -> Float32:
-    """Depth z in metres (rows, width) float32, NaN where two confident neighbouring stripes do not enclose the pixel.
+    """Depth z in metres (rows, width) float32, NaN where no two neighbouring stripes of one surface enclose the pixel.
 
-    Only stripes of at least `min_confidence` are used, and nothing else is filled. Depth that lies outside the depth
-    range by more than a tenth is also NaN.
+    Only stripes of at least `min_confidence` are used, and nothing else is filled. Depth whose inverse lies outside
+    that of the depth range by more than a tenth is also NaN.
     """
     from rig.depth.kernels import fill_rows
 
@@ -56,8 +56,8 @@ SAME_PX = 1.5
 
 
 def share_claims(stripes: StripeTable, grid: LineGrid) -> StripeTable:
-    """The table in which the confidence c of coinciding answers is multiplied by c over their sum; equal ones are
-    halved.
+    """The table in which the confidence c of each of several coinciding answers is multiplied by c over the sum of
+    theirs; two equal ones are halved.
 
     Positions stay as they are.
     """

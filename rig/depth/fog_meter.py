@@ -11,11 +11,11 @@ is fitted by maximum likelihood of the counts, binned by s (float64 sums (blocks
 The parameters are haze, extinction, the share `rest` that was scattered more than once, and the error of the learned
 ambient light.
 
-Error bars are those of the sandwich, H^-1 (sum of g g^T) H^-1, with g the likelihood's slope from each block of rows
-and columns. What the model leaves out shows as scatter between blocks, as in a jackknife, of which this is the first
-order.
-One error shows in no scatter: light scattered more than once flattens the decay all over the picture. Therefore
-REST_SHARE of `rest` is added to the extinction's relative error.
+Error bars are those of the sandwich, H^-1 (sum of g g^T) H^-1, with H the information of the counts and g the
+likelihood's slope from each block of rows and columns; they are no shorter than those of H^-1. What the model leaves
+out shows as scatter between blocks, as in a jackknife, of which this is the first order. One error shows in no scatter:
+light scattered more than once flattens the decay all over the picture. Therefore REST_SHARE of `rest` is added (in
+quadrature) to the extinction's relative error.
 
 Limits. Nothing is carried over between maps: a reading depends on its map only, and is the same whenever the map is
 estimated again. If the fog forms a halo around the stripes (`halo` of the model), its light falls off on both sides of
@@ -45,7 +45,7 @@ STEPS: Final = 40
 REST_PRIOR: Final = 25.0
 """Inverse variance of `rest` before any count (sd 0.2), so that a map without pixels behind stripes is solvable too."""
 RIDGE: Final = 1e-11
-"""Added to the diagonal: keeps the inverse positive where two numbers say the same, as even haze and ambient light."""
+"""Added to the diagonal: keeps the inverse positive where two numbers say the same, as even haze and daylight do."""
 FLUX_MIN: Final = 1e-7
 FLUX_MAX: Final = 50.0
 """Photons per exposure; between these all logarithms are finite."""
@@ -64,7 +64,7 @@ def fit_fog(sums: Float64, path_m: Float64) -> FogFit | None:
     """Fit of block sums (blocks, 2, bins, 4) over bins of mean path; None if too little was seen before stripes.
 
     Levenberg's steps start from the likeliest of several extinctions. The covariance is that of the counts; each
-    parameter's error is widened to the sandwich's.
+    parameter's error is widened to the sandwich's if that is larger.
     """
     blocks, _, bins, _ = sums.shape
     used = sums[..., 1].sum(0).ravel() > LEAST_EXPOSURES
@@ -107,8 +107,8 @@ def _inverse(information: Float64) -> Float64:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class _Data:
-    """Sums of the fit, (blocks, cells) each; path_m, behind: (cells,), distance from the middle path, and side of the
-    stripe.
+    """Data of the fit, (blocks, cells): sums of ones and exposures; gain, ambient: means of the geometry factor and of
+    the flux that is no haze. path_m, behind: (cells,), distance from the middle path, and whether behind the stripe.
     """
 
     ones: Float64
@@ -174,7 +174,7 @@ is flatter by 25 to 40 % where `rest` is 0.35 to 0.45 (Mitsuba rows, docs/explan
 
 @dataclass(frozen=True, slots=True)
 class FogEstimate:
-    """Fog and light of a map, each with its standard deviation; None if it is not resolved.
+    """Fog and light of a map, each but veil_to_signal with its standard deviation; None if it is not resolved.
 
     visibility_m: 3.912 / extinction; its standard deviation is half of the change for an extinction that is two
     standard deviations smaller.
@@ -194,7 +194,7 @@ class FogEstimate:
     veil_to_signal: float | None = None
 
     def brief(self) -> str:
-        """The visibility in three words, empty if it is not resolved."""
+        """The visibility with its error as a short text, empty if it is not resolved."""
         if self.visibility_m is None or self.visibility_sd_m is None:
             return ""
         return f"visibility {digits(self.visibility_m)} +- {digits(self.visibility_sd_m, 2)} m"
@@ -235,7 +235,8 @@ def read_fog(sweep: Any, stripe: StripeTable, geometry: SweepGeometry, state: An
 
 
 def _dark_offset(sweep: Any, ambient: Float32, hot_flux: float) -> tuple[float, float] | None:
-    """Excess of dark frames over the learned ambient light, and its standard deviation; None without dark frames."""
+    """Excess of dark frames over the learned ambient light, and its standard deviation; None without dark frames, or if
+    none or all of their pixels fired."""
     if sweep.dark_counts is None:
         return None
     frames = np.broadcast_to(sweep.n_dark if sweep.dark_frames is None else sweep.dark_frames, ambient.shape)

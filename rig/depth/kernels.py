@@ -34,7 +34,8 @@ def fill_rows(
     Also writes the mirror's command there, from the columns' `commands`, unless `command` is empty.
 
     Two stripes of one row lie on one surface if their columns are at most MAX_COLUMN_GAP apart and their spacing is
-    that of equal depth within 1 px + 3 sd. Between them the column is linear in x. The more confident pair wins.
+    that of equal depth within 1 px + 3 sd. Between them the column is linear in x. A pair's confidence is the lower one
+    of its two stripes, and the more confident pair wins.
     """
     rows, columns = x_px.shape
     width = u.shape[1]

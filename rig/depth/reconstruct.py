@@ -44,7 +44,8 @@ def map_geometry(
     model: RigModel | None, column_commands: Sequence[float] | Float64, depth_range_m: tuple[float, float], *,
     sensor: tuple[int, int] | None = None, lines: LineGrid | None = None,
 ) -> SweepGeometry:  # fmt: skip
-    """Geometry of maps; arguments as of `Reconstructor`. Raises UsageError without model and sensor."""
+    """Geometry of maps; arguments as of `Reconstructor`. Raises UsageError without model and sensor, and the errors of
+    `sweep_geometry`."""
     if model is None:
         if sensor is None:
             raise UsageError("without a calibration the sensor size (rows, width) must be given")
@@ -59,7 +60,7 @@ class Reconstructor:
     model: rig model; None for an uncalibrated rig, which gives stripes only and needs sensor (rows, width).
     column_commands: (columns,) mirror command of each column's centre. learned: states of earlier maps to use. lines:
     which line lights which column, if there are several. The estimator must be named (`rig.scan.estimator` chooses for
-    `auto`). Raises UsageError without model and sensor.
+    `auto`): without `learned` any other name raises KeyError. Raises the errors of `map_geometry` too.
     """
 
     def __init__(
@@ -96,7 +97,7 @@ class Reconstructor:
         return self.estimator.counter(layout, self.geometry)
 
     def map(self, sweep: FrameTally) -> MapResult:
-        """Stripe table, depth and intensity of one counted sweep, with the time that estimation took.
+        """The map of one counted sweep, with the time that all of it took.
 
         sweep: the result of a `counter`, or a `CountVolume`.
         """
@@ -135,6 +136,6 @@ class Reconstructor:
         return self.geometry.bound_to(self._model, commands, sweep.velocity_per_s)
 
     def _fog(self, sweep: FrameTally, stripe: StripeTable) -> FogEstimate:
-        """Fog of the map; nothing if its estimator learns no haze, or without a geometry."""
+        """Fog of the map; an empty estimate if its estimator learns no haze, or without a calibration."""
         state = self.estimator.used
         return FogEstimate() if state is None or self._model is None else read_fog(sweep, stripe, self.geometry, state)

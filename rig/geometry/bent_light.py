@@ -21,7 +21,7 @@ _SAMPLED_SHEETS = 4097
 """Sheets sampled over the command range: between two of them a plane is linear to 1e-8 rad."""
 _SAMPLED_COLUMNS = 9
 _SAMPLED_ROWS = 16
-"""So many columns, and one row in so many, are looked at for what the bent rays leave."""
+"""About so many columns, and one row in so many, are examined for the error that bent rays leave."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -94,8 +94,8 @@ def beside_px(
 ) -> int:
     """Largest distance in pixels of stripes from the place that planes and bent rays give, within the depth range.
 
-    rays: u and v (rows, width); bent: u as from `bent_u`. Holds for sweeps in both directions at the fastest speed at
-    which the lag was measured.
+    rays: u and v (rows, width); bent: u as from `bent_u`. Rounded up, from a sample of rows and columns. Holds for
+    sweeps in both directions at the fastest speed at which the lag was measured.
     """
     u, v, bent = (each[::_SAMPLED_ROWS] for each in (*rays, bent))
     y = np.arange(0, len(rays[0]), _SAMPLED_ROWS)[:, None]

@@ -18,7 +18,8 @@ from rig.simd import Float32, Float64, Int32
 def row_windows(u: Float32, v: Float32, plane: Float64, w_far: float, w_near: float) -> tuple[Int32, Int32]:
     """First and last pixel (rows, columns) int32 whose inverse depth p.(u, v, 1) lies in [w_far, w_near].
 
-    Pixels without a ray (NaN) are outside.
+    Pixels at a row's ends without a ray (NaN) are outside. The interval is empty (first > last) where the plane has no
+    such pixel, and on rows with fewer than two rays.
     """
     rows, width = u.shape
     columns = plane.shape[0]
@@ -53,8 +54,8 @@ def row_windows(u: Float32, v: Float32, plane: Float64, w_far: float, w_near: fl
 
 @numba.njit(inline="always")
 def with_rays(u, y, first, last):  # type: ignore[no-untyped-def]
-    """First and last of those pixels of a row, without pixels at its ends that have no ray. At least one pixel
-    is left."""
+    """First and last pixel of the stretch `first` to `last` of row y without those at its ends that have no ray. At
+    least one pixel is left."""
     while first < last and np.isnan(u[y, first]):
         first += 1
     while last > first and np.isnan(u[y, last]):
@@ -63,8 +64,8 @@ def with_rays(u, y, first, last):  # type: ignore[no-untyped-def]
 
 
 NEWTON_STEPS: Final = 2
-"""Newton's steps from the plane on: they leave the rounding of float32, also where sheets bow ten times as much as a
-bad lens's."""
+"""Newton's steps from the plane on: no more error than float32's rounding is left, also where sheets bow ten times as
+much as a bad lens's."""
 
 
 @numba.njit(cache=True, nogil=True)
@@ -74,9 +75,9 @@ def bent_inverse_depth(
 ) -> None:  # fmt: skip
     """Write inverse depth (rows, width) where the mirror was bound to `command`; NaN where there is none.
 
-    ahead: (rows,) difference of the command from that when the row is exposed. sheets: (samples, 10) float64, n, d,
-    middle and across of the sheets at even steps of the command from low to high, close enough to be interpolated
-    linearly.
+    ahead: (rows,) change of the command until the row is exposed. sheets: (samples, 10) float64, n, d, middle and
+    across of the sheets at even steps of the command from low to high, close enough to be interpolated linearly.
+    origin: (3,) of the sheets' fan in metres. bow: per radian.
     """
     rows, width = command.shape
     per_command = (len(sheets) - 1) / (high - low)

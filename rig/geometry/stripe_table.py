@@ -18,10 +18,9 @@ class StripeTable:
     confidence: probability that x_px is within 1 px of the truth, 0 to 1 (0 where x_px is NaN).
     x_sd_px: standard deviation of x_px given that it is the right stripe.
     signal: photons per exposure of the stripe, summed across it; haze: photons per exposure and pixel just before it.
-    x2_px: position of a second stripe beside it, nearer or farther (a pane before a wall), NaN where no light stands
-    out;
-    confidence2: probability that there is one within 1 px of it, 0 where it is NaN. Both are None if an estimator does
-    not look for one.
+    x2_px: position of a second stripe beside that at x_px, nearer or farther (a pane before a wall), NaN where no light
+    stands out. confidence2: probability that there is a stripe within 1 px of x2_px, 0 where x2_px is NaN. Both are
+    None if an estimator does not look for a second stripe.
     """
 
     x_px: Float32
@@ -52,7 +51,7 @@ def stripe_errors(x_px: Float32, true_x_px: Float32) -> dict[str, float | None]:
     """Errors in pixels over the (row, column) that have a true stripe; both arrays (rows, columns), NaN = none.
 
     `missing`: share of those without an estimate; `mean_abs`, `median_abs`: over the estimated ones (None if there are
-    none); `within_1px`: over all, where a missing one counts as wrong.
+    none); `within_1px`: share of all, where a missing one counts as wrong. All None if there is no true stripe.
     """
     scored = np.isfinite(true_x_px)
     error = np.abs(x_px[scored].astype(np.float64) - true_x_px[scored])

@@ -84,7 +84,8 @@ class SweepGeometry:
     def reference_px(self) -> Float64:
         """Position of each column's line at the middle inverse depth, (rows, columns) px, as if without distortion.
 
-        Only its differences between neighbouring rows and columns matter. It may lie outside the picture.
+        Only its differences between neighbouring rows and columns matter. It may lie outside the picture. 0 everywhere
+        if no row has two pixels with a ray.
         """
         near_m, far_m = self.depth_range_m
         w = 0.5 * (1.0 / near_m + 1.0 / far_m)
@@ -103,7 +104,8 @@ class SweepGeometry:
 def sweep_geometry(model: RigModel, commands: Float64, depth_range_m: tuple[float, float]) -> SweepGeometry:
     """Search windows of the light at mirror commands (columns,), for a camera and a depth range in metres.
 
-    Raises UsageError if a plane passes through the camera, or if no column can be seen within the depth range.
+    Raises UsageError if a plane passes through the camera, or if no column can be seen within the depth range, and
+    CalibrationError for commands outside the calibration's.
     """
     from rig.geometry.kernels import row_windows
 

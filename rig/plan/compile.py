@@ -34,7 +34,7 @@ BLOCK_S = 5e-3
 Each block costs Python some 0.3 ms, part of it on every thread; an estimate waits for its block to fill.
 """
 BLOCK_BYTES = 16 << 20
-"""Most bytes of a block's frames: 512 whole frames of 512 x 512 pixels."""
+"""Most bytes of a block's frames with their records: 511 whole frames of 512 x 512 pixels."""
 
 PointClock = Callable[[float], Fraction]
 
@@ -94,7 +94,7 @@ def _draft(
     info: SpadInfo,
     line_offsets: Sequence[float],
 ) -> tuple[ScanPlan | None, list[str]]:
-    """The plan, where there is a mirror path for it, and all problems with scanner and calibration."""
+    """The plan, None if it cannot be made, and all problems with scanner, calibration and blanking pattern."""
     places, lines = scan.columns // len(line_offsets), None
     commands = column_command(np.arange(scan.columns), scan.command_range, scan.columns)
     if len(line_offsets) > 1:
@@ -129,7 +129,7 @@ def path_demand(scan: ScanConfig, places: int, model: RigModel | None, *, marker
         frame_s=1 / frame_rate,
         lag_s=max(model.lag_s if model is not None else Lag()),
         guard_s=GUARD_FRAMES / float(frame_rate),
-        # Without markers nothing says that the gate was low on a column: it is open on all of them for sure.
+        # Without markers nothing says that the gate was low on a column, so it must surely be open on all of them.
         clock_tolerance=CLOCK_TOLERANCE if blanking is None else MAX_CLOCK_ERROR,
         dark_fraction=scan.dark_fraction,
         bidirectional=scan.bidirectional,
@@ -180,7 +180,7 @@ def _plan(
 
 
 def _with_windows(plan: ScanPlan, step_px: int) -> ScanPlan:
-    """The plan with its moving windows, and the markers that move them in the dark."""
+    """The plan with its moving windows and the markers that move them in the dark; unchanged if it can have none."""
     moving = moving_windows(plan, step_px)
     if moving is None:
         return plan
@@ -207,7 +207,8 @@ def _transported(plan: ScanPlan, burst: BurstMode | None) -> ScanPlan:
 def _windows(
     model: RigModel | None, commands: NDArray[np.float64], scan: ScanConfig, info: SpadInfo, lines: LineGrid | None
 ) -> tuple[NDArray[np.int32], int, LineGrid | None]:
-    """First pixel of each column's window, the windows' width, and the lines with the overlap of their windows."""
+    """First pixel of each column's window, the windows' width, and the lines with the overlap of their windows. Raises
+    PlanError where `sweep_geometry` raises UsageError."""
     if model is None:
         return np.zeros(scan.columns, np.int32), -(-info.width // 64) * 64, lines
     from rig.geometry.windows import sweep_geometry

@@ -102,12 +102,12 @@ def plan_content(plan: ScanPlan) -> dict[str, Any]:
 
 
 def rounded(value: float) -> str:
-    """A number for people, with four digits and no exponent."""
+    """A number for people, with four digits; without exponent between 0.0001 and a million."""
     return f"{float(f'{value:.4g}'):g}"
 
 
 def beyond_sensor(scan: ScanConfig, info: SpadInfo) -> Iterator[tuple[float, str]]:
-    """The sensor's highest frame rate and, if the requested one is higher, the problem."""
+    """Yield the sensor's highest frame rate and the problem if the requested rate is higher, else nothing."""
     if scan.frame_rate > info.max_frame_rate_hz:
         most = float(info.max_frame_rate_hz)
         yield (
@@ -118,7 +118,7 @@ def beyond_sensor(scan: ScanConfig, info: SpadInfo) -> Iterator[tuple[float, str
 
 
 def beyond_link(plan: ScanPlan, info: SpadInfo, draft_at: Callable[[Fraction], ScanPlan | None]) -> tuple[float, str]:
-    """The highest frame rate that the link carries, in whole hertz, and the problem with the requested one."""
+    """Highest frame rate that the link carries, in whole hertz (0: none), and the problem with the requested one."""
     rate, have = float(plan.frame_rate_hz), plan.link_bytes_per_s or 0.0
     made = f"{rounded(rate * frame_bytes(plan.width, plan.rows) / 1e6)} MB/s of full frames"
     if plan.windows is not None:
@@ -137,8 +137,8 @@ def beyond_link(plan: ScanPlan, info: SpadInfo, draft_at: Callable[[Fraction], S
 def _carried_hz(plan: ScanPlan, step_px: int, draft_at: Callable[[Fraction], ScanPlan | None]) -> int:
     """The highest frame rate of this scan that the link carries, in whole hertz.
 
-    The slower the scan, the closer its markers and the narrower its windows may be: tried from the narrowest ones,
-    which are carried fastest, to full frames.
+    The slower the scan, the closer its markers and the narrower its windows may be. Widths are tried from the narrowest
+    one, which is carried fastest, to full frames.
     """
     for width in range(*window_widths(plan, step_px)):
         rate = math.floor((plan.link_bytes_per_s or 0.0) / frame_bytes(width, plan.rows))

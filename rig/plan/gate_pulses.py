@@ -27,7 +27,7 @@ def sync_program(plan: ScanPlan, maps: int) -> tuple[tuple[Pulse, ...], int]:
 
 
 def _gate_s(plan: ScanPlan, sweep: int, lit: bool) -> list[tuple[float, float]]:
-    """(open, close) of the gate from the scan marker of a sweep, ascending."""
+    """(open, close) of the gate in seconds from a sweep's scan marker, ascending; the pattern's alone if not lit."""
     leg = plan.leg(sweep)
     flashes = () if plan.blanking is None else plan.blanking.flashes_s(sweep % len(plan.legs))
     begin_s = plan.pattern_s(leg)
@@ -47,7 +47,7 @@ def _pulses(plan: ScanPlan, sweep: int, lit: bool) -> list[Pulse]:
 
 DEPTHS_TRIED = 32
 COMMANDS_TRIED = 256
-"""Number of places at which it is tried whether the camera sees the line."""
+"""Numbers of depths and of mirror commands at which it is tried whether the camera sees the line."""
 
 
 def unseen_pattern(plan: ScanPlan, model: RigModel | None) -> list[str]:

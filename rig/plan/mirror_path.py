@@ -23,7 +23,7 @@ from drivers.interfaces import ScannerLimits
 Array = NDArray[np.float64]
 
 MIN_RAMP_POINTS = 4
-"""Fewest points of a ramp: with fewer it is a step to the galvo, whatever its formula says."""
+"""Fewest points of a ramp or move: with fewer it is a step to the galvo, whatever its formula says."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -124,7 +124,7 @@ def sweep_path(
 ) -> SweepPath:
     """Make the path that crosses `edges` (commands of the first and last lit edge) at constant velocity in `lit_s`.
 
-    margin_s: duration of the constant velocity before the first edge and, equally, after the last.
+    margin_s: least duration of the constant velocity before the first edge and, equally, after the last.
     fly_back: return to the start before the sweep ends (unidirectional); otherwise the sweep ends where the return
       begins.
     least_points: minimum length of the sweep; a rest makes up the difference.
@@ -213,12 +213,12 @@ class PathDemand:
         """Time for which the gate is open before the first and after the last column: the guard, and the drift of its
         clock.
         """
-        # Counted from the scan marker; the run-in is shorter than the lit part wherever it matters.
+        # The drift counts from the scan marker; the run-in is shorter than the lit part wherever it matters.
         return self.guard_s + self.clock_tolerance * 2 * float(self.lit_s)
 
     @property
     def cruise_margin_s(self) -> float:
-        """Time at constant velocity beyond the lit part, so that the lag is steady while the gate is open."""
+        """Time at constant velocity on either side of the lit part; the lag is then steady while the gate is open."""
         return self.lag_s + self.gate_margin_s + self.lead_s
 
 
@@ -297,8 +297,8 @@ def _path(demand: PathDemand, motion: MirrorLimits) -> SweepPath:
 
 
 def remedy(demand: PathDemand, exposures: int, limits: ScannerLimits, point_clock: Callable[[float], Fraction]) -> str:
-    """Say what to change so that the scanner can follow: the fewest exposures, or the widest range, that are
-    possible."""
+    """Say what to change so that the scanner can follow: the fewest exposures and the widest range that are possible,
+    else other settings."""
 
     def works(changed: PathDemand) -> bool:
         return not find_path(changed, limits, point_clock).problems

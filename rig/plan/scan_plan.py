@@ -34,10 +34,10 @@ Shifted against itself, or against its reverse, it correlates to at most 0.36; i
 MAX_CLOCK_ERROR = 1e-3
 """Clock ratios further from nominal than this are a fault, not a crystal."""
 CHIPS_PER_COLUMN = 5
-"""Length of a column in chips, about: the longer a chip, the fewer photons it takes to find it."""
+"""Length of a column in chips, about: the longer a chip, the fewer photons per frame it takes to find the pattern."""
 MOST_CHIP_FRAMES = 8
 VERNIER_FRAMES = 0.382
-"""Fraction added to whole frames: one minus the golden ratio, whose multiples spread most evenly."""
+"""Fraction added to whole frames: one minus the golden ratio's fraction 0.618, whose multiples spread most evenly."""
 MARGIN_FRAMES = 2.0
 """Dark frames kept before the pattern, and behind the last frame of its search."""
 
@@ -71,7 +71,7 @@ class Blanking:
 
 
 def blanking_for(columns: int, exposures: int, frame_rate_hz: Fraction) -> Blanking:
-    """Make the pattern for a scan. The clocks of scanner and SPAD may differ by up to `MAX_CLOCK_ERROR`."""
+    """Make the pattern for a scan of `columns` places; clocks of scanner and SPAD may be `MAX_CLOCK_ERROR` apart."""
     frame_s = 1 / float(frame_rate_hz)
     chip = min(max(1, round(exposures / CHIPS_PER_COLUMN)), MOST_CHIP_FRAMES) + VERNIER_FRAMES
     # From one pattern to the next; sweeps are rarely longer than twice their lit part.
@@ -108,7 +108,7 @@ class ScanPlan:
     sweep_points: points from one scan marker to the next.
     marker_points: int64 (markers,), point of line marker j within a sweep. It marks the command of the edge j *
       columns_per_marker columns into the lit part; markers after the lit part only move the window in the dark.
-    commands: float64 (columns,), mirror command of each column's centre.
+    commands: float64 (columns,), mirror command of each column's centre, plus its line's offset.
     x0: int32 (columns,), first stored pixel of each column's window. window: stored pixels per row. Both are multiples
       of 64.
     link_bytes_per_s: rate that the SPAD's link carries; None if it cannot stream.

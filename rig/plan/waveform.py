@@ -23,9 +23,9 @@ from rig.plan.mirror_path import SweepPath, mirrored
 from rig.plan.scan_plan import Leg, ScanPlan
 
 LEAST_MARKER_POINTS = 4
-"""Points of a marker: one high and one low, and as many again before a comparator is sure to see the next one."""
+"""Fewest points between markers: one high and one low, and as many again for a comparator to be sure of the next."""
 LEAST_MARKER_FRAMES = 2
-"""Frames between edges, so that they never share a frame, whose record has room for the position of one."""
+"""Fewest frames between edges, which thus never share a frame: its record has room for the position of one."""
 SLACK_COLUMNS = 1.0
 """Columns kept on either side of those that an entry should see: room for clock errors and late markers."""
 
@@ -60,7 +60,8 @@ def line_markers(path: SweepPath, columns: int, exposures: int) -> tuple[int, ND
 def _scan_marker_points(leg: Leg, rate: Fraction) -> int:
     """Points for which the scan marker, which holds the gate, stays high: until the middle of the gate's last slice.
 
-    So neither the scanner's clock nor the sync source's decides when the gate closes, while they differ by less.
+    So the gate closes as its pulse ends, not as the marker falls, while the clocks of scanner and sync source differ by
+    less than half a slice.
     """
     lit_s = leg.gate_close_s - leg.gate_open_s
     return max(1, math.floor((leg.gate_close_s - lit_s / slices(lit_s) / 2) * rate))
@@ -81,7 +82,8 @@ def waveform_of(legs: tuple[Leg, ...], marker_points: NDArray[np.int64], rate: F
 def moving_windows(plan: ScanPlan, step_px: int) -> tuple[WindowTable, NDArray[np.int64]] | None:
     """The table of windows for a plan that has the markers of its lit part, and the points of the markers in the dark.
 
-    step_px: grid of the sensor's windows. None if windows would be as wide as the sensor.
+    step_px: grid of the sensor's windows. None if windows would be as wide as the sensor, or the grid leaves out pixels
+    that columns use.
     """
     _, row, grid = window_widths(plan, step_px)
     spans = [_spans(plan, leg, grid) for leg in plan.legs]

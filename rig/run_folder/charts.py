@@ -92,7 +92,7 @@ class Panel:
     front: Sequence[Point] = ()
 
     def axes(self) -> tuple[Axis, Axis]:
-        """The two axes, which show all points."""
+        """The axes of x and y, which show all points of the curves and, above 0, their intervals."""
         points = [point for series in self.series for point in series.points]
         ends = [(math.nan, y) for series in self.series for interval in series.intervals for y in interval if y > 0]
         width, height = PANEL_PX

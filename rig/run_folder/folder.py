@@ -4,8 +4,9 @@
     learned/000000.npz (the state used for the map, if the estimator learns)
     truth/000000.npz (if a world knows it)  manifest.json  summary.json
 
-Everything is written beside the folder under a hidden name and moved in one step at the end. The folder of a recording
-is there from the start and grows in place. Data written with `replace_file` and `sync_folder` survives a loss of power.
+Everything is written beside the folder under a hidden name and moved in one step at the end; a given empty folder is
+filled file by file, summary.json last. The folder of a recording is there from the start and grows in place. Data
+written with `replace_file` and `sync_folder` survives a loss of power.
 """
 
 import io
@@ -39,10 +40,10 @@ Rays = tuple[NDArray[np.floating], NDArray[np.floating]]
 
 
 class RunFolder:
-    """Collects the outputs of a run. `publish` makes them appear as `path`; leaving without it removes every trace.
+    """Collects the outputs of a run. `publish` makes them appear as `path`; leaving without it or `keep` removes them.
 
     in_place: whether the outputs can be seen at `path` from the start.
-    Raises UsageError, with one line, if the folder exists with something in it or cannot be written.
+    Raises UsageError, with one line, if `path` is a file or a folder with something in it, or cannot be written.
     """
 
     def __init__(self, path: str | os.PathLike[str], *, in_place: bool = False) -> None:
@@ -96,7 +97,7 @@ class RunFolder:
         return self._scratch / name
 
     def write_truth(self, index: int, truth: SweepTruth) -> None:
-        """Write the world's truth for the sweep of a map."""
+        """Write the world's truth for the sweep of a map. Raises UsageError as `write_map` does."""
         self._write({f"truth/{index:06d}.npz": _npz_bytes({"x_px": truth.x_px, "depth_m": truth.depth_m})})
 
     def remove_map(self, index: int) -> None:
@@ -105,8 +106,8 @@ class RunFolder:
             file.unlink(missing_ok=True)
 
     def write_json(self, name: str, content: Mapping[str, Any]) -> None:
-        """Write `name` (manifest.json, summary.json) as strict JSON. A reader sees either the old file or the
-        new one."""
+        """Write `name` (manifest.json, summary.json) as strict JSON, the manifest sealed. A reader sees either the old
+        file or the new one. Raises UsageError if it cannot be written."""
         text = json_text(content)
         text = sealed_text(text) if name == MANIFEST else text
         file = self.place(name)
@@ -118,7 +119,7 @@ class RunFolder:
             raise _unwritable(self.path, error) from error
 
     def write_text(self, name: str, text: str) -> None:
-        """Write a file of text."""
+        """Write a file of text. Raises UsageError as `write_map` does."""
         self._write({name: text.encode()})
 
     def keep(self) -> None:
@@ -129,7 +130,7 @@ class RunFolder:
 
     def publish(self) -> Path:
         """Make the folder appear and return its path: its name, or NAME-2 and so on if the name has been taken
-        meanwhile.
+        meanwhile. Raises UsageError if it cannot.
         """
         scratch = self._scratch
         assert scratch is not None, "a run folder is published once"
@@ -206,7 +207,7 @@ class RunFolder:
 
 
 def json_text(content: Mapping[str, Any]) -> str:
-    """Write strict JSON: NaN and infinities become null, arrays become lists, paths become text."""
+    """Content as strict JSON: NaN and infinities are null, arrays lists, fractions numbers, paths and the like text."""
     return json.dumps(_plain(content), indent=1, allow_nan=False, ensure_ascii=False)
 
 
@@ -219,7 +220,7 @@ class SavePolicy:
 
     @classmethod
     def parse(cls, text: str) -> "SavePolicy":
-        """Parse "all", "last" or "every 5". Raises UsageError for anything else."""
+        """Parse "all", "last" or "every 5", also "every=5" or "every:5". Raises UsageError for anything else."""
         match = re.fullmatch(r"(all)|(last)|every[\s:=]+0*([1-9]\d*)", text.strip().lower(), re.ASCII)
         if match is None:
             raise UsageError(f"--save is {text!r}; write 'all', 'last' or 'every N' with N of 1 or more")
@@ -235,7 +236,7 @@ class SavePolicy:
 
 
 def _renamed(folder: Path, target: Path) -> bool:
-    """Move a folder; False if something is at `target` already."""
+    """Move a folder; False if what is at `target` already prevents it. Raises OSError if something else does."""
     try:
         folder.rename(target)
     except OSError:
@@ -285,7 +286,7 @@ def hold(fd: int) -> None:
 
 
 def is_held(file: Path) -> bool:
-    """Whether a process has locked a file; False if there is no such file."""
+    """Whether a process has locked a file; False if there is no such file, and on Windows."""
     if fcntl is None or not file.exists():
         return False
     with file.open("rb") as stream:

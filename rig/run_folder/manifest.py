@@ -20,7 +20,7 @@ SEAL: Final = "crc32"
 UNFINISHED: Final = "recording"
 """Verdict of a run that is not over, or was killed."""
 MOST_RUN_FRAMES: Final = 1 << 48
-"""Most frames that a run can have: 80 years at 100 kHz."""
+"""A run has fewer frames than this: 89 years at 100 kHz."""
 _NEXT: Final = "'rig repair' writes a new one"
 
 Count = Annotated[int, Field(ge=0, lt=MOST_RUN_FRAMES)]
@@ -107,8 +107,8 @@ def sealed_text(text: str) -> str:
 
 
 def read_manifest(folder: Path) -> dict[str, Any] | None:
-    """Read the manifest of a run without its seal; None if there is none. Raises DamagedRecordingError if it is
-    damaged.
+    """Read the manifest of a run without its seal; None if there is none. Raises DamagedRecordingError if it is damaged
+    or cannot be read.
     """
     try:
         raw = (folder / MANIFEST).read_bytes()
@@ -153,7 +153,7 @@ def ended_before_last_map(manifest: Mapping[str, Any]) -> bool:
 
 
 def known_missing(manifest: Mapping[str, Any] | None) -> list[RunGap] | None:
-    """Frames that a repair found missing; None if there was no repair."""
+    """Frames that a repair found missing; None if there was no repair or is no manifest."""
     if manifest is None or "repaired" not in manifest:
         return None
     return [(int(run), int(first), int(last)) for run, first, last in manifest.get("missing") or []]
@@ -180,7 +180,7 @@ def file_crc32(path: Path) -> int:
 
 
 def inputs_problems(folder: Path, manifest: Mapping[str, Any]) -> list[str]:
-    """Lines on the files beside the frames that differ from what the manifest says."""
+    """Lines on the files beside the frames that differ from what the manifest says or cannot be read."""
     problems = []
     for name, stated in (manifest.get("inputs") or {}).items():
         try:

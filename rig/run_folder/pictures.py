@@ -17,7 +17,8 @@ _LABELS = 6
 
 
 def depth_limits(depth_m: NDArray[np.float32]) -> tuple[float, float] | None:
-    """Depths (m) at the ends of the colour scale: all but the outermost 1 % on each side; None if there is no depth."""
+    """Depths (m) at the ends of the colour scale, just beyond all but the outermost 1 % on each side; None if there is
+    no depth."""
     known = depth_m[np.isfinite(depth_m)]
     if not known.size:
         return None
@@ -29,7 +30,8 @@ def depth_limits(depth_m: NDArray[np.float32]) -> tuple[float, float] | None:
 def depth_picture(
     depth_m: NDArray[np.float32], limits: tuple[float, float] | None, unit: str = "m"
 ) -> NDArray[np.uint8]:
-    """Depth in colours between its limits, red to blue, with a scale at the right; BGR, black without depth."""
+    """Depth in colours, near red to far blue, black where there is none, with a scale at the right; all black without
+    limits. uint8 BGR (rows, width + SCALE_PX, 3)."""
     import cv2
 
     rows, width = depth_m.shape
@@ -64,7 +66,7 @@ def intensity_picture(intensity: NDArray[np.uint32]) -> NDArray[np.uint8]:
 
 
 def png_bytes(picture: NDArray[np.uint8]) -> bytes:
-    """A picture, grey (rows, width) or BGR (rows, width, 3), as a PNG file."""
+    """A picture, grey (rows, width) or BGR (rows, width, 3), as a PNG file. Raises ValueError if that fails."""
     import cv2
 
     done, data = cv2.imencode(".png", picture)
@@ -89,7 +91,7 @@ def _colours(depth_m: NDArray[np.floating], limits: tuple[float, float]) -> NDAr
 
     low, high = limits
     share = np.clip((high - depth_m) / (high - low), 0, 1)
-    # Both ends of the map are nearly black; black means 'no depth' here.
+    # Both ends of the colour map are nearly black; black means 'no depth' here.
     levels = np.round(20 + 225 * share).astype(np.uint8)
     colours: NDArray[np.uint8] = cv2.applyColorMap(levels[:, None], cv2.COLORMAP_TURBO)[:, 0]
     return colours
@@ -112,7 +114,7 @@ def cloud(
     v: NDArray[np.floating],
     intensity: NDArray[np.uint32],
 ) -> NDArray[np.void]:
-    """One POINT for each pixel with a depth. All arguments are (rows, width); (u, v, 1) is each pixel's ray."""
+    """One POINT for each pixel with depth and ray. All arguments are (rows, width); (u, v, 1) is each pixel's ray."""
     known = np.isfinite(depth_m) & np.isfinite(u) & np.isfinite(v)
     z = depth_m[known]
     points = np.empty(z.size, POINT)

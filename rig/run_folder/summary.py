@@ -18,8 +18,8 @@ _LARGEST = {
     "ring_slots", "ring_bytes", "ring_high_water", "map_queue", "map_queue_high_water", "recorder_s", "recorder_blocks",
     "recorder_bytes",
 }  # fmt: skip
-"""Figures of which a run with several starts of the SPAD has the largest, which the recorder's are of all starts by
-then; it has the sum of all others."""
+"""Figures of which the largest counts where a run starts the SPAD several times; other figures are added up. Those of
+the recorder grow from start to start, so that the largest is that of the whole run."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -27,7 +27,7 @@ class PipelineStats:
     """Figures of a pipeline during a run or at its end. Times are wall time in seconds; None means that there is no
     such stage.
 
-    source_fill_s: in the SPAD's `fill`, without source_wait_s, which is spent waiting for a free slot of the ring.
+    source_fill_s: in the SPAD's `fill`, without source_wait_s, the time spent waiting for a free slot of the ring.
     ring_high_water: largest number of slots in use at one time, of ring_slots, which take ring_bytes together.
     dropped_blocks, dropped_frames: those that found no free slot. counting_s: binding and counting. estimation_s: from
     counts to map. map_wait_s: waiting for room among the maps that the caller has not taken yet; map_queue is that
@@ -83,8 +83,9 @@ class RunVerdict(StrEnum):
 class RunFrames:
     """Frames between the first and the last scan marker, including dark and fly-back ones; expected = received + lost.
 
-    If a run ended before its last map these are all frames that came, while lit counts those of its whole maps.
-    crc_errors: blocks refused for their checksum; None if the source does not say. lit: frames that fell on columns.
+    If a run ended before its last map these are all frames that came or were lost, while lit counts those of its whole
+    maps. crc_errors: blocks refused as damaged, out of order or of another size; None if the source does not say. lit:
+    frames counted for columns.
     """
 
     expected: int = 0
@@ -98,8 +99,9 @@ class RunFrames:
 class Synchronisation:
     """The binding of a run's frames to columns: by what, and how well.
 
-    residual_columns, clock_error: the largest of its sweeps; None if one could not be checked. detection_probability:
-    the smallest, for a blanking pattern as bright as a sweep's; None if markers bound the frames.
+    residual_columns: the largest of its sweeps; None if one could not be checked. clock_error: that farthest from 0.
+    detection_probability: the smallest, for a blanking pattern as bright as a sweep's; None if markers bound the
+    frames.
     """
 
     by: Literal["markers", "blanking pattern"]
@@ -132,8 +134,8 @@ class Summary:
     """A run in figures. Times are in seconds of sensor and computer, fractions are of camera pixels; None means no
     value.
 
-    verdict_reasons: reasons against maps, found in the maps themselves. accepted_calibration: reasons against the
-    calibration that the user accepted. estimator_why: reason for the estimator, if the run chose it itself.
+    fog: of the last map. verdict_reasons: reasons against maps, found in the maps themselves. accepted_calibration:
+    reasons against the calibration that the user accepted. estimator_why: reason for the estimator if the run chose it.
     """
 
     maps: int
@@ -158,7 +160,7 @@ class Summary:
     estimator_why: str = ""
 
     def as_json(self) -> dict[str, Any]:
-        """The summary as plain values. `truth` is there only if known, some other keys only for a scan or a replay."""
+        """The summary as plain values. `truth` and the fields after `verdict` are left out where they are empty."""
         content = asdict(self)
         content["verdict"] = self.verdict.value
         optional = ("truth", "stages", "sync", "replay", "verdict_reasons", "accepted_calibration", "estimator_why")
@@ -205,7 +207,7 @@ class MapTally:
         errors = None
         if truth is not None:
             errors = stripe_errors(result.stripe.x_px, truth.x_px), depth_errors(result.depth_m, truth.depth_m)
-        # What was learned grows from map to map; the last one knows most. One step: an interrupt counts it or does not.
+        # In one step: with an interrupt the map is counted wholly or not at all.
         self._maps.append(_OfMap(compute_s, valid, result.fog, errors, result.doubts))
 
     def summary(
