@@ -44,8 +44,12 @@ def map_geometry(
     model: RigModel | None, column_commands: Sequence[float] | Float64, depth_range_m: tuple[float, float], *,
     sensor: tuple[int, int] | None = None, lines: LineGrid | None = None,
 ) -> SweepGeometry:  # fmt: skip
-    """Geometry of maps; arguments as of `Reconstructor`. Raises UsageError without model and sensor, and the errors of
-    `sweep_geometry`."""
+    """The geometry that a `Reconstructor` takes.
+
+    model: rig model; None for an uncalibrated rig, which gives stripes only and needs sensor (rows, width).
+    column_commands: (columns,) mirror command of each column's centre. lines: which line lights which column, if there
+    are several. Raises UsageError without model and sensor, and the errors of `sweep_geometry`.
+    """
     if model is None:
         if sensor is None:
             raise UsageError("without a calibration the sensor size (rows, width) must be given")
@@ -57,23 +61,22 @@ def map_geometry(
 class Reconstructor:
     """Turns counted sweeps into maps, one after the other; estimators that learn carry their state from map to map.
 
-    model: rig model; None for an uncalibrated rig, which gives stripes only and needs sensor (rows, width).
-    column_commands: (columns,) mirror command of each column's centre. learned: states of earlier maps to use. lines:
-    which line lights which column, if there are several. The estimator must be named (`rig.scan.estimator` chooses for
-    `auto`): without `learned` any other name raises KeyError. Raises the errors of `map_geometry` too.
+    model, column_commands, lines: those that `map_geometry` has made the geometry of. learned: states of earlier maps
+    to use. The estimator must be named (`rig.scan.estimator` chooses for `auto`): without `learned` any other name
+    raises KeyError.
     """
 
     def __init__(
         self,
         model: RigModel | None,
         column_commands: Sequence[float] | Float64,
-        depth_range_m: tuple[float, float],
+        geometry: SweepGeometry,
         estimate: EstimateConfig,
         *,
-        sensor: tuple[int, int] | None = None,
         learned: Sequence[Learned] = (),
         lines: LineGrid | None = None,
     ) -> None:
+        self.geometry = geometry
         self._model = model
         self._commands = np.asarray(column_commands, dtype=np.float64)
         self._min_confidence = estimate.min_confidence
@@ -87,8 +90,7 @@ class Reconstructor:
             self.estimator = recalling(estimate.estimator, learned, threads, temporal_prior=prior)
         else:
             self.estimator = create_estimator(estimate.estimator, threads, temporal_prior=prior)
-        self.geometry = map_geometry(model, self._commands, depth_range_m, sensor=sensor, lines=lines)
-        self._checks = MapChecks(self.geometry, calibrated=model is not None, knows=estimate.estimator in LEARNING)
+        self._checks = MapChecks(geometry, calibrated=model is not None, knows=estimate.estimator in LEARNING)
 
     def counter(self, layout: SweepLayout) -> Counter:
         """A counter whose sweeps go to `map`, one after the other and each before frames of the next are added."""

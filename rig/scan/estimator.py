@@ -22,7 +22,7 @@ KEPT_UP = 0.5
 """Share of a sweep's time that a map of `joint` may take; the rest is for counting and for a busy moment."""
 ROWS, COLUMNS = 128, 160
 """Part of the picture, at most, whose map is timed: some milliseconds."""
-MOST_EXPOSURES = 10
+EXPOSURES = 10
 TRIES = 3
 
 
@@ -63,11 +63,13 @@ def time_of_map(geometry: SweepGeometry, threads: int) -> float:
     part = _middle(geometry)
     rate = np.full((part.columns, part.rows, part.window), 0.05)
     column, row = np.meshgrid(np.arange(part.columns), np.arange(part.rows), indexing="ij")
-    rate[column, row, (part.x_lo + part.x_hi).T // 2 - part.x0[:, None]] = 0.95
+    # The window of a row that sees nothing of a column is empty, and lies elsewhere.
+    middle = (part.x_lo + part.x_hi).T // 2 - part.x0[:, None]
+    rate[column, row, np.clip(middle, 0, part.window - 1)] = 0.95
     sweep = CountVolume(
-        counts=np.random.default_rng(0).binomial(MOST_EXPOSURES, rate).astype(np.uint8), x0=part.x0,
-        n_frames=np.full(part.columns, MOST_EXPOSURES, np.int32), column=np.arange(float(part.columns)),
-        dark_counts=None, n_dark=0, width=part.width, exposures=MOST_EXPOSURES,
+        counts=np.random.default_rng(0).binomial(EXPOSURES, rate).astype(np.uint8), x0=part.x0,
+        n_frames=np.full(part.columns, EXPOSURES, np.int32), column=np.arange(float(part.columns)),
+        dark_counts=None, n_dark=0, width=part.width, exposures=EXPOSURES,
     )  # fmt: skip
     model = start_model(sweep, part, np.full((part.rows, part.width), 0.05, np.float32), 0.0)
     later, took_s = Joint(threads, model, learns=False), []

@@ -25,10 +25,10 @@ def reconstruct_cube(
     """
     plan, model = cube.plan, calibration.model
     commands = column_commands(plan)
-    estimate, why = choose_estimator(estimate, map_geometry(model, commands, plan.depth_range))
-    reconstructor = Reconstructor(model, commands, plan.depth_range, estimate)
+    geometry = map_geometry(model, commands, plan.depth_range)
+    estimate, why = choose_estimator(estimate, geometry)
+    reconstructor = Reconstructor(model, commands, geometry, estimate)
     warm_up(estimate.estimator, estimate.filter, plan.exposures, dark=False)
-    geometry = reconstructor.geometry
     tally = MapTally(plan.columns, plan.exposures, estimate.estimator, estimate.filter, why)
     counter = reconstructor.counter(
         SweepLayout(

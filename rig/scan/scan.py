@@ -28,6 +28,7 @@ from rig.devices.open import OpenRig
 from rig.devices.prepare import lead_s, most_sweeps, prepare, spare_lead_s
 from rig.errors import RigError
 from rig.estimate.registry import LEARNING, Learned
+from rig.geometry.windows import SweepGeometry
 from rig.plan.compile import spad_request
 from rig.plan.describe import plan_content
 from rig.plan.scan_plan import ScanPlan
@@ -68,9 +69,7 @@ def run_scan(
     here = identity_of(rig)
     calibration = calibration_use(rig, accept=request.accept_calibration, here=here)
     plan, timing = prepared or prepare(rig)
-    geometry = map_geometry(
-        rig.model, plan.commands, plan.depth_range_m, sensor=(plan.rows, plan.width), lines=plan.lines
-    )
+    geometry = _geometry(rig, plan)
     estimate, why = choose_estimator(rig.config.estimate, geometry, _map_time_s(rig, plan, request.maps))
     if why:
         tell_stage(f"{estimate.estimator}: {why}")
@@ -79,8 +78,10 @@ def run_scan(
     source: LiveSource | ReplaySource = LiveSource(rig, plan, request.maps)
     if isinstance(rig.spad, ReplaySpad):
         source = ReplaySource(rig.spad, plan, request.maps, estimate, rig.model)
-    reconstructor = make_reconstructor(rig, plan, learned=source.learned)
-    run.rays = reconstructor.geometry.rays if rig.model is not None else None
+    reconstructor = Reconstructor(
+        rig.model, plan.commands, geometry, estimate, learned=source.learned, lines=plan.lines
+    )
+    run.rays = geometry.rays if rig.model is not None else None
     warm_up(estimate.estimator, estimate.filter, plan.exposures, dark=True)
     warm_binding(plan)
     manifest: dict[str, Any] = {
@@ -226,15 +227,14 @@ def _first_alone(rig: OpenRig) -> bool:
     return learns and not rig.spad.info.can_wait
 
 
-def make_reconstructor(
-    rig: OpenRig, plan: ScanPlan, estimate: EstimateConfig | None = None, learned: Sequence[Learned] = ()
-) -> Reconstructor:
-    """Make the reconstructor for the maps of a plan. estimate: its settings, if they differ from those of the
-    config."""
-    estimate, sensor = estimate or rig.config.estimate, (plan.rows, plan.width)
-    return Reconstructor(
-        rig.model, plan.commands, plan.depth_range_m, estimate, sensor=sensor, learned=learned, lines=plan.lines
-    )
+def make_reconstructor(rig: OpenRig, plan: ScanPlan, estimate: EstimateConfig) -> Reconstructor:
+    """Make a reconstructor that has learned nothing yet for the maps of a plan."""
+    return Reconstructor(rig.model, plan.commands, _geometry(rig, plan), estimate, lines=plan.lines)
+
+
+def _geometry(rig: OpenRig, plan: ScanPlan) -> SweepGeometry:
+    sensor = plan.rows, plan.width
+    return map_geometry(rig.model, plan.commands, plan.depth_range_m, sensor=sensor, lines=plan.lines)
 
 
 def devices_content(rig: OpenRig, plan: ScanPlan, timing: SpadTiming) -> dict[str, Any]:

@@ -40,7 +40,7 @@ def reconstructor_of(
     """
     from calibration.files.rig_file import load_rig_model
     from rig.config.models import EstimateConfig
-    from rig.depth.reconstruct import Reconstructor
+    from rig.depth.reconstruct import Reconstructor, map_geometry
 
     with tempfile.TemporaryDirectory() as folder:
         model = load_rig_model(point.write_calibration(Path(folder)))
@@ -48,7 +48,8 @@ def reconstructor_of(
     estimate = EstimateConfig(
         estimator=estimator, filter="none", min_confidence=0.5, threads=threads, temporal_prior=temporal_prior
     )
-    return Reconstructor(model, commands, DEPTH_RANGE_M, estimate, lines=lines)
+    geometry = map_geometry(model, commands, DEPTH_RANGE_M, lines=lines)
+    return Reconstructor(model, commands, geometry, estimate, lines=lines)
 
 
 def volume_of(reconstructor: Any, counts: NDArray[np.unsignedinteger], exposures: int) -> Any:

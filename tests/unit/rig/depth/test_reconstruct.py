@@ -18,7 +18,8 @@ covers(Reconstructor, map_geometry, warm_up)
 def reconstructor(sweep, **options) -> Reconstructor:
     g = sweep.point.geometry
     estimate = EstimateConfig(threads=2, **{"estimator": "likelihood", **options})
-    return Reconstructor(rig_model(g), np.arange(g.columns), DEPTH_RANGE_M, estimate)
+    model, commands = rig_model(g), np.arange(g.columns)
+    return Reconstructor(model, commands, map_geometry(model, commands, DEPTH_RANGE_M), estimate)
 
 
 @cache
@@ -29,7 +30,7 @@ def mapped(light="report", exposures=10, rig="left", **options) -> MapResult:
 
 def test_without_a_model_the_sensor_size_is_asked_for():
     with pytest.raises(UsageError, match=re.escape("sensor size (rows, width) must be given")):
-        Reconstructor(None, np.arange(5), DEPTH_RANGE_M, EstimateConfig(estimator="edge"))
+        map_geometry(None, np.arange(5), DEPTH_RANGE_M)
 
 
 @pytest.mark.parametrize("estimator", ["argmax", "edge", "likelihood", "joint"])
@@ -65,7 +66,8 @@ def test_a_higher_confidence_limit_only_takes_pixels_away():
 
 def test_without_a_model_there_are_stripes_but_neither_depth_nor_fog():
     sweep, config = simulated(rows=16, columns=64), EstimateConfig(estimator="likelihood")
-    rebuilt = Reconstructor(None, np.arange(64), DEPTH_RANGE_M, config, sensor=(16, 512))
+    geometry = map_geometry(None, np.arange(64), DEPTH_RANGE_M, sensor=(16, 512))
+    rebuilt = Reconstructor(None, np.arange(64), geometry, config)
     result = rebuilt.map(volume_of(sweep.counts, rebuilt.geometry, 10))
     assert np.isnan(result.depth_m).all()
     assert result.fog.extinction_per_m is result.fog.extinction_sd_per_m is result.fog.visibility_m is None

@@ -9,8 +9,8 @@ from rig.devices.prepare import prepare
 
 
 def test_binding_compiles_nothing_more_behind_it():
-    from rig.depth.reconstruct import Reconstructor
     from rig.scan.acquisition import Acquisition, AcquisitionRequest
+    from rig.scan.scan import make_reconstructor
 
     with open_rig(load_config("simulated", {"scan.columns": 40, "scan.exposures": 20})) as rig:
         plan, timing = prepare(rig)
@@ -18,7 +18,7 @@ def test_binding_compiles_nothing_more_behind_it():
         made = [len(kernel.signatures) for kernel in (binding_kernels.walk, binding_kernels.cover)]
         assert min(made) >= 1
         estimate = EstimateConfig(estimator="argmax", threads=1)
-        maker = Reconstructor(rig.model, plan.commands, plan.depth_range_m, estimate)
+        maker = make_reconstructor(rig, plan, estimate)
         list(Acquisition(rig, plan, timing, maker, AcquisitionRequest(maps=1)).run())
         assert made == [len(kernel.signatures) for kernel in (binding_kernels.walk, binding_kernels.cover)]
 

@@ -9,7 +9,7 @@ from calibration.model.scanner import PivotScanner
 from rig.config.models import EstimateConfig
 from rig.count.volume import CountVolume
 from rig.depth.depth import depth_map
-from rig.depth.reconstruct import Reconstructor
+from rig.depth.reconstruct import Reconstructor, map_geometry
 from rig.geometry import bent_light as bent_light_module
 from rig.geometry import kernels
 from rig.geometry.stripe_table import StripeTable
@@ -129,8 +129,8 @@ def test_a_map_is_made_of_the_sweep_s_own_commands_and_direction() -> None:
     shifted = COMMANDS + 0.3 * (COMMANDS[1] - COMMANDS[0])  # bound 0.3 columns beside their centres
     stripes = seen_stripes(fan, model, np.array([ROWS - 1]), 3.0, velocity, shifted)
     stripes[:, -1] = np.nan  # there is no command beyond the last column's
-    maker = Reconstructor(model, COMMANDS, RANGE_M, EstimateConfig(estimator="argmax", threads=1))
-    geometry = maker.geometry
+    geometry = map_geometry(model, COMMANDS, RANGE_M)
+    maker = Reconstructor(model, COMMANDS, geometry, EstimateConfig(estimator="argmax", threads=1))
     counts = CountVolume(
         n_frames=np.full(COLUMNS, 10, np.int32), column=np.arange(COLUMNS) + 0.3, dark_counts=None, n_dark=0,
         width=WIDTH, velocity_per_s=velocity, x0=geometry.x0, exposures=10,

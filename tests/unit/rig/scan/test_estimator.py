@@ -1,8 +1,10 @@
 """The estimator that `auto` stands for."""
 
 import math
+from dataclasses import replace
 from types import SimpleNamespace
 
+import numpy as np
 import pytest
 
 from drivers.clock import VirtualClock
@@ -65,6 +67,13 @@ def test_a_part_of_the_picture_is_timed_for_the_whole(shape):
     assert (part.rows, part.columns) == (min(whole.rows, ROWS), min(whole.columns, COLUMNS))
     assert part.x_lo.shape == (part.rows, part.columns)
     assert 0 < time_of_map(whole, 1) < 60
+
+
+def test_rows_that_see_nothing_of_a_column_do_not_stop_the_timing():
+    x_lo, x_hi = np.full((64, 40), 30, np.int32), np.full((64, 40), 49, np.int32)
+    x_lo[:20, ::3], x_hi[:20, ::3] = 0, -1
+    narrow = replace(GEOMETRY, x_lo=x_lo, x_hi=x_hi, x0=np.full(40, 30, np.int32), window=20)
+    assert 0 < time_of_map(narrow, 1) < 60
 
 
 def test_frames_wait_for_maps_in_streams_and_in_replays_that_keep_a_clock():
