@@ -6,7 +6,7 @@ at all: `prepare` provides one.
 numba compiles a kernel anew if its own file has changed, but not if another file has from which the kernel inlines
 functions. After an update old kernels would silently work on new tables. So `prepare` notes what each module of these
 packages is made of, itself and all that it imports, and removes the kernels of those that have changed. Looking whether
-any file has changed takes some milliseconds, and the rest a second.
+any file has changed takes a few milliseconds, and the rest a second.
 """
 
 import ast
@@ -21,7 +21,8 @@ VARIABLE = "NUMBA_CACHE_DIR"
 """Numba's own setting, see its manual; a value that the user has set is left alone."""
 PACKAGES = "calibration", "drivers", "rig", "sim_backend"
 TOP = Path(__file__).parent.parent
-NOTE = "spadrig-kernels.json"
+NOTE = "spadrig-kernels-{}.json"
+"""With a digest of the checkout: several may share one folder."""
 
 
 def prepare() -> None:
@@ -36,18 +37,19 @@ def prepare() -> None:
 def forget_stale(top: Path, kept: Path | None) -> None:
     """Remove kernels of modules below `top` that, or whose imports, have changed since the last call.
 
-    kept: numba's folder; None if kernels lie beside their modules.
+    kept: numba's folder; None if kernels lie beside their modules. If the note cannot be written, as on a full disk,
+    the next call does the same again.
     """
-    files = {_module_of(top, file): file for package in PACKAGES for file in _sources(top / package)}
-    stats = ((file, file.stat()) for file in files.values())
-    seen = _digest("".join(f"{file} {stat.st_mtime_ns} {stat.st_size}\n" for file, stat in stats).encode())
-    note = (kept or top / "rig" / "__pycache__") / NOTE
+    sources = sorted(file for package in PACKAGES for file in _sources(os.path.join(top, package)))
+    seen = _digest("".join(f"{path} {changed_ns} {size}\n" for path, changed_ns, size in sources).encode())
+    note = (kept or top / "rig" / "__pycache__") / NOTE.format(_digest(os.fsencode(top))[:16])
     try:
         before = json.loads(note.read_text())
     except (OSError, ValueError):
         before = {}
     if before.get("seen") == seen:
         return
+    files = {_module_of(top, Path(path)): Path(path) for path, _, _ in sources}
     now = _made_of(files)
     for module, digest in now.items():
         if before.get("modules", {}).get(module) != digest:
@@ -56,16 +58,26 @@ def forget_stale(top: Path, kept: Path | None) -> None:
             for folder in folders:
                 for kernel in folder.glob(f"{file.stem}.*.nb[ic]"):
                     kernel.unlink(missing_ok=True)
-    note.parent.mkdir(parents=True, exist_ok=True)
-    with tempfile.NamedTemporaryFile("w", dir=note.parent, delete=False) as new:
-        json.dump({"seen": seen, "modules": now}, new)
-    os.replace(new.name, note)
+    new = note.with_suffix(f".{os.getpid()}")
+    try:
+        note.parent.mkdir(parents=True, exist_ok=True)
+        new.write_text(json.dumps({"seen": seen, "modules": now}))
+        new.replace(note)
+    except OSError:
+        new.unlink(missing_ok=True)
 
 
-def _sources(package: Path) -> Iterator[Path]:
-    for folder, inner, names in os.walk(package):
-        inner[:] = sorted(name for name in inner if name != "__pycache__")
-        yield from (Path(folder, name) for name in sorted(names) if name.endswith(".py"))
+def _sources(folder: str) -> Iterator[tuple[str, int, int]]:
+    """Path, time of change in ns, and size of the Python files in a folder and below, in any order."""
+    if not os.path.isdir(folder):
+        return
+    with os.scandir(folder) as entries:
+        for entry in entries:
+            if entry.name.endswith(".py"):
+                stat = entry.stat()
+                yield entry.path, stat.st_mtime_ns, stat.st_size
+            elif entry.name != "__pycache__" and entry.is_dir():
+                yield from _sources(entry.path)
 
 
 def _module_of(top: Path, file: Path) -> str:

@@ -1,5 +1,6 @@
 """Kernels are kept where the user can write, nowhere that another user could, and only as long as they hold."""
 
+import errno
 import os
 import stat
 import subprocess
@@ -85,6 +86,16 @@ def test_kernels_go_if_their_module_or_one_that_it_imports_has_changed(tree, tmp
     compile_all()
     (tree / "rig/d.py").write_text("one = 2")
     assert left() == {"a", "b", "c"}
+
+
+def test_a_note_that_cannot_be_written_stops_nothing_and_leaves_nothing(tree, monkeypatch):
+    def full(path, text):
+        path.touch()
+        raise OSError(errno.ENOSPC, "no space left on device")
+
+    monkeypatch.setattr(kernel_cache.Path, "write_text", full)
+    kernel_cache.forget_stale(tree, tree / "kept")
+    assert not list((tree / "kept").iterdir())
 
 
 def test_an_inlined_function_of_another_file_is_never_the_old_one(tree):
