@@ -2,8 +2,8 @@
 medium.
 
 The likelihood itself: `rig.estimate.row.likelihood`; the search along a row: `rig.estimate.search.rows`; the model and
-how it is learned: `rig.estimate.row.model`, `rig.estimate.row.em`, `rig.estimate.search.online_learning`. The first map
-is counted completely and estimated twice, because the first pass finds which pixels were quiet behind the stripe. Every
+how it is learned: `rig.estimate.row.model`, `rig.estimate.row.em`, `rig.estimate.search.online_learning`; the
+confidence of an answer, from its neighbours: `rig.estimate.search.confidence`. The first map is counted completely and estimated twice, because the first pass finds which pixels were quiet behind the stripe. Every
 later map is judged column by column while its frames come in, with a model learned from earlier maps alone.
 """
 
@@ -34,6 +34,7 @@ class Likelihood:
         self._workers = RowWorkers(threads)
         self._lessons = OnlineLearner(_judge, model, learns=learns)
         self._at: tuple[SweepGeometry, Float32] | None = None
+        self._light: tuple[RowModel, float, int] | None = None
         self.used: RowModel | None = None
         """The state that the last map was estimated with."""
 
@@ -66,16 +67,20 @@ class Likelihood:
         self._lessons.attend(
             found, used, int(sweep.n_frames.sum()), lambda: Seen(sweep, sweep.intensity(), quiet, lines)
         )
-        return believed(
-            found, self._reference(geometry), sweep.n_frames, float(np.median(used.ambient)),
-            2 * signal_reach(line_profile(used.line_sigma_px)) + 1, self._workers,
-        )  # fmt: skip
+        return believed(found, self._reference(geometry), sweep.n_frames, *self._light_of(used), self._workers)
 
     def _reference(self, geometry: SweepGeometry) -> Float32:
         """The geometry's `reference_px`, computed once while the geometry stays the same."""
         if self._at is None or self._at[0] is not geometry:
             self._at = geometry, geometry.reference_px().astype(np.float32)
         return self._at[1]
+
+    def _light_of(self, model: RowModel) -> tuple[float, int]:
+        """A model's usual ambient light and the pixels that a stripe's light is summed over, computed once a model."""
+        if self._light is None or self._light[0] is not model:
+            line_px = 2 * signal_reach(line_profile(model.line_sigma_px)) + 1
+            self._light = model, float(np.median(model.ambient)), line_px
+        return self._light[1:]
 
     def judge(self, geometry: SweepGeometry, exposures: int, *, dark: bool) -> SearchTables:
         """Tables of the search under the present model; made once per model."""

@@ -47,7 +47,7 @@ import numpy as np
 from rig.estimate.joint.place.places import LIGHT_PX, Places
 from rig.estimate.joint.winner import UNITS, LabelAnswers
 from rig.estimate.row.model import RowModel
-from rig.estimate.row.neighbours import COPIED_ROWS, MARGIN, SAME_PX, with_margin
+from rig.estimate.row.neighbours import COPIED_ROWS, MARGIN, SAME_PX, on_surface, with_margin
 from rig.geometry.stripe_table import StripeTable
 from rig.simd import Bools, Float32, Int16, Int32
 from rig.simd.functions import error_function, exponential, logarithm
@@ -169,16 +169,9 @@ def light_row(distance: Float32, light: Float32, row: int, number: Float32, tota
 
     distance, light: copies `with_margin`; row: of these copies.
     """
-    width, one = distance.shape[1], zero_float32() + np.float32(1.0)
-    at, to_add = address_of(distance), address_of(light)
+    width, at, to_add = distance.shape[1], address_of(distance), address_of(light)
     for c in range(0, width - 2 * LANES, LANES):
-        here = row * width + LANES + c
-        own, same, lit = load_float32(at, here), zero_float32(), zero_float32()
-        for line in range(here - width, here + width + 1, width):
-            for near in range(line - 1, line + 2):
-                off = load_float32(at, near) - own
-                same = same + where_small(one, off, SAME_PX)
-                lit = lit + where_small(load_float32(to_add, near), off, SAME_PX)
+        same, lit = on_surface(at, to_add, row * width + LANES + c, width, 1)
         store_float32(address_of(number), c, same)
         store_float32(address_of(total), c, lit)
 

@@ -10,8 +10,8 @@ import numba
 import numpy as np
 
 from rig.simd import Float32
-from rig.simd.memory import address_of, copy_floats
-from rig.simd.vectors import LANES
+from rig.simd.memory import address_of, copy_floats, load_float32
+from rig.simd.vectors import LANES, where_small, zero_float32
 
 SAME_PX: Final = np.float32(1.0)
 """Neighbours whose distances differ by no more lie on the same surface."""
@@ -37,3 +37,19 @@ def with_margin(array: Float32, first_row: int, last_row: int) -> Float32:
         else:
             line[:] = nowhere
     return copy
+
+
+@numba.njit(forceinline=True)
+def on_surface(distance, light, here, width, reach):  # type: ignore[no-untyped-def]
+    """Number of the answers up to `reach` rows and columns away on the same surface, and their light, of LANES answers.
+
+    distance, light: addresses of copies `with_margin` that are `width` wide; here: the element of the first answer.
+    An answer counts itself; one without a distance has none.
+    """
+    own, number, lit, one = load_float32(distance, here), zero_float32(), zero_float32(), zero_float32() + 1.0
+    for line in range(here - reach * width, here + reach * width + 1, width):
+        for near in range(line - reach, line + reach + 1):
+            off = load_float32(distance, near) - own
+            number = number + where_small(one, off, SAME_PX)
+            lit = lit + where_small(load_float32(light, near), off, SAME_PX)
+    return number, lit

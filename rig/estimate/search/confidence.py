@@ -25,12 +25,12 @@ import cv2
 import numba
 import numpy as np
 
-from rig.estimate.row.neighbours import COPIED_ROWS, MARGIN, SAME_PX, with_margin
+from rig.estimate.row.neighbours import COPIED_ROWS, MARGIN, on_surface, with_margin
 from rig.geometry.stripe_table import StripeTable
 from rig.simd import Float32, Int32
 from rig.simd.functions import exponential, logarithm
 from rig.simd.memory import address_of, load_float32, store_float32
-from rig.simd.vectors import LANES, larger_float, smaller_float, square_root, where_small, zero_float32
+from rig.simd.vectors import LANES, larger_float, smaller_float, square_root, zero_float32
 from rig.threads import RowWorkers
 
 A: Final = 1.018
@@ -80,12 +80,7 @@ def _judged(at, here, width, exposed, ambient, line_px):  # type: ignore[no-unty
     """Confidence of LANES answers, the first of which is element `here` of the copies at these addresses."""
     distance, light, haze, there = at
     none, one = zero_float32(), zero_float32() + np.float32(1.0)
-    own, agree, lit = load_float32(distance, here), none, none
-    for line in range(here - REACH * width, here + REACH * width + 1, width):
-        for near in range(line - REACH, line + REACH + 1):
-            off = load_float32(distance, near) - own
-            agree = agree + where_small(one, off, SAME_PX)
-            lit = lit + where_small(load_float32(light, near), off, SAME_PX)
+    agree, lit = on_surface(distance, light, here, width, REACH)
     agree = larger_float(agree, one)
     mean, before = lit / agree, load_float32(haze, here)
     below = (before + 2.0 * ambient) * (0.5 * line_px)

@@ -148,8 +148,8 @@ def test_every_frame_is_where_the_rule_puts_it_to_the_last_bit(case, sizes, rng,
     assume(blocks)
     bound, clocks = bind(plan, blocks)
     sweep, column, bins = placed_one_by_one(plan, blocks, clocks)
-    # A damaged line marker shifts the time by which a later sweep is judged to have begun. That time is asked only where
-    # no frame behind in the same block confirms the sweep, or where sweeps seem to be missing.
+    # A damaged line marker shifts the time by which a later sweep is judged to have begun. That time is only asked
+    # where no frame behind in the same block confirms the sweep, or where sweeps seem to be missing.
     left_out = disturbed & (bound["bins"] == BIN_UNUSABLE) & np.isnan(bound["column"]) & (bound["sweep"] != sweep)
     last = np.isin(np.arange(len(sweep)), np.cumsum([block.n_frames for block in blocks]) - 1)
     assert (sweep > bound["sweep"])[left_out].all()
