@@ -3,8 +3,9 @@ medium.
 
 The likelihood itself: `rig.estimate.row.likelihood`; the search along a row: `rig.estimate.search.rows`; the model and
 how it is learned: `rig.estimate.row.model`, `rig.estimate.row.em`, `rig.estimate.search.online_learning`; the
-confidence of an answer, from its neighbours: `rig.estimate.search.confidence`. The first map is counted completely and estimated twice, because the first pass finds which pixels were quiet behind the stripe. Every
-later map is judged column by column while its frames come in, with a model learned from earlier maps alone.
+confidence of an answer, from its neighbours: `rig.estimate.search.confidence`. The first map is counted completely and
+estimated twice, because the first pass finds which pixels were quiet behind the stripe. Every later map is judged
+column by column while its frames come in, with a model learned from earlier maps alone.
 """
 
 import numpy as np

@@ -4,11 +4,12 @@ import numpy as np
 import pytest
 
 from rig.estimate.search.confidence import LEAST, MORE_NOISE, REACH, SEEN, SPARED, A, B, C, D, believed, confidences
+from rig.estimate.row.neighbours import on_surface
 from rig.geometry.stripe_table import StripeTable
 from rig.threads import RowWorkers
 from tests.stability.inventory import covers
 
-covers(believed, confidences)
+covers(believed, confidences, on_surface)
 LINE_PX, AMBIENT = 5, 0.01
 
 
