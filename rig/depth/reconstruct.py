@@ -59,8 +59,9 @@ class Reconstructor:
 
     model: rig model; None for an uncalibrated rig, which gives stripes only and needs sensor (rows, width).
     column_commands: (columns,) mirror command of each column's centre. learned: states of earlier maps to use. lines:
-    which line lights which column, if there are several. The estimator must be named (`rig.scan.estimator` chooses for
-    `auto`): without `learned` any other name raises KeyError. Raises the errors of `map_geometry` too.
+    which line lights which column, if there are several. The estimator must be named, since `rig.scan.estimator` chooses
+    for `auto`. KeyError for `auto` and, with `learned`, for estimators that learn nothing; also the errors of
+    `map_geometry`.
     """
 
     def __init__(

@@ -72,6 +72,12 @@ def test_without_a_model_there_are_stripes_but_neither_depth_nor_fog():
     assert np.nanmedian(sweep.errors(result.stripe.x_px)) < 1.0
 
 
+def test_no_learned_state_makes_another_estimator_of_one_that_learns_nothing():
+    config, learned = EstimateConfig(estimator="edge"), [mapped().learned]
+    with pytest.raises(KeyError, match="edge"):
+        Reconstructor(None, np.arange(5), DEPTH_RANGE_M, config, sensor=(16, 512), learned=learned)
+
+
 def test_the_median_filter_leaves_light_alone_and_brings_positions_nearer():
     plain, filtered = mapped(estimator="edge"), mapped(estimator="edge", filter="median")
     for name in ("signal", "haze"):
