@@ -219,6 +219,7 @@ def result_of(
     velocities: of all sweeps. Raises Degenerate if depth is almost unknown.
     """
     problem, solution, state = fit.problem, fit.solution, fit.state
+    lags = misfit.lag_decisions(solution, problem, fit.free, state.timing, bool(lag_groups(velocities)))
     names = np.array(problem.terms.names)
     unexplained = misfit.of_fit(problem, solution).factor
     matrix = unexplained * solution.covariance(problem.tie) + misfit.widening(problem, solution, fit.decisions)
@@ -258,7 +259,7 @@ def result_of(
         misfit=unexplained,
         condition=solution.condition,
         converged=solution.converged,
-        decisions=(*fit.kept, *fit.decisions, *misfit.lag_decisions(solution, problem, fit.free, state.timing)),
+        decisions=(*fit.kept, *fit.decisions, *lags),
         board=board,
         free=tuple(fit.free),
         information=problem.tie.T @ solution.matrix @ problem.tie / unexplained,
