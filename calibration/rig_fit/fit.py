@@ -216,7 +216,9 @@ def result_of(
     fit: Rounds, left_out: tuple[str, ...], board: Board, start: RigModel | None, velocities: Array
 ) -> RigFit:
     """The result of rounds that have run. Its model takes what they do not determine from `start`, if there is one.
-    velocities: of all sweeps. Raises Degenerate if depth is almost unknown.
+
+    left_out: names of views without corners. velocities: the signed velocities of all sweeps. Raises Degenerate if
+    depth is almost unknown.
     """
     problem, solution, state = fit.problem, fit.solution, fit.state
     lags = misfit.lag_decisions(solution, problem, fit.free, state.timing, bool(lag_groups(velocities)))

@@ -59,9 +59,10 @@ class Reconstructor:
 
     model: rig model; None for an uncalibrated rig, which gives stripes only and needs sensor (rows, width).
     column_commands: (columns,) mirror command of each column's centre. learned: states of earlier maps to use. lines:
-    which line lights which column, if there are several. The estimator must be named, since `rig.scan.estimator` chooses
-    for `auto`. KeyError for `auto` and, with `learned`, for estimators that learn nothing; also the errors of
-    `map_geometry`.
+    which line lights which column, if there are several.
+
+    Raises KeyError for the estimator `auto`, for which `rig.scan.estimator` chooses, and with `learned` for estimators
+    that learn nothing; also the errors of `map_geometry`.
     """
 
     def __init__(
