@@ -271,10 +271,11 @@ _TRUTH_GRID = 32
 
 @dataclass(frozen=True, slots=True)
 class DepthErrors:
-    """Errors over the pixels that the true rig lights at one depth; NaN if there are none.
+    """Errors at the pixels that the true rig lights at one depth; NaN if there are none.
 
-    median_m, worst_m: of the absolute errors. ratio: root mean square in units of the predicted sd; 1 on average if the
-    covariance is right, NaN also if the model has none.
+    median_m, worst_m: of the absolute errors. ratio: root mean square of the errors, each divided by the sd that the
+    model's covariance predicts for it. If covariances are right, its square averages 1 over many calibrations. NaN also
+    if the model has no covariance.
     """
 
     depth_m: float

@@ -105,9 +105,10 @@ def _decision(
 def _largest_set(
     alone: dict[str, float], most: float, together: Callable[[Collection[str]], float]
 ) -> tuple[set[str], float]:
-    """The effects, the smallest first, that can be left out together within a bound, and what they change then.
+    """The effects that can be left out together, and the bound of what they change then.
 
-    alone: what each changes. together: what some change.
+    They are taken from the smallest on, as long as the bound for all taken is `most` at most. alone: the bound for each
+    by itself. together: gives the bound for several.
     """
     taken: list[str] = []
     total = 0.0

@@ -33,14 +33,15 @@ SPARSITY = 6
 def effects_report(world: "SimulatedWorld", *, power_w: float, exposure_s: float, exposures: int) -> dict[str, Any]:
     """The report for columns of `exposures` frames at a given power.
 
-    planned_for: power_w, exposure_s (of a column's frames together) and exposures that the plan holds for.
+    power_w: of the laser. planned_for: power_w (of all lines together), exposure_s (of a column's frames together) and
+    exposures that the plan holds for.
     changed_decisions_bound: for all effects left out together. effects: one mapping for each of the catalogue, with
     effect, on, why, share (of the detected photons, before saturation, over 16 mirror positions),
     changed_decisions_bound (None: unknown), removable (whether the world can do without it), cost_us_per_frame (None:
     it is part of a device, of another effect or of the gain).
     """
     plan, model = world.effect_plan, world.flux_model
-    photons, laser_us = _light(world, model, power_w * exposure_s, exposure_s, exposures)
+    photons, laser_us = _light(world, model, power_w * world.fan.total * exposure_s, exposure_s, exposures)
     photons |= {name: exposure_s * float(rate.sum()) for name, rate in model.steady.items()}
     whole = sum(photons.values())
     costs: dict[str, float | None] = {**laser_us, **_bits_us(world, model, FrameTimes(exposure_s, exposure_s))}
@@ -98,7 +99,7 @@ def _light(
         held = hold_s(effect)
         frames = exposures if held == 0 else min(exposures, max(1, round(held / exposure_s)))
         photons[name] = joules * float(np.mean([part[name][0].sum(dtype=np.float64) for part in parts]))
-        took_s = [part[name][1] for part in parts]
+        took_s = [len(world.fan.offsets) * part[name][1] for part in parts]
         if name == "motion":  # its work is the view that all others ask for, whatever the columns
             took_s = [_took_s(partial(view.at, (turn + 1) * held)) for turn in range(TIMED_ROUNDS)]
             frames = max(1, round(held / exposure_s))

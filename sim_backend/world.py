@@ -143,7 +143,7 @@ class SimulatedWorld:
         """
         frames = exposures + 1  # as many as a column can get, since the clocks are independent
         # Photons of several lines add up: what can be left out of one with all their power can be left out of each.
-        planned_for = PlannedFor(power_w * (self.fan.share * len(self.fan.offsets)), frames * exposure_s, frames)
+        planned_for = PlannedFor(power_w * self.fan.total, frames * exposure_s, frames)
         if planned_for != self._planned_for:
             self._planned_for, self._planned = planned_for, None
         self._plan()

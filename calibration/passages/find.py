@@ -193,15 +193,15 @@ class SweepCounts:
         return np.where(np.isfinite(self.command), first + (self.command - self.command[first]) / self.step, number)
 
     def at_pixels(self, pixels: NDArray[np.int64]) -> tuple[NDArray[np.int32], NDArray[np.int32]]:
-        """Returns, for n pixels (row, x), the number of ones (columns, n) and of frames (columns, n) or (columns, 1).
+        """Number of 1s (columns, n) and of frames, (columns, n) or (columns, 1) if equal for all, of n pixels (row, x).
 
-        Both are 0 where a column's window does not reach the pixel; one that all columns share must reach it.
+        Both are 0 where a column's window does not reach the pixel.
         """
         total, rows, window = self.counts.shape
         ones = np.zeros((total, len(pixels)), np.int32)
         n = self.n_frames.astype(np.int32)[:, None]
-        if np.all(self.x0 == self.x0[0]):  # the usual case, and the quicker one
-            at = pixels[:, 0] * window + pixels[:, 1] - int(self.x0[0])
+        if window >= self.width and not self.x0.any():  # the usual case, and the quicker one
+            at = pixels[:, 0] * window + pixels[:, 1]
             for k in range(total):
                 ones[k] = self.counts[k].reshape(rows * window).take(at)
             return ones, n
@@ -220,7 +220,7 @@ def find_passages(
     mask: NDArray[np.bool_] | None = None,
     most: int = MOST_PASSAGES,
 ) -> Passages:
-    """Passages of at most `most` pixels of a mask (rows, width), by default of any pixels; empty if the line is not
+    """Passages of at most `most` pixels of a mask (rows, width), by default of any pixels; none if the line is not
     visible.
     """
     rows = sweep.counts.shape[1]

@@ -157,7 +157,7 @@ class PassageFit:
 
     significance: of the line against levels alone, in standard deviations (the square root of twice the logarithm of
     the likelihood ratio). misfit: Pearson's chi squared, as standard deviations above its mean. likelihood: its
-    logarithm. settled: whether the counts tell the centre.
+    logarithm. settled: whether the counts tell the centre; if not, centre and sd mean nothing.
     """
 
     centre: Array

@@ -216,9 +216,12 @@ def result_of(
     fit: Rounds, left_out: tuple[str, ...], board: Board, start: RigModel | None, velocities: Array
 ) -> RigFit:
     """The result of rounds that have run. Its model takes what they do not determine from `start`, if there is one.
-    velocities: of all sweeps. Raises Degenerate if depth is almost unknown.
+
+    left_out: names of views without corners. velocities: the signed velocities of all sweeps. Raises Degenerate if
+    depth is almost unknown.
     """
     problem, solution, state = fit.problem, fit.solution, fit.state
+    lags = misfit.lag_decisions(solution, problem, fit.free, state.timing, bool(lag_groups(velocities)))
     names = np.array(problem.terms.names)
     unexplained = misfit.of_fit(problem, solution).factor
     matrix = unexplained * solution.covariance(problem.tie) + misfit.widening(problem, solution, fit.decisions)
@@ -258,7 +261,7 @@ def result_of(
         misfit=unexplained,
         condition=solution.condition,
         converged=solution.converged,
-        decisions=(*fit.kept, *fit.decisions, *misfit.lag_decisions(solution, problem, fit.free, state.timing)),
+        decisions=(*fit.kept, *fit.decisions, *lags),
         board=board,
         free=tuple(fit.free),
         information=problem.tie.T @ solution.matrix @ problem.tie / unexplained,

@@ -99,18 +99,19 @@ def best(decisions: Sequence[TermDecision]) -> int | None:
 
 
 def lag_decisions(
-    solution: RigSolution, problem: RigProblem, free: Sequence[Sequence[str]], timing: Array
+    solution: RigSolution, problem: RigProblem, free: Sequence[Sequence[str]], timing: Array, determined: bool
 ) -> list[TermDecision]:
-    """The decisions on the lags, from what the directions and speeds determine of them."""
+    """The decisions on the lags that are still free; one for both if the sweeps' directions and speeds do not determine
+    them.
+    """
     spread = np.sqrt(np.diag(solution.covariance(problem.tie)))
-    told = {group[0]: group for group in free if group[0].startswith("lag")}
     decisions = []
-    for group in told.values():
+    for group in (group for group in free if group[0].startswith("lag")):
         at = problem.terms.at(group[:1])[0]
         said = "of each direction" if len(group) == 1 else "one for both: the sweeps do not tell them apart"
         value = float(timing[TIMES.index(group[0])])
         decisions.append(TermDecision("/".join(group), True, value, float(spread[at]), said))
-    if not told:
+    if not determined:
         value = float(timing[0])
         decisions.append(TermDecision("lag", False, value, np.nan, "not told by one direction at one speed: as it was"))
     return decisions

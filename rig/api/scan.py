@@ -76,9 +76,11 @@ def plan_scan(
 ) -> ScanPlan:
     """Compile the plan of a scan and check it against the limits of its devices (`rig scan --dry-run`).
 
-    Options and checks are those of `scan`, including the room on the disk, but not whether `out` is empty. Devices are
-    opened, asked for their limits and closed again. Nothing moves and no light leaves, so `arm` is not needed. Raises
-    UsageError for a scan that cannot be made, DevicesError, one line per device, if real ones are missing.
+    Options and checks are those of `scan`, including the room on the disk. Two things only `scan` finds out: whether
+    `out` is new or empty and can be written, and whether the estimator `joint`, if asked for, has the memory that it
+    needs. Devices are opened, asked for their limits and closed again. Nothing moves and no light leaves, so `arm` is
+    not needed. Raises UsageError for a scan that cannot be made, DevicesError, one line per device, if real ones are
+    missing.
     """
     request = replace(request or ScanRequest(), **changes)
     settings = _configured(config, request)

@@ -45,8 +45,9 @@ def calibrate_check(
     tell: TellLine | None = None,
     **changes: Any,
 ) -> CalibrationResult:
-    """Judge a calibration by a flat board that was not used for it (`rig calibrate check`). The result is noted
-    beside it, if it says whose it is.
+    """Judge a calibration by a flat board that was not used for it (`rig calibrate check`).
+
+    If the calibration names the rig it is of, the result is noted beside its file, and scans heed it.
 
     Raises Degenerate if the board cannot be used, CalibrationError if the calibration cannot, and UsageError for a
     wrong request and for views that the calibration was made of.

@@ -62,8 +62,8 @@ class Reconstructor:
     """Turns counted sweeps into maps, one after the other; estimators that learn carry their state from map to map.
 
     model, column_commands, lines: those that `map_geometry` has made the geometry of. learned: states of earlier maps
-    to use. The estimator must be named (`rig.scan.estimator` chooses for `auto`): without `learned` any other name
-    raises KeyError.
+    to use. Raises KeyError for the estimator `auto`, for which `rig.scan.estimator` chooses, and with `learned` for
+    estimators that learn nothing.
     """
 
     def __init__(

@@ -66,7 +66,10 @@ class LearnsFromStream(Estimator, Protocol):
 
 
 def recalling(name: str, learned: Sequence[Learned], threads: int = 2, *, temporal_prior: bool = False) -> Estimator:
-    """Estimator of a name in LEARNING that estimates each map with its own state from `learned`, and learns nothing."""
+    """Estimator of a name in LEARNING that estimates each map with its own state from `learned`, and learns nothing.
+
+    KeyError for any other name.
+    """
     return Recalled(_learning(name, threads, learns=False, temporal_prior=temporal_prior), learned)
 
 
@@ -87,6 +90,8 @@ def _learning(name: str, threads: int, *, learns: bool, temporal_prior: bool) ->
         from rig.estimate.likelihood import Likelihood
 
         return Likelihood(threads, learns=learns)
+    if name != "joint":
+        raise KeyError(name)
     from rig.estimate.joint.joint import Joint
 
     return Joint(threads, learns=learns, temporal_prior=temporal_prior)

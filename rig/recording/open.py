@@ -176,8 +176,10 @@ class RunInfo:
 class RecordingInfo:
     """Contents of a recording.
 
-    verdict: the run's own. compressed: number of compressed segments. bytes: of all segments on the disk. maps: number
-    of whole ones. devices: names by slot. problems: one line each, as far as a look at a few blocks shows.
+    verdict: the one in the run's manifest. segments, compressed: number of all segments and of the compressed ones.
+    bytes: size of all segments on the disk. maps: number of whole maps. config: name of the config, devices: names by
+    slot, versions: of the software, all at the time of recording. What only the manifest says is None or empty without
+    one. problems: one line each, as far as a look at a few blocks shows.
     """
 
     folder: Path

@@ -50,7 +50,7 @@ class AcquisitionRequest:
     first_alone: take the first map with a separate start, so that a SPAD that cannot wait stands still while the
     estimator learns from that map.
     learns: whether the estimator learns from the first map.
-    starts: those of a recording, if the scan may not choose how many sweeps each takes.
+    starts: the starts of a recording, which say how many sweeps each takes; None lets the scan choose.
     silence_s: a SPAD that sends nothing for this long, with the ring empty, has failed.
     recording: takes every block; None records nothing.
     listeners: callbacks that are informed of the progress.
@@ -67,12 +67,13 @@ class AcquisitionRequest:
 
 
 class Acquisition:
-    """A scan with an open rig, and with the plan and timing from `rig.devices.prepare`. Iterate once over `run()`.
+    """A scan with an open rig. Iterate once over `run()`.
 
-    maker: makes the maps, on the counting thread; a `rig.depth.reconstruct.Reconstructor`.
+    plan, timing: from `rig.devices.prepare`. maker: makes the maps, on the counting thread; a
+    `rig.depth.reconstruct.Reconstructor`.
 
-    Raises UsageError if the SPAD cannot do what the policy asks, PlanError if its memory is too small for a map,
-    ValueError for less than one map.
+    Raises UsageError if the SPAD cannot do what the policy asks, ValueError for less than one map, and PlanError if the
+    memory of a SPAD that is no recording is too small for a map.
     """
 
     def __init__(

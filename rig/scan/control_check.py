@@ -24,9 +24,10 @@ _SHOWN = 24
 
 @dataclass(frozen=True, slots=True)
 class ControlCheck:
-    """Result of a comparison. worst_swap_s: largest distance of a buffer, of `swaps`, from its time, either way.
+    """Result of a comparison. commands, swaps: numbers of commands, and of buffers of points, that both had sent.
 
-    problems: one line each; empty if the two agree.
+    worst_swap_s: the most by which one of these buffers came before or after its time; 0 if there are none. problems:
+    one line each; empty if the two agree.
     """
 
     commands: int
@@ -45,8 +46,8 @@ class ControlCheck:
 def check_control(recorded: Path, now: Path, *, devices: Sequence[str], tolerance_s: float | None) -> ControlCheck:
     """Compare two files of control traffic.
 
-    devices: those that took part. tolerance_s: for the times of buffers; None does not compare times. Raises
-    ProtocolError if a file is not one of control traffic.
+    devices: those that took part. tolerance_s: most by which a buffer may miss its time; with None no time is a
+    problem. Raises ProtocolError if a file is not one of control traffic.
     """
     before, after = Spoken.of(read_taps(recorded)), Spoken.of(read_taps(now) if now.exists() else ())
     problems: list[str] = []

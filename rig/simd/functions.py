@@ -1,11 +1,12 @@
 """Logarithm, powers of e and 2, and the error function of LANES float32 at once, where the C library computes only one.
 
-`logarithm` and `exponential` split numbers into powers of two and mantissas; `error_function` is Abramowitz and Stegun
-7.1.28. Each states its error.
+`logarithm` and `exponential` split off a power of two and sum a series for the rest. `error_function` is Abramowitz
+and Stegun 7.1.28. Each states its error.
 
-`powers` turns scores into likelihoods. A score is a whole number of units (int16), 128 >> shift to the octave, and
-2^(score / units) is read from the bits of a bfloat16, which is linear between powers of two. The result is exact at
-whole octaves above the zero level, and elsewhere up to 6 % too large, 4 % on average (`MEAN_EXCESS`).
+`powers` turns scores into likelihoods. Scores are int16; `units` = 128 >> shift of them make an octave, a factor of 2.
+2^(score / units) is read from the bits of a bfloat16, which is linear between powers of two. The result is exact where
+a score lies a whole number of octaves above the zero level, and elsewhere up to 6 % too large, 4 % on average
+(`MEAN_EXCESS`).
 """
 
 import math

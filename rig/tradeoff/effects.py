@@ -88,7 +88,8 @@ class Effect:
 class SceneEffects:
     """The effects of a scene.
 
-    planned_for: the largest power_w, exposure_s and exposures of a column for which the choice of effects holds.
+    planned_for: the largest values for which the choice of effects holds: power_w of all lines together, exposure_s of
+      a column's frames together, and exposures, the number of these frames.
     changed_decisions_bound: bound for all effects together that are left out.
     """
 

@@ -8,17 +8,17 @@ along the row:
 
 with n.X taken on the surface along the row. For a rectified rig this is the camera-side cosine law
 (rho/pi) I0 du |N.q| / Z^2 exp(-sigma Z (|q_p| + |q_c|)), with I0 du = J sqrt(1 + u_p^2)/|q_p|^2. The surface is the
-facet m.X = 1 through the point: |N.e| = |1 - m.S|/(|m| r) for a source at S. The profile across the row is a Gaussian
+facet m.X = 1 through the point: |N.e| = |1 - m.S|/(|m| r) for a source at S. The profile along the row is a Gaussian
 integrated over each pixel, of the width that `sim_backend.light.line` gives.
 
-Half of what droplets take out of the beam (`forward_share` f = 0.5) is diffraction within 1 to 2 degrees. The
-stripe's extinction counts it as lost; `ForwardBlur` brings it back as a wider copy. On a path of length l the number of
-such deflections is Poisson of mean t = f sigma_s l, so the extra light is exp(t) - 1 times the ballistic light. A
-deflection by an angle of standard deviation s per axis, at the share x of the path to or from the surface, shifts the
-light by (1 - x) of the angle, of variance s^2/3 on average over x. Light that was deflected at all was deflected
-t / (1 - exp(-t)) times on average. The blur is one Gaussian of the resulting variance (small-angle scattering as a
-random walk, Ishimaru, "Wave propagation and scattering in random media", 1978, chapter 13). Cost: about 0.5 ms per
-mirror position for 512 rows.
+A share f of what the medium scatters (`forward_share`; droplets: half) is diffraction, which turns light by 1 to 2
+degrees only. The stripe's extinction counts this light as lost; `ForwardBlur` brings it back as a wider copy. On a path
+of length l, there and back, the number of such turns is Poisson of mean t = f sigma_s l, with the scattering
+coefficient sigma_s. So the extra light is exp(t) - 1 times the ballistic light. A turn by an angle of standard
+deviation s per axis, at the share x of the way to the surface or back, shifts the light by (1 - x) of the angle: a
+variance of s^2/3 on average over x. Light that was turned at all was turned t / (1 - exp(-t)) times on average. The
+blur is one Gaussian of the resulting variance (small-angle scattering as a random walk, Ishimaru, "Wave propagation and
+scattering in random media", 1978, chapter 13). Cost: about 0.5 ms per mirror position for 512 rows.
 """
 
 import math

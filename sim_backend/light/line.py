@@ -50,6 +50,11 @@ class LineFan:
     offsets: tuple[float, ...] = (0.0,)
     share: float = 1.0
 
+    @property
+    def total(self) -> float:
+        """Power of all lines together, as a multiple of the laser's."""
+        return self.share * len(self.offsets)
+
     def sheets(
         self, sheets_of: SheetsOf, held: Array, rows: int, moment_s: Sequence[float], limits: Limits = EVERYWHERE
     ) -> list[list[LightSheet]]:

@@ -4,7 +4,7 @@ import difflib
 import os
 import zipfile
 from pathlib import Path
-from typing import Annotated, Self
+from typing import Annotated, Any, Self
 
 import numpy as np
 from pydantic import Field, model_validator
@@ -15,7 +15,7 @@ from calibration.files.problems import ValueSources, validated
 from calibration.files.sections import load_yaml
 from drivers.errors import DeviceError
 from drivers.units import Lux, Metres, MetresPerSecond, Radians
-from sim_backend.scenes.medium import Fog, Medium, Rain, Section, Snow
+from sim_backend.scenes.medium import Fog, Medium, Rain, Section, Smoke, Snow
 from sim_backend.scenes.surfaces import Array, Surfaces, checked
 
 SCENE_FOLDER = Path(__file__).parents[2] / "config" / "scenes"
@@ -135,16 +135,18 @@ def load_scene(name: str) -> tuple[SceneFile, Path]:
 
 
 def with_fog(scene: SceneFile, visibility: str) -> SceneFile:
-    """The scene with another fog, of the given visibility (text with a unit), or without a medium if that is CLEAR.
-    A medium's `backscatter`, `phase` and shares stay the same.
+    """The scene with air of another visibility (text with a unit), or without a medium if that is CLEAR.
+
+    Only the density changes: smoke stays smoke, with its own phase function and shares. Clear air becomes fog.
     """
     if visibility == CLEAR:
         return scene.model_copy(update={"medium": None})
     fog = Fog(visibility=visibility)  # type: ignore[arg-type]
-    if scene.medium is None:
-        return scene.model_copy(update={"medium": Medium(fog=fog)})
-    medium = scene.medium.model_copy(update={"fog": fog, "smoke": None, "extinction": None})
-    return scene.model_copy(update={"medium": medium})
+    medium = scene.medium or Medium(fog=fog)
+    changed: dict[str, Any] = {"fog": fog, "extinction": None}
+    if medium.smoke is not None:
+        changed = {"smoke": Smoke(visibility=visibility)}  # type: ignore[arg-type]
+    return scene.model_copy(update={"medium": medium.model_copy(update=changed)})
 
 
 def with_board_at(scene: SceneFile, place: BoardPlace) -> SceneFile:

@@ -101,12 +101,12 @@ class RowState(NamedTuple):
 
 
 class RowBuffers(NamedTuple):
-    """Buffers of one row, filled by `row_fluxes` and `judge_line`, nearest pixel first; made once per thread.
+    """Buffers of one row, made once per thread. `row_fluxes` fills before to log_prior, `judge_line` the others too.
 
-    n: ones; before, behind: flux of each pixel in front of and behind the stripe; scale: stripe photons at amplitude 1;
-    cell: nearest profile bin; gain: geometry factor of the haze; others: flux of other lines' haze, included in before
-    and behind;
-    w: inverse depth; log_prior: of positions; the rest: see `row_scores` and `row_posterior`.
+    Pixels go from the nearest depth to the farthest. n: 1s. before, behind: flux of a pixel if the stripe lies behind
+    it, and if it lies before it. scale: stripe photons at amplitude 1. cell: nearest profile bin. gain: factor G of the
+    haze, by which its profile is multiplied. others: flux of other lines' haze, included in before and behind. w:
+    inverse depth. log_prior: of positions. The rest: see `row_scores` and `row_posterior`.
     """
 
     n: Float32

@@ -368,7 +368,7 @@ def _place_by_neighbours(desk, search, rows, c, stripe):  # type: ignore[no-unty
 
 @numba.njit(forceinline=True)
 def _look_closely(desk, search, rows, c, exposures, stripe):  # type: ignore[no-untyped-def]
-    """Place the lines of the batch's rows, and write the answers."""
+    """Place the lines of the batch's rows by labels a quarter of a pixel apart, and write the answers."""
     # The usual width as a constant: its loop is unrolled.
     if desk.weight_pairs == USUAL_PAIRS:
         _compare_labels(desk, search, rows, exposures, USUAL_PAIRS)

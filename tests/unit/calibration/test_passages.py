@@ -146,6 +146,17 @@ def test_windows_that_move_with_the_line_give_what_they_hold():
     assert np.all((found.x_px >= x0[at]) & (found.x_px < x0[at] + window))
 
 
+def test_one_window_for_all_columns_gives_the_passages_of_its_own_pixels():
+    counts, _ = passed(np.random.default_rng(6), Light(0.6, 6.0), 10, pixels=3840)
+    x0, frames = np.full(len(counts), 32, np.int32), np.full(len(counts), 10)
+    found = find_passages(SweepCounts(counts[:, :, 32:96], frames, np.arange(60.0), x0, counts.shape[2]), 1, 1.0)
+    whole = np.zeros_like(counts)
+    whole[:, :, 32:96] = counts[:, :, 32:96]
+    wanted = find_passages(sweep_of(whole, 10), 1, 1.0)
+    np.testing.assert_array_equal(found.command, wanted.command)
+    assert len(found.command) > 500
+
+
 def test_noise_hot_pixels_and_saturation_give_no_passages():
     rng = np.random.default_rng(8)
     for flux in (0.02, 0.3, 2.0):

@@ -69,6 +69,13 @@ def test_a_term_that_is_neither_there_nor_not_widens_the_covariance() -> None:
     assert np.max(variance / narrow) > 1.5
 
 
+def test_a_lag_that_is_held_at_0_is_decided_on_once() -> None:
+    rig, seen = replace(data.RIG, lag=(-2e-7, -2e-7)), replace(data.SEEN, passages=100)
+    fit = data.fitted(rig, 1, seen, poses=5)
+    (lag,) = (d for d in fit.decisions if d.name.startswith("lag"))
+    assert (lag.kept, fit.model.lag_s.forward, lag.reason) == (False, 0, "not below 0 for any mirror: held at 0")
+
+
 @pytest.mark.parametrize(
     ("changed", "term", "value"),
     [

@@ -69,3 +69,17 @@ def test_the_world_plans_its_effects_for_the_light_of_all_lines_and_tells_their_
     world.project_lines([-0.2, 0.3], shared=False)
     world.plan_for(0.05, 1e-5, 3)
     assert world.effect_plan.planned_for.power_w == 0.1
+
+
+def test_the_report_weighs_the_light_of_all_lines():
+    world = made_world(scene="street-clear")
+
+    def stripe_to_dark() -> float:
+        share = {line["effect"]: line["share"] for line in world.effects_report(0.05, 1e-5, 3)["effects"]}
+        return share["stripe"] / share["dark counts"]
+
+    one = stripe_to_dark()
+    world.project_lines([-0.2, 0.3], shared=True)
+    assert stripe_to_dark() == pytest.approx(one)
+    world.project_lines([-0.2, 0.3], shared=False)
+    assert stripe_to_dark() == pytest.approx(2 * one)

@@ -211,7 +211,10 @@ def test_another_fog_changes_how_dense_a_medium_is_and_nothing_else():
     assert thick.medium.backscatter == scene.medium.backscatter
     assert thick.medium.multiple_scattering == scene.medium.multiple_scattering
     smoke, _ = load_scene("street-smoke")
-    assert with_fog(smoke, "20 m").extinction_per_m == pytest.approx(3.912 / 20)
+    thin = with_fog(smoke, "50 m")
+    assert thin.extinction_per_m == pytest.approx(3.912 / 50)
+    assert thin.medium.mean_cosine == smoke.medium.mean_cosine
+    assert thin.medium.back_per_sr == smoke.medium.back_per_sr
     assert with_fog(load_scene("street-clear")[0], "20 m").extinction_per_m == pytest.approx(3.912 / 20)
     assert with_fog(thick, "clear").medium is None
     world = made_world(fog="20 m")

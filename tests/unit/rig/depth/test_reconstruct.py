@@ -8,6 +8,7 @@ from rig.config.models import EstimateConfig
 from rig.depth.reconstruct import MapResult, Reconstructor, map_geometry
 from rig.depth.warm_up import warm_up
 from rig.errors import UsageError
+from rig.geometry.windows import uncalibrated_geometry
 from tests.reference.geometry import DEPTH_RANGE_M
 from tests.stability.inventory import covers
 from tests.unit.small_maps import rig_model, simulated, volume_of
@@ -72,6 +73,12 @@ def test_without_a_model_there_are_stripes_but_neither_depth_nor_fog():
     assert np.isnan(result.depth_m).all()
     assert result.fog.extinction_per_m is result.fog.extinction_sd_per_m is result.fog.visibility_m is None
     assert np.nanmedian(sweep.errors(result.stripe.x_px)) < 1.0
+
+
+def test_no_learned_state_makes_another_estimator_of_one_that_learns_nothing():
+    config, learned = EstimateConfig(estimator="edge"), [mapped().learned]
+    with pytest.raises(KeyError, match="edge"):
+        Reconstructor(None, np.arange(64), uncalibrated_geometry(16, 512, 64), config, learned=learned)
 
 
 def test_the_median_filter_leaves_light_alone_and_brings_positions_nearer():
