@@ -20,7 +20,7 @@ from calibration.verdict import Verdict, reason_for
 from tests.stability.inventory import covers
 from tests.unit.calibration.cameras import MATRIX, camera
 
-covers(sections, problems)
+covers(sections, problems, load_array, load_arrays)
 
 BUNDLED = Path(__file__).parents[3] / "config" / "simulated-rig.yaml"
 HEAD = "format: spadrig-calibration\nversion: 1\n"
