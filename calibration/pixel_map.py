@@ -27,7 +27,6 @@ import hashlib
 import json
 import math
 import os
-import zipfile
 from dataclasses import dataclass
 from pathlib import Path
 from statistics import NormalDist
@@ -39,7 +38,7 @@ from numpy.typing import NDArray
 
 from calibration.arrays import Array, Mask
 from calibration.errors import CalibrationError
-from calibration.files.npy_files import load_numpy
+from calibration.files.npy_files import load_arrays
 from calibration.views import robust_sd
 
 LEAST_COUNTS = 10.0
@@ -420,9 +419,7 @@ def save_pixels(version: PixelVersion, path: str | os.PathLike[str]) -> None:
     scratch.replace(file)
 
 
-_DAMAGE = (
-    ArithmeticError, AttributeError, EOFError, KeyError, RecursionError, TypeError, ValueError, zipfile.BadZipFile,
-)  # fmt: skip
+_DAMAGE = (ArithmeticError, AttributeError, KeyError, RecursionError, TypeError, ValueError)
 """Errors that reading raises for a file that is not as it was written."""
 
 
@@ -430,14 +427,13 @@ def load_pixels(path: str | os.PathLike[str]) -> PixelVersion:
     """Read a version from a file. Raises CalibrationError if the file holds none."""
     file = Path(path)
     try:
-        with load_numpy(file) as archive:
-            about: dict[str, Any] = json.loads(str(archive["about"]))
-            arrays = {name: archive[name] for name in _ARRAYS}
-            dead = archive["dead"] if "dead" in archive.files else None
+        archive = load_arrays(file)
+        about: dict[str, Any] = json.loads(str(archive["about"]))
+        arrays: dict[str, Any] = {name: archive[name] for name in _ARRAYS}
         if about["format"] != FORMAT or len({array.shape for array in arrays.values()}) != 1:
             raise ValueError(f"'format' is {about['format']!r}")
         numbers: dict[str, Any] = {name: float(about[name]) for name in _NUMBERS}
-        pixels = PixelMap(**arrays, dead=dead, frames=int(about["frames"]), **numbers)
+        pixels = PixelMap(**arrays, dead=archive.get("dead"), frames=int(about["frames"]), **numbers)
         return PixelVersion(pixels, int(about["version"]), str(about["created"]), about["parent"], str(about["sensor"]))
     except OSError as error:
         raise CalibrationError(f"cannot read {file}: {error.strerror or error}; {_NEXT}") from error

@@ -53,6 +53,10 @@ class ProtocolError(DeviceError):
     missing."""
 
 
+class CommandRefused(ProtocolError):
+    """Raised when the device does not know a command, or refuses it in its present state."""
+
+
 class CorruptBlock(ProtocolError):
     """Raised when the magic, checksum, sizes or trailer of a block, or of an index, are wrong. It must not be used."""
 

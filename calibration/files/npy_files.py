@@ -1,4 +1,5 @@
-"""Reading .npy and .npz files from any source. The size of an array that a header states is not trusted.
+"""Reading .npy and .npz files from any source. The size of an array that a header states is not trusted, and whatever
+numpy, zipfile and zlib raise for damaged bytes is a ValueError.
 
 numpy allocates an array as large as its header says before it reads the first number. Here an array of that size must
 first fit into the file.
@@ -8,9 +9,10 @@ import math
 import os
 import zipfile
 from pathlib import Path
-from typing import IO, Any, Final, Literal
+from typing import IO, Any, Final
 
 import numpy as np
+from numpy.typing import NDArray
 
 _MAGIC_BYTES: Final = 8
 _LENGTH_BYTES: Final = {1: 2, 2: 4, 3: 4}
@@ -21,18 +23,36 @@ _DEFLATE_RATIO: Final = 1032
 """Bytes that one compressed byte can stand for at most (zlib's technical details)."""
 
 
-def load_numpy(file: str | os.PathLike[str], mmap_mode: Literal["r"] | None = None) -> Any:
-    """An array, or an archive of arrays; pickles are refused. Raises OSError; ValueError or BadZipFile for other
-    files; for a few damaged ones zlib.error, TokenError, TypeError or NotImplementedError.
-    """
-    with Path(file).open("rb") as stream:
-        is_archive = stream.read(4) == b"PK\x03\x04"
-        stream.seek(0)
-        if is_archive:
-            _check_archive(stream)
-        else:
-            _check_array(stream, os.fstat(stream.fileno()).st_size)
-    return np.load(file, mmap_mode=mmap_mode, allow_pickle=False)
+def load_array(file: str | os.PathLike[str]) -> NDArray[Any]:
+    """The array of a .npy file; pickles are refused. Raises OSError; ValueError, with one line, for any other file."""
+    loaded = _load(Path(file))
+    if isinstance(loaded, dict):
+        raise ValueError("it is an archive of arrays, not a single one")
+    return loaded
+
+
+def load_arrays(file: str | os.PathLike[str]) -> dict[str, NDArray[Any]]:
+    """The arrays of a .npz file by name. Raises errors as `load_array` does."""
+    loaded = _load(Path(file))
+    if not isinstance(loaded, dict):
+        raise ValueError("it is a single array, not an archive of arrays")
+    return loaded
+
+
+def _load(file: Path) -> NDArray[Any] | dict[str, NDArray[Any]]:
+    with file.open("rb") as stream:
+        try:
+            is_archive = stream.read(4) == b"PK\x03\x04"
+            stream.seek(0)
+            if is_archive:
+                _check_archive(stream)
+            else:
+                _check_array(stream, os.fstat(stream.fileno()).st_size)
+            stream.seek(0)
+            loaded = np.load(stream, allow_pickle=False)
+            return dict(loaded) if is_archive else loaded
+        except Exception as error:
+            raise ValueError(" ".join(str(error).split()) or type(error).__name__) from error
 
 
 def _check_archive(stream: IO[bytes]) -> None:

@@ -28,7 +28,6 @@ docs/reference/calibration-file.md explains everything. The file of a camera alo
 
 import hashlib
 import os
-import zipfile
 from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import Any, Final, Literal, TypeVar, get_args
@@ -39,7 +38,7 @@ from numpy.typing import NDArray
 
 from calibration.errors import CalibrationError
 from calibration.files import sections
-from calibration.files.npy_files import load_numpy
+from calibration.files.npy_files import load_array
 from calibration.files.problems import ValueSources, validated
 from calibration.model.camera import Camera
 from calibration.model.parameters import with_parameters
@@ -98,8 +97,11 @@ def _read(file: Path, what: str, model: type[File]) -> File:
 def load_camera(path: Path) -> KnownCamera:
     """Read a camera file. Raises CalibrationError, with one line."""
     parsed = _read(path, "a camera", _CameraFile)
-    covariance = Covariance(tuple(parsed.covariance.names), np.array(parsed.covariance.matrix, dtype=np.float64))
-    camera = Camera(**parsed.camera.model_dump())
+    try:
+        covariance = Covariance(tuple(parsed.covariance.names), np.array(parsed.covariance.matrix, dtype=np.float64))
+        camera = Camera(**parsed.camera.model_dump())
+    except ValueError as error:  # numpy's own for rows of different lengths
+        raise CalibrationError(f"{path}: {error}") from error
     return KnownCamera(camera, covariance, frozenset(parsed.views), parsed.verdict, parsed.reasons)
 
 
@@ -256,15 +258,13 @@ def _array(folder: Path, name: str, what: str) -> NDArray[Any]:
     """The array of a file beside the calibration. Raises CalibrationError if it is not what it must be."""
     file, key = folder / name, "covariance.file" if what == "covariance" else what
     try:
-        array = load_numpy(file)
+        array = load_array(file)
     except FileNotFoundError as error:
         raise CalibrationError(
             f"{key} names {file}, which does not exist; paths are relative to the calibration file"
         ) from error
-    except (OSError, ValueError, EOFError, zipfile.BadZipFile) as error:
+    except (OSError, ValueError) as error:
         raise CalibrationError(f"{key} {file} is not a readable .npy array; write it with numpy.save") from error
-    if not isinstance(array, np.ndarray):
-        raise CalibrationError(f"{key} {file} is an archive, not a single .npy array; write it with numpy.save")
     kinds, must = _ARRAYS[what]
     rows = what == "planes" and array.shape[1:] != (4,)
     if array.dtype.kind not in kinds or rows:

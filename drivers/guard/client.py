@@ -118,7 +118,7 @@ _log = logging.getLogger(__name__)
 OPEN_S = 30.0
 """Time for the guard to start and open its devices: a laser that takes ten commands a second has much to be asked."""
 ANSWER_S = {"arm": 180.0, "program": 20.0}
-"""Time for a verb; a laser may warm up while it is armed."""
+"""Time for a verb. `arm` has as much more as its laser's config allows for warming up."""
 USUAL_ANSWER_S = 10.0
 LOWER_S = 5.0
 """Time for the rescue, where the guard is gone."""
@@ -161,6 +161,7 @@ class Guard:
         self._opening = {slot: threading.Event() for slot in configs}
         self._proxies: dict[str, Any] = {}
         self._armed = False
+        self._answer_s = ANSWER_S | {"arm": ANSWER_S["arm"] + getattr(laser, "warm_up", 0.0)}
         self.failure: DeviceError | None = None
         """The reason why the guard switched the light off, or `GuardLost`; None while all is well."""
         self._lost = threading.Event()
@@ -228,7 +229,7 @@ class Guard:
     def ask(self, slot: str, verb: str, *arguments: Any) -> Any:
         """Have the guard call a device's method on behalf of a proxy; returns its result or raises its error.
 
-        Raises `failure` instead of switching anything on, `DeviceTimeout` after `ANSWER_S`, and `GuardLost` if the
+        Raises `failure` instead of switching anything on, `DeviceTimeout` if it takes too long, and `GuardLost` if the
         guard is gone; methods that make a device safe first wait until the application has tried to do so itself.
         """
         if self.failure is not None and verb in _ENABLING:
@@ -243,7 +244,7 @@ class Guard:
                 raise self._gone(verb)
             request = {"id": number, "slot": slot, "verb": verb, "arguments": arguments}
             self._channel.send(request, within_s=1.0)
-            deadline_s = ANSWER_S.get(verb, USUAL_ANSWER_S)
+            deadline_s = self._answer_s.get(verb, USUAL_ANSWER_S)
             answer = inbox.get(timeout=deadline_s)
         except queue.Empty:
             raise DeviceTimeout(f"{slot}: {verb} is not done after {deadline_s:g} s; check the device") from None

@@ -24,7 +24,7 @@ Job = Callable[[], object]
 
 
 class Lane:
-    """A daemon thread that does jobs one after the other. A job must not raise."""
+    """A daemon thread that does jobs one after the other. It outlives a job that raises: the next may end the light."""
 
     def __init__(self, name: str) -> None:
         self._jobs: queue.PriorityQueue[tuple[int, int, Job]] = queue.PriorityQueue()
@@ -45,6 +45,8 @@ class Lane:
             _, _, job = self._jobs.get()
             try:
                 job()
+            except Exception:
+                _log.exception("guard")
             finally:
                 self._jobs.task_done()
 

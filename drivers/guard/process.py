@@ -19,7 +19,7 @@ import sys
 import threading
 import time
 from collections.abc import Callable, Mapping
-from contextlib import closing
+from contextlib import closing, suppress
 from functools import partial
 from typing import Any
 
@@ -310,7 +310,7 @@ class GuardProcess:
             try:
                 if owned.device is not None:
                     owned.device.close()
-            except DeviceError as error:
+            except Exception as error:  # the next one is closed all the same
                 _log.error("%s: %s", owned.slot, error)
         for owned in self._owned.values():
             owned.flush()
@@ -372,11 +372,12 @@ class Rescue:
     def _save(self, slot: str, armed: bool) -> None:
         try:
             if armed and slot in self._off:
-                self._switch_off(slot)
+                with suppress(Exception):  # opening the device is tried all the same, and tells what is wrong
+                    self._switch_off(slot)
             with _once_free(self._create[slot]) as device:
                 make_safe(device, disarm=armed)
             self._outcome[slot] = "made safe by the application"
-        except DeviceError as error:
+        except Exception as error:  # also a driver's own fault: the other device is waited for, and this one is told
             self._outcome[slot] = f"NOT made safe, {error}"
             _log.error("%s: %s", slot, error)
 

@@ -19,11 +19,11 @@ from dataclasses import dataclass
 from functools import partial
 from typing import Literal
 
-from drivers.errors import DeviceError, DeviceFault, ProtocolError
+from drivers.errors import CommandRefused, DeviceError, DeviceFault, ProtocolError
 from drivers.interfaces import LaserLimits, LaserStatus
 from drivers.lasers.serial_laser import SerialLaser, SerialLaserConfig, open_laser, require_serial_number
 from drivers.registry import Kind, Surroundings
-from drivers.transports.dialogue import DONE, FLAG, NUMBER, CommandRefused, Dialogue, LineTiming
+from drivers.transports.dialogue import DONE, FLAG, NUMBER, Dialogue, LineTiming
 
 _log = logging.getLogger(__name__)
 

@@ -20,11 +20,19 @@ from typing import Annotated, Literal
 from pydantic import Field
 
 from drivers.clock import NS_PER_S
-from drivers.errors import DeviceError, DeviceFault, DeviceNotFound, DeviceTimeout, InterlockOpen, LimitExceeded
+from drivers.errors import (
+    CommandRefused,
+    DeviceError,
+    DeviceFault,
+    DeviceNotFound,
+    DeviceTimeout,
+    InterlockOpen,
+    LimitExceeded,
+)
 from drivers.interfaces import LaserLimits, LaserStatus
 from drivers.lasers.serial_laser import SerialLaser, SerialLaserConfig, open_laser, require_serial_number
 from drivers.registry import Kind, Surroundings
-from drivers.transports.dialogue import DONE, NUMBER, CommandRefused, Dialogue, LineTiming
+from drivers.transports.dialogue import DONE, NUMBER, Dialogue, LineTiming
 from drivers.units import Seconds
 
 SWITCH = re.compile(r"ON|OFF")

@@ -16,7 +16,7 @@ from typing import Any, Protocol
 import numpy as np
 from numpy.typing import NDArray
 
-from drivers.errors import DeviceDisconnected, DeviceError
+from drivers.errors import DeviceDisconnected, DeviceError, DeviceFault
 from drivers.interfaces import BeamScanner, ScannerLimits, ScannerStatus, ScanWaveform
 from drivers.registry import Surroundings
 from drivers.scanners.galvo import GalvoConfig, brake, ramp
@@ -265,12 +265,12 @@ class DacScanner(BeamScanner):
         try:
             run.feed(self._stopping)
             self._position = run.source.last
-        except DeviceError as error:
-            self._error = error
+        except Exception as error:  # a driver's own fault too must end a scan: its frames have no markers any more
+            self._error = error if isinstance(error, DeviceError) else DeviceFault(f"{self.name} failed: {error!r}")
             _log.error("%s", error)
 
     def _rest(self) -> float:
-        """Wait for a run to end; returns the drive at which the mirror rests. If that is unknown, halts the board."""
+        """Wait for a run to end; returns the drive at which the next one begins. Halts the board if it is unknown."""
         self._join()
         if self._position is None:
             self._position = self._dac.halt()

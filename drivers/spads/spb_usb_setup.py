@@ -225,7 +225,7 @@ class Wiring:
     """Whether the chip streams only within a session that is opened by commands."""
 
     def open_session(self, link: BulkLink) -> None:
-        """Clear what an unclosed session left behind, then tell the FT601 to stream."""
+        """Clear what an unclosed session left behind, then tell the FT601 to stream. May raise `ProtocolError`."""
         if not self.has_session:
             return
         found = len(link.control_in(0xC0, _CONFIG_REQUEST, 1, 0, _CONFIG_BYTES, 1.0))

@@ -17,7 +17,7 @@ from dataclasses import dataclass
 from typing import Protocol
 
 from drivers.clock import Clock, now_s
-from drivers.errors import DeviceFault, DeviceTimeout, ProtocolError
+from drivers.errors import CommandRefused, DeviceFault, DeviceTimeout, ProtocolError
 from drivers.transports.serial_port import SerialPort
 
 
@@ -58,10 +58,6 @@ class LineTiming:
     """Silence after which a line counts as drained."""
     drain_s: float = 1.0
     """Longest time for which a line is drained."""
-
-
-class CommandRefused(ProtocolError):  # noqa: N818 - named after what happened, as all device errors
-    """Raised when the device does not know a command, or refuses it in its present state."""
 
 
 class Framing(Protocol):

@@ -32,7 +32,7 @@ from rig.scan.pipeline import Overload, require_policy
 from rig.scan.reconstruct import reconstruct_cube
 from rig.scan.replay import play
 from rig.scan.run import Run, RunResult
-from rig.scan.scan import LiveSource, recording_space, run_scan
+from rig.scan.scan import LiveSource, foreseen, recording_space, run_scan
 
 
 def scan(
@@ -72,6 +72,7 @@ def plan_scan(
     request: ScanRequest | None = None,
     *,
     on_space: Callable[[Space], None] | None = None,
+    on_estimator: Callable[[str], None] | None = None,
     **changes: Any,
 ) -> ScanPlan:
     """Compile the plan of a scan and check it against the limits of its devices (`rig scan --dry-run`).
@@ -79,8 +80,10 @@ def plan_scan(
     Options and checks are those of `scan`, including the room on the disk. Two things only `scan` finds out: whether
     `out` is new or empty and can be written, and whether the estimator `joint`, if asked for, has the memory that it
     needs. Devices are opened, asked for their limits and closed again. Nothing moves and no light leaves, so `arm` is
-    not needed. Raises UsageError for a scan that cannot be made, DevicesError, one line per device, if real ones are
-    missing.
+    not needed.
+
+    on_estimator: called with the estimator in words; whether `auto` keeps up with a stream is measured by `scan` only.
+    Raises UsageError for a scan that cannot be made, DevicesError, one line per device, if real ones are missing.
     """
     request = replace(request or ScanRequest(), **changes)
     settings = _configured(config, request)
@@ -90,6 +93,8 @@ def plan_scan(
         calibration_use(rig, accept=request.accept_calibration)
         plan, timing = prepare(rig)
         require_memory(rig, plan)
+        if on_estimator is not None:
+            on_estimator(foreseen(rig, plan, request.maps))
         if request.record and request.out is not None:
             source = LiveSource(rig, plan, request.maps)
             space = recording_space(rig, plan, timing, source, Path(request.out).absolute(), save)

@@ -269,7 +269,7 @@ def camera_report(fit: CameraFit, views: Sequence[View], board: Board) -> Report
         )
         for name, pose, used, off_px in zip(fit.views, fit.poses, fit.used, fit.view_rms_px, strict=True)
     ]
-    head = ("view", "distance, m", "tilt, degrees", "corners used", "rms, px")
+    head = ("view", "depth, m", "tilt, degrees", "corners used", "rms, px")
     sections = camera_sections(fit.camera, views, fit.residual_px)
     return "Calibration of the camera", [*sections, ("Views", table(head, rows))]
 
@@ -284,7 +284,7 @@ def check_report(boards: Sequence[CheckedBoard], uncertainty: DepthUncertainty |
                          f"{mm(board.flatness_peak_m)}"),
             ("chi2", f"{board.chi2:.1f} of {board.freedom}"),
             ("scale", f"{board.scale:.5f}, sd {digits(board.scale_sd, 2)}"),
-            ("distance", f"{board.distance_m:.3f} m"),
+            ("depth", f"{board.distance_m:.3f} m"),
         ]  # fmt: skip
         shown = picture(cells_picture(board.cells_m), caption)
         sections.append((f"View {board.name}", table(("", ""), rows) + shown))
@@ -340,7 +340,7 @@ def _views_section(fit: RigFit, judged: JudgedRig) -> Section:
                 ("+" if shift > 0 else "") + in_mm(shift),
             )
         )
-    head = ("view", "distance, m", "tilt, degrees", "corners", "rms, px", "passages", "shift, mm")
+    head = ("view", "depth, m", "tilt, degrees", "corners", "rms, px", "passages", "shift, mm")
     left_out = paragraph(f"Without a board: {', '.join(fit.left_out)}.", small=True) if fit.left_out else ""
     return "Views", table(head, rows) + left_out
 

@@ -13,7 +13,6 @@ interrupted, or whose views gave no calibration, leaves its views, which can be 
 """
 
 import io
-import zipfile
 from collections.abc import Collection, Mapping
 from dataclasses import asdict, dataclass, replace
 from datetime import UTC, datetime
@@ -28,7 +27,7 @@ from numpy.typing import NDArray
 from calibration.board.board import Board
 from calibration.depth_error import DepthErrors, depth_errors
 from calibration.errors import Degenerate
-from calibration.files.npy_files import load_numpy
+from calibration.files.npy_files import load_arrays
 from calibration.files.rig_file import CALIBRATION_FILE, corners_digest, save_rig_model
 from calibration.model.rig_model import Identity, RigModel
 from calibration.rig_fit.rig_state import FEWEST_PASSAGES, shows_line
@@ -322,12 +321,12 @@ def save_view(view: View, file: Path) -> None:
 def load_view(file: Path) -> View:
     """Read a view. Raises UsageError if the file holds none."""
     try:
-        with load_numpy(file) as arrays:
-            version = int(arrays["format_version"])
-            if version != VERSION:
-                raise UsageError(f"{file} is a view of version {version}, this program reads version {VERSION}")
-            return _view(arrays)
-    except (OSError, ValueError, KeyError, zipfile.BadZipFile) as error:
+        arrays = load_arrays(file)
+        version = int(arrays["format_version"])
+        if version != VERSION:
+            raise UsageError(f"{file} is a view of version {version}, this program reads version {VERSION}")
+        return _view(arrays)
+    except (OSError, ArithmeticError, KeyError, TypeError, ValueError) as error:
         raise UsageError(f"{file} is no view of a calibration ({error}); take it out of the folder") from error
 
 

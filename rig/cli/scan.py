@@ -25,18 +25,19 @@ def scan_command(
     """Acquire and reconstruct depth maps."""
     if dry_run:
         spaces: list[Space] = []
-        plan = api.plan_scan(config, request, on_space=spaces.append)
-        return _of_plan(plan, spaces[0] if spaces else None)
+        estimator: list[str] = []
+        plan = api.plan_scan(config, request, on_space=spaces.append, on_estimator=estimator.append)
+        return _of_plan(plan, estimator[0], spaces[0] if spaces else None)
     with progress():
         result = api.scan(config, request, on_space=say_space)
     return report(result)
 
 
-def _of_plan(plan: "ScanPlan", space: "Space | None") -> Answer:
+def _of_plan(plan: "ScanPlan", estimator: str, space: "Space | None") -> Answer:
     from rig.plan.describe import plan_content, plan_text
 
     recording = {} if space is None else {"recording": space.content()}
-    said = plan_text(plan) + ("" if space is None else f"\nrecording   {space}")
+    said = f"{plan_text(plan)}\nestimator   {estimator}" + ("" if space is None else f"\nrecording   {space}")
     return Answer({"plan": plan_content(plan), **recording}, lambda: print(said))
 
 

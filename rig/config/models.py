@@ -8,6 +8,7 @@ of the frames. `scan.command_range` is the range of the mirror, and line l's col
 `line_offsets[l]`.
 """
 
+import os
 from collections.abc import Sequence
 from itertools import pairwise
 from pathlib import Path
@@ -206,8 +207,8 @@ def _of_slot(slot: str) -> BeforeValidator:
 
 
 def _beside_config(value: Path | None, info: ValidationInfo) -> Path | None:
-    folder = (info.context or {}).get("folder")
-    return value if value is None or folder is None else Path(folder) / value
+    folder = (info.context or {}).get("folder") or ""
+    return None if value is None else Path(folder) / os.path.expanduser(value)
 
 
 class RigConfig(ConfigSection):

@@ -325,7 +325,7 @@ def laser_off(config: RigConfig) -> list[str]:
                 if device is not None:
                     getattr(device, switch)()
                     done.append(f"{device.name}: {what}")
-            except DeviceError as error:
+            except Exception as error:  # a driver's own fault must not keep the laser on
                 trouble.append(f"{slot}: {error}")
     if trouble:
         raise DevicesError("\n".join([*trouble, *done]))

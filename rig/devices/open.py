@@ -93,7 +93,7 @@ def open_light(config: RigConfig, trouble: list[str]) -> Iterator[tuple[SyncSour
         for slot in GUARDED:
             try:
                 opened[slot] = stack.enter_context(_create(slot, getattr(config, slot), surroundings))
-            except DeviceError as error:
+            except Exception as error:  # whatever it is, it must not keep the other one alight
                 trouble.append(f"{slot}: {error}")
         yield opened["sync"], opened["laser"]
 

@@ -6,8 +6,7 @@ by `FrameLog`. If the camera of whole frames is known, `transforms.json` makes i
 """
 
 import json
-import zipfile
-from collections.abc import Iterable, Iterator, Mapping
+from collections.abc import Callable, Iterable, Iterator, Mapping
 from itertools import pairwise
 from pathlib import Path
 from typing import Any, BinaryIO, Final
@@ -15,7 +14,7 @@ from typing import Any, BinaryIO, Final
 import numpy as np
 from numpy.typing import NDArray
 
-from calibration.files.npy_files import load_numpy
+from calibration.files.npy_files import load_array, load_arrays
 from calibration.model.camera import Camera
 from drivers.frames import BlockHeader, FrameBlock, Mark
 from rig.errors import UsageError
@@ -188,15 +187,14 @@ class MapFiles:
 
     def arrays(self, index: int) -> dict[str, NDArray[np.float32]]:
         """Stripe table of a map, (rows, columns) each, and its depth_m (height, width) if the rig is calibrated."""
-        with load(self._run / "stripe" / f"{index:06d}.npz") as table:
-            arrays = dict(table)
+        arrays = load(self._run / "stripe" / f"{index:06d}.npz", load_arrays)
         file = self._run / "depth" / f"{index:06d}.npy"
         return {**arrays, "depth_m": load(file)} if file.exists() else arrays
 
 
-def load(file: Path) -> Any:
-    """Load a file with numpy. Raises UsageError, with one line, if that fails."""
+def load(file: Path, read: Callable[[Path], Any] = load_array) -> Any:
+    """Load a file of numpy's. Raises UsageError, with one line, if that fails."""
     try:
-        return load_numpy(file)
-    except (OSError, ValueError, EOFError, zipfile.BadZipFile) as error:
+        return read(file)
+    except (OSError, ValueError) as error:
         raise UsageError(f"cannot read {file}: {error}; make the maps again with rig reconstruct") from error

@@ -24,10 +24,10 @@ def plan_text(plan: ScanPlan) -> str:
     step = f"{plan.columns_per_marker} columns" if plan.columns_per_marker > 1 else "column"
     lines = (
         f"columns     {plan.places} x {plan.exposures} frames at {rate / 1e3:g} kHz, "
-        f"{float(plan.column_s) * 1e6:g} us each" + _lines(plan),
+        f"{digits(float(plan.column_s) * 1e6, 6)} us each" + _lines(plan),
         f"mirror      command {low:g} to {high:g}, {sides}, {digits(plan.speed_per_s)} /s, lag {lag}",
         f"sweep       {float(plan.sweep_s) * 1e3:.2f} ms, {plan.sweep_points} points at "
-        f"{float(plan.point_rate_hz):g} Hz, a line marker every {step}",
+        f"{digits(float(plan.point_rate_hz), 6)} Hz, a line marker every {step}",
         f"maps        {plan.map_rate_hz:.2f} a second from {float(plan.frames_per_sweep):.1f} frames "
         f"({float(plan.sweep_s) * 1e3:.1f} ms of sensor time), {plan.dark_fraction:.1%} of them dark",
         f"gate        {gate.gate_open_s * 1e3:.3f} to {gate.gate_close_s * 1e3:.3f} ms after the scan marker",
@@ -68,13 +68,13 @@ def _link(plan: ScanPlan) -> str:
     sent = "full frames"
     if plan.windowed:
         sent = f"moving windows of {plan.frame_width} pixels"
-    text = f"{plan.mode} of {sent}, {rounded(plan.bytes_per_s / 1e6)} MB/s"
+    text = f"{plan.mode} of {sent}, {digits(plan.bytes_per_s / 1e6, 4)} MB/s"
     if plan.full_frames_hz is None:
         return text
-    text += f"; the link carries full frames up to {rounded(plan.full_frames_hz / 1e3)} kHz"
+    text += f"; the link carries full frames up to {digits(plan.full_frames_hz / 1e3, 4)} kHz"
     if plan.windows is None or plan.windows_hz is None:
         return text
-    return f"{text}, windows of {plan.windows.width_px} pixels up to {rounded(plan.windows_hz / 1e3)} kHz"
+    return f"{text}, windows of {plan.windows.width_px} pixels up to {digits(plan.windows_hz / 1e3, 4)} kHz"
 
 
 _TIMING = (
@@ -101,11 +101,6 @@ def plan_content(plan: ScanPlan) -> dict[str, Any]:
     }
 
 
-def rounded(value: float) -> str:
-    """A number for people, with four digits; without exponent between 0.0001 and a million."""
-    return f"{float(f'{value:.4g}'):g}"
-
-
 def beyond_sensor(scan: ScanConfig, info: SpadInfo) -> Iterator[tuple[float, str]]:
     """Yield the sensor's highest frame rate and the problem if the requested rate is higher, else nothing."""
     if scan.frame_rate > info.max_frame_rate_hz:
@@ -120,17 +115,17 @@ def beyond_sensor(scan: ScanConfig, info: SpadInfo) -> Iterator[tuple[float, str
 def beyond_link(plan: ScanPlan, info: SpadInfo, draft_at: Callable[[Fraction], ScanPlan | None]) -> tuple[float, str]:
     """Highest frame rate that the link carries, in whole hertz (0: none), and the problem with the requested one."""
     rate, have = float(plan.frame_rate_hz), plan.link_bytes_per_s or 0.0
-    made = f"{rounded(rate * frame_bytes(plan.width, plan.rows) / 1e6)} MB/s of full frames"
+    made = f"{digits(rate * frame_bytes(plan.width, plan.rows) / 1e6, 4)} MB/s of full frames"
     if plan.windows is not None:
         width = plan.windows.width_px
-        made += f", {rounded(rate * frame_bytes(width, plan.rows) / 1e6)} MB/s of moving windows of {width} pixels"
+        made += f", {digits(rate * frame_bytes(width, plan.rows) / 1e6, 4)} MB/s of moving windows of {width} pixels"
     carried = _carried_hz(plan, info.roi_step_px, draft_at)
     remedy = (
         f"lower frame_rate to {carried / 1e3:g} kHz or narrow depth_range" if carried else "use a SPAD that streams"
     )
     return carried, (
         f"scan.frame_rate {rate / 1e3:g} kHz makes {made}; the link of the {info.model} SPAD carries "
-        f"{rounded(have / 1e6)} MB/s; {remedy}"
+        f"{digits(have / 1e6, 4)} MB/s; {remedy}"
     )
 
 

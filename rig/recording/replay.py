@@ -6,7 +6,6 @@ the SPAD is played as one start. So a map is made from exactly the same frames i
 
 import itertools
 import logging
-import zipfile
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
@@ -15,7 +14,7 @@ from typing import Any, TypeVar
 import numpy as np
 from numpy.typing import NDArray
 
-from calibration.files.npy_files import load_numpy
+from calibration.files.npy_files import load_arrays
 from calibration.files.rig_file import CALIBRATION_FILE
 from calibration.model.rig_model import RigModel
 from drivers.frames import FrameBlock
@@ -372,9 +371,8 @@ def _kept(file: Path, make: Callable[[dict[str, NDArray[Any]]], T]) -> T | None:
     if not file.exists():
         return None
     try:
-        with load_numpy(file) as arrays:
-            return make(dict(arrays))
-    except (OSError, ValueError, KeyError, zipfile.BadZipFile) as error:
+        return make(load_arrays(file))
+    except (OSError, ValueError, KeyError) as error:
         raise DamagedRecordingError(f"{file} is not readable ({error}); move it away to go on without it") from error
 
 

@@ -277,7 +277,7 @@ class Acquisition:
             try:
                 step()
             except BaseException as error:  # neither a step that fails nor a second Ctrl-C may keep the others away
-                trouble.append(f"{name}: {error or type(error).__name__}")
+                trouble.append(f"{name}: {str(error) or type(error).__name__}")
                 interrupted = interrupted or (None if isinstance(error, Exception) else error)
         if not pipeline.join_source():
             trouble.append(f"spad: {rig.spad.name} did not return within {JOIN_S:g} s of being stopped; unplug it")

@@ -39,6 +39,14 @@ def choose_estimator(
     return estimate.model_copy(update={"estimator": name}), why
 
 
+def foreseen_estimator(estimate: EstimateConfig, geometry: SweepGeometry, map_time_s: float) -> str:
+    """The estimator of a run for people, as far as it is known before anything is measured. map_time_s: as above."""
+    chosen, why = choose_estimator(estimate, geometry)
+    if why and chosen.estimator == "joint" and math.isfinite(map_time_s) and not estimate.temporal_prior:
+        return f"auto: joint if this machine makes a map in {digits(1e3 * KEPT_UP * map_time_s, 2)} ms, else likelihood"
+    return f"auto: {chosen.estimator}, {why}" if why else chosen.estimator
+
+
 def _choice(estimate: EstimateConfig, geometry: SweepGeometry, map_time_s: float) -> tuple[str, str]:
     from rig.estimate.joint.tables import grid_of
 

@@ -39,7 +39,7 @@ from rig.recording.segment import Space, paged
 from rig.requests import RunRequest
 from rig.run_folder.folder import SavePolicy
 from rig.scan.acquisition import SILENCE_S, Acquisition, AcquisitionRequest
-from rig.scan.estimator import choose_estimator
+from rig.scan.estimator import choose_estimator, foreseen_estimator
 from rig.scan.monitor import NOBODY, Listeners
 from rig.scan.pipeline import FEWEST_SLOTS, Overload, require_policy
 from rig.scan.run import Run, RunResult, frames_of, frames_that_came, sweep_content, synchronisation_of, verdict_of
@@ -211,6 +211,13 @@ def recording_space(
     map_bytes = BYTES_PER_PIXEL * plan.rows * max(plan.width, plan.columns)
     frames_bytes = (math.ceil(frames / block_frames) + starts) * block_bytes
     return Space.on_disk_of(folder, frames_bytes, map_bytes * save.count(source.maps))
+
+
+def foreseen(rig: OpenRig, plan: ScanPlan, maps: int | None) -> str:
+    """The estimator of a scan for people, as far as it is known before the scan."""
+    sensor = plan.rows, plan.width
+    geometry = map_geometry(rig.model, plan.commands, plan.depth_range_m, sensor=sensor, lines=plan.lines)
+    return foreseen_estimator(rig.config.estimate, geometry, _map_time_s(rig, plan, maps))
 
 
 def _map_time_s(rig: OpenRig, plan: ScanPlan, maps: int | None) -> float:

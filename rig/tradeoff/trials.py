@@ -6,7 +6,7 @@ from itertools import count, product, starmap
 from pathlib import Path
 from typing import Any, Literal, NamedTuple
 
-from rig.config.models import RigConfig
+from rig.config.models import AUTO, RigConfig
 from rig.config.overrides import Config, configure, with_lines
 from rig.errors import each_or_problems
 from rig.estimate.registry import ESTIMATORS, FILTERS
@@ -118,7 +118,8 @@ def run_tradeoff(
 def require_methods(estimators: Sequence[str], filters: Sequence[str]) -> list[str]:
     """Problems with names of estimators and filters."""
     return [
-        f"{what} {name!r} is unknown; choose of {', '.join(known)}"
+        f"{what} {name!r} {'is a choice between others' if (what, name) == ('estimator', AUTO) else 'is unknown'}; "
+        f"choose of {', '.join(known)}"
         for what, names, known in (("estimator", estimators, ESTIMATORS), ("filter", filters, FILTERS))
         for name in names
         if name not in known

@@ -2,7 +2,6 @@
 
 import difflib
 import os
-import zipfile
 from pathlib import Path
 from typing import Annotated, Any, Self
 
@@ -10,7 +9,7 @@ import numpy as np
 from pydantic import Field, model_validator
 
 from calibration.errors import FileError
-from calibration.files.npy_files import load_numpy
+from calibration.files.npy_files import load_arrays
 from calibration.files.problems import ValueSources, validated
 from calibration.files.sections import load_yaml
 from drivers.errors import DeviceError
@@ -189,12 +188,11 @@ def load_folder(folder: Path, size: tuple[int, int]) -> Surfaces:
     if not path.is_file():
         raise DeviceError(f"scene folder {folder} has no {WORLD_FILE}")
     try:
-        with load_numpy(path) as stored:
-            missing = [key for key in ("depth_m", "albedo") if key not in stored]
-            if missing:
-                raise DeviceError(f"scene file {path} lacks {' and '.join(missing)}; it holds {', '.join(stored)}")
-            depth_m, albedo = stored["depth_m"], stored["albedo"]
-            trusted = stored["trusted"] if "trusted" in stored else np.ones(depth_m.shape, bool)
-    except (OSError, ValueError, zipfile.BadZipFile) as error:
-        raise DeviceError(f"scene file {path} cannot be read: {error}") from error
-    return checked(str(folder), depth_m, albedo, trusted, size)
+        stored = load_arrays(path)
+    except (OSError, ValueError) as error:
+        raise DeviceError(f"scene file {path} cannot be read: {error}; write it with numpy.savez") from error
+    missing = [key for key in ("depth_m", "albedo") if key not in stored]
+    if missing:
+        raise DeviceError(f"scene file {path} lacks {' and '.join(missing)}; it holds {', '.join(stored)}")
+    depth_m = stored["depth_m"]
+    return checked(str(folder), depth_m, stored["albedo"], stored.get("trusted", np.ones(depth_m.shape, bool)), size)

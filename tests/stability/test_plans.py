@@ -20,7 +20,6 @@ from rig.errors import PlanError
 from rig.plan import waveform
 from rig.plan.calibration_reach import require_speed
 from rig.plan.compile import compile_plan, path_demand
-from rig.plan.describe import rounded
 from rig.plan.gate_pulses import sync_program
 from rig.plan.mirror_path import (
     MirrorLimits,
@@ -185,13 +184,6 @@ def test_plans_are_exact_in_time_and_finite_in_all_their_figures(plan) -> None:
     assert plan.readout_s(10) >= 0
     assert plan.leg(10**9) in plan.legs
     assert not plan.window_x0(np.zeros(2, np.uint32), np.zeros(2, np.int64), np.array([-1, 0])).any() or plan.windows
-
-
-@covers(rounded)
-@EXAMPLES
-@given(value=st.floats(1e-12, 1e12))
-def test_figures_for_people_keep_four_digits(value) -> None:
-    assert float(rounded(value)) == pytest.approx(value, rel=1e-3)
 
 
 @covers(Blanking, blanking_for, moving_windows)

@@ -65,9 +65,11 @@ def test_save_says_which_maps_are_written(rig: Rig, small: Path, save: list[str]
 
 
 def test_a_dry_run_prints_the_plan_and_writes_nothing(rig: Rig, small: Path) -> None:
-    people, programs = rig("scan", small, "--dry-run"), rig("scan", small, "--dry-run", "--json")
+    people = rig("scan", small, "--dry-run", "--estimator", "auto")
+    programs = rig("scan", small, "--dry-run", "--json")
     assert people.code == programs.code == 0
     assert "sweep" in people.out
+    assert "estimator   auto: joint, no frame waits for its maps" in people.out
     assert strict(programs.out)["plan"]["columns"] == 200  # type: ignore[index]
     assert not list(Path().iterdir())
 

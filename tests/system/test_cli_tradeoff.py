@@ -77,6 +77,7 @@ def test_repeats_differ_and_what_cannot_be_had_ends_with_1_and_the_nearest(rig: 
         (["--fog", "7"], "'7' has no unit"),
         (["--exposures", "4", "--scene", "street,nowhere"], "scene 'nowhere'"),
         (["--estimators", "best"], "estimator 'best' is unknown; choose of argmax"),
+        (["--estimators", "auto"], "estimator 'auto' is a choice between others; choose of argmax, edge"),
         (["--repeat", "0"], "repeat is 0"),
         (["--exposures", "60000"], "exposures above"),
         (["--time-budget", "-5 ms"], "--time-budget is -5 ms; it must be more than 0"),

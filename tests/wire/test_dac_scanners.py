@@ -8,6 +8,7 @@ import pytest
 
 from drivers.clock import VirtualClock
 from drivers.errors import DeviceBusy, DeviceDisconnected, DeviceError, DeviceNotFound, DevicePermission, DeviceTimeout
+from drivers.scanners.helios import HeliosRun
 from sim_backend.wire.firmware.helios import DAC_STEPS, KEEP_S, DacHistory, Played
 from sim_backend.wire.serve.usb import EmulatedUsb
 from tests.wire.scanners import (
@@ -114,6 +115,15 @@ def test_a_firmware_that_hangs_ends_the_run_within_its_deadline(kind: Kind) -> N
     assert (clock.now_ns() - began) / 1e9 < 2
     with pytest.raises(DeviceTimeout):
         device.close()
+
+
+def test_a_fault_of_the_driver_itself_is_told_too(monkeypatch: pytest.MonkeyPatch) -> None:
+    with opened("helios", HeliosRecorder()) as (device, _):
+        monkeypatch.setattr(HeliosRun, "feed", lambda *_: 1 / 0)
+        play(device, 3)
+        monkeypatch.undo()
+        assert device.status.fault is not None
+        assert "ZeroDivisionError" in device.status.fault
 
 
 @over_both

@@ -5,14 +5,20 @@ import signal
 import subprocess
 import sys
 import tempfile
+import threading
 import time
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass
+from typing import NoReturn
 
 import pytest
 
-from drivers.errors import DeviceBusy, DeviceError, DeviceNotFound, GuardLost, LimitExceeded
+from drivers.errors import CommandRefused, DeviceBusy, DeviceError, DeviceNotFound, GuardLost, LimitExceeded
 from drivers.guard import Guard, GuardLimits
+from drivers.guard.channel import error_from, error_message
+from drivers.guard.client import ANSWER_S
+from drivers.guard.owned import Lane
+from drivers.guard.process import Rescue
 from drivers.lasers.cobolt import CoboltConfig
 from drivers.lasers.obis import ObisConfig
 from drivers.registry import Surroundings
@@ -156,6 +162,43 @@ def test_a_laser_is_off_before_it_is_opened_once_the_guard_is_gone(channel: int 
         said = model.commands[before:]
         assert said.index(f"SOUR{address}:AM:STAT OFF") < said.index("SYST:COMM:HAND?")  # the first one of opening it
         assert not any(command.startswith("SOUR:AM:STSOUR") for command in said)
+
+
+def test_an_error_of_any_class_comes_through_as_what_it_is() -> None:
+    classes, left = [], [DeviceError]
+    while left:
+        classes.append(left.pop())
+        left += [one for one in classes[-1].__subclasses__() if one.__module__.startswith("drivers.")]
+    assert CommandRefused in classes
+    assert [type(error_from(error_message(one("text")))) for one in classes] == classes
+
+
+def broken(*_: object) -> NoReturn:
+    raise KeyError("outputs")
+
+
+def test_a_driver_that_fails_in_its_own_way_keeps_no_other_device_alight(rig: GuardedRig) -> None:
+    lane, done = Lane("test"), threading.Event()
+    lane.do(broken)
+    lane.do(done.set)
+    assert done.wait(PATIENCE_S)
+    laser = ObisConfig.model_validate({"port": rig.laser.path, "max_power": "50 mW"})
+    rig.laser.model.shine(POWER_W)  # type: ignore[attr-defined]
+    rescue = Rescue({"laser": laser, "sync": PrawnDoConfig(port=rig.sync.path)}, {})
+    rescue._create["sync"] = rescue._switch_off = broken  # type: ignore[method-assign]
+    outcome = rescue.run({"laser", "sync"}, armed=True)
+    assert outcome == "laser: made safe by the application, sync: NOT made safe, 'outputs'"
+    assert not rig.laser.model.emitting  # type: ignore[attr-defined]
+
+
+def test_a_laser_may_take_the_time_that_its_config_gives_it_to_warm_up(
+    rig: GuardedRig, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setitem(ANSWER_S, "arm", 0.0)
+    rig.laser.model.warm_up_s = 1.0  # type: ignore[attr-defined]
+    with guard_of(rig) as guard:
+        guard.laser.arm(POWER_W)
+        assert rig.laser.model.emitting  # type: ignore[attr-defined]
 
 
 @pytest.mark.parametrize("at_work", [False, True])

@@ -92,6 +92,20 @@ def test_what_is_written_before_a_run() -> None:
     assert device.commands[-5][0] == Op.START  # EXPOSED is asked for behind it, two halves twice
 
 
+def test_a_start_without_what_it_needs_is_refused() -> None:
+    device = model(paced=True)
+    for name, value in (
+        *((Register.EXPOSURE_TICKS, 1000), (Register.PERIOD_TICKS, 1000), (Register.BLOCK_FRAMES, 4)),
+        *((Register.WINDOW_WIDTH_PX, 64), (Register.WINDOW_SWEEPS, 1), (Register.WINDOW_COUNTS, 1)),
+    ):
+        device._obey(Op.WRITE, 0, name, value, 0.0)
+        started = device._obey(Op.START, 0, 0, 0, 0.0)
+        complete = name == Register.BLOCK_FRAMES
+        assert started.status == (AckStatus.OK if complete else AckStatus.BAD_VALUE), name
+        if complete:
+            device._obey(Op.ABORT, 0, 0, 0, 0.0)
+
+
 @pytest.mark.parametrize(
     ("settings", "registers", "deaf", "sort", "words"),
     [

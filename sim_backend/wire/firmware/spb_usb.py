@@ -173,7 +173,7 @@ class SpbUsbModel(UsbModel):
         run_id = (self._run_id + 1) & 0xFFFF
         try:
             run = EmulatedRun(self._board, self._source, self._registers, run_id, self._memory, now_s)
-        except ValueError:
+        except (KeyError, ValueError):
             return AckStatus.BAD_VALUE, 0
         self._run, self._run_id = run, run_id
         self._queue.clear()

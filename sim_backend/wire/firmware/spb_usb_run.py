@@ -120,7 +120,9 @@ class EmulatedRun:
         memory: BlockMemory,
         now_s: float,
     ) -> None:
-        """Raises ValueError if the stride is bad or holds no frame."""
+        """Raises ValueError if the stride is bad or holds no frame, or if period, block_frames or a window table's
+        entries are 0; KeyError for entries that were never written.
+        """
         self.next_frame = 0
         self.pinged_s = now_s
         self.over = False
@@ -134,6 +136,8 @@ class EmulatedRun:
         self._width = board.width if self._window is None else self._window.width_px
         most = frames_per_block(self._stride, self._width, board.height)
         self._block_frames = min(most, registers[Register.BLOCK_FRAMES])
+        if 0 in (self._period, self._block_frames):
+            raise ValueError(f"a period of {self._period} ticks and {self._block_frames} frames in a block")
         self._n_frames = (registers[Register.N_FRAMES] | registers[Register.N_FRAMES + 4] << 32) or None
         self._start_s = self._sent_s = now_s
         self._seq = 0
@@ -245,6 +249,8 @@ def _window(registers: Mapping[int, int]) -> WindowTable | None:
     if width == 0:
         return None
     counts = [registers[Register.WINDOW_COUNTS + 4 * i] for i in range(registers[Register.WINDOW_SWEEPS])]
+    if not (counts and all(counts)):
+        raise ValueError(f"window tables of {counts} entries")
     begins = np.cumsum([0, *counts])
     tables = [
         np.array([registers[Register.WINDOW_X0 + 4 * i] for i in range(begin, begin + count)], np.int32)

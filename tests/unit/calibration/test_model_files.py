@@ -1,5 +1,7 @@
 """The files of a calibration and of a camera: what is written is read back, what is wrong said in one line."""
 
+import contextlib
+from collections.abc import Callable
 from dataclasses import fields, is_dataclass, replace
 from pathlib import Path
 
@@ -9,6 +11,7 @@ import yaml
 
 from calibration.errors import CalibrationError
 from calibration.files import problems, sections
+from calibration.files.npy_files import load_array, load_arrays
 from calibration.files.rig_file import KnownCamera, camera_file_text, load_camera, load_rig_model, save_rig_model
 from calibration.model.camera import Camera
 from calibration.model.rig_model import Covariance, Identity, Lag, RigModel
@@ -17,7 +20,7 @@ from calibration.verdict import Verdict, reason_for
 from tests.stability.inventory import covers
 from tests.unit.calibration.cameras import MATRIX, camera
 
-covers(sections, problems)
+covers(sections, problems, load_array, load_arrays)
 
 BUNDLED = Path(__file__).parents[3] / "config" / "simulated-rig.yaml"
 HEAD = "format: spadrig-calibration\nversion: 1\n"
@@ -210,3 +213,25 @@ def test_a_file_of_old_is_one_that_nobody_judged(tmp_path: Path) -> None:
     assert (known.verdict, known.reasons) == (None, ())
     with pytest.raises(CalibrationError, match="verdict is 'good'"):
         read_back(tmp_path, text.replace("verdict: passed\n", "verdict: good\n"))
+    ragged = text.replace("[0.0, 0.09]", "[0.0]")
+    assert ragged != text
+    with pytest.raises(CalibrationError, match=r"camera\.yaml: .*inhomogeneous"):
+        read_back(tmp_path, ragged)
+
+
+@pytest.mark.parametrize(("read", "write_it"), [(load_array, np.save), (load_arrays, np.savez_compressed)])
+def test_whatever_is_damaged_in_an_array_or_archive_is_one_kind_of_error(
+    tmp_path: Path, read: Callable[[Path], object], write_it: Callable[..., None]
+) -> None:
+    file = tmp_path / "file"
+    with file.open("wb") as stream:
+        write_it(stream, np.arange(8.0))
+    whole = file.read_bytes()
+    for at in range(len(whole)):
+        for bit in (1, 8, 32):
+            file.write_bytes(whole[:at] + bytes([whole[at] ^ bit]) + whole[at + 1 :])
+            with contextlib.suppress(ValueError):
+                read(file)
+        file.write_bytes(whole[:at])
+        with pytest.raises(ValueError, match=r"^[^\n]+$"):
+            read(file)

@@ -32,6 +32,8 @@ def test_the_report_of_planes_shows_text_first_then_the_four_pictures() -> None:
     terms = html[html.index("Terms of the model") :]
     assert '<th class="number">value</th>' in terms
     assert "<th>unit</th>" in terms
+    views_head = html[html.index("<h2>Views</h2>") :]
+    assert '<th class="number">depth, m</th>' in views_head
     assert not re.search(r'(src|href)="(?!data:)', html)
 
 

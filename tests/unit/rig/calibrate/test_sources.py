@@ -87,9 +87,13 @@ def test_nothing_is_left_of_a_view_that_could_not_be_written(tmp_path):
 def test_what_is_no_view_is_named(tmp_path):
     with pytest.raises(UsageError, match="holds no view"):
         load_views(tmp_path)
-    (tmp_path / "000.npz").write_bytes(b"PK rubbish")
-    with pytest.raises(UsageError, match=r"000\.npz is no view"):
-        load_views(tmp_path)
+    save_view(view_of(), tmp_path / "000.npz")
+    damaged = bytearray((tmp_path / "000.npz").read_bytes())
+    damaged[100:] = bytes(byte ^ 0x55 for byte in damaged[100:200]) + damaged[200:]
+    for content in (b"PK rubbish", damaged):
+        (tmp_path / "000.npz").write_bytes(content)
+        with pytest.raises(UsageError, match=r"000\.npz is no view"):
+            load_views(tmp_path)
     np.savez(tmp_path / "000.npz", format_version=np.array(99))
     with pytest.raises(UsageError, match="version 99"):
         load_views(tmp_path)

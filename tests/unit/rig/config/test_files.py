@@ -148,6 +148,16 @@ def test_a_mistake_in_an_override_is_called_an_option(write):
     ]
 
 
+def test_a_calibration_may_lie_at_home(write, tmp_path, monkeypatch):
+    monkeypatch.setenv("HOME", str(tmp_path))
+    for name, meant in (
+        ("~/cal.yaml", tmp_path / "cal.yaml"),
+        ("~nobody-here/c.yaml", tmp_path / "~nobody-here/c.yaml"),
+    ):
+        file = write(RIG.replace("name: test", f"name: test\ncalibration: {name}"))
+        assert load_config(file).calibration == meant
+
+
 def test_a_config_named_by_a_relative_path_is_written_out_for_any_folder(write, tmp_path, monkeypatch):
     for name in ("rig", "rig/scenes", "art", "street", "elsewhere"):
         (tmp_path / name).mkdir()

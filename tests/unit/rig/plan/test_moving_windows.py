@@ -189,6 +189,8 @@ def test_the_description_names_the_window_its_rate_and_what_the_link_carries():
     assert "stream of moving windows of 192 pixels, 11.2 MB/s; the link carries full frames up to 44.12 kHz" in text
     assert "windows of 192 pixels up to 107.1 kHz" in text
     assert "burst of full frames" in plan_text(plan_of(scan(), spad=linked(1e5, burst=BurstMode(1000, 1e6))))
+    slow = dataclasses.replace(plan_of(scan()), frame_rate_hz=Fraction(2))
+    assert "4 frames at 0.002 kHz, 2000000 us each" in plan_text(slow)
 
 
 class Counter:

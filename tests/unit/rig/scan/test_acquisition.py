@@ -79,11 +79,12 @@ def test_a_step_that_fails_does_not_keep_the_others_from_running():
     assert log == START + STOP
 
 
-def test_a_second_interrupt_while_stopping_still_makes_everything_safe():
+def test_a_second_interrupt_while_stopping_still_makes_everything_safe(caplog):
     run, log = begun({"sync": {"abort": KeyboardInterrupt()}})
     with pytest.raises(KeyboardInterrupt):
         run.throw(ValueError("first"))
     assert log == START + STOP
+    assert "gate: KeyboardInterrupt" in caplog.text
 
 
 def test_trouble_while_stopping_is_noted_on_the_error_that_led_there():

@@ -14,7 +14,7 @@ from rig.config.models import EstimateConfig
 from rig.estimate.joint import tables
 from rig.geometry.windows import uncalibrated_geometry
 from rig.scan import estimator as module
-from rig.scan.estimator import COLUMNS, KEPT_UP, ROWS, choose_estimator, time_of_map
+from rig.scan.estimator import COLUMNS, KEPT_UP, ROWS, choose_estimator, foreseen_estimator, time_of_map
 from rig.scan.scan import _map_time_s
 
 GEOMETRY = uncalibrated_geometry(64, 64, 40)
@@ -48,6 +48,20 @@ def test_in_a_stream_joint_must_keep_up(map_s):
     fast, why = choose_estimator(EstimateConfig(), GEOMETRY, map_s / KEPT_UP * 0.99)
     assert fast.estimator == "likelihood"
     assert why == "a map of joint takes 100 ms, a sweep 200 ms"
+
+
+def test_what_is_known_of_the_estimator_before_a_scan_needs_no_measurement(monkeypatch):
+    monkeypatch.setattr(module, "time_of_map", None)
+    for asked, map_time_s, told in (
+        (EstimateConfig(estimator="edge"), 0.05, "edge"),
+        (EstimateConfig(), math.inf, "auto: joint, no frame waits for its maps"),
+        (EstimateConfig(temporal_prior=True), 0.05, "auto: joint, it alone has a temporal prior"),
+        (EstimateConfig(), 0.05, "auto: joint if this machine makes a map in 25 ms, else likelihood"),
+    ):
+        assert foreseen_estimator(asked, GEOMETRY, map_time_s) == told
+    monkeypatch.setattr(tables, "MOST_BYTES", 1000)
+    told = foreseen_estimator(EstimateConfig(), GEOMETRY, 0.05)
+    assert told == "auto: likelihood, joint would take too much memory"
 
 
 def test_memory_and_the_temporal_prior_have_a_say(map_s, monkeypatch):
