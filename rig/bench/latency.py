@@ -68,7 +68,7 @@ SPIN_S = 2e-4
 
 @dataclass(frozen=True, slots=True)
 class Latency:
-    """Microseconds from a column's last frame to its estimate, over so many columns.
+    """Microseconds from a column's last frame to its estimate, over `columns` columns, on `threads` threads.
 
     p999: the 99.9 % quantile. late_max_us: largest lateness of a block at the source.
     """

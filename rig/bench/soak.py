@@ -157,7 +157,7 @@ class LoopedSpad(SpadArray):
             cycle, at = divmod(first + done + length - self._lead, length)
             size = min(n - done, length - at)
             records[done : done + size] = loop.records[at : at + size]
-            # Before the first marker, cycle 0, the sweeps that the loop counts from 1 on are over or have not begun.
+            # The loop counts its sweeps from 1 on; before the first marker, in cycle 0, its last one becomes number 0.
             before = (cycle - 1) * loop.sweeps
             if not done:  # the header's count goes on where the 16 bits of records begin again
                 sweep = int(loop.records["sweep"][at]) + before

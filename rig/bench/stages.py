@@ -176,7 +176,7 @@ def search_stage(
 
     def measure(seconds: float) -> Measured:
         judge = likelihood.judge(frames.geometry, exposures, dark=True)
-        # One for all sweeps, as in a scan; kept beyond this moment, the tables of all stages' judges would be too much.
+        # One for all sweeps, as in a scan, but not for the next call: the tables of all stages would be too much.
         counter = ColumnJudge(layout, frames.geometry, judge, workers)
         blocks = source(frames, walk)
         done, spent = 0, 0.0
@@ -238,7 +238,7 @@ def joint_stage(surface: BenchSurface, volume: CountVolume, threads: int, model:
     pictures = surface.pictures()
 
     def measure(seconds: float) -> Measured:
-        # Made anew: kept beyond this moment, the memory of all threads' and exposures' would be too much.
+        # Made anew for each call: the memory of all stages together would be too much.
         joint = Joint(threads, model, learns=False)
 
         def make() -> NDArray[np.float32]:

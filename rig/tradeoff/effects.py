@@ -176,7 +176,7 @@ def open_world(config: RigConfig) -> Iterator[tuple[ReportsEffects, float]]:
             device = getattr(config, slot)
             if not device.real_time:  # a simulated one tells the world what it does
                 stack.enter_context(lookup(slot, device.kind).create(device, surroundings))
-        # As a scan does: the laser's limit. One that is not there states it in its config.
+        # As in a scan: the laser's limit, which its config states even if the laser is not opened here.
         power_w = getattr(config.laser, "max_power", None) if config.scan.power is None else config.scan.power
         if power_w is None:
             raise UsageError(f"{config.name} states no laser power; add for example 'power: 20 mW' under scan")
@@ -219,7 +219,7 @@ def _trials(
 
 
 def _trial(config: RigConfig, columns: int, names: list[str]) -> Array:
-    """Stripe errors (rows, columns) in px of a scan with so many columns and these effects, see `charged_errors`.
+    """Stripe errors (rows, columns) in px of a scan of this many columns with these effects, see `charged_errors`.
 
     An interrupt is raised again.
     """

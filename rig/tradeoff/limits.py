@@ -73,7 +73,7 @@ def bayes_errors(light: RowLight, exposures: Sequence[int], draws: int, rng: np.
     places, spacing = _places(light, max(exposures))
     flux = np.maximum(light.flux(places), FLUX_MIN)
     here = np.maximum(light.flux(np.array([light.position]))[0], FLUX_MIN)
-    # log L = sum n log(e^flux - 1) - K flux, an exact identity; all of it is of differences to the true position.
+    # log L = sum n log(e^flux - 1) - K flux, exactly; gain and loss are differences to the true position.
     gain = log_fired(flux) + flux - (log_fired(here) + here)
     loss = (flux - here).sum(1)
     errors = np.empty((len(exposures), draws))
@@ -245,7 +245,7 @@ def chernoff_exponent(flux: Array, other: Array) -> Array:
     dark = low - high
     sign = np.where(first >= second, 1.0, -1.0)
     t = _best_share(log_fired(second), -second, sign * fired, sign * dark)
-    # Exponent of the brighter of the two in each pixel.
+    # The exponent of the brighter of the two in each pixel.
     share = np.where(sign > 0, t[..., None], 1.0 - t[..., None])
     return np.asarray(_overlap_exponent(low, high, fired, dark, share).sum(-1))
 

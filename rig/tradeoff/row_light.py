@@ -152,7 +152,7 @@ def row_light(parts: Mapping[str, Array], geometry: SweepGeometry, row: int, col
     if total < LEAST_STRIPE or lo > hi:
         return None
     position = float((stripe * x).sum() / total)
-    # The pixel itself has a twelfth of a square pixel.
+    # The width of a pixel itself adds 1/12 px^2.
     variance = float((stripe * (x - position) ** 2).sum() / total) - 1.0 / 12.0
     if variance > SPLIT_PX**2 or not lo <= position <= hi:
         return None

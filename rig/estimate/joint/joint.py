@@ -103,7 +103,7 @@ class Joint:
         )
         stripes = replace(first, x2_px=x2_px, confidence2=confidence2)
         self._prior.leave(stripes, tables.grid)
-        # Whether the first map has taught anything is for the trust of its lessons to say.
+        # The trust of its lessons says whether the first map has taught anything.
         known = self._lessons.model is not None
         judged = stripes if known else self._teaching(sweep, tables, stripes)
         self._lessons.attend(
@@ -113,13 +113,13 @@ class Joint:
 
     def _first_model(self, volume: CountVolume, geometry: SweepGeometry) -> RowModel:
         """The model learned from the first sweep: row by row, then from stripes, which all rows together show."""
-        self._prior.recall(None)  # of maps that taught nothing
+        self._prior.recall(None)  # forget maps that taught nothing
         model = start = first_model(volume, geometry, self._workers)
         witness_px, lessons, intensity = None, 0, volume.intensity()
         while lessons < (LESSONS if witness_px is None else HALO_LESSONS):
             model, lessons = self._taught(volume, intensity, geometry, model, witness_px), lessons + 1
             if witness_px is None and model.halo.any():
-                # What is scattered many times has misled these lessons: begin again with a second teacher.
+                # Light scattered many times has misled these lessons: begin again, with contrast as a second teacher.
                 witness_px, model, lessons = self._by_contrast(volume, geometry, model), start, 0
         return model
 

@@ -30,7 +30,7 @@ _LEAST_AT: Final = -VECTOR
 CHUNK: Final = 16
 """Columns that are stepped through together: enough that none waits for its last step, few enough for the caches."""
 _AHEAD: Final = 3
-"""Rows ahead of which memory is asked for: each lies on a page of its own, which the processor does not foresee."""
+"""Rows by which memory is asked for ahead: each lies on a page of its own, which the processor does not foresee."""
 _SET, _ADD, _TOTAL = 0, 1, 2
 
 
@@ -44,7 +44,7 @@ JUMP: Final = 40
 
 @numba.njit(cache=True, nogil=True)
 def _path_memory(paths: int, labels: int) -> Uint8:
-    """Memory for L of the last pixel and of this one on so many paths; must live as long as the paths."""
+    """Memory for L of the last pixel and of this one on this many paths; it must live as long as they."""
     return np.full(2 * paths * (labels + 2 * _SIDE) + _SIDE, LARGEST, np.uint8)
 
 
@@ -56,7 +56,7 @@ def _paths_in(memory):  # type: ignore[no-untyped-def]
 
 @numba.njit(forceinline=True)
 def _begin(path, paths, labels):  # type: ignore[no-untyped-def]
-    """Begin so many paths: there is no message to their first pixel."""
+    """Begin a number of paths: there is no message to their first pixel."""
     for _ in range(2 * paths):
         for v in range(0, labels, VECTOR):
             store_bytes(path, v, zero_bytes())
@@ -87,7 +87,7 @@ def _step(before, after, cost, message, total, hidden, labels, ahead, use):  # t
         by_two = add_saturated_unsigned(by_two, TWO)
         by_three = add_saturated_unsigned(by_three, THREE)
         best = smaller_unsigned(smaller_unsigned(by_one, by_two), smaller_unsigned(by_three, load_bytes(before, v)))
-        # L is as it is, not less its least: what is subtracted at the end need not be waited for before.
+        # L keeps its least, which is subtracted from the message alone: no step waits for it earlier.
         sent = sub_saturated_unsigned(smaller_unsigned(best, most), least)
         here = add_saturated_unsigned(load_bytes(cost, v), sent)
         next_least = smaller_unsigned(next_least, here)

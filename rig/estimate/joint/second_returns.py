@@ -160,7 +160,7 @@ def measure_seconds(
     alone = still[LANES:-LANES].reshape(sweep.u.shape)
     for y in range(first_row, last_row):
         for c in range(x_px.shape[1]):
-            # Whatever an earlier map left there: neighbours pool it where the distance is known, searched or not.
+            # What an earlier map left must go: neighbours pool it wherever the distance is known, searched or not.
             out.ones[y, c] = out.expected[y, c] = out.light[y, c] = out.moment[y, c] = 0.0
             place = np.float32(x_far[y, c]) + out.distance[y, c]
             if np.isnan(place) or np.isnan(x_px[y, c]) or sweep.x_lo[y, c] > sweep.x_hi[y, c]:
@@ -302,7 +302,7 @@ def second_returns(
     def look(first: int, last: int) -> None:
         sum_blocks(*seen, light.place, side, apart, x_px, first, last, blocks)
         here = slice(first * BLOCK, last * BLOCK)
-        seconds.distance[here] = x2_px[here] = np.nan  # of neighbours of those that are asked, too
+        seconds.distance[here] = x2_px[here] = np.nan  # also for rows that are not asked: neighbours read them
         confidence2[here] = 0.0
 
     workers.over(block_rows, look)

@@ -131,7 +131,7 @@ def _fill(
                     contrast.frames[off] * frames, low, high, score[phase],
                 )  # fmt: skip
             none = _write_own(score, low, high, side, contrast.units_per_nat, own)
-            # `own` begins with the first stored pixel: so much before that is label 0.
+            # `own` begins with the first stored pixel, `skipped` pixels after the farthest one that holds a label.
             skipped = far - (high - 1) if side > 0 else low - far
             shift = (here[LABEL] + here[ODD]) % PHASES - PHASES * skipped - here[LABEL]
             first, end = max(int(here[LABEL]), -shift), min(int(here[LABEL_END]), PHASES * (high - low) - shift)

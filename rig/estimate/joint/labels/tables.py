@@ -135,7 +135,7 @@ def fill_tables(
                 out.span[i, 0], out.span[i, 1] = span
                 out.used[i] = -(-label_end // (PHASES * LANES))
                 for p in range(span[0], span[1]):
-                    # Around its middle the halo is level; `halo_tables` tell what it is elsewhere.
+                    # Around its middle the halo is level; `fill_halo` tables how it differs elsewhere.
                     glow[p] = state.glow[row.cell[to_t - p]]
                     near_glow[p] = beside[row.cell[to_t - p]]
                     for near in (_NEAR, _FAR):
@@ -254,7 +254,7 @@ def _fill_taps(
                         base = flux[_FAR, at] + nearer * (flux[_NEAR, at] - flux[_FAR, at])
                     extra = light[m] * scale[to_t - p] * shares[off + VARIANTS, d + reach] + halo
                     cell = cell_of(min(max(base + extra, FLUX_MIN), FLUX_MAX))
-                    # `halo_tables` tell the light around of a pixel that holds the line too: as if it had none of it.
+                    # What tables of the halo already count for a pixel that holds the line, as if it held none of it.
                     around = light[m] * scale[to_t - p] * near_glow[p] - middle_light * scale[to_t - at] * glow[at]
                     told = cell_of(min(max(flux[own, at] + around, FLUX_MIN), FLUX_MAX))
                     weight = _weight((table[0, cell] - table[0, told]) * per_nat)

@@ -90,7 +90,7 @@ def measure_light(
         lines[_PX, c], lines[_PY, c], lines[_PZ, c] = sweep.plane[c, 0], sweep.plane[c, 1], sweep.plane[c, 2]
         lines[_GAIN, c] = state.column_gain[c]
     for y in range(first_row, last_row):
-        # The next row's, which lies on other pages: not foreseen.
+        # The next row's, which the processor does not foresee, since it lies on other pages.
         for line in range(4 * pixels * (y + 1), 4 * pixels * (y + 2), CACHE_LINE):
             prefetch(at_u + line)
             prefetch(at_v + line)
@@ -174,7 +174,7 @@ def _measure(at: int, width: int, taps: int, ambient: int, bins: int) -> None:
     before = _flux(own + paths * (load_float32(near, 0) + part * load_float32(near, 4 * LANES)), others)
     behind = _flux(own + paths * (load_float32(near, LANES) + part * load_float32(near, 5 * LANES)), others)
     halo = load_float32(near, 3 * LANES) + part * load_float32(near, 7 * LANES)
-    # A pixel that the picture does not have, or that is blind, counts as one of just the expected light.
+    # Missing and blind pixels add nothing, as if they had just the expected light.
     light = light - logarithm(larger_float(dark, _LEAST)) - shown * ((before + behind) * half - own)
     # What the halo adds to the light of the line grows with it.
     light = light / (one + halo * np.float32(2 * LIGHT_PX + 1))

@@ -32,8 +32,8 @@ ENOUGH = 1 / 0.06**2
 """Information, 1/px^2, from which on a place is known well enough: over more neighbours surfaces bend."""
 PAIRS = ((4, 0.576), (6, 0.280))
 """Of each round of joining: rows and columns to the neighbours of a pair, and the share of their information that
-counts. 5 x 5 neighbours count as 25 stripes, joined with eight such as 140, and with eight of those as 454, since these
-overlap."""
+counts. 5 x 5 neighbours count as 25 stripes, joined with eight like them as 140, and these with eight like them as 454,
+since they overlap."""
 MOST_MOVED_PX = 0.9
 """Farthest that a stripe moves from its label, all rounds together. Labels end a pixel beyond what is searched, so
 answers end within 2 px of it. Only in pictures of full pixels would stripes move farther."""

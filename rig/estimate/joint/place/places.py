@@ -130,7 +130,7 @@ def add_moments(
 
 
 TAPS: Final = 2 * REACH_PX + 1
-"""Pixels around a stripe that are looked at; EIGHT are fetched."""
+"""Number of pixels around a stripe that are used; EIGHT are fetched."""
 MOST_FLUX: Final = np.float32(20.0)
 """Largest flux: it leaves a pixel dark once in 5 x 10^8 exposures. Missing pixels get it as ambient light."""
 _TILE: Final = 16
@@ -155,7 +155,7 @@ def fetch_counts(counts: Counts, x0: Int32, x_px: Float32, first_row: int, last_
                     first = nearest_pixel(x_px[y, c]) - REACH_PX - int(x0[c])
                     if 0 <= first <= window - EIGHT:
                         at = source + ((c * rows + y) * window + first) * size
-                        # Counts of one column after the other are not what a processor foresees.
+                        # The processor does not foresee the next column's counts.
                         prefetch(at + column)
                         for i in range(size):
                             write_int64(to + (y * columns + c) * EIGHT * size, i, read_int64(at, i))
