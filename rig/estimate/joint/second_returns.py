@@ -190,7 +190,7 @@ def measure_seconds(
 
 @numba.njit(cache=True, nogil=True, error_model="numpy")
 def move_seconds(reach: int, first_row: int, last_row: int, seconds: Seconds) -> None:
-    """Fill moved, the distance of the middle of the light around each candidate, pooled over neighbours."""
+    """Fill moved, the distance of the middle of the light around each candidate, pooled; at most `reach` px from it."""
     moved = seconds.moved
     distance = with_margin(seconds.distance, first_row, last_row)
     moment, light = with_margin(seconds.moment, first_row, last_row), with_margin(seconds.light, first_row, last_row)

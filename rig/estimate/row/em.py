@@ -54,9 +54,9 @@ AMPLITUDE_SPAN = 3.4
 EVEN_SHARE = 0.25
 """Part of the prior over positions that stays even, whatever the map before looked like."""
 PRIOR_PHOTONS = 100.0
-"""Photons as whose measurement the fitted exponential counts against each bin's own."""
+"""The fitted exponential counts, against each bin's own counts, as if so many photons had measured it."""
 START_EXTINCTIONS_PER_M = (0.0, 0.1, 0.4, 1.5)
-"""Extinctions that a first sweep is begun with: clear air to dense fog."""
+"""Extinctions with which a first sweep begins: clear air to dense fog."""
 
 
 class Expectation(NamedTuple):

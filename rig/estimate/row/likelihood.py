@@ -82,7 +82,8 @@ def add_evidence(
 ) -> None:
     """Add to score the log-likelihood of n ones in k frames at flux base + light * scale, less `own`.
 
-    Fluxes must be at least FLUX_MIN. Written for the vectoriser: no branch, unsigned table index, slices from zero.
+    Arrays are equally long, fluxes at least FLUX_MIN. Written for the vectoriser: no branch, unsigned table index,
+    slices from zero.
     """
     gain, loss = table[0], table[1]
     for t in range(score.shape[0]):

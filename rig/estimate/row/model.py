@@ -130,7 +130,7 @@ class HazeFit:
 
 
 def fit_haze(path_m: Float64, flux: Float64, variance: Float64) -> HazeFit | None:
-    """Weighted fit of an exponential to haze flux (bins,) with its variance (bins,); None if there is no haze.
+    """Weighted fit of an exponential to haze flux (bins,) with its variance (bins,); None with hardly any haze.
 
     Gauss-Newton on amplitude and extinction. The extinction is kept between 0 and EXTINCTION_MAX_PER_M, and below
     OPTICAL_DEPTH_MAX at the nearest haze.
