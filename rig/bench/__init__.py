@@ -1,6 +1,6 @@
 """`rig bench`: measures in one run how fast this machine counts and estimates, and how fast it reads its memory.
 
-`speed` measures the rows, `latency` the time from a column's last frame to its estimate, `soak` a long stream through
-the acquisition itself. Figures are medians over rounds in which everything is measured in turn, so that a machine that
-slows down or has other work slows all of them alike. Ratios are of figures from one run.
+`speed` measures the rows of its table, `latency` the time from a column's last frame to its estimate, `soak` a long
+stream through the acquisition itself. Speeds are medians over rounds. Each round measures every row in turn, so a
+machine that slows down or has other work slows all of them alike. Ratios are of figures from one run.
 """

@@ -2,8 +2,8 @@
 
 Haze falls off with distance and drops to a tenth at a stripe. Place and brightness of the stripe are drawn anew for
 every row and every `PLACE_FRAMES` frames. The light is that of the working point `report` (docs/results/README.md).
-Rows that make complete maps use a single surface, as frames of a sweep and as a pair of pictures of the same
-disparities.
+Stages that make complete maps use a single surface instead, as frames of a sweep and as a pair of pictures with the
+same disparities.
 """
 
 from dataclasses import dataclass
@@ -18,7 +18,7 @@ from rig.geometry.windows import SweepGeometry
 from rig.threads import RowWorkers
 
 BITS_OF_CHANCE = 16
-"""A pixel detects where a random number of so many bits is below its threshold."""
+"""A pixel fires if a random number of this many bits is below its threshold."""
 
 
 @numba.njit(cache=True, nogil=True)
@@ -32,7 +32,7 @@ def read_all(words: NDArray[np.uint64]) -> int:
 
 @numba.njit(cache=True, nogil=True)
 def draw_frames(threshold: NDArray[np.uint32], seed: int, frames: NDArray[np.uint8]) -> None:
-    """Draw frames (n, rows, window / 8) of pixels that detect if a 16-bit number is below threshold (rows, window).
+    """Fill frames (n, rows, window / 8) with pixels that fire if a 16-bit number is below threshold (rows, window).
 
     The numbers are SplitMix64's (Steele, Lea, Flood, "Fast splittable pseudorandom number generators", OOPSLA 2014).
     """
@@ -65,7 +65,8 @@ def count_columns(
 ) -> None:
     """Count whole columns of frames, one after the other, into bit planes that the next column reuses.
 
-    words: (all words,) of frames of `rows` rows; planes: see `new_planes`. Expanding counts is part of an estimate.
+    words: (all words,) of frames of `rows` rows; planes: see `new_planes`. Of each frame the chunks of rows
+    first_chunk..last_chunk-1 are counted. Planes are not turned into counts, which is part of an estimate.
     """
     frame = rows * row_words
     frames = words.shape[0] // frame
@@ -82,18 +83,18 @@ ROWS, WIDTH = 512, 512
 COLUMNS = 500
 """Columns of a sweep: what an estimate knows of each column is then as much memory as in a scan."""
 PLACE_FRAMES = 100
-"""Frames for which a stripe stays; every number of exposures that estimates are measured at divides it."""
+"""Frames of a place, for which stripes stay; every number of exposures that estimates are measured at divides it."""
 BLOCK_PLACES = 5
 BLOCK_FRAMES = BLOCK_PLACES * PLACE_FRAMES
-"""Frames handed over at a time, as many as in a scan at 100 kHz (`rig.plan.compile.BLOCK_S`)."""
+"""Frames of a block, as many as in a scan at 100 kHz (`rig.plan.compile.BLOCK_S`)."""
 FRAMES_BYTES = 192 * 2**20
-"""Frames of each window size: several times a big cache."""
+"""Memory of the frames of each window size: several times a big cache."""
 DISTINCT = 64
-"""Places of the stripe drawn anew; after so many the same bits follow in other memory."""
+"""Places that are drawn; after so many the same bits are repeated in other memory."""
 EDGE_PX = 8
-"""Stripes keep so far from the ends of the window."""
+"""Least distance of a stripe from the ends of the window."""
 HAZE, HAZE_PER_M, BEHIND, AMBIENT = 0.14, 0.1, 0.1, 0.005
-"""Photons per exposure and pixel at 1.5 m, their decay, the share behind the stripe, and light that is always there."""
+"""Haze in photons per exposure and pixel at 1.5 m, its decay, its share behind the stripe, and ambient light."""
 LINE_SD_PX = 0.6
 STRIPE = (0.2, 1.5)
 """Photons per exposure, summed across the stripe: dimmest and brightest."""
@@ -105,8 +106,8 @@ NEAR_W, FAR_W = 1.0, 0.125
 class BenchFrames:
     """Frames of one window size.
 
-    bits: uint8 (n, rows, row bytes), n a multiple of BLOCK_FRAMES. truth_px: float32 (places, rows), stripe position
-    from frame PLACE_FRAMES i on. window: searched pixels, which begin at geometry.x0; rows of frames may be longer.
+    bits: uint8 (n, rows, row bytes), n a multiple of BLOCK_FRAMES. truth_px: float32 (places, rows), where place i has
+    its stripes. window: searched pixels, which begin at geometry.x0; rows of frames may be longer.
     """
 
     window: int
@@ -126,7 +127,7 @@ class BenchFrames:
 
 
 def window_frames(window: int, workers: RowWorkers, n_bytes: int = FRAMES_BYTES) -> BenchFrames:
-    """Frames that hold only the window."""
+    """Frames that hold only the window, as many blocks as fit into `n_bytes`, but at least one."""
     places = BLOCK_PLACES * max(1, n_bytes // (BLOCK_FRAMES * ROWS * window // 8))
     bits = np.empty((places * PLACE_FRAMES, ROWS, window // 8), np.uint8)
     distinct = min(places, DISTINCT)
@@ -149,7 +150,7 @@ def window_frames(window: int, workers: RowWorkers, n_bytes: int = FRAMES_BYTES)
 
 
 def full_frames(narrow: BenchFrames, n_bytes: int = FRAMES_BYTES) -> BenchFrames:
-    """Whole frames of the sensor. The window lies in them as its geometry says; the other pixels are similar."""
+    """Whole frames of the sensor. The window lies where its geometry says; the other pixels are copies of it."""
     copies = WIDTH // narrow.window
     places = BLOCK_PLACES * max(1, n_bytes // (BLOCK_FRAMES * narrow.frame_bytes * copies))
     bits = np.tile(narrow.bits[: places * PLACE_FRAMES], (1, 1, copies))
@@ -157,7 +158,7 @@ def full_frames(narrow: BenchFrames, n_bytes: int = FRAMES_BYTES) -> BenchFrames
 
 
 def bench_geometry(window: int, rows: int = ROWS, columns: int = COLUMNS) -> SweepGeometry:
-    """Columns whose planes all cross the depth range over exactly `window` pixels, beginning at a multiple of it."""
+    """Geometry of columns that all cross the depth range over the same `window` pixels, from a multiple of it on."""
     x0 = min(window, WIDTH - window)
     u = np.broadcast_to(np.linspace(-0.5, 0.5, WIDTH, dtype=np.float32), (rows, WIDTH)).copy()
     tangents_per_px = 1.0 / (WIDTH - 1)
@@ -172,7 +173,10 @@ def bench_geometry(window: int, rows: int = ROWS, columns: int = COLUMNS) -> Swe
 
 
 def thresholds(window: int, place: NDArray[np.float32], photons: NDArray[np.float32]) -> NDArray[np.uint32]:
-    """Detection probability of each pixel, (rows, window), in units of 2 ** -BITS_OF_CHANCE."""
+    """Detection probability of each pixel, (rows, window), in units of 2 ** -BITS_OF_CHANCE.
+
+    place: (rows,), of the stripe, in pixels of the window; photons: (rows,), of the stripe per exposure.
+    """
     x = np.arange(window)
     depth_m = 1.0 / (NEAR_W - (NEAR_W - FAR_W) / (window - 1) * x)
     haze = HAZE * np.exp(-HAZE_PER_M * (depth_m - 1.5))
@@ -183,15 +187,17 @@ def thresholds(window: int, place: NDArray[np.float32], photons: NDArray[np.floa
 
 
 WINDOW = 64
-"""Pixels that are searched, and disparities of the pictures."""
+"""Pixels of the surface that are searched, and disparities of its pictures."""
 PATCH = 16
-"""Rows and columns of one brightness."""
+"""Rows and columns of a patch of one brightness."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class BenchSurface:
-    """place_px: float32 (columns, rows), the stripe's place in its window; photons: of the stripe, of the same
-    shape."""
+    """A surface that a whole sweep sees.
+
+    place_px: float32 (columns, rows), the stripe's place in its window; photons: of the stripe, of the same shape.
+    """
 
     place_px: NDArray[np.float32]
     photons: NDArray[np.float32]
@@ -207,9 +213,7 @@ class BenchSurface:
         return SweepLayout(columns, rows, WIDTH, self.geometry.x0, WINDOW, exposures, WINDOW)
 
     def frames(self, exposures: int, workers: RowWorkers) -> NDArray[np.uint8]:
-        """Packed frames (columns x exposures, rows, row bytes), column after column, with the light of
-        `rig.bench.frames`.
-        """
+        """Packed frames (columns x exposures, rows, row bytes), column after column, with the light of `thresholds`."""
         columns, rows = self.place_px.shape
         bits = np.empty((columns * exposures, rows, WINDOW // 8), np.uint8)
 
@@ -222,9 +226,7 @@ class BenchSurface:
         return bits
 
     def pictures(self) -> tuple[NDArray[np.uint8], NDArray[np.uint8]]:
-        """Left and right picture (rows, columns) of a texture. The point at x in the left one is at x - place in the
-        right one.
-        """
+        """Left and right picture (rows, columns) of a texture: x in the left is x - place in the right."""
         import cv2
 
         disparity = np.ascontiguousarray(self.place_px.T)
@@ -235,7 +237,7 @@ class BenchSurface:
 
 
 def bench_surface(rows: int = ROWS, columns: int = COLUMNS) -> BenchSurface:
-    """A wavy slope with a wall in front of its middle."""
+    """A surface that is a wavy slope with a wall in front of its middle."""
     c, y = np.linspace(0.0, 1.0, columns)[:, None], np.linspace(0.0, 1.0, rows)
     place = 0.55 + 0.3 * c + 0.1 * np.sin(4 * np.pi * y)
     wall = (np.abs(c - 0.5) < 0.2) & (np.abs(y - 0.5) < 0.3)
@@ -246,7 +248,7 @@ def bench_surface(rows: int = ROWS, columns: int = COLUMNS) -> BenchSurface:
 
 
 def count_surface(surface: BenchSurface, bits: NDArray[np.uint8], exposures: int, workers: RowWorkers) -> CountVolume:
-    """The counts of all frames."""
+    """The counts of all frames `bits` of a surface, column after column."""
     counter = SweepCounter(surface.layout(exposures), workers)
     counter.add(bits, *sweep_frames(surface.geometry, exposures))
     return counter.finish()

@@ -2,10 +2,10 @@
 
 A source thread copies blocks of 5 ms into the ring and publishes each when its last frame would have been exposed, at
 100 kHz. Another thread takes them from the ring and estimates with the given workers; at the end of a sweep it takes
-the result and clears the counter for the next, as a scan does. A frame's time is its block's minus the frames after it.
-So the latency includes the wait for the block to fill. For a block's last column it also includes the wait for the next
-block, whose first frame shows that the column is complete. Binding frames to columns and making the map are not
-included.
+the result and clears the counter for the next, as a scan does. A frame's time is that of its block, less the duration
+of the frames after it. So the latency includes the wait for the block to fill. For a block's last column it also
+includes the wait for the next block, whose first frame shows that the column is complete. Binding frames to columns and
+making the map are not included.
 """
 
 import threading
@@ -61,14 +61,17 @@ def header_of(seq: int, frames: int, width: int) -> BlockHeader:
 FRAME_S = float(PERIOD_TICKS / TICK_HZ)
 SECONDS = 3.0
 SLOTS = 16
-"""A ring of 80 ms, so that nothing is dropped where the host pauses; a pause is seen in the figures."""
+"""Blocks of the ring: 80 ms, so that nothing is dropped if the host pauses; a pause is seen in the figures."""
 SPIN_S = 2e-4
-"""Before a block is due the source stops sleeping, which may take longer than asked for."""
+"""Seconds before a block is due from which the source does not sleep: a sleep may take longer than asked for."""
 
 
 @dataclass(frozen=True, slots=True)
 class Latency:
-    """Microseconds from a column's last frame to its estimate. late_max_us: largest lateness of a block."""
+    """Microseconds from a column's last frame to its estimate, over `columns` columns, on `threads` threads.
+
+    p999: the 99.9 % quantile. late_max_us: largest lateness of a block at the source.
+    """
 
     median: float
     p999: float
@@ -81,7 +84,7 @@ class Latency:
     def kept_up(self) -> bool:
         """Whether the estimate kept up with the stream, so that the figures are not those of a queue.
 
-        A median of more than ten blocks is taken as the sign of a growing queue.
+        It did not if a block was late by a whole ring, or if the median is more than the time of ten blocks.
         """
         return (
             self.late_max_us < 1e6 * SLOTS * BLOCK_FRAMES * FRAME_S and self.median < 1e6 * 10 * BLOCK_FRAMES * FRAME_S
@@ -91,7 +94,7 @@ class Latency:
 def measure_latency(
     frames: BenchFrames, exposures: int, workers: RowWorkers, likelihood: Likelihood, seconds: float = SECONDS
 ) -> Latency:
-    """Latency for a stream of `seconds` at 100 kHz."""
+    """Latency for a stream of `seconds` at 100 kHz, estimated with what `likelihood` has learned."""
     n_blocks = max(2, round(seconds / (BLOCK_FRAMES * FRAME_S)))
     ring = BlockRing(SLOTS, BLOCK_FRAMES * frames.frame_bytes)
     reader = ring.reader("counting")
@@ -125,7 +128,7 @@ def measure_latency(
 
 
 def _play(frames: BenchFrames, ring: BlockRing, published: NDArray[np.float64], late: NDArray[np.float64]) -> None:
-    """Publish blocks as time passes, the bench's frames over and over."""
+    """Publish the bench's frames over and over, each block when it is due; fill published and late, both in s."""
     places = len(frames.bits) // BLOCK_FRAMES
     shape = (BLOCK_FRAMES, *frames.bits.shape[1:])
     records = np.zeros(BLOCK_FRAMES, FRAME_RECORD)

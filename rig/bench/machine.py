@@ -7,7 +7,7 @@ from typing import Any
 
 _CPU_INFO = Path("/proc/cpuinfo")
 _CACHES = Path("/sys/devices/system/cpu/cpu0/cache")
-"""Linux says here what others do not say at all: caches are then left out."""
+"""Files in which Linux describes itself; other systems have none, and caches are left out."""
 
 
 def machine() -> dict[str, Any]:

@@ -43,14 +43,14 @@ from rig.scan.pipeline import Overload, require_policy
 from rig.scan.scan import make_reconstructor
 
 LEAD_FRAMES = 200
-"""Most frames before the first scan marker: the end of a sweep, as of a scanner that runs already."""
+"""Most frames before the first scan marker: the end of a sweep, as if the scanner already ran."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Loop:
     """Frames of whole sweeps, from the frame with one scan marker to just before the frame with another.
 
-    records: (n,) of `FRAME_RECORD`; bits: uint8 (n, rows, row bytes); sweeps: their number.
+    records: (n,) of `FRAME_RECORD`; bits: uint8 (n, rows, row bytes); sweeps: their number; width: px of a frame.
     """
 
     records: NDArray[np.void]
@@ -60,7 +60,7 @@ class Loop:
 
     @classmethod
     def of(cls, blocks: Iterable[FrameBlock], sweeps: int) -> Self:
-        """The first `sweeps` sweeps of a stream without gaps."""
+        """The first `sweeps` whole sweeps of a stream without gaps."""
         kept = list(blocks)
         records = np.concatenate([block.records for block in kept])
         scans = np.flatnonzero(records["marks"] & int(Mark.SCAN))
@@ -82,7 +82,7 @@ class LoopedSpad(SpadArray):
         self._run_id = 0
         self._lead = min(LEAD_FRAMES, len(loop.records) // (2 * loop.sweeps))
         self.late_max_s = 0.0
-        """Delay of the latest block against its own time: the source, too, needs its share of the processor."""
+        """Largest lateness of a block, in s: the source, too, needs its share of the processor."""
 
     @property
     def info(self) -> SpadInfo:
@@ -157,7 +157,7 @@ class LoopedSpad(SpadArray):
             cycle, at = divmod(first + done + length - self._lead, length)
             size = min(n - done, length - at)
             records[done : done + size] = loop.records[at : at + size]
-            # Before the first marker, cycle 0, the sweeps that the loop counts from 1 on are over or have not begun.
+            # The loop counts its sweeps from 1 on; before the first marker, in cycle 0, its last one becomes number 0.
             before = (cycle - 1) * loop.sweeps
             if not done:  # the header's count goes on where the 16 bits of records begin again
                 sweep = int(loop.records["sweep"][at]) + before
@@ -186,11 +186,11 @@ CONFIG = "simulated"
 EXIT_DEVICE = 3
 """Exit code of a scan that the overload policy ended."""
 LOOP_S = 0.2
-"""Least time that the recorded sweeps last: many times what a cache holds."""
+"""Least time in s that the recorded sweeps last: many times what a cache holds."""
 DEPTH_RANGE = ["4 m", "15 m"]
 """Range whose stripes lie within 128 pixels of a row, the window for which speeds are stated."""
 LINK_MARGIN = 1.02
-"""A link that carries windows of the line, but no whole frames, carries so many times what they need."""
+"""Rate of the link over what windows that move with the line need: whole frames do not fit through it."""
 SETTLED = 0.1
 """Share of the run after which memory is to grow no more."""
 _STATM = Path("/proc/self/statm")
@@ -218,9 +218,8 @@ class SoakReport:
 
     seconds: of stream played. maps: number made, of maps_planned. times_real_time: time span of the received frames
     over the time spent on binding, counting and making maps of them, without the first map. resident_*: memory of the
-    process after a tenth of the maps and at the end; None if the system does not report it. source_late_max_s: largest
-    lateness of a block.
-    ended_by: what ended the run early.
+    process after a tenth of the maps and at the end, and its growth as a share; None if the system does not report it.
+    source_late_max_s: largest lateness of a block. ended_by: the error that ended the run early; None if none did.
     """
 
     seconds: float
@@ -289,7 +288,7 @@ def soak(
 
 @contextmanager
 def _quiet_sweeps() -> Iterator[None]:
-    """Without a line for every sweep that lost frames: there may be thousands, and the report counts them."""
+    """Log no line for a sweep that lost frames: there may be thousands, and the report counts them."""
     log = logging.getLogger("rig.count.sweeps")
     before = log.level
     log.setLevel(logging.ERROR)
@@ -301,7 +300,7 @@ def _quiet_sweeps() -> Iterator[None]:
 
 @contextmanager
 def _looped_rig(policy: Overload, window: bool) -> Iterator[tuple[OpenRig, LoopedSpad]]:
-    """The simulated rig, and in its SPAD's place one that plays what that recorded."""
+    """The simulated rig with a looped SPAD, which plays what the rig's own SPAD recorded; gives that SPAD too."""
     # Clocks that agree to the last bit: the loop then closes without a jump.
     settings: dict[str, object] = {"scanner.clock_error": "0 ppm", "scan.depth_range": DEPTH_RANGE}
     if window:
@@ -385,7 +384,7 @@ def _played(
 
 
 def _resident_bytes() -> int:
-    """Resident memory of this process; 0 where the system does not say it so."""
+    """Resident memory of this process; 0 if the system does not report it."""
     try:
         pages = int(_STATM.read_text().split()[1])
     except (OSError, ValueError, IndexError):

@@ -42,17 +42,17 @@ from rig.threads import RowWorkers
 REAL_TIME_HZ = 100_000
 """Frames a second of the sensor."""
 READ_EVERY = 12
-"""Rows from one reading of the memory to the next."""
+"""Rows measured from one reading of the memory to the next."""
 
 WINDOWS = (64, 128, 256, 512)
 EXPOSURES = (1, 5, 10, 20, 50)
 COUNT_EXPOSURES = (1, 3, 5, 10, 15, 20, 50)
-"""Counting is claimed for 3 to 15 and beyond."""
+"""Exposures at which counting alone is measured: its speed is claimed for 3 to 15 and beyond."""
 WINDOW = 128
-"""Window of the rows that are not measured at every one."""
+"""Window, in px, of the rows that are not measured at every one."""
 FEW_EXPOSURES = (1, 10)
 LEARN_EXPOSURES = 10
-"""Exposures of the sweep that is learned from, once a window: the light does not depend on them."""
+"""Exposures of the sweep that each window learns from: an exposure's light is the same for all numbers of them."""
 READ_BYTES = 256 * 2**20
 """Memory that is read for its bandwidth: far more than any cache holds."""
 
@@ -64,7 +64,7 @@ Workers = Mapping[int, RowWorkers]
 class Extent:
     """Amount of work that is measured.
 
-    moment_s, count_moment_s: time for each row in each of the `rounds`; the latter is for the fast rows `count`.
+    moment_s, count_moment_s: time of each row in each of the `rounds`, the latter for the rows `count`, which are fast.
     latency_s: length of the stream for the latency. frames_bytes, read_bytes: memory of the frames of each window, and
     for the plain read. map_rows, map_columns: size of the complete maps.
     """
@@ -82,13 +82,13 @@ class Extent:
 
     @property
     def usual_window(self) -> int:
-        """Window of the rows that are measured at only one window."""
+        """Window of the rows that are measured at only one: WINDOW, or the first if that is not measured."""
         return WINDOW if WINDOW in self.windows else self.windows[0]
 
 
 @dataclass(frozen=True, slots=True)
 class Case:
-    """A row to be measured. frame_bytes: bytes read from memory per frame; None if that has no meaning."""
+    """A row that is to be measured. frame_bytes: bytes read from memory per frame; None if that has no meaning."""
 
     stage: str
     window: int
@@ -100,10 +100,11 @@ class Case:
 
 @dataclass(frozen=True, slots=True)
 class SpeedRow:
-    """One figure. exposures: None if columns play no part. A speed or quotient is None if it has no meaning.
+    """A row of the table. exposures: None if columns play no part. A speed or quotient is None if it has no meaning.
 
-    ms_per_map: of stages that make complete maps. times_sgbm: for `joint`, the time of a map over that of a StereoSGBM
-    map on as many threads, measured alternately.
+    of_memory_bandwidth: bytes of frames a second over those of the plain read. times_numpy: speed over that of the row
+    `numpy`. ms_per_map: of stages that make complete maps. times_sgbm: for `joint`, the time of a map over that of a
+    StereoSGBM map on as many threads, measured alternately. The error fields are those of `StripeError`.
     """
 
     stage: str
@@ -136,7 +137,7 @@ class WorkingPoint:
 
     @property
     def keeps_up(self) -> bool:
-        """Whether no frame has to wait for long."""
+        """Whether as many maps are possible as are needed."""
         return self.maps_per_s >= self.needed_per_s
 
     def __str__(self) -> str:
@@ -160,7 +161,7 @@ class SpeedReport:
 
     @property
     def working_points(self) -> tuple[WorkingPoint, ...]:
-        """The working point of each estimator at each number of exposures of whole sweeps, on all threads."""
+        """The working point of each row that does whole sweeps on all threads."""
         most = max(row.threads for row in self.rows)
         return tuple(
             WorkingPoint(
@@ -181,8 +182,9 @@ class SpeedReport:
 def measure_speed(
     threads: int | None = None, extent: Extent | None = None, progress: Progress | None = None
 ) -> SpeedReport:
-    """Measure everything. threads: the largest number, by default one for each core. progress: called with rows done
-    and in all.
+    """Measure all rows and the latency.
+
+    threads: the largest number, by default one for each core. progress: called with the rows done and in all.
     """
     begun = time.perf_counter()
     extent = extent or Extent()

@@ -1,7 +1,7 @@
-"""The stages that are measured. Each works on frames for a short time and returns how many it did in which time.
+"""The stages that are measured. Each works on frames for a short time and returns their number and the time it took.
 
-docs/results/speed.md explains each of them. Work that is done once a sweep is not timed, except in `whole_sweeps`. On a
-machine with other work, quotients of figures measured one after the other are meaningless, so `joint` and StereoSGBM
+docs/results/speed.md explains each of them. Work that is done once a sweep is not timed, except with `whole_sweeps`. On
+a machine with other work, quotients of figures measured one after the other are meaningless, so `joint` and StereoSGBM
 make maps alternately. Nothing is learned meanwhile, and each begins with a map that is not timed.
 """
 
@@ -41,12 +41,12 @@ Bits = NDArray[np.uint8]
 COUNT_PIECE = 1000
 """Frames that are counted at a time: handing work to threads then takes no share of it."""
 NUMPY_PIECE = 20
-"""Frames that numpy unpacks at a time, or one column of more: a naive program keeps its memory small too."""
+"""Frames that numpy unpacks at a time, or a column if that has more: a naive program keeps its memory small too."""
 
 
 @dataclass(frozen=True, slots=True)
 class StripeError:
-    """Difference of estimates from the truth, over rows x columns; missing: share without an estimate."""
+    """Mean and median |estimate - truth| of the rows and columns with an estimate; missing: share of those without."""
 
     mean_abs_px: float
     median_abs_px: float
@@ -68,9 +68,9 @@ class Measured:
 
 
 Stage = Callable[[float], Measured]
-"""Works for about so many seconds."""
+"""A function that works for about so many seconds."""
 Blocks = Callable[[BenchFrames, "Walk"], Iterator[tuple[int, Bits]]]
-"""Gives blocks of frames and the first place of each, for ever."""
+"""A function that gives blocks of frames, each after its first place, for ever."""
 
 
 class Walk:
@@ -81,7 +81,7 @@ class Walk:
         self._at = 0
 
     def next(self, places: int = 1) -> int:
-        """The first of the next places, which follow one another, each of PLACE_FRAMES frames."""
+        """The first of the next `places` places, which lie one after another, each of PLACE_FRAMES frames."""
         at = self._at if self._at + places <= self._places else 0
         self._at = (at + places) % self._places
         return at
@@ -110,7 +110,7 @@ def count_stage(frames: BenchFrames, walk: Walk, exposures: int, workers: RowWor
 
 
 def numpy_stage(frames: BenchFrames, walk: Walk, exposures: int) -> Stage:
-    """The stage that counts naively with numpy on one thread."""
+    """The stage that counts naively with numpy on one thread, and takes the brightest pixel of each row."""
     columns = max(NUMPY_PIECE // exposures, 1)
     n = columns * exposures
     rows = frames.bits.shape[1]
@@ -134,14 +134,14 @@ def numpy_stage(frames: BenchFrames, walk: Walk, exposures: int) -> Stage:
 
 
 def from_memory(frames: BenchFrames, walk: Walk) -> Iterator[tuple[int, Bits]]:
-    """Blocks as they lie in memory."""
+    """Blocks as they lie in memory, each after its first place."""
     while True:
         place = walk.next(BLOCK_PLACES)
         yield place, frames.bits[place * PLACE_FRAMES : place * PLACE_FRAMES + BLOCK_FRAMES]
 
 
 def from_file(path: Path, stride: int) -> Blocks:
-    """A source of the same blocks that reads them from a recording and checks header checksums."""
+    """A source of the same blocks that reads them from a recording and checks headers; stride: bytes of each."""
 
     def blocks(frames: BenchFrames, walk: Walk) -> Iterator[tuple[int, Bits]]:
         # Copy-on-write: kernels are compiled for memory that may be written.
@@ -167,15 +167,16 @@ def search_stage(
     *,
     whole_sweeps: bool = False,
 ) -> Stage:
-    """The stage that counts and runs `likelihood`. whole_sweeps: whether to time also the work that is done once a
-    sweep.
+    """The stage that counts and runs `likelihood`.
+
+    whole_sweeps: whether it does whole sweeps and also times the work that is done once a sweep.
     """
     bins, column, x0 = sweep_frames(frames.geometry, exposures)
     layout = frames.layout(exposures)
 
     def measure(seconds: float) -> Measured:
         judge = likelihood.judge(frames.geometry, exposures, dark=True)
-        # One for all sweeps, as in a scan; kept beyond this moment, the tables of all stages' judges would be too much.
+        # One for all sweeps, as in a scan, but not for the next call: the tables of all stages would be too much.
         counter = ColumnJudge(layout, frames.geometry, judge, workers)
         blocks = source(frames, walk)
         done, spent = 0, 0.0
@@ -207,7 +208,7 @@ def search_stage(
 
 
 def stripe_error(difference: NDArray[np.float32]) -> StripeError:
-    """The error of stripes from their differences to the truth, NaN where there is no estimate."""
+    """The error of stripes, from their differences to the truth in px, NaN where there is no estimate."""
     found = np.abs(difference[np.isfinite(difference)])
     if not len(found):
         return StripeError(float("nan"), float("nan"), 1.0)
@@ -215,15 +216,15 @@ def stripe_error(difference: NDArray[np.float32]) -> StripeError:
 
 
 SGBM_BLOCK_PX = 3
-"""OpenCV's own default; its penalties follow from it as its documentation advises."""
+"""OpenCV's default for the side of the blocks it matches; penalties follow from it as its documentation advises."""
 PAIRS = 5
-"""Maps of `joint` and of StereoSGBM, made by turns, that a quotient is the median of, each round."""
+"""Least number of times that `joint` and StereoSGBM make a map by turns, for the median of the quotients."""
 SGBM_STEPS = 16
 """Steps of OpenCV's disparities to the pixel."""
 
 
 def learn_joint(surface: BenchSurface, exposures: int, threads: int) -> RowModel:
-    """State that `joint` learns from a first sweep of the surface, as in a scan."""
+    """The state that `joint` has learned after a first sweep of the surface, as in a scan."""
     joint = Joint(threads)
     with RowWorkers(threads) as workers:
         volume = count_surface(surface, surface.frames(exposures, workers), exposures, workers)
@@ -233,11 +234,11 @@ def learn_joint(surface: BenchSurface, exposures: int, threads: int) -> RowModel
 
 
 def joint_stage(surface: BenchSurface, volume: CountVolume, threads: int, model: RowModel) -> Stage:
-    """The stage that runs `joint` on counts."""
+    """The stage that runs `joint` on counts, by turns with StereoSGBM."""
     pictures = surface.pictures()
 
     def measure(seconds: float) -> Measured:
-        # Made anew: kept beyond this moment, the memory of all threads' and exposures' would be too much.
+        # Made anew for each call: the memory of all stages together would be too much.
         joint = Joint(threads, model, learns=False)
 
         def make() -> NDArray[np.float32]:
@@ -288,9 +289,7 @@ def sgbm_stage(surface: BenchSurface, threads: int) -> Stage:
 
 @contextmanager
 def matching(pictures: tuple[Bits, Bits], threads: int) -> Iterator[Callable[[], NDArray[np.int16]]]:
-    """StereoSGBM of left and right picture on `threads` threads. Each call makes a map: disparities in 1 / SGBM_STEPS
-    px.
-    """
+    """Give a function that makes a map of both pictures with StereoSGBM: disparities in 1 / SGBM_STEPS px."""
     import cv2
 
     area = SGBM_BLOCK_PX**2
@@ -311,7 +310,7 @@ def _timed(
     error: StripeError,
     beside: Callable[[], object] | None = None,
 ) -> Measured:
-    """Make maps of so many frames each for a moment; beside: what is done by turns with it, PAIRS times at least."""
+    """Make maps of `frames` frames each for `seconds`; beside: what is done by turns with it, PAIRS times at least."""
     spent: list[float] = []
     quotients: list[float] = []
     while sum(spent) < seconds or len(spent) < (1 if beside is None else PAIRS):

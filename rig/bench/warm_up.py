@@ -20,11 +20,11 @@ from rig.scan.monitor import Listeners, ScanProgress
 from rig.scan.scan import make_reconstructor
 
 ENOUGH_FRAMES = 1000
-"""Simulated frames, the first columns of a sweep among them."""
+"""Number of frames that are simulated, the first columns of a sweep among them."""
 
 
 def warm_rig(config: RigConfig) -> float:
-    """Compile everything and return the seconds it took. Real devices are not opened."""
+    """Compile everything that the rig needs, and return the seconds it took. Real devices are not opened."""
     begun = time.perf_counter()
     for done, estimator in enumerate(ESTIMATORS):
         tell_stage("warming up", done, len(ESTIMATORS), "estimators")

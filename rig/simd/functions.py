@@ -34,12 +34,12 @@ from rig.simd.vectors import (
 _MANTISSA_BITS: Final = 23
 _BIAS: Final = 127
 _ROOT_HALF: Final = 0x3F3504F3
-"""Bits of sqrt(1/2): mantissas from there to sqrt(2) have the smallest logarithms."""
+"""Bits of sqrt(1/2) as a float32: mantissas from there to sqrt(2) have the smallest logarithms."""
 _LOG2_E, _LN_2 = 1.0 / math.log(2.0), math.log(2.0)
 _LEAST, _MOST = -87.0, 88.0
-"""Powers of e that a float32 holds."""
+"""Least and largest power of e that a float32 holds."""
 _TO_WHOLE: Final = 1.5 * 2.0**_MANTISSA_BITS
-"""Added and taken off again it leaves the nearest whole number."""
+"""Number that, added and taken off again, leaves the nearest whole number."""
 _ERF: Final = 0.0000430638, 0.0002765672, 0.0001520143, 0.0092705272, 0.0422820123, 0.0705230784
 """Abramowitz and Stegun, Handbook of Mathematical Functions, 7.1.28, the highest power first."""
 
@@ -60,16 +60,16 @@ def _power(builder: Any, a: Any) -> Any:
 
 
 exponents = emitted(FLOAT32(FLOAT32), lambda builder, a: builder.sitofp(_exponents(builder, a), FLOAT32.llvm))
-"""exponents(a): powers of two nearest to the lanes, which must be positive and no smaller than 1.2e-38."""
+"""exponents(a): exponents of the powers of two nearest to the lanes, as float32; lanes must be at least 1.2e-38."""
 mantissas = emitted(FLOAT32(FLOAT32), _mantissas)
-"""mantissas(a): the lanes divided by those powers, sqrt(1/2) to sqrt(2)."""
+"""mantissas(a): the lanes divided by those powers of two, sqrt(1/2) to sqrt(2)."""
 power_of_two = emitted(FLOAT32(FLOAT32), _power)
-"""power_of_two(a): of whole numbers from -126 to 127."""
+"""power_of_two(a): 2 to the power of the lanes, whole numbers from -126 to 127."""
 
 
 @numba.njit(forceinline=True)
 def logarithm(a):  # type: ignore[no-untyped-def]
-    """Natural logarithm of positive lanes, with an error of 2e-7 of its value or of 1, whichever is larger."""
+    """Natural logarithm of positive lanes, with an error of 2e-7 times its size, or 2e-7 if that is below 1."""
     part = mantissas(a)
     ratio = (part - 1.0) / (part + 1.0)
     square = ratio * ratio
@@ -79,7 +79,7 @@ def logarithm(a):  # type: ignore[no-untyped-def]
 
 @numba.njit(forceinline=True)
 def exponential(a):  # type: ignore[no-untyped-def]
-    """e to the power of the lanes, which are limited to -87..88. Relative error: 1e-5 at the ends, 3e-7 around 1."""
+    """e to the power of the lanes, which are limited to -87..88. Relative error: 1e-5 at the ends, 3e-7 near 0."""
     steps = smaller_float(larger_float(a, _LEAST), _MOST) * _LOG2_E
     whole = steps + _TO_WHOLE - _TO_WHOLE
     rest = (steps - whole) * _LN_2
@@ -91,7 +91,7 @@ def exponential(a):  # type: ignore[no-untyped-def]
 
 @numba.njit(forceinline=True)
 def error_function(a):  # type: ignore[no-untyped-def]
-    """erf of lanes that are not negative, with an error of 1e-6."""
+    """Error function of lanes that are not negative, with an error of at most 1e-6."""
     grown = smaller_float(a, 4.0) * _ERF[0] + _ERF[1]
     for more in _ERF[2:]:
         grown = grown * smaller_float(a, 4.0) + more
@@ -103,16 +103,14 @@ def error_function(a):  # type: ignore[no-untyped-def]
 
 
 BIAS: Final = np.int16(127 << 7)
-"""Exponent of 1.0 as a bfloat16."""
+"""Bits of 1.0 as a bfloat16."""
 MEAN_EXCESS: Final = np.float32(1.040684)
-"""Mean of (1 + f) / 2^f over f in 0..1: by so much a term is too large on average."""
+"""Mean of (1 + f) / 2^f over f in 0..1, the factor by which a term is too large on average."""
 
 
 @numba.njit(inline="always")
 def lift_to_powers(best, shift):  # type: ignore[no-untyped-def]
-    """Number to add to scores so that 0 is the zero level: 127 octaves below each lane's best score, or the lowest
-    number.
-    """
+    """Number to add to scores so that 0 lies 127 octaves below each lane's best score, or at the least score."""
     return add_saturated(sub_saturated(zero_int16(), best), np.int16(np.int64(BIAS) >> shift))
 
 

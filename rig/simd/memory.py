@@ -75,9 +75,9 @@ load_block = _reader(BLOCK, _I8, BLOCK.llvm, 1)
 load_int16 = _reader(INT16, _I16, INT16.llvm, 2)
 """load_int16(address, index): 16 of the int16 at `address`, from number `index` on."""
 load_float32 = _reader(FLOAT32, _F32, FLOAT32.llvm, 4)
-"""load_float32(address, index): the same of float32."""
+"""load_float32(address, index): 16 of the float32 at `address`, from number `index` on."""
 load_four = _reader(FOUR, _F32, FOUR.llvm, 4)
-"""load_four(address, index): four of the float32."""
+"""load_four(address, index): four of the float32 at `address`, from number `index` on."""
 store_bytes = _writer(BYTES, _I8, BYTES.llvm, 1)
 """store_bytes(address, index, bytes): write 32 bytes."""
 store_int16 = _writer(INT16, _I16, INT16.llvm, 2)
@@ -89,9 +89,9 @@ store_four = _writer(FOUR, _F32, FOUR.llvm, 4)
 _WHOLE = (types.uint8, _I8, 1), (types.int16, _I16, 2), (types.int32, _I32, 4), (types.int64, _I64, 1)
 _NUMBERS = *_WHOLE, (types.float32, _F32, 4)
 read_byte, read_int16, read_int32, read_int64, read_float32 = (_reader(kind, a, a, at) for kind, a, at in _NUMBERS)
-"""read_...(address, index): one number."""
+"""read_...(address, index): number `index` of those at `address`."""
 write_byte, write_int16, write_int32, write_int64, write_float32 = (_writer(kind, a, a, at) for kind, a, at in _NUMBERS)
-"""write_...(address, index, number): one number."""
+"""write_...(address, index, number): write number `index` of those at `address`."""
 
 
 @numba.njit(cache=True, nogil=True)
@@ -137,9 +137,9 @@ def _prefetch(to_write: int, locality: int) -> Any:
 
 
 prefetch = _prefetch(0, 2)
-"""prefetch(address): fetch the cache line there into the second cache; any address will do."""
+"""prefetch(address): fetch the cache line there into the second-level cache; any address will do."""
 prefetch_to_write = _prefetch(1, 3)
-"""prefetch_to_write(address): fetch the cache line there into the first cache, for this core alone."""
+"""prefetch_to_write(address): fetch the cache line there into the first-level cache, for this core alone."""
 
 
 load_widened = emitted(
@@ -157,7 +157,7 @@ def _load_counts(builder: Any, address: Any, index: Any) -> Any:
 load_counts = emitted(FLOAT32(types.intp, types.intp), _load_counts)
 """load_counts(address, index): 16 unsigned bytes from `index` on as float32."""
 CACHE_LINE: Final = 64
-"""Bytes."""
+"""Bytes of a cache line."""
 
 
 def aligned_zeros(shape: tuple[int, ...], dtype: DTypeLike) -> NDArray[Any]:

@@ -39,7 +39,7 @@ def _interleaved(first: int) -> Any:
 
 
 first_row_pairs, second_row_pairs = _interleaved(0), _interleaved(LANES)
-"""first_row_pairs(a, b): bytes of a and b by turns, of the first row of each of the two; the second row's."""
+"""first_row_pairs(a, b), second_row_pairs(a, b): bytes of a and b by turns, of the first 16 of each or the second."""
 
 
 def _shuffled(source: Sequence[int]) -> Any:
@@ -53,7 +53,7 @@ def _up_in_halves(by: int) -> Any:
 
 
 up_1 = _shuffled([LANES, *range(LANES - 1)])
-"""up_1(a): lane i takes what lane i - 1 had, the first one 0."""
+"""up_1(a): lane i gets what lane i - 1 had, and the first one 0."""
 _up_1_in_halves, _up_2_in_halves, _up_4_in_halves = _up_in_halves(1), _up_in_halves(2), _up_in_halves(4)
 _lower_end = _shuffled([LANES] * _HALF + [_HALF - 1] * _HALF)
 
@@ -61,7 +61,7 @@ _lower_end = _shuffled([LANES] * _HALF + [_HALF - 1] * _HALF)
 @numba.njit(inline="always")
 def running_sum(a):  # type: ignore[no-untyped-def]
     """Saturated sum of each lane and all lanes below it."""
-    # Within halves first: on x86 what crosses them takes three times as long.
+    # Within halves first: on x86 a shuffle across them takes three times as long.
     a = add_saturated(a, _up_1_in_halves(a))
     a = add_saturated(a, _up_2_in_halves(a))
     a = add_saturated(a, _up_4_in_halves(a))
@@ -96,7 +96,7 @@ def _equal_bits(builder: Any, address: Any, index: Any, step: Any, number: Any) 
 
 
 equal_bits = emitted(types.uint32(types.intp, types.intp, types.intp, types.int16), _equal_bits)
-"""equal_bits(address, index, step, number): bit i is set where int16 number index + i step is it, i from 0 to 7."""
+"""equal_bits(address, index, step, number): bit i, 0 to 7, is set where the int16 at index + i step is the number."""
 _NO = ir.Constant(ir.IntType(1), 0)
 lowest_bit = emitted(types.uint32(types.uint32), lambda builder, mask: builder.cttz(mask, _NO))
 """lowest_bit(mask): number of the lowest bit that is set; 32 where none is."""
@@ -142,7 +142,7 @@ def _unpacked(builder: Any, a: Any, b: Any, combine: Callable[[Any, Any], Any]) 
 
 
 def _reduced(builder: Any, rows: Sequence[Any], combine: Callable[[Any, Any], Any]) -> Any:
-    """One number a row out of as many rows as 256 bits hold numbers, in order."""
+    """One number a row, in order, of as many rows as 256 bits hold numbers."""
     count = rows[0].type.count
     block = count // 2
     halves = []
@@ -173,7 +173,7 @@ def _largest_of_rows(builder: Any, address: Any) -> Any:
 
 
 largest_of_rows = emitted(INT16(types.intp), _largest_of_rows)
-"""largest_of_rows(address): the largest one of each of 16 rows of 16 integers of 16 bits, one row after another."""
+"""largest_of_rows(address): the largest number of each of 16 rows of 16 int16, which lie one after another."""
 
 
 def _store_folded(builder: Any, address: Any, row: Any, a: Any) -> None:
@@ -183,7 +183,7 @@ def _store_folded(builder: Any, address: Any, row: Any, a: Any) -> None:
 
 
 store_folded = emitted(types.void(types.intp, types.intp, FLOAT32), _store_folded)
-"""store_folded(address, row, a): sums of the lower and the upper half of 16 float32, as row `row` of FOLDED."""
+"""store_folded(address, row, a): write the lower half of 16 float32 plus the upper half, as row `row` of FOLDED."""
 
 
 def _totals_of_rows(builder: Any, address: Any) -> Any:
@@ -193,7 +193,7 @@ def _totals_of_rows(builder: Any, address: Any) -> Any:
 
 
 totals_of_rows = emitted(FLOAT32(types.intp), _totals_of_rows)
-"""totals_of_rows(address): sum of each of 16 rows of FOLDED float32, one row after another."""
+"""totals_of_rows(address): the sum of each of 16 rows of FOLDED float32, which lie one after another."""
 
 
 EIGHT: Final = 8
@@ -201,8 +201,7 @@ _EIGHT_FLOATS = ir.VectorType(ir.FloatType(), EIGHT)
 
 
 def _turned(builder: Any, rows: list[Any]) -> list[Any]:
-    """Columns of eight rows of eight, in steps that stay within halves except for the last: those are the quick
-    ones."""
+    """Columns of eight rows of eight; all steps but the last stay within halves, which is quicker."""
 
     def mixed(a: Any, b: Any, places: list[int]) -> Any:
         return builder.shuffle_vector(a, b, place_list([*places, *(i + EIGHT // 2 for i in places)]))
@@ -236,9 +235,9 @@ def _fetch_eights(builder: Any, places: Any, behind: Any, to: Any) -> None:
 
 
 fetch_eights = emitted(types.void(types.intp, types.intp, types.intp), _fetch_eights)
-"""fetch_eights(places, behind, to): write eight vectors; places: address of sixteen addresses.
+"""fetch_eights(places, behind, to): write eight vectors of sixteen float32 to address `to`.
 
-Eight float32 each, `behind` bytes from there on.
+places: address of sixteen addresses. Lane i of the vectors gets the eight float32 `behind` bytes after address i.
 """
 
 
@@ -255,4 +254,4 @@ def _spread_eights(builder: Any, source: Any, to: Any) -> None:
 
 
 spread_eights = emitted(types.void(types.intp, types.intp), _spread_eights)
-"""spread_eights(source, to): write eight vectors from sixteen times eight unsigned bytes, one after another."""
+"""spread_eights(source, to): write eight vectors of float32; lane i gets the i-th eight of the unsigned bytes there."""

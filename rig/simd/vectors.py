@@ -20,7 +20,7 @@ from numba.core.datamodel import models
 from numba.extending import intrinsic, overload, register_model
 
 LANES: Final = 16
-"""Numbers of a vector."""
+"""Numbers in a vector."""
 
 _INT32 = ir.IntType(32)
 intrinsic_of: Any = intrinsic
@@ -54,9 +54,9 @@ class _LanesModel(models.PrimitiveModel):
 
 
 BYTES = Lanes(8, count=2 * LANES)
-"""Two bytes a lane."""
+"""32 bytes, two for each lane."""
 BLOCK = Lanes(8, count=8 * LANES)
-"""128 bytes, as many registers as they take."""
+"""128 bytes, in as many registers as that takes."""
 INT16 = Lanes(16)
 FLOAT32 = Lanes(32, real=True)
 FOUR = Lanes(32, real=True, count=4)
@@ -190,13 +190,13 @@ def wide(number: int) -> Any:
 
 
 as_bytes = emitted(BYTES(INT16), lambda builder, a: builder.bitcast(a, BYTES.llvm))
-"""as_bytes(a): the two bytes of each 16-bit lane."""
+"""as_bytes(a): the two bytes of each 16-bit lane, the lower one first."""
 to_int16 = emitted(INT16(FLOAT32), lambda b, a: b.trunc(b.fptosi(a, WIDE), INT16.llvm))
 """to_int16(a): float32 lanes, which must fit, without their fraction."""
 to_float32 = emitted(FLOAT32(INT16), lambda b, a: b.sitofp(b.sext(a, WIDE), FLOAT32.llvm))
-"""to_float32(a): 16-bit lanes as numbers."""
+"""to_float32(a): signed 16-bit lanes as float32."""
 square_root = emitted(FLOAT32(FLOAT32), lambda b, a: called(b, f"llvm.sqrt.{vector_name(a.type)}", a.type, a))
-"""square_root(a): of float32 lanes."""
+"""square_root(a): square root of float32 lanes."""
 
 
 def _has_avx2() -> bool:
@@ -226,9 +226,9 @@ def _dot_pairs(builder: Any, counts: Any, weights: Any) -> Any:
 
 
 dot_pairs = emitted(INT16(BYTES, BYTES), _dot_pairs)
-"""dot_pairs(counts, weights): in each lane the sum of its two products, 16 bits, stopping at their limits.
+"""dot_pairs(counts, weights): counts times weights, summed over each lane's two bytes and limited to 16 bits.
 
-counts: unsigned bytes; weights: signed.
+counts: unsigned bytes; weights: signed bytes.
 """
 
 
@@ -264,7 +264,7 @@ def _extreme(name: str) -> Any:
 
 
 largest_float, smallest_float = _extreme("maxnum"), _extreme("minnum")
-"""largest_float(a), smallest_float(a): the largest, and the smallest, one of float32 lanes that is a number."""
+"""largest_float(a), smallest_float(a): the largest or the smallest of float32 lanes, without those that are NaN."""
 
 
 def _where_small(builder: Any, values: Any, sizes: Any, limit: Any) -> Any:
@@ -274,14 +274,12 @@ def _where_small(builder: Any, values: Any, sizes: Any, limit: Any) -> Any:
 
 
 where_small = emitted(FLOAT32(FLOAT32, FLOAT32, types.float32), _where_small)
-"""where_small(values, sizes, limit): float32 lanes, 0 where the size is more than `limit` either way, or NaN."""
+"""where_small(values, sizes, limit): `values`, but 0 where |sizes| is more than `limit` or NaN; float32 lanes."""
 
 
 @intrinsic_of
 def where_below(typing: Any, values: Any, others: Any, sizes: Any, limits: Any) -> VectorCode:
-    """where_below(values, others, sizes, limits): float32 lanes, `values` if the size is below the limit, else
-    `others`.
-    """
+    """where_below(values, others, sizes, limits): `values` where sizes < limits, else `others`; float32 lanes."""
 
     def code(context: Any, builder: Any, signature: Any, args: Any) -> Any:
         limit = args[3]
@@ -300,7 +298,7 @@ def _scaled(builder: Any, a: Any, weights: Any) -> Any:
 
 
 scaled = emitted(INT16(INT16, INT16), _scaled)
-"""scaled(a, weights): a * weights / 2^15 rounded to the nearest, of signed 16-bit lanes; not both -32768."""
+"""scaled(a, weights): a * weights / 2^15, rounded, of signed 16-bit lanes; they must not both be -32768."""
 
 UNPACKED: Final = (0, 1, 2, 3, 8, 9, 10, 11, 4, 5, 6, 7, 12, 13, 14, 15)
 """Order of the lanes after `from_bfloat16_unpacked`: the one that costs an x86 processor one instruction."""

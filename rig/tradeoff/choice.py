@@ -36,8 +36,7 @@ class Wish:
 
 @dataclass(frozen=True, slots=True)
 class Choice:
-    """The setting to use or, if none meets the requirement, the nearest; with the figures of its worst scene
-    and fog."""
+    """The setting to use or, if none meets the wish, the nearest. Each figure is its worst in any scene and fog."""
 
     wish: Wish
     fits: bool
@@ -69,8 +68,7 @@ class Choice:
 
 
 def wish_of(time_budget: str | None, error: str | None, of: str) -> Wish | None:
-    """The requirement in the options; None if neither time nor error is given. Raises UsageError, a line per
-    problem."""
+    """The wish in the options; None if neither time nor error is given. Raises UsageError with all problems."""
     problems = []
     time_ms = error_px = None
     if of not in ("sensor", "compute"):
@@ -99,7 +97,7 @@ def wish_of(time_budget: str | None, error: str | None, of: str) -> Wish | None:
 
 
 def choose(rows: Sequence[TradeoffRow], wish: Wish) -> Choice | None:
-    """Choose the setting to use; None if every setting leaves too many answers out."""
+    """Choose a setting of those tried in every scene and fog; None if each leaves too many answers out somewhere."""
     by_setting: dict[TrialSetting, list[TradeoffRow]] = {}
     for row in rows:
         by_setting.setdefault(row.setting, []).append(row)
@@ -125,8 +123,8 @@ def choose(rows: Sequence[TradeoffRow], wish: Wish) -> Choice | None:
 def advice(rows: Sequence[TradeoffRow], wish: Wish | None, answer: Choice | None) -> str:
     """Say in a sentence which setting to take.
 
-    It is the one that was asked for or, without a requirement, the shortest scan with an error of at most `WORTH` times
-    the smallest of all. answer: the choice for the requirement.
+    It is `answer`, the choice for the wish, or without a wish the shortest scan with an error of at most `WORTH` times
+    the smallest of all.
     """
     if wish is not None and answer is not None:
         return f"take {answer.setting}: {answer.figures}, the best for {wish}" if answer.fits else str(answer)

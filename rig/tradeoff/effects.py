@@ -30,7 +30,7 @@ Flux = dict[str, NDArray[Any]]
 """Arrays (width,): x_px, total, and the parts of the total by effect, in photons per exposure."""
 
 TRIAL_COLUMNS = 40
-"""Columns of a trial scan, over the config's range: some 10^4 rows with a stripe."""
+"""Columns of a trial scan, spread over the config's range: some 10^4 stripes."""
 
 
 @runtime_checkable
@@ -67,8 +67,8 @@ class Effect:
     share: share of all detected photons.
     changed_decisions_bound: largest share of decisions that can change without it; None if there is no bound.
     cost_us_per_frame: of one thread; None if it is part of another effect.
-    stripe_error_change_px: how much larger the mean stripe error is with it than without it, with its standard error;
-      None if neither is known.
+    stripe_error_change_px, stripe_error_change_sd_px: how much larger the mean stripe error is with it than without it,
+      and the standard error of that; None if not known.
     basis: 'trial' if that was measured in a pair of trial scans, 'bound' if it is the bound of an effect that is left
       out.
     """
@@ -107,7 +107,7 @@ def scene_effects(
 ) -> SceneEffects:
     """List the physical effects that a simulated scene calls for, why, and how much each matters (`rig effects`).
 
-    They are those at the power, exposure and exposures of the config's scan.
+    They are those at the power, exposure time and number of exposures of the config's scan.
     trials: measure how much each effect changes the stripe error, in pairs of short scans; takes seconds.
     progress: called with the number of trial scans done and the total.
     Raises UsageError without a simulated world.
@@ -130,8 +130,8 @@ def scene_effects(
 def flux_row(config: Config = SIMULATED, *, scene: str | None = None, row: int | None, column: int | None) -> Flux:
     """Noise-free photons per exposure of one image row while the line is at a column's centre (`rig effects --row`).
 
-    x_px: pixels (width,); total; and by name the share of each effect of light and dark counts, zeros for effects that
-    are off. The shares add up to the total. Raises UsageError for a row or column that does not exist.
+    x_px: pixels (width,); total; and by name the part of each effect of light and dark counts, zeros for effects that
+    are off. The parts add up to the total. Raises UsageError for a row or column that does not exist.
     """
     if row is None or column is None:
         raise UsageError("the flux is that of one image row at one column of the scan; give both --row and --column")
@@ -152,7 +152,7 @@ def flux_row(config: Config = SIMULATED, *, scene: str | None = None, row: int |
 
 
 def _mirror_command(config: RigConfig, column: int) -> float:
-    """Mirror command while a column is lit."""
+    """The mirror command at a column's centre."""
     scan, offsets = config.scan, config.line_offsets
     if len(offsets) > 1:
         grid, _ = line_grid(offsets, scan.columns, scan.command_range)
@@ -177,7 +177,7 @@ def open_world(config: RigConfig) -> Iterator[tuple[ReportsEffects, float]]:
             device = getattr(config, slot)
             if not device.real_time:  # a simulated one tells the world what it does
                 stack.enter_context(lookup(slot, device.kind).create(device, surroundings))
-        # As a scan does: the laser's limit. One that is not there states it in its config.
+        # As in a scan: the laser's limit, which its config states even if the laser is not opened here.
         power_w = getattr(config.laser, "max_power", None) if config.scan.power is None else config.scan.power
         if power_w is None:
             raise UsageError(f"{config.name} states no laser power; add for example 'power: 20 mW' under scan")
@@ -190,8 +190,8 @@ def _trials(
 ) -> dict[str, tuple[float, float]]:
     """Pixels by which the mean stripe error grows with each effect, and the standard error of that.
 
-    Measured in pairs of short scans with the same random numbers and all other effects on. Empty for a world that lives
-    in the host's time.
+    Measured in pairs of short scans with the same random numbers and all other effects on. Empty for a world that runs
+    in real time.
     """
     if config.world is None or config.world.real_time:
         return {}
@@ -220,7 +220,7 @@ def _trials(
 
 
 def _trial(config: RigConfig, columns: int, names: list[str]) -> Array:
-    """Stripe errors of a scan with so many columns and these effects; missing answers are charged.
+    """Stripe errors (rows, columns) in px of a scan of this many columns with these effects, see `charged_errors`.
 
     An interrupt is raised again.
     """

@@ -58,7 +58,7 @@ OTHER_COLOUR = "#cc79a7"
 
 
 def tradeoff_svg(rows: Sequence[TradeoffRow], ci95_by: str) -> str:
-    """Draw the SVG file. Rows with too many answers missing are left out."""
+    """The picture as SVG text, without rows with too many answers missing. ci95_by: what the intervals are over."""
     places = dict.fromkeys(row.place for row in rows)
     shown = [row for row in rows if row.counts]
     panels = [

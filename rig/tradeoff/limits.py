@@ -3,10 +3,10 @@
 The ideal estimator knows haze, ambient light, the line's width and the brightness of the stripe, and has to find only
 its position. If stripes are spread evenly over the search, no answer has a smaller mean |error| than the median of the
 posterior. `bayes_errors` computes it from drawn counts, at 5 ms a row for four numbers of exposures. M neighbours on
-one surface count as M times the exposures. `chernoff_exponent` and `position_sd_px` give lower bounds on how often, and
-by how much, a row's photons lead to the wrong position; the formulas are in docs/explanation/limits.md. A pixel fires
-in an exposure with probability p = 1 - exp(-flux), all independently; q = 1 - p, and p', q' are those of another
-position.
+one surface count as M times the exposures. `chernoff_exponent` says how fast wrong positions get rarer with more
+exposures, `position_sd_px` how exactly the right one can be found; the formulas are in docs/explanation/limits.md. A
+pixel fires in an exposure with probability p = 1 - exp(-flux), all independently; q = 1 - p, and p', q' are those of
+another position.
 """
 
 import math
@@ -23,9 +23,7 @@ from rig.tradeoff.rows import LOCAL_PX, Place, TradeoffRow
 
 
 def least_exponent(light: RowLight) -> float:
-    """The smallest C to a whole-pixel place more than 1 px off, the rate at which such errors become rarer; inf if
-    there is no such place.
-    """
+    """The smallest Chernoff exponent to a position that is 2, 3, ... px off; inf if the search has no such position."""
     places = light.whole_positions()
     exponent = chernoff_exponent(light.flux(places), light.flux(np.array([light.position])))
     return float(exponent[np.abs(places - light.position) > 1.5].min(initial=np.inf))
@@ -51,11 +49,10 @@ def position_information(light: RowLight) -> float:
 
 
 def position_sd_px(light: RowLight, exposures: float) -> float:
-    """Cramer-Rao bound on the position's standard deviation from K exposures (of M equal rows: M K); inf without
-    information.
+    """Cramer-Rao bound on the position's standard deviation; inf without information.
 
     It holds for unbiased answers near the true stripe. In rows so dark that other positions compete, no answer comes
-    near it.
+    near it. exposures: the sum over all rows if equal rows are seen together.
     """
     information = exposures * position_information(light)
     return 1.0 / math.sqrt(information) if information > 0 else math.inf
@@ -68,16 +65,15 @@ EXPONENT_ROWS: Final = 24
 COARSE_PX: Final = 0.5
 """Spacing of positions far from the true one."""
 FINE_SHARE: Final = 8.0
-"""Positions near the true one lie this part (an eighth) of their distance from it apart."""
+"""Positions near the true one lie their distance from it, divided by this, apart."""
 
 
 def bayes_errors(light: RowLight, exposures: Sequence[int], draws: int, rng: np.random.Generator) -> Array:
-    """|error| in px of the posterior median for `draws` simulated rows at each number of exposures, (exposures,
-    draws)."""
+    """|error| in px, (exposures, draws), of the posterior's median for drawn rows at each number of exposures."""
     places, spacing = _places(light, max(exposures))
     flux = np.maximum(light.flux(places), FLUX_MIN)
     here = np.maximum(light.flux(np.array([light.position]))[0], FLUX_MIN)
-    # log L = sum n log(e^flux - 1) - K flux, an exact identity; all of it is of differences to the true position.
+    # log L = sum n log(e^flux - 1) - K flux, exactly; gain and loss are differences to the true position.
     gain = log_fired(flux) + flux - (log_fired(here) + here)
     loss = (flux - here).sum(1)
     errors = np.empty((len(exposures), draws))
@@ -89,7 +85,7 @@ def bayes_errors(light: RowLight, exposures: Sequence[int], draws: int, rng: np.
 
 
 def _places(light: RowLight, exposures: int) -> tuple[Array, Array]:
-    """Positions over the search and the pixels that each stands for: the nearer to the true one, the denser."""
+    """Positions over the search, denser near the true one, and the width in px that each stands for."""
     finest = min(max(position_sd_px(light, exposures), 1e-3), 1.0) / FINE_SHARE
     reach = math.ceil(FINE_SHARE * math.log(COARSE_PX / finest))
     steps = finest * np.expm1(np.arange(1, reach + 1) / FINE_SHARE) * FINE_SHARE
@@ -101,7 +97,7 @@ def _places(light: RowLight, exposures: int) -> tuple[Array, Array]:
 
 
 def _medians(score: Array, places: Array, spacing: Array) -> Array:
-    """Median of each posterior (rows, places), which is even within the pixels that a place stands for."""
+    """Median of each posterior, even over the width of each place; score: logarithm of its masses (rows, places)."""
     mass = np.exp(score - score.max(1, keepdims=True))
     below = np.cumsum(mass, axis=1)
     half = 0.5 * below[:, -1]
@@ -117,8 +113,9 @@ class StatisticalLimit:
     mean_abs_px, mean_abs_se_px: smallest mean |error| of any answer from one row, or from `averaged` equal ones, and
     its standard error.
     within_1px: share of those answers within 1 px.
-    exponent: median over rows of the smallest Chernoff exponent per exposure to a position more than 1 px off.
-    position_sd_px: median Cramer-Rao bound.
+    exponent: median over rows of the smallest Chernoff exponent per exposure to a position more than 1 px off, of one
+      row whatever `averaged`.
+    position_sd_px: median Cramer-Rao bound, of `averaged` rows together.
     """
 
     exposures: int
@@ -135,10 +132,10 @@ def limits(
 ) -> list[StatisticalLimit]:
     """Compute the limit of each number of exposures over some rows of a scene; the same seed gives the same limit.
 
-    averaged: number of neighbours of equal disparity with which each row may be seen; 1 for an estimator of single
-    rows.
+    averaged: number of rows of equal disparity that are seen together; 1 for an estimator of single rows.
     draws: per row. 200 rows take a second for four numbers of exposures, and EXPONENT_ROWS of them a second for their
       exponents.
+    Raises ValueError without rows.
     """
     if not lights:
         raise ValueError("a limit needs at least one row of light")
@@ -168,9 +165,9 @@ ROWS = 200
 COUPLED = "joint"
 """The estimator that sees a row together with its neighbours; the median filter sees as many rows."""
 LEAST_WRONG = 0.003
-"""Least share of the ideal's answers more than 1 px off that a ratio is taken to: twenty of 200 rows x 32 draws."""
+"""Least share of the ideal's answers that must be more than 1 px off for a ratio: twenty of 200 rows x 32 draws."""
 LOCAL_SDS = 3.0
-"""Standard deviations that must fit into LOCAL_PX, so that answers within it are all that found the stripe."""
+"""Standard deviations of the bound that must fit into LOCAL_PX, so that nearly all right answers lie within it."""
 
 
 class SceneLimits:
@@ -229,16 +226,15 @@ def _finite(value: float) -> float | None:
 
 
 NEWTON_STEPS: Final = 60
-"""Most steps to the best exponent t; bisection alone would get there."""
+"""Most steps to the best share t; bisection alone would get there."""
 GAP_EXACT: Final = 0.5
-"""1 minus a pixel's overlap below which it is summed from its small parts."""
+"""Value of 1 minus a pixel's overlap below which it is summed from small parts, not as a difference."""
 SERIES_BELOW: Final = 0.05
-"""Ratio of chances, as a logarithm, below which a series stands for differences that cancel."""
+"""Logarithm of a ratio of chances below which a series replaces differences that cancel."""
 
 
 def chernoff_exponent(flux: Array, other: Array) -> Array:
-    """Chernoff's exponent C per exposure for separating rows of light `flux` from rows of `other`, (..., pixels) each;
-    0 if equal.
+    """Chernoff's exponent C per exposure between rows of light `flux` and `other`, (..., pixels) each; 0 if equal.
 
     The probability that `other` is the likelier one although `flux` is true, or the reverse, is at most exp(-K C).
     """
@@ -249,7 +245,7 @@ def chernoff_exponent(flux: Array, other: Array) -> Array:
     dark = low - high
     sign = np.where(first >= second, 1.0, -1.0)
     t = _best_share(log_fired(second), -second, sign * fired, sign * dark)
-    # Exponent of the brighter of the two in each pixel.
+    # The exponent of the brighter of the two in each pixel.
     share = np.where(sign > 0, t[..., None], 1.0 - t[..., None])
     return np.asarray(_overlap_exponent(low, high, fired, dark, share).sum(-1))
 

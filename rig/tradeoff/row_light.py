@@ -67,7 +67,7 @@ class RowLight:
 
 
 def pixel_share(away_px: Array, sigma_px: float) -> Array:
-    """Share of a Gaussian line of unit light in pixels whose centres lie away_px from its own; exact in the flanks."""
+    """Share of a Gaussian line's light in pixels whose centres lie away_px from its own; exact in the flanks too."""
     away = np.abs(away_px)
     shares = np.zeros(away.shape)
     near = away < PROFILE_SIGMAS * sigma_px + 0.5
@@ -78,19 +78,20 @@ def pixel_share(away_px: Array, sigma_px: float) -> Array:
 
 
 HAZE, STRIPE = "fog", "stripe"
-"""Effects whose light ends at the object, and lies on it; all others do not depend on where the stripe is."""
+"""The effect whose light ends at the object, and the one that lies on it; others do not depend on the position."""
 TRIES = 8
-"""Rows looked at for each that is wanted: some have no stripe."""
+"""Most rows looked at for each that is wanted: some have no stripe."""
 LEAST_STRIPE = 1e-4
 """Photons per exposure below which a row counts as one without a stripe: none in ten thousand exposures."""
 SPLIT_PX = 2.5
 """Standard deviation along the row from which a stripe is taken to be split over a depth edge."""
 LEAST_SIGMA_PX = 0.2
 CLEAR_SIGMAS = 4.0
+"""Standard deviations of the line, and 1 px more, that pixels lie before it where the haze is fitted."""
 
 
 def scene_lights(config: RigConfig, *, rows: int = 200, seed: int = 0) -> list[RowLight]:
-    """Light of some rows of a config's scene, drawn at random over rows and columns; the same for the same seed.
+    """Light of up to `rows` rows of a config's scene, drawn at random over columns; the same for the same seed.
 
     Halo, drops and ambient light are those at the true position. Rows whose stripe is split, hidden or outside the
     depth range are left out. Raises UsageError without a world, a calibration or any stripe, and for a rig of several
@@ -126,7 +127,7 @@ def _lights(
     world: ReportsEffects, model: RigModel, commands: Array, depth_range_m: tuple[float, float],
     power_w: float, exposure_s: float, rng: np.random.Generator,
 ) -> list[RowLight]:  # fmt: skip
-    """Light of one row of each column, where it has a stripe."""
+    """Light of one row of each column, drawn at random, if it has a stripe."""
     geometry = sweep_geometry(model, commands, depth_range_m)
     found = []
     for column, command in enumerate(commands):
@@ -151,7 +152,7 @@ def row_light(parts: Mapping[str, Array], geometry: SweepGeometry, row: int, col
     if total < LEAST_STRIPE or lo > hi:
         return None
     position = float((stripe * x).sum() / total)
-    # The pixel itself has a twelfth of a square pixel.
+    # The width of a pixel itself adds 1/12 px^2.
     variance = float((stripe * (x - position) ** 2).sum() / total) - 1.0 / 12.0
     if variance > SPLIT_PX**2 or not lo <= position <= hi:
         return None
@@ -175,7 +176,7 @@ def row_light(parts: Mapping[str, Array], geometry: SweepGeometry, row: int, col
 
 
 def _free_haze(path_m: Array, haze: Array, clear: NDArray[np.bool_]) -> tuple[Array, float]:
-    """Haze along the row as if there were no object, and its extinction per metre."""
+    """Haze along the row as if there were no object, and its extinction per metre; 0 with too few clear pixels."""
     if clear.sum() < 3:
         return np.zeros(len(path_m)), 0.0
     slope, level = np.polyfit(path_m[clear], np.log(haze[clear]), 1)

@@ -65,14 +65,14 @@ class TradeoffRow:
     within_1px, missing: shares of the true stripes.
     depth_mm: mean depth error; None if no pixel has a depth.
     ci95: confidence interval of mean_abs_px, over repeats or else over blocks of the map.
-    local_sd_px: standard deviation of the errors of answers within LOCAL_PX, from their median; None without any.
+    local_sd_px: standard deviation of the errors of answers within LOCAL_PX, from the median |error|; None without any.
     pareto, pareto_compute: whether no other setting in the same scene and fog is at least as good in error and in time
-    (of sensor or computer) and better in one of them.
+    (of sensor or computer) and better in one of them; False with too many answers missing.
 
     The other fields compare it with the statistical limit (`rig.tradeoff.limits`); each is None if that is not known.
     times_limit: mean_abs_px over the statistical limit.
-    exponent_nats: Chernoff's exponent per exposure. times_wrong_limit: share of answers more than 1 px off over the
-      ideal estimator's.
+    exponent_nats: Chernoff's exponent per exposure, of all rows that are seen together. times_wrong_limit: share of
+      answers more than 1 px off over the ideal estimator's.
     position_sd_px: Cramer-Rao's bound. times_position_limit: local_sd_px over that.
     """
 
@@ -121,7 +121,7 @@ class TradeoffRow:
 def score_map(
     place: Place, setting: TrialSetting, result: MapResult, truth: SweepTruth, sensor_ms: float, compute_ms: float
 ) -> TradeoffRow:
-    """Make the row of one map. Raises UsageError if the world has no stripe to be found."""
+    """Make the row of one map, with an interval over its blocks. Raises UsageError if the truth has no stripe."""
     true_px = truth.x_px.astype(np.float64)
     if not np.isfinite(true_px).any():
         raise UsageError("the line is nowhere seen in this scene; check the scene and scan.command_range")
@@ -147,7 +147,7 @@ def score_map(
 
 
 def over_repeats(rows: Sequence[TradeoffRow]) -> TradeoffRow:
-    """Make the row of a setting from those of its repeats."""
+    """Make the row of a setting from those of its repeats: their means, and the median of compute_ms."""
     averaged: dict[str, float | None] = {}
     for name in ("sensor_ms", "mean_abs_px", "within_1px", "missing", "depth_mm", "local_sd_px"):
         known = [value for row in rows if (value := getattr(row, name)) is not None]
@@ -164,7 +164,7 @@ def with_fronts(rows: Sequence[TradeoffRow]) -> tuple[TradeoffRow, ...]:
 
 
 def _fronts(rows: Sequence[TradeoffRow], of: Clock) -> set[int]:
-    """Places of the rows that no other one in their scene and fog beats."""
+    """Indices of the rows that no other one in their scene and fog beats."""
     found: set[int] = set()
     best: dict[Place, float] = {}
     counting = [(row.time_ms(of), row.mean_abs_px, i) for i, row in enumerate(rows) if row.counts]
@@ -185,7 +185,7 @@ _T = {1: 12.7062, 2: 4.3027, 3: 3.1824, 4: 2.7764, 5: 2.5706}
 
 
 def repeats_interval(means: Sequence[float]) -> Interval:
-    """Interval of the mean of at least two independent means of absolute errors; therefore never below zero."""
+    """Interval of the mean of two or more independent means of absolute errors, so never below zero."""
     half = t_quantile(len(means) - 1) * statistics.stdev(means) / math.sqrt(len(means))
     middle = statistics.fmean(means)
     return max(0.0, middle - half), middle + half

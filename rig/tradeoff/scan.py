@@ -34,9 +34,9 @@ from rig.tradeoff.rows import Place, TradeoffRow, TrialSetting, score_map
 MAPS = 2
 """Maps of a scan: estimators learn from the first one, the last one is scored."""
 TIMED_PASSES = 3
-"""Number of times that the last map is made, for the median of its time."""
+"""Most passes over the last map, for the median of its time."""
 LONG_S = 1.0
-"""Seconds of all passes together after which no more are made."""
+"""Seconds after which no more passes are made."""
 MOST_KEPT_BYTES = 2_000_000_000
 """Most bytes of frames of one sweep in memory."""
 
@@ -97,7 +97,7 @@ class FrameKeeper:
 
 
 class ManyMakers:
-    """Makes the maps of several estimators and filters from the same frames, in place of a `Reconstructor`."""
+    """Makes maps of several estimators and filters from the same frames; takes the place of a `Reconstructor`."""
 
     def __init__(self, makers: Mapping[str, Reconstructor], filters: Sequence[str]) -> None:
         self._makers = makers
@@ -127,7 +127,7 @@ class ManyMakers:
         return next(iter(made.values()))[0]
 
     def _timed(self, name: str, sweep: KeptSweep, passes: int) -> dict[str, tuple[MapResult, float]]:
-        """Results of the first of some passes by filter, each with the median of the passes' seconds."""
+        """Results of the first pass by filter, each with the median of the seconds that the passes took."""
         begun = time.perf_counter()
         made = [self._all_filters(name, sweep)]
         while len(made) < passes and time.perf_counter() - begun < LONG_S:
@@ -155,8 +155,7 @@ class ManyMakers:
 def score_methods(
     config: RigConfig, place: Place, asked: TradeoffRequest, seed: int, tell: Callable[[float], None]
 ) -> list[TradeoffRow]:
-    """Scan once with a simulated rig and score the maps that each estimator, with each filter, makes from the same
-    frames.
+    """Scan once with a simulated rig and score the map that each estimator and filter makes from the same frames.
 
     tell: called with the share of the frames that have been taken.
     """

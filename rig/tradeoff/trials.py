@@ -37,8 +37,10 @@ Trials = Mapping[Trial, RigConfig]
 
 
 def trials_of(config: Config, asked: TradeoffRequest) -> Trials:
-    """Every scene in every fog, with every number of exposures and lines. Raises UsageError with all problems of all of
-    them, and then of their plans, of which those for the smallest and the largest number of exposures are checked.
+    """The trials of every scene in every fog, with every number of exposures and lines.
+
+    Raises UsageError with the problems of all configs or, if there are none, of all plans. Only plans for the smallest
+    and the largest number of exposures are checked.
     """
     scenes, fogs, lines = asked.scenes or (None,), asked.fogs or (None,), asked.lines or (None,)
     trials = list(starmap(Trial, product(scenes, fogs, asked.exposures, lines)))
@@ -116,7 +118,7 @@ def run_tradeoff(
 
 
 def require_methods(estimators: Sequence[str], filters: Sequence[str]) -> list[str]:
-    """Problems with names of estimators and filters."""
+    """A line for each name that is no estimator or no filter."""
     return [
         f"{what} {name!r} {'is a choice between others' if (what, name) == ('estimator', AUTO) else 'is unknown'}; "
         f"choose of {', '.join(known)}"

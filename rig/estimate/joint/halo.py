@@ -7,7 +7,7 @@ pixels around a stripe and around its 5 x 5 neighbours on the same surface are e
 
     flux = base + a scale (share + glow),   log-likelihood = sum n log(1 - exp(-flux)) - (K - n) flux
 
-with haze and ambient light as base. It is concave in a. Newton's steps start from below, since the slope is convex.
+with haze and ambient light as base. This is concave in a, and its slope is convex, so Newton's steps start from below.
 Saturated pixels give no information, those beside them do. If the amplitude is hardly more than its noise, or
 neighbours do not agree on it, the light of a stripe is unknown and the stripe is not used. Nor is one that brings 2
 photons or more to a pixel.
@@ -17,10 +17,11 @@ The fit (`add_equations`, `solve`). The counts beside a stripe of s photons, at 
     flux = ambient + offset + G haze(w)                 before the stripe
          = ambient + offset + share(w) G haze(w)        behind it,      on both sides + s rho(w, d)
 
-with rho as in `rig.estimate.row.inputs`. That is linear in haze (BINS), share (HALO_NODES), halo (HALO_NODES, reaches)
-and offset, so one weighted least squares fit (float64, no number negative) separates them: the halo follows the
-brightness of each stripe, the haze does not. Means over the pixels behind and before stripes could not do that. Later
-maps are tested for whether a halo is still there, or has appeared.
+with w the path inverse depth, and G and rho as in `rig.estimate.row.inputs`. Behind stripes the haze is the model's. So
+the flux is linear in haze (BINS), share (HALO_NODES), halo (HALO_NODES, reaches) and offset. One weighted least squares
+fit (float64, no number negative) separates them, since the halo follows the brightness of each stripe and the haze does
+not. Means over the pixels behind and before stripes could not do that. Later maps are tested for whether a halo is
+still there, or has appeared.
 """
 
 import math
@@ -57,10 +58,11 @@ from rig.threads import RowWorkers
 LEAST_FLUX: Final = 2e-3
 """Least flux of a pixel when its counts are weighted."""
 LINE_PX: Final = 4.5
-"""Pixels so far from a stripe show nothing of the line itself."""
+"""Pixels this far from a stripe, or farther, show nothing of the line itself."""
 _REACHES: Final = np.array(HALO_REACHES_PX)
 SETTLED: Final = 1e-6
 MOST_SWEEPS: Final = 3000
+"""`solve` stops when no number's step lowers the misfit by SETTLED, or after so many times through all numbers."""
 
 
 @numba.njit(cache=True, nogil=True)
@@ -72,7 +74,7 @@ def add_equations(
 
     Unknowns: haze in each profile bin; its share behind the stripe at each node; halo at each node and reach; ambient
     light missing in the state. halo: (BINS, pixels) of `halo_shares`; light: of each line's stripe at its x_px,
-    photons. Only one half of the matrix is filled, rows from columns on.
+    photons. Only the lower triangle of the matrix is filled.
     """
     bins, number = state.profile.shape[0], len(_REACHES)
     first_share, first_halo, last = bins, bins + HALO_NODES, matrix.shape[0] - 1
@@ -126,9 +128,7 @@ def add_equations(
 
 @numba.njit(cache=True, nogil=True)
 def solve(matrix: Float64, right: Float64, free: int) -> Float64:
-    """The x that minimises x' matrix x - 2 right' x with no number below 0 except number `free`, found one number at a
-    time.
-    """
+    """The x that minimises x' matrix x - 2 right' x with no number but number `free` below 0, by coordinate descent."""
     x, slope = np.zeros_like(right), -right
     for _ in range(MOST_SWEEPS):
         largest = 0.0
@@ -148,20 +148,22 @@ def solve(matrix: Float64, right: Float64, free: int) -> Float64:
 
 
 REACH: Final = 2
-"""Rows and columns to either side whose stripes are asked."""
+"""Rows and columns to either side whose stripes are asked for the light of one."""
 LEAST_ASKED: Final = 10
-"""Stripes, of 25, that lie on the same surface where light is known."""
+"""Fewest stripes, of 25, that must lie on its surface for the light of one to be known."""
 LEAST_SURE: Final = 4.0
-"""Standard deviations of its noise that the light is more than."""
+"""Light must be more than this many standard deviations of its noise to be known."""
 DISAGREED: Final = 3.0
-"""Standard deviations by which the stripes' misfit may exceed what chance brings. Of stripes that pass these limits
-less than 1 % are none (random scenes at five exposures)."""
+"""Standard deviations by which the stripes' misfit may exceed what chance brings. Of answers that pass these limits
+less than 1 % are no stripes (random scenes at five exposures)."""
 MOST_STEPS: Final = 8
 MOST_GROWTH: Final = 4.0
-"""By so much an amplitude may grow or shrink in a step."""
+"""Largest factor by which an amplitude may grow or shrink in a step."""
 LIGHT_SETTLED: Final = 1e-2
+"""Relative step of an amplitude below which it is settled."""
 LIGHT_LEAST_FLUX: Final = 1e-4
 MOST_FLUX: Final = 20.0
+"""Least and largest flux of a pixel, in photons per exposure, in the search for the light."""
 
 
 @numba.njit(cache=True, nogil=True, error_model="numpy")
@@ -194,7 +196,7 @@ def likeliest_light(
 def _ask(counts, n_frames, sweep, state, shares, x_px, places, y, c, a):  # type: ignore[no-untyped-def]
     """Slope of the log-likelihood in the amplitude and how fast it falls; misfit of the stripes, and their number.
 
-    misfit: sum of each stripe's own slope squared, over its variance.
+    The misfit is the sum of each stripe's own slope squared, over its variance: as large as the number by chance.
     """
     side, pixels = 1 if sweep.near_is_left else -1, sweep.u.shape[1]
     score, information, misfit, asked = 0.0, 0.0, 0.0, 0
@@ -232,23 +234,23 @@ def _ask(counts, n_frames, sweep, state, shares, x_px, places, y, c, a):  # type
 
 
 CLEAR: Final = np.float32(0.5)
-"""Confidence of stripes that teach."""
+"""Stripes of more confidence than this teach."""
 MOST_PEAK: Final = 2.0
-"""Photons per exposure in one pixel from which on a stripe's light is known by its flanks only: a line a little wider
-than thought would be a dimmer stripe with a stronger halo."""
+"""Photons per exposure in one pixel from which on a stripe is not used, since only its flanks tell its light: a line a
+little wider than thought would be taken for a dimmer stripe with a stronger halo."""
 DETECT_LINES: Final = AGAIN_LINES // 4
-"""Clear stripes that tell whether there is a halo."""
+"""Number of clear stripes that tell whether there is a halo."""
 MEASURE_LINES: Final = 4 * AGAIN_LINES
-"""Clear stripes that measure it, once the first map has one."""
+"""Number of clear stripes that measure it, once the first map has one."""
 FEWEST_LIGHTS: Final = 64
 """Stripes of known light without which a later map says nothing about a halo."""
 LEAST_EVIDENCE, LEAST_PER_EXPOSURE = 30.0, 0.02
-"""Least chi squared that a halo must take off the fit, altogether and per stripe and exposure: noise takes off 2 to 10;
-the wings of a line that moves or is not sharp 0.01 per exposure, fog of optical depth 0.2 0.02 to 0.05, of 1 more than
-0.15."""
+"""Least chi squared that a halo must take off the fit, altogether and per exposure of the stripes. Noise takes off 2 to
+10 altogether. The wings of a line that moves or is not sharp take off 0.01 per exposure, fog of optical depth 0.2 takes
+off 0.02 to 0.05, of 1 more than 0.15."""
 SMOOTH_HAZE, SMOOTH_SHARE, SMOOTH_HALO, SMALL_HALO = 3e4, 300.0, 3.0, 0.1
-"""Strengths of the smoothness: cost, over their squares, of bends of the haze, steps of its share behind the stripe,
-steps of the halo and the halo itself. They decide only where there are no data."""
+"""Factors on the squares of bends of the haze, steps of its share behind the stripe, steps of the halo and the halo
+itself, which are added to the misfit. They decide only where there are no data."""
 _SHARE, _HALO = BINS, BINS + HALO_NODES
 _SIZE = _HALO + HALO_NODES * len(HALO_REACHES_PX) + 1
 
@@ -282,7 +284,7 @@ def learn_first_halo(
     volume: CountVolume, geometry: SweepGeometry, model: RowModel, ambient: Float32, tables: JointTables,
     stripes: StripeTable, places: Places, workers: RowWorkers,
 ) -> RowModel:  # fmt: skip
-    """The first map's model with the halo of `learn_halo`. Call it again with the map that is made with that model.
+    """The first map's model with the halo of `learn_halo`. Call this again with the map that is made with that model.
 
     With several lines at once the model stays as it is, since the other lines' haze would be taken for a halo.
     """

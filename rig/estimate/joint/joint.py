@@ -3,10 +3,10 @@
 Each label (candidate position) of a row and column (`rig.estimate.joint.labels.grid`) gets a cost from the counts
 (`rig.estimate.joint.labels.costs`, a fast form of `rig.estimate.row.likelihood`). It includes the halo, if there is one
 (`rig.estimate.joint.labels.halo_rows`), and the previous map, if requested (`rig.estimate.joint.temporal`). Under a
-halo it is averaged with a cost that knows no medium (`rig.estimate.joint.labels.contrast`). Costs are
-tied to those of the neighbours along four paths (`rig.estimate.joint.paths`); weak answers are decided by a vote of all
-neighbours (`rig.estimate.joint.vote`). The best label of each row and column is placed between labels with the help of
-neighbours on its surface (`rig.estimate.joint.place.place`), judged (`rig.estimate.joint.confidence`) and searched for
+halo it is averaged with a cost that knows no medium (`rig.estimate.joint.labels.contrast`). Costs are tied to those of
+the neighbours along four paths (`rig.estimate.joint.paths`); weak answers are decided by a vote of all neighbours
+(`rig.estimate.joint.vote`). The best label of each row and column is placed between labels with the help of neighbours
+on its surface (`rig.estimate.joint.place.place`) and judged (`rig.estimate.joint.confidence`). Each row is searched for
 a second line (`rig.estimate.joint.second_returns`). The model of light and medium is learned row by row first, as by
 `likelihood`, then from the map's own stripes.
 """
@@ -41,15 +41,15 @@ from rig.simd.memory import pointers
 from rig.threads import RowWorkers
 
 LESSONS = 2
-"""Times that the first map's stripes teach the model that they are then estimated with again."""
+"""Times that the first map's stripes teach the model with which they are then estimated again."""
 HALO_LESSONS = 4
-"""The same where a halo was found."""
+"""Times that they do so under a halo."""
 AGREE_PX = np.float32(1.0)
-"""Under a halo a stripe teaches only if its surroundings alone put it within so many pixels."""
+"""Under a halo a stripe of the first map teaches only if its surroundings alone put it within so many pixels."""
 TRUSTED = np.float32(0.5)
 """Trust from which on a stripe's brightness counts for the model under a halo."""
 QUIET_COLUMNS = 8
-"""One column in so many teaches the ambient light where there are dark frames too."""
+"""One column in so many teaches the ambient light if dark frames teach it too."""
 
 
 class Joint:
@@ -85,7 +85,7 @@ class Joint:
     def counter(self, layout: SweepLayout, geometry: SweepGeometry) -> Counter:
         """A counter whose sweeps `estimate` takes. geometry: the nominal one, which holds for every sweep.
 
-        Raises UsageError if its maps would take too much memory; no light has been let out by then.
+        Raises UsageError if its maps would take too much memory, before any light is let out.
         """
         grid_of(geometry)
         return SweepCounter(layout, self._workers)
@@ -103,7 +103,7 @@ class Joint:
         )
         stripes = replace(first, x2_px=x2_px, confidence2=confidence2)
         self._prior.leave(stripes, tables.grid)
-        # Whether the first map has taught anything is for the trust of its lessons to say.
+        # The trust of its lessons says whether the first map has taught anything.
         known = self._lessons.model is not None
         judged = stripes if known else self._teaching(sweep, tables, stripes)
         self._lessons.attend(
@@ -112,14 +112,14 @@ class Joint:
         return stripes
 
     def _first_model(self, volume: CountVolume, geometry: SweepGeometry) -> RowModel:
-        """Learn from the first sweep: row by row, then from stripes that all rows together show far better."""
-        self._prior.recall(None)  # of maps that taught nothing
+        """The model learned from the first sweep: row by row, then from stripes, which all rows together show."""
+        self._prior.recall(None)  # forget maps that taught nothing
         model = start = first_model(volume, geometry, self._workers)
         witness_px, lessons, intensity = None, 0, volume.intensity()
         while lessons < (LESSONS if witness_px is None else HALO_LESSONS):
             model, lessons = self._taught(volume, intensity, geometry, model, witness_px), lessons + 1
             if witness_px is None and model.halo.any():
-                # What is scattered many times has misled these lessons: begin again with a second teacher.
+                # Light scattered many times has misled these lessons: begin again, with contrast as a second teacher.
                 witness_px, model, lessons = self._by_contrast(volume, geometry, model), start, 0
         return model
 
@@ -153,7 +153,7 @@ class Joint:
         return replace(model, amplitude=amplitude, weight=weight)
 
     def _by_contrast(self, volume: CountVolume, geometry: SweepGeometry, model: RowModel) -> Float32:
-        """x_px (rows, columns) that the surroundings of labels alone tell."""
+        """x_px (rows, columns) from the costs of `rig.estimate.joint.labels.contrast` alone."""
         setting = LearningSetting(model, geometry, volume.exposures, volume.dark_counts is not None)
         tables = tables_of(setting, self._workers, contrast=True)
         x_px = np.empty(tables.grid.x_far.shape, np.float32)
@@ -162,7 +162,7 @@ class Joint:
         return x_px
 
     def _teaching(self, volume: CountVolume, tables: JointTables, stripes: StripeTable) -> StripeTable:
-        """The table with the trust that lessons put into each answer instead of its confidence."""
+        """The table with, instead of confidence, the trust that the first map's lessons put into each answer."""
         memory, trust = self._room(tables.grid), np.empty_like(stripes.confidence)
         self._workers.over(
             len(trust),
@@ -174,10 +174,9 @@ class Joint:
         return replace(stripes, confidence=trust)
 
     def _read(self, volume: CountVolume, tables: JointTables, x_px: Float32, *, alone: bool = False) -> None:
-        """Fill x_px (rows, columns) with the labels of least cost, and the answers in memory. The last step is only
-        queued.
+        """Fill x_px (rows, columns) with the positions of the best labels, and the answers in memory.
 
-        alone: whether labels are costed by their surroundings only.
+        The last step is only queued. alone: whether labels are costed by their surroundings only.
         """
         grid, workers = tables.grid, self._workers
         rows, columns = x_px.shape

@@ -5,9 +5,10 @@ The trust of the first map's lessons in an answer (`fill_trust`, float32 (rows, 
 
     trust = erf(3 px / (sqrt 2 sd)) / (1 + exp(A - B margin)) / (1 + C z^-D)
 
-This is the confidence of `rig.estimate.joint.confidence` with three changes: z is the stripe's light over its noise,
-pooled over neighbours, above half of the haze; agreement of answers around does not count; and it asks for the right
-surface, within 3 px. Later lessons use the table's confidence, since the model is known by then.
+with the margin in cost over UNITS. This is the confidence of `rig.estimate.joint.confidence` with three changes. z is
+the stripe's light over its noise, pooled over neighbours, above the mean of the haze before and behind it. Agreement of
+answers around does not count. And the trust is that in the right surface, within 3 px. Later lessons use the table's
+confidence, since the model is known by then.
 
 B, C and D are fitted by maximum likelihood to lessons on random scenes of a second simulator, in clear air, thin and
 dense fog, under a halo and with hot pixels at 1 to 10 exposures, with places without a stripe counted as wrong. A is
@@ -36,9 +37,9 @@ B: Final = 0.608
 LOG_C: Final = -2.43
 D: Final = 1.427
 POOLED: Final = 25.0
-"""Answers whose light counts as one: about half of the neighbours that it is pooled over lie on the same surface."""
+"""Answers over which light is taken to be pooled: about half of the neighbours lie on the same surface."""
 LEAST_Z: Final = 0.05
-"""Least z, where a stripe shows no light."""
+"""Least z, for a stripe that shows no light."""
 
 
 @numba.njit(cache=True, nogil=True, error_model="numpy")
@@ -46,7 +47,10 @@ def fill_trust(
     x_px: Float32, sd_px: Float32, n_frames: Int32, margin: Uint8, places: Places, ambient: float, first_row: int,
     last_row: int, trust: Float32,
 ) -> None:  # fmt: skip
-    """Fill trust, 0 to 1, of rows first_row..last_row-1; arrays (rows, columns), 0 where x_px is NaN."""
+    """Fill trust, 0 to 1, of rows first_row..last_row-1, 0 where x_px is NaN; arrays (rows, columns).
+
+    ambient: usual ambient light, photons per exposure and pixel.
+    """
     amplitudes, scales, hazes = places.amplitude, places.scale, places.haze
     for y in range(first_row, last_row):
         for c in range(x_px.shape[1]):
@@ -64,7 +68,7 @@ def fill_trust(
 
 
 QUIET_REACH_PX: Final = 8
-"""Pixels so far behind a clear stripe show nothing of it."""
+"""Pixels more than this behind a clear stripe show nothing of it."""
 QUIET: Final = 0.9
 """Confidence from which a stripe is clear."""
 
@@ -74,10 +78,10 @@ def read_positions(
     x_far: Float64, n_frames: Int32, side: int, width: int, answer: LabelAnswers, first_row: int, last_row: int,
     x_px: Float32, distance: Float32,
 ) -> None:  # fmt: skip
-    """Fill x_px (rows, columns) of the answers' labels, and its distance from x_far; NaN without data.
+    """Fill x_px (rows, columns) from the answers' labels, and its distance from x_far; NaN without data.
 
     An answer in the outer half of the first or last of `width` pixels gets margin 0 in `answer`. A stripe beyond that
-    pixel is as dark as a missing one and has no label, so darkness makes the outermost label seem far better than all
+    pixel is as dark as a missing one and has no label. So darkness makes the outermost label seem far better than all
     others.
     """
     label, margin, nothing = answer.label, answer.margin, np.float32(np.nan)
@@ -95,7 +99,7 @@ def add_quiet(
     counts: Counts, n_frames: Int32, sweep: Sweep, state: RowState, halo: Float32, x_px: Float32, signal: Float32,
     confidence: Float32, column_step: int, most_light: float, first_row: int, last_row: int, quiet: Float64,
 ) -> None:  # fmt: skip
-    """Add to quiet (2, rows, width) the ones and exposures of pixels behind clear stripes, of some columns.
+    """Add to quiet (2, rows, width) the ones and exposures of pixels behind clear stripes, every column_step columns.
 
     Pixels without a ray are left out. halo: (BINS, pixels) of `halo_shares`, without pixels if there is none. With a
     halo it is not dark behind a stripe of `signal` photons, and the expected halo and pedestal are subtracted from the

@@ -28,9 +28,9 @@ _SIDE: Final = 2 * VECTOR
 """Bytes before and behind the labels of a path, whole cache lines: labels beyond the ends, and its least L."""
 _LEAST_AT: Final = -VECTOR
 CHUNK: Final = 16
-"""Columns that go down and up together: enough that none waits for its own last step, few enough for the caches."""
+"""Columns that are stepped through together: enough that none waits for its last step, few enough for the caches."""
 _AHEAD: Final = 3
-"""Rows ahead of which memory is asked for: each lies on a page of its own, which the processor does not foresee."""
+"""Rows by which memory is asked for ahead: each lies on a page of its own, which the processor does not foresee."""
 _SET, _ADD, _TOTAL = 0, 1, 2
 
 
@@ -38,13 +38,13 @@ ONE: Final = 16
 TWO: Final = 24
 THREE: Final = 30
 JUMP: Final = 40
-"""Costs of a change of label between neighbours, of 1, 2 or 3 labels, or of any other, in units of
-`rig.estimate.joint.labels.costs`: counted in nats a change costs more the more exposures there are."""
+"""Costs of a change of label between neighbours, P1, P2, P3 and J of the module, in units of
+`rig.estimate.joint.labels.costs`. A unit is more nats with more exposures, so a change then costs more nats."""
 
 
 @numba.njit(cache=True, nogil=True)
 def _path_memory(paths: int, labels: int) -> Uint8:
-    """Memory for L of the last pixel and of this one on so many paths; must live as long as the paths."""
+    """Memory for L of the last pixel and of this one on this many paths; it must live as long as they."""
     return np.full(2 * paths * (labels + 2 * _SIDE) + _SIDE, LARGEST, np.uint8)
 
 
@@ -56,7 +56,7 @@ def _paths_in(memory):  # type: ignore[no-untyped-def]
 
 @numba.njit(forceinline=True)
 def _begin(path, paths, labels):  # type: ignore[no-untyped-def]
-    """Begin so many paths: there is no message to their first pixel."""
+    """Begin a number of paths: there is no message to their first pixel."""
     for _ in range(2 * paths):
         for v in range(0, labels, VECTOR):
             store_bytes(path, v, zero_bytes())
@@ -66,10 +66,11 @@ def _begin(path, paths, labels):  # type: ignore[no-untyped-def]
 
 @numba.njit(forceinline=True)
 def _step(before, after, cost, message, total, hidden, labels, ahead, use):  # type: ignore[no-untyped-def]
-    """One step of a path: from L of its last pixel, at `before`, to L of this one, at `after`; all of these addresses.
+    """Do one step of a path: from L of its last pixel, at `before`, to L of this one, at `after`. All are addresses.
 
-    use: whether the message is written to `message`, added to it, or all of them and the cost make up `total`, without
-    the labels that are `hidden`. ahead: bytes to the cost and message that are to be fetched into the cache; 0: none.
+    use: _SET writes the message to `message`, _ADD adds it there, _TOTAL writes to `total` the sum of it, `message` and
+    cost, LARGEST for labels that are `hidden`. ahead: bytes to the cost and message that are to be fetched into the
+    cache; 0: none.
     """
     least = zero_bytes() + read_byte(before, _LEAST_AT)
     most = add_saturated_unsigned(least, JUMP)
@@ -86,7 +87,7 @@ def _step(before, after, cost, message, total, hidden, labels, ahead, use):  # t
         by_two = add_saturated_unsigned(by_two, TWO)
         by_three = add_saturated_unsigned(by_three, THREE)
         best = smaller_unsigned(smaller_unsigned(by_one, by_two), smaller_unsigned(by_three, load_bytes(before, v)))
-        # L is as it is, not less its least: what is subtracted at the end need not be waited for before.
+        # L keeps its least, which is subtracted from the message alone: no step waits for it earlier.
         sent = sub_saturated_unsigned(smaller_unsigned(best, most), least)
         here = add_saturated_unsigned(load_bytes(cost, v), sent)
         next_least = smaller_unsigned(next_least, here)
@@ -103,7 +104,7 @@ def _step(before, after, cost, message, total, hidden, labels, ahead, use):  # t
 
 @numba.njit(forceinline=True)
 def _both_ways(cost, message, paths, columns, labels, first, last, use):  # type: ignore[no-untyped-def]
-    """Steps first..last-1 from both ends of a row; cost, message, paths: addresses."""
+    """Do steps first..last-1 from both ends of a row; cost, message, paths: addresses."""
     size = labels + 2 * _SIDE
     to_right, to_left = first * labels, (columns - 1 - first) * labels
     before, after = paths + 2 * size * (first & 1), paths + 2 * size * (1 - (first & 1))
@@ -117,7 +118,7 @@ def _both_ways(cost, message, paths, columns, labels, first, last, use):  # type
 
 @numba.njit(cache=True, nogil=True)
 def _along_row(cost: int, message: int, columns: int, labels: int, paths: int) -> None:
-    """Messages of both ways along one row; all but numbers addresses."""
+    """Write the sums of the messages of both ways along one row; cost, message, paths: addresses."""
     _begin(paths, 2, labels)
     half = columns // 2
     # From both ends at once, two paths that do not wait for each other: to the middle there is nothing to add to.
@@ -143,8 +144,8 @@ def along_rows(cost: Uint8, message: Uint8, first_row: int, last_row: int) -> No
 
 @numba.njit(cache=True, nogil=True)
 def _step_down(before: int, after: int, cost: int, message: int, labels: int, columns: int, ahead: int) -> None:
-    """Step some columns of a row on their way down; all but numbers are addresses."""
-    # Apart from what surrounds it: all that the loop needs finds room in the registers.
+    """Step some columns of a row on their way down; before, after, cost, message: addresses."""
+    # A function of its own: all that the loop needs finds room in the registers.
     for _ in range(columns):
         _step(before, after, cost, message, 0, 0, labels, ahead, _ADD)
         before, after = before + labels + 2 * _SIDE, after + labels + 2 * _SIDE
@@ -179,7 +180,7 @@ def _go_up(
     cost: int, message: int, rows: int, row_bytes: int, columns: int, paths: int, pixel: int,
     desk: Readout,
 ) -> None:  # fmt: skip
-    """Totals of some columns and their answers, from the last row on; pixel: place of the first among the answers."""
+    """Find totals and answers of some columns, from the last row up. pixel: number of the first one's first answer."""
     labels = desk.labels
     width = row_bytes // labels
     before, after = paths, paths + CHUNK * (labels + 2 * _SIDE)
@@ -195,9 +196,9 @@ def _go_up(
 
 @numba.njit(cache=True, nogil=True)
 def along_columns(cost: Uint8, message: Uint8, first_column: int, last_column: int, desk: Readout) -> None:
-    """Answer columns first_column..last_column-1, from what `along_rows` left in all rows of message.
+    """Answer columns first_column..last_column-1, from what `along_rows` left in `message` for all rows.
 
-    Adds the messages from above to message. desk: pointers to the `Readout` of CHUNK columns.
+    Messages from above are added to `message`. desk: pointers to the `Readout` of CHUNK columns.
     """
     rows, columns, labels = cost.shape
     memory = _path_memory(CHUNK, labels)

@@ -2,11 +2,11 @@
 
 A block is BLOCK x BLOCK lines (rows of columns). Lines are added pixel by pixel of distance from the far end, without
 the pixels near their stripes. Both the ones counted and those expected from haze and ambient light are added. With K
-frames of a line, q the probability that ambient light leaves a pixel without a count and c that haze does,
+frames of a line, and q and c the probabilities that a pixel stays dark under ambient light alone and under haze alone,
 
     ones expected = sum over lines K (1 - q c) = sum over columns K (number of lines - c sum q)
 
-so that lines only add up their own parts, left and right of the stripe; the block's haze is multiplied with the sums.
+so lines only add up their q, left and right of the stripe, and these sums are multiplied with the block's c.
 Sums are float32 (block rows, block columns, pixels of distance), sixteen pixels to a vector.
 """
 
@@ -38,23 +38,24 @@ from rig.simd.memory import (
 from rig.simd.vectors import LANES, where_below, zero_float32
 
 BLOCK: Final = 4
-"""Rows, and columns, whose light is summed at once; a block is judged together with its eight neighbours."""
+"""Rows and columns of a block; it is judged together with its eight neighbours."""
 LEFT_OUT: Final = np.float32(0.0)
-"""Marks pixels that show nothing, since they always fire, among the probabilities of no one."""
+"""The probability of staying dark given to pixels that show nothing, since they always fire or must not be used."""
 PLACE_X, PLACE_BEGIN, PLACE_END, PLACES = 0, 1, 2, 4
 NOWHERE: Final = -(1 << 15)
 """PLACE_X of a line where nothing is searched, see `line_places`."""
 SEEN, STILL, HERE, FIELDS = range(4)
-"""Fields of a line: addresses of its counts and of `still` at pixel 0 of distance, and its number in the map."""
+"""Fields of a line: addresses of its counts and `still` at pixel 0 of distance, its number in the map; their number."""
 BEGIN, LEFT_END, RIGHT, END, LIMITS = range(5)
-"""Limits of a line, in pixels of distance: first, up to where it is left of the stripe, from where right, and end."""
+"""Limits of a line, in pixels of distance: its begin, the end of its part left of the stripe, the begin of its part
+right of the stripe, its end; their number."""
 
 
 class LineTable(NamedTuple):
-    """Lines of a block, addresses: int64 (BLOCK^2, FIELDS) and float32 (BLOCK^2, LIMITS), column by column.
+    """Addresses of the lines of a block, column by column, and of what belongs to them.
 
-    ends, frames: int64 and float32 (BLOCK,), the number of lines up to the end of each column, and its frames. order:
-    0, 1, ... as float32.
+    lines: int64 (BLOCK^2, FIELDS); limits: float32 (BLOCK^2, LIMITS); ends, frames: int64 and float32 (BLOCK,), number
+    of lines up to the end of each column, and its frames; order: 0, 1, ... as float32.
     """
 
     lines: int
@@ -66,7 +67,7 @@ class LineTable(NamedTuple):
 
 @numba.njit(cache=True, nogil=True)
 def line_places(sweep: Sweep, x_far: Float64, side: int, pixels: int) -> Int16:
-    """Places of the lines of all rows and columns, int16 (rows, columns, PLACES); made once per model.
+    """The places of the lines of all rows and columns, int16 (rows, columns, PLACES); made once per model.
 
     PLACE_X: x of pixel 0 of distance, the leftmost of `pixels`, NOWHERE where nothing is searched; PLACE_BEGIN,
     PLACE_END: first pixel of distance that is searched and was stored, and the one after the last.
@@ -94,9 +95,9 @@ def sum_lines(
 ) -> None:  # fmt: skip
     """Write the sums of a block to the addresses to_ones and to_expected.
 
-    inner: first and last pixel between which all lines are left of their stripes, and the same for right of them.
-    as_bytes: whether counts are bytes, else float32. clear: address of the probabilities that haze leaves a pixel
-    without a count, left and right of the stripe.
+    inner: begin and end of the pixels in which all lines are left of their stripes, and of those in which all are right
+    of them. as_bytes: whether counts are bytes, else float32. clear: address of the probabilities that a pixel stays
+    dark under haze alone, left and right of the stripe.
     """
     none, order, one = zero_float32(), load_float32(table.order, 0), zero_float32() + np.float32(1.0)
     for v in range(0, pixels, LANES):
@@ -138,14 +139,14 @@ def sum_lines(
 
 
 HAZE_BLOCKS: Final = 4
-"""Blocks above one another that haze is worked out for at once: it changes slowly from row to row."""
+"""Blocks above one another for which haze is computed together: it changes slowly from row to row."""
 HAZE_STEP: Final = 8
-"""Pixels from one place where haze is worked out to the next."""
+"""Pixels from one place where haze is computed to the next."""
 _IN_ORDER: Final = np.arange(LANES, dtype=np.float32)
 
 
 class Blocks(NamedTuple):
-    """Sums per block: float32 (block rows, block columns, pixels of distance), of ones and of expected ones.
+    """Sums of ones and of expected ones in each block, float32 (block rows, block columns, pixels of distance).
 
     The number of pixels is a multiple of LANES.
     """
@@ -155,9 +156,9 @@ class Blocks(NamedTuple):
 
 
 class _Map(NamedTuple):
-    """Addresses of the arrays in which lines are looked up.
+    """The arrays in which lines are looked up, and their sizes.
 
-    x_px, place, x0, n_frames, counts: first elements; still: pixel 0 of the first row.
+    x_px, place, x0, n_frames, counts: addresses of the first elements; still: address of pixel 0 of the first row.
     """
 
     x_px: int
@@ -224,7 +225,7 @@ def sum_blocks(
 
 @numba.njit(forceinline=True)
 def _ask_for_block(seen: _Map, by: int, before: int) -> None:
-    """Prefetch the counts of the block after `before`, and the places and stripes of the fourth: none is foreseen."""
+    """Prefetch counts of the block after `before`, places and stripes of the fourth: the processor foresees none."""
     row_bytes, top = seen.window * seen.count_bytes, by * BLOCK
     for y in range(top, min(top + BLOCK, seen.rows)):
         there = y * seen.columns + (before + 4) * BLOCK
@@ -239,9 +240,9 @@ def _ask_for_block(seen: _Map, by: int, before: int) -> None:
 def _list_lines(
     seen: _Map, table: LineTable, by: int, bx: int, aside: np.float32, counts_size: int, still_size: int
 ) -> tuple[int, bool, tuple[np.float32, np.float32, np.float32, np.float32]]:
-    """Write the lines of a block into the table, those without pixels left out.
+    """Write the lines of a block that have pixels into the table.
 
-    Their number, whether all vectors of theirs may be read where they are, and `inner` of `sum_lines`. Sizes: of
+    Returns their number, whether all their vectors may be read where they are, and `inner` of `sum_lines`. Sizes: of
     counts, and of `still` from pixel 0 on.
     """
     number, readable, all_pixels = 0, seen.count_bytes == 1, np.float32(seen.pixels)
@@ -281,7 +282,7 @@ def _copy_lines(
     counts: Counts, still: Float32, place: Int16, x0: Int32, width: int, number: int, lines: NDArray[np.int64],
     spare: Float32,
 ) -> None:  # fmt: skip
-    """Copy what lines show to `spare`, counts as float32, and have them point there.
+    """Copy counts, as float32, and `still` of lines to `spare`, and have `lines` point there.
 
     At the ends of an array, and of counts that are no bytes, vectors cannot be read where they are.
     """
@@ -297,7 +298,7 @@ def _copy_lines(
 
 @numba.njit(cache=True, nogil=True)
 def _clear_beside(sweep: Sweep, state: RowState, y: int, c: int, start: int, side: int, clear: Float32) -> None:
-    """Probability of no one by haze left and right of a stripe, (2, pixels + 1), in pixels from `start` on.
+    """Fill clear (2, pixels + 1), chances to stay dark under haze alone, left and right of a stripe, from `start` on.
 
     Straight lines between every HAZE_STEP pixels. Pixels without a ray have that of the nearest one with a ray.
     """

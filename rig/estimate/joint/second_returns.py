@@ -1,17 +1,17 @@
 """Second returns: a second line of light beside the stripe, from a pane before a wall, a twig, a flake of snow.
 
 In haze a row cannot answer with both surfaces, because the light behind the nearer one excludes that the haze ends
-there. So the light of the nearer one is looked for in the counts. It exceeds the haze by too little to be seen in a
-single row. Light is first summed over blocks of rows and columns (`rig.estimate.joint.second_return_blocks`) and
-compared with the light expected from haze and ambient light, pixel by pixel of distance from the far end. Then each row
-is examined itself, with its neighbours. Let own and block be the light of a candidate in standard deviations, over its
-own neighbourhood and in its block. The probability that it is right is
+there. So the light of the nearer one is looked for in the counts. In a single row it exceeds the haze by too little to
+be seen. So light is first summed over blocks of rows and columns (`rig.estimate.joint.second_return_blocks`) and
+compared with what haze and ambient light bring, pixel by pixel of distance from the far end. Then each row is examined
+itself, with its neighbours. Let own and block be the light of a candidate in standard deviations, pooled over its own
+neighbours and over its block's. The probability that it is right is
 
     logit confidence2 = LOG_ODDS . (1, own, block)
 
 Positions x2_px and confidence2 are float32 (rows, columns), NaN and 0 where nothing stands out. LOG_ODDS are fitted to
-maps with a pane over a third of them and to maps without any. Limits: light within APART_PX plus LINE_SIGMAS widths of
-the line from a stripe counts as the stripe's own, so closer surfaces are not separated.
+maps with a pane over a third of them and to maps without any. Light within APART_PX plus LINE_SIGMAS widths of the line
+from a stripe counts as the stripe's own, so closer surfaces are not separated.
 """
 
 from typing import Final, NamedTuple
@@ -35,17 +35,17 @@ from rig.threads import RowWorkers, Work
 RING_PX: Final = 4
 """Pixels to either side of where light is looked for that tell whether haze is as strong as was learned."""
 GAP_PX: Final = 1
-"""Pixels between the light that is looked for and those."""
+"""Pixels between the light that is looked for and those of the ring."""
 LEAST_RING: Final = 0.25
-"""Share of those pixels that must be seen on each side."""
+"""Least light expected on each side of the ring, per pixel over that of the candidate: with less, too few were seen."""
 STEEPER: Final = 1.5
-"""Factor on the excess haze of the ring's brighter side: haze between its two sides is not straight."""
+"""Factor on the excess haze of the ring's brighter side: between its two sides haze is no straight line."""
 CANDIDATE: Final = np.float32(4.0)
-"""Standard deviations from which a block's light is looked at more closely."""
+"""Standard deviations above which a block's light is a candidate."""
 REACH: Final = 3
-"""Rows and columns to either side that light is pooled over in the end."""
+"""Rows and columns to either side over which a candidate's own light is pooled."""
 LOG_ODDS: Final = -16.0, 0.4, 3.0
-"""Log odds that a candidate is right are these times 1 and the standard deviations of its light and its block's."""
+"""Factors of the log odds that a candidate is right, see the module."""
 _AROUND: Final = -(-(RING_PX + GAP_PX + 6) // LANES) * LANES
 """Room beside the pixels of distance: whatever the line's reach, up to 6 px."""
 
@@ -66,8 +66,7 @@ class Seconds(NamedTuple):
     """Candidates of second returns, float32 (rows, columns) each.
 
     distance: from the far end in px, NaN if there is no candidate; ones, expected: within the line's reach of it;
-    light,
-    moment: ones above those expected, and that times the distance in px; moved: see `move_seconds`.
+    light, moment: ones above those expected, and that times the distance from it in px; moved: see `move_seconds`.
     """
 
     distance: Float32
@@ -80,7 +79,7 @@ class Seconds(NamedTuple):
 
 @numba.njit(cache=True, nogil=True, error_model="numpy")
 def find_candidates(blocks: Blocks, reach: int, side: int, first_block: int, last_block: int, out: Candidates) -> None:
-    """Fill rows of blocks first_block..last_block-1. reach: half-width of the line's light, px."""
+    """Find the candidates of rows of blocks first_block..last_block-1. reach: half-width of the line's light, px."""
     rows, columns, pixels = blocks.ones.shape
     three = np.zeros((2, columns, pixels), np.float32)
     nine, above = np.zeros((2, pixels + 2 * _AROUND), np.float32), np.empty(pixels, np.float32)
@@ -109,7 +108,7 @@ def find_candidates(blocks: Blocks, reach: int, side: int, first_block: int, las
 
 @numba.njit(cache=True, nogil=True)
 def _add_lines(first: int, apart: int, number: int, size: int, total: int) -> None:
-    """The sum of some lines of `size` numbers, `apart` bytes from one another; first, total: addresses."""
+    """Write the sum of some lines of `size` numbers, `apart` bytes from one another; first, total: addresses."""
     for i in range(0, size, LANES):
         lines = load_float32(first, i)
         for k in range(1, number):
@@ -119,7 +118,7 @@ def _add_lines(first: int, apart: int, number: int, size: int, total: int) -> No
 
 @numba.njit(cache=True, nogil=True)
 def _light_above(room: int, pixels: int, reach: int, excess: int) -> np.float32:
-    """Write the light around each pixel above what CANDIDATE allows to `excess`; returns the most. Addresses all."""
+    """Write each pixel's light beyond CANDIDATE standard deviations to `excess`; the most. room, excess: addresses."""
     row, most = pixels + 2 * _AROUND, zero_float32()
     for i in range(0, pixels, LANES):
         ones, expected = zero_float32(), zero_float32()
@@ -135,7 +134,7 @@ def _light_above(room: int, pixels: int, reach: int, excess: int) -> np.float32:
 
 @numba.njit(cache=True, nogil=True, error_model="numpy")
 def _stands_out(sums: Float32, i: int, reach: int) -> tuple[float, float]:
-    """Standard deviations of the light around i above the haze that its ring shows; that haze over the learned one."""
+    """Light around i above the haze that its ring shows, in standard deviations; that haze over the learned one."""
     n, e = sums[0, i - reach : i + reach + 1].sum(), sums[1, i - reach : i + reach + 1].sum()
     more = 1.0
     # Light that only falls off to one side is a halo of the stripe or haze that was learned too weak.
@@ -153,8 +152,7 @@ def measure_seconds(
     counts: Counts, n_frames: Int32, sweep: Sweep, state: RowState, still: Float32, x_far: Float64, side: int,
     apart: float, reach: int, x_px: Float32, haze: Float32, first_row: int, last_row: int, out: Seconds,
 ) -> None:  # fmt: skip
-    """Fill everything but distance for candidates of rows first_row..last_row-1; 0 near a stripe and without a
-    candidate.
+    """Fill ones, expected, light and moment of rows first_row..last_row-1: 0 near a stripe and without a candidate.
 
     state, still: see `SecondLight`; haze: of `Candidates`.
     """
@@ -162,7 +160,7 @@ def measure_seconds(
     alone = still[LANES:-LANES].reshape(sweep.u.shape)
     for y in range(first_row, last_row):
         for c in range(x_px.shape[1]):
-            # Whatever an earlier map left there: neighbours pool it where the distance is known, searched or not.
+            # What an earlier map left must go: neighbours pool it wherever the distance is known, searched or not.
             out.ones[y, c] = out.expected[y, c] = out.light[y, c] = out.moment[y, c] = 0.0
             place = np.float32(x_far[y, c]) + out.distance[y, c]
             if np.isnan(place) or np.isnan(x_px[y, c]) or sweep.x_lo[y, c] > sweep.x_hi[y, c]:
@@ -192,7 +190,7 @@ def measure_seconds(
 
 @numba.njit(cache=True, nogil=True, error_model="numpy")
 def move_seconds(reach: int, first_row: int, last_row: int, seconds: Seconds) -> None:
-    """Fill moved: distance of each candidate, moved to the middle of the light around it, pooled over neighbours."""
+    """Fill moved, the distance of the middle of the light around each candidate, pooled; at most `reach` px from it."""
     moved = seconds.moved
     distance = with_margin(seconds.distance, first_row, last_row)
     moment, light = with_margin(seconds.moment, first_row, last_row), with_margin(seconds.light, first_row, last_row)
@@ -214,8 +212,8 @@ def judge_seconds(
 ) -> None:  # fmt: skip
     """Fill x2_px and confidence2 of rows first_row..last_row-1; NaN and 0 where nothing stands out.
 
-    The significance of a candidate's light, pooled over neighbours, is the signed root of twice the gain in
-    log-likelihood of Poisson counts, in standard deviations, which holds for few photons too. sure: of `Candidates`.
+    The light of a candidate in standard deviations, pooled over neighbours, is the root of twice the gain in
+    log-likelihood of Poisson counts, which holds for few photons too. sure: of `Candidates`.
     """
     distance = with_margin(seconds.distance, first_row, last_row)
     ones, expected = with_margin(seconds.ones, first_row, last_row), with_margin(seconds.expected, first_row, last_row)
@@ -234,20 +232,19 @@ def judge_seconds(
 
 
 APART_PX = 2.0
-"""Light so far from a stripe, and further by LINE_SIGMAS widths of the line, is not its own."""
+"""Light farther from a stripe than this plus LINE_SIGMAS widths of the line is not its own."""
 LINE_SIGMAS = 2.5
 LIGHT_SIGMAS = 1.5
-"""Widths of the line to either side that its light is looked for in."""
+"""Widths of the line to either side in which its light is looked for."""
 
 
 class SecondLight(NamedTuple):
     """Inputs of the search for second returns from a model; made once per model by `second_light`.
 
-    state: without ambient light. still: float32, (rows x width) between LANES numbers at either end, probability of no
-    one from ambient light alone; LEFT_OUT for pixels that always fire or must not be used, which show neither haze nor
-    stripes.
-    place: of `line_places`. apart: px from a stripe within which light counts as its own. reach: px to either side of a
-    line.
+    state: without ambient light. still: float32, (rows x width) between LANES numbers at either end, the probability
+    that a pixel stays dark under ambient light alone; LEFT_OUT for pixels that always fire or must not be used, which
+    show neither haze nor stripes. place: of `line_places`. apart: px from a stripe within which light counts as its
+    own. reach: px to either side of a line.
     """
 
     state: RowState
@@ -258,7 +255,7 @@ class SecondLight(NamedTuple):
 
 
 def second_light(state: RowState, line_sigma_px: float, grid: LabelGrid, sweep: Sweep) -> SecondLight:
-    """The inputs of the search under `state`: light of haze and ambient light."""
+    """The inputs of the search under `state`, for a line of this width."""
     still = np.where(hot_in_bands(state.ambient), LEFT_OUT, np.exp(-state.ambient))
     return SecondLight(
         state._replace(ambient=np.zeros_like(state.ambient)),
@@ -270,7 +267,7 @@ def second_light(state: RowState, line_sigma_px: float, grid: LabelGrid, sweep: 
 
 
 class SecondRoom(NamedTuple):
-    """Working memory for the search, reused from map to map, since new memory is slow."""
+    """Working memory of the search, used for all maps, since new memory is slow."""
 
     blocks: Blocks
     candidates: Candidates
@@ -305,7 +302,7 @@ def second_returns(
     def look(first: int, last: int) -> None:
         sum_blocks(*seen, light.place, side, apart, x_px, first, last, blocks)
         here = slice(first * BLOCK, last * BLOCK)
-        seconds.distance[here] = x2_px[here] = np.nan  # of neighbours of those that are asked, too
+        seconds.distance[here] = x2_px[here] = np.nan  # also for rows that are not asked: neighbours read them
         confidence2[here] = 0.0
 
     workers.over(block_rows, look)

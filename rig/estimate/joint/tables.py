@@ -23,12 +23,16 @@ from rig.simd.memory import aligned_zeros
 from rig.threads import RowWorkers
 
 MOST_BYTES = 4 << 30
-"""Costs and messages of a map may take so much: room for 1000 columns, each searched over all of 1024 x 1024 pixels.
+"""Most that costs and messages of a map may take: room for 1000 columns, each searched over all of 1024 x 1024 pixels.
 Tables of a halo come on top, half as much there."""
 
 
 class JointTables(NamedTuple):
-    """Everything that is made once per model, with its inputs; see the module that makes each."""
+    """Everything that is made once per model, with its inputs; see the module that makes each.
+
+    shares: of `profile_table`. halo: of `halo_shares`, without pixels if there is no halo. dark: whether there are dark
+    frames.
+    """
 
     grid: LabelGrid
     costs: Costs
@@ -42,15 +46,13 @@ class JointTables(NamedTuple):
     dark: bool
     settings: AnswerSettings
     rooms: dict[int, tuple[CostRoom, CostRoom]]
-    """Working memory for costs by the first row of its thread, and `pointers` to it: to make them takes 0.5 ms."""
+    """By the first row of a thread, its working memory for costs and `pointers` to it: making them takes 0.5 ms."""
     pairs: Float32
     """Pairs of `pairs_to_ask`, for maps whose columns all have frames."""
 
 
 class Memory(NamedTuple):
-    """Memory that is reused for one map after the other: costs and messages (rows, columns, labels) uint8, and the
-    answers.
-    """
+    """Memory that all maps use in turn: costs and messages, uint8 (rows, columns, labels), and the answers."""
 
     cost: Uint8
     message: Uint8

@@ -1,8 +1,8 @@
 """Temporal prior of `joint`: where a surface was clear in the last map, places far from it cost a little more.
 
-If the last map's label was b, a label l costs min(SLOPE max(|l - b| - FREE, 0), c MOST) more, where c is between 0 and
-1 by the confidence of the last answer. MOST is far less than the cost of a jump between neighbours and than the
-evidence of a stripe's photons, so where something has moved its rows outvote the prior. Nothing accumulates over maps.
+If the last map's label was b, a label l costs min(SLOPE max(|l - b| - FREE, 0), c MOST) more, where c rises from 0 to 1
+with the confidence of the last answer. MOST is far less than the cost of a jump between neighbours, and than the
+evidence of a stripe's photons. So where something has moved, its rows outvote the prior. Nothing adds up over maps.
 """
 
 import numba
@@ -19,13 +19,13 @@ from rig.simd.memory import address_of, load_bytes, store_bytes
 from rig.simd.vectors import add_saturated_unsigned
 
 MOST = 3
-"""Most that a label costs more, in units as all costs (`UNITS`). With 6, dark things that move are held back."""
+"""Most that the prior adds to a label's cost, in units (`UNITS`). With 6, dark things that move would be held back."""
 SLOPE = 2
-"""Units for each label farther off."""
+"""Units for each label that is farther off."""
 FREE = 1
-"""Labels from the last one that cost nothing: its own error, and surfaces that drift."""
+"""Labels of distance that cost nothing: the last label has an error, and surfaces drift."""
 LEAST_SURE = 0.5
-"""Confidence up to which an answer leaves nothing."""
+"""Confidence up to which an answer leaves nothing to the next map."""
 
 
 class TemporalPrior:
@@ -56,7 +56,7 @@ class TemporalPrior:
             self._ramps = _ramps(grid.labels)
 
     def add(self, volume: CountVolume, first: int, last: int, cost: Uint8) -> None:
-        """Add to the costs (rows, columns, labels) of rows first..last-1."""
+        """Add the prior to the costs (rows, columns, labels) of rows first..last-1."""
         if self.before is not None and self._ramps is not None:
             _add_ramps(self.before, volume.n_frames, self._ramps, first, last, cost)
 
@@ -76,7 +76,7 @@ class TemporalPrior:
 
 
 def _ramps(labels: int) -> Uint8:
-    """Cost that is added to the label i - labels beyond the last one, for each limit of it: (MOST + 1, 2 labels)."""
+    """Costs to add, uint8 (MOST + 1, 2 labels): by their limit, and by label less last label plus `labels`."""
     away = np.abs(np.arange(2 * labels) - labels)
     ramp = SLOPE * np.maximum(away - FREE, 0)
     return np.asarray(np.minimum(ramp, np.arange(MOST + 1)[:, None]), np.uint8)

@@ -6,9 +6,9 @@ those of the four nearest neighbours; the winner is the one with the least
 
     sum over 5 x 5 neighbours of margin min(|label - its label|, FAR),
 
-unless the row's own counts make it worse than the old one by more than OBJECTION. The new margin is the neighbours'
-average support for the label minus that for others, so labels on which streaks disagree are not certain. Labels are
-int16, margins uint8 in units of cost; sums fit 16 bits (SHARE).
+unless the row's own counts make it worse than the old one by more than OBJECTION. The new margin is the sum of the
+margins for the label less that of the margins for others, over the number of neighbours and at least 0. So labels on
+which streaks disagree are not certain. Labels are int16, margins uint8 in units of cost; sums fit 16 bits (SHARE).
 """
 
 from typing import Final, NamedTuple
@@ -38,13 +38,13 @@ REACH: Final = 2
 """Rows and columns to either side that vote."""
 SHARE_BITS: Final = 2
 SHARE: Final = 1 << SHARE_BITS
-"""Units of margin to a vote: so 16 bits hold what all neighbours say."""
+"""Units of margin to a vote: so 16 bits hold the votes of all neighbours."""
 NOWHERE: Final = 30000
-"""Label of what lies outside the picture: farther than FAR from all others, so that it is never elected."""
+"""Label outside the picture: farther than FAR from all others, so that it is never elected."""
 
 
 class Ballots(NamedTuple):
-    """Labels and votes of a map, used during a vote, with a margin of REACH rows and columns without votes.
+    """Labels and votes of a map, with REACH rows and columns, at least, without votes on every side.
 
     label: float32 as answered; whole: int16, the nearest integer; votes: int16, the margin over SHARE.
     """
@@ -76,13 +76,13 @@ def collect(answer: LabelAnswers, first_column: int, last_column: int, out: Ball
 
 
 NEIGHBOURS_PX: Final = 3.0
-"""Columns farther apart have no vote: in dense fog they know too little of one another."""
+"""Distance of columns above which there is no vote: in dense fog they know too little of one another."""
 WEAK: Final = 48
-"""Margin, in units of cost, from which an answer stands."""
+"""Margin, in units of cost, from which on an answer stands without a vote."""
 OBJECTION: Final = 8
-"""Units of cost by which the row's own counts may speak against what the neighbours say."""
+"""Most units of cost by which the row's own counts may be against the label that the neighbours elect."""
 FAR: Final = 16
-"""Labels from which on all are equally far off."""
+"""Distance in labels from which on all are equally far off."""
 SAME: Final = 2
 """Labels no farther apart speak for one another: a pixel."""
 _CANDIDATES: Final = 5
@@ -129,7 +129,7 @@ def _vote_rows(hall: _Hall, rows: int, first_row: int, last_row: int) -> None:
 
 @numba.njit(cache=True, nogil=True)
 def _elect_row(hall: _Hall, y: int) -> None:
-    """Elect the candidate that the neighbours of each answer of row y are for."""
+    """Elect a candidate for each weak answer of row y."""
     line = (y + REACH) * hall.width + REACH
     for c in range(0, hall.columns, LANES):
         weak = _weak_lanes(hall.ballots.votes, line + c, hall.columns - c)
@@ -150,7 +150,7 @@ def _elect_row(hall: _Hall, y: int) -> None:
 
 @numba.njit(cache=True, nogil=True)
 def _settle_row(hall: _Hall, y: int, high: int) -> None:
-    """Let the counts of row y object, and write its answers; high: rows that vote."""
+    """Let the counts of row y object, and write its weak answers; high: number of rows that vote."""
     line, down = (y + REACH) * hall.width + REACH, np.float32(1.0 / high)
     for c in range(0, hall.columns, LANES):
         pixel, at = y * hall.columns + c, line + c
@@ -182,7 +182,7 @@ def _settle_row(hall: _Hall, y: int, high: int) -> None:
 
 @numba.njit(forceinline=True)
 def _weak_lanes(votes, at, end):  # type: ignore[no-untyped-def]
-    """Bits of those of LANES answers that are weak; there are none from `end` on."""
+    """A number with a bit for each of LANES answers, set if it is weak; there are no answers from `end` on."""
     strong = equal_mask(smaller(load_int16(votes, at), np.int16(WEAK // SHARE)), np.int16(WEAK // SHARE))
     return ~np.int64(strong) & ((1 << min(LANES, end)) - 1)
 
@@ -219,7 +219,7 @@ def _apart(label, other):  # type: ignore[no-untyped-def]
 
 @numba.njit(forceinline=True)
 def _elect(against):  # type: ignore[no-untyped-def]
-    """The first candidate of each lane that least speaks against."""
+    """The first candidate of each lane with the least against it."""
     none, least = zero_int16(), load_int16(against, 0)
     best = none
     for k in range(1, _CANDIDATES):

@@ -2,11 +2,11 @@
 
 With S(l) the totals of a pixel (uint8, LARGEST if a label is excluded) and l* the label with the least total,
 
-    label  = sum of l w(l) / sum of w(l) over |l - l*| <= r,     w(l) = exp(-beta (S(l) - S(l*)) / UNITS)
+    label  = sum of l w(l) / sum of w(l) over |l - l*| <= r,     w(l) = exp(-BETA (S(l) - S(l*)) / UNITS)
     margin = min of S(l) over |l - l*| >= MARGIN_FROM  -  S(l*)
 
 r is REACH, or less if labels on either side are excluded. label is float32, margin uint8, (rows, columns). Several
-columns of a row are read at a time, in short rounds over the columns, so that others proceed while one waits.
+columns of a row are read at a time, in short steps for all of them, so that others proceed while one waits.
 """
 
 from typing import Final, NamedTuple
@@ -38,21 +38,21 @@ REACH: Final = 4
 MARGIN_FROM: Final = 3
 """Labels from the winner at which the margin's rivals begin: 1.5 pixels."""
 LARGEST: Final = 255
-"""Largest cost and total: of a label that is excluded."""
+"""Largest cost and total, those of a label that is excluded."""
 TAPS: Final = 2 * REACH + 1
 POWERS: Final = 4
-"""Numbers that are summed at once: powers 0 and 1 of the distance, and two zeros."""
+"""Numbers that are summed at once: powers 0 and 1 of the distance in labels, and two zeros."""
 VECTOR: Final = 32
 """Labels that are worked on at once."""
 MIDDLE: Final = VECTOR // 2
 UNITS: Final = 8.0
-"""Units of cost per nat of very few exposures; of K exposures UNITS / (1 + K / SHARP), see
+"""Units of cost per nat with very few exposures; with K exposures there are UNITS / (1 + K / SHARP), see
 `rig.estimate.joint.labels.costs`.
 """
 
 
 BETA: Final = 0.5
-"""A label weighs exp(-BETA * excess of its total / UNITS)."""
+"""Steepness of the weights w(l) of the module."""
 
 
 class AnswerSettings(NamedTuple):
@@ -60,8 +60,7 @@ class AnswerSettings(NamedTuple):
 
     weights: float32 (256,), by a total's excess over the least. powers: float32 (REACH + 1, TAPS, POWERS), powers of
     the distance for each reach, 0 at taps beyond it. reach: uint8 (2^TAPS,), the reach if the taps of the set bits are
-    excluded.
-    near: uint8 (VECTOR,) with the winner at MIDDLE, LARGEST for labels that do not count for the margin.
+    excluded. near: uint8 (VECTOR,) with the winner at MIDDLE, LARGEST for labels that do not count for the margin.
     """
 
     stripes: int
@@ -72,7 +71,7 @@ class AnswerSettings(NamedTuple):
 
 
 class LabelAnswers(NamedTuple):
-    """Answers, (rows, columns) each. Positions are counted in labels, costs in units (`UNITS`).
+    """Answers of a map, (rows, columns) each. Positions are counted in labels, costs in units (`UNITS`).
 
     label: float32, mean of the labels around the one with the least total (the smaller of equal ones). The mean extends
     only as far as both sides have labels, since a single side would draw every answer to it. margin: uint8, the least
@@ -111,10 +110,8 @@ class Readout(NamedTuple):
 
     end: labels up to the end of the last block with stripes; size: bytes from the totals of a column to the next.
     around: uint8, totals of the columns, with at least a vector of LARGEST before and after each; totals: address of
-    the first one's.
-    hidden: uint8 (labels,), LARGEST for labels that are no stripe. Per column: least_label: int32, label of the least
-    total;
-    least: uint8, that total; moments: float32 (columns, POWERS).
+    the first one's. hidden: uint8 (labels,), LARGEST for labels that are no stripe. Per column: least_label: int32,
+    label of the least total; least: uint8, that total; moments: float32 (columns, POWERS), sums of weight times power.
     """
 
     settings: AnswerSettings
@@ -156,7 +153,7 @@ def _least_of(totals, desk):  # type: ignore[no-untyped-def]
 
 @numba.njit(forceinline=True)
 def _find_winners(columns, desk):  # type: ignore[no-untyped-def]
-    """The least total of each column and its label, the smallest such one."""
+    """Find the least total of each column and its label, the smallest of equal ones."""
     for c in range(columns):
         totals = desk.totals + c * desk.size
         least, label = _least_of(totals, desk), 0
@@ -169,7 +166,7 @@ def _find_winners(columns, desk):  # type: ignore[no-untyped-def]
 
 @numba.njit(forceinline=True)
 def _weigh(columns, desk):  # type: ignore[no-untyped-def]
-    """Sums of weight times each power over the labels around the winners, as far as both sides have some."""
+    """Sum weight times each power over the labels around the winners, as far as both sides have some."""
     settings = desk.settings
     for c in range(columns):
         around = desk.totals + c * desk.size + read_int32(desk.least_label, c)
@@ -205,7 +202,7 @@ def _write_answers(pixel, columns, desk):  # type: ignore[no-untyped-def]
 
 @numba.njit(cache=True, nogil=True, error_model="numpy")
 def answer_columns(pixel: int, columns: int, desk: Readout) -> None:
-    """Answer columns from their totals, which are overwritten. pixel: place of the first one's answer."""
+    """Answer columns from their totals, which are overwritten. pixel: number of the first one's answer."""
     _find_winners(columns, desk)
     _weigh(columns, desk)
     _hide_winners(columns, desk)
@@ -214,7 +211,7 @@ def answer_columns(pixel: int, columns: int, desk: Readout) -> None:
 
 @numba.njit(forceinline=True)
 def fetch_answers(pixel, columns, desk):  # type: ignore[no-untyped-def]
-    """Prefetch the memory of the answers."""
+    """Prefetch the memory of some columns' answers."""
     answer = desk.answer
     for at in (pixel, pixel + columns - 1):
         prefetch(answer.label + 4 * at)

@@ -17,7 +17,7 @@ from rig.simd import Float32, Float64
 NEIGHBOURHOOD_PX = 31
 """Side of the square of pixels whose mean a pixel is drawn to."""
 DEFECT_FLUX = float(FLUX_MAX)
-"""Ambient given to pixels not to be used: one that is always lit says the same of every hypothesis, nothing."""
+"""Ambient light given to pixels that must not be used: a pixel that always fires favours no hypothesis."""
 HOT_SIGMA = 6.0
 """Excess over the neighbours, in standard deviations, that makes a pixel hot: 1e-9 of good pixels pass."""
 
@@ -25,10 +25,10 @@ HOT_SIGMA = 6.0
 def ambient_map(
     tally: FrameTally, intensity: NDArray[np.uint32], geometry: SweepGeometry, quiet: Float64 | None
 ) -> Float32:
-    """Photons per exposure (rows, width) float32 from dark frames, `quiet` (2, rows, width) counts and hot pixels.
+    """Ambient light and dark counts of each pixel in photons per exposure, (rows, width), from all that shows them.
 
-    intensity: (rows, width), ones of each pixel within the windows. quiet: ones and exposures of each pixel while
-    clearly behind the stripe; None before any stripe is known. Ones minus the light of a halo may be negative.
+    intensity: (rows, width), ones of each pixel within the windows. quiet: (2, rows, width), ones and exposures of each
+    pixel while clearly behind the stripe; None before any stripe is known. Ones less those of a halo may be negative.
     """
     ones = np.zeros((geometry.rows, geometry.width))
     exposures = np.zeros_like(ones)
@@ -61,7 +61,7 @@ def _window_exposures(tally: FrameTally, geometry: SweepGeometry) -> NDArray[np.
 
 
 def _lowest_level(totals: NDArray[np.uint32]) -> float:
-    """A level that hardly any pixel lies below: 2nd percentile of the mean flux over the window."""
+    """A level that hardly any pixel lies below: half the flux of the 2nd percentile of their mean rates."""
     seen = totals[1] > 0
     if not seen.any():
         return 1e-5
@@ -70,7 +70,7 @@ def _lowest_level(totals: NDArray[np.uint32]) -> float:
 
 
 def _shrunk(ones: Float64, exposures: Float64) -> Float64:
-    """Flux per pixel: its own counts drawn to the local mean by as much as pixels are alike (empirical Bayes)."""
+    """Flux per pixel: its own, drawn to the local mean, more so the more alike pixels are (empirical Bayes)."""
     row_rates = ones.sum(1)[exposures.sum(1) > 0] / exposures.sum(1)[exposures.sum(1) > 0]
     overall = max(float(np.median(row_rates)), 1e-6)
     mean = np.full(ones.shape, overall)

@@ -26,16 +26,17 @@ from rig.simd import Float32, Float64, Int32
 from rig.threads import RowWorkers
 
 START_LINES, START_FRAMES = 512, 8192
-"""Lines (rows x columns) that tell which start of a first sweep is the likeliest, and how wide the light line is; and
-the exposures that they have together at least, as far as there are FIRST_LINES."""
+"""Lines (rows of columns) that tell which start of a first sweep is the likeliest, and how wide the laser line is; more
+of them, up to FIRST_LINES, if they have fewer exposures than START_FRAMES together."""
 FIRST_LINES = 2048
 LAST_LINES = 4096
 """Lines that the first and the last rounds over a first sweep read: 250 000 and 500 000 pixels."""
 AGAIN_LINES = 8192
 """Lines that teach once more when neighbours have told where their stripes are."""
 NEXT_LINES = 2048
-"""Lines read of a sweep that carries a model on; what the sweeps before it taught fades by FADE with each."""
+"""Lines that are read of each later sweep."""
 FADE = 0.7
+"""Factor on what earlier sweeps taught, with each later one."""
 WIDTH_EVIDENCE = 3.0
 """Natural logarithm of the odds from which the width moves."""
 FIRST_ROUNDS = 8
@@ -45,17 +46,17 @@ columns. Gains learned from fewer lines are noise, which the extinction cannot b
 MOST_TRUST = np.float32(0.98)
 """Largest trust in what neighbours say of a stripe, however sure they are: its own row may know better."""
 LEVELS = 14
-"""Sums per profile bin of an expectation, see `learn_rows`."""
+"""Number of sums per profile bin in an expectation, see `learn_rows`."""
 PIECES = 4
-"""Pieces that lines are summed in, whatever the number of threads."""
+"""Pieces in which lines are summed, whatever the number of threads."""
 AMPLITUDE_SPAN = 3.4
 """Natural logarithm of the ratio of the largest amplitude to the smallest: a factor of 30."""
 EVEN_SHARE = 0.25
 """Part of the prior over positions that stays even, whatever the map before looked like."""
 PRIOR_PHOTONS = 100.0
-"""Weight of the fitted exponential against each bin's own counts."""
+"""The fitted exponential counts, against each bin's own counts, as if so many photons had measured it."""
 START_EXTINCTIONS_PER_M = (0.0, 0.1, 0.4, 1.5)
-"""Extinctions that a first sweep is begun with: clear air to dense fog."""
+"""Extinctions with which a first sweep begins: clear air to dense fog."""
 
 
 class Expectation(NamedTuple):
@@ -68,7 +69,7 @@ class Expectation(NamedTuple):
     evidence: float
 
     def plus(self, other: "Expectation") -> "Expectation":
-        """Sums of both together."""
+        """The sums over the lines of both."""
         both: Any = zip(self, other, strict=True)
         return Expectation(*(one + more for one, more in both))
 
@@ -100,7 +101,7 @@ def lines_of(volume: CountVolume, where: tuple[Int32, Int32], known: StripeTable
 
 
 def expect(lines: Lines, geometry: SweepGeometry, model: RowModel, workers: RowWorkers) -> Expectation:
-    """Expectation step of `model` over some lines."""
+    """The expectation step of `model` over some lines."""
     sweep, state, hot_flux = sweep_of(geometry), state_of(model), model.hot_flux()
     # Fixed pieces, added in order: the sums do not depend on the number of threads.
     edges = np.linspace(0, len(lines.row), PIECES + 1).astype(int)
@@ -211,7 +212,7 @@ def fit_line_width(lines: Lines, geometry: SweepGeometry, model: RowModel, worke
 def _bins(geometry: SweepGeometry) -> tuple[float, float]:
     """First path inverse depth and bins per unit of it, with room for the margins outside the depth range."""
     near_m, far_m = geometry.depth_range_m
-    # Paths are longer than depths towards the picture's corners: up to a third for the fields of view met here.
+    # Paths are longer than depths towards the picture's corners, by up to a third with usual fields of view.
     w_lo, w_hi = 0.6 / far_m, 1.15 / near_m
     return w_lo, (BINS - 1) / (w_hi - w_lo)
 
@@ -255,7 +256,7 @@ def flux(ones: float, exposures: float) -> float:
 def maximise(
     model: RowModel, seen: Expectation, *, spread: bool, free_ambient: bool = False, gains: bool = True
 ) -> RowModel:
-    """The model that explains the weighted counts best.
+    """The model that explains the weighted counts best; one with a halo keeps its haze and amplitudes.
 
     spread: whether the amplitude grid may move. free_ambient: whether the level of ambient light was guessed and is
     learned as well. gains: whether to learn the strength of the haze per row and column; learned from few lines, or
@@ -302,7 +303,8 @@ def maximise(
 def _split_rest(rest: Float64, variance: Float64, haze: Float64) -> tuple[float, float]:
     """The level behind the stripe as ambient left over and a share (0 to 1) of the haze: light scattered twice or more.
 
-    Weighted fit of rest = excess + share * haze over the bins; without enough bins all of it is haze's, or nothing.
+    Weighted fit of rest = excess + share * haze over the bins. Both are 0 with fewer than 4 bins; the share is 0 if the
+    haze is too even.
     """
     known = np.isfinite(rest) & np.isfinite(haze) & (variance > 0)
     if known.sum() < 4:
@@ -318,7 +320,7 @@ def _split_rest(rest: Float64, variance: Float64, haze: Float64) -> tuple[float,
 
 
 def _level(sums: Float64) -> tuple[Float64, Float64]:
-    """Flux above ambient per unit geometry factor and its variance (BINS,), NaN in bins without data.
+    """Flux above ambient per unit geometry factor, and its variance, (BINS,); NaN in bins with few exposures.
 
     sums: (BINS, 4), ones, exposures, and exposures weighted with geometry factor and ambient flux.
     """
@@ -357,9 +359,9 @@ def _amplitudes(model: RowModel, mass: Float64, spread: bool) -> tuple[Float32, 
 
 
 def _position_prior(levels: Float64) -> Float64:
-    """Log density of stripes over the bins (BINS,), 0 where they are spread evenly; smooth, and never against a place.
+    """Smoothed log density of stripes over the bins (BINS,), 0 where they are spread evenly.
 
-    It decides only where a row hardly has photons; a quarter of it stays even: it says at most 1.4 nats against.
+    It decides only where a row hardly has photons. A quarter of it stays even, so no place loses more than 1.4 nats.
     """
     kernel = np.array([1.0, 2.0, 3.0, 2.0, 1.0])
     found, even = (np.convolve(np.pad(levels[:, i], 2), kernel, "valid") for i in (12, 13))
@@ -385,14 +387,14 @@ def _gain(gain: Float32, seen: Float64, ambient: float, before: Float64) -> Floa
 
 
 CUT: Final = 0.05
-"""Share of the depth range outside the picture up to which a row tells how often the stripe is missing."""
+"""Share of a row's depth range outside the picture below which the row tells how often stripes are missing."""
 CERTAIN: Final = 0.6
 """Probability within 1 px from which a row teaches the level behind the stripe."""
 CLEAR: Final = 0.97
 CLEAR_PX: Final = 6
-"""Rows as certain as this, and pixels as far before their stripe, measure the haze itself."""
+"""Rows more certain than CLEAR measure the haze itself, with pixels more than CLEAR_PX before their stripe."""
 LEAST_OWN: Final = 1e-3
-"""Least haze of a line, over that of the others at a pixel, that is told from none."""
+"""Least haze of a line over that of the other lines at a pixel: below it there is no telling them apart."""
 
 
 @numba.njit(cache=True, nogil=True)
@@ -400,14 +402,14 @@ def learn_rows(
     sweep: Sweep, state: RowState, lines: Lines, hot_flux: float, levels: Float64, rows_seen: Float64,
     columns_seen: Float64, amplitude_mass: Float64,
 ) -> float:  # fmt: skip
-    """Expectation step over some lines; returns the log evidence.
+    """Do the expectation step over some lines, and return the log evidence.
 
-    Adds to levels (bins, 14): ones, exposures, and exposures weighted with geometry factor and with ambient flux, first
-    of pixels before the stripe and then of pixels behind it, each weighted by the probability of being there, then of
-    pixels well before a stripe beyond doubt; then stripes, and stripes if all positions were equally likely. Adds to
-    rows_seen (rows, 2) and columns_seen (columns, 2): ones before the stripe, and those expected. Adds to
-    amplitude_mass (M + 1,): rows per amplitude, the last entry 'no stripe'. Pixels with more ambient flux than hot_flux
-    are left out.
+    levels (bins, LEVELS) gets ones, exposures, and exposures weighted with geometry factor and with ambient flux: 0 to
+    3 of pixels before the stripe and 4 to 7 of pixels behind it, each weighted by the probability of being there, 8 to
+    11 of pixels well before a stripe beyond doubt. 12 are stripes, 13 stripes if all positions were equally likely.
+    rows_seen (rows, 2) and columns_seen (columns, 2) get ones before the stripe and those expected; amplitude_mass
+    (M + 1,) gets rows per amplitude, the last entry 'no stripe'. All are added to what is there. Pixels with more
+    ambient flux than hot_flux are left out.
     """
     amplitudes = state.amplitude.shape[0]
     row = row_buffers(sweep.window, amplitudes)
@@ -440,7 +442,7 @@ def _learn_levels(
 ) -> None:  # fmt: skip
     """Add one row's pixels to the levels before and behind the stripe.
 
-    where: row, column and exposures; span: what `row_fluxes` says of it.
+    where: row, column and exposures; span: what `row_fluxes` returned for it.
     """
     (y, c, k), (length, first, last, start) = where, span
     step = 1 if sweep.near_is_left else -1

@@ -1,8 +1,8 @@
 """Inputs of the compiled row likelihood: the sweep, the learned state, and one row's fluxes in near-to-far order.
 
-A pixel sees the point where its ray meets the column's light plane. With paths c from the camera and p from the scanner
-to this point, G = row gain x column gain x c x p (both per unit of depth), w' = 2 w / (c + p) the path inverse depth,
-and haze, rest, S the profiles of `rig.estimate.row.model` at w',
+A pixel sees the point where its ray meets the column's light plane. Let w be the point's inverse depth, and c and p its
+paths from the camera and from the scanner, per unit of depth. With G = row gain x column gain x c x p, the path inverse
+depth w' = 2 w / (c + p), and haze, rest, S the profiles of `rig.estimate.row.model` at w',
 
     before = ambient + G haze(w') + others,    behind = ambient + G rest(w') + others,    scale = S(w')
 
@@ -31,7 +31,7 @@ from rig.simd import Float32, Float64, Int32
 
 
 def halo_shares(model: RowModel, pixels: int) -> Float32:
-    """rho at each profile bin and 0 to pixels - 1 px from the stripe, (BINS, pixels); 0 if there is no halo."""
+    """rho of the module at each profile bin and 0 to pixels - 1 px from the stripe, (BINS, pixels)."""
     reach = np.array(HALO_REACHES_PX)[:, None]
     shape = np.exp(-np.arange(pixels) / reach) / (2 * reach)
     return np.asarray(over_bins(np.asarray(model.halo), len(model.profile)) @ shape, np.float32)
@@ -148,7 +148,7 @@ def state_of(model: RowModel) -> RowState:
 
 @numba.njit(cache=True, nogil=True)
 def row_buffers(window: int, amplitudes: int) -> RowBuffers:
-    """Buffers for rows of up to `window` pixels."""
+    """Buffers for rows of up to `window` pixels and this number of amplitudes."""
     return RowBuffers(
         np.empty(window, np.float32), np.empty(window, np.float32), np.empty(window, np.float32),
         np.empty(window, np.float32), np.empty(window, np.int32), np.empty(window, np.float32),
@@ -162,16 +162,14 @@ def row_buffers(window: int, amplitudes: int) -> RowBuffers:
 @numba.njit(inline="always")
 def path_to_plane(px, py, pz, vy):  # type: ignore[no-untyped-def]
     """Length of the light's path to a plane's points on a row of tangent vy, per unit of depth."""
-    # Tangent at which this row meets the plane infinitely far away.
+    # Tangent u at which this row meets the plane infinitely far away.
     path_u = -(py * vy + pz) / px
     return np.sqrt(1.0 + path_u * path_u + vy * vy)
 
 
 @numba.njit(inline="always")
 def profile_place(px, py, pz, ux, vx, path_p, w_lo, per_w, bins):  # type: ignore[no-untyped-def]
-    """Path from the camera to a plane's point, per unit of depth; the point's path inverse depth and place among the
-    bins.
-    """
+    """Path from the camera to a plane's point, per unit of depth; the point's inverse depth, and its fractional bin."""
     path_c = np.sqrt(np.float32(1.0) + ux * ux + vx * vx)
     w = px * ux + py * vx + pz
     return path_c, w, min(max((w * 2.0 / (path_p + path_c) - w_lo) * per_w, 0.0), bins - 1.001)
@@ -179,15 +177,13 @@ def profile_place(px, py, pz, ux, vx, path_p, w_lo, per_w, bins):  # type: ignor
 
 @numba.njit(inline="always")
 def flux_between(ambient, gain, one, other, part):  # type: ignore[no-untyped-def]
-    """Flux of ambient light plus gain times the profile, interpolated between `one` of a bin and `other` of the next by
-    `part`.
-    """
+    """Flux of ambient light plus gain times the profile, a `part` of the way from `one` to `other`, the next bin's."""
     return min(max(ambient + gain * (one + part * (other - one)), FLUX_MIN), FLUX_MAX)
 
 
 @numba.njit(inline="always")
 def line_light(sweep, state, y, c, middle):  # type: ignore[no-untyped-def]
-    """Length of the light's path to the plane's points on row y per unit of depth, and the strength of the haze there.
+    """Length p of the light's path to the plane's points on row y, per unit of depth, and G of the module without c.
 
     middle: pixel of the row whose v is used.
     """
@@ -200,8 +196,8 @@ def line_light(sweep, state, y, c, middle):  # type: ignore[no-untyped-def]
 def others_at(sweep, state, y, c, x):  # type: ignore[no-untyped-def]
     """Haze at one pixel from the lines that are lit together with column c, on whichever side of c's stripe it lies.
 
-    The places of their own stripes are unknown. The probability that their haze has not ended there is taken as the
-    share of the depth range behind the pixel's point on their plane.
+    The places of their own stripes are unknown. The probability that a line's haze has not ended at the pixel is taken
+    as the share of the depth range behind the pixel's point on the line's plane.
     """
     profile, light = state.profile, 0.0
     ux, vx = np.float64(sweep.u[y, x]), np.float64(sweep.v[y, x])
@@ -221,8 +217,9 @@ def others_at(sweep, state, y, c, x):  # type: ignore[no-untyped-def]
 
 @numba.njit(inline="always")
 def fluxes_of(plane, ux, vx, ambient, profile, w_lo, per_w, path_p, strength):  # type: ignore[no-untyped-def]
-    """Flux before and behind the stripe, its scale, geometry factor, inverse depth and bin for one pixel, whose ray is
-    (ux, vx), without other lines.
+    """Flux before and behind the stripe, its scale, G, inverse depth and nearest bin of one pixel, without other lines.
+
+    ux, vx: the pixel's ray. path_p, strength: of `line_light`.
     """
     path_c, w, b = profile_place(plane[0], plane[1], plane[2], ux, vx, path_p, w_lo, per_w, profile.shape[0])
     i = int(b)
@@ -235,7 +232,7 @@ def fluxes_of(plane, ux, vx, ambient, profile, w_lo, per_w, path_p, strength):  
 
 @numba.njit(inline="always")
 def fluxes_at(sweep, state, y, x, c, path_p, strength):  # type: ignore[no-untyped-def]
-    """`fluxes_of` of one pixel for column c's stripe, with the contribution of other lines' haze to both fluxes."""
+    """`fluxes_of` of one pixel for column c's stripe, with other lines' haze in both fluxes and as a last number."""
     before, behind, scale, gain, w, cell = fluxes_of(
         sweep.plane[c], sweep.u[y, x], sweep.v[y, x], state.ambient[y, x], state.profile, state.w_lo, state.per_w,
         path_p, strength,
@@ -293,7 +290,7 @@ def row_fluxes(sweep: Sweep, state: RowState, row: RowBuffers, y: int, c: int) -
 def judge_line(
     sweep: Sweep, state: RowState, row: RowBuffers, lines: Lines, i: int
 ) -> tuple[int, int, int, int, float, float, float]:
-    """Compute the posterior of line i in `row`.
+    """Compute the posterior of line i, in `row`.
 
     Returns the values of `row_fluxes`, then the probability of 'no stripe', the share of its prior that is due to the
     picture's border, and the log evidence.

@@ -51,9 +51,9 @@ FLUX_MAX: Final = np.float32(2.0**EXPONENT_HIGH * 0.999)
 LABEL_PX: Final = 0.25
 """Spacing of the sub-pixel positions around the most probable pixel."""
 LABELS: Final = 13
-"""Sub-pixel positions, 1.5 px each way: the mean of the peak, not of its neighbours."""
+"""Number of sub-pixel positions, up to 1.5 px each way: enough for the mean of a peak, without the next one."""
 LOST: Final = np.float32(24.0)
-"""Log-likelihood below the best from which on a hypothesis does not count (exp(-24) = 4e-11)."""
+"""Nats below the best from which on a hypothesis does not count (exp(-24) = 4e-11)."""
 
 
 def logit_table() -> Float32:
@@ -80,10 +80,10 @@ def cell_of(flux):  # type: ignore[no-untyped-def]
 def add_evidence(
     n: Float32, k: Real, base: Float32, light: Real, scale: Float32, own: Float32, table: Float32, score: Float32
 ) -> None:
-    """score += log-likelihood of n ones in k frames at flux base + light * scale, minus `own`; all arrays have equal
-    length.
+    """Add to score the log-likelihood of n ones in k frames at flux base + light * scale, less `own`.
 
-    Fluxes must be at least FLUX_MIN. Written for the vectoriser: no branch, unsigned table index, slices from zero.
+    Arrays are equally long, fluxes at least FLUX_MIN. Written for the vectoriser: no branch, unsigned table index,
+    slices from zero.
     """
     gain, loss = table[0], table[1]
     for t in range(score.shape[0]):
@@ -154,11 +154,11 @@ def row_posterior(
     score: Float32, edge: Float32, length: int, first: int, last: int, log_weight: Float32, log_prior: Float32,
     none: tuple[float, float, float], posterior: Float32, by_amplitude: Float64,
 ) -> tuple[float, float]:  # fmt: skip
-    """Posterior (length,) over positions, summed over amplitudes; by_amplitude (M,) is summed over positions.
+    """Fill posterior (length,), of positions over all amplitudes, and by_amplitude (M,), of amplitudes over positions.
 
     none: prior of a row that is entirely behind its stripe (nearer than the picture), of one that is before it, and of
     one whose haze ends somewhere without a stripe. log_prior: of positions, up to a constant; log_weight: of
-    amplitudes. Returns (probability of 'no stripe', log evidence of the row).
+    amplitudes. Returns the probability of 'no stripe' and the row's log evidence, relative to 'everything is behind'.
     """
     mass = 0.0
     for j in range(first, last + 1):

@@ -1,10 +1,10 @@
 """The learned model of light and medium for the row likelihood. All of it is learned from counts.
 
-Path inverse depth w is 1 over the mean of the two path lengths, scanner to point and point to camera. There are two
-profiles over BINS bins of w, haze before the stripe and the level behind it, each multiplied by a gain per row and per
-column, since single-scattered haze depends on the two path lengths only. A stripe carries a S(w) photons, with a one of
-AMPLITUDES learned amplitudes (reflectance and laser power) and S = w^2 exp(-2 extinction / w), scaled to 1 in the
-middle bin.
+Path inverse depth w is 1 over the mean of the two path lengths, scanner to point and point to camera. Haze that was
+scattered once depends on these two lengths only. So there are two profiles over BINS bins of w, haze before the stripe
+and the level behind it, each multiplied by a gain per row and per column. A stripe carries a S(w) photons, where a is
+one of AMPLITUDES learned amplitudes (reflectance and laser power) and S = w^2 exp(-2 extinction / w), scaled to 1 in
+the middle bin.
 
 The line is a Gaussian of learned width, integrated over pixels (`pixel_shares`).
 """
@@ -24,14 +24,14 @@ from rig.simd import Float32, Float64
 BINS = 64
 """Bins of path inverse depth of the profiles."""
 AMPLITUDES = 4
-"""Stripe amplitudes that are learned, with their probabilities."""
+"""Number of stripe amplitudes that are learned, with their probabilities."""
 EXTINCTION_MAX_PER_M = 5.0
 HALO_NODES = 12
-"""Path inverse depths at which the halo is learned."""
+"""Number of path inverse depths at which the halo is learned."""
 HALO_REACHES_PX = (8.0, 16.0, 32.0, 64.0, 128.0)
-"""Reaches of the exponentials that make up a halo: no line is as wide, and the last one is even over most windows."""
+"""Reaches of the exponentials that make up a halo: all are wider than a line, the last is even over most windows."""
 OPTICAL_DEPTH_MAX = 50.0
-"""Most extinction times path at which haze is looked for: e^-100 of it would come back."""
+"""Largest extinction times path at which haze is looked for: e^-100 of it comes back."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -44,10 +44,9 @@ class RowModel:
     width) float32, photons per exposure of ambient light and dark counts. amplitude, weight: (AMPLITUDES,), photons at
     S = 1 and their probability.
     none_weight: probability of a row without stripe. line_sigma_px: width of the line. extinction_per_m and its
-    standard
-    deviation: NaN if the haze does not resolve it. halo: (HALO_NODES, reaches) float32, light of the stripe's halo over
-    its own (`rig.estimate.row.inputs`), 0 if there is none. before: labels that the previous map left to this one
-    (`rig.estimate.joint.temporal`), None if it left none.
+    standard deviation: NaN if the haze does not tell it. halo: (HALO_NODES, reaches) float32, light of the stripe's
+    halo over its own (`rig.estimate.row.inputs`), 0 if there is none. before: labels that the previous map left to this
+    one (`rig.estimate.joint.temporal`), None if it left none.
     """
 
     profile: Float32
@@ -72,9 +71,7 @@ class RowModel:
 
     @classmethod
     def from_arrays(cls, arrays: Mapping[str, NDArray[np.generic]]) -> "RowModel":
-        """The state from which `arrays` came, bit for bit. Raises KeyError if a field is missing that every version
-        has.
-        """
+        """The state from which `arrays` came, bit for bit. Raises KeyError if a field without a default is missing."""
         kept = {
             field.name: arrays[field.name]
             for field in fields(cls)
@@ -93,7 +90,7 @@ class RowModel:
 
 
 def stripe_scale(path_m: Float64, extinction_per_m: float) -> Float64:
-    """Relative strength of a stripe of given reflectance over distance, 1 at the middle of the inverse depth range."""
+    """Strength of a stripe of given reflectance at these path lengths, relative to that at the middle one."""
     log_scale = -2.0 * np.log(path_m) - 2.0 * extinction_per_m * path_m
     middle = len(path_m) // 2
     return np.asarray(np.exp(np.clip(log_scale - log_scale[middle], -30.0, 30.0)))
@@ -133,7 +130,7 @@ class HazeFit:
 
 
 def fit_haze(path_m: Float64, flux: Float64, variance: Float64) -> HazeFit | None:
-    """Weighted fit of an exponential to haze flux (bins,) with its variance (bins,); None if there is no haze.
+    """Weighted fit of an exponential to haze flux (bins,) with its variance (bins,); None with hardly any haze.
 
     Gauss-Newton on amplitude and extinction. The extinction is kept between 0 and EXTINCTION_MAX_PER_M, and below
     OPTICAL_DEPTH_MAX at the nearest haze.

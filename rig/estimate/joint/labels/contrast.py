@@ -1,18 +1,19 @@
 """Cost of every label from its own surroundings alone: a stripe is brighter than what lies beside it.
 
 With counts n of K frames at the pixels t around a label, shares w_t of the line in them (of sum 1), and p0 the share of
-firing pixels in BESIDE_PX to both sides over 2 ROWS + 1 rows,
+ones among the pixels BESIDE_PX to both sides in 2 ROWS + 1 rows,
 
     p = sum w_t n_t / K,    N = K / sum w_t^2
     score = N (p log(p / p0) + (1 - p) log((1 - p) / (1 - p0))) where p > p0, else 0,    in nats
 
-the log-likelihood ratio of 'p' over 'p0' for N frames, pooled as a matched filter pools them. As in
+which is the log-likelihood ratio of p over p0 for N frames, pooled as a matched filter pools them. As in
 `rig.estimate.joint.labels.costs`,
 
     cost(l) = units_per_nat (largest score of the row - score(l)),    uint8 (rows, columns, labels), <= COST_LIMIT
 
-These costs use no learned number but the width of the line. Where fog scatters light many times, a learned haze and
-halo can explain a wrong place, but they cannot mislead these; which in turn know nothing of haze that ends.
+These costs use no learned light; of what was learned they need only the line's width and which pixels are hot. Where
+fog scatters light many times, a learned haze and halo can explain a wrong place, but cannot mislead these costs. On the
+other hand, these costs know nothing of haze that ends.
 """
 
 from typing import Final, NamedTuple
@@ -32,26 +33,26 @@ from rig.simd.shuffles import reversed_lanes
 from rig.simd.vectors import LANES, as_bytes, larger_float, smaller_float, to_int16, zero_float32
 
 ROWS: Final = 6
-"""Rows to either side whose pixels beside a label are its surroundings too."""
+"""Rows to either side whose pixels are surroundings of a label too."""
 BESIDE_PX: Final = 4, 10
 """Pixels to either side of a label that are its surroundings, from and to."""
 REACH_PX: Final = 2
 """Pixels to either side of a label that its line falls on."""
 LEAST_ONES: Final = np.float32(0.5)
-"""Surroundings without a one are taken to have had so many."""
+"""Ones that surroundings without any are taken to have."""
 MOST_SHARE: Final = np.float32(1.0 - 1e-4)
-"""Largest share of firing pixels: scores stay finite."""
+"""Largest p and p0, so that scores stay finite."""
 _AHEAD: Final = 2
-"""Rows ahead of which memory is asked for."""
+"""Rows by which memory is asked for ahead."""
 
 
 class Contrast(NamedTuple):
     """Settings of these costs under one model.
 
-    place: int16 (columns, rows, PLACES) of `places_of`. hot_start, hot_x: as in `LabelTables`, of pixels that count
-    what the one beside them counts. shares: float32 (2, FRACTIONS, taps) of the line in the pixels around centres -4/8
+    place: int16 (columns, rows, PLACES) of `places_of`. hot_start, hot_x: as in `LabelTables`, of pixels that take the
+    count of the pixel beside them. shares: float32 (2, FRACTIONS, taps) of the line in the pixels around centres -4/8
     to 3/8 px off towards near, from far to near and from near to far. frames: float32 (FRACTIONS,), N for one frame.
-    side: 1 where near is left, else -1. width: pixels of a sensor's row; what is stored behind them is padding.
+    side: 1 if near is left, else -1. width: pixels of a sensor's row; what is stored behind them is padding.
     """
 
     place: Int16
@@ -130,7 +131,7 @@ def _fill(
                     contrast.frames[off] * frames, low, high, score[phase],
                 )  # fmt: skip
             none = _write_own(score, low, high, side, contrast.units_per_nat, own)
-            # `own` begins with the first stored pixel: so much before that is label 0.
+            # `own` begins with the first stored pixel, `skipped` pixels after the farthest one that holds a label.
             skipped = far - (high - 1) if side > 0 else low - far
             shift = (here[LABEL] + here[ODD]) % PHASES - PHASES * skipped - here[LABEL]
             first, end = max(int(here[LABEL]), -shift), min(int(here[LABEL_END]), PHASES * (high - low) - shift)
@@ -142,7 +143,7 @@ def _fill(
 
 @numba.njit(cache=True, nogil=True)
 def _mended(counts: Counts, contrast: Contrast, y: int, x0: int, n: Float32) -> Float32:
-    """Counts of a row as n holds them from REACH_PX on, hot pixels with those of the pixel beside them."""
+    """Fill n from REACH_PX on with a row's counts, hot pixels with that of the pixel beside them; returns that part."""
     window = counts.shape[0]
     mended = n[REACH_PX : REACH_PX + window]
     for t in range(window):
@@ -156,7 +157,7 @@ def _mended(counts: Counts, contrast: Contrast, y: int, x0: int, n: Float32) -> 
 
 @numba.njit(cache=True, nogil=True)
 def _note_pixels_beside(seen: int, pixels: Float32) -> None:
-    """Fill pixels with one over the number of a row's first `seen` pixels that are the surroundings of each."""
+    """Fill pixels with 1 over the number of surrounding pixels of each, among the first `seen` of a row."""
     begin, end = BESIDE_PX
     for t in range(seen):
         left = max(t - begin + 1, 0) - max(t - end, 0)
@@ -182,7 +183,7 @@ def _score_pixels(
     n: Float32, running: Float32, pixels: Float32, shares: Float32, seen: float, frames: float, pooled: float,
     low: int, high: int, score: Float32,
 ) -> None:  # fmt: skip
-    """Fill score, LANES places further on, of pixels low..high-1, and 0 up to a whole vector.
+    """Fill score of pixels low..high-1, which begins LANES places further on, and 0 up to a whole vector.
 
     n: counts from REACH_PX before the window on. seen: frames times rows around. pooled: N of the module.
     """
@@ -206,7 +207,7 @@ def _score_pixels(
 
 @numba.njit(cache=True, nogil=True, error_model="numpy")
 def _write_own(score: Float32, low: int, high: int, side: int, units: float, own: Uint8) -> int:
-    """Fill own with the costs of pixels low..high-1 from far to near, two each. Returns the cost of score 0."""
+    """Fill own with the costs of pixels low..high-1 from far to near, two a pixel. Returns the cost of score 0."""
     width, at, to, best = score.shape[1], address_of(score), address_of(own), zero_float32()
     for t in range(low + LANES, high + LANES, LANES):
         best = larger_float(best, larger_float(load_float32(at, t), load_float32(at, width + t)))

@@ -8,10 +8,10 @@ units,
     score(x) = sums + max over brightnesses of (constant + sum over taps n tap)
     cost(x)  = (best score of the row - score(x)) / 2^down               uint8, at most COST_LIMIT
 
-Counts n are int16 fractions of their maximum (COUNT_BITS). The two phases of a pixel are the low and the high byte of
-the same 16 bits, in this order. BATCH rows of a column go through each part together. Parts are separate functions and
-not inlined, because in a single function the compiler keeps a register for every address. The loop over taps is
-unrolled for the usual width of the line.
+Counts n are int16 fractions of their maximum (COUNT_BITS). The costs of a pixel's two phases are the low and the high
+byte of the same 16 bits, in this order. BATCH rows of a column go through each part together. Parts are separate
+functions and not inlined, because in a single function the compiler keeps a register for every address. The loop over
+taps is unrolled for the usual width of the line.
 """
 
 from typing import Final, NamedTuple
@@ -80,13 +80,13 @@ from rig.simd.vectors import (
 COST_LIMIT: Final = 160
 """Largest cost of a label that is not excluded."""
 EXCLUDED: Final = 255
-"""Cost of a label that cannot be: outside the picture, more than a pixel outside the row's search window."""
+"""Cost of a label that cannot be: outside the picture, or more than a pixel outside the row's search window."""
 BASE: Final = -8000
-"""Score of 'everything is before the stripe': most of the range lies above it."""
+"""Score of 'everything is before the stripe': most of the range of 16 bits lies above it."""
 _USUAL_TAPS: Final = 5
-"""Pixels around a position where the line is as narrow as it mostly is."""
+"""Number of pixels around a position with a line as narrow as most are."""
 COUNT_BITS: Final = 15
-"""Counts are kept as fractions of 2^15 of what they can be."""
+"""A count is kept as 2^COUNT_BITS times its share of the largest that there can be."""
 
 
 @numba.njit(cache=True, nogil=True)
@@ -94,10 +94,10 @@ def read_bytes(
     counts: int, begin: int, places: int, stored: tuple[int, int, int, int], side: int, pixels: int, times: int,
     b: Buffers, batch: int,
 ) -> None:  # fmt: skip
-    """Fill n, from far to near. Pixels outside the stored ones may get any value.
+    """Fill n of `batch` rows from counts that are bytes, from far to near. Pixels that were not stored get any value.
 
-    counts: address of the first count, begin: place of the first row's counts. stored: first pixel, pixels of a row,
-    number of all counts, counts of a column. times: factor on counts.
+    counts: address of the first count, begin: number of the first row's first one. stored: first pixel, pixels of a
+    row, number of all counts, counts of a column. times: factor on counts.
     """
     x0, window, size, column = stored
     factor = np.int16(times)
@@ -113,8 +113,7 @@ def read_bytes(
                 count = np.int64(read_byte(counts + begin + r * window, x)) if 0 <= x < window else np.int64(0)
                 write_int16(n, p, np.int16(count * times))
             continue
-        # The next column's counts will be wanted when this one's last row has been read; the rest the next row asks
-        # for.
+        # The next column's counts, which come after this one's last row; the next row asks for the rest.
         for line in range(0, min(pixels + LANES, window), CACHE_LINE):
             prefetch(counts + low + column + line)
         if side > 0:
@@ -127,7 +126,7 @@ def read_bytes(
 
 @numba.njit(cache=True, nogil=True)
 def mend_rows(at: LabelTables, places: int, y: int, per_nat: float, side: int, b: Buffers, batch: int) -> None:
-    """Give pixels that the table weighs, but that are hot or missing in the row, a count without information.
+    """Give a count without information to pixels that the table weighs, but that are hot or missing in the row.
 
     y: number of the first row; per_nat: units times exposures.
     """
@@ -162,7 +161,7 @@ def _neutral(at, i, p, per_nat):  # type: ignore[no-untyped-def]
 
 @numba.njit(cache=True, nogil=True)
 def sum_edges(at: LabelTables, fitted: Fitted, b: Buffers, batch: int) -> None:
-    """Fill sums, as far as there are labels."""
+    """Fill sums, the scores of a change at each pixel, as far as there are labels."""
     pixels = at.pixels
     for r in range(batch):
         i = read_int32(b.here, r)
@@ -194,7 +193,7 @@ def _likelier_lights(n, tap, constant, taps):  # type: ignore[no-untyped-def]
 
 @numba.njit(forceinline=True)
 def _score_row(sums, n, tap, constant, score, vectors, taps, pairs):  # type: ignore[no-untyped-def]
-    """The scores of a row, and the largest one of each lane."""
+    """Write the scores of a row; returns the largest one of each lane."""
     best = zero_int16() + np.int16(-32768)
     for _ in range(vectors):
         far, near = _likelier_lights(n, tap, constant, taps)
@@ -237,7 +236,7 @@ def score_rows(at: LabelTables, constants: int, which: int, taps: int, b: Buffer
 
 @numba.njit(cache=True, nogil=True)
 def cost_rows(at: LabelTables, ways: Ways, b: Buffers, batch: int) -> None:
-    """Fill cost for all possible labels."""
+    """Fill cost from scores, 0 for rows without a table."""
     half = (1 << ways.down) >> 1
     for r in range(batch):
         cost, score = b.cost + r * b.cost_row, b.score + 2 * r * b.score_row
@@ -255,7 +254,7 @@ def cost_rows(at: LabelTables, ways: Ways, b: Buffers, batch: int) -> None:
 
 @numba.njit(cache=True, nogil=True)
 def write_rows(places: int, ways: Ways, b: Buffers, batch: int, out: int, row_bytes: int) -> None:
-    """Write the costs of labels to address out, with rows `row_bytes` apart."""
+    """Write the costs of labels to address `out`, `row_bytes` from row to row."""
     for r in range(batch):
         here, cost, to = places + 2 * PLACES * r, b.cost + r * b.cost_row, out + r * row_bytes
         low, high = read_int16(here, LABEL), read_int16(here, LABEL_END)
@@ -275,8 +274,8 @@ def write_rows(places: int, ways: Ways, b: Buffers, batch: int, out: int, row_by
 class CostRoom(NamedTuple):
     """Tables and buffers of `fill_costs` and `fit_tables`, which take `pointers` to them.
 
-    read: pixels of a row that weigh anything: those beyond the last vector of any table and its taps belong to no
-    label, and only halos weigh them.
+    read: number of pixels of a row that are read. Those beyond the last label of all tables and its taps have a weight
+    only with a halo.
     """
 
     at: LabelTables
@@ -299,7 +298,7 @@ def fill_costs(
     counts: Counts, n_frames: Int32, x0: Int32, place: Int16, numbers: Int32, room: CostRoom, ways: Ways,
     first_row: int, last_row: int, out: Uint8,
 ) -> None:  # fmt: skip
-    """Costs of rows first_row..last_row-1, see `Costs.fill` in `rig.estimate.joint.labels.costs`.
+    """Fill the costs of rows first_row..last_row-1, see `Costs.fill` in `rig.estimate.joint.labels.costs`.
 
     numbers: `at` of the tables. room: pointers to the tables and a thread's buffers.
     """
@@ -333,7 +332,7 @@ def fill_costs(
                 batch = min(BATCH, end - y)
                 to = out_at + (y * columns + c) * labels
                 places = place_at + 2 * PLACES * (c * rows + y)
-                # Costs of one row after the other, and places of one column after the other, are not foreseen.
+                # The processor foresees neither the next row's costs nor the next column's places.
                 for r in range(batch):
                     for line in range(0, labels, CACHE_LINE):
                         prefetch_to_write(to + r * columns * labels + line)
@@ -364,10 +363,10 @@ def fill_costs(
 
 @numba.njit(cache=True, nogil=True)
 def _times(exposures: int, ways: Ways) -> float:
-    """Factor on the counts of a column, a whole number where it is not below 1; products fit 16 bits.
+    """Factor on the counts of a column, a whole number if it is not below 1; products fit 16 bits.
 
-    A nat of more exposures is worth fewer units, as in a map where all columns have so many: else columns with few
-    would count for less beside others with many, and the penalties between neighbours for more.
+    A nat of more exposures is worth fewer units, as in a map where all columns have so many. Otherwise columns with few
+    exposures would count for less beside others with many, and the penalties between neighbours for more.
     """
     full = 2.0 ** (COUNT_BITS - ways.bits)
     worth = (ways.sharp + ways.exposures) / (ways.sharp + exposures)
@@ -400,7 +399,7 @@ def fit_tables(room: CostRoom, ways: Ways, first: int, last: int) -> None:
 
 @numba.njit(cache=True, nogil=True)
 def _fit_table(at: LabelTables, i: int, j: int, per_nat: float, to: Fitted, through: int) -> None:
-    """Constants of table i for a number of exposures, as number j; per_nat: units times exposures."""
+    """Write table i's constants and edges for a number of exposures as number j; per_nat: units times exposures."""
     source, constant = at.constant + 4 * i * at.constants, to.constant + 2 * j * at.constants
     for k in range(0, at.constants, LANES):
         store_int16(constant, k, rounded(load_float32(source, k) * np.float32(per_nat)))

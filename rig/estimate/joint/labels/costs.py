@@ -1,7 +1,7 @@
 """Cost of every label on every row and column: a fast form of `rig.estimate.row.likelihood`, tested against it.
 
 The cost says how much less likely a label makes the counts than the best label does. It uses the line's profile at the
-label's own eighth of a pixel, some amplitudes, and tables that the rows of a band share
+label's own eighth of a pixel, two amplitudes (four under a halo), and tables that the rows of a band share
 (`rig.estimate.joint.labels.tables`),
 
     cost(l) = units_per_nat (max log-likelihood - log-likelihood(l)),   uint8 (rows, columns, labels), <= COST_LIMIT
@@ -54,22 +54,22 @@ from rig.threads import RowWorkers
 SHARP: Final = 8.0
 """Exposures at which a nat is worth half as many units: the labels beside the best one must still count."""
 FINEST: Final = 64.0
-"""Most units of scores per nat."""
+"""Largest number of units per nat in scores."""
 WEIGHT_BITS: Final = 12
 """Weights of 2^WEIGHT_BITS units per nat reach to 8 nats per count."""
 RISE_LIMIT: Final = 22000
-"""Most that the score of a change may rise along a row, of a range of 40000."""
+"""Most that the sum over a row's pixels may rise, of a range of 40000 for scores."""
 TAPS_LIMIT: Final = 28000
 """Most that the pixels around a position may add to its score."""
 FRAMES_OVER_HALF_MORE: Final = 4
 """The counts of a column weigh no more than those of one and a half times the nominal exposures plus this many."""
 LOOKED_AT: Final = 32
-"""Number of columns, and of rows, whose rise decides the units of all."""
+"""Number of rows, and of columns, that are looked at for the units of all."""
 QUANTILES: Final = (0.25, 0.75)
-"""Shares of the learned amplitudes below those that the costs try."""
+"""Quantiles of the learned amplitudes that the costs try."""
 HALO_QUANTILES: Final = (0.1, 0.35, 0.65, 0.9)
-"""Shares of the amplitudes that are tried under a halo. It is many times brighter than its stripe, so that a stripe
-between two amplitudes would be drawn to a distance where the halo of one of them fits."""
+"""Quantiles that are tried under a halo. It is many times brighter than its stripe, so a stripe between two amplitudes
+would be drawn to a distance where the halo of one of them fits."""
 HALO_TRUST: Final = 0.9
 """Part of the halo's evidence that counts: it is summed over many pixels, which have the errors of the learned halo in
 common."""
@@ -77,7 +77,7 @@ common."""
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Costs:
-    """Gives the costs of a sweep's counts under one model; made once per model by `costs_of`.
+    """All that the costs of a sweep's counts need under one model; made once per model by `costs_of`.
 
     units_per_nat: of cost; UNITS / (1 + exposures / SHARP), or less if 16 bits do not hold the scores of haze.
     """
@@ -90,7 +90,7 @@ class Costs:
     units_per_nat: float
 
     def room(self) -> CostRoom:
-        """Working memory for one thread, reused for one band of rows after the other."""
+        """Working memory for one thread, used for one band of rows after the other."""
         return room_for(self.tables, self.halo, self.grid.labels)
 
     def fill(self, volume: CountVolume, first: int, last: int, room: CostRoom, out: Uint8) -> None:
@@ -167,8 +167,8 @@ def _ways(
 def _largest(sweep: Sweep, state: RowState, row: RowBuffers, light: float) -> tuple[float, float]:
     """Largest sums along some rows, in nats.
 
-    Per exposure, of all pixels of a row lying behind the stripe instead of before it; per count, of the pixels that a
-    stripe of this light falls on.
+    The first is per exposure, from all pixels of a row being behind the stripe instead of before it. The second is per
+    count, from the pixels that a stripe of this light falls on.
     """
     rise = gain = 0.0
     rows, columns = sweep.x_lo.shape
@@ -214,7 +214,7 @@ def _lights(model: RowModel) -> Float32:
 
 
 def hot_in_bands(ambient: Float32) -> Bools:
-    """Pixels (rows, width) far brighter than the median of their column over BAND_ROWS rows, their band or the last."""
+    """Pixels (rows, width) far brighter than the median at their x over their band, or over the last BAND_ROWS rows."""
     rows, hot = len(ambient), np.empty(ambient.shape, np.bool_)
     for first in range(0, rows, BAND_ROWS):
         band = ambient[first : first + BAND_ROWS]
@@ -224,6 +224,6 @@ def hot_in_bands(ambient: Float32) -> Bools:
 
 
 def _band_means(gain: Float32) -> Float32:
-    """Each row's gain as the mean of its band's."""
+    """For each row the mean gain of its band."""
     parts = np.split(gain, np.arange(BAND_ROWS, len(gain), BAND_ROWS))
     return np.concatenate([np.full_like(part, part.mean()) for part in parts])

@@ -25,22 +25,23 @@ from rig.geometry.windows import MARGIN_PX, SweepGeometry
 from rig.simd import Float32, Float64, Int16, Int32
 
 PER_PX: Final = 2
-"""Labels per pixel: with one, the stripe's place between two of them costs 0.05 px of error at 10 exposures."""
+"""Labels per pixel. With one, a stripe between two of them would have 0.05 px more error at 10 exposures."""
 SPARE: Final = 1
-"""Labels beyond the searched pixels at either end, for the mean of a peak there."""
+"""Labels beyond the searched pixels at the near end, for the mean of a peak there."""
 VECTOR: Final = 32
 BAND_ROWS: Final = 64
 """Rows that share tables of costs."""
 _ROWS_APART: Final = 8
-"""One row in so many is looked at for the distance of columns."""
+"""One row in so many is looked at for the usual distance of columns."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class LabelGrid:
     """Label l of a row and column is at x_far - side * l / PER_PX, for l from 0 to stripes - 1.
 
-    x_far: float64 (rows, columns), NaN where nothing is searched. side: 1 where near is left, else -1. labels: a
-    multiple of VECTOR; those from stripes on are unused. column_px: usual distance from one column to the next.
+    x_far: float64 (rows, columns), NaN where nothing is searched. side: 1 if near is left, else -1. labels: their
+    number, a multiple of VECTOR; those from stripes on are unused. column_px: usual distance from one column to the
+    next.
     """
 
     x_far: Float64
@@ -100,12 +101,12 @@ def far_ends(u: Float32, v: Float32, plane: Float64, x_lo: Int32, x_hi: Int32, w
 
 
 FRACTIONS: Final = 8
-"""Parts of a pixel that the centre of a line is told apart in."""
+"""Places within a pixel to which the centre of a line is rounded."""
 VARIANTS: Final = FRACTIONS // 2
 PHASES: Final = 2
 FAR_PX: Final = MARGIN_PX
 SLACK_PX: Final = 1
-"""Pixels that a label may lie outside the row's search window: the mean of a peak at its end needs both sides."""
+"""Pixels by which a label may lie outside the row's search window: the mean of a peak at its end needs both sides."""
 START, VARIANT, ODD, LABEL, LABEL_END, VALID, VALID_END, MEND = range(8)
 """START: x of pixel 0; VARIANT: -1 where nothing is searched; ODD: 1 where label 0 is of phase 1; LABEL, LABEL_END:
 labels that can be, from and up to; VALID, VALID_END: pixels p that were stored and are looked at; MEND: 1 where some

@@ -1,10 +1,10 @@
 """The halo's part of the label costs, compiled: a fast form of `rig.estimate.row.likelihood`, tested against it.
 
-The halo of `rig.estimate.row.inputs` is part of every hypothesis. The tables of `rig.estimate.joint.labels.tables`
-treat the halo as equally bright everywhere as at the stripe, which is right where the stripe's place is decided. The
-difference elsewhere varies slowly with the stripe's place and from pixel to pixel. So it is tabled for stripes BLOCK_PX
-apart, with linear interpolation, and for the mean counts of blocks of as many pixels (`HaloTables`: int16 weights,
-float32 constants in nats per exposure).
+The halo of `rig.estimate.row.inputs` is part of every hypothesis. The tables of `rig.estimate.joint.labels.tables` take
+the halo to be as bright everywhere as at the stripe, which is right where the stripe's place is decided. The difference
+elsewhere varies slowly with the stripe's place and from pixel to pixel. So it is tabled for stripes BLOCK_PX apart,
+with linear interpolation, and for the mean counts of blocks of BLOCK_PX pixels (`HaloTables`: int16 weights, float32
+constants in nats per exposure).
 """
 
 from typing import Final, NamedTuple
@@ -32,17 +32,16 @@ from rig.simd.vectors import LANES, add_saturated, larger_float, scaled, smaller
 
 BLOCK_PX: Final = 8
 FIRST_PX: Final = FAR_PX % BLOCK_PX - BLOCK_PX
-"""Pixel that the first block begins at, before the row: the first label's pixel begins a block."""
+"""Pixel at which the first block begins, before the row: so the first label's pixel begins a block."""
 AHEAD: Final = (FAR_PX - FIRST_PX) // BLOCK_PX
-"""Blocks behind a stripe at place 0."""
+"""Number of blocks behind a stripe at place 0."""
 _FULL: Final = 32768.0
 
 
 class HaloTables(NamedTuple):
-    """Tables of the halo. Blocks of pixels are counted from FIRST_PX on, places of the stripe from the far end of label
-    0's pixel.
+    """Tables of the halo. Blocks are counted from FIRST_PX on, the stripe's places from the far end of label 0's pixel.
 
-    weight: int16 (bands, columns, blocks, lights, places), of the counts of a block over BLOCK_PX. constant: float32
+    weight: int16 (bands, columns, blocks, lights, places), of the mean count of a block. constant: float32
     (bands, columns, lights, places), nats per exposure. ramp: int16 (phases, 3, LANES), interpolation weights of the
     three places around a vector of labels, in 2^-15. Without a halo all but `ramp` are empty.
     """
@@ -76,7 +75,7 @@ def fill_halo(
     sweep: Sweep, state: RowState, place: Int16, ambient: Float32, hot: Bools, light: Float32, halo: Float32,
     per_nat: float, first_band: int, last_band: int, tables: LabelTables, out: HaloTables,
 ) -> None:  # fmt: skip
-    """Fill bands first_band..last_band-1; arguments as in `rig.estimate.joint.labels.tables.fill_tables`.
+    """Fill the tables of bands first_band..last_band-1; arguments as those of `fill_tables`.
 
     halo: (BINS, pixels) of `halo_shares`.
     """
@@ -84,7 +83,7 @@ def fill_halo(
     pixels = tables.edge.shape[1]
     row, middle_light = row_buffers(sweep.window, 1), np.sqrt(light[0] * light[-1])
     mean, number = np.empty(pixels, np.float32), np.empty(pixels, np.int32)
-    # Of the blocks: flux before and behind the stripe, and of the halo as the tables of labels have it.
+    # Of each block: flux before and behind the stripe, and of the halo as the tables of labels have it.
     level, size = np.empty((3, out.weight.shape[2]), np.float32), np.empty(out.weight.shape[2], np.int64)
     for b in range(first_band, last_band):
         rows = b * BAND_ROWS, min((b + 1) * BAND_ROWS, place.shape[1])
@@ -132,7 +131,7 @@ def fill_halo(
 
 
 HIGHEST: Final = 30000
-"""Scores and their parts are cut there."""
+"""Largest size of scores and their parts; larger ones are cut."""
 _TO_UNSIGNED: Final = np.float32(32768.5)
 _POSSIBLE: Final = np.int16(28000)
 """Constants of positions without a label lie below the negative of this, others above."""
@@ -140,14 +139,13 @@ _POSSIBLE: Final = np.int16(28000)
 
 @numba.njit(forceinline=True)
 def rounded(a):  # type: ignore[no-untyped-def]
-    """Parts of scores, float32 lanes, rounded to 16-bit ones."""
+    """Parts of scores, float32 lanes, rounded to 16 bits and cut at HIGHEST."""
     a = larger_float(smaller_float(a, np.float32(HIGHEST)), np.float32(-HIGHEST))
     return to_int16(a + _TO_UNSIGNED) + np.int16(-32768)
 
 
 class HaloRoom(NamedTuple):
-    """The tables with their numbers of blocks, brightnesses and places, and working memory for a column and a batch of
-    rows.
+    """The tables with their sizes, and working memory for a column and a batch of rows.
 
     All int16 unless said. fitted: (lights, places), constants of all places for a column's exposures; mean: (blocks,),
     counts of blocks; level: (lights, places), evidence of the halo for a stripe at each place; constant: of the
@@ -166,7 +164,7 @@ class HaloRoom(NamedTuple):
 
 
 def new_halo_room(halo: HaloTables, constants: int) -> HaloRoom:
-    """Working memory for rows with this number of constants of positions."""
+    """Working memory for rows with this number of constants."""
     _, _, blocks, lights, places = halo.weight.shape
     return HaloRoom(
         tables=halo, blocks=blocks, lights=lights, places=places, fitted=aligned_zeros((lights, places), np.int16),
@@ -186,7 +184,7 @@ def fit_halo(halo: HaloRoom, column: int, per_nat: float) -> None:
 
 @numba.njit(cache=True, nogil=True)
 def halo_rows(halo: HaloRoom, column: int, at: LabelTables, fitted: Fitted, b: Buffers, batch: int) -> None:
-    """Fill constant with the constants of the rows' tables plus the evidence of the halo."""
+    """Fill constant with the constants of the rows' tables plus the evidence of the halo, for `batch` rows."""
     vectors, numbers = b.score_row // (PHASES * LANES), halo.lights * halo.places
     weights = halo.tables.weight + 2 * column * halo.blocks * numbers
     for r in range(batch):

@@ -4,14 +4,15 @@ They hold the terms of `rig.estimate.row.likelihood`, relative to 'everything is
 of a pixel before and behind the stripe, and p'_S of a pixel that it lights,
 
     edge = logit p'_E - logit p'_B                  int16: a count at a pixel behind the stripe
-    tap  = logit p'_S - logit of the above          int16: a count at a pixel around a label, for LIGHTS amplitudes
+    tap  = logit p'_S - logit p'_B or p'_E          int16: a count at a pixel around a label, for LIGHTS amplitudes;
+                                                    relative to what the sum of edges takes the pixel for
     constant, edge_sum: the same of log(1 - p'), float32 per exposure: the number of frames differs between columns
 
 Haze, pedestal and ambient light vary slowly along a line, so the rows of a band share a table for each variant of
 `rig.estimate.joint.labels.grid` that occurs among them. Weights are for counts as `scaled` multiplies them.
 
-The stripe's brightness is unknown. Two quantiles of the learned one are tried, under a halo four, and the likeliest
-counts. The learned prior of positions is not used, since it makes errors larger.
+The stripe's brightness is unknown. Two quantiles of the learned brightnesses are tried, under a halo four, and the
+likeliest counts. The learned prior of positions is not used, since it makes errors larger.
 """
 
 from typing import Final, NamedTuple
@@ -134,7 +135,7 @@ def fill_tables(
                 out.span[i, 0], out.span[i, 1] = span
                 out.used[i] = -(-label_end // (PHASES * LANES))
                 for p in range(span[0], span[1]):
-                    # Around its middle the halo is level; `halo_tables` tell what it is elsewhere.
+                    # Around its middle the halo is level; `fill_halo` tables how it differs elsewhere.
                     glow[p] = state.glow[row.cell[to_t - p]]
                     near_glow[p] = beside[row.cell[to_t - p]]
                     for near in (_NEAR, _FAR):
@@ -167,10 +168,9 @@ def mark_rows(place: Int16, hot: Bools, side: int, tables: LabelTables) -> None:
 
 @numba.njit(cache=True, nogil=True)
 def middle_row(place: Int16, c: int, rows: tuple[int, int], variant: int) -> tuple[int, int, int]:
-    """The row of a variant (-1: of any) nearest the band's middle, or -1; and the first and end position of all its
-    rows.
+    """The row of a variant (-1: of any) nearest the band's middle, -1 if there is none; first and end of its positions.
 
-    There are two positions per pixel, counted from the pixel that holds label 0.
+    The latter are of all rows of the variant. There are two positions per pixel, from the one that holds label 0 on.
     """
     middle = (rows[0] + rows[1]) // 2
     best, first, end = -1, 1 << 15, 0
@@ -189,7 +189,7 @@ def mean_ambient(
     place: Int16, ambient: Float32, hot: Bools, side: int, c: int,
     rows: tuple[int, int], mean: Float32, number: Int32,
 ) -> None:  # fmt: skip
-    """Mean ambient light of the band's rows at each pixel p. A pixel without a value takes that of the pixel before."""
+    """Fill mean, the band's mean ambient light at each pixel p; pixels without a value take that of the one before."""
     mean[:] = 0.0
     number[:] = 0
     for y in range(rows[0], rows[1]):
@@ -254,7 +254,7 @@ def _fill_taps(
                         base = flux[_FAR, at] + nearer * (flux[_NEAR, at] - flux[_FAR, at])
                     extra = light[m] * scale[to_t - p] * shares[off + VARIANTS, d + reach] + halo
                     cell = cell_of(min(max(base + extra, FLUX_MIN), FLUX_MAX))
-                    # `halo_tables` tell the light around of a pixel that holds the line too: as if it had none of it.
+                    # What tables of the halo already count for a pixel that holds the line, as if it held none of it.
                     around = light[m] * scale[to_t - p] * near_glow[p] - middle_light * scale[to_t - at] * glow[at]
                     told = cell_of(min(max(flux[own, at] + around, FLUX_MIN), FLUX_MAX))
                     weight = _weight((table[0, cell] - table[0, told]) * per_nat)
@@ -275,7 +275,7 @@ def _weight(value):  # type: ignore[no-untyped-def]
 BATCH: Final = LANES
 """Rows that go through each part of the work together: while one waits for a result, others go on."""
 SUMS_FROM: Final = LANES - 1
-"""Sums up to and including a pixel belong to the next one: so they are written at whole vectors."""
+"""Place of the first sum. The sum up to and including a pixel is the next one's, so whole vectors are written."""
 POSITION: Final = PHASES * LIGHTS * LANES
 """Numbers that a vector of pixels has in a table for a pair of brightnesses."""
 
@@ -283,9 +283,9 @@ POSITION: Final = PHASES * LIGHTS * LANES
 class Ways(NamedTuple):
     """Units and limits of scores and costs.
 
-    units: of scores per nat, for columns with the usual number of `exposures`; bits: of the largest count; most: upper
-    limit of a column's exposures; sharp: number of exposures at which a nat is worth half as many units; down: power of
-    two that turns scores into costs; reach: taps on either side; side, stripes: as in `LabelGrid`.
+    units: of scores per nat, for columns with the usual number of `exposures`; bits: of the largest count; most:
+    exposures up to which counts have full weight; sharp: number of exposures at which a nat is worth half as many
+    units; down: scores are divided by 2^down for costs; reach: taps on either side; side, stripes: as in `LabelGrid`.
     """
 
     units: float
@@ -310,11 +310,11 @@ class Buffers(NamedTuple):
     """Working memory for BATCH rows, int16 (BATCH, n_row or the like) unless said.
 
     n: counts of pixels from far to near; sums: score of a change at each pixel from SUMS_FROM on, the first one BASE;
-    score: of pixel and phase; top: largest scores in each of some lanes, later of all. cost: uint8, of labels, from
-    that of the first pixel's phase 0 on.
-    For all rows: mask: uint8 (labels,), EXCLUDED or 0; constant: of positions, edge: of pixels, for each variant;
-    through: intermediate sums for edge. int32: table: of variants from -1 on, -1 if there is none; here: that of each
-    row of the batch; fitted: its place in `Fitted`; shown: first label of the mask, and the one after the last.
+    score: of pixel and phase; top: the largest score in each lane of each row, then that of each row in the first
+    LANES. cost: uint8, of labels, from that of the first pixel's phase 0 on. For all rows: mask: uint8 (labels,),
+    EXCLUDED or 0; constant: of positions, edge: of pixels, for each variant; through: intermediate sums for edge.
+    int32: table: number of each variant's table, from variant -1 on, -1 if there is none; here: that of each row of the
+    batch; fitted: its place in `Fitted`; shown: first label of the mask, and the one after the last.
     """
 
     n: Int16

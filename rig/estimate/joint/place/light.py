@@ -1,11 +1,11 @@
 """Light of stripes, haze around them, and score and information of their places, compiled, LANES stripes to a vector.
 
-With counts n of K frames at the pixels t within LIGHT_PX of a stripe, and the haze taken as half of that before and
-half of that behind (`measure_light`),
+With counts n of K frames at the pixels t within LIGHT_PX of a stripe, and haze the mean of that before and that behind
+(`measure_light`),
 
     light = (sum over t of log (K + 1/2) / (K - n_t + 1/2) - ambient_t - haze) / (1 + (2 LIGHT_PX + 1) glow)
 
-in photons per exposure, computed as one logarithm of a product. Blind pixels count with the expected light. Haze is
+in photons per exposure, computed as one logarithm of a product. Blind pixels add nothing to the sum. Haze is
 interpolated between bins of its profile, from a table in which all values of a bin lie side by side.
 
 With the flux of each of the TAPS pixels around a stripe of `light` photons, and D = 1 / (e^flux - 1) (`score_places`),
@@ -14,7 +14,7 @@ With the flux of each of the TAPS pixels around a stripe of `light` photons, and
     g = sum slope (n D - (K - n)),    h = sum K slope^2 D
 
 are the slope of the log-likelihood in the stripe's place and its Fisher information, 1/px and 1/px^2. A pixel that is
-missing in the row or must not be used is given so much light that it carries no information. Arrays are float32 (rows,
+missing in the row or must not be used is given so much light that it gives no information. Arrays are float32 (rows,
 columns), see `Places` (`rig.estimate.joint.place.places`).
 """
 
@@ -55,7 +55,7 @@ from rig.simd.shuffles import EIGHT, fetch_eights
 from rig.simd.vectors import LANES, larger_float, smaller_float, square_root, where_below, where_small, zero_float32
 
 _SHOWS: Final = np.nextafter(BLIND_FLUX, np.float32(0.0))
-"""Most ambient light of a pixel that still shows something."""
+"""Most ambient light with which a pixel still shows a stripe's light."""
 _LEAST: Final = np.float32(1e-37)
 _PX, _PY, _PZ, _GAIN, _U, _V, _BIN, _PATHS, _PART, _OTHERS, _FRAMES = range(11)
 _LIGHT, _SCALE, _HAZE, _REST, _GLOW, _FIELDS = range(11, 17)
@@ -90,7 +90,7 @@ def measure_light(
         lines[_PX, c], lines[_PY, c], lines[_PZ, c] = sweep.plane[c, 0], sweep.plane[c, 1], sweep.plane[c, 2]
         lines[_GAIN, c] = state.column_gain[c]
     for y in range(first_row, last_row):
-        # The next row's, which lies on other pages: not foreseen.
+        # The next row's, which the processor does not foresee, since it lies on other pages.
         for line in range(4 * pixels * (y + 1), 4 * pixels * (y + 2), CACHE_LINE):
             prefetch(at_u + line)
             prefetch(at_v + line)
@@ -153,7 +153,7 @@ def _find_bins(at: int, width: int, gain: np.float32, w_lo: np.float32, per_w: n
 
 @numba.njit(cache=True, nogil=True)
 def _measure(at: int, width: int, taps: int, ambient: int, bins: int) -> None:
-    """Light of LANES stripes and all that is wanted of haze; taps: address of their counts, and room behind them."""
+    """Write light, scale, haze, rest, glow of LANES stripes; taps: address of their counts, with room behind them."""
     near = taps + 4 * EIGHT * LANES
     one, none, half = zero_float32() + np.float32(1.0), zero_float32(), np.float32(0.5)
     fetch_eights(ambient, 0, near)
@@ -174,7 +174,7 @@ def _measure(at: int, width: int, taps: int, ambient: int, bins: int) -> None:
     before = _flux(own + paths * (load_float32(near, 0) + part * load_float32(near, 4 * LANES)), others)
     behind = _flux(own + paths * (load_float32(near, LANES) + part * load_float32(near, 5 * LANES)), others)
     halo = load_float32(near, 3 * LANES) + part * load_float32(near, 7 * LANES)
-    # A pixel that the picture does not have, or that is blind, counts as one of just the expected light.
+    # Missing and blind pixels add nothing, as if they had just the expected light.
     light = light - logarithm(larger_float(dark, _LEAST)) - shown * ((before + behind) * half - own)
     # What the halo adds to the light of the line grows with it.
     light = light / (one + halo * np.float32(2 * LIGHT_PX + 1))
@@ -192,10 +192,10 @@ def _flux(own, others):  # type: ignore[no-untyped-def]
 
 
 FRACTIONS: Final = 16
-"""Parts of a pixel that the line's profile is told apart in."""
+"""Places within a pixel for which the line's profile is tabled."""
 LEAST_FLUX: Final = np.float32(1e-5)
 _VISIBLE: Final = np.nextafter(MOST_FLUX, np.float32(0.0))
-"""Most ambient light of a pixel that tells anything of the stripe's place."""
+"""Most ambient light with which a pixel still tells something of the stripe's place."""
 _OF_AMPLITUDE, _OF_SCALE, _OF_GLOW, _OF_HAZE, _OF_REST, _OF_DISTANCE = range(6)
 _LIT, _TAKEN, _SCORE, _KNOWN, _SCORE_FIELDS = range(5)
 _EIGHTS: Final = EIGHT * LANES
@@ -259,8 +259,8 @@ def _score(
 ) -> None:  # fmt: skip
     """Fill score and known of LANES stripes.
 
-    of: addresses of what is known of stripes before, here: number of the first. seen: address of their counts, and room
-    behind them.
+    of: addresses of what is known of all stripes, here: number of the first of these. seen: address of their counts,
+    with room behind them.
     """
     share, growth, own = seen + 4 * _EIGHTS, seen + 8 * _EIGHTS, seen + 12 * _EIGHTS
     fetch_eights(ambient, 0, own)
@@ -293,7 +293,7 @@ def _score(
 
 @numba.njit(forceinline=True)
 def _dark_over_lit(flux):  # type: ignore[no-untyped-def]
-    """1 / (e^flux - 1): how often a pixel stays dark over how often it does not."""
+    """1 / (e^flux - 1): the probability that a pixel stays dark over that of firing."""
     part = smaller_float(larger_float(flux, LEAST_FLUX), MOST_FLUX) * np.float32(2.0**-_DOUBLINGS)
     grown = part * np.float32(1 / 5040) + np.float32(1 / 720)
     for below in (120.0, 24.0, 6.0, 2.0, 1.0):

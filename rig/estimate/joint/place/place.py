@@ -1,8 +1,8 @@
 """Sub-pixel places of stripes whose labels are known: their light, their pooled places, and the width of the line.
 
-Steps: light of each stripe, pooled brightness, score and information of its place, the place pooled over neighbours,
-then combined with pairs of opposite neighbours. The formulas are in `rig.estimate.joint.place.places` and
-`rig.estimate.joint.place.pool`. Positions are float32 (rows, columns) in px, moved by at most MOST_MOVED_PX.
+The steps are: light of each stripe; its brightness, pooled over neighbours; score and information of its place; its
+place, pooled over neighbours; that place joined with pairs of opposite neighbours. The formulas are in
+`rig.estimate.joint.place.places` and `rig.estimate.joint.place.pool`. Positions are float32 (rows, columns) in px.
 """
 
 from itertools import pairwise
@@ -22,34 +22,34 @@ from rig.simd.shuffles import EIGHT
 from rig.threads import RowWorkers
 
 LIGHT_REACH = 3
-"""Rows and columns to either side that a stripe's brightness is pooled over."""
+"""Rows and columns to either side over which a stripe's brightness is pooled."""
 REACHES = (1, 2)
-"""Rows and columns to either side that its place is pooled over: the first of these that tells it well enough."""
+"""Rows and columns to either side over which its place is pooled: the first of these that gives ENOUGH."""
 LESSON_REACHES = (1, 2, 3, 4)
-"""REACHES for the lessons of the first map, whose places no pairs join: joined places of weak stripes are so smooth
-that their brightness would be learned too dark."""
+"""REACHES for the lessons of the first map, whose places are not joined with pairs: joined places of weak stripes are
+so smooth that their brightness would be learned too dark."""
 ENOUGH = 1 / 0.06**2
-"""Information, 1/px^2, from which a place is known well enough: surfaces bend over more neighbours."""
+"""Information, 1/px^2, from which on a place is known well enough: over more neighbours surfaces bend."""
 PAIRS = ((4, 0.576), (6, 0.280))
-"""Rows and columns to the pairs of neighbours that place a stripe further where that is not enough, round by round, and
-the share that they know of what each knows: 5 x 5 neighbours count as 25 stripes, joined with eight such as 140, and
-with eight of those as 454, since these overlap."""
+"""Of each round of joining: rows and columns to the neighbours of a pair, and the share of their information that
+counts. 5 x 5 neighbours count as 25 stripes, joined with eight like them as 140, and these with eight like them as 454,
+since they overlap."""
 MOST_MOVED_PX = 0.9
-"""Farthest that a stripe moves, all rounds together: labels, half a pixel apart, end a pixel beyond what is searched,
-and answers 2 px beyond it. Only pictures of full pixels would move stripes farther."""
+"""Farthest that a stripe moves from its label, all rounds together. Labels end a pixel beyond what is searched, so
+answers end within 2 px of it. Only in pictures of full pixels would stripes move farther."""
 BEYOND = 3.0
-"""Brightness may exceed the learned amplitudes by this factor either way."""
+"""Factor by which brightness may lie beyond the learned amplitudes, either way."""
 DARKEST = 300.0
-"""Stripes are taken to be no darker than the bright ones by this factor."""
+"""Largest ratio of the brightest of the four amplitudes to another."""
 SLOPE_STEP_PX = 0.05
 LEAST_PHOTONS = 100.0
-"""Photons per exposure, over all stripes, that can tell the width of the line."""
+"""Least light of all stripes, in photons per exposure, that tells the width of the line."""
 LINE_SIGMA_PX = np.array([0.25, 2.4])
-"""Smallest and largest width that is looked for."""
+"""Smallest and largest width that `line_width` gives."""
 
 
 def profile_table(sigma_px: float) -> Float32:
-    """Shares of the line and their slopes as `score_places` takes them."""
+    """Shares of a line of this width, and their slopes, as `score_places` takes them."""
     centre = (np.arange(FRACTIONS) + 0.5) / FRACTIONS - 0.5
     distance = np.arange(-REACH_PX, REACH_PX + 1) - centre[:, None]
     on, back = (pixel_shares(sigma_px, distance - step) for step in (SLOPE_STEP_PX, -SLOPE_STEP_PX))
@@ -76,10 +76,10 @@ def place(
     *,
     lesson: bool = False,
 ) -> Float32:
-    """Move x_px, whose distances from the far end are in `places`, to the positions pooled over neighbours.
+    """Move x_px, whose distances from the far end are in `places`, to the places pooled over neighbours.
 
-    lesson: whether the first map's lessons will use them. Returns the standard deviation in px. Light, haze and
-    intermediate results are left in `places`. The last steps are only queued, see `weigh_light`.
+    Returns their standard deviations in px. Light, haze and intermediate results are left in `places`. The last steps
+    are only queued, see `weigh_light`. lesson: whether the first map's lessons will use the places.
     """
     sd = np.empty_like(x_px)
     around = weigh_light(volume, sweep, state, x_px, places, workers)
@@ -129,9 +129,7 @@ def weigh_light(
 def line_width(
     volume: CountVolume, sweep: Sweep, state: RowState, stripes: StripeTable, workers: RowWorkers
 ) -> float | None:
-    """Standard deviation of the line in px, from the light of clear stripes around their places; None if there is too
-    little.
-    """
+    """Standard deviation of the line in px, from the light of clear stripes; None if there is too little of it."""
     sums = np.zeros((stripes.x_px.shape[0], 2))
     clear = stripes.x_px, stripes.x_sd_px, stripes.confidence, stripes.signal
     seen = volume.counts, volume.n_frames, sweep, state, *clear
@@ -144,7 +142,7 @@ def line_width(
 
 
 def amplitudes_of(places: Places, trusted: Bools | None = None) -> tuple[Float32, Float64]:
-    """Four amplitudes that represent those of a map's stripes, pooled over neighbours, and their shares.
+    """Four amplitudes, dark to bright, that stand for those of a map's stripes, and their shares of the stripes.
 
     trusted: (rows, columns), which stripes count; None for all.
     """

@@ -1,13 +1,13 @@
 """Sub-pixel placing of stripes by one step of Fisher scoring, pooled over neighbours on the same surface.
 
-At its answer each row gives the slope of its log-likelihood with the stripe's position (the score g) and its Fisher
-information h, `rig.estimate.joint.place.light`. Neighbours on one surface share its distance d from the far end,
-float32 px. The pooled value
+At its answer each row n gives the slope of its log-likelihood with the stripe's position (the score g) and its Fisher
+information h (`rig.estimate.joint.place.light`). Neighbours on one surface share its distance d from the far end in px.
+The pooled value
 
-    d = sum (h d_n + g_n) / sum h
+    d = sum (h_n d_n + g_n) / sum h_n
 
-is as good as the maximum of their common likelihood, with 1 / sqrt(sum h) as its standard deviation. A stripe's
-brightness is pooled in the same way before; otherwise a dark row would be taken for a brighter one that stands on haze.
+is as good as the maximum of their common likelihood, and 1 / sqrt(sum h_n) is its standard deviation. Before that, each
+stripe's brightness is pooled; otherwise a dark row would be taken for a brighter one that stands on haze.
 
 Counts are stored column by column, but answers are processed row by row, LANES columns to a vector. So the counts
 around all stripes are brought into the order of the answers once, in tiles of rows and columns (`fetch_counts`).
@@ -28,30 +28,31 @@ from rig.simd.vectors import LANES
 REACH_PX: Final = 3
 """Pixels to either side of a stripe that say where it is."""
 LIGHT_PX: Final = 2
-"""Pixels to either side that its light is summed over."""
+"""Pixels to either side over which its light is summed."""
 CLEAR: Final = 0.9
 CLEAR_SD_PX: Final = 0.2
-"""Stripes this clear, and placed this well, tell the width of the line."""
+"""Stripes with more confidence than CLEAR and less deviation than CLEAR_SD_PX tell the width of the line."""
 BESIDE_PX: Final = 5, 6
 """Pixels to either side, from and to, that show how much of a halo is under a line, and nothing of the line."""
 BLIND_FLUX: Final = np.float32(3.0)
-"""Ambient light of a pixel that fires in 95 % of all frames and shows nothing; pixels not to be used have more."""
+"""Ambient light with which a pixel fires in 95 % of all frames and shows nothing; pixels not to be used have more."""
 LEAST_FRAMES: Final = 2.0
-"""With fewer frames light beside a line in a halo is told so badly that the line seems far too narrow."""
+"""Fewest frames that tell a line's width in a halo: with fewer, the light beside it is so uncertain that it seems far
+too narrow."""
 FEW_FRAMES: Final = 3.0
-"""Up to so many frames counts are taken as they are: the flux of a full pixel would be a guess."""
+"""Frames up to which the share of ones is taken as the light: the flux of a full pixel would be a guess."""
 DARK_FRAMES: Final = 1.5
 FEW_FRAMES_FLUX: Final = 0.5
-"""Flux from which on a pixel of FEW_FRAMES or fewer is taken to be full."""
+"""Flux from which on a pixel of FEW_FRAMES frames or fewer is taken to be full."""
 
 
 class Places(NamedTuple):
     """Light and place of each stripe, float32 (rows, columns) each.
 
     distance: x from the far end in px, NaN if there is none; light: photons per exposure above haze and ambient; scale:
-    light of amplitude 1; haze, rest: before and behind it; glow: of the halo at the stripe, photons per pixel over
-    those of the stripe; known: h of the module; score: h times distance, plus g; placed: the final distance; joined,
-    joined_sd: intermediate distance and its standard deviation.
+    light of amplitude 1; amplitude: light over scale, pooled; haze, rest: flux before and behind it above ambient;
+    glow: of the halo at the stripe, photons per pixel over those of the stripe; known: h of the module; score: h times
+    distance, plus g; placed: the final distance; joined, joined_sd: intermediate distance and its standard deviation.
     """
 
     distance: Float32
@@ -70,9 +71,7 @@ class Places(NamedTuple):
 
 @numba.njit(inline="always")
 def most_shown(frames):  # type: ignore[no-untyped-def]
-    """Flux up to which the counts of this number of frames measure a pixel's brightness well: DARK_FRAMES of them stay
-    dark.
-    """
+    """Flux up to which this number of frames measures a pixel's light well: at least DARK_FRAMES of them stay dark."""
     return np.log(frames / DARK_FRAMES) if frames > FEW_FRAMES else FEW_FRAMES_FLUX
 
 
@@ -81,12 +80,11 @@ def add_moments(
     counts: Counts, n_frames: Int32, sweep: Sweep, state: RowState, x_px: Float32, sd_px: Float32, confidence: Float32,
     signal: Float32, first_row: int, last_row: int, sums: Float64,
 ) -> None:  # fmt: skip
-    """Add to sums (rows, 2) the light of clear stripes within REACH_PX, and the light times (its squared distance -
-    sd^2).
+    """Add to sums (rows, 2) the light of clear stripes within REACH_PX, and light times (its squared distance - sd^2).
 
-    Light is above haze, halo and ambient, in photons. A row of sums gets only contributions from the same row of the
-    picture. With a halo, stripes that saturate their pixels are left out, since the halo would be taken for their
-    missing flanks.
+    Light is that above haze, halo and ambient light, in photons per exposure. Each row of sums gets that of the same
+    row of the picture. With a halo, stripes that saturate their pixels are left out, since the halo would be taken for
+    their missing flanks.
     """
     for y in range(first_row, last_row):
         for c in range(x_px.shape[1]):
@@ -132,16 +130,15 @@ def add_moments(
 
 
 TAPS: Final = 2 * REACH_PX + 1
-"""Pixels around a stripe that are looked at; EIGHT are fetched."""
+"""Number of pixels around a stripe that are used; EIGHT are fetched."""
 MOST_FLUX: Final = np.float32(20.0)
-"""Largest flux: no brighter pixel stays dark in 10^8 exposures. Pixels that do not exist get it as ambient light."""
+"""Largest flux: it leaves a pixel dark once in 5 x 10^8 exposures. Missing pixels get it as ambient light."""
 _TILE: Final = 16
 
 
 @numba.njit(cache=True, nogil=True)
 def fetch_counts(counts: Counts, x0: Int32, x_px: Float32, first_row: int, last_row: int, around: Counts) -> None:
-    """Fill around (rows, columns, EIGHT) of rows first_row..last_row-1 with the counts from REACH_PX before each stripe
-    on.
+    """Fill rows first_row..last_row-1 of around (rows, columns, EIGHT): counts from REACH_PX before each stripe on.
 
     counts: (columns, rows, window), C-contiguous; around: of the same type. Values are 0 where no pixel was stored, and
     arbitrary where there is no stripe.
@@ -158,7 +155,7 @@ def fetch_counts(counts: Counts, x0: Int32, x_px: Float32, first_row: int, last_
                     first = nearest_pixel(x_px[y, c]) - REACH_PX - int(x0[c])
                     if 0 <= first <= window - EIGHT:
                         at = source + ((c * rows + y) * window + first) * size
-                        # Counts of one column after the other are not what a processor foresees.
+                        # The processor does not foresee the next column's counts.
                         prefetch(at + column)
                         for i in range(size):
                             write_int64(to + (y * columns + c) * EIGHT * size, i, read_int64(at, i))
@@ -176,7 +173,7 @@ def nearest_pixel(x):  # type: ignore[no-untyped-def]
 
 @numba.njit(forceinline=True)
 def ambient_place(ambient, width, y, x, x0, window, spare):  # type: ignore[no-untyped-def]
-    """Address of the ambient light from REACH_PX before pixel x on. It is copied to `spare` if a part of it is missing.
+    """Address of a row's ambient light, from REACH_PX before pixel x on. It is copied to `spare` if a part is missing.
 
     ambient: address of rows of `width` pixels; spare: address of EIGHT numbers, set to MOST_FLUX for pixels that were
     not stored or lie outside the picture.
@@ -192,9 +189,7 @@ def ambient_place(ambient, width, y, x, x0, window, spare):  # type: ignore[no-u
 
 @numba.njit(forceinline=True)
 def counts_of(around, at, y, c, to):  # type: ignore[no-untyped-def]
-    """Write EIGHT vectors of the counts of stripes c..c+LANES-1, see `fetch_counts`, to address `to`. at: address of
-    `around`.
-    """
+    """Write EIGHT vectors of counts of stripes c..c+LANES-1 of row y to address `to`. around, at: array and address."""
     if around.itemsize == 1 and c + LANES <= around.shape[1]:
         spread_eights(at + (y * around.shape[1] + c) * EIGHT, to)
         return

@@ -6,14 +6,15 @@ sums cannot be used. Rows are processed in copies with a margin of NaN (`with_ma
 All arrays are float32 (rows, columns).
 
 Joining: on a plane of any slope, the mean of two places opposite each other is the place between them. So a stripe is
-combined with opposite neighbours some stripes away, each already placed with its own neighbourhood, if their mean m
-agrees with its own place d: within SAME_PX, and within SIGMAS of the standard deviation expected for the difference,
+joined with pairs of opposite neighbours, each already placed with its own neighbourhood, where their mean m agrees with
+its own place d: within SAME_PX, and within SIGMAS times the standard deviation expected for the difference,
 
     d' = (d / s^2 + sum m / v) / (1 / s^2 + sum 1 / v),    v = (s1^2 + s2^2) / 4
 
-Where a surface ends or bends they do not agree, and the stripe stays where it is. Two such rounds reach as far as 25 x
-25 neighbours for the work of 16. Neighbourhoods overlap, so pairs contain less information than the sum of its parts:
-`share` of it, which makes the standard deviation right where all agree.
+with standard deviations s of the stripe, and s1 and s2 of the pair. Where a surface ends or bends they do not agree,
+and the stripe stays where it is. Two such rounds reach as far as 25 x 25 neighbours for the work of 16. Neighbourhoods
+overlap, so a pair tells less than it seems. The factor `share` on what pairs tell makes the standard deviation of d'
+right where all agree.
 """
 
 from typing import Final
@@ -42,7 +43,7 @@ _LEAST: Final = np.float32(1e-12)
 
 @numba.njit(cache=True, nogil=True)
 def pool_row(distance: Float32, first: Float32, second: Float32, y: int, reach: int, sums: Float32) -> None:
-    """Sums of `first` and `second` over the neighbours of row y on the same surface, itself included.
+    """Fill sums of `first` and `second` over the neighbours of each stripe of row y on its surface, itself included.
 
     distance, first, second: of `with_margin`; y: counted from their first row after the margin. sums: (2, columns),
     where the number of columns is a multiple of LANES.
@@ -54,7 +55,7 @@ def pool_row(distance: Float32, first: Float32, second: Float32, y: int, reach: 
 
 @numba.njit(cache=True, nogil=True)
 def widen_row(at: tuple[int, int, int], width: int, y: int, inner: int, reach: int, enough: float, sums: int) -> None:
-    """Add those neighbours that are more than `inner` rows or columns away, up to `reach`.
+    """Add to sums, as `pool_row`, those neighbours that are more than `inner` rows or columns away, up to `reach`.
 
     Stripes whose second sum already reaches `enough` may be left as they are. at, sums: addresses; width: of copies.
     """
@@ -88,7 +89,7 @@ def _widen_block(at: tuple[int, int, int], to: int, width: int, here: int, c: in
 def pool_amplitude(
     reach: int, faintest: float, brightest: float, first_row: int, last_row: int, places: Places
 ) -> None:
-    """Fill amplitude: brightness of each stripe over that of its scale, pooled over neighbours, between two limits."""
+    """Fill amplitude: light over scale, both summed over each stripe's neighbours, between two limits."""
     amplitude, columns = address_of(places.amplitude), places.amplitude.shape[1]
     sums = np.empty((2, -(-columns // LANES) * LANES), np.float32)
     at, width = address_of(sums), sums.shape[1]
@@ -140,7 +141,7 @@ def pool_places(
 
 @numba.njit(cache=True, nogil=True)
 def _settle(lines: int, columns: int, distance: int, enough: float) -> bool:
-    """Place the stripes that are not placed yet and know enough; whether any others are left."""
+    """Place the stripes that are not placed yet and have enough information; returns whether any others are left."""
     one, none, least = zero_float32() + np.float32(1.0), zero_float32(), zero_float32()
     for c in range(0, columns, LANES):
         known, before = load_float32(lines, columns + c), load_float32(lines, 3 * columns + c)
@@ -158,8 +159,8 @@ def _settle(lines: int, columns: int, distance: int, enough: float) -> bool:
 
 
 SIGMAS: Final = 2.0
-"""Standard deviations by which a pair may differ from the stripe between it: what belongs together nearly always does,
-and a surface that bends by more than its noise is left as it is."""
+"""Standard deviations by which a pair may differ from the stripe between it: on a plane nearly all pairs are within
+them, and a surface that bends by more than its noise is left as it is."""
 
 
 @numba.njit(cache=True, nogil=True)
@@ -167,7 +168,7 @@ def join_pairs(
     distance: Float32, sd_px: Float32, step: int, share: float, enough: float, first_row: int, last_row: int,
     out_distance: Float32, out_sd_px: Float32,
 ) -> None:  # fmt: skip
-    """Fill the outputs, (rows, columns) as the inputs, of rows first_row..last_row-1.
+    """Fill rows first_row..last_row-1 of the outputs with places joined with pairs; all arrays are (rows, columns).
 
     distance: from the far end in px, NaN where there is no stripe; sd_px: at most 1, which means no information. step:
     number of rows and columns to the neighbours, at most MARGIN. enough: information, 1/px^2, above which a stripe
