@@ -2,13 +2,14 @@
 
 No frame is changed and no byte of a segment thrown away. Bytes that are not part of a sound block go to
 `frames-000000.torn`, at the place they had in the segment, a damaged compressed segment to `frames-000000.torn.zst` and
-a damaged manifest to `manifest.damaged.json`. Another repair adds to the first, numbers the second, replaces the third.
+a damaged manifest to `manifest.damaged.json`. What another repair keeps gets a number: `frames-000000-1.torn`, ...
 """
 
 import json
 import os
 from collections.abc import Iterator
 from dataclasses import dataclass
+from itertools import chain, count
 from pathlib import Path
 from typing import Any, BinaryIO, Final
 
@@ -93,8 +94,8 @@ def _clear(segment: SegmentReader, blocks: list[Range], done: list[str]) -> None
     end = round_up_to_page(blocks[-1][1]) if blocks else 0
     others = [(a, used) for a, b in _between(blocks, segment.size) if (used := _used(segment, a, b)) > a]
     if others:
-        torn = segment.path.with_suffix(".torn")
-        with torn.open("rb+" if torn.exists() else "wb") as copy:
+        torn = _free(segment.path.with_suffix(".torn"))
+        with torn.open("wb") as copy:
             _copy(segment, others, copy)
         done.append(f"{segment.path.name}: {len(others)} pieces that are no sound block are kept in {torn.name}")
     if not blocks:
@@ -119,10 +120,7 @@ def _unpack(segment: SegmentReader, blocks: list[Range], done: list[str]) -> Non
     if blocks and segment.size == end and not any(_is_damaged(segment, a, b) for a, b in _between(blocks, end)):
         return
     plain = segment.path.with_name(segment.path.name.removesuffix(PACKED_SUFFIX))
-    torn = plain.with_suffix(f".torn{PACKED_SUFFIX}")
-    number = 1
-    while torn.exists():
-        torn, number = plain.with_suffix(f".torn-{number}{PACKED_SUFFIX}"), number + 1
+    torn = _free(plain.with_suffix(f".torn{PACKED_SUFFIX}"))
     if blocks:
         scratch = plain.with_name(f"{plain.name}.part")
         with scratch.open("wb") as file:
@@ -132,6 +130,13 @@ def _unpack(segment: SegmentReader, blocks: list[Range], done: list[str]) -> Non
     segment.path.rename(torn)
     kept = f"its sound blocks are in {plain.name}, plain" if blocks else "it holds no sound block"
     done.append(f"{segment.path.name} is kept as {torn.name}; {kept}")
+
+
+def _free(path: Path) -> Path:
+    """The path, with a number in its name if there is such a file: what an earlier repair kept stays as it is."""
+    stem, _, rest = path.name.partition(".")
+    numbered = (path.with_name(f"{stem}-{number}.{rest}") for number in count(1))
+    return next(one for one in chain([path], numbered) if not one.exists())
 
 
 def _is_damaged(segment: SegmentReader, begin: int, stop: int) -> bool:
@@ -171,8 +176,8 @@ def _write_manifest(folder: Path, found: Examination, done: list[str]) -> None:
     if manifest is None:
         damaged = folder / MANIFEST
         if damaged.exists():
-            damaged.replace(folder / "manifest.damaged.json")
-            done.append(f"the damaged {MANIFEST} is kept as manifest.damaged.json")
+            kept = damaged.rename(_free(folder / "manifest.damaged.json"))
+            done.append(f"the damaged {MANIFEST} is kept as {kept.name}")
         done.append(f"{MANIFEST} written anew, from the blocks alone: plan and calibration are as they lie here")
         manifest = {"verdict": UNFINISHED}
     elif manifest.get("verdict") == UNFINISHED:

@@ -153,6 +153,31 @@ def test_a_lost_manifest_is_written_anew(tmp_path: Path, runs: Runs, what: str) 
     assert (folder / "manifest.damaged.json").exists() == (what == "damaged")
 
 
+def test_a_part_whose_manifest_does_not_say_its_frames_is_repaired(tmp_path: Path, runs: Runs) -> None:
+    folder = record(tmp_path, [runs[0][1:]], cut={"first_frame": 16})
+    assert verify(folder).verdict is Integrity.INTACT
+    flip(folder / FIRST, 4096 + 500)
+    assert verify(folder).verdict is Integrity.DAMAGED
+    assert repair(folder).after.gaps == [(0, 32, 47)]
+
+
+def test_a_second_repair_leaves_what_the_first_one_kept(tmp_path: Path, runs: Runs) -> None:
+    folder = record(tmp_path, runs)
+    kept: dict[str, bytes] = {}
+    for byte in (b"1", b"2"):
+        with (folder / FIRST).open("rb+") as file:  # both times the second block
+            file.seek(4096)
+            file.write(byte * 4096)
+        (folder / MANIFEST).write_bytes(byte)
+        repair(folder)
+        assert all((folder / name).read_bytes() == data for name, data in kept.items())
+        kept = {name: data for name, data in files_of(folder).items() if "torn" in name or "damaged" in name}
+    assert [name for name, data in kept.items() if b"2" * 4096 in data or data == b"2"] == [
+        "frames-000000-1.torn",
+        "manifest-1.damaged.json",
+    ]
+
+
 def test_blocks_that_come_twice_or_swapped_are_put_right(tmp_path: Path, runs: Runs) -> None:
     folder = record(tmp_path, runs)
     data = bytearray((folder / FIRST).read_bytes())
