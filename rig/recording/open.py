@@ -13,7 +13,7 @@ from drivers.errors import DeviceNotFound, ProtocolError
 from drivers.frames import FrameBlock, Mark
 from drivers.recorded import RecordedRun, RunRecording
 from drivers.recorded.contents import INDEX_FILE
-from drivers.recorded.segments import PACKED_SUFFIX, segment_files
+from drivers.recorded.segments import PACKED_SUFFIX, segment_files, zstandard_or_error
 from rig.config.overrides import PathLike
 from rig.count.bind import MAX_RESIDUAL_COLUMNS
 from rig.errors import DamagedRecordingError, UsageError
@@ -36,9 +36,15 @@ def open_recording(folder: Path) -> RunRecording:
 
 
 def require_recording(path: Path) -> None:
-    """Raise UsageError if a path is not a folder with a recording, saying what it is instead."""
-    if not (path.is_dir() and segment_files(path)):
+    """Raise UsageError if a path is not a folder with a recording, saying what it is instead, or cannot be unpacked."""
+    files = segment_files(path).values() if path.is_dir() else ()
+    if not files:
         raise UsageError(f"{path} {_instead(path)}")
+    if any(file.name.endswith(PACKED_SUFFIX) for file in files):
+        try:
+            zstandard_or_error()
+        except ProtocolError as error:
+            raise UsageError(f"{path}: {error}") from None
 
 
 def _instead(path: Path) -> str:
