@@ -128,6 +128,15 @@ def test_starts_follow_one_another_and_end_unless_they_loop(recording: Path) -> 
         assert len(set(ids)) == 5
 
 
+def test_no_two_starts_of_a_loop_have_the_same_number_where_one_is_left_out(recording: Path) -> None:
+    third = block(9, 0, 0, 25, 0)
+    (recording / "frames-000002.spb").write_bytes(b"".join(map(bytes, block_parts(third))))
+    with replay(recording, loop=True) as device:
+        device.leave_out({1})
+        stride = device.configure(REQUEST).stride
+        assert [next_start(device, stride)[0].header.run_id for _ in range(5)] == [7, 9, 10, 12, 13]
+
+
 def test_a_block_whose_payload_is_damaged_is_left_out_and_counted(recording: Path) -> None:
     file = recording / "frames-000000.spb"
     data = bytearray(file.read_bytes())
