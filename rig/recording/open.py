@@ -1,5 +1,6 @@
 """Opens recordings for the commands that read one, and finds what they hold and which frames belong to which map."""
 
+import difflib
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 from itertools import pairwise
@@ -53,7 +54,10 @@ def _instead(path: Path) -> str:
     if path.is_file():
         return "is a file; " + ("name the folder that it lies in" if path.match(f"{SEGMENTS}*") else name_one)
     if not path.exists():
-        return f"does not exist; {name_one}"
+        beside = [one.name for one in path.parent.glob("*/") if segment_files(one)]
+        close = difflib.get_close_matches(path.name, beside, n=1)
+        meant = f"did you mean '{path.with_name(close[0])}'? " if close else ""
+        return f"does not exist; {meant}{name_one}"
     inside = sorted(part for part in path.iterdir() if part.is_dir() and segment_files(part))
     if inside:
         more = "" if len(inside) == 1 else f" or another of {len(inside)} in it"

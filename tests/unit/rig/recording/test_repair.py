@@ -3,12 +3,14 @@
 import json
 import re
 import sys
+from functools import partial
 from pathlib import Path
 
 import numpy as np
 import pytest
 
 from drivers.recorded import INDEX_FILE, RunRecording
+from rig.api import reconstruct
 from rig.errors import DamagedRecordingError, UsageError
 from rig.recording.repair import repair
 from rig.recording.verify import Integrity, verify
@@ -219,3 +221,11 @@ def test_a_folder_without_a_recording_is_called_what_it_is(tmp_path: Path, files
     for act in (verify, repair):
         with pytest.raises(UsageError, match=re.escape(said)):
             act(tmp_path / "absent" if files is None else tmp_path)
+
+
+def test_a_recording_with_a_similar_name_beside_one_that_is_not_there_is_named(tmp_path: Path, runs: Runs) -> None:
+    record(tmp_path / "street", runs[:1])
+    (tmp_path / "strett").mkdir()  # holds nothing
+    for act in (verify, partial(reconstruct, out=tmp_path / "out")):
+        with pytest.raises(UsageError, match=r"does not exist; did you mean '.*street'\? name the folder"):
+            act(tmp_path / "stret")
