@@ -16,7 +16,7 @@ from typing import Any, BinaryIO, Final
 import numpy as np
 
 from drivers.errors import CorruptBlock
-from drivers.recorded.contents import INDEX_FILE, index_header, round_up_to_page
+from drivers.recorded.contents import INDEX_FILE, INDEX_RECORD, index_header, round_up_to_page, segment_name
 from drivers.recorded.segments import PACKED_SUFFIX, PlainSegment, SegmentReader
 from rig.config.overrides import PathLike
 from rig.errors import RecordingError, UsageError
@@ -73,18 +73,22 @@ def repair(run: PathLike) -> Repair:
 
 def _put_in_order(found: Examination, done: list[str]) -> bool:
     """Rename segments so that their numbers rise with the frames in them; return whether that was necessary."""
-    segments = {segment.number: segment.path for segment in found.segments}
+    paths = {segment.number: segment.path for segment in found.segments}
     numbers = list(dict.fromkeys(found.entries["segment"].tolist()))  # entries are in the order of their frames
     if numbers == sorted(numbers):
         return False
-    moves = [(segments[old], segments[new]) for old, new in zip(numbers, sorted(numbers), strict=True) if old != new]
-    for path, _ in moves:
-        path.rename(path.with_name(f"{path.name}.moving"))
-    for path, other in moves:
-        target = other.with_name(other.name.split(".")[0] + "".join(path.suffixes))
-        path.with_name(f"{path.name}.moving").rename(target)
-        done.append(f"{path.name} is {target.name} now, by the frames in it")
+    moves = [(paths[old], new) for old, new in zip(numbers, sorted(numbers), strict=True) if old != new]
+    # First to numbers that are free: all are segments still, wherever a repair is killed.
+    aside = [_numbered(path, number) for number, (path, _) in enumerate(moves, max(paths) + 1)]
+    for (path, new), moved in zip(moves, aside, strict=True):
+        done.append(f"{path.name} is {_numbered(moved, new).name} now, by the frames in it")
     return True
+
+
+def _numbered(segment: Path, number: int) -> Path:
+    """Rename a segment so that it has this number; returns its new path."""
+    name = segment_name(number)
+    return segment.rename(segment.with_name(name + segment.name[len(name) :]))
 
 
 def _clear(segment: SegmentReader, blocks: list[Range], done: list[str]) -> None:
@@ -211,7 +215,8 @@ def _write_manifest(folder: Path, found: Examination, done: list[str]) -> None:
 
 
 def _recording(found: Examination) -> dict[str, Any]:
-    """The part of `Recording.content` that a repair changes; the starts only if the manifest does not have them."""
+    """The part of `Recording.content` that a repair changes; if the manifest has no starts, those that blocks tell."""
+    segments = [np.frombuffer(b"".join(block.entry for block in run), INDEX_RECORD)["segment"] for run in found.runs]
     with_blocks = set(found.entries["segment"].tolist())
     content: dict[str, Any] = {
         "files": [s.path.name.removesuffix(PACKED_SUFFIX) for s in found.segments if s.number in with_blocks],
@@ -219,11 +224,9 @@ def _recording(found: Examination) -> dict[str, Any]:
         "blocks": len(found.entries),
         "bytes": found.bytes,
     }
-    if "starts" not in ((found.manifest or {}).get("recording") or {}):
-        content["starts"] = starts = []
-        for run in found.runs:  # whole sweeps, as the blocks tell, and the first segment
-            first = run[0].header
-            segments = found.entries["segment"][found.entries["run_id"] == first.run_id]
-            sweeps = max(0, run[-1].last_sweep - max(1, first.sweep))
-            starts.append({"sweeps": sweeps, "segment": int(segments.min())})
+    starts = ((found.manifest or {}).get("recording") or {}).get("starts")
+    if starts is None:  # whole sweeps, and the first segment
+        starts = [{"sweeps": max(0, run[-1].last_sweep - max(1, run[0].header.sweep))} for run in found.runs]
+    if len(starts) == len(found.runs):
+        content["starts"] = [{**start, "segment": int(of.min())} for start, of in zip(starts, segments, strict=True)]
     return content

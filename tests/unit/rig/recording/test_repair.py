@@ -16,7 +16,7 @@ from rig.recording.repair import repair
 from rig.recording.verify import Integrity, verify
 from rig.recording.writer import Recording
 from rig.run_folder.manifest import MANIFEST, read_manifest, sealed_text
-from tests.unit.rig.recording.recorded import Runs, assert_same, flip, read, record, run_blocks
+from tests.unit.rig.recording.recorded import Runs, assert_all_there, assert_same, flip, read, record, run_blocks
 
 FIRST = "frames-000000.spb"
 
@@ -189,6 +189,35 @@ def test_blocks_that_come_twice_or_swapped_are_put_right(tmp_path: Path, runs: R
     done = repair(folder)
     assert done.after.verdict is Integrity.INTACT, done
     assert_same(read(RunRecording(folder))[0], runs[0])
+
+
+@pytest.mark.parametrize("renamed", range(6))
+def test_a_repair_that_is_killed_while_it_puts_segments_in_order_loses_none(
+    tmp_path: Path, runs: Runs, monkeypatch: pytest.MonkeyPatch, renamed: int
+) -> None:
+    folder = record(tmp_path, runs)
+    names = sorted(file.name for file in folder.glob("frames-*.spb"))[:3]
+    for name in names:
+        (folder / name).rename(folder / f"{name}.kept")
+    for name, other in zip(names, [*names[1:], names[0]], strict=True):
+        (folder / f"{name}.kept").rename(folder / other)
+    rename, done = Path.rename, []
+
+    def killed(self: Path, target: Path) -> Path:
+        if len(done) == renamed:
+            raise KeyboardInterrupt
+        done.append(target)
+        return rename(self, target)
+
+    monkeypatch.setattr(Path, "rename", killed)
+    with pytest.raises(KeyboardInterrupt):
+        repair(folder)
+    monkeypatch.undo()
+    assert repair(folder).after.verdict is Integrity.INTACT
+    recording = RunRecording(folder)
+    assert_all_there(recording, runs)
+    starts = (read_manifest(folder) or {})["recording"]["starts"]
+    assert [start["segment"] for start in starts] == [int(run.entries["segment"][0]) for run in recording.runs]
 
 
 @pytest.mark.skipif(sys.platform == "win32", reason="Windows itself keeps others away")
