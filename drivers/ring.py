@@ -93,12 +93,12 @@ class BlockRing:
             if self._any_claimed:
                 raise WrongState(f"ring: reader {name!r} after the first claim; add readers before the source starts")
             optional = sum(not reader.required for reader in self._readers) + (not required)
-            if optional >= self.slots:
+            most = max([holds, *(reader.holds for reader in self._readers)])
+            if most + optional > self.slots:
                 raise ValueError(
-                    f"ring: optional reader {name!r} could hold the last of {self.slots} slots; make the ring longer"
+                    f"ring: with reader {name!r} one holds {most} of {self.slots} slots, and {optional} optional ones "
+                    "hold one each; make the ring longer"
                 )
-            if holds > self.slots - optional:
-                raise ValueError(f"ring: reader {name!r} holds {holds} of {self.slots} slots; make the ring longer")
             reader = RingReader(self, name, required, holds)
             self._readers.append(reader)
             return reader

@@ -273,7 +273,7 @@ class ReplaySpad(SpadArray):
         times, index = divmod(self._played, len(runs))
         if times and not self.loops:
             raise DeviceFault(f"{self.name}: all its {len(runs)} starts are played; configure it anew, or let it loop")
-        self._run_id = (runs[index].header.run_id + times * len(runs)) & 0xFFFF
+        self._run_id = (runs[index].header.run_id + times * len(self.recording.runs)) & 0xFFFF
         self._played += 1
         self._reading = Cursor(self.recording, runs[index], n_frames, by_block=not self._info.markers)
         self._t0_ticks = runs[index].header.t0_ticks

@@ -24,8 +24,6 @@ LIMITS = ScannerLimits(
 """Limits that every recorded waveform is within: the mirror has followed it already."""
 MAX_POWER_W = 1e3
 RESOLUTION_S = 1e-9
-_LARGEST_DIVISOR = 100_000
-"""Largest denominator of a point clock; a float then says which fraction it is."""
 
 
 class StandInConfig(KindConfig):
@@ -54,7 +52,8 @@ class RecordedScanner(BeamScanner):
         return ScannerStatus(moving=now_s(self._clock) < self._ends_s, fault=None, position=None)
 
     def _do_point_clock(self, requested_hz: float) -> Fraction:
-        return Fraction(requested_hz).limit_denominator(_LARGEST_DIVISOR)
+        simplest = (Fraction(requested_hz).limit_denominator(10**digits) for digits in range(20))
+        return next(rate for rate in simplest if float(rate) == requested_hz)  # the one a divider made, for any board
 
     def _do_load(self, waveform: ScanWaveform, repeats: int, clock_hz: Fraction) -> None:
         self._takes_s = float(repeats * len(waveform.command) / clock_hz)

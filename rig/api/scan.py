@@ -211,7 +211,7 @@ def reconstruct(
     """
     request = replace(request or ReconstructRequest(), **changes)
     source = Path(source)
-    if source.is_dir():
+    if source.is_dir() or not (source.suffix or source.exists()):
         require_recording(source)
     if source.is_dir() and not holds_frames_alone(source):
         if plan is not None and (source / PLAN_FILE).exists():

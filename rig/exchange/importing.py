@@ -142,7 +142,7 @@ def import_frames(
             "verdict": "gaps" if gaps else "complete",
         }
         if ranges[0][0]:  # not from the start of the SPAD on, as after 'rig cut'
-            manifest["cut"] = {"first_frame": ranges[0][0]}
+            manifest["cut"] = {"frames": [[_RUN_ID, ranges[0][0], sum(ranges[-1])]]}
         folder.write_json(MANIFEST, manifest)
         path = folder.publish()
     return ImportResult(

@@ -257,7 +257,7 @@ def lost_ends(
     ranges = _told_ranges(contents, runs)
     blocks = ((manifest or {}).get("recording") or {}).get("blocks")
     if cut is not None and isinstance(blocks, int) and blocks > sum(map(len, runs)):
-        for run_id, first, end in cut["frames"]:
+        for run_id, first, end in cut.get("frames") or ():
             _extend(ranges, run_id, first, end)
     gaps: list[RunGap] = []
     for number, run in enumerate(runs):

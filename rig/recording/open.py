@@ -1,5 +1,6 @@
 """Opens recordings for the commands that read one, and finds what they hold and which frames belong to which map."""
 
+import difflib
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 from itertools import pairwise
@@ -13,7 +14,7 @@ from drivers.errors import DeviceNotFound, ProtocolError
 from drivers.frames import FrameBlock, Mark
 from drivers.recorded import RecordedRun, RunRecording
 from drivers.recorded.contents import INDEX_FILE
-from drivers.recorded.segments import PACKED_SUFFIX, segment_files
+from drivers.recorded.segments import PACKED_SUFFIX, segment_files, zstandard_or_error
 from rig.config.overrides import PathLike
 from rig.count.bind import MAX_RESIDUAL_COLUMNS
 from rig.errors import DamagedRecordingError, UsageError
@@ -36,9 +37,15 @@ def open_recording(folder: Path) -> RunRecording:
 
 
 def require_recording(path: Path) -> None:
-    """Raise UsageError if a path is not a folder with a recording, saying what it is instead."""
-    if not (path.is_dir() and segment_files(path)):
+    """Raise UsageError if a path is not a folder with a recording, saying what it is instead, or cannot be unpacked."""
+    files = segment_files(path).values() if path.is_dir() else ()
+    if not files:
         raise UsageError(f"{path} {_instead(path)}")
+    if any(file.name.endswith(PACKED_SUFFIX) for file in files):
+        try:
+            zstandard_or_error()
+        except ProtocolError as error:
+            raise UsageError(f"{path}: {error}") from None
 
 
 def _instead(path: Path) -> str:
@@ -47,7 +54,10 @@ def _instead(path: Path) -> str:
     if path.is_file():
         return "is a file; " + ("name the folder that it lies in" if path.match(f"{SEGMENTS}*") else name_one)
     if not path.exists():
-        return f"does not exist; {name_one}"
+        beside = [one.name for one in path.parent.glob("*/") if segment_files(one)]
+        close = difflib.get_close_matches(path.name, beside, n=1)
+        meant = f"did you mean '{path.with_name(close[0])}'? " if close else ""
+        return f"does not exist; {meant}{name_one}"
     inside = sorted(part for part in path.iterdir() if part.is_dir() and segment_files(part))
     if inside:
         more = "" if len(inside) == 1 else f" or another of {len(inside)} in it"

@@ -2,20 +2,21 @@
 
 No frame is changed and no byte of a segment thrown away. Bytes that are not part of a sound block go to
 `frames-000000.torn`, at the place they had in the segment, a damaged compressed segment to `frames-000000.torn.zst` and
-a damaged manifest to `manifest.damaged.json`. Another repair adds to the first, numbers the second, replaces the third.
+a damaged manifest to `manifest.damaged.json`. What another repair keeps gets a number: `frames-000000-1.torn`, ...
 """
 
 import json
 import os
 from collections.abc import Iterator
 from dataclasses import dataclass
+from itertools import chain, count
 from pathlib import Path
 from typing import Any, BinaryIO, Final
 
 import numpy as np
 
 from drivers.errors import CorruptBlock
-from drivers.recorded.contents import INDEX_FILE, index_header, round_up_to_page
+from drivers.recorded.contents import INDEX_FILE, INDEX_RECORD, index_header, round_up_to_page, segment_name
 from drivers.recorded.segments import PACKED_SUFFIX, PlainSegment, SegmentReader
 from rig.config.overrides import PathLike
 from rig.errors import RecordingError, UsageError
@@ -72,18 +73,22 @@ def repair(run: PathLike) -> Repair:
 
 def _put_in_order(found: Examination, done: list[str]) -> bool:
     """Rename segments so that their numbers rise with the frames in them; return whether that was necessary."""
-    segments = {segment.number: segment.path for segment in found.segments}
+    paths = {segment.number: segment.path for segment in found.segments}
     numbers = list(dict.fromkeys(found.entries["segment"].tolist()))  # entries are in the order of their frames
     if numbers == sorted(numbers):
         return False
-    moves = [(segments[old], segments[new]) for old, new in zip(numbers, sorted(numbers), strict=True) if old != new]
-    for path, _ in moves:
-        path.rename(path.with_name(f"{path.name}.moving"))
-    for path, other in moves:
-        target = other.with_name(other.name.split(".")[0] + "".join(path.suffixes))
-        path.with_name(f"{path.name}.moving").rename(target)
-        done.append(f"{path.name} is {target.name} now, by the frames in it")
+    moves = [(paths[old], new) for old, new in zip(numbers, sorted(numbers), strict=True) if old != new]
+    # First to numbers that are free: all are segments still, wherever a repair is killed.
+    aside = [_numbered(path, number) for number, (path, _) in enumerate(moves, max(paths) + 1)]
+    for (path, new), moved in zip(moves, aside, strict=True):
+        done.append(f"{path.name} is {_numbered(moved, new).name} now, by the frames in it")
     return True
+
+
+def _numbered(segment: Path, number: int) -> Path:
+    """Rename a segment so that it has this number; returns its new path."""
+    name = segment_name(number)
+    return segment.rename(segment.with_name(name + segment.name[len(name) :]))
 
 
 def _clear(segment: SegmentReader, blocks: list[Range], done: list[str]) -> None:
@@ -93,8 +98,8 @@ def _clear(segment: SegmentReader, blocks: list[Range], done: list[str]) -> None
     end = round_up_to_page(blocks[-1][1]) if blocks else 0
     others = [(a, used) for a, b in _between(blocks, segment.size) if (used := _used(segment, a, b)) > a]
     if others:
-        torn = segment.path.with_suffix(".torn")
-        with torn.open("rb+" if torn.exists() else "wb") as copy:
+        torn = _free(segment.path.with_suffix(".torn"))
+        with torn.open("wb") as copy:
             _copy(segment, others, copy)
         done.append(f"{segment.path.name}: {len(others)} pieces that are no sound block are kept in {torn.name}")
     if not blocks:
@@ -119,10 +124,7 @@ def _unpack(segment: SegmentReader, blocks: list[Range], done: list[str]) -> Non
     if blocks and segment.size == end and not any(_is_damaged(segment, a, b) for a, b in _between(blocks, end)):
         return
     plain = segment.path.with_name(segment.path.name.removesuffix(PACKED_SUFFIX))
-    torn = plain.with_suffix(f".torn{PACKED_SUFFIX}")
-    number = 1
-    while torn.exists():
-        torn, number = plain.with_suffix(f".torn-{number}{PACKED_SUFFIX}"), number + 1
+    torn = _free(plain.with_suffix(f".torn{PACKED_SUFFIX}"))
     if blocks:
         scratch = plain.with_name(f"{plain.name}.part")
         with scratch.open("wb") as file:
@@ -132,6 +134,13 @@ def _unpack(segment: SegmentReader, blocks: list[Range], done: list[str]) -> Non
     segment.path.rename(torn)
     kept = f"its sound blocks are in {plain.name}, plain" if blocks else "it holds no sound block"
     done.append(f"{segment.path.name} is kept as {torn.name}; {kept}")
+
+
+def _free(path: Path) -> Path:
+    """The path, with a number in its name if there is such a file: what an earlier repair kept stays as it is."""
+    stem, _, rest = path.name.partition(".")
+    numbered = (path.with_name(f"{stem}-{number}.{rest}") for number in count(1))
+    return next(one for one in chain([path], numbered) if not one.exists())
 
 
 def _is_damaged(segment: SegmentReader, begin: int, stop: int) -> bool:
@@ -171,8 +180,8 @@ def _write_manifest(folder: Path, found: Examination, done: list[str]) -> None:
     if manifest is None:
         damaged = folder / MANIFEST
         if damaged.exists():
-            damaged.replace(folder / "manifest.damaged.json")
-            done.append(f"the damaged {MANIFEST} is kept as manifest.damaged.json")
+            kept = damaged.rename(_free(folder / "manifest.damaged.json"))
+            done.append(f"the damaged {MANIFEST} is kept as {kept.name}")
         done.append(f"{MANIFEST} written anew, from the blocks alone: plan and calibration are as they lie here")
         manifest = {"verdict": UNFINISHED}
     elif manifest.get("verdict") == UNFINISHED:
@@ -206,7 +215,8 @@ def _write_manifest(folder: Path, found: Examination, done: list[str]) -> None:
 
 
 def _recording(found: Examination) -> dict[str, Any]:
-    """The part of `Recording.content` that a repair changes; the starts only if the manifest does not have them."""
+    """The part of `Recording.content` that a repair changes; if the manifest has no starts, those that blocks tell."""
+    segments = [np.frombuffer(b"".join(block.entry for block in run), INDEX_RECORD)["segment"] for run in found.runs]
     with_blocks = set(found.entries["segment"].tolist())
     content: dict[str, Any] = {
         "files": [s.path.name.removesuffix(PACKED_SUFFIX) for s in found.segments if s.number in with_blocks],
@@ -214,11 +224,9 @@ def _recording(found: Examination) -> dict[str, Any]:
         "blocks": len(found.entries),
         "bytes": found.bytes,
     }
-    if "starts" not in ((found.manifest or {}).get("recording") or {}):
-        content["starts"] = starts = []
-        for run in found.runs:  # whole sweeps, as the blocks tell, and the first segment
-            first = run[0].header
-            segments = found.entries["segment"][found.entries["run_id"] == first.run_id]
-            sweeps = max(0, run[-1].last_sweep - max(1, first.sweep))
-            starts.append({"sweeps": sweeps, "segment": int(segments.min())})
+    starts = ((found.manifest or {}).get("recording") or {}).get("starts")
+    if starts is None:  # whole sweeps, and the first segment
+        starts = [{"sweeps": max(0, run[-1].last_sweep - max(1, run[0].header.sweep))} for run in found.runs]
+    if len(starts) == len(found.runs):
+        content["starts"] = [{**start, "segment": int(of.min())} for start, of in zip(starts, segments, strict=True)]
     return content

@@ -8,7 +8,7 @@ from typing import Any
 
 import numpy as np
 
-from drivers.errors import DeviceNotFound, ProtocolError
+from drivers.errors import DeviceNotFound
 from drivers.frames import BlockHeader
 from drivers.recorded.contents import INDEX_FILE, INDEX_RECORD, Contents, find_blocks, round_up_to_page
 from drivers.recorded.order import in_order
@@ -127,8 +127,6 @@ def examine(folder: Path) -> Examination:
         segments = open_segments(folder)
     except DeviceNotFound as error:
         raise UsageError(str(error)) from None
-    except ProtocolError as error:  # a package is missing
-        raise UsageError(f"{folder}: {error}") from None
     tell_stage(CHECKING)
     contents = find_blocks(segments, folder)
     sound, damage = check_segments(segments)

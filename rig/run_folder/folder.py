@@ -29,6 +29,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from drivers.interfaces import SweepTruth
+from drivers.recorded.contents import INDEX_FILE
 from rig.depth.reconstruct import MapResult
 from rig.errors import UsageError
 from rig.run_folder.manifest import MANIFEST, sealed_text
@@ -162,7 +163,8 @@ class RunFolder:
         """Remove everything that was not published, and the folders made for it."""
         if self._scratch is not None:
             if self._in_place:
-                for child in self._scratch.iterdir():
+                mine = not is_held(self._scratch / INDEX_FILE)  # else another run took the folder while it was empty
+                for child in self._scratch.iterdir() if mine else ():
                     shutil.rmtree(child, ignore_errors=True) if child.is_dir() else child.unlink(missing_ok=True)
             else:
                 shutil.rmtree(self._scratch, ignore_errors=True)
@@ -236,7 +238,10 @@ class SavePolicy:
 
 
 def _renamed(folder: Path, target: Path) -> bool:
-    """Move a folder; False if what is at `target` already prevents it. Raises OSError if something else does."""
+    """Move a folder; False if there is something at `target` already, if only an empty folder, which another run may
+    have claimed. Raises OSError if anything else prevents it."""
+    if target.exists():
+        return False
     try:
         folder.rename(target)
     except OSError:

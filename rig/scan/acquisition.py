@@ -11,7 +11,7 @@ from dataclasses import dataclass, fields, replace
 from fractions import Fraction
 
 from drivers.clock import VirtualClock
-from drivers.errors import DeviceFault, DeviceTimeout
+from drivers.errors import DeviceError, DeviceFault, DeviceTimeout
 from drivers.guard import GuardLimits
 from drivers.interfaces import SpadCounters, SpadTiming
 from drivers.replay.spad import ReplaySpad
@@ -176,11 +176,14 @@ class Acquisition:
                     if (found := pipeline.maps.take_streaming(TELL_S)) is not None:
                         self._fog = found.result.fog
                         yield found
-                    if rig.guard is not None and rig.guard.failure is not None:
-                        pipeline.end_source(rig.guard.failure)  # the SPAD may be what is silent: not waited for
+                    try:
+                        if rig.guard is not None and rig.guard.failure is not None:
+                            raise rig.guard.failure
+                        if (fault := rig.scanner.status.fault) is not None:  # frames would go on without markers
+                            raise DeviceFault(fault)
+                    except DeviceError as error:
+                        pipeline.end_source(error)  # the SPAD may be what is silent: not waited for
                         break
-                    if (fault := rig.scanner.status.fault) is not None:  # frames would go on without markers
-                        raise DeviceFault(fault)
                     self._tell(assembler, done)
             finally:
                 trouble = self._make_safe(pipeline)

@@ -63,7 +63,7 @@ class Source:
     def join(self, timeout_s: float) -> bool:
         """Wait for the thread; False if it does not end in time. Readers get only what is left, in either case."""
         ended = self.thread.join(timeout_s)
-        self._ring.finish()
+        self._ring.finish(self._why)
         return ended
 
     def _run(self) -> None:

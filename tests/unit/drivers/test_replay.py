@@ -13,9 +13,10 @@ import pytest
 from drivers.clock import VirtualClock
 from drivers.errors import DeviceFault, DeviceNotFound, LimitExceeded
 from drivers.frames import BlockFlag, FrameBlock, Mark
-from drivers.interfaces import SpadRequest, WindowTable
+from drivers.interfaces import ScanWaveform, SpadRequest, WindowTable
 from drivers.registry import Surroundings
 from drivers.replay.spad import KIND, ReplaySpad, ReplaySpadConfig
+from drivers.replay.stand_ins import SCANNER, StandInConfig
 from drivers.ring import BlockRing, OnFull
 from drivers.spb1 import BlockLayout, block_parts, block_views, seal_block
 from tests.unit.drivers.spb1_bytes import GOLDEN_HEADER
@@ -127,6 +128,15 @@ def test_starts_follow_one_another_and_end_unless_they_loop(recording: Path) -> 
         assert len(set(ids)) == 5
 
 
+def test_no_two_starts_of_a_loop_have_the_same_number_where_one_is_left_out(recording: Path) -> None:
+    third = block(9, 0, 0, 25, 0)
+    (recording / "frames-000002.spb").write_bytes(b"".join(map(bytes, block_parts(third))))
+    with replay(recording, loop=True) as device:
+        device.leave_out({1})
+        stride = device.configure(REQUEST).stride
+        assert [next_start(device, stride)[0].header.run_id for _ in range(5)] == [7, 9, 10, 12, 13]
+
+
 def test_a_block_whose_payload_is_damaged_is_left_out_and_counted(recording: Path) -> None:
     file = recording / "frames-000000.spb"
     data = bytearray(file.read_bytes())
@@ -207,3 +217,10 @@ def test_a_folder_without_a_recording_is_refused(tmp_path: Path) -> None:
         pass
     with pytest.raises(DeviceNotFound, match="rig replay RUN"):
         KIND.create(ReplaySpadConfig(), Surroundings(VirtualClock(), None, 0))
+
+
+@pytest.mark.parametrize("rate", [Fraction(112_000_000, 110_017), Fraction(48_000_000, 47_999), Fraction(25_000)])
+def test_the_stand_in_for_the_scanner_runs_at_the_very_rate_of_the_one_recorded(rate: Fraction) -> None:
+    command = np.zeros(4)
+    with SCANNER.create(StandInConfig(), Surroundings(VirtualClock(), None, 0)) as scanner:
+        assert scanner.load(ScanWaveform(command, command.astype(np.uint8), rate), 1) == rate

@@ -82,6 +82,10 @@ def test_readers_that_could_hold_every_slot_and_a_ring_of_nothing_are_refused() 
         ring.reader("count", holds=2)
     with pytest.raises(ValueError, match="make the ring longer"):
         ring.reader("two", required=False)
+    ring = BlockRing(2, STRIDE)
+    ring.reader("count", holds=2)
+    with pytest.raises(ValueError, match="holds 2 of 2 slots, and 1 optional"):  # in either order
+        ring.reader("monitor", required=False)
 
 
 def test_an_optional_reader_holds_one_slot_and_never_the_last_one() -> None:

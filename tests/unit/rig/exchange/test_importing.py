@@ -10,8 +10,8 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from drivers.frames import BlockFlag, FrameBlock
-from drivers.recorded import RunRecording
-from rig.api import import_frames, verify
+from drivers.recorded import INDEX_FILE, RunRecording
+from rig.api import import_frames, repair, verify
 from rig.errors import UsageError
 from rig.exchange import raw_files
 from rig.exchange.importing import ImportResult
@@ -23,6 +23,7 @@ from tests.unit.rig.exchange.foreign_files import (
     swissspad2_full,
     swissspad2_half,
 )
+from tests.unit.rig.recording.recorded import flip
 
 NUMBERS = st.integers(-5, 2**70) | st.floats()
 JSON = st.recursive(st.none() | NUMBERS | st.text(max_size=3), lambda inner: st.lists(inner, max_size=3), max_leaves=6)
@@ -136,6 +137,15 @@ def test_a_photon_cube_of_any_width_keeps_its_clock_and_numbers(tmp_path: Path) 
     assert first.header.tick_hz / first.header.frame_period_ticks == 97_700
     assert np.array_equal(frames_of(tmp_path / "run"), frames)
     assert second.start_ticks[0] == 6 * first.header.frame_period_ticks
+
+
+def test_the_end_of_an_import_that_does_not_begin_at_frame_0_is_missed_without_its_index(tmp_path: Path) -> None:
+    sidecar = {"format": "spadrig-frames", "width": 16, "ranges": [[1, 5, 4], [1, 11, 5]]}
+    import_cube(tmp_path, np.packbits(some_frames(9, 2, 16), axis=2), sidecar)
+    run = tmp_path / "run"
+    flip(run / "frames-000000.spb", 4096 + 300)
+    (run / INDEX_FILE).unlink()
+    assert repair(run).after.gaps == [(0, 9, 15)]
 
 
 @settings(max_examples=50, deadline=None)

@@ -3,18 +3,20 @@
 import json
 import re
 import sys
+from functools import partial
 from pathlib import Path
 
 import numpy as np
 import pytest
 
 from drivers.recorded import INDEX_FILE, RunRecording
+from rig.api import reconstruct
 from rig.errors import DamagedRecordingError, UsageError
 from rig.recording.repair import repair
 from rig.recording.verify import Integrity, verify
 from rig.recording.writer import Recording
 from rig.run_folder.manifest import MANIFEST, read_manifest, sealed_text
-from tests.unit.rig.recording.recorded import Runs, assert_same, flip, read, record, run_blocks
+from tests.unit.rig.recording.recorded import Runs, assert_all_there, assert_same, flip, read, record, run_blocks
 
 FIRST = "frames-000000.spb"
 
@@ -153,6 +155,31 @@ def test_a_lost_manifest_is_written_anew(tmp_path: Path, runs: Runs, what: str) 
     assert (folder / "manifest.damaged.json").exists() == (what == "damaged")
 
 
+def test_a_part_whose_manifest_does_not_say_its_frames_is_repaired(tmp_path: Path, runs: Runs) -> None:
+    folder = record(tmp_path, [runs[0][1:]], cut={"first_frame": 16})
+    assert verify(folder).verdict is Integrity.INTACT
+    flip(folder / FIRST, 4096 + 500)
+    assert verify(folder).verdict is Integrity.DAMAGED
+    assert repair(folder).after.gaps == [(0, 32, 47)]
+
+
+def test_a_second_repair_leaves_what_the_first_one_kept(tmp_path: Path, runs: Runs) -> None:
+    folder = record(tmp_path, runs)
+    kept: dict[str, bytes] = {}
+    for byte in (b"1", b"2"):
+        with (folder / FIRST).open("rb+") as file:  # both times the second block
+            file.seek(4096)
+            file.write(byte * 4096)
+        (folder / MANIFEST).write_bytes(byte)
+        repair(folder)
+        assert all((folder / name).read_bytes() == data for name, data in kept.items())
+        kept = {name: data for name, data in files_of(folder).items() if "torn" in name or "damaged" in name}
+    assert [name for name, data in kept.items() if b"2" * 4096 in data or data == b"2"] == [
+        "frames-000000-1.torn",
+        "manifest-1.damaged.json",
+    ]
+
+
 def test_blocks_that_come_twice_or_swapped_are_put_right(tmp_path: Path, runs: Runs) -> None:
     folder = record(tmp_path, runs)
     data = bytearray((folder / FIRST).read_bytes())
@@ -162,6 +189,35 @@ def test_blocks_that_come_twice_or_swapped_are_put_right(tmp_path: Path, runs: R
     done = repair(folder)
     assert done.after.verdict is Integrity.INTACT, done
     assert_same(read(RunRecording(folder))[0], runs[0])
+
+
+@pytest.mark.parametrize("renamed", range(6))
+def test_a_repair_that_is_killed_while_it_puts_segments_in_order_loses_none(
+    tmp_path: Path, runs: Runs, monkeypatch: pytest.MonkeyPatch, renamed: int
+) -> None:
+    folder = record(tmp_path, runs)
+    names = sorted(file.name for file in folder.glob("frames-*.spb"))[:3]
+    for name in names:
+        (folder / name).rename(folder / f"{name}.kept")
+    for name, other in zip(names, [*names[1:], names[0]], strict=True):
+        (folder / f"{name}.kept").rename(folder / other)
+    rename, done = Path.rename, []
+
+    def killed(self: Path, target: Path) -> Path:
+        if len(done) == renamed:
+            raise KeyboardInterrupt
+        done.append(target)
+        return rename(self, target)
+
+    monkeypatch.setattr(Path, "rename", killed)
+    with pytest.raises(KeyboardInterrupt):
+        repair(folder)
+    monkeypatch.undo()
+    assert repair(folder).after.verdict is Integrity.INTACT
+    recording = RunRecording(folder)
+    assert_all_there(recording, runs)
+    starts = (read_manifest(folder) or {})["recording"]["starts"]
+    assert [start["segment"] for start in starts] == [int(run.entries["segment"][0]) for run in recording.runs]
 
 
 @pytest.mark.skipif(sys.platform == "win32", reason="Windows itself keeps others away")
@@ -194,3 +250,11 @@ def test_a_folder_without_a_recording_is_called_what_it_is(tmp_path: Path, files
     for act in (verify, repair):
         with pytest.raises(UsageError, match=re.escape(said)):
             act(tmp_path / "absent" if files is None else tmp_path)
+
+
+def test_a_recording_with_a_similar_name_beside_one_that_is_not_there_is_named(tmp_path: Path, runs: Runs) -> None:
+    record(tmp_path / "street", runs[:1])
+    (tmp_path / "strett").mkdir()  # holds nothing
+    for act in (verify, partial(reconstruct, out=tmp_path / "out")):
+        with pytest.raises(UsageError, match=r"does not exist; did you mean '.*street'\? name the folder"):
+            act(tmp_path / "stret")

@@ -1,6 +1,7 @@
 """The run folder: whole or not there, and files that other programs can read."""
 
 import json
+import sys
 from fractions import Fraction
 from pathlib import Path
 
@@ -9,10 +10,13 @@ import numpy as np
 import pytest
 
 from drivers.interfaces import SweepTruth
+from drivers.recorded import RunRecording
 from rig.depth.reconstruct import FogEstimate, MapResult
 from rig.geometry.stripe_table import StripeTable
+from rig.recording.writer import Recording
 from rig.run_folder.folder import RunFolder, json_text
 from rig.run_folder.pictures import SCALE_PX, depth_picture
+from tests.unit.rig.recording.recorded import run_blocks
 
 ROWS, WIDTH, COLUMNS = 40, 60, 7
 
@@ -154,6 +158,27 @@ def test_a_run_whose_name_was_taken_meanwhile_is_kept_beside_it(
     assert all((tmp_path / name / "summary.json").exists() for name in published)
     assert len(list(tmp_path.iterdir())) == 3
     assert [record.getMessage().rpartition("/")[2] for record in caplog.records] == ["run-2", "run-3"]
+
+
+def test_a_run_is_not_moved_into_the_empty_folder_that_a_recording_has_claimed_meanwhile(tmp_path: Path) -> None:
+    out = tmp_path / "run"
+    with RunFolder(out) as folder:
+        folder.write_json("summary.json", {})
+        with RunFolder(out, in_place=True):  # fails before its first frame
+            published = folder.publish()
+    assert published == tmp_path / "run-2"
+    assert list(tmp_path.rglob("*")) == [published, published / "summary.json"]
+
+
+@pytest.mark.skipif(sys.platform == "win32", reason="there are no locks that tell of it")
+def test_a_run_that_fails_leaves_what_another_records_in_the_same_folder(tmp_path: Path) -> None:
+    with RunFolder(tmp_path, in_place=True) as mine:
+        with RunFolder(tmp_path, in_place=True):  # it was empty then as well
+            recording = Recording(mine.place(""), expected_bytes=0)
+            recording.append(run_blocks()[0])
+        recording.close()
+        mine.keep()
+    assert RunRecording(tmp_path).frames == 16
 
 
 def test_an_empty_folder_is_filled_stays_when_nothing_comes_of_it_and_is_left_to_who_was_faster(tmp_path: Path) -> None:

@@ -11,12 +11,13 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from calibration.model.rig_model import Lag
-from drivers.errors import DeviceDisconnected, DeviceFault, DeviceTimeout, ProtocolError
-from drivers.interfaces import BurstMode
+from drivers.errors import DeviceDisconnected, DeviceError, DeviceFault, DeviceTimeout, ProtocolError
+from drivers.interfaces import BurstMode, ScannerStatus
 from rig.count.sweeps import SweepAssembler
 from rig.count.volume import SweepCounter, SweepLayout
 from rig.errors import DevicesError
 from rig.run_folder.summary import RunVerdict
+from rig.scan import pipeline
 from rig.scan.run import verdict_of
 from rig.threads import RowWorkers
 from tests.unit.rig.count.streams import HEIGHT, SPAD, WIDTH, plan_of, scan, stream_of
@@ -138,6 +139,37 @@ def test_a_scanner_that_stops_early_ends_the_scan():
     rig.scanner.fault = "scanner: the points ran dry"
     with pytest.raises(DeviceFault, match="ran dry"):
         list(acquisition(rig, PLAN, 5).run())
+    assert log == START + STOP
+
+
+@pytest.mark.parametrize("unplugged", [False, True])
+def test_maps_that_are_whole_when_the_scanner_stops_early_are_still_given(unplugged):
+    rig, log = rig_of(5)
+    at_work = threading.Event()
+
+    def ask(scanner):  # the counting thread waits at the end of map 3, for one of 1 and 2 to be taken
+        assert at_work.wait(PATIENCE_S)
+        if unplugged:
+            raise DeviceDisconnected("the points ran dry")
+        return ScannerStatus(True, "the points ran dry", None)
+
+    rig.scanner.__class__ = type("Failing", (type(rig.scanner),), {"status": property(ask)})
+    run = acquisition(rig, PLAN, 5, FakeMaker(lambda index: index == 3 and at_work.set())).run()
+    assert [next(run).sweep.index for _ in range(4)] == [0, 1, 2, 3]
+    with pytest.raises(DeviceError, match="ran dry"):
+        list(run)
+    assert log == START + STOP
+
+
+def test_a_spad_that_hangs_meanwhile_does_not_hide_why_the_scan_was_ended(monkeypatch):
+    monkeypatch.setattr(pipeline, "JOIN_S", 0.01)
+    over = threading.Event()
+    rig, log = rig_of(5, behaviour=lambda seq: seq < 3 or over.wait(PATIENCE_S))
+    rig.scanner.fault = "scanner: the points ran dry"
+    with pytest.raises(DeviceFault, match="ran dry") as caught:
+        list(acquisition(rig, PLAN, 5).run())
+    over.set()
+    assert "spad did not return" in caught.value.__notes__[0]
     assert log == START + STOP
 
 
