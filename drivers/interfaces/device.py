@@ -86,7 +86,9 @@ class Device(ABC):
         self.close()
 
     def _require(self, verb: str, *allowed: DeviceState, first: str = "") -> None:
-        """Raise `WrongState` unless the state is one of `allowed`; `first` names the verb to call before."""
+        """Raise `WrongState` unless the state is one of `allowed`. first: the method that the message advises to call
+        first.
+        """
         if self._state in allowed:
             return
         if self._state is DeviceState.CLOSED:

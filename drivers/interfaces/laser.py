@@ -114,7 +114,7 @@ class LineLaser(Device):
 
     @abstractmethod
     def _do_pause(self) -> None:
-        """Stop emission; must work in any state, also where the laser was found emitting at open."""
+        """Stop emission. Must work in any state, also if the laser already emitted when it was opened."""
 
     @abstractmethod
     def _do_disarm(self) -> None: ...

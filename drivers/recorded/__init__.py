@@ -1,5 +1,4 @@
-"""Recordings on disk: segments of SPB1 blocks and their index, and the one reader that replay and everything
-else uses."""
+"""Recordings on disk: segments of SPB1 blocks and their index, and the reader that replay and all other parts use."""
 
 from drivers.recorded.contents import INDEX_FILE, segment_name
 from drivers.recorded.reader import RecordedRun, RunRecording
