@@ -94,7 +94,7 @@ class BlockHeader:
     sweep: int
     """Scan markers since the run's start, at the first frame."""
     frame_step: int
-    """1, or k where the device keeps every k-th frame or sums k."""
+    """1, or k if the device keeps every k-th frame or sums k frames."""
     width: int
     """Pixels of each frame's window; constant within a block."""
     height: int

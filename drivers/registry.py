@@ -59,8 +59,8 @@ class Kind:
     one cannot be used. None: the config names no file, or the kind is a world, which is created as the check.
     """
     off: Callable[[Any], bytes] | None = None
-    """Function that returns, for a config, the bytes that switch off a laser on a serial port in any state; they are
-    sent where there is no time to open it first."""
+    """Function that returns, for a config, the bytes that switch off a laser on a serial port in any state. They are
+    sent if there is no time to open the laser first."""
 
 
 def kinds(slot: str) -> tuple[str, ...]:

@@ -40,14 +40,14 @@ class Channel:
         return self._end.fileno()
 
     def send(self, message: Message, within_s: float = 0.0) -> None:
-        """Queue a message and send what the socket takes within that time. A peer that is gone raises no error."""
+        """Queue a message and send what the socket accepts within that time. A peer that is gone raises no error."""
         line = json.dumps(message, separators=(",", ":")).encode() + b"\n"
         with self._lock:
             self._unsent += line
         self.flush(within_s)
 
     def flush(self, within_s: float = 0.0) -> None:
-        """Send what is still queued, as far as the socket takes it within that time."""
+        """Send what is still queued, as much as the socket accepts within that time."""
         ends_at = time.monotonic() + within_s
         with self._lock:
             while self._unsent:

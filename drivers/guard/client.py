@@ -352,7 +352,7 @@ class Guard:
             self._parted = True
 
     def _end(self) -> None:
-        """Deal with the end of the guard. If it said no goodbye, make the devices safe from here."""
+        """Handle the end of the guard. If it ended without a goodbye, make the devices safe from this process."""
         if self._parted:
             self._lost.set()
         else:

@@ -257,7 +257,7 @@ class GuardProcess:
         laser.lane.do(lambda: self._ask_laser(laser))
 
     def _ask_laser(self, laser: Owned) -> None:
-        """Ask the laser, on its lane, about interlock and faults; again where an answer is missing or garbled."""
+        """Ask the laser, on its lane, about interlock and faults; a second time if an answer is missing or garbled."""
         device: LineLaser = laser.device
         for attempt in range(2):
             try:
@@ -313,7 +313,7 @@ class GuardProcess:
             try:
                 if owned.device is not None:
                     owned.device.close()
-            except Exception as error:  # the next one is closed all the same
+            except Exception as error:  # the next device is still closed
                 _log.error("%s: %s", owned.slot, error)
         for owned in self._owned.values():
             owned.flush()

@@ -46,7 +46,7 @@ class GuardLimits:
     """Time from `run` to the first frame: SPAD, scanner and the scan marker come in between. An application at work
     gets `busy_within_s` on top, since devices that start and a machine with too much to do may come together."""
     check_s: float = 0.05
-    """Time for the gate to say whether its program has ended, before it is taken for still running."""
+    """Time for the gate to say whether its program has ended. After that the program counts as running."""
     help_itself_s: float = 0.5
     """Time for an application that lives but takes no frames to make its rig safe, before it is killed."""
 

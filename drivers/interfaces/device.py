@@ -102,4 +102,4 @@ class Device(ABC):
 
     @abstractmethod
     def _do_close(self) -> None:
-        """Give back handles and memory. Runs also where making the device safe failed."""
+        """Release handles and memory. Called even if making the device safe failed."""

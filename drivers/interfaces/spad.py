@@ -71,7 +71,7 @@ class WindowTable:
         return x0
 
     def check(self, sensor_width: int, step_px: int) -> None:
-        """Raise `LimitExceeded` for an empty table and for windows that a sensor cannot give: off its grid of steps and
+        """Raise `LimitExceeded` for an empty table and for windows that a sensor cannot send: off its grid of steps and
         words, or beyond its edge.
 
         The last word of a row may reach beyond a sensor whose width is not a whole number of words; its pad bits are 0.

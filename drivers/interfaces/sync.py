@@ -60,7 +60,7 @@ class SyncStatus:
     """The device's own report, read anew each time."""
 
     state: Literal["stopped", "waiting", "running", "aborted"]
-    """State of the program; "running" also where the device cannot tell that its program waits for the scan marker."""
+    """State of the program. A device that cannot tell whether its program waits for the scan marker says "running"."""
     outputs: int | None
     """Levels read back from the pins; None: this device cannot read them while a program runs."""
 

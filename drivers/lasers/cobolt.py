@@ -168,7 +168,7 @@ class CoboltLaser(SerialLaser):
 
     def _do_status(self) -> LaserStatus:
         line = self._line
-        # A flipped bit may fake an alarm: what ends a scan is asked twice. If it hides one, the next poll finds it.
+        # A flipped bit may fake an alarm, so what ends a scan is read twice. If it hides one, the next poll finds it.
         interlock_open = line.ask_flag("ilk?") and line.ask_flag("ilk?")
         fault = self._fault()
         on = line.ask_flag("l?")
@@ -222,7 +222,7 @@ class CoboltLaser(SerialLaser):
             self._enable(power_w)
             self._require_no_stop()
         except DeviceError:
-            with suppress(DeviceError):  # the first error is the one to tell
+            with suppress(DeviceError):  # the first error is the one to report
                 self._darken()
             raise
         self._armed = True
@@ -235,7 +235,7 @@ class CoboltLaser(SerialLaser):
             self._darken()  # then it is dark whenever it comes on, until the power is set
         if not gated:
             self._gate()
-        # Each exchange takes a tenth of a second: a pause from another thread is heeded before what lights.
+        # Each exchange takes a tenth of a second: check for a pause from another thread before each step to light.
         self._require_no_stop()
         if not on:
             self._start()
@@ -340,8 +340,8 @@ def _identify(config: CoboltConfig, line: Dialogue) -> CoboltLaser:
 
 
 def _off(config: CoboltConfig) -> bytes:
-    """The bytes that switch off. No CR goes before them: it might count as a command, after which none is heeded for
-    0.1 s."""
+    """The bytes that switch off. No CR goes before them: it might count as a command, and the laser ignores others for
+    0.1 s after one."""
     return b"l0\r"
 
 

@@ -212,7 +212,7 @@ class ObisLaser(SerialLaser):
                 self._told_on = True
                 self._switch("SOUR:AM:STAT", "ON")
         except DeviceError:
-            with suppress(DeviceError):  # the first error is the one to tell
+            with suppress(DeviceError):  # the first error is the one to report
                 self._switch_off()
             raise
         if self._stopped:  # a pause from another thread overtook the ON
@@ -221,7 +221,7 @@ class ObisLaser(SerialLaser):
         self._armed = True
 
     def _prepare(self) -> None:
-        """Switch off, and set up the laser so that nothing but the gate governs the light, now and after power-up."""
+        """Switch off, and set up the laser so that only the gate controls the light, now and after power-up."""
         self._switch_off()
         self._switch("SYST:CDRH", "ON")
         self._switch("SYST:AUT", "OFF")

@@ -217,7 +217,7 @@ def _block_at(segment: SegmentReader, entry: Any, *, check_payload: bool) -> Fra
 
 
 def _search(segment: SegmentReader, known: Entries, problems: list[str]) -> Iterator[bytes]:
-    """Index records of the blocks that lie where `known` (sorted by offset) has none."""
+    """Index records of the blocks in those parts of a segment that no record of `known` (sorted by offset) covers."""
     ends = round_up_to_page(known["offset"] + known["length"])
     starts = np.concatenate([np.zeros(1, np.int64), ends.astype(np.int64)])
     stops = np.concatenate([known["offset"].astype(np.int64), np.array([segment.size], np.int64)])

@@ -237,7 +237,7 @@ def open_segments(path: Path) -> list[SegmentReader]:
 
 
 def segment_files(path: Path) -> dict[int, Path]:
-    """The segment files by number. If a segment exists both plain and compressed, the plain one is taken."""
+    """The segment files by number. If a segment exists both plain and compressed, the plain one is used."""
     if path.is_file():
         return {0: path}
     found: dict[int, Path] = {}

@@ -90,7 +90,7 @@ def _read(noted: dict[str, Any]) -> SpadInfo:
 
 
 def _told_by(recording: RunRecording) -> SpadInfo:
-    """The SPAD's properties as far as the blocks alone tell them."""
+    """The SPAD's properties, as far as they follow from the blocks alone."""
     first = recording.runs[0].header
     rate = first.tick_hz / (first.frame_period_ticks or max(1, first.exposure_ticks))
     most = max(run.end_frame for run in recording.runs)
@@ -137,7 +137,7 @@ class Cursor:
         self.next_frame = 0
         """One past the last frame that was played."""
         self.step_due = by_block
-        """Whether the frames that come next wait for a step: those behind a scan marker, or all without markers."""
+        """Whether the next frames wait for a step: those after a scan marker, or all frames if there are no markers."""
         self.damaged = 0
         """Blocks that could not be read, so far."""
 
@@ -194,7 +194,7 @@ class Cursor:
 
 
 def _continues(block: FrameBlock, before: FrameBlock) -> bool:
-    """Whether a block's frames follow those of the one before, both being whole."""
+    """Whether a block's frames follow those of the block before, and both blocks are whole."""
     whole = before.status == block.status == BlockStatus.OK
     return whole and block.header.first_frame == before.header.first_frame + before.n_frames
 

@@ -224,7 +224,7 @@ class HeliosDac:
         self.clock.sleep(_AFTER_STOP_S)
 
     def close(self) -> None:
-        """Stop, take the shutter pin low (the firmware never does), go back to 'disabled' and give the device back."""
+        """Stop, take the shutter pin low (the firmware never does), go back to 'disabled' and release the device."""
         try:
             self.stop()
             self._send(_SHUTTER, 0)

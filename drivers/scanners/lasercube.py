@@ -119,8 +119,8 @@ class LaserCubeDac:
         self.queued()
 
     def halt(self) -> float:
-        """Switch the colours off and clear the ring; returns 0. The mirror's position is unknown afterwards, and the
-        next run goes to the centre in one jump."""
+        """Switch the colours off and clear the ring; returns 0. The mirror stops at an unknown position, so the next
+        run begins with a jump to the centre."""
         self.safe()
         return 0.0
 
@@ -263,7 +263,7 @@ class LaserCubeRun:
         while True:
             asked_s = now_s(self._link.clock)
             queued = self._queued()
-            # An answer that took long bounds nothing: one quick answer must have vouched for the last points.
+            # A slow answer bounds nothing: only a quick one shows that the last points were played.
             seen = seen or now_s(self._link.clock) - asked_s < _TOLERANCE_POINTS / self._rate_hz
             if queued < self._hold - _TOLERANCE_POINTS:
                 break

@@ -37,7 +37,7 @@ from drivers.transports.tap import Tap
 from drivers.units import BytesPerSecond, ExactHertz
 
 GUARD_BYTES = 512
-"""Bytes that must come behind a block before it counts. The longest error text of the samples has 160 characters."""
+"""Bytes that must follow a block before it is used. The longest error text of the samples has 160 characters."""
 SLICE_S = 0.05
 """Length of one wait: a `stop` from another thread is noticed at most this late."""
 _ERROR_CHECK_S = 0.5
@@ -348,7 +348,7 @@ class Spad512s(SpadArray):
         return seal_block(memory, self._header(run), layout, payload_crc=False)
 
     def _claim(self, ring: BlockRing, ends_at: float, timeout_s: float) -> NDArray[np.uint8] | None:
-        """A free slot; None if there is none and the ring does not wait. Raises `DeviceTimeout` if it waits in vain."""
+        """A free slot; None if there is none and the ring does not wait. Raises `DeviceTimeout` if none comes free."""
         while True:
             memory = ring.claim(min(SLICE_S, max(0.0, ends_at - time.monotonic())))
             if memory is not None or not ring.waits:

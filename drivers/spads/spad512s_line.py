@@ -190,7 +190,7 @@ class Spad512sLine:
     """The connection, which is open once `connect` has returned. For use by one thread at a time."""
 
     def __init__(self, name: str, address: str, deadlines: Deadlines, tap: Tap | None = None) -> None:
-        """tap: notes commands and answers, but not pixels."""
+        """tap: records commands and answers, but not pixels."""
         self.address = address
         self._tap = tap
         self._name = name
@@ -228,7 +228,7 @@ class Spad512sLine:
         answer_s = self._deadlines.answer_s
         with self._given_up_on_silence():
             stream = self._open()
-            stream.drain(0.0, answer_s)  # what came unasked is no answer to this
+            stream.drain(0.0, answer_s)  # what came before the command is no answer to it
             self._send(stream, command)
             answer = self._read_text(stream, answer_s)
             if not answer:

@@ -137,7 +137,7 @@ class SpbUsb(SpadArray):
         return self._timing
 
     def _bytes_per_s(self, request: SpadRequest, width: int) -> float:
-        """Bytes a second that come in: of a burst, no more than the read-out gives."""
+        """Bytes a second that arrive; in a burst, at most the rate of the read-out."""
         exposed = float(request.frame_rate_hz) * frame_bytes(width, self.info.height)
         burst = self.info.burst if request.mode == "burst" else None
         return exposed if burst is None else min(exposed, burst.readout_bytes_per_s)
@@ -201,7 +201,9 @@ class SpbUsb(SpadArray):
         return False
 
     def _note_wait(self, seconds: float) -> None:
-        """Add to the time for which the device was asked in vain, without this thread's own delays, and report it."""
+        """Add to the time for which the device was asked and gave no frames, and report it. This thread's own delays do
+        not count.
+        """
         self._waited_s += seconds
         if self.on_wait is not None:
             self.on_wait(self._waited_s)
@@ -253,7 +255,7 @@ class SpbUsb(SpadArray):
                 self._end_run(receiver)
 
     def _end_run(self, receiver: BlockReceiver) -> None:
-        """Abort, wait for the last block so that none is left for the next run, give the queue back."""
+        """Abort, wait for the last block so that none is left for the next run, and cancel the queued reads."""
         self._receiver = None
         exposed: int | None = None
         try:

@@ -53,7 +53,7 @@ USUAL_TIMING = PrawnDoTiming()
 
 
 class PrawnDoLine:
-    """Sends commands and queries, one at a time, from any thread. Close the `port` to give it back."""
+    """Sends commands and queries, one at a time, from any thread. Close the `port` to release it."""
 
     def __init__(self, name: str, port: SerialPort, timing: PrawnDoTiming) -> None:
         self._name = name
@@ -88,8 +88,8 @@ class PrawnDoLine:
     def transact(self, command: str, deadline_s: float | None = None, *, urgent: bool = False) -> list[str]:
         """Send a command; returns the lines of its answer without blank ones.
 
-        urgent: whether the command is part of taking the outputs low, for which all others end with `DeviceFault`. Also
-        raises `DeviceTimeout` or `ProtocolError`.
+        urgent: whether the command is part of taking the outputs low. Meanwhile all other commands end with
+        `DeviceFault`. Also raises `DeviceTimeout` or `ProtocolError`.
         """
         deadline_s = self._timing.reply_s if deadline_s is None else deadline_s
         with self.lock:
@@ -172,8 +172,8 @@ class PrawnDoLine:
             self.port.write(_LOWER)
 
     def _try_to_lower(self) -> bool:
-        """Try once; returns whether the outputs read back low. During each round trip the board's second core carries
-        out the last command.
+        """Try once; returns whether the outputs read back low. The round trip of `abt` gives the board's second core
+        the time to end the program.
         """
         hasty_s = self._timing.hasty_s
         self.transact("abt", hasty_s, urgent=True)
@@ -183,9 +183,9 @@ class PrawnDoLine:
         return self.pins(hasty_s, urgent=True) == 0 and self.run_status(hasty_s, urgent=True)[0] in IDLE
 
     def _free_wedged(self, most_words: int) -> None:
-        """Free a board that hears no commands since another host never finished sending it a program: send the rest.
+        """Free a board that executes no commands because another host never finished sending it a program.
 
-        The rest is zeros, which are words that wait with all outputs low.
+        The program is completed with zeros, which are words that wait with all outputs low.
         """
         _log.warning("%s does not answer on %s; trying to end an unfinished program", self._name, self.port.path)
         self.port.write(b"\nend\n")

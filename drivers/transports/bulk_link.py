@@ -190,7 +190,7 @@ class QueuedLink:
         self._queue.clear()
 
     def close(self) -> None:
-        """Cancel all reads and give the device back; a second call does nothing."""
+        """Cancel all reads and release the device; a second call does nothing."""
         if self._handle is not None:
             self.cancel()
             for transfer in self._spare:

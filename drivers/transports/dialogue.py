@@ -83,7 +83,7 @@ class Framing(Protocol):
 
 
 class Dialogue:
-    """Sends commands and queries, one at a time, from any thread. Close the `port` to give it back."""
+    """Sends commands and queries, one at a time, from any thread. Close the `port` to release it."""
 
     def __init__(self, name: str, port: SerialPort, framing: Framing, clock: Clock, timing: LineTiming) -> None:
         self.name = name
@@ -172,7 +172,7 @@ class Dialogue:
         """Send one command and return its reply."""
         passed_s = now_s(self.clock) - self._quiet_since_s
         self.clock.sleep(self._timing.gap_s - passed_s)
-        if self.port.reset_input().strip():  # a reply that nobody asked for; its other half may still come
+        if self.port.reset_input().strip():  # a late or unwanted reply, of which more may still come
             self.port.drain(self._timing.quiet_s, self._timing.drain_s)
         self.port.write(self._framing.encode(command))
         try:

@@ -53,7 +53,7 @@ class SerialPort:
     """
 
     def __init__(self, name: str, endpoint: Endpoint, tap: Tap | None = None) -> None:
-        """Open the port. name: the device's name in messages. tap: notes all that passes.
+        """Open the port. name: the device's name in messages. tap: records all that passes.
 
         Addresses: a path or COM port, "serial=ABC" (serial number of the USB device) or "usb=VVVV:PPPP" (hexadecimal
         vendor and product, the only one attached). Raises `DeviceNotFound`, `DevicePermission` or `DeviceBusy`.
@@ -71,7 +71,7 @@ class SerialPort:
     def lost(self) -> bool:
         """Whether the port has hung up; always False on Windows. Asks only the kernel. Allowed from any thread."""
         if not hasattr(select, "poll"):
-            return False  # Windows tells with the next read
+            return False  # on Windows the next read shows it
         try:
             hung_up = select.poll()
             hung_up.register(self._port.fileno(), 0)  # hang-ups and errors are always reported
@@ -128,7 +128,7 @@ class SerialPort:
 
     def close(self) -> None:
         """Close the port; a second call does nothing. Never raises: a lost port counts as closed."""
-        with suppress(*_FOREIGN):  # the port is gone, and with it all that could be given back
+        with suppress(*_FOREIGN):  # the port is gone, so there is nothing left to release
             self._port.close()
 
     def _open(self, endpoint: Endpoint) -> Any:

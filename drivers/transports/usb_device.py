@@ -209,8 +209,7 @@ class UsbDevice:
         return frozenset(endpoint.bEndpointAddress for interface in interfaces for endpoint in interface)
 
     def close(self) -> None:
-        """Give the interfaces and the device back; a second call does nothing. Never raises, as the device may
-        be gone."""
+        """Release the interfaces and the device; a second call does nothing. Never raises: the device may be gone."""
         with self._lock:
             if not self._open:
                 return
@@ -268,7 +267,7 @@ def _listing(device: Any) -> UsbListing:
 
 
 def _string(device: Any, index: int) -> str | None:
-    """A string of the device; None if there is none or it may not be asked."""
+    """A string of the device; None if there is none or this user may not read it."""
     try:
         text = usb.util.get_string(device, index)
     except (usb.core.USBError, ValueError, NotImplementedError):  # ValueError: pyusb's 'no languages', mostly EACCES

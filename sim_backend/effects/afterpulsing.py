@@ -55,7 +55,7 @@ def after_probability(afterpulsing: float, lifetime_s: float, times: FrameTimes)
 
 
 def blind_probability(dead_time_s: float, times: FrameTimes) -> float:
-    """Chance that a detection in the frame after another falls into that one's dead time."""
+    """Chance that a detection falls into the dead time of a detection in the frame before."""
     reach = (dead_time_s - times.gap_s) / times.exposure_s
     if reach > 1:  # late detections blind the whole of the next exposure
         return 1 - max(0.0, 2 - reach) ** 2 / 2

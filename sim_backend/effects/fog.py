@@ -77,8 +77,8 @@ def _add_haze(
     sheet: Traced, light: tuple[Any, ...], numbers: Numbers, first_row: int, last_row: int, rate: Array
 ) -> None:
     """Add the haze of a sheet. light: the sheet's planes, scale of each of them, halvings per m, sigma_px."""
-    # Arrays and tuples are taken apart before the loops: within them, each access would count a reference. Numbers come
-    # from outside, too: written here they would be float64.
+    # Arrays and tuples are unpacked before the loops: inside, each access would count a reference. Constants are
+    # arguments, too: as literals they would be float64.
     _, _, x_stripe, x_end, start, step = sheet
     inverse, scales, halvings_per_m, sigma_px = light
     (u, v, q, source), terms, halving, (zero, unit, two, least) = numbers
@@ -102,14 +102,14 @@ def _add_haze(
         for i in range(high - low):
             x = np.uint64(low) + np.uint64(i)
             ray_u, ray_v, length = u[row, x], v[row, x], q[row, x]
-            # Everything times w = 1/z, so that one division does; w is kept from 0, where all light has faded.
+            # Everything is multiplied by w = 1/z, so that one division is enough; `least` keeps w away from 0.
             w = max(a * ray_u + b * ray_v + c, least)
             away_x, away_y, away_z = ray_u - w * source_x, ray_v - w * source_y, unit - w * source_z
             r2 = away_x * away_x + away_y * away_y + away_z * away_z
             r, one = math.sqrt(r2), unit / (r2 * w)
             lit[x] = scale * length * (one * (r * w))
             halvings[x] = halvings_per_m * ((r + length) * (one * r2))
-        for i in range(high - low):  # a loop of its own: more pixels are then under way at a time
+        for i in range(high - low):  # a separate loop: the processor then works on more pixels at a time
             x = np.uint64(low) + np.uint64(i)
             lit[x] *= power_of_half(halvings[x], halving)
         if n_terms > 0:

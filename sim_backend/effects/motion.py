@@ -105,7 +105,7 @@ def _shift(
                     m = facet[j, i]
                     stretch = 1.0 + m[0] * shift[0] + m[1] * shift[1] + m[2] * shift[2]
                     if not stretch > 0.0:
-                        break  # has come up to the camera's plane
+                        break  # the surface has reached the camera's plane
                     w = (m[0] * u[y, x] + m[1] * v[y, x] + m[2]) / stretch
                     to_j, to_i = _source(u, v, y, x, w, shift)
                     if abs(to_j - j) <= 1 and abs(to_i - i) <= 1:

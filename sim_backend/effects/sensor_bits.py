@@ -112,7 +112,7 @@ class Defects:
 
     def __init__(self, setting: Setting) -> None:
         sensor = setting.sensor
-        # One number a pixel for both, so that a larger share has the pixels of the smaller one, and more.
+        # One random number a pixel for both, so that a larger share includes all pixels of a smaller one.
         lot = np.random.default_rng([sensor.pixel_seed, _DEFECTS]).random(setting.view.u.shape)
         self._alive = packed(lot >= sensor.dead_share)
         self._hot = packed(lot >= 1 - sensor.hot_share)

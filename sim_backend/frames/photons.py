@@ -2,7 +2,7 @@
 
 Consecutive frames with the same light (one mirror position, power and time) form a span. For a span the sheet is
 traced, its flux summed and p turned into levels; then each frame is drawn from the levels. Rows are split over threads,
-each of which goes by itself through all spans of a block (of one time, if things move); every step works row by row, so
+each of which goes by itself through all spans of a block (or of one moment, if things move); steps work row by row, so
 the split does not matter. The sensor's effects on bits act on whole frames, and windows are cut out afterwards.
 Measured for 512 x 512, the street in fog: 12 us a frame and 0.45 ms per mirror position on one core, 6.4 us and 0.26 ms
 on two (`python -m tests.benchmarks.simulator`).

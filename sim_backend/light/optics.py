@@ -69,7 +69,7 @@ class Line(Section):
 
     wavelength: Annotated[Metres, Field(gt=0)] = 520e-9
     fan: Annotated[Radians, Field(gt=0, lt=math.pi)] = math.radians(50)
-    """Angle over which the power is spread evenly; it is taken to cover the picture."""
+    """Angle over which the power is spread evenly; it is assumed to cover the picture."""
     sigma_px: float = Field(default=0.6, gt=0.05, le=20)
     """Gaussian width of the stripe in the picture, pixels: line width and blur of the lens together."""
     spread: Annotated[Radians, Field(ge=0, lt=0.1)] = 0.0

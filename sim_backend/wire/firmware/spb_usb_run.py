@@ -19,7 +19,7 @@ from sim_backend.wire.serve.usb_model import AlternateSpec, DeviceSpec, Endpoint
 IDLE_S: Final = 0.1
 """Time without frames after which a run sends a heartbeat block."""
 BUFFERS: Final = 80
-"""Blocks that transports may hold at a time; memory is taken as it is needed."""
+"""Blocks that transports may hold at a time; memory is allocated when it is needed."""
 
 
 @dataclass(frozen=True, slots=True)
