@@ -1,4 +1,4 @@
-"""The order of a recording's blocks, and which of them contradict the others. A wrong number costs only its own block.
+"""The order of a recording's blocks, and which of them contradict the others. A wrong number costs only one block.
 
 Within a run the numbers of blocks, frames, ticks and sweeps all rise. If blocks contradict each other, the consistent
 set with the largest sum of weights is kept. A block weighs more if it agrees with its neighbours and with the index.

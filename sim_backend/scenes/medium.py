@@ -3,13 +3,14 @@
 Henyey and Greenstein (1941): p(theta) = (1 - g^2) / (4 pi (1 + g^2 - 2 g cos theta)^1.5), in 1/sr, of integral 1 over
 all directions and mean cosine g; at 180 degrees (1 - g) / (4 pi (1 + g)^2).
 
-Rain (Marshall and Palmer 1948): N(D) = 8000 exp(-L D) per m^3 and mm, L = 4.1 R^-0.21 /mm. A drop's extinction is twice
-its cross-section (diffraction included), so sigma = 2 (pi/4) 8000 2/L^3 mm^2/m^3 = 3.65e-4 R^0.63 /m. Fall speed:
+In the following D is the diameter in mm, R the rate in mm/h of water, and N the number of particles per m^3 and mm.
+
+Rain (Marshall and Palmer 1948): N(D) = 8000 exp(-L D), L = 4.1 R^-0.21 /mm. A drop's extinction is twice its
+cross-section (diffraction included), so sigma = 2 (pi/4) 8000 2/L^3 mm^2/m^3 = 3.65e-4 R^0.63 /m. Fall speed:
 9.65 - 10.3 exp(-0.6 D) m/s (Atlas, Srivastava and Sekhon 1973).
 
 Snow (Gunn and Marshall 1958), by melted diameter: N(D) = 3800 R^-0.87 exp(-L D), L = 2.55 R^-0.48 /mm. A flake has 4.5
-times its melted cross-section and falls at 1.6 (D/10)^0.31 m/s (aggregates of dendrites, Langleben 1954). R is in mm/h
-of water, D in mm.
+times its melted cross-section and falls at 1.6 (D/10)^0.31 m/s (aggregates of dendrites, Langleben 1954).
 """
 
 import math

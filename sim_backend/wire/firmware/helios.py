@@ -2,9 +2,9 @@
 0952a2a).
 
 There are two buffers, one playing and one pending, and a status polled with 03. A frame of whole packets never
-completes. A refused frame is refused silently. Frames within 100 ms of STOP are dropped. A frame without SINGLE repeats
-for ever. `DacModel` is the part that emulated scanner boards have in common; emulated worlds and tests read its record
-of the outputs.
+completes. Frames are refused silently. Frames within 100 ms of STOP are dropped. A frame without SINGLE repeats for
+ever. `DacModel` is the part that emulated scanner boards have in common; emulated worlds and tests read its record of
+the outputs.
 """
 
 import struct
