@@ -39,7 +39,7 @@ class SystemClock:
 
 
 class VirtualClock:
-    """A clock that stands still until somebody advances it. Thread-safe. Waiting on it takes no real time."""
+    """A clock that stands still until it is advanced. Thread-safe. Waiting on it takes no real time."""
 
     def __init__(self, start_ns: int = 0) -> None:
         self._lock = threading.Lock()

@@ -21,7 +21,7 @@ class DevicePermission(DeviceError):
 
 
 class DeviceTimeout(DeviceError):
-    """Raised when a device or a ring gave nothing within the time the caller allowed."""
+    """Raised when a device does not answer, or a ring has no slot or block, within the time the caller allowed."""
 
 
 class DeviceDisconnected(DeviceError):
@@ -78,4 +78,6 @@ class RingOverflow(DeviceError):
 
 
 class UnknownKind(DeviceError):
-    """Raised when the registry has no usable kind of that name: lists those it has, or says why that one is not."""
+    """Raised when the registry has no usable kind of that name. Lists the kinds there are, or says why this one cannot
+    be used.
+    """

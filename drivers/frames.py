@@ -34,7 +34,7 @@ class Mark(IntFlag):
     BACKWARD = 32
     """Level, not edge: the scanner runs backward."""
     WINDOW_LOST = 64
-    """The device lost the line that its window table is at; `x0` is not to be trusted."""
+    """The device no longer knew at which entry of its window table it was; `x0` is unreliable."""
 
 
 class BlockFlag(IntFlag):
@@ -76,7 +76,8 @@ class BlockHeader:
 
     flags: BlockFlag
     run_id: int
-    """Number of the run, 16 bit; another one at each start, so that what is left from an earlier run is recognised."""
+    """Number of the run, 16 bit. A run is one start of the SPAD here. Each start has another number, so that blocks
+    left from an earlier one are recognised."""
     block_seq: int
     """Number of the block in its run, from 0."""
     first_frame: int
@@ -93,7 +94,7 @@ class BlockHeader:
     sweep: int
     """Scan markers since the run's start, at the first frame."""
     frame_step: int
-    """1, or k where the device keeps every k-th frame or sums k."""
+    """1, or k if the device keeps every k-th frame or sums k frames."""
     width: int
     """Pixels of each frame's window; constant within a block."""
     height: int

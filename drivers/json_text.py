@@ -6,15 +6,13 @@ import json
 from typing import Any, Final
 
 MAX_DEPTH: Final = 64
-"""Most lists and mappings within one another."""
+"""Largest depth to which lists and mappings may be nested."""
 _MOST_DIGITS: Final = 20
-"""Digits of the longest whole number of 64 bits."""
+"""Digits of the largest unsigned 64-bit integer."""
 
 
 def parse_json(text: str | bytes) -> Any:
-    """The content of a JSON text. Raises ValueError, with one line, if it is not JSON or exceeds what this program
-    takes.
-    """
+    """The content of a JSON text. Raises ValueError, with one line, if it is not JSON or exceeds a limit above."""
     try:
         content = json.loads(text, parse_int=_whole)
     except RecursionError:

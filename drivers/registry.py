@@ -23,8 +23,8 @@ class KindConfig(BaseModel):
     model_config = ConfigDict(extra="forbid", frozen=True)
 
     real_time: ClassVar[bool] = True
-    """Whether the kind runs in the host's time. A device's light then counts as real; a world that does not puts the
-    whole rig on virtual time."""
+    """Whether the kind runs in the host's time. If a device does, its light counts as real. If the world does not, the
+    whole rig runs on virtual time."""
 
     kind: str
 
@@ -41,7 +41,7 @@ class Surroundings:
     ports: Mapping[str, Endpoint] = field(default_factory=dict)
     """Ports that an emulating world created, by name; a device's `port: emulated:NAME` means one of them."""
     tap: Tap | None = None
-    """Tap on everything that passes the device's port, where its traffic is recorded."""
+    """Tap that records everything that passes the device's port. None: nothing is recorded."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -59,8 +59,8 @@ class Kind:
     one cannot be used. None: the config names no file, or the kind is a world, which is created as the check.
     """
     off: Callable[[Any], bytes] | None = None
-    """Function that returns, for a config, the bytes that switch off a laser on a serial port in any state; they are
-    sent where there is no time to open it first."""
+    """Function that returns, for a config, the bytes that switch off a laser on a serial port in any state. They are
+    sent if there is no time to open the laser first."""
 
 
 def kinds(slot: str) -> tuple[str, ...]:

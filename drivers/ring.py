@@ -1,8 +1,8 @@
-"""The ring of block slots between one source thread and its readers: allocated once, no copies, no loss unsaid.
+"""The ring of block slots between one source thread and its readers: allocated once, no copies, every loss counted.
 
 The source claims free slots (several at once if USB transfers are queued), fills them and publishes them in the order
-of claiming. Every reader gets the blocks in that order, all of them unless it is optional, and holds a slot until it
-asks for the next block, or for some blocks longer.
+of claiming. A required reader gets every block in that order; an optional one may miss some. A reader holds a slot
+until it asks for the next block, or for a later one if it `holds` several.
 
 The ring's `on_full` says what happens when no slot is free, so drivers need not know the policy. They claim; if they
 get nothing and `ring.waits` is False, they drop the block, count it as lost and call `mark_overflow`.
@@ -22,7 +22,8 @@ from drivers.errors import DeviceTimeout, RingOverflow, WrongState
 from drivers.frames import FrameBlock
 
 _PAGE_BYTES = 4096
-"""Slots start on pages where the stride allows it: 64-bit counting and DMA both like aligned memory."""
+"""64-bit counting and DMA are fast on aligned memory. The first slot starts on a page; all do if the stride is whole
+pages."""
 
 
 class OnFull(Enum):
@@ -84,10 +85,10 @@ class BlockRing:
     def reader(self, name: str, *, required: bool = True, holds: int = 1) -> "RingReader":
         """A new reader. Raises `WrongState` after the first claim, since all readers are to see all blocks.
 
-        holds: number of blocks that it keeps, the newest ones, for work that is still under way. Raises ValueError if
-        the ring has too few slots for it.
-        A reader with required=False (a monitor) never makes the source wait. It takes one slot at most: the newest
-        block waits for it, but while it holds one it misses those that come. `skipped` counts the ones it missed.
+        holds: number of its newest blocks that a reader keeps because work on them is under way. Raises ValueError if
+        the ring has too few slots for that.
+        A reader with required=False (a monitor) never makes the source wait. It occupies one slot at most: it gets the
+        newest block, and misses the blocks that are published while it holds one. `skipped` counts those.
         """
         with self._changed:
             if self._any_claimed:
@@ -104,8 +105,8 @@ class BlockRing:
             return reader
 
     def claim(self, timeout_s: float) -> NDArray[np.uint8] | None:
-        """Memory of a free slot, uint8 (stride,), with old bytes in it. None if no slot is free, if
-        `waits` after at most `timeout_s`. Raises `WrongState` after `finish`.
+        """Memory of a free slot, uint8 (stride,), with old bytes in it. None if no slot is free. A ring that `waits`
+        first waits for one, at most `timeout_s`. Raises `WrongState` after `finish`.
         """
         with self._changed:
             self._require_unfinished("claim")
@@ -139,7 +140,9 @@ class BlockRing:
             self._changed.notify_all()
 
     def mark_overflow(self, n_frames: int = 0) -> None:
-        """Note that a block of `n_frames`, counted as lost, found no slot. Raises RingOverflow if that ends the run."""
+        """Count a block of `n_frames` frames that was dropped for want of a slot. Raises `RingOverflow` if the ring's
+        policy is `OnFull.FAIL`.
+        """
         with self._changed:
             self.last_frame += n_frames
             self.dropped_blocks += 1
@@ -274,7 +277,9 @@ class RingReader:
 
 
 def _aligned(n_bytes: int) -> NDArray[np.uint8]:
-    """Zeroed bytes that start on a page, every page touched: the first block must not wait for the kernel."""
+    """Zeroed bytes that start on a page. Every page is written once, so that the first block need not wait for the
+    kernel.
+    """
     memory = np.empty(n_bytes + _PAGE_BYTES, np.uint8)
     memory.fill(0)
     start = -memory.ctypes.data % _PAGE_BYTES

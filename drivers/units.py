@@ -22,20 +22,20 @@ _MAX_TEXT = 1000
 """Longest text taken, in characters: exact arithmetic on an endless number would take endless time."""
 
 MANY_ZEROS = 5
-"""Number of zeros from which on a whole number is written with an exponent."""
+"""A whole number that ends with this many zeros or more is written with an exponent."""
 _FAITHFUL = Context(prec=20)
-"""Decimal digits that pin a 64-bit float (17) with enough to spare for one multiplication by a unit."""
+"""A 64-bit float needs 17 decimal digits; the other 3 are a margin for one multiplication by a unit."""
 
 
 @dataclass(frozen=True, slots=True)
 class Dimension:
-    """A physical dimension. `units` gives the size of each unit in SI (rain rate: in m/h); output prefers the first."""
+    """A physical dimension. units: size of each unit in SI (rain rate: in m/h); the first is preferred in output."""
 
     name: str
     units: Mapping[str, Fraction]
     example: str
     only_read: frozenset[str] = frozenset()
-    """Units that nothing is written in."""
+    """Units that are understood when read and never written."""
 
 
 _PREFIXES = {"G": 9, "M": 6, "k": 3, "": 0, "c": -2, "m": -3, "u": -6, "\u00b5": -6, "\u03bc": -6, "n": -9, "p": -12}

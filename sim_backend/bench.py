@@ -27,7 +27,7 @@ class BenchState:
     mirror: (n,) mirror position, as a command, in the middle of each exposure. velocity_per_s: (n,) its velocity, NaN
     if unknown. share: (n,) part of the exposure with the gate high. edge: (n,) bool, whether the gate changed during
     the exposure. backward: (n,) bool, direction level at the start. line_s, scan_s: times of the markers' rising edges
-    in these frames. power_w: power behind an open gate, 0 while paused. jitter: (n,) or 0, how far the mirror is off
+    in these frames. power_w: power behind an open gate, 0 while paused. jitter: (n,) or 0, deviation of the mirror from
     `mirror`.
     """
 

@@ -2,8 +2,8 @@
 
 Let a pixel detect m photons in a column's K frames, on average, and m + D with an effect. Per exposure the divergence
 of its bits is at most (D/K)^2 / (2 (e^(m/K) - 1)), so that over pixels and frames it is at most eps = sum D^2 / (2 m),
-and the data differ in total variation by at most sqrt(eps/2) (Pinsker's inequality [1]). They also differ by no more
-than the probability that any of the D photons is seen, which is at most D: the better bound in the dark. The first
+and the data differ in total variation by at most sqrt(eps/2) (Pinsker's inequality [1]). The data also differ by no
+more than the probability that any of the D photons is seen, which is at most D: the better bound in the dark. The first
 bound is used for pixels with D < m, the second for the others, and the two add up (triangle inequality). No decision
 rule on a row's data can then differ more often than that.
 
@@ -30,12 +30,12 @@ from sim_backend.frames.flux import FluxModel, hold_s
 from sim_backend.light.sheet import empty_sheet
 
 Wanted = Literal["planned", "all"] | tuple[str, ...]
-"""The effects to run of those that a scene calls for: all but the negligible ones, all, or these."""
+"""The effects to run, of those that a scene calls for: "planned" (all but negligible ones), "all", or those named."""
 
 MOST_CHANGED = 0.01
-"""Share of decisions that may change by all that is left out: eps = 2e-4."""
+"""Largest share of decisions that all left-out effects together may change; it means eps = 2e-4."""
 MOST = PlannedFor(power_w=1.0, exposure_s=1e-3, exposures=100)
-"""Planned for where nobody says what is to be scanned: more than a line laser and an ordinary scan have."""
+"""Values to plan for if it is not known what will be scanned; a line laser and an ordinary scan stay below them."""
 SAFETY = 2.0
 """Safety factor on the mean over sampled rows and columns: the spread over them is less."""
 SAMPLED_COLUMNS, SAMPLED_BANDS, BAND_ROWS = 16, 4, 8
@@ -65,7 +65,9 @@ class EffectPlan:
 def plan_effects(
     setting: Setting, planes: Array, planned_for: PlannedFor, wanted: Wanted = "planned"
 ) -> tuple[EffectPlan, FluxModel]:
-    """The plan, and the model with the effects that it keeps. planes: (n, 4), of mirror positions over the range."""
+    """The plan, and the model with the effects that it keeps. planes: (n, 4), light planes at mirror positions over the
+    range.
+    """
     calls = {entry: entry.called(setting) for entry in CATALOGUE}
     candidates = [entry for entry, (called, _) in calls.items() if called and is_active(entry.name, wanted)]
     changes: dict[str, float] = {}
@@ -107,8 +109,8 @@ def _largest_set(
 ) -> tuple[set[str], float]:
     """The effects that can be left out together, and the bound of what they change then.
 
-    They are taken from the smallest on, as long as the bound for all taken is `most` at most. alone: the bound for each
-    by itself. together: gives the bound for several.
+    Effects are added from the smallest on, as long as the bound for all of them together is at most `most`. alone: the
+    bound for each effect by itself. together: returns the bound for several effects.
     """
     taken: list[str] = []
     total = 0.0
@@ -129,8 +131,8 @@ class _Bounds:
         self._seconds, self._joules = planned_for.exposure_s, planned_for.exposure_s * planned_for.power_w
         light = [name for name, effect in model.laser.items() if name != MEASURED and hold_s(effect) == 0]
         self.names = (*light, *model.steady)
-        """Names of the effects that can be bounded: laser light that stands still, except the stripe, and all that is
-        there without the laser."""
+        """Names of the effects that can be bounded: laser light that does not move, except the stripe, and light and
+        counts without the laser."""
         view = model.setting.view
         self._bands = _bands(view.rows)
         self._sheets = [empty_sheet(plane, view.rows) for plane in planes] if light else []
@@ -166,7 +168,9 @@ class _Bounds:
 
 
 def _changed(change: Array, least: Array) -> Array:
-    """The module's bound for each row (...), from a change and the least of a column's photons, both (..., width)."""
+    """The module's bound for each row (...). change, least: D and the smaller number of photons with and without the
+    effects, in a column's frames, both (..., width).
+    """
     small = change < least
     spread = np.divide(change * change, least, out=np.zeros_like(change), where=small)
     return np.asarray(0.5 * np.sqrt(spread.sum(axis=-1)) + np.where(small, 0.0, change).sum(axis=-1))

@@ -27,18 +27,18 @@ if TYPE_CHECKING:
 
 TIMED_FRAMES, TIMED_ROUNDS = 50, 5
 SPARSITY = 6
-"""Halvings of the lit share on which bits are timed: 1 pixel in 2^6, as in fog."""
+"""Effects on bits are timed on frames in which 1 pixel in 2^6 is lit, as in fog."""
 
 
 def effects_report(world: "SimulatedWorld", *, power_w: float, exposure_s: float, exposures: int) -> dict[str, Any]:
-    """The report for columns of `exposures` frames at a given power.
+    """The report for columns of `exposures` frames at a given power of the laser. Its keys:
 
-    power_w: of the laser. planned_for: power_w (of all lines together), exposure_s (of a column's frames together) and
-    exposures that the plan holds for.
-    changed_decisions_bound: for all effects left out together. effects: one mapping for each of the catalogue, with
-    effect, on, why, share (of the detected photons, before saturation, over 16 mirror positions),
-    changed_decisions_bound (None: unknown), removable (whether the world can do without it), cost_us_per_frame (None:
-    it is part of a device, of another effect or of the gain).
+    planned_for: power_w (of all lines together), exposure_s (of a column's frames together) and exposures that the
+    plan holds for.
+    changed_decisions_bound: for all effects left out together.
+    effects: one mapping for each effect of the catalogue, with effect, on, why, share (of the detected photons, before
+    saturation, over 16 mirror positions), changed_decisions_bound (None: unknown), removable (whether the world can do
+    without it), cost_us_per_frame (None: it is part of a device, of another effect or of the gain).
     """
     plan, model = world.effect_plan, world.flux_model
     photons, laser_us = _light(world, model, power_w * world.fan.total * exposure_s, exposure_s, exposures)
@@ -92,7 +92,7 @@ def _light(
     """Mean photons per frame over the mirror positions, and us per frame, of every effect of the laser."""
     view = world.setting.view
     sheets = [view.sheet(plane) for plane in world.sampled_planes]
-    _parts(model, sheets[0], 0, 1, np.float32)  # compiled, and in the cache; in the precision that frames are drawn in
+    _parts(model, sheets[0], 0, 1, np.float32)  # compiles the kernels, in the precision that frames are drawn in
     parts = [_parts(model, sheet, 0, world.size[0], np.float32) for sheet in sheets]
     photons, us = {}, {}
     for name, effect in model.laser.items():
@@ -100,7 +100,7 @@ def _light(
         frames = exposures if held == 0 else min(exposures, max(1, round(held / exposure_s)))
         photons[name] = joules * float(np.mean([part[name][0].sum(dtype=np.float64) for part in parts]))
         took_s = [len(world.fan.offsets) * part[name][1] for part in parts]
-        if name == "motion":  # its work is the view that all others ask for, whatever the columns
+        if name == "motion":  # its cost is the view that all other effects use, whatever the columns
             took_s = [_took_s(partial(view.at, (turn + 1) * held)) for turn in range(TIMED_ROUNDS)]
             frames = max(1, round(held / exposure_s))
         us[name] = 1e6 * median(took_s) / frames

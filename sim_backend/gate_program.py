@@ -89,7 +89,7 @@ class GateProgram:
         return at, words
 
     def forget(self, before_s: float) -> None:
-        """Drop history before `before_s`, which nobody will ask for any more."""
+        """Drop the history before `before_s`, which is no longer needed."""
         keep = 0
         while keep + 1 < len(self._times) and self._times[keep + 1] <= before_s:
             keep += 1

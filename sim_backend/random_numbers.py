@@ -214,7 +214,7 @@ def drawn_word(typing: Any, key: Any, blocks: Any, levels: Any) -> _Code:
 
 @_intrinsic
 def full_word(typing: Any, levels: Any) -> _Code:
-    """full_word(levels): bits of a word, 1 for pixels with the lowest level, -32768. levels: as in `drawn_word`."""
+    """full_word(levels): bits of a word, 1 for pixels whose level is stored as -32768. levels: as in `drawn_word`."""
 
     def code(context: Any, builder: Any, signature: Any, args: Any) -> Any:
         lowest = ir.Constant(_PIXELS, [-0x8000] * _VECTOR_PX)

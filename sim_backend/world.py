@@ -67,8 +67,8 @@ class WorldConfig(KindConfig):
 
     kind: str = "simulated"
     geometry: str | None = None
-    """Rig-model file of the rig as it really is; the bundled simulated rig by default. Sheets that bow, pass beside the
-    mirror's axis or touch a cone, and rows that are exposed late, are simulated where this file has them.
+    """Rig-model file of the rig as it really is; the bundled simulated rig by default. If the file has sheets that bow,
+    pass beside the mirror's axis or touch a cone, or rows that are exposed one after the other, so has the simulation.
     """
     scene: str = "street"
     """A bundled scene's name, a scene file, or a folder of surfaces."""
@@ -142,7 +142,7 @@ class SimulatedWorld:
         Call it before the SPAD is configured. Otherwise the effects are chosen for `MOST`.
         """
         frames = exposures + 1  # as many as a column can get, since the clocks are independent
-        # Photons of several lines add up: what can be left out of one with all their power can be left out of each.
+        # Photons of several lines add up: an effect that is negligible for one line of their total power is so for all.
         planned_for = PlannedFor(power_w * self.fan.total, frames * exposure_s, frames)
         if planned_for != self._planned_for:
             self._planned_for, self._planned = planned_for, None
@@ -184,8 +184,8 @@ class SimulatedWorld:
         self.fan = LineFan(tuple(offsets), 1 / len(offsets) if shared else 1.0)
 
     def hold_columns(self, commands: Array) -> None:
-        """Hold the flux constant within columns at these mirror commands (columns,): all frames of a column share one
-        p.
+        """Hold the flux constant within columns at these mirror commands (columns,): a pixel has the same probability
+        in all frames of a column.
 
         Call it before the run. Otherwise the stripe moves within a column, as the mirror does.
         """
@@ -260,7 +260,7 @@ class SimulatedWorld:
 
 
 def _own(model: RigModel) -> dict[str, str]:
-    """The rig's own peculiarities, by effect, and how much of each."""
+    """The effects that the rig model itself has, and how large each is."""
     found = {}
     if bow := getattr(model.scanner, "bow_per_rad", 0.0):
         found["sheet bow"] = f"the sheet leaves its plane by {bow:g} rad times the square of the angle within its fan"

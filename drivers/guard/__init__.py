@@ -7,8 +7,9 @@ cannot.
         guard.beat(last_frame_number)
 
 Between `sync.run()` and the moment the gate goes low, the guard expects the frame number to keep changing. If the
-application has ended, was stopped or hangs, the guard switches the light off (within 100 ms if no thread works), and
-kills an application that does not make its rig safe by itself. `GuardLimits` says what counts as hanging.
+application has ended, was stopped or hangs, the guard switches the light off (within 100 ms if all threads of the
+application sleep), and kills an application that does not make its rig safe by itself. `GuardLimits` says what counts
+as hanging.
 """
 
 from drivers.guard.client import Guard

@@ -40,14 +40,14 @@ class Channel:
         return self._end.fileno()
 
     def send(self, message: Message, within_s: float = 0.0) -> None:
-        """Queue a message and send what the socket takes within that time. A peer that is gone raises no error."""
+        """Queue a message and send what the socket accepts within that time. A peer that is gone raises no error."""
         line = json.dumps(message, separators=(",", ":")).encode() + b"\n"
         with self._lock:
             self._unsent += line
         self.flush(within_s)
 
     def flush(self, within_s: float = 0.0) -> None:
-        """Send what is still queued, as far as the socket takes it within that time."""
+        """Send what is still queued, as much as the socket accepts within that time."""
         ends_at = time.monotonic() + within_s
         with self._lock:
             while self._unsent:
@@ -82,12 +82,12 @@ class Channel:
         return [json.loads(line) for line in lines]
 
     def close(self) -> None:
-        """Hang up; a second call does nothing."""
+        """Close the connection; a second call does nothing."""
         self._end.close()
 
 
 def error_message(error: BaseException) -> list[str]:
-    """The error as a message can carry it: its class and its text."""
+    """The content of a message that carries an error: the name of its class and its text."""
     return [type(error).__name__, str(error)]
 
 
@@ -110,7 +110,7 @@ _NO_FRAME = -1
 
 
 class Heartbeat:
-    """The shared page, as either process sees it."""
+    """The shared page of memory. Each of the two processes has an object of this class for it."""
 
     def __init__(self, handle: int) -> None:
         """handle: file descriptor of an anonymous file of at least a page."""

@@ -1,5 +1,5 @@
-"""The application's side of the guard. It starts the guard, talks to it, sends heartbeats, and takes over if it is
-lost.
+"""The application's side of the guard. It starts the guard, talks to it, sends heartbeats, and makes the devices safe
+itself if the guard is lost.
 """
 
 import itertools
@@ -28,7 +28,7 @@ from drivers.transports.tap import TapFile
 
 
 class _Guarded(Device):
-    """A device whose port the guard owns. about: what the guard read when it opened the device."""
+    """A device whose port the guard owns. about: properties that the guard read when it opened the device."""
 
     _slot: ClassVar[str]
 
@@ -63,7 +63,7 @@ class GuardedLaser(_Guarded, LineLaser):
         return LaserStatus(**self._ask("status"))
 
     def _check_health(self) -> None:
-        """Do nothing: the guard's own `arm` checks, and a slow laser is not asked twice."""
+        """Do nothing: `arm` in the guard checks already, and a slow laser need not be asked twice."""
 
     def _do_arm(self, power_w: float) -> None:
         self._ask("arm", power_w)
@@ -116,20 +116,20 @@ def _plain(pulses: Sequence[Pulse]) -> list[list[Any]]:
 _log = logging.getLogger(__name__)
 
 OPEN_S = 30.0
-"""Time for the guard to start and open its devices: a laser that takes ten commands a second has much to be asked."""
+"""Time for the guard to start and open its devices. A laser that accepts ten commands a second is slow to open."""
 ANSWER_S = {"arm": 180.0, "program": 20.0}
-"""Time for a verb. `arm` has as much more as its laser's config allows for warming up."""
+"""Time for the answer to a method. For `arm`, the `warm_up` of the laser's config is added."""
 USUAL_ANSWER_S = 10.0
 LOWER_S = 5.0
-"""Time for the rescue, where the guard is gone."""
+"""Time for the rescue after the guard is gone."""
 SILENCE_S = 2.0
-"""A guard that gives no sign of life for so long, in time that this process was awake, hangs: it is ended..."""
+"""A guard that gives no sign of life for this long, while this process is awake, counts as hung and is killed."""
 BUSY_SILENCE_S = 5.0
-"""...or after this where it is at work or waits for a processor or a disk."""
+"""The same for a guard that is at work or waits for a processor or a disk."""
 _TICK_S = 0.01
 _MAX_STEP_S = 0.1
 _RESCUE_SWITCH_S = 5e-4
-"""Longest time for which other threads keep the interpreter while light is taken; Python's default is 5 ms."""
+"""Longest time for which other threads keep the interpreter during a rescue; Python's default is 5 ms."""
 _LOWERING = ("pause", "disarm", "gate_low", "abort")
 _ENABLING = ("arm", "program", "run")
 
@@ -230,7 +230,8 @@ class Guard:
         """Have the guard call a device's method on behalf of a proxy; returns its result or raises its error.
 
         Raises `failure` instead of switching anything on, `DeviceTimeout` if it takes too long, and `GuardLost` if the
-        guard is gone; methods that make a device safe first wait until the application has tried to do so itself.
+        guard is gone. A method that makes a device safe raises `GuardLost` only once the application has tried to make
+        it safe itself.
         """
         if self.failure is not None and verb in _ENABLING:
             raise self.failure
@@ -290,7 +291,7 @@ class Guard:
             return cast(_Proxy, self._proxies[slot])
 
     def _told(self, answer: Message | None, verb: str) -> Message:
-        """The answer. Raises the error that it carries, or `GuardLost` if there is none since the guard is gone."""
+        """The answer. If it carries an error, raises that. Raises `GuardLost` if it is None: the guard is gone."""
         if answer is None:
             raise self._gone(verb)
         if "error" in answer:
@@ -351,7 +352,7 @@ class Guard:
             self._parted = True
 
     def _end(self) -> None:
-        """Deal with the end of the guard. If it said no goodbye, make the devices safe from here."""
+        """Handle the end of the guard. If it ended without a goodbye, make the devices safe from this process."""
         if self._parted:
             self._lost.set()
         else:

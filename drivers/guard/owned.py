@@ -1,6 +1,6 @@
 """A device that the guard owns: opened from its config, used through the application's messages, made safe at the end.
 
-Each of its two `Lane`s is a thread that does one job after the other for it, urgent ones first.
+Each device has two `Lane`s. A lane is a thread that does one job after the other.
 """
 
 import itertools
@@ -24,7 +24,9 @@ Job = Callable[[], object]
 
 
 class Lane:
-    """A daemon thread that does jobs one after the other. It outlives a job that raises: the next may end the light."""
+    """A daemon thread that does jobs one after the other. An error in a job is only logged: the next job may be the one
+    that switches the light off.
+    """
 
     def __init__(self, name: str) -> None:
         self._jobs: queue.PriorityQueue[tuple[int, int, Job]] = queue.PriorityQueue()
@@ -32,7 +34,7 @@ class Lane:
         threading.Thread(target=self._work, name=name, daemon=True).start()
 
     def do(self, job: Job, *, first: bool = False) -> None:
-        """Queue a job. With `first` it goes ahead of all jobs queued without it."""
+        """Queue a job. first: put it before all jobs that were queued without `first`."""
         self._jobs.put((0 if first else 1, next(self._order), job))
 
     @property
@@ -65,13 +67,13 @@ class Owned:
         self.slot = slot
         self.device: Any = None
         self.armed = False
-        """Whether this is a laser that is to be disarmed where the application cannot go on."""
+        """Whether this is a laser that is to be disarmed if the application cannot go on."""
         self.emits = False
-        """Whether this is a laser that shines through an open gate, as far as it was told to."""
+        """Whether this is a laser that shines through an open gate, judged by the calls made so far."""
         self.lane = Lane(slot)
         self.urgent = Lane(f"{slot}, urgent")
         self.enabling = False
-        """Whether a verb that may end in light is under way on `lane`."""
+        """Whether a method that may switch light on is under way on `lane`."""
         self.unsafe = False
         """Whether `try_safe` is to be called until it has succeeded."""
         self.trying = False
@@ -85,7 +87,7 @@ class Owned:
         self._create = partial(kind.create, model, surroundings)
 
     def open(self) -> dict[str, Any]:
-        """Open the device; returns what its proxy can say without asking it. May raise DeviceError."""
+        """Open the device; returns the properties that its proxy reports without asking it. May raise DeviceError."""
         self.device = self._create()
         about: dict[str, Any] = {"name": self.device.name, "identity": self.device.identity}
         if isinstance(self.device, LineLaser):
@@ -156,7 +158,7 @@ class Owned:
             self.trying = False
 
     def calm(self) -> None:
-        """Make the device dark, during a method that may switch light on or right behind it. Errors are only logged."""
+        """Make the device dark during a method that may switch light on, or right after it. Errors are only logged."""
         try:
             make_safe(self.device, disarm=False)
         except DeviceError as error:

@@ -40,9 +40,10 @@ SIGN_OF_LIFE_S = 0.05
 POLL_S = 1.0
 """Time between questions to an armed laser about interlock and faults (docs/reference/hardware.md: at 1 Hz or more)."""
 END_CHECK_S = 0.2
-"""Time between questions whether the gate's program has ended, while an application at work is late with its frames."""
+"""Time between checks whether the gate's program has ended, while an application at work is late with its frames."""
 GATE_FIRST_S = 0.1
-"""Longest time that a kill waits for the low gate: a mirror whose program dies must not be lit."""
+"""Delay before a stopped application is killed. The gate is low by then: the mirror may rest once the application is
+dead."""
 GIVE_UP_S = 10.0
 """Time after which the guard gives up making a device safe that does not answer."""
 
@@ -121,7 +122,7 @@ class GuardProcess:
         for slot, config in message["open"].items():
             try:
                 owned = Owned(slot, config, message["ports"], message["tap"])
-            except Exception as error:  # the application is told of a config that is no good here
+            except Exception as error:  # a config that is unusable here is reported to the application
                 self._channel.send({"opened": slot, "error": error_message(error)})
                 continue
             self._owned[slot] = owned
@@ -145,10 +146,10 @@ class GuardProcess:
         lane = owned.urgent if verb in _URGENT else owned.lane
         lane.do(lambda: self._answer(owned, message))
         if verb in _URGENT and owned.enabling:
-            owned.lane.do(owned.calm)  # what the overtaken verb still does is undone behind it
+            owned.lane.do(owned.calm)  # undoes what the overtaken method may still do
 
     def _answer(self, owned: Owned, message: Message) -> None:
-        """Do a verb and answer with its result or error. Runs on a lane of the device's."""
+        """Call a device's method and send its result or error. Runs on one of the device's lanes."""
         verb = message["verb"]
         answer: Message = {"id": message["id"]}
         with self._trip_lock:
@@ -186,7 +187,7 @@ class GuardProcess:
         watch, frame = self._watch, self._heartbeat.frame
         if frame != watch.last:
             self._silence_noted = False
-        elif watch.watching and not self._silence_noted:  # a look at every thread, and seldom needed
+        elif watch.watching and not self._silence_noted:  # slow, since it looks at every thread; seldom needed
             self._silence_noted = True
             application.note_progress()
         emits = any(owned.emits for owned in self._owned.values())
@@ -207,7 +208,7 @@ class GuardProcess:
                 application.kill()
 
     def _suspect(self, trouble: str, stopped: bool, now: float) -> None:
-        """Act on missing frames, unless the gate says, in time, that its program has ended by itself."""
+        """Act on missing frames, unless the gate reports in time that its program has ended by itself."""
         sync = self._owned.get("sync")
         if stopped or sync is None or (self._check_until is not None and now > self._check_until):
             self._trip_application(trouble, stopped)
@@ -216,13 +217,13 @@ class GuardProcess:
             sync.urgent.do(lambda: self._check_end(sync, trouble), first=True)
 
     def _check_end(self, sync: Owned, trouble: str) -> None:
-        """Trip the application unless the gate's program has ended by itself. Runs on a lane of the gate's."""
+        """Trip the application unless the gate's program has ended by itself. Runs on one of the gate's lanes."""
         if not self._note_end(sync):
             self._trip_application(f"{trouble}; check the SPAD's cable and trigger, or unload the computer", False)
         self._check_until = None
 
     def _note_end(self, sync: Owned) -> bool:
-        """Ask the gate if its program has ended; if so, stop watching and pause the laser. Runs on a lane of it."""
+        """Ask the gate if its program has ended. If so, stop watching and pause the laser. Runs on a gate's lane."""
         try:
             status = sync.device.status
         except DeviceError:
@@ -232,7 +233,7 @@ class GuardProcess:
         self._watch.stop()
         laser = self._owned.get("laser")
         if laser is not None and laser.emits and not laser.enabling:
-            laser.urgent.do(lambda: self._rest(laser))  # what the application asks for afterwards stands behind it
+            laser.urgent.do(lambda: self._rest(laser))  # later requests of the application queue behind it
         return True
 
     def _rest(self, laser: Owned) -> None:
@@ -256,7 +257,7 @@ class GuardProcess:
         laser.lane.do(lambda: self._ask_laser(laser))
 
     def _ask_laser(self, laser: Owned) -> None:
-        """Ask the laser, on its lane, about interlock and faults; again where an answer is missing or garbled."""
+        """Ask the laser, on its lane, about interlock and faults; a second time if an answer is missing or garbled."""
         device: LineLaser = laser.device
         for attempt in range(2):
             try:
@@ -276,13 +277,15 @@ class GuardProcess:
     # Ending the light
 
     def _trip(self, cause: DeviceError) -> bool:
-        """Take the gate low and pause the laser, at once and whatever else is under way. False: it was done before."""
+        """Take the gate low and pause the laser, at once, whatever else is under way. Returns False if that was done
+        before.
+        """
         with self._trip_lock:
             if self._tripped is not None:
                 return False
             self._tripped = cause
         for owned in self._owned.values():
-            if owned.enabling:  # dark at once; what is still being switched on is switched off behind it
+            if owned.enabling:  # dark at once, and again (`try_safe`) behind the method that switches light on
                 owned.urgent.do(owned.calm, first=True)
             owned.unsafe = True
         self._make_safe()
@@ -291,7 +294,7 @@ class GuardProcess:
         return True
 
     def _make_safe(self) -> None:
-        """Give the lanes the jobs that are due."""
+        """Queue an attempt to make safe each device for which one is due."""
         with self._trip_lock:
             due = [owned for owned in self._owned.values() if owned.due]
             for owned in due:
@@ -310,7 +313,7 @@ class GuardProcess:
             try:
                 if owned.device is not None:
                     owned.device.close()
-            except Exception as error:  # the next one is closed all the same
+            except Exception as error:  # the next device is still closed
                 _log.error("%s: %s", owned.slot, error)
         for owned in self._owned.values():
             owned.flush()
@@ -319,7 +322,7 @@ class GuardProcess:
 
 
 def _told(error: Exception) -> list[str]:
-    """The error as the application is told it; one that is no device's is logged: it is a fault of the guard."""
+    """The content of a message that carries an error. If it is no `DeviceError`, it is a fault in the guard: log it."""
     if not isinstance(error, DeviceError):
         _log.exception("guard")
     return error_message(error)
@@ -339,8 +342,8 @@ FREE_S = 1.0
 """Time for the kernel to free the ports of a process that ended."""
 _RETRY_S = 0.005
 OFF_TIMES, OFF_GAP_S = 2, 0.11
-"""Number of times that `Kind.off` is sent, and their distance: a Cobolt heeds no command within 0.1 s of another
-(docs/reference/hardware.md), and the guard may just have asked something."""
+"""Number of times that `Kind.off` is sent, and the seconds between them: a Cobolt ignores a command within 0.1 s of
+another (docs/reference/hardware.md), and the guard may just have sent one."""
 
 
 class Rescue:
@@ -372,12 +375,12 @@ class Rescue:
     def _save(self, slot: str, armed: bool) -> None:
         try:
             if armed and slot in self._off:
-                with suppress(Exception):  # opening the device is tried all the same, and tells what is wrong
+                with suppress(Exception):  # opening the device is tried all the same, and shows what is wrong
                     self._switch_off(slot)
             with _once_free(self._create[slot]) as device:
                 make_safe(device, disarm=armed)
             self._outcome[slot] = "made safe by the application"
-        except Exception as error:  # also a driver's own fault: the other device is waited for, and this one is told
+        except Exception as error:  # also a fault in a driver: the outcome must name both devices
             self._outcome[slot] = f"NOT made safe, {error}"
             _log.error("%s: %s", slot, error)
 

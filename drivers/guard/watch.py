@@ -33,20 +33,20 @@ class GuardLimits:
     """
 
     frames_within_s: float = 0.05
-    """Limit for an application that sleeps, as two looks say: with their 20 ms and the gate's 30 ms, 100 ms in all."""
+    """Limit for an application that sleeps. Two looks confirm it (20 ms), the gate takes 30 ms: 100 ms in all."""
     busy_within_s: float = 1.5
-    """Limit for one that computes or waits for a processor or a disk. Under load threads were seen to wake 0.35 s late,
-    and disks stall for a second: none of that may end a scan. The light meanwhile is that of a moving mirror, since
-    each sweep waits, with its gate low, for a scan marker."""
+    """Limit for an application that computes or waits for a processor or a disk. Under load, threads wake up to 0.35 s
+    late and disks stall for a second; neither may end a scan. The mirror moves while light is out meanwhile, since each
+    sweep waits with its gate low for a scan marker."""
     waits_within_s: float = 0.04
-    """Limit for one at work whose source thread says that it has asked the SPAD for so long in vain."""
+    """Limit for an application at work whose source thread reports that the SPAD has given no frames for this long."""
     first_wait_s: float = 0.3
     """The same limit before the first frame."""
     first_frame_s: float = 1.0
     """Time from `run` to the first frame: SPAD, scanner and the scan marker come in between. An application at work
     gets `busy_within_s` on top, since devices that start and a machine with too much to do may come together."""
     check_s: float = 0.05
-    """Time for the gate to say whether its program has ended, before it is taken for still running."""
+    """Time for the gate to say whether its program has ended. After that the program counts as running."""
     help_itself_s: float = 0.5
     """Time for an application that lives but takes no frames to make its rig safe, before it is killed."""
 
@@ -111,12 +111,12 @@ class FrameWatch:
 _AT_WORK = ("R", "D")
 """States of a thread at work: running or waiting for a processor; waiting for a disk."""
 _BUSY_SHARE = 0.15
-"""Share of a time for which all threads together have run, or waited for a processor, in a process at work. One that
-hangs wakes some service thread for microseconds now and then."""
+"""A process is at work if its threads together ran, or waited for a processor, for more than this share of the time. A
+process that hangs still wakes some service thread for microseconds now and then."""
 
 
 class WatchedProcess:
-    """A process of this user, seen from outside. `close` closes the pidfd it holds.
+    """Another process of the same user, seen from outside. `close` closes the pidfd.
 
     idle_thread: number of a thread that wakes up regularly by itself. On an overloaded machine it waits for a processor
     each time. Its time is not counted as work; but while it runs or waits for a processor the process is not asleep,

@@ -86,7 +86,9 @@ class Device(ABC):
         self.close()
 
     def _require(self, verb: str, *allowed: DeviceState, first: str = "") -> None:
-        """Raise `WrongState` unless the state is one of `allowed`; `first` names the verb to call before."""
+        """Raise `WrongState` unless the state is one of `allowed`. first: the method that the message advises to call
+        first.
+        """
         if self._state in allowed:
             return
         if self._state is DeviceState.CLOSED:
@@ -100,4 +102,4 @@ class Device(ABC):
 
     @abstractmethod
     def _do_close(self) -> None:
-        """Give back handles and memory. Runs also where making the device safe failed."""
+        """Release handles and memory. Called even if making the device safe failed."""

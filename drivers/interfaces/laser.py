@@ -30,7 +30,7 @@ class LaserStatus:
     fault: str | None
     """The laser's faults in one line; None: it has none."""
     key_on: bool | None
-    """True where the laser's key is on. None: the laser has no key, or does not say."""
+    """Whether the laser's key is on. None: the laser has no key, or does not say."""
     warming_up: bool
     """The laser is not ready yet; its light may begin later by itself."""
     input_mode: str
@@ -114,7 +114,7 @@ class LineLaser(Device):
 
     @abstractmethod
     def _do_pause(self) -> None:
-        """Stop emission; must work in any state, also where the laser was found emitting at open."""
+        """Stop emission. Must work in any state, also if the laser already emitted when it was opened."""
 
     @abstractmethod
     def _do_disarm(self) -> None: ...

@@ -1,4 +1,4 @@
-"""The beam scanner: one mirror that plays a compiled waveform of drive commands, with marker bits beside them."""
+"""The beam scanner: one mirror that plays a compiled waveform. Each point is a drive command with marker bits."""
 
 import logging
 from abc import abstractmethod
@@ -18,8 +18,8 @@ MARKER_SCAN = 2
 LEVEL_BACKWARD = 4
 """Bits of a waveform's marker words. A bit at point i is high from the start of point i for one point.
 
-A sweep begins where MARKER_SCAN rises. It stays high until just before the sweep's light ends: the sync source lets
-light out only while it is, and a scanner that stops or is unplugged lets it fall.
+A sweep begins where MARKER_SCAN rises. This marker stays high until just before the sweep's light ends. The sync source
+lets light out only while it is high, and it falls if the scanner stops or is unplugged.
 """
 
 _ROUNDING = 1e-6
@@ -109,7 +109,7 @@ class BeamScanner(Device):
         """Load a waveform, to be played `repeats` times without a seam; returns the exact point clock at which it will
         run.
 
-        Raises `LimitExceeded` for the first limit that waveform or `repeats` break, with the value. Nothing moves.
+        Raises `LimitExceeded` for the first limit that is broken, with the value. Nothing moves.
         """
         self._note_end()
         self._require("load", DeviceState.READY, DeviceState.CONFIGURED, first="stop")
@@ -152,7 +152,7 @@ class BeamScanner(Device):
         self._do_park()
 
     def _note_end(self) -> None:
-        """Learn, where the state matters, that a waveform has ended by itself."""
+        """Update the state if a waveform has ended by itself. Called where the state matters."""
         if self._state is DeviceState.RUNNING and not self._do_status().moving:
             self._state = DeviceState.CONFIGURED
 

@@ -4,6 +4,8 @@ It may send only a part of each row: a window that moves with the laser line. Th
 device. The device steps through the table by the scanner's markers and never by counting frames: a scan marker selects
 entry 0 of the next sweep, line marker j entry j. A frame has one window, fixed at its start; a marker that arrives
 during a frame moves the window of the next one.
+
+A run in this module is one start of the SPAD, from `start` to the last frame or to `stop`.
 """
 
 import logging
@@ -25,7 +27,7 @@ from drivers.ring import BlockRing
 _WORD_PX = 8 * ROW_ALIGN_BYTES
 """Windows lie on whole 64-bit words, on which the counting runs."""
 _SCAN, _LINE = int(Mark.SCAN), int(Mark.LINE)
-"""Plain numbers: numpy takes microseconds to see what a flag is."""
+"""Plain integers: numpy takes microseconds to convert an `IntFlag`."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -45,7 +47,7 @@ class WindowTable:
     _begins: NDArray[np.int64] = field(init=False, repr=False)
 
     def __post_init__(self) -> None:
-        """Join the tables, so that a block is one look-up."""
+        """Join the tables, so that one look-up serves a whole block."""
         object.__setattr__(self, "_joined", np.concatenate([np.zeros(0, np.int32), *self.x0]))
         object.__setattr__(self, "_entries", np.array([len(x0) for x0 in self.x0], np.int64))
         object.__setattr__(self, "_begins", np.cumsum(self._entries) - self._entries)
@@ -69,7 +71,7 @@ class WindowTable:
         return x0
 
     def check(self, sensor_width: int, step_px: int) -> None:
-        """Raise `LimitExceeded` for an empty table and for windows that a sensor cannot give: off its grid of steps and
+        """Raise `LimitExceeded` for an empty table and for windows that a sensor cannot send: off its grid of steps and
         words, or beyond its edge.
 
         The last word of a row may reach beyond a sensor whose width is not a whole number of words; its pad bits are 0.
@@ -141,7 +143,8 @@ class SpadInfo:
     trigger_modes: tuple[str, ...]
     """Start of an exposure: "free" (one follows the other), "external" (a pulse on the trigger input)."""
     can_wait: bool = False
-    """Whether it can stand still while the ring is full, as a simulation on virtual time does; a sensor cannot."""
+    """Whether it can pause while the ring is full, as a simulation or a stored burst can. A sensor that streams
+    cannot."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -210,8 +213,8 @@ class SpadArray(Device):
         self._mode: SpadMode | None = None
         self._run_opened = False
         self.on_wait: Callable[[float], None] | None = None
-        """Called within `fill` with the number of seconds for which the device has been asked in vain since its last
-        frames. A device that cannot tell leaves it alone."""
+        """Called within `fill` with the seconds since the last frames for which the device was asked and gave none. A
+        device that cannot tell never calls it."""
 
     @property
     @abstractmethod
@@ -235,7 +238,7 @@ class SpadArray(Device):
 
     @property
     def health(self) -> SpadHealth:
-        """Ask the device. Raises `WrongState` during a run, when its line may be busy, and after `close`."""
+        """Ask the device. Raises `WrongState` after `close`, and during a run, when its connection may be busy."""
         self._require("health", DeviceState.READY, DeviceState.CONFIGURED, first="stop")
         return self._do_health()
 

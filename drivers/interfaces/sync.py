@@ -24,9 +24,9 @@ HOLD_S = 0.5e-3
 
 @dataclass(frozen=True, slots=True)
 class Pulse:
-    """One word of a program: hold the outputs (OR of `OUT_*`) for a duration, or, if it is None, while the scan marker
-    is low.
+    """One word of a program: levels of the outputs (OR of `OUT_*`), and for how long they are held.
 
+    duration_s: None means as long as the scan marker is low, so the word waits for a sweep.
     held: the gate stays high only as long as the scan marker does; the source checks that every `HOLD_S`. If a scanner
     stops, is unplugged or loses its program, the light therefore goes off even if nobody else has noticed.
     """
@@ -60,7 +60,7 @@ class SyncStatus:
     """The device's own report, read anew each time."""
 
     state: Literal["stopped", "waiting", "running", "aborted"]
-    """State of the program; "running" also where the device cannot tell that its program waits for the scan marker."""
+    """State of the program. A device that cannot tell whether its program waits for the scan marker says "running"."""
     outputs: int | None
     """Levels read back from the pins; None: this device cannot read them while a program runs."""
 
@@ -87,8 +87,8 @@ class SyncSource(Device):
         """Load `pulses`, to be played `repeats` times, after which all outputs go low. Nothing is played before `run`.
 
         Raises `LimitExceeded` for a word that waits with the gate high (it would burn one spot for as long as the
-        scanner rests), other outputs than `OUT_*`, a duration below half the resolution or without end, no pulses or
-        repeats at all, or more than the device holds.
+        scanner rests), other outputs than `OUT_*`, a duration below half the resolution or infinite, no pulses or
+        repeats at all, or a program that is too long for the device.
         """
         self._note_end()
         self._require("program", DeviceState.READY, DeviceState.CONFIGURED, first="abort")
@@ -126,7 +126,7 @@ class SyncSource(Device):
         self._check_low(~0, "abort")
 
     def _note_end(self) -> None:
-        """Learn, where the state matters, that a program has ended by itself."""
+        """Update the state if a program has ended by itself. Called where the state matters."""
         if self._state is DeviceState.RUNNING and self._do_status().state in ("stopped", "aborted"):
             self._state = DeviceState.CONFIGURED
 

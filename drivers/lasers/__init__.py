@@ -1,4 +1,4 @@
 """Line lasers on serial ports: Cobolt and OBIS.
 
-A driver takes its device's config and gives a `drivers.interfaces.LineLaser`. `serial_laser` holds what they share.
+A driver makes a `drivers.interfaces.LineLaser` from its device's config. `serial_laser` holds what the drivers share.
 """

@@ -7,8 +7,9 @@ itself and reports fault 1.
 The 06-MLD has its own command language, newer lasers an SCPI-like one. A 06-DPL is refused, since its power follows a
 gate only up to about 1 kHz. The laser is kept dark by a power of 0 and not by `l0`: after `l0` its key must be turned
 (pycobolt issue 6), whereas a power of 0 can be read back, by the next program too. `pause` sets the power to 0 (and
-sends `las:paus 1`), so no key is needed to resume; if no 0 reads back, it switches off. `disarm` does the
-same and sends `l0`; with autostart enabled the key must then be turned off and on before the laser starts again.
+sends `las:paus 1`), so no key is needed to resume; if the power does not read back as 0, `pause` switches the laser
+off. `disarm` does the same and sends `l0`; with autostart enabled the key must then be turned off and on before the
+laser starts again.
 """
 
 import logging
@@ -30,15 +31,15 @@ _log = logging.getLogger(__name__)
 COUNT = re.compile(r"\d{1,4}")
 WORD = re.compile(r"[A-Za-z][A-Za-z0-9_]*")
 NAME = re.compile(r"(?=.*\d)[A-Za-z0-9][A-Za-z0-9._/ -]*")
-"""Model and serial numbers: with a digit, which no other reply in words has."""
+"""Form of model and serial numbers. They contain a digit, unlike all other replies in words."""
 USUAL_TIMING = LineTiming(gap_s=0.1)
 
 _REFUSED = re.compile(r"syntax error.*", re.IGNORECASE)
 _JUNK = re.compile(r"^[^A-Za-z0-9+-]+")
 _MOST_LINES = 3
-"""Most lines of a reply: itself, and lines of nothing but junk or echo before it."""
+"""Most lines to read for one reply: lines that are only junk or echo may come before it."""
 _POWER_STEP_MW = 0.1
-"""Finest step of power that every model keeps."""
+"""Every model resolves its power setting at least this finely."""
 
 
 class CoboltFraming:
@@ -72,29 +73,29 @@ class Dialect:
     """The words of one of the laser's command languages. Pairs are a command without its value and the query for it."""
 
     mode: str
-    """Question of the mode; the answer has the form `mode_form`."""
+    """Query of the mode; the answer has the form `mode_form`."""
     mode_form: re.Pattern[str]
     modulate: str
-    """Command of the mode in which an input governs the light..."""
+    """Command that selects the mode in which an input controls the light."""
     modulated: str
-    """...and that mode's name."""
+    """Name of that mode in answers, in lower case."""
     digital: tuple[str, str]
     analog: tuple[str, str]
-    """Whether the TTL input, and whether the analog one, governs the light in that mode: command and query."""
+    """Command and query for whether the TTL input, or the analog one, controls the light in that mode."""
     set_power: str
-    """Command of the power under the gate, in milliwatts."""
+    """Command that sets the power while the gate is high, in milliwatts."""
     powers: Mapping[str, tuple[str, float]]
-    """Question of the power in each mode that knows one, and its unit in watts."""
+    """Query of the set power by mode, and its unit in watts. Modes without a set power are missing."""
     no_power: str
-    """Command that takes the power of the constant-power mode to 0."""
+    """Command that sets the power of the constant-power mode to 0."""
     waits_for_key: tuple[str, re.Pattern[str], re.Pattern[str]]
-    """Question of the laser's state, the answer's form, and the answers if it starts only once its key is turned."""
+    """Query of the laser's state, the form of its answers, and of those that mean that it waits for its key."""
     names: Mapping[str, str]
-    """Names of modes without input, where the laser calls them by a number."""
+    """Names of the other modes, by the number that the laser reports."""
     external: str = ""
-    """Command that lets the input govern and not the host."""
+    """Command that gives control to the input and not to the host."""
     pause: str = ""
-    """Command that blanks at once (1), until it is taken back (0)."""
+    """Command that blanks the light at once (value 1) or ends that (0)."""
 
 
 MLD = Dialect(
@@ -138,7 +139,7 @@ FAMILIES = {
     "06-01": r"-06-.*-1\d{3}(-C)?$",
     "06-MLD": r"-06-0",
 }
-"""Model numbers of each family; the first one that fits, sorted as in pycobolt."""
+"""Patterns of each family's model numbers. The first match counts; the order is that of pycobolt."""
 
 
 def classify(model: str) -> str:
@@ -167,7 +168,7 @@ class CoboltLaser(SerialLaser):
 
     def _do_status(self) -> LaserStatus:
         line = self._line
-        # A flipped bit may fake an alarm: what ends a scan is asked twice. If it hides one, the next poll finds it.
+        # A flipped bit may fake an alarm, so what ends a scan is read twice. If it hides one, the next poll finds it.
         interlock_open = line.ask_flag("ilk?") and line.ask_flag("ilk?")
         fault = self._fault()
         on = line.ask_flag("l?")
@@ -196,7 +197,7 @@ class CoboltLaser(SerialLaser):
         return self._line.ask(self._dialect.mode, self._dialect.mode_form).lower()
 
     def _input_mode(self, mode: str) -> str:
-        """The control of the light in this mode: only "digital" keeps it under the gate."""
+        """Name of the input or mode that controls the light. The gate alone controls it only if that is "digital"."""
         dialect = self._dialect
         if mode != dialect.modulated:
             return dialect.names.get(mode, mode)
@@ -206,7 +207,7 @@ class CoboltLaser(SerialLaser):
         return "mixed" if digital else "analog" if analog else "modulation without input"
 
     def _power_w(self, mode: str) -> float | None:
-        """The power in watts that the laser is set to in this mode. None: the mode knows none (current)."""
+        """The power in watts that is set in this mode. None: the mode has no set power (constant current)."""
         if mode not in self._dialect.powers:
             return None
         question, unit_w = self._dialect.powers[mode]
@@ -221,20 +222,20 @@ class CoboltLaser(SerialLaser):
             self._enable(power_w)
             self._require_no_stop()
         except DeviceError:
-            with suppress(DeviceError):  # the first error is the one to tell
+            with suppress(DeviceError):  # the first error is the one to report
                 self._darken()
             raise
         self._armed = True
 
     def _enable(self, power_w: float) -> None:
-        """Keep the laser dark until the gate is known to govern the light; only then set the power."""
+        """Keep the laser dark until the gate is known to control the light; only then set the power."""
         gated = all(self._input_mode(self._mode()) == "digital" for _ in range(2))  # a flipped bit must not shine
         on = self._line.ask_flag("l?")
         if not (gated and on):
-            self._darken()  # whenever it comes on, it is dark until the power is set
+            self._darken()  # then it is dark whenever it comes on, until the power is set
         if not gated:
             self._gate()
-        # Each exchange takes a tenth of a second: a pause from another thread is heeded before what lights.
+        # Each exchange takes a tenth of a second: check for a pause from another thread before each step to light.
         self._require_no_stop()
         if not on:
             self._start()
@@ -245,7 +246,7 @@ class CoboltLaser(SerialLaser):
             self._line.tell(f"{self._dialect.pause} 0")
 
     def _gate(self) -> None:
-        """Let the TTL input, and nothing else, govern the light. Read back; to be called in the dark."""
+        """Let only the TTL input control the light, and read that back. Call it while the laser is dark."""
         line, dialect = self._line, self._dialect
         for (command, question), value in ((dialect.digital, "1"), (dialect.analog, "0")):
             line.tell_and_check(f"{command} {value}", question, FLAG, value.__eq__)
@@ -256,7 +257,7 @@ class CoboltLaser(SerialLaser):
         )
 
     def _set_power(self, power_w: float) -> None:
-        """Set the power while the gate is high. Read back."""
+        """Set the power that is emitted while the gate is high, and read it back."""
         command, (question, _) = self._dialect.set_power, self._dialect.powers[self._dialect.modulated]
         power_mw = power_w * 1e3
         slack_mw = max(0.01 * power_mw, _POWER_STEP_MW / 2)
@@ -265,9 +266,9 @@ class CoboltLaser(SerialLaser):
         )
 
     def _darken(self) -> None:
-        """Leave no light in any mode that knows a power, at once and without the key.
+        """Set the power to 0 in every mode that has one, at once and without the key.
 
-        The power under the gate goes first: this may be an emergency. The next program can read the powers back.
+        The power under the gate is set first: this may be an emergency. The next program can read the powers back.
         """
         if self._dialect.pause:
             self._line.tell(f"{self._dialect.pause} 1")
@@ -279,7 +280,7 @@ class CoboltLaser(SerialLaser):
         self._line.tell("@cob1" if self._autostart else "l1")
         self._started = True
         if not self._line.ask_flag("l?") and self._waits_for_key():
-            # The start is not called back: the key that is turned now leads to a laser that is on, and dark.
+            # The start is not cancelled: once the key is turned, the laser comes on, and is dark.
             self._started = False
             raise DeviceFault(f"{self._name} waits for its key; turn the key off and on, then start again")
 
@@ -291,7 +292,7 @@ class CoboltLaser(SerialLaser):
             _log.warning("%s: pause failed (%s); switching off", self._name, error)
             power_w = None
         if power_w != 0 and self._line.ask_flag("l?"):
-            # A mode that knows no power, or a laser that keeps its own: off is the only dark that is sure.
+            # The mode has no set power, or the laser did not accept it: only off is surely dark.
             self._switch_off()
             _log.warning("%s: switched off, its key must be turned before it starts again", self._name)
 
@@ -304,7 +305,7 @@ class CoboltLaser(SerialLaser):
 
     def _switch_off(self) -> None:
         self._started = False
-        self._line.tell("@cob0")  # also a start that is under way
+        self._line.tell("@cob0")  # also ends a start that is under way
         self._line.tell_and_check("l0", "l?", COUNT, "0".__eq__)
 
 
@@ -339,8 +340,8 @@ def _identify(config: CoboltConfig, line: Dialogue) -> CoboltLaser:
 
 
 def _off(config: CoboltConfig) -> bytes:
-    """The bytes that switch off. No CR goes before them: it might count as a command, after which none is heeded for
-    0.1 s."""
+    """The bytes that switch off. No CR goes before them: it might count as a command, and the laser ignores others for
+    0.1 s after one."""
     return b"l0\r"
 
 

@@ -5,7 +5,7 @@ tables of `obis.h`, the operator's manual (appendix C) and mmCoreAndDevices PRs 
 plate's temperature, `SOUR:TEMP:PROT:BAS:LOW?` and `HIGH?`, are in `obis.cpp` and in Micro-Manager's `CoherentOBIS.cpp`.
 
 `AM:STAT ON` sent during warm-up is deferred, and light may come minutes later. So `arm` waits until the laser is ready
-and only then sends ON; if the wait ends in any other way it sends OFF. With CDRH the emission follows ON by 5 s. Modes
+and only then sends ON; if the wait ends in any other way it sends OFF. In CDRH mode emission begins 5 s after ON. Modes
 cannot be changed while the laser is on. `pause` sends `AM:STAT OFF`, confirmed by the emission bit; no key is needed to
 resume. `disarm` does the same and sets the least power. With the handshake off, a set command gets no answer at all. So
 the handshake is read first and never changed, and every setting is read back.
@@ -76,7 +76,7 @@ class ObisFraming:
         self._suffix = "" if channel is None else str(channel)
         self._handshake: bool | None = None
         self.identity = ""
-        """The reply to `*IDN?`, once it is known: from then on only the same reply shows that the line is in step."""
+        """The reply to `*IDN?`, once known. From then on only the same reply shows that replies match their queries."""
 
     @property
     def ping(self) -> str:
@@ -93,12 +93,12 @@ class ObisFraming:
         return True
 
     def encode(self, command: str) -> bytes:
-        """The bytes of a command, with the laser's address behind a Remote and CRLF."""
+        """The bytes of a command, with CRLF at the end. Behind a Remote they contain the laser's channel."""
         addressed = command if command == _HANDSHAKE else _ADDRESSED.sub(rf"\g<1>{self._suffix}", command)
         return addressed.encode("ascii") + b"\r\n"
 
     def read(self, command: str, read_line: Callable[[], str]) -> str:
-        """The reply to a command. Without handshake a set command counts as done unanswered; reading back will tell."""
+        """The reply to a command. Without handshake a set command has none and counts as done; callers read it back."""
         if not command.endswith("?"):
             return read_line() if self._handshake else DONE
         reply = read_line()
@@ -212,7 +212,7 @@ class ObisLaser(SerialLaser):
                 self._told_on = True
                 self._switch("SOUR:AM:STAT", "ON")
         except DeviceError:
-            with suppress(DeviceError):  # the first error is the one to tell
+            with suppress(DeviceError):  # the first error is the one to report
                 self._switch_off()
             raise
         if self._stopped:  # a pause from another thread overtook the ON
@@ -221,7 +221,7 @@ class ObisLaser(SerialLaser):
         self._armed = True
 
     def _prepare(self) -> None:
-        """Switch off, and set up the laser so that nothing but the gate governs the light, now and after power-up."""
+        """Switch off, and set up the laser so that only the gate controls the light, now and after power-up."""
         self._switch_off()
         self._switch("SYST:CDRH", "ON")
         self._switch("SYST:AUT", "OFF")
@@ -233,13 +233,13 @@ class ObisLaser(SerialLaser):
 
     def _set_power(self, power_w: float) -> None:
         def is_power(reply: str) -> bool:
-            return abs(float(reply) - power_w) <= max(0.01 * power_w, 5e-5)  # they keep 0.1 mW
+            return abs(float(reply) - power_w) <= max(0.01 * power_w, 5e-5)  # stored in steps of 0.1 mW
 
         setting = "SOUR:POW:LEV:IMM:AMPL"
         self._line.tell_and_check(f"{setting} {power_w:.5f}", f"{setting}?", NUMBER, is_power)
 
     def _await_ready(self) -> None:
-        """Wait until an ON acts at once: sent earlier it would be deferred, and light come when nobody expects it.
+        """Wait until an ON acts at once. Sent earlier it is deferred, and light comes when nobody expects it.
         Raises `DeviceFault`, `InterlockOpen`, `WrongState` after a pause, or `DeviceTimeout`.
         """
         give_up_ns = self._clock.now_ns() + round(self._warm_up_s * NS_PER_S)
@@ -327,7 +327,7 @@ def _identify(config: ObisConfig, framing: ObisFraming, line: Dialogue) -> ObisL
 
 
 def _base_range(line: Dialogue) -> TemperatureRange | None:
-    """The range that the base plate may be in. None: the unit states no valid one; its own fault word judges then."""
+    """The range that the base plate may be in. None: the unit states no valid one; only its fault word counts then."""
     try:
         low, high = (line.ask_surely(f"SOUR:TEMP:PROT:BAS:{end}?", CELSIUS) for end in ("LOW", "HIGH"))
     except CommandRefused:

@@ -24,7 +24,7 @@ class SerialLaserConfig(KindConfig):
     port: str
     """Serial port: a path or COM port, "serial=..." or "usb=VVVV:PPPP" of its USB device, or "emulated:NAME"."""
     max_power: Annotated[Watts, Field(gt=0)]
-    """Most power, in watts, that this rig may ever send out; the laser's own maximum holds where that is smaller."""
+    """Most power, in watts, that this rig may ever send out. If the laser's own maximum is smaller, that holds."""
     serial_number: str | None = None
     """Serial number of the laser; any other laser is refused. None: any laser will do."""
 

@@ -1,5 +1,7 @@
-"""Recordings on disk: segments of SPB1 blocks and their index, and the one reader that replay and everything
-else uses."""
+"""Recordings on disk: segments of SPB1 blocks and their index, and the reader that replay and all other parts use.
+
+A run in this package is one start of the SPAD, as in SPB1. The folder of a run of `rig scan` may hold several of them.
+"""
 
 from drivers.recorded.contents import INDEX_FILE, segment_name
 from drivers.recorded.reader import RecordedRun, RunRecording

@@ -1,9 +1,10 @@
 """The contents of a recording: which blocks it holds, and where.
 
 The index `frames.idx` has a header of 64 bytes, then a record of 64 bytes for each block, in the order of writing. Each
-record has its own CRC, so a torn or damaged one is recognised and affects no other. A record counts if its CRC is
-right and its place exists and is no other's. Stretches that no record covers are searched for blocks; if the first or
-last block of any segment is not as recorded, all segments are searched whole. `find_blocks` reads no payloads.
+record has its own CRC, so a torn or damaged one is recognised and affects no other. A record is used if its CRC is
+right, its place exists, and no other record claims the same bytes. Stretches that no record covers are searched for
+blocks. If the first or last block of any segment differs from its record, the index is ignored and all segments are
+searched. `find_blocks` reads no payloads.
 
 The index only tells where to look. The blocks themselves hold everything, so a lost index can be rebuilt from them
 (`rig repair`).
@@ -61,7 +62,9 @@ def index_header() -> bytes:
 
 
 def index_of(block: FrameBlock, segment: int, offset: int, length: int | None = None) -> bytes:
-    """The 64-byte record of a block at byte `offset` of `segment`. length: of header to trailer; None: as written."""
+    """The 64-byte record of a block at byte `offset` of `segment`. length: bytes from header to trailer; None: those
+    that the header gives.
+    """
     header = block.header
     length = length or BlockLayout(block.n_frames, header.width, header.height).block_bytes
     place = segment, int(header.flags), offset, length
@@ -177,7 +180,7 @@ def _told(folder: Path, problems: list[str]) -> Entries | None:
 
 
 def _inside(records: Entries, segments: dict[int, SegmentReader], problems: list[str]) -> Entries:
-    """The records that tell of blocks which can be there; where two tell of the same bytes, neither."""
+    """The records whose blocks can be there. If two records claim the same bytes, both are left out."""
     sizes = np.zeros(max(segments) + 2)
     sizes[list(segments)] = [segment.size for segment in segments.values()]
     room = sizes[np.minimum(records["segment"], len(sizes) - 1)]
@@ -198,7 +201,7 @@ def _inside(records: Entries, segments: dict[int, SegmentReader], problems: list
 
 
 def _fits(records: Entries, segment: SegmentReader) -> bool:
-    """Whether the first and the last block that the index tells of in a segment are there."""
+    """Whether the first and the last block that the index has for a segment are there."""
     ends = (records[0], records[-1]) if len(records) else ()
     try:
         return all(_block_at(segment, entry, check_payload=False) is not None for entry in ends)
@@ -214,7 +217,7 @@ def _block_at(segment: SegmentReader, entry: Any, *, check_payload: bool) -> Fra
 
 
 def _search(segment: SegmentReader, known: Entries, problems: list[str]) -> Iterator[bytes]:
-    """Index records of the blocks that lie where `known` (sorted by offset) has none."""
+    """Index records of the blocks in those parts of a segment that no record of `known` (sorted by offset) covers."""
     ends = round_up_to_page(known["offset"] + known["length"])
     starts = np.concatenate([np.zeros(1, np.int64), ends.astype(np.int64)])
     stops = np.concatenate([known["offset"].astype(np.int64), np.array([segment.size], np.int64)])
@@ -227,7 +230,7 @@ def _search(segment: SegmentReader, known: Entries, problems: list[str]) -> Iter
 
 
 def round_up_to_page(size: Any) -> Any:
-    """The smallest multiple of `PAGE_BYTES` that is not less, for a number or for each element of an array."""
+    """The smallest multiple of `PAGE_BYTES` that is at least `size`, a number or an array."""
     return -(-size // PAGE_BYTES) * PAGE_BYTES
 
 

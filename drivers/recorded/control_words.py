@@ -1,8 +1,8 @@
-"""The commands in recorded control traffic that do something, without the queries between them.
+"""The commands in recorded control traffic that make a device do something, without the queries between them.
 
-How often a driver queries a device depends on the host's timing, and so do the tokens that number the queries; neither
-is compared. The drivers may send a command again when a reply was lost, so repeats on a serial line count once. The
-queries known here are those of Helios, LaserCube, Cobolt, OBIS and PrawnDO (docs/reference/hardware.md).
+Queries are left out because their number, and the tokens in them, depend on the host's timing. The drivers may send a
+command again when a reply was lost, so repeats on a serial line count once. The queries known here are those of Helios,
+LaserCube, Cobolt, OBIS and PrawnDO (docs/reference/hardware.md).
 """
 
 import re
@@ -21,9 +21,9 @@ _USB_QUESTIONS = {
     "01": (0x83, 0x84, 0x87, 0x88, 0x89, 0x8A, 0x8B, 0x8C),  # LaserCube: rates, range, ring, version
 }
 FRAME_PORTS = ("02", "03")
-"""Bulk endpoints that points go to: each transfer is a buffer for the device, sent when the device has room."""
+"""Bulk endpoints for points. Each transfer is a buffer of points, sent when the device has room."""
 BEGIN, END = (b"run", b"swr"), b"abt"
-"""Commands of the sync source. A scan runs between them; after the end the mirror is parked from wherever it is."""
+"""Commands of the sync source that begin and end a scan. After the end the mirror is parked from wherever it is."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -35,7 +35,9 @@ class Spoken:
 
     @classmethod
     def of(cls, passed: Iterable[Passed]) -> "Spoken":
-        """Sort the pieces of traffic that the taps recorded, given in order of time."""
+        """Sort recorded traffic into commands by device and point buffers by scan. passed: the pieces from the taps, in
+        order of time.
+        """
         sent: dict[tuple[str, str], list[Passed]] = defaultdict(list)
         for one in passed:
             if one.direction == OUT:
@@ -53,7 +55,7 @@ class Spoken:
 
 
 def _lines(pieces: list[Passed]) -> list[Passed]:
-    """The lines that are no questions, each as a piece with the time of the one in which it ends."""
+    """The lines that are no queries. Each has the time of the piece in which it ends."""
     stream = b"".join(piece.data for piece in pieces)
     ends = list(accumulate(len(piece.data) for piece in pieces))
     found, begin, piece = [], 0, 0
@@ -68,7 +70,7 @@ def _lines(pieces: list[Passed]) -> list[Passed]:
 
 
 def _once(words: list[Passed]) -> list[Passed]:
-    """The commands without repeats of the last one or two: drivers repeat both to make sure."""
+    """The commands without immediate repeats of one command or of a pair, which drivers send to make sure."""
     kept: list[Passed] = []
     for word in words:
         kept.append(word)
@@ -81,7 +83,7 @@ def _once(words: list[Passed]) -> list[Passed]:
 
 
 def _scans(sync: list[Passed] | None, buffers: list[Passed]) -> list[list[Passed]]:
-    """The buffers sent during each scan that came to its end; without a sync source, all of them as one scan."""
+    """The buffers sent during each scan that came to its end; without a sync source, all buffers as one scan."""
     if not buffers:
         return []
     if sync is None:

@@ -1,7 +1,7 @@
-"""The order of a recording's blocks, and which of them contradict the others. A wrong number costs only its own block.
+"""The order of a recording's blocks, and which of them contradict the others. A wrong number costs only one block.
 
-Within a run the numbers of blocks, frames, ticks and sweeps all rise. If blocks contradict each other, those that
-together weigh most are kept: each counts, and more if it agrees with its neighbours and with the index.
+Within a run the numbers of blocks, frames, ticks and sweeps all rise. If blocks contradict each other, the consistent
+set with the largest sum of weights is kept. A block weighs more if it agrees with its neighbours and with the index.
 """
 
 from bisect import bisect_left, bisect_right
@@ -15,18 +15,18 @@ Entries = NDArray[Any]
 Ints = NDArray[np.int64]
 
 _NEIGHBOURS: Final = 2
-"""Number of blocks on either side that are asked whether a block's numbers go with theirs."""
+"""Number of blocks on either side with whose numbers a block's numbers are compared."""
 _OF_BLOCK: Final = 16
 _OF_INDEX: Final = 8
-"""Weights of a block and of its record in the index, beside 1 for each agreeing neighbour: one block never outweighs
-two."""
+"""Weight of a block, and the weight that a record in the index adds. Each agreeing neighbour adds 1. So one block never
+outweighs two."""
 _OUTLIERS: Final = 4
-"""If more than one block in so many has the wrong ticks or sweep, the device counts so, and none is left out."""
+"""If more than one block in this many does not fit by its ticks or sweep, the device counts so, and all are kept."""
 
 
 def in_order(entries: Entries, told: Entries, problems: list[str], *, folder: bool) -> tuple[Entries, bool]:
-    """The blocks run after run with rising numbers, without contradictory ones; and whether they also lie in this
-    order.
+    """The blocks, run after run and with rising numbers, without those that contradict others; and whether they also
+    lie in this order in the files.
 
     told: the sound records of the index, ordered by place; they give the order of the runs. problems: gets a line for
     each sort of blocks left out. folder: whether the segments are those of a run's folder, each with blocks of one run.
@@ -50,10 +50,10 @@ def in_order(entries: Entries, told: Entries, problems: list[str], *, folder: bo
 
 
 def _foreign(by_place: Entries, told: Entries) -> NDArray[np.bool_]:
-    """Whether each block is of another run than its segment, (n,): than most of the segment, or, where the block is
-    alone there, than the index says.
+    """Whether each block is of another run than its segment, bool (n,).
 
-    The index is believed where it names a run that has other segments while the block's own run has none.
+    The run of a segment is that of most of its blocks. A block that is alone in its segment is foreign if the index
+    names another run, that run has other segments, and the block's own run has none.
     """
     run, segment = by_place["run_id"].astype(np.uint64), by_place["segment"].astype(np.uint64)
     runs, of_run = np.unique(run, return_counts=True)
@@ -71,7 +71,9 @@ def _foreign(by_place: Entries, told: Entries) -> NDArray[np.bool_]:
 
 
 def _runs(by_place: Entries, told: Entries) -> list[Ints]:
-    """Indices of each run's blocks; runs by their records' median place in the index, those without records last."""
+    """Indices of each run's blocks. Runs are sorted by the median place of their records in the index; runs without
+    records come last.
+    """
     place = {run: float(np.median(at)) for run, at in _grouped(told["run_id"]).items()}
     mine = _grouped(by_place["run_id"])
     return [mine[run] for run in sorted(mine, key=lambda run: (run not in place, place.get(run, np.median(mine[run]))))]
@@ -85,7 +87,7 @@ def _grouped(values: NDArray[Any]) -> dict[int, Ints]:
 
 
 def _rising(run: Entries, told: Entries) -> Ints:
-    """Indices of the blocks of a run, given in the order of places, that are kept, in the order of their numbers."""
+    """Indices of the blocks that are kept, in the order of their numbers. run: a run's blocks, in order of place."""
     order: Ints = np.argsort(run["block_seq"], kind="stable")
     seq, first, t0, sweep = (run[name].astype(np.int64) for name in ("block_seq", "first_frame", "t0_ticks", "sweep"))
     end = first + run["n_frames"]
@@ -105,8 +107,8 @@ def _rising(run: Entries, told: Entries) -> Ints:
 
 
 def _agreeing(seq: Ints, first: Ints, t0: Ints, n_frames: Ints) -> Ints:
-    """Number of neighbours, int64 (n,), with which each block agrees in number, frames or ticks, the least of the
-    three; 0 if its frames reach into those of the next block."""
+    """Number of neighbours with which each block agrees, int64 (n,): the least of the counts for block number, frame
+    number and ticks; 0 if its frames overlap those of the next block."""
     place = np.arange(len(seq))
     steps = np.diff(first)
     per_frame = float(np.median(np.diff(t0)[steps > 0] / steps[steps > 0])) if (steps > 0).any() else 0.0
@@ -124,8 +126,10 @@ def _agreeing(seq: Ints, first: Ints, t0: Ints, n_frames: Ints) -> Ints:
 
 
 def _heaviest(low: Ints, high: Ints, group: Ints, weight: Ints) -> Ints:
-    """Indices of the heaviest chain in which each `low` is at least the `high` before and `group`, sorted, rises."""
-    ends: list[int] = []  # of chains so far, rising, as do their weights
+    """Indices of the chain with the largest sum of weights. In a chain each `low` is at least the `high` before it, and
+    no two members have the same `group` (sorted).
+    """
+    ends: list[int] = []  # last `high` of each chain so far, in rising order, and so are the sums of weights
     totals: list[int] = []
     lasts: list[int] = []
     before = np.full(len(low), -1)
@@ -147,7 +151,9 @@ def _heaviest(low: Ints, high: Ints, group: Ints, weight: Ints) -> Ints:
 
 
 def _extend(ends: list[int], totals: list[int], lasts: list[int], waiting: list[tuple[int, int, int]]) -> None:
-    """Take in the chains that end with the blocks of one number, where none that ends as early is as heavy."""
+    """Add the chains that end with the blocks of one group. A chain is left out if another one ends no later and is at
+    least as heavy.
+    """
     for end, total, last in waiting:
         at = bisect_right(ends, end)
         if at and totals[at - 1] >= total:

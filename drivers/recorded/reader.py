@@ -25,14 +25,14 @@ from drivers.recorded.order import Entries
 from drivers.recorded.segments import open_segments
 
 READERS: Final = 2
-"""Threads that read ahead; one checks 4 GB/s."""
+"""Threads that read ahead; one checks the CRCs of 4 GB/s."""
 BLOCKS_AHEAD: Final = 6
 READ_AHEAD_BYTES: Final = 32 * 2**20
 _ROUNDING_TICKS: Final = 1e-6
 """Ticks by which a number of seconds may miss a whole tick, since binary numbers do."""
 _MOST_TICKS: Final = 2.0**62
 _WITNESSES: Final = 3
-"""Blocks of a run that are asked for its size and clock."""
+"""Blocks of a run that are read to learn its frame size and clock."""
 
 _log = logging.getLogger(__name__)
 
@@ -66,7 +66,8 @@ class RecordedRun:
 
     def frame_at(self, seconds: float) -> int:
         """Number of the first frame, lost ones included, that begins `seconds` or more after the run's first one;
-        `end_frame` if none does. If frames are triggered from outside: the first frame of the block being taken then.
+        `end_frame` if none does. If frames are triggered from outside: the first frame of the block that was taken at
+        that time.
         """
         since = self.entries["t0_ticks"].astype(np.int64)
         since -= since[0]
@@ -78,7 +79,7 @@ class RecordedRun:
         return min(int(self.entries["first_frame"][at]) + behind, next_block)
 
     def gaps(self) -> list[tuple[int, int]]:
-        """(first, last) frame numbers of each stretch between its blocks that is in none of them."""
+        """(first, last) frame numbers of each gap between two of its blocks."""
         begins = self.entries["first_frame"].astype(np.int64)
         ends = begins + self.entries["n_frames"]
         where = np.flatnonzero(begins[1:] > ends[:-1])
@@ -155,7 +156,9 @@ class RunRecording:
                     yield block
 
     def _expect(self, entries: Entries, i: int, told: int) -> int:
-        """Have the system read what comes, in pieces; returns the index of the first entry that it was not told of."""
+        """Announce the entries from `i` on to the system, `READ_AHEAD_BYTES` at a time. told: index of the first entry
+        not announced yet; returns its new value.
+        """
         if told > i:
             return told
         size, told = 0, i

@@ -29,9 +29,9 @@ SKIPPABLE_MAGIC: Final = 0x184D2A5E
 SEEKABLE_MAGIC: Final = 0x8F92EAB1
 FRAME_MAGIC: Final = bytes.fromhex("28b52ffd")
 MAX_FRAME_BYTES: Final = 1 << 31
-"""A frame holds one block; a table that says more is damaged."""
+"""Most plain bytes of a zstd frame, which holds one block; a table that states more is damaged."""
 MOST_RATIO: Final = 1 << 15
-"""Plain bytes that a packed one can stand for: a block of zstd takes 4 bytes and holds 128 KiB at most (RFC 8878)."""
+"""Most plain bytes for one packed byte: a block of zstd takes 4 bytes and holds 128 KiB at most (RFC 8878)."""
 _PIECE_BYTES: Final = 1 << 12
 """Bytes of a frame of unknown size that are fed to the unpacker at a time: they unpack to 128 MiB at most."""
 
@@ -44,7 +44,9 @@ Bytes = NDArray[np.uint8]
 
 @dataclass(frozen=True, slots=True)
 class FrameTable:
-    """Offsets at which each frame begins, packed and unpacked: int64 (frames + 1,). The last ones are the ends."""
+    """Begins of the zstd frames in the file (packed) and in the plain segment: int64 (frames + 1,). The last value of
+    each is the end.
+    """
 
     packed: NDArray[np.int64]
     plain: NDArray[np.int64]
@@ -88,7 +90,7 @@ def unpack_frame(packed: Bytes, size: int) -> Bytes:
     zstandard = zstandard_or_error()
     raw = packed.tobytes()
     try:
-        if zstandard.frame_content_size(raw) != size:  # asked first: a damaged one must not order terabytes
+        if zstandard.frame_content_size(raw) != size:  # first of all: a damaged frame may state terabytes
             raise CorruptBlock(f"compressed block says that it holds other than {size} bytes")
         return np.frombuffer(zstandard.ZstdDecompressor().decompress(raw), np.uint8)
     except zstandard.ZstdError as error:
@@ -235,7 +237,7 @@ def open_segments(path: Path) -> list[SegmentReader]:
 
 
 def segment_files(path: Path) -> dict[int, Path]:
-    """The segment files by number. If a segment exists both plain and compressed, the plain one is taken."""
+    """The segment files by number. If a segment exists both plain and compressed, the plain one is used."""
     if path.is_file():
         return {0: path}
     found: dict[int, Path] = {}

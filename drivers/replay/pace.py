@@ -14,21 +14,23 @@ from fractions import Fraction
 from drivers.clock import NS_PER_S, Clock
 
 SLOWEST, FASTEST = 1e-4, 1e4
-"""Speeds of `xN`."""
+"""Smallest and largest N of `xN`."""
 _PIECE_S = 0.2
-"""Longest time between two blocks at a slow clock: they are cut so that none is longer."""
+"""Longest time between two blocks: at a slow clock, blocks are cut to this duration."""
 _SLICE_S = 0.02
-"""One wait: how late a stop is noticed."""
+"""Length of one wait: a stop is noticed at most this late."""
 _TIMES = re.compile(r"x(\d+(?:\.\d*)?|\.\d+)")
 
 
 @dataclass(frozen=True, slots=True)
 class ReplayClock:
-    """The clock that `--clock` asks for. speed: recorded seconds per second; None for as fast as taken, or in steps."""
+    """The clock that `--clock` asks for. speed: recorded seconds per second; None: as fast as frames are taken, or in
+    steps.
+    """
 
     speed: float | None = None
     steps: bool = False
-    """Frames wait for somebody's word, step by step."""
+    """Whether frames wait for a call of `Pace.step`."""
 
     @classmethod
     def parse(cls, text: str) -> "ReplayClock":
@@ -48,7 +50,7 @@ class ReplayClock:
 
 @dataclass(frozen=True, slots=True)
 class PaceReport:
-    """Lateness of `blocks` blocks against their own times. held_s: for how long a full ring held up the replay."""
+    """Lateness of blocks against the times at which they were due. held_s: time for which a full ring held them up."""
 
     blocks: int = 0
     late_mean_s: float = 0.0
@@ -71,7 +73,7 @@ class Pace:
         self.halted = False
         """Whether the run was stopped."""
         self.closed = False
-        """Whether nothing will ever wait again."""
+        """Whether the replay is closed, after which nothing waits any more."""
         self._origin_ns = 0
         self._late_s = _Lateness()
         self._held_ns = 0

@@ -1,9 +1,9 @@
 """A SPAD array that plays a recording: every frame with its record, with the same starts and the same gaps.
 
-The blocks need not be those of the recording. Consecutive frames are cut or joined to the requested block length, which
-shows that results do not depend on it. Checksums are tested before frames are copied into the ring. A damaged block is
-left out and becomes a gap like any other. The properties of the sensor come from the recording's manifest, or else, as
-far as possible, from the frames.
+The blocks need not be those of the recording. Consecutive frames are cut or joined to the requested block length, so
+that one can check that results do not depend on it. Checksums are tested before frames are copied into the ring. A
+damaged block is left out and becomes a gap like any other. The properties of the sensor come from the recording's
+manifest. Without one they come from the frames, as far as possible.
 """
 
 import threading
@@ -34,8 +34,8 @@ MANIFEST = "manifest.json"
 
 
 def recorded_device(recording: Path, slot: str) -> dict[str, Any] | None:
-    """The manifest's entry on a device of a recording; None if there is none. Raises `ProtocolError` if it cannot be
-    read.
+    """The manifest's entry on a device of a recording; None if there is none. Raises `ProtocolError` if the manifest
+    cannot be read.
     """
     file = recording / MANIFEST
     try:
@@ -51,7 +51,7 @@ def recorded_device(recording: Path, slot: str) -> dict[str, Any] | None:
 
 def recorded_info(recording: RunRecording) -> SpadInfo:
     """Properties of the SPAD that took the frames, except that a recording can always wait. Raises `ProtocolError` if
-    the manifest contradicts the frames or is none."""
+    the manifest cannot be read or contradicts the frames."""
     noted = recorded_device(recording.path, "spad")
     told = _told_by(recording)
     if noted is None:
@@ -90,7 +90,7 @@ def _read(noted: dict[str, Any]) -> SpadInfo:
 
 
 def _told_by(recording: RunRecording) -> SpadInfo:
-    """The SPAD's properties as far as the blocks alone tell them."""
+    """The SPAD's properties, as far as they follow from the blocks alone."""
     first = recording.runs[0].header
     rate = first.tick_hz / (first.frame_period_ticks or max(1, first.exposure_ticks))
     most = max(run.end_frame for run in recording.runs)
@@ -115,13 +115,13 @@ def _told_by(recording: RunRecording) -> SpadInfo:
 _SCAN = int(Mark.SCAN)
 
 Piece = tuple[FrameBlock, int, int]
-"""Frames [a, b) of a recorded block."""
+"""A recorded block, and a and b: the piece is its frames a to b - 1."""
 
 
 class Cursor:
     """A position while reading one start to its end, or to frame number `n_frames`. For use by one thread at a time.
 
-    by_block: whether a step is a block.
+    by_block: whether each block is a step of `Pace`, since there are no scan markers.
     """
 
     def __init__(self, recording: RunRecording, run: RecordedRun, n_frames: int | None, *, by_block: bool) -> None:
@@ -137,7 +137,7 @@ class Cursor:
         self.next_frame = 0
         """One past the last frame that was played."""
         self.step_due = by_block
-        """Whether the frames that come next wait for a step: those behind a scan marker, or all without markers."""
+        """Whether the next frames wait for a step: those after a scan marker, or all frames if there are no markers."""
         self.damaged = 0
         """Blocks that could not be read, so far."""
 
@@ -194,7 +194,7 @@ class Cursor:
 
 
 def _continues(block: FrameBlock, before: FrameBlock) -> bool:
-    """Whether a block's frames follow those of the one before, both being whole."""
+    """Whether a block's frames follow those of the block before, and both blocks are whole."""
     whole = before.status == block.status == BlockStatus.OK
     return whole and block.header.first_frame == before.header.first_frame + before.n_frames
 
@@ -213,7 +213,7 @@ class ReplaySpadConfig(KindConfig):
     clock: Annotated[str, AfterValidator(lambda text: ReplayClock.parse(text) and text)] = "realtime"
     """Speed: realtime, max, step, or a multiple of real time: x4, x0.1."""
     loop: bool = False
-    """Whether to begin again behind the last frame."""
+    """Whether to begin again after the last frame."""
     block_frames: int | None = Field(default=None, ge=1)
     """Most frames of a block; by default as many as the scan asks for."""
 
@@ -227,7 +227,7 @@ class ReplaySpad(SpadArray):
         self.recording = recording
         """The recording that is played."""
         self.loops = config.loop
-        """Whether it begins again behind the last start."""
+        """Whether it begins again after the last start."""
         self.pace = Pace(ReplayClock.parse(config.clock), clock)
         self._info = recorded_info(recording)
         self._played = 0
@@ -353,7 +353,7 @@ class ReplaySpad(SpadArray):
         return not reading.over
 
     def _due_s(self, block: FrameBlock, _: int, end: int) -> float:
-        """Time at which the last of these frames had been exposed, from the first one of the run."""
+        """Seconds from the begin of the start's first frame to the end of the last of these frames."""
         header = block.header
         ticks = header.t0_ticks - self._t0_ticks + int(block.records["ticks"][end - 1]) + header.frame_period_ticks
         return float(ticks / header.tick_hz)

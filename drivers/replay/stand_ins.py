@@ -27,7 +27,7 @@ RESOLUTION_S = 1e-9
 
 
 class StandInConfig(KindConfig):
-    """Config of a device whose part a recording plays."""
+    """Config of a device that a recording replaces."""
 
     real_time: ClassVar[bool] = False
 
@@ -53,7 +53,7 @@ class RecordedScanner(BeamScanner):
 
     def _do_point_clock(self, requested_hz: float) -> Fraction:
         simplest = (Fraction(requested_hz).limit_denominator(10**digits) for digits in range(20))
-        return next(rate for rate in simplest if float(rate) == requested_hz)  # the one a divider made, for any board
+        return next(rate for rate in simplest if float(rate) == requested_hz)  # the rate that any board's divider made
 
     def _do_load(self, waveform: ScanWaveform, repeats: int, clock_hz: Fraction) -> None:
         self._takes_s = float(repeats * len(waveform.command) / clock_hz)

@@ -1,9 +1,9 @@
-"""The common part of all beam scanners that are a galvo behind a USB DAC: how it runs.
+"""The common part of all beam scanners that are a galvo behind a USB DAC.
 
-The mirror moves only when it is started, stopped, parked or closed, along ramps or brakes; only an emergency halt may
-let it jump. A run consists of the way to the first point, the waveform, and the way to rest. A thread feeds the points
-to the DAC slice by slice and keeps track of where the mirror rests. Nothing is computed in advance: a waveform of a
-million points repeated for hours takes only the memory of the waveform.
+The mirror moves only when it is started, stopped, parked or closed, along the paths of `galvo`; only an emergency halt
+may let it jump. A run consists of the way to the first point, the waveform, and the way to rest. A thread feeds the
+points to the DAC slice by slice and keeps track of where the mirror rests. Nothing is computed in advance: a waveform
+of a million points repeated for hours takes only the memory of the waveform.
 """
 
 import logging
@@ -28,7 +28,7 @@ _log = logging.getLogger(__name__)
 FULL_SCALE, CENTRE = 4095, 0x800
 """Largest value of the converters, and the one at which the mirror stands without power."""
 POLL_S = 0.002
-"""Time between two questions of how far the board has played."""
+"""Time between two queries of how far the board has played."""
 PATIENCE_S = 1.0
 """Wait for a buffer to become free, beyond the time that its points take."""
 DRIFT = 1e-3
@@ -65,8 +65,8 @@ def colour(high: NDArray[Any]) -> NDArray[np.uint8]:
 
 
 class PointSource:
-    """Gives the points of a run in order: the way from rest at `position` to `end`, then `repeats` of a waveform that
-    begins there. For use by one thread.
+    """Gives the points of a run in order: the way from rest at `position` to `end`, then a waveform that begins there,
+    `repeats` times. For use by one thread.
     """
 
     def __init__(
@@ -152,7 +152,7 @@ class Dac(Protocol):
     """See `Device.serial`."""
     highest_rate_hz: float
     closes_at: float | None
-    """Drive that the mirror jumps to when the board is given back; None: it stays."""
+    """Drive that the mirror jumps to when the board is closed; None: it stays."""
 
     def point_clock(self, requested_hz: float, low_hz: float, high_hz: float) -> Fraction:
         """The exact rate nearest to the requested one, between low and high."""
@@ -167,7 +167,7 @@ class Dac(Protocol):
         """Stop what the board plays, in an emergency; returns the drive at which the next run is to begin."""
 
     def close(self) -> None:
-        """Make the outputs safe and give the board back."""
+        """Make the outputs safe and release the USB device."""
 
 
 class DacScanner(BeamScanner):
@@ -239,7 +239,7 @@ class DacScanner(BeamScanner):
 
     def _do_close(self) -> None:
         self._stopping.set()
-        self._join()  # nobody talks while the device is given back
+        self._join()  # no other thread may talk to the board while it is closed
         try:
             if self._dac.closes_at is not None and self._position is not None:
                 self._go(self._dac.closes_at)
@@ -261,7 +261,7 @@ class DacScanner(BeamScanner):
         run.begin()
 
     def _feed(self, run: DacRun) -> None:
-        """Feed the device, in the thread. `status` tells of what fails here, which ends the run."""
+        """Feed the device, in the thread. An error ends the run, and `status` reports it."""
         try:
             run.feed(self._stopping)
             self._position = run.source.last
@@ -270,7 +270,7 @@ class DacScanner(BeamScanner):
             _log.error("%s", error)
 
     def _rest(self) -> float:
-        """Wait for a run to end; returns the drive at which the next one begins. Halts the board if it is unknown."""
+        """Wait for a run to end; returns the drive at which the mirror rests. If that is unknown, halts the board."""
         self._join()
         if self._position is None:
             self._position = self._dac.halt()

@@ -2,7 +2,8 @@
 
 The paths lead to the first point, to a stop and to the dump angle:
 
-    ramp   x(t) = a + (b - a) (1 - cos(pi t / T)) / 2      peaks: v = |b - a| pi / 2T, a = |b - a| pi^2 / 2T^2
+    ramp   from a to b in time T: x(t) = a + (b - a) (1 - cos(pi t / T)) / 2
+           largest speed |b - a| pi / 2T, largest acceleration |b - a| pi^2 / 2T^2
     brake  constant deceleration from the mirror's present speed
 
 DACs pass the steps of their input to the galvo as they are, and a full-range jump at every point can overheat it
@@ -21,7 +22,7 @@ from drivers.registry import KindConfig
 from drivers.units import PerSecond, PerSecondSquared
 
 LOWEST_RATE_HZ = 1000.0
-"""Lowest point rate: slower than that a mirror shows every point as a step."""
+"""Lowest point rate. At lower ones the mirror follows every point as a visible step."""
 MOST_WAVEFORM_POINTS = 1_000_000
 """Most points of a waveform, which stays in the host's memory, 9 bytes a point."""
 
@@ -33,11 +34,11 @@ class GalvoConfig(KindConfig):
     """Limits of the galvo, from its data sheet. The DAC itself would play anything."""
 
     port: str = "usb"
-    """Port: usb; where several are attached usb:serial=ABC, or usb:path=1-2 for a Helios, which has no serial number;
-    emulated:NAME."""
+    """Port: "usb"; if several are attached, "usb:serial=ABC" for a LaserCube or "usb:path=1-2" for a Helios, which has
+    no serial number; or "emulated:NAME"."""
     axis: Literal["x", "y"] = "x"
     max_velocity: Annotated[PerSecond, Field(gt=0, le=1e6)]
-    """Speed of the normalised drive, whose full range is 2."""
+    """Largest speed of the normalised drive, whose full range is 2."""
     max_acceleration: Annotated[PerSecondSquared, Field(gt=0, le=1e10)]
     max_step: Annotated[float, Field(gt=0, le=2)] = 0.1
     """Largest change of the drive from one point to the next."""
@@ -102,7 +103,7 @@ def brake(position: float, velocity_per_s: float, limits: ScannerLimits, rate_hz
         return np.empty(0)
     low, high = limits.command_range
     room = max((high - position) if step > 0 else (position - low), 0.0)
-    # Steps s (1 - k / m): each is shorter than the last by s / m, and together they are s (m - 1) / 2 long.
+    # Steps s (1 - k / m), k = 1 ... m - 1: each is shorter than the last by s / m; their sum is s (m - 1) / 2.
     decrements = math.ceil(abs(step) * rate_hz**2 / (limits.acceleration_per_s2 * _HEADROOM))
     decrements = int(min(decrements, 1 + 2 * room / abs(step)))
     steps = step * (1 - np.arange(1, decrements) / decrements)

@@ -9,8 +9,8 @@ Every frame is SINGLE, so that the mirror stops after two frames if the host die
 centres the mirror in one jump, so it is used only in emergencies and at the end; scans end with a brake ramp. The
 shutter pin is never raised.
 
-The device's status tells only when the pending buffer becomes free; from it follows whether the buffers ever ran empty.
-The pending frame began to play between the last status 'full' and the first 'free', which bounds the time at which it
+The device's status tells only when the pending buffer becomes free, but that shows whether the buffers ever ran empty:
+the pending frame began to play between the last status 'full' and the first 'free', which bounds the time at which it
 ends. If a frame arrives after the earliest such time, the mirror may have stood still, and the run ends with a fault.
 If a buffer becomes free before the playing frame can have ended, the device has silently dropped a frame. What was
 really played is known only from the markers in the SPAD's stream.
@@ -75,7 +75,7 @@ def nearest_rate(requested_hz: float, low_hz: float, high_hz: float) -> Fraction
     """The true rate nearest to `requested_hz`, between low and high."""
     near = math.floor(requested_hz)
     cycles = round(SYSTICK_HZ / requested_hz)
-    # n cycles are what floor(112e6 / (n - 1)) asks for, where any whole number does.
+    # If any whole number of pps gives n cycles a point, floor(112e6 / (n - 1)) does.
     candidates = {near, near + 1} | {SYSTICK_HZ // (n - 1) for n in (cycles - 1, cycles, cycles + 1, cycles + 2)}
     rates = [rate_of(pps) for pps in candidates if LEAST_PPS <= pps <= MOST_PPS]
     return min((rate for rate in rates if low_hz <= rate <= high_hz), key=lambda rate: abs(float(rate) - requested_hz))
@@ -91,10 +91,11 @@ def sendable(points: int) -> bool:
 
 
 def slice_points(left: int, most: int) -> int:
-    """Number of points of the next frame out of `left`. Requires that `most` is sendable, and `left` too if it is at
-    most `most`.
+    """Number of points of the next frame if `left` points are left. Requires that `most` is sendable, and also `left`
+    if it is not above `most`.
 
-    The last two frames share what is left: a short frame in the middle would end before its successor arrives.
+    The last two frames are of about equal length. If the last but one were short, it would end before the last one
+    arrives.
     """
     if left <= most:
         return left
@@ -127,7 +128,7 @@ _COMMANDS, _REPLIES, _FRAMES = 0x06, 0x83, 0x02
 _REPLY_BYTES = 32
 _STOP, _SHUTTER, _STATUS, _VERSION, _NAME, _SDK_VERSION = 0x01, 0x02, 0x03, 0x04, 0x05, 0x07
 _OUR_SDK_VERSION = 11
-"""Version of the vendor's library whose frames these are."""
+"""Version of the vendor's library whose frame format is used."""
 
 _STATUSES = {b"\x83\x01": True, b"\x83\x00": False}
 
@@ -223,7 +224,7 @@ class HeliosDac:
         self.clock.sleep(_AFTER_STOP_S)
 
     def close(self) -> None:
-        """Stop, take the shutter pin low (the firmware never does), go back to 'disabled' and give the device back."""
+        """Stop, take the shutter pin low (the firmware never does), go back to 'disabled' and release the device."""
         try:
             self.stop()
             self._send(_SHUTTER, 0)
@@ -278,7 +279,7 @@ class HeliosRun:
         self._earliest_end_s = self._latest_end_s = 0.0
         """Bounds on when the playing frame ends, on the host's clock."""
         self._next: tuple[bytes, float] | None = None
-        """The frame to be sent next and its duration: made while another plays, not when the time for it has come."""
+        """The frame to be sent next and its duration. It is made in advance, while another one plays."""
         if self._unsendable():
             source.pad_start()
 
@@ -323,7 +324,7 @@ class HeliosRun:
         self._check_kept()
 
     def _check_kept(self) -> None:
-        """Check that a frame that was taken was kept: the status must then be 'full' until the playing one ends."""
+        """Check that the board kept the frame it accepted: the status must be 'full' until the playing one ends."""
         free = None
         while free is None and now_s(self._clock) < self._earliest_end_s:
             free = self._link.free()
@@ -345,7 +346,7 @@ class HeliosRun:
         return encode(points, self._link.config.axis, self._pps, flags), len(points) / self._rate_hz
 
     def _send(self, frame: bytes) -> tuple[float, float]:
-        """Send a frame; returns the host's times between which it arrived."""
+        """Send a frame; returns the earliest and the latest time of its arrival, on the host's clock."""
         began_s = now_s(self._clock)
         self._link.send_frame(frame)
         self._sent += 1

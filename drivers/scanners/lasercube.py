@@ -1,7 +1,7 @@
 """Scanner kind `lasercube`: a galvo behind a LaserCube / LaserDock USB board (docs/reference/hardware.md).
 
     outputs   X (or Y): mirror. With `colours: markers` R: backward. G: line marker. B: scan marker. X is not
-              reversed, unlike in the vendor's program: the calibration tells in which direction a command leads
+              reversed, unlike in the vendor's program: the calibration says in which direction a command leads
 
 The board has a ring of samples that a thread keeps filled, without frames or seams. Its colour outputs drive lasers of
 its own unless these are unplugged, so they stay off until the config says where they lead. It can be stopped only with
@@ -119,8 +119,8 @@ class LaserCubeDac:
         self.queued()
 
     def halt(self) -> float:
-        """Switch the colours off and clear the ring; returns 0. The mirror's position is unknown afterwards, and the
-        next run goes to the centre in one jump."""
+        """Switch the colours off and clear the ring; returns 0. The mirror stops at an unknown position, so the next
+        run begins with a jump to the centre."""
         self.safe()
         return 0.0
 
@@ -158,7 +158,7 @@ class LaserCubeDac:
             self._link.write(_SAMPLES, samples[at : at + step], _SAMPLES_S)
 
     def close(self) -> None:
-        """Make the board safe and give the USB device back."""
+        """Make the board safe and release the USB device."""
         try:
             self.safe()
         finally:
@@ -201,8 +201,8 @@ def encode(points: PointSlice, axis: str, *, markers: bool) -> bytes:
 
 
 _HOLD_S = 0.03
-"""Shortest time for which the first and the last point are held: the host may be late by this when it asks first and
-clears last."""
+"""Shortest time for which the first and the last point are held. The host may be this late with its first query and
+with the final clear."""
 _TOLERANCE_POINTS = 48
 """Tolerance in points: less than a transfer, which gets lost as a whole; more than the device's own steps in
 counting."""
@@ -225,7 +225,7 @@ class LaserCubeRun:
         if source.left:
             source.pad_start(self._hold)
         self._waiting = b""
-        """Samples short of a transfer."""
+        """Samples that do not fill a transfer yet."""
         self._sent = 0
         self._start_s = (-np.inf, np.inf)
         """Earliest and latest time at which the first sample can have been played."""
@@ -263,7 +263,7 @@ class LaserCubeRun:
         while True:
             asked_s = now_s(self._link.clock)
             queued = self._queued()
-            # An answer that took long bounds nothing: one quick answer must have vouched for the last points.
+            # A slow answer bounds nothing: only a quick one shows that the last points were played.
             seen = seen or now_s(self._link.clock) - asked_s < _TOLERANCE_POINTS / self._rate_hz
             if queued < self._hold - _TOLERANCE_POINTS:
                 break
@@ -275,7 +275,7 @@ class LaserCubeRun:
             raise DeviceFault(f"{self._link.name}: answered too late to tell how the run ended; unload the host")
 
     def _send(self, points: PointSlice) -> None:
-        """Send whole transfers; samples short of one wait."""
+        """Send whole transfers; the samples left over wait for the next call."""
         self._waiting += encode(points, self._axis, markers=self._markers)
         whole = len(self._waiting) // (8 * SAMPLES_PER_TRANSFER) * 8 * SAMPLES_PER_TRANSFER
         self._link.send(self._waiting[:whole])

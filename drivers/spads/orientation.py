@@ -23,7 +23,8 @@ _SWAPS = tuple(
         (0xF0F0F0F00F0F0F0F, 0x00000000F0F0F0F0, 28),
     )
 )
-"""Bits that stay, bits that move up, and by how many places: blocks of 1, 2 and 4 pixels change sides in turn."""
+"""Three steps: bits that stay, bits that move up, and by how many places. A step swaps blocks of 1, 2 or 4 pixels
+across the diagonal."""
 
 
 def turned_size(width: int, height: int, turn_deg: QuarterTurn) -> tuple[int, int]:

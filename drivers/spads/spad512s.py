@@ -37,9 +37,9 @@ from drivers.transports.tap import Tap
 from drivers.units import BytesPerSecond, ExactHertz
 
 GUARD_BYTES = 512
-"""Bytes that must come behind a block before it counts. The longest error text of the samples has 160 characters."""
+"""Bytes that must follow a block before it is used. The longest error text of the samples has 160 characters."""
 SLICE_S = 0.05
-"""One wait: how late a `stop` from another thread comes at most."""
+"""Length of one wait: a `stop` from another thread is noticed at most this late."""
 _ERROR_CHECK_S = 0.5
 """Silence within a run after which the last bytes are looked at: they may be an error text."""
 _UNIFORM = (0x00, 0xFF)
@@ -62,10 +62,10 @@ class Spad512sRun:
         self._block_frames, self._frame_bytes = block_frames, frame_bytes
         self._memory = np.zeros(block_frames * frame_bytes + GUARD_BYTES, np.uint8)
         self._got = 0
-        """Number of bytes of the present block, and of what guards it, that are here."""
+        """Bytes received so far of the present block and of the guard bytes behind it."""
         self._heard_at = time.monotonic()
         self._seen: dict[tuple[int, int], int] = {}
-        """Frames seen, by the checksums of their halves: 64 bits, since 10 000 frames may well share one of 32."""
+        """Numbers of the frames seen, by the checksums of their halves. 32 bits would be too few for 10 000 frames."""
 
     @property
     def next_n(self) -> int:
@@ -162,7 +162,7 @@ TICKS_PER_FRAME = 1024
 _TEMPERATURES = ("master FPGA", "slave FPGA", "board", "chip")
 """Names of the temperatures that `R` reports first, in its order."""
 _US_SLACK = 1e-6
-"""Error in microseconds of a whole number of microseconds that is given as a float in seconds."""
+"""Rounding error, in microseconds, of a whole number of microseconds that is given as a float in seconds."""
 
 
 class Spad512sConfig(KindConfig):
@@ -256,7 +256,9 @@ class Spad512s(SpadArray):
         return self._timing
 
     def _check_period(self, request: SpadRequest, exposure_us: int) -> None:
-        """Raise `LimitExceeded` unless the period, running free, is the longer of exposure and read-out."""
+        """Raise `LimitExceeded` for a frame rate that the device does not run at by itself. Running free, its period is
+        the longer of exposure and read-out.
+        """
         if self._config.trigger == "external":
             return
         period_s = max(Fraction(exposure_us, 1_000_000), 1 / self._info.max_frame_rate_hz)
@@ -311,7 +313,7 @@ class Spad512s(SpadArray):
             except DeviceTimeout:
                 raise
             except BaseException:
-                # Nothing that still comes can be told from an answer, so the connection goes with the run.
+                # What still arrives cannot be distinguished from an answer, so the connection is closed as well.
                 self._run = None
                 self._lost = self._exposed - self._delivered
                 self._line.hang_up()
@@ -346,7 +348,7 @@ class Spad512s(SpadArray):
         return seal_block(memory, self._header(run), layout, payload_crc=False)
 
     def _claim(self, ring: BlockRing, ends_at: float, timeout_s: float) -> NDArray[np.uint8] | None:
-        """A free slot; None if there is none and the ring does not wait. Raises `DeviceTimeout` if it waits in vain."""
+        """A free slot; None if there is none and the ring does not wait. Raises `DeviceTimeout` if none comes free."""
         while True:
             memory = ring.claim(min(SLICE_S, max(0.0, ends_at - time.monotonic())))
             if memory is not None or not ring.waits:

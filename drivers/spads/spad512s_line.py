@@ -7,8 +7,8 @@ go one at a time, and the length of an answer is not announced. On connection th
 word is the detector type. The first `D` may report that a calibration of the breakdown voltage starts. Then nothing may
 be sent before "The breakdown is around", and `D` is sent again.
 
-The connection itself has a deadline on every call, and one typed error for each way in which it can fail. Only looking
-up a host name has no deadline of ours. The resolver has its own, so give numeric addresses if that matters.
+Every call of the connection has a deadline, and each way in which it can fail has an error class of its own. Only
+looking up a host name takes as long as the resolver allows, so give numeric addresses if that matters.
 """
 
 import errno
@@ -37,7 +37,7 @@ _log = logging.getLogger(__name__)
 DONE, ERROR = b"DONE", b"ERROR"
 """Words that end a run; `DONE` may be glued to an answer in text as well."""
 QUIET_S = 0.05
-"""A text answer has no stated end: it is whole when the line was quiet for so long, or when it ends with DONE."""
+"""A text answer has no stated end. It is complete after a silence of this length, or when it ends with DONE."""
 _MOST_TEXT_BYTES = 65_536
 _CALIBRATION_STARTS = ("will start soon", "has started")
 _CALIBRATION_ENDS = "The breakdown is around"
@@ -94,7 +94,7 @@ class TcpStream:
             self._socket.settimeout(deadline_s)
             try:
                 n = self._socket.recv_into(view)
-            except (TimeoutError, BlockingIOError) as error:  # the second where the deadline is now
+            except (TimeoutError, BlockingIOError) as error:  # the second if the deadline is 0
                 if error.errno == errno.ETIMEDOUT:
                     raise  # of the connection: the other side is lost
                 return 0
@@ -103,12 +103,12 @@ class TcpStream:
         return n
 
     def drain(self, quiet_s: float, deadline_s: float) -> bytes:
-        """Read until the line is quiet for `quiet_s`, at most for `deadline_s`; returns the last 64 KiB that came."""
+        """Read until nothing comes for `quiet_s`, at most for `deadline_s`; returns the last 64 KiB that came."""
         ends_at = time.monotonic() + deadline_s
         dropped = bytearray()
         while (left_s := ends_at - time.monotonic()) > 0 and (data := self.receive(min(quiet_s, left_s))):
             dropped += data
-            del dropped[:-_CHUNK_BYTES]  # the end says why it ended; a burst of gigabytes is not kept
+            del dropped[:-_CHUNK_BYTES]  # the last bytes say why the run ended; a burst of gigabytes is not kept
         return bytes(dropped)
 
     def close(self) -> None:
@@ -131,7 +131,7 @@ class TcpStream:
 
     @contextmanager
     def _translated(self) -> Iterator[None]:
-        """Raise our error for all that a socket raises about an open connection: that means that it is gone."""
+        """Raise `DeviceDisconnected` for any error of the socket: all of them mean that the connection is gone."""
         try:
             yield
         except OSError as error:
@@ -157,9 +157,9 @@ class Deadlines:
     calibration_s: float = 90.0
     answer_s: float = 5.0
     stop_s: float = 1.0
-    """A run that still sends so long after STOP is left by closing the connection."""
+    """If a run still sends this long after STOP, the connection is closed."""
     listens_s: float = 1.0
-    """A program that serves one client may take so long to listen again once that one has left."""
+    """Time that the program may take to listen again after its only client has left."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -187,10 +187,10 @@ class Spad512sIdentity:
 
 
 class Spad512sLine:
-    """The line, which is open once `connect` has returned. For use by one thread at a time."""
+    """The connection, which is open once `connect` has returned. For use by one thread at a time."""
 
     def __init__(self, name: str, address: str, deadlines: Deadlines, tap: Tap | None = None) -> None:
-        """tap: notes commands and answers, but not pixels."""
+        """tap: records commands and answers, but not pixels."""
         self.address = address
         self._tap = tap
         self._name = name
@@ -228,7 +228,7 @@ class Spad512sLine:
         answer_s = self._deadlines.answer_s
         with self._given_up_on_silence():
             stream = self._open()
-            stream.drain(0.0, answer_s)  # what came unasked is no answer to this
+            stream.drain(0.0, answer_s)  # what came before the command is no answer to it
             self._send(stream, command)
             answer = self._read_text(stream, answer_s)
             if not answer:
@@ -240,7 +240,7 @@ class Spad512sLine:
 
     @contextmanager
     def _given_up_on_silence(self) -> Iterator[None]:
-        """Close a connection that is gone or silent: a late answer could not be told from that to the next command."""
+        """Close a connection that is gone or silent: a late answer would be taken for that to the next command."""
         try:
             yield
         except (DeviceTimeout, DeviceDisconnected):
@@ -260,7 +260,7 @@ class Spad512sLine:
         return self._open().receive_into(view, wait_s)
 
     def rest(self) -> bytes:
-        """Read what the program still sends of a run; returns the end of it."""
+        """Read what the program still sends of a run; returns its last bytes."""
         return self._open().drain(4 * QUIET_S, self._deadlines.stop_s)
 
     def leave_run(self) -> None:
@@ -346,7 +346,7 @@ class Spad512sLine:
             self._tap.note("tcp", direction, data)
 
     def _read_text(self, stream: TcpStream, deadline_s: float) -> str:
-        """The text until the line is quiet or says DONE, at most for `deadline_s`; empty if nothing came."""
+        """The text until a silence or DONE, at most for `deadline_s`; empty if nothing came."""
         ends_at = time.monotonic() + deadline_s
         data = stream.receive(deadline_s)
         while data and not data.endswith(DONE) and time.monotonic() < ends_at:
@@ -359,5 +359,5 @@ class Spad512sLine:
 
 
 def _ended(came: bytes) -> bool:
-    """Whether a run has ended, by its last bytes before a silence."""
+    """Whether a run has ended. came: its last bytes before a silence."""
     return came.rstrip().endswith((DONE, ERROR))

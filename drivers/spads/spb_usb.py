@@ -39,9 +39,10 @@ from drivers.units import Seconds
 _log = logging.getLogger(__name__)
 
 _CHECKED_BYTES_PER_S = 0.5e9
-"""Rate up to which payload CRCs are checked live; above, the recorder and `rig verify` do."""
+"""Rate up to which payload CRCs are checked. Above it, damage to pixels on the link goes unnoticed: a recording gets
+CRCs of the pixels that arrived."""
 _SLICE_S = 0.05
-"""One wait inside `fill`: how late a `stop` from another thread comes at most."""
+"""Length of one wait inside `fill`: a `stop` from another thread is noticed at most this late."""
 _PINGS_PER_HEARTBEAT = 4
 _SILENCE_S = 0.5
 """Silence after which the device is asked whether it still runs; a run without frames sends a heartbeat block every
@@ -61,10 +62,11 @@ class SpbUsbConfig(KindConfig):
     reads: Literal["queued", "plain"] = "queued"
     """queued: many reads in flight (libusb1); plain: one after the other (pyusb), for slow streams."""
     silence: Annotated[Seconds, Field(ge=0.04, le=1.5)] = 0.04
-    """Time for which the device may be asked in vain while light may fall: then it has failed, and the guard takes the
-    light. An emulated one shares this computer's processors and needs longer."""
+    """Longest time without frames or answers from the device while light may be out. After it the device counts as
+    failed and the guard switches the light off. An emulated device shares this computer's processors and needs
+    longer."""
     heartbeat: Annotated[Seconds, Field(ge=0.02, le=60)] = 1.0
-    """The device ends a run and drops its gate where it hears nothing of this program for so long."""
+    """Time without a PING from this program after which the device ends a run and takes its gate low."""
     test_pattern: bool = True
     """Check bit order and row order with the device's test pattern when opening."""
 
@@ -85,7 +87,7 @@ class SpbUsb(SpadArray):
         self._receiver: BlockReceiver | None = None
         self._counters = SpadCounters(0, 0, 0, 0, 0)
         self._waited_s = 0.0
-        """Seconds for which the device has been asked in vain since the last frames."""
+        """Seconds since the last frames for which the device was asked and gave none."""
         try:
             wiring.open_session(link)
             ack_in = wiring.ack_in if wiring.ack_in in link.endpoints else None
@@ -135,7 +137,7 @@ class SpbUsb(SpadArray):
         return self._timing
 
     def _bytes_per_s(self, request: SpadRequest, width: int) -> float:
-        """Bytes a second that come in: of a burst, no more than the read-out gives."""
+        """Bytes a second that arrive; in a burst, at most the rate of the read-out."""
         exposed = float(request.frame_rate_hz) * frame_bytes(width, self.info.height)
         burst = self.info.burst if request.mode == "burst" else None
         return exposed if burst is None else min(exposed, burst.readout_bytes_per_s)
@@ -199,7 +201,9 @@ class SpbUsb(SpadArray):
         return False
 
     def _note_wait(self, seconds: float) -> None:
-        """Add to the time for which the device was asked in vain, without this thread's own delays, and report it."""
+        """Add to the time for which the device was asked and gave no frames, and report it. This thread's own delays do
+        not count.
+        """
         self._waited_s += seconds
         if self.on_wait is not None:
             self.on_wait(self._waited_s)
@@ -232,7 +236,7 @@ class SpbUsb(SpadArray):
         try:
             self._count(receiver, self._control.read64(Register.EXPOSED))
         except DeviceTimeout:
-            if not receiver.ended:  # else the last block has told it
+            if not receiver.ended:  # otherwise the last block has said it
                 raise DeviceFault(
                     f"{self.name}: the run ended without its last block and the device does not say how many frames it "
                     "exposed; power-cycle it"
@@ -251,7 +255,7 @@ class SpbUsb(SpadArray):
                 self._end_run(receiver)
 
     def _end_run(self, receiver: BlockReceiver) -> None:
-        """Abort, wait for the last block so that none is left for the next run, give the queue back."""
+        """Abort, wait for the last block so that none is left for the next run, and cancel the queued reads."""
         self._receiver = None
         exposed: int | None = None
         try:

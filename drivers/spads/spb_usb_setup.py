@@ -168,7 +168,7 @@ def require_windows(identity: SensorIdentity, window: WindowTable, name: str) ->
 
 
 def require_order(control: ControlChannel, identity: SensorIdentity, heartbeat_s: float) -> None:
-    """Raise `ProtocolError` if bits or rows of the test pattern, where the device has one, come in a wrong order."""
+    """Raise `ProtocolError` if bits or rows of the test pattern come in a wrong order. No check without a pattern."""
     if Feature.TEST_PATTERN not in identity.features:
         return
     info, name, period = identity.info, control.link.label, identity.min_period_ticks

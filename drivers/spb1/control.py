@@ -31,7 +31,7 @@ PROTOCOL_MAJOR: Final = 1
 IDENTITY_MAGIC: Final = 0x31425053
 """`SPB1` as a little-endian number."""
 TEXT_BYTES: Final = 64
-"""Model and serial are zero-padded text of so many bytes."""
+"""Length of model and serial, which are zero-padded text."""
 
 
 class Op(IntEnum):
@@ -174,7 +174,9 @@ _REFUSALS: Final[dict[int, str]] = {
 
 
 def pattern_row(row: int, frame: int, width: int) -> bytes:
-    """Packed bytes of a row of the test pattern: its number (u16, little-endian), then one pixel that walks."""
+    """Packed bytes of a row of the test pattern: its number (u16, little-endian), then one set pixel, which moves on by
+    one in each frame.
+    """
     bits = bytearray(-(-width // 64) * 8)
     bits[0:2] = row.to_bytes(2, "little")
     x = 16 + frame % (width - 16)
@@ -183,16 +185,16 @@ def pattern_row(row: int, frame: int, width: int) -> bytes:
 
 
 _ANSWER_S = 1.0
-"""Longest wait for all acknowledgements of a transfer..."""
+"""Longest wait for all acknowledgements of a transfer."""
 _SLICE_S = 0.05
-"""...in pieces, after each of which, if nothing came, `on_wait` is called."""
+"""Length of one piece of that wait. `on_wait` is called after each piece in which nothing came."""
 _AT_ONCE = 32
 """Commands that share a transfer."""
 _ACK_READ_BYTES = 1024
 """One packet of the fastest USB: reads are whole packets."""
 _DRAIN_BYTES = 1 << 16
 _QUIET_S = 0.003
-"""A stream that gives nothing for so long is empty: what the device has ready comes within microseconds."""
+"""A stream that gives nothing for this long is empty: what the device has ready comes within microseconds."""
 _DRAIN_S = 1.0
 _TRIES = 3
 TAP_PORT = "control"
@@ -220,15 +222,15 @@ class ControlChannel:
         self._request_id = 0
         self._received: list[Ack] = []
         self.on_wait: Callable[[float], None] | None = None
-        """Called for each piece of a wait in vain, with its seconds."""
+        """Called after each piece of a wait in which nothing came, with its length in seconds."""
 
     def read(self, register: int) -> int:
         """The value of a register."""
         return self.read_all((register,))[0]
 
     def read_all(self, registers: Sequence[int]) -> list[int]:
-        """The values of several registers, read twice, as they have no checksum. Raises `ProtocolError` if three pairs
-        differ."""
+        """The values of several registers. All are read twice, since they have no checksum. Raises `ProtocolError` if
+        the two readings differ three times."""
         for _ in range(_TRIES):
             values = [ack.value for ack in self._ask([(Op.READ, register, 0) for register in (*registers, *registers)])]
             if values[: len(registers)] == values[len(registers) :]:
@@ -307,7 +309,7 @@ class ControlChannel:
         return acks
 
     def _answer(self, command: Command, ends_at: float) -> Ack:
-        """The acknowledgement of a command; those of others, given up before, are passed over."""
+        """The acknowledgement of a command. Late ones of commands that were given up are skipped."""
         while True:
             while self._received:
                 ack = self._received.pop(0)

@@ -1,7 +1,8 @@
 """Reading SPB1 blocks: a single one in its memory, or a stream of them that may be damaged.
 
 Header and trailer are always checked in full. The payload's CRC is checked on request, since it reads every byte, which
-at full rate would cost a live stream much of a core. No block found damaged is passed on or skipped silently.
+at full rate would cost a live stream much of a core. A block that is found damaged is never passed on and always
+reported.
 """
 
 from collections.abc import Iterator
@@ -47,10 +48,10 @@ _PAYLOADS: Final = {
 }
 
 MAX_COUNT: Final = 2**63 - 2**32
-"""Largest number and tick of a block's first frame: with what its records span added, both stay within int64."""
+"""Largest number, and largest tick, of a block's first frame. Those of its last frame then fit int64 too."""
 
 _LSB_FIRST: Final = int(BlockFlag.LSB_FIRST)
-"""A plain number: arithmetic with flags takes microseconds, and this is done for every block."""
+"""A plain integer: arithmetic with flags takes microseconds, and this is done for every block."""
 
 _BITS_REVERSED: Final = np.packbits(np.unpackbits(np.arange(256, dtype=np.uint8), bitorder="little"))
 
@@ -145,7 +146,7 @@ def read_control(buffer: NDArray[np.uint8], fields: HeaderFields) -> bytes:
 
 @lru_cache(maxsize=16)
 def _rate(tick_hz: int, denominator: int) -> Fraction:
-    """Ticks per second; 0 if the denominator is. Kept, since a fraction takes microseconds and the same few recur."""
+    """Ticks per second; 0 if the denominator is 0. Cached, since a fraction takes microseconds and few values occur."""
     return Fraction(tick_hz, denominator) if denominator else Fraction(0)
 
 
@@ -224,7 +225,7 @@ _SEARCH_BYTES = 16 * 2**20
 class Damage:
     """A piece of a stream that gave no block: where it is, its length (0 if only padding is missing) and why.
 
-    unsupported: whether a header with the right CRC describes a block that this reader does not take.
+    unsupported: whether a header with the right CRC describes a block that this reader does not support.
     """
 
     offset: int
@@ -239,7 +240,7 @@ def walk_blocks(buffer: NDArray[np.uint8], stride: int | None, *, check_payload:
     stride: bytes from block to block. None if it is unknown or changes: then each block ends at its own size, and zeros
     up to the next one are padding. After damage, reading resumes at the next header with the right CRC on a multiple of
     `ALIGN`. A block whose number does not rise within its run was sent or written twice and counts as damage. Control
-    blocks are skipped. Raises `UnsupportedBlock` at a block of a kind that this reader does not take.
+    blocks are skipped. Raises `UnsupportedBlock` at a block of a kind that this reader does not support.
     """
     last: FrameBlock | None = None
     for item in walk_placed(buffer, stride, check_payload=check_payload):
@@ -268,11 +269,13 @@ class Placed:
 
 
 def walk_placed(buffer: NDArray[np.uint8], stride: int | None, *, check_payload: bool) -> Iterator[Placed | Damage]:
-    """Blocks with places, and damage, as they lie; numbers may fall or repeat. Unsupported blocks are damage."""
+    """Blocks with their places, and damage, in the order in which they lie. Block numbers may fall or repeat.
+    Unsupported blocks are reported as damage.
+    """
     if stride is not None:
         check_stride(stride)
     offset = 0
-    rest = 0  # where the block before really ended: a piece lost from its padding brings the next one forward
+    rest = 0  # where the last block really ended: if a piece of its padding got lost, the next block begins early
     while offset < len(buffer):
         if stride is None and (zeros := _zeros(buffer, offset)):
             offset += zeros

@@ -1,9 +1,9 @@
 """The receiving end of a live SPB1 stream (docs/reference/spb1-usb.md): queued reads straight into ring slots.
 
 Reads of one stride each are kept in flight, into slots claimed in order. A block is used where it lies, or refused and
-counted. After damage, the next sound header on a multiple of 1024 bytes tells where blocks begin, and one short read
-brings the reads back in step. If the ring has no free slot, reads go on into spare memory so that the device's FIFO
-does not overflow. Such a block is copied into a slot if one has become free meanwhile, else dropped and counted.
+counted. After damage, the next sound header on a multiple of 1024 bytes shows where blocks begin, and one short read
+aligns the reads with the blocks again. If the ring has no free slot, reads go on into spare memory so that the device's
+FIFO does not overflow. Such a block is copied into a slot if one has become free meanwhile, else dropped and counted.
 """
 
 import logging
@@ -23,16 +23,16 @@ from drivers.transports.bulk_link import Buffer, BulkLink
 _log = logging.getLogger(__name__)
 
 QUEUE_BYTES = 8 << 20
-"""Reads in flight hold about so much, 20 ms of the fastest link: what a busy host may be late by. Half of what Linux
-grants by default."""
+"""Total size of the reads in flight: 20 ms of the fastest link, by which a busy host may be late. It is half of what
+Linux grants by default."""
 MOST_READS, FEWEST_READS = 64, 4
 _WORD_PX = 64
 _LAST, _LOST_BEFORE, _FORCED_LOW = (
     int(flag) for flag in (BlockFlag.LAST, BlockFlag.LOST_BEFORE, BlockFlag.GATE_FORCED_LOW)
 )
-"""Plain numbers: arithmetic with flags takes microseconds, ten times a block."""
+"""Plain integers: arithmetic with flags takes microseconds, and there is much of it in each block."""
 _ROOMY_RING = 8
-"""Number of slots from which on two reads are kept in flight even where the ring is full."""
+"""With a ring of at least this many slots, two reads are kept in flight even while the ring is full; else one."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -75,7 +75,7 @@ class BlockReceiver:
     def __init__(self, link: BulkLink, endpoint: int, armed: Armed, label: str) -> None:
         self.delivered = 0
         self.next_frame = 0
-        """Number of the frame behind the last one that is known to have been exposed."""
+        """One more than the number of the last frame that is known to have been exposed."""
         self.crc_errors = 0
         """Blocks refused: damaged, out of order or of another geometry."""
         self.resyncs = 0
@@ -90,7 +90,7 @@ class BlockReceiver:
         self._depth = max(FEWEST_READS, min(MOST_READS, QUEUE_BYTES // armed.stride))
         self._items: deque[_Item] = deque()
         self._held: Buffer | None = None
-        """A claimed slot that the system took no read for."""
+        """A claimed slot for which the system accepted no read yet."""
         self._spares: list[Buffer] = [np.zeros(armed.stride, np.uint8) for _ in range(2)]
         self._ring: BlockRing | None = None
         self._last_seq = -1
@@ -98,7 +98,7 @@ class BlockReceiver:
         self._lost_at_last = 0
         """Frames that were lost before the block published last."""
         self._realign = 0
-        """Bytes to read before blocks begin at the beginning of reads again."""
+        """Bytes to read until the next read begins where a block begins."""
         self._row_px = 8 * packed_row_bytes(armed.sensor_width)
 
     def take(self, ring: BlockRing, timeout_s: float) -> Took:
@@ -253,7 +253,9 @@ class BlockReceiver:
         self._published += 1
 
     def _copied(self, fields: HeaderFields, buffer: Buffer) -> FrameBlock | None:
-        """The block, copied into a slot; None if none is free, or later reads hold slots, which come in order."""
+        """The block, copied into a slot. None if no slot is free, or if reads in flight hold slots, since slots must be
+        published in order.
+        """
         assert self._ring is not None, "set by take"
         if self._held is not None or any(item.slot for item in self._items):
             return None
@@ -264,7 +266,7 @@ class BlockReceiver:
         return read_frames(memory, fields, check_payload=False)
 
     def _as_received(self, block: FrameBlock) -> FrameBlock:
-        """The block with number and losses as they are behind this receiver, which may have refused or dropped some."""
+        """The block with its number and losses corrected for the blocks that this receiver refused or dropped."""
         header = block.header
         lost = header.first_frame - self.delivered
         flags = int(header.flags) & ~_LOST_BEFORE | (_LOST_BEFORE if lost > self._lost_at_last else 0)
@@ -274,7 +276,9 @@ class BlockReceiver:
         return replace(block, header=header)
 
     def _find_step(self, data: Buffer) -> None:
-        """Look for a sound header inside a damaged read: from there on blocks begin elsewhere in each read."""
+        """Look for a sound header inside a damaged read. If there is one, blocks now begin there in every read, so the
+        reads in flight are dropped and later ones realigned.
+        """
         for offset in range(ALIGN, len(data) - HEADER_BYTES + 1, ALIGN):
             if data[offset : offset + len(MAGIC)].tobytes() != MAGIC:
                 continue

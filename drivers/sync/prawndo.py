@@ -52,7 +52,8 @@ def compile_program(pulses: Sequence[Pulse], repeats: int, board: ProgramLimits)
     """
     _check_waits(_words(pulses, board), repeats, board)
     period = _words(sliced(pulses), board)
-    # A wait beside the end's own zeros would be the end, on that wait's outputs: a shortest word parts them.
+    # Two words of 0 cycles in a row end a program. A wait just before the end would be the first of these two, and its
+    # outputs would stay: a shortest word separates them.
     end = np.array([(0, MIN_CYCLES), (0, 0), (0, 0)], WORD)[int(period["cycles"][-1] != 0) :]
     n_words = repeats * len(period) + len(end)
     if n_words > board.max_words:
@@ -80,8 +81,8 @@ def _cycles(index: int, pulse: Pulse, board: ProgramLimits) -> int:
 
 
 def _check_waits(period: NDArray[np.void], repeats: int, board: ProgramLimits) -> None:
-    """Raise `LimitExceeded` unless the program plays longer between two waits than a scan marker may last: one marker
-    would end both."""
+    """Raise `LimitExceeded` if the program plays no longer between two successive waits than a scan marker may last:
+    one marker would then end both waits."""
     waits = np.flatnonzero(period["cycles"] == 0)
     if len(waits) == 0:
         return
@@ -173,7 +174,7 @@ class PrawnDo(SyncSource):
         return self._line.port.lost
 
     def most_repeats(self, pulses: Sequence[Pulse]) -> int:
-        """Number of times that `pulses` fit into the board's memory beside the words at the end: it has no loops."""
+        """Number of times that `pulses` fit into the memory with the words at the end; the board has no loops."""
         return (self._board.max_words - 3) // len(sliced(pulses))
 
     def _do_program(self, pulses: Sequence[Pulse], repeats: int) -> None:
@@ -188,7 +189,7 @@ class PrawnDo(SyncSource):
                 if f"Number of instructions: {len(words)}" not in lines:
                     raise DeviceFault(f"{self.name}: {lines} after a program of {len(words)} words; load it again")
             except DeviceError:
-                try:  # nothing of what did not arrive whole may ever be run
+                try:  # a program that did not arrive whole must never run
                     self._line.command("cls")
                 except DeviceError as error:
                     _log.warning("%s: %s", self.name, error)

@@ -25,13 +25,14 @@ BYTES_PER_WORD = 6
 
 _CRLF = b"\r\n"
 _LOWER = b"\nabt\nsts\nman 0\nsts\nman 0\n"
-"""The first line end completes whatever a former host began to say. While the board says its state, its second core
-does what `abt` asked for, without which it refuses `man`: low outputs need no round trip of a host that may be late."""
+"""The first line end completes whatever an earlier host began to send. The board refuses `man` until its second core
+has done what `abt` asks for. It does that while the first core answers `sts`, so the outputs go low without a round
+trip to the host, which may be late."""
 _RESUSCITATED = "System Clock Resus'd"
 _CHUNK_BYTES = 4032
 """Bytes per write while a program is loaded: sixteen of the firmware's own pieces of 42 words."""
 _SLICE_S = 0.02
-"""Longest time until a command under way gives way to the gate."""
+"""A command under way is given up at most this late when the gate has to go low."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -52,7 +53,7 @@ USUAL_TIMING = PrawnDoTiming()
 
 
 class PrawnDoLine:
-    """Sends commands and queries, one at a time, from any thread. Close the `port` to give it back."""
+    """Sends commands and queries, one at a time, from any thread. Close the `port` to release it."""
 
     def __init__(self, name: str, port: SerialPort, timing: PrawnDoTiming) -> None:
         self._name = name
@@ -87,8 +88,8 @@ class PrawnDoLine:
     def transact(self, command: str, deadline_s: float | None = None, *, urgent: bool = False) -> list[str]:
         """Send a command; returns the lines of its answer without blank ones.
 
-        urgent: whether the command is part of taking the outputs low, for which all others end with `DeviceFault`. Also
-        raises `DeviceTimeout` or `ProtocolError`.
+        urgent: whether the command is part of taking the outputs low. Meanwhile all other commands end with
+        `DeviceFault`. Also raises `DeviceTimeout` or `ProtocolError`.
         """
         deadline_s = self._timing.reply_s if deadline_s is None else deadline_s
         with self.lock:
@@ -171,7 +172,9 @@ class PrawnDoLine:
             self.port.write(_LOWER)
 
     def _try_to_lower(self) -> bool:
-        """Try once; returns whether the outputs read back low. During each round trip the second core does its part."""
+        """Try once; returns whether the outputs read back low. The round trip of `abt` gives the board's second core
+        the time to end the program.
+        """
         hasty_s = self._timing.hasty_s
         self.transact("abt", hasty_s, urgent=True)
         if self.run_status(hasty_s, urgent=True)[0] not in IDLE:
@@ -180,9 +183,9 @@ class PrawnDoLine:
         return self.pins(hasty_s, urgent=True) == 0 and self.run_status(hasty_s, urgent=True)[0] in IDLE
 
     def _free_wedged(self, most_words: int) -> None:
-        """Free a board that hears no commands since another host never finished sending it a program: send the rest.
+        """Free a board that executes no commands because another host never finished sending it a program.
 
-        The rest is zeros, which are words that wait with all outputs low.
+        The program is completed with zeros, which are words that wait with all outputs low.
         """
         _log.warning("%s does not answer on %s; trying to end an unfinished program", self._name, self.port.path)
         self.port.write(b"\nend\n")
@@ -198,8 +201,8 @@ class PrawnDoLine:
         raise DeviceTimeout(f"{self._name} does not answer on {self.port.path}; unplug it, plug it in and start again")
 
     def _ask_twice(self, command: str, parse: Callable[[str], _T], deadline_s: float | None, urgent: bool) -> _T:
-        """Ask twice in one go; returns the answer. Raises `ProtocolError` if the two differ: a flipped bit makes a low
-        gate of a high one."""
+        """Send a query twice in one write; returns the answer. Raises `ProtocolError` if the two answers differ: a
+        flipped bit would show a high gate as low."""
         lines = self.transact(f"{command}\n{command}", deadline_s, urgent=urgent)
         try:
             first, second = (parse(line) for line in lines)
@@ -212,7 +215,9 @@ class PrawnDoLine:
     def _until(
         self, done: Callable[[list[str]], bool], before: str | None, deadline_s: float, urgent: bool
     ) -> list[str]:
-        """The lines that follow the one with `before` (None: all), up to and with the one that makes it `done`."""
+        """The lines after the one that contains `before` (None: all lines), up to and including the line at which
+        `done` returns True.
+        """
         ends_at = now_s(self.clock) + deadline_s
         lines: list[str] = []
         begun = before is None
@@ -246,7 +251,9 @@ class PrawnDoLine:
         return f"#{self._serial_number:08x}"
 
     def _pay_debt(self) -> None:
-        """Fill up a program that was broken off, with words that wait low, so that commands are heard again."""
+        """Complete a program that was sent only in part, with words that wait with all outputs low. Only then does the
+        board accept commands again.
+        """
         if self._owed_bytes:
             owed, self._owed_bytes = self._owed_bytes, 0
             self.port.write(bytes(owed) + b"\n")

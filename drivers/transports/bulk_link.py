@@ -1,4 +1,4 @@
-"""A USB device that streams: commands, answers, and reads that are queued so that its FIFO never overflows.
+"""A USB device that streams: commands, answers, and reads that are queued so that its FIFO does not overflow.
 
 tests/benchmarks/spb_usb.py compares `PlainLink` and `QueuedLink`. Both have a deadline on every call and raise this
 project's errors. A queue belongs to one thread at a time. Buffers are whole packets long and must be left alone until
@@ -57,8 +57,8 @@ class PlainLink(UsbDevice):
         return True
 
     def reap(self, timeout_s: float) -> tuple[Buffer, int] | None:
-        """Read into the oldest queued buffer now; returns it and its number of bytes. None: the next call goes on with
-        it."""
+        """Read into the oldest queued buffer now; returns it and its number of bytes. None if it is not complete in
+        time; the next call continues with it."""
         if not self._queue:
             return None
         endpoint, buffer = self._queue[0]
@@ -190,7 +190,7 @@ class QueuedLink:
         self._queue.clear()
 
     def close(self) -> None:
-        """Cancel all reads and give the device back; a second call does nothing."""
+        """Cancel all reads and release the device; a second call does nothing."""
         if self._handle is not None:
             self.cancel()
             for transfer in self._spare:

@@ -34,7 +34,7 @@ class FairLock:
             self._held.acquire()
 
     def __exit__(self, *_: object) -> None:
-        """Give it to whoever waits."""
+        """Release the lock. A waiting thread gets it."""
         self._held.release()
 
 
@@ -83,7 +83,7 @@ class Framing(Protocol):
 
 
 class Dialogue:
-    """Sends commands and queries, one at a time, from any thread. Close the `port` to give it back."""
+    """Sends commands and queries, one at a time, from any thread. Close the `port` to release it."""
 
     def __init__(self, name: str, port: SerialPort, framing: Framing, clock: Clock, timing: LineTiming) -> None:
         self.name = name
@@ -140,7 +140,7 @@ class Dialogue:
 
     def ask_surely(self, command: str, form: re.Pattern[str]) -> str:
         """Ask up to four times, until two replies in a row agree, and return that reply; else raise `ProtocolError`.
-        Nothing else protects a value that is kept from a flipped bit. Other errors as in `tell`.
+        Use it for values that are kept: nothing else protects them from a flipped bit. Other errors as in `tell`.
         """
         last = self.ask(command, form)
         for _ in range(_ATTEMPTS):
@@ -172,7 +172,7 @@ class Dialogue:
         """Send one command and return its reply."""
         passed_s = now_s(self.clock) - self._quiet_since_s
         self.clock.sleep(self._timing.gap_s - passed_s)
-        if self.port.reset_input().strip():  # a reply that nobody asked for; its other half may still come
+        if self.port.reset_input().strip():  # a late or unwanted reply, of which more may still come
             self.port.drain(self._timing.quiet_s, self._timing.drain_s)
         self.port.write(self._framing.encode(command))
         try:
@@ -184,12 +184,12 @@ class Dialogue:
             self._quiet_since_s = now_s(self.clock)
 
     def _resync(self, quiet_s: float) -> None:
-        """Drop what comes late, then ask what only one reply can answer."""
+        """Drop late replies, then send the ping, whose answer is known."""
         for attempt in range(_ATTEMPTS):
             self.port.drain(quiet_s, self._timing.drain_s)
             ping = self._framing.ping
             try:
-                # Quiet afterwards: that was the answer to this question and not to one before.
+                # Silence afterwards shows that this was the answer to this query and not to an earlier one.
                 if self._framing.greets(self._once(ping)) and not self.port.drain(quiet_s, self._timing.drain_s):
                     return
             except DeviceTimeout:

@@ -36,7 +36,7 @@ _FOREIGN = (serial.SerialException, OSError, _termios_error)
 _SLICE_S = 0.02
 """One wait inside pyserial: the granularity of deadlines, in seconds."""
 _WRITE_S = 1.0
-"""Time for a write: a device that takes nothing for so long hangs. 1 s is 11 520 characters at 115 200 baud."""
+"""Time for a write: a device that takes nothing for this long hangs. 1 s is 11 520 characters at 115 200 baud."""
 _BAUD = 115_200
 _MAX_LINE_BYTES = 65_536
 """Longer than any reply to a command: beyond it the line is noise without an end."""
@@ -53,14 +53,14 @@ class SerialPort:
     """
 
     def __init__(self, name: str, endpoint: Endpoint, tap: Tap | None = None) -> None:
-        """Open the port. name: the device's name in messages. tap: notes all that passes.
+        """Open the port. name: the device's name in messages. tap: records all that passes.
 
         Addresses: a path or COM port, "serial=ABC" (serial number of the USB device) or "usb=VVVV:PPPP" (hexadecimal
         vendor and product, the only one attached). Raises `DeviceNotFound`, `DevicePermission` or `DeviceBusy`.
         """
         self._name = name
         self.path = _find(name, endpoint.address)
-        """The port's path, found where the address was a serial number."""
+        """The port's path, also if the address was a serial number or USB ids."""
         self._received = bytearray()
         self._tap = tap
         self._port = self._open(endpoint)
@@ -69,12 +69,12 @@ class SerialPort:
 
     @property
     def lost(self) -> bool:
-        """Whether the port has hung up; False on Windows. Sends nothing, the kernel knows. Allowed from any thread."""
+        """Whether the port has hung up; always False on Windows. Asks only the kernel. Allowed from any thread."""
         if not hasattr(select, "poll"):
-            return False  # Windows tells with the next read
+            return False  # on Windows the next read shows it
         try:
             hung_up = select.poll()
-            hung_up.register(self._port.fileno(), 0)  # hang-ups and errors are told unasked
+            hung_up.register(self._port.fileno(), 0)  # hang-ups and errors are always reported
             return bool(hung_up.poll(0))
         except (*_FOREIGN, TypeError, ValueError):
             return True
@@ -128,7 +128,7 @@ class SerialPort:
 
     def close(self) -> None:
         """Close the port; a second call does nothing. Never raises: a lost port counts as closed."""
-        with suppress(*_FOREIGN):  # the port is gone, and with it all that could be given back
+        with suppress(*_FOREIGN):  # the port is gone, so there is nothing left to release
             self._port.close()
 
     def _open(self, endpoint: Endpoint) -> Any:
@@ -175,7 +175,9 @@ class SerialPort:
 
     @contextmanager
     def _translated(self) -> Iterator[None]:
-        """Raise our error for everything that pyserial raises about an open port: it means that the port is gone."""
+        """Raise `DeviceDisconnected` for everything that pyserial raises on an open port: it means that the port is
+        gone.
+        """
         try:
             yield
         except (*_FOREIGN, TypeError) as error:

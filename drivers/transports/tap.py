@@ -45,7 +45,7 @@ class TapFile:
         try:
             handle = os.open(self.path, os.O_RDONLY)
         except FileNotFoundError:
-            return  # nobody has said anything yet
+            return  # no tap has written yet
         try:
             os.fsync(handle)
         finally:
@@ -88,7 +88,7 @@ class Tap:
             written.wait(timeout_s)
 
     def __del__(self) -> None:
-        """End the writer once nobody holds the tap: devices are closed in any order, their threads end after them."""
+        """End the writer once nothing refers to the tap. When its device is closed, other threads may still use it."""
         self._lines.put(None)
 
 
@@ -104,7 +104,7 @@ def _write(path: str, lines: _Lines) -> None:
                 if handle is None:
                     handle = os.open(path, os.O_WRONLY | os.O_APPEND | os.O_CREAT | os.O_CLOEXEC, 0o644)
                 os.write(handle, line)
-            except OSError as error:  # never a reason to let go of a device; the recording itself ends the run
+            except OSError as error:  # no reason to give up a device; a full disk ends the run by the recording itself
                 full = True
                 _log.warning("%s ends here: %s", path, error.strerror or error)
     if handle is not None:

@@ -6,7 +6,7 @@ emulator's object otherwise. Between two reads nothing is queued; `bulk_link` ha
 
 Errors have the numbers of libusb 1.0 and the meanings that Linux gives them. Unplugging shows as ENODEV, EIO or
 ESHUTDOWN. A read shorter than a packet overflows and loses the packet. The sum of all queued transfers is limited by
-`usbfs_memory_mb` (16).
+Linux's `usbfs_memory_mb`, 16 MB by default.
 """
 
 import array
@@ -35,7 +35,7 @@ from drivers.transports.endpoints import UDEV_RULES
 from drivers.transports.tap import IN, OUT, Tap
 
 USBFS_HINT = "echo 256 | sudo tee /sys/module/usbcore/parameters/usbfs_memory_mb"
-"""Linux lets all queued transfers hold 16 MB unless told otherwise."""
+"""Command that raises the limit for all queued transfers together, which is 16 MB by default."""
 
 _LOST = (errno.ENODEV, errno.EIO, errno.ESHUTDOWN, errno.ENOTCONN)
 
@@ -59,7 +59,7 @@ def translated(label: str, endpoint: int | None = None, timeout_s: float | None 
 def usb_failure(
     label: str, number: int | None, text: str, endpoint: int | None = None, timeout_s: float | None = None
 ) -> DeviceError:
-    """The error of ours for an errno of libusb, which is None if it has none. text: libusb's own message."""
+    """Our error for a failure in libusb. number: its errno, None if it has none. text: libusb's own message."""
     where = "" if endpoint is None else f" on endpoint 0x{endpoint:02x}"
     if number in _LOST:
         return DeviceDisconnected(f"{label}: the device is gone ({text}); check cable and power, open again")
@@ -119,9 +119,9 @@ class UsbDevice:
     """
 
     def __init__(self, listing: UsbListing, label: str, alternates: Mapping[int, int], tap: Tap | None = None) -> None:
-        """Claim and set `alternates`, {interface: alternate setting}. Use `open_device` to find the listing.
+        """Claim the interfaces in `alternates` and set each to its alternate setting. Usually called by `open_device`.
 
-        tap: notes what `write` and `read` pass.
+        tap: records what `write` and `read` pass.
         """
         self.listing = listing
         self.label = f"{label} at {listing.address}"
@@ -145,7 +145,7 @@ class UsbDevice:
             self._device.set_configuration()
         for interface, alternate in alternates.items():
             usb.util.claim_interface(self._device, interface)
-            # Always sent, also where the setting is the present one: it is the firmware's 'start afresh'.
+            # Always sent, also if the setting is the present one: it makes the firmware start afresh.
             self._device.set_interface_altsetting(interface, alternate)
 
     def set_alternate(self, interface: int, alternate: int) -> None:
@@ -209,8 +209,7 @@ class UsbDevice:
         return frozenset(endpoint.bEndpointAddress for interface in interfaces for endpoint in interface)
 
     def close(self) -> None:
-        """Give the interfaces and the device back; a second call does nothing. Never raises, as the device may
-        be gone."""
+        """Release the interfaces and the device; a second call does nothing. Never raises: the device may be gone."""
         with self._lock:
             if not self._open:
                 return
@@ -268,7 +267,7 @@ def _listing(device: Any) -> UsbListing:
 
 
 def _string(device: Any, index: int) -> str | None:
-    """A string of the device; None if there is none or it may not be asked."""
+    """A string of the device; None if there is none or this user may not read it."""
     try:
         text = usb.util.get_string(device, index)
     except (usb.core.USBError, ValueError, NotImplementedError):  # ValueError: pyusb's 'no languages', mostly EACCES

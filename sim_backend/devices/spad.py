@@ -4,12 +4,13 @@ On a `VirtualClock` time passes as frames are made; on any other clock a block c
 is over.
 
 On the way to the computer some frames get lost, which leaves a gap. Others are replaced by a copy of the frame before
-in their block, with its pixels, markers, counters and ticks. The copy's number is still the next one, since blocks
-count what they hold; only its ticks show it. The seed and the frame number determine which frames are struck.
+in their block, with its pixels, markers, counters and ticks. A copy keeps the number of the frame that it replaces, so
+only its ticks show it. The seed and the frame number determine which frames are lost or replaced.
 
-The tick counter runs on its own crystal (`clock_error`, `clock_wander`), with a constant error and a random walk:
+The tick counter runs on its own crystal (`clock_error`, `clock_wander`). At time t its rate has the relative error y, a
+constant plus a random walk W:
 
-    dt/dtick = 1 / (tick_hz (1 + y)),    y = error + W,    W a random walk: var W(t) = wander^2 t
+    dt/dtick = 1 / (tick_hz (1 + y)),    y = error + W,    var W(t) = wander^2 t
 
 (random walk of frequency, of which the Allan deviation is wander sqrt(t/3): D. Allan, IEEE Trans. UFFC 34, 647, 1987.)
 W makes a step every millisecond of the counter. An ordinary crystal is off by up to 50 ppm, and by 1 ppm more per K; a
@@ -39,7 +40,7 @@ from sim_backend.frames.photons import PhotonSource
 from sim_backend.world import SimulatedWorld, note_effect
 
 _TWICE = np.uint64(0xE7037ED1A0B428DB)
-"""Stream that keeps the draws of frames that come twice apart from those of frames that get lost."""
+"""Random stream for the frames that come twice, apart from that for the frames that get lost."""
 
 
 SUBFRAME_STEPS = 256
@@ -102,7 +103,7 @@ class TickClock:
         self._sd = wander * np.sqrt(self._step_ticks * tick_s)
         self._random = np.random.default_rng(seed)
         self._step = 0
-        """Number of the first step in the lists: steps that nobody will ask for any more are forgotten."""
+        """Number of the first step in the lists; steps that are no longer needed are dropped."""
         self._start_s = [start_s]
         self._error = [error]
 
@@ -128,8 +129,8 @@ TICKS_PER_FRAME = 1024
 MAX_THREADS = 4
 START_BITS = 48
 MOST_STARTS = 0x3FFF
-"""Mask of the number of a start. Photons are drawn by the number of a frame: frames of the second start are numbered
-from 2^48 on, and so on."""
+"""Photons are drawn by frame number. So that starts differ, the frames of the second start are numbered from 2^48 on,
+and so on. `MOST_STARTS` is the mask for the number of a start."""
 
 
 class SimulatedSpadConfig(KindConfig):
@@ -147,7 +148,7 @@ class SimulatedSpadConfig(KindConfig):
     loss_probability: float = Field(default=0.0, ge=0, le=1)
     """Chance of every frame to get lost on the way."""
     duplicate_probability: float = Field(default=0.0, ge=0, le=1)
-    """Chance of every frame to be replaced by the one before it in its block, which so comes twice."""
+    """Chance of every frame, except the first of a block, to be replaced by a copy of the one before it."""
     clock_error: Annotated[Ppm, Field(ge=-1e-3, le=1e-3)] = 0.0
     """Relative error of the crystal."""
     clock_wander: Annotated[Ppm, Field(ge=0, le=1e-3)] = 0.0
@@ -279,7 +280,7 @@ class SimulatedSpad(SpadArray):
         start_s, state = self._frames(n)
         self._markers.record(state, start_s, self._period_s, np.zeros(n, FRAME_RECORD))
         if any(effect.reads_before for effect in self._world.flux_model.bits.values()):
-            # The next frame depends on the last of these, whether anybody gets to see it or not.
+            # The next frame depends on the last of these, even though nobody receives it.
             unseen = np.empty((1, self._info.height, self._layout(1).row_bytes), np.uint8)
             self._draw(state, start_s, np.zeros(n, np.int32), unseen, first=n - 1)
         self._advance(n, lost=n)
@@ -314,7 +315,9 @@ class SimulatedSpad(SpadArray):
         self._just_lost = False
 
     def _repeat(self, records: NDArray[np.void], bits: NDArray[np.uint8]) -> None:
-        """Replace frames of a block by those before them; its first has none before it in the memory."""
+        """Replace frames of a block, drawn with `duplicate_probability`, each by the one before it. The first is never
+        replaced, since the one before it is not in this buffer.
+        """
         chance = self._config.duplicate_probability
         twice = dropped_frames(np.uint64(self._random_seed) ^ _TWICE, self._next_frame, len(records), chance)
         for i in np.flatnonzero(twice[1:]) + 1:
@@ -323,7 +326,7 @@ class SimulatedSpad(SpadArray):
     def _draw(
         self, state: BenchState, start_s: Array, x0: NDArray[np.int32], bits: NDArray[np.uint8], first: int = 0
     ) -> None:
-        """Draw the next frames, from number `first` of them on, into `bits`."""
+        """Draw the next frames into `bits`, without the first `first` of those that `state` describes."""
         assert self._photons is not None, "configured before started"
         held, power_w = self._world.mirror_positions(state, self._period_s), state.power_w * state.share
         number = self._first_draw + self._next_frame + first

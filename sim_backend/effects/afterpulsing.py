@@ -1,7 +1,7 @@
 """Afterpulsing and dead time: what a detection does to the same pixel's next frame.
 
-One-bit frames have exposure T and period P = T + gap. A detection falls anywhere in its exposure with equal chance, as
-it does at low flux. Neither effect matters within that exposure, where the pixel is 1 already.
+One-bit frames have exposure T and period P = T + gap. The time t of a detection in its exposure is uniform from 0 to T,
+as it is at low flux. Neither effect matters within that exposure, where the pixel is 1 already.
 
 Afterpulse: a trap releases a carrier with total probability a, after a time that is exponential with mean tau (Cova et
 al., IEEE Electron Device Letters 12, 685, 1991). The chance that it does so within the next exposure is
@@ -55,9 +55,9 @@ def after_probability(afterpulsing: float, lifetime_s: float, times: FrameTimes)
 
 
 def blind_probability(dead_time_s: float, times: FrameTimes) -> float:
-    """Chance that a detection in the frame after another falls into that one's dead time."""
+    """Chance that a detection falls into the dead time of a detection in the frame before."""
     reach = (dead_time_s - times.gap_s) / times.exposure_s
-    if reach > 1:  # the whole of the exposure for the later ones of those detections
+    if reach > 1:  # late detections blind the whole of the next exposure
         return 1 - max(0.0, 2 - reach) ** 2 / 2
     return max(0.0, reach) ** 2 / 2
 
@@ -67,7 +67,7 @@ def _carry_over(
     words: Words, before: Words, width: int, seed: np.uint64, first_frame: int, after: float, blind: float
 ) -> None:
     """Clear bits of frames (frames, rows, words) that the frame before blinds, then set those that pulse after it."""
-    # From the last frame to the first: each finds the one before it as it was.
+    # From the last frame to the first, so that each reads the one before it unchanged.
     for f in range(len(words) - 1, -1, -1):
         frame = np.uint64(first_frame + f)
         earlier = words[f - 1] if f > 0 else before

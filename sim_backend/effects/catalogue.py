@@ -178,7 +178,7 @@ CATALOGUE = (
     Entry("stripe", "laser", "stripe:Stripe", lambda _: "it is what is measured"),
     Entry("texture and cosine", "within", "", lambda _: _SURFACE),
     Entry("line width and defocus", "within", "", _defocus, _SHARP),
-    # Acts on what the effects before it brought, and that is the stripe.
+    # Acts on the light that the effects before it added: the stripe.
     Entry("speckle", "laser", "speckle:Speckle", _speckle, "the line's speckle is off"),
     Entry("fog", "laser", "fog:Haze", _fog, _NO_MEDIUM),
     Entry("forward blur", "laser", "stripe:ForwardBlur", _forward_blur, f"{_NO_MEDIUM} with a forward_share"),
@@ -191,7 +191,7 @@ CATALOGUE = (
     Entry("airlight", "steady", "ambient:airlight", _airlight, f"{_NO_MEDIUM} or no ambient light", _ambient_changes),
     Entry("dark counts", "steady", "dark_counts:dark_counts", _dark_counts, of_sensor=True),
     Entry("quantum efficiency and fill factor", "within", "", _efficiency),
-    # The one that reads the frame before is the first on the bits: those are then the photons' own.
+    # Reads the frame before, so it is the first effect on bits: the frame then holds only photons and dark counts.
     Entry("afterpulsing and dead time", "bits", "afterpulsing:Afterpulsing", _afterpulsing),
     Entry("crosstalk", "bits", "sensor_bits:Crosstalk", _crosstalk, changes=_crosstalk_changes),
     Entry("hot and dead pixels", "bits", "sensor_bits:Defects", _defects, changes=_defects_change),

@@ -1,13 +1,16 @@
 """The haze: laser light that the medium scatters once, where a pixel's ray crosses the sheet.
 
-With J = P/F the power per radian of fan and n.X = d the sheet, a ray q = (u, v, 1) crosses it at z = d/(n.q) and sees
+The laser spreads its power P over the fan's angle F: J = P/F per radian. The medium has the scattering coefficient
+sigma_s, the extinction sigma and the phase function p. A ray q = (u, v, 1) crosses the sheet n.X = d at z = d/(n.q) and
+sees the radiance
 
     L = sigma_s p J |q| / (r |n.q|) exp(-sigma (r + z |q|)),      r = |z q - S| from the source S
 
-For a rectified rig all powers of z cancel: sigma_s p I0 du |q_p||q_c|/b exp(-sigma z (|q_p| + |q_c|)). The phase
-function p is constant (`backscatter`: scattering angles are all near 180 degrees) or a sum of Henyey-Greenstein terms
-at the cosine -(z q - S).q/(r |q|). The haze ends where the sheet's light ends: at the object, blurred by `sigma_px`,
-and in the sheet's own shadow along the row. `medium` switches it on.
+For a rectified rig of baseline b, with the rays q_p of the projector and q_c of the camera, all powers of z cancel:
+sigma_s p I0 du |q_p||q_c|/b exp(-sigma z (|q_p| + |q_c|)), where I0 du = J sqrt(1 + u_p^2)/|q_p|^2. The phase function
+is constant (`backscatter`: scattering angles are all near 180 degrees) or a sum of Henyey-Greenstein terms at the
+cosine -(z q - S).q/(r |q|). The haze ends where the sheet's light ends: at the object, blurred by `sigma_px`, and in
+the sheet's own shadow along the row. `medium` switches it on.
 
 Along a row the loop over lit pixels has no branches, so it becomes vector instructions; only the pixels under the
 blurred end are done one by one. Cost per mirror position for 512 x 512 pixels, half of them lit: 0.36 ms in float64,
@@ -31,7 +34,7 @@ from sim_backend.random_numbers import HALVING, LOG2_E, power_of_half
 REACH_SIGMAS = 5.0
 """Sds at which the blurred end is cut."""
 LEAST_INVERSE_DEPTH = 1e-12
-"""Least inverse depth, in 1/m: what lies farther or behind the camera is taken as there."""
+"""Least inverse depth, in 1/m. Points that lie farther away or behind the camera are given this one."""
 Numbers = tuple[tuple[NDArray[Any], ...], NDArray[Any], tuple[Any, ...], tuple[Any, ...]]
 """The kernel's numbers, in one precision: rays u, v, |q| (rows, width) and source (3,); terms (n, 3), weight, |g| and
 sign of each Henyey-Greenstein term; halving, see `power_of_half`; 0, 1, 2 and least inverse depth."""
@@ -74,8 +77,8 @@ def _add_haze(
     sheet: Traced, light: tuple[Any, ...], numbers: Numbers, first_row: int, last_row: int, rate: Array
 ) -> None:
     """Add the haze of a sheet. light: the sheet's planes, scale of each of them, halvings per m, sigma_px."""
-    # Arrays and tuples are taken apart before the loops: within them, each access would count a reference. Numbers come
-    # from outside, too: written here they would be float64.
+    # Arrays and tuples are unpacked before the loops: inside, each access would count a reference. Constants are
+    # arguments, too: as literals they would be float64.
     _, _, x_stripe, x_end, start, step = sheet
     inverse, scales, halvings_per_m, sigma_px = light
     (u, v, q, source), terms, halving, (zero, unit, two, least) = numbers
@@ -99,14 +102,14 @@ def _add_haze(
         for i in range(high - low):
             x = np.uint64(low) + np.uint64(i)
             ray_u, ray_v, length = u[row, x], v[row, x], q[row, x]
-            # Everything times w = 1/z, so that one division does; w is kept from 0, where all light has faded.
+            # Everything is multiplied by w = 1/z, so that one division is enough; `least` keeps w away from 0.
             w = max(a * ray_u + b * ray_v + c, least)
             away_x, away_y, away_z = ray_u - w * source_x, ray_v - w * source_y, unit - w * source_z
             r2 = away_x * away_x + away_y * away_y + away_z * away_z
             r, one = math.sqrt(r2), unit / (r2 * w)
             lit[x] = scale * length * (one * (r * w))
             halvings[x] = halvings_per_m * ((r + length) * (one * r2))
-        for i in range(high - low):  # a loop of its own: more pixels are then under way at a time
+        for i in range(high - low):  # a separate loop: the processor then works on more pixels at a time
             x = np.uint64(low) + np.uint64(i)
             lit[x] *= power_of_half(halvings[x], halving)
         if n_terms > 0:
@@ -125,7 +128,7 @@ def _add_haze(
         if n_terms > 0:
             for i in range(high - low):
                 x = np.uint64(low) + np.uint64(i)
-                lit[x] = lit[x] * phase[x] if lit[x] > zero else zero  # no ray, no phase
+                lit[x] = lit[x] * phase[x] if lit[x] > zero else zero  # a pixel without a ray has no phase
         for i in range(high_whole - low_whole):
             whole = np.uint64(low_whole) + np.uint64(i)
             rate[row, whole] += lit[whole]

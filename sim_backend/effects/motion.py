@@ -2,9 +2,10 @@
 
 All surfaces are shifted together by D = velocity x time. A surface's facet m.X = 1 becomes m.(X - D) = 1, that is m /
 (1 + m.D), so the inverse depth of a ray q = (u, v, 1) is m.q / (1 + m.D) with m of the pixel at which the point was at
-time 0. That pixel is searched from two starting points, the nearest surface and the surface seen there at time 0; the
-nearer result wins, which is right except for a pixel or two along edges. Newly uncovered areas continue the surface
-behind, and what enters at the borders continues the surface there. Albedo is that of the nearest pixel.
+time 0. That pixel is searched for from two starting points, the nearest surface and the surface seen there at time 0;
+the nearer result is used, which is right except for a pixel or two along edges. Newly uncovered areas continue the
+surface behind, and areas that enter the picture continue the surface at its border. Albedo is that of the nearest
+pixel.
 
 The view is computed anew every `HOLD_S`, in which a surface at 10 m/s moves by 1 cm. This takes about 40 ms for
 512 x 512 pixels. Light that does not come from the laser stays that of time 0.
@@ -25,7 +26,7 @@ from sim_backend.light.view import CameraView
 
 HOLD_S = 1e-3
 KEPT_VIEWS = 8
-"""Views that are kept, more than a block of frames takes; 10 MB each for 512 x 512 pixels."""
+"""Views that are kept, more than a block of frames needs; 10 MB each for 512 x 512 pixels."""
 SEARCH_STEPS = 3
 
 
@@ -71,7 +72,7 @@ def shifted(still: CameraView, shift_m: Array) -> CameraView:
 @numba.njit(cache=True, nogil=True)
 def _source(u: Array, v: Array, y: int, x: int, w: float, shift: Array) -> tuple[int, int]:
     """Pixel (row, column) of the point at time 0 that a ray now sees at inverse depth w. -1: it was behind the camera,
-    or the rays have no slope. The tangents are taken as linear over the way.
+    or the rays have no slope. Tangents are assumed to be linear between the two pixels.
     """
     rows, width = u.shape
     scale = 1.0 - shift[2] * w
@@ -104,7 +105,7 @@ def _shift(
                     m = facet[j, i]
                     stretch = 1.0 + m[0] * shift[0] + m[1] * shift[1] + m[2] * shift[2]
                     if not stretch > 0.0:
-                        break  # has come up to the camera's plane
+                        break  # the surface has reached the camera's plane
                     w = (m[0] * u[y, x] + m[1] * v[y, x] + m[2]) / stretch
                     to_j, to_i = _source(u, v, y, x, w, shift)
                     if abs(to_j - j) <= 1 and abs(to_i - i) <= 1:

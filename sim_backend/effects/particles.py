@@ -1,15 +1,15 @@
 """Rain and snow: drops and flakes flash up where they cross the sheet, and have fallen further by the next sweep.
 
 Sizes, extinction and fall speed are in `sim_backend.scenes.medium`. The sheet contains density x thickness x area
-particles (drops at 20 mm/h and 2 mm: 7 per m^2), whose brightness goes as 1/z^3. What rain takes out of the beam, next
-to nothing below 20 m, is in the extinction of stripe and haze. A flake is modelled as a diffuse sphere of albedo 0.9
-with 4.5 times its melted cross-section. Seen from the side it is lit from, it sends back 8/3 of the mean over all
-directions, which is 8.6 times the light of a drop of equal melted diameter.
+particles (rain of 20 mm/h in a sheet of 2 mm: 7 per m^2), whose brightness goes as 1/z^3. The light that rain removes
+from the beam, next to nothing below 20 m, is in the extinction of stripe and haze. A flake is a diffuse sphere of
+albedo 0.9 with 4.5 times its melted cross-section. Seen from the side it is lit from, it sends back 8/3 of the mean
+over all directions, which is 8.6 times the light of a drop of equal melted diameter.
 
-A particle at X in a sheet of Gaussian thickness, s = n.X - d off its middle, gets J/r N(s; sd) W/m^2 with J = P/fan and
-sd^2 = (thickness/4)^2 + (r spread/4)^2. It sends back that times its `back_m2_per_sr`, and is seen as a point of this
-intensity I: a pixel of solid angle w sees the radiance I/(|X|^2 w). It is blurred like the line, and drawn as a streak
-of the length that it falls in `HOLD_S`.
+A particle at X, r from the mirror, lies s = n.X - d off the middle of the sheet, whose profile N is Gaussian. It gets
+J/r N(s; sd) W/m^2 with J = P/fan and sd^2 = (thickness/4)^2 + (r spread/4)^2. This times its `back_m2_per_sr` is the
+intensity I that it sends back: a pixel of solid angle w sees the radiance I/(|X|^2 w). The point is blurred like the
+line, and drawn as a streak of the length that the particle falls in `HOLD_S`.
 
 The particles are a fixed set in the cone that the camera sees. Each keeps its depth; its direction moves with its speed
 and re-enters at the other side of the cone. So they are spread evenly at any time, and the time alone determines where

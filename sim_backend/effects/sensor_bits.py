@@ -5,9 +5,9 @@ of pixels. If each of the places 0, 1, 2, ... is hit with probability p,
 
     gap = floor(ln U / ln(1 - p)),    U uniform in (0, 1)
 
-places are skipped before the next hit (geometric distribution; Devroye, Non-Uniform Random Variate Generation, 1986,
-X.2). U has 53 bits and comes from a counter, keyed by seed, effect and frame as the photons are. The hits in a frame
-depend on these alone, not on blocks or threads. Measured: 17 ns a hit.
+is the number of places skipped before the next hit (geometric distribution; Devroye, Non-Uniform Random Variate
+Generation, 1986, X.2). U has 53 bits and comes from a counter, keyed by seed, effect and frame as the photons are. The
+hits in a frame depend on these alone, not on blocks or threads. Measured: 17 ns a hit.
 """
 
 import math
@@ -55,7 +55,8 @@ class Crosstalk:
     """A detection triggers a neighbouring pixel by the light of its own avalanche.
 
     Acts on the bits of photons, dark counts and afterpulses. Each detection of a frame fires each of its 4 neighbours
-    with probability c / 4, all independently. Pixels fired in this way trigger no others, which would be of order c^2.
+    with probability c / 4 (c: `crosstalk`), all independently. Pixels fired in this way trigger no others, an effect of
+    order c^2.
     A pixel whose own chance is p, and of whose neighbours m fired, is 1 with probability 1 - (1 - p)(1 - c/4)^m; in a
     flat picture of small p that is p (1 + c). Light that crosses the border is lost. c is 0.1 to 0.2 % in 512 x 512
     arrays of large pitch; the share beyond the 4 neighbours is not modelled.
@@ -111,7 +112,7 @@ class Defects:
 
     def __init__(self, setting: Setting) -> None:
         sensor = setting.sensor
-        # One number a pixel for both, so that a larger share has the pixels of the smaller one, and more.
+        # One random number a pixel for both, so that a larger share includes all pixels of a smaller one.
         lot = np.random.default_rng([sensor.pixel_seed, _DEFECTS]).random(setting.view.u.shape)
         self._alive = packed(lot >= sensor.dead_share)
         self._hot = packed(lot >= 1 - sensor.hot_share)
@@ -126,10 +127,9 @@ class BitErrors:
     """Each pixel of a frame is read wrongly with probability e, 0 as 1 and 1 as 0: P(1) = p (1 - e) + (1 - p) e.
 
     Acts on the bits as they are read, after all other effects. These errors happen inside the sensor, between the
-    pixels and the logic that packs frames. Checksums are computed from the wrong bits, so neither a CRC nor a
-    recording's `verify` detects them. Errors after the checksum, on the cable, are not
-    simulated; tests make them with `SpbUsbModel.mangle`. Exact; cost per frame of 512 x 512: 5 us at 0.1 %, in
-    proportion to e.
+    pixels and the logic that packs frames. Checksums are computed from the wrong bits, so neither a CRC nor `rig
+    verify` detects them. Errors after the checksum, on the cable, are not simulated; tests make them with
+    `SpbUsbModel.mangle`. Exact; cost per frame of 512 x 512: 5 us at 0.1 %, in proportion to e.
     """
 
     reads_before = False

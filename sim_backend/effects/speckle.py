@@ -1,9 +1,9 @@
 """Speckle: laser light comes back grainy from a rough surface; a pixel averages the grains it covers.
 
 The light of M independent grains is gamma distributed with mean 1 and contrast (standard deviation over mean)
-1/sqrt(M). A diode of area A covers 1 + A / grain of them, where a grain has the area (4/pi) (wavelength N)^2 behind an
-f-number N; twice that, as a diffuse surface depolarises (Goodman, "Speckle phenomena in optics", 2007, sections 4.2 and
-4.6). With the default sensor at f/2 the contrast is 0.15.
+1/sqrt(M). Behind an f-number N a grain has the area a = (4/pi) (wavelength N)^2. A diode of area A covers 1 + A/a
+grains; M is twice that, since a diffuse surface depolarises (Goodman, "Speckle phenomena in optics", 2007, sections 4.2
+and 4.6). With the default sensor at f/2 the contrast is 0.15.
 
 Acts on the stripe, the light added before this effect. The grains depend on the pixel and on the position of the sheet
 in steps of the line's width, so they stay for all exposures of a column and return in every sweep. Cost: about 0.4 ms
@@ -39,7 +39,7 @@ class Speckle:
 
     def add(self, sheet: LightSheet, first_row: int, last_row: int, rate: Array) -> None:
         """Multiply the light of the stripe by the grains."""
-        # Of a bowed sheet `inverse` changes while rows are drawn, by threads; the plane that it bows from does not.
+        # The `inverse` of a bowed sheet changes while threads draw its rows; the plane that it bows from does not.
         by_u, _, ahead = sheet.inverse[0] if sheet.bowed is None else sheet.bowed.planes[0][:3]
         with np.errstate(divide="ignore", invalid="ignore"):
             place = np.rint(ahead / by_u * self._widths_per_tangent) + 0.0  # no negative zero

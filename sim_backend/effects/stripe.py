@@ -1,15 +1,16 @@
 """The stripe: the sheet's light on the surface, seen by the camera.
 
 A fan of power P spread evenly over an angle F carries J = P/F per radian; its flux vector is J/r delta(n.X - d) e, with
-r the distance from the source and e the direction from it. On a Lambertian surface (albedo rho, normal N), integrated
-along the row:
+r the distance from the source and e the direction from it. On a Lambertian surface (albedo rho, normal N) in a medium
+of extinction sigma, the radiance L integrated along the row is
 
     integral of L dx = (rho/pi) (J/r) |N.e| / |d(n.X)/dx| exp(-sigma (r + |X|))          per pixel of row
 
-with n.X taken on the surface along the row. For a rectified rig this is the camera-side cosine law
-(rho/pi) I0 du |N.q| / Z^2 exp(-sigma Z (|q_p| + |q_c|)), with I0 du = J sqrt(1 + u_p^2)/|q_p|^2. The surface is the
-facet m.X = 1 through the point: |N.e| = |1 - m.S|/(|m| r) for a source at S. The profile along the row is a Gaussian
-integrated over each pixel, of the width that `sim_backend.light.line` gives.
+with n.X taken on the surface along the row. For a rectified rig, with the rays q_p of the projector and q = q_c of the
+camera, this is the camera-side cosine law (rho/pi) I0 du |N.q| / Z^2 exp(-sigma Z (|q_p| + |q_c|)), with
+I0 du = J sqrt(1 + u_p^2)/|q_p|^2. The surface is the facet m.X = 1 through the point: |N.e| = |1 - m.S|/(|m| r) for a
+source at S. The profile along the row is a Gaussian integrated over each pixel, of the width that
+`sim_backend.light.line` gives.
 
 A share f of what the medium scatters (`forward_share`; droplets: half) is diffraction, which turns light by 1 to 2
 degrees only. The stripe's extinction counts this light as lost; `ForwardBlur` brings it back as a wider copy. On a path
@@ -120,9 +121,8 @@ def spread_line(total: float, centre: float, sigma: float, row: Array) -> None:
 def _add_lines(
     view: Arrays, sheet: Traced, light: tuple[float, ...], width: Array, first_row: int, last_row: int, rate: Array
 ) -> None:
-    """Add the stripe, or, where light is turned, its blurred copy. light: scale, extinction, turns per m, their angle.
-
-    width: as in `line_width`.
+    """Add the stripe, or its blurred copy if `light` has turns. light: scale, extinction, turns per metre, their angle
+    in pixels. width: as in `line_width`.
     """
     inverse, offset_m, x_stripe, _, _, _ = sheet
     scale, extinction_per_m, turned_per_m, angle_px = light

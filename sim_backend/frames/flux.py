@@ -6,9 +6,9 @@ share is the part of the exposure during which the gate let light out. `steady` 
 command.
 
 Tracing the light costs more than drawing a frame. So the frames that the mirror spends in one cell of a grid
-(`CommandGrid`) all get their mean position; the mean over a column's frames is then that of a mirror that moves on. If
-the columns' commands are known the cells are the columns; otherwise the range is divided into four cells per pixel of
-width.
+(`CommandGrid`) all get their mean position; the mean position over a column's frames is then that of the moving mirror.
+If the columns' commands are known the cells are the columns; otherwise the range is divided into four cells per pixel
+of width.
 """
 
 from collections.abc import Collection, Mapping, Sequence
@@ -32,8 +32,8 @@ class FluxModel:
         self.setting = setting
         loaded = {entry: entry.load()(setting) for entry in entries if entry.kind != "within"}
         self.laser: Mapping[str, LaserEffect] = {e.name: effect for e, effect in loaded.items() if e.kind == "laser"}
-        """The laser's effects by name, in the order in which they add: a later one may act on what the earlier ones
-        brought."""
+        """The laser's effects by name, in the order in which they act: a later one may change the light that the
+        earlier ones added."""
         self.steady: Mapping[str, Array] = {e.name: rate for e, rate in loaded.items() if e.kind == "steady"}
         """Detections per second (rows, width) by name."""
         self.bits: Mapping[str, BitEffect] = {e.name: effect for e, effect in loaded.items() if e.kind == "bits"}
@@ -76,15 +76,15 @@ def hold_s(effect: LaserEffect) -> float:
 
 FINE_POSITIONS_PER_PX = 4
 ROUNDING = 1e-9
-"""Step to which positions are rounded, far below what a frame can tell: frames then have the very same mean."""
+"""Step to which mean positions are rounded, far finer than frames can show, so that those of a cell are equal."""
 _SLACK = 1e-6
 """Slack, as a share of a step, for frames that lie on the very border of cells."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class CommandGrid:
-    """A grid of ascending positions (n,) float64. The cell of a position is all that is nearest to it; edges (n - 1,)
-    lie between cells. `low` and `high` bound the first and the last cell.
+    """A grid of ascending positions (n,) float64. The cell of a position has all commands that are nearest to it. edges
+    (n - 1,): the borders between cells. `low` and `high` bound the first and the last cell.
     """
 
     positions: Array
@@ -122,7 +122,7 @@ def column_grid(commands: Array, limits: tuple[float, float]) -> CommandGrid:
 
 
 def fine_grid(width: int, limits: tuple[float, float]) -> CommandGrid:
-    """Grid for a bench that has not been told the columns."""
+    """Grid for a bench that does not know the columns."""
     return _grid(np.linspace(*limits, FINE_POSITIONS_PER_PX * width + 1), limits)
 
 

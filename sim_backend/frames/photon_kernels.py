@@ -1,8 +1,8 @@
 """Compiled exact Bernoulli sampling of packed binary frames, 16 pixels at a time.
 
-A bit is 1 if a random number of 16 bits is below the pixel's level, about 2^16 p. The rest of p comes from a second
-draw: each pixel is chosen with chance c = 3 x 2^-16, about twelve per frame, and its bit is drawn again with chance s,
-where
+A pixel's bit is 1 with probability p. It is set if a random number of 16 bits is below the pixel's level, about 2^16 p.
+The rest of p comes from a second draw: each pixel is chosen with chance c = 3 x 2^-16, about twelve per frame, and its
+bit is drawn again with chance s, where
 
     p = (1 - c) level / 2^16 + c s,     0 <= s <= 1 for every level within [2^16 (p - c) / (1 - c), 2^16 p / (1 - c)]
 
@@ -49,14 +49,14 @@ fraction. So the level lies at least half a level inside its interval, on both s
 bits, 2^16 is within the interval, too."""
 _TOGETHER = 8
 _KEY_ROWS, _ROW_SHIFT = 8, 16
-"""Rows that share a key, and where their number stands in that of a block."""
+"""Number of rows that share a key, and the bit of a block number from which on the row's number is put."""
 _WORD_BYTES = WORD_PX * 2
 """Bytes that the levels of a word of pixels take."""
 _PER_SKIP = 1.0 / math.log1p(-CHANCE)
 
 _S11 = np.uint64(11)
 _ANEW = np.uint64(2**32)
-"""Number in the place of the row for the streams of pixels that are drawn anew."""
+"""Used in place of the number of the row group in the streams of pixels that are drawn anew."""
 _STRIP_ROWS = 64
 _UNIT = 2.0**-53
 _PLACE = np.array(PLACE, np.uint8)
@@ -157,7 +157,7 @@ def draw_frames(
     row_words = stored.shape[1]
     blocks = block_numbers(row_words)
     of_blocks, of_levels = blocks.ctypes.data, stored.ctypes.data
-    # A few frames at a time: rows of all of them would be spread over more pages than are known at once.
+    # A few frames at a time: rows of all frames would lie on more memory pages than the processor's TLB holds.
     for first in range(0, frames, _TOGETHER):
         for group in range(first_row // _KEY_ROWS, (last_row - 1) // _KEY_ROWS + 1):
             for f in range(first, min(first + _TOGETHER, frames)):

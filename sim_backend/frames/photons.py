@@ -2,7 +2,7 @@
 
 Consecutive frames with the same light (one mirror position, power and time) form a span. For a span the sheet is
 traced, its flux summed and p turned into levels; then each frame is drawn from the levels. Rows are split over threads,
-each of which goes by itself through all spans of a block (of one time, if things move); every step works row by row, so
+each of which goes by itself through all spans of a block (or of one moment, if things move); steps work row by row, so
 the split does not matter. The sensor's effects on bits act on whole frames, and windows are cut out afterwards.
 Measured for 512 x 512, the street in fog: 12 us a frame and 0.45 ms per mirror position on one core, 6.4 us and 0.26 ms
 on two (`python -m tests.benchmarks.simulator`).
@@ -32,9 +32,9 @@ _SLACK = 1e-6
 
 @dataclass(frozen=True, slots=True, eq=False)
 class _Span:
-    """Frames first..last-1 of a block. moment_s: time of the bench, for what moves. power_w: 0 in the dark. sheets: of
-    all lines, still to be traced; None in the dark, or if those of the lit span before hold. fresh: whether levels
-    change.
+    """Frames first..last-1 of a block. moment_s: time of the bench, for moving things. power_w: 0 in the dark. sheets:
+    of all lines, still to be traced; None in the dark, or if those of the last lit span still apply. fresh: whether the
+    levels change.
     """
 
     first: int
@@ -46,7 +46,7 @@ class _Span:
 
 
 class PhotonSource:
-    """Draws the frames of a configured SPAD, called from one thread, in up to `threads` threads with that one."""
+    """Draws the frames of a configured SPAD. Call it from one thread; it uses up to `threads` threads, that one too."""
 
     def __init__(
         self,
@@ -87,8 +87,8 @@ class PhotonSource:
     ) -> None:
         """Fill `bits` (n, rows, row bytes) with windows of frames first_frame, first_frame + 1, ...
 
-        held: mirror positions (n,), or (n, 2) for the exposure of the first and the last row; NaN if the light goes
-        nowhere. power_w: (n,) averaged over each exposure. x0: (n,) first pixel of each window, a multiple of 64.
+        held: mirror positions (n,), or (n, 2) for the exposure of the first and the last row; NaN if no light meets the
+        scene. power_w: (n,) averaged over each exposure. x0: (n,) first pixel of each window, a multiple of 64.
         time_s: (n,) start of each exposure in the bench's time, for scenes that move.
         """
         words = bits.view(np.uint64)
@@ -149,7 +149,7 @@ class PhotonSource:
                 draw_frames(levels, light, self._seed, first_frame + span.first, (a, b), first_word[part], words[part])
 
         try:
-            # What moves is where it is at one time: its picture is made once, for all bands.
+            # Spans of the same moment are drawn together, so that the view of moving things is made once for all bands.
             for _, together in groupby(spans, lambda span: span.moment_s):
                 group = list(together)
                 bowed = [sheet for span in group for sheet in span.sheets or () if sheet.bowed is not None]
@@ -174,7 +174,7 @@ class PhotonSource:
             if of_line is None:
                 model.add_sheet(sheet, a, b, rate)
                 continue
-            of_line[a:b] = 0  # effects may act on what those before them brought, which is never another line's
+            of_line[a:b] = 0  # an effect may change the light that earlier ones added, but never another line's
             model.add_sheet(sheet, a, b, of_line)
             of_line[a:b] *= np.float32(self._fan.share)
             rate[a:b] += of_line[a:b]
@@ -184,8 +184,8 @@ class PhotonSource:
         set_levels(self._steady, self._rate, exposure_w_s, (a, b), dark, self._lit, levels)
 
     def _apply_bit_effects(self, first_frame: int, whole: Words) -> None:
-        """Let the sensor act on whole frames, in as many parts as there are threads: a part needs what the effect found
-        in the frame before it."""
+        """Apply the sensor's effects to whole frames, in as many parts as there are threads. Each part also gets the
+        frame before it, as it was before the effect."""
         if first_frame != self._next_frame:
             for kept in self._before:
                 kept[:] = 0

@@ -1,8 +1,8 @@
 """The laser lines in the picture: their positions, their shares of the power, and their width at each depth.
 
-A diffractive element splits one laser's power among the lines; several lasers bring their own. All lines leave the same
-mirror, so line l is where a single line would be at the mirror's command plus the offset of l. The flux of a frame, in
-which each line's stripe and haze end at its own object, is
+A diffractive element splits one laser's power among the lines; of several lasers, each has its own power. All lines
+leave the same mirror, so line l is where a single line would be at the mirror's command plus the offset of l. The flux
+of a frame, in which each line's stripe and haze end at its own object, is
 
     lambda = exposure (steady + power sum over lines of share sheet_l)
 

@@ -48,7 +48,7 @@ class Sensor(Section):
     crosstalk: Annotated[Ppm, Field(ge=0, le=0.5)] = 0.0
     """Number of neighbours that a detection sets off, on average; 0.1 to 0.2 % in arrays of this class."""
     afterpulsing: Annotated[Ppm, Field(ge=0, le=0.5)] = 0.0
-    """Number of detections that follow a detection, whenever; 0.1 to 1 %."""
+    """Mean number of afterpulses of a detection, at any later time; 0.1 to 1 %."""
     trap_lifetime: Annotated[Seconds, Field(gt=0, le=1)] = 100e-9
     """Mean time until an afterpulse."""
     dead_time: Annotated[Seconds, Field(ge=0, le=1e-6)] = 0.0
@@ -69,7 +69,7 @@ class Line(Section):
 
     wavelength: Annotated[Metres, Field(gt=0)] = 520e-9
     fan: Annotated[Radians, Field(gt=0, lt=math.pi)] = math.radians(50)
-    """Angle over which the power is spread evenly; it is taken to cover the picture."""
+    """Angle over which the power is spread evenly; it is assumed to cover the picture."""
     sigma_px: float = Field(default=0.6, gt=0.05, le=20)
     """Gaussian width of the stripe in the picture, pixels: line width and blur of the lens together."""
     spread: Annotated[Radians, Field(ge=0, lt=0.1)] = 0.0

@@ -69,7 +69,7 @@ class LightSheet:
         )
         ray = np.stack([u, v, np.ones_like(u)], axis=-1)
         with np.errstate(divide="ignore", invalid="ignore"):
-            # Where the ray meets the plane: so near the sheet that the tangent there and here are one.
+            # Where the ray meets the plane: so near the bowed sheet that the tangent plane is the same.
             points = ray / np.sum(self.inverse[rows] * ray, axis=-1, keepdims=True)
             aside = _TANGENT_STEP_M * np.concatenate([np.zeros((1, 3)), np.eye(3), -np.eye(3)])[:, None]
             off_m, *around = bowed.distance_m(points + aside)
@@ -90,7 +90,7 @@ def empty_sheet(planes: Array, rows: int, time_s: float = 0.0, bowed: LightSheet
     """
     planes = np.array(planes if planes.ndim == 2 else planes[None])
     offset = planes[:, 3]
-    with np.errstate(divide="ignore", invalid="ignore"):  # through the camera: seen edge-on, no depth
+    with np.errstate(divide="ignore", invalid="ignore"):  # a plane through the camera is seen edge-on, without depth
         inverse = np.where(offset[:, None] != 0, planes[:, :3] / offset[:, None], np.nan)
     normal, nowhere, unseen = np.ascontiguousarray(planes[:, :3]), np.full(rows, np.nan), np.zeros(rows, np.int64)
     places = nowhere, nowhere.copy(), unseen, unseen.copy()
@@ -101,7 +101,7 @@ DEPTH_JUMP = 0.02
 """Relative step of depth from one pixel to the next above which two pixels lie on different surfaces. A surface this
 steep makes 85 degrees with the image plane at f = 600 px and returns next to no light."""
 SPAN_PX = 32
-"""Pixels that are passed at a time."""
+"""Pixels of a span, which is skipped as a whole if possible."""
 
 
 @numba.njit(cache=True, nogil=True)

@@ -2,8 +2,8 @@
 
 A pixel's albedo is the mean over its area, as a real pixel averages print finer than itself. A few rays are enough for
 a pixel that contains no edge of the print; otherwise many rays are used, on a Fibonacci lattice that is placed
-differently in every pixel. Its depth is that of the ray through its centre. The wall is perpendicular to the camera's
-axis.
+differently in every pixel. A pixel's depth is that of the ray through its centre. The wall is perpendicular to the
+camera's axis.
 """
 
 from collections.abc import Sequence
@@ -28,7 +28,7 @@ If the lattice were the same in all pixels, all edges of one direction would sha
 of a picture would be off together by 0.0015 px, twice what the photons of a bright picture leave.
 """
 LOOK = 21
-"""So many of these rays, evenly chosen, and the pixel's four corners tell whether it sees an edge."""
+"""Number of these rays, evenly chosen, that decide with the pixel's four corners whether it sees an edge."""
 WALL_ALBEDO = 0.5
 """Albedo of a painted wall, neither white nor dark."""
 

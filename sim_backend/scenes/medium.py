@@ -1,15 +1,16 @@
-"""The medium and the weather of a scene: fog or smoke, rain or snow, how dense, and where they scatter light to.
+"""The medium and the weather of a scene: fog or smoke, rain or snow, their density and how they scatter light.
 
 Henyey and Greenstein (1941): p(theta) = (1 - g^2) / (4 pi (1 + g^2 - 2 g cos theta)^1.5), in 1/sr, of integral 1 over
 all directions and mean cosine g; at 180 degrees (1 - g) / (4 pi (1 + g)^2).
 
-Rain (Marshall and Palmer 1948): N(D) = 8000 exp(-L D) per m^3 and mm, L = 4.1 R^-0.21 /mm. Drops take out twice their
+In the following D is the diameter in mm, R the rate in mm/h of water, and N the number of particles per m^3 and mm.
+
+Rain (Marshall and Palmer 1948): N(D) = 8000 exp(-L D), L = 4.1 R^-0.21 /mm. A drop's extinction is twice its
 cross-section (diffraction included), so sigma = 2 (pi/4) 8000 2/L^3 mm^2/m^3 = 3.65e-4 R^0.63 /m. Fall speed:
 9.65 - 10.3 exp(-0.6 D) m/s (Atlas, Srivastava and Sekhon 1973).
 
 Snow (Gunn and Marshall 1958), by melted diameter: N(D) = 3800 R^-0.87 exp(-L D), L = 2.55 R^-0.48 /mm. A flake has 4.5
-times its melted cross-section and falls at 1.6 (D/10)^0.31 m/s (aggregates of dendrites, Langleben 1954). R is in mm/h
-of water, D in mm.
+times its melted cross-section and falls at 1.6 (D/10)^0.31 m/s (aggregates of dendrites, Langleben 1954).
 """
 
 import math
@@ -31,12 +32,12 @@ DROPLET_G = 0.85
 """Mean cosine of scattering of fog droplets in visible light."""
 SMOKE_BACKSCATTER, SMOKE_SCATTERING_SHARE = 0.027, 0.96
 """Fresh wood smoke at 532 nm: lidar ratio 38 sr, single-scattering albedo 0.96; 1/(38 * 0.96) per sr (De Rosa et al.,
-Remote Sensing 14, 4984, 2022). Soot of open flames absorbs most of what it takes: scattering_share 0.2 to 0.3."""
+Remote Sensing 14, 4984, 2022). Soot of open flames mostly absorbs: scattering_share 0.2 to 0.3."""
 SMOKE_G = 0.65
 """Mean cosine of particles of 0.15 um effective radius, as in that smoke."""
 FORWARD_ANGLE = math.radians(1.5)
-"""Standard deviation of the angle, per axis, by which a droplet's diffraction turns light: half of what a droplet takes
-out of the beam, it only turns by 1 to 2 degrees."""
+"""Standard deviation of the angle, per axis, by which a droplet's diffraction turns light. Half of the light that a
+droplet removes from the beam is only turned by 1 to 2 degrees."""
 
 _PER_STERADIAN = re.compile(r"\s*(\d+\.?\d*(?:[eE][+-]?\d+)?|\.\d+)\s*/sr\s*", re.ASCII)
 
@@ -58,7 +59,7 @@ MeanCosine = Annotated[float, Field(gt=-1, lt=1)]
 
 def henyey_greenstein(cosine: float, g: float) -> float:
     """Phase function in 1/sr for the cosine of the scattering angle (-1 = back)."""
-    ahead, sharp = math.copysign(cosine, cosine * g), abs(g)  # 1 + g^2 - 2 g cos, with nothing that cancels at the peak
+    ahead, sharp = math.copysign(cosine, cosine * g), abs(g)  # 1 + g^2 - 2 g cos, without cancellation at the peak
     return (1 - g) * (1 + g) / (4 * math.pi * math.pow((1 - sharp) ** 2 + 2 * sharp * (1 - ahead), 1.5))
 
 
@@ -113,17 +114,16 @@ class Medium(Section):
     smoke: Smoke | None = Field(default=None, examples=["{extinction: 0.5 /m}"])
     extinction: Annotated[PerMetre, Field(gt=0)] | None = Field(default=None, examples=["0.1 /m"])
     backscatter: PerSteradian = DROPLET_BACKSCATTER
-    """Phase function near 180 degrees, where no `phase` is given. Water droplets 0.05, smoke 0.027, isotropic
-    0.0796."""
+    """Phase function near 180 degrees, if no `phase` is given. Water droplets 0.05, smoke 0.027, isotropic 0.0796."""
     phase: Literal["isotropic"] | Phase | None = Field(default=None, examples=["{g: 0.85}"])
     """The phase function at all angles, in place of `backscatter`."""
     scattering_share: float = Field(default=1.0, ge=0, le=1, examples=["0.96"])
     """Scattering over extinction; droplets hardly absorb visible light."""
     forward_share: float = Field(default=0.0, ge=0, le=0.5, examples=["0.5"])
-    """Part of the scattering that is diffraction, which turns light by `FORWARD_ANGLE` only: it blurs the stripe in
-    place of dimming it. Droplets 0.5; 0 takes all scattered light as lost to the stripe."""
+    """Part of the scattering that is diffraction, which turns light by `FORWARD_ANGLE` only: it blurs the stripe
+    instead of dimming it. Droplets 0.5; with 0 all scattered light is lost to the stripe."""
     multiple_scattering: bool = True
-    """Whether light scattered more than once is made where the optical depth calls for it."""
+    """Whether light scattered more than once is simulated, unless it is negligible."""
 
     @model_validator(mode="before")
     @classmethod
@@ -145,7 +145,7 @@ class Medium(Section):
 
     @property
     def extinction_per_m(self) -> float:
-        """Extinction coefficient in 1/m of light that must not be deflected at all."""
+        """Extinction coefficient in 1/m. Light deflected by any angle, however small, counts as lost."""
         seen = self.fog or self.smoke
         if seen is not None and seen.visibility is not None:
             return KOSCHMIEDER / seen.visibility
@@ -191,7 +191,7 @@ Array = NDArray[np.float64]
 
 M2_PER_MM2 = 1e-6
 DIFFRACTION = 2.0
-"""A particle much larger than the wavelength takes out twice what falls on it."""
+"""A particle much larger than the wavelength removes twice the light that falls on it."""
 FLAKE_AREA = 4.5
 """Cross-section of a flake over that of its melted drop: 4 to 5."""
 LAMBERT_SPHERE_BACK = 2 / (3 * math.pi)

@@ -52,7 +52,7 @@ class SceneBoard(BoardPlace):
     file: str | None = None
     """Board file of the print; the bundled one by default."""
     mirrored: bool = False
-    """Printed the wrong way round."""
+    """Whether it is printed the wrong way round."""
 
 
 class SceneFile(Section):
@@ -62,9 +62,9 @@ class SceneFile(Section):
     board: SceneBoard | tuple[SceneBoard, ...] = Field(
         default=(), examples=["{rotation: [20 deg, 0 deg, 0 deg], position: [-30 cm, -20 cm, 1.5 m]}"]
     )
-    """Boards in front of the wall where `surfaces` is `board`."""
+    """Boards in front of the wall, if `surfaces` is `board`."""
     wall: Annotated[Metres, Field(gt=0, examples=["4 m"])] = 4.0
-    """Distance from the camera's plane to the wall that boards stand in front of."""
+    """Distance from the camera's plane to the wall behind the boards."""
     medium: Medium | None = Field(default=None, examples=["{fog: {visibility: 30 m}}"])
     rain: Rain | None = Field(default=None, examples=["{rate: 20 mm/h}"])
     snow: Snow | None = Field(default=None, examples=["{rate: 2 mm/h}"])
@@ -117,7 +117,7 @@ def load_scene(name: str) -> tuple[SceneFile, Path]:
     bundled = SCENE_FOLDER / f"{name}.yaml"
     path = Path(name).expanduser()
     file = bundled if name in bundled_scenes() else path
-    if os.path.isdir(file):  # unlike Path.is_dir, it takes any text for a name
+    if os.path.isdir(file):  # unlike Path.is_dir, it accepts any text as a name
         return SceneFile(surfaces=str(file.resolve())), file
     if not os.path.isfile(file):
         close = difflib.get_close_matches(path.stem, bundled_scenes(), n=1)

@@ -39,7 +39,7 @@ def box(u: Array, v: Array, x: tuple[float, float], y: tuple[float, float], z: t
 
 
 def post(u: Array, v: Array, x: float, z: float, radius: float, y: tuple[float, float]) -> Array:
-    """Depth at which rays meet the mantle of an upright cylinder between two heights."""
+    """Depth at which rays meet the side of an upright cylinder between two heights."""
     a, b, c = u * u + 1, x * u + z, x * x + z * z - radius * radius
     root = b * b - a * c
     with np.errstate(invalid="ignore"):

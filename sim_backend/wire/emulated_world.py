@@ -46,7 +46,7 @@ USB_BAUD = 10_000_000
 """Baud of a virtual COM port, which is as fast as USB lets it be."""
 PICO_2 = 2
 KEPT_S = 20.0
-"""Time after which the past of the gate is forgotten."""
+"""Age at which the gate's history is dropped."""
 KEPT_FRAMES = 1_000_000_000
 """Most frames that wait for the host."""
 
@@ -71,7 +71,7 @@ class EmulatedWorld(SimulatedWorld):
     def __init__(self, config: EmulatedWorldConfig, surroundings: Surroundings, bus: Any = None) -> None:
         """Raises DeviceError if the geometry, the scene or the focus cannot be used, or rows are exposed late.
 
-        bus: has a method `plug`, by which it takes the USB devices, and is closed by its maker; by default an
+        bus: an object with a method `plug` that attaches a USB device; the caller closes it. By default an
         `EmulatedUsb`, within this process.
         """
         super().__init__(config, surroundings)

@@ -53,7 +53,7 @@ _POWERS: dict[Family, dict[str, tuple[str, float]]] = {
         "p": ("constant_power_w", 1.0),
     },
 }
-"""Commands that set a flag, or a power in a unit of so many watts, and the model's attribute for it."""
+"""Commands that set a flag or a power, with the model's attribute for it, and a power's unit in watts."""
 
 
 @dataclass(eq=False)
@@ -100,7 +100,7 @@ class CoboltModel:
 
     @property
     def gated(self) -> bool:
-        """Whether the TTL input governs the light."""
+        """Whether the TTL input controls the light."""
         return self.mode == "modulation" and self.digital and self.modulator == "external"
 
     @property

@@ -2,9 +2,9 @@
 0952a2a).
 
 There are two buffers, one playing and one pending, and a status polled with 03. A frame of whole packets never
-completes. A refused frame is refused silently. Frames within 100 ms of STOP are dropped. A frame without SINGLE repeats
-for ever. `DacModel` is the part that emulated scanner boards have in common; emulated worlds and tests read its record
-of the outputs.
+completes. Frames are refused silently. Frames within 100 ms of STOP are dropped. A frame without SINGLE repeats for
+ever. `DacModel` is the part that emulated scanner boards have in common; emulated worlds and tests read its record of
+the outputs.
 """
 
 import struct
@@ -21,7 +21,7 @@ from sim_backend.wire.serve.usb_model import STALL, AlternateSpec, Answer, Devic
 Array = NDArray[np.float64]
 
 KEEP_S = 20.0
-"""Age at which output is forgotten."""
+"""Age at which the output's history is dropped."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -94,7 +94,7 @@ class DacHistory:
         edges: list[Array] = []
         with self._lock:
             high_until = -np.inf
-            # A piece that ended shortly before is taken too: it tells whether an output high at from_s rose before.
+            # A piece that ended shortly before is used too: it shows whether an output high at from_s rose earlier.
             for one in self._between(from_s - KEEP_S / 100, until_s):
                 high = one.levels[:, line] > 0
                 before = np.concatenate([[one.start_s - high_until < one.period_s / 2], high[:-1]])
@@ -167,7 +167,7 @@ class DacModel(UsbModel):
         raise NotImplementedError
 
     def _take_points(self, data: bytes, now_s: float) -> int | None:
-        """Bytes taken; None: not now."""
+        """Take points; returns the number of bytes taken, None while not ready."""
         raise NotImplementedError
 
     def _halt(self, now_s: float) -> None:

@@ -11,7 +11,7 @@ from collections.abc import Callable
 from dataclasses import dataclass, field
 
 OFF_BITS = 0xC800_0000
-"""Bits of every sample status in docs/reference/hardware.md."""
+"""Bits that are set in every sample status in docs/reference/hardware.md."""
 _COMMAND = re.compile(r"[^\r\n]+[\r\n]+")
 _ADDRESS = re.compile(r"^(SYST|SOUR)(\d*)(?=:)")
 FORBIDDEN = "SYST:CDRH OFF"
@@ -73,7 +73,7 @@ class ObisModel:
 
     @property
     def gated(self) -> bool:
-        """Whether the TTL input governs the light."""
+        """Whether the TTL input controls the light."""
         return self.mode == "DIGITAL"
 
     @property

@@ -12,7 +12,7 @@ from dataclasses import dataclass
 import numpy as np
 
 STOPPED, STARTING, RUNNING, ABORT_REQUESTED, ABORTED = 0, 1, 2, 3, 5
-"""Values of `run-status` that an onlooker can meet."""
+"""Values of `run-status` that a host can see."""
 
 INTERNAL_HZ = 100_000_000
 MAX_WORDS = {1: 30_000, 2: 60_000}
@@ -41,8 +41,8 @@ class _Run:
 class PrawnDoModel:
     """The firmware and the pins. Times are seconds of whatever clock the wire runs on; they never decrease.
 
-    trigger: what drives GPIO16; None: nothing. board: 1 for a Pico, 2 for a Pico 2. external_clock_hz: what is
-    connected to GPIO20.
+    trigger: the signal on GPIO16; None: always low. board: 1 for a Pico, 2 for a Pico 2. external_clock_hz: frequency
+    of the clock on GPIO20; None: there is none.
     """
 
     def __init__(
@@ -94,7 +94,7 @@ class PrawnDoModel:
                 line, self._line = self._line.decode("latin-1").rstrip("\r\n"), bytearray()
                 asked = self.status == ABORT_REQUESTED
                 answer += self._answer(line, now_s)
-                if asked:  # to say this took longer than the second core needs
+                if asked:  # sending that answer takes longer than the second core needs
                     self.status = ABORTED
         return answer
 
@@ -117,7 +117,7 @@ class PrawnDoModel:
         return [(from_s, self._levels[first - 1]), *zip(self._times[first:last], self._levels[first:last], strict=True)]
 
     def forget(self, before_s: float) -> None:
-        """Drop history before `before_s`, which nobody asks for any more."""
+        """Drop the history before `before_s`, which is no longer needed."""
         keep = bisect_right(self._times, before_s) - 1
         del self._times[:keep], self._levels[:keep]
 
@@ -165,14 +165,14 @@ class PrawnDoModel:
     def _set_outputs(self, level: int, at_s: float) -> None:
         if level == self._levels[-1]:
             return
-        if self._times[-1] == at_s and self._levels[-2] == level:  # a level that lasted no time was none
+        if self._times[-1] == at_s and self._levels[-2] == level:  # a level that lasted no time is dropped
             del self._times[-1], self._levels[-1]
             return
         self._times.append(at_s)
         self._levels.append(level)
 
     def _settle(self, now_s: float) -> None:
-        """Let the second core act on what the first one asked of it before the next bytes came."""
+        """Let the board's second core do what the first one had asked for before these bytes came."""
         if self.status == ABORT_REQUESTED:
             self.status = ABORTED
         self.advance(now_s)

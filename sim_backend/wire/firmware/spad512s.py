@@ -51,7 +51,7 @@ class Spad512sModel:
         self.commands: list[str] = []
         """Commands as they came, for tests to look at."""
         self.fail_at_byte: int | None = None
-        """Test knob: number of bytes of pixels behind which the next run ends with `fail_text`."""
+        """Test knob: number of bytes of pixels after which the next run ends with `fail_text`."""
         self.fail_text = b"\nAuto-protect: too much light. Acquisition ERROR"
         self._frames = frames
         self._calibration_s = calibration_s

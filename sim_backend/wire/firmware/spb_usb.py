@@ -31,7 +31,7 @@ FT601_CONFIG_BYTES: Final = 152
 
 
 class SpbUsbModel(UsbModel):
-    """The device. mangle: makes of each block the pieces that the stream sends, to damage it for tests."""
+    """The device. mangle: returns the pieces to send in place of a block, so that tests can damage the stream."""
 
     def __init__(self, source: FrameSource, board: SpbUsbBoard) -> None:
         self.chip: Chip = board.chip
@@ -135,7 +135,7 @@ class SpbUsbModel(UsbModel):
         if self._board.acks == "endpoint":
             self._acks.append(ack.packed())
             return
-        # START's own still has the stride of before the run: so the host knows where blocks of frames begin.
+        # The answer to START still has the stride from before the run: so the host knows where blocks of frames begin.
         in_run = self._run is not None and ack.op != Op.START
         stride = self._registers[Register.STRIDE] if in_run else ACK_BLOCK_BYTES
         self._send(None, self._memory.control_block(stride, REGISTER_ACK, self._run_id, ack.packed()))
@@ -205,7 +205,7 @@ class SpbUsbModel(UsbModel):
         self._acks.clear()
         self._session_open = self.chip == "fx3"
         self.gate_allowed = False
-        """Level of the FPGA's own gate line: low from an abort, a strike of the watchdog or a loss of bus power until
+        """Level of the FPGA's own gate line: low from an abort, a time-out of the watchdog or a loss of bus power until
         the next START."""
 
     def _watch(self, now_s: float) -> None:

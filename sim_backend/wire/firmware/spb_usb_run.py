@@ -19,7 +19,7 @@ from sim_backend.wire.serve.usb_model import AlternateSpec, DeviceSpec, Endpoint
 IDLE_S: Final = 0.1
 """Time without frames after which a run sends a heartbeat block."""
 BUFFERS: Final = 80
-"""Blocks that transports may hold at a time; memory is taken as it is needed."""
+"""Blocks that transports may hold at a time; memory is allocated when it is needed."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -69,11 +69,11 @@ class SpbUsbBoard:
     product_name: str = "SPB1 SPAD"
     """Product string by which drivers find it."""
     paced: bool = False
-    """Frames come when they are exposed; else as fast as the host takes them."""
+    """Whether frames come only once they are exposed; else they come as fast as the host takes them."""
     fifo_frames: int = 10_000
     """Frames that wait for the host before new ones are lost."""
     payload_crc: bool = True
-    """Blocks carry the CRC of their payload."""
+    """Whether blocks carry the CRC of their payload."""
     tick_hz: int = 100_000_000
     min_period_ticks: int = 1000
     ddr_bytes: int = 1 << 30
@@ -88,7 +88,7 @@ class SpbUsbBoard:
 
 
 class BlockMemory:
-    """A pool of `BUFFERS` block buffers, given out in turn; a transport must let go of each before its next turn."""
+    """A pool of `BUFFERS` block buffers, used in turn; a transport must be done with each before it is used again."""
 
     def __init__(self) -> None:
         self._buffers: deque[NDArray[np.uint8]] = deque()
@@ -156,7 +156,7 @@ class EmulatedRun:
     def next_block(self, now_s: float) -> memoryview | None:
         """The next block, if one is ready at that time."""
         if self._n_frames is not None and self.next_frame >= self._n_frames:
-            return self.end(BlockStatus.OK, BlockFlag(0))  # stopped just behind a whole block
+            return self.end(BlockStatus.OK, BlockFlag(0))  # stopped just after a whole block
         n = self._block_frames if self._n_frames is None else min(self._block_frames, self._n_frames - self.next_frame)
         if self._board.paced:
             n = self._lose_overrun(n, now_s)

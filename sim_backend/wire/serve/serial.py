@@ -2,7 +2,7 @@
 
 Replies leave at 10 bits a character, as through a UART (a virtual COM port is faster, and no driver may depend on
 that). The terminal is opened by the real pyserial, from any process, and runs in the host's time; it ignores the baud
-rate. Its path is a link, gone while unplugged, and the same when plugged in again.
+rate. Its path is a link, which is gone while the device is unplugged and is the same when it is plugged in again.
 """
 
 import os
@@ -20,9 +20,9 @@ from sim_backend.wire.serve.wire_server import WireServer
 BITS_PER_CHARACTER = 10
 """8N1: a start bit, eight data bits, a stop bit."""
 _TURN_S = 0.001
-"""One turn of the serving thread while bytes are on their way."""
+"""Length of one turn of the serving thread while bytes are on their way."""
 _IDLE_S = 0.01
-"""One turn while nothing happens: how late a model's own events come at most."""
+"""Length of one turn while nothing happens: a model's own events come at most this late."""
 
 
 class SerialModel(Protocol):

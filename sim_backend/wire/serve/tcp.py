@@ -14,9 +14,9 @@ from sim_backend.wire.serve.wire_server import WireServer
 
 HOST = "127.0.0.1"
 CHUNK_BYTES = 65_536
-"""Most bytes that are asked of the model at a time: one piece of a stream, which a fault may strike."""
+"""Most bytes that are taken from the model at a time."""
 _TURN_S = 0.002
-"""One turn of the serving thread while nothing moves."""
+"""Length of one turn of the serving thread while no byte moves."""
 
 
 class TcpModel(Protocol):

@@ -4,9 +4,8 @@
     device = bus.plug(HeliosModel())
     usb.core.find(backend=bus, idVendor=0x1209)     # or open_device(..., backend=bus)
 
-This is the fastest and most portable way to run a driver. It does without libusb, which would keep transfers in
-flight, and without the kernel. The base of device models is in `usb_model`, and so are the errors, which are pyusb's
-own.
+This is the fastest and most portable way to run a driver. libusb's queued (asynchronous) reads and the kernel's part
+are not exercised. `usb_model` has the base of device models and the errors, which are pyusb's own.
 """
 
 import errno
@@ -34,8 +33,8 @@ from sim_backend.wire.serve.usb_model import (
 )
 
 FIRST_POLL_S, LONGEST_POLL_S = 250e-6, 1e-3
-"""Waits until a transfer that the device is not ready for asks again: each twice as long, from the first up to the
-second."""
+"""A transfer for which the device is not ready is tried again after the first of these times, then after twice as long
+each time, up to the second."""
 
 _BUS = 1
 _SPEED = {"full": 2, "high": 3, "super": 4}

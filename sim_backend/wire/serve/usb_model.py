@@ -289,7 +289,7 @@ class AttachedDevice:
             return taken or 0
 
     def inp(self, endpoint: int, room: int, owner: object) -> bytes | memoryview | None:
-        """Data that the device has now, or None. Raises EOVERFLOW if they are more than the room left."""
+        """Data that the device has now, or None. Raises EOVERFLOW if there is more data than room."""
         with self._alive():
             packet = self._usable(endpoint, owner).packet_bytes
             answer = self.model.inp(endpoint, -(-room // packet) * packet, self._now())
