@@ -1,9 +1,10 @@
 """The camera from corners of a board at several poses: OpenCV's calibration, made robust and with an uncertainty.
 
-Left out are the corners of a view that does not fit the others (because the board moved or its corners are in another
-order), single corners that do not fit their view, and the corners of a board seen from behind, which is a mirror image.
-Views that lose more than one corner are named. The fit to the others is that of cv2.calibrateCamera. The covariance is
-s^2 (J^T J)^-1 with the poses free and s^2 the residuals' variance, so it counts errors of the lens model as noise.
+Three kinds of corners are left out: those of a view that does not fit the others (because the board moved or its
+corners are in another order), single corners that do not fit their view, and those of a board seen from behind, which
+is a mirror image. Views that lose more than one corner are named. cv2.calibrateCamera fits the remaining corners. The
+covariance is s^2 (J^T J)^-1 with the poses free, J the derivatives of the corners' pixels and s^2 the residuals'
+variance, so it counts errors of the lens model as noise.
 
 The normal equations, with free poses, decide whether the corners determine a camera: by their condition number and by
 the sd of the focal length. The angles between the boards only decide how a refusal is worded, and whether all
@@ -28,7 +29,7 @@ from calibration.views import LEAST_ACROSS_PX, NO_POSE, BoardPose, Corners, View
 
 Kind = TypeVar("Kind")
 _POSE = 6
-"""OpenCV's columns: rotation, position, then fx fy cx cy and the distortion."""
+"""Columns of rotation and position in OpenCV's derivatives; those of fx fy cx cy and the distortion follow."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -66,7 +67,7 @@ _MOST_CONDITION = 1e11
 """Largest condition number of the normal matrix at unit diagonal: beyond, doubles lose its smallest eigenvalue."""
 _PARALLEL_RAD = float(np.radians(3.0))
 _SAME_PLACE = 0.02
-"""Share of their distance within which two parallel boards count as one pose."""
+"""Largest distance between parallel boards at one pose, as a share of their distance from the camera."""
 _GUESSED_FOCAL = (1.2, 0.7, 2.5)
 """Focal lengths, in widths of the picture, to start from where OpenCV's own start fails."""
 _FLAGS = {
@@ -105,7 +106,7 @@ class CameraProblem:
         return self.board.corners_m[self.corners[view].ids]
 
     def check(self, used: Sequence[Mask]) -> None:
-        """Raise Degenerate if there is only one pose."""
+        """Raise Degenerate if all views show the board at one pose."""
         rough = self._rough(used)
         shown = _of_used(rough.poses, used)
         places = np.stack([pose.to_camera(np.array([*self.board.size_m, 0.0]) / 2) for pose in shown])
@@ -202,7 +203,7 @@ class CameraProblem:
         return CameraSolution(matrix, np.zeros(self.terms), poses, ())
 
     def _normal(self, used: Sequence[Mask], solution: CameraSolution) -> Normal:
-        """The normal equations of the camera, with as many terms of distortion as are looked for."""
+        """The normal equations of the camera, with as many terms of distortion as are fitted."""
         terms, distortion = self.terms, solution.distortion
         total = np.zeros((4 + terms, 4 + terms))
         given = np.zeros(max(len(distortion), 5)) if terms <= 5 else np.zeros(14 if terms > 8 else 8)
@@ -234,7 +235,7 @@ class CameraProblem:
 
 
 def _of_used(of_views: Sequence[Kind], used: Sequence[Mask]) -> tuple[Kind, ...]:
-    """Those of the views that have a corner in use."""
+    """The entries of those views that have a corner in use."""
     return tuple(each for each, mask in zip(of_views, used, strict=True) if mask.any())
 
 
@@ -244,17 +245,17 @@ def rms(residual_px: Array) -> float:
 
 
 _FEWEST_CORNERS = 8
-"""Fewest corners of a view: four give the pose, the rest say whether it fits."""
+"""Fewest corners of a view: four determine the pose, the others check it."""
 _VIEW_LIMIT = 2.5
-"""A view is an outlier where its residuals, in sds of its corners, are so many times those of the usual view."""
+"""A view is an outlier if its residuals, in sds of its corners, exceed those of the usual view by this factor."""
 _CORNER_LIMIT = 6.0
 """Sds of either coordinate beyond which a corner is left out."""
 _FEW_CORNERS = 1
 """Number of corners that may be left out of a view without naming it."""
 _LEAST_CLOSE = 0.7
-"""Least share of a view's corners; with fewer that fit, none is used."""
+"""Least share of a view's corners that must fit; with fewer, none of them is used."""
 _FEWEST_VIEWS = 3
-"""Fewest views that must stay when outliers leave."""
+"""Fewest views that stay in the fit, even if they are outliers."""
 _MAX_ROUNDS = 20
 
 
@@ -263,7 +264,7 @@ class CameraFit:
     """A camera and the data it was fitted to. Sequences run over the views with enough corners, which `views` names.
 
     residual_px: (n, 2) float64, projected minus seen, of every corner. used: (n,) bool, corners in the fit. rms_px: rms
-    distance of those. outliers: names of the views that do not fit, entirely or in more than one corner. condition:
+    of their distances. outliers: names of the views that do not fit, entirely or in more than one corner. condition:
     condition number of the normal equations at unit diagonal. spread_rad: largest angle between the boards in the fit.
     """
 
@@ -339,7 +340,7 @@ def fit_camera(views: Sequence[View], board: Board, size: tuple[int, int], *, di
 def _without_outliers(
     problem: CameraProblem, solution: CameraSolution, used: list[Mask]
 ) -> tuple[CameraSolution, list[Mask]]:
-    """The fit without what does not fit: the worst view at a time, then single corners, until nothing changes."""
+    """Repeat the fit without outliers, first one view at a time, then single corners, until nothing changes."""
     dropped = {i for i, mask in enumerate(used) if not mask.any()}
     behind = frozenset(dropped)
     sds = [found.likely_sd_px for found in problem.corners]
@@ -365,7 +366,7 @@ def _without_outliers(
 
 
 def _close(residual_px: Array, sd_px: float) -> Mask:
-    """Corners within the limit; none of a view that has more beyond it than it should."""
+    """Corners within _CORNER_LIMIT; none if these are less than _LEAST_CLOSE of the view's corners."""
     close: Mask = np.abs(residual_px).max(axis=1) <= _CORNER_LIMIT * sd_px
     return close if close.mean() >= _LEAST_CLOSE else np.zeros_like(close)
 

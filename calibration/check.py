@@ -1,10 +1,10 @@
 """A calibration judged by boards that were not used for it: do they come out flat, and of the right size and angle?
 
 A board at an unknown pose is scanned. The scanned points of each of its squares are averaged; the deviations of these
-averages from their best plane are the flatness error. The board's corners are put on that plane along their rays, and
-the ratio of their distances to those of the board is the scale error. Two boards give the error of the angle between
-them. Each result comes with the error expected from the model's covariance and the scan's noise. With m the deviations
-(cells,), C their expected covariance and P the projection that removes a plane,
+averages from their best plane are the flatness error. The board's corners are put on that plane along their rays; the
+size of their pattern, divided by its size on the board, is the scale. Two boards give the angle between them. Each
+result comes with the error expected from the model's covariance and the scan's noise. With m the deviations (cells,), C
+their expected covariance and P the projection that removes a plane,
 
     chi2 = (P m)' (P C P)^+ (P m)    with cells - 3 degrees of freedom.
 """
@@ -25,7 +25,7 @@ from calibration.model.rig_model import RigModel
 from calibration.views import FEWEST_CORNERS, Corners, Passages, View
 
 _FEWEST_CELLS = 8
-"""Scanned squares of a board; three of them already go into its plane."""
+"""Fewest scanned squares of a board; three of them only determine its plane."""
 _FEWEST_IN_CELL = 5
 
 
@@ -77,13 +77,13 @@ def cells_of(model: RigModel, view: View, board: Board) -> BoardCells:
 
 
 def _points_of(model: RigModel, cells: BoardCells) -> Array:
-    """(cells, 3): each square's point, the mean of the sweeps'."""
+    """(cells, 3): each square's point, averaged over the sweeps."""
     return np.asarray(_triangulated(model, cells.x_px, cells.y_px, cells.command, cells.velocity_per_s).mean(axis=0))
 
 
 def noise_m2(model: RigModel, cells: BoardCells, normal: Array) -> float:
-    """Variance of a square's mean along the board's normal, from the differences between sweeps or else from the
-    passages' sd.
+    """Variance of a square's mean along the board's normal, from the differences between sweeps. If there is only one
+    sweep, it follows from the sd of the passages.
     """
     found = _triangulated(model, cells.x_px, cells.y_px, cells.command, cells.velocity_per_s) @ normal
     sweeps = len(found)
@@ -107,7 +107,7 @@ def _scanned(model: RigModel, view: View, board: Board) -> Iterator[tuple[Passag
     """Each sweep of a view; where its pixels lie on the board (m, 2), metres, NaN off its squares; and its points
     (m, 3) in the camera's frame, NaN where the command lies outside the model's range.
 
-    Rays see a plane by a homography. Raises Degenerate if the corners are too few to locate the board.
+    A homography maps rays to the board. Raises Degenerate if the corners are too few to locate the board.
     """
     found = 0 if view.corners is None else len(view.corners.ids)
     if view.corners is None or found < FEWEST_CORNERS:
@@ -128,13 +128,13 @@ def _scanned(model: RigModel, view: View, board: Board) -> Iterator[tuple[Passag
 
 
 def off_plane(xy: Array) -> Array:
-    """(cells, cells - 3) orthonormal basis of all deviations that are no plane."""
+    """(cells, cells - 3) orthonormal basis of the deviations that remain after a plane is removed."""
     full = np.linalg.qr(np.column_stack([np.ones(len(xy)), xy]), mode="complete")[0]
     return full[:, 3:]
 
 
 _PARALLEL = 1e-6
-"""Sine of the angle up to which two boards count as parallel: neither is tilted towards the other."""
+"""Sine of the angle up to which two boards count as parallel."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -143,9 +143,8 @@ class CheckedBoard:
 
     distance_m: its mean depth. flatness_rms_m, flatness_peak_m: deviations of its squares' means from their plane;
     expected_m: the rms expected from covariance and noise. chi2, freedom: of the deviations. scale: scanned size over
-    stated size; scale_sd: its expected sd. cells_m: (squares down, across) deviations, NaN where a square was not
-    scanned.
-    point_rms_m: rms deviation of single passages from the plane.
+    stated size; scale_sd: its expected sd. point_rms_m: rms deviation of single passages from the plane. cells_m:
+    (squares down, across) deviations, NaN where a square was not scanned.
     """
 
     name: str
@@ -206,7 +205,7 @@ def check_board(model: RigModel, view: View, board: Board) -> CheckedBoard:
 
     def measure(tried: RigModel) -> Array:
         found = _points_of(tried, cells)
-        normal, offset = _plane(points)  # the same reference for all
+        normal, offset = _plane(points)  # of the unchanged model: the same reference for every changed one
         return np.append(found @ normal - offset, _scale(tried, found, corners, board))
 
     values, covariance = propagated(model, measure)
@@ -236,7 +235,7 @@ def check_board(model: RigModel, view: View, board: Board) -> CheckedBoard:
 
 
 def _scale(model: RigModel, points: Array, corners: Corners, board: Board) -> float:
-    """Size of the corners' pattern, put on the scanned plane along their rays, over its size on the board."""
+    """Size of the pattern of corners, put on the scanned plane along their rays, divided by its size on the board."""
     normal, offset = _plane(points)
     u, v = model.camera.tangents_at(*corners.px.T)
     rays = np.stack([u, v, np.ones_like(u)], axis=-1)
@@ -246,7 +245,7 @@ def _scale(model: RigModel, points: Array, corners: Corners, board: Board) -> fl
 
 
 def _plane(points: Array) -> tuple[Array, float]:
-    """n.X = d of the best plane through points (m, 3), |n| = 1, n_z > 0."""
+    """(n, d) of the best plane n.X = d through points (m, 3), |n| = 1, n_z >= 0."""
     middle = points.mean(axis=0)
     normal = np.linalg.svd(points - middle, full_matrices=False)[2][2]
     normal = normal if normal[2] >= 0 else -normal

@@ -2,9 +2,10 @@
 
     var z = J C J',    J = dz / d(parameters) of the pixel's ray on the light sheet of its mirror command.
 
-The part of a group is the variance that would vanish if the parameters of that group were known exactly,
-J C_.g C_gg^-1 C_g. J'. It lies between 0 and the total, and is the group's own variance if the group is correlated with
-no other. Correlated groups share a part, so parts may add up to more than the total.
+C is the covariance. The part of a group g of parameters is the variance that would vanish if they were known exactly,
+J C_.g C_gg^-1 C_g. J', where C_.g are the group's columns of C. It lies between 0 and the total, and is the group's own
+variance if the group is correlated with no other. Correlated groups share variance, so parts may add up to more than
+the total.
 
 There is also the covariance of any other number that follows from a model (`propagated`), the effect on depth of an
 error in the mirror's command or in the stripe's position (`sensitivity`), and, if a simulation knows the true model,
@@ -26,7 +27,7 @@ from calibration.model.rig_model import Covariance, RigModel
 
 _STEPS = dict.fromkeys(MATRIX, 1e-3) | dict.fromkeys(TIMES, 1e-9) | {ROW_DELAY: 1e-12}
 _STEP = 1e-6
-"""Change of each parameter, in its own unit, for differences: small against what bends, large against rounding."""
+"""Change of each parameter, in its own unit, for differences: small enough for linearity, large against rounding."""
 
 
 def propagated(model: RigModel, measure: Callable[[RigModel], Array]) -> tuple[Array, Array]:
@@ -49,7 +50,7 @@ def by_parameter(model: RigModel, names: tuple[str, ...], measure: Callable[[Rig
 
 
 def _changed(model: RigModel, name: str, step: float) -> tuple[float, RigModel]:
-    """The step taken and the model then; no step where a parameter is at its bound, as a lag of 0 s."""
+    """The step and the changed model; 0 and the same model if the step passes a bound, e.g. to a lag below 0 s."""
     try:
         return step, with_parameters(model, [name], [step])
     except CalibrationError:
@@ -59,12 +60,12 @@ def _changed(model: RigModel, name: str, step: float) -> tuple[float, RigModel]:
 GROUPS: Final = {"baseline": "the baseline", "camera": "the camera", "angle": "the mirror's angle", "lag": "the lag"}
 """Groups of parameters, each with the words for it."""
 _GRID = 48
-"""Least number of pixels looked at along the longer side of a map; all if it has fewer."""
+"""Least number of pixels along the longer side of the picture at which depth is judged; all if it has fewer."""
 _SEARCH_STEPS = 60
 _FOUND_M = 1e-9
 """A mirror command is found when its sheet passes the point within this: a thousandth of any calibration's error."""
 _INSIDE = 1e-6
-"""Share of the command range by which differences stay within it."""
+"""Distance from the ends of the command range, as a share of it, at which differences are taken there."""
 _INDEPENDENT = 1e-12
 """Eigenvalues of a correlation matrix below this are rounding."""
 
@@ -145,7 +146,7 @@ def command_at(model: RigModel, x_px: ArrayLike, y_px: ArrayLike, depth_m: Array
     def off(command: Array) -> Array:
         return model.sheets(command).distance_m(points)
 
-    # False position, Illinois variant: an end that stays counts half the next time.
+    # False position, Illinois variant: the value at an end that stays is halved.
     low, high = (np.full(points.shape[:-1], end) for end in model.scanner.command_range)
     off_low, off_high = off(low), off(high)
     with np.errstate(invalid="ignore"):
@@ -169,7 +170,7 @@ def depth_jacobian(
 ) -> Array:
     """Derivatives of z (m) at raw pixels and mirror commands (broadcast) by the parameters of the covariance: (..., p).
 
-    The mirror stands at `command` in the unchanged model; a change of the lag or the row delay moves it. NaN where
+    The mirror is at `command` in the unchanged model; a change of the lag or the row delay moves the mirror. NaN where
     there is no depth. Raises CalibrationError for a model without covariance.
     """
     names = _covariance(model).names
@@ -218,9 +219,10 @@ def _covariance(model: RigModel) -> Covariance:
 
 
 _SENSITIVITY_GRID: Final = 24
-"""Pixels looked at along each side."""
+"""Pixels along each side at which the sensitivity is computed."""
 LEAST_LIT_SHARE: Final = 0.05
-"""Share of the picture that must be lit for a distance to be judged at: more than a border column or row."""
+"""Share of the picture that the line must reach at a distance for the sensitivity there: more than a border column or
+row."""
 _DISTANCES_M: Final = np.geomspace(0.05, 100.0, 60)
 
 

@@ -10,9 +10,7 @@ class CalibrationError(ValueError):
 
 
 class Degenerate(CalibrationError):  # noqa: N818, the input is, not the program
-    """Raised for input from which no model follows. `reason` is for programs: one of the verdict's codes, such as
-    'one-pose'.
-    """
+    """Raised for input from which no model follows. reason: a code for programs, such as 'one-pose'."""
 
     def __init__(self, reason: str, message: str) -> None:
         """Take the reason, and the message: what is wrong, its value and limit, the condition number, the next step."""

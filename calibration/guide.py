@@ -1,12 +1,12 @@
 """Advice on the board's next pose, and why: the pose after which the expected depth error is smallest.
 
-Candidates form a grid of distance, place in the picture and tilt. The gain of each is forecast from the fit of the
-views so far (`Forecast`). Before there is a fit, three poses are shown that tell most about any camera. The same grid
-gives the sequence of poses that a simulated rig shows without guidance.
+Candidates form a grid of distance, place in the picture and tilt. `Forecast` predicts the gain of each from the fit of
+the views so far. Before there is a fit, and always without guidance, the poses of `sequence` are shown, which differ as
+much as possible.
 
-A pose that has not been shown has no data, but its equations need none. The fit so far gives the places of its corners
-and passages and their derivatives by the parameters; the other views give their noise. Added to the information already
-there, these equations give the expected covariance.
+A pose that has not been shown has no data, but the normal equations need none: they need derivatives and noise. The fit
+so far gives the places of corners and passages at the new pose and their derivatives by the parameters; the other views
+give their noise. Added to the information already there, these equations give the expected covariance.
 """
 
 import math
@@ -85,7 +85,7 @@ class Candidate:
 
 @dataclass(frozen=True, slots=True)
 class Advice:
-    """The next pose. before_m, after_m: expected depth error now and once it has been shown; NaN before there
+    """The next pose. before_m, after_m: expected depth error at `at_m` before and after this pose; NaN before there
     is a fit."""
 
     candidate: Candidate
@@ -153,7 +153,10 @@ def rough_camera(size: tuple[int, int]) -> Camera:
 def _candidate(
     camera: Camera, board: Board, fill: float, place: tuple[int, int], tilt: tuple[int, int]
 ) -> Candidate | None:
-    """The pose that brings the board to its place and no farther than the border; None if it does not fit."""
+    """The pose that puts the board at `place` in the picture, with _BORDER_SHARE of the picture free around it.
+
+    None if the board does not fit, or if at `place` it would be off the middle by less than an eighth of its size.
+    """
     rotation = TILT_RAD * np.array([tilt[0], tilt[1], 0.0])
     turn = cv2.Rodrigues(rotation)[0]
     width, height = camera.width - 1, camera.height - 1
@@ -177,9 +180,9 @@ def _candidate(
 
 
 BOARD_POINTS = 14
-"""Points along either side of the board where passages are looked at; each stands for as many as there will be."""
+"""Points along each side of the board at which passages are forecast; each stands for its share of all passages."""
 _CELLS = (9, 7)
-"""Cells of the picture, across and down, in whose middles the depth error is looked at."""
+"""Cells of the picture, across and down, in whose middles the depth error is computed."""
 BORDER_PX = 2.0
 """Distance from the picture's border within which corners are not found."""
 
@@ -223,7 +226,7 @@ class Forecast:
         return float(np.sqrt(np.median(variance))) if variance.size else math.nan
 
     def _seen(self, pose: BoardPose) -> Sighting | None:
-        """The corners and passages that a board there would give, without errors; None if they are too few."""
+        """The corners and passages that a board at `pose` would give, without errors; None if they are too few."""
         model, board = self._fit.model, self._fit.board
         corners_m = board.corners_m
         x, y, found = _inside(model, pose.to_camera(corners_m))
@@ -256,7 +259,7 @@ class Forecast:
 
 
 def _next_velocities(fit: RigFit) -> tuple[float, ...]:
-    """The next pose's velocities: views take turns with a few sets of them, and the set shown longest ago is next."""
+    """The velocities of the next view's sweeps: views use a few sets in turn, and the one used longest ago is next."""
     shown = [tuple(sweep.direction * sweep.speed_per_s for sweep in view) for view in fit.sweeps if view]
     last = {velocities: turn for turn, velocities in enumerate(shown)}
     return min(last, key=last.__getitem__)
@@ -272,7 +275,7 @@ def _inside(model: RigModel, points: Array) -> tuple[Array, Array, NDArray[np.bo
 
 
 def _depth_by_free(fit: RigFit, at_m: float) -> Array:
-    """(points, free parameters): how the depth at places all over the picture changes with what was fitted."""
+    """(points, free parameters): derivatives of the depth at `at_m`, all over the picture, by what was fitted."""
     model = fit.model
     assert model.covariance is not None, "a fit has one"
     names = model.covariance.names

@@ -9,10 +9,11 @@ to half of that of the surrounding pixels: b = ln(2 e^(s + b0) - 1) - s, with b0
 the limit, and farther above its neighbours than counting and scatter explain. Fewer frames than `frames_for` cannot
 classify pixels near the limit.
 
-A noisy pixel is one whose counts scatter over blocks of frames more than counting statistics allow, as when its rate
-jumps (random telegraph noise). Index of dispersion: sum (n - e)^2 / e over the blocks, with e in proportion to the
-counts of ordinary pixels, so that a lamp or a warming sensor makes no pixel noisy. It is chi-square with blocks - 1
-degrees of freedom, except for the 1 - p of bits. `FALSE_ALARM` is the probability that a good pixel is called noisy.
+A noisy pixel is one whose counts n scatter over blocks of frames more than counting statistics allow, as when its rate
+jumps (random telegraph noise). The index of dispersion is the sum of (n - e)^2 / e over the blocks. The expected counts
+e are proportional to the counts of ordinary pixels, so that a lamp or a warming sensor makes no pixel noisy. Divided by
+1 - p, since frames hold bits, the index is chi-square with blocks - 1 degrees of freedom. `FALSE_ALARM` is the
+probability that a good pixel is called noisy.
 
 A dead pixel is one that hardly fires in light although its neighbours do. It cannot be recognised without light.
 
@@ -45,9 +46,9 @@ LEAST_COUNTS = 10.0
 """A pixel's mean counts in a block from which on chi-square describes their scatter; quieter ones are not judged."""
 LEAST_BLOCKS, MOST_BLOCKS = 8, 64
 _APART, _ROUNDS = 6.0, 8
-"""Multiple of a count's sd plus 1 that an ordinary pixel may lie above the usual; rounds in which this is asked."""
+"""An ordinary pixel counts at most this multiple of (sd + 1) above the expected counts; rounds of this selection."""
 _MANY, _MOST_COMMON = 100, 1.5
-"""Scatter that so many pixels have in common is no fault of theirs, up to this factor in variance."""
+"""If so many pixels are judged, the scatter common to them is removed, up to this factor in variance."""
 
 
 class DarkTally:
@@ -82,7 +83,7 @@ class DarkTally:
         return kept
 
     def scatter(self) -> tuple[Array, NDArray[np.int64], Mask]:
-        """Index of dispersion (rows, width), 0 where it cannot be judged; its degrees of freedom; where it can."""
+        """Index of dispersion (rows, width), 0 if unknown; its degrees of freedom; a mask of where it is known."""
         ordinary = self.ordinary()
         blocks = np.zeros(self.ones.shape, np.int64)
         counts, expected, squares = (np.zeros(self.ones.shape) for _ in range(3))
@@ -102,11 +103,11 @@ class DarkTally:
             share = np.minimum(counts / self.frames, 1.0)
             few = LEAST_COUNTS * blocks
             judged = (blocks >= LEAST_BLOCKS) & (counts >= few) & (self.frames - counts >= few)
-            # What is expected was counted too, and scatters with the root of that.
+            # The expected counts were counted too, and scatter with the root of their sum.
             index = (squares * expected / counts - counts) / (1.0 - share + counts / max(compared, 1.0))
         index = np.where(judged, index, 0.0)
         dof = np.maximum(blocks - 1, 1)
-        if judged.sum() >= _MANY:  # afterpulses make everybody's counts scatter a little
+        if judged.sum() >= _MANY:  # afterpulses make the counts of all pixels scatter a little
             middle = np.median(index[judged] / (dof[judged] * (1 - 2 / (9 * dof[judged])) ** 3))
             index /= np.clip(middle, 1.0, _MOST_COMMON)
         return index, dof, judged
@@ -115,9 +116,10 @@ class DarkTally:
 SIGNAL = 0.1
 """Photons per pixel and exposure of the weakest stripes that are looked for: ten frames see one."""
 PRECISION = 0.02
-"""Relative sd of a rate at the limit: misplaces 0.6 % of the hot pixels if the number above r goes with r^-0.7."""
+"""Relative sd of a rate at the limit. 0.6 % of the hot pixels are misclassified if the number above a rate r goes with
+r^-0.7."""
 FALSE_ALARM = 1e-6
-"""Probability that a pixel without fault is called noisy, or dead: a quarter of one in 512 x 512."""
+"""Probability that a good pixel is called noisy, or dead: a quarter of a pixel in 512 x 512."""
 DEAD_SHARE = 0.1
 """Share of its neighbours' light below which a pixel is dead."""
 _HOT_SIGMA = 6.0
@@ -133,7 +135,7 @@ class PixelMap:
     float32, sd of the rate between blocks beyond that of counting, 0 if there is none or it is unknown. hot, noisy:
     bool. dead: None if there was no light. judged, lit_judged: share of the pixels that fired often enough to tell
     whether they are noisy, and that were lit well enough to tell whether they are dead. defects: pixels that are hot,
-    dead, or noisy and at times as fast as hot ones. limit_per_s: float32, the rate above which a pixel is hot. frames:
+    dead, or noisy with jumps that reach the limit. limit_per_s: float32, the rate above which a pixel is hot. frames:
     largest number of frames of a pixel. ordinary_per_s: mean dark rate of the ordinary pixels.
     """
 
@@ -275,15 +277,16 @@ def _chi_square_limit(dof: NDArray[np.int64], probability: float) -> Array:
 
 
 SIGNIFICANT = 5.0
-"""Sd of counting by which a rate must differ."""
+"""Counting sds by which a rate must differ to count as changed."""
 MOST_RATIO = 2.0
-"""Common factor between two maps from which on thresholds and learned rates of the old one are wrong: 8 to 10 K."""
+"""Common factor between two maps, as after 8 to 10 K, from which on limits and learned rates of the old one are wrong.
+"""
 MOST_NEW_DEFECTS = 0.005
-"""Share of all pixels that may have become defects."""
+"""Largest share of all pixels that may have become defects."""
 LEAST_ALIKE = 0.5
-"""Share of the old map's hot pixels that are hot again on the same sensor, at the least."""
+"""Least share of the old map's hot pixels that are hot again if the sensor is the same."""
 _LEAST_HOT = 10
-"""Fewer hot pixels tell one sensor from another by chance only."""
+"""Fewest hot pixels by which two sensors can be distinguished."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -291,11 +294,11 @@ class PixelDrift:
     """The change from an older map to a newer one.
 
     became_hot, became_dead, recovered: (n, 2) row and column; hot and recovered ones only if the change is more than
-    chance, dead ones only if both maps tell. ratio: of the ordinary pixels' rates, newer to older; ratio_sigma: its
-    distance from 1 in sd. changed: share of the pixels whose rates differ by more than chance after this factor is
-    removed. correlation: of the logarithms of the rates, NaN if fewer than two pixels have both or all
-    are equal. alike: share of the old hot pixels that are still hot, None if too few. new_defects:
-    share of all pixels that became hot or dead.
+    chance, dead ones only if both maps were made with light. ratio: of the ordinary pixels' rates, newer to older;
+    ratio_sigma: its distance from 1 in sd. changed: share of the pixels whose rates differ by more than chance after
+    this factor is removed. correlation: of the logarithms of the rates, NaN if fewer than two pixels have both or all
+    are equal. alike: share of the old hot pixels that are still hot, None if too few. new_defects: share of all pixels
+    that became hot or dead.
     """
 
     became_hot: NDArray[np.int64]
@@ -420,7 +423,7 @@ def save_pixels(version: PixelVersion, path: str | os.PathLike[str]) -> None:
 
 
 _DAMAGE = (ArithmeticError, AttributeError, KeyError, RecursionError, TypeError, ValueError)
-"""Errors that reading raises for a file that is not as it was written."""
+"""Errors that reading raises for a damaged file."""
 
 
 def load_pixels(path: str | os.PathLike[str]) -> PixelVersion:

@@ -8,7 +8,7 @@ from typing import Any, Final, Literal
 from calibration.errors import digits
 
 VerdictWord = Literal["passed", "failed"]
-"""A verdict as files have it."""
+"""A verdict as written in files."""
 SIGMAS: Final = 4.0
 """Standard deviations by which a result, such as the baseline, must differ from the stated one to count as wrong."""
 WORST_TIMES: Final = 4.0
@@ -16,13 +16,12 @@ WORST_TIMES: Final = 4.0
 
 
 AT_M: Final = 5.0
-"""Distance at which depth is judged unless another is asked for."""
+"""Distance at which depth is judged by default."""
 
 
 @dataclass(frozen=True, slots=True)
 class AccuracyGoal:
-    """The required quality of a calibration: sd of depth at a distance, and the baseline if somebody has
-    measured it."""
+    """The required quality of a calibration: sd of depth at a distance, and the baseline if it was measured."""
 
     accuracy_m: float
     at_m: float = AT_M
@@ -67,7 +66,7 @@ class Verdict:
 
 
 MOST_POSES: Final = 50
-"""Most poses that anybody shows: four times those of a usual calibration."""
+"""Most poses that can be expected of a person: four times those of a usual calibration."""
 
 _GUIDED = " ('--guided' says which)"
 _TELL_MORE = f"make each pose tell more, with more light, the board nearer and tilted more{_GUIDED}"
@@ -105,8 +104,7 @@ def more_poses(shown: int, what: str, found: tuple[float, float], asked: float, 
     """The reason if data are simply too few, with an estimate of how many poses would be enough.
 
     shown: number of poses so far. what: words for the error, with the verb. found, asked: errors (median, 95 %) and the
-    limit of the median; the text names the one that exceeds its limit more.
-    said: turns an error into text.
+    limit of the median; the text names the one that exceeds its limit more. said: turns an error into text.
     """
     over = [error / limit for error, limit in zip(found, (asked, WORST_TIMES * asked), strict=True)]
     worst = over[1] > over[0]

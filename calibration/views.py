@@ -1,8 +1,7 @@
 """One view of a calibration board held still: where its corners lie, and when the line passed over each pixel.
 
 A pixel's passage is the mirror command at which the line's centre crosses it. The pixel's albedo is the same in every
-column, so the board's print does not bias the passage, as it would bias a stripe sought along a row. Scatter is
-estimated by `robust_sd`, which a few wrong values do not affect.
+column, so the board's print does not bias the passage. It does bias the position of a stripe along a row.
 """
 
 from dataclasses import dataclass
@@ -56,8 +55,9 @@ class Corners:
 class Passages:
     """Mirror commands at which the line's centre crossed the pixels of one sweep.
 
-    x_px, y_px: (m,) float64. command: (m,) float64, the command at that instant, without any lag. sd: (m,) float64 in
-    command units. direction: +1 while the command rises, else -1. speed_per_s: size of the command's velocity, above 0.
+    x_px, y_px: (m,) float64. command: (m,) float64, the command at that instant, not corrected for lags. sd: (m,)
+    float64 in command units. direction: +1 while the command rises, else -1. speed_per_s: size of the command's
+    velocity, above 0.
     """
 
     x_px: Array
@@ -103,7 +103,7 @@ class BoardPose:
 
 
 MAD_TO_SD: Final = 1.4826
-"""Standard deviation over the median of the absolute value, of a normal distribution."""
+"""Standard deviation of a normal distribution, divided by the median of the absolute values."""
 
 
 def robust_sd(deviations: ArrayLike) -> float:

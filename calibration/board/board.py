@@ -32,7 +32,7 @@ _LENGTH = re.compile(r"(\d+(?:\.\d*)?|\.\d+)\s*([a-z]*)")
 
 
 def _metres(text: object) -> float:
-    """The length that a text such as '60 mm' means; a bare number is refused, as everywhere in the project."""
+    """The length in metres of a text such as '60 mm'. Raises ValueError for a number without a unit."""
     match = _LENGTH.fullmatch(text.strip()) if isinstance(text, str) else None
     if match is None or match[2] not in _METRES:
         raise ValueError(f"{text!r} is no length; write it with a unit ({', '.join(_METRES)}), like '60 mm'")
@@ -59,7 +59,7 @@ MARGIN_SQUARES = 0.5
 PAPER_SQUARES = 0.8 * MARGIN_SQUARES
 """Width, in squares, of the margin around the squares, and of that part of it which is surely white paper."""
 BUNDLED_BOARD = Path(__file__).parents[2] / "config" / "board.yaml"
-"""The board that the commands take when none is named."""
+"""File of the board that is used if none is named."""
 
 _FEWEST_SQUARES = 3
 """Fewest squares along a side; fewer leave less than 2 x 2 inner corners."""
@@ -72,10 +72,9 @@ class Board:
     """A printed board: number of squares along (x, y), their side in metres and, on a ChArUco board, the side of its
     markers.
 
-    dictionary: the name of an OpenCV dictionary, such as DICT_5X5_100. modules: (squares down, across, side, side),
-    True where a marker is black, its border included; squares without a marker are False. side: modules along a marker,
-    0 for a chessboard. Raises CalibrationError for a
-    board that cannot be printed.
+    dictionary: the name of an OpenCV dictionary, such as DICT_5X5_100. modules: the cells of all markers, (squares
+    down, across, side, side), True where black, the marker's border included; squares without a marker are False. side:
+    modules along a marker, 0 for a chessboard. Raises CalibrationError for a board that cannot be printed.
     """
 
     kind: Literal["charuco", "chessboard"]
@@ -188,8 +187,8 @@ class Board:
 
 
 def load_board(path: str | os.PathLike[str] | None = None) -> Board:
-    """The board that a YAML file describes; None: the bundled one. Raises CalibrationError, with one line, if the file
-    describes none.
+    """Read a board from a YAML file. path None: the bundled board. Raises CalibrationError if the file describes no
+    board.
     """
     file = BUNDLED_BOARD if path is None else Path(path)
     read = load_yaml(file, "a board", "kind: charuco")
@@ -208,6 +207,6 @@ def _dictionary(name: str) -> cv2.aruco.Dictionary:
 
 
 def spread_rad(poses: Sequence[BoardPose]) -> float:
-    """The largest angle (rad) between the normals of any two of the boards; there must be one at least."""
+    """The largest angle (rad) between the normals of any two of the boards. poses: at least one."""
     normals = np.stack([pose.matrix[:, 2] for pose in poses])
     return float(np.arccos(np.clip(normals @ normals.T, -1, 1)).max())

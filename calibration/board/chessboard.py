@@ -1,13 +1,14 @@
 """Finds a plain chessboard in a picture. OpenCV finds a grid; the squares around it tell whether it is the board.
 
-OpenCV finds the grid that it is asked for in any larger print too, and sometimes in a smaller one, with false corners.
-So a grid counts as the board only if its print has exactly as many corners as the board, as far as the picture shows.
+If asked for a grid of some size, OpenCV also finds one in any larger print, and sometimes one with false corners in a
+smaller print. So a grid counts as the board only if its print has exactly as many corners as the board, as far as the
+picture shows.
 
-Where four squares meet, the light changes across the line between them, above the corner in one direction and below it
-in the other; along a row of corners the direction alternates. A row that was only guessed, or that lies on the edge of
-the print, shows no such change on its outer side. A row that continues outside the grid does show it. So a grid is cut
-down to the real corners, and extended while more of them follow (`known_lattice`). What lies outside the picture is
-unknown.
+At a corner four squares meet. The brightness changes from left to right: in one direction above the corner, in the
+other below it. Along a row of corners the direction alternates. A row of corners that OpenCV only guessed, or that lies
+on the edge of the print, shows no such change on its outer side. Where the print goes on outside the grid, the change
+is visible there too. So a grid is cut down to the real corners, and extended while more of them follow
+(`known_lattice`). What lies outside the picture is unknown.
 """
 
 import itertools
@@ -26,18 +27,20 @@ from calibration.board.registration import SUBPIXELS, WIDE, BoardMap, Drawing, f
 Picture = NDArray[np.float32]
 
 _OFFSETS = np.array([0.1, 0.2, 0.3, 0.4])
-"""Squares from a corner at which the change is looked at: clear of its edges, and within half an outer square."""
+"""Distances from a corner, in squares, at which the change is measured: clear of the edges that meet in the corner, and
+within the nearer half of an outer square."""
 _THERE = 0.3
 _GOES_ON = 0.5
-"""Least change across a line outside the grid, as a share of that in the grid, for another row to follow there. In
-OpenCV's 26 chessboard pictures a row that is there has 0.75 to 1.15 of it, one that is not 0.09 at most."""
+"""Least change of brightness, as a share of the usual one in the grid. _THERE: for a corner or an outer row to be real.
+_GOES_ON: outside the grid, for another row to follow there. In OpenCV's 26 chessboard pictures the share is 0.75 to
+1.15 where a row follows, and 0.09 at most where none does."""
 _LEAST_ALIKE = 0.8
 """Least share of a grid's corners that must show the change; in noise half of them do."""
 _FEWEST = 2
-"""Fewest corners along a side, and fewest changes that tell of a row."""
+"""Fewest corners along a side, and fewest measured changes from which a row is judged."""
 _OUTLIER_SQUARES = 0.4
 _MOST = 100
-"""Most corners along a side: a board may have as many squares."""
+"""Most corners along a side: no board has more squares."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -64,14 +67,14 @@ class Lattice:
 
     @property
     def known(self) -> tuple[bool, bool]:
-        """Whether the number along (x, y) is that of the whole print, because its end is visible on both sides."""
+        """For (x, y): whether these are all corners of the print, because its end is visible on both sides."""
         upper, right, lower, left = (change < _GOES_ON for change in self.beyond)
         return left and right, upper and lower
 
 
 def known_lattice(picture: Picture, px: Array) -> Lattice | None:
-    """The real corners, from a grid (down, across, 2) that may have some too many or too few; None if it is no
-    chessboard.
+    """The real corners, from a grid (down, across, 2) that may have rows too many or too few; None if the picture shows
+    no chessboard there.
     """
     cut = _cut_down(picture, px)
     if cut is None:
@@ -87,9 +90,10 @@ def known_lattice(picture: Picture, px: Array) -> Lattice | None:
 class _Seen:
     """Light around the corners of a grid.
 
-    map: to pixels from squares, counted from the outer corner of the grid's top left one. usual: usual change across a
-    line, positive if the top left square is black. alike: share of the corners that have such a change. own: change on
-    the outer side of the uppermost row, as a share of the usual one; NaN where it is not visible.
+    map: to pixels, from positions in squares whose origin is the outer corner of the top left square. usual: usual
+    change of brightness at a corner, positive if the top left square is black. alike: share of the corners that have
+    such a change. own: change on the outer side of the uppermost row, as a share of the usual one; NaN where it is not
+    visible.
     """
 
     map: BoardMap
@@ -111,7 +115,7 @@ def _cut_down(picture: Picture, px: Array) -> Array | None:
 
 
 def _grown(picture: Picture, px: Array) -> Array:
-    """The grid with the rows that follow outside."""
+    """The grid, extended on all sides by the rows of corners that follow."""
     turn = kept = 0
     while kept < 4 and max(px.shape[:2]) < _MOST:
         turned = np.rot90(px, turn)
@@ -142,7 +146,7 @@ def _seen(picture: Picture, px: Array) -> _Seen | None:
 
 
 def _seen_beyond(picture: Picture, px: Array) -> float:
-    """The change in the row of squares above the grid's uppermost, as a share of the usual; NaN where not seen."""
+    """The change at the next row of corners above the grid, as a share of the usual one; NaN if not seen."""
     seen = _seen(picture, px)
     if seen is None:
         return np.nan
@@ -166,7 +170,9 @@ def _change(picture: Picture, board_map: BoardMap, x: NDArray[np.integer], y: ND
 
 
 def _row_above(picture: Picture, px: Array) -> Array | None:
-    """(across, 2) corners above the uppermost row, at their expected places where not found; None if most are not."""
+    """(across, 2) corners above the uppermost row. A corner that is not found is put at its expected place; None if
+    most are not found.
+    """
     seen = _seen(picture, px)
     if seen is None:
         return None
@@ -190,7 +196,7 @@ def _row_above(picture: Picture, px: Array) -> Array | None:
 
 
 def _map(px: Array) -> BoardMap | None:
-    """The map to pixels from squares, counted from the outer corner of the grid's top left one."""
+    """The map of `_Seen` through the corners of a grid; None if no smooth map fits them."""
     board = _board(px.shape[1], px.shape[0])
     points = px.reshape(-1, 2)
     side = np.median(np.linalg.norm(np.diff(px, axis=1), axis=-1))
@@ -211,12 +217,14 @@ def _median(values: Array) -> float:
 _SMALLEST_PARTS = ((4, 4), (3, 3))
 """Inner corners of a chessboard that count as a part of one; small ones are more often found where none is."""
 _FORMS_FOR_PARTS = ((1, 0.0), (1, 1.5), (2, 0.8))
-"""(enlargement, smoothing), as FORMS: quick ones, since a part is looked for where the whole was not found."""
+"""(enlargement, smoothing), as in FORMS; few and quick ones, since they are tried after all of FORMS have failed."""
 _NOTHING = MatchedPoints(np.zeros((0, 2)), np.zeros((0, 2)), 0)
 
 
 def find_chessboard(shown: Gray, board: Board) -> MatchedPoints:
-    """The board's inner corners, from its top left if that can be told; or no points, but `part` or `other` if seen."""
+    """The board's inner corners, from its top left if the print shows which corner that is. If only a part of it or
+    another chessboard is seen, there are no points, and `part` or `other` says so.
+    """
     seen: Lattice | None = None
     for form in FORMS:
         lattice = _lattice(shown, _grid(shown, board, form))
@@ -244,7 +252,7 @@ def _as_grid(corners: ArrayLike, shape: tuple[int, ...], scale: int) -> Array:
 
 
 def _grid(shown: Gray, board: Board, form: tuple[int, float]) -> Array | None:
-    """A grid with as many corners as the board; None if there is none."""
+    """The corners (down, across, 2) that OpenCV finds for the board's own grid; None if it finds none."""
     flags = cv2.CALIB_CB_ADAPTIVE_THRESH | cv2.CALIB_CB_NORMALIZE_IMAGE | cv2.CALIB_CB_FAST_CHECK
     picture = as_form(shown, *form)
     found, corners = cv2.findChessboardCorners(picture, board.grid, flags=flags)
@@ -282,7 +290,7 @@ def _is_whole(lattice: Lattice, board: Board) -> bool:
 def _unlike(lattice: Lattice, board: Board) -> MatchedPoints:
     """A part of the board, or another one."""
     count = lattice.px.size // 2
-    may_be = any(  # either way round it has as many corners as are seen, or more where they may go on
+    may_be = any(  # with x and y as they are or exchanged: the corners seen are all, or more may follow
         all(
             seen == has if known else seen <= has
             for seen, known, has in zip(lattice.least, lattice.known, grid, strict=True)
@@ -301,9 +309,10 @@ def _unlike(lattice: Lattice, board: Board) -> MatchedPoints:
 def _from_top_left(px: Array, shown: Gray, board: Board) -> tuple[Array, bool]:
     """The grid numbered as the board is, and whether it is the board's mirror image.
 
-    The numbering is turned so that x to y is clockwise in the picture, as it is from in front of the board, then by
-    half a turn where the top left square would be white. With both sides even, or both odd, a half turn changes no
-    colour: then x runs to the right. With the same even number along both sides a quarter turn does.
+    First the rows are ordered so that x to y is clockwise in the picture, as in front of the board. If one number of
+    squares is odd and the other even, the numbering is then turned by half a turn if the top left square would be
+    white. Otherwise half a turn changes no colour, and x is made to run to the right; if both numbers are the same, a
+    quarter turn comes first if the top left square would be white.
     """
     (along_x, along_y), (below_x, below_y) = np.mean(px[:, -1] - px[:, 0], axis=0), np.mean(px[-1] - px[0], axis=0)
     if along_x * below_y < along_y * below_x:
@@ -325,7 +334,7 @@ def _top_left_is_black(px: Array, shown: Gray) -> bool:
     height, width = shown.shape
     x = np.clip(np.round(middles[..., 0]).astype(int), 0, width - 1)
     y = np.clip(np.round(middles[..., 1]).astype(int), 0, height - 1)
-    # The first square between corners is the second along both sides: of the top left one's colour.
+    # The first square between corners is the second of the board along x and y, so it has the top left one's colour.
     same = np.add.outer(np.arange(middles.shape[0]), np.arange(middles.shape[1])) % 2 == 0
     light = shown[y, x].astype(np.float64)
     return bool(light[same].mean() < light[~same].mean())

@@ -20,11 +20,11 @@ from calibration.errors import Degenerate
 from calibration.views import Corners
 
 _REACHES = (1, 2, 4)
-"""Half width of the neighbourhood, in pixels; the next one where all of it is unusable."""
+"""Half widths of the neighbourhood, in pixels. The next one is used where a whole neighbourhood is unusable."""
 
 
 def repaired(picture: NDArray[np.generic], defects: NDArray[np.bool_] | None = None) -> NDArray[np.float32]:
-    """The picture with defects (True) and non-finite values replaced by the median of their neighbours, 0 if none."""
+    """The picture with defects (True) and non-finite values replaced by the median of usable neighbours, 0 if none."""
     values: NDArray[np.float32] = np.array(picture, dtype=np.float32)
     bad = ~np.isfinite(values)
     if defects is not None:
@@ -45,16 +45,18 @@ def repaired(picture: NDArray[np.generic], defects: NDArray[np.bool_] | None = N
 LEAST_SHARE = 0.5
 """A view must show more than this share of the board's corners."""
 _SECOND_BOARD_MARKERS = 4
-"""Markers that lie on a board of their own and are too many for misreadings."""
+"""Fewest markers off the board that count as a second board: so many are not misread in a consistent way."""
 _MAP_OUTLIER_SQUARES = 0.4
-"""Distance from the homography, in squares, that no lens bends a board by and every misread marker exceeds."""
+"""Largest distance of a point from the homography, in squares. Lenses bend a board by less; misread markers are farther
+off."""
 _GROWTH_SQUARES = 1.6
-"""Distance from the known part of a board to the next corners; beyond, a map through a few markers leads astray."""
+"""Distance from the known part of a board to the next corners; beyond, a map through a few markers is too wrong."""
 _OUTLIER_SDS = 6.0
-"""Sds that a corner may lie off the map, or the two lengths below if larger: a lens bends more than the map."""
+"""Sds that a corner may lie off the map. The limit is at least _LEAST_OUTLIER_PX and _LEAST_OUTLIER_SQUARES, since a
+lens bends more than the map."""
 _LEAST_OUTLIER_PX = 0.3
 _MOST_USUAL_SDS = 4.0
-"""Largest ratio of a corner's sd to that of its neighbours: beyond, the drawing was laid over something else."""
+"""Largest ratio of a corner's sd to the median one: beyond, the drawing was matched to something else."""
 _LEAST_OUTLIER_SQUARES = 0.02
 
 
@@ -108,7 +110,9 @@ def _another(sighting: MatchedPoints, rest: NDArray[np.bool_], limit_px: float, 
 def _refined(
     values: NDArray[np.float32], board: Board, rough: BoardMap, sighting: MatchedPoints
 ) -> tuple[NDArray[np.int32], Array, Array]:
-    """Find all corners: around the rough map, then, growing, around better ones; last, each on pixels of its own."""
+    """Find all corners: first close to the rough map, then farther out with maps through the corners found so far, and
+    last each on pixels that no other corner uses.
+    """
     corners_m = board.corners_m[:, :2]
     side = sides_px(board, rough, np.array([board.size_m]) / 2)[0]
     drawing = Drawing.of(board, SUBPIXELS * side)
@@ -158,7 +162,7 @@ def _not_found(sighting: MatchedPoints, board: Board) -> Degenerate:
 
 
 def _too_few(found: int, board: Board, board_map: BoardMap, shape: tuple[int, ...]) -> Degenerate:
-    # Without the bend, which grows without limit beyond the points that it goes through.
+    # Without the polynomial, which grows without limit outside the points that it was fitted to.
     expected = replace(board_map, bend_px=np.zeros_like(board_map.bend_px)).to_px(board.corners_m[:, :2])
     height, width = shape
     beyond = {

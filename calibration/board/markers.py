@@ -1,10 +1,10 @@
-"""Finds markers, and checks that they stand as a board's file says.
+"""Finds markers, and checks that their places and ids agree with the board's file.
 
-Their places on the lattice of squares are found without their ids. A marker's own outline tells where the neighbouring
-squares are. Going from one marker to the next gives all markers of
-a print whole-number places (column, row). A layout gives each id its place. If a layout other than the stated one fits
-clearly more of the markers, the print is another board. Ids run row by row over the white squares, starting from 0
-unless chosen otherwise; OpenCV before 4.6 began boards of an even number of rows with a white square.
+First each marker gets a place (column, row) on the lattice of squares, without using its id: the outline of a marker
+tells where the neighbouring squares are, and so on from marker to marker. A layout says at which place each id should
+be. If a layout other than the stated one fits clearly more of the markers, the print is another board. Ids run row by
+row over the white squares, usually from 0. OpenCV before 4.6 began boards with an even number of rows with a white
+square.
 """
 
 from collections.abc import Iterator
@@ -20,22 +20,22 @@ from calibration.board.board import Board
 Places = NDArray[np.int64]
 
 _NEXT_SQUARES = 2.5
-"""Farthest from a placed marker to the next while few are placed, later twice that; they are 1.4 squares apart."""
+"""Farthest from a placed marker to the next while few are placed, later twice that. Neighbours: 1.4 squares."""
 _OFF_SQUARES = 0.3
-"""Farther from the middle of a square, a marker is none of this lattice."""
+"""Largest distance of a marker of this lattice from the middle of a square."""
 _MOST_TURN_RAD = 0.6
 _FOR_HOMOGRAPHY = 4
 _MOST_ACROSS = 40
 _CLEARLY_MORE = 2
-"""Markers that are where another layout has them: single ones are misread."""
+"""By how many more markers another layout must fit: single ones may be misread."""
 _LEAST_SHARE = 0.6
-"""Share of a lattice's markers that a layout must put where they are."""
+"""Least share of a lattice's markers that a layout must fit."""
 _EDGE_SQUARES = 0.2
 """Distance beyond a row at which the next one is looked for: within the white paper around a print."""
 _WHITE_PERCENT = 90
 """Percentile of the pixels among markers that counts as white; half of these pixels are white."""
 _FEWEST = 6
-"""Fewest markers of which a share tells anything."""
+"""Fewest markers for which _LEAST_SHARE is meaningful."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -48,7 +48,7 @@ class Markers:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class _Layout:
-    """Number of squares across; white_first: whether the top left one is white; the first marker's id."""
+    """An order of ids. across: squares along a row. white_first: whether the top left square is white."""
 
     across: int
     white_first: bool = False
@@ -68,7 +68,7 @@ class _Layout:
 
 
 def contradiction(read: Markers, board: Board, shown: NDArray[np.uint8]) -> str | None:
-    """Text on how the markers read in the picture `shown` do not fit the board; None if they do."""
+    """Say how the markers that were `read` in the picture `shown` contradict the board; None if they fit it."""
     assert board.marker_m is not None, "asked of boards with markers"
     placed, lattice = _lattice(read.px, board.marker_m / board.square_m)
     ids, lattice = read.ids[placed], lattice[placed]
@@ -79,7 +79,7 @@ def contradiction(read: Markers, board: Board, shown: NDArray[np.uint8]) -> str 
     if fitting < different:
         others = list(_others(board, int(ids.min())))
         support = [_support(layout, ids, lattice)[0] for layout in others]
-        best = int(np.argmax(support))  # of several the likeliest
+        best = int(np.argmax(support))  # the first, and so the likeliest, of equally good ones
         if support[best] >= max(fitting + _CLEARLY_MORE, _LEAST_SHARE * different):
             return _named(others[best], ids, board)
         if different >= _FEWEST and fitting < _LEAST_SHARE * different:
@@ -88,10 +88,10 @@ def contradiction(read: Markers, board: Board, shown: NDArray[np.uint8]) -> str 
 
 
 def _others(board: Board, least_id: int) -> Iterator[_Layout]:
-    """The layouts that may have been printed, the likeliest first; among them the board's own, with rows without end.
+    """The layouts that may have been printed, the likeliest first. The first is the board's own, with more rows.
 
-    Ids repeat their pattern every two rows, which hold as many as a row has squares: first ids farther below the least
-    one that was read put markers where one of these does.
+    least_id: the lowest id that was read. The pattern of places repeats every two rows, which together hold as many
+    markers as a row has squares. So lower first ids than those tried here fit no differently.
     """
     across, down = board.squares
     yield _Layout(across)
@@ -130,7 +130,7 @@ def _support(layout: _Layout, ids: Places, lattice: Places) -> tuple[int, Places
 
 
 def _lattice(px: Array, marker_squares: float) -> tuple[NDArray[np.bool_], Places]:
-    """The markers (n, 4, 2) on one lattice: a mask (n,) of as many as can be, and their (n, 2) columns and rows."""
+    """The lattice that holds the most of the markers (n, 4, 2): a mask (n,) of these, and (n, 2) columns and rows."""
     best, places = np.zeros(len(px), np.bool_), np.zeros((len(px), 2), np.int64)
     tried = np.zeros(len(px), np.bool_)
     for start in np.argsort([-cv2.contourArea(corners.astype(np.float32)) for corners in px]):
@@ -165,7 +165,10 @@ def _grown(px: Array, start: int, marker_squares: float) -> tuple[NDArray[np.boo
 
 
 def _map_to_lattice(places: Places, px: Array, marker_squares: float) -> Array | None:
-    """(3, 3) from pixels to squares, (0, 0) the middle of the first; affine for few markers: its errors grow less."""
+    """Map (3, 3) from pixels to squares, with the first one's middle at (0, 0); None if the markers determine none.
+
+    It is affine for few markers, since its errors grow less with distance.
+    """
     corners = np.array([[-1, -1], [1, -1], [1, 1], [-1, 1]]) * (marker_squares / 2)
     lattice, seen = (places[:, None] + corners).reshape(-1, 2), px.reshape(-1, 2)
     if len(places) < _FOR_HOMOGRAPHY:
@@ -180,7 +183,7 @@ def _map_to_lattice(places: Places, px: Array, marker_squares: float) -> Array |
 
 
 def _ends_early(board: Board, shown: NDArray[np.uint8], px: Array, places: Places) -> str | None:
-    """Words for a print that shows white paper below its last markers, where the board has black squares; or None."""
+    """Say that the print has white paper below its last markers, where the board has black squares; None otherwise."""
     across, down = board.squares
     assert board.marker_m is not None, "asked of boards with markers"
     to_lattice = _map_to_lattice(places, px, board.marker_m / board.square_m)
@@ -215,7 +218,7 @@ Gray = NDArray[np.uint8]
 FORMS = ((1, 0.0), (2, 0.8), (3, 0.8), (2, 1.5), (4, 1.2))
 """(enlargement, smoothing in pixels of the picture), in the order they are tried (docs/how-to/calibration.md)."""
 _ENOUGH = 0.9
-"""Share of the markers at which no further form is tried."""
+"""Share of the markers from which on no further form is tried."""
 _DARKEST, _BRIGHTEST = 0.5, 99.5
 """Percentiles that become black and white: a hot pixel or a lamp is neither."""
 

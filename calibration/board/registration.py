@@ -1,8 +1,8 @@
 """Locates corners to a few hundredths of a pixel by matching the board, drawn as it should look around each, to the
 picture.
 
-A smooth map leads from the board to the picture. It is a homography and, if there are enough points, a polynomial for
-the distortion of the lens. It needs no camera model. It is fitted to points whose board positions are known, and tells
+A smooth map leads from the board to the picture: a homography and, if there are enough points, a polynomial for the
+distortion of the lens. The map needs no camera model. It is fitted to points whose board positions are known, and tells
 where corners should be and how the board looks around each. The polynomial is a function of the position in the
 picture, not on the board. Lens distortion is a polynomial there, whatever the board's tilt; on a tilted board it is
 not. Fitting it on the board moves corners by less than 0.002 px, but equally in all pictures, which makes focal lengths
@@ -11,8 +11,8 @@ wrong by 0.025 % at k1 = 0.2.
 Around a corner the picture is offset + gain * (1 + slopes) * drawn board, shifted by (dx, dy); the shift that fits best
 tells where the corner is. All edges around it, those of the markers included, contribute, so a picture of few photons
 gives a tenth of the error of cv2.cornerSubPix (docs/how-to/calibration.md). The fit is weighted least squares by
-Gauss-Newton, with a variance proportional to the light, as for photons. Pixels far off (such as an unlisted hot pixel)
-do not count.
+Gauss-Newton, with a variance proportional to the light, as for photons. Outliers (such as an unlisted hot pixel) do not
+count.
 
 The drawing is bent as the map bends around each corner, and is as fine as the picture it is compared with. A homography
 without the bend, or edges rounded to drawn pixels, would move all corners of a picture alike by some 0.002 px, which no
@@ -31,9 +31,9 @@ from calibration.board.board import MARGIN_SQUARES, Board
 _PX_PER_SQUARE = (32, 256)
 """Least and most pixels of the drawing per square."""
 _MOST_PX = 1 << 25
-"""Most pixels of a drawing, 128 MB. Boards of more than 21 x 21 squares reach it; the largest there are get 57 pixels a
-square. Fewer pixels cost precision: 30 x 29 squares, each 17 to 24 pixels in the picture, have corners off by 0.0018 px
-when drawn 134 to a square, and by 0.0009 px at 256."""
+"""Most pixels of a drawing, 128 MB. Boards of more than 21 x 21 squares can reach it; the largest ones allowed are
+drawn with 57 pixels per square. Fewer pixels cost precision: 30 x 29 squares, each 17 to 24 pixels wide in the picture,
+have corners off by 0.0018 px if drawn with 134 pixels per square, and by 0.0009 px with 256."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -74,7 +74,7 @@ _BENDS = ((30, 3), (12, 2))
 """(least number of points, degree of the polynomial): two points to a term at least."""
 _FEWEST_POINTS = 4
 _KEPT_SHARES = (0.8, 0.8, 1.0)
-"""Shares of the points, the closest ones, that the polynomial is fitted to in turn: one far off must not bend it."""
+"""Shares of the points, the best fitting ones, that the polynomial is fitted to in turn: outliers must not bend it."""
 _OUTLIER_MEDIANS = 5.0
 _LEAST_OUTLIER_PX = 0.3
 
@@ -109,7 +109,8 @@ def fit_map(
 ) -> tuple[BoardMap, NDArray[np.bool_]] | None:
     """The map through points (n, 2) seen at px (n, 2), and which of them it fits; None if no four agree.
 
-    outlier_px: most distance from the homography. With a polynomial, points within five times the usual distance fit.
+    outlier_px: largest distance from the homography. If there is a polynomial, a point fits that is off by at most five
+    times the median distance, or by 0.3 px.
     """
     if len(points_m) < _FEWEST_POINTS:
         return None
@@ -152,40 +153,41 @@ def _terms(at: Array, degree: int) -> Array:
 
 
 SUBPIXELS = 12
-"""Samples drawn per pixel and axis before they are averaged over the pixel's area; even. A drawing is as fine, within
-_PX_PER_SQUARE: of squares wider than 21 pixels it is coarser, and interpolated.
+"""Samples drawn per pixel and axis before they are averaged over the pixel's area; even. The drawing is as fine, within
+_PX_PER_SQUARE: for squares wider than 21 pixels it is coarser, and interpolated.
 
-Corners are off with 6 by 0.0020 px without noise, alike enough in all pictures to move focal lengths by 60 ppm; with 12
-by 0.0012 px, most of it the pictures' own drawing, and 30 ppm.
+With 6 samples and no noise, corners are off by 0.0020 px, alike enough in all pictures to change focal lengths by 60
+ppm. With 12 they are off by 0.0012 px, most of it from the drawing of the test pictures, and focal lengths by 30 ppm.
 """
 WIDE, OWN = 0.9, 0.5
-"""Reach of the patch around a corner, in squares. WIDE, to find it: short of the next corners. OWN: halfway to them, so
-that no two corners share pixels, and their errors are as independent as a fit takes them to be."""
+"""Reach of the patch around a corner, in squares. WIDE, to find the corner: short of the next corners. OWN: halfway to
+the next ones, so that no two corners share pixels and their errors are independent, as a fit assumes."""
 _MOST_REACH_PX = 16
 _LEAST_REACH_PX = 4
 _SEARCH_SQUARES = 0.25
 """Farthest search for a corner: beyond, a shift could mistake one module of a marker for the next."""
 _POWERS = [(i, j) for i in range(4) for j in range(4 - i)]
-"""Powers of x and y that place the drawing around a corner: a tilt and a lens bend no more over two squares."""
+"""Powers of x and y that place the drawing around a corner: enough for a tilt and a lens over two squares."""
 _AROUND = np.stack(np.meshgrid(*2 * [np.linspace(-1.25, 1.25, 7)]), axis=-1).reshape(-1, 2)
 """Points, in units of the reach, that the polynomial is fitted to: over the patch and a pixel more on every side."""
 _STEPS = 4
 _SETTLED_SDS = 0.1
-"""A step this small ends the iteration: what is left is a tenth of it."""
+"""A step of fewer sds of the corner ends the iteration: the remaining error is a tenth of the step."""
 _OUTLIER_SDS = 5.0
 _DARK_SHARE = 0.05
-"""Noise that is there without light, as a share of the picture's white."""
+"""Least variance of a pixel, as a share of the variance on white."""
 _LEAST_MATCH = 0.4
-"""Correlation of picture and drawing; a board under few photons gives 0.5, anything else 0.2."""
+"""Least correlation of picture and drawing. A board under few photons gives 0.5, anything else 0.2."""
 _MOST_SD_PX = 0.5
 _DRAWING_SD_PX = 0.003
-"""Error of the drawing itself, with room: 0.0012 px without noise, but in part alike in many pictures."""
+"""Error of the drawing itself. Measured are 0.0012 px without noise; more is assumed, since part of the error is alike
+in many pictures."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class _Place:
-    """A corner's surroundings: its pixel, the side of a square, the half width of its patch, and (4, 4, 2) powers that
-    map the picture to the drawing.
+    """A corner's surroundings: its expected pixel, the side of a square and the half width of its patch in pixels, and
+    (4, 4, 2) coefficients of the polynomial from picture to drawing.
     """
 
     expected_px: Array
@@ -221,7 +223,7 @@ def sides_px(board: Board, board_map: BoardMap, corners_m: Array) -> Array:
 
 
 def _places(drawing: Drawing, board_map: BoardMap, ids: NDArray[np.int32], reach_squares: float) -> list[_Place]:
-    """The places where the map has the corners, each with how the drawing lies there."""
+    """The places where the map puts the corners, each with its polynomial from picture to drawing."""
     board = drawing.board
     corners_m = board.corners_m[ids, :2]
     sides = sides_px(board, board_map, corners_m)
@@ -236,7 +238,7 @@ def _places(drawing: Drawing, board_map: BoardMap, ids: NDArray[np.int32], reach
 
 
 def _bent(at: Array, drawn: Array) -> Array | None:
-    """The polynomial from picture to drawing; None if a map gone astray squeezes the board into a line."""
+    """The polynomial from picture to drawing; None if a wrong map squeezes the board into a line."""
     if not np.isfinite(at).all():
         return None
     i, j = np.array(_POWERS).T
@@ -285,7 +287,7 @@ def _draw(
     drawing: Drawing, place: _Place, to_drawing: Array, shift: Array, box: tuple[int, int, int, int]
 ) -> tuple[Array, Array, Array]:
     """The drawing on pixels x0:x1, y0:y1 with everything moved by `shift`, averaged over each pixel's area; and its
-    changes per pixel of shift along x and y.
+    slopes per pixel along x and y.
     """
     x0, y0, x1, y1 = box
     n = SUBPIXELS
@@ -326,7 +328,7 @@ def _best_whole_shift(
 
 
 def _shift(seen: Array, drawn: Array, along_x: Array, along_y: Array) -> tuple[float, float, float] | None:
-    """(dx, dy, sd) that brings the drawing onto what is seen; None if the drawing is not there."""
+    """(dx, dy, sd) of the shift that brings the drawing onto the picture; None if the picture does not show it."""
     rows, columns = seen.shape
     x, y = np.linspace(-1, 1, columns), np.linspace(-1, 1, rows)[:, None]
     light = np.stack([np.ones_like(drawn), drawn, drawn * x, drawn * y], axis=-1).reshape(-1, 4)

@@ -6,12 +6,13 @@ only by noise and by one constant for each direction (the remaining error of the
 of single sweeps, a sign that exposures are not locked to the mirror. If no view has two sweeps, they are measured
 against each sweep's own straight line. Medians in bins keep bad passages out.
 
-A fit of everything may move a board by a millimetre to fit the light. So each pose is taken from the corners alone,
-with camera and mirror as fitted. The passages are then off the light by what the views disagree on: only the noise of
-the poses if one rig saw them all, and a shift of each view if camera or mirror moved in between.
+The fit of the whole rig may move a board by a millimetre to fit the light planes. So each pose is fitted again to the
+corners alone, with camera and mirror as fitted before. The distance of the passages from the light planes then shows
+how much the views disagree: only by the noise of the poses if one rig saw them all, or by a shift of each view if
+camera or mirror moved in between.
 
-If few passages are left, as in bright room light, a mean square is mostly noise; its largest plausible size is returned
-too.
+With few passages, as in bright room light, a mean square is mostly noise. The largest value that may be noise is
+returned too.
 """
 
 import math
@@ -32,7 +33,8 @@ BINS = 24
 """Bins of the command range: wide enough for tens of passages each, narrow enough for a wave of several turns."""
 _FEWEST_IN_BIN = 5
 _LEAST_SHARE_IN_BIN = 0.25
-"""Share of a sweep's usual bin contents that a bin must hold: noise has chosen the members of a nearly empty one."""
+"""Least number of passages in a bin, as a share of the usual number in the sweep's bins: those of a nearly empty bin
+are there by chance."""
 _FEWEST_BINS = 4
 _MEDIAN_VARIANCE = np.pi / 2
 """Variance of a median in units of the mean's, normal distribution."""
@@ -98,7 +100,9 @@ def _binned(sweeps: Sequence[SweepFit], edges: Array) -> tuple[Array, Array]:
 
 
 def _between(left: Array, variance: Array, views: Sequence[Sequence[int]]) -> tuple[float, float]:
-    """Mean square of what tells the sweeps of a view apart, NaN where no view has two; and its sd, were all noise."""
+    """Mean square of the differences between sweeps of a view without the noise, and its sd if all were noise; NaN if
+    no view has two sweeps.
+    """
     found = weight = chance = 0.0
     for rows in views:
         if len(rows) > 1:
@@ -112,7 +116,9 @@ def _between(left: Array, variance: Array, views: Sequence[Sequence[int]]) -> tu
 
 
 def _off_lines(left: Array, variance: Array) -> tuple[float, float]:
-    """Mean square of single sweeps off their straight lines, NaN if none is long enough; sd as in `_between`."""
+    """Mean square of the distances of sweeps from their own straight lines, and its sd, as in `_between`; NaN if no
+    sweep is long enough.
+    """
     found = weight = chance = 0.0
     bins = np.arange(BINS)
     for values, noise in zip(left, variance, strict=True):
@@ -131,18 +137,18 @@ def _off_lines(left: Array, variance: Array) -> tuple[float, float]:
 _STEP = 1e-6
 """Change for differences: of the command as a share of its range, of a pose in rad and m."""
 _ROUNDS = 8
-"""Rounds in which a pose settles with the weights of its corners."""
+"""Rounds in which a pose and the weights of its corners are fitted in turn."""
 _FEWEST_TO_SPLIT = 4
 MOST_MISFIT = 3.0
-"""Factor on the variances up to which the views are taken to agree."""
+"""Largest misfit, a factor on the variances, at which the views count as in agreement."""
 MOST_UNEXPLAINED = 0.35
-"""Share of the shifts' variance that a single move may leave."""
+"""Largest share of the shifts' variance that may remain for a single move to explain them."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class ViewShift:
-    """Shift of one view in command units: the median of its passages off the light, and its sd from the pose's
-    noise."""
+    """Shift of one view in command units: the median distance of its passages from the light planes, and its sd from
+    the pose's noise."""
 
     name: str
     shift: float
@@ -174,8 +180,8 @@ def common_shift(shifts: tuple[ViewShift, ...], wave: float, sweeps: int) -> tup
 
 
 def counted(shifts: tuple[ViewShift, ...], outliers: tuple[str, ...], misfit: float = 1.0) -> tuple[ViewShift, ...]:
-    """The shifts that have to agree. A single outlier is left out, unless it is the last view or the others do
-    not fit."""
+    """The shifts that have to agree. A single outlier is left out if it is not the last view and the misfit is at most
+    MOST_MISFIT."""
     if len(outliers) != 1 or not shifts or shifts[-1].name in outliers or misfit > MOST_MISFIT:
         return shifts
     return tuple(one for one in shifts if one.name not in outliers)
@@ -193,7 +199,7 @@ def last_before_move(shifts: tuple[ViewShift, ...]) -> str | None:
 
 
 def _corner_pose(fit: RigFit, view: View, start: BoardPose) -> tuple[BoardPose, Array] | None:
-    """Pose by the corners alone, which count as they do in the fit, and its covariance (6, 6); None if they are few."""
+    """Pose from the corners alone, weighted as in the fit, and its covariance (6, 6); None for too few corners."""
     if view.corners is None:
         return None
     px = np.asarray(view.corners.px, np.float64)
@@ -225,7 +231,7 @@ def _shift(model: RigModel, name: str, pose: BoardPose, covariance: Array, sweep
 
 
 def _residual(model: RigModel, pose: BoardPose, sweep: SweepFit) -> Array:
-    """(m,) by how much the mirror's command is above the one whose light goes through the board's point."""
+    """(m,) mirror command of each passage minus the command at which the light goes through the board's point."""
     u, v = model.camera.tangents_at(sweep.x_px, sweep.y_px)
     ray = np.stack([u, v, np.ones_like(u)], axis=-1)
     normal = pose.matrix[:, 2]

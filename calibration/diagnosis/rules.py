@@ -3,16 +3,17 @@
 Each number of the evidence reveals one possible mistake: how many poses there were, how far they were tilted, how large
 the board appeared, how much of the picture it reached, how bright the room was, how long the baseline came out.
 
-A calibration passes if the depth error that its covariance predicts is at most what was asked for, and if its data
-agree with each other and with what is known of the rig. The first reason is the root cause. The order of reasons is:
+A calibration passes if the depth error that its covariance predicts is at most the one asked for, and if its data agree
+with each other and with what is known of the rig. Otherwise the verdict lists reasons. The first one is the most likely
+root cause. Their order is:
 
 1. Conditions that make other faults appear: room light that hides the line, boards too far away to be located.
-2. Data that no single rig can have produced (waves, a rig that moved), since nothing else can be believed then.
+2. Data that no single rig can have produced (waves, a rig that moved), since no other result can be trusted then.
 3. A baseline that differs from the stated one: the whole scene is then too large or too small. If the predicted error
 is too large, this comes after 4, since a baseline is only as good as the fit it comes from.
 4. Too little data (room light, too few poses, no tilt, boards too far away, corners in only a part of the picture).
-This is a likely cause if the predicted error is too large. It also counts if the covariance is small enough, but only
-because of the model, and almost no data are left to check the model by.
+This is a likely cause if the predicted error is too large. It counts even if the predicted error is small enough: if
+that is due to the assumed model, hardly any data are left to check the model.
 
 If the error is too large and the data have none of these faults, there are simply too few of them. Last come faults
 that the predicted error does not show: sweeps whose directions and speeds do not determine a lag for a direction of the
@@ -39,15 +40,15 @@ from calibration.verdict import SIGMAS, WORST_TIMES, AccuracyGoal, Reason, Verdi
 from calibration.views import FEWEST_CORNERS, BoardPose, Corners, View
 
 _WHITE_PERCENT = 75
-"""Percentile of the board's pixels that is white: half of a board is."""
+"""Percentile of the board's pixels that counts as white: half of a board is white."""
 
 
 @dataclass(frozen=True, slots=True)
 class ViewEvidence:
     """Evidence from the views before anything is fitted; NaN if unknown.
 
-    shown: number of poses. used: number of them that can check a fit: with corners and, if the line is asked for, with
-    the line on the board. coverage: share of the picture within the outline of all corners. room_flux: photons per
+    shown: number of poses. used: number of them that can check a fit: with corners and, if the rig is fitted, with the
+    line on the board. coverage: share of the picture within the outline of all corners. room_flux: photons per
     pixel and exposure of white on the board (of the bright parts of the picture if there is no board), median over the
     views. odd: names of views that do not fit the others and were not used.
     """
@@ -148,17 +149,18 @@ FEWEST_POSES: Final = 6
 FEWEST_WHY: Final = "are the fewest that can be checked against each other"
 
 
-# Limits of a number: beyond the first it is never enough; within the second, looked up where a result is not precise
-# enough, it is no likely cause of that.
+# Two limits of each number. Beyond the first, the data are never good enough. The second, stricter one holds if the
+# result is not precise enough: beyond it, the number is a likely cause of that.
 LEAST_TILT_RAD: Final = math.radians(12), math.radians(20)
-"""Tilt between two boards. Of parallel ones focal length and distance cannot be told apart."""
+"""Tilt between two boards. Parallel boards do not distinguish focal length from distance."""
 LEAST_BOARD_RAD: Final = 0.11, 0.15
-"""Angle under which a board is seen. Its perspective, by which focal length is told, goes with the angle's square."""
+"""Angle under which a board is seen. The focal length follows from its perspective, which goes with the angle's square.
+"""
 LEAST_COVERAGE: Final = 0.3, 0.5
-"""Share of the picture within the outline of all corners; the lens is extrapolated outside, which nothing checks."""
+"""Share of the picture within the outline of all corners. Outside, the lens model is extrapolated and unchecked."""
 MOST_ROOM_FLUX: Final = 3.0, 1.0
-"""Photons per pixel and exposure from white. At 3, 95 % of the frames hold a 1 whether the line is there or not; from 1
-on room light costs more than half of what a frame can tell of the line."""
+"""Photons per pixel and exposure from white. At 3, 95 % of the frames hold a 1 whether the line is there or not. From 1
+on, room light costs more than half of a frame's information about the line."""
 
 
 def data_lack(
@@ -256,20 +258,20 @@ def lag_lack(velocities_per_s: Sequence[float], *, mean_will_do: bool) -> list[R
 LEAST_BASELINE_CHANGE: Final = 0.01
 """Error of a tape measure: 3 mm in 300 mm."""
 MOST_SHIFT = 0.25
-"""Share of the accuracy asked by which views may contradict each other. A fit has gone between them already, and its
-depth is off by several times what is left: 2 to 5 times over 30 simulated knocks."""
+"""Largest contradiction between views, as a share of the accuracy asked for. The fit lies between contradicting views
+already, and its depth is off by several times the remaining contradiction: 2 to 5 times over 30 simulated knocks."""
 
 WAVES_MOVE = 2.0
-"""Multiple of the waves that a view's shift must exceed to count as a move: waves move whole views too, of few sweeps
-by as much as sweeps differ, up to 1.35 times in 23 simulated calibrations."""
+"""Multiple of the waves that a view's shift must exceed to count as a move. Waves shift whole views too: views of few
+sweeps by as much as the sweeps differ, up to 1.35 times as much in 23 simulated calibrations."""
 
 
 @dataclass(frozen=True, slots=True)
 class FitEvidence:
     """Evidence from a fit and the poses of its boards; NaN if unknown.
 
-    expected_m, worst_m: predicted sd of the depth at the distance asked, median and 95 % of the picture. wave_m: depth
-    error there of one sweep against another of the same view; wave_noise_m: its largest value that may be noise.
+    expected_m, worst_m: predicted sd of the depth at the distance asked for, median and 95 % of the picture. wave_m:
+    depth error there of one sweep against another of the same view; wave_noise_m: its largest value that may be noise.
     shift_m: depth error of a view against the others; shift_noise_m: its largest value that may be noise; moved_after:
     the view after which the rig moved, if one move explains the shifts. misfit: factor by which the variances were
     increased because the data contradict each other. baseline_m, baseline_sd_m: distance of camera and mirror axis.
@@ -308,30 +310,30 @@ def judge(views: ViewEvidence, fit: FitEvidence, asked: AccuracyGoal) -> Verdict
 def judge_refusal(
     refused: Degenerate, views: ViewEvidence, poses: PoseEvidence | None = None, *, photons: bool = True
 ) -> Verdict:
-    """The verdict if no model could be fitted: what the views lack, or else what the fit said. Arguments as in
+    """The verdict if no model could be fitted: what the views lack, and why the fit failed. Arguments as in
     `data_lack`.
     """
     lacking = [*hiding(views, poses, photons=photons), *data_lack(views, poses, imprecise=True, photons=photons)]
     code = _REFUSED_FOR.get(refused.reason, refused.reason)
     own = reason_for(code, str(refused))
-    if refused.reason in _SEEN_AT_ONCE:  # but for room light, which hides boards, nothing goes before it
+    if refused.reason in _SEEN_AT_ONCE:  # only room light, which hides boards, goes before it
         return Verdict(False, (*[reason for reason in lacking if reason.code == "room-light"], own))
     codes = [reason.code for reason in lacking]
     if code not in codes:
-        # That boards are parallel a fit sees better than rough poses do; of other refusals it can only guess the cause.
+        # A fit recognizes parallel boards better than rough poses do. The causes of other refusals are only guessed.
         seen = refused.reason == "coplanar" and "poor-coverage" in codes
         lacking.insert(codes.index("poor-coverage") if seen else len(codes), own)
     return Verdict(False, tuple(lacking))
 
 
 _REFUSED_FOR = {"one-pose": "too-few-poses", "coplanar": "no-tilt"}
-"""Reason for which a fit was impossible, and the lack of data behind it."""
+"""From the reason why a fit was impossible to the reason in the verdict: the lack of data behind it."""
 _SEEN_AT_ONCE = ("no-board", "wrong-board", "board-half-out", "mirrored", "two-boards", "no-line")
 """Faults of single views that leave too few to be used."""
 
 
 def _contradictions(fit: FitEvidence, asked: AccuracyGoal, imprecise: bool) -> list[Reason]:
-    """Reasons why no single rig can have made the data. Limits are lower if only the misfit makes it imprecise."""
+    """Reasons why no single rig can have made the data. Limits are lower if only the misfit makes the fit imprecise."""
     limit = asked.accuracy_m
     grown = math.sqrt(max(fit.misfit, 1.0))
     if imprecise and fit.expected_m <= limit * grown and fit.worst_m <= WORST_TIMES * limit * grown:

@@ -1,8 +1,9 @@
 """The verdicts on a fit of the camera alone, on a fit of the rig, on lags, and on a check.
 
 A camera is judged by how accurately it knows the directions of rays, in pixels. A camera whose rays are all turned by
-one angle is as good as before, since the mirror is calibrated with it. So the error of a pixel is what remains of J C
-J' after the best common rotation of all rays is removed from J.
+one angle is as good as before, since the mirror is calibrated with it. So the variance of a pixel is J C J', with C the
+covariance and J the derivatives of the pixels by the parameters, from which the best common rotation of all rays is
+removed.
 
 Lag and row delay are judged by the depth error that their uncertainty causes. A check fails if its errors are larger
 than expected from the covariance and larger than the accuracy asked for allows.
@@ -33,7 +34,7 @@ from calibration.verdict import AT_M, SIGMAS, WORST_TIMES, AccuracyGoal, Reason,
 from calibration.views import View
 
 ACCURACY_PX = 0.1
-"""Error of a pixel's place, and of the stripe's, that is good enough: no estimator does better in fog."""
+"""Error of a pixel's ray, and of the stripe's position, that is good enough: no estimator does better in fog."""
 _GRID = 16
 _STEP = 1e-6
 
@@ -101,7 +102,7 @@ def ray_sd_px(camera: Camera, covariance: Covariance) -> Array:
 
 
 UNLIKELY_SDS: Final = 4.0
-"""Distance of chi2 from its number of degrees of freedom, in its sds, beyond which deviations are no longer chance."""
+"""Distance of chi2 above its degrees of freedom, in sds of chi2, beyond which deviations are no longer chance."""
 
 _AGAIN = "calibrate again"
 
@@ -176,8 +177,8 @@ class JudgedRig:
 def goal(
     worth: Sensitivity, accuracy_m: float | None = None, at_m: float = AT_M, stated_baseline_m: float | None = None
 ) -> AccuracyGoal:
-    """The accuracy asked for: sd of depth at `at_m`, where `worth` was computed. accuracy_m: None for that of
-    ACCURACY_PX.
+    """The accuracy asked for: sd of depth at `at_m`, the depth of `worth`. accuracy_m None: the depth error that
+    ACCURACY_PX causes.
     """
     return AccuracyGoal(ACCURACY_PX * worth.per_pixel_m if accuracy_m is None else accuracy_m, at_m, stated_baseline_m)
 
@@ -190,8 +191,8 @@ def judge_fit(
     accuracy_m: float | None = None,
     stated_baseline_m: float | None = None,
 ) -> JudgedRig:
-    """Judge a fit by the sd of depth asked for (None: that of ACCURACY_PX). Raises CalibrationError if the line does
-    not reach `at_m`.
+    """Judge a fit by its sd of depth at `at_m`. accuracy_m: as in `goal`. Raises CalibrationError if the line does not
+    reach `at_m`.
     """
     model = fit.model
     worth = sensitivity(model, at_m)

@@ -18,7 +18,7 @@ _MAGIC_BYTES: Final = 8
 _LENGTH_BYTES: Final = {1: 2, 2: 4, 3: 4}
 """Bytes that hold the length of the header, by version of the format."""
 _MOST_HEADER_BYTES: Final = 10_000
-"""numpy's own limit, which it looks at only once it has read so much."""
+"""numpy's own limit, which numpy checks only after it has read the whole header."""
 _DEFLATE_RATIO: Final = 1032
 """Bytes that one compressed byte can stand for at most (zlib's technical details)."""
 
@@ -66,7 +66,7 @@ def _check_archive(stream: IO[bytes]) -> None:
 
 
 def _check_array(stream: IO[bytes], size: int) -> None:
-    """Raises ValueError unless the array of a file of `size` bytes, from where the stream is at, has room in it."""
+    """Raise ValueError unless the array at the stream's position fits into a file of `size` bytes."""
     magic = stream.read(_MAGIC_BYTES)
     if len(magic) < _MAGIC_BYTES or not magic.startswith(np.lib.format.MAGIC_PREFIX):
         raise ValueError("it is no array of numpy's")

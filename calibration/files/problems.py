@@ -20,7 +20,7 @@ Model = TypeVar("Model", bound=BaseModel)
 KindOf = Callable[[str, Any], type[BaseModel] | None]
 
 MAX_VALUE_CHARACTERS = 60
-"""Values longer than this are cut in messages, which stay one line."""
+"""Longer values are cut in messages, so that a message stays one line."""
 
 _TYPES = {
     "int": "a whole number",
@@ -42,7 +42,7 @@ _BOUNDS = {
     "less_than_equal": ("at most", "le"),
 }
 _READS_ON = ("is ", "has ", "runs ", "begins ")
-"""A validator's message that begins so reads on from the key; any other follows a colon."""
+"""A validator's message that begins with one of these is put after the key as a sentence; others follow a colon."""
 _WORDS = {True: "true", False: "false", None: "null"}
 
 
@@ -147,13 +147,13 @@ def validated(
             found.setdefault(_key(problem, content), []).append(problem)
     told = []
     for key, value, words in _no_numbers(schema, model, content, ()):
-        if all(problem["type"] in _BOUNDS for problem in found.get(key, [])):  # true counts as 1 there, NaN as nothing
+        if all(problem["type"] in _BOUNDS for problem in found.get(key, [])):  # pydantic compares true as 1, and NaN
             found.pop(key, None)
             dotted, then = sources.flag(key) or ".".join(key), _then(key, schema, sources.flag(key))
             told.append((key, f"{dotted} is {_shown(value)}, it must be {words}{then}"))
     keys = [*found, *(key for key, _ in told)]
     for key, problems in found.items():
-        # If a value may have several shapes and has problems within it, it tells nothing that it has not another shape.
+        # If a value may have several forms and has problems inside, it is no news that other forms do not fit.
         shape = all(one["type"] == "literal_error" or one["type"].endswith("_type") for one in problems)
         if not (shape and any(len(other) > len(key) and other[: len(key)] == key for other in keys)):
             told.append((key, _text(problems, key, schema, sources.flag(key))))
@@ -167,7 +167,7 @@ def validated(
 def _no_numbers(
     schema: _Schema, model: type[BaseModel], content: Mapping[str, Any], path: Key
 ) -> Iterator[tuple[Key, Any, str]]:
-    """Truth values, NaN and infinities where numbers are due: key, value and what it must be."""
+    """Truth values, NaN and infinities where finite numbers are expected: key, value and what it must be."""
     for name, value in content.items():
         info = model.model_fields.get(name)
         if info is None:
@@ -242,7 +242,7 @@ def _named(key: Key) -> Key:
 
 def _text(problems: list[ErrorDetails], key: Key, schema: _Schema, flag: str | None) -> str:
     """The message for the problems of one key. flag: the option that the value was given with."""
-    # If a value may have several shapes, an objection by the one that fits is worth more than that others do not fit.
+    # If a value may have several forms, the error of the form that fits says more than those of the others.
     problem = next((one for one in problems if one["type"] == "value_error"), problems[0])
     dotted = flag or ".".join(key)
     kind, context = problem["type"], problem.get("ctx", {})
@@ -274,7 +274,7 @@ def _text(problems: list[ErrorDetails], key: Key, schema: _Schema, flag: str | N
 
 
 def _limit(info: FieldInfo | None, value: float) -> str:
-    """A limit in the unit of its field, where that has one: its metadata then knows how numbers are `written`."""
+    """A limit as text. If its field has a unit, `written` in the field's metadata adds that unit."""
     marks = [] if info is None else list(info.metadata)
     for part in () if info is None else _parts(info.annotation):
         marks += getattr(part, "__metadata__", ())

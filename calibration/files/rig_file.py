@@ -14,15 +14,15 @@ or, instead of `planes`, a scanner with commands of its own:
 
 Optional: source_m, lag_s: {forward, backward}, speed_range_per_s: [low, high], row_delay_s, gate_delay_s,
 colour_skew_s, marker_rising, defects: a bool .npy, dark_rate: a float .npy, covariance: {names, file}, identity,
-provenance: any mapping, two of whose keys are read. Paths are relative to the file's folder;
-docs/reference/calibration-file.md explains everything. The file of a camera alone:
+provenance: any mapping, of which the program reads velocities_per_s and corners. Paths are relative to the file's
+folder; docs/reference/calibration-file.md explains everything. The file of a camera alone:
 
     format: spadrig-camera
     version: 1
     camera: {width, height, matrix, distortion}              # as above
     covariance: {names: [fx, fy, ...], matrix: [[...]]}      # the uncertainty of these parameters
     views: [16 hexadecimal digits, ...]                      # digests of the views used: none may count twice
-    verdict: passed or failed                                # left out if nobody judged it
+    verdict: passed or failed                                # left out if it was not judged
     reasons: [too-few-poses, ...]                            # codes of why it failed
 """
 
@@ -51,7 +51,7 @@ CAMERA_FORMAT = "spadrig-camera"
 VERSION = 1
 """Version of both formats."""
 CORNERS = "corners"
-"""Key in the provenance of a rig's calibration: digests of the views it was made of, those of its camera too."""
+"""Key in the provenance of a rig's calibration: digests of the views used for it and for its camera."""
 
 
 class _CovarianceRows(sections.FileSection):
@@ -71,7 +71,7 @@ class _CameraFile(sections.FileSection):
 
 @dataclass(frozen=True, slots=True, eq=False)
 class KnownCamera:
-    """A camera, its covariance, the digests of the views it was made from, and its verdict (None: nobody judged it)."""
+    """A camera, its covariance, the digests of the views it was made from, and its verdict (None: not judged)."""
 
     camera: Camera
     covariance: Covariance
@@ -219,7 +219,7 @@ def _build(parsed: sections.CalibrationFile, folder: Path) -> RigModel:
         **{name: getattr(parsed, name) for name in _PLAIN},
     )
     if known is not None:
-        try:  # a fit may have tried more terms than the model kept: their uncertainty counts
+        try:  # a fit may have tried more terms than the model kept: their uncertainty counts too
             with_parameters(model, known.names, np.zeros(len(known.names)))
         except CalibrationError as error:
             raise CalibrationError(f"covariance.names: {error}") from error
@@ -255,7 +255,9 @@ _ARRAYS = {
 
 
 def _array(folder: Path, name: str, what: str) -> NDArray[Any]:
-    """The array of a file beside the calibration. Raises CalibrationError if it is not what it must be."""
+    """The array of a file named in a calibration. Raises CalibrationError for a wrong dtype or shape of planes, and for
+    an unreadable file.
+    """
     file, key = folder / name, "covariance.file" if what == "covariance" else what
     try:
         array = load_array(file)

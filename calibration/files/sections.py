@@ -138,13 +138,13 @@ class CalibrationFile(FileSection):
 MAX_BYTES: Final = 64 << 20
 """Largest file: the plan of a long scan takes a hundredth of that."""
 MAX_DEPTH: Final = 64
-"""Most lists and mappings within one another."""
+"""Most levels of nested lists and mappings."""
 MAX_NODES: Final = 4_000_000
 """Most values that a file may write out."""
 MAX_REPEATED: Final = 100_000
-"""Most values that aliases may repeat: anchors that name one another turn nine lines into a billion values."""
+"""Most values that aliases may repeat: with nested aliases, nine lines can stand for a billion values."""
 MAX_WHOLE: Final = 1 << 64
-"""Size below which whole numbers must be: counts, identifiers and seeds have at most 64 bits."""
+"""Whole numbers must be smaller in size: counts, identifiers and seeds have at most 64 bits."""
 _MOST_SHOWN: Final = 40
 
 
@@ -215,7 +215,7 @@ class _Refused(yaml.YAMLError):
 
 
 class _Loader(getattr(yaml, "CSafeLoader", yaml.SafeLoader)):  # type: ignore[misc]
-    """Reads YAML, and reports the line of a value that is not what its tag or form says, such as 2024-13-45."""
+    """Reads YAML, and reports the line of a value that does not fit its tag or form, such as the date 2024-13-45."""
 
     def construct_object(self, node: yaml.Node, deep: bool = False) -> Any:
         """The value of a node."""
@@ -236,7 +236,7 @@ def _cut(node: yaml.Node) -> str:
 
 def _require_bounded(text: str) -> None:
     """Raise a YAMLError if the text holds, nests or repeats too much, before values are made of it."""
-    known: dict[str | None, tuple[int, int]] = {}  # of what is anchored: its values, and how deep they nest
+    known: dict[str | None, tuple[int, int]] = {}  # by anchor: the number of values, and how deep they nest
     written = repeated = 0
     events = yaml.parse(text, Loader=_Loader)
 
@@ -286,7 +286,7 @@ def _places(node: yaml.Node, path: Key) -> Iterator[tuple[Key, int]]:
 
 
 def _twice(node: yaml.Node) -> list[tuple[Key, int]]:
-    """The keys that are given again, with the lines of their repetitions; keys below such a one are left out."""
+    """The keys that are given again, with the lines of their repetitions. Keys below a repeated key are left out."""
     seen: set[Key] = set()
     found: list[tuple[Key, int]] = []
     for key, line in _places(node, ()):

@@ -39,7 +39,7 @@ _RESIDUAL_LIMIT = 1e-10
 """Largest accepted |forward(inverse) - target|, in tangents: 1e-7 px at f = 1000 px; relative to targets above 1."""
 
 _HALVINGS = 60
-"""Halvings that bring a radius of up to _MAX_TANGENT down to its last bits."""
+"""Halvings that determine a radius of up to _MAX_TANGENT to its last bits."""
 
 _RING = 1e-3
 """Step, in tangents, at which a fold is looked for."""
@@ -122,7 +122,7 @@ class LensModel:
                 return target_u, target_v
             u, v, good = self._solve(target_u, target_v, target_u, target_v)
             if not np.all(good):
-                # Rare: far from the axis or past the fold, where the target itself is no place to start from.
+                # Rare: far from the axis or past the fold, where the target itself is a bad start.
                 hard = ~good
                 u_hard, v_hard = target_u[hard], target_v[hard]
                 u[hard], v[hard], good[hard] = self._solve(*self._across_radius(u_hard, v_hard), u_hard, v_hard)
@@ -162,7 +162,7 @@ class LensModel:
         return good
 
     def newton(self, u: Array, v: Array, target_u: Array, target_v: Array, steps: int) -> tuple[Array, Array]:
-        """Tangents that `forward` puts on the targets, by this many steps of Newton's method or fewer."""
+        """Tangents that `forward` maps to the targets, by at most `steps` steps of Newton's method from (u, v)."""
         for _ in range(steps):
             at = self.forward(u, v)
             miss_u, miss_v = at.u - target_u, at.v - target_v
@@ -182,7 +182,7 @@ class LensModel:
         return u, v, (miss < limit) & self.valid(u, v)
 
     def _across_radius(self, target_u: Array, target_v: Array) -> tuple[Array, Array]:
-        """The tangent that k1 to k6 alone put where the target is, by bisection up to their fold."""
+        """The tangents that k1 to k6 alone map to the targets, by bisection up to the first fold."""
         seen = np.hypot(target_u, target_v)
         low, high = np.zeros_like(seen), np.full_like(seen, min(np.sqrt(self._fold_r2), _MAX_TANGENT))
         k1, k2, _, _, k3, k4, k5, k6 = self._terms[:8]
@@ -199,8 +199,8 @@ class LensModel:
 def _folds(terms: Array) -> tuple[float, list[float]]:
     """r2 of the first fold of k1 to k6 alone, inf if there is none, and an r2 within each ring that is folded.
 
-    With g = n / d a ring is folded where n, d or the slope of r g, n d + 2 r2 (n' d - n d'), is not positive. Rings
-    narrower than _RING are no lens's.
+    With g = n / d a ring is folded where n, d or the slope of r g, n d + 2 r2 (n' d - n d'), is not positive. Folded
+    rings narrower than _RING may be missed; no lens has them.
     """
     k1, k2, _, _, k3, k4, k5, k6 = terms[:8]
     n, d = Polynomial([1, k1, k2, k3]), Polynomial([1, k4, k5, k6])

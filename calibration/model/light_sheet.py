@@ -7,12 +7,12 @@ sheet if
 
     n.X = d + tan(bow phi^2) hypot(p, q),    phi = atan2(q, p),
 
-whether O itself lies in the plane or slightly beside it. O is the model's `source_m`; if that is unknown, the point of
-the mirror's axis nearest to the camera.
+even if O itself lies slightly off the plane. O is the model's `source_m`; if that is unknown, the point of the mirror's
+axis nearest to the camera.
 
 Ray r = (u, v, 1), plane n.X = d:  z = d / (n.r). Along an image row dz/dx = -(z^2 / d) (n . dr/dx), whose sign tells on
 which side of the stripe the near points lie. All arguments broadcast. NaN means 'no depth'; there are no infinities and
-no warnings. n.r loses digits where ray and plane are nearly parallel: `NEARLY_PARALLEL` keeps z right to 1e-9.
+no warnings. n.r loses digits where ray and plane are nearly parallel: `NEARLY_PARALLEL` keeps z accurate to 1e-9.
 """
 
 from dataclasses import dataclass
@@ -28,7 +28,7 @@ from calibration.model.scanner import PivotScanner, Scanner
 NEARLY_PARALLEL: Final = 1e-6
 """Sine of the angle between ray and plane below which there is no depth: 1e-3 px at f = 1000 px."""
 LEAST_OFFSET_M: Final = 1e-6
-"""Least distance of a plane from the camera: all points of one that passes closer are seen on one line."""
+"""Least distance of a plane from the camera: a plane that passes closer is seen edge-on and gives no depth."""
 
 
 def inverse_depth(u: ArrayLike, v: ArrayLike, planes: ArrayLike) -> Array:
@@ -43,8 +43,8 @@ def inverse_depth(u: ArrayLike, v: ArrayLike, planes: ArrayLike) -> Array:
 
 
 def depth(u: ArrayLike, v: ArrayLike, planes: ArrayLike) -> Array:
-    """Depth z (m) of rays (u, v) on planes (..., 4), |n| = 1; NaN where it is not positive or nearly parallel, and for
-    planes within LEAST_OFFSET_M of the camera."""
+    """Depth z (m) of rays (u, v) on planes (..., 4), |n| = 1. NaN where z is not positive, where ray and plane are
+    nearly parallel, and for planes within LEAST_OFFSET_M of the camera."""
     return _met(u, v, inverse_depth(u, v, planes), _along(u, v, planes))
 
 
@@ -58,7 +58,7 @@ def _met(u: ArrayLike, v: ArrayLike, inverse: Array, along: Array) -> Array:
 
 
 def _along(u: ArrayLike, v: ArrayLike, planes: ArrayLike) -> Array:
-    """n.r, the ray's way along the plane's normal."""
+    """n.r, the component of the rays along the normals."""
     p = np.asarray(planes, np.float64)
     return p[..., 0] * np.asarray(u, np.float64) + p[..., 1] * np.asarray(v, np.float64) + p[..., 2]
 
@@ -74,7 +74,7 @@ def depth_slope(u: ArrayLike, v: ArrayLike, planes: ArrayLike, camera: Camera) -
 
 
 def near_side(u: ArrayLike, v: ArrayLike, planes: ArrayLike, camera: Camera) -> NDArray[np.int8]:
-    """The side of the stripe, the scanner's, on which nearer points appear: -1 smaller x, +1 larger x, 0 undefined."""
+    """The side of the stripe on which nearer points appear: -1 smaller x, +1 larger x, 0 undefined."""
     p = np.asarray(planes, np.float64)
     du, dv = camera.tangent_slopes(u, v)
     offset = np.where(np.abs(p[..., 3]) < LEAST_OFFSET_M, 0.0, p[..., 3])
@@ -86,7 +86,7 @@ def near_side(u: ArrayLike, v: ArrayLike, planes: ArrayLike, camera: Camera) -> 
 
 _MOST_STEPS = 12
 _CONVERGED = 1e-12
-"""Relative step at which Newton's method has arrived; sheets are so nearly flat that three steps do."""
+"""Relative step at which Newton's method has converged; sheets are nearly flat, so three steps are enough."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -164,7 +164,7 @@ def light_sheets(scanner: Scanner, source_m: ArrayLike | None, commands: ArrayLi
     across = scanner.axis_direction - np.sum(normal * scanner.axis_direction, axis=-1, keepdims=True) * normal
     across /= np.linalg.norm(across, axis=-1, keepdims=True)
     middle = np.cross(across, normal)
-    middle = np.where(middle[..., 2:] < 0, -middle, middle)  # the light goes where the camera looks
+    middle = np.where(middle[..., 2:] < 0, -middle, middle)  # the light goes towards the scene
     return LightSheets(planes, fan_origin(scanner, source_m), middle, across, scanner.bow_per_rad)
 
 

@@ -142,9 +142,10 @@ def _rotation(vector: Array) -> Array:
 SWEPT: Final = "velocities_per_s"
 """Key in a model's provenance: the signed velocities of the sweeps that its planes were found from."""
 ALIKE_SPEEDS: Final = 0.02
-"""Relative difference up to which two speeds count as one: a lag from them errs 50 times as much as a passage."""
+"""Relative difference up to which two speeds count as one: a lag from two such speeds errs 50 times as much as a
+passage."""
 SPEED_MARGIN: Final = 0.05
-"""Share by which a speed may lie outside those at which a lag was measured, with the lag still taken to hold."""
+"""A measured lag is assumed to hold for speeds outside the measured ones by up to this share."""
 
 
 def lag_groups(velocities_per_s: ArrayLike) -> tuple[tuple[str, ...], ...]:
@@ -165,7 +166,7 @@ def one_speed(velocities_per_s: ArrayLike) -> bool:
 
 
 def untold(velocities_per_s: Sequence[float]) -> Array:
-    """(n, 3): changes of (position, lag forward, lag backward) that no sweep shows, the larger lag 1 s in size."""
+    """(n, 3): changes of (position, lag forward, lag backward) that no sweep shows, scaled to 1 s in the larger lag."""
     velocity = np.asarray(velocities_per_s, np.float64)
     if velocity.size == 0:
         return np.zeros((0, 3))
@@ -178,8 +179,8 @@ def untold(velocities_per_s: Sequence[float]) -> Array:
 
 
 def alike_speeds(speeds_per_s: ArrayLike) -> NDArray[np.int64]:
-    """(n,): a group number for each speed. Speeds without a gap between them share a group, whatever their
-    direction."""
+    """(n,): a group number for each speed, whatever its direction. Neighbouring speeds that differ by at most
+    ALIKE_SPEEDS share a group."""
     speeds, which = np.unique(np.abs(np.asarray(speeds_per_s, np.float64)), return_inverse=True)
     apart = np.diff(speeds, prepend=speeds[:1]) > ALIKE_SPEEDS * speeds
     return np.cumsum(apart, dtype=np.int64)[which.reshape(-1)]

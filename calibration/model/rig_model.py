@@ -17,7 +17,7 @@ from calibration.model.scanner import Scanner
 from calibration.verdict import VerdictWord
 
 _ASYMMETRY = 1e-6
-"""Rounding: by so much equal correlations may differ, and a smallest eigenvalue lie below 0."""
+"""Allowance for rounding: difference of equal correlations, and distance of the smallest eigenvalue below 0."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -94,9 +94,9 @@ class RigModel:
     row_delay_s: delay of each row's exposure after that of the row above. gate_delay_s: delay of the light after the
     gate's edge. colour_skew_s: time by which the scanner's gate output precedes its mirror. marker_rising: whether the
     rising edge of a scan marker counts, rather than the falling one.
-    covariance: of the parameters that were estimated, see `parameters`. identity: None if nobody recorded it.
+    covariance: of the parameters that were estimated, see `parameters`. identity: None if it was not recorded.
     Raises CalibrationError for a lag below 0, a time that is not finite, a map of another size than the camera's, and
-    planes within 45 degrees of the search axis, since they give no position along the row.
+    planes within 45 degrees of the image row, since they give no position along the row.
     """
 
     camera: Camera

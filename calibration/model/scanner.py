@@ -18,11 +18,11 @@ _ROUNDING = 1e-15
 _MOST_ANGLE_RAD = 1e3
 """Largest angle: sines of larger ones lose digits, and no mirror turns that far."""
 _MOST_OFFSET_M = 10.0
-"""Metres by which light could pass the axis of any mirror."""
+"""Largest distance at which light could pass the axis of any mirror."""
 _MOST_CONE_RAD = 0.5
 """A mirror that tilts the light more than this towards its axis is mounted wrongly."""
 _MOST_BOW_PER_RAD = 0.5
-"""Light at right angles to the fan's middle would otherwise leave it backwards; laser lines bow by some 0.01."""
+"""With more, light at right angles to the fan's middle would leave the fan backwards. Laser lines have about 0.01."""
 
 
 class Scanner(Protocol):
@@ -115,7 +115,7 @@ class PivotScanner:
         axis = _unit(_vector(self.axis_direction, "axis_direction"), "axis_direction")
         normal = _vector(self.zero_normal, "zero_normal")
         normal = _near_one(normal, normal)
-        normal = _across(_across(normal, axis), axis)  # twice: what is left of a normal close to the axis is inexact
+        normal = _across(_across(normal, axis), axis)  # twice, since the first result is inexact near the axis
         angle = np.array(self.angle_rad, dtype=np.float64)
         if angle.ndim != 1 or angle.size == 0 or not np.all(np.isfinite(angle)):
             raise CalibrationError("pivot scanner's angle_rad must be finite polynomial terms, constant first")
@@ -183,7 +183,7 @@ def _vector(value: ArrayLike, name: str) -> Array:
 
 
 def _near_one(values: Array, vectors: Array) -> Array:
-    """Values (..., m) times the power of two that brings the vectors (..., n) to length about one: their bits stay."""
+    """Values (..., m) times the power of two that brings the vectors (..., n) to length about 1, without rounding."""
     _, exponent = np.frexp(np.abs(vectors).max(axis=-1, keepdims=True))
     return np.asarray(np.ldexp(values, -exponent))
 

@@ -1,24 +1,24 @@
 """Finds a sweep's passages (when the laser line passed over each pixel) and its picture in the counts of its columns.
 
-Passages are found for many pixels, spread evenly over the picture. The first step finds the column at which the line
-stands out most from both sides (sums over columns, and their peak). The second fits the passage by maximum likelihood
-to the columns around it (`calibration.passages.fit`). Pixels without information are left out. The sd of a passage says
-how far it can be trusted; within a flat top, where all frames are lit, it is large. The line must be visible in two
-columns or more. If columns are wider than 2 pixels, most pixels give no passage, so calibrate with many columns of few
-exposures rather than few columns of many.
+Passages are found for many pixels, spread evenly over the picture. The first step finds, for each pixel, the column at
+which the line stands out most from the columns on both sides. The second step fits the passage by maximum likelihood to
+the columns around it (`calibration.passages.fit`). Pixels without information are left out. Each passage has an sd; it
+is large within a flat top, where all frames hold a 1. The line must be visible in two columns or more. If columns are
+wider than 2 pixels, most pixels give no passage, so calibrate with many columns of few exposures rather than few
+columns of many.
 
 10 000 pixels of 500 columns take about 0.5 s.
 
 The picture is the flux of the scene, photons per pixel and exposure. The response of one-bit pixels is inverted, flux =
--ln(1 - share of 1s). A pixel that is lit in every frame is treated as if half a frame were not. If room light alone
-gives a picture, the columns in which the line lit a pixel are left out, because the line saturates white and black
-alike on near boards and leaves stripes if columns are wide. In the dark the line's own light makes the picture, summed
-over columns. 512 x 512 pixels of 500 columns take about 0.4 s.
+-ln(1 - share of 1s). For a pixel with a 1 in every frame, half a frame is counted as a 0. If room light alone gives a
+picture, the columns in which the line lit a pixel are left out, because the line saturates white and black alike on
+near boards and leaves stripes if columns are wide. In the dark the line's own light makes the picture, summed over
+columns. 512 x 512 pixels of 500 columns take about 0.4 s.
 
-`even_pixels` finds where a picture is even along its rows, away from edges of print that the line crosses. A pixel's
-passage is that of the light it receives. If a lens or the pixel itself mixes white from one side with black from the
-other, the white dominates and the passage is up to a quarter of a pixel off. Edges along the row do no harm, since the
-line crosses them and lights both sides at once.
+`even_pixels` finds where a picture is even along its rows, away from printed edges that the line moves across. A
+passage is measured with the light that the pixel receives. If a lens or the pixel itself mixes white from one side with
+black from the other, the white dominates and the passage is up to a quarter of a pixel off. Edges parallel to the row
+do no harm, since the line lights both sides of them at once.
 """
 
 from dataclasses import dataclass
@@ -34,13 +34,13 @@ from calibration.passages.fit import LineShape, PassageFit, fit_passages
 from calibration.views import Corners, Passages
 
 CORES = (1, 3)
-"""Half widths, in columns, of what the line is looked for with."""
+"""Half widths, in columns, of the cores of `brightest`, which are tried in turn."""
 RING = 8
-"""Columns on either side that it has to stand out from."""
+"""Width, in columns, of the rings on either side that the core is compared with."""
 TOP = 0.95
-"""Share of the best column's score from which on a column stands out as well."""
+"""Share of the best column's score from which on a column belongs to a flat top."""
 LEAST_SEEN = 3.0
-"""Score above which a line is fitted: chance makes as much along a few dozen columns."""
+"""Score above which a line is fitted. Noise alone reaches about this score in a few dozen columns."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -67,8 +67,8 @@ class ColumnSums:
         return ColumnSums(self.ones[:, which], self.frames if self.frames.shape[1] == 1 else self.frames[:, which])
 
     def between(self, begin: int, end: int) -> tuple[NDArray[np.float32], NDArray[np.float32]]:
-        """Share of 1s (columns, pixels) in the columns from `begin` to before `end` away, NaN without frames; and the
-        number of frames, (columns, pixels or 1).
+        """For each column, the share of 1s (columns, pixels) over the columns from `begin` to before `end` relative to
+        it, NaN without frames; and the number of frames, (columns, pixels or 1).
         """
         edges = np.arange(self.columns)
         first, last = (np.clip(edges + shift, 0, self.columns) for shift in (begin, end))
@@ -91,8 +91,8 @@ class ColumnSums:
 def brightest(sums: ColumnSums) -> tuple[Array, NDArray[np.bool_]]:
     """Column at which the line stands out most (pixels,), and whether it stands out enough.
 
-    The share of 1s within the core is compared with the larger one of two rings beside it, since the haze has an edge
-    there but no peak.
+    The share of 1s within a core is compared with the larger of those in the rings on either side. So the edge of the
+    haze, which is no peak, does not stand out.
     """
     pixels = sums.ones.shape[1]
     best, at = np.full(pixels, -np.inf), np.zeros(pixels)
@@ -106,7 +106,7 @@ def brightest(sums: ColumnSums) -> tuple[Array, NDArray[np.bool_]]:
             score = np.nan_to_num((mean - ring) / spread, nan=-np.inf)
         top = score.argmax(axis=0)
         value = score[top, np.arange(pixels)]
-        # The middle of a flat top, of which the first column would be as good as any.
+        # The middle of a flat top, not its first column.
         alike = (score >= TOP * value) & (np.abs(columns - top) <= RING)
         middle = (alike * columns).sum(axis=0) / np.maximum(alike.sum(axis=0), 1)
         better = value > best
@@ -117,8 +117,8 @@ def brightest(sums: ColumnSums) -> tuple[Array, NDArray[np.bool_]]:
 def evenly(mask: NDArray[np.bool_]) -> NDArray[np.int64]:
     """(n, 2) row and column of the pixels in a mask (height, width), in the order of Bayer's dither matrix.
 
-    The order goes from coarse to fine: every fourth pixel in both directions comes before the rest of every second. It
-    reads the bits of y xor x and of y in turn, from the last to the first.
+    The order goes from coarse to fine: every fourth pixel in both directions comes before the others of every second.
+    It reads the bits of y xor x and of y in turn, from the last to the first.
     """
     rows, columns = np.nonzero(mask)
     bits = max(1, int(max(mask.shape) - 1).bit_length())
@@ -132,31 +132,31 @@ def evenly(mask: NDArray[np.bool_]) -> NDArray[np.int64]:
 Counts = NDArray[np.unsignedinteger[Any]]
 
 MOST_PASSAGES = 2000
-"""Most passages of a sweep; more say little more about a dozen parameters."""
+"""Most passages of a sweep; more would hardly improve a dozen parameters."""
 TRIES = 6
-"""Factor on the number of pixels that are looked at where few of them see the line."""
+"""Most pixels that are tried, as a multiple of the passages wanted."""
 CHUNK = 3000
 """Pixels at a time."""
 NEAR_SIGMAS = 4.5
-"""Reach of the line around its centre, plus one column: what is farther away tells of the levels only."""
+"""Reach of the line around its centre in sigmas, to which one column is added. Columns beyond determine only levels."""
 REACH = 14
-"""Columns on either side of the line that tell of the levels, and at least twice as many as it has itself."""
+"""Columns on either side of the line's centre that are used; at least twice the reach of the line."""
 FAR = 1e4
 SHAPES = (*(LineShape(box) for box in (0.0, 1.5, 2.5, 4.0)), LineShape(1.5, travels=True))
-"""Shapes that are tried: lines whose light is the same in all frames of a column, as on a DAC's stairs, and one that
-moves, for which the pixel's width hardly matters."""
+"""Shapes that are tried: lines at rest during a column, as with a DAC that moves in steps, and one that moves, for
+which the pixel's width hardly matters."""
 MOST_LOSS = 2.0
-"""Most that a pixel's log-likelihood may lose against its best shape: one astray must not choose for all."""
+"""Most by which one pixel's log-likelihood counts against a shape, so that no single bad pixel chooses for all."""
 LEAST_SAMPLE, SAMPLE = 50, 300
-"""Pixels that tell of the passage's shape: fewer than the first find one for themselves alone, more are not asked."""
+"""Pixels from which the shape is chosen: at most SAMPLE. From fewer than LEAST_SAMPLE it is not kept for others."""
 LEAST_SIGNIFICANCE = 5.0
 """Least significance of the line, in standard deviations."""
 MOST_MISFIT = 5.0
-"""Largest misfit, in standard deviations of chi squared: beyond, there was another line, or something moved."""
+"""Largest misfit, in standard deviations of chi squared. Beyond, there was a second line, or something moved."""
 MOST_SD = 1.0
 """Largest sd of a passage, in columns."""
 GROUPS = 4
-"""Parts of the picture, in each direction, that have a line width of their own."""
+"""Parts of the picture along each axis, each with its own width of the line."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -257,7 +257,9 @@ class _Shape:
 def _passages(
     sweep: SweepCounts, pixels: NDArray[np.int64], shape: _Shape | None
 ) -> tuple[tuple[NDArray[np.int64], Array, Array], _Shape | None]:
-    """The pixels (m, 2) of these that tell of a passage, its centre and sd (m,) in columns; and the passages' shape."""
+    """Those of the pixels that have a passage (m, 2), its centre and sd (m,) in columns; and the passages' shape, None
+    if too few pixels determine it.
+    """
     ones, frames = sweep.at_pixels(pixels)
     sums = ColumnSums.of(ones, frames)
     start, seen = brightest(sums)
@@ -286,7 +288,9 @@ def _passages(
 
 
 def _around(sums: ColumnSums, position: Array, start: Array, near: int) -> tuple[Array, Array, Array]:
-    """1s, frames and positions (pixels, 2 near + 3) around the passages; the ends sum up what is farther away."""
+    """1s, frames and positions (pixels, 2 near + 3) around the passages. The first and last entries are the sums over
+    the columns farther away.
+    """
     middle = np.rint(start).astype(np.int64)[:, None]
     far = max(REACH, 2 * near)
     begin = np.concatenate([middle - far, middle + np.arange(-near, near + 2)], axis=1)
@@ -301,7 +305,7 @@ LEFT_OUT = 10
 """Columns left out on either side of the line's brightest one, at most MOST_LEFT_OUT of all columns."""
 MOST_LEFT_OUT = 1 / 12
 LEAST_COUNTS = 30.0
-"""Detections per pixel that make a picture: the median over its brighter half."""
+"""Least number of detections per pixel for a picture by room light: the median over its brighter half."""
 
 
 def flux_picture(sweeps: tuple[SweepCounts, ...]) -> NDArray[np.float32]:
@@ -320,7 +324,7 @@ def flux_picture(sweeps: tuple[SweepCounts, ...]) -> NDArray[np.float32]:
 
 
 def _off_the_line(sweep: SweepCounts) -> tuple[Array, Array]:
-    """1s and frames (rows, width) of the columns in which the line was elsewhere."""
+    """1s and frames (rows, width) of the columns in which the line did not light the pixel."""
     columns = len(sweep.counts)
     ones, frames = _everything(sweep)
     middle = _brightest_column(sweep)[:, : sweep.width]
@@ -351,7 +355,7 @@ def _everything(sweep: SweepCounts) -> tuple[Array, Array]:
 
 
 def _brightest_column(sweep: SweepCounts) -> NDArray[np.int32]:
-    """Column (rows, width or more) that, with the columns before and after it, gave a pixel most 1s."""
+    """For each pixel (rows, width or more), the column that, with those before and after it, gave most 1s."""
     columns, rows, window = sweep.counts.shape
     size = (rows, int(sweep.x0.max(initial=0)) + window)
     most, at = np.zeros(size, np.uint32), np.zeros(size, np.int32)
@@ -373,7 +377,7 @@ def _by_column(sweep: SweepCounts) -> tuple[Array, Array]:
     flux = np.zeros((rows, int(sweep.x0.max(initial=0)) + window))
     for k in range(columns):
         n = int(sweep.n_frames[k])
-        # Nearly unbiased and finite where all are lit (docs/explanation/physics.md, Counts and flux).
+        # Nearly unbiased, and finite if all frames hold a 1 (docs/explanation/physics.md, Counts and flux).
         inverse = n * np.log((n + 0.5) / (n - np.arange(n + 1) + 0.5))
         flux[:, int(sweep.x0[k]) : int(sweep.x0[k]) + window] += inverse.take(sweep.counts[k])
     return flux[:, : sweep.width], _everything(sweep)[1]

@@ -5,18 +5,18 @@ Of n frames in column t, y have a 1: y ~ Binomial(n, 1 - exp(-flux)), and around
     flux(t) = before + (after - before) Phi(z) + area phi(z) / sigma,   z = (t - c) / sigma
 
 with phi and Phi the normal density and its integral. The terms are the level of the haze before the line, its change
-behind it, and the line. Line, pixel and the line's travel within a column all blur the passage symmetrically; sigma
-describes them together. `LineShape.box`, the width of the latter two in widths of the line, says how flat this makes
-the peak. That suffices if few frames are lit. If many are, a line that moves by a column during the frames lights those
-near it, and what is counted is the mean of their p, not p of their mean flux. With `LineShape.travels` sigma describes
-only line and pixel, and with frames at places u of the column
+behind the line, and the line. Line, pixel and the line's travel within a column all blur the passage symmetrically;
+sigma describes all three together. `LineShape.box`, the width of pixel and travel in widths of the line, says how flat
+they make the peak. That suffices if few frames hold a 1. If many do, the motion of the line within a column matters:
+the frames of a column see different fluxes, and their 1s follow the mean of their probabilities, not the probability at
+their mean flux. With `LineShape.travels` sigma describes only line and pixel, and with frames at places u of the column
 
     flux(t) = levels - log mean over u of exp(-area line(t + u)),    |u| < 1/2
 
 theta: (pixels, 5): BEFORE, AFTER, AREA, CENTRE and the logarithm of SIGMA. Sigma is common to the pixels of a group (a
 part of the picture), the others belong to each pixel. The fit uses Fisher scoring on all pixels at once, with damping
-(Levenberg and Marquardt) for steps that would make things worse; sigma's part of the information is a border of the
-pixels' blocks.
+(Levenberg and Marquardt) for steps that would lower the likelihood. The information matrix has one block per pixel and
+a border for sigma.
 """
 
 from dataclasses import dataclass
@@ -30,14 +30,14 @@ _NODES = tuple((x / 2, w / 2) for x, w in zip(*np.polynomial.legendre.leggauss(3
 _TRAVEL = tuple((x / 2, w / 2) for x, w in zip(*np.polynomial.legendre.leggauss(4), strict=True))
 LEAST_FLUX = 1e-7
 LEVEL_COUNTS = 0.5
-"""Prior of a level, as a number of 1s: one without a single 1 is half a count over all its frames, not 0."""
+"""Prior of a level, as a number of 1s: a level without any 1 becomes half a count over all its frames, not 0."""
 BEFORE, AFTER, AREA, CENTRE, SIGMA = range(5)
 
 
 @dataclass(frozen=True, slots=True)
 class LineShape:
-    """Shape of the line. box: width of its part that is not Gaussian, in sigmas. travels: whether it moves within a
-    column.
+    """Shape of the line. box: width of the blur that is not Gaussian, in standard deviations of the Gaussian part.
+    travels: whether the line moves within a column.
     """
 
     box: float = 0.0
@@ -55,7 +55,7 @@ def light(theta: Array, at: Array, shape: LineShape) -> tuple[Array, Array]:
     else:
         line, slope = _line(sigma, away, shape.box)
         shone, widens, blur = area * line, slope * away - line, sigma
-    passed = _normal_integral(away / blur)  # its shape hardly matters
+    passed = _normal_integral(away / blur)  # of a Gaussian: the exact shape of this edge hardly matters
     flux = np.maximum(before + (after - before) * passed + shone, LEAST_FLUX)
     edge = (after - before) * line
     widened = area * widens - edge * away * (sigma / blur) ** 2
@@ -124,29 +124,29 @@ def log_likelihood(ones: Array, frames: Array, flux: Array) -> Array:
 
 
 FITTED_BESIDES = 3
-"""Levels before and after, and the line's light."""
+"""Number of parameters fitted besides the centre: levels before and after, and the line's light."""
 UNKNOWN_SD = 1e3
-"""Columns; of a passage that the photons do not tell."""
+"""Sd, in columns, of a passage that the photons do not determine."""
 ITERATIONS, WIDTH_ITERATIONS = 12, 7
-"""Iterations; in the first ones the common widths are found too."""
+"""Most iterations, and the number of first ones in which the common widths are fitted too."""
 MOST_WORSE = 2.0
 """Most that the logarithm of a pixel's likelihood may fall while the width is being found."""
 MOST_STEP = 0.6
 """Largest change in one iteration: of the centre in sigmas, and of the logarithm of sigma."""
 DAMPING = 0.01
-"""Damping to begin with: share by which the information's diagonal is raised, so that steps fall short."""
+"""Damping at the start: share by which the information's diagonal is raised to shorten steps."""
 LEAST_STEP = 1e-3
-"""Change of the centre, in columns, at which the fit ends: less for all but one pixel in a hundred."""
+"""The fit ends when the centre changes by less than this, in columns, at 99 % of the pixels."""
 SPAN, SPACING = 4, 0.8
-"""Places on either side of a centre's best at which its likelihood is looked at; their distance in deviations."""
+"""Places on either side of the best centre at which the likelihood is computed, and their spacing in assumed sds."""
 MOST_AT_END = 0.03
-"""Most chance at an end of that: where there is more, the centre is not known."""
+"""Largest probability of the outermost places; with more, the centre is not known."""
 ALIKE = 1.25
-"""Factor by which the deviation found may differ from the one that was looked for."""
+"""Factor by which the sd found may differ from the one assumed; beyond, the likelihood is computed once more."""
 LEAST_LOOK, MOST_LOOK = 0.01, 0.7
-"""Bounds of the deviation that is looked for, in columns."""
+"""Bounds of the assumed sd, in columns."""
 LEAST_SIGMA, MOST_SIGMA = 0.25, 12.0
-"""Bounds of sigma, in columns. A narrower line lies in one column or two, which do not say where."""
+"""Bounds of sigma, in columns. A narrower line lies in one or two columns, which do not determine its position."""
 SIGMA_SPREAD = 0.15
 """Standard deviation of the logarithm of sigma from one part of the picture to another."""
 
@@ -156,8 +156,8 @@ class PassageFit:
     """One entry per pixel, in columns. centre, sd: of the passage. sigma: of the pixel's group.
 
     significance: of the line against levels alone, in standard deviations (the square root of twice the logarithm of
-    the likelihood ratio). misfit: Pearson's chi squared, as standard deviations above its mean. likelihood: its
-    logarithm. settled: whether the counts tell the centre; if not, centre and sd mean nothing.
+    the likelihood ratio). misfit: Pearson's chi squared, as standard deviations above its mean. likelihood: the
+    log-likelihood. settled: whether the counts determine the centre; if not, centre and sd mean nothing.
     """
 
     centre: Array
@@ -177,9 +177,8 @@ def fit_passages(
 
     ones, frames, at: (pixels, columns) float64, 1s, frames and position of each column; frames are 0 if there are none.
     The first and the last column stand for everything far away on their side. start: (pixels,) first guess of the
-    passage.
-    group: (pixels,) part of the picture, from 0 on. shape: of the line's light. exact: take `sd` from the whole
-    likelihood rather than from the parabola at its top.
+    passage. group: (pixels,) part of the picture, from 0 on. shape: of the line's light. exact: take centre and `sd`
+    from the whole likelihood rather than from the parabola at its top.
     """
     theta = _start(ones, frames, at, start)
     damping = np.full(len(start), DAMPING)
@@ -191,7 +190,7 @@ def fit_passages(
         worse_by = 0.0
         if iteration < WIDTH_ITERATIONS:
             wanted[:, SIGMA] += _width_step(theta[:, SIGMA], score, information, group)
-            worse_by = MOST_WORSE  # what is better for the group may be worse for a pixel of it
+            worse_by = MOST_WORSE  # a width that is better for the group may be worse for a pixel
         new_flux, new_slopes = light(wanted, at, shape)
         new_likelihood = log_likelihood(ones, frames, new_flux)
         better = new_likelihood >= likelihood - worse_by
@@ -205,10 +204,10 @@ def fit_passages(
     flux, slopes = light(theta, at, shape)
     _, information = score_of(ones, frames, flux, slopes, theta)
     covariance = np.linalg.inv(regular(information[:, :SIGMA, :SIGMA]))
-    known = covariance[:, CENTRE, CENTRE] > 0  # of next to no light the inverse is rounding, and may be negative
+    known = covariance[:, CENTRE, CENTRE] > 0  # almost without light the inverse is rounding, and may be negative
     sd = np.sqrt(np.where(known, covariance[:, CENTRE, CENTRE], UNKNOWN_SD**2))
     settled = known
-    # What not knowing the pixel's other parameters adds: by the information, and where photons are few.
+    # Factor by which the pixel's other, unknown parameters increase the sd: from the information, and for few photons.
     unknown = sd * np.sqrt(information[:, CENTRE, CENTRE]) * np.sqrt(_few(frames, flux, slopes, theta))
     if exact:
         sd, settled = _centred(ones, frames, at, shape, theta, sd)
@@ -222,7 +221,7 @@ def fit_passages(
 
 
 def _start(ones: Array, frames: Array, at: Array, start: Array) -> Array:
-    """First guess (pixels, 5): levels from the outermost columns, area from what stands above them."""
+    """First guess (pixels, 5): levels from the outermost columns, area from the flux above them."""
     flux = np.log((frames + 0.5) / (frames - ones + 0.5))
     theta = np.empty((len(start), 5))
     away = at - start[:, None]
@@ -238,7 +237,7 @@ def _start(ones: Array, frames: Array, at: Array, start: Array) -> Array:
 
 
 def _moved(theta: Array, score: Array, information: Array, damping: Array) -> Array:
-    """`theta` after a step of the pixels' own parameters, the smaller the more it is damped."""
+    """`theta` after a damped step of the pixels' own parameters."""
     own = regular(information[:, :SIGMA, :SIGMA])
     own += (damping[:, None] * np.einsum("pii->pi", own))[:, :, None] * np.eye(SIGMA)
     step = np.linalg.solve(own, score[:, :SIGMA, None])[:, :, 0]
@@ -255,14 +254,16 @@ def _few(frames: Array, flux: Array, slopes: Array, theta: Array) -> Array:
     """Factor (pixels,) on the variance: the line's detections over those left when FITTED_BESIDES are subtracted."""
     level = slopes[:, BEFORE] * theta[:, BEFORE, None] + slopes[:, AFTER] * theta[:, AFTER, None]
     detections = (frames * (np.exp(-level) - np.exp(-flux))).sum(axis=1)
-    result: Array = np.maximum(detections / np.maximum(detections - FITTED_BESIDES, 1), 1)  # a dip has fewer than none
+    result: Array = np.maximum(detections / np.maximum(detections - FITTED_BESIDES, 1), 1)  # 1 if negative (a dip)
     return result
 
 
 def _centred(
     ones: Array, frames: Array, at: Array, shape: LineShape, theta: Array, sd: Array
 ) -> tuple[Array, NDArray[np.bool_]]:
-    """Move the centres of `theta` to their means; return sd and `settled`. Look twice where the sd was a bad guess."""
+    """Move the centres of `theta` to their means; return sd and `settled`. Repeat once where the sd was far from the
+    assumed one.
+    """
     sd, settled, again = sd.copy(), np.ones(len(sd), np.bool_), np.arange(len(sd))
     for _ in range(2):
         look = np.clip(sd[again], LEAST_LOOK, MOST_LOOK)
@@ -277,18 +278,19 @@ def _centred(
 def _posterior(
     ones: Array, frames: Array, at: Array, shape: LineShape, theta: Array, sd: Array
 ) -> tuple[Array, Array, NDArray[np.bool_]]:
-    """Mean and standard deviation of the centre (pixels,) for a known sigma; whether the places looked at hold them.
+    """Mean and standard deviation of the centre (pixels,) for a known sigma, and whether the places cover its range.
 
-    Few photons make no parabola of the likelihood: its width at the top is then not what the centre errs by.
+    sd: assumed, for the spacing of places. With few photons the likelihood is no parabola, and its curvature at the top
+    does not give the error of the centre.
     """
     shifts = sd[:, None] * np.arange(-SPAN, SPAN + 1) * SPACING
     gain = np.empty(shifts.shape)
-    for side in (range(SPAN, -1, -1), range(SPAN, 2 * SPAN + 1)):  # outward, each from what its neighbour found
+    for side in (range(SPAN, -1, -1), range(SPAN, 2 * SPAN + 1)):  # outward, each place starts from its neighbour
         moved = theta.copy()
         for j in side:
             moved[:, CENTRE] = theta[:, CENTRE] + shifts[:, j]
             flux, slopes = light(moved, at, shape)
-            own = slopes[:, :CENTRE]  # flux is linear in these, or all but where the line travels
+            own = slopes[:, :CENTRE]  # flux is linear in these, nearly so if the line travels
             residual, weight = residual_of(ones, frames, flux)
             score = (own * residual[:, None]).sum(axis=2)
             information = (own * own * weight[:, None]).sum(axis=2)
@@ -307,7 +309,9 @@ def _posterior(
 
 
 def _width_step(log_sigma: Array, score: Array, information: Array, group: NDArray[np.int64]) -> Array:
-    """Step of each pixel's log sigma: its group's, drawn to the mean of all groups; other parameters follow it."""
+    """Step of each pixel's log sigma: the same within a group, drawn to the mean of all groups. The step allows for the
+    other parameters' response.
+    """
     border = information[:, :SIGMA, SIGMA]
     solved = np.linalg.solve(regular(information[:, :SIGMA, :SIGMA]), np.stack([score[:, :SIGMA], border], axis=2))
     effective = score[:, SIGMA] - (border * solved[:, :, 0]).sum(axis=1)

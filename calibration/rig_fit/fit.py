@@ -1,10 +1,10 @@
 """Bundle adjustment of a whole rig: camera, poses of the board, mirror and lag, from corners and passages together.
 
 Start values come from linear fits (`rig_state`), the best values from robust least squares (`solve`) with a noise
-estimated from the residuals themselves (`noise`). A round (`Rounds`) fits, examines the residuals, and ends with at
-most one decision (`misfit`): a mirror term that the data call for is added, a lag below 0 is fixed, or a view that does
-not fit the others is no longer used. A lag that the sweeps' speeds and directions do not determine is not fitted. The
-covariance covers all parameters jointly.
+estimated from the residuals themselves (`noise`). Each round (`Rounds`) fits, examines the residuals, and ends with at
+most one decision (`misfit`): a mirror term that the data require is added, a lag below 0 is fixed at 0, or a view that
+does not fit the others is no longer used. A lag that the sweeps' speeds and directions do not determine is not fitted.
+The covariance covers all parameters jointly.
 """
 
 from collections.abc import Sequence
@@ -30,19 +30,19 @@ from calibration.views import BoardPose, View, robust_sd
 MOST_ROUNDS = 16
 """Most rounds of fitting and deciding; all but the last add a term, fix a lag, drop a view or settle noise."""
 MOST_IDLE_ROUNDS = 4
-"""Most rounds without a decision: data that contradict each other may keep a fit from coming to rest for ever."""
+"""Most rounds without a decision: contradictory data may keep a fit from ever converging."""
 SETTLED_SHARE = 0.02
 """Relative change of the noise that is still allowed in the last round."""
 MOST_ODD_SHARE = 1 / 3
-"""Largest share of the views with passages that may be dropped as outliers; beyond it, it is not they who are wrong."""
+"""Largest share of the views with passages that may be dropped; if more do not fit, these views are not the fault."""
 
 
 @dataclass
 class Rounds:
     """The state of alternately fitting and deciding.
 
-    base: parameters that are free at the beginning; free: those free now. decisions: the latest ones about terms; kept:
-    those that changed the model.
+    base: groups of parameters that are free at the beginning; free: those free now. decisions: the latest ones about
+    terms; kept: those that changed the model.
     """
 
     problem: RigProblem
@@ -55,7 +55,7 @@ class Rounds:
     kept: tuple[TermDecision, ...] = ()
 
     def __post_init__(self) -> None:
-        """Begin with the least of all models."""
+        """Begin with the smallest model."""
         self.free = list(self.base)
 
     def run(self) -> None:
@@ -86,7 +86,7 @@ class Rounds:
             return False
         counted = self.problem.counted.copy()
         counted[odd] = False
-        # Terms that this view made the fit take in are decided again without it.
+        # Terms that were added because of this view are decided again without the view.
         self.free, self.kept = list(self.base), ()
         self.problem = replace(self.problem, tie=self.problem.terms.tied(self.free), counted=counted)
         self.state = rig_state.with_terms_of(self.state, self.base)
@@ -166,7 +166,7 @@ class RigFit:
     """A fitted rig. Per view, in the order of `views`: poses, corner_residual_px (n, 2) predicted minus seen, sweeps.
 
     left_out: names of views without corners; outliers: names of views that do not fit the others and were not used.
-    noise: estimated from the residuals; corner_scale: scale of the usual corner, by which its sd is that of `noise`.
+    noise: estimated from the residuals; corner_scale: times `noise.corner_sd_px` it is the sd of the usual corner.
     misfit: factor by which variances were multiplied, 1 if the model describes everything. condition: condition number
     of the scaled equations of the shared parameters. converged: False if contradictory data keep the fit from
     converging. decisions: about terms and lags. free: the fitted parameters, where the names of one group share a
@@ -215,7 +215,7 @@ class RigFit:
 def result_of(
     fit: Rounds, left_out: tuple[str, ...], board: Board, start: RigModel | None, velocities: Array
 ) -> RigFit:
-    """The result of rounds that have run. Its model takes what they do not determine from `start`, if there is one.
+    """The result of finished rounds. What they do not determine is taken from `start`, if there is one.
 
     left_out: names of views without corners. velocities: the signed velocities of all sweeps. Raises Degenerate if
     depth is almost unknown.
@@ -269,7 +269,7 @@ def result_of(
 
 
 def _trimmed(terms: Array, least: int) -> Array:
-    """The terms without the zeros at the end, but `least` of them."""
+    """The terms without the zeros at the end, but at least `least` of them."""
     used = np.flatnonzero(terms)
     return terms[: max(least, int(used[-1]) + 1 if used.size else 0)]
 

@@ -1,11 +1,11 @@
-"""The misfit of a fitted rig: views that do not fit, slow misfit, and mirror terms that the data call for.
+"""The misfit of a fitted rig: views that do not fit, slow misfit, and mirror terms that the data require.
 
 Terms are decided one at a time, and for good unless a view is dropped later. A term that is not in the model is tried
 to first order: the equations give the value it would take and its standard deviation. It is added if its value exceeds
 SIGNIFICANT_SD standard deviations and the term can be separated from the others. The angle's polynomial grows by one or
-two orders, since a symmetric mirror has no even terms. If several terms qualify, the one that leaves least unexplained
-is added first. A missing term can be imitated in part by another (light that passes beside the axis by an angle that
-bends), and the imitation may even have the smaller relative error.
+two orders, since a symmetric mirror has no even terms. If several terms qualify, the one that lowers chi2 most is added
+first. Another term can partly imitate a missing one (a nonlinear angle imitates light that misses the axis), and the
+imitation may even have the smaller relative error.
 """
 
 from collections.abc import Callable, Iterator, Sequence
@@ -23,7 +23,7 @@ from calibration.rig_fit.solve import RigProblem, RigSolution, ViewNormal, scale
 
 SIGNIFICANT_SD = 5.0
 LEAST_OWN_SHARE = 1e-7
-"""Share of a term's weight in the equations that must be its own when all others are free; less is rounding."""
+"""Least share of a term's information that must be left when all others are free; less is rounding."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -64,7 +64,7 @@ def tried(
 ) -> TermDecision:
     """The decision on the last of the new terms, with all of them free.
 
-    left_over: gives the factor of the variances if chi2 were less by its argument.
+    left_over: gives the factor on the variances that would remain if chi2 fell by its argument.
     """
     at = problem.terms.at(new)
     left, wanted = _beside_free(problem, solution, solution, at)
@@ -84,7 +84,7 @@ def tried(
 def _beside_free(
     problem: RigProblem, solution: RigSolution, own: RigSolution | ViewNormal, at: list[int]
 ) -> tuple[Array, Array]:
-    """(matrix, right) of the equations `own` for the parameters `at`, once all that is free has followed them."""
+    """(matrix, right) of the equations `own` for the parameters `at`, after elimination of the free parameters."""
     tie = problem.tie
     inverse, _ = scaled_inverse(tie.T @ solution.matrix @ tie)
     across = tie.T @ own.matrix[:, at]
@@ -93,7 +93,7 @@ def _beside_free(
 
 
 def best(decisions: Sequence[TermDecision]) -> int | None:
-    """Index of the decision that leaves least unexplained among those that would be kept; None if there is none."""
+    """Index of the decision with the largest gain among those that would be kept; None if there is none."""
     kept = [at for at, decision in enumerate(decisions) if decision.kept]
     return max(kept, key=lambda at: decisions[at].gain) if kept else None
 
@@ -118,7 +118,7 @@ def lag_decisions(
 
 
 def first_order(problem: RigProblem, solution: RigSolution, open_one: TermDecision) -> Array:
-    """(p,) change of all shared parameters if this term, and those that go along with it, were added."""
+    """(p,) change of all shared parameters if this term, and those in its `along`, were added."""
     taken = dict((*open_one.along, (open_one.name, open_one.value)))
     at, values = problem.terms.at(tuple(taken)), np.array(list(taken.values()))
     inverse, _ = scaled_inverse(problem.tie.T @ solution.matrix @ problem.tie)
@@ -153,30 +153,31 @@ def corner_noise(problem: RigProblem, solution: RigSolution, noise: Noise) -> fl
 SCANNER_MOVES = (*AXIS, "angle_0")
 """Parameters that change when a scanner is knocked: five of six, since a shift along the axis changes nothing."""
 ODD_CHI2 = 60.0
-"""Least fall of chi2 when an odd view has its own place of the scanner: 20 is one in a thousand."""
+"""Least fall of chi2 if an odd view has its own place of the scanner; chance exceeds 20 once in a thousand views."""
 ODD_TIMES = 8.0
-"""Least such fall as a multiple of the median one of the other views, should the model fit none of them well."""
+"""Least such fall as a multiple of the other views' median, in case the model fits none of the views well."""
 EXPLAINED_SHARE = 0.05
-"""Alternatively: at most this share of the misfit is left when the view has its own place of the scanner,"""
+"""A view is odd too if its own place of the scanner leaves at most this share of the misfit, if OTHERS_SHARE and
+LEAST_EXPLAINED hold as well."""
 OTHERS_SHARE = 0.3
-"""and at least this share is left whichever other view has one,"""
+"""Least share of the misfit that must be left if any other view has its own place of the scanner instead."""
 LEAST_EXPLAINED = 2.0
-"""where the misfit is at least this factor on the variances."""
+"""Least misfit, as a factor on the variances, for this."""
 FEWEST_TO_TELL = 4
-"""Views with passages: of fewer none is the usual one."""
+"""Fewest views with passages among which one can be odd."""
 UNDECIDED_SD = 2.5
-"""Significance from which on a term that was not taken in widens the covariance by what it would change."""
+"""Significance from which on a term that was not added widens the covariance by the change that it would cause."""
 MISFIT_SD = 3.0
 """Sds by which chi2 of the slow misfit must exceed its mean before it is believed."""
 
 
 def odd_view(problem: RigProblem, solution: RigSolution, left: "Misfit") -> int | None:
-    """The view that most calls for another scanner position, if it stands out, else None. left: the misfit of the fit.
+    """The view that fits best with another scanner position, if it stands out, else None. left: the misfit of the fit.
 
     Each view's equations tell how far chi2 would fall if the scanner had a separate position for this view alone. Views
-    without passages say nothing about it and are left out, since with their zeros any other view would stand out. With
-    few views, one that does not fit bends the fit so far that all others call for another position too; but only its
-    own separate position removes the misfit.
+    without passages are left out: their fall is always zero, and any other view would stand out from them. With few
+    views, one that does not fit bends the fit so far that the others seem to need another position too; but only a
+    separate position for the view that does not fit removes the misfit.
     """
     counted = np.flatnonzero(problem.counted & with_passages(problem))
     gains = np.array([_own_place(problem, solution, int(view)) for view in counted])
@@ -191,7 +192,7 @@ def odd_view(problem: RigProblem, solution: RigSolution, left: "Misfit") -> int 
 
 
 def _alone(left: "Misfit", gain: float, next_gain: float) -> bool:
-    """Whether a view's own place explains the misfit, and no other view's."""
+    """Whether one view's own place of the scanner explains the misfit, and no other view's does."""
     excess = left.without(0.0) - 1
     remains, otherwise = left.without(gain) - 1, left.without(next_gain) - 1
     return excess >= LEAST_EXPLAINED - 1 and remains <= EXPLAINED_SHARE * excess and otherwise >= OTHERS_SHARE * excess
@@ -252,7 +253,7 @@ def of_fit(problem: RigProblem, solution: RigSolution) -> Misfit:
     for view, own in enumerate(solution.views):
         if problem.counted[view]:
             joint = own.joint(covariance)
-            corner_chi2 += own.chi2[0]  # with the noise that the corners alone speak for
+            corner_chi2 += own.chi2[0]  # with the noise estimated from the corners alone
             corner_free += solution.rows[view][0].residual.size - float(np.sum(joint * own.corner_part))
             for chi2, count in _of_sweeps(problem, solution, view):
                 slow_chi2, slow_free = slow_chi2 + chi2, slow_free + count
@@ -261,7 +262,7 @@ def of_fit(problem: RigProblem, solution: RigSolution) -> Misfit:
 
 
 def _of_sweeps(problem: RigProblem, solution: RigSolution, view: int) -> Iterator[tuple[float, int]]:
-    """chi2 and number of the terms of the smooth part of each of a view's sweeps."""
+    """For each sweep of a view, chi2 of the smooth part of its residuals, and the number of terms of that part."""
     seen, jitter, residual = problem.sightings[view], solution.jitter, solution.rows[view][1].residual
     _, weight, starts = solution.weight[view]
     for sweep in seen.sweeps:

@@ -2,12 +2,12 @@
 
 Passages have three kinds of error: that of their own photons (their sd, times one factor), that of the mirror, which
 all pixels crossed at the same instant share (jitter), and what the model does not describe, which varies slowly over a
-sweep. To keep the last out of the first two, each sweep's own smooth part is removed first. Then, in narrow bins of the
-command, products of different passages of a bin give the jitter's variance, products across bins its reach, and the
-scatter within a bin the factor.
+sweep. To separate the third kind from the others, each sweep's own smooth part is removed first. Then, in narrow bins
+of the command, products of different passages of a bin give the jitter's variance, products across bins its reach, and
+the scatter within a bin the factor.
 
-Before all that the sd are corrected. A passage's sd is estimated from the same few photons as the passage itself. Those
-that seem most precise are so partly by chance, and a fit that believed them would underestimate its own error.
+Before all that the sds are corrected. A passage's sd is estimated from the same few photons as the passage itself.
+Passages that seem most precise do so partly by chance, and a fit that trusted their sds would underestimate its error.
 """
 
 from collections.abc import Sequence
@@ -22,22 +22,22 @@ from calibration.rig_fit.rig_state import Sighting
 from calibration.views import MAD_TO_SD, robust_sd
 
 BINS = 1024
-"""Bins of the whole command range: some to a column, within which jitter hardly changes."""
+"""Bins of the whole command range: several per column. Jitter hardly changes within a bin."""
 MOST_REACH_BINS = 96
 LEAST_FACTOR = 0.3
-"""Least factor of the passages' own sd; that an sd is stated more than three times too large is not believed."""
+"""Least factor on the passages' own sds: they are not assumed to be stated more than three times too large."""
 TAIL_SD = 3.0
 """Sds from which on an error counts as unlikely, and pulls no more than one of this size."""
 OUTLIER_SD = 6.0
-"""Sds from which on a deviation is no error of this kind, and does not count."""
+"""Sds from which on a deviation is an outlier, and does not count."""
 CUT_SD = 4.0
 """Sds beyond which errors are left out where noise is estimated: one outlier's square would outweigh hundreds."""
 FEWEST_PAIRS = 200
-"""Fewest pairs of neighbouring passages that tell how errors go with their sd."""
+"""Fewest pairs of neighbouring passages from which the relation of errors and sds is fitted."""
 LEAST_SPREAD = 0.05
-"""Least spread of the logarithm of the sd that tells how errors go with it."""
+"""Least spread of the logarithm of the sd for this fit."""
 SIGNIFICANT_SD = 3.0
-"""Significance for a jitter to be there; one overlooked makes a model look better than it is."""
+"""Least significance of jitter. It is small, since overlooked jitter makes a model look better than it is."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -63,8 +63,8 @@ def smooth_basis(command: Array, y_px: Array) -> Array:
 def restated(residuals: Sequence[Array], sightings: Sequence[Sighting]) -> tuple[Sighting, ...]:
     """The sightings with sd a s^b instead of each passage's sd s, where a and b fit the errors at each speed.
 
-    They are found from differences of neighbouring passages, in which most of the jitter and of the model's error
-    cancels. The geometric mean of the sd stays as it is; the factor is estimated later.
+    a and b are found from differences of neighbouring passages, in which most of the jitter and of the model's error
+    cancels. The geometric mean of the sds stays as it is; the factor is estimated later.
     """
     pairs: dict[int, list[tuple[Array, Array]]] = {}
     kinds = _kinds(sightings)
@@ -88,7 +88,7 @@ def restated(residuals: Sequence[Array], sightings: Sequence[Sighting]) -> tuple
 
 
 def _kinds(sightings: Sequence[Sighting]) -> list[list[int]]:
-    """A number for every sweep of every view, the same for sweeps of like speed, whose frames in a column are alike."""
+    """A number for every sweep of every view, the same for sweeps of similar speeds."""
     speeds = [[float(seen.velocity_per_s[sweep.start]) for sweep in seen.sweeps] for seen in sightings]
     kinds = iter(alike_speeds([speed for of_view in speeds for speed in of_view]).tolist())
     return [[next(kinds) for _ in of_view] for of_view in speeds]
@@ -126,7 +126,7 @@ def passage_noise(residuals: Sequence[Array], sightings: Sequence[Sighting]) -> 
             n = int(at[-1]) + 1
             lengths.append(n * width)
             total, product = np.bincount(at, weight, n), np.bincount(at, weight * left, n)
-            # Of a bin's own pairs each counts once, as of two bins', and none of a passage with itself.
+            # Each pair within a bin counts once, as do pairs across bins. A passage makes no pair with itself.
             pairs[0] += 0.5 * np.sum(product**2 - np.bincount(at, (weight * left) ** 2, n))
             shares[0] += 0.5 * np.sum(total**2 - np.bincount(at, weight**2, n))
             for lag in range(1, min(MOST_REACH_BINS, n)):
@@ -144,13 +144,13 @@ def passage_noise(residuals: Sequence[Array], sightings: Sequence[Sighting]) -> 
     if stands_out[best] < SIGNIFICANT_SD or not lengths:
         return factor, 0.0, width
     reach = float(reaches[best]) * width
-    # The smooth part that was taken off had three terms along the command, and took the jitter of three reaches.
+    # The smooth part that was removed has three terms along the command, and removed the jitter of three reaches.
     taken = min(3 * reach / float(np.mean(lengths)), 0.6)
     return factor, float(np.sqrt((shape[best] @ pairs) / told[best] / (1 - taken))), reach
 
 
 def bin_starts(seen: Sighting, reach: float) -> NDArray[np.int64]:
-    """Indices in a view's passages at which each run begins that shares the mirror's jitter."""
+    """Indices in a view's passages at which the bins begin whose passages share the mirror's jitter."""
     first = np.zeros(len(seen.command), bool)
     for sweep in seen.sweeps:
         command = seen.command[sweep]
@@ -160,8 +160,8 @@ def bin_starts(seen: Sighting, reach: float) -> NDArray[np.int64]:
 
 
 def tail_weight(normalised: Array, usual: float = 1 / MAD_TO_SD) -> Array:
-    """Weight of errors given in units of sd, whose usual median size is `usual`. If all are large, none is an
-    outlier."""
+    """Weight of errors in units of sd. usual: median of their sizes if the sd is right. If most errors are large, they
+    are no outliers."""
     away = np.abs(normalised)
     if away.size:
         away = away / max(1.0, float(np.median(away)) / usual)

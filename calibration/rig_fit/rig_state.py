@@ -3,10 +3,10 @@
 A sighting is a pose's corners and passages, cleaned and in the order that the fit needs.
 
 First values are poses from corners, planes from passages, and the mirror's axis from the planes. With the poses known,
-every passage is a point in space that the light met at a command. For a line turned about an axis, x = d(c) - b(c) y -
-e(c) z with smooth d, b, e. These are polynomials, found by one linear least squares fit over all points of one
-direction and speed of sweep. The normals of the planes lie across the axis. The commands at which two sweeps reach the
-same angle differ by the mirror's lag.
+every passage is a point in space that the light met at a command c. For a line turned about an axis, x = d(c) - b(c) y
+- e(c) z with smooth d, b, e. These are polynomials, found by one linear least squares fit over all points of one
+direction and speed of sweep. The normals of the planes are perpendicular to the axis. Each sweep reaches an angle at a
+command that is shifted by its velocity times the mirror's lag, so the lags follow from the differences of the commands.
 
 Views that determine no rig model are refused with the reason, the measured value, its limit and what to do.
 """
@@ -43,13 +43,13 @@ from calibration.views import (
 )
 
 EDGE_PX = 1.5
-"""Passages this close to the board's outline are left out: such pixels see what stands behind it too."""
+"""Passages this close to the outline of the paper are left out: such pixels also see what is behind the board."""
 LEAST_SD_SHARE = 0.05
-"""Least sd of a passage, as a share of its sweep's median: a few that are too sure of themselves must not decide."""
+"""Least sd of a passage, as a share of its sweep's median: a few with too small an sd must not dominate."""
 LEAST_CORNER_SD_PX = 0.02
-"""Error that the print, the lens model and the finding of corners leave, however bright the picture."""
+"""Error of a corner due to print, lens model and search, however bright the picture."""
 FEWEST_PASSAGES = 30
-"""Fewest passages of a sweep; fewer say nothing that the noise can be told from."""
+"""Fewest passages of a sweep; fewer do not determine their noise."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -129,7 +129,7 @@ def shows_line(view: View) -> bool:
 
 
 def _on_board(sweep: Passages, board: Board, camera: Camera, pose: BoardPose) -> Passages:
-    """The passages of a sweep within the board's outline, sorted by command."""
+    """The valid passages of a sweep within the outline of the board's paper, sorted by command."""
     x, y, command, sd = (np.asarray(of, np.float64) for of in (sweep.x_px, sweep.y_px, sweep.command, sweep.sd))
     keep = np.isfinite(x) & np.isfinite(y) & np.isfinite(command) & np.isfinite(sd) & (sd > 0)
     u, v = camera.tangents_at(x, y)
@@ -220,13 +220,13 @@ def _moved(pose: BoardPose, change: Array) -> BoardPose:
 
 
 _ORDERS = (3, 1, 3)
-"""Orders of d, b and e in the command: tangents of an angle that turns a quarter of a right angle either way."""
+"""Orders of d, b and e in the command: enough for tangents of angles up to a quarter of a right angle either way."""
 POSES_FOR_PLANES = 5
-"""Fewest boards; on fewer a command's light leaves too few lines to lay a plane through, all errors considered."""
+"""Fewest boards at one speed for planes: on fewer boards, a command's light gives too few lines for a good plane."""
 MOST_FIRST_LAG_S = 1e-3
 """Largest first value of a lag: ten times that of a small galvo."""
 _STEP = 0.7
-"""Share of a sweep's command range over which its planes are sampled; those at the ends are known worst."""
+"""Share of a sweep's command range over which its planes are sampled; those at the ends are least accurate."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -240,7 +240,7 @@ class LitPoints:
 
 
 def first_pose(camera: Camera, corners_m: Array, corner_px: Array) -> BoardPose:
-    """The pose of a board from its corners. Raises Degenerate if they are no picture of it."""
+    """The pose of a board from its corners. Raises Degenerate if OpenCV finds no pose."""
     try:
         _, turn, shift = cv2.solvePnP(
             corners_m, corner_px, camera.matrix, camera.distortion, flags=cv2.SOLVEPNP_ITERATIVE
@@ -266,11 +266,11 @@ def board_points(camera: Camera, sightings: Sequence[Sighting], poses: Sequence[
 
 
 def first_scanner(points: LitPoints, command_range: tuple[float, float]) -> tuple[PivotScanner, Array]:
-    """A mirror and (lag forward, lag backward, 0): the fit of all sweeps begins with them.
+    """Start values of a fit: a mirror and (lag forward, lag backward, 0).
 
-    Lags that the sweeps cannot tell apart get one value; if they determine neither, both are 0.
+    Lags that the sweeps cannot separate get one value; if the sweeps determine neither, both are 0.
     """
-    # The signed speeds at which enough boards were swept to tell their planes; where none was, the most swept.
+    # The signed speeds at which enough boards were scanned for planes; if there are none, those with most boards.
     velocities = np.unique(points.velocity_per_s)
     shown = np.array([np.unique(points.view[points.velocity_per_s == velocity]).size for velocity in velocities])
     velocities = velocities[shown >= min(POSES_FOR_PLANES, int(shown.max()))]
@@ -300,7 +300,7 @@ def _planes_of(points: LitPoints, velocity: float) -> tuple[Array, Array]:
     d, b, e = (powers(order) for order in _ORDERS)
     design = np.hstack([d, -b * at[:, 1:2], -e * at[:, 2:3]])
     weight = np.ones(len(c))
-    for _ in range(6):  # points of light that was not the line's are few and far off
+    for _ in range(6):  # points that other light than the line's gave are few and far off
         terms = np.linalg.lstsq(design * weight[:, None], at[:, 0] * weight, rcond=1e-10)[0]
         left = np.abs(at[:, 0] - design @ terms)
         weight = 1 / np.hypot(1, left / max(2 * float(np.median(left)), 1e-12))
@@ -332,7 +332,7 @@ def _lags(velocities: Array, curves: Sequence[tuple[Array, Array]]) -> tuple[flo
     if not ties:
         return 0.0, 0.0
     middle = float(np.mean([np.median(angle) for _, angle in curves]))
-    # Full: angles of too few poses may all be the same, which is no reason to warn.
+    # full=True: no warning if all angles are the same, as with too few poses.
     commands = [polynomial.polyfit(angle - middle, command, 2, full=True)[0][0] for command, angle in curves]
     design = np.array(
         [[1.0] + [v if (FORWARD if v > 0 else BACKWARD) in tie else 0.0 for tie in ties] for v in velocities]
@@ -344,15 +344,15 @@ def _lags(velocities: Array, curves: Sequence[tuple[Array, Array]]) -> tuple[flo
 
 
 LEAST_TILT_RAD = np.radians(5.0)
-"""Tilt between boards below which a refusal is put down to it."""
+"""Tilt between boards below which a refusal names the tilt as its reason."""
 LEAST_THICKNESS = 0.01
 """Least thickness of the points about their best plane, as a share of their distance: less is one plane."""
 LEAST_SPAN = 0.02
-"""Least span of the commands, in command units: a line that hardly moved tells nothing of how it turns."""
+"""Least span of the commands, in command units: a line that hardly moved does not show how it turns."""
 LEAST_LIT_SHARE = 0.1
-"""Least share of the picture that must be lit for a distance to be judged at."""
+"""Least share of the picture that the line must reach at a distance for depth to be judged there."""
 MOST_DEPTH_SD_SHARE = 0.2
-"""Largest sd of depth, as a share of the distance; a model that knows depth no better knows nothing."""
+"""Largest sd of depth, as a share of the distance; a model with more is refused."""
 
 
 def check_views(views: Sequence[View], sightings: Sequence[Sighting]) -> None:
@@ -410,7 +410,7 @@ def no_start(error: Exception, poses: Sequence[BoardPose]) -> Degenerate:
 
 
 def unfit(names: Sequence[str]) -> str:
-    """Text for the views that were not used."""
+    """Text that names the views that were not used."""
     return f"view{'s' if len(names) > 1 else ''} {', '.join(names)} left out: unlike the others"
 
 
@@ -422,7 +422,7 @@ def check_depth(
     misfit: float = 1.0,
     outliers: Sequence[str] = (),
 ) -> None:
-    """Raise Degenerate if the poses hardly determine depth, misfit aside, or if the line reaches nothing."""
+    """Raise Degenerate if the poses hardly determine depth, even without the misfit, or if the line reaches nothing."""
     camera = model.camera
     x, y = np.meshgrid(np.linspace(0.1, 0.9, 7) * camera.width, np.linspace(0.1, 0.9, 5) * camera.height)
     for at_m in (AT_M, float(np.median([np.linalg.norm(pose.position_m) for pose in poses]))):

@@ -2,7 +2,8 @@
 
 The normal equations take one view at a time and eliminate its pose.
 
-Passages of one instant share the mirror's jitter, of sd s. For each bin, with D the diagonal of their own variances,
+Passages of one instant share the mirror's jitter, of sd s. With V the covariance of the passages in one bin of
+instants, and D the diagonal of their own variances,
 
     V = D + s^2 11',    V^-1 = D^-1 - k (D^-1 1)(D^-1 1)',    k = s^2 / (1 + s^2 1'D^-1 1)
 
@@ -27,7 +28,7 @@ from calibration.rig_fit.rig_state import RigState, Sighting
 from calibration.rig_fit.rows import Rows, Terms
 
 _USUAL_MISS = float(np.sqrt(np.log(2.0)))
-"""Median of a distance in a plane (Rayleigh's distribution), its mean square 1."""
+"""Median of a distance in a plane whose mean square is 1 (Rayleigh's distribution)."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -131,11 +132,11 @@ def _products(rows: Rows, weight: Array) -> tuple[Array, Array, float]:
 
 MOST_STEPS = 12
 WEIGHED_STEPS = 6
-"""Steps after which an outlier stays one: weights that follow every step never come to rest."""
+"""Steps after which the weights of outliers stay: with new weights in every step a fit may never converge."""
 CONVERGED_CHI2 = 1e-3
-"""Gain in chi2 promised by the next step at which a fit is at rest: 0.03 sd along any parameter."""
+"""A fit has converged if the next step promises less gain in chi2 than this: 0.03 sd along any parameter."""
 ROUGH_SHARE = 1e-4
-"""Share of chi2 that the next step may still promise, besides 1, where a term is only looked for."""
+"""A rough fit, good enough for decisions, ends if the next step promises less than 1 plus this share of chi2."""
 WORSE_CHI2 = 0.1
 """Amount by which a step may raise chi2: derivatives are exact except for how a bow changes along the line."""
 MOST_DAMPING = 1e8
@@ -270,7 +271,7 @@ def _own_promise(view: ViewNormal) -> float:
 
 
 def _chi2(views: Sequence[ViewNormal], problem: RigProblem, state: RigState) -> float:
-    """Chi2; inf if it or its slopes are no numbers, as where a lens folds within the picture."""
+    """Chi2; inf if chi2 or a derivative is no finite number, as when a lens folds within the picture."""
     if not all(np.isfinite(view.matrix).all() for view in views):
         return np.inf
     total = sum(sum(view.chi2) for view in _counted(views, problem))

@@ -3,17 +3,19 @@
     ones of frame i = level + slope i + brightness r(share of the exposure that was lit),     r(0) = 0, r(1) = 1
 
 At most one frame is partly lit. All others give level, slope and brightness by least squares, and so the response r of
-the partly lit frame, with its standard deviation. A pixel that fires with probability p when fully lit has
+the partly lit frame, with its standard deviation. A pixel that fires with probability p when fully lit fires with
+probability
 
     1 - (1 - p)^s = s p + s (1 - s) / 2 p^2 + ...
 
-whose coefficients are all positive and sum to 1. With m the mean of p over the ones (sum of p^2 over sum of p) the
-response of a share s is therefore known within
+if a share s of the exposure is lit. The coefficients are all positive and sum to 1. With m the mean of p over the ones
+(sum of p^2 over sum of p), r is therefore known within
 
     s + s (1 - s) m / 2 <= r(s) <= s + (1 - s) m
 
-For a weak line that is s. For a saturated line almost nothing is known within one frame, and the information must come
-from edges at other places within their frames. The ones scatter like photons, or more if the residuals show it.
+For a weak line, r(s) = s. For a saturated line almost nothing is known from one frame, and the information must come
+from edges at other places within their frames. The ones are assumed to scatter like photons, or more if the residuals
+show it.
 """
 
 from collections.abc import Sequence
@@ -29,7 +31,7 @@ SPARE_FRAMES = 2
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Edge:
-    """An edge of the light. chi2: (times,) if the edge is at each of the times. brightness, brightness_sd: extra ones
+    """An edge of the light. chi2: (times,), for the edge at each of the times. brightness, brightness_sd: extra ones
     of a lit frame.
 
     scatter: variance of the ones around the fit in units of that of photons; chi2 and the sd include it.
@@ -44,11 +46,10 @@ class Edge:
 def fit_edge(
     ones: Array, start_s: Array, exposure_s: float, times_s: Array, *, rises: bool, saturation: float = 0.0
 ) -> Edge:
-    """Compute how well light that begins (rises) or ends at each of the times (times,), ascending, explains some
-    frames.
+    """Compute how well light that begins (rises) or ends at each of the times (times,), ascending, explains the frames.
 
     ones, start_s: (frames,), 1s of each frame and start of its exposure, at least 8 frames. saturation: m above. Times
-    within two frames of either end are taken as impossible. Raises ValueError if all are.
+    within two frames of either end count as impossible. Raises ValueError if all do.
     """
     weight = 1 / max(float(ones.mean()), 1.0)
     first, last = np.searchsorted(start_s, times_s[[0, -1]], side="right") - 1
@@ -58,7 +59,7 @@ def fit_edge(
     scatter = max(best.chi2 / (len(ones) - 5), 1.0)
     chi2 = np.full(len(times_s), np.inf)
     for part, step in steps.items():
-        end_s = start_s[part + 1]  # without light between exposures one moment is as good as another
+        end_s = start_s[part + 1]  # nothing distinguishes times between two exposures
         here = (times_s >= start_s[part]) & (times_s < end_s)
         share = np.clip((start_s[part] + exposure_s - times_s[here]) / exposure_s, 0, 1)
         share = share if rises else 1 - share
@@ -82,7 +83,7 @@ def edge_time(edges: Sequence[Edge], times_s: Array) -> tuple[float, float]:
 
 
 _NO_LIGHT = 1e9
-"""Chi squared of light that takes ones away."""
+"""Chi squared of light with a brightness of 0 or less, which is impossible."""
 
 
 @dataclass(frozen=True, slots=True)

@@ -5,10 +5,10 @@ that is at the command (`Passages` in calibration/views.py)
 
     command = position + s v (lag_s - row_delay y)
 
-Positions are eliminated as each pixel's weighted mean (`SharedPixels`); the rest is linear in the two lags and the row
-delay. Passages close in time are treated as correlated, since a mirror's jitter is common to all pixels that it passes
-then. The fit needs neither a board nor geometry, only pixels with a passage in several of the sweeps: 2000 pixels of 4
-sweeps take 10 ms.
+Each pixel's position is eliminated as a weighted mean over the sweeps (`SharedPixels`); what remains is linear in the
+two lags and the row delay. Passages close in time are treated as correlated, since they share the mirror's jitter. The
+fit needs neither a board nor geometry, only pixels with a passage in several of the sweeps: 2000 pixels of 4 sweeps
+take 10 ms.
 
 The sweeps limit what can be determined (`calibration.model.parameters`). One speed in each direction gives only a mean
 of the lags, and both are set to it. At least two speeds in one direction give the lag of each direction that was
@@ -35,12 +35,12 @@ from calibration.model.rig_model import Lag
 from calibration.views import Passages, robust_sd
 
 SWEEP_ERROR_S = 3e-7
-"""Error of every sweep as a whole besides noise: a thirtieth of a frame of 10 us."""
+"""Error common to all passages of a sweep, in addition to noise: a thirtieth of a frame of 10 us."""
 LEAST_PIXELS = 50
 CLUSTERS = 64
-"""Parts of the command range in which the mirror's own trembling is taken to be common to all pixels."""
+"""Parts of the command range within which the mirror's jitter is assumed to be common to all pixels."""
 LEAST_SHARE = 1e-9
-"""Smallest eigenvalue of the scaled equations; below it nothing but rounding tells designs apart."""
+"""Smallest eigenvalue of the scaled equations; below it only rounding separates the unknowns."""
 MOST_OFF = 4.7
 """Residuals, in robust standard deviations, from which on a passage does not count."""
 
@@ -89,11 +89,11 @@ class SharedPixels:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Solved:
-    """The result of a least squares fit. value, covariance: of the designs' coefficients.
+    """The result of a least squares fit. value, covariance: of the unknowns, the coefficients of the designs.
 
     residual: (pixels, sweeps), in command units. weight: weight of each passage, 0 for an outlier. noise: robust sd of
-    the residuals in units of the stated sd. design: (pixels, sweeps, designs),
-    after elimination of each pixel's own position.
+    the residuals in units of the stated sd. design: (pixels, sweeps, designs), after elimination of each pixel's own
+    position.
     """
 
     value: Array
@@ -116,8 +116,8 @@ class Solved:
 
 
 def solve(seen: SharedPixels, designs: Sequence[Array]) -> Solved:
-    """Weighted least squares without pixels' own positions and outliers. Raises Degenerate if designs cannot be
-    separated.
+    """Weighted least squares without outliers, after elimination of each pixel's position. designs: derivative of the
+    command by each unknown. Raises Degenerate if the unknowns cannot be separated.
     """
     basis = np.stack([np.broadcast_to(each, seen.command.shape) for each in designs], axis=2)
     weight, noise = seen.weight, 1.0
@@ -142,7 +142,7 @@ def solve(seen: SharedPixels, designs: Sequence[Array]) -> Solved:
         scaled = np.abs(error) * np.sqrt(seen.weight)
         noise = max(robust_sd(scaled[seen.weight > 0]), 1e-12)
         weight = seen.weight * (scaled < MOST_OFF * max(noise, 1.0))
-    # Passages that tremble together count together (sandwich over parts of a sweep); a sweep may be off as a whole.
+    # Errors within a part of a sweep are correlated (sandwich covariance by clusters); a whole sweep may be off too.
     pulls = clustered(weight[:, :, None] * x * error[:, :, None], clusters(seen))
     by_sweep = np.einsum("ij,ija->ja", weight, x) * (SWEEP_ERROR_S * seen.speed)[:, None]
     covariance = inverse @ (pulls.T @ pulls + by_sweep.T @ by_sweep) @ inverse
@@ -170,7 +170,8 @@ def clustered(values: Array, cluster: NDArray[np.int64]) -> Array:
 
 
 SIGNIFICANT = 5.0
-"""Standard deviations of a row delay that is believed against the known one, and of a lag below 0 that is refused."""
+"""Standard deviations by which a row delay must differ from the known one to replace it, and by which a lag must lie
+below 0 to be refused."""
 MOST_CHI2_SDS = 4.0
 """Most standard deviations by which chi squared of the speeds may lie above its mean."""
 
@@ -239,7 +240,7 @@ def fit_sync(sweeps: Sequence[Passages], row_delay_s: float = 0.0, row_delay_sd_
     _require_speeds(sweeps)
     seen = SharedPixels.of(sweeps)
     heard = (seen.weight > 0).sum(axis=0).tolist()
-    if not all(heard):  # a sweep that shares no pixel says nothing, least of all of its speed
+    if not all(heard):  # a sweep that shares no pixel says nothing, and its speed must not count
         return fit_sync(
             [sweep for sweep, tells in zip(sweeps, heard, strict=True) if tells], row_delay_s, row_delay_sd_s
         )
@@ -260,7 +261,8 @@ def fit_sync(sweeps: Sequence[Passages], row_delay_s: float = 0.0, row_delay_sd_
     else:
         solved = solve(seen, lags)
 
-    # From the solution to both lags and the row delay: a common lag is both, one that was not scanned is not known.
+    # From the solution to both lags and the row delay. A common lag stands for both. Covariances of an unscanned
+    # direction are NaN.
     which = {way: 0 if common else told.index(way) for way in told}
     kept = [which.get(way) for way in (1, -1)]
     covariance = np.full((3, 3), np.nan)
@@ -309,8 +311,8 @@ def _require_speeds(sweeps: Sequence[Passages]) -> None:
 
 
 def _require_one_way_round(seen: SharedPixels) -> None:
-    """Raise Degenerate if the commands of one direction run against those of the other: the marker's level is taken
-    for the wrong one."""
+    """Raise Degenerate if the commands of one direction run against those of the other: then the direction marker has
+    the wrong polarity."""
     ahead, back = (seen.direction == way for way in (1, -1))
     if not (ahead.any() and back.any()):
         return

@@ -10,8 +10,8 @@ new lags:
 This assumes that the mirror's lags were the same then as now. If old and new lags contradict each other, the lags have
 changed, and the angle stays as it was, provided it is known without them.
 
-The row delay is transferred with the lags if the sweeps determined it. The fit of the lags (`lag_fit`) was given the
-model's knowledge of it, so its value contains both.
+The row delay is transferred with the lags if the sweeps determined it. The fit of the lags (`lag_fit`) started from the
+row delay of the model and its sd, so the fitted row delay combines both.
 """
 
 from dataclasses import replace
@@ -26,9 +26,10 @@ from calibration.sync.lag_fit import SIGNIFICANT, SyncFit
 from calibration.verdict import Reason
 
 _OPEN_S = 1e-4, 1e-2
-"""Sds given to a lag that nothing tells: for the slopes, to follow it; for the test of a change, to accept any."""
+"""Sds assumed for a lag that the sweeps do not determine: for the slopes; and, so that any change passes, for the test
+whether lags have changed."""
 _LEAST_SHARE = 1e-9
-"""Least eigenvalue of the scaled covariance of lags; below it they were taken for one."""
+"""Least eigenvalue of the scaled covariance of the lags; below it both were fitted as one."""
 _AGAIN = "calibrate the planes again, both ways and at two speeds or more (--exposures)"
 
 
@@ -71,7 +72,7 @@ def with_lags(base: RigModel, fit: SyncFit) -> tuple[RigModel, Reason | None]:
 
 
 def _told(fit: SyncFit) -> tuple[dict[str, float], Array]:
-    """The values that the sweeps tell, by name, and their covariance; a lag that was not scanned equals the other."""
+    """The values that the sweeps determine, by name, and their covariance. A lag without sweeps equals the other."""
     ways = [at if np.isfinite(fit.covariance[at, at]) else 1 - at for at in (0, 1)]
     at = [*ways, 2] if fit.row_told else ways
     values = dict(zip(TIMES, (*fit.lag_s, fit.row_delay_s), strict=True))
@@ -104,14 +105,14 @@ def _slopes(
 
 
 def _open(base: RigModel, names: tuple[str, ...], velocities: tuple[float, ...], sd_s: float) -> Array:
-    """Covariance of what no sweep at these velocities shows, its lags having this standard deviation."""
+    """Covariance of changes that no sweep at these velocities shows, with sd_s the sd of the lags."""
     matrix = np.zeros((len(names), len(names)))
     if not isinstance(base.scanner, PivotScanner):
         return matrix
     for moved, forward, backward in untold(velocities):
         together = np.zeros(len(names))
         together[[names.index(FORWARD), names.index(BACKWARD)]] = forward, backward
-        # Where the light of a command c was, there is now that of c + moved.
+        # The light of a command c moves to where that of c - moved was.
         for k, term in enumerate(base.scanner.angle_rad[1:], start=1):
             if f"angle_{k - 1}" in names:
                 together[names.index(f"angle_{k - 1}")] -= k * term * moved

@@ -23,7 +23,7 @@ from rig.requests import CameraRequest
 
 CAMERA_FILE = "camera.yaml"
 FEWEST_VIEWS = 3
-"""Fewest views of a camera: with fewer, one view takes up whatever is wrong with the other."""
+"""Fewest views of a camera: with fewer, nothing contradicts a view that is wrong."""
 
 
 def calibrate_camera(
@@ -36,8 +36,8 @@ def calibrate_camera(
 ) -> CalibrationResult:
     """Calibrate the camera alone (`rig calibrate camera`). `sources` may also be pictures, and folders of them.
 
-    Raises Degenerate if the views give no calibration, with the root cause and notes on the others,
-    and UsageError for a wrong request.
+    Raises Degenerate if the views give no calibration, with the likely root cause and notes on the other reasons, and
+    UsageError for a wrong request.
     """
     request = replace(request or CameraRequest(), **changes)
     si_values(request)
@@ -69,7 +69,7 @@ def calibrate_camera(
 
 
 def _fitted(session: Session, board: Board, terms: int) -> CameraFit:
-    """Fit the camera; raises Degenerate if it would hang on so few views that they cannot contradict each other."""
+    """Fit the camera. Raises Degenerate if fewer than FEWEST_VIEWS views could be used."""
     fit = fit_camera(session.views, board, session.size, distortion_terms=terms)
     if len(fit.kept) < FEWEST_VIEWS:
         raise Degenerate(

@@ -1,20 +1,20 @@
 """Takes one view of the board from a scan of it: the board's picture, its corners, and the passages of every sweep.
 
 `capture_view` scans a live rig, `capture_recorded` reads a recorded run. An existing calibration is not used in the
-scan, so that nothing of it enters the new one: whole rows are counted, and a passage is the command at that instant as
-if the mirror had no lag. Only if a SPAD cannot send or keep whole frames fast enough does it send the windows of that
-calibration, and the plan then allows for its lag. Neither changes the passages, except that a line outside the windows
-is not seen.
+scan, so that nothing of it enters the new one: whole rows are counted. A passage is the mirror command at the instant
+when the line's centre crosses a pixel, stated as if the mirror had no lag. If a SPAD cannot send or keep whole frames
+fast enough, it sends the windows of the existing calibration instead, and the plan then allows for the known lag.
+Neither changes the passages, except that a line outside the windows is not seen.
 
-Passages are kept for pixels spread evenly over the board, away from the edges of its print, or over the whole picture
-if no board was found. The first half millisecond of a sweep is left out, because the mirror lags and is still
-accelerating then.
+Passages are kept for pixels spread evenly over the board, away from printed edges, or over the whole picture if no
+board was found. The first half millisecond of a sweep is left out, because the mirror lags and is still accelerating
+then.
 
 `shown` brings the board to the wanted pose: a person is asked to hold it there, or the simulated world moves it.
 `SpeedRotation` scans successive poses at different numbers of exposures per column, so that the mirror is seen at
-several speeds. A speed that the rig cannot do is left out. If a speed does not show the line on the board, the pose is
-scanned again at the slowest one before the board is moved. A speed that never showed the line when the slowest did is
-left out too.
+several speeds. A speed that the rig cannot do is left out. If the line cannot be found on the board at some speed, the
+pose is scanned again at the slowest speed before the board is moved. If the line is found then and was never found at
+the faster speed, that speed is left out too.
 """
 
 from collections.abc import Callable, Sequence
@@ -54,9 +54,9 @@ from rig.scan.run import OutFolder, Run
 from rig.scan.scan import run_scan
 
 MOST_LAG_S = 5e-4
-"""Seconds; longest lag that is allowed for: small galvos follow their command within 100 to 300 us."""
+"""Longest lag of a mirror that is expected, in seconds: small galvos follow their command within 100 to 300 us."""
 MOST_SWEEPS = 4
-"""Most sweeps of a recording that are looked at."""
+"""Most sweeps of a recording that are used."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -81,9 +81,9 @@ def capture_view(
 ) -> Capture:
     """Scan once, in both directions, and take the view.
 
-    board: None if none is to be looked for; passages are then of the whole picture.
+    board: None if there is none; passages are then of the whole picture.
     seed: of everything simulated.
-    exposures: per column; None is as the config says.
+    exposures: per column; None: the config's.
     arm: must be True if laser or gate are real.
     defects: (rows, width), pixels that are not used.
     out: folder to record the scan into; None writes nothing.
@@ -114,7 +114,7 @@ def capture_recorded(run: Path, name: str, board: Board | None, *, defects: NDAr
 
 
 def plain(config: RigConfig) -> RigConfig:
-    """The config of a scan of which only the counts are wanted: its estimator keeps them complete."""
+    """The config of a scan for its counts alone, with an estimator that keeps all counts."""
     update = {"estimator": "argmax", "filter": "none", "temporal_prior": False}
     return config.model_copy(update={"estimate": config.estimate.model_copy(update=update)})
 
@@ -143,7 +143,7 @@ def _captured(
     defects: NDArray[np.bool_] | None,
     out: OutFolder,
 ) -> Capture:
-    # A simulated world is not asked for the truth, nor to hold its light within columns: it moves as the mirror does.
+    # Without its world, a simulated rig gives no truth, and its line moves on within columns as the mirror does.
     rig = replace(rig, world=None)
     plan, timing = prepare(rig)
     sweeps: list[SweepData] = []
@@ -174,7 +174,7 @@ def scan_sweeps(
     out: OutFolder = None,
     prepared: tuple[ScanPlan, SpadTiming] | None = None,
 ) -> None:
-    """Scan for the listeners and, with `out`, a recording alone. An interrupt is raised again, once the rig is safe."""
+    """Scan only for the listeners and, with `out`, a recording. An interrupt is raised again once the rig is safe."""
     scan, estimate = rig.config.scan, rig.config.estimate
     tally = MapTally(scan.columns, scan.exposures, estimate.estimator, estimate.filter)
     request = RunRequest(maps=maps, record=out is not None, accept_calibration=True)
@@ -184,7 +184,7 @@ def scan_sweeps(
 
 
 def _sweep_counts(sweep: SweepData, plan: ScanPlan) -> SweepCounts:
-    """The counts of a sweep, with the commands of its columns as if the plan knew of no lag."""
+    """The counts of a sweep, with the commands that were sent at its columns, not corrected for the plan's lag."""
     volume = sweep.tally
     assert isinstance(volume, CountVolume), "what argmax has counted"
     command = plan.command_at(volume.column) + plan.velocity_per_s(sweep.direction) * _leg(plan, sweep.direction).lag_s
@@ -196,7 +196,7 @@ def _leg(plan: ScanPlan, direction: int) -> Leg:
 
 
 def _steady(passages: Passages, plan: ScanPlan) -> Passages:
-    """The passages that came when the mirror had long been moving as fast as it was told to."""
+    """The passages at least MOST_LAG_S after the begin of the sweep: then the mirror moves at full speed."""
     first = plan.command_range[0 if _leg(plan, passages.direction).columns_rise else 1]
     since_s = passages.direction * (passages.command - first) / passages.speed_per_s
     keep = since_s >= MOST_LAG_S
@@ -207,7 +207,7 @@ def _steady(passages: Passages, plan: ScanPlan) -> Passages:
 def corners_in(
     picture: NDArray[np.float32], board: Board | None, defects: NDArray[np.bool_] | None = None
 ) -> tuple[Corners | None, Degenerate | None]:
-    """The board's corners in a picture, or why there are none; neither if there is no board to look for."""
+    """(corners of the board in a picture, None) or (None, why there are none); (None, None) if board is None."""
     if board is None:
         return None, None
     try:
@@ -219,7 +219,7 @@ def corners_in(
 TellLine = Callable[[str], None]
 """A callback that takes a line for people."""
 AskPerson = Callable[[str], None]
-"""A callback that has the board moved as a text says; KeyboardInterrupt ends the session."""
+"""A callback that asks a person to move the board as a text says, and waits. KeyboardInterrupt ends the session."""
 
 
 def world_moves_board(config: RigConfig) -> bool:
@@ -265,14 +265,14 @@ def shown(config: RigConfig, what: str, pose: Candidate, ask: AskPerson | None, 
 
 
 Scan = Callable[..., Capture]
-"""A function that takes a view at so many `exposures` per column; None: the config's. Raises PlanError if it cannot."""
+"""A function that takes a view. exposures: per column; None: the config's. Raises PlanError if the rig cannot do it."""
 
 
 class SpeedRotation:
     """Takes successive views at different speeds in turn."""
 
     def __init__(self, exposures: Sequence[int], sees: Callable[[Capture], bool], tell: TellLine | None = None) -> None:
-        """Take the exposures per column, none: the config's; `sees` says whether a capture has what it is taken for."""
+        """exposures: per column, in turn; empty: the config's. sees: whether a capture shows enough of the line."""
         self.turns = list(exposures)
         self._sees = sees
         self._tell = tell or (lambda line: None)

@@ -31,7 +31,7 @@ _BOARD_KEYS = (
     "distance_m", "flatness_rms_m", "flatness_peak_m", "expected_m", "chi2", "freedom", "scale", "scale_sd",
     "point_rms_m",
 )  # fmt: skip
-"""Figures of a checked board that are in the summary."""
+"""Numbers of a checked board that are in the summary."""
 NO_COVARIANCE = "the calibration has no covariance: nothing tells what depth error to expect"
 SEED_APART = 1 << 20
 """Offset of a check's seeds from a calibration's: a simulated rig then shows other poses and other photons."""
@@ -47,10 +47,11 @@ def calibrate_check(
 ) -> CalibrationResult:
     """Judge a calibration by a flat board that was not used for it (`rig calibrate check`).
 
-    If the calibration names the rig it is of, the result is noted beside its file, and scans heed it.
+    If the calibration states its rig, the result is noted beside its file. After a failed check, scans refuse the
+    calibration.
 
     Raises Degenerate if the board cannot be used, CalibrationError if the calibration cannot, and UsageError for a
-    wrong request and for views that the calibration was made of.
+    wrong request and for views that the calibration was made from.
     """
     request = replace(request or CheckRequest(), **changes)
     values = si_values(request)
@@ -100,7 +101,7 @@ def calibrate_check(
 
 
 def _require_others(views: Sequence[View], model: RigModel) -> None:
-    """Raise UsageError for views that the model was made of: it was fitted to their errors too."""
+    """Raise UsageError for views that the model was made from: the model was fitted to their errors too."""
     made_of = model.provenance.get(CORNERS) or ()
     same = [view.name for view in views if corners_digest(view) in made_of]
     if same:
@@ -111,7 +112,7 @@ def _require_others(views: Sequence[View], model: RigModel) -> None:
 
 
 def _with_board(session: Session, least: int) -> list[View]:
-    """The views that show the board. Raises Degenerate, with the trouble of each view, if they are too few."""
+    """The views that show the board. Raises Degenerate, with the problem of each view, if they are too few."""
     views = [view for view in session.views if view.corners is not None]
     if len(views) < least:
         reason = next((why.reason for why in session.refused.values()), "no-board")

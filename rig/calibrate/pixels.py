@@ -55,7 +55,7 @@ STARTS: Final = 32
 """Starts of the SPAD, and so blocks whose counts are compared; more if its memory holds too few frames."""
 BLOCK_FRAMES: Final = 128
 SPARE_SLOTS: Final = 4
-"""Slots of the ring beyond those needed, for a device that sends shorter blocks than asked for, and would drop some."""
+"""Slots of the ring beyond those needed, so that nothing is lost if a device sends shorter blocks than requested."""
 SILENCE_S: Final = 5.0
 SPREAD_S: Final = 10.0
 """Seconds from the first start to the last one."""
@@ -100,9 +100,10 @@ def take_dark(
     progress: Progress | None = None,
     covered: Callable[[], None] | None = None,
 ) -> tuple[pixel_map.DarkTally, float]:
-    """Take at least `frames` frames in the dark, once the lens is `covered`; return their tally and exposure in s.
+    """Take at least `frames` frames in the dark; return their tally and exposure in s.
 
-    May raise DeviceError.
+    covered: called first, so that a person covers the lens; a world that can cover it does so instead. May raise
+    DeviceError.
     """
     if isinstance(rig.world, CoversLens):
         rig.world.cover_lens()
@@ -115,7 +116,7 @@ def take_dark(
     timing = rig.spad.configure(request)
     rig.sync.gate_low()
     workers = RowWorkers(rig.config.estimate.threads or os.cpu_count() or 1)
-    # A layout for dark frames only: no column will ever be counted.
+    # A layout for dark frames only: its one column is never counted.
     layout = SweepLayout(1, info.height, info.width, np.zeros(1, np.int32), WORD_PX, 1)
     counter = SweepCounter(layout, workers)
     tally = pixel_map.DarkTally((info.height, info.width))
@@ -161,7 +162,7 @@ def _request(scan: ScanConfig, info: SpadInfo, frames: int) -> SpadRequest:
 
 
 def _blocks(rig: OpenRig, frames: int, stride: int, block_frames: int) -> Iterator[FrameBlock]:
-    """Blocks of a start of so many frames, for all of which the ring has room."""
+    """Yield the blocks of one start of `frames` frames. The ring has room for all of them."""
     ring = BlockRing(-(-frames // block_frames) + SPARE_SLOTS, stride)
     source = Source(rig.spad, ring, SILENCE_S, lambda: None)
     with ring.reader("pixels") as reader:
@@ -187,7 +188,7 @@ def _frames_in_windows(volume: CountVolume) -> NDArray[np.int64]:
 MOST_LEAK: Final = 0.1
 """Correlation of neighbouring pixels' rates beyond which the lens was not covered; crosstalk makes 0.01."""
 WORST_PRECISION: Final = 0.2
-"""Relative standard deviation of a rate at the limit, beyond which hot pixels cannot be told."""
+"""Relative standard deviation of a rate at the limit, beyond which hot pixels cannot be identified."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -390,7 +391,7 @@ def _last(against: PathLike | None, config: RigConfig, recorded: Path | None) ->
 
 
 def _note(config: RigConfig, drift: pixel_map.PixelDrift) -> None:
-    """Note beside the calibration in use whether its map of the pixels still holds."""
+    """Note beside the config's calibration whether its older map of the pixels still holds."""
     assert config.calibration is not None, "the older map lies beside it"
     try:
         model = load_rig_model(config.calibration)
@@ -407,7 +408,7 @@ def _written(result: PixelResult, folder: RunFolder, calibration: Path | None) -
     try:
         pixel_map.save_pixels(result.found, folder.place(PIXELS_FILE))
         folder.place("dark_rate.png").write_bytes(png_bytes(dark_rate_picture(pixels)))
-        if calibration is not None:  # the config's with the new map, and the notes that speak against it
+        if calibration is not None:  # the config's calibration with the new map, and earlier notes on it
             before, file = load_rig_model(calibration), folder.place(CALIBRATION_FILE)
             rate = np.nan_to_num(pixels.rate_per_s, nan=pixels.ordinary_per_s).astype(np.float32)
             after = replace(before, defects=pixels.defects, dark_rate_per_s=rate)

@@ -1,7 +1,7 @@
 """`rig calibrate planes`: calibrates the whole rig, camera, mirror and lag together, from views of a board.
 
-In the guided mode (`guided`) the rig is fitted after each view, and the pose that lowers the expected error most is
-asked for next.
+In the guided mode (`guided`) the rig is fitted after each view, and the next pose is the one that lowers the expected
+error most.
 """
 
 from collections.abc import Callable, Mapping, Sequence
@@ -33,10 +33,10 @@ from rig.progress import tell_stage
 from rig.requests import PlanesRequest
 
 SPEEDS = ((1.0, 1), (0.3, 2), (2.0, 4))
-"""Exposures per column by turns: factors of the config's, and the least number for each.
+"""(factor on the config's exposures per column, least number of exposures) of successive views, used in turn.
 
-The lags of both directions need several speeds, and hold between the lowest and the highest of them. One exposure shows
-the line in bright light only, so that it is tried only where it is the config's own.
+The lags of both directions need several speeds, and hold between the lowest and the highest of them. With one exposure
+the line is visible in bright light only, so one exposure is used only if the config has it.
 """
 
 
@@ -51,7 +51,8 @@ def calibrate_planes(
     """Calibrate camera, light planes and lag together from views of a board (`rig calibrate planes`).
 
     The defects of the base calibration are kept. Raises Degenerate, with notes why, if the views give no model,
-    CalibrationError for a file that cannot be used and a line that misses `at`, UsageError for a wrong request.
+    CalibrationError for a file that cannot be used and a line that does not reach the distance `at`, UsageError for a
+    wrong request.
     """
     request = replace(request or PlanesRequest(), **changes)
     values = si_values(request)
@@ -215,7 +216,7 @@ def guided(
 ) -> ChoosePose:  # fmt: skip
     """Return a choice of poses by how much they lower the expected error, until the verdict passes or none is left.
 
-    start: chooses for as long as no fit of the session's views can be judged. fit, judge: those of the final result.
+    start: chooses the poses until a fit of the session's views can be judged. fit, judge: those of the final result.
     """
     asked: set[tuple[float, tuple[int, int], tuple[int, int]]] = set()
 
@@ -225,7 +226,7 @@ def guided(
         try:
             found = fit()
             judged = judge(found)
-        except CalibrationError:  # no model yet, or its line misses the distance asked
+        except CalibrationError:  # no model yet, or its line does not reach the distance asked for
             return start(views)
         at_m = judged.asked.at_m
         session.say(f"expected error {judged.uncertainty.line()}; asked {mm(judged.asked.accuracy_m)}")
@@ -235,7 +236,7 @@ def guided(
             return None
         advice = next_pose(choices, at_m, judged.evidence.expected_m, Forecast(found, at_m))
         chosen = advice.candidate
-        asked.add((chosen.fill, chosen.place, chosen.tilt))  # a board that was not found there will not be again
+        asked.add((chosen.fill, chosen.place, chosen.tilt))  # never again, even if the board is not found there
         return advice
 
     return choose

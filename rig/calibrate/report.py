@@ -105,7 +105,7 @@ _UNITS = {
     "offset_0": ("mm", 1e3), "offset": ("mm/rad^{order}", 1e3),
     "lag": ("us", 1e6), "row_delay": ("ns/row", 1e9),
 }  # fmt: skip
-"""Unit of each term of the model, and how many of it make the SI unit. The mirror command has no unit."""
+"""Unit of each term of the model, and how many of these units make one SI unit. The mirror command has no unit."""
 
 
 def measured(name: str, value: float, sd: float) -> tuple[str, str, str]:
@@ -149,7 +149,7 @@ _GROUND, _RIM, _INK = (255, 255, 255), (200, 194, 189), (77, 64, 51)
 _ERROR = (0, 94, 213)
 """Colour of errors; colours here are BGR."""
 _COLOURS = ((178, 114, 0), (0, 94, 213), (115, 158, 0), (167, 121, 204), (0, 159, 230), (233, 180, 86), (66, 228, 240))
-"""Colours of the views, by turns: those of Okabe and Ito, which the colour-blind can tell apart."""
+"""Colours of the views, used in turn: those of Okabe and Ito, which the colour-blind can distinguish."""
 ARROW_TIMES = (1000, 500, 200, 100, 50, 20, 10, 5, 2, 1)
 
 
@@ -219,8 +219,8 @@ def planes_report(fit: RigFit, views: Sequence[View], judged: JudgedRig) -> Repo
 
 
 def camera_sections(camera: Camera, views: Sequence[View], residuals_px: Sequence[Array]) -> list[Section]:
-    """Sections that show where corners were seen, with the views' colours and names, and how far they are from the
-    model's, by arrows that are enlarged.
+    """Sections that show where corners were seen, with the views' colours and names, and their distances from the
+    model's corners as enlarged arrows.
     """
     scale = _WIDTH_PX / camera.width
     coverage = np.full((round(camera.height * scale), _WIDTH_PX, 3), _GROUND, np.uint8)
@@ -406,7 +406,7 @@ def rate_chart(pixels: PixelMap, older: PixelMap | None = None) -> str:
     """Chart (SVG) of the number of pixels by dark rate, with the limit above which they are hot."""
     maps = [(pixels, "this map", _NEW), *([(older, "the last one", _OLD)] if older is not None else [])]
     rates = [one.rate_per_s[np.isfinite(one.rate_per_s)].astype(np.float64) for one, _, _ in maps]
-    # Pixels that never fired stand at half a count.
+    # Pixels that never fired are shown at half a count.
     floor = 0.5 / max(pixels.frames, 1) / pixels.exposure_s
     rates = [np.maximum(rate, floor) for rate in rates]
     ends = min(float(r.min()) for r in rates), max(float(r.max()) for r in rates)

@@ -142,7 +142,7 @@ class Session:
     def __exit__(
         self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
     ) -> None:
-        """Keep what was written if there is a view among it, and say so where something went wrong."""
+        """Keep the folder if it has a view; a note on the error, if there is one, says where the views are."""
         if self._folder is None:
             return
         if self.views:
@@ -276,7 +276,7 @@ def told(view: View, refused: Degenerate | None) -> str:
 
 
 def true_model(live: RigConfig | None) -> RigModel | None:
-    """The rig as its world knows it; None for a real one. Called only after everything was estimated."""
+    """The true rig model, from the simulated rig's world; None for a real rig. Called only after all estimates."""
     if live is None or live.world is None:
         return None
     with open_rig(live.model_copy(update={"calibration": None})) as rig:

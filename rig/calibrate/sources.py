@@ -23,7 +23,7 @@ VIEWS = "views"
 """Folder of a session that holds its views."""
 PICTURES = (".png", ".jpg", ".jpeg", ".tif", ".tiff", ".bmp")
 BOARD_SCENE = "board"
-"""Scene that a simulated rig is shown where its own has no board."""
+"""Scene that a simulated rig is shown if its own scene has no board."""
 
 
 SourcesLike = Config | Sequence[Config]
@@ -95,7 +95,7 @@ def sort_sources(sources: SourcesLike, *, pictures: bool = False, scene: str | N
 
 
 def _live(source: Config, scene: str | None, notes: list[str]) -> RigConfig:
-    """The config of a rig. A note says where a simulated one is shown another scene than its own."""
+    """The config of a rig. A note is added if a simulated rig is shown another scene than its own."""
     loaded = configure(source, scene=scene)
     world = loaded.world
     if scene is not None or world is None or "board_pose" not in type(world).model_fields:
@@ -142,8 +142,10 @@ def si_values(request: CalibrationRequest) -> dict[str, float]:
 
 
 def known_camera(file: Path, *, accept: bool = False) -> tuple[KnownCamera, list[Refusal]]:
-    """Read a camera file, and return also the reasons in spite of which it is used. Raises UsageError if its verdict
-    failed, unless `accept`, and CalibrationError if it is no such file. Without a verdict it is used unchecked.
+    """Read a camera file; return the camera and the reasons of its failed verdict, if it is used in spite of one.
+
+    accept: whether to use a camera whose verdict failed. Raises UsageError if it failed and is not accepted, and
+    CalibrationError if the file is no camera file. A camera without a verdict is used.
     """
     known = load_camera(file)
     found = failed_verdict(known.verdict, known.reasons)

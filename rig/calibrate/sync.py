@@ -47,11 +47,11 @@ from rig.recording.inputs import read_plan
 from rig.requests import SyncRequest
 
 AROUND_FRAMES = 12
-"""Frames looked at on either side of the planned place of an edge."""
+"""Frames used on either side of the planned place of an edge."""
 LEAST_FRAMES = 4
 """Fewest frames on either side of an edge."""
 SETTLED_FRAMES = 3
-"""Frames from the edge at which a frame and the two that follow are all dark, or all lit."""
+"""Distance from the edge, in frames, beyond which a frame and the two that follow are all dark, or all lit."""
 MOST_LATE_FRAMES = 3
 """Longest delay that is looked for, in frames; gates take microseconds."""
 MOST_SCATTER = 10.0
@@ -149,11 +149,11 @@ def _own(live: RigConfig | None) -> LoadedCalibration | None:
     try:
         return live.calibration, load_rig_model(live.calibration)
     except CalibrationError:
-        return None  # the command that needs it says what is wrong with it
+        return None  # other commands, which need it, report what is wrong with it
 
 
 def _signed(model: RigModel, gate: GateDelay | None, verdict: Verdict) -> RigModel:
-    """The model with the lags, the gate's delay and their origin; its verdict fails where the measurement's did."""
+    """The model with the gate's delay and the origin of the lags; its verdict fails if that of the lags did."""
     identity = model.identity
     if identity is not None and not verdict.passed:
         identity = replace(identity, verdict="failed", reasons=(*identity.reasons, *verdict.codes))
@@ -225,7 +225,9 @@ def gate_delay(run: Path) -> GateDelay | None:
 
 
 def _edge(ones: Array, middle_s: Array, late_s: Array, plan: ScanPlan, *, rises: bool) -> Edge | None:
-    """The edge, tried at delays (delays,), from `_ones` and middles (frames,) around its plan at 0; None: too few."""
+    """Fit an edge at each of the delays late_s; None for too few frames around it. ones: from `_ones`. middle_s:
+    (frames,), middles of the exposures after the planned time of the edge.
+    """
     frame_s = float(1 / plan.frame_rate_hz)
     near = np.abs(middle_s) < AROUND_FRAMES * frame_s
     if min((near & (middle_s < 0)).sum(), (near & (middle_s > 0)).sum()) < LEAST_FRAMES:
@@ -237,7 +239,7 @@ def _edge(ones: Array, middle_s: Array, late_s: Array, plan: ScanPlan, *, rises:
 
 
 def _saturation(lit: Array, dark: Array) -> float:
-    """Sum of p^2 over sum of p for pixels that the line lights with probability p; 1, the worst, if none can tell."""
+    """Sum of p^2 over sum of p if the line makes pixels fire with probability p; 1, the worst, if unknown."""
     if not (len(lit) and len(dark)):
         return 1.0
     whole, next_one, after = (lit.mean(axis=0) - dark.mean(axis=0)).tolist()

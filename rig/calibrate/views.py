@@ -33,10 +33,10 @@ from rig.progress import part, tell_stage
 from rig.requests import BoardRequest
 
 MISSED_SHARE = 0.5
-"""Share of further poses that are shown where the board is not found in some."""
+"""Share of extra poses that are shown if the board is not found at some."""
 
 LASTING = (["wrong-board"] * 3, ["mirrored"] * 3)
-"""Refusals of a session's first views which no pose of the board will change: the session ends with them."""
+"""Reasons of the first refusals after which a session ends, since no other pose of the board would help."""
 
 
 ChoosePose = Callable[[Sequence[View]], Advice | None]
@@ -44,7 +44,7 @@ ChoosePose = Callable[[Sequence[View]], Advice | None]
 
 
 def require_poses(session: Session, poses: int) -> None:
-    """Raise UsageError if this number of poses, with the views taken already, is too small whatever they show."""
+    """Raise UsageError if this number of poses, with the views taken already, is below FEWEST_POSES."""
     there = sum(view.corners is not None for view in session.views)
     if there + poses < FEWEST_POSES:
         beside = f" and {there} view{'s' * (there > 1)} taken before" if there else ""
@@ -54,7 +54,7 @@ def require_poses(session: Session, poses: int) -> None:
 
 
 def good_poses(config: RigConfig, board: Board, poses: int, at_m: float, seed: int, behind: int = 0) -> ChoosePose:
-    """Return a choice of poses that tell most about any rig, one after the other, with some to spare.
+    """Return a choice of the poses of `calibration.guide.sequence`, one after the other, with some to spare.
 
     behind: number of poses of the sequence already shown. Raises UsageError if no pose fits the picture.
     """
@@ -91,8 +91,8 @@ def take_live(
     """Take as many good views as are requested, of a board that is moved from pose to pose.
 
     choose: chooses the poses. ask: asks a person to move the board.
-    exposures: per column, used in turn, so that the mirror is seen at several speeds; speeds that the rig cannot do are
-      left out, and those that never show the line although more exposures do; empty is as the config says.
+    exposures: per column, used in turn, so that the mirror is seen at several speeds (see `SpeedRotation`); empty: the
+      config's.
     defects: (rows, width), pixels that are not used. line: whether the line has to be seen on the board.
     """
 
@@ -172,11 +172,11 @@ def _pictured(file: Path, board: Board | None) -> tuple[View, Degenerate | None]
 def refusal(
     refused: Degenerate, session: Session, board: Board, *, photons: bool = True, line: bool = True
 ) -> Degenerate:
-    """The error for views that give no calibration, with its root cause, and the other reasons in notes.
+    """The error for views that give no calibration: its message is the likely root cause, its notes the other reasons.
 
-    The other arguments are as in `judge_refused`.
+    photons, line: as in `judge_refused`.
     """
-    if refused.reason == "no-board" and session.refused:  # rather, why most views have no board
+    if refused.reason == "no-board" and session.refused:  # replaced by the most common reason of the views
         (reason, _), *_ = Counter(why.reason for why in session.refused.values()).most_common()
         refused = Degenerate(reason, f"none of {len(session.views)} views shows the board as it should")
     reasons = judge_refused(refused, session.views, board, session.size, photons=photons, line=line).reasons

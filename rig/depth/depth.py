@@ -52,12 +52,12 @@ def depth_map(
 
 
 SAME_PX = 1.5
-"""Answers this close mean the same stripe: each may be off by a pixel, and stripes that meet cannot be told apart."""
+"""Answers this close mean the same stripe: each may be off by a pixel, and closer stripes cannot be separated."""
 
 
 def share_claims(stripes: StripeTable, grid: LineGrid) -> StripeTable:
-    """The table in which the confidence c of each of several coinciding answers is multiplied by c over the sum of
-    theirs; two equal ones are halved.
+    """The table with lower confidences of coinciding answers: each confidence c is multiplied by c over the sum of the
+    confidences of the answers that coincide. Two equal ones are halved.
 
     Positions stay as they are.
     """

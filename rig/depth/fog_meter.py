@@ -1,21 +1,22 @@
 """The fog meter: how dense the medium is, and the light it scatters and the ambient light, from the counts of a single
 map.
 
-Rows whose stripe is beyond doubt show the light before it and behind it. With s the mean of the path lengths from
-scanner and camera in metres, and G the geometry factor of the haze (`rig.estimate.row.inputs`),
+Rows of a column whose stripe is beyond doubt (clear rows) show the light before and behind the stripe. With s the mean
+of the path lengths from scanner and camera in metres, and G the geometry factor of the haze
+(`rig.estimate.row.inputs`),
 
     flux = ambient + offset + haze G exp(-2 extinction s)           before the stripe
          = ambient + offset + rest haze G exp(-2 extinction s)      behind it
 
 is fitted by maximum likelihood of the counts, binned by s (float64 sums (blocks, 2, bins, 4), see `add_clear_rows`).
-The parameters are haze, extinction, the share `rest` that was scattered more than once, and the error of the learned
-ambient light.
+The parameters are haze, extinction, the share `rest` of the haze that was scattered more than once, and `offset`, the
+error of the learned ambient light.
 
-Error bars are those of the sandwich, H^-1 (sum of g g^T) H^-1, with H the information of the counts and g the
-likelihood's slope from each block of rows and columns; they are no shorter than those of H^-1. What the model leaves
-out shows as scatter between blocks, as in a jackknife, of which this is the first order. One error shows in no scatter:
-light scattered more than once flattens the decay all over the picture. Therefore REST_SHARE of `rest` is added (in
-quadrature) to the extinction's relative error.
+Standard deviations are those of the sandwich, H^-1 (sum of g g^T) H^-1, with H the information of the counts and g the
+likelihood's slope from each block of rows and columns, but at least those of H^-1. What the model leaves out shows as
+scatter between blocks; the sandwich is a jackknife to first order. One error shows in no scatter: light scattered more
+than once flattens the decay all over the picture. Therefore REST_SHARE times `rest` is added (in quadrature) to the
+extinction's relative error.
 
 Limits. Nothing is carried over between maps: a reading depends on its map only, and is the same whenever the map is
 estimated again. If the fog forms a halo around the stripes (`halo` of the model), its light falls off on both sides of
@@ -45,7 +46,7 @@ STEPS: Final = 40
 REST_PRIOR: Final = 25.0
 """Inverse variance of `rest` before any count (sd 0.2), so that a map without pixels behind stripes is solvable too."""
 RIDGE: Final = 1e-11
-"""Added to the diagonal: keeps the inverse positive where two numbers say the same, as even haze and daylight do."""
+"""Added to the diagonal: keeps the inverse positive if two parameters act alike, as even haze and ambient light do."""
 FLUX_MIN: Final = 1e-7
 FLUX_MAX: Final = 50.0
 """Photons per exposure; between these all logarithms are finite."""
@@ -99,7 +100,7 @@ def fit_fog(sums: Float64, path_m: Float64) -> FogFit | None:
 
 
 def _inverse(information: Float64) -> Float64:
-    """Inverse of an information whose numbers may be of any size, and may depend on each other."""
+    """Inverse of an information matrix whose parameters may have any scale, and may be dependent."""
     size = np.sqrt(np.diag(information))
     relative = information / np.outer(size, size) + RIDGE * np.eye(len(size))
     return np.asarray(np.linalg.inv(relative) / np.outer(size, size))
@@ -156,28 +157,28 @@ class _Data:
 VISIBILITY_CONTRAST: Final = 3.912
 """-ln(0.02): visibility is the distance at which contrast falls to 2 %, 3.912 / extinction (Koschmieder)."""
 RESOLVED_SIGMAS: Final = 3.0
-"""A figure is stated where it is at least this many standard deviations above zero."""
+"""A quantity is stated if it is more than this many standard deviations above zero."""
 CLEAR: Final = 0.85
 CLEAR_PX: Final = 6.0
-"""Lines as certain as this, and pixels as far from their stripe, are read. Surer lines alone would tell the haze too
-thin, since at few exposures it is chance that makes a line sure; among less sure ones stripes are taken for haze."""
+"""Least confidence of a clear row, and least distance of its pixels that are read from its stripe. A higher confidence
+would bias the haze low, since with few exposures it is reached by chance; with a lower one stripes count as haze."""
 LEAST_LINES: Final = 30
-"""Clear lines below which a map says nothing."""
+"""Fewest clear rows, over all columns, for a reading."""
 BLOCKS: Final = 4
 """Blocks along the rows, and along the columns."""
 MODEL_SHARE: Final = 0.02
-"""Relative error that the model's form brings: bins, gains of rows and columns, two path lengths taken as one."""
+"""Relative error due to the model's form: bins, gains of rows and columns, one mean for two path lengths."""
 REST_SHARE: Final = 1.0
-"""Relative error of the extinction over the share of light scattered more than once. Traced: in isotropic fog the decay
-is flatter by 25 to 40 % where `rest` is 0.35 to 0.45 (Mitsuba rows, docs/explanation/fog-meter.md)."""
+"""Relative error of the extinction, divided by the share of light scattered more than once. In ray-traced isotropic fog
+the decay is flatter by 25 to 40 % if `rest` is 0.35 to 0.45 (Mitsuba rows, docs/explanation/fog-meter.md)."""
 
 
 @dataclass(frozen=True, slots=True)
 class FogEstimate:
     """Fog and light of a map, each but veil_to_signal with its standard deviation; None if it is not resolved.
 
-    visibility_m: 3.912 / extinction; its standard deviation is half of the change for an extinction that is two
-    standard deviations smaller.
+    visibility_m: 3.912 / extinction. visibility_sd_m: half of the amount by which visibility grows if the extinction
+    is smaller by two of its standard deviations.
     ambient_per_exposure: photons per pixel and exposure that are not the laser's: surfaces, airlight and dark counts,
     mean over the pixels read. veil_per_exposure: the laser's light that the medium sends back, per pixel just before
     the stripe, mean over the rows read; veil_to_signal: ratio to their stripes' light.
@@ -249,7 +250,7 @@ def _dark_offset(sweep: Any, ambient: Float32, hot_flux: float) -> tuple[float, 
 
 
 def _dark_alone(sums: Float64, dark: tuple[float, float] | None) -> FogEstimate:
-    """The ambient light, if dark frames tell of it: a halo or the haze of other lines lies on all that is read."""
+    """The ambient light alone, from dark frames: a halo or the haze of other lines disturbs everything else."""
     if dark is None:
         return FogEstimate()
     level = float(sums[..., 3].sum() / sums[..., 1].sum()) + dark[0]
@@ -268,7 +269,7 @@ def _stated(
     exposures = sums[..., 1].sum()
     ambient, ambient_sd = float(sums[..., 3].sum() / exposures), float(sd[2])
     if dark is not None:
-        # The laser's light that is there on both sides of the stripe has been scattered more than once as well.
+        # Laser light that is equally present on both sides of the stripe has been scattered more than once as well.
         level = np.average(haze * np.exp(-2.0 * extinction * (path_m - fit.at_m)), weights=sums[:, 0, :, 2].sum(0))
         rest = max(rest, 0.0) + max(float(offset) - dark[0], 0.0) / max(float(level), FLUX_MIN)
         offset, ambient_sd = dark[0], math.hypot(dark[1], MODEL_SHARE * (ambient + dark[0]))
@@ -278,7 +279,7 @@ def _stated(
     if extinction > RESOLVED_SIGMAS * extinction_sd:
         visibility_m, farther_m = (VISIBILITY_CONTRAST / float(extinction - n * extinction_sd) for n in (0.0, 2.0))
         found |= {"extinction_per_m": float(extinction), "extinction_sd_per_m": extinction_sd}
-        # As far as the extinction's bar reaches on the side of clear air: the other side's is shorter.
+        # On the side of clear air, where the change is larger.
         found |= {"visibility_m": visibility_m, "visibility_sd_m": (farther_m - visibility_m) / 2.0}
     found |= _ambient(ambient, ambient_sd)
     if len(at_stripe):

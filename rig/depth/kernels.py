@@ -21,7 +21,7 @@ MAX_COLUMN_GAP: Final = 2
 """Stripes of columns farther apart than this are not joined to one surface."""
 SPACING_TOLERANCE_PX: Final = 1.0
 SPACING_SIGMAS: Final = 3.0
-"""Stripes lie on one surface where their spacing is that of equal depth within these."""
+"""Stripes lie on one surface if their spacing differs from that of equal depth by at most the sum of both."""
 
 
 @numba.njit(cache=True, nogil=True)
@@ -85,10 +85,12 @@ def add_clear_rows(
     sweep: Sweep, state: RowState, lines: Lines, x_px: Float32, clear: Bools, block: Int32, clear_px: float,
     hot_flux: float, sums: Float64, at_stripe: Float64,
 ) -> None:  # fmt: skip
-    """Add the pixels of clear lines that are clear_px or more before or behind their stripe at x_px.
+    """Add the pixels that are clear_px or more before or behind the stripe at x_px, for each clear row of a column.
 
-    sums: (blocks, 2, bins, SUMS), before and behind. at_stripe (lines, 2): path in metres and geometry factor of the
-    haze at the stripe, unchanged for other lines. Pixels with more ambient flux than hot_flux are left out.
+    lines: the rows with their columns; x_px, clear and block have one entry for each. clear: whether its stripe is
+    beyond doubt; other rows are skipped. block: number of its block of rows and columns. sums: (blocks, 2, bins, SUMS),
+    before and behind the stripe. at_stripe (lines, 2): path in metres and geometry factor of the haze at the stripe,
+    unchanged for skipped rows. Pixels with more ambient flux than hot_flux are left out.
     """
     row = row_buffers(sweep.window, state.amplitude.shape[0])
     step = 1 if sweep.near_is_left else -1

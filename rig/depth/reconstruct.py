@@ -44,7 +44,7 @@ def map_geometry(
     model: RigModel | None, column_commands: Sequence[float] | Float64, depth_range_m: tuple[float, float], *,
     sensor: tuple[int, int] | None = None, lines: LineGrid | None = None,
 ) -> SweepGeometry:  # fmt: skip
-    """The geometry that a `Reconstructor` takes.
+    """The geometry for a `Reconstructor`.
 
     model: rig model; None for an uncalibrated rig, which gives stripes only and needs sensor (rows, width).
     column_commands: (columns,) mirror command of each column's centre. lines: which line lights which column, if there
@@ -61,9 +61,9 @@ def map_geometry(
 class Reconstructor:
     """Turns counted sweeps into maps, one after the other; estimators that learn carry their state from map to map.
 
-    model, column_commands, lines: those that `map_geometry` has made the geometry of. learned: states of earlier maps
-    to use. Raises KeyError for the estimator `auto`, for which `rig.scan.estimator` chooses, and with `learned` for
-    estimators that learn nothing.
+    model, column_commands, lines: the same that were given to `map_geometry`. learned: kept states; each map is then
+    estimated with its own, and nothing is learned. Raises KeyError for the estimator `auto` (`rig.scan.estimator`
+    chooses one first), and with `learned` for estimators that learn nothing.
     """
 
     def __init__(
@@ -127,7 +127,7 @@ class Reconstructor:
         return MapResult(stripe, depth, intensity, fog, compute_s, self.estimator.used, doubts)
 
     def _bound(self, sweep: FrameTally) -> SweepGeometry:
-        """Geometry with the planes where the frames of each column really were."""
+        """Geometry with the planes at which the frames of each column were actually taken."""
         if self._model is None:
             return self.geometry
         column = sweep.bound_column()

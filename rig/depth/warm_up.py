@@ -17,7 +17,7 @@ from rig.plan.scan_plan import ScanPlan
 ROWS, COLUMNS = 16, 24
 """Size of the made-up map; any would do."""
 MAPS = 2
-"""The first map is learned, the second one is judged as its frames come."""
+"""The first map is learned from, the second one is estimated while its frames come."""
 
 
 def warm_up(estimator: str, filter: str, exposures: int, *, dark: bool) -> None:
@@ -28,12 +28,12 @@ def warm_up(estimator: str, filter: str, exposures: int, *, dark: bool) -> None:
     rng = np.random.default_rng(0)
     geometry = uncalibrated_geometry(ROWS, WORD_PX, COLUMNS)
     layout = SweepLayout(COLUMNS, ROWS, WORD_PX, geometry.x0, geometry.window, exposures, None, dark)
-    # A prior needs kernels beside those of an estimate without one.
+    # An estimate with a prior needs additional kernels.
     maker = create_estimator(estimator, 1, temporal_prior=True)
     counter = maker.counter(layout, geometry)
     bins = np.repeat(np.arange(-1 if dark else 0, COLUMNS, dtype=np.int32), exposures)
     bins[bins < 0] = BIN_DARK
-    # A stripe that wanders from column to column: from noise alone nothing is learned, and nothing judged after it.
+    # A stripe that moves from column to column: from noise alone nothing would be learned, nor estimated after it.
     rate = np.full((len(bins), ROWS, WORD_PX), 0.05)
     lit = np.flatnonzero(bins >= 0)
     rate[lit, :, WORD_PX // 4 + bins[lit]] = 0.95

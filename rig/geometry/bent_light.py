@@ -1,8 +1,8 @@
-"""Light that is no plane within a column: sheets that bow, and rows that are read one after the other.
+"""Light that is not one plane within a column: sheets that bow, and rows that are exposed one after the other.
 
-Windows, estimators and the joining of stripes work with planes and rays (u, v, 1). So they are given rays that are bent
+Windows, estimators and the joining of stripes work with planes and rays (u, v, 1). So they use rays that are bent
 sideways by the effect of the bow in the middle of the depth range. The remaining error, together with the delay of the
-rows, is below a pixel or two. The windows are wider by that (`beside_px`), and the depth of a map is corrected
+rows, is below a pixel or two. The windows are widened by it (`beside_px`), and the depth of a map is corrected
 afterwards, exactly, from each pixel's command (`BentLight.inverse_depth`). `calibration.model.light_sheet` has the
 formula of a bowed sheet. Rays are float32 (rows, width), commands and sheets float64.
 """
@@ -21,7 +21,7 @@ _SAMPLED_SHEETS = 4097
 """Sheets sampled over the command range: between two of them a plane is linear to 1e-8 rad."""
 _SAMPLED_COLUMNS = 9
 _SAMPLED_ROWS = 16
-"""About so many columns, and one row in so many, are examined for the error that bent rays leave."""
+"""The error that bent rays leave is computed in about this many columns, and in one of this many rows."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -40,7 +40,7 @@ class BentLight:
     velocity_per_s: float = 0.0
 
     def inverse_depth(self, command: Float64, first_row: int = 0) -> Float32:
-        """Inverse depth where the mirror was bound to commands (rows, width), from first_row on; NaN stays NaN."""
+        """Inverse depth of pixels (rows, width), from first_row on, that are bound to these commands; NaN stays NaN."""
         from rig.geometry.kernels import bent_inverse_depth
 
         model, rows = self.model, slice(first_row, first_row + len(command))
@@ -92,7 +92,7 @@ def bent_u(model: RigModel, u: Float64, v: Float64, depth_m: float) -> Float64:
 def beside_px(
     model: RigModel, rays: tuple[Float64, Float64], bent: Float64, commands: Float64, depth_range_m: tuple[float, float]
 ) -> int:
-    """Largest distance in pixels of stripes from the place that planes and bent rays give, within the depth range.
+    """Largest distance in pixels of true stripes from those that planes and bent rays give, within the depth range.
 
     rays: u and v (rows, width); bent: u as from `bent_u`. Rounded up, from a sample of rows and columns. Holds for
     sweeps in both directions at the fastest speed at which the lag was measured.

@@ -64,8 +64,8 @@ def with_rays(u, y, first, last):  # type: ignore[no-untyped-def]
 
 
 NEWTON_STEPS: Final = 2
-"""Newton's steps from the plane on: no more error than float32's rounding is left, also where sheets bow ten times as
-much as a bad lens's."""
+"""Newton's steps, starting from the plane. They leave no more error than float32's rounding, even if sheets bow ten
+times as much as those of a bad lens."""
 
 
 @numba.njit(cache=True, nogil=True)
@@ -73,7 +73,7 @@ def bent_inverse_depth(
     command: Float64, ahead: Float64, u: Float32, v: Float32, sheets: Float64, low: float, high: float, origin: Float64,
     bow: float, inverse_depth: Float32,
 ) -> None:  # fmt: skip
-    """Write inverse depth (rows, width) where the mirror was bound to `command`; NaN where there is none.
+    """Write inverse depth (rows, width) of pixels that are bound to `command`; NaN where there is none.
 
     ahead: (rows,) change of the command until the row is exposed. sheets: (samples, 10) float64, n, d, middle and
     across of the sheets at even steps of the command from low to high, close enough to be interpolated linearly.

@@ -18,7 +18,7 @@ class StripeTable:
     confidence: probability that x_px is within 1 px of the truth, 0 to 1 (0 where x_px is NaN).
     x_sd_px: standard deviation of x_px given that it is the right stripe.
     signal: photons per exposure of the stripe, summed across it; haze: photons per exposure and pixel just before it.
-    x2_px: position of a second stripe beside that at x_px, nearer or farther (a pane before a wall), NaN where no light
+    x2_px: position of a second stripe in addition to x_px, nearer or farther (a pane before a wall), NaN where no light
     stands out. confidence2: probability that there is a stripe within 1 px of x2_px, 0 where x2_px is NaN. Both are
     None if an estimator does not look for a second stripe.
     """
@@ -44,7 +44,7 @@ class StripeTable:
 
 
 MISSING_PX = 10.0
-"""Error charged for a missing answer, in px, where leaving answers out must not help."""
+"""Error charged for a missing answer, in px, so that leaving answers out does not help."""
 
 
 def stripe_errors(x_px: Float32, true_x_px: Float32) -> dict[str, float | None]:

@@ -20,7 +20,7 @@ from rig.simd import Bools, Float32, Float64, Int32
 WORD_PX: Final = 64
 """Windows start and end at multiples of one 64-bit word, so that counting runs on whole words."""
 MARGIN_PX = 10
-"""Pixels kept on both sides of the search interval: they still say where the haze ends."""
+"""Pixels kept on both sides of the search interval, since they show where the haze ends."""
 _GOLDEN: Final = 0.6180339887
 """Fraction of the golden ratio, whose multiples cover rows and columns without beating against either."""
 
@@ -146,7 +146,7 @@ def sweep_geometry(model: RigModel, commands: Float64, depth_range_m: tuple[floa
     first = np.where(empty, 0, np.clip(first, 0, width - 1)) // WORD_PX * WORD_PX
     last = np.where(empty, 0, np.clip(last, 0, width - 1))
     window = int(-(-(last - first + 1).max() // WORD_PX) * WORD_PX)
-    # Columns that see nothing take their neighbour's window: moving windows need not jump for them.
+    # Columns that see nothing get their neighbour's window, so that moving windows need not jump for them.
     some = np.flatnonzero(~empty)
     nearest = some[np.searchsorted(some, np.arange(x_lo.shape[1])).clip(max=len(some) - 1)]
     x0 = np.minimum(first, padded - window).astype(np.int32)[nearest]
@@ -157,7 +157,7 @@ def sweep_geometry(model: RigModel, commands: Float64, depth_range_m: tuple[floa
 
 
 def uncalibrated_geometry(rows: int, width: int, columns: int) -> SweepGeometry:
-    """Geometry of a rig without a model: the whole row is searched, near is taken to be left, and depth has no meaning.
+    """Geometry of a rig without a model: the whole row is searched, near points are assumed left, depth means nothing.
 
     Inverse depth falls linearly from 1.5 to 0.5 across the picture, so that the estimators' haze profile has a scale.
     """

@@ -20,7 +20,7 @@ from rig.geometry.windows import WORD_PX, sweep_geometry
 from rig.plan.scan_plan import ScanPlan
 
 MOST_TIMES = 1000.0
-"""Most exposures that a calibration is advised to be made at, as a multiple of the scan's: more teach nothing."""
+"""Most exposures that are advised for a calibration, as a multiple of the scan's."""
 
 
 def model_problems(

@@ -62,7 +62,7 @@ def compile_plan(
 
     point_clock: the scanner's exact clock for a requested rate (`BeamScanner.point_clock`).
     model: None if the rig is not calibrated; there is then no lag and the window is the whole row.
-    line_offsets: of the rig, which fit the scan.
+    line_offsets: of the rig's lines; the number of columns is a multiple of theirs.
     Raises PlanError with one line per problem.
     """
 
@@ -73,7 +73,7 @@ def compile_plan(
     too_fast = [*beyond_sensor(scan, info)]
     if plan is not None and plan.mode == "stream" and plan.bytes_per_s > (plan.link_bytes_per_s or 0.0):
         too_fast.append(beyond_link(plan, info, lambda rate: draft(scan.model_copy(update={"frame_rate": rate}))[0]))
-    spad_problems = [min(too_fast)[1]] if too_fast else []  # the stricter limit: the other remedy would not be enough
+    spad_problems = [min(too_fast)[1]] if too_fast else []  # the stricter limit: its remedy meets the other one too
     problems = [*spad_problems, *problems]
     if problems or plan is None:
         raise PlanError(*problems)
@@ -129,7 +129,7 @@ def path_demand(scan: ScanConfig, places: int, model: RigModel | None, *, marker
         frame_s=1 / frame_rate,
         lag_s=max(model.lag_s if model is not None else Lag()),
         guard_s=GUARD_FRAMES / float(frame_rate),
-        # Without markers nothing says that the gate was low on a column, so it must surely be open on all of them.
+        # Without markers nothing shows that the gate was low on a column, so it must surely be open on all columns.
         clock_tolerance=CLOCK_TOLERANCE if blanking is None else MAX_CLOCK_ERROR,
         dark_fraction=scan.dark_fraction,
         bidirectional=scan.bidirectional,
@@ -174,8 +174,8 @@ def _plan(
         blanking=blanking,
         lines=lines,
     )
-    # Line markers move the windows, also in whole frames; without them every pixel of a frame is used, and so it is
-    # where the windows of several lines lie all over the picture.
+    # Line markers move the windows, also within whole frames. Every pixel of a frame is used without markers, and with
+    # several lines, whose windows lie all over the picture.
     return _transported(plan if blanking or lines else _with_windows(plan, info.roi_step_px), info.burst)
 
 
@@ -191,7 +191,10 @@ def _with_windows(plan: ScanPlan, step_px: int) -> ScanPlan:
 
 
 def _transported(plan: ScanPlan, burst: BurstMode | None) -> ScanPlan:
-    """The plan with the way its frames come: whole where the link carries them, or windows, or bursts, or unchanged."""
+    """The plan with the way its frames are sent: whole, else in windows, if the link carries these; else in bursts.
+
+    It is unchanged if none is possible.
+    """
     rate = float(plan.frame_rate_hz)
     if rate <= (plan.full_frames_hz or 0.0):
         return plan

@@ -1,6 +1,6 @@
 """The program of the sync source: when the gate opens, sweep by sweep, and the blanking pattern before it.
 
-`unseen_pattern` checks whether the camera sees that pattern, during which the line is beside the first column.
+`unseen_pattern` checks whether the camera sees that pattern, during which the line is just before the first column.
 """
 
 import numpy as np
@@ -47,7 +47,7 @@ def _pulses(plan: ScanPlan, sweep: int, lit: bool) -> list[Pulse]:
 
 DEPTHS_TRIED = 32
 COMMANDS_TRIED = 256
-"""Numbers of depths and of mirror commands at which it is tried whether the camera sees the line."""
+"""Numbers of depths and of mirror commands at which it is checked whether the camera sees the line."""
 
 
 def unseen_pattern(plan: ScanPlan, model: RigModel | None) -> list[str]:
@@ -65,7 +65,7 @@ def unseen_pattern(plan: ScanPlan, model: RigModel | None) -> list[str]:
 
     problems = []
     for leg in plan.legs:
-        # Of several lines the one that lights the first column then: that is where the pattern is looked for.
+        # With several lines, the one that lights the first column: the pattern is looked for in its light.
         offset = 0.0 if plan.lines is None else plan.lines.offsets[plan.lines.line[0 if leg.columns_rise else -1]]
         first, last = plan.command_range if leg.columns_rise else plan.command_range[::-1]
         middle_s = plan.pattern_s(leg) + plan.blanking.length_s / 2

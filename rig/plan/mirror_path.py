@@ -23,7 +23,7 @@ from drivers.interfaces import ScannerLimits
 Array = NDArray[np.float64]
 
 MIN_RAMP_POINTS = 4
-"""Fewest points of a ramp or move: with fewer it is a step to the galvo, whatever its formula says."""
+"""Fewest points of a ramp or move; with fewer, the sampled path is practically a step for the galvo."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -260,7 +260,7 @@ def find_path(demand: PathDemand, limits: ScannerLimits, point_clock: Callable[[
 def _within_limits(
     demand: PathDemand, limits: ScannerLimits, rate: Fraction, speed_limit: float
 ) -> tuple[SweepPath, list[str]]:
-    """The quickest path at this point clock with RMS acceleration and reach allowed; else a path and the problems."""
+    """The quickest path at this point clock, and the limits (RMS acceleration, range) that it exceeds, as text."""
     low, high = limits.command_range
     heat_limit = limits.rms_duty * limits.acceleration_per_s2 * HEADROOM
     acceleration = limits.acceleration_per_s2 * HEADROOM

@@ -7,11 +7,12 @@ c - 0.5 to c + 0.5. Column 0 begins at `command_range[0]` and the last one ends 
 too.
 
 `Blanking` is a pattern of flashes in each sweep's run-in, by which frames without markers are assigned to columns. The
-sync source waits for the scan marker and then opens the gate in a known order of flashes, before it opens it for the
-lit part. The mirror moves at constant velocity by then, a few columns before the first one. The place of the pattern
-among the frames gives the time of the scan marker; the time from one sweep's pattern to the next gives the ratio of the
-scanner's clock and the SPAD's. A chip is not a whole number of frames. The edges of the flashes therefore fall on all
-parts of a frame, and their place is known to a small part of a frame whatever the phase of the two clocks.
+sync source waits for the scan marker. It then opens the gate for a known sequence of flashes, and after that for the
+lit part. During the flashes the mirror already moves at constant velocity, a few columns before the first one. The
+place of the pattern among the frames gives the time of the scan marker; the time from one sweep's pattern to the next
+gives the ratio of the scanner's clock and the SPAD's. The pattern consists of chips of equal length, in each of which
+the gate is open or closed. A chip is not a whole number of frames. The edges of the flashes therefore fall on all parts
+of a frame, and their place is known to a small part of a frame whatever the phase of the two clocks.
 """
 
 import math
@@ -34,7 +35,8 @@ Shifted against itself, or against its reverse, it correlates to at most 0.36; i
 MAX_CLOCK_ERROR = 1e-3
 """Clock ratios further from nominal than this are a fault, not a crystal."""
 CHIPS_PER_COLUMN = 5
-"""Length of a column in chips, about: the longer a chip, the fewer photons per frame it takes to find the pattern."""
+"""Approximate length of a column in chips: the longer a chip, the fewer photons per frame it takes to find the pattern.
+"""
 MOST_CHIP_FRAMES = 8
 VERNIER_FRAMES = 0.382
 """Fraction added to whole frames: one minus the golden ratio's fraction 0.618, whose multiples spread most evenly."""
@@ -268,7 +270,7 @@ class ScanPlan:
         return column_command(column, self.command_range, self.places)
 
     def line_commands(self, column: Array) -> Array:
-        """Commands (columns,) at which a single line would be where each column's line was, at its bound column."""
+        """Commands (columns,) that bring a single line to where each column's line was. column: as bound."""
         return self.command_at(column) if self.lines is None else self.lines.bound_commands(self.commands, column)
 
     @property
@@ -277,7 +279,9 @@ class ScanPlan:
         return 0 if self.blanking is None else len(self.legs)
 
     def pattern_s(self, leg: Leg) -> float:
-        """Seconds from the scan marker of a sweep of this leg until the blanking pattern begins."""
+        """Seconds from the scan marker of a sweep of this leg until the blanking pattern begins; without a pattern,
+        until the gate opens.
+        """
         return leg.gate_open_s - (0.0 if self.blanking is None else self.blanking.lead_s)
 
     def frames_for(self, maps: int) -> float:

@@ -23,9 +23,9 @@ from rig.plan.mirror_path import SweepPath, mirrored
 from rig.plan.scan_plan import Leg, ScanPlan
 
 LEAST_MARKER_POINTS = 4
-"""Fewest points between markers: one high and one low, and as many again for a comparator to be sure of the next."""
+"""Fewest points between markers: one high and one low, doubled so that a comparator surely detects the next one."""
 LEAST_MARKER_FRAMES = 2
-"""Fewest frames between edges, which thus never share a frame: its record has room for the position of one."""
+"""Fewest frames between marker edges: two edges must not fall into one frame, whose record holds only one position."""
 SLACK_COLUMNS = 1.0
 """Columns kept on either side of those that an entry should see: room for clock errors and late markers."""
 
@@ -60,8 +60,8 @@ def line_markers(path: SweepPath, columns: int, exposures: int) -> tuple[int, ND
 def _scan_marker_points(leg: Leg, rate: Fraction) -> int:
     """Points for which the scan marker, which holds the gate, stays high: until the middle of the gate's last slice.
 
-    So the gate closes as its pulse ends, not as the marker falls, while the clocks of scanner and sync source differ by
-    less than half a slice.
+    So the gate closes when its pulse ends, not when the marker falls, as long as the clocks of scanner and sync source
+    differ by less than half a slice.
     """
     lit_s = leg.gate_close_s - leg.gate_open_s
     return max(1, math.floor((leg.gate_close_s - lit_s / slices(lit_s) / 2) * rate))
