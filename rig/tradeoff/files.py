@@ -53,7 +53,7 @@ def csv_text(rows: Sequence[TradeoffRow]) -> str:
 
 
 COLOURS = {"argmax": "#7b8896", "edge": "#d55e00", "likelihood": "#0072b2", "joint": "#009e73"}
-"""Colours of estimators, which the colour-blind can tell apart (Okabe and Ito, 'Color universal design', 2008)."""
+"""Colours of estimators that the colour-blind can tell apart (Okabe and Ito, 'Color universal design', 2008)."""
 OTHER_COLOUR = "#cc79a7"
 
 
