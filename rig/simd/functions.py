@@ -110,7 +110,7 @@ MEAN_EXCESS: Final = np.float32(1.040684)
 
 @numba.njit(inline="always")
 def lift_to_powers(best, shift):  # type: ignore[no-untyped-def]
-    """Number to add to scores so that 0 lies 127 octaves below each lane's best score, but not below the least int16."""
+    """Number to add to scores so that 0 lies 127 octaves below each lane's best score, or at the least int16."""
     return add_saturated(sub_saturated(zero_int16(), best), np.int16(np.int64(BIAS) >> shift))
 
 
