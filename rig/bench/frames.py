@@ -2,9 +2,8 @@
 
 Haze falls off with distance and drops to a tenth at a stripe. Position and brightness of the stripe are drawn anew for
 every row and every `PLACE_FRAMES` frames, which are called a place. The light is that of the working point `report`
-(docs/results/README.md).
-Stages that make complete maps use a single surface instead, as frames of a sweep and as a pair of pictures with the
-same disparities.
+(docs/results/README.md). Stages that make complete maps use a single surface instead, as frames of a sweep and as a
+pair of pictures with the same disparities.
 """
 
 from dataclasses import dataclass
@@ -24,7 +23,7 @@ BITS_OF_CHANCE = 16
 
 @numba.njit(cache=True, nogil=True)
 def read_all(words: NDArray[np.uint64]) -> int:
-    """Read every word once. The result only keeps the compiler from leaving the reading out."""
+    """Read every word once. There is a result only so that the compiler does not leave the reading out."""
     total = np.uint64(0)
     for i in range(words.shape[0]):
         total ^= words[i]

@@ -61,7 +61,7 @@ def header_of(seq: int, frames: int, width: int) -> BlockHeader:
 FRAME_S = float(PERIOD_TICKS / TICK_HZ)
 SECONDS = 3.0
 SLOTS = 16
-"""Blocks of the ring: 80 ms, so that nothing is dropped if the host pauses; a pause is seen in the figures."""
+"""Blocks of the ring: 80 ms, so that nothing is dropped if the host pauses; the latency then shows the pause."""
 SPIN_S = 2e-4
 """For so many seconds before a block is due the source does not sleep: a sleep may take longer than requested."""
 

@@ -238,7 +238,7 @@ def joint_stage(surface: BenchSurface, volume: CountVolume, threads: int, model:
     pictures = surface.pictures()
 
     def measure(seconds: float) -> Measured:
-        # Made anew for each call: the memory of all stages together would be too much.
+        # Made anew for each call: all stages together would need too much memory.
         joint = Joint(threads, model, learns=False)
 
         def make() -> NDArray[np.float32]:
@@ -310,7 +310,7 @@ def _timed(
     error: StripeError,
     beside: Callable[[], object] | None = None,
 ) -> Measured:
-    """Make maps of `frames` frames each for `seconds`. beside: called after each map, which then are at least PAIRS."""
+    """Make maps of `frames` frames each for `seconds`. beside: called after each map, at least PAIRS times."""
     spent: list[float] = []
     quotients: list[float] = []
     while sum(spent) < seconds or len(spent) < (1 if beside is None else PAIRS):

@@ -119,7 +119,7 @@ class _LikelihoodCounter:
         return self._present().finish()
 
     def _present(self) -> SweepCounter | ColumnJudge:
-        # Chosen with the first frames: only then has the sweep before this one been estimated and has taught.
+        # Chosen with the first frames: only then has the sweep before been estimated and learned from.
         if self._counter is None:
             layout = self._layout
             if self._of.model is None or layout.exposures > BYTE_EXPOSURES:

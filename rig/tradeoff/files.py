@@ -58,7 +58,7 @@ OTHER_COLOUR = "#cc79a7"
 
 
 def tradeoff_svg(rows: Sequence[TradeoffRow], ci95_by: str) -> str:
-    """The picture as SVG text, without rows with too many answers missing. ci95_by: what the intervals are over."""
+    """The picture as SVG text, without rows with too many answers missing. ci95_by: as in `Tradeoff`."""
     places = dict.fromkeys(row.place for row in rows)
     shown = [row for row in rows if row.counts]
     panels = [

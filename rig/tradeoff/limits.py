@@ -5,9 +5,8 @@ its position. If stripes are spread evenly over the search, no answer has a smal
 posterior. `bayes_errors` computes this error from drawn counts, at 5 ms a row for four numbers of exposures. M
 neighbours on one surface count as M times the exposures. `chernoff_exponent` says how fast wrong positions get rarer
 with more exposures, `position_sd_px` how exactly the right position can be found; the formulas are in
-docs/explanation/limits.md. A
-pixel fires in an exposure with probability p = 1 - exp(-flux), all independently; q = 1 - p, and p', q' are those of
-another position.
+docs/explanation/limits.md. A pixel fires in an exposure with probability p = 1 - exp(-flux), independently of all other
+pixels; q = 1 - p, and p', q' are those of another position.
 """
 
 import math
@@ -227,7 +226,7 @@ def _finite(value: float) -> float | None:
 
 
 NEWTON_STEPS: Final = 60
-"""Most steps to the best share t; bisection alone would get there."""
+"""Largest number of steps to the best share t; bisection alone would also get there."""
 GAP_EXACT: Final = 0.5
 """If 1 minus a pixel's overlap is below this, it is summed from small parts, not computed as a difference."""
 SERIES_BELOW: Final = 0.05

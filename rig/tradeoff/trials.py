@@ -54,7 +54,7 @@ def trials_of(config: Config, asked: TradeoffRequest) -> Trials:
 class Tradeoff:
     """Result of a trade-off: the rows of all settings.
 
-    ci95_by: over what the confidence intervals are.
+    ci95_by: whether confidence intervals come from repeats or from blocks of a map.
     answer: the setting to use; None without a wish, or if each setting has too many missing answers.
     verdict: 'aborted' if an interrupt ended it; the rows are then those that were complete.
     folder: where everything was written; None if nothing was.

@@ -32,9 +32,9 @@ mean of opposite neighbours (`apart_row`).
 Arrays are float32 (rows, columns), numbers of neighbours int16. Source of the constants: WIDER, B, C, D, E and F are
 fitted by maximum likelihood to random cluttered scenes of a second simulator, K = 1 to 30 in air and fog, with all
 answers counted. A and G are chosen on random scenes of the tests' simulator, since fitted values would make stripes
-without haze too uncertain. H, DARKER, CLEARLY and AT_END are chosen by the likelihood of random scenes that
-are partly open to the sky (`tests.reference.tables.open_scenes`); larger values take too much from dim stripes in clear
-air.
+without haze too uncertain. H, DARKER, CLEARLY and AT_END are chosen by the likelihood of random scenes that are partly
+open to the sky (`tests.reference.tables.open_scenes`); larger values lower the confidence of dim stripes in clear air
+too much.
 """
 
 import math
@@ -64,7 +64,7 @@ OPPOSITE: Final = 2, 4
 ASKED: Final = 4 * len(OPPOSITE)
 """Number of pairs of opposite neighbours: along rows, columns and both diagonals."""
 _ANYWHERE: Final = np.float32(1e6)
-"""Pixels: more than any two answers are apart."""
+"""In px: larger than the distance of any two answers."""
 
 
 class Neighbours(NamedTuple):
@@ -193,7 +193,7 @@ H: Final = 4.0
 DARKER: Final = 2.0
 """Natural logarithm of the ratio of a bright stripe's light to that of a dark one."""
 CLEARLY: Final = 1.2
-"""By how much `missing` and `unseen` decrease per unit of contrast."""
+"""Decrease of `missing` and `unseen` per unit of contrast."""
 AT_END: Final = 3.0
 """`unseen` of an answer without any light."""
 NEAR_END_PX: Final = 1.0, 3.0
@@ -202,7 +202,7 @@ SOME_HAZE: Final = 0.05
 FAR_BELOW: Final = 6.0
 """A contrast below minus this is a hole where light should be, whatever the answers around."""
 _HALF_PX: Final = LIGHT_PX + 0.5
-"""Half the pixels that a stripe's light is summed over."""
+"""Half the number of pixels over which a stripe's light is summed."""
 _LEAST_ODDS: Final = 1e-3
 _MOST_AGREE: Final = 1.02
 """Odds of agreement stay between 0.001 and 50."""

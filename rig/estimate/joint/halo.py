@@ -73,8 +73,8 @@ def add_equations(
     """Add the normal equations of lines first_line..last_line-1, weighted by the counts that the present state expects.
 
     Unknowns: haze in each profile bin; its share behind the stripe at each node; halo at each node and reach; offset of
-    the ambient light. halo: (BINS, pixels) of `halo_shares`; light: of each line's stripe at its x_px,
-    photons. Only the lower triangle of the matrix is filled.
+    the ambient light. halo: (BINS, pixels) of `halo_shares`; light: of each line's stripe at its x_px, photons. Only
+    the lower triangle of the matrix is filled.
     """
     bins, number = state.profile.shape[0], len(_REACHES)
     first_share, first_halo, last = bins, bins + HALO_NODES, matrix.shape[0] - 1
@@ -316,8 +316,8 @@ def learn_halo(
 ) -> RowModel:
     """The model with the halo that these stripes show, and the haze under it; without a halo if they show none.
 
-    The scale of stripes is kept, since their light is based on it. ambient: of each pixel, (rows, width),
-    the start value of the fit. dark: whether there are dark frames.
+    The scale of stripes is kept, since their light is based on it. ambient: of each pixel, (rows, width), the start
+    value of the fit. dark: whether there are dark frames.
     """
     matrix, right = _equations(seen, geometry, replace(model, ambient=ambient), workers)
     free = -1 if dark else _SIZE - 1

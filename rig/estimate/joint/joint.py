@@ -43,7 +43,7 @@ from rig.threads import RowWorkers
 LESSONS = 2
 """Number of times that the first map's stripes are estimated and the model is learned again from them."""
 HALO_LESSONS = 4
-"""The same number under a halo."""
+"""Number of these lessons under a halo."""
 AGREE_PX = np.float32(1.0)
 """Under a halo, a stripe of the first map is learned from only if its contrast alone puts it within so many pixels."""
 TRUSTED = np.float32(0.5)

@@ -68,7 +68,7 @@ class LineTable(NamedTuple):
 
 @numba.njit(cache=True, nogil=True)
 def line_places(sweep: Sweep, x_far: Float64, side: int, pixels: int) -> Int16:
-    """Where the lines of all rows and columns are stored, int16 (rows, columns, PLACES); made once per model.
+    """Places of the lines of all rows and columns, int16 (rows, columns, PLACES); made once per model.
 
     PLACE_X: x of pixel 0 of distance, the leftmost of `pixels`, NOWHERE where nothing is searched; PLACE_BEGIN,
     PLACE_END: first pixel of distance that is searched and was stored, and the one after the last.
@@ -142,7 +142,7 @@ def sum_lines(
 HAZE_BLOCKS: Final = 4
 """Blocks above one another for which haze is computed together: it changes slowly from row to row."""
 HAZE_STEP: Final = 8
-"""Pixels from one place where haze is computed to the next."""
+"""Spacing, in px, of the places at which haze is computed."""
 _IN_ORDER: Final = np.arange(LANES, dtype=np.float32)
 
 
@@ -183,8 +183,8 @@ def sum_blocks(
 ) -> None:  # fmt: skip
     """Fill the sums of rows of blocks first_block..last_block-1, without pixels within `apart` px of stripes x_px.
 
-    Haze is that in the middle of HAZE_BLOCKS blocks, or of the block itself if nothing is searched there. state, still:
-    see `SecondLight`; place: of `line_places`.
+    Haze is taken in the middle of HAZE_BLOCKS blocks, or of the block itself if nothing is searched there. state,
+    still: see `SecondLight`; place: of `line_places`.
     """
     rows, columns = x_px.shape
     pixels, across, aside, x0 = out.ones.shape[2], out.ones.shape[1], np.float32(apart), sweep.x0

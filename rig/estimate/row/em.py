@@ -1,7 +1,7 @@
 """Learns the row model from the counts of a sweep by expectation-maximisation over a lattice of rows and columns.
 
 A line, in this package, is one row of one column. In each round every line's posterior P(j) over positions gives the
-probability of each pixel to lie before or behind the stripe: pixel t lies before it if the stripe is farther, with
+probability that a pixel lies before or behind the stripe: pixel t lies before it if the stripe is farther, with
 probability sum over j > t of P(j). Ones and exposures are added with these weights per bin of path inverse depth
 (`learn_rows`). Haze, pedestal (the level behind the stripe), gains, amplitudes and line width are then set from those
 float64 sums. Where data are few, haze is assumed to fall exponentially with the path length.
@@ -390,12 +390,13 @@ def _gain(gain: Float32, seen: Float64, ambient: float, before: Float64) -> Floa
 
 
 CUT: Final = 0.05
-"""A row teaches amplitudes, 'no stripe' and positions if less than this share of its prior lies beyond the border."""
+"""Amplitudes, 'no stripe' and positions are learned from rows with less than this share of their prior beyond the
+picture's border."""
 CERTAIN: Final = 0.6
-"""Probability within 1 px above which a row teaches the level behind the stripe."""
+"""The level behind the stripe is learned from rows with more than this probability within 1 px."""
 CLEAR: Final = 0.97
 CLEAR_PX: Final = 6
-"""Rows more certain than CLEAR measure the haze itself, with pixels more than CLEAR_PX before their stripe."""
+"""The extinction is learned from rows more certain than CLEAR, at pixels more than CLEAR_PX before their stripe."""
 LEAST_OWN: Final = 1e-3
 """Least haze of a line at a pixel relative to that of the other lines: if it is weaker, this share is assumed."""
 

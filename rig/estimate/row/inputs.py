@@ -7,7 +7,7 @@ depth w' = 2 w / (c + p), and haze, rest, S the profiles of `rig.estimate.row.mo
     before = ambient + G haze(w') + others,    behind = ambient + G rest(w') + others,    scale = S(w')
 
 in photons per exposure; `others` is the haze of lines lit at the same time (`others_at`). All are float32, and fluxes
-are limited to FLUX_MIN..FLUX_MAX. `judge_line` fills them in and gives the row's posterior.
+are limited to FLUX_MIN..FLUX_MAX. `judge_line` computes all of them and the row's posterior.
 
 Fog scatters the stripe's own light once more, into a halo on both sides of it. At the distance d along the row from a
 stripe of s photons the halo has, per pixel,

@@ -19,8 +19,8 @@ amplitudes,
 
     P(j) ~ prior_j sum over m of weight_m exp(log-likelihood(j, m))
 
-`row_scores` is the log-likelihood, `row_posterior` the sum over amplitudes, `mode_of` the answer: read them in this
-order. Arrays of a row are float32 (L,), scores of M amplitudes float32 (M, L). `rig.estimate.row.inputs` and
+`row_scores` computes the log-likelihood, `row_posterior` the sum over amplitudes, `mode_of` the answer: read them in
+this order. Arrays of a row are float32 (L,), scores of M amplitudes float32 (M, L). `rig.estimate.row.inputs` and
 `rig.estimate.row.model` explain where `before`, `behind`, `scale` and the priors come from. Only `logit_table` and LOST
 are approximations.
 

@@ -141,7 +141,7 @@ def _fill_places(sweep: Sweep, x_far: Float64, side: int, stripes: int, pixels: 
             )
             if lo > hi or max(lo, first) > min(hi, last):
                 continue
-            # In eighths of a pixel towards near: label 0, and from there to the pixel that holds it.
+            # In eighths of a pixel towards near: the position of label 0. Then the pixel that holds it.
             at = -int(np.floor(FRACTIONS * side * x_far[y, c] + 0.5))
             pixel = (at + FRACTIONS // 2) // FRACTIONS
             place[VARIANT] = at % VARIANTS
@@ -153,10 +153,10 @@ def _fill_places(sweep: Sweep, x_far: Float64, side: int, stripes: int, pixels: 
             place[VALID_END] = side * (start - near) + 1
             far, near = (min(hi, last), max(lo, first)) if side > 0 else (max(lo, first), min(hi, last))
             step = FRACTIONS // PHASES
-            # Of the pixels that were stored, all eighths that are nearest to them.
+            # Limited to the eighths that are nearest to a stored pixel.
             low = max(-side * far - SLACK_PX, -side * (last if side > 0 else first) - 4 / FRACTIONS)
             high = min(-side * near + SLACK_PX, -side * (first if side > 0 else last) + 3 / FRACTIONS)
             place[LABEL] = min(max(int(np.ceil((FRACTIONS * low - at) / step)), 0), stripes)
-            # The pixel of the last label is one that tables have.
+            # The last label's pixel must be in the tables.
             high_label = int(np.floor((FRACTIONS * high - at) / step))
             place[LABEL_END] = min(max(high_label + 1, place[LABEL]), stripes, PHASES * pixels - place[ODD])
