@@ -1,9 +1,9 @@
 """Synthetic frames with a known truth, enough of them that they come from memory and not from a cache.
 
-Haze falls off with distance and drops to a tenth at a stripe. Place and brightness of the stripe are drawn anew for
-every row and every `PLACE_FRAMES` frames. The light is that of the working point `report` (docs/results/README.md).
-Stages that make complete maps use a single surface instead, as frames of a sweep and as a pair of pictures with the
-same disparities.
+Haze falls off with distance and drops to a tenth at a stripe. Position and brightness of the stripe are drawn anew for
+every row and every `PLACE_FRAMES` frames, which are called a place. The light is that of the working point `report`
+(docs/results/README.md). Stages that make complete maps use a single surface instead, as frames of a sweep and as a
+pair of pictures with the same disparities.
 """
 
 from dataclasses import dataclass
@@ -23,7 +23,7 @@ BITS_OF_CHANCE = 16
 
 @numba.njit(cache=True, nogil=True)
 def read_all(words: NDArray[np.uint64]) -> int:
-    """Read every word once. The result only keeps the compiler from leaving the reading out."""
+    """Read every word once. There is a result only so that the compiler does not leave the reading out."""
     total = np.uint64(0)
     for i in range(words.shape[0]):
         total ^= words[i]
@@ -81,16 +81,16 @@ def count_columns(
 
 ROWS, WIDTH = 512, 512
 COLUMNS = 500
-"""Columns of a sweep: what an estimate knows of each column is then as much memory as in a scan."""
+"""Columns of a sweep, as in a scan, so that the tables of all columns take as much memory."""
 PLACE_FRAMES = 100
-"""Frames of a place, for which stripes stay; every number of exposures that estimates are measured at divides it."""
+"""Frames with the same stripes; a multiple of every number of exposures at which estimates are measured."""
 BLOCK_PLACES = 5
 BLOCK_FRAMES = BLOCK_PLACES * PLACE_FRAMES
 """Frames of a block, as many as in a scan at 100 kHz (`rig.plan.compile.BLOCK_S`)."""
 FRAMES_BYTES = 192 * 2**20
 """Memory of the frames of each window size: several times a big cache."""
 DISTINCT = 64
-"""Places that are drawn; after so many the same bits are repeated in other memory."""
+"""Places that are drawn; further places are copies of them in other memory."""
 EDGE_PX = 8
 """Least distance of a stripe from the ends of the window."""
 HAZE, HAZE_PER_M, BEHIND, AMBIENT = 0.14, 0.1, 0.1, 0.005
@@ -106,8 +106,8 @@ NEAR_W, FAR_W = 1.0, 0.125
 class BenchFrames:
     """Frames of one window size.
 
-    bits: uint8 (n, rows, row bytes), n a multiple of BLOCK_FRAMES. truth_px: float32 (places, rows), where place i has
-    its stripes. window: searched pixels, which begin at geometry.x0; rows of frames may be longer.
+    bits: uint8 (n, rows, row bytes), n a multiple of BLOCK_FRAMES. truth_px: float32 (places, rows), stripe positions
+    of each place. window: searched pixels, which begin at geometry.x0; rows of frames may be longer.
     """
 
     window: int
@@ -150,7 +150,7 @@ def window_frames(window: int, workers: RowWorkers, n_bytes: int = FRAMES_BYTES)
 
 
 def full_frames(narrow: BenchFrames, n_bytes: int = FRAMES_BYTES) -> BenchFrames:
-    """Whole frames of the sensor. The window lies where its geometry says; the other pixels are copies of it."""
+    """Whole frames of the sensor. The window lies where the geometry puts it; the other pixels are copies of it."""
     copies = WIDTH // narrow.window
     places = BLOCK_PLACES * max(1, n_bytes // (BLOCK_FRAMES * narrow.frame_bytes * copies))
     bits = np.tile(narrow.bits[: places * PLACE_FRAMES], (1, 1, copies))
@@ -158,7 +158,7 @@ def full_frames(narrow: BenchFrames, n_bytes: int = FRAMES_BYTES) -> BenchFrames
 
 
 def bench_geometry(window: int, rows: int = ROWS, columns: int = COLUMNS) -> SweepGeometry:
-    """Geometry of columns that all cross the depth range over the same `window` pixels, from a multiple of it on."""
+    """Geometry in which all columns have the same search window of `window` pixels, beginning at a multiple of it."""
     x0 = min(window, WIDTH - window)
     u = np.broadcast_to(np.linspace(-0.5, 0.5, WIDTH, dtype=np.float32), (rows, WIDTH)).copy()
     tangents_per_px = 1.0 / (WIDTH - 1)
@@ -248,7 +248,7 @@ def bench_surface(rows: int = ROWS, columns: int = COLUMNS) -> BenchSurface:
 
 
 def count_surface(surface: BenchSurface, bits: NDArray[np.uint8], exposures: int, workers: RowWorkers) -> CountVolume:
-    """The counts of all frames `bits` of a surface, column after column."""
+    """Count all frames of a sweep over a surface. bits: these frames, column after column."""
     counter = SweepCounter(surface.layout(exposures), workers)
     counter.add(bits, *sweep_frames(surface.geometry, exposures))
     return counter.finish()

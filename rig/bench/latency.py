@@ -26,7 +26,7 @@ from rig.threads import RowWorkers
 
 TICK_HZ = Fraction(100_000_000)
 PERIOD_TICKS = 1000
-"""10 us: 100 kHz."""
+"""Frame period: 10 us, so 100 kHz."""
 
 
 def recording_of(frames: BenchFrames) -> tuple[NDArray[np.uint8], int]:
@@ -61,9 +61,9 @@ def header_of(seq: int, frames: int, width: int) -> BlockHeader:
 FRAME_S = float(PERIOD_TICKS / TICK_HZ)
 SECONDS = 3.0
 SLOTS = 16
-"""Blocks of the ring: 80 ms, so that nothing is dropped if the host pauses; a pause is seen in the figures."""
+"""Blocks of the ring: 80 ms, so that nothing is dropped if the host pauses; the latency then shows the pause."""
 SPIN_S = 2e-4
-"""Seconds before a block is due from which the source does not sleep: a sleep may take longer than asked for."""
+"""For so many seconds before a block is due the source does not sleep: a sleep may take longer than requested."""
 
 
 @dataclass(frozen=True, slots=True)

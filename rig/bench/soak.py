@@ -1,5 +1,5 @@
-"""A long stream from memory at the sensor's rate through the acquisition of `rig scan`, to see what is lost and what
-grows.
+"""Plays a long stream from memory, at the sensor's rate, through the acquisition of `rig scan`, to see what is lost and
+what grows.
 
 The bundled simulated rig records a few sweeps, once. A SPAD that cannot wait plays them in real time, with running
 frame numbers. Everything else is as in a scan: ring, binding, counting, estimation, maps, a monitor, and the overload
@@ -43,7 +43,7 @@ from rig.scan.pipeline import Overload, require_policy
 from rig.scan.scan import make_reconstructor
 
 LEAD_FRAMES = 200
-"""Most frames before the first scan marker: the end of a sweep, as if the scanner already ran."""
+"""Largest number of frames before the first scan marker: the end of a sweep of a scanner that already runs."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -70,7 +70,7 @@ class Loop:
 
 
 class LoopedSpad(SpadArray):
-    """A SPAD that plays a loop. timing: as configured when the frames were taken; info: of the SPAD that took them."""
+    """A SPAD that plays a loop. timing, info: of the SPAD that took the loop's frames."""
 
     def __init__(self, loop: Loop, info: SpadInfo, timing: SpadTiming) -> None:
         super().__init__("looped SPAD")
@@ -159,7 +159,7 @@ class LoopedSpad(SpadArray):
             records[done : done + size] = loop.records[at : at + size]
             # The loop counts its sweeps from 1 on; before the first marker, in cycle 0, its last one becomes number 0.
             before = (cycle - 1) * loop.sweeps
-            if not done:  # the header's count goes on where the 16 bits of records begin again
+            if not done:  # the header's count is longer than the 16 bits of records
                 sweep = int(loop.records["sweep"][at]) + before
             records["sweep"][done : done + size] += np.uint16(before & 0xFFFF)
             np.copyto(bits[done : done + size], loop.bits[at : at + size])
@@ -190,9 +190,9 @@ LOOP_S = 0.2
 DEPTH_RANGE = ["4 m", "15 m"]
 """Range whose stripes lie within 128 pixels of a row, the window for which speeds are stated."""
 LINK_MARGIN = 1.02
-"""Rate of the link over what windows that move with the line need: whole frames do not fit through it."""
+"""Rate of the link over the rate that windows moving with the line need: too low for whole frames."""
 SETTLED = 0.1
-"""Share of the run after which memory is to grow no more."""
+"""Share of the maps after which memory should no longer grow."""
 _STATM = Path("/proc/self/statm")
 
 
@@ -301,7 +301,7 @@ def _quiet_sweeps() -> Iterator[None]:
 @contextmanager
 def _looped_rig(policy: Overload, window: bool) -> Iterator[tuple[OpenRig, LoopedSpad]]:
     """The simulated rig with a looped SPAD, which plays what the rig's own SPAD recorded; gives that SPAD too."""
-    # Clocks that agree to the last bit: the loop then closes without a jump.
+    # With clocks that agree exactly, the loop closes without a jump.
     settings: dict[str, object] = {"scanner.clock_error": "0 ppm", "scan.depth_range": DEPTH_RANGE}
     if window:
         settings["spad.link"] = f"{_window_bytes_per_s(settings) / 1e6:.6f} MB/s"
@@ -321,7 +321,7 @@ def _window_bytes_per_s(settings: dict[str, object]) -> float:
 
 
 def _recorded(rig: OpenRig, plan: ScanPlan, timing: SpadTiming) -> Loop:
-    """Sweeps of the simulated rig that end where they began, to the frame."""
+    """Record sweeps of the simulated rig; so many that together they take a whole number of frames."""
     whole = plan.frames_per_sweep.denominator
     sweeps = math.ceil(math.ceil(LOOP_S / float(plan.sweep_s)) / whole) * whole
     with tempfile.TemporaryDirectory(prefix="spadrig-bench-") as folder:
@@ -347,7 +347,7 @@ def _played(
         for found in acquisition.run():
             frames = found.sweep.frames
             expected, received, lost = expected + frames.expected, received + frames.received, lost + frames.lost
-            if resident:  # the first map is learned from, which is done once
+            if resident:  # the first map takes longer, since the model is learned from it
                 worked_off, compute_s = worked_off + frames.received, compute_s + found.compute_s
             resident.append(_resident_bytes())
             if len(resident) <= max(1, SETTLED * asked.maps):

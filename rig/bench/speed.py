@@ -1,7 +1,7 @@
 """The rows of `rig bench`: every stage at every window, number of exposures and of threads, measured in turn.
 
-A round measures each row for a short time, and the memory beside them; figures are medians over the rounds. Each
-measurement begins after the frames of the previous one, so that frames come from memory.
+A round measures each row for a short time, and reads the memory in between; results are medians over the rounds. Each
+measurement begins after the frames of the previous one, so that frames come from memory and not from a cache.
 """
 
 import os
@@ -49,12 +49,12 @@ EXPOSURES = (1, 5, 10, 20, 50)
 COUNT_EXPOSURES = (1, 3, 5, 10, 15, 20, 50)
 """Exposures at which counting alone is measured: its speed is claimed for 3 to 15 and beyond."""
 WINDOW = 128
-"""Window, in px, of the rows that are not measured at every one."""
+"""Window, in px, of the rows that are measured at one window only."""
 FEW_EXPOSURES = (1, 10)
 LEARN_EXPOSURES = 10
-"""Exposures of the sweep that each window learns from: an exposure's light is the same for all numbers of them."""
+"""Exposures per column of the sweep from which each window's model is learned; it holds for any number of exposures."""
 READ_BYTES = 256 * 2**20
-"""Memory that is read for its bandwidth: far more than any cache holds."""
+"""Memory that is read to measure its bandwidth: far more than any cache holds."""
 
 Workers = Mapping[int, RowWorkers]
 """Workers by their number of threads."""
@@ -64,7 +64,7 @@ Workers = Mapping[int, RowWorkers]
 class Extent:
     """Amount of work that is measured.
 
-    moment_s, count_moment_s: time of each row in each of the `rounds`, the latter for the rows `count`, which are fast.
+    moment_s: time of each row in each of the `rounds`; count_moment_s: of the rows `count`, which are fast.
     latency_s: length of the stream for the latency. frames_bytes, read_bytes: memory of the frames of each window, and
     for the plain read. map_rows, map_columns: size of the complete maps.
     """
@@ -82,7 +82,7 @@ class Extent:
 
     @property
     def usual_window(self) -> int:
-        """Window of the rows that are measured at only one: WINDOW, or the first if that is not measured."""
+        """Window of the rows that are measured at one window only: WINDOW, or the first if WINDOW is not measured."""
         return WINDOW if WINDOW in self.windows else self.windows[0]
 
 
@@ -100,11 +100,11 @@ class Case:
 
 @dataclass(frozen=True, slots=True)
 class SpeedRow:
-    """A row of the table. exposures: None if columns play no part. A speed or quotient is None if it has no meaning.
+    """A row of the table. exposures: None for stages without columns. Numbers without a meaning for a stage are None.
 
-    of_memory_bandwidth: bytes of frames a second over those of the plain read. times_numpy: speed over that of the row
-    `numpy`. ms_per_map: of stages that make complete maps. times_sgbm: for `joint`, the time of a map over that of a
-    StereoSGBM map on as many threads, measured alternately. The error fields are those of `StripeError`.
+    of_memory_bandwidth: bytes of frames read a second over the memory's bandwidth. times_numpy: speed over that of the
+    row `numpy`. ms_per_map: of stages that make complete maps. times_sgbm: for `joint`, the time of a map over that of
+    a StereoSGBM map on as many threads, measured alternately. The error fields are those of `StripeError`.
     """
 
     stage: str
@@ -126,7 +126,7 @@ class SpeedRow:
 class WorkingPoint:
     """Whether an estimator keeps up with the sensor, including counting.
 
-    maps_per_s: of COLUMNS columns; needed_per_s: the number that frames at REAL_TIME_HZ make.
+    maps_per_s: of COLUMNS columns; needed_per_s: maps a second of a sensor at REAL_TIME_HZ.
     """
 
     estimator: str
@@ -184,7 +184,7 @@ def measure_speed(
 ) -> SpeedReport:
     """Measure all rows and the latency.
 
-    threads: the largest number, by default one for each core. progress: called with the rows done and in all.
+    threads: the largest number, by default one for each core. progress: called with the number of rows done and of all.
     """
     begun = time.perf_counter()
     extent = extent or Extent()
@@ -301,7 +301,7 @@ def _map_cases(workers: Workers, extent: Extent) -> list[Case]:
 def _in_turn(
     cases: list[Case], frames: BenchFrames, extent: Extent, progress: Progress | None
 ) -> tuple[list[float], list[list[Measured]]]:
-    """Bytes a second of each reading of the memory, and what each case measured in each round."""
+    """Bytes a second of each reading of the memory, and the result of each case in each round."""
     # Memory of its own with the bits of frames: pages of zeros would be read from a cache.
     words = np.resize(frames.bits.reshape(-1).view(np.uint64), extent.read_bytes // 8)
     memory: list[float] = []

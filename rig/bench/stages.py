@@ -1,8 +1,8 @@
 """The stages that are measured. Each works on frames for a short time and returns their number and the time it took.
 
-docs/results/speed.md explains each of them. Work that is done once a sweep is not timed, except with `whole_sweeps`. On
-a machine with other work, quotients of figures measured one after the other are meaningless, so `joint` and StereoSGBM
-make maps alternately. Nothing is learned meanwhile, and each begins with a map that is not timed.
+docs/results/speed.md explains each stage. Work that is done once a sweep is not timed, except with `whole_sweeps`. On a
+machine with other work, quotients of times measured one after the other are meaningless, so `joint` and StereoSGBM make
+maps alternately. Nothing is learned meanwhile. Stages that make maps begin with one that is not timed.
 """
 
 import time
@@ -39,9 +39,9 @@ from rig.threads import RowWorkers
 Bits = NDArray[np.uint8]
 
 COUNT_PIECE = 1000
-"""Frames that are counted at a time: handing work to threads then takes no share of it."""
+"""Frames that are counted at a time: so many that handing work to threads takes a negligible part of the time."""
 NUMPY_PIECE = 20
-"""Frames that numpy unpacks at a time, or a column if that has more: a naive program keeps its memory small too."""
+"""Frames that numpy unpacks at a time, or a column if it has more: a naive program keeps its memory small too."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -70,18 +70,18 @@ class Measured:
 Stage = Callable[[float], Measured]
 """A function that works for about so many seconds."""
 Blocks = Callable[[BenchFrames, "Walk"], Iterator[tuple[int, Bits]]]
-"""A function that gives blocks of frames, each after its first place, for ever."""
+"""A function that yields, without end, the index of a block's first place and the block."""
 
 
 class Walk:
-    """Places in the frames at which measurements begin in turn, so that none finds its frames in a cache."""
+    """Gives each measurement the next places of the frames, so that it does not find its frames in a cache."""
 
     def __init__(self, frames: BenchFrames) -> None:
         self._places = len(frames.bits) // PLACE_FRAMES
         self._at = 0
 
     def next(self, places: int = 1) -> int:
-        """The first of the next `places` places, which lie one after another, each of PLACE_FRAMES frames."""
+        """Index of the first of the next `places` places, which follow one another, each of PLACE_FRAMES frames."""
         at = self._at if self._at + places <= self._places else 0
         self._at = (at + places) % self._places
         return at
@@ -134,14 +134,14 @@ def numpy_stage(frames: BenchFrames, walk: Walk, exposures: int) -> Stage:
 
 
 def from_memory(frames: BenchFrames, walk: Walk) -> Iterator[tuple[int, Bits]]:
-    """Blocks as they lie in memory, each after its first place."""
+    """Yield blocks from memory, each after the index of its first place."""
     while True:
         place = walk.next(BLOCK_PLACES)
         yield place, frames.bits[place * PLACE_FRAMES : place * PLACE_FRAMES + BLOCK_FRAMES]
 
 
 def from_file(path: Path, stride: int) -> Blocks:
-    """A source of the same blocks that reads them from a recording and checks headers; stride: bytes of each."""
+    """A source that reads the same blocks from a recording and checks their headers. stride: bytes of each block."""
 
     def blocks(frames: BenchFrames, walk: Walk) -> Iterator[tuple[int, Bits]]:
         # Copy-on-write: kernels are compiled for memory that may be written.
@@ -176,7 +176,7 @@ def search_stage(
 
     def measure(seconds: float) -> Measured:
         judge = likelihood.judge(frames.geometry, exposures, dark=True)
-        # One for all sweeps, as in a scan, but not for the next call: the tables of all stages would be too much.
+        # One for all sweeps, as in a scan, but a new one for each call: those of all stages would need too much memory.
         counter = ColumnJudge(layout, frames.geometry, judge, workers)
         blocks = source(frames, walk)
         done, spent = 0, 0.0
@@ -218,9 +218,9 @@ def stripe_error(difference: NDArray[np.float32]) -> StripeError:
 SGBM_BLOCK_PX = 3
 """OpenCV's default for the side of the blocks it matches; penalties follow from it as its documentation advises."""
 PAIRS = 5
-"""Least number of times that `joint` and StereoSGBM make a map by turns, for the median of the quotients."""
+"""Least number of times that `joint` and StereoSGBM make a map alternately, for the median of the quotients."""
 SGBM_STEPS = 16
-"""Steps of OpenCV's disparities to the pixel."""
+"""Steps of OpenCV's disparities per pixel."""
 
 
 def learn_joint(surface: BenchSurface, exposures: int, threads: int) -> RowModel:
@@ -234,11 +234,11 @@ def learn_joint(surface: BenchSurface, exposures: int, threads: int) -> RowModel
 
 
 def joint_stage(surface: BenchSurface, volume: CountVolume, threads: int, model: RowModel) -> Stage:
-    """The stage that runs `joint` on counts, by turns with StereoSGBM."""
+    """The stage that runs `joint` on counts, alternately with StereoSGBM."""
     pictures = surface.pictures()
 
     def measure(seconds: float) -> Measured:
-        # Made anew for each call: the memory of all stages together would be too much.
+        # Made anew for each call: all stages together would need too much memory.
         joint = Joint(threads, model, learns=False)
 
         def make() -> NDArray[np.float32]:
@@ -310,7 +310,7 @@ def _timed(
     error: StripeError,
     beside: Callable[[], object] | None = None,
 ) -> Measured:
-    """Make maps of `frames` frames each for `seconds`; beside: what is done by turns with it, PAIRS times at least."""
+    """Make maps of `frames` frames each for `seconds`. beside: called after each map, at least PAIRS times."""
     spent: list[float] = []
     quotients: list[float] = []
     while sum(spent) < seconds or len(spent) < (1 if beside is None else PAIRS):

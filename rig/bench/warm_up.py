@@ -1,6 +1,6 @@
-"""Compiles every kernel that a rig's scans can need: estimators, filters and, if it is simulated, its world.
+"""Compiles every kernel that a rig's scans can need: estimators, filters and, if the rig is simulated, its world.
 
-Each is run once on little data. numba keeps the compiled code on disk, so that a second time takes seconds.
+Each kernel is run once on little data. numba keeps the compiled code on disk, so that a second time takes seconds.
 """
 
 import time
@@ -44,7 +44,7 @@ class _EnoughError(Exception):
 
 
 def _simulate(rig: OpenRig) -> None:
-    """Let the world make the frames of a scan's beginning, bind and count them, and tell the truth of two columns."""
+    """Let the world make the first frames of a scan, bind and count them, and ask for the truth of two columns."""
     plan, timing = prepare(rig)
     maker = make_reconstructor(rig, plan, EstimateConfig(estimator="argmax", threads=1))
 

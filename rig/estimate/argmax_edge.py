@@ -1,10 +1,11 @@
-"""Compiled estimators `argmax` (brightest pixel of the row, the naive reference) and `edge` (that of the report).
+"""Compiled estimators `argmax` (brightest pixel of the row, the naive reference) and `edge` (that of the report which
+this project follows).
 
 `argmax` takes the largest count inside the window, and the smallest x among equal ones. `edge` fits an exponential
 background to the near side of the row and takes the largest (count - background), weighted with the drop of the level
-from the 8 px before to the 8 px behind, and then the largest count within 2 px of it. Counts are integers (columns,
-rows, window); answers are float32 (rows, columns), refined to sub-pixel positions with the two neighbours. Neither uses
-a model or learns one.
+from the 8 px before to the 8 px behind, and then the largest count within 2 px of that pixel. Counts are integers
+(columns, rows, window); answers are float32 (rows, columns), refined to sub-pixel positions with the two neighbours.
+Neither uses a model or learns one.
 """
 
 from dataclasses import dataclass
@@ -31,9 +32,8 @@ NEAR_SHARE: Final = 0.25
 
 @numba.njit(cache=True, nogil=True)
 def sub_pixel(weight: Float64, peak: int, length: int) -> float:
-    """Sub-pixel offset of the peak, -0.5 to 0.5 px: centroid of the peak and its neighbours above the lower of these.
-
-    It is 0 where all three are equal, and at either end of the row.
+    """Offset of the line from the peak's pixel, -0.5 to 0.5 px: centroid of the pixel and its neighbours, less the
+    lower neighbour's weight. It is 0 where all three are equal, and at either end of the row.
     """
     if peak <= 0 or peak >= length - 1:
         return 0.0
@@ -47,11 +47,12 @@ def sub_pixel(weight: Float64, peak: int, length: int) -> float:
 
 @numba.njit(cache=True, nogil=True)
 def peak_confidence(weight: Float64, counts: Float64, k: float, peak: int, length: int) -> tuple[float, float]:
-    """(P(the true peak is within 1 px of `peak`), mean count away from it).
+    """Probability that the true peak is within 1 px of `peak`, and the mean count more than 1 px away.
 
     The row is modelled as 'one pixel at the peak's rate, the others at the mean rate of the rest'. Over k frames the
     log-likelihood ratio of a stripe at x to 'no stripe', of prior NO_STRIPE, is weight[x] (logit p_peak - logit p_rest)
-    + k log((1 - p_peak) / (1 - p_rest)). Half a count keeps rates off 0 and 1. (0, 0) if the peak has no count.
+    + k log((1 - p_peak) / (1 - p_rest)). Half a count is added so that no rate is 0 or 1. (0, 0) if the peak has no
+    count.
     """
     if counts[peak] <= 0.0:
         return 0.0, 0.0
@@ -65,7 +66,7 @@ def peak_confidence(weight: Float64, counts: Float64, k: float, peak: int, lengt
             around += counts[t]
             pixels += 1.0
     rest = (total - around) / max(length - pixels, 1.0)
-    # 1 - p from the counts themselves: at K = 10^6 half of its digits would be lost.
+    # 1 - p is computed from the counts: 1 less p would lose half of its digits at K = 10^6.
     p_peak, q_peak = (counts[peak] + 0.5) / (k + 1.0), (k - counts[peak] + 0.5) / (k + 1.0)
     rest_k = k + 1.0 / length
     p_rest = min((max(rest, 0.0) + 0.5 / length) / rest_k, p_peak)
@@ -84,8 +85,8 @@ def peak_confidence(weight: Float64, counts: Float64, k: float, peak: int, lengt
 
 @numba.njit(cache=True, nogil=True)
 def _near_fit(n: Float64, length: int) -> tuple[float, float]:
-    """Level at the nearest pixel and decay per pixel, at least 0, of an exponential through the near part of a row, by
-    that part's two halves' sums. (0, 0) if the row is too short or the nearer half has no count."""
+    """Fit an exponential to the near part of a row, from the sums of its two halves. Returns the level at the nearest
+    pixel and the decay per pixel, at least 0; (0, 0) if the row is too short or the nearer half has no count."""
     half = max(int(length * NEAR_SHARE) // 2, 2)
     if 2 * half > length:
         return 0.0, 0.0
@@ -123,7 +124,7 @@ def peak_rows(
             first, last = max(x_lo[y, c], x0[c]), min(x_hi[y, c], x0[c] + window - 1)
             if first > last:
                 continue
-            # Pixels beyond the search window say what lies before and behind; none of them can be the answer.
+            # Pixels beyond the search window only show the levels before and behind; none of them can be the answer.
             low = max(first - EDGE_REACH_PX, x0[c], 0)
             high = min(last + EDGE_REACH_PX, x0[c] + window - 1, defects.shape[1] - 1)
             start = low if near_is_left else high
@@ -146,7 +147,7 @@ def peak_rows(
                 if peak < 0 or weights[t] > weights[peak]:
                     peak = t
             if with_edge:
-                # A stripe's far flank has its own light before it and scores high: climb back to the top.
+                # The stripe's far flank scores high, because the stripe's light lies before it: go back to the top.
                 top = peak
                 for t in range(max(0, peak - STRIPE_PX), min(length, peak + STRIPE_PX + 1)):
                     if inside[t] > inside[top]:

@@ -4,8 +4,8 @@ medium.
 The likelihood itself: `rig.estimate.row.likelihood`; the search along a row: `rig.estimate.search.rows`; the model and
 how it is learned: `rig.estimate.row.model`, `rig.estimate.row.em`, `rig.estimate.search.online_learning`; the
 confidence of an answer, from its neighbours: `rig.estimate.search.confidence`. The first map is counted completely and
-estimated twice, because the first pass finds which pixels were quiet behind the stripe. Every later map is judged
-column by column while its frames come in, with a model learned from earlier maps alone.
+estimated twice, because pixels that the first estimate shows to lie behind the stripe tell the ambient light. Every
+later map is judged column by column while its frames come in, with a model learned from earlier maps alone.
 """
 
 import numpy as np
@@ -49,7 +49,7 @@ class Likelihood:
         self._lessons.model = model
 
     def counter(self, layout: SweepLayout, geometry: SweepGeometry) -> Counter:
-        """A counter whose sweeps `estimate` takes. geometry: the nominal one, which holds for every sweep."""
+        """A counter whose finished sweeps go to `estimate`. geometry: the nominal one, which holds for every sweep."""
         return _LikelihoodCounter(self, layout, geometry, self._workers)
 
     def estimate(self, sweep: CountVolume | SearchedSweep, geometry: SweepGeometry) -> StripeTable:
@@ -64,7 +64,7 @@ class Likelihood:
             found, quiet = search_volume(sweep, geometry, self._lessons.tables(setting, self._workers), self._workers)
             lines = lines_of(sweep, next_lattice(geometry))
         self.used = used
-        # Lessons are of rows, and heed what a row is sure of itself.
+        # Learning goes row by row, so by each row's own confidence, without its neighbours.
         self._lessons.attend(
             found, used, int(sweep.n_frames.sum()), lambda: Seen(sweep, sweep.intensity(), quiet, lines)
         )
@@ -77,7 +77,7 @@ class Likelihood:
         return self._at[1]
 
     def _light_of(self, model: RowModel) -> tuple[float, int]:
-        """A model's usual ambient light and the pixels that a stripe's light is summed over, computed once a model."""
+        """A model's median ambient light and over how many pixels a stripe's light is summed; computed once a model."""
         if self._light is None or self._light[0] is not model:
             line_px = 2 * signal_reach(line_profile(model.line_sigma_px)) + 1
             self._light = model, float(np.median(model.ambient)), line_px
@@ -119,7 +119,7 @@ class _LikelihoodCounter:
         return self._present().finish()
 
     def _present(self) -> SweepCounter | ColumnJudge:
-        # Chosen with the first frames: only then has the sweep before this one been estimated and has taught.
+        # Chosen with the first frames: only then has the sweep before been estimated and learned from.
         if self._counter is None:
             layout = self._layout
             if self._of.model is None or layout.exposures > BYTE_EXPOSURES:

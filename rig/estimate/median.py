@@ -1,4 +1,5 @@
-"""Filter `median`: the report's 5x5 median, applied to disparity so that the slant of columns does not matter.
+"""Filter `median`: a 5x5 median, as in the report that this project follows, applied to disparity so that the slant of
+columns does not matter.
 
 Disparity is x minus the position of the column's line at a fixed depth. Missing answers (NaN) are ignored, not filled.
 """
@@ -15,7 +16,7 @@ REACH = 2
 MEDIAN_EFFICIENCY = 1.2533
 """Standard deviation of a median over that of a mean, sqrt(pi / 2), for normal errors."""
 SURE = np.float32(0.999999)
-"""Largest confidence of an answer where several are counted together."""
+"""Largest confidence of an answer in the probability that none of several is right: its logarithm stays finite."""
 
 
 @numba.njit(cache=True, nogil=True)
@@ -61,7 +62,7 @@ def _median_rows(disparity: Float32, confidence: Float32, coupled: bool, out: Fl
 def median_filter(stripes: StripeTable, reference_px: Float64, *, coupled: bool = False) -> StripeTable:
     """Stripe table with x_px from the 5x5 median of its disparity, and with confidence and x_sd_px to match.
 
-    reference_px: (rows, columns), the position of the column's line at a fixed depth; an answer with NaN there is lost.
+    reference_px: (rows, columns), the position of the column's line at a fixed depth; where NaN, the result is NaN.
     Confidence becomes the share of the neighbours' confidence that belongs to answers within 1 px of the median, times
     the probability that at least one of those is right. For coupled answers their mean confidence takes the place of
     that probability, since answers that influence each other also agree where nothing is lit. x_sd_px becomes the

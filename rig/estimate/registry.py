@@ -1,7 +1,7 @@
 """Stripe estimators by name, which turn the counts of a sweep into a stripe table.
 
-`create_estimator` makes a fresh one. `recalling` makes one that is given the states with which maps were estimated, one
-for each map, and so estimates these maps again bit for bit.
+`create_estimator` makes a fresh one. `recalling` makes one that estimates earlier maps again, bit for bit, from the
+learned state that was kept with each of them.
 """
 
 from collections.abc import Sequence
@@ -18,13 +18,13 @@ if TYPE_CHECKING:
 ESTIMATORS = ("argmax", "edge", "likelihood", "joint")
 FILTERS = ("none", "median")
 LEARNING = frozenset({"likelihood", "joint"})
-"""Estimators that learn from the stream, for which the first map takes much longer than those after it."""
+"""Estimators that learn from the stream. Their first map takes much longer than later ones."""
 COUPLED = frozenset({"joint"})
-"""Estimators whose answers already go by their neighbours', so that neighbours who agree are no further evidence."""
+"""Estimators in which neighbours influence each other's answers: that neighbours agree is then no further evidence."""
 
 
 class Learned(Protocol):
-    """State that an estimator has learned. Its extinction is NaN if the haze does not resolve it."""
+    """State that an estimator has learned. Its extinction is NaN if the haze does not determine it."""
 
     @property
     def extinction_per_m(self) -> float:
@@ -42,7 +42,7 @@ class Learned(Protocol):
 
 
 class Estimator(Protocol):
-    """An estimator. used: the state with which the last map was estimated, None if it learns none."""
+    """An estimator. used: the state with which the last map was estimated; None if the estimator does not learn."""
 
     @property
     def used(self) -> Learned | None:
@@ -50,11 +50,11 @@ class Estimator(Protocol):
         ...
 
     def counter(self, layout: "SweepLayout", geometry: "SweepGeometry") -> "Counter":
-        """A counter whose sweeps `estimate` takes. geometry: that of every sweep, with columns at their centres."""
+        """A counter whose finished sweeps go to `estimate`. geometry: of every sweep, with columns at their centres."""
         ...
 
     def estimate(self, sweep: Any, geometry: "SweepGeometry") -> "StripeTable":
-        """Stripe table of the sweep that `counter` returned, or of a `CountVolume`."""
+        """Stripe table of a sweep: what a counter of this estimator has finished, or a `CountVolume`."""
         ...
 
 
@@ -62,19 +62,19 @@ class LearnsFromStream(Estimator, Protocol):
     """An estimator in LEARNING. Its model can be set, to continue from a kept state."""
 
     model: Any
-    """The state that the next map will be estimated with, None until a map has taught one."""
+    """The state with which the next map will be estimated, None until a map was good enough to learn from."""
 
 
 def recalling(name: str, learned: Sequence[Learned], threads: int = 2, *, temporal_prior: bool = False) -> Estimator:
-    """Estimator of a name in LEARNING that estimates each map with its own state from `learned`, and learns nothing.
+    """An estimator that learns nothing and estimates each map with its own state, the next one of `learned`.
 
-    KeyError for any other name.
+    name: one of LEARNING, else KeyError.
     """
     return Recalled(_learning(name, threads, learns=False, temporal_prior=temporal_prior), learned)
 
 
 def create_estimator(name: str, threads: int = 2, *, temporal_prior: bool = False) -> Estimator:
-    """A fresh estimator of a name in ESTIMATORS, for up to `threads` threads; KeyError for any other name.
+    """A fresh estimator that uses up to `threads` threads. name: one of ESTIMATORS, else KeyError.
 
     temporal_prior: whether `joint` uses the last map as a weak prior; the others ignore it.
     """
@@ -98,7 +98,7 @@ def _learning(name: str, threads: int, *, learns: bool, temporal_prior: bool) ->
 
 
 class Recalled:
-    """Estimates each map with its own state, and further maps with the last one. of: an estimator that learns
+    """Estimates each map with its own state, and further maps with the last state. of: an estimator that learns
     nothing. states: at least one."""
 
     def __init__(self, of: LearnsFromStream, states: Sequence[Learned]) -> None:

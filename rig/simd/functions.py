@@ -1,4 +1,4 @@
-"""Logarithm, powers of e and 2, and the error function of LANES float32 at once, where the C library computes only one.
+"""Logarithm, powers of e and 2, and the error function of LANES float32 at once; the C library computes one at a time.
 
 `logarithm` and `exponential` split off a power of two and sum a series for the rest. `error_function` is Abramowitz
 and Stegun 7.1.28. Each states its error.
@@ -34,12 +34,12 @@ from rig.simd.vectors import (
 _MANTISSA_BITS: Final = 23
 _BIAS: Final = 127
 _ROOT_HALF: Final = 0x3F3504F3
-"""Bits of sqrt(1/2) as a float32: mantissas from there to sqrt(2) have the smallest logarithms."""
+"""Bits of sqrt(1/2) as a float32: mantissas from sqrt(1/2) to sqrt(2) have the smallest logarithms."""
 _LOG2_E, _LN_2 = 1.0 / math.log(2.0), math.log(2.0)
 _LEAST, _MOST = -87.0, 88.0
 """Least and largest power of e that a float32 holds."""
 _TO_WHOLE: Final = 1.5 * 2.0**_MANTISSA_BITS
-"""Number that, added and taken off again, leaves the nearest whole number."""
+"""Adding and then subtracting this number rounds to the nearest whole number."""
 _ERF: Final = 0.0000430638, 0.0002765672, 0.0001520143, 0.0092705272, 0.0422820123, 0.0705230784
 """Abramowitz and Stegun, Handbook of Mathematical Functions, 7.1.28, the highest power first."""
 
@@ -69,7 +69,7 @@ power_of_two = emitted(FLOAT32(FLOAT32), _power)
 
 @numba.njit(forceinline=True)
 def logarithm(a):  # type: ignore[no-untyped-def]
-    """Natural logarithm of positive lanes, with an error of 2e-7 times its size, or 2e-7 if that is below 1."""
+    """Natural logarithm of positive lanes. Error: 2e-7 times its size, or 2e-7 if its size is below 1."""
     part = mantissas(a)
     ratio = (part - 1.0) / (part + 1.0)
     square = ratio * ratio
@@ -110,7 +110,7 @@ MEAN_EXCESS: Final = np.float32(1.040684)
 
 @numba.njit(inline="always")
 def lift_to_powers(best, shift):  # type: ignore[no-untyped-def]
-    """Number to add to scores so that 0 lies 127 octaves below each lane's best score, or at the least score."""
+    """Number to add to scores so that 0 lies 127 octaves below each lane's best score, or at the least int16."""
     return add_saturated(sub_saturated(zero_int16(), best), np.int16(np.int64(BIAS) >> shift))
 
 

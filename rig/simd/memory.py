@@ -1,7 +1,7 @@
-"""Reads and writes of lanes and numbers in memory that is given by its address, and arrays that begin at a cache line.
+"""Reads and writes of lanes and numbers at an address in memory, and arrays that begin at a cache line.
 
 Addresses are used instead of arrays because numba counts references to every array that a compiled function gets. In
-the functions for one image row that takes many times as long as the work itself. So a caller makes a named tuple of
+the functions for one image row this takes many times as long as the work itself. So a caller makes a named tuple of
 arrays, keeps it alive and passes its `pointers`; inside a kernel there is `address_of`. Nothing here checks that an
 index lies inside the array. In an array that begins at a cache line (`aligned_zeros`), a vector of 32 bytes never lies
 across two cache lines, which would have to be read separately.
@@ -24,9 +24,9 @@ Arrays = TypeVar("Arrays", bound=tuple[Any, ...])
 
 
 def pointers(arrays: Arrays) -> Arrays:
-    """A named tuple of arrays and numbers as kernels take it, with each array replaced by its address.
+    """A copy of a named tuple for kernels, with each array replaced by its address, also in tuples within it.
 
-    Tuples within it are converted too. Arrays must be C-contiguous, and the caller must keep them alive.
+    Arrays must be C-contiguous, and the caller must keep them alive.
     """
     return type(arrays)(*map(_pointer_to, arrays))
 
@@ -44,7 +44,7 @@ def address_of(array):  # type: ignore[no-untyped-def]
 
 
 def _pointer(builder: Any, address: Any, index: Any, element: Any, whole: Any) -> Any:
-    """Pointer to `whole`, which begins at element `index` of what lies at `address`."""
+    """Pointer of type `whole` to element number `index` of the elements at `address`."""
     return builder.bitcast(builder.gep(builder.inttoptr(address, element.as_pointer()), [index]), whole.as_pointer())
 
 
@@ -73,11 +73,11 @@ load_bytes = _reader(BYTES, _I8, BYTES.llvm, 1)
 load_block = _reader(BLOCK, _I8, BLOCK.llvm, 1)
 """load_block(address, index): 128 bytes from `index` on."""
 load_int16 = _reader(INT16, _I16, INT16.llvm, 2)
-"""load_int16(address, index): 16 of the int16 at `address`, from number `index` on."""
+"""load_int16(address, index): 16 of the int16 at `address`, from `index` on."""
 load_float32 = _reader(FLOAT32, _F32, FLOAT32.llvm, 4)
-"""load_float32(address, index): 16 of the float32 at `address`, from number `index` on."""
+"""load_float32(address, index): 16 of the float32 at `address`, from `index` on."""
 load_four = _reader(FOUR, _F32, FOUR.llvm, 4)
-"""load_four(address, index): four of the float32 at `address`, from number `index` on."""
+"""load_four(address, index): four of the float32 at `address`, from `index` on."""
 store_bytes = _writer(BYTES, _I8, BYTES.llvm, 1)
 """store_bytes(address, index, bytes): write 32 bytes."""
 store_int16 = _writer(INT16, _I16, INT16.llvm, 2)
@@ -125,7 +125,7 @@ def _load_two_rows(builder: Any, address: Any, first: Any, second: Any) -> Any:
 
 
 load_two_rows = emitted(BYTES(types.intp, types.intp, types.intp), _load_two_rows)
-"""load_two_rows(address, first, second): 16 bytes from `first` on, and behind them 16 bytes from `second` on."""
+"""load_two_rows(address, first, second): 16 bytes from `first` on, then 16 bytes from `second` on."""
 
 
 def _prefetch(to_write: int, locality: int) -> Any:
@@ -137,7 +137,7 @@ def _prefetch(to_write: int, locality: int) -> Any:
 
 
 prefetch = _prefetch(0, 2)
-"""prefetch(address): fetch the cache line there into the second-level cache; any address will do."""
+"""prefetch(address): fetch the cache line there into the second-level cache; the address need not be valid."""
 prefetch_to_write = _prefetch(1, 3)
 """prefetch_to_write(address): fetch the cache line there into the first-level cache, for this core alone."""
 
@@ -149,7 +149,7 @@ load_widened = emitted(
 
 
 def _load_counts(builder: Any, address: Any, index: Any) -> Any:
-    # By way of signed numbers, which every processor turns into float32 at once.
+    # As signed numbers, which every processor converts to float32 in one instruction.
     wide = builder.zext(_load(builder, address, index, _I8, _HALF, 1), ir.VectorType(_I32, LANES))
     return builder.sitofp(wide, FLOAT32.llvm)
 

@@ -3,8 +3,8 @@ numbers.
 
 Reductions (`largest_of_rows`, `totals_of_rows`) take LANES rows at once and give one number per row, which becomes one
 lane of the answer. If they went row by row, every step would wait for the one before. `fetch_eights` and
-`spread_eights` take eight numbers from each of LANES places and transpose them, so that lane i of eight vectors holds
-those of place i.
+`spread_eights` take eight numbers from each of LANES addresses and transpose them, so that lane i of eight vectors
+holds those of address i.
 """
 
 from collections.abc import Callable, Sequence
@@ -39,11 +39,11 @@ def _interleaved(first: int) -> Any:
 
 
 first_row_pairs, second_row_pairs = _interleaved(0), _interleaved(LANES)
-"""first_row_pairs(a, b), second_row_pairs(a, b): bytes of a and b by turns, of the first 16 of each or the second."""
+"""first_row_pairs(a, b), second_row_pairs(a, b): bytes of a and b alternately, of the first or the last 16 of each."""
 
 
 def _shuffled(source: Sequence[int]) -> Any:
-    """Lane i takes what lane source[i] had, 0 where that is LANES."""
+    """An operation in which lane i gets lane source[i], or 0 where source[i] is LANES."""
     zeros = ir.Constant(INT16.llvm, [0] * LANES)
     return emitted(INT16(INT16), lambda builder, a: builder.shuffle_vector(a, zeros, place_list(source)))
 
@@ -53,7 +53,7 @@ def _up_in_halves(by: int) -> Any:
 
 
 up_1 = _shuffled([LANES, *range(LANES - 1)])
-"""up_1(a): lane i gets what lane i - 1 had, and the first one 0."""
+"""up_1(a): lane i gets lane i - 1, and the first lane 0."""
 _up_1_in_halves, _up_2_in_halves, _up_4_in_halves = _up_in_halves(1), _up_in_halves(2), _up_in_halves(4)
 _lower_end = _shuffled([LANES] * _HALF + [_HALF - 1] * _HALF)
 
@@ -99,7 +99,7 @@ equal_bits = emitted(types.uint32(types.intp, types.intp, types.intp, types.int1
 """equal_bits(address, index, step, number): bit i, 0 to 7, is set where the int16 at index + i step is the number."""
 _NO = ir.Constant(ir.IntType(1), 0)
 lowest_bit = emitted(types.uint32(types.uint32), lambda builder, mask: builder.cttz(mask, _NO))
-"""lowest_bit(mask): number of the lowest bit that is set; 32 where none is."""
+"""lowest_bit(mask): index of the lowest bit that is set; 32 if no bit is set."""
 
 
 def _lanes_between(builder: Any, first: Any, end: Any) -> Any:
@@ -117,21 +117,21 @@ first_equal = emitted(
     types.int64(BLOCK, types.uint8),
     lambda builder, a, number: builder.trunc(builder.cttz(_bits_where(builder, a, number), _NO), _I64),
 )
-"""first_equal(a, number): place of the first byte of a block that equals the number; 128 where none does."""
+"""first_equal(a, number): index of the first byte of a block that equals the number; 128 if none does."""
 
 
 reversed_lanes = _shuffled(range(LANES - 1, -1, -1))
 """reversed_lanes(a): the last lane first."""
 last_everywhere = _shuffled([LANES - 1] * LANES)
-"""last_everywhere(a): the highest lane in all of them."""
+"""last_everywhere(a): the highest lane copied to all lanes."""
 
 
 FOLDED: Final = LANES // 2
-"""Numbers that `store_folded` leaves of a row."""
+"""Numbers per row that `store_folded` writes."""
 
 
 def _unpacked(builder: Any, a: Any, b: Any, combine: Callable[[Any, Any], Any]) -> Any:
-    """Numbers of a and b by turns, the lower half of each 128 bits combined with the upper one."""
+    """Numbers of a and b alternately, the lower half of each 128 bits combined with the upper half."""
     count, block = a.type.count, 128 // (16 if isinstance(a.type.element, ir.IntType) else 32)
     parts = []
     for first in (0, block // 2):
@@ -142,12 +142,12 @@ def _unpacked(builder: Any, a: Any, b: Any, combine: Callable[[Any, Any], Any]) 
 
 
 def _reduced(builder: Any, rows: Sequence[Any], combine: Callable[[Any, Any], Any]) -> Any:
-    """One number a row, in order, of as many rows as 256 bits hold numbers."""
+    """One number per row, in order, for as many rows as a vector holds numbers."""
     count = rows[0].type.count
     block = count // 2
     halves = []
     for begin in (0, block):
-        # Rows in an order that unpacking turns into the usual one.
+        # Rows in the order from which `_unpacked` makes the usual order.
         order = [int(f"{i:0{block.bit_length() - 1}b}"[::-1], 2) for i in range(block)]
         level = [rows[begin + i] for i in order]
         while len(level) > 1:
@@ -183,7 +183,7 @@ def _store_folded(builder: Any, address: Any, row: Any, a: Any) -> None:
 
 
 store_folded = emitted(types.void(types.intp, types.intp, FLOAT32), _store_folded)
-"""store_folded(address, row, a): write the lower half of 16 float32 plus the upper half, as row `row` of FOLDED."""
+"""store_folded(address, row, a): write the lower half of 16 float32 plus the upper half, as row number `row` there."""
 
 
 def _totals_of_rows(builder: Any, address: Any) -> Any:
@@ -254,4 +254,4 @@ def _spread_eights(builder: Any, source: Any, to: Any) -> None:
 
 
 spread_eights = emitted(types.void(types.intp, types.intp), _spread_eights)
-"""spread_eights(source, to): write eight vectors of float32; lane i gets the i-th eight of the unsigned bytes there."""
+"""spread_eights(source, to): write eight vectors of float32 to `to`; lane i gets the i-th eight bytes at `source`."""

@@ -56,7 +56,7 @@ class _LanesModel(models.PrimitiveModel):
 BYTES = Lanes(8, count=2 * LANES)
 """32 bytes, two for each lane."""
 BLOCK = Lanes(8, count=8 * LANES)
-"""128 bytes, in as many registers as that takes."""
+"""128 bytes, in as many registers as needed."""
 INT16 = Lanes(16)
 FLOAT32 = Lanes(32, real=True)
 FOUR = Lanes(32, real=True, count=4)
@@ -64,7 +64,7 @@ FOUR = Lanes(32, real=True, count=4)
 
 
 def _splat(context: Any, builder: Any, lanes: Lanes, number_type: Any, number: Any) -> Any:
-    """A number of any type as all of the lanes."""
+    """A number of any type, copied to all lanes."""
     element = types.float32 if lanes.real else types.Integer.from_bitwidth(lanes.bits, signed=True)
     return everywhere(builder, context.cast(builder, number, number_type, element), lanes.count)
 
@@ -104,7 +104,7 @@ def emitted(signature: Any, emit: Callable[..., Any]) -> Any:
 
         return signature, code
 
-    # numba asks how many arguments there are.
+    # numba reads the number of arguments from the signature.
     names = ("typing", *(f"a{i}" for i in range(len(signature.args))))
     parameters = [Parameter(name, Parameter.POSITIONAL_OR_KEYWORD) for name in names]
     operation.__signature__ = Signature(parameters)  # type: ignore[attr-defined]
@@ -135,7 +135,7 @@ def _is_real(value: Any) -> bool:
     return isinstance(value.type.element, ir.FloatType)
 
 
-# Sums of a fixed number of products may be fused: every machine with the same instructions gives the same bits.
+# Products and sums may be fused ("contract"): every machine with the same instructions gives the same bits.
 _add = _binary(lambda b, x, y: b.fadd(x, y, flags=("contract",)) if _is_real(x) else b.add(x, y))
 _sub = _binary(lambda b, x, y: b.fsub(x, y, flags=("contract",)) if _is_real(x) else b.sub(x, y))
 _mul = _binary(lambda b, x, y: b.fmul(x, y, flags=("contract",)) if _is_real(x) else b.mul(x, y))
@@ -192,7 +192,7 @@ def wide(number: int) -> Any:
 as_bytes = emitted(BYTES(INT16), lambda builder, a: builder.bitcast(a, BYTES.llvm))
 """as_bytes(a): the two bytes of each 16-bit lane, the lower one first."""
 to_int16 = emitted(INT16(FLOAT32), lambda b, a: b.trunc(b.fptosi(a, WIDE), INT16.llvm))
-"""to_int16(a): float32 lanes, which must fit, without their fraction."""
+"""to_int16(a): float32 lanes without their fraction; they must fit."""
 to_float32 = emitted(FLOAT32(INT16), lambda b, a: b.sitofp(b.sext(a, WIDE), FLOAT32.llvm))
 """to_float32(a): signed 16-bit lanes as float32."""
 square_root = emitted(FLOAT32(FLOAT32), lambda b, a: called(b, f"llvm.sqrt.{vector_name(a.type)}", a.type, a))
@@ -208,7 +208,7 @@ def _has_avx2() -> bool:
 
 
 def _dot_pairs(builder: Any, counts: Any, weights: Any) -> Any:
-    # LLVM has no name of its own for what is one instruction on x86, and does not always recognise it.
+    # One instruction on x86. LLVM has no portable intrinsic for it, and does not always recognise the pattern.
     if _has_avx2():
         return called(builder, "llvm.x86.avx2.pmadd.ub.sw", INT16.llvm, counts, weights)
     nothing = ir.Constant(BYTES.llvm, ir.Undefined)
@@ -264,7 +264,7 @@ def _extreme(name: str) -> Any:
 
 
 largest_float, smallest_float = _extreme("maxnum"), _extreme("minnum")
-"""largest_float(a), smallest_float(a): the largest or the smallest of float32 lanes, without those that are NaN."""
+"""largest_float(a), smallest_float(a): the largest or the smallest of float32 lanes, ignoring NaN."""
 
 
 def _where_small(builder: Any, values: Any, sizes: Any, limit: Any) -> Any:
@@ -301,11 +301,11 @@ scaled = emitted(INT16(INT16, INT16), _scaled)
 """scaled(a, weights): a * weights / 2^15, rounded, of signed 16-bit lanes; they must not both be -32768."""
 
 UNPACKED: Final = (0, 1, 2, 3, 8, 9, 10, 11, 4, 5, 6, 7, 12, 13, 14, 15)
-"""Order of the lanes after `from_bfloat16_unpacked`: the one that costs an x86 processor one instruction."""
+"""Order of the lanes after `from_bfloat16_unpacked`, which an x86 processor produces with one instruction."""
 
 
 def _unpacked(builder: Any, bits: Any) -> Any:
-    # A zero in front of each number (at the lower address) is the lower half of a float32.
+    # A zero before each number (at the lower address) is the lower half of the float32.
     zeros = ir.Constant(bits.type, [0] * LANES)
     pairs = [index for lane in UNPACKED for index in (LANES, lane)]
     return builder.bitcast(builder.shuffle_vector(bits, zeros, place_list(pairs)), FLOAT32.llvm)

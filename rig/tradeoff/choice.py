@@ -16,7 +16,7 @@ from rig.tradeoff.rows import Clock, TradeoffRow, TrialSetting
 
 _PIXELS = re.compile(r"\s*(\d+\.?\d*(?:[eE][+-]?\d{1,3})?|\.\d+)\s*px\s*", re.ASCII)
 WORTH = 1.5
-"""Factor on the least error of all: what a longer scan would still gain is not worth its time to most users."""
+"""Without a wish, the shortest scan within this factor of the least error is advised: a longer one gains little."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -36,7 +36,7 @@ class Wish:
 
 @dataclass(frozen=True, slots=True)
 class Choice:
-    """The setting to use or, if none meets the wish, the nearest. Each figure is its worst in any scene and fog."""
+    """The setting to use or, if none meets the wish, the nearest. Its figures are its worst in any scene and fog."""
 
     wish: Wish
     fits: bool
@@ -97,7 +97,10 @@ def wish_of(time_budget: str | None, error: str | None, of: str) -> Wish | None:
 
 
 def choose(rows: Sequence[TradeoffRow], wish: Wish) -> Choice | None:
-    """Choose a setting of those tried in every scene and fog; None if each leaves too many answers out somewhere."""
+    """Choose among the settings that were tried in every scene and fog.
+
+    None if each of them has too many missing answers in some scene and fog.
+    """
     by_setting: dict[TrialSetting, list[TradeoffRow]] = {}
     for row in rows:
         by_setting.setdefault(row.setting, []).append(row)

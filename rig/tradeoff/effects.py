@@ -1,4 +1,4 @@
-"""Finds which physical effects a simulated scene calls for, according to its world, and measures how much each
+"""Lists the physical effects that a simulated scene calls for, as its world reports them, and measures how much each
 matters."""
 
 from collections.abc import Iterator, Mapping
@@ -67,10 +67,10 @@ class Effect:
     share: share of all detected photons.
     changed_decisions_bound: largest share of decisions that can change without it; None if there is no bound.
     cost_us_per_frame: of one thread; None if it is part of another effect.
-    stripe_error_change_px, stripe_error_change_sd_px: how much larger the mean stripe error is with it than without it,
-      and the standard error of that; None if not known.
-    basis: 'trial' if that was measured in a pair of trial scans, 'bound' if it is the bound of an effect that is left
-      out.
+    stripe_error_change_px, stripe_error_change_sd_px: how much larger the mean stripe error is with the effect than
+      without it, and the standard error of this change; None if not known.
+    basis: 'trial' if the change was measured in a pair of trial scans, 'bound' if it is the bound of an effect that is
+      left out.
     """
 
     effect: str
@@ -168,7 +168,7 @@ def open_world(config: RigConfig) -> Iterator[tuple[ReportsEffects, float]]:
     with ExitStack() as stack:
         try:
             surroundings = surroundings_of(config, 0, stack)
-        except DeviceError as error:  # a scene that is not there is the config's fault
+        except DeviceError as error:  # a missing scene is an error of the config
             raise UsageError(f"world: {error}") from error
         world: Any = surroundings.world
         if not isinstance(world, ReportsEffects):
@@ -188,7 +188,7 @@ def open_world(config: RigConfig) -> Iterator[tuple[ReportsEffects, float]]:
 def _trials(
     config: RigConfig, on: list[str], tried: list[str], progress: Progress | None
 ) -> dict[str, tuple[float, float]]:
-    """Pixels by which the mean stripe error grows with each effect, and the standard error of that.
+    """Pixels by which the mean stripe error grows with each effect, and the standard error of this growth.
 
     Measured in pairs of short scans with the same random numbers and all other effects on. Empty for a world that runs
     in real time.
@@ -202,7 +202,7 @@ def _trials(
             with part(f"trial scan 1 of {trials}"):
                 whole = _trial(config, columns, on)
             break
-        except PlanError:  # the mirror cannot sweep as fast
+        except PlanError:  # the mirror cannot sweep so fast
             if columns == config.scan.columns:
                 raise
             columns = min(2 * columns, config.scan.columns)

@@ -53,12 +53,12 @@ def csv_text(rows: Sequence[TradeoffRow]) -> str:
 
 
 COLOURS = {"argmax": "#7b8896", "edge": "#d55e00", "likelihood": "#0072b2", "joint": "#009e73"}
-"""Colours of estimators, which the colour-blind can tell apart (Okabe and Ito, 'Color universal design', 2008)."""
+"""Colours of estimators that the colour-blind can tell apart (Okabe and Ito, 'Color universal design', 2008)."""
 OTHER_COLOUR = "#cc79a7"
 
 
 def tradeoff_svg(rows: Sequence[TradeoffRow], ci95_by: str) -> str:
-    """The picture as SVG text, without rows with too many answers missing. ci95_by: what the intervals are over."""
+    """The picture as SVG text, without rows with too many answers missing. ci95_by: as in `Tradeoff`."""
     places = dict.fromkeys(row.place for row in rows)
     shown = [row for row in rows if row.counts]
     panels = [

@@ -2,11 +2,11 @@
 
 The ideal estimator knows haze, ambient light, the line's width and the brightness of the stripe, and has to find only
 its position. If stripes are spread evenly over the search, no answer has a smaller mean |error| than the median of the
-posterior. `bayes_errors` computes it from drawn counts, at 5 ms a row for four numbers of exposures. M neighbours on
-one surface count as M times the exposures. `chernoff_exponent` says how fast wrong positions get rarer with more
-exposures, `position_sd_px` how exactly the right one can be found; the formulas are in docs/explanation/limits.md. A
-pixel fires in an exposure with probability p = 1 - exp(-flux), all independently; q = 1 - p, and p', q' are those of
-another position.
+posterior. `bayes_errors` computes this error from drawn counts, at 5 ms a row for four numbers of exposures. M
+neighbours on one surface count as M times the exposures. `chernoff_exponent` says how fast wrong positions get rarer
+with more exposures, `position_sd_px` how exactly the right position can be found; the formulas are in
+docs/explanation/limits.md. A pixel fires in an exposure with probability p = 1 - exp(-flux), independently of all other
+pixels; q = 1 - p, and p', q' are those of another position.
 """
 
 import math
@@ -32,13 +32,13 @@ def least_exponent(light: RowLight) -> float:
 def position_information(light: RowLight) -> float:
     """Fisher information of the position per exposure, 1/px^2, from the stripe's flanks and from where the haze ends.
 
-    Pixels that always fire give none. A stripe so bright and narrow that it saturates the two pixels beside the border
-    on which it is centred has information 0.
+    Pixels that always fire give no information. It is 0 for a stripe that is centred on the border of two pixels and so
+    bright and narrow that it saturates both and lights no other.
     """
     pixel = np.arange(len(light.before), dtype=np.float64)
     away = pixel - light.position
     flux = np.maximum(light.flux(np.array([light.position]))[0], FLUX_MIN)
-    # Of a Gaussian's values at a pixel's two borders: their difference, exact however wide it is.
+    # Difference of the Gaussian at a pixel's two borders, exact for any width.
     inner = (np.abs(away) - 0.5) / light.sigma_px
     flank = np.exp(-0.5 * inner**2) * -np.expm1(-np.abs(away) / light.sigma_px**2)
     slope = np.sign(away) * flank * (light.stripe / (light.sigma_px * math.sqrt(2.0 * math.pi)))
@@ -65,7 +65,7 @@ EXPONENT_ROWS: Final = 24
 COARSE_PX: Final = 0.5
 """Spacing of positions far from the true one."""
 FINE_SHARE: Final = 8.0
-"""Positions near the true one lie their distance from it, divided by this, apart."""
+"""Near the true position, the spacing is the distance from it divided by this."""
 
 
 def bayes_errors(light: RowLight, exposures: Sequence[int], draws: int, rng: np.random.Generator) -> Array:
@@ -85,7 +85,7 @@ def bayes_errors(light: RowLight, exposures: Sequence[int], draws: int, rng: np.
 
 
 def _places(light: RowLight, exposures: int) -> tuple[Array, Array]:
-    """Positions over the search, denser near the true one, and the width in px that each stands for."""
+    """Positions over the search, denser near the true one, and the width in px that each represents."""
     finest = min(max(position_sd_px(light, exposures), 1e-3), 1.0) / FINE_SHARE
     reach = math.ceil(FINE_SHARE * math.log(COARSE_PX / finest))
     steps = finest * np.expm1(np.arange(1, reach + 1) / FINE_SHARE) * FINE_SHARE
@@ -97,7 +97,7 @@ def _places(light: RowLight, exposures: int) -> tuple[Array, Array]:
 
 
 def _medians(score: Array, places: Array, spacing: Array) -> Array:
-    """Median of each posterior, even over the width of each place; score: logarithm of its masses (rows, places)."""
+    """Median of each posterior, uniform over the width of each place; score: logarithm of its masses (rows, places)."""
     mass = np.exp(score - score.max(1, keepdims=True))
     below = np.cumsum(mass, axis=1)
     half = 0.5 * below[:, -1]
@@ -108,7 +108,7 @@ def _medians(score: Array, places: Array, spacing: Array) -> Array:
 
 @dataclass(frozen=True, slots=True)
 class StatisticalLimit:
-    """Limits of rows of a scene at a number of exposures; means over its rows.
+    """Limits of rows of a scene at a number of exposures; means over these rows unless stated.
 
     mean_abs_px, mean_abs_se_px: smallest mean |error| of any answer from one row, or from `averaged` equal ones, and
     its standard error.
@@ -161,11 +161,11 @@ def limits(
 
 
 ROWS = 200
-"""Number of rows of a scene that its limit is the mean of."""
+"""Number of rows of a scene over which its limit is averaged."""
 COUPLED = "joint"
 """The estimator that sees a row together with its neighbours; the median filter sees as many rows."""
 LEAST_WRONG = 0.003
-"""Least share of the ideal's answers that must be more than 1 px off for a ratio: twenty of 200 rows x 32 draws."""
+"""Least share of the ideal estimator's answers more than 1 px off, for a ratio: twenty of 200 rows x 32 draws."""
 LOCAL_SDS = 3.0
 """Standard deviations of the bound that must fit into LOCAL_PX, so that nearly all right answers lie within it."""
 
@@ -198,11 +198,11 @@ class SceneLimits:
         return _beside(row, self._found[place, averaged][row.exposures])
 
     def _lights_of(self, config: RigConfig) -> Sequence[RowLight]:
-        # What the world leaves out must be too little for the most exposures.
+        # Effects that the world leaves out must be negligible for the largest number of exposures.
         scan = config.scan.model_copy(update={"exposures": max(self._exposures)})
         try:
             return scene_lights(config.model_copy(update={"scan": scan}), rows=ROWS)
-        except UsageError:  # a scene whose stripe is nowhere whole can still be scored
+        except UsageError:  # a scene without a whole stripe has no limit, but can be scored
             return ()
 
 
@@ -226,11 +226,11 @@ def _finite(value: float) -> float | None:
 
 
 NEWTON_STEPS: Final = 60
-"""Most steps to the best share t; bisection alone would get there."""
+"""Largest number of steps to the best share t; bisection alone would also get there."""
 GAP_EXACT: Final = 0.5
-"""Value of 1 minus a pixel's overlap below which it is summed from small parts, not as a difference."""
+"""If 1 minus a pixel's overlap is below this, it is summed from small parts, not computed as a difference."""
 SERIES_BELOW: Final = 0.05
-"""Logarithm of a ratio of chances below which a series replaces differences that cancel."""
+"""Logarithm of a ratio of probabilities below which a series replaces differences that cancel."""
 
 
 def chernoff_exponent(flux: Array, other: Array) -> Array:
@@ -240,12 +240,12 @@ def chernoff_exponent(flux: Array, other: Array) -> Array:
     """
     first, second = np.broadcast_arrays(np.maximum(flux, FLUX_MIN), np.maximum(other, FLUX_MIN))
     low, high = np.minimum(first, second), np.maximum(first, second)
-    # The brighter row's chances to fire and not to fire, over the darker one's: no difference of rounded numbers.
+    # Logarithms of the probabilities to fire and to stay dark, brighter over darker, without rounded differences.
     fired = np.log1p(-np.expm1(low - high) / np.expm1(np.minimum(low, 700.0)))
     dark = low - high
     sign = np.where(first >= second, 1.0, -1.0)
     t = _best_share(log_fired(second), -second, sign * fired, sign * dark)
-    # The exponent of the brighter of the two in each pixel.
+    # The power s of the brighter of the two in each pixel.
     share = np.where(sign > 0, t[..., None], 1.0 - t[..., None])
     return np.asarray(_overlap_exponent(low, high, fired, dark, share).sum(-1))
 
@@ -279,7 +279,8 @@ def _best_share(log_p: Array, log_q: Array, fired: Array, dark: Array) -> Array:
 def _overlap_exponent(low: Array, high: Array, fired: Array, dark: Array, share: Array) -> Array:
     """-log(p^s p'^(1-s) + q^s q'^(1-s)) of each pixel, p of the flux `high` and s its share; fired >= 0 >= dark.
 
-    1 minus the sum, p [(1 - s) expm1(-fired) - expm1(-(1 - s) fired)] and so for q, is exact however alike the two are.
+    1 minus the sum is computed as p [(1 - s) expm1(-fired) - expm1(-(1 - s) fired)] plus the same for q. This is exact
+    however similar the two rows are.
     """
     gap = -np.expm1(-high) * _convexity(1.0 - share, -fired) + np.exp(-low) * _convexity(share, dark)
     apart = np.logaddexp(log_fired(high) - (1.0 - share) * fired, share * dark - low)

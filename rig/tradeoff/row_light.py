@@ -1,6 +1,6 @@
 """The expected light of an image row, with everything known except the position of the stripe.
 
-`scene_lights` takes it from the world of a simulated scene, for `rig.tradeoff.limits`. No estimator ever gets it.
+`scene_lights` computes it from the world of a simulated scene, for `rig.tradeoff.limits`. No estimator ever gets it.
 """
 
 import math
@@ -32,8 +32,7 @@ PROFILE_SIGMAS: Final = 8.0
 class RowLight:
     """Expected light of one image row in photons per exposure, nearest pixel first; arrays (pixels,) float64.
 
-    before, behind: light of a pixel in front of the stripe, and of the same pixel behind it; each above 0 (dark
-      counts).
+    before, behind: light of each pixel if it lies before the stripe, and if it lies behind; above 0 (dark counts).
     strength: brightness of a stripe of the same reflectance at each pixel, in any unit.
     position: of the stripe, in pixels. stripe: its photons, summed across it. sigma_px: width of the Gaussian line.
     first, last: first and last pixel of the search, around the position.
@@ -49,7 +48,7 @@ class RowLight:
     last: float
 
     def flux(self, position: Array) -> Array:
-        """Expected light (positions, pixels) if the stripe were at these places."""
+        """Expected light (positions, pixels) if the stripe were at these positions."""
         pixel = np.arange(len(self.before), dtype=np.float64)
         away = pixel - np.asarray(position)[:, None]
         strength = np.interp(position, pixel, self.strength) / max(
@@ -78,16 +77,16 @@ def pixel_share(away_px: Array, sigma_px: float) -> Array:
 
 
 HAZE, STRIPE = "fog", "stripe"
-"""The effect whose light ends at the object, and the one that lies on it; others do not depend on the position."""
+"""Names of two effects: haze ends at the object, the stripe lies on it. Others do not depend on the position."""
 TRIES = 8
-"""Most rows looked at for each that is wanted: some have no stripe."""
+"""Largest number of draws of rows until enough have a stripe."""
 LEAST_STRIPE = 1e-4
-"""Photons per exposure below which a row counts as one without a stripe: none in ten thousand exposures."""
+"""Photons per exposure below which a row counts as one without a stripe: less than one in ten thousand exposures."""
 SPLIT_PX = 2.5
-"""Standard deviation along the row from which a stripe is taken to be split over a depth edge."""
+"""Standard deviation along the row above which a stripe counts as split over a depth edge."""
 LEAST_SIGMA_PX = 0.2
 CLEAR_SIGMAS = 4.0
-"""Standard deviations of the line, and 1 px more, that pixels lie before it where the haze is fitted."""
+"""The haze is fitted to pixels more than so many standard deviations of the line plus 1 px before the stripe."""
 
 
 def scene_lights(config: RigConfig, *, rows: int = 200, seed: int = 0) -> list[RowLight]:
@@ -176,7 +175,7 @@ def row_light(parts: Mapping[str, Array], geometry: SweepGeometry, row: int, col
 
 
 def _free_haze(path_m: Array, haze: Array, clear: NDArray[np.bool_]) -> tuple[Array, float]:
-    """Haze along the row as if there were no object, and its extinction per metre; 0 with too few clear pixels."""
+    """Haze along the row without the object, and its extinction per metre; both 0 with fewer than 3 clear pixels."""
     if clear.sum() < 3:
         return np.zeros(len(path_m)), 0.0
     slope, level = np.polyfit(path_m[clear], np.log(haze[clear]), 1)

@@ -1,4 +1,5 @@
-"""The rows of a trade-off: error and time of a setting, with a confidence interval, and whether another one beats it.
+"""The rows of a trade-off: error and time of a setting, with a confidence interval, and whether another setting is
+better.
 
 `score_map` makes the row of one map, `over_repeats` that of several, `with_fronts` marks the Pareto fronts.
 
@@ -27,10 +28,10 @@ Place = tuple[str, str | None]
 """Scene and fog."""
 
 MOST_MISSING = 0.05
-"""Most true stripes without an answer, as a share, with which a figure counts."""
+"""Largest share of true stripes without an answer with which a row's error is meaningful."""
 
 LOCAL_PX = 1.0
-"""Pixels of error within which an answer found the stripe; the errors of these are those of placing it."""
+"""Largest error, in px, of an answer that has found the stripe; what remains is the error of its position."""
 _SD_OF_MEDIAN = 1.4826
 """Standard deviation of a Gaussian over the median of its absolute values."""
 
@@ -58,7 +59,7 @@ class TrialSetting:
 class TradeoffRow:
     """A setting in one scene and fog, over all repeats: errors relative to the world's truth, and times.
 
-    fog: a visibility or 'clear'; None is as the scene says.
+    fog: a visibility or 'clear'; None for the scene's own fog.
     sensor_ms: of one map, with dark frames and fly-back.
     compute_ms: of a map after the first, with counting and everything else.
     mean_abs_px: over every (row, column) with a true stripe; a missing answer counts as `MISSING_PX`.
@@ -66,14 +67,15 @@ class TradeoffRow:
     depth_mm: mean depth error; None if no pixel has a depth.
     ci95: confidence interval of mean_abs_px, over repeats or else over blocks of the map.
     local_sd_px: standard deviation of the errors of answers within LOCAL_PX, from the median |error|; None without any.
-    pareto, pareto_compute: whether no other setting in the same scene and fog is at least as good in error and in time
-    (of sensor or computer) and better in one of them; False with too many answers missing.
+    pareto, pareto_compute: whether the row is on the Pareto front, where no other setting in the same scene and fog is
+    at least as good in error and in time (of sensor or computer) and better in one of them; False with too many answers
+    missing.
 
-    The other fields compare it with the statistical limit (`rig.tradeoff.limits`); each is None if that is not known.
+    The other fields compare the row with the statistical limit (`rig.tradeoff.limits`); each is None if not known.
     times_limit: mean_abs_px over the statistical limit.
     exponent_nats: Chernoff's exponent per exposure, of all rows that are seen together. times_wrong_limit: share of
       answers more than 1 px off over the ideal estimator's.
-    position_sd_px: Cramer-Rao's bound. times_position_limit: local_sd_px over that.
+    position_sd_px: Cramer-Rao's bound. times_position_limit: local_sd_px over this bound.
     """
 
     scene: str
@@ -100,7 +102,7 @@ class TradeoffRow:
 
     @property
     def counts(self) -> bool:
-        """Whether few enough answers are missing for its error to be meaningful."""
+        """Whether few enough answers are missing for the error to be meaningful."""
         return self.missing <= MOST_MISSING
 
     @property
@@ -164,7 +166,7 @@ def with_fronts(rows: Sequence[TradeoffRow]) -> tuple[TradeoffRow, ...]:
 
 
 def _fronts(rows: Sequence[TradeoffRow], of: Clock) -> set[int]:
-    """Indices of the rows that no other one in their scene and fog beats."""
+    """Indices of the rows that no other row in their scene and fog beats."""
     found: set[int] = set()
     best: dict[Place, float] = {}
     counting = [(row.time_ms(of), row.mean_abs_px, i) for i, row in enumerate(rows) if row.counts]

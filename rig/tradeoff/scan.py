@@ -1,8 +1,8 @@
 """One simulated scan that serves several estimators: its frames are kept, and every estimator makes its maps from them.
 
-Estimators learn from the first map. The frames of the last one are counted and estimated when the SPAD stands still, so
+Estimators learn from the first map. The frames of the last one are counted and estimated when the SPAD has stopped, so
 that times do not include the simulation, as on a rig whose frames are not computed by the same machine. Only the pixels
-that the plan uses are kept, as with a SPAD that sends windows. `score_methods` does it.
+that the plan uses are kept, as with a SPAD that sends windows. Begin reading at `score_methods`.
 """
 
 import statistics
@@ -34,9 +34,9 @@ from rig.tradeoff.rows import Place, TradeoffRow, TrialSetting, score_map
 MAPS = 2
 """Maps of a scan: estimators learn from the first one, the last one is scored."""
 TIMED_PASSES = 3
-"""Most passes over the last map, for the median of its time."""
+"""Largest number of passes over the last map; its time is their median."""
 LONG_S = 1.0
-"""Seconds after which no more passes are made."""
+"""Seconds after which no further pass begins."""
 MOST_KEPT_BYTES = 2_000_000_000
 """Most bytes of frames of one sweep in memory."""
 
@@ -54,7 +54,7 @@ class KeptSweep(FrameTally):
 
 
 class FrameKeeper:
-    """A `Counter` that keeps the frames of a sweep, as far as the plan uses their pixels."""
+    """A `Counter` that keeps the frames of a sweep, cut to the pixels that the plan uses."""
 
     def __init__(self, layout: SweepLayout) -> None:
         self._layout = layout
@@ -73,7 +73,7 @@ class FrameKeeper:
         self._blocks.append((self._used(bits, x0), bins.copy(), column.copy(), x0.copy()))
 
     def settle(self, under_way: int = 0) -> None:
-        """Do nothing, since `add` leaves nothing to be read later."""
+        """Do nothing, since `add` copies its frames."""
 
     def finish(self) -> KeptSweep:
         """The sweep with its frames."""
@@ -97,7 +97,7 @@ class FrameKeeper:
 
 
 class ManyMakers:
-    """Makes maps of several estimators and filters from the same frames; takes the place of a `Reconstructor`."""
+    """Makes maps of several estimators and filters from the same frames; used in place of a `Reconstructor`."""
 
     def __init__(self, makers: Mapping[str, Reconstructor], filters: Sequence[str]) -> None:
         self._makers = makers
@@ -118,12 +118,12 @@ class ManyMakers:
         self._maps += 1
         last = self._maps == MAPS
         names = list(self._makers)
-        if not last:  # there is nothing to learn for the others
+        if not last:  # the others have nothing to learn
             names = [name for name in names if name in LEARNING] or names[:1]
         for name in names:
             made = self._timed(name, sweep, TIMED_PASSES if last else 1)
             self.results |= {(name, filter): each for filter, each in made.items()} if last else {}
-        sweep.blocks.clear()  # the next sweep's frames need the room
+        sweep.blocks.clear()  # the next sweep's frames need the memory
         return next(iter(made.values()))[0]
 
     def _timed(self, name: str, sweep: KeptSweep, passes: int) -> dict[str, tuple[MapResult, float]]:
@@ -157,7 +157,7 @@ def score_methods(
 ) -> list[TradeoffRow]:
     """Scan once with a simulated rig and score the map that each estimator and filter makes from the same frames.
 
-    tell: called with the share of the frames that have been taken.
+    tell: called with the share of the frames that are done.
     """
     with open_rig(config, seed=seed) as rig:
         assert rig.world is not None, "only simulated rigs are tried"

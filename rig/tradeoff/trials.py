@@ -19,7 +19,7 @@ from rig.tradeoff.scan import MAPS, require_plan, score_methods
 
 
 class Trial(NamedTuple):
-    """One scan to try. scene, lines: None is as the config says. fog: None is as the scene says."""
+    """One scan to try. scene, lines: None for the config's own. fog: None for the scene's own."""
 
     scene: str | None
     fog: str | None
@@ -33,7 +33,7 @@ class Trial(NamedTuple):
 
 
 Trials = Mapping[Trial, RigConfig]
-"""Every trial once, with its config; its repeats are scans of their own."""
+"""Each trial with its config. A trial is scanned as often as repeats are requested."""
 
 
 def trials_of(config: Config, asked: TradeoffRequest) -> Trials:
@@ -54,11 +54,11 @@ def trials_of(config: Config, asked: TradeoffRequest) -> Trials:
 class Tradeoff:
     """Result of a trade-off: the rows of all settings.
 
-    ci95_by: what the intervals are over.
-    answer: the setting to use, if one was asked for and any counts.
+    ci95_by: whether confidence intervals come from repeats or from blocks of a map.
+    answer: the setting to use; None without a wish, or if each setting has too many missing answers.
     verdict: 'aborted' if an interrupt ended it; the rows are then those that were complete.
     folder: where everything was written; None if nothing was.
-    accepted_calibration: reasons in spite of which the calibration was used.
+    accepted_calibration: reasons to refuse the calibration, which was used all the same.
     """
 
     rows: tuple[TradeoffRow, ...]
@@ -94,9 +94,9 @@ def run_tradeoff(
 ) -> Tradeoff:
     """Scan and score all trials, with at least one estimator and filter.
 
-    progress: called with the number of frames done and the total, counting those on columns.
+    progress: called with the number of frames done and the total, both of frames on columns.
 
-    An interrupt ends it after the last complete row; before there is one it is raised.
+    An interrupt ends the trade-off after the last complete row; before the first complete row it is raised again.
     """
     rows: list[TradeoffRow] = []
     verdict: Literal["complete", "aborted"] = "complete"

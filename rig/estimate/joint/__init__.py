@@ -1,6 +1,6 @@
 """The estimator `joint`: the likelihood of every row, tied to its neighbours in rows and columns.
 
 Order of work: `labels` gives every candidate position of a row and column a cost in bytes; `paths` and `winner` pick
-the cheapest positions along rows and columns; `vote` corrects weak answers and `place` moves answers to sub-pixel
-positions; `confidence` judges them by their neighbours; `lesson` and `halo` learn from them for the next map.
+the cheapest positions along rows and columns; `vote` corrects weak answers and `place` refines answers to sub-pixel
+positions; `confidence` judges answers by their neighbours; `lesson` and `halo` learn from them for the next map.
 """

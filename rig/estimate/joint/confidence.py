@@ -3,22 +3,22 @@ stripe.
 
 Three things can be wrong with an answer, and each has its factor:
 
-    confidence = erf(1 / (sqrt 2 WIDER sd))                    the stripe is farther off than it should be
+    confidence = erf(1 / (sqrt 2 WIDER sd))                    the stripe is more than a pixel off
                / (1 + exp(A - B margin + G apart))             another position is the right one
                / (1 + exp(C - D ln contrast' + hole            there is no stripe: haze ends, nothing shines
                           + g (E - F ln odds) + H ((1 - g)^2 missing + e unseen)))
 
-- margin: how much worse the next best place is or, after a vote, how much neighbours favour this one, in cost over
+- margin: how much more the next best position costs or, after a vote, how much neighbours favour this one, in cost over
   UNITS. apart: share of the pairs of opposite neighbours that put the answer elsewhere (`apart_row`).
-- contrast: light that 3 x 3 neighbours on the surface have in common above the *whole* haze before the stripe, over its
-  noise; contrast' = max(contrast + 3, 1). If haze merely ends, an answer can lie a little before the end, and half of
-  the haze would be taken for light. hole: by how much contrast is below -FAR_BELOW, 30 at most.
-- odds: ratio of answers around that agree to those that do not. They count in proportion to the haze, g = k / (k +
-  SOME_HAZE) with k photons of it in all exposures. In clear air only a stripe gives a margin, and small things, whose
-  surroundings do not agree, are as certain as others.
-- missing: max(ln((1 + bright) / (1 + light)) - DARKER - CLEARLY max(contrast, 0), 0), with light: photons of all pixels
-  in the contrast, bright: photons for the model's largest amplitude. If even a dark stripe would be visible, the
-  absence of light means that there is no stripe, which light over its noise cannot show.
+- contrast: mean light of the 3 x 3 neighbours on the surface above the *whole* haze before the stripe, over the noise
+  of this mean; contrast' = max(contrast + 3, 1). The whole haze, because an answer can lie a little before the end of
+  haze, and half of the haze would then be taken for light. hole: by how much contrast is below -FAR_BELOW, 30 at most.
+- odds: ratio of answers around that agree to those that do not. Odds count the more, the more haze there is, by the
+  factor g = k / (k + SOME_HAZE) with k photons of haze per pixel in all exposures. In clear air only a stripe gives a
+  margin, and small things, whose surroundings do not agree, are as certain as others.
+- missing: max(ln((1 + bright) / (1 + light)) - DARKER - CLEARLY max(contrast, 0), 0), with light: photons of the
+  neighbours in the contrast, bright: photons that they would have at the model's largest amplitude. If even a dark
+  stripe would be visible, missing light means that there is no stripe. The contrast cannot show this.
 - unseen: max(AT_END - CLEARLY max(contrast, 0), 0), with e = 1 up to 1 px from the far end of the depth range and 0
   from 3 px on. Haze that continues beyond the range seems to end there, so evenly that answers agree; a stripe so far
   away must be seen by its own light.
@@ -26,15 +26,15 @@ Three things can be wrong with an answer, and each has its factor:
 Agreement distinguishes a surface from nothing at all. Without a stripe every row finds the place where its noise looks
 most like one, and four paths tie those answers into streaks but not into surfaces. Each answer has a number of 5 x 5
 neighbours on the same surface (`count_neighbours`); odds come from the sum of these numbers over 7 x 7 answers
-(`agreement_row`). Thin and slanted things have few such neighbours, but a wrong answer is usually not where those
-opposite each other put it.
+(`agreement_row`). Thin and slanted things have few such neighbours. But there too, a wrong answer is usually not at the
+mean of opposite neighbours (`apart_row`).
 
 Arrays are float32 (rows, columns), numbers of neighbours int16. Source of the constants: WIDER, B, C, D, E and F are
 fitted by maximum likelihood to random cluttered scenes of a second simulator, K = 1 to 30 in air and fog, with all
-answers counted. A and G are chosen on random scenes of the tests' simulator, since fitted values trust stripes too
-little where haze is not in question. H, DARKER, CLEARLY and AT_END are chosen by the likelihood of random scenes that
-are partly open to the sky (`tests.reference.tables.open_scenes`); larger values take too much from dim stripes in clear
-air.
+answers counted. A and G are chosen on random scenes of the tests' simulator, since fitted values would make stripes
+without haze too uncertain. H, DARKER, CLEARLY and AT_END are chosen by the likelihood of random scenes that are partly
+open to the sky (`tests.reference.tables.open_scenes`); larger values lower the confidence of dim stripes in clear air
+too much.
 """
 
 import math
@@ -62,13 +62,13 @@ AROUND: Final = 3
 OPPOSITE: Final = 2, 4
 """Rows and columns to the neighbours that lie opposite each other."""
 ASKED: Final = 4 * len(OPPOSITE)
-"""Pairs of opposite neighbours: along rows, columns and both diagonals."""
+"""Number of pairs of opposite neighbours: along rows, columns and both diagonals."""
 _ANYWHERE: Final = np.float32(1e6)
-"""Pixels: more than any two answers are apart."""
+"""In px: larger than the distance of any two answers."""
 
 
 class Neighbours(NamedTuple):
-    """Number of neighbours on the surface of each answer, and number of pairs that can be compared.
+    """For each answer, the number of neighbours on its surface, and the number of pairs that could agree.
 
     number: int16 (rows, columns) with a margin of AROUND rows and LANES columns that holds 0. pairs: of `pairs_to_ask`.
     """
@@ -84,25 +84,25 @@ def new_neighbours(pairs: Float32) -> Neighbours:
 
 
 def pairs_to_ask(there: Bools) -> Float32:
-    """Number of pairs of neighbours around each place (rows, columns) that both exist; at least 1.
+    """Number of pairs around each answer that could agree (`agreement_row`), at least 1: (rows, columns).
 
-    there: whether a place is searched and has frames; other places do not count.
+    there: whether an answer is searched and has frames; others are in no pair.
     """
     weight = there.astype(np.float32)
     return np.maximum(_around(weight * _around(weight, NEIGHBOURS), AROUND), np.float32(1))
 
 
 def _around(number: Float32, reach: int) -> Float32:
-    """Sums of whole numbers over so many rows and columns to either side, 0 beyond."""
+    """Sums of whole numbers over `reach` rows and columns to either side, with 0 beyond the array."""
     side = 2 * reach + 1
     return np.asarray(cv2.boxFilter(number, -1, (side, side), normalize=False, borderType=cv2.BORDER_CONSTANT))
 
 
 @numba.njit(cache=True, nogil=True)
 def count_neighbours(distance: Float32, first_row: int, last_row: int, out: Neighbours) -> None:
-    """Fill the numbers of rows first_row..last_row-1.
+    """Fill `Neighbours.number` of rows first_row..last_row-1.
 
-    distance: (rows, columns), of answers from the far end in px, NaN if there is none.
+    distance: (rows, columns), of answers from the far end in px, NaN where there is no answer.
     """
     for band in range(first_row, last_row, COPIED_ROWS):
         end = min(band + COPIED_ROWS, last_row)
@@ -113,7 +113,10 @@ def count_neighbours(distance: Float32, first_row: int, last_row: int, out: Neig
 
 @numba.njit(cache=True, nogil=True)
 def _count_row(distance: Float32, row: int, number: Int16) -> None:
-    """Count the neighbours in a row of a copy `with_margin`."""
+    """Write, for each answer of a row, how many of the 5 x 5 answers around it, itself included, lie on its surface.
+
+    distance: a copy `with_margin`; row: of the copy.
+    """
     width, at, one = distance.shape[1], address_of(distance), zero_float32() + np.float32(1.0)
     for c in range(0, width - 2 * LANES, LANES):
         here = row * width + LANES + c
@@ -127,7 +130,8 @@ def _count_row(distance: Float32, row: int, number: Int16) -> None:
 
 @numba.njit(cache=True, nogil=True)
 def agreement_row(number: Int16, y: int, line: Int16, out: Float32) -> None:
-    """Write the number of pairs that agree around each answer of row y.
+    """Write, for each answer of row y, the number of pairs that agree: an answer of the 7 x 7 around and a neighbour on
+    its surface.
 
     number: as in `Neighbours`; line: working memory of the same width, whose margins are 0.
     """
@@ -187,18 +191,18 @@ E: Final = 5.871
 F: Final = 2.585
 H: Final = 4.0
 DARKER: Final = 2.0
-"""Natural logarithm of how much less light than a bright stripe a dark one may bring."""
+"""Natural logarithm of the ratio of a bright stripe's light to that of a dark one."""
 CLEARLY: Final = 1.2
-"""By how much one standard deviation of light above its noise lessens `missing` and `unseen`."""
+"""Decrease of `missing` and `unseen` per unit of contrast."""
 AT_END: Final = 3.0
 """`unseen` of an answer without any light."""
 NEAR_END_PX: Final = 1.0, 3.0
 SOME_HAZE: Final = 0.05
-"""Photons of haze per pixel, over all exposures, from which on its end can be taken for a stripe."""
+"""Photons of haze per pixel, over all exposures, at which odds count half."""
 FAR_BELOW: Final = 6.0
-"""Standard deviations below the haze from which on no agreement around makes up for a hole where light should be."""
+"""A contrast below minus this is a hole where light should be, whatever the answers around."""
 _HALF_PX: Final = LIGHT_PX + 0.5
-"""Half the pixels that a stripe's light is summed over."""
+"""Half the number of pixels over which a stripe's light is summed."""
 _LEAST_ODDS: Final = 1e-3
 _MOST_AGREE: Final = 1.02
 """Odds of agreement stay between 0.001 and 50."""
@@ -230,7 +234,7 @@ def confidences(
     # Local names: each use of the tuple itself in the loop would count references to all of its arrays.
     scales, lights, hazes, rests = places.scale, places.light, places.haze, places.rest
     number, margins, columns = neighbours.number, answer.margin, x_px.shape[1]
-    # An odd number of cache lines: one line of numbers after the other does not push the others out of the cache.
+    # An odd number of cache lines per row of `lines`, so that its rows do not displace one another in the cache.
     width = (-(-columns // LANES) | 1) * LANES
     lines, pairs = np.zeros((_LINES, width), np.float32), np.zeros(number.shape[1], np.int16)
     at = address_of(lines)
@@ -269,7 +273,7 @@ def confidences(
 
 @numba.njit(cache=True, nogil=True)
 def _judge(at: int, width: int, bright: Brightness) -> None:
-    """Fill the confidence of a line of stripes, and cut their light."""
+    """Fill the confidence of a row's answers, and limit their light to the model's amplitudes."""
     one, none = zero_float32() + 1.0, zero_float32()
     for c in range(0, width, LANES):
         scale, light = load_float32(at, _SCALE * width + c), load_float32(at, _LIGHT * width + c)
@@ -295,14 +299,14 @@ def _judge(at: int, width: int, bright: Brightness) -> None:
 
 @numba.njit(forceinline=True)
 def _ending(at, width, c):  # type: ignore[no-untyped-def]
-    """Haze that ends at a stripe: what is before it less what is behind."""
+    """Haze that ends at a stripe: haze before it less that behind it."""
     ends = load_float32(at, _HAZE * width + c) - load_float32(at, _REST * width + c)
     return larger_float(ends, zero_float32())
 
 
 @numba.njit(forceinline=True)
 def _number(at, width, c):  # type: ignore[no-untyped-def]
-    """Number of 3 x 3 answers on the surface, this one counted."""
+    """Number of 3 x 3 answers on the surface, this one included."""
     return larger_float(load_float32(at, _LIT * width + c), zero_float32() + 1.0)
 
 
@@ -314,7 +318,7 @@ def _above_haze(at, width, c):  # type: ignore[no-untyped-def]
 
 @numba.njit(forceinline=True)
 def _unlit(at, width, c, shines, clear, brightest):  # type: ignore[no-untyped-def]
-    """Light that a stripe would bring and that is not there: in clear air, and at the far end of the depth range."""
+    """(1 - g)^2 missing + e unseen, as in the module. shines: CLEARLY max(contrast, 0); clear: 1 - g."""
     one, none = zero_float32() + 1.0, zero_float32()
     exposures, number = load_float32(at, _FRAMES * width + c), _number(at, width, c)
     light, most = _above_haze(at, width, c), load_float32(at, _SCALE * width + c) * brightest * number
@@ -328,7 +332,7 @@ def _unlit(at, width, c, shines, clear, brightest):  # type: ignore[no-untyped-d
 
 @numba.njit(forceinline=True)
 def _contrast(at, width, c, ambient):  # type: ignore[no-untyped-def]
-    """Light that stripes share with neighbours above the whole haze before them, over its noise."""
+    """Contrast, as in the module."""
     one, none = zero_float32() + 1.0, zero_float32()
     haze, rest = load_float32(at, _HAZE * width + c), load_float32(at, _REST * width + c)
     number, exposures = _number(at, width, c), load_float32(at, _FRAMES * width + c)

@@ -1,16 +1,16 @@
 """Learns haze and halo from the stripes of a sweep: the light of each stripe first, then one linear fit.
 
 The light of stripes (`likeliest_light`). A halo is measured by the light beside a stripe, relative to the stripe's own
-light. The light of `rig.estimate.joint.place.light` adds up each pixel's own flux, which is limited when pixels
+light. The light from `rig.estimate.joint.place.light` is the sum of the pixels' fluxes, which is limited when pixels
 saturate; bright stripes would be taken for dimmer ones with a stronger halo. Here the counts n of K frames of all
 pixels around a stripe and around its 5 x 5 neighbours on the same surface are explained by one amplitude a,
 
     flux = base + a scale (share + glow),   log-likelihood = sum n log(1 - exp(-flux)) - (K - n) flux
 
-with haze and ambient light as base. This is concave in a, and its slope is convex, so Newton's steps start from below.
-Saturated pixels give no information, those beside them do. If the amplitude is hardly more than its noise, or
-neighbours do not agree on it, the light of a stripe is unknown and the stripe is not used. Nor is one that brings 2
-photons or more to a pixel.
+with haze and ambient light as base. The log-likelihood is concave in a and its slope convex, so Newton's method
+converges from an amplitude that is too small. Saturated pixels give no information, those beside them do. If the
+amplitude is hardly more than its noise, or neighbours do not agree on it, the light of a stripe is unknown and the
+stripe is not used. Nor is a stripe with 2 photons per exposure or more in one pixel.
 
 The fit (`add_equations`, `solve`). The counts beside a stripe of s photons, at the distance d along the row, show
 
@@ -19,9 +19,9 @@ The fit (`add_equations`, `solve`). The counts beside a stripe of s photons, at 
 
 with w the path inverse depth, and G and rho as in `rig.estimate.row.inputs`. Behind stripes the haze is the model's. So
 the flux is linear in haze (BINS), share (HALO_NODES), halo (HALO_NODES, reaches) and offset. One weighted least squares
-fit (float64, no number negative) separates them, since the halo follows the brightness of each stripe and the haze does
-not. Means over the pixels behind and before stripes could not do that. Later maps are tested for whether a halo is
-still there, or has appeared.
+fit (float64, no number negative but the offset, which is 0 if there are dark frames) separates them, since the halo
+follows the brightness of each stripe and the haze does not. Means over the pixels behind and before stripes could not
+do that. Later maps are tested for whether a halo has appeared or vanished.
 """
 
 import math
@@ -62,7 +62,7 @@ LINE_PX: Final = 4.5
 _REACHES: Final = np.array(HALO_REACHES_PX)
 SETTLED: Final = 1e-6
 MOST_SWEEPS: Final = 3000
-"""`solve` stops when no number's step lowers the misfit by SETTLED, or after so many times through all numbers."""
+"""`solve` stops when no number's step lowers the misfit by SETTLED, or after MOST_SWEEPS passes through all numbers."""
 
 
 @numba.njit(cache=True, nogil=True)
@@ -72,9 +72,9 @@ def add_equations(
 ) -> None:  # fmt: skip
     """Add the normal equations of lines first_line..last_line-1, weighted by the counts that the present state expects.
 
-    Unknowns: haze in each profile bin; its share behind the stripe at each node; halo at each node and reach; ambient
-    light missing in the state. halo: (BINS, pixels) of `halo_shares`; light: of each line's stripe at its x_px,
-    photons. Only the lower triangle of the matrix is filled.
+    Unknowns: haze in each profile bin; its share behind the stripe at each node; halo at each node and reach; offset of
+    the ambient light. halo: (BINS, pixels) of `halo_shares`; light: of each line's stripe at its x_px, photons. Only
+    the lower triangle of the matrix is filled.
     """
     bins, number = state.profile.shape[0], len(_REACHES)
     first_share, first_halo, last = bins, bins + HALO_NODES, matrix.shape[0] - 1
@@ -102,7 +102,7 @@ def add_equations(
             dark = np.exp(-max(expected, LEAST_FLUX))
             weight = frames * dark / (1.0 - dark)
             n = np.float64(lines.counts[i, start + side * t - sweep.x0[c]])
-            # The flux that would make these counts the expected ones, near the present state.
+            # The flux at which these counts would be expected, linearised at the present state.
             flux = (n / frames - 1.0 + dark) / dark - np.log(dark) - ambient - row.others[t]
             if before:
                 index[0], value[0], used = cell, gain, 1
@@ -128,7 +128,7 @@ def add_equations(
 
 @numba.njit(cache=True, nogil=True)
 def solve(matrix: Float64, right: Float64, free: int) -> Float64:
-    """The x that minimises x' matrix x - 2 right' x with no number but number `free` below 0, by coordinate descent."""
+    """The x that minimises x' matrix x - 2 right' x, by coordinate descent. Only x[free] may be negative."""
     x, slope = np.zeros_like(right), -right
     for _ in range(MOST_SWEEPS):
         largest = 0.0
@@ -148,13 +148,13 @@ def solve(matrix: Float64, right: Float64, free: int) -> Float64:
 
 
 REACH: Final = 2
-"""Rows and columns to either side whose stripes are asked for the light of one."""
+"""Rows and columns to either side whose stripes on the same surface help to find the light of a stripe."""
 LEAST_ASKED: Final = 10
-"""Fewest stripes, of 25, that must lie on its surface for the light of one to be known."""
+"""Least number of stripes on the same surface, of 25 with the stripe itself, with which its light is known."""
 LEAST_SURE: Final = 4.0
-"""Light must be more than this many standard deviations of its noise to be known."""
+"""The light is known only if it exceeds this many standard deviations of its noise."""
 DISAGREED: Final = 3.0
-"""Standard deviations by which the stripes' misfit may exceed what chance brings. Of answers that pass these limits
+"""Standard deviations by which the stripes' misfit may exceed its expected value. Of answers that pass these limits
 less than 1 % are no stripes (random scenes at five exposures)."""
 MOST_STEPS: Final = 8
 MOST_GROWTH: Final = 4.0
@@ -194,9 +194,9 @@ def likeliest_light(
 
 @numba.njit(cache=True, nogil=True, error_model="numpy")
 def _ask(counts, n_frames, sweep, state, shares, x_px, places, y, c, a):  # type: ignore[no-untyped-def]
-    """Slope of the log-likelihood in the amplitude and how fast it falls; misfit of the stripes, and their number.
+    """Slope of the log-likelihood over the amplitude, the decrease of this slope, misfit of the stripes, their number.
 
-    The misfit is the sum of each stripe's own slope squared, over its variance: as large as the number by chance.
+    The misfit is the sum of each stripe's own slope squared, over its variance; its expected value is the number.
     """
     side, pixels = 1 if sweep.near_is_left else -1, sweep.u.shape[1]
     score, information, misfit, asked = 0.0, 0.0, 0.0, 0
@@ -216,7 +216,7 @@ def _ask(counts, n_frames, sweep, state, shares, x_px, places, y, c, a):  # type
                 ambient = np.float64(state.ambient[v, t])
                 if ambient >= BLIND_FLUX:
                     continue
-                # The pixel that holds the centre is in haze on its near part only.
+                # The pixel that holds the stripe's centre is in haze on its near part only.
                 lit = (part if side > 0 else 1.0 - part) if d == 0 else 1.0 if d * side < 0 else 0.0
                 base = ambient + lit * places.haze[v, q] + (1.0 - lit) * places.rest[v, q]
                 slope = places.scale[v, q] * np.float64(shares[fraction, 0, d + REACH_PX] + places.glow[v, q])
@@ -234,29 +234,29 @@ def _ask(counts, n_frames, sweep, state, shares, x_px, places, y, c, a):  # type
 
 
 CLEAR: Final = np.float32(0.5)
-"""Stripes of more confidence than this teach."""
+"""A stripe is clear if its confidence exceeds this."""
 MOST_PEAK: Final = 2.0
-"""Photons per exposure in one pixel from which on a stripe is not used, since only its flanks tell its light: a line a
-little wider than thought would be taken for a dimmer stripe with a stronger halo."""
+"""Photons per exposure in one pixel from which on a stripe is not used. Its light would be known from its flanks only,
+and with a line a little wider than learned it would be taken for a dimmer stripe with a stronger halo."""
 DETECT_LINES: Final = AGAIN_LINES // 4
-"""Number of clear stripes that tell whether there is a halo."""
+"""Number of clear stripes with which a map is tested for a halo."""
 MEASURE_LINES: Final = 4 * AGAIN_LINES
-"""Number of clear stripes that measure it, once the first map has one."""
+"""Number of clear stripes with which the halo is measured, once the first map has one."""
 FEWEST_LIGHTS: Final = 64
-"""Stripes of known light without which a later map says nothing about a halo."""
+"""Least number of stripes of known light with which a later map is tested for a halo."""
 LEAST_EVIDENCE, LEAST_PER_EXPOSURE = 30.0, 0.02
-"""Least chi squared that a halo must take off the fit, altogether and per exposure of the stripes. Noise takes off 2 to
-10 altogether. The wings of a line that moves or is not sharp take off 0.01 per exposure, fog of optical depth 0.2 takes
-off 0.02 to 0.05, of 1 more than 0.15."""
+"""Least reduction of the fit's chi squared by a halo, altogether and per exposure of the stripes. Noise reduces it by 2
+to 10 altogether. The wings of a line that moves or is not sharp reduce it by 0.01 per exposure, fog of optical depth
+0.2 by 0.02 to 0.05, of 1 by more than 0.15."""
 SMOOTH_HAZE, SMOOTH_SHARE, SMOOTH_HALO, SMALL_HALO = 3e4, 300.0, 3.0, 0.1
-"""Factors on the squares of bends of the haze, steps of its share behind the stripe, steps of the halo and the halo
-itself, which are added to the misfit. They decide only where there are no data."""
+"""Factors on squares that are added to the misfit: of second differences of the haze, of steps of its share behind the
+stripe, of steps of the halo, and of the halo itself. They decide only where there are no data."""
 _SHARE, _HALO = BINS, BINS + HALO_NODES
 _SIZE = _HALO + HALO_NODES * len(HALO_REACHES_PX) + 1
 
 
 class BrightLines(NamedTuple):
-    """Lines with a clear stripe, from which a halo can be learned, and the light of each stripe in photons."""
+    """Lines with a clear stripe of known light, from which a halo can be learned, and this light in photons."""
 
     lines: Lines
     light: Float32
@@ -266,7 +266,7 @@ def bright_lines(
     volume: CountVolume, tables: JointTables, stripes: StripeTable, places: Places, workers: RowWorkers,
     number: int = DETECT_LINES,
 ) -> BrightLines:  # fmt: skip
-    """Lines of a map whose light is known, out of about `number` with a clear stripe, evenly spread.
+    """Lines of a map with a stripe of known light, out of about `number` with a clear stripe, evenly spread.
 
     tables: those that the map was made with; places: of its stripes.
     """
@@ -284,7 +284,7 @@ def learn_first_halo(
     volume: CountVolume, geometry: SweepGeometry, model: RowModel, ambient: Float32, tables: JointTables,
     stripes: StripeTable, places: Places, workers: RowWorkers,
 ) -> RowModel:  # fmt: skip
-    """The first map's model with the halo of `learn_halo`. Call this again with the map that is made with that model.
+    """The first map's model with the halo of `learn_halo`. Call it again with the map that is made with the new model.
 
     With several lines at once the model stays as it is, since the other lines' haze would be taken for a halo.
     """
@@ -316,8 +316,8 @@ def learn_halo(
 ) -> RowModel:
     """The model with the halo that these stripes show, and the haze under it; without a halo if they show none.
 
-    The scale of stripes stays that of the model, on which their light is based. ambient: of each pixel, (rows, width),
-    the start value of the fit. dark: whether there are dark frames.
+    The scale of stripes is kept, since their light is based on it. ambient: of each pixel, (rows, width), the start
+    value of the fit. dark: whether there are dark frames.
     """
     matrix, right = _equations(seen, geometry, replace(model, ambient=ambient), workers)
     free = -1 if dark else _SIZE - 1

@@ -1,14 +1,14 @@
 """Estimator `joint`: the row likelihood tied across rows and columns, for a whole map at a time.
 
 Each label (candidate position) of a row and column (`rig.estimate.joint.labels.grid`) gets a cost from the counts
-(`rig.estimate.joint.labels.costs`, a fast form of `rig.estimate.row.likelihood`). It includes the halo, if there is one
-(`rig.estimate.joint.labels.halo_rows`), and the previous map, if requested (`rig.estimate.joint.temporal`). Under a
-halo it is averaged with a cost that knows no medium (`rig.estimate.joint.labels.contrast`). Costs are tied to those of
-the neighbours along four paths (`rig.estimate.joint.paths`); weak answers are decided by a vote of all neighbours
-(`rig.estimate.joint.vote`). The best label of each row and column is placed between labels with the help of neighbours
-on its surface (`rig.estimate.joint.place.place`) and judged (`rig.estimate.joint.confidence`). Each row is searched for
-a second line (`rig.estimate.joint.second_returns`). The model of light and medium is learned row by row first, as by
-`likelihood`, then from the map's own stripes.
+(`rig.estimate.joint.labels.costs`, a fast form of `rig.estimate.row.likelihood`). The cost includes the halo, if there
+is one (`rig.estimate.joint.labels.halo_rows`), and the previous map, if requested (`rig.estimate.joint.temporal`).
+Under a halo it is averaged with a second cost that needs no model of the medium (`rig.estimate.joint.labels.contrast`).
+Costs are tied to those of the neighbours along four paths (`rig.estimate.joint.paths`); weak answers are decided by a
+vote of all neighbours (`rig.estimate.joint.vote`). The answer of each row and column is then refined to a position
+between labels, with the help of neighbours on its surface (`rig.estimate.joint.place.place`), and gets a confidence
+(`rig.estimate.joint.confidence`). Each row is searched for a second line (`rig.estimate.joint.second_returns`). The
+model of light and medium is learned row by row first, as by `likelihood`, then from the map's own stripes.
 """
 
 from dataclasses import replace
@@ -41,15 +41,15 @@ from rig.simd.memory import pointers
 from rig.threads import RowWorkers
 
 LESSONS = 2
-"""Times that the first map's stripes teach the model with which they are then estimated again."""
+"""Number of times that the first map's stripes are estimated and the model is learned again from them."""
 HALO_LESSONS = 4
-"""Times that they do so under a halo."""
+"""Number of these lessons under a halo."""
 AGREE_PX = np.float32(1.0)
-"""Under a halo a stripe of the first map teaches only if its surroundings alone put it within so many pixels."""
+"""Under a halo, a stripe of the first map is learned from only if its contrast alone puts it within so many pixels."""
 TRUSTED = np.float32(0.5)
-"""Trust from which on a stripe's brightness counts for the model under a halo."""
+"""Under a halo, the amplitudes are learned only from stripes of more trust than this."""
 QUIET_COLUMNS = 8
-"""One column in so many teaches the ambient light if dark frames teach it too."""
+"""If there are dark frames, one column in so many is also used to learn the ambient light; else every column."""
 
 
 class Joint:
@@ -83,7 +83,7 @@ class Joint:
         self._lessons.model = model if model.before is None else replace(model, before=None)
 
     def counter(self, layout: SweepLayout, geometry: SweepGeometry) -> Counter:
-        """A counter whose sweeps `estimate` takes. geometry: the nominal one, which holds for every sweep.
+        """A counter whose finished sweeps go to `estimate`. geometry: the nominal one, which holds for every sweep.
 
         Raises UsageError if its maps would take too much memory, before any light is let out.
         """
@@ -103,7 +103,7 @@ class Joint:
         )
         stripes = replace(first, x2_px=x2_px, confidence2=confidence2)
         self._prior.leave(stripes, tables.grid)
-        # The trust of its lessons says whether the first map has taught anything.
+        # Whether the first map is good enough to learn from is judged by the trust of its lessons.
         known = self._lessons.model is not None
         judged = stripes if known else self._teaching(sweep, tables, stripes)
         self._lessons.attend(
@@ -112,14 +112,14 @@ class Joint:
         return stripes
 
     def _first_model(self, volume: CountVolume, geometry: SweepGeometry) -> RowModel:
-        """The model learned from the first sweep: row by row, then from stripes, which all rows together show."""
-        self._prior.recall(None)  # forget maps that taught nothing
+        """The model learned from the first sweep: row by row, then from the stripes of the whole map."""
+        self._prior.recall(None)  # forget maps from which nothing was learned
         model = start = first_model(volume, geometry, self._workers)
         witness_px, lessons, intensity = None, 0, volume.intensity()
         while lessons < (LESSONS if witness_px is None else HALO_LESSONS):
             model, lessons = self._taught(volume, intensity, geometry, model, witness_px), lessons + 1
             if witness_px is None and model.halo.any():
-                # Light scattered many times has misled these lessons: begin again, with contrast as a second teacher.
+                # Light scattered many times has misled these lessons: begin again, and check stripes by contrast.
                 witness_px, model, lessons = self._by_contrast(volume, geometry, model), start, 0
         return model
 
@@ -127,9 +127,9 @@ class Joint:
         self, volume: CountVolume, intensity: NDArray[np.uint32], geometry: SweepGeometry, model: RowModel,
         witness_px: Float32 | None,
     ) -> RowModel:  # fmt: skip
-        """The model that stripes estimated with `model` teach.
+        """The model learned from stripes that are estimated with `model`.
 
-        intensity: of the volume. witness_px: x_px of `_by_contrast`, which the stripes must confirm.
+        intensity: of the volume. witness_px: x_px of `_by_contrast`, from which the stripes must not differ.
         """
         setting = LearningSetting(model, geometry, volume.exposures, volume.dark_counts is not None)
         tables = tables_of(setting, self._workers, contrast=witness_px is not None)
@@ -162,7 +162,7 @@ class Joint:
         return x_px
 
     def _teaching(self, volume: CountVolume, tables: JointTables, stripes: StripeTable) -> StripeTable:
-        """The table with, instead of confidence, the trust that the first map's lessons put into each answer."""
+        """The table with the trust of the first map's lessons (`fill_trust`) in place of the confidence."""
         memory, trust = self._room(tables.grid), np.empty_like(stripes.confidence)
         self._workers.over(
             len(trust),
@@ -176,14 +176,14 @@ class Joint:
     def _read(self, volume: CountVolume, tables: JointTables, x_px: Float32, *, alone: bool = False) -> None:
         """Fill x_px (rows, columns) with the positions of the best labels, and the answers in memory.
 
-        The last step is only queued. alone: whether labels are costed by their surroundings only.
+        The last step is only queued. alone: whether costs are those of contrast alone.
         """
         grid, workers = tables.grid, self._workers
         rows, columns = x_px.shape
         memory = self._room(grid)
 
         def tie_rows(first: int, last: int) -> None:
-            # Rows that share tables: those are fetched once, and costs are tied along rows while the cache has them.
+            # Band by band: rows of a band share tables, and their costs are tied while they are still in the cache.
             if first not in tables.rooms:
                 room = tables.costs.room()
                 tables.rooms[first] = room, pointers(room)
@@ -215,7 +215,7 @@ class Joint:
         if neighbours:
             workers.post(columns, lambda first, last: collect(memory.answer, first, last, memory.ballots))
         workers.settle()
-        workers.post(rows, read)  # what is placed next is of the same rows
+        workers.post(rows, read)  # without waiting: each thread goes on with the same rows
 
     def _stripes(self, volume: CountVolume, tables: JointTables, *, lesson: bool = False) -> StripeTable:
         grid, workers, memory = tables.grid, self._workers, self._room(tables.grid)

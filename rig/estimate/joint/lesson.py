@@ -6,14 +6,14 @@ The trust of the first map's lessons in an answer (`fill_trust`, float32 (rows, 
     trust = erf(3 px / (sqrt 2 sd)) / (1 + exp(A - B margin)) / (1 + C z^-D)
 
 with the margin in cost over UNITS. This is the confidence of `rig.estimate.joint.confidence` with three changes. z is
-the stripe's light over its noise, pooled over neighbours, above the mean of the haze before and behind it. Agreement of
-answers around does not count. And the trust is that in the right surface, within 3 px. Later lessons use the table's
-confidence, since the model is known by then.
+the stripe's light above the mean of the haze before and behind it, pooled over neighbours, over its noise. Whether the
+answers around agree does not count. And the answer need only be on the right surface, within 3 px. Later lessons use
+the table's confidence, since the model is known by then.
 
 B, C and D are fitted by maximum likelihood to lessons on random scenes of a second simulator, in clear air, thin and
 dense fog, under a halo and with hot pixels at 1 to 10 exposures, with places without a stripe counted as wrong. A is
-half of its fitted value. Lessons with too little trust teach worse: a distrusted answer is judged by its own row alone,
-and the answers left out are those that show what the model does not know yet.
+half of its fitted value, because too little trust makes a worse model: an answer without trust is judged by its own row
+alone, and the answers left out are those that show what the model does not know yet.
 """
 
 import math
@@ -37,7 +37,7 @@ B: Final = 0.608
 LOG_C: Final = -2.43
 D: Final = 1.427
 POOLED: Final = 25.0
-"""Answers over which light is taken to be pooled: about half of the neighbours lie on the same surface."""
+"""Number of answers over which light is assumed to be pooled: about half of the neighbours lie on the same surface."""
 LEAST_Z: Final = 0.05
 """Least z, for a stripe that shows no light."""
 
@@ -81,8 +81,7 @@ def read_positions(
     """Fill x_px (rows, columns) from the answers' labels, and its distance from x_far; NaN without data.
 
     An answer in the outer half of the first or last of `width` pixels gets margin 0 in `answer`. A stripe beyond that
-    pixel is as dark as a missing one and has no label. So darkness makes the outermost label seem far better than all
-    others.
+    pixel has no label and leaves the row dark. In a dark row the outermost label seems far better than all others.
     """
     label, margin, nothing = answer.label, answer.margin, np.float32(np.nan)
     for y in range(first_row, last_row):
@@ -101,10 +100,10 @@ def add_quiet(
 ) -> None:  # fmt: skip
     """Add to quiet (2, rows, width) the ones and exposures of pixels behind clear stripes, every column_step columns.
 
-    Pixels without a ray are left out. halo: (BINS, pixels) of `halo_shares`, without pixels if there is none. With a
-    halo it is not dark behind a stripe of `signal` photons, and the expected halo and pedestal are subtracted from the
+    Pixels without a ray are left out. halo: (BINS, pixels) of `halo_shares`, without pixels if there is no halo. With a
+    halo, light also falls behind a stripe of `signal` photons: the expected halo and pedestal are subtracted from the
     ones. Pixels where these exceed `most_light`, photons per exposure, are left out. So are stripes that saturate their
-    pixels: their halo is brighter than it seems, and the remainder would be taken for ambient light.
+    pixels: their halo is brighter than expected, and the excess would be taken for ambient light.
     """
     width, several = sweep.u.shape[1], sweep.others.shape[1] > 0
     # Local names: each use of a tuple in the loop would count references to all of its arrays.

@@ -1,6 +1,6 @@
 """Four-path aggregation, compiled: the cost of each label, tied to the labels of the neighbours on rows and columns.
 
-Along a path, from the pixel q before p,
+A pixel, in this module, is one row and column of the map. Along a path, from the pixel q before p,
 
     L(p, l) = C(p, l) + m(p, l)
     m(p, l) = min(L(q, l), L(q, l +- 1) + P1, L(q, l +- 2) + P2, L(q, l +- 3) + P3, min L(q) + J) - min L(q)
@@ -30,7 +30,7 @@ _LEAST_AT: Final = -VECTOR
 CHUNK: Final = 16
 """Columns that are stepped through together: enough that none waits for its last step, few enough for the caches."""
 _AHEAD: Final = 3
-"""Rows by which memory is asked for ahead: each lies on a page of its own, which the processor does not foresee."""
+"""Rows ahead of which memory is prefetched: each lies on a page of its own, so the processor does not prefetch it."""
 _SET, _ADD, _TOTAL = 0, 1, 2
 
 
@@ -44,7 +44,7 @@ JUMP: Final = 40
 
 @numba.njit(cache=True, nogil=True)
 def _path_memory(paths: int, labels: int) -> Uint8:
-    """Memory for L of the last pixel and of this one on this many paths; it must live as long as they."""
+    """Memory for L of the last pixel and of this one on this many paths; keep it as long as its address is used."""
     return np.full(2 * paths * (labels + 2 * _SIDE) + _SIDE, LARGEST, np.uint8)
 
 
@@ -68,9 +68,9 @@ def _begin(path, paths, labels):  # type: ignore[no-untyped-def]
 def _step(before, after, cost, message, total, hidden, labels, ahead, use):  # type: ignore[no-untyped-def]
     """Do one step of a path: from L of its last pixel, at `before`, to L of this one, at `after`. All are addresses.
 
-    use: _SET writes the message to `message`, _ADD adds it there, _TOTAL writes to `total` the sum of it, `message` and
-    cost, LARGEST for labels that are `hidden`. ahead: bytes to the cost and message that are to be fetched into the
-    cache; 0: none.
+    use: _SET writes the message to `message`, _ADD adds it there; _TOTAL adds it to `message` and cost and writes the
+    sum to `total`, LARGEST for labels that are `hidden`. ahead: bytes to the cost and message that are prefetched; 0:
+    none.
     """
     least = zero_bytes() + read_byte(before, _LEAST_AT)
     most = add_saturated_unsigned(least, JUMP)
@@ -79,7 +79,7 @@ def _step(before, after, cost, message, total, hidden, labels, ahead, use):  # t
         if ahead != 0 and v & VECTOR == 0:
             prefetch(cost + ahead + v)
             prefetch(message + ahead + v)
-        # Both sides at once; what lies beyond the ends is as large as can be.
+        # Both sides at once; beyond the ends of the labels lies LARGEST.
         by_one = smaller_unsigned(load_bytes(before, v - 1), load_bytes(before, v + 1))
         by_two = smaller_unsigned(load_bytes(before, v - 2), load_bytes(before, v + 2))
         by_three = smaller_unsigned(load_bytes(before, v - 3), load_bytes(before, v + 3))
@@ -87,7 +87,7 @@ def _step(before, after, cost, message, total, hidden, labels, ahead, use):  # t
         by_two = add_saturated_unsigned(by_two, TWO)
         by_three = add_saturated_unsigned(by_three, THREE)
         best = smaller_unsigned(smaller_unsigned(by_one, by_two), smaller_unsigned(by_three, load_bytes(before, v)))
-        # L keeps its least, which is subtracted from the message alone: no step waits for it earlier.
+        # The least is subtracted only here, from the message, so that the step before need not wait for it.
         sent = sub_saturated_unsigned(smaller_unsigned(best, most), least)
         here = add_saturated_unsigned(load_bytes(cost, v), sent)
         next_least = smaller_unsigned(next_least, here)
@@ -121,7 +121,7 @@ def _along_row(cost: int, message: int, columns: int, labels: int, paths: int) -
     """Write the sums of the messages of both ways along one row; cost, message, paths: addresses."""
     _begin(paths, 2, labels)
     half = columns // 2
-    # From both ends at once, two paths that do not wait for each other: to the middle there is nothing to add to.
+    # Two paths from both ends at once, which do not wait for each other. Up to the middle they set, then they add.
     _both_ways(cost, message, paths, columns, labels, 0, half, _SET)
     for v in range(half * labels, (columns - half) * labels, VECTOR):
         store_bytes(message, v, zero_bytes())
@@ -145,7 +145,7 @@ def along_rows(cost: Uint8, message: Uint8, first_row: int, last_row: int) -> No
 @numba.njit(cache=True, nogil=True)
 def _step_down(before: int, after: int, cost: int, message: int, labels: int, columns: int, ahead: int) -> None:
     """Step some columns of a row on their way down; before, after, cost, message: addresses."""
-    # A function of its own: all that the loop needs finds room in the registers.
+    # A function of its own, so that everything in the loop fits into the registers.
     for _ in range(columns):
         _step(before, after, cost, message, 0, 0, labels, ahead, _ADD)
         before, after = before + labels + 2 * _SIDE, after + labels + 2 * _SIDE
@@ -180,7 +180,7 @@ def _go_up(
     cost: int, message: int, rows: int, row_bytes: int, columns: int, paths: int, pixel: int,
     desk: Readout,
 ) -> None:  # fmt: skip
-    """Find totals and answers of some columns, from the last row up. pixel: number of the first one's first answer."""
+    """Find totals and answers of some columns, from the last row up. pixel: index of the first answer in row 0."""
     labels = desk.labels
     width = row_bytes // labels
     before, after = paths, paths + CHUNK * (labels + 2 * _SIDE)
@@ -196,7 +196,7 @@ def _go_up(
 
 @numba.njit(cache=True, nogil=True)
 def along_columns(cost: Uint8, message: Uint8, first_column: int, last_column: int, desk: Readout) -> None:
-    """Answer columns first_column..last_column-1, from what `along_rows` left in `message` for all rows.
+    """Answer columns first_column..last_column-1, from what `along_rows` wrote to `message` for all rows.
 
     Messages from above are added to `message`. desk: pointers to the `Readout` of CHUNK columns.
     """

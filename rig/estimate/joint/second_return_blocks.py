@@ -1,8 +1,9 @@
 """Sums of light over blocks of rows and columns at equal distances from the far end, compiled, for second returns.
 
-A block is BLOCK x BLOCK lines (rows of columns). Lines are added pixel by pixel of distance from the far end, without
-the pixels near their stripes. Both the ones counted and those expected from haze and ambient light are added. With K
-frames of a line, and q and c the probabilities that a pixel stays dark under ambient light alone and under haze alone,
+A block is BLOCK x BLOCK lines (rows of columns). Lines are added at equal distances from the far end, in whole pixels
+(pixel 0 of distance is the leftmost), without the pixels near their stripes. Both the ones counted and those expected
+from haze and ambient light are added. With K frames of a line, and q and c the probabilities that a pixel stays dark
+under ambient light alone and under haze alone,
 
     ones expected = sum over lines K (1 - q c) = sum over columns K (number of lines - c sum q)
 
@@ -40,19 +41,19 @@ from rig.simd.vectors import LANES, where_below, zero_float32
 BLOCK: Final = 4
 """Rows and columns of a block; it is judged together with its eight neighbours."""
 LEFT_OUT: Final = np.float32(0.0)
-"""The probability of staying dark given to pixels that show nothing, since they always fire or must not be used."""
+"""Value in `still` that marks pixels which are left out, since they always fire or must not be used."""
 PLACE_X, PLACE_BEGIN, PLACE_END, PLACES = 0, 1, 2, 4
 NOWHERE: Final = -(1 << 15)
 """PLACE_X of a line where nothing is searched, see `line_places`."""
 SEEN, STILL, HERE, FIELDS = range(4)
-"""Fields of a line: addresses of its counts and `still` at pixel 0 of distance, its number in the map; their number."""
+"""Fields of a line: addresses of its counts and `still` at pixel 0 of distance, its index in the map; their number."""
 BEGIN, LEFT_END, RIGHT, END, LIMITS = range(5)
 """Limits of a line, in pixels of distance: its begin, the end of its part left of the stripe, the begin of its part
 right of the stripe, its end; their number."""
 
 
 class LineTable(NamedTuple):
-    """Addresses of the lines of a block, column by column, and of what belongs to them.
+    """Addresses of the lines of a block, column by column, and of their limits and frames.
 
     lines: int64 (BLOCK^2, FIELDS); limits: float32 (BLOCK^2, LIMITS); ends, frames: int64 and float32 (BLOCK,), number
     of lines up to the end of each column, and its frames; order: 0, 1, ... as float32.
@@ -67,7 +68,7 @@ class LineTable(NamedTuple):
 
 @numba.njit(cache=True, nogil=True)
 def line_places(sweep: Sweep, x_far: Float64, side: int, pixels: int) -> Int16:
-    """The places of the lines of all rows and columns, int16 (rows, columns, PLACES); made once per model.
+    """Places of the lines of all rows and columns, int16 (rows, columns, PLACES); made once per model.
 
     PLACE_X: x of pixel 0 of distance, the leftmost of `pixels`, NOWHERE where nothing is searched; PLACE_BEGIN,
     PLACE_END: first pixel of distance that is searched and was stored, and the one after the last.
@@ -141,7 +142,7 @@ def sum_lines(
 HAZE_BLOCKS: Final = 4
 """Blocks above one another for which haze is computed together: it changes slowly from row to row."""
 HAZE_STEP: Final = 8
-"""Pixels from one place where haze is computed to the next."""
+"""Spacing, in px, of the places at which haze is computed."""
 _IN_ORDER: Final = np.arange(LANES, dtype=np.float32)
 
 
@@ -180,10 +181,10 @@ def sum_blocks(
     counts: Counts, n_frames: Int32, sweep: Sweep, state: RowState, still: Float32, place: Int16, side: int,
     apart: float, x_px: Float32, first_block: int, last_block: int, out: Blocks,
 ) -> None:  # fmt: skip
-    """Fill the sums of rows of blocks first_block..last_block-1, without what lies within `apart` px of stripes x_px.
+    """Fill the sums of rows of blocks first_block..last_block-1, without pixels within `apart` px of stripes x_px.
 
-    Haze is that in the middle of HAZE_BLOCKS blocks, or of the block itself if nothing is searched there. state, still:
-    see `SecondLight`; place: of `line_places`.
+    Haze is taken in the middle of HAZE_BLOCKS blocks, or of the block itself if nothing is searched there. state,
+    still: see `SecondLight`; place: of `line_places`.
     """
     rows, columns = x_px.shape
     pixels, across, aside, x0 = out.ones.shape[2], out.ones.shape[1], np.float32(apart), sweep.x0
@@ -225,7 +226,7 @@ def sum_blocks(
 
 @numba.njit(forceinline=True)
 def _ask_for_block(seen: _Map, by: int, before: int) -> None:
-    """Prefetch counts of the block after `before`, places and stripes of the fourth: the processor foresees none."""
+    """Prefetch the counts of the block after `before`, and places and stripes of the fourth block after it."""
     row_bytes, top = seen.window * seen.count_bytes, by * BLOCK
     for y in range(top, min(top + BLOCK, seen.rows)):
         there = y * seen.columns + (before + 4) * BLOCK
@@ -242,8 +243,8 @@ def _list_lines(
 ) -> tuple[int, bool, tuple[np.float32, np.float32, np.float32, np.float32]]:
     """Write the lines of a block that have pixels into the table.
 
-    Returns their number, whether all their vectors may be read where they are, and `inner` of `sum_lines`. Sizes: of
-    counts, and of `still` from pixel 0 on.
+    Returns their number, whether all their vectors can be read in place, and `inner` of `sum_lines`. counts_size,
+    still_size: number of counts, and of values in `still` from pixel 0 of the first row on.
     """
     number, readable, all_pixels = 0, seen.count_bytes == 1, np.float32(seen.pixels)
     inner = np.float32(0.0), all_pixels, np.float32(0.0), all_pixels
@@ -282,9 +283,9 @@ def _copy_lines(
     counts: Counts, still: Float32, place: Int16, x0: Int32, width: int, number: int, lines: NDArray[np.int64],
     spare: Float32,
 ) -> None:  # fmt: skip
-    """Copy counts, as float32, and `still` of lines to `spare`, and have `lines` point there.
+    """Copy counts, as float32, and `still` of lines to `spare`, and let `lines` point there.
 
-    At the ends of an array, and of counts that are no bytes, vectors cannot be read where they are.
+    At the ends of an array, and if counts are not bytes, vectors cannot be read in place.
     """
     columns = place.shape[1]
     for i in range(number):
@@ -298,9 +299,11 @@ def _copy_lines(
 
 @numba.njit(cache=True, nogil=True)
 def _clear_beside(sweep: Sweep, state: RowState, y: int, c: int, start: int, side: int, clear: Float32) -> None:
-    """Fill clear (2, pixels + 1), chances to stay dark under haze alone, left and right of a stripe, from `start` on.
+    """Fill clear (2, pixels + 1), the probability to stay dark under haze alone of pixels from `start` on, left and
+    right of a stripe.
 
-    Straight lines between every HAZE_STEP pixels. Pixels without a ray have that of the nearest one with a ray.
+    It is computed every HAZE_STEP pixels and interpolated linearly. A pixel without a ray has the value of the nearest
+    pixel with a ray.
     """
     # Local names: each use of the tuple itself in the loop would count references to all of its arrays.
     u, v, profile, w_lo, per_w = sweep.u, sweep.v, state.profile, state.w_lo, state.per_w

@@ -1,17 +1,17 @@
 """Second returns: a second line of light beside the stripe, from a pane before a wall, a twig, a flake of snow.
 
-In haze a row cannot answer with both surfaces, because the light behind the nearer one excludes that the haze ends
-there. So the light of the nearer one is looked for in the counts. In a single row it exceeds the haze by too little to
-be seen. So light is first summed over blocks of rows and columns (`rig.estimate.joint.second_return_blocks`) and
-compared with what haze and ambient light bring, pixel by pixel of distance from the far end. Then each row is examined
-itself, with its neighbours. Let own and block be the light of a candidate in standard deviations, pooled over its own
-neighbours and over its block's. The probability that it is right is
+A row has one stripe in the model, so the other line's light is searched for before and behind the stripe. In a single
+row it exceeds the haze by too little to be seen. So light is first summed over blocks of rows and columns
+(`rig.estimate.joint.second_return_blocks`) and compared, at each distance (in pixels) from the far end, with the light
+that is expected from haze and ambient light. Then each row is examined with its neighbours. Let own and block be the
+light of a candidate in standard deviations, pooled over its own neighbours and over its block's. The probability that
+it is right is
 
     logit confidence2 = LOG_ODDS . (1, own, block)
 
 Positions x2_px and confidence2 are float32 (rows, columns), NaN and 0 where nothing stands out. LOG_ODDS are fitted to
-maps with a pane over a third of them and to maps without any. Light within APART_PX plus LINE_SIGMAS widths of the line
-from a stripe counts as the stripe's own, so closer surfaces are not separated.
+maps with a pane over a third of the picture and to maps without a pane. Light closer to a stripe than APART_PX plus
+LINE_SIGMAS standard deviations of the line counts as the stripe's own, so closer surfaces are not separated.
 """
 
 from typing import Final, NamedTuple
@@ -33,13 +33,13 @@ from rig.simd.vectors import LANES, larger_float, largest_float, square_root, ze
 from rig.threads import RowWorkers, Work
 
 RING_PX: Final = 4
-"""Pixels to either side of where light is looked for that tell whether haze is as strong as was learned."""
+"""Pixels on either side of a candidate (the ring) that show whether haze is as strong as was learned."""
 GAP_PX: Final = 1
-"""Pixels between the light that is looked for and those of the ring."""
+"""Pixels between the candidate's light and the ring."""
 LEAST_RING: Final = 0.25
-"""Least light expected on each side of the ring, per pixel over that of the candidate: with less, too few were seen."""
+"""Least light expected per pixel on each side of the ring, over the candidate's: else too few pixels were seen."""
 STEEPER: Final = 1.5
-"""Factor on the excess haze of the ring's brighter side: between its two sides haze is no straight line."""
+"""Factor on the excess haze of the ring's brighter side: haze is not linear between both sides."""
 CANDIDATE: Final = np.float32(4.0)
 """Standard deviations above which a block's light is a candidate."""
 REACH: Final = 3
@@ -47,7 +47,7 @@ REACH: Final = 3
 LOG_ODDS: Final = -16.0, 0.4, 3.0
 """Factors of the log odds that a candidate is right, see the module."""
 _AROUND: Final = -(-(RING_PX + GAP_PX + 6) // LANES) * LANES
-"""Room beside the pixels of distance: whatever the line's reach, up to 6 px."""
+"""Zeros on either side of the pixels of distance, enough for a ring around a line of up to 6 px reach."""
 
 
 class Candidates(NamedTuple):
@@ -108,7 +108,7 @@ def find_candidates(blocks: Blocks, reach: int, side: int, first_block: int, las
 
 @numba.njit(cache=True, nogil=True)
 def _add_lines(first: int, apart: int, number: int, size: int, total: int) -> None:
-    """Write the sum of some lines of `size` numbers, `apart` bytes from one another; first, total: addresses."""
+    """Write the sum of `number` lines of `size` float32, `apart` bytes from one another. first, total: addresses."""
     for i in range(0, size, LANES):
         lines = load_float32(first, i)
         for k in range(1, number):
@@ -118,7 +118,8 @@ def _add_lines(first: int, apart: int, number: int, size: int, total: int) -> No
 
 @numba.njit(cache=True, nogil=True)
 def _light_above(room: int, pixels: int, reach: int, excess: int) -> np.float32:
-    """Write each pixel's light beyond CANDIDATE standard deviations to `excess`; the most. room, excess: addresses."""
+    """Write by how much the light around each pixel exceeds CANDIDATE standard deviations to `excess`, and return the
+    largest excess. room, excess: addresses."""
     row, most = pixels + 2 * _AROUND, zero_float32()
     for i in range(0, pixels, LANES):
         ones, expected = zero_float32(), zero_float32()
@@ -134,10 +135,10 @@ def _light_above(room: int, pixels: int, reach: int, excess: int) -> np.float32:
 
 @numba.njit(cache=True, nogil=True, error_model="numpy")
 def _stands_out(sums: Float32, i: int, reach: int) -> tuple[float, float]:
-    """Light around i above the haze that its ring shows, in standard deviations; that haze over the learned one."""
+    """Light around i above the haze that its ring shows, in standard deviations, and that haze over the learned one."""
     n, e = sums[0, i - reach : i + reach + 1].sum(), sums[1, i - reach : i + reach + 1].sum()
     more = 1.0
-    # Light that only falls off to one side is a halo of the stripe or haze that was learned too weak.
+    # Light that falls off to one side only is a halo of the stripe, or haze that was learned too weak.
     for start in (i - reach - GAP_PX - RING_PX, i + reach + 1 + GAP_PX):
         ring, asked = sums[0, start : start + RING_PX].sum(), sums[1, start : start + RING_PX].sum()
         if not asked > LEAST_RING * e * RING_PX / (2 * reach + 1):
@@ -160,7 +161,7 @@ def measure_seconds(
     alone = still[LANES:-LANES].reshape(sweep.u.shape)
     for y in range(first_row, last_row):
         for c in range(x_px.shape[1]):
-            # What an earlier map left must go: neighbours pool it wherever the distance is known, searched or not.
+            # Clear the values of an earlier map: neighbours pool them wherever the distance is known.
             out.ones[y, c] = out.expected[y, c] = out.light[y, c] = out.moment[y, c] = 0.0
             place = np.float32(x_far[y, c]) + out.distance[y, c]
             if np.isnan(place) or np.isnan(x_px[y, c]) or sweep.x_lo[y, c] > sweep.x_hi[y, c]:
@@ -169,7 +170,7 @@ def measure_seconds(
             x, frames = int(np.rint(place)), np.float32(n_frames[c])
             at = min(max(x, sweep.x_lo[y, c]), sweep.x_hi[y, c])
             path_p, strength = line_light(sweep, state, y, c, at)
-            # Mean of both sides: part of the learned haze may be light of the second surface itself.
+            # Mean of the haze on both sides: at the candidate, it may contain light of the second surface itself.
             near, far = max(at - HAZE_STEP // 2, lo), min(at + HAZE_STEP // 2, hi)
             before, behind, _, _, _, _, _ = fluxes_at(sweep, state, y, near, c, path_p, strength)
             before_too, behind_too, _, _, _, _, _ = fluxes_at(sweep, state, y, far, c, path_p, strength)
@@ -190,7 +191,8 @@ def measure_seconds(
 
 @numba.njit(cache=True, nogil=True, error_model="numpy")
 def move_seconds(reach: int, first_row: int, last_row: int, seconds: Seconds) -> None:
-    """Fill moved, the distance of the middle of the light around each candidate, pooled; at most `reach` px from it."""
+    """Fill moved, the distance of each candidate moved to the centroid of the light around it, pooled over neighbours,
+    by at most `reach` px."""
     moved = seconds.moved
     distance = with_margin(seconds.distance, first_row, last_row)
     moment, light = with_margin(seconds.moment, first_row, last_row), with_margin(seconds.light, first_row, last_row)
@@ -212,8 +214,8 @@ def judge_seconds(
 ) -> None:  # fmt: skip
     """Fill x2_px and confidence2 of rows first_row..last_row-1; NaN and 0 where nothing stands out.
 
-    The light of a candidate in standard deviations, pooled over neighbours, is the root of twice the gain in
-    log-likelihood of Poisson counts, which holds for few photons too. sure: of `Candidates`.
+    The light of a candidate in standard deviations, pooled over neighbours, is the square root of twice the gain in
+    log-likelihood of Poisson counts. This holds for few photons too. sure: of `Candidates`.
     """
     distance = with_margin(seconds.distance, first_row, last_row)
     ones, expected = with_margin(seconds.ones, first_row, last_row), with_margin(seconds.expected, first_row, last_row)
@@ -232,10 +234,10 @@ def judge_seconds(
 
 
 APART_PX = 2.0
-"""Light farther from a stripe than this plus LINE_SIGMAS widths of the line is not its own."""
+"""Light farther from a stripe than this plus LINE_SIGMAS standard deviations of the line is not the stripe's own."""
 LINE_SIGMAS = 2.5
 LIGHT_SIGMAS = 1.5
-"""Widths of the line to either side in which its light is looked for."""
+"""Standard deviations of the line, on either side of a candidate, over which its light is summed."""
 
 
 class SecondLight(NamedTuple):
@@ -292,7 +294,7 @@ def second_returns(
     """x2_px and confidence2 (rows, columns) beside stripes at x_px; NaN and 0 where nothing stands out."""
     rows, columns = x_px.shape
     blocks, candidates, seconds = room
-    # Read by address: another kind of number would be read as nonsense.
+    # It is read by address, so its type must be int32.
     n_frames = np.ascontiguousarray(volume.n_frames, np.int32)
     seen = volume.counts, n_frames, sweep, light.state, light.still
     reach, side, apart, block_rows = light.reach, grid.side, light.apart, len(candidates.distance)
@@ -302,12 +304,12 @@ def second_returns(
     def look(first: int, last: int) -> None:
         sum_blocks(*seen, light.place, side, apart, x_px, first, last, blocks)
         here = slice(first * BLOCK, last * BLOCK)
-        seconds.distance[here] = x2_px[here] = np.nan  # also for rows that are not asked: neighbours read them
+        seconds.distance[here] = x2_px[here] = np.nan  # also in rows without candidates: neighbours read them
         confidence2[here] = 0.0
 
     workers.over(block_rows, look)
     workers.over(block_rows, lambda first, last: find_candidates(blocks, reach, side, first, last, candidates))
-    # One row of blocks at least: nothing may be left to compile for the first second return of a scan.
+    # At least one row of blocks, so that nothing is left to compile for the first second return of a scan.
     asked = np.flatnonzero(np.isfinite(candidates.distance).any(axis=1))
     asked = asked if len(asked) else np.array([0])
 

@@ -62,7 +62,7 @@ class Memory(NamedTuple):
     seconds: SecondRoom
 
     def fits(self, grid: LabelGrid) -> bool:
-        """Whether maps of this grid fit into it."""
+        """Whether the memory has the shape of this grid's maps."""
         return self.cost.shape == (*grid.x_far.shape, grid.labels)
 
 
@@ -92,7 +92,7 @@ def grid_of(geometry: SweepGeometry) -> LabelGrid:
 def tables_of(setting: LearningSetting, workers: RowWorkers, *, contrast: bool = False) -> JointTables:
     """The tables of a model, for a geometry and a number of exposures per column.
 
-    contrast: whether labels are also costed by their surroundings; under a halo they always are.
+    contrast: whether to make tables for costs of contrast; under a halo they are always made.
     """
     model, geometry, grid = setting.model, setting.geometry, grid_of(setting.geometry)
     costs = costs_of(model, geometry, grid, setting.exposures, workers)

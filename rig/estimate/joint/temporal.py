@@ -1,8 +1,9 @@
-"""Temporal prior of `joint`: where a surface was clear in the last map, places far from it cost a little more.
+"""Temporal prior of `joint`: where a surface was clear in the last map, labels far from it cost a little more.
 
-If the last map's label was b, a label l costs min(SLOPE max(|l - b| - FREE, 0), c MOST) more, where c rises from 0 to 1
-with the confidence of the last answer. MOST is far less than the cost of a jump between neighbours, and than the
-evidence of a stripe's photons. So where something has moved, its rows outvote the prior. Nothing adds up over maps.
+If the last map's label was b, the cost of a label l rises by min(SLOPE max(|l - b| - FREE, 0), c MOST), where c grows
+from 0 to 1 with the confidence of the last answer. MOST is far less than the cost of a jump between neighbours, and
+than the evidence of a stripe's photons. So where something has moved, the counts outweigh the prior. Only the last map
+is used: the prior does not grow from map to map.
 """
 
 import numba
@@ -21,18 +22,18 @@ from rig.simd.vectors import add_saturated_unsigned
 MOST = 3
 """Most that the prior adds to a label's cost, in units (`UNITS`). With 6, dark things that move would be held back."""
 SLOPE = 2
-"""Units for each label that is farther off."""
+"""Units per label of distance from the last label."""
 FREE = 1
-"""Labels of distance that cost nothing: the last label has an error, and surfaces drift."""
+"""Distance in labels that costs nothing: the last label has an error, and surfaces drift."""
 LEAST_SURE = 0.5
-"""Confidence up to which an answer leaves nothing to the next map."""
+"""Confidence up to which an answer is no prior for the next map."""
 
 
 class TemporalPrior:
-    """Memory of the last map for the next one. on: whether maps leave anything.
+    """Memory of the last map for the next one. on: whether maps are kept.
 
-    before: uint16 (2, rows, columns), the last map's labels and the largest extra cost of others (0: nothing is known).
-    None if there is nothing, as after a map without frames and before the first map of a geometry.
+    before: uint16 (2, rows, columns), the last map's labels and the largest cost added to others (0: no prior). None if
+    nothing is known, as after a map without frames and before the first map of a geometry.
     """
 
     def __init__(self, on: bool) -> None:
@@ -68,7 +69,7 @@ class TemporalPrior:
         sure = np.minimum((stripes.confidence.astype(np.float64) - LEAST_SURE) / (1.0 - LEAST_SURE), 1.0)
         off = grid.side * (grid.x_far - stripes.x_px) * PER_PX
         there = (sure > 0.0) & np.isfinite(off)
-        # A new one each time: the last one is part of the state that its map was estimated with.
+        # A new array each time: the last one is part of the state with which this map was estimated.
         before = np.zeros((2, *off.shape), np.uint16)
         before[0, there] = np.clip(np.rint(off[there]), 0, grid.stripes - 1)
         before[1, there] = np.rint(sure[there] * MOST)
@@ -76,7 +77,8 @@ class TemporalPrior:
 
 
 def _ramps(labels: int) -> Uint8:
-    """Costs to add, uint8 (MOST + 1, 2 labels): by their limit, and by label less last label plus `labels`."""
+    """Costs to add, uint8 (MOST + 1, 2 * labels). First index: their largest value; second: label - last label +
+    labels."""
     away = np.abs(np.arange(2 * labels) - labels)
     ramp = SLOPE * np.maximum(away - FREE, 0)
     return np.asarray(np.minimum(ramp, np.arange(MOST + 1)[:, None]), np.uint8)

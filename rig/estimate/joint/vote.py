@@ -1,4 +1,4 @@
-"""Vote on weak answers of the aggregation, compiled: the common opinion of the neighbours on all sides.
+"""Vote on weak answers of the aggregation, compiled: all neighbours decide together.
 
 Four paths carry evidence along rows and columns only. If few photons come back, single rows or columns are wrong as a
 whole and form streaks. So an answer whose margin is below WEAK is put to the vote. Candidates are its own label and
@@ -6,9 +6,10 @@ those of the four nearest neighbours; the winner is the one with the least
 
     sum over 5 x 5 neighbours of margin min(|label - its label|, FAR),
 
-unless the row's own counts make it worse than the old one by more than OBJECTION. The new margin is the sum of the
-margins for the label less that of the margins for others, over the number of neighbours and at least 0. So labels on
-which streaks disagree are not certain. Labels are int16, margins uint8 in units of cost; sums fit 16 bits (SHARE).
+unless its cost from the row's own counts exceeds that of the old label by more than OBJECTION. The new margin is the
+sum of the neighbours' margins for the label, less the sum of those for other labels, over the number of neighbours and
+at least 0. So where streaks disagree, margins are small. Labels are int16, margins uint8 in units of cost; sums fit 16
+bits (SHARE).
 """
 
 from typing import Final, NamedTuple
@@ -38,7 +39,7 @@ REACH: Final = 2
 """Rows and columns to either side that vote."""
 SHARE_BITS: Final = 2
 SHARE: Final = 1 << SHARE_BITS
-"""Units of margin to a vote: so 16 bits hold the votes of all neighbours."""
+"""Units of margin that make one vote, so that 16 bits hold the votes of all neighbours."""
 NOWHERE: Final = 30000
 """Label outside the picture: farther than FAR from all others, so that it is never elected."""
 
@@ -76,15 +77,15 @@ def collect(answer: LabelAnswers, first_column: int, last_column: int, out: Ball
 
 
 NEIGHBOURS_PX: Final = 3.0
-"""Distance of columns above which there is no vote: in dense fog they know too little of one another."""
+"""Largest distance of columns at which there is a vote: in dense fog, columns farther apart do not help each other."""
 WEAK: Final = 48
-"""Margin, in units of cost, from which on an answer stands without a vote."""
+"""Margin, in units of cost, from which on there is no vote on an answer."""
 OBJECTION: Final = 8
-"""Most units of cost by which the row's own counts may be against the label that the neighbours elect."""
+"""Most units by which the elected label may cost more than the old one, by the row's own counts."""
 FAR: Final = 16
-"""Distance in labels from which on all are equally far off."""
+"""Limit to distances between labels in a vote."""
 SAME: Final = 2
-"""Labels no farther apart speak for one another: a pixel."""
+"""Labels at most so far apart, a pixel, support one another."""
 _CANDIDATES: Final = 5
 
 
@@ -150,7 +151,7 @@ def _elect_row(hall: _Hall, y: int) -> None:
 
 @numba.njit(cache=True, nogil=True)
 def _settle_row(hall: _Hall, y: int, high: int) -> None:
-    """Let the counts of row y object, and write its weak answers; high: number of rows that vote."""
+    """Reject elections to which the counts of row y object, and write its weak answers; high: rows that vote."""
     line, down = (y + REACH) * hall.width + REACH, np.float32(1.0 / high)
     for c in range(0, hall.columns, LANES):
         pixel, at = y * hall.columns + c, line + c
@@ -171,7 +172,7 @@ def _settle_row(hall: _Hall, y: int, high: int) -> None:
                 write_float32(hall.answer.label, pixel + i, read_float32(hall.ballots.label, other))
         _count_support(hall.ballots.whole, hall.ballots.votes, at, hall.width, hall.elected + 2 * c, hall.against)
         support = to_float32(larger(load_int16(hall.against, 0), np.int16(0)) * np.int16(SHARE))
-        # Half a unit more: a whole quotient stays one, whatever the rounding.
+        # Half a unit is added, so that no whole quotient is rounded down.
         share = (support + np.float32(0.5)) * (load_float32(hall.share, c) * down)
         store_int16(hall.against, 0, to_int16(share))
         while weak != 0:
@@ -182,7 +183,7 @@ def _settle_row(hall: _Hall, y: int, high: int) -> None:
 
 @numba.njit(forceinline=True)
 def _weak_lanes(votes, at, end):  # type: ignore[no-untyped-def]
-    """A number with a bit for each of LANES answers, set if it is weak; there are no answers from `end` on."""
+    """A number with a bit for each of LANES answers, set if the answer is weak; there are no answers from `end` on."""
     strong = equal_mask(smaller(load_int16(votes, at), np.int16(WEAK // SHARE)), np.int16(WEAK // SHARE))
     return ~np.int64(strong) & ((1 << min(LANES, end)) - 1)
 

@@ -34,16 +34,16 @@ from rig.simd.shuffles import equal_bytes, first_equal
 from rig.simd.vectors import BLOCK, smaller_unsigned, smallest_byte, zero_four
 
 REACH: Final = 4
-"""Labels to each side of the winner that its sub-label position is the mean of."""
+"""Labels on each side of the winner over which the mean for its sub-label position is taken."""
 MARGIN_FROM: Final = 3
-"""Labels from the winner at which the margin's rivals begin: 1.5 pixels."""
+"""Least distance of the margin's rivals from the winner, in labels: 1.5 pixels."""
 LARGEST: Final = 255
 """Largest cost and total, those of a label that is excluded."""
 TAPS: Final = 2 * REACH + 1
 POWERS: Final = 4
 """Numbers that are summed at once: powers 0 and 1 of the distance in labels, and two zeros."""
 VECTOR: Final = 32
-"""Labels that are worked on at once."""
+"""Labels that are processed at once."""
 MIDDLE: Final = VECTOR // 2
 UNITS: Final = 8.0
 """Units of cost per nat with very few exposures; with K exposures there are UNITS / (1 + K / SHARP), see
@@ -183,7 +183,7 @@ def _weigh(columns, desk):  # type: ignore[no-untyped-def]
 
 @numba.njit(forceinline=True)
 def _hide_winners(columns, desk):  # type: ignore[no-untyped-def]
-    """Take the winners, and what does not count for the margin, out of the totals."""
+    """Set the totals of the winners, and of labels too close to count for the margin, to LARGEST."""
     near = load_bytes(desk.settings.near, 0)
     for c in range(columns):
         around = desk.totals + c * desk.size + read_int32(desk.least_label, c)
@@ -202,7 +202,7 @@ def _write_answers(pixel, columns, desk):  # type: ignore[no-untyped-def]
 
 @numba.njit(cache=True, nogil=True, error_model="numpy")
 def answer_columns(pixel: int, columns: int, desk: Readout) -> None:
-    """Answer columns from their totals, which are overwritten. pixel: number of the first one's answer."""
+    """Answer columns from their totals, which are overwritten. pixel: index of the first column's answer."""
     _find_winners(columns, desk)
     _weigh(columns, desk)
     _hide_winners(columns, desk)

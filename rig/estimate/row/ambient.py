@@ -1,8 +1,8 @@
 """Ambient light and dark counts of every pixel, from dark frames, quiet pixels behind stripes and sums over columns.
 
-Both are constant for a pixel over the columns of a sweep, so the counts summed over all columns show them: a pixel that
-fires far more often than its neighbours while the laser crosses the whole picture is hot, whatever the scene. If there
-are few counts, the estimate is drawn towards the mean of the pixels around.
+For each pixel both are constant during a sweep. So the counts summed over all columns show hot pixels, whatever the
+scene: they fire far more often than their neighbours while the laser crosses the whole picture. If there are few
+counts, the estimate is drawn towards the mean of the pixels around.
 """
 
 import cv2
@@ -17,27 +17,28 @@ from rig.simd import Float32, Float64
 NEIGHBOURHOOD_PX = 31
 """Side of the square of pixels whose mean a pixel is drawn to."""
 DEFECT_FLUX = float(FLUX_MAX)
-"""Ambient light given to pixels that must not be used: a pixel that always fires favours no hypothesis."""
+"""Ambient light assumed for pixels that must not be used: counts of a pixel that always fires favour no hypothesis."""
 HOT_SIGMA = 6.0
-"""Excess over the neighbours, in standard deviations, that makes a pixel hot: 1e-9 of good pixels pass."""
+"""Excess over the neighbours, in standard deviations, above which a pixel is hot: 1e-9 of good pixels exceed it."""
 
 
 def ambient_map(
     tally: FrameTally, intensity: NDArray[np.uint32], geometry: SweepGeometry, quiet: Float64 | None
 ) -> Float32:
-    """Ambient light and dark counts of each pixel in photons per exposure, (rows, width), from all that shows them.
+    """Ambient light and dark counts of each pixel in photons per exposure, (rows, width).
 
     intensity: (rows, width), ones of each pixel within the windows. quiet: (2, rows, width), ones and exposures of each
-    pixel while clearly behind the stripe; None before any stripe is known. Ones less those of a halo may be negative.
+    pixel while clearly behind the stripe; None before any stripe is known. The ones may be negative if the expected
+    light of a halo was subtracted from them.
     """
     ones = np.zeros((geometry.rows, geometry.width))
     exposures = np.zeros_like(ones)
     if tally.dark_counts is not None:
         ones += tally.dark_counts
         exposures += tally.n_dark if tally.dark_frames is None else tally.dark_frames
-    # Behind its stripe a pixel is not dark where other lines are lit together with it.
+    # With several lines, a pixel behind one line's stripe may be lit by another line.
     if quiet is not None and geometry.others is None:
-        # What a halo is expected to add has been taken off: chance may leave less than nothing.
+        # The expected light of a halo has been subtracted: by chance the difference may be negative.
         ones += np.maximum(quiet[0], 0.0)
         exposures += quiet[1]
     totals = np.stack([intensity, np.broadcast_to(_window_exposures(tally, geometry), intensity.shape)])
@@ -61,7 +62,7 @@ def _window_exposures(tally: FrameTally, geometry: SweepGeometry) -> NDArray[np.
 
 
 def _lowest_level(totals: NDArray[np.uint32]) -> float:
-    """A level that hardly any pixel lies below: half the flux of the 2nd percentile of their mean rates."""
+    """A level below which hardly any pixel lies: half the flux at the 2nd percentile of the pixels' mean rates."""
     seen = totals[1] > 0
     if not seen.any():
         return 1e-5
@@ -70,7 +71,7 @@ def _lowest_level(totals: NDArray[np.uint32]) -> float:
 
 
 def _shrunk(ones: Float64, exposures: Float64) -> Float64:
-    """Flux per pixel: its own, drawn to the local mean, more so the more alike pixels are (empirical Bayes)."""
+    """Flux of each pixel, drawn to the local mean; the more so, the more alike pixels are (empirical Bayes)."""
     row_rates = ones.sum(1)[exposures.sum(1) > 0] / exposures.sum(1)[exposures.sum(1) > 0]
     overall = max(float(np.median(row_rates)), 1e-6)
     mean = np.full(ones.shape, overall)
@@ -95,7 +96,7 @@ def _shrunk(ones: Float64, exposures: Float64) -> Float64:
 
 
 def hot_pixels(totals: NDArray[np.uint32]) -> Float64:
-    """Flux (rows, width) of pixels far above their neighbours over the whole sweep, 0 elsewhere.
+    """Excess flux (rows, width) of pixels far above their neighbours over the whole sweep, 0 elsewhere.
 
     totals: (2, rows, width), ones and exposures of each pixel while inside the stored window.
     """
@@ -104,7 +105,8 @@ def hot_pixels(totals: NDArray[np.uint32]) -> Float64:
     around = cv2.medianBlur(rate, 5).astype(np.float64)
     expected = around * exposures
     excess = ones - expected
-    # A stripe brighter than its neighbours' may cross the pixel once: allow it as much light again as the median pixel.
+    # Once in the sweep a stripe brighter than its neighbours' may cross the pixel: allow half as much light again as
+    # expected, or half of the median pixel's if that is less.
     hot = excess > HOT_SIGMA * np.sqrt(expected + 1.0) + 0.5 * expected.clip(max=np.median(expected))
     excess_rate = np.clip(excess / np.maximum(exposures, 1.0), 0.0, 0.9999)
     return np.where(hot & (exposures > 0), -np.log1p(-excess_rate), 0.0)

@@ -1,10 +1,10 @@
 """Learns the row model from the counts of a sweep by expectation-maximisation over a lattice of rows and columns.
 
-In each round the row likelihood's posterior P(j) over positions gives the share of every pixel's evidence before and
-behind the stripe: pixel t lies before it with the probability that the stripe is farther, sum over j > t of P(j). Ones
-and exposures are added with these weights per bin of path inverse depth (`learn_rows`). Haze, pedestal, row gains,
-amplitudes and line width are then set from those float64 sums. Nothing is assumed about the medium or the light except
-that haze falls with the path length, and that only where data are few.
+A line, in this package, is one row of one column. In each round every line's posterior P(j) over positions gives the
+probability that a pixel lies before or behind the stripe: pixel t lies before it if the stripe is farther, with
+probability sum over j > t of P(j). Ones and exposures are added with these weights per bin of path inverse depth
+(`learn_rows`). Haze, pedestal (the level behind the stripe), gains, amplitudes and line width are then set from those
+float64 sums. Where data are few, haze is assumed to fall exponentially with the path length.
 """
 
 from dataclasses import replace
@@ -26,37 +26,37 @@ from rig.simd import Float32, Float64, Int32
 from rig.threads import RowWorkers
 
 START_LINES, START_FRAMES = 512, 8192
-"""Lines (rows of columns) that tell which start of a first sweep is the likeliest, and how wide the laser line is; more
-of them, up to FIRST_LINES, if they have fewer exposures than START_FRAMES together."""
+"""Lines from which the likeliest start and the width of the laser line are chosen in a first sweep: START_LINES, or as
+many (up to FIRST_LINES) as have START_FRAMES exposures together."""
 FIRST_LINES = 2048
 LAST_LINES = 4096
-"""Lines that the first and the last rounds over a first sweep read: 250 000 and 500 000 pixels."""
+"""Lines that the first and the last rounds over a first sweep read: 250 000 and 500 000 pixels in all."""
 AGAIN_LINES = 8192
-"""Lines that teach once more when neighbours have told where their stripes are."""
+"""Lines from which a first sweep's model is learned again, once neighbours have helped to locate the stripes."""
 NEXT_LINES = 2048
-"""Lines that are read of each later sweep."""
+"""Lines that are read from each later sweep."""
 FADE = 0.7
-"""Factor on what earlier sweeps taught, with each later one."""
+"""Factor on the weight of earlier sweeps, each time that one more sweep is learned from."""
 WIDTH_EVIDENCE = 3.0
-"""Natural logarithm of the odds from which the width moves."""
+"""Gain of log-likelihood above which the line width is changed."""
 FIRST_ROUNDS = 8
 LAST_ROUNDS = 3
-"""Rounds over a first sweep: with FIRST_LINES and the line's width, then with LAST_LINES and the gains of rows and
-columns. Gains learned from fewer lines are noise, which the extinction cannot be told from."""
+"""Rounds over a first sweep. The first ones read FIRST_LINES and also fit the line width; the last ones read LAST_LINES
+and also learn the gains of rows and columns. From fewer lines, noise in the gains would be taken for extinction."""
 MOST_TRUST = np.float32(0.98)
-"""Largest trust in what neighbours say of a stripe, however sure they are: its own row may know better."""
+"""Largest trust in a stripe position known from neighbours: the row's own counts may contradict it."""
 LEVELS = 14
 """Number of sums per profile bin in an expectation, see `learn_rows`."""
 PIECES = 4
-"""Pieces in which lines are summed, whatever the number of threads."""
+"""Pieces in which lines are summed, the same for any number of threads."""
 AMPLITUDE_SPAN = 3.4
 """Natural logarithm of the ratio of the largest amplitude to the smallest: a factor of 30."""
 EVEN_SHARE = 0.25
-"""Part of the prior over positions that stays even, whatever the map before looked like."""
+"""Share of the prior over positions that stays uniform, whatever the earlier maps looked like."""
 PRIOR_PHOTONS = 100.0
-"""The fitted exponential counts, against each bin's own counts, as if so many photons had measured it."""
+"""Weight of the fitted exponential against each bin's own counts, in photons."""
 START_EXTINCTIONS_PER_M = (0.0, 0.1, 0.4, 1.5)
-"""Extinctions with which a first sweep begins: clear air to dense fog."""
+"""Extinctions that are tried as a start for a first sweep: clear air to dense fog."""
 
 
 class Expectation(NamedTuple):
@@ -74,7 +74,7 @@ class Expectation(NamedTuple):
         return Expectation(*(one + more for one, more in both))
 
     def faded(self, share: float) -> "Expectation":
-        """The sums as if only this share of the lines had been seen."""
+        """The sums times `share`."""
         sums: Any = self
         return Expectation(*(share * each for each in sums))
 
@@ -88,7 +88,7 @@ def lattice(geometry: SweepGeometry, lines: int) -> tuple[Int32, Int32]:
 
 
 def lines_of(volume: CountVolume, where: tuple[Int32, Int32], known: StripeTable | None = None) -> Lines:
-    """The counts of a volume at (rows, columns), each one row of its column's window.
+    """The lines of a volume at `where`, (rows, columns).
 
     known: stripes that were estimated with the help of the neighbours' counts.
     """
@@ -151,7 +151,7 @@ def learn_first(volume: CountVolume, geometry: SweepGeometry, ambient: Float32, 
     for i in range(FIRST_ROUNDS):
         seen = expect(first, geometry, model, workers)
         model = maximise(model, seen, spread=True, free_ambient=guessed, gains=False)
-        # A width that stayed is looked at again only once the rest is nearly known.
+        # A width that did not change is tried again only in the last two rounds, when the model is nearly known.
         if moves or i >= FIRST_ROUNDS - 2:
             width = model.line_sigma_px
             model = fit_line_width(few, geometry, model, workers)
@@ -171,10 +171,10 @@ def next_lattice(geometry: SweepGeometry) -> tuple[Int32, Int32]:
 def learn_next(
     lines: Lines, geometry: SweepGeometry, model: RowModel, before: Expectation | None, workers: RowWorkers
 ) -> tuple[RowModel, Expectation]:
-    """The model updated with the lines of `next_lattice` of one more sweep.
+    """The model updated with lines of one more sweep, those of `next_lattice`, and the sums for the next call.
 
-    before: what was learned from earlier sweeps. It is returned with this sweep's added, and fades by FADE per sweep.
-    The line width is not changed if neighbours say where the line is, since their answer depends on the width.
+    before: the sums returned by the call before, which now count FADE times. The line width is not changed if lines
+    have positions known from neighbours, since these depend on the width.
     """
     seen = expect(lines, geometry, model, workers)
     if before is not None:
@@ -193,7 +193,7 @@ def learn_again(
     known: StripeTable,
     workers: RowWorkers,
 ) -> RowModel:
-    """The model of a first sweep once its stripes are known better than row by row."""
+    """The model of a first sweep, learned again with stripes `known` from more than their own rows."""
     lines = lines_of(volume, lattice(geometry, AGAIN_LINES), known)
     seen = expect(lines, geometry, replace(model, ambient=ambient), workers)
     return maximise(replace(model, ambient=ambient), seen, spread=True, free_ambient=volume.dark_counts is None)
@@ -256,14 +256,15 @@ def flux(ones: float, exposures: float) -> float:
 def maximise(
     model: RowModel, seen: Expectation, *, spread: bool, free_ambient: bool = False, gains: bool = True
 ) -> RowModel:
-    """The model that explains the weighted counts best; one with a halo keeps its haze and amplitudes.
+    """The model that explains the weighted counts best. If it has a halo, only the prior over positions and the
+    probability of 'no stripe' are learned.
 
     spread: whether the amplitude grid may move. free_ambient: whether the level of ambient light was guessed and is
-    learned as well. gains: whether to learn the strength of the haze per row and column; learned from few lines, or
-    from map to map, it drifts.
+    learned as well. gains: whether to learn the strength of the haze per row and column, which would drift if it were
+    learned from few lines or from map to map.
     """
     if model.halo.any():
-        # Row by row a halo is taken for haze: `rig.estimate.joint.halo` tells one from the other.
+        # A single row cannot tell a halo from haze; `rig.estimate.joint.halo` can.
         profile = np.column_stack([model.profile[:, :3], _position_prior(seen.levels)]).astype(np.float32)
         return replace(model, profile=profile, none_weight=_amplitudes(model, seen.amplitude_mass, False)[2])
     path_m = model.path_m()
@@ -285,7 +286,7 @@ def maximise(
     scale = stripe_scale(path_m, extinction)
     profile = np.stack([before, behind, scale, _position_prior(seen.levels)], 1).astype(np.float32)
     amplitude, weight, none = _amplitudes(model, seen.amplitude_mass, spread)
-    # The stated extinction comes from rows beyond doubt alone: a stripe taken for haze would flatten the decay.
+    # The stated extinction comes only from rows with a certain stripe: one taken for haze would flatten the decay.
     clear = fit_haze(path_m, *_level(seen.levels[:, 8:12]))
     if gains:
         model = replace(
@@ -301,10 +302,12 @@ def maximise(
 
 
 def _split_rest(rest: Float64, variance: Float64, haze: Float64) -> tuple[float, float]:
-    """The level behind the stripe as ambient left over and a share (0 to 1) of the haze: light scattered twice or more.
+    """Split the level behind the stripe into left-over ambient light and a share (0 to 1) of the haze.
+
+    The share is light scattered twice or more.
 
     Weighted fit of rest = excess + share * haze over the bins. Both are 0 with fewer than 4 bins; the share is 0 if the
-    haze is too even.
+    haze hardly varies.
     """
     known = np.isfinite(rest) & np.isfinite(haze) & (variance > 0)
     if known.sum() < 4:
@@ -322,7 +325,7 @@ def _split_rest(rest: Float64, variance: Float64, haze: Float64) -> tuple[float,
 def _level(sums: Float64) -> tuple[Float64, Float64]:
     """Flux above ambient per unit geometry factor, and its variance, (BINS,); NaN in bins with few exposures.
 
-    sums: (BINS, 4), ones, exposures, and exposures weighted with geometry factor and ambient flux.
+    sums: (BINS, 4), ones, exposures, exposures times geometry factor, exposures times ambient flux.
     """
     ones, exposures, geometric, ambient = sums.T
     few = exposures < 50
@@ -381,20 +384,21 @@ def _gain(gain: Float32, seen: Float64, ambient: float, before: Float64) -> Floa
     haze_share = float(before.mean() / (before.mean() + ambient + 1e-9))
     if haze_share < 0.3:
         return gain
-    # Few counts say little: as if 100 more had been as expected.
+    # 100 counts as expected are added, so that a few counts change little.
     learned = gain * np.clip((ones + 100.0) / (expected + 100.0), 0.5, 2.0)
     return np.asarray(np.clip(learned / learned.mean(), 0.2, 5.0), dtype=np.float32)
 
 
 CUT: Final = 0.05
-"""Share of a row's depth range outside the picture below which the row tells how often stripes are missing."""
+"""Amplitudes, 'no stripe' and positions are learned from rows with less than this share of their prior beyond the
+picture's border."""
 CERTAIN: Final = 0.6
-"""Probability within 1 px from which a row teaches the level behind the stripe."""
+"""The level behind the stripe is learned from rows with more than this probability within 1 px."""
 CLEAR: Final = 0.97
 CLEAR_PX: Final = 6
-"""Rows more certain than CLEAR measure the haze itself, with pixels more than CLEAR_PX before their stripe."""
+"""The extinction is learned from rows more certain than CLEAR, at pixels more than CLEAR_PX before their stripe."""
 LEAST_OWN: Final = 1e-3
-"""Least haze of a line over that of the other lines at a pixel: below it there is no telling them apart."""
+"""Least haze of a line at a pixel relative to that of the other lines: if it is weaker, this share is assumed."""
 
 
 @numba.njit(cache=True, nogil=True)
@@ -404,12 +408,15 @@ def learn_rows(
 ) -> float:  # fmt: skip
     """Do the expectation step over some lines, and return the log evidence.
 
-    levels (bins, LEVELS) gets ones, exposures, and exposures weighted with geometry factor and with ambient flux: 0 to
-    3 of pixels before the stripe and 4 to 7 of pixels behind it, each weighted by the probability of being there, 8 to
-    11 of pixels well before a stripe beyond doubt. 12 are stripes, 13 stripes if all positions were equally likely.
-    rows_seen (rows, 2) and columns_seen (columns, 2) get ones before the stripe and those expected; amplitude_mass
-    (M + 1,) gets rows per amplitude, the last entry 'no stripe'. All are added to what is there. Pixels with more
-    ambient flux than hot_flux are left out.
+    Added to levels (bins, LEVELS), in columns:
+    - 0 to 3, of pixels before the stripe: ones, exposures, exposures times geometry factor, exposures times ambient
+      flux, all weighted by the probability that the pixel lies before the stripe;
+    - 4 to 7: the same of pixels behind the stripe, of rows more certain than CERTAIN;
+    - 8 to 11: the same, unweighted, of pixels more than CLEAR_PX before the stripe of rows more certain than CLEAR;
+    - 12 and 13: stripes, and stripes if all positions were equally likely.
+    Added to rows_seen (rows, 2) and columns_seen (columns, 2): ones before the stripe and those expected. Added to
+    amplitude_mass (M + 1,): rows per amplitude, last those with 'no stripe'. Pixels with more ambient flux than
+    hot_flux are left out of levels 0 to 11, rows_seen and columns_seen.
     """
     amplitudes = state.amplitude.shape[0]
     row = row_buffers(sweep.window, amplitudes)
@@ -447,7 +454,7 @@ def _learn_levels(
     (y, c, k), (length, first, last, start) = where, span
     step = 1 if sweep.near_is_left else -1
     reach = state.psi.shape[0]
-    # Doubtful rows would teach the level behind the stripe their own guess; haze before it is plentiful anyway.
+    # A doubtful row's pixels behind the stripe would confirm its own guess. For haze, all rows are used.
     mode, near_mass = mode_of(row.posterior, first, last)
     certain, clear = near_mass > CERTAIN, near_mass > CLEAR
     passed = 0.0
@@ -458,10 +465,10 @@ def _learn_levels(
             continue
         gain, others = row.gain[t], row.others[t]
         if others > 0.0:
-            # Other lines' haze is haze like this one's: what there is of both tells the strength of each.
+            # Other lines' haze has the same profile: the factor of the profile grows by their share.
             own = row.before[t] - ambient - others
             gain *= 1.0 + others / max(own, LEAST_OWN * others)
-        # The stripe's own width counts for neither side.
+        # Pixels within the stripe's width count for neither side.
         ahead = 0.0
         near = row.posterior[t]
         for d in range(1, reach + 1):

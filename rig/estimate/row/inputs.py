@@ -7,7 +7,7 @@ depth w' = 2 w / (c + p), and haze, rest, S the profiles of `rig.estimate.row.mo
     before = ambient + G haze(w') + others,    behind = ambient + G rest(w') + others,    scale = S(w')
 
 in photons per exposure; `others` is the haze of lines lit at the same time (`others_at`). All are float32, and fluxes
-are limited to FLUX_MIN..FLUX_MAX. `judge_line` fills them in and gives the row's posterior.
+are limited to FLUX_MIN..FLUX_MAX. `judge_line` computes all of them and the row's posterior.
 
 Fog scatters the stripe's own light once more, into a halo on both sides of it. At the distance d along the row from a
 stripe of s photons the halo has, per pixel,
@@ -31,7 +31,7 @@ from rig.simd import Float32, Float64, Int32
 
 
 def halo_shares(model: RowModel, pixels: int) -> Float32:
-    """rho of the module at each profile bin and 0 to pixels - 1 px from the stripe, (BINS, pixels)."""
+    """rho (see the module) at each profile bin, at 0 to pixels - 1 px from the stripe, (BINS, pixels)."""
     reach = np.array(HALO_REACHES_PX)[:, None]
     shape = np.exp(-np.arange(pixels) / reach) / (2 * reach)
     return np.asarray(over_bins(np.asarray(model.halo), len(model.profile)) @ shape, np.float32)
@@ -82,7 +82,8 @@ class Lines(NamedTuple):
 class RowState(NamedTuple):
     """A RowModel as the kernels read it: log weights instead of weights, the line's profiles instead of its width.
 
-    glow: (BINS,), the halo at the stripe itself, photons per pixel over those of the stripe.
+    psi: `line_profile`; fine: `fine_profiles`; table: `logit_table`. glow: (BINS,), the halo in the stripe's own pixel,
+    as a share of the stripe's photons.
     """
 
     profile: Float32
@@ -103,10 +104,10 @@ class RowState(NamedTuple):
 class RowBuffers(NamedTuple):
     """Buffers of one row, made once per thread. `row_fluxes` fills before to log_prior, `judge_line` the others too.
 
-    Pixels go from the nearest depth to the farthest. n: 1s. before, behind: flux of a pixel if the stripe lies behind
-    it, and if it lies before it. scale: stripe photons at amplitude 1. cell: nearest profile bin. gain: factor G of the
-    haze, by which its profile is multiplied. others: flux of other lines' haze, included in before and behind. w:
-    inverse depth. log_prior: of positions. The rest: see `row_scores` and `row_posterior`.
+    Pixels go from the nearest depth to the farthest. n: counts. before: flux of a pixel that lies before the stripe;
+    behind: of one behind it. scale: stripe photons at amplitude 1. cell: nearest profile bin. gain: the factor G, by
+    which the profile is multiplied. others: flux of other lines' haze, included in before and behind. w: inverse depth.
+    log_prior: of positions. For the other fields see `row_scores` and `row_posterior`.
     """
 
     n: Float32
@@ -126,9 +127,9 @@ class RowBuffers(NamedTuple):
 
 
 def sweep_of(geometry: SweepGeometry) -> Sweep:
-    """A sweep's geometry as the kernels take it."""
+    """A sweep's geometry in the form that the kernels read."""
     near_m, far_m = geometry.depth_range_m
-    # Kernels read most of them by their addresses.
+    # Contiguous, because kernels read most of these arrays by address.
     x0, x_lo, x_hi = (np.ascontiguousarray(a, np.int32) for a in (geometry.x0, geometry.x_lo, geometry.x_hi))
     u, v = (np.ascontiguousarray(a, np.float32) for a in (geometry.u, geometry.v))
     return Sweep(
@@ -138,7 +139,7 @@ def sweep_of(geometry: SweepGeometry) -> Sweep:
 
 
 def state_of(model: RowModel) -> RowState:
-    """A learned state as the kernels take it."""
+    """A learned state in the form that the kernels read."""
     return RowState(
         model.profile, model.w_lo, model.per_w, model.row_gain, model.column_gain, model.ambient, model.amplitude,
         np.log(np.maximum(model.weight, 1e-6)).astype(np.float32), model.none_weight, line_profile(model.line_sigma_px),
@@ -161,7 +162,7 @@ def row_buffers(window: int, amplitudes: int) -> RowBuffers:
 
 @numba.njit(inline="always")
 def path_to_plane(px, py, pz, vy):  # type: ignore[no-untyped-def]
-    """Length of the light's path to a plane's points on a row of tangent vy, per unit of depth."""
+    """Length of the light's path to a plane's points on a row, per unit of depth. vy: ray tangent v of the row."""
     # Tangent u at which this row meets the plane infinitely far away.
     path_u = -(py * vy + pz) / px
     return np.sqrt(1.0 + path_u * path_u + vy * vy)
@@ -169,7 +170,7 @@ def path_to_plane(px, py, pz, vy):  # type: ignore[no-untyped-def]
 
 @numba.njit(inline="always")
 def profile_place(px, py, pz, ux, vx, path_p, w_lo, per_w, bins):  # type: ignore[no-untyped-def]
-    """Path from the camera to a plane's point, per unit of depth; the point's inverse depth, and its fractional bin."""
+    """Path from the camera to a plane's point, per unit of depth, the point's inverse depth, and its fractional bin."""
     path_c = np.sqrt(np.float32(1.0) + ux * ux + vx * vx)
     w = px * ux + py * vx + pz
     return path_c, w, min(max((w * 2.0 / (path_p + path_c) - w_lo) * per_w, 0.0), bins - 1.001)
@@ -177,13 +178,14 @@ def profile_place(px, py, pz, ux, vx, path_p, w_lo, per_w, bins):  # type: ignor
 
 @numba.njit(inline="always")
 def flux_between(ambient, gain, one, other, part):  # type: ignore[no-untyped-def]
-    """Flux of ambient light plus gain times the profile, a `part` of the way from `one` to `other`, the next bin's."""
+    """Flux of ambient light plus gain times the profile, which is interpolated between the values `one` and `other` of
+    two successive bins; part: 0 at the first, 1 at the second."""
     return min(max(ambient + gain * (one + part * (other - one)), FLUX_MIN), FLUX_MAX)
 
 
 @numba.njit(inline="always")
 def line_light(sweep, state, y, c, middle):  # type: ignore[no-untyped-def]
-    """Length p of the light's path to the plane's points on row y, per unit of depth, and G of the module without c.
+    """Length p of the light's path to the plane's points on row y, per unit of depth, and the module's G over c.
 
     middle: pixel of the row whose v is used.
     """
@@ -194,10 +196,10 @@ def line_light(sweep, state, y, c, middle):  # type: ignore[no-untyped-def]
 
 @numba.njit(inline="always")
 def others_at(sweep, state, y, c, x):  # type: ignore[no-untyped-def]
-    """Haze at one pixel from the lines that are lit together with column c, on whichever side of c's stripe it lies.
+    """Haze at one pixel from the lines that are lit together with column c; the same before and behind c's stripe.
 
-    The places of their own stripes are unknown. The probability that a line's haze has not ended at the pixel is taken
-    as the share of the depth range behind the pixel's point on the line's plane.
+    The positions of the other lines' stripes are unknown. The probability that a line's haze has not ended at the pixel
+    is taken as the share of the depth range, in inverse depth, behind the pixel's point on that line's plane.
     """
     profile, light = state.profile, 0.0
     ux, vx = np.float64(sweep.u[y, x]), np.float64(sweep.v[y, x])
@@ -232,7 +234,7 @@ def fluxes_of(plane, ux, vx, ambient, profile, w_lo, per_w, path_p, strength):  
 
 @numba.njit(inline="always")
 def fluxes_at(sweep, state, y, x, c, path_p, strength):  # type: ignore[no-untyped-def]
-    """`fluxes_of` of one pixel for column c's stripe, with other lines' haze in both fluxes and as a last number."""
+    """`fluxes_of` for pixel x of row y and column c, with other lines' haze added to both fluxes and returned last."""
     before, behind, scale, gain, w, cell = fluxes_of(
         sweep.plane[c], sweep.u[y, x], sweep.v[y, x], state.ambient[y, x], state.profile, state.w_lo, state.per_w,
         path_p, strength,
@@ -246,7 +248,7 @@ def fluxes_at(sweep, state, y, x, c, path_p, strength):  # type: ignore[no-untyp
 
 @numba.njit(cache=True, nogil=True)
 def row_fluxes(sweep: Sweep, state: RowState, row: RowBuffers, y: int, c: int) -> tuple[int, int, int, int]:
-    """Fill before to log_prior of `row` for row y of column c, which do not depend on the counts.
+    """Fill the buffers before to log_prior for row y of column c. They do not depend on the counts.
 
     Returns (length, first and last index that a stripe may have, x of index 0); pixel t is x + t if near is left, else
     x - t. The length is 0 if there is nothing to search.
@@ -290,9 +292,9 @@ def row_fluxes(sweep: Sweep, state: RowState, row: RowBuffers, y: int, c: int) -
 def judge_line(
     sweep: Sweep, state: RowState, row: RowBuffers, lines: Lines, i: int
 ) -> tuple[int, int, int, int, float, float, float]:
-    """Compute the posterior of line i, in `row`.
+    """Compute the posterior of line i and write it to `row`.
 
-    Returns the values of `row_fluxes`, then the probability of 'no stripe', the share of its prior that is due to the
+    Returns the values of `row_fluxes`, then the probability of 'no stripe', the part of the prior that lies beyond the
     picture's border, and the log evidence.
     """
     c = lines.column[i]

@@ -19,9 +19,10 @@ amplitudes,
 
     P(j) ~ prior_j sum over m of weight_m exp(log-likelihood(j, m))
 
-`row_scores` is the log-likelihood, `row_posterior` the sum over amplitudes, `mode_of` the answer: read them in this
-order. Arrays of a row are float32 (L,), scores float32 (M, L). `rig.estimate.row.inputs` and `rig.estimate.row.model`
-explain where `before`, `behind`, `scale` and the priors come from. Only `logit_table` and LOST are approximations.
+`row_scores` computes the log-likelihood, `row_posterior` the sum over amplitudes, `mode_of` the answer: read them in
+this order. Arrays of a row are float32 (L,), scores of M amplitudes float32 (M, L). `rig.estimate.row.inputs` and
+`rig.estimate.row.model` explain where `before`, `behind`, `scale` and the priors come from. Only `logit_table` and LOST
+are approximations.
 
 `rig.estimate.search` and `rig.estimate.joint.labels` are fast forms of this and are tested against it.
 tests/unit/rig/estimate/row/test_likelihood.py compares this module with direct sums, in 50 digits and float64.
@@ -41,19 +42,19 @@ FLOOR: Final = 1e-3
 EXPONENT_LOW: Final = -21
 EXPONENT_HIGH: Final = 8
 CELL_BITS: Final = 8
-"""Octaves of flux that `logit_table` spans, and bits of its cells within an octave."""
+"""`logit_table` spans fluxes from 2^EXPONENT_LOW to 2^EXPONENT_HIGH, with 2^CELL_BITS cells per octave."""
 TABLE_BASE: Final = np.uint32((127 + EXPONENT_LOW) << CELL_BITS)
 TABLE_SHIFT: Final = np.uint32(23 - CELL_BITS)
 """A float32 shifted right by TABLE_SHIFT bits, less TABLE_BASE, is the number of its cell."""
 FLUX_MIN: Final = np.float32(2.0**EXPONENT_LOW)
 FLUX_MAX: Final = np.float32(2.0**EXPONENT_HIGH * 0.999)
-"""Photons per exposure and pixel that the table begins and ends with."""
+"""Smallest and largest flux in the table, photons per exposure and pixel."""
 LABEL_PX: Final = 0.25
 """Spacing of the sub-pixel positions around the most probable pixel."""
 LABELS: Final = 13
-"""Number of sub-pixel positions, up to 1.5 px each way: enough for the mean of a peak, without the next one."""
+"""Number of sub-pixel positions, up to 1.5 px each way: enough for the mean of a peak, without another peak."""
 LOST: Final = np.float32(24.0)
-"""Nats below the best from which on a hypothesis does not count (exp(-24) = 4e-11)."""
+"""Hypotheses at least this many nats below the best are ignored (exp(-24) = 4e-11)."""
 
 
 def logit_table() -> Float32:
@@ -132,16 +133,16 @@ def row_scores(
 def none_prior(
     near: float, far: float, w_first: float, w_last: float, none_weight: float
 ) -> tuple[float, float, float]:
-    """Prior of 'no stripe' as `row_posterior` takes it, from the part of the depth range that the picture shows.
+    """The three priors of 'no stripe' for `row_posterior`, from the part of the depth range that the picture shows.
 
     near, far: ends of the depth range as inverse depths; w_first, w_last: those of the first and last position.
-    Positions that the picture's border cuts off are as likely, per inverse depth, as those that it shows.
+    Positions beyond the picture's border are as likely, per inverse depth, as those in the picture.
     """
     span = near - far
     cut_near = min(max((near - w_first) / span, 0.0), 1.0)
     cut_far = min(max((w_last - far) / span, 0.0), 1.0)
     rest = 1.0 - none_weight
-    # A row that shows nearly nothing must not lose its few positions altogether.
+    # Where hardly any of the depth range is in the picture, its few positions keep at least a tenth.
     cut = cut_near + cut_far
     if cut > 0.9:
         cut_near, cut_far = cut_near * 0.9 / cut, cut_far * 0.9 / cut

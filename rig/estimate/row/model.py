@@ -1,10 +1,10 @@
 """The learned model of light and medium for the row likelihood. All of it is learned from counts.
 
-Path inverse depth w is 1 over the mean of the two path lengths, scanner to point and point to camera. Haze that was
-scattered once depends on these two lengths only. So there are two profiles over BINS bins of w, haze before the stripe
-and the level behind it, each multiplied by a gain per row and per column. A stripe carries a S(w) photons, where a is
-one of AMPLITUDES learned amplitudes (reflectance and laser power) and S = w^2 exp(-2 extinction / w), scaled to 1 in
-the middle bin.
+Path inverse depth w (w' in `inputs`) is 1 over the mean of the two path lengths, scanner to point and point to camera.
+Haze that was scattered once depends on these two lengths only. So there are two profiles over BINS bins of w, haze
+before the stripe and the level behind it, each multiplied by a gain per row and per column. A stripe has a S(w) photons
+per exposure, where a is one of AMPLITUDES learned amplitudes (reflectance and laser power) and S = w^2 exp(-2
+extinction / w), scaled to 1 in the middle bin.
 
 The line is a Gaussian of learned width, integrated over pixels (`pixel_shares`).
 """
@@ -29,9 +29,9 @@ EXTINCTION_MAX_PER_M = 5.0
 HALO_NODES = 12
 """Number of path inverse depths at which the halo is learned."""
 HALO_REACHES_PX = (8.0, 16.0, 32.0, 64.0, 128.0)
-"""Reaches of the exponentials that make up a halo: all are wider than a line, the last is even over most windows."""
+"""Decay lengths of the exponentials that make up a halo: from wider than a line to nearly even over most windows."""
 OPTICAL_DEPTH_MAX = 50.0
-"""Largest extinction times path at which haze is looked for: e^-100 of it comes back."""
+"""Largest extinction times path length in a fit of haze: only e^-100 of the light would come back."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -42,11 +42,10 @@ class RowModel:
     behind it in photons per exposure and pixel at unit geometry factor, the stripe scale S, and the log prior of
     positions. row_gain: (rows,) and column_gain: (columns,) float32, strength of the haze on each. ambient: (rows,
     width) float32, photons per exposure of ambient light and dark counts. amplitude, weight: (AMPLITUDES,), photons at
-    S = 1 and their probability.
-    none_weight: probability of a row without stripe. line_sigma_px: width of the line. extinction_per_m and its
-    standard deviation: NaN if the haze does not tell it. halo: (HALO_NODES, reaches) float32, light of the stripe's
-    halo over its own (`rig.estimate.row.inputs`), 0 if there is none. before: labels that the previous map left to this
-    one (`rig.estimate.joint.temporal`), None if it left none.
+    S = 1 and their probability. none_weight: probability of a row without stripe. line_sigma_px: standard deviation of
+    the line's profile. extinction_per_m and its standard deviation: NaN if the haze does not determine it. halo:
+    (HALO_NODES, reaches) float32, light of the halo as a share of the stripe's (`rig.estimate.row.inputs`), 0 if there
+    is none. before: labels of the previous map as a prior (`rig.estimate.joint.temporal`), None if not used.
     """
 
     profile: Float32
@@ -130,7 +129,8 @@ class HazeFit:
 
 
 def fit_haze(path_m: Float64, flux: Float64, variance: Float64) -> HazeFit | None:
-    """Weighted fit of an exponential to haze flux (bins,) with its variance (bins,); None with hardly any haze.
+    """Weighted fit of an exponential to haze flux (bins,) with its variance (bins,). None if fewer than 4 bins are
+    known or there is hardly any haze.
 
     Gauss-Newton on amplitude and extinction. The extinction is kept between 0 and EXTINCTION_MAX_PER_M, and below
     OPTICAL_DEPTH_MAX at the nearest haze.

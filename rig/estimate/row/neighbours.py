@@ -1,7 +1,7 @@
-"""Copies of maps with a margin, in which compiled code compares the answers around each one without checking bounds.
+"""Copies of maps with a margin: compiled code can compare each answer with those around it without checking bounds.
 
-Answers are compared by their distance in px from where the line of their row and column is at one depth: neighbours
-whose distances are the same within SAME_PX lie on one surface. Arrays are float32 (rows, columns).
+Compared is an answer's distance in px from the position of its column's line at a fixed depth: neighbours whose
+distances are the same within SAME_PX lie on one surface. Arrays are float32 (rows, columns).
 """
 
 from typing import Final
@@ -14,16 +14,16 @@ from rig.simd.memory import address_of, copy_floats, load_float32
 from rig.simd.vectors import LANES, where_small, zero_float32
 
 SAME_PX: Final = np.float32(1.0)
-"""Neighbours whose distances differ by no more lie on the same surface."""
+"""Neighbours whose distances differ by at most this lie on the same surface."""
 MARGIN: Final = 6
-"""Rows above and below that copies have more, as far as anything is pooled; to both sides they have LANES columns."""
+"""Extra rows above and below in a copy: the farthest distance over which answers are pooled."""
 COPIED_ROWS: Final = 32
-"""Rows that are copied at once where that leaves the copies in the cache."""
+"""Rows that are copied at a time where the copies should stay in the cache."""
 
 
 @numba.njit(cache=True, nogil=True)
 def with_margin(array: Float32, first_row: int, last_row: int) -> Float32:
-    """Copy of rows first_row..last_row-1 with the rows and columns around them, NaN where there are none."""
+    """Copy of rows first_row..last_row-1 with MARGIN rows and at least LANES columns around; NaN outside the array."""
     rows, columns = array.shape
     top, end = max(first_row - MARGIN, 0), min(last_row + MARGIN, rows)
     width = (-(-columns // LANES) + 2) * LANES
@@ -41,10 +41,11 @@ def with_margin(array: Float32, first_row: int, last_row: int) -> Float32:
 
 @numba.njit(forceinline=True)
 def on_surface(distance, light, here, width, reach):  # type: ignore[no-untyped-def]
-    """Number of the answers up to `reach` rows and columns away on the same surface, and their light, of LANES answers.
+    """For each of LANES answers, the number of answers on its surface up to `reach` rows and columns away, and the sum
+    of their light.
 
-    distance, light: addresses of copies `with_margin` that are `width` wide; here: the element of the first answer.
-    An answer counts itself; one without a distance has none.
+    distance, light: addresses of copies `with_margin` that are `width` wide; here: index of the first answer. An answer
+    counts itself; without a distance (NaN) the number is 0.
     """
     own, number, lit, one = load_float32(distance, here), zero_float32(), zero_float32(), zero_float32() + 1.0
     for line in range(here - reach * width, here + reach * width + 1, width):

@@ -1,5 +1,6 @@
 """The fast search for the best position of a row, tested against the exact likelihood, `rig.estimate.row.likelihood`.
 
-Sixteen rows or pixels at a time are scored in 16 bits, then the best place of each row is examined closely. `stream`
-judges columns while the sweep still goes on; `online_learning` keeps the learned model between maps.
+Sixteen rows or pixels at a time are scored in 16 bits, then the best position of each row is examined closely. To judge
+a column is to estimate its stripe on every row: `stream` does so while the sweep still goes on. `online_learning` keeps
+the learned model between maps.
 """

@@ -1,13 +1,14 @@
 """Close look at the best position of a row, compiled: a fast form of `rig.estimate.row.likelihood`, tested against it.
 
-It finds the position of the line within the pixel from LABELS lines LABEL_PX apart, with one label per lane of a
-vector. With L and R the flux left and right of the line, s its light and f_i,t its share in pixel t at label i,
+It finds the position of the line within the pixel. LABELS positions (labels), LABEL_PX apart, are compared, one per
+lane of a vector. With L and R the flux left and right of the line, s its light, f_i,t its share in pixel t at label i,
+and l_i,t the part of pixel t that lies left of it,
 
-    score_i = K constant_i + sum over t of n_t weight_i,t,   from flux_i,t = share L + (1 - share) R + s f_i,t
+    score_i = K constant_i + sum over t of n_t weight_i,t,   from flux_i,t = l_i,t L + (1 - l_i,t) R + s f_i,t
 
 in units of 1 / (128 >> shift) octaves of likelihood, saturating int16. The position is the posterior mean over labels,
 float32. weight (int8) and constant (float32) are tabled over two fluxes, haze and line, two levels an octave; s is
-taken from the counts themselves.
+measured from the counts.
 """
 
 from typing import Final, NamedTuple
@@ -36,7 +37,7 @@ from rig.simd.vectors import (
 )
 
 LEVEL_SHIFT: Final = np.uint32(22)
-"""Two levels an octave: the exponent and the first bit behind it of a float32."""
+"""Shift that keeps the exponent and first mantissa bit of a float32: two levels an octave."""
 LOWEST_OCTAVE: Final = -14
 LEVEL_BASE: Final = np.uint32((127 + LOWEST_OCTAVE) << 1)
 LEVELS: Final = 36
@@ -48,10 +49,10 @@ LOWEST_SCORE: Final = np.float32(-32000.0)
 class Closeup(NamedTuple):
     """Tables of the close look.
 
-    weight: int8 (LEVELS, LEVELS, 2, R + 1, LANES, 2) over haze, line, last bit of the pixel looked at, pair of pixels
-    from `first_px` on, label: units per count; constant: float32 (LEVELS, LEVELS, LANES), units per exposure. The mean
-    over the labels is subtracted from both. Units are 128 >> shift an octave. label, square: float32 (LANES,), number
-    of the label from the middle one, and its square, in the order UNPACKED.
+    weight: int8 (LEVELS, LEVELS, 2, R + 1, LANES, 2) over haze, line, last bit of the pixel's index, pair of pixels
+    from `first_px` on, label, pixel of the pair: units per count; constant: float32 (LEVELS, LEVELS, LANES), units per
+    exposure. The mean over the labels is subtracted from both. Units are 128 >> shift an octave. label, square: float32
+    (LANES,), number of the label from the middle one, and its square, in the order UNPACKED.
     """
 
     weight: NDArray[np.int8]
@@ -113,7 +114,7 @@ def closeup_tables(weight: Float32, constant: Float32, units: int) -> Closeup:
 
 
 def largest_score(weight: Float32, units: int) -> float:
-    """Largest sum of the weights of a label, with `units` units an octave, from `label_weights`."""
+    """Largest sum of a label's weights (absolute values), with `units` units an octave, from `label_weights`."""
     return float(np.abs(_cut(weight, units)).sum(axis=2).max())
 
 

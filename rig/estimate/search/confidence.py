@@ -1,20 +1,21 @@
 """Confidence of `likelihood`: the probability that an answer lies within a pixel of a stripe, from its neighbours.
 
 A row alone cannot tell a dim stripe from a place where the haze merely ends, behind the edge of something nearer: the
-counts of both look alike. Its neighbours can. They agree on a surface, and what they see there adds up:
+counts of both look alike. Its neighbours can: on a surface their answers agree, and their light adds up:
 
     confidence = 1 / (1 + exp(A - B ln odds - C asinh contrast + D ln K))
 
-- odds: (agree - 1/2) / (others + 1/2). Of the answers up to REACH rows and columns away, itself among them, those that
-  `agree` lie on one surface: their distance from where the line is at one depth is the same, within SAME_PX. An answer
-  without neighbours has odds 1. Odds above 1 count as far as there is light, min(max(contrast / SEEN, 0), 1).
-- contrast: light above half the haze and ambient light that those which agree have on average, less SPARED pixels of
-  haze, over its noise, at least LEAST. An answer may lie a little before the end of the haze, and then takes its light
-  for the stripe's.
+- odds: (agree - 1/2) / (others + 1/2). agree: number of answers on this answer's surface, up to REACH rows and columns
+  away, itself included. Their distances from the position of the line at a fixed depth are the same within SAME_PX.
+  others: the number of all other answers there. An answer without neighbours has odds 1. If ln odds is positive, it is
+  multiplied by min(max(contrast / SEEN, 0), 1): without light, agreement is no evidence.
+- contrast: mean light of the answers that agree, above ambient light and half the haze, less SPARED pixels of haze,
+  over the noise of this mean; at least LEAST. SPARED is for answers a little before the end of the haze, which take
+  light of the haze for the stripe's.
 - K: exposures. The more there are, the more alike do neighbouring rows place the end of a haze.
 
 A, B, C and D are fitted by maximum likelihood to random scenes of the tests' simulator, at K = 1 to 30, with haze,
-ambient light and stripes of many strengths; all answers count, those where there is no stripe as wrong ones.
+ambient light and stripes of many strengths. Answers where there is no stripe count as wrong.
 docs/results/confidence.md says how far it can be believed.
 """
 
@@ -40,10 +41,10 @@ D: Final = 0.515
 SPARED: Final = 0.75
 LEAST: Final = -30.0
 SEEN: Final = 3.0
-"""Contrast from which on agreement counts in full: rows without any light agree too, on the first place searched."""
+"""Contrast from which on agreement counts in full. Rows without any light agree too, on the first position searched."""
 REACH: Final = 3
 MORE_NOISE: Final = 1.0 / 9.0
-"""Counts: the noise of light is not zero where nothing was counted."""
+"""In counts: the noise of light is not zero where nothing was counted."""
 
 
 @numba.njit(cache=True, nogil=True)
@@ -53,10 +54,10 @@ def confidences(
 ) -> None:  # fmt: skip
     """Write the confidence of rows first_row..last_row-1, 0 where there is no answer.
 
-    All but `exposures` (columns,) and numbers are (rows, columns). distance: in px from where the line is at one depth,
+    Arrays are (rows, columns), exposures (columns,). distance: in px from the position of the line at a fixed depth,
     NaN where there is no answer; light: photons per exposure above ambient light and half of the haze; there: number of
-    answers around each one, itself counted; ambient: usual light of a pixel behind the stripe; line_px: pixels that
-    light is summed over.
+    answers up to REACH rows and columns away, itself included; ambient: usual light of a pixel behind the stripe;
+    line_px: number of pixels over which light is summed.
     """
     columns = confidence.shape[1]
     k, line = with_margin(exposures.reshape(1, -1), 0, 1), np.empty(columns + LANES, np.float32)
@@ -77,7 +78,7 @@ def confidences(
 
 @numba.njit(forceinline=True)
 def _judged(at, here, width, exposed, ambient, line_px):  # type: ignore[no-untyped-def]
-    """Confidence of LANES answers, the first of which is element `here` of the copies at these addresses."""
+    """Confidence of LANES answers. at: addresses of the four copies; here: index of the first answer in them."""
     distance, light, haze, there = at
     none, one = zero_float32(), zero_float32() + np.float32(1.0)
     agree, lit = on_surface(distance, light, here, width, REACH)
@@ -99,9 +100,9 @@ def _judged(at, here, width, exposed, ambient, line_px):  # type: ignore[no-unty
 def believed(
     found: StripeTable, reference_px: Float32, exposures: Int32, ambient: float, line_px: int, workers: RowWorkers
 ) -> StripeTable:
-    """A stripe table of the search with the confidence that neighbours give it, and without light below zero.
+    """A stripe table of the search with confidences from neighbours, and without negative signals.
 
-    reference_px: (rows, columns), where the line is at one depth; the rest as for `confidences`.
+    reference_px: (rows, columns), position of the line at a fixed depth; other arguments: see `confidences`.
     """
     distance, side = found.x_px - reference_px, 2 * REACH + 1
     here = np.isfinite(distance).astype(np.float32)

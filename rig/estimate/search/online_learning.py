@@ -1,9 +1,9 @@
 """Decides when an estimator learns, and holds the model that it uses until then.
 
-The first map is estimated with a model learned from that map itself. A later map is used for learning when enough
-frames have come since the last lesson (TEACH_FRAMES), on a thread beside the stream. The new model is used a fixed
-number of frames later (LAG_FRAMES), so that a live scan hardly ever waits and results do not depend on the speed of the
-machine.
+The first map is estimated with a model learned from that map itself. A later map is used for learning (a lesson) when
+enough frames have come since the last lesson (TEACH_FRAMES), on a thread beside the stream. The new model is used a
+fixed number of frames later (LAG_FRAMES), so that a live scan hardly ever waits and results do not depend on the speed
+of the machine.
 """
 
 from collections.abc import Callable
@@ -28,23 +28,22 @@ from rig.simd import Float64
 from rig.threads import RowWorkers, yield_to_others
 
 LEAST_SURE = 0.02
-"""Share of confident answers below which a map teaches nothing: a closed shutter must not spoil the maps after it."""
+"""Least share of confident answers in a map that is used for learning: a closed shutter must not spoil later maps."""
 TEACH_FRAMES = 100_000
-"""Lit frames from one map that teaches to the next: a second at 100 kHz. Learning costs some 0.2 s of one core, with
-the tables of `joint` twice that."""
+"""Least number of lit frames from one lesson to the next: a second at 100 kHz. Learning costs some 0.2 s of one core,
+with the tables of `joint` twice that."""
 LAG_FRAMES = 50_000
-"""Lit frames from a map that teaches to the first one that heeds it: time to learn beside the stream."""
+"""Lit frames from a lesson's map to the first map that is estimated with the new model: time to learn."""
 
 Tables = TypeVar("Tables")
-"""Tables that an estimator makes ready under a model, for sweeps of one geometry."""
+"""An estimator's tables for one model and one geometry."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class LearningSetting:
-    """A model and the kind of sweep for which tables are made. Raises UsageError if it was learned from one of another
-    size.
+    """A model and the kind of sweep for which tables are made. exposures: nominal; dark: whether there are dark frames.
 
-    exposures: of most columns; dark: whether sweeps have dark frames.
+    Raises UsageError if the model was learned from a sweep of another size.
     """
 
     model: RowModel
@@ -65,18 +64,17 @@ class LearningSetting:
             )
 
     def same(self, other: "LearningSetting") -> bool:
-        """Whether the other one has the same tables."""
+        """Whether the other setting has the same tables."""
         alike = (self.exposures, self.dark) == (other.exposures, other.dark)
         return alike and self.model is other.model and self.geometry is other.geometry
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Seen:
-    """The part of a sweep that is used for learning: its tally, ones and exposures behind clear stripes, some lines of
-    counts.
+    """The part of a sweep that is used for learning.
 
-    intensity: of the tally, taken when the map was made. more: input of the estimator's own `learn_more`, see
-    `OnlineLearner`.
+    tally: of the sweep; intensity: as returned by the tally; quiet: ones and exposures of pixels behind clear stripes,
+    see `ambient_map`; lines: some counts. more: input of the estimator's own `learn_more`, see `OnlineLearner`.
     """
 
     tally: FrameTally
@@ -89,8 +87,8 @@ class Seen:
 class OnlineLearner(Generic[Tables]):
     """The model that an estimator uses, None before the first lesson, and the tables made for it.
 
-    make: makes tables. learn_more: learns from `more` of a `Seen`, in addition to what every estimator learns. Both are
-    also called on the thread beside the stream. learns: whether later maps change the model.
+    make: makes tables. learn_more: learns from `more` of a `Seen`, in addition to what every estimator learns. Both run
+    on the learning thread, `make` also on the caller's. learns: whether later maps change the model.
     """
 
     def __init__(
@@ -110,22 +108,23 @@ class OnlineLearner(Generic[Tables]):
         self._lesson: Future[tuple[LearningSetting, Expectation, Tables]] | None = None
         self._tutor = ThreadPoolExecutor(1, thread_name_prefix="learning", initializer=yield_to_others)
         self._frames_since = 0
-        """Lit frames since the last map that taught."""
+        """Lit frames since the last lesson's map."""
 
     def model_for(self, first: Callable[[], RowModel]) -> RowModel:
-        """The model to estimate a sweep with. first: learns it from the sweep if there is none yet."""
+        """The model with which to estimate a sweep. first: called to learn it from the sweep if there is none yet."""
         return self.model if self.model is not None else first()
 
     def tables(self, setting: LearningSetting, workers: RowWorkers) -> Tables:
-        """Tables for a setting; made once while it stays the same."""
+        """Tables for a setting, made again only when the setting changes."""
         if self._made is None or not self._made[0].same(setting):
-            self._made = None  # their memory may go before more is made
+            self._made = None  # frees the old tables before new ones are made
             self._made = setting, self._make(setting, workers)
         return self._made[1]
 
     def attend(self, stripes: StripeTable, used: RowModel, frames: int, see: Callable[[], Seen]) -> None:
-        """Note a map of that many lit frames, estimated with `used`. `see` is called only if the map is to be used for
-        learning.
+        """Take note of a map: begin a lesson from it if one is due, or take over the model of the last lesson.
+
+        used: the model that the map was estimated with; frames: its lit frames; see: called if the map is used.
         """
         self._frames_since += frames
         sure = bool(np.mean(stripes.confidence > 0.5) >= LEAST_SURE)
@@ -137,7 +136,7 @@ class OnlineLearner(Generic[Tables]):
                 assert self._made is not None, "a map has been estimated"
                 self._lesson = self._tutor.submit(self._teach, self._made[0], see(), self._taught)
         elif self._frames_since >= LAG_FRAMES:
-            # Waits where the lesson is not over: which map is estimated with what never depends on speed.
+            # Waits if the lesson is not over: which map is estimated with which model must not depend on speed.
             setting, self._taught, tables = self._lesson.result()
             self.model, self._made = setting.model, (setting, tables)
             self._lesson = None
@@ -145,7 +144,7 @@ class OnlineLearner(Generic[Tables]):
     def _teach(
         self, setting: LearningSetting, seen: Seen, before: Expectation | None
     ) -> tuple[LearningSetting, Expectation, Tables]:
-        """The setting carried on by one sweep, and the tables that follow from it, on one thread beside the stream."""
+        """Learn from one sweep, on the learning thread: the new setting, the sums for the next lesson, new tables."""
         ambient = ambient_map(seen.tally, seen.intensity, setting.geometry, seen.quiet)
         with RowWorkers(1) as workers:
             model = replace(setting.model, ambient=ambient)
@@ -157,7 +156,7 @@ class OnlineLearner(Generic[Tables]):
 
 
 def first_model(volume: CountVolume, geometry: SweepGeometry, workers: RowWorkers) -> RowModel:
-    """Learn from the first sweep, which is searched once to find which pixels were quiet behind the stripe."""
+    """Learn from the first sweep. It is searched once: the pixels behind stripes then show the ambient light."""
     intensity = volume.intensity()
     model = learn_first(volume, geometry, ambient_map(volume, intensity, geometry, None), workers)
     dark = volume.dark_counts is not None

@@ -1,8 +1,8 @@
 """Makes the tables of the search along a row, per column and band of rows, from a model and a geometry.
 
 The search is a fast form of `rig.estimate.row.likelihood`, tested against it. This module decides how many rows share a
-table (`rows_of_band`), and how fine the units of likelihood are and how often counts are halved so that no 16-bit sum
-overflows (`judge_of`). tests/unit/rig/estimate/search/test_prepare.py checks those bounds.
+table (`rows_of_band`). It also chooses the unit of likelihood, and the exposures above which counts are halved, so that
+no 16-bit sum overflows (`judge_of`). tests/unit/rig/estimate/search/test_prepare.py checks those bounds.
 """
 
 from typing import Any
@@ -34,29 +34,30 @@ from rig.simd.vectors import LANES
 from rig.threads import RowWorkers
 
 BAND_ROWS = (64, 32, 16, 8, 4)
-"""Rows that share a table: as many as a line crosses without leaving a pixel."""
+"""Rows that may share a table. The most for which the line shifts by at most BAND_SHEAR_PX are taken."""
 BAND_SHEAR_PX = 1
 TAP_SHARE = 0.06
-"""Share of the line in a pixel from which it takes part in the search."""
+"""Least share of the line in a pixel that is read to score a position."""
 SCORE_LIMIT = 12500
-"""Largest sum of taps times counts: less than half of the range of 16 bits, so that no sum of two wraps round."""
+"""Largest sum of taps times counts: less than half the range of 16 bits, so that the sum of two does not wrap round."""
 MOST_HALVINGS = 6
 CLOSE_SHIFT = 3
-"""Weights of the close-up are of 16 units an octave: what 8 bits then cut says as much as 8 octaves."""
+"""Weights of the close-up have 128 >> 3 = 16 units an octave, or fewer: 8 bits then reach 8 octaves."""
 CLOSE_LIMIT = 60000
-"""Largest sum of a label's weights times counts if all pixels were full, which no line's are. Sums saturate at half."""
+"""Largest sum of a label's weights, each times the largest count. It may exceed the range of 16 bits, in which sums
+saturate, since no line fills all pixels."""
 LOOKED_AT = 32
-"""Number of columns whose weights decide the units of all."""
+"""Number of columns from whose weights the unit for all columns is chosen."""
 ROUGH_UNITS = 4.0
-"""Units per octave in which no weight reaches its limit: a logit lies within 11 octaves of 0 either way."""
+"""Units per octave with which no weight reaches its limit: a logit is between -11 and 11 octaves."""
 CUT = 1.25
-"""Factor by which the largest weights may exceed their limit, at which they are cut."""
+"""Factor by which the largest weights may exceed WEIGHT_LIMIT. They are then cut to it."""
 FRAMES_OVER_TWICE = 8
 """A column may have this many frames more than twice the nominal number before its counts are halved."""
 HOT_FACTOR, HOT_FLUX = 4.0, 0.02
-"""A pixel is hot for the search above this many times its neighbours' ambient light plus so many photons."""
+"""A pixel is hot for the search if its ambient light exceeds HOT_FACTOR times the band's plus HOT_FLUX photons."""
 LEAST_VEIL = 0.1
-"""Haze of other lines, over the ambient light, from which on the close-up has to know of it."""
+"""Ratio of haze to ambient light above which other lines' haze is tabled. There is then no close-up."""
 
 
 def judge_of(
@@ -107,7 +108,7 @@ def judge_of(
 
 
 def _taps(psi: Float32) -> int:
-    """Pixels on either side of a line's centre that take part in the search. psi: share of the line in 0..T px."""
+    """Pixels on either side of a line's centre that are read to score a position. psi: see `row_scores`."""
     return max(1, int(np.count_nonzero(psi[1:] > TAP_SHARE)))
 
 
@@ -124,7 +125,7 @@ def _hot_of_windows(hot: Bools, geometry: SweepGeometry) -> tuple[Int32, Int16, 
     for x0 in range(0, int(geometry.x0.max(initial=0)) + 1, WORD_PX):
         # Hot pixels of windows that no column has are left out.
         inside = hot[:, x0 : x0 + geometry.window] if x0 in geometry.x0 else hot[:, :0]
-        y, x = (np.ascontiguousarray(index) for index in np.nonzero(inside))  # else: another kernel, compiled when used
+        y, x = (np.ascontiguousarray(index) for index in np.nonzero(inside))  # or another kernel would be compiled
         starts.append(before + np.searchsorted(y, np.arange(rows + 1)))
         at.append(x.astype(np.int16))
         places.append(PAIRS * pair_bytes(lanes) * y.astype(np.int32) + places_of(x, lanes))
@@ -159,7 +160,7 @@ def clear_found(found: RowAnswers) -> None:
 
 
 def stripes_of(found: RowAnswers, judge: SearchTables, workers: RowWorkers) -> StripeTable:
-    """The stripe table of a sweep that has been judged by `judge`."""
+    """The stripe table of a sweep that was judged with `judge`."""
     columns, fields, rows = found.stripe.shape
     out = np.empty((fields, rows, columns), np.float32)
     workers.over(rows, lambda first, last: turned(found.stripe, judge.limits, first, last, out))
@@ -167,8 +168,8 @@ def stripes_of(found: RowAnswers, judge: SearchTables, workers: RowWorkers) -> S
 
 
 def quiet_of(found: RowAnswers, width: int) -> Float64:
-    """Ones and exposures of pixels while clearly behind a stripe, float64 (2, rows, width); both of the halved
-    counts."""
+    """Ones and exposures of pixels while clearly behind a stripe, float64 (2, rows, width). Halved counts are added
+    with halved exposures."""
     exposures = np.repeat(np.cumsum(found.quiet_exposures[:, :-1], axis=1), STEPS, axis=1)[:, :width]
     return np.stack([pixel_order(found.quiet, width), exposures / EXPOSURE_PARTS])
 
@@ -184,7 +185,7 @@ def _limits(geometry: SweepGeometry) -> Int16:
 
 
 def rows_of_band(geometry: SweepGeometry) -> int:
-    """The largest of BAND_ROWS for which a column's window shifts by at most BAND_SHEAR_PX over the band."""
+    """The largest of BAND_ROWS for which windows shift by at most BAND_SHEAR_PX over the band, in 99 % of the cases."""
     inside = (geometry.x_lo <= geometry.x_hi) & (geometry.x_lo > 0) & (geometry.x_hi < geometry.width - 1)
     for rows in BAND_ROWS:
         first = np.arange(0, geometry.rows, rows)
@@ -197,7 +198,8 @@ def rows_of_band(geometry: SweepGeometry) -> int:
 
 
 def _lights(model: RowModel) -> tuple[Float32, Float32]:
-    """Amplitudes of the search and the logarithm of their shares: the dim and the bright half of the learned ones."""
+    """Amplitudes of the search, geometric means of the dim and the bright half of the learned ones, and the logarithm
+    of each half's probability."""
     log_q, weight = np.log(model.amplitude.astype(np.float64)), np.maximum(model.weight, 1e-6)
     halves = np.array_split(np.arange(len(log_q)), SCREENS)
     shares = np.array([weight[half].sum() for half in halves])
@@ -206,7 +208,7 @@ def _lights(model: RowModel) -> tuple[Float32, Float32]:
 
 
 def _banded(sweep: Sweep, state: RowState, band_rows: int) -> tuple[Sweep, RowState]:
-    """Sweep and state as if each band were one row: geometry of its middle row, windows of all, mean ambient light."""
+    """Sweep and state with one row per band: geometry of the middle row, windows of all rows, mean ambient light."""
     rows = sweep.u.shape[0]
     first = np.arange(0, rows, band_rows)
     middle = np.minimum(first + band_rows // 2, rows - 1)
@@ -245,9 +247,8 @@ def _empty_tables(columns: int, bands: int, lanes: int, reach: int, *, others: b
 
 
 def _largest(sweep: Sweep, state: RowState, light: Float32, reach: int) -> tuple[float, float]:
-    """Largest sum of a position's taps, or half of that of a lane's edge weights, which stand alone, and largest tap.
-
-    In octaves, from the tables of one band in the middle of some columns.
+    """Largest sum of a position's taps, or half of a lane's largest sum of edge weights if that is more, and largest
+    tap; in octaves, from the tables of the middle band of some columns.
     """
     columns = np.unique(np.linspace(0, sweep.plane.shape[0] - 1, LOOKED_AT).astype(np.int64))
     middle = slice(sweep.u.shape[0] // 2, sweep.u.shape[0] // 2 + 1)

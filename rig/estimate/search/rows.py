@@ -52,9 +52,9 @@ from rig.simd.shuffles import lanes_between, largest_of_rows, store_folded, tota
 from rig.simd.vectors import LANES, as_bytes, larger, larger_float, smaller, smaller_float, to_float32
 
 COUNT_LIMIT: Final = 63
-"""Largest count the search works with; counts of more exposures are halved until they fit."""
+"""Largest count in the search; counts of more exposures are halved until they fit."""
 EXPOSURE_PARTS: Final = 4
-"""Steps per exposure: where counts are halved exposures become fractions, 65 become 32.5, 65535 become 63.999."""
+"""Steps per exposure. Where counts are halved, exposures become fractions: 65 become 32.5, 65535 become 63.999."""
 FIELDS: Final = 5
 """Fields of an answer: x_px, confidence, x_sd_px, signal and haze, see `StripeTable`. The confidence is the row's own,
 without its neighbours; a signal can be below zero."""
@@ -68,10 +68,10 @@ class SearchTables(NamedTuple):
     ambient: float32 (bands, width padded to whole words). hot_start: int32 (words, rows + 1), for windows that begin at
     each word the first entry of each row in hot_at and hot_place; hot_at: int16, stored pixels whose counts are not
     used; hot_place: int32, their places in the counts of all rows of the picture. nominal: exposures for which the
-    tables are made. faintest, brightest: photons of a stripe at scale 1. reach: half the line's width in px. shift:
-    units of the scores are 128 >> shift an octave;
-    close_shift: the same for the close-up. most: largest count. quiet_step: one of this number of columns is used to
-    learn the ambient light. flux: see `count_fluxes`.
+    tables are made. faintest, brightest: photons of a stripe at scale 1. reach: px on either side of a stripe whose
+    light is its own. shift: scores have 128 >> shift units an octave; close_shift: the same for the close-up. most:
+    largest count. quiet_step: one of this number of columns is used to learn the ambient light. flux: see
+    `count_fluxes`.
     """
 
     tables: ScreenTables
@@ -102,11 +102,10 @@ class RowAnswers(NamedTuple):
 
     stripe: float32 (columns, FIELDS, rows), NaN and confidence 0 if there is nothing. quiet: int32 (rows, PAIRS, lanes
     of the sensor + LANES, 2), ones of pixels while clearly behind a stripe, in lane order; quiet_exposures: int32
-    (rows, lanes + 1), their exposures in 1/EXPOSURE_PARTS as steps up and down. light: int32, like quiet, ones of every
-    pixel within the windows. The most recent ones of both are still in quiet_here and light_here, uint8 (rows, PAIRS,
-    lanes of the window, 2).
-    lines: int32 (lines, window), counts of the rows used for learning; line_start: int32 (columns + 1,) and line_row:
-    int32, the rows of each column in order.
+    (rows, lanes + 1), their exposures in 1/EXPOSURE_PARTS, stored as steps along the lanes. light: int32, like quiet,
+    ones of every pixel within the windows. The most recent ones of both are still in quiet_here and light_here, uint8
+    (rows, PAIRS, lanes of the window, 2). lines: int32 (lines, window), counts of rows that are kept; line_start: int32
+    (columns + 1,), each column's first entry in line_row, int32, the rows kept, in order.
     """
 
     stripe: Float32
@@ -123,10 +122,9 @@ class RowAnswers(NamedTuple):
 class SearchPointers(NamedTuple):
     """Pointers (`rig.simd.memory.pointers`) to tables, answers and a thread's memory, with the sizes of their arrays.
 
-    bands, taps: number of tables of a column, and of pairs of a table with taps; weight_pairs: the latter for the
-    close-up.
-    lanes: of the window, sum_lanes: of the sums over the picture. limit_rows: of `limits`. ambient: that of the tables
-    if they have it (several_lines), else of the bands, ambient_px wide.
+    lanes: of the window. bands: tables per column. taps: pairs of pixels with taps, T + 1; weight_pairs: the same for
+    the close-up. sum_lanes: of the sums over the picture. limit_rows: of `limits`. ambient: that of the tables if they
+    have it (several_lines), else of the bands, ambient_px wide.
     """
 
     judge: SearchTables
@@ -144,7 +142,7 @@ class SearchPointers(NamedTuple):
 
 
 def pointers_of(judge: SearchTables, found: RowAnswers, memory: Uint8) -> SearchPointers:
-    """Pointers to everything. The arrays must outlive them. memory: of a thread, see `search_memory`."""
+    """Pointers to all arrays, which must outlive them. memory: of a thread, see `search_memory`."""
     tables = judge.tables
     several_lines = tables.ambient.shape[0] > 0
     ambient = tables.ambient if several_lines else judge.ambient
@@ -168,15 +166,15 @@ def count_fluxes() -> Float32:
 
 
 QUIET: Final = 0.9
-"""Probability within 1 px from which the pixels behind the stripe teach the ambient light."""
+"""Probability within 1 px above which the pixels behind the stripe are used to learn the ambient light."""
 QUIET_STEP: Final = 8
-"""One column in so many does so where there are dark frames as well, else every one."""
+"""If there are dark frames, one column in so many is used for this, else every column."""
 SIGNAL_REACH_PX: Final = 2
-"""Pixels on either side whose light is the stripe's, where the line is narrower."""
+"""Least number of pixels on either side of a stripe whose light is summed as its own."""
 FEW_EXPOSURES: Final = 1
-"""Exposures up to which a close look says no more than the scores of the neighbours, which are there already."""
+"""Exposures up to which the scores beside the best position place the line as well as a close-up."""
 USUAL_PAIRS: Final = 4
-"""Pairs of pixels that the close-up looks at, where the line is no wider than usual."""
+"""Pairs of pixels that the close-up reads for a line of usual width."""
 
 
 @numba.njit(cache=True, nogil=True)
@@ -190,9 +188,8 @@ def halvings(exposures: int, most: int) -> int:
 
 @numba.njit(forceinline=True)
 def _fetch_ahead(desk: SearchPointers, pixels: int, table: int) -> None:
-    """Prefetch a table: few of its numbers are read in order, which no processor foresees.
-
-    It is the next column's.
+    """Prefetch table number `table`, the next column's. Few of its numbers are read in order, so the processor does not
+    prefetch them itself.
     """
     tables, taps = desk.judge.tables, 2 * SCREENS * desk.taps * pixels
     for at in range(0, taps, CACHE_LINE):
@@ -209,7 +206,7 @@ def _fetch_ahead(desk: SearchPointers, pixels: int, table: int) -> None:
 
 @numba.njit(forceinline=True)
 def table_for(desk: SearchPointers, search: Search, c: int, b: int, exposures: float) -> ScreenTable:
-    """The table of column c and band b, made ready for columns with this number of exposures."""
+    """The table of column c and band b, adapted to this number of exposures."""
     judge, tables = desk.judge, desk.judge.tables
     pixels, table = STEPS * search.lanes, c * desk.bands + b
     constant = tables.position + 2 * SCREENS * pixels * table
@@ -241,15 +238,15 @@ def table_for(desk: SearchPointers, search: Search, c: int, b: int, exposures: f
 
 @numba.njit(forceinline=True)
 def _hot_of_row(desk, x0, y):  # type: ignore[no-untyped-def]
-    """The first hot pixel of row y, and where those before it end, among all of windows that begin at x0."""
+    """Index of row y's first hot pixel, and end of the row before, among the hot pixels of windows that begin at x0."""
     return np.int64(read_int32(desk.judge.hot_start, (x0 // WORD_PX) * (desk.judge.rows + 1) + y))
 
 
 @numba.njit(cache=True, nogil=True)
 def _neutral_counts(neutral: int, exposures: float, c: int, window: int, to: int) -> None:
-    """Write counts that speak for no position, a byte for each stored pixel; neutral, to: addresses."""
+    """Write counts that favour no position, a byte for each stored pixel; neutral, to: addresses."""
     for x in range(window):
-        # Rounded up or down as by chance, so that hot pixels lean to neither side on average.
+        # Rounded up or down pseudo-randomly, so that hot pixels favour neither side on average.
         chance = np.float32((np.int32(x) * np.int32(40503) + np.int32(c) * np.int32(20011)) & np.int32(0xFFFF))
         count = np.float32(exposures) * read_float32(neutral, x) + chance * np.float32(1.0 / 65536.0)
         write_byte(to, x, np.uint8(count))
@@ -257,7 +254,7 @@ def _neutral_counts(neutral: int, exposures: float, c: int, window: int, to: int
 
 @numba.njit(forceinline=True)
 def _mute_hot(desk, search, first, rows, x0):  # type: ignore[no-untyped-def]
-    """Give the hot pixels of the batch's rows counts that speak for no position; their own are kept in `muted`."""
+    """Give the hot pixels of the batch's rows counts that favour no position; their own are kept in `muted`."""
     n, begin = search.n - first * search.n_bytes, _hot_of_row(desk, x0, first)
     for h in range(begin, _hot_of_row(desk, x0, first + rows)):
         place = read_int32(desk.judge.hot_place, h)
@@ -284,7 +281,7 @@ def judge_rows(
     if not table.searched:
         return
     _mute_hot(desk, search, first, rows, np.int64(read_int32(desk.judge.x0, c)))
-    # Each part for all rows before the next: one row's parts wait for one another, different rows' do not.
+    # Each step is done for all rows before the next step: the steps of one row must wait for one another.
     score_rows(table, desk.taps - 1, search, rows)
     find_best(search, rows, desk.judge.shift)
     add_likelihoods(table, search, rows, desk.judge.window, desk.judge.shift)
@@ -292,7 +289,7 @@ def judge_rows(
     certainty = certainties(table, search, desk.judge.shift)
     _answer(certainty, stripe + 4 * desk.judge.rows, rows, search)
     _measure_light(desk, search, table, first, rows, c, exposures, stripe)
-    # The close-up knows one level behind the stripe for all columns; other lines' haze makes it as many as there are.
+    # The close-up has one level behind the stripe for all columns. With other lines' haze, the level differs by column.
     if exposures <= FEW_EXPOSURES or desk.several_lines:
         _place_by_neighbours(desk, search, rows, c, stripe)
     else:
@@ -311,7 +308,7 @@ def _answer(lanes, to, rows, search):  # type: ignore[no-untyped-def]
     if rows == BATCH:
         store_float32(to, 0, lanes)
     else:
-        # What lies behind may be another thread's.
+        # The memory behind may be another thread's.
         store_float32(search.answer, 0, lanes)
         for r in range(rows):
             write_float32(to, r, read_float32(search.answer, r))
@@ -319,11 +316,11 @@ def _answer(lanes, to, rows, search):  # type: ignore[no-untyped-def]
 
 @numba.njit(forceinline=True)
 def _measure_light(desk, search, table, first, rows, c, exposures, stripe):  # type: ignore[no-untyped-def]
-    """Signal and haze of the batch's rows, from row `first` of the picture on, for answers and close-up."""
+    """Measure signal and haze of the batch's rows, `first` and following ones, for the answers and the close-up."""
     limits = desk.judge.limits + 4 * desk.limit_rows * c
     low, high = load_int16(limits, first), load_int16(limits, desk.limit_rows + first)
     store_int16(search.x, 0, smaller(larger(load_int16(search.x, 0), low), high))
-    # The usual reach as a constant: its loop is unrolled.
+    # With the usual reach as a constant, the loop is unrolled.
     if desk.judge.reach == SIGNAL_REACH_PX:
         _read_light(desk, search, table, rows, exposures, SIGNAL_REACH_PX)
     else:
@@ -353,7 +350,7 @@ def _read_light(desk, search, table, rows, exposures, reach):  # type: ignore[no
 
 @numba.njit(forceinline=True)
 def _place_by_neighbours(desk, search, rows, c, stripe):  # type: ignore[no-untyped-def]
-    """Place the lines of the batch's rows by the scores beside the best ones, and write the answers."""
+    """Refine the positions of the batch's rows by the scores beside the best ones, and write the answers."""
     lift = load_int16(search.lift, 0)
     own = powers_in_order(load_int16(search.best, 0), lift, desk.judge.shift)
     left = powers_in_order(load_int16(search.left, 0), lift, desk.judge.shift)
@@ -368,8 +365,8 @@ def _place_by_neighbours(desk, search, rows, c, stripe):  # type: ignore[no-unty
 
 @numba.njit(forceinline=True)
 def _look_closely(desk, search, rows, c, exposures, stripe):  # type: ignore[no-untyped-def]
-    """Place the lines of the batch's rows by labels a quarter of a pixel apart, and write the answers."""
-    # The usual width as a constant: its loop is unrolled.
+    """Refine the positions of the batch's rows by labels a quarter of a pixel apart, and write the answers."""
+    # With the usual width as a constant, the loop is unrolled.
     if desk.weight_pairs == USUAL_PAIRS:
         _compare_labels(desk, search, rows, exposures, USUAL_PAIRS)
     else:
@@ -426,7 +423,7 @@ def _learn_quiet(desk: SearchPointers, lanes: int, n: int, y: int, c: int, x: in
 
 @numba.njit(cache=True, nogil=True)
 def keep_line(n: int, lanes: int, window: int, to: int) -> None:
-    """Write the counts of a row in pixel order, int32, where the learning reads them; n, to: addresses."""
+    """Write the counts of a row in pixel order, int32, to `RowAnswers.lines`; n, to: addresses."""
     for x in range(window):
         write_int32(to, x, np.int32(read_byte(n, place_of(x, lanes))))
 

@@ -43,13 +43,14 @@ from rig.simd.vectors import (
 )
 
 START: Final = -12000
-"""Score of 'everything is as right of the stripe': most of the range lies above it."""
+"""Score of 'everything is right of the stripe': low, since most scores lie above it."""
 
 
 @numba.njit(cache=True, nogil=True)
 def fit_positions(position: int, slope: int, places: int, more: float, to: int) -> None:
-    """Write the constants of a table's positions for columns with `more` exposures than nominal. All arguments but
-    numbers are addresses.
+    """Write the constants of a table's positions for columns with `more` exposures than nominal.
+
+    position, slope, to: addresses of `places` int16 each.
     """
     for i in range(places):
         constant = np.float32(read_int16(position, i)) + more / np.float32(SLOPE) * np.float32(read_int16(slope, i))
@@ -78,7 +79,7 @@ def score_rows(table: ScreenTable, reach: int, search: Search, rows: int) -> Non
     """Score every position of the batch's first rows. reach: T of the table's taps."""
     for r in range(rows):
         _sum_edges(table, search, r)
-    # Apart from the sums, which wait for one another: those of several rows are under way at once.
+    # Separate loops: one row's sums wait for one another, so those of several rows should be under way at once.
     if reach == 1:
         for r in range(rows):
             _score_narrow(table, search, r)
@@ -130,7 +131,7 @@ def _score_narrow(table, search, r):  # type: ignore[no-untyped-def]
     for v in range(0, lanes, LANES):
         level = load_int16(search.start, r * lanes + v)
         at = 2 * (PAD + v)
-        # The first step's neighbour is in the last pair of the lane before, the last one's in the first of that behind.
+        # The first step also reads the last pair of the lane before, the last step the first pair of the lane behind.
         before, p0, p1 = load_bytes(n, at + 3 * pair - 2), load_bytes(n, at), load_bytes(n, at + pair)
         p2, p3, behind = load_bytes(n, at + 2 * pair), load_bytes(n, at + 3 * pair), load_bytes(n, at + 2)
         s0 = _position_score(before, p0, tap, constant, 0, v, lanes, level)
@@ -185,7 +186,7 @@ def _score_wide(table: ScreenTable, reach: int, search: Search, r: int) -> None:
 
 
 NOTHING: Final = np.float32(1.2e-38)
-"""The smallest likelihood that counts."""
+"""Least sum of likelihoods by which is divided: the smallest normal float32."""
 MOST_OCTAVES: Final = 60
 """A hypothesis without a stripe counts no more than 2^60 times the best position."""
 
@@ -207,7 +208,7 @@ def find_best(search: Search, rows: int, shift: int) -> None:
             lane = np.int64(lowest_bit(equal_mask(load_int16(search.tops, r * LANES), wanted)))
         else:
             lane = _lane_with(score, lanes, wanted)
-        # Which step it is cannot be foreseen: all are compared at once.
+        # Branches on the step would be mispredicted: all steps are compared at once.
         step = np.int64(lowest_bit(equal_bits(score, lane, lanes, wanted)))
         write_int16(search.x, r, np.int16(STEPS * lane + step))
 
@@ -229,8 +230,7 @@ def add_likelihoods(table: ScreenTable, search: Search, rows: int, window: int, 
     """Fill mass, left and right of the batch's first rows. Call it after `find_best`.
 
     mass: sum of the likelihoods of all positions, and of a change without a stripe at each lane, up to a factor for
-    each row.
-    left, right: scores beside the best position.
+    each row. left, right: scores beside the best position.
     """
     lanes = search.lanes
     for r in range(rows):
@@ -269,8 +269,8 @@ def certainties(table: ScreenTable, search: Search, shift: int):  # type: ignore
     own = powers_in_order(load_int16(search.best, 0), lift, shift)
     near = powers_in_order(load_int16(search.left, 0), lift, shift)
     near = near + powers_in_order(load_int16(search.right, 0), lift, shift)
-    # The best position's own term is exact, the others are too large by the same share on average.
+    # `powers` is exact for the best position and too large by the factor MEAN_EXCESS, on average, for all others.
     others = totals_of_rows(search.mass) + ends - own
     own = own * MEAN_EXCESS
-    # Where even the best score is the lowest there is, nothing is known.
+    # Where even the best score is the lowest possible, the likelihoods are 0, and so is the result.
     return smaller_float((own + near) / larger_float(own + others, NOTHING), np.float32(1.0))

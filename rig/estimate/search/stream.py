@@ -1,11 +1,12 @@
-"""A sweep judged by `rig.estimate.search.rows` while its frames come in, with the same result bit for bit as
-afterwards.
+"""Judges the columns of a sweep by `rig.estimate.search.rows` while its frames come in. The result is the same, bit for
+bit, as from the counts of the whole sweep.
 
-`ColumnJudge` is the counter of `likelihood`: it judges each column as soon as it is complete and keeps no counts of it.
-Rows are processed in chunks, so that counts never leave the cache. A chunk's counters, uint64 bit planes
-(`rig.count.kernels`), take the frames of a column as they come. At the first frame of the next column the rows of the
-finished one are read out of the planes into registers, judged, and dropped. If a column continues in the next block,
-its counters stay in memory. `search_volume` judges the counts of a whole sweep, integers (columns, rows, window).
+`ColumnJudge` is the counter of `likelihood`: it judges each column as soon as it is complete and keeps its counts only
+on the rows that are needed to learn and to check the map. Rows are processed in chunks, so that counts never leave the
+cache. A chunk's counters, uint64 bit planes (`rig.count.kernels`), take the frames of a column as they come. At the
+first frame of the next column the rows of the finished one are read out of the planes into registers, judged, and
+dropped. If a column continues in the next block, its counters stay in memory. `search_volume` judges the counts of a
+whole sweep, integers (columns, rows, window).
 """
 
 from dataclasses import dataclass
@@ -56,8 +57,8 @@ SUM_LIMIT: Final = BYTE_FRAMES
 class OpenColumn(NamedTuple):
     """The column whose frames are being counted. Between two blocks it is the same for all chunks.
 
-    column: -1 if none is open. first_word: of the frames' window. frames: counted so far. sums_x0: begin of the window
-    of `RowAnswers.light_here` and `quiet_here`; summed: exposures that they hold.
+    column: -1 if none is open. first_word: of the frames' window. frames: counted so far. sums_x0: first pixel of the
+    window of `RowAnswers.light_here` and `quiet_here`; summed: exposures in these sums.
     """
 
     column: int
@@ -69,7 +70,7 @@ class OpenColumn(NamedTuple):
 
 @numba.njit(cache=True, nogil=True)
 def _move_window(by, row_words, n, planes):  # type: ignore[no-untyped-def]
-    """Let counters follow a window that moved `by` words to the right; what leaves it is dropped, what is new is 0."""
+    """Shift counters when their window moves `by` words to the right. Words that it leaves are dropped, new ones 0."""
     for q in range(PLANES):
         p = planes[q * CHUNK : q * CHUNK + n]
         for row in range(0, n, row_words):
@@ -80,14 +81,15 @@ def _move_window(by, row_words, n, planes):  # type: ignore[no-untyped-def]
 
 @numba.njit(cache=True, nogil=True)
 def carry_sums(desk: SearchPointers, x0: int, first_row: int, last_row: int) -> None:
-    """Add the light of the window that began at x0 to the picture's, and start again from 0."""
+    """Add the 8-bit sums of the window that began at x0, light and quiet, to the picture's, and clear them."""
     _carry(desk.found.light_here, desk.lanes, desk.found.light, desk.sum_lanes, x0 // STEPS, first_row, last_row)
     _carry(desk.found.quiet_here, desk.lanes, desk.found.quiet, desk.sum_lanes, x0 // STEPS, first_row, last_row)
 
 
 @numba.njit(cache=True, nogil=True)
 def _carry(window: int, window_lanes: int, picture: int, lanes: int, lane: int, first_row: int, last_row: int) -> None:
-    """Move bytes (rows, PAIRS, window_lanes, 2) to int32 (rows, PAIRS, lanes, 2) from `lane` on; both addresses."""
+    """Move bytes (rows, PAIRS, window_lanes, 2) to int32 (rows, PAIRS, lanes, 2) from `lane` on. window, picture: their
+    addresses."""
     for row in range(PAIRS * first_row, PAIRS * last_row):
         some, lot = window + 2 * window_lanes * row, picture + 8 * (lanes * row + lane)
         for v in range(0, 2 * window_lanes, 2 * LANES):
@@ -98,7 +100,7 @@ def _carry(window: int, window_lanes: int, picture: int, lanes: int, lane: int, 
 @numba.njit(cache=True, nogil=True)
 def _finish(desk, state, planes, row_bytes, first_row, last_row):  # type: ignore[no-untyped-def]
     """Judge rows first_row..last_row-1 of a finished column; planes: address of the chunk's counters."""
-    # With the usual number of lanes as a constant all offsets are, and no register is spent on them.
+    # With the usual number of lanes as a constant, all offsets are constants and need no registers.
     if desk.lanes == LANES:
         _finish_rows(desk, search_in(desk.memory, LANES), state, planes, row_bytes, first_row, last_row)
     else:
@@ -127,7 +129,7 @@ def _finish_rows(desk, search, state, planes, row_bytes, first_row, last_row):  
         for y in range(max(first_row, band * judge.band_rows), end, BATCH):
             rows = min(BATCH, end - y)
             for r in range(0, rows, 2):
-                # The partner of an odd last row is never looked at; behind the last counters there are some spare ones.
+                # The partner of an odd last row is not used. Behind the last counters there are some spare ones.
                 to = n + r * search.n_bytes
                 read_planes(planes, at, at + row_bytes, CHUNK * WORD_BYTES, n_planes, judge.window, to, lanes)
                 at += 2 * row_bytes
@@ -282,7 +284,7 @@ class ColumnJudge:
     def begin(self, judge: SearchTables) -> None:
         """Begin the next sweep, with the tables `judge`."""
         self._workers.settle()
-        if judge is not self._judge:  # else the addresses hold: made anew they would take 0.1 ms of each thread
+        if judge is not self._judge:  # else the addresses are still valid; to make them takes each thread 0.1 ms
             self._judge, self._desks = judge, {}
         clear_found(self._found)
         self._tally.reset()
@@ -307,7 +309,7 @@ class ColumnJudge:
 
     def settle(self, under_way: int = 0) -> None:
         """See `Counter`."""
-        # Dark frames are work of their own: the more is waited for.
+        # A block with dark frames was posted as two pieces of work, so fewer blocks may still be under way.
         self._workers.settle(under_way)
 
     def finish(self) -> SearchedSweep:
@@ -371,7 +373,7 @@ class ColumnJudge:
 def search_volume(
     volume: CountVolume, geometry: SweepGeometry, judge: SearchTables, workers: RowWorkers
 ) -> tuple[StripeTable, Float64]:
-    """The stripes found with `judge`, and the ones and exposures of pixels behind clear stripes (2, rows, width)."""
+    """Stripes of a volume, judged with `judge`; ones and exposures of pixels behind clear stripes (2, rows, width)."""
     found = nothing_found(geometry, None)
 
     def work(first: int, last: int) -> None:

@@ -33,30 +33,30 @@ OUTSIDE: Final = -32000
 NONE: Final = 5
 SLOPE: Final = 8
 WEIGHT_LIMIT: Final = 127
-"""Largest weight: a count that would say more says this much."""
+"""Largest weight; larger ones are cut to it."""
 LN2: Final = 0.6931471805599453
 FLUX_LEFT, FLUX_RIGHT, GAIN_LEFT, GAIN_RIGHT, LOSS_LEFT, LOSS_RIGHT = range(6)
-"""Numbers kept of each pixel: flux on either side of a stripe, and its entries of the logit table."""
+"""Numbers per pixel: its flux left and right of the stripe, and their entries in the logit table."""
 
 
 class ScreenTables(NamedTuple):
     """Tables of all columns and bands, see the module.
 
-    P: stored pixels per row, padded to whole vectors; in order of step and lane unless said.
+    P: stored pixels per row, padded to whole vectors; in order of step and lane unless stated.
 
     edge: int8 (columns, bands, PAIRS, lanes, 2), weight of a count left of the stripe.
-    tap: int8 (columns, bands, SCREENS, STEPS, T + 1, lanes, 2), weights at each position of the counts of T + 1 pairs
-    from `first_pair` on, which hold those T px around it; at odd positions that of the pixel before as left as well.
-    position: int16 (columns, bands, SCREENS, P), units of position x at the nominal number of exposures, its prior
+    tap: int8 (columns, bands, SCREENS, STEPS, T + 1, lanes, 2), for each position the weights of counts up to T px
+    around it, in T + 1 pairs from `first_pair` on. At odd positions the first pixel of the position's own pair also has
+    its weight as a pixel left of the stripe.
+    position: int16 (columns, bands, SCREENS, P), constant of position x at the nominal number of exposures, its prior
     included; slope: int16, the same shape, increase with each further exposure in 1 / SLOPE of a unit.
     lane: float32 (columns, bands, lanes), units per exposure if all pixels up to a lane's last lie left.
-    none: float32 (columns, bands, NONE), units of 'no stripe': all as right, all as left, a change somewhere (per
-    lane); first and last lane with pixels of the column.
+    none: float32 (columns, bands, NONE), units of 'no stripe': all right of it, all left of it, a change somewhere (per
+    lane); then the first and last lane with pixels of the column.
     neutral: float32 (columns, bands, P), ones per exposure that carry no information, in pixel order.
     before, scale: float32 (columns, bands, P) as in `RowBuffers`, in pixel order.
     first, last: int32 (columns, bands), first and last position in stored pixels.
-    ambient: float32 (columns, bands, P), ambient light and other lines' haze if there are any; otherwise without
-    columns.
+    ambient: float32 (columns, bands, P), ambient light and other lines' haze; without columns if there is no such haze.
     """
 
     edge: NDArray[np.int8]
@@ -120,7 +120,7 @@ def fill_tables(
                 levels[GAIN_RIGHT, x], levels[LOSS_RIGHT, x] = gain[at], loss[at]
                 weight = levels[GAIN_LEFT, x] - levels[GAIN_RIGHT, x]
                 constant = levels[LOSS_LEFT, x] - levels[LOSS_RIGHT, x]
-                # What rounding leaves over goes to the next pixel: sums over many pixels must not drift.
+                # The rounding error is added to the next pixel, so that sums over many pixels do not drift.
                 wanted = weight * per_nat + over
                 edge[_pair(x), x // STEPS, x & 1] = _weight(wanted)
                 over = wanted - edge[_pair(x), x // STEPS, x & 1] if abs(wanted) < WEIGHT_LIMIT else np.float32(0.0)
@@ -147,7 +147,7 @@ def _positions(sweep, state, light, log_share, per_nat, nominal, b, c, span, row
             within = np.float32(0.0)
         s, lane = x % STEPS, x // STEPS
         place = s * lanes + lane
-        # First pixel of the pairs that the taps are for.
+        # First pixel of the pairs that have taps.
         first_px = 2 * (x // 2 + first_pair(s, reach))
         for m in range(light.shape[0]):
             constant = within
@@ -214,18 +214,17 @@ def first_pair(s, reach):  # type: ignore[no-untyped-def]
 
 
 BATCH: Final = LANES
-"""Rows that go through each part of the search together: while one waits for a result, others go on."""
+"""Rows that go through each step of the search together: while one waits for a result, others go on."""
 PLACE_BEFORE: Final = 8
-"""Pixels before the first one, and behind the last one, of which the place is known."""
+"""Number of pixels before the first one, and behind the last one, that have an entry in `Search.place`."""
 
 
 class ScreenTable(NamedTuple):
-    """One table made ready for a number of exposures.
+    """One table adapted to a number of exposures.
 
     Addresses, in lane order: edge, tap as in `ScreenTables`, constant as in `Search`; in pixel order, float32 of the
-    stored
-    pixels: before, scale, ambient. Numbers: all_right, all_left: scores of 'no stripe' as in `ScreenTables.none`;
-    all_right is complete. searched: whether there is any position to find.
+    stored pixels: before, scale, ambient. Numbers: all_right, score if all pixels lie right of the stripe; all_left,
+    what is added to the sum of all lanes if all lie left. searched: whether there is any position to search.
     """
 
     edge: int
@@ -243,14 +242,14 @@ class Search(NamedTuple):
     """Addresses of a thread's buffers for BATCH rows of `lanes` lanes, and the bytes from row to row of each.
 
     n: counts, see `rig.count.lane_order`. int16: score (STEPS, lanes); start (lanes,), score of a change at the lane's
-    first pixel; tops (LANES,), best scores in each of some lanes; constant (SCREENS, STEPS, lanes), the tables' part
-    per exposure times the exposures; lane (lanes,), the same for lanes; change (lanes,), score added by a change
-    without a stripe in the lane; label (LANES,), scores of the close-up; place: index of pixel -PLACE_BEFORE in a row
-    of counts. neutral, muted: bytes, counts of hot pixels, see `rig.estimate.search.rows`. For each row of the batch,
-    int16: all_left, score if all pixels lie left; best, x: best score and its pixel; left, right: the scores beside it;
-    levels: of the close-up; lift: see `lift_to_powers`; ceiling: largest score. float32: light, before, scale, ambient:
-    see `rig.estimate.search.rows`; answer: one field of the answers before it is written. Folded (`rig.simd.shuffles`):
-    mass, sum of all likelihoods; moment, square: sums of the close-up.
+    first pixel; tops (LANES,), the largest score of every LANES-th lane; constant (SCREENS, STEPS, lanes), the tables'
+    part per exposure times the exposures; lane (lanes,), the same for lanes; change (lanes,), score added by a change
+    without a stripe in the lane; label (LANES,), scores of the close-up; place: index in a row of counts of each pixel
+    from -PLACE_BEFORE on. neutral, muted: bytes, counts of hot pixels, see `rig.estimate.search.rows`. For each row of
+    the batch, int16: all_left, sum of all lanes; best, x: best score and its pixel; left, right: the scores beside it;
+    levels: of the close-up; lift: see `lift_to_powers`; ceiling: largest score of 'no stripe'. float32: light, before,
+    scale, ambient: see `rig.estimate.search.rows`; answer: one field of the answers before it is written. Folded
+    (`rig.simd.shuffles`): mass, sum of all likelihoods; moment, square: sums of the close-up.
     """
 
     lanes: int

@@ -1,4 +1,4 @@
-"""Cost of every label from its own surroundings alone: a stripe is brighter than what lies beside it.
+"""Contrast: cost of every label from its own surroundings alone, since a stripe is brighter than the pixels beside it.
 
 With counts n of K frames at the pixels t around a label, shares w_t of the line in them (of sum 1), and p0 the share of
 ones among the pixels BESIDE_PX to both sides in 2 ROWS + 1 rows,
@@ -6,14 +6,14 @@ ones among the pixels BESIDE_PX to both sides in 2 ROWS + 1 rows,
     p = sum w_t n_t / K,    N = K / sum w_t^2
     score = N (p log(p / p0) + (1 - p) log((1 - p) / (1 - p0))) where p > p0, else 0,    in nats
 
-which is the log-likelihood ratio of p over p0 for N frames, pooled as a matched filter pools them. As in
-`rig.estimate.joint.labels.costs`,
+which is the log-likelihood ratio of p over p0 for N frames, the effective number with the weights of a matched filter.
+As in `rig.estimate.joint.labels.costs`,
 
     cost(l) = units_per_nat (largest score of the row - score(l)),    uint8 (rows, columns, labels), <= COST_LIMIT
 
-These costs use no learned light; of what was learned they need only the line's width and which pixels are hot. Where
-fog scatters light many times, a learned haze and halo can explain a wrong place, but cannot mislead these costs. On the
-other hand, these costs know nothing of haze that ends.
+Of the learned model these costs need only the line's width and the hot pixels. Where fog scatters light many times, a
+learned haze and halo can explain a wrong position, but cannot mislead these costs. On the other hand, these costs do
+not use the end of haze as evidence.
 """
 
 from typing import Final, NamedTuple
@@ -33,17 +33,17 @@ from rig.simd.shuffles import reversed_lanes
 from rig.simd.vectors import LANES, as_bytes, larger_float, smaller_float, to_int16, zero_float32
 
 ROWS: Final = 6
-"""Rows to either side whose pixels are surroundings of a label too."""
+"""Rows to either side whose pixels also belong to a label's surroundings."""
 BESIDE_PX: Final = 4, 10
 """Pixels to either side of a label that are its surroundings, from and to."""
 REACH_PX: Final = 2
 """Pixels to either side of a label that its line falls on."""
 LEAST_ONES: Final = np.float32(0.5)
-"""Ones that surroundings without any are taken to have."""
+"""Number of ones assumed for surroundings without any."""
 MOST_SHARE: Final = np.float32(1.0 - 1e-4)
 """Largest p and p0, so that scores stay finite."""
 _AHEAD: Final = 2
-"""Rows by which memory is asked for ahead."""
+"""Rows ahead of which memory is prefetched."""
 
 
 class Contrast(NamedTuple):
@@ -77,7 +77,7 @@ def contrast_of(costs: Costs, line_sigma_px: float, width: int) -> Contrast:
 
 
 def cost_contrast(volume: CountVolume, contrast: Contrast, first: int, last: int, cost: Uint8, *, alone: bool) -> None:
-    """Write these costs over those of rows first..last-1, or (not alone) the mean of both.
+    """Replace the costs of rows first..last-1 by these costs or, if not alone, by the mean of both.
 
     cost: uint8 (rows, columns, labels) of all rows. Labels that are EXCLUDED stay so, and so do columns without frames.
     Threads may fill different rows at once.
@@ -143,7 +143,7 @@ def _fill(
 
 @numba.njit(cache=True, nogil=True)
 def _mended(counts: Counts, contrast: Contrast, y: int, x0: int, n: Float32) -> Float32:
-    """Fill n from REACH_PX on with a row's counts, hot pixels with that of the pixel beside them; returns that part."""
+    """Fill n, from REACH_PX on, with a row's counts, and return this part. A hot pixel gets its neighbour's count."""
     window = counts.shape[0]
     mended = n[REACH_PX : REACH_PX + window]
     for t in range(window):

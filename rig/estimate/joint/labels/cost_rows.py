@@ -80,13 +80,13 @@ from rig.simd.vectors import (
 COST_LIMIT: Final = 160
 """Largest cost of a label that is not excluded."""
 EXCLUDED: Final = 255
-"""Cost of a label that cannot be: outside the picture, or more than a pixel outside the row's search window."""
+"""Cost of an impossible label: outside the picture, or more than a pixel outside the row's search window."""
 BASE: Final = -8000
-"""Score of 'everything is before the stripe': most of the range of 16 bits lies above it."""
+"""Score of 'everything is before the stripe': low, since most scores lie above it."""
 _USUAL_TAPS: Final = 5
-"""Number of pixels around a position with a line as narrow as most are."""
+"""Number of pixels around a position for a line of usual width."""
 COUNT_BITS: Final = 15
-"""A count is kept as 2^COUNT_BITS times its share of the largest that there can be."""
+"""Counts are stored as fractions of the largest possible count, in units of 2^-COUNT_BITS."""
 
 
 @numba.njit(cache=True, nogil=True)
@@ -96,7 +96,7 @@ def read_bytes(
 ) -> None:  # fmt: skip
     """Fill n of `batch` rows from counts that are bytes, from far to near. Pixels that were not stored get any value.
 
-    counts: address of the first count, begin: number of the first row's first one. stored: first pixel, pixels of a
+    counts: address of the first count, begin: index of the first row's first count. stored: first pixel, pixels of a
     row, number of all counts, counts of a column. times: factor on counts.
     """
     x0, window, size, column = stored
@@ -113,7 +113,7 @@ def read_bytes(
                 count = np.int64(read_byte(counts + begin + r * window, x)) if 0 <= x < window else np.int64(0)
                 write_int16(n, p, np.int16(count * times))
             continue
-        # The next column's counts, which come after this one's last row; the next row asks for the rest.
+        # Prefetch the next column's counts, which come after this column's last row, as far as the next row does not.
         for line in range(0, min(pixels + LANES, window), CACHE_LINE):
             prefetch(counts + low + column + line)
         if side > 0:
@@ -126,9 +126,9 @@ def read_bytes(
 
 @numba.njit(cache=True, nogil=True)
 def mend_rows(at: LabelTables, places: int, y: int, per_nat: float, side: int, b: Buffers, batch: int) -> None:
-    """Give a count without information to pixels that the table weighs, but that are hot or missing in the row.
+    """Give a count without information to pixels with a weight in the table that are hot or missing in the row.
 
-    y: number of the first row; per_nat: units times exposures.
+    y: index of the first row; per_nat: units times exposures.
     """
     for r in range(batch):
         i, place = read_int32(b.here, r), places + 2 * PLACES * r
@@ -161,7 +161,7 @@ def _neutral(at, i, p, per_nat):  # type: ignore[no-untyped-def]
 
 @numba.njit(cache=True, nogil=True)
 def sum_edges(at: LabelTables, fitted: Fitted, b: Buffers, batch: int) -> None:
-    """Fill sums, the scores of a change at each pixel, as far as there are labels."""
+    """Fill sums: at each pixel, the score if all farther pixels lie behind the stripe; as far as there are labels."""
     pixels = at.pixels
     for r in range(batch):
         i = read_int32(b.here, r)
@@ -212,9 +212,9 @@ def _score_row(sums, n, tap, constant, score, vectors, taps, pairs):  # type: ig
 
 @numba.njit(cache=True, nogil=True)
 def score_rows(at: LabelTables, constants: int, which: int, taps: int, b: Buffers, batch: int) -> None:
-    """Fill `b.score`, a score per position, and `b.top`, the largest one, of the first `batch` rows in `b`.
+    """Fill `b.score`, a score per position, and `b.top`, the largest score, of the first `batch` rows in `b`.
 
-    constants, which: addresses of the positions' constants, and of each row's number among them. taps: number of pixels
+    constants, which: addresses of the positions' constants, and of each row's index among them. taps: number of pixels
     around a position.
     """
     for r in range(batch):
@@ -332,7 +332,7 @@ def fill_costs(
                 batch = min(BATCH, end - y)
                 to = out_at + (y * columns + c) * labels
                 places = place_at + 2 * PLACES * (c * rows + y)
-                # The processor foresees neither the next row's costs nor the next column's places.
+                # The processor prefetches neither the next row's costs nor the next column's places itself.
                 for r in range(batch):
                     for line in range(0, labels, CACHE_LINE):
                         prefetch_to_write(to + r * columns * labels + line)
@@ -365,8 +365,8 @@ def fill_costs(
 def _times(exposures: int, ways: Ways) -> float:
     """Factor on the counts of a column, a whole number if it is not below 1; products fit 16 bits.
 
-    A nat of more exposures is worth fewer units, as in a map where all columns have so many. Otherwise columns with few
-    exposures would count for less beside others with many, and the penalties between neighbours for more.
+    With more exposures a nat is worth fewer units, as in a map whose columns all have so many. Otherwise a column with
+    few exposures would count for less beside others with many, and the penalties between neighbours for more.
     """
     full = 2.0 ** (COUNT_BITS - ways.bits)
     worth = (ways.sharp + ways.exposures) / (ways.sharp + exposures)
@@ -399,7 +399,7 @@ def fit_tables(room: CostRoom, ways: Ways, first: int, last: int) -> None:
 
 @numba.njit(cache=True, nogil=True)
 def _fit_table(at: LabelTables, i: int, j: int, per_nat: float, to: Fitted, through: int) -> None:
-    """Write table i's constants and edges for a number of exposures as number j; per_nat: units times exposures."""
+    """Write table i's constants and edges for a number of exposures to index j; per_nat: units times exposures."""
     source, constant = at.constant + 4 * i * at.constants, to.constant + 2 * j * at.constants
     for k in range(0, at.constants, LANES):
         store_int16(constant, k, rounded(load_float32(source, k) * np.float32(per_nat)))

@@ -8,7 +8,7 @@ label's own eighth of a pixel, two amplitudes (four under a halo), and tables th
     units_per_nat = UNITS / (1 + K / SHARP) for K exposures
 
 or less if 16 bits would not hold the scores. EXCLUDED marks impossible labels. 'No stripe' is not among the labels,
-since a row taken for empty would pass nothing on from its neighbours.
+since a row with that answer would pass no information between its neighbours.
 """
 
 from dataclasses import dataclass
@@ -58,26 +58,25 @@ FINEST: Final = 64.0
 WEIGHT_BITS: Final = 12
 """Weights of 2^WEIGHT_BITS units per nat reach to 8 nats per count."""
 RISE_LIMIT: Final = 22000
-"""Most that the sum over a row's pixels may rise, of a range of 40000 for scores."""
+"""Largest rise of the sum over a row's pixels, of a range of 40000 for scores."""
 TAPS_LIMIT: Final = 28000
 """Most that the pixels around a position may add to its score."""
 FRAMES_OVER_HALF_MORE: Final = 4
 """The counts of a column weigh no more than those of one and a half times the nominal exposures plus this many."""
 LOOKED_AT: Final = 32
-"""Number of rows, and of columns, that are looked at for the units of all."""
+"""Number of rows, and of columns, from which the units for all are chosen."""
 QUANTILES: Final = (0.25, 0.75)
 """Quantiles of the learned amplitudes that the costs try."""
 HALO_QUANTILES: Final = (0.1, 0.35, 0.65, 0.9)
 """Quantiles that are tried under a halo. It is many times brighter than its stripe, so a stripe between two amplitudes
 would be drawn to a distance where the halo of one of them fits."""
 HALO_TRUST: Final = 0.9
-"""Part of the halo's evidence that counts: it is summed over many pixels, which have the errors of the learned halo in
-common."""
+"""Factor on the halo's evidence: the many pixels over which it is summed share the errors of the learned halo."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Costs:
-    """All that the costs of a sweep's counts need under one model; made once per model by `costs_of`.
+    """Tables and settings for the costs of sweeps under one model; made once per model by `costs_of`.
 
     units_per_nat: of cost; UNITS / (1 + exposures / SHARP), or less if 16 bits do not hold the scores of haze.
     """
@@ -97,8 +96,8 @@ class Costs:
         """Write the costs of rows first..last-1 to out, uint8 (rows, columns, labels) of all rows.
 
         Rows without frames, or with nothing to search, cost 0 everywhere. Best called with 16 rows or more at a time.
-        Threads may fill different rows at once, each with its own working memory. room: `pointers` to that, which the
-        caller keeps alive.
+        Threads may fill different rows at once, each with its own working memory. room: `pointers` to this memory,
+        which the caller keeps alive.
         """
         fill_costs(
             volume.counts, volume.n_frames, volume.x0, self.place, self.tables.at, room, self.ways, first, last, out
@@ -150,7 +149,7 @@ def _ways(
     most = exposures + exposures // 2 + FRAMES_OVER_HALF_MORE
     bits = most.bit_length()
     rise, gain = _largest(sweep, state, row_buffers(sweep.window, 1), light[-1])
-    # Where pixels say nothing at all, any unit will do.
+    # If pixels give no information at all, any unit will do.
     largest = max(rise / RISE_LIMIT, gain / TAPS_LIMIT, 1e-9)
     finest = min(FINEST, 2.0 ** (WEIGHT_BITS - bits), 1.0 / (most * largest))
     wanted = UNITS / (1.0 + exposures / SHARP)
@@ -214,7 +213,8 @@ def _lights(model: RowModel) -> Float32:
 
 
 def hot_in_bands(ambient: Float32) -> Bools:
-    """Pixels (rows, width) far brighter than the median at their x over their band, or over the last BAND_ROWS rows."""
+    """Pixels (rows, width) far brighter than the median at their x over their band (in the last band, over the last
+    BAND_ROWS rows)."""
     rows, hot = len(ambient), np.empty(ambient.shape, np.bool_)
     for first in range(0, rows, BAND_ROWS):
         band = ambient[first : first + BAND_ROWS]

@@ -1,7 +1,7 @@
 """Positions as labels that neighbours on one surface share: steps of disparity from the far end of the depth range.
 
-On a surface of constant depth the stripe of the next column is one column spacing further on. So positions in pixels
-say nothing about neighbours, but distances from where the stripe would be at the far end do. Label l of a row and
+On a surface of constant depth the stripe of the next column is one column spacing further on. So neighbours are not
+compared by positions in pixels, but by distances from where the stripe would be at the far end. Label l of a row and
 column is at
 
     x = x_far - side l / PER_PX,     x_far: float64 (rows, columns), side: 1 where near is left, else -1
@@ -27,12 +27,12 @@ from rig.simd import Float32, Float64, Int16, Int32
 PER_PX: Final = 2
 """Labels per pixel. With one, a stripe between two of them would have 0.05 px more error at 10 exposures."""
 SPARE: Final = 1
-"""Labels beyond the searched pixels at the near end, for the mean of a peak there."""
+"""Labels beyond the searched pixels at the near end, so that the mean of a peak there has labels on both sides."""
 VECTOR: Final = 32
 BAND_ROWS: Final = 64
 """Rows that share tables of costs."""
 _ROWS_APART: Final = 8
-"""One row in so many is looked at for the usual distance of columns."""
+"""One row in so many is used to find the usual distance of columns."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -101,7 +101,7 @@ def far_ends(u: Float32, v: Float32, plane: Float64, x_lo: Int32, x_hi: Int32, w
 
 
 FRACTIONS: Final = 8
-"""Places within a pixel to which the centre of a line is rounded."""
+"""Positions within a pixel to which the centre of a line is rounded."""
 VARIANTS: Final = FRACTIONS // 2
 PHASES: Final = 2
 FAR_PX: Final = MARGIN_PX
@@ -109,8 +109,9 @@ SLACK_PX: Final = 1
 """Pixels by which a label may lie outside the row's search window: the mean of a peak at its end needs both sides."""
 START, VARIANT, ODD, LABEL, LABEL_END, VALID, VALID_END, MEND = range(8)
 """START: x of pixel 0; VARIANT: -1 where nothing is searched; ODD: 1 where label 0 is of phase 1; LABEL, LABEL_END:
-labels that can be, from and up to; VALID, VALID_END: pixels p that were stored and are looked at; MEND: 1 where some
-pixel that the row's table weighs is not among those, or is hot (`rig.estimate.joint.labels.tables`)."""
+first possible label, and one after the last; VALID, VALID_END: first pixel p that was stored and is read, and one after
+the last; MEND: 1 where some pixel with a weight in the row's table is not among those, or is hot
+(`rig.estimate.joint.labels.tables`)."""
 PLACES: Final = 8
 
 
@@ -140,7 +141,7 @@ def _fill_places(sweep: Sweep, x_far: Float64, side: int, stripes: int, pixels: 
             )
             if lo > hi or max(lo, first) > min(hi, last):
                 continue
-            # In eighths of a pixel towards near: label 0, and from there to the pixel that holds it.
+            # In eighths of a pixel towards near: the position of label 0. Then the pixel that holds it.
             at = -int(np.floor(FRACTIONS * side * x_far[y, c] + 0.5))
             pixel = (at + FRACTIONS // 2) // FRACTIONS
             place[VARIANT] = at % VARIANTS
@@ -152,10 +153,10 @@ def _fill_places(sweep: Sweep, x_far: Float64, side: int, stripes: int, pixels: 
             place[VALID_END] = side * (start - near) + 1
             far, near = (min(hi, last), max(lo, first)) if side > 0 else (max(lo, first), min(hi, last))
             step = FRACTIONS // PHASES
-            # Of the pixels that were stored, all eighths that are nearest to them.
+            # Limited to the eighths that are nearest to a stored pixel.
             low = max(-side * far - SLACK_PX, -side * (last if side > 0 else first) - 4 / FRACTIONS)
             high = min(-side * near + SLACK_PX, -side * (first if side > 0 else last) + 3 / FRACTIONS)
             place[LABEL] = min(max(int(np.ceil((FRACTIONS * low - at) / step)), 0), stripes)
-            # The pixel of the last label is one that tables have.
+            # The last label's pixel must be in the tables.
             high_label = int(np.floor((FRACTIONS * high - at) / step))
             place[LABEL_END] = min(max(high_label + 1, place[LABEL]), stripes, PHASES * pixels - place[ODD])

@@ -1,8 +1,8 @@
 """The halo's part of the label costs, compiled: a fast form of `rig.estimate.row.likelihood`, tested against it.
 
-The halo of `rig.estimate.row.inputs` is part of every hypothesis. The tables of `rig.estimate.joint.labels.tables` take
-the halo to be as bright everywhere as at the stripe, which is right where the stripe's place is decided. The difference
-elsewhere varies slowly with the stripe's place and from pixel to pixel. So it is tabled for stripes BLOCK_PX apart,
+The halo of `rig.estimate.row.inputs` is part of every hypothesis. In the tables of `rig.estimate.joint.labels.tables`
+the halo is as bright everywhere as at the stripe, which is right for the pixels around the stripe. The difference
+elsewhere varies slowly with the stripe's position and from pixel to pixel. So it is tabled for stripes BLOCK_PX apart,
 with linear interpolation, and for the mean counts of blocks of BLOCK_PX pixels (`HaloTables`: int16 weights, float32
 constants in nats per exposure).
 """
@@ -32,7 +32,7 @@ from rig.simd.vectors import LANES, add_saturated, larger_float, scaled, smaller
 
 BLOCK_PX: Final = 8
 FIRST_PX: Final = FAR_PX % BLOCK_PX - BLOCK_PX
-"""Pixel at which the first block begins, before the row: so the first label's pixel begins a block."""
+"""First pixel of the first block, before the row, so that the first label's pixel begins a block."""
 AHEAD: Final = (FAR_PX - FIRST_PX) // BLOCK_PX
 """Number of blocks behind a stripe at place 0."""
 _FULL: Final = 32768.0
@@ -83,7 +83,7 @@ def fill_halo(
     pixels = tables.edge.shape[1]
     row, middle_light = row_buffers(sweep.window, 1), np.sqrt(light[0] * light[-1])
     mean, number = np.empty(pixels, np.float32), np.empty(pixels, np.int32)
-    # Of each block: flux before and behind the stripe, and of the halo as the tables of labels have it.
+    # For each block: flux before and behind the stripe, and flux of the halo in the tables of labels.
     level, size = np.empty((3, out.weight.shape[2]), np.float32), np.empty(out.weight.shape[2], np.int64)
     for b in range(first_band, last_band):
         rows = b * BAND_ROWS, min((b + 1) * BAND_ROWS, place.shape[1])
@@ -111,7 +111,7 @@ def fill_halo(
                     level[2, k] += middle_light * row.scale[t] * state.glow[row.cell[t]] / size[k]
             out.weight[b, c] = 0
             out.constant[b, c] = 0.0
-            # No label lies around the places behind these, which fill up a vector: `halo` need not reach so far.
+            # Further places only fill up a vector. They have no labels, and `halo` need not reach so far.
             for j in range(LANES // BLOCK_PX * tables.tap.shape[1] + 1):
                 t = min(max(to_t - FAR_PX - BLOCK_PX * j, 0), length - 1)
                 for m in range(light.shape[0]):
@@ -147,9 +147,9 @@ def rounded(a):  # type: ignore[no-untyped-def]
 class HaloRoom(NamedTuple):
     """The tables with their sizes, and working memory for a column and a batch of rows.
 
-    All int16 unless said. fitted: (lights, places), constants of all places for a column's exposures; mean: (blocks,),
-    counts of blocks; level: (lights, places), evidence of the halo for a stripe at each place; constant: of the
-    positions, for each row of a batch; which: int32 (BATCH,), each row's index there.
+    All int16 unless stated. fitted: (lights, places), constants of all places for a column's exposures; mean:
+    (blocks,), counts of blocks; level: (lights, places), evidence of the halo for a stripe at each place; constant: of
+    the positions, for each row of a batch; which: int32 (BATCH,), each row's index there.
     """
 
     tables: HaloTables
@@ -218,6 +218,6 @@ def halo_rows(halo: HaloRoom, column: int, at: LabelTables, fitted: Fitted, b: B
                     says = says + scaled(third, load_int16(ramp, 2 * LANES))
                     j = pair * POSITION + (phase * LIGHTS + m % LIGHTS) * LANES
                     constant = load_int16(source, j)
-                    # Positions without a label stay so whatever the halo says.
+                    # Positions without a label stay impossible, whatever the halo adds.
                     never = smaller(constant + _POSSIBLE, np.int16(0)) << 4
                     store_int16(to, j, add_saturated(add_saturated(constant, says), never))

@@ -5,14 +5,14 @@ of a pixel before and behind the stripe, and p'_S of a pixel that it lights,
 
     edge = logit p'_E - logit p'_B                  int16: a count at a pixel behind the stripe
     tap  = logit p'_S - logit p'_B or p'_E          int16: a count at a pixel around a label, for LIGHTS amplitudes;
-                                                    relative to what the sum of edges takes the pixel for
+                                                    B or E as in the sum of edges: E for farther pixels
     constant, edge_sum: the same of log(1 - p'), float32 per exposure: the number of frames differs between columns
 
 Haze, pedestal and ambient light vary slowly along a line, so the rows of a band share a table for each variant of
-`rig.estimate.joint.labels.grid` that occurs among them. Weights are for counts as `scaled` multiplies them.
+`rig.estimate.joint.labels.grid` that occurs among them. Counts are multiplied with weights by `scaled`.
 
-The stripe's brightness is unknown. Two quantiles of the learned brightnesses are tried, under a halo four, and the
-likeliest counts. The learned prior of positions is not used, since it makes errors larger.
+The stripe's brightness is unknown. Two quantiles of the learned amplitudes are tried, under a halo four, and the score
+of the likeliest is used. The learned prior of positions is not used, since it makes errors larger.
 """
 
 from typing import Final, NamedTuple
@@ -42,9 +42,9 @@ from rig.simd.memory import CACHE_LINE, aligned_zeros
 from rig.simd.vectors import LANES
 
 LIGHTS: Final = 2
-"""Stripe brightnesses that are scored together; of all of them, one pair or more, the likeliest counts."""
+"""Stripe brightnesses that are scored together, as a pair. Of all pairs the likeliest brightness is used."""
 WEIGHT_LIMIT: Final = 32767
-"""Largest weight: a count that would say more says this much."""
+"""Largest weight; larger ones are cut to it."""
 IMPOSSIBLE: Final = np.float32(-1e9)
 """Constant of a position where no row of the band has a label."""
 _NEAR, _FAR = 0, 1
@@ -135,7 +135,7 @@ def fill_tables(
                 out.span[i, 0], out.span[i, 1] = span
                 out.used[i] = -(-label_end // (PHASES * LANES))
                 for p in range(span[0], span[1]):
-                    # Around its middle the halo is level; `fill_halo` tables how it differs elsewhere.
+                    # Near the stripe the halo is level; `fill_halo` tables how it differs elsewhere.
                     glow[p] = state.glow[row.cell[to_t - p]]
                     near_glow[p] = beside[row.cell[to_t - p]]
                     for near in (_NEAR, _FAR):
@@ -153,7 +153,7 @@ def fill_tables(
 
 @numba.njit(cache=True, nogil=True)
 def mark_rows(place: Int16, hot: Bools, side: int, tables: LabelTables) -> None:
-    """Set MEND for rows whose tables weigh pixels that are hot or missing in the row."""
+    """Set MEND for rows in which pixels with a weight in the row's table are hot or missing."""
     for c in range(place.shape[0]):
         for y in range(place.shape[1]):
             here = place[c, y]
@@ -246,7 +246,7 @@ def _fill_taps(
                 halo = (light[m] - middle_light) * scale[to_t - p] * glow[p]
                 for d in range(max(-reach, span[0] - p), min(reach + 1, span[1] - p)):
                     at = p + d
-                    # Relative to what the running sum takes the pixel for: behind up to here, before from here on.
+                    # Relative to the running sum, in which pixels up to here lie behind, and from here on before.
                     own = _FAR if d < 0 else _NEAR
                     base = flux[own, at]
                     if d == 0:
@@ -254,7 +254,7 @@ def _fill_taps(
                         base = flux[_FAR, at] + nearer * (flux[_NEAR, at] - flux[_FAR, at])
                     extra = light[m] * scale[to_t - p] * shares[off + VARIANTS, d + reach] + halo
                     cell = cell_of(min(max(base + extra, FLUX_MIN), FLUX_MAX))
-                    # What tables of the halo already count for a pixel that holds the line, as if it held none of it.
+                    # The light that the tables of the halo already assume for this pixel, without the line.
                     around = light[m] * scale[to_t - p] * near_glow[p] - middle_light * scale[to_t - at] * glow[at]
                     told = cell_of(min(max(flux[own, at] + around, FLUX_MIN), FLUX_MAX))
                     weight = _weight((table[0, cell] - table[0, told]) * per_nat)
@@ -273,11 +273,11 @@ def _weight(value):  # type: ignore[no-untyped-def]
 
 
 BATCH: Final = LANES
-"""Rows that go through each part of the work together: while one waits for a result, others go on."""
+"""Rows that go through each step of the work together: while one waits for a result, others go on."""
 SUMS_FROM: Final = LANES - 1
 """Place of the first sum. The sum up to and including a pixel is the next one's, so whole vectors are written."""
 POSITION: Final = PHASES * LIGHTS * LANES
-"""Numbers that a vector of pixels has in a table for a pair of brightnesses."""
+"""Numbers per vector of pixels in a table, for a pair of brightnesses."""
 
 
 class Ways(NamedTuple):
@@ -307,7 +307,7 @@ class Fitted(NamedTuple):
 
 
 class Buffers(NamedTuple):
-    """Working memory for BATCH rows, int16 (BATCH, n_row or the like) unless said.
+    """Working memory for BATCH rows, int16 (BATCH, n_row or the like) unless stated.
 
     n: counts of pixels from far to near; sums: score of a change at each pixel from SUMS_FROM on, the first one BASE;
     score: of pixel and phase; top: the largest score in each lane of each row, then that of each row in the first

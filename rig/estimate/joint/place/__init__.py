@@ -1,1 +1,1 @@
-"""Sub-pixel positions: each stripe is placed by its own counts and by those of neighbours on the same surface."""
+"""Sub-pixel positions of stripes, from their own counts and those of neighbours on the same surface."""

@@ -1,7 +1,7 @@
 """Light of stripes, haze around them, and score and information of their places, compiled, LANES stripes to a vector.
 
-With counts n of K frames at the pixels t within LIGHT_PX of a stripe, and haze the mean of that before and that behind
-(`measure_light`),
+With counts n of K frames at the pixels t within LIGHT_PX of a stripe, haze the mean of the haze before and behind, and
+glow the halo per pixel as a share of the light (`measure_light`),
 
     light = (sum over t of log (K + 1/2) / (K - n_t + 1/2) - ambient_t - haze) / (1 + (2 LIGHT_PX + 1) glow)
 
@@ -13,9 +13,9 @@ With the flux of each of the TAPS pixels around a stripe of `light` photons, and
     slope = light d share / dx (and the step of haze at the centre),
     g = sum slope (n D - (K - n)),    h = sum K slope^2 D
 
-are the slope of the log-likelihood in the stripe's place and its Fisher information, 1/px and 1/px^2. A pixel that is
-missing in the row or must not be used is given so much light that it gives no information. Arrays are float32 (rows,
-columns), see `Places` (`rig.estimate.joint.place.places`).
+are the slope of the log-likelihood over the stripe's position and its Fisher information, 1/px and 1/px^2. For a pixel
+that is missing in the row or must not be used, so much ambient light is assumed that the pixel gives no information.
+Arrays are float32 (rows, columns), see `Places` (`rig.estimate.joint.place.places`).
 """
 
 from typing import Final
@@ -68,16 +68,16 @@ def measure_light(
 ) -> None:  # fmt: skip
     """Fill light, scale, haze, rest and glow of rows first_row..last_row-1 for stripes at x_px; 0 where there is none.
 
-    around: of `fetch_counts`. Haze is that of the nearest pixel that is searched.
+    around: of `fetch_counts`. Haze is taken at the nearest searched pixel.
     """
     columns, (pixels, last_bin) = x_px.shape[1], (sweep.u.shape[1], np.float32(state.profile.shape[0] - 1.001))
     window, several, bins = sweep.window, sweep.others.shape[1] > 0, _bins(state.profile, state.glow)
-    # An odd number of cache lines: one line of numbers after the other does not push the others out of the cache.
+    # An odd number of cache lines per row of `lines`, so that its rows do not displace one another in the cache.
     width = (-(-columns // LANES) | 1) * LANES
     lines, spare = np.zeros((_FIELDS, width), np.float32), np.full((width, EIGHT), MOST_FLUX, np.float32)
     taps = np.zeros((2, EIGHT, LANES), np.float32)
     ambient_places, bin_places = np.empty(width, np.int64), np.empty(width, np.int64)
-    # Addresses: threads that count references to the same array wait for one another.
+    # Addresses, since threads that count references to the same array wait for one another.
     at, spare_at, bins_at, taps_at = address_of(lines), address_of(spare), address_of(bins), address_of(taps)
     ambient_at, bin_at = address_of(ambient_places), address_of(bin_places)
     at_x, at_x0 = address_of(x_px), address_of(sweep.x0)
@@ -90,7 +90,7 @@ def measure_light(
         lines[_PX, c], lines[_PY, c], lines[_PZ, c] = sweep.plane[c, 0], sweep.plane[c, 1], sweep.plane[c, 2]
         lines[_GAIN, c] = state.column_gain[c]
     for y in range(first_row, last_row):
-        # The next row's, which the processor does not foresee, since it lies on other pages.
+        # The next row lies on other pages, so the processor does not prefetch it itself.
         for line in range(4 * pixels * (y + 1), 4 * pixels * (y + 2), CACHE_LINE):
             prefetch(at_u + line)
             prefetch(at_v + line)
@@ -138,7 +138,7 @@ def _bins(profile: Float32, glow: Float32) -> Float32:
 
 @numba.njit(cache=True, nogil=True)
 def _find_bins(at: int, width: int, gain: np.float32, w_lo: np.float32, per_w: np.float32, last: np.float32) -> None:
-    """Write the places of stripes among the profile's bins, and the strength of haze there."""
+    """Write each stripe's fractional bin of the profile, and the strength G of haze there."""
     for c in range(0, width, LANES):
         px, py = load_float32(at, _PX * width + c), load_float32(at, _PY * width + c)
         pz, u, v = load_float32(at, _PZ * width + c), load_float32(at, _U * width + c), load_float32(at, _V * width + c)
@@ -176,7 +176,7 @@ def _measure(at: int, width: int, taps: int, ambient: int, bins: int) -> None:
     halo = load_float32(near, 3 * LANES) + part * load_float32(near, 7 * LANES)
     # Missing and blind pixels add nothing, as if they had just the expected light.
     light = light - logarithm(larger_float(dark, _LEAST)) - shown * ((before + behind) * half - own)
-    # What the halo adds to the light of the line grows with it.
+    # The halo adds light in proportion to that of the line.
     light = light / (one + halo * np.float32(2 * LIGHT_PX + 1))
     scale = load_float32(near, 2 * LANES) + part * load_float32(near, 6 * LANES)
     store_float32(at, _LIGHT * width, where_below(light, none, none, frames))
@@ -192,10 +192,10 @@ def _flux(own, others):  # type: ignore[no-untyped-def]
 
 
 FRACTIONS: Final = 16
-"""Places within a pixel for which the line's profile is tabled."""
+"""Positions within a pixel for which the line's profile is tabled."""
 LEAST_FLUX: Final = np.float32(1e-5)
 _VISIBLE: Final = np.nextafter(MOST_FLUX, np.float32(0.0))
-"""Most ambient light with which a pixel still tells something of the stripe's place."""
+"""Most ambient light with which a pixel still gives information on the stripe's position."""
 _OF_AMPLITUDE, _OF_SCALE, _OF_GLOW, _OF_HAZE, _OF_REST, _OF_DISTANCE = range(6)
 _LIT, _TAKEN, _SCORE, _KNOWN, _SCORE_FIELDS = range(5)
 _EIGHTS: Final = EIGHT * LANES
@@ -214,12 +214,12 @@ def score_places(
     """
     window, (pixels, columns) = sweep.window, (state.ambient.shape[1], x_px.shape[1])
     side, half, one = 1 if sweep.near_is_left else -1, np.float32(0.5), np.float32(1.0)
-    # An odd number of cache lines: one line of numbers after the other does not push the others out of the cache.
+    # An odd number of cache lines per row of `lines`, so that its rows do not displace one another in the cache.
     width = (-(-columns // LANES) | 1) * LANES
     lines, spare = np.zeros((_SCORE_FIELDS, width), np.float32), np.full((width, EIGHT), MOST_FLUX, np.float32)
     taps = np.zeros((4, EIGHT, LANES), np.float32)
     ambient_places, share_places = np.empty(width, np.int64), np.empty(width, np.int64)
-    # Addresses: threads that count references to the same array wait for one another.
+    # Addresses, since threads that count references to the same array wait for one another.
     at, spare_at, taps_at, all_shares = address_of(lines), address_of(spare), address_of(taps), address_of(shares)
     ambient_at, shares_at = address_of(ambient_places), address_of(share_places)
     ambient = address_of(state.ambient)
@@ -259,8 +259,8 @@ def _score(
 ) -> None:  # fmt: skip
     """Fill score and known of LANES stripes.
 
-    of: addresses of what is known of all stripes, here: number of the first of these. seen: address of their counts,
-    with room behind them.
+    of: addresses of the fields of all stripes, here: index of the first of these. seen: address of their counts, with
+    room behind them.
     """
     share, growth, own = seen + 4 * _EIGHTS, seen + 8 * _EIGHTS, seen + 12 * _EIGHTS
     fetch_eights(ambient, 0, own)
@@ -268,7 +268,7 @@ def _score(
     fetch_eights(shares, 4 * EIGHT, growth)
     frames = load_float32(at, _TAKEN * width)
     light = load_float32(of[_OF_AMPLITUDE], here) * load_float32(of[_OF_SCALE], here)
-    # Around its middle the halo is level.
+    # Near the stripe the halo is level.
     halo = light * load_float32(of[_OF_GLOW], here)
     before, behind = load_float32(of[_OF_HAZE], here) + halo, load_float32(of[_OF_REST], here) + halo
     edge = before - behind
@@ -299,7 +299,7 @@ def _dark_over_lit(flux):  # type: ignore[no-untyped-def]
     for below in (120.0, 24.0, 6.0, 2.0, 1.0):
         grown = grown * part + np.float32(1.0 / below)
     grown = grown * part
-    # All terms are positive: nothing is lost to rounding on the way up.
+    # All terms are positive, so no digits cancel.
     for _ in range(_DOUBLINGS):
         grown = grown * (grown + np.float32(2.0))
     return (zero_float32() + np.float32(1.0)) / grown

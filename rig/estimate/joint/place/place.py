@@ -24,32 +24,32 @@ from rig.threads import RowWorkers
 LIGHT_REACH = 3
 """Rows and columns to either side over which a stripe's brightness is pooled."""
 REACHES = (1, 2)
-"""Rows and columns to either side over which its place is pooled: the first of these that gives ENOUGH."""
+"""Rows and columns to either side over which a stripe's place is pooled: the first of these that gives ENOUGH."""
 LESSON_REACHES = (1, 2, 3, 4)
 """REACHES for the lessons of the first map, whose places are not joined with pairs: joined places of weak stripes are
 so smooth that their brightness would be learned too dark."""
 ENOUGH = 1 / 0.06**2
-"""Information, 1/px^2, from which on a place is known well enough: over more neighbours surfaces bend."""
+"""Information, 1/px^2, that is enough for a place: no more neighbours are used, since surfaces bend."""
 PAIRS = ((4, 0.576), (6, 0.280))
-"""Of each round of joining: rows and columns to the neighbours of a pair, and the share of their information that
-counts. 5 x 5 neighbours count as 25 stripes, joined with eight like them as 140, and these with eight like them as 454,
-since they overlap."""
+"""For each round of joining: rows and columns to the neighbours of a pair, and `share` of `join_pairs`. Since
+neighbourhoods overlap, a stripe with 5 x 5 neighbours counts as 25 stripes, joined with eight such stripes as 140, and
+this joined with eight such as 454."""
 MOST_MOVED_PX = 0.9
-"""Farthest that a stripe moves from its label, all rounds together. Labels end a pixel beyond what is searched, so
-answers end within 2 px of it. Only in pictures of full pixels would stripes move farther."""
+"""Largest shift of a stripe from its label, all rounds together. Labels end a pixel beyond the searched pixels, so
+answers end within 2 px of these. Only in pictures of saturated pixels would stripes move farther."""
 BEYOND = 3.0
 """Factor by which brightness may lie beyond the learned amplitudes, either way."""
 DARKEST = 300.0
 """Largest ratio of the brightest of the four amplitudes to another."""
 SLOPE_STEP_PX = 0.05
 LEAST_PHOTONS = 100.0
-"""Least light of all stripes, in photons per exposure, that tells the width of the line."""
+"""Least light of all stripes, in photons per exposure, from which `line_width` gives a width."""
 LINE_SIGMA_PX = np.array([0.25, 2.4])
 """Smallest and largest width that `line_width` gives."""
 
 
 def profile_table(sigma_px: float) -> Float32:
-    """Shares of a line of this width, and their slopes, as `score_places` takes them."""
+    """Shares of a line of this width, and their slopes: `shares` of `score_places`."""
     centre = (np.arange(FRACTIONS) + 0.5) / FRACTIONS - 0.5
     distance = np.arange(-REACH_PX, REACH_PX + 1) - centre[:, None]
     on, back = (pixel_shares(sigma_px, distance - step) for step in (SLOPE_STEP_PX, -SLOPE_STEP_PX))
@@ -76,10 +76,10 @@ def place(
     *,
     lesson: bool = False,
 ) -> Float32:
-    """Move x_px, whose distances from the far end are in `places`, to the places pooled over neighbours.
+    """Move x_px to positions pooled over neighbours, and return their standard deviations in px.
 
-    Returns their standard deviations in px. Light, haze and intermediate results are left in `places`. The last steps
-    are only queued, see `weigh_light`. lesson: whether the first map's lessons will use the places.
+    places: holds the distances of x_px from the far end, and receives light, haze and intermediate results. lesson:
+    whether the result is for the first map's lessons. The last steps are only queued, see `weigh_light`.
     """
     sd = np.empty_like(x_px)
     around = weigh_light(volume, sweep, state, x_px, places, workers)
@@ -108,10 +108,10 @@ def place(
 def weigh_light(
     volume: CountVolume, sweep: Sweep, state: RowState, x_px: Float32, places: Places, workers: RowWorkers
 ) -> Counts:
-    """Fill light, scale, haze and amplitude of `places` for stripes at x_px, as `state` describes them.
+    """Fill light, scale, haze, rest, glow and amplitude of `places` for stripes at x_px. state: the model.
 
-    Returns the counts around the stripes, see `fetch_counts`. Amplitudes are only queued: later work on the same rows
-    can use them; all other users must call `settle` first.
+    Returns the counts around the stripes, see `fetch_counts`. The amplitudes are only queued: work posted later for the
+    same rows can use them; all other users must call `workers.settle` first.
     """
     faintest, brightest = float(state.amplitude[0]) / BEYOND, float(state.amplitude[-1]) * BEYOND
     around = np.empty((*x_px.shape, EIGHT), volume.counts.dtype)
@@ -142,7 +142,7 @@ def line_width(
 
 
 def amplitudes_of(places: Places, trusted: Bools | None = None) -> tuple[Float32, Float64]:
-    """Four amplitudes, dark to bright, that stand for those of a map's stripes, and their shares of the stripes.
+    """Four amplitudes, dark to bright, that represent those of a map's stripes, and their shares of the stripes.
 
     trusted: (rows, columns), which stripes count; None for all.
     """

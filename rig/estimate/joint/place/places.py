@@ -6,8 +6,8 @@ The pooled value
 
     d = sum (h_n d_n + g_n) / sum h_n
 
-is as good as the maximum of their common likelihood, and 1 / sqrt(sum h_n) is its standard deviation. Before that, each
-stripe's brightness is pooled; otherwise a dark row would be taken for a brighter one that stands on haze.
+is as accurate as the maximum of their common likelihood, and 1 / sqrt(sum h_n) is its standard deviation. Before that,
+each stripe's brightness is pooled; otherwise a dark row would be taken for a brighter one that stands on haze.
 
 Counts are stored column by column, but answers are processed row by row, LANES columns to a vector. So the counts
 around all stripes are brought into the order of the answers once, in tiles of rows and columns (`fetch_counts`).
@@ -26,33 +26,34 @@ from rig.simd.shuffles import EIGHT, spread_eights
 from rig.simd.vectors import LANES
 
 REACH_PX: Final = 3
-"""Pixels to either side of a stripe that say where it is."""
+"""Pixels to either side of a stripe from which its place is computed."""
 LIGHT_PX: Final = 2
-"""Pixels to either side over which its light is summed."""
+"""Pixels to either side of a stripe over which its light is summed."""
 CLEAR: Final = 0.9
 CLEAR_SD_PX: Final = 0.2
-"""Stripes with more confidence than CLEAR and less deviation than CLEAR_SD_PX tell the width of the line."""
+"""The line's width is measured on stripes of more confidence than CLEAR and less deviation than CLEAR_SD_PX."""
 BESIDE_PX: Final = 5, 6
-"""Pixels to either side, from and to, that show how much of a halo is under a line, and nothing of the line."""
+"""Pixels to either side of a line, from and to, that show the halo under the line and nothing of the line itself."""
 BLIND_FLUX: Final = np.float32(3.0)
 """Ambient light with which a pixel fires in 95 % of all frames and shows nothing; pixels not to be used have more."""
 LEAST_FRAMES: Final = 2.0
-"""Fewest frames that tell a line's width in a halo: with fewer, the light beside it is so uncertain that it seems far
-too narrow."""
+"""Least number of frames with which a line's width is measured in a halo: with fewer, the light beside the line is so
+uncertain that the line seems far too narrow."""
 FEW_FRAMES: Final = 3.0
-"""Frames up to which the share of ones is taken as the light: the flux of a full pixel would be a guess."""
+"""Frames up to which the share of ones is used as the light: the flux of a full pixel would be a guess."""
 DARK_FRAMES: Final = 1.5
 FEW_FRAMES_FLUX: Final = 0.5
-"""Flux from which on a pixel of FEW_FRAMES frames or fewer is taken to be full."""
+"""Flux above which a pixel of FEW_FRAMES frames or fewer counts as saturated."""
 
 
 class Places(NamedTuple):
     """Light and place of each stripe, float32 (rows, columns) each.
 
-    distance: x from the far end in px, NaN if there is none; light: photons per exposure above haze and ambient; scale:
-    light of amplitude 1; amplitude: light over scale, pooled; haze, rest: flux before and behind it above ambient;
-    glow: of the halo at the stripe, photons per pixel over those of the stripe; known: h of the module; score: h times
-    distance, plus g; placed: the final distance; joined, joined_sd: intermediate distance and its standard deviation.
+    distance: x from the far end in px, NaN if there is no stripe; light: photons per exposure above haze and ambient
+    light; scale: light at amplitude 1; amplitude: light over scale, pooled; haze, rest: flux above ambient light,
+    before and behind the stripe; glow: halo per pixel at the stripe, as a share of the stripe's light; known: h of the
+    module; score: h times distance, plus g; placed: the final distance; joined, joined_sd: intermediate distance and
+    its standard deviation.
     """
 
     distance: Float32
@@ -82,9 +83,9 @@ def add_moments(
 ) -> None:  # fmt: skip
     """Add to sums (rows, 2) the light of clear stripes within REACH_PX, and light times (its squared distance - sd^2).
 
-    Light is that above haze, halo and ambient light, in photons per exposure. Each row of sums gets that of the same
-    row of the picture. With a halo, stripes that saturate their pixels are left out, since the halo would be taken for
-    their missing flanks.
+    Light is in photons per exposure, without haze, halo and ambient light. Each row of sums belongs to a row of the
+    picture. With a halo, stripes that saturate their pixels are left out, since the halo would be taken for their
+    flanks.
     """
     for y in range(first_row, last_row):
         for c in range(x_px.shape[1]):
@@ -155,7 +156,7 @@ def fetch_counts(counts: Counts, x0: Int32, x_px: Float32, first_row: int, last_
                     first = nearest_pixel(x_px[y, c]) - REACH_PX - int(x0[c])
                     if 0 <= first <= window - EIGHT:
                         at = source + ((c * rows + y) * window + first) * size
-                        # The processor does not foresee the next column's counts.
+                        # The processor does not prefetch the next column's counts itself.
                         prefetch(at + column)
                         for i in range(size):
                             write_int64(to + (y * columns + c) * EIGHT * size, i, read_int64(at, i))

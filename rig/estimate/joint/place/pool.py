@@ -1,9 +1,9 @@
 """Sums over neighbours on one surface, and places combined with pairs of opposite neighbours, LANES stripes to a
 vector.
 
-Pooling: a neighbour whose distance from the far end differs by more than SAME_PX is left out, one by one, so running
-sums cannot be used. Rows are processed in copies with a margin of NaN (`with_margin`), so that no bounds need checking.
-All arrays are float32 (rows, columns).
+Pooling: sums over those neighbours whose distance from the far end differs by at most SAME_PX. This differs from stripe
+to stripe, so running sums cannot be used. Rows are processed in copies with a margin of NaN (`with_margin`), so that no
+bounds need checking. All arrays are float32 (rows, columns).
 
 Joining: on a plane of any slope, the mean of two places opposite each other is the place between them. So a stripe is
 joined with pairs of opposite neighbours, each already placed with its own neighbourhood, where their mean m agrees with
@@ -13,8 +13,8 @@ its own place d: within SAME_PX, and within SIGMAS times the standard deviation 
 
 with standard deviations s of the stripe, and s1 and s2 of the pair. Where a surface ends or bends they do not agree,
 and the stripe stays where it is. Two such rounds reach as far as 25 x 25 neighbours for the work of 16. Neighbourhoods
-overlap, so a pair tells less than it seems. The factor `share` on what pairs tell makes the standard deviation of d'
-right where all agree.
+overlap, so pairs add less information than 1 / v. The factor `share` on it makes the standard deviation of d' right
+where all agree.
 """
 
 from typing import Final
@@ -67,7 +67,7 @@ def widen_row(at: tuple[int, int, int], width: int, y: int, inner: int, reach: i
 
 @numba.njit(cache=True, nogil=True)
 def _widen_block(at: tuple[int, int, int], to: int, width: int, here: int, c: int, inner: int, reach: int) -> None:
-    """Do what `widen_row` does for LANES stripes, from number `here` of the copies and from c of the sums on."""
+    """Do what `widen_row` does for LANES stripes, from index `here` of the copies and index c of the sums on."""
     own, columns = load_float32(at[0], here), width - 2 * LANES
     a, b = load_float32(to, c), load_float32(to, columns + c)
     for away in range(-reach, reach + 1):
@@ -89,7 +89,7 @@ def _widen_block(at: tuple[int, int, int], to: int, width: int, here: int, c: in
 def pool_amplitude(
     reach: int, faintest: float, brightest: float, first_row: int, last_row: int, places: Places
 ) -> None:
-    """Fill amplitude: light over scale, both summed over each stripe's neighbours, between two limits."""
+    """Fill amplitude: light over scale, each summed over a stripe's neighbours, kept between faintest and brightest."""
     amplitude, columns = address_of(places.amplitude), places.amplitude.shape[1]
     sums = np.empty((2, -(-columns // LANES) * LANES), np.float32)
     at, width = address_of(sums), sums.shape[1]
@@ -115,7 +115,7 @@ def pool_places(
     reaches: sizes of the neighbourhood, smallest first; the first one with `enough` information (1/px^2) is taken.
     """
     columns = moved.shape[1]
-    # Two sums, by how far to move, and the standard deviation, negative where it is not known yet.
+    # The two sums, the shift, and the standard deviation, which is negative while not known.
     lines = np.empty((4, -(-columns // LANES) * LANES), np.float32)
     to, to_moved, to_sd = address_of(lines), address_of(moved), address_of(sd)
     for band in range(first_row, last_row, COPIED_ROWS):
@@ -125,7 +125,7 @@ def pool_places(
         at, width = (address_of(distance), address_of(score), address_of(known)), distance.shape[1]
         for y in range(band, end):
             lines[:3], lines[3] = 0.0, -1.0
-            lines[1, columns:] = np.inf  # nothing to look for beyond the last column
+            lines[1, columns:] = np.inf  # nothing to pool beyond the last column
             own = at[0] + 4 * ((y - band + MARGIN) * width + LANES)
             for i in range(len(reaches)):
                 inner, last = reaches[i - 1] if i > 0 else -1, i == len(reaches) - 1
@@ -159,8 +159,8 @@ def _settle(lines: int, columns: int, distance: int, enough: float) -> bool:
 
 
 SIGMAS: Final = 2.0
-"""Standard deviations by which a pair may differ from the stripe between it: on a plane nearly all pairs are within
-them, and a surface that bends by more than its noise is left as it is."""
+"""Standard deviations by which the mean of a pair may differ from the stripe between them: on a plane nearly all pairs
+differ by less, and a surface that bends by more than its noise is left as it is."""
 
 
 @numba.njit(cache=True, nogil=True)
@@ -168,7 +168,7 @@ def join_pairs(
     distance: Float32, sd_px: Float32, step: int, share: float, enough: float, first_row: int, last_row: int,
     out_distance: Float32, out_sd_px: Float32,
 ) -> None:  # fmt: skip
-    """Fill rows first_row..last_row-1 of the outputs with places joined with pairs; all arrays are (rows, columns).
+    """Join the stripes of rows first_row..last_row-1 with pairs, see the module; all arrays are (rows, columns).
 
     distance: from the far end in px, NaN where there is no stripe; sd_px: at most 1, which means no information. step:
     number of rows and columns to the neighbours, at most MARGIN. enough: information, 1/px^2, above which a stripe
@@ -193,7 +193,7 @@ def join_pairs(
 
 @numba.njit(cache=True, nogil=True)
 def _join_row(at: tuple[int, int], width: int, here: int, step: int, share: float, known: float, out: int) -> None:
-    """Join one row, whose first stripe is element `here` of the copies; known: variance from which on stripes stay."""
+    """Join one row, whose first stripe has index `here` in the copies; known: variance up to which stripes stay."""
     one, none = zero_float32() + np.float32(1.0), zero_float32()
     quarter, sigmas, shared = np.float32(0.25), np.float32(SIGMAS * SIGMAS), np.float32(share)
     enough = np.float32(known)
