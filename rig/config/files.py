@@ -33,7 +33,7 @@ FLAGS: Mapping[Key, str] = {
     ("estimate", "temporal_prior"): "--temporal-prior",
     ("estimate", "threads"): "--threads",
 }
-"""Keys that the command line has an option for, with that option."""
+"""Options of the command line, by the key of the config that each sets."""
 
 
 def kind_of(slot: str, content: Any) -> type[BaseModel] | None:

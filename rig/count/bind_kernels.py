@@ -46,7 +46,7 @@ def _bin(marks, column, columns):  # type: ignore[no-untyped-def]
 
 @numba.njit(cache=True, nogil=True)
 def _in_order(bin, number, plan, carried):  # type: ignore[no-untyped-def]
-    """Note a lit frame and return its bin, BIN_UNUSABLE if its sweep is past that column, or the column is full."""
+    """Note a lit frame and return its bin; BIN_UNUSABLE if the sweep has left that column, or the column is full."""
     now = carried[0]
     if number != now.sweep:
         return BIN_UNUSABLE
@@ -93,7 +93,7 @@ def walk(
         start = (np.int64(record.ticks) + block.start_ticks) * UNITS_PER_TICK
         point = _marker_point(marks, np.int64(record.line), number, plan)
         if point >= 0:
-            # The middle of the 1/256 of the period that the position names.
+            # The position names a 1/256 of the frame period: take its middle.
             position = (marks >> SUBFRAME_SHIFT) & SUBFRAME_MASK
             now.anchor_time, now.anchor_point = start + (2 * position + 1) * block.period_ticks, point
             edges[0, now.edges], edges[1, now.edges] = point, now.anchor_time

@@ -206,7 +206,7 @@ class MarkerLine:
         self.sd.append(max(sd, LEAST_SD_FRAMES))
 
     def fit(self, index: int) -> tuple[float, float, float]:
-        """Place of sweep `index`'s scan marker, its standard deviation, and frames per sweep; needs two markers."""
+        """Place of the scan marker of sweep `index` and its standard deviation; frames per sweep. Needs two markers."""
         weight = np.array(self.sd) ** -2.0
         x = np.array(self.index, np.float64) - index
         middle = float(weight @ x / weight.sum())
@@ -357,7 +357,7 @@ class BlankingSync:
             self._pilots.append((leg, found))
 
     def _begin_next(self, last: int) -> SweepPlace | None:
-        """The next sweep that begins up to frame `last`; None: none does."""
+        """The next sweep that begins up to frame `last`; None if there is none."""
         if self._next is not None:
             return self._expected(last)
         for pilot in list(self._pilots):

@@ -84,7 +84,7 @@ class FrameTally:
     velocity_per_s: float = 0.0
 
     def intensity(self) -> NDArray[np.uint32]:
-        """Counts summed over the columns, (rows, width) uint32, in a subclass that has them."""
+        """Counts summed over the columns, (rows, width) uint32; only in subclasses that keep counts."""
         raise NotImplementedError
 
     def bound_column(self) -> NDArray[np.float64]:

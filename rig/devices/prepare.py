@@ -39,7 +39,7 @@ class PlansEffects(Protocol):
     """A world that leaves out effects that make no difference to a scan."""
 
     def plan_for(self, power_w: float, exposure_s: float, exposures: int) -> None:
-        """Choose the simulated effects for columns of `exposures` frames of that exposure, at that power or less."""
+        """Choose the simulated effects for columns of `exposures` frames of `exposure_s`, at `power_w` or less."""
         ...
 
 
@@ -77,7 +77,7 @@ def _compiled(rig: OpenRig, scan: ScanConfig) -> ScanPlan:
 
 
 BURST_LEAD_S, HOST_LEAD_S = 5e-3, 0.15
-"""Seconds between the SPAD's start and the first scan marker that a burst must have room for.
+"""A burst must have room for so many seconds between the SPAD's start and the first scan marker.
 
 The first is for virtual time, the second for a host that starts one device after the other over USB and serial ports.
 """

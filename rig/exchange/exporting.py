@@ -153,7 +153,7 @@ class _Export:
         self.damage += recording.problems
 
     def _manifest(self) -> dict[str, Any]:
-        """The run's manifest; empty if there is none or it is damaged, which is noted."""
+        """The run's manifest; empty if there is none, or if it is damaged; the damage is noted."""
         try:
             return read_manifest(self._run) or {}
         except DamagedRecordingError as error:

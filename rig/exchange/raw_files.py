@@ -2,7 +2,7 @@
 
 SPAD512S (Pi Imaging): 1-bit RAW files, dumps of the TCP stream, sparse lists. Packed files have rows of 64 bytes, most
 significant bit first. A dump of the stream may end with `DONE`; as pixels may have the same bytes, the length decides.
-Sparse lists are u32 little-endian numbers of the pixels that fired, row by row; the number of pixels closes a frame.
+Sparse lists are u32 little-endian numbers of the pixels that fired, row by row; the frame's pixel count ends a frame.
 
 SwissSPAD2: least significant bit first. Half array: 256 rows of 512 pixels, 512 frames in the camera's files of 8 MiB.
 Full array: 512 x 512, 256 frames a file, read out as 256 rows of 1024 pixels in 8 zones of 128: a quarter of the upper

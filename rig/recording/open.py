@@ -37,7 +37,7 @@ def open_recording(folder: Path) -> RunRecording:
 
 
 def require_recording(path: Path) -> None:
-    """Raise UsageError if a path is not a folder with a recording, saying what it is instead, or cannot be unpacked."""
+    """Raise UsageError if a path is no folder with a recording, or if that is compressed and zstandard is missing."""
     files = segment_files(path).values() if path.is_dir() else ()
     if not files:
         raise UsageError(f"{path} {_instead(path)}")

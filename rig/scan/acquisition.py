@@ -280,7 +280,7 @@ class Acquisition:
         for name, step in steps:
             try:
                 step()
-            except BaseException as error:  # neither a step that fails nor a second Ctrl-C may keep the others away
+            except BaseException as error:  # neither a failed step nor a second Ctrl-C may prevent the others
                 trouble.append(f"{name}: {str(error) or type(error).__name__}")
                 interrupted = interrupted or (None if isinstance(error, Exception) else error)
         if not pipeline.join_source():

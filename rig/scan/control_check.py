@@ -46,8 +46,8 @@ class ControlCheck:
 def check_control(recorded: Path, now: Path, *, devices: Sequence[str], tolerance_s: float | None) -> ControlCheck:
     """Compare two files of control traffic.
 
-    devices: those that took part. tolerance_s: most by which a buffer may miss its time; with None no time is a
-    problem. Raises ProtocolError if a file is not one of control traffic.
+    devices: those that took part. tolerance_s: most by which a buffer may miss its time; None allows any time. Raises
+    ProtocolError if a file is not one of control traffic.
     """
     before, after = Spoken.of(read_taps(recorded)), Spoken.of(read_taps(now) if now.exists() else ())
     problems: list[str] = []

@@ -1,4 +1,4 @@
-"""Plays a recording: opens its devices, scans, and compares what drivers sent with what was sent when it was taken."""
+"""Plays a recording: opens its devices, scans, and compares what drivers send with what they sent when it was taken."""
 
 import logging
 import tempfile

@@ -79,7 +79,7 @@ class Run:
         self._tap: TapFile | None = None
 
     def start_tap(self) -> TapFile:
-        """Start to record what passes the ports of the devices, and return the file with it."""
+        """Start to record the traffic on the ports of the devices, and return its file."""
         assert self._folder is not None, "asked for with a recording, which needs a folder"
         self._tap = TapFile.begin(self._folder.place(CONTROL_FILE))
         return self._tap

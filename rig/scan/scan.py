@@ -229,7 +229,7 @@ def _map_time_s(rig: OpenRig, plan: ScanPlan, maps: int | None) -> float:
 
 
 def _first_alone(rig: OpenRig) -> bool:
-    """Whether the first map gets a start of its own: a live stream cannot stand still while its map is learned from."""
+    """Whether the first map gets a start of its own: a live stream does not stop while the estimator learns from it."""
     learns = rig.config.estimate.estimator in (AUTO, *LEARNING)  # `auto` becomes one of those
     return learns and not rig.spad.info.can_wait
 

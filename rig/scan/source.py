@@ -61,7 +61,7 @@ class Source:
         self._ring.end_waits()
 
     def join(self, timeout_s: float) -> bool:
-        """Wait for the thread; False if it does not end in time. Readers get only what is left, in either case."""
+        """Wait for the thread; False if it does not end in time. In both cases readers get what is left in the ring."""
         ended = self.thread.join(timeout_s)
         self._ring.finish(self._why)
         return ended
