@@ -1,13 +1,13 @@
 """Entry point of `rig` and `python -m rig`.
 
-Loading the program takes a moment. Ctrl-C during that time ends it as at any other time, with one line and exit code 4.
+Loading the program takes a moment. Ctrl-C while it loads ends it as at any other time: with one line and exit code 4.
 """
 
 import sys
 
 
 def main() -> None:
-    """Load the command line and run it; ends the process with the exit code."""
+    """Load and run the command line. Ends the process with the command's exit code."""
     try:
         from rig.cli.main import main as command_line
     except KeyboardInterrupt:

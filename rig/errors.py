@@ -1,7 +1,7 @@
-"""Errors of the application above the devices, each with the exit code with which the command line ends.
+"""Errors of the application, each with the exit code that the command line returns for it.
 
-A message names the thing, the value, the limit and the next step. Several problems found together are one error with
-one line each, so that nobody has to correct a config one key at a time.
+A message names the thing, the value, the limit and the next step. Problems found together become one error with a line
+for each, so that nobody has to correct a config one key at a time. Errors of a single device are in `drivers.errors`.
 """
 
 from collections.abc import Callable, Iterable, Iterator
@@ -19,7 +19,7 @@ class RigError(Exception):
 
 
 class UsageError(RigError):
-    """Raised when the user asked for something impossible: a wrong option, config, plan or file."""
+    """Raised for a request that cannot be met: a wrong option, config, plan or file."""
 
     exit_code = 2
 
@@ -29,13 +29,13 @@ class UsageError(RigError):
 
     @classmethod
     def of(cls, problems: Iterable[str]) -> "UsageError":
-        """One error for several problems, each on its own line and only once."""
+        """Make one error of several problems: a line for each, without duplicates."""
         return cls(*dict.fromkeys(problems))
 
 
 @contextmanager
 def noted(problems: list[str]) -> Iterator[None]:
-    """A context that a UsageError leaves without being raised; its problems are added to the list."""
+    """A context that catches a UsageError and adds the error's problems to the list."""
     try:
         yield
     except UsageError as error:
@@ -43,7 +43,7 @@ def noted(problems: list[str]) -> Iterator[None]:
 
 
 def each_or_problems(items: Iterable[Item], make: Callable[[Item], Made]) -> list[Made]:
-    """Make something of each item. Raises UsageError with all problems of all of them."""
+    """Call `make` on each item and list the results. Raises one UsageError with the problems of all items."""
     made: list[Made] = []
     problems: list[str] = []
     for item in items:
@@ -65,14 +65,13 @@ class DevicesError(RigError):
 
 
 class RecordingError(RigError):
-    """Raised when a recording cannot be written, cut or mended. A run then ends, and what was recorded is kept."""
+    """Raised when a recording cannot be written, cut or repaired. A scan then ends; what was recorded is kept."""
 
     exit_code = 3
 
 
 class DivergedError(RigError):
-    """Raised when a driver sent its device something different from the recording that is played, or at another
-    time."""
+    """Raised during a replay when a driver sends its device something other than was recorded, or at another time."""
 
 
 class DamagedRecordingError(RigError):

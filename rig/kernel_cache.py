@@ -1,12 +1,12 @@
-"""Where numba keeps compiled kernels, and which of those that are kept no longer hold.
+"""Gives numba a folder for compiled kernels, and removes kernels that are out of date.
 
-Service accounts and containers often have no folder in which numba can store kernels, and numba then refuses to compile
-at all: `prepare` provides one.
+Service accounts and containers often have no folder in which numba can store kernels. numba then refuses to compile at
+all, so `prepare` provides a folder.
 
-numba compiles a kernel anew if its own file has changed, but not if another file has from which the kernel inlines
-functions. After an update old kernels would silently work on new tables. So `prepare` notes what each module of these
-packages is made of, itself and all that it imports, and removes the kernels of those that have changed. Looking whether
-any file has changed takes a few milliseconds, and the rest a second.
+numba compiles a kernel anew if the kernel's own file has changed. It does not if the change is in another file, from
+which the kernel inlines functions. After an update, old kernels would silently work on new tables. So `prepare` stores
+a digest of each module's source and of all modules that it imports, and removes the kernels of modules whose digest has
+changed. Checking whether any file has changed takes a few milliseconds, computing the digests a second.
 """
 
 import ast
@@ -18,15 +18,15 @@ from collections.abc import Iterator
 from pathlib import Path
 
 VARIABLE = "NUMBA_CACHE_DIR"
-"""Numba's own setting, see its manual; a value that the user has set is left alone."""
+"""numba's own environment variable (see its manual). A value that the user has set is kept."""
 PACKAGES = "calibration", "drivers", "rig", "sim_backend"
 TOP = Path(__file__).parent.parent
 NOTE = "spadrig-kernels-{}.json"
-"""With a digest of the checkout: several may share one folder."""
+"""Name of the file with the digests. {} is a digest of the checkout's path, since several may share one folder."""
 
 
 def prepare() -> None:
-    """Give numba a folder that it can write, and forget stale kernels. Call it before numba is imported."""
+    """Give numba a folder that it can write to, and remove stale kernels. Call this before numba is imported."""
     home = Path(os.environ.get("XDG_CACHE_HOME") or Path("~/.cache").expanduser())
     if VARIABLE not in os.environ and not _writable(TOP / "rig" / "__pycache__"):
         os.environ[VARIABLE] = str(home / "spadrig-kernels" if _writable(home) else _private_folder())
@@ -35,10 +35,10 @@ def prepare() -> None:
 
 
 def forget_stale(top: Path, kept: Path | None) -> None:
-    """Remove kernels of modules below `top` that, or whose imports, have changed since the last call.
+    """Remove the kernels of modules below `top` that have changed since the last call, or whose imports have.
 
-    kept: numba's folder; None if kernels lie beside their modules. If the note cannot be written, as on a full disk,
-    the next call does the same again.
+    kept: numba's folder; None if kernels lie beside their modules. If the digests cannot be stored, as on a full disk,
+    the next call removes the same kernels again.
     """
     sources = sorted(file for package in PACKAGES for file in _sources(os.path.join(top, package)))
     seen = _digest("".join(f"{path} {changed_ns} {size}\n" for path, changed_ns, size in sources).encode())
@@ -86,7 +86,7 @@ def _module_of(top: Path, file: Path) -> str:
 
 
 def _made_of(files: dict[str, Path]) -> dict[str, str]:
-    """A digest of the source of each module and of all modules that it imports, directly or not."""
+    """A digest for each module: of its source and of all modules that it imports, directly or indirectly."""
     sources = {module: file.read_bytes() for module, file in files.items()}
     imports = {module: _imported(source) & sources.keys() for module, source in sources.items()}
     own = {module: _digest(source) for module, source in sources.items()}
@@ -117,14 +117,14 @@ def _digest(data: bytes) -> str:
 
 
 def _writable(folder: Path) -> bool:
-    """Whether the folder, or the nearest one above it that exists, can be written."""
+    """Whether a folder can be written to. If it does not exist, the nearest existing folder above it decides."""
     while not folder.exists() and folder != folder.parent:
         folder = folder.parent
     return folder.is_dir() and os.access(folder, os.W_OK)
 
 
 def _private_folder() -> Path:
-    """A folder that only this user can write: kernels are code, and temporary folders are everybody's."""
+    """A folder that only this user can write to. Kernels are code, and anybody can write to the temporary folder."""
     user = os.getuid() if hasattr(os, "getuid") else 0
     folder = Path(tempfile.gettempdir()) / f"spadrig-kernels-{user}"
     folder.mkdir(mode=0o700, exist_ok=True)

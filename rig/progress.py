@@ -1,7 +1,7 @@
-"""Progress of a command: named stages, with a count if one is known, reported to whoever listens.
+"""Progress of a command: named stages, with counts where they are known.
 
-It works like a log: reports go from where the work is done to the listener of the calling thread, if there is one,
-without being passed down through calls.
+It works like logging: `tell_stage` reports to the listener of the calling thread, if there is one, so no callback needs
+to be passed down through calls.
 """
 
 from collections.abc import Callable, Iterator
@@ -10,21 +10,21 @@ from contextvars import ContextVar
 from dataclasses import dataclass
 
 Progress = Callable[[int, int], None]
-"""A callback that gets what is done and what there is to do, in frames, maps or rows, now and then."""
+"""A callback that is called now and then with what is done and the total, in frames, maps or rows."""
 
 
 PREPARING = "preparing"
-"""The stage before anything else is told."""
+"""The first stage, before any other is reported."""
 
 
 @dataclass(frozen=True, slots=True)
 class Step:
-    """One moment of a command.
+    """A report of progress.
 
-    total: None if the number is not known; otherwise `done` never exceeds it.
+    total: None if it is not known; otherwise `done` never exceeds it.
     unit: of the counts, in the plural.
-    note: anything else to say.
-    part: the part of the whole that the stage belongs to, such as 'pose 3 of 12'.
+    note: further text.
+    part: the part of the command that the stage belongs to, such as 'pose 3 of 12'.
     """
 
     stage: str
@@ -49,7 +49,7 @@ def tell_stage(stage: str, done: int = 0, total: int | None = None, unit: str = 
 
 
 def counted(stage: str, unit: str, progress: Progress | None = None) -> Progress:
-    """A callback that reports the counts it gets as progress of this stage, and passes them on to `progress`."""
+    """A callback that reports its counts as progress of this stage, and passes them on to `progress`."""
 
     def count(done: int, total: int) -> None:
         tell_stage(stage, done, total, unit)
@@ -71,7 +71,7 @@ def listening(listener: Listener) -> Iterator[None]:
 
 @contextmanager
 def part(name: str) -> Iterator[None]:
-    """A context in which all reports belong to this part of the whole. It begins with the stage PREPARING."""
+    """A context in which all reports carry the name of this part. The first report is the stage PREPARING."""
     token = _part.set(name)
     tell_stage(PREPARING)
     try:

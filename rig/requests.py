@@ -1,8 +1,8 @@
-"""Requests of a user: one frozen dataclass for each command, which the command line fills and `rig.api` takes.
+"""Requests of a user: a frozen dataclass for each command with many options, filled by the options or by a Python call.
 
-A field has its type and a phrase that says what it is. `rig scan --help` prints the phrase, `help(ScanRequest)` has it
-for Python; `rig/cli/command.py` makes an option of each field. None leaves a setting to the config, whose defaults are
-in `rig/config/models.py`.
+Each field has a type and a phrase that describes it, which `rig scan --help` and `help(ScanRequest)` show.
+`rig/cli/command.py` makes an option of each field. None leaves a setting to the config, whose defaults are in
+`rig/config/models.py`.
 """
 
 import inspect
@@ -24,7 +24,7 @@ def option(
 
     about: a phrase that describes it. unset: description of the value used if none is given.
     name: of the command line's option, if it differs from the field's. read_as: the type that the command line reads,
-    if it differs from the field's. least: the smallest value.
+    if it differs from the field's. least: the smallest value allowed.
     """
     told = {"about": about, "unset": unset, "name": name, "read_as": read_as, "least": least}
     return field(default=default, metadata=told)
@@ -36,7 +36,7 @@ def path_option(about: str, unset: str) -> str | os.PathLike[str] | None:
 
 
 def options_of(request: type) -> "list[Field[Any]]":
-    """The fields of a request in the order of its help: its own fields before the inherited ones."""
+    """The fields of a request in the order of its help: its own fields, then inherited ones."""
     by_name = {each.name: each for each in fields(request)}
     names = (name for part in request.__mro__ for name in inspect.get_annotations(part))
     return [by_name[name] for name in dict.fromkeys(names)]
@@ -157,7 +157,7 @@ class TradeoffRequest:
 @described
 @dataclass(frozen=True, slots=True, kw_only=True)
 class CutRequest:
-    """A part of a recording (`rig cut`): exactly one of `maps`, `frames` and `time`."""
+    """A part of a recording (`rig cut`). Give exactly one of `maps`, `frames` and `time`."""
 
     maps: str | None = option(None, "A:B, maps A to before B, from 0")
     frames: str | None = option(None, "A:B, frames A to before B")
@@ -168,7 +168,7 @@ class CutRequest:
 @described
 @dataclass(frozen=True, slots=True, kw_only=True)
 class ImportRequest:
-    """A reading of frames in another program's files (`rig import`)."""
+    """Import of frames from another program's files (`rig import`)."""
 
     form: str | None = option(
         None, "pi-imaging: packed or sparse; swissspad2: half or full; photoncube: packed", unset="as it looks; half"

@@ -15,16 +15,16 @@ from typing import Self
 import numpy as np
 
 Work = Callable[[int, int], None]
-"""Work on a range of rows; it is called with the first row and the one behind the last."""
+"""A callback that works on a range of rows, called with the first row and the row after the last."""
 _Job = tuple[Work, int, int]
 _LEAST_URGENT = 19
 
 
 class RowWorkers:
-    """Threads that share the rows of a picture. Each always gets the same rows, which may still be in its cache.
+    """Threads that share the rows of a picture. Each always gets the same rows, which may still be in its core's cache.
 
-    Work can be queued (`post`): each thread goes through it in order and none waits for the others. An error in the
-    work is raised at the next call, and no further work is begun until then. With one thread work is done at once.
+    `post` queues work: each thread does its part in order and none waits for the others. If work fails, the next call
+    raises its error, and no further work is begun until then. With one thread, `post` does the work itself, at once.
     The threads end with `close`, or when nothing refers to the workers any more.
     """
 
@@ -36,9 +36,7 @@ class RowWorkers:
             threading.Thread(target=_run, args=(self._state, queue, i), name=f"rows {i}", daemon=True).start()
 
     def over(self, rows: int, work: Work) -> None:
-        """Call work(first, last) for ranges that together cover rows 0..rows-1, after everything that was posted
-        before.
-        """
+        """Call work(first, last) for ranges that together cover rows 0..rows-1; wait for them and all earlier posts."""
         self.post(rows, work)
         self.settle()
 
@@ -57,10 +55,7 @@ class RowWorkers:
             queue.put((work, first, last))
 
     def settle(self, under_way: int = 0) -> None:
-        """Wait until at most the last `under_way` posts are still being worked on; if one failed, wait for all.
-
-        Raises the error of a post that failed.
-        """
+        """Wait until all posts but the last `under_way` are done. If one failed, wait for all and raise its error."""
         state = self._state
         if not state.queues:
             return
@@ -94,16 +89,16 @@ class _State:
         self.done = [0] * threads
         self.posted = 0
         self.wanted = 0
-        """Posts that the caller waits for."""
+        """Number of posts that must be done before the caller, who waits, goes on."""
         self.changed = threading.Condition()
         self.error: BaseException | None = None
-        """The first failure, until the caller has been told and nothing is left over."""
+        """The first failure. It is kept until all posted work is over and the caller has received it."""
 
 
 def yield_to_others() -> None:
-    """Give the calling thread the lowest priority, so that it hardly works unless a core is idle. On Linux alone.
+    """Give the calling thread the lowest priority: it hardly works while no core is idle. Does nothing except on Linux.
 
-    Row threads work in step, so one that shares its core with less urgent work slows all of them.
+    Every map waits for the slowest row thread, so less urgent work on one row thread's core would delay all.
     """
     if sys.platform == "linux":
         os.setpriority(os.PRIO_PROCESS, threading.get_native_id(), _LEAST_URGENT)
@@ -122,7 +117,7 @@ def _run(state: _State, queue: "SimpleQueue[_Job | None]", i: int) -> None:
         del work, job
         with state.changed:
             state.done[i] += 1
-            # Whoever waits is not woken to find that others are not done.
+            # The caller is woken only when all that it waits for is done, or after a failure.
             if min(state.done) >= state.wanted or state.error is not None:
                 state.changed.notify_all()
 
@@ -133,10 +128,10 @@ def _end(state: _State) -> None:
 
 
 class StageThread:
-    """A thread that runs `run` once beside the caller. A program that ends does not wait for it.
+    """A thread that calls `run` once. A program that ends does not wait for it.
 
-    `run` must handle all its own errors. A stage may fail before its thread is started, so `join` may come without
-    `start`.
+    `run` must handle all its own errors. `join` may be called without `start`, since a scan may fail before its threads
+    are started.
     """
 
     def __init__(self, run: Callable[[], None], name: str) -> None:

@@ -4,12 +4,12 @@ from rig.api import scan
 result = scan(exposures=4, seed=1)
 result.last.depth_m, result.summary.truth
 
-For a calibration `sources` may be a rig (a config, the name of a bundled one, or its file), folders of runs taken with
-`record`, folders of earlier calibrations (for their views) and, for the camera alone, pictures. The default is the
-bundled simulated rig, whose world moves the board. `ask` is called to have the board of a real rig moved, and returns
-once that is done; `tell` gets a line about each view. All calibrations raise CalibrationError if the views give no
-calibration (Degenerate, with `.reason`, if more or other views would help), UsageError for a request that cannot be
-met, and DeviceError or DevicesError if devices fail. Views that were taken by then are in `out`.
+For a calibration, `sources` may be a rig (a config, the name of a bundled one, or its file), folders of runs taken with
+`record`, folders of earlier calibrations (for their views) and, for `calibrate_camera`, pictures. The default is the
+bundled simulated rig, which moves the board itself. With a real rig, `ask` is called when the board must be moved, and
+must return once that is done; `tell` gets a line about each view. All calibrations raise CalibrationError if the views
+give no calibration (its subclass Degenerate, with `.reason`, if more or other views would help), UsageError for a
+request that cannot be met, and DeviceError or DevicesError if devices fail. Views taken before the error are in `out`.
 """
 
 from rig.api.rig import bench, check_config, devices, doctor, laser_off, warm_up

@@ -1,4 +1,4 @@
-"""The calls about a rig and its computer: check a config, list devices, laser off, benchmarks."""
+"""The calls about a rig and its computer: check a config, examine or list devices, laser off, speed, compilation."""
 
 from pathlib import Path
 from typing import TYPE_CHECKING
@@ -14,7 +14,7 @@ if TYPE_CHECKING:
 
 
 def check_config(config: Config = SIMULATED) -> "RigConfig":
-    """Return the config after opening every file that it names in the way a scan does (`rig config check`).
+    """Load a config, open every file that it names as a scan would, and return the config (`rig config check`).
 
     Raises UsageError with one line per problem.
     """
@@ -43,7 +43,7 @@ def devices() -> "list[Attached]":
 
 
 def laser_off(config: Config = SIMULATED) -> list[str]:
-    """Take the gate low, disarm the laser, and return lines that say what was done (`rig laser off`).
+    """Set the gate low, disarm the laser, and return lines that say what was done (`rig laser off`).
 
     Raises DevicesError if a device does not answer.
     """

@@ -49,10 +49,10 @@ def scan(
 
     request, changes: options, as a `ScanRequest` or by the names of its fields: `scan("lab", exposures=3)`.
     progress: called several times a second with frames done and frames planned.
-    live: called as often with a `ScanProgress`, which has the figures of every stage.
+    live: called equally often with a `ScanProgress`, which has the figures of every stage.
     monitor: called with the newest frames as a `MonitorView`, at most ten times a second and on a thread of its own;
       the run never waits for it.
-    on_space: called before anything moves with a `Space`: the most that the recording will take on the disk.
+    on_space: called with a `Space` before anything moves: the most disk space that the recording will take.
 
     Raises UsageError for a request that cannot be met, DeviceError or DevicesError if devices fail, RecordingError if
     frames cannot be written; maps finished by then are in `out`. An interrupt ends the scan after its last complete
@@ -77,13 +77,14 @@ def plan_scan(
 ) -> ScanPlan:
     """Compile the plan of a scan and check it against the limits of its devices (`rig scan --dry-run`).
 
-    Options and checks are those of `scan`, including the room on the disk. Two things only `scan` finds out: whether
-    `out` is new or empty and can be written, and whether the estimator `joint`, if asked for, has the memory that it
-    needs. Devices are opened, asked for their limits and closed again. Nothing moves and no light leaves, so `arm` is
-    not needed.
+    Options and checks are those of `scan`, including the room on the disk for a recording. Only `scan` finds out two
+    things: whether `out` is new or empty and can be written, and whether there is memory enough for the estimator
+    `joint` if it was named. Devices are opened, asked for their limits and closed again. Nothing moves and no light
+    leaves, so `arm` is not needed.
 
-    on_estimator: called with the estimator in words; whether `auto` keeps up with a stream is measured by `scan` only.
-    Raises UsageError for a scan that cannot be made, DevicesError, one line per device, if real ones are missing.
+    on_estimator: called with the estimator and why it is used, in words. For `auto` it may state a condition: only
+      `scan` measures whether `joint` keeps up with a stream.
+    Raises UsageError for a scan that cannot be made, and DevicesError, one line per device, for devices that fail.
     """
     request = replace(request or ScanRequest(), **changes)
     settings = _configured(config, request)
@@ -116,17 +117,19 @@ def replay(
     steps: Callable[[Pace], None] | None = None,
     **changes: Any,
 ) -> RunResult:
-    """Play a recording as if it were taken now. The depth is the same, bit for bit, at any clock (`rig replay`).
+    """Process a recording as if its frames came from the SPAD now (`rig replay`).
+
+    The depth is the same, bit for bit, at any speed (`clock`), unless frames are dropped (`on_overload`).
 
     run: folder of a run taken with `record`.
     request, changes: options, as a `ReplayRequest` or by the names of its fields.
-    calibration: file made since the recording; None is the recording's own.
-    steps: for the clock 'step', called before the start with an object whose `step()` and `run_on()` may be called from
-      any thread.
+    calibration: file made since the recording; None means the recording's own.
+    steps: for the clock 'step', called before the start with an object whose `step()`, one sweep more, and `run_on()`,
+      all that remains, may be called from any thread.
     Everything else is as in `scan`.
 
     Raises UsageError if there is no recording, DamagedRecordingError if it cannot be played as it is, and DivergedError
-    if drivers sent something else than was recorded or, in real time, a buffer of points more than 2 ms off its time.
+    if drivers sent something other than was recorded or, in real time, a buffer of points more than 2 ms off its time.
     """
     request = replace(request or ReplayRequest(), **changes)
     settings = replay_config(Path(run), request, None if request.config is None else configure(request.config))
@@ -162,7 +165,7 @@ def _listeners(
 
 
 def _new_run(settings: RigConfig, request: RunRequest) -> Run:
-    """Claim the run's folder. Raises UsageError with all that is wrong with the request."""
+    """Claim the run's folder. Raises UsageError with all problems of the request."""
     save = _checked(request, require_simulated_or_armed(settings, request.arm))
     scan, estimate = settings.scan, settings.estimate
     tally = MapTally(scan.columns, scan.exposures, estimate.estimator, estimate.filter)
@@ -170,7 +173,7 @@ def _new_run(settings: RigConfig, request: RunRequest) -> Run:
 
 
 def _checked(request: RunRequest, others: Sequence[str] = ()) -> SavePolicy:
-    """The policy for maps to write. Raises UsageError with `others` and all that is wrong with the request."""
+    """Check a request; returns which maps to write. Raises UsageError with `others` and all problems of the request."""
     problems = list(others)
     if request.record and request.out is None:
         problems.append("record writes the frames into the run's folder; name one with out")
@@ -201,8 +204,8 @@ def reconstruct(
 
     source: folder of a run taken with `record`; or frames alone: an .npy of uint8 (maps x columns x exposures, height,
       ceil(width/8)), or the folder that `rig import` made of such frames.
-    plan, calibration: both are needed for frames alone. A run has its own; it may be given a calibration file that was
-      made since.
+    plan, calibration: both are needed for frames alone. A run has its own; for it, `calibration` may name a file made
+      since, and `plan` must be left out.
     request, changes: options, as a `ReconstructRequest` or by the names of its fields.
     progress: called with the number of frames or maps done and the total.
 
@@ -240,7 +243,7 @@ def reconstruct(
 
 
 def _estimate(request: ReconstructRequest) -> EstimateConfig:
-    """The settings for frames alone, which come with none."""
+    """The settings of the estimate for frames alone, which have no config."""
     estimator, filter = request.estimator or AUTO, request.filter or "none"
     min_confidence = 0.5 if request.min_confidence is None else request.min_confidence
     problems = []

@@ -17,7 +17,7 @@ from rig.tradeoff.files import write_files
 from rig.tradeoff.trials import Tradeoff, require_methods, run_tradeoff, trials_of
 
 EXPOSURES = (1, 3, 10)
-"""Exposures per column that are tried where the caller names none."""
+"""Exposures per column that are tried if the caller names none."""
 
 
 def tradeoff(
@@ -27,11 +27,11 @@ def tradeoff(
     progress: Progress | None = None,
     **changes: Any,
 ) -> Tradeoff:
-    """Scan a simulated rig with all combinations of settings and score them by the world's truth (`rig tradeoff`).
+    """Scan a simulated rig with all combinations of settings and compare the maps with the truth (`rig tradeoff`).
 
     request, changes: options, as a `TradeoffRequest` or by the names of its fields:
-      `tradeoff(exposures=(1, 3), time_budget="20 ms")`. A calibration is checked against the rig with the number of
-      lines in its config.
+      `tradeoff(exposures=(1, 3), time_budget="20 ms")`. The calibration is checked once, against the rig with as many
+      lines as its config names.
     progress: called with the number of frames done and the total.
 
     Raises UsageError, one line per problem. An interrupt ends the trials after the last complete row, with verdict

@@ -25,7 +25,7 @@ def bench_command(
         str, typer.Option("--on-overload", help="soak: frames come too fast: abort, drop or block")
     ] = "abort",
 ) -> Answer:
-    """Measure how fast this machine counts and estimates, beside how fast it reads its memory."""
+    """Measure how fast this machine counts and estimates, and how fast it reads memory."""
     from rig.errors import UsageError
 
     if soak is None and (window or slow_consumer != 0 or on_overload != "abort"):

@@ -46,7 +46,7 @@ EXIT_SOFTWARE = 70
 """An error in the program itself: EX_SOFTWARE of sysexits.h."""
 
 Commands = Mapping[str, "Callable[..., int | Answer] | tuple[str, Commands]"]
-"""Commands by name; a group is its help and the commands in it."""
+"""Commands by name. A group is a pair: its help, and the commands in it."""
 
 ConfigArgument = Annotated[
     str,
@@ -67,8 +67,8 @@ _JSON = inspect.Parameter(
 
 @dataclass(frozen=True, slots=True)
 class Answer:
-    """Result of a command. content: printed with --json. show: prints it for people. code: the exit code. note: said
-    afterwards on stderr.
+    """Result of a command. content: printed with --json. show: prints it for people. code: the exit code. note: printed
+    to stderr afterwards.
     """
 
     content: Mapping[str, Any]
@@ -89,8 +89,8 @@ def add_commands(app: typer.Typer, commands: Commands) -> None:
 
 
 def command(function: Callable[..., int | Answer]) -> Callable[..., None]:
-    """Wrap a command: its answer is printed, with the option --json for programs; its user's mistakes and its devices'
-    faults become lines and exit codes.
+    """Wrap a command: print its answer, as JSON with the option --json; turn mistakes of the user and failures of
+    devices into lines on stderr and exit codes.
     """
     signature = inspect.signature(function)
 
@@ -143,7 +143,7 @@ _MANY = {Sequence[str]: split_option, Sequence[int]: whole_numbers}
 
 
 def asks(request_type: type[Any]) -> Callable[[Callable[..., Answer]], Callable[..., Answer]]:
-    """Give a command an option for each field of a request; it gets them together, as its argument `request`.
+    """Give a command an option for each field of a request. The command gets the filled request as `request`.
 
     A field for which the command already has its own option is left out.
     """
@@ -172,7 +172,7 @@ def _option_name(field: "Field[Any]") -> str:
 
 
 def _parameter(field: "Field[Any]") -> inspect.Parameter:
-    """The parameter of a command that typer makes the option of a field from."""
+    """The parameter of a command from which typer makes the option for a field."""
     told, name, many = field.metadata, _option_name(field), field.type in _MANY
     kind_of_name = next((one for one in get_args(Kind) if one == field.name.removesuffix("s")), None)
     option = typer.Option(

@@ -1,7 +1,7 @@
 """The names that a shell completes with Tab: bundled rigs and scenes, estimators, filters.
 
-If no name fits, the shell completes file names. Names come without the descriptions of `rig scenes`, because fish takes
-the second line of a long description for another name.
+If no name fits, the shell completes file names. Names come without the descriptions of `rig scenes`, because the shell
+fish takes the second line of a long description for another name.
 """
 
 from collections.abc import Callable, Iterable
@@ -22,7 +22,7 @@ def names(kind: Kind) -> Iterable[str]:
 
 
 def one_of(kind: Kind) -> Callable[[str], list[str]]:
-    """A completer for a value that is one name of a kind."""
+    """A completer for a value that is one name of this kind."""
 
     def complete(incomplete: str) -> list[str]:
         return [name for name in names(kind) if name.startswith(incomplete)]

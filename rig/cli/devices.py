@@ -30,7 +30,7 @@ def devices_command() -> Answer:
 
 
 def laser_off_command(config: ConfigArgument = "simulated") -> int:
-    """Take the gate low and switch the laser's emission off for good."""
+    """Set the gate low and switch the laser's emission off for good."""
     for line in api.laser_off(config):
         print(line)
     return 0

@@ -22,9 +22,9 @@ from rig.cli import bench, calibrate, devices, recordings, scan
 from rig.cli.command import EXIT_ABORTED, EXIT_SOFTWARE, EXIT_USAGE, add_commands, fail, refused_file, say
 
 _ENDING = ("SIGTERM", "SIGHUP", "SIGBREAK")
-"""Signals that end a program, beside Ctrl-C; no system has all of them."""
+"""Signals that end a program, besides Ctrl-C; no system has all of them."""
 _TYPER_INTERRUPTED = 130
-"""Exit code that typer returns where an interrupt reaches it."""
+"""Exit code that typer returns after an interrupt."""
 
 app = typer.Typer(
     name="rig",
@@ -49,7 +49,7 @@ def main(argv: Sequence[str] | None = None) -> None:
     """Entry point of `rig`; ends the process with the exit code."""
     arguments = _join_save(list(sys.argv[1:] if argv is None else argv))
     logging.basicConfig(level=logging.WARNING, stream=sys.stderr, format="%(levelname)s: %(message)s")
-    # Matrices are small here: on two cores numpy's own threads made some steps take up to 30 times as long.
+    # Matrices are small here: with numpy's own threads some steps take up to 30 times as long on two cores.
     os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
     with _signals_interrupt():
         try:
@@ -57,7 +57,7 @@ def main(argv: Sequence[str] | None = None) -> None:
             code = app(args=arguments, prog_name="rig", standalone_mode=False)
         except (KeyboardInterrupt, Exception) as error:
             code = _say_why(error, arguments)
-        if code == _TYPER_INTERRUPTED:  # before a command had begun, or once more while one ended
+        if code == _TYPER_INTERRUPTED:  # an interrupt before a command had begun, or a second one while it ended
             code = fail(EXIT_ABORTED, [], ["aborted"], "--json" in arguments)
     if argv is None and code == EXIT_ABORTED:
         _ignore_interrupts()
@@ -65,7 +65,7 @@ def main(argv: Sequence[str] | None = None) -> None:
 
 
 def _ignore_interrupts() -> None:
-    """Ignore interrupts from now on: only threads are left to end, and the exit code stands."""
+    """Ignore interrupts from now on: only threads have yet to end, and the exit code is known."""
     if threading.current_thread() is threading.main_thread():
         for name in ("SIGINT", *_ENDING):
             if (number := getattr(signal, name, None)) is not None:
@@ -74,9 +74,9 @@ def _ignore_interrupts() -> None:
 
 @contextmanager
 def _signals_interrupt() -> Iterator[None]:
-    """Within the context, signals that end a program raise KeyboardInterrupt and make the rig safe as Ctrl-C does.
+    """A context in which signals that end a program raise KeyboardInterrupt, and so make the rig safe as Ctrl-C does.
 
-    A signal that is ignored (nohup) stays ignored; threads other than the main one get none.
+    A signal that is ignored (nohup) stays ignored. Outside the main thread the context does nothing.
     """
 
     def interrupt(number: int, frame: object) -> None:
@@ -96,21 +96,21 @@ def _signals_interrupt() -> Iterator[None]:
 
 
 def _say_why(error: BaseException, arguments: list[str]) -> int:
-    """Say which error ended a command that did not handle it; returns the exit code, after an interrupt too."""
+    """Print an error that no command handled, and return the exit code. An interrupt prints nothing here."""
     as_json = "--json" in arguments
     if isinstance(error, KeyboardInterrupt) or isinstance(error.__cause__, KeyboardInterrupt):
         return _TYPER_INTERRUPTED
-    refused = refused_file(error)  # the shell's start-up files, by --install-completion
+    refused = refused_file(error)  # such as the shell's start-up file, which --install-completion changes
     if refused is not None:
         return fail(EXIT_USAGE, [refused], [], as_json)
-    # Typer carries click inside or beside itself, depending on its version.
+    # Some versions of typer contain click and others import it, so the class of click's errors is not fixed.
     if not hasattr(error, "format_message"):
         traceback.print_exception(error)
         return fail(EXIT_SOFTWARE, [f"the program failed with {type(error).__name__}: {error}; report it"], [], as_json)
     context = getattr(error, "ctx", None)
     command = context.command_path if context is not None else "rig"
     message = error.format_message().rstrip(".")
-    # What an error tells of its option's type differs between versions, these words do not.
+    # The wording about the type of an option differs between versions, but these words are in all of them.
     steps = (
         ("valid integer", "write a whole number or "),
         ("valid float", "write a number or "),
@@ -131,7 +131,7 @@ def _values(option: str, arguments: list[str]) -> list[str]:
 
 
 def _require_no_empty(arguments: list[str]) -> None:
-    """Raise BadParameter for an empty argument or `--NAME=`: an unset shell variable, which would mean '.'."""
+    """Raise BadParameter for an empty argument or `--NAME=`: mostly an unset shell variable, and it would mean '.'."""
     for before, word in pairwise(["rig", *arguments]):
         if not word or (word.startswith("--") and word.endswith("=")):
             place = f"the argument behind '{before}'" if not word else f"'{word}'"
@@ -154,7 +154,7 @@ def _root(
 
 
 def _join_save(arguments: list[str]) -> list[str]:
-    """Join `--save every 5` into one value, which is what an option takes."""
+    """Join `every 5` of `--save every 5` into one value, since an option takes only one."""
     for i in range(len(arguments) - 2):
         if arguments[i : i + 2] == ["--save", "every"]:
             return [*arguments[: i + 1], f"every {arguments[i + 2]}", *arguments[i + 3 :]]

@@ -1,4 +1,4 @@
-"""Shows on stderr the progress of a command: a running line at a terminal, otherwise a line when a stage begins."""
+"""Shows the progress of a command on stderr: one line that is redrawn at a terminal, otherwise a line per stage."""
 
 import logging
 import math
@@ -18,7 +18,7 @@ if TYPE_CHECKING:
 
 COMPILING = "compiling, about a minute, the first time only"
 PATIENCE_S = 2.0
-"""Seconds; without a terminal, a command that takes less says nothing of its progress."""
+"""Without a terminal, a command that takes less than this prints no progress."""
 BAR_CELLS = 20
 
 _live: ContextVar["Live | None"] = ContextVar("live", default=None)
@@ -53,8 +53,8 @@ class ProgressLine:
         self.on_change()
 
     def compiler_ended(self) -> None:
-        """Note that a compilation is over. The stage stays 'compiling' until the next step, since more usually
-        follows."""
+        """Note that a compilation is over. The stage stays 'compiling' until the next step, since another compilation
+        usually follows."""
         self._compilers -= 1
 
     @property
@@ -64,7 +64,7 @@ class ProgressLine:
 
     @property
     def clock(self) -> str:
-        """Time since the beginning."""
+        """Time since the command began, as text."""
         seconds = math.floor(time.monotonic() - self._begun_s)
         hours, minutes = seconds // 3600, seconds // 60 % 60
         return f"{hours}:{minutes:02d}:{seconds % 60:02d}" if hours else f"{minutes}:{seconds % 60:02d}"
@@ -98,7 +98,7 @@ class ProgressLine:
 
 @contextmanager
 def progress(*, compiles: bool = True) -> Iterator[None]:
-    """A context in which stderr shows the progress of the work. compiles: whether any of it is compiled code."""
+    """A context in which stderr shows the progress of the work. compiles: whether the work uses compiled kernels."""
     line = ProgressLine()
     with ExitStack() as stack:
         stack.enter_context(_drawn(line) if sys.stderr.isatty() else _announced(line))
@@ -110,8 +110,8 @@ def progress(*, compiles: bool = True) -> Iterator[None]:
 
 @contextmanager
 def _announced(line: ProgressLine) -> Iterator[None]:
-    """Within the context each part is printed once, and each stage outside of parts once, as soon as the command has
-    taken `PATIENCE_S`.
+    """A context in which each part, and each stage outside parts, is printed once. Nothing is printed before
+    `PATIENCE_S` have passed.
     """
     lock, said, speaks = threading.Lock(), set[str](), PATIENCE_S <= 0
 
@@ -153,7 +153,7 @@ def paused() -> Iterator[None]:
 
 @contextmanager
 def _drawn(line: ProgressLine) -> Iterator[None]:
-    """Within the context the line stands at the bottom of the terminal, below all else that goes to stderr."""
+    """A context in which the line stands at the bottom of the terminal, below all else that goes to stderr."""
     from rich.console import Console
     from rich.live import Live
 
@@ -176,7 +176,7 @@ def _drawn(line: ProgressLine) -> Iterator[None]:
 
 @contextmanager
 def _watched_compiler(line: ProgressLine) -> Iterator[None]:
-    """Within the context the line is told of each kernel that numba finds in none of its caches."""
+    """A context in which the line is told when numba compiles a kernel, which it does only if no cache holds it."""
     from numba.core import event
 
     class Watch(event.Listener):

@@ -23,7 +23,7 @@ if TYPE_CHECKING:
 RunArgument = Annotated[Path, typer.Argument(metavar="RUN", help="folder of a recorded run", show_default=False)]
 
 _LOOK_S = 0.2
-"""Seconds of one wait for a key."""
+"""Seconds to wait for a key before looking whether the replay is over."""
 MOST_LINES = 20
 """Most problems, and most gaps, that are shown to people; `--json` has all."""
 
@@ -174,7 +174,7 @@ def replay_command(
     request: ReplayRequest,
     run: Annotated[Path, typer.Argument(metavar="RUN", help="a run taken with --record", show_default=False)],
 ) -> Answer:
-    """Play a recording as if it were taken now, at any clock."""
+    """Play a recording as if it were taken now, at any speed."""
     if request.loop and request.save is None:
         request = replace(request, save="last")
     steps = _step_by_keys if request.clock == "step" else None
@@ -186,7 +186,7 @@ def replay_command(
 
 
 def _step_by_keys(pace: "Pace") -> None:
-    """Make a step for each line of the standard input, on a thread; at its end, play the rest at full speed."""
+    """Start a thread that plays a sweep per line of standard input, and the rest at full speed when the input ends."""
     if sys.stdin.isatty():
         say("Enter: one sweep more; Ctrl-C ends")
     threading.Thread(target=_follow, args=(pace, sys.stdin.fileno()), name="steps", daemon=True).start()
@@ -194,7 +194,7 @@ def _step_by_keys(pace: "Pace") -> None:
 
 def _follow(pace: "Pace", handle: int) -> None:
     while not pace.closed:
-        # Not through sys.stdin: a thread that holds its lock would hang the interpreter at its end.
+        # Not through sys.stdin: a thread that waits there holds a lock on which the interpreter would hang at exit.
         if select.select([handle], [], [], _LOOK_S)[0]:
             data = os.read(handle, 4096)
             for _ in range(data.count(b"\n")):

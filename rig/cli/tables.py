@@ -1,4 +1,4 @@
-"""Results as tables in a terminal: runs, scenes, trade-offs (80 columns), `rig bench` (100 columns), calibrations."""
+"""Tables of results for a terminal: runs, effects and trade-offs (80 characters), `rig bench` (100), calibrations."""
 
 import sys
 import textwrap
@@ -25,16 +25,16 @@ if TYPE_CHECKING:
     from rig.calibrate.session import CalibrationResult
 
 WIDE = 300
-"""Characters of a line that goes to a file or a pipe; no line here is as long."""
+"""Width in characters for a file or a pipe; no line here is as long."""
 
 Row = TypeVar("Row")
 Columns = Sequence[tuple[str, Callable[[Row], str]]]
-"""Headings, each with the function that gives the cell of a row."""
+"""Headings, each with the function that makes the cell from a row."""
 
 _NAME_CELLS = 17
 """Characters that an effect's name takes on each of its lines."""
 LEAST_WAIT_S = 1e-3
-"""Shortest wait of the source that is mentioned."""
+"""Waits of the source for a free slot of the ring are shown if they are at least this long."""
 
 _NEXT_STEP = {
     RunVerdict.GAPS: "frames were lost; lower frame_rate or free the computer, then scan again",
@@ -52,7 +52,7 @@ def console(width: int | None = None) -> Console:
 
 
 def _print_pairs(pairs: Iterable[tuple[str, str]], width: int | None = None) -> None:
-    """Print names, and the text of each beside it."""
+    """Print each name with its text beside it."""
     table = Table.grid(padding=(0, 2))
     table.add_column(style="bold")
     table.add_column()
@@ -62,7 +62,7 @@ def _print_pairs(pairs: Iterable[tuple[str, str]], width: int | None = None) -> 
 
 
 def _table(columns: "Columns[Row]", rows: Iterable[Row], *, left: Collection[str] = (), apart: int = 1) -> Table:
-    """A table of these rows. left: headings of text, which begins at the left. apart: spaces between columns."""
+    """A table of these rows. left: headings of the columns that are aligned left. apart: spaces between columns."""
     table = Table(box=None, pad_edge=False, padding=(0, apart, 0, 0))
     for name, _ in columns:
         table.add_column(name, justify="left" if name in left else "right", no_wrap=True)
@@ -85,7 +85,7 @@ def run_table(result: RunResult) -> None:
 
 
 def _advice(result: RunResult) -> str | None:
-    """The next step that the verdict calls for; for an aborted run, how much of it there is."""
+    """The next step that the verdict calls for; for an aborted run, how much of it was made or kept."""
     summary = result.summary
     if summary.verdict is not RunVerdict.ABORTED or (summary.maps and result.folder is not None):
         return _NEXT_STEP.get(summary.verdict)
@@ -124,7 +124,7 @@ def effects_table(scene: SceneEffects) -> None:
 
 
 def flux_table(flux: Flux) -> None:
-    """Print the flux of a row, a line for each pixel and a column for each effect, to stdout."""
+    """Print the flux of an image row to stdout: one text line per pixel, with one value per effect."""
     print("  ".join(f"{name:>12}" for name in flux))
     for x, *parts in zip(*flux.values(), strict=True):
         print("  ".join([f"{x:>12}", *(f"{part:>12.6g}" for part in parts)]))
@@ -139,7 +139,7 @@ def _error_change(effect: Effect) -> str:
 
 
 def _of_maps(maps: tuple[int, ...], of: int) -> str:
-    """Beginning of a line that names the maps a reason is about, where a run has several."""
+    """Text that names the maps a reason is about; empty if the run has only one map."""
     if of == 1:
         return ""
     return f"map {maps[0]}: " if len(maps) == 1 else f"{len(maps)} of {of} maps, the first is {maps[0]}: "
@@ -255,7 +255,7 @@ _LEFT = ("estimator", "filter", "")
 def tradeoff_table(done: Tradeoff) -> None:
     """Print a trade-off to stdout, beginning with the setting to use.
 
-    * marks rows on the front of error over sensor time, + those on the front over compute time.
+    * marks rows on the Pareto front of error and sensor time, + those on the front of error and compute time.
     """
     print(textwrap.fill(done.advice, WIDTH))
     print()

@@ -8,9 +8,9 @@ from dataclasses import dataclass
 from pathlib import Path
 
 BUNDLED = Path(__file__).parents[2] / "config"
-"""Folder of the configs that travel with the program."""
+"""Folder of the configs that come with the program."""
 SCENES = BUNDLED / "scenes"
-"""Folder of the scenes that travel with the program."""
+"""Folder of the scenes that come with the program."""
 
 
 @dataclass(frozen=True, slots=True)

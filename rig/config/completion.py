@@ -6,7 +6,7 @@ from typing import Any, NamedTuple
 import yaml
 
 MOST_COLUMNS = 110
-"""Column from which on a line that is filled in continues on the next one."""
+"""Characters of a line. Keys that are filled in within braces continue on the next line if they would exceed this."""
 
 
 class _Edit(NamedTuple):
@@ -18,9 +18,9 @@ class _Edit(NamedTuple):
 
 
 def completed(text: str, node: yaml.MappingNode, values: Mapping[str, Any], full: Mapping[str, Any]) -> str:
-    """The text with those strings changed that `values` gives otherwise, and with the keys of `full` that it lacks.
+    """Edit a text: replace strings that differ in `values`, and add the keys of `full` that are missing.
 
-    node: parsed node of the text. values: has the text's keys.
+    node: parsed node of the text. values: content of the text, in which strings may have been changed.
     """
     done, at = [], 0
     for edit in sorted(_edits(text, node, values, full), key=lambda edit: edit.begin):
@@ -30,7 +30,7 @@ def completed(text: str, node: yaml.MappingNode, values: Mapping[str, Any], full
 
 
 def _edits(text: str, node: yaml.MappingNode, values: Mapping[str, Any], full: Mapping[str, Any]) -> Iterator[_Edit]:
-    """Replacements for the text; where several begin at one place, the inner one comes first."""
+    """Replacements for the text. If several begin at one place, the one of the inner mapping comes first."""
     for key, value in node.value:
         given = values.get(key.value)
         if isinstance(value, yaml.MappingNode) and isinstance(given, Mapping):
@@ -44,7 +44,7 @@ def _edits(text: str, node: yaml.MappingNode, values: Mapping[str, Any], full: M
 
 
 def _added_inside(text: str, node: yaml.MappingNode, missing: Mapping[str, Any]) -> _Edit:
-    """Keys within braces, behind the last one."""
+    """Add keys within braces, after the last one."""
     at = node.value[-1][1].end_mark.index if node.value else node.start_mark.index + 1
     column = at - (text.rfind("\n", 0, at) + 1)
     parts: list[str] = []
@@ -61,7 +61,7 @@ def _added_inside(text: str, node: yaml.MappingNode, missing: Mapping[str, Any])
 
 
 def _added_below(text: str, node: yaml.MappingNode, missing: Mapping[str, Any]) -> _Edit:
-    """Keys on lines of their own, behind the line of the last one."""
+    """Add keys on lines of their own, below the last one."""
     end = _end(node)
     if text[end - 1] != "\n":
         end = text.find("\n", end) + 1 or len(text)
@@ -70,7 +70,7 @@ def _added_below(text: str, node: yaml.MappingNode, missing: Mapping[str, Any]) 
 
 
 def _end(node: yaml.Node) -> int:
-    """Index behind the last character of what a node holds; a node without brackets has its end mark farther on."""
+    """Index after the last character of a node's content. The end mark of a node without brackets may lie beyond it."""
     if isinstance(node, yaml.CollectionNode) and not node.flow_style and node.value:
         last = node.value[-1]
         return _end(last[1] if isinstance(last, tuple) else last)

@@ -33,7 +33,7 @@ FLAGS: Mapping[Key, str] = {
     ("estimate", "temporal_prior"): "--temporal-prior",
     ("estimate", "threads"): "--threads",
 }
-"""Keys that the command line has an option for, with that option."""
+"""Options of the command line, by the key of the config that each sets."""
 
 
 def kind_of(slot: str, content: Any) -> type[BaseModel] | None:
@@ -54,10 +54,10 @@ _OTHERS = {
     FORMAT: "a calibration",
     CAMERA_FORMAT: "the calibration of a camera alone",
 }
-"""Other files of this program that are taken for configs, by their `format`."""
+"""Other files of this program that a user may mistake for a config, by their key `format`."""
 _CONFIG = ("a config", "scan: {columns: 500}")
 MAX_PATH = 1000
-"""Characters from which on text is no path."""
+"""Text of this many characters or more is not taken for a path."""
 SCENE = ("world", "scene")
 """Key of the scene: a path, or a bundled scene's name."""
 NO_CONFIG = "no config"
@@ -70,8 +70,8 @@ def load_config(name_or_path: str | Path = "simulated", overrides: Mapping[str, 
     """Load the rig config of a bundled name ("simulated") or a file, with values replaced by `overrides`.
 
     overrides: value by dotted key, e.g. {"scan.exposures": 4, "world.scene": "street"}; None values are skipped. Paths
-    in the file, and `calibration` also in overrides, are relative to the file's folder, other paths in overrides to the
-    working directory. Raises UsageError with one line per problem, all problems at once.
+    in the file are relative to the file's folder, and so is `calibration` in overrides. Other paths in overrides are
+    relative to the working directory. Raises UsageError with one line per problem, all problems at once.
     """
     path = find_config(name_or_path)
     read = read_config(path)
@@ -86,7 +86,7 @@ def load_config(name_or_path: str | Path = "simulated", overrides: Mapping[str, 
 
 
 def load_cube_plan(path: str | Path) -> CubePlan:
-    """Load the `plan.yaml` of a bare cube. Raises UsageError with one line per problem."""
+    """Load the `plan.yaml` of frames alone (`rig reconstruct`). Raises UsageError with one line per problem."""
     read = _read(Path(path), "a plan", "columns: 500")
     keys = f"the plan of frames alone has {', '.join(CubePlan.model_fields)}"
     if {"spad", "scanner"} <= read.content.keys():
@@ -99,8 +99,8 @@ def load_cube_plan(path: str | Path) -> CubePlan:
 def completed_text(name_or_path: str | Path) -> str:
     """The text of a config, including comments, with every default filled in and every path absolute.
 
-    It has the same meaning in a file of any folder. If aliases or the like prevent filling in defaults, the text is
-    written anew without comments. Raises UsageError as `load_config` does.
+    The text means the same in a file of any folder. If defaults cannot be filled in, for example because of aliases,
+    the text is written anew without comments. Raises UsageError as `load_config` does.
     """
     path = find_config(name_or_path)
     read = read_config(path)
@@ -120,7 +120,7 @@ def completed_text(name_or_path: str | Path) -> str:
 
 
 def config_content(text: str) -> dict[str, Any]:
-    """The keys and values of a config's text. Raises UsageError if it is not one."""
+    """The keys and values of a config's text, unchecked. Raises UsageError if it is not a YAML mapping."""
     try:
         return parse_yaml(text, *_CONFIG, "config").content
     except FileError as error:
@@ -212,7 +212,7 @@ def _read(path: Path, what: str, example: str) -> YamlFile:
 
 
 def _refuse_others(path: str | Path, content: Mapping[str, Any], then: str) -> None:
-    """Raise UsageError for a file of this program that is no config and no plan of a cube. then: the next step."""
+    """Raise UsageError for a file of this program that is of another kind (`_OTHERS`). then: the next step."""
     if (what := _OTHERS.get(str(content.get("format")))) is not None:
         raise UsageError(f"{path} is {what}; {then}")
 
@@ -227,10 +227,10 @@ def _validated(
 
 
 def _anchor_paths(content: dict[str, Any], folder: Path) -> None:
-    """Make relative paths in the slots of devices absolute: their kinds do not know the file's folder.
+    """Make relative paths in the sections of devices absolute, since devices do not know the file's folder.
 
-    A path is a scene that is not bundled, what a kind's config holds as a path, and text that begins with ./ or ../,
-    ends in .yaml or .yml, or has a slash and exists beside the file; never what begins with ~.
+    These count as paths: a scene that is not bundled, a value whose field is a path, and text that begins with ./ or
+    ../, ends in .yaml or .yml, or has a slash and exists in the folder. Text that begins with ~ is left as it is.
     """
 
     def anchored(value: object) -> object:
@@ -253,7 +253,8 @@ def _anchor_paths(content: dict[str, Any], folder: Path) -> None:
 
 
 def _absolute(path: Path) -> str:
-    """Make a path absolute and free of '..'; a link itself is not followed: /dev/serial/by-id/ has stable names."""
+    """Make a path absolute. Links and '..' in its folder are resolved. A last part that is a link is kept, since names
+    in /dev/serial/by-id/ are stable."""
     return str(path.parent.resolve() / path.name)
 
 

@@ -1,11 +1,11 @@
 """The config of a rig: which devices, which calibration, what scan and which estimate; validated with units and limits.
 
-Times, rates and lengths are text with a unit in YAML ("10 us", "100 kHz", "8 m"). Slots of devices hold the config
-model of their kind, which is defined with its driver. Files are read by `rig.config.files`.
+Times, rates and lengths are text with a unit in YAML ("10 us", "100 kHz", "8 m"). The sections of devices (`spad`,
+`scanner`, ...) hold the config model of their kind, which is defined with its driver. `rig.config.files` reads files.
 
 A rig may project several lines at once. With L lines the mirror sweeps one L-th of the field, so a map takes one L-th
-of the frames. `scan.command_range` is the range of the mirror, and line l's columns lie at its commands plus
-`line_offsets[l]`.
+of the frames. `scan.command_range` is the range of the mirror, and the columns of line l lie at the mirror's commands
+plus `line_offsets[l]`.
 """
 
 import os
@@ -32,7 +32,7 @@ from drivers.units import Age, ExactHertz, Metres, Seconds, Watts
 
 MOST_LINES = 16
 LEAST_FRESH = 0.5
-"""Least distance of neighbouring lines, as a share of the mirror's sweep: closer ones light the same places."""
+"""Least distance of neighbouring lines, as a share of the mirror's sweep: closer ones light most places twice."""
 
 LinePower = Literal["shared", "each"]
 
@@ -59,10 +59,10 @@ LineOffsets = Annotated[
 
 
 MIN_DARK_FRACTION = 0.05
-"""Least share of a live sweep's frames that must be dark: the dark rate is learned from them."""
+"""Smallest share of a sweep's frames that must be dark, since the dark rate is learned from them. Cubes need none."""
 
 AUTO: Final = "auto"
-"""The estimator that stands for `joint` where it keeps up, else for `likelihood`."""
+"""Setting that chooses the estimator: `joint` where it keeps up with the frames, else `likelihood`."""
 Estimator = Literal["auto", "argmax", "edge", "likelihood", "joint"]
 Filter = Literal["none", "median"]
 
@@ -179,7 +179,7 @@ class EstimateConfig(ConfigSection):
     @field_validator("temporal_prior")
     @classmethod
     def _prior_is_of_joint(cls, value: bool, info: ValidationInfo) -> bool:
-        estimator = info.data.get("estimator", "joint")  # absent where it is itself a problem
+        estimator = info.data.get("estimator", "joint")  # missing if the estimator itself is not valid
         if value and estimator not in (AUTO, "joint"):
             raise ValueError(
                 f"is for the estimator joint, this is {estimator}; choose estimator joint or leave the prior off"
@@ -265,7 +265,7 @@ def line_problems(offsets: Sequence[float], columns: int, command_range: tuple[f
         fits = f"{above}" if below == 0 else f"{below} or {above}"
         problems.append(f"scan.columns is {columns}, no multiple of the {lines} lines of line_offsets; make it {fits}")
     span = abs(command_range[1] - command_range[0])
-    spare = span * lines / columns  # one place of the mirror: lines farther apart than span and this leave a gap
+    spare = span * lines / columns  # one place of the mirror; lines farther apart than span + spare leave a gap
     for first, second in pairwise(offsets):
         apart = second - first
         told = f"line_offsets {first:g} and {second:g} are {apart:g} apart, scan.command_range spans {span:g}"

@@ -28,7 +28,7 @@ def configure(
     min_confidence: float | None = None,
     temporal_prior: bool | None = None,
 ) -> RigConfig:
-    """Load and validate the config that `scan` would use; options that are None stay as the config says.
+    """Load and validate the config that `scan` would use. An option that is None leaves the config's value.
 
     config: the name of a bundled rig, a file or a RigConfig.
     scene: of a simulated rig, a bundled name or a path.
@@ -75,7 +75,7 @@ def _changed(config: RigConfig, options: Mapping[str, object]) -> RigConfig:
 
 
 def with_lines(config: RigConfig, lines: int, power: LinePower = "shared") -> RigConfig:
-    """The config of this rig and field with `lines` evenly spaced lines; the mirror sweeps the share of one line.
+    """Make a config with `lines` evenly spaced lines over the same field. The mirror sweeps only the share of one line.
 
     config: of one line. Columns are rounded down to a multiple of `lines`, at least `lines`. Raises UsageError for a
     config with several lines, for a number of lines out of range, and if the changed config is not valid.

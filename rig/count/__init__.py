@@ -1,1 +1,1 @@
-"""From frames to counts: assigns each frame to its column and sweep, and adds up detections without unpacking a bit."""
+"""From frames to counts: assigns each frame to a sweep and column, and adds up detections without unpacking bits."""

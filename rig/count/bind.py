@@ -1,15 +1,16 @@
-"""Assigns frames to columns ("binds" them) by the markers in their own stream, never by host time or by counting.
+"""Assigns frames to columns ("binds" them) by the markers among the frames, never by host time or by counting frames.
 
-If the SPAD puts no markers into its frames, `rig.count.blanking` finds the sweeps in their light and marks them.
+If the SPAD puts no markers into its frames, `rig.count.blanking` finds the sweeps by their light and writes the marks.
 
-Each frame is placed from the latest marker at or before it. The plan gives that marker's point of the scanner clock.
-The distance from there is the SPAD's own clock times the ratio of the two clocks, which is fitted to the markers of
-every sweep and used in the next one. So the column of a frame depends only on earlier frames, not on the size of blocks
-(unless its record is damaged). A compiled walk (`rig.count.bind_kernels`) places the frames; Python runs once a block
-and at the begin of each sweep.
+Each frame is placed from the latest marker at or before it. The plan says at which point (sample) of the mirror's
+waveform that marker lies. The number of points since then is the time since the marker by the SPAD's clock, times the
+point rate, times the ratio of the scanner's clock to the SPAD's. The ratio is fitted to the markers of every sweep and
+used in the next one. So the column of a frame depends only on earlier frames, not on the size of blocks (unless a
+record is damaged). A compiled walk (`rig.count.bind_kernels`) places the frames; Python runs only once per block and at
+the begin of each sweep.
 
-The lit frames of a sweep run through its columns in order. A frame that would fall back to a column already left is not
-used. This can happen, by the size of the residual, when a marker corrects the extrapolation from the one before.
+The lit frames of a sweep go through the columns in order. When a marker corrects the extrapolation from the one before,
+frames may fall back to a column already left. Such frames are not used.
 """
 
 import math
@@ -28,22 +29,23 @@ from rig.count.volume import BIN_UNUSABLE, BYTE_EXPOSURES, BYTE_FRAMES
 from rig.plan.scan_plan import MAX_CLOCK_ERROR, ScanPlan
 
 MAX_RESIDUAL_COLUMNS = 0.05
-"""A sweep whose markers stray further from one straight line of time than this is not synchronised."""
+"""Largest distance of a marker from the straight line, point over time, that is fitted to a synchronised sweep."""
 MOST_OUT_OF_TURN = 1000
-"""Frames of a sweep that may name one which cannot have begun; more are no flipped bits but a wrong line or link."""
+"""Most frames during a sweep that may name another sweep which cannot have begun. Flipped bits cause a few; more mean
+that the marker's line or the link is faulty."""
 Places = tuple[NDArray[np.int32], NDArray[np.float64], NDArray[np.int32]]
 """Sweep, column and bin of each frame."""
 UNITS_PER_TICK = 2 * (SUBFRAME_MASK + 1)
-"""Units in a tick. Times are whole numbers of units (int64), in which markers and exposure middles are exact: a frame's
-column is then the same to the last bit in whatever block it comes. Good for 200 days at 1 GHz."""
+"""Units of time in a tick. In whole units (int64) markers and middles of exposures are exact, so that a frame's column
+is the same to the last bit in whatever block it comes. They suffice for 200 days at 1 GHz."""
 CARRIED = np.dtype(
     [(name, np.int64) for name in ("sweep", "anchor_time", "anchor_point", "edges", "wrong_way", "column", "in_column")]
 )
 """State that the walk carries from block to block.
 
-sweep: the one that runs, -1 before the first marker. anchor_time, anchor_point: the latest marker, in units and in
+sweep: the present one, -1 before the first marker. anchor_time, anchor_point: of the latest marker, in units and in
 points since the first sweep; point -1: none yet. edges: markers of the sweep so far. wrong_way: as in `SweepClock`.
-column, in_column: the column that the sweep has come to, -1 before the first, and how many frames it has so far.
+column, in_column: the column that the sweep has come to, -1 before the first, and its number of frames so far.
 """
 
 
@@ -52,7 +54,7 @@ class BoundFrames:
     """Sweep, column and bin of each frame of a block.
 
     sweep: -1 before the first marker. column: fractional, at the middle of the exposure, continued linearly outside the
-    lit part; NaN before the first usable marker and where a record names a sweep out of turn. bins: column index,
+    lit part; NaN before the first usable marker and for frames that name a sweep out of turn. bins: column index,
     BIN_DARK or BIN_UNUSABLE. starts: frame indices: 0, and those at which a sweep begins.
     """
 
@@ -66,13 +68,13 @@ class BoundFrames:
 class SweepClock:
     """Clock of one finished sweep.
 
-    clock_error: relative excess of the scanner's clock over nominal, in the SPAD's time. residual_columns: with
-    markers, the largest distance of a marker from the fitted line. With fewer than two markers they are 0 and NaN. With
-    patterns, the distance of the pattern after the sweep from the line of those before it, or the standard deviation of
-    that distance if it is larger; NaN if that pattern was not found. markers: number of markers or patterns that the
-    clock rests on. first_frame, end_frame: numbers of the first frame of this sweep and of the next one. wrong_way:
-    number of lit frames whose direction level was not the plan's. detection: chance that a blanking pattern as bright
-    as this sweep's is found, 0 if it was not; None if markers were used.
+    clock_error: relative excess of the scanner's clock over nominal, in the SPAD's time; 0 with fewer than two markers.
+    residual_columns: with markers, the largest distance of a marker from the fitted line, NaN with fewer than two. With
+    blanking patterns, the distance of the pattern after the sweep from the line through those before it, or the
+    standard deviation of that distance if it is larger; NaN if that pattern was not found. markers: number of markers
+    or patterns that the clock is fitted to. first_frame, end_frame: numbers of the first frame of this sweep and of the
+    next one. wrong_way: number of lit frames in which the scanner's direction signal was not the plan's. detection:
+    chance that a pattern as bright as this sweep's is found, 0 if it was not; None if markers were used.
     """
 
     sweep: int
@@ -110,7 +112,7 @@ class PlanTerms(NamedTuple):
 
 
 class BlockTerms(NamedTuple):
-    """Numbers of a header for the walk. start_ticks: from the run's first frame. middle: of an exposure, in units."""
+    """Numbers of a header for the walk. start_ticks: since the first block's. middle: of an exposure, in units."""
 
     sweep: int
     start_ticks: int
@@ -120,10 +122,10 @@ class BlockTerms(NamedTuple):
 
 
 class FrameBinder:
-    """Binds the blocks of one run, in order. Records count markers up to and including their own frame.
+    """Binds the blocks of one start of the SPAD, in order. Records count markers up to and including their own frame.
 
-    clock_ratio: of the scanner's clock to nominal, before the first sweep. first_sweep: number of the first whole
-    sweep; an incomplete one fits no clock. end_sweep: number after that of the last sweep wanted; None for all.
+    clock_ratio: of the scanner's clock to nominal, until a sweep gives it. first_sweep: number of the first whole
+    sweep; incomplete ones before give no ratio. end_sweep: number after that of the last sweep wanted; None for all.
     """
 
     def __init__(
@@ -169,10 +171,10 @@ class FrameBinder:
         if n > len(self._records):
             self._records = np.empty(n, FRAME_RECORD)
         have = self._edges.shape[1]
-        if self._carried["edges"][0] + n + 1 > have:  # should there be a marker in each frame
+        if self._carried["edges"][0] + n + 1 > have:  # there may be a marker in each frame
             self._edges = np.concatenate([self._edges, np.empty((2, have + n), np.int64)], axis=1)
         records = self._records[:n]
-        # Always of one type, which memory of a ring, a file or a wire is not: each type would be compiled by itself.
+        # Records of a ring, a file or a wire differ in numba's type; the walk would be compiled for each, so copy them.
         records.view(_WHOLE)[:] = block.records.view(_WHOLE)
         if self._light is not None:
             self._light.mark(block, records)
@@ -208,11 +210,11 @@ class FrameBinder:
         self._walk(self._records[:0], 0, terms, self._terms, self._carried, self._edges, *_new_places(0))
 
     def _out_of_turn(self, at: int, records: NDArray[np.void], terms: BlockTerms) -> bool:
-        """Whether frame `at` names a sweep that cannot have begun, as one flipped bit does.
+        """Whether frame `at` names a sweep that cannot have begun, for example because a bit is flipped.
 
-        Its own scan marker confirms the next sweep. Else the frame behind must name the same one, and where sweeps are
-        left out, or no frame is behind, the time since the latest marker must allow it. Before the first sweep the last
-        of several frames needs a scan marker.
+        The next sweep is confirmed by a scan marker in the frame itself. Otherwise the following frame must name the
+        same sweep. If sweeps are skipped, or the block has no following frame, enough time must have passed since the
+        latest marker. Before the first sweep, the last of several frames needs a scan marker.
         """
         now = self._carried[0]
         running, number = int(now["sweep"]), _sweep_named(records[at], terms)
@@ -246,15 +248,15 @@ class FrameBinder:
         sweep[at], column[at], bins[at] = int(self._carried["sweep"][0]), np.nan, BIN_UNUSABLE
 
     def _begin(self, at: int, record: np.void, terms: BlockTerms, header: BlockHeader) -> list[SweepClock]:
-        """Close the sweep that ran and any missed; begin the next one at frame index `at`, where its scan marker is if
-        received. Returns the clocks of the closed ones."""
+        """Close the present sweep and any that were missed, and begin the next one at frame index `at`, which has the
+        scan marker if it was received. Returns the clocks of the closed sweeps."""
         now = self._carried[0]
         running, number = int(now["sweep"]), _sweep_named(record, terms)
         start = (int(record["ticks"]) + terms.start_ticks) * UNITS_PER_TICK
         received = bool(record["marks"] & Mark.SCAN)
         closed = []
         if running < 0:
-            # Where the first marker got lost, all frames that did with it may be of this sweep.
+            # If the first marker was lost, all frames that were lost with it may be of this sweep.
             lost_with_it = not received and at == 0
             self._first_frame = min(self._next_frame, header.first_frame) if lost_with_it else header.first_frame + at
         elif received and number == running + 1 and not record["marks"] & Mark.GATE_EDGE:
@@ -272,7 +274,7 @@ class FrameBinder:
         return closed
 
     def _begin_in_light(self, at: int, record: np.void, terms: BlockTerms, header: BlockHeader) -> list[SweepClock]:
-        """Do as `_begin` where the light has told at which frames sweeps begin and when their scan markers came."""
+        """Do as `_begin` for frames without markers: `BlankingSync` has found where sweeps and scan markers lie."""
         assert self._light is not None, "asked for by the caller"
         now = self._carried[0]
         running, number = int(now["sweep"]), _sweep_named(record, terms)
@@ -295,7 +297,7 @@ class FrameBinder:
         return closed
 
     def _boundary_frame(self, number: int, at: int, header: BlockHeader, start: int) -> int:
-        """Number of the frame in which sweep `number` began, from the scanner's clock where the marker was lost."""
+        """Number of the frame in which sweep `number` began, whose marker was lost, from the scanner's clock."""
         here = header.first_frame + at
         time, point = (int(self._carried[name][0]) for name in ("anchor_time", "anchor_point"))
         if point < 0:
@@ -318,7 +320,7 @@ class FrameBinder:
         return clock
 
     def _points_per_unit(self, tick_hz: Fraction) -> float:
-        if tick_hz != self._tick_hz:  # once a run: fractions take longer than all the rest of a block
+        if tick_hz != self._tick_hz:  # only once: fractions take longer than all other work on a block
             self._tick_hz = tick_hz
             self._nominal = float(self._plan.point_rate_hz / tick_hz / UNITS_PER_TICK)
         return self._nominal * self._ratio
@@ -333,7 +335,7 @@ def _new_places(n: int) -> Places:
 
 
 def _sweep_named(record: np.void, terms: BlockTerms) -> int:
-    """Number of the sweep that a frame names: scan markers so far, of which its record has the low 16 bits, less 1."""
+    """Number of the sweep that a frame names: 1 less than its scan markers so far. The record has their low 16 bits."""
     return terms.sweep + ((int(record["sweep"]) - terms.sweep) & 0xFFFF) - 1
 
 
@@ -344,7 +346,7 @@ def _period(header: BlockHeader) -> int:
 def _fit(
     point: NDArray[np.int64], time: NDArray[np.int64], points_per_unit: float, points_per_column: float
 ) -> tuple[float, float, int]:
-    """Relative clock error, largest residual in columns and number of a sweep's markers; 0 and NaN for fewer than 2."""
+    """Relative clock error and largest residual in columns (0 and NaN for fewer than 2 markers), number of markers."""
     count = len(point)
     if count < 2 or np.ptp(point) == 0 or np.ptp(time) == 0:  # damaged records can mark one point twice
         return 0.0, math.nan, count

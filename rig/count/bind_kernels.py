@@ -1,6 +1,6 @@
 """Compiled walk along the records of a block, which gives every frame its sweep, column and bin.
 
-It goes frame by frame because each frame decides what may be done with the next. Its state is kept in one record
+It goes frame by frame, because the place of a frame depends on the frames before it. Its state is kept in one record
 (`CARRIED` in `rig.count.bind`), so that it continues in the next block.
 """
 
@@ -24,8 +24,8 @@ _WINDOW_LOST: Final = int(Mark.WINDOW_LOST)
 
 @numba.njit(cache=True, nogil=True)
 def _marker_point(marks, line, number, plan):  # type: ignore[no-untyped-def]
-    """Point of the marker in a frame of sweep `number`, counted from the first sweep on; -1: none that is usable."""
-    # A record has room for one position, the latest edge's: beside a gate edge it is not surely the marker's.
+    """Point of the marker in a frame of sweep `number`, counted from the first sweep on; -1: no usable marker."""
+    # A record holds one position, that of the latest edge. If the gate has an edge too, it may not be the marker's.
     if marks & _GATE_EDGE:
         return -1
     if marks & _LINE and 1 <= line <= len(plan.marker_points):
@@ -46,7 +46,7 @@ def _bin(marks, column, columns):  # type: ignore[no-untyped-def]
 
 @numba.njit(cache=True, nogil=True)
 def _in_order(bin, number, plan, carried):  # type: ignore[no-untyped-def]
-    """Note a lit frame and return its bin, BIN_UNUSABLE if its sweep is past that column, or the column is full."""
+    """Note a lit frame and return its bin; BIN_UNUSABLE if the sweep has left that column, or the column is full."""
     now = carried[0]
     if number != now.sweep:
         return BIN_UNUSABLE
@@ -87,13 +87,13 @@ def walk(
         if number > now.sweep:
             return i
         sweep[i], column[i], bins[i] = number, np.nan, BIN_UNUSABLE
-        # Sweeps never go back: such a number is damaged, and so may be the marker beside it.
+        # Sweeps never go back: such a number is damaged, and the marker in the same record may be damaged too.
         if number < 0 or number < now.sweep:
             continue
         start = (np.int64(record.ticks) + block.start_ticks) * UNITS_PER_TICK
         point = _marker_point(marks, np.int64(record.line), number, plan)
         if point >= 0:
-            # The middle of the 1/256 of the period that the position names.
+            # The position names a 1/256 of the frame period: take its middle.
             position = (marks >> SUBFRAME_SHIFT) & SUBFRAME_MASK
             now.anchor_time, now.anchor_point = start + (2 * position + 1) * block.period_ticks, point
             edges[0, now.edges], edges[1, now.edges] = point, now.anchor_time
@@ -119,7 +119,7 @@ def cover(
     """Take frames out of their bin if their used pixels do not cover all pixels that their column counts.
 
     x0: (n,) first of the `used_px` pixels of each frame. column_x0: (columns,) first of the `window` pixels of each
-    column. Returns the numbers of frames left on columns and in the dark.
+    column. Returns the numbers of frames left on columns and in the dark bin.
     """
     lit = dark = 0
     for i in range(len(bins)):

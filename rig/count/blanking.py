@@ -1,20 +1,22 @@
 """Finds the sweeps of frames without markers by the blanking pattern in their light, and writes the missing marks.
 
-Finding the pattern (`PatternSearch`). The model of the ones n_i in frame i, for a pattern that begins at t (in frames,
-frame i being exposed from i on), is
+The pattern is a known order of laser flashes just before the lit part of each sweep (`rig.plan.scan_plan.Blanking`).
+
+Finding the pattern (`PatternSearch`). Time t is in frames; the exposure of frame i begins at i. If the pattern begins
+at t, the number of ones (detections) n_i in frame i is modelled as
 
     n_i = level + drift i + brightness g_i(t),     g_i = share of frame i's exposure with the gate open
 
-For every t it is fitted by least squares (float64); the best t is the one that explains most. Photons of the laser, of
-daylight and dark counts all scatter alike, so nothing needs to be known about them. `score` is brightness over its
-standard deviation. To distinguish the pattern from other light that comes and goes, the residual beyond the scatter of
-photons must not exceed what the pattern explains.
+The model is fitted by least squares (float64) for many t; the best t explains most. Detections of laser light, daylight
+and dark counts all have the same (Poisson) noise, so their shares need not be known. `score` is brightness over its
+standard deviation. To distinguish the pattern from other light that comes and goes, the residual in excess of photon
+noise must not exceed what the pattern explains.
 
-Finding the sweeps (`BlankingSync`). Scan markers lie on a straight line in time, which is fitted to all patterns found
-so far (`MarkerLine`). If a pattern is missing, because frames were lost or nothing reflected the light, its place is
-taken from that line. For counting, a sweep begins with the frame at which its pattern has certainly passed, just before
-the gate opens for the lit part. All this depends only on the frames before, not on the size of blocks, and never on the
-host's time or on the clock that the device states.
+Finding the sweeps (`BlankingSync`). Scan markers are equally spaced in time. So a straight line, time over sweep, is
+fitted to all patterns found so far (`MarkerLine`). If a pattern is missing, because frames were lost or nothing
+reflected the light, its place is taken from that line. For counting, a sweep begins with the frame at which its pattern
+has certainly passed, just before the gate opens for the lit part. All this depends only on earlier frames, not on the
+size of blocks, and never on the host's time or on the clock that the device states.
 """
 
 import logging
@@ -33,23 +35,23 @@ from rig.plan.scan_plan import MARGIN_FRAMES, MAX_CLOCK_ERROR, Blanking, ScanPla
 Array = NDArray[np.float64]
 
 LEAST_SCORE = 4.0
-"""Standard deviations from which on light may be the pattern. Chance brings one in every other burst, but two at the
-right distance in one of some ten thousand, and then the pattern behind the first map does not bear them out."""
+"""Least score of a pattern, in standard deviations. Chance brings one in every other burst, but two at the right
+distance only in one of some ten thousand; in that case the pattern after the first map is missing."""
 MOST_UNEXPLAINED = 1.0
-"""Largest residual beyond the scatter of photons, over what the pattern explains. In the wrong place it leaves 7."""
+"""Largest residual in excess of photon noise, relative to what the pattern explains. It is 7 in the wrong place."""
 LEAST_SHARE = 0.7
-"""Share of the frames of a measurement that must have been received."""
+"""Least share of the frames of a measurement that must have been received."""
 EDGE_FRAMES = 2
-"""Frames looked at before and behind the pattern."""
+"""Frames used before and after the pattern."""
 STEPS = 8
-"""Places tried per frame; the best is then found between them."""
+"""Places tried per frame; the best place is then interpolated."""
 PHASES = np.arange(4) / 4
-"""Places tried within each frame while nothing is known, in frames."""
+"""Places tried within each frame by the rough search, in frames."""
 _FIT_STEPS = 4
 _NO_LIGHT = 1e-300
-"""Ones per frame, fewer than any light gives: in frames without a single one scores are 0 instead of 0/0."""
+"""Ones per frame, fewer than any light gives. They make scores 0 instead of 0/0 in frames without a single one."""
 _GRAIN = 64
-"""The rough search rounds shares of a frame to whole parts of 1/64: its sums are exact, in whatever order."""
+"""The rough search rounds shares of a frame to multiples of 1/64, so that its sums are exact in any order."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -93,14 +95,14 @@ class PatternSearch:
     def __init__(self, shape: PatternShape) -> None:
         self._shape = shape
         self.window = math.ceil(shape.length) + 1 + 2 * EDGE_FRAMES
-        """Frames that the rough search looks at together."""
+        """Number of frames in a window of the rough search."""
         frames = np.arange(self.window, dtype=np.float64)
         shares = shape.shares(EDGE_FRAMES + PHASES, frames)
         self._time = 2 * frames - (self.window - 1)
         self._shares = np.round(shares * _GRAIN)
 
     def scores(self, ones: Array) -> tuple[Array, NDArray[np.bool_]]:
-        """Best score in each window of `ones` (n,), NaN if a frame is lost, and whether it may be the pattern.
+        """Best score in each window of `ones` (n,), NaN if a frame is lost, and whether the pattern may lie in it.
 
         Both are (n - window + 1,). Raises ValueError for fewer frames than a window has."""
         n = self.window
@@ -123,7 +125,7 @@ class PatternSearch:
     def measure(self, ones: Array, first: int, place: float, radius: float) -> PatternFit | None:
         """The pattern within `radius` frames of `place`; None if it is not there.
 
-        ones: of frames `first`, first + 1, ... , NaN if missing. None too if they do not have enough of `span`.
+        ones: of frames `first`, first + 1, ... , NaN if missing. None too without enough frames of `span`.
         """
         begin, end = self.span(place, radius)
         if begin < first or end > first + len(ones):
@@ -146,7 +148,7 @@ class PatternSearch:
 
 
 def _judged(cross: Array, left: float, total: Array, mean: Array, n: int) -> tuple[Array, Array]:
-    """Score, and what remains beyond the scatter of photons as a share of what is explained."""
+    """Score, and the residual in excess of photon noise relative to what is explained."""
     explained = cross**2 / left
     rest = np.maximum(total - explained, 0)
     scatter = np.maximum(rest / (n - 4), np.maximum(mean, _NO_LIGHT))
@@ -162,7 +164,7 @@ def _best(shares: Array, places: Array, frames: Array, ones: Array) -> PatternFi
     explained = np.where((cross > 0) & (size > 0), cross**2 / np.where(size > 0, size, 1), 0.0)
     at = int(np.argmax(explained))
     a, b = max(at - _FIT_STEPS, 0), min(at + _FIT_STEPS + 1, len(places))
-    if explained[at] <= 0 or b - a < 2 * _FIT_STEPS + 1:  # at the rim of what was looked at: it is not in there
+    if explained[at] <= 0 or b - a < 2 * _FIT_STEPS + 1:  # best at the edge of the range: it lies elsewhere
         return None
     n, mean = len(ones), np.array(ones.mean())
     score, unexplained = _judged(cross[at], float(size[at]), np.array(ones_left @ ones_left), mean, n)
@@ -179,12 +181,12 @@ def _best(shares: Array, places: Array, frames: Array, ones: Array) -> PatternFi
 
 
 def detection_probability(score: float) -> float:
-    """Chance that a pattern with this score on average is found."""
+    """Chance that a pattern is found whose score is this on average."""
     return 0.5 * math.erfc((LEAST_SCORE - score) / math.sqrt(2))
 
 
 LEAST_SD_FRAMES = 1e-3
-"""No place is better known than this: one bright pattern must not outweigh all others."""
+"""Least standard deviation of a place: one bright pattern must not outweigh all others."""
 
 
 @dataclass(slots=True)
@@ -204,7 +206,7 @@ class MarkerLine:
         self.sd.append(max(sd, LEAST_SD_FRAMES))
 
     def fit(self, index: int) -> tuple[float, float, float]:
-        """Place of sweep `index`'s scan marker, its standard deviation, and frames per sweep; needs two markers."""
+        """Place of the scan marker of sweep `index` and its standard deviation; frames per sweep. Needs two markers."""
         weight = np.array(self.sd) ** -2.0
         x = np.array(self.index, np.float64) - index
         middle = float(weight @ x / weight.sum())
@@ -218,11 +220,11 @@ class MarkerLine:
 _log = logging.getLogger(__name__)
 
 SEARCH_S = 10.0
-"""Seconds, and three sweeps more, after which a stream is given up that shows no two patterns a sweep apart."""
+"""Seconds, plus three sweeps, after which the search for two patterns that are one sweep apart is given up."""
 CLEAR_SCORE = 2 * LEAST_SCORE
-"""A pattern that stands out so clearly is surely one: where sweeps are not found, light is not what is missing."""
+"""Score of a certain pattern. If it is reached and sweeps are not found, the reason is not lack of light."""
 ASIDE_PX = 64
-"""Pixels counted on both sides of the window of a leg's first column: in the run-in the stripe is a bit beside it."""
+"""Pixels counted on both sides of the window of a leg's first column: in the run-in the stripe lies beside it."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -230,9 +232,9 @@ class SweepPlace:
     """Place of a sweep among the frames.
 
     frame: the first one that counts. scan_frame: place of its scan marker, in frames. ratio: of the scanner's clock to
-    nominal, in the SPAD's time. patterns: how many it rests on. found: its own pattern; None if the place is taken from
-    the line of the others. residual_frames: distance of its pattern from the place predicted by earlier ones, or that
-    distance's standard deviation if larger; NaN without a pattern.
+    nominal, in the SPAD's time. patterns: number of patterns that these are fitted to. found: the sweep's own pattern;
+    None if the place is taken from the line through the others. residual_frames: distance of its pattern from the place
+    predicted by earlier ones, or that distance's standard deviation if larger; NaN without a pattern.
     """
 
     number: int
@@ -250,8 +252,10 @@ class SweepPlace:
 
 
 class BlankingSync:
-    """Finds the sweeps of one run, block by block. Indices count sweeps of the waveform, numbers those of the maps.
+    """Finds the sweeps of one start of the SPAD, block by block.
 
+    The index of a sweep counts all sweeps of the waveform. The first ones are pilots, which have only the pattern. The
+    number of a sweep counts from the first map on, so it is negative for pilots.
     end_sweep: number of the last sweep that is marked, which follows all wanted ones; None to mark all.
     """
 
@@ -278,9 +282,9 @@ class BlankingSync:
         self._best: tuple[float, int, int] | None = None
         """Score, last frame and leg of the best of the latest windows that look like a pattern; None: there is none."""
         self._most: tuple[float, int] = (0.0, 0)
-        """Highest score of all, and the first frame of its window: to be told if nothing is found."""
+        """Highest score of all, and the first frame of its window, for the message if nothing is found."""
         self._pilots: list[tuple[int, PatternFit]] = []
-        """Patterns that may be the first of the run, each with the index of its sweep."""
+        """Patterns that may be the first of the start, each with the index of its sweep."""
         self._line = MarkerLine()
         self._next: int | None = None
         """Index of the sweep whose pattern is expected next; None: nothing is known yet."""
@@ -290,7 +294,7 @@ class BlankingSync:
     def mark(self, block: FrameBlock, records: NDArray[np.void]) -> None:
         """Fill marks, line and sweep of the block's `records` (n,).
 
-        Raises DeviceFault if the run, or `SEARCH_S`, ends without two patterns that are one sweep apart.
+        Raises DeviceFault if frames end, or the search (`SEARCH_S`), without two patterns that are one sweep apart.
         """
         header, n = block.header, block.n_frames
         self._count(block)
@@ -299,7 +303,7 @@ class BlankingSync:
         if self._next is None:
             self._look(header.first_frame, last)
         while (place := self._begin_next(last)) is not None:
-            begin = max(place.frame, at)  # later, where the frames in which it began were lost
+            begin = max(place.frame, at)  # later if the sweep's first frames were lost
             self._write(records[at - header.first_frame : begin - header.first_frame], at)
             self._now, at = place, begin
         self._write(records[at - header.first_frame :], at)
@@ -311,7 +315,7 @@ class BlankingSync:
         return [*(self._places.pop(number) for number in range(first, last)), self._places[last]]
 
     def _count(self, block: FrameBlock) -> None:
-        """Append the ones of each frame, where each leg's run-in is seen; lost frames are NaN."""
+        """Append each frame's ones in the words that see a leg's run-in, for each leg; lost frames are NaN."""
         first = block.header.first_frame
         if self._origin is None:
             self._origin = self._ones_first = first
@@ -323,7 +327,7 @@ class BlankingSync:
         self._ones_first = first + block.n_frames - self._ones.shape[1]
 
     def _look(self, first: int, last: int) -> None:
-        """Take up patterns that lie anywhere in the frames so far."""
+        """Search the frames so far for patterns, and keep those found as possible pilots."""
         hits: list[tuple[int, float, int]] = []
         for leg, search in enumerate(self._searches):
             begin = max(first - search.window + 1, self._ones_first)
@@ -353,7 +357,7 @@ class BlankingSync:
             self._pilots.append((leg, found))
 
     def _begin_next(self, last: int) -> SweepPlace | None:
-        """The next sweep that begins up to frame `last`; None: none does."""
+        """The next sweep that begins up to frame `last`; None if there is none."""
         if self._next is not None:
             return self._expected(last)
         for pilot in list(self._pilots):
@@ -423,7 +427,7 @@ class BlankingSync:
         leg = self._plan.leg(now.number)
         since = first + np.arange(len(records)) - now.scan_frame
         opened, closed = leg.gate_open_s * self._rate, leg.gate_close_s * self._rate
-        # The gate is on the sync source's clock, of which the light says nothing: margin is half a frame and its error.
+        # The gate follows the sync source's clock, which light does not show: margin is half a frame and its error.
         early, late = (0.5 + MAX_CLOCK_ERROR * at for at in (opened, closed))
         upcoming = self._period / now.ratio + self._delay[(now.number + 1) % len(self._delay)] - self._tolerance
         marks = np.full(len(records), int(Mark.GATE_EDGE), np.uint32)
@@ -449,7 +453,7 @@ class BlankingSync:
 
 
 def _words(plan: ScanPlan, columns_rise: bool) -> tuple[int, int]:
-    """First word of a row, and the one behind the last, in which the run-in of a leg is seen."""
+    """First word of a row in which the run-in of a leg is seen, and the word after the last."""
     x0 = int(plan.x0[0 if columns_rise else -1])
     row = -(-plan.width // WORD_PX)
     return max(0, (x0 - ASIDE_PX) // WORD_PX), min(row, -(-(x0 + plan.window + ASIDE_PX) // WORD_PX))

@@ -4,8 +4,8 @@ A counter of a pixel is sum over i of 2^i (bit of plane i). Planes are uint64; P
 frames. Seven frames at a time go through a tree of full adders (Harley and Seal; see Muła, Kurz, Lemire, "Faster
 population counts using AVX2 instructions", 2018) and into the planes as one 3-bit number. Adding frame after frame
 without the tree takes about twice as long. The planes of `CHUNK` words lie side by side, so that they stay in the
-fastest cache while frames are added. Their distances are known to the compiler, which then need not check that they do
-not overlap.
+fastest cache while frames are added. The distances between planes are constants, so compiled code need not check
+whether they overlap.
 """
 
 from typing import Final
@@ -81,7 +81,7 @@ def _sum_7(a, b, c, d, e, g, h):  # type: ignore[no-untyped-def]
 
 @numba.njit(inline="always")
 def _add_number(p, i, ones, twos, fours, few):  # type: ignore[no-untyped-def]
-    """Add a 3-bit number to the first four planes; what overflows them goes to the last one, unless `few` is set."""
+    """Add a 3-bit number to the first four planes; the overflow goes to the last plane, unless `few` is set."""
     x = p[i]
     p[i] = x ^ ones
     p[CHUNK + i], carry = _sum_3(p[CHUNK + i], twos, x & ones)
@@ -178,7 +178,7 @@ def add_frames(words: Words, frame: int, at: int, first: int, last: int, n: int,
     if f == last:
         return
     few = all_frames <= FEW_FRAMES
-    # Whatever is added goes into four planes at least.
+    # Adding changes at least four planes.
     for q in range(planes_for(counted + f - first), 4 if few else PLANES):
         planes[q * CHUNK : q * CHUNK + n] = np.uint64(0)
     while f < last:
@@ -215,10 +215,10 @@ def add_runs(
 ) -> None:
     """Add frames to `counts` (columns, rows, window), or to `dark` (rows, PAIRS, lanes + LANES, 2) in lane order.
 
-    words: (all words,), with `row_words` per row; first_word: (n,), word of the sensor's row at which the used_words
-    words of a frame's used pixels begin; bins: (n,), -1 dark, -2 skip, else a row of columns_at (bins, lines), the
-    columns for which a frame is counted, one for every line; without lines lit frames are skipped. x0: (columns,). Only
-    rows first_row..last_row-1 are touched, so that threads may share the outputs.
+    words: (all words,), with `row_words` per row. first_word: (n,), word of the sensor's row at which a frame's used
+    pixels begin; they are `used_words` words. bins: (n,), -1 dark, -2 skip, else an index of columns_at (bins, lines),
+    which holds the columns for which the frame is counted, one for every laser line; with no lines, lit frames are
+    skipped. x0: (columns,). Only rows first_row..last_row-1 are touched, so that threads may share the outputs.
     """
     rows, width_words = dark.shape[0], (dark.shape[2] - LANES) * STEPS // WORD_PX
     window = counts.shape[2]
@@ -238,7 +238,7 @@ def add_runs(
             times = columns_at.shape[1] if bin >= 0 else 1 if bin == -1 else 0
             if times > 0:
                 add_frames(words, rows * row_words, y0 * row_words, f, g, n, 0, planes)
-            # A frame of whole rows begins at the sensor's first word, a window where its used pixels do.
+            # A frame of whole rows begins at the sensor's first word, a windowed frame at its used pixels.
             begins = 0 if row_words == width_words else first_word[f]
             row_bytes, n_planes = row_words * WORD_BYTES, planes_for(g - f)
             for line in range(times):

@@ -1,8 +1,8 @@
-"""Counts of a row in lane order, which is the order into which bit planes turn with shifts and masks alone.
+"""Counts of a row in lane order: the order in which shifts and masks alone turn bit planes into bytes.
 
 Lane i of pair q holds the bytes of pixels 8 i + 2 q and 8 i + 2 q + 1, in the order of bits in packed bytes. A row of
-counts is uint8 (PAIRS, lanes + 2 PAD, 2). There are PAD zero lanes on both sides of each pair's lanes, so that the pair
-before or after any is one load away. An x86 processor multiplies and adds two neighbouring counts in one instruction.
+counts is uint8 (PAIRS, lanes + 2 PAD, 2). PAD zero lanes on both sides of each pair's lanes allow a load at any offset
+of up to PAD lanes. An x86 processor multiplies and adds two neighbouring counts in one instruction.
 """
 
 from typing import Final
@@ -121,7 +121,7 @@ def _share(x, times):  # type: ignore[no-untyped-def]
 
 @numba.njit(inline="always")
 def _fine_share(x, times, turn):  # type: ignore[no-untyped-def]
-    """Like `_share`, in 2048 steps that differ from turn to turn: eight steps would not keep the mean of few counts.
+    """Like `_share`, in 2048 steps that differ from turn to turn: eight steps would not keep the mean of small counts.
 
     The multipliers are odd, so that 2048 pixels in a row, or turns, take every step once.
     """
@@ -158,7 +158,7 @@ def halve_counts(n: int, lanes: int, times: int) -> None:
     """
     rest = (1 << times) - 1
     for q in range(PAIRS):
-        # The sum of a byte and its share may not fit: what is left over is looked at by itself.
+        # A byte plus its share may overflow, so the remainder of the division is rounded separately.
         shares = as_bytes(zero_int16() + np.int16(_share(2 * q, times) | _share(2 * q + 1, times) << 8))
         for v in range(0, 2 * lanes, 2 * LANES):
             at = q * pair_bytes(lanes) + 2 * PAD + v

@@ -1,6 +1,7 @@
 """Compiled part of `rig.count.map_checks`: light that lines of counts have in common, and how smooth rows are.
 
-With n ones of a pixel in K frames and r its usual rate, a line of counts k is turned into line-shaped excess,
+A line of counts holds the counts of one image row in one column, over the window. Line 0 is a point's own; lines 1, 2
+and so on are its partners'. With n ones of a pixel in K frames and r its usual rate, line k becomes stripe-like excess,
 
     z = (n - K r) / sqrt(K r),    e_k(j) = mean of z over 3 px around j - mean of z 4 to 9 px away on both sides
 
@@ -9,7 +10,7 @@ j + s - LAGS_PX to j + s + LAGS_PX, minus the mean of the same sum BESIDE_PX to 
 products of neighbouring pixels. Lines are int32 (line and partners, points, window); results of `compare_lines` are
 float64 (points, 3 + orders).
 
-Broad light, mainly haze, is compared by sums of z over BIN_PX, minus the line's mean of z:
+Broad light, mainly haze, is compared by sums of z over BIN_PX, minus the line's mean of z, at offsets o in bins:
 
     a_k(i) = sum over bin i of (z - mean of z),    shared(partner, o) = sum over points and i of a_0(i) a_k(i + s + o)
 """
@@ -23,28 +24,28 @@ from numpy.typing import NDArray
 from rig.geometry.windows import MARGIN_PX, WORD_PX
 
 BIN_PX: Final = 4
-"""Pixels that `follow_lines` adds up: light of all widths is compared, and lines are known no better."""
+"""Pixels of a bin of `follow_lines`: light of all widths is compared, and expected places are known no better."""
 SPAN: Final = 26
-"""Bins to either side of the expected place at which light is looked for."""
+"""Bins to either side of the expected place that are compared."""
 LAGS_PX: Final = 2
-"""Pixels by which a surface may lean between the lines that are compared."""
+"""Pixels by which a stripe may lie off the expected place, since its surface may be inclined."""
 
 BESIDE_PX: Final = 9
-"""Pixels from where the line should be at which light that is still in common is haze."""
+"""Distance from the expected place, in pixels, at which light still in common is haze."""
 LEAST_SHARED: Final = 0.25
-"""Light that frames of one column have in common at least, over what all frames of two rows have: 1 for a line that
-stands still, 0.4 at two frames a column for one that moves by 5 px in it."""
+"""Least light that the frames of one column have in common, relative to that of two rows. It is 1 for a laser line that
+stands still, and 0.4 at two frames per column for one that moves by 5 px during the column."""
 
 
 @numba.njit(inline="always")
 def _searched(x_lo, x_hi, x0, window, width):  # type: ignore[no-untyped-def]
-    """First and last stored pixel of a line that is searched, with the margin to its sides."""
+    """First and last stored pixel of a line that is searched, including the margin at both ends."""
     return max(x_lo - MARGIN_PX, x0, 0) - x0, min(x_hi + MARGIN_PX, x0 + window - 1, width - 1) - x0
 
 
 @numba.njit(inline="always")
 def _around(total, j):  # type: ignore[no-untyped-def]
-    """Sum of the pixels up to LAGS_PX from pixel j. total: for each pixel the sum of those before it, and of all."""
+    """Sum of the pixels up to LAGS_PX from pixel j. total: sums of the first 0, 1, 2, ... pixels."""
     last = total.shape[0] - 1
     return total[min(max(j + LAGS_PX + 1, 0), last)] - total[min(max(j - LAGS_PX, 0), last)]
 
@@ -73,8 +74,9 @@ def compare_lines(
 
     The first two outputs are the light in common with each partner, which is 0 on average for noise, haze and anything
     that stands still. The third is LEAST_SHARED times the light that single pixels have in common with the next row,
-    minus the light that their own frames have in common. It is 0 for one frame, else negative: they show the same line.
-    The others are the increase of the sum of products of neighbouring pixels when they are taken in each order.
+    minus the light that their own frames have in common. It is 0 for one frame, and negative on average if all frames
+    show the stripe at one place. The others are, for each order, the increase of the sum of products of neighbouring
+    pixels if pixels are taken in that order.
     """
     window = lines.shape[2]
     line = np.zeros((3, window))
@@ -116,7 +118,7 @@ def compare_lines(
             excess = excesses[0, j]
             if excess != 0.0:
                 rate = usual[row[0, i], x0[column[0, i]] + j]
-                # Pairs of different frames: a frame's own ones would be in common with themselves.
+                # Only pairs of different frames count: the ones of a frame agree with themselves.
                 alone = lines[0, i, j] * (1.0 - 2.0 * rate) + frames * rate * rate
                 own = (excess * excess - alone / (frames * max(rate, least))) * frames / (frames - 1.0)
                 own -= 0.5 * excess * (excesses[0, j - BESIDE_PX] + excesses[0, j + BESIDE_PX])
@@ -156,7 +158,7 @@ def _add_products(a, b, margin, to, out):  # type: ignore[no-untyped-def]
 _I, _F, _D = numba.int32[:, :], numba.float32[:, :], numba.float64[:, :]
 
 
-# Compiled when it is imported: only a wide sweep asks for it, which is too late for a stream.
+# Compiled at import: it is first called after a wide sweep, and compiling then would hold up the stream.
 @numba.njit(
     (numba.int32[:, :, ::1], _I, _I, _I, _I, numba.int32[:], _I, _I, _F, _F, _D, _D, numba.float64[:]),
     cache=True, nogil=True,
@@ -176,7 +178,7 @@ def follow_lines(
     shared: NDArray[np.float64],
     noise: NDArray[np.float64],
 ) -> None:
-    """Add up what points have in common with their partners, as a function of the distance from the expected place.
+    """Add up the light that points have in common with their partners, over the distance from the expected place.
 
     lines to x_hi: as for `compare_lines`, with all partners. usual, weight: (rows, width), mean ones r per exposure of
     each pixel over the sweep and 1 / sqrt(r), with a least r; both 0 for unusable pixels. rows: (partner columns, 5),
@@ -215,11 +217,11 @@ def follow_lines(
             k = partner + 2
             if exposures[0, i] == 0 or exposures[1, i] == 0 or exposures[k, i] == 0:
                 continue
-            # Each bin is light and noise: light times noise either way, and noise times noise.
+            # A bin is light plus noise, so a product has noise from light times noise (twice) and noise times noise.
             noise[partner] += BIN_PX * max(power[0] + power[k] - BIN_PX * bins, BIN_PX * bins)
             _add_products(light[0], light[1], margin, _in_bins(shift[0, i]), rows[partner])
             to = _in_bins(shift[k - 1, i] + x0[column[0, i]] - x0[column[k, i]])
-            # Along the motion, whichever way that is.
+            # Offsets are counted along the motion, whichever way that is.
             _add_products(
                 light[0], light[k], margin, to, shared[partner] if shift[k - 1, i] >= 0 else shared[partner, ::-1]
             )

@@ -1,21 +1,21 @@
-"""Checks of a map's counts and answers by its own light, which no correctly taken scene fails, whatever it looks like.
+"""Checks of a map's counts and answers by its own light. A correctly taken map passes them, whatever the scene.
 
-They use up to 512 or 8192 points, each a row and column with partners: the next row, and four columns at whose times
-the line has moved by 6 to 64 px (less where that is too much of the sweep). A stripe appears at all of them, at places
-that the planes predict; noise does not.
+They use up to 512 or 8192 points. A point is a row and a column. Its partners are the next row in the same column, and
+the same row in four other columns, to which the laser line has moved by 6 to 64 px (less in a narrow sweep). A stripe
+appears at a point and all its partners, at places that the planes predict; noise does not. Each has a line of counts,
+those of its row in its column.
 
-- Pixels of a row: light falls on neighbours alike, so no other order of the pixels is smoother than the right one.
-- Rows: a line of light is at the same place on the next row.
-- Frames: those of one column show the line at one place, pixel by pixel, just as two rows do.
-- Columns: the line moves from column to column as the planes predict; so does all other light of the sweep, mainly
+- Pixels of a row: neighbours receive similar light, so no other order of the pixels is smoother than the right one.
+- Rows: a stripe is at the same place on the next row.
+- Frames: those of one column show the stripe at one place, pixel by pixel, just as two rows do.
+- Columns: the stripe moves from column to column as the planes predict; so does all other light of the sweep, mainly
   haze.
-- Answers of estimators that state a probability as confidence: a confident answer, 0.9 for one place of some 150, needs
-  evidence of seven nats. At most 7 x 7 lines contribute to it, so each contributes at least a seventh, which is on
-  average half a standard deviation. So there must be that much more light at the answers than behind them, on lines
-  that did not give them.
+- Answers of estimators whose confidence is a probability: an answer with confidence 0.9, for one place of some 150,
+  needs evidence of seven nats. At most 7 x 7 lines of counts contribute to it. So each contributes at least 1/7 nat on
+  average, which is light half a standard deviation above the background. So there must be that much more light at the
+  answers than behind them, on lines of counts that did not give the answers.
 
-Limits are in standard deviations estimated from the points themselves. If there are too few points, a check says
-nothing.
+Limits are in standard deviations estimated from the points themselves. With too few points, a check says nothing.
 """
 
 from collections.abc import Iterator
@@ -31,59 +31,59 @@ from rig.geometry.windows import MARGIN_PX, WORD_PX, SweepGeometry, evenly_sprea
 Array = NDArray[np.float64]
 
 POINTS: Final = 512
-"""Points of a sweep whose counts are not kept; only their lines are."""
+"""Most points of a sweep whose counts are not kept, except the lines of counts of these points."""
 VOLUME_POINTS: Final = 8192
-"""Points of a sweep whose counts are kept."""
+"""Most points of a sweep whose counts are kept."""
 FEWEST_POINTS: Final = 128
-"""Points below which a check says nothing."""
+"""Least number of points for a check."""
 APART_PX: Final = (6.0, 16.0, 32.0, 64.0)
-"""The line's motion from a point's column to its partners: from more than the line is wide to as much as haze is."""
+"""Motion of the stripe from a point's column to its partner columns: from more than its width to the width of haze."""
 MOST_APART: Final = (1 / 16, 1 / 6, 1 / 6, 1 / 6)
-"""Share of a sweep's columns that lie at most between a point and each partner: what is farther is another surface."""
+"""Largest distance to each partner column, as a share of the sweep's columns: beyond it lies another surface."""
 NEAREST: Final = 3
-"""A point's own line, that of the next row and that of the nearest partner column: where narrow light is looked for."""
+"""Lines of counts that are compared for narrow light: a point's own, the next row's and the nearest column's."""
 FOLLOWED: Final = 256
-"""Points whose light of all widths is followed through the columns first; twice as many while that leaves it open."""
+"""Points at which light of all widths is first followed through the columns. Their number doubles until it suffices."""
 LIMIT: Final = 4.0
 """Standard deviations: one false alarm in 30 000 checks."""
 FEWEST_ROWS: Final = 24
-"""With fewer rows than this a sum over rows can hardly be LIMIT deviations off: n rows reach sqrt(n) at most."""
+"""Least number of rows for the check of pixel order: a sum over n rows reaches sqrt(n) standard deviations at most."""
 LEAST_FOLLOWING: Final = 0.25
-"""Least light in common with the other column, over that with the next row: scenes have 0.8 and more, clutter such as
-fences half of it; columns that do not follow one another have none."""
+"""Least light in common with the nearest partner column, relative to that with the next row. Scenes have 0.8 and more,
+clutter such as fences half of it. Columns that do not follow one another have none."""
 MOST_AMISS: Final = -0.45
-"""Light in common with the partner columns at the best of all wrong places, minus that at the best of those where the
-planes put it, over that with the next row; the sum over the four partners. Maps have -0.65 in dense fog to -3 in clear
+"""Limit of a sum over the four partner columns: light in common at the best wrong place, minus that at the best place
+where the planes put it, relative to the light in common with the next row. Maps have -0.65 in dense fog to -3 in clear
 air; shuffled or reversed columns have -0.4 to 2.
 """
 LEAST_LIGHT: Final = 12.0
-"""Light in common with the next row, in standard deviations, below which nothing is said of where it moves to."""
+"""Least light in common with the next row, in standard deviations, to judge how light moves."""
 MARGIN: Final = 3.5
 """Standard deviations by which a map's sum must exceed MOST_AMISS for a doubt."""
 SATURATED: Final = 0.99
-"""Share of ones among all pixels and frames from which on a map is full."""
+"""Share of ones among all pixels and frames above which a map is saturated."""
 LEAST_WIDTH_PX: Final = 32
-"""Width of a sensor below which the line's motion to its nearest partner, with pixels beside it, does not fit in."""
+"""Least sensor width with room for the stripe's motion to its nearest partner, and for pixels beside it."""
 DIMMEST: Final = 0.1
-"""Least mean rate of a pixel, over that of all, that its noise is reckoned with."""
+"""Least rate with which a pixel's noise is computed, relative to the mean rate of all pixels."""
 SURE: Final = 0.9
-"""Confidence of answers that must have light."""
+"""Least confidence of answers that must have light, the sure ones."""
 GROUPS: Final = 16
-"""Most groups of sure answers by distance: wrong ones are mostly wrong together, as a surface that is not there."""
+"""Most groups of sure answers, by distance. Wrong answers mostly form a false surface, so they are in one group."""
 LEAST_CONTRAST: Final = 0.5
-"""Mean light at sure answers above that behind them, in standard deviations: see the module."""
+"""Least mean light at sure answers above that behind them, in standard deviations: see the module."""
 LINE_PX, BEHIND_PX = (-1, 1), (3, 9)
-"""Pixels from an answer, away from the near side, that hold its light, and light behind it."""
+"""First and last pixel of an answer's light and of the light behind it, counted from the answer towards far depths."""
 
 ORDERS: Final = ("the bits of each byte", *(f"the bytes of {bits}-bit words" for bits in (16, 32, 64)))
 """Wrong orders of pixels that are tried."""
 
 
 class Points(NamedTuple):
-    """Rows and columns that are checked, with their partners: on the next row, and APART_PX further on.
+    """Rows and columns of points (index 0) and of their partners: the next row (1), and columns APART_PX away (2, ...).
 
-    row, column: int32 (2 + partner columns, points). shift: int32 (1 + partner columns, points), pixels from a stripe
-    to the partner's, on one surface.
+    row, column: int32 (2 + partner columns, points). shift: int32 (1 + partner columns, points), pixels from the stripe
+    at a point to the stripe of the same surface at each partner.
     """
 
     row: NDArray[np.int32]
@@ -122,7 +122,7 @@ class MapChecks:
         self._calibrated = calibrated
         # On a sensor hardly wider than the line, light cannot be seen to move.
         self._follows = calibrated and geometry.width >= LEAST_WIDTH_PX
-        # Beside a line another one stands where this one moves to.
+        # With several laser lines, another one stands where this one moves to.
         self._alone = geometry.others is None
         self._knows = knows
         self._points: dict[int, Points] = {}
@@ -131,8 +131,8 @@ class MapChecks:
     def doubts(self, sweep: Any, intensity: NDArray[np.uint32], stripe: StripeTable) -> tuple[str, ...]:
         """Doubts about a map, each a sentence that says what to look at; empty if nothing speaks against it.
 
-        sweep: a `CountVolume`, or a sweep with `checked`, the counts of the POINTS (lines, points, window). intensity:
-        (rows, width). stripe: the estimator's own answers.
+        sweep: a `CountVolume`, or a sweep with `checked`: the lines of counts of POINTS points and of their partners,
+        (lines, points, window). intensity: (rows, width). stripe: the estimator's answers, unfiltered.
         """
         most = VOLUME_POINTS if isinstance(sweep, CountVolume) else POINTS
         if most not in self._points:
@@ -140,7 +140,7 @@ class MapChecks:
         counts = _Counts(sweep, self._geometry, self._points[most])
         seen = counts.exposures_seen()
         if not seen.any():
-            return ()  # all of its frames were lost, which the gaps say
+            return ()  # all of its frames were lost, which the gaps show
         fired = float(intensity.sum()) / (float(seen.sum()) * self._geometry.rows)
         if fired == 0.0:
             return ("no light: not one pixel fired in any frame; check lens cap, laser, gate and the sensor's power",)
@@ -166,11 +166,11 @@ class MapChecks:
         out = self._compared(counts, few, usual, least)
         clear = out[:, 1] / LEAST_FOLLOWING - out[:, 0], -out[:, 2]
         if len(few) < len(lit) and any(each.any() and _deviations(each) < LIMIT for each in clear):
-            out, few = self._compared(counts, lit, usual, least), lit  # what few points leave open
+            out, few = self._compared(counts, lit, usual, least), lit  # few points left it open
         points = counts.points
         _, of_row = np.unique(points.row[0, few], return_inverse=True)
         if of_row.max() + 1 >= FEWEST_ROWS:
-            # Pixels that are always on are the same on every line of a row: rows are what is independent.
+            # Pixels that are always on are in every line of counts of their row, so only rows are independent.
             likeliest = int(out[:, 3:].sum(axis=0).argmax())
             if _deviations(np.bincount(of_row, out[:, 3 + likeliest]).astype(np.float64)) > LIMIT:
                 expected = "bytes as they lie along the row" if likeliest else "most significant bit first"
@@ -217,7 +217,7 @@ class MapChecks:
         return out
 
     def _amiss(self, counts: "_Counts", chosen: NDArray[np.int64], usual: NDArray[np.float32], least: float) -> bool:
-        """Whether light of all widths moves from column to column otherwise than the planes; False if undecided."""
+        """Whether light of all widths moves from column to column otherwise than planes predict; False if undecided."""
         from rig.count.map_check_kernels import BIN_PX, SPAN, follow_lines
 
         geometry, points = self._geometry, counts.points
@@ -225,7 +225,7 @@ class MapChecks:
         rows, shared, noise = np.zeros((partners, 5)), np.zeros((partners, 2 * SPAN + 1)), np.zeros(partners)
         moved_px = np.abs(np.median(points.shift[1:, chosen], axis=1))
         if moved_px[-1] < 0.75 * APART_PX[-1]:
-            return False  # too narrow a sweep for haze to be told from what stands still
+            return False  # too narrow a sweep to distinguish haze from light that stands still
         expected = np.abs(np.arange(-SPAN, SPAN + 1)) <= np.maximum(0.5 * moved_px / BIN_PX, 1.0)[:, None]
         used = np.isfinite(usual)
         weight = np.where(used, 1.0 / np.sqrt(np.maximum(usual, np.float32(least))), np.float32(0.0))
@@ -248,7 +248,7 @@ class MapChecks:
         return False
 
     def _sure(self, counts: "_Counts", stripe: StripeTable) -> tuple[int, NDArray[np.int64]]:
-        """Number of groups that the sure answers go into, and the points they are at."""
+        """Number of groups of sure answers, and the numbers of the points that have such answers."""
         y, c = counts.points.row[0], counts.points.column[0]
         lit = counts.lit()
         sure = lit[stripe.confidence[y[lit], c[lit]] >= SURE]
@@ -307,11 +307,11 @@ class _Counts:
         return np.asarray(np.cumsum(steps)[: geometry.width])
 
     def lit(self) -> NDArray[np.int64]:
-        """Numbers of the points whose NEAREST lines, their own among them, all have frames."""
+        """Numbers of the points whose first NEAREST lines of counts, their own among them, all have frames."""
         return np.flatnonzero((self.exposures[:NEAREST] > 0).all(axis=0))
 
     def lines(self, chosen: NDArray[np.int64], most: int) -> NDArray[np.int32]:
-        """Whole lines of chosen points and their first partners, (most, chosen, window)."""
+        """Lines of counts of chosen points and their first partners, (most, chosen, window)."""
         if self.of_volume:
             found = self._sweep.counts[self.points.column[:most, chosen], self.points.row[:most, chosen]]
         else:
@@ -338,7 +338,7 @@ class _Counts:
 
 
 def _ever_more(chosen: NDArray[np.int64], first: int) -> Iterator[NDArray[np.int64]]:
-    """Parts of evenly spread points, each as many as all before it, the first at least `first`."""
+    """Parts of the chosen points, each evenly spread. Each has as many as all before it, the first at least `first`."""
     step = 1 << max((len(chosen) // first).bit_length() - 1, 0)
     yield chosen[::step]
     while step > 1:
@@ -347,7 +347,7 @@ def _ever_more(chosen: NDArray[np.int64], first: int) -> Iterator[NDArray[np.int
 
 
 def _deviations(values: Array) -> float:
-    """Standard deviations by which a sum of independent values is above 0."""
+    """Standard deviations by which a sum of independent values is above 0, estimated from the values."""
     squares = float((values**2).sum())
     return float(values.sum()) / np.sqrt(squares) if squares > 0 else 0.0
 

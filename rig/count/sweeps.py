@@ -1,4 +1,4 @@
-"""From blocks to sweeps: binds and counts the frames of a run, and keeps account of those that are missing."""
+"""From blocks to sweeps: binds and counts the frames of a start, and keeps account of those that are missing."""
 
 import logging
 import math
@@ -21,7 +21,7 @@ from rig.plan.scan_plan import ScanPlan
 _log = logging.getLogger(__name__)
 
 MOST_UNDER_WAY = 16
-"""Blocks that the counting may hold at a time: threads are at work on some while the next one is bound."""
+"""Most blocks that counting may hold at a time: threads are still at work on some while the next one is bound."""
 
 Gap = tuple[int, int]
 
@@ -62,7 +62,7 @@ class SweepAccount:
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class SweepData(SweepAccount):
-    """One counted sweep. tally: its counter's, with the velocity. count_s: wall time spent on binding and counting."""
+    """One counted sweep. tally: the counter's, with the mirror's velocity. count_s: wall time to bind and count."""
 
     tally: FrameTally
     count_s: float
@@ -74,7 +74,7 @@ class SweepData(SweepAccount):
 
 @dataclass(frozen=True, slots=True)
 class SweepStart:
-    """First sweep of a run to become a map: number 0, except in a part that was cut from a recording.
+    """First sweep of a start to become a map: number 0, except in a part that was cut from a recording.
 
     clock_ratio: as in `FrameBinder`. Frames of earlier sweeps are not counted.
     """
@@ -84,7 +84,7 @@ class SweepStart:
 
 
 class SweepAssembler:
-    """Turns the blocks of one run into sweeps. The result does not depend on how frames are grouped into blocks."""
+    """Turns the blocks of one start into sweeps. The result does not depend on how frames are grouped into blocks."""
 
     def __init__(
         self, plan: ScanPlan, counter: Counter, maps: int, first_index: int = 0, start: SweepStart | None = None
@@ -114,8 +114,8 @@ class SweepAssembler:
         """Whether the scan marker that closes the last map has been seen."""
 
     def add(self, block: FrameBlock) -> Iterator[SweepData]:
-        """Count a block; yields the sweeps that end in it. Stop calling it once `complete`. Raises ProtocolError for a
-        block that is not of this run and plan, and the errors of `FrameBinder.bind`."""
+        """Count a block; yields the sweeps that end in it. Not to be called after `complete`. Raises ProtocolError for
+        a block that is not of this start and plan, and the errors of `FrameBinder.bind`."""
         self._check(block)
         first = block.header.first_frame
         if self._next_frame is not None and first > self._next_frame:
@@ -190,7 +190,7 @@ class SweepAssembler:
         return data
 
     def _note_repeated(self, block: FrameBlock, bound: BoundFrames) -> NDArray[np.int64]:
-        """Count frames whose ticks do not rise as lost: each is the one before it once more. Returns their indices."""
+        """Count frames whose ticks do not rise as lost, since each repeats the one before it. Returns their indices."""
         ticks = block.start_ticks
         before = ticks[0] - 1 if self._last_tick is None else self._last_tick
         repeated = np.flatnonzero(np.diff(ticks, prepend=before) <= 0)
@@ -205,8 +205,8 @@ class SweepAssembler:
         return repeated
 
     def _windows(self, block: FrameBlock, bound: BoundFrames) -> NDArray[np.int32]:
-        """First pixel used of each frame, int32 (n,): what the plan says for full frames, else its record; 0 if that is
-        marked as lost. Raises ProtocolError for a window off whole words or the sensor."""
+        """First used pixel of each frame, int32 (n,): from the plan for full frames, from the records for windows, 0 if
+        a window is lost. Raises ProtocolError for a window off whole words or the sensor."""
         records, plan = block.records, self._plan
         if block.header.width == plan.width:
             return plan.window_x0(records["marks"], records["line"], bound.sweep)
@@ -223,7 +223,7 @@ class SweepAssembler:
         return x0
 
     def _check(self, block: FrameBlock) -> None:
-        """Raise ProtocolError for a block of another run or size of frames, or of frames before the next one."""
+        """Raise ProtocolError for a block of another start or frame size, or one that begins before the next frame."""
         header, plan = block.header, self._plan
         widths = {plan.width} if plan.windows is None else {plan.width, plan.windows.width_px}
         # Counters cannot go from one width to another in the middle of a column.

@@ -24,7 +24,7 @@ BIN_UNUSABLE = -2
 BYTE_FRAMES = 255
 """Most frames of a column that counters of 8 bits hold."""
 BYTE_EXPOSURES = 200
-"""Nominal exposures up to which such counters suffice: binding lets no column have more than BYTE_FRAMES then."""
+"""Most nominal exposures for 8-bit counters: up to this, binding lets no column have more than BYTE_FRAMES frames."""
 
 Counts = NDArray[np.unsignedinteger[Any]]
 """uint8, uint16 or uint32, as wide as the counts need."""
@@ -69,10 +69,10 @@ class SweepLayout:
 class FrameTally:
     """Frames of a sweep, which every counter records besides the counts.
 
-    n_frames: (columns,), in each column's bin. column: (columns,), mean fractional column of those frames, NaN if there
-    are none. dark_counts: (rows, width) over n_dark frames with the gate low, None if there are none. width: of the
-    sensor, pixels. dark_frames: (width,), number of the n_dark frames in which a pixel was used; None: in all of them.
-    velocity_per_s: of the mirror command over the columns, negative if it fell, 0 if unknown.
+    n_frames: (columns,), frames in each column's bin. column: (columns,), mean fractional column of those frames, NaN
+    if there are none. dark_counts: (rows, width), ones over n_dark frames with the gate low, None if there are none.
+    width: of the sensor, pixels. dark_frames: (width,), number of the n_dark frames in which a pixel was used; None: in
+    all of them. velocity_per_s: of the mirror command over the columns, negative if it fell, 0 if unknown.
     """
 
     n_frames: NDArray[np.int32]
@@ -84,7 +84,7 @@ class FrameTally:
     velocity_per_s: float = 0.0
 
     def intensity(self) -> NDArray[np.uint32]:
-        """Counts summed over the columns, (rows, width) uint32, in a subclass that has them."""
+        """Counts summed over the columns, (rows, width) uint32; only in subclasses that keep counts."""
         raise NotImplementedError
 
     def bound_column(self) -> NDArray[np.float64]:
@@ -149,7 +149,7 @@ class SweepTally:
 
         self._layout = layout
         self.dark = np.zeros((layout.rows, PAIRS, layout.padded_width // 8 + LANES, 2), np.int32)
-        """Ones of dark frames, which kernels add, in lane order, with room for a whole vector behind each row."""
+        """Sums of the ones of dark frames in lane order, filled by kernels. A row ends with room for a whole vector."""
         self.reset()
 
     def reset(self) -> None:
@@ -166,7 +166,7 @@ class SweepTally:
         if lit.any():
             here, columns = bins[lit], self._layout.columns
             self.n_frames += np.bincount(here, minlength=columns).astype(np.int32)
-            # One frame after the other, in order: the sum must not depend on where a block ends.
+            # Frames are added one by one, in order: the rounding of the sum must not depend on where a block ends.
             np.add.at(self._column_sum, here, column[lit])
         dark = first_word[bins == BIN_DARK]
         if len(dark):
@@ -251,8 +251,8 @@ class SweepCounter:
 class LineCounter(SweepCounter):
     """The counter of a rig with several lines. Its bins are places of the mirror, and its frames are whole rows.
 
-    Frames of a place are added once, and each line's window is read from the result. layout and the volume are of all
-    columns.
+    Frames of a place are added once, and each line's window is read from the result. The layout and the volume have the
+    columns of all lines.
     """
 
     def __init__(self, layout: SweepLayout, grid: LineGrid, workers: RowWorkers) -> None:
@@ -263,7 +263,7 @@ class LineCounter(SweepCounter):
         self.reset()
 
     def finish(self) -> CountVolume:
-        """The counts so far. A column's frames are those of its place, with the same offset from the centre."""
+        """The counts so far. A column has the frames of its mirror place, at the same distance from its centre."""
         place, volume = self._grid.place, super().finish()
         column = np.arange(len(place)) + (volume.column - np.arange(self._grid.places))[place]
         return replace(volume, n_frames=volume.n_frames[place], column=column)

@@ -49,7 +49,7 @@ _SLOTS: Final = ("spad", "scanner")
 """Devices that depth depends on: laser and sync source only let the light out."""
 _NO_SERIAL: Final = ("", "none")
 _GEOMETRY: Final = "geometry"
-"""Key of a simulated rig's true geometry, by its numbers; `world` is the name of its file, which says less."""
+"""Key of a digest of a simulated rig's true geometry. The key `world` has only the name of the geometry's file."""
 _CHECKS: Final = {"check": "rig calibrate check", "pixels": "rig calibrate pixels"}
 
 
@@ -128,8 +128,8 @@ def rig_content(identity: Identity) -> dict[str, Any]:
 
 
 def calibration_use(rig: OpenRig, *, accept: bool = False, here: Identity | None = None) -> CalibrationUse | None:
-    """The calibration of an open rig, compared with it; None if it has none. Raises UsageError with a line for each
-    reason.
+    """The calibration of an open rig, after comparison with the rig; None if the rig has none. Raises UsageError with a
+    line for each reason against it.
 
     accept: whether to use it in spite of the reasons. here: identity of the rig, if the caller has it. Reasons that
     were accepted when a recording was taken stay accepted for the recording's own calibration.
@@ -183,7 +183,7 @@ def _used(
 
 
 def _foreign(made: Identity, here: Identity) -> list[Refusal]:
-    """Reasons for each part that both identities name and that differs."""
+    """A reason for each part that both identities name and that differs."""
     of = f" of the rig '{made.name}'" if made.name else ""
     found = []
     for what, ours, theirs in (("", *_comparable(made, here)), (" serial number", made.serials, here.serials)):
@@ -194,7 +194,7 @@ def _foreign(made: Identity, here: Identity) -> list[Refusal]:
 
 
 def _comparable(made: Identity, here: Identity) -> tuple[dict[str, str], dict[str, str]]:
-    """Kinds of both; simulated worlds by their geometry, or by the file's name where one of the two has no geometry."""
+    """Kinds of both. For simulated worlds these are digests of the geometry, or file names if one has no digest."""
     both = dict(made.kinds), dict(here.kinds)
     digests = [kinds.pop(_GEOMETRY, "") for kinds in both]
     if all(digests):
@@ -245,7 +245,7 @@ def accepted_by(use: CalibrationUse | None) -> tuple[str, ...]:
 
 
 def failed_verdict(verdict: str | None, reasons: Sequence[str]) -> list[Refusal]:
-    """The reason that follows from a calibration's own verdict; none if it passed or nobody judged it (None)."""
+    """The reason that follows from a calibration's own verdict; none if it passed or was not judged (None)."""
     if verdict != "failed":
         return []
     why = ", ".join(reasons) or "no reason noted"

@@ -45,17 +45,17 @@ LEAST_FREE_BYTES = 2**30
 
 RING_SLOTS = 8
 LOOK_S = 30.0
-"""Longest look at the stream."""
+"""Longest examination of the frames, in seconds."""
 FILL_S = 5.0
 DARK_PROGRAM = (Pulse(0, None), Pulse(0, 1e-3))
-"""Program that ends once it was triggered; all outputs stay low throughout."""
+"""Program of the sync source that keeps all outputs low, and ends once it was triggered."""
 _LEAST_LINES = 3
 
 
 @dataclass(frozen=True, slots=True)
 class LineMarkers:
-    """The line markers of a sweep, compared with its plan. clock_error: relative excess of the scanner's clock over
-    nominal, in the SPAD's time. jitter_columns: standard deviation."""
+    """Line markers of a sweep, compared with its plan. jitter_columns: standard deviation of their times. clock_error:
+    relative excess of the scanner's clock over nominal, in the SPAD's time."""
 
     rate_hz: float
     jitter_columns: float
@@ -67,8 +67,8 @@ class DarkLook:
     """Frames of a sweep with the gate low, and what came with them.
 
     records: (n,), records of all frames. dark_share: share of ones in the first frames of the blocks. n_bytes: bytes of
-    pixels; seconds: time from the start of the mirror until all had come.
-    counters: the SPAD's own, before it was stopped. triggered: whether the sync source's program ran to its end.
+    pixels; seconds: time from the start of the mirror until all frames had come. counters: the SPAD's own, read before
+    it was stopped. triggered: whether the sync source's program ran to its end.
     """
 
     records: NDArray[np.void]
@@ -111,7 +111,7 @@ def look(rig: OpenRig, plan: ScanPlan, stride: int) -> DarkLook:
     shares: list[float] = []
     n_bytes, scans = 0, 0
     with ring.reader("doctor") as reader, ExitStack() as at_end:
-        for make_safe in (rig.spad.stop, rig.scanner.park, rig.sync.abort):  # the last one first
+        for make_safe in (rig.spad.stop, rig.scanner.park, rig.sync.abort):  # called in reverse order
             at_end.callback(make_safe)
         rig.sync.gate_low()
         rig.spad.start(frames)
@@ -137,7 +137,7 @@ def _count(records: NDArray[np.void], mark: Mark) -> int:
 
 @dataclass(frozen=True, slots=True)
 class Finding:
-    """Result of one examination. ok: False if a scan could not run like this."""
+    """Result of one examination. ok: False if it would keep a scan from running."""
 
     name: str
     ok: bool
@@ -211,7 +211,7 @@ def _calibration(rig: OpenRig) -> Finding:
 
 
 def _plan(plan: ScanPlan) -> Finding:
-    """Finding on the plan; one that the link cannot carry is refused before it comes here."""
+    """Finding on the plan. A plan that exceeds the link's rate was refused before."""
     link = f"{plan.bytes_per_s / 1e6:.0f} MB/s"
     if plan.readout_bytes_per_s is not None:
         link = f"read out at {plan.readout_bytes_per_s / 1e6:.0f} MB/s"
@@ -281,7 +281,7 @@ def _disk(folder: Path) -> Finding:
 
 
 KNOWN = (("helios", HELIOS), ("lasercube", LASERCUBE), *(("spb-usb", one) for one in USB_IDS))
-"""USB devices by the kind of their driver; those on serial ports say what they are only when asked."""
+"""USB devices by the kind of their driver. Devices on serial ports cannot be identified without being opened."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -310,7 +310,7 @@ def attached() -> list[Attached]:
 
 
 def laser_off(config: RigConfig) -> list[str]:
-    """Take the gate low and switch emission off; returns what was done.
+    """Set the gate low and switch emission off; returns what was done.
 
     Both are tried even if one fails. Raises DevicesError with the failures, then with what was done.
     """

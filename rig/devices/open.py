@@ -1,6 +1,6 @@
 """Opens all devices of a rig together, lists every failure at once, and closes them gate first, whatever happens.
 
-This module also decides who may let light out: a real laser or gate needs the user's consent, a simulated one does not.
+It also checks that the user consents to light: a real laser or gate needs that (`--arm`), a simulated one does not.
 """
 
 from collections.abc import Iterator, Mapping, Sequence
@@ -23,14 +23,14 @@ from rig.errors import DevicesError, UsageError
 from rig.recording.cube import cube_columns
 
 GUARDED = ("laser", "sync")
-"""Slots whose devices a process of its own owns, since they let light out."""
+"""Slots of the devices that let light out. If they are real, a separate process (the guard) owns them."""
 DEVICES = ("spad", "scanner", "laser", "sync")
 """Slots of devices, in the order in which they are opened."""
 
 
 @dataclass(frozen=True, slots=True)
 class OpenRig:
-    """The open devices of a rig. world: None for a real rig; model: None if it is not calibrated."""
+    """The open devices of a rig. world: None for a real rig. model: None if the rig is not calibrated."""
 
     config: RigConfig
     clock: Clock
@@ -93,7 +93,7 @@ def open_light(config: RigConfig, trouble: list[str]) -> Iterator[tuple[SyncSour
         for slot in GUARDED:
             try:
                 opened[slot] = stack.enter_context(_create(slot, getattr(config, slot), surroundings))
-            except Exception as error:  # whatever it is, it must not keep the other one alight
+            except Exception as error:  # no error of one device may keep the other one on
                 trouble.append(f"{slot}: {error}")
         yield opened["sync"], opened["laser"]
 
@@ -159,8 +159,7 @@ def _create_surroundings(config: RigConfig, seed: int, stack: ExitStack, problem
 
 
 def surroundings_of(config: RigConfig, seed: int, stack: ExitStack) -> Surroundings:
-    """Clock and world of the config, with the devices that the world provides. Raises DeviceError if it cannot
-    be made."""
+    """Clock and world of the config, with the world's devices. Raises DeviceError if the world cannot be made."""
     virtual = config.world is not None and not config.world.real_time
     clock = VirtualClock() if virtual else SystemClock()
     bare = Surroundings(clock, None, seed)
@@ -177,7 +176,7 @@ def surroundings_of(config: RigConfig, seed: int, stack: ExitStack) -> Surroundi
 
 
 def _tapped(surroundings: Surroundings, slot: str, file: TapFile | None, stack: ExitStack) -> Surroundings:
-    """Surroundings with a tap for a slot's device, where traffic is recorded; written once the device is closed."""
+    """Surroundings with a tap for a slot's device, if traffic is recorded; flushed once the device is closed."""
     if file is None:
         return surroundings
     tap = Tap(file, slot)
@@ -197,7 +196,7 @@ def _load_model(config: RigConfig, problems: list[str]) -> RigModel | None:
     except CalibrationError as error:
         problems.append(f"calibration: {error}")
         return None
-    if (cube_columns(model) or 0) > 2:  # commands 0 and 1 may as well be those of a mirror
+    if (cube_columns(model) or 0) > 2:  # up to two planes may as well be those of a mirror
         problems.append(
             f"calibration: {config.calibration} is for a bare cube ('planes', one per column); a scan needs a "
             "calibration with 'scanner', which says where the plane is at any mirror command"
@@ -207,7 +206,7 @@ def _load_model(config: RigConfig, problems: list[str]) -> RigModel | None:
 
 
 def _pause_if_emitting(laser: LineLaser) -> list[str]:
-    """Pause a laser that emits before anybody armed it, and refuse the scan: somebody else is using it."""
+    """Pause a laser that emits before this program armed it. Returns the reason to refuse the scan."""
     try:
         if not laser.status.emission:
             return []

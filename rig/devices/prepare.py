@@ -22,7 +22,7 @@ from rig.plan.scan_plan import ScanPlan
 from rig.recording.replay import replay_plan
 
 HOLD_EXPOSURES = 10
-"""Exposures per column from which simulated light is held within columns; with fewer, within parts of columns."""
+"""With at least so many exposures per column, simulated light is constant in a column; with fewer, in parts of one."""
 
 
 @runtime_checkable
@@ -39,15 +39,15 @@ class PlansEffects(Protocol):
     """A world that leaves out effects that make no difference to a scan."""
 
     def plan_for(self, power_w: float, exposure_s: float, exposures: int) -> None:
-        """Choose the simulated effects for columns of `exposures` frames of that exposure, at that power or less."""
+        """Choose the simulated effects for columns of `exposures` frames of `exposure_s`, at `power_w` or less."""
         ...
 
 
 def prepare(rig: OpenRig) -> tuple[ScanPlan, SpadTiming]:
     """Compile the plan and configure the SPAD for it. Nothing moves and no light leaves. Raises PlanError for a scan
-    that these devices cannot do, DeviceError if the SPAD refuses it; for a recording as `replay_plan`."""
+    that these devices cannot do, DeviceError if the SPAD refuses it; for a recording what `replay_plan` raises."""
     scan = rig.config.scan
-    if isinstance(rig.spad, ReplaySpad):  # what was scanned is bound by the plan that it was scanned with
+    if isinstance(rig.spad, ReplaySpad):  # a recording is bound by the plan that it was taken with
         return replay_plan(rig.spad, rig.spad.recording, scan, rig.model)
     most_w = rig.laser.limits.max_power_w
     if scan.power is not None and scan.power > most_w:
@@ -60,12 +60,12 @@ def prepare(rig: OpenRig) -> tuple[ScanPlan, SpadTiming]:
     plan = _compiled(rig, scan)
     timing = rig.spad.configure(spad_request(scan, plan))
     rate_hz = timing.tick_hz / timing.frame_period_ticks
-    if rate_hz != plan.frame_rate_hz:  # a SPAD that rounds: path and windows are those of the rate that it has
+    if rate_hz != plan.frame_rate_hz:  # the SPAD rounds: plan path and windows for its rate
         plan = _compiled(rig, scan.model_copy(update={"frame_rate": rate_hz}))
         timing = rig.spad.configure(spad_request(scan, plan))
     plan = replace(plan, exposure_s=float(timing.exposure_ticks / timing.tick_hz))
     if isinstance(rig.world, HoldsColumns):
-        # A frame's light may be held this far from where the mirror is; the mean over a column's frames is right.
+        # A frame's light is that of the middle of its part of a column; the mean over a column's frames is right.
         parts = math.ceil(HOLD_EXPOSURES / plan.exposures)
         rig.world.hold_columns(plan.command_at((np.arange(plan.places * parts) + 0.5) / parts - 0.5))
     return plan, timing
@@ -77,15 +77,15 @@ def _compiled(rig: OpenRig, scan: ScanConfig) -> ScanPlan:
 
 
 BURST_LEAD_S, HOST_LEAD_S = 5e-3, 0.15
-"""Seconds between the SPAD's start and the first scan marker that a burst must have room for.
+"""A burst must have room for so many seconds between the SPAD's start and the first scan marker.
 
 The first is for virtual time, the second for a host that starts one device after the other over USB and serial ports.
 """
 
 SPARE_LEAD_S = 0.35
-"""Further seconds before the first marker, where the memory has room and reading ends with the last scan marker.
+"""Further seconds before the first marker, since a busy host starts its devices late.
 
-A busy host starts its devices late.
+They are added if the memory has room, and if reading ends with the last scan marker.
 """
 
 

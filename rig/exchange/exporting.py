@@ -31,7 +31,7 @@ FRAMES_PER_PICTURE: Final = 100
 
 @dataclass(frozen=True, slots=True)
 class ExportResult:
-    """Result of an export. gaps: missing frames, [run id, first, last]. damage: a line for each unreadable part."""
+    """Result of an export. gaps: missing frames, (run id, first, last). damage: a line for each unreadable part."""
 
     folder: Path
     kind: str
@@ -54,10 +54,10 @@ def export_run(
     """Write a run for other programs (`rig export`): npy, hdf5, ply, png or mp4.
 
     request, changes: what pictures and films show, as an `ExportRequest` or by the names of its fields.
-    out: the folder to write, which appears only once it is complete; None is RUN-KIND beside the run.
+    out: the folder to write, which appears only once it is complete; None means RUN-KIND beside the run.
     progress: called with the number of frames done and the total.
-    Raises UsageError if the run has nothing of that kind, a request does not fit it, `out` cannot be written or h5py is
-    not installed; DamagedRecordingError if no block of a recording can be read.
+    Raises UsageError if the run has nothing of that kind, the request does not fit the kind, `out` cannot be written or
+    h5py is not installed; DamagedRecordingError if no block of a recording can be read.
     """
     run, request = Path(run), replace(request or ExportRequest(), **changes)
     _check(run, kind, request)
@@ -139,7 +139,7 @@ class _Export:
         return bool(segment_files(self._run)) and (self._run.is_dir() or self._run.match(f"{SEGMENTS}*"))
 
     def _blocks(self) -> Iterator[FrameBlock]:
-        """Give all sound blocks of the recording; other blocks are noted as damage."""
+        """Yield all sound blocks of the recording, and note other blocks as damage."""
         try:
             recording = RunRecording(self._run)
             done = 0
@@ -153,7 +153,7 @@ class _Export:
         self.damage += recording.problems
 
     def _manifest(self) -> dict[str, Any]:
-        """The run's manifest; empty if there is none or it is damaged, which is noted."""
+        """The run's manifest; empty if there is none, or if it is damaged; the damage is noted."""
         try:
             return read_manifest(self._run) or {}
         except DamagedRecordingError as error:
@@ -178,7 +178,7 @@ class _Export:
         return view
 
     def _make_maps(self) -> str:
-        """The next step where there are no maps. Raises UsageError if there are no frames to make maps of either."""
+        """The next step if there are no maps. Raises UsageError if there are no frames to make maps of either."""
         require_recording(self._run)
         return f"make them first: {reconstruct_line(self._run)}, and export that folder"
 

@@ -14,7 +14,7 @@ from numpy.typing import NDArray
 from rig.errors import UsageError, each_or_problems
 
 CHUNK_BYTES: Final = 16 << 20
-"""Bytes of the pieces that files are read in, about."""
+"""Approximate bytes of the pieces in which files are read."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -23,7 +23,7 @@ class ForeignFrames:
 
     chunks: returns the frames in pieces, uint8 (any number, height, ceil(width / 8)), most significant bit = leftmost
     pixel.
-    origin: for the manifest. ranges: [first frame, frames] of consecutive numbers, if the file records lost ones.
+    origin: for the manifest. ranges: (first, number of frames) of each stretch without a gap, if the file has gaps.
     hints: lines for the user about what may be wrong.
     """
 

@@ -38,7 +38,7 @@ _CHUNK_BYTES: Final = 1 << 20
 _CLASSES: Final = {"float32": "single", "float64": "double"}
 """MATLAB's names of types; integers have the same names as in numpy."""
 _ROOM_BYTES: Final = 16 << 20
-"""Bytes left free for what HDF5 itself keeps and writes late."""
+"""Bytes left free for data that HDF5 buffers and writes late."""
 
 
 def require_h5py() -> Any:
@@ -81,7 +81,7 @@ def write_hdf5(blocks: Iterable[FrameBlock], maps: MapFiles, manifest: Mapping[s
 
 
 def _require_room(path: Path, n_bytes: int) -> None:
-    """Raise OSError before the disk is full: HDF5 cannot close a file then, and ends the whole process."""
+    """Raise OSError before the disk is full. On a full disk HDF5 cannot close a file, and ends the whole process."""
     if shutil.disk_usage(path.parent).free < n_bytes + _ROOM_BYTES:
         raise OSError(errno.ENOSPC, os.strerror(errno.ENOSPC), str(path))
 
@@ -102,7 +102,7 @@ def _write_frames(file: Any, log: FrameLog) -> None:
 
 
 def _write_maps(group: Any, maps: MapFiles) -> None:
-    """Write the maps one by one: a run may hold more than memory does."""
+    """Write the maps one by one, since those of a run may not fit into memory together."""
     for place, index in enumerate(maps.indices):
         arrays = maps.arrays(index)
         _require_room(Path(group.file.filename), sum(values.nbytes for values in arrays.values()))

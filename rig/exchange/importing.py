@@ -52,7 +52,7 @@ _KINDS: Final = {
 _RUN_ID: Final = 1
 _BLOCK_BYTES: Final = 1 << 20
 _MAX_TICK_HZ: Final = 0xFFFFFFFF
-"""Largest numerator and denominator of a clock that a block's header can say."""
+"""Largest numerator and denominator of a clock that a block's header can hold."""
 _MIN_RATE_HZ: Final = 0.001
 
 
@@ -81,7 +81,7 @@ def import_frames(
     progress: Progress | None = None,
     **changes: Any,
 ) -> ImportResult:
-    """Make a recording from the frames of another program (`rig import`); it appears only once it is complete.
+    """Make a recording from the frames of another program (`rig import`). Its folder appears only once it is complete.
 
     kind: pi-imaging, swissspad2 or photoncube.
     files: in order; a folder stands for the files in it.
@@ -141,7 +141,7 @@ def import_frames(
             "recording": recording.content(),
             "verdict": "gaps" if gaps else "complete",
         }
-        if ranges[0][0]:  # not from the start of the SPAD on, as after 'rig cut'
+        if ranges[0][0]:  # the first frame is not number 0, as after 'rig cut'
             manifest["cut"] = {"frames": [[_RUN_ID, ranges[0][0], sum(ranges[-1])]]}
         folder.write_json(MANIFEST, manifest)
         path = folder.publish()
@@ -185,7 +185,7 @@ def _turned(foreign: ForeignFrames, turn: QuarterTurn) -> Iterator[NDArray[np.ui
 
 
 def _clock(rate: Fraction | None) -> tuple[Fraction, int]:
-    """The frequency of the finest tick that a block's header can say, and ticks a frame, at most 1000."""
+    """Tick frequency and ticks per frame: the most of 1000, 100, 10 and 1 whose frequency a block's header can hold."""
     if rate is None:
         return Fraction(1), 1
     rate = rate.limit_denominator(_MAX_TICK_HZ // max(1, -(-rate.numerator // rate.denominator)))

@@ -23,7 +23,7 @@ from rig.run_folder.folder import RunFolder, json_text
 
 CUBE: Final = "frames.npy"
 Ranges = list[tuple[int, int, int]]
-"""(run id, first frame, frames) of each stretch of consecutive numbers; as gaps (run id, first, last)."""
+"""(run id of the start, first frame, number of frames) of each stretch without a gap; of gaps (run id, first, last)."""
 _POSE: Final = "[[1,0,0,0],[0,1,0,0],[0,0,1,0],[0,0,0,1]]"
 """Pose for visionsim: the camera does not move, and its own frame is the world's."""
 
@@ -34,7 +34,7 @@ class FrameLog:
     def __init__(self) -> None:
         self._header: BlockHeader | None = None
         self._parts: list[tuple[int, NDArray[np.int64], NDArray[np.int64], NDArray[np.void]]] = []
-        """Run, numbers, ticks and records of each block."""
+        """Run id, numbers, ticks and records of each block."""
         self.n_frames = 0
 
     def add(self, block: FrameBlock) -> None:
@@ -62,7 +62,7 @@ class FrameLog:
         return self._header
 
     def columns(self) -> dict[str, NDArray[Any]]:
-        """Arrays (frames,): number, run, ticks and time_s of the SPAD's clock, and other fields of the records."""
+        """Arrays (frames,): number, run id, ticks and time_s of the SPAD's clock, and other fields of the records."""
         runs, *arrays = zip(*self._parts, strict=True)
         number, ticks, records = map(np.concatenate, arrays)
         return {
@@ -87,7 +87,7 @@ class FrameLog:
         return ranges
 
     def gaps(self) -> Ranges:
-        """Frames that are missing between others of their run, [run id, first, last]."""
+        """Frames that are missing between others of their start, (run id, first, last)."""
         return [
             (run, first + n, next_first - 1)
             for (run, first, n), (next_run, next_first, _) in pairwise(self.ranges())
@@ -123,14 +123,14 @@ class FrameLog:
 
 
 def _spans(true: NDArray[np.bool_]) -> Iterator[tuple[int, int]]:
-    """[first, last] index of every run of True."""
+    """(first, last) index of every stretch of True."""
     edges = np.flatnonzero(np.diff(true, prepend=False, append=False))
     for first, end in edges.reshape(-1, 2):
         yield int(first), int(end) - 1
 
 
 def _changes(values: NDArray[np.integer[Any]]) -> Iterator[tuple[int, int]]:
-    """[index, value] wherever the value is another than the one before."""
+    """(index, value) wherever the value differs from the one before."""
     for index in np.flatnonzero(np.concatenate([[True], values[1:] != values[:-1]])) if len(values) else ():
         yield int(index), int(values[index])
 
@@ -160,7 +160,7 @@ def write_npy(
 
 
 def _write_header(file: BinaryIO, block: FrameBlock, n_frames: int) -> None:
-    """Write the header, which takes the same room for any number of frames (numpy leaves it for arrays that grow)."""
+    """Write the header. It has the same size for any number of frames, since numpy leaves room for arrays that grow."""
     shape = (n_frames, block.header.height, -(-block.header.width // 8))
     np.lib.format.write_array_header_1_0(file, {"descr": "|u1", "fortran_order": False, "shape": shape})
 

@@ -1,8 +1,8 @@
 """Photon cubes of `photoncube` and `visionsim`: `.npy` uint8 (frames, height, ceil(width / 8)).
 
 They are packed along the width, most significant bit first (`numpy.packbits(axis=2)`; docs/reference/hardware.md). A
-fourth axis of length 1, the channel, is allowed. A file beside the array may add what it cannot hold: `NAME.json` of
-`rig export` (width, frame rate, frame numbers) or visionsim's `transforms.json` (width).
+fourth axis of length 1, the channel, is allowed. A file beside the array may add what the array cannot hold:
+`NAME.json` of `rig export` (width, frame rate, frame numbers) or visionsim's `transforms.json` (width).
 """
 
 from collections.abc import Iterator, Mapping, Sequence
@@ -25,9 +25,9 @@ PACK: Final = "numpy.packbits(frames, axis=2)"
 SIDECAR_FORMAT: Final = "spadrig-frames"
 TRANSFORMS: Final = "transforms.json"
 _MOST_PIXELS: Final = 0xFFFF
-"""Width and height that a block's header can say."""
+"""Largest width and height that a block's header can hold."""
 _MOST_FRAMES: Final = 2**48
-"""First number that is too large for a frame: three years of 100 kHz are a thirtieth of it."""
+"""Largest believable frame number: three years at 100 kHz reach a thirtieth of it."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -39,8 +39,7 @@ class _Cube:
 
 
 def open_photoncube(files: Sequence[Path], asked: ImportRequest) -> ForeignFrames:
-    """Open cubes as frames one after the other. Raises UsageError, a line per problem, for files that are not such
-    cubes.
+    """Open cubes as one sequence of frames. Raises UsageError, a line per problem, for files that are no such cubes.
 
     If all bytes are 0 or 1, the user, or a file beside the cube, must state that they are packed.
     """

@@ -17,7 +17,7 @@ from rig.scan.monitor import add_frames
 View = Literal["depth", "intensity", "frames"]
 VIEWS: Final[tuple[View, ...]] = get_args(View)
 _BRIGHT_SHARE: Final = 0.999
-"""Share of the first picture's pixels that are darker than what is shown as white."""
+"""Quantile of the first picture's pixel values that is shown as white."""
 _MOST_PIXELS: Final = 1 << 24
 """Most pixels of a picture of frames: five times as many as the largest SPAD array has."""
 Picture = NDArray[np.uint8]
@@ -85,7 +85,7 @@ def write_mp4(pictures: Iterable[Picture], path: Path, pictures_per_s: float) ->
     finally:
         if film is not None:
             film.release()
-    if n and cv2.VideoCapture(str(path)).get(cv2.CAP_PROP_FRAME_COUNT) != n:  # OpenCV says nothing of a full disk
+    if n and cv2.VideoCapture(str(path)).get(cv2.CAP_PROP_FRAME_COUNT) != n:  # OpenCV reports no full disk
         raise UsageError(f"only a part of the film could be written; is the disk of {path.parent} full?")
     return n
 

@@ -2,7 +2,7 @@
 
 SPAD512S (Pi Imaging): 1-bit RAW files, dumps of the TCP stream, sparse lists. Packed files have rows of 64 bytes, most
 significant bit first. A dump of the stream may end with `DONE`; as pixels may have the same bytes, the length decides.
-Sparse lists are u32 little-endian numbers of the pixels that fired, row by row; the number of pixels closes a frame.
+Sparse lists are u32 little-endian numbers of the pixels that fired, row by row; the frame's pixel count ends a frame.
 
 SwissSPAD2: least significant bit first. Half array: 256 rows of 512 pixels, 512 frames in the camera's files of 8 MiB.
 Full array: 512 x 512, 256 frames a file, read out as 256 rows of 1024 pixels in 8 zones of 128: a quarter of the upper
@@ -37,11 +37,11 @@ _LSB_FIRST: Final = np.packbits(np.unpackbits(np.arange(256, dtype=np.uint8), bi
 """Bytes with their bits reversed."""
 _JUDGED_FRAMES: Final = 512
 _JUDGED_SIGMAS: Final = 10.0
-"""Standard deviations by which even and odd frames of one scene do not differ by chance."""
+"""By chance, even and odd frames of one scene do not differ by so many standard deviations."""
 
 
 def open_pi_imaging(files: Sequence[Path], asked: ImportRequest) -> ForeignFrames:
-    """Open files as frames one after the other. The form of each file is recognised unless the request states it.
+    """Open files as one sequence of frames. The form of each file is recognised unless the request states it.
 
     Raises UsageError, a line per file, for contents that are not a whole number of frames or that fit both forms.
     """
@@ -68,7 +68,7 @@ def _open_pi_imaging(file: Path, form: str | None, rows: int) -> tuple[str, NDAr
     frame_bytes = rows * COLUMNS // 8
     ended = content[-len(DONE) :].tobytes() == DONE
     packed = content[: len(content) - len(content) % frame_bytes]
-    # Pixels may read DONE: it is an ending only where it is too much.
+    # Pixels may have the same bytes as DONE: they are an ending only if they come after whole frames.
     is_packed = len(packed) > 0 and (len(packed) == len(content) or (ended and len(content) - len(packed) == len(DONE)))
     listed = content[: len(content) - len(DONE)] if ended else content
     is_sparse = _is_list(listed, rows * COLUMNS)
@@ -112,8 +112,8 @@ def _sparse(content: NDArray[np.uint8], rows: int) -> Iterator[NDArray[np.uint8]
 
 
 def open_swissspad2(files: Sequence[Path], asked: ImportRequest) -> ForeignFrames:
-    """Open files as frames one after the other, as half arrays unless the request says full. Raises UsageError, a line
-    per file, for other sizes.
+    """Open files as one sequence of frames, of half arrays unless the request says full. Raises UsageError, a line per
+    file, for other sizes.
     """
     full = asked.form == "full"
     frame_bytes = _HALF_BYTES * (2 if full else 1)
@@ -156,7 +156,7 @@ def full_frames(raw: NDArray[np.uint8]) -> NDArray[np.uint8]:
 
 
 def _alternates(content: NDArray[np.uint8]) -> bool:
-    """Whether even and odd half frames differ by more than photons scatter, as the halves of full frames do."""
+    """Whether even and odd half frames differ by more than photon noise, as the halves of full frames do."""
     frames = content[: 2 * _HALF_BYTES * (_JUDGED_FRAMES // 2)].reshape(-1, _HALF_BYTES)
     even, odd = frames[0 : len(frames) // 2 * 2 : 2], frames[1::2]
     counts = [np.unpackbits(part, axis=1).sum(axis=0, dtype=np.float64) for part in (even, odd)]

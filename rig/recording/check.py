@@ -1,7 +1,8 @@
 """Reads every byte of a recording and finds which blocks are sound, what is damaged, and whether frames are missing.
 
 `check_segments` finds the sound blocks, `Continuity` the gaps between them, which show in the blocks' numbers. Gaps at
-the ends of a run show only in what else is known of it: `lost_ends` looks at the index and the manifest.
+the ends of a start do not show in its blocks: `lost_ends` finds them in the index and the manifest. In names of this
+package, `run` is one start of the SPAD; its run id is in every block.
 """
 
 import zlib
@@ -28,16 +29,16 @@ CHECKERS: Final = 2
 """Number of segments checked at a time."""
 _STEP_BYTES: Final = 64 * 2**20
 _CLOCK_SHARE: Final = 0.01
-"""Tolerance of ticks against frame numbers, as a share of the frames, beside half a frame."""
+"""Tolerance of ticks against frame numbers: this share of the frames, plus half a frame."""
 _NEIGHBOURS: Final = 2
-"""Number of blocks before it, and as many behind it, that a block is compared with."""
+"""A block is compared with so many blocks before it, and as many after it."""
 _FEW: Final = 4
-"""At most one in so many blocks of a run, or one of three, is left out for its ticks or sweep."""
+"""At most one in so many blocks of a start is left out because of its ticks or sweep; of three blocks, one."""
 
 
 @dataclass(frozen=True, slots=True)
 class SoundBlock:
-    """A block with all its checksums right, except that it may have none of its pixels (see `objection`).
+    """A block with correct checksums. Only the checksum of the pixels may be missing (see `objection`).
 
     entry: its index record. first_tick, last_tick: of its frames; 0 if it has none. last_sweep: number of scan markers
     up to its last frame. repeated: (first, last) numbers of frames whose ticks do not rise; they count as lost.
@@ -86,7 +87,7 @@ def check_segments(segments: Sequence[SegmentReader]) -> tuple[list[SoundBlock],
 
 
 def merged_gaps(gaps: Iterable[RunGap]) -> list[RunGap]:
-    """The gaps of each run in order. Gaps that overlap or touch are joined, and empty ones dropped."""
+    """The gaps of each start in order. Gaps that overlap or touch are joined, and empty ones dropped."""
     merged: list[RunGap] = []
     for number, first, last in sorted(gap for gap in gaps if gap[1] <= gap[2]):
         if merged and merged[-1][0] == number and first <= merged[-1][2] + 1:
@@ -116,7 +117,7 @@ class Continuity:
         return sum(last + 1 - first for _, first, last in merged_gaps(self.gaps))
 
     def follow(self, number: int, run: Run, *, is_part: bool) -> None:
-        """Note the gaps before and between the blocks of a run, and what is wrong with their numbers and ticks.
+        """Note the gaps before and between the blocks of a start, and what is wrong with their numbers and ticks.
 
         is_part: whether the recording was cut from another one, so that it need not begin with the first block.
         """
@@ -178,9 +179,9 @@ def in_step(frames: int, ticks: int, header: BlockHeader) -> bool:
 
 
 def out_of_step(run: Run) -> list[SoundBlock]:
-    """Blocks of a run whose ticks or sweep disagree with their frame numbers, judged by their neighbours.
+    """Blocks of a start whose ticks or sweep disagree with their frame numbers, judged by their neighbours.
 
-    Empty if there would be more than a few, since the device then counts differently, or if the run has at most two.
+    Empty if there would be more than a few, since the device then counts differently, or with at most two blocks.
     """
     votes = [0] * len(run)
     for i, block in enumerate(run):
@@ -234,7 +235,7 @@ def _stretches(numbers: NDArray[np.int64]) -> Iterator[tuple[int, int]]:
 def _objection(segment: SegmentReader, placed: Placed) -> str | None:
     """Reason why a block with all its checksums cannot be what was recorded; None if it can."""
     end = placed.offset + placed.length
-    if not TRAILER.unpack(segment.at(end - TRAILER_BYTES, TRAILER_BYTES).tobytes())[4]:  # no CRC, unless it is 0
+    if not TRAILER.unpack(segment.at(end - TRAILER_BYTES, TRAILER_BYTES).tobytes())[4]:  # 0: no CRC, or a CRC of 0
         payload = segment.at(placed.offset + HEADER_BYTES, placed.length - HEADER_BYTES - TRAILER_BYTES)
         if zlib.crc32(payload.tobytes()) != 0:
             return "has no checksum of its pixels"
@@ -248,7 +249,7 @@ def _objection(segment: SegmentReader, placed: Placed) -> str | None:
 def lost_ends(
     contents: Contents, runs: Sequence[Run], joined: Continuity, manifest: dict[str, Any] | None
 ) -> list[RunGap]:
-    """Frames that are missing at the end of each run, in a part also at its beginning (`follow` finds other gaps).
+    """Frames that are missing at the end of each start and, in a part that was cut, at its beginning.
 
     They show in index records of missing blocks, in the range of frames of a part, and in the number of frames that the
     device delivered. Starts of which nothing is left get the numbers after those of `runs`.
@@ -262,7 +263,7 @@ def lost_ends(
     gaps: list[RunGap] = []
     for number, run in enumerate(runs):
         first, end = ranges.pop(run[0].header.run_id, (run[0].first_frame, run[-1].end_frame))
-        if cut is not None and first < run[0].first_frame:  # of a whole run the first frame is number 0
+        if cut is not None and first < run[0].first_frame:  # a whole start begins with frame 0
             gaps.append((number, first, run[0].first_frame - 1))
         if end > run[-1].end_frame:
             gaps.append((number, run[-1].end_frame, end - 1))
@@ -272,8 +273,8 @@ def lost_ends(
 
 
 def _told_ranges(contents: Contents, runs: Sequence[Run]) -> dict[int, tuple[int, int]]:
-    """First and end frame, by run id, of index records beyond the ends of a run or of a run of which nothing is left;
-    empty if the index tells of fewer than half of the sound blocks."""
+    """First and end frame by run id, from index records beyond the ends of a start, or of a start of which nothing is
+    left. Empty if the index names fewer than half of the sound blocks."""
     sound = {block.entry for run in runs for block in run}
     if len(contents.told) == 0 or 2 * sum(entry.tobytes() in sound for entry in contents.told) < len(sound):
         return {}
@@ -289,13 +290,13 @@ def _told_ranges(contents: Contents, runs: Sequence[Run]) -> dict[int, tuple[int
 
 
 def _extend(ranges: dict[int, tuple[int, int]], run_id: int, first: int, end: int) -> None:
-    """Extend the range of a run's frames to these."""
+    """Extend the range of a start's frames to these."""
     began, ended = ranges.get(run_id, (first, end))
     ranges[run_id] = min(began, first), max(ended, end)
 
 
 def _reaches_beyond(entry: Any, run: Run) -> bool:
-    """Whether an index record is of frames beyond the ends of a run, of the right size and at the right time."""
+    """Whether an index record is of frames beyond the ends of a start, of the right size and at the right time."""
     n_frames, first = int(entry["n_frames"]), int(entry["first_frame"])
     near = run[-1] if first >= run[-1].end_frame else run[0]
     if near is run[0] and first + n_frames > near.first_frame:
@@ -309,7 +310,7 @@ def _reaches_beyond(entry: Any, run: Run) -> bool:
 
 
 def _delivered_behind(runs: Sequence[Run], missing: Sequence[RunGap], manifest: dict[str, Any] | None) -> list[RunGap]:
-    """Frames behind the end of the last run that the device delivered and that nothing else mentions."""
+    """Frames after the end of the last start that the device delivered and that nothing else mentions."""
     if manifest is None or not runs or ended_early(manifest) is not None:
         return []
     delivered = device_counters(manifest)[0].get("delivered", 0)

@@ -29,7 +29,7 @@ from rig.run_folder.folder import sync_folder
 from rig.run_folder.manifest import UNFINISHED
 
 LEVEL: Final = 3
-"""Level of zstd, its default: binary frames look like noise to it, and higher levels find little more."""
+"""Level of zstd, its default: binary frames look like noise to zstd, and higher levels save little more."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -84,7 +84,7 @@ def _compress(segment: PlainSegment, offsets: list[int]) -> None:
     sizes: list[tuple[int, int]] = []
     try:
         with scratch.open("wb") as file:
-            for begin, end in pairwise(sorted({0, *offsets, segment.size})):  # what is before the first block too
+            for begin, end in pairwise(sorted({0, *offsets, segment.size})):  # bytes before the first block too
                 plain = segment.at(begin, end - begin)
                 frame = packer.compress(plain.data)
                 if not np.array_equal(unpack_frame(np.frombuffer(frame, np.uint8), len(plain)), plain):

@@ -41,8 +41,7 @@ Piece = tuple[int, NDArray[np.uint8]]
 class Cube:
     """Checked frames of whole maps. first_frame: number of the first map's first frame. maps: number of whole sweeps.
 
-    between: reads the frames that exist from a first one to before an end, at most a given number at a time, from the
-    disk.
+    between: called with (first, end, step), reads the existing ones of frames first..end-1, at most step at a time.
     """
 
     path: Path
@@ -127,7 +126,7 @@ def count_map(cube: Cube, index: int, counter: Counter) -> tuple[FrameTally, lis
         bits[:, :, row_bytes - 1] &= last_byte
         column = (np.arange(start - first, following - first) // cube.plan.exposures).astype(np.int32)
         counter.add(bits, column, column.astype(np.float64), np.zeros(len(bits), np.int32))
-        counter.settle(1)  # frames wait in memory until they are counted
+        counter.settle(1)  # limits the frames that wait in memory
     if following < end:
         gaps.append((following, end - 1))
     return counter.finish(), gaps

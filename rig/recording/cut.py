@@ -1,7 +1,8 @@
-"""Cuts a part out of a recording, as a recording of its own: by maps, by frames of a run, or by time.
+"""Cuts a part out of a recording, as a recording of its own: by maps, by frames of a start, or by time.
 
-Frames keep their run and number, so that the maps of a part, numbered from 0 again, are bound as in the whole. The part
-includes everything needed to estimate its maps again: plan, calibration, learned states and, if known, the truth.
+Frames keep their run id and number, so that the part's maps are bound as in the whole recording. Maps are numbered from
+0 again. The part includes everything needed to estimate them again: plan, calibration, learned states and, if known,
+the truth.
 """
 
 import math
@@ -25,14 +26,14 @@ from rig.run_folder.manifest import MANIFEST, UNFINISHED, known_missing, manifes
 from rig.run_folder.summary import RunVerdict
 
 OF_MAPS: Final = ("learned", "truth")
-"""Folders with a file for each map, which a part takes along."""
+"""Folders with a file for each map, which are copied to the part."""
 _VERDICT_WITHOUT_GAPS: Final = {RunVerdict.GAPS: RunVerdict.COMPLETE, UNFINISHED: RunVerdict.ABORTED}
-"""Verdict of a part, by that of the whole: its gaps may lie elsewhere, and a part is over even if the run is not."""
+"""Verdict of a part without gaps, by the verdict of the whole. A part is over even if the run is not."""
 
 
 @dataclass(frozen=True, slots=True)
 class Part:
-    """Frames of one run. first_map, end_map: the maps completely in it, by the recording's numbers; 0, 0 for none."""
+    """Frames of one start. The maps completely in it are first_map to end_map - 1 of the recording; 0, 0 for none."""
 
     run: RecordedRun
     first_frame: int
@@ -44,8 +45,8 @@ class Part:
 def cut(run: PathLike, out: PathLike, request: CutRequest | None = None, **changes: Any) -> dict[str, Any]:
     """Write a part of a recording to the folder `out` and return the manifest of the part (`rig cut`).
 
-    request, changes: which part, as a `CutRequest` or by the names of its fields: `cut("run", "part", maps="0:2")`. Of
-      a range `A:B` either may be left out, for the first or the end; a single number means one map or frame.
+    request, changes: which part, as a `CutRequest` or by the names of its fields: `cut("run", "part", maps="0:2")`. In
+      a range `A:B`, A may be left out for the first, B for the end; a single number means one map or frame.
 
     Raises UsageError for a part that does not exist or an `out` that cannot be written, DamagedRecordingError if the
     recording is damaged, RecordingError if the disk is full.
@@ -108,7 +109,7 @@ def _parts(recording: RunRecording, spans: Sequence[MapSpan], asked: CutRequest)
 
 
 def _map_parts(recording: RunRecording, spans: Sequence[MapSpan], first: int, end: int) -> list[Part]:
-    """One part for each run that the maps are of, with the frame of the marker that closes its last map."""
+    """One part for each start that has some of the maps, with the frame whose marker closes the last of these."""
     if not any(run.entries["sweep"].any() for run in recording.runs):
         raise UsageError(
             f"{recording.path} has no markers to tell maps apart (sweeps are found by the light of a whole run, if at "
@@ -148,7 +149,7 @@ def _time_range(text: str, of: RecordedRun) -> tuple[int, int]:
 def _manifest(
     manifest: dict[str, Any], parts: Sequence[Part], recording: dict[str, object], lost: list[list[int]]
 ) -> dict[str, Any]:
-    """The whole's manifest, with the part's frames, maps and verdict."""
+    """The manifest of the whole recording, with the part's frames, maps and verdict."""
     first_map, end_map = parts[0].first_map, parts[-1].end_map
     sweeps, verdict = manifest.get("sweeps"), manifest.get("verdict", UNFINISHED)
     content = {
@@ -184,7 +185,7 @@ def _manifest(
 
 
 def _clock_ratio(manifest: dict[str, Any], part: Part, is_first: bool) -> float:
-    """Ratio of the clocks that the first map of a part was bound with: the last one fitted before it in its run."""
+    """Ratio of the clocks with which the first map of a part was bound: the last one fitted before it in its start."""
     sweeps = manifest.get("sweeps") or []
     known = (manifest.get("cut") or {}).get("clock_ratios") or []
     ratio = float(known[part.run.number]) if part.run.number < len(known) else 1.0

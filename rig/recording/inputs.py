@@ -1,8 +1,8 @@
-"""Plan and calibration beside the frames of a recording, which are needed to interpret them without the rig.
+"""Plan and calibration beside the frames of a recording, without which frames cannot be interpreted.
 
 `to_plain` and `from_plain` turn dataclasses into plain values for YAML and JSON and back, exactly: fractions become
-text ("100000/3"), arrays their dtype and values. Fields that a dataclass computes itself (init=False) are left out, and
-so are fields marked `SINCE` while they have no value, so that older files can still be read.
+text ("100000/3"), arrays their dtype and values. Fields that a dataclass computes itself (init=False) are left out.
+Fields marked `SINCE` are left out if they are None, and may be missing, so that older files can still be read.
 """
 
 import re
@@ -32,7 +32,7 @@ PLAN_VERSION: Final = 1
 MOST_EXPOSURES: Final = 0xFFFF
 """Most exposures per column, as in a config."""
 MOST_PIXELS: Final = 0xFFFF
-"""Most pixels each way, which is what a block's header can say."""
+"""Most pixels each way, which is what a block's header can hold."""
 
 
 def write_inputs(folder: Path, plan: ScanPlan, model: RigModel | None) -> None:
@@ -109,8 +109,8 @@ def _require_sizes(plan: ScanPlan) -> None:
 
 
 def holds_frames_alone(folder: Path) -> bool:
-    """Whether a recording has no plan and never had one, as with imported frames: neither manifest nor markers tell of
-    one.
+    """Whether a recording has no plan and never had one, as with imported frames: neither its manifest names a plan nor
+    its frames have markers.
 
     Raises UsageError if there is no recording, DamagedRecordingError if the manifest or every block is damaged.
     """
@@ -193,7 +193,7 @@ def _read(kind: Any, content: Any, where: str) -> Any:
         kinds = [inner[0]] * len(items) if inner[1:] == (...,) else inner
         return tuple(_read(one, item, f"{where}[{i}]") for i, (one, item) in enumerate(zip(kinds, items, strict=True)))
     if kind is Fraction:
-        if _FRACTION.fullmatch(_need(content, str, where)) is None:  # 1e999999999 is one too, of a gigabyte
+        if _FRACTION.fullmatch(_need(content, str, where)) is None:  # Fraction reads 1e999999999 too
             raise ValueError(f"{where} is {content!r}, which is no fraction of whole numbers")
         return Fraction(content)
     if kind is float:

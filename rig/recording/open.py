@@ -22,7 +22,7 @@ from rig.plan.scan_plan import MAX_CLOCK_ERROR
 from rig.run_folder.manifest import MANIFEST, RunGap, ended_before_last_map, is_cut_short, known_missing, read_manifest
 
 SEGMENTS: Final = "frames-*.spb"
-"""Pattern of the files that the frames of a recording lie in."""
+"""Pattern of the names of files that hold a recording's frames."""
 
 
 def open_recording(folder: Path) -> RunRecording:
@@ -37,7 +37,7 @@ def open_recording(folder: Path) -> RunRecording:
 
 
 def require_recording(path: Path) -> None:
-    """Raise UsageError if a path is not a folder with a recording, saying what it is instead, or cannot be unpacked."""
+    """Raise UsageError if a path is no folder with a recording, or if that is compressed and zstandard is missing."""
     files = segment_files(path).values() if path.is_dir() else ()
     if not files:
         raise UsageError(f"{path} {_instead(path)}")
@@ -90,7 +90,7 @@ def manifest_or_none(folder: Path) -> tuple[dict[str, Any] | None, str | None]:
 
 @dataclass(frozen=True, slots=True)
 class MapSpan:
-    """Frames of a map: those of one run, from the frame with its scan marker to before the frame with the next."""
+    """Frames of a map, all of one start (`run`): from the one with its scan marker to before the one with the next."""
 
     run: int
     first_frame: int
@@ -113,7 +113,7 @@ def map_spans(recording: RunRecording, manifest: dict[str, Any] | None) -> list[
 
 
 def _stated(recording: RunRecording, sweeps: list[dict[str, Any]]) -> Iterator[MapSpan]:
-    """Spans as the manifest states them; frame numbers begin anew with each run."""
+    """Spans as the manifest states them; frame numbers begin anew with each start."""
     run, end = 0, 0
     for sweep in sweeps:
         first = int(sweep["first_frame"])
@@ -131,7 +131,7 @@ def _marked(recording: RunRecording) -> Iterator[MapSpan]:
 
 
 def _sweep_begins(recording: RunRecording, run: RecordedRun) -> Iterator[int]:
-    """The frame of each scan marker except those before the run."""
+    """Numbers of the frames of a start that have a scan marker, or that follow lost frames with one."""
     entries = run.entries
     changes = np.flatnonzero(np.diff(entries["sweep"].astype(np.int64), prepend=-1) != 0)
     look_into = sorted({0, len(entries) - 1, *changes.tolist(), *(changes[1:] - 1).tolist()})
@@ -147,7 +147,7 @@ def _sweep_begins(recording: RunRecording, run: RecordedRun) -> Iterator[int]:
 
 
 def markers_seen(block: FrameBlock) -> NDArray[np.int64]:
-    """Number of scan markers in the run up to each frame: the record's low 16 bits, extended with the header's 32."""
+    """Number of scan markers in the start up to each frame: the record's low 16 bits, extended with the header's 32."""
     sweep = block.header.sweep
     return np.asarray(sweep + ((block.records["sweep"].astype(np.int64) - sweep) & 0xFFFF))
 
@@ -188,8 +188,8 @@ class RecordingInfo:
 
     verdict: the one in the run's manifest. segments, compressed: number of all segments and of the compressed ones.
     bytes: size of all segments on the disk. maps: number of whole maps. config: name of the config, devices: names by
-    slot, versions: of the software, all at the time of recording. What only the manifest says is None or empty without
-    one. problems: one line each, as far as a look at a few blocks shows.
+    slot, versions: of the software, all at the time of recording. Without a manifest, what only it says is None or
+    empty. problems: one line each, as far as a look at a few blocks shows.
     """
 
     folder: Path
@@ -237,7 +237,7 @@ def info(run: PathLike) -> RecordingInfo:
 
 
 def _is_there(span: MapSpan, run: RecordedRun, manifest: dict[str, Any]) -> bool:
-    """Whether a map's last frame and the marker that closes it are there after a repair, in a part also its first."""
+    """Whether a map's last frame and its closing marker are left after a repair; in a part, also its first frame."""
     if "repaired" not in manifest:
         return True
     begin = span.first_frame if "cut" in manifest else span.end_frame - 1

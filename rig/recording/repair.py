@@ -2,7 +2,7 @@
 
 No frame is changed and no byte of a segment thrown away. Bytes that are not part of a sound block go to
 `frames-000000.torn`, at the place they had in the segment, a damaged compressed segment to `frames-000000.torn.zst` and
-a damaged manifest to `manifest.damaged.json`. What another repair keeps gets a number: `frames-000000-1.torn`, ...
+a damaged manifest to `manifest.damaged.json`. What a later repair keeps gets a number: `frames-000000-1.torn`, ...
 """
 
 import json
@@ -78,7 +78,7 @@ def _put_in_order(found: Examination, done: list[str]) -> bool:
     if numbers == sorted(numbers):
         return False
     moves = [(paths[old], new) for old, new in zip(numbers, sorted(numbers), strict=True) if old != new]
-    # First to numbers that are free: all are segments still, wherever a repair is killed.
+    # First to free numbers, so that all files are still segments if the repair is killed.
     aside = [_numbered(path, number) for number, (path, _) in enumerate(moves, max(paths) + 1)]
     for (path, new), moved in zip(moves, aside, strict=True):
         done.append(f"{path.name} is {_numbered(moved, new).name} now, by the frames in it")
@@ -92,7 +92,7 @@ def _numbered(segment: Path, number: int) -> Path:
 
 
 def _clear(segment: SegmentReader, blocks: list[Range], done: list[str]) -> None:
-    """Copy what is no sound block to the torn file, zero it, and end the segment behind the last sound block.
+    """Move all but sound blocks to the torn file, zeros in their place; end the segment after the last sound block.
 
     A segment without a sound block is removed."""
     end = round_up_to_page(blocks[-1][1]) if blocks else 0
@@ -137,7 +137,7 @@ def _unpack(segment: SegmentReader, blocks: list[Range], done: list[str]) -> Non
 
 
 def _free(path: Path) -> Path:
-    """The path, with a number in its name if there is such a file: what an earlier repair kept stays as it is."""
+    """The path; with a number in its name if the file exists, so that what an earlier repair kept stays as it is."""
     stem, _, rest = path.name.partition(".")
     numbered = (path.with_name(f"{stem}-{number}.{rest}") for number in count(1))
     return next(one for one in chain([path], numbered) if not one.exists())
@@ -161,7 +161,7 @@ def _between(blocks: list[Range], size: int) -> Iterator[Range]:
 
 
 def _used(segment: SegmentReader, begin: int, stop: int) -> int:
-    """End of the last byte in a range that is not zero; `begin` where all are."""
+    """End of the last byte in a range that is not zero; `begin` if all are zero."""
     data = segment.at(begin, stop - begin)
     return stop - int((data[::-1] != 0).argmax()) if data.any() else begin
 
@@ -215,7 +215,7 @@ def _write_manifest(folder: Path, found: Examination, done: list[str]) -> None:
 
 
 def _recording(found: Examination) -> dict[str, Any]:
-    """The part of `Recording.content` that a repair changes; if the manifest has no starts, those that blocks tell."""
+    """The part of `Recording.content` that a repair changes. Starts that the manifest lacks are derived from blocks."""
     segments = [np.frombuffer(b"".join(block.entry for block in run), INDEX_RECORD)["segment"] for run in found.runs]
     with_blocks = set(found.entries["segment"].tolist())
     content: dict[str, Any] = {

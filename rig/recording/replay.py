@@ -1,7 +1,7 @@
-"""Prepares a recording to be run like a scan: plan and starts; the other devices are recorded, emulated or real.
+"""Prepares a recording to be played like a scan: its plan and its starts. Other devices are recorded, emulated or real.
 
 Frames are bound by the plan with which they were taken (`plan.yaml`), never by a newly compiled one, and each start of
-the SPAD is played as one start. So a map is made from exactly the same frames in the same order, at any clock.
+the SPAD is played as one start. So a map is made from exactly the same frames in the same order, at any speed.
 """
 
 import itertools
@@ -47,18 +47,18 @@ from rig.run_folder.manifest import (
 T = TypeVar("T")
 _log = logging.getLogger(__name__)
 SILENCE_S = 5.0
-"""Silence after which a SPAD has failed, as for a live one, in the time of the recording."""
+"""Seconds without frames, in the time of the recording, after which the SPAD counts as failed, as in a live scan."""
 ENDLESS = 1_000_000_000
 """Number of maps that stands for a loop without end."""
 RECORDED = ("scanner", "laser", "sync")
-"""Slots whose devices a recording can play as well."""
+"""Slots of the devices, besides the SPAD, that a recording can stand for."""
 
 
 def replay_config(run: Path, request: ReplayRequest, others: RigConfig | None = None) -> RigConfig:
     """Make the config of the rig that plays a recording. Raises UsageError if there is no recording that can be played,
     or for a wrong request; DamagedRecordingError if the recording's manifest or other files are damaged.
 
-    request: its settings of the estimate replace those of the recording.
+    request: its settings of the estimate, where given, replace those of the recording.
     others: rig whose world, scanner, laser and sync source take part; None to use the recorded ones.
     """
     try:
@@ -91,7 +91,7 @@ def replay_config(run: Path, request: ReplayRequest, others: RigConfig | None = 
         "scan": recorded.get("scan") or _scan_of(plan),
         "estimate": {**(recorded.get("estimate") or {}), **given},
     }
-    if content["estimate"].get("estimator") != "joint":  # another estimator than that of the scan, which had a prior
+    if content["estimate"].get("estimator") != "joint":  # only joint has a prior; the scan's does not apply
         content["estimate"].pop("temporal_prior", None)
     if others is not None:
         content |= {slot: part for slot, part in others.model_dump(mode="json").items() if slot in (*RECORDED, "world")}
@@ -126,7 +126,7 @@ def replay_plan(
 
 
 class ReplaySource:
-    """Facts about a recording for the run that plays it, as `rig.scan.scan.LiveSource` has them for a live one.
+    """Facts about a recording for its replay, as `rig.scan.scan.LiveSource` has them for a live scan.
 
     maps: number of maps to take; None for all. starts: those of the SPAD, one after the other. learned: states with
     which the maps of a part were estimated; empty if they are to be learned anew. Raises UsageError if there are too
@@ -167,9 +167,7 @@ class ReplaySource:
 
     @property
     def silence_s(self) -> float:
-        """Longest silence of the SPAD that is allowed. It is longer at a slow clock, and unlimited while it waits for
-        steps.
-        """
+        """Longest time without frames that is allowed: longer at a slow clock, and practically unlimited in steps."""
         pace = self._spad.pace
         return 1e6 if pace.stepping else SILENCE_S / min(1.0, pace.speed or 1.0)
 
@@ -213,7 +211,7 @@ class RecordedStart:
     """One start of the SPAD in a recording.
 
     begin: the sweep with which its whole maps begin. first_map: number of the first of these maps in the recording.
-    sweeps: how many they are. gone: frames at the start's ends that the manifest mentions but no block contains.
+    sweeps: number of these maps. gone: frames at the start's ends that the manifest mentions but no block contains.
     """
 
     number: int
@@ -224,7 +222,7 @@ class RecordedStart:
 
 
 def recorded_sweeps(recording: RunRecording, plan: ScanPlan, manifest: dict[str, Any]) -> list[RecordedStart]:
-    """The whole sweeps of each start of the SPAD, as the run took them, as far as their frames are there.
+    """The whole sweeps of each start of the SPAD that the run took and whose frames are left.
 
     Raises DamagedRecordingError if a start is missing but a later one is there, since their maps would be confused.
     """
@@ -254,7 +252,7 @@ def recorded_sweeps(recording: RunRecording, plan: ScanPlan, manifest: dict[str,
 def _what_is_left(
     start: RecordedStart, recording: RunRecording, run: RecordedRun, plan: ScanPlan, manifest: dict[str, Any]
 ) -> RecordedStart:
-    """The part of a start, as the run took it, whose frames are there."""
+    """The part of a start whose frames are left. start: as the run took it."""
     first, end = _readable_range(recording, run)
     begin, first_map, maps = start.begin, start.first_map, start.sweeps
     noted = manifest.get("sweeps")
@@ -274,7 +272,7 @@ def _what_is_left(
         if sweeps is not None:
             before = sum(int(sweep["first_frame"]) < first for sweep in sweeps)
             begin = replace(begin, clock_ratio=fitted_ratio(begin.clock_ratio, sweeps[:before]))
-        else:  # a killed run noted no sweeps; if the end is lost too, one map is taken to be gone from the beginning
+        else:  # a killed run noted no sweeps; if the end is lost too, assume that one map is lost at the beginning
             before = maps - whole if end >= part_end else min(1, maps)
     return RecordedStart(run.number, begin, first_map + before, min(whole, maps - before), tuple(gone))
 
@@ -308,7 +306,7 @@ def _end_block(recording: RunRecording, run: RecordedRun, *, last: bool) -> Fram
 
 
 def _readable_range(recording: RunRecording, run: RecordedRun) -> tuple[int, int]:
-    """First frame of a start and the one behind its last, in sound blocks; (first, first) where no block is sound."""
+    """First frame of a start in sound blocks, and the one after the last; (first, first) if no block is sound."""
     first, last = (_end_block(recording, run, last=end) for end in (False, True))
     if first is None or last is None:
         return run.first_frame, run.first_frame
@@ -326,7 +324,7 @@ def _end_gaps(recording: RunRecording, manifest: dict[str, Any]) -> list[RunGap]
 
 
 def _part_starts(recording: RunRecording, cut: dict[str, Any] | None) -> list[SweepStart]:
-    """The sweep that the maps of each run begin with: the first one, except in a part."""
+    """The sweep with which the maps of each start begin: the first one, except in a part that was cut."""
     if cut is None:
         return [SweepStart() for _ in recording.runs]
     ratios = cut.get("clock_ratios") or []
@@ -377,7 +375,7 @@ def _kept(file: Path, make: Callable[[dict[str, NDArray[Any]]], T]) -> T | None:
 
 
 def _scan_of(plan: ScanPlan) -> dict[str, Any]:
-    """The scan section that a plan came from, as far as a run needs it."""
+    """The scan section of the config that a plan came from, as far as a replay needs it."""
     return {
         "columns": plan.columns,
         "exposures": plan.exposures,

@@ -1,9 +1,8 @@
 """Writes one segment of a recording: SPB1 blocks one after the other, each padded with zeros to whole pages.
 
-Blocks bypass the page cache if the system allows it (O_DIRECT), several at a time, with pixels straight from their
-memory. This takes 0.3 s of CPU per GB, nearly all of it for the checksum, compared with 2 s through the page cache.
-Written data is then already on the disk, and a sync has little to do. `Space` is the room that a recorded run will take
-at most.
+Blocks are written several at a time, past the page cache if the system allows it (O_DIRECT), without copying pixels if
+they are aligned. This takes 0.3 s of CPU per GB, nearly all of it for the checksum, compared with 2 s through the page
+cache. Then a sync has little to do. `Space` is the most room that a recorded run will take.
 """
 
 import errno
@@ -24,7 +23,7 @@ from drivers.spb1 import block_parts
 from rig.errors import UsageError
 
 PAGE_BYTES: Final = 4096
-"""Unit of places and sizes of what is written past the page cache, in the file and in memory."""
+"""Writes past the page cache have sizes and offsets, in the file and in memory, that are multiples of this."""
 _SHARE_OF_FREE: Final = 2
 """The free space divided by this is the most that is set aside at a time: maps go to the same disk."""
 
@@ -54,7 +53,7 @@ class OpenSegment:
         self.placed = 0
         """Offset of the next block, bytes."""
         self.end = 0
-        """Offset of the end of the last block that is written and has only written ones before it, bytes."""
+        """Offset in bytes of the end of the blocks that are written without a gap between them."""
         self.synced = 0
         """Value of `end` at the beginning of the last sync."""
         self._lock = threading.Lock()
@@ -73,7 +72,7 @@ class OpenSegment:
         return offset
 
     def write(self, block: FrameBlock, offset: int, staging: Staging) -> None:
-        """Write a block at its place. Its memory must not change until this returns. Raises OSError."""
+        """Write a block at its place. The block's memory must not change until this returns. Raises OSError."""
         pieces = _pieces(block, staging)
         while pieces:
             written = self._write(pieces, offset)
@@ -142,7 +141,7 @@ def _pieces(block: FrameBlock, staging: Staging) -> list[memoryview]:
 
 
 def _open_direct(path: Path) -> int:
-    """Create a file and open it past the page cache where file system and system can."""
+    """Create a file and open it past the page cache if the system and the file system allow that."""
     flags = os.O_WRONLY | os.O_CREAT | os.O_EXCL | getattr(os, "O_BINARY", 0)
     direct = getattr(os, "O_DIRECT", 0)
     fd = os.open(path, flags, 0o644)
@@ -150,14 +149,14 @@ def _open_direct(path: Path) -> int:
         return fd
     try:
         direct_fd = os.open(path, os.O_WRONLY | direct)
-    except OSError:  # EINVAL: a file system without
+    except OSError:  # EINVAL: the file system does not allow it
         return fd
     os.close(fd)
     return direct_fd
 
 
 def _reserve(path: Path, size: int) -> None:
-    """Set space aside, which spares the file system the work while frames come. Nothing is lost where that fails."""
+    """Set space aside, so that the file system need not find it while frames come. A failure does no harm."""
     if not hasattr(os, "posix_fallocate"):
         return
     fd = os.open(path, os.O_WRONLY)
@@ -183,7 +182,7 @@ class Space:
 
     @classmethod
     def on_disk_of(cls, folder: Path, recording_bytes: int, map_bytes: int) -> "Space":
-        """Determine the space on the disk of a folder, given as an absolute path, which need not exist."""
+        """Determine the space on the disk of a folder. The folder is an absolute path and need not exist."""
         there = next(path for path in (folder, *folder.parents) if path.is_dir())
         return cls(folder, recording_bytes, map_bytes, shutil.disk_usage(there).free)
 

@@ -36,7 +36,7 @@ class Integrity(StrEnum):
 
     INTACT = "intact"
     GAPS = "gaps"
-    """Whole, but the device lost frames, or a repair cut some away, and said so."""
+    """Whole, but the device reports lost frames, or a repair found frames missing and noted that."""
     UNFINISHED = "unfinished"
     """The run is not over, or was killed, or went on without the recording; nothing else is wrong."""
     DAMAGED = "damaged"
@@ -46,9 +46,10 @@ class Integrity(StrEnum):
 class Verification:
     """Verdict on a recording, with its evidence.
 
-    blocks, frames: number of sound ones. bytes: those that sound blocks take in the segments. lost: frames that the
-    device lost or a repair found missing. gaps: their ranges, (run, first, last). problems: one line each. run: verdict
-    of the run that was recorded, None if unknown. ended: why the recording ended before the run; None if it did not.
+    runs: number of starts of the SPAD. blocks, frames: number of sound ones. bytes: what sound blocks take in the
+    segments. lost: frames that the device lost or a repair found missing. gaps: their ranges, (number of the start,
+    first, last). problems: one line each. run: verdict of the run that was recorded, None if unknown. ended: why the
+    recording ended before the run; None if it did not.
     """
 
     verdict: Integrity
@@ -71,8 +72,7 @@ class Verification:
 
 @dataclass(frozen=True, slots=True)
 class Examination:
-    """Everything that can be found out about a recording. runs: the sound blocks of each run, in order of their
-    frames."""
+    """Everything found out about a recording. runs: the sound blocks of each start, in order of their frames."""
 
     segments: list[SegmentReader]
     runs: list[list[SoundBlock]]
@@ -143,7 +143,7 @@ def examine(folder: Path) -> Examination:
     for number, run in enumerate(runs):
         joined.follow(number, run, is_part="cut" in (manifest or {}))
     problems += joined.problems
-    if problems:  # where nothing is wrong nothing is gone
+    if problems:  # without any, no frame is missing at the ends
         joined.missing += lost_ends(contents, runs, joined, manifest)
     if manifest is not None:
         if manifest.get("verdict") != UNFINISHED:
@@ -153,7 +153,7 @@ def examine(folder: Path) -> Examination:
 
 
 def _runs(contents: Contents, sound: Sequence[SoundBlock], problems: list[str]) -> list[list[SoundBlock]]:
-    """The sound blocks of each run, in order; adds a line to `problems` for each block that is left out or gone."""
+    """The sound blocks of each start, in order; adds a line to `problems` for each block that is left out or gone."""
     headers: dict[int, list[BlockHeader]] = {}
     for block in sound:
         headers.setdefault(block.header.run_id, []).append(block.header)
@@ -199,7 +199,7 @@ def _left_out(block: SoundBlock, why: str) -> str:
 def _against_manifest(
     manifest: dict[str, Any], segments: Sequence[SegmentReader], runs: Sequence[Run], joined: Continuity
 ) -> list[str]:
-    """Problems where a finished run's manifest tells of other blocks and frames than there are."""
+    """A line for each number of blocks, segments, frames or lost frames that a finished run's manifest has wrong."""
     recording = manifest.get("recording") or {}
     frames = sum(block.n_frames for run in runs for block in run)
     there = {

@@ -2,11 +2,11 @@
 
 A block counts once the system has all its bytes and those of every block before it; then its index record is written.
 So a killed program loses no block that counted. A loss of power loses at most blocks younger than `SYNC_INTERVAL_S`,
-since a thread makes the disk keep what was written, blocks before index.
+since a thread syncs the files to the disk, blocks before index.
 
-`Recording` does this. `Recorder` is the pipeline's thread that passes the blocks of one start of the SPAD to it. The
-recording's threads write them, several at a time, from their slots in the ring. The recorder is a required reader of
-the ring: if the disk is slower than the stream, the ring fills and the overload policy decides.
+`Recording` does this. `Recorder` is the pipeline's thread that passes the blocks of one start of the SPAD to the
+recording. The recording's threads write several blocks at a time, straight from their slots in the ring. The recorder
+is a required reader of the ring: if the disk is slower than the stream, the ring fills and the overload policy decides.
 """
 
 import errno
@@ -36,10 +36,10 @@ SYNC_INTERVAL_S: Final = 0.2
 _SYNC_EVERY_S: Final = SYNC_INTERVAL_S / 2
 """Seconds from the end of one sync to the next: a block may have to wait for the sync under way and for the next."""
 WRITERS: Final = 4
-"""Number of blocks written at a time: one thread makes checksums for some 4 GB/s, and disks like a queue."""
+"""Blocks written at a time: one thread computes checksums at some 4 GB/s, and disks are faster with a queue."""
 RESERVE_FILE: Final = ".recording.reserve"
 RESERVE_BYTES: Final = 1 << 20
-"""Bytes kept free beside the recording, so that manifest and summary find room on a disk that it filled."""
+"""Bytes reserved beside the recording, so that manifest and summary have room if the recording fills the disk."""
 
 
 @dataclass(slots=True, eq=False)
@@ -55,7 +55,7 @@ class _Placed:
 class Recording:
     """A recording that grows block by block in a folder; whatever fails, it ends after a whole block.
 
-    One thread submits and appends. expected_bytes: room to set aside for all segments; None: `segment_bytes` for each.
+    Only one thread may submit and append. expected_bytes: room to set aside in all; None: `segment_bytes` per segment.
     on_begin: called by `begin`. on_sync: called with every sync, on its thread, and when the recording is closed.
     Raises RecordingError if the folder cannot be written.
     """
@@ -78,7 +78,7 @@ class Recording:
         """Time of all writers together, for checksums and writing."""
         self.files: list[str] = []
         self.starts: list[dict[str, int]] = []
-        """Each start of the SPAD has the `sweeps` that it was to give and the number of its first `segment`."""
+        """For each start of the SPAD, the planned number of `sweeps` and the number of its first `segment`."""
         self.longest_unsynced_s = 0.0
         """Longest time from one sync's beginning to the next one's end."""
         self._expected_bytes = expected_bytes
@@ -122,7 +122,7 @@ class Recording:
         self.submit(block).result()
 
     def submit(self, block: FrameBlock) -> "Future[None]":
-        """Begin to write a block after the others. Its memory must not change until the result is available.
+        """Begin to write a block after the others. The block's memory must not change until the result is available.
 
         The result, or this call, raises RecordingError if a block could not be written; from that block on none counts.
         """
@@ -177,7 +177,7 @@ class Recording:
         }
 
     def _segment_for(self, size: int, is_for: tuple[int, int]) -> OpenSegment:
-        """The segment for a block: a new one after `begin`, for another run or width, or if the old one has no room."""
+        """The segment for a block: a new one after `begin`, for another run id or width, or if the old one is full."""
         segment = self._segment
         fits = segment is not None and (segment.placed == 0 or segment.placed + size <= self._segment_bytes)
         if segment is not None and fits and self._segment_is_for == is_for:
@@ -290,7 +290,7 @@ class Recorder:
             try:
                 while (block := self._next()) is not None:
                     under_way.append(self._recording.submit(block))
-                    while len(under_way) >= self._reader.holds:  # asking for the next block gives the oldest one back
+                    while len(under_way) >= self._reader.holds:  # `next` gives the oldest slot back
                         under_way.popleft().result()
                 while under_way:
                     under_way.popleft().result()

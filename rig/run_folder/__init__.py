@@ -1,4 +1,4 @@
-"""The folder that a run leaves, which appears whole or not at all: maps, pictures, clouds, manifest and summary.
+"""The folder of a run: maps, pictures, clouds, manifest and summary. Unless recorded, it appears whole or not at all.
 
 `folder` writes the files, `pictures` and `charts` draw, `manifest` and `summary` hold what the two JSON files say.
 """

@@ -1,12 +1,12 @@
-"""The folder of a run: every output in one place, either complete or not there at all.
+"""The folder of a run: every output in one place. Except for a recording, it is either complete or not there at all.
 
     depth/000000.npy  depth/000000.png  intensity/000000.png  stripe/000000.npz  cloud/000000.ply
     learned/000000.npz (the state used for the map, if the estimator learns)
     truth/000000.npz (if a world knows it)  manifest.json  summary.json
 
-Everything is written beside the folder under a hidden name and moved in one step at the end; a given empty folder is
-filled file by file, summary.json last. The folder of a recording is there from the start and grows in place. Data
-written with `replace_file` and `sync_folder` survives a loss of power.
+Everything is written beside the folder under a hidden name and moved in one step at the end. If the folder exists and
+is empty, it is filled at the end, file by file, summary.json last. The folder of a recording is there from the start
+and grows in place. Data written with `replace_file` and `sync_folder` survives a loss of power.
 """
 
 import io
@@ -41,14 +41,14 @@ Rays = tuple[NDArray[np.floating], NDArray[np.floating]]
 
 
 class RunFolder:
-    """Collects the outputs of a run. `publish` makes them appear as `path`; leaving without it or `keep` removes them.
+    """Collects the outputs of a run. `publish` makes them appear as `path`; if not published or kept, they are removed.
 
     in_place: whether the outputs can be seen at `path` from the start.
     Raises UsageError, with one line, if `path` is a file or a folder with something in it, or cannot be written.
     """
 
     def __init__(self, path: str | os.PathLike[str], *, in_place: bool = False) -> None:
-        """Claim the folder; nothing is visible at `path` yet, or an empty folder where it grows in place."""
+        """Claim the folder. Nothing is visible at `path` yet, or an empty folder if it grows in place."""
         self.path = Path(path).absolute()
         self._in_place = in_place
         self._limits: tuple[float, float] | None = None
@@ -93,7 +93,7 @@ class RunFolder:
         self._write(files)
 
     def place(self, name: str) -> Path:
-        """Path at which a file of the run is written; to be closed before `publish`. "" is the folder itself."""
+        """Path at which to write a file of the run. Close the file before `publish`. "" is the folder itself."""
         assert self._scratch is not None, "the run folder is published or discarded already"
         return self._scratch / name
 

@@ -27,7 +27,7 @@ Count = Annotated[int, Field(ge=0, lt=MOST_RUN_FRAMES)]
 Section = dict[str, Any] | None
 Frames = Annotated[list[int], Field(min_length=3, max_length=3)]
 RunGap = tuple[int, int, int]
-"""Number of the run, and first and last frame that are missing."""
+"""Number of the start of the SPAD, and first and last missing frame."""
 
 
 class _Part(BaseModel):

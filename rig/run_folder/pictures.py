@@ -17,8 +17,7 @@ _LABELS = 6
 
 
 def depth_limits(depth_m: NDArray[np.float32]) -> tuple[float, float] | None:
-    """Depths (m) at the ends of the colour scale, just beyond all but the outermost 1 % on each side; None if there is
-    no depth."""
+    """Depths (m) at the ends of the colour scale, just beyond the 1st and 99th percentile; None without any depth."""
     known = depth_m[np.isfinite(depth_m)]
     if not known.size:
         return None
@@ -40,7 +39,7 @@ def depth_picture(
         return picture
     low, high = limits
     known = np.isfinite(depth_m)
-    if known.any():  # of a sweep whose frames were all lost nothing is known, whatever the maps before it saw
+    if known.any():  # none is if all frames were lost; then limits are those of a map before
         picture[:, :width][known] = _colours(depth_m[known], limits)
     top, bottom = min(12, rows // 8), max(rows - 12, rows - rows // 8)
     bar = np.linspace(low, high, bottom - top)

@@ -18,8 +18,8 @@ _LARGEST = {
     "ring_slots", "ring_bytes", "ring_high_water", "map_queue", "map_queue_high_water", "recorder_s", "recorder_blocks",
     "recorder_bytes",
 }  # fmt: skip
-"""Figures of which the largest counts where a run starts the SPAD several times; other figures are added up. Those of
-the recorder grow from start to start, so that the largest is that of the whole run."""
+"""If a run starts the SPAD several times, the largest value of these figures is taken; other figures are added up.
+Those of the recorder grow from start to start, so that the largest is that of the whole run."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -32,8 +32,7 @@ class PipelineStats:
     dropped_blocks, dropped_frames: those that found no free slot. counting_s: binding and counting. estimation_s: from
     counts to map. map_wait_s: waiting for room among the maps that the caller has not taken yet; map_queue is that
     room, and at most map_queue_high_water maps waited. recorder_s: computing checksums and writing. monitor_updates:
-    views shown.
-    monitor_skipped_blocks: blocks that the monitor did not look at.
+    views shown. monitor_skipped_blocks: blocks that the monitor did not show.
     """
 
     source_fill_s: float = 0.0
@@ -123,7 +122,7 @@ Errors = Mapping[str, float | None]
 
 @dataclass(frozen=True, slots=True)
 class TruthErrors:
-    """Errors against a known truth, averaged over maps (medians: the median of the maps')."""
+    """Errors against a known truth, averaged over maps (of medians, the median over maps)."""
 
     stripe_error_px: Errors
     depth_error_m: Errors

@@ -1,7 +1,7 @@
 """Runs a scan: starts the devices in order, takes maps from their frames, and makes everything safe.
 
 The `Pipeline` works between SPAD and caller. When all frames have come, or anything fails, the rig is made safe on the
-caller's thread. What is in the ring by then is still counted and estimated, unless that thread itself failed.
+caller's thread. What is in the ring by then is still counted and estimated, unless the caller's thread itself failed.
 """
 
 import logging
@@ -34,7 +34,7 @@ from rig.scan.pipeline import JOIN_S, Overload, Pipeline, require_policy, ring_f
 _log = logging.getLogger(__name__)
 
 SILENCE_S = 5.0
-"""A SPAD that sends nothing for this long, with the ring empty, has failed."""
+"""A SPAD that sends nothing for so many seconds, with the ring empty, has failed."""
 WARM_UP_S = 120.0
 """Longest wait for a laser to warm up."""
 WARM_LOOK_S = 0.2
@@ -112,7 +112,7 @@ class Acquisition:
         """Scan; yields the maps in order. However the iteration ends, gate, laser, scanner and SPAD are made safe.
 
         Raises DeviceError if a device fails, RingOverflow if frames came too fast, RecordingError if a block cannot be
-        written (on other threads: after all whole maps); DevicesError if not all devices could be made safe.
+        written; all maps that are still complete come first. Raises DevicesError if not all devices could be made safe.
         """
         plan = self._plan
         counter = self._maker.counter(
@@ -127,7 +127,7 @@ class Acquisition:
             done += group
 
     def _next_start(self, left: int) -> tuple[int, SweepStart]:
-        """Number of sweeps of the next start, of so many that are left, and the sweep with which it begins.
+        """Number of sweeps of the next start, at most `left`, and the sweep with which the start begins.
 
         The number is the recorded one, 1 for a first map alone, or else as many as burst memory and sync program hold.
         """
@@ -182,7 +182,7 @@ class Acquisition:
                         if (fault := rig.scanner.status.fault) is not None:  # frames would go on without markers
                             raise DeviceFault(fault)
                     except DeviceError as error:
-                        pipeline.end_source(error)  # the SPAD may be what is silent: not waited for
+                        pipeline.end_source(error)  # no wait: the SPAD itself may be silent
                         break
                     self._tell(assembler, done)
             finally:
@@ -221,7 +221,7 @@ class Acquisition:
     def _silence_of_spad_s(self) -> float:
         """Seconds for which the SPAD may give no answer while light may fall."""
         spad, usual = self._rig.config.spad, GuardLimits()
-        if str(getattr(spad, "port", "")).startswith(EMULATED_PREFIX):  # on the processors of this very process
+        if str(getattr(spad, "port", "")).startswith(EMULATED_PREFIX):  # emulated on the same processors
             return usual.busy_within_s
         return float(getattr(spad, "silence", usual.waits_within_s))
 
@@ -252,19 +252,20 @@ class Acquisition:
         return "rendering" if isinstance(self._rig.clock, VirtualClock) else "scanning"
 
     def _arm(self) -> None:
-        """Arm the laser behind a gate that reads back low and wait until it is warm, before the SPAD can overflow."""
+        """Arm the laser while the gate reads back low, and wait until it is warm. The SPAD, which may overflow, starts
+        later."""
         self._rig.sync.gate_low()
         laser, power_w = self._rig.laser, self._rig.config.scan.power
         laser.arm(laser.limits.max_power_w if power_w is None else power_w)
         waited_s = 0.0
-        while laser.status.warming_up:  # 'armed' does not mean 'light'
+        while laser.status.warming_up:  # an armed laser may give no light yet
             if waited_s >= WARM_UP_S:
                 raise DeviceTimeout(f"{laser.name} is still warming up after {WARM_UP_S:g} s; wait and start again")
             self._rig.clock.sleep(WARM_LOOK_S)
             waited_s += WARM_LOOK_S
 
     def _make_safe(self, pipeline: Pipeline) -> list[str]:
-        """Take the gate low, take no more frames, pause the laser, park the mirror and stop the SPAD, in this order,
+        """Set the gate low, take no more frames, pause the laser, park the mirror and stop the SPAD, in this order,
         whatever fails; returns a line for each failure. An interrupt meanwhile is raised at the end."""
         rig = self._rig
         trouble: list[str] = []
@@ -279,7 +280,7 @@ class Acquisition:
         for name, step in steps:
             try:
                 step()
-            except BaseException as error:  # neither a step that fails nor a second Ctrl-C may keep the others away
+            except BaseException as error:  # neither a failed step nor a second Ctrl-C may prevent the others
                 trouble.append(f"{name}: {str(error) or type(error).__name__}")
                 interrupted = interrupted or (None if isinstance(error, Exception) else error)
         if not pipeline.join_source():

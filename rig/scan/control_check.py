@@ -1,9 +1,9 @@
 """Compares what drivers sent to their devices in a replay with the recording: the commands, and when each was sent.
 
 Commands are compared byte by byte. For buffers of points the time is compared too: how much later than in the recording
-each was sent, relative to the middle of its scan, since the host chooses when a scan begins. The point at which a scan
-was stopped also depends on the host's timing. So a last buffer that only one of the two had sent is not compared, nor
-how the mirror was parked.
+each was sent, relative to the median over its scan, since the host chooses when a scan begins. The host's timing also
+decides at which point a scan was stopped. So a last buffer that only one of the two had sent is not compared, nor how
+the mirror was parked.
 """
 
 import statistics
@@ -46,8 +46,8 @@ class ControlCheck:
 def check_control(recorded: Path, now: Path, *, devices: Sequence[str], tolerance_s: float | None) -> ControlCheck:
     """Compare two files of control traffic.
 
-    devices: those that took part. tolerance_s: most by which a buffer may miss its time; with None no time is a
-    problem. Raises ProtocolError if a file is not one of control traffic.
+    devices: those that took part. tolerance_s: most by which a buffer may miss its time; None allows any time. Raises
+    ProtocolError if a file is not one of control traffic.
     """
     before, after = Spoken.of(read_taps(recorded)), Spoken.of(read_taps(now) if now.exists() else ())
     problems: list[str] = []
@@ -92,7 +92,7 @@ def _first_difference(device: str, what: str, said: list[Passed], says: list[Pas
 def _swaps_off(said: list[Passed], says: list[Passed]) -> list[float]:
     """Seconds by which each buffer came later than recorded, less the median of its scan.
 
-    The second one has no time of its own, since a device takes it as soon as the host has it: it gets 0.
+    The second buffer gets 0: a device takes it as soon as the host has it, so its time is not the device's.
     """
     late_s = [(new.t_ns - old.t_ns) / 1e9 for old, new in zip(said, says, strict=False)]
     timed_s = late_s[:1] + late_s[2:]

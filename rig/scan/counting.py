@@ -1,6 +1,6 @@
 """The counting thread, which turns blocks into maps. It alone counts and estimates, one sweep after the other.
 
-`MapQueue` is the bounded queue from it to the caller, which also says when the stream is over.
+`MapQueue` is the bounded queue of maps from this thread to the caller, who learns from it when the stream is over.
 """
 
 import threading
@@ -139,7 +139,7 @@ class CountingThread:
     on_complete: called on this thread as soon as the marker that closes the last sweep is counted; the last map is
       estimated after that.
 
-    Maps go to `queue`, which ends with this thread. If it ended too early, `error` says why.
+    Maps go to `queue`, which ends with this thread. If the thread ended too early, `error` says why.
     """
 
     def __init__(

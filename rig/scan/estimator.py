@@ -1,8 +1,8 @@
-"""Chooses the estimator of a run that says `auto`: `joint` wherever it keeps up with the frames, else `likelihood`.
+"""Chooses the estimator of a run with `auto`: `joint` wherever it keeps up with the frames, else `likelihood`.
 
-`joint` errs several times less than `likelihood` and takes longer. That does not matter where no frame waits for a map:
-with simulated rigs, recordings and cubes, and where a single map is asked for. In a stream a map must be made within
-the time of a sweep. How fast `joint` is on this machine and with these threads is measured just before.
+`joint` errs several times less than `likelihood` and takes longer. That does not matter if no frame waits for a map:
+with simulated rigs, recordings and cubes, and for a single map. In a stream a map must be made within the time of a
+sweep. How fast `joint` is on this machine and with these threads is measured just before the scan.
 """
 
 import math
@@ -19,9 +19,9 @@ from rig.errors import UsageError
 from rig.geometry.windows import SweepGeometry
 
 KEPT_UP = 0.5
-"""Share of a sweep's time that a map of `joint` may take; the rest is for counting and for a busy moment."""
+"""Share of a sweep's time that a map of `joint` may take; the rest is for counting and for other load."""
 ROWS, COLUMNS = 128, 160
-"""Part of the picture, at most, whose map is timed: some milliseconds."""
+"""Largest part of the picture whose map is timed. That takes some milliseconds."""
 EXPOSURES = 10
 TRIES = 3
 
@@ -29,7 +29,7 @@ TRIES = 3
 def choose_estimator(
     estimate: EstimateConfig, geometry: SweepGeometry, map_time_s: float = math.inf
 ) -> tuple[EstimateConfig, str]:
-    """The settings with the estimator that `auto` stands for, and why it was chosen. Other settings come back as given.
+    """Replace `auto` in the settings; returns them and the reason. Settings without `auto` are returned unchanged.
 
     map_time_s: time in which a map must be made; infinite if no frame waits for it.
     """
@@ -40,7 +40,7 @@ def choose_estimator(
 
 
 def foreseen_estimator(estimate: EstimateConfig, geometry: SweepGeometry, map_time_s: float) -> str:
-    """The estimator of a run for people, as far as it is known before anything is measured. map_time_s: as above."""
+    """The estimator of a run in words, as far as it is known before `joint` is timed. map_time_s: as above."""
     chosen, why = choose_estimator(estimate, geometry)
     if why and chosen.estimator == "joint" and math.isfinite(map_time_s) and not estimate.temporal_prior:
         return f"auto: joint if this machine makes a map in {digits(1e3 * KEPT_UP * map_time_s, 2)} ms, else likelihood"
@@ -64,14 +64,14 @@ def _choice(estimate: EstimateConfig, geometry: SweepGeometry, map_time_s: float
 
 
 def time_of_map(geometry: SweepGeometry, threads: int) -> float:
-    """Seconds that a later map of `joint` takes on this machine, without a halo: a part of the picture is timed."""
+    """Seconds that `joint` takes on this machine for a map after the first, without a halo, scaled up from a part."""
     from rig.estimate.joint.joint import Joint
     from rig.estimate.row.em import start_model
 
     part = _middle(geometry)
     rate = np.full((part.columns, part.rows, part.window), 0.05)
     column, row = np.meshgrid(np.arange(part.columns), np.arange(part.rows), indexing="ij")
-    # The window of a row that sees nothing of a column is empty, and lies elsewhere.
+    # If a row sees nothing of a column, x_lo and x_hi describe an empty window that may lie outside: clip.
     middle = (part.x_lo + part.x_hi).T // 2 - part.x0[:, None]
     rate[column, row, np.clip(middle, 0, part.window - 1)] = 0.95
     sweep = CountVolume(
@@ -89,7 +89,7 @@ def time_of_map(geometry: SweepGeometry, threads: int) -> float:
 
 
 def _middle(geometry: SweepGeometry) -> SweepGeometry:
-    """The middle rows and columns of a sweep, whole if it is small."""
+    """The middle rows and columns of a sweep, or all of them if they are few."""
     rows, columns = (
         slice((whole - min(whole, most)) // 2, (whole + min(whole, most)) // 2)
         for whole, most in ((geometry.rows, ROWS), (geometry.columns, COLUMNS))

@@ -1,8 +1,8 @@
 """Information on a run while it goes on: its progress and, for a monitor, its newest frames.
 
 `Listeners` are the callbacks. The monitor is a thread that shows the newest frames at most ten times a second and never
-delays other threads. It is an optional reader of the ring, copies what it shows and gives the block back before the
-callback sees it. A slow callback sees fewer blocks. One that raises is reported once and not called again. One that
+delays other threads. It is an optional reader of the ring, sums the frames to show and gives the block back before it
+calls the callback. A slow callback sees fewer blocks. One that raises is reported once and not called again. One that
 hangs is abandoned when the SPAD has stopped. Summing 16 frames of 512 x 512 takes 3 to 10 ms.
 """
 
@@ -35,11 +35,10 @@ MOST_FRAMES = 16
 
 @dataclass(frozen=True, slots=True, eq=False)
 class MonitorView:
-    """A small picture of the newest block.
+    """The first frames of the newest block, summed.
 
     first_frame: number of the first frame summed. frames: number of frames summed.
-    counts: uint16 (rows, width) of the sensor, the ones of each pixel in those frames, as far as their window covers
-    it.
+    counts: uint16 (rows, width) of the sensor, the ones of each pixel in those frames; 0 outside their windows.
     stages: the present figures of the pipeline.
     """
 
@@ -61,8 +60,8 @@ MonitorCallback = Callable[[MonitorView], object]
 class ScanProgress:
     """Progress of a run, reported several times a second and at its end.
 
-    frames: frames received, at most frames_planned, the number that the plan takes from the first scan marker to the
-    last.
+    frames: frames received, at most frames_planned. frames_planned: number that the plan takes from the first scan
+    marker to the last.
     lost: frames lost by the SPAD's own count; if it has none, those that found no room in the ring.
     sweeps: sweeps counted, of `maps`.
     stages: the figures of each stage so far.
@@ -97,7 +96,7 @@ class Listeners:
     on_space: Callable[[Space], None] | None = None
 
     def tell(self, now: ScanProgress) -> None:
-        """Tell `rig.progress` and `live` how far a scan is."""
+        """Report to `rig.progress` and `live` how far a scan is."""
         notes = [f"{now.sweeps} of {now.maps} maps counted"] if 1 < now.maps < ENDLESS else []
         notes += [f"{now.lost} lost"] if now.lost else []
         notes += [] if now.fog is None or not now.fog.brief() else [now.fog.brief()]
@@ -125,7 +124,7 @@ class Monitor:
 
     @property
     def skipped(self) -> int:
-        """Number of blocks that were not looked at."""
+        """Number of blocks that were not shown."""
         return self._reader.skipped
 
     def end(self, timeout_s: float) -> bool:

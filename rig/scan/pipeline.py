@@ -29,7 +29,7 @@ JOIN_S = 30.0
 DRAIN_S = 60.0
 """Longest wait for the disk to take what is left in the ring."""
 LEAVE_S = 2.0
-"""Longest wait for an estimate that nobody wants any more; it ends by itself later."""
+"""Longest wait for an estimate whose map will not be taken; the estimate ends by itself later."""
 MONITOR_S = 0.5
 """Longest wait for the monitor's callback at the end."""
 
@@ -142,7 +142,7 @@ class Pipeline:
 RING_BYTES = 512 * 2**20
 """Bytes of the ring of a source that cannot wait: 0.16 s of full frames at 100 kHz, longer than a pause of Python."""
 FEWEST_SLOTS = 8
-"""Also the slots for a source that can wait: it runs ahead by as many blocks."""
+"""Least number of slots. A source that can wait gets just these, and so runs ahead by as many blocks."""
 MOST_SLOTS = 1024
 
 
@@ -152,9 +152,9 @@ class Overload(StrEnum):
     ABORT = "abort"
     """Lose nothing: a source that can wait waits, one that cannot ends the run."""
     DROP = "drop"
-    """Drop them, count them as lost and go on, also where the source could wait."""
+    """Drop them, count them as lost and go on, also if the source could wait."""
     BLOCK = "block"
-    """Let the source wait; refused where it cannot."""
+    """Let the source wait; refused if it cannot."""
 
     @classmethod
     def parse(cls, text: str) -> "Overload":
@@ -179,7 +179,7 @@ def ring_for(
 ) -> BlockRing:
     """Allocate the ring between this SPAD and its readers and touch its memory.
 
-    keeps_time: whether the SPAD can wait but should not need to.
+    keeps_time: whether the SPAD, although it can wait, should not need to, as in a replay with a clock.
     """
     few = info.can_wait and not keeps_time
     slots = FEWEST_SLOTS if few else min(max(RING_BYTES // timing.stride, FEWEST_SLOTS), MOST_SLOTS)

@@ -1,4 +1,4 @@
-"""Plays a recording: opens its devices, scans, and compares what drivers sent with what was sent when it was taken."""
+"""Plays a recording: opens its devices, scans, and compares what drivers send with what they sent when it was taken."""
 
 import logging
 import tempfile
@@ -35,9 +35,9 @@ def play(
     """Play a recording with the rig of `replay_config`; `run` takes the maps. steps: called with the replay's pace
     before its first frame.
 
-    If drivers take part and the recording has control traffic, what they sent is compared with it once the rig is
-    closed, also after a failure, but not if the recorded scan was to make another number of sweeps. Raises
-    DivergedError if the two differ; what the run wrote is kept.
+    If drivers take part and the recording has control traffic, what they sent is compared with that traffic once the
+    rig is closed, also after a failure. It is not compared if the recorded scan had planned another number of sweeps.
+    Raises DivergedError if the two differ; what the run wrote is kept.
     """
     drivers = [slot for slot in RECORDED if getattr(config, slot).real_time]
     compared = bool(drivers) and (recording / CONTROL_FILE).exists()
@@ -70,8 +70,8 @@ def play(
 
 
 def _asks_for_the_same(recording: RunRecording, maps: int | None) -> bool:
-    """Whether a replay tells its devices of as many sweeps as the recorded scan did, which may have ended before its
-    last; logs the difference. maps: None for all of the recording.
+    """Whether a replay plans as many sweeps as the recorded scan did; logs the difference. They differ if that scan
+    ended before its last sweep. maps: None for all of the recording.
     """
     manifest = read_manifest(recording.path) or {}
     told = sum(int(start["sweeps"]) for start in (manifest.get("recording") or {}).get("starts") or [])
@@ -90,7 +90,7 @@ def _check(recording: Path, tap: TapFile, drivers: Sequence[str], tolerance_s: f
 
 
 def _require_no_difference(recording: Path, tap: TapFile, drivers: Sequence[str], error: Exception) -> None:
-    """Raise DivergedError if a run that failed had sent other bytes; what it did not come to send is ignored."""
+    """Raise DivergedError if a failed replay had sent other bytes. What it did not send any more is ignored."""
     problems = [one for one in _check(recording, tap, drivers, None).problems if "byte" in one]
     if problems:
         raise _diverged((*problems, str(error)), None) from error

@@ -68,7 +68,7 @@ class Run:
     def __init__(
         self, out: OutFolder, tally: MapTally, save: SavePolicy | None = None, *, record: bool = False
     ) -> None:
-        """Claim the folder. Raises UsageError where it cannot be written."""
+        """Claim the folder. Raises UsageError if it cannot be written."""
         self.tally = tally
         self._folder = None if out is None else RunFolder(out, in_place=record)
         self.rays: Rays | None = None
@@ -79,7 +79,7 @@ class Run:
         self._tap: TapFile | None = None
 
     def start_tap(self) -> TapFile:
-        """Start to record what passes the ports of the devices, and return the file with it."""
+        """Start to record the traffic on the ports of the devices, and return its file."""
         assert self._folder is not None, "asked for with a recording, which needs a folder"
         self._tap = TapFile.begin(self._folder.place(CONTROL_FILE))
         return self._tap
@@ -105,7 +105,7 @@ class Run:
         manifest: what is known before the first frame; it is on the disk before this returns, and written again with
           each start of the SPAD.
         write_inputs: writes the files that have to lie beside the frames.
-        space: room that all of it will take.
+        space: the most room that frames and maps will take.
         Raises UsageError if the disk has less room or files beside the frames cannot be written, RecordingError if the
         recording itself cannot be.
         """
@@ -195,7 +195,7 @@ class Run:
 
 
 def versions() -> dict[str, str]:
-    """Versions of the program and of what its figures depend on."""
+    """Versions of the program and of the packages on which its results depend."""
     found = {"python": platform.python_version()}
     for name in ("spadrig", "numpy", "numba", "opencv-contrib-python-headless"):
         try:

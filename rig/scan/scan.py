@@ -1,7 +1,7 @@
 """A scan from open devices to its folder: what happens before, while and after `acquisition` runs the devices.
 
-`run_scan` makes the plan and what turns counts into maps, starts the recording, hands each map to its `Run`, and says
-at the end what came and what was lost. `devices_content` describes the devices for the manifest.
+`run_scan` makes the plan and the `Reconstructor`, starts the recording, hands each map to its `Run`, and states at the
+end which frames came and which were lost. `devices_content` describes the devices for the manifest.
 """
 
 import math
@@ -155,7 +155,7 @@ def run_scan(
 
 
 class LiveSource:
-    """Facts for a run about frames that are exposed now. `ReplaySource` has those about a recording.
+    """Facts about a live scan, for `run_scan`. `ReplaySource` has those about a recording.
 
     maps: number of maps that the run will take. learned: states of the estimator to begin with. starts: None lets the
     scan choose the starts of the SPAD. silence_s: longest silence of the SPAD.
@@ -176,8 +176,8 @@ class LiveSource:
         return -(-self.maps // most) + (_first_alone(self._rig) and self.maps > 1)
 
     def truth(self, sweep: SweepAccount, column: NDArray[np.float64]) -> SweepTruth | None:
-        """Truth of the world, if it knows it, for a sweep bound to `column`. It is asked only after the estimate, which
-        must never see it.
+        """Truth for a sweep bound to `column`, if the world knows it. The world is asked only after the estimate, which
+        must never see the truth.
         """
         if self._rig.world is None:
             return None
@@ -186,7 +186,7 @@ class LiveSource:
         return self._rig.world.truth(self._plan.line_commands(column), velocity_per_s)
 
     def lost_outside(self, sweeps: Sequence[SweepAccount]) -> list[Gap]:
-        """Frames (first, last) lost outside all these sweeps: none that anybody knows of."""
+        """Frames (first, last) known to be lost outside all these sweeps: always empty for a live scan."""
         return []
 
 
@@ -214,7 +214,7 @@ def recording_space(
 
 
 def foreseen(rig: OpenRig, plan: ScanPlan, maps: int | None) -> str:
-    """The estimator of a scan for people, as far as it is known before the scan."""
+    """The estimator of a scan in words, as far as it is known before the scan."""
     sensor = plan.rows, plan.width
     geometry = map_geometry(rig.model, plan.commands, plan.depth_range_m, sensor=sensor, lines=plan.lines)
     return foreseen_estimator(rig.config.estimate, geometry, _map_time_s(rig, plan, maps))
@@ -229,7 +229,7 @@ def _map_time_s(rig: OpenRig, plan: ScanPlan, maps: int | None) -> float:
 
 
 def _first_alone(rig: OpenRig) -> bool:
-    """Whether the first map gets a start of its own: a live stream cannot stand still while its map is learned from."""
+    """Whether the first map gets a start of its own: a live stream does not stop while the estimator learns from it."""
     learns = rig.config.estimate.estimator in (AUTO, *LEARNING)  # `auto` becomes one of those
     return learns and not rig.spad.info.can_wait
 

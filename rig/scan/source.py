@@ -11,7 +11,7 @@ from drivers.ring import BlockRing, RingReader
 from rig.threads import StageThread
 
 HANG_S = 180.0
-"""Longest wait for a SPAD whose `fill` neither returns nor says that it has nothing."""
+"""Longest wait, in seconds, for a SPAD whose `fill` neither returns nor raises DeviceTimeout."""
 
 
 class Source:
@@ -40,7 +40,7 @@ class Source:
         self.thread = StageThread(self._run, "spad source")
         self._busy_s = 0.0
         self.silences: list[DeviceTimeout] = []
-        """The SPAD's own messages, one for each time that it had nothing for half of `silence_s` and the ring room."""
+        """The SPAD's own errors, one each time it had nothing for half of `silence_s` with room in the ring."""
 
     @property
     def name(self) -> str:
@@ -61,7 +61,7 @@ class Source:
         self._ring.end_waits()
 
     def join(self, timeout_s: float) -> bool:
-        """Wait for the thread; False if it does not end in time. Readers get only what is left, in either case."""
+        """Wait for the thread; False if it does not end in time. In both cases readers get what is left in the ring."""
         ended = self.thread.join(timeout_s)
         self._ring.finish(self._why)
         return ended
@@ -85,7 +85,7 @@ class Source:
                 self._on_frame(self._ring.last_frame)
             return more
         except DeviceTimeout as error:
-            if not self._ring.full:  # else it is no silence: it waits for a reader that is slow
+            if not self._ring.full:  # with a full ring it is no silence: the SPAD waits for a slow reader
                 self.silences.append(error)
             return True
         finally:
@@ -93,8 +93,8 @@ class Source:
 
 
 def blocks(reader: RingReader, source: Source, silence_s: float) -> Iterator[FrameBlock]:
-    """Yield the blocks of the run. Raises the source's error after them, and DeviceTimeout if none comes: in the SPAD's
-    own words if it is silent while the ring is empty, in the ring's after HANG_S."""
+    """Yield the blocks of the start. Raises the source's error after them, and DeviceTimeout if none comes: the SPAD's
+    own if it is silent while the ring is empty, the ring's after HANG_S."""
     while True:
         heard = len(source.silences)
         waited_s = 0.0
@@ -104,8 +104,8 @@ def blocks(reader: RingReader, source: Source, silence_s: float) -> Iterator[Fra
                 break
             except DeviceTimeout:
                 waited_s += silence_s
-                # The first time-out may be of a wait for room that ended just before it was looked at. One that does
-                # not come means that the SPAD is at work: a simulated one compiles its kernels before the first block.
+                # The first silence may be of a wait for room that ended just before `full` was read. Without silences
+                # the SPAD is at work: a simulated one compiles its kernels before the first block.
                 if len(source.silences) >= heard + 2:
                     raise source.silences[-1] from None
                 if waited_s >= HANG_S:
