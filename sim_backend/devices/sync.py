@@ -1,6 +1,7 @@
 """The simulated pattern generator. Its gate output lets laser light out; its trigger input reads the scan marker."""
 
 from collections.abc import Sequence
+from dataclasses import replace
 from typing import ClassVar, Literal
 
 from drivers.interfaces import Pulse, SyncSource, SyncStatus
@@ -35,7 +36,7 @@ class SimulatedSync(SyncSource):
 
     def _do_program(self, pulses: Sequence[Pulse], repeats: int) -> None:
         rounded = tuple(
-            Pulse(p.outputs, None if p.duration_s is None else round(p.duration_s / RESOLUTION_S) * RESOLUTION_S)
+            p if p.duration_s is None else replace(p, duration_s=round(p.duration_s / RESOLUTION_S) * RESOLUTION_S)
             for p in pulses
         )
         self._program = (rounded, repeats)

@@ -1,5 +1,6 @@
 """The bench over time: mirror with lag and shaking, marker edges, gate program, light = emission AND gate."""
 
+from dataclasses import replace
 from fractions import Fraction
 from itertools import pairwise
 
@@ -24,6 +25,7 @@ from drivers.interfaces import (
 from drivers.registry import Surroundings
 from sim_backend.bench import Bench
 from sim_backend.devices.scanner import SimulatedScannerConfig, create
+from sim_backend.devices.sync import SimulatedSync
 from sim_backend.gate_program import GateProgram
 from sim_backend.mirror_motion import JITTER_HOLD_S, Jitter, Playing
 from sim_backend.world import KIND, WorldConfig
@@ -96,6 +98,14 @@ def test_a_held_pulse_lasts_as_long_as_the_marker_and_not_a_slice_longer(step: f
     np.testing.assert_allclose(times, [0.0, 1 + HOLD_S, 1 + 21 * HOLD_S, 3 + HOLD_S, 3 + 6 * HOLD_S])
     assert words.tolist() == [0, OUT_GATE, 0, OUT_GATE, 0]
     assert program.waiting
+
+
+def test_the_simulated_source_holds_the_gate_as_the_plan_says() -> None:
+    bench = Bench(VirtualClock(5_000), Lag(0.0, 0.0))
+    sync = SimulatedSync(bench)
+    lit = Pulse(OUT_GATE, 4e-3 + 1e-9, held=True)
+    sync.program([Pulse(0, None), lit, Pulse(0, 1e-3)], 1)
+    assert sync._program == ((Pulse(0, None), replace(lit, duration_s=4e-3), Pulse(0, 1e-3)), 1)
 
 
 def test_lowering_the_gate_keeps_the_past_and_lasts() -> None:
