@@ -62,12 +62,12 @@ def test_a_real_signal_ends_a_scan_in_order(small: Path, tmp_path: Path, name: s
     out = tmp_path / "run"
     with subprocess.Popen([*command, "--json", "--out", str(out)], stdout=-1, stderr=-1, text=True) as process:
         began = time.monotonic()
-        while not list(tmp_path.glob(".run.*.part/depth/000001.npy")) and time.monotonic() - began < 60:
+        while not list(tmp_path.glob(".run.*.part/depth/000001.npy")) and time.monotonic() - began < 300:
             assert process.poll() is None, process.communicate()[1]
             time.sleep(0.05)
         process.send_signal(getattr(signal, name))
         try:
-            printed, said = process.communicate(timeout=60)
+            printed, said = process.communicate(timeout=300)
         finally:
             process.kill()
     assert process.returncode == 4, said
