@@ -1,7 +1,8 @@
 """From mirror command to light plane (n, d), n.X = d, |n| = 1: a sampled table, or a mirror that turns about an axis.
 
 The command is the one used in the calibration: a galvo's normalised drive (-1 to 1), or the column number of a cube of
-frames. (n, d) and (-n, -d) are the same plane; results have n_x > 0 wherever the plane crosses the rows.
+frames. (n, d) and (-n, -d) are the same plane; the sign is chosen so that n_x > 0 for every plane that a
+`RigModel` accepts.
 """
 
 from dataclasses import dataclass, field

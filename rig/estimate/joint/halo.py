@@ -194,9 +194,11 @@ def likeliest_light(
 
 @numba.njit(cache=True, nogil=True, error_model="numpy")
 def _ask(counts, n_frames, sweep, state, shares, x_px, places, y, c, a):  # type: ignore[no-untyped-def]
-    """Slope of the log-likelihood over the amplitude, the decrease of this slope, misfit of the stripes, their number.
+    """First derivative of the log-likelihood with respect to the amplitude, minus its second derivative, misfit of the
+    stripes, and number of stripes.
 
-    The misfit is the sum of each stripe's own slope squared, over its variance; its expected value is the number.
+    The misfit is a sum over the stripes: the square of each one's contribution to the first derivative, divided by the
+    variance of that contribution. Its expected value is about the number of stripes.
     """
     side, pixels = 1 if sweep.near_is_left else -1, sweep.u.shape[1]
     score, information, misfit, asked = 0.0, 0.0, 0.0, 0
