@@ -49,8 +49,8 @@ class WrongState(DeviceError):
 
 
 class ProtocolError(DeviceError):
-    """Raised when bytes from a device or a file do not follow their protocol, or the package for them is
-    missing."""
+    """Raised when bytes from a device or a file do not follow their protocol, or when the Python package that reads
+    them is not installed."""
 
 
 class CommandRefused(ProtocolError):

@@ -117,8 +117,8 @@ def brightest(sums: ColumnSums) -> tuple[Array, NDArray[np.bool_]]:
 def evenly(mask: NDArray[np.bool_]) -> NDArray[np.int64]:
     """(n, 2) row and column of the pixels in a mask (height, width), in the order of Bayer's dither matrix.
 
-    The order goes from coarse to fine: every fourth pixel in both directions comes before the others of every second.
-    It reads the bits of y xor x and of y in turn, from the last to the first.
+    The order goes from coarse to fine: pixels whose row and column are multiples of 4 come before the other pixels
+    whose row and column are even. It follows from the bits of y xor x and of y in turn, the lowest bit first.
     """
     rows, columns = np.nonzero(mask)
     bits = max(1, int(max(mask.shape) - 1).bit_length())

@@ -1,7 +1,7 @@
 """The guard's own process: carries out what the application asks, and watches the application meanwhile.
 
-The main thread never touches a device. It reads messages, looks at the application every 10 ms and gives jobs to lanes.
-The light is ended (a "trip") when the application ends, is stopped or takes no frames; when a port hangs up; when the
+The main thread never touches a device. It reads messages, looks at the application every 10 ms and queues jobs for the
+threads of the devices (lanes, see `drivers.guard.owned`). The light is ended (a "trip") when the application ends, is stopped or takes no frames; when a port hangs up; when the
 laser reports an open interlock or a fault, or stops answering; or when the guard is told to end. In a trip all outputs
 of the gate go low and the laser is paused, both at the same time. Afterwards an application that cannot go on by itself
 is killed, the laser is disarmed and the ports are closed. If frames stop because the gate's program has ended, the
@@ -329,7 +329,8 @@ def _told(error: Exception) -> list[str]:
 
 
 def main(arguments: list[str]) -> int:
-    """Run the guard; returns its exit code. arguments: handles of the socket and of the heartbeat's page."""
+    """Run the guard; returns its exit code. arguments: file descriptors, as text, of the socket to the application and
+    of the memory page shared with it (`Heartbeat`)."""
     for number in (signal.SIGINT, signal.SIGHUP, signal.SIGPIPE):
         signal.signal(number, signal.SIG_IGN)
     logging.basicConfig(level=logging.WARNING, format="%(message)s", stream=sys.stderr)

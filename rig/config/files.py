@@ -37,7 +37,7 @@ FLAGS: Mapping[Key, str] = {
 
 
 def kind_of(slot: str, content: Any) -> type[BaseModel] | None:
-    """The config model of the kind that a slot's content names; None if it names none."""
+    """The config model of the kind that a slot's content names; None if slot or kind is missing or unknown."""
     if slot not in SLOTS or not isinstance(content, Mapping):
         return None
     try:

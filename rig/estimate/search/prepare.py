@@ -247,8 +247,10 @@ def _empty_tables(columns: int, bands: int, lanes: int, reach: int, *, others: b
 
 
 def _largest(sweep: Sweep, state: RowState, light: Float32, reach: int) -> tuple[float, float]:
-    """Largest sum of a position's taps, or half of a lane's largest sum of edge weights if that is more, and largest
-    tap; in octaves, from the tables of the middle band of some columns.
+    """Two magnitudes in octaves (factors of two of likelihood), from the tables of the middle band of some columns.
+
+    The first is the largest sum of a position's taps, or half the largest sum of a lane's edge weights if that is more.
+    The second is the largest tap. All are absolute values.
     """
     columns = np.unique(np.linspace(0, sweep.plane.shape[0] - 1, LOOKED_AT).astype(np.int64))
     middle = slice(sweep.u.shape[0] // 2, sweep.u.shape[0] // 2 + 1)

@@ -39,9 +39,9 @@ _ROWS_APART: Final = 8
 class LabelGrid:
     """Label l of a row and column is at x_far - side * l / PER_PX, for l from 0 to stripes - 1.
 
-    x_far: float64 (rows, columns), NaN where nothing is searched. side: 1 if near is left, else -1. labels: their
-    number, a multiple of VECTOR; those from stripes on are unused. column_px: usual distance from one column to the
-    next.
+    x_far: float64 (rows, columns), NaN where nothing is searched. side: 1 if near is left, else -1. stripes: number of
+    labels in use; labels: the same, rounded up to a multiple of VECTOR. column_px: usual distance from one column to
+    the next.
     """
 
     x_far: Float64
