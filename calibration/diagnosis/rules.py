@@ -270,13 +270,12 @@ sweeps by as much as the sweeps differ, up to 1.35 times as much in 23 simulated
 class FitEvidence:
     """Evidence from a fit and the poses of its boards; what is unknown has its default.
 
-    expected_m, worst_m: predicted sd of the depth at the distance asked for, median and 95th percentile of the picture. wave_m:
-    depth error there of one sweep against another of the same view; wave_noise_m: its largest value that may be noise.
-    shift_m: depth error of a view against the others; shift_noise_m: its largest value that may be noise; moved_after:
-    the view after which the rig moved, if one move explains the shifts. misfit: factor by which the variances were
-    increased because the data contradict each other. baseline_m, baseline_sd_m: distance from camera to mirror axis, and
-    its sd.
-    velocities_per_s: of the sweeps, signed; empty if unknown.
+    expected_m, worst_m: predicted sd of the depth at the distance asked for, median and 95th percentile of the picture.
+    wave_m: depth error there of one sweep against another of the same view; wave_noise_m: its largest value that may be
+    noise. shift_m: depth error of a view against the others; shift_noise_m: its largest value that may be noise;
+    moved_after: the view after which the rig moved, if one move explains the shifts. misfit: factor by which the
+    variances were increased because the data contradict each other. baseline_m, baseline_sd_m: distance from camera to
+    mirror axis, and its sd. velocities_per_s: of the sweeps, signed; empty if unknown.
     """
 
     poses: PoseEvidence

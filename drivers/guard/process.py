@@ -1,11 +1,11 @@
 """The guard's own process: carries out what the application asks, and watches the application meanwhile.
 
 The main thread never touches a device. It reads messages, looks at the application every 10 ms and queues jobs for the
-threads of the devices (lanes, see `drivers.guard.owned`). The light is ended (a "trip") when the application ends, is stopped or takes no frames; when a port hangs up; when the
-laser reports an open interlock or a fault, or stops answering; or when the guard is told to end. In a trip all outputs
-of the gate go low and the laser is paused, both at the same time. Afterwards an application that cannot go on by itself
-is killed, the laser is disarmed and the ports are closed. If frames stop because the gate's program has ended, the
-laser is only paused.
+threads of the devices (lanes, see `drivers.guard.owned`). The light is ended (a "trip") when the application ends, is
+stopped or takes no frames; when a port hangs up; when the laser reports an open interlock or a fault, or stops
+answering; or when the guard is told to end. In a trip all outputs of the gate go low and the laser is paused, both at
+the same time. Afterwards an application that cannot go on by itself is killed, the laser is disarmed and the ports are
+closed. If frames stop because the gate's program has ended, the laser is only paused.
 
 `Rescue` is for the opposite case, when the guard is gone: the application opens the ports, which are free then, and
 makes the devices safe as far as it can.

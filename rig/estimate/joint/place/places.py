@@ -141,8 +141,8 @@ _TILE: Final = 16
 def fetch_counts(counts: Counts, x0: Int32, x_px: Float32, first_row: int, last_row: int, around: Counts) -> None:
     """Fetch EIGHT counts for each stripe, the first of them REACH_PX before its pixel, for rows first_row..last_row-1.
 
-    counts: (columns, rows, window), C-contiguous; around: (rows, columns, EIGHT), filled, of the same type. Values are 0 where no pixel was stored, and
-    arbitrary where there is no stripe.
+    counts: (columns, rows, window), C-contiguous; around: (rows, columns, EIGHT), filled, of the same type. Values are
+    0 where no pixel was stored, and arbitrary where there is no stripe.
     """
     columns, rows, window = counts.shape
     size, column = counts.itemsize, rows * window * counts.itemsize
