@@ -37,7 +37,7 @@ STEP, PLACES = 0.005, 320
 AT = (np.arange(PLACES) + 0.5) * STEP
 DEPTHS = np.geomspace(0.02, 6.0, 24)
 """Optical depths of the wall."""
-HALO_GROWTH, HAZE_GROWTH = 0.5, 0.4
+HALO_GROWTH, HAZE_GROWTH = 0.4, 0.5
 ALBEDO = 0.5
 """Of the walls traced."""
 FAN = math.radians(30.0)
@@ -107,7 +107,8 @@ def _spectrum(band: Array) -> Array:
 
 
 def _row(spectrum: NDArray[np.complex128]) -> Array:
-    return np.asarray(np.fft.irfft(spectrum, 4 * PLACES))
+    """Light of this spectrum, without what rounding leaves below 0."""
+    return np.asarray(np.maximum(np.fft.irfft(spectrum, 4 * PLACES), 0.0))
 
 
 def _log_haze(baseline: float, parallax: Array) -> Array:

@@ -2,7 +2,7 @@
 
 `sim_backend.effects.beam_spread` has the physics. It gives the halo as a share of the ballistic stripe, and the haze
 that is spread beyond its end as a share of the haze there, by the angle to that end and by the optical depth t: half of
-that of the light's own way. Tables are made once for the medium and the rig (some 50 ms). Between depths they are
+that of the light's own way. Tables are made once for the medium and the rig (0.1 to 0.3 s). Between depths they are
 interpolated as shares of e^(2 t) - 1 and e^(1.5 t) - 1, which change little. Angles are pixels as in the middle of the
 picture. Light that is turned only a little (`forward_share`) counts as not scattered; it blurs the stripe itself.
 

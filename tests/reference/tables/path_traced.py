@@ -152,12 +152,12 @@ def near(row: Array, tangent: float, baseline: float) -> Array:
 def traced_near(
     lobes: tuple[tuple[float, float], ...], tau: float, geometry: tuple[float, float], batches: int, seed: int
 ) -> Array:
-    """Levels of light scattered more than once, before and behind, and their standard errors; 300 000 photons a batch
+    """Levels of light scattered more than once, before and behind, and their standard errors; 100 000 photons a batch
     and half.
     """
     found = []
     for batch in range(batches):
-        by_meetings = traced(lobes, tau, *geometry, 300_000, seed * 100 + batch)
+        by_meetings = traced(lobes, tau, *geometry, 100_000, seed * 100 + batch)
         found.append(near(np.array([1, ALBEDO, ALBEDO**2, ALBEDO**3]) @ by_meetings / DISTANCE_M**2, *geometry))
     return np.concatenate([np.mean(found, axis=0), np.std(found, axis=0, ddof=1) / np.sqrt(batches)])
 
