@@ -35,6 +35,9 @@ SMOKE_BACKSCATTER, SMOKE_SCATTERING_SHARE = 0.027, 0.96
 Remote Sensing 14, 4984, 2022). Soot of open flames mostly absorbs: scattering_share 0.2 to 0.3."""
 SMOKE_G = 0.65
 """Mean cosine of particles of 0.15 um effective radius, as in that smoke."""
+BACK_LOBE_G = -0.7
+"""g of the lobe that stands for a medium's backscatter where only that is given: droplets throw light back within some
+30 degrees."""
 FORWARD_ANGLE = math.radians(1.5)
 """Standard deviation of the angle, per axis, by which a droplet's diffraction turns light. Half of the light that a
 droplet removes from the beam is only turned by 1 to 2 degrees."""
@@ -185,6 +188,22 @@ class Medium(Section):
         if self.phase_terms is not None:
             return sum(weight * g for weight, g in self.phase_terms)
         return DROPLET_G if self.smoke is None else SMOKE_G
+
+    @property
+    def lobes(self) -> tuple[tuple[float, float], ...]:
+        """(weight, g) of Henyey-Greenstein terms for what is scattered by more than the forward share, which is taken
+        from the most forward one. Where only `backscatter` is given, two with this value and the mean cosine.
+        """
+        rest, terms = 1 - self.forward_share, self.phase_terms
+        if terms is None:
+            g = (self.mean_cosine - self.forward_share) / rest
+            lacks = self.backscatter / rest - henyey_greenstein(-1.0, g)
+            back = min(max(lacks / henyey_greenstein(-1.0, BACK_LOBE_G), 0.0), 0.08)
+            return (1 - back, (g - back * BACK_LOBE_G) / (1 - back)), (back, BACK_LOBE_G)
+        *others, (weight, g) = sorted(terms, key=lambda term: term[1])
+        kept = [*others, (max(weight - self.forward_share, 0.0), g)]
+        total = sum(weight for weight, _ in kept)
+        return tuple((weight / total, g) for weight, g in kept) if total > 0 else terms
 
 
 Array = NDArray[np.float64]

@@ -1,67 +1,97 @@
-"""Light of more than one scattering: totals, the pedestal; and rows of an independent path tracer."""
+"""Light of more than one scattering: its parts, and traced rows."""
 
 import numpy as np
 import pytest
 
-from sim_backend.effects import halo
+from sim_backend.effects import beam_spread, halo
+from sim_backend.effects.beam_spread import AT, DEPTHS, FAN, scattered_once, shapes
 from sim_backend.effects.catalogue import CATALOGUE
-from sim_backend.effects.halo import halo_share
-from tests.reference.tables import path_traced
 from tests.reference.tables.path_traced import (
+    BASELINE_M,
     BEFORE,
+    DISTANCE_M,
     FOLDER,
+    HELD_OUT,
+    LOBES,
     PEAK,
     STRIPE_PX,
+    TANGENT,
+    beside_mitsuba,
     fog,
+    level_errors,
+    level_rows,
     means,
+    near,
     radiance,
     traced_fog,
+    traced_near,
     traced_row,
 )
 from tests.stability.inventory import covers
 from tests.unit.sim.rigs import effect_rate, rig, setting, wall
 
-covers(halo)
+covers(beam_spread, halo)
 
 traced_only = pytest.mark.skipif(not FOLDER.is_dir(), reason="no reference rows beside this checkout")
 
 
-@pytest.mark.parametrize(("tau", "forward"), [(0.5, 0.7), (1.0, 0.64), (2.0, 0.5)])
-def test_the_halo_over_the_ballistic_stripe(tau: float, forward: float) -> None:
-    whole = np.expm1(2 * tau)
-    assert halo_share(2 * tau, 1.0) / whole == pytest.approx(forward, abs=0.015)
-    assert 0.15 <= halo_share(2 * tau, 0.0) / whole <= 0.18
+@pytest.mark.parametrize("lobes", [((1.0, 0.0),), ((0.9, 0.9), (0.1, -0.5))])
+def test_light_scattered_once_is_that_of_a_sum_over_the_lit_sheet(lobes: tuple[tuple[float, float], ...]) -> None:
+    """Wall at z = 1, the sheet x = 0 in small squares, each a source of what it scatters."""
+    i, share = int(np.searchsorted(DEPTHS, 1.0)), 0.7
+    t, ours = DEPTHS[i], scattered_once(lobes, share, False)[i]
+    z = (np.arange(1000) + 0.5) / 1000
+    tangent = np.tan(FAN) * (np.arange(-500, 500) + 0.5)[:, None] / 500
+    y = z * tangent
+    r, area = np.hypot(y, z), z / 1000 * np.tan(FAN) / 500
+    for place in (10, 40, 160):
+        d = np.sqrt(AT[place] ** 2 + y**2 + (1 - z) ** 2)
+        cosine = (-y * y + z * (1 - z)) / (r * d)
+        scattered = sum(w * (1 - g * g) / (4 * np.pi * (1 + g * g - 2 * g * cosine) ** 1.5) for w, g in lobes)
+        light = share * t * scattered / r * (1 - z) / d**3 * np.exp(-t * (r + d - 1))
+        assert ours[place] == pytest.approx(np.sum(light * area), rel=0.01)
 
 
-@pytest.mark.parametrize("x_command", [0.05, 0.056])
-def test_its_light_is_all_there_and_symmetrical(x_command: float) -> None:
-    """Narrow exponentials: a wide picture holds nearly all of the halo; the pedestal is taken off at its borders."""
-    model = rig(size=(4, 801), focal_px=60.0, baseline_m=0.0001)
-    scene = {"medium": {"extinction": "0.2 /m", "scattering_share": 0.9}}
-    setup = setting(model, wall(model, (0.0, 0.0, 1.0), 2.5), **scene)
-    plane = model.planes(x_command)
-    halo, stripe = effect_rate(setup, "halo", plane)[1], effect_rate(setup, "stripe", plane)[1]
-    centre = setup.view.sheet(plane).x_stripe_px[1]
-    behind = np.arange(801) > centre
-    behind_level = halo[-1]
-    r_m = np.linalg.norm([2.5 * (centre - 400) / 60 + 0.0001, 0, 2.5])
-    way_m = r_m + 2.5 * np.hypot(1, (centre - 400) / 60)
-    total = stripe.sum() * halo_share(0.2 * 0.9 * way_m, 1.0)
-    right = np.sum(halo[behind] - behind_level)
-    share_right = _share_right_of(np.floor(centre) + 0.5 - centre)
-    assert right == pytest.approx(total * share_right, rel=2e-3)
-    # The light travels to the right: to the left there is more of the pedestal.
-    middle = round(centre)
-    rise = 0.8 * -np.expm1(-(middle - np.arange(middle)) / (60 * np.radians(6.0)))
-    left = np.sum(halo[:middle] - behind_level * (1 + rise))
-    assert left == pytest.approx(total * _share_right_of(centre - (middle - 0.5)), rel=2e-3)
+@pytest.mark.parametrize("g", [-0.99, 0.0, 0.999])
+@pytest.mark.parametrize("baseline", [1e-9, 1e3])
+def test_light_of_extreme_media_is_finite_and_positive(g: float, baseline: float) -> None:
+    for shape in shapes(((1.0, g),), 1e-3, baseline) + shapes(((1.0, g),), 1.0, baseline):
+        assert np.isfinite(shape).all()
+        assert shape.min() >= 0
 
 
-def _share_right_of(off_px: float) -> float:
-    """Share of the halo beyond a border that lies off_px to the right of its centre."""
-    scales = 60 * np.radians(1.7), 60 * np.radians(6.0)
-    each = [0.5 * np.exp(-abs(off_px) / s) if off_px > 0 else 1 - 0.5 * np.exp(-abs(off_px) / s) for s in scales]
-    return float(np.mean(each))
+def test_a_rig_in_the_mirror_shows_its_row_mirrored() -> None:
+    rows = []
+    for side in (1.0, -1.0):
+        model = rig(size=(4, 301), baseline_m=0.3 * side)
+        setup = setting(model, wall(model, (0.0, 0.0, 1.0), 2.5), medium={"extinction": "0.2 /m"})
+        rows.append(effect_rate(setup, "halo", np.array([side, 0.0, -0.1, -0.3]))[1])
+    np.testing.assert_allclose(rows[0], rows[1][::-1], rtol=1e-5)
+
+
+def test_a_halo_goes_with_its_stripe_and_a_pedestal_with_the_haze() -> None:
+    medium = {"extinction": "0.2 /m", "backscatter": "0.05 /sr"}
+    black, grey, white = (radiance("halo", albedo=albedo, medium=medium) for albedo in (0.0, 0.4, 0.8))
+    np.testing.assert_allclose(white - black, 2 * (grey - black), rtol=1e-4)
+    assert not radiance("halo", albedo=0.0, medium={**medium, "backscatter": "0 /sr"}).any()
+
+
+@pytest.mark.parametrize("geometry", HELD_OUT)
+def test_levels_of_geometries_that_nothing_was_fitted_to(geometry: tuple[float, float]) -> None:
+    for name, tau, errors, noise in level_errors((geometry,)):
+        assert np.all(np.abs(errors) < (0.2 if tau == 2.0 else 0.1) + 2 * noise), (name, tau, errors, noise)
+
+
+def test_the_photon_tracer_makes_the_levels_that_are_kept() -> None:
+    made = traced_near(LOBES["isotropic"], 0.5, HELD_OUT[1], 2, 0)
+    kept = next(levels for *row, levels in level_rows() if row == ["isotropic", 0.5, HELD_OUT[1]])
+    np.testing.assert_allclose(made[:2], kept[:2], rtol=0.15)
+
+
+def test_the_photon_tracer_sees_what_mitsuba_sees() -> None:
+    pytest.importorskip("mitsuba", reason="mitsuba is not installed: pip install spadrig[tracer]")
+    theirs, error, ours = beside_mitsuba("isotropic", 64, 8)
+    assert np.all(np.abs(ours - theirs) < 0.05 * theirs + 3 * error)
 
 
 @pytest.mark.parametrize(
@@ -96,11 +126,11 @@ def test_traced_rows_in_isotropic_fog(tau: float) -> None:
 
 
 @pytest.mark.parametrize(("tau", "low", "high"), [(0.5, 0.08, 0.13), (1.0, 0.18, 0.32), (2.0, 0.35, 0.46)])
-def test_the_pedestal_behind_the_stripe(monkeypatch: pytest.MonkeyPatch, tau: float, low: float, high: float) -> None:
-    """Fog alone: a black wall; 10 px before the stripe."""
-    monkeypatch.setattr(path_traced, "ALBEDO", 0.0)
-    row = radiance(medium={**fog(tau), "phase": {"g": 0.85}})
-    assert low < row[260] / row[208] < high
+def test_the_pedestal_behind_the_stripe(tau: float, low: float, high: float) -> None:
+    """Fog of droplets alone: a black wall."""
+    row = radiance(albedo=0.0, medium={**fog(tau), "phase": {"terms": LOBES["droplets"]}})
+    before, behind = near(row, TANGENT, BASELINE_M / DISTANCE_M)
+    assert low < behind / before < high
 
 
 def test_depths_that_nothing_comes_back_from_stay_finite() -> None:

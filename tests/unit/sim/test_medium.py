@@ -77,6 +77,24 @@ def test_values_at_180_degrees_and_mean_cosines(phase: object, back: float, cosi
     assert (fog.phase_terms, fog.back_per_sr, fog.mean_cosine) == (None, 0.05, 0.85)
 
 
+@pytest.mark.parametrize("share", [0.0, 0.5])
+def test_lobes_scatter_back_and_forward_as_the_medium_does_but_for_its_forward_share(share: float) -> None:
+    for given in ({"backscatter": "0.05 /sr"}, {"phase": "isotropic"}, {"phase": {"terms": [[0.1, -0.5], [0.9, 0.9]]}}):
+        medium = Medium.model_validate({"extinction": "0.1 /m", "forward_share": share, **given})
+        weights, cosines = np.array(medium.lobes).T
+        back = sum(weight * henyey_greenstein(-1.0, g) for weight, g in medium.lobes)
+        assert weights.sum() == pytest.approx(1)
+        assert weights.min() > 0
+        if given == {"backscatter": "0.05 /sr"}:
+            assert (1 - share) * back == pytest.approx(0.05, rel=0.05)
+            assert share + (1 - share) * weights @ cosines == pytest.approx(0.85)
+        elif share == 0:
+            assert back == pytest.approx(medium.back_per_sr)
+    assert Medium.model_validate({"extinction": "0.1 /m", "forward_share": 0.5, "phase": {"g": 0.9}}).lobes == (
+        (1, 0.9),
+    )
+
+
 def test_smoke_absorbs_and_sends_less_back_than_fog() -> None:
     smoke = Medium.model_validate({"smoke": {"extinction": "0.5 /m"}})
     assert smoke.extinction_per_m == 0.5
