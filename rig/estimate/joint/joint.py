@@ -45,7 +45,7 @@ LESSONS = 2
 HALO_LESSONS = 4
 """Number of these lessons under a halo."""
 AGREE_PX = np.float32(1.0)
-"""Under a halo, a stripe of the first map is learned from only if its contrast alone puts it within so many pixels."""
+"""Under a halo, a first map's stripe is learned from only if the costs of contrast alone put it so near, in px."""
 TRUSTED = np.float32(0.5)
 """Under a halo, the amplitudes are learned only from stripes of more trust than this."""
 QUIET_COLUMNS = 8
@@ -162,7 +162,7 @@ class Joint:
         return x_px
 
     def _teaching(self, volume: CountVolume, tables: JointTables, stripes: StripeTable) -> StripeTable:
-        """The table with the trust of the first map's lessons (`fill_trust`) in place of the confidence."""
+        """The stripe table with the trust of `fill_trust` in place of the confidence."""
         memory, trust = self._room(tables.grid), np.empty_like(stripes.confidence)
         self._workers.over(
             len(trust),

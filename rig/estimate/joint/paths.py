@@ -10,8 +10,9 @@ and the total of a label is C plus the messages m of the four paths, left, right
 `along_rows` leaves the messages of two paths; `along_columns` adds the other two and reads the answers from the totals
 (`rig.estimate.joint.winner`).
 
-Labels stay in order in memory, and neighbours are unaligned loads from the first cache, since shuffling them in
-registers gains nothing. Several paths are processed at once, because each step of a path waits for the one before.
+Labels stay in order in memory. Neighbouring labels are read by unaligned loads from the first-level cache, since
+shuffling them in registers gains nothing. Several paths are processed at once, because each step of a path waits for
+the one before.
 """
 
 from typing import Final
@@ -30,7 +31,7 @@ _LEAST_AT: Final = -VECTOR
 CHUNK: Final = 16
 """Columns that are stepped through together: enough that none waits for its last step, few enough for the caches."""
 _AHEAD: Final = 3
-"""Rows ahead of which memory is prefetched: each lies on a page of its own, so the processor does not prefetch it."""
+"""Memory is prefetched this many rows ahead: each row lies on another page, so the processor does not prefetch it."""
 _SET, _ADD, _TOTAL = 0, 1, 2
 
 
@@ -196,7 +197,7 @@ def _go_up(
 
 @numba.njit(cache=True, nogil=True)
 def along_columns(cost: Uint8, message: Uint8, first_column: int, last_column: int, desk: Readout) -> None:
-    """Answer columns first_column..last_column-1, from what `along_rows` wrote to `message` for all rows.
+    """Find the answers of columns first_column..last_column-1, from what `along_rows` wrote to `message` for all rows.
 
     Messages from above are added to `message`. desk: pointers to the `Readout` of CHUNK columns.
     """

@@ -22,7 +22,7 @@ from rig.simd.vectors import add_saturated_unsigned
 MOST = 3
 """Most that the prior adds to a label's cost, in units (`UNITS`). With 6, dark things that move would be held back."""
 SLOPE = 2
-"""Units per label of distance from the last label."""
+"""Units of cost per label of distance from the last label."""
 FREE = 1
 """Distance in labels that costs nothing: the last label has an error, and surfaces drift."""
 LEAST_SURE = 0.5

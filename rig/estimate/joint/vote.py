@@ -45,7 +45,7 @@ NOWHERE: Final = 30000
 
 
 class Ballots(NamedTuple):
-    """Labels and votes of a map, with REACH rows and columns, at least, without votes on every side.
+    """Labels and votes of a map, with a margin of at least REACH rows and columns without votes on every side.
 
     label: float32 as answered; whole: int16, the nearest integer; votes: int16, the margin over SHARE.
     """
@@ -85,7 +85,7 @@ OBJECTION: Final = 8
 FAR: Final = 16
 """Limit to distances between labels in a vote."""
 SAME: Final = 2
-"""Labels at most so far apart, a pixel, support one another."""
+"""Largest difference of labels that support one another: one pixel."""
 _CANDIDATES: Final = 5
 
 

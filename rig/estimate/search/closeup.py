@@ -2,7 +2,7 @@
 
 It finds the position of the line within the pixel. LABELS positions (labels), LABEL_PX apart, are compared, one per
 lane of a vector. With L and R the flux left and right of the line, s its light, f_i,t its share in pixel t at label i,
-and l_i,t the part of pixel t that lies left of it,
+and l_i,t the part of pixel t that lies left of label i,
 
     score_i = K constant_i + sum over t of n_t weight_i,t,   from flux_i,t = l_i,t L + (1 - l_i,t) R + s f_i,t
 

@@ -1,7 +1,8 @@
 """Decides when an estimator learns, and holds the model that it uses until then.
 
 The first map is estimated with a model learned from that map itself. A later map is used for learning (a lesson) when
-enough frames have come since the last lesson (TEACH_FRAMES), on a thread beside the stream. The new model is used a
+enough frames have come since the last lesson (TEACH_FRAMES) and enough of its answers are confident (LEAST_SURE).
+Lessons run on a thread of their own. The new model is used a
 fixed number of frames later (LAG_FRAMES), so that a live scan hardly ever waits and results do not depend on the speed
 of the machine.
 """
@@ -85,7 +86,7 @@ class Seen:
 
 
 class OnlineLearner(Generic[Tables]):
-    """The model that an estimator uses, None before the first lesson, and the tables made for it.
+    """The model that an estimator uses, None until a map was good enough to learn from, and the tables made for it.
 
     make: makes tables. learn_more: learns from `more` of a `Seen`, in addition to what every estimator learns. Both run
     on the learning thread, `make` also on the caller's. learns: whether later maps change the model.

@@ -34,7 +34,7 @@ from rig.simd.vectors import LANES
 from rig.threads import RowWorkers
 
 BAND_ROWS = (64, 32, 16, 8, 4)
-"""Rows that may share a table. The most for which the line shifts by at most BAND_SHEAR_PX are taken."""
+"""Numbers of rows that may share a table: the largest for which the line shifts by at most BAND_SHEAR_PX is used."""
 BAND_SHEAR_PX = 1
 TAP_SHARE = 0.06
 """Least share of the line in a pixel that is read to score a position."""

@@ -43,15 +43,16 @@ LEAST_ONES: Final = np.float32(0.5)
 MOST_SHARE: Final = np.float32(1.0 - 1e-4)
 """Largest p and p0, so that scores stay finite."""
 _AHEAD: Final = 2
-"""Rows ahead of which memory is prefetched."""
+"""Memory is prefetched this many rows ahead."""
 
 
 class Contrast(NamedTuple):
     """Settings of these costs under one model.
 
     place: int16 (columns, rows, PLACES) of `places_of`. hot_start, hot_x: as in `LabelTables`, of pixels that take the
-    count of the pixel beside them. shares: float32 (2, FRACTIONS, taps) of the line in the pixels around centres -4/8
-    to 3/8 px off towards near, from far to near and from near to far. frames: float32 (FRACTIONS,), N for one frame.
+    count of the pixel beside them. shares: float32 (2, FRACTIONS, taps) of the line in the pixels around its centre,
+    which is -4/8 to 3/8 px off the middle of its pixel, towards near. First index: 0 from far to near, 1 from near to
+    far. frames: float32 (FRACTIONS,), N for one frame.
     side: 1 if near is left, else -1. width: pixels of a sensor's row; what is stored behind them is padding.
     """
 
@@ -227,7 +228,7 @@ def _write_own(score: Float32, low: int, high: int, side: int, units: float, own
 
 @numba.njit(cache=True, nogil=True)
 def _write_costs(own: Uint8, alone: bool, cost: Uint8) -> None:
-    """Write own, or its mean with cost, to cost (labels,), but for labels that are EXCLUDED."""
+    """Write own, or its mean with cost, to cost (labels,), except where cost is EXCLUDED."""
     for label in range(cost.shape[0]):
         before = cost[label]
         mean = np.uint8((np.uint16(before) + np.uint16(own[label]) + np.uint16(1)) >> np.uint16(1))

@@ -58,7 +58,7 @@ FINEST: Final = 64.0
 WEIGHT_BITS: Final = 12
 """Weights of 2^WEIGHT_BITS units per nat reach to 8 nats per count."""
 RISE_LIMIT: Final = 22000
-"""Largest rise of the sum over a row's pixels, of a range of 40000 for scores."""
+"""Largest rise of the sum over a row's pixels, in units of score; scores have a range of 40000."""
 TAPS_LIMIT: Final = 28000
 """Most that the pixels around a position may add to its score."""
 FRAMES_OVER_HALF_MORE: Final = 4

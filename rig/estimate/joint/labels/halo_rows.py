@@ -39,7 +39,8 @@ _FULL: Final = 32768.0
 
 
 class HaloTables(NamedTuple):
-    """Tables of the halo. Blocks are counted from FIRST_PX on, the stripe's places from the far end of label 0's pixel.
+    """Tables of the halo. Blocks are counted from FIRST_PX on, places of the stripe, BLOCK_PX apart, from the far end
+    of label 0's pixel.
 
     weight: int16 (bands, columns, blocks, lights, places), of the mean count of a block. constant: float32
     (bands, columns, lights, places), nats per exposure. ramp: int16 (phases, 3, LANES), interpolation weights of the
