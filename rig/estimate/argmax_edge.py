@@ -2,10 +2,10 @@
 project follows).
 
 `argmax` takes the largest count inside the window, and the smallest x among equal ones. `edge` fits an exponential
-background to the near side of the row and takes the largest (count - background), weighted with the drop of the level
-from the 8 px before to the 8 px behind, and then the largest count within 2 px of that pixel. Counts are integers
-(columns, rows, window); answers are float32 (rows, columns), refined to sub-pixel positions with the two neighbours.
-Neither uses a model or learns one.
+background to the near side of the row and finds the pixel with the largest product of (count - background) and the drop
+of the level from the 8 px before to the 8 px behind. It takes the largest count within 2 px of that pixel. Counts are
+integers (columns, rows, window); answers are float32 (rows, columns), refined to sub-pixel positions with the two
+neighbours. Neither uses a model or learns one.
 """
 
 from dataclasses import dataclass
@@ -172,9 +172,8 @@ def peak_rows(
 def _edge_scores(n: Float64, begin: int, length: int, background: float, decay: float, score: Float64) -> None:
     """(count - background) times the drop of the mean level from the 8 px before to the 8 px behind.
 
-    Both factors are at least 0; 0.05 is added to the drop.
-
-    n: counts, also beyond the window. score: its first `length` values become those of pixels begin, begin + 1, ...
+    Both factors are at least 0; 0.05 is added to the drop. n: counts, also beyond the window. score: its first `length`
+    values become those of pixels begin, begin + 1, ...
     """
     for t in range(length):
         at = begin + t

@@ -110,7 +110,7 @@ MEAN_EXCESS: Final = np.float32(1.040684)
 
 @numba.njit(inline="always")
 def lift_to_powers(best, shift):  # type: ignore[no-untyped-def]
-    """Number to add to scores, as int16 and saturated, so that the best score of each lane becomes likelihood 1.0."""
+    """Number to add to scores, saturated int16, so that each lane's best score becomes 1.0 (less if it is very low)."""
     return add_saturated(sub_saturated(zero_int16(), best), np.int16(np.int64(BIAS) >> shift))
 
 

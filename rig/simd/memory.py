@@ -44,7 +44,7 @@ def address_of(array):  # type: ignore[no-untyped-def]
 
 
 def _pointer(builder: Any, address: Any, index: Any, element: Any, whole: Any) -> Any:
-    """Pointer to element `index` of the array of `element` at `address`, as a pointer to a value of type `whole`."""
+    """Pointer of type `whole` to item `index` of an array at `address`, whose items are of type `element`."""
     return builder.bitcast(builder.gep(builder.inttoptr(address, element.as_pointer()), [index]), whole.as_pointer())
 
 
@@ -142,7 +142,7 @@ def _prefetch(to_write: int, locality: int) -> Any:
 prefetch = _prefetch(0, 2)
 """prefetch(address): fetch the cache line at an address, valid or not, into the second-level cache."""
 prefetch_to_write = _prefetch(1, 3)
-"""prefetch_to_write(address): fetch the cache line into the first-level cache, and from those of other cores."""
+"""prefetch_to_write(address): fetch the cache line into the first-level cache, out of other cores' caches."""
 
 
 load_widened = emitted(

@@ -152,7 +152,7 @@ def solve(matrix: Float64, right: Float64, free: int) -> Float64:
 REACH: Final = 2
 """Rows and columns to either side whose stripes on the same surface help to find the light of a stripe."""
 LEAST_ASKED: Final = 10
-"""The light is known only if so many of the 5 x 5 stripes, itself included, lie on the stripe's surface."""
+"""A stripe's light is known only if so many of the 5 x 5 stripes around it, itself included, lie on its surface."""
 LEAST_SURE: Final = 4.0
 """The light is known only if it exceeds this many standard deviations of its noise."""
 DISAGREED: Final = 3.0

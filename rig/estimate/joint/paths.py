@@ -26,7 +26,7 @@ from rig.simd.memory import address_of, load_bytes, prefetch, read_byte, store_b
 from rig.simd.vectors import add_saturated_unsigned, smaller_unsigned, smallest_byte, sub_saturated_unsigned, zero_bytes
 
 _SIDE: Final = 2 * VECTOR
-"""Bytes before and behind the labels of a path, whole cache lines: labels beyond the ends, and its least L."""
+"""Bytes before and behind the labels of a path, each a cache line: LARGEST, and at _LEAST_AT the path's least L."""
 _LEAST_AT: Final = -VECTOR
 CHUNK: Final = 16
 """Columns that are stepped through together: enough that none waits for its last step, few enough for the caches."""
@@ -40,7 +40,7 @@ TWO: Final = 24
 THREE: Final = 30
 JUMP: Final = 40
 """Costs of a change of label between neighbours, P1, P2, P3 and J of the module, in units of
-`rig.estimate.joint.labels.costs`. A unit is more nats with more exposures, so a change then costs more nats."""
+`rig.estimate.joint.labels.costs`. With more exposures a unit stands for more nats, so a change costs more nats."""
 
 
 @numba.njit(cache=True, nogil=True)
@@ -57,7 +57,7 @@ def _paths_in(memory):  # type: ignore[no-untyped-def]
 
 @numba.njit(forceinline=True)
 def _begin(path, paths, labels):  # type: ignore[no-untyped-def]
-    """Begin a number of paths: there is no message to their first pixel."""
+    """Begin this number of paths: L is 0 before their first pixel, so that no message reaches it."""
     for _ in range(2 * paths):
         for v in range(0, labels, VECTOR):
             store_bytes(path, v, zero_bytes())
@@ -67,7 +67,7 @@ def _begin(path, paths, labels):  # type: ignore[no-untyped-def]
 
 @numba.njit(forceinline=True)
 def _step(before, after, cost, message, total, hidden, labels, ahead, use):  # type: ignore[no-untyped-def]
-    """Do one step of a path: from L of its last pixel, at `before`, to L of this one, at `after`. All are addresses.
+    """Step along a path: from L of the previous pixel, at `before`, to L of this one, at `after`. All are addresses.
 
     use: _SET writes the message to `message`, _ADD adds it there; _TOTAL adds it to `message` and cost and writes the
     sum to `total`, LARGEST for labels that are `hidden`. ahead: bytes to the cost and message that are prefetched; 0:

@@ -7,7 +7,7 @@ pixel stays dark under ambient light alone and under haze alone,
 
     ones expected = sum over lines K (1 - q c) = sum over columns K (number of lines - c sum q)
 
-so lines only add up their q, left and right of the stripe, and these sums are multiplied with the block's c.
+so only the q of the lines are summed, left and right of the stripe, and these sums are multiplied with the block's c.
 Sums are float32 (block rows, block columns, pixels of distance), sixteen pixels to a vector.
 """
 

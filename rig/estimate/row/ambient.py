@@ -1,8 +1,8 @@
 """Ambient light and dark counts of every pixel, from dark frames, quiet pixels behind stripes and sums over columns.
 
 For each pixel both are constant during a sweep. So the counts summed over all columns show hot pixels, whatever the
-scene: over the whole sweep they fire far more often than their neighbours. If there are few
-counts, the estimate is drawn towards the mean of the pixels around.
+scene: over the whole sweep they fire far more often than their neighbours. If there are few counts, the estimate is
+drawn towards the mean of the pixels around.
 """
 
 import cv2

@@ -54,7 +54,7 @@ AMPLITUDE_SPAN = 3.4
 EVEN_SHARE = 0.25
 """Share of the prior over positions that stays uniform, whatever the earlier maps looked like."""
 PRIOR_PHOTONS = 100.0
-"""Weight of the fitted exponential in the mean with a bin's own level: that of so many photons."""
+"""In the mean of a bin's own level and the fitted exponential, the exponential weighs as much as so many photons."""
 START_EXTINCTIONS_PER_M = (0.0, 0.1, 0.4, 1.5)
 """Extinctions that are tried as a start for a first sweep: clear air to dense fog."""
 

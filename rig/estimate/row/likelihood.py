@@ -59,7 +59,7 @@ LOST: Final = np.float32(24.0)
 
 
 def logit_table() -> Float32:
-    """Table (2, cells) float32 of logit p' and log(1 - p') over flux: 256 cells an octave, value at the cell's middle.
+    """Table (2, cells) float32 of logit p' and log(1 - p') by flux: 256 cells an octave, value at the cell's middle.
 
     The largest error, half a cell, changes a log-likelihood by 0.002 per count, far below its own noise.
     """
@@ -134,7 +134,7 @@ def row_scores(
 def none_prior(
     near: float, far: float, w_first: float, w_last: float, none_weight: float
 ) -> tuple[float, float, float]:
-    """The three priors of 'no stripe' for `row_posterior`, from the part of the depth range that the picture shows.
+    """The three priors `none` of `row_posterior`, from the part of the depth range that the picture shows.
 
     near, far: ends of the depth range as inverse depths; w_first, w_last: those of the first and last position.
     Positions beyond the picture's border are as likely, per inverse depth, as those in the picture.

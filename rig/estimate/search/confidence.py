@@ -10,8 +10,8 @@ counts of both look alike. Its neighbours can: on a surface their answers agree,
   others: the number of all other answers there. An answer without neighbours has odds 1. If ln odds is positive, it is
   multiplied by min(max(contrast / SEEN, 0), 1): without light, agreement is no evidence.
 - contrast: mean light of the answers that agree, above ambient light and half the haze, less SPARED pixels of haze,
-  over the noise of this mean; at least LEAST. SPARED is for answers a little before the end of the haze, which take
-  light of the haze for the stripe's.
+  divided by the noise of this mean; at least LEAST. SPARED is for answers a little before the end of the haze, which
+  take light of the haze for the stripe's.
 - K: exposures. With more exposures, neighbouring rows place the end of a haze more alike.
 
 A, B, C and D are fitted by maximum likelihood to random scenes of the tests' simulator, at K = 1 to 30, with haze,
@@ -44,7 +44,7 @@ SEEN: Final = 3.0
 """Contrast from which on agreement counts in full. Rows without any light agree too, on the first position searched."""
 REACH: Final = 3
 MORE_NOISE: Final = 1.0 / 9.0
-"""In counts: the noise of light is not zero where nothing was counted."""
+"""Counts added to the noise of the light, which is not zero where nothing was counted."""
 
 
 @numba.njit(cache=True, nogil=True)

@@ -2,9 +2,8 @@
 
 The first map is estimated with a model learned from that map itself. A later map is used for learning (a lesson) when
 enough frames have come since the last lesson (TEACH_FRAMES) and enough of its answers are confident (LEAST_SURE).
-Lessons run on a thread of their own. The new model is used a
-fixed number of frames later (LAG_FRAMES), so that a live scan hardly ever waits and results do not depend on the speed
-of the machine.
+Lessons run on a thread of their own. The new model is used a fixed number of frames later (LAG_FRAMES), so that a live
+scan hardly ever waits and results do not depend on the speed of the machine.
 """
 
 from collections.abc import Callable
@@ -29,7 +28,7 @@ from rig.simd import Float64
 from rig.threads import RowWorkers, yield_to_others
 
 LEAST_SURE = 0.02
-"""Least share of confident answers in a map that is used for learning: a closed shutter must not spoil later maps."""
+"""Least share of answers with a confidence above 0.5 in a map to learn from: a closed shutter teaches nothing."""
 TEACH_FRAMES = 100_000
 """Least number of lit frames from one lesson to the next: a second at 100 kHz. Learning costs some 0.2 s of one core,
 with the tables of `joint` twice that."""

@@ -168,7 +168,7 @@ def count_fluxes() -> Float32:
 QUIET: Final = 0.9
 """Probability within 1 px above which the pixels behind the stripe are used to learn the ambient light."""
 QUIET_STEP: Final = 8
-"""If there are dark frames, one column in so many is used for this, else every column."""
+"""If there are dark frames, one column in so many is used to learn the ambient light, else every column."""
 SIGNAL_REACH_PX: Final = 2
 """Least number of pixels on either side of a stripe whose light is summed as its own."""
 FEW_EXPOSURES: Final = 1
@@ -304,7 +304,7 @@ def judge_rows(
 
 @numba.njit(forceinline=True)
 def _answer(lanes, to, rows, search):  # type: ignore[no-untyped-def]
-    """Write one field of the answers for so many rows to address `to`."""
+    """Write one field of the answers of the batch's first `rows` rows to address `to`."""
     if rows == BATCH:
         store_float32(to, 0, lanes)
     else:

@@ -49,7 +49,7 @@ START: Final = -12000
 
 @numba.njit(cache=True, nogil=True)
 def fit_positions(position: int, slope: int, places: int, more: float, to: int) -> None:
-    """Write the constants of a table's positions for columns with `more` exposures than nominal.
+    """Write the constants of a table's positions for columns with the nominal number of exposures plus `more`.
 
     position, slope, to: addresses of `places` int16 each.
     """
@@ -111,7 +111,7 @@ def _sum_edges(table, search, r):  # type: ignore[no-untyped-def]
 
 @numba.njit(forceinline=True)
 def _position_score(first, second, tap, constant, s, v, lanes, level):  # type: ignore[no-untyped-def]
-    """Score of the positions of step s at the likelier of two amplitudes; first, second: counts that taps weight."""
+    """Score of the positions of step s at the likelier of two amplitudes. first, second: counts of pairs with taps."""
     at, screen = 4 * s * lanes + 2 * v, 4 * STEPS * lanes
     dim = dot_pairs(first, load_bytes(tap, at)) + dot_pairs(second, load_bytes(tap, at + 2 * lanes))
     dim = add_saturated(dim, load_int16(constant, s * lanes + v))

@@ -51,7 +51,7 @@ from rig.simd.vectors import LANES, zero_bytes
 from rig.threads import RowWorkers
 
 SUM_LIMIT: Final = BYTE_FRAMES
-"""Exposures after which the 8-bit sums are carried over."""
+"""Most exposures in the 8-bit sums. With more they would overflow, so they are added up first (`carry_sums`)."""
 
 
 class OpenColumn(NamedTuple):

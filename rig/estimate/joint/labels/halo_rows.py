@@ -34,7 +34,7 @@ BLOCK_PX: Final = 8
 FIRST_PX: Final = FAR_PX % BLOCK_PX - BLOCK_PX
 """First pixel of the first block, before the row, so that the first label's pixel begins a block."""
 AHEAD: Final = (FAR_PX - FIRST_PX) // BLOCK_PX
-"""Number of blocks behind a stripe at place 0."""
+"""Number of blocks on the far side of a stripe at place 0."""
 _FULL: Final = 32768.0
 
 

@@ -1,7 +1,7 @@
 """Tables of the label costs, per column, band of rows and variant, and the working memory.
 
-They hold the terms of `rig.estimate.row.likelihood`, relative to 'everything is before the stripe'. With
-the probability p' that a pixel fires, p'_B before and p'_E behind the stripe, and p'_S where the stripe lights it,
+They hold the terms of `rig.estimate.row.likelihood`, relative to 'everything is before the stripe'. With the
+probability p' that a pixel fires, p'_B before and p'_E behind the stripe, and p'_S where the stripe lights it,
 
     edge = logit p'_E - logit p'_B                  int16: a count at a pixel behind the stripe
     tap  = logit p'_S - logit p'_B or p'_E          int16: a count at a pixel around a label, for LIGHTS amplitudes;
@@ -310,8 +310,8 @@ class Buffers(NamedTuple):
     """Working memory for BATCH rows, int16 (BATCH, n_row or the like) unless stated.
 
     n: counts of pixels from far to near; sums: score of a change at each pixel from SUMS_FROM on, the first one BASE;
-    score: of pixel and phase; top: the largest score in each lane of each row, then that of each row in the first
-    LANES. cost: uint8, of labels, from that of the first pixel's phase 0 on. For all rows: mask: uint8 (labels,),
+    score: of pixel and phase; top: the largest score in each lane of each row; in the end the first LANES hold that
+    of each row. cost: uint8, of labels, from that of the first pixel's phase 0 on. For all rows: mask: uint8 (labels,),
     EXCLUDED or 0; constant: of positions, edge: of pixels, for each variant; through: intermediate sums for edge.
     int32: table: number of each variant's table, from variant -1 on, -1 if there is none; here: that of each row of the
     batch; fitted: its place in `Fitted`; shown: first label of the mask, and the one after the last.

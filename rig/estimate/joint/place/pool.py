@@ -55,7 +55,7 @@ def pool_row(distance: Float32, first: Float32, second: Float32, y: int, reach: 
 
 @numba.njit(cache=True, nogil=True)
 def widen_row(at: tuple[int, int, int], width: int, y: int, inner: int, reach: int, enough: float, sums: int) -> None:
-    """Add to sums, as `pool_row`, those neighbours that are more than `inner` rows or columns away, up to `reach`.
+    """Add to the sums of `pool_row` those neighbours that are more than `inner` rows or columns away, up to `reach`.
 
     Stripes whose second sum already reaches `enough` may be left as they are. at, sums: addresses; width: of copies.
     """
