@@ -95,10 +95,7 @@ def _judge(setting: LearningSetting, workers: RowWorkers) -> SearchTables:
 
 
 class _LikelihoodCounter:
-    """Counts sweeps completely until there is a model, then searches each column as soon as its frames are there.
-
-    With more than BYTE_EXPOSURES exposures all sweeps are counted completely.
-    """
+    """Counts sweeps completely without a model or beyond BYTE_EXPOSURES exposures; else judges columns as they come."""
 
     def __init__(self, of: Likelihood, layout: SweepLayout, geometry: SweepGeometry, workers: RowWorkers) -> None:
         self._of, self._layout, self._geometry, self._workers = of, layout, geometry, workers

@@ -96,10 +96,7 @@ write_byte, write_int16, write_int32, write_int64, write_float32 = (_writer(kind
 
 @numba.njit(cache=True, nogil=True)
 def copy_floats(source: int, to: int, number: int) -> None:
-    """Copy float32 values from address `source` to address `to`, 16 at a time; numba copies slices one value at a time.
-
-    number: how many values.
-    """
+    """Copy `number` float32 from address `source` to address `to`, 16 at a time; numba copies slices one by one."""
     whole = number - number % LANES
     for i in range(0, whole, LANES):
         store_float32(to, i, load_float32(source, i))

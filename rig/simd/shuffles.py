@@ -142,10 +142,7 @@ def _unpacked(builder: Any, a: Any, b: Any, combine: Callable[[Any, Any], Any]) 
 
 
 def _reduced(builder: Any, rows: Sequence[Any], combine: Callable[[Any, Any], Any]) -> Any:
-    """Combine the numbers of each row into one; the results are in the order of the rows.
-
-    rows: as many vectors as a vector holds numbers.
-    """
+    """Combine the numbers of each row into one, in the order of the rows: as many rows as numbers in a row."""
     count = rows[0].type.count
     block = count // 2
     halves = []

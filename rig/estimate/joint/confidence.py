@@ -307,7 +307,7 @@ def _ending(at, width, c):  # type: ignore[no-untyped-def]
 
 @numba.njit(forceinline=True)
 def _number(at, width, c):  # type: ignore[no-untyped-def]
-    """Number of 3 x 3 answers on the surface, this one included."""
+    """Number of the 3 x 3 answers around each answer, itself included, that lie on its surface."""
     return larger_float(load_float32(at, _LIT * width + c), zero_float32() + 1.0)
 
 

@@ -14,7 +14,7 @@ since the model is known by then.
 B, C and D are fitted by maximum likelihood to lessons on random scenes of a second simulator, in clear air, thin and
 dense fog, under a halo and with hot pixels at 1 to 10 exposures, with places without a stripe counted as wrong. A is
 half of its fitted value, because too little trust makes a worse model: an answer without trust is judged by its own row
-alone, and the answers left out are those that show what the model does not know yet.
+alone, and it is the answers with too little trust that show what the model does not know yet.
 """
 
 import math
@@ -103,8 +103,8 @@ def add_quiet(
 
     Pixels without a ray are left out. halo: (BINS, pixels) of `halo_shares`, without pixels if there is no halo. With a
     halo, light also falls behind a stripe of `signal` photons: the expected halo and pedestal are subtracted from the
-    ones. Pixels where these exceed `most_light`, photons per exposure, are left out. So are stripes that saturate their
-    pixels: their halo is brighter than expected, and the excess would be taken for ambient light.
+    ones. Pixels where both together exceed `most_light`, photons per exposure, are left out. So are stripes that
+    saturate their pixels: their halo is brighter than expected, and the excess would be taken for ambient light.
     """
     width, several = sweep.u.shape[1], sweep.others.shape[1] > 0
     # Local names: each use of a tuple in the loop would count references to all of its arrays.

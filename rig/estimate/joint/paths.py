@@ -26,7 +26,7 @@ from rig.simd.memory import address_of, load_bytes, prefetch, read_byte, store_b
 from rig.simd.vectors import add_saturated_unsigned, smaller_unsigned, smallest_byte, sub_saturated_unsigned, zero_bytes
 
 _SIDE: Final = 2 * VECTOR
-"""Bytes before and behind the labels of a path, each a cache line: LARGEST, and at _LEAST_AT the path's least L."""
+"""Bytes before and behind the labels of a path, a cache line each. All are LARGEST but the least L, at _LEAST_AT."""
 _LEAST_AT: Final = -VECTOR
 CHUNK: Final = 16
 """Columns that are stepped through together: enough that none waits for its last step, few enough for the caches."""

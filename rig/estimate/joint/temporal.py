@@ -77,8 +77,7 @@ class TemporalPrior:
 
 
 def _ramps(labels: int) -> Uint8:
-    """Costs to add, uint8 (MOST + 1, 2 * labels). First index: their largest value; second: label - last label +
-    labels."""
+    """Costs to add, uint8 (MOST + 1, 2 * labels), by their largest value and by label - last label + labels."""
     away = np.abs(np.arange(2 * labels) - labels)
     ramp = SLOPE * np.maximum(away - FREE, 0)
     return np.asarray(np.minimum(ramp, np.arange(MOST + 1)[:, None]), np.uint8)

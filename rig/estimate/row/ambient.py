@@ -71,7 +71,7 @@ def _lowest_level(totals: NDArray[np.uint32]) -> float:
 
 
 def _shrunk(ones: Float64, exposures: Float64) -> Float64:
-    """Flux of each pixel, drawn to the local mean; the more so, the more alike pixels are (empirical Bayes)."""
+    """Flux of each pixel, drawn to the local mean, more strongly if pixels are more alike (empirical Bayes)."""
     row_rates = ones.sum(1)[exposures.sum(1) > 0] / exposures.sum(1)[exposures.sum(1) > 0]
     overall = max(float(np.median(row_rates)), 1e-6)
     mean = np.full(ones.shape, overall)

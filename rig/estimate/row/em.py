@@ -173,7 +173,7 @@ def learn_next(
 ) -> tuple[RowModel, Expectation]:
     """The model updated with lines of one more sweep, those of `next_lattice`, and the sums for the next call.
 
-    before: the sums returned by the call before, which now count FADE times. The line width is not changed if lines
+    before: the sums returned by the previous call; they are multiplied by FADE. The line width is not changed if lines
     have positions known from neighbours, since these depend on the width.
     """
     seen = expect(lines, geometry, model, workers)

@@ -6,8 +6,8 @@ depth w' = 2 w / (c + p), and haze, rest, S the profiles of `rig.estimate.row.mo
 
     before = ambient + G haze(w') + others,    behind = ambient + G rest(w') + others,    scale = S(w')
 
-in photons per exposure; `others` is the haze of lines lit at the same time (`others_at`). All are float32, and fluxes
-are limited to FLUX_MIN..FLUX_MAX. `judge_line` computes all of them and the row's posterior.
+in photons per exposure; `others` is the haze of laser lines lit at the same time (`others_at`). All are float32, and
+fluxes are limited to FLUX_MIN..FLUX_MAX. `judge_line` computes all of them and the row's posterior.
 
 Fog scatters the stripe's own light once more, into a halo on both sides of it. At the distance d along the row from a
 stripe of s photons the halo has, per pixel,
@@ -196,7 +196,7 @@ def line_light(sweep, state, y, c, middle):  # type: ignore[no-untyped-def]
 
 @numba.njit(inline="always")
 def others_at(sweep, state, y, c, x):  # type: ignore[no-untyped-def]
-    """Haze at one pixel from the lines that are lit together with column c; the same before and behind c's stripe.
+    """Haze at one pixel from the laser lines lit together with column c's; the same before and behind c's stripe.
 
     The positions of the other lines' stripes are unknown. The probability that a line's haze has not ended at the pixel
     is taken as the share of the depth range, in inverse depth, behind the pixel's point on that line's plane.

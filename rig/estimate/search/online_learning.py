@@ -156,7 +156,7 @@ class OnlineLearner(Generic[Tables]):
 
 
 def first_model(volume: CountVolume, geometry: SweepGeometry, workers: RowWorkers) -> RowModel:
-    """Learn from the first sweep. It is searched once: the pixels behind stripes then show the ambient light."""
+    """The model of a first sweep, learned twice: once stripes are found, pixels behind them show the ambient light."""
     intensity = volume.intensity()
     model = learn_first(volume, geometry, ambient_map(volume, intensity, geometry, None), workers)
     dark = volume.dark_counts is not None

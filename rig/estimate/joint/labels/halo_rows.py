@@ -176,7 +176,7 @@ def new_halo_room(halo: HaloTables, constants: int) -> HaloRoom:
 
 @numba.njit(cache=True, nogil=True)
 def fit_halo(halo: HaloRoom, column: int, per_nat: float) -> None:
-    """Fill fitted for a column's exposures. column: its number among all bands; per_nat: units x exposures."""
+    """Fill `halo.fitted` for a column's exposures. column: band * columns + column; per_nat: units x exposures."""
     numbers = halo.lights * halo.places
     for j in range(0, numbers, LANES):
         nats = load_float32(halo.tables.constant + 4 * column * numbers, j) * np.float32(per_nat)
@@ -185,7 +185,7 @@ def fit_halo(halo: HaloRoom, column: int, per_nat: float) -> None:
 
 @numba.njit(cache=True, nogil=True)
 def halo_rows(halo: HaloRoom, column: int, at: LabelTables, fitted: Fitted, b: Buffers, batch: int) -> None:
-    """Fill constant with the constants of the rows' tables plus the evidence of the halo, for `batch` rows."""
+    """Fill `halo.constant` for `batch` rows: constants of the rows' tables plus the evidence of the halo."""
     vectors, numbers = b.score_row // (PHASES * LANES), halo.lights * halo.places
     weights = halo.tables.weight + 2 * column * halo.blocks * numbers
     for r in range(batch):

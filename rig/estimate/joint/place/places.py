@@ -190,7 +190,7 @@ def ambient_place(ambient, width, y, x, x0, window, spare):  # type: ignore[no-u
 
 @numba.njit(forceinline=True)
 def counts_of(around, at, y, c, to):  # type: ignore[no-untyped-def]
-    """Write EIGHT vectors of counts of stripes c..c+LANES-1 of row y to address `to`. around, at: array and address."""
+    """Write EIGHT vectors of counts of stripes c..c+LANES-1 of row y to address `to`. at: address of `around`."""
     if around.itemsize == 1 and c + LANES <= around.shape[1]:
         spread_eights(at + (y * around.shape[1] + c) * EIGHT, to)
         return
