@@ -1,6 +1,6 @@
 """From counts to stripe positions: the estimators `argmax`, `edge`, `likelihood` and `joint`, and the median filter.
 
 Input: the counts of a sweep and its geometry. Output: a stripe table. Read `rig.estimate.row.likelihood` first: it is
-the specification, the exact likelihood of one row. `search` finds the best position of a row fast, `joint` ties rows
-and columns together. `registry` finds an estimator by its name.
+the specification, the exact likelihood of one row. `search` finds the best position of a row fast, `joint` estimates
+rows and columns together. `registry` finds an estimator by its name.
 """

@@ -1,11 +1,11 @@
-"""Compiled estimators `argmax` (brightest pixel of the row, the naive reference) and `edge` (that of the report which
-this project follows).
+"""Compiled estimators `argmax` (brightest pixel of the row, the naive reference) and `edge` (from the report that this
+project follows).
 
 `argmax` takes the largest count inside the window, and the smallest x among equal ones. `edge` fits an exponential
-background to the near side of the row and takes the largest (count - background), weighted with the drop of the level
-from the 8 px before to the 8 px behind, and then the largest count within 2 px of that pixel. Counts are integers
-(columns, rows, window); answers are float32 (rows, columns), refined to sub-pixel positions with the two neighbours.
-Neither uses a model or learns one.
+background to the near side of the row and finds the pixel with the largest product of (count - background) and the drop
+of the level from the 8 px before to the 8 px behind. It takes the largest count within 2 px of that pixel. Counts are
+integers (columns, rows, window); answers are float32 (rows, columns), refined to sub-pixel positions with the two
+neighbours. Neither uses a model or learns one.
 """
 
 from dataclasses import dataclass
@@ -23,17 +23,17 @@ from rig.threads import RowWorkers
 EDGE_REACH_PX: Final = 8
 """Pixels on each side between which `edge` measures the drop of the level (the report's discontinuity)."""
 STRIPE_PX: Final = 2
-"""Pixels on each side of the peak that belong to the stripe: 3 sigma of a line of 0.6 px."""
+"""Pixels on each side of the peak that belong to the stripe: 3 sigma of a line with sigma = 0.6 px."""
 NO_STRIPE: Final = 0.1
-"""Prior of a row without stripe: shadows and borders take about a tenth of the rows of the scenes measured."""
+"""Prior probability that a row has no stripe: about the share of shadows and borders in the scenes measured."""
 NEAR_SHARE: Final = 0.25
 """Share of the row, from its near end, to which `edge` fits the decaying background."""
 
 
 @numba.njit(cache=True, nogil=True)
 def sub_pixel(weight: Float64, peak: int, length: int) -> float:
-    """Offset of the line from the peak's pixel, -0.5 to 0.5 px: centroid of the pixel and its neighbours, less the
-    lower neighbour's weight. It is 0 where all three are equal, and at either end of the row.
+    """Offset of the line from the peak's pixel, -0.5 to 0.5 px: centroid of the pixel and its two neighbours, after the
+    smaller neighbour's weight is subtracted from all three. 0 where all three are equal, and at either end of the row.
     """
     if peak <= 0 or peak >= length - 1:
         return 0.0
@@ -49,10 +49,10 @@ def sub_pixel(weight: Float64, peak: int, length: int) -> float:
 def peak_confidence(weight: Float64, counts: Float64, k: float, peak: int, length: int) -> tuple[float, float]:
     """Probability that the true peak is within 1 px of `peak`, and the mean count more than 1 px away.
 
-    The row is modelled as 'one pixel at the peak's rate, the others at the mean rate of the rest'. Over k frames the
-    log-likelihood ratio of a stripe at x to 'no stripe', of prior NO_STRIPE, is weight[x] (logit p_peak - logit p_rest)
-    + k log((1 - p_peak) / (1 - p_rest)). Half a count is added so that no rate is 0 or 1. (0, 0) if the peak has no
-    count.
+    Model: one pixel fires at the peak's rate p_peak, all others at the mean rate p_rest of the pixels more than 1 px
+    away. Over k frames the log-likelihood ratio of 'stripe at x' to 'no stripe' (prior NO_STRIPE) is
+    weight[x] (logit p_peak - logit p_rest) + k log((1 - p_peak) / (1 - p_rest)). Half a count is added so that no rate
+    is 0 or 1. (0, 0) if the peak has no count.
     """
     if counts[peak] <= 0.0:
         return 0.0, 0.0
@@ -170,9 +170,10 @@ def peak_rows(
 
 @numba.njit(cache=True, nogil=True)
 def _edge_scores(n: Float64, begin: int, length: int, background: float, decay: float, score: Float64) -> None:
-    """(count - background) times the drop of the mean level from the 8 px before to the 8 px behind, both cut at 0.
+    """(count - background) times the drop of the mean level from the 8 px before to the 8 px behind.
 
-    n: counts, also beyond the window. score: its first `length` values become those of pixels begin, begin + 1, ...
+    Both factors are at least 0; 0.05 is added to the drop. n: counts, also beyond the window. score: its first `length`
+    values become those of pixels begin, begin + 1, ...
     """
     for t in range(length):
         at = begin + t

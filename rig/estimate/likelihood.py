@@ -5,7 +5,8 @@ The likelihood itself: `rig.estimate.row.likelihood`; the search along a row: `r
 how it is learned: `rig.estimate.row.model`, `rig.estimate.row.em`, `rig.estimate.search.online_learning`; the
 confidence of an answer, from its neighbours: `rig.estimate.search.confidence`. The first map is counted completely and
 estimated twice, because pixels that the first estimate shows to lie behind the stripe tell the ambient light. Every
-later map is judged column by column while its frames come in, with a model learned from earlier maps alone.
+later map is estimated with a model learned from earlier maps alone: column by column while its frames come in, or when
+it is complete if it has more than BYTE_EXPOSURES exposures.
 """
 
 import numpy as np
@@ -77,7 +78,7 @@ class Likelihood:
         return self._at[1]
 
     def _light_of(self, model: RowModel) -> tuple[float, int]:
-        """A model's median ambient light and over how many pixels a stripe's light is summed; computed once a model."""
+        """A model's median ambient light, and the number of pixels over which a stripe's light is summed; kept."""
         if self._light is None or self._light[0] is not model:
             line_px = 2 * signal_reach(line_profile(model.line_sigma_px)) + 1
             self._light = model, float(np.median(model.ambient)), line_px
@@ -94,7 +95,7 @@ def _judge(setting: LearningSetting, workers: RowWorkers) -> SearchTables:
 
 
 class _LikelihoodCounter:
-    """Counts the first sweep completely, and judges the columns of every later one as they come."""
+    """Counts sweeps completely without a model or beyond BYTE_EXPOSURES exposures; else judges columns as they come."""
 
     def __init__(self, of: Likelihood, layout: SweepLayout, geometry: SweepGeometry, workers: RowWorkers) -> None:
         self._of, self._layout, self._geometry, self._workers = of, layout, geometry, workers

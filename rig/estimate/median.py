@@ -16,7 +16,7 @@ REACH = 2
 MEDIAN_EFFICIENCY = 1.2533
 """Standard deviation of a median over that of a mean, sqrt(pi / 2), for normal errors."""
 SURE = np.float32(0.999999)
-"""Largest confidence of an answer in the probability that none of several is right: its logarithm stays finite."""
+"""Limit of each confidence in the probability that none of several answers is right: log(1 - confidence) is finite."""
 
 
 @numba.njit(cache=True, nogil=True)
@@ -63,10 +63,10 @@ def median_filter(stripes: StripeTable, reference_px: Float64, *, coupled: bool 
     """Stripe table with x_px from the 5x5 median of its disparity, and with confidence and x_sd_px to match.
 
     reference_px: (rows, columns), the position of the column's line at a fixed depth; where NaN, the result is NaN.
-    Confidence becomes the share of the neighbours' confidence that belongs to answers within 1 px of the median, times
-    the probability that at least one of those is right. For coupled answers their mean confidence takes the place of
-    that probability, since answers that influence each other also agree where nothing is lit. x_sd_px becomes the
-    standard deviation of a median of those answers.
+    The new confidence is a product. First factor: the share of the confidence in the 5x5 that belongs to answers within
+    1 px of the median. Second factor: the probability that at least one of these answers is right; if `coupled`, their
+    mean confidence, since answers that influence each other also agree where nothing is lit. x_sd_px becomes the
+    standard deviation of a median of these answers.
     """
     reference = reference_px.astype(np.float32)
     out = np.full((3, *stripes.x_px.shape), np.nan, np.float32)

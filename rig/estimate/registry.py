@@ -1,7 +1,7 @@
 """Stripe estimators by name, which turn the counts of a sweep into a stripe table.
 
-`create_estimator` makes a fresh one. `recalling` makes one that estimates earlier maps again, bit for bit, from the
-learned state that was kept with each of them.
+`create_estimator` makes one that has learned nothing yet. `recalling` makes one that estimates earlier maps again, bit
+for bit, from the learned state that was kept with each of them.
 """
 
 from collections.abc import Sequence
@@ -50,11 +50,11 @@ class Estimator(Protocol):
         ...
 
     def counter(self, layout: "SweepLayout", geometry: "SweepGeometry") -> "Counter":
-        """A counter whose finished sweeps go to `estimate`. geometry: of every sweep, with columns at their centres."""
+        """A counter whose finished sweeps go to `estimate`. geometry: the nominal one, the same for all sweeps."""
         ...
 
     def estimate(self, sweep: Any, geometry: "SweepGeometry") -> "StripeTable":
-        """Stripe table of a sweep: what a counter of this estimator has finished, or a `CountVolume`."""
+        """Stripe table of one sweep. sweep: the result of a counter of this estimator, or a `CountVolume`."""
         ...
 
 
@@ -98,8 +98,8 @@ def _learning(name: str, threads: int, *, learns: bool, temporal_prior: bool) ->
 
 
 class Recalled:
-    """Estimates each map with its own state, and further maps with the last state. of: an estimator that learns
-    nothing. states: at least one."""
+    """Estimates each map with its own state, and maps beyond these with the last state. of: an estimator of LEARNING
+    that does not learn any more. states: at least one."""
 
     def __init__(self, of: LearnsFromStream, states: Sequence[Learned]) -> None:
         self._states, self._of = list(states), of

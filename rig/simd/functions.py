@@ -1,12 +1,12 @@
-"""Logarithm, powers of e and 2, and the error function of LANES float32 at once; the C library computes one at a time.
+"""Logarithm, powers of e and 2, and the error function of 16 float32 at once; the C library computes one at a time.
 
 `logarithm` and `exponential` split off a power of two and sum a series for the rest. `error_function` is Abramowitz
 and Stegun 7.1.28. Each states its error.
 
-`powers` turns scores into likelihoods. Scores are int16; `units` = 128 >> shift of them make an octave, a factor of 2.
-2^(score / units) is read from the bits of a bfloat16, which is linear between powers of two. The result is exact where
-a score lies a whole number of octaves above the zero level, and elsewhere up to 6 % too large, 4 % on average
-(`MEAN_EXCESS`).
+`powers` turns scores into likelihoods 2^(score / units). Scores are int16, and `units` = 128 >> shift. Shifted left by
+`shift` bits, a score is read as the bits of a bfloat16 (`rig.simd.vectors`), whose value is linear between powers of
+two. The result is exact where a score lies a whole number of octaves (factors of 2) above the score that becomes 0, and
+elsewhere up to 6 % too large, 4 % on average (`MEAN_EXCESS`).
 """
 
 import math
@@ -34,10 +34,10 @@ from rig.simd.vectors import (
 _MANTISSA_BITS: Final = 23
 _BIAS: Final = 127
 _ROOT_HALF: Final = 0x3F3504F3
-"""Bits of sqrt(1/2) as a float32: mantissas from sqrt(1/2) to sqrt(2) have the smallest logarithms."""
+"""Bits of sqrt(1/2) as a float32: mantissas from sqrt(1/2) to sqrt(2) have the logarithms nearest to 0."""
 _LOG2_E, _LN_2 = 1.0 / math.log(2.0), math.log(2.0)
 _LEAST, _MOST = -87.0, 88.0
-"""Least and largest power of e that a float32 holds."""
+"""Limits of the exponent: e^-87 and e^88 are still normal float32 numbers."""
 _TO_WHOLE: Final = 1.5 * 2.0**_MANTISSA_BITS
 """Adding and then subtracting this number rounds to the nearest whole number."""
 _ERF: Final = 0.0000430638, 0.0002765672, 0.0001520143, 0.0092705272, 0.0422820123, 0.0705230784
@@ -60,16 +60,16 @@ def _power(builder: Any, a: Any) -> Any:
 
 
 exponents = emitted(FLOAT32(FLOAT32), lambda builder, a: builder.sitofp(_exponents(builder, a), FLOAT32.llvm))
-"""exponents(a): exponents of the powers of two nearest to the lanes, as float32; lanes must be at least 1.2e-38."""
+"""exponents(a): exponent of the power of two nearest in ratio to each lane, as float32; lanes: at least 1.2e-38."""
 mantissas = emitted(FLOAT32(FLOAT32), _mantissas)
-"""mantissas(a): the lanes divided by those powers of two, sqrt(1/2) to sqrt(2)."""
+"""mantissas(a): each lane divided by 2^exponents(a), sqrt(1/2) to sqrt(2)."""
 power_of_two = emitted(FLOAT32(FLOAT32), _power)
 """power_of_two(a): 2 to the power of the lanes, whole numbers from -126 to 127."""
 
 
 @numba.njit(forceinline=True)
 def logarithm(a):  # type: ignore[no-untyped-def]
-    """Natural logarithm of positive lanes. Error: 2e-7 times its size, or 2e-7 if its size is below 1."""
+    """Natural logarithm of positive lanes. Error: 2e-7 where |logarithm| < 1, else 2e-7 of the logarithm."""
     part = mantissas(a)
     ratio = (part - 1.0) / (part + 1.0)
     square = ratio * ratio
@@ -105,20 +105,20 @@ def error_function(a):  # type: ignore[no-untyped-def]
 BIAS: Final = np.int16(127 << 7)
 """Bits of 1.0 as a bfloat16."""
 MEAN_EXCESS: Final = np.float32(1.040684)
-"""Mean of (1 + f) / 2^f over f in 0..1, the factor by which a term is too large on average."""
+"""Mean of (1 + f) / 2^f over f in 0..1: the factor by which a result of `powers` is too large on average."""
 
 
 @numba.njit(inline="always")
 def lift_to_powers(best, shift):  # type: ignore[no-untyped-def]
-    """Number to add to scores so that 0 lies 127 octaves below each lane's best score, or at the least int16."""
+    """Number to add to scores, saturated int16, so that each lane's best score becomes 1.0 (less if it is very low)."""
     return add_saturated(sub_saturated(zero_int16(), best), np.int16(np.int64(BIAS) >> shift))
 
 
 @numba.njit(inline="always")
 def powers(scores, lift, shift):  # type: ignore[no-untyped-def]
-    """2^(score / units) of 16-bit lanes as float32 in the order UNPACKED, up to a factor common to all.
+    """2^(score / units) of 16-bit lanes as float32, times a factor that depends only on `lift`.
 
-    lift: see `lift_to_powers`; scores below the zero level give 0.
+    lift: see `lift_to_powers`; scores below -lift give 0. The lanes are in the order UNPACKED of `rig.simd.vectors`.
     """
     return from_bfloat16_unpacked(larger(add_saturated(scores, lift), np.int16(0)) << shift)
 

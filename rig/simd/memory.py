@@ -1,10 +1,10 @@
-"""Reads and writes of lanes and numbers at an address in memory, and arrays that begin at a cache line.
+"""Reads and writes of vectors and single numbers at an address in memory, and arrays that begin at a cache line.
 
 Addresses are used instead of arrays because numba counts references to every array that a compiled function gets. In
-the functions for one image row this takes many times as long as the work itself. So a caller makes a named tuple of
-arrays, keeps it alive and passes its `pointers`; inside a kernel there is `address_of`. Nothing here checks that an
-index lies inside the array. In an array that begins at a cache line (`aligned_zeros`), a vector of 32 bytes never lies
-across two cache lines, which would have to be read separately.
+the functions for one image row the counting takes many times as long as the work itself. So a caller makes a named
+tuple of arrays, keeps it alive and passes its `pointers`; inside a kernel `address_of` gives the address of an array.
+Nothing here checks that an index lies inside the array. In an array that begins at a cache line (`aligned_zeros`), a
+vector of 32 bytes at a multiple of 32 bytes lies in one cache line, so that one line is read for it, not two.
 """
 
 from typing import Any, Final, TypeVar
@@ -24,7 +24,7 @@ Arrays = TypeVar("Arrays", bound=tuple[Any, ...])
 
 
 def pointers(arrays: Arrays) -> Arrays:
-    """A copy of a named tuple for kernels, with each array replaced by its address, also in tuples within it.
+    """A copy of a named tuple for kernels, with each array replaced by its address, also in named tuples within it.
 
     Arrays must be C-contiguous, and the caller must keep them alive.
     """
@@ -39,12 +39,12 @@ def _pointer_to(value: Any) -> Any:
 
 @numba.njit(inline="always")
 def address_of(array):  # type: ignore[no-untyped-def]
-    """Address of an array's first element. It is signed, since sums of signed and unsigned numbers would be floats."""
+    """Address of an array's first element. Signed: numba makes a float of a signed plus an unsigned number."""
     return np.int64(array.ctypes.data)
 
 
 def _pointer(builder: Any, address: Any, index: Any, element: Any, whole: Any) -> Any:
-    """Pointer of type `whole` to element number `index` of the elements at `address`."""
+    """Pointer of type `whole` to item `index` of an array at `address`, whose items are of type `element`."""
     return builder.bitcast(builder.gep(builder.inttoptr(address, element.as_pointer()), [index]), whole.as_pointer())
 
 
@@ -89,14 +89,14 @@ store_four = _writer(FOUR, _F32, FOUR.llvm, 4)
 _WHOLE = (types.uint8, _I8, 1), (types.int16, _I16, 2), (types.int32, _I32, 4), (types.int64, _I64, 1)
 _NUMBERS = *_WHOLE, (types.float32, _F32, 4)
 read_byte, read_int16, read_int32, read_int64, read_float32 = (_reader(kind, a, a, at) for kind, a, at in _NUMBERS)
-"""read_...(address, index): number `index` of those at `address`."""
+"""read_...(address, index): the number at `index` in the array at `address`."""
 write_byte, write_int16, write_int32, write_int64, write_float32 = (_writer(kind, a, a, at) for kind, a, at in _NUMBERS)
-"""write_...(address, index, number): write number `index` of those at `address`."""
+"""write_...(address, index, number): write the number at `index` in the array at `address`."""
 
 
 @numba.njit(cache=True, nogil=True)
 def copy_floats(source: int, to: int, number: int) -> None:
-    """Copy `number` float32 from one address to another, since numba copies slices number by number."""
+    """Copy `number` float32 from address `source` to address `to`, 16 at a time; numba copies slices one by one."""
     whole = number - number % LANES
     for i in range(0, whole, LANES):
         store_float32(to, i, load_float32(source, i))
@@ -137,9 +137,9 @@ def _prefetch(to_write: int, locality: int) -> Any:
 
 
 prefetch = _prefetch(0, 2)
-"""prefetch(address): fetch the cache line there into the second-level cache; the address need not be valid."""
+"""prefetch(address): fetch the cache line at an address, valid or not, into the second-level cache."""
 prefetch_to_write = _prefetch(1, 3)
-"""prefetch_to_write(address): fetch the cache line there into the first-level cache, for this core alone."""
+"""prefetch_to_write(address): fetch the cache line into the first-level cache, out of other cores' caches."""
 
 
 load_widened = emitted(
@@ -161,7 +161,7 @@ CACHE_LINE: Final = 64
 
 
 def aligned_zeros(shape: tuple[int, ...], dtype: DTypeLike) -> NDArray[Any]:
-    """Zeros of that shape, contiguous, beginning at a cache line."""
+    """A contiguous array of zeros that begins at a cache line."""
     size = int(np.prod(shape, dtype=np.int64)) * np.dtype(dtype).itemsize
     memory = np.zeros(size + CACHE_LINE, np.uint8)
     begin = -memory.ctypes.data % CACHE_LINE

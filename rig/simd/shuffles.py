@@ -2,9 +2,9 @@
 numbers.
 
 Reductions (`largest_of_rows`, `totals_of_rows`) take LANES rows at once and give one number per row, which becomes one
-lane of the answer. If they went row by row, every step would wait for the one before. `fetch_eights` and
-`spread_eights` take eight numbers from each of LANES addresses and transpose them, so that lane i of eight vectors
-holds those of address i.
+lane of the result. If they went row by row, every step would wait for the one before. `fetch_eights` and
+`spread_eights` read eight numbers at each of LANES places in memory and transpose them: vector d gets the d-th number
+of every place, its lane i that of place i.
 """
 
 from collections.abc import Callable, Sequence
@@ -39,7 +39,7 @@ def _interleaved(first: int) -> Any:
 
 
 first_row_pairs, second_row_pairs = _interleaved(0), _interleaved(LANES)
-"""first_row_pairs(a, b), second_row_pairs(a, b): bytes of a and b alternately, of the first or the last 16 of each."""
+"""first_row_pairs(a, b), second_row_pairs(a, b): bytes of a and b alternately, the first 16 or the last 16 of each."""
 
 
 def _shuffled(source: Sequence[int]) -> Any:
@@ -96,7 +96,7 @@ def _equal_bits(builder: Any, address: Any, index: Any, step: Any, number: Any) 
 
 
 equal_bits = emitted(types.uint32(types.intp, types.intp, types.intp, types.int16), _equal_bits)
-"""equal_bits(address, index, step, number): bit i, 0 to 7, is set where the int16 at index + i step is the number."""
+"""equal_bits(address, index, step, number): bit i, 0 to 7, is set where the int16 at index + i * step is the number."""
 _NO = ir.Constant(ir.IntType(1), 0)
 lowest_bit = emitted(types.uint32(types.uint32), lambda builder, mask: builder.cttz(mask, _NO))
 """lowest_bit(mask): index of the lowest bit that is set; 32 if no bit is set."""
@@ -121,7 +121,7 @@ first_equal = emitted(
 
 
 reversed_lanes = _shuffled(range(LANES - 1, -1, -1))
-"""reversed_lanes(a): the last lane first."""
+"""reversed_lanes(a): the lanes in reverse order."""
 last_everywhere = _shuffled([LANES - 1] * LANES)
 """last_everywhere(a): the highest lane copied to all lanes."""
 
@@ -131,7 +131,7 @@ FOLDED: Final = LANES // 2
 
 
 def _unpacked(builder: Any, a: Any, b: Any, combine: Callable[[Any, Any], Any]) -> Any:
-    """Numbers of a and b alternately, the lower half of each 128 bits combined with the upper half."""
+    """Combine the lower half of each 128 bits with the upper half, in a and in b; results of a and b alternate."""
     count, block = a.type.count, 128 // (16 if isinstance(a.type.element, ir.IntType) else 32)
     parts = []
     for first in (0, block // 2):
@@ -142,7 +142,7 @@ def _unpacked(builder: Any, a: Any, b: Any, combine: Callable[[Any, Any], Any]) 
 
 
 def _reduced(builder: Any, rows: Sequence[Any], combine: Callable[[Any, Any], Any]) -> Any:
-    """One number per row, in order, for as many rows as a vector holds numbers."""
+    """Combine the numbers of each row into one, in the order of the rows: as many rows as numbers in a row."""
     count = rows[0].type.count
     block = count // 2
     halves = []
@@ -201,7 +201,7 @@ _EIGHT_FLOATS = ir.VectorType(ir.FloatType(), EIGHT)
 
 
 def _turned(builder: Any, rows: list[Any]) -> list[Any]:
-    """Columns of eight rows of eight; all steps but the last stay within halves, which is quicker."""
+    """The columns of eight rows of eight numbers. All steps but the last move numbers within half a vector: quicker."""
 
     def mixed(a: Any, b: Any, places: list[int]) -> Any:
         return builder.shuffle_vector(a, b, place_list([*places, *(i + EIGHT // 2 for i in places)]))
@@ -237,7 +237,7 @@ def _fetch_eights(builder: Any, places: Any, behind: Any, to: Any) -> None:
 fetch_eights = emitted(types.void(types.intp, types.intp, types.intp), _fetch_eights)
 """fetch_eights(places, behind, to): write eight vectors of sixteen float32 to address `to`.
 
-places: address of sixteen addresses. Lane i of the vectors gets the eight float32 `behind` bytes after address i.
+places: address of sixteen addresses. Lane i of vector d gets the d-th float32 from `behind` bytes after address i on.
 """
 
 
@@ -254,4 +254,4 @@ def _spread_eights(builder: Any, source: Any, to: Any) -> None:
 
 
 spread_eights = emitted(types.void(types.intp, types.intp), _spread_eights)
-"""spread_eights(source, to): write eight vectors of float32 to `to`; lane i gets the i-th eight bytes at `source`."""
+"""spread_eights(source, to): write eight vectors of float32: lane i of vector d gets byte 8 i + d at `source`."""

@@ -1,6 +1,6 @@
 """Sixteen lanes as one numba value: explicit vector arithmetic for the code that takes most of the time.
 
-LLVM's own vectoriser fails on the search along a row (several short loops over one small buffer), so its kernels use
+LLVM's own vectoriser fails on the search along a row (several short loops over one small buffer), so that search uses
 vectors explicitly: `Lanes` is an LLVM vector of 16 numbers, which LLVM maps to the processor's instructions (AVX2,
 AVX-512, NEON). Everything here is for code compiled with `numba.njit`. Lanes live in registers and cannot leave a
 kernel. `rig.simd.memory` reads and writes them; `rig.simd.shuffles` moves numbers between lanes.
@@ -83,7 +83,7 @@ def place_list(indices: Iterable[int]) -> Any:
 
 
 def vector_name(vector: ir.VectorType) -> str:
-    """The name of a vector type as it appears in names of LLVM's intrinsics."""
+    """The name of a vector type as it appears in names of LLVM's intrinsics, such as v16i16."""
     return f"v{vector.count}" + ("f32" if isinstance(vector.element, ir.FloatType) else f"i{vector.element.width}")
 
 
@@ -200,7 +200,7 @@ square_root = emitted(FLOAT32(FLOAT32), lambda b, a: called(b, f"llvm.sqrt.{vect
 
 
 def _has_avx2() -> bool:
-    """Whether numba compiles for a processor with AVX2: this one, unless its settings name another."""
+    """Whether the processor that numba compiles for has AVX2: this one, or the one that numba's settings name."""
     settings: Any = config
     if settings.CPU_NAME is None and settings.CPU_FEATURES is None:
         return bool(binding.get_host_cpu_features().get("avx2", False))

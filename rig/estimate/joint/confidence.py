@@ -8,11 +8,12 @@ Three things can be wrong with an answer, and each has its factor:
                / (1 + exp(C - D ln contrast' + hole            there is no stripe: haze ends, nothing shines
                           + g (E - F ln odds) + H ((1 - g)^2 missing + e unseen)))
 
-- margin: how much more the next best position costs or, after a vote, how much neighbours favour this one, in cost over
-  UNITS. apart: share of the pairs of opposite neighbours that put the answer elsewhere (`apart_row`).
-- contrast: mean light of the 3 x 3 neighbours on the surface above the *whole* haze before the stripe, over the noise
-  of this mean; contrast' = max(contrast + 3, 1). The whole haze, because an answer can lie a little before the end of
-  haze, and half of the haze would then be taken for light. hole: by how much contrast is below -FAR_BELOW, 30 at most.
+- margin: how much more the next best position costs or, after a vote, how much neighbours favour this one, in cost
+  divided by UNITS. apart: share of the pairs of opposite neighbours that put the answer elsewhere (`apart_row`).
+- contrast: mean light of the 3 x 3 neighbours on the surface above the *whole* haze before the stripe, divided by the
+  noise of this mean; contrast' = max(contrast + 3, 1). The whole haze, because an answer can lie a little before the
+  end of haze, and half of the haze would then be taken for light. hole: by how much contrast is below -FAR_BELOW, 30 at
+  most.
 - odds: ratio of answers around that agree to those that do not. Odds count the more, the more haze there is, by the
   factor g = k / (k + SOME_HAZE) with k photons of haze per pixel in all exposures. In clear air only a stripe gives a
   margin, and small things, whose surroundings do not agree, are as certain as others.
@@ -26,8 +27,8 @@ Three things can be wrong with an answer, and each has its factor:
 Agreement distinguishes a surface from nothing at all. Without a stripe every row finds the place where its noise looks
 most like one, and four paths tie those answers into streaks but not into surfaces. Each answer has a number of 5 x 5
 neighbours on the same surface (`count_neighbours`); odds come from the sum of these numbers over 7 x 7 answers
-(`agreement_row`). Thin and slanted things have few such neighbours. But there too, a wrong answer is usually not at the
-mean of opposite neighbours (`apart_row`).
+(`agreement_row`). Thin and slanted things have few such neighbours. There a wrong answer usually shows by not being at
+the mean of opposite neighbours (`apart_row`).
 
 Arrays are float32 (rows, columns), numbers of neighbours int16. Source of the constants: WIDER, B, C, D, E and F are
 fitted by maximum likelihood to random cluttered scenes of a second simulator, K = 1 to 30 in air and fog, with all
@@ -60,7 +61,7 @@ NEIGHBOURS: Final = 2
 AROUND: Final = 3
 """Rows and columns to either side over which the numbers of neighbours are summed."""
 OPPOSITE: Final = 2, 4
-"""Rows and columns to the neighbours that lie opposite each other."""
+"""Distances, in rows and columns, from an answer to the neighbours that lie opposite each other."""
 ASKED: Final = 4 * len(OPPOSITE)
 """Number of pairs of opposite neighbours: along rows, columns and both diagonals."""
 _ANYWHERE: Final = np.float32(1e6)
@@ -306,7 +307,7 @@ def _ending(at, width, c):  # type: ignore[no-untyped-def]
 
 @numba.njit(forceinline=True)
 def _number(at, width, c):  # type: ignore[no-untyped-def]
-    """Number of 3 x 3 answers on the surface, this one included."""
+    """Number of the 3 x 3 answers around each answer, itself included, that lie on its surface."""
     return larger_float(load_float32(at, _LIT * width + c), zero_float32() + 1.0)
 
 

@@ -5,23 +5,25 @@ light. The light from `rig.estimate.joint.place.light` is the sum of the pixels'
 saturate; bright stripes would be taken for dimmer ones with a stronger halo. Here the counts n of K frames of all
 pixels around a stripe and around its 5 x 5 neighbours on the same surface are explained by one amplitude a,
 
-    flux = base + a scale (share + glow),   log-likelihood = sum n log(1 - exp(-flux)) - (K - n) flux
+    flux = base + a scale (psi + glow),     log-likelihood = sum n log(1 - exp(-flux)) - (K - n) flux
 
-with haze and ambient light as base. The log-likelihood is concave in a and its slope convex, so Newton's method
-converges from an amplitude that is too small. Saturated pixels give no information, those beside them do. If the
-amplitude is hardly more than its noise, or neighbours do not agree on it, the light of a stripe is unknown and the
-stripe is not used. Nor is a stripe with 2 photons per exposure or more in one pixel.
+with haze and ambient light as base, psi the share of the line in the pixel, and glow that of the halo in a pixel at the
+stripe. The log-likelihood is concave in a and its slope convex, so Newton's method converges from an amplitude that is
+too small. Saturated pixels give no information, those beside them do. If the amplitude is hardly more than its noise,
+or neighbours do not agree on it, the light of a stripe is unknown and the stripe is not used. Nor is a stripe with 2
+photons per exposure or more in one pixel.
 
 The fit (`add_equations`, `solve`). The counts beside a stripe of s photons, at the distance d along the row, show
 
     flux = ambient + offset + G haze(w)                 before the stripe
          = ambient + offset + share(w) G haze(w)        behind it,      on both sides + s rho(w, d)
 
-with w the path inverse depth, and G and rho as in `rig.estimate.row.inputs`. Behind stripes the haze is the model's. So
-the flux is linear in haze (BINS), share (HALO_NODES), halo (HALO_NODES, reaches) and offset. One weighted least squares
-fit (float64, no number negative but the offset, which is 0 if there are dark frames) separates them, since the halo
-follows the brightness of each stripe and the haze does not. Means over the pixels behind and before stripes could not
-do that. Later maps are tested for whether a halo has appeared or vanished.
+with w the path inverse depth, share(w) the ratio of the level behind the stripe to the haze, and G and rho as in
+`rig.estimate.row.inputs`. Behind stripes, haze(w) is taken from the present model. So the flux is linear in haze
+(BINS), share (HALO_NODES), halo (HALO_NODES, reaches) and offset. One weighted least squares fit (float64) separates
+them, since the halo follows the brightness of each stripe and the haze does not; means over the pixels before and
+behind stripes could not separate them. Only the offset may be negative; it is 0 if there are dark frames. Later maps
+are tested for whether a halo has appeared or vanished.
 """
 
 import math
@@ -150,7 +152,7 @@ def solve(matrix: Float64, right: Float64, free: int) -> Float64:
 REACH: Final = 2
 """Rows and columns to either side whose stripes on the same surface help to find the light of a stripe."""
 LEAST_ASKED: Final = 10
-"""Least number of stripes on the same surface, of 25 with the stripe itself, with which its light is known."""
+"""A stripe's light is known only if so many of the 5 x 5 stripes around it, itself included, lie on its surface."""
 LEAST_SURE: Final = 4.0
 """The light is known only if it exceeds this many standard deviations of its noise."""
 DISAGREED: Final = 3.0
@@ -171,7 +173,7 @@ def likeliest_light(
     counts: Counts, n_frames: Int32, sweep: Sweep, state: RowState, shares: Float32, x_px: Float32, places: Places,
     rows: Int32, columns: Int32, first_line: int, last_line: int, light: Float32, known: Bools,
 ) -> None:  # fmt: skip
-    """Fill light, photons per exposure, and known for stripes first_line..last_line-1 of those at (rows, columns).
+    """Fill `light` (photons per exposure) and `known`, items first_line..last_line-1, for stripes at (rows, columns).
 
     counts: (columns, rows, window); shares: of `profile_table`; x_px: (rows, columns), of all stripes.
     """
@@ -268,7 +270,7 @@ def bright_lines(
     volume: CountVolume, tables: JointTables, stripes: StripeTable, places: Places, workers: RowWorkers,
     number: int = DETECT_LINES,
 ) -> BrightLines:  # fmt: skip
-    """Lines of a map with a stripe of known light, out of about `number` with a clear stripe, evenly spread.
+    """Of about `number` lines with a clear stripe, evenly spread over a map: those whose stripe has a known light.
 
     tables: those that the map was made with; places: of its stripes.
     """
@@ -299,7 +301,8 @@ def learn_first_halo(
 
 def learn_next_halo(setting: LearningSetting, seen: BrightLines, workers: RowWorkers) -> RowModel:
     """The model of a later lesson. A halo is added when the map begins to show one, and removed when it shows none.
-    A map with hardly a stripe of known light changes nothing.
+    Nothing changes with fewer than FEWEST_LIGHTS stripes of known light, with several laser lines at once, or in a
+    model without a halo whose extinction is unknown.
 
     A halo that stays is not changed. If it were learned anew from so few lines in lesson after lesson, halo, haze and
     the level behind stripes would drift against each other (in steady fog errors grow by 10 to 25 % in eight maps).

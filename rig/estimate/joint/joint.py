@@ -3,12 +3,13 @@
 Each label (candidate position) of a row and column (`rig.estimate.joint.labels.grid`) gets a cost from the counts
 (`rig.estimate.joint.labels.costs`, a fast form of `rig.estimate.row.likelihood`). The cost includes the halo, if there
 is one (`rig.estimate.joint.labels.halo_rows`), and the previous map, if requested (`rig.estimate.joint.temporal`).
-Under a halo it is averaged with a second cost that needs no model of the medium (`rig.estimate.joint.labels.contrast`).
-Costs are tied to those of the neighbours along four paths (`rig.estimate.joint.paths`); weak answers are decided by a
-vote of all neighbours (`rig.estimate.joint.vote`). The answer of each row and column is then refined to a position
-between labels, with the help of neighbours on its surface (`rig.estimate.joint.place.place`), and gets a confidence
-(`rig.estimate.joint.confidence`). Each row is searched for a second line (`rig.estimate.joint.second_returns`). The
-model of light and medium is learned row by row first, as by `likelihood`, then from the map's own stripes.
+Under a halo the cost is averaged with a second one that needs no model of the medium
+(`rig.estimate.joint.labels.contrast`). Costs are tied to those of the neighbours along four paths
+(`rig.estimate.joint.paths`); weak answers are decided by a vote of all neighbours (`rig.estimate.joint.vote`). The
+answer of each row and column is then refined to a position between labels, with the help of neighbours on its surface
+(`rig.estimate.joint.place.place`), and gets a confidence (`rig.estimate.joint.confidence`). Each row is searched for a
+second line (`rig.estimate.joint.second_returns`). The model of light and medium is learned row by row first, as by
+`likelihood`, then from the map's own stripes.
 """
 
 from dataclasses import replace
@@ -45,7 +46,7 @@ LESSONS = 2
 HALO_LESSONS = 4
 """Number of these lessons under a halo."""
 AGREE_PX = np.float32(1.0)
-"""Under a halo, a stripe of the first map is learned from only if its contrast alone puts it within so many pixels."""
+"""Under a halo, a first map's stripe is learned from only if contrast alone puts it at most this far away, in px."""
 TRUSTED = np.float32(0.5)
 """Under a halo, the amplitudes are learned only from stripes of more trust than this."""
 QUIET_COLUMNS = 8
@@ -129,7 +130,7 @@ class Joint:
     ) -> RowModel:  # fmt: skip
         """The model learned from stripes that are estimated with `model`.
 
-        intensity: of the volume. witness_px: x_px of `_by_contrast`, from which the stripes must not differ.
+        intensity: of the volume. witness_px: x_px of `_by_contrast`; stripes more than AGREE_PX from it are not used.
         """
         setting = LearningSetting(model, geometry, volume.exposures, volume.dark_counts is not None)
         tables = tables_of(setting, self._workers, contrast=witness_px is not None)
@@ -162,7 +163,7 @@ class Joint:
         return x_px
 
     def _teaching(self, volume: CountVolume, tables: JointTables, stripes: StripeTable) -> StripeTable:
-        """The table with the trust of the first map's lessons (`fill_trust`) in place of the confidence."""
+        """The stripe table with the trust of `fill_trust` in place of the confidence."""
         memory, trust = self._room(tables.grid), np.empty_like(stripes.confidence)
         self._workers.over(
             len(trust),

@@ -1,19 +1,20 @@
 """Reads a map's answers and what can be learned from them, compiled: positions, trust in each, and quiet pixels behind
 them.
 
-The trust of the first map's lessons in an answer (`fill_trust`, float32 (rows, columns)) is
+When the model is learned from the first map, each answer counts with a trust (`fill_trust`, float32 (rows, columns)):
 
     trust = erf(3 px / (sqrt 2 sd)) / (1 + exp(A - B margin)) / (1 + C z^-D)
 
-with the margin in cost over UNITS. This is the confidence of `rig.estimate.joint.confidence` with three changes. z is
-the stripe's light above the mean of the haze before and behind it, pooled over neighbours, over its noise. Whether the
-answers around agree does not count. And the answer need only be on the right surface, within 3 px. Later lessons use
-the table's confidence, since the model is known by then.
+with the margin in cost divided by UNITS. This is the confidence of `rig.estimate.joint.confidence` with three changes.
+First, z takes the place of contrast': the light of the stripe above the mean of the haze before and behind it, divided
+by its noise, both pooled over neighbours. Second, it does not matter whether the answers around agree. Third, the
+answer need only be on the right surface, within 3 px. Lessons from later maps use the confidence of the stripe table,
+since the model is known by then.
 
 B, C and D are fitted by maximum likelihood to lessons on random scenes of a second simulator, in clear air, thin and
 dense fog, under a halo and with hot pixels at 1 to 10 exposures, with places without a stripe counted as wrong. A is
 half of its fitted value, because too little trust makes a worse model: an answer without trust is judged by its own row
-alone, and the answers left out are those that show what the model does not know yet.
+alone, and it is the answers with too little trust that show what the model does not know yet.
 """
 
 import math
@@ -78,7 +79,7 @@ def read_positions(
     x_far: Float64, n_frames: Int32, side: int, width: int, answer: LabelAnswers, first_row: int, last_row: int,
     x_px: Float32, distance: Float32,
 ) -> None:  # fmt: skip
-    """Fill x_px (rows, columns) from the answers' labels, and its distance from x_far; NaN without data.
+    """Fill x_px (rows, columns) from the answers' labels, and distance = x_px - x_far; NaN without data.
 
     An answer in the outer half of the first or last of `width` pixels gets margin 0 in `answer`. A stripe beyond that
     pixel has no label and leaves the row dark. In a dark row the outermost label seems far better than all others.
@@ -102,8 +103,8 @@ def add_quiet(
 
     Pixels without a ray are left out. halo: (BINS, pixels) of `halo_shares`, without pixels if there is no halo. With a
     halo, light also falls behind a stripe of `signal` photons: the expected halo and pedestal are subtracted from the
-    ones. Pixels where these exceed `most_light`, photons per exposure, are left out. So are stripes that saturate their
-    pixels: their halo is brighter than expected, and the excess would be taken for ambient light.
+    ones. Pixels where both together exceed `most_light`, photons per exposure, are left out. So are stripes that
+    saturate their pixels: their halo is brighter than expected, and the excess would be taken for ambient light.
     """
     width, several = sweep.u.shape[1], sweep.others.shape[1] > 0
     # Local names: each use of a tuple in the loop would count references to all of its arrays.

@@ -10,8 +10,9 @@ and the total of a label is C plus the messages m of the four paths, left, right
 `along_rows` leaves the messages of two paths; `along_columns` adds the other two and reads the answers from the totals
 (`rig.estimate.joint.winner`).
 
-Labels stay in order in memory, and neighbours are unaligned loads from the first cache, since shuffling them in
-registers gains nothing. Several paths are processed at once, because each step of a path waits for the one before.
+Labels stay in order in memory. Neighbouring labels are read by unaligned loads from the first-level cache, since
+shuffling them in registers gains nothing. Several paths are processed at once, because each step of a path waits for
+the one before.
 """
 
 from typing import Final
@@ -25,12 +26,12 @@ from rig.simd.memory import address_of, load_bytes, prefetch, read_byte, store_b
 from rig.simd.vectors import add_saturated_unsigned, smaller_unsigned, smallest_byte, sub_saturated_unsigned, zero_bytes
 
 _SIDE: Final = 2 * VECTOR
-"""Bytes before and behind the labels of a path, whole cache lines: labels beyond the ends, and its least L."""
+"""Bytes before and behind the labels of a path, a cache line each. All are LARGEST but the least L, at _LEAST_AT."""
 _LEAST_AT: Final = -VECTOR
 CHUNK: Final = 16
 """Columns that are stepped through together: enough that none waits for its last step, few enough for the caches."""
 _AHEAD: Final = 3
-"""Rows ahead of which memory is prefetched: each lies on a page of its own, so the processor does not prefetch it."""
+"""Memory is prefetched this many rows ahead: each row lies on another page, so the processor does not prefetch it."""
 _SET, _ADD, _TOTAL = 0, 1, 2
 
 
@@ -39,7 +40,7 @@ TWO: Final = 24
 THREE: Final = 30
 JUMP: Final = 40
 """Costs of a change of label between neighbours, P1, P2, P3 and J of the module, in units of
-`rig.estimate.joint.labels.costs`. A unit is more nats with more exposures, so a change then costs more nats."""
+`rig.estimate.joint.labels.costs`. With more exposures a unit stands for more nats, so a change costs more nats."""
 
 
 @numba.njit(cache=True, nogil=True)
@@ -56,7 +57,7 @@ def _paths_in(memory):  # type: ignore[no-untyped-def]
 
 @numba.njit(forceinline=True)
 def _begin(path, paths, labels):  # type: ignore[no-untyped-def]
-    """Begin a number of paths: there is no message to their first pixel."""
+    """Begin this number of paths: L is 0 before their first pixel, so that no message reaches it."""
     for _ in range(2 * paths):
         for v in range(0, labels, VECTOR):
             store_bytes(path, v, zero_bytes())
@@ -66,7 +67,7 @@ def _begin(path, paths, labels):  # type: ignore[no-untyped-def]
 
 @numba.njit(forceinline=True)
 def _step(before, after, cost, message, total, hidden, labels, ahead, use):  # type: ignore[no-untyped-def]
-    """Do one step of a path: from L of its last pixel, at `before`, to L of this one, at `after`. All are addresses.
+    """Step along a path: from L of the previous pixel, at `before`, to L of this one, at `after`. All are addresses.
 
     use: _SET writes the message to `message`, _ADD adds it there; _TOTAL adds it to `message` and cost and writes the
     sum to `total`, LARGEST for labels that are `hidden`. ahead: bytes to the cost and message that are prefetched; 0:
@@ -196,7 +197,7 @@ def _go_up(
 
 @numba.njit(cache=True, nogil=True)
 def along_columns(cost: Uint8, message: Uint8, first_column: int, last_column: int, desk: Readout) -> None:
-    """Answer columns first_column..last_column-1, from what `along_rows` wrote to `message` for all rows.
+    """Find the answers of columns first_column..last_column-1, from what `along_rows` wrote to `message` for all rows.
 
     Messages from above are added to `message`. desk: pointers to the `Readout` of CHUNK columns.
     """

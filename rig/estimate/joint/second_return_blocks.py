@@ -1,13 +1,13 @@
 """Sums of light over blocks of rows and columns at equal distances from the far end, compiled, for second returns.
 
-A block is BLOCK x BLOCK lines (rows of columns). Lines are added at equal distances from the far end, in whole pixels
-(pixel 0 of distance is the leftmost), without the pixels near their stripes. Both the ones counted and those expected
-from haze and ambient light are added. With K frames of a line, and q and c the probabilities that a pixel stays dark
-under ambient light alone and under haze alone,
+A block is BLOCK x BLOCK lines; a line is one row of one column. Lines are added at equal distances from the far end, in
+whole pixels (pixel 0 of distance is the leftmost), without the pixels near their stripes. Both the ones counted and
+those expected from haze and ambient light are added. With K frames of a line, and q and c the probabilities that a
+pixel stays dark under ambient light alone and under haze alone,
 
     ones expected = sum over lines K (1 - q c) = sum over columns K (number of lines - c sum q)
 
-so lines only add up their q, left and right of the stripe, and these sums are multiplied with the block's c.
+so only the q of the lines are summed, left and right of the stripe, and these sums are multiplied with the block's c.
 Sums are float32 (block rows, block columns, pixels of distance), sixteen pixels to a vector.
 """
 

@@ -37,7 +37,7 @@ RING_PX: Final = 4
 GAP_PX: Final = 1
 """Pixels between the candidate's light and the ring."""
 LEAST_RING: Final = 0.25
-"""Least light expected per pixel on each side of the ring, over the candidate's: else too few pixels were seen."""
+"""Least ratio of the light expected per pixel on each side of the ring to the candidate's: else too few are seen."""
 STEEPER: Final = 1.5
 """Factor on the excess haze of the ring's brighter side: haze is not linear between both sides."""
 CANDIDATE: Final = np.float32(4.0)
@@ -65,8 +65,9 @@ class Candidates(NamedTuple):
 class Seconds(NamedTuple):
     """Candidates of second returns, float32 (rows, columns) each.
 
-    distance: from the far end in px, NaN if there is no candidate; ones, expected: within the line's reach of it;
-    light, moment: ones above those expected, and that times the distance from it in px; moved: see `move_seconds`.
+    distance: from the far end in px, NaN if there is no candidate; ones, expected: ones counted and expected within
+    the line's reach of the candidate; light: ones - expected; moment: the same, each pixel's multiplied by its distance
+    from the candidate in px; moved: see `move_seconds`.
     """
 
     distance: Float32
@@ -135,7 +136,10 @@ def _light_above(room: int, pixels: int, reach: int, excess: int) -> np.float32:
 
 @numba.njit(cache=True, nogil=True, error_model="numpy")
 def _stands_out(sums: Float32, i: int, reach: int) -> tuple[float, float]:
-    """Light around i above the haze that its ring shows, in standard deviations, and that haze over the learned one."""
+    """Light around i above the haze that its ring shows, in standard deviations, and that haze over the learned one.
+
+    (0, 1) if too few pixels of the ring were seen (LEAST_RING).
+    """
     n, e = sums[0, i - reach : i + reach + 1].sum(), sums[1, i - reach : i + reach + 1].sum()
     more = 1.0
     # Light that falls off to one side only is a halo of the stripe, or haze that was learned too weak.
@@ -246,7 +250,7 @@ class SecondLight(NamedTuple):
     state: without ambient light. still: float32, (rows x width) between LANES numbers at either end, the probability
     that a pixel stays dark under ambient light alone; LEFT_OUT for pixels that always fire or must not be used, which
     show neither haze nor stripes. place: of `line_places`. apart: px from a stripe within which light counts as its
-    own. reach: px to either side of a line.
+    own. reach: px to either side of a candidate over which its light is summed.
     """
 
     state: RowState

@@ -24,7 +24,7 @@ from rig.threads import RowWorkers
 
 MOST_BYTES = 4 << 30
 """Most that costs and messages of a map may take: room for 1000 columns, each searched over all of 1024 x 1024 pixels.
-Tables of a halo come on top, half as much there."""
+Tables of a halo come on top, half as much in that case."""
 
 
 class JointTables(NamedTuple):
@@ -46,7 +46,7 @@ class JointTables(NamedTuple):
     dark: bool
     settings: AnswerSettings
     rooms: dict[int, tuple[CostRoom, CostRoom]]
-    """By the first row of a thread, its working memory for costs and `pointers` to it: making them takes 0.5 ms."""
+    """For each thread, by its first row: working memory for costs and `pointers` to it. Making them takes 0.5 ms."""
     pairs: Float32
     """Pairs of `pairs_to_ask`, for maps whose columns all have frames."""
 

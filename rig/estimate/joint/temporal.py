@@ -22,7 +22,7 @@ from rig.simd.vectors import add_saturated_unsigned
 MOST = 3
 """Most that the prior adds to a label's cost, in units (`UNITS`). With 6, dark things that move would be held back."""
 SLOPE = 2
-"""Units per label of distance from the last label."""
+"""Units of cost per label of distance from the last label."""
 FREE = 1
 """Distance in labels that costs nothing: the last label has an error, and surfaces drift."""
 LEAST_SURE = 0.5
@@ -77,8 +77,7 @@ class TemporalPrior:
 
 
 def _ramps(labels: int) -> Uint8:
-    """Costs to add, uint8 (MOST + 1, 2 * labels). First index: their largest value; second: label - last label +
-    labels."""
+    """Costs to add, uint8 (MOST + 1, 2 * labels), by their largest value and by label - last label + labels."""
     away = np.abs(np.arange(2 * labels) - labels)
     ramp = SLOPE * np.maximum(away - FREE, 0)
     return np.asarray(np.minimum(ramp, np.arange(MOST + 1)[:, None]), np.uint8)

@@ -4,12 +4,12 @@ Four paths carry evidence along rows and columns only. If few photons come back,
 whole and form streaks. So an answer whose margin is below WEAK is put to the vote. Candidates are its own label and
 those of the four nearest neighbours; the winner is the one with the least
 
-    sum over 5 x 5 neighbours of margin min(|label - its label|, FAR),
+    sum over 5 x 5 neighbours n of margin_n min(|label - label_n|, FAR),
 
 unless its cost from the row's own counts exceeds that of the old label by more than OBJECTION. The new margin is the
-sum of the neighbours' margins for the label, less the sum of those for other labels, over the number of neighbours and
-at least 0. So where streaks disagree, margins are small. Labels are int16, margins uint8 in units of cost; sums fit 16
-bits (SHARE).
+sum of the neighbours' margins for the label, less the sum of those for other labels, divided by the number of
+neighbours and at least 0. So where streaks disagree, margins are small. Labels are int16, margins uint8 in units of
+cost; sums fit 16 bits (SHARE).
 """
 
 from typing import Final, NamedTuple
@@ -45,7 +45,7 @@ NOWHERE: Final = 30000
 
 
 class Ballots(NamedTuple):
-    """Labels and votes of a map, with REACH rows and columns, at least, without votes on every side.
+    """Labels and votes of a map, with a margin of at least REACH rows and columns without votes on every side.
 
     label: float32 as answered; whole: int16, the nearest integer; votes: int16, the margin over SHARE.
     """
@@ -85,7 +85,7 @@ OBJECTION: Final = 8
 FAR: Final = 16
 """Limit to distances between labels in a vote."""
 SAME: Final = 2
-"""Labels at most so far apart, a pixel, support one another."""
+"""Largest difference of labels that support one another: one pixel."""
 _CANDIDATES: Final = 5
 
 
@@ -151,7 +151,7 @@ def _elect_row(hall: _Hall, y: int) -> None:
 
 @numba.njit(cache=True, nogil=True)
 def _settle_row(hall: _Hall, y: int, high: int) -> None:
-    """Reject elections to which the counts of row y object, and write its weak answers; high: rows that vote."""
+    """Reject elections to which the counts of row y object, and write its weak answers; high: number of voting rows."""
     line, down = (y + REACH) * hall.width + REACH, np.float32(1.0 / high)
     for c in range(0, hall.columns, LANES):
         pixel, at = y * hall.columns + c, line + c

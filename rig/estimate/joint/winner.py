@@ -56,7 +56,7 @@ BETA: Final = 0.5
 
 
 class AnswerSettings(NamedTuple):
-    """Number of labels that are stripes, 0..stripes-1, and the tables of `answer_settings`.
+    """Tables of `answer_settings`, and the number of labels: 0..stripes-1 are positions, those behind are padding.
 
     weights: float32 (256,), by a total's excess over the least. powers: float32 (REACH + 1, TAPS, POWERS), powers of
     the distance for each reach, 0 at taps beyond it. reach: uint8 (2^TAPS,), the reach if the taps of the set bits are
@@ -106,11 +106,11 @@ _BLOCK: Final = BLOCK.count
 
 
 class Readout(NamedTuple):
-    """Arrays and sizes with which a thread answers columns; kernels get `pointers` to them.
+    """Arrays and sizes with which a thread finds the answers of some columns; kernels get `pointers` to them.
 
     end: labels up to the end of the last block with stripes; size: bytes from the totals of a column to the next.
     around: uint8, totals of the columns, with at least a vector of LARGEST before and after each; totals: address of
-    the first one's. hidden: uint8 (labels,), LARGEST for labels that are no stripe. Per column: least_label: int32,
+    the first one's. hidden: uint8 (labels,), LARGEST for padding. Per column: least_label: int32,
     label of the least total; least: uint8, that total; moments: float32 (columns, POWERS), sums of weight times power.
     """
 
@@ -202,7 +202,7 @@ def _write_answers(pixel, columns, desk):  # type: ignore[no-untyped-def]
 
 @numba.njit(cache=True, nogil=True, error_model="numpy")
 def answer_columns(pixel: int, columns: int, desk: Readout) -> None:
-    """Answer columns from their totals, which are overwritten. pixel: index of the first column's answer."""
+    """Write the answers of columns from their totals, which are overwritten. pixel: index of the first answer."""
     _find_winners(columns, desk)
     _weigh(columns, desk)
     _hide_winners(columns, desk)

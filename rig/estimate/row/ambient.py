@@ -1,8 +1,8 @@
 """Ambient light and dark counts of every pixel, from dark frames, quiet pixels behind stripes and sums over columns.
 
 For each pixel both are constant during a sweep. So the counts summed over all columns show hot pixels, whatever the
-scene: they fire far more often than their neighbours while the laser crosses the whole picture. If there are few
-counts, the estimate is drawn towards the mean of the pixels around.
+scene: over the whole sweep they fire far more often than their neighbours. If there are few counts, the estimate is
+drawn towards the mean of the pixels around.
 """
 
 import cv2
@@ -17,7 +17,7 @@ from rig.simd import Float32, Float64
 NEIGHBOURHOOD_PX = 31
 """Side of the square of pixels whose mean a pixel is drawn to."""
 DEFECT_FLUX = float(FLUX_MAX)
-"""Ambient light assumed for pixels that must not be used: counts of a pixel that always fires favour no hypothesis."""
+"""Ambient light assumed for pixels that must not be used: if they are expected to fire always, they favour nothing."""
 HOT_SIGMA = 6.0
 """Excess over the neighbours, in standard deviations, above which a pixel is hot: 1e-9 of good pixels exceed it."""
 
@@ -27,9 +27,9 @@ def ambient_map(
 ) -> Float32:
     """Ambient light and dark counts of each pixel in photons per exposure, (rows, width).
 
-    intensity: (rows, width), ones of each pixel within the windows. quiet: (2, rows, width), ones and exposures of each
-    pixel while clearly behind the stripe; None before any stripe is known. The ones may be negative if the expected
-    light of a halo was subtracted from them.
+    intensity: (rows, width), ones of each pixel while inside the stored window. quiet: (2, rows, width), ones and
+    exposures of each pixel while clearly behind the stripe; None before any stripe is known. These ones may be negative
+    if the expected light of a halo was subtracted.
     """
     ones = np.zeros((geometry.rows, geometry.width))
     exposures = np.zeros_like(ones)
@@ -71,7 +71,7 @@ def _lowest_level(totals: NDArray[np.uint32]) -> float:
 
 
 def _shrunk(ones: Float64, exposures: Float64) -> Float64:
-    """Flux of each pixel, drawn to the local mean; the more so, the more alike pixels are (empirical Bayes)."""
+    """Flux of each pixel, drawn to the local mean, more strongly if pixels are more alike (empirical Bayes)."""
     row_rates = ones.sum(1)[exposures.sum(1) > 0] / exposures.sum(1)[exposures.sum(1) > 0]
     overall = max(float(np.median(row_rates)), 1e-6)
     mean = np.full(ones.shape, overall)

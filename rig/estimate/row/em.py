@@ -26,8 +26,8 @@ from rig.simd import Float32, Float64, Int32
 from rig.threads import RowWorkers
 
 START_LINES, START_FRAMES = 512, 8192
-"""Lines from which the likeliest start and the width of the laser line are chosen in a first sweep: START_LINES, or as
-many (up to FIRST_LINES) as have START_FRAMES exposures together."""
+"""START_LINES lines are used to choose the likeliest start and the width of the laser line in a first sweep. If they
+have fewer than START_FRAMES exposures together, more are used, up to FIRST_LINES."""
 FIRST_LINES = 2048
 LAST_LINES = 4096
 """Lines that the first and the last rounds over a first sweep read: 250 000 and 500 000 pixels in all."""
@@ -38,7 +38,7 @@ NEXT_LINES = 2048
 FADE = 0.7
 """Factor on the weight of earlier sweeps, each time that one more sweep is learned from."""
 WIDTH_EVIDENCE = 3.0
-"""Gain of log-likelihood above which the line width is changed."""
+"""Gain of log-likelihood, in nats, above which the line width is changed."""
 FIRST_ROUNDS = 8
 LAST_ROUNDS = 3
 """Rounds over a first sweep. The first ones read FIRST_LINES and also fit the line width; the last ones read LAST_LINES
@@ -54,7 +54,7 @@ AMPLITUDE_SPAN = 3.4
 EVEN_SHARE = 0.25
 """Share of the prior over positions that stays uniform, whatever the earlier maps looked like."""
 PRIOR_PHOTONS = 100.0
-"""Weight of the fitted exponential against each bin's own counts, in photons."""
+"""In the mean of a bin's own level and the fitted exponential, the exponential weighs as much as so many photons."""
 START_EXTINCTIONS_PER_M = (0.0, 0.1, 0.4, 1.5)
 """Extinctions that are tried as a start for a first sweep: clear air to dense fog."""
 
@@ -173,7 +173,7 @@ def learn_next(
 ) -> tuple[RowModel, Expectation]:
     """The model updated with lines of one more sweep, those of `next_lattice`, and the sums for the next call.
 
-    before: the sums returned by the call before, which now count FADE times. The line width is not changed if lines
+    before: the sums returned by the previous call; they are multiplied by FADE. The line width is not changed if lines
     have positions known from neighbours, since these depend on the width.
     """
     seen = expect(lines, geometry, model, workers)
@@ -256,8 +256,8 @@ def flux(ones: float, exposures: float) -> float:
 def maximise(
     model: RowModel, seen: Expectation, *, spread: bool, free_ambient: bool = False, gains: bool = True
 ) -> RowModel:
-    """The model that explains the weighted counts best. If it has a halo, only the prior over positions and the
-    probability of 'no stripe' are learned.
+    """The model that explains the weighted counts best. If `model` has a halo, only the prior over positions and the
+    probability of 'no stripe' are changed.
 
     spread: whether the amplitude grid may move. free_ambient: whether the level of ambient light was guessed and is
     learned as well. gains: whether to learn the strength of the haze per row and column, which would drift if it were
@@ -302,12 +302,10 @@ def maximise(
 
 
 def _split_rest(rest: Float64, variance: Float64, haze: Float64) -> tuple[float, float]:
-    """Split the level behind the stripe into left-over ambient light and a share (0 to 1) of the haze.
+    """Split the level behind the stripe into ambient light not yet subtracted and a share (0 to 1) of the haze.
 
-    The share is light scattered twice or more.
-
-    Weighted fit of rest = excess + share * haze over the bins. Both are 0 with fewer than 4 bins; the share is 0 if the
-    haze hardly varies.
+    Weighted fit of rest = excess + share * haze over the bins. The share stands for light scattered twice or more. Both
+    results are 0 with fewer than 4 bins; the share is 0 if the haze hardly varies.
     """
     known = np.isfinite(rest) & np.isfinite(haze) & (variance > 0)
     if known.sum() < 4:
@@ -364,7 +362,7 @@ def _amplitudes(model: RowModel, mass: Float64, spread: bool) -> tuple[Float32, 
 def _position_prior(levels: Float64) -> Float64:
     """Smoothed log density of stripes over the bins (BINS,), 0 where they are spread evenly.
 
-    It decides only where a row hardly has photons. A quarter of it stays even, so no place loses more than 1.4 nats.
+    It decides only in rows with hardly any photons. A quarter of it stays even, so no place loses more than 1.4 nats.
     """
     kernel = np.array([1.0, 2.0, 3.0, 2.0, 1.0])
     found, even = (np.convolve(np.pad(levels[:, i], 2), kernel, "valid") for i in (12, 13))
@@ -398,7 +396,7 @@ CLEAR: Final = 0.97
 CLEAR_PX: Final = 6
 """The extinction is learned from rows more certain than CLEAR, at pixels more than CLEAR_PX before their stripe."""
 LEAST_OWN: Final = 1e-3
-"""Least haze of a line at a pixel relative to that of the other lines: if it is weaker, this share is assumed."""
+"""With several laser lines: least haze of a column's own line relative to that of the others; used if it is less."""
 
 
 @numba.njit(cache=True, nogil=True)
@@ -408,15 +406,16 @@ def learn_rows(
 ) -> float:  # fmt: skip
     """Do the expectation step over some lines, and return the log evidence.
 
-    Added to levels (bins, LEVELS), in columns:
+    Rows that have no stripe with a probability of 0.5 or more add nothing to levels 0 to 11, rows_seen and
+    columns_seen. Added to levels (bins, LEVELS), in columns:
     - 0 to 3, of pixels before the stripe: ones, exposures, exposures times geometry factor, exposures times ambient
       flux, all weighted by the probability that the pixel lies before the stripe;
     - 4 to 7: the same of pixels behind the stripe, of rows more certain than CERTAIN;
     - 8 to 11: the same, unweighted, of pixels more than CLEAR_PX before the stripe of rows more certain than CLEAR;
-    - 12 and 13: stripes, and stripes if all positions were equally likely.
+    - 12 and 13: stripes, and stripes if all positions were equally likely (see CUT).
     Added to rows_seen (rows, 2) and columns_seen (columns, 2): ones before the stripe and those expected. Added to
-    amplitude_mass (M + 1,): rows per amplitude, last those with 'no stripe'. Pixels with more ambient flux than
-    hot_flux are left out of levels 0 to 11, rows_seen and columns_seen.
+    amplitude_mass (M + 1,): rows per amplitude, last those with 'no stripe' (see CUT). Pixels with more ambient flux
+    than hot_flux are left out of levels 0 to 11, rows_seen and columns_seen.
     """
     amplitudes = state.amplitude.shape[0]
     row = row_buffers(sweep.window, amplitudes)

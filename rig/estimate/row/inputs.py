@@ -6,8 +6,8 @@ depth w' = 2 w / (c + p), and haze, rest, S the profiles of `rig.estimate.row.mo
 
     before = ambient + G haze(w') + others,    behind = ambient + G rest(w') + others,    scale = S(w')
 
-in photons per exposure; `others` is the haze of lines lit at the same time (`others_at`). All are float32, and fluxes
-are limited to FLUX_MIN..FLUX_MAX. `judge_line` computes all of them and the row's posterior.
+in photons per exposure; `others` is the haze of laser lines lit at the same time (`others_at`). All are float32, and
+fluxes are limited to FLUX_MIN..FLUX_MAX. `judge_line` computes all of them and the row's posterior.
 
 Fog scatters the stripe's own light once more, into a halo on both sides of it. At the distance d along the row from a
 stripe of s photons the halo has, per pixel,
@@ -102,7 +102,7 @@ class RowState(NamedTuple):
 
 
 class RowBuffers(NamedTuple):
-    """Buffers of one row, made once per thread. `row_fluxes` fills before to log_prior, `judge_line` the others too.
+    """Buffers of one row, made once per thread. `row_fluxes` fills `before` to `log_prior`, `judge_line` all.
 
     Pixels go from the nearest depth to the farthest. n: counts. before: flux of a pixel that lies before the stripe;
     behind: of one behind it. scale: stripe photons at amplitude 1. cell: nearest profile bin. gain: the factor G, by
@@ -185,7 +185,7 @@ def flux_between(ambient, gain, one, other, part):  # type: ignore[no-untyped-de
 
 @numba.njit(inline="always")
 def line_light(sweep, state, y, c, middle):  # type: ignore[no-untyped-def]
-    """Length p of the light's path to the plane's points on row y, per unit of depth, and the module's G over c.
+    """Length p of the light's path to the plane's points on row y, per unit of depth, and G / c (both: see the module).
 
     middle: pixel of the row whose v is used.
     """
@@ -196,7 +196,7 @@ def line_light(sweep, state, y, c, middle):  # type: ignore[no-untyped-def]
 
 @numba.njit(inline="always")
 def others_at(sweep, state, y, c, x):  # type: ignore[no-untyped-def]
-    """Haze at one pixel from the lines that are lit together with column c; the same before and behind c's stripe.
+    """Haze at one pixel from the laser lines lit together with column c's; the same before and behind c's stripe.
 
     The positions of the other lines' stripes are unknown. The probability that a line's haze has not ended at the pixel
     is taken as the share of the depth range, in inverse depth, behind the pixel's point on that line's plane.
@@ -248,7 +248,7 @@ def fluxes_at(sweep, state, y, x, c, path_p, strength):  # type: ignore[no-untyp
 
 @numba.njit(cache=True, nogil=True)
 def row_fluxes(sweep: Sweep, state: RowState, row: RowBuffers, y: int, c: int) -> tuple[int, int, int, int]:
-    """Fill the buffers before to log_prior for row y of column c. They do not depend on the counts.
+    """Fill the buffers `before` to `log_prior` for row y of column c. They do not depend on the counts.
 
     Returns (length, first and last index that a stripe may have, x of index 0); pixel t is x + t if near is left, else
     x - t. The length is 0 if there is nothing to search.

@@ -8,7 +8,8 @@ one-bit frames. Hypothesis (j, m), 'the stripe is at pixel j with amplitude a_m'
            = behind_t for t > j                               pedestal and ambient light
            = (before_t + behind_t) / 2 at t = j
 
-A pixel fires with p' = (1 - e)(1 - exp(-flux)) + e/2; the floor e (FLOOR) bounds the evidence of a single pixel. Then
+A pixel fires with probability p' = (1 - e)(1 - exp(-flux)) + e/2; the floor e (FLOOR) bounds the evidence of a single
+pixel. Then
 
     log-likelihood(j, m) = sum over t of n_t logit p'_t + K log(1 - p'_t)
 
@@ -58,7 +59,7 @@ LOST: Final = np.float32(24.0)
 
 
 def logit_table() -> Float32:
-    """Table (2, cells) float32 of logit p' and log(1 - p') over flux: 256 cells an octave, value at the cell's middle.
+    """Table (2, cells) float32 of logit p' and log(1 - p') by flux: 256 cells an octave, value at the cell's middle.
 
     The largest error, half a cell, changes a log-likelihood by 0.002 per count, far below its own noise.
     """
@@ -133,7 +134,7 @@ def row_scores(
 def none_prior(
     near: float, far: float, w_first: float, w_last: float, none_weight: float
 ) -> tuple[float, float, float]:
-    """The three priors of 'no stripe' for `row_posterior`, from the part of the depth range that the picture shows.
+    """The three priors `none` of `row_posterior`, from the part of the depth range that the picture shows.
 
     near, far: ends of the depth range as inverse depths; w_first, w_last: those of the first and last position.
     Positions beyond the picture's border are as likely, per inverse depth, as those in the picture.
@@ -155,11 +156,11 @@ def row_posterior(
     score: Float32, edge: Float32, length: int, first: int, last: int, log_weight: Float32, log_prior: Float32,
     none: tuple[float, float, float], posterior: Float32, by_amplitude: Float64,
 ) -> tuple[float, float]:  # fmt: skip
-    """Fill posterior (length,), of positions over all amplitudes, and by_amplitude (M,), of amplitudes over positions.
+    """Fill `posterior` (length,), the probability of each position, and `by_amplitude` (M,), that of each amplitude.
 
-    none: prior of a row that is entirely behind its stripe (nearer than the picture), of one that is before it, and of
-    one whose haze ends somewhere without a stripe. log_prior: of positions, up to a constant; log_weight: of
-    amplitudes. Returns the probability of 'no stripe' and the row's log evidence, relative to 'everything is behind'.
+    none: prior of a row that lies entirely behind its stripe, of one that lies entirely before it, and of one whose
+    haze ends somewhere without a stripe. log_prior: of positions, up to a constant; log_weight: of amplitudes. Returns
+    the probability of 'no stripe' and the row's log evidence, relative to 'everything is behind'.
     """
     mass = 0.0
     for j in range(first, last + 1):

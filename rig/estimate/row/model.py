@@ -2,9 +2,9 @@
 
 Path inverse depth w (w' in `inputs`) is 1 over the mean of the two path lengths, scanner to point and point to camera.
 Haze that was scattered once depends on these two lengths only. So there are two profiles over BINS bins of w, haze
-before the stripe and the level behind it, each multiplied by a gain per row and per column. A stripe has a S(w) photons
-per exposure, where a is one of AMPLITUDES learned amplitudes (reflectance and laser power) and S = w^2 exp(-2
-extinction / w), scaled to 1 in the middle bin.
+before the stripe and the level behind it. Each is multiplied by the factor G of `inputs` (geometry, a gain per row and
+one per column). A stripe has a S(w) photons per exposure, where a is one of AMPLITUDES learned amplitudes (reflectance
+times laser power) and S = w^2 exp(-2 extinction / w), scaled to 1 in the middle bin.
 
 The line is a Gaussian of learned width, integrated over pixels (`pixel_shares`).
 """
@@ -132,8 +132,8 @@ def fit_haze(path_m: Float64, flux: Float64, variance: Float64) -> HazeFit | Non
     """Weighted fit of an exponential to haze flux (bins,) with its variance (bins,). None if fewer than 4 bins are
     known or there is hardly any haze.
 
-    Gauss-Newton on amplitude and extinction. The extinction is kept between 0 and EXTINCTION_MAX_PER_M, and below
-    OPTICAL_DEPTH_MAX at the nearest haze.
+    Gauss-Newton on amplitude and extinction. The extinction is kept between 0 and EXTINCTION_MAX_PER_M, and extinction
+    times path at the nearest bin at most at OPTICAL_DEPTH_MAX.
     """
     used = np.isfinite(flux) & np.isfinite(variance) & (variance > 0)
     if used.sum() < 4:
@@ -155,7 +155,7 @@ def fit_haze(path_m: Float64, flux: Float64, variance: Float64) -> HazeFit | Non
         return float(np.sum(weight * (h - amplitude * shape) ** 2))
 
     def linear(extinction: float) -> tuple[float, Float64, Float64]:
-        """Amplitude, derivatives of the haze by amplitude and extinction, and the matrix of the normal equations."""
+        """Amplitude, derivatives of the haze with respect to both parameters, matrix of the normal equations."""
         amplitude, shape = fitted(extinction)
         design = np.stack([shape, -2.0 * (s - s.min()) * amplitude * shape])
         return amplitude, design, (design * weight) @ design.T

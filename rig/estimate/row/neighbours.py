@@ -1,7 +1,7 @@
 """Copies of maps with a margin: compiled code can compare each answer with those around it without checking bounds.
 
-Compared is an answer's distance in px from the position of its column's line at a fixed depth: neighbours whose
-distances are the same within SAME_PX lie on one surface. Arrays are float32 (rows, columns).
+Answers are compared by their distance in px from the position of their column's line at a fixed depth: neighbours whose
+distances differ by at most SAME_PX lie on one surface. Arrays are float32 (rows, columns).
 """
 
 from typing import Final

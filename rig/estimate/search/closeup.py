@@ -1,8 +1,8 @@
 """Close look at the best position of a row, compiled: a fast form of `rig.estimate.row.likelihood`, tested against it.
 
 It finds the position of the line within the pixel. LABELS positions (labels), LABEL_PX apart, are compared, one per
-lane of a vector. With L and R the flux left and right of the line, s its light, f_i,t its share in pixel t at label i,
-and l_i,t the part of pixel t that lies left of it,
+lane of a vector. With L and R the flux left and right of the line, s the line's light, f_i,t its share in pixel t if it
+is at label i, and l_i,t the part of pixel t that lies left of label i,
 
     score_i = K constant_i + sum over t of n_t weight_i,t,   from flux_i,t = l_i,t L + (1 - l_i,t) R + s f_i,t
 
@@ -41,7 +41,7 @@ LEVEL_SHIFT: Final = np.uint32(22)
 LOWEST_OCTAVE: Final = -14
 LEVEL_BASE: Final = np.uint32((127 + LOWEST_OCTAVE) << 1)
 LEVELS: Final = 36
-"""2^-14 to 2^4 photons per exposure."""
+"""Number of flux levels, from 2^-14 to 2^4 photons per exposure."""
 IMPOSSIBLE: Final = np.float32(-1e30)
 LOWEST_SCORE: Final = np.float32(-32000.0)
 
@@ -68,7 +68,7 @@ def label_weights(
     """Weight of a count for each label, (LEVELS, LEVELS, F, LABELS), and of an exposure, (LEVELS, LEVELS, LABELS).
 
     Both are in octaves of likelihood, with the mean over the labels subtracted. ambient: photons per exposure; share:
-    level of the pedestal over that of the haze; fine: (LABELS, F) as `fine_profiles` of `rig.estimate.row.model`;
+    ratio of the pedestal to the haze; fine: (LABELS, F) as `fine_profiles` of `rig.estimate.row.model`;
     table: `logit_table`.
     """
     pixels = fine.shape[1]
@@ -139,7 +139,7 @@ def level_flux(level):  # type: ignore[no-untyped-def]
 
 @numba.njit(inline="always")
 def levels_of(before, signal):  # type: ignore[no-untyped-def]
-    """Index of the two levels in the tables, 16-bit lanes, for fluxes in float32 lanes."""
+    """Index of the pair of levels in the tables, 16-bit lanes, for fluxes in float32 lanes."""
     return _level_of_each(before) * np.int16(LEVELS) + _level_of_each(signal)
 
 

@@ -10,9 +10,9 @@ counts of both look alike. Its neighbours can: on a surface their answers agree,
   others: the number of all other answers there. An answer without neighbours has odds 1. If ln odds is positive, it is
   multiplied by min(max(contrast / SEEN, 0), 1): without light, agreement is no evidence.
 - contrast: mean light of the answers that agree, above ambient light and half the haze, less SPARED pixels of haze,
-  over the noise of this mean; at least LEAST. SPARED is for answers a little before the end of the haze, which take
-  light of the haze for the stripe's.
-- K: exposures. The more there are, the more alike do neighbouring rows place the end of a haze.
+  divided by the noise of this mean; at least LEAST. SPARED is for answers a little before the end of the haze, which
+  take light of the haze for the stripe's.
+- K: exposures. With more exposures, neighbouring rows place the end of a haze more alike.
 
 A, B, C and D are fitted by maximum likelihood to random scenes of the tests' simulator, at K = 1 to 30, with haze,
 ambient light and stripes of many strengths. Answers where there is no stripe count as wrong.
@@ -44,7 +44,7 @@ SEEN: Final = 3.0
 """Contrast from which on agreement counts in full. Rows without any light agree too, on the first position searched."""
 REACH: Final = 3
 MORE_NOISE: Final = 1.0 / 9.0
-"""In counts: the noise of light is not zero where nothing was counted."""
+"""Counts added to the noise of the light, which is not zero where nothing was counted."""
 
 
 @numba.njit(cache=True, nogil=True)
@@ -55,9 +55,9 @@ def confidences(
     """Write the confidence of rows first_row..last_row-1, 0 where there is no answer.
 
     Arrays are (rows, columns), exposures (columns,). distance: in px from the position of the line at a fixed depth,
-    NaN where there is no answer; light: photons per exposure above ambient light and half of the haze; there: number of
-    answers up to REACH rows and columns away, itself included; ambient: usual light of a pixel behind the stripe;
-    line_px: number of pixels over which light is summed.
+    NaN where there is no answer; light: photons per exposure above ambient light and half of the haze; haze: photons
+    per exposure and pixel before the answer; there: number of answers up to REACH rows and columns away, itself
+    included; ambient: usual light of a pixel behind the stripe; line_px: number of pixels over which light is summed.
     """
     columns = confidence.shape[1]
     k, line = with_margin(exposures.reshape(1, -1), 0, 1), np.empty(columns + LANES, np.float32)
@@ -100,7 +100,7 @@ def _judged(at, here, width, exposed, ambient, line_px):  # type: ignore[no-unty
 def believed(
     found: StripeTable, reference_px: Float32, exposures: Int32, ambient: float, line_px: int, workers: RowWorkers
 ) -> StripeTable:
-    """A stripe table of the search with confidences from neighbours, and without negative signals.
+    """The stripe table `found` by the search, with confidences from neighbours and without negative signals.
 
     reference_px: (rows, columns), position of the line at a fixed depth; other arguments: see `confidences`.
     """

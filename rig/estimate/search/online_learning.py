@@ -1,9 +1,9 @@
 """Decides when an estimator learns, and holds the model that it uses until then.
 
 The first map is estimated with a model learned from that map itself. A later map is used for learning (a lesson) when
-enough frames have come since the last lesson (TEACH_FRAMES), on a thread beside the stream. The new model is used a
-fixed number of frames later (LAG_FRAMES), so that a live scan hardly ever waits and results do not depend on the speed
-of the machine.
+enough frames have come since the last lesson (TEACH_FRAMES) and enough of its answers are confident (LEAST_SURE).
+Lessons run on a thread of their own. The new model is used a fixed number of frames later (LAG_FRAMES), so that a live
+scan hardly ever waits and results do not depend on the speed of the machine.
 """
 
 from collections.abc import Callable
@@ -28,7 +28,7 @@ from rig.simd import Float64
 from rig.threads import RowWorkers, yield_to_others
 
 LEAST_SURE = 0.02
-"""Least share of confident answers in a map that is used for learning: a closed shutter must not spoil later maps."""
+"""Least share of answers with a confidence above 0.5 in a map to learn from: a closed shutter teaches nothing."""
 TEACH_FRAMES = 100_000
 """Least number of lit frames from one lesson to the next: a second at 100 kHz. Learning costs some 0.2 s of one core,
 with the tables of `joint` twice that."""
@@ -85,7 +85,7 @@ class Seen:
 
 
 class OnlineLearner(Generic[Tables]):
-    """The model that an estimator uses, None before the first lesson, and the tables made for it.
+    """The model that an estimator uses, None until a map was good enough to learn from, and the tables made for it.
 
     make: makes tables. learn_more: learns from `more` of a `Seen`, in addition to what every estimator learns. Both run
     on the learning thread, `make` also on the caller's. learns: whether later maps change the model.
@@ -156,7 +156,7 @@ class OnlineLearner(Generic[Tables]):
 
 
 def first_model(volume: CountVolume, geometry: SweepGeometry, workers: RowWorkers) -> RowModel:
-    """Learn from the first sweep. It is searched once: the pixels behind stripes then show the ambient light."""
+    """The model of a first sweep, learned twice: once stripes are found, pixels behind them show the ambient light."""
     intensity = volume.intensity()
     model = learn_first(volume, geometry, ambient_map(volume, intensity, geometry, None), workers)
     dark = volume.dark_counts is not None

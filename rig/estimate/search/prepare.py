@@ -34,7 +34,7 @@ from rig.simd.vectors import LANES
 from rig.threads import RowWorkers
 
 BAND_ROWS = (64, 32, 16, 8, 4)
-"""Rows that may share a table. The most for which the line shifts by at most BAND_SHEAR_PX are taken."""
+"""Numbers of rows that may share a table: the largest for which the line shifts by at most BAND_SHEAR_PX is used."""
 BAND_SHEAR_PX = 1
 TAP_SHARE = 0.06
 """Least share of the line in a pixel that is read to score a position."""
@@ -44,8 +44,8 @@ MOST_HALVINGS = 6
 CLOSE_SHIFT = 3
 """Weights of the close-up have 128 >> 3 = 16 units an octave, or fewer: 8 bits then reach 8 octaves."""
 CLOSE_LIMIT = 60000
-"""Largest sum of a label's weights, each times the largest count. It may exceed the range of 16 bits, in which sums
-saturate, since no line fills all pixels."""
+"""Largest sum of a label's weights in units, each times the largest count. It may exceed the range of 16 bits, in which
+sums saturate, since no line fills all pixels."""
 LOOKED_AT = 32
 """Number of columns from whose weights the unit for all columns is chosen."""
 ROUGH_UNITS = 4.0

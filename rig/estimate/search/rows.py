@@ -65,13 +65,13 @@ class SearchTables(NamedTuple):
 
     x0: int32 (columns,), first stored pixel; window: stored pixels; limits: int16 (columns, 2, rows + LANES), first and
     last stored pixel of each search window, with the first after the last if there is none. rows: of the picture.
-    ambient: float32 (bands, width padded to whole words). hot_start: int32 (words, rows + 1), for windows that begin at
-    each word the first entry of each row in hot_at and hot_place; hot_at: int16, stored pixels whose counts are not
-    used; hot_place: int32, their places in the counts of all rows of the picture. nominal: exposures for which the
-    tables are made. faintest, brightest: photons of a stripe at scale 1. reach: px on either side of a stripe whose
-    light is its own. shift: scores have 128 >> shift units an octave; close_shift: the same for the close-up. most:
-    largest count. quiet_step: one of this number of columns is used to learn the ambient light. flux: see
-    `count_fluxes`.
+    ambient: float32 (bands, width padded to whole words). hot_start: int32 (words, rows + 1): for a window that begins
+    at a word of WORD_PX pixels, index of the row's first entry in hot_at and hot_place; hot_at: int16, stored pixels
+    whose counts are not used; hot_place: int32, their places in the counts of all rows of the picture. nominal:
+    exposures for which the tables are made. faintest, brightest: photons of a stripe at scale 1. reach: px on either
+    side of a stripe whose light is its own. shift: scores have 128 >> shift units an octave; close_shift: the same for
+    the close-up. most: largest count. quiet_step: one of this number of columns is used to learn the ambient light.
+    flux: see `count_fluxes`.
     """
 
     tables: ScreenTables
@@ -102,10 +102,10 @@ class RowAnswers(NamedTuple):
 
     stripe: float32 (columns, FIELDS, rows), NaN and confidence 0 if there is nothing. quiet: int32 (rows, PAIRS, lanes
     of the sensor + LANES, 2), ones of pixels while clearly behind a stripe, in lane order; quiet_exposures: int32
-    (rows, lanes + 1), their exposures in 1/EXPOSURE_PARTS, stored as steps along the lanes. light: int32, like quiet,
-    ones of every pixel within the windows. The most recent ones of both are still in quiet_here and light_here, uint8
-    (rows, PAIRS, lanes of the window, 2). lines: int32 (lines, window), counts of rows that are kept; line_start: int32
-    (columns + 1,), each column's first entry in line_row, int32, the rows kept, in order.
+    (rows, lanes + 1), their exposures in 1/EXPOSURE_PARTS, stored as differences from lane to lane. light: int32, like
+    quiet, ones of every pixel within the windows. The most recent ones of both are still in quiet_here and light_here,
+    uint8 (rows, PAIRS, lanes of the window, 2). lines: int32 (lines, window), counts of rows that are kept; line_start:
+    int32 (columns + 1,), each column's first entry in line_row, int32, the rows kept, in order.
     """
 
     stripe: Float32
@@ -155,7 +155,7 @@ def pointers_of(judge: SearchTables, found: RowAnswers, memory: Uint8) -> Search
 
 
 def count_fluxes() -> Float32:
-    """Photons per exposure estimated from n ones in k exposures, float32: log (k + 1/2) / (k - n + 1/2).
+    """Photons per exposure estimated from n ones in k exposures, float32: log((k + 1/2) / (k - n + 1/2)).
 
     Nearly unbiased, and finite also at n = k. Rows are k in steps of 1/EXPOSURE_PARTS; columns are n, up to one more
     than COUNT_LIMIT, since halved counts are rounded up.
@@ -168,7 +168,7 @@ def count_fluxes() -> Float32:
 QUIET: Final = 0.9
 """Probability within 1 px above which the pixels behind the stripe are used to learn the ambient light."""
 QUIET_STEP: Final = 8
-"""If there are dark frames, one column in so many is used for this, else every column."""
+"""If there are dark frames, one column in so many is used to learn the ambient light, else every column."""
 SIGNAL_REACH_PX: Final = 2
 """Least number of pixels on either side of a stripe whose light is summed as its own."""
 FEW_EXPOSURES: Final = 1
@@ -276,7 +276,7 @@ def judge_rows(
 ) -> None:
     """Estimate rows first..first+rows-1 (at most BATCH) of column c, all in the band to which `table` belongs.
 
-    Their counts must be in the rows of the batch.
+    Their counts must be in `search.n`.
     """
     if not table.searched:
         return
@@ -304,7 +304,7 @@ def judge_rows(
 
 @numba.njit(forceinline=True)
 def _answer(lanes, to, rows, search):  # type: ignore[no-untyped-def]
-    """Write one field of the answers for so many rows to address `to`."""
+    """Write one field of the answers of the batch's first `rows` rows to address `to`."""
     if rows == BATCH:
         store_float32(to, 0, lanes)
     else:

@@ -1,6 +1,7 @@
 """Scores of all positions of a row, compiled: a fast form of `rig.estimate.row.likelihood`, tested against it.
 
-Computes log-likelihoods relative to 'everything is right of the stripe', the best one, and its certainty:
+Computes log-likelihoods relative to 'everything is right of the stripe', the best of them and how probable its position
+is:
 
     score_m(x) = K constant_m(x) + sum over pixels left of x of n edge + sum over pixels t around x of n_t tap_m,t(x)
 
@@ -48,7 +49,7 @@ START: Final = -12000
 
 @numba.njit(cache=True, nogil=True)
 def fit_positions(position: int, slope: int, places: int, more: float, to: int) -> None:
-    """Write the constants of a table's positions for columns with `more` exposures than nominal.
+    """Write the constants of a table's positions for columns with the nominal number of exposures plus `more`.
 
     position, slope, to: addresses of `places` int16 each.
     """
@@ -76,7 +77,7 @@ def fit_lanes(per_exposure: int, exposures: float, change: float, first: int, la
 
 @numba.njit(forceinline=True)
 def score_rows(table: ScreenTable, reach: int, search: Search, rows: int) -> None:
-    """Score every position of the batch's first rows. reach: T of the table's taps."""
+    """Score every position of the batch's first `rows` rows. reach: T of the table's taps."""
     for r in range(rows):
         _sum_edges(table, search, r)
     # Separate loops: one row's sums wait for one another, so those of several rows should be under way at once.
@@ -90,7 +91,7 @@ def score_rows(table: ScreenTable, reach: int, search: Search, rows: int) -> Non
 
 @numba.njit(forceinline=True)
 def _rise(table, search, r, q, v):  # type: ignore[no-untyped-def]
-    """Score that the counts of pair q in lanes v.. of row r add to all positions right of them."""
+    """Score that the counts of pair q in the lanes from v on of row r add to all positions right of the pair."""
     n = search.n + r * search.n_bytes + 2 * (PAD + v) + q * pair_bytes(search.lanes)
     return dot_pairs(load_bytes(n, 0), load_bytes(table.edge, 2 * (q * search.lanes + v)))
 
@@ -110,7 +111,7 @@ def _sum_edges(table, search, r):  # type: ignore[no-untyped-def]
 
 @numba.njit(forceinline=True)
 def _position_score(first, second, tap, constant, s, v, lanes, level):  # type: ignore[no-untyped-def]
-    """Score of the positions of step s at the likelier of two amplitudes; first, second: the pairs of their taps."""
+    """Score of the positions of step s at the likelier of two amplitudes. first, second: counts of pairs with taps."""
     at, screen = 4 * s * lanes + 2 * v, 4 * STEPS * lanes
     dim = dot_pairs(first, load_bytes(tap, at)) + dot_pairs(second, load_bytes(tap, at + 2 * lanes))
     dim = add_saturated(dim, load_int16(constant, s * lanes + v))
@@ -186,14 +187,14 @@ def _score_wide(table: ScreenTable, reach: int, search: Search, r: int) -> None:
 
 
 NOTHING: Final = np.float32(1.2e-38)
-"""Least sum of likelihoods by which is divided: the smallest normal float32."""
+"""Least divisor, the smallest normal float32: a sum of likelihoods may be 0."""
 MOST_OCTAVES: Final = 60
 """A hypothesis without a stripe counts no more than 2^60 times the best position."""
 
 
 @numba.njit(forceinline=True)
 def find_best(search: Search, rows: int, shift: int) -> None:
-    """Fill best, lift, ceiling and x of the batch's first rows.
+    """Fill best, lift, ceiling and x of the batch's first `rows` rows.
 
     Among pixels with the same best score, the one of the lowest lane and there of the first step is taken.
     """
@@ -227,7 +228,7 @@ def _lane_with(score: int, lanes: int, wanted: np.int16) -> int:
 
 @numba.njit(forceinline=True)
 def add_likelihoods(table: ScreenTable, search: Search, rows: int, window: int, shift: int) -> None:
-    """Fill mass, left and right of the batch's first rows. Call it after `find_best`.
+    """Fill mass, left and right of the batch's first `rows` rows. Call it after `find_best`.
 
     mass: sum of the likelihoods of all positions, and of a change without a stripe at each lane, up to a factor for
     each row. left, right: scores beside the best position.

@@ -51,7 +51,7 @@ from rig.simd.vectors import LANES, zero_bytes
 from rig.threads import RowWorkers
 
 SUM_LIMIT: Final = BYTE_FRAMES
-"""Exposures after which the 8-bit sums are carried over."""
+"""Most exposures in the 8-bit sums. With more they would overflow, so they are added up first (`carry_sums`)."""
 
 
 class OpenColumn(NamedTuple):
@@ -81,15 +81,16 @@ def _move_window(by, row_words, n, planes):  # type: ignore[no-untyped-def]
 
 @numba.njit(cache=True, nogil=True)
 def carry_sums(desk: SearchPointers, x0: int, first_row: int, last_row: int) -> None:
-    """Add the 8-bit sums of the window that began at x0, light and quiet, to the picture's, and clear them."""
+    """Add the 8-bit sums light_here and quiet_here to light and quiet, and clear them. x0: begin of their window."""
     _carry(desk.found.light_here, desk.lanes, desk.found.light, desk.sum_lanes, x0 // STEPS, first_row, last_row)
     _carry(desk.found.quiet_here, desk.lanes, desk.found.quiet, desk.sum_lanes, x0 // STEPS, first_row, last_row)
 
 
 @numba.njit(cache=True, nogil=True)
 def _carry(window: int, window_lanes: int, picture: int, lanes: int, lane: int, first_row: int, last_row: int) -> None:
-    """Move bytes (rows, PAIRS, window_lanes, 2) to int32 (rows, PAIRS, lanes, 2) from `lane` on. window, picture: their
-    addresses."""
+    """Add bytes (rows, PAIRS, window_lanes, 2) to int32 (rows, PAIRS, lanes, 2) from `lane` on, and clear them.
+
+    window, picture: addresses of the bytes and of the int32."""
     for row in range(PAIRS * first_row, PAIRS * last_row):
         some, lot = window + 2 * window_lanes * row, picture + 8 * (lanes * row + lane)
         for v in range(0, 2 * window_lanes, 2 * LANES):
@@ -238,7 +239,7 @@ class SearchedSweep(FrameTally):
 
     stripe: the stripe table. light: uint32 (rows, width), counts summed over the columns. quiet: float64 (2, rows,
     width), ones and exposures of pixels while clearly behind a stripe. lines: the counts used for learning. checked:
-    int32 (partners, points, window), counts of the `check_points`.
+    int32 (partners, points, window), counts of the `check_points` (`rig.count.map_checks`).
     """
 
     stripe: StripeTable
@@ -253,7 +254,7 @@ class SearchedSweep(FrameTally):
 
 
 class ColumnJudge:
-    """The `Counter` that judges: counts and estimates one sweep after the other, each with one `SearchTables`.
+    """The `Counter` that also judges: it counts and estimates sweep after sweep, each with its own `SearchTables`.
 
     Its memory is allocated once; `begin` clears it for the next sweep.
     """

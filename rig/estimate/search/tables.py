@@ -1,7 +1,7 @@
 """Tables of the search along a row, per column and band of rows, and a thread's buffers.
 
 They hold the terms of `rig.estimate.row.likelihood` in integers, with `units` units to an octave of likelihood. With
-p'_L and p'_R of a pixel left and right of the stripe and p'_S of a pixel that it lights,
+the probability p' that a pixel fires, p'_L left and p'_R right of the stripe, and p'_S where the stripe lights it,
 
     edge = logit p'_L - logit p'_R                  int8: a count at a pixel left of position x
     tap  = logit p'_S - logit p'_L or R             int8: a count at a pixel around x, for SCREENS amplitudes
@@ -36,7 +36,7 @@ WEIGHT_LIMIT: Final = 127
 """Largest weight; larger ones are cut to it."""
 LN2: Final = 0.6931471805599453
 FLUX_LEFT, FLUX_RIGHT, GAIN_LEFT, GAIN_RIGHT, LOSS_LEFT, LOSS_RIGHT = range(6)
-"""Numbers per pixel: its flux left and right of the stripe, and their entries in the logit table."""
+"""Indices of the numbers per pixel: its flux left and right of the stripe, and their entries in the logit table."""
 
 
 class ScreenTables(NamedTuple):
@@ -51,8 +51,8 @@ class ScreenTables(NamedTuple):
     position: int16 (columns, bands, SCREENS, P), constant of position x at the nominal number of exposures, its prior
     included; slope: int16, the same shape, increase with each further exposure in 1 / SLOPE of a unit.
     lane: float32 (columns, bands, lanes), units per exposure if all pixels up to a lane's last lie left.
-    none: float32 (columns, bands, NONE), units of 'no stripe': all right of it, all left of it, a change somewhere (per
-    lane); then the first and last lane with pixels of the column.
+    none: float32 (columns, bands, NONE), scores of 'no stripe': all pixels right of it, all left of it, a change
+    somewhere (per lane); then the first and last lane with pixels of the column.
     neutral: float32 (columns, bands, P), ones per exposure that carry no information, in pixel order.
     before, scale: float32 (columns, bands, P) as in `RowBuffers`, in pixel order.
     first, last: int32 (columns, bands), first and last position in stored pixels.
@@ -81,7 +81,8 @@ def fill_tables(
     """Fill the tables of bands first_band..last_band-1.
 
     sweep, state: of a sweep whose rows are the bands (`rig.estimate.search.prepare`). light, log_share: (SCREENS,),
-    amplitudes of the search and the logarithm of their probability. units: per octave. nominal: exposures.
+    amplitudes of the search and the logarithm of their probability. units: per octave. nominal: exposures for
+    `position`.
     """
     columns = sweep.plane.shape[0]
     lanes = out.lane.shape[2]
@@ -239,17 +240,17 @@ class ScreenTable(NamedTuple):
 
 
 class Search(NamedTuple):
-    """Addresses of a thread's buffers for BATCH rows of `lanes` lanes, and the bytes from row to row of each.
+    """Addresses of a thread's buffers for BATCH rows of `lanes` lanes, and the bytes from row to row of n and score.
 
     n: counts, see `rig.count.lane_order`. int16: score (STEPS, lanes); start (lanes,), score of a change at the lane's
-    first pixel; tops (LANES,), the largest score of every LANES-th lane; constant (SCREENS, STEPS, lanes), the tables'
-    part per exposure times the exposures; lane (lanes,), the same for lanes; change (lanes,), score added by a change
-    without a stripe in the lane; label (LANES,), scores of the close-up; place: index in a row of counts of each pixel
-    from -PLACE_BEFORE on. neutral, muted: bytes, counts of hot pixels, see `rig.estimate.search.rows`. For each row of
-    the batch, int16: all_left, sum of all lanes; best, x: best score and its pixel; left, right: the scores beside it;
-    levels: of the close-up; lift: see `lift_to_powers`; ceiling: largest score of 'no stripe'. float32: light, before,
-    scale, ambient: see `rig.estimate.search.rows`; answer: one field of the answers before it is written. Folded
-    (`rig.simd.shuffles`): mass, sum of all likelihoods; moment, square: sums of the close-up.
+    first pixel; tops (LANES,), item i: the largest score of lanes i, i + LANES, ...; constant (SCREENS, STEPS, lanes),
+    the tables' part per exposure times the exposures; lane (lanes,), the same for lanes; change (lanes,), score added
+    by a change without a stripe in the lane; label (LANES,), scores of the close-up; place: index in a row of counts of
+    each pixel from -PLACE_BEFORE on. neutral, muted: bytes, counts of hot pixels, see `rig.estimate.search.rows`. For
+    each row of the batch, int16: all_left, sum of all lanes; best, x: best score and its pixel; left, right: the scores
+    beside it; levels: of the close-up; lift: see `lift_to_powers`; ceiling: largest score of 'no stripe'. float32:
+    light, before, scale, ambient: see `rig.estimate.search.rows`; answer: one field of the answers before it is
+    written. Folded (`rig.simd.shuffles`): mass, sum of all likelihoods; moment, square: sums of the close-up.
     """
 
     lanes: int
@@ -326,7 +327,7 @@ def search_memory(lanes: int) -> Uint8:
 
 @numba.njit(forceinline=True)
 def search_in(memory: int, lanes: int) -> Search:
-    """The buffers in `search_memory` at that address."""
+    """The buffers in memory made by `search_memory`. memory: its address."""
     return _search_at(memory, lanes)[0]
 
 

@@ -6,7 +6,7 @@ ones among the pixels BESIDE_PX to both sides in 2 ROWS + 1 rows,
     p = sum w_t n_t / K,    N = K / sum w_t^2
     score = N (p log(p / p0) + (1 - p) log((1 - p) / (1 - p0))) where p > p0, else 0,    in nats
 
-which is the log-likelihood ratio of p over p0 for N frames, the effective number with the weights of a matched filter.
+which is the log-likelihood ratio of p to p0 for N frames, the effective number with the weights of a matched filter.
 As in `rig.estimate.joint.labels.costs`,
 
     cost(l) = units_per_nat (largest score of the row - score(l)),    uint8 (rows, columns, labels), <= COST_LIMIT
@@ -43,16 +43,17 @@ LEAST_ONES: Final = np.float32(0.5)
 MOST_SHARE: Final = np.float32(1.0 - 1e-4)
 """Largest p and p0, so that scores stay finite."""
 _AHEAD: Final = 2
-"""Rows ahead of which memory is prefetched."""
+"""Memory is prefetched this many rows ahead."""
 
 
 class Contrast(NamedTuple):
     """Settings of these costs under one model.
 
     place: int16 (columns, rows, PLACES) of `places_of`. hot_start, hot_x: as in `LabelTables`, of pixels that take the
-    count of the pixel beside them. shares: float32 (2, FRACTIONS, taps) of the line in the pixels around centres -4/8
-    to 3/8 px off towards near, from far to near and from near to far. frames: float32 (FRACTIONS,), N for one frame.
-    side: 1 if near is left, else -1. width: pixels of a sensor's row; what is stored behind them is padding.
+    count of the pixel beside them. shares: float32 (2, FRACTIONS, taps) of the line in the pixels around its centre,
+    which is -4/8 to 3/8 px off the middle of its pixel, towards near. First index: 0 from far to near, 1 from near to
+    far. frames: float32 (FRACTIONS,), N for one frame. side: 1 if near is left, else -1. width: pixels of a sensor's
+    row; what is stored behind them is padding.
     """
 
     place: Int16
@@ -157,7 +158,7 @@ def _mended(counts: Counts, contrast: Contrast, y: int, x0: int, n: Float32) -> 
 
 @numba.njit(cache=True, nogil=True)
 def _note_pixels_beside(seen: int, pixels: Float32) -> None:
-    """Fill pixels with 1 over the number of surrounding pixels of each, among the first `seen` of a row."""
+    """Fill `pixels`, for the first `seen` pixels of a row: 1 over the number of surrounding pixels among these."""
     begin, end = BESIDE_PX
     for t in range(seen):
         left = max(t - begin + 1, 0) - max(t - end, 0)
@@ -167,7 +168,7 @@ def _note_pixels_beside(seen: int, pixels: Float32) -> None:
 
 @numba.njit(cache=True, nogil=True)
 def _add_up(total: Float32, running: Float32) -> None:
-    """Fill the running sums of total (window,), from BESIDE_PX[1] pixels before it to as many behind it and more.
+    """Fill `running`: item BESIDE_PX[1] + t + 1 is the sum of total up to pixel t, or of all beyond the last pixel.
 
     float32 is exact for sums below 2^24.
     """
@@ -183,7 +184,7 @@ def _score_pixels(
     n: Float32, running: Float32, pixels: Float32, shares: Float32, seen: float, frames: float, pooled: float,
     low: int, high: int, score: Float32,
 ) -> None:  # fmt: skip
-    """Fill score of pixels low..high-1, which begins LANES places further on, and 0 up to a whole vector.
+    """Fill `score` for pixels low..high-1 from item LANES + low on, and set the LANES items behind them to 0.
 
     n: counts from REACH_PX before the window on. seen: frames times rows around. pooled: N of the module.
     """
@@ -227,7 +228,7 @@ def _write_own(score: Float32, low: int, high: int, side: int, units: float, own
 
 @numba.njit(cache=True, nogil=True)
 def _write_costs(own: Uint8, alone: bool, cost: Uint8) -> None:
-    """Write own, or its mean with cost, to cost (labels,), but for labels that are EXCLUDED."""
+    """Write own, or its mean with cost, to cost (labels,), except where cost is EXCLUDED."""
     for label in range(cost.shape[0]):
         before = cost[label]
         mean = np.uint8((np.uint16(before) + np.uint16(own[label]) + np.uint16(1)) >> np.uint16(1))

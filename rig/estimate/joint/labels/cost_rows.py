@@ -94,7 +94,7 @@ def read_bytes(
     counts: int, begin: int, places: int, stored: tuple[int, int, int, int], side: int, pixels: int, times: int,
     b: Buffers, batch: int,
 ) -> None:  # fmt: skip
-    """Fill n of `batch` rows from counts that are bytes, from far to near. Pixels that were not stored get any value.
+    """Fill n of `batch` rows from counts that are bytes, from far to near. Pixels that were not stored get any values.
 
     counts: address of the first count, begin: index of the first row's first count. stored: first pixel, pixels of a
     row, number of all counts, counts of a column. times: factor on counts.
@@ -365,8 +365,9 @@ def fill_costs(
 def _times(exposures: int, ways: Ways) -> float:
     """Factor on the counts of a column, a whole number if it is not below 1; products fit 16 bits.
 
-    With more exposures a nat is worth fewer units, as in a map whose columns all have so many. Otherwise a column with
-    few exposures would count for less beside others with many, and the penalties between neighbours for more.
+    A nat is worth as many units as in a map whose columns all have this number of exposures, so fewer with more of
+    them. Otherwise a column with few exposures would count for less beside others with many, and the penalties between
+    neighbours for more.
     """
     full = 2.0 ** (COUNT_BITS - ways.bits)
     worth = (ways.sharp + ways.exposures) / (ways.sharp + exposures)

@@ -58,7 +58,7 @@ FINEST: Final = 64.0
 WEIGHT_BITS: Final = 12
 """Weights of 2^WEIGHT_BITS units per nat reach to 8 nats per count."""
 RISE_LIMIT: Final = 22000
-"""Largest rise of the sum over a row's pixels, of a range of 40000 for scores."""
+"""Largest rise of the sum over a row's pixels, in units of score; scores have a range of 40000."""
 TAPS_LIMIT: Final = 28000
 """Most that the pixels around a position may add to its score."""
 FRAMES_OVER_HALF_MORE: Final = 4
@@ -68,8 +68,8 @@ LOOKED_AT: Final = 32
 QUANTILES: Final = (0.25, 0.75)
 """Quantiles of the learned amplitudes that the costs try."""
 HALO_QUANTILES: Final = (0.1, 0.35, 0.65, 0.9)
-"""Quantiles that are tried under a halo. It is many times brighter than its stripe, so a stripe between two amplitudes
-would be drawn to a distance where the halo of one of them fits."""
+"""Quantiles that are tried under a halo. A halo is many times brighter than its stripe, so a stripe between two
+amplitudes would be drawn to a distance where the halo of one of them fits."""
 HALO_TRUST: Final = 0.9
 """Factor on the halo's evidence: the many pixels over which it is summed share the errors of the learned halo."""
 
@@ -95,9 +95,9 @@ class Costs:
     def fill(self, volume: CountVolume, first: int, last: int, room: CostRoom, out: Uint8) -> None:
         """Write the costs of rows first..last-1 to out, uint8 (rows, columns, labels) of all rows.
 
-        Rows without frames, or with nothing to search, cost 0 everywhere. Best called with 16 rows or more at a time.
-        Threads may fill different rows at once, each with its own working memory. room: `pointers` to this memory,
-        which the caller keeps alive.
+        Rows of columns without frames, and rows with nothing to search, cost 0. Call it best with 16 rows or more at a
+        time. Threads may fill different rows at once, each with its own working memory. room: `pointers` to this
+        memory, which the caller keeps alive.
         """
         fill_costs(
             volume.counts, volume.n_frames, volume.x0, self.place, self.tables.at, room, self.ways, first, last, out

@@ -106,7 +106,7 @@ VARIANTS: Final = FRACTIONS // 2
 PHASES: Final = 2
 FAR_PX: Final = MARGIN_PX
 SLACK_PX: Final = 1
-"""Pixels by which a label may lie outside the row's search window: the mean of a peak at its end needs both sides."""
+"""Pixels by which a label may lie outside a search window: the mean of a peak at its end needs both sides."""
 START, VARIANT, ODD, LABEL, LABEL_END, VALID, VALID_END, MEND = range(8)
 """START: x of pixel 0; VARIANT: -1 where nothing is searched; ODD: 1 where label 0 is of phase 1; LABEL, LABEL_END:
 first possible label, and one after the last; VALID, VALID_END: first pixel p that was stored and is read, and one after

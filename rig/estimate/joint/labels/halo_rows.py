@@ -34,12 +34,13 @@ BLOCK_PX: Final = 8
 FIRST_PX: Final = FAR_PX % BLOCK_PX - BLOCK_PX
 """First pixel of the first block, before the row, so that the first label's pixel begins a block."""
 AHEAD: Final = (FAR_PX - FIRST_PX) // BLOCK_PX
-"""Number of blocks behind a stripe at place 0."""
+"""Number of blocks on the far side of a stripe at place 0."""
 _FULL: Final = 32768.0
 
 
 class HaloTables(NamedTuple):
-    """Tables of the halo. Blocks are counted from FIRST_PX on, the stripe's places from the far end of label 0's pixel.
+    """Tables of the halo. Blocks are counted from FIRST_PX on, places of the stripe, BLOCK_PX apart, from the far end
+    of label 0's pixel.
 
     weight: int16 (bands, columns, blocks, lights, places), of the mean count of a block. constant: float32
     (bands, columns, lights, places), nats per exposure. ramp: int16 (phases, 3, LANES), interpolation weights of the
@@ -175,7 +176,7 @@ def new_halo_room(halo: HaloTables, constants: int) -> HaloRoom:
 
 @numba.njit(cache=True, nogil=True)
 def fit_halo(halo: HaloRoom, column: int, per_nat: float) -> None:
-    """Fill fitted for a column's exposures. column: its number among all bands; per_nat: units x exposures."""
+    """Fill `halo.fitted` for a column's exposures. column: band * columns + column; per_nat: units x exposures."""
     numbers = halo.lights * halo.places
     for j in range(0, numbers, LANES):
         nats = load_float32(halo.tables.constant + 4 * column * numbers, j) * np.float32(per_nat)
@@ -184,7 +185,7 @@ def fit_halo(halo: HaloRoom, column: int, per_nat: float) -> None:
 
 @numba.njit(cache=True, nogil=True)
 def halo_rows(halo: HaloRoom, column: int, at: LabelTables, fitted: Fitted, b: Buffers, batch: int) -> None:
-    """Fill constant with the constants of the rows' tables plus the evidence of the halo, for `batch` rows."""
+    """Fill `halo.constant` for `batch` rows: constants of the rows' tables plus the evidence of the halo."""
     vectors, numbers = b.score_row // (PHASES * LANES), halo.lights * halo.places
     weights = halo.tables.weight + 2 * column * halo.blocks * numbers
     for r in range(batch):

@@ -1,7 +1,7 @@
 """Tables of the label costs, per column, band of rows and variant, and the working memory.
 
-They hold the terms of `rig.estimate.row.likelihood`, relative to 'everything is before the stripe'. With p'_B and p'_E
-of a pixel before and behind the stripe, and p'_S of a pixel that it lights,
+They hold the terms of `rig.estimate.row.likelihood`, relative to 'everything is before the stripe'. With the
+probability p' that a pixel fires, p'_B before and p'_E behind the stripe, and p'_S where the stripe lights it,
 
     edge = logit p'_E - logit p'_B                  int16: a count at a pixel behind the stripe
     tap  = logit p'_S - logit p'_B or p'_E          int16: a count at a pixel around a label, for LIGHTS amplitudes;
@@ -108,8 +108,9 @@ def fill_tables(
     """Fill the tables of bands first_band..last_band-1.
 
     state: without ambient light, which is in `ambient` (rows, width), for pixels that are not `hot`. light: (LIGHTS x
-    pairs,) photons at unit scale. shares: (FRACTIONS, taps) of the line in the pixels around centres -4/8 to 3/8 px
-    off. per_nat: units of weight; most: largest sum of a position's weights.
+    pairs,) photons at unit scale. shares: (FRACTIONS, taps) of the line in the pixels around its centre, which is -4/8
+    to 3/8 px off the middle of its pixel. beside: (BINS,), share of the halo in a pixel 4 px from the stripe. per_nat:
+    units of weight; most: largest sum of a position's weights.
     """
     side = 1 if sweep.near_is_left else -1
     pixels = out.edge.shape[1]
@@ -168,9 +169,8 @@ def mark_rows(place: Int16, hot: Bools, side: int, tables: LabelTables) -> None:
 
 @numba.njit(cache=True, nogil=True)
 def middle_row(place: Int16, c: int, rows: tuple[int, int], variant: int) -> tuple[int, int, int]:
-    """The row of a variant (-1: of any) nearest the band's middle, -1 if there is none; first and end of its positions.
-
-    The latter are of all rows of the variant. There are two positions per pixel, from the one that holds label 0 on.
+    """The row of a variant (-1: of any) nearest the middle of `rows`, -1 if there is none. Then the first position of
+    all rows of the variant, and the one after the last: two per pixel, counted from the pixel that holds label 0.
     """
     middle = (rows[0] + rows[1]) // 2
     best, first, end = -1, 1 << 15, 0
@@ -275,7 +275,7 @@ def _weight(value):  # type: ignore[no-untyped-def]
 BATCH: Final = LANES
 """Rows that go through each step of the work together: while one waits for a result, others go on."""
 SUMS_FROM: Final = LANES - 1
-"""Place of the first sum. The sum up to and including a pixel is the next one's, so whole vectors are written."""
+"""Index of the first sum. The sum up to and including pixel p is stored for p + 1: so it begins a whole vector."""
 POSITION: Final = PHASES * LIGHTS * LANES
 """Numbers per vector of pixels in a table, for a pair of brightnesses."""
 
@@ -310,8 +310,8 @@ class Buffers(NamedTuple):
     """Working memory for BATCH rows, int16 (BATCH, n_row or the like) unless stated.
 
     n: counts of pixels from far to near; sums: score of a change at each pixel from SUMS_FROM on, the first one BASE;
-    score: of pixel and phase; top: the largest score in each lane of each row, then that of each row in the first
-    LANES. cost: uint8, of labels, from that of the first pixel's phase 0 on. For all rows: mask: uint8 (labels,),
+    score: of pixel and phase; top: the largest score in each lane of each row; in the end the first LANES hold that
+    of each row. cost: uint8, of labels, from that of the first pixel's phase 0 on. For all rows: mask: uint8 (labels,),
     EXCLUDED or 0; constant: of positions, edge: of pixels, for each variant; through: intermediate sums for edge.
     int32: table: number of each variant's table, from variant -1 on, -1 if there is none; here: that of each row of the
     batch; fitted: its place in `Fitted`; shown: first label of the mask, and the one after the last.

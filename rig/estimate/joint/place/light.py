@@ -3,7 +3,7 @@
 With counts n of K frames at the pixels t within LIGHT_PX of a stripe, haze the mean of the haze before and behind, and
 glow the halo per pixel as a share of the light (`measure_light`),
 
-    light = (sum over t of log (K + 1/2) / (K - n_t + 1/2) - ambient_t - haze) / (1 + (2 LIGHT_PX + 1) glow)
+    light = (sum over t of log((K + 1/2) / (K - n_t + 1/2)) - ambient_t - haze) / (1 + (2 LIGHT_PX + 1) glow)
 
 in photons per exposure, computed as one logarithm of a product. Blind pixels add nothing to the sum. Haze is
 interpolated between bins of its profile, from a table in which all values of a bin lie side by side.
@@ -13,7 +13,7 @@ With the flux of each of the TAPS pixels around a stripe of `light` photons, and
     slope = light d share / dx (and the step of haze at the centre),
     g = sum slope (n D - (K - n)),    h = sum K slope^2 D
 
-are the slope of the log-likelihood over the stripe's position and its Fisher information, 1/px and 1/px^2. For a pixel
+are the derivative of the log-likelihood by position (1/px) and the Fisher information on it (1/px^2). For a pixel
 that is missing in the row or must not be used, so much ambient light is assumed that the pixel gives no information.
 Arrays are float32 (rows, columns), see `Places` (`rig.estimate.joint.place.places`).
 """
@@ -210,7 +210,7 @@ def score_places(
     """Fill score and known of rows first_row..last_row-1 for stripes at x_px.
 
     shares: (FRACTIONS, 2, EIGHT), share of the line in each of the TAPS pixels around the one that holds its centre,
-    and the derivative of the share by the centre's position in pixels. around: of `fetch_counts`.
+    and the derivative of the share with respect to the centre's position in px. around: of `fetch_counts`.
     """
     window, (pixels, columns) = sweep.window, (state.ambient.shape[1], x_px.shape[1])
     side, half, one = 1 if sweep.near_is_left else -1, np.float32(0.5), np.float32(1.0)

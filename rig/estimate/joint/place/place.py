@@ -31,9 +31,9 @@ so smooth that their brightness would be learned too dark."""
 ENOUGH = 1 / 0.06**2
 """Information, 1/px^2, that is enough for a place: no more neighbours are used, since surfaces bend."""
 PAIRS = ((4, 0.576), (6, 0.280))
-"""For each round of joining: rows and columns to the neighbours of a pair, and `share` of `join_pairs`. Since
-neighbourhoods overlap, a stripe with 5 x 5 neighbours counts as 25 stripes, joined with eight such stripes as 140, and
-this joined with eight such as 454."""
+"""For each round of joining: rows and columns to the neighbours of a pair, and `share` of `join_pairs`. A place pooled
+over 5 x 5 stripes has the information of 25 stripes, of 140 after the first round and of 454 after the second. Since
+neighbourhoods overlap, these are less than 9 x 25 and 81 x 25."""
 MOST_MOVED_PX = 0.9
 """Largest shift of a stripe from its label, all rounds together. Labels end a pixel beyond the searched pixels, so
 answers end within 2 px of these. Only in pictures of saturated pixels would stripes move farther."""

@@ -1,8 +1,8 @@
 """Sub-pixel placing of stripes by one step of Fisher scoring, pooled over neighbours on the same surface.
 
 At its answer each row n gives the slope of its log-likelihood with the stripe's position (the score g) and its Fisher
-information h (`rig.estimate.joint.place.light`). Neighbours on one surface share its distance d from the far end in px.
-The pooled value
+information h (`rig.estimate.joint.place.light`). Neighbours on one surface have the same distance d, in px, from the
+position at the far end of the depth range. The pooled value
 
     d = sum (h_n d_n + g_n) / sum h_n
 
@@ -33,7 +33,7 @@ CLEAR: Final = 0.9
 CLEAR_SD_PX: Final = 0.2
 """The line's width is measured on stripes of more confidence than CLEAR and less deviation than CLEAR_SD_PX."""
 BESIDE_PX: Final = 5, 6
-"""Pixels to either side of a line, from and to, that show the halo under the line and nothing of the line itself."""
+"""From which to which distance, in px, the pixels beside a line show its halo and nothing of the line itself."""
 BLIND_FLUX: Final = np.float32(3.0)
 """Ambient light with which a pixel fires in 95 % of all frames and shows nothing; pixels not to be used have more."""
 LEAST_FRAMES: Final = 2.0
@@ -190,7 +190,7 @@ def ambient_place(ambient, width, y, x, x0, window, spare):  # type: ignore[no-u
 
 @numba.njit(forceinline=True)
 def counts_of(around, at, y, c, to):  # type: ignore[no-untyped-def]
-    """Write EIGHT vectors of counts of stripes c..c+LANES-1 of row y to address `to`. around, at: array and address."""
+    """Write EIGHT vectors of counts of stripes c..c+LANES-1 of row y to address `to`. at: address of `around`."""
     if around.itemsize == 1 and c + LANES <= around.shape[1]:
         spread_eights(at + (y * around.shape[1] + c) * EIGHT, to)
         return

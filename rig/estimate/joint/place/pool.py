@@ -1,9 +1,9 @@
 """Sums over neighbours on one surface, and places combined with pairs of opposite neighbours, LANES stripes to a
 vector.
 
-Pooling: sums over those neighbours whose distance from the far end differs by at most SAME_PX. This differs from stripe
-to stripe, so running sums cannot be used. Rows are processed in copies with a margin of NaN (`with_margin`), so that no
-bounds need checking. All arrays are float32 (rows, columns).
+Pooling: sums over those neighbours whose distance from the far end differs by at most SAME_PX. Each stripe has other
+such neighbours, so running sums cannot be used. Rows are processed in copies with a margin of NaN (`with_margin`), so
+that no bounds need checking. All arrays are float32 (rows, columns).
 
 Joining: on a plane of any slope, the mean of two places opposite each other is the place between them. So a stripe is
 joined with pairs of opposite neighbours, each already placed with its own neighbourhood, where their mean m agrees with
@@ -13,8 +13,8 @@ its own place d: within SAME_PX, and within SIGMAS times the standard deviation 
 
 with standard deviations s of the stripe, and s1 and s2 of the pair. Where a surface ends or bends they do not agree,
 and the stripe stays where it is. Two such rounds reach as far as 25 x 25 neighbours for the work of 16. Neighbourhoods
-overlap, so pairs add less information than 1 / v. The factor `share` on it makes the standard deviation of d' right
-where all agree.
+overlap, so pairs add less information than 1 / v. In the standard deviation of d' it is multiplied by `share`, which is
+right where all pairs agree.
 """
 
 from typing import Final
@@ -55,7 +55,7 @@ def pool_row(distance: Float32, first: Float32, second: Float32, y: int, reach: 
 
 @numba.njit(cache=True, nogil=True)
 def widen_row(at: tuple[int, int, int], width: int, y: int, inner: int, reach: int, enough: float, sums: int) -> None:
-    """Add to sums, as `pool_row`, those neighbours that are more than `inner` rows or columns away, up to `reach`.
+    """Add to the sums of `pool_row` those neighbours that are more than `inner` rows or columns away, up to `reach`.
 
     Stripes whose second sum already reaches `enough` may be left as they are. at, sums: addresses; width: of copies.
     """
@@ -171,8 +171,8 @@ def join_pairs(
     """Join the stripes of rows first_row..last_row-1 with pairs, see the module; all arrays are (rows, columns).
 
     distance: from the far end in px, NaN where there is no stripe; sd_px: at most 1, which means no information. step:
-    number of rows and columns to the neighbours, at most MARGIN. enough: information, 1/px^2, above which a stripe
-    stays where it is.
+    number of rows and columns to the neighbours, at most MARGIN. share: factor on the information of pairs.
+    enough: information, 1/px^2, above which a stripe stays where it is.
     """
     columns = distance.shape[1]
     to_distance, to_sd = address_of(out_distance), address_of(out_sd_px)
