@@ -188,7 +188,7 @@ class EstimateConfig(ConfigSection):
 
 
 def _of_slot(slot: str) -> BeforeValidator:
-    """A validator that reads a mapping, or a kind's config, as the config model of the kind that it names."""
+    """A validator of a device's section, a mapping or a config model: makes the config model of the kind it names."""
 
     def validate(value: object, info: ValidationInfo) -> object:
         if isinstance(value, KindConfig):

@@ -9,8 +9,8 @@ used in the next one. So the column of a frame depends only on earlier frames, n
 record is damaged). A compiled walk (`rig.count.bind_kernels`) places the frames; Python runs only once per block and at
 the begin of each sweep.
 
-The lit frames of a sweep go through the columns in order. When a marker corrects the extrapolation from the one before,
-frames may fall back to a column already left. Such frames are not used.
+The lit frames of a sweep go through the columns in order. When a new marker corrects the time extrapolated from the
+marker before, frames may fall back to a column already left. Such frames are not used.
 """
 
 import math
@@ -112,7 +112,8 @@ class PlanTerms(NamedTuple):
 
 
 class BlockTerms(NamedTuple):
-    """Numbers of a header for the walk. start_ticks: since the first block's. middle: of an exposure, in units."""
+    """Numbers of a block's header for the walk. sweep: scan markers before the block. start_ticks: from the first
+    block's start to this one's. period_ticks: of a frame. middle: half an exposure, in units."""
 
     sweep: int
     start_ticks: int
@@ -335,7 +336,7 @@ def _new_places(n: int) -> Places:
 
 
 def _sweep_named(record: np.void, terms: BlockTerms) -> int:
-    """Number of the sweep that a frame names: 1 less than its scan markers so far. The record has their low 16 bits."""
+    """Number of the sweep that a frame names: the scan markers so far, which its record has mod 2^16, minus 1."""
     return terms.sweep + ((int(record["sweep"]) - terms.sweep) & 0xFFFF) - 1
 
 

@@ -45,7 +45,7 @@ NEAREST: Final = 3
 FOLLOWED: Final = 256
 """Points at which light of all widths is first followed through the columns. Their number doubles until it suffices."""
 LIMIT: Final = 4.0
-"""Standard deviations: one false alarm in 30 000 checks."""
+"""Standard deviations beyond which a check raises a doubt: one false alarm in 30 000 checks."""
 FEWEST_ROWS: Final = 24
 """Least number of rows for the check of pixel order: a sum over n rows reaches sqrt(n) standard deviations at most."""
 LEAST_FOLLOWING: Final = 0.25

@@ -64,7 +64,8 @@ class KnowsRig(Protocol):
 
 @dataclass(frozen=True, slots=True)
 class CalibrationUse:
-    """The calibration of a run. checked: whether it states its rig. accepted: reasons in spite of which it is used."""
+    """The calibration of a run. checked: whether it states its rig and so was compared. accepted: reasons against it
+    that the user accepted."""
 
     model: RigModel
     checked: bool
@@ -142,8 +143,8 @@ def calibration_use(rig: OpenRig, *, accept: bool = False, here: Identity | None
 
 
 def cube_calibration_use(model: RigModel, file: Path | None, *, accept: bool = False) -> CalibrationUse:
-    """The calibration of a cube of frames whose rig is unknown. Only its verdict and checks count. May raise
-    UsageError.
+    """The calibration of a cube of frames whose rig is unknown. Only its verdict and checks count. Raises UsageError as
+    `calibration_use` does.
     """
     return _used(model, file, refusals(model, file, None), accept)
 
@@ -240,7 +241,7 @@ def _accepted_before(rig: OpenRig) -> frozenset[str]:
 
 
 def accepted_by(use: CalibrationUse | None) -> tuple[str, ...]:
-    """The reasons in spite of which a run's calibration was used, for its summary."""
+    """The reasons against a run's calibration that the user accepted, for the summary."""
     return () if use is None else tuple(map(str, use.accepted))
 
 
@@ -266,8 +267,8 @@ def check_content(checked: str, accepted: Sequence[Refusal]) -> dict[str, Any]:
 
 
 def note_check(file: Path, model: RigModel, what: str, *, passed: bool, reasons: tuple[str, ...] = ()) -> Path:
-    """Note the outcome of a check in a file beside the calibration; returns its path. what: check or pixels. Raises
-    OSError, or UsageError if older notes cannot be read."""
+    """Note the outcome of a check in a file beside the calibration; returns that file's path. what: the command that
+    checked, 'check' or 'pixels'. Raises OSError, or UsageError if older notes cannot be read."""
     beside = _beside(file)
     notes = _read_notes(beside)
     date = datetime.now(UTC).isoformat(timespec="seconds")

@@ -22,7 +22,7 @@ from rig.plan.scan_plan import ScanPlan
 from rig.recording.replay import replay_plan
 
 HOLD_EXPOSURES = 10
-"""With at least so many exposures per column, simulated light is constant in a column; with fewer, in parts of one."""
+"""With this many exposures per column or more, simulated light is constant over a column; with fewer, over parts."""
 
 
 @runtime_checkable
@@ -77,7 +77,7 @@ def _compiled(rig: OpenRig, scan: ScanConfig) -> ScanPlan:
 
 
 BURST_LEAD_S, HOST_LEAD_S = 5e-3, 0.15
-"""A burst must have room for so many seconds between the SPAD's start and the first scan marker.
+"""A burst must have room for this time in seconds between the SPAD's start and the first scan marker.
 
 The first is for virtual time, the second for a host that starts one device after the other over USB and serial ports.
 """
@@ -85,7 +85,7 @@ The first is for virtual time, the second for a host that starts one device afte
 SPARE_LEAD_S = 0.35
 """Further seconds before the first marker, since a busy host starts its devices late.
 
-They are added if the memory has room, and if reading ends with the last scan marker.
+They are added if the memory has room and the SPAD has markers: reading then ends with the last scan marker.
 """
 
 

@@ -1,7 +1,7 @@
 """Checks whether a calibration is valid for a scan: for its sensor, its mirror's speed and its range of commands.
 
-`recalibrated` adapts the plan of a recording to a calibration made since. What was scanned does not change, but where
-it is seen may.
+`recalibrated` adapts the plan of a recording to a calibration made later. Mirror and gate did what they did; lag and
+windows may change.
 """
 
 import math
@@ -70,7 +70,8 @@ def recalibrated(plan: ScanPlan, model: RigModel) -> ScanPlan:
     """The plan with the lag and the windows of `model`; unchanged if it was compiled for that model.
 
     Mirror, gate and markers stay as they were, and so do the pixels that the SPAD sent. Frames that do not contain a
-    column's window do not count for it. Raises UsageError if the calibration is not of this rig and scan.
+    column's window do not count for that column. Raises UsageError if the calibration does not fit the plan's sensor,
+    speed or commands.
     """
     try:
         model.check_sensor(plan.width, plan.rows)

@@ -2,7 +2,7 @@
 
 Blocks are written several at a time, past the page cache if the system allows it (O_DIRECT), without copying pixels if
 they are aligned. This takes 0.3 s of CPU per GB, nearly all of it for the checksum, compared with 2 s through the page
-cache. Then a sync has little to do. `Space` is the most room that a recorded run will take.
+cache, and little is left for a sync. `Space` is the most room that a recorded run will take.
 """
 
 import errno

@@ -1,4 +1,4 @@
-"""Makes depth maps from a cube of frames without records, map by map."""
+"""Makes depth maps, one by one, from a cube: an array of frames without markers or frame numbers."""
 
 import time
 
