@@ -52,7 +52,7 @@ from rig.scan.source import Source, blocks
 from rig.threads import RowWorkers
 
 STARTS: Final = 32
-"""Starts of the SPAD, and so blocks whose counts are compared; more if its memory holds too few frames."""
+"""Starts of the SPAD; the counts of each are one block of the statistics. More if its memory holds too few frames."""
 BLOCK_FRAMES: Final = 128
 SPARE_SLOTS: Final = 4
 """Slots of the ring beyond those needed, so that nothing is lost if a device sends shorter blocks than requested."""

@@ -114,7 +114,8 @@ class Session:
     ) -> None:
         """Claim the folder; None writes nothing. Raises UsageError if it cannot be claimed.
 
-        board: what the views show. tell: gets a line on each view. of_camera: digests of a camera's views.
+        board: what the views show. tell: gets a line on each view. of_camera: digests of the views that a known camera
+        was made of, which must not be used again.
         """
         self.views: list[View] = []
         self.refused: dict[str, Degenerate] = {}

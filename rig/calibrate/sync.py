@@ -65,10 +65,10 @@ MOST_SWEEPS = 20
 
 @dataclass(frozen=True, slots=True)
 class GateDelay:
-    """Delay of the light after the gate of a plan, in seconds.
+    """Delay of the light relative to the planned gate, in seconds.
 
-    opens_s, closes_s: how much later than planned; NaN if the line was not in the picture then. opens_sd_s,
-    closes_sd_s: their standard deviations. edges: number of edges seen.
+    opens_s, closes_s: how much later than planned the light comes and goes; NaN if the line was not in the picture
+    then. opens_sd_s, closes_sd_s: their standard deviations. edges: number of edges seen.
     """
 
     opens_s: float

@@ -112,8 +112,8 @@ class PlanTerms(NamedTuple):
 
 
 class BlockTerms(NamedTuple):
-    """Numbers of a block's header for the walk. sweep: scan markers before the block. start_ticks: from the first
-    block's start to this one's. period_ticks: of a frame. middle: half an exposure, in units."""
+    """Numbers of a block's header for the walk. sweep: scan markers up to the block's first frame. start_ticks: from
+    the first block's start to this one's. period_ticks: of a frame. middle: half an exposure, in units."""
 
     sweep: int
     start_ticks: int
@@ -123,7 +123,7 @@ class BlockTerms(NamedTuple):
 
 
 class FrameBinder:
-    """Binds the blocks of one start of the SPAD, in order. Records count markers up to and including their own frame.
+    """Binds the blocks of one start of the SPAD, in order. A frame's record counts scan markers, its own included.
 
     clock_ratio: of the scanner's clock to nominal, until a sweep gives it. first_sweep: number of the first whole
     sweep; incomplete ones before give no ratio. end_sweep: number after that of the last sweep wanted; None for all.
@@ -298,7 +298,7 @@ class FrameBinder:
         return closed
 
     def _boundary_frame(self, number: int, at: int, header: BlockHeader, start: int) -> int:
-        """Number of the frame in which sweep `number` began, whose marker was lost, from the scanner's clock."""
+        """Number of the frame in which sweep `number` began if its marker was lost, computed from the clocks."""
         here = header.first_frame + at
         time, point = (int(self._carried[name][0]) for name in ("anchor_time", "anchor_point"))
         if point < 0:

@@ -148,7 +148,7 @@ class PatternSearch:
 
 
 def _judged(cross: Array, left: float, total: Array, mean: Array, n: int) -> tuple[Array, Array]:
-    """Score, and the residual in excess of photon noise relative to what is explained."""
+    """Score, and the residual in excess of photon noise, divided by what the pattern explains."""
     explained = cross**2 / left
     rest = np.maximum(total - explained, 0)
     scatter = np.maximum(rest / (n - 4), np.maximum(mean, _NO_LIGHT))
@@ -181,7 +181,7 @@ def _best(shares: Array, places: Array, frames: Array, ones: Array) -> PatternFi
 
 
 def detection_probability(score: float) -> float:
-    """Chance that a pattern is found whose score is this on average."""
+    """Chance that a pattern with this mean score is found."""
     return 0.5 * math.erfc((LEAST_SCORE - score) / math.sqrt(2))
 
 

@@ -1,9 +1,9 @@
 """Checks of a map's counts and answers by its own light. A correctly taken map passes them, whatever the scene.
 
-They use up to 512 or 8192 points. A point is a row and a column. Its partners are the next row in the same column, and
-the same row in four other columns, to which the laser line has moved by 6 to 64 px (less in a narrow sweep). A stripe
-appears at a point and all its partners, at places that the planes predict; noise does not. Each has a line of counts,
-those of its row in its column.
+They use up to 8192 points, or 512 if not all counts are kept. A point is a row and a column. Its partners are the next
+row in the same column, and the same row in four other columns, to which the laser line has moved by 6 to 64 px (less in
+a narrow sweep). A stripe appears at a point and all its partners, at places that the planes predict; noise does not.
+Point and partners each have a line of counts: those of the row in the column.
 
 - Pixels of a row: neighbours receive similar light, so no other order of the pixels is smoother than the right one.
 - Rows: a stripe is at the same place on the next row.

@@ -50,7 +50,7 @@ RIDGE: Final = 1e-11
 """Added to the diagonal: keeps the inverse positive if two parameters act alike, as even haze and ambient light do."""
 FLUX_MIN: Final = 1e-7
 FLUX_MAX: Final = 50.0
-"""Photons per exposure; between these all logarithms are finite."""
+"""Photons per exposure; between FLUX_MIN and FLUX_MAX all logarithms are finite."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)

@@ -195,7 +195,7 @@ def _foreign(made: Identity, here: Identity) -> list[Refusal]:
 
 
 def _comparable(made: Identity, here: Identity) -> tuple[dict[str, str], dict[str, str]]:
-    """Kinds of both. For simulated worlds these are digests of the geometry, or file names if one has no digest."""
+    """Kinds of both. That of a simulated world is its geometry's digest, or file name if one of them has no digest."""
     both = dict(made.kinds), dict(here.kinds)
     digests = [kinds.pop(_GEOMETRY, "") for kinds in both]
     if all(digests):

@@ -1,4 +1,4 @@
-"""Prepares open devices for a scan: the plan is compiled once and the SPAD configured for it, before anything moves.
+"""Prepares open devices for a scan: the plan is compiled and the SPAD configured for it, before anything moves.
 
 This module also divides a SPAD's burst memory between the time until the scanner has started and the maps.
 """
@@ -90,7 +90,7 @@ They are added if the memory has room and the SPAD has markers: reading then end
 
 
 def lead_s(rig: OpenRig) -> float:
-    """Duration in seconds of the part of a burst before its first scan marker."""
+    """Seconds of a burst that are reserved for the time before its first scan marker."""
     return BURST_LEAD_S if isinstance(rig.clock, VirtualClock) else HOST_LEAD_S
 
 

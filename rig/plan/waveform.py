@@ -60,8 +60,8 @@ def line_markers(path: SweepPath, columns: int, exposures: int) -> tuple[int, ND
 def _scan_marker_points(leg: Leg, rate: Fraction) -> int:
     """Points for which the scan marker, which holds the gate, stays high: until the middle of the gate's last slice.
 
-    So the gate closes when its pulse ends, not when the marker falls, as long as the clocks of scanner and sync source
-    differ by less than half a slice.
+    The sync source begins each slice of a gate pulse only while the marker is high. So the gate closes when its pulse
+    ends, not when the marker falls, as long as the clocks of scanner and sync source differ by less than half a slice.
     """
     lit_s = leg.gate_close_s - leg.gate_open_s
     return max(1, math.floor((leg.gate_close_s - lit_s / slices(lit_s) / 2) * rate))

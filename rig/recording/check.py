@@ -31,7 +31,7 @@ _STEP_BYTES: Final = 64 * 2**20
 _CLOCK_SHARE: Final = 0.01
 """Tolerance of ticks against frame numbers: this share of the frames, plus half a frame."""
 _NEIGHBOURS: Final = 2
-"""A block is compared with so many blocks before it, and as many after it."""
+"""Number of blocks before a block, and after it, with which it is compared."""
 _FEW: Final = 4
 """At most one in this many blocks of a start is left out because of its ticks or sweep; of three blocks, one."""
 

@@ -53,7 +53,7 @@ class OpenSegment:
         self.placed = 0
         """Offset of the next block, bytes."""
         self.end = 0
-        """Offset in bytes of the end of the blocks that are written without a gap between them."""
+        """Offset in bytes of the first block that is not written yet: all blocks before it are."""
         self.synced = 0
         """Value of `end` at the beginning of the last sync."""
         self._lock = threading.Lock()

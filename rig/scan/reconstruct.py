@@ -1,4 +1,4 @@
-"""Makes depth maps, one by one, from a cube: an array of frames without markers or frame numbers."""
+"""Makes depth maps, one by one, from a cube: frames without markers, in an array or an imported recording."""
 
 import time
 

@@ -36,7 +36,7 @@ class RunResult:
     """Result of a run.
 
     last: the last map; None if the run ended before its first.
-    truth: the truth of that map; None without a simulated world.
+    truth: the truth of that map; None if it is not known.
     folder: where everything was written; None if nothing was.
     control: for a replay with drivers, the comparison of what they sent with the recording.
     """
