@@ -137,7 +137,7 @@ def take_kept(session: Session, sources: ViewSources, defects: NDArray[np.bool_]
 
 
 def _require_alike(folder: Path, board: Board | None) -> None:
-    """Raise UsageError if a session shows another board. The size of the squares may differ: a new measurement."""
+    """Raise UsageError if a session shows another board. Only the size of its squares may have been measured again."""
     file = folder / BOARD_FILE
     if not file.is_file():  # no board was looked for
         return

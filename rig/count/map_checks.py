@@ -10,8 +10,8 @@ Point and partners each have a line of counts: those of the row in the column.
 - Frames: those of one column show the stripe at one place, pixel by pixel, just as two rows do.
 - Columns: the stripe moves from column to column as the planes predict; so does all other light of the sweep, mainly
   haze.
-- Answers of estimators whose confidence is a probability: an answer with confidence 0.9, for one place of some 150,
-  needs evidence of seven nats. At most 7 x 7 lines of counts contribute to it. So each contributes at least 1/7 nat on
+- Answers of estimators that learn the light: an answer with confidence 0.9, for one place of some 150, needs evidence
+  of seven nats. At most 7 x 7 lines of counts contribute to it. So each contributes at least 1/7 nat on
   average, which is light half a standard deviation above the background. So there must be that much more light at the
   answers than behind them, on lines of counts that did not give the answers.
 
@@ -114,7 +114,8 @@ def check_points(geometry: SweepGeometry, points: int = POINTS) -> Points:
 class MapChecks:
     """The checks of maps of one geometry.
 
-    calibrated: whether its planes are known. knows: whether the estimator's confidence is a probability.
+    calibrated: whether its planes are known. knows: whether the estimator learns the light, so that its confidence is a
+    probability under what it has learned.
     """
 
     def __init__(self, geometry: SweepGeometry, *, calibrated: bool, knows: bool) -> None:

@@ -195,7 +195,7 @@ def _foreign(made: Identity, here: Identity) -> list[Refusal]:
 
 
 def _comparable(made: Identity, here: Identity) -> tuple[dict[str, str], dict[str, str]]:
-    """Kinds of both. That of a simulated world is its geometry's digest, or file name if one of them has no digest."""
+    """Kinds of both. For a simulated world: the digest of its geometry, or the file name if one rig has no digest."""
     both = dict(made.kinds), dict(here.kinds)
     digests = [kinds.pop(_GEOMETRY, "") for kinds in both]
     if all(digests):
@@ -278,7 +278,7 @@ def note_check(file: Path, model: RigModel, what: str, *, passed: bool, reasons:
 
 
 def carry_notes(old: Path, before: RigModel, new: Path, after: RigModel, *, new_pixels: bool = False) -> None:
-    """Copy the notes on failed checks from a calibration to the one that was made from it. Raises as `note_check`.
+    """Copy the notes on failed checks from a calibration to the one made from it. Raises what `note_check` raises.
 
     new_pixels: whether the new one has a pixel map of its own, so that notes on the old one do not apply.
     """

@@ -22,7 +22,7 @@ from rig.plan.scan_plan import ScanPlan
 from rig.recording.replay import replay_plan
 
 HOLD_EXPOSURES = 10
-"""With this many exposures per column or more, simulated light is constant over a column; with fewer, over parts."""
+"""From this number of exposures per column on, simulated light is constant in a column; below, in parts of one."""
 
 
 @runtime_checkable

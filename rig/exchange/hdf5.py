@@ -81,7 +81,7 @@ def write_hdf5(blocks: Iterable[FrameBlock], maps: MapFiles, manifest: Mapping[s
 
 
 def _require_room(path: Path, n_bytes: int) -> None:
-    """Raise OSError before the disk is nearly full: HDF5 cannot close a file on a full disk and ends the process."""
+    """Raise OSError if n_bytes nearly fill the disk. On a full disk HDF5 cannot close a file and ends the process."""
     if shutil.disk_usage(path.parent).free < n_bytes + _ROOM_BYTES:
         raise OSError(errno.ENOSPC, os.strerror(errno.ENOSPC), str(path))
 

@@ -14,8 +14,8 @@ from rig.plan.scan_plan import ScanPlan
 def sync_program(plan: ScanPlan, maps: int) -> tuple[tuple[Pulse, ...], int]:
     """Pulses and repeats that open the gate once in each of `maps` sweeps and then leave it low.
 
-    A blanking pattern, if the plan has one, is given in each of these sweeps, in the pilot sweeps before them and in
-    the sweep after them.
+    A blanking pattern, if the plan has one, is given in each of these sweeps, in the sweep after them, and in pilot
+    sweeps before them, which have nothing else.
     """
     if plan.blanking is not None:
         lit = range(plan.pilots, plan.pilots + maps)

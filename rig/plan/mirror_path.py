@@ -226,7 +226,7 @@ class PathDemand:
 
 @dataclass(frozen=True, slots=True)
 class PathFound:
-    """A path with its point clock, or the problems with it, without remedies."""
+    """A path and its point clock. If no path is possible, it is None and `problems` say why, without remedies."""
 
     path: SweepPath | None
     rate_hz: Fraction
@@ -234,7 +234,7 @@ class PathFound:
 
 
 def find_path(demand: PathDemand, limits: ScannerLimits, point_clock: Callable[[float], Fraction]) -> PathFound:
-    """Find the quickest path within the limits, on the fastest point clock for which the device holds its points."""
+    """Find the quickest path within the limits, on the fastest point clock at which the scanner can hold all points."""
     low_hz, high_hz = limits.point_rate_hz
     asked = high_hz
     sweeps = 2 if demand.bidirectional else 1

@@ -60,7 +60,7 @@ class Cube:
 
 def open_cube(path: str | os.PathLike[str], plan: CubePlan, model: RigModel) -> Cube:
     """Open a .npy file, or the folder of a recording. Raises UsageError if it cannot be read or disagrees with plan or
-    calibration, DamagedRecordingError as `open_recording`."""
+    calibration, DamagedRecordingError as `open_recording` does."""
     file = Path(path)
     camera = model.camera
     if file.is_dir():

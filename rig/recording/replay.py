@@ -104,7 +104,7 @@ def replay_plan(
     """The plan with which the frames were taken, adapted to the present calibration, and the timing of the configured
     SPAD.
 
-    Raises UsageError as `read_plan`, and DamagedRecordingError if the frames differ in size from the plan's.
+    Raises UsageError as `read_plan` does, and DamagedRecordingError if the frames differ in size from the plan's.
     """
     from rig.plan.calibration_reach import recalibrated, whole_rows
 
