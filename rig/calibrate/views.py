@@ -137,7 +137,7 @@ def take_kept(session: Session, sources: ViewSources, defects: NDArray[np.bool_]
 
 
 def _require_alike(folder: Path, board: Board | None) -> None:
-    """Raise UsageError if a session shows another board. Only the size of its squares may have been measured again."""
+    """Raise UsageError if a session shows another board. The squares' size may differ: it can be measured again."""
     file = folder / BOARD_FILE
     if not file.is_file():  # no board was looked for
         return

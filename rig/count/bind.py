@@ -113,7 +113,7 @@ class PlanTerms(NamedTuple):
 
 class BlockTerms(NamedTuple):
     """Numbers of a block's header for the walk. sweep: scan markers up to the block's first frame. start_ticks: from
-    the first block's start to this one's. period_ticks: of a frame. middle: half an exposure, in 1 / UNITS_PER_TICK."""
+    the first block's start to this one's. period_ticks: of a frame. middle: half an exposure (`UNITS_PER_TICK`)."""
 
     sweep: int
     start_ticks: int

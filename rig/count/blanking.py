@@ -148,7 +148,7 @@ class PatternSearch:
 
 
 def _judged(cross: Array, left: float, total: Array, mean: Array, n: int) -> tuple[Array, Array]:
-    """Score, and the residual in excess of photon noise, divided by what the pattern explains."""
+    """(score, excess). excess: the residual beyond photon noise, divided by what the pattern explains."""
     explained = cross**2 / left
     rest = np.maximum(total - explained, 0)
     scatter = np.maximum(rest / (n - 4), np.maximum(mean, _NO_LIGHT))

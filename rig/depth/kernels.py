@@ -21,8 +21,7 @@ MAX_COLUMN_GAP: Final = 2
 """Stripes of columns farther apart than this are not joined to one surface."""
 SPACING_TOLERANCE_PX: Final = 1.0
 SPACING_SIGMAS: Final = 3.0
-"""Stripes lie on one surface if their spacing differs from that of equal depth by at most 1 px plus 3 standard
-deviations."""
+"""Stripes lie on one surface if their spacing differs from that of equal depth by at most 1 px + 3 sd."""
 
 
 @numba.njit(cache=True, nogil=True)

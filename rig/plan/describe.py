@@ -135,7 +135,7 @@ def beyond_link(plan: ScanPlan, info: SpadInfo, draft_at: Callable[[Fraction], S
 def _carried_hz(plan: ScanPlan, step_px: int, draft_at: Callable[[Fraction], ScanPlan | None]) -> int:
     """The highest frame rate of this scan that the link carries, in whole hertz.
 
-    A slower scan may have a marker every fewer columns, and so narrower windows. Widths are tried from the narrowest,
+    In a slower scan fewer columns lie between markers, so windows can be narrower. Widths are tried from the narrowest,
     which allows the highest rate, to full frames.
     """
     for width in range(*window_widths(plan, step_px)):
