@@ -3,10 +3,10 @@
 Service accounts and containers often have no folder in which numba can store kernels. numba then refuses to compile at
 all, so `prepare` provides a folder.
 
-numba compiles a kernel anew if the kernel's own file has changed. It does not if the change is in another file, from
-which the kernel inlines functions. After an update, old kernels would silently work on new tables. So `prepare` stores
-a digest of each module's source and of all modules that it imports, and removes the kernels of modules whose digest has
-changed. Checking whether any file has changed takes a few milliseconds, computing the digests a second.
+numba compiles a kernel anew if the kernel's own file has changed, but not if a function that it inlines from another
+file has. After an update, such kernels would silently run old code. So `prepare` stores a digest of each module's
+source and of all modules that it imports, and removes the kernels of modules whose digest has changed. Checking whether
+any file has changed takes a few milliseconds, computing the digests a second.
 """
 
 import ast

@@ -4,7 +4,7 @@ from rig.api import scan
 result = scan(exposures=4, seed=1)
 result.last.depth_m, result.summary.truth
 
-For a calibration, `sources` may be a rig (a config, the name of a bundled one, or its file), folders of runs taken with
+For a calibration, `sources` may be a rig (a config, its file, or the name of a bundled rig), folders of runs taken with
 `record`, folders of earlier calibrations (for their views) and, for `calibrate_camera`, pictures. The default is the
 bundled simulated rig, which moves the board itself. With a real rig, `ask` is called when the board must be moved, and
 must return once that is done; `tell` gets a line about each view. All calibrations raise CalibrationError if the views

@@ -49,14 +49,14 @@ def scan(
 
     request, changes: options, as a `ScanRequest` or by the names of its fields: `scan("lab", exposures=3)`.
     progress: called several times a second with frames done and frames planned.
-    live: called equally often with a `ScanProgress`, which has the figures of every stage.
+    live: called at the same times with a `ScanProgress`: also maps, lost frames and the figures of every thread.
     monitor: called with the newest frames as a `MonitorView`, at most ten times a second and on a thread of its own;
       the run never waits for it.
     on_space: called with a `Space` before anything moves: the most disk space that the recording will take.
 
     Raises UsageError for a request that cannot be met, DeviceError or DevicesError if devices fail, RecordingError if
-    frames cannot be written; maps finished by then are in `out`. An interrupt ends the scan after its last complete
-    map, with verdict 'aborted'.
+    frames cannot be written; maps finished by then are in `out`. An interrupt (Ctrl-C) ends the scan; its complete maps
+    are kept, with verdict 'aborted'.
     """
     request = replace(request or ScanRequest(), **changes)
     settings = _configured(config, request)
@@ -124,12 +124,12 @@ def replay(
     run: folder of a run taken with `record`.
     request, changes: options, as a `ReplayRequest` or by the names of its fields.
     calibration: file made since the recording; None means the recording's own.
-    steps: for the clock 'step', called before the start with an object whose `step()`, one sweep more, and `run_on()`,
-      all that remains, may be called from any thread.
-    Everything else is as in `scan`.
+    steps: for the clock 'step'; called before the start with a `Pace`. Its `step()` plays one more sweep, its
+      `run_on()` all that remain. Both may be called from any thread.
+    The other arguments are those of `scan`.
 
     Raises UsageError if there is no recording, DamagedRecordingError if it cannot be played as it is, and DivergedError
-    if drivers sent something other than was recorded or, in real time, a buffer of points more than 2 ms off its time.
+    if drivers sent other commands than recorded or, in real time, mirror points more than 2 ms too early or too late.
     """
     request = replace(request or ReplayRequest(), **changes)
     settings = replay_config(Path(run), request, None if request.config is None else configure(request.config))
@@ -173,7 +173,7 @@ def _new_run(settings: RigConfig, request: RunRequest) -> Run:
 
 
 def _checked(request: RunRequest, others: Sequence[str] = ()) -> SavePolicy:
-    """Check a request; returns which maps to write. Raises UsageError with `others` and all problems of the request."""
+    """Check a request; returns which maps to write. Raises UsageError with all its problems, after `others`."""
     problems = list(others)
     if request.record and request.out is None:
         problems.append("record writes the frames into the run's folder; name one with out")
@@ -204,8 +204,8 @@ def reconstruct(
 
     source: folder of a run taken with `record`; or frames alone: an .npy of uint8 (maps x columns x exposures, height,
       ceil(width/8)), or the folder that `rig import` made of such frames.
-    plan, calibration: both are needed for frames alone. A run has its own; for it, `calibration` may name a file made
-      since, and `plan` must be left out.
+    plan, calibration: both are needed for frames alone. A run has its own: leave `plan` out, and name a file as
+      `calibration` only if it is newer.
     request, changes: options, as a `ReconstructRequest` or by the names of its fields.
     progress: called with the number of frames or maps done and the total.
 
@@ -243,7 +243,7 @@ def reconstruct(
 
 
 def _estimate(request: ReconstructRequest) -> EstimateConfig:
-    """The settings of the estimate for frames alone, which have no config."""
+    """The settings of the estimate for frames alone, which have no config. Raises UsageError."""
     estimator, filter = request.estimator or AUTO, request.filter or "none"
     min_confidence = 0.5 if request.min_confidence is None else request.min_confidence
     problems = []

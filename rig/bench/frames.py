@@ -66,7 +66,7 @@ def count_columns(
     """Count whole columns of frames, one after the other, into bit planes that the next column reuses.
 
     words: (all words,) of frames of `rows` rows; planes: see `new_planes`. Of each frame the chunks of rows
-    first_chunk..last_chunk-1 are counted. Planes are not turned into counts, which is part of an estimate.
+    first_chunk..last_chunk-1 are counted. Turning planes into counts is part of an estimate and not done here.
     """
     frame = rows * row_words
     frames = words.shape[0] // frame

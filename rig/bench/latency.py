@@ -63,7 +63,7 @@ SECONDS = 3.0
 SLOTS = 16
 """Blocks of the ring: 80 ms, so that nothing is dropped if the host pauses; the latency then shows the pause."""
 SPIN_S = 2e-4
-"""For so many seconds before a block is due the source does not sleep: a sleep may take longer than requested."""
+"""Seconds before a block is due in which the source does not sleep: a sleep may take longer than requested."""
 
 
 @dataclass(frozen=True, slots=True)

@@ -190,7 +190,7 @@ LOOP_S = 0.2
 DEPTH_RANGE = ["4 m", "15 m"]
 """Range whose stripes lie within 128 pixels of a row, the window for which speeds are stated."""
 LINK_MARGIN = 1.02
-"""Rate of the link over the rate that windows moving with the line need: too low for whole frames."""
+"""Rate of the link, relative to the rate that windows moving with the line need; too low for whole frames."""
 SETTLED = 0.1
 """Share of the maps after which memory should no longer grow."""
 _STATM = Path("/proc/self/statm")
@@ -216,9 +216,10 @@ class SoakFrames:
 class SoakReport:
     """Findings of a soak.
 
-    seconds: of stream played. maps: number made, of maps_planned. times_real_time: time span of the received frames
-    over the time spent on binding, counting and making maps of them, without the first map. resident_*: memory of the
-    process after a tenth of the maps and at the end, and its growth as a share; None if the system does not report it.
+    seconds: of stream played. maps: number made, of maps_planned. times_real_time: time span of the received frames,
+    divided by the time spent on binding, counting and making maps of them; the first map is left out. resident_*:
+    memory of the process after a tenth of the maps and at the end, and its growth as a share; None if the system does
+    not report it.
     source_late_max_s: largest lateness of a block. ended_by: the error that ended the run early; None if none did.
     """
 

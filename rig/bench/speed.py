@@ -102,9 +102,10 @@ class Case:
 class SpeedRow:
     """A row of the table. exposures: None for stages without columns. Numbers without a meaning for a stage are None.
 
-    of_memory_bandwidth: bytes of frames read a second over the memory's bandwidth. times_numpy: speed over that of the
-    row `numpy`. ms_per_map: of stages that make complete maps. times_sgbm: for `joint`, the time of a map over that of
-    a StereoSGBM map on as many threads, measured alternately. The error fields are those of `StripeError`.
+    of_memory_bandwidth: bytes of frames read a second, divided by the memory's bandwidth. times_numpy: speed divided by
+    that of the row `numpy`. ms_per_map: of stages that make complete maps. times_sgbm: for `joint`, the time of a map
+    divided by that of a StereoSGBM map on as many threads, measured alternately. The error fields are those of
+    `StripeError`.
     """
 
     stage: str
@@ -265,7 +266,7 @@ def _window_cases(frames: BenchFrames, learned: Likelihood, workers: Workers, ex
 def _usual_cases(
     frames: BenchFrames, learned: Likelihood, workers: Workers, extent: Extent, folder: Path
 ) -> list[Case]:
-    """The rows of the usual window: with the ends of sweeps, in whole frames, and from a recording."""
+    """The rows of the usual window: with the work at the end of sweeps, in whole frames, and from a recording."""
     few = [k for k in FEW_EXPOSURES if k in extent.exposures]
     full = full_frames(frames, extent.frames_bytes)
     walk, full_walk = Walk(frames), Walk(full)

@@ -57,7 +57,7 @@ class StripeError:
 class Measured:
     """Work of one measurement, with the error if it estimates and the number of maps if it makes complete ones.
 
-    times_sgbm: time of a map over that of a StereoSGBM map, if the two were made alternately.
+    times_sgbm: time of a map divided by that of a StereoSGBM map, if the two were made alternately.
     """
 
     frames: int
@@ -68,7 +68,7 @@ class Measured:
 
 
 Stage = Callable[[float], Measured]
-"""A function that works for about so many seconds."""
+"""A function that measures a stage for about the given number of seconds."""
 Blocks = Callable[[BenchFrames, "Walk"], Iterator[tuple[int, Bits]]]
 """A function that yields, without end, the index of a block's first place and the block."""
 
@@ -216,7 +216,7 @@ def stripe_error(difference: NDArray[np.float32]) -> StripeError:
 
 
 SGBM_BLOCK_PX = 3
-"""OpenCV's default for the side of the blocks it matches; penalties follow from it as its documentation advises."""
+"""Side of the blocks that StereoSGBM matches, OpenCV's default. Its documentation derives the penalties from it."""
 PAIRS = 5
 """Least number of times that `joint` and StereoSGBM make a map alternately, for the median of the quotients."""
 SGBM_STEPS = 16

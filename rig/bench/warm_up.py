@@ -1,6 +1,6 @@
 """Compiles every kernel that a rig's scans can need: estimators, filters and, if the rig is simulated, its world.
 
-Each kernel is run once on little data. numba keeps the compiled code on disk, so that a second time takes seconds.
+Each kernel is run once on little data. numba keeps the compiled code on disk, so that another call takes only seconds.
 """
 
 import time

@@ -4,7 +4,7 @@
 scan, so that nothing of it enters the new one: whole rows are counted. A passage is the mirror command at the instant
 when the line's centre crosses a pixel, stated as if the mirror had no lag. If a SPAD cannot send or keep whole frames
 fast enough, it sends the windows of the existing calibration instead, and the plan then allows for the known lag.
-Neither changes the passages, except that a line outside the windows is not seen.
+Windows and lag do not change the passages, except that a line outside the windows is not seen.
 
 Passages are kept for pixels spread evenly over the board, away from printed edges, or over the whole picture if no
 board was found. The first half millisecond of a sweep is left out, because the mirror lags and is still accelerating
@@ -196,7 +196,7 @@ def _leg(plan: ScanPlan, direction: int) -> Leg:
 
 
 def _steady(passages: Passages, plan: ScanPlan) -> Passages:
-    """The passages at least MOST_LAG_S after the begin of the sweep: then the mirror moves at full speed."""
+    """The passages at least MOST_LAG_S after the sweep's start, when the mirror moves at full speed."""
     first = plan.command_range[0 if _leg(plan, passages.direction).columns_rise else 1]
     since_s = passages.direction * (passages.command - first) / passages.speed_per_s
     keep = since_s >= MOST_LAG_S
@@ -272,7 +272,8 @@ class SpeedRotation:
     """Takes successive views at different speeds in turn."""
 
     def __init__(self, exposures: Sequence[int], sees: Callable[[Capture], bool], tell: TellLine | None = None) -> None:
-        """exposures: per column, in turn; empty: the config's. sees: whether a capture shows enough of the line."""
+        """exposures: numbers per column that take turns; empty: the config's. sees: whether a capture shows enough of
+        the line."""
         self.turns = list(exposures)
         self._sees = sees
         self._tell = tell or (lambda line: None)

@@ -2,7 +2,7 @@
 
 Dark frames come from the SPAD alone or from a recorded run, lit ones from a scan or a run. In the dark nothing moves
 and no light leaves: the gate is low, the laser is not armed, the scanner rests. The frames come in short starts
-spread over some time, since rates that jump do so within milliseconds or minutes.
+spread over some time, since the rate of a noisy pixel may jump within milliseconds or only within minutes.
 
 The folder has pixels.npz (the map with its version), calibration.yaml (that of the config, if any, with the new defects
 and dark rates), dark_rate.png, report.html and summary.json. The statistics are in `calibration.pixel_map`.
@@ -52,7 +52,7 @@ from rig.scan.source import Source, blocks
 from rig.threads import RowWorkers
 
 STARTS: Final = 32
-"""Starts of the SPAD, and so blocks whose counts are compared; more if its memory holds too few frames."""
+"""Starts of the SPAD; the counts of each are one block of the statistics. More if its memory holds too few frames."""
 BLOCK_FRAMES: Final = 128
 SPARE_SLOTS: Final = 4
 """Slots of the ring beyond those needed, so that nothing is lost if a device sends shorter blocks than requested."""
@@ -81,7 +81,7 @@ class SweepSums:
     lit: Sums | None = None
 
     def add(self, sweep: SweepData) -> None:
-        """Add a sweep; its dark frames are one block. A sweep without whole counts of them is left out."""
+        """Add a sweep; its dark frames count as one block. A sweep without dark frames or kept counts is left out."""
         volume = sweep.tally
         if not isinstance(volume, CountVolume) or volume.dark_counts is None:
             return
@@ -188,7 +188,7 @@ def _frames_in_windows(volume: CountVolume) -> NDArray[np.int64]:
 MOST_LEAK: Final = 0.1
 """Correlation of neighbouring pixels' rates beyond which the lens was not covered; crosstalk makes 0.01."""
 WORST_PRECISION: Final = 0.2
-"""Relative standard deviation of a rate at the limit, beyond which hot pixels cannot be identified."""
+"""Relative standard deviation of a dark rate at the limit of hot pixels, beyond which they cannot be identified."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -302,7 +302,7 @@ _log = logging.getLogger(__name__)
 
 PIXELS_FILE: Final = "pixels.npz"
 LIT_FRAMES: Final = 100
-"""Exposures taken with the line on each pixel: enough to judge one that sees a photon in a third of them."""
+"""Exposures taken with the line on each pixel: enough to judge a pixel that should fire in a third of them."""
 
 
 def calibrate_pixels(

@@ -50,9 +50,9 @@ def calibrate_planes(
 ) -> CalibrationResult:
     """Calibrate camera, light planes and lag together from views of a board (`rig calibrate planes`).
 
-    The defects of the base calibration are kept. Raises Degenerate, with notes why, if the views give no model,
-    CalibrationError for a file that cannot be used and a line that does not reach the distance `at`, UsageError for a
-    wrong request.
+    The defects of the request's `calibration` are kept. Raises Degenerate, with notes why, if the views give no model,
+    CalibrationError if a file cannot be used or the line does not reach the distance `at`, UsageError for a wrong
+    request.
     """
     request = replace(request or PlanesRequest(), **changes)
     values = si_values(request)
@@ -103,7 +103,7 @@ def speeds_of(live: RigConfig) -> tuple[int, ...]:
 
 
 def _fit(session: Session, board: Board, base: RigModel | None, camera: KnownCamera | None) -> RigFit:
-    """Fit the rig to the views so far, with all that is known from elsewhere."""
+    """Fit the rig to the views so far, starting from `base` and with the known `camera`, if there are any."""
     tell_stage("fitting", len(session.views), unit="views")
     return fit_rig(
         session.views,
@@ -214,7 +214,8 @@ def guided(
     start: ChoosePose, board: Board, depth_range_m: tuple[float, float], session: Session,
     fit: Callable[[], RigFit], judge: Callable[[RigFit], JudgedRig],
 ) -> ChoosePose:  # fmt: skip
-    """Return a choice of poses by how much they lower the expected error, until the verdict passes or none is left.
+    """Return a function that chooses the pose which lowers the expected error most, until the verdict passes or no
+    pose is left.
 
     start: chooses the poses until a fit of the session's views can be judged. fit, judge: those of the final result.
     """

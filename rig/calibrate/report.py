@@ -1,8 +1,8 @@
 """Writes the reports of `rig calibrate`, one HTML file each: verdict and reasons first, then the pictures.
 
-`planes_report`, `camera_report`, `check_report` and `sync_report` make their parts of tables, pictures and charts,
-`page` the file; nothing is loaded from elsewhere. Numbers have units and only the digits that are known. `subject` says
-what a report is about, so that printed reports are not confused.
+`planes_report`, `camera_report`, `check_report` and `sync_report` make the parts of a report: tables, pictures and
+charts. `page` makes the file, which loads nothing from elsewhere. Numbers have units and only the digits that are
+known. `subject` says what a report is about, so that printed reports are not confused.
 """
 
 import base64
@@ -181,8 +181,8 @@ _WAYS = {1: "rising command", -1: "falling command"}
 
 
 def plane_residuals(judged: JudgedRig, sweeps: Sequence[SweepFit]) -> str:
-    """Chart (SVG) of each sweep's median residuals over the command, in mm of depth at the distance asked, with a panel
-    per direction.
+    """Chart (SVG) of each sweep's median residuals over the command, in mm of depth at the distance of the accuracy
+    asked for, with a panel per direction.
     """
     views, waves = list(dict.fromkeys(sweep.view for sweep in sweeps)), judged.waves
 

@@ -3,7 +3,7 @@
     views/000.npz ...  rig.json (the rig of the views)  board.yaml (their board)  calibration.yaml (+ .npy)  camera.yaml
     report.html  summary.json
 
-`Session` holds the views and writes it all; `CalibrationResult` is what a calibration returns. A session that was
+`Session` holds the views and writes all files; `CalibrationResult` is what a calibration returns. A session that was
 interrupted, or whose views gave no calibration, leaves its views, which can be a source for the next. A view's file,
 `views/000.npz`, has all that a fit needs of a pose. It is written completely or not at all:
 
@@ -52,7 +52,7 @@ BOARD_FILE = "board.yaml"
 
 
 def session_rig(folder: Path) -> Identity | None:
-    """The rig of a session's views; None if the session has no file of it. Raises UsageError if that is damaged."""
+    """The rig of a session's views, from its file rig.json; None without one. Raises UsageError if it is damaged."""
     try:
         content = parse_json((folder / RIG_FILE).read_text(encoding="utf-8"))
         return Identity(**{**content, "reasons": tuple(content["reasons"])})
@@ -72,8 +72,8 @@ class CalibrationResult:
     line: the result in one line, such as 'at 5 m: 8 mm, 6 of them from the baseline'.
     figures: for people, (name, text).
     summary: for programs; the content of summary.json.
-    model: the calibrated or checked model; None if only a camera was calibrated, or lags of no model.
-    folder, calibration: where they were written; None if they were not.
+    model: the calibrated or checked model; None if only a camera was calibrated, or lags without a calibration.
+    folder, calibration: paths of the session's folder and calibration file; None if they were not written.
     """
 
     verdict: Verdict
@@ -114,7 +114,8 @@ class Session:
     ) -> None:
         """Claim the folder; None writes nothing. Raises UsageError if it cannot be claimed.
 
-        board: what the views show. tell: gets a line on each view. of_camera: digests of a camera's views.
+        board: what the views show. tell: gets a line on each view. of_camera: digests of the views that a known camera
+        was made of, which must not be used again.
         """
         self.views: list[View] = []
         self.refused: dict[str, Degenerate] = {}
@@ -168,8 +169,8 @@ class Session:
         identity: Identity | None = None,
         source: Path | None = None,
     ) -> None:
-        """Add a view from a file or run under a name of its own. Raises UsageError for one that would count
-        twice or is of another rig, and if it cannot be written."""
+        """Add a view; if its name is taken, it gets another one. Raises UsageError for a view that would count twice or
+        is of another rig, and if it cannot be written. source: file or run that the view comes from."""
         self._require_new(view, str(source or view.name))
         if view.name in [known.name for known in self.views]:
             view = replace(view, name=f"{view.name}-{len(self.views)}")
@@ -222,7 +223,7 @@ class Session:
     def finish(
         self, command: str, result: CalibrationResult, report: Report, made_from: LoadedCalibration | None = None
     ) -> CalibrationResult:
-        """Write the result with its model, if it has one, and notes on the calibration that it was made from.
+        """Write the result and its model, if it has one. Failed checks of `made_from` are noted on the new model too.
 
         Returns the result with its whole summary and with the paths of what was written.
         """

@@ -45,8 +45,8 @@ class ViewSources:
 def sort_sources(sources: SourcesLike, *, pictures: bool = False, scene: str | None = None) -> ViewSources:
     """Find out what each source is. Without any, the bundled simulated rig is used.
 
-    scene: of a simulated rig. None is its own or, if that has no board, the bundled one with a board. Raises UsageError
-    with a line per problem, DeviceError if a scene cannot be read.
+    scene: for a simulated rig; None means its own scene or, if that has no board, the bundled scene 'board'. Raises
+    UsageError with a line per problem, DeviceError if a scene cannot be read.
     """
     live, problems, notes = list[RigConfig](), list[str](), list[str]()
     sessions, recorded, found = list[Path](), list[Path](), list[Path]()

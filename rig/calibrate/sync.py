@@ -65,10 +65,10 @@ MOST_SWEEPS = 20
 
 @dataclass(frozen=True, slots=True)
 class GateDelay:
-    """Delay of the light after the gate of a plan, in seconds.
+    """Delay of the light relative to the planned gate, in seconds.
 
-    opens_s, closes_s: how much later than planned; NaN if the line was not in the picture then. opens_sd_s,
-    closes_sd_s: their standard deviations. edges: number of edges seen.
+    opens_s, closes_s: how much later than planned the light comes and goes; NaN if the line was not in the picture
+    then. opens_sd_s, closes_sd_s: their standard deviations. edges: number of edges seen.
     """
 
     opens_s: float
@@ -239,7 +239,7 @@ def _edge(ones: Array, middle_s: Array, late_s: Array, plan: ScanPlan, *, rises:
 
 
 def _saturation(lit: Array, dark: Array) -> float:
-    """Sum of p^2 over sum of p if the line makes pixels fire with probability p; 1, the worst, if unknown."""
+    """Sum of p^2 divided by sum of p, with p the chance that the line makes a pixel fire; 1, the worst, if unknown."""
     if not (len(lit) and len(dark)):
         return 1.0
     whole, next_one, after = (lit.mean(axis=0) - dark.mean(axis=0)).tolist()
@@ -247,7 +247,8 @@ def _saturation(lit: Array, dark: Array) -> float:
 
 
 def _sweeps(run: Path, plan: ScanPlan) -> list[tuple[int, Array, Array]]:
-    """Number, ones (frames, 3) and middle of exposure (frames,) after the scan marker, for each of the first sweeps."""
+    """For each of the first sweeps: its number, `_ones` (frames, 3) and the times (frames,) of the exposures' middles
+    in seconds after the scan marker."""
     recording = RunRecording(run)
     found: list[tuple[int, Array, Array]] = []
     for start in recording.runs:
@@ -268,7 +269,9 @@ def _sweeps(run: Path, plan: ScanPlan) -> list[tuple[int, Array, Array]]:
 
 
 def _ones(block: FrameBlock) -> Array:
-    """(frames, 3): pixels that fired in a frame, also in the next one, also in the next but one; NaN without these."""
+    """Numbers (frames, 3) of pixels that fired in a frame, in it and the next one, in it and the next but one.
+
+    NaN without such a frame, and if the window has moved by then."""
     bits, x0 = block.bits, block.records["x0"]
     ones = np.full((len(bits), 3), np.nan)
     for apart in range(3):

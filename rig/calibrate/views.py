@@ -33,10 +33,10 @@ from rig.progress import part, tell_stage
 from rig.requests import BoardRequest
 
 MISSED_SHARE = 0.5
-"""Share of extra poses that are shown if the board is not found at some."""
+"""Most extra poses, relative to those requested, that are shown if the board is not found at some."""
 
 LASTING = (["wrong-board"] * 3, ["mirrored"] * 3)
-"""Reasons of the first refusals after which a session ends, since no other pose of the board would help."""
+"""A session ends if the first views are refused for these reasons, since no other pose of the board would help."""
 
 
 ChoosePose = Callable[[Sequence[View]], Advice | None]
@@ -54,7 +54,7 @@ def require_poses(session: Session, poses: int) -> None:
 
 
 def good_poses(config: RigConfig, board: Board, poses: int, at_m: float, seed: int, behind: int = 0) -> ChoosePose:
-    """Return a choice of the poses of `calibration.guide.sequence`, one after the other, with some to spare.
+    """Return a function that chooses the poses of `calibration.guide.sequence` in order, with some to spare.
 
     behind: number of poses of the sequence already shown. Raises UsageError if no pose fits the picture.
     """
@@ -137,7 +137,7 @@ def take_kept(session: Session, sources: ViewSources, defects: NDArray[np.bool_]
 
 
 def _require_alike(folder: Path, board: Board | None) -> None:
-    """Raise UsageError where a session shows another board; the side of the squares may have been measured anew."""
+    """Raise UsageError if a session shows another board. The squares' size may differ: it can be measured again."""
     file = folder / BOARD_FILE
     if not file.is_file():  # no board was looked for
         return

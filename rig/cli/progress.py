@@ -176,7 +176,7 @@ def _drawn(line: ProgressLine) -> Iterator[None]:
 
 @contextmanager
 def _watched_compiler(line: ProgressLine) -> Iterator[None]:
-    """A context in which the line is told when numba compiles a kernel, which it does only if no cache holds it."""
+    """A context in which numba's compilations are reported to `line`. Kernels cached on the disk are not compiled."""
     from numba.core import event
 
     class Watch(event.Listener):

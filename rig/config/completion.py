@@ -20,7 +20,8 @@ class _Edit(NamedTuple):
 def completed(text: str, node: yaml.MappingNode, values: Mapping[str, Any], full: Mapping[str, Any]) -> str:
     """Edit a text: replace strings that differ in `values`, and add the keys of `full` that are missing.
 
-    node: parsed node of the text. values: content of the text, in which strings may have been changed.
+    node: parsed node of the text. values: content of the text, in which strings may have been changed. full: content
+    with all keys.
     """
     done, at = [], 0
     for edit in sorted(_edits(text, node, values, full), key=lambda edit: edit.begin):

@@ -1,7 +1,8 @@
 """The config of a rig: which devices, which calibration, what scan and which estimate; validated with units and limits.
 
-Times, rates and lengths are text with a unit in YAML ("10 us", "100 kHz", "8 m"). The sections of devices (`spad`,
-`scanner`, ...) hold the config model of their kind, which is defined with its driver. `rig.config.files` reads files.
+Times, rates and lengths are text with a unit in YAML ("10 us", "100 kHz", "8 m"). The sections of devices (slots:
+`spad`, `scanner`, ...) hold the config model of their kind, which is defined with its driver. `rig.config.files` reads
+files.
 
 A rig may project several lines at once. With L lines the mirror sweeps one L-th of the field, so a map takes one L-th
 of the frames. `scan.command_range` is the range of the mirror, and the columns of line l lie at the mirror's commands
@@ -188,7 +189,7 @@ class EstimateConfig(ConfigSection):
 
 
 def _of_slot(slot: str) -> BeforeValidator:
-    """A validator that reads a mapping, or a kind's config, as the config model of the kind that it names."""
+    """A validator for a device's section. It turns a mapping or config model into the model of the kind it names."""
 
     def validate(value: object, info: ValidationInfo) -> object:
         if isinstance(value, KindConfig):

@@ -31,7 +31,7 @@ def configure(
     """Load and validate the config that `scan` would use. An option that is None leaves the config's value.
 
     config: the name of a bundled rig, a file or a RigConfig.
-    scene: of a simulated rig, a bundled name or a path.
+    scene: for a simulated rig: the name of a bundled scene, or a path.
     fog: replaces the scene's fog: a visibility such as '20 m', or 'clear'.
     exposures: frames per column.
     estimator, filter, min_confidence: as in the config's `estimate`.
@@ -77,8 +77,8 @@ def _changed(config: RigConfig, options: Mapping[str, object]) -> RigConfig:
 def with_lines(config: RigConfig, lines: int, power: LinePower = "shared") -> RigConfig:
     """Make a config with `lines` evenly spaced lines over the same field. The mirror sweeps only the share of one line.
 
-    config: of one line. Columns are rounded down to a multiple of `lines`, at least `lines`. Raises UsageError for a
-    config with several lines, for a number of lines out of range, and if the changed config is not valid.
+    config: a rig with one line. Columns are rounded down to a multiple of `lines`, at least `lines`. Raises UsageError
+    for a config with several lines, for a number of lines out of range, and if the changed config is not valid.
     """
     if len(config.line_offsets) > 1:
         raise UsageError(f"{config.name} has {len(config.line_offsets)} lines already; name a config with one")

@@ -9,8 +9,8 @@ used in the next one. So the column of a frame depends only on earlier frames, n
 record is damaged). A compiled walk (`rig.count.bind_kernels`) places the frames; Python runs only once per block and at
 the begin of each sweep.
 
-The lit frames of a sweep go through the columns in order. When a marker corrects the extrapolation from the one before,
-frames may fall back to a column already left. Such frames are not used.
+The lit frames of a sweep go through the columns in order. When a new marker corrects the time extrapolated from the
+marker before, frames may fall back to a column already left. Such frames are not used.
 """
 
 import math
@@ -112,7 +112,8 @@ class PlanTerms(NamedTuple):
 
 
 class BlockTerms(NamedTuple):
-    """Numbers of a header for the walk. start_ticks: since the first block's. middle: of an exposure, in units."""
+    """Numbers of a block's header for the walk. sweep: scan markers up to the block's first frame. start_ticks: from
+    the first block's start to this one's. period_ticks: of a frame. middle: half an exposure (`UNITS_PER_TICK`)."""
 
     sweep: int
     start_ticks: int
@@ -122,7 +123,7 @@ class BlockTerms(NamedTuple):
 
 
 class FrameBinder:
-    """Binds the blocks of one start of the SPAD, in order. Records count markers up to and including their own frame.
+    """Binds the blocks of one start of the SPAD, in order. A frame's record counts scan markers, its own included.
 
     clock_ratio: of the scanner's clock to nominal, until a sweep gives it. first_sweep: number of the first whole
     sweep; incomplete ones before give no ratio. end_sweep: number after that of the last sweep wanted; None for all.
@@ -297,7 +298,7 @@ class FrameBinder:
         return closed
 
     def _boundary_frame(self, number: int, at: int, header: BlockHeader, start: int) -> int:
-        """Number of the frame in which sweep `number` began, whose marker was lost, from the scanner's clock."""
+        """Number of the frame in which sweep `number` began if its marker was lost, computed from the clocks."""
         here = header.first_frame + at
         time, point = (int(self._carried[name][0]) for name in ("anchor_time", "anchor_point"))
         if point < 0:
@@ -335,7 +336,7 @@ def _new_places(n: int) -> Places:
 
 
 def _sweep_named(record: np.void, terms: BlockTerms) -> int:
-    """Number of the sweep that a frame names: 1 less than its scan markers so far. The record has their low 16 bits."""
+    """Number of the sweep that a frame names: the scan markers so far, which its record has mod 2^16, minus 1."""
     return terms.sweep + ((int(record["sweep"]) - terms.sweep) & 0xFFFF) - 1
 
 

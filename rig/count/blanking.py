@@ -35,8 +35,8 @@ from rig.plan.scan_plan import MARGIN_FRAMES, MAX_CLOCK_ERROR, Blanking, ScanPla
 Array = NDArray[np.float64]
 
 LEAST_SCORE = 4.0
-"""Least score of a pattern, in standard deviations. Chance brings one in every other burst, but two at the right
-distance only in one of some ten thousand; in that case the pattern after the first map is missing."""
+"""Least score of a pattern, in standard deviations. Noise reaches it in every other burst, but twice at the right
+distance only in one burst of some ten thousand; in that case the pattern after the first map is missing."""
 MOST_UNEXPLAINED = 1.0
 """Largest residual in excess of photon noise, relative to what the pattern explains. It is 7 in the wrong place."""
 LEAST_SHARE = 0.7
@@ -125,7 +125,7 @@ class PatternSearch:
     def measure(self, ones: Array, first: int, place: float, radius: float) -> PatternFit | None:
         """The pattern within `radius` frames of `place`; None if it is not there.
 
-        ones: of frames `first`, first + 1, ... , NaN if missing. None too without enough frames of `span`.
+        ones: of frames `first`, first + 1, ... , NaN if missing. Returns None also if too many frames are missing.
         """
         begin, end = self.span(place, radius)
         if begin < first or end > first + len(ones):
@@ -148,7 +148,7 @@ class PatternSearch:
 
 
 def _judged(cross: Array, left: float, total: Array, mean: Array, n: int) -> tuple[Array, Array]:
-    """Score, and the residual in excess of photon noise relative to what is explained."""
+    """(score, excess). excess: the residual beyond photon noise, divided by what the pattern explains."""
     explained = cross**2 / left
     rest = np.maximum(total - explained, 0)
     scatter = np.maximum(rest / (n - 4), np.maximum(mean, _NO_LIGHT))
@@ -181,7 +181,7 @@ def _best(shares: Array, places: Array, frames: Array, ones: Array) -> PatternFi
 
 
 def detection_probability(score: float) -> float:
-    """Chance that a pattern is found whose score is this on average."""
+    """Chance that a pattern with this mean score is found."""
     return 0.5 * math.erfc((LEAST_SCORE - score) / math.sqrt(2))
 
 
@@ -222,7 +222,7 @@ _log = logging.getLogger(__name__)
 SEARCH_S = 10.0
 """Seconds, plus three sweeps, after which the search for two patterns that are one sweep apart is given up."""
 CLEAR_SCORE = 2 * LEAST_SCORE
-"""Score of a certain pattern. If it is reached and sweeps are not found, the reason is not lack of light."""
+"""Score of a pattern beyond doubt. If it is reached and sweeps are not found, the reason is not lack of light."""
 ASIDE_PX = 64
 """Pixels counted on both sides of the window of a leg's first column: in the run-in the stripe lies beside it."""
 

@@ -20,7 +20,7 @@ STEPS: Final = 8
 PAIRS: Final = 4
 """Pairs of pixels per lane."""
 PAD: Final = 8
-"""Zero lanes on both sides of each pair's."""
+"""Zero lanes before and after the lanes of each pair."""
 
 
 @numba.njit(cache=True, nogil=True)
@@ -115,7 +115,7 @@ def read_planes(
 
 @numba.njit(inline="always")
 def _share(x, times):  # type: ignore[no-untyped-def]
-    """Number added to the count of pixel x before it is divided by 2^times: 0 to 2^times - 1 by turns."""
+    """Number added to the count of pixel x before it is divided by 2^times: 0 to 2^times - 1, spread over 8 pixels."""
     return ((x & 7) << times) >> 3
 
 

@@ -1,7 +1,8 @@
 """Compiled part of `rig.count.map_checks`: light that lines of counts have in common, and how smooth rows are.
 
-A line of counts holds the counts of one image row in one column, over the window. Line 0 is a point's own; lines 1, 2
-and so on are its partners'. With n ones of a pixel in K frames and r its usual rate, line k becomes stripe-like excess,
+A line of counts holds the counts of one image row in one column, over the window. A point is such a row and column,
+its partners are others (`rig.count.map_checks`). Line 0 is a point's own; lines 1, 2 and so on are its partners'. With
+n ones of a pixel in K frames and r its usual rate, line k becomes stripe-like excess,
 
     z = (n - K r) / sqrt(K r),    e_k(j) = mean of z over 3 px around j - mean of z 4 to 9 px away on both sides
 
@@ -39,7 +40,7 @@ stands still, and 0.4 at two frames per column for one that moves by 5 px during
 
 @numba.njit(inline="always")
 def _searched(x_lo, x_hi, x0, window, width):  # type: ignore[no-untyped-def]
-    """First and last stored pixel of a line that is searched, including the margin at both ends."""
+    """First and last searched pixel of a line, including the margin at both ends, counted from the window's first."""
     return max(x_lo - MARGIN_PX, x0, 0) - x0, min(x_hi + MARGIN_PX, x0 + window - 1, width - 1) - x0
 
 

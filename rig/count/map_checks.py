@@ -1,17 +1,17 @@
 """Checks of a map's counts and answers by its own light. A correctly taken map passes them, whatever the scene.
 
-They use up to 512 or 8192 points. A point is a row and a column. Its partners are the next row in the same column, and
-the same row in four other columns, to which the laser line has moved by 6 to 64 px (less in a narrow sweep). A stripe
-appears at a point and all its partners, at places that the planes predict; noise does not. Each has a line of counts,
-those of its row in its column.
+They use up to 8192 points, or 512 if not all counts are kept. A point is a row and a column. Its partners are the next
+row in the same column, and the same row in four other columns, to which the laser line has moved by 6 to 64 px (less in
+a narrow sweep). A stripe appears at a point and all its partners, at places that the planes predict; noise does not.
+Point and partners each have a line of counts: those of the row in the column.
 
 - Pixels of a row: neighbours receive similar light, so no other order of the pixels is smoother than the right one.
 - Rows: a stripe is at the same place on the next row.
 - Frames: those of one column show the stripe at one place, pixel by pixel, just as two rows do.
 - Columns: the stripe moves from column to column as the planes predict; so does all other light of the sweep, mainly
   haze.
-- Answers of estimators whose confidence is a probability: an answer with confidence 0.9, for one place of some 150,
-  needs evidence of seven nats. At most 7 x 7 lines of counts contribute to it. So each contributes at least 1/7 nat on
+- Answers of estimators that learn the light: an answer with confidence 0.9, for one place of some 150, needs evidence
+  of seven nats. At most 7 x 7 lines of counts contribute to it. So each contributes at least 1/7 nat on
   average, which is light half a standard deviation above the background. So there must be that much more light at the
   answers than behind them, on lines of counts that did not give the answers.
 
@@ -45,7 +45,7 @@ NEAREST: Final = 3
 FOLLOWED: Final = 256
 """Points at which light of all widths is first followed through the columns. Their number doubles until it suffices."""
 LIMIT: Final = 4.0
-"""Standard deviations: one false alarm in 30 000 checks."""
+"""Standard deviations beyond which a check raises a doubt: one false alarm in 30 000 checks."""
 FEWEST_ROWS: Final = 24
 """Least number of rows for the check of pixel order: a sum over n rows reaches sqrt(n) standard deviations at most."""
 LEAST_FOLLOWING: Final = 0.25
@@ -114,7 +114,8 @@ def check_points(geometry: SweepGeometry, points: int = POINTS) -> Points:
 class MapChecks:
     """The checks of maps of one geometry.
 
-    calibrated: whether its planes are known. knows: whether the estimator's confidence is a probability.
+    calibrated: whether its planes are known. knows: whether the estimator learns the light, so that its confidence is a
+    probability under what it has learned.
     """
 
     def __init__(self, geometry: SweepGeometry, *, calibrated: bool, knows: bool) -> None:

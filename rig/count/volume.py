@@ -88,7 +88,7 @@ class FrameTally:
         raise NotImplementedError
 
     def bound_column(self) -> NDArray[np.float64]:
-        """Fractional column of each bin (columns,), its own centre if it has no frames."""
+        """Mean fractional column of each column's frames (columns,); the column's centre if it has none."""
         return np.where(self.n_frames > 0, self.column, np.arange(len(self.column), dtype=np.float64))
 
 

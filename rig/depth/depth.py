@@ -24,8 +24,8 @@ def depth_map(
 ) -> Float32:
     """Depth z in metres (rows, width) float32, NaN where no two neighbouring stripes of one surface enclose the pixel.
 
-    Only stripes of at least `min_confidence` are used, and nothing else is filled. Depth whose inverse lies outside
-    that of the depth range by more than a tenth is also NaN.
+    Only stripes of at least `min_confidence` are used. Depth is also NaN if 1/z is above 1.1 / near or below 0.9 / far,
+    with near and far the limits of the depth range.
     """
     from rig.depth.kernels import fill_rows
 
@@ -56,8 +56,8 @@ SAME_PX = 1.5
 
 
 def share_claims(stripes: StripeTable, grid: LineGrid) -> StripeTable:
-    """The table with lower confidences of coinciding answers: each confidence c is multiplied by c over the sum of the
-    confidences of the answers that coincide. Two equal ones are halved.
+    """The table with the confidences of coinciding answers lowered: c becomes c^2 / s, with s the sum of the
+    confidences of the answers that coincide. Two equal confidences are halved.
 
     Positions stay as they are.
     """

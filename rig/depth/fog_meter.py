@@ -20,8 +20,9 @@ extinction's relative error.
 
 Limits. Nothing is carried over between maps: a reading depends on its map only, and is the same whenever the map is
 estimated again. If the fog forms a halo around the stripes (`halo` of the model), its light falls off on both sides of
-them as haze would, and neither extinction nor veil is given. They are not given for several lines at once either,
-because the other lines' haze ends at their own stripes, at unknown places, which changes the form of the decay.
+them as haze would, and neither extinction nor veil (the haze just before the stripe) is given. Nor are they given for
+several lines at once: the other lines' haze ends at their own stripes, at unknown places, which changes the form of the
+decay.
 """
 
 import math
@@ -49,7 +50,7 @@ RIDGE: Final = 1e-11
 """Added to the diagonal: keeps the inverse positive if two parameters act alike, as even haze and ambient light do."""
 FLUX_MIN: Final = 1e-7
 FLUX_MAX: Final = 50.0
-"""Photons per exposure; between these all logarithms are finite."""
+"""Photons per exposure; between FLUX_MIN and FLUX_MAX all logarithms are finite."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -108,8 +109,10 @@ def _inverse(information: Float64) -> Float64:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class _Data:
-    """Data of the fit, (blocks, cells): sums of ones and exposures; gain, ambient: means of the geometry factor and of
-    the flux that is no haze. path_m, behind: (cells,), distance from the middle path, and whether behind the stripe.
+    """Data of the fit, (blocks, cells); a cell is a bin of path on one side of the stripe.
+
+    ones, exposures: sums. gain, ambient: means of the geometry factor and of the flux that is no haze. path_m, behind:
+    (cells,), path less the mean path, and whether the cell is behind the stripe.
     """
 
     ones: Float64
@@ -160,8 +163,9 @@ RESOLVED_SIGMAS: Final = 3.0
 """A quantity is stated if it is more than this many standard deviations above zero."""
 CLEAR: Final = 0.85
 CLEAR_PX: Final = 6.0
-"""Least confidence of a clear row, and least distance of its pixels that are read from its stripe. A higher confidence
-would bias the haze low, since with few exposures it is reached by chance; with a lower one stripes count as haze."""
+"""Least confidence of a clear row, and least distance in pixels between its stripe and the pixels that are read. A
+higher confidence would bias the haze low, since with few exposures it is reached by chance; with a lower one stripes
+count as haze."""
 LEAST_LINES: Final = 30
 """Fewest clear rows, over all columns, for a reading."""
 BLOCKS: Final = 4
@@ -179,9 +183,9 @@ class FogEstimate:
 
     visibility_m: 3.912 / extinction. visibility_sd_m: half of the amount by which visibility grows if the extinction
     is smaller by two of its standard deviations.
-    ambient_per_exposure: photons per pixel and exposure that are not the laser's: surfaces, airlight and dark counts,
-    mean over the pixels read. veil_per_exposure: the laser's light that the medium sends back, per pixel just before
-    the stripe, mean over the rows read; veil_to_signal: ratio to their stripes' light.
+    ambient_per_exposure: photons per pixel and exposure that are not the laser's (ambient light from surfaces and fog,
+    dark counts), mean over the pixels read. veil_per_exposure: the laser's light that the medium sends back, per pixel
+    just before the stripe, mean over the rows read. veil_to_signal: the veil divided by the light of those stripes.
     """
 
     extinction_per_m: float | None = None

@@ -21,7 +21,7 @@ MAX_COLUMN_GAP: Final = 2
 """Stripes of columns farther apart than this are not joined to one surface."""
 SPACING_TOLERANCE_PX: Final = 1.0
 SPACING_SIGMAS: Final = 3.0
-"""Stripes lie on one surface if their spacing differs from that of equal depth by at most the sum of both."""
+"""Stripes lie on one surface if their spacing differs from that of equal depth by at most 1 px + 3 sd."""
 
 
 @numba.njit(cache=True, nogil=True)
@@ -77,7 +77,8 @@ def fill_rows(
 
 
 SUMS: Final = 4
-"""Sums of a cell: ones, exposures, and exposures weighted with geometry factor and with flux that is no haze."""
+"""Sums for each block, side and bin: ones, exposures, and exposures weighted with geometry factor and with flux that is
+no haze."""
 
 
 @numba.njit(cache=True, nogil=True)
@@ -88,9 +89,9 @@ def add_clear_rows(
     """Add the pixels that are clear_px or more before or behind the stripe at x_px, for each clear row of a column.
 
     lines: the rows with their columns; x_px, clear and block have one entry for each. clear: whether its stripe is
-    beyond doubt; other rows are skipped. block: number of its block of rows and columns. sums: (blocks, 2, bins, SUMS),
-    before and behind the stripe. at_stripe (lines, 2): path in metres and geometry factor of the haze at the stripe,
-    unchanged for skipped rows. Pixels with more ambient flux than hot_flux are left out.
+    beyond doubt; other rows are skipped. block: in which block of rows and columns it lies. sums: (blocks, 2, bins,
+    SUMS), before and behind the stripe. at_stripe (lines, 2): path in metres and geometry factor of the haze at the
+    stripe, unchanged for skipped rows. Pixels with more ambient flux than hot_flux are left out.
     """
     row = row_buffers(sweep.window, state.amplitude.shape[0])
     step = 1 if sweep.near_is_left else -1

@@ -99,7 +99,7 @@ class Reconstructor:
         return self.estimator.counter(layout, self.geometry)
 
     def map(self, sweep: FrameTally) -> MapResult:
-        """The map of one counted sweep, with the time that all of it took.
+        """Make the map of one counted sweep; its `compute_s` is the time for all of this.
 
         sweep: the result of a `counter`, or a `CountVolume`.
         """
@@ -108,8 +108,9 @@ class Reconstructor:
         return self.complete(stripe, sweep, self._filter, time.perf_counter() - begun)
 
     def complete(self, stripe: StripeTable, sweep: FrameTally, filter: str, estimate_s: float) -> MapResult:
-        """The map of a sweep whose stripe table the estimator made in `estimate_s`, with filter, depth and
-        intensity."""
+        """Make the map of a sweep from its stripe table: filter, depth, intensity, fog and doubts.
+
+        estimate_s: the time that the estimator took for the table."""
         begun = time.perf_counter() - estimate_s
         geometry, fog, intensity = self._bound(sweep), self._fog(sweep, stripe), sweep.intensity()
         doubts = self._checks.doubts(sweep, intensity, stripe)

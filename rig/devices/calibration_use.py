@@ -64,7 +64,8 @@ class KnowsRig(Protocol):
 
 @dataclass(frozen=True, slots=True)
 class CalibrationUse:
-    """The calibration of a run. checked: whether it states its rig. accepted: reasons in spite of which it is used."""
+    """The calibration of a run. checked: whether it states its rig and so was compared. accepted: reasons against it
+    that the user accepted."""
 
     model: RigModel
     checked: bool
@@ -142,8 +143,8 @@ def calibration_use(rig: OpenRig, *, accept: bool = False, here: Identity | None
 
 
 def cube_calibration_use(model: RigModel, file: Path | None, *, accept: bool = False) -> CalibrationUse:
-    """The calibration of a cube of frames whose rig is unknown. Only its verdict and checks count. May raise
-    UsageError.
+    """The calibration of a cube of frames whose rig is unknown. Only its verdict and checks count. Raises UsageError as
+    `calibration_use` does.
     """
     return _used(model, file, refusals(model, file, None), accept)
 
@@ -194,7 +195,7 @@ def _foreign(made: Identity, here: Identity) -> list[Refusal]:
 
 
 def _comparable(made: Identity, here: Identity) -> tuple[dict[str, str], dict[str, str]]:
-    """Kinds of both. For simulated worlds these are digests of the geometry, or file names if one has no digest."""
+    """Kinds of both. For a simulated world: the digest of its geometry, or the file name if one rig has no digest."""
     both = dict(made.kinds), dict(here.kinds)
     digests = [kinds.pop(_GEOMETRY, "") for kinds in both]
     if all(digests):
@@ -240,7 +241,7 @@ def _accepted_before(rig: OpenRig) -> frozenset[str]:
 
 
 def accepted_by(use: CalibrationUse | None) -> tuple[str, ...]:
-    """The reasons in spite of which a run's calibration was used, for its summary."""
+    """The reasons against a run's calibration that the user accepted, for the summary."""
     return () if use is None else tuple(map(str, use.accepted))
 
 
@@ -266,8 +267,8 @@ def check_content(checked: str, accepted: Sequence[Refusal]) -> dict[str, Any]:
 
 
 def note_check(file: Path, model: RigModel, what: str, *, passed: bool, reasons: tuple[str, ...] = ()) -> Path:
-    """Note the outcome of a check in a file beside the calibration; returns its path. what: check or pixels. Raises
-    OSError, or UsageError if older notes cannot be read."""
+    """Note the outcome of a check in a file beside the calibration; returns that file's path. what: the command that
+    checked, 'check' or 'pixels'. Raises OSError, or UsageError if older notes cannot be read."""
     beside = _beside(file)
     notes = _read_notes(beside)
     date = datetime.now(UTC).isoformat(timespec="seconds")
@@ -277,7 +278,7 @@ def note_check(file: Path, model: RigModel, what: str, *, passed: bool, reasons:
 
 
 def carry_notes(old: Path, before: RigModel, new: Path, after: RigModel, *, new_pixels: bool = False) -> None:
-    """Copy the notes on failed checks from a calibration to the one that was made from it. Raises as `note_check`.
+    """Copy the notes on failed checks from a calibration to the one made from it. Raises what `note_check` raises.
 
     new_pixels: whether the new one has a pixel map of its own, so that notes on the old one do not apply.
     """

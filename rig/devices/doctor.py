@@ -54,8 +54,10 @@ _LEAST_LINES = 3
 
 @dataclass(frozen=True, slots=True)
 class LineMarkers:
-    """Line markers of a sweep, compared with its plan. jitter_columns: standard deviation of their times. clock_error:
-    relative excess of the scanner's clock over nominal, in the SPAD's time."""
+    """Line markers of a sweep, compared with its plan.
+
+    rate_hz: markers per second. jitter_columns: standard deviation of their times. clock_error: relative excess of the
+    scanner's clock over nominal, in the SPAD's time."""
 
     rate_hz: float
     jitter_columns: float
@@ -137,7 +139,7 @@ def _count(records: NDArray[np.void], mark: Mark) -> int:
 
 @dataclass(frozen=True, slots=True)
 class Finding:
-    """Result of one examination. ok: False if it would keep a scan from running."""
+    """Result of one examination. ok: False if a scan could not run."""
 
     name: str
     ok: bool

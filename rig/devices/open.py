@@ -206,7 +206,7 @@ def _load_model(config: RigConfig, problems: list[str]) -> RigModel | None:
 
 
 def _pause_if_emitting(laser: LineLaser) -> list[str]:
-    """Pause a laser that emits before this program armed it. Returns the reason to refuse the scan."""
+    """Pause a laser that emits before this program armed it. Returns the reason to refuse the scan, if there is one."""
     try:
         if not laser.status.emission:
             return []

@@ -1,4 +1,4 @@
-"""Prepares open devices for a scan: the plan is compiled once and the SPAD configured for it, before anything moves.
+"""Prepares open devices for a scan: the plan is compiled and the SPAD configured for it, before anything moves.
 
 This module also divides a SPAD's burst memory between the time until the scanner has started and the maps.
 """
@@ -22,7 +22,7 @@ from rig.plan.scan_plan import ScanPlan
 from rig.recording.replay import replay_plan
 
 HOLD_EXPOSURES = 10
-"""With at least so many exposures per column, simulated light is constant in a column; with fewer, in parts of one."""
+"""From this number of exposures per column on, simulated light is constant in a column; below, in parts of one."""
 
 
 @runtime_checkable
@@ -77,7 +77,7 @@ def _compiled(rig: OpenRig, scan: ScanConfig) -> ScanPlan:
 
 
 BURST_LEAD_S, HOST_LEAD_S = 5e-3, 0.15
-"""A burst must have room for so many seconds between the SPAD's start and the first scan marker.
+"""A burst must have room for this time in seconds between the SPAD's start and the first scan marker.
 
 The first is for virtual time, the second for a host that starts one device after the other over USB and serial ports.
 """
@@ -85,12 +85,12 @@ The first is for virtual time, the second for a host that starts one device afte
 SPARE_LEAD_S = 0.35
 """Further seconds before the first marker, since a busy host starts its devices late.
 
-They are added if the memory has room, and if reading ends with the last scan marker.
+They are added if the memory has room and the SPAD has markers: reading then ends with the last scan marker.
 """
 
 
 def lead_s(rig: OpenRig) -> float:
-    """Duration in seconds of the part of a burst before its first scan marker."""
+    """Seconds of a burst that are reserved for the time before its first scan marker."""
     return BURST_LEAD_S if isinstance(rig.clock, VirtualClock) else HOST_LEAD_S
 
 

@@ -52,7 +52,7 @@ def require_h5py() -> Any:
 
 def write_hdf5(blocks: Iterable[FrameBlock], maps: MapFiles, manifest: Mapping[str, Any], path: Path) -> FrameLog:
     """Write frames, maps and manifest to a new file. A run without frames or without maps has no such group. Raises
-    UsageError without h5py or if the frames do not make one array, OSError before the disk is full."""
+    UsageError without h5py or if the frames do not make one array, OSError if the disk has too little room left."""
     h5py = require_h5py()
     log = FrameLog()
     with h5py.File(path, "w", userblock_size=_USER_BLOCK) as file:
@@ -81,7 +81,7 @@ def write_hdf5(blocks: Iterable[FrameBlock], maps: MapFiles, manifest: Mapping[s
 
 
 def _require_room(path: Path, n_bytes: int) -> None:
-    """Raise OSError before the disk is full. On a full disk HDF5 cannot close a file, and ends the whole process."""
+    """Raise OSError if n_bytes nearly fill the disk. On a full disk HDF5 cannot close a file and ends the process."""
     if shutil.disk_usage(path.parent).free < n_bytes + _ROOM_BYTES:
         raise OSError(errno.ENOSPC, os.strerror(errno.ENOSPC), str(path))
 

@@ -185,7 +185,7 @@ def _turned(foreign: ForeignFrames, turn: QuarterTurn) -> Iterator[NDArray[np.ui
 
 
 def _clock(rate: Fraction | None) -> tuple[Fraction, int]:
-    """Tick frequency and ticks per frame: the most of 1000, 100, 10 and 1 whose frequency a block's header can hold."""
+    """Tick frequency, and ticks per frame: the largest of 1000, 100, 10, 1 with a frequency that a header can hold."""
     if rate is None:
         return Fraction(1), 1
     rate = rate.limit_denominator(_MAX_TICK_HZ // max(1, -(-rate.numerator // rate.denominator)))

@@ -95,7 +95,7 @@ class FrameLog:
         ]
 
     def content(self) -> dict[str, Any]:
-        """Everything for a JSON file that an array of pixels cannot hold. Places are indices of the array."""
+        """All that an array of pixels cannot hold, for a JSON file. Markers and changes are at indices of the array."""
         header, columns = self.header, self.columns()
         marks = columns["marks"]
         return {

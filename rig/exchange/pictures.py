@@ -45,9 +45,10 @@ def map_pictures(maps: MapFiles, view: View) -> Iterator[Picture]:
 
 
 def frame_pictures(blocks: Iterable[FrameBlock], frames_per_picture: int) -> Iterator[Picture]:
-    """Sum received frames in groups on the whole sensor, in square-root grey. An incomplete last group is left out.
+    """Sum received frames in groups, and draw the square roots of the sums on the whole sensor as grey levels.
 
-    White is the level of the brightest pixels of the first picture, so that a film does not flicker.
+    An incomplete last group is left out. White is the level of the brightest pixels of the first picture, so that a
+    film does not flicker.
     """
     white = 0.0
     for counts in _sums(blocks, frames_per_picture):

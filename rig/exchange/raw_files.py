@@ -37,7 +37,7 @@ _LSB_FIRST: Final = np.packbits(np.unpackbits(np.arange(256, dtype=np.uint8), bi
 """Bytes with their bits reversed."""
 _JUDGED_FRAMES: Final = 512
 _JUDGED_SIGMAS: Final = 10.0
-"""By chance, even and odd frames of one scene do not differ by so many standard deviations."""
+"""Even and odd frames of one scene differ by fewer standard deviations than this."""
 
 
 def open_pi_imaging(files: Sequence[Path], asked: ImportRequest) -> ForeignFrames:

@@ -28,8 +28,8 @@ _SAMPLED_ROWS = 16
 class BentLight:
     """Rays and sheets that turn a map's commands into depth if the light is bent.
 
-    u, v: float32 (rows, width), true rays. commands: (columns,) of the columns. velocity_per_s: of the command during
-    the sweep, negative if it fell. sheets: (samples, 10), the model's sheets as the kernel reads them.
+    u, v: float32 (rows, width), true rays. commands: (columns,) of the columns' centres. velocity_per_s: of the command
+    during the sweep, negative if it fell. sheets: (samples, 10), the model's sheets as the kernel reads them.
     """
 
     model: RigModel

@@ -54,9 +54,10 @@ class LineGrid:
         return result
 
     def bound_commands(self, commands: Float64, column: Float64) -> Float64:
-        """Commands of the lines of all columns when the mirror was bound to `column`, both (columns,).
+        """Command (columns,) of each column's line when the column's frames were taken.
 
-        commands: of the columns' centres. Fractional columns count from each column's own number.
+        commands: of the columns' centres. column: (columns,), the fractional columns to which the frames were bound.
+        Their distances from the columns' own numbers are in places of the mirror.
         """
         result: Float64 = commands + (column - np.arange(len(commands))) * self.step
         return result

@@ -15,7 +15,8 @@ class StripeTable:
     """Result of an estimator for one sweep; all arrays float32 (rows, columns).
 
     x_px: sub-pixel stripe position in raw pixels, centres at integers; NaN only where the row has no data.
-    confidence: probability that x_px is within 1 px of the truth, 0 to 1 (0 where x_px is NaN).
+    confidence: probability that x_px is within 1 px of the truth, 0 to 1 (0 where x_px is NaN); that of `argmax` and
+    `edge` takes no account of haze.
     x_sd_px: standard deviation of x_px given that it is the right stripe.
     signal: photons per exposure of the stripe, summed across it; haze: photons per exposure and pixel just before it.
     x2_px: position of a second stripe in addition to x_px, nearer or farther (a pane before a wall), NaN where no light

@@ -82,10 +82,10 @@ class SweepGeometry:
         return int(self.plane.shape[0])
 
     def reference_px(self) -> Float64:
-        """Position of each column's line at the middle inverse depth, (rows, columns) px, as if without distortion.
+        """Position of each column's line at the middle inverse depth, (rows, columns) px, without lens distortion.
 
-        Only its differences between neighbouring rows and columns matter. It may lie outside the picture. 0 everywhere
-        if no row has two pixels with a ray.
+        Only differences between neighbouring rows and columns matter. Positions may lie outside the picture. 0
+        everywhere if no row has two pixels with a ray.
         """
         near_m, far_m = self.depth_range_m
         w = 0.5 * (1.0 / near_m + 1.0 / far_m)

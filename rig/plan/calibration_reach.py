@@ -1,7 +1,7 @@
 """Checks whether a calibration is valid for a scan: for its sensor, its mirror's speed and its range of commands.
 
-`recalibrated` adapts the plan of a recording to a calibration made since. What was scanned does not change, but where
-it is seen may.
+`recalibrated` adapts the plan of a recording to a calibration made later. Mirror and gate did what they did; lag and
+windows may change.
 """
 
 import math
@@ -44,7 +44,7 @@ def model_problems(
 
 
 def require_speed(model: RigModel, speed_per_s: float, exposures: int) -> None:
-    """Raise CalibrationError if the lag was not measured near this speed, with the command that measures it.
+    """Raise CalibrationError if the lag was not measured near this speed. The message has a command that measures it.
 
     The speed of a sweep is inversely proportional to its exposures. The command names this scan's exposures and those
     of the farther end of the old range, so that scans that were possible stay possible.
@@ -70,7 +70,8 @@ def recalibrated(plan: ScanPlan, model: RigModel) -> ScanPlan:
     """The plan with the lag and the windows of `model`; unchanged if it was compiled for that model.
 
     Mirror, gate and markers stay as they were, and so do the pixels that the SPAD sent. Frames that do not contain a
-    column's window do not count for it. Raises UsageError if the calibration is not of this rig and scan.
+    column's window do not count for that column. Raises UsageError if the calibration does not fit the plan's sensor,
+    speed or commands.
     """
     try:
         model.check_sensor(plan.width, plan.rows)

@@ -62,7 +62,7 @@ def compile_plan(
 
     point_clock: the scanner's exact clock for a requested rate (`BeamScanner.point_clock`).
     model: None if the rig is not calibrated; there is then no lag and the window is the whole row.
-    line_offsets: of the rig's lines; the number of columns is a multiple of theirs.
+    line_offsets: command offset of each laser line; the number of columns is a multiple of the number of lines.
     Raises PlanError with one line per problem.
     """
 
@@ -119,7 +119,7 @@ def _draft(
 
 
 def path_demand(scan: ScanConfig, places: int, model: RigModel | None, *, markers: bool) -> PathDemand:
-    """The demand on the mirror of a scan with `places` line positions. markers: whether the SPAD has any."""
+    """The demand of a scan on the mirror. places: mirror positions. markers: whether the SPAD reports markers."""
     frame_rate = scan.frame_rate
     blanking = None if markers else blanking_for(places, scan.exposures, frame_rate)
     return PathDemand(

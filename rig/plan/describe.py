@@ -39,7 +39,7 @@ def plan_text(plan: ScanPlan) -> str:
 
 
 def _window(plan: ScanPlan) -> str:
-    """Pixels of the windows, for people. Stored rows are padded to whole words, sensors' rows need not be."""
+    """Width of the windows as text. Stored rows are padded to 64 pixels, so a window can exceed the sensor's row."""
     return f"all {plan.width} pixels" if plan.window >= plan.width else f"{plan.window} of {plan.width} pixels"
 
 
@@ -113,7 +113,10 @@ def beyond_sensor(scan: ScanConfig, info: SpadInfo) -> Iterator[tuple[float, str
 
 
 def beyond_link(plan: ScanPlan, info: SpadInfo, draft_at: Callable[[Fraction], ScanPlan | None]) -> tuple[float, str]:
-    """Highest frame rate that the link carries, in whole hertz (0: none), and the problem with the requested one."""
+    """Highest frame rate that the link carries, in whole hertz (0: none), and the problem with the requested one.
+
+    draft_at: makes the plan at another frame rate; None if there is none.
+    """
     rate, have = float(plan.frame_rate_hz), plan.link_bytes_per_s or 0.0
     made = f"{digits(rate * frame_bytes(plan.width, plan.rows) / 1e6, 4)} MB/s of full frames"
     if plan.windows is not None:
@@ -132,8 +135,8 @@ def beyond_link(plan: ScanPlan, info: SpadInfo, draft_at: Callable[[Fraction], S
 def _carried_hz(plan: ScanPlan, step_px: int, draft_at: Callable[[Fraction], ScanPlan | None]) -> int:
     """The highest frame rate of this scan that the link carries, in whole hertz.
 
-    The slower the scan, the closer its markers and the narrower its windows may be. Widths are tried from the narrowest
-    one, which is carried fastest, to full frames.
+    In a slower scan fewer columns lie between markers, so windows can be narrower. Widths are tried from the narrowest,
+    which allows the highest rate, to full frames.
     """
     for width in range(*window_widths(plan, step_px)):
         rate = math.floor((plan.link_bytes_per_s or 0.0) / frame_bytes(width, plan.rows))

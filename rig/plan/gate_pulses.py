@@ -14,8 +14,8 @@ from rig.plan.scan_plan import ScanPlan
 def sync_program(plan: ScanPlan, maps: int) -> tuple[tuple[Pulse, ...], int]:
     """Pulses and repeats that open the gate once in each of `maps` sweeps and then leave it low.
 
-    If the plan has a blanking pattern, it comes in each of these sweeps, in the pilot sweeps before and in the sweep
-    after.
+    A blanking pattern, if the plan has one, is given in each of these sweeps, in the sweep after them, and in pilot
+    sweeps before them, which have nothing else.
     """
     if plan.blanking is not None:
         lit = range(plan.pilots, plan.pilots + maps)
@@ -27,7 +27,7 @@ def sync_program(plan: ScanPlan, maps: int) -> tuple[tuple[Pulse, ...], int]:
 
 
 def _gate_s(plan: ScanPlan, sweep: int, lit: bool) -> list[tuple[float, float]]:
-    """(open, close) of the gate in seconds from a sweep's scan marker, ascending; the pattern's alone if not lit."""
+    """(open, close) of the gate in seconds from a sweep's scan marker, ascending; only the pattern's if not `lit`."""
     leg = plan.leg(sweep)
     flashes = () if plan.blanking is None else plan.blanking.flashes_s(sweep % len(plan.legs))
     begin_s = plan.pattern_s(leg)

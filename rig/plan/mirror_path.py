@@ -1,9 +1,10 @@
 """The mirror's path over one sweep: run-in, constant velocity, run-out, fly-back, rest, all with bounded acceleration.
 
-Ramps raise the velocity along half a cosine, v(t) = v (1 - cos(pi t/T))/2, so the acceleration starts and ends at zero
-and peaks at pi v/(2 T). Moves from rest to rest are cycloids, x(t) = D (t/T - sin(2 pi t/T)/(2 pi)), with peak velocity
-2 D/T and peak acceleration 2 pi D/T^2. Every segment lasts a whole number of points, so a sweep does too and nothing
-drifts. The lit part lies in the middle of the constant velocity and lasts exactly as long as its frames.
+T is the duration of a segment. Ramps raise the velocity along half a cosine, v(t) = v (1 - cos(pi t/T))/2, so the
+acceleration starts and ends at zero and peaks at pi v/(2 T). Moves from rest to rest over a distance D are cycloids,
+x(t) = D (t/T - sin(2 pi t/T)/(2 pi)), with peak velocity 2 D/T and peak acceleration 2 pi D/T^2. Every segment lasts a
+whole number of points (samples of the command), so a sweep does too and nothing drifts. The lit part lies in the middle
+of the constant velocity and lasts exactly as long as its frames.
 
 `find_path` finds the quickest path that a scanner can follow for a scan, or the problems; `remedy` says what helps.
 """
@@ -57,7 +58,7 @@ class SweepPath:
     """One sweep from its scan marker (point 0) to the next one.
 
     points: length of the sweep.
-    lit_start: points from the start to the command of the first lit edge. lit_points: points between the two lit edges.
+    lit_start: points until the command reaches the first edge of the lit part. lit_points: length of the lit part.
     cruise: first and last point of the constant-velocity part.
     low, high: extreme commands.
     """
@@ -183,8 +184,9 @@ class PathDemand:
     edges: commands of the lit part's two ends.
     column_s, frame_s: exact seconds of a column and of a frame.
     lag_s: longest lag of the mirror.
-    guard_s: extra time that the gate is open on either side. clock_tolerance: relative error of its clock.
-    lead_s: further time at constant velocity, not counted as dark.
+    guard_s: extra time that the gate is open on either side. clock_tolerance: relative error of the gate's clock.
+    dark_fraction: least share of dark frames.
+    lead_s: further time at constant velocity, for a blanking pattern; not counted as dark.
     """
 
     edges: tuple[float, float]
@@ -210,8 +212,8 @@ class PathDemand:
 
     @property
     def gate_margin_s(self) -> float:
-        """Time for which the gate is open before the first and after the last column: the guard, and the drift of its
-        clock.
+        """Time for which the gate is open before the first and after the last column: `guard_s`, and the drift of the
+        gate's clock.
         """
         # The drift counts from the scan marker; the run-in is shorter than the lit part wherever it matters.
         return self.guard_s + self.clock_tolerance * 2 * float(self.lit_s)
@@ -224,7 +226,7 @@ class PathDemand:
 
 @dataclass(frozen=True, slots=True)
 class PathFound:
-    """A path with its point clock, or the problems with it, without remedies."""
+    """A path and its point clock. If no path is possible, it is None and `problems` say why, without remedies."""
 
     path: SweepPath | None
     rate_hz: Fraction
@@ -232,7 +234,7 @@ class PathFound:
 
 
 def find_path(demand: PathDemand, limits: ScannerLimits, point_clock: Callable[[float], Fraction]) -> PathFound:
-    """Find the quickest path within the limits, on the fastest point clock for which the device holds its points."""
+    """Find the quickest path within the limits, on the fastest point clock at which the scanner can hold all points."""
     low_hz, high_hz = limits.point_rate_hz
     asked = high_hz
     sweeps = 2 if demand.bidirectional else 1

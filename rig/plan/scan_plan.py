@@ -39,7 +39,7 @@ CHIPS_PER_COLUMN = 5
 """
 MOST_CHIP_FRAMES = 8
 VERNIER_FRAMES = 0.382
-"""Fraction added to whole frames: one minus the golden ratio's fraction 0.618, whose multiples spread most evenly."""
+"""Part of a frame added to a chip's whole frames: 1 - 0.618 (golden ratio). Multiples of it spread most evenly."""
 MARGIN_FRAMES = 2.0
 """Dark frames kept before the pattern, and behind the last frame of its search."""
 
@@ -48,7 +48,8 @@ MARGIN_FRAMES = 2.0
 class Blanking:
     """The blanking pattern of a plan.
 
-    guard_s: dark time between pattern and lit part. tolerance_s: how far the pattern may lie from its planned time.
+    chip_s: length of a chip. guard_s: dark time between pattern and lit part. tolerance_s: how far the pattern may lie
+    from its planned time.
     """
 
     chip_s: float
@@ -111,11 +112,11 @@ class ScanPlan:
     marker_points: int64 (markers,), point of line marker j within a sweep. It marks the command of the edge j *
       columns_per_marker columns into the lit part; markers after the lit part only move the window in the dark.
     commands: float64 (columns,), mirror command of each column's centre, plus its line's offset.
-    x0: int32 (columns,), first stored pixel of each column's window. window: stored pixels per row. Both are multiples
-      of 64.
+    x0: int32 (columns,), first stored pixel of each column's window. window: the windows' width in stored pixels. Both
+      are multiples of 64.
     link_bytes_per_s: rate that the SPAD's link carries; None if it cannot stream.
-    windows: the pixels of each frame that are used, by the markers before it; None for all.
-    windowed: whether the SPAD sends only these.
+    windows: which pixels of a frame are used, as a table by the markers before that frame; None if all are.
+    windowed: whether the SPAD sends only these pixels.
     blanking: the pattern that binds frames if the SPAD has no markers; None if it has.
     lines: which line lights which column, if there are several; None if one lights all.
     """
@@ -270,7 +271,8 @@ class ScanPlan:
         return column_command(column, self.command_range, self.places)
 
     def line_commands(self, column: Array) -> Array:
-        """Commands (columns,) that bring a single line to where each column's line was. column: as bound."""
+        """Commands (columns,) that bring a single line to where each column's line was. column: the positions to which
+        the columns' frames were bound."""
         return self.command_at(column) if self.lines is None else self.lines.bound_commands(self.commands, column)
 
     @property

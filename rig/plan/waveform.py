@@ -60,8 +60,8 @@ def line_markers(path: SweepPath, columns: int, exposures: int) -> tuple[int, ND
 def _scan_marker_points(leg: Leg, rate: Fraction) -> int:
     """Points for which the scan marker, which holds the gate, stays high: until the middle of the gate's last slice.
 
-    So the gate closes when its pulse ends, not when the marker falls, as long as the clocks of scanner and sync source
-    differ by less than half a slice.
+    The sync source begins each slice of a gate pulse only while the marker is high. So the gate closes when its pulse
+    ends, not when the marker falls, as long as the clocks of scanner and sync source differ by less than half a slice.
     """
     lit_s = leg.gate_close_s - leg.gate_open_s
     return max(1, math.floor((leg.gate_close_s - lit_s / slices(lit_s) / 2) * rate))
@@ -108,7 +108,10 @@ def window_widths(plan: ScanPlan, step_px: int) -> tuple[int, int, int]:
 
 
 def _spans(plan: ScanPlan, leg: Leg, grid: int) -> tuple[Pixels, Pixels]:
-    """First pixel, on the grid, and end of the pixels that each entry has to hold; entry 0 before the first marker."""
+    """First pixel (a multiple of `grid`) and end of the pixels that each entry of the table has to hold.
+
+    Entry 0 holds until the first marker, entry i from marker i - 1 on.
+    """
     frame_s = float(1 / plan.frame_rate_hz)
     edges_s = np.concatenate([[0], plan.marker_points, [plan.sweep_points]]) / float(plan.point_rate_hz)
     # The window is taken at a frame's start and used at the middle of its exposure, up to a frame later.

@@ -31,9 +31,9 @@ _STEP_BYTES: Final = 64 * 2**20
 _CLOCK_SHARE: Final = 0.01
 """Tolerance of ticks against frame numbers: this share of the frames, plus half a frame."""
 _NEIGHBOURS: Final = 2
-"""A block is compared with so many blocks before it, and as many after it."""
+"""Number of blocks before a block, and after it, with which it is compared."""
 _FEW: Final = 4
-"""At most one in so many blocks of a start is left out because of its ticks or sweep; of three blocks, one."""
+"""At most one in this many blocks of a start is left out because of its ticks or sweep; of three blocks, one."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -173,7 +173,7 @@ class Continuity:
 
 
 def in_step(frames: int, ticks: int, header: BlockHeader) -> bool:
-    """Whether frames whose numbers differ by `frames` can be `ticks` apart; always true if triggered from outside."""
+    """Whether frames whose numbers differ by `frames` can be `ticks` apart; always true without a frame period."""
     period = header.frame_period_ticks
     return not period or abs(ticks - frames * period) <= period * (0.5 + _CLOCK_SHARE * abs(frames))
 
@@ -181,7 +181,7 @@ def in_step(frames: int, ticks: int, header: BlockHeader) -> bool:
 def out_of_step(run: Run) -> list[SoundBlock]:
     """Blocks of a start whose ticks or sweep disagree with their frame numbers, judged by their neighbours.
 
-    Empty if there would be more than a few, since the device then counts differently, or with at most two blocks.
+    Empty if more than a few disagree, since the device then counts in another way. Empty too with at most two blocks.
     """
     votes = [0] * len(run)
     for i, block in enumerate(run):

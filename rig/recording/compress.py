@@ -1,4 +1,4 @@
-"""Compresses a finished recording, each block by itself, so that any of them can be read alone.
+"""Compresses a finished recording, each block by itself, so that any block can be read alone.
 
 `frames-000000.spb` becomes `frames-000000.spb.zst`; the index stays as it is. Each segment is replaced only once the
 compressed one is on the disk and unpacks to the same bytes.

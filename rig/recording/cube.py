@@ -1,4 +1,4 @@
-"""A cube of packed frames without records, made by any program: checked against its plan, counted map by map.
+"""A cube of packed frames, made by any program: checked against its plan, counted map by map.
 
 The frames are in a .npy file: uint8 (maps x columns x exposures, height, ceil(width / 8)), packed along the width, most
 significant bit first (`numpy.packbits(frames, axis=2)`). Or they are in a recording without plan and markers, as
@@ -41,7 +41,7 @@ Piece = tuple[int, NDArray[np.uint8]]
 class Cube:
     """Checked frames of whole maps. first_frame: number of the first map's first frame. maps: number of whole sweeps.
 
-    between: called with (first, end, step), reads the existing ones of frames first..end-1, at most step at a time.
+    between: called with (first, end, step), yields those of the frames first..end-1 that exist, at most step at a time.
     """
 
     path: Path
@@ -60,7 +60,7 @@ class Cube:
 
 def open_cube(path: str | os.PathLike[str], plan: CubePlan, model: RigModel) -> Cube:
     """Open a .npy file, or the folder of a recording. Raises UsageError if it cannot be read or disagrees with plan or
-    calibration, DamagedRecordingError as `open_recording`."""
+    calibration, DamagedRecordingError as `open_recording` does."""
     file = Path(path)
     camera = model.camera
     if file.is_dir():
@@ -242,7 +242,7 @@ def pack_line(frames: str, dtype: np.dtype[Any]) -> str:
 
 
 def _numpy_line(frames: NDArray[Any], height: int, width: int) -> str | None:
-    """The line of numpy that makes uint8 (frames, height, ceil(width / 8)) of an array; None for another size."""
+    """The line of numpy that makes uint8 (frames, height, ceil(width / 8)) of an array; None if its size cannot fit."""
     packed, whole, dtype = (height, -(-width // 8)), (height, width), frames.dtype
     line, shape = "frames", frames.shape
     if shape in (packed, whole):

@@ -109,7 +109,7 @@ def _parts(recording: RunRecording, spans: Sequence[MapSpan], asked: CutRequest)
 
 
 def _map_parts(recording: RunRecording, spans: Sequence[MapSpan], first: int, end: int) -> list[Part]:
-    """One part for each start that has some of the maps, with the frame whose marker closes the last of these."""
+    """One part for each start that has some of the maps, up to the frame whose marker closes the last of them."""
     if not any(run.entries["sweep"].any() for run in recording.runs):
         raise UsageError(
             f"{recording.path} has no markers to tell maps apart (sweeps are found by the light of a whole run, if at "

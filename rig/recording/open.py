@@ -90,7 +90,7 @@ def manifest_or_none(folder: Path) -> tuple[dict[str, Any] | None, str | None]:
 
 @dataclass(frozen=True, slots=True)
 class MapSpan:
-    """Frames of a map, all of one start (`run`): from the one with its scan marker to before the one with the next."""
+    """Frames of a map, all of one start (`run`): from the frame with its scan marker to just before the next marker."""
 
     run: int
     first_frame: int
@@ -131,7 +131,7 @@ def _marked(recording: RunRecording) -> Iterator[MapSpan]:
 
 
 def _sweep_begins(recording: RunRecording, run: RecordedRun) -> Iterator[int]:
-    """Numbers of the frames of a start that have a scan marker, or that follow lost frames with one."""
+    """Numbers of a start's frames with a scan marker; if such a frame was lost, that of the first one after it."""
     entries = run.entries
     changes = np.flatnonzero(np.diff(entries["sweep"].astype(np.int64), prepend=-1) != 0)
     look_into = sorted({0, len(entries) - 1, *changes.tolist(), *(changes[1:] - 1).tolist()})

@@ -92,7 +92,7 @@ def _numbered(segment: Path, number: int) -> Path:
 
 
 def _clear(segment: SegmentReader, blocks: list[Range], done: list[str]) -> None:
-    """Move all but sound blocks to the torn file, zeros in their place; end the segment after the last sound block.
+    """Move all but sound blocks to the torn file, leaving zeros, and end the segment after the last sound block.
 
     A segment without a sound block is removed."""
     end = round_up_to_page(blocks[-1][1]) if blocks else 0

@@ -104,7 +104,7 @@ def replay_plan(
     """The plan with which the frames were taken, adapted to the present calibration, and the timing of the configured
     SPAD.
 
-    Raises UsageError as `read_plan`, and DamagedRecordingError if the frames differ in size from the plan's.
+    Raises UsageError as `read_plan` does, and DamagedRecordingError if the frames differ in size from the plan's.
     """
     from rig.plan.calibration_reach import recalibrated, whole_rows
 
@@ -128,9 +128,10 @@ def replay_plan(
 class ReplaySource:
     """Facts about a recording for its replay, as `rig.scan.scan.LiveSource` has them for a live scan.
 
-    maps: number of maps to take; None for all. starts: those of the SPAD, one after the other. learned: states with
-    which the maps of a part were estimated; empty if they are to be learned anew. Raises UsageError if there are too
-    few maps and no loop, DamagedRecordingError if a start of the SPAD is missing or a kept state is unreadable.
+    maps: number of maps to take; None for all. starts: those of the SPAD, one after the other. learned: in a part that
+    was cut out, the states with which its maps were estimated; empty if the estimator is to learn again. Raises
+    UsageError if there are too few maps and no loop, DamagedRecordingError if a start of the SPAD is missing or a kept
+    state is unreadable.
     """
 
     command = "replay"

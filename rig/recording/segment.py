@@ -2,7 +2,7 @@
 
 Blocks are written several at a time, past the page cache if the system allows it (O_DIRECT), without copying pixels if
 they are aligned. This takes 0.3 s of CPU per GB, nearly all of it for the checksum, compared with 2 s through the page
-cache. Then a sync has little to do. `Space` is the most room that a recorded run will take.
+cache, and little is left for a sync. `Space` is the most room that a recorded run will take.
 """
 
 import errno
@@ -53,7 +53,7 @@ class OpenSegment:
         self.placed = 0
         """Offset of the next block, bytes."""
         self.end = 0
-        """Offset in bytes of the end of the blocks that are written without a gap between them."""
+        """Offset in bytes of the first block that is not written yet: all blocks before it are."""
         self.synced = 0
         """Value of `end` at the beginning of the last sync."""
         self._lock = threading.Lock()

@@ -214,7 +214,7 @@ class Recording:
                 self.busy_s += time.perf_counter() - begun
 
     def _count(self, placed: _Placed) -> None:
-        """Index every block with nothing missing before it: a block that could not be written is never done."""
+        """Note that a block is written, and index all blocks before the first one that is not written (or failed)."""
         with self._lock:
             placed.done = True
             while self._order and self._order[0].done:

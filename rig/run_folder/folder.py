@@ -209,7 +209,7 @@ class RunFolder:
 
 
 def json_text(content: Mapping[str, Any]) -> str:
-    """Content as strict JSON: NaN and infinities are null, arrays lists, fractions numbers, paths and the like text."""
+    """Content as strict JSON. NaN and infinity become null, arrays become lists, fractions numbers, and paths text."""
     return json.dumps(_plain(content), indent=1, allow_nan=False, ensure_ascii=False)
 
 
@@ -238,8 +238,8 @@ class SavePolicy:
 
 
 def _renamed(folder: Path, target: Path) -> bool:
-    """Move a folder; False if there is something at `target` already, if only an empty folder, which another run may
-    have claimed. Raises OSError if anything else prevents it."""
+    """Move a folder; False if `target` exists, even as an empty folder: another run may have claimed it. Raises OSError
+    if anything else prevents the move."""
     if target.exists():
         return False
     try:

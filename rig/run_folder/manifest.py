@@ -1,7 +1,7 @@
 """The manifest of a run, `manifest.json`. It is sealed with a checksum, since depth depends on its content.
 
-`crc32` is the CRC-32 (zlib) of its other content as JSON without spaces and with sorted keys. So a digit that changed
-on the disk is detected, but different line breaks are accepted.
+The key `crc32` has the CRC-32 (zlib) of all other content, written as JSON without spaces and with sorted keys. So a
+digit that changed on the disk is detected, but different line breaks are accepted.
 """
 
 import json
@@ -153,7 +153,7 @@ def ended_before_last_map(manifest: Mapping[str, Any]) -> bool:
 
 
 def known_missing(manifest: Mapping[str, Any] | None) -> list[RunGap] | None:
-    """Frames that a repair found missing; None if there was no repair or is no manifest."""
+    """Frames that a repair found missing; None without a repair or without a manifest."""
     if manifest is None or "repaired" not in manifest:
         return None
     return [(int(run), int(first), int(last)) for run, first, last in manifest.get("missing") or []]

@@ -75,7 +75,7 @@ def png_bytes(picture: NDArray[np.uint8]) -> bytes:
 
 
 def _without_window_steps(intensity: NDArray[np.uint32]) -> NDArray[np.float64]:
-    """Counts as floats, without the steps where windows of whole words, and the haze in them, begin and end."""
+    """Counts as floats, without the steps at multiples of 64 px, where windows and the haze in them begin or end."""
     level = intensity.astype(np.float64)
     reach = 3
     for edge in range(WORD_PX, level.shape[1] - reach, WORD_PX):

@@ -98,9 +98,9 @@ class RunFrames:
 class Synchronisation:
     """The binding of a run's frames to columns: by what, and how well.
 
-    residual_columns: the largest of its sweeps; None if one could not be checked. clock_error: that farthest from 0.
-    detection_probability: the smallest, for a blanking pattern as bright as a sweep's; None if markers bound the
-    frames.
+    residual_columns: largest residual of its sweeps in columns (`rig.count.bind.SweepClock`); None if a sweep could not
+    be checked. clock_error: the one farthest from 0. detection_probability: smallest chance of all sweeps that a
+    pattern as bright as the sweep's is found; None if markers bound the frames.
     """
 
     by: Literal["markers", "blanking pattern"]

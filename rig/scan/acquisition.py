@@ -1,7 +1,8 @@
 """Runs a scan: starts the devices in order, takes maps from their frames, and makes everything safe.
 
 The `Pipeline` works between SPAD and caller. When all frames have come, or anything fails, the rig is made safe on the
-caller's thread. What is in the ring by then is still counted and estimated, unless the caller's thread itself failed.
+caller's thread. Frames that are still in the ring buffer then are counted and estimated, unless the caller's thread
+itself failed.
 """
 
 import logging
@@ -34,7 +35,7 @@ from rig.scan.pipeline import JOIN_S, Overload, Pipeline, require_policy, ring_f
 _log = logging.getLogger(__name__)
 
 SILENCE_S = 5.0
-"""A SPAD that sends nothing for so many seconds, with the ring empty, has failed."""
+"""A SPAD that sends nothing for this long, while the ring is empty, has failed."""
 WARM_UP_S = 120.0
 """Longest wait for a laser to warm up."""
 WARM_LOOK_S = 0.2
@@ -46,11 +47,11 @@ TELL_S = 0.1
 class AcquisitionRequest:
     """An acquisition of `maps` maps.
 
-    policy: for frames that come too fast.
+    policy: what to do with frames that come too fast.
     first_alone: take the first map with a separate start, so that a SPAD that cannot wait stands still while the
     estimator learns from that map.
     learns: whether the estimator learns from the first map.
-    starts: the starts of a recording, which say how many sweeps each takes; None lets the scan choose.
+    starts: for a replay, the recorded starts with the number of sweeps of each; None lets the scan choose.
     silence_s: a SPAD that sends nothing for this long, with the ring empty, has failed.
     recording: takes every block; None records nothing.
     listeners: callbacks that are informed of the progress.
@@ -73,7 +74,7 @@ class Acquisition:
     `rig.depth.reconstruct.Reconstructor`.
 
     Raises UsageError if the SPAD cannot do what the policy asks, ValueError for less than one map, and PlanError if the
-    memory of a SPAD that is no recording is too small for a map.
+    memory of a SPAD is too small for a map (not checked in a replay).
     """
 
     def __init__(
@@ -206,7 +207,7 @@ class Acquisition:
             self._end_group(pipeline, assembler)
 
     def _guard_limits(self, sweeps: int) -> GuardLimits:
-        """The guard's limits for the frames of this start: a burst is silent until it is read out."""
+        """The laser guard's time limits for this start. They allow for a burst, silent until it is read out."""
         usual, plan = GuardLimits(), self._plan
         block_s = 3 * self._timing.stride / plan.link_bytes_per_s if plan.link_bytes_per_s else 0.0
         exposed_s = (self._burst_frames(sweeps) or 0) / float(plan.frame_rate_hz)
@@ -219,7 +220,7 @@ class Acquisition:
         )
 
     def _silence_of_spad_s(self) -> float:
-        """Seconds for which the SPAD may give no answer while light may fall."""
+        """Longest time without an answer from the SPAD, in seconds, while the laser may shine."""
         spad, usual = self._rig.config.spad, GuardLimits()
         if str(getattr(spad, "port", "")).startswith(EMULATED_PREFIX):  # emulated on the same processors
             return usual.busy_within_s
@@ -293,7 +294,7 @@ class Acquisition:
 
 
 def added_counters(before: SpadCounters, now: SpadCounters) -> SpadCounters:
-    """Sum of the counts of two starts; None for counts that the device does not report in both."""
+    """Sum of the counts of two starts; None for each count that is None in either."""
     counts = (
         None if (a := getattr(before, field.name)) is None or (b := getattr(now, field.name)) is None else a + b
         for field in fields(SpadCounters)

@@ -24,10 +24,10 @@ _SHOWN = 24
 
 @dataclass(frozen=True, slots=True)
 class ControlCheck:
-    """Result of a comparison. commands, swaps: numbers of commands, and of buffers of points, that both had sent.
+    """Result of a comparison. commands, swaps: numbers of commands, and of buffers of points, that were compared.
 
-    worst_swap_s: the most by which one of these buffers came before or after its time; 0 if there are none. problems:
-    one line each; empty if the two agree.
+    worst_swap_s: the most by which one of these buffers came too early or too late; 0 if there are none. problems: one
+    line each; empty if replay and recording agree.
     """
 
     commands: int
@@ -46,8 +46,8 @@ class ControlCheck:
 def check_control(recorded: Path, now: Path, *, devices: Sequence[str], tolerance_s: float | None) -> ControlCheck:
     """Compare two files of control traffic.
 
-    devices: those that took part. tolerance_s: most by which a buffer may miss its time; None allows any time. Raises
-    ProtocolError if a file is not one of control traffic.
+    devices: those whose drivers took part in the replay. tolerance_s: most by which a buffer may come too early or too
+    late; None allows any time. Raises ProtocolError if a file is not one of control traffic.
     """
     before, after = Spoken.of(read_taps(recorded)), Spoken.of(read_taps(now) if now.exists() else ())
     problems: list[str] = []
@@ -72,7 +72,7 @@ def check_control(recorded: Path, now: Path, *, devices: Sequence[str], toleranc
 
 
 def _first_difference(device: str, what: str, said: list[Passed], says: list[Passed], *, tail: int) -> str | None:
-    """Say where the two differ first, by a byte or by more than `tail` commands that one of them lacks, or None."""
+    """Describe the first difference: another byte, or more than `tail` commands missing at the end. None if none."""
     for number, (old, new) in enumerate(zip(said, says, strict=False)):
         if old.data != new.data:
             pairs = enumerate(zip(old.data, new.data, strict=False))

@@ -1,6 +1,7 @@
 """The counting thread, which turns blocks into maps. It alone counts and estimates, one sweep after the other.
 
-`MapQueue` is the bounded queue of maps from this thread to the caller, who learns from it when the stream is over.
+`MapQueue` is the bounded queue of maps from this thread to the caller. It also tells the caller when the frames have
+ended.
 """
 
 import threading
@@ -27,8 +28,8 @@ from rig.threads import StageThread
 class AcquiredMap:
     """A map and the account of its sweep, without the counts, which are large.
 
-    column: float64 (columns,), the place to which the frames of each column were bound. compute_s: wall time of
-    binding, counting and estimation.
+    column: float64 (columns,), mean fractional column of each column's frames; its centre if it has none. compute_s:
+    wall time of binding, counting and estimation.
     """
 
     sweep: SweepAccount
@@ -38,7 +39,7 @@ class AcquiredMap:
 
 
 class MapQueue:
-    """At most `room` maps that wait for the caller. One thread puts, one takes; any thread may end the stream.
+    """At most `room` maps that wait for the caller. One thread puts maps, another takes them; any may end the stream.
 
     streaming: whether the rig still has to be kept running.
     closed: whether nobody will take maps any more.
@@ -86,8 +87,8 @@ class MapQueue:
             self._changed.notify_all()
 
     def take_streaming(self, timeout_s: float) -> AcquiredMap | None:
-        """The next map. None after `timeout_s`, or at once when the stream is over, so that the rig is made
-        safe first."""
+        """The next map. None after `timeout_s`, or at once when the stream is over: the caller then makes the rig safe
+        before it takes the other maps."""
         return self._take(timeout_s, lambda: not self.streaming)
 
     def take_rest(self, timeout_s: float) -> AcquiredMap | None:
@@ -120,8 +121,8 @@ class MakesMaps(Protocol):
 class CountingRequest:
     """The work of one start of the SPAD.
 
-    assembler: takes `sweeps` sweeps. maker: makes their maps. silence_s: longest silence of the SPAD. on_sweep: called
-    on the counting thread with each counted sweep before its map is made.
+    assembler: makes `sweeps` sweeps of the blocks. maker: makes their maps. silence_s: longest silence of the SPAD.
+    on_sweep: called on the counting thread with each counted sweep before its map is made.
     """
 
     assembler: SweepAssembler

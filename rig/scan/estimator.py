@@ -40,7 +40,10 @@ def choose_estimator(
 
 
 def foreseen_estimator(estimate: EstimateConfig, geometry: SweepGeometry, map_time_s: float) -> str:
-    """The estimator of a run in words, as far as it is known before `joint` is timed. map_time_s: as above."""
+    """The estimator of a run in words, as far as it is known before `joint` is timed.
+
+    map_time_s: as in `choose_estimator`.
+    """
     chosen, why = choose_estimator(estimate, geometry)
     if why and chosen.estimator == "joint" and math.isfinite(map_time_s) and not estimate.temporal_prior:
         return f"auto: joint if this machine makes a map in {digits(1e3 * KEPT_UP * map_time_s, 2)} ms, else likelihood"
@@ -64,7 +67,10 @@ def _choice(estimate: EstimateConfig, geometry: SweepGeometry, map_time_s: float
 
 
 def time_of_map(geometry: SweepGeometry, threads: int) -> float:
-    """Seconds that `joint` takes on this machine for a map after the first, without a halo, scaled up from a part."""
+    """Seconds that `joint` takes on this machine for a map, measured on a part of the picture and scaled up.
+
+    The first map, from which it learns, takes longer; so do maps with a halo.
+    """
     from rig.estimate.joint.joint import Joint
     from rig.estimate.row.em import start_model
 

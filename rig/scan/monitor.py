@@ -38,7 +38,7 @@ class MonitorView:
     """The first frames of the newest block, summed.
 
     first_frame: number of the first frame summed. frames: number of frames summed.
-    counts: uint16 (rows, width) of the sensor, the ones of each pixel in those frames; 0 outside their windows.
+    counts: uint16 (rows, width), how often each sensor pixel fired in those frames; 0 outside their windows.
     stages: the present figures of the pipeline.
     """
 
@@ -48,7 +48,7 @@ class MonitorView:
     stages: PipelineStats
 
     def row_profile(self) -> NDArray[np.float64]:
-        """Detections per frame and pixel along the rows, float64 (width,): the mean over all rows."""
+        """Mean detections per frame and pixel at each x, float64 (width,): averaged over frames and rows."""
         profile: NDArray[np.float64] = self.counts.mean(axis=0) / self.frames
         return profile
 
@@ -66,8 +66,8 @@ class ScanProgress:
     sweeps: sweeps counted, of `maps`.
     stages: the figures of each stage so far.
     fog: estimate from the newest map; None before the first.
-    stage: 'replaying', 'rendering' on virtual time, otherwise 'scanning'; 'learning' while the estimator learns from
-      the first map, 'estimating' while another map is made.
+    stage: 'learning' while the estimator makes the first map and learns from it, 'estimating' while it makes another
+      map; otherwise 'replaying', 'rendering' (a simulated rig on virtual time) or 'scanning'.
     """
 
     frames: int
@@ -128,7 +128,7 @@ class Monitor:
         return self._reader.skipped
 
     def end(self, timeout_s: float) -> bool:
-        """Show no more. False if the callback does not return; it is then abandoned with its thread."""
+        """Stop showing blocks. False if the callback does not return; it is then abandoned with its thread."""
         self._over.set()
         ended = self.thread.join(timeout_s)
         if not ended:
@@ -164,9 +164,7 @@ class Monitor:
 
 
 def add_frames(counts: NDArray[np.unsignedinteger], block: FrameBlock, first: int, end: int) -> None:
-    """Add the 1s of each pixel over frames first to end - 1 of a block to `counts` (sensor height, sensor width), each
-    at the place of its window.
-    """
+    """Add frames first to end - 1 of a block to `counts` (sensor height, sensor width): how often each pixel fired."""
     header = block.header
     corners = np.stack([block.records["x0"], block.records["y0"]], axis=1).astype(np.int64)
     moves = np.flatnonzero(np.any(np.diff(corners[first:end], axis=0), axis=1)) + 1 + first

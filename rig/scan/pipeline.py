@@ -166,7 +166,7 @@ class Overload(StrEnum):
 
 
 def require_policy(policy: Overload, info: SpadInfo) -> None:
-    """Raise UsageError if the policy makes a source wait that cannot."""
+    """Raise UsageError if the policy is BLOCK and the SPAD cannot wait."""
     if policy is Overload.BLOCK and not info.can_wait:
         raise UsageError(
             f"--on-overload is 'block', but the {info.model} SPAD cannot wait while it exposes; "
@@ -179,7 +179,7 @@ def ring_for(
 ) -> BlockRing:
     """Allocate the ring between this SPAD and its readers and touch its memory.
 
-    keeps_time: whether the SPAD, although it can wait, should not need to, as in a replay with a clock.
+    keeps_time: whether a SPAD that can wait should rarely need to. It then gets a large ring, as in a replay.
     """
     few = info.can_wait and not keeps_time
     slots = FEWEST_SLOTS if few else min(max(RING_BYTES // timing.stride, FEWEST_SLOTS), MOST_SLOTS)

@@ -1,4 +1,4 @@
-"""Makes depth maps from a cube of frames without records, map by map."""
+"""Makes depth maps, one by one, from a cube: frames without markers, in an array or an imported recording."""
 
 import time
 

@@ -70,8 +70,8 @@ def play(
 
 
 def _asks_for_the_same(recording: RunRecording, maps: int | None) -> bool:
-    """Whether a replay plans as many sweeps as the recorded scan did; logs the difference. They differ if that scan
-    ended before its last sweep. maps: None for all of the recording.
+    """Whether a replay plans as many sweeps as the recorded scan did. If not, that is logged: either `maps` is another
+    number (None: all of the recording), or the recorded scan ended before its last sweep.
     """
     manifest = read_manifest(recording.path) or {}
     told = sum(int(start["sweeps"]) for start in (manifest.get("recording") or {}).get("starts") or [])
@@ -90,7 +90,7 @@ def _check(recording: Path, tap: TapFile, drivers: Sequence[str], tolerance_s: f
 
 
 def _require_no_difference(recording: Path, tap: TapFile, drivers: Sequence[str], error: Exception) -> None:
-    """Raise DivergedError if a failed replay had sent other bytes. What it did not send any more is ignored."""
+    """Raise DivergedError if a replay that failed had sent other bytes. Commands missing at its end are ignored."""
     problems = [one for one in _check(recording, tap, drivers, None).problems if "byte" in one]
     if problems:
         raise _diverged((*problems, str(error)), None) from error

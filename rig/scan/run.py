@@ -36,7 +36,7 @@ class RunResult:
     """Result of a run.
 
     last: the last map; None if the run ended before its first.
-    truth: the truth of that map, if a world knows it.
+    truth: the truth of that map; None if it is not known.
     folder: where everything was written; None if nothing was.
     control: for a replay with drivers, the comparison of what they sent with the recording.
     """
@@ -141,7 +141,7 @@ class Run:
     def __exit__(
         self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
     ) -> None:
-        """Remove what was not finished, except what was recorded: 'rig repair' makes that whole."""
+        """Remove a folder that was not finished, unless a block was recorded: 'rig repair' completes the recording."""
         try:
             if self._recording is not None:
                 self._recording.close()
@@ -152,8 +152,8 @@ class Run:
                 self._folder.discard()
 
     def add(self, result: MapResult, compute_s: float, truth: SweepTruth | None = None) -> None:
-        """Take the next map; whatever interrupts this, it counts completely or not at all. Raises UsageError if it
-        cannot be written."""
+        """Take the next map. If an error or interrupt comes meanwhile, the map counts completely or not at all. Raises
+        UsageError if the map cannot be written."""
         index = self.tally.maps
         before = self._last
         try:
@@ -224,7 +224,8 @@ def frames_of(sweeps: list[SweepAccount], crc_errors: int | None, outside: Seque
 def frames_that_came(of_maps: RunFrames, counters: SpadCounters, dropped: int) -> RunFrames:
     """Frames of a run that ended before its last map: all that came, including those after its last whole map.
 
-    counters: the SPAD's own. dropped: frames that found no free slot, for a SPAD that does not count lost frames.
+    of_maps: those of its whole maps. counters: the SPAD's own. dropped: frames that found no room in the ring; they
+    count as the lost ones if the SPAD does not count lost frames.
     """
     lost = dropped if counters.lost is None else counters.lost
     return replace(of_maps, expected=counters.delivered + lost, received=counters.delivered, lost=lost)
@@ -252,8 +253,8 @@ def verdict_of(
     doubtful: bool,
     outside: Sequence[Gap] = (),
 ) -> RunVerdict:
-    """The gravest verdict that applies. doubtful: whether a map's own light speaks against it. outside: as in
-    `frames_of`.
+    """The gravest verdict that applies. doubtful: whether a check of a map's light found a doubt
+    (`rig.count.map_checks`). outside: as in `frames_of`.
     """
     if aborted:
         return RunVerdict.ABORTED

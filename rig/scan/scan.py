@@ -221,7 +221,7 @@ def foreseen(rig: OpenRig, plan: ScanPlan, maps: int | None) -> str:
 
 
 def _map_time_s(rig: OpenRig, plan: ScanPlan, maps: int | None) -> float:
-    """Seconds in which each map must be made, infinite if no frame waits for it; a replay can have a clock to keep."""
+    """Seconds in which each map must be made, infinite if no frame waits for it. A replay may have a set speed."""
     speed = None if rig.spad.info.can_wait else 1.0
     if isinstance(rig.spad, ReplaySpad):
         speed = rig.spad.pace.speed
@@ -229,7 +229,7 @@ def _map_time_s(rig: OpenRig, plan: ScanPlan, maps: int | None) -> float:
 
 
 def _first_alone(rig: OpenRig) -> bool:
-    """Whether the first map gets a start of its own: a live stream does not stop while the estimator learns from it."""
+    """Whether the first map gets a separate start of the SPAD: a live stream cannot wait while the estimator learns."""
     learns = rig.config.estimate.estimator in (AUTO, *LEARNING)  # `auto` becomes one of those
     return learns and not rig.spad.info.can_wait
 

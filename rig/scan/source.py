@@ -77,7 +77,7 @@ class Source:
         self._on_end()
 
     def _fill(self) -> bool:
-        """Let the SPAD fill the ring once; whether more may come."""
+        """Let the SPAD fill the ring once; returns whether more may come."""
         begun = time.perf_counter()
         try:
             more = self._spad.fill(self._ring, self._silence_s / 2)

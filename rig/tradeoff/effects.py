@@ -38,7 +38,7 @@ class ReportsEffects(World, Protocol):
     """A world that can report how much its effects matter."""
 
     def effects_report(self, power_w: float, exposure_s: float, exposures: int) -> Mapping[str, Any]:
-        """Report on the effects: planned_for, changed_decisions_bound, and effects, a mapping for each.
+        """A report with the fields of `SceneEffects`; its `effects` are mappings, one for each effect.
 
         A mapping's keys are the fields of `Effect` up to `cost_us_per_frame`, and `removable`: whether the effect can
         be left out with `effects` in the world's config.
@@ -65,7 +65,8 @@ class Effect:
 
     on, why: whether it is simulated, and the reason.
     share: share of all detected photons.
-    changed_decisions_bound: largest share of decisions that can change without it; None if there is no bound.
+    changed_decisions_bound: largest share of an estimator's answers that can differ without the effect, whatever the
+      estimator; None if there is no bound.
     cost_us_per_frame: of one thread; None if it is part of another effect.
     stripe_error_change_px, stripe_error_change_sd_px: how much larger the mean stripe error is with the effect than
       without it, and the standard error of this change; None if not known.
@@ -107,7 +108,7 @@ def scene_effects(
 ) -> SceneEffects:
     """List the physical effects that a simulated scene calls for, why, and how much each matters (`rig effects`).
 
-    They are those at the power, exposure time and number of exposures of the config's scan.
+    They are judged at the power, exposure time and number of exposures of the config's scan.
     trials: measure how much each effect changes the stripe error, in pairs of short scans; takes seconds.
     progress: called with the number of trial scans done and the total.
     Raises UsageError without a simulated world.

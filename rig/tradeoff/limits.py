@@ -1,8 +1,8 @@
 """The statistical limit: the smallest error that any estimator can have on a scene, however well it knows the light.
 
 The ideal estimator knows haze, ambient light, the line's width and the brightness of the stripe, and has to find only
-its position. If stripes are spread evenly over the search, no answer has a smaller mean |error| than the median of the
-posterior. `bayes_errors` computes this error from drawn counts, at 5 ms a row for four numbers of exposures. M
+its position. If stripes are spread evenly over the searched pixels, the median of the posterior has the smallest mean
+|error| of all answers. `bayes_errors` computes it from drawn counts, in 5 ms a row for four numbers of exposures. M
 neighbours on one surface count as M times the exposures. `chernoff_exponent` says how fast wrong positions get rarer
 with more exposures, `position_sd_px` how exactly the right position can be found; the formulas are in
 docs/explanation/limits.md. A pixel fires in an exposure with probability p = 1 - exp(-flux), independently of all other
@@ -23,7 +23,7 @@ from rig.tradeoff.rows import LOCAL_PX, Place, TradeoffRow
 
 
 def least_exponent(light: RowLight) -> float:
-    """The smallest Chernoff exponent to a position that is 2, 3, ... px off; inf if the search has no such position."""
+    """The smallest Chernoff exponent to a position that is 2, 3, ... px off; inf if no such position is searched."""
     places = light.whole_positions()
     exponent = chernoff_exponent(light.flux(places), light.flux(np.array([light.position])))
     return float(exponent[np.abs(places - light.position) > 1.5].min(initial=np.inf))
@@ -181,7 +181,7 @@ class SceneLimits:
     def beside(self, rows: Sequence[TradeoffRow], config: RigConfig) -> list[TradeoffRow]:
         """Add the limits to the rows of one scene and fog; rows without a limit stay as they are.
 
-        config: of their scan.
+        config: the one that was scanned.
         """
         if len(config.line_offsets) > 1:
             return list(rows)

@@ -86,7 +86,7 @@ SPLIT_PX = 2.5
 """Standard deviation along the row above which a stripe counts as split over a depth edge."""
 LEAST_SIGMA_PX = 0.2
 CLEAR_SIGMAS = 4.0
-"""The haze is fitted to pixels more than so many standard deviations of the line plus 1 px before the stripe."""
+"""The haze is fitted to pixels more than this many standard deviations of the line plus 1 px before the stripe."""
 
 
 def scene_lights(config: RigConfig, *, rows: int = 200, seed: int = 0) -> list[RowLight]:

@@ -33,7 +33,7 @@ MOST_MISSING = 0.05
 LOCAL_PX = 1.0
 """Largest error, in px, of an answer that has found the stripe; what remains is the error of its position."""
 _SD_OF_MEDIAN = 1.4826
-"""Standard deviation of a Gaussian over the median of its absolute values."""
+"""Standard deviation of a Gaussian, divided by the median of its absolute values."""
 
 Clock = Literal["sensor", "compute"]
 """The time that an error is traded for: the sensor's or the computer's."""
@@ -72,10 +72,10 @@ class TradeoffRow:
     missing.
 
     The other fields compare the row with the statistical limit (`rig.tradeoff.limits`); each is None if not known.
-    times_limit: mean_abs_px over the statistical limit.
+    times_limit: mean_abs_px divided by the statistical limit.
     exponent_nats: Chernoff's exponent per exposure, of all rows that are seen together. times_wrong_limit: share of
-      answers more than 1 px off over the ideal estimator's.
-    position_sd_px: Cramer-Rao's bound. times_position_limit: local_sd_px over this bound.
+      answers more than 1 px off, divided by that of the ideal estimator.
+    position_sd_px: Cramer-Rao's bound. times_position_limit: local_sd_px divided by this bound.
     """
 
     scene: str
