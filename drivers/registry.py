@@ -56,7 +56,7 @@ class Kind:
     create: Callable[[Any, Surroundings], Any]
     check_files: Callable[[Any], object] | None = None
     """Function that opens the files which a config names, as `create` does, but no device. It raises `DeviceError` if
-    one cannot be used. None: the config names no file, or the kind is a world, which is created as the check.
+    one cannot be used. None: the config names no file, or the kind is a world (creating the world is the check).
     """
     off: Callable[[Any], bytes] | None = None
     """Function that returns, for a config, the bytes that switch off a laser on a serial port in any state. They are

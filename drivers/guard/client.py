@@ -150,7 +150,9 @@ class Guard:
         limits: GuardLimits | None = None,
         tap: TapFile | None = None,
     ) -> None:
-        """Start the guard, which opens the devices meanwhile. Raises `UnknownKind`, or `DeviceError` outside Linux."""
+        """Start the guard without waiting until it has opened the devices. Raises `UnknownKind`, or `DeviceError`
+        outside Linux.
+        """
         configs = {slot: config for slot, config in (("laser", laser), ("sync", sync)) if config is not None}
         ports = ports or {}
         self._rescue = Rescue(configs, ports)

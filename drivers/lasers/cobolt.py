@@ -70,7 +70,7 @@ class CoboltFraming:
 
 @dataclass(frozen=True, slots=True)
 class Dialect:
-    """The words of one of the laser's command languages. Pairs are a command without its value and the query for it."""
+    """The words of one of the laser's command languages. A pair: a command without its value, and its query."""
 
     mode: str
     """Query of the mode; the answer has the form `mode_form`."""
@@ -85,7 +85,7 @@ class Dialect:
     set_power: str
     """Command that sets the power while the gate is high, in milliwatts."""
     powers: Mapping[str, tuple[str, float]]
-    """Query of the set power by mode, and its unit in watts. Modes without a set power are missing."""
+    """By mode: the query of the set power, and the reply's unit in watts. Modes without a set power are missing."""
     no_power: str
     """Command that sets the power of the constant-power mode to 0."""
     waits_for_key: tuple[str, re.Pattern[str], re.Pattern[str]]

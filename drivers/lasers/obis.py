@@ -70,7 +70,8 @@ ERRORS = {
 
 
 class ObisFraming:
-    """The form of an OBIS's commands and replies. channel: the laser's slot in a Remote; None without one."""
+    """The form of an OBIS's commands and replies. channel: the laser's slot in a Remote, which is a controller
+    for several lasers; None without one."""
 
     def __init__(self, channel: int | None) -> None:
         self._suffix = "" if channel is None else str(channel)

@@ -117,8 +117,8 @@ class Contents:
 
 
 def find_blocks(segments: Sequence[SegmentReader], folder: Path) -> Contents:
-    """The blocks of a recording. Damage raises nothing: it is listed in `problems`, and only the blocks it hit are
-    missing.
+    """The blocks of a recording. Damage raises nothing: it is listed in `problems`. Only damaged blocks, and blocks
+    that contradict others (`in_order`), are missing.
     """
     by_number = {segment.number: segment for segment in segments}
     problems: list[str] = []

@@ -1,8 +1,8 @@
 """The clock of a replay: when each recorded frame is due, in the time of the clock that is passed in.
 
 `realtime` plays at the frame clock of the recording, `x4` and `x0.1` at multiples of it, `max` never waits, and `step`
-waits for a call for each step. Time lost to a full ring shifts all later frames and is counted, so that frames then
-come at their normal pace again and not all at once.
+waits for a call of `Pace.step` before each sweep, or before each block without scan markers. Time lost to a full
+ring shifts all later frames and is counted, so that frames then come at their normal pace again and not all at once.
 """
 
 import math
@@ -100,7 +100,7 @@ class Pace:
         self._origin_ns = self._clock.now_ns()
 
     def step(self) -> None:
-        """Allow one more step."""
+        """Allow one more step: a sweep, or a block if there are no scan markers."""
         with self._changed:
             self._steps += 1
             self._changed.notify_all()

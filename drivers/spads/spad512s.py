@@ -9,7 +9,8 @@ Facts and their sources: docs/reference/hardware.md. `spad512s_line` talks to th
   with `ERROR` may come at any point. Pixels may look like such text, so the exact length decides, and what follows it.
 - Frames lie on their side: the vendor's samples turn them by 90 degrees counter-clockwise (`rotation`).
 - Frames carry neither ticks nor markers; the ticks in the records are nominal. Frames have no number or checksum
-  either. Pixels handed over twice would have the right length, so a frame identical to an earlier one is an error.
+  either. Pixels handed over twice would have the right length, so a frame identical to an earlier one is an
+  error, unless all its pixels are equal.
 - `STOP` is known only from other people's code. If a run does not end soon after it, the connection is closed.
 """
 
@@ -176,7 +177,7 @@ class Spad512sConfig(KindConfig):
     trigger: Literal["free", "external"] = "free"
     """free: exposures follow one another; external: each starts at a pulse on the frame trigger input."""
     max_frame_rate: Annotated[ExactHertz, Field(gt=0)] = Fraction(100_000_000, 1024)
-    """97.7 kHz: the read-out of a frame takes 10.24 us, during the next exposure if that is as long."""
+    """97.7 kHz: the read-out of a frame takes 10.24 us. The next exposure runs during the read-out."""
     burst_frames: int = Field(default=10_000, ge=1)
     """Frames that one run may have: what the memory of this unit holds, see its data sheet."""
     readout: Annotated[BytesPerSecond, Field(gt=0)] = 100e6

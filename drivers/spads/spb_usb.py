@@ -75,7 +75,7 @@ class SpbUsb(SpadArray):
     """An SPB1 SPAD over an open link."""
 
     def __init__(self, config: SpbUsbConfig, link: BulkLink, clock: Clock, tap: Tap | None = None) -> None:
-        """Check the device's identity and test pattern. clock: that of the deadlines, on which the link waits too."""
+        """Check the device's identity and test pattern. clock: for deadlines; the link must wait on it too."""
         super().__init__(link.label)
         self._config = config
         self._link = link
@@ -87,7 +87,7 @@ class SpbUsb(SpadArray):
         self._receiver: BlockReceiver | None = None
         self._counters = SpadCounters(0, 0, 0, 0, 0)
         self._waited_s = 0.0
-        """Seconds since the last frames for which the device was asked and gave none."""
+        """Seconds, since the last frames, for which the device was asked for frames and gave none."""
         try:
             wiring.open_session(link)
             ack_in = wiring.ack_in if wiring.ack_in in link.endpoints else None

@@ -102,7 +102,7 @@ _PATTERN_S = 1.0
 
 @dataclass(frozen=True, slots=True)
 class RunSetup:
-    """The registers of a run except for its length. Windows are None for full frames."""
+    """The registers of a run except for its length. window: None for full frames."""
 
     period_ticks: int
     exposure_ticks: int
@@ -235,13 +235,13 @@ class Wiring:
             self._tell(link, command)
 
     def close_session(self, link: BulkLink) -> None:
-        """End the session. Otherwise the FT601 answers nobody until it is plugged in again."""
+        """End the session. An FT601 whose session is not ended answers nobody until it is plugged in again."""
         if self.has_session:
             for command in (_ABORT, _CLEAR):
                 self._tell(link, command)
 
     def _tell(self, link: BulkLink, command: int) -> None:
-        """Send a session command to the pipes in use; others disturb the session (LeechCore pull requests 80, 81)."""
+        """Send a command to the pipes in use. On others it disturbs the session (LeechCore pull requests 80, 81)."""
         for pipe in sorted({self.stream_in, self.ack_in} & link.endpoints):
             length = _STREAM_BYTES if command == _STREAM else 0
             link.write(_SESSION_OUT, _COMMAND.pack(0, pipe, command, 0, length, 0, 0), 1.0)

@@ -37,7 +37,7 @@ _ROOMY_RING = 8
 
 @dataclass(frozen=True, slots=True)
 class Armed:
-    """Properties that the blocks of a run must have."""
+    """Properties that the blocks of a run must have. n_frames: of the run; None if it has no set end."""
 
     run_id: int
     stride: int
@@ -96,7 +96,7 @@ class BlockReceiver:
         self._last_seq = -1
         self._published = 0
         self._lost_at_last = 0
-        """Frames that were lost before the block published last."""
+        """Frames that were lost in the run before the last published block."""
         self._realign = 0
         """Bytes to read until the next read begins where a block begins."""
         self._row_px = 8 * packed_row_bytes(armed.sensor_width)
