@@ -1,7 +1,5 @@
-"""Binary frames in memory. A block holds consecutive frames: a record and packed bits for each.
-
-A run in this module is one start of the SPAD.
-"""
+"""Binary frames in memory. A block holds consecutive frames: a record and packed bits for each. A
+run in this module is one start of the SPAD."""
 
 from dataclasses import dataclass
 from enum import IntEnum, IntFlag
@@ -13,8 +11,8 @@ from numpy.typing import NDArray
 FRAME_RECORD = np.dtype(
     [("marks", "<u4"), ("ticks", "<u4"), ("x0", "<u2"), ("y0", "<u2"), ("line", "<u2"), ("sweep", "<u2")]
 )
-"""One frame's record, 16 bytes, as in SPB1 1.0. marks: bits of `Mark`; ticks: start of the exposure after the block's
-`t0_ticks`; x0, y0: corner of the window in pixels; line: number of line markers since the last scan marker; sweep:
+"""One frame's record, 16 bytes, as in SPB1 1.0. marks: bits of `Mark`; ticks: from the block's `t0_ticks` to the start
+of the exposure; x0, y0: corner of the window in pixels; line: number of line markers since the last scan marker; sweep:
 number of scan markers since the run's start (low 16 bits)."""
 
 ROW_ALIGN_BYTES = 8

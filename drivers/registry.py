@@ -23,8 +23,8 @@ class KindConfig(BaseModel):
     model_config = ConfigDict(extra="forbid", frozen=True)
 
     real_time: ClassVar[bool] = True
-    """Whether the kind runs in the host's time. If a device does, its light counts as real. If the world does not, the
-    whole rig runs on virtual time."""
+    """Whether the kind runs in the host's time. A laser or sync source that does is owned by the guard. If the world
+    does not, the whole rig runs on virtual time."""
 
     kind: str
 

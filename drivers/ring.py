@@ -4,8 +4,8 @@ The source claims free slots (several at once if USB transfers are queued), fill
 of claiming. A required reader gets every block in that order; an optional one may miss some. A reader holds a
 block's slot until it asks for the next block; with `holds` = n, until it asks for the n-th block after that one.
 
-The ring's `on_full` says what happens when no slot is free, so drivers need not know the policy. They claim; if they
-get nothing and `ring.waits` is False, they drop the block, count it as lost and call `mark_overflow`.
+The ring's `on_full` says what happens when no slot is free, so drivers need not know the policy. If they claim and
+get no slot, and `ring.waits` is False, they drop the block, count it as lost and call `mark_overflow`.
 """
 
 import threading
@@ -134,7 +134,7 @@ class BlockRing:
             self._changed.notify_all()
 
     def discard(self) -> None:
-        """Give the oldest claimed slot back unpublished, as when it holds no frames (a heartbeat, a damaged block)."""
+        """Give the oldest claimed slot back unpublished, for example if it holds a heartbeat or a damaged block."""
         with self._changed:
             self._free.append(self._oldest_claimed("discard"))
             self._changed.notify_all()

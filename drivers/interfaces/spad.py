@@ -141,7 +141,7 @@ class SpadInfo:
     markers: bool
     """Whether frame records carry the markers of scanner and gate."""
     trigger_modes: tuple[str, ...]
-    """Start of an exposure: "free" (one follows the other), "external" (a pulse on the trigger input)."""
+    """Ways to start an exposure: "free" (one follows the other), "external" (a pulse on the trigger input)."""
     can_wait: bool = False
     """Whether the SPAD can pause while the ring is full, as a simulation or a stored burst can. A sensor that streams
     cannot."""
@@ -182,11 +182,11 @@ class SpadCounters:
     delivered: int
     """Frames published in the ring."""
     lost: int | None
-    """exposed = delivered + lost once the run has ended; while it runs, frames on their way are in `exposed` only."""
+    """Once the run has ended, exposed = delivered + lost. While it runs, frames on their way count only as exposed."""
     crc_errors: int | None
     """Blocks refused: damaged, out of order or of another geometry."""
     resyncs: int | None
-    """Times that the beginning of blocks had to be found anew after damage."""
+    """Number of times that the beginning of blocks had to be found anew after damage."""
 
 
 @dataclass(frozen=True, slots=True)

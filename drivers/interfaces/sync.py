@@ -26,7 +26,7 @@ HOLD_S = 0.5e-3
 class Pulse:
     """One word of a program: levels of the outputs (OR of `OUT_*`), and their duration.
 
-    duration_s: None: as long as the scan marker is low, so that the word waits for a sweep.
+    duration_s: if None, as long as the scan marker is low, so that the word waits for a sweep.
     held: the gate stays high only as long as the scan marker does; the source checks that every `HOLD_S`. If a scanner
     stops, is unplugged or loses its program, the light therefore goes off even if nobody else has noticed.
     """

@@ -165,7 +165,7 @@ class ObisConfig(SerialLaserConfig):
 
 
 TemperatureRange = tuple[float, float]
-"""The least and the most at which the base plate may be, in degrees Celsius."""
+"""Lowest and highest temperature that the base plate may have, in degrees Celsius."""
 
 
 class ObisLaser(SerialLaser):
@@ -269,7 +269,7 @@ class ObisLaser(SerialLaser):
         self._set_power(self._limits.min_power_w)
 
     def _switch_off(self) -> None:
-        """Switch off, a deferred ON too. Raises `DeviceFault` if the laser still emits."""
+        """Switch off; this also cancels a deferred ON. Raises `DeviceFault` if the laser still emits."""
         self._switch("SOUR:AM:STAT", "OFF")
         self._told_on = False
         if self._bits() & EMISSION:

@@ -21,7 +21,7 @@ _USB_QUESTIONS = {
     "01": (0x83, 0x84, 0x87, 0x88, 0x89, 0x8A, 0x8B, 0x8C),  # LaserCube: rates, range, ring, version
 }
 FRAME_PORTS = ("02", "03")
-"""Bulk endpoints for points. Each transfer is a buffer of points, sent when the device has room."""
+"""Bulk endpoints for points (Helios, LaserCube). Each transfer is a buffer of points, sent when the device has room."""
 BEGIN, END = (b"run", b"swr"), b"abt"
 """Commands of the sync source that begin and end a scan. Point buffers sent after the end are left out: they park the
 mirror from wherever it happens to be."""

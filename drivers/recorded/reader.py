@@ -25,7 +25,7 @@ from drivers.recorded.order import Entries
 from drivers.recorded.segments import open_segments
 
 READERS: Final = 2
-"""Threads that read ahead; one checks the CRCs of 4 GB/s."""
+"""Threads that read ahead. One thread checks CRCs at 4 GB/s."""
 BLOCKS_AHEAD: Final = 6
 READ_AHEAD_BYTES: Final = 32 * 2**20
 _ROUNDING_TICKS: Final = 1e-6
@@ -41,7 +41,7 @@ _log = logging.getLogger(__name__)
 class RecordedRun:
     """The blocks of one start of the SPAD. Frame numbers count from that start, so the first one need not be 0.
 
-    number: of the run in the recording, from 0. entries: (n,) of `INDEX_RECORD`. header: that of a sound block. Up
+    number: which run of the recording, from 0. entries: (n,) of `INDEX_RECORD`. header: that of a sound block. Up
     to three sound blocks are read, and the frame size and clock that most of them have are decisive.
     """
 

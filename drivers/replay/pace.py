@@ -24,8 +24,8 @@ _TIMES = re.compile(r"x(\d+(?:\.\d*)?|\.\d+)")
 
 @dataclass(frozen=True, slots=True)
 class ReplayClock:
-    """The clock that `--clock` asks for. speed: recorded seconds per second; None: as fast as frames are taken, or in
-    steps.
+    """The clock named by the option `--clock`. speed: recorded seconds per second; None: as fast as frames are taken,
+    or in steps.
     """
 
     speed: float | None = None
@@ -118,7 +118,7 @@ class Pace:
             self._changed.notify_all()
 
     def wait_for_step(self, timeout_s: float) -> bool:
-        """Take a step. False if none was allowed in time or the run was stopped."""
+        """Wait for an allowed step and take it. False if none was allowed in time or the run was stopped."""
         with self._changed:
             self._changed.wait_for(lambda: self._steps > 0 or self._run_on or self.halted, timeout_s)
             if self.halted or not (self._run_on or self._steps):

@@ -128,14 +128,14 @@ class Cursor:
         begins = run.entries["first_frame"].astype(np.int64)
         self._begins = begins if n_frames is None else begins[begins < n_frames]
         self.end_frame = run.end_frame if n_frames is None else min(n_frames, run.end_frame)
-        """One past the last frame there is."""
+        """One more than the number of the last frame to be played."""
         self._blocks = cast(Generator[FrameBlock, None, None], recording.blocks(run, None, self.end_frame))
         self._ahead: deque[FrameBlock] = deque()
         self._at = 0
         self._taken = 0
         self._by_block = by_block
         self.next_frame = 0
-        """One past the last frame that was played."""
+        """One more than the number of the last frame that was played."""
         self.step_due = by_block
         """Whether the next frames wait for a step: those after a scan marker, or all frames if there are no markers."""
         self.damaged = 0

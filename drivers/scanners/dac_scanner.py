@@ -293,8 +293,7 @@ def open_scanner(
     identify: Callable[[UsbDevice], Dac],
 ) -> DacScanner:
     """Open the scanner at the config's port. alternates: alternate setting by USB interface. identify: makes the
-    `Dac` of an open device, or raises an error.
-    """
+    `Dac` of an open device, or raises an error."""
     endpoint = resolve(config.port, surroundings.ports)
     usb = open_device(wanted, endpoint.address, alternates, endpoint.usb_backend, surroundings.tap)
     try:

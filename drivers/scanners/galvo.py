@@ -58,7 +58,7 @@ class GalvoConfig(KindConfig):
         return self
 
     def limits(self, highest_rate_hz: float) -> ScannerLimits:
-        """The limits of the galvo on a DAC that runs at up to that rate."""
+        """The limits of the galvo on a DAC whose highest point rate is `highest_rate_hz`."""
         return ScannerLimits(
             command_range=self.command_range,
             velocity_per_s=self.max_velocity,

@@ -285,7 +285,7 @@ class HeliosRun:
             source.pad_start()
 
     def begin(self) -> None:
-        """Send the first frame, which plays once it is complete."""
+        """Send the first frame, which begins to play as soon as it is complete."""
         self._wait_until_idle()
         first, duration_s = self._made(FLAG_SINGLE | FLAG_START)
         earliest_s, arrived_s = self._send(first)
@@ -384,8 +384,7 @@ class HeliosRun:
 
     def _note_swap(self, earliest_s: float, latest_s: float) -> None:
         """Note that the pending frame, if any, began to play between these times. Raises `DeviceFault` if that is too
-        early: a frame was dropped.
-        """
+        early: a frame was dropped."""
         if not self._pending_s:
             return
         if latest_s < self._earliest_end_s - POLL_S:

@@ -255,7 +255,8 @@ class LaserCubeRun:
         self._finish()
 
     def _finish(self) -> None:
-        """Send copies of the last point and clear the ring while they play. Raises `DeviceFault` if that fails."""
+        """Send copies of the last point and clear the ring while they play. Raises `DeviceFault` if the ring does not
+        empty, or if no answer was quick enough to confirm that it did."""
         hold = self._hold + -(len(self._waiting) // 8) % SAMPLES_PER_TRANSFER
         self._send(PointSlice(np.full(hold, self.source.last), np.zeros(hold, np.uint8), np.zeros(hold, bool)))
         end_s = now_s(self._link.clock) + (self._most + hold) / self._rate_hz * (1 + DRIFT) + PATIENCE_S

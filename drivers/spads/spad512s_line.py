@@ -240,7 +240,7 @@ class Spad512sLine:
 
     @contextmanager
     def _given_up_on_silence(self) -> Iterator[None]:
-        """Close a connection that is gone or silent: a late answer would be taken for that to the next command."""
+        """Close a connection that is gone or silent: a late answer would pass for the answer to the next command."""
         try:
             yield
         except (DeviceTimeout, DeviceDisconnected):

@@ -39,8 +39,8 @@ from drivers.units import Seconds
 _log = logging.getLogger(__name__)
 
 _CHECKED_BYTES_PER_S = 0.5e9
-"""Rate up to which payload CRCs are checked. Above it, damage to pixels on the link goes unnoticed: a recording gets
-CRCs of the pixels that arrived."""
+"""Rate up to which payload CRCs are checked. Above it, damage to pixels on the link goes unnoticed, and a recording
+gets CRCs of the pixels as they arrived."""
 _SLICE_S = 0.05
 """Length of one wait inside `fill`: a `stop` from another thread is noticed at most this late."""
 _PINGS_PER_HEARTBEAT = 4

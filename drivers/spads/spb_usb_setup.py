@@ -156,7 +156,7 @@ def block_size(identity: SensorIdentity, width: int, block_frames: int, name: st
 
 
 def require_windows(identity: SensorIdentity, window: WindowTable, name: str) -> None:
-    """Raise `LimitExceeded` if the device cannot move windows, or not that many."""
+    """Raise `LimitExceeded` if the device cannot move windows, or cannot hold a table of this size."""
     if Feature.WINDOWS not in identity.features:
         raise LimitExceeded(f"{name}: its firmware moves no windows; ask for full frames or a lower frame_rate")
     entries = sum(len(x0) for x0 in window.x0)
@@ -168,7 +168,7 @@ def require_windows(identity: SensorIdentity, window: WindowTable, name: str) ->
 
 
 def require_order(control: ControlChannel, identity: SensorIdentity, heartbeat_s: float) -> None:
-    """Raise `ProtocolError` if bits or rows of the test pattern come in a wrong order. No check without a pattern."""
+    """Raise `ProtocolError` if bits or rows of the test pattern come in a wrong order. Skipped if it has no pattern."""
     if Feature.TEST_PATTERN not in identity.features:
         return
     info, name, period = identity.info, control.link.label, identity.min_period_ticks

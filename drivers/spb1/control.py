@@ -19,10 +19,10 @@ from drivers.transports.bulk_link import BulkLink
 from drivers.transports.tap import IN, OUT, Tap
 
 COMMAND: Final = struct.Struct("<4sHHII")
-"""magic, op, request id, address, value."""
+"""Fields of a command: magic, op, request id, address, value."""
 COMMAND_MAGIC: Final = b"SPC1"
 ACK: Final = COMMAND
-"""magic, op, request id, status, value."""
+"""Fields of an acknowledgement: magic, op, request id, status, value."""
 ACK_MAGIC: Final = b"SPA1"
 ACK_BLOCK_BYTES: Final = 1024
 """Stride of control blocks outside of runs."""
@@ -40,7 +40,7 @@ class Op(IntEnum):
     READ = 1
     WRITE = 2
     START = 3
-    """Acknowledged with the new run_id."""
+    """Start a run. The acknowledgement holds its run_id."""
     STOP = 4
     """End after the frame under way; what is in the FIFO is still sent."""
     ABORT = 5

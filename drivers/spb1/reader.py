@@ -219,7 +219,7 @@ def _check_crc(what: str, found: int, stated: int) -> None:
 
 
 _SEARCH_BYTES = 16 * 2**20
-"""A search looks at this much at a time, so that a big file mapped into memory is not read to its end for one gap."""
+"""Bytes that a search reads at a time: one piece of damage must not cause a big mapped file to be read to its end."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -303,7 +303,7 @@ def walk_placed(buffer: NDArray[np.uint8], stride: int | None, *, check_payload:
 
 
 def _zeros(buffer: NDArray[np.uint8], offset: int) -> int:
-    """Number of bytes that are zero from `offset` on, in whole pieces of `ALIGN` or to the end; long runs go fast."""
+    """Number of zero bytes from `offset` on, in whole pieces of `ALIGN` bytes or up to the end of the buffer."""
     end, step = offset, ALIGN
     while end < len(buffer):
         piece = buffer[end : end + step]

@@ -140,7 +140,7 @@ class PrawnDoLine:
     def lower(self) -> None:
         """End the program and take all outputs low; returns as soon as they read back low.
 
-        `abt` alone leaves the outputs as they are, and `man` is executed only once the state machine has stopped. Both
+        `abt` alone leaves the outputs as they are, and `man` is executed only once the program has been ended. Both
         are sent at once; then the outputs are checked and the commands repeated until they are low. Raises
         `DeviceTimeout` or `ProtocolError` if the board does not answer properly, in which case the gate may be high,
         and `DeviceFault` if its outputs do not go low.

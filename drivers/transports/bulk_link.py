@@ -38,7 +38,7 @@ _ERRNO = {
     -9: errno.EPIPE,
     -11: errno.ENOMEM,
 }
-"""libusb's error codes (`enum libusb_error` of libusb 1.0) as Linux numbers them."""
+"""Linux error numbers by libusb's error codes (`enum libusb_error` of libusb 1.0)."""
 
 
 class PlainLink(UsbDevice):

@@ -1,8 +1,8 @@
 """One USB device, opened and claimed through pyusb. Every call has a deadline; every failure raises an error of ours.
 
 Addresses: "usb" (the only one attached), "usb:serial=ABC", "usb:path=1-2.4" (bus and hub ports, as in
-/sys/bus/usb/devices; for devices without a serial string). `backend` is pyusb's: None for the real libusb, an
-emulator's object otherwise. Between two reads nothing is queued; `bulk_link` has what a stream needs.
+/sys/bus/usb/devices; for devices without a serial string). `backend` is a pyusb backend: None for the real libusb,
+an emulator's object otherwise. Between two reads nothing is queued; `bulk_link` has what a stream needs.
 
 Errors carry Linux error numbers, as pyusb sets them for libusb 1.0. Unplugging shows as ENODEV, EIO, ESHUTDOWN or
 ENOTCONN. If a read asks for fewer bytes than a packet has, it overflows and the packet is lost. The sum of all queued
