@@ -51,7 +51,7 @@ class VirtualClock:
             return self._now_ns
 
     def sleep(self, seconds: float) -> None:
-        """Advance by `seconds`, rounded to the nanosecond."""
+        """Advance the time by `seconds`, rounded to the nanosecond. Zero and negative values do nothing."""
         if seconds > 0:
             with self._lock:
                 self._now_ns += round(seconds * NS_PER_S)

@@ -21,7 +21,7 @@ class DevicePermission(DeviceError):
 
 
 class DeviceTimeout(DeviceError):
-    """Raised when a device does not answer, or a ring has no slot or block, within the time the caller allowed."""
+    """Raised when a device does not answer, or the block ring has no free slot or no new block, in the time allowed."""
 
 
 class DeviceDisconnected(DeviceError):
@@ -43,8 +43,8 @@ class LimitExceeded(DeviceError):
 
 
 class WrongState(DeviceError):
-    """Raised when the device's state does not allow the method that is called, or another thread has ended that method.
-    Says what to do instead.
+    """Raised when the device's state does not allow the method that is called, or another thread has interrupted that
+    method (as `pause` interrupts `arm`). Says what to do instead.
     """
 
 
@@ -58,7 +58,7 @@ class CommandRefused(ProtocolError):
 
 
 class CorruptBlock(ProtocolError):
-    """Raised when the magic, checksum, sizes or trailer of a block, or of an index, are wrong. It must not be used."""
+    """Raised when the magic, checksum, sizes or trailer of a block or index are wrong. It must not be used."""
 
 
 class UnsupportedBlock(ProtocolError):
@@ -74,10 +74,10 @@ class GuardLost(DeviceError):
 
 
 class RingOverflow(DeviceError):
-    """Raised when a source had to drop blocks because the ring was full and the overload policy is to abort."""
+    """Raised when a source had to drop a block because the block ring was full, and the overload policy is to abort."""
 
 
 class UnknownKind(DeviceError):
-    """Raised when the registry has no usable kind of that name. Lists the kinds there are, or says why this one cannot
-    be used.
+    """Raised when the registry has no usable device kind of the name that was asked for. Lists the kinds there are, or
+    says why this one cannot be used.
     """

@@ -1,4 +1,5 @@
-"""Binary frames in memory. A block holds consecutive frames: a record and packed bits for each."""
+"""Binary frames in memory. A block holds consecutive frames: a record and packed bits for each. A
+run in this module is one start of the SPAD."""
 
 from dataclasses import dataclass
 from enum import IntEnum, IntFlag
@@ -10,15 +11,16 @@ from numpy.typing import NDArray
 FRAME_RECORD = np.dtype(
     [("marks", "<u4"), ("ticks", "<u4"), ("x0", "<u2"), ("y0", "<u2"), ("line", "<u2"), ("sweep", "<u2")]
 )
-"""One frame's record, 16 bytes: marks (`Mark`), ticks since the block's `t0_ticks`, corner of the window in pixels,
-line markers since the last scan marker, scan markers since the run's start (low 16 bits). SPB1 1.0 wire layout."""
+"""One frame's record, 16 bytes, as in SPB1 1.0. marks: bits of `Mark`; ticks: from the block's `t0_ticks` to the start
+of the exposure; x0, y0: corner of the window in pixels; line: number of line markers since the last scan marker; sweep:
+number of scan markers since the run's start (low 16 bits)."""
 
 ROW_ALIGN_BYTES = 8
 """Rows are padded to whole 64-bit words, on which the counting runs."""
 
 SUBFRAME_SHIFT = 8
 SUBFRAME_MASK = 0xFF
-"""Bits 8-15 of `marks`: position of the latest edge within the frame, in 1/256 of the frame period."""
+"""Bits 8-15 of `marks`: time of the frame's latest edge, in 1/256 of the frame period after its start."""
 
 
 class Mark(IntFlag):
@@ -32,13 +34,13 @@ class Mark(IntFlag):
     SCAN = 8
     TRIGGER = 16
     BACKWARD = 32
-    """Level, not edge: the scanner runs backward."""
+    """The scanner runs backward: a level, whereas LINE, SCAN and TRIGGER are edges."""
     WINDOW_LOST = 64
     """The device no longer knew at which entry of its window table it was; `x0` is unreliable."""
 
 
 class BlockFlag(IntFlag):
-    """Flags of a block (SPB1 1.0 header, offset 8)."""
+    """Flags of a block (SPB1 1.0 header, offset 8); docs/reference/spb1.md explains them."""
 
     FIRST = 1 << 0
     LAST = 1 << 1
@@ -76,14 +78,14 @@ class BlockHeader:
 
     flags: BlockFlag
     run_id: int
-    """Number of the run, 16 bit. A run is one start of the SPAD here. Each start has another number, so that blocks
-    left from an earlier one are recognised."""
+    """Number of the run, 16 bit. Each run has another number, so that blocks left over from an earlier one are
+    recognised."""
     block_seq: int
     """Number of the block in its run, from 0."""
     first_frame: int
     """Number of the first frame; counts *exposed* frames since the run's start, lost ones included."""
     t0_ticks: int
-    """Start of the first frame's exposure."""
+    """Start of the first frame's exposure, in ticks of `tick_hz`."""
     lost_before: int
     """Frames exposed since the run's start, before this block, that are not in the stream."""
     tick_hz: Fraction
@@ -92,7 +94,7 @@ class BlockHeader:
     """Nominal period; 0 = triggered from outside."""
     exposure_ticks: int
     sweep: int
-    """Scan markers since the run's start, at the first frame."""
+    """Number of scan markers since the run's start, up to the first frame."""
     frame_step: int
     """1, or k if the device keeps every k-th frame or sums k frames."""
     width: int
@@ -108,8 +110,8 @@ class BlockHeader:
 
 @dataclass(frozen=True, slots=True)
 class FrameBlock:
-    """Consecutive frames in one piece of memory. If that is a slot of a ring, they are valid until it is released: copy
-    what is needed for longer.
+    """Consecutive frames in one piece of memory. If that memory is a slot of the block ring, the frames are valid until
+    the slot is released; copy what is needed for longer.
 
     records: (n,) of `FRAME_RECORD`.
     bits: uint8 (n, height, row bytes), packed along the width, most significant bit first (numpy `packbits` order). Pad

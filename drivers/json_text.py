@@ -8,11 +8,11 @@ from typing import Any, Final
 MAX_DEPTH: Final = 64
 """Largest depth to which lists and mappings may be nested."""
 _MOST_DIGITS: Final = 20
-"""Digits of the largest unsigned 64-bit integer."""
+"""Most digits of an integer: those of the largest unsigned 64-bit number."""
 
 
 def parse_json(text: str | bytes) -> Any:
-    """The content of a JSON text. Raises ValueError, with one line, if it is not JSON or exceeds a limit above."""
+    """The content of a JSON text. Raises ValueError, in one line, if it is no JSON or breaks a limit of this module."""
     try:
         content = json.loads(text, parse_int=_whole)
     except RecursionError:

@@ -23,8 +23,8 @@ class KindConfig(BaseModel):
     model_config = ConfigDict(extra="forbid", frozen=True)
 
     real_time: ClassVar[bool] = True
-    """Whether the kind runs in the host's time. If a device does, its light counts as real. If the world does not, the
-    whole rig runs on virtual time."""
+    """Whether the kind runs in the host's time. A laser or sync source that does is owned by the guard. If the world
+    does not, the whole rig runs on virtual time."""
 
     kind: str
 
@@ -56,7 +56,7 @@ class Kind:
     create: Callable[[Any, Surroundings], Any]
     check_files: Callable[[Any], object] | None = None
     """Function that opens the files which a config names, as `create` does, but no device. It raises `DeviceError` if
-    one cannot be used. None: the config names no file, or the kind is a world, which is created as the check.
+    one cannot be used. None: the config names no file, or the kind is a world (creating the world is the check).
     """
     off: Callable[[Any], bytes] | None = None
     """Function that returns, for a config, the bytes that switch off a laser on a serial port in any state. They are

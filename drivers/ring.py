@@ -1,11 +1,11 @@
 """The ring of block slots between one source thread and its readers: allocated once, no copies, every loss counted.
 
 The source claims free slots (several at once if USB transfers are queued), fills them and publishes them in the order
-of claiming. A required reader gets every block in that order; an optional one may miss some. A reader holds a slot
-until it asks for the next block, or for a later one if it `holds` several.
+of claiming. A required reader gets every block in that order; an optional one may miss some. A reader holds a
+block's slot until it asks for the next block; with `holds` = n, until it asks for the n-th block after that one.
 
-The ring's `on_full` says what happens when no slot is free, so drivers need not know the policy. They claim; if they
-get nothing and `ring.waits` is False, they drop the block, count it as lost and call `mark_overflow`.
+The ring's `on_full` says what happens when no slot is free, so drivers need not know the policy. If they claim and
+get no slot, and `ring.waits` is False, they drop the block, count it as lost and call `mark_overflow`.
 """
 
 import threading
@@ -22,8 +22,8 @@ from drivers.errors import DeviceTimeout, RingOverflow, WrongState
 from drivers.frames import FrameBlock
 
 _PAGE_BYTES = 4096
-"""64-bit counting and DMA are fast on aligned memory. The first slot starts on a page; all do if the stride is whole
-pages."""
+"""The first slot starts on a page, and all do if the stride is a whole number of pages: 64-bit counting and DMA are
+fast on aligned memory."""
 
 
 class OnFull(Enum):
@@ -38,10 +38,10 @@ class OnFull(Enum):
 
 
 class BlockRing:
-    """`slots` pieces of memory of `stride` bytes each. They are allocated and touched at once, on creation.
+    """`slots` pieces of memory of `stride` bytes each, all allocated, and each page written once, on creation.
 
     One source thread calls `claim`, `publish`, `discard`, `mark_overflow` and `finish`; each reader belongs to one
-    thread. holds_s: seconds of the stream that fill the ring, for the message of an overflow; None if unknown.
+    thread. holds_s: seconds of the stream that the ring can hold, for the message of an overflow; None if unknown.
     Raises ValueError if `slots` or `stride` is below 1.
     """
 
@@ -51,7 +51,7 @@ class BlockRing:
         self.slots = slots
         self.stride = stride
         self.high_water = 0
-        """Most slots that were published and not yet released at one time."""
+        """Largest number of slots that held published and not yet released blocks at one time."""
         self.waited_s = 0.0
         """Time the source spent in `claim` because no slot was free."""
         self.last_frame = -1
@@ -85,8 +85,8 @@ class BlockRing:
     def reader(self, name: str, *, required: bool = True, holds: int = 1) -> "RingReader":
         """A new reader. Raises `WrongState` after the first claim, since all readers are to see all blocks.
 
-        holds: number of its newest blocks that a reader keeps because work on them is under way. Raises ValueError if
-        the ring has too few slots for that.
+        holds: number of newest blocks that the reader keeps while it works on them. Raises ValueError if the ring has
+        too few slots for that.
         A reader with required=False (a monitor) never makes the source wait. It occupies one slot at most: it gets the
         newest block, and misses the blocks that are published while it holds one. `skipped` counts those.
         """
@@ -105,8 +105,8 @@ class BlockRing:
             return reader
 
     def claim(self, timeout_s: float) -> NDArray[np.uint8] | None:
-        """Memory of a free slot, uint8 (stride,), with old bytes in it. None if no slot is free. A ring that `waits`
-        first waits for one, at most `timeout_s`. Raises `WrongState` after `finish`.
+        """Memory of a free slot, uint8 (stride,), still with the bytes of an older block. None if no slot is free. A
+        ring that `waits` first waits for a slot, at most `timeout_s`. Raises `WrongState` after `finish`.
         """
         with self._changed:
             self._require_unfinished("claim")
@@ -119,7 +119,7 @@ class BlockRing:
             return view
 
     def publish(self, block: FrameBlock) -> None:
-        """Hand readers the block of the oldest claimed slot. Raises `WrongState` without one, or after `finish`."""
+        """Hand readers the block in the oldest claimed slot. Raises `WrongState` if there is none or after `finish`."""
         with self._changed:
             self._require_unfinished("publish")
             slot = self._oldest_claimed("publish")
@@ -134,7 +134,7 @@ class BlockRing:
             self._changed.notify_all()
 
     def discard(self) -> None:
-        """Give the oldest claimed slot back unpublished, as when it holds no frames (a heartbeat, a damaged block)."""
+        """Give the oldest claimed slot back unpublished, for example if it holds a heartbeat or a damaged block."""
         with self._changed:
             self._free.append(self._oldest_claimed("discard"))
             self._changed.notify_all()
@@ -234,7 +234,7 @@ class RingReader:
             return None
 
     def release(self) -> None:
-        """Give all blocks back before the next one is asked for. The source may then overwrite their memory."""
+        """Give all held blocks back now, without asking for the next one. Their memory may then be overwritten."""
         with self._ring._changed:
             self._release_held()
 

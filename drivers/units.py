@@ -77,8 +77,8 @@ DIMENSIONS: Mapping[str, Dimension] = {dimension.name: dimension for dimension i
 def parse_quantity(text: object, dimension: str) -> float:
     """The SI number that a text such as "10 us" means (ratio: 1 for 100 %; rain rate: m/h).
 
-    Correctly rounded: "0.1 us" gives the float 1e-07. Raises ValueError, in one line, for anything else and for what no
-    float can hold.
+    Correctly rounded: "0.1 us" gives the float 1e-07. Raises ValueError, with a message of one line, for text of
+    another form and for numbers that no float can hold.
     """
     exact = parse_exact(text, dimension)
     try:
@@ -91,7 +91,7 @@ def parse_quantity(text: object, dimension: str) -> float:
 
 
 def parse_exact(text: object, dimension: str) -> Fraction:
-    """Parse a quantity as `parse_quantity` does, without rounding or bounds. Both take fractions ("100000/3 Hz")."""
+    """Parse as `parse_quantity` does, without rounding or bounds. Both functions accept fractions ("100000/3 Hz")."""
     known = DIMENSIONS[dimension]
     like = f'write the {known.name} with a unit, like "{known.example}"'
     if not isinstance(text, str):
@@ -112,11 +112,10 @@ def parse_exact(text: object, dimension: str) -> Fraction:
 
 
 def format_quantity(value: float | Fraction, dimension: str) -> str:
-    """A text with a unit, as people write it, that reads back to exactly `value`. Raises ValueError if `value` is
-    not finite.
+    """A text with a unit that reads back to exactly `value`. Raises ValueError if `value` is not finite.
 
-    Chooses the shortest text whose number is between 0.1 and 1000, if there is one. Among texts of nearly the same
-    length it prefers the first unit, then a number of at least 1.
+    Prefers, in this order: a number without exponent; a number between 0.1 and 1000; the shortest text, where the first
+    unit of the dimension may take one character more; that first unit; a number of at least 1.
     """
     known = DIMENSIONS[dimension]
     if not math.isfinite(value):

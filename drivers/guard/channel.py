@@ -3,8 +3,9 @@
 Each message, errors included, is one line of JSON over a socket pair. The end of the stream is a message too: the
 kernel sends it as soon as the other process is gone.
 
-The heartbeat is a page of memory that both processes share; the source thread writes to it. A beat only stores numbers,
-without a lock or a system call, so that a full pipe, a stopped guard or a slow disk cannot delay it.
+The heartbeat is a page of memory that both processes share. The application's source thread, which reads the SPAD,
+writes to it. A beat only stores numbers, without a lock or a system call, so that a full pipe, a stopped guard or a
+slow disk cannot delay it.
 """
 
 import json
@@ -92,7 +93,8 @@ def error_message(error: BaseException) -> list[str]:
 
 
 def error_from(message: list[str]) -> DeviceError:
-    """The error that a message carries. A class not in `drivers.errors` gives `ProtocolError` and blames the guard."""
+    """The error that a message carries. If its class is not in `drivers.errors`: a `ProtocolError` that blames the
+    guard."""
     name, text = message
     kind = getattr(drivers.errors, name, None)
     if isinstance(kind, type) and issubclass(kind, DeviceError):

@@ -125,7 +125,7 @@ LOWER_S = 5.0
 SILENCE_S = 2.0
 """A guard that gives no sign of life for this long, while this process is awake, counts as hung and is killed."""
 BUSY_SILENCE_S = 5.0
-"""The same for a guard that is at work or waits for a processor or a disk."""
+"""The same limit for a guard that is at work or waits for a processor or a disk."""
 _TICK_S = 0.01
 _MAX_STEP_S = 0.1
 _RESCUE_SWITCH_S = 5e-4
@@ -150,7 +150,8 @@ class Guard:
         limits: GuardLimits | None = None,
         tap: TapFile | None = None,
     ) -> None:
-        """Start the guard, which opens the devices meanwhile. Raises `UnknownKind`, or `DeviceError` outside Linux."""
+        """Start the guard without waiting until it has opened the devices. Raises `UnknownKind`, or `DeviceError`
+        outside Linux."""
         configs = {slot: config for slot, config in (("laser", laser), ("sync", sync)) if config is not None}
         ports = ports or {}
         self._rescue = Rescue(configs, ports)

@@ -87,7 +87,7 @@ class Owned:
         self._create = partial(kind.create, model, surroundings)
 
     def open(self) -> dict[str, Any]:
-        """Open the device; returns the properties that its proxy reports without asking it. May raise DeviceError."""
+        """Open the device; returns what its proxy in the application reports unasked. May raise DeviceError."""
         self.device = self._create()
         about: dict[str, Any] = {"name": self.device.name, "identity": self.device.identity}
         if isinstance(self.device, LineLaser):
@@ -166,7 +166,7 @@ class Owned:
 
 
 def make_safe(device: LineLaser | SyncSource, *, disarm: bool) -> None:
-    """Take all outputs of a gate low, or pause a laser and, if asked, disarm it. May raise DeviceError."""
+    """Take all outputs of a sync source low, or pause a laser and, if `disarm`, disarm it. May raise DeviceError."""
     if isinstance(device, SyncSource):
         device.abort()
         return

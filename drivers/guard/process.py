@@ -5,7 +5,8 @@ threads of the devices (lanes, see `drivers.guard.owned`). The light is ended (a
 stopped or takes no frames; when a port hangs up; when the laser reports an open interlock or a fault, or stops
 answering; or when the guard is told to end. In a trip all outputs of the gate go low and the laser is paused, both at
 the same time. Afterwards an application that cannot go on by itself is killed, the laser is disarmed and the ports are
-closed. If frames stop because the gate's program has ended, the laser is only paused.
+closed. If frames stop because the gate's program has ended, the laser is only paused. "The gate" in this module is the
+sync source, which drives the gate.
 
 `Rescue` is for the opposite case, when the guard is gone: the application opens the ports, which are free then, and
 makes the devices safe as far as it can.
@@ -42,8 +43,8 @@ POLL_S = 1.0
 END_CHECK_S = 0.2
 """Time between checks whether the gate's program has ended, while an application at work is late with its frames."""
 GATE_FIRST_S = 0.1
-"""Delay before a stopped application is killed. The gate is low by then: the mirror may rest once the application is
-dead."""
+"""Delay before a stopped application is killed, so that the gate is low first: once the application is dead, the mirror
+may stand still."""
 GIVE_UP_S = 10.0
 """Time after which the guard gives up making a device safe that does not answer."""
 
@@ -93,7 +94,7 @@ class GuardProcess:
     # Messages
 
     def _receive(self) -> list[Message]:
-        """The messages that come within a tick. If the application is gone, trips and begins the end."""
+        """The messages that come within a tick. If the application is gone, ends the light and lets `run` end."""
         sources = [self._channel.fileno()]
         if self._application is not None and self._application.handle is not None:
             sources.append(self._application.handle)

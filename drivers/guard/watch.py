@@ -26,7 +26,7 @@ MAX_STEP_S = 0.03
 
 @dataclass(frozen=True, slots=True)
 class GuardLimits:
-    """Longest times without a new frame number while the gate may open. The light is off within 50 ms after them.
+    """Longest times without a new frame number while the gate may open. The light is off within 50 ms after that.
 
     The defaults suit a stream with several blocks in 10 ms. A burst, which sends nothing until it is read out, and
     blocks that take longer need more: three times the time between two blocks.
@@ -36,8 +36,8 @@ class GuardLimits:
     """Limit for an application that sleeps. Two looks confirm it (20 ms), the gate takes 30 ms: 100 ms in all."""
     busy_within_s: float = 1.5
     """Limit for an application that computes or waits for a processor or a disk. Under load, threads wake up to 0.35 s
-    late and disks stall for a second; neither may end a scan. The mirror moves while light is out meanwhile, since each
-    sweep waits with its gate low for a scan marker."""
+    late and disks stall for a second; neither may end a scan. No spot is burnt meanwhile: each sweep waits, with the
+    gate low, for a scan marker, so that light is out only while the mirror moves."""
     waits_within_s: float = 0.04
     """Limit for an application at work whose source thread reports that the SPAD has given no frames for this long."""
     first_wait_s: float = 0.3
@@ -119,8 +119,8 @@ class WatchedProcess:
     """Another process of the same user, seen from outside. `close` closes the pidfd.
 
     idle_thread: number of a thread that wakes up regularly by itself. On an overloaded machine it waits for a processor
-    each time. Its time is not counted as work; but while it runs or waits for a processor the process is not asleep,
-    since other threads may wait for the interpreter that it holds.
+    each time. Its time is not counted as work. But while it runs or waits for a processor, the process does not count
+    as asleep, since other threads may wait for the interpreter's lock that it holds.
     """
 
     def __init__(self, pid: int, idle_thread: int | None = None) -> None:

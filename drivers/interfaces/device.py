@@ -57,7 +57,7 @@ class Device(ABC):
 
     @property
     def serial(self) -> str | None:
-        """The device's serial number, or the permanent name of one without; None if it has neither."""
+        """The device's serial number, or, in place of that, a permanent name stored in it; None if it has neither."""
         return None
 
     @property
@@ -98,7 +98,7 @@ class Device(ABC):
 
     @abstractmethod
     def _make_safe(self) -> None:
-        """End what still runs; called once by `close`, in any state. Written by each interface."""
+        """End what still runs; called once by `close`, in any state. Each interface implements it."""
 
     @abstractmethod
     def _do_close(self) -> None:

@@ -34,7 +34,7 @@ class LaserStatus:
     warming_up: bool
     """The laser is not ready yet; its light may begin later by itself."""
     input_mode: str
-    """The way in which the gate input acts, e.g. "digital"."""
+    """Kind of input or mode that controls the light. It is "digital" if only the TTL gate does."""
     temperature_c: float | None = None
     """Temperature of the laser's base plate. None: the laser does not say."""
     power_w: float | None = None

@@ -19,7 +19,8 @@ LEVEL_BACKWARD = 4
 """Bits of a waveform's marker words. A bit at point i is high from the start of point i for one point.
 
 A sweep begins where MARKER_SCAN rises. This marker stays high until just before the sweep's light ends. The sync source
-lets light out only while it is high, and it falls if the scanner stops or is unplugged.
+lets light out only while the scan marker is high. So the light ends too if the scanner stops or is unplugged, since the
+marker then falls.
 """
 
 _ROUNDING = 1e-6
@@ -39,7 +40,7 @@ class ScannerLimits:
     step: float
     """Largest change of command from one point to the next."""
     rms_duty: float
-    """Largest root-mean-square acceleration of a waveform as a share of `acceleration_per_s2`: the mirror's heat."""
+    """Largest RMS acceleration of a waveform as a share of `acceleration_per_s2`. It bounds the mirror's heat."""
     max_points: int
     """Most points of a waveform."""
     point_rate_hz: tuple[float, float]
@@ -76,7 +77,7 @@ class BeamScanner(Device):
     """A galvanometer with its DAC. Use: `load`, `start`, then `stop` or the waveform's end after its repeats, then
     `park`.
 
-    Opening it moves nothing, and neither does closing it before the first `start` or `park`.
+    Opening the scanner moves nothing, and neither does closing it before the first `start` or `park`.
     """
 
     _has_moved = False
@@ -135,8 +136,8 @@ class BeamScanner(Device):
         self._state = DeviceState.RUNNING
 
     def stop(self) -> None:
-        """Bring the mirror to rest; the waveform stays loaded. Does nothing unless one was started. Allowed from any
-        thread.
+        """Bring the mirror to rest; the waveform stays loaded. Does nothing if none is being played. Allowed
+        from any thread.
         """
         self._require("stop", *OPEN_STATES)
         if self._state is DeviceState.RUNNING:

@@ -34,10 +34,10 @@ _SCAN, _LINE = int(Mark.SCAN), int(Mark.LINE)
 class WindowTable:
     """The window of a frame as a function of the markers seen before it.
 
-    width_px: pixels of every window. x0: one int32 array (entries,) for each sweep of the scan's period (one, or both
-    directions) with the first pixel of each window. Entry 0 holds from the scan marker to the first line marker, entry
-    j from line marker j on, the last one until the next scan marker. Before the first scan marker of a run, entry 0 of
-    the first sweep holds.
+    width_px: pixels of every window. x0: the first pixel of each window, as one int32 array (entries,) for each sweep
+    of the scan's period (one or two, for one or both directions). Entry 0 holds from the scan marker to the first line
+    marker, entry j from line marker j on, the last entry until the next scan marker. Before the first scan marker of a
+    run, entry 0 of the first sweep holds.
     """
 
     width_px: int
@@ -71,10 +71,10 @@ class WindowTable:
         return x0
 
     def check(self, sensor_width: int, step_px: int) -> None:
-        """Raise `LimitExceeded` for an empty table and for windows that a sensor cannot send: off its grid of steps and
-        words, or beyond its edge.
+        """Raise `LimitExceeded` for an empty table and for a window that the sensor cannot send: its start or width is
+        no multiple of `step_px` and of 64 pixels, or it reaches beyond the row.
 
-        The last word of a row may reach beyond a sensor whose width is not a whole number of words; its pad bits are 0.
+        A row is padded with 0 bits to whole 64-bit words, so its last window may reach beyond the sensor's last pixel.
         """
         grid = math.lcm(step_px, _WORD_PX)
         row = -(-sensor_width // _WORD_PX) * _WORD_PX
@@ -130,7 +130,7 @@ class SpadInfo:
     """Pixels per row of the frames delivered, which are turned upright."""
     height: int
     rotation_deg: int
-    """Angle at which the sensor is mounted; the frames that it delivers are upright already."""
+    """Degrees counter-clockwise by which the driver turns the sensor's frames. Frames delivered are upright already."""
     max_frame_rate_hz: Fraction
     burst: BurstMode | None
     """None: the sensor cannot store a run."""
@@ -141,9 +141,9 @@ class SpadInfo:
     markers: bool
     """Whether frame records carry the markers of scanner and gate."""
     trigger_modes: tuple[str, ...]
-    """Start of an exposure: "free" (one follows the other), "external" (a pulse on the trigger input)."""
+    """Ways to start an exposure: "free" (one follows the other), "external" (a pulse on the trigger input)."""
     can_wait: bool = False
-    """Whether it can pause while the ring is full, as a simulation or a stored burst can. A sensor that streams
+    """Whether the SPAD can pause while the ring is full, as a simulation or a stored burst can. A sensor that streams
     cannot."""
 
 
@@ -182,11 +182,11 @@ class SpadCounters:
     delivered: int
     """Frames published in the ring."""
     lost: int | None
-    """exposed = delivered + lost once the run has ended; while it runs, frames on their way are in `exposed` only."""
+    """Once the run has ended, exposed = delivered + lost. While it runs, frames on their way count only as exposed."""
     crc_errors: int | None
     """Blocks refused: damaged, out of order or of another geometry."""
     resyncs: int | None
-    """Times that the beginning of blocks had to be found anew after damage."""
+    """Number of times that the beginning of blocks had to be found anew after damage."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -196,7 +196,7 @@ class SpadHealth:
     temperatures_c: Mapping[str, float] = field(default_factory=dict)
     """Temperatures by the place where each is measured."""
     excess_bias_v: float | None = None
-    """Excess bias of the diodes; bright light at a high one ages the chip."""
+    """Excess bias of the diodes. Bright light ages the chip if the excess bias is high."""
     frame_clock_hz: float | None = None
     """Measured rate of the clock that starts the frames."""
     memory_high_water_bytes: int | None = None
@@ -213,8 +213,8 @@ class SpadArray(Device):
         self._mode: SpadMode | None = None
         self._run_opened = False
         self.on_wait: Callable[[float], None] | None = None
-        """Called within `fill` with the seconds since the last frames for which the device was asked and gave none. A
-        device that cannot tell never calls it."""
+        """Callback within `fill`. Its argument is the time in seconds, since the last frames, for which the device was
+        asked for frames and gave none. A driver that cannot tell never calls it."""
 
     @property
     @abstractmethod
@@ -254,7 +254,7 @@ class SpadArray(Device):
         return timing
 
     def start(self, n_frames: int | None) -> None:
-        """Expose `n_frames` frames, or until `stop` if it is None; frame numbers and counters start at 0. Raises
+        """Expose `n_frames` frames, or, if that is None, until `stop`; frame numbers and counters start at 0. Raises
         `LimitExceeded` below 1 frame, or for a burst that the device cannot store.
         """
         first = "configure" if self._state is DeviceState.READY else "stop"

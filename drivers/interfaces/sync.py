@@ -17,16 +17,16 @@ OUT_FRAME = 1
 OUT_GATE = 2
 """Output that lets laser light out."""
 OUT_MARKER = 4
-"""Output that marks the SPAD's records."""
+"""Output that sets a mark in the SPAD's frame records."""
 HOLD_S = 0.5e-3
-"""Longest time by which a held pulse outlasts the scan marker. A galvo needs about as long to come to rest."""
+"""Longest time by which a held pulse (`Pulse.held`) outlasts the scan marker. A galvo takes about as long to stop."""
 
 
 @dataclass(frozen=True, slots=True)
 class Pulse:
-    """One word of a program: levels of the outputs (OR of `OUT_*`), and for how long they are held.
+    """One word of a program: levels of the outputs (OR of `OUT_*`), and their duration.
 
-    duration_s: None means as long as the scan marker is low, so the word waits for a sweep.
+    duration_s: if None, as long as the scan marker is low, so that the word waits for a sweep.
     held: the gate stays high only as long as the scan marker does; the source checks that every `HOLD_S`. If a scanner
     stops, is unplugged or loses its program, the light therefore goes off even if nobody else has noticed.
     """

@@ -23,8 +23,9 @@ class World(Protocol):
     """The scene that the simulated devices of a rig share."""
 
     def truth(self, commands: NDArray[np.float64], velocity_per_s: float = 0.0) -> SweepTruth:
-        """The truth of a sweep whose columns had the scanner commands (columns,) when their first row was exposed.
+        """The truth of one sweep.
 
+        commands: (columns,), the scanner command of each column when the first image row was exposed.
         velocity_per_s: speed of the command during the sweep, negative if it fell.
         """
         ...

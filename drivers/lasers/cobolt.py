@@ -70,7 +70,7 @@ class CoboltFraming:
 
 @dataclass(frozen=True, slots=True)
 class Dialect:
-    """The words of one of the laser's command languages. Pairs are a command without its value and the query for it."""
+    """The words of one of the laser's command languages. A pair: a command without its value, and its query."""
 
     mode: str
     """Query of the mode; the answer has the form `mode_form`."""
@@ -81,19 +81,19 @@ class Dialect:
     """Name of that mode in answers, in lower case."""
     digital: tuple[str, str]
     analog: tuple[str, str]
-    """Command and query for whether the TTL input, or the analog one, controls the light in that mode."""
+    """Command and query for whether the TTL input (or the analog input) controls the light in that mode."""
     set_power: str
     """Command that sets the power while the gate is high, in milliwatts."""
     powers: Mapping[str, tuple[str, float]]
-    """Query of the set power by mode, and its unit in watts. Modes without a set power are missing."""
+    """By mode: the query of the set power, and the reply's unit in watts. Modes without a set power are missing."""
     no_power: str
     """Command that sets the power of the constant-power mode to 0."""
     waits_for_key: tuple[str, re.Pattern[str], re.Pattern[str]]
-    """Query of the laser's state, the form of its answers, and of those that mean that it waits for its key."""
+    """Query of the laser's state, the form of its answers, and the form of those that mean: it waits for its key."""
     names: Mapping[str, str]
     """Names of the other modes, by the number that the laser reports."""
     external: str = ""
-    """Command that gives control to the input and not to the host."""
+    """Command that lets the input control the light, and not the host. Empty: not needed."""
     pause: str = ""
     """Command that blanks the light at once (value 1) or ends that (0)."""
 
@@ -130,7 +130,7 @@ SCPI = Dialect(
     external="laser:pm:dig:modulator external",
     pause="las:paus",
 )
-"""The newer 06-01 language. With its modulator on "command" the laser follows `!e` and `!d` and never answers them."""
+"""The newer 06-01 language. With its modulator on "command" the laser obeys `!e` and `!d`, without an answer."""
 DIALECTS = {"06-MLD": MLD, "06-01": SCPI}
 
 
@@ -148,7 +148,7 @@ def classify(model: str) -> str:
 
 
 FAULTS = {1: "temperature", 3: "interlock was open", 4: "constant power timed out"}
-"""Meaning of `f?`; 0 is none."""
+"""Meanings of the answer to `f?`. 0: no fault."""
 
 
 class CoboltConfig(SerialLaserConfig):
@@ -268,7 +268,7 @@ class CoboltLaser(SerialLaser):
     def _darken(self) -> None:
         """Set the power to 0 in every mode that has one, at once and without the key.
 
-        The power under the gate is set first: this may be an emergency. The next program can read the powers back.
+        The power of the gated mode comes first: this may be an emergency. The next program can read the powers back.
         """
         if self._dialect.pause:
             self._line.tell(f"{self._dialect.pause} 1")

@@ -70,7 +70,8 @@ ERRORS = {
 
 
 class ObisFraming:
-    """The form of an OBIS's commands and replies. channel: the laser's slot in a Remote; None without one."""
+    """The form of an OBIS's commands and replies. channel: the laser's slot in a Remote, which is a controller
+    for several lasers; None without one."""
 
     def __init__(self, channel: int | None) -> None:
         self._suffix = "" if channel is None else str(channel)
@@ -164,7 +165,7 @@ class ObisConfig(SerialLaserConfig):
 
 
 TemperatureRange = tuple[float, float]
-"""The least and the most at which the base plate may be, in degrees Celsius."""
+"""Lowest and highest temperature that the base plate may have, in degrees Celsius."""
 
 
 class ObisLaser(SerialLaser):
@@ -268,7 +269,7 @@ class ObisLaser(SerialLaser):
         self._set_power(self._limits.min_power_w)
 
     def _switch_off(self) -> None:
-        """Switch off, a deferred ON too. Raises `DeviceFault` if the laser still emits."""
+        """Switch off; this also cancels a deferred ON. Raises `DeviceFault` if the laser still emits."""
         self._switch("SOUR:AM:STAT", "OFF")
         self._told_on = False
         if self._bits() & EMISSION:

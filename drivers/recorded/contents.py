@@ -81,7 +81,8 @@ def _signed(record: bytes) -> bytes:
 def decode_index(buffer: NDArray[np.uint8]) -> tuple[NDArray[np.void], NDArray[np.bool_]]:
     """Records (n,) of `INDEX_RECORD`, as a view of `buffer` (uint8 (bytes,)), and which of them are sound (n,).
 
-    A torn record at the end is left out. Raises CorruptBlock without a sound index header of this version at the start.
+    A torn record at the end is left out. Raises CorruptBlock if `buffer` does not start with a sound index
+    header of this version.
     """
     head = buffer[:HEADER_BYTES].tobytes()
     if len(head) < HEADER_BYTES or head[:4] != MAGIC or zlib.crc32(head[: -_CRC.size]) != _CRC.unpack(head[-4:])[0]:
@@ -117,8 +118,8 @@ class Contents:
 
 
 def find_blocks(segments: Sequence[SegmentReader], folder: Path) -> Contents:
-    """The blocks of a recording. Damage raises nothing: it is listed in `problems`, and only the blocks it hit are
-    missing.
+    """The blocks of a recording. Damage raises nothing: it is listed in `problems`. Only damaged blocks, and blocks
+    that contradict others (`in_order`), are missing.
     """
     by_number = {segment.number: segment for segment in segments}
     problems: list[str] = []

@@ -21,14 +21,15 @@ _USB_QUESTIONS = {
     "01": (0x83, 0x84, 0x87, 0x88, 0x89, 0x8A, 0x8B, 0x8C),  # LaserCube: rates, range, ring, version
 }
 FRAME_PORTS = ("02", "03")
-"""Bulk endpoints for points. Each transfer is a buffer of points, sent when the device has room."""
+"""Bulk endpoints for points (Helios, LaserCube). Each transfer is a buffer of points, sent when the device has room."""
 BEGIN, END = (b"run", b"swr"), b"abt"
-"""Commands of the sync source that begin and end a scan. After the end the mirror is parked from wherever it is."""
+"""Commands of the sync source that begin and end a scan. Point buffers sent after the end are left out: they park the
+mirror from wherever it happens to be."""
 
 
 @dataclass(frozen=True, slots=True)
 class Spoken:
-    """The commands sent to a rig, each with its time, by device, and the point buffers of each scan."""
+    """The commands sent to a rig. commands: by device. scans: point buffers by scan. Each piece has its time."""
 
     commands: dict[str, list[Passed]]
     scans: list[list[Passed]]
@@ -70,7 +71,7 @@ def _lines(pieces: list[Passed]) -> list[Passed]:
 
 
 def _once(words: list[Passed]) -> list[Passed]:
-    """The commands without immediate repeats of one command or of a pair, which drivers send to make sure."""
+    """The commands without immediate repeats of one command or a pair of commands; drivers repeat when in doubt."""
     kept: list[Passed] = []
     for word in words:
         kept.append(word)

@@ -21,15 +21,17 @@ _OF_INDEX: Final = 8
 """Weight of a block, and the weight that a record in the index adds. Each agreeing neighbour adds 1. So one block never
 outweighs two."""
 _OUTLIERS: Final = 4
-"""If more than one block in this many does not fit by its ticks or sweep, the device counts so, and all are kept."""
+"""Blocks whose ticks (or sweeps) do not fit are left out only if they are at most one in this many. If there are more,
+the device probably counts like that, and all blocks are kept."""
 
 
 def in_order(entries: Entries, told: Entries, problems: list[str], *, folder: bool) -> tuple[Entries, bool]:
     """The blocks, run after run and with rising numbers, without those that contradict others; and whether they also
     lie in this order in the files.
 
-    told: the sound records of the index, ordered by place; they give the order of the runs. problems: gets a line for
-    each sort of blocks left out. folder: whether the segments are those of a run's folder, each with blocks of one run.
+    told: the sound records of the index, ordered by place; they give the order of the runs. problems: a line is
+    appended for each reason why blocks are left out. folder: whether the segments are those of a run's folder, where
+    each holds blocks of one run.
     """
     if len(entries) == 0:
         return entries, True
@@ -126,8 +128,8 @@ def _agreeing(seq: Ints, first: Ints, t0: Ints, n_frames: Ints) -> Ints:
 
 
 def _heaviest(low: Ints, high: Ints, group: Ints, weight: Ints) -> Ints:
-    """Indices of the chain with the largest sum of weights. In a chain each `low` is at least the `high` before it, and
-    no two members have the same `group` (sorted).
+    """Indices of the chain of items with the largest sum of weights. In a chain, each item's `low` is at least the
+    `high` of the item before it, and no two items have the same `group`. group: must be sorted.
     """
     ends: list[int] = []  # last `high` of each chain so far, in rising order, and so are the sums of weights
     totals: list[int] = []

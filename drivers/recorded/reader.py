@@ -25,11 +25,11 @@ from drivers.recorded.order import Entries
 from drivers.recorded.segments import open_segments
 
 READERS: Final = 2
-"""Threads that read ahead; one checks the CRCs of 4 GB/s."""
+"""Threads that read ahead. One thread checks CRCs at 4 GB/s."""
 BLOCKS_AHEAD: Final = 6
 READ_AHEAD_BYTES: Final = 32 * 2**20
 _ROUNDING_TICKS: Final = 1e-6
-"""Ticks by which a number of seconds may miss a whole tick, since binary numbers do."""
+"""Tolerance in ticks: a time in seconds that means a whole number of ticks misses it by a rounding error."""
 _MOST_TICKS: Final = 2.0**62
 _WITNESSES: Final = 3
 """Blocks of a run that are read to learn its frame size and clock."""
@@ -41,8 +41,8 @@ _log = logging.getLogger(__name__)
 class RecordedRun:
     """The blocks of one start of the SPAD. Frame numbers count from that start, so the first one need not be 0.
 
-    number: of the run in the recording, from 0. entries: (n,) of `INDEX_RECORD`. header: of a sound block with the size
-    and clock that most of up to three sound blocks have.
+    number: which run of the recording, from 0. entries: (n,) of `INDEX_RECORD`. header: that of a sound block. Up
+    to three sound blocks are read, and the frame size and clock that most of them have are decisive.
     """
 
     number: int
@@ -242,4 +242,4 @@ def _spread(n: int) -> Iterator[int]:
 _run_kind: Final = attrgetter(
     *("run_id", "width", "height", "sensor_width", "sensor_height", "tick_hz", "frame_period_ticks", "exposure_ticks")
 )
-"""The values that all blocks of a run share: its id, size and clock."""
+"""The values that all blocks of a run share: its id, frame size and clock."""

@@ -68,7 +68,7 @@ class FrameTable:
         return int(self.plain[-1])
 
     def frames_at(self, start: int, end: int) -> range:
-        """The frames that hold the plain bytes from `start` to `end`."""
+        """Indices of the zstd frames that hold the plain bytes from `start` to `end`."""
         if start >= min(end, self.size):
             return range(0)
         first = int(np.searchsorted(self.plain, start, "right")) - 1

@@ -1,8 +1,8 @@
 """The clock of a replay: when each recorded frame is due, in the time of the clock that is passed in.
 
 `realtime` plays at the frame clock of the recording, `x4` and `x0.1` at multiples of it, `max` never waits, and `step`
-waits for a call for each step. Time lost to a full ring shifts all later frames and is counted, so that frames then
-come at their normal pace again and not all at once.
+waits for a call of `Pace.step` before each sweep, or before each block without scan markers. Time lost to a full
+ring shifts all later frames and is counted, so that frames then come at their normal pace again and not all at once.
 """
 
 import math
@@ -24,8 +24,8 @@ _TIMES = re.compile(r"x(\d+(?:\.\d*)?|\.\d+)")
 
 @dataclass(frozen=True, slots=True)
 class ReplayClock:
-    """The clock that `--clock` asks for. speed: recorded seconds per second; None: as fast as frames are taken, or in
-    steps.
+    """The clock named by the option `--clock`. speed: recorded seconds per second; None: as fast as frames are taken,
+    or in steps.
     """
 
     speed: float | None = None
@@ -100,7 +100,7 @@ class Pace:
         self._origin_ns = self._clock.now_ns()
 
     def step(self) -> None:
-        """Allow one more step."""
+        """Allow one more step: a sweep, or a block if there are no scan markers."""
         with self._changed:
             self._steps += 1
             self._changed.notify_all()
@@ -118,7 +118,7 @@ class Pace:
             self._changed.notify_all()
 
     def wait_for_step(self, timeout_s: float) -> bool:
-        """Take a step. False if none was allowed in time or the run was stopped."""
+        """Wait for an allowed step and take it. False if none was allowed in time or the run was stopped."""
         with self._changed:
             self._changed.wait_for(lambda: self._steps > 0 or self._run_on or self.halted, timeout_s)
             if self.halted or not (self._run_on or self._steps):

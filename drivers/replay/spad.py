@@ -1,8 +1,8 @@
 """A SPAD array that plays a recording: every frame with its record, with the same starts and the same gaps.
 
 The blocks need not be those of the recording. Consecutive frames are cut or joined to the requested block length, so
-that one can check that results do not depend on it. Checksums are tested before frames are copied into the ring. A
-damaged block is left out and becomes a gap like any other. The properties of the sensor come from the recording's
+that one can check that results do not depend on that length. Checksums are tested before frames are copied into the
+ring. A damaged block is left out and becomes a gap like any other. The sensor's properties come from the recording's
 manifest. Without one they come from the frames, as far as possible.
 """
 
@@ -115,11 +115,11 @@ def _told_by(recording: RunRecording) -> SpadInfo:
 _SCAN = int(Mark.SCAN)
 
 Piece = tuple[FrameBlock, int, int]
-"""A recorded block, and a and b: the piece is its frames a to b - 1."""
+"""(block, a, b): frames a to b - 1 of a recorded block, counted in the block from 0."""
 
 
 class Cursor:
-    """A position while reading one start to its end, or to frame number `n_frames`. For use by one thread at a time.
+    """A position while reading one start to its end, or up to frame `n_frames` - 1. For use by one thread at a time.
 
     by_block: whether each block is a step of `Pace`, since there are no scan markers.
     """
@@ -128,14 +128,14 @@ class Cursor:
         begins = run.entries["first_frame"].astype(np.int64)
         self._begins = begins if n_frames is None else begins[begins < n_frames]
         self.end_frame = run.end_frame if n_frames is None else min(n_frames, run.end_frame)
-        """One past the last frame there is."""
+        """One more than the number of the last frame to be played."""
         self._blocks = cast(Generator[FrameBlock, None, None], recording.blocks(run, None, self.end_frame))
         self._ahead: deque[FrameBlock] = deque()
         self._at = 0
         self._taken = 0
         self._by_block = by_block
         self.next_frame = 0
-        """One past the last frame that was played."""
+        """One more than the number of the last frame that was played."""
         self.step_due = by_block
         """Whether the next frames wait for a step: those after a scan marker, or all frames if there are no markers."""
         self.damaged = 0
@@ -242,7 +242,7 @@ class ReplaySpad(SpadArray):
         return self._info
 
     def leave_out(self, runs: Collection[int]) -> None:
-        """Skip the starts of these numbers."""
+        """Skip the starts with these numbers (`RecordedRun.number`)."""
         self._runs = [run for run in self.recording.runs if run.number not in runs]
 
     def _do_configure(self, request: SpadRequest) -> SpadTiming:
@@ -353,7 +353,7 @@ class ReplaySpad(SpadArray):
         return not reading.over
 
     def _due_s(self, block: FrameBlock, _: int, end: int) -> float:
-        """Seconds from the begin of the start's first frame to the end of the last of these frames."""
+        """Recorded seconds from the first frame of the start to the end of frame `end` - 1 of the block."""
         header = block.header
         ticks = header.t0_ticks - self._t0_ticks + int(block.records["ticks"][end - 1]) + header.frame_period_ticks
         return float(ticks / header.tick_hz)

@@ -21,7 +21,7 @@ LIMITS = ScannerLimits(
     max_points=1 << 24,
     point_rate_hz=(1e-3, 1e9),
 )
-"""Limits that every recorded waveform is within: the mirror has followed it already."""
+"""Limits that every recorded waveform keeps. They need not be strict: a real mirror has followed it already."""
 MAX_POWER_W = 1e3
 RESOLUTION_S = 1e-9
 
@@ -35,7 +35,7 @@ class StandInConfig(KindConfig):
 
 
 class RecordedScanner(BeamScanner):
-    """A scanner that only takes the time a scan needs and moves nothing."""
+    """A scanner that moves nothing, but takes as long as the real scan."""
 
     def __init__(self, clock: Clock) -> None:
         super().__init__("recorded scanner")

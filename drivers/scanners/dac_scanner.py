@@ -1,9 +1,9 @@
 """The common part of all beam scanners that are a galvo behind a USB DAC.
 
-The mirror moves only when it is started, stopped, parked or closed, along the paths of `galvo`; only an emergency halt
-may let it jump. A run consists of the way to the first point, the waveform, and the way to rest. A thread feeds the
-points to the DAC slice by slice and keeps track of where the mirror rests. Nothing is computed in advance: a waveform
-of a million points repeated for hours takes only the memory of the waveform.
+The mirror moves only when the scanner is started, stopped, parked or closed, along the paths of `galvo`; only an
+emergency halt may let it jump. A run here is one motion: the way to the first point, the waveform and, if it is
+stopped, the way to rest; or only the way from one place of rest to another. A thread feeds the points to the DAC slice
+by slice. Nothing is computed in advance: a waveform of a million points repeated for hours takes only its own memory.
 """
 
 import logging
@@ -26,7 +26,7 @@ from drivers.transports.usb_device import UsbDevice, UsbId, open_device
 _log = logging.getLogger(__name__)
 
 FULL_SCALE, CENTRE = 4095, 0x800
-"""Largest value of the converters, and the one at which the mirror stands without power."""
+"""Largest value of the 12-bit converters, and the value at which the mirror stands without power."""
 POLL_S = 0.002
 """Time between two queries of how far the board has played."""
 PATIENCE_S = 1.0
@@ -199,7 +199,7 @@ class DacScanner(BeamScanner):
 
     @property
     def limits(self) -> ScannerLimits:
-        """The config's limits, at the rates that the device allows."""
+        """The config's limits. The highest point rate is that of `Dac.highest_rate_hz`."""
         return self._limits
 
     def _do_status(self) -> ScannerStatus:
@@ -292,7 +292,8 @@ def open_scanner(
     surroundings: Surroundings,
     identify: Callable[[UsbDevice], Dac],
 ) -> DacScanner:
-    """Open the scanner at the config's port. identify: makes the `Dac` of an open device, or raises an error."""
+    """Open the scanner at the config's port. alternates: alternate setting by USB interface. identify: makes the
+    `Dac` of an open device, or raises an error."""
     endpoint = resolve(config.port, surroundings.ports)
     usb = open_device(wanted, endpoint.address, alternates, endpoint.usb_backend, surroundings.tap)
     try:

@@ -58,7 +58,7 @@ class GalvoConfig(KindConfig):
         return self
 
     def limits(self, highest_rate_hz: float) -> ScannerLimits:
-        """The limits of the galvo on a DAC that runs at up to that rate."""
+        """The limits of the galvo on a DAC whose highest point rate is `highest_rate_hz`."""
         return ScannerLimits(
             command_range=self.command_range,
             velocity_per_s=self.max_velocity,
@@ -75,8 +75,8 @@ _HEADROOM = 0.9
 
 
 def ramp(start: float, end: float, limits: ScannerLimits, rate_hz: float) -> NDArray[np.float64]:
-    """Commands from `start` (excluded) to `end` (included), at rest on both sides. float64 (n,); n = 0 if they are
-    equal.
+    """Commands from `start` (excluded) to `end` (included), at rest at both ends. float64 (n,); n = 0 if `start`
+    equals `end`.
     """
     way = abs(end - start)
     if way == 0:
@@ -93,10 +93,10 @@ def ramp(start: float, end: float, limits: ScannerLimits, rate_hz: float) -> NDA
 
 
 def brake(position: float, velocity_per_s: float, limits: ScannerLimits, rate_hz: float) -> NDArray[np.float64]:
-    """Commands from `position` (excluded) to rest at a constant deceleration, inside the range. float64 (n,).
+    """Commands from `position` (excluded) to rest at a constant deceleration, inside the command range. float64 (n,).
 
-    The deceleration exceeds `limits` only if the range leaves no room otherwise, which no waveform within the limits
-    requires.
+    The deceleration exceeds its limit only if the command range leaves too little room. This never happens when
+    a waveform within the limits is stopped.
     """
     step = velocity_per_s / rate_hz
     if step == 0:

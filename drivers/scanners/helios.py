@@ -5,19 +5,19 @@ SDK v11).
 
 The device plays frames of up to 4095 points from two buffers, one playing and one pending, and has neither a trigger
 nor a clock output: synchronisation comes from the markers in the SPAD's stream. A thread keeps the pending buffer full.
-Every frame is SINGLE, so that the mirror stops after two frames if the host dies, and does not scan for ever. STOP
+Every frame has the flag SINGLE (play once): if the host dies, the mirror stops after at most two frames. STOP
 centres the mirror in one jump, so it is used only in emergencies and at the end; scans end with a brake ramp. The
 shutter pin is never raised.
 
 The device's status tells only when the pending buffer becomes free, but that shows whether the buffers ever ran empty:
 the pending frame began to play between the last status 'full' and the first 'free', which bounds the time at which it
-ends. If a frame arrives after the earliest such time, the mirror may have stood still, and the run ends with a fault.
+ends. If its successor arrives after the earliest such time, the mirror may have stood still: the run ends with a fault.
 If a buffer becomes free before the playing frame can have ended, the device has silently dropped a frame. What was
 really played is known only from the markers in the SPAD's stream.
 
 Sources of the protocol: `Grix/helios_dac` 0952a2a, firmware/AtmelStudio_helios/lasdac_mainfirmware/src/main.c and
-sdk/cpp/HeliosDac.cpp (read for facts; no code taken). Only the opcodes below are used: DE would jump to the bootloader,
-06 wears the flash, and 02 is sent with 0 only. A point takes floor(112e6 / pps) + 1 cycles of 112 MHz.
+sdk/cpp/HeliosDac.cpp (read for facts; no code taken). Only the opcodes below are used: DE would jump to the bootloader
+and 06 wears the flash. 02 (shutter) is sent with 0 only. A point takes floor(112e6 / pps) + 1 cycles of 112 MHz.
 """
 
 import logging
@@ -54,7 +54,8 @@ _log = logging.getLogger(__name__)
 _TESTED_FIRMWARE = 6
 SYSTICK_HZ = 112_000_000
 LEAST_PPS, MOST_PPS = 7, 65535
-"""Beyond these the firmware clamps and the vendor's library drops points, both in silence: refused here."""
+"""Lowest and highest points per second. Beyond them the firmware clamps and the vendor's library drops points, both
+silently, so this driver refuses such rates."""
 MOST_POINTS = 4095
 """Most points of a frame in the vendor's library; the firmware's buffer holds one more."""
 
@@ -72,7 +73,7 @@ def pps_of(rate_hz: Fraction) -> int:
 
 
 def nearest_rate(requested_hz: float, low_hz: float, high_hz: float) -> Fraction:
-    """The true rate nearest to `requested_hz`, between low and high."""
+    """The rate nearest to `requested_hz`, between low and high, at which the device can really run."""
     near = math.floor(requested_hz)
     cycles = round(SYSTICK_HZ / requested_hz)
     # If any whole number of pps gives n cycles a point, floor(112e6 / (n - 1)) does.
@@ -147,7 +148,7 @@ class HeliosConfig(GalvoConfig):
 
     kind: Literal["helios"] = "helios"
     name: str | None = None
-    """Name stored in the device; another one is refused."""
+    """Name stored in the device; a device with another name is refused. None: any name will do."""
     max_point_rate: Annotated[Hertz, Field(gt=LOWEST_RATE_HZ, le=MOST_PPS)] = 65535.0
     """Most points per second. Lower it where the host's USB is busy: 40 kHz leaves a margin."""
     frame: Annotated[Seconds, Field(ge=0.01, le=0.5)] = 0.06
@@ -190,7 +191,7 @@ class HeliosDac:
         return HeliosRun(self, source, clock_hz)
 
     def check(self) -> None:
-        """Check that the board answers. Raises DeviceTimeout if two queries get no answer."""
+        """Check that the board answers. Raises DeviceTimeout if neither of two queries gets a valid status."""
         if self.free() is None and self.free() is None:
             raise DeviceTimeout(f"{self.name}: gives no status; unplug it and plug it in again")
 
@@ -237,7 +238,7 @@ class HeliosDac:
             self._link.write(_COMMANDS, bytes((opcode, data)), _COMMAND_S)
 
     def _ask(self, opcode: int, answer: int, least: int) -> bytes:
-        """The bytes behind the answer's first one. Asks twice with three reads each, as the vendor's library does."""
+        """The bytes after the answer's first byte. Asks twice with three reads each, as the vendor's library does."""
         heard = b""
         with self._lock:
             for _ in range(2):
@@ -284,7 +285,7 @@ class HeliosRun:
             source.pad_start()
 
     def begin(self) -> None:
-        """Send the first frame, which plays once it is complete."""
+        """Send the first frame, which begins to play as soon as it is complete."""
         self._wait_until_idle()
         first, duration_s = self._made(FLAG_SINGLE | FLAG_START)
         earliest_s, arrived_s = self._send(first)
@@ -382,7 +383,8 @@ class HeliosRun:
         return False
 
     def _note_swap(self, earliest_s: float, latest_s: float) -> None:
-        """Note that the pending frame, if any, began to play between these times."""
+        """Note that the pending frame, if any, began to play between these times. Raises `DeviceFault` if that is too
+        early: a frame was dropped."""
         if not self._pending_s:
             return
         if latest_s < self._earliest_end_s - POLL_S:

@@ -5,7 +5,7 @@
 
 The board has a ring of samples that a thread keeps filled, without frames or seams. Its colour outputs drive lasers of
 its own unless these are unplugged, so they stay off until the config says where they lead. It can be stopped only with
-'clear' and 'disable'. It does nothing when the host dies, so the laser's gate must not depend on it.
+'clear' and 'disable'. It takes no action when the host dies, so the laser's gate must not depend on it.
 
 Whether each sample was played exactly once is judged from the answers to 'how many are queued'. Each answer bounds the
 time at which the first sample was played, assuming that no sample was lost, repeated or delayed; the intervals of all
@@ -255,7 +255,8 @@ class LaserCubeRun:
         self._finish()
 
     def _finish(self) -> None:
-        """Send copies of the last point and clear the ring while they play. Raises `DeviceFault` if that fails."""
+        """Send copies of the last point and clear the ring while they play. Raises `DeviceFault` if the ring does not
+        empty, or if no answer was quick enough to confirm that it did."""
         hold = self._hold + -(len(self._waiting) // 8) % SAMPLES_PER_TRANSFER
         self._send(PointSlice(np.full(hold, self.source.last), np.zeros(hold, np.uint8), np.zeros(hold, bool)))
         end_s = now_s(self._link.clock) + (self._most + hold) / self._rate_hz * (1 + DRIFT) + PATIENCE_S

@@ -6,10 +6,12 @@ Facts and their sources: docs/reference/hardware.md. `spad512s_line` talks to th
 - `PU,0` goes before every acquisition. `I,1,tInt,n,trigger,overlap,sparse,1` takes n frames of 1 bit. tInt is in
   microseconds at 1 and 4 bits, in milliseconds from 6 bits on.
 - The answer is 32 768 bytes a frame (65 536 for a 1M sensor), most significant bit first; then `DONE`. Text that ends
-  with `ERROR` may come at any point. Pixels may look like such text, so the exact length decides, and what follows it.
+  with `ERROR` may come at any point. Pixels may look like such text, so only the exact length and
+  the bytes after it show the end.
 - Frames lie on their side: the vendor's samples turn them by 90 degrees counter-clockwise (`rotation`).
 - Frames carry neither ticks nor markers; the ticks in the records are nominal. Frames have no number or checksum
-  either. Pixels handed over twice would have the right length, so a frame identical to an earlier one is an error.
+  either. Pixels handed over twice would have the right length, so a frame identical to an earlier one is an
+  error, unless all its pixels are equal.
 - `STOP` is known only from other people's code. If a run does not end soon after it, the connection is closed.
 """
 
@@ -37,7 +39,8 @@ from drivers.transports.tap import Tap
 from drivers.units import BytesPerSecond, ExactHertz
 
 GUARD_BYTES = 512
-"""Bytes that must follow a block before it is used. The longest error text of the samples has 160 characters."""
+"""Bytes that must follow a block before it is used, so that no part of an error text is taken for pixels. The
+longest error text of the samples has 160 characters."""
 SLICE_S = 0.05
 """Length of one wait: a `stop` from another thread is noticed at most this late."""
 _ERROR_CHECK_S = 0.5
@@ -156,8 +159,8 @@ class Spad512sRun:
 COLUMNS = 512
 ROW_BYTES = COLUMNS // 8
 TICK_HZ = 100_000_000
-"""Nominal ticks per second: the stream carries no time. If a period is no whole number of ticks, it is divided into
-`TICKS_PER_FRAME` instead."""
+"""Nominal ticks per second: the stream carries no time. If the frame period is no whole number of such
+ticks, it is divided into `TICKS_PER_FRAME` ticks instead."""
 TICKS_PER_FRAME = 1024
 _TEMPERATURES = ("master FPGA", "slave FPGA", "board", "chip")
 """Names of the temperatures that `R` reports first, in its order."""
@@ -176,7 +179,7 @@ class Spad512sConfig(KindConfig):
     trigger: Literal["free", "external"] = "free"
     """free: exposures follow one another; external: each starts at a pulse on the frame trigger input."""
     max_frame_rate: Annotated[ExactHertz, Field(gt=0)] = Fraction(100_000_000, 1024)
-    """97.7 kHz: the read-out of a frame takes 10.24 us, during the next exposure if that is as long."""
+    """Highest frame rate. 97.7 kHz: the read-out of a frame takes 10.24 us, during the next exposure."""
     burst_frames: int = Field(default=10_000, ge=1)
     """Frames that one run may have: what the memory of this unit holds, see its data sheet."""
     readout: Annotated[BytesPerSecond, Field(gt=0)] = 100e6

@@ -35,7 +35,7 @@ from drivers.transports.tap import IN, OUT, Tap
 _log = logging.getLogger(__name__)
 
 DONE, ERROR = b"DONE", b"ERROR"
-"""Words that end a run; `DONE` may be glued to an answer in text as well."""
+"""Words that end a run. `DONE` may also directly follow a text answer."""
 QUIET_S = 0.05
 """A text answer has no stated end. It is complete after a silence of this length, or when it ends with DONE."""
 _MOST_TEXT_BYTES = 65_536
@@ -182,7 +182,7 @@ class Spad512sIdentity:
 
     @property
     def rows(self) -> int:
-        """1024 for the 1M flavour, else 512."""
+        """Rows of the sensor: 1024 for the 1M flavour, else 512."""
         return 1024 if "1M" in self.flavour else 512
 
 
@@ -224,7 +224,7 @@ class Spad512sLine:
             self._send(self._open(), command)
 
     def ask(self, command: str) -> str:
-        """Send a command and return its answer. Raises DeviceFault if that is an ERROR, DeviceTimeout without one."""
+        """Send a command and return its answer. Raises DeviceFault if that is an ERROR, DeviceTimeout if none comes."""
         answer_s = self._deadlines.answer_s
         with self._given_up_on_silence():
             stream = self._open()
@@ -240,7 +240,7 @@ class Spad512sLine:
 
     @contextmanager
     def _given_up_on_silence(self) -> Iterator[None]:
-        """Close a connection that is gone or silent: a late answer would be taken for that to the next command."""
+        """Close a connection that is gone or silent: a late answer would pass for the answer to the next command."""
         try:
             yield
         except (DeviceTimeout, DeviceDisconnected):

@@ -39,8 +39,8 @@ from drivers.units import Seconds
 _log = logging.getLogger(__name__)
 
 _CHECKED_BYTES_PER_S = 0.5e9
-"""Rate up to which payload CRCs are checked. Above it, damage to pixels on the link goes unnoticed: a recording gets
-CRCs of the pixels that arrived."""
+"""Rate up to which payload CRCs are checked. Above it, damage to pixels on the link goes unnoticed, and a recording
+gets CRCs of the pixels as they arrived."""
 _SLICE_S = 0.05
 """Length of one wait inside `fill`: a `stop` from another thread is noticed at most this late."""
 _PINGS_PER_HEARTBEAT = 4
@@ -75,7 +75,7 @@ class SpbUsb(SpadArray):
     """An SPB1 SPAD over an open link."""
 
     def __init__(self, config: SpbUsbConfig, link: BulkLink, clock: Clock, tap: Tap | None = None) -> None:
-        """Check the device's identity and test pattern. clock: that of the deadlines, on which the link waits too."""
+        """Check the device's identity and test pattern. clock: for deadlines; the link must wait on it too."""
         super().__init__(link.label)
         self._config = config
         self._link = link
@@ -87,7 +87,7 @@ class SpbUsb(SpadArray):
         self._receiver: BlockReceiver | None = None
         self._counters = SpadCounters(0, 0, 0, 0, 0)
         self._waited_s = 0.0
-        """Seconds since the last frames for which the device was asked and gave none."""
+        """Seconds, since the last frames, for which the device was asked for frames and gave none."""
         try:
             wiring.open_session(link)
             ack_in = wiring.ack_in if wiring.ack_in in link.endpoints else None

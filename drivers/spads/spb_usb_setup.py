@@ -102,7 +102,7 @@ _PATTERN_S = 1.0
 
 @dataclass(frozen=True, slots=True)
 class RunSetup:
-    """The registers of a run except for its length. Windows are None for full frames."""
+    """The registers of a run except for its length. window: None for full frames."""
 
     period_ticks: int
     exposure_ticks: int
@@ -156,7 +156,7 @@ def block_size(identity: SensorIdentity, width: int, block_frames: int, name: st
 
 
 def require_windows(identity: SensorIdentity, window: WindowTable, name: str) -> None:
-    """Raise `LimitExceeded` if the device cannot move windows, or not that many."""
+    """Raise `LimitExceeded` if the device cannot move windows, or cannot hold a table of this size."""
     if Feature.WINDOWS not in identity.features:
         raise LimitExceeded(f"{name}: its firmware moves no windows; ask for full frames or a lower frame_rate")
     entries = sum(len(x0) for x0 in window.x0)
@@ -168,7 +168,7 @@ def require_windows(identity: SensorIdentity, window: WindowTable, name: str) ->
 
 
 def require_order(control: ControlChannel, identity: SensorIdentity, heartbeat_s: float) -> None:
-    """Raise `ProtocolError` if bits or rows of the test pattern come in a wrong order. No check without a pattern."""
+    """Raise `ProtocolError` if bits or rows of the test pattern come in a wrong order. Skipped if it has no pattern."""
     if Feature.TEST_PATTERN not in identity.features:
         return
     info, name, period = identity.info, control.link.label, identity.min_period_ticks
@@ -235,13 +235,13 @@ class Wiring:
             self._tell(link, command)
 
     def close_session(self, link: BulkLink) -> None:
-        """End the session. Otherwise the FT601 answers nobody until it is plugged in again."""
+        """End the session. An FT601 whose session is not ended answers nobody until it is plugged in again."""
         if self.has_session:
             for command in (_ABORT, _CLEAR):
                 self._tell(link, command)
 
     def _tell(self, link: BulkLink, command: int) -> None:
-        """Send a session command to the pipes in use; others disturb the session (LeechCore pull requests 80, 81)."""
+        """Send a command to the pipes in use. On others it disturbs the session (LeechCore pull requests 80, 81)."""
         for pipe in sorted({self.stream_in, self.ack_in} & link.endpoints):
             length = _STREAM_BYTES if command == _STREAM else 0
             link.write(_SESSION_OUT, _COMMAND.pack(0, pipe, command, 0, length, 0, 0), 1.0)

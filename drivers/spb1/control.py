@@ -19,10 +19,10 @@ from drivers.transports.bulk_link import BulkLink
 from drivers.transports.tap import IN, OUT, Tap
 
 COMMAND: Final = struct.Struct("<4sHHII")
-"""magic, op, request id, address, value."""
+"""Fields of a command: magic, op, request id, address, value."""
 COMMAND_MAGIC: Final = b"SPC1"
 ACK: Final = COMMAND
-"""magic, op, request id, status, value."""
+"""Fields of an acknowledgement: magic, op, request id, status, value."""
 ACK_MAGIC: Final = b"SPA1"
 ACK_BLOCK_BYTES: Final = 1024
 """Stride of control blocks outside of runs."""
@@ -40,13 +40,13 @@ class Op(IntEnum):
     READ = 1
     WRITE = 2
     START = 3
-    """Acknowledged with the new run_id."""
+    """Start a run. The acknowledgement holds its run_id."""
     STOP = 4
     """End after the frame under way; what is in the FIFO is still sent."""
     ABORT = 5
-    """Gate low, FIFO flushed, one block flagged last and aborted."""
+    """Lower the gate, empty the memory, then send one block without frames, flagged last and aborted."""
     PING = 6
-    """I am alive; the value is the last frame number received (low 32 bits)."""
+    """Show that the host is alive. The value is the last frame number received (low 32 bits)."""
 
 
 class AckStatus(IntEnum):
@@ -174,8 +174,8 @@ _REFUSALS: Final[dict[int, str]] = {
 
 
 def pattern_row(row: int, frame: int, width: int) -> bytes:
-    """Packed bytes of a row of the test pattern: its number (u16, little-endian), then one set pixel, which moves on by
-    one in each frame.
+    """Packed bytes of a row of the test pattern: the row's number (u16, little-endian), then one set pixel, which moves
+    on by one in each frame.
     """
     bits = bytearray(-(-width // 64) * 8)
     bits[0:2] = row.to_bytes(2, "little")
@@ -230,7 +230,7 @@ class ControlChannel:
 
     def read_all(self, registers: Sequence[int]) -> list[int]:
         """The values of several registers. All are read twice, since they have no checksum. Raises `ProtocolError` if
-        the two readings differ three times."""
+        the two readings differ in each of three attempts."""
         for _ in range(_TRIES):
             values = [ack.value for ack in self._ask([(Op.READ, register, 0) for register in (*registers, *registers)])]
             if values[: len(registers)] == values[len(registers) :]:

@@ -2,8 +2,8 @@
 
 Little-endian: header 96 B, records 16 B per frame, zeros to a multiple of 64, packed pixels, trailer 32 B, zeros to the
 stride. The checksum is CRC-32 as zlib defines it. It is computed by ISA-L if that is installed (12 GB/s on a core),
-else by zlib (3.5 GB/s). Both release the interpreter's lock for large buffers. Blocks are written either around records
-and pixels that are already in place or in parts for a file.
+else by zlib (3.5 GB/s). Both release the interpreter's lock for large buffers. Blocks are written either around
+records and pixels that are already in place (`seal_block`) or in parts for a file (`block_parts`).
 """
 
 import struct

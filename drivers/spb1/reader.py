@@ -48,7 +48,7 @@ _PAYLOADS: Final = {
 }
 
 MAX_COUNT: Final = 2**63 - 2**32
-"""Largest number, and largest tick, of a block's first frame. Those of its last frame then fit int64 too."""
+"""Largest `first_frame` and `t0_ticks` of a block: the number and tick of its last frame then fit int64 too."""
 
 _LSB_FIRST: Final = int(BlockFlag.LSB_FIRST)
 """A plain integer: arithmetic with flags takes microseconds, and this is done for every block."""
@@ -87,8 +87,9 @@ class HeaderFields:
 def parse_block(buffer: NDArray[np.uint8], *, check_payload: bool) -> FrameBlock:
     """The block at the start of `buffer` (uint8 (bytes,), contiguous, may be longer), as views of the same memory.
 
-    Raises `UnsupportedBlock` if its header is sound but says sparse, summed, every k-th frame only, another major
-    version or control block; else `CorruptBlock` if anything is wrong with it (in the payload only if `check_payload`).
+    Raises `UnsupportedBlock` if its header is sound but states another major version, another payload than packed
+    frames, other than 1 bit per pixel, or every k-th frame only. Raises `CorruptBlock` if anything else is wrong with
+    the block; the payload is checked only if `check_payload`.
     A truncated block gives its complete frames. Blocks with the least significant bit first are copied and delivered
     like all others, without that flag.
     """
@@ -218,7 +219,7 @@ def _check_crc(what: str, found: int, stated: int) -> None:
 
 
 _SEARCH_BYTES = 16 * 2**20
-"""A search looks at this much at a time, so that a big file mapped into memory is not read to its end for one gap."""
+"""Bytes that a search reads at a time: one piece of damage must not cause a big mapped file to be read to its end."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -302,7 +303,7 @@ def walk_placed(buffer: NDArray[np.uint8], stride: int | None, *, check_payload:
 
 
 def _zeros(buffer: NDArray[np.uint8], offset: int) -> int:
-    """Number of bytes that are zero from `offset` on, in whole pieces of `ALIGN` or to the end; long runs go fast."""
+    """Number of zero bytes from `offset` on, in whole pieces of `ALIGN` bytes or up to the end of the buffer."""
     end, step = offset, ALIGN
     while end < len(buffer):
         piece = buffer[end : end + step]

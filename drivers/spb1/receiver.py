@@ -37,7 +37,8 @@ _ROOMY_RING = 8
 
 @dataclass(frozen=True, slots=True)
 class Armed:
-    """Properties that the blocks of a run must have."""
+    """Properties that the blocks of a run must have. n_frames: of the whole run; None if its end is not set.
+    check_payload: whether CRCs of payloads are checked."""
 
     run_id: int
     stride: int
@@ -96,7 +97,7 @@ class BlockReceiver:
         self._last_seq = -1
         self._published = 0
         self._lost_at_last = 0
-        """Frames that were lost before the block published last."""
+        """Frames that were lost in the run before the last published block."""
         self._realign = 0
         """Bytes to read until the next read begins where a block begins."""
         self._row_px = 8 * packed_row_bytes(armed.sensor_width)
@@ -215,7 +216,7 @@ class BlockReceiver:
             raise CorruptBlock(f"block {block.block_seq} reaches beyond the {armed.n_frames} frames of the run")
 
     def _require_windows(self, block: FrameBlock) -> None:
-        """Raise CorruptBlock if a window lies off the 64-bit words or beyond the row: the counting relies on
+        """Raise CorruptBlock unless all windows start on a 64-bit word and lie within the row: the counting relies on
         both."""
         if block.n_frames == 0:
             return

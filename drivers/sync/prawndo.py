@@ -103,7 +103,7 @@ INTERNAL_HZ = 100_000_000
 """The board's own clock (docs/reference/hardware.md)."""
 MAX_WORDS = {"board: pico1": 30_000, "board: pico2": 60_000}
 OLDEST_FIRMWARE = (1, 3)
-"""Oldest firmware: from here on `adm` takes a start address, and `brd` exists."""
+"""Oldest firmware accepted: from this version on, `adm` takes a start address and `brd` exists."""
 _CLOCK_CHANGE_S = 0.02
 """Time for the board to find out that there is no clock on GPIO20."""
 _CLOCK_TOLERANCE = 0.01

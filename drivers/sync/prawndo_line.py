@@ -2,8 +2,8 @@
 
 The firmware does not mark where an answer begins or ends (docs/reference/hardware.md). So every command is sent between
 two lines of nonsense, new each time, which the firmware repeats in its complaint. In this way an answer that is late,
-repeated or missing is recognised. Answers on which light depends are asked for twice. Taking the outputs low overtakes
-all other commands.
+repeated or missing is recognised. Queries on which the safety of the light depends are sent twice. Taking the
+outputs low overtakes all other commands.
 """
 
 import logging
@@ -25,9 +25,9 @@ BYTES_PER_WORD = 6
 
 _CRLF = b"\r\n"
 _LOWER = b"\nabt\nsts\nman 0\nsts\nman 0\n"
-"""The first line end completes whatever an earlier host began to send. The board refuses `man` until its second core
-has done what `abt` asks for. It does that while the first core answers `sts`, so the outputs go low without a round
-trip to the host, which may be late."""
+"""The first line end completes whatever an earlier host began to send. The board's first core answers commands, and its
+second core ends the program after `abt`; until then `man` is refused. The second core does so while the first one
+answers `sts`. So the outputs go low without a round trip to the host, which may be late."""
 _RESUSCITATED = "System Clock Resus'd"
 _CHUNK_BYTES = 4032
 """Bytes per write while a program is loaded: sixteen of the firmware's own pieces of 42 words."""
@@ -116,7 +116,7 @@ class PrawnDoLine:
         return self._ask_twice("sts", parse, deadline_s, urgent)
 
     def pins(self, deadline_s: float | None = None, *, urgent: bool = False) -> int:
-        """Levels of the outputs. They can be read only in state `IDLE`."""
+        """Levels of the outputs. They can be read only in the states `IDLE`."""
         return self._ask_twice("gto", lambda line: int(line, 16), deadline_s, urgent)
 
     def load(self, payload: bytes) -> None:
@@ -140,7 +140,7 @@ class PrawnDoLine:
     def lower(self) -> None:
         """End the program and take all outputs low; returns as soon as they read back low.
 
-        `abt` alone leaves the outputs as they are, and `man` is executed only once the state machine has stopped. Both
+        `abt` alone leaves the outputs as they are, and `man` is executed only once the program has been ended. Both
         are sent at once; then the outputs are checked and the commands repeated until they are low. Raises
         `DeviceTimeout` or `ProtocolError` if the board does not answer properly, in which case the gate may be high,
         and `DeviceFault` if its outputs do not go low.

@@ -38,7 +38,7 @@ _ERRNO = {
     -9: errno.EPIPE,
     -11: errno.ENOMEM,
 }
-"""libusb's error codes (`enum libusb_error` of libusb 1.0) as Linux numbers them."""
+"""Linux error numbers by libusb's error codes (`enum libusb_error` of libusb 1.0)."""
 
 
 class PlainLink(UsbDevice):
@@ -52,13 +52,13 @@ class PlainLink(UsbDevice):
         self._got = 0
 
     def submit(self, endpoint: int, buffer: Buffer) -> bool:
-        """Keep the buffer for `reap`."""
+        """Queue the buffer for `reap`; always returns True."""
         self._queue.append((endpoint, buffer))
         return True
 
     def reap(self, timeout_s: float) -> tuple[Buffer, int] | None:
-        """Read into the oldest queued buffer now; returns it and its number of bytes. None if it is not complete in
-        time; the next call continues with it."""
+        """Read into the oldest queued buffer now; returns it and its number of bytes. None if nothing
+        is queued, or if the buffer is not complete in time; the next call then continues with it."""
         if not self._queue:
             return None
         endpoint, buffer = self._queue[0]
@@ -87,8 +87,8 @@ class PlainLink(UsbDevice):
 class QueuedLink:
     """A streaming USB device with many reads in flight, which libusb writes straight into the caller's memory.
 
-    Uses module `usb1` of package libusb1. Its events are handled inside `read`, `reap` and `cancel`, on the thread that
-    calls them.
+    Uses module `usb1` of package libusb1. libusb's events are handled inside `read`, `reap` and `cancel`, on the
+    thread that calls them.
     """
 
     def __init__(self, listing: UsbListing, label: str, interfaces: tuple[int, ...]) -> None:

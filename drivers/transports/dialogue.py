@@ -3,8 +3,8 @@ reply.
 
 Nothing on a laser's line checks or numbers a reply (docs/reference/hardware.md, lasers), so a late one would be taken
 for the answer to the next command. Therefore the input is dropped before each command, and each reply must have the
-form that its command calls for. If it has not, or if none comes, the line is drained and a query is sent whose answer
-is known. The form of a make's commands and replies is its `Framing`.
+form that its command calls for. If a reply has another form, or none comes, the line is drained and a query is
+sent whose answer is known. The form of a make's commands and replies is its `Framing`.
 
 Threads take turns through a `FairLock`. A thread that polls a slow device takes its lock again as soon as it has
 released it; with a plain lock the thread that wants to switch the laser off could wait for ever.
@@ -111,7 +111,7 @@ class Dialogue:
         self.ask(command, _DONE)
 
     def ask(self, command: str, form: re.Pattern[str]) -> str:
-        """The reply to a query. Errors as in `tell`."""
+        """The reply to a query. form: the pattern of the whole reply. Errors as in `tell`."""
         with self._lock:
             reply = ""
             for attempt in range(_ATTEMPTS):

@@ -22,7 +22,7 @@ class Endpoint:
     usb_backend: object | None = None
     """The `usb.backend.IBackend` that serves an emulated USB device; None: libusb."""
     serial_port: Callable[[], Any] | None = None
-    """Function that opens an emulated serial port, like a `serial.Serial` with a `clock` on which it waits; None:
+    """Function that opens an emulated serial port: an object like `serial.Serial` that waits on its own `clock`. None:
     pyserial opens the address."""
 
 

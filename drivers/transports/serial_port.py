@@ -1,8 +1,8 @@
 """A serial port with a deadline on every call, and one typed error for each way in which it can fail.
 
-Wraps pyserial. What that raises for a lost port depends on the call, so every exception is caught around every call.
+Wraps pyserial. Its exceptions for a lost port depend on the call, so all of them are caught around every call.
 Deadlines are in the host's time, since pyserial waits in no other; an emulated port (`Endpoint.serial_port`) brings its
-own clock. Network ports are refused, because those of pyserial 3.5 write without a deadline and leak.
+own clock. Network ports are refused, because those of pyserial 3.5 write without a deadline.
 """
 
 import errno

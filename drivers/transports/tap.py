@@ -58,7 +58,7 @@ class Tap:
     """
 
     def __init__(self, file: TapFile, device: str) -> None:
-        """device: its slot in the rig."""
+        """device: the device's slot in the rig, for example "laser"."""
         self._file = file
         self._device = device
         self._lines: _Lines = SimpleQueue()

@@ -1,12 +1,12 @@
 """One USB device, opened and claimed through pyusb. Every call has a deadline; every failure raises an error of ours.
 
 Addresses: "usb" (the only one attached), "usb:serial=ABC", "usb:path=1-2.4" (bus and hub ports, as in
-/sys/bus/usb/devices; for devices without a serial string). `backend` is pyusb's: None for the real libusb, an
-emulator's object otherwise. Between two reads nothing is queued; `bulk_link` has what a stream needs.
+/sys/bus/usb/devices; for devices without a serial string). `backend` is a pyusb backend: None for the real libusb,
+an emulator's object otherwise. Between two reads nothing is queued; `bulk_link` has what a stream needs.
 
-Errors have the numbers of libusb 1.0 and the meanings that Linux gives them. Unplugging shows as ENODEV, EIO or
-ESHUTDOWN. A read shorter than a packet overflows and loses the packet. The sum of all queued transfers is limited by
-Linux's `usbfs_memory_mb`, 16 MB by default.
+Errors carry Linux error numbers, as pyusb sets them for libusb 1.0. Unplugging shows as ENODEV, EIO, ESHUTDOWN or
+ENOTCONN. If a read asks for fewer bytes than a packet has, it overflows and the packet is lost. The sum of all queued
+transfers is limited by Linux's `usbfs_memory_mb`, 16 MB by default.
 """
 
 import array
@@ -59,7 +59,7 @@ def translated(label: str, endpoint: int | None = None, timeout_s: float | None 
 def usb_failure(
     label: str, number: int | None, text: str, endpoint: int | None = None, timeout_s: float | None = None
 ) -> DeviceError:
-    """Our error for a failure in libusb. number: its errno, None if it has none. text: libusb's own message."""
+    """The `DeviceError` for a failure in libusb. number: its errno, None if it has none. text: libusb's own message."""
     where = "" if endpoint is None else f" on endpoint 0x{endpoint:02x}"
     if number in _LOST:
         return DeviceDisconnected(f"{label}: the device is gone ({text}); check cable and power, open again")
@@ -77,8 +77,8 @@ def usb_failure(
 
 @dataclass(frozen=True, slots=True)
 class UsbId:
-    """The ids of a kind of device. Vendors share numbers, so one of `product_names`, if there are any, must be part of
-    the product string, where that can be read."""
+    """The ids of a kind of device. Unrelated devices use the same ids, so one of `product_names`, if any, must
+    be part of the product string, where that can be read."""
 
     label: str
     vendor: int
@@ -113,9 +113,10 @@ def attached(wanted: UsbId, backend: object | None = None) -> list[UsbListing]:
 
 
 class UsbDevice:
-    """An open device with its interfaces claimed and in the wanted alternate settings. Calls are safe from any thread.
+    """An open device with its interfaces claimed and in the wanted alternate settings.
 
-    The caller must serialise transfers on one endpoint. `close` waits for none of them, so end your threads first.
+    Any thread may call its methods, but two transfers on one endpoint must not overlap. `close` waits for no transfer,
+    so end your threads first.
     """
 
     def __init__(self, listing: UsbListing, label: str, alternates: Mapping[int, int], tap: Tap | None = None) -> None:
