@@ -1,4 +1,4 @@
-"""How a medium spreads a thin beam, and what that makes of the stripe and of the haze.
+"""The spread of a thin beam in a medium, and its effect on the stripe and on the haze.
 
 On its way to a wall at optical depth t, a sheet of light is scattered into a band around its ballistic line. Scattered
 exactly once, the band is a quadrature over the sheet, with no approximation: at tangent x beside the line
@@ -39,7 +39,7 @@ DEPTHS = np.geomspace(0.02, 6.0, 24)
 """Optical depths of the wall."""
 HALO_GROWTH, HAZE_GROWTH = 0.4, 0.5
 ALBEDO = 0.5
-"""Of the walls traced."""
+"""Albedo of the walls that were traced."""
 FAN = math.radians(30.0)
 """Half the fan that lights a row."""
 NODES = 24

@@ -27,7 +27,7 @@ HALO_RISE, HAZE_RISE = 2.0, 1.5
 FINER = 4
 """Tables have so many depths for each of `DEPTHS`: the nearest one is taken, which is within 3 %."""
 LEAST_COSINE = 0.1
-"""Of the angle by which the sheet leaves the camera's axis; keeps a halo from being infinitely wide."""
+"""Smallest cosine of the angle between the sheet and the camera's axis that is used: no halo gets infinitely wide."""
 LEAST_BASELINE_M = 1e-6
 Tables = tuple[NDArray[Any], ...]
 """Halo, haze before its end, haze behind it, by depth and distance in pixels; then the same for falling distances."""
