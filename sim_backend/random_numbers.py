@@ -249,8 +249,8 @@ _S27, _S30, _S31 = np.uint64(27), np.uint64(30), np.uint64(31)
 
 
 def mixed(z: Any) -> Any:
-    """64 bits, a uint64 or an array of them, each of which depends on all bits of z. Products wrap: see numpy's
-    errstate.
+    """64 bits, a uint64 or an array of them, each of which depends on all bits of z. Products overflow on
+    purpose; `np.errstate(over="ignore")` keeps numpy from warning of it.
     """
     z = (z ^ (z >> _S30)) * _MIX_1
     z = (z ^ (z >> _S27)) * _MIX_2
@@ -273,7 +273,7 @@ LOG2_E: Final = 1.4426950408889634
 _LN2_HIGH, _LN2_LOW = 6.93147180369123816490e-01, 1.90821492927058770002e-10
 """ln 2 in two parts, the high one with 20 zeros at its end: its product with k is exact (Cody and Waite)."""
 _ROUNDER, _ROUNDER_32 = 1.5 * 2.0**52, 1.5 * 2.0**23
-"""Added to a float64 or float32 it leaves the nearest integer in the last bits."""
+"""If it is added to a float64 or float32, the last bits of the sum are the nearest integer."""
 _C13, _C12, _C11, _C10, _C9, _C8 = 1 / 6227020800, 1 / 479001600, 1 / 39916800, 1 / 3628800, 1 / 362880, 1 / 40320
 _C7, _C6, _C5, _C4, _C3 = 1 / 5040, 1 / 720, 1 / 120, 1 / 24, 1 / 6
 
@@ -282,7 +282,7 @@ HALVING: Final[dict[Any, tuple[Any, ...]]] = {
     np.float64: (1010.0, _ROUNDER, *_SERIES),
     np.float32: tuple(map(np.float32, (120.0, _ROUNDER_32, *_SERIES))),
 }
-"""Constants of `power_of_half`, by precision: most halvings, rounder, series."""
+"""Constants of `power_of_half`, by precision: largest t, rounder, series."""
 _SERIES_32 = (1 / math.factorial(n) for n in (0, 2, 3, 4, 5, 6))
 ROUGHLY: Final = tuple(map(np.float32, (80.0, LOG2_E, _ROUNDER_32, math.log(2), *_SERIES_32)))
 """Constants of `one_minus_exp_minus_32`: largest t, scale, rounder, ln 2, series without its linear term."""

@@ -10,13 +10,13 @@ For a rectified rig of baseline b, with the rays q_p of the projector and q_c of
 sigma_s p I0 du |q_p||q_c|/b exp(-sigma z (|q_p| + |q_c|)), where I0 du = J sqrt(1 + u_p^2)/|q_p|^2. The phase function
 is constant (`backscatter`: scattering angles are all near 180 degrees) or a sum of Henyey-Greenstein terms at the
 cosine -(z q - S).q/(r |q|). The haze ends where the sheet's light ends: at the object, blurred by `sigma_px`, and in
-the sheet's own shadow along the row. `medium` switches it on.
+the sheet's own shadow along the row. The haze is simulated if the scene has a `medium`.
 
 Along a row the loop over lit pixels has no branches, so it becomes vector instructions; only the pixels under the
 blurred end are done one by one. Cost per mirror position for 512 x 512 pixels, half of them lit: 0.36 ms in float64,
 0.19 ms in float32. Kernels use the precision of the array they add to. In float32 the haze is right to 1e-5 at an
-optical depth of 10. By the divergence of `sim_backend.effect_planner` that is 1e-8 for a row's pixels in a column, of
-2e-4 allowed.
+optical depth of 10. For a row in one column this makes the divergence eps of `sim_backend.effect_planner` 1e-8; 2e-4 is
+allowed.
 """
 
 import math
@@ -32,7 +32,7 @@ from sim_backend.light.sheet import LightSheet, Traced
 from sim_backend.random_numbers import HALVING, LOG2_E, power_of_half
 
 REACH_SIGMAS = 5.0
-"""Sds at which the blurred end is cut."""
+"""Distance, in standard deviations, beyond which the blur of the haze's end is neglected."""
 LEAST_INVERSE_DEPTH = 1e-12
 """Least inverse depth, in 1/m. Points that lie farther away or behind the camera are given this one."""
 Numbers = tuple[tuple[NDArray[Any], ...], NDArray[Any], tuple[Any, ...], tuple[Any, ...]]

@@ -56,7 +56,8 @@ class BoardAtPose:
 
 
 def load_boards(shown: Sequence[SceneBoard], folder: Path) -> list[BoardAtPose]:
-    """The boards of a scene file whose paths start at `folder`. Raises DeviceError if a board's file cannot be used."""
+    """The boards of a scene file. Relative paths start at `folder`. Raises DeviceError if a board's file cannot be
+    used."""
     try:
         return [
             BoardAtPose(

@@ -39,7 +39,7 @@ _MODES: dict[Mode, tuple[str, str]] = {
     "constant power": ("1", "ConstantPower"),
     "modulation": ("2", "PowerModulation"),
 }
-"""The modes as either family calls them."""
+"""Name of each mode in the replies of 06-MLD and of 06-01."""
 _RUN_MODES = {name.lower(): mode for mode, (_, name) in _MODES.items()}
 _FLAGS: dict[Family, dict[str, str]] = {
     "06-MLD": {"sdmes": "digital", "sames": "analog"},

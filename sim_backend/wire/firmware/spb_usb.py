@@ -209,7 +209,7 @@ class SpbUsbModel(UsbModel):
         the next START."""
 
     def _watch(self, now_s: float) -> None:
-        """Act as the watchdog: a run whose host sends no PING ends dark."""
+        """Act as the watchdog: if the host sends no PING for HEARTBEAT_MS, the run ends with the gate low."""
         limit_ms = self._registers[Register.HEARTBEAT_MS]
         run = self._run
         if run is not None and limit_ms and now_s - run.pinged_s > limit_ms / 1000:
