@@ -110,8 +110,9 @@ class DepthUncertainty:
 def depth_uncertainty(model: RigModel, depth_m: float, velocity_per_s: float | None = None) -> DepthUncertainty:
     """The uncertainty at a given depth over the picture.
 
-    velocity_per_s: signed velocity of the command, which multiplies the lag. None: the fastest rise for which the lag
-    holds, or 0 if it was not measured. Raises CalibrationError for a model without covariance.
+    velocity_per_s: signed velocity of the command, which multiplies the lag. None: the highest speed of a rising
+    command for which the lag holds, or 0 if the lag was not measured. Raises CalibrationError for a model without
+    covariance.
     """
     covariance = _covariance(model)
     if velocity_per_s is None:

@@ -203,7 +203,7 @@ class Forecast:
         self.now_m = self._expected(fit.information)
 
     def __call__(self, pose: BoardPose) -> float:
-        """The median over the picture of the depth's expected sd in metres; NaN where the pose shows too little."""
+        """The median over the picture of the depth's expected sd in metres; NaN if the pose shows too little."""
         seen = self._seen(pose)
         if seen is None:
             return math.nan

@@ -279,8 +279,7 @@ def _chi_square_limit(dof: NDArray[np.int64], probability: float) -> Array:
 SIGNIFICANT = 5.0
 """Counting sds by which a rate must differ to count as changed."""
 MOST_RATIO = 2.0
-"""Common factor between two maps, as after 8 to 10 K, from which on limits and learned rates of the old one are wrong.
-"""
+"""Common factor between two maps, as after 8 to 10 K, from which on the old map's limits and rates are useless."""
 MOST_NEW_DEFECTS = 0.005
 """Largest share of all pixels that may have become defects."""
 LEAST_ALIKE = 0.5

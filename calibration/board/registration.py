@@ -71,7 +71,7 @@ class Drawing:
 
 
 _BENDS = ((30, 3), (12, 2))
-"""(least number of points, degree of the polynomial): two points to a term at least."""
+"""(least number of points, degree of the polynomial): at least two points per term."""
 _FEWEST_POINTS = 4
 _KEPT_SHARES = (0.8, 0.8, 1.0)
 """Shares of the points, the best fitting ones, that the polynomial is fitted to in turn: outliers must not bend it."""
@@ -172,7 +172,7 @@ _AROUND = np.stack(np.meshgrid(*2 * [np.linspace(-1.25, 1.25, 7)]), axis=-1).res
 """Points, in units of the reach, that the polynomial is fitted to: over the patch and a pixel more on every side."""
 _STEPS = 4
 _SETTLED_SDS = 0.1
-"""A step of fewer sds of the corner ends the iteration: the remaining error is a tenth of the step."""
+"""A step shorter than this, in sds of the corner, ends the iteration: the remaining error is a tenth of the step."""
 _OUTLIER_SDS = 5.0
 _DARK_SHARE = 0.05
 """Least variance of a pixel, as a share of the variance on white."""

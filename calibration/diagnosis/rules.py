@@ -270,7 +270,7 @@ sweeps by as much as the sweeps differ, up to 1.35 times as much in 23 simulated
 class FitEvidence:
     """Evidence from a fit and the poses of its boards; what is unknown has its default.
 
-    expected_m, worst_m: predicted sd of the depth at the distance asked for, median and 95th percentile of the picture.
+    expected_m, worst_m: predicted sd of depth at the distance asked for, median and 95th percentile over the picture.
     wave_m: depth error there of one sweep against another of the same view; wave_noise_m: its largest value that may be
     noise. shift_m: depth error of a view against the others; shift_noise_m: its largest value that may be noise;
     moved_after: the view after which the rig moved, if one move explains the shifts. misfit: factor by which the

@@ -41,8 +41,8 @@ _STEP = 1e-6
 
 @dataclass(frozen=True, slots=True, eq=False)
 class JudgedCamera:
-    """The verdict on a camera; sd of a pixel's place along the row (median, 95 %); share of the picture within all
-    corners.
+    """The verdict on a camera. sd_px, worst_px: median and 95th percentile over the picture of the sd of a pixel's ray
+    along the row. coverage: share of the picture within the outline of all corners.
     """
 
     verdict: Verdict

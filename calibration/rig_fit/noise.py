@@ -25,7 +25,7 @@ BINS = 1024
 """Bins of the whole command range: several per column. Jitter hardly changes within a bin."""
 MOST_REACH_BINS = 96
 LEAST_FACTOR = 0.3
-"""Least factor on the passages' own sds: they are not assumed to be stated more than three times too large."""
+"""Least factor on the passages' own sds: these are assumed to be at most about three times too large."""
 TAIL_SD = 3.0
 """Sds from which on an error counts as unlikely, and pulls no more than one of this size."""
 OUTLIER_SD = 6.0

@@ -89,7 +89,7 @@ class SharedPixels:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Solved:
-    """The result of a least squares fit. value, covariance: of the unknowns, the coefficients of the designs.
+    """The result of a least squares fit. value, covariance: of the unknowns, one for each design of `solve`.
 
     residual: (pixels, sweeps), in command units. weight: weight of each passage, 0 for an outlier. noise: robust sd of
     the residuals in units of the stated sd. design: (pixels, sweeps, designs), after elimination of each pixel's own
@@ -196,11 +196,11 @@ class SweepTiming:
 class SyncFit:
     """Fitted lags. lag_s, row_delay_s: as in `RigModel`. covariance: (3, 3), s^2, of the three.
 
-    speed_range_per_s: the range in which they hold. common: whether the two lags could not be separated. told: which
-    directions were scanned. row_told: whether the row delay was determined; if not, it is the one known before, with
-    the variance that the sweeps alone would have given. sweeps: lag of each sweep by itself, at the fitted row delay.
-    chi2, dof: of those against common lags; `steady`: whether they agree. noise: robust standard deviation of the
-    residuals in units of the stated sd.
+    speed_range_per_s: the range in which they hold. common: whether the two lags could not be separated. told: the
+    directions that were scanned, +1 and -1. row_told: whether the row delay was determined; if not, it is the one known
+    before, with the variance that the sweeps alone would have given. sweeps: lag of each sweep by itself, at the fitted
+    row delay. chi2, dof: of these lags against the fitted ones; `steady`: whether they agree. noise: robust standard
+    deviation of the residuals in units of the stated sd.
     """
 
     lag_s: Lag
