@@ -38,7 +38,7 @@ MOST_CHANGED = 0.01
 MOST = PlannedFor(power_w=1.0, exposure_s=1e-3, exposures=100)
 """Values to plan for if it is not known what will be scanned; a line laser and an ordinary scan stay below them."""
 SAFETY = 2.0
-"""Safety factor on the mean over sampled rows and columns; rows and columns differ by less."""
+"""Safety factor on the mean over sampled rows and columns, for the differences between rows and columns."""
 SAMPLED_COLUMNS, SAMPLED_BANDS, BAND_ROWS = 16, 4, 8
 
 

@@ -47,7 +47,7 @@ _PIXELS = ir.VectorType(_I16, _VECTOR_PX)
 _PACKED: Final = (*range(8), *range(16, 24), *range(8, 16), *range(24, 32))
 """Order in which x86 packs the pixels of two vectors into 32 bits by one instruction."""
 PLACE: Final = tuple(8 * (0, 2, 1, 3, 4, 6, 5, 7)[x // 8] + 7 - x % 8 for x in range(WORD_PX))
-"""Place of the level of pixel x of a word, so that bits come out as `packbits` has them."""
+"""Index at which the level of pixel x of a word is stored, so that the bits drawn have the order of `packbits`."""
 
 _S_BOX = bytes.fromhex(
     "637c777bf26b6fc53001672bfed7ab76ca82c97dfa5947f0add4a2af9ca472c0b7fd9326363ff7cc34a5e5f171d8311504c723c3"

@@ -187,7 +187,7 @@ class SimulatedWorld:
         """Hold the flux constant within columns at these mirror commands (columns,): a pixel has the same detection
         probability in all frames of a column.
 
-        Call it before the run. Otherwise the stripe moves within a column, as the mirror does.
+        Call it before the run. Otherwise the stripe moves within a column in steps of about a quarter of a pixel.
         """
         self.grid = column_grid(commands, self.model.scanner.command_range)
 

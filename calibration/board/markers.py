@@ -20,7 +20,7 @@ from calibration.board.board import Board
 Places = NDArray[np.int64]
 
 _NEXT_SQUARES = 2.5
-"""Largest distance from a placed marker to the next; twice that once several are placed. Neighbours are 1.4 apart."""
+"""Largest distance in squares from a placed marker to the next; doubled once several are placed. Neighbours: 1.4."""
 _OFF_SQUARES = 0.3
 """Largest distance of a marker of this lattice from the middle of a square."""
 _MOST_TURN_RAD = 0.6

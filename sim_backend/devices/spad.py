@@ -94,8 +94,8 @@ def windows_at(window: WindowTable | None, first_sweep: int, records: NDArray[np
 
 
 class TickClock:
-    """A tick counter that starts from 0 at `start_s` of the bench. error: relative, positive is fast. wander: random
-    change of the error, per root second.
+    """A tick counter that starts from 0 at time `start_s` of the bench. error: relative error of its rate, positive if
+    it runs fast. wander: standard deviation of the change of the error in one second.
     """
 
     def __init__(self, tick_s: float, start_s: float, error: float, wander: float, seed: list[int]) -> None:
@@ -379,7 +379,7 @@ class SimulatedSpad(SpadArray):
 
 
 def create(config: SimulatedSpadConfig, surroundings: Surroundings) -> SimulatedSpad:
-    """The SPAD that looks at the world. Raises DeviceError if the rig has no simulated world."""
+    """The SPAD in the simulated world. Raises DeviceError if the rig has no simulated world."""
     if not isinstance(surroundings.world, SimulatedWorld):
         raise DeviceError(
             "simulated SPAD has nothing to look at: the rig has no simulated world; add world: {kind: simulated}"

@@ -20,8 +20,8 @@ class Entry:
     """One effect: its name, what it acts on, its factory as module:name ("" if it is part of another), and the rule
     that calls for it.
 
-    why(setting): the reason in words why the effect is called for, None if it is not. absent: the reason why not; ""
-    means that the sensor has no such effect.
+    why(setting): the reason in words why the effect is called for, None if it is not. absent: the reason in that case;
+    "" means that the sensor has no such effect.
     of_sensor: light or counts that stay under a covered lens.
     changes(setting, planned_for), in closed form: the largest share of decisions on a row and column that can differ
     without the effect (may exceed 1). None: there is no closed form. The planner then evaluates the effect if it is

@@ -34,7 +34,7 @@ from sim_backend.random_numbers import HALVING, LOG2_E, power_of_half
 REACH_SIGMAS = 5.0
 """Distance, in standard deviations, beyond which the blur of the haze's end is neglected."""
 LEAST_INVERSE_DEPTH = 1e-12
-"""Least inverse depth, in 1/m. Points that lie farther away or behind the camera are given this one."""
+"""Least inverse depth, in 1/m. Points that lie farther away or behind the camera get this value."""
 Numbers = tuple[tuple[NDArray[Any], ...], NDArray[Any], tuple[Any, ...], tuple[Any, ...]]
 """The kernel's numbers, in one precision: rays u, v, |q| (rows, width) and source (3,); terms (n, 3), weight, |g| and
 sign of each Henyey-Greenstein term; halving, see `power_of_half`; 0, 1, 2 and least inverse depth."""
@@ -65,7 +65,7 @@ class Haze:
         self._sigma_px = setting.line.sigma_px
 
     def add(self, sheet: LightSheet, first_row: int, last_row: int, rate: Array) -> None:
-        """Add detections per second and watt of laser power."""
+        """See `LaserEffect`."""
         kind = rate.dtype
         scales = (self._scale / np.where(sheet.offset_m != 0, np.abs(sheet.offset_m), np.inf)).astype(kind)
         light = sheet.inverse.astype(kind), scales, kind.type(LOG2_E * self._extinction_per_m), self._sigma_px
@@ -76,7 +76,8 @@ class Haze:
 def _add_haze(
     sheet: Traced, light: tuple[Any, ...], numbers: Numbers, first_row: int, last_row: int, rate: Array
 ) -> None:
-    """Add the haze of a sheet. light: the sheet's planes, scale of each of them, halvings per m, sigma_px."""
+    """Add the haze of a sheet. light: `inverse` of the sheet, scale of each plane, halvings of light per m,
+    sigma_px."""
     # Arrays and tuples are unpacked before the loops: inside, each access would count a reference. Constants are
     # arguments, too: as literals they would be float64.
     _, _, x_stripe, x_end, start, step = sheet

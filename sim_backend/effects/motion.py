@@ -121,7 +121,9 @@ def _shift(
 
 @numba.njit(cache=True, nogil=True)
 def _uncover(u: Array, v: Array, known: NDArray[np.bool_], surface: Array, facet: Array, albedo: Array) -> None:
-    """Continue the farther of the known surfaces on both sides over each unknown pixel of a row."""
+    """At each unknown pixel of a row, continue the surface of the next known pixel to the left or right, whichever
+    surface is farther away.
+    """
     width = len(u)
     for x in range(width):
         if known[x]:

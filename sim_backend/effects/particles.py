@@ -203,7 +203,7 @@ class ParticleLight:
         self.particles = make_particles(what, np.column_stack([low, span]), farthest_m, rng)
 
     def add(self, sheet: LightSheet, first_row: int, last_row: int, rate: Array) -> None:
-        """Add detections per second and watt of laser power."""
+        """See `LaserEffect`."""
         if not np.isfinite(sheet.inverse).all():
             return
         view, them = self._view.arrays, self.particles

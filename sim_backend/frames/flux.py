@@ -61,7 +61,7 @@ class FluxModel:
             effect.add(sheet, first_row, last_row, rate)
 
     def flux(self, plane: Array, exposure_s: float, power_w: float) -> Array:
-        """Photons per exposure, float64 (rows, width), with the mirror at the plane (4,) = nx, ny, nz, d."""
+        """Detections per exposure, float64 (rows, width), for the light plane (4,) = nx, ny, nz, d."""
         view = self.setting.view
         sheet = view.sheet(plane)
         rate = np.zeros_like(self.steady_per_s)

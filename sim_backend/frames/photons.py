@@ -219,7 +219,7 @@ class PhotonSource:
 
 @numba.njit(cache=True, nogil=True)
 def _cut_windows(whole: Words, first_word: Places, words: Words) -> None:
-    """Copy each frame's window, words (frames, rows, words of a window), out of whole frames."""
+    """Copy each frame's window out of whole frames into `words` (frames, rows, words of a window)."""
     for f in range(len(words)):
         first = first_word[f]
         for y in range(words.shape[1]):

@@ -105,7 +105,7 @@ class CoboltModel:
 
     @property
     def power_w(self) -> float:
-        """Power of the light that comes out now, in W; through an open gate if the laser is gated."""
+        """Power in W that comes out now; for a gated laser, the power that an open gate lets out."""
         if not self.on or self.paused or self.interlock_open or self.fault:
             return 0.0
         match self.mode:

@@ -60,7 +60,7 @@ class DacHistory:
                 self._rests.popleft()
 
     def cut(self, time_s: float, command: float | None = None) -> None:
-        """Play nothing from that time on. The command holds, or jumps to `command` if given."""
+        """Play nothing from `time_s` on. The drive keeps its value, or jumps to `command` if that is given."""
         here = float(self.command(np.array([time_s]))[0])
         with self._lock:
             while self._played and self._played[-1].start_s >= time_s:
@@ -244,8 +244,8 @@ class HeliosModel(DacModel):
         self._dead_until_s = -1.0
 
     def set_interface(self, interface: int, alternate: int, now_s: float) -> None:
-        """Enable the DAC (alternate 1), blank and with the mirror where it is, or stop it (any other), blank and at the
-        centre.
+        """Alternate 1 enables the DAC: colours low, and the mirror stays where it is. Any other one stops it: colours
+        low, mirror at the centre.
         """
         self.advance(now_s)
         self._halt(now_s)
