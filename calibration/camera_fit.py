@@ -197,7 +197,7 @@ class CameraProblem:
         return BoardPose(np.ravel(turn), np.ravel(shift))
 
     def _rough(self, used: Sequence[Mask]) -> CameraSolution:
-        """A guessed camera, and the poses of all views that it sees."""
+        """A guessed camera, and the poses at which it sees the board in all views."""
         matrix = self._guess(_GUESSED_FOCAL[0])
         poses = tuple(self._pose(i, matrix, np.zeros(5)) for i in range(len(used)))
         return CameraSolution(matrix, np.zeros(self.terms), poses, ())

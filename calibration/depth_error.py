@@ -63,7 +63,7 @@ _GRID = 48
 """Least number of pixels along the longer side of the picture at which depth is judged; all if it has fewer."""
 _SEARCH_STEPS = 60
 _FOUND_M = 1e-9
-"""A mirror command is found when its sheet passes the point within this: a thousandth of any calibration's error."""
+"""A mirror command is found when its sheet is this near to the point: a thousandth of any calibration's error."""
 _INSIDE = 1e-6
 """Distance from the ends of the command range, as a share of it, at which differences are taken there."""
 _INDEPENDENT = 1e-12

@@ -43,7 +43,7 @@ from calibration.files.npy_files import load_arrays
 from calibration.views import robust_sd
 
 LEAST_COUNTS = 10.0
-"""A pixel's mean counts in a block from which on chi-square describes their scatter; quieter ones are not judged."""
+"""Least mean counts in a block from which a pixel's scatter is judged; chi-square does not describe smaller counts."""
 LEAST_BLOCKS, MOST_BLOCKS = 8, 64
 _APART, _ROUNDS = 6.0, 8
 """An ordinary pixel counts at most this multiple of (sd + 1) above the expected counts; rounds of this selection."""
@@ -218,7 +218,7 @@ def hot_flux(signal: float, level: Array | float) -> Array:
 
 
 def frames_for(limit_flux: float, precision: float = PRECISION) -> int:
-    """Number of frames that measure a rate at the limit with this relative sd."""
+    """Number of frames that measure a rate at the limit with the relative sd `precision`."""
     return math.ceil(math.expm1(limit_flux) / (limit_flux * precision) ** 2)
 
 

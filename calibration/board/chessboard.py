@@ -215,7 +215,8 @@ def _median(values: Array) -> float:
 
 
 _SMALLEST_PARTS = ((4, 4), (3, 3))
-"""Inner corners of a chessboard that count as a part of one; small ones are more often found where none is."""
+"""Inner corners of a chessboard that count as a part of one; small ones are more often found where there is no
+board."""
 _FORMS_FOR_PARTS = ((1, 0.0), (1, 1.5), (2, 0.8))
 """(enlargement, smoothing), as in FORMS; few and quick ones, since they are tried after all of FORMS have failed."""
 _NOTHING = MatchedPoints(np.zeros((0, 2)), np.zeros((0, 2)), 0)

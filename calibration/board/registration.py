@@ -167,7 +167,7 @@ _LEAST_REACH_PX = 4
 _SEARCH_SQUARES = 0.25
 """Farthest search for a corner: beyond, a shift could mistake one module of a marker for the next."""
 _POWERS = [(i, j) for i in range(4) for j in range(4 - i)]
-"""Powers of x and y that place the drawing around a corner: enough for a tilt and a lens over two squares."""
+"""Powers of x and y that place the drawing around a corner: enough for tilt and lens distortion over two squares."""
 _AROUND = np.stack(np.meshgrid(*2 * [np.linspace(-1.25, 1.25, 7)]), axis=-1).reshape(-1, 2)
 """Points, in units of the reach, that the polynomial is fitted to: over the patch and a pixel more on every side."""
 _STEPS = 4

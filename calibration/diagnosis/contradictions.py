@@ -30,7 +30,7 @@ from calibration.rig_fit.solve import corner_weights
 from calibration.views import FEWEST_CORNERS, BoardPose, View, robust_sd
 
 BINS = 24
-"""Bins of the command range: wide enough for tens of passages each, narrow enough for a wave of several turns."""
+"""Bins of the command range: wide enough for tens of passages each, narrow enough for a wave of several periods."""
 _FEWEST_IN_BIN = 5
 _LEAST_SHARE_IN_BIN = 0.25
 """Least number of passages in a bin, as a share of the usual number in the sweep's bins: those of a nearly empty bin
@@ -39,7 +39,7 @@ _FEWEST_BINS = 4
 _MEDIAN_VARIANCE = np.pi / 2
 """Variance of a median in units of the mean's, normal distribution."""
 _MEDIAN_TAKES = 0.8
-"""The robust scatter of n values around their own median is (n - 0.8) / n of the true (Croux, Rousseeuw, 1992)."""
+"""The robust scatter of n values around their own median is (n - 0.8) / n of the true one (Croux, Rousseeuw, 1992)."""
 NOISE_SIGMAS = 4.0
 """Standard deviations of a mean square up to which it may be noise."""
 

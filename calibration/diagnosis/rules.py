@@ -327,9 +327,9 @@ def judge_refusal(
 
 
 _REFUSED_FOR = {"one-pose": "too-few-poses", "coplanar": "no-tilt"}
-"""From the reason why a fit was impossible to the reason in the verdict: the lack of data behind it."""
+"""For reasons why a fit was impossible: the verdict's reason, which is the lack of data behind it."""
 _SEEN_AT_ONCE = ("no-board", "wrong-board", "board-half-out", "mirrored", "two-boards", "no-line")
-"""Faults of single views that leave too few to be used."""
+"""Faults of single views, due to which too few views can be used."""
 
 
 def _contradictions(fit: FitEvidence, asked: AccuracyGoal, imprecise: bool) -> list[Reason]:

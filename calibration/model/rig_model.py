@@ -59,7 +59,7 @@ class Covariance:
 
 
 class Lag(NamedTuple):
-    """Seconds by which the mirror follows its command, for each sweep direction (forward: rising command)."""
+    """Seconds by which the mirror lags behind its command, for each sweep direction (forward: rising command)."""
 
     forward: float = 0.0
     backward: float = 0.0

@@ -305,7 +305,7 @@ LEFT_OUT = 10
 """Columns left out on either side of the one that lights the pixel most, but at most MOST_LEFT_OUT of all columns."""
 MOST_LEFT_OUT = 1 / 12
 LEAST_COUNTS = 30.0
-"""Least number of detections per pixel for a picture by room light: the median over its brighter half."""
+"""Least number of detections per pixel for a picture by room light, as the median over the brighter half."""
 
 
 def flux_picture(sweeps: tuple[SweepCounts, ...]) -> NDArray[np.float32]:

@@ -34,7 +34,7 @@ MOST_IDLE_ROUNDS = 4
 SETTLED_SHARE = 0.02
 """Relative change of the noise that is still allowed in the last round."""
 MOST_ODD_SHARE = 1 / 3
-"""Largest share of the views with passages that may be dropped; if more do not fit, these views are not the fault."""
+"""Largest share of the views with passages that may be dropped; if more do not fit, the fault is elsewhere."""
 
 
 @dataclass

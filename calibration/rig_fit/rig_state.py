@@ -220,7 +220,7 @@ def _moved(pose: BoardPose, change: Array) -> BoardPose:
 
 
 _ORDERS = (3, 1, 3)
-"""Orders of d, b and e in the command: enough for tangents of angles up to a quarter of a right angle either way."""
+"""Orders of d, b and e in the command: enough for tangents of angles from -22.5 to 22.5 degrees."""
 POSES_FOR_PLANES = 5
 """Fewest boards at one speed for planes: on fewer boards, a command's light gives too few lines for a good plane."""
 MOST_FIRST_LAG_S = 1e-3
@@ -422,7 +422,9 @@ def check_depth(
     misfit: float = 1.0,
     outliers: Sequence[str] = (),
 ) -> None:
-    """Raise Degenerate if the poses hardly determine depth, even without the misfit, or if the line reaches nothing."""
+    """Raise Degenerate if the poses hardly determine depth, even if the misfit were removed, or if the line reaches
+    nothing.
+    """
     camera = model.camera
     x, y = np.meshgrid(np.linspace(0.1, 0.9, 7) * camera.width, np.linspace(0.1, 0.9, 5) * camera.height)
     for at_m in (AT_M, float(np.median([np.linalg.norm(pose.position_m) for pose in poses]))):

@@ -178,7 +178,7 @@ MOST_CHI2_SDS = 4.0
 
 @dataclass(frozen=True, slots=True)
 class SweepTiming:
-    """The lag of one sweep by itself: the fitted one plus the sweep's mean residual; sd_s: of the latter."""
+    """The lag of one sweep by itself: the fitted lag, changed by the sweep's mean residual. sd_s: of this change."""
 
     direction: int
     speed_per_s: float

@@ -26,8 +26,8 @@ from calibration.sync.lag_fit import SIGNIFICANT, SyncFit
 from calibration.verdict import Reason
 
 _OPEN_S = 1e-4, 1e-2
-"""Sds assumed for a lag that the sweeps do not determine: for the slopes; and, so that any change passes, for the test
-whether lags have changed."""
+"""Sds assumed for a lag that the sweeps do not determine. The first is for the slopes; the second, which lets any
+change pass, is for the test whether lags have changed."""
 _LEAST_SHARE = 1e-9
 """Least eigenvalue of the scaled covariance of the lags; below it both were fitted as one."""
 _AGAIN = "calibrate the planes again, both ways and at two speeds or more (--exposures)"
