@@ -6,10 +6,9 @@ Then each row has its own: that of the mirror at the row's time, and the tangent
 it.
 
 A compiled walk follows the light along each row and finds whether it ends as a stripe. On a row the sheet's inverse
-depth w(x) = n.(u, v, 1)/d falls in the direction in which its light travels outward. The walk starts at the edge
-of the picture where w is larger and ends where w falls below the surface's inverse depth. Spans of 32 pixels in which
-even the least w lies before the nearest surface are skipped at once. Cost: about 0.05 ms for 512 x 512 pixels, half of
-them lit.
+depth w(x) = n.(u, v, 1)/d falls in the direction in which its light travels outward. The walk starts at the edge of the
+picture where w is larger and ends where w falls below the surface's inverse depth. Spans of 32 pixels in which even the
+least w lies before the nearest surface are skipped at once. Cost: about 0.05 ms for 512 x 512 pixels, half of them lit.
 """
 
 from dataclasses import dataclass, replace

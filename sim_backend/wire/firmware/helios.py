@@ -1,11 +1,10 @@
 """A Helios laser DAC as its firmware behaves, traps included (docs/reference/hardware.md; vendor's firmware v6,
 0952a2a).
 
-There are two buffers, one playing and one pending, and a status polled with 03. A frame whose
-length is a multiple of the packet size never completes. Invalid frames are dropped silently, and so are frames within
-100 ms after STOP. A frame without SINGLE repeats for
-ever. `DacModel` is the part that emulated scanner boards have in common; emulated worlds and tests read its record of
-the outputs.
+There are two buffers, one playing and one pending, and a status polled with 03. A frame whose length is a multiple of
+the packet size never completes. Invalid frames are dropped silently, and so are frames within 100 ms after STOP. A
+frame without SINGLE repeats for ever. `DacModel` is the part that emulated scanner boards have in common; emulated
+worlds and tests read its record of the outputs.
 """
 
 import struct
