@@ -17,7 +17,7 @@ probability that a good pixel is called noisy.
 
 A dead pixel is one that hardly fires in light although its neighbours do. It cannot be recognised without light.
 
-Changes (`pixel_drift`) are found from frames of the same exposure in the same dark. Dark rates double every 8 to 10 K,
+Changes (`pixel_drift`) are found from frames of the same exposure in darkness. Dark rates double every 8 to 10 K,
 so a warmer sensor shows as a common factor, and faulty pixels show one by one.
 
 `pixels.npz` holds the arrays of a `PixelMap` by their names (`dead` is left out if unknown), and `about`, JSON text:

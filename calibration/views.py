@@ -1,7 +1,7 @@
 """One view of a calibration board held still: where its corners lie, and when the line passed over each pixel.
 
 A pixel's passage is the mirror command at which the line's centre crosses it. The pixel's albedo is the same in every
-column, so the board's print does not bias the passage. It does bias the position of a stripe along a row.
+column, so the board's print does not bias the passage. The print does bias a stripe's position along a row.
 """
 
 from dataclasses import dataclass

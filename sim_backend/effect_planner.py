@@ -4,9 +4,9 @@ decision is what an estimator, or any other rule, concludes from a row's data in
 Let a pixel detect m photons in a column's K frames, on average, and m + D with an effect. Per exposure the
 Kullback-Leibler divergence of its bits is at most (D/K)^2 / (2 (e^(m/K) - 1)). Summed over pixels and frames it is at
 most eps = sum D^2 / (2 m), so the data differ in total variation by at most sqrt(eps/2) (Pinsker's inequality [1]). The
-data also differ by no more than the probability that any of the D photons is seen, which is at most D: the better bound
-in the dark. The first bound is used for pixels with D < m, the second for the others, and the two add up (triangle
-inequality). No decision can then change with a larger probability than that.
+data also differ by no more than the probability that any of the D photons is seen, which is at most D; this is the
+better bound in the dark. The first bound is used for pixels with D < m, the second for the others, and the two add up
+(triangle inequality). No decision can then change with a larger probability than that.
 
 Both bounds grow with power and exposure, so a plan for the largest power and exposure of a column holds for all smaller
 ones. For light that does not depend on the laser, the bound assumes that the laser is off and uses the worst row. The

@@ -12,8 +12,8 @@ One AES round of 256 bits takes one cycle on x86 with VAES, two with AES-NI or o
 give the same bits, many times as slowly.
 
 Exponentials are written without branches or calls, so that loops over them become vector instructions. With
-k = round(t) and f = k - t, |f| <= 1/2:  2^-t = 2^-k 2^f, the latter by its Taylor series. Relative error against 50
-digits: for `power_of_half` 3e-13 (series to f^10) and the effect of rounding t; for `one_minus_exp_minus` 4e-16 (to
+k = round(t) and f = k - t, |f| <= 1/2:  2^-t = 2^-k 2^f, the latter by its Taylor series. Relative errors, found with
+50 digits: for `power_of_half` 3e-13 (series to f^10) and the effect of rounding t; for `one_minus_exp_minus` 4e-16 (to
 r^13, with r = f ln 2 in two parts). `one_minus_exp_minus_32` is a float32 version for uses where six digits suffice.
 The numbers that loops need come as a tuple from the kernel's caller (`HALVING`, `ROUGHLY`). If they were constants,
 LLVM would load them anew for every vector: 24 of the 59 instructions of a loop over `power_of_half`.

@@ -1,10 +1,10 @@
 """Contradictions that a single unmoved rig cannot produce: differences between sweeps (waves), and shifts between
 views.
 
-Nothing moved while the sweeps of a view were taken. So their residuals, binned over the mirror's command, may differ
-only by noise and by one constant for each direction (the remaining error of the lag). All other differences are waves
-of single sweeps, a sign that exposures are not locked to the mirror. If no view has two sweeps, waves
-are measured against each sweep's own straight line. Medians in bins keep bad passages out.
+It is assumed that nothing moved during the sweeps of a view. So their residuals, binned over the mirror's command, may
+differ only by noise and by one constant for each direction (the remaining error of the lag). All other differences are
+waves of single sweeps, a sign that exposures are not locked to the mirror. If no view has two sweeps, waves are
+measured against each sweep's own straight line. Medians in bins keep bad passages out.
 
 The fit of the whole rig may move a board by a millimetre to fit the light planes. So each pose is fitted again to the
 corners alone, with camera and mirror as fitted before. The distance of the passages from the light planes then shows

@@ -1,6 +1,6 @@
 """The state of a rig's fit (model, timing, poses, residuals), the sightings to which it is fitted, and first values.
 
-A sighting is a pose's corners and passages, cleaned and in the order that the fit needs.
+A sighting is a view's corners and passages, cleaned and in the order that the fit needs.
 
 First values are poses from corners, planes from passages, and the mirror's axis from the planes. With the poses known,
 every passage is a point in space that the light met at a command c. For a line turned about an axis, x = d(c) - b(c) y

@@ -1,9 +1,9 @@
 """The lags of light, mirror and frames, from sweeps over one unmoved scene at several speeds, in both directions.
 
 A pixel sees the line at one mirror position, whatever the speed. In a sweep with direction s = +1 or -1 and speed v
-that is at the command (`Passages` in calibration/views.py)
+the line reaches that position at the command (`Passages` in calibration/views.py)
 
-    command = position + s v (lag_s - row_delay y)
+    command = position + s v (lag(s) - row_delay y)
 
 Each pixel's position is eliminated as a weighted mean over the sweeps (`SharedPixels`); what remains is linear in the
 two lags and the row delay. Passages close in time are treated as correlated, since they share the mirror's jitter. The
@@ -17,7 +17,7 @@ needs rows, not speeds. A row delay that is known from elsewhere is combined wit
 contradict each other significantly; if nothing is known it is 0.
 
 A constant delay of the markers behind the mirror's command (the scanner's colour outputs trail its mirror outputs by
-some microseconds, docs/reference/hardware.md) shortens both lags, which are then right for binding with the same
+some microseconds, docs/reference/hardware.md) shortens both lags; they are then right for binding with the same
 markers. A marker of the wrong polarity shows in the binding; the gate's delay shows in the frames at its edges
 (`gate_fit`).
 """

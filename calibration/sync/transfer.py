@@ -1,9 +1,9 @@
 """A model with lags from other sweeps, and the consequences for its mirror's angle.
 
-A mirror's angle was fitted together with lags; with other lags it changes, by an amount that their covariance C gives.
-If the sweeps of the planes did not separate the lags (`calibration.model.parameters`), any lags are possible, each with
-its own angle, and C is very large in that direction. With x the lags, y the other parameters, S the covariance of the
-new lags:
+A mirror's angle was fitted together with lags. With other lags the fit would have given another angle, by an amount
+that follows from the covariance C of all parameters. If the sweeps of the planes did not separate the lags
+(`calibration.model.parameters`), any lags are possible, each with its own angle, and C is very large in that direction.
+With x the lags, y the other parameters, S the covariance of the new lags:
 
     y | x = y0 + A (x - x0),    A = C_yx C_xx^-1,    cov y = (1 -A) C (1 -A)' + A S A',    cov (y, x) = A S
 

@@ -11,7 +11,7 @@ Afterpulse: a trap releases a carrier with total probability a, after an exponen
 Dead time d: a detection within d - gap of the end of its exposure leaves the pixel blind at the start of the next; a
 detection there falls into the blind part with probability
 
-    1/T^2 int_0^T min(T, max(0, t + d - P)) dt = s^2 / (2 T^2),    s = d - gap between 0 and T
+    1/T^2 int_0^T min(T, max(0, t + d - P)) dt = s^2 / (2 T^2),    for s = d - gap from 0 to T
 
 If the pixel's bit is 1, these are the chances that its next bit is set or cleared: 5e-5 each with a = 0.5 %,
 tau = d = 100 ns and frames of 10 us without a gap. Later exposures, and afterpulses of afterpulses, are left out. Bits

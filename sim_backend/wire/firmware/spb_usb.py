@@ -1,6 +1,6 @@
 """An SPB1 device on USB (docs/reference/spb1-usb.md): control plane, states, heartbeat, watchdog.
 
-It is either a Cypress FX3 board (commands on 0x01, stream on 0x81, acknowledgements on 0x82) or behind an FTDI FT601
+Its USB chip is a Cypress FX3 (commands on 0x01, stream on 0x81, acknowledgements on 0x82) or an FTDI FT601
 (session commands on 0x01, commands on 0x02, stream on 0x82, acknowledgements on 0x83). A board without the endpoint for
 acknowledgements sends them in the stream. A pure state machine: what the sensor sees comes from `source`.
 """
