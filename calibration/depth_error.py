@@ -277,8 +277,8 @@ class DepthErrors:
     """Errors at the pixels that the true rig lights at one depth; NaN if there are none.
 
     median_m, worst_m: of the absolute errors. ratio: root mean square of the errors, each divided by the sd that the
-    model's covariance predicts for it. If covariances are right, its square averages 1 over many calibrations. NaN also
-    if the model has no covariance.
+    model's covariance predicts for it. If covariances are right, its square averages 1 over many calibrations. The
+    ratio is NaN also if the model has no covariance.
     """
 
     depth_m: float

@@ -239,8 +239,8 @@ _SPEEDS = "scan both ways (scan.bidirectional), at two speeds or more (scan.expo
 def lag_lack(velocities_per_s: Sequence[float], *, mean_will_do: bool) -> list[Reason]:
     """Reasons why sweeps do not determine both lags.
 
-    mean_will_do: whether the mean of the lags is enough, as for planes, which are then right at one speed in both
-    directions.
+    mean_will_do: whether the mean of the lags is enough, as for planes: they are then right for sweeps at one speed in
+    both directions.
     """
     ways = {velocity > 0 for velocity in velocities_per_s}
     if not ways:

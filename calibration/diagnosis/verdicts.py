@@ -177,8 +177,8 @@ class JudgedRig:
 def goal(
     worth: Sensitivity, accuracy_m: float | None = None, at_m: float = AT_M, stated_baseline_m: float | None = None
 ) -> AccuracyGoal:
-    """The accuracy asked for: sd of depth at `at_m`, the depth of `worth`. accuracy_m None: the depth error that
-    ACCURACY_PX causes.
+    """The accuracy asked for, as sd of depth at `at_m`. worth: the sensitivity there. accuracy_m None: the depth error
+    that ACCURACY_PX causes.
     """
     return AccuracyGoal(ACCURACY_PX * worth.per_pixel_m if accuracy_m is None else accuracy_m, at_m, stated_baseline_m)
 

@@ -150,7 +150,7 @@ def passage_noise(residuals: Sequence[Array], sightings: Sequence[Sighting]) -> 
 
 
 def bin_starts(seen: Sighting, reach: float) -> NDArray[np.int64]:
-    """Indices in a view's passages at which the bins begin whose passages share the mirror's jitter."""
+    """Indices in a view's passages at which bins begin. Passages of one bin share the mirror's jitter."""
     first = np.zeros(len(seen.command), bool)
     for sweep in seen.sweeps:
         command = seen.command[sweep]

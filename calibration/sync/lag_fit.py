@@ -173,7 +173,7 @@ SIGNIFICANT = 5.0
 """Standard deviations by which a row delay must differ from the known one to replace it, and by which a lag must lie
 below 0 to be refused."""
 MOST_CHI2_SDS = 4.0
-"""Most standard deviations by which chi squared of the speeds may lie above its mean."""
+"""Most standard deviations by which chi squared of the sweeps' lags may lie above its mean."""
 
 
 @dataclass(frozen=True, slots=True)
