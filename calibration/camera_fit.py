@@ -34,8 +34,8 @@ _POSE = 6
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Normal:
-    """Normal equations. matrix: (p, p) float64, J^T J of the camera's parameters with all poses free; pixels and
-    natural units.
+    """Normal equations. matrix: (p, p) float64, J^T J of the camera's parameters with all poses free; in pixels and
+    each parameter's own unit.
     """
 
     names: tuple[str, ...]
@@ -138,7 +138,7 @@ class CameraProblem:
         return CameraSolution(matrix, distortion, poses, tuple(residual))
 
     def judged(self, solution: CameraSolution, used: Sequence[Mask]) -> tuple[float, Normal]:
-        """(variance of a corner's coordinate in px^2, normal matrix). Raises Degenerate if the corners determine no
+        """(variance of a corner's coordinate in px^2, normal equations). Raises Degenerate if the corners determine no
         camera.
         """
         normal = self._normal(used, solution)
@@ -197,7 +197,7 @@ class CameraProblem:
         return BoardPose(np.ravel(turn), np.ravel(shift))
 
     def _rough(self, used: Sequence[Mask]) -> CameraSolution:
-        """A guessed camera, and the poses of all views that it sees."""
+        """A guessed camera, and the poses at which it sees the board in all views."""
         matrix = self._guess(_GUESSED_FOCAL[0])
         poses = tuple(self._pose(i, matrix, np.zeros(5)) for i in range(len(used)))
         return CameraSolution(matrix, np.zeros(self.terms), poses, ())
@@ -372,7 +372,7 @@ def _close(residual_px: Array, sd_px: float) -> Mask:
 
 
 def _is_mirrored(corners: Corners, board: Board) -> bool:
-    """True where the numbering runs against the clock: the board seen from behind, or in a mirror."""
+    """Whether the corners are numbered in the opposite sense: the board is seen from behind, or in a mirror."""
     homography, _ = cv2.findHomography(board.corners_m[corners.ids, :2], corners.px)
     if homography is None:
         return False

@@ -182,7 +182,7 @@ def check_angle(model: RigModel, first: View, second: View, board: Board) -> Che
 
 
 def _tilt_noise(model: RigModel, cells: BoardCells, other: BoardCells) -> float:
-    """Variance (rad^2) of a board's tilt towards another one, from the noise of the scan of the former."""
+    """Variance (rad^2) of the tilt of the board of `cells` towards the `other` one, from the noise of its own scan."""
     points = _points_of(model, cells)
     normal, _ = _plane(points)
     towards = _plane(_points_of(model, other))[0]

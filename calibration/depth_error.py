@@ -63,7 +63,7 @@ _GRID = 48
 """Least number of pixels along the longer side of the picture at which depth is judged; all if it has fewer."""
 _SEARCH_STEPS = 60
 _FOUND_M = 1e-9
-"""A mirror command is found when its sheet passes the point within this: a thousandth of any calibration's error."""
+"""A mirror command is found when its sheet is this near to the point: a thousandth of any calibration's error."""
 _INSIDE = 1e-6
 """Distance from the ends of the command range, as a share of it, at which differences are taken there."""
 _INDEPENDENT = 1e-12
@@ -110,8 +110,9 @@ class DepthUncertainty:
 def depth_uncertainty(model: RigModel, depth_m: float, velocity_per_s: float | None = None) -> DepthUncertainty:
     """The uncertainty at a given depth over the picture.
 
-    velocity_per_s: signed velocity of the command, which multiplies the lag. None: the fastest rise for which the lag
-    holds, or 0 if it was not measured. Raises CalibrationError for a model without covariance.
+    velocity_per_s: signed velocity of the command, which multiplies the lag. None: the highest speed of a rising
+    command for which the lag holds, or 0 if the lag was not measured. Raises CalibrationError for a model without
+    covariance.
     """
     covariance = _covariance(model)
     if velocity_per_s is None:
@@ -276,8 +277,8 @@ class DepthErrors:
     """Errors at the pixels that the true rig lights at one depth; NaN if there are none.
 
     median_m, worst_m: of the absolute errors. ratio: root mean square of the errors, each divided by the sd that the
-    model's covariance predicts for it. If covariances are right, its square averages 1 over many calibrations. NaN also
-    if the model has no covariance.
+    model's covariance predicts for it. If covariances are right, its square averages 1 over many calibrations. The
+    ratio is NaN also if the model has no covariance.
     """
 
     depth_m: float

@@ -203,7 +203,7 @@ class Forecast:
         self.now_m = self._expected(fit.information)
 
     def __call__(self, pose: BoardPose) -> float:
-        """The median over the picture of the depth's expected sd in metres; NaN where the pose shows too little."""
+        """The median over the picture of the depth's expected sd in metres; NaN if the pose shows too little."""
         seen = self._seen(pose)
         if seen is None:
             return math.nan
@@ -266,7 +266,7 @@ def _next_velocities(fit: RigFit) -> tuple[float, ...]:
 
 
 def _inside(model: RigModel, points: Array) -> tuple[Array, Array, NDArray[np.bool_]]:
-    """(x, y) of points in the picture and whether they are in it."""
+    """(x, y) of points in the picture, and whether they lie within it, by more than BORDER_PX."""
     x, y = model.camera.project(points)
     with np.errstate(invalid="ignore"):
         inside: NDArray[np.bool_] = (x > BORDER_PX) & (x < model.camera.width - 1 - BORDER_PX)

@@ -17,7 +17,7 @@ probability that a good pixel is called noisy.
 
 A dead pixel is one that hardly fires in light although its neighbours do. It cannot be recognised without light.
 
-Changes (`pixel_drift`) are found from frames of the same exposure in the same dark. Dark rates double every 8 to 10 K,
+Changes (`pixel_drift`) are found from frames of the same exposure in darkness. Dark rates double every 8 to 10 K,
 so a warmer sensor shows as a common factor, and faulty pixels show one by one.
 
 `pixels.npz` holds the arrays of a `PixelMap` by their names (`dead` is left out if unknown), and `about`, JSON text:
@@ -43,7 +43,7 @@ from calibration.files.npy_files import load_arrays
 from calibration.views import robust_sd
 
 LEAST_COUNTS = 10.0
-"""A pixel's mean counts in a block from which on chi-square describes their scatter; quieter ones are not judged."""
+"""Least mean counts in a block from which a pixel's scatter is judged; chi-square does not describe smaller counts."""
 LEAST_BLOCKS, MOST_BLOCKS = 8, 64
 _APART, _ROUNDS = 6.0, 8
 """An ordinary pixel counts at most this multiple of (sd + 1) above the expected counts; rounds of this selection."""
@@ -218,7 +218,7 @@ def hot_flux(signal: float, level: Array | float) -> Array:
 
 
 def frames_for(limit_flux: float, precision: float = PRECISION) -> int:
-    """Number of frames that measure a rate at the limit with this relative sd."""
+    """Number of frames that measure a rate at the limit with the relative sd `precision`."""
     return math.ceil(math.expm1(limit_flux) / (limit_flux * precision) ** 2)
 
 
@@ -279,8 +279,7 @@ def _chi_square_limit(dof: NDArray[np.int64], probability: float) -> Array:
 SIGNIFICANT = 5.0
 """Counting sds by which a rate must differ to count as changed."""
 MOST_RATIO = 2.0
-"""Common factor between two maps, as after 8 to 10 K, from which on limits and learned rates of the old one are wrong.
-"""
+"""Common factor between two maps, as after 8 to 10 K, from which on the old map's limits and rates are useless."""
 MOST_NEW_DEFECTS = 0.005
 """Largest share of all pixels that may have become defects."""
 LEAST_ALIKE = 0.5

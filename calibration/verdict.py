@@ -12,7 +12,7 @@ VerdictWord = Literal["passed", "failed"]
 SIGMAS: Final = 4.0
 """Standard deviations by which a result, such as the baseline, must differ from the stated one to count as wrong."""
 WORST_TIMES: Final = 4.0
-"""The picture's worst places (95 %) may have this many times the error asked for."""
+"""The 95th percentile of the error over the picture may be this many times the error asked for."""
 
 
 AT_M: Final = 5.0
@@ -103,8 +103,9 @@ def unguided(verdict: Verdict) -> Verdict:
 def more_poses(shown: int, what: str, found: tuple[float, float], asked: float, said: Callable[[float], str]) -> Reason:
     """The reason if data are simply too few, with an estimate of how many poses would be enough.
 
-    shown: number of poses so far. what: words for the error, with the verb. found, asked: errors (median, 95 %) and the
-    limit of the median; the text names the one that exceeds its limit more. said: turns an error into text.
+    shown: number of poses so far. what: words for the error, with the verb. found: median and 95th percentile of
+    the error over the picture. asked: limit of the median; the text names the one that exceeds its limit more. said:
+    turns an error into text.
     """
     over = [error / limit for error, limit in zip(found, (asked, WORST_TIMES * asked), strict=True)]
     worst = over[1] > over[0]

@@ -1,7 +1,7 @@
 """One view of a calibration board held still: where its corners lie, and when the line passed over each pixel.
 
 A pixel's passage is the mirror command at which the line's centre crosses it. The pixel's albedo is the same in every
-column, so the board's print does not bias the passage. It does bias the position of a stripe along a row.
+column, so the board's print does not bias the passage. The print does bias a stripe's position along a row.
 """
 
 from dataclasses import dataclass
@@ -18,7 +18,7 @@ USUAL_CORNER_SD_PX = 0.03
 FEWEST_CORNERS = 6
 """Fewest corners that give a board's pose, with some to spare."""
 LEAST_ACROSS_PX = 1.0
-"""Least extent of corners across their line, in pixels, for a pose; they are found to some 0.01 px."""
+"""Least `Corners.across_px` for a pose; corners are found to some 0.01 px."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -103,7 +103,7 @@ class BoardPose:
 
 
 MAD_TO_SD: Final = 1.4826
-"""Standard deviation of a normal distribution, divided by the median of the absolute values."""
+"""Standard deviation of a normal distribution, divided by the median of its absolute deviations."""
 
 
 def robust_sd(deviations: ArrayLike) -> float:

@@ -26,9 +26,9 @@ class BenchState:
 
     mirror: (n,) mirror position, as a command, in the middle of each exposure. velocity_per_s: (n,) its velocity, NaN
     if unknown. share: (n,) part of the exposure with the gate high. edge: (n,) bool, whether the gate changed during
-    the exposure. backward: (n,) bool, direction level at the start. line_s, scan_s: times of the markers' rising edges
-    in these frames. power_w: power behind an open gate, 0 while paused. jitter: (n,) or 0, deviation of the mirror from
-    `mirror`.
+    the exposure. backward: (n,) bool, level of the direction signal at the frame's start. line_s, scan_s: times of the
+    markers' rising edges in these frames. power_w: laser power that an open gate lets out, 0 if the laser is off.
+    jitter: (n,) or 0, deviation of the mirror from `mirror`.
     """
 
     mirror: Array
@@ -66,7 +66,7 @@ class Bench:
         return self._epoch_ns + round(time_s * NS_PER_S)
 
     def play(self, waveform: ScanWaveform, repeats: int, *, latency_s: float, rate_hz: float) -> None:
-        """Start the mirror's waveform `latency_s` from now."""
+        """Play a waveform `repeats` times at `rate_hz` points per second, starting `latency_s` from now."""
         with self._lock:
             start_s = self.now_s() + latency_s
             self._motion = Playing(waveform, repeats, start_s, rate_hz, self.lag.forward, self.lag.backward)
@@ -105,7 +105,7 @@ class Bench:
                 self._program.lower_gate(self.now_s())
 
     def abort_program(self) -> None:
-        """Take all outputs low from now on."""
+        """Take all outputs low from now on, until the next program."""
         with self._lock:
             self._aborted = True
             if self._program is not None:

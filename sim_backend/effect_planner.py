@@ -1,17 +1,18 @@
-"""Plans which effects to run: those the scene calls for, except those that provably change almost no decision.
+"""Plans which effects to run: those the scene calls for, except those that provably change almost no decision. A
+decision is what an estimator, or any other rule, concludes from a row's data in one column.
 
-Let a pixel detect m photons in a column's K frames, on average, and m + D with an effect. Per exposure the divergence
-of its bits is at most (D/K)^2 / (2 (e^(m/K) - 1)), so that over pixels and frames it is at most eps = sum D^2 / (2 m),
-and the data differ in total variation by at most sqrt(eps/2) (Pinsker's inequality [1]). The data also differ by no
-more than the probability that any of the D photons is seen, which is at most D: the better bound in the dark. The first
-bound is used for pixels with D < m, the second for the others, and the two add up (triangle inequality). No decision
-rule on a row's data can then differ more often than that.
+Let a pixel detect m photons in a column's K frames, on average, and m + D with an effect. Per exposure the
+Kullback-Leibler divergence of its bits is at most (D/K)^2 / (2 (e^(m/K) - 1)). Summed over pixels and frames it is at
+most eps = sum D^2 / (2 m), so the data differ in total variation by at most sqrt(eps/2) (Pinsker's inequality [1]). The
+data also differ by no more than the probability that any of the D photons is seen, which is at most D; this is the
+better bound in the dark. The first bound is used for pixels with D < m, the second for the others, and the two add up
+(triangle inequality). No decision can then change with a larger probability than that.
 
 Both bounds grow with power and exposure, so a plan for the largest power and exposure of a column holds for all smaller
-ones. For light that does not depend on the laser, the bound takes the laser as off and uses the worst row. The laser's
-effects are evaluated on sampled columns and rows that have a stripe, with all other effects present; the bound is twice
-the mean. If an effect's catalogue entry has a closed form that is small enough, its code is not even loaded. The
-smallest effects are left out first, as long as all that is left out together changes at most `MOST_CHANGED` of the
+ones. For light that does not depend on the laser, the bound assumes that the laser is off and uses the worst row. The
+laser's effects are evaluated on sampled columns and rows that have a stripe, with all other effects present; the bound
+is twice the mean. If an effect's catalogue entry has a closed form that is small enough, its code is not even loaded.
+The smallest effects are left out first, as long as all that is left out together changes at most `MOST_CHANGED` of the
 decisions.
 
 [1] A. B. Tsybakov, "Introduction to nonparametric estimation", Springer 2009, section 2.4.
@@ -37,7 +38,7 @@ MOST_CHANGED = 0.01
 MOST = PlannedFor(power_w=1.0, exposure_s=1e-3, exposures=100)
 """Values to plan for if it is not known what will be scanned; a line laser and an ordinary scan stay below them."""
 SAFETY = 2.0
-"""Safety factor on the mean over sampled rows and columns: the spread over them is less."""
+"""Safety factor on the mean over sampled rows and columns, for the differences between rows and columns."""
 SAMPLED_COLUMNS, SAMPLED_BANDS, BAND_ROWS = 16, 4, 8
 
 
@@ -65,8 +66,8 @@ class EffectPlan:
 def plan_effects(
     setting: Setting, planes: Array, planned_for: PlannedFor, wanted: Wanted = "planned"
 ) -> tuple[EffectPlan, FluxModel]:
-    """The plan, and the model with the effects that it keeps. planes: (n, 4), light planes at mirror positions over the
-    range.
+    """The plan, and the model with the effects that it keeps. planes: (n, 4), light planes at n mirror positions spread
+    over the range.
     """
     calls = {entry: entry.called(setting) for entry in CATALOGUE}
     candidates = [entry for entry, (called, _) in calls.items() if called and is_active(entry.name, wanted)]
@@ -124,7 +125,7 @@ def _largest_set(
 
 
 class _Bounds:
-    """Bounds of what may be left out of a model, found by evaluating its light."""
+    """Bounds how many decisions change if effects are left out of a model, by evaluating the model's light."""
 
     def __init__(self, model: FluxModel, planes: Array, planned_for: PlannedFor) -> None:
         self._model = model
@@ -177,7 +178,9 @@ def _changed(change: Array, least: Array) -> Array:
 
 
 def _bands(rows: int) -> list[tuple[int, int]]:
-    """Bands of rows that are looked at, spread over the picture; all rows of a small one."""
+    """The bands of rows that are sampled, spread over the picture: first row, and that after the last. A small picture
+    is one band.
+    """
     if rows <= SAMPLED_BANDS * BAND_ROWS:
         return [(0, rows)]
     middles = (np.arange(SAMPLED_BANDS) + 0.5) * rows / SAMPLED_BANDS

@@ -59,7 +59,9 @@ def effects_report(world: "SimulatedWorld", *, power_w: float, exposure_s: float
 def flux_row(
     world: "SimulatedWorld", row: int, command: float, power_w: float, exposure_s: float
 ) -> Mapping[str, Array]:
-    """Photons per exposure (width,) of a row, by effect of light or dark counts; zeros for effects that are off."""
+    """Detections per exposure along a row (width,), from each effect that adds light or dark counts; zeros for effects
+    that are off.
+    """
     model, view, limits = world.flux_model, world.setting.view, world.model.scanner.command_range
     (sheets,) = world.fan.sheets(world.model.sheets, np.array([command]), view.rows, [0.0], limits)
     lit: dict[str, Array] = {}
@@ -89,7 +91,9 @@ def _line(decision: EffectDecision, share: float, costs: Mapping[str, float | No
 def _light(
     world: "SimulatedWorld", model: FluxModel, joules: float, exposure_s: float, exposures: int
 ) -> tuple[dict[str, float], dict[str, float]]:
-    """Mean photons per frame over the mirror positions, and us per frame, of every effect of the laser."""
+    """For every effect on the laser's light: detected photons per frame, averaged over mirror positions, and
+    microseconds per frame.
+    """
     view = world.setting.view
     sheets = [view.sheet(plane) for plane in world.sampled_planes]
     _parts(model, sheets[0], 0, 1, np.float32)  # compiles the kernels, in the precision that frames are drawn in

@@ -30,7 +30,7 @@ class GateProgram:
 
     @property
     def ended(self) -> bool:
-        """Whether the last word is over, at the time to which the program was advanced, or the program aborted."""
+        """Whether the program was aborted, or its last word is over at the time to which it was advanced."""
         return self._words_left == 0
 
     @property
@@ -77,7 +77,7 @@ class GateProgram:
 
     def levels(self, from_s: float, until_s: float) -> tuple[Array, NDArray[np.int64]]:
         """Level changes before until_s, beginning with the one that set the level at from_s: times (n,) and output
-        words (n,). If the program starts later, the first is 0 at from_s.
+        words (n,). If the program starts after from_s, the first word is 0 at from_s.
         """
         times = np.array(self._times)
         first = max(int(np.searchsorted(times, from_s, side="right")) - 1, 0)
@@ -89,7 +89,7 @@ class GateProgram:
         return at, words
 
     def forget(self, before_s: float) -> None:
-        """Drop the history before `before_s`, which is no longer needed."""
+        """Drop the level changes that are needed only for times before `before_s`."""
         keep = 0
         while keep + 1 < len(self._times) and self._times[keep + 1] <= before_s:
             keep += 1

@@ -1,8 +1,8 @@
 """The motion of the simulated mirror and the levels of the scanner's marker outputs, at any time.
 
-The command has the value of point i at the start of point i and goes linearly to the next one. The mirror follows it
-with the lag of its direction of motion. Marker outputs have no lag. A real mirror also shakes. Times are seconds of the
-bench.
+The command has the value of point i at the start of point i and goes linearly to the next one. The mirror lags
+behind the command by a time that depends on its direction of motion. Marker outputs have no lag. A real mirror also
+shakes. Times are seconds of the bench.
 """
 
 import math

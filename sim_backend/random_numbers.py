@@ -12,8 +12,8 @@ One AES round of 256 bits takes one cycle on x86 with VAES, two with AES-NI or o
 give the same bits, many times as slowly.
 
 Exponentials are written without branches or calls, so that loops over them become vector instructions. With
-k = round(t) and f = k - t, |f| <= 1/2:  2^-t = 2^-k 2^f, the latter by its Taylor series. Relative error against 50
-digits: for `power_of_half` 3e-13 (series to f^10) and the effect of rounding t; for `one_minus_exp_minus` 4e-16 (to
+k = round(t) and f = k - t, |f| <= 1/2:  2^-t = 2^-k 2^f, the latter by its Taylor series. Relative errors, found with
+50 digits: for `power_of_half` 3e-13 (series to f^10) and the effect of rounding t; for `one_minus_exp_minus` 4e-16 (to
 r^13, with r = f ln 2 in two parts). `one_minus_exp_minus_32` is a float32 version for uses where six digits suffice.
 The numbers that loops need come as a tuple from the kernel's caller (`HALVING`, `ROUGHLY`). If they were constants,
 LLVM would load them anew for every vector: 24 of the 59 instructions of a loop over `power_of_half`.
@@ -47,7 +47,7 @@ _PIXELS = ir.VectorType(_I16, _VECTOR_PX)
 _PACKED: Final = (*range(8), *range(16, 24), *range(8, 16), *range(24, 32))
 """Order in which x86 packs the pixels of two vectors into 32 bits by one instruction."""
 PLACE: Final = tuple(8 * (0, 2, 1, 3, 4, 6, 5, 7)[x // 8] + 7 - x % 8 for x in range(WORD_PX))
-"""Place of the level of pixel x of a word, so that bits come out as `packbits` has them."""
+"""Index at which the level of pixel x of a word is stored, so that the bits drawn have the order of `packbits`."""
 
 _S_BOX = bytes.fromhex(
     "637c777bf26b6fc53001672bfed7ab76ca82c97dfa5947f0add4a2af9ca472c0b7fd9326363ff7cc34a5e5f171d8311504c723c3"
@@ -249,8 +249,8 @@ _S27, _S30, _S31 = np.uint64(27), np.uint64(30), np.uint64(31)
 
 
 def mixed(z: Any) -> Any:
-    """64 bits, a uint64 or an array of them, each of which depends on all bits of z. Products wrap: see numpy's
-    errstate.
+    """64 bits, a uint64 or an array of them, each of which depends on all bits of z. Products overflow on
+    purpose; `np.errstate(over="ignore")` keeps numpy from warning of it.
     """
     z = (z ^ (z >> _S30)) * _MIX_1
     z = (z ^ (z >> _S27)) * _MIX_2
@@ -273,7 +273,7 @@ LOG2_E: Final = 1.4426950408889634
 _LN2_HIGH, _LN2_LOW = 6.93147180369123816490e-01, 1.90821492927058770002e-10
 """ln 2 in two parts, the high one with 20 zeros at its end: its product with k is exact (Cody and Waite)."""
 _ROUNDER, _ROUNDER_32 = 1.5 * 2.0**52, 1.5 * 2.0**23
-"""Added to a float64 or float32 it leaves the nearest integer in the last bits."""
+"""If it is added to a float64 or float32, the last bits of the sum are the nearest integer."""
 _C13, _C12, _C11, _C10, _C9, _C8 = 1 / 6227020800, 1 / 479001600, 1 / 39916800, 1 / 3628800, 1 / 362880, 1 / 40320
 _C7, _C6, _C5, _C4, _C3 = 1 / 5040, 1 / 720, 1 / 120, 1 / 24, 1 / 6
 
@@ -282,7 +282,7 @@ HALVING: Final[dict[Any, tuple[Any, ...]]] = {
     np.float64: (1010.0, _ROUNDER, *_SERIES),
     np.float32: tuple(map(np.float32, (120.0, _ROUNDER_32, *_SERIES))),
 }
-"""Constants of `power_of_half`, by precision: most halvings, rounder, series."""
+"""Constants of `power_of_half`, by precision: largest t, rounder, series."""
 _SERIES_32 = (1 / math.factorial(n) for n in (0, 2, 3, 4, 5, 6))
 ROUGHLY: Final = tuple(map(np.float32, (80.0, LOG2_E, _ROUNDER_32, math.log(2), *_SERIES_32)))
 """Constants of `one_minus_exp_minus_32`: largest t, scale, rounder, ln 2, series without its linear term."""

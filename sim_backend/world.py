@@ -28,7 +28,7 @@ from sim_backend.scenes.medium import Section
 from sim_backend.scenes.scene import CLEAR, BoardPlace, load_scene, load_surfaces, with_board_at, with_fog
 
 LEAST_PIXELS = 2
-"""Least size of the camera each way: light is computed with the slopes of the rays from pixel to pixel."""
+"""Least width and height of the camera, in pixels: light is computed from the rays' change from pixel to pixel."""
 DEFAULT_GEOMETRY = Path(__file__).parent.parent / "config" / "simulated-rig.yaml"
 
 
@@ -68,7 +68,7 @@ class WorldConfig(KindConfig):
     kind: str = "simulated"
     geometry: str | None = None
     """Rig-model file of the rig as it really is; the bundled simulated rig by default. If the file has sheets that bow,
-    pass beside the mirror's axis or touch a cone, or rows that are exposed one after the other, so has the simulation.
+    pass beside the mirror's axis or touch a cone, or rows that are exposed one after the other, this is simulated.
     """
     scene: str = "street"
     """A bundled scene's name, a scene file, or a folder of surfaces."""
@@ -83,7 +83,7 @@ class WorldConfig(KindConfig):
     """Effects that are simulated, of those that the scene calls for: all but those that provably change next to nothing
     (`planned`), `all`, or a list of names (for ablations)."""
     command_grid: CommandGridConfig | None = None
-    """Columns in which the flux is held, for use without an application that calls `hold_columns`."""
+    """Columns within which the flux is held constant, if no application calls `hold_columns`."""
 
     @property
     def has_board(self) -> bool:
@@ -115,7 +115,7 @@ class SimulatedWorld:
             self.scene = with_board_at(self.scene, config.board_pose)
         u, v = camera.tangents()
         self.surfaces = load_surfaces(self.scene, folder, u, v)
-        """Depth, albedo and where they are trusted; the truth behind `truth`."""
+        """Depth, albedo and where they are trusted. `truth` is computed from them."""
         gain = detections_per_radiance(config.optics, config.sensor, config.line)
         motion = None
         if self.scene.motion is not None and is_active("motion", config.effects):
@@ -131,13 +131,13 @@ class SimulatedWorld:
         self.fan: LineFan = ONE_LINE
         """The lines that leave the mirror together."""
         self.grid = fine_grid(camera.width, self.model.scanner.command_range)
-        """Mirror positions the flux is computed at."""
+        """Cells of mirror positions; frames in one cell share one flux."""
         if config.command_grid is not None:
             grid = config.command_grid
             self.hold_columns(np.linspace(grid.first, grid.last, grid.columns))
 
     def plan_for(self, power_w: float, exposure_s: float, exposures: int) -> None:
-        """Choose the effects for columns of `exposures` frames of that exposure, at that power or less.
+        """Choose the effects for columns of `exposures` frames of `exposure_s` each, at `power_w` or less.
 
         Call it before the SPAD is configured. Otherwise the effects are chosen for `MOST`.
         """
@@ -184,10 +184,10 @@ class SimulatedWorld:
         self.fan = LineFan(tuple(offsets), 1 / len(offsets) if shared else 1.0)
 
     def hold_columns(self, commands: Array) -> None:
-        """Hold the flux constant within columns at these mirror commands (columns,): a pixel has the same probability
-        in all frames of a column.
+        """Hold the flux constant within columns at these mirror commands (columns,): a pixel has the same detection
+        probability in all frames of a column.
 
-        Call it before the run. Otherwise the stripe moves within a column, as the mirror does.
+        Call it before the run. Otherwise the stripe moves within a column in steps of about a quarter of a pixel.
         """
         self.grid = column_grid(commands, self.model.scanner.command_range)
 
@@ -195,15 +195,15 @@ class SimulatedWorld:
         """Let no more light in. Only the sensor's own counts are left, and none of its effects is left out, however
         small.
 
-        Call it before the SPAD is configured. Only `plan_for` with other values than before undoes it.
+        Call it before the SPAD is configured. A later `plan_for` with other values undoes it.
         """
         kept = [entry for entry in CATALOGUE if entry.of_sensor or entry.kind == "bits"]
         wanted = [e for e in kept if e.called(self.setting)[0] and is_active(e.name, self.config.effects)]
         self._planned = self._plan()[0], FluxModel(self.setting, wanted)
 
     def mirror_positions(self, state: BenchState, period_s: float) -> Array:
-        """Mirror positions (n,) whose light n frames see, one period apart: those of the columns, with the mirror's
-        jitter.
+        """Mirror positions (n,) that set the light of n frames, one period apart: the mean position within the frame's
+        cell of `grid`, plus the mirror's jitter.
 
         If rows are exposed one after the other, (n, 2) for the first and the last row. NaN outside the grid.
         """
@@ -248,7 +248,7 @@ class SimulatedWorld:
         return effects_report(self, power_w=power_w, exposure_s=exposure_s, exposures=exposures)
 
     def flux_row(self, row: int, command: float, power_w: float, exposure_s: float) -> Mapping[str, Array]:
-        """Noise-free photons per exposure of an image row's pixels, by effect, at a mirror command."""
+        """Mean detections per exposure along an image row, for each effect that adds light or counts, at a command."""
         from sim_backend.effects_report import flux_row
 
         return flux_row(self, row, command, power_w, exposure_s)

@@ -1,1 +1,1 @@
-"""The calibration board: its print, its corners in a picture, and how much of the picture they cover."""
+"""The calibration board: its print, and how its corners are found in a picture."""

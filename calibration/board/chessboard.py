@@ -90,9 +90,9 @@ def known_lattice(picture: Picture, px: Array) -> Lattice | None:
 class _Seen:
     """Light around the corners of a grid.
 
-    map: to pixels, from positions in squares whose origin is the outer corner of the top left square. usual: usual
-    change of brightness at a corner, positive if the top left square is black. alike: share of the corners that have
-    such a change. own: change on the outer side of the uppermost row, as a share of the usual one; NaN where it is not
+    map: maps positions in squares, from the outer corner of the top left square, to pixels. usual: usual change of
+    brightness at a corner, positive if the top left square is black. alike: share of the corners that have such a
+    change. own: change on the outer side of the uppermost row, as a share of the usual one; NaN where it is not
     visible.
     """
 
@@ -215,7 +215,8 @@ def _median(values: Array) -> float:
 
 
 _SMALLEST_PARTS = ((4, 4), (3, 3))
-"""Inner corners of a chessboard that count as a part of one; small ones are more often found where none is."""
+"""Inner corners of a chessboard that count as a part of one; small ones are more often found where there is no
+board."""
 _FORMS_FOR_PARTS = ((1, 0.0), (1, 1.5), (2, 0.8))
 """(enlargement, smoothing), as in FORMS; few and quick ones, since they are tried after all of FORMS have failed."""
 _NOTHING = MatchedPoints(np.zeros((0, 2)), np.zeros((0, 2)), 0)
@@ -288,7 +289,7 @@ def _is_whole(lattice: Lattice, board: Board) -> bool:
 
 
 def _unlike(lattice: Lattice, board: Board) -> MatchedPoints:
-    """A part of the board, or another one."""
+    """The result for a lattice that is not the whole board: a part of the board, or another chessboard."""
     count = lattice.px.size // 2
     may_be = any(  # with x and y as they are or exchanged: the corners seen are all, or more may follow
         all(
@@ -329,7 +330,7 @@ def _from_top_left(px: Array, shown: Gray, board: Board) -> tuple[Array, bool]:
 
 
 def _top_left_is_black(px: Array, shown: Gray) -> bool:
-    """Whether squares of the top left one's colour are the darker ones, as seen between the corners."""
+    """Whether the top left square is black, judged by the brightness of all squares between the corners."""
     middles = (px[:-1, :-1] + px[:-1, 1:] + px[1:, :-1] + px[1:, 1:]) / 4
     height, width = shown.shape
     x = np.clip(np.round(middles[..., 0]).astype(int), 0, width - 1)

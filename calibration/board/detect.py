@@ -52,8 +52,8 @@ off."""
 _GROWTH_SQUARES = 1.6
 """Distance from the known part of a board to the next corners; beyond, a map through a few markers is too wrong."""
 _OUTLIER_SDS = 6.0
-"""Sds that a corner may lie off the map. The limit is at least _LEAST_OUTLIER_PX and _LEAST_OUTLIER_SQUARES, since a
-lens bends more than the map."""
+"""Sds that a corner may lie off the map. The limit is at least _LEAST_OUTLIER_PX and _LEAST_OUTLIER_SQUARES, since the
+map does not follow a lens exactly."""
 _LEAST_OUTLIER_PX = 0.3
 _MOST_USUAL_SDS = 4.0
 """Largest ratio of a corner's sd to the median one: beyond, the drawing was matched to something else."""
@@ -100,7 +100,7 @@ def find_corners(picture: NDArray[np.generic], board: Board, defects: NDArray[np
 
 
 def _another(sighting: MatchedPoints, rest: NDArray[np.bool_], limit_px: float, board: Board) -> bool:
-    """True where points off the best board, `rest`, lie on a second one."""
+    """Whether the points `rest`, which are not on the best board, lie on a second one."""
     if rest.sum() < 4 * _SECOND_BOARD_MARKERS:
         return False
     second = fit_map(sighting.points_m[rest], sighting.px[rest], limit_px, board.size_m)
@@ -139,7 +139,7 @@ def _refined(
 
 
 def _close_to(known_m: Array, board: Board) -> NDArray[np.int32]:
-    """Ids of the corners so close to known points that the map through those holds there."""
+    """Ids of the corners so close to known points that the map through these points holds there."""
     away = np.linalg.norm(board.corners_m[:, None, :2] - known_m, axis=-1).min(axis=1, initial=np.inf)
     return np.flatnonzero(away <= _GROWTH_SQUARES * board.square_m).astype(np.int32)
 

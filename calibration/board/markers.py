@@ -20,7 +20,7 @@ from calibration.board.board import Board
 Places = NDArray[np.int64]
 
 _NEXT_SQUARES = 2.5
-"""Farthest from a placed marker to the next while few are placed, later twice that. Neighbours: 1.4 squares."""
+"""Largest distance in squares from a placed marker to the next; doubled once several are placed. Neighbours: 1.4."""
 _OFF_SQUARES = 0.3
 """Largest distance of a marker of this lattice from the middle of a square."""
 _MOST_TURN_RAD = 0.6
@@ -130,7 +130,7 @@ def _support(layout: _Layout, ids: Places, lattice: Places) -> tuple[int, Places
 
 
 def _lattice(px: Array, marker_squares: float) -> tuple[NDArray[np.bool_], Places]:
-    """The lattice that holds the most of the markers (n, 4, 2): a mask (n,) of these, and (n, 2) columns and rows."""
+    """The lattice that holds most of the markers (n, 4, 2): a mask (n,) of these, and their (n, 2) columns and rows."""
     best, places = np.zeros(len(px), np.bool_), np.zeros((len(px), 2), np.int64)
     tried = np.zeros(len(px), np.bool_)
     for start in np.argsort([-cv2.contourArea(corners.astype(np.float32)) for corners in px]):
@@ -167,7 +167,7 @@ def _grown(px: Array, start: int, marker_squares: float) -> tuple[NDArray[np.boo
 def _map_to_lattice(places: Places, px: Array, marker_squares: float) -> Array | None:
     """Map (3, 3) from pixels to squares, with the first one's middle at (0, 0); None if the markers determine none.
 
-    It is affine for few markers, since its errors grow less with distance.
+    For few markers it is affine: the errors of an affine map grow less with distance than those of a homography.
     """
     corners = np.array([[-1, -1], [1, -1], [1, 1], [-1, 1]]) * (marker_squares / 2)
     lattice, seen = (places[:, None] + corners).reshape(-1, 2), px.reshape(-1, 2)

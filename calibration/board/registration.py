@@ -71,7 +71,7 @@ class Drawing:
 
 
 _BENDS = ((30, 3), (12, 2))
-"""(least number of points, degree of the polynomial): two points to a term at least."""
+"""(least number of points, degree of the polynomial): at least two points per term."""
 _FEWEST_POINTS = 4
 _KEPT_SHARES = (0.8, 0.8, 1.0)
 """Shares of the points, the best fitting ones, that the polynomial is fitted to in turn: outliers must not bend it."""
@@ -167,12 +167,12 @@ _LEAST_REACH_PX = 4
 _SEARCH_SQUARES = 0.25
 """Farthest search for a corner: beyond, a shift could mistake one module of a marker for the next."""
 _POWERS = [(i, j) for i in range(4) for j in range(4 - i)]
-"""Powers of x and y that place the drawing around a corner: enough for a tilt and a lens over two squares."""
+"""Powers of x and y that place the drawing around a corner: enough for tilt and lens distortion over two squares."""
 _AROUND = np.stack(np.meshgrid(*2 * [np.linspace(-1.25, 1.25, 7)]), axis=-1).reshape(-1, 2)
 """Points, in units of the reach, that the polynomial is fitted to: over the patch and a pixel more on every side."""
 _STEPS = 4
 _SETTLED_SDS = 0.1
-"""A step of fewer sds of the corner ends the iteration: the remaining error is a tenth of the step."""
+"""A step shorter than this, in sds of the corner, ends the iteration: the remaining error is a tenth of the step."""
 _OUTLIER_SDS = 5.0
 _DARK_SHARE = 0.05
 """Least variance of a pixel, as a share of the variance on white."""

@@ -1,10 +1,10 @@
 """Contradictions that a single unmoved rig cannot produce: differences between sweeps (waves), and shifts between
 views.
 
-Nothing moved while the sweeps of a view were taken. So their residuals, binned over the mirror's command, may differ
-only by noise and by one constant for each direction (the remaining error of the lag). All other differences are waves
-of single sweeps, a sign that exposures are not locked to the mirror. If no view has two sweeps, they are measured
-against each sweep's own straight line. Medians in bins keep bad passages out.
+It is assumed that nothing moved during the sweeps of a view. So their residuals, binned over the mirror's command, may
+differ only by noise and by one constant for each direction (the remaining error of the lag). All other differences are
+waves of single sweeps, a sign that exposures are not locked to the mirror. If no view has two sweeps, waves are
+measured against each sweep's own straight line. Medians in bins keep bad passages out.
 
 The fit of the whole rig may move a board by a millimetre to fit the light planes. So each pose is fitted again to the
 corners alone, with camera and mirror as fitted before. The distance of the passages from the light planes then shows
@@ -30,7 +30,7 @@ from calibration.rig_fit.solve import corner_weights
 from calibration.views import FEWEST_CORNERS, BoardPose, View, robust_sd
 
 BINS = 24
-"""Bins of the command range: wide enough for tens of passages each, narrow enough for a wave of several turns."""
+"""Bins of the command range: wide enough for tens of passages each, narrow enough for a wave of several periods."""
 _FEWEST_IN_BIN = 5
 _LEAST_SHARE_IN_BIN = 0.25
 """Least number of passages in a bin, as a share of the usual number in the sweep's bins: those of a nearly empty bin
@@ -39,7 +39,7 @@ _FEWEST_BINS = 4
 _MEDIAN_VARIANCE = np.pi / 2
 """Variance of a median in units of the mean's, normal distribution."""
 _MEDIAN_TAKES = 0.8
-"""The robust scatter of n values around their own median is (n - 0.8) / n of the true (Croux, Rousseeuw, 1992)."""
+"""The robust scatter of n values around their own median is (n - 0.8) / n of the true one (Croux, Rousseeuw, 1992)."""
 NOISE_SIGMAS = 4.0
 """Standard deviations of a mean square up to which it may be noise."""
 

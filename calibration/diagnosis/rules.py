@@ -239,8 +239,8 @@ _SPEEDS = "scan both ways (scan.bidirectional), at two speeds or more (scan.expo
 def lag_lack(velocities_per_s: Sequence[float], *, mean_will_do: bool) -> list[Reason]:
     """Reasons why sweeps do not determine both lags.
 
-    mean_will_do: whether the mean of the lags is enough, as for planes, which are then right at one speed in both
-    directions.
+    mean_will_do: whether the mean of the lags is enough, as for planes: they are then right for sweeps at one speed in
+    both directions.
     """
     ways = {velocity > 0 for velocity in velocities_per_s}
     if not ways:
@@ -270,7 +270,7 @@ sweeps by as much as the sweeps differ, up to 1.35 times as much in 23 simulated
 class FitEvidence:
     """Evidence from a fit and the poses of its boards; what is unknown has its default.
 
-    expected_m, worst_m: predicted sd of the depth at the distance asked for, median and 95th percentile of the picture.
+    expected_m, worst_m: predicted sd of depth at the distance asked for, median and 95th percentile over the picture.
     wave_m: depth error there of one sweep against another of the same view; wave_noise_m: its largest value that may be
     noise. shift_m: depth error of a view against the others; shift_noise_m: its largest value that may be noise;
     moved_after: the view after which the rig moved, if one move explains the shifts. misfit: factor by which the
@@ -327,9 +327,9 @@ def judge_refusal(
 
 
 _REFUSED_FOR = {"one-pose": "too-few-poses", "coplanar": "no-tilt"}
-"""From the reason why a fit was impossible to the reason in the verdict: the lack of data behind it."""
+"""For reasons why a fit was impossible: the verdict's reason, which is the lack of data behind it."""
 _SEEN_AT_ONCE = ("no-board", "wrong-board", "board-half-out", "mirrored", "two-boards", "no-line")
-"""Faults of single views that leave too few to be used."""
+"""Faults of single views, due to which too few views can be used."""
 
 
 def _contradictions(fit: FitEvidence, asked: AccuracyGoal, imprecise: bool) -> list[Reason]:

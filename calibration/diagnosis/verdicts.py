@@ -41,8 +41,8 @@ _STEP = 1e-6
 
 @dataclass(frozen=True, slots=True, eq=False)
 class JudgedCamera:
-    """The verdict on a camera; sd of a pixel's place along the row (median, 95 %); share of the picture within all
-    corners.
+    """The verdict on a camera. sd_px, worst_px: median and 95th percentile over the picture of the sd of a pixel's ray
+    along the row. coverage: share of the picture within the outline of all corners.
     """
 
     verdict: Verdict
@@ -177,8 +177,8 @@ class JudgedRig:
 def goal(
     worth: Sensitivity, accuracy_m: float | None = None, at_m: float = AT_M, stated_baseline_m: float | None = None
 ) -> AccuracyGoal:
-    """The accuracy asked for: sd of depth at `at_m`, the depth of `worth`. accuracy_m None: the depth error that
-    ACCURACY_PX causes.
+    """The accuracy asked for, as sd of depth at `at_m`. worth: the sensitivity there. accuracy_m None: the depth error
+    that ACCURACY_PX causes.
     """
     return AccuracyGoal(ACCURACY_PX * worth.per_pixel_m if accuracy_m is None else accuracy_m, at_m, stated_baseline_m)
 

@@ -1,5 +1,5 @@
-"""Reading .npy and .npz files from any source. The size of an array that a header states is not trusted, and whatever
-numpy, zipfile and zlib raise for damaged bytes is a ValueError.
+"""Reading .npy and .npz files from any source. The size of an array that a header states is not trusted, and any
+exception of numpy, zipfile and zlib for damaged bytes becomes a ValueError.
 
 numpy allocates an array as large as its header says before it reads the first number. Here an array of that size must
 first fit into the file.

@@ -142,7 +142,7 @@ def camera_content(camera: Camera) -> dict[str, Any]:
 CALIBRATION_FILE: Final = "calibration.yaml"
 """Name of a calibration file wherever the project writes one."""
 _PLAIN = {"row_delay_s": 0.0, "gate_delay_s": 0.0, "colour_skew_s": 0.0, "marker_rising": True}
-"""Fields that a model and its file have under the same name, and the values of those that the file leaves out."""
+"""Fields with the same name in a model and its file. A field is left out of the file if it has the value given here."""
 
 
 def load_rig_model(path: str | os.PathLike[str]) -> RigModel:

@@ -140,7 +140,7 @@ MAX_BYTES: Final = 64 << 20
 MAX_DEPTH: Final = 64
 """Most levels of nested lists and mappings."""
 MAX_NODES: Final = 4_000_000
-"""Most values that a file may write out."""
+"""Most values in a file, without those that aliases repeat."""
 MAX_REPEATED: Final = 100_000
 """Most values that aliases may repeat: with nested aliases, nine lines can stand for a billion values."""
 MAX_WHOLE: Final = 1 << 64

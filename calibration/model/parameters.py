@@ -166,7 +166,7 @@ def one_speed(velocities_per_s: ArrayLike) -> bool:
 
 
 def untold(velocities_per_s: Sequence[float]) -> Array:
-    """(n, 3): changes of (position, lag forward, lag backward) that no sweep shows, scaled to 1 s in the larger lag."""
+    """(n, 3): changes of (position, lag forward, lag backward) that no sweep shows; the larger lag's change is 1 s."""
     velocity = np.asarray(velocities_per_s, np.float64)
     if velocity.size == 0:
         return np.zeros((0, 3))

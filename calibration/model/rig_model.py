@@ -59,7 +59,7 @@ class Covariance:
 
 
 class Lag(NamedTuple):
-    """Seconds by which the mirror follows its command, for each sweep direction (forward: rising command)."""
+    """Seconds by which the mirror lags behind its command, for each sweep direction (forward: rising command)."""
 
     forward: float = 0.0
     backward: float = 0.0
@@ -87,7 +87,7 @@ class Identity:
 class RigModel:
     """Camera, scanner, lag, defects and provenance of one rig.
 
-    speed_range_per_s: command speeds at which the lag was measured, None if it was not measured.
+    speed_range_per_s: lowest and highest command speed for which the lag holds; None if the lag was not measured.
     source_m: (3,) where the light leaves the mirror, camera frame; None if unknown.
     defects: (height, width) bool, True = pixel not to be used; None if unknown.
     dark_rate_per_s: (height, width) float32, counts per second in the dark; None if unknown.

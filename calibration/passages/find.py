@@ -148,7 +148,7 @@ which the pixel's width hardly matters."""
 MOST_LOSS = 2.0
 """Most by which one pixel's log-likelihood counts against a shape, so that no single bad pixel chooses for all."""
 LEAST_SAMPLE, SAMPLE = 50, 300
-"""Pixels from which the shape is chosen: at most SAMPLE. From fewer than LEAST_SAMPLE it is not kept for others."""
+"""The shape is chosen from at most SAMPLE pixels. If there are fewer than LEAST_SAMPLE, other pixels do not use it."""
 LEAST_SIGNIFICANCE = 5.0
 """Least significance of the line, in standard deviations."""
 MOST_MISFIT = 5.0
@@ -302,10 +302,10 @@ def _around(sums: ColumnSums, position: Array, start: Array, near: int) -> tuple
 
 
 LEFT_OUT = 10
-"""Columns left out on either side of the line's brightest one, at most MOST_LEFT_OUT of all columns."""
+"""Columns left out on either side of the one that lights the pixel most, but at most MOST_LEFT_OUT of all columns."""
 MOST_LEFT_OUT = 1 / 12
 LEAST_COUNTS = 30.0
-"""Least number of detections per pixel for a picture by room light: the median over its brighter half."""
+"""Least number of detections per pixel for a picture by room light, as the median over the brighter half."""
 
 
 def flux_picture(sweeps: tuple[SweepCounts, ...]) -> NDArray[np.float32]:

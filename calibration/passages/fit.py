@@ -9,9 +9,9 @@ behind the line, and the line. Line, pixel and the line's travel within a column
 sigma describes all three together. `LineShape.box`, the width of pixel and travel in widths of the line, says how flat
 they make the peak. That suffices if few frames hold a 1. If many do, the motion of the line within a column matters:
 the frames of a column see different fluxes, and their 1s follow the mean of their probabilities, not the probability at
-their mean flux. With `LineShape.travels` sigma describes only line and pixel, and with frames at places u of the column
+their mean flux. With `LineShape.travels` sigma describes line and pixel alone, and a column's frames lie at places u:
 
-    flux(t) = levels - log mean over u of exp(-area line(t + u)),    |u| < 1/2
+    flux(t) = levels - log mean over u of exp(-area line(t + u)),    |u| < 1/2,    line = phi(z) / sigma
 
 theta: (pixels, 5): BEFORE, AFTER, AREA, CENTRE and the logarithm of SIGMA. Sigma is common to the pixels of a group (a
 part of the picture), the others belong to each pixel. The fit uses Fisher scoring on all pixels at once, with damping

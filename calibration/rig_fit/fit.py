@@ -34,7 +34,7 @@ MOST_IDLE_ROUNDS = 4
 SETTLED_SHARE = 0.02
 """Relative change of the noise that is still allowed in the last round."""
 MOST_ODD_SHARE = 1 / 3
-"""Largest share of the views with passages that may be dropped; if more do not fit, these views are not the fault."""
+"""Largest share of the views with passages that may be dropped; if more do not fit, the fault is elsewhere."""
 
 
 @dataclass
@@ -166,7 +166,7 @@ class RigFit:
     """A fitted rig. Per view, in the order of `views`: poses, corner_residual_px (n, 2) predicted minus seen, sweeps.
 
     left_out: names of views without corners; outliers: names of views that do not fit the others and were not used.
-    noise: estimated from the residuals; corner_scale: times `noise.corner_sd_px` it is the sd of the usual corner.
+    noise: estimated from the residuals; corner_scale: median sd of the corners as a multiple of `noise.corner_sd_px`.
     misfit: factor by which variances were multiplied, 1 if the model describes everything. condition: condition number
     of the scaled equations of the shared parameters. converged: False if contradictory data keep the fit from
     converging. decisions: about terms and lags. free: the fitted parameters, where the names of one group share a
@@ -215,7 +215,7 @@ class RigFit:
 def result_of(
     fit: Rounds, left_out: tuple[str, ...], board: Board, start: RigModel | None, velocities: Array
 ) -> RigFit:
-    """The result of finished rounds. What they do not determine is taken from `start`, if there is one.
+    """The result of finished rounds. Properties that were not fitted are taken from `start`, if there is one.
 
     left_out: names of views without corners. velocities: the signed velocities of all sweeps. Raises Degenerate if
     depth is almost unknown.

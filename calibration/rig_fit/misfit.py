@@ -30,8 +30,8 @@ LEAST_OWN_SHARE = 1e-7
 class TermDecision:
     """A decision about a term.
 
-    value, sd: what it is or would be, in its own unit; NaN if unknown. along: name and value of the terms that would be
-    added with it. gain: decrease of chi2 with all of them.
+    value, sd: as fitted, or as it would be, in the term's own unit; NaN if unknown. along: name and value of the terms
+    that would be added with it. gain: decrease of chi2 with all of them.
     """
 
     name: str
@@ -118,7 +118,7 @@ def lag_decisions(
 
 
 def first_order(problem: RigProblem, solution: RigSolution, open_one: TermDecision) -> Array:
-    """(p,) change of all shared parameters if this term, and those in its `along`, were added."""
+    """(p,) change of all shared parameters if the term of `open_one`, and those in its `along`, were added."""
     taken = dict((*open_one.along, (open_one.name, open_one.value)))
     at, values = problem.terms.at(tuple(taken)), np.array(list(taken.values()))
     inverse, _ = scaled_inverse(problem.tie.T @ solution.matrix @ problem.tie)
@@ -128,7 +128,7 @@ def first_order(problem: RigProblem, solution: RigSolution, open_one: TermDecisi
 
 
 def corner_noise(problem: RigProblem, solution: RigSolution, noise: Noise) -> float:
-    """Corner sd (pixels) from the corners alone. Passages that contradict the corners would only make them seem
+    """Corner sd (pixels) from the corners alone. Passages that contradict the corners would make the corners seem
     noisy."""
     p = len(problem.terms.names)
     shared: Array = np.zeros((p, p))
@@ -153,7 +153,7 @@ def corner_noise(problem: RigProblem, solution: RigSolution, noise: Noise) -> fl
 SCANNER_MOVES = (*AXIS, "angle_0")
 """Parameters that change when a scanner is knocked: five of six, since a shift along the axis changes nothing."""
 ODD_CHI2 = 60.0
-"""Least fall of chi2 if an odd view has its own place of the scanner; chance exceeds 20 once in a thousand views."""
+"""Least fall of chi2 if an odd view gets a scanner place of its own. Chance alone gives 20 once in a thousand views."""
 ODD_TIMES = 8.0
 """Least such fall as a multiple of the other views' median, in case the model fits none of the views well."""
 EXPLAINED_SHARE = 0.05
@@ -162,7 +162,7 @@ LEAST_EXPLAINED hold as well."""
 OTHERS_SHARE = 0.3
 """Least share of the misfit that must be left if any other view has its own place of the scanner instead."""
 LEAST_EXPLAINED = 2.0
-"""Least misfit, as a factor on the variances, for this."""
+"""Least misfit, as a factor on the variances, at which EXPLAINED_SHARE and OTHERS_SHARE are applied."""
 FEWEST_TO_TELL = 4
 """Fewest views with passages among which one can be odd."""
 UNDECIDED_SD = 2.5
@@ -226,7 +226,7 @@ def widening(problem: RigProblem, solution: RigSolution, decisions: Sequence[Ter
 
 
 class Misfit(NamedTuple):
-    """Chi2 and the part of it expected from noise, for the corners and for slow variations over the sweeps."""
+    """(chi2, chi2 expected from noise) of the corners and of slow variations over the sweeps."""
 
     corners: tuple[float, float]
     slow: tuple[float, float]

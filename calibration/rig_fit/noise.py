@@ -25,9 +25,9 @@ BINS = 1024
 """Bins of the whole command range: several per column. Jitter hardly changes within a bin."""
 MOST_REACH_BINS = 96
 LEAST_FACTOR = 0.3
-"""Least factor on the passages' own sds: they are not assumed to be stated more than three times too large."""
+"""Least factor on the passages' own sds: these are assumed to be at most about three times too large."""
 TAIL_SD = 3.0
-"""Sds from which on an error counts as unlikely, and pulls no more than one of this size."""
+"""Sds from which on an error counts as unlikely, and pulls the fit no more than an error of this size."""
 OUTLIER_SD = 6.0
 """Sds from which on a deviation is an outlier, and does not count."""
 CUT_SD = 4.0
@@ -150,7 +150,7 @@ def passage_noise(residuals: Sequence[Array], sightings: Sequence[Sighting]) -> 
 
 
 def bin_starts(seen: Sighting, reach: float) -> NDArray[np.int64]:
-    """Indices in a view's passages at which the bins begin whose passages share the mirror's jitter."""
+    """Indices in a view's passages at which bins begin. Passages of one bin share the mirror's jitter."""
     first = np.zeros(len(seen.command), bool)
     for sweep in seen.sweeps:
         command = seen.command[sweep]
@@ -160,8 +160,8 @@ def bin_starts(seen: Sighting, reach: float) -> NDArray[np.int64]:
 
 
 def tail_weight(normalised: Array, usual: float = 1 / MAD_TO_SD) -> Array:
-    """Weight of errors in units of sd. usual: median of their sizes if the sd is right. If most errors are large, they
-    are no outliers."""
+    """Weights of errors that are in units of their sd. usual: median of the absolute errors if the sd is right. If the
+    median is larger, the sd is taken to be too small."""
     away = np.abs(normalised)
     if away.size:
         away = away / max(1.0, float(np.median(away)) / usual)

@@ -1,6 +1,6 @@
 """The state of a rig's fit (model, timing, poses, residuals), the sightings to which it is fitted, and first values.
 
-A sighting is a pose's corners and passages, cleaned and in the order that the fit needs.
+A sighting is a view's corners and passages, cleaned and in the order that the fit needs.
 
 First values are poses from corners, planes from passages, and the mirror's axis from the planes. With the poses known,
 every passage is a point in space that the light met at a command c. For a line turned about an axis, x = d(c) - b(c) y
@@ -220,7 +220,7 @@ def _moved(pose: BoardPose, change: Array) -> BoardPose:
 
 
 _ORDERS = (3, 1, 3)
-"""Orders of d, b and e in the command: enough for tangents of angles up to a quarter of a right angle either way."""
+"""Orders of d, b and e in the command: enough for tangents of angles from -22.5 to 22.5 degrees."""
 POSES_FOR_PLANES = 5
 """Fewest boards at one speed for planes: on fewer boards, a command's light gives too few lines for a good plane."""
 MOST_FIRST_LAG_S = 1e-3
@@ -422,7 +422,9 @@ def check_depth(
     misfit: float = 1.0,
     outliers: Sequence[str] = (),
 ) -> None:
-    """Raise Degenerate if the poses hardly determine depth, even without the misfit, or if the line reaches nothing."""
+    """Raise Degenerate if the poses hardly determine depth, even if the misfit were removed, or if the line reaches
+    nothing.
+    """
     camera = model.camera
     x, y = np.meshgrid(np.linspace(0.1, 0.9, 7) * camera.width, np.linspace(0.1, 0.9, 5) * camera.height)
     for at_m in (AT_M, float(np.median([np.linalg.norm(pose.position_m) for pose in poses]))):

@@ -6,7 +6,7 @@ meets the pixel's ray on the board. With F the distance of that point X from a s
 With the ray r, X = t r on the board's plane m.(X - P) = 0: a turn w and shift s of the board move X along r, which
 changes F by (n.r / m.r) (w.(m x (P - X)) + m.s), and a change dr of the ray changes it by t (n - (n.r / m.r) m).dr.
 
-The light that row y sees left the mirror at the position of the command lag - row_delay y earlier. The order of the
+When row y sees the light, the mirror is where its command was lag - row_delay y earlier. The order of the
 columns is that of `Terms.names`; the turns and shifts of the axis are those of `calibration.model.parameters`.
 """
 

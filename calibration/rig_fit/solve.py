@@ -132,11 +132,12 @@ def _products(rows: Rows, weight: Array) -> tuple[Array, Array, float]:
 
 MOST_STEPS = 12
 WEIGHED_STEPS = 6
-"""Steps after which the weights of outliers stay: with new weights in every step a fit may never converge."""
+"""Steps after which the weights of outliers are kept: with new weights in every step a fit may never converge."""
 CONVERGED_CHI2 = 1e-3
 """A fit has converged if the next step promises less gain in chi2 than this: 0.03 sd along any parameter."""
 ROUGH_SHARE = 1e-4
-"""A rough fit, good enough for decisions, ends if the next step promises less than 1 plus this share of chi2."""
+"""A rough fit, good enough for decisions, ends if the next step promises a gain in chi2 below 1 plus this share of
+it."""
 WORSE_CHI2 = 0.1
 """Amount by which a step may raise chi2: derivatives are exact except for how a bow changes along the line."""
 MOST_DAMPING = 1e8
@@ -230,7 +231,9 @@ def solved(problem: RigProblem, state: RigState, noise: Noise, *, roughly: bool 
 
 
 def scaled_inverse(matrix: Array) -> tuple[Array, float]:
-    """(inverse, condition number) of an information matrix, scaled. Raises Degenerate if it is practically singular."""
+    """(inverse, condition number at unit diagonal) of an information matrix. Raises Degenerate if this is practically
+    singular.
+    """
     weight = np.diag(matrix)
     if not np.all(np.isfinite(matrix)) or np.any(weight <= 0):
         raise Degenerate(

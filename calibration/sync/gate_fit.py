@@ -31,8 +31,8 @@ SPARE_FRAMES = 2
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Edge:
-    """An edge of the light. chi2: (times,), for the edge at each of the times. brightness, brightness_sd: extra ones
-    of a lit frame.
+    """An edge of the light. chi2: (times,), for the edge at each of the times. brightness, brightness_sd: number of
+    extra ones in a lit frame, and its sd.
 
     scatter: variance of the ones around the fit in units of that of photons; chi2 and the sd include it.
     """
@@ -48,8 +48,8 @@ def fit_edge(
 ) -> Edge:
     """Compute how well light that begins (rises) or ends at each of the times (times,), ascending, explains the frames.
 
-    ones, start_s: (frames,), 1s of each frame and start of its exposure, at least 8 frames. saturation: m above. Times
-    within two frames of either end count as impossible. Raises ValueError if all do.
+    ones, start_s: (frames,), 1s of each frame and start of its exposure, at least 8 frames. saturation: m in the
+    module's text. Times within two frames of either end count as impossible. Raises ValueError if all do.
     """
     weight = 1 / max(float(ones.mean()), 1.0)
     first, last = np.searchsorted(start_s, times_s[[0, -1]], side="right") - 1

@@ -1,9 +1,9 @@
 """The lags of light, mirror and frames, from sweeps over one unmoved scene at several speeds, in both directions.
 
 A pixel sees the line at one mirror position, whatever the speed. In a sweep with direction s = +1 or -1 and speed v
-that is at the command (`Passages` in calibration/views.py)
+the line reaches that position at the command (`Passages` in calibration/views.py)
 
-    command = position + s v (lag_s - row_delay y)
+    command = position + s v (lag(s) - row_delay y)
 
 Each pixel's position is eliminated as a weighted mean over the sweeps (`SharedPixels`); what remains is linear in the
 two lags and the row delay. Passages close in time are treated as correlated, since they share the mirror's jitter. The
@@ -17,7 +17,7 @@ needs rows, not speeds. A row delay that is known from elsewhere is combined wit
 contradict each other significantly; if nothing is known it is 0.
 
 A constant delay of the markers behind the mirror's command (the scanner's colour outputs trail its mirror outputs by
-some microseconds, docs/reference/hardware.md) shortens both lags, which are then right for binding with the same
+some microseconds, docs/reference/hardware.md) shortens both lags; they are then right for binding with the same
 markers. A marker of the wrong polarity shows in the binding; the gate's delay shows in the frames at its edges
 (`gate_fit`).
 """
@@ -89,7 +89,7 @@ class SharedPixels:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Solved:
-    """The result of a least squares fit. value, covariance: of the unknowns, the coefficients of the designs.
+    """The result of a least squares fit. value, covariance: of the unknowns, one for each design of `solve`.
 
     residual: (pixels, sweeps), in command units. weight: weight of each passage, 0 for an outlier. noise: robust sd of
     the residuals in units of the stated sd. design: (pixels, sweeps, designs), after elimination of each pixel's own
@@ -173,12 +173,12 @@ SIGNIFICANT = 5.0
 """Standard deviations by which a row delay must differ from the known one to replace it, and by which a lag must lie
 below 0 to be refused."""
 MOST_CHI2_SDS = 4.0
-"""Most standard deviations by which chi squared of the speeds may lie above its mean."""
+"""Most standard deviations by which chi squared of the sweeps' lags may lie above its mean."""
 
 
 @dataclass(frozen=True, slots=True)
 class SweepTiming:
-    """The lag of one sweep by itself: the fitted one plus the sweep's mean residual; sd_s: of the latter."""
+    """The lag of one sweep by itself: the fitted lag, changed by the sweep's mean residual. sd_s: of this change."""
 
     direction: int
     speed_per_s: float
@@ -196,11 +196,11 @@ class SweepTiming:
 class SyncFit:
     """Fitted lags. lag_s, row_delay_s: as in `RigModel`. covariance: (3, 3), s^2, of the three.
 
-    speed_range_per_s: the range in which they hold. common: whether the two lags could not be separated. told: which
-    directions were scanned. row_told: whether the row delay was determined; if not, it is the one known before, with
-    the variance that the sweeps alone would have given. sweeps: lag of each sweep by itself, at the fitted row delay.
-    chi2, dof: of those against common lags; `steady`: whether they agree. noise: robust standard deviation of the
-    residuals in units of the stated sd.
+    speed_range_per_s: the range in which they hold. common: whether the two lags could not be separated. told: the
+    directions that were scanned, +1 and -1. row_told: whether the row delay was determined; if not, it is the one known
+    before, with the variance that the sweeps alone would have given. sweeps: lag of each sweep by itself, at the fitted
+    row delay. chi2, dof: of these lags against the fitted ones; `steady`: whether they agree. noise: robust standard
+    deviation of the residuals in units of the stated sd.
     """
 
     lag_s: Lag

@@ -1,9 +1,9 @@
 """A model with lags from other sweeps, and the consequences for its mirror's angle.
 
-A mirror's angle was fitted together with lags; with other lags it changes, by an amount that their covariance C gives.
-If the sweeps of the planes did not separate the lags (`calibration.model.parameters`), any lags are possible, each with
-its own angle, and C is very large in that direction. With x the lags, y the other parameters, S the covariance of the
-new lags:
+A mirror's angle was fitted together with lags. With other lags the fit would have given another angle, by an amount
+that follows from the covariance C of all parameters. If the sweeps of the planes did not separate the lags
+(`calibration.model.parameters`), any lags are possible, each with its own angle, and C is very large in that direction.
+With x the lags, y the other parameters, S the covariance of the new lags:
 
     y | x = y0 + A (x - x0),    A = C_yx C_xx^-1,    cov y = (1 -A) C (1 -A)' + A S A',    cov (y, x) = A S
 
@@ -26,8 +26,8 @@ from calibration.sync.lag_fit import SIGNIFICANT, SyncFit
 from calibration.verdict import Reason
 
 _OPEN_S = 1e-4, 1e-2
-"""Sds assumed for a lag that the sweeps do not determine: for the slopes; and, so that any change passes, for the test
-whether lags have changed."""
+"""Sds assumed for a lag that the sweeps do not determine. The first is for the slopes; the second, which lets any
+change pass, is for the test whether lags have changed."""
 _LEAST_SHARE = 1e-9
 """Least eigenvalue of the scaled covariance of the lags; below it both were fitted as one."""
 _AGAIN = "calibrate the planes again, both ways and at two speeds or more (--exposures)"

@@ -26,7 +26,7 @@ LIMITS = ScannerLimits(
     max_points=1_000_000,
     point_rate_hz=(1e3, 200e3),
 )
-"""Limits of a fast small galvo: full sweep in half a millisecond."""
+"""Limits of a small, fast galvo. At its largest velocity it crosses its range in half a millisecond."""
 
 
 class SimulatedScannerConfig(KindConfig):
@@ -38,9 +38,10 @@ class SimulatedScannerConfig(KindConfig):
     clock_error: Annotated[Ppm, Field(ge=-1e-3, le=1e-3)] = 20e-6
     """Relative error of the scanner's crystal."""
     start_latency: Annotated[Seconds, Field(ge=0)] = 1.3373e-3
-    """Time from `start` to the first point; no whole number of frames."""
+    """Time from `start` to the first point. The default is not a whole number of frame periods."""
     jitter: float = Field(default=0.0, ge=0, le=0.1)
-    """Standard deviation of the mirror's random error, in units of the drive; a column of the bundled rig is 3.5e-3."""
+    """Standard deviation of the mirror's random error, in units of the mirror command, whose range is -1 to 1. Columns
+    of the bundled rig are 3.5e-3 apart."""
     serial: str = Field(default="SIM-MIRROR-0001", min_length=1)
     """Serial number. A scanner with another one needs a calibration of its own."""
 

@@ -3,9 +3,9 @@
 On a `VirtualClock` time passes as frames are made; on any other clock a block comes when the period of its last frame
 is over.
 
-On the way to the computer some frames get lost, which leaves a gap. Others are replaced by a copy of the frame before
-in their block, with its pixels, markers, counters and ticks. A copy keeps the number of the frame that it replaces, so
-only its ticks show it. The seed and the frame number determine which frames are lost or replaced.
+On the way to the computer some frames get lost, which leaves a gap. Others are replaced by a copy of the
+previous frame of their block: its pixels, markers, counters and ticks. A copy keeps the number of the frame that it
+replaces, so only its ticks show it. The seed and the frame number determine which frames are lost or replaced.
 
 The tick counter runs on its own crystal (`clock_error`, `clock_wander`). At time t its rate has the relative error y, a
 constant plus a random walk W:
@@ -13,8 +13,8 @@ constant plus a random walk W:
     dt/dtick = 1 / (tick_hz (1 + y)),    y = error + W,    var W(t) = wander^2 t
 
 (random walk of frequency, of which the Allan deviation is wander sqrt(t/3): D. Allan, IEEE Trans. UFFC 34, 647, 1987.)
-W makes a step every millisecond of the counter. An ordinary crystal is off by up to 50 ppm, and by 1 ppm more per K; a
-wander of 0.1 ppm per root second is much.
+In the simulation W changes in steps, one every millisecond of the counter. An ordinary crystal is off by up to 50 ppm,
+and by 1 ppm more per K; a wander of 0.1 ppm per root second is much.
 """
 
 import os
@@ -40,7 +40,7 @@ from sim_backend.frames.photons import PhotonSource
 from sim_backend.world import SimulatedWorld, note_effect
 
 _TWICE = np.uint64(0xE7037ED1A0B428DB)
-"""Random stream for the frames that come twice, apart from that for the frames that get lost."""
+"""Selects the random stream that decides which frames come twice. Another stream decides which get lost."""
 
 
 SUBFRAME_STEPS = 256
@@ -59,9 +59,11 @@ class MarkerInputs:
         self.sweep = 0
 
     def record(self, state: BenchState, start_s: Array, period_s: float, records: NDArray[np.void]) -> int:
-        """Fill marks, line and sweep of consecutive frames that start at start_s (n,), about one period apart.
+        """Fill marks, line and sweep in the records of consecutive frames that start at start_s (n,), about one period
+        apart.
 
-        Returns the number of scan markers since START at the first frame, which the records hold only to 16 bits.
+        Returns the number of scan markers since START, up to and including the first frame. The records hold only the
+        lowest 16 bits of such numbers.
         """
         lit = np.where(state.edge, int(Mark.GATE_EDGE), np.where(state.share > 0, int(Mark.GATE_HIGH), 0))
         marks = lit | np.where(state.backward, int(Mark.BACKWARD), 0)
@@ -92,8 +94,8 @@ def windows_at(window: WindowTable | None, first_sweep: int, records: NDArray[np
 
 
 class TickClock:
-    """A tick counter that starts from 0 at `start_s` of the bench. error: relative, positive is fast. wander: random
-    change of the error, per root second.
+    """A tick counter that starts from 0 at time `start_s` of the bench. error: relative error of its rate, positive if
+    it runs fast. wander: standard deviation of the change of the error in one second.
     """
 
     def __init__(self, tick_s: float, start_s: float, error: float, wander: float, seed: list[int]) -> None:
@@ -124,13 +126,14 @@ class TickClock:
 
 
 TICK_HZ = 100_000_000
-"""Tick rate if a frame period is a whole number of its ticks; else it is `TICKS_PER_FRAME` times the frame rate."""
+"""Tick rate if the frame period is a whole number of such ticks. Otherwise the tick rate is `TICKS_PER_FRAME` times
+the frame rate."""
 TICKS_PER_FRAME = 1024
 MAX_THREADS = 4
 START_BITS = 48
 MOST_STARTS = 0x3FFF
-"""Photons are drawn by frame number. So that starts differ, the frames of the second start are numbered from 2^48 on,
-and so on. `MOST_STARTS` is the mask for the number of a start."""
+"""The random numbers of a frame depend on its number. So that starts differ, frames of start i = 0, 1, ... are numbered
+from i 2^`START_BITS` on. i is masked with `MOST_STARTS`."""
 
 
 class SimulatedSpadConfig(KindConfig):
@@ -141,18 +144,18 @@ class SimulatedSpadConfig(KindConfig):
     kind: Literal["simulated"] = "simulated"
     max_frame_rate: Annotated[ExactHertz, Field(gt=0)] = Fraction(100_000)
     link: Annotated[BytesPerSecond, Field(gt=0)] = 8e9
-    """Bytes a second that the link to the computer carries; where full frames are too much for it, windows are sent. By
-    default more than 512 x 512 pixels at 100 kHz need."""
+    """Bytes per second that the link to the computer carries. If full frames need more, only each row's window is sent.
+    The default is more than 512 x 512 pixels at 100 kHz need."""
     lost_frames: tuple[int, ...] = ()
-    """Numbers of frames that get lost on the way, to try gaps with."""
+    """Numbers of frames that get lost on the way, for testing gaps."""
     loss_probability: float = Field(default=0.0, ge=0, le=1)
-    """Chance of every frame to get lost on the way."""
+    """Probability that a frame gets lost on the way."""
     duplicate_probability: float = Field(default=0.0, ge=0, le=1)
-    """Chance of every frame, except the first of a block, to be replaced by a copy of the one before it."""
+    """Probability that a frame, other than the first of a block, is replaced by a copy of the one before it."""
     clock_error: Annotated[Ppm, Field(ge=-1e-3, le=1e-3)] = 0.0
     """Relative error of the crystal."""
     clock_wander: Annotated[Ppm, Field(ge=0, le=1e-3)] = 0.0
-    """Random change of that error in a second, as a standard deviation; it grows with the root of time."""
+    """Standard deviation of the change of that error in one second; it grows with the square root of time."""
     serial: str = Field(default="SIM-0001", min_length=1)
     """Serial number. A sensor with another one needs a calibration of its own."""
 
@@ -326,7 +329,7 @@ class SimulatedSpad(SpadArray):
     def _draw(
         self, state: BenchState, start_s: Array, x0: NDArray[np.int32], bits: NDArray[np.uint8], first: int = 0
     ) -> None:
-        """Draw the next frames into `bits`, without the first `first` of those that `state` describes."""
+        """Draw the frames that `state` describes into `bits`, but leave out the first `first` of these frames."""
         assert self._photons is not None, "configured before started"
         held, power_w = self._world.mirror_positions(state, self._period_s), state.power_w * state.share
         number = self._first_draw + self._next_frame + first
@@ -376,7 +379,7 @@ class SimulatedSpad(SpadArray):
 
 
 def create(config: SimulatedSpadConfig, surroundings: Surroundings) -> SimulatedSpad:
-    """The SPAD that looks at the world. Raises DeviceError if the rig has no simulated world."""
+    """The SPAD in the simulated world. Raises DeviceError if the rig has no simulated world."""
     if not isinstance(surroundings.world, SimulatedWorld):
         raise DeviceError(
             "simulated SPAD has nothing to look at: the rig has no simulated world; add world: {kind: simulated}"

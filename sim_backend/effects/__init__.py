@@ -1,1 +1,1 @@
-"""Effects on the light between laser and sensor. A module is imported only if a scene calls for its effect."""
+"""Effects on laser light, other light and the sensor's bits. A module is imported only if a scene has its effect."""

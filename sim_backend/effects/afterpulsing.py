@@ -3,19 +3,20 @@
 One-bit frames have exposure T and period P = T + gap. The time t of a detection in its exposure is uniform from 0 to T,
 as it is at low flux. Neither effect matters within that exposure, where the pixel is 1 already.
 
-Afterpulse: a trap releases a carrier with total probability a, after a time that is exponential with mean tau (Cova et
-al., IEEE Electron Device Letters 12, 685, 1991). The chance that it does so within the next exposure is
+Afterpulse: a trap releases a carrier with total probability a, after an exponentially distributed time of mean tau
+(Cova et al., IEEE Electron Device Letters 12, 685, 1991). The chance that it does so within the next exposure is
 
     a/T int_0^T [exp(-(P-t)/tau) - exp(-(P-t+T)/tau)] dt = a (tau/T) exp(-gap/tau) (1 - exp(-T/tau))^2
 
 Dead time d: a detection within d - gap of the end of its exposure leaves the pixel blind at the start of the next; a
 detection there falls into the blind part with probability
 
-    1/T^2 int_0^T min(T, max(0, t + d - P)) dt = s^2 / (2 T^2),    s = d - gap between 0 and T
+    1/T^2 int_0^T min(T, max(0, t + d - P)) dt = s^2 / (2 T^2),    for s = d - gap from 0 to T
 
 If the pixel's bit is 1, these are the chances that its next bit is set or cleared: 5e-5 each with a = 0.5 %,
-tau = d = 100 ns and frames of 10 us without a gap. Later exposures, and afterpulses of afterpulses, are left out. Draws
-are exact. Cost per frame of 512 x 512: 0.8 us at these figures; the last frame of each gap is drawn, too.
+tau = d = 100 ns and frames of 10 us without a gap. Later exposures, and afterpulses of afterpulses, are left out. Bits
+change with exactly these chances. Cost per frame of 512 x 512: 0.8 us at these figures. The last frame of each gap is
+drawn in addition: it is not received, but affects the next frame.
 """
 
 import math
@@ -66,7 +67,9 @@ def blind_probability(dead_time_s: float, times: FrameTimes) -> float:
 def _carry_over(
     words: Words, before: Words, width: int, seed: np.uint64, first_frame: int, after: float, blind: float
 ) -> None:
-    """Clear bits of frames (frames, rows, words) that the frame before blinds, then set those that pulse after it."""
+    """Clear the bits that the previous frame's dead time suppresses, then set that frame's afterpulses. words: (frames,
+    rows, words). before: the frame before the first. after, blind: `log_miss` of the chances.
+    """
     # From the last frame to the first, so that each reads the one before it unchanged.
     for f in range(len(words) - 1, -1, -1):
         frame = np.uint64(first_frame + f)
@@ -77,7 +80,7 @@ def _carry_over(
 
 @numba.njit(cache=True, nogil=True, error_model="numpy")
 def _carry_bits(now: Words, earlier: Words, width: int, key: np.uint64, log_miss: float, lit: bool) -> None:
-    """Set (lit) or clear each bit (rows, words) that is 1 in the earlier frame, with the chance that log_miss says."""
+    """Set (lit) or clear each bit (rows, words) that is 1 in the earlier frame, with chance p. log_miss: ln(1 - p)."""
     draw = 0
     place = next_hit(-1.0, key, draw, log_miss)
     while place < len(now) * width:

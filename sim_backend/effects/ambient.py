@@ -1,9 +1,9 @@
 """Ambient light: on the surfaces, and scattered into the pixel by the medium in front of them.
 
 A surface of albedo rho at distance |X| has the radiance rho/pi E exp(-sigma |X|), where E is the irradiance within the
-filter's band and sigma the extinction (Lambert, Beer-Lambert). The medium has L_inf (1 - exp(-sigma |X|)) (Koschmieder)
-with L_inf = (scattering share) E/pi: a thick layer of a medium that does not absorb looks like a white surface in the
-same diffuse light.
+filter's band and sigma the extinction (Lambert, Beer-Lambert). The medium adds L_inf (1 - exp(-sigma |X|))
+(Koschmieder) with L_inf = (scattering share) E/pi: a thick layer of a medium that does not absorb looks like a white
+surface in the same diffuse light.
 """
 
 import math

@@ -10,9 +10,9 @@ from sim_backend.effects.setting import PlannedFor, Setting
 from sim_backend.light.optics import ambient_irradiance
 
 EffectKind = Literal["laser", "steady", "bits", "within"]
-"""Target of an effect: the sheet's light (`LaserEffect`); light or counts without the sheet, from a function that
-returns detections per second, float64 (rows, width); the sensor's bits (`BitEffect`); `within`: it is worked into a
-simulated device, another effect or the gain, which hold its code."""
+"""Target of an effect. "laser": the sheet's light (`LaserEffect`). "steady": light or counts without the laser; its
+code is a function that returns detections per second, float64 (rows, width). "bits": the sensor's bits (`BitEffect`).
+"within": the effect is part of a simulated device, of another effect or of the gain, and has no code of its own."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -20,12 +20,12 @@ class Entry:
     """One effect: its name, what it acts on, its factory as module:name ("" if it is part of another), and the rule
     that calls for it.
 
-    why(setting): the reason in words why the effect is called for, None if it is not. absent: the reason why not; ""
-    means that the sensor has no such effect.
+    why(setting): the reason in words why the effect is called for, None if it is not. absent: the reason in that case;
+    "" means that the sensor has no such effect.
     of_sensor: light or counts that stay under a covered lens.
     changes(setting, planned_for), in closed form: the largest share of decisions on a row and column that can differ
-    without the effect (may exceed 1). None: there is no such form; the planner then evaluates light and dark counts,
-    and never leaves out others, nor light that moves.
+    without the effect (may exceed 1). None: there is no closed form. The planner then evaluates the effect if it is
+    light that does not move or dark counts; any other effect is never left out.
     """
 
     name: str

@@ -1,7 +1,7 @@
 """Dark counts: detections without light, a rate per pixel whose distribution has a long tail of hot pixels.
 
     ordinary pixels: ln(rate / median) normal with sd 0.12
-    hot pixels:      P(rate > r median) = 0.01 (r / 10)^-0.7 from r = 2 to 1e5, where rates end
+    hot pixels:      P(rate > r median) = 0.01 (r / 10)^-0.7 from r = 2 to 1e5, the largest ratio
 
 The figures are from a 512 x 512 binary SPAD (50 x 50 pixels, 7650 frames of 10 us; public data of LabPresse/SP2T.jl).
 Its shares of pixels above 2, 3, 5, 10, 30 and 100 times the median are 3.4, 2.2, 1.4, 1.0, 0.5 and 0.2 %; the formula
@@ -17,7 +17,7 @@ from sim_backend.effects.setting import Array, Setting
 from sim_backend.light.optics import Sensor
 
 _BODY_SD = 0.12
-"""Sd of ln(rate) of the ordinary pixels: the measured spread minus that of the counting."""
+"""Standard deviation of ln(rate) of the ordinary pixels: as measured, less the part due to counting statistics."""
 _TAIL_SHARE, _TAIL_AT = 0.01, 10.0
 _TAIL_START = 2.0
 _TAIL_POWER = math.log10(5)

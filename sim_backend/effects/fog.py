@@ -10,13 +10,13 @@ For a rectified rig of baseline b, with the rays q_p of the projector and q_c of
 sigma_s p I0 du |q_p||q_c|/b exp(-sigma z (|q_p| + |q_c|)), where I0 du = J sqrt(1 + u_p^2)/|q_p|^2. The phase function
 is constant (`backscatter`: scattering angles are all near 180 degrees) or a sum of Henyey-Greenstein terms at the
 cosine -(z q - S).q/(r |q|). The haze ends where the sheet's light ends: at the object, blurred by `sigma_px`, and in
-the sheet's own shadow along the row. `medium` switches it on.
+the sheet's own shadow along the row. The haze is simulated if the scene has a `medium`.
 
 Along a row the loop over lit pixels has no branches, so it becomes vector instructions; only the pixels under the
 blurred end are done one by one. Cost per mirror position for 512 x 512 pixels, half of them lit: 0.36 ms in float64,
 0.19 ms in float32. Kernels use the precision of the array they add to. In float32 the haze is right to 1e-5 at an
-optical depth of 10. By the divergence of `sim_backend.effect_planner` that is 1e-8 for a row's pixels in a column, of
-2e-4 allowed.
+optical depth of 10. For a row in one column this makes the divergence eps of `sim_backend.effect_planner` 1e-8; 2e-4 is
+allowed.
 """
 
 import math
@@ -32,9 +32,9 @@ from sim_backend.light.sheet import LightSheet, Traced
 from sim_backend.random_numbers import HALVING, LOG2_E, power_of_half
 
 REACH_SIGMAS = 5.0
-"""Sds at which the blurred end is cut."""
+"""Distance, in standard deviations, beyond which the blur of the haze's end is neglected."""
 LEAST_INVERSE_DEPTH = 1e-12
-"""Least inverse depth, in 1/m. Points that lie farther away or behind the camera are given this one."""
+"""Least inverse depth, in 1/m. Points that lie farther away or behind the camera get this value."""
 Numbers = tuple[tuple[NDArray[Any], ...], NDArray[Any], tuple[Any, ...], tuple[Any, ...]]
 """The kernel's numbers, in one precision: rays u, v, |q| (rows, width) and source (3,); terms (n, 3), weight, |g| and
 sign of each Henyey-Greenstein term; halving, see `power_of_half`; 0, 1, 2 and least inverse depth."""
@@ -65,7 +65,7 @@ class Haze:
         self._sigma_px = setting.line.sigma_px
 
     def add(self, sheet: LightSheet, first_row: int, last_row: int, rate: Array) -> None:
-        """Add detections per second and watt of laser power."""
+        """See `LaserEffect`."""
         kind = rate.dtype
         scales = (self._scale / np.where(sheet.offset_m != 0, np.abs(sheet.offset_m), np.inf)).astype(kind)
         light = sheet.inverse.astype(kind), scales, kind.type(LOG2_E * self._extinction_per_m), self._sigma_px
@@ -76,7 +76,8 @@ class Haze:
 def _add_haze(
     sheet: Traced, light: tuple[Any, ...], numbers: Numbers, first_row: int, last_row: int, rate: Array
 ) -> None:
-    """Add the haze of a sheet. light: the sheet's planes, scale of each of them, halvings per m, sigma_px."""
+    """Add the haze of a sheet. light: `inverse` of the sheet, scale of each plane, halvings of light per m,
+    sigma_px."""
     # Arrays and tuples are unpacked before the loops: inside, each access would count a reference. Constants are
     # arguments, too: as literals they would be float64.
     _, _, x_stripe, x_end, start, step = sheet

@@ -1,7 +1,7 @@
 """Motion: the surfaces move while the mirror sweeps, so that columns see them at different times.
 
 All surfaces are shifted together by D = velocity x time. A surface's facet m.X = 1 becomes m.(X - D) = 1, that is m /
-(1 + m.D), so the inverse depth of a ray q = (u, v, 1) is m.q / (1 + m.D) with m of the pixel at which the point was at
+(1 + m.D), so the inverse depth of a ray q = (u, v, 1) is m.q / (1 + m.D) with m from the pixel that saw the point at
 time 0. That pixel is searched for from two starting points, the nearest surface and the surface seen there at time 0;
 the nearer result is used, which is right except for a pixel or two along edges. Newly uncovered areas continue the
 surface behind, and areas that enter the picture continue the surface at its border. Albedo is that of the nearest
@@ -31,7 +31,7 @@ SEARCH_STEPS = 3
 
 
 class MovingSurfaces:
-    """Makes the view at a time and keeps the latest ones, since threads that draw rows are at different times."""
+    """Makes the view at a given time. Keeps the latest views, since threads that draw rows are at different times."""
 
     def __init__(self, velocity_m_per_s: Sequence[float]) -> None:
         """velocity_m_per_s: along x (right), y (down), z (away from the camera)."""
@@ -71,8 +71,8 @@ def shifted(still: CameraView, shift_m: Array) -> CameraView:
 
 @numba.njit(cache=True, nogil=True)
 def _source(u: Array, v: Array, y: int, x: int, w: float, shift: Array) -> tuple[int, int]:
-    """Pixel (row, column) of the point at time 0 that a ray now sees at inverse depth w. -1: it was behind the camera,
-    or the rays have no slope. Tangents are assumed to be linear between the two pixels.
+    """Pixel (row, column) that saw at time 0 the point that pixel (y, x) now sees at inverse depth w. -1, -1: the point
+    was behind the camera, or the rays have no slope. Tangents are assumed to be linear between the two pixels.
     """
     rows, width = u.shape
     scale = 1.0 - shift[2] * w
@@ -89,7 +89,7 @@ def _source(u: Array, v: Array, y: int, x: int, w: float, shift: Array) -> tuple
 def _shift(
     u: Array, v: Array, surface: Array, facet: Array, albedo: Array, shift: Array, new: tuple[Array, Array, Array]
 ) -> None:
-    """Write surface, facet and albedo of the shifted surfaces."""
+    """Write surface, facet and albedo of the shifted surfaces into `new`."""
     new_surface, new_facet, new_albedo = new
     rows, width = u.shape
     nearest = max(0.0, np.max(surface))
@@ -121,7 +121,9 @@ def _shift(
 
 @numba.njit(cache=True, nogil=True)
 def _uncover(u: Array, v: Array, known: NDArray[np.bool_], surface: Array, facet: Array, albedo: Array) -> None:
-    """Continue the farther of the known surfaces on both sides over each unknown pixel of a row."""
+    """At each unknown pixel of a row, continue the surface of the next known pixel to the left or right, whichever
+    surface is farther away.
+    """
     width = len(u)
     for x in range(width):
         if known[x]:

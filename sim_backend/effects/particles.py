@@ -30,7 +30,7 @@ from sim_backend.light.sheet import Arrays, LightSheet, Traced
 from sim_backend.scenes.medium import Rain, Snow
 
 REACH_SIGMAS = 4.0
-"""Sds at which sheet and picture of a particle are cut."""
+"""Distance, in standard deviations, beyond which the sheet's profile and a particle's blur are neglected."""
 FARTHEST_RANGE_M = 30.0
 """Largest distance of a particle from the mirror."""
 NEWTON_STEPS = 8
@@ -86,8 +86,9 @@ def _add_particles(
 ) -> None:
     """Add the particles' light to rows first_row..last_row-1 of `rate`.
 
-    particles: cone, z, back, at, per_s, normal of the sheet's planes, `line_width`. light: gain over
-    the fan's angle, extinction per metre, time, sd of the sheet at the mirror and its growth per metre from there.
+    particles: from `Particles`, cone, z_m, back_m2_per_sr, at, per_s; normal of the sheet's planes; `line_width`.
+    light: gain over the fan's angle, extinction per metre, time, sd of the sheet at the mirror and its growth per metre
+    from there.
     """
     u, v, _, _, _, _, source = view
     cone, depth, back, at, per_s, normal, width = particles
@@ -151,8 +152,8 @@ Precipitation = Rain | Snow
 class Particles:
     """n particles in the cone ((2, 2): low and span of the tangents u and v).
 
-    z_m, diameter_mm (melted), back_m2_per_sr: (n,). at, per_s: (n, 2), position along u and v at time 0 and speed, as
-    shares of the cone's width.
+    z_m, diameter_mm (melted), back_m2_per_sr (see the module): (n,). at, per_s: (n, 2), position along u and v at time
+    0 and its change per second, as shares of the cone's width.
     """
 
     cone: Array
@@ -170,7 +171,7 @@ class Particles:
 
 
 def make_particles(what: Precipitation, cone: Array, farthest_m: float, rng: np.random.Generator) -> Particles:
-    """Random particles in the cone ((2, 2): low and span of u and v) up to a depth."""
+    """Random particles in the cone ((2, 2): low and span of u and v) up to depth farthest_m."""
     z = np.linspace(min(NEAREST_M, farthest_m), farthest_m, DEPTH_STEPS)
     volume = z**2 * cone[0, 1] * cone[1, 1]
     faintest = FAINTEST_MM / FAINTEST_AT_M**1.5
@@ -202,7 +203,7 @@ class ParticleLight:
         self.particles = make_particles(what, np.column_stack([low, span]), farthest_m, rng)
 
     def add(self, sheet: LightSheet, first_row: int, last_row: int, rate: Array) -> None:
-        """Add detections per second and watt of laser power."""
+        """See `LaserEffect`."""
         if not np.isfinite(sheet.inverse).all():
             return
         view, them = self._view.arrays, self.particles

@@ -22,17 +22,19 @@ from sim_backend.random_numbers import WORD_PX, frame_key
 _CROSSTALK, _ERRORS = np.uint64(0xC6A4A7935BD1E995), np.uint64(0x8EBC6AF09C88C6E3)
 """Streams that keep these draws apart from those of photons and other effects."""
 _DEFECTS = 2
-"""Stream of the sensor's seed, apart from the one that says which pixels are hot in the dark."""
+"""Stream of the sensor's seed that keeps these draws apart from those of the dark rates."""
 
 
 def log_miss(probability: float) -> float:
-    """ln(1 - p), as `next_hit` takes it."""
+    """ln(1 - p), an argument of `next_hit`."""
     return -math.inf if probability >= 1 else math.log1p(-probability)
 
 
 @numba.njit(cache=True, nogil=True, error_model="numpy")
 def next_hit(place: float, key: np.uint64, draw: int, log_miss: float) -> float:
-    """The hit after `place` (-1: from the start), infinity if p is 0. draw: 0, 1, 2, ... of this key's stream."""
+    """The next hit after `place` (-1: the first hit), infinity if p is 0. draw: number of this random draw, 0, 1, 2,
+    ..., in the key's stream. log_miss: ln(1 - p).
+    """
     uniform = (float(frame_key(key, np.uint64(draw)) >> np.uint64(11)) + 0.5) * 2.0**-53
     return place + 1.0 + math.floor(math.log(uniform) / log_miss) if log_miss < 0.0 else math.inf
 
@@ -56,13 +58,12 @@ class Crosstalk:
 
     Acts on the bits of photons, dark counts and afterpulses. Each detection of a frame fires each of its 4 neighbours
     with probability c / 4 (c: `crosstalk`), all independently. Pixels fired in this way trigger no others, an effect of
-    order c^2.
-    A pixel whose own chance is p, and of whose neighbours m fired, is 1 with probability 1 - (1 - p)(1 - c/4)^m; in a
-    flat picture of small p that is p (1 + c). Light that crosses the border is lost. c is 0.1 to 0.2 % in 512 x 512
-    arrays of large pitch; the share beyond the 4 neighbours is not modelled.
+    order c^2. A pixel that fires by itself with probability p and has m neighbours that fired is 1 with probability
+    1 - (1 - p)(1 - c/4)^m. If all pixels have the same small p, that is on average p (1 + c). Light across the border
+    is lost. c is 0.1 to 0.2 % in 512 x 512 arrays of large pitch; the share beyond the 4 neighbours is not modelled.
 
-    Exact for any c. Each pixel has four possible transfers (up, down, left, right), taken pixel by pixel; those that
-    occur are drawn by their gaps. Cost per frame of 512 x 512: 9 us at 0.15 %, in proportion to c.
+    Exact for any c. Each pixel has four possible transfers (up, down, left, right), numbered pixel by pixel; the gaps
+    between those that occur are drawn. Cost per frame of 512 x 512: 9 us at 0.15 %, in proportion to c.
     """
 
     reads_before = False
@@ -78,7 +79,7 @@ class Crosstalk:
 
 @numba.njit(cache=True, nogil=True, error_model="numpy")
 def _spark_over(words: Words, width: int, seed: np.uint64, first_frame: int, log_miss: float) -> None:
-    """Set the neighbours' bits in frames (frames, rows, words)."""
+    """Set the bits of neighbours that detections fire, in frames (frames, rows, words)."""
     frames, rows, _ = words.shape
     fired = np.empty_like(words[0])
     for f in range(frames):

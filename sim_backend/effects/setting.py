@@ -55,18 +55,20 @@ class FrameTimes:
 
 
 class LaserEffect(Protocol):
-    """Light that comes from the laser's sheet. One that moves has `hold_s`, the time for which it stands still."""
+    """Light that comes from the laser's sheet. If it changes with time, the effect has the attribute `hold_s`: the time
+    in s for which it stays the same.
+    """
 
     def add(self, sheet: LightSheet, first_row: int, last_row: int, rate: Array) -> None:
         """Add detections per second and watt to `rate` (rows, width), rows first_row..last_row-1. Releases the GIL.
 
-        rate is float64, or float32 when frames are drawn, whose seven digits are more than photons can show.
+        rate is float64, or float32 when frames are drawn; seven digits are more than photons can show.
         """
         ...
 
 
 class BitEffect(Protocol):
-    """A change that the sensor makes to the photons' bits."""
+    """A change that the sensor makes to the bits of its frames."""
 
     reads_before: bool
     """Whether `before` is read. If so, the last frame of every gap is drawn, too, though nobody receives it."""

@@ -61,7 +61,7 @@ class FluxModel:
             effect.add(sheet, first_row, last_row, rate)
 
     def flux(self, plane: Array, exposure_s: float, power_w: float) -> Array:
-        """Photons per exposure, float64 (rows, width), with the mirror at the plane (4,) = nx, ny, nz, d."""
+        """Detections per exposure, float64 (rows, width), for the light plane (4,) = nx, ny, nz, d."""
         view = self.setting.view
         sheet = view.sheet(plane)
         rate = np.zeros_like(self.steady_per_s)
@@ -76,7 +76,8 @@ def hold_s(effect: LaserEffect) -> float:
 
 FINE_POSITIONS_PER_PX = 4
 ROUNDING = 1e-9
-"""Step to which mean positions are rounded, far finer than frames can show, so that those of a cell are equal."""
+"""Step to which mean positions are rounded, so that frames of one cell get equal values; far finer than frames can
+show."""
 _SLACK = 1e-6
 """Slack, as a share of a step, for frames that lie on the very border of cells."""
 
@@ -93,7 +94,7 @@ class CommandGrid:
     high: float
 
     def hold(self, commands: Array, steps: Array) -> Array:
-        """Mean positions of the frames that share a cell with frames at commands (n,); NaN outside the grid.
+        """For frames at commands (n,): the mean position of all frames in the same cell; NaN outside the grid.
 
         steps: (n,) how far the mirror moves from one frame to the next. 0 means that the frame is alone, as when one
         step leaves the cell. NaN means unknown: the frame is held at the cell's own position.

@@ -40,23 +40,23 @@ from sim_backend.random_numbers import (
 
 LEVELS = 2**16
 NEVER = LEVELS // 2 - 1
-"""Level 0 as it is stored: `NEVER` minus the level is stored, so the highest level is -32768."""
+"""The stored value of level 0. `NEVER` minus the level is stored, so the highest level is stored as -32768."""
 CHANCE = 3.0 / LEVELS
-"""Chance of a pixel to be drawn anew."""
+"""Probability that a pixel is drawn anew."""
 _LEVELING = tuple(np.float32(x) for x in (NEVER + 1.5, LEVELS / (1.0 - CHANCE), NEVER - LEVELS + 1, NEVER))
-"""Offset, slope, least and largest: the offset minus the slope times p is stored, within 16 bits, without its
-fraction. So the level lies at least half a level inside its interval, on both sides. Where it is the highest of 16
-bits, 2^16 is within the interval, too."""
+"""Offset, slope, least and largest stored value. Offset minus slope times p is limited to the least and largest value
+and stored without its fraction. So the level lies at least half a level inside its interval, on both sides. Where it is
+the highest of 16 bits, 2^16 is within the interval, too."""
 _TOGETHER = 8
 _KEY_ROWS, _ROW_SHIFT = 8, 16
-"""Number of rows that share a key, and the bit of a block number from which on the row's number is put."""
+"""Number of rows that share a key, and the shift in bits of a row's number before it is XORed into the key."""
 _WORD_BYTES = WORD_PX * 2
 """Bytes that the levels of a word of pixels take."""
 _PER_SKIP = 1.0 / math.log1p(-CHANCE)
 
 _S11 = np.uint64(11)
 _ANEW = np.uint64(2**32)
-"""Used in place of the number of the row group in the streams of pixels that are drawn anew."""
+"""Added to a strip's number. The sum replaces the number of the row group in the streams of pixels drawn anew."""
 _STRIP_ROWS = 64
 _UNIT = 2.0**-53
 _PLACE = np.array(PLACE, np.uint8)
@@ -88,8 +88,9 @@ def set_levels(
     """Set the levels of rows, in place, for p = 1 - exp(-(steady + exposure_w_s rate)).
 
     steady: photons per exposure; rate: per second and watt, both (rows, width), not negative; exposure_w_s: power times
-    time. Words of 64 pixels before the first and after the last with light take their levels from `dark`, unless that
-    has no rows. lit (rows, words) says which of `levels` differ from those of `dark`, before and after the call.
+    time. In each row, the words of 64 pixels before the first word with laser light and after the last one take their
+    levels from `dark`, unless `dark` has no rows. lit (rows, words) says which words of `levels` may differ from
+    `dark`; the call updates it.
     """
     rates, constants = (rate, rate.view(np.uint32), np.float32(exposure_w_s)), (ROUGHLY, _LEVELING)
     _set_levels(steady, rates, rows, dark, lit, levels, constants)

@@ -46,7 +46,7 @@ class _Span:
 
 
 class PhotonSource:
-    """Draws the frames of a configured SPAD. Call it from one thread; it uses up to `threads` threads, that one too."""
+    """Draws the frames of a configured SPAD. Call it from one thread; this one is among the up to `threads` used."""
 
     def __init__(
         self,
@@ -58,7 +58,9 @@ class PhotonSource:
         fan: LineFan = ONE_LINE,
         command_range: tuple[float, float] = (-np.inf, np.inf),
     ) -> None:
-        """sheets_of: makes sheets of mirror commands. command_range: a line outside is dark. fan: the laser lines."""
+        """sheets_of: makes sheets from mirror commands. fan: the laser lines. A line whose command is outside
+        command_range is dark.
+        """
         rows, width = model.steady_per_s.shape
         words = -(-width // WORD_PX)
         self._model = model
@@ -217,7 +219,7 @@ class PhotonSource:
 
 @numba.njit(cache=True, nogil=True)
 def _cut_windows(whole: Words, first_word: Places, words: Words) -> None:
-    """Copy each frame's window, words (frames, rows, words of a window), out of whole frames."""
+    """Copy each frame's window out of whole frames into `words` (frames, rows, words of a window)."""
     for f in range(len(words)):
         first = first_word[f]
         for y in range(words.shape[1]):

@@ -1,8 +1,8 @@
 """The laser lines in the picture: their positions, their shares of the power, and their width at each depth.
 
-A diffractive element splits one laser's power among the lines; of several lasers, each has its own power. All lines
-leave the same mirror, so line l is where a single line would be at the mirror's command plus the offset of l. The flux
-of a frame, in which each line's stripe and haze end at its own object, is
+A diffractive element splits one laser's power among the lines; with several lasers, each line has a laser's power. All
+lines leave the same mirror, so line l is where a single line would be at the mirror's command plus the offset of l. The
+flux of a frame, in which each line's stripe and haze end at its own object, is
 
     lambda = exposure (steady + power sum over lines of share sheet_l)
 
@@ -89,7 +89,7 @@ def _of_rows(sheets: LightSheets, index: int, rows: int) -> LightSheets:
 
 
 def line_width(view: CameraView, optics: Optics, sensor: Sensor, line: Line) -> Array:
-    """The values that `sigma_px` takes: (4,) variance in px^2, spread in px, defocus in px m, inverse focus in 1/m.
+    """Argument `width` of `sigma_px`: (4,) variance in px^2, spread in px, defocus in px m, inverse focus in 1/m.
 
     Raises DeviceError if the focus lies within the focal length, since the lens forms no image of such points.
     """

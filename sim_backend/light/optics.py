@@ -14,7 +14,7 @@ from sim_backend.scenes.medium import Section
 
 PLANCK_J_S = 6.62607015e-34
 LIGHT_M_PER_S = 299792458.0
-"""SI definitions of 2019."""
+"""Exact by definition of the SI."""
 DAYLIGHT_W_PER_M3_LUX = 1.4e4
 """Spectral irradiance of daylight near 520 nm per lux, W/m^2 per metre of wavelength: 1.5 W/m^2/nm at 110 klux
 (ASTM G173 global sunlight)."""
@@ -54,7 +54,7 @@ class Sensor(Section):
     dead_time: Annotated[Seconds, Field(ge=0, le=1e-6)] = 0.0
     """Time for which a pixel is blind after a detection."""
     bit_error_rate: Annotated[Ppm, Field(ge=0, le=0.5)] = 0.0
-    """Chance of every pixel of a frame to be read wrongly."""
+    """Probability that a pixel of a frame is read wrongly."""
 
     @model_validator(mode="after")
     def _one_defect_a_pixel(self) -> Self:

@@ -6,9 +6,9 @@ Then each row has its own: that of the mirror at the row's time, and the tangent
 it.
 
 A compiled walk follows the light along each row and finds whether it ends as a stripe. On a row the sheet's inverse
-depth w(x) = n.(u, v, 1)/d falls in the direction in which its light travels outward. The walk starts at the near edge
-of the picture and ends where w passes the surface's inverse depth. Spans of 32 pixels in which even the least w lies
-before the nearest surface are skipped at once. Cost: about 0.05 ms for 512 x 512 pixels, half of them lit.
+depth w(x) = n.(u, v, 1)/d falls in the direction in which its light travels outward. The walk starts at the edge of the
+picture where w is larger and ends where w falls below the surface's inverse depth. Spans of 32 pixels in which even the
+least w lies before the nearest surface are skipped at once. Cost: about 0.05 ms for 512 x 512 pixels, half of them lit.
 """
 
 from dataclasses import dataclass, replace
@@ -31,7 +31,7 @@ _TANGENT_STEP_M = 1e-4
 
 @dataclass(frozen=True, slots=True, eq=False)
 class LightSheet:
-    """The planes n.X = d of a sheet, k = 1 for all rows or one for each row, and what their light does on every row.
+    """The k planes n.X = d of a sheet, one for all rows or one for each row, and where its light runs on every row.
 
     normal: (k, 3) float64 unit vectors; offset_m: (k,) d; inverse: (k, 3) n/d, so that 1/z = inverse.(u, v, 1).
     x_stripe_px: (rows,) float64, sub-pixel stripe position, NaN = no stripe.

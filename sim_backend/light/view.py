@@ -18,7 +18,7 @@ Moves = Callable[["CameraView", float], "CameraView"]
 class CameraView:
     """Rays and surfaces on the camera's pixel grid. All maps are float64 (rows, width).
 
-    u, v: ray tangents, NaN where the lens has no inverse. u_x, v_x: their slopes per pixel along the row.
+    u, v: ray tangents, NaN where the lens model has no inverse. u_x, v_x: their slopes per pixel along the row.
     surface: inverse depth in 1/m (0: nothing there). facet: (rows, width, 3), the plane m.X = 1 through each surface
     point. albedo: 0..1. source_m: (3,) where the light leaves the mirror. motion: None if nothing moves.
     """

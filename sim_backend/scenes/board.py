@@ -22,7 +22,8 @@ from sim_backend.scenes.scene import SceneBoard
 from sim_backend.scenes.surfaces import Array, Surfaces, checked
 
 RAYS, TURNS = 233, 144
-"""Neighbouring Fibonacci numbers: rays through a pixel that sees an edge, no two in line with its row or its column.
+"""RAYS: number of rays through a pixel that sees an edge. TURNS, the Fibonacci number before it, places them so that no
+two are in line with the pixel's row or column.
 
 If the lattice were the same in all pixels, all edges of one direction would share its error: with 34 rays, all corners
 of a picture would be off together by 0.0015 px, twice what the photons of a bright picture leave.
@@ -56,7 +57,8 @@ class BoardAtPose:
 
 
 def load_boards(shown: Sequence[SceneBoard], folder: Path) -> list[BoardAtPose]:
-    """The boards of a scene file whose paths start at `folder`. Raises DeviceError if a board's file cannot be used."""
+    """The boards of a scene file. Relative paths start at `folder`. Raises DeviceError if a board's file cannot be
+    used."""
     try:
         return [
             BoardAtPose(

@@ -41,7 +41,7 @@ class BoardPlace(Section):
     """Pose of a calibration board, as in `calibration.views.BoardPose`."""
 
     rotation: tuple[Radians, Radians, Radians] = Field(examples=["[20 deg, 0 deg, 0 deg]"])
-    """Rotation vector; all 0: square to the camera's axis."""
+    """Rotation vector; all 0: the board is perpendicular to the camera's axis."""
     position: tuple[Metres, Metres, Metres] = Field(examples=["[-30 cm, -20 cm, 1.5 m]"])
     """Position of the top left corner of the board's squares: x right, y down, z away from the camera."""
 
@@ -96,8 +96,8 @@ class SceneFile(Section):
 
     @property
     def diffuse_extinction_per_m(self) -> float:
-        """Extinction coefficient in 1/m of light that may be deflected a little on its way: haze, airlight and ambient
-        light.
+        """Extinction coefficient in 1/m for haze, airlight and ambient light, without the medium's forward scattering:
+        such light counts even if it was deflected a little on its way.
         """
         return self.extinction_per_m - (0.0 if self.medium is None else self.medium.forward_per_m)
 
@@ -179,8 +179,8 @@ def load_surfaces(scene: SceneFile, folder: Path, u: Array, v: Array) -> Surface
 
 
 def load_folder(folder: Path, size: tuple[int, int]) -> Surfaces:
-    """Surfaces from a folder for a camera of size (rows, width). Raises DeviceError unless they are sound
-    and of that size.
+    """Surfaces from a folder for a camera of size (rows, width). Raises DeviceError if they are invalid
+    or of another size.
 
     `world.npz` holds `depth_m`, `albedo` and, if some depths were guessed, `trusted`.
     """

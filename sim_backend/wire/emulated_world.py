@@ -69,7 +69,7 @@ class EmulatedWorld(SimulatedWorld):
     """One scene and the devices of the rig in front of it, which are plugged in when it is created."""
 
     def __init__(self, config: EmulatedWorldConfig, surroundings: Surroundings, bus: Any = None) -> None:
-        """Raises DeviceError if the geometry, the scene or the focus cannot be used, or rows are exposed late.
+        """Raises DeviceError if the geometry, the scene or the focus cannot be used, or the geometry has a row delay.
 
         bus: an object with a method `plug` that attaches a USB device; the caller closes it. By default an
         `EmulatedUsb`, within this process.

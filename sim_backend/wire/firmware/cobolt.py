@@ -39,7 +39,7 @@ _MODES: dict[Mode, tuple[str, str]] = {
     "constant power": ("1", "ConstantPower"),
     "modulation": ("2", "PowerModulation"),
 }
-"""The modes as either family calls them."""
+"""Name of each mode in the replies of 06-MLD and of 06-01."""
 _RUN_MODES = {name.lower(): mode for mode, (_, name) in _MODES.items()}
 _FLAGS: dict[Family, dict[str, str]] = {
     "06-MLD": {"sdmes": "digital", "sames": "analog"},
@@ -105,7 +105,7 @@ class CoboltModel:
 
     @property
     def power_w(self) -> float:
-        """Power of the light that comes out now, in W; through an open gate if the laser is gated."""
+        """Power in W that comes out now; for a gated laser, the power that an open gate lets out."""
         if not self.on or self.paused or self.interlock_open or self.fault:
             return 0.0
         match self.mode:

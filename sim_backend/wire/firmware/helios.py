@@ -1,10 +1,10 @@
 """A Helios laser DAC as its firmware behaves, traps included (docs/reference/hardware.md; vendor's firmware v6,
 0952a2a).
 
-There are two buffers, one playing and one pending, and a status polled with 03. A frame of whole packets never
-completes. Frames are refused silently. Frames within 100 ms of STOP are dropped. A frame without SINGLE repeats for
-ever. `DacModel` is the part that emulated scanner boards have in common; emulated worlds and tests read its record of
-the outputs.
+There are two buffers, one playing and one pending, and a status polled with 03. A frame whose length is a multiple of
+the packet size never completes. Invalid frames are dropped silently, and so are frames within 100 ms after STOP. A
+frame without SINGLE repeats for ever. `DacModel` is the part that emulated scanner boards have in common; emulated
+worlds and tests read its record of the outputs.
 """
 
 import struct
@@ -59,7 +59,7 @@ class DacHistory:
                 self._rests.popleft()
 
     def cut(self, time_s: float, command: float | None = None) -> None:
-        """Play nothing from that time on. The command holds, or jumps to `command` if given."""
+        """Play nothing from `time_s` on. The drive keeps its value, or jumps to `command` if that is given."""
         here = float(self.command(np.array([time_s]))[0])
         with self._lock:
             while self._played and self._played[-1].start_s >= time_s:
@@ -117,14 +117,14 @@ class DacHistory:
 
 DAC_STEPS = 4095
 CENTRE = 0x800 / DAC_STEPS * 2 - 1
-"""Normalised drive without power."""
+"""Normalised drive of an output at 0 V, as without power."""
 
 
 class DacModel(UsbModel):
     """Base of the scanner boards. `history` records what the outputs did; times are the transport's."""
 
     def __init__(self, spec: DeviceSpec, *, commands: int, replies: int, points: int) -> None:
-        """commands, replies, points: addresses of the endpoints for them."""
+        """commands, replies, points: addresses of the endpoints that carry them."""
         self.spec = spec
         self.history = DacHistory(CENTRE, lines=4)
         self.deaf = False
@@ -179,11 +179,11 @@ SYSTICK_HZ = 112_000_000
 BUFFER_POINTS = 4096
 STOP_DEAD_S = 0.1
 BUS_BYTES_PER_S = 1.0e6
-"""Bytes a second at full speed, about: 4095 points take 28 ms."""
+"""Approximate rate of full-speed USB: 4095 points take 28 ms."""
 
 COMMANDS, REPLIES, FRAMES = 0x06, 0x83, 0x02
 RED, GREEN, BLUE, INTENSITY = 0, 1, 2, 3
-"""Colour outputs, as lines of the history."""
+"""Colour outputs: numbers of their lines in `DacHistory`."""
 
 _SPEC = DeviceSpec(
     vendor=0x1209,
@@ -243,8 +243,8 @@ class HeliosModel(DacModel):
         self._dead_until_s = -1.0
 
     def set_interface(self, interface: int, alternate: int, now_s: float) -> None:
-        """Enable the DAC (alternate 1), blank and with the mirror where it is, or stop it (any other), blank and at the
-        centre.
+        """Alternate 1 enables the DAC: colours low, and the mirror stays where it is. Any other one stops it: colours
+        low, mirror at the centre.
         """
         self.advance(now_s)
         self._halt(now_s)

@@ -78,7 +78,7 @@ class ObisModel:
 
     @property
     def power_w(self) -> float:
-        """Power of the light that comes out now, in W; through an open gate if the laser is gated."""
+        """Power in W that comes out now; for a gated laser, the power that an open gate lets out."""
         return self.set_power_w if self.emitting else 0.0
 
     def shine(self, power_w: float, *, gated: bool = True) -> None:

@@ -111,13 +111,13 @@ class PrawnDoModel:
         return self._levels[bisect_right(self._times, at_s) - 1]
 
     def changes(self, from_s: float, until_s: float) -> list[tuple[float, int]]:
-        """The level at `from_s`, then each change up to and at `until_s`: (time, outputs)."""
+        """The level at `from_s`, then each change up to and including `until_s`: (time, outputs)."""
         first = bisect_right(self._times, from_s)
         last = bisect_right(self._times, until_s)
         return [(from_s, self._levels[first - 1]), *zip(self._times[first:last], self._levels[first:last], strict=True)]
 
     def forget(self, before_s: float) -> None:
-        """Drop the history before `before_s`, which is no longer needed."""
+        """Drop the level changes that are needed only for times before `before_s`."""
         keep = bisect_right(self._times, before_s) - 1
         del self._times[:keep], self._levels[:keep]
 
@@ -172,7 +172,7 @@ class PrawnDoModel:
         self._levels.append(level)
 
     def _settle(self, now_s: float) -> None:
-        """Let the board's second core do what the first one had asked for before these bytes came."""
+        """Let the board's second core, which plays the program, carry out what the first core requested before now."""
         if self.status == ABORT_REQUESTED:
             self.status = ABORTED
         self.advance(now_s)

@@ -148,7 +148,7 @@ class Spad512sModel:
         self._run = _Run(n, max(t_int * 1e-6, READ_OUT_S), now_s)  # microseconds: bits is 1
 
     def _expose(self, run: "_Run", now_s: float) -> None:
-        """Put the next frames onto the wire, if they are exposed, or what ends the run."""
+        """Send the next frames if they are exposed, or the text that ends the run."""
         if run.aborted or run.next_frame == run.n_frames:
             self._out += b"ERROR" if run.aborted else b"DONE"
             self._run = None
@@ -172,7 +172,7 @@ class Spad512sModel:
 
 
 _BACK: Final[dict[QuarterTurn, QuarterTurn]] = {0: 0, 90: 270, 180: 180, 270: 90}
-"""The turn that undoes another."""
+"""For each rotation, the one that undoes it."""
 
 
 @dataclass(slots=True)

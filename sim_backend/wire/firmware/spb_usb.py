@@ -1,6 +1,6 @@
 """An SPB1 device on USB (docs/reference/spb1-usb.md): control plane, states, heartbeat, watchdog.
 
-It is either a Cypress FX3 board (commands on 0x01, stream on 0x81, acknowledgements on 0x82) or behind an FTDI FT601
+Its USB chip is a Cypress FX3 (commands on 0x01, stream on 0x81, acknowledgements on 0x82) or an FTDI FT601
 (session commands on 0x01, commands on 0x02, stream on 0x82, acknowledgements on 0x83). A board without the endpoint for
 acknowledgements sends them in the stream. A pure state machine: what the sensor sees comes from `source`.
 """
@@ -209,7 +209,7 @@ class SpbUsbModel(UsbModel):
         the next START."""
 
     def _watch(self, now_s: float) -> None:
-        """Act as the watchdog: a run whose host sends no PING ends dark."""
+        """Act as the watchdog: if the host sends no PING for HEARTBEAT_MS, the run ends with the gate low."""
         limit_ms = self._registers[Register.HEARTBEAT_MS]
         run = self._run
         if run is not None and limit_ms and now_s - run.pinged_s > limit_ms / 1000:

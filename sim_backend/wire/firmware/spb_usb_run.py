@@ -44,11 +44,10 @@ class FrameSource(Protocol):
         ...
 
     def expose(self, span: Span, records: NDArray[np.void], bits: NDArray[np.uint8] | None) -> int:
-        """Fill `marks`, `x0`, `line`, `sweep` of the records (n,), and the bits unless they are None because the frames
-        get lost.
+        """Fill `marks`, `x0`, `line`, `sweep` of the records (n,), and the bits.
 
-        bits: (n, height, row bytes), with old bytes in it. Returns the number of scan markers since START at the first
-        frame.
+        bits: (n, height, row bytes), to be overwritten; None if the frames get lost. Returns the number of scan markers
+        since START, up to and including the first frame.
         """
         ...
 
@@ -182,7 +181,9 @@ class EmulatedRun:
         return self._memory.control_block(self._stride, IDLE, self._run_id, b"")
 
     def _lose_overrun(self, n: int, now_s: float) -> int:
-        """Frames of the next block, 0 until all are exposed; those that the FIFO cannot hold are lost first."""
+        """Lose the frames that the FIFO cannot hold. Returns the number of frames in the next block, 0 if some of them
+        are not exposed yet.
+        """
         exposed = int((now_s - self._start_s) * self._board.tick_hz / self._period)
         if self._n_frames is not None:
             exposed = min(exposed, self._n_frames)
@@ -285,7 +286,7 @@ def device_spec(chip: Chip, acks: str, serial: str | None, product_name: str) ->
 
 
 def registers_at_power_up(board: SpbUsbBoard) -> dict[int, int]:
-    """The registers by address. Those that a host writes are 0, except STRIDE, which is the largest."""
+    """The registers by address. Those that a host can write are 0, except STRIDE, which equals MAX_STRIDE."""
     registers = dict.fromkeys(WRITABLE, 0)
     registers |= {
         Register.MAGIC: IDENTITY_MAGIC,

@@ -119,7 +119,7 @@ class TcpServer(WireServer[TcpModel]):
         return True
 
     def _give(self, now_s: float) -> bool:
-        """Send what is due; ask the model for more only when all is sent, as a program blocks in its own send."""
+        """Send what is due. Ask the model for more only when all is sent: until then a real program blocks in send."""
         if self._client is None:
             return False
         if not self._outbox and self._wire_s() >= self._free_at:

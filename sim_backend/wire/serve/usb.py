@@ -186,7 +186,7 @@ class EmulatedUsb(usb.backend.IBackend):  # type: ignore[misc] # pyusb carries n
         dev_handle.device.clear_halt(ep)
 
     def _until(self, timeout_ms: int) -> Iterator[None]:
-        """Yield now and then until the time is over, at least once. Raises ValueError if there is no time."""
+        """Yield for each attempt until the timeout is over, at least once. Raises ValueError for a timeout of 0."""
         if timeout_ms <= 0:
             raise ValueError("a timeout of 0 waits for ever in libusb; give the transfer a deadline")
         end_s, poll_s = now_s(self._clock) + timeout_ms / 1000, FIRST_POLL_S

@@ -164,7 +164,7 @@ class UsbModel:
         """Note that the host chose an alternate setting. It is 0 also when the host released the interface or died."""
 
     def control(self, setup: Setup, data: bytes, now_s: float) -> Answer:
-        """Answer a class or vendor request: the reply for IN, b"" ('taken') for OUT, None while not ready."""
+        """Answer a class or vendor request: the reply for IN, b"" ('taken') for OUT, None while not ready, or STALL."""
         return STALL
 
     def out(self, endpoint: int, data: bytes, now_s: float) -> int | Stall | None:
@@ -199,7 +199,7 @@ class AttachedDevice:
         """Whether this user may not open it (EACCES)."""
         self.configuration = 1
         self.lock = threading.RLock()
-        """Held around every call of the model; hold it to look at it."""
+        """Held around every call of the model; hold it to read the model's attributes."""
         self._now = now
         self._claims: dict[int, object] = {}
         self._alternates: dict[int, int] = {}
