@@ -289,7 +289,7 @@ def _passages(
 
 def _around(sums: ColumnSums, position: Array, start: Array, near: int) -> tuple[Array, Array, Array]:
     """1s, frames and positions (pixels, 2 near + 3) around the passages. The first and last entries are the sums over
-    the columns farther away.
+    the columns farther away; their positions are -FAR and FAR.
     """
     middle = np.rint(start).astype(np.int64)[:, None]
     far = max(REACH, 2 * near)

@@ -1,7 +1,7 @@
 """The commands in recorded control traffic that make a device do something, without the queries between them.
 
-Queries are left out because their number, and the tokens in them, depend on the host's timing. The drivers may send a
-command again when a reply was lost, so repeats on a serial line count once. The queries known here are those of Helios,
+Queries are left out because their number, and the numbered lines with which the PrawnDO driver frames a command,
+depend on the host's timing. The drivers may send a command again when a reply was lost, so repeats on a serial line count once. The queries known here are those of Helios,
 LaserCube, Cobolt, OBIS and PrawnDO (docs/reference/hardware.md).
 """
 

@@ -46,8 +46,8 @@ def model_problems(
 def require_speed(model: RigModel, speed_per_s: float, exposures: int) -> None:
     """Raise CalibrationError if the lag was not measured near this speed. The message has a command that measures it.
 
-    The speed of a sweep is inversely proportional to its exposures. The command names this scan's exposures and those
-    of the farther end of the old range, so that scans that were possible stay possible.
+    The speed of a sweep is inversely proportional to its exposures. The command names this scan's exposures, and those
+    that give the speed at the far end of the range measured so far, so that scans that were possible stay possible.
     """
     try:
         model.check_speed(speed_per_s)

@@ -70,7 +70,7 @@ class LineTable(NamedTuple):
 def line_places(sweep: Sweep, x_far: Float64, side: int, pixels: int) -> Int16:
     """Places of the lines of all rows and columns, int16 (rows, columns, PLACES); made once per model.
 
-    PLACE_X: x of pixel 0 of distance, the leftmost of `pixels`, NOWHERE where nothing is searched; PLACE_BEGIN,
+    PLACE_X: x of pixel 0 of distance, the leftmost of all `pixels`; NOWHERE if nothing is searched. PLACE_BEGIN,
     PLACE_END: first pixel of distance that is searched and was stored, and the one after the last.
     """
     rows, columns = x_far.shape

@@ -371,7 +371,7 @@ def _position_prior(levels: Float64) -> Float64:
 
 
 def _gain(gain: Float32, seen: Float64, ambient: float, before: Float64) -> Float32:
-    """Strength of the haze per row or column, smoothed over 65 of them; 1 on average, unchanged where haze is weak.
+    """Strength of the haze per row or column, smoothed over 65 of them; 1 on average. As it was if haze is weak.
 
     seen: (n, 2), ones before the stripe and those expected with the present gain.
     """
