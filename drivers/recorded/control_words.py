@@ -1,8 +1,8 @@
 """The commands in recorded control traffic that make a device do something, without the queries between them.
 
-Queries are left out because their number, and the numbered lines with which the PrawnDO driver frames a command,
-depend on the host's timing. The drivers may send a command again when a reply was lost, so repeats on a serial line count once. The queries known here are those of Helios,
-LaserCube, Cobolt, OBIS and PrawnDO (docs/reference/hardware.md).
+Queries are left out because their number, and the numbered lines with which the PrawnDO driver frames a command, depend
+on the host's timing. The drivers may send a command again when a reply was lost, so repeats on a serial line count
+once. The queries known here are those of Helios, LaserCube, Cobolt, OBIS and PrawnDO (docs/reference/hardware.md).
 """
 
 import re
