@@ -41,7 +41,7 @@ class GuardLimits:
     waits_within_s: float = 0.04
     """Limit for an application at work whose source thread reports that the SPAD has given no frames for this long."""
     first_wait_s: float = 0.3
-    """The same limit before the first frame."""
+    """This limit, before the first frame."""
     first_frame_s: float = 1.0
     """Time from `run` to the first frame: SPAD, scanner and the scan marker come in between. An application at work
     gets `busy_within_s` on top, since devices that start and a machine with too much to do may come together."""

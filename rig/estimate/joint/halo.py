@@ -270,7 +270,7 @@ def bright_lines(
     volume: CountVolume, tables: JointTables, stripes: StripeTable, places: Places, workers: RowWorkers,
     number: int = DETECT_LINES,
 ) -> BrightLines:  # fmt: skip
-    """Of about `number` lines with a clear stripe, evenly spread over a map: those whose stripe has a known light.
+    """Lines whose stripe has a known light, out of about `number` with a clear stripe, evenly spread over a map.
 
     tables: those that the map was made with; places: of its stripes.
     """
