@@ -215,9 +215,7 @@ def recording_space(
 
 def foreseen(rig: OpenRig, plan: ScanPlan, maps: int | None) -> str:
     """The estimator of a scan in words, as far as it is known before the scan."""
-    sensor = plan.rows, plan.width
-    geometry = map_geometry(rig.model, plan.commands, plan.depth_range_m, sensor=sensor, lines=plan.lines)
-    return foreseen_estimator(rig.config.estimate, geometry, _map_time_s(rig, plan, maps))
+    return foreseen_estimator(rig.config.estimate, _geometry(rig, plan), _map_time_s(rig, plan, maps))
 
 
 def _map_time_s(rig: OpenRig, plan: ScanPlan, maps: int | None) -> float:

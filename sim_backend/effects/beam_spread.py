@@ -28,6 +28,8 @@ from collections.abc import Sequence
 import numpy as np
 from numpy.typing import NDArray
 
+from sim_backend.scenes.medium import henyey_greenstein
+
 Array = NDArray[np.float64]
 Lobes = Sequence[tuple[float, float]]
 """(weight, g) of the Henyey-Greenstein terms of a phase function; weights sum to 1."""
@@ -49,8 +51,7 @@ FINER = 8
 
 def phase(lobes: Lobes, cosine: Array | float) -> Array:
     """Phase function in 1/sr."""
-    terms = [w * (1 - g * g) / (1 + g * g - 2 * g * np.asarray(cosine)) ** 1.5 for w, g in lobes]
-    return np.asarray(sum(terms) / (4 * math.pi))
+    return np.asarray(sum(weight * henyey_greenstein(cosine, g) for weight, g in lobes))
 
 
 def scattered_once(lobes: Lobes, share: float, haze: bool) -> Array:

@@ -60,10 +60,10 @@ PerSteradian = Annotated[
 MeanCosine = Annotated[float, Field(gt=-1, lt=1)]
 
 
-def henyey_greenstein(cosine: float, g: float) -> float:
-    """Phase function in 1/sr for the cosine of the scattering angle (-1 = back)."""
-    ahead, sharp = math.copysign(cosine, cosine * g), abs(g)  # 1 + g^2 - 2 g cos, without cancellation at the peak
-    return (1 - g) * (1 + g) / (4 * math.pi * math.pow((1 - sharp) ** 2 + 2 * sharp * (1 - ahead), 1.5))
+def henyey_greenstein(cosine: Any, g: float) -> Any:
+    """Phase function in 1/sr for the cosine of the scattering angle (-1 = back), a number or an array."""
+    ahead, sharp = np.copysign(cosine, cosine * g), abs(g)  # 1 + g^2 - 2 g cos, without cancellation at the peak
+    return (1 - g) * (1 + g) / (4 * math.pi * np.power((1 - sharp) ** 2 + 2 * sharp * (1 - ahead), 1.5))
 
 
 class Section(BaseModel):
@@ -180,7 +180,7 @@ class Medium(Section):
         """Phase function at 180 degrees."""
         if self.phase_terms is None:
             return self.backscatter
-        return sum(weight * henyey_greenstein(-1.0, g) for weight, g in self.phase_terms)
+        return float(sum(weight * henyey_greenstein(-1.0, g) for weight, g in self.phase_terms))
 
     @property
     def mean_cosine(self) -> float:
@@ -197,8 +197,8 @@ class Medium(Section):
         rest, terms = 1 - self.forward_share, self.phase_terms
         if terms is None:
             g = (self.mean_cosine - self.forward_share) / rest
-            lacks = self.backscatter / rest - henyey_greenstein(-1.0, g)
-            back = min(max(lacks / henyey_greenstein(-1.0, BACK_LOBE_G), 0.0), 0.08)
+            lacks = self.backscatter / rest - float(henyey_greenstein(-1.0, g))
+            back = min(max(lacks / float(henyey_greenstein(-1.0, BACK_LOBE_G)), 0.0), 0.08)
             return (1 - back, (g - back * BACK_LOBE_G) / (1 - back)), (back, BACK_LOBE_G)
         *others, (weight, g) = sorted(terms, key=lambda term: term[1])
         kept = [*others, (max(weight - self.forward_share, 0.0), g)]
