@@ -16,7 +16,7 @@ from numpy.typing import NDArray
 
 from rig.count.lane_order import PAD, PAIRS, STEPS, new_counts, padded_lanes, read_planes, write_counts
 from rig.geometry.windows import WORD_PX
-from rig.simd.memory import address_of, aligned_zeros
+from rig.simd.memory import address_of, aligned_zeros, keep_alive
 from rig.simd.vectors import LANES
 
 Words = NDArray[np.uint64]
@@ -258,6 +258,7 @@ def add_runs(
                         else:
                             write_counts(n_row[r], counts[c, y + r])
             f = g
+    keep_alive(as_bytes, n_lit, n_dark)
 
 
 @numba.njit(cache=True, nogil=True)

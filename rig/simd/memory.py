@@ -2,7 +2,8 @@
 
 Addresses are used instead of arrays because numba counts references to every array that a compiled function gets. In
 the functions for one image row the counting takes many times as long as the work itself. So a caller makes a named
-tuple of arrays, keeps it alive and passes its `pointers`; inside a kernel `address_of` gives the address of an array.
+tuple of arrays, keeps it alive and passes its `pointers`; inside a kernel `address_of` gives the address of an array,
+and `keep_alive` keeps one that the kernel itself has allocated.
 Nothing here checks that an index lies inside the array. In an array that begins at a cache line (`aligned_zeros`), a
 vector of 32 bytes at a multiple of 32 bytes lies in one cache line, so that one line is read for it, not two.
 """
@@ -41,6 +42,15 @@ def _pointer_to(value: Any) -> Any:
 def address_of(array):  # type: ignore[no-untyped-def]
     """Address of an array's first element. Signed: numba makes a float of a signed plus an unsigned number."""
     return np.int64(array.ctypes.data)
+
+
+@numba.njit(cache=True, nogil=True)
+def keep_alive(*arrays):  # type: ignore[no-untyped-def]
+    """Keep arrays that a kernel has allocated alive up to this call.
+
+    Numba frees an array after its last use by name, even if its address is used later: another thread may then get that
+    memory.
+    """
 
 
 def _pointer(builder: Any, address: Any, index: Any, element: Any, whole: Any) -> Any:

@@ -52,7 +52,7 @@ from rig.estimate.row.neighbours import COPIED_ROWS, MARGIN, SAME_PX, on_surface
 from rig.geometry.stripe_table import StripeTable
 from rig.simd import Bools, Float32, Int16, Int32
 from rig.simd.functions import error_function, exponential, logarithm
-from rig.simd.memory import address_of, copy_floats, load_float32, store_float32, store_int16
+from rig.simd.memory import address_of, copy_floats, keep_alive, load_float32, store_float32, store_int16
 from rig.simd.vectors import LANES, larger_float, smaller_float, square_root, to_int16, where_small, zero_float32
 from rig.threads import RowWorkers
 
@@ -269,7 +269,8 @@ def confidences(
                 if np.isnan(x_px[y, c]):
                     confidence[y, c] = 0.0
                     signal[y, c] = haze[y, c] = sd_px[y, c] = nothing
-    lines[:1] = 0.0  # kept alive up to here: numba would free what only its address still uses
+        keep_alive(distance)
+    keep_alive(lines)
 
 
 @numba.njit(cache=True, nogil=True)

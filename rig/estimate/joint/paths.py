@@ -22,7 +22,7 @@ import numpy as np
 
 from rig.estimate.joint.winner import LARGEST, VECTOR, Readout, answer_columns, fetch_answers
 from rig.simd import Uint8
-from rig.simd.memory import address_of, load_bytes, prefetch, read_byte, store_bytes, write_byte
+from rig.simd.memory import address_of, keep_alive, load_bytes, prefetch, read_byte, store_bytes, write_byte
 from rig.simd.vectors import add_saturated_unsigned, smaller_unsigned, smallest_byte, sub_saturated_unsigned, zero_bytes
 
 _SIDE: Final = 2 * VECTOR
@@ -140,7 +140,7 @@ def along_rows(cost: Uint8, message: Uint8, first_row: int, last_row: int) -> No
     for row in range(first_row, last_row):
         at = row * columns * labels
         _along_row(address_of(cost) + at, address_of(message) + at, columns, labels, _paths_in(memory))
-    memory[:1] = 0  # kept alive up to here: only the address is used above
+    keep_alive(memory)
 
 
 @numba.njit(cache=True, nogil=True)
@@ -209,4 +209,4 @@ def along_columns(cost: Uint8, message: Uint8, first_column: int, last_column: i
         costs, messages = address_of(cost) + at, address_of(message) + at
         _go_down(costs, messages, rows, row_bytes, labels, count, paths)
         _go_up(costs, messages, rows, row_bytes, count, paths, column, desk)
-    memory[:1] = 0  # kept alive up to here: only the address is used above
+    keep_alive(memory)

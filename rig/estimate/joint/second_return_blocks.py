@@ -25,6 +25,7 @@ from rig.simd import Float32, Float64, Int16, Int32
 from rig.simd.memory import (
     CACHE_LINE,
     address_of,
+    keep_alive,
     load_counts,
     load_float32,
     prefetch,
@@ -219,9 +220,7 @@ def sum_blocks(
                 _copy_lines(counts, still, place, x0, sweep.u.shape[1], number, lines, spare)
             at = 4 * pixels * (by * across + bx)
             sum_lines(table, inner, readable, clear_at + 4 * clear[0].size * bx, pixels, to_ones + at, to_expected + at)
-    # Keeps the arrays alive up to here: numba would free those of which only the address is still used.
-    lines[0, 0] = ends[0] = 0
-    limits[0, 0] = spare[0, 0, 0] = frames[0] = 0.0
+    keep_alive(lines, limits, ends, frames, clear, spare)
 
 
 @numba.njit(forceinline=True)

@@ -28,7 +28,7 @@ from rig.estimate.row.inputs import RowState, Sweep, fluxes_at, line_light
 from rig.estimate.row.neighbours import with_margin
 from rig.geometry.kernels import with_rays
 from rig.simd import Float32, Float64, Int16, Int32
-from rig.simd.memory import address_of, aligned_zeros, load_float32, store_float32
+from rig.simd.memory import address_of, aligned_zeros, keep_alive, load_float32, store_float32
 from rig.simd.vectors import LANES, larger_float, largest_float, square_root, zero_float32
 from rig.threads import RowWorkers, Work
 
@@ -104,7 +104,7 @@ def find_candidates(blocks: Blocks, reach: int, side: int, first_block: int, las
                     if sure > out.sure[by, bx]:
                         out.distance[by, bx] = i - (pixels - 1 if side > 0 else 0)
                         out.sure[by, bx], out.haze[by, bx] = sure, more
-    three[:1] = 0.0  # kept alive up to here: numba would free what only its address still uses
+    keep_alive(three, nine, above)
 
 
 @numba.njit(cache=True, nogil=True)

@@ -30,7 +30,7 @@ from rig.estimate.row.neighbours import COPIED_ROWS, MARGIN, on_surface, with_ma
 from rig.geometry.stripe_table import StripeTable
 from rig.simd import Float32, Int32
 from rig.simd.functions import exponential, logarithm
-from rig.simd.memory import address_of, load_float32, store_float32
+from rig.simd.memory import address_of, keep_alive, load_float32, store_float32
 from rig.simd.vectors import LANES, larger_float, smaller_float, square_root, zero_float32
 from rig.threads import RowWorkers
 
@@ -74,6 +74,8 @@ def confidences(
                 store_float32(address_of(line), c, judged)
             for c in range(columns):
                 confidence[y, c] = 0.0 if np.isnan(distance[y, c]) else line[c]
+        keep_alive(distances, lights, hazes, around)
+    keep_alive(k, line)
 
 
 @numba.njit(forceinline=True)

@@ -22,7 +22,7 @@ from rig.count.lane_order import PAIRS, STEPS, pair_bytes, place_of
 from rig.estimate.row.inputs import RowState, Sweep, row_buffers, row_fluxes
 from rig.estimate.row.likelihood import FLUX_MAX, cell_of, none_prior
 from rig.simd import Float32, Int16, Int32, Uint8
-from rig.simd.memory import CACHE_LINE, address_of, read_int16, write_int16
+from rig.simd.memory import CACHE_LINE, address_of, keep_alive, read_int16, write_int16
 from rig.simd.shuffles import FOLDED
 from rig.simd.vectors import LANES
 
@@ -322,6 +322,7 @@ def search_memory(lanes: int) -> Uint8:
     search = search_in(address_of(memory), lanes)
     for i in range(STEPS * lanes + 2 * PLACE_BEFORE):
         write_int16(search.place, i, np.int16(place_of(i - PLACE_BEFORE, lanes)))
+    keep_alive(whole)
     return memory
 
 

@@ -43,6 +43,7 @@ from rig.simd.memory import (
     CACHE_LINE,
     address_of,
     copy_floats,
+    keep_alive,
     load_float32,
     prefetch,
     read_float32,
@@ -121,9 +122,7 @@ def measure_light(
             _measure(at + 4 * c, width, taps_at, ambient_at + 8 * c, bin_at + 8 * c)
         for i in range(len(found)):
             copy_floats(at + 4 * width * (_LIGHT + i), found[i] + 4 * columns * y, columns)
-    # Keeps the arrays alive up to here: numba would free those of which only the address is still used.
-    spare[:1] = bins[:1] = taps[:1] = lines[:1] = 0.0
-    ambient_places[:1] = bin_places[:1] = 0
+    keep_alive(spare, bins, taps, lines, ambient_places, bin_places)
 
 
 @numba.njit(cache=True, nogil=True)
@@ -247,9 +246,7 @@ def score_places(
             _score(at + 4 * c, width, known, y * columns + c, taps_at, ambient_at + 8 * c, shares_at + 8 * c, side)
         copy_floats(at + 4 * width * _SCORE, to_score + 4 * columns * y, columns)
         copy_floats(at + 4 * width * _KNOWN, to_known + 4 * columns * y, columns)
-    # Keeps the arrays alive up to here: numba would free those of which only the address is still used.
-    spare[:1] = taps[:1] = lines[:1] = 0.0
-    ambient_places[:1] = share_places[:1] = 0
+    keep_alive(spare, taps, lines, ambient_places, share_places)
 
 
 @numba.njit(cache=True, nogil=True)

@@ -25,7 +25,7 @@ import numpy as np
 from rig.estimate.joint.place.places import Places
 from rig.estimate.row.neighbours import COPIED_ROWS, MARGIN, SAME_PX, with_margin
 from rig.simd import Float32
-from rig.simd.memory import address_of, copy_floats, load_float32, store_float32
+from rig.simd.memory import address_of, copy_floats, keep_alive, load_float32, store_float32
 from rig.simd.vectors import (
     LANES,
     larger_float,
@@ -103,7 +103,7 @@ def pool_amplitude(
                 own = load_float32(at, c) / larger_float(load_float32(at, width + c), _LEAST)
                 store_float32(at, c, smaller_float(larger_float(own, faintest), brightest))
             copy_floats(at, amplitude + 4 * columns * y, columns)
-    sums[:1] = 0.0  # kept alive up to here: numba would free what only its address still uses
+    keep_alive(sums)
 
 
 @numba.njit(cache=True, nogil=True)
@@ -134,9 +134,8 @@ def pool_places(
                     break
             copy_floats(to + 8 * (width - 2 * LANES), to_moved + 4 * columns * y, columns)
             copy_floats(to + 12 * (width - 2 * LANES), to_sd + 4 * columns * y, columns)
-        # Keeps the arrays alive up to here: numba would free those of which only the address is still used.
-        distance[:1] = score[:1] = known[:1] = 0.0
-    lines[:1] = 0.0
+        keep_alive(distance, score, known)
+    keep_alive(lines)
 
 
 @numba.njit(cache=True, nogil=True)
@@ -186,9 +185,8 @@ def join_pairs(
             _join_row(around, width, (y - band + MARGIN) * width + LANES, step, share, 1.0 / enough, at)
             copy_floats(at, to_distance + 4 * columns * y, columns)
             copy_floats(at + 4 * width, to_sd + 4 * columns * y, columns)
-        # Keeps the arrays alive up to here: numba would free those of which only the address is still used.
-        places[:1] = sds[:1] = 0.0
-    lines[:1] = 0.0
+        keep_alive(places, sds)
+    keep_alive(lines)
 
 
 @numba.njit(cache=True, nogil=True)
