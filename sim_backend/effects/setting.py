@@ -62,7 +62,8 @@ class LaserEffect(Protocol):
     def add(self, sheet: LightSheet, first_row: int, last_row: int, rate: Array) -> None:
         """Add detections per second and watt to `rate` (rows, width), rows first_row..last_row-1. Releases the GIL.
 
-        rate is float64, or float32 when frames are drawn; seven digits are more than photons can show.
+        `rate` holds what the effects before this one in the catalogue have added for this sheet, which may be changed.
+        It is float64, or float32 when frames are drawn; seven digits are more than photons can show.
         """
         ...
 
