@@ -24,7 +24,7 @@ _TIMES = re.compile(r"x(\d+(?:\.\d*)?|\.\d+)")
 
 @dataclass(frozen=True, slots=True)
 class ReplayClock:
-    """The clock named by the option `--clock`. speed: recorded seconds per second; None: as fast as frames are taken,
+    """The clock named by the option `--clock`. speed: recorded seconds per second; None: as fast as frames are read,
     or in steps.
     """
 
@@ -65,7 +65,7 @@ class Pace:
 
     def __init__(self, what: ReplayClock, clock: Clock) -> None:
         self.speed = what.speed
-        """Recorded seconds per second; None: as fast as frames are taken."""
+        """Recorded seconds per second; None: as fast as frames are read."""
         self._clock = clock
         self._changed = threading.Condition()
         self._steps = 0

@@ -1,12 +1,12 @@
-"""The folder of a run: every output in one place. Except for a recording, it is either complete or not there at all.
+"""The folder of a run: every output in one place.
 
     depth/000000.npy  depth/000000.png  intensity/000000.png  stripe/000000.npz  cloud/000000.ply
     learned/000000.npz (the state used for the map, if the estimator learns)
     truth/000000.npz (if a world knows it)  manifest.json  summary.json
 
-Everything is written beside the folder under a hidden name and moved in one step at the end. If the folder exists and
-is empty, it is filled at the end, file by file, summary.json last. The folder of a recording is there from the start
-and grows in place. Data written with `replace_file` and `sync_folder` survives a loss of power.
+A new folder is complete when it appears: everything is written to a hidden folder beside it, which is renamed at the
+end. If the folder exists and is empty, it is filled at the end, file by file, summary.json last. The folder of a
+recording is there from the start and grows in place. Data written with `replace_file` and `sync_folder` survives a loss of power.
 """
 
 import io
