@@ -266,8 +266,8 @@ def _window_cases(frames: BenchFrames, learned: Likelihood, workers: Workers, ex
 def _usual_cases(
     frames: BenchFrames, learned: Likelihood, workers: Workers, extent: Extent, folder: Path
 ) -> list[Case]:
-    """Cases of the usual window only, all of `likelihood`: one that works at the end of sweeps, one with whole frames, and
-    one with frames from a recording.
+    """Cases of the usual window only, all of `likelihood`: one that works at the end of sweeps, one with whole
+    frames, and one with frames from a recording.
     """
     few = [k for k in FEW_EXPOSURES if k in extent.exposures]
     full = full_frames(frames, extent.frames_bytes)

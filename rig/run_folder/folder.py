@@ -6,7 +6,8 @@
 
 A new folder is complete when it appears: everything is written to a hidden folder beside it, which is renamed at the
 end. If the folder exists and is empty, it is filled at the end, file by file, summary.json last. The folder of a
-recording is there from the start and grows in place. Data written with `replace_file` and `sync_folder` survives a loss of power.
+recording is there from the start and grows in place. Data written with `replace_file` and
+`sync_folder` survives a loss of power.
 """
 
 import io
