@@ -1,5 +1,5 @@
 """The application: config, plan, acquisition, reconstruction, command line."""
 
-from rig.kernel_cache import prepare
+from rig.kernel_cache import prepare_kernels
 
-prepare()
+prepare_kernels()

@@ -1,12 +1,12 @@
 """Gives numba a folder for compiled kernels, and removes kernels that are out of date.
 
 Service accounts and containers often have no folder in which numba can store kernels. numba then refuses to compile at
-all, so `prepare` provides a folder.
+all, so `prepare_kernels` provides a folder.
 
 numba compiles a kernel anew if the kernel's own file has changed, but not if a function that it inlines from another
-file has. After an update, such kernels would silently run old code. So `prepare` stores a digest of each module's
-source and of all modules that it imports, and removes the kernels of modules whose digest has changed. Checking whether
-any file has changed takes a few milliseconds, computing the digests a second.
+file has. After an update, such kernels would silently run old code. So `prepare_kernels` stores a digest of each
+module's source and of all modules that it imports, and removes the kernels of modules whose digest has changed. Checking
+whether any file has changed takes a few milliseconds, computing the digests a second.
 """
 
 import ast
@@ -25,7 +25,7 @@ NOTE = "spadrig-kernels-{}.json"
 """Name of the file with the digests. {} is a digest of the checkout's path, since several may share one folder."""
 
 
-def prepare() -> None:
+def prepare_kernels() -> None:
     """Give numba a folder that it can write to, and remove stale kernels. Call this before numba is imported."""
     home = Path(os.environ.get("XDG_CACHE_HOME") or Path("~/.cache").expanduser())
     if VARIABLE not in os.environ and not _writable(TOP / "rig" / "__pycache__"):

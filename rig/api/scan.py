@@ -13,7 +13,7 @@ from rig.config.files import load_cube_plan
 from rig.config.models import AUTO, CubePlan, EstimateConfig, RigConfig
 from rig.config.overrides import SIMULATED, Config, PathLike, configure, seed_problems
 from rig.devices.calibration_use import calibration_use, cube_calibration_use
-from rig.devices.open import open_rig, require_simulated_or_armed
+from rig.devices.open import light_problems, open_rig
 from rig.devices.prepare import prepare, require_memory
 from rig.errors import UsageError, noted
 from rig.estimate.registry import ESTIMATORS, FILTERS
@@ -32,7 +32,7 @@ from rig.scan.pipeline import Overload, require_policy
 from rig.scan.reconstruct import reconstruct_cube
 from rig.scan.replay import play
 from rig.scan.run import Run, RunResult
-from rig.scan.scan import LiveSource, foreseen, recording_space, run_scan
+from rig.scan.scan import LiveFacts, foreseen, recording_space, run_scan
 
 
 def scan(
@@ -97,8 +97,8 @@ def plan_scan(
         if on_estimator is not None:
             on_estimator(foreseen(rig, plan, request.maps))
         if request.record and request.out is not None:
-            source = LiveSource(rig, plan, request.maps)
-            space = recording_space(rig, plan, timing, source, Path(request.out).absolute(), save)
+            facts = LiveFacts(rig, plan, request.maps)
+            space = recording_space(rig, plan, timing, facts, Path(request.out).absolute(), save)
             space.require()
             if on_space is not None:
                 on_space(space)
@@ -166,7 +166,7 @@ def _listeners(
 
 def _new_run(settings: RigConfig, request: RunRequest) -> Run:
     """Claim the run's folder. Raises UsageError with all problems of the request."""
-    save = _checked(request, require_simulated_or_armed(settings, request.arm))
+    save = _checked(request, light_problems(settings, request.arm))
     scan, estimate = settings.scan, settings.estimate
     tally = MapTally(scan.columns, scan.exposures, estimate.estimator, estimate.filter)
     return Run(request.out, tally, save, record=request.record)

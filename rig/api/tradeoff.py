@@ -14,7 +14,7 @@ from rig.requests import TradeoffRequest
 from rig.run_folder.folder import RunFolder
 from rig.tradeoff.choice import wish_of
 from rig.tradeoff.files import write_files
-from rig.tradeoff.trials import Tradeoff, require_methods, run_tradeoff, trials_of
+from rig.tradeoff.trials import Tradeoff, method_problems, run_tradeoff, trials_of
 
 EXPOSURES = (1, 3, 10)
 """Exposures per column that are tried if the caller names none."""
@@ -46,7 +46,7 @@ def tradeoff(
         estimators=request.estimators or [name for name in ESTIMATORS if name != "argmax"],
         filters=request.filters or FILTERS,
     )
-    problems += require_methods(request.estimators, request.filters)
+    problems += method_problems(request.estimators, request.filters)
     if loaded.estimate.temporal_prior and set(request.estimators) != {"joint"}:
         problems.append(
             f"{loaded.name} has estimate.temporal_prior, which is for joint alone; leave it out of the config or try "

@@ -39,7 +39,7 @@ from rig.config.models import RigConfig
 from rig.count.sweeps import SweepData
 from rig.count.volume import CountVolume
 from rig.devices.calibration_use import identity_of
-from rig.devices.open import OpenRig, open_rig, require_simulated_or_armed
+from rig.devices.open import OpenRig, light_problems, open_rig
 from rig.devices.prepare import prepare
 from rig.errors import PlanError, UsageError
 from rig.plan.scan_plan import Leg, ScanPlan
@@ -91,7 +91,7 @@ def capture_view(
     does.
     """
     settings = _settings(config, exposures)
-    if problems := require_simulated_or_armed(settings, arm):
+    if problems := light_problems(settings, arm):
         raise UsageError.of(problems)
     for known in (None, config.calibration):
         try:
@@ -243,7 +243,7 @@ def require_live(config: RigConfig | None, ask: AskPerson | None, arm: bool) -> 
     """
     if config is None:
         return
-    problems = require_simulated_or_armed(config, arm)
+    problems = light_problems(config, arm)
     if ask is None and not world_moves_board(config):
         problems.append(
             f"{config.name} is a real rig, and nobody is there to move the board; run this at a terminal, pass "

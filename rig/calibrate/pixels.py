@@ -37,7 +37,7 @@ from rig.config.overrides import SIMULATED, Config, PathLike, configure
 from rig.count.sweeps import SweepData
 from rig.count.volume import BIN_DARK, CountVolume, SweepCounter, SweepLayout
 from rig.devices.calibration_use import carry_notes, note_check
-from rig.devices.open import OpenRig, open_rig, require_simulated_or_armed
+from rig.devices.open import OpenRig, light_problems, open_rig
 from rig.errors import UsageError
 from rig.geometry.windows import WORD_PX
 from rig.progress import Progress, counted
@@ -323,7 +323,7 @@ def calibrate_pixels(
     path, frames = None if isinstance(source, RigConfig) else Path(source), request.frames
     recorded = path if path is not None and path.is_dir() and segment_files(path) else None
     config = plain(replay_config(recorded, ReplayRequest(clock="max")) if recorded else configure(source))
-    problems = [] if not request.light or recorded else require_simulated_or_armed(config, request.arm)
+    problems = [] if not request.light or recorded else light_problems(config, request.arm)
     if frames is not None and frames < 1:
         problems.append(f"frames is {frames}; it must be at least 1")
     if problems:

@@ -73,7 +73,7 @@ class SweepData(SweepAccount):
 
 
 @dataclass(frozen=True, slots=True)
-class SweepStart:
+class FirstSweep:
     """First sweep of a start to become a map: number 0, except in a part that was cut from a recording.
 
     clock_ratio: as in `FrameBinder`. Frames of earlier sweeps are not counted.
@@ -87,7 +87,7 @@ class SweepAssembler:
     """Turns the blocks of one start into sweeps. The result does not depend on how frames are grouped into blocks."""
 
     def __init__(
-        self, plan: ScanPlan, counter: Counter, maps: int, first_index: int = 0, start: SweepStart | None = None
+        self, plan: ScanPlan, counter: Counter, maps: int, first_index: int = 0, start: FirstSweep | None = None
     ) -> None:
         from rig.count.bind_kernels import cover
 
@@ -98,7 +98,7 @@ class SweepAssembler:
         self._counter = counter
         self._maps = maps
         self._first_index = first_index
-        self._start = start or SweepStart()
+        self._start = start or FirstSweep()
         self._binder = FrameBinder(plan, self._start.clock_ratio, self._start.sweep, self._start.sweep + maps)
         self._adds: deque[int] = deque(maxlen=MOST_UNDER_WAY)
         self._next_frame: int | None = None
@@ -114,8 +114,11 @@ class SweepAssembler:
         """Whether the scan marker that closes the last map has been seen."""
 
     def add(self, block: FrameBlock) -> Iterator[SweepData]:
-        """Count a block; yields the sweeps that end in it. Not to be called after `complete`. Raises ProtocolError for
-        a block that is not of this start and plan, and the errors of `FrameBinder.bind`."""
+        """Count a block; yields each sweep that ends in it before any frame of the next is counted. Iterate to the end.
+
+        Not to be called after `complete`. Raises ProtocolError for a block that is not of this start and plan, and the
+        errors of `FrameBinder.bind`.
+        """
         self._check(block)
         first = block.header.first_frame
         if self._next_frame is not None and first > self._next_frame:
@@ -235,7 +238,7 @@ class SweepAssembler:
             )
         if self._run_id not in (None, header.run_id):
             raise ProtocolError(
-                f"block {header.block_seq} is of run {header.run_id}, not of run {self._run_id}; start anew"
+                f"block {header.block_seq} is of start {header.run_id}, not of start {self._run_id}; start anew"
             )
         if self._next_frame is not None and header.first_frame < self._next_frame:
             raise ProtocolError(

@@ -216,7 +216,7 @@ def _pause_if_emitting(laser: LineLaser) -> list[str]:
     return [f"laser: {laser.name} was found emitting and has been paused; find out who armed it, then start again"]
 
 
-def require_simulated_or_armed(config: RigConfig, arm: bool) -> list[str]:
+def light_problems(config: RigConfig, arm: bool) -> list[str]:
     """Problems with letting light out: every real laser and gate needs the user's consent (`arm`)."""
     devices = {slot: getattr(config, slot) for slot in GUARDED}
     real = [

@@ -24,7 +24,7 @@ from drivers.replay.pace import PaceReport, ReplayClock
 from drivers.replay.spad import ReplaySpad
 from rig.config.files import parse_config
 from rig.config.models import EstimateConfig, RigConfig, ScanConfig
-from rig.count.sweeps import Gap, SweepAccount, SweepStart
+from rig.count.sweeps import FirstSweep, Gap, SweepAccount
 from rig.errors import DamagedRecordingError, UsageError
 from rig.estimate.registry import LEARNING, Learned
 from rig.estimate.row.model import RowModel
@@ -125,8 +125,8 @@ def replay_plan(
     return plan, spad.configure(request)
 
 
-class ReplaySource:
-    """Facts about a recording for its replay, as `rig.scan.scan.LiveSource` has them for a live scan.
+class ReplayFacts:
+    """Facts about a recording for its replay, as `rig.scan.scan.LiveFacts` has them for a live scan.
 
     maps: number of maps to take; None for all. starts: those of the SPAD, one after the other. learned: in a part that
     was cut out, the states with which its maps were estimated; empty if the estimator is to learn again. Raises
@@ -216,7 +216,7 @@ class RecordedStart:
     """
 
     number: int
-    begin: SweepStart
+    begin: FirstSweep
     first_map: int
     sweeps: int
     gone: tuple[RunGap, ...] = ()
@@ -324,10 +324,10 @@ def _end_gaps(recording: RunRecording, manifest: dict[str, Any]) -> list[RunGap]
     return sorted(gaps)
 
 
-def _part_starts(recording: RunRecording, cut: dict[str, Any] | None) -> list[SweepStart]:
+def _part_starts(recording: RunRecording, cut: dict[str, Any] | None) -> list[FirstSweep]:
     """The sweep with which the maps of each start begin: the first one, except in a part that was cut."""
     if cut is None:
-        return [SweepStart() for _ in recording.runs]
+        return [FirstSweep() for _ in recording.runs]
     ratios = cut.get("clock_ratios") or []
     starts = []
     for run in recording.runs:
@@ -338,7 +338,7 @@ def _part_starts(recording: RunRecording, cut: dict[str, Any] | None) -> list[Sw
             )
         # A part may begin in the middle of a sweep.
         first = block.header.sweep - begins_sweep(block)
-        starts.append(SweepStart(first, float(ratios[run.number]) if run.number < len(ratios) else 1.0))
+        starts.append(FirstSweep(first, float(ratios[run.number]) if run.number < len(ratios) else 1.0))
     return starts
 
 

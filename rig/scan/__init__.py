@@ -2,6 +2,6 @@
 
 Input: a rig and a request. Output: maps, one after the other, and an account of every frame. `scan` prepares a scan,
 runs it and reports how it went. `acquisition` starts and stops the devices, `source` fills the ring, `pipeline` moves
-blocks between threads, `counting` makes maps of them, `run` keeps the maps. `reconstruct` and `replay` do the same from
-a cube or a recording.
+blocks between threads, `counting` makes maps of them, `estimator` says with which estimator, `run` keeps the maps.
+`monitor` tells listeners about progress. `reconstruct` and `replay` make maps from a cube or a recording.
 """

@@ -17,7 +17,7 @@ from drivers.guard import GuardLimits
 from drivers.interfaces import SpadCounters, SpadTiming
 from drivers.replay.spad import ReplaySpad
 from drivers.transports.endpoints import EMULATED_PREFIX
-from rig.count.sweeps import SweepAssembler, SweepStart
+from rig.count.sweeps import FirstSweep, SweepAssembler
 from rig.count.volume import SweepLayout
 from rig.depth.fog_meter import FogEstimate
 from rig.devices.open import OpenRig
@@ -121,13 +121,13 @@ class Acquisition:
         )
         done = 0
         while done < self._asked.maps:
-            group, begin = self._next_start(self._asked.maps - done)
-            assembler = SweepAssembler(plan, counter, group, done, begin)
+            sweeps, begin = self._next_start(self._asked.maps - done)
+            assembler = SweepAssembler(plan, counter, sweeps, done, begin)
             counter.reset()
-            yield from self._run_group(assembler, group, done)
-            done += group
+            yield from self._run_start(assembler, sweeps, done)
+            done += sweeps
 
-    def _next_start(self, left: int) -> tuple[int, SweepStart]:
+    def _next_start(self, left: int) -> tuple[int, FirstSweep]:
         """Number of sweeps of the next start, at most `left`, and the sweep with which the start begins.
 
         The number is the recorded one, 1 for a first map alone, or else as many as burst memory and sync program hold.
@@ -136,8 +136,8 @@ class Acquisition:
             start = next(self._asked.starts)
             return min(left, start.sweeps), start.begin
         if self._asked.first_alone and left == self._asked.maps:
-            return 1, SweepStart()
-        return min(left, most_sweeps(self._rig, self._plan) or left), SweepStart()
+            return 1, FirstSweep()
+        return min(left, most_sweeps(self._rig, self._plan) or left), FirstSweep()
 
     def _burst_frames(self, sweeps: int) -> int | None:
         if self._plan.burst_frames is None:
@@ -145,7 +145,7 @@ class Acquisition:
         lead = Fraction(lead_s(self._rig) + spare_lead_s(self._rig)) * self._plan.frame_rate_hz
         return min(self._plan.burst_frames, math.ceil(self._plan.frames_for(sweeps) + lead))
 
-    def _run_group(self, assembler: SweepAssembler, sweeps: int, done: int) -> Generator[AcquiredMap, None, None]:
+    def _run_start(self, assembler: SweepAssembler, sweeps: int, done: int) -> Generator[AcquiredMap, None, None]:
         rig, plan = self._rig, self._plan
         clock = rig.scanner.load(plan.waveform, plan.scanner_repeats(sweeps))
         if clock != plan.point_rate_hz:
@@ -167,7 +167,7 @@ class Acquisition:
         trouble: list[str] = []
         try:
             try:
-                self._arm()
+                self._arm_laser()
                 rig.spad.start(self._burst_frames(sweeps))
                 self._pipeline = pipeline
                 rig.sync.run()
@@ -204,7 +204,7 @@ class Acquisition:
                     error.add_note(line)
             raise
         finally:
-            self._end_group(pipeline, assembler)
+            self._end_start(pipeline, assembler)
 
     def _guard_limits(self, sweeps: int) -> GuardLimits:
         """The laser guard's time limits for this start. They allow for a burst, silent until it is read out."""
@@ -226,7 +226,7 @@ class Acquisition:
             return usual.busy_within_s
         return float(getattr(spad, "silence", usual.waits_within_s))
 
-    def _end_group(self, pipeline: Pipeline, assembler: SweepAssembler) -> None:
+    def _end_start(self, pipeline: Pipeline, assembler: SweepAssembler) -> None:
         pipeline.close()
         if pipeline.monitor_lost:
             self._listeners = replace(self._listeners, monitor=None)
@@ -252,7 +252,7 @@ class Acquisition:
             return "replaying"
         return "rendering" if isinstance(self._rig.clock, VirtualClock) else "scanning"
 
-    def _arm(self) -> None:
+    def _arm_laser(self) -> None:
         """Arm the laser while the gate reads back low, and wait until it is warm. The SPAD, which may overflow, starts
         later."""
         self._rig.sync.gate_low()

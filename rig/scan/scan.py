@@ -34,7 +34,7 @@ from rig.plan.describe import plan_content
 from rig.plan.scan_plan import ScanPlan
 from rig.progress import tell_stage
 from rig.recording.inputs import to_plain, write_inputs
-from rig.recording.replay import RecordedStart, ReplaySource
+from rig.recording.replay import RecordedStart, ReplayFacts
 from rig.recording.segment import Space, paged
 from rig.requests import RunRequest
 from rig.run_folder.folder import SavePolicy
@@ -75,40 +75,38 @@ def run_scan(
         tell_stage(f"{estimate.estimator}: {why}")
     rig = replace(rig, config=rig.config.model_copy(update={"estimate": estimate}))
     run.tally.estimator, run.tally.estimator_why = estimate.estimator, why
-    source: LiveSource | ReplaySource = LiveSource(rig, plan, request.maps)
+    facts: LiveFacts | ReplayFacts = LiveFacts(rig, plan, request.maps)
     if isinstance(rig.spad, ReplaySpad):
-        source = ReplaySource(rig.spad, plan, request.maps, estimate, rig.model)
-    reconstructor = Reconstructor(
-        rig.model, plan.commands, geometry, estimate, learned=source.learned, lines=plan.lines
-    )
+        facts = ReplayFacts(rig.spad, plan, request.maps, estimate, rig.model)
+    reconstructor = Reconstructor(rig.model, plan.commands, geometry, estimate, learned=facts.learned, lines=plan.lines)
     run.rays = geometry.rays if rig.model is not None else None
     warm_up(estimate.estimator, estimate.filter, plan.exposures, dark=True)
     warm_binding(plan)
     manifest: dict[str, Any] = {
-        "command": source.command,
+        "command": facts.command,
         "config": rig.config.model_dump(mode="json"),
         "plan": plan_content(plan),
         "calibration": None if calibration is None else calibration.content(),
         "rig": rig_content(here),
         "devices": devices_content(rig, plan, timing),
         "seed": rig.seed,
-        "maps": source.maps,
+        "maps": facts.maps,
         "on_overload": policy.value,
     }
     recording = None
     if request.record:
         assert run.path is not None, "a recording is asked for with a folder"
-        space = recording_space(rig, plan, timing, source, run.path, run.save)
+        space = recording_space(rig, plan, timing, facts, run.path, run.save)
         recording = run.start_recording(manifest, lambda folder: write_inputs(folder, plan, rig.model), space)
         if listeners.on_space is not None:
             listeners.on_space(space)
     asked = AcquisitionRequest(
-        maps=source.maps,
+        maps=facts.maps,
         policy=policy,
         first_alone=_first_alone(rig),
-        learns=estimate.estimator in LEARNING and not source.learned,
-        starts=source.starts,
-        silence_s=source.silence_s,
+        learns=estimate.estimator in LEARNING and not facts.learned,
+        starts=facts.starts,
+        silence_s=facts.silence_s,
         recording=recording,
         listeners=listeners,
     )
@@ -118,7 +116,7 @@ def run_scan(
     try:
         with closing(acquisition.run()) as running:
             for found in running:
-                truth = source.truth(found.sweep, found.column)
+                truth = facts.truth(found.sweep, found.column)
                 sweeps.append(found.sweep)  # before its map: whatever ends the run, no map is without its account
                 run.add(found.result, found.compute_s, truth)
     except (KeyboardInterrupt, DeviceError, RigError) as error:
@@ -127,7 +125,7 @@ def run_scan(
         ended_by = error
     del sweeps[run.tally.maps :]
     counters, stages = acquisition.counters, acquisition.stages
-    outside = [] if ended_by is not None else source.lost_outside(sweeps)
+    outside = [] if ended_by is not None else facts.lost_outside(sweeps)
     frames = frames_of(sweeps, counters.crc_errors, outside)
     summary = run.tally.summary(
         frames=frames if ended_by is None else frames_that_came(frames, counters, stages.dropped_frames),
@@ -137,7 +135,7 @@ def run_scan(
         ),
         stages=stages,
         sync=synchronisation_of(sweeps),
-        replay=source.report,
+        replay=facts.report,
         accepted_calibration=accepted_by(calibration),
     )
     manifest |= {
@@ -148,14 +146,14 @@ def run_scan(
     result = run.finish(summary, manifest)
     if ended_by is not None and not isinstance(ended_by, KeyboardInterrupt):
         if result.folder is not None:
-            whole = f"{len(sweeps)} of {source.maps} maps were whole and" if sweeps else "no map was whole; frames"
+            whole = f"{len(sweeps)} of {facts.maps} maps were whole and" if sweeps else "no map was whole; frames"
             ended_by.add_note(f"{whole} are in {result.folder}")
         raise ended_by
     return result
 
 
-class LiveSource:
-    """Facts about a live scan, for `run_scan`. `ReplaySource` has those about a recording.
+class LiveFacts:
+    """Facts about a live scan, for `run_scan`. `ReplayFacts` has those about a recording.
 
     maps: number of maps that the run will take. learned: states of the estimator to begin with. starts: None lets the
     scan choose the starts of the SPAD. silence_s: longest silence of the SPAD.
@@ -194,23 +192,23 @@ def recording_space(
     rig: OpenRig,
     plan: ScanPlan,
     timing: SpadTiming,
-    source: LiveSource | ReplaySource,
+    facts: LiveFacts | ReplayFacts,
     folder: Path,
     save: SavePolicy,
 ) -> Space:
     """Room that the frames and the maps of a recorded scan take at most, and the room on the disk of its folder."""
-    request, rate_hz, starts = spad_request(rig.config.scan, plan), float(plan.frame_rate_hz), source.count_starts()
+    request, rate_hz, starts = spad_request(rig.config.scan, plan), float(plan.frame_rate_hz), facts.count_starts()
     spare_s = lead_s(rig) + spare_lead_s(rig)  # of each start, before its first marker and after its last one
     if rig.spad.info.can_wait:  # on virtual time the SPAD may be a whole ring ahead of what is counted
         spare_s += FEWEST_SLOTS * request.block_frames / rate_hz
-    frames = plan.frames_for(source.maps) + (starts - 1) * plan.frames_for(0) + starts * spare_s * rate_hz
+    frames = plan.frames_for(facts.maps) + (starts - 1) * plan.frames_for(0) + starts * spare_s * rate_hz
     if plan.burst_frames is not None:
         frames = min(frames, starts * plan.burst_frames)
     block_frames = min(request.block_frames, frames_per_block(timing.stride, plan.frame_width, plan.rows))
     block_bytes = paged(BlockLayout(block_frames, plan.frame_width, plan.rows).block_bytes)
     map_bytes = BYTES_PER_PIXEL * plan.rows * max(plan.width, plan.columns)
     frames_bytes = (math.ceil(frames / block_frames) + starts) * block_bytes
-    return Space.on_disk_of(folder, frames_bytes, map_bytes * save.count(source.maps))
+    return Space.on_disk_of(folder, frames_bytes, map_bytes * save.count(facts.maps))
 
 
 def foreseen(rig: OpenRig, plan: ScanPlan, maps: int | None) -> str:

@@ -117,7 +117,7 @@ def run_tradeoff(
     )
 
 
-def require_methods(estimators: Sequence[str], filters: Sequence[str]) -> list[str]:
+def method_problems(estimators: Sequence[str], filters: Sequence[str]) -> list[str]:
     """A line for each name that is no estimator or no filter."""
     return [
         f"{what} {name!r} {'is a choice between others' if (what, name) == ('estimator', AUTO) else 'is unknown'}; "

@@ -32,7 +32,7 @@ def test_a_private_folder_serves_where_nothing_can_be_written_and_one_open_to_ot
     if open_to_all:
         usual.mkdir()
         usual.chmod(0o777)
-    kernel_cache.prepare()
+    kernel_cache.prepare_kernels()
     folder = os.environ[kernel_cache.VARIABLE]
     assert (folder == str(usual)) is not open_to_all
     assert stat.S_IMODE(os.stat(folder).st_mode) == 0o700
@@ -42,7 +42,7 @@ def test_a_private_folder_serves_where_nothing_can_be_written_and_one_open_to_ot
 def test_the_users_own_setting_stays(monkeypatch, tmp_path):
     monkeypatch.setenv(kernel_cache.VARIABLE, str(tmp_path))
     monkeypatch.setattr(kernel_cache, "_writable", lambda folder: False)
-    kernel_cache.prepare()
+    kernel_cache.prepare_kernels()
     assert os.environ[kernel_cache.VARIABLE] == str(tmp_path)
 
 

@@ -6,7 +6,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from drivers.recorded.reader import block_part
-from rig.count.sweeps import SweepAssembler, SweepStart
+from rig.count.sweeps import FirstSweep, SweepAssembler
 from rig.count.volume import BIN_DARK, BIN_UNUSABLE, FrameTally
 from tests.unit.rig.count.streams import plan_of, scan, stand_still, stream_of
 
@@ -88,7 +88,7 @@ def test_maps_of_a_part_begin_with_the_sweep_that_is_whole():
     blocks = stream.blocks(itertools.repeat(100))
     whole = sweeps(plan, blocks, maps=3)
     first = stream.scan_frames[0] + 50  # in the middle of sweep 0
-    part = SweepAssembler(plan, Noting(), 2, 0, SweepStart(1, 1 + whole[0].clock_error))
+    part = SweepAssembler(plan, Noting(), 2, 0, FirstSweep(1, 1 + whole[0].clock_error))
     kept = [block_part(block, first, 10**6) for block in blocks if block.header.first_frame + block.n_frames > first]
     found = [sweep for block in kept for sweep in part.add(block)]
     assert [sweep.index for sweep in found] == [0, 1]

@@ -9,7 +9,7 @@ import pytest
 
 from drivers.interfaces import SweepTruth
 from rig.depth.reconstruct import FogEstimate, MapResult
-from rig.devices.open import require_simulated_or_armed
+from rig.devices.open import light_problems
 from rig.errors import UsageError
 from rig.geometry.stripe_table import StripeTable
 from rig.run_folder.folder import SavePolicy, json_text
@@ -83,9 +83,9 @@ def test_real_light_needs_arming() -> None:
     def config(laser: str, sync: str, port: str = "/dev/ttyUSB0") -> Any:
         return SimpleNamespace(name="lab", laser=device(laser, port), sync=device(sync, port))
 
-    assert require_simulated_or_armed(config("obis", "prawndo", port="emulated:laser"), arm=False) == []
-    assert require_simulated_or_armed(config("simulated", "simulated"), arm=False) == []
-    assert require_simulated_or_armed(config("obis", "prawndo"), arm=True) == []
-    (problem,) = require_simulated_or_armed(config("obis", "simulated"), arm=False)
+    assert light_problems(config("obis", "prawndo", port="emulated:laser"), arm=False) == []
+    assert light_problems(config("simulated", "simulated"), arm=False) == []
+    assert light_problems(config("obis", "prawndo"), arm=True) == []
+    (problem,) = light_problems(config("obis", "simulated"), arm=False)
     assert "laser obis" in problem
     assert "--arm" in problem

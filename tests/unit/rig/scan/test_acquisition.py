@@ -253,7 +253,7 @@ def test_blocks_of_another_run_or_size_are_refused():
     blocks = stream_of(PLAN, 1, lag=LAG).blocks(itertools.repeat(32))
     stale = dataclasses.replace(blocks[1], header=dataclasses.replace(blocks[1].header, run_id=9))
     small = dataclasses.replace(blocks[0], header=dataclasses.replace(blocks[0].header, height=2))
-    with pytest.raises(ProtocolError, match="of run 9, not of run 1"):
+    with pytest.raises(ProtocolError, match="of start 9, not of start 1"):
         sweeps_of(PLAN, [blocks[0], stale], 1)
     with pytest.raises(ProtocolError, match="64 x 2 pixels, the plan is for 64 x 4"):
         sweeps_of(PLAN, [small], 1)
