@@ -5,8 +5,8 @@ all, so `prepare_kernels` provides a folder.
 
 numba compiles a kernel anew if the kernel's own file has changed, but not if a function that it inlines from another
 file has. After an update, such kernels would silently run old code. So `prepare_kernels` stores a digest of each
-module's source and of all modules that it imports, and removes the kernels of modules whose digest has changed. Checking
-whether any file has changed takes a few milliseconds, computing the digests a second.
+module's source and of all modules that it imports, and removes the kernels of modules whose digest has changed. To
+check whether any file has changed takes a few milliseconds, to compute the digests a second.
 """
 
 import ast
