@@ -299,6 +299,17 @@ def learn_first_halo(
     return learn_halo(seen, geometry, model, ambient, workers, dark=volume.dark_counts is not None)
 
 
+def halfway(before: RowModel, after: RowModel) -> RowModel:
+    """`after` with the mean of both models' halos; with its own halo if one of the models has none.
+
+    Which stripes are found depends on the halo, and the halo on these stripes. With whole steps the model swings from
+    lesson to lesson (docs/decisions/0032-dense-fog-what-misleads-the-lessons.md).
+    """
+    if not (before.halo.any() and after.halo.any()):
+        return after
+    return replace(after, halo=np.asarray((before.halo + after.halo) / 2, np.float32))
+
+
 def learn_next_halo(setting: LearningSetting, seen: BrightLines, workers: RowWorkers) -> RowModel:
     """The model of a later lesson. A halo is added when the map begins to show one, and removed when it shows none.
     Nothing changes with fewer than FEWEST_LIGHTS stripes of known light, with several laser lines at once, or in a

@@ -19,7 +19,7 @@ from numpy.typing import NDArray
 
 from rig.count.volume import Counter, CountVolume, SweepCounter, SweepLayout
 from rig.estimate.joint.confidence import pairs_to_ask, stripe_table
-from rig.estimate.joint.halo import bright_lines, learn_first_halo, learn_next_halo
+from rig.estimate.joint.halo import bright_lines, halfway, learn_first_halo, learn_next_halo
 from rig.estimate.joint.labels.contrast import cost_contrast
 from rig.estimate.joint.labels.grid import BAND_ROWS, LabelGrid
 from rig.estimate.joint.lesson import add_quiet, fill_trust, read_positions
@@ -43,7 +43,7 @@ from rig.threads import RowWorkers
 
 LESSONS = 2
 """Number of times that the first map's stripes are estimated and the model is learned again from them."""
-HALO_LESSONS = 4
+HALO_LESSONS = 3
 """Number of these lessons under a halo."""
 AGREE_PX = np.float32(1.0)
 """Under a halo, a first map's stripe is learned from only if contrast alone puts it at most this far away, in px."""
@@ -132,6 +132,7 @@ class Joint:
 
         intensity: of the volume. witness_px: x_px of `_by_contrast`; stripes more than AGREE_PX from it are not used.
         """
+        before = model
         setting = LearningSetting(model, geometry, volume.exposures, volume.dark_counts is not None)
         tables = tables_of(setting, self._workers, contrast=witness_px is not None)
         stripes = self._teaching(volume, tables, self._stripes(volume, tables, lesson=True))
@@ -147,6 +148,8 @@ class Joint:
         assert self._memory is not None, "a map has been estimated"
         places = self._memory.places
         model = learn_first_halo(volume, geometry, model, ambient, tables, stripes, places, self._workers)
+        if witness_px is not None:
+            model = halfway(before, model)
         # Amplitudes are relative to the scale of the model that they are written into.
         weigh_light(volume, tables.sweep, state_of(model), stripes.x_px, places, self._workers)
         self._workers.settle()
