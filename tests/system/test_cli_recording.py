@@ -55,14 +55,14 @@ def test_a_recording_can_be_reconstructed_otherwise(rig: Rig, small: Path) -> No
 def test_the_folder_of_a_recording_says_what_it_is_before_the_first_frame(
     rig: Rig, small: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    start, seen = Acquisition._arm, []
+    start, seen = Acquisition._arm_laser, []
 
     def look(self: Acquisition) -> None:
         seen.append(json.loads(Path("run/manifest.json").read_text()))
         assert {file.name for file in Path("run").iterdir()} >= {"plan.yaml", "calibration.yaml", "frames.idx"}
         start(self)
 
-    monkeypatch.setattr(Acquisition, "_arm", look)
+    monkeypatch.setattr(Acquisition, "_arm_laser", look)
     assert rig("scan", small, "--record", "--out", "run").code == 0
     (begun,) = seen
     ended = json.loads(Path("run/manifest.json").read_text())

@@ -62,17 +62,17 @@ def main(folder: Path) -> None:
 def _say_late(of: str, file: Path, **options: Any) -> None:
     """Scan, and print what was compiled late of the modules whose names begin so."""
     armed: set[str] = set()
-    arm = Acquisition._arm
+    arm = Acquisition._arm_laser
 
     def note(acquisition: Acquisition) -> None:
         arm(acquisition)
         armed.update(_compiled(of))
 
-    Acquisition._arm = note  # type: ignore[method-assign]
+    Acquisition._arm_laser = note  # type: ignore[method-assign]
     try:
         run = api.scan(file, out=file.parent / "run", save="last", record=True, **options)
     finally:
-        Acquisition._arm = arm  # type: ignore[method-assign]
+        Acquisition._arm_laser = arm  # type: ignore[method-assign]
     assert armed, "the laser was armed"
     print(f"scanned {run.summary.maps}")
     for kernel in sorted(_compiled(of) - armed):

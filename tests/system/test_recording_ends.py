@@ -99,7 +99,7 @@ def test_ctrl_c_before_the_first_frame_leaves_nothing(rig: Rig, small: Path, mon
     def interrupted(self: Acquisition) -> None:
         raise KeyboardInterrupt
 
-    monkeypatch.setattr(Acquisition, "_arm", interrupted)
+    monkeypatch.setattr(Acquisition, "_arm_laser", interrupted)
     assert rig("scan", small, *SCAN).code == 4
     assert not list(Path().iterdir())
 
