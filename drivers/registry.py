@@ -74,7 +74,9 @@ def lookup(slot: str, kind: str) -> Kind:
     found = {entry.value: entry for entry in _entries(slot) if entry.name == kind}
     if not found:
         choices = ", ".join(kinds(slot)) or "none installed"
-        raise UnknownKind(f"{slot}: unknown kind {kind!r}; choose one of: {choices}")
+        raise UnknownKind(
+            f"{slot}: unknown kind {kind!r}; choose one of: {choices}, or install the package that has it"
+        )
     if len(found) > 1:
         raise UnknownKind(f"{slot}: kind {kind!r} is offered twice ({', '.join(sorted(found))}); uninstall one package")
     entry = next(iter(found.values()))

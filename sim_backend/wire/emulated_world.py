@@ -51,6 +51,10 @@ KEPT_FRAMES = 1_000_000_000
 """Most frames that wait for the host."""
 
 
+LASERS = {"cobolt": CoboltModel, "obis": ObisModel}
+"""Firmware models that can answer at emulated:laser. Each needs `on_emission`, `power_w` and `receive`."""
+
+
 class EmulatedWorldConfig(WorldConfig):
     """Config of the world with emulated devices, whose ports are `emulated:laser`, `gate`, `scanner` and `spad`."""
 
@@ -85,7 +89,7 @@ class EmulatedWorld(SimulatedWorld):
         self._emission_lock = threading.Lock()
         self._emission: list[tuple[float, float]] = [(-np.inf, 0.0)]
         """(time, power) of every change of the power in W behind an open gate."""
-        self.laser = (CoboltModel if config.laser == "cobolt" else ObisModel)(on_emission=self._note_emission)
+        self.laser = LASERS[config.laser](on_emission=self._note_emission)
         self._draw_once()
         self.sync = PrawnDoModel(self._scan_marker, board=PICO_2)
         self.scanner = HeliosModel(clock_error=config.scanner_clock_error)

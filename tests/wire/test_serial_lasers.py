@@ -11,12 +11,14 @@ from pydantic import ValidationError
 
 from drivers.clock import now_s
 from drivers.errors import DeviceBusy, DeviceDisconnected, DeviceNotFound, DeviceTimeout, LimitExceeded
+from drivers.guard.process import OFF_GAP_S, OFF_TIMES
 from drivers.interfaces import LineLaser
 from drivers.lasers import cobolt as cobolt_framing
 from drivers.lasers import obis as obis_framing
 from drivers.lasers.cobolt import CoboltConfig
 from drivers.lasers.obis import ObisConfig
 from drivers.lasers.serial_laser import SerialLaserConfig
+from drivers.registry import kinds, lookup
 from drivers.transports.dialogue import FairLock
 from rig.config.files import load_config
 from rig.devices.open import open_rig
@@ -24,7 +26,7 @@ from rig.errors import DevicesError
 from sim_backend.wire.firmware.cobolt import CoboltModel
 from sim_backend.wire.firmware.obis import ObisModel
 from sim_backend.wire.serve.serial import SerialServer
-from tests.wire.lasers import Babble, Silent, bring_up, eventually, open_cobolt, open_obis, wire
+from tests.wire.lasers import USUAL, Babble, Silent, bring_up, eventually, open_cobolt, open_obis, wire
 
 
 @dataclass(frozen=True)
@@ -61,6 +63,27 @@ def test_a_config_without_a_power_limit_or_a_port_is_refused(make: Make) -> None
     for given in ({"port": "/dev/ttyUSB0"}, {"max_power": "10 mW"}, {"port": "x", "max_power": 0.01}):
         with pytest.raises(ValidationError):
             make.config.model_validate(given)
+
+
+def test_every_kind_of_serial_laser_has_bytes_that_switch_it_off() -> None:
+    installed = [lookup("laser", name) for name in kinds("laser")]
+    serial = [kind for kind in installed if issubclass(kind.config, SerialLaserConfig)]
+    assert len(serial) >= len(MAKES)
+    assert all(kind.off is not None for kind in serial), "the guard sends them where the driver cannot act"
+
+
+@pytest.mark.parametrize("name", MAKES)
+def test_the_bytes_that_switch_a_laser_off_darken_it_while_it_emits(name: str) -> None:
+    make, kind = MAKES[name], lookup("laser", name)
+    model = make.model()
+    with wire(model) as (_, surroundings), make.open(surroundings) as laser:
+        bring_up(laser, surroundings.clock)
+        assert model.emitting
+        assert kind.off is not None
+        for _ in range(OFF_TIMES):  # as the guard sends them: a laser may be busy with the last command
+            model.receive(kind.off(make.config.model_validate(USUAL)), now_s(surroundings.clock))
+            surroundings.clock.sleep(OFF_GAP_S)
+        assert not model.emitting
 
 
 @each_make
