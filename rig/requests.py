@@ -110,6 +110,9 @@ class ScanRequest(RunRequest):
     scene: str | None = option(None, "a bundled scene, a scene file or a folder (simulated rigs)", unset="the config's")
     exposures: int | None = option(None, "frames per column (K)", unset="the config's")
     temporal_prior: bool | None = option(None, "joint: hold each map to the last one a little", unset="the config's")
+    learned: str | os.PathLike[str] | None = path_option(
+        "file that keeps what the estimator has learned, for the next scan's first map", "the config's, else none"
+    )
     seed: int = option(0, "seed of everything simulated")
 
 

@@ -150,6 +150,7 @@ def _rows(summary: Summary) -> list[tuple[str, str]]:
     estimator = summary.estimator + (f" ({summary.estimator_why})" if summary.estimator_why else "")
     rows = [
         ("maps", f"{summary.maps} of {summary.columns} columns x {summary.exposures} exposures, {estimator}"),
+        *((("learned", summary.learned),) if summary.learned else ()),
         ("frames", f"{frames.received} received, {frames.lost} lost, {frames.lit} on columns"),
         (
             "time",

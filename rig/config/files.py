@@ -70,8 +70,9 @@ def load_config(name_or_path: str | Path = "simulated", overrides: Mapping[str, 
     """Load the rig config of a bundled name ("simulated") or a file, with values replaced by `overrides`.
 
     overrides: value by dotted key, e.g. {"scan.exposures": 4, "world.scene": "street"}; None values are skipped. Paths
-    in the file are relative to the file's folder, and so is `calibration` in overrides. Other paths in overrides are
-    relative to the working directory. Raises UsageError with one line per problem, all problems at once.
+    in the file are relative to the file's folder, and so are `calibration` and `estimate.learned` in overrides. Other
+    paths in overrides are relative to the working directory. Raises UsageError with one line per problem, all problems
+    at once.
     """
     path = find_config(name_or_path)
     read = read_config(path)
@@ -109,6 +110,8 @@ def completed_text(name_or_path: str | Path) -> str:
     full = portable_content(load_config(path))
     if anchored.get("calibration") is not None:
         anchored["calibration"] = full["calibration"]
+    if (anchored.get("estimate") or {}).get("learned") is not None:
+        anchored["estimate"]["learned"] = full["estimate"]["learned"]
     text = completed(read.text, read.node, anchored, full)
     try:
         same = portable_content(parse_config(config_content(text))) == full
@@ -150,6 +153,8 @@ def portable_content(config: RigConfig) -> dict[str, Any]:
     _anchor_paths(content, here)
     if config.calibration is not None:
         content["calibration"] = _absolute(here / config.calibration)
+    if config.estimate.learned is not None:
+        content["estimate"]["learned"] = _absolute(here / config.estimate.learned)
     return content
 
 

@@ -154,6 +154,11 @@ class ScanConfig(ConfigSection):
         return self
 
 
+def _beside_config(value: Path | None, info: ValidationInfo) -> Path | None:
+    folder = (info.context or {}).get("folder") or ""
+    return None if value is None else Path(folder) / os.path.expanduser(value)
+
+
 class EstimateConfig(ConfigSection):
     """Settings of the estimate, which turns counts into depth."""
 
@@ -168,6 +173,12 @@ class EstimateConfig(ConfigSection):
         default=False,
         description="hold each map to the last one a little, for scenes that mostly stand still; `joint` only",
         examples=["true"],
+    )
+    learned: Annotated[Path | None, AfterValidator(_beside_config)] = Field(
+        default=None,
+        description="file in which scans keep what the estimator has learned, for the next one's first map; relative "
+        "to this file",
+        examples=["learned.npz"],
     )
     threads: int | None = Field(
         default=None,
@@ -205,11 +216,6 @@ def _of_slot(slot: str) -> BeforeValidator:
         return kind.config.model_validate(value, context=info.context)
 
     return BeforeValidator(validate)
-
-
-def _beside_config(value: Path | None, info: ValidationInfo) -> Path | None:
-    folder = (info.context or {}).get("folder") or ""
-    return None if value is None else Path(folder) / os.path.expanduser(value)
 
 
 class RigConfig(ConfigSection):

@@ -27,6 +27,7 @@ def configure(
     filter: Filter | None = None,
     min_confidence: float | None = None,
     temporal_prior: bool | None = None,
+    learned: PathLike | None = None,
 ) -> RigConfig:
     """Load and validate the config that `scan` would use. An option that is None leaves the config's value.
 
@@ -36,6 +37,7 @@ def configure(
     exposures: frames per column.
     estimator, filter, min_confidence: as in the config's `estimate`.
     temporal_prior: make `joint` use the last map as a weak prior for the next.
+    learned: file in which scans keep what the estimator has learned.
     Raises UsageError with one line per problem.
     """
     options: dict[str, object | None] = {
@@ -46,6 +48,7 @@ def configure(
         "estimate.filter": filter,
         "estimate.min_confidence": min_confidence,
         "estimate.temporal_prior": temporal_prior,
+        "estimate.learned": None if learned is None else os.path.abspath(learned),
     }
     loaded = config if isinstance(config, RigConfig) else load_config(os.fspath(config))
     for name, asked in (("scene", scene), ("fog", fog)):

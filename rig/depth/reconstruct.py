@@ -62,7 +62,8 @@ class Reconstructor:
     """Turns counted sweeps into maps, one after the other; estimators that learn carry their state from map to map.
 
     model, column_commands, lines: the same that were given to `map_geometry`. learned: kept states; each map is then
-    estimated with its own, and nothing is learned. Raises KeyError for the estimator `auto` (`rig.scan.estimator`
+    estimated with its own, and nothing is learned. kept: the state of an earlier run, used if it explains the first
+    map. Raises KeyError for the estimator `auto` (`rig.scan.estimator`
     chooses one first), and with `learned` for estimators that learn nothing.
     """
 
@@ -74,6 +75,7 @@ class Reconstructor:
         estimate: EstimateConfig,
         *,
         learned: Sequence[Learned] = (),
+        kept: Learned | None = None,
         lines: LineGrid | None = None,
     ) -> None:
         self.geometry = geometry
@@ -89,8 +91,14 @@ class Reconstructor:
         if learned:
             self.estimator = recalling(estimate.estimator, learned, threads, temporal_prior=prior)
         else:
-            self.estimator = create_estimator(estimate.estimator, threads, temporal_prior=prior)
+            self.estimator = create_estimator(estimate.estimator, threads, temporal_prior=prior, kept=kept)
         self._checks = MapChecks(geometry, calibrated=model is not None, knows=estimate.estimator in LEARNING)
+
+    @property
+    def state(self) -> Learned | None:
+        """The state for the next map; None if nothing has been learned."""
+        state: Learned | None = getattr(self.estimator, "model", None)  # the other estimators have none
+        return state
 
     def counter(self, layout: SweepLayout) -> Counter:
         """A counter whose sweeps go to `map`, one after the other and each before frames of the next are added."""

@@ -59,7 +59,7 @@ class Estimator(Protocol):
 
 
 class LearnsFromStream(Estimator, Protocol):
-    """An estimator in LEARNING. Its model can be set, to continue from a kept state."""
+    """An estimator in LEARNING. Its model can be set, to estimate a map again."""
 
     model: Any
     """The state with which the next map will be estimated, None until a map was good enough to learn from."""
@@ -73,28 +73,31 @@ def recalling(name: str, learned: Sequence[Learned], threads: int = 2, *, tempor
     return Recalled(_learning(name, threads, learns=False, temporal_prior=temporal_prior), learned)
 
 
-def create_estimator(name: str, threads: int = 2, *, temporal_prior: bool = False) -> Estimator:
+def create_estimator(
+    name: str, threads: int = 2, *, temporal_prior: bool = False, kept: Learned | None = None
+) -> Estimator:
     """A fresh estimator that uses up to `threads` threads. name: one of ESTIMATORS, else KeyError.
 
-    temporal_prior: whether `joint` uses the last map as a weak prior; the others ignore it.
+    temporal_prior: whether `joint` uses the last map as a weak prior; the others ignore it. kept: the state of an
+    earlier run; an estimator of LEARNING begins with it if it explains the first map, the others ignore it.
     """
     if name in LEARNING:
-        return _learning(name, threads, learns=True, temporal_prior=temporal_prior)
+        return _learning(name, threads, learns=True, temporal_prior=temporal_prior, kept=kept)
     from rig.estimate.argmax_edge import Peaks
 
     return {"argmax": Peaks(False, threads), "edge": Peaks(True, threads)}[name]
 
 
-def _learning(name: str, threads: int, *, learns: bool, temporal_prior: bool) -> LearnsFromStream:
+def _learning(name: str, threads: int, *, learns: bool, temporal_prior: bool, kept: Any = None) -> LearnsFromStream:
     if name == "likelihood":
         from rig.estimate.likelihood import Likelihood
 
-        return Likelihood(threads, learns=learns)
+        return Likelihood(threads, learns=learns, kept=kept)
     if name != "joint":
         raise KeyError(name)
     from rig.estimate.joint.joint import Joint
 
-    return Joint(threads, learns=learns, temporal_prior=temporal_prior)
+    return Joint(threads, learns=learns, temporal_prior=temporal_prior, kept=kept)
 
 
 class Recalled:

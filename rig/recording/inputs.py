@@ -1,4 +1,5 @@
-"""Plan and calibration beside the frames of a recording, without which frames cannot be interpreted.
+"""Plan and calibration beside the frames of a recording, without which frames cannot be interpreted, and the state that
+its estimator began with.
 
 `to_plain` and `from_plain` turn dataclasses into plain values for YAML and JSON and back, exactly: fractions become
 text ("100000/3"), arrays their dtype and values. Fields that a dataclass computes itself (init=False) are left out.
@@ -22,12 +23,15 @@ from calibration.files.sections import load_yaml
 from calibration.model.rig_model import RigModel
 from rig.config.files import PLAN_FORMAT
 from rig.errors import UsageError
+from rig.estimate.row.model import RowModel
 from rig.geometry.windows import WORD_PX
 from rig.plan.scan_plan import MOST_CHIP_FRAMES, Blanking, ScanPlan
 from rig.recording.open import manifest_or_none, open_recording
+from rig.run_folder.folder import write_learned
 from rig.run_folder.manifest import inputs_problems, read_manifest
 
 PLAN_FILE: Final = "plan.yaml"
+LEARNED_FILE: Final = "learned.npz"
 PLAN_VERSION: Final = 1
 MOST_EXPOSURES: Final = 0xFFFF
 """Most exposures per column, as in a config."""
@@ -35,14 +39,20 @@ MOST_PIXELS: Final = 0xFFFF
 """Most pixels each way, which is what a block's header can hold."""
 
 
-def write_inputs(folder: Path, plan: ScanPlan, model: RigModel | None) -> None:
-    """Write the compiled plan with every number, and the calibration, if there is one. Raises OSError."""
+def write_inputs(
+    folder: Path, plan: ScanPlan, model: RigModel | None, learned: tuple[str, RowModel] | None = None
+) -> None:
+    """Write the compiled plan with every number, the calibration, and the state `learned` in an earlier run by the
+    estimator of this name. The last two may be None. Raises OSError.
+    """
     content = {"format": PLAN_FORMAT, "version": PLAN_VERSION, "plan": to_plain(plan)}
     dumper = getattr(yaml, "CSafeDumper", yaml.SafeDumper)
     text = yaml.dump(content, Dumper=dumper, sort_keys=False, default_flow_style=None, width=120)
     (folder / PLAN_FILE).write_text(text, encoding="utf-8")
     if model is not None:
         save_rig_model(model, folder / CALIBRATION_FILE)
+    if learned is not None:
+        write_learned(folder / LEARNED_FILE, *learned)
 
 
 def read_plan(folder: Path, name: str = PLAN_FILE) -> ScanPlan:

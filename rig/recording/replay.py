@@ -31,7 +31,7 @@ from rig.estimate.row.model import RowModel
 from rig.plan.compile import spad_request
 from rig.plan.scan_plan import ScanPlan
 from rig.recording.check import merged_gaps
-from rig.recording.inputs import PLAN_FILE, read_plan
+from rig.recording.inputs import LEARNED_FILE, PLAN_FILE, read_plan
 from rig.recording.open import begins_sweep, fitted_ratio, markers_seen, require_recording
 from rig.requests import ReplayRequest
 from rig.run_folder.manifest import (
@@ -89,7 +89,7 @@ def replay_config(run: Path, request: ReplayRequest, others: RigConfig | None = 
         },
         **{slot: {"kind": "replay"} for slot in RECORDED},
         "scan": recorded.get("scan") or _scan_of(plan),
-        "estimate": {**(recorded.get("estimate") or {}), **given},
+        "estimate": {**(recorded.get("estimate") or {}), **given, "learned": _begun_with(run)},
     }
     if content["estimate"].get("estimator") != "joint":  # only joint has a prior; the scan's does not apply
         content["estimate"].pop("temporal_prior", None)
@@ -123,6 +123,11 @@ def replay_plan(
         plan = whole_rows(plan)
     request = replace(spad_request(scan, plan), frame_rate_hz=plan.frame_rate_hz, exposure_s=plan.exposure_s)
     return plan, spad.configure(request)
+
+
+def _begun_with(run: Path) -> str | None:
+    """File of the state that a recording's estimator began with; None if it learned everything anew."""
+    return str((run / LEARNED_FILE).absolute()) if (run / LEARNED_FILE).exists() else None
 
 
 class ReplayFacts:

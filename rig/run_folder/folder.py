@@ -29,10 +29,13 @@ from typing import Any, Self
 import numpy as np
 from numpy.typing import NDArray
 
+from calibration.files.npy_files import load_arrays
 from drivers.interfaces import SweepTruth
 from drivers.recorded.contents import INDEX_FILE
 from rig.depth.reconstruct import MapResult
 from rig.errors import UsageError
+from rig.estimate.registry import Learned
+from rig.estimate.row.model import RowModel
 from rig.run_folder.manifest import MANIFEST, sealed_text
 from rig.run_folder.pictures import cloud, depth_limits, depth_picture, intensity_picture, ply_bytes, png_bytes
 
@@ -271,6 +274,26 @@ def _plain(value: Any) -> Any:
 def _unwritable(path: Path, error: OSError) -> UsageError:
     reason = error.strerror or str(error)
     return UsageError(f"cannot write {path}: {reason}; name another folder with --out or free the space it needs")
+
+
+def write_learned(file: Path, estimator: str, state: Learned) -> None:
+    """Write the state of an estimator in one step, without the labels of its last map, to be read by `read_learned`.
+    Raises OSError.
+    """
+    arrays = {name: value for name, value in state.arrays().items() if name != "before"}
+    replace_file(file, _npz_bytes({**arrays, "estimator": np.array(estimator)}))
+
+
+def read_learned(file: Path) -> tuple[str, RowModel]:
+    """The name of an estimator and its state. Raises UsageError if the file has none, or is not readable."""
+    try:
+        arrays = load_arrays(file)
+        return str(arrays["estimator"]), RowModel.from_arrays(arrays)
+    except (OSError, ValueError, KeyError) as error:
+        what = f"it has no {error}" if isinstance(error, KeyError) else str(error)
+        raise UsageError(
+            f"{file} holds nothing that an estimator has learned ({what}); remove it, or name another file"
+        ) from error
 
 
 def _npz_bytes(arrays: Mapping[str, NDArray[Any]]) -> bytes:

@@ -135,6 +135,7 @@ class Summary:
 
     fog: of the last map. verdict_reasons: reasons against maps, found in the maps themselves. accepted_calibration:
     reasons against the calibration that the user accepted. estimator_why: reason for the estimator if the run chose it.
+    learned: whether the first map was estimated with the state of an earlier run, and why if not; if a file was named.
     """
 
     maps: int
@@ -157,12 +158,15 @@ class Summary:
     verdict_reasons: tuple[Doubt, ...] = ()
     accepted_calibration: tuple[str, ...] = ()
     estimator_why: str = ""
+    learned: str = ""
 
     def as_json(self) -> dict[str, Any]:
         """The summary as plain values. `truth` and the fields after `verdict` are left out where they are empty."""
         content = asdict(self)
         content["verdict"] = self.verdict.value
-        optional = ("truth", "stages", "sync", "replay", "verdict_reasons", "accepted_calibration", "estimator_why")
+        optional = (
+            "truth", "stages", "sync", "replay", "verdict_reasons", "accepted_calibration", "estimator_why", "learned",
+        )  # fmt: skip
         return {name: value for name, value in content.items() if value or name not in optional}
 
 
@@ -184,6 +188,7 @@ class MapTally:
     estimator: str
     filter: str
     estimator_why: str = ""
+    learned: str = ""
     _maps: list[_OfMap] = field(default_factory=list)
 
     @property
@@ -244,6 +249,7 @@ class MapTally:
             verdict_reasons=self.doubts,
             accepted_calibration=accepted_calibration,
             estimator_why=self.estimator_why,
+            learned=self.learned,
         )
 
 

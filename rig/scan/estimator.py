@@ -1,4 +1,5 @@
-"""Chooses the estimator of a run with `auto`: `joint` wherever it keeps up with the frames, else `likelihood`.
+"""Chooses the estimator of a run with `auto`: `joint` wherever it keeps up with the frames, else `likelihood`. Finds
+what an earlier run has learned for it.
 
 `joint` errs several times less than `likelihood` and takes longer. That does not matter if no frame waits for a map:
 with simulated rigs, recordings and cubes, and for a single map. In a stream a map must be made within the time of a
@@ -9,6 +10,7 @@ import math
 import os
 import time
 from dataclasses import replace
+from pathlib import Path
 
 import numpy as np
 
@@ -16,7 +18,10 @@ from calibration.errors import digits
 from rig.config.models import AUTO, EstimateConfig
 from rig.count.volume import CountVolume
 from rig.errors import UsageError
+from rig.estimate.registry import LEARNING
+from rig.estimate.row.model import RowModel
 from rig.geometry.windows import SweepGeometry
+from rig.run_folder.folder import read_learned
 
 KEPT_UP = 0.5
 """Share of a sweep's time that a map of `joint` may take; the rest is for counting and for other load."""
@@ -64,6 +69,32 @@ def _choice(estimate: EstimateConfig, geometry: SweepGeometry, map_time_s: float
     took_s = time_of_map(geometry, estimate.threads or os.cpu_count() or 1)
     name = "joint" if took_s <= KEPT_UP * map_time_s else "likelihood"
     return name, f"a map of joint takes {digits(1e3 * took_s, 2)} ms, a sweep {digits(1e3 * map_time_s, 2)} ms"
+
+
+def kept_model(file: Path | None, estimator: str, geometry: SweepGeometry) -> tuple[RowModel | None, str]:
+    """The state kept in a file by an earlier run, if it can be used here, else None and why not ("" without a file).
+
+    Raises UsageError if the file is not readable, or its folder does not exist.
+    """
+    from rig.estimate.row.em import path_bins
+    from rig.estimate.search.online_learning import LearningSetting
+
+    if file is None or estimator not in LEARNING:
+        return None, ""
+    if not file.parent.is_dir():
+        raise UsageError(f"learned {file}: there is no folder {file.parent}; make it, or name another file")
+    if not file.exists():
+        return None, f"anew, {file} is written at the end"
+    name, model = read_learned(file)
+    if name != estimator:
+        return None, f"anew: {file} was learned by {name}"
+    try:
+        LearningSetting(model, geometry, 1, True)
+    except UsageError:
+        return None, f"anew: {file} was learned from frames or columns of another size or number"
+    if (model.w_lo, model.per_w) != path_bins(geometry):
+        return None, f"anew: {file} was learned for another depth range"
+    return model, ""
 
 
 def time_of_map(geometry: SweepGeometry, threads: int) -> float:

@@ -4,6 +4,7 @@
 end which frames came and which were lost. `devices_content` describes the devices for the manifest.
 """
 
+import logging
 import math
 from collections.abc import Iterator, Sequence
 from contextlib import closing
@@ -37,12 +38,14 @@ from rig.recording.inputs import to_plain, write_inputs
 from rig.recording.replay import RecordedStart, ReplayFacts
 from rig.recording.segment import Space, paged
 from rig.requests import RunRequest
-from rig.run_folder.folder import SavePolicy
+from rig.run_folder.folder import SavePolicy, write_learned
 from rig.scan.acquisition import SILENCE_S, Acquisition, AcquisitionRequest
-from rig.scan.estimator import choose_estimator, foreseen_estimator
+from rig.scan.estimator import choose_estimator, foreseen_estimator, kept_model
 from rig.scan.monitor import NOBODY, Listeners
 from rig.scan.pipeline import FEWEST_SLOTS, Overload, require_policy
 from rig.scan.run import Run, RunResult, frames_of, frames_that_came, sweep_content, synchronisation_of, verdict_of
+
+_log = logging.getLogger(__name__)
 
 BYTES_PER_PIXEL: Final = 40
 """Bytes that all files of a map take for every pixel of the camera or of the stripe table, whichever is more."""
@@ -78,7 +81,12 @@ def run_scan(
     facts: LiveFacts | ReplayFacts = LiveFacts(rig, plan, request.maps)
     if isinstance(rig.spad, ReplaySpad):
         facts = ReplayFacts(rig.spad, plan, request.maps, estimate, rig.model)
-    reconstructor = Reconstructor(rig.model, plan.commands, geometry, estimate, learned=facts.learned, lines=plan.lines)
+    kept, run.tally.learned = None, ""
+    if not facts.learned:
+        kept, run.tally.learned = kept_model(estimate.learned, estimate.estimator, geometry)
+    reconstructor = Reconstructor(
+        rig.model, plan.commands, geometry, estimate, learned=facts.learned, kept=kept, lines=plan.lines
+    )
     run.rays = geometry.rays if rig.model is not None else None
     warm_up(estimate.estimator, estimate.filter, plan.exposures, dark=True)
     warm_binding(plan)
@@ -93,11 +101,15 @@ def run_scan(
         "maps": facts.maps,
         "on_overload": policy.value,
     }
+
+    def write_beside(folder: Path) -> None:
+        write_inputs(folder, plan, rig.model, None if kept is None else (estimate.estimator, kept))
+
     recording = None
     if request.record:
         assert run.path is not None, "a recording is asked for with a folder"
         space = recording_space(rig, plan, timing, facts, run.path, run.save)
-        recording = run.start_recording(manifest, lambda folder: write_inputs(folder, plan, rig.model), space)
+        recording = run.start_recording(manifest, write_beside, space)
         if listeners.on_space is not None:
             listeners.on_space(space)
     asked = AcquisitionRequest(
@@ -117,6 +129,9 @@ def run_scan(
         with closing(acquisition.run()) as running:
             for found in running:
                 truth = facts.truth(found.sweep, found.column)
+                if kept is not None and not sweeps:
+                    file, serves = estimate.learned, found.result.learned is kept
+                    run.tally.learned = f"from {file}" if serves else f"anew: {file} does not explain the first map"
                 sweeps.append(found.sweep)  # before its map: whatever ends the run, no map is without its account
                 run.add(found.result, found.compute_s, truth)
     except (KeyboardInterrupt, DeviceError, RigError) as error:
@@ -144,12 +159,24 @@ def run_scan(
         "counters": asdict(counters),
     }
     result = run.finish(summary, manifest)
+    if isinstance(facts, LiveFacts) and not summary.verdict_reasons and reconstructor.state is not None:
+        _keep_learned(estimate, reconstructor.state)
     if ended_by is not None and not isinstance(ended_by, KeyboardInterrupt):
         if result.folder is not None:
             whole = f"{len(sweeps)} of {facts.maps} maps were whole and" if sweeps else "no map was whole; frames"
             ended_by.add_note(f"{whole} are in {result.folder}")
         raise ended_by
     return result
+
+
+def _keep_learned(estimate: EstimateConfig, state: Learned) -> None:
+    """Keep a state for the next run, if the config names a file for it."""
+    if estimate.learned is None:
+        return
+    try:
+        write_learned(estimate.learned, estimate.estimator, state)
+    except OSError as error:
+        _log.warning("cannot keep what was learned in %s: %s", estimate.learned, error.strerror or error)
 
 
 class LiveFacts:

@@ -34,7 +34,7 @@ from rig.estimate.row.ambient import ambient_map
 from rig.estimate.row.em import learn_again, lines_of, next_lattice
 from rig.estimate.row.inputs import state_of
 from rig.estimate.row.model import RowModel
-from rig.estimate.search.online_learning import LearningSetting, OnlineLearner, Seen, first_model
+from rig.estimate.search.online_learning import LearningSetting, OnlineLearner, Seen
 from rig.geometry.stripe_table import StripeTable
 from rig.geometry.windows import SweepGeometry
 from rig.simd import Float32, Float64
@@ -58,13 +58,20 @@ class Joint:
 
     Pass `model` to estimate a map again with the state that it was estimated with: the result is the same bit for bit.
     learns: whether later maps change that state. temporal_prior: whether the last map is a weak prior for the next.
+    kept: state of an earlier run, used if it explains the first map.
     """
 
     def __init__(
-        self, threads: int = 2, model: RowModel | None = None, *, learns: bool = True, temporal_prior: bool = False
+        self,
+        threads: int = 2,
+        model: RowModel | None = None,
+        *,
+        learns: bool = True,
+        temporal_prior: bool = False,
+        kept: RowModel | None = None,
     ) -> None:
         self._workers = RowWorkers(threads)
-        self._lessons = OnlineLearner(tables_of, None, learns=learns, learn_more=learn_next_halo)
+        self._lessons = OnlineLearner(tables_of, None, learns=learns, learn_more=learn_next_halo, kept=kept)
         self._prior = TemporalPrior(temporal_prior)
         self._memory: Memory | None = None
         self.used: RowModel | None = None
@@ -113,9 +120,12 @@ class Joint:
         return stripes
 
     def _first_model(self, volume: CountVolume, geometry: SweepGeometry) -> RowModel:
-        """The model learned from the first sweep: row by row, then from the stripes of the whole map."""
+        """The kept model, or one learned from the first sweep: row by row, then from the stripes of the whole map."""
         self._prior.recall(None)  # forget maps from which nothing was learned
-        model = start = first_model(volume, geometry, self._workers)
+        model, serves = self._lessons.first(volume, geometry, self._workers)
+        if serves:
+            return model
+        start = model
         witness_px, lessons, intensity = None, 0, volume.intensity()
         while lessons < (LESSONS if witness_px is None else HALO_LESSONS):
             model, lessons = self._taught(volume, intensity, geometry, model, witness_px), lessons + 1

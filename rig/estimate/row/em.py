@@ -209,7 +209,7 @@ def fit_line_width(lines: Lines, geometry: SweepGeometry, model: RowModel, worke
     return tried[best] if evidence[best] > evidence[1] + WIDTH_EVIDENCE else model
 
 
-def _bins(geometry: SweepGeometry) -> tuple[float, float]:
+def path_bins(geometry: SweepGeometry) -> tuple[float, float]:
     """First path inverse depth and bins per unit of it, with room for the margins outside the depth range."""
     near_m, far_m = geometry.depth_range_m
     # Paths are longer than depths towards the picture's corners, by up to a third with usual fields of view.
@@ -219,7 +219,7 @@ def _bins(geometry: SweepGeometry) -> tuple[float, float]:
 
 def start_model(volume: CountVolume, geometry: SweepGeometry, ambient: Float32, extinction_per_m: float) -> RowModel:
     """Row model with haze of a guessed extinction that matches the mean level of the nearest pixels."""
-    w_lo, per_w = _bins(geometry)
+    w_lo, per_w = path_bins(geometry)
     path_m = 1.0 / (w_lo + np.arange(BINS) / per_w)
     level = _near_level(volume, geometry)
     typical = float(np.median(ambient))

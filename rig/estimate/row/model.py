@@ -34,6 +34,14 @@ OPTICAL_DEPTH_MAX = 50.0
 """Largest extinction times path length in a fit of haze: only e^-100 of the light would come back."""
 
 
+_SHAPES = {
+    "profile": (BINS, 4),
+    "amplitude": (AMPLITUDES,),
+    "weight": (AMPLITUDES,),
+    "halo": (HALO_NODES, len(HALO_REACHES_PX)),
+}
+
+
 @dataclass(frozen=True, slots=True)
 class RowModel:
     """Learned state of the row likelihood, enough to estimate any map again bit for bit.
@@ -70,12 +78,17 @@ class RowModel:
 
     @classmethod
     def from_arrays(cls, arrays: Mapping[str, NDArray[np.generic]]) -> "RowModel":
-        """The state from which `arrays` came, bit for bit. Raises KeyError if a field without a default is missing."""
+        """The state from which `arrays` came, bit for bit. Raises KeyError if a field without a default is missing,
+        ValueError if one has another size than kernels expect.
+        """
         kept = {
             field.name: arrays[field.name]
             for field in fields(cls)
             if field.name in arrays or (field.default is MISSING and field.default_factory is MISSING)
         }
+        for name, shape in _SHAPES.items():
+            if name in kept and kept[name].shape != shape:
+                raise ValueError(f"{name} is of {kept[name].shape} numbers, not {shape}")
         values: dict[str, Any] = {name: value if value.ndim else float(value) for name, value in kept.items()}
         return cls(**values)
 
