@@ -95,7 +95,7 @@ def reason_for(code: str, text: str, value: float = math.nan, limit: float = mat
 
 
 def unguided(verdict: Verdict) -> Verdict:
-    """The verdict without next steps that name the guided mode, for a command that has none."""
+    """The verdict with next steps that do not mention `--guided`, for a command that has no guided mode."""
     reasons = tuple(replace(reason, next_step=reason.next_step.replace(_GUIDED, "")) for reason in verdict.reasons)
     return replace(verdict, reasons=reasons)
 

@@ -256,7 +256,9 @@ def gray(values: NDArray[np.float32]) -> Gray:
 
 
 def find_markers(shown: Gray, board: Board) -> MatchedPoints:
-    """The board's markers. `mirrored` is set if the mirror image of the picture shows more of them."""
+    """The board's markers. If few are found, and more than twice as many in the picture's mirror image, the result is
+    that of the mirror image: `mirrored` is set, and `px` are its pixels.
+    """
     best = _most_markers(shown, board)
     if best.count <= 0.25 * len(board.charuco().getIds()):
         flipped = _most_markers(np.ascontiguousarray(shown[:, ::-1]), board)

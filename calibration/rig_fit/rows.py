@@ -6,8 +6,9 @@ meets the pixel's ray on the board. With F the distance of that point X from a s
 With the ray r, X = t r on the board's plane m.(X - P) = 0: a turn w and shift s of the board move X along r, which
 changes F by (n.r / m.r) (w.(m x (P - X)) + m.s), and a change dr of the ray changes it by t (n - (n.r / m.r) m).dr.
 
-When row y sees the light, the mirror is where its command was lag - row_delay y earlier. The order of the
-columns is that of `Terms.names`; the turns and shifts of the axis are those of `calibration.model.parameters`.
+When row y sees the light, the mirror is where its command was lag - row_delay y earlier. Derivatives by
+parameters are in the order of `Terms.names`; the turns and shifts of the axis are those of
+`calibration.model.parameters`.
 """
 
 from collections.abc import Sequence
@@ -84,7 +85,7 @@ class _Lit(NamedTuple):
 
 
 class Sheet(NamedTuple):
-    """The light that meets given points: mirror command (m,), dF/dc (m,), normal (m, 3), dF/dp (m, terms)."""
+    """The light that meets n points: mirror command (n,), dF/dc (n,), normal (n, 3). columns: dF/dp (n, terms)."""
 
     command: Array
     per_command: Array

@@ -276,9 +276,10 @@ class SpadArray(Device):
         """Claim, fill and publish a block or more. True while more may come, False once the run has ended.
 
         Called on the application's source thread; waits at most `timeout_s` for frames, then raises `DeviceTimeout`. If
-        the ring is full and `ring.waits`, a source that can wait does so within the same time. Otherwise it drops the
-        block, counts its frames as lost and calls `ring.mark_overflow` with their number, which may raise to end the
-        run. Calls after the end return False. If another thread calls `stop` meanwhile, the call returns False early.
+        the ring is full and `ring.waits` is true, a source that can wait waits for room, with the same time limit. Any
+        other source drops the block at once, counts its frames as lost and calls `ring.mark_overflow` with their
+        number, which may raise to end the run. Calls after the end return False. If another thread calls `stop`
+        meanwhile, the call returns False early.
         """
         if not (self._run_opened and self._state is DeviceState.CONFIGURED):
             self._require("fill", DeviceState.RUNNING, first="start")

@@ -3,6 +3,7 @@
 `realtime` plays at the frame clock of the recording, `x4` and `x0.1` at multiples of it, `max` never waits, and `step`
 waits for a call of `Pace.step` before each sweep, or before each block without scan markers. Time lost to a full
 ring shifts all later frames and is counted, so that frames then come at their normal pace again and not all at once.
+A run, in this module, is what comes after one start of the SPAD.
 """
 
 import math
@@ -95,7 +96,7 @@ class Pace:
         return math.inf if self.speed is None else max(1.0, _PIECE_S * self.speed / float(period_s))
 
     def start(self) -> None:
-        """Begin a run now."""
+        """Begin a run: recorded time 0 is due now."""
         self.halted = False
         self._origin_ns = self._clock.now_ns()
 

@@ -141,7 +141,7 @@ def replay(
 
 
 def _configured(config: Config, request: ScanRequest) -> RigConfig:
-    changed = "scene", "exposures", "estimator", "filter", "min_confidence", "temporal_prior"
+    changed = "scene", "exposures", "estimator", "filter", "min_confidence", "temporal_prior", "learned"
     return configure(config, **_chosen(request, *changed))
 
 

@@ -101,8 +101,8 @@ class CalibrationResult:
 class Session:
     """The views of a calibration, written one by one as they are taken, and then its result.
 
-    views: those taken so far. refused: the reasons for those without corners, by name. identity: the rig they belong to
-    (None if unknown).
+    views: those taken so far. refused: why no corners were found in a view, by the view's name. identity: the rig they
+    belong to (None if unknown).
     """
 
     def __init__(

@@ -62,8 +62,8 @@ class Reconstructor:
     """Turns counted sweeps into maps, one after the other; estimators that learn carry their state from map to map.
 
     model, column_commands, lines: the same that were given to `map_geometry`. learned: kept states; each map is then
-    estimated with its own, and nothing is learned. kept: the state of an earlier run, used if it explains the first
-    map. Raises KeyError for the estimator `auto` (`rig.scan.estimator`
+    estimated with its own, and nothing is learned. kept: the state of an earlier run, used by `joint` if it explains
+    the first map. Raises KeyError for the estimator `auto` (`rig.scan.estimator`
     chooses one first), and with `learned` for estimators that learn nothing.
     """
 
@@ -97,8 +97,13 @@ class Reconstructor:
     @property
     def state(self) -> Learned | None:
         """The state for the next map; None if nothing has been learned."""
-        state: Learned | None = getattr(self.estimator, "model", None)  # the other estimators have none
+        state: Learned | None = getattr(self.estimator, "model", None)  # not every estimator has one
         return state
+
+    @property
+    def kept_serves(self) -> bool:
+        """Whether the first map was estimated with the state of an earlier run."""
+        return bool(getattr(self.estimator, "kept_serves", False))
 
     def counter(self, layout: SweepLayout) -> Counter:
         """A counter whose sweeps go to `map`, one after the other and each before frames of the next are added."""

@@ -15,7 +15,7 @@ from rig.count.volume import BYTE_EXPOSURES, Counter, CountVolume, SweepCounter,
 from rig.estimate.row.em import lines_of, next_lattice
 from rig.estimate.row.model import RowModel, line_profile
 from rig.estimate.search.confidence import believed
-from rig.estimate.search.online_learning import LearningSetting, OnlineLearner, Seen
+from rig.estimate.search.online_learning import LearningSetting, OnlineLearner, Seen, first_model
 from rig.estimate.search.prepare import judge_of, signal_reach
 from rig.estimate.search.rows import SearchTables
 from rig.estimate.search.stream import ColumnJudge, SearchedSweep, search_volume
@@ -29,14 +29,12 @@ class Likelihood:
     """Row likelihood with the state it has learned so far; `model` is None until a map was good enough to learn from.
 
     Pass `model` to estimate a map again with the state that it was estimated with: the result is the same bit for bit.
-    learns: whether later maps change that state. kept: state of an earlier run, used if it explains the first map.
+    learns: whether later maps change that state.
     """
 
-    def __init__(
-        self, threads: int = 2, model: RowModel | None = None, *, learns: bool = True, kept: RowModel | None = None
-    ) -> None:
+    def __init__(self, threads: int = 2, model: RowModel | None = None, *, learns: bool = True) -> None:
         self._workers = RowWorkers(threads)
-        self._lessons = OnlineLearner(_judge, model, learns=learns, kept=kept)
+        self._lessons = OnlineLearner(_judge, model, learns=learns)
         self._at: tuple[SweepGeometry, Float32] | None = None
         self._light: tuple[RowModel, float, int] | None = None
         self.used: RowModel | None = None
@@ -62,7 +60,7 @@ class Likelihood:
             used, found = self.model, sweep.stripe
             quiet, lines = sweep.quiet, sweep.lines
         else:
-            used = self._lessons.model_for(lambda: self._lessons.first(sweep, geometry, self._workers)[0])
+            used = self._lessons.model_for(lambda: first_model(sweep, geometry, self._workers))
             setting = LearningSetting(used, geometry, sweep.exposures, sweep.dark_counts is not None)
             found, quiet = search_volume(sweep, geometry, self._lessons.tables(setting, self._workers), self._workers)
             lines = lines_of(sweep, next_lattice(geometry))

@@ -78,8 +78,8 @@ def create_estimator(
 ) -> Estimator:
     """A fresh estimator that uses up to `threads` threads. name: one of ESTIMATORS, else KeyError.
 
-    temporal_prior: whether `joint` uses the last map as a weak prior; the others ignore it. kept: the state of an
-    earlier run; an estimator of LEARNING begins with it if it explains the first map, the others ignore it.
+    temporal_prior: whether `joint` uses the last map as a weak prior. kept: the state of an earlier run, with which
+    `joint` begins if it explains the first map. The other estimators ignore both.
     """
     if name in LEARNING:
         return _learning(name, threads, learns=True, temporal_prior=temporal_prior, kept=kept)
@@ -92,7 +92,7 @@ def _learning(name: str, threads: int, *, learns: bool, temporal_prior: bool, ke
     if name == "likelihood":
         from rig.estimate.likelihood import Likelihood
 
-        return Likelihood(threads, learns=learns, kept=kept)
+        return Likelihood(threads, learns=learns)
     if name != "joint":
         raise KeyError(name)
     from rig.estimate.joint.joint import Joint

@@ -216,12 +216,14 @@ class ScanPlan:
 
     @property
     def full_frames_hz(self) -> float | None:
-        """Highest rate of full frames that the link carries; None if there is no stream."""
+        """Highest frame rate at which the link can carry full frames, Hz; None if there is no stream."""
         return None if self.link_bytes_per_s is None else self.link_bytes_per_s / frame_bytes(self.width, self.rows)
 
     @property
     def windows_hz(self) -> float | None:
-        """Highest rate of this plan's windows that the link carries; None if there are no windows or no stream."""
+        """Highest frame rate at which the link can carry this plan's windows, Hz; None if there are no windows or no
+        stream.
+        """
         if self.windows is None or self.link_bytes_per_s is None:
             return None
         return self.link_bytes_per_s / frame_bytes(self.windows.width_px, self.rows)
@@ -229,10 +231,11 @@ class ScanPlan:
     def window_x0(
         self, marks: NDArray[np.integer], line: NDArray[np.integer], sweep: NDArray[np.integer]
     ) -> NDArray[np.int32]:
-        """First used pixel of each frame, int32 (n,), from marks and line of its record and the number of its sweep.
+        """First pixel of each frame's window, int32 (n,), from marks and line of its record and the number of its
+        sweep.
 
         It does not depend on whether the SPAD sent the whole frame or only its window. sweep is -1 before the first
-        marker.
+        scan marker.
         """
         if self.windows is None:
             return np.zeros(len(line), np.int32)

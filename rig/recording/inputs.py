@@ -39,11 +39,9 @@ MOST_PIXELS: Final = 0xFFFF
 """Most pixels each way, which is what a block's header can hold."""
 
 
-def write_inputs(
-    folder: Path, plan: ScanPlan, model: RigModel | None, learned: tuple[str, RowModel] | None = None
-) -> None:
-    """Write the compiled plan with every number, the calibration, and the state `learned` in an earlier run by the
-    estimator of this name. The last two may be None. Raises OSError.
+def write_inputs(folder: Path, plan: ScanPlan, model: RigModel | None, learned: RowModel | None = None) -> None:
+    """Write the compiled plan with every number, the calibration if there is one, and the state `learned` in an earlier
+    run if the scan begins with it. Raises OSError.
     """
     content = {"format": PLAN_FORMAT, "version": PLAN_VERSION, "plan": to_plain(plan)}
     dumper = getattr(yaml, "CSafeDumper", yaml.SafeDumper)
@@ -52,7 +50,7 @@ def write_inputs(
     if model is not None:
         save_rig_model(model, folder / CALIBRATION_FILE)
     if learned is not None:
-        write_learned(folder / LEARNED_FILE, *learned)
+        write_learned(folder / LEARNED_FILE, learned)
 
 
 def read_plan(folder: Path, name: str = PLAN_FILE) -> ScanPlan:

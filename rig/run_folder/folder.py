@@ -276,23 +276,19 @@ def _unwritable(path: Path, error: OSError) -> UsageError:
     return UsageError(f"cannot write {path}: {reason}; name another folder with --out or free the space it needs")
 
 
-def write_learned(file: Path, estimator: str, state: Learned) -> None:
-    """Write the state of an estimator in one step, without the labels of its last map, to be read by `read_learned`.
-    Raises OSError.
-    """
-    arrays = {name: value for name, value in state.arrays().items() if name != "before"}
-    replace_file(file, _npz_bytes({**arrays, "estimator": np.array(estimator)}))
+def write_learned(file: Path, state: Learned) -> None:
+    """Write a learned state in one step, without the labels of its last map, for `read_learned`. Raises OSError."""
+    replace_file(file, _npz_bytes({name: value for name, value in state.arrays().items() if name != "before"}))
 
 
-def read_learned(file: Path) -> tuple[str, RowModel]:
-    """The name of an estimator and its state. Raises UsageError if the file has none, or is not readable."""
+def read_learned(file: Path) -> RowModel:
+    """The state in a file. Raises UsageError if there is none, or the file is not readable."""
     try:
-        arrays = load_arrays(file)
-        return str(arrays["estimator"]), RowModel.from_arrays(arrays)
+        return RowModel.from_arrays(load_arrays(file))
     except (OSError, ValueError, KeyError) as error:
         what = f"it has no {error}" if isinstance(error, KeyError) else str(error)
         raise UsageError(
-            f"{file} holds nothing that an estimator has learned ({what}); remove it, or name another file"
+            f"{file} holds nothing that joint has learned ({what}); remove it, or name another file"
         ) from error
 
 

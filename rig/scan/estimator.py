@@ -1,5 +1,5 @@
 """Chooses the estimator of a run with `auto`: `joint` wherever it keeps up with the frames, else `likelihood`. Finds
-what an earlier run has learned for it.
+what `joint` has learned in an earlier run.
 
 `joint` errs several times less than `likelihood` and takes longer. That does not matter if no frame waits for a map:
 with simulated rigs, recordings and cubes, and for a single map. In a stream a map must be made within the time of a
@@ -18,7 +18,6 @@ from calibration.errors import digits
 from rig.config.models import AUTO, EstimateConfig
 from rig.count.volume import CountVolume
 from rig.errors import UsageError
-from rig.estimate.registry import LEARNING
 from rig.estimate.row.model import RowModel
 from rig.geometry.windows import SweepGeometry
 from rig.run_folder.folder import read_learned
@@ -72,22 +71,22 @@ def _choice(estimate: EstimateConfig, geometry: SweepGeometry, map_time_s: float
 
 
 def kept_model(file: Path | None, estimator: str, geometry: SweepGeometry) -> tuple[RowModel | None, str]:
-    """The state kept in a file by an earlier run, if it can be used here, else None and why not ("" without a file).
+    """The state of `joint` kept in a file by an earlier run, if it can be used here, else None and why not.
+
+    The text is empty without a file, and for other estimators.
 
     Raises UsageError if the file is not readable, or its folder does not exist.
     """
     from rig.estimate.row.em import path_bins
     from rig.estimate.search.online_learning import LearningSetting
 
-    if file is None or estimator not in LEARNING:
+    if file is None or estimator != "joint":
         return None, ""
     if not file.parent.is_dir():
         raise UsageError(f"learned {file}: there is no folder {file.parent}; make it, or name another file")
     if not file.exists():
         return None, f"anew, {file} is written at the end"
-    name, model = read_learned(file)
-    if name != estimator:
-        return None, f"anew: {file} was learned by {name}"
+    model = read_learned(file)
     try:
         LearningSetting(model, geometry, 1, True)
     except UsageError:

@@ -103,7 +103,7 @@ def run_scan(
     }
 
     def write_beside(folder: Path) -> None:
-        write_inputs(folder, plan, rig.model, None if kept is None else (estimate.estimator, kept))
+        write_inputs(folder, plan, rig.model, kept)
 
     recording = None
     if request.record:
@@ -130,8 +130,9 @@ def run_scan(
             for found in running:
                 truth = facts.truth(found.sweep, found.column)
                 if kept is not None and not sweeps:
-                    file, serves = estimate.learned, found.result.learned is kept
-                    run.tally.learned = f"from {file}" if serves else f"anew: {file} does not explain the first map"
+                    used = reconstructor.kept_serves
+                    told = f"from {estimate.learned}", f"anew: {estimate.learned} does not explain the first map"
+                    run.tally.learned = told[0] if used else told[1]
                 sweeps.append(found.sweep)  # before its map: whatever ends the run, no map is without its account
                 run.add(found.result, found.compute_s, truth)
     except (KeyboardInterrupt, DeviceError, RigError) as error:
@@ -171,10 +172,10 @@ def run_scan(
 
 def _keep_learned(estimate: EstimateConfig, state: Learned) -> None:
     """Keep a state for the next run, if the config names a file for it."""
-    if estimate.learned is None:
+    if estimate.learned is None or estimate.estimator != "joint":
         return
     try:
-        write_learned(estimate.learned, estimate.estimator, state)
+        write_learned(estimate.learned, state)
     except OSError as error:
         _log.warning("cannot keep what was learned in %s: %s", estimate.learned, error.strerror or error)
 

@@ -93,8 +93,11 @@ class Source:
 
 
 def blocks(reader: RingReader, source: Source, silence_s: float) -> Iterator[FrameBlock]:
-    """Yield the blocks of the start. Raises the source's error after them, and DeviceTimeout if none comes: the SPAD's
-    own if it is silent while the ring is empty, the ring's after HANG_S."""
+    """Yield the blocks of one start of the SPAD, then raise the source's error, if there is one.
+
+    Raises DeviceTimeout if no block comes: the SPAD's error if the SPAD says that it has no frames, else the ring's
+    after HANG_S. silence_s: longest wait for a block before it is asked whether the SPAD has said so.
+    """
     while True:
         heard = len(source.silences)
         waited_s = 0.0

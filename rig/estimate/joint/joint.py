@@ -31,10 +31,10 @@ from rig.estimate.joint.temporal import TemporalPrior
 from rig.estimate.joint.vote import NEIGHBOURS_PX, collect, vote
 from rig.estimate.joint.winner import new_readout
 from rig.estimate.row.ambient import ambient_map
-from rig.estimate.row.em import learn_again, lines_of, next_lattice
+from rig.estimate.row.em import expect, learn_again, lines_of, next_lattice
 from rig.estimate.row.inputs import state_of
 from rig.estimate.row.model import RowModel
-from rig.estimate.search.online_learning import LearningSetting, OnlineLearner, Seen
+from rig.estimate.search.online_learning import LearningSetting, OnlineLearner, Seen, first_model
 from rig.geometry.stripe_table import StripeTable
 from rig.geometry.windows import SweepGeometry
 from rig.simd import Float32, Float64
@@ -45,6 +45,9 @@ LESSONS = 2
 """Number of times that the first map's stripes are estimated and the model is learned again from them."""
 HALO_LESSONS = 3
 """Number of these lessons under a halo."""
+KEPT_WORSE = 0.0015
+"""Share of the log likelihood by which a kept medium may explain a first sweep worse than the one that was learned from
+it row by row. It is at most 0.0004 in the same fog, 0.001 at 0.8 of the visibility, 0.002 and more in other scenes."""
 AGREE_PX = np.float32(1.0)
 """Under a halo, a first map's stripe is learned from only if contrast alone puts it at most this far away, in px."""
 TRUSTED = np.float32(0.5)
@@ -58,7 +61,7 @@ class Joint:
 
     Pass `model` to estimate a map again with the state that it was estimated with: the result is the same bit for bit.
     learns: whether later maps change that state. temporal_prior: whether the last map is a weak prior for the next.
-    kept: state of an earlier run, used if it explains the first map.
+    kept: state of an earlier run, used for the first map if it explains its counts.
     """
 
     def __init__(
@@ -71,7 +74,10 @@ class Joint:
         kept: RowModel | None = None,
     ) -> None:
         self._workers = RowWorkers(threads)
-        self._lessons = OnlineLearner(tables_of, None, learns=learns, learn_more=learn_next_halo, kept=kept)
+        self._lessons = OnlineLearner(tables_of, None, learns=learns, learn_more=learn_next_halo)
+        self._kept = kept
+        self.kept_serves: bool | None = None
+        """Whether the first map was estimated with the kept state; None before, and if there is none."""
         self._prior = TemporalPrior(temporal_prior)
         self._memory: Memory | None = None
         self.used: RowModel | None = None
@@ -120,12 +126,14 @@ class Joint:
         return stripes
 
     def _first_model(self, volume: CountVolume, geometry: SweepGeometry) -> RowModel:
-        """The kept model, or one learned from the first sweep: row by row, then from the stripes of the whole map."""
+        """The model for the first sweep: learned row by row, then from a kept state or the whole map's stripes."""
         self._prior.recall(None)  # forget maps from which nothing was learned
-        model, serves = self._lessons.first(volume, geometry, self._workers)
-        if serves:
-            return model
-        start = model
+        model = start = first_model(volume, geometry, self._workers)
+        if self._kept is not None:
+            kept = self._adapted(self._kept, model, volume, geometry)
+            self.kept_serves = kept is not None
+            if kept is not None:
+                return kept
         witness_px, lessons, intensity = None, 0, volume.intensity()
         while lessons < (LESSONS if witness_px is None else HALO_LESSONS):
             model, lessons = self._taught(volume, intensity, geometry, model, witness_px), lessons + 1
@@ -133,6 +141,29 @@ class Joint:
                 # Light scattered many times has misled these lessons: begin again, and check stripes by contrast.
                 witness_px, model, lessons = self._by_contrast(volume, geometry, model), start, 0
         return model
+
+    def _adapted(
+        self, kept: RowModel, fresh: RowModel, volume: CountVolume, geometry: SweepGeometry
+    ) -> RowModel | None:
+        """The state of an earlier run, adapted to a first sweep; None if it does not explain the sweep's counts.
+
+        fresh: learned row by row from the sweep. A halo is taken over together with everything else, but only if that
+        explains the counts better, since a single row cannot tell it from haze. Without a halo, the line's width and
+        the brightness of stripes are taken over if the medium is still the same.
+        """
+        lines = lines_of(volume, next_lattice(geometry))
+
+        def evidence(model: RowModel) -> float:
+            return expect(lines, geometry, model, self._workers).evidence
+
+        if kept.halo.any():
+            return kept if evidence(kept) > evidence(fresh) else None
+        profile = np.column_stack([kept.profile[:, :3], fresh.profile[:, 3]]).astype(np.float32)
+        medium = replace(fresh, profile=profile, row_gain=kept.row_gain, column_gain=kept.column_gain)
+        own = evidence(fresh)
+        if evidence(medium) < own - KEPT_WORSE * abs(own):
+            return None
+        return replace(fresh, amplitude=kept.amplitude, weight=kept.weight, line_sigma_px=kept.line_sigma_px)
 
     def _taught(
         self, volume: CountVolume, intensity: NDArray[np.uint32], geometry: SweepGeometry, model: RowModel,

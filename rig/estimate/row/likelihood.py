@@ -101,9 +101,10 @@ def row_scores(
 ) -> None:  # fmt: skip
     """Log-likelihood of every position and amplitude relative to 'everything is behind'.
 
-    psi: (T + 1,) share of the stripe at 0..T px from its centre. Writes score (M, length); edge (length + 1,), the
-    score of a change from before to behind at t without any stripe; and taps (3, length): each pixel's own
-    log-likelihood before and behind, and the flux between the two.
+    n: (length,) ones of the k exposures. psi: (T + 1,) share of the stripe at 0..T px from its centre. table: of
+    `logit_table`. Writes score (M, length); edge (length + 1,), the score of a change from before to behind at t
+    without any stripe; and taps (3, length): each pixel's log-likelihood if it lies before the stripe, the same behind
+    it, and the mean of its two fluxes.
     """
     n, before, behind, scale = n[:length], before[:length], behind[:length], scale[:length]
     near, far, middle = taps[0, :length], taps[1, :length], taps[2, :length]

@@ -1,7 +1,6 @@
 """Decides when an estimator learns, and holds the model that it uses until then.
 
-The first map is estimated with a model learned from that map itself, or with one kept from an earlier run if that
-explains the map nearly as well (`OnlineLearner.first`). A later map is used for learning (a lesson) when
+The first map is estimated with a model learned from that map itself. A later map is used for learning (a lesson) when
 enough frames have come since the last lesson (TEACH_FRAMES) and enough of its answers are confident (LEAST_SURE).
 Lessons run on a thread of their own. The new model is used a fixed number of frames later (LAG_FRAMES), so that a live
 scan hardly ever waits and results do not depend on the speed of the machine.
@@ -18,7 +17,7 @@ from numpy.typing import NDArray
 from rig.count.volume import CountVolume, FrameTally
 from rig.errors import UsageError
 from rig.estimate.row.ambient import ambient_map
-from rig.estimate.row.em import Expectation, expect, learn_first, learn_next, lines_of, next_lattice
+from rig.estimate.row.em import Expectation, learn_first, learn_next, lines_of, next_lattice
 from rig.estimate.row.inputs import Lines
 from rig.estimate.row.model import RowModel
 from rig.estimate.search.prepare import judge_of
@@ -35,10 +34,6 @@ TEACH_FRAMES = 100_000
 with the tables of `joint` twice that."""
 LAG_FRAMES = 50_000
 """Lit frames from a lesson's map to the first map that is estimated with the new model: time to learn."""
-
-KEPT_WORSE = 0.02
-"""Share of the log likelihood by which a kept model may explain a first sweep worse than the model learned from it row
-by row. Learned from another scan of the same scene it is worse by 0.001 to 0.014, in other fog by 0.08 and more."""
 
 Tables = TypeVar("Tables")
 """An estimator's tables for one model and one geometry."""
@@ -93,8 +88,7 @@ class OnlineLearner(Generic[Tables]):
     """The model that an estimator uses, None until a map was good enough to learn from, and the tables made for it.
 
     make: makes tables. learn_more: learns from `more` of a `Seen`, in addition to what every estimator learns. Both run
-    on the learning thread, `make` also on the caller's. learns: whether later maps change the model. kept: the model of
-    an earlier run, tried on the first map.
+    on the learning thread, `make` also on the caller's. learns: whether later maps change the model.
     """
 
     def __init__(
@@ -104,10 +98,8 @@ class OnlineLearner(Generic[Tables]):
         *,
         learns: bool,
         learn_more: Callable[[LearningSetting, Any, RowWorkers], RowModel] | None = None,
-        kept: RowModel | None = None,
     ) -> None:
         self._make = make
-        self._kept = kept
         self._learn_more = learn_more
         self._learns = learns
         self.model = model
@@ -121,15 +113,6 @@ class OnlineLearner(Generic[Tables]):
     def model_for(self, first: Callable[[], RowModel]) -> RowModel:
         """The model with which to estimate a sweep. first: called to learn it from the sweep if there is none yet."""
         return self.model if self.model is not None else first()
-
-    def first(self, volume: CountVolume, geometry: SweepGeometry, workers: RowWorkers) -> tuple[RowModel, bool]:
-        """The model for a first sweep, and whether it is the kept one; else it is learned row by row from the sweep."""
-        fresh = first_model(volume, geometry, workers)
-        if self._kept is None:
-            return fresh, False
-        lines = lines_of(volume, next_lattice(geometry))
-        kept, own = (expect(lines, geometry, model, workers).evidence for model in (self._kept, fresh))
-        return (self._kept, True) if kept >= own - KEPT_WORSE * abs(own) else (fresh, False)
 
     def tables(self, setting: LearningSetting, workers: RowWorkers) -> Tables:
         """Tables for a setting, made again only when the setting changes."""

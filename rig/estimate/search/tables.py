@@ -1,7 +1,8 @@
 """Tables of the search along a row, per column and band of rows, and a thread's buffers.
 
-They hold the terms of `rig.estimate.row.likelihood` in integers, with `units` units to an octave of likelihood. With
-the probability p' that a pixel fires, p'_L left and p'_R right of the stripe, and p'_S where the stripe lights it,
+They hold the terms of `rig.estimate.row.likelihood` in integers, with `units` units to an octave (a factor of 2) of
+likelihood. With the probability p' that a pixel fires, p'_L left and p'_R right of the stripe, and p'_S where the
+stripe lights it,
 
     edge = logit p'_L - logit p'_R                  int8: a count at a pixel left of position x
     tap  = logit p'_S - logit p'_L or R             int8: a count at a pixel around x, for SCREENS amplitudes
@@ -42,21 +43,25 @@ FLUX_LEFT, FLUX_RIGHT, GAIN_LEFT, GAIN_RIGHT, LOSS_LEFT, LOSS_RIGHT = range(6)
 class ScreenTables(NamedTuple):
     """Tables of all columns and bands, see the module.
 
-    P: stored pixels per row, padded to whole vectors; in order of step and lane unless stated.
+    P: stored pixels per row, padded to whole vectors. Unless stated otherwise they are in lane order, in STEPS steps,
+    which make PAIRS pairs (`rig.count.lane_order`). T: pixels to each side of a position that are looked at.
 
     edge: int8 (columns, bands, PAIRS, lanes, 2), weight of a count left of the stripe.
     tap: int8 (columns, bands, SCREENS, STEPS, T + 1, lanes, 2), for each position the weights of counts up to T px
     around it, in T + 1 pairs from `first_pair` on. At odd positions the first pixel of the position's own pair also has
     its weight as a pixel left of the stripe.
     position: int16 (columns, bands, SCREENS, P), constant of position x at the nominal number of exposures, its prior
-    included; slope: int16, the same shape, increase with each further exposure in 1 / SLOPE of a unit.
-    lane: float32 (columns, bands, lanes), units per exposure if all pixels up to a lane's last lie left.
+    included; slope: int16, the same shape, what each further exposure adds to it, in 1 / SLOPE of a unit.
+    lane: float32 (columns, bands, lanes), score in units per exposure if all pixels up to the lane's last one lie left
+    of the stripe.
     none: float32 (columns, bands, NONE), scores of 'no stripe': all pixels right of it, all left of it, a change
     somewhere (per lane); then the first and last lane with pixels of the column.
-    neutral: float32 (columns, bands, P), ones per exposure that carry no information, in pixel order.
+    neutral: float32 (columns, bands, P), ones per exposure that are as likely left of the stripe as right of it, in
+    pixel order.
     before, scale: float32 (columns, bands, P) as in `RowBuffers`, in pixel order.
     first, last: int32 (columns, bands), first and last position in stored pixels.
-    ambient: float32 (columns, bands, P), ambient light and other lines' haze; without columns if there is no such haze.
+    ambient: float32 (columns, bands, P), ambient light and other lines' haze, in pixel order; of shape (0, bands, P) if
+    there are no other lines.
     """
 
     edge: NDArray[np.int8]

@@ -184,8 +184,10 @@ class UsbModel:
 
 
 class AttachedDevice:
-    """A model on the bus. Enforces the rules of a kernel and a host controller. Thread-safe. Errors are
-    `UsbFailure`: ENODEV without the device, EPIPE for a transfer that is refused or to a halted endpoint.
+    """A model on the bus. Enforces the rules of a kernel and a host controller. Thread-safe.
+
+    All errors are `UsbFailure`. Any call may raise ENODEV (the device is unplugged), any transfer EPIPE (it is refused,
+    or its endpoint is halted).
     """
 
     def __init__(self, model: UsbModel, bus: int, port: int, now: Callable[[], float]) -> None:
