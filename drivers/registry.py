@@ -46,10 +46,10 @@ class Surroundings:
 
 @dataclass(frozen=True, slots=True)
 class Kind:
-    """The object that an entry point loads: the config model of a kind and the function that creates the opened device.
+    """The object that an entry point loads: the config model of a kind and the function that opens the device.
 
-    `create(config, surroundings)` gets an instance of `config` and returns a device of the slot's interface (or a
-    `World`); it raises a `DeviceError` if the device cannot be opened.
+    `create(config, surroundings)` gets an instance of `config` and returns a device with the interface of its part of
+    the rig (see SLOTS), or a `World`. It raises a `DeviceError` if the device cannot be opened.
     """
 
     config: type[BaseModel]

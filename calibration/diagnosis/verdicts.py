@@ -114,8 +114,12 @@ def judge_check(
     angle: CheckedAngle | None = None,
     stated_angle_rad: float | None = None,
 ) -> Verdict:
-    """Judge checked boards. asked: the required depth error; at other distances it scales with the square of the
-    distance.
+    """Judge checked boards.
+
+    asked: the required depth error at one distance. For flatness and angle the error allowed at another distance grows
+    with the square of the distance; the size of a board may be wrong by the share accuracy_m / at_m at any distance.
+    board_width_m: of the boards. angle, stated_angle_rad: the angle between two boards as scanned, and as measured by
+    hand.
     """
     found: list[Reason] = []
     for board in boards:

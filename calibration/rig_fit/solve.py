@@ -147,7 +147,9 @@ MOST_CONDITION = 1e12
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Prior:
-    """Knowledge of the camera from elsewhere: information (p, p), 0 for other parameters, around the values (p,)."""
+    """What is known about the camera from elsewhere. matrix: information (inverse covariance) of all p parameters, zero
+    for those that are not the camera's. values: (p,), the values expected.
+    """
 
     matrix: Array
     values: Array

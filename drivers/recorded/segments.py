@@ -44,7 +44,7 @@ Bytes = NDArray[np.uint8]
 
 @dataclass(frozen=True, slots=True)
 class FrameTable:
-    """Begins of the zstd frames in the file (packed) and in the plain segment: int64 (frames + 1,). The last value of
+    """Starts of the zstd frames in the file (packed) and in the plain segment: int64 (frames + 1,). The last value of
     each is the end.
     """
 

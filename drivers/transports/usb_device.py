@@ -88,7 +88,10 @@ class UsbId:
 
 @dataclass(frozen=True, slots=True)
 class UsbListing:
-    """A device on the bus, as far as it can be known without claiming it. Strings are None if unset or forbidden."""
+    """A device on the bus, as far as it can be known without claiming it.
+
+    Strings are None if the device has none, or if they cannot be read, as without permission.
+    """
 
     path: str
     serial: str | None

@@ -34,10 +34,11 @@ def calibrate_camera(
     tell: TellLine | None = None,
     **changes: Any,
 ) -> CalibrationResult:
-    """Calibrate the camera alone (`rig calibrate camera`). `sources` may also be pictures, and folders of them.
+    """Calibrate the camera alone (`rig calibrate camera`).
 
-    Raises Degenerate if the views give no calibration, with the likely root cause and notes on the other reasons, and
-    UsageError for a wrong request.
+    sources: rigs or folders of views, as for the other calibrations, or pictures, or folders of pictures. request,
+    changes: options, as a `CameraRequest` or by the names of its fields. Raises UsageError for a wrong request, and
+    Degenerate if the views give no calibration: its message is the likeliest cause, its notes are other possible ones.
     """
     request = replace(request or CameraRequest(), **changes)
     si_values(request)

@@ -181,8 +181,8 @@ _WAYS = {1: "rising command", -1: "falling command"}
 
 
 def plane_residuals(judged: JudgedRig, sweeps: Sequence[SweepFit]) -> str:
-    """Chart (SVG) of each sweep's median residuals over the command, in mm of depth at the distance of the accuracy
-    asked for, with a panel per direction.
+    """Chart (SVG) of each sweep's median residuals against the mirror command, with one panel for each direction of
+    sweep. Residuals are in mm of depth at the distance for which the accuracy was asked. Empty without sweeps.
     """
     views, waves = list(dict.fromkeys(sweep.view for sweep in sweeps)), judged.waves
 

@@ -132,8 +132,8 @@ def _fine_share(x, times, turn):  # type: ignore[no-untyped-def]
 def read_counts(counts: NDArray[np.unsignedinteger], halved: int, n: int, lanes: int, turn: int = 0) -> None:
     """Write the counts (window,) of a row in pixel order, divided by 2^halved, to address n in lane order.
 
-    The rounding is that of `halve_counts` for divisors up to 8. turn: a number that differs between the columns in
-    which a pixel is read.
+    For divisors up to 8, counts are rounded as in `halve_counts`. For larger ones, rounding also varies with `turn`,
+    such as the number of the column, so that small counts keep their mean.
     """
     for x in range(counts.shape[0]):
         share = _share(x, halved) if halved <= 3 else _fine_share(x, halved, turn)

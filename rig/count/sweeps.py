@@ -74,7 +74,8 @@ class SweepData(SweepAccount):
 
 @dataclass(frozen=True, slots=True)
 class FirstSweep:
-    """First sweep of a start to become a map: number 0, except in a part that was cut from a recording.
+    """The first sweep of a start that is made into a map. Its number is 0, unless the frames are a part that was cut
+    from a recording.
 
     clock_ratio: as in `FrameBinder`. Frames of earlier sweeps are not counted.
     """

@@ -68,9 +68,9 @@ class LineMarkers:
 class DarkLook:
     """Frames of a sweep with the gate low, and what came with them.
 
-    records: (n,), records of all frames. dark_share: share of ones in the first frames of the blocks. n_bytes: bytes of
-    pixels; seconds: time from the start of the mirror until all frames had come. counters: the SPAD's own, read before
-    it was stopped. triggered: whether the sync source's program ran to its end.
+    records: (n,), records of all frames. dark_share: share of ones, from the first frame of each block. n_bytes: number
+    of bytes of pixels; seconds: time from the start of the mirror until all frames had come. counters: the SPAD's own,
+    read before it was stopped. triggered: whether the sync source's program ran to its end.
     """
 
     records: NDArray[np.void]

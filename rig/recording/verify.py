@@ -72,7 +72,10 @@ class Verification:
 
 @dataclass(frozen=True, slots=True)
 class Examination:
-    """Everything found out about a recording. runs: the sound blocks of each start, in order of their frames."""
+    """Everything found out about a recording.
+
+    runs: the undamaged blocks of each start of the SPAD, in the order of their frames.
+    """
 
     segments: list[SegmentReader]
     runs: list[list[SoundBlock]]
