@@ -72,14 +72,21 @@ def test_confidence_is_the_share_within_a_pixel(empty: bool) -> None:
     assert calibration_error(claimed, right) <= CALIBRATION
 
 
-def test_a_first_map_in_dense_fog_does_not_learn_from_its_own_wrong_places() -> None:
-    config = load_config("simulated", {"scan.columns": 150})
-    result = scan(config, scene="street-dense-fog", estimator="joint", exposures=10, seed=1)
+@pytest.mark.parametrize(("exposures", "seed", "within"), [(10, 1, 0.8), (1, 3, 0.5)])
+def test_a_first_map_in_dense_fog_does_not_learn_from_its_own_wrong_places(
+    exposures: int, seed: int, within: float
+) -> None:
+    # At 30 kHz the mirror can sweep 150 columns of a single exposure.
+    config = load_config(
+        "simulated", {"scan.columns": 150, "scan.frame_rate": "30 kHz", "scan.exposure": "10 us", "scan.exposures": 10}
+    )
+    result = scan(config, scene="street-dense-fog", estimator="joint", exposures=exposures, seed=seed)
     assert result.last is not None
     assert result.truth is not None
     stripe, truth = result.last.stripe, result.truth.x_px
     lit = np.isfinite(truth)
-    # With seeds 1 to 3: 0.95, 0.97, 0.94, and 0.032, 0.035, 0.006. In a fog of another halo it was 0.87, 0.94, 0.93 and
-    # 0.004 at most, and without a second teacher 0.74 and 0.11.
-    assert (np.abs(stripe.x_px - truth)[lit] <= 1.0).mean() > 0.8
+    # K = 10, seeds 1 to 3: 0.95, 0.97, 0.94, and 0.032, 0.035, 0.006. In a fog of another halo it was 0.87, 0.94, 0.93
+    # and 0.004 at most, and without a second teacher 0.74 and 0.11. K = 1: 0.64 to 0.66 and 0.013 at most; with seed 3
+    # it was 0.08 before lost stripes made learning begin again.
+    assert (np.abs(stripe.x_px - truth)[lit] <= 1.0).mean() > within
     assert (stripe.confidence[~lit] > 0.5).mean() < 0.05

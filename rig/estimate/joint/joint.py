@@ -51,7 +51,9 @@ it row by row. It is at most 0.0004 in the same fog, 0.001 at 0.8 of the visibil
 AGREE_PX = np.float32(1.0)
 """Under a halo, a first map's stripe is learned from only if contrast alone puts it at most this far away, in px."""
 TRUSTED = np.float32(0.5)
-"""Under a halo, the amplitudes are learned only from stripes of more trust than this."""
+"""An answer teaches if its trust exceeds this: under a halo, amplitudes are learned only from such stripes."""
+LOST = 0.2
+"""If fewer answers than this share teach the last lesson in fog, light scattered many times may hide the stripes."""
 QUIET_COLUMNS = 8
 """If there are dark frames, one column in so many is also used to learn the ambient light; else every column."""
 
@@ -134,13 +136,18 @@ class Joint:
             self.kept_serves = kept is not None
             if kept is not None:
                 return kept
-        witness_px, lessons, intensity = None, 0, volume.intensity()
+        witness_px, lessons, intensity, misled = None, 0, volume.intensity(), model
+        foggy = bool(model.profile[:, 0].max() > np.median(model.ambient))
         while lessons < (LESSONS if witness_px is None else HALO_LESSONS):
-            model, lessons = self._taught(volume, intensity, geometry, model, witness_px), lessons + 1
-            if witness_px is None and model.halo.any():
-                # Light scattered many times has misled these lessons: begin again, and check stripes by contrast.
+            (model, teaching), lessons = self._taught(volume, intensity, geometry, model, witness_px), lessons + 1
+            lost = foggy and lessons == LESSONS and teaching < LOST
+            if witness_px is None and (model.halo.any() or lost):
+                # Light scattered many times has misled these lessons, so that they found a halo, or too few stripes to
+                # find one. Begin again, and check stripes by contrast.
+                misled = model
                 witness_px, model, lessons = self._by_contrast(volume, geometry, model), start, 0
-        return model
+        # Lost stripes prove no halo: without one, nothing has to be learned by contrast.
+        return misled if witness_px is not None and not (model.halo.any() or misled.halo.any()) else model
 
     def _adapted(
         self, kept: RowModel, fresh: RowModel, volume: CountVolume, geometry: SweepGeometry
@@ -168,8 +175,8 @@ class Joint:
     def _taught(
         self, volume: CountVolume, intensity: NDArray[np.uint32], geometry: SweepGeometry, model: RowModel,
         witness_px: Float32 | None,
-    ) -> RowModel:  # fmt: skip
-        """The model learned from stripes that are estimated with `model`.
+    ) -> tuple[RowModel, float]:  # fmt: skip
+        """The model learned from stripes that are estimated with `model`, and the share of answers that teach it.
 
         intensity: of the volume. witness_px: x_px of `_by_contrast`; stripes more than AGREE_PX from it are not used.
         """
@@ -195,7 +202,7 @@ class Joint:
         weigh_light(volume, tables.sweep, state_of(model), stripes.x_px, places, self._workers)
         self._workers.settle()
         amplitude, weight = amplitudes_of(places, None if witness_px is None else stripes.confidence > TRUSTED)
-        return replace(model, amplitude=amplitude, weight=weight)
+        return replace(model, amplitude=amplitude, weight=weight), float(np.mean(stripes.confidence > TRUSTED))
 
     def _by_contrast(self, volume: CountVolume, geometry: SweepGeometry, model: RowModel) -> Float32:
         """x_px (rows, columns) from the costs of `rig.estimate.joint.labels.contrast` alone."""
