@@ -56,6 +56,8 @@ class Bench:
         self._power_w = 0.0
         self.jitter = Jitter(0.0, 0)
         """Shaking of the mirror."""
+        self.spad_start_s = 0.0
+        """Time of the SPAD's last start."""
 
     def now_s(self) -> float:
         """Present time of the bench."""

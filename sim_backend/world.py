@@ -6,6 +6,7 @@ from pathlib import Path
 from typing import Annotated, Any, ClassVar
 
 import numpy as np
+from numpy.typing import NDArray
 from pydantic import AfterValidator, BeforeValidator, Field
 
 from calibration.errors import CalibrationError
@@ -23,7 +24,7 @@ from sim_backend.frames.flux import ROUNDING, FluxModel, column_grid, fine_grid
 from sim_backend.frames.photons import PhotonSource
 from sim_backend.light.line import ONE_LINE, LineFan, line_width
 from sim_backend.light.optics import Line, Optics, Sensor, detections_per_radiance
-from sim_backend.light.view import make_view
+from sim_backend.light.view import CameraView, make_view
 from sim_backend.scenes.medium import Section
 from sim_backend.scenes.scene import CLEAR, BoardPlace, load_scene, load_surfaces, with_board_at, with_fog
 
@@ -89,6 +90,10 @@ class WorldConfig(KindConfig):
     def has_board(self) -> bool:
         """Whether the scene contains a calibration board. Raises DeviceError if the scene cannot be read."""
         return bool(load_scene(self.scene)[0].boards)
+
+
+MOST_VIEWS, TIME_STEP_S = 64, 1e-3
+"""Where surfaces move, the truth of a sweep is put together from at most so many moments, at least this far apart."""
 
 
 class SimulatedWorld:
@@ -223,22 +228,28 @@ class SimulatedWorld:
         """The rig as it really is, which is what a calibration should find."""
         return self.model
 
-    def truth(self, commands: Array, velocity_per_s: float = 0.0) -> SweepTruth:
+    def truth(self, commands: Array, velocity_per_s: float = 0.0, time_s: Array | None = None) -> SweepTruth:
         """The true position of the stripe for each column (commands (columns,)), and the depth of every pixel.
 
-        velocity_per_s: of the command. If surfaces move, the truth is that of the bench's time 0, before they moved.
+        velocity_per_s: of the command. time_s: (columns,), as in the interface. If surfaces move, a column's truth is
+        that of its own time, and a pixel's depth that of the time at which the line passed the pixel.
         """
-        view = self.setting.view.at(0.0)
-        x_px = np.full((view.rows, len(commands)), np.nan, np.float32)
         first = np.asarray(commands, dtype=np.float64)
         held = np.stack([first, first + velocity_per_s * self._frame_delay_s], axis=-1)
         held = np.clip(held, *self.model.scanner.command_range) if self._frame_delay_s else first
-        for column, (sheet,) in enumerate(ONE_LINE.sheets(self.model.sheets, held, view.rows, [0.0] * len(first))):
-            view.trace(sheet, 0, view.rows)
+        still, at_s = self.setting.view, np.zeros(len(first))
+        if still.motion is not None and time_s is not None:
+            at_s = self.bench.spad_start_s + np.nan_to_num(_in_steps(time_s))
+        x_px = np.full((still.rows, len(first)), np.nan, np.float32)
+        for column, (sheet,) in enumerate(ONE_LINE.sheets(self.model.sheets, held, still.rows, at_s.tolist())):
+            still.trace(sheet, 0, still.rows)
             x_px[:, column] = sheet.x_stripe_px
-        with np.errstate(divide="ignore"):
-            depth = self.surfaces.depth_m.copy() if view is self.setting.view else (1 / view.surface).astype(np.float32)
-        depth[~np.isfinite(depth) | np.isnan(view.u)] = np.nan
+        if still.motion is None:
+            depth = self.surfaces.depth_m.copy()
+        else:
+            with np.errstate(divide="ignore"):
+                depth = (1 / surface_passed(still, x_px, at_s)).astype(np.float32)
+        depth[~np.isfinite(depth) | np.isnan(still.u)] = np.nan
         return SweepTruth(x_px=x_px, depth_m=depth)
 
     def effects_report(self, power_w: float, exposure_s: float, exposures: int) -> dict[str, Any]:
@@ -267,6 +278,33 @@ def _own(model: RigModel) -> dict[str, str]:
     if model.row_delay_s:
         found["row delay"] = f"each row is exposed {1e9 * model.row_delay_s:g} ns later than the one above"
     return found
+
+
+def _in_steps(time_s: Array) -> Array:
+    """Times (n,) rounded to at most MOST_VIEWS values: each takes a view of its own where surfaces move."""
+    low, high = float(np.nanmin(time_s)), float(np.nanmax(time_s))
+    step_s = max((high - low) / MOST_VIEWS, TIME_STEP_S)
+    return low + np.floor((time_s - low) / step_s) * step_s
+
+
+def surface_passed(still: CameraView, x_px: NDArray[np.float32], at_s: Array) -> Array:
+    """Inverse depth (rows, width) of every pixel of moving surfaces at the time at which the line passed it.
+
+    x_px: (rows, columns), the stripe; at_s: (columns,). Pixels between stripes have the time of the nearest one.
+    """
+    pixels = np.arange(still.width)
+    passed_s = np.full((still.rows, still.width), float(np.median(at_s)))
+    for y in range(still.rows):
+        lit = np.flatnonzero(np.isfinite(x_px[y]))
+        lit = lit[np.argsort(x_px[y, lit])]
+        if len(lit):
+            middles = (x_px[y, lit[1:]] + x_px[y, lit[:-1]]) / 2
+            passed_s[y] = at_s[lit[np.searchsorted(middles, pixels)]]
+    surface: Array = np.empty_like(still.surface)
+    for time_s in np.unique(passed_s):
+        here = passed_s == time_s
+        surface[here] = still.at(float(time_s)).surface[here]
+    return surface
 
 
 def _load_geometry(path: Path) -> RigModel:

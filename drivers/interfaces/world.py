@@ -22,10 +22,14 @@ class SweepTruth:
 class World(Protocol):
     """The scene that the simulated devices of a rig share."""
 
-    def truth(self, commands: NDArray[np.float64], velocity_per_s: float = 0.0) -> SweepTruth:
+    def truth(
+        self, commands: NDArray[np.float64], velocity_per_s: float = 0.0, time_s: NDArray[np.float64] | None = None
+    ) -> SweepTruth:
         """The truth of one sweep.
 
         commands: (columns,), the scanner command of each column when the first image row was exposed.
         velocity_per_s: speed of the command during the sweep, negative if it fell.
+        time_s: (columns,), seconds from the SPAD's last start until each column was exposed, ascending or descending,
+          for worlds in which something moves. None: the time when the world was made.
         """
         ...

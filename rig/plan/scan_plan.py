@@ -269,6 +269,16 @@ class ScanPlan:
         done = (np.asarray(tau_s, np.float64) - self.lit_start_s(leg)) / float(self.column_s)
         return done - 0.5 if leg.columns_rise else self.places - 0.5 - done
 
+    def column_time_s(self, column: Array, direction: int, first_frame: int) -> Array:
+        """Seconds from the SPAD's start until the mirror passes fractional places (n,) in a sweep of a direction that
+        begins with frame `first_frame`.
+        """
+        leg = next(leg for leg in self.legs if leg.direction == direction)
+        place = np.asarray(column if self.lines is None else self.lines.place, np.float64)
+        done = place + 0.5 if leg.columns_rise else self.places - 0.5 - place
+        passed: Array = first_frame / float(self.frame_rate_hz) + self.lit_start_s(leg) + done * float(self.column_s)
+        return passed
+
     def command_at(self, column: Array) -> Array:
         """Mirror command of fractional places, of any shape; NaN stays NaN."""
         return column_command(column, self.command_range, self.places)

@@ -208,8 +208,9 @@ class LiveFacts:
         if self._rig.world is None:
             return None
         tell_stage("comparing with the truth")
-        velocity_per_s = self._plan.velocity_per_s(sweep.direction)
-        return self._rig.world.truth(self._plan.line_commands(column), velocity_per_s)
+        plan = self._plan
+        time_s = plan.column_time_s(column, sweep.direction, sweep.first_frame)
+        return self._rig.world.truth(plan.line_commands(column), plan.velocity_per_s(sweep.direction), time_s)
 
     def lost_outside(self, sweeps: Sequence[SweepAccount]) -> list[Gap]:
         """Frames (first, last) known to be lost outside all these sweeps: always empty for a live scan."""

@@ -174,7 +174,9 @@ def score_methods(
         running = Acquisition(rig, plan, timing, maker, request).run()
         with closing(running):
             last = [found for found in running][-1]
-        truth = rig.world.truth(plan.line_commands(last.column), plan.velocity_per_s(last.sweep.direction))
+        time_s = plan.column_time_s(last.column, last.sweep.direction, last.sweep.first_frame)
+        commands, velocity_per_s = plan.line_commands(last.column), plan.velocity_per_s(last.sweep.direction)
+        truth = rig.world.truth(commands, velocity_per_s, time_s)
     expected = last.sweep.frames.expected
     sensor_ms = 1e3 * (expected / float(plan.frame_rate_hz) + plan.readout_s(expected))
     exposures, lines = config.scan.exposures, len(config.line_offsets)

@@ -228,6 +228,7 @@ class SimulatedSpad(SpadArray):
         # The counter runs since the bench was set up; a run starts at its next tick.
         self._t0_ticks = -(-clock.now_ns() * tick_hz.numerator // (NS_PER_S * tick_hz.denominator))
         start_s = float(self._t0_ticks / tick_hz - Fraction(self._world.bench.clock_ns(0.0), NS_PER_S))
+        self._world.bench.spad_start_s = start_s
         self._n_frames = n_frames
         self._next_frame = self._block_seq = 0
         self._counters = SpadCounters(0, 0, 0, 0, 0)

@@ -190,6 +190,7 @@ class WorldFrames:
     def expose(self, span: Span, records: NDArray[np.void], bits: NDArray[np.uint8] | None) -> int:
         """See `FrameSource`."""
         start_s: Array = span.start_s + np.arange(span.n, dtype=np.float64) * span.period_s
+        self._world.bench.spad_start_s = span.start_s - span.first_frame * span.period_s
         state, power_w = self._world.during(start_s, span.exposure_s, span.period_s)
         sweep = self._markers.record(state, start_s, span.period_s, records)
         x0 = windows_at(span.window, sweep, records)
