@@ -155,7 +155,8 @@ class Acquisition:
             )
         rig.sync.program(*sync_program(plan, sweeps))
         asked = self._asked
-        ring = ring_for(asked.policy, rig.spad.info, plan, self._timing, keeps_time=asked.starts is not None)
+        keeps_time = isinstance(rig.spad, ReplaySpad) and rig.spad.pace.speed is not None
+        ring = ring_for(asked.policy, rig.spad.info, plan, self._timing, keeps_time=keeps_time)
         work = CountingRequest(assembler, sweeps, self._maker, asked.silence_s, self._listeners.sweeps)
         on_frame = None if rig.guard is None else rig.guard.beat
         pipeline = Pipeline(rig.spad, ring, work, asked.recording, self._listeners.monitor, on_frame)

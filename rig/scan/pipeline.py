@@ -179,7 +179,8 @@ def ring_for(
 ) -> BlockRing:
     """Allocate the ring between this SPAD and its readers and touch its memory.
 
-    keeps_time: whether a SPAD that can wait should rarely need to. It then gets a large ring, as in a replay.
+    keeps_time: whether a SPAD that can wait should rarely need to, as in a replay with a clock. It then gets a large
+      ring.
     """
     few = info.can_wait and not keeps_time
     slots = FEWEST_SLOTS if few else min(max(RING_BYTES // timing.stride, FEWEST_SLOTS), MOST_SLOTS)
