@@ -78,7 +78,7 @@ def usb_failure(
 @dataclass(frozen=True, slots=True)
 class UsbId:
     """The ids of a kind of device. Unrelated devices use the same ids, so one of `product_names`, if any, must
-    be part of the product string, where that can be read."""
+    be part of the product string, where that can be read, in upper or lower case."""
 
     label: str
     vendor: int
@@ -107,8 +107,8 @@ def attached(wanted: UsbId, backend: object | None = None) -> list[UsbListing]:
     devices = usb.core.find(find_all=True, backend=backend or _libusb(), **ids)
     with translated(wanted.label):
         listings = [_listing(device) for device in devices]
-    names = wanted.product_names or ("",)
-    found = [one for one in listings if one.product_name is None or any(name in one.product_name for name in names)]
+    names = [name.casefold() for name in wanted.product_names] or [""]
+    found = [one for one in listings if one.product_name is None or any(n in one.product_name.casefold() for n in names)]
     return sorted(found, key=lambda one: one.path)
 
 
