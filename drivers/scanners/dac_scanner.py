@@ -317,7 +317,8 @@ Config = TypeVar("Config", bound=GalvoConfig)
 
 
 def config_of(kind: type[Config], **fields: object) -> Config:
-    """The config of a board that is opened by itself. Raises `LimitExceeded` with one line for the first wrong field."""
+    """The config of a board that is opened by itself. Raises `LimitExceeded`, with one line, for the first wrong
+    field."""
     try:
         return kind.model_validate(fields)
     except ValidationError as error:

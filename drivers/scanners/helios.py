@@ -16,8 +16,8 @@ The device's status tells only when the pending buffer becomes free, but that sh
 the pending frame began to play between the last status 'full' and the first 'free', which bounds the time at which it
 ends. If its successor arrives after the earliest such time, the mirror may have stood still: the run ends with a fault.
 If a buffer becomes free before the playing frame can have ended, the device has silently dropped a frame. What was
-really played is known only from the markers in the SPAD's stream. An answer may get lost, so a query has a short
-time-out and is repeated: a lost answer costs less than half of the 60 ms that a frame lasts.
+really played is known only from the markers in the SPAD's stream. An answer may get lost, so a query has a
+time-out of at most a third of a frame and is repeated; one lost answer in each frame does not end a scan.
 
 The first point of every frame but the first lasts some 2 to 3 us longer than the others (inferred): the firmware writes
 this point's colours over SPI before it starts the timer anew. With frames of 60 ms that is 50 ppm of the duration,
@@ -146,7 +146,8 @@ _STATUSES = {b"\x83\x01": True, b"\x83\x00": False}
 _COMMAND_S = 0.1
 """Deadline for a command other than a status query."""
 _STATUS_S = 0.02
-"""Deadline for a status query, which is repeated. The vendor's 16 ms are too short for slow hosts (pull request 10)."""
+"""Longest deadline for a status query, which is repeated. The vendor's 16 ms are too short for slow hosts (pull request
+10)."""
 _STATUS_TRIES = 5
 """Status queries without an answer after which an idle board counts as dead."""
 _FRAME_S = 0.5
@@ -213,15 +214,15 @@ class HeliosDac:
         self.stop()
         return 0.0
 
-    def free(self) -> bool | None:
+    def free(self, timeout_s: float = _STATUS_S) -> bool | None:
         """Whether a frame can be sent. None if the device gave no valid status, which also means no."""
         with self._lock:
             try:
                 if self._out_of_step:
                     self._link.drain(_REPLIES, _REPLY_BYTES, _DRAIN_S)
                 self._out_of_step = True
-                self._send(_STATUS, 0, _STATUS_S)
-                answer = _STATUSES.get(self._link.read(_REPLIES, _REPLY_BYTES, _STATUS_S))
+                self._send(_STATUS, 0, timeout_s)
+                answer = _STATUSES.get(self._link.read(_REPLIES, _REPLY_BYTES, timeout_s))
                 self._out_of_step = answer is None
             except DeviceTimeout:
                 return None
@@ -341,7 +342,7 @@ class HeliosRun:
         """Check that the board kept the frame it accepted: the status must be 'full' until the playing one ends."""
         free = None
         while free is None and now_s(self._clock) < self._earliest_end_s:
-            free = self._link.free()
+            free = self._free()
         if free is False:
             return
         if now_s(self._clock) < self._earliest_end_s:
@@ -366,6 +367,10 @@ class HeliosRun:
         self._sent += 1
         return began_s + len(frame) / _WIRE_BYTES_PER_S, now_s(self._clock)
 
+    def _free(self) -> bool | None:
+        # Short frames leave less time to ask again.
+        return self._link.free(min(_STATUS_S, self._playing_s / 3))
+
     def _unsendable(self) -> bool:
         return self.source.left <= self._most and not sendable(self.source.left)
 
@@ -381,7 +386,7 @@ class HeliosRun:
         heard_s, full_s = now_s(self._clock), self._earliest_end_s
         while stopping is None or not stopping.is_set():
             asked_s = now_s(self._clock)
-            free = self._link.free()
+            free = self._free()
             answered_s = now_s(self._clock)
             if free:
                 self._note_swap(max(full_s, self._earliest_end_s), answered_s)

@@ -81,8 +81,8 @@ class LaserCubeConfig(GalvoConfig):
 
     kind: Literal["lasercube"] = "lasercube"
     colours: Literal["dark", "markers"] = "dark"
-    """Use of the colour outputs. markers: its lasers are unplugged and the outputs lead to the marker inputs. dark: 0 at
-    every point."""
+    """Use of the colour outputs. markers: its lasers are unplugged and the outputs lead to the marker inputs. dark: they
+    are 0 at every point."""
     max_point_rate: Annotated[Hertz, Field(gt=LOWEST_RATE_HZ, le=100_000)] = 30_000.0
     """Most points per second; the device may allow less."""
     buffer: Annotated[Seconds, Field(ge=0.01, le=0.5)] = 0.06
@@ -277,11 +277,11 @@ class LaserCubeRun:
             queued = self._queued()
             # A slow answer bounds nothing: only a quick one shows that the last points were played.
             seen = seen or now_s(clock) - asked_s < _TOLERANCE_POINTS / self._rate_hz
-            now = min(copies, self._room(queued))
-            self._send(PointSlice(np.full(now, self.source.last), np.zeros(now, np.uint8), np.zeros(now, bool)))
             if not copies and queued < self._hold - _TOLERANCE_POINTS:
                 break
-            copies -= now
+            some = min(copies, self._room(queued))
+            self._send(PointSlice(np.full(some, self.source.last), np.zeros(some, np.uint8), np.zeros(some, bool)))
+            copies -= some
             self._require_before(end_s)
             clock.sleep(POLL_S)
         clock.sleep(queued / self._rate_hz)

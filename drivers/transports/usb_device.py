@@ -107,9 +107,13 @@ def attached(wanted: UsbId, backend: object | None = None) -> list[UsbListing]:
     devices = usb.core.find(find_all=True, backend=backend or _libusb(), **ids)
     with translated(wanted.label):
         listings = [_listing(device) for device in devices]
-    names = [name.casefold() for name in wanted.product_names] or [""]
-    found = [one for one in listings if one.product_name is None or any(n in one.product_name.casefold() for n in names)]
-    return sorted(found, key=lambda one: one.path)
+    return sorted((one for one in listings if _named(one, wanted.product_names)), key=lambda one: one.path)
+
+
+def _named(listing: UsbListing, names: tuple[str, ...]) -> bool:
+    if listing.product_name is None or not names:
+        return True
+    return any(name.casefold() in listing.product_name.casefold() for name in names)
 
 
 class UsbDevice:
