@@ -20,7 +20,7 @@ answers must have a time in common. Samples are sent in whole transfers, so that
 with copies of its first point, so that a sample lost before the first answer is one of them.
 
 Sources of the protocol: `Wickedlasers/laserdocklib` 51d13bc, lib/src/LaserdockDevice*.cpp, and issue 15 (product string
-`Laserdock`, 12 Mb/s); `Joewodsen/lasercube-v1-ethernet-bridge` 389a35f, README.md and docs/protocol.md (a ring of 768
+`Laserdock`, 12 Mb/s); `Joewodsen/lasercube-v1-ethernet-bridge` 389a35f, README.md and the page on its protocol (a ring of 768
 samples that is not played while the output is off, measured with firmware 3.7). What the outputs do without samples
 is known only from the board whose protocol the LaserCube has, `macpod/lasershark_firmware` f33c6d6,
 lasershark/src/lasershark.c. All were read for facts; no code was taken. Lasershark boards share the USB ids, so the
@@ -81,8 +81,8 @@ class LaserCubeConfig(GalvoConfig):
 
     kind: Literal["lasercube"] = "lasercube"
     colours: Literal["dark", "markers"] = "dark"
-    """Use of the colour outputs. markers: its lasers are unplugged and the outputs lead to the marker inputs. dark: they
-    are 0 at every point."""
+    """Use of the colour outputs. markers: its lasers are unplugged and the outputs lead to the marker inputs. dark:
+    all are 0 at every point."""
     max_point_rate: Annotated[Hertz, Field(gt=LOWEST_RATE_HZ, le=100_000)] = 30_000.0
     """Most points per second; the device may allow less."""
     buffer: Annotated[Seconds, Field(ge=0.01, le=0.5)] = 0.06
