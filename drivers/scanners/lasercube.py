@@ -20,11 +20,10 @@ answers must have a time in common. Samples are sent in whole transfers, so that
 with copies of its first point, so that a sample lost before the first answer is one of them.
 
 Sources of the protocol: `Wickedlasers/laserdocklib` 51d13bc, lib/src/LaserdockDevice*.cpp, and issue 15 (product string
-`Laserdock`, 12 Mb/s); `Joewodsen/lasercube-v1-ethernet-bridge` 389a35f, README.md and the page on its protocol (a ring of 768
-samples that is not played while the output is off, measured with firmware 3.7). What the outputs do without samples
-is known only from the board whose protocol the LaserCube has, `macpod/lasershark_firmware` f33c6d6,
-lasershark/src/lasershark.c. All were read for facts; no code was taken. Lasershark boards share the USB ids, so the
-product string decides.
+`Laserdock`, 12 Mb/s); `Joewodsen/lasercube-v1-ethernet-bridge` 389a35f, README.md (a ring of 768 samples that is not
+played while the output is off, measured with firmware 3.7). What the outputs do without samples is known only from the
+board whose protocol the LaserCube has: `macpod/lasershark_firmware` f33c6d6, lasershark/src/lasershark.c. All were read
+for facts; no code was taken. Lasershark boards share the USB ids, so the product string decides.
 """
 
 import math
