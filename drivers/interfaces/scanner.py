@@ -77,7 +77,8 @@ class BeamScanner(Device):
     """A galvanometer with its DAC. Use: `load`, `start`, then `stop` or the waveform's end after its repeats, then
     `park`.
 
-    Opening the scanner moves nothing, and neither does closing it before the first `start` or `park`.
+    Opening the scanner moves nothing, except that a mirror which another program left elsewhere may jump to the centre.
+    Closing it before the first `start` or `park` moves nothing.
     """
 
     _has_moved = False

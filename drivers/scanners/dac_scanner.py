@@ -1,7 +1,8 @@
 """The common part of all beam scanners that are a galvo behind a USB DAC.
 
-The mirror moves only when the scanner is started, stopped, parked or closed, along the paths of `galvo`; only an
-emergency halt may let it jump. A run here is one motion: the way to the first point, the waveform and, if it is
+The mirror moves only when the scanner is started, stopped, parked or closed, along the paths of `galvo`. It may jump to
+the centre in two cases: when a board is opened whose mirror another program left elsewhere, and in an emergency halt. A
+run here is one motion: the way to the first point, the waveform and, if it is
 stopped, the way to rest; or only the way from one place of rest to another. A thread feeds the points to the DAC slice
 by slice. Nothing is computed in advance: a waveform of a million points repeated for hours takes only its own memory.
 """
@@ -9,18 +10,20 @@ by slice. Nothing is computed in advance: a waveform of a million points repeate
 import logging
 import threading
 from collections.abc import Callable, Mapping
+from contextlib import suppress
 from dataclasses import dataclass
 from fractions import Fraction
-from typing import Any, Protocol
+from typing import Any, Protocol, Self, TypeVar
 
 import numpy as np
 from numpy.typing import NDArray
+from pydantic import ValidationError
 
-from drivers.errors import DeviceDisconnected, DeviceError, DeviceFault
+from drivers.errors import DeviceDisconnected, DeviceError, DeviceFault, LimitExceeded
 from drivers.interfaces import BeamScanner, ScannerLimits, ScannerStatus, ScanWaveform
-from drivers.registry import Surroundings
 from drivers.scanners.galvo import GalvoConfig, brake, ramp
-from drivers.transports.endpoints import resolve
+from drivers.transports.endpoints import Endpoint
+from drivers.transports.tap import Tap
 from drivers.transports.usb_device import UsbDevice, UsbId, open_device
 
 _log = logging.getLogger(__name__)
@@ -143,7 +146,7 @@ class DacRun(Protocol):
 
 
 class Dac(Protocol):
-    """An open board. When it is powered up, its mirror stands at the centre, drive 0."""
+    """An open board, whose mirror stands at the centre, drive 0. Closing it puts the mirror back there in one jump."""
 
     name: str
     identity: str
@@ -151,8 +154,6 @@ class Dac(Protocol):
     serial: str | None
     """See `Device.serial`."""
     highest_rate_hz: float
-    closes_at: float | None
-    """Drive that the mirror jumps to when the board is closed; None: it stays."""
 
     def point_clock(self, requested_hz: float, low_hz: float, high_hz: float) -> Fraction:
         """The exact rate nearest to the requested one, between low and high."""
@@ -172,6 +173,25 @@ class Dac(Protocol):
 
 class DacScanner(BeamScanner):
     """One mirror axis. While a waveform is played, a separate thread communicates with the board."""
+
+    @classmethod
+    def at(
+        cls,
+        endpoint: Endpoint,
+        wanted: UsbId,
+        alternates: Mapping[int, int],
+        config: GalvoConfig,
+        identify: Callable[[UsbDevice], Dac],
+        tap: Tap | None = None,
+    ) -> Self:
+        """Open the board at an address. alternates: alternate setting by USB interface. identify: makes the `Dac` of an
+        open device, or raises an error."""
+        usb = open_device(wanted, endpoint.address, alternates, endpoint.usb_backend, tap)
+        try:
+            return cls(identify(usb), config)
+        except BaseException:
+            usb.close()
+            raise
 
     def __init__(self, dac: Dac, config: GalvoConfig) -> None:
         """Take over `dac`, which is closed with the scanner."""
@@ -237,14 +257,22 @@ class DacScanner(BeamScanner):
     def _do_park(self) -> None:
         self._go(self._park)
 
+    def _make_safe(self) -> None:
+        # Without its cable the board has no power: nothing is left to be made safe.
+        with suppress(DeviceDisconnected):
+            super()._make_safe()
+
     def _do_close(self) -> None:
         self._stopping.set()
         self._join()  # no other thread may talk to the board while it is closed
         try:
-            if self._dac.closes_at is not None and self._position is not None:
-                self._go(self._dac.closes_at)
-        finally:
-            self._dac.close()
+            try:
+                if self._position is not None:
+                    self._go(0.0)
+            finally:
+                self._dac.close()
+        except DeviceDisconnected as error:
+            _log.warning("%s", error)
 
     def _go(self, command: float) -> None:
         """Bring the mirror to rest at `command` by a ramp at the highest point rate."""
@@ -285,19 +313,15 @@ class DacScanner(BeamScanner):
                 self._thread = None
 
 
-def open_scanner(
-    wanted: UsbId,
-    alternates: Mapping[int, int],
-    config: GalvoConfig,
-    surroundings: Surroundings,
-    identify: Callable[[UsbDevice], Dac],
-) -> DacScanner:
-    """Open the scanner at the config's port. alternates: alternate setting by USB interface. identify: makes the
-    `Dac` of an open device, or raises an error."""
-    endpoint = resolve(config.port, surroundings.ports)
-    usb = open_device(wanted, endpoint.address, alternates, endpoint.usb_backend, surroundings.tap)
+Config = TypeVar("Config", bound=GalvoConfig)
+
+
+def config_of(kind: type[Config], **fields: object) -> Config:
+    """The config of a board that is opened by itself. Raises `LimitExceeded`, with one line, for the first wrong
+    field."""
     try:
-        return DacScanner(identify(usb), config)
-    except BaseException:
-        usb.close()
-        raise
+        return kind.model_validate(fields)
+    except ValidationError as error:
+        wrong = error.errors()[0]
+        where = ".".join(str(part) for part in wrong["loc"])
+        raise LimitExceeded(f"{where or kind.__name__}: {wrong['msg']}; correct this argument") from None

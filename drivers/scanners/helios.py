@@ -5,15 +5,23 @@ SDK v11).
 
 The device plays frames of up to 4095 points from two buffers, one playing and one pending, and has neither a trigger
 nor a clock output: synchronisation comes from the markers in the SPAD's stream. A thread keeps the pending buffer full.
-Every frame has the flag SINGLE (play once): if the host dies, the mirror stops after at most two frames. STOP
-centres the mirror in one jump, so it is used only in emergencies and at the end; scans end with a brake ramp. The
-shutter pin is never raised.
+Every frame has the flag SINGLE (play once): if the host dies, the mirror stops after at most two frames. The shutter
+pin is never raised.
+
+The firmware writes the centre to the mirror only after STOP, in one jump. It does not when it is powered up or enabled,
+so STOP is sent when the board is opened. After that, STOP is used only in emergencies and at the end; scans end with a
+brake ramp.
 
 The device's status tells only when the pending buffer becomes free, but that shows whether the buffers ever ran empty:
 the pending frame began to play between the last status 'full' and the first 'free', which bounds the time at which it
 ends. If its successor arrives after the earliest such time, the mirror may have stood still: the run ends with a fault.
 If a buffer becomes free before the playing frame can have ended, the device has silently dropped a frame. What was
-really played is known only from the markers in the SPAD's stream.
+really played is known only from the markers in the SPAD's stream. An answer may get lost, so a query has a
+time-out of at most a third of a frame and is repeated; one lost answer in each frame does not end a scan.
+
+The first point of every frame but the first lasts some 2 to 3 us longer than the others (inferred): the firmware writes
+this point's colours over SPI before it starts the timer anew. With frames of 60 ms that is 50 ppm of the duration,
+which `DRIFT` covers. It displaces points, never their order, and the markers move with them.
 
 Sources of the protocol: `Grix/helios_dac` 0952a2a, firmware/AtmelStudio_helios/lasdac_mainfirmware/src/main.c and
 sdk/cpp/HeliosDac.cpp (read for facts; no code taken). Only the opcodes below are used: DE would jump to the bootloader
@@ -25,12 +33,12 @@ import math
 import struct
 import threading
 from fractions import Fraction
-from typing import Annotated, Literal
+from typing import Annotated, Any, Literal
 
 import numpy as np
 from pydantic import Field
 
-from drivers.clock import Clock, now_s
+from drivers.clock import Clock, SystemClock, now_s
 from drivers.errors import DeviceFault, DeviceNotFound, DeviceTimeout, ProtocolError
 from drivers.interfaces import LEVEL_BACKWARD, MARKER_LINE, MARKER_SCAN
 from drivers.registry import Kind, Surroundings
@@ -43,11 +51,13 @@ from drivers.scanners.dac_scanner import (
     PointSlice,
     PointSource,
     colour,
-    open_scanner,
+    config_of,
 )
 from drivers.scanners.galvo import LOWEST_RATE_HZ, GalvoConfig
+from drivers.transports.endpoints import Endpoint, resolve
+from drivers.transports.tap import Tap
 from drivers.transports.usb_device import UsbDevice, UsbId
-from drivers.units import Hertz, Seconds
+from drivers.units import Hertz, Seconds, format_quantity
 
 _log = logging.getLogger(__name__)
 
@@ -134,7 +144,12 @@ _OUR_SDK_VERSION = 11
 _STATUSES = {b"\x83\x01": True, b"\x83\x00": False}
 
 _COMMAND_S = 0.1
-"""Deadline for a command; the vendor's 16 ms are too short for slow hosts (pull request 10)."""
+"""Deadline for a command other than a status query."""
+_STATUS_S = 0.02
+"""Longest deadline for a status query, which is repeated. The vendor's 16 ms are too short for slow hosts (pull request
+10)."""
+_STATUS_TRIES = 5
+"""Status queries without an answer after which an idle board counts as dead."""
 _FRAME_S = 0.5
 _SETTLE_S = 0.1
 """Pause between entering alternate setting 1 and the first command."""
@@ -161,10 +176,8 @@ class HeliosDac:
     STOP leaves the mirror at the centre, and so does the alternate setting without endpoints.
     """
 
-    closes_at: float | None = 0.0
-
     def __init__(self, config: HeliosConfig, link: UsbDevice, clock: Clock) -> None:
-        """Wait until the firmware is enabled, drop old replies, learn version and name."""
+        """Wait until the firmware is enabled, drop old replies, learn version and name, and centre the mirror."""
         self.name = link.label
         self.highest_rate_hz = config.max_point_rate
         self.config = config
@@ -181,6 +194,7 @@ class HeliosDac:
         self.stored_name = self._ask(_NAME, 0x85, 1).split(b"\0")[0].decode("ascii", "replace")
         self.serial = self.stored_name or None
         self.identity = f"{self.name}, {self.stored_name!r}, firmware {self.firmware}"
+        self.stop()
 
     def point_clock(self, requested_hz: float, low_hz: float, high_hz: float) -> Fraction:
         """The rate nearest to the requested one that the divider of the board's timer can make."""
@@ -191,8 +205,8 @@ class HeliosDac:
         return HeliosRun(self, source, clock_hz)
 
     def check(self) -> None:
-        """Check that the board answers. Raises DeviceTimeout if neither of two queries gets a valid status."""
-        if self.free() is None and self.free() is None:
+        """Check that the board answers. Raises DeviceTimeout if none of several queries gets a valid status."""
+        if all(self.free() is None for _ in range(_STATUS_TRIES)):
             raise DeviceTimeout(f"{self.name}: gives no status; unplug it and plug it in again")
 
     def halt(self) -> float:
@@ -200,15 +214,15 @@ class HeliosDac:
         self.stop()
         return 0.0
 
-    def free(self) -> bool | None:
+    def free(self, timeout_s: float = _STATUS_S) -> bool | None:
         """Whether a frame can be sent. None if the device gave no valid status, which also means no."""
         with self._lock:
             try:
                 if self._out_of_step:
                     self._link.drain(_REPLIES, _REPLY_BYTES, _DRAIN_S)
                 self._out_of_step = True
-                self._send(_STATUS, 0)
-                answer = _STATUSES.get(self._link.read(_REPLIES, _REPLY_BYTES, _COMMAND_S))
+                self._send(_STATUS, 0, timeout_s)
+                answer = _STATUSES.get(self._link.read(_REPLIES, _REPLY_BYTES, timeout_s))
                 self._out_of_step = answer is None
             except DeviceTimeout:
                 return None
@@ -233,9 +247,9 @@ class HeliosDac:
         finally:
             self._link.close()
 
-    def _send(self, opcode: int, data: int) -> None:
+    def _send(self, opcode: int, data: int, timeout_s: float = _COMMAND_S) -> None:
         with self._lock:
-            self._link.write(_COMMANDS, bytes((opcode, data)), _COMMAND_S)
+            self._link.write(_COMMANDS, bytes((opcode, data)), timeout_s)
 
     def _ask(self, opcode: int, answer: int, least: int) -> bytes:
         """The bytes after the answer's first byte. Asks twice with three reads each, as the vendor's library does."""
@@ -328,7 +342,7 @@ class HeliosRun:
         """Check that the board kept the frame it accepted: the status must be 'full' until the playing one ends."""
         free = None
         while free is None and now_s(self._clock) < self._earliest_end_s:
-            free = self._link.free()
+            free = self._free()
         if free is False:
             return
         if now_s(self._clock) < self._earliest_end_s:
@@ -353,6 +367,10 @@ class HeliosRun:
         self._sent += 1
         return began_s + len(frame) / _WIRE_BYTES_PER_S, now_s(self._clock)
 
+    def _free(self) -> bool | None:
+        # Short frames leave less time to ask again.
+        return self._link.free(min(_STATUS_S, self._playing_s / 3))
+
     def _unsendable(self) -> bool:
         return self.source.left <= self._most and not sendable(self.source.left)
 
@@ -368,7 +386,7 @@ class HeliosRun:
         heard_s, full_s = now_s(self._clock), self._earliest_end_s
         while stopping is None or not stopping.is_set():
             asked_s = now_s(self._clock)
-            free = self._link.free()
+            free = self._free()
             answered_s = now_s(self._clock)
             if free:
                 self._note_swap(max(full_s, self._earliest_end_s), answered_s)
@@ -394,18 +412,55 @@ class HeliosRun:
         self._latest_end_s = min(latest_s, self._latest_end_s) + self._playing_s * (1 + DRIFT)
 
 
-def create(config: HeliosConfig, surroundings: Surroundings) -> DacScanner:
-    """Open the Helios at the config's port."""
+class Helios(DacScanner):
+    """A galvo behind a Helios."""
 
+    @classmethod
+    def open(
+        cls,
+        port: str = "usb",
+        *,
+        max_velocity_per_s: float,
+        max_acceleration_per_s2: float,
+        max_point_rate_hz: float = MOST_PPS,
+        frame_s: float = 0.06,
+        clock: Clock | None = None,
+        usb_backend: object | None = None,
+        **settings: Any,
+    ) -> "Helios":
+        """Open a Helios by itself. Commands are drives from -1 to 1, so the galvo's limits are in drive per second.
+
+        port: as in `GalvoConfig`. max_point_rate_hz, frame_s: the most points per second; the longest frame. settings:
+        axis, max_step, rms_duty, command_range, park, name, as in `HeliosConfig`. clock, usb_backend: for emulators.
+        Raises `LimitExceeded` for a setting that is not possible, other `DeviceError` if the board cannot be opened.
+        """
+        config = config_of(
+            HeliosConfig,
+            port=port,
+            max_velocity=format_quantity(max_velocity_per_s, "rate"),
+            max_acceleration=format_quantity(max_acceleration_per_s2, "acceleration"),
+            max_point_rate=format_quantity(max_point_rate_hz, "frequency"),
+            frame=format_quantity(frame_s, "time"),
+            **settings,
+        )
+        return _opened(config, Endpoint(port, usb_backend), clock or SystemClock())
+
+
+def _opened(config: HeliosConfig, endpoint: Endpoint, clock: Clock, tap: Tap | None = None) -> Helios:
     def identify(usb: UsbDevice) -> HeliosDac:
-        dac = HeliosDac(config, usb, surroundings.clock)
+        dac = HeliosDac(config, usb, clock)
         if dac.firmware < _TESTED_FIRMWARE:
             _log.warning("%s: firmware %d is older than the tested %d", dac.name, dac.firmware, _TESTED_FIRMWARE)
         if config.name not in (None, dac.stored_name):
             raise DeviceNotFound(f"{dac.name}: its name is {dac.stored_name!r}, not {config.name!r}; correct port")
         return dac
 
-    return open_scanner(HELIOS, {INTERFACE: ENABLED}, config, surroundings, identify)
+    return Helios.at(endpoint, HELIOS, {INTERFACE: ENABLED}, config, identify, tap)
+
+
+def create(config: HeliosConfig, surroundings: Surroundings) -> Helios:
+    """Open the Helios at the config's port."""
+    return _opened(config, resolve(config.port, surroundings.ports), surroundings.clock, surroundings.tap)
 
 
 KIND = Kind(config=HeliosConfig, create=create)

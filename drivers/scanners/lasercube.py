@@ -3,30 +3,38 @@
     outputs   X (or Y): mirror. With `colours: markers` R: backward. G: line marker. B: scan marker. X is not
               reversed, unlike in the vendor's program: the calibration says in which direction a command leads
 
-The board has a ring of samples that a thread keeps filled, without frames or seams. Its colour outputs drive lasers of
-its own unless these are unplugged, so they stay off until the config says where they lead. It can be stopped only with
-'clear' and 'disable'. It takes no action when the host dies, so the laser's gate must not depend on it.
+The board has a ring of samples that a thread keeps filled, without frames or seams. It plays the ring only while its
+output is on; while the output is off, X and Y rest at the centre. So the output is switched on for the first run and
+stays on until the board is closed, and dark points are points whose colours are 0. The colour outputs drive lasers of
+the board's own unless these are unplugged, so all points are dark until the config says where the outputs lead.
+
+When the ring runs empty, X and Y keep their values and the colours go to 0. So a run ends with copies of its last
+point, and the mirror rests there. Switching the output off or clearing the ring would put the mirror at the centre in
+one jump. That is done when the board is opened, in emergencies, and when it is closed, by then at the centre. If the
+host dies, the ring runs empty within its length: the colours go dark and the mirror stands still. No other action is
+taken, so the laser's gate must not depend on this board alone.
 
 Whether each sample was played exactly once is judged from the answers to 'how many are queued'. Each answer bounds the
 time at which the first sample was played, assuming that no sample was lost, repeated or delayed; the intervals of all
 answers must have a time in common. Samples are sent in whole transfers, so that a lost one is noticed. A run begins
-with copies of its first point, so that a sample lost before the first answer is one of them. It ends with copies of its
-last point, and the ring is cleared while they are played, because it is not documented whether the device holds or
-repeats its output when the ring runs empty.
+with copies of its first point, so that a sample lost before the first answer is one of them.
 
-Source of the protocol: `Wickedlasers/laserdocklib` 51d13bc, lib/src/LaserdockDevice*.cpp (read for facts; no code
-taken). Lasershark boards share the USB ids, so the product string decides.
+Sources of the protocol: `Wickedlasers/laserdocklib` 51d13bc, lib/src/LaserdockDevice*.cpp, and issue 15 (product string
+`Laserdock`, 12 Mb/s); `Joewodsen/lasercube-v1-ethernet-bridge` 389a35f, README.md (a ring of 768 samples that is not
+played while the output is off, measured with firmware 3.7). What the outputs do without samples is known only from the
+board whose protocol the LaserCube has: `macpod/lasershark_firmware` f33c6d6, lasershark/src/lasershark.c. All were read
+for facts; no code was taken. Lasershark boards share the USB ids, so the product string decides.
 """
 
 import math
 import threading
 from fractions import Fraction
-from typing import Annotated, Literal
+from typing import Annotated, Any, Literal
 
 import numpy as np
 from pydantic import Field
 
-from drivers.clock import Clock, now_s
+from drivers.clock import Clock, SystemClock, now_s
 from drivers.errors import DeviceFault, DeviceTimeout, ProtocolError
 from drivers.interfaces import LEVEL_BACKWARD, MARKER_LINE, MARKER_SCAN
 from drivers.registry import Kind, Surroundings
@@ -39,11 +47,13 @@ from drivers.scanners.dac_scanner import (
     DacScanner,
     PointSlice,
     PointSource,
-    open_scanner,
+    config_of,
 )
 from drivers.scanners.galvo import LOWEST_RATE_HZ, GalvoConfig
+from drivers.transports.endpoints import Endpoint, resolve
+from drivers.transports.tap import Tap
 from drivers.transports.usb_device import UsbDevice, UsbId
-from drivers.units import Hertz, Seconds
+from drivers.units import Hertz, Seconds, format_quantity
 
 LASERCUBE = UsbId("LaserCube", 0x1FC9, 0x04D8, ("LaserCube", "LaserDock"))
 ALTERNATES = {0: 0, 1: 1}
@@ -51,6 +61,9 @@ ALTERNATES = {0: 0, 1: 1}
 _COMMANDS, _REPLIES, _SAMPLES = 0x01, 0x81, 0x03
 _REPLY_BYTES = 64
 SAMPLES_PER_TRANSFER = 64
+_SPARE_SAMPLES = 8
+"""Samples of the ring that stay free: one packet of 64 B. The firmware keeps a transfer waiting that would fill the
+ring, until 64 samples are free."""
 
 _ENABLE, _SET_RATE, _GET_RATE, _MAX_RATE = 0x80, 0x82, 0x83, 0x84
 _DAC_MIN, _DAC_MAX, _RING_SIZE, _RING_FREE, _CLEAR = 0x87, 0x88, 0x89, 0x8A, 0x8D
@@ -68,20 +81,19 @@ class LaserCubeConfig(GalvoConfig):
     kind: Literal["lasercube"] = "lasercube"
     colours: Literal["dark", "markers"] = "dark"
     """Use of the colour outputs. markers: its lasers are unplugged and the outputs lead to the marker inputs. dark:
-    never enabled."""
+    all are 0 at every point."""
     max_point_rate: Annotated[Hertz, Field(gt=LOWEST_RATE_HZ, le=100_000)] = 30_000.0
     """Most points per second; the device may allow less."""
     buffer: Annotated[Seconds, Field(ge=0.01, le=0.5)] = 0.06
-    """Duration of the samples queued in the device: the host may be late by as much, and a stop takes as long."""
+    """Duration of the samples queued in the device: the host may be late by as much, and a stop takes as long. The
+    device's ring is the limit: 768 samples last 25 ms at 30 kHz."""
 
 
 class LaserCubeDac:
     """A LaserCube as a `Dac`: its commands, one at a time. May be called from any thread.
 
-    The board cannot report the mirror's position; the first run begins at the centre.
+    The board cannot report the mirror's position. It is at the centre while the output is off.
     """
-
-    closes_at: float | None = None
 
     def __init__(self, config: LaserCubeConfig, link: UsbDevice, clock: Clock) -> None:
         """Switch the output off, empty the ring, and ask the device about itself."""
@@ -119,22 +131,22 @@ class LaserCubeDac:
         self.queued()
 
     def halt(self) -> float:
-        """Switch the colours off and clear the ring; returns 0. The mirror stops at an unknown position, so the next
-        run begins with a jump to the centre."""
+        """Switch the output off and clear the ring, which brings the mirror to the centre in one jump; returns that
+        position."""
         self.safe()
         return 0.0
 
     def safe(self) -> None:
-        """Switch the colours off, then clear the ring."""
+        """Switch the output off, then clear the ring: all dark, mirror at the centre."""
         self.enable(False)
         self.clear()
 
     def enable(self, on: bool) -> None:
-        """Enable or disable the colour outputs."""
+        """Switch the output on or off. Off: the ring is not played, the colours are 0, X and Y at the centre."""
         self._ask(bytes((_ENABLE, on)))
 
     def clear(self) -> None:
-        """Empty the ring; the mirror stays where it is."""
+        """Empty the ring. The colours go to 0, X and Y to the centre in one jump."""
         self._ask(bytes((_CLEAR, 0)))
 
     def set_rate(self, rate_hz: int) -> None:
@@ -201,8 +213,8 @@ def encode(points: PointSlice, axis: str, *, markers: bool) -> bytes:
 
 
 _HOLD_S = 0.03
-"""Shortest time for which the first and the last point are held. The host may be this late with its first query and
-with the final clear."""
+"""Shortest time for which the first and the last point are held, if the ring is long enough. The host may be this late
+with its first and its last query."""
 _TOLERANCE_POINTS = 48
 """Tolerance in points: less than a transfer, which gets lost as a whole; more than the device's own steps in
 counting."""
@@ -219,9 +231,10 @@ class LaserCubeRun:
         self._axis = config.axis
         self._markers = config.colours == "markers"
         wanted = math.ceil(max(_HOLD_S, config.buffer / 2) * rate_hz / SAMPLES_PER_TRANSFER)
-        # In whole transfers, and at most a quarter of the ring.
-        self._hold = max(1, min(wanted, link.ring_points // 4 // SAMPLES_PER_TRANSFER)) * SAMPLES_PER_TRANSFER
-        self._most = min(round(config.buffer * rate_hz), link.ring_points - 2 * self._hold)
+        # In whole transfers, and at most half of the ring.
+        self._hold = max(1, min(wanted, link.ring_points // 2 // SAMPLES_PER_TRANSFER)) * SAMPLES_PER_TRANSFER
+        wanted = max(round(config.buffer * rate_hz), 2 * SAMPLES_PER_TRANSFER)
+        self._most = min(wanted, link.ring_points - _SPARE_SAMPLES)
         if source.left:
             source.pad_start(self._hold)
         self._waiting = b""
@@ -233,13 +246,11 @@ class LaserCubeRun:
 
     def begin(self) -> None:
         """Send copies of the first point, which play at once, then points until the buffer is full."""
-        self._link.clear()
         self._link.set_rate(self._rate_hz)
-        self._link.enable(self._markers)
+        self._link.enable(True)
         self._asked_s = now_s(self._link.clock)
         self._send(self.source.take(self._hold))
-        self._queued()
-        self._send(self.source.take(self._most - self._hold))
+        self._send(self.source.take(self._room(self._queued())))
 
     def feed(self, stopping: threading.Event) -> None:
         """Send all remaining points; returns when the mirror rests. Brakes once `stopping` is set."""
@@ -249,31 +260,43 @@ class LaserCubeRun:
             if not stopped and stopping.is_set():
                 stopped = True
                 self.source.stop()
-            if queued < self._most:
-                self._send(self.source.take(self._most - queued))
+            self._send(self.source.take(self._room(queued)))
             self._link.clock.sleep(POLL_S)
         self._finish()
 
     def _finish(self) -> None:
-        """Send copies of the last point and clear the ring while they play. Raises `DeviceFault` if the ring does not
-        empty, or if no answer was quick enough to confirm that it did."""
-        hold = self._hold + -(len(self._waiting) // 8) % SAMPLES_PER_TRANSFER
-        self._send(PointSlice(np.full(hold, self.source.last), np.zeros(hold, np.uint8), np.zeros(hold, bool)))
-        end_s = now_s(self._link.clock) + (self._most + hold) / self._rate_hz * (1 + DRIFT) + PATIENCE_S
+        """Send copies of the last point and wait until the ring is empty. Raises `DeviceFault` if it does not empty, or
+        if no answer was quick enough to confirm that every point was played."""
+        clock = self._link.clock
+        copies = self._hold + -(len(self._waiting) // 8) % SAMPLES_PER_TRANSFER
+        end_s = now_s(clock) + (self._most + copies) / self._rate_hz * (1 + DRIFT) + PATIENCE_S
         seen = False
         while True:
-            asked_s = now_s(self._link.clock)
+            asked_s = now_s(clock)
             queued = self._queued()
             # A slow answer bounds nothing: only a quick one shows that the last points were played.
-            seen = seen or now_s(self._link.clock) - asked_s < _TOLERANCE_POINTS / self._rate_hz
-            if queued < self._hold - _TOLERANCE_POINTS:
+            seen = seen or now_s(clock) - asked_s < _TOLERANCE_POINTS / self._rate_hz
+            if not copies and queued < self._hold - _TOLERANCE_POINTS:
                 break
-            if now_s(self._link.clock) > end_s:
-                raise DeviceFault(f"{self._link.name}: its buffer does not empty; unplug it and plug it in again")
-            self._link.clock.sleep(POLL_S)
-        self._link.safe()
+            some = min(copies, self._room(queued))
+            self._send(PointSlice(np.full(some, self.source.last), np.zeros(some, np.uint8), np.zeros(some, bool)))
+            copies -= some
+            self._require_before(end_s)
+            clock.sleep(POLL_S)
+        clock.sleep(queued / self._rate_hz)
+        while self._link.queued():
+            self._require_before(end_s)
+            clock.sleep(POLL_S)
         if not seen:
             raise DeviceFault(f"{self._link.name}: answered too late to tell how the run ended; unload the host")
+
+    def _require_before(self, end_s: float) -> None:
+        if now_s(self._link.clock) > end_s:
+            raise DeviceFault(f"{self._link.name}: its buffer does not empty; unplug it and plug it in again")
+
+    def _room(self, queued: int) -> int:
+        """Number of points that may be taken while so many samples are queued in the device."""
+        return max(0, self._most - queued - len(self._waiting) // 8)
 
     def _send(self, points: PointSlice) -> None:
         """Send whole transfers; the samples left over wait for the next call."""
@@ -310,13 +333,48 @@ class LaserCubeRun:
         return queued
 
 
-def create(config: LaserCubeConfig, surroundings: Surroundings) -> DacScanner:
+class LaserCube(DacScanner):
+    """A galvo behind a LaserCube."""
+
+    @classmethod
+    def open(
+        cls,
+        port: str = "usb",
+        *,
+        max_velocity_per_s: float,
+        max_acceleration_per_s2: float,
+        max_point_rate_hz: float = 30_000.0,
+        buffer_s: float = 0.06,
+        clock: Clock | None = None,
+        usb_backend: object | None = None,
+        **settings: Any,
+    ) -> "LaserCube":
+        """Open a LaserCube by itself. Commands are drives from -1 to 1, so the galvo's limits are in drive per second.
+
+        port: as in `GalvoConfig`. max_point_rate_hz, buffer_s: the most points per second; the samples queued in the
+        device. settings: axis, max_step, rms_duty, command_range, park, colours, as in `LaserCubeConfig`. clock,
+        usb_backend: for emulators. Raises `LimitExceeded` for a setting that is not possible, other `DeviceError` if
+        the board cannot be opened.
+        """
+        config = config_of(
+            LaserCubeConfig,
+            port=port,
+            max_velocity=format_quantity(max_velocity_per_s, "rate"),
+            max_acceleration=format_quantity(max_acceleration_per_s2, "acceleration"),
+            max_point_rate=format_quantity(max_point_rate_hz, "frequency"),
+            buffer=format_quantity(buffer_s, "time"),
+            **settings,
+        )
+        return _opened(config, Endpoint(port, usb_backend), clock or SystemClock())
+
+
+def _opened(config: LaserCubeConfig, endpoint: Endpoint, clock: Clock, tap: Tap | None = None) -> LaserCube:
+    return LaserCube.at(endpoint, LASERCUBE, ALTERNATES, config, lambda usb: LaserCubeDac(config, usb, clock), tap)
+
+
+def create(config: LaserCubeConfig, surroundings: Surroundings) -> LaserCube:
     """Open the LaserCube at the config's port."""
-
-    def identify(usb: UsbDevice) -> LaserCubeDac:
-        return LaserCubeDac(config, usb, surroundings.clock)
-
-    return open_scanner(LASERCUBE, ALTERNATES, config, surroundings, identify)
+    return _opened(config, resolve(config.port, surroundings.ports), surroundings.clock, surroundings.tap)
 
 
 KIND = Kind(config=LaserCubeConfig, create=create)

@@ -78,7 +78,7 @@ def usb_failure(
 @dataclass(frozen=True, slots=True)
 class UsbId:
     """The ids of a kind of device. Unrelated devices use the same ids, so one of `product_names`, if any, must
-    be part of the product string, where that can be read."""
+    be part of the product string, where that can be read, in upper or lower case."""
 
     label: str
     vendor: int
@@ -110,9 +110,13 @@ def attached(wanted: UsbId, backend: object | None = None) -> list[UsbListing]:
     devices = usb.core.find(find_all=True, backend=backend or _libusb(), **ids)
     with translated(wanted.label):
         listings = [_listing(device) for device in devices]
-    names = wanted.product_names or ("",)
-    found = [one for one in listings if one.product_name is None or any(name in one.product_name for name in names)]
-    return sorted(found, key=lambda one: one.path)
+    return sorted((one for one in listings if _named(one, wanted.product_names)), key=lambda one: one.path)
+
+
+def _named(listing: UsbListing, names: tuple[str, ...]) -> bool:
+    if listing.product_name is None or not names:
+        return True
+    return any(name.casefold() in listing.product_name.casefold() for name in names)
 
 
 class UsbDevice:

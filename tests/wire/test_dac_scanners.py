@@ -8,6 +8,7 @@ import pytest
 
 from drivers.clock import VirtualClock
 from drivers.errors import DeviceBusy, DeviceDisconnected, DeviceError, DeviceNotFound, DevicePermission, DeviceTimeout
+from drivers.interfaces import DeviceState
 from drivers.scanners.helios import HeliosRun
 from sim_backend.wire.firmware.helios import DAC_STEPS, KEEP_S, DacHistory, Played
 from sim_backend.wire.serve.usb import EmulatedUsb
@@ -48,12 +49,13 @@ over_both = pytest.mark.parametrize("kind", [HELIOS, LASERCUBE], ids=lambda kind
 def test_opening_looking_and_closing_moves_nothing_and_sends_no_points(kind: Kind) -> None:
     clock, model = VirtualClock(), kind.board()
     with opened(kind.name, model, clock) as (device, plugged):
+        opened_s = plugged.now_s()
         assert not device.status.moving
         device.load(cosine(device), 3)
         device.stop()
     clock.sleep(1.0)
     assert model.sent(model.points_endpoint) == []
-    command = model.history.command(np.linspace(0, plugged.now_s(), 1000))
+    command = model.history.command(np.linspace(opened_s, plugged.now_s(), 1000))
     assert (command == command[0]).all()
     assert abs(command[0]) <= STEP
 
@@ -138,11 +140,24 @@ def test_unplugging_during_a_run_is_a_disconnection(kind: Kind) -> None:
         finish(device)
     with pytest.raises(DeviceDisconnected):
         device.stop()
-    with pytest.raises(DeviceDisconnected):
-        device.close()
     device.close()
     plugged.bus.plug(kind.board())
     open_scanner(kind.name, plugged.bus, clock).close()
+
+
+@over_both
+@pytest.mark.parametrize("moved", [False, True])
+def test_closing_after_an_unplug_warns_and_raises_nothing(
+    kind: Kind, moved: bool, caplog: pytest.LogCaptureFixture
+) -> None:
+    plugged = plug(kind.board(), VirtualClock())
+    device = open_scanner(kind.name, plugged.bus, plugged.clock)
+    if moved:
+        play(device, 1)
+    plugged.attached.unplug()
+    device.close()
+    assert device.state is DeviceState.CLOSED
+    assert "the device is gone" in caplog.text
 
 
 @over_both

@@ -3,18 +3,32 @@
 import logging
 import struct
 from contextlib import closing
+from dataclasses import replace
 from fractions import Fraction
+from typing import Any
 
 import numpy as np
 import pytest
 
 from drivers.clock import VirtualClock
-from drivers.errors import DeviceError, DeviceNotFound, DeviceTimeout, ProtocolError
+from drivers.errors import DeviceError, DeviceNotFound, DeviceTimeout, LimitExceeded, ProtocolError
 from drivers.interfaces import LEVEL_BACKWARD, MARKER_LINE, MARKER_SCAN, ScanWaveform
 from drivers.scanners.dac_scanner import PointSlice
-from drivers.scanners.helios import HELIOS, encode, sendable, slice_points
+from drivers.scanners.helios import HELIOS, Helios, encode, sendable, slice_points
 from drivers.transports.usb_device import open_device
-from sim_backend.wire.firmware.helios import BLUE, COMMANDS, FRAMES, GREEN, INTENSITY, RED, REPLIES, HeliosModel
+from sim_backend.wire.firmware.helios import (
+    BLUE,
+    CENTRE,
+    COMMANDS,
+    FRAMES,
+    GREEN,
+    INTENSITY,
+    RED,
+    REPLIES,
+    DacHistory,
+    HeliosModel,
+    _Frame,
+)
 from sim_backend.wire.serve.usb import EmulatedUsb
 from sim_backend.wire.serve.usb_model import Answer
 from tests.wire.scanners import HeliosRecorder, cosine, finish, open_scanner, opened, play, plug
@@ -175,7 +189,7 @@ def test_frames_hold_at_most_4095_points_however_long_they_may_last() -> None:
 
 def test_replies_may_take_longer_than_the_vendors_16_ms() -> None:
     class Slow(HeliosModel):
-        """A busy host: a reply is there 90 ms after its question."""
+        """A reply is there 18 ms after its question."""
 
         asked_s = 0.0
 
@@ -184,10 +198,43 @@ def test_replies_may_take_longer_than_the_vendors_16_ms() -> None:
             super()._command(data, now_s)
 
         def inp(self, endpoint: int, length: int, now_s: float) -> Answer:
-            return super().inp(endpoint, length, now_s) if now_s - self.asked_s > 0.09 else None
+            return super().inp(endpoint, length, now_s) if now_s - self.asked_s > 0.018 else None
 
     with opened("helios", Slow()) as (device, _):
         assert not device.status.moving
+
+
+@pytest.mark.parametrize("every", [29, 31, 37])
+def test_a_lost_status_reply_is_asked_for_again_in_time(every: int) -> None:
+    class Losing(HeliosRecorder):
+        """Every so many replies to the status query get lost: about one in each frame, at another place each time."""
+
+        asked = lost = 0
+
+        def _command(self, data: bytes, now_s: float) -> None:
+            super()._command(data, now_s)
+            if data[0] == 0x03:
+                self.asked += 1
+                if self.asked % every == 0:
+                    self.lost += 1
+                    self._replies.pop()
+
+    model = Losing()
+    with opened("helios", model) as (device, _):
+        play(device, 20)
+        assert device.status.fault is None
+        assert model.lost > 20
+
+
+def test_a_board_that_gives_no_status_is_a_timeout_within_a_fraction_of_a_second() -> None:
+    model = HeliosModel()
+    with opened("helios", model) as (device, plugged):
+        model.deaf = True
+        began_s = plugged.now_s()
+        with pytest.raises(DeviceTimeout, match="gives no status"):
+            _ = device.status
+        assert plugged.now_s() - began_s < 0.3
+        model.deaf = False
 
 
 def test_the_version_is_asked_for_twice_since_a_first_answer_may_get_lost() -> None:
@@ -212,7 +259,7 @@ def test_frames_wait_150_ms_after_stop_since_the_firmware_refuses_them_for_100()
         device.stop()
         device.start()
         device.stop()
-        stopped = next(at for at, endpoint, data in model.log if (endpoint, data[:1]) == (COMMANDS, b"\x01"))
+        _, stopped = (at for at, endpoint, data in model.log if (endpoint, data[:1]) == (COMMANDS, b"\x01"))
         after = next(at for at, endpoint, _ in model.log if endpoint == FRAMES and at > stopped)
         assert after - stopped >= 0.149
         assert model.refused == 0
@@ -230,6 +277,43 @@ def test_the_shutter_is_never_opened_and_only_known_opcodes_are_sent() -> None:
     assert all(len(command) == 2 for command in model.sent(COMMANDS))
     assert not model.shutter
     assert not model.bootloader
+
+
+def test_a_mirror_that_stands_elsewhere_is_centred_by_a_stop_at_open() -> None:
+    model = HeliosRecorder()
+    model.history = DacHistory(0.7, lines=4)  # no point was written since the power came, or another program died
+    with opened("helios", model) as (device, plugged):
+        assert b"\x01\x00" in model.sent(COMMANDS)
+        assert model.history.command(np.array([plugged.now_s()]))[0] == CENTRE
+        assert device.status.position == 0.0
+        play(device, 1)
+        assert model.refused == 0
+
+
+def test_a_longer_first_point_in_every_frame_is_no_fault() -> None:
+    class Seamed(HeliosModel):
+        """The firmware starts its timer anew after it has written a frame's first point."""
+
+        def _decode(self, data: bytes, pps: int, flags: int) -> _Frame:
+            frame = super()._decode(data, pps, flags)
+            return replace(frame, duration_s=frame.duration_s + 3e-6)
+
+    with opened("helios", Seamed(), frame="10 ms") as (device, _):
+        play(device, 10)
+        assert device.status.fault is None
+
+
+def test_it_opens_by_itself_with_plain_numbers() -> None:
+    clock, model = VirtualClock(), HeliosModel(name="left")
+    board: dict[str, Any] = {"usb_backend": plug(model, clock).bus, "clock": clock}
+    galvo: dict[str, Any] = {"max_velocity_per_s": 2000.0, "max_acceleration_per_s2": 2e6}
+    with Helios.open(**galvo, max_point_rate_hz=40e3, frame_s=0.03, name="left", **board) as device:
+        assert device.limits.point_rate_hz[1] == 40e3
+        play(device, 2)
+        assert device.status.fault is None
+    with pytest.raises(LimitExceeded, match="frame") as refused:
+        Helios.open(**galvo, frame_s=10.0, **board)
+    assert "\n" not in str(refused.value)
 
 
 def test_close_stops_waits_lowers_the_shutter_and_leaves_alternate_0() -> None:
@@ -296,7 +380,7 @@ def test_park_ends_at_the_dump_angle_with_a_frame_not_with_stop() -> None:
         device.start()
         device.park()
         assert model.history.command(np.array([plugged.now_s()]))[0] == pytest.approx(0.8, abs=1 / 4095)
-        assert b"\x01\x00" not in model.sent(COMMANDS)
+        assert model.sent(COMMANDS).count(b"\x01\x00") == 1  # at open
 
 
 # What goes wrong

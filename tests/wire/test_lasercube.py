@@ -1,17 +1,56 @@
 """The LaserCube driver against the firmware model. Golden bytes: docs/reference/hardware.md."""
 
+from dataclasses import replace
 from typing import Any
 
 import numpy as np
 import pytest
 
+from drivers.clock import VirtualClock
 from drivers.errors import DeviceError, DeviceFault, DeviceNotFound, LimitExceeded, ProtocolError
 from drivers.interfaces import LEVEL_BACKWARD, MARKER_LINE, MARKER_SCAN
 from drivers.scanners.dac_scanner import PointSlice
-from drivers.scanners.lasercube import encode
-from sim_backend.wire.serve.usb_model import Stall
+from drivers.scanners.lasercube import LaserCube, encode
+from sim_backend.wire.firmware.helios import CENTRE
+from sim_backend.wire.serve.usb_model import EndpointSpec, Stall
+from tests.wire import scanners
 from tests.wire.lasercube import BLUE, COMMANDS, GREEN, RED, SAMPLES, LaserCubeModel
-from tests.wire.scanners import LaserCubeRecorder, cosine, opened, play
+from tests.wire.scanners import LaserCubeRecorder, cosine, opened, play, plug
+
+STEP = 2 / 4095
+
+
+class Laserdock(LaserCubeRecorder):
+    """A board that its owners have measured and whose ancestor's firmware is public (drivers/scanners/lasercube.py).
+
+    It has a ring of 768 samples, which it plays only while its output is on. Without output, and when the ring is
+    cleared, X and Y are at the centre.
+    """
+
+    def __init__(self, clock: VirtualClock | None = None, late: int = -1, **options: Any) -> None:
+        super().__init__(clock, late, **{"ring": 768, "product_name": "Laserdock", **options})
+        full_speed = tuple(
+            replace(one, endpoints=tuple(EndpointSpec(end.address, "bulk", 64) for end in one.endpoints))
+            for one in self.spec.alternates
+        )
+        self.spec = replace(self.spec, manufacturer="WICKED", speed="full", alternates=full_speed)
+        self.fullest = 0
+
+    def advance(self, now_s: float) -> None:
+        if self.enabled:
+            super().advance(now_s)
+        else:
+            self._played_to_s = now_s
+
+    def _take_points(self, data: bytes, now_s: float) -> int | None:
+        taken = super()._take_points(data, now_s)
+        self.fullest = max(self.fullest, self._queued)
+        return taken
+
+    def _command(self, data: bytes, now_s: float) -> None:
+        if data in (b"\x80\x00", b"\x8d\x00"):
+            self.history.cut(now_s, CENTRE)
+        super()._command(data, now_s)
 
 
 def test_samples_are_the_bytes_of_the_manual() -> None:
@@ -56,13 +95,78 @@ def test_its_own_lasers_stay_dark_unless_the_config_says_where_the_colours_lead(
     model = LaserCubeRecorder()
     with opened("lasercube", model) as (device, _):
         play(device, 2)
-        assert b"\x80\x01" not in model.sent(COMMANDS)
         assert all(not any(data[at : at + 4]) for data in model.sent(SAMPLES) for at in range(0, len(data), 8))
 
 
-@pytest.mark.parametrize("when_empty", ["hold", "repeat"])
-def test_points_and_markers_come_out_once_whatever_an_empty_ring_does(when_empty: str) -> None:
-    model = LaserCubeRecorder(when_empty=when_empty)
+@pytest.mark.parametrize("colours", ["dark", "markers"])
+def test_the_output_is_on_for_the_whole_run_since_the_ring_is_not_played_otherwise(colours: str) -> None:
+    model = Laserdock()
+    with opened("lasercube", model, colours=colours) as (device, plugged):
+        wave, began_s = cosine(device), plugged.now_s()
+        play(device, 2)
+        assert device.status.fault is None
+        times = np.arange(began_s, plugged.now_s(), 1 / 25_000)
+        played = model.history.command(times)
+        assert played.max() == pytest.approx(wave.command.max(), abs=STEP)
+        assert np.count_nonzero(np.abs(played - wave.command.max()) < STEP) > 2 * 50
+        sent = [(endpoint, data) for _, endpoint, data in model.log]
+        first = sent.index((SAMPLES, model.sent(SAMPLES)[0]))
+        assert (COMMANDS, b"\x80\x01") in sent[:first]
+        assert not {b"\x80\x00", b"\x8d\x00"} & {data for _, data in sent[first:]}
+
+
+def test_the_mirror_never_jumps_and_stays_at_the_dump_angle_until_it_is_closed() -> None:
+    clock, model = VirtualClock(), Laserdock()
+    with opened("lasercube", model, clock, max_point_rate="25 kHz", park=0.8) as (device, plugged):
+        began_s, most = plugged.now_s(), device.limits.step
+        play(device, 1)
+        device.start()
+        device.stop()
+        device.park()
+        clock.sleep(1.0)
+        assert model.enabled
+        assert model.history.command(np.array([plugged.now_s()]))[0] == pytest.approx(0.8, abs=STEP)
+    times = np.arange(began_s, plugged.now_s() + 0.1, 1 / 25_000)
+    way = model.history.command(times)
+    # Twice the step: a moment of the record may see two points.
+    assert np.abs(np.diff(way)).max() <= 2 * most
+    assert way[-1] == CENTRE
+    assert not model.enabled
+
+
+def test_a_ring_of_768_samples_is_used_up_to_its_last_packet(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(scanners, "LATE_S", 0.022)  # half of the ring lasts 15 ms, all of it 30 ms
+    clock = VirtualClock()
+    model = Laserdock(clock, late=60)
+    with opened("lasercube", model, clock) as (device, _):
+        play(device, 3)
+        assert device.status.fault is None
+        assert 768 - 64 - 8 < model.fullest <= 768 - 8
+
+
+@pytest.mark.parametrize("product_name", ["Laserdock", "Laserdock.", "LaserCube", "LASERDOCK"])
+def test_the_product_string_is_compared_without_case(product_name: str) -> None:
+    with opened("lasercube", Laserdock(product_name=product_name)) as (device, _):
+        assert "LaserCube" in device.identity
+
+
+def test_it_opens_by_itself_with_plain_numbers() -> None:
+    clock, model = VirtualClock(), Laserdock()
+    board: dict[str, Any] = {"usb_backend": plug(model, clock).bus, "clock": clock}
+    galvo: dict[str, Any] = {"max_velocity_per_s": 2000.0, "max_acceleration_per_s2": 2e6}
+    with LaserCube.open(**galvo, max_point_rate_hz=25e3, buffer_s=0.02, park=0.5, **board) as device:
+        assert device.limits.point_rate_hz[1] == 25e3
+        play(device, 2)
+        assert device.status.fault is None
+    with pytest.raises(LimitExceeded, match="max_velocity") as refused:
+        LaserCube.open(max_velocity_per_s=-1.0, max_acceleration_per_s2=2e6, **board)
+    assert "\n" not in str(refused.value)
+    with pytest.raises(LimitExceeded, match="parc"):
+        LaserCube.open(**galvo, parc=0.5, **board)
+
+
+def test_points_and_markers_come_out_once_and_the_mirror_rests_at_the_last_point() -> None:
+    model = LaserCubeRecorder()
     with opened("lasercube", model, colours="markers") as (device, plugged):
         wave, repeats, rate_hz = cosine(device), 3, 25_000
         play(device, repeats)
