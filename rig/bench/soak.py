@@ -33,6 +33,7 @@ from rig.depth.warm_up import warm_up
 from rig.devices.open import OpenRig, open_rig
 from rig.devices.prepare import prepare
 from rig.errors import UsageError
+from rig.estimate.registry import ESTIMATORS
 from rig.plan.scan_plan import ScanPlan
 from rig.progress import Progress
 from rig.recording.writer import Recording
@@ -254,6 +255,8 @@ def soak(
     window: bool = False,
     slow_consumer_s: float = 0.0,
     on_overload: str = "abort",
+    estimator: str = "likelihood",
+    exposures: int | None = None,
     progress: Progress | None = None,
 ) -> SoakReport:
     """Play a stream of 100 kHz in real time through the acquisition (`rig bench --soak`).
@@ -261,6 +264,7 @@ def soak(
     window: send windows that move with the line instead of whole frames.
     slow_consumer_s: time added to every map, to see what an overload does.
     on_overload: as in `rig.api.scan`; a stream that is ended by it gives a report too.
+    estimator, exposures: by name; per column, None for those of the bundled rig.
     progress: called with frames done and frames planned.
 
     Raises UsageError for invalid arguments.
@@ -278,11 +282,14 @@ def soak(
         monitor=MonitorView.row_profile,  # what a viewer would show
         sweeps=(lambda _: time.sleep(slow_consumer_s)) if slow_consumer_s else None,
     )
-    with _looped_rig(policy, window) as (rig, spad), _quiet_sweeps():
+    if estimator not in ESTIMATORS:
+        raise UsageError(f"estimator {estimator!r} is unknown; choose one of {', '.join(ESTIMATORS)}")
+    with _looped_rig(policy, window, exposures) as (rig, spad), _quiet_sweeps():
         plan, timing = prepare(rig)
         maps = max(2, 1 + math.ceil(seconds / float(plan.sweep_s)))  # the first one is taken alone
-        warm_up("likelihood", "none", plan.exposures, dark=True)
-        maker = make_reconstructor(rig, plan, EstimateConfig(estimator="likelihood", threads=threads))
+        warm_up(estimator, "none", plan.exposures, dark=True)
+        settings = EstimateConfig.model_validate({"estimator": estimator, "threads": threads})
+        maker = make_reconstructor(rig, plan, settings)
         asked = AcquisitionRequest(maps=maps, policy=policy, first_alone=True, learns=True, listeners=listeners)
         return _played(Acquisition(rig, plan, timing, maker, asked), spad, plan, asked, slow_consumer_s)
 
@@ -300,10 +307,14 @@ def _quiet_sweeps() -> Iterator[None]:
 
 
 @contextmanager
-def _looped_rig(policy: Overload, window: bool) -> Iterator[tuple[OpenRig, LoopedSpad]]:
+def _looped_rig(policy: Overload, window: bool, exposures: int | None) -> Iterator[tuple[OpenRig, LoopedSpad]]:
     """The simulated rig with a looped SPAD, which plays what the rig's own SPAD recorded; gives that SPAD too."""
     # With clocks that agree exactly, the loop closes without a jump.
-    settings: dict[str, object] = {"scanner.clock_error": "0 ppm", "scan.depth_range": DEPTH_RANGE}
+    settings: dict[str, object] = {
+        "scanner.clock_error": "0 ppm",
+        "scan.depth_range": DEPTH_RANGE,
+        "scan.exposures": exposures,
+    }
     if window:
         settings["spad.link"] = f"{_window_bytes_per_s(settings) / 1e6:.6f} MB/s"
     with open_rig(load_config(CONFIG, settings)) as rig:

@@ -24,17 +24,23 @@ def bench_command(
     on_overload: Annotated[
         str, typer.Option("--on-overload", help="soak: frames come too fast: abort, drop or block")
     ] = "abort",
+    estimator: Annotated[str, typer.Option("--estimator", help="soak: the estimator")] = "likelihood",
+    exposures: Annotated[
+        int | None, typer.Option("--exposures", help="soak: frames per column", show_default="10", min=1)
+    ] = None,
 ) -> Answer:
     """Measure how fast this machine counts and estimates, and how fast it reads memory."""
     from rig.errors import UsageError
 
-    if soak is None and (window or slow_consumer != 0 or on_overload != "abort"):
-        raise UsageError("--window, --slow-consumer and --on-overload are of a soak; add --soak 30, or leave them out")
+    others = window, slow_consumer, on_overload, estimator, exposures
+    if soak is None and others != (False, 0.0, "abort", "likelihood", None):
+        raise UsageError("all options but --threads and --json are of a soak; add --soak 30, or leave them out")
     stream = None
     if soak is not None:  # before the bench, which takes a minute: the request for the soak may be wrong
         with progress():
             stream = api.soak(
                 soak, threads=threads, window=window, slow_consumer_s=slow_consumer / 1e3, on_overload=on_overload,
+                estimator=estimator, exposures=exposures,
             )  # fmt: skip
     with progress():
         report = api.bench(threads=threads)
