@@ -271,3 +271,18 @@ def _add_dark(n: NDArray[np.uint8], lane: int, sums: NDArray[np.int32]) -> None:
             at = q * pair + 2 * (PAD + i)
             sums[q, lane + i, 0] += n[at]
             sums[q, lane + i, 1] += n[at + 1]
+
+
+@numba.njit(cache=True, nogil=True)
+def sum_columns(
+    counts: NDArray[np.unsignedinteger], x0: NDArray[np.int32], out: NDArray[np.uint32], first_row: int, last_row: int
+) -> None:
+    """Add the counts (columns, rows, window) of rows first_row..last_row-1 to out (rows, width or more).
+
+    x0: (columns,), the pixel of `out` at which each column's window begins.
+    """
+    for y in range(first_row, last_row):
+        for c in range(counts.shape[0]):
+            row = out[y, x0[c] : x0[c] + counts.shape[2]]
+            for t in range(counts.shape[2]):
+                row[t] += counts[c, y, t]

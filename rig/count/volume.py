@@ -6,6 +6,7 @@ have their own counter, which keeps less (`Counter`). All of them also record a 
 """
 
 from dataclasses import dataclass, replace
+from functools import partial
 from typing import Any, Protocol
 
 import numpy as np
@@ -83,8 +84,9 @@ class FrameTally:
     dark_frames: NDArray[np.int32] | None = None
     velocity_per_s: float = 0.0
 
-    def intensity(self) -> NDArray[np.uint32]:
-        """Counts summed over the columns, (rows, width) uint32; only in subclasses that keep counts."""
+    def intensity(self, workers: RowWorkers | None = None) -> NDArray[np.uint32]:
+        """Counts summed over the columns, (rows, width) uint32; only in subclasses that keep counts. workers: threads
+        that share the work."""
         raise NotImplementedError
 
     def bound_column(self) -> NDArray[np.float64]:
@@ -104,12 +106,17 @@ class CountVolume(FrameTally):
     x0: NDArray[np.int32]
     exposures: int
 
-    def intensity(self) -> NDArray[np.uint32]:
-        """Counts summed over the columns, (rows, width) uint32."""
-        columns, rows, window = self.counts.shape
+    def intensity(self, workers: RowWorkers | None = None) -> NDArray[np.uint32]:
+        """Counts summed over the columns, (rows, width) uint32. workers: threads that share the work."""
+        from rig.count.kernels import sum_columns
+
+        _, rows, window = self.counts.shape
         out = np.zeros((rows, max(self.width, int(self.x0.max(initial=0)) + window)), np.uint32)
-        for c in range(columns):
-            out[:, self.x0[c] : self.x0[c] + window] += self.counts[c]
+        share = partial(sum_columns, self.counts, self.x0, out)
+        if workers is None:
+            share(0, rows)
+        else:
+            workers.over(rows, share)
         return out[:, : self.width]
 
 

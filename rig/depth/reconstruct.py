@@ -125,7 +125,7 @@ class Reconstructor:
 
         estimate_s: the time that the estimator took for the table."""
         begun = time.perf_counter() - estimate_s
-        geometry, fog, intensity = self._bound(sweep), self._fog(sweep, stripe), sweep.intensity()
+        geometry, fog, intensity = self._bound(sweep), self._fog(sweep, stripe), sweep.intensity(self._workers)
         doubts = self._checks.doubts(sweep, intensity, stripe)
         if self._lines is not None:
             stripe = share_claims(stripe, self._lines)

@@ -136,7 +136,7 @@ class Joint:
             self.kept_serves = kept is not None
             if kept is not None:
                 return kept
-        witness_px, lessons, intensity, misled = None, 0, volume.intensity(), model
+        witness_px, lessons, intensity, misled = None, 0, volume.intensity(self._workers), model
         foggy = bool(model.profile[:, 0].max() > np.median(model.ambient))
         while lessons < (LESSONS if witness_px is None else HALO_LESSONS):
             (model, teaching), lessons = self._taught(volume, intensity, geometry, model, witness_px), lessons + 1
@@ -290,7 +290,7 @@ class Joint:
         quiet = self._quiet(volume, geometry, tables, stripes)
         lines = lines_of(volume, next_lattice(geometry), stripes)
         bright = bright_lines(volume, tables, stripes, self._memory.places, self._workers)
-        return Seen(volume, volume.intensity(), quiet, lines, bright)
+        return Seen(volume, volume.intensity(self._workers), quiet, lines, bright)
 
     def _quiet(
         self, volume: CountVolume, geometry: SweepGeometry, tables: JointTables, stripes: StripeTable

@@ -157,7 +157,7 @@ class OnlineLearner(Generic[Tables]):
 
 def first_model(volume: CountVolume, geometry: SweepGeometry, workers: RowWorkers) -> RowModel:
     """The model of a first sweep, learned twice: once stripes are found, pixels behind them show the ambient light."""
-    intensity = volume.intensity()
+    intensity = volume.intensity(workers)
     model = learn_first(volume, geometry, ambient_map(volume, intensity, geometry, None), workers)
     dark = volume.dark_counts is not None
     judge = judge_of(model, geometry, volume.exposures, workers, dark=dark)

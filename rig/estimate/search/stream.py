@@ -248,8 +248,8 @@ class SearchedSweep(FrameTally):
     lines: Lines
     checked: Int32
 
-    def intensity(self) -> NDArray[np.uint32]:
-        """Counts summed over the columns, (rows, width) uint32."""
+    def intensity(self, workers: RowWorkers | None = None) -> NDArray[np.uint32]:
+        """Counts summed over the columns, (rows, width) uint32; they are known."""
         return self.light
 
 
