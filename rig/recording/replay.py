@@ -68,6 +68,7 @@ def replay_config(run: Path, request: ReplayRequest, others: RigConfig | None = 
     if request.block_frames is not None and request.block_frames < 1:
         raise UsageError(f"block_frames is {request.block_frames}; it must be at least 1")
     require_recording(run)
+    plan = read_plan(run)
     manifest = read_manifest(run)
     if manifest is None:
         raise DamagedRecordingError(f"{run / MANIFEST} is missing; 'rig repair' writes a new one")
@@ -87,7 +88,7 @@ def replay_config(run: Path, request: ReplayRequest, others: RigConfig | None = 
             **{name: getattr(request, name) for name in ("clock", "loop", "block_frames")},
         },
         **{slot: {"kind": "replay"} for slot in RECORDED},
-        "scan": recorded.get("scan") or _scan_of(read_plan(run)),
+        "scan": recorded.get("scan") or _scan_of(plan),
         "estimate": {**(recorded.get("estimate") or {}), **given, "learned": _begun_with(run)},
     }
     if content["estimate"].get("estimator") != "joint":  # only joint has a prior; the scan's does not apply
