@@ -273,6 +273,10 @@ def _add_dark(n: NDArray[np.uint8], lane: int, sums: NDArray[np.int32]) -> None:
             sums[q, lane + i, 1] += n[at + 1]
 
 
+SUM_ROWS = 16
+"""Rows of a band of `sum_columns`."""
+
+
 @numba.njit(cache=True, nogil=True)
 def sum_columns(
     counts: NDArray[np.unsignedinteger], x0: NDArray[np.int32], out: NDArray[np.uint32], first_row: int, last_row: int
@@ -281,8 +285,10 @@ def sum_columns(
 
     x0: (columns,), the pixel of `out` at which each column's window begins.
     """
-    for y in range(first_row, last_row):
+    # Band by band: its sums stay in the cache, and its counts lie together in every column.
+    for band in range(first_row, last_row, SUM_ROWS):
         for c in range(counts.shape[0]):
-            row = out[y, x0[c] : x0[c] + counts.shape[2]]
-            for t in range(counts.shape[2]):
-                row[t] += counts[c, y, t]
+            for y in range(band, min(band + SUM_ROWS, last_row)):
+                row = out[y, x0[c] : x0[c] + counts.shape[2]]
+                for t in range(counts.shape[2]):
+                    row[t] += counts[c, y, t]

@@ -138,6 +138,65 @@ def compare_lines(
 
 
 @numba.njit(inline="always")
+def _mean(line, low, high, x, away, reach_px):  # type: ignore[no-untyped-def]
+    """Mean of the pixels x + away * (first to last of reach_px) of a line; NaN if they are not all in low..high."""
+    first, last = x + away * reach_px[0], x + away * reach_px[1]
+    if min(first, last) < low or max(first, last) > high:
+        return np.nan
+    total = 0.0
+    for j in range(min(first, last), max(first, last) + 1):
+        total += line[j]
+    return total / (reach_px[1] - reach_px[0] + 1)
+
+
+_I, _F, _D, _N = numba.int32[:, :], numba.float32[:, :], numba.float64[:, :], numba.int32[:]
+_PAIR = numba.types.UniTuple(numba.int64, 2)  # type: ignore[no-untyped-call]
+
+
+# Compiled at import: it is first called when a map has enough sure answers, and compiling would hold up the stream.
+@numba.njit(
+    [
+        (counts[:, :, ::1], _N, _N, _N, _N, _N, numba.int64[:], numba.int64, _PAIR, _PAIR, _N, _I, _I, numba.int64,
+         numba.float64[:], numba.int64[:])
+        for counts in (numba.uint8, numba.uint16, numba.uint32, numba.int32)
+    ],
+    cache=True, nogil=True,
+)  # fmt: skip
+def add_contrast(
+    counts: NDArray[np.integer],
+    a: NDArray[np.int32],
+    b: NDArray[np.int32],
+    row: NDArray[np.int32],
+    column: NDArray[np.int32],
+    exposures: NDArray[np.int32],
+    x: NDArray[np.int64],
+    away: int,
+    line_px: tuple[int, int],
+    behind_px: tuple[int, int],
+    x0: NDArray[np.int32],
+    x_lo: NDArray[np.int32],
+    x_hi: NDArray[np.int32],
+    width: int,
+    contrast: NDArray[np.float64],
+    asked: NDArray[np.int64],
+) -> None:
+    """Add to `contrast` (n,), for each line counts[a, b], the mean ones per exposure at x, less those behind it.
+
+    row, column, exposures: of each line. x: (n,), pixels of the sensor. away: 1 or -1, direction towards far depths.
+    line_px, behind_px: first and last pixel of both means, from x on towards far depths. asked: (n,), goes up by one;
+    lines on which not all of these pixels were searched change neither.
+    """
+    for i in range(x.shape[0]):
+        c = column[i]
+        low, high = _searched(x_lo[row[i], c], x_hi[row[i], c], x0[c], counts.shape[2], width)
+        line, at = counts[a[i], b[i]], x[i] - x0[c]
+        found = _mean(line, low, high, at, away, line_px) - _mean(line, low, high, at, away, behind_px)
+        if not np.isnan(found):
+            contrast[i] += found / exposures[i]
+            asked[i] += 1
+
+
+@numba.njit(inline="always")
 def _in_bins(px):  # type: ignore[no-untyped-def]
     return int(np.floor(px / BIN_PX + 0.5))
 
@@ -154,9 +213,6 @@ def _add_products(a, b, margin, to, out):  # type: ignore[no-untyped-def]
         if a[i] != 0.0:
             for o in range(out.shape[0]):
                 out[o] += a[i] * b[i + to + o - reach]
-
-
-_I, _F, _D = numba.int32[:, :], numba.float32[:, :], numba.float64[:, :]
 
 
 # Compiled at import: it is first called after a wide sweep, and compiling then would hold up the stream.

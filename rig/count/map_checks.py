@@ -26,7 +26,7 @@ from numpy.typing import NDArray
 
 from rig.count.volume import CountVolume
 from rig.geometry.stripe_table import StripeTable
-from rig.geometry.windows import MARGIN_PX, WORD_PX, SweepGeometry, evenly_spread
+from rig.geometry.windows import WORD_PX, SweepGeometry, evenly_spread
 
 Array = NDArray[np.float64]
 
@@ -83,12 +83,13 @@ class Points(NamedTuple):
     """Rows and columns of points (index 0) and of their partners: the next row (1), and columns APART_PX away (2, ...).
 
     row, column: int32 (2 + partner columns, points). shift: int32 (1 + partner columns, points), pixels from the stripe
-    at a point to the stripe of the same surface at each partner.
+    at a point to the stripe of the same surface at each partner. moved_px: median distance to each partner column.
     """
 
     row: NDArray[np.int32]
     column: NDArray[np.int32]
     shift: NDArray[np.int32]
+    moved_px: Array
 
 
 def check_points(geometry: SweepGeometry, points: int = POINTS) -> Points:
@@ -108,7 +109,8 @@ def check_points(geometry: SweepGeometry, points: int = POINTS) -> Points:
     y, c = y[pick], c[pick]
     row, column = np.stack([y, y + 1, *[y] * len(apart)]), np.stack([c, c, *(c + n for n in apart)])
     shift = np.rint(reference[row[1:], column[1:]] - reference[y, c])
-    return Points(row.astype(np.int32), column.astype(np.int32), shift.astype(np.int32))
+    moved_px = np.abs(np.median(shift[1:], axis=1)) if len(y) else np.zeros(len(apart))
+    return Points(row.astype(np.int32), column.astype(np.int32), shift.astype(np.int32), moved_px)
 
 
 class MapChecks:
@@ -224,7 +226,7 @@ class MapChecks:
         geometry, points = self._geometry, counts.points
         partners = len(APART_PX)
         rows, shared, noise = np.zeros((partners, 5)), np.zeros((partners, 2 * SPAN + 1)), np.zeros(partners)
-        moved_px = np.abs(np.median(points.shift[1:, chosen], axis=1))
+        moved_px = points.moved_px
         if moved_px[-1] < 0.75 * APART_PX[-1]:
             return False  # too narrow a sweep to distinguish haze from light that stands still
         expected = np.abs(np.arange(-SPAN, SPAN + 1)) <= np.maximum(0.5 * moved_px / BIN_PX, 1.0)[:, None]
@@ -256,6 +258,8 @@ class MapChecks:
         return min(len(sure) // FEWEST_POINTS, GROUPS), sure
 
     def _of_answers(self, counts: "_Counts", stripe: StripeTable) -> str | None:
+        from rig.count.map_check_kernels import add_contrast
+
         geometry, points = self._geometry, counts.points
         groups, sure = self._sure(counts, stripe)
         if not groups:
@@ -265,12 +269,11 @@ class MapChecks:
         away = 1 if geometry.near_is_left else -1
         contrast, asked = np.zeros(len(sure)), np.zeros(len(sure), np.int64)
         for partner in (1, 2):
-            at = x + points.shift[partner - 1, sure]
-            line = counts.mean(partner, sure, at, away, LINE_PX)
-            behind = counts.mean(partner, sure, at, away, BEHIND_PX)
-            known = np.isfinite(line) & np.isfinite(behind)
-            contrast[known] += (line - behind)[known]
-            asked += known
+            add_contrast(
+                *counts.of_lines(partner, sure), points.row[partner, sure], points.column[partner, sure],
+                counts.exposures[partner, sure], x + points.shift[partner - 1, sure], away, LINE_PX, BEHIND_PX,
+                geometry.x0, geometry.x_lo, geometry.x_hi, geometry.width, contrast, asked,
+            )  # fmt: skip
         order = np.argsort(away * (x - geometry.x_lo[y, c]), kind="stable")
         for group in np.array_split(order[asked[order] > 0], groups):
             if len(group) >= FEWEST_POINTS // 2:
@@ -319,23 +322,13 @@ class _Counts:
             found = self._sweep.checked[:most, chosen]
         return np.ascontiguousarray(found, np.int32)
 
-    def mean(
-        self, partner: int, chosen: NDArray[np.int64], x: NDArray[np.int64], away: int, reach_px: tuple[int, int]
-    ) -> Array:
-        """Mean ones per exposure of the pixels x + away * (first to last of reach_px); NaN if not all were searched."""
-        geometry = self._geometry
-        y, c = self.points.row[partner, chosen], self.points.column[partner, chosen]
-        px = x[:, None] + away * np.arange(reach_px[0], reach_px[1] + 1)
-        low = np.maximum(np.maximum(geometry.x_lo[y, c] - MARGIN_PX, geometry.x0[c]), 0)
-        high = np.minimum(geometry.x_hi[y, c] + MARGIN_PX, geometry.x0[c] + geometry.window - 1)
-        inside = (px >= low[:, None]) & (px <= np.minimum(high, geometry.width - 1)[:, None])
-        at = np.where(inside, px - geometry.x0[c][:, None], 0)
+    def of_lines(
+        self, partner: int, chosen: NDArray[np.int64]
+    ) -> tuple[NDArray[Any], NDArray[np.int32], NDArray[np.int32]]:
+        """The counts (a, b, window) as they are stored, with a and b of the lines of chosen points' partner."""
         if self.of_volume:
-            ones = self._sweep.counts[c[:, None], y[:, None], at]
-        else:
-            ones = self._sweep.checked[partner][chosen[:, None], at]
-        mean = ones.mean(axis=1) / self.exposures[partner, chosen]
-        return np.where(inside.all(axis=1), mean, np.nan)
+            return self._sweep.counts, self.points.column[partner, chosen], self.points.row[partner, chosen]
+        return self._sweep.checked, np.full(len(chosen), partner, np.int32), chosen.astype(np.int32)
 
 
 def _ever_more(chosen: NDArray[np.int64], first: int) -> Iterator[NDArray[np.int64]]:

@@ -35,7 +35,7 @@ from calibration.errors import digits
 from rig.count.volume import CountVolume
 from rig.geometry.stripe_table import StripeTable
 from rig.geometry.windows import SweepGeometry
-from rig.simd import Bools, Float32, Float64
+from rig.simd import Bools, Float32, Float64, Int32
 
 if TYPE_CHECKING:
     from rig.estimate.row.inputs import Lines
@@ -205,18 +205,21 @@ class FogEstimate:
         return f"visibility {digits(self.visibility_m)} +- {digits(self.visibility_sd_m, 2)} m"
 
 
-def read_fog(sweep: Any, stripe: StripeTable, geometry: SweepGeometry, state: Any) -> FogEstimate:
+def read_fog(
+    sweep: Any, stripe: StripeTable, geometry: SweepGeometry, state: Any, where: tuple[Int32, Int32] | None = None
+) -> FogEstimate:
     """The fog of one map.
 
     sweep: a `CountVolume`, or a sweep with `lines` of counts. stripe: its stripe table, made with the `RowModel`
-    `state`.
+    `state`. where: lines of counts that are read of a `CountVolume`; None for those of `next_lattice`.
     """
     from rig.depth.kernels import SUMS, add_clear_rows
     from rig.estimate.row.em import lines_of, next_lattice
     from rig.estimate.row.inputs import state_of, sweep_of
     from rig.estimate.row.model import BINS
 
-    lines: Lines = lines_of(sweep, next_lattice(geometry)) if isinstance(sweep, CountVolume) else sweep.lines
+    whole = isinstance(sweep, CountVolume)
+    lines: Lines = lines_of(sweep, where or next_lattice(geometry)) if whole else sweep.lines
     row, column = lines.row, lines.column
     clear = (stripe.confidence[row, column] > CLEAR) & (lines.exposures > 0)
     if np.count_nonzero(clear) < LEAST_LINES:
@@ -244,13 +247,14 @@ def _dark_offset(sweep: Any, ambient: Float32, hot_flux: float) -> tuple[float, 
     none or all of their pixels fired."""
     if sweep.dark_counts is None:
         return None
-    frames = np.broadcast_to(sweep.n_dark if sweep.dark_frames is None else sweep.dark_frames, ambient.shape)
-    used = (frames > 0) & (ambient <= hot_flux)
-    exposures, ones = float(frames[used].sum()), float(sweep.dark_counts[used].sum())
+    frames = np.broadcast_to(sweep.n_dark if sweep.dark_frames is None else sweep.dark_frames, ambient.shape[1:])
+    used = (ambient <= hot_flux).astype(np.float64)
+    exposures, ones = float((used @ frames).sum()), float(np.vdot(used, sweep.dark_counts))
     if ones < 1.0 or ones >= exposures:
         return None
     level = -math.log1p(-ones / exposures)
-    return level - float(np.average(ambient[used], weights=frames[used])), level / math.sqrt(ones)
+    mean = float(((used * ambient) @ frames).sum()) / exposures
+    return level - mean, level / math.sqrt(ones)
 
 
 def _dark_alone(sums: Float64, dark: tuple[float, float] | None) -> FogEstimate:

@@ -2,8 +2,10 @@
 
 import os
 import time
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
+from functools import partial
+from typing import Any, NamedTuple, Protocol
 
 import numpy as np
 from numpy.typing import NDArray
@@ -15,11 +17,11 @@ from rig.count.volume import Counter, FrameTally, LineCounter, SweepLayout
 from rig.depth.depth import depth_map, share_claims
 from rig.depth.fog_meter import FogEstimate, read_fog
 from rig.errors import UsageError
-from rig.estimate.registry import COUPLED, LEARNING, Learned, create_estimator, recalling
+from rig.estimate.registry import COUPLED, LEARNING, Learned, ManyMaps, create_estimator, recalling
 from rig.geometry.line_grid import LineGrid
 from rig.geometry.stripe_table import StripeTable
 from rig.geometry.windows import SweepGeometry, sweep_geometry, uncalibrated_geometry
-from rig.simd import Float32, Float64
+from rig.simd import Float32, Float64, Int32
 from rig.threads import RowWorkers
 
 
@@ -58,8 +60,34 @@ def map_geometry(
     return geometry if lines is None else replace(geometry, others=lines.others(geometry.plane))
 
 
+class MapUnderWay(NamedTuple):
+    """A map that was begun. run: makes it, on any thread. end: learns from it, in the order of the sweeps."""
+
+    run: Callable[[], MapResult]
+    end: Callable[[], None]
+
+
+class Lane(NamedTuple):
+    """What one of several maps at the same time needs for itself: the estimator's memory, and one thread."""
+
+    solver: Any
+    workers: RowWorkers
+
+
+class MakesMaps(Protocol):
+    """The part of a `Reconstructor` that a scan uses. Once the counting thread runs, no other thread uses it."""
+
+    def counter(self, layout: SweepLayout) -> Counter:
+        """Make a counter whose sweeps `map` takes."""
+        ...
+
+    def map(self, sweep: FrameTally) -> MapResult:
+        """Make the map of one counted sweep."""
+        ...
+
+
 class Reconstructor:
-    """Turns counted sweeps into maps, one after the other; estimators that learn carry their state from map to map.
+    """Turns counted sweeps into maps; estimators that learn carry their state from map to map.
 
     model, column_commands, lines: the same that were given to `map_geometry`. learned: kept states; each map is then
     estimated with its own, and nothing is learned. kept: the state of an earlier run, used by `joint` if it explains
@@ -92,6 +120,7 @@ class Reconstructor:
             self.estimator = recalling(estimate.estimator, learned, threads, temporal_prior=prior)
         else:
             self.estimator = create_estimator(estimate.estimator, threads, temporal_prior=prior, kept=kept)
+        self._fog_lines: tuple[Int32, Int32] | None = None
         self._checks = MapChecks(geometry, calibrated=model is not None, knows=estimate.estimator in LEARNING)
 
     @property
@@ -120,12 +149,44 @@ class Reconstructor:
         stripe = self.estimator.estimate(sweep, self.geometry)
         return self.complete(stripe, sweep, self._filter, time.perf_counter() - begun)
 
+    def lanes(self) -> list[Lane]:
+        """What is needed to make maps at the same time, one for each map; empty if they have to be made one by one."""
+        if not isinstance(self.estimator, ManyMaps):
+            return []
+        n = min(self._workers.threads, self.estimator.most_at_once(self.geometry))
+        return [Lane(self.estimator.solver(), RowWorkers(1)) for _ in range(n)] if n > 1 else []
+
+    def may_begin(self, frames: int) -> bool:
+        """Whether the next map may be begun while maps with so many lit frames are under way."""
+        assert isinstance(self.estimator, ManyMaps), "it has lanes"
+        return self.estimator.may_begin(frames)
+
+    def begin(self, sweep: FrameTally, lane: Lane) -> MapUnderWay:
+        """Begin the map of a sweep. lane: used by no other map until the map's `end` is called."""
+        assert isinstance(self.estimator, ManyMaps), "it has lanes"
+        work = self.estimator.begin(sweep, self.geometry, lane.solver)
+
+        def complete() -> MapResult:
+            begun = time.perf_counter()
+            stripe = work.run()
+            estimate_s = time.perf_counter() - begun
+            return self.completed(stripe, sweep, self._filter, estimate_s, work.used, lane.workers)
+
+        return MapUnderWay(complete, partial(self.estimator.end, work))
+
     def complete(self, stripe: StripeTable, sweep: FrameTally, filter: str, estimate_s: float) -> MapResult:
         """Make the map of a sweep from its stripe table: filter, depth, intensity, fog and doubts.
 
         estimate_s: the time that the estimator took for the table."""
+        return self.completed(stripe, sweep, filter, estimate_s, self.estimator.used, self._workers)
+
+    def completed(
+        self, stripe: StripeTable, sweep: FrameTally, filter: str, estimate_s: float, used: Learned | None,
+        workers: RowWorkers,
+    ) -> MapResult:  # fmt: skip
+        """As `complete`, for a stripe table that was estimated with the state `used`. May be called from any thread."""
         begun = time.perf_counter() - estimate_s
-        geometry, fog, intensity = self._bound(sweep), self._fog(sweep, stripe), sweep.intensity(self._workers)
+        geometry, fog, intensity = self._bound(sweep), self._fog(sweep, stripe, used), sweep.intensity(workers)
         doubts = self._checks.doubts(sweep, intensity, stripe)
         if self._lines is not None:
             stripe = share_claims(stripe, self._lines)
@@ -136,9 +197,9 @@ class Reconstructor:
         if self._model is None:
             depth = np.full((geometry.rows, geometry.width), np.nan, np.float32)
         else:
-            depth = depth_map(stripe, geometry, self._min_confidence, self._workers)
+            depth = depth_map(stripe, geometry, self._min_confidence, workers)
         compute_s = time.perf_counter() - begun
-        return MapResult(stripe, depth, intensity, fog, compute_s, self.estimator.used, doubts)
+        return MapResult(stripe, depth, intensity, fog, compute_s, used, doubts)
 
     def _bound(self, sweep: FrameTally) -> SweepGeometry:
         """Geometry with the planes at which the frames of each column were actually taken."""
@@ -151,7 +212,12 @@ class Reconstructor:
             commands = self._lines.bound_commands(self._commands, column)
         return self.geometry.bound_to(self._model, commands, sweep.velocity_per_s)
 
-    def _fog(self, sweep: FrameTally, stripe: StripeTable) -> FogEstimate:
+    def _fog(self, sweep: FrameTally, stripe: StripeTable, state: Learned | None) -> FogEstimate:
         """Fog of the map; an empty estimate if its estimator learns no haze, or without a calibration."""
-        state = self.estimator.used
-        return FogEstimate() if state is None or self._model is None else read_fog(sweep, stripe, self.geometry, state)
+        if state is None or self._model is None:
+            return FogEstimate()
+        from rig.estimate.row.em import next_lattice
+
+        if self._fog_lines is None:  # they are always the same, and take a while to find
+            self._fog_lines = next_lattice(self.geometry)
+        return read_fog(sweep, stripe, self.geometry, state, self._fog_lines)

@@ -5,7 +5,7 @@ for bit, from the learned state that was kept with each of them.
 """
 
 from collections.abc import Sequence
-from typing import TYPE_CHECKING, Any, Protocol
+from typing import TYPE_CHECKING, Any, Protocol, runtime_checkable
 
 if TYPE_CHECKING:
     import numpy as np
@@ -58,6 +58,41 @@ class Estimator(Protocol):
         ...
 
 
+class Work(Protocol):
+    """A map under way. used: the state with which it is estimated."""
+
+    used: Learned
+
+    def run(self) -> "StripeTable":
+        """Make the stripe table; on any thread."""
+        ...
+
+
+@runtime_checkable
+class ManyMaps(Protocol):
+    """An estimator that can estimate several maps at the same time."""
+
+    def most_at_once(self, geometry: "SweepGeometry") -> int:
+        """Number of maps for which there is memory; 1 if each map needs the one before."""
+        ...
+
+    def solver(self) -> Any:
+        """Memory and a thread for one map at a time."""
+        ...
+
+    def may_begin(self, frames: int) -> bool:
+        """Whether the state of the next map is certain while maps with so many lit frames are under way."""
+        ...
+
+    def begin(self, sweep: Any, geometry: "SweepGeometry", solver: Any) -> Work:
+        """Begin a map with a solver that no other map uses. Its `run` may be called on any thread; then call `end`."""
+        ...
+
+    def end(self, work: Any) -> None:
+        """Learn from a map that has been made. Call it in the order in which maps were begun."""
+        ...
+
+
 class LearnsFromStream(Estimator, Protocol):
     """An estimator in LEARNING. Its model can be set, to estimate a map again."""
 
@@ -70,7 +105,9 @@ def recalling(name: str, learned: Sequence[Learned], threads: int = 2, *, tempor
 
     name: one of LEARNING, else KeyError.
     """
-    return Recalled(_learning(name, threads, learns=False, temporal_prior=temporal_prior), learned)
+    return (RecalledMaps if name == "joint" else Recalled)(
+        _learning(name, threads, learns=False, temporal_prior=temporal_prior), learned
+    )
 
 
 def create_estimator(
@@ -120,6 +157,39 @@ class Recalled:
     def estimate(self, sweep: Any, geometry: "SweepGeometry") -> "StripeTable":
         """Estimate a map with its own state, then take the next state."""
         stripes = self._of.estimate(sweep, geometry)
+        self._take_next()
+        return stripes
+
+    def _take_next(self) -> None:
         if self._states:
             self._of.model = self._states.pop(0)
-        return stripes
+
+
+class RecalledMaps(Recalled):
+    """A `Recalled` of an estimator that can estimate several maps at the same time."""
+
+    @property
+    def _many(self) -> ManyMaps:
+        assert isinstance(self._of, ManyMaps), "it is `joint`"
+        return self._of
+
+    def most_at_once(self, geometry: "SweepGeometry") -> int:
+        """See `ManyMaps`."""
+        return self._many.most_at_once(geometry)
+
+    def solver(self) -> Any:
+        """See `ManyMaps`."""
+        return self._many.solver()
+
+    def may_begin(self, frames: int) -> bool:
+        """Always: every map has a state of its own, or the last one."""
+        return True
+
+    def begin(self, sweep: Any, geometry: "SweepGeometry", solver: Any) -> Work:
+        """Begin a map with its own state, then take the next state."""
+        work: Work = self._many.begin(sweep, geometry, solver)
+        self._take_next()
+        return work
+
+    def end(self, work: Any) -> None:
+        """Learn nothing."""

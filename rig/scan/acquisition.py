@@ -20,6 +20,7 @@ from drivers.transports.endpoints import EMULATED_PREFIX
 from rig.count.sweeps import FirstSweep, SweepAssembler
 from rig.count.volume import SweepLayout
 from rig.depth.fog_meter import FogEstimate
+from rig.depth.reconstruct import MakesMaps
 from rig.devices.open import OpenRig
 from rig.devices.prepare import lead_s, most_sweeps, require_memory, spare_lead_s
 from rig.errors import DevicesError
@@ -28,7 +29,7 @@ from rig.plan.scan_plan import ScanPlan
 from rig.recording.replay import RecordedStart
 from rig.recording.writer import Recording
 from rig.run_folder.summary import PipelineStats
-from rig.scan.counting import AcquiredMap, CountingRequest, MakesMaps
+from rig.scan.counting import AcquiredMap, CountingRequest
 from rig.scan.monitor import NOBODY, Listeners, ScanProgress
 from rig.scan.pipeline import JOIN_S, Overload, Pipeline, require_policy, ring_for
 

@@ -10,7 +10,6 @@ from collections import deque
 from collections.abc import Callable, Iterator
 from contextlib import suppress
 from dataclasses import dataclass
-from typing import Protocol
 
 import numpy as np
 from numpy.typing import NDArray
@@ -18,8 +17,8 @@ from numpy.typing import NDArray
 from drivers.errors import DeviceFault
 from drivers.ring import RingReader
 from rig.count.sweeps import SweepAccount, SweepAssembler, SweepData
-from rig.count.volume import Counter, FrameTally, SweepLayout
-from rig.depth.reconstruct import MapResult
+from rig.depth.maps_at_once import MapsAtOnce
+from rig.depth.reconstruct import MakesMaps, MapResult
 from rig.scan.source import Source, blocks
 from rig.threads import StageThread
 
@@ -105,18 +104,6 @@ class MapQueue:
             return found
 
 
-class MakesMaps(Protocol):
-    """The part of a `Reconstructor` that a scan uses; once the counting thread runs, no other thread uses it."""
-
-    def counter(self, layout: SweepLayout) -> Counter:
-        """Make a counter whose sweeps `map` takes."""
-        ...
-
-    def map(self, sweep: FrameTally) -> MapResult:
-        """Make the map of one counted sweep."""
-        ...
-
-
 @dataclass(frozen=True, slots=True)
 class CountingRequest:
     """The work of one start of the SPAD.
@@ -133,12 +120,10 @@ class CountingRequest:
 
 
 class CountingThread:
-    """Thread that counts the blocks of one start of the SPAD and estimates each sweep at its end.
-
-    A sweep is estimated before any frame after it is counted.
+    """Thread that counts the blocks of one start of the SPAD, and has each sweep made into a map at its end.
 
     on_complete: called on this thread as soon as the marker that closes the last sweep is counted; the last map is
-      estimated after that.
+      begun after that.
 
     Maps go to `queue`, which ends with this thread. If the thread ended too early, `error` says why.
     """
@@ -161,9 +146,13 @@ class CountingThread:
         self.estimation_s = 0.0
         self.wait_s = 0.0
         """Time spent waiting for the caller to take maps."""
-        self.estimating = False
-        """Whether the map of a counted sweep is being made just now."""
         self.error: BaseException | None = None
+        self._maps = MapsAtOnce(request.maker, self._deliver)
+
+    @property
+    def estimating(self) -> bool:
+        """Whether the map of a counted sweep is being made just now."""
+        return self._maps.under_way
 
     def _run(self) -> None:
         try:
@@ -176,17 +165,25 @@ class CountingThread:
                         self._asked.assembler.settle(0)
         except BaseException as error:  # raised again on the caller's thread
             self.error = error
+        try:
+            while not self._queue.closed and self._maps.deliver_next():
+                pass
+        except BaseException as error:
+            self.error = self.error or error
         self._queue.end()
 
     def _count(self) -> None:
         assembler = self._asked.assembler
         for block in blocks(self._reader, self._source, self._asked.silence_s):
+            self._maps.deliver_ready()
             sweeps = assembler.add(block)
             while (sweep := self._next(sweeps)) is not None:
                 if assembler.complete:
                     self._reader.close()
                     self._on_complete()
-                self._estimate(sweep)
+                if self._asked.on_sweep is not None:
+                    self._asked.on_sweep(sweep)
+                self._maps.put(sweep, last=assembler.complete)
             if assembler.complete or self._queue.closed:
                 return
             self._settle()
@@ -207,16 +204,10 @@ class CountingThread:
         self._asked.assembler.settle(self._reader.holds - 1)
         self.counting_s += time.perf_counter() - begun
 
-    def _estimate(self, sweep: SweepData) -> None:
-        begun = time.perf_counter()
-        self.estimating = True
-        if self._asked.on_sweep is not None:
-            self._asked.on_sweep(sweep)
-        result = self._asked.maker.map(sweep.tally)
-        self.estimating = False
+    def _deliver(self, sweep: SweepData, result: MapResult) -> None:
         column = sweep.tally.bound_column()
         found = AcquiredMap(sweep.account(), column, result, sweep.count_s + result.compute_s)
-        estimated = time.perf_counter()
-        self.estimation_s += estimated - begun
+        self.estimation_s += result.compute_s
+        begun = time.perf_counter()
         self._queue.put(found)
-        self.wait_s += time.perf_counter() - estimated
+        self.wait_s += time.perf_counter() - begun

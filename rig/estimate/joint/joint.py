@@ -12,33 +12,25 @@ second line (`rig.estimate.joint.second_returns`). The model of light and medium
 `likelihood`, then from the map's own stripes.
 """
 
-from dataclasses import replace
+from dataclasses import dataclass, replace
 
 import numpy as np
 from numpy.typing import NDArray
 
 from rig.count.volume import Counter, CountVolume, SweepCounter, SweepLayout
-from rig.estimate.joint.confidence import pairs_to_ask, stripe_table
-from rig.estimate.joint.halo import bright_lines, halfway, learn_first_halo, learn_next_halo
-from rig.estimate.joint.labels.contrast import cost_contrast
-from rig.estimate.joint.labels.grid import BAND_ROWS, LabelGrid
-from rig.estimate.joint.lesson import add_quiet, fill_trust, read_positions
-from rig.estimate.joint.paths import CHUNK, along_columns, along_rows
-from rig.estimate.joint.place.place import amplitudes_of, line_width, place, weigh_light
-from rig.estimate.joint.second_returns import second_returns
-from rig.estimate.joint.tables import JointTables, Memory, grid_of, memory_for, tables_of
+from rig.estimate.joint.halo import halfway, learn_first_halo, learn_next_halo
+from rig.estimate.joint.place.place import amplitudes_of, line_width, weigh_light
+from rig.estimate.joint.solver import MapSolver
+from rig.estimate.joint.tables import MOST_BYTES, JointTables, bytes_of, grid_of, tables_of
 from rig.estimate.joint.temporal import TemporalPrior
-from rig.estimate.joint.vote import NEIGHBOURS_PX, collect, vote
-from rig.estimate.joint.winner import new_readout
 from rig.estimate.row.ambient import ambient_map
 from rig.estimate.row.em import expect, learn_again, lines_of, next_lattice
 from rig.estimate.row.inputs import state_of
 from rig.estimate.row.model import RowModel
-from rig.estimate.search.online_learning import LearningSetting, OnlineLearner, Seen, first_model
+from rig.estimate.search.online_learning import LearningSetting, OnlineLearner, first_model
 from rig.geometry.stripe_table import StripeTable
 from rig.geometry.windows import SweepGeometry
-from rig.simd import Float32, Float64
-from rig.simd.memory import pointers
+from rig.simd import Float32
 from rig.threads import RowWorkers
 
 LESSONS = 2
@@ -54,8 +46,6 @@ TRUSTED = np.float32(0.5)
 """An answer teaches if its trust exceeds this: under a halo, amplitudes are learned only from such stripes."""
 LOST = 0.2
 """If fewer answers than this share teach the last lesson in fog, light scattered many times may hide the stripes."""
-QUIET_COLUMNS = 8
-"""If there are dark frames, one column in so many is also used to learn the ambient light; else every column."""
 
 
 class Joint:
@@ -81,7 +71,7 @@ class Joint:
         self.kept_serves: bool | None = None
         """Whether the first map was estimated with the kept state; None before, and if there is none."""
         self._prior = TemporalPrior(temporal_prior)
-        self._memory: Memory | None = None
+        self._solver = MapSolver(self._workers, self._prior)
         self.used: RowModel | None = None
         """The state that the last map was estimated with."""
         if model is not None:
@@ -108,24 +98,44 @@ class Joint:
 
     def estimate(self, sweep: CountVolume, geometry: SweepGeometry) -> StripeTable:
         """Stripe table of one sweep. Afterwards `model` is the state for the next sweep."""
+        work = self.begin(sweep, geometry, self._solver)
+        stripes = work.run()
+        self.end(work)
+        return stripes
+
+    def most_at_once(self, geometry: SweepGeometry) -> int:
+        """Number of maps at the same time for which there is memory; 1 with a temporal prior."""
+        return 1 if self._prior.on else MOST_BYTES // bytes_of(grid_of(geometry))
+
+    def solver(self) -> MapSolver:
+        """Memory and a thread for one of several maps at the same time."""
+        return MapSolver(RowWorkers(1))
+
+    def may_begin(self, frames: int) -> bool:
+        """Whether the model of the next map is certain while maps with so many lit frames are under way."""
+        return self._lessons.certain(frames)
+
+    def begin(self, sweep: CountVolume, geometry: SweepGeometry, solver: MapSolver | None = None) -> "MapWork":
+        """Begin the map of a sweep, see `ManyMaps`. solver: None for the estimator's own."""
         model = self._lessons.model_for(lambda: self._first_model(sweep, geometry))
         setting = LearningSetting(model, geometry, sweep.exposures, sweep.dark_counts is not None)
         tables = self._lessons.tables(setting, self._workers)
         self._prior.begin(geometry, tables.grid)
         self.used = model if self._prior.before is None else replace(model, before=self._prior.before)
-        first, room = self._stripes(sweep, tables), self._room(tables.grid).seconds
-        x2_px, confidence2 = second_returns(
-            sweep, tables.grid, tables.sweep, tables.light, first.x_px, room, self._workers
-        )
-        stripes = replace(first, x2_px=x2_px, confidence2=confidence2)
+        return MapWork(sweep, setting, tables, solver or self._solver, self.used)
+
+    def end(self, work: "MapWork") -> None:
+        """Take note of a map that `run` has made: afterwards `model` is the state for the next sweep."""
+        assert work.stripes is not None, "the map has been made"
+        sweep, tables, stripes, model = work.sweep, work.tables, work.stripes, work.setting.model
         self._prior.leave(stripes, tables.grid)
         # Whether the first map is good enough to learn from is judged by the trust of its lessons.
         known = self._lessons.model is not None
-        judged = stripes if known else self._teaching(sweep, tables, stripes)
+        judged = stripes if known else work.solver.teaching(sweep, tables, stripes)
         self._lessons.attend(
-            judged, model, int(sweep.n_frames.sum()), lambda: self._seen(sweep, geometry, tables, stripes)
-        )
-        return stripes
+            judged, model, int(sweep.n_frames.sum()),
+            lambda: work.solver.seen(sweep, work.setting.geometry, tables, stripes),
+        )  # fmt: skip
 
     def _first_model(self, volume: CountVolume, geometry: SweepGeometry) -> RowModel:
         """The model for the first sweep: learned row by row, then from a kept state or the whole map's stripes."""
@@ -145,7 +155,9 @@ class Joint:
                 # Light scattered many times has misled these lessons, so that they found a halo, or too few stripes to
                 # find one. Begin again, and check stripes by contrast.
                 misled = model
-                witness_px, model, lessons = self._by_contrast(volume, geometry, model), start, 0
+                setting = LearningSetting(model, geometry, volume.exposures, volume.dark_counts is not None)
+                tables = tables_of(setting, self._workers, contrast=True)
+                witness_px, model, lessons = self._solver.by_contrast(volume, tables), start, 0
         # Lost stripes prove no halo: without one, nothing has to be learned by contrast.
         return misled if witness_px is not None and not (model.halo.any() or misled.halo.any()) else model
 
@@ -178,23 +190,22 @@ class Joint:
     ) -> tuple[RowModel, float]:  # fmt: skip
         """The model learned from stripes that are estimated with `model`, and the share of answers that teach it.
 
-        intensity: of the volume. witness_px: x_px of `_by_contrast`; stripes more than AGREE_PX from it are not used.
+        intensity: of the volume. witness_px: of `MapSolver.by_contrast`; stripes off it by over AGREE_PX are left out.
         """
-        before = model
+        before, solver = model, self._solver
         setting = LearningSetting(model, geometry, volume.exposures, volume.dark_counts is not None)
         tables = tables_of(setting, self._workers, contrast=witness_px is not None)
-        stripes = self._teaching(volume, tables, self._stripes(volume, tables, lesson=True))
+        stripes = solver.teaching(volume, tables, solver.stripes(volume, tables, lesson=True))
         if witness_px is not None:
             with np.errstate(invalid="ignore"):
                 agree = np.abs(stripes.x_px - witness_px) <= AGREE_PX
             stripes = replace(stripes, confidence=np.where(agree, stripes.confidence, np.float32(0)))
-        quiet = self._quiet(volume, geometry, tables, stripes)
+        quiet = solver.quiet(volume, geometry, tables, stripes)
         ambient = ambient_map(volume, intensity, geometry, quiet)
         width = line_width(volume, tables.sweep, tables.state, stripes, self._workers)
         model = replace(model, line_sigma_px=width or model.line_sigma_px)
         model = learn_again(volume, geometry, model, ambient, stripes, self._workers)
-        assert self._memory is not None, "a map has been estimated"
-        places = self._memory.places
+        places = solver.places
         model = learn_first_halo(volume, geometry, model, ambient, tables, stripes, places, self._workers)
         if witness_px is not None:
             model = halfway(before, model)
@@ -204,105 +215,22 @@ class Joint:
         amplitude, weight = amplitudes_of(places, None if witness_px is None else stripes.confidence > TRUSTED)
         return replace(model, amplitude=amplitude, weight=weight), float(np.mean(stripes.confidence > TRUSTED))
 
-    def _by_contrast(self, volume: CountVolume, geometry: SweepGeometry, model: RowModel) -> Float32:
-        """x_px (rows, columns) from the costs of `rig.estimate.joint.labels.contrast` alone."""
-        setting = LearningSetting(model, geometry, volume.exposures, volume.dark_counts is not None)
-        tables = tables_of(setting, self._workers, contrast=True)
-        x_px = np.empty(tables.grid.x_far.shape, np.float32)
-        self._read(volume, tables, x_px, alone=True)
-        self._workers.settle()
-        return x_px
 
-    def _teaching(self, volume: CountVolume, tables: JointTables, stripes: StripeTable) -> StripeTable:
-        """The stripe table with the trust of `fill_trust` in place of the confidence."""
-        memory, trust = self._room(tables.grid), np.empty_like(stripes.confidence)
-        self._workers.over(
-            len(trust),
-            lambda first, last: fill_trust(
-                stripes.x_px, stripes.x_sd_px, volume.n_frames, memory.answer.margin, memory.places,
-                tables.bright.ambient, first, last, trust,
-            ),
-        )  # fmt: skip
-        return replace(stripes, confidence=trust)
+@dataclass(slots=True, eq=False)
+class MapWork:
+    """A map under way: counts, the model and its tables, and a solver. used: the model with the prior's memory.
 
-    def _read(self, volume: CountVolume, tables: JointTables, x_px: Float32, *, alone: bool = False) -> None:
-        """Fill x_px (rows, columns) with the positions of the best labels, and the answers in memory.
+    stripes: None until `run` has made them.
+    """
 
-        The last step is only queued. alone: whether costs are those of contrast alone.
-        """
-        grid, workers = tables.grid, self._workers
-        rows, columns = x_px.shape
-        memory = self._room(grid)
+    sweep: CountVolume
+    setting: LearningSetting
+    tables: JointTables
+    solver: MapSolver
+    used: RowModel
+    stripes: StripeTable | None = None
 
-        def tie_rows(first: int, last: int) -> None:
-            # Band by band: rows of a band share tables, and their costs are tied while they are still in the cache.
-            if first not in tables.rooms:
-                room = tables.costs.room()
-                tables.rooms[first] = room, pointers(room)
-            _, room_at = tables.rooms[first]
-            for band in range(first, last, BAND_ROWS):
-                end = min(band + BAND_ROWS, last)
-                tables.costs.fill(volume, band, end, room_at, memory.cost)
-                if tables.contrast is not None:
-                    cost_contrast(volume, tables.contrast, band, end, memory.cost, alone=alone)
-                self._prior.add(volume, band, end, memory.cost)
-                along_rows(memory.cost, memory.message, band, end)
-
-        def tie_columns(first: int, last: int) -> None:
-            desk = new_readout(tables.settings, memory.answer, CHUNK, grid.labels)
-            along_columns(memory.cost, memory.message, first, last, pointers(desk))
-
-        neighbours = grid.column_px <= NEIGHBOURS_PX
-
-        def read(first: int, last: int) -> None:
-            if neighbours:
-                vote(memory.ballots, memory.cost, first, last, memory.answer)
-            read_positions(
-                grid.x_far, volume.n_frames, grid.side, tables.sweep.u.shape[1], memory.answer, first, last, x_px,
-                memory.places.distance,
-            )  # fmt: skip
-
-        workers.over(rows, tie_rows)
-        workers.post(columns, tie_columns)
-        if neighbours:
-            workers.post(columns, lambda first, last: collect(memory.answer, first, last, memory.ballots))
-        workers.settle()
-        workers.post(rows, read)  # without waiting: each thread goes on with the same rows
-
-    def _stripes(self, volume: CountVolume, tables: JointTables, *, lesson: bool = False) -> StripeTable:
-        grid, workers, memory = tables.grid, self._workers, self._room(tables.grid)
-        x_px = np.empty(grid.x_far.shape, np.float32)
-        self._read(volume, tables, x_px)
-        seen = volume, tables.sweep, tables.state
-        sd = place(*seen, tables.shares, x_px, memory.places, workers, lesson=lesson)
-        lit = volume.n_frames > 0
-        pairs = tables.pairs if lit.all() else pairs_to_ask(np.isfinite(grid.x_far) & lit)
-        return stripe_table(x_px, sd, volume.n_frames, memory.answer, memory.places, pairs, tables.bright, workers)
-
-    def _room(self, grid: LabelGrid) -> Memory:
-        memory = self._memory
-        if memory is None or not memory.fits(grid):
-            memory = self._memory = memory_for(grid)
-        return memory
-
-    def _seen(self, volume: CountVolume, geometry: SweepGeometry, tables: JointTables, stripes: StripeTable) -> Seen:
-        assert self._memory is not None, "a map has been estimated"
-        quiet = self._quiet(volume, geometry, tables, stripes)
-        lines = lines_of(volume, next_lattice(geometry), stripes)
-        bright = bright_lines(volume, tables, stripes, self._memory.places, self._workers)
-        return Seen(volume, volume.intensity(self._workers), quiet, lines, bright)
-
-    def _quiet(
-        self, volume: CountVolume, geometry: SweepGeometry, tables: JointTables, stripes: StripeTable
-    ) -> Float64:
-        quiet = np.zeros((2, geometry.rows, geometry.width))
-        most_light = float(np.median(tables.state.ambient))
-
-        def work(first: int, last: int) -> None:
-            add_quiet(
-                volume.counts, volume.n_frames, tables.sweep, tables.state, tables.halo, stripes.x_px, stripes.signal,
-                stripes.confidence, QUIET_COLUMNS if tables.dark else 1, most_light, first, last, quiet,
-            )  # fmt: skip
-
-        self._workers.over(geometry.rows, work)
-        return quiet
+    def run(self) -> StripeTable:
+        """Make the stripe table."""
+        self.stripes = self.solver.map(self.sweep, self.tables)
+        return self.stripes

@@ -1,4 +1,4 @@
-"""Tables that `joint` makes once per model, and the memory that it keeps from map to map."""
+"""Tables that `joint` makes once per model."""
 
 from typing import NamedTuple
 
@@ -7,24 +7,20 @@ import numpy as np
 from rig.errors import UsageError
 from rig.estimate.joint.confidence import Brightness, brightness_of, pairs_to_ask
 from rig.estimate.joint.labels.contrast import Contrast, contrast_of
-from rig.estimate.joint.labels.cost_rows import CostRoom
 from rig.estimate.joint.labels.costs import Costs, costs_of
 from rig.estimate.joint.labels.grid import LabelGrid, label_grid
-from rig.estimate.joint.place.place import new_places, profile_table
-from rig.estimate.joint.place.places import Places
-from rig.estimate.joint.second_returns import SecondLight, SecondRoom, second_light, second_room
-from rig.estimate.joint.vote import Ballots, new_ballots
-from rig.estimate.joint.winner import AnswerSettings, LabelAnswers, answer_settings, new_answer
+from rig.estimate.joint.place.place import profile_table
+from rig.estimate.joint.second_returns import SecondLight, second_light
+from rig.estimate.joint.winner import AnswerSettings, answer_settings
 from rig.estimate.row.inputs import RowState, Sweep, halo_shares, state_of, sweep_of
 from rig.estimate.search.online_learning import LearningSetting
 from rig.geometry.windows import SweepGeometry
-from rig.simd import Float32, Uint8
-from rig.simd.memory import aligned_zeros
+from rig.simd import Float32
 from rig.threads import RowWorkers
 
 MOST_BYTES = 4 << 30
-"""Most that costs and messages of a map may take: room for 1000 columns, each searched over all of 1024 x 1024 pixels.
-Tables of a halo come on top, half as much in that case."""
+"""Most that costs and messages of all maps under way may take: room for a map of 1000 columns, each searched over all
+of 1024 x 1024 pixels. Tables of a halo come on top, half as much in that case."""
 
 
 class JointTables(NamedTuple):
@@ -45,42 +41,21 @@ class JointTables(NamedTuple):
     bright: Brightness
     dark: bool
     settings: AnswerSettings
-    rooms: dict[int, tuple[CostRoom, CostRoom]]
-    """For each thread, by its first row: working memory for costs and `pointers` to it. Making them takes 0.5 ms."""
     pairs: Float32
     """Pairs of `pairs_to_ask`, for maps whose columns all have frames."""
 
 
-class Memory(NamedTuple):
-    """Memory that all maps use in turn: costs and messages, uint8 (rows, columns, labels), and the answers."""
-
-    cost: Uint8
-    message: Uint8
-    answer: LabelAnswers
-    ballots: Ballots
-    places: Places
-    seconds: SecondRoom
-
-    def fits(self, grid: LabelGrid) -> bool:
-        """Whether the memory has the shape of this grid's maps."""
-        return self.cost.shape == (*grid.x_far.shape, grid.labels)
-
-
-def memory_for(grid: LabelGrid) -> Memory:
-    """Memory for maps of a grid."""
+def bytes_of(grid: LabelGrid) -> int:
+    """Memory that costs and messages of a map take."""
     rows, columns = grid.x_far.shape
-    cost, message = (aligned_zeros((rows, columns, grid.labels), np.uint8) for _ in range(2))
-    return Memory(
-        cost, message, new_answer(rows, columns), new_ballots(rows, columns), new_places(rows, columns),
-        second_room(grid),
-    )  # fmt: skip
+    return int(2 * rows * columns * grid.labels)
 
 
 def grid_of(geometry: SweepGeometry) -> LabelGrid:
     """The labels of a geometry. Raises UsageError if their costs would take too much memory."""
     grid = label_grid(geometry)
     rows, columns = grid.x_far.shape
-    if (needed := 2 * rows * columns * grid.labels) > MOST_BYTES:
+    if (needed := bytes_of(grid)) > MOST_BYTES:
         raise UsageError(
             f"joint weighs {grid.labels} places on each of {rows} rows of {columns} columns, which takes "
             f"{needed / 2**30:.1f} GiB; it may take {MOST_BYTES / 2**30:.3g}: narrow depth_range, or use the estimator "
@@ -101,6 +76,5 @@ def tables_of(setting: LearningSetting, workers: RowWorkers, *, contrast: bool =
     return JointTables(
         grid, costs, by_contrast, sweep, state, profile_table(sigma_px),
         halo_shares(model, geometry.width if model.halo.any() else 0), second_light(state, sigma_px, grid, sweep),
-        brightness_of(model), setting.dark, answer_settings(grid.stripes), {},
-        pairs_to_ask(np.isfinite(grid.x_far)),
+        brightness_of(model), setting.dark, answer_settings(grid.stripes), pairs_to_ask(np.isfinite(grid.x_far)),
     )  # fmt: skip

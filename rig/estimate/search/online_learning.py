@@ -114,6 +114,14 @@ class OnlineLearner(Generic[Tables]):
         """The model with which to estimate a sweep. first: called to learn it from the sweep if there is none yet."""
         return self.model if self.model is not None else first()
 
+    def certain(self, frames: int) -> bool:
+        """Whether there is a model, and stays while maps with so many lit frames, all together, are attended to."""
+        if self.model is None or frames == 0 or not self._learns:
+            return self.model is not None
+        # A lesson could begin with the first of these maps.
+        since = 0 if self._lesson is None else self._frames_since
+        return since + frames < LAG_FRAMES
+
     def tables(self, setting: LearningSetting, workers: RowWorkers) -> Tables:
         """Tables for a setting, made again only when the setting changes."""
         if self._made is None or not self._made[0].same(setting):

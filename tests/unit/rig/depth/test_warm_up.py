@@ -24,10 +24,10 @@ def test_binding_compiles_nothing_more_behind_it():
 
 
 def test_kernels_of_a_halo_are_compiled_for_joint_before_a_map_shows_one(monkeypatch):
-    from rig.estimate.joint import joint
+    from rig.estimate.joint import solver
 
     seen = []
-    cost_contrast = joint.cost_contrast
-    monkeypatch.setattr(joint, "cost_contrast", lambda *args, **named: (seen.append(1), cost_contrast(*args, **named)))
+    cost_contrast = solver.cost_contrast
+    monkeypatch.setattr(solver, "cost_contrast", lambda *args, **named: (seen.append(1), cost_contrast(*args, **named)))
     warm_up("joint", "none", 3, dark=False)
     assert seen

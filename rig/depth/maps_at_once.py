@@ -1,0 +1,122 @@
+"""Makes the maps of counted sweeps, several at the same time where the estimator can, and delivers them in the order of
+the sweeps.
+
+A map made on one thread takes less time of all processors together than one that several threads share, since parts of
+it cannot be shared. So in a stream each thread makes a map of its own. The results are the same: an estimator says
+whether the model of the next map is certain before the maps that are under way have been learned from
+(`Reconstructor.may_begin`). A map that nothing would run beside is shared by all threads.
+"""
+
+import threading
+import time
+from collections import deque
+from collections.abc import Callable
+from concurrent.futures import Future, ThreadPoolExecutor
+from dataclasses import replace
+from typing import NamedTuple
+
+from rig.count.sweeps import SweepData
+from rig.depth.reconstruct import Lane, MakesMaps, MapResult, MapUnderWay, Reconstructor
+
+
+class _UnderWay(NamedTuple):
+    sweep: SweepData
+    work: MapUnderWay
+    lane: Lane
+    result: Future[MapResult]
+
+
+class MapsAtOnce:
+    """Makes maps with `maker`. All methods are called by one thread; `deliver` is called on it, with each sweep and its
+    map. A map's `compute_s` is its share of the time: n maps that are made at the same time each get an n-th of it.
+    """
+
+    def __init__(self, maker: MakesMaps, deliver: Callable[[SweepData, MapResult], None]) -> None:
+        self._maker = maker
+        self._deliver = deliver
+        self._free = maker.lanes() if isinstance(maker, Reconstructor) else []
+        self._pool = ThreadPoolExecutor(len(self._free), "map") if self._free else None
+        self._maps: deque[_UnderWay] = deque()
+        self._alone = False
+        self._time = _SharedTime()
+
+    @property
+    def under_way(self) -> bool:
+        """Whether a map is being made, or waits to be delivered. May be called from any thread."""
+        return self._alone or bool(self._maps)
+
+    def put(self, sweep: SweepData, *, last: bool) -> None:
+        """Begin the map of a sweep, after those before it if it needs what is learned from them, or if all threads are
+        at work. last: whether no other sweep follows soon.
+
+        Raises what making a map raises, of this sweep or of one before.
+        """
+        self.deliver_ready()
+        maker, pool = self._maker, self._pool
+        if pool is not None and isinstance(maker, Reconstructor):
+            while self._maps and not (self._free and maker.may_begin(self._frames())):
+                self._deliver_next()
+            if (self._maps or not last) and maker.may_begin(self._frames()):
+                lane = self._free.pop()
+                work = maker.begin(sweep.tally, lane)
+                self._maps.append(_UnderWay(sweep, work, lane, pool.submit(self._time.of, work.run)))
+                return
+        self._alone = True
+        try:
+            result = maker.map(sweep.tally)
+        finally:
+            self._alone = False
+        self._deliver(sweep, result)
+
+    def deliver_ready(self) -> None:
+        """Deliver the maps that are ready."""
+        while self._maps and self._maps[0].result.done():
+            self._deliver_next()
+
+    def deliver_next(self) -> bool:
+        """Wait for the next map and deliver it; False if none is under way."""
+        if self._maps:
+            self._deliver_next()
+        return bool(self._maps)
+
+    def _frames(self) -> int:
+        return sum(int(each.sweep.tally.n_frames.sum()) for each in self._maps)
+
+    def _deliver_next(self) -> None:
+        sweep, work, lane, made = self._maps[0]
+        try:
+            result = made.result()
+            work.end()
+        finally:
+            self._maps.popleft()
+            self._free.append(lane)
+        self._deliver(sweep, result)
+
+
+class _SharedTime:
+    """Wall time, divided at each moment by the number of maps that are being made."""
+
+    def __init__(self) -> None:
+        self._lock = threading.Lock()
+        self._each_s = 0.0
+        """Time that a map would have been charged that has been made all along."""
+        self._at_s = 0.0
+        self._running = 0
+
+    def of(self, make: Callable[[], MapResult]) -> MapResult:
+        """The map that `make` returns, with its share of the time."""
+        begun_s = self._step(1)
+        try:
+            result = make()
+        finally:
+            ended_s = self._step(-1)
+        return replace(result, compute_s=ended_s - begun_s)
+
+    def _step(self, more: int) -> float:
+        with self._lock:
+            now_s = time.perf_counter()
+            if self._running:
+                self._each_s += (now_s - self._at_s) / self._running
+            self._at_s = now_s
+            self._running += more
+            return self._each_s
