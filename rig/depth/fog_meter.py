@@ -249,11 +249,12 @@ def _dark_offset(sweep: Any, ambient: Float32, hot_flux: float) -> tuple[float, 
         return None
     frames = np.broadcast_to(sweep.n_dark if sweep.dark_frames is None else sweep.dark_frames, ambient.shape[1:])
     used = (ambient <= hot_flux).astype(np.float64)
-    exposures, ones = float((used @ frames).sum()), float(np.vdot(used, sweep.dark_counts))
+    # einsum: products of matrices would wake the threads of a library, beside those that make maps.
+    exposures, ones = float(np.einsum("yx,x->", used, frames)), float(np.einsum("yx,yx->", used, sweep.dark_counts))
     if ones < 1.0 or ones >= exposures:
         return None
     level = -math.log1p(-ones / exposures)
-    mean = float(((used * ambient) @ frames).sum()) / exposures
+    mean = float(np.einsum("yx,yx,x->", used, ambient, frames)) / exposures
     return level - mean, level / math.sqrt(ones)
 
 
