@@ -297,7 +297,9 @@ def _map_cases(workers: Workers, extent: Extent) -> list[Case]:
         bits = surface.frames(k, workers[most])
         volume = count_surface(surface, bits, k, workers[most])
         cases += [Case("joint", window, k, n, None, stages.joint_stage(surface, volume, n, model)) for n in workers]
-    cases.append(Case("joint-sweep", window, k, most, None, stages.joint_sweep_stage(surface, bits, k, most, model)))
+    cases += [
+        Case("joint-sweep", window, k, n, None, stages.joint_sweep_stage(surface, bits, k, n, model)) for n in workers
+    ]
     return cases
 
 

@@ -7,6 +7,7 @@ maps alternately. Nothing is learned meanwhile. Stages that make maps begin with
 
 import time
 from collections.abc import Callable, Iterator
+from concurrent.futures import ThreadPoolExecutor
 from contextlib import contextmanager
 from dataclasses import dataclass
 from pathlib import Path
@@ -253,23 +254,31 @@ def joint_stage(surface: BenchSurface, volume: CountVolume, threads: int, model:
 
 
 def joint_sweep_stage(surface: BenchSurface, bits: Bits, exposures: int, threads: int, model: RowModel) -> Stage:
-    """The stage that counts and runs `joint`, one after the other."""
+    """The stage that counts and runs `joint` as a scan does: a map on each thread, while the next sweep is counted."""
     bins, column, x0 = sweep_frames(surface.geometry, exposures)
 
     def measure(seconds: float) -> Measured:
         joint = Joint(threads, model, learns=False)
         counter = joint.counter(surface.layout(exposures), surface.geometry)
+        solvers = [joint.solver() for _ in range(threads)]
 
-        def make() -> NDArray[np.float32]:
+        def count() -> CountVolume:
             counter.reset()
             for first in range(0, len(bits), BLOCK_FRAMES):
                 block = slice(first, first + BLOCK_FRAMES)
                 counter.add(bits[block], bins[block], column[block], x0[block])
             volume = counter.finish()
             assert isinstance(volume, CountVolume), "joint needs the counts of whole sweeps"
-            return joint.estimate(volume, surface.geometry).x_px
+            return volume
 
-        return _timed(make, seconds, len(bits), stripe_error(make() - surface.truth_px()))
+        with ThreadPoolExecutor(threads) as pool:
+
+            def make() -> NDArray[np.float32]:
+                works = [pool.submit(joint.begin(count(), surface.geometry, solver).run) for solver in solvers]
+                made = [work.result() for work in works]
+                return made[0].x_px
+
+            return _timed(make, seconds, len(bits), stripe_error(make() - surface.truth_px()), maps=threads)
 
     return measure
 
@@ -309,8 +318,12 @@ def _timed(
     frames: int,
     error: StripeError,
     beside: Callable[[], object] | None = None,
+    maps: int = 1,
 ) -> Measured:
-    """Make maps of `frames` frames each for `seconds`. beside: called after each map, at least PAIRS times."""
+    """Make maps of `frames` frames each for `seconds`. beside: called after each map, at least PAIRS times.
+
+    maps: made by each call of `make`.
+    """
     spent: list[float] = []
     quotients: list[float] = []
     while sum(spent) < seconds or len(spent) < (1 if beside is None else PAIRS):
@@ -318,7 +331,7 @@ def _timed(
         if beside is not None:
             quotients.append(spent[-1] / _seconds_of(beside))
     times = float(np.median(quotients)) if quotients else None
-    return Measured(len(spent) * frames, sum(spent), error, len(spent), times)
+    return Measured(maps * len(spent) * frames, sum(spent), error, maps * len(spent), times)
 
 
 def _seconds_of(work: Callable[[], object]) -> float:

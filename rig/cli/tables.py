@@ -307,7 +307,7 @@ _TITLES = {
     "likelihood-sweep": "the same with what is done once a sweep",
     "likelihood-full": "counting + likelihood in a window of whole frames",
     "joint": "joint from counts, whole maps of 512 x 500; x sgbm: its time over that of sgbm, by turns",
-    "joint-sweep": "counting + joint, one after the other",
+    "joint-sweep": "counting + joint, a map on each thread",
     "sgbm": "OpenCV's StereoSGBM, MODE_HH4, as many disparities and pixels, two pictures",
     "disk": "counting + likelihood from a recording (page cache), header checksums",
     "numpy": "numpy: unpackbits, sum, argmax",

@@ -9,6 +9,7 @@ sweep. How fast `joint` is on this machine and with these threads is measured ju
 import math
 import os
 import time
+from concurrent.futures import ThreadPoolExecutor
 from dataclasses import replace
 from pathlib import Path
 
@@ -97,11 +98,11 @@ def kept_model(file: Path | None, estimator: str, geometry: SweepGeometry) -> tu
 
 
 def time_of_map(geometry: SweepGeometry, threads: int) -> float:
-    """Seconds that `joint` takes on this machine for a map, measured on a part of the picture and scaled up.
+    """Seconds from map to map of `joint` on this machine, measured on a part of the picture and scaled up.
 
-    The first map, from which it learns, takes longer; so do maps with a halo.
+    Each thread makes a map, as in a stream. The first map, from which it learns, takes longer; so do maps with a halo.
     """
-    from rig.estimate.joint.joint import Joint
+    from rig.estimate.joint.joint import Joint, MapWork
     from rig.estimate.row.em import start_model
 
     part = _middle(geometry)
@@ -116,12 +117,15 @@ def time_of_map(geometry: SweepGeometry, threads: int) -> float:
         dark_counts=None, n_dark=0, width=part.width, exposures=EXPOSURES,
     )  # fmt: skip
     model = start_model(sweep, part, np.full((part.rows, part.width), 0.05, np.float32), 0.0)
-    later, took_s = Joint(threads, model, learns=False), []
-    for _ in range(1 + TRIES):
-        begun = time.perf_counter()
-        later.estimate(sweep, part)
-        took_s.append(time.perf_counter() - begun)
-    return min(took_s[1:]) * (geometry.rows * geometry.columns) / (part.rows * part.columns)
+    joint, took_s = Joint(threads, model, learns=False), []
+    at_once = max(min(threads, joint.most_at_once(geometry)), 1)
+    works = [joint.begin(sweep, part, joint.solver()) for _ in range(at_once)]
+    with ThreadPoolExecutor(at_once) as pool:
+        for _ in range(1 + TRIES):
+            begun = time.perf_counter()
+            list(pool.map(MapWork.run, works))
+            took_s.append(time.perf_counter() - begun)
+    return min(took_s[1:]) / at_once * (geometry.rows * geometry.columns) / (part.rows * part.columns)
 
 
 def _middle(geometry: SweepGeometry) -> SweepGeometry:

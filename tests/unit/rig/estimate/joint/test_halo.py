@@ -114,7 +114,7 @@ def test_first_and_later_maps_tell_whether_there_is_a_halo(light, other):
     assert np.isfinite(errors).mean() > 0.95
     setting = LearningSetting(joint.used, swept.geometry, 5, False)
     tables = tables_of(setting, WORKERS)
-    seen = bright_lines(swept.volume, tables, stripes, joint._memory.places, WORKERS)
+    seen = bright_lines(swept.volume, tables, stripes, joint._solver.places, WORKERS)
     assert learn_next_halo(setting, seen, WORKERS) is joint.used
     wrong = first_map(other)[1].used
     assert learn_next_halo(replace(setting, model=wrong), seen, WORKERS).halo.any() == (light == "halo")
@@ -133,7 +133,7 @@ def test_surroundings_hold_a_map_whose_halo_was_learned_three_times_too_strong(e
     model = replace(joint.used, halo=joint.used.halo * np.float32(3))
     tables = tables_of(LearningSetting(model, swept.geometry, exposures, False), RowWorkers(2))
     within, without = (
-        np.mean(swept.errors(joint._stripes(swept.volume, each).x_px) <= 1.0)
+        np.mean(swept.errors(joint._solver.stripes(swept.volume, each).x_px) <= 1.0)
         for each in (tables, tables._replace(contrast=None))
     )
     assert within > 0.92

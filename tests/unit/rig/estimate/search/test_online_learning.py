@@ -1,5 +1,6 @@
 """When a map teaches, and from which map on that is heeded."""
 
+from collections import deque
 from dataclasses import replace
 from types import SimpleNamespace
 
@@ -70,6 +71,38 @@ def test_a_map_teaches_every_so_many_frames_and_is_heeded_a_fixed_number_later(t
 def test_lessons_carry_on_what_was_seen_before(taught):
     assert run(TEACH_FRAMES, 4) == [0, 0, 1, 1]
     assert taught == [(0, None), (2, "seen 0")]
+
+
+@pytest.mark.parametrize("learns", [True, False])
+@pytest.mark.parametrize("frames", [LAG_FRAMES // 5, LAG_FRAMES // 2, LAG_FRAMES, 3 * LAG_FRAMES])
+@pytest.mark.parametrize("at_once", [2, 7])
+def test_maps_begun_before_earlier_ones_taught_use_the_same_models(taught, learns, frames, at_once):
+    maps = 3 * (TEACH_FRAMES + LAG_FRAMES) // frames + 2
+    school = OnlineLearner(lambda setting, workers: setting.model.none_weight, MODEL, learns=learns)
+    under_way, used, most = deque(), [], 0
+
+    def end():
+        index, model = under_way.popleft()
+        seen = SimpleNamespace(tally=None, intensity=None, quiet=None, lines=index)
+        school.attend(stripes(), model, frames, lambda: seen)
+
+    for index in range(maps):
+        while len(under_way) == at_once or not school.certain(frames * len(under_way)):
+            end()
+        model = school.model_for(pytest.fail)
+        school.tables(LearningSetting(model, GEOMETRY, 10, False), WORKERS)
+        used.append(round(100 * (model.none_weight - MODEL.none_weight)))
+        under_way.append((index, model))
+        most = max(most, len(under_way))
+    while under_way:
+        end()
+    assert used == run(frames, maps, learns)
+    assert most == min(at_once, maps, (LAG_FRAMES - 1) // frames + 1 if learns else maps)
+
+
+def test_no_map_may_begin_before_the_first_one_has_taught():
+    school = OnlineLearner(lambda setting, workers: None, None, learns=True)
+    assert not school.certain(0)
 
 
 def test_an_estimator_that_learns_nothing_keeps_its_model(taught):
