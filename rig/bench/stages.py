@@ -6,8 +6,9 @@ maps alternately. Nothing is learned meanwhile. Stages that make maps begin with
 """
 
 import time
+from collections import deque
 from collections.abc import Callable, Iterator
-from concurrent.futures import ThreadPoolExecutor
+from concurrent.futures import Future, ThreadPoolExecutor
 from contextlib import contextmanager
 from dataclasses import dataclass
 from pathlib import Path
@@ -35,6 +36,7 @@ from rig.estimate.joint.joint import Joint
 from rig.estimate.likelihood import Likelihood
 from rig.estimate.row.model import RowModel
 from rig.estimate.search.stream import ColumnJudge
+from rig.geometry.stripe_table import StripeTable
 from rig.threads import RowWorkers
 
 Bits = NDArray[np.uint8]
@@ -253,6 +255,10 @@ def joint_stage(surface: BenchSurface, volume: CountVolume, threads: int, model:
     return measure
 
 
+ROUNDS = 4
+"""Maps that each thread makes between two looks at the clock, where several are made at the same time."""
+
+
 def joint_sweep_stage(surface: BenchSurface, bits: Bits, exposures: int, threads: int, model: RowModel) -> Stage:
     """The stage that counts and runs `joint` as a scan does: a map on each thread, while the next sweep is counted."""
     bins, column, x0 = sweep_frames(surface.geometry, exposures)
@@ -274,11 +280,16 @@ def joint_sweep_stage(surface: BenchSurface, bits: Bits, exposures: int, threads
         with ThreadPoolExecutor(threads) as pool:
 
             def make() -> NDArray[np.float32]:
-                works = [pool.submit(joint.begin(count(), surface.geometry, solver).run) for solver in solvers]
-                made = [work.result() for work in works]
-                return made[0].x_px
+                under_way: deque[Future[StripeTable]] = deque()
+                for index in range(ROUNDS * threads):
+                    if len(under_way) == threads:
+                        under_way.popleft().result()
+                    work = joint.begin(count(), surface.geometry, solvers[index % threads])
+                    under_way.append(pool.submit(work.run))
+                return [each.result() for each in under_way][-1].x_px
 
-            return _timed(make, seconds, len(bits), stripe_error(make() - surface.truth_px()), maps=threads)
+            error = stripe_error(make() - surface.truth_px())
+            return _timed(make, seconds, len(bits), error, maps=ROUNDS * threads)
 
     return measure
 

@@ -226,6 +226,8 @@ def add_runs(
     as_bytes = planes.view(np.uint8)
     n_lit = new_counts(2, padded_lanes(window))
     n_dark = new_counts(2, padded_lanes(used_words * WORD_PX))
+    n_pairs, eights = n_lit.view(np.uint16), counts.view(np.uint64)
+    lit_pair = n_pairs.shape[1] // PAIRS
     chunk_rows = rows_of_chunk(row_words)
     for y0 in range(first_row, last_row, chunk_rows):
         y1 = min(y0 + chunk_rows, last_row)
@@ -255,8 +257,14 @@ def add_runs(
                     for r in range(min(2, y1 - y)):
                         if c < 0:
                             _add_dark(n_row[r], wanted * (WORD_PX // STEPS), dark[y + r])
-                        else:
+                        elif counts.itemsize > 1:
                             write_counts(n_row[r], counts[c, y + r])
+                        else:  # all pairs of a lane at once: sums of bytes do not overflow, see `with_room`
+                            for i in range(window // STEPS):
+                                eight = np.uint64(0)
+                                for q in range(PAIRS):
+                                    eight |= np.uint64(n_pairs[r, q * lit_pair + PAD + i]) << np.uint64(16 * q)
+                                eights[c, y + r, i] += eight
             f = g
     keep_alive(as_bytes, n_lit, n_dark)
 
