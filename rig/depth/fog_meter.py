@@ -247,15 +247,16 @@ def _dark_offset(sweep: Any, ambient: Float32, hot_flux: float) -> tuple[float, 
     none or all of their pixels fired."""
     if sweep.dark_counts is None:
         return None
-    frames = np.broadcast_to(sweep.n_dark if sweep.dark_frames is None else sweep.dark_frames, ambient.shape[1:])
-    used = (ambient <= hot_flux).astype(np.float64)
-    # einsum: products of matrices would wake the threads of a library, beside those that make maps.
-    exposures, ones = float(np.einsum("yx,x->", used, frames)), float(np.einsum("yx,yx->", used, sweep.dark_counts))
+    from rig.depth.kernels import sum_dark
+
+    frames = sweep.dark_frames
+    if frames is None:
+        frames = np.full(ambient.shape[1], sweep.n_dark, np.int32)
+    ones, exposures, light = sum_dark(sweep.dark_counts, frames, ambient, hot_flux)
     if ones < 1.0 or ones >= exposures:
         return None
     level = -math.log1p(-ones / exposures)
-    mean = float(np.einsum("yx,yx,x->", used, ambient, frames)) / exposures
-    return level - mean, level / math.sqrt(ones)
+    return level - light / exposures, level / math.sqrt(ones)
 
 
 def _dark_alone(sums: Float64, dark: tuple[float, float] | None) -> FogEstimate:

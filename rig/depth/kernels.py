@@ -13,6 +13,7 @@ from typing import Final
 
 import numba
 import numpy as np
+from numpy.typing import NDArray
 
 from rig.estimate.row.inputs import Lines, RowState, Sweep, row_buffers, row_fluxes
 from rig.simd import Bools, Float32, Float64, Int32
@@ -114,3 +115,22 @@ def add_clear_rows(
             cell[1] += k
             cell[2] += k * row.gain[t]
             cell[3] += k * (ambient + row.others[t])
+
+
+@numba.njit(cache=True, nogil=True)
+def sum_dark(
+    dark_counts: NDArray[np.uint32], dark_frames: Int32, ambient: Float32, hot_flux: float
+) -> tuple[float, float, float]:
+    """Ones, exposures, and exposures weighted with the ambient flux (rows, width), all over dark frames.
+
+    dark_counts: (rows, width); dark_frames: (width,), number of dark frames in which a pixel was used. Pixels with more
+    ambient flux than hot_flux are left out.
+    """
+    ones, exposures, light = 0.0, 0.0, 0.0
+    for y in range(ambient.shape[0]):
+        for x in range(ambient.shape[1]):
+            if ambient[y, x] <= hot_flux:
+                ones += dark_counts[y, x]
+                exposures += dark_frames[x]
+                light += np.float64(ambient[y, x]) * dark_frames[x]
+    return ones, exposures, light

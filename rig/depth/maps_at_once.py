@@ -12,31 +12,44 @@ import time
 from collections import deque
 from collections.abc import Callable
 from concurrent.futures import Future, ThreadPoolExecutor
-from dataclasses import replace
-from typing import NamedTuple
+from dataclasses import dataclass, replace
+from typing import Generic, Protocol, TypeVar
 
-from rig.count.sweeps import SweepData
+from rig.count.volume import FrameTally
 from rig.depth.reconstruct import Lane, MakesMaps, MapResult, MapUnderWay, Reconstructor
 
 
-class _UnderWay(NamedTuple):
-    sweep: SweepData
+class Counted(Protocol):
+    """A counted sweep. tally: of the maker's counter."""
+
+    @property
+    def tally(self) -> FrameTally:
+        """Counts and frames of the sweep."""
+        ...
+
+
+AnyCounted = TypeVar("AnyCounted", bound=Counted)
+
+
+@dataclass(slots=True, eq=False)
+class _UnderWay(Generic[AnyCounted]):
+    sweep: AnyCounted
     work: MapUnderWay
     lane: Lane
     result: Future[MapResult]
 
 
-class MapsAtOnce:
+class MapsAtOnce(Generic[AnyCounted]):
     """Makes maps with `maker`. All methods are called by one thread; `deliver` is called on it, with each sweep and its
     map. A map's `compute_s` is its share of the time: n maps that are made at the same time each get an n-th of it.
     """
 
-    def __init__(self, maker: MakesMaps, deliver: Callable[[SweepData, MapResult], None]) -> None:
+    def __init__(self, maker: MakesMaps, deliver: Callable[[AnyCounted, MapResult], None]) -> None:
         self._maker = maker
         self._deliver = deliver
         self._free = maker.lanes() if isinstance(maker, Reconstructor) else []
         self._pool = ThreadPoolExecutor(len(self._free), "map") if self._free else None
-        self._maps: deque[_UnderWay] = deque()
+        self._maps: deque[_UnderWay[AnyCounted]] = deque()
         self._alone = False
         self._time = _SharedTime()
 
@@ -45,7 +58,7 @@ class MapsAtOnce:
         """Whether a map is being made, or waits to be delivered. May be called from any thread."""
         return self._alone or bool(self._maps)
 
-    def put(self, sweep: SweepData, *, last: bool) -> None:
+    def put(self, sweep: AnyCounted, *, last: bool) -> None:
         """Begin the map of a sweep, after those before it if it needs what is learned from them, or if all threads are
         at work. last: whether no other sweep follows soon.
 
@@ -83,14 +96,14 @@ class MapsAtOnce:
         return sum(int(each.sweep.tally.n_frames.sum()) for each in self._maps)
 
     def _deliver_next(self) -> None:
-        sweep, work, lane, made = self._maps[0]
+        first = self._maps[0]
         try:
-            result = made.result()
-            work.end()
+            result = first.result.result()
+            first.work.end()
         finally:
             self._maps.popleft()
-            self._free.append(lane)
-        self._deliver(sweep, result)
+            self._free.append(first.lane)
+        self._deliver(first.sweep, result)
 
 
 class _SharedTime:

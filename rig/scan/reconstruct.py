@@ -1,11 +1,13 @@
 """Makes depth maps, one by one, from a cube: frames without markers, in an array or an imported recording."""
 
 import time
+from typing import NamedTuple
 
 from rig.config.models import EstimateConfig
 from rig.count.sweeps import Gap
-from rig.count.volume import SweepLayout
-from rig.depth.reconstruct import Reconstructor, map_geometry
+from rig.count.volume import FrameTally, SweepLayout
+from rig.depth.maps_at_once import MapsAtOnce
+from rig.depth.reconstruct import MapResult, Reconstructor, map_geometry
 from rig.depth.warm_up import warm_up
 from rig.devices.calibration_use import CalibrationUse, accepted_by
 from rig.estimate.registry import LEARNING
@@ -14,6 +16,11 @@ from rig.recording.cube import Cube, column_commands, count_map
 from rig.run_folder.summary import MapTally, RunFrames
 from rig.scan.estimator import choose_estimator
 from rig.scan.run import OutFolder, Run, RunResult, verdict_of
+
+
+class _CountedMap(NamedTuple):
+    tally: FrameTally
+    count_s: float
 
 
 def reconstruct_cube(
@@ -40,17 +47,22 @@ def reconstruct_cube(
         run.rays = geometry.rays
         aborted = False
         told = counted("estimating", "maps", progress)
+
+        def deliver(sweep: _CountedMap, result: MapResult) -> None:
+            run.add(result, sweep.count_s + result.compute_s)
+            told(tally.maps, cube.maps)
+
+        maps = MapsAtOnce(reconstructor, deliver)
         try:
             for index in range(cube.maps):
                 if estimate.estimator in LEARNING and not index:
                     tell_stage("learning")
                 begun = time.perf_counter()
                 sweep, missing = count_map(cube, index, counter)
-                count_s = time.perf_counter() - begun
-                result = reconstructor.map(sweep)
                 gaps.append(missing)
-                run.add(result, count_s + result.compute_s)
-                told(tally.maps, cube.maps)
+                maps.put(_CountedMap(sweep, time.perf_counter() - begun), last=index + 1 == cube.maps)
+            while maps.deliver_next():
+                pass
         except KeyboardInterrupt:
             aborted = True
         gaps_of_run = [gap for of_map in gaps[: tally.maps] for gap in of_map]

@@ -44,6 +44,8 @@ AGREE_PX = np.float32(1.0)
 """Under a halo, a first map's stripe is learned from only if contrast alone puts it at most this far away, in px."""
 TRUSTED = np.float32(0.5)
 """An answer teaches if its trust exceeds this: under a halo, amplitudes are learned only from such stripes."""
+COUNTING_THREADS = 4
+"""Most threads that count: more only get into each other's way, since counting waits for memory."""
 LOST = 0.2
 """If fewer answers than this share teach the last lesson in fog, light scattered many times may hide the stripes."""
 
@@ -94,7 +96,8 @@ class Joint:
         Raises UsageError if its maps would take too much memory, before any light is let out.
         """
         grid_of(geometry)
-        return SweepCounter(layout, self._workers)
+        few = self._workers if self._workers.threads <= COUNTING_THREADS else RowWorkers(COUNTING_THREADS)
+        return SweepCounter(layout, few)
 
     def estimate(self, sweep: CountVolume, geometry: SweepGeometry) -> StripeTable:
         """Stripe table of one sweep. Afterwards `model` is the state for the next sweep."""
