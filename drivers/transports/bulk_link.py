@@ -6,6 +6,7 @@ project's errors. A queue belongs to one thread at a time. Buffers are whole pac
 """
 
 import array
+import ctypes
 import errno
 import logging
 import time
@@ -15,6 +16,7 @@ from contextlib import contextmanager, suppress
 from dataclasses import dataclass
 from typing import Any
 
+import libusb_package
 import numpy as np
 import usb.util
 from numpy.typing import NDArray
@@ -95,6 +97,10 @@ class QueuedLink:
         """Open the device of a listing and claim its interfaces."""
         import usb1
 
+        try:
+            usb1.loadLibrary()
+        except OSError:  # the system has none
+            usb1.loadLibrary(ctypes.CDLL(str(libusb_package.get_library_path())))
         usb.util.dispose_resources(listing.handle)  # pyusb opened it to read its strings
         self.label = f"{label} at {listing.address}"
         self._usb1 = usb1

@@ -17,6 +17,7 @@ from dataclasses import dataclass, field
 from threading import RLock
 from typing import Any
 
+import libusb_package
 import usb.backend.libusb1
 import usb.core
 import usb.util
@@ -284,9 +285,15 @@ def _string(device: Any, index: int) -> str | None:
 
 
 def _libusb() -> Any:
+    """pyusb's backend for the system's libusb, else for the one that package libusb-package carries."""
     backend = usb.backend.libusb1.get_backend()
     if backend is None:
-        raise DeviceError("libusb is not installed, USB devices cannot be reached; run: sudo apt install libusb-1.0-0")
+        backend = usb.backend.libusb1.get_backend(find_library=libusb_package.find_library)
+    if backend is None:
+        raise DeviceError(
+            "libusb cannot be loaded, and USB devices need it; run: pip install --force-reinstall libusb-package, "
+            "or install libusb-1.0-0 with the system's packages"
+        )
     return backend
 
 

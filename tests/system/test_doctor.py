@@ -9,7 +9,6 @@ from typing import Any
 
 import numpy as np
 import pytest
-import usb.backend.libusb1
 
 from drivers.lasers.obis import ObisConfig
 from rig import api
@@ -127,10 +126,6 @@ def test_a_full_disk_and_a_folder_that_cannot_be_written(small: Path, monkeypatc
 
 def test_devices_lists_what_is_attached_and_opens_nothing(rig: Rig) -> None:
     ran = rig("devices", "--json")
-    if usb.backend.libusb1.get_backend() is None:
-        assert ran.code == 3
-        assert "libusb" in ran.err
-        pytest.skip("libusb is not installed")
     assert ran.code == 0
     for one in json.loads(ran.out)["devices"]:
         assert set(one) == {"address", "what", "kind"}

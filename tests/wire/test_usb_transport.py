@@ -1,6 +1,8 @@
 """The USB transport over the emulated backend and, where umockdev is installed, over real libusb."""
 
 import errno
+import subprocess
+import sys
 from collections.abc import Callable
 from contextlib import closing
 
@@ -119,6 +121,35 @@ def test_every_usb_error_becomes_one_line_of_ours(number: int | None, ours: type
 
 
 def test_a_missing_libusb_says_what_to_install(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr("usb.backend.libusb1.get_backend", lambda: None)
-    with pytest.raises(DeviceError, match=r"apt install libusb-1\.0-0"):
+    monkeypatch.setattr("usb.backend.libusb1.get_backend", lambda find_library=None: None)
+    with pytest.raises(DeviceError, match=r"pip install --force-reinstall libusb-package"):
         attached(LOOPBACK)
+
+
+WITHOUT_A_SYSTEM_LIBRARY = """
+import ctypes, ctypes.util, usb.util
+from types import SimpleNamespace
+from drivers.errors import DeviceNotFound
+from drivers.transports.bulk_link import QueuedLink
+from drivers.transports.usb_device import UsbId, attached
+
+load = ctypes.CDLL
+def by_path_alone(name, *rest, **named):
+    if name is not None and "/" not in str(name):
+        raise OSError(name)
+    return load(name, *rest, **named)
+ctypes.CDLL, ctypes.util.find_library = by_path_alone, lambda name: None
+usb.util.dispose_resources = lambda device: None
+
+assert attached(UsbId("a thing that nobody makes", 0x1234, 0x5678)) == []
+try:
+    QueuedLink(SimpleNamespace(handle=None, address="1-1", path="1-1"), "thing", (0,))
+except DeviceNotFound as error:
+    print(error)
+"""
+
+
+def test_the_library_that_comes_along_serves_where_the_system_has_none() -> None:
+    run = subprocess.run([sys.executable, "-c", WITHOUT_A_SYSTEM_LIBRARY], capture_output=True, text=True, timeout=60)
+    assert run.returncode == 0, run.stderr
+    assert "gone since it was found" in run.stdout
