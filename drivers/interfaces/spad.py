@@ -22,6 +22,7 @@ from numpy.typing import NDArray
 from drivers.errors import LimitExceeded
 from drivers.frames import ROW_ALIGN_BYTES, Mark, frame_bytes
 from drivers.interfaces.device import OPEN_STATES, Device, DeviceState
+from drivers.interfaces.grab import Grabbed, take
 from drivers.ring import BlockRing
 
 _WORD_PX = 8 * ROW_ALIGN_BYTES
@@ -98,6 +99,8 @@ _log = logging.getLogger(__name__)
 
 SpadMode = Literal["stream", "burst"]
 
+_GRAB_BLOCK_BYTES = 4 * 2**20
+"""Size of the blocks that `grab` asks for."""
 _EXPOSURE_SLACK = 1e-9
 """Share by which an exposure may exceed the period: 1e-05 s as a float is a little more than 1/100000 s."""
 
@@ -297,6 +300,33 @@ class SpadArray(Device):
             _log.info("%s: stop", self._name)
             self._state = DeviceState.CONFIGURED
             self._do_stop()
+
+    def grab(
+        self,
+        n_frames: int,
+        *,
+        frame_rate_hz: float | Fraction | None = None,
+        exposure_s: float | None = None,
+        mode: SpadMode | None = None,
+        timeout_s: float = 5.0,
+    ) -> Grabbed:
+        """Take `n_frames` whole frames and return them in memory, with the numbers of those that were lost.
+
+        frame_rate_hz: None for the highest. exposure_s: None for the whole frame period. mode: None for a stream where
+        the sensor and its link can, else a burst. timeout_s: longest wait for frames. Raises `LimitExceeded` for what
+        the device cannot do, `DeviceTimeout` if no frames come.
+        """
+        info = self.info
+        rate = info.max_frame_rate_hz if frame_rate_hz is None else Fraction(frame_rate_hz)
+        if mode is None:
+            fits = info.stream is not None and float(rate) * frame_bytes(info.width, info.height) <= (
+                info.stream.bytes_per_s
+            )
+            mode = "stream" if fits or info.burst is None else "burst"
+        block_frames = max(1, min(n_frames, _GRAB_BLOCK_BYTES // frame_bytes(info.width, info.height)))
+        period_s = float(1 / rate) if rate > 0 else 0.0
+        request = SpadRequest(rate, period_s if exposure_s is None else exposure_s, mode, block_frames)
+        return take(self, self.configure(request), n_frames, timeout_s)
 
     def _check(self, request: SpadRequest) -> None:
         info = self.info

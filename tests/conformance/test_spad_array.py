@@ -8,7 +8,7 @@ from itertools import pairwise
 import numpy as np
 import pytest
 
-from drivers.errors import DeviceTimeout
+from drivers.errors import DeviceTimeout, LimitExceeded
 from drivers.frames import BlockFlag, packed_row_bytes
 from drivers.interfaces import DeviceState
 from drivers.ring import BlockRing
@@ -94,6 +94,29 @@ def test_after_the_end_it_gives_no_more_starts_again_at_frame_0_and_closes_for_g
     verbs = (lambda: spad.device.configure(spad.request), lambda: spad.device.start(1), fill, spad.device.stop)
     require_final(spad.device, *verbs)
     assert spad.device.counters.delivered == 0
+
+
+def test_grabbed_frames_are_those_of_the_run_with_the_numbers_of_lost_ones(spad: SpadCase) -> None:
+    device, asked = spad.device, spad.request
+    if asked.window is not None:
+        pytest.skip("whole frames are grabbed")
+    got = device.grab(
+        150, frame_rate_hz=asked.frame_rate_hz, exposure_s=asked.exposure_s, mode=asked.mode, timeout_s=TIMEOUT_S
+    )
+    info, counters = device.info, device.counters
+    assert device.state is DeviceState.CONFIGURED
+    assert len(got.number) == len(got.records) == len(got.bits) == counters.delivered
+    assert (np.diff(got.number) >= 1).all()
+    assert sorted([*got.number.tolist(), *got.lost.tolist()]) == list(range(150))
+    assert counters.lost in (None, len(got.lost))
+    assert got.frames.shape == (len(got.number), info.height, info.width)
+    assert got.frames.dtype == np.bool_
+    assert np.array_equal(got.frames.sum(axis=0), got.counts)
+    assert 0 < got.frames.mean() < 1
+    with pytest.raises(LimitExceeded):
+        device.grab(10, frame_rate_hz=2 * info.max_frame_rate_hz)
+    with pytest.raises(LimitExceeded):
+        device.grab(0, frame_rate_hz=asked.frame_rate_hz, mode=asked.mode)
 
 
 def test_an_endless_run_ends_when_another_thread_stops_it(spad: SpadCase) -> None:

@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 
 from rig.depth.fog_meter import fit_fog, read_fog
-from rig.depth.kernels import add_clear_rows
+from rig.depth.kernels import add_clear_rows, sum_dark
 from tests.reference.working_point import Light
 from tests.stability.inventory import covers
 from tests.unit.rig.depth.test_fog_meter import PATH_M, state_of, stripes_of, sums, swept
@@ -49,7 +49,7 @@ def test_sums_that_are_all_zeros_all_ones_or_nowhere() -> None:
     assert np.isfinite(fit_fog(few, PATH_M).covariance).all()
 
 
-@covers(add_clear_rows)
+@covers(add_clear_rows, read_fog)
 @pytest.mark.parametrize("level", [0, 1, 5])
 def test_pictures_without_any_contrast_have_no_fog(level) -> None:
     sweep = swept(Light(), 5)
@@ -58,3 +58,21 @@ def test_pictures_without_any_contrast_have_no_fog(level) -> None:
     assert fog.extinction_per_m is None
     assert fog.veil_per_exposure is None
     assert fog.visibility_m is None
+
+
+@covers(sum_dark)
+@pytest.mark.parametrize("hot_flux", [0.0, 0.02, np.inf])
+def test_dark_sums_are_those_of_exact_integers_up_to_the_largest_counts(hot_flux) -> None:
+    rng = np.random.default_rng(1)
+    ambient = rng.uniform(1e-7, 0.1, (40, 70)).astype(np.float32)
+    ambient[3, 5] = np.inf  # a pixel that always fires
+    for most in (0, 1, 2**31 - 1):
+        dark = rng.integers(0, most, ambient.shape, np.uint32, endpoint=True)
+        frames = rng.integers(0, most, 70, np.int32, endpoint=True)
+        used = (ambient <= hot_flux) & np.isfinite(ambient)
+        ambient_here = np.where(used, ambient.astype(np.float64), 0.0)
+        expected = (
+            dark[used].astype(np.float64).sum(), (used * frames.astype(float)).sum(), (ambient_here * frames).sum(),
+        )  # fmt: skip
+        limit = min(hot_flux, float(np.finfo(np.float32).max))
+        assert sum_dark(dark, frames, ambient, limit) == pytest.approx(expected, rel=1e-12)

@@ -13,10 +13,7 @@ from rig.depth import maps_at_once
 from rig.depth.maps_at_once import MapsAtOnce
 from rig.depth.reconstruct import Reconstructor
 from rig.estimate.search import online_learning
-from tests.stability.inventory import covers
 from tests.unit.small_maps import simulated
-
-covers(maps_at_once)
 
 SWEPT = [simulated(exposures=3, rows=24, columns=64, seed=seed) for seed in range(1, 8)]
 VOLUMES = [swept.volume for swept in SWEPT]

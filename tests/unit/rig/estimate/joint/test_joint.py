@@ -6,7 +6,7 @@ from functools import cache
 import numpy as np
 import pytest
 
-from rig.estimate.joint import confidence, lesson
+from rig.estimate.joint import confidence, lesson, solver, tables
 from rig.estimate.joint.joint import Joint
 from rig.estimate.joint.labels.grid import PER_PX, label_grid
 from rig.estimate.registry import recalling
@@ -20,7 +20,7 @@ from tests.unit.small_maps import assert_same, geometry_of, simulated, street, v
 
 pytestmark = pytest.mark.slow
 
-covers(confidence, lesson)
+covers(confidence, lesson, solver, tables, Joint)
 
 
 @cache
