@@ -3,12 +3,12 @@
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field
 from importlib.metadata import EntryPoint, entry_points
-from typing import Any, ClassVar
+from typing import Any, ClassVar, TypeVar
 
-from pydantic import BaseModel, ConfigDict
+from pydantic import BaseModel, ConfigDict, ValidationError
 
-from drivers.clock import Clock
-from drivers.errors import UnknownKind
+from drivers.clock import Clock, SystemClock
+from drivers.errors import LimitExceeded, UnknownKind
 from drivers.interfaces import World
 from drivers.transports.endpoints import Endpoint
 from drivers.transports.tap import Tap
@@ -61,6 +61,25 @@ class Kind:
     off: Callable[[Any], bytes] | None = None
     """Function that returns, for a config, the bytes that switch off a laser on a serial port in any state. They are
     sent if there is no time to open the laser first."""
+
+
+Config = TypeVar("Config", bound=BaseModel)
+
+
+def config_of(kind: type[Config], **fields: object) -> Config:
+    """The config of a device that is opened by itself, without a file. Raises `LimitExceeded`, with one line, for
+    the first wrong field."""
+    try:
+        return kind.model_validate(fields)
+    except ValidationError as error:
+        wrong = error.errors()[0]
+        where = ".".join(str(part) for part in wrong["loc"])
+        raise LimitExceeded(f"{where or kind.__name__}: {wrong['msg']}; correct this argument") from None
+
+
+def alone() -> Surroundings:
+    """The surroundings of a real device that is opened by itself."""
+    return Surroundings(SystemClock(), None, 0)
 
 
 def kinds(slot: str) -> tuple[str, ...]:

@@ -17,9 +17,8 @@ from typing import Any, Protocol, Self, TypeVar
 
 import numpy as np
 from numpy.typing import NDArray
-from pydantic import ValidationError
 
-from drivers.errors import DeviceDisconnected, DeviceError, DeviceFault, LimitExceeded
+from drivers.errors import DeviceDisconnected, DeviceError, DeviceFault
 from drivers.interfaces import BeamScanner, ScannerLimits, ScannerStatus, ScanWaveform
 from drivers.scanners.galvo import GalvoConfig, brake, ramp
 from drivers.transports.endpoints import Endpoint
@@ -314,14 +313,3 @@ class DacScanner(BeamScanner):
 
 
 Config = TypeVar("Config", bound=GalvoConfig)
-
-
-def config_of(kind: type[Config], **fields: object) -> Config:
-    """The config of a board that is opened by itself. Raises `LimitExceeded`, with one line, for the first wrong
-    field."""
-    try:
-        return kind.model_validate(fields)
-    except ValidationError as error:
-        wrong = error.errors()[0]
-        where = ".".join(str(part) for part in wrong["loc"])
-        raise LimitExceeded(f"{where or kind.__name__}: {wrong['msg']}; correct this argument") from None

@@ -41,7 +41,7 @@ from pydantic import Field
 from drivers.clock import Clock, SystemClock, now_s
 from drivers.errors import DeviceFault, DeviceNotFound, DeviceTimeout, ProtocolError
 from drivers.interfaces import LEVEL_BACKWARD, MARKER_LINE, MARKER_SCAN
-from drivers.registry import Kind, Surroundings
+from drivers.registry import Kind, Surroundings, config_of
 from drivers.scanners.dac_scanner import (
     CENTRE,
     DRIFT,
@@ -51,7 +51,6 @@ from drivers.scanners.dac_scanner import (
     PointSlice,
     PointSource,
     colour,
-    config_of,
 )
 from drivers.scanners.galvo import LOWEST_RATE_HZ, GalvoConfig
 from drivers.transports.endpoints import Endpoint, resolve

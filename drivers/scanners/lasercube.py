@@ -37,7 +37,7 @@ from pydantic import Field
 from drivers.clock import Clock, SystemClock, now_s
 from drivers.errors import DeviceFault, DeviceTimeout, ProtocolError
 from drivers.interfaces import LEVEL_BACKWARD, MARKER_LINE, MARKER_SCAN
-from drivers.registry import Kind, Surroundings
+from drivers.registry import Kind, Surroundings, config_of
 from drivers.scanners.dac_scanner import (
     CENTRE,
     DRIFT,
@@ -47,7 +47,6 @@ from drivers.scanners.dac_scanner import (
     DacScanner,
     PointSlice,
     PointSource,
-    config_of,
 )
 from drivers.scanners.galvo import LOWEST_RATE_HZ, GalvoConfig
 from drivers.transports.endpoints import Endpoint, resolve

@@ -7,7 +7,7 @@ PING comes for `heartbeat`. Pings are sent by `fill`, between two blocks, so the
 
 import logging
 import threading
-from typing import Annotated, Literal
+from typing import Annotated, Any, Literal
 
 from pydantic import Field
 
@@ -15,7 +15,7 @@ from drivers.clock import Clock, now_s
 from drivers.errors import DeviceError, DeviceFault, DeviceTimeout, LimitExceeded
 from drivers.frames import frame_bytes
 from drivers.interfaces import SpadArray, SpadCounters, SpadHealth, SpadInfo, SpadRequest, SpadTiming
-from drivers.registry import Kind, KindConfig, Surroundings
+from drivers.registry import Kind, KindConfig, Surroundings, alone, config_of
 from drivers.ring import BlockRing
 from drivers.spads.spb_usb_setup import (
     LABEL,
@@ -34,7 +34,7 @@ from drivers.transports.bulk_link import BulkLink, PlainLink, QueuedLink
 from drivers.transports.endpoints import Endpoint, resolve
 from drivers.transports.tap import Tap
 from drivers.transports.usb_device import find_device
-from drivers.units import Seconds
+from drivers.units import Seconds, format_quantity
 
 _log = logging.getLogger(__name__)
 
@@ -99,6 +99,21 @@ class SpbUsb(SpadArray):
         except BaseException:
             self._do_close()
             raise
+
+    @classmethod
+    def open(
+        cls, port: str = "usb", *, chip: Chip = "fx3", heartbeat_s: float = 1.0,
+        surroundings: Surroundings | None = None, **settings: Any,
+    ) -> "SpbUsb":  # fmt: skip
+        """Open an SPB1 SPAD by itself, without a config file.
+
+        port, chip: as in `SpbUsbConfig`. heartbeat_s: time without a call of `fill` after which the device ends
+        a run. settings: reads, test_pattern, as in `SpbUsbConfig`. surroundings: of an emulator. Raises `LimitExceeded`
+        for a setting that is not possible, other `DeviceError` if the device cannot be opened.
+        """
+        heartbeat = format_quantity(heartbeat_s, "time")
+        config = config_of(SpbUsbConfig, port=port, chip=chip, heartbeat=heartbeat, **settings)
+        return create(config, surroundings or alone())
 
     @property
     def info(self) -> SpadInfo:
