@@ -93,7 +93,7 @@ class WorldConfig(KindConfig):
 
 
 MOST_VIEWS, TIME_STEP_S = 64, 1e-3
-"""Where surfaces move, the truth of a sweep is put together from at most so many moments, at least this far apart."""
+"""The truth of a moving scene is put together from at most so many moments of a sweep, at least this far apart."""
 
 
 class SimulatedWorld:

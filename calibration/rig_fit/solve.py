@@ -147,7 +147,7 @@ MOST_CONDITION = 1e12
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Prior:
-    """What is known about the camera from elsewhere. matrix: information (inverse covariance) of all p parameters, zero
+    """Knowledge about the camera from elsewhere. matrix: information (inverse covariance) of all p parameters, zero
     for those that are not the camera's. values: (p,), the values expected.
     """
 

@@ -2,7 +2,6 @@
 
 import logging
 import math
-import time
 from collections import deque
 from collections.abc import Iterator
 from dataclasses import dataclass, fields, replace
@@ -17,6 +16,7 @@ from rig.count.bind import BoundFrames, FrameBinder, SweepClock
 from rig.count.volume import BIN_UNUSABLE, Counter, FrameTally
 from rig.geometry.windows import WORD_PX
 from rig.plan.scan_plan import ScanPlan
+from rig.shared_time import SharedTime
 
 _log = logging.getLogger(__name__)
 
@@ -62,7 +62,8 @@ class SweepAccount:
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class SweepData(SweepAccount):
-    """One counted sweep. tally: the counter's, with the mirror's velocity. count_s: wall time to bind and count."""
+    """One counted sweep. tally: the counter's, with the mirror's velocity. count_s: time to bind and count, as
+    `SharedTime` charges it."""
 
     tally: FrameTally
     count_s: float
@@ -107,6 +108,8 @@ class SweepAssembler:
         self._gaps: list[Gap] = []
         self._received = self._lit = self._dark = self._repeated = 0
         self._count_s = 0.0
+        self.time = SharedTime()
+        """Divides the time between counting and the maps that are made meanwhile."""
         self._run_id: int | None = None
         self._width: int | None = None
         self.frames_seen = 0
@@ -125,11 +128,11 @@ class SweepAssembler:
         if self._next_frame is not None and first > self._next_frame:
             self._gaps.append((self._next_frame, first - 1))
         self._next_frame = first + block.n_frames
-        begun = time.perf_counter()
-        bound, clocks = self._binder.bind(block)
-        x0 = self._windows(block, bound)
-        repeated = self._note_repeated(block, bound)
-        self._count_s += time.perf_counter() - begun
+        with self.time.charge() as spent:
+            bound, clocks = self._binder.bind(block)
+            x0 = self._windows(block, bound)
+            repeated = self._note_repeated(block, bound)
+        self._count_s += spent.seconds
         self.frames_seen += block.n_frames
         self._adds.append(0)
         for a, b in pairwise((*bound.starts, block.n_frames)):
@@ -143,21 +146,21 @@ class SweepAssembler:
                     return
             if number < self._start.sweep:
                 continue
-            begun = time.perf_counter()
-            bins = bound.bins[a:b]
-            lit, dark = self._cover(bins, x0[a:b], self._used_px, self._column_x0, self._plan.window)
-            self._received += b - a - int(np.count_nonzero((repeated >= a) & (repeated < b)))
-            self._lit += lit
-            self._dark += dark
-            self._counter.add(block.bits[a:b], bins, bound.column[a:b], x0[a:b])
-            self._adds[-1] += 1
-            self._count_s += time.perf_counter() - begun
+            with self.time.charge() as spent:
+                bins = bound.bins[a:b]
+                lit, dark = self._cover(bins, x0[a:b], self._used_px, self._column_x0, self._plan.window)
+                self._received += b - a - int(np.count_nonzero((repeated >= a) & (repeated < b)))
+                self._lit += lit
+                self._dark += dark
+                self._counter.add(block.bits[a:b], bins, bound.column[a:b], x0[a:b])
+                self._adds[-1] += 1
+            self._count_s += spent.seconds
 
     def settle(self, blocks: int) -> None:
         """Wait until all blocks but the last `blocks`, fewer than MOST_UNDER_WAY, have been read."""
-        begun = time.perf_counter()
-        self._counter.settle(sum(list(self._adds)[-blocks:]) if blocks else 0)
-        self._count_s += time.perf_counter() - begun
+        with self.time.charge() as spent:
+            self._counter.settle(sum(list(self._adds)[-blocks:]) if blocks else 0)
+        self._count_s += spent.seconds
 
     def _finish(self, clock: SweepClock) -> SweepData:
         expected = clock.end_frame - clock.first_frame
@@ -167,10 +170,10 @@ class SweepAssembler:
             if first < clock.end_frame and last >= clock.first_frame
         ]
         self._gaps = [gap for gap in self._gaps if gap[1] >= clock.end_frame]
-        begun = time.perf_counter()
         direction = self._plan.leg(clock.sweep).direction
-        tally = replace(self._counter.finish(), velocity_per_s=self._plan.velocity_per_s(direction))
-        self._count_s += time.perf_counter() - begun
+        with self.time.charge() as spent:
+            tally = replace(self._counter.finish(), velocity_per_s=self._plan.velocity_per_s(direction))
+        self._count_s += spent.seconds
         data = SweepData(
             index=self._first_index + clock.sweep - self._start.sweep,
             direction=direction,

@@ -7,8 +7,6 @@ whether the model of the next map is certain before the maps that are under way 
 (`Reconstructor.may_begin`). A map that nothing would run beside is shared by all threads.
 """
 
-import threading
-import time
 from collections import deque
 from collections.abc import Callable
 from concurrent.futures import Future, ThreadPoolExecutor
@@ -17,6 +15,7 @@ from typing import Generic, Protocol, TypeVar
 
 from rig.count.volume import FrameTally
 from rig.depth.reconstruct import Lane, MakesMaps, MapResult, MapUnderWay, Reconstructor
+from rig.shared_time import SharedTime
 
 
 class Counted(Protocol):
@@ -41,17 +40,19 @@ class _UnderWay(Generic[AnyCounted]):
 
 class MapsAtOnce(Generic[AnyCounted]):
     """Makes maps with `maker`. All methods are called by one thread; `deliver` is called on it, with each sweep and its
-    map. A map's `compute_s` is its share of the time: n maps that are made at the same time each get an n-th of it.
+    map. A map's `compute_s` is what `time` charges it.
     """
 
-    def __init__(self, maker: MakesMaps, deliver: Callable[[AnyCounted, MapResult], None]) -> None:
+    def __init__(
+        self, maker: MakesMaps, deliver: Callable[[AnyCounted, MapResult], None], time: SharedTime | None = None
+    ) -> None:
         self._maker = maker
         self._deliver = deliver
         self._free = maker.lanes() if isinstance(maker, Reconstructor) else []
         self._pool = ThreadPoolExecutor(len(self._free), "map") if self._free else None
         self._maps: deque[_UnderWay[AnyCounted]] = deque()
         self._alone = False
-        self._time = _SharedTime()
+        self.time = time or SharedTime()
 
     @property
     def under_way(self) -> bool:
@@ -72,7 +73,7 @@ class MapsAtOnce(Generic[AnyCounted]):
             if (self._maps or not last) and maker.may_begin(self._frames()):
                 lane = self._free.pop()
                 work = maker.begin(sweep.tally, lane)
-                self._maps.append(_UnderWay(sweep, work, lane, pool.submit(self._time.of, work.run)))
+                self._maps.append(_UnderWay(sweep, work, lane, pool.submit(self._charged, work.run)))
                 return
         self._alone = True
         try:
@@ -92,6 +93,11 @@ class MapsAtOnce(Generic[AnyCounted]):
             self._deliver_next()
         return bool(self._maps)
 
+    def _charged(self, make: Callable[[], MapResult]) -> MapResult:
+        with self.time.charge() as spent:
+            result = make()
+        return replace(result, compute_s=spent.seconds)
+
     def _frames(self) -> int:
         return sum(int(each.sweep.tally.n_frames.sum()) for each in self._maps)
 
@@ -104,32 +110,3 @@ class MapsAtOnce(Generic[AnyCounted]):
             self._maps.popleft()
             self._free.append(first.lane)
         self._deliver(first.sweep, result)
-
-
-class _SharedTime:
-    """Wall time, divided at each moment by the number of maps that are being made."""
-
-    def __init__(self) -> None:
-        self._lock = threading.Lock()
-        self._each_s = 0.0
-        """Time that a map would have been charged that has been made all along."""
-        self._at_s = 0.0
-        self._running = 0
-
-    def of(self, make: Callable[[], MapResult]) -> MapResult:
-        """The map that `make` returns, with its share of the time."""
-        begun_s = self._step(1)
-        try:
-            result = make()
-        finally:
-            ended_s = self._step(-1)
-        return replace(result, compute_s=ended_s - begun_s)
-
-    def _step(self, more: int) -> float:
-        with self._lock:
-            now_s = time.perf_counter()
-            if self._running:
-                self._each_s += (now_s - self._at_s) / self._running
-            self._at_s = now_s
-            self._running += more
-            return self._each_s

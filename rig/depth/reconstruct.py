@@ -68,7 +68,7 @@ class MapUnderWay(NamedTuple):
 
 
 class Lane(NamedTuple):
-    """What one of several maps at the same time needs for itself: the estimator's memory, and one thread."""
+    """Room to make one of several maps at the same time: the estimator's memory, and a thread."""
 
     solver: Any
     workers: RowWorkers
@@ -150,7 +150,7 @@ class Reconstructor:
         return self.complete(stripe, sweep, self._filter, time.perf_counter() - begun)
 
     def lanes(self) -> list[Lane]:
-        """What is needed to make maps at the same time, one for each map; empty if they have to be made one by one."""
+        """Room for the maps that can be made at the same time; empty if they have to be made one by one."""
         if not isinstance(self.estimator, ManyMaps):
             return []
         n = min(self._workers.threads, self.estimator.most_at_once(self.geometry))
@@ -184,7 +184,7 @@ class Reconstructor:
         self, stripe: StripeTable, sweep: FrameTally, filter: str, estimate_s: float, used: Learned | None,
         workers: RowWorkers,
     ) -> MapResult:  # fmt: skip
-        """As `complete`, for a stripe table that was estimated with the state `used`. May be called from any thread."""
+        """Do the work of `complete` for a stripe table estimated with the state `used`; on any thread."""
         begun = time.perf_counter() - estimate_s
         geometry, fog, intensity = self._bound(sweep), self._fog(sweep, stripe, used), sweep.intensity(workers)
         doubts = self._checks.doubts(sweep, intensity, stripe)

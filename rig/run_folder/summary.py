@@ -30,9 +30,9 @@ class PipelineStats:
     source_fill_s: in the SPAD's `fill`, without source_wait_s, the time spent waiting for a free slot of the ring.
     ring_high_water: largest number of slots in use at one time, of ring_slots, which take ring_bytes together.
     dropped_blocks, dropped_frames: those that found no free slot. counting_s: binding and counting. estimation_s: from
-    counts to map. map_wait_s: waiting for room among the maps that the caller has not taken yet; map_queue is that
-    room, and at most map_queue_high_water maps waited. recorder_s: computing checksums and writing. monitor_updates:
-    views shown. monitor_skipped_blocks: blocks that the monitor did not show.
+    counts to map, as `SharedTime` charges it. map_wait_s: waiting for room among the maps that the caller has not taken
+    yet; map_queue is that room, and at most map_queue_high_water maps waited. recorder_s: computing checksums and
+    writing. monitor_updates: views shown. monitor_skipped_blocks: blocks that the monitor did not show.
     """
 
     source_fill_s: float = 0.0

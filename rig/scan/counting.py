@@ -28,7 +28,7 @@ class AcquiredMap:
     """A map and the account of its sweep, without the counts, which are large.
 
     column: float64 (columns,), mean fractional column of each column's frames; its centre if it has none. compute_s:
-    wall time of binding, counting and estimation.
+    time of binding, counting and estimation, see `SharedTime`.
     """
 
     sweep: SweepAccount
@@ -147,7 +147,7 @@ class CountingThread:
         self.wait_s = 0.0
         """Time spent waiting for the caller to take maps."""
         self.error: BaseException | None = None
-        self._maps = MapsAtOnce(request.maker, self._deliver)
+        self._maps = MapsAtOnce(request.maker, self._deliver, request.assembler.time)
 
     @property
     def estimating(self) -> bool:

@@ -1,6 +1,5 @@
 """Makes depth maps, one by one, from a cube: frames without markers, in an array or an imported recording."""
 
-import time
 from typing import NamedTuple
 
 from rig.config.models import EstimateConfig
@@ -57,10 +56,10 @@ def reconstruct_cube(
             for index in range(cube.maps):
                 if estimate.estimator in LEARNING and not index:
                     tell_stage("learning")
-                begun = time.perf_counter()
-                sweep, missing = count_map(cube, index, counter)
+                with maps.time.charge() as spent:
+                    sweep, missing = count_map(cube, index, counter)
                 gaps.append(missing)
-                maps.put(_CountedMap(sweep, time.perf_counter() - begun), last=index + 1 == cube.maps)
+                maps.put(_CountedMap(sweep, spent.seconds), last=index + 1 == cube.maps)
             while maps.deliver_next():
                 pass
         except KeyboardInterrupt:

@@ -72,7 +72,7 @@ class MapSolver:
 
     @property
     def places(self) -> Places:
-        """Where light was looked for in the last map."""
+        """The places of the last map, at which its light was measured."""
         assert self._memory is not None, "a map has been estimated"
         return self._memory.places
 

@@ -2,14 +2,12 @@
 
 import threading
 from dataclasses import replace
-from itertools import pairwise
 from types import SimpleNamespace
 
 import numpy as np
 import pytest
 
 from rig.config.models import EstimateConfig
-from rig.depth import maps_at_once
 from rig.depth.maps_at_once import MapsAtOnce
 from rig.depth.reconstruct import Reconstructor
 from rig.estimate.search import online_learning
@@ -122,14 +120,3 @@ def test_a_map_that_nothing_runs_beside_is_shared_by_all_threads(monkeypatch):
     made(maker(3), last=True)
     made(maker(3, temporal_prior=True))
     made(maker(1))
-
-
-def test_time_is_shared_by_the_maps_that_are_made_at_each_moment(monkeypatch):
-    #          a begins, b begins, a ends, b ends, c begins, c ends
-    moments = [10.0, 11.0, 13.0, 14.0, 20.0, 21.0]
-    monkeypatch.setattr(maps_at_once.time, "perf_counter", lambda: moments.pop(0))
-    shared = maps_at_once._SharedTime()
-    marks = [shared._step(step) for step in (1, 1, -1, -1, 1, -1)]
-    a, b, c = marks[2] - marks[0], marks[3] - marks[1], marks[5] - marks[4]
-    assert (a, b, c) == (2.0, 2.0, 1.0)
-    assert all(later >= earlier for earlier, later in pairwise(marks))
