@@ -19,7 +19,7 @@ import numpy as np
 from numpy.typing import NDArray
 from pydantic import Field
 
-from drivers.errors import DeviceError, DeviceFault, LimitExceeded, ProtocolError
+from drivers.errors import DeviceError, DeviceFault, LimitExceeded, ProtocolError, WrongState
 from drivers.interfaces import Pulse, SyncSource, SyncStatus, sliced
 from drivers.registry import Kind, KindConfig, Surroundings
 from drivers.sync.prawndo_line import IDLE, USUAL_TIMING, PrawnDoLine, PrawnDoTiming
@@ -172,6 +172,20 @@ class PrawnDo(SyncSource):
     def port_lost(self) -> bool:
         """Whether the port is gone, found out without sending anything. May be called from any thread."""
         return self._line.port.lost
+
+    def run(self) -> None:
+        """Play the program from its first word. If that fails in any way, all outputs are low when the error leaves:
+        the board may have started although its answer did not arrive."""
+        try:
+            super().run()
+        except WrongState:
+            raise  # nothing was sent
+        except BaseException:
+            try:
+                self._line.lower()
+            except DeviceError as error:
+                _log.error("%s: outputs may be high, turn the laser off by its key: %s", self.name, error)
+            raise
 
     def most_repeats(self, pulses: Sequence[Pulse]) -> int:
         """Number of times that `pulses` fit into the memory with the words at the end; the board has no loops."""

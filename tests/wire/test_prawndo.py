@@ -200,6 +200,9 @@ def test_a_last_word_that_waits_is_parted_from_the_end() -> None:
         pytest.param(b"adm 0 ea60\n\x02\0", id="359 998 bytes of a program are missing"),
         pytest.param(b"man 2\nma", id="in the middle of a line"),
         pytest.param(b"man 2\nadd\n2 5\n", id="adding words"),
+        pytest.param(b"man ffff\n", id="all outputs set by hand"),
+        pytest.param(b"man 2\nadd\n2 5\nend\nedt\n", id="editing a word"),
+        pytest.param(b"deb\nman 2\nadd\n2 5\n", id="adding words with debug output"),
     ],
 )
 def test_trap_a_board_is_lowered_and_freed_by_opening_it_however_a_dead_host_left_it(left: bytes) -> None:
@@ -210,6 +213,51 @@ def test_trap_a_board_is_lowered_and_freed_by_opening_it_however_a_dead_host_lef
             device.program(SWEEP, 1)
             device.run()
             assert device.status.state == "running"
+
+
+def test_trap_debug_output_left_on_by_somebody_is_switched_off() -> None:
+    """It would stand among the answers: `run` would fail although the program plays, and low outputs could not be
+    read."""
+    with board() as wire:
+        wire.model.receive(b"deb\n", 0.0)
+        with wire.open() as device:
+            device.program(SWEEP, 1)
+            device.run()
+            assert device.status.state == "running"
+
+
+@pytest.mark.parametrize("answer", [b"hwstart: 0\r\nok\r\n", b""], ids=["a wrong answer", "no answer"])
+def test_a_run_that_fails_leaves_the_outputs_low_although_the_program_has_started(answer: bytes) -> None:
+    with board() as wire, wire.open() as device:
+        device.program([Pulse(OUT_GATE, 30.0)], 1)
+        reply = wire.model._answer
+
+        def answer_wrongly(line: str, now_s: float) -> bytes:
+            said = reply(line, now_s)
+            return answer if line == "swr" else said
+
+        wire.model._answer = answer_wrongly  # type: ignore[method-assign]
+        with pytest.raises(DeviceFault, match="swr was answered"):
+            device.run()
+        changes = wire.model.changes(0.0, wire.now_s)
+        assert [level for _, level in changes] == [0, OUT_GATE, 0]
+        assert wire.model.status == 5
+        assert device.status.outputs == 0
+
+
+def test_a_run_that_is_interrupted_leaves_the_outputs_low(monkeypatch: pytest.MonkeyPatch) -> None:
+    with board() as wire, wire.open() as device:
+        device.program([Pulse(OUT_GATE, 30.0)], 1)
+        command = device._line.command
+
+        def interrupted(line: str) -> None:
+            command(line)
+            raise KeyboardInterrupt
+
+        monkeypatch.setattr(device._line, "command", interrupted)
+        with pytest.raises(KeyboardInterrupt):
+            device.run()
+        assert wire.pins == 0
 
 
 @pytest.mark.parametrize(
