@@ -28,6 +28,8 @@ _LOWER = b"\nabt\nsts\nman 0\nsts\nman 0\n"
 """The first line end completes whatever an earlier host began to send. The board's first core answers commands, and its
 second core ends the program after `abt`; until then `man` is refused. The second core does so while the first one
 answers `sts`. So the outputs go low without a round trip to the host, which may be late."""
+USB_IDS = (0x2E8A, 0x000A)
+"""Vendor and product of the firmware on either board. Other firmware of a Pico has the same ones."""
 _WAKE = b"\n0 0\nend\nndb\n"
 """Ends what an earlier host may have begun by hand: `edt` swallows all lines up to two numbers, `add` up to `end`, and
 neither hears `abt`. Then no debug output, which would stand among the answers and delays `abt`."""
@@ -77,9 +79,17 @@ class PrawnDoLine:
     def connect(self, most_words: int) -> None:
         """Take all outputs low before anything else is asked, whatever state an earlier host left the board in.
 
-        most_words: the largest memory of any board, in words. Raises `ProtocolError` if something else answers,
-        `DeviceTimeout` if nothing does, `DeviceFault` if the outputs do not go low.
+        A board in the middle of a program is freed only if the port shows the right USB ids: that takes hundreds of
+        kilobytes, which nothing else should get. most_words: the largest memory of any board, in words. Raises
+        `ProtocolError` if it is something else, `DeviceTimeout` if nothing answers, `DeviceFault` if the outputs do not
+        go low.
         """
+        found = self.port.usb_ids
+        if found is not None and found != USB_IDS:
+            raise ProtocolError(
+                f"{self._name}: {self.port.path} is USB device {_as_text(found)}, not {_as_text(USB_IDS)}; correct "
+                "'port'"
+            )
         self.port.write(_WAKE)
         try:
             self.lower()
@@ -88,6 +98,11 @@ class PrawnDoLine:
                 raise ProtocolError(
                     f"{self._name}: what answers on {self.port.path} is no PrawnDO (it says "
                     f"{self._last_heard[:40]!r}); correct 'port'"
+                ) from None
+            if found is None:
+                raise DeviceTimeout(
+                    f"{self._name} does not answer on {self.port.path}, which has no USB ids to know it by; unplug it, "
+                    "plug it in and start again, or correct 'port'"
                 ) from None
             self._free_wedged(most_words)
         self.command("ndb")
@@ -263,3 +278,7 @@ class PrawnDoLine:
         if self._owed_bytes:
             owed, self._owed_bytes = self._owed_bytes, 0
             self.port.write(bytes(owed) + b"\n")
+
+
+def _as_text(usb_ids: tuple[int, int]) -> str:
+    return f"{usb_ids[0]:04x}:{usb_ids[1]:04x}"

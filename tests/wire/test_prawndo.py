@@ -15,7 +15,7 @@ from drivers.errors import (
 )
 from drivers.interfaces import HOLD_S, OUT_FRAME, OUT_GATE, OUT_MARKER, Pulse
 from drivers.sync.prawndo import ProgramLimits, compile_program
-from drivers.sync.prawndo_line import PrawnDoTiming
+from drivers.sync.prawndo_line import USB_IDS, PrawnDoTiming
 from sim_backend.wire.firmware.prawndo import PrawnDoModel
 from tests.wire.lasers import PATIENCE_S, Silent, eventually
 from tests.wire.syncs import SWEEP, TriggerLine, board
@@ -206,7 +206,7 @@ def test_a_last_word_that_waits_is_parted_from_the_end() -> None:
     ],
 )
 def test_trap_a_board_is_lowered_and_freed_by_opening_it_however_a_dead_host_left_it(left: bytes) -> None:
-    with board(board=2) as wire:
+    with board(board=2, usb_ids=USB_IDS) as wire:
         wire.model.receive(left, 0.0)
         with wire.open() as device:
             assert wire.pins == 0
@@ -399,3 +399,33 @@ def test_a_port_that_says_nothing() -> None:
         wire.server.hang()
         with pytest.raises(DeviceTimeout):
             wire.open()
+
+
+@pytest.mark.parametrize("left", [b"", b"adm 0 ea60\n"], ids=["another device", "a board in the middle of a program"])
+def test_nothing_large_is_sent_to_a_port_without_usb_ids_before_it_has_said_what_it_is(left: bytes) -> None:
+    class Deaf(Silent):
+        heard = 0
+
+        def receive(self, data: bytes, now_s: float) -> bytes:
+            self.heard += len(data)
+            return b""
+
+    with board(board=2) as wire:
+        if left:
+            wire.model.receive(left, 0.0)
+            heard = listen_to(wire.model)
+        else:
+            wire.server.model = deaf = Deaf()
+        with pytest.raises(DeviceTimeout, match=r"no USB ids.*unplug it") as refused:
+            wire.open()
+        assert (len(heard) if left else deaf.heard) < 2000
+        assert "\n" not in str(refused.value)
+
+
+def test_a_port_of_another_usb_device_is_refused_before_a_byte_is_sent() -> None:
+    with board(usb_ids=(0x0403, 0x6001)) as wire:
+        heard = listen_to(wire.model)
+        with pytest.raises(ProtocolError, match=r"/dev/emulated-\w+ is USB device 0403:6001, not 2e8a:000a") as refused:
+            wire.open()
+        assert not heard
+        assert "\n" not in str(refused.value)
