@@ -29,7 +29,7 @@ _LOWER = b"\nabt\nsts\nman 0\nsts\nman 0\n"
 second core ends the program after `abt`; until then `man` is refused. The second core does so while the first one
 answers `sts`. So the outputs go low without a round trip to the host, which may be late."""
 USB_IDS = (0x2E8A, 0x000A)
-"""Vendor and product of the firmware on either board. Other firmware of a Pico has the same ones."""
+"""Vendor and product of the firmware on either board: those of any Pico, so other firmware may show them too."""
 _WAKE = b"\n0 0\nend\nndb\n"
 """Ends what an earlier host may have begun by hand: `edt` swallows all lines up to two numbers, `add` up to `end`, and
 neither hears `abt`. Then no debug output, which would stand among the answers and delays `abt`."""
@@ -67,6 +67,8 @@ class PrawnDoLine:
         self.port = port
         self.clock = port.clock
         """The clock of its deadlines."""
+        self.advice = "check its cable"
+        """What to do if it does not answer."""
         self._timing = timing
         self.lock = threading.RLock()
         """Hold it around commands that belong together."""
@@ -263,7 +265,7 @@ class PrawnDoLine:
             except DeviceTimeout:
                 if now_s(self.clock) >= ends_at:
                     raise DeviceTimeout(
-                        f"{self._name} did not answer within {deadline_s:g} s on {self.port.path}; check its cable"
+                        f"{self._name} did not answer within {deadline_s:g} s on {self.port.path}; {self.advice}"
                     ) from None
 
     def _token(self) -> str:
