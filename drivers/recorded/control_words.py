@@ -15,7 +15,8 @@ from drivers.transports.tap import OUT, Passed
 
 _SERIAL = "serial"
 _LINE_END = re.compile(rb"[\r\n]")
-_QUESTION = re.compile(rb"\s*|[ -~]*\?|sts|gto|ver|brd|frq|len|#[0-9a-f]{8}")
+_QUESTION = re.compile(rb"\s*|[ -~]*\?|sts|gto|ver|brd|frq|len|#[0-9a-f]{8}|0 0|end|ndb")
+"""Also the lines by which a PrawnDO leaves what another client had begun: they change nothing that is played."""
 _USB_QUESTIONS = {
     "06": (0x03, 0x04, 0x05),  # Helios: status, version, name
     "01": (0x83, 0x84, 0x87, 0x88, 0x89, 0x8A, 0x8B, 0x8C),  # LaserCube: rates, range, ring, version

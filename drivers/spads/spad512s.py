@@ -5,7 +5,8 @@ Facts and their sources: docs/reference/hardware.md. `spad512s_line` talks to th
 - The vendor's program must run, on this computer or behind a bridge; it serves one client.
 - `PU,0` goes before every acquisition. `I,1,tInt,n,trigger,overlap,sparse,1` takes n frames of 1 bit. tInt is in
   microseconds at 1 and 4 bits, in milliseconds from 6 bits on.
-- The answer is 32 768 bytes a frame (65 536 for a 1M sensor), most significant bit first; then `DONE`. Text that ends
+- The newest sample of the vendor adds the image width, older ones do not (`width_in_command`).
+- The answer is 32 768 bytes a frame (131 072 for a 1M sensor), most significant bit first; then `DONE`. Text that ends
   with `ERROR` may come at any point. Pixels may look like such text, so only the exact length and
   the bytes after it show the end.
 - Frames lie on their side: the vendor's samples turn them by 90 degrees counter-clockwise (`rotation`).
@@ -114,10 +115,20 @@ class Spad512sRun:
             return
         if now - self._heard_at >= _ERROR_CHECK_S:
             self._refuse_error_text(b"")
+            self._refuse_other_size()
         if now >= ends_at:
             raise DeviceTimeout(
                 f"{self._name} sent nothing for {timeout_s:g} s, {self.next_frame} of {self.n_frames} frames are "
                 "here; check trigger and the vendor's program"
+            )
+
+    def _refuse_other_size(self) -> None:
+        """Raise ProtocolError if the run is over, with frames of another size."""
+        pixel_bytes, odd = divmod(self.next_frame * self._frame_bytes + self._got - len(DONE), self.n_frames)
+        if odd == 0 and pixel_bytes > 0 and self._memory[: self._got].tobytes().endswith(DONE):
+            raise ProtocolError(
+                f"{self._name} ended the run with {pixel_bytes} bytes a frame, not {self._frame_bytes}; its frames "
+                "cannot be read: please report it"
             )
 
     def _require_done(self, pixel_bytes: int) -> None:
@@ -151,13 +162,12 @@ class Spad512sRun:
         while start and (32 <= text[start - 1] < 127 or text[start - 1] in b"\r\n\t"):
             start -= 1
         words = " ".join(text[start:].decode("ascii").split())
+        hint = "; if it dislikes the command, switch 'width_in_command'" if start == 0 and not self.next_frame else ""
         raise DeviceFault(
-            f"{self._name} ended the run: {words!r}; see the vendor's program (auto-protect?) before retrying"
+            f"{self._name} ended the run: {words!r}; see the vendor's program (auto-protect?) before retrying{hint}"
         )
 
 
-COLUMNS = 512
-ROW_BYTES = COLUMNS // 8
 TICK_HZ = 100_000_000
 """Nominal ticks per second: the stream carries no time. If the frame period is no whole number of such
 ticks, it is divided into `TICKS_PER_FRAME` ticks instead."""
@@ -179,7 +189,11 @@ class Spad512sConfig(KindConfig):
     trigger: Literal["free", "external"] = "free"
     """free: exposures follow one another; external: each starts at a pulse on the frame trigger input."""
     max_frame_rate: Annotated[ExactHertz, Field(gt=0)] = Fraction(100_000_000, 1024)
-    """Highest frame rate. 97.7 kHz: the read-out of a frame takes 10.24 us, during the next exposure."""
+    """Highest frame rate. 97.7 kHz: the read-out of a frame takes 10.24 us, during the next exposure. For a 1M sensor
+    it must be given."""
+    width_in_command: bool = False
+    """Whether `I` names the image width, as in the vendor's newest sample. The program says ERROR if it dislikes that.
+    """
     burst_frames: int = Field(default=10_000, ge=1)
     """Frames that one run may have: what the memory of this unit holds, see its data sheet."""
     readout: Annotated[BytesPerSecond, Field(gt=0)] = 100e6
@@ -203,7 +217,15 @@ class Spad512s(SpadArray):
         self._run_id = 0
         self._run: Spad512sRun | None = None
         self._identity = self._line.connect()
-        width, height = turned_size(COLUMNS, self._identity.rows, config.rotation)
+        side = self._identity.side
+        if side != 512 and "max_frame_rate" not in config.model_fields_set:
+            self._line.hang_up()
+            raise DeviceFault(
+                f"{self.name}: {float(config.max_frame_rate) / 1e3:.1f} kHz is the frame rate of the 512 x 512 sensor, "
+                f"and frames of this one ({self._identity.flavour}) carry no time; set 'max_frame_rate' from its data "
+                "sheet"
+            )
+        width, height = turned_size(side, side, config.rotation)
         self._info = SpadInfo(
             model=f"{self._identity.detector} {self._identity.flavour}".strip(),
             serial=self._identity.master_serial,
@@ -279,11 +301,13 @@ class Spad512s(SpadArray):
             self._halt.clear()
             self._run_id = (self._run_id + 1) & 0xFFFF
             self._exposed, self._delivered, self._lost = n_frames, 0, 0
-            frame_bytes = self._identity.rows * ROW_BYTES
+            side = self._identity.side
+            frame_bytes = side * side // 8
             self._run = Spad512sRun(self.name, self._line, n_frames, self._block_frames, frame_bytes)
             external = int(self._config.trigger == "external")
             # overlap 1: the next exposure runs while a frame is read out; sparse 0; stream 1 = pixels over TCP
-            self._line.tell(f"I,1,{self._exposure_us},{n_frames},{external},1,0,1\n")
+            width = f",{side}" if self._config.width_in_command else ""
+            self._line.tell(f"I,1,{self._exposure_us},{n_frames},{external},1,0,1{width}\n")
 
     def _connect_where_lost(self) -> None:
         """Connect again if the connection is gone. The program may need a moment before it listens again.
@@ -345,7 +369,7 @@ class Spad512s(SpadArray):
         n = run.next_n
         layout = BlockLayout(n, self._info.width, self._info.height)
         records, bits = block_views(memory, layout)
-        turn_packed(pixels.reshape(n, self._identity.rows, ROW_BYTES), self._config.rotation, bits)
+        turn_packed(pixels.reshape(n, self._identity.side, -1), self._config.rotation, bits)
         records[:] = np.zeros((), records.dtype)
         records["ticks"] = np.arange(n, dtype=np.uint32) * np.uint32(self._timing.frame_period_ticks)
         return seal_block(memory, self._header(run), layout, payload_crc=False)

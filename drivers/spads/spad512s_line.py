@@ -181,8 +181,8 @@ class Spad512sIdentity:
         )
 
     @property
-    def rows(self) -> int:
-        """Rows of the sensor: 1024 for the 1M flavour, else 512."""
+    def side(self) -> int:
+        """Rows of the sensor, and columns: 1024 for the 1M flavour, else 512."""
         return 1024 if "1M" in self.flavour else 512
 
 
@@ -300,9 +300,8 @@ class Spad512sLine:
             )
         detector = banner.split()[0]
         if "SPAD" not in detector.upper():
-            raise ProtocolError(
-                f"{self._name}: {self.address} greets with {banner[:60]!r}; that is no SPAD, correct 'port'"
-            )
+            # A newer program may greet in other words; whether it is one shows in its answer to D.
+            _log.warning("%s: %s greets with %r, which names no SPAD", self._name, self.address, banner[:60])
         answer = self.ask("D")
         if any(words in banner + answer for words in _CALIBRATION_STARTS):
             if _CALIBRATION_ENDS not in banner + answer:

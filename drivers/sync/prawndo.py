@@ -1,8 +1,8 @@
 """PrawnDO, a pulse generator on a Raspberry Pi Pico: sixteen outputs, 10 ns steps, a trigger, text over USB serial.
 
 Facts: docs/reference/hardware.md, from `prawn_do/prawn_do.{c,pio}` of labscript-suite/prawn_digital_output 3fecbdd
-(BSD). Outputs (docs/reference/hardware.md, Wiring and timing): GPIO0 triggers the SPAD, GPIO1 is the laser's gate,
-GPIO2 marks records.
+(BSD). Outputs (docs/reference/hardware.md, Wiring and timing): unless the config says otherwise, GPIO0 triggers the
+SPAD, GPIO1 is the laser's gate, GPIO2 marks records.
 
 The firmware has neither loops nor a watchdog. So programs are written out in full and end with two words that hold
 everything low, whatever happens to the host. The firmware cannot read its pins while a program runs, nor report whether
@@ -13,14 +13,14 @@ marker in this way. Pulses that the board would play differently from what was w
 import logging
 from collections.abc import Sequence
 from dataclasses import dataclass
-from typing import Annotated, Literal
+from typing import Annotated, Literal, Self
 
 import numpy as np
 from numpy.typing import NDArray
-from pydantic import Field
+from pydantic import Field, model_validator
 
-from drivers.errors import DeviceError, DeviceFault, LimitExceeded, ProtocolError
-from drivers.interfaces import Pulse, SyncSource, SyncStatus, sliced
+from drivers.errors import DeviceError, DeviceFault, LimitExceeded, ProtocolError, WrongState
+from drivers.interfaces import OUT_FRAME, OUT_GATE, OUT_MARKER, Pulse, SyncSource, SyncStatus, sliced
 from drivers.registry import Kind, KindConfig, Surroundings
 from drivers.sync.prawndo_line import IDLE, USUAL_TIMING, PrawnDoLine, PrawnDoTiming
 from drivers.transports.endpoints import resolve
@@ -37,6 +37,27 @@ WORD = np.dtype([("outputs", "<u2"), ("cycles", "<u4")])
 
 
 @dataclass(frozen=True, slots=True)
+class OutputPins:
+    """The pins, 0 to 15, that carry the outputs `OUT_*`."""
+
+    frame: int = 0
+    gate: int = 1
+    marker: int = 2
+
+    def levels(self, outputs: int) -> int:
+        """Levels of the pins for an OR of `OUT_*`."""
+        return sum(1 << pin for output, pin in self._pairs if outputs & output)
+
+    def outputs(self, levels: int) -> int:
+        """The OR of those `OUT_*` whose pins are high."""
+        return sum(output for output, pin in self._pairs if levels >> pin & 1)
+
+    @property
+    def _pairs(self) -> tuple[tuple[int, int], ...]:
+        return (OUT_FRAME, self.frame), (OUT_GATE, self.gate), (OUT_MARKER, self.marker)
+
+
+@dataclass(frozen=True, slots=True)
 class ProgramLimits:
     """Limits of a program. trigger_pulse_s: the longest scan marker of a program without held pulses."""
 
@@ -44,6 +65,7 @@ class ProgramLimits:
     clock_hz: float
     max_words: int
     trigger_pulse_s: float
+    pins: OutputPins = OutputPins()
 
 
 def compile_program(pulses: Sequence[Pulse], repeats: int, board: ProgramLimits) -> NDArray[np.void]:
@@ -65,7 +87,8 @@ def compile_program(pulses: Sequence[Pulse], repeats: int, board: ProgramLimits)
 
 
 def _words(pulses: Sequence[Pulse], board: ProgramLimits) -> NDArray[np.void]:
-    return np.array([(pulse.outputs, _cycles(index, pulse, board)) for index, pulse in enumerate(pulses)], WORD)
+    levels = [board.pins.levels(pulse.outputs) for pulse in pulses]
+    return np.array([(level, _cycles(index, pulses[index], board)) for index, level in enumerate(levels)], WORD)
 
 
 def _cycles(index: int, pulse: Pulse, board: ProgramLimits) -> int:
@@ -102,8 +125,9 @@ def _check_waits(period: NDArray[np.void], repeats: int, board: ProgramLimits) -
 INTERNAL_HZ = 100_000_000
 """The board's own clock (docs/reference/hardware.md)."""
 MAX_WORDS = {"board: pico1": 30_000, "board: pico2": 60_000}
-OLDEST_FIRMWARE = (1, 3)
-"""Oldest firmware accepted: from this version on, `adm` takes a start address and `brd` exists."""
+OLDEST_FIRMWARE = (1, 3, 1)
+"""Oldest firmware accepted. Before it `swr` waits for a trigger, so that one marker would start two words, and `man`
+after `abt` may set the next word of the program, with the gate high, instead of what it was told."""
 _CLOCK_CHANGE_S = 0.02
 """Time for the board to find out that there is no clock on GPIO20."""
 _CLOCK_TOLERANCE = 0.01
@@ -135,6 +159,26 @@ class PrawnDoConfig(KindConfig):
             gt=0, le=50e6, description="frequency of the clock on GPIO20; none: the board's own", examples=["10 MHz"]
         ),
     ] = None
+    frame_output: Annotated[
+        int, Field(ge=0, le=15, description="output that triggers the SPAD: 0 to 15, GPIO number")
+    ] = 0
+    gate_output: Annotated[int, Field(ge=0, le=15, description="output that is the laser's gate")] = 1
+    marker_output: Annotated[int, Field(ge=0, le=15, description="output that marks the SPAD's records")] = 2
+
+    @model_validator(mode="after")
+    def _check_outputs(self) -> Self:
+        used = (self.frame_output, self.gate_output, self.marker_output)
+        for output in used:
+            if used.count(output) > 1:
+                raise ValueError(
+                    f"output {output} has two uses; give frame_output, gate_output and marker_output one each"
+                )
+        return self
+
+    @property
+    def pins(self) -> OutputPins:
+        """The pins that carry the outputs."""
+        return OutputPins(self.frame_output, self.gate_output, self.marker_output)
 
 
 class PrawnDo(SyncSource):
@@ -146,11 +190,13 @@ class PrawnDo(SyncSource):
         self._confirmed = False
         port = SerialPort(self.name, resolve(config.port, surroundings.ports), surroundings.tap)
         self._line = PrawnDoLine(self.name, port, timing)
+        if config.external_clock is not None:
+            self._line.advice = "check its cable and the clock on GPIO20; if that stopped, power-cycle the board"
         try:
             self._line.connect(max(MAX_WORDS.values()))
             clock_hz = float(INTERNAL_HZ) if config.external_clock is None else config.external_clock
             self._firmware, max_words = self._identify()
-            self._board = ProgramLimits(self.name, clock_hz, max_words, config.trigger_pulse)
+            self._board = ProgramLimits(self.name, clock_hz, max_words, config.trigger_pulse, config.pins)
             self._set_clock()
             self._line.command("cls")
         except BaseException:
@@ -172,6 +218,20 @@ class PrawnDo(SyncSource):
     def port_lost(self) -> bool:
         """Whether the port is gone, found out without sending anything. May be called from any thread."""
         return self._line.port.lost
+
+    def run(self) -> None:
+        """Play the program from its first word. If that fails in any way, all outputs are low when the error leaves:
+        the board may have started although its answer did not arrive."""
+        try:
+            super().run()
+        except WrongState:
+            raise  # nothing was sent
+        except BaseException:
+            try:
+                self._line.lower()
+            except DeviceError as error:
+                _log.error("%s: outputs may be high, turn the laser off by its key: %s", self.name, error)
+            raise
 
     def most_repeats(self, pulses: Sequence[Pulse]) -> int:
         """Number of times that `pulses` fit into the memory with the words at the end; the board has no loops."""
@@ -211,7 +271,8 @@ class PrawnDo(SyncSource):
     def _do_status(self) -> SyncStatus:
         with self._line.lock:
             state, _ = self._line.run_status()
-            return SyncStatus(_STATES[state], self._line.pins() if state in IDLE else None)
+            outputs = self._board.pins.outputs(self._line.pins()) if state in IDLE else None
+            return SyncStatus(_STATES[state], outputs)
 
     def _do_close(self) -> None:
         self._line.port.close()
@@ -220,7 +281,7 @@ class PrawnDo(SyncSource):
         """Firmware, and words that the board holds; raises ProtocolError for old firmware or an unknown board."""
         version = "".join(self._line.transact("ver")).removeprefix("Version: ")
         try:
-            numbers = tuple(int(part) for part in version.split(".")[:2])
+            numbers = tuple(int(part) for part in version.split(".")[:3])
         except ValueError:
             raise ProtocolError(f"{self.name}: no version in {version!r}; is this a PrawnDO?") from None
         if numbers < OLDEST_FIRMWARE:
@@ -257,8 +318,8 @@ class PrawnDo(SyncSource):
         _, external = self._line.run_status()
         if external != (self._config.external_clock is not None):
             raise DeviceFault(
-                f"{self.name}: the clock on GPIO20 is lost and the board runs on its own; check that clock, then open "
-                "the device again"
+                f"{self.name}: the clock on GPIO20 is lost and the board runs on its own; check that clock, then "
+                "power-cycle the board (its serial port may have frozen) and open the device again"
             )
 
 

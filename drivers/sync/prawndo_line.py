@@ -28,7 +28,14 @@ _LOWER = b"\nabt\nsts\nman 0\nsts\nman 0\n"
 """The first line end completes whatever an earlier host began to send. The board's first core answers commands, and its
 second core ends the program after `abt`; until then `man` is refused. The second core does so while the first one
 answers `sts`. So the outputs go low without a round trip to the host, which may be late."""
+USB_IDS = (0x2E8A, 0x000A)
+"""Vendor and product of the firmware on either board: those of any Pico, so other firmware may show them too."""
+_WAKE = b"\n0 0\nend\nndb\n"
+"""Ends what an earlier host may have begun by hand: `edt` swallows all lines up to two numbers, `add` up to `end`, and
+neither hears `abt`. Then no debug output, which would stand among the answers and delays `abt`."""
 _RESUSCITATED = "System Clock Resus'd"
+_READY = "ready"
+"""Answer to `adm`, behind which the board hears no commands. It may be left over from a host that died then."""
 _CHUNK_BYTES = 4032
 """Bytes per write while a program is loaded: sixteen of the firmware's own pieces of 42 words."""
 _SLICE_S = 0.02
@@ -60,6 +67,8 @@ class PrawnDoLine:
         self.port = port
         self.clock = port.clock
         """The clock of its deadlines."""
+        self.advice = "check its cable"
+        """What to do if it does not answer."""
         self._timing = timing
         self.lock = threading.RLock()
         """Hold it around commands that belong together."""
@@ -72,18 +81,33 @@ class PrawnDoLine:
     def connect(self, most_words: int) -> None:
         """Take all outputs low before anything else is asked, whatever state an earlier host left the board in.
 
-        most_words: the largest memory of any board, in words. Raises `ProtocolError` if something else answers,
-        `DeviceTimeout` if nothing does, `DeviceFault` if the outputs do not go low.
+        A board in the middle of a program is freed only if the port shows the right USB ids: that takes hundreds of
+        kilobytes, which nothing else should get. most_words: the largest memory of any board, in words. Raises
+        `ProtocolError` if it is something else, `DeviceTimeout` if nothing answers, `DeviceFault` if the outputs do not
+        go low.
         """
+        found = self.port.usb_ids
+        if found is not None and found != USB_IDS:
+            raise ProtocolError(
+                f"{self._name}: {self.port.path} is USB device {_as_text(found)}, not {_as_text(USB_IDS)}; correct "
+                "'port'"
+            )
+        self.port.write(_WAKE)
         try:
             self.lower()
         except DeviceTimeout:
-            if self._last_heard:
+            if self._last_heard not in ("", _READY):
                 raise ProtocolError(
                     f"{self._name}: what answers on {self.port.path} is no PrawnDO (it says "
                     f"{self._last_heard[:40]!r}); correct 'port'"
                 ) from None
+            if found is None:
+                raise DeviceTimeout(
+                    f"{self._name} does not answer on {self.port.path}, which has no USB ids to know it by; unplug it, "
+                    "plug it in and start again, or correct 'port'"
+                ) from None
             self._free_wedged(most_words)
+        self.command("ndb")
 
     def transact(self, command: str, deadline_s: float | None = None, *, urgent: bool = False) -> list[str]:
         """Send a command; returns the lines of its answer without blank ones.
@@ -127,7 +151,7 @@ class PrawnDoLine:
             with self._in_one_piece:
                 self._owed_bytes = len(payload)  # `adm` cannot be left before all bytes have come
                 self.port.write(f"{before}\nadm 0 {len(payload) // BYTES_PER_WORD:x}\n".encode())
-                self._until(lambda lines: lines[-1] == "ready", before, self._timing.reply_s, urgent=False)
+                self._until(lambda lines: lines[-1] == _READY, before, self._timing.reply_s, urgent=False)
                 for at in range(0, len(payload), _CHUNK_BYTES):
                     piece = payload[at : at + _CHUNK_BYTES]
                     self.port.write(piece)
@@ -188,10 +212,9 @@ class PrawnDoLine:
         The program is completed with zeros, which are words that wait with all outputs low.
         """
         _log.warning("%s does not answer on %s; trying to end an unfinished program", self._name, self.port.path)
-        self.port.write(b"\nend\n")
         piece = bytes(BYTES_PER_WORD * _CHUNK_BYTES)
         for _ in range(BYTES_PER_WORD * most_words // len(piece) + 2):
-            self.port.write(piece + b"\n")
+            self.port.write(piece + b"\nndb\n")
             try:
                 self.transact("sts", 2 * self._timing.hasty_s)
             except (DeviceTimeout, ProtocolError):
@@ -242,7 +265,7 @@ class PrawnDoLine:
             except DeviceTimeout:
                 if now_s(self.clock) >= ends_at:
                     raise DeviceTimeout(
-                        f"{self._name} did not answer within {deadline_s:g} s on {self.port.path}; check its cable"
+                        f"{self._name} did not answer within {deadline_s:g} s on {self.port.path}; {self.advice}"
                     ) from None
 
     def _token(self) -> str:
@@ -257,3 +280,7 @@ class PrawnDoLine:
         if self._owed_bytes:
             owed, self._owed_bytes = self._owed_bytes, 0
             self.port.write(bytes(owed) + b"\n")
+
+
+def _as_text(usb_ids: tuple[int, int]) -> str:
+    return f"{usb_ids[0]:04x}:{usb_ids[1]:04x}"

@@ -24,6 +24,9 @@ class Endpoint:
     serial_port: Callable[[], Any] | None = None
     """Function that opens an emulated serial port: an object like `serial.Serial` that waits on its own `clock`. None:
     pyserial opens the address."""
+    usb_ids: tuple[int, int] | None = None
+    """Vendor and product of an emulated serial port's USB device. None: an emulated port has none, and those of a real
+    one are looked up."""
 
 
 def one_line(error: Exception) -> str:

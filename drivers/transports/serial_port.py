@@ -6,6 +6,7 @@ own clock. Network ports are refused, because those of pyserial 3.5 write withou
 """
 
 import errno
+import os
 import select
 from collections.abc import Iterator
 from contextlib import contextmanager, suppress
@@ -63,6 +64,7 @@ class SerialPort:
         """The port's path, also if the address was a serial number or USB ids."""
         self._received = bytearray()
         self._tap = tap
+        self._endpoint = endpoint
         self._port = self._open(endpoint)
         self.clock: Clock = SystemClock() if endpoint.serial_port is None else self._port.clock
         """The clock of its deadlines."""
@@ -78,6 +80,17 @@ class SerialPort:
             return bool(hung_up.poll(0))
         except (*_FOREIGN, TypeError, ValueError):
             return True
+
+    @property
+    def usb_ids(self) -> tuple[int, int] | None:
+        """Vendor and product of the USB device behind the port; None: it is not on USB, or cannot tell."""
+        if self._endpoint.usb_ids is not None or self._endpoint.serial_port is not None:
+            return self._endpoint.usb_ids
+        here = os.path.realpath(self.path)  # links like /dev/serial/by-id are not listed
+        for port in list_ports.comports():
+            if port.vid is not None and port.pid is not None and os.path.realpath(port.device) == here:
+                return int(port.vid), int(port.pid)
+        return None
 
     def write(self, data: bytes) -> None:
         """Send all of `data`. Raises `DeviceTimeout` if the device takes none for a second, or `DeviceDisconnected`."""

@@ -3,6 +3,7 @@
 from bisect import bisect_right
 from collections.abc import Iterator
 from contextlib import contextmanager
+from dataclasses import replace
 from typing import Any
 
 from drivers.clock import VirtualClock, now_s
@@ -39,9 +40,18 @@ class TriggerLine:
 
 
 class Board:
-    """A PrawnDO with a trigger input, in virtual time. terminal: on a pseudo terminal, for a guard's process."""
+    """A PrawnDO with a trigger input, in virtual time. terminal: on a pseudo terminal, for a guard's process. usb_ids:
+    those that its port shows."""
 
-    def __init__(self, faults: FaultSchedule | None = None, *, terminal: bool = False, **settings: Any) -> None:
+    def __init__(
+        self,
+        faults: FaultSchedule | None = None,
+        *,
+        terminal: bool = False,
+        usb_ids: tuple[int, int] | None = None,
+        **settings: Any,
+    ) -> None:
+        self.usb_ids = usb_ids
         self.clock = VirtualClock()
         self.trigger = TriggerLine()
         self.model = PrawnDoModel(self.trigger, **settings)
@@ -62,7 +72,8 @@ class Board:
 
     def open(self, timing: PrawnDoTiming = USUAL_TIMING, **config: Any) -> PrawnDo:
         made = PrawnDoConfig.model_validate({"port": "emulated:sync", **config})
-        return PrawnDo(made, Surroundings(self.clock, None, 0, {"sync": self.server.endpoint}), timing)
+        endpoint = replace(self.server.endpoint, usb_ids=self.usb_ids)
+        return PrawnDo(made, Surroundings(self.clock, None, 0, {"sync": endpoint}), timing)
 
 
 @contextmanager

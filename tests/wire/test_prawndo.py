@@ -15,7 +15,7 @@ from drivers.errors import (
 )
 from drivers.interfaces import HOLD_S, OUT_FRAME, OUT_GATE, OUT_MARKER, Pulse
 from drivers.sync.prawndo import ProgramLimits, compile_program
-from drivers.sync.prawndo_line import PrawnDoTiming
+from drivers.sync.prawndo_line import USB_IDS, PrawnDoTiming
 from sim_backend.wire.firmware.prawndo import PrawnDoModel
 from tests.wire.lasers import PATIENCE_S, Silent, eventually
 from tests.wire.syncs import SWEEP, TriggerLine, board
@@ -125,6 +125,31 @@ def test_the_gate_is_low_within_half_a_millisecond_of_the_marker() -> None:
     assert 0.0101 <= changes[2][0] - rises_s <= 0.0101 + HOLD_S
 
 
+@pytest.mark.parametrize(("frame", "gate", "marker"), [(0, 1, 2), (15, 14, 13), (1, 15, 0), (7, 8, 9)])
+def test_each_of_the_sixteen_outputs_may_be_gate_frames_or_marker(frame: int, gate: int, marker: int) -> None:
+    with board() as wire, wire.open(frame_output=frame, gate_output=gate, marker_output=marker) as device:
+        held = Pulse(OUT_GATE | OUT_MARKER, 0.5e-3, held=True)
+        device.program([Pulse(OUT_MARKER, None), Pulse(OUT_GATE | OUT_FRAME, 1e-3), held], 1)
+        on_pins = [word for word, _ in wire.model.words]
+        assert on_pins == [1 << marker, 1 << gate | 1 << frame, 1 << marker, 1 << gate | 1 << marker, 0, 0]
+        device.run()
+        wire.trigger.pulse(wire.now_s, 1e-5)
+        wire.clock.sleep(5e-4)
+        assert wire.pins == 1 << gate | 1 << frame
+        device.gate_low()
+        assert wire.pins == 0
+        wire.model.receive(f"man {1 << gate | 1 << marker:x}\n".encode(), wire.now_s)
+        assert device.status.outputs == OUT_GATE | OUT_MARKER
+
+
+def test_outputs_beyond_the_sixteen_and_an_output_with_two_uses_are_refused() -> None:
+    with board() as wire:
+        with pytest.raises(ValueError, match="less than or equal to 15"):
+            wire.open(gate_output=16)
+        with pytest.raises(ValueError, match="output 2 has two uses"):
+            wire.open(gate_output=2)
+
+
 # The traps of docs/reference/hardware.md, one test each
 
 
@@ -200,16 +225,64 @@ def test_a_last_word_that_waits_is_parted_from_the_end() -> None:
         pytest.param(b"adm 0 ea60\n\x02\0", id="359 998 bytes of a program are missing"),
         pytest.param(b"man 2\nma", id="in the middle of a line"),
         pytest.param(b"man 2\nadd\n2 5\n", id="adding words"),
+        pytest.param(b"man ffff\n", id="all outputs set by hand"),
+        pytest.param(b"man 2\nadd\n2 5\nend\nedt\n", id="editing a word"),
+        pytest.param(b"deb\nman 2\nadd\n2 5\n", id="adding words with debug output"),
     ],
 )
 def test_trap_a_board_is_lowered_and_freed_by_opening_it_however_a_dead_host_left_it(left: bytes) -> None:
-    with board(board=2) as wire:
+    with board(board=2, usb_ids=USB_IDS) as wire:
         wire.model.receive(left, 0.0)
         with wire.open() as device:
             assert wire.pins == 0
             device.program(SWEEP, 1)
             device.run()
             assert device.status.state == "running"
+
+
+def test_trap_debug_output_left_on_by_somebody_is_switched_off() -> None:
+    """It would stand among the answers: `run` would fail although the program plays, and low outputs could not be
+    read."""
+    with board() as wire:
+        wire.model.receive(b"deb\n", 0.0)
+        with wire.open() as device:
+            device.program(SWEEP, 1)
+            device.run()
+            assert device.status.state == "running"
+
+
+@pytest.mark.parametrize("answer", [b"hwstart: 0\r\nok\r\n", b""], ids=["a wrong answer", "no answer"])
+def test_a_run_that_fails_leaves_the_outputs_low_although_the_program_has_started(answer: bytes) -> None:
+    with board() as wire, wire.open() as device:
+        device.program([Pulse(OUT_GATE, 30.0)], 1)
+        reply = wire.model._answer
+
+        def answer_wrongly(line: str, now_s: float) -> bytes:
+            said = reply(line, now_s)
+            return answer if line == "swr" else said
+
+        wire.model._answer = answer_wrongly  # type: ignore[method-assign]
+        with pytest.raises(DeviceFault, match="swr was answered"):
+            device.run()
+        changes = wire.model.changes(0.0, wire.now_s)
+        assert [level for _, level in changes] == [0, OUT_GATE, 0]
+        assert wire.model.status == 5
+        assert device.status.outputs == 0
+
+
+def test_a_run_that_is_interrupted_leaves_the_outputs_low(monkeypatch: pytest.MonkeyPatch) -> None:
+    with board() as wire, wire.open() as device:
+        device.program([Pulse(OUT_GATE, 30.0)], 1)
+        command = device._line.command
+
+        def interrupted(line: str) -> None:
+            command(line)
+            raise KeyboardInterrupt
+
+        monkeypatch.setattr(device._line, "command", interrupted)
+        with pytest.raises(KeyboardInterrupt):
+            device.run()
+        assert wire.pins == 0
 
 
 @pytest.mark.parametrize(
@@ -229,9 +302,19 @@ def test_trap_an_external_clock_that_dies_is_noticed_before_the_next_run() -> No
         with wire.server.lock:
             wire.model.external_clock_hz = None
             wire.model._resuscitate()
-        with pytest.raises(DeviceFault, match="GPIO20"):
+        with pytest.raises(DeviceFault, match=r"clock on GPIO20 is lost.*power-cycle the board"):
             device.run()
         device.abort()
+
+
+def test_trap_a_board_whose_external_clock_stops_may_hear_nothing_until_it_is_power_cycled() -> None:
+    with board(external_clock_hz=10_000_000) as wire:
+        device = wire.open(external_clock="10 MHz")
+        wire.server.hang()
+        with pytest.raises(DeviceTimeout, match=r"clock on GPIO20.*power-cycle the board"):
+            _ = device.status
+        wire.server.resume()
+        device.close()
 
 
 @pytest.mark.parametrize(("kind", "words"), [(1, 30_000), (2, 60_000)])
@@ -331,8 +414,11 @@ def test_a_board_that_is_unplugged() -> None:
 
 
 def test_firmware_that_is_too_old() -> None:
-    with board(version="1.2.0") as wire, pytest.raises(ProtocolError, match=r"firmware 1\.2\.0 is older than 1\.3"):
-        wire.open()
+    """Up to 1.3.0 `swr` waits for a trigger, and `man` after `abt` may set the next word of the program instead."""
+    for version in ("1.2.0", "1.3.0"):
+        said = rf"firmware {version} is older than 1\.3\.1"
+        with board(version=version) as wire, pytest.raises(ProtocolError, match=said):
+            wire.open()
 
 
 def test_a_device_that_is_no_prawndo() -> None:
@@ -351,3 +437,33 @@ def test_a_port_that_says_nothing() -> None:
         wire.server.hang()
         with pytest.raises(DeviceTimeout):
             wire.open()
+
+
+@pytest.mark.parametrize("left", [b"", b"adm 0 ea60\n"], ids=["another device", "a board in the middle of a program"])
+def test_nothing_large_is_sent_to_a_port_without_usb_ids_before_it_has_said_what_it_is(left: bytes) -> None:
+    class Deaf(Silent):
+        heard = 0
+
+        def receive(self, data: bytes, now_s: float) -> bytes:
+            self.heard += len(data)
+            return b""
+
+    with board(board=2) as wire:
+        if left:
+            wire.model.receive(left, 0.0)
+            heard = listen_to(wire.model)
+        else:
+            wire.server.model = deaf = Deaf()
+        with pytest.raises(DeviceTimeout, match=r"no USB ids.*unplug it") as refused:
+            wire.open()
+        assert (len(heard) if left else deaf.heard) < 2000
+        assert "\n" not in str(refused.value)
+
+
+def test_a_port_of_another_usb_device_is_refused_before_a_byte_is_sent() -> None:
+    with board(usb_ids=(0x0403, 0x6001)) as wire:
+        heard = listen_to(wire.model)
+        with pytest.raises(ProtocolError, match=r"/dev/emulated-\w+ is USB device 0403:6001, not 2e8a:000a") as refused:
+            wire.open()
+        assert not heard
+        assert "\n" not in str(refused.value)

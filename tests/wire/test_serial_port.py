@@ -4,6 +4,7 @@ Deadlines are looked at on the emulated port, which keeps virtual time.
 """
 
 import errno
+import os
 from collections.abc import Callable, Iterator
 from types import SimpleNamespace
 
@@ -192,6 +193,15 @@ def test_a_port_is_found_by_serial_number_and_by_product(monkeypatch: pytest.Mon
             found.close()
     with pytest.raises(DeviceNotFound, match=r"no serial port with serial=B2; attached: .*serial=A1"):
         SerialPort("box", Endpoint("serial=B2"))
+
+
+def test_the_usb_ids_of_a_port_are_found_through_links_too(monkeypatch: pytest.MonkeyPatch) -> None:
+    with SerialServer(Echo()) as server:
+        for listed, ids in ((os.path.realpath(server.path), (0x2E8A, 0xA)), ("/dev/ttyS0", None)):
+            monkeypatch.setattr(list_ports, "comports", lambda: attached((listed, None, 0x2E8A, 0xA)))  # noqa: B023
+            port = SerialPort("box", server.endpoint)  # whose path is a link
+            assert port.usb_ids == ids
+            port.close()
 
 
 def test_two_equal_devices_ask_for_the_serial_number_or_the_port(monkeypatch: pytest.MonkeyPatch) -> None:

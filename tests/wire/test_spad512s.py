@@ -102,10 +102,13 @@ INFO = b"M1\nS1\n2.0\n1.0\n1.0\n512\n1\n1\n1\n"
 
 
 @contextmanager
-def answering(n_frames: int, answer: bytes, tap: Tap | None = None) -> Iterator[Spad512s]:
+def answering(
+    n_frames: int, answer: bytes, tap: Tap | None = None, info: bytes = INFO, **config: Any
+) -> Iterator[Spad512s]:
     """A device that answers one run of n frames with these very bytes."""
-    script = ((b"D", INFO), (b"PU,0", b"ok"), (f"I,1,20,{n_frames},0,1,0,1\n".encode(), answer))
-    with scripted(*script) as (address, heard), Spad512s(Spad512sConfig(), Endpoint(address), PATIENT, tap) as device:
+    script = ((b"D", info), (b"PU,0", b"ok"), (f"I,1,20,{n_frames},0,1,0,1\n".encode(), answer))
+    made = Spad512sConfig.model_validate(config)
+    with scripted(*script) as (address, heard), Spad512s(made, Endpoint(address), PATIENT, tap) as device:
         yield device
         assert heard == [command for command, _ in script]
 
@@ -268,14 +271,65 @@ def test_wrong_addresses_are_one_line_each() -> None:
         assert "\n" not in str(refused.value)
 
 
-def test_the_1m_flavour_has_1024_rows_and_lies_on_its_side() -> None:
+def test_the_1m_flavour_has_1024_rows_of_1024_columns() -> None:
     def frames(first: int, start_s: float, period_s: float, n: int) -> NDArray[np.uint8]:
-        return np.random.default_rng(first).integers(0, 256, (n, 512, 128), dtype=np.uint8)
+        return np.random.default_rng(first).integers(0, 256, (n, 1024, 128), dtype=np.uint8)
 
-    with connected(Spad512sModel(frames, flavour="1M")) as (device, _):
-        assert (device.info.width, device.info.height) == (1024, 512)
+    model = Spad512sModel(frames, flavour="1M", wants_width=True)
+    with connected(model, max_frame_rate="97.65625 kHz", width_in_command=True) as (device, _):
+        assert (device.info.width, device.info.height) == (1024, 1024)
         (block,) = take(device, 8)
         assert np.array_equal(block.bits, frames(0, 0, 0, 8))
+        assert model.commands[-1] == "I,1,20,8,0,1,0,1,1024"
+
+
+def test_the_1m_flavour_needs_a_frame_rate_of_its_own_since_frames_carry_no_time() -> None:
+    with (
+        TcpServer(Spad512sModel(noise, flavour="1M")) as server,
+        pytest.raises(DeviceFault, match=r"97\.7 kHz.*of the 512 x 512 sensor.*max_frame_rate"),
+    ):
+        Spad512s(Spad512sConfig(), server.endpoint)
+
+
+def test_frames_of_another_size_than_expected_are_told_and_never_taken() -> None:
+    half = b"".join(noise(number, 0, 0, 1).tobytes() for number in range(6)) + b"DONE"  # three frames of 1024 x 512
+    info = INFO.replace(b"512", b"1M")
+    with (
+        answering(3, half, info=info, max_frame_rate="97.65625 kHz") as device,
+        pytest.raises(ProtocolError, match="65536 bytes a frame, not 131072"),
+    ):
+        take(device, 3)
+
+
+@pytest.mark.parametrize("wants_width", [False, True])
+def test_the_width_is_sent_as_a_ninth_field_where_the_program_wants_it(wants_width: bool) -> None:
+    model = Spad512sModel(noise, wants_width=wants_width)
+    with connected(model, width_in_command=True) as (device, _):
+        take(device, 16)
+        assert model.commands[-1] == "I,1,20,16,0,1,0,1,512"
+    model = Spad512sModel(noise, wants_width=wants_width)
+    with connected(model) as (device, _):
+        if wants_width:
+            with pytest.raises(DeviceFault, match=r"Wrong number of arguments ERROR.*width_in_command"):
+                take(device, 16)
+        else:
+            take(device, 16)
+        assert "I,1,20,16,0,1,0,1" in model.commands
+
+
+@pytest.mark.parametrize("lines", [7, 8, 9, 10])
+def test_the_description_may_have_lines_more_than_those_that_are_read(lines: int) -> None:
+    info = b"".join(INFO.splitlines(keepends=True)[:lines]) + b"1\n" * (lines - 9)
+    with answering(1, bytes(FRAME_BYTES) + b"DONE", info=info) as device:
+        assert device.info.serial == "M1"
+        take(device, 1)
+
+
+def test_a_banner_that_names_no_spad_is_only_a_warning(caplog: pytest.LogCaptureFixture) -> None:
+    with connected(Spad512sModel(noise, banner="cS512 server 3.0\n")) as (device, _):
+        assert device.info.model == "cS512 512"
+        take(device, 16)
+    assert "greets with 'cS512 server 3.0'" in caplog.text
 
 
 def test_a_rate_that_does_not_follow_from_the_exposure_is_refused_or_triggered() -> None:

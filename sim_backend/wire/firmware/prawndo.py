@@ -23,7 +23,7 @@ LINE_BYTES = 256
 """Size of the firmware's line buffer."""
 CLOCK_LIMIT_HZ = {1: 133_000_000, 2: 150_000_000}
 BANNER = b"Prawn Digital Output online\r\n"
-_WHEN_IDLE = ("gto", "len", "adm", "clk", "frq", "add", "cls", "man", "run", "swr")
+_WHEN_IDLE = ("gto", "len", "adm", "clk", "frq", "add", "edt", "cls", "man", "run", "swr")
 """Commands that are refused while a program runs."""
 
 Trigger = Callable[[float, float], float | None]
@@ -71,7 +71,8 @@ class PrawnDoModel:
         self._line = bytearray()
         self._missing = 0  # bytes that `adm` still waits for
         self._binary = bytearray()
-        self._adding = False
+        self._adding = self._editing = False
+        self._debug = False
         self._unasked = b""
 
     # The wire
@@ -185,7 +186,12 @@ class PrawnDoModel:
         line = line.partition("\0")[0]  # a C string
         if self._adding:
             return self._add(line)
+        if self._editing:
+            return self._edit(line)
         match line[:3]:
+            case "deb" | "ndb" as name:
+                self._debug = name == "deb"
+                return _said("ok")
             case "ver":
                 return _said(f"Version: {self._version}")
             case "brd":
@@ -216,6 +222,9 @@ class PrawnDoModel:
             case "add":
                 self._adding = True
                 return b""
+            case "edt":
+                self._editing = bool(self.words)
+                return b"" if self.words else _said("No commands to edit", "ok")
             case "cls":
                 self.words.clear()
             case "man":
@@ -223,11 +232,15 @@ class PrawnDoModel:
                 if numbers is None:
                     return _said("invalid request")
                 self._set_outputs(numbers[0] & 0xFFFF, now_s)
+                if self._debug:  # from the second core, as below
+                    return _said("ok", f"Output commanded: {numbers[0]:x}")
             case "run" | "swr":  # started by hardware, it waits for a trigger before the first word
                 self.status = STARTING
                 self._run = _Run(-1, now_s)
                 if name == "swr":
                     self._enter(0, now_s)
+                if self._debug:
+                    return _said("ok", f"hwstart: {int(name == 'run')}")
         return _said("ok")
 
     def _abort(self) -> bytes:
@@ -251,6 +264,15 @@ class PrawnDoModel:
             return _said(f"Invalid output specification {word:x}" if word > 0xFFFF else short)
         self.words.append((word, cycles))
         return b""
+
+    def _edit(self, line: str) -> bytes:
+        """Swallow lines until one has two numbers, which replace the last word."""
+        numbers = _numbers(f"edt {line}", 16, 2)
+        if numbers is None:
+            return b""
+        self._editing = False
+        self.words[-1] = (numbers[0], numbers[1])
+        return _said("ok")
 
     def _add_many(self, line: str) -> bytes:
         numbers = _numbers(line, 16, 2)

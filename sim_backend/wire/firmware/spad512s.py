@@ -33,6 +33,7 @@ class Spad512sModel:
     glued_done: whether text answers end with DONE, as in one emulation; the real program's behaviour is unknown.
     extra_fields: whether `R` answers eight fields instead of six. heeds_stop: whether STOP ends a run. rotation: the
     turn that makes its pixels upright. paced: whether pixels come no earlier than the sensor exposes them.
+    wants_width: whether `I` must name the image width, as in the newest sample; else it may.
     """
 
     def __init__(
@@ -47,6 +48,8 @@ class Spad512sModel:
         heeds_stop: bool = True,
         rotation: QuarterTurn = 90,
         paced: bool = False,
+        banner: str = BANNER,
+        wants_width: bool = False,
     ) -> None:
         self.commands: list[str] = []
         """Commands as they came, for tests to look at."""
@@ -62,6 +65,8 @@ class Spad512sModel:
         self._rows = 1024 if "1M" in flavour else 512
         self._rotation: QuarterTurn = rotation
         self._paced = paced
+        self._banner = banner
+        self._wants_width = wants_width
         self.restarted()
         self._calibrating_until: float | None = None
         self._pile_up_sent = False
@@ -70,7 +75,7 @@ class Spad512sModel:
 
     def connected(self, now_s: float) -> None:
         """Greet the client."""
-        self._out = bytearray(BANNER.encode())
+        self._out = bytearray(self._banner.encode())
         self._run = None
 
     def disconnected(self, now_s: float) -> None:
@@ -132,10 +137,13 @@ class Spad512sModel:
         self._out += (CALIBRATION_SOON + CALIBRATION_BEGUN).encode()
 
     def _acquire(self, arguments: list[str], now_s: float) -> None:
-        """Begin the run of I,bits,tInt,n,trigger,overlap,sparse,stream, or say what is wrong with it."""
+        """Begin the run of I,bits,tInt,n,trigger,overlap,sparse,stream[,width], or say what is wrong with it."""
         try:
-            bits, t_int, n, _, _, sparse, stream = (int(word) for word in arguments[:7])
+            bits, t_int, n, _, _, sparse, stream, *width = (int(word) for word in arguments)
         except ValueError:
+            self._say("Wrong number of arguments ERROR")
+            return
+        if width != [self._rows] and (width or self._wants_width):
             self._say("Wrong number of arguments ERROR")
             return
         if (bits, sparse, stream) != (1, 0, 1) or n < 1 or t_int < 1:
@@ -157,9 +165,9 @@ class Spad512sModel:
         if self._paced and now_s < run.start_s + (run.next_frame + n) * run.period_s:
             return
         upright = self._frames(run.next_frame, run.start_s + run.next_frame * run.period_s, run.period_s, n)
-        pixels = np.empty((n, self._rows, 64), np.uint8)
+        pixels = np.empty((n, self._rows, self._rows // 8), np.uint8)
         turn_packed(upright, _BACK[self._rotation], pixels)
-        sent = run.next_frame * self._rows * 64
+        sent = run.next_frame * self._rows * self._rows // 8
         run.next_frame += n
         data = pixels.tobytes()
         if self.fail_at_byte is not None and sent + len(data) > self.fail_at_byte:

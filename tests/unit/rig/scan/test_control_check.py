@@ -72,6 +72,13 @@ def test_questions_tokens_repeats_and_parking_are_not_compared(tmp_path: Path) -
     assert found.swaps == 4
 
 
+def test_what_ends_another_clients_leftovers_is_not_compared(tmp_path: Path) -> None:
+    """Recordings from before the driver sent it replay as they did."""
+    now = scan()
+    now.lines.insert(0, (0, "sync", "serial", OUT, b"\n0 0\nend\nndb\n"))
+    assert compare(tmp_path, now).problems == ()
+
+
 def with_program(program: bytes) -> Talk:
     now = scan()
     now.lines = [(*line[:4], program) if line[4].startswith(b"\x01\x0a") else line for line in now.lines]
