@@ -220,6 +220,18 @@ def test_the_states_of_a_run_that_is_aborted() -> None:
     assert model.status == ABORTED
 
 
+def test_an_abort_in_the_instant_of_the_end_blocks_all_until_the_power_is_off() -> None:
+    model = PrawnDoModel()
+    model.late_abort = True
+    assert said(model, PROGRAM + b"swr\nabt\n") == b"ok\r\nok\r\nok\r\n"
+    for now_s in (1.0, 2.0):
+        assert said(model, b"sts\n", now_s) == b"run-status:3 clock-status:0\r\n"
+        assert said(model, b"abt\n", now_s) == b"Can only abort when status is 1 or 2\r\n"
+        assert said(model, b"man 0\n", now_s) == b"Cannot execute command man 0\n during buffered execution.\r\n"
+    model.power_cycle(3.0)
+    assert said(model, b"sts\n", 3.0) == BANNER + b"run-status:0 clock-status:0\r\n"
+
+
 def test_a_software_start_plays_at_once_and_a_hardware_start_at_the_level() -> None:
     for command, start_s in ((b"swr\n", 1.0), (b"run\n", 2.0)):
         model = PrawnDoModel(high_from(2.0))

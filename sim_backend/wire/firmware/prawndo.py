@@ -75,6 +75,8 @@ class PrawnDoModel:
         self._release = tuple(int(part) for part in version.split("."))
         self.external_clock_hz = external_clock_hz
         self._uart_takes_pins = uart_takes_pins
+        self.late_abort = False
+        """Test knob: whether `abt` comes in the instant in which the program ends. Nobody then answers the request."""
         self._now_s = float("-inf")  # the latest time at which the wire was served
         self._times: list[float] = [float("-inf")]
         self._levels: list[int] = [0]
@@ -246,9 +248,9 @@ class PrawnDoModel:
     def _abort_now(self) -> None:
         """Stop the player; the outputs stay as they are."""
         run, self._run = self._run, None
-        self.status = ABORTED
         if run is None:
             return
+        self.status = ABORTED
         if self._release < (1, 3, 1):  # the word that would have come next stays in the player, before any other
             after = run.index + (2 if self._waits(run.index) else 1)
             self._stale = self._memory[after][0] if after < self._count else None
@@ -355,6 +357,8 @@ class PrawnDoModel:
         if self.status not in (STARTING, RUNNING):
             return _said("Can only abort when status is 1 or 2")
         self.status = ABORT_REQUESTED
+        if self.late_abort:
+            self._run = None
         return _said("ok")
 
     def _start(self, triggered: bool, now_s: float) -> bytes:
