@@ -275,7 +275,7 @@ def test_the_1m_flavour_has_1024_rows_of_1024_columns() -> None:
     def frames(first: int, start_s: float, period_s: float, n: int) -> NDArray[np.uint8]:
         return np.random.default_rng(first).integers(0, 256, (n, 1024, 128), dtype=np.uint8)
 
-    model = Spad512sModel(frames, flavour="1M", wants_width=True)
+    model = Spad512sModel(frames, flavour="1M", fields=(9,))
     with connected(model, max_frame_rate="97.65625 kHz", width_in_command=True) as (device, _):
         assert (device.info.width, device.info.height) == (1024, 1024)
         (block,) = take(device, 8)
@@ -303,11 +303,11 @@ def test_frames_of_another_size_than_expected_are_told_and_never_taken() -> None
 
 @pytest.mark.parametrize("wants_width", [False, True])
 def test_the_width_is_sent_as_a_ninth_field_where_the_program_wants_it(wants_width: bool) -> None:
-    model = Spad512sModel(noise, wants_width=wants_width)
+    model = Spad512sModel(noise, fields=(9,) if wants_width else (8, 9))
     with connected(model, width_in_command=True) as (device, _):
         take(device, 16)
         assert model.commands[-1] == "I,1,20,16,0,1,0,1,512"
-    model = Spad512sModel(noise, wants_width=wants_width)
+    model = Spad512sModel(noise, fields=(9,) if wants_width else (8, 9))
     with connected(model) as (device, _):
         if wants_width:
             with pytest.raises(DeviceFault, match=r"Wrong number of arguments ERROR.*width_in_command"):

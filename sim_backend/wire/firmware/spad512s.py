@@ -1,7 +1,8 @@
 """The vendor's program of a SPAD512S as seen from its TCP port (docs/reference/hardware.md), traps included.
 
-A pure state machine: it gets commands and the time, and gives text and pixels. It takes frames of 1 bit only. Their
-content comes upright from `frames` and is turned onto its side, as the real sensor delivers it.
+A pure state machine: it gets commands and the time, and gives text and pixels. It takes frames of 1 bit and of the full
+width only. Their content comes upright from `frames` and is turned onto its side, as the real sensor delivers it.
+Public sources tell what clients send and how they read the answers, so the words of most answers are made up here.
 """
 
 from collections.abc import Callable
@@ -22,7 +23,20 @@ CALIBRATION_SOON: Final = "The breakdown calibration process will start soon.\n"
 CALIBRATION_BEGUN: Final = "The breakdown calibration process has started.\n"
 CALIBRATION_DONE: Final = "The breakdown is around 24.1 V\n"
 READ_OUT_S: Final = 10.24e-6
-_INFO: Final = "MASTER-0042\nSLAVE-0043\n2.3.1\n1.4\n1.1\n{flavour}\n{intensity}\n1\n0\n"
+_INFO: Final = (
+    ("Master FPGA serial", "MASTER-0042"),
+    ("Slave FPGA serial", "SLAVE-0043"),
+    ("Software version", "2.3.1"),
+    ("Firmware version", "1.4"),
+    ("Hardware version", "1.1"),
+    ("Hardware flavour", "{flavour}"),
+    ("Intensity imaging", "{intensity}"),
+    ("Gated imaging", "1"),
+    ("FLIM imaging", "0"),
+)
+"""Lines of the answer to `D`. The vendor's client looks for a flavour after 18 characters of the sixth line."""
+_EIGHT_FIELDS: Final = 8
+"""Fields of `I` with its name; the ninth one is the width of the image in pixels."""
 _FRAMES_AT_ONCE = 8
 """Frames made at a time."""
 
@@ -31,9 +45,11 @@ class Spad512sModel:
     """The program and its device. calibration_s: duration of the calibration that the first `D` starts; 0: none.
 
     glued_done: whether text answers end with DONE, as in one emulation; the real program's behaviour is unknown.
-    extra_fields: whether `R` answers eight fields instead of six. heeds_stop: whether STOP ends a run. rotation: the
-    turn that makes its pixels upright. paced: whether pixels come no earlier than the sensor exposes them.
-    wants_width: whether `I` must name the image width, as in the newest sample; else it may.
+    extra_fields: whether `R` answers eight fields instead of six. flavour: 512, or 1M for 1024 rows. columns: pixels of
+    a row as the sensor delivers it; None: as many as there are rows. labels: whether the lines of `D` tell what they
+    mean. fields: numbers of fields with which `I` is taken; newer clients of the vendor send nine. heeds_stop: whether
+    STOP ends a run. wants_pile_up: whether each run needs PU,0 before it. rotation: the turn that makes its pixels
+    upright. paced: whether pixels come no earlier than the sensor exposes them.
     """
 
     def __init__(
@@ -45,11 +61,14 @@ class Spad512sModel:
         extra_fields: bool = False,
         flavour: str = "512",
         intensity: bool = True,
+        columns: int | None = None,
+        labels: bool = True,
+        fields: tuple[int, ...] = (_EIGHT_FIELDS, _EIGHT_FIELDS + 1),
+        banner: str = BANNER,
         heeds_stop: bool = True,
+        wants_pile_up: bool = False,
         rotation: QuarterTurn = 90,
         paced: bool = False,
-        banner: str = BANNER,
-        wants_width: bool = False,
     ) -> None:
         self.commands: list[str] = []
         """Commands as they came, for tests to look at."""
@@ -61,12 +80,16 @@ class Spad512sModel:
         self._done = "\nDONE" if glued_done else ""
         self._extra = ",1,0" if extra_fields else ""
         self._heeds_stop = heeds_stop
-        self._info = _INFO.format(flavour=flavour, intensity=int(intensity))
+        lines = (f"{label}: {value}" if labels else value for label, value in _INFO)
+        self._info = "".join(f"{line}\n" for line in lines).format(flavour=flavour, intensity=int(intensity))
         self._rows = 1024 if "1M" in flavour else 512
+        self._columns = columns or self._rows
+        self._fields = fields
+        self._banner = banner
+        self._wants_pile_up = wants_pile_up
+        self._excess_bias_v = 4.0
         self._rotation: QuarterTurn = rotation
         self._paced = paced
-        self._banner = banner
-        self._wants_width = wants_width
         self.restarted()
         self._calibrating_until: float | None = None
         self._pile_up_sent = False
@@ -117,8 +140,8 @@ class Spad512sModel:
         name, *arguments = command.split(",")
         if name == "D" and not arguments:
             self._describe(now_s)
-        elif name == "V" and not arguments:
-            self._say("23.5,4.0")
+        elif name == "V":
+            self._bias(arguments)
         elif name == "R" and not arguments:
             self._say(f"41.5,42.0,38.5,-9.5,40000000.0,97656.25{self._extra}")
         elif name == "PU" and arguments in (["0"], ["1"]):
@@ -136,24 +159,38 @@ class Spad512sModel:
         self._calibrating_until = now_s + self._calibration_s
         self._out += (CALIBRATION_SOON + CALIBRATION_BEGUN).encode()
 
+    def _bias(self, arguments: list[str]) -> None:
+        """Answer V, or set the excess bias to the x of V,x."""
+        if not arguments:
+            self._say(f"23.5,{self._excess_bias_v}")
+            return
+        try:
+            self._excess_bias_v = float(arguments[0])
+        except ValueError:
+            self._say("Wrong voltage ERROR")
+            return
+        self._say(f"Excess bias set to {self._excess_bias_v} V")
+
     def _acquire(self, arguments: list[str], now_s: float) -> None:
         """Begin the run of I,bits,tInt,n,trigger,overlap,sparse,stream[,width], or say what is wrong with it."""
         try:
-            bits, t_int, n, _, _, sparse, stream, *width = (int(word) for word in arguments)
-        except ValueError:
+            if 1 + len(arguments) not in self._fields:
+                raise ValueError
+            t_int = float(arguments.pop(1))
+            bits, n, _, overlap, sparse, stream, *width = (int(word) for word in arguments)
+        except (IndexError, ValueError):
             self._say("Wrong number of arguments ERROR")
             return
-        if width != [self._rows] and (width or self._wants_width):
-            self._say("Wrong number of arguments ERROR")
-            return
-        if (bits, sparse, stream) != (1, 0, 1) or n < 1 or t_int < 1:
+        if (bits, sparse, stream) != (1, 0, 1) or width not in ([], [self._columns]) or n < 1 or t_int < 1:
             self._say("Mode not emulated ERROR")
             return
-        if not self._pile_up_sent:
+        if self._wants_pile_up and not self._pile_up_sent:
             self._say("Pile-up correction not set ERROR")
             return
         self._pile_up_sent = False  # it holds for one acquisition
-        self._run = _Run(n, max(t_int * 1e-6, READ_OUT_S), now_s)  # microseconds: bits is 1
+        exposure_s = t_int * 1e-6  # microseconds: bits is 1
+        period_s = max(exposure_s, READ_OUT_S) if overlap else exposure_s + READ_OUT_S
+        self._run = _Run(n, period_s, now_s)
 
     def _expose(self, run: "_Run", now_s: float) -> None:
         """Send the next frames if they are exposed, or the text that ends the run."""
@@ -165,9 +202,10 @@ class Spad512sModel:
         if self._paced and now_s < run.start_s + (run.next_frame + n) * run.period_s:
             return
         upright = self._frames(run.next_frame, run.start_s + run.next_frame * run.period_s, run.period_s, n)
-        pixels = np.empty((n, self._rows, self._rows // 8), np.uint8)
+        row_bytes = self._columns // 8
+        pixels = np.empty((n, self._rows, row_bytes), np.uint8)
         turn_packed(upright, _BACK[self._rotation], pixels)
-        sent = run.next_frame * self._rows * self._rows // 8
+        sent = run.next_frame * self._rows * row_bytes
         run.next_frame += n
         data = pixels.tobytes()
         if self.fail_at_byte is not None and sent + len(data) > self.fail_at_byte:
