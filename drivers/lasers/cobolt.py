@@ -1,15 +1,19 @@
 """The Cobolt (Huebner) 06-01 line laser, gated by its digital modulation input.
 
-Commands and replies are in docs/reference/hardware.md. Sources: cobolt-lasers/pycobolt 1333e53 (2025-09) and
-python-microscope `lights/cobolt.py`. Old firmware may send junk before a reply. The laser monitors its temperatures
-itself and reports fault 1.
+Commands and replies are in docs/reference/hardware.md. Sources: cobolt-lasers/pycobolt 1333e53 (2025-09),
+python-microscope `lights/cobolt.py`, and the vendor's adapter for Micro-Manager (mmCoreAndDevices 8431eb1,
+DeviceAdapters/CoboltOfficial). Old firmware may send junk before a reply. The laser monitors its temperatures itself
+and reports fault 1.
 
-The 06-MLD has its own command language, newer lasers an SCPI-like one. A 06-DPL is refused, since its power follows a
-gate only up to about 1 kHz. The laser is kept dark by a power of 0 and not by `l0`: after `l0` its key must be turned
-(pycobolt issue 6), whereas a power of 0 can be read back, by the next program too. `pause` sets the power to 0 (and
-sends `las:paus 1`), so no key is needed to resume; if the power does not read back as 0, `pause` switches the laser
-off. `disarm` does the same and sends `l0`; with autostart enabled the key must then be turned off and on before the
-laser starts again.
+There are two command languages, that of the first 06-MLD lasers and a SCPI-like one. Which of them a laser speaks is
+asked and not taken from its model number, since an 06-MLD comes with either firmware. A 06-DPL is refused, since its
+power follows a gate only up to about 1 kHz. Not every unit knows every question: what is asked about key and autostart
+and is refused counts as unknown.
+
+The laser is kept dark by a power of 0 and not by `l0`: after `l0` its key must be turned (pycobolt issue 6), whereas a
+power of 0 can be read back, by the next program too. `pause` sets the power to 0 (and sends `las:paus 1`), so no key is
+needed to resume; if the power does not read back as 0, `pause` switches the laser off. `disarm` does the same and sends
+`l0`; with autostart enabled the key must then be turned off and on before the laser starts again.
 """
 
 import logging
@@ -34,7 +38,7 @@ NAME = re.compile(r"(?=.*\d)[A-Za-z0-9][A-Za-z0-9._/ -]*")
 """Form of model and serial numbers. They contain a digit, unlike all other replies in words."""
 USUAL_TIMING = LineTiming(gap_s=0.1)
 
-_REFUSED = re.compile(r"syntax error.*", re.IGNORECASE)
+_REFUSED = re.compile(r"syntax error.*|.*\b(invalid|illegal)\b.*", re.IGNORECASE)
 _JUNK = re.compile(r"^[^A-Za-z0-9+-]+")
 _MOST_LINES = 3
 """Most lines to read for one reply: lines that are only junk or echo may come before it."""
@@ -92,6 +96,10 @@ class Dialect:
     """Query of the laser's state, the form of its answers, and the form of those that mean: it waits for its key."""
     names: Mapping[str, str]
     """Names of the other modes, by the number that the laser reports."""
+    autostart: tuple[str, ...]
+    """Questions for whether autostart is enabled. The first one that the laser knows counts."""
+    most_power: tuple[str, ...]
+    """Questions for the most power, in milliwatts. The first one that the laser knows counts."""
     external: str = ""
     """Command that lets the input control the light, and not the host. Empty: not needed."""
     pause: str = ""
@@ -110,6 +118,8 @@ MLD = Dialect(
     no_power="p 0",
     waits_for_key=("gom?", COUNT, re.compile("1")),
     names={"0": "constant current", "1": "constant power"},
+    autostart=("@cobas?", "gas?"),
+    most_power=("gmlp?",),
 )
 """The language of 06-MLD."""
 SCPI = Dialect(
@@ -127,11 +137,14 @@ SCPI = Dialect(
     no_power="laser:cp:power:setpoint 0",
     waits_for_key=("state?", WORD, re.compile(".*waitingforkey.*", re.IGNORECASE)),
     names={},
+    autostart=("@cobas?", "autostart:enabled?"),
+    most_power=("laser:cp:power:setpoint? max", "gmlp?"),
     external="laser:pm:dig:modulator external",
     pause="las:paus",
 )
 """The newer 06-01 language. With its modulator on "command" the laser obeys `!e` and `!d`, without an answer."""
-DIALECTS = {"06-MLD": MLD, "06-01": SCPI}
+DIALECTS = (SCPI, MLD)
+"""Both languages, in the order in which they are tried: newer firmware may know words of the old one too."""
 
 
 FAMILIES = {
@@ -160,10 +173,14 @@ class CoboltConfig(SerialLaserConfig):
 class CoboltLaser(SerialLaser):
     """A Cobolt 06-01. `status` takes almost a second, since the laser allows at most ten commands a second."""
 
-    def __init__(self, line: Dialogue, dialect: Dialect, name: str, limits: LaserLimits, autostart: bool) -> None:
+    def __init__(
+        self, line: Dialogue, dialect: Dialect, name: str, limits: LaserLimits, autostart: bool | None
+    ) -> None:
+        """autostart: whether it is enabled; None: the laser does not say."""
         super().__init__(name, line, limits)
         self._dialect = dialect
         self._autostart = autostart
+        self._tells_key = autostart is not False
         self._started = False
 
     def _do_status(self) -> LaserStatus:
@@ -175,7 +192,7 @@ class CoboltLaser(SerialLaser):
         mode = self._mode()
         input_mode = self._input_mode(mode)
         set_w = self._power_w(mode) if on else 0.0
-        key_on = line.ask_flag("@cobasks?") if self._autostart else None
+        key_on = self._key_on()
         if not on and fault is None and self._waits_for_key():
             fault = "it waits for its key: turn the key off and on"
         return LaserStatus(
@@ -188,6 +205,16 @@ class CoboltLaser(SerialLaser):
             input_mode=input_mode,
             power_w=line.ask_number("pa?") if on else 0.0,
         )
+
+    def _key_on(self) -> bool | None:
+        """Whether the key is on. None: it does not matter, or the laser does not know the question."""
+        if not self._tells_key:
+            return None
+        try:
+            return self._line.ask_flag("@cobasks?")
+        except CommandRefused:
+            self._tells_key = False  # a refusal takes most of a second, and the guard asks every second
+            return None
 
     def _fault(self) -> str | None:
         number = int(self._line.ask("f?", COUNT)) and int(self._line.ask("f?", COUNT))
@@ -277,7 +304,13 @@ class CoboltLaser(SerialLaser):
 
     def _start(self) -> None:
         """Switch on; emission follows once temperatures are reached."""
-        self._line.tell("@cob1" if self._autostart else "l1")
+        if self._autostart is None:
+            try:
+                self._line.tell("@cob1")
+            except CommandRefused:
+                self._line.tell("l1")  # refused itself while autostart is enabled, so no key is bypassed
+        else:
+            self._line.tell("@cob1" if self._autostart else "l1")
         self._started = True
         if not self._line.ask_flag("l?") and self._waits_for_key():
             # The start is not cancelled: once the key is turned, the laser comes on, and is dark.
@@ -315,7 +348,9 @@ def create(config: CoboltConfig, surroundings: Surroundings, timing: LineTiming 
 
 
 def _identify(config: CoboltConfig, line: Dialogue) -> CoboltLaser:
-    """Find out which laser answers, with as few questions as possible: each takes 0.1 s, and a guard waits for them."""
+    """Find out which laser answers, with as few questions as possible: each takes 0.1 s, and a guard waits for them.
+    A refused one takes several times that.
+    """
     try:
         model = line.ask_surely("glm?", NAME)
     except CommandRefused:
@@ -327,16 +362,42 @@ def _identify(config: CoboltConfig, line: Dialogue) -> CoboltLaser:
         raise DeviceFault(
             f"cobolt laser {model} is an 06-DPL: its power follows a gate up to 1 kHz only; use an 06-MLD"
         )
-    if family not in DIALECTS:
+    if family == "unknown":
         raise DeviceFault(f"cobolt laser {model} is no 06-01 type; this driver runs 06-MLD and newer 06-01 lasers")
+    dialect = _language(config, line, model)
     serial = line.ask_surely("sn?", NAME)
     require_serial_number("cobolt", config, serial)
-    limit_w = float(line.ask_surely("gmlp?", NUMBER)) * 1e-3
+    most_mw = _first_known(line, dialect.most_power, NUMBER)
+    if most_mw is None:
+        raise ProtocolError(f"{line.name} does not say its most power; check its firmware")
+    limit_w = float(most_mw) * 1e-3
     if limit_w <= 0:
         raise ProtocolError(f"{line.name} says that its most power is {limit_w:g} W; check its cable and firmware")
-    autostart = line.ask_surely("@cobas?", FLAG) == "1"
+    autostart = _first_known(line, dialect.autostart, FLAG)
     limits = LaserLimits(0.0, min(config.max_power, limit_w))
-    return CoboltLaser(line, DIALECTS[family], f"Cobolt {model} {serial}", limits, autostart)
+    name = f"Cobolt {model} {serial}"
+    return CoboltLaser(line, dialect, name, limits, None if autostart is None else autostart == "1")
+
+
+def _language(config: CoboltConfig, line: Dialogue, model: str) -> Dialect:
+    """The language in which the laser answers the question for its mode."""
+    for dialect in DIALECTS:
+        try:
+            line.ask(
+                dialect.mode, dialect.mode_form
+            )  # a refusal has not the form of an answer, even with a flipped bit
+        except CommandRefused:
+            continue
+        return dialect
+    raise DeviceFault(f"cobolt laser {model} on {config.port} knows neither of the 06-01 languages; use an 06-01 laser")
+
+
+def _first_known(line: Dialogue, questions: tuple[str, ...], form: re.Pattern[str]) -> str | None:
+    """The reply to the first of these questions that the laser knows; None if it refuses all of them."""
+    for question in questions:
+        with suppress(CommandRefused):
+            return line.ask_surely(question, form)
+    return None
 
 
 def _off(config: CoboltConfig) -> bytes:

@@ -9,7 +9,7 @@ from drivers.clock import now_s
 from drivers.errors import DeviceFault, InterlockOpen, ProtocolError, WrongState
 from drivers.lasers.cobolt import CoboltConfig, classify
 from drivers.lasers.cobolt import create as create_cobolt
-from sim_backend.wire.firmware.cobolt import MODELS, CoboltModel, Family
+from sim_backend.wire.firmware.cobolt import ILLEGAL, MODELS, CoboltModel, Family
 from tests.wire.faults import Fault, FaultScript
 from tests.wire.lasers import bring_up, open_cobolt, overtaken_arm, wire
 
@@ -49,7 +49,9 @@ def test_the_model_answers_as_the_manual_says() -> None:
 def test_the_first_commands_are_a_ping_and_questions() -> None:
     model = CoboltModel()
     with wire(model) as (_, surroundings), open_cobolt(surroundings):
-        assert model.commands == ["?", "glm?", "glm?", "sn?", "sn?", "gmlp?", "gmlp?", "@cobas?", "@cobas?"]
+        twice = [question for question in ("sn?", "gmlp?", "@cobas?") for _ in range(2)]
+        language = ["laser:runmode?", "?", "laser:runmode?", "gam?"]  # a refusal counts if it comes twice
+        assert model.commands == ["?", "glm?", "glm?", *language, *twice]
 
 
 @pytest.mark.parametrize(
@@ -152,6 +154,73 @@ def test_trap_after_l0_the_key_must_be_turned_and_after_a_pause_not(family: Fami
         clock.sleep(10.0)
         assert not laser.status.emission  # it came on by itself, and dark
         bring_up(laser, clock)
+
+
+@pytest.mark.parametrize("family", FAMILIES)
+def test_trap_units_that_refuse_the_questions_for_key_and_autostart_are_asked_otherwise(family: Family) -> None:
+    for autostart, start in ((True, "@cob1"), (False, "l1")):
+        model = CoboltModel(family, autostart=autostart, refuses=frozenset({"@cobas?", "@cobasks?"}))
+        with wire(model) as (_, surroundings), open_cobolt(surroundings) as laser:
+            status = laser.status
+            assert (status.key_on, status.fault) == (None, None)
+            laser.arm(0.05)
+            assert [command for command in model.commands if command in ("@cob1", "l1")] == [start]
+            began_s = now_s(surroundings.clock)
+            assert laser.status.key_on is None
+            assert now_s(surroundings.clock) - began_s < 1.5
+            assert model.commands.count("@cobasks?") == (2 if autostart else 0)  # refused twice, not asked any more
+
+
+@pytest.mark.parametrize("autostart", [True, False])
+def test_a_unit_that_says_nothing_of_key_and_autostart_can_be_started(autostart: bool) -> None:
+    refused = {"@cobas?", "@cobasks?", "gas?"} | (set() if autostart else {"@cob1"})
+    model = CoboltModel(autostart=autostart, refuses=frozenset(refused))
+    with wire(model) as (_, surroundings), open_cobolt(surroundings) as laser:
+        assert laser.status.key_on is None
+        bring_up(laser, surroundings.clock)
+        laser.disarm()
+        assert not model.emitting
+    assert not model.forbidden
+
+
+@pytest.mark.parametrize("family", FAMILIES)
+@pytest.mark.parametrize("number", MODELS.values())
+def test_trap_the_language_follows_the_firmware_and_not_the_model_number(family: Family, number: str) -> None:
+    model = CoboltModel(family, model=number)
+    with wire(model) as (_, surroundings), open_cobolt(surroundings) as laser:
+        bring_up(laser, surroundings.clock)
+        assert model.gated
+        assert model.power_w == pytest.approx(0.05)
+
+
+def test_a_laser_that_knows_neither_language_is_refused() -> None:
+    model = CoboltModel(refuses=frozenset({"gam?"}))
+    with wire(model) as (_, surroundings), pytest.raises(DeviceFault, match="knows neither of the 06-01 languages"):
+        open_cobolt(surroundings)
+
+
+@pytest.mark.parametrize("refused", ["gmlp?", "laser:cp:power:setpoint? max"])
+def test_trap_newer_lasers_state_their_most_power_in_their_own_language(refused: str) -> None:
+    model = CoboltModel("06-01", max_power_w=0.06, refuses=frozenset({refused}))
+    with wire(model) as (_, surroundings), open_cobolt(surroundings) as laser:
+        assert laser.limits.max_power_w == pytest.approx(0.06)
+
+
+def test_a_laser_that_does_not_state_its_most_power_is_refused() -> None:
+    model = CoboltModel(refuses=frozenset({"gmlp?"}))
+    with wire(model) as (_, surroundings), pytest.raises(ProtocolError, match="does not say its most power"):
+        open_cobolt(surroundings)
+
+
+@pytest.mark.parametrize("words", ["Syntax error: illegal command", "Invalid command", "Error: illegal command"])
+def test_a_refusal_may_have_other_words(words: str) -> None:
+    class Curt(CoboltModel):
+        def _answer(self, command: str, now_s: float) -> str:
+            said = super()._answer(command, now_s)
+            return words if said == ILLEGAL else said
+
+    with wire(Curt(refuses=frozenset({"@cobasks?"}))) as (_, surroundings), open_cobolt(surroundings) as laser:
+        assert laser.status.key_on is None
 
 
 def test_trap_p_takes_watts_and_slmp_milliwatts() -> None:

@@ -69,6 +69,8 @@ class CoboltModel:
     """Its model number; empty: the usual one of the family."""
     serial: str = "16328"
     firmware: str = "4.1.3"
+    refuses: frozenset[str] = frozenset()
+    """Commands and questions that this unit does not know although others of its family do."""
     autostart: bool = True
     warm_up_s: float = 3.0
     junk: bytes = b""
@@ -182,9 +184,11 @@ class CoboltModel:
 
     def _answer(self, command: str, now_s: float) -> str:
         name, _, value = command.partition(" ")
+        if name in self.refuses or command in self.refuses:
+            return ILLEGAL
         if self.family == "06-01":
             name = re.sub("[a-z]+", lambda word: _SHORT.get(word[0], word[0]), name)
-        said = self._query(name)
+        said = self._query(f"{name} {value}" if name.endswith("?") and value else name)
         if said is not None:
             return said
         return "OK" if self._act(name, now_s) or self._set(name, value) else ILLEGAL
@@ -209,11 +213,13 @@ class CoboltModel:
         modulation = f"{self.modulation_power_w * 1e3:.4f}"
         if self.family == "06-MLD":
             answers |= {"gam?": number, "gdmes?": _flag(self.digital), "games?": _flag(self.analog)}
-            answers |= {"glmp?": modulation, "gom?": self._operating_mode()}
+            answers |= {"glmp?": modulation, "gom?": self._operating_mode(), "gas?": _flag(self.autostart)}
         else:
             answers |= {"las:runm?": name, "las:pm:dig:ena?": _flag(self.digital), "state?": self._state()}
             answers |= {"las:pm:ana:ena?": _flag(self.analog), "las:pm:pow:setp?": modulation}
             answers["las:cp:pow:setp?"] = f"{self.constant_power_w * 1e3:.4f}"
+            answers["las:cp:pow:setp? max"] = f"{self.max_power_w * 1e3:.1f}"
+            answers["autostart:enabled?"] = _flag(self.autostart)
         return answers.get(command)
 
     def _operating_mode(self) -> str:
