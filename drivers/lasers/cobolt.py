@@ -10,10 +10,12 @@ asked and not taken from its model number, since an 06-MLD comes with either fir
 power follows a gate only up to about 1 kHz. Not every unit knows every question: what is asked about key and autostart
 and is refused counts as unknown.
 
-The laser is kept dark by a power of 0 and not by `l0`: after `l0` its key must be turned (pycobolt issue 6), whereas a
-power of 0 can be read back, by the next program too. `pause` sets the power to 0 (and sends `las:paus 1`), so no key is
-needed to resume; if the power does not read back as 0, `pause` switches the laser off. `disarm` does the same and sends
-`l0`; with autostart enabled the key must then be turned off and on before the laser starts again.
+`pause` must not need the key afterwards, as `l0` does (pycobolt issue 6). It blanks the light as the makers do: by
+`las:paus 1`, or by `l0r`, which is the shutter of the vendor's adapter; an 06-MLD that knows no `l0r` goes to constant
+current at 0 mA, as in that adapter. No blanking can be read back, so the powers are set to 0 too: that is what the next
+program can read. Whether a power of 0 alone is dark is in no source. If mode and power do not read back as dark,
+`pause` switches the laser off. `disarm` sets the powers to 0 and sends `l0`; with autostart enabled the key must then
+be turned off and on before the laser starts again.
 """
 
 import logging
@@ -102,8 +104,14 @@ class Dialect:
     """Questions for the most power, in milliwatts. The first one that the laser knows counts."""
     external: str = ""
     """Command that lets the input control the light, and not the host. Empty: not needed."""
-    pause: str = ""
-    """Command that blanks the light at once (value 1) or ends that (0)."""
+    pauses: tuple[tuple[str, str], ...] = ()
+    """Commands that blank the light at once, each with the one that ends that. The first that the laser knows is used.
+    """
+    pauses_any_time: bool = False
+    """Whether every unit knows the first of `pauses` and obeys it also while it is off."""
+    no_current: tuple[str, str, str, str] | None = None
+    """Command that sets the current of the constant-current mode to 0, its query, the command that enters that mode,
+    and the mode in answers. None: not known."""
 
 
 MLD = Dialect(
@@ -120,6 +128,8 @@ MLD = Dialect(
     names={"0": "constant current", "1": "constant power"},
     autostart=("@cobas?", "gas?"),
     most_power=("gmlp?",),
+    pauses=(("l0r", "l1r"),),
+    no_current=("slc 0", "glc?", "ecc", "0"),
 )
 """The language of 06-MLD."""
 SCPI = Dialect(
@@ -140,7 +150,8 @@ SCPI = Dialect(
     autostart=("@cobas?", "autostart:enabled?"),
     most_power=("laser:cp:power:setpoint? max", "gmlp?"),
     external="laser:pm:dig:modulator external",
-    pause="las:paus",
+    pauses=(("las:paus 1", "las:paus 0"), ("l0r", "l1r")),
+    pauses_any_time=True,
 )
 """The newer 06-01 language. With its modulator on "command" the laser obeys `!e` and `!d`, without an answer."""
 DIALECTS = (SCPI, MLD)
@@ -181,6 +192,11 @@ class CoboltLaser(SerialLaser):
         self._dialect = dialect
         self._autostart = autostart
         self._tells_key = autostart is not False
+        self._pauses = dialect.pauses
+        """Those that the laser knows or may know."""
+        self._knows_pause = dialect.pauses_any_time
+        self._blanked = False
+        """Whether the light was blanked and that was not ended yet."""
         self._started = False
 
     def _do_status(self) -> LaserStatus:
@@ -234,7 +250,11 @@ class CoboltLaser(SerialLaser):
         return "mixed" if digital else "analog" if analog else "modulation without input"
 
     def _power_w(self, mode: str) -> float | None:
-        """The power in watts that is set in this mode. None: the mode has no set power (constant current)."""
+        """The power in watts that is set in this mode. None: the mode has no set power (constant current above 0)."""
+        no_current = self._dialect.no_current
+        if no_current is not None and mode == no_current[3]:
+            with suppress(CommandRefused):
+                return 0.0 if self._line.ask_number(no_current[1]) == 0 else None
         if mode not in self._dialect.powers:
             return None
         question, unit_w = self._dialect.powers[mode]
@@ -250,7 +270,7 @@ class CoboltLaser(SerialLaser):
             self._require_no_stop()
         except DeviceError:
             with suppress(DeviceError):  # the first error is the one to report
-                self._darken()
+                self._darken(on=True)
             raise
         self._armed = True
 
@@ -258,8 +278,8 @@ class CoboltLaser(SerialLaser):
         """Keep the laser dark until the gate is known to control the light; only then set the power."""
         gated = all(self._input_mode(self._mode()) == "digital" for _ in range(2))  # a flipped bit must not shine
         on = self._line.ask_flag("l?")
-        if not (gated and on):
-            self._darken()  # then it is dark whenever it comes on, until the power is set
+        if not (gated and on and self._armed):
+            gated &= self._darken(on=on)  # then it is dark whenever it comes on, until the power is set
         if not gated:
             self._gate()
         # Each exchange takes a tenth of a second: check for a pause from another thread before each step to light.
@@ -269,8 +289,8 @@ class CoboltLaser(SerialLaser):
         self._require_no_stop()
         self._set_power(power_w)
         self._require_no_stop()
-        if self._dialect.pause:
-            self._line.tell(f"{self._dialect.pause} 0")
+        if self._blanked or self._dialect.pauses_any_time:
+            self._end_blanking(on=on)
 
     def _gate(self) -> None:
         """Let only the TTL input control the light, and read that back. Call it while the laser is dark."""
@@ -292,15 +312,57 @@ class CoboltLaser(SerialLaser):
             f"{command} {power_mw:.4f}", question, NUMBER, lambda reply: abs(float(reply) - power_mw) <= slack_mw
         )
 
-    def _darken(self) -> None:
-        """Set the power to 0 in every mode that has one, at once and without the key.
+    def _darken(self, *, on: bool) -> bool:
+        """Blank the light, and set the power to 0 in every mode that has one, at once and without the key. Returns
+        whether the mode is still the one that it was.
 
-        The power of the gated mode comes first: this may be an emergency. The next program can read the powers back.
+        on: whether the laser may be on; one that is off is only blanked if it is sure to obey the end of that later.
+        What is sure to be obeyed comes first: this may be an emergency. The next program can read the powers back.
         """
-        if self._dialect.pause:
-            self._line.tell(f"{self._dialect.pause} 1")
-        self._set_power(0.0)
+        to_blank = on or self._dialect.pauses_any_time
+        blanked = to_blank and self._knows_pause and self._blank()
+        try:
+            self._set_power(0.0)
+        finally:
+            if to_blank and not blanked:
+                blanked = self._blank()
         self._line.tell(self._dialect.no_power)
+        if to_blank and not blanked:
+            self._cut_current()
+            return False
+        return True
+
+    def _blank(self) -> bool:
+        """Blank the light in a way that needs no key afterwards. False: the laser knows no command for that."""
+        for pair in self._pauses:
+            with suppress(CommandRefused):
+                self._line.tell(pair[0])
+                self._pauses = (pair,)
+                self._knows_pause = self._blanked = True
+                return True
+        if not self._knows_pause:
+            self._pauses = ()  # a refusal takes most of a second, which the next pause must not lose
+        return False
+
+    def _end_blanking(self, *, on: bool) -> None:
+        """Let the light out again. on: whether the laser was on before it was armed."""
+        try:
+            self._line.tell(self._pauses[0][1])
+        except CommandRefused:
+            if on:
+                raise
+            _log.warning("%s: does not end its pause before it is on; if it stays dark, arm again", self._name)
+        else:
+            self._blanked = False
+
+    def _cut_current(self) -> None:
+        """Go to constant current at 0 mA. The current is not put back later: this mode does not follow the gate, and a
+        pause from another thread could come between."""
+        if self._dialect.no_current is None:
+            raise DeviceFault(f"{self._name} knows no command that blanks its light")
+        no_current, question, enter, mode = self._dialect.no_current
+        self._line.tell_and_check(no_current, question, NUMBER, lambda reply: float(reply) == 0)
+        self._line.tell_and_check(enter, self._dialect.mode, self._dialect.mode_form, mode.__eq__)
 
     def _start(self) -> None:
         """Switch on; emission follows once temperatures are reached."""
@@ -319,7 +381,8 @@ class CoboltLaser(SerialLaser):
 
     def _do_pause(self) -> None:
         try:
-            self._darken()
+            on = self._armed or self._started or any(self._line.ask_flag("l?") for _ in range(2))  # a bit may flip
+            self._darken(on=on)
             power_w = self._power_w(self._mode())
         except (DeviceFault, ProtocolError) as error:
             _log.warning("%s: pause failed (%s); switching off", self._name, error)
@@ -331,7 +394,7 @@ class CoboltLaser(SerialLaser):
 
     def _do_disarm(self) -> None:
         try:
-            self._darken()
+            self._darken(on=False)  # `l0` follows at once, and the next start must not find it blanked
         finally:
             self._switch_off()
         self._armed = False
