@@ -32,7 +32,7 @@ from drivers.guard.watch import TICK_S, FrameWatch, GuardLimits, WatchedProcess
 from drivers.interfaces import DeviceState, LineLaser
 from drivers.registry import Surroundings, lookup
 from drivers.transports.endpoints import Endpoint, resolve
-from drivers.transports.serial_port import SerialPort
+from drivers.transports.serial_port import BAUD, SerialPort
 
 _log = logging.getLogger(__name__)
 
@@ -355,12 +355,12 @@ class Rescue:
         """Find the drivers now: there will be no time to import them."""
         surroundings = Surroundings(SystemClock(), None, 0, ports)
         self._create: dict[str, Callable[[], Any]] = {}
-        self._off: dict[str, tuple[Callable[[], Endpoint], bytes]] = {}
+        self._off: dict[str, tuple[Callable[[], SerialPort], bytes]] = {}
         for slot, config in configs.items():
             kind = lookup(slot, config.kind)
             self._create[slot] = partial(kind.create, config, surroundings)
             if kind.off is not None:
-                self._off[slot] = partial(resolve, config.port, ports), kind.off(config)
+                self._off[slot] = partial(_open_port, slot, config, ports), kind.off(config)
         self._outcome: dict[str, str] = {}
 
     def run(self, slots: set[str], armed: bool) -> str:
@@ -388,12 +388,16 @@ class Rescue:
 
     def _switch_off(self, slot: str) -> None:
         """Switch the emission off before anything is asked: opening a slow laser takes more than a second."""
-        place, off = self._off[slot]
-        endpoint = place()
-        with closing(_once_free(lambda: SerialPort(slot, endpoint))) as port:
+        open_port, off = self._off[slot]
+        with closing(_once_free(open_port)) as port:
             for _ in range(OFF_TIMES):
                 port.write(off)
                 time.sleep(OFF_GAP_S)
+
+
+def _open_port(slot: str, config: Any, ports: Mapping[str, Endpoint]) -> SerialPort:
+    """The port of a config, at the config's rate if it has one: at another one the laser would not understand."""
+    return SerialPort(slot, resolve(config.port, ports), baud=getattr(config, "baud", BAUD))
 
 
 def _once_free(open_it: Callable[[], Any]) -> Any:

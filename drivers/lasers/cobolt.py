@@ -1,15 +1,21 @@
 """The Cobolt (Huebner) 06-01 line laser, gated by its digital modulation input.
 
-Commands and replies are in docs/reference/hardware.md. Sources: cobolt-lasers/pycobolt 1333e53 (2025-09) and
-python-microscope `lights/cobolt.py`. Old firmware may send junk before a reply. The laser monitors its temperatures
-itself and reports fault 1.
+Commands and replies are in docs/reference/hardware.md. Sources: cobolt-lasers/pycobolt 1333e53 (2025-09),
+python-microscope `lights/cobolt.py`, and the vendor's adapter for Micro-Manager (mmCoreAndDevices 8431eb1,
+DeviceAdapters/CoboltOfficial). Old firmware may send junk before a reply. The laser monitors its temperatures itself
+and reports fault 1.
 
-The 06-MLD has its own command language, newer lasers an SCPI-like one. A 06-DPL is refused, since its power follows a
-gate only up to about 1 kHz. The laser is kept dark by a power of 0 and not by `l0`: after `l0` its key must be turned
-(pycobolt issue 6), whereas a power of 0 can be read back, by the next program too. `pause` sets the power to 0 (and
-sends `las:paus 1`), so no key is needed to resume; if the power does not read back as 0, `pause` switches the laser
-off. `disarm` does the same and sends `l0`; with autostart enabled the key must then be turned off and on before the
-laser starts again.
+There are two command languages, that of the first 06-MLD lasers and a SCPI-like one. Which of them a laser speaks is
+asked and not taken from its model number, since an 06-MLD comes with either firmware. A 06-DPL is refused, since its
+power follows a gate only up to about 1 kHz. Not every unit knows every question: what is asked about key and autostart
+and is refused counts as unknown.
+
+`pause` must not need the key afterwards, as `l0` does (pycobolt issue 6). It blanks the light as the makers do: by
+`las:paus 1`, or by `l0r`, which is the shutter of the vendor's adapter; an 06-MLD that knows no `l0r` goes to constant
+current at 0 mA, as in that adapter. No blanking can be read back, so the powers are set to 0 too: that is what the next
+program can read. Whether a power of 0 alone is dark is in no source. If mode and power do not read back as dark,
+`pause` switches the laser off. `disarm` sets the powers to 0 and sends `l0`; with autostart enabled the key must then
+be turned off and on before the laser starts again.
 """
 
 import logging
@@ -34,7 +40,7 @@ NAME = re.compile(r"(?=.*\d)[A-Za-z0-9][A-Za-z0-9._/ -]*")
 """Form of model and serial numbers. They contain a digit, unlike all other replies in words."""
 USUAL_TIMING = LineTiming(gap_s=0.1)
 
-_REFUSED = re.compile(r"syntax error.*", re.IGNORECASE)
+_REFUSED = re.compile(r"syntax error.*|.*\b(invalid|illegal)\b.*", re.IGNORECASE)
 _JUNK = re.compile(r"^[^A-Za-z0-9+-]+")
 _MOST_LINES = 3
 """Most lines to read for one reply: lines that are only junk or echo may come before it."""
@@ -92,10 +98,20 @@ class Dialect:
     """Query of the laser's state, the form of its answers, and the form of those that mean: it waits for its key."""
     names: Mapping[str, str]
     """Names of the other modes, by the number that the laser reports."""
+    autostart: tuple[str, ...]
+    """Questions for whether autostart is enabled. The first one that the laser knows counts."""
+    most_power: tuple[str, ...]
+    """Questions for the most power, in milliwatts. The first one that the laser knows counts."""
     external: str = ""
     """Command that lets the input control the light, and not the host. Empty: not needed."""
-    pause: str = ""
-    """Command that blanks the light at once (value 1) or ends that (0)."""
+    pauses: tuple[tuple[str, str], ...] = ()
+    """Commands that blank the light at once, each with the one that ends that. The first that the laser knows is used.
+    """
+    pauses_any_time: bool = False
+    """Whether every unit knows the first of `pauses` and obeys it also while it is off."""
+    no_current: tuple[str, str, str, str] | None = None
+    """Command that sets the current of the constant-current mode to 0, its query, the command that enters that mode,
+    and the mode in answers. None: not known."""
 
 
 MLD = Dialect(
@@ -110,6 +126,10 @@ MLD = Dialect(
     no_power="p 0",
     waits_for_key=("gom?", COUNT, re.compile("1")),
     names={"0": "constant current", "1": "constant power"},
+    autostart=("@cobas?", "gas?"),
+    most_power=("gmlp?",),
+    pauses=(("l0r", "l1r"),),
+    no_current=("slc 0", "glc?", "ecc", "0"),
 )
 """The language of 06-MLD."""
 SCPI = Dialect(
@@ -127,11 +147,15 @@ SCPI = Dialect(
     no_power="laser:cp:power:setpoint 0",
     waits_for_key=("state?", WORD, re.compile(".*waitingforkey.*", re.IGNORECASE)),
     names={},
+    autostart=("@cobas?", "autostart:enabled?"),
+    most_power=("laser:cp:power:setpoint? max", "gmlp?"),
     external="laser:pm:dig:modulator external",
-    pause="las:paus",
+    pauses=(("las:paus 1", "las:paus 0"), ("l0r", "l1r")),
+    pauses_any_time=True,
 )
 """The newer 06-01 language. With its modulator on "command" the laser obeys `!e` and `!d`, without an answer."""
-DIALECTS = {"06-MLD": MLD, "06-01": SCPI}
+DIALECTS = (SCPI, MLD)
+"""Both languages, in the order in which they are tried: newer firmware may know words of the old one too."""
 
 
 FAMILIES = {
@@ -160,10 +184,19 @@ class CoboltConfig(SerialLaserConfig):
 class CoboltLaser(SerialLaser):
     """A Cobolt 06-01. `status` takes almost a second, since the laser allows at most ten commands a second."""
 
-    def __init__(self, line: Dialogue, dialect: Dialect, name: str, limits: LaserLimits, autostart: bool) -> None:
+    def __init__(
+        self, line: Dialogue, dialect: Dialect, name: str, limits: LaserLimits, autostart: bool | None
+    ) -> None:
+        """autostart: whether it is enabled; None: the laser does not say."""
         super().__init__(name, line, limits)
         self._dialect = dialect
         self._autostart = autostart
+        self._tells_key = autostart is not False
+        self._pauses = dialect.pauses
+        """Those that the laser knows or may know."""
+        self._knows_pause = dialect.pauses_any_time
+        self._blanked = False
+        """Whether the light was blanked and that was not ended yet."""
         self._started = False
 
     def _do_status(self) -> LaserStatus:
@@ -175,7 +208,7 @@ class CoboltLaser(SerialLaser):
         mode = self._mode()
         input_mode = self._input_mode(mode)
         set_w = self._power_w(mode) if on else 0.0
-        key_on = line.ask_flag("@cobasks?") if self._autostart else None
+        key_on = self._key_on()
         if not on and fault is None and self._waits_for_key():
             fault = "it waits for its key: turn the key off and on"
         return LaserStatus(
@@ -188,6 +221,16 @@ class CoboltLaser(SerialLaser):
             input_mode=input_mode,
             power_w=line.ask_number("pa?") if on else 0.0,
         )
+
+    def _key_on(self) -> bool | None:
+        """Whether the key is on. None: it does not matter, or the laser does not know the question."""
+        if not self._tells_key:
+            return None
+        try:
+            return self._line.ask_flag("@cobasks?")
+        except CommandRefused:
+            self._tells_key = False  # a refusal takes most of a second, and the guard asks every second
+            return None
 
     def _fault(self) -> str | None:
         number = int(self._line.ask("f?", COUNT)) and int(self._line.ask("f?", COUNT))
@@ -207,7 +250,11 @@ class CoboltLaser(SerialLaser):
         return "mixed" if digital else "analog" if analog else "modulation without input"
 
     def _power_w(self, mode: str) -> float | None:
-        """The power in watts that is set in this mode. None: the mode has no set power (constant current)."""
+        """The power in watts that is set in this mode. None: the mode has no set power (constant current above 0)."""
+        no_current = self._dialect.no_current
+        if no_current is not None and mode == no_current[3]:
+            with suppress(CommandRefused):
+                return 0.0 if self._line.ask_number(no_current[1]) == 0 else None
         if mode not in self._dialect.powers:
             return None
         question, unit_w = self._dialect.powers[mode]
@@ -223,7 +270,7 @@ class CoboltLaser(SerialLaser):
             self._require_no_stop()
         except DeviceError:
             with suppress(DeviceError):  # the first error is the one to report
-                self._darken()
+                self._darken(on=True)
             raise
         self._armed = True
 
@@ -231,8 +278,8 @@ class CoboltLaser(SerialLaser):
         """Keep the laser dark until the gate is known to control the light; only then set the power."""
         gated = all(self._input_mode(self._mode()) == "digital" for _ in range(2))  # a flipped bit must not shine
         on = self._line.ask_flag("l?")
-        if not (gated and on):
-            self._darken()  # then it is dark whenever it comes on, until the power is set
+        if not (gated and on and self._armed):
+            gated &= self._darken(on=on)  # then it is dark whenever it comes on, until the power is set
         if not gated:
             self._gate()
         # Each exchange takes a tenth of a second: check for a pause from another thread before each step to light.
@@ -242,8 +289,8 @@ class CoboltLaser(SerialLaser):
         self._require_no_stop()
         self._set_power(power_w)
         self._require_no_stop()
-        if self._dialect.pause:
-            self._line.tell(f"{self._dialect.pause} 0")
+        if self._blanked or self._dialect.pauses_any_time:
+            self._end_blanking(on=on)
 
     def _gate(self) -> None:
         """Let only the TTL input control the light, and read that back. Call it while the laser is dark."""
@@ -265,19 +312,67 @@ class CoboltLaser(SerialLaser):
             f"{command} {power_mw:.4f}", question, NUMBER, lambda reply: abs(float(reply) - power_mw) <= slack_mw
         )
 
-    def _darken(self) -> None:
-        """Set the power to 0 in every mode that has one, at once and without the key.
+    def _darken(self, *, on: bool) -> bool:
+        """Blank the light, and set the power to 0 in every mode that has one, at once and without the key. Returns
+        whether the mode is still the one that it was.
 
-        The power of the gated mode comes first: this may be an emergency. The next program can read the powers back.
+        on: whether the laser may be on; one that is off is only blanked if it is sure to obey the end of that later.
+        What is sure to be obeyed comes first: this may be an emergency. The next program can read the powers back.
         """
-        if self._dialect.pause:
-            self._line.tell(f"{self._dialect.pause} 1")
-        self._set_power(0.0)
+        to_blank = on or self._dialect.pauses_any_time
+        blanked = to_blank and self._knows_pause and self._blank()
+        try:
+            self._set_power(0.0)
+        finally:
+            if to_blank and not blanked:
+                blanked = self._blank()
         self._line.tell(self._dialect.no_power)
+        if to_blank and not blanked:
+            self._cut_current()
+            return False
+        return True
+
+    def _blank(self) -> bool:
+        """Blank the light in a way that needs no key afterwards. False: the laser knows no command for that."""
+        for pair in self._pauses:
+            with suppress(CommandRefused):
+                self._line.tell(pair[0])
+                self._pauses = (pair,)
+                self._knows_pause = self._blanked = True
+                return True
+        if not self._knows_pause:
+            self._pauses = ()  # a refusal takes most of a second, which the next pause must not lose
+        return False
+
+    def _end_blanking(self, *, on: bool) -> None:
+        """Let the light out again. on: whether the laser was on before it was armed."""
+        try:
+            self._line.tell(self._pauses[0][1])
+        except CommandRefused:
+            if on:
+                raise
+            _log.warning("%s: does not end its pause before it is on; if it stays dark, arm again", self._name)
+        else:
+            self._blanked = False
+
+    def _cut_current(self) -> None:
+        """Go to constant current at 0 mA. The current is not put back later: this mode does not follow the gate, and a
+        pause from another thread could come between."""
+        if self._dialect.no_current is None:
+            raise DeviceFault(f"{self._name} knows no command that blanks its light")
+        no_current, question, enter, mode = self._dialect.no_current
+        self._line.tell_and_check(no_current, question, NUMBER, lambda reply: float(reply) == 0)
+        self._line.tell_and_check(enter, self._dialect.mode, self._dialect.mode_form, mode.__eq__)
 
     def _start(self) -> None:
         """Switch on; emission follows once temperatures are reached."""
-        self._line.tell("@cob1" if self._autostart else "l1")
+        if self._autostart is None:
+            try:
+                self._line.tell("@cob1")
+            except CommandRefused:
+                self._line.tell("l1")  # refused itself while autostart is enabled, so no key is bypassed
+        else:
+            self._line.tell("@cob1" if self._autostart else "l1")
         self._started = True
         if not self._line.ask_flag("l?") and self._waits_for_key():
             # The start is not cancelled: once the key is turned, the laser comes on, and is dark.
@@ -286,7 +381,8 @@ class CoboltLaser(SerialLaser):
 
     def _do_pause(self) -> None:
         try:
-            self._darken()
+            on = self._armed or self._started or any(self._line.ask_flag("l?") for _ in range(2))  # a bit may flip
+            self._darken(on=on)
             power_w = self._power_w(self._mode())
         except (DeviceFault, ProtocolError) as error:
             _log.warning("%s: pause failed (%s); switching off", self._name, error)
@@ -298,7 +394,7 @@ class CoboltLaser(SerialLaser):
 
     def _do_disarm(self) -> None:
         try:
-            self._darken()
+            self._darken(on=False)  # `l0` follows at once, and the next start must not find it blanked
         finally:
             self._switch_off()
         self._armed = False
@@ -315,7 +411,9 @@ def create(config: CoboltConfig, surroundings: Surroundings, timing: LineTiming 
 
 
 def _identify(config: CoboltConfig, line: Dialogue) -> CoboltLaser:
-    """Find out which laser answers, with as few questions as possible: each takes 0.1 s, and a guard waits for them."""
+    """Find out which laser answers, with as few questions as possible: each takes 0.1 s, and a guard waits for them.
+    A refused one takes several times that.
+    """
     try:
         model = line.ask_surely("glm?", NAME)
     except CommandRefused:
@@ -327,16 +425,42 @@ def _identify(config: CoboltConfig, line: Dialogue) -> CoboltLaser:
         raise DeviceFault(
             f"cobolt laser {model} is an 06-DPL: its power follows a gate up to 1 kHz only; use an 06-MLD"
         )
-    if family not in DIALECTS:
+    if family == "unknown":
         raise DeviceFault(f"cobolt laser {model} is no 06-01 type; this driver runs 06-MLD and newer 06-01 lasers")
+    dialect = _language(config, line, model)
     serial = line.ask_surely("sn?", NAME)
     require_serial_number("cobolt", config, serial)
-    limit_w = float(line.ask_surely("gmlp?", NUMBER)) * 1e-3
+    most_mw = _first_known(line, dialect.most_power, NUMBER)
+    if most_mw is None:
+        raise ProtocolError(f"{line.name} does not say its most power; check its firmware")
+    limit_w = float(most_mw) * 1e-3
     if limit_w <= 0:
         raise ProtocolError(f"{line.name} says that its most power is {limit_w:g} W; check its cable and firmware")
-    autostart = line.ask_surely("@cobas?", FLAG) == "1"
+    autostart = _first_known(line, dialect.autostart, FLAG)
     limits = LaserLimits(0.0, min(config.max_power, limit_w))
-    return CoboltLaser(line, DIALECTS[family], f"Cobolt {model} {serial}", limits, autostart)
+    name = f"Cobolt {model} {serial}"
+    return CoboltLaser(line, dialect, name, limits, None if autostart is None else autostart == "1")
+
+
+def _language(config: CoboltConfig, line: Dialogue, model: str) -> Dialect:
+    """The language in which the laser answers the question for its mode."""
+    for dialect in DIALECTS:
+        try:
+            line.ask(
+                dialect.mode, dialect.mode_form
+            )  # a refusal has not the form of an answer, even with a flipped bit
+        except CommandRefused:
+            continue
+        return dialect
+    raise DeviceFault(f"cobolt laser {model} on {config.port} knows neither of the 06-01 languages; use an 06-01 laser")
+
+
+def _first_known(line: Dialogue, questions: tuple[str, ...], form: re.Pattern[str]) -> str | None:
+    """The reply to the first of these questions that the laser knows; None if it refuses all of them."""
+    for question in questions:
+        with suppress(CommandRefused):
+            return line.ask_surely(question, form)
+    return None
 
 
 def _off(config: CoboltConfig) -> bytes:

@@ -1,14 +1,17 @@
 """The Coherent OBIS LX/LS line laser, gated by its digital modulation input (`SOUR:AM:EXT DIG`).
 
 Commands and replies are in docs/reference/hardware.md. Sources: python-microscope `lights/obis.py` (69625e0), the bit
-tables of `obis.h`, the operator's manual (appendix C) and mmCoreAndDevices PRs 645 and 531. The limits of the base
-plate's temperature, `SOUR:TEMP:PROT:BAS:LOW?` and `HIGH?`, are in `obis.cpp` and in Micro-Manager's `CoherentOBIS.cpp`.
+tables of `obis.h`, the operator's manual (appendix C), mmCoreAndDevices PRs 645 and 531, and the status words of
+AllenNeuralDynamics/obis-laser debc218. The limits of the base plate's temperature, `SOUR:TEMP:PROT:BAS:LOW?` and
+`HIGH?`, are in `obis.cpp` and in Micro-Manager's `CoherentOBIS.cpp`.
 
 `AM:STAT ON` sent during warm-up is deferred, and light may come minutes later. So `arm` waits until the laser is ready
-and only then sends ON; if the wait ends in any other way it sends OFF. In CDRH mode emission begins 5 s after ON. Modes
+and only then sends ON; if the wait ends in any other way it sends OFF. The lasers whose words are known say standby
+once they could emit, and never "ready": both count. In CDRH mode emission begins 5 s after ON. Modes
 cannot be changed while the laser is on. `pause` sends `AM:STAT OFF`, confirmed by the emission bit; no key is needed to
 resume. `disarm` does the same and sets the least power. With the handshake off, a set command gets no answer at all. So
-the handshake is read first and never changed, and every setting is read back.
+the handshake is read first and never changed, and every setting is read back. Autostart is switched off by the first
+`arm`, so that the laser does not come on by itself at its next power-up; `close` puts it back once the laser is off.
 """
 
 import re
@@ -116,6 +119,7 @@ class ObisFraming:
 
 EMISSION = 0x2
 READY = 0x4
+STANDBY = 0x8
 CDRH_DELAY = 0x10
 WARM_UP = 0x100
 KEY_OFF = 0x0200_0000
@@ -145,6 +149,8 @@ FAULTS = {
 FAULT = 0x1
 HARDWARE_FAULT = 0x20
 """Bits of `SYST:STAT?` that say that there is a fault."""
+_NOT_READY = WARM_UP | FAULT | HARDWARE_FAULT | KEY_OFF | INTERLOCK
+"""A laser that shows one of these bits is not ready, although it may be in standby."""
 
 _LOCK = re.compile(r"ON|OK|OFF")
 """`SYST:LOCK?`: OFF = open. Units say ON or OK for closed."""
@@ -152,6 +158,8 @@ _MODE = re.compile(r"[A-Z]{3,7}")
 _DIGITAL = ("DIG", "DIGITAL")
 _MODES = {"CWP": "constant power", "CWC": "constant current"}
 _READY_POLL_S = 0.5
+_DARK_S, _DARK_POLL_S = 0.5, 0.05
+"""Longest time for the emission bit to clear after OFF, and between two looks at it."""
 
 
 class ObisConfig(SerialLaserConfig):
@@ -177,6 +185,8 @@ class ObisLaser(SerialLaser):
         self._base_range = _base_range(line)
         self._warm_up_s = warm_up_s
         self._told_on = False
+        self._autostart_found: str | None = None
+        """What autostart was before `arm` switched it off. None: it was not touched."""
 
     def _do_status(self) -> LaserStatus:
         line = self._line
@@ -225,6 +235,8 @@ class ObisLaser(SerialLaser):
         """Switch off, and set up the laser so that only the gate controls the light, now and after power-up."""
         self._switch_off()
         self._switch("SYST:CDRH", "ON")
+        if self._autostart_found is None:
+            self._autostart_found = self._line.ask_surely("SYST:AUT?", SWITCH)
         self._switch("SYST:AUT", "OFF")
         self._line.tell_and_check("SOUR:AM:EXT DIG", "SOUR:AM:SOUR?", _MODE, _DIGITAL.__contains__)
         self._switch("SOUR:TEMP:APR", "ON")
@@ -244,7 +256,7 @@ class ObisLaser(SerialLaser):
         Raises `DeviceFault`, `InterlockOpen`, `WrongState` after a pause, or `DeviceTimeout`.
         """
         give_up_ns = self._clock.now_ns() + round(self._warm_up_s * NS_PER_S)
-        while not (bits := self._bits()) & READY or bits & WARM_UP:
+        while not (bits := self._bits()) & (READY | STANDBY) or bits & _NOT_READY:
             fault = self._fault(bits)
             if fault is not None:
                 raise DeviceFault(f"{self._name}: fault {fault}; clear it at the laser and arm again")
@@ -269,11 +281,20 @@ class ObisLaser(SerialLaser):
         self._set_power(self._limits.min_power_w)
 
     def _switch_off(self) -> None:
-        """Switch off; this also cancels a deferred ON. Raises `DeviceFault` if the laser still emits."""
+        """Switch off; this also cancels a deferred ON. Raises `DeviceFault` if the laser still emits after a while."""
         self._switch("SOUR:AM:STAT", "OFF")
         self._told_on = False
-        if self._bits() & EMISSION:
-            raise DeviceFault(f"{self._name} still emits after OFF; turn its key off")
+        give_up_ns = self._clock.now_ns() + round(_DARK_S * NS_PER_S)
+        while self._bits() & EMISSION:
+            if self._clock.now_ns() >= give_up_ns:
+                raise DeviceFault(f"{self._name} still emits after OFF; turn its key off")
+            self._clock.sleep(_DARK_POLL_S)
+
+    def _make_safe(self) -> None:
+        super()._make_safe()
+        if self._autostart_found == "ON":
+            with suppress(DeviceError):  # the laser is off, and that is what a close is for
+                self._switch("SYST:AUT", "ON")
 
     def _bits(self) -> int:
         return int(self._line.ask_surely("SYST:STAT?", BITS), 16)

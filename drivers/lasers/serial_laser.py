@@ -14,7 +14,7 @@ from drivers.interfaces import LaserLimits, LaserStatus, LineLaser
 from drivers.registry import KindConfig, Surroundings
 from drivers.transports.dialogue import Dialogue, Framing, LineTiming
 from drivers.transports.endpoints import resolve
-from drivers.transports.serial_port import SerialPort
+from drivers.transports.serial_port import BAUD, SerialPort
 from drivers.units import Watts
 
 
@@ -27,6 +27,8 @@ class SerialLaserConfig(KindConfig):
     """Most power, in watts, that this rig may ever send out. If the laser's own maximum is smaller, that holds."""
     serial_number: str | None = None
     """Serial number of the laser; any other laser is refused. None: any laser will do."""
+    baud: Annotated[int, Field(ge=9600, le=921_600)] = BAUD
+    """Bits per second of the port, where the laser or the adapter before it is set to another rate than usual."""
 
 
 class SerialLaser(LineLaser):
@@ -91,7 +93,7 @@ def open_laser(
     make: name of the make in messages. Raises `DeviceNotFound` if nothing of that make answers, and what
     `SerialPort` and `identify` raise.
     """
-    port = SerialPort(f"{make} laser", resolve(config.port, surroundings.ports), surroundings.tap)
+    port = SerialPort(f"{make} laser", resolve(config.port, surroundings.ports), surroundings.tap, config.baud)
     try:
         line = Dialogue(f"{make} laser", port, framing, surroundings.clock, timing)
         try:

@@ -38,7 +38,8 @@ _SLICE_S = 0.02
 """One wait inside pyserial: the granularity of deadlines, in seconds."""
 _WRITE_S = 1.0
 """Time for a write: a device that takes nothing for this long hangs. 1 s is 11 520 characters at 115 200 baud."""
-_BAUD = 115_200
+BAUD = 115_200
+"""Rate of a port whose device asks for no other."""
 _MAX_LINE_BYTES = 65_536
 """Longer than any reply to a command: beyond it the line is noise without an end."""
 
@@ -53,8 +54,8 @@ class SerialPort:
     Not thread-safe: a driver that is polled from several threads must lock around a whole command and reply.
     """
 
-    def __init__(self, name: str, endpoint: Endpoint, tap: Tap | None = None) -> None:
-        """Open the port. name: the device's name in messages. tap: records all that passes.
+    def __init__(self, name: str, endpoint: Endpoint, tap: Tap | None = None, baud: int = BAUD) -> None:
+        """Open the port. name: the device's name in messages. tap: records all that passes. baud: bits per second.
 
         Addresses: a path or COM port, "serial=ABC" (serial number of the USB device) or "usb=VVVV:PPPP" (hexadecimal
         vendor and product, the only one attached). Raises `DeviceNotFound`, `DevicePermission` or `DeviceBusy`.
@@ -65,7 +66,7 @@ class SerialPort:
         self._received = bytearray()
         self._tap = tap
         self._endpoint = endpoint
-        self._port = self._open(endpoint)
+        self._port = self._open(endpoint, baud)
         self.clock: Clock = SystemClock() if endpoint.serial_port is None else self._port.clock
         """The clock of its deadlines."""
 
@@ -144,7 +145,7 @@ class SerialPort:
         with suppress(*_FOREIGN):  # the port is gone, so there is nothing left to release
             self._port.close()
 
-    def _open(self, endpoint: Endpoint) -> Any:
+    def _open(self, endpoint: Endpoint, baud: int) -> Any:
         if "://" in self.path:
             raise DeviceNotFound(
                 f"{self._name}: port {self.path} is on the network; make a local one of it (socat PTY,raw,link=PATH "
@@ -153,7 +154,7 @@ class SerialPort:
         try:
             if endpoint.serial_port is not None:
                 return endpoint.serial_port()
-            return serial.Serial(self.path, _BAUD, timeout=_SLICE_S, write_timeout=_WRITE_S, exclusive=True)
+            return serial.Serial(self.path, baud, timeout=_SLICE_S, write_timeout=_WRITE_S, exclusive=True)
         except _FOREIGN as error:
             raise self._refused(error) from None
 

@@ -9,7 +9,7 @@ from drivers.clock import now_s
 from drivers.errors import DeviceFault, InterlockOpen, ProtocolError, WrongState
 from drivers.lasers.cobolt import CoboltConfig, classify
 from drivers.lasers.cobolt import create as create_cobolt
-from sim_backend.wire.firmware.cobolt import MODELS, CoboltModel, Family
+from sim_backend.wire.firmware.cobolt import ILLEGAL, MODELS, CoboltModel, Family
 from tests.wire.faults import Fault, FaultScript
 from tests.wire.lasers import bring_up, open_cobolt, overtaken_arm, wire
 
@@ -49,7 +49,9 @@ def test_the_model_answers_as_the_manual_says() -> None:
 def test_the_first_commands_are_a_ping_and_questions() -> None:
     model = CoboltModel()
     with wire(model) as (_, surroundings), open_cobolt(surroundings):
-        assert model.commands == ["?", "glm?", "glm?", "sn?", "sn?", "gmlp?", "gmlp?", "@cobas?", "@cobas?"]
+        twice = [question for question in ("sn?", "gmlp?", "@cobas?") for _ in range(2)]
+        language = ["laser:runmode?", "?", "laser:runmode?", "gam?"]  # a refusal counts if it comes twice
+        assert model.commands == ["?", "glm?", "glm?", *language, *twice]
 
 
 @pytest.mark.parametrize(
@@ -154,6 +156,73 @@ def test_trap_after_l0_the_key_must_be_turned_and_after_a_pause_not(family: Fami
         bring_up(laser, clock)
 
 
+@pytest.mark.parametrize("family", FAMILIES)
+def test_trap_units_that_refuse_the_questions_for_key_and_autostart_are_asked_otherwise(family: Family) -> None:
+    for autostart, start in ((True, "@cob1"), (False, "l1")):
+        model = CoboltModel(family, autostart=autostart, refuses=frozenset({"@cobas?", "@cobasks?"}))
+        with wire(model) as (_, surroundings), open_cobolt(surroundings) as laser:
+            status = laser.status
+            assert (status.key_on, status.fault) == (None, None)
+            laser.arm(0.05)
+            assert [command for command in model.commands if command in ("@cob1", "l1")] == [start]
+            began_s = now_s(surroundings.clock)
+            assert laser.status.key_on is None
+            assert now_s(surroundings.clock) - began_s < 1.5
+            assert model.commands.count("@cobasks?") == (2 if autostart else 0)  # refused twice, not asked any more
+
+
+@pytest.mark.parametrize("autostart", [True, False])
+def test_a_unit_that_says_nothing_of_key_and_autostart_can_be_started(autostart: bool) -> None:
+    refused = {"@cobas?", "@cobasks?", "gas?"} | (set() if autostart else {"@cob1"})
+    model = CoboltModel(autostart=autostart, refuses=frozenset(refused))
+    with wire(model) as (_, surroundings), open_cobolt(surroundings) as laser:
+        assert laser.status.key_on is None
+        bring_up(laser, surroundings.clock)
+        laser.disarm()
+        assert not model.emitting
+    assert not model.forbidden
+
+
+@pytest.mark.parametrize("family", FAMILIES)
+@pytest.mark.parametrize("number", MODELS.values())
+def test_trap_the_language_follows_the_firmware_and_not_the_model_number(family: Family, number: str) -> None:
+    model = CoboltModel(family, model=number)
+    with wire(model) as (_, surroundings), open_cobolt(surroundings) as laser:
+        bring_up(laser, surroundings.clock)
+        assert model.gated
+        assert model.power_w == pytest.approx(0.05)
+
+
+def test_a_laser_that_knows_neither_language_is_refused() -> None:
+    model = CoboltModel(refuses=frozenset({"gam?"}))
+    with wire(model) as (_, surroundings), pytest.raises(DeviceFault, match="knows neither of the 06-01 languages"):
+        open_cobolt(surroundings)
+
+
+@pytest.mark.parametrize("refused", ["gmlp?", "laser:cp:power:setpoint? max"])
+def test_trap_newer_lasers_state_their_most_power_in_their_own_language(refused: str) -> None:
+    model = CoboltModel("06-01", max_power_w=0.06, refuses=frozenset({refused}))
+    with wire(model) as (_, surroundings), open_cobolt(surroundings) as laser:
+        assert laser.limits.max_power_w == pytest.approx(0.06)
+
+
+def test_a_laser_that_does_not_state_its_most_power_is_refused() -> None:
+    model = CoboltModel(refuses=frozenset({"gmlp?"}))
+    with wire(model) as (_, surroundings), pytest.raises(ProtocolError, match="does not say its most power"):
+        open_cobolt(surroundings)
+
+
+@pytest.mark.parametrize("words", ["Syntax error: illegal command", "Invalid command", "Error: illegal command"])
+def test_a_refusal_may_have_other_words(words: str) -> None:
+    class Curt(CoboltModel):
+        def _answer(self, command: str, now_s: float) -> str:
+            said = super()._answer(command, now_s)
+            return words if said == ILLEGAL else said
+
+    with wire(Curt(refuses=frozenset({"@cobasks?"}))) as (_, surroundings), open_cobolt(surroundings) as laser:
+        assert laser.status.key_on is None
+
+
 def test_trap_p_takes_watts_and_slmp_milliwatts() -> None:
     model = CoboltModel()
     with wire(model) as (_, surroundings), open_cobolt(surroundings) as laser:
@@ -246,6 +315,139 @@ def test_families_are_told_apart_as_pycobolt_does() -> None:
 
 
 # Limits, identity, and lasers found in any state.
+
+
+class Leaky(CoboltModel):
+    """One that is not dark where only its power is 0: no source says that it is."""
+
+    @property
+    def power_w(self) -> float:
+        leaks = self.on and not self.paused and self.mode != "constant current"
+        return max(super().power_w, 0.001 if leaks else 0.0)
+
+
+def sets(model: CoboltModel) -> list[str]:
+    return [command for command in model.commands if "?" not in command]
+
+
+@pytest.mark.parametrize(
+    ("refused", "paused"),
+    [
+        ((), ["l0r", "slmp 0.0000", "p 0"]),
+        (("l0r", "l1r"), ["slmp 0.0000", "p 0", "slc 0", "ecc"]),
+    ],
+)
+def test_trap_a_power_of_0_need_not_be_dark_so_a_pause_blanks_the_light(
+    refused: tuple[str, ...], paused: list[str]
+) -> None:
+    model = Leaky(refuses=frozenset(refused), warm_up_s=0.0)
+    model.current_ma = 40.0
+    with wire(model) as (_, surroundings), open_cobolt(surroundings) as laser:
+        for _ in range(3):
+            bring_up(laser, surroundings.clock)
+            assert model.gated
+            assert model.power_w == pytest.approx(0.05)
+            laser.pause()
+            assert not model.emitting
+            assert not laser.status.emission
+            assert model.on  # no key needed
+        model.commands.clear()
+        bring_up(laser, surroundings.clock)
+        laser.arm(0.02)
+        assert model.power_w == pytest.approx(0.02)
+        model.commands.clear()
+        laser.pause()
+        assert sets(model) == paused
+        assert not model.emitting
+    assert "l0" not in model.commands
+
+
+def test_a_unit_without_the_command_to_blank_is_asked_for_it_once() -> None:
+    model = CoboltModel(refuses=frozenset({"l0r", "l1r"}))
+    with wire(model) as (_, surroundings), open_cobolt(surroundings) as laser:
+        for _ in range(3):
+            bring_up(laser, surroundings.clock)
+            laser.pause()
+    assert model.commands.count("l0r") == 2  # the second one confirms that it was no flipped bit
+    assert "l1r" not in model.commands
+
+
+def test_a_laser_that_was_blanked_and_switched_off_shines_after_the_next_start() -> None:
+    model = CoboltModel()
+    with wire(model) as (_, surroundings), open_cobolt(surroundings) as laser:
+        bring_up(laser, surroundings.clock)
+        laser.pause()
+        laser.disarm()
+        assert model.paused  # as the driver must expect
+        for on in (False, True):
+            model.turn_key(on, now_s(surroundings.clock))
+        bring_up(laser, surroundings.clock)
+        assert model.power_w == pytest.approx(0.05)
+
+
+def test_a_laser_that_is_off_is_not_blanked() -> None:
+    model = CoboltModel()
+    with wire(model) as (_, surroundings), open_cobolt(surroundings) as laser:
+        laser.pause()
+        laser.arm(0.05)
+        assert "l0r" not in model.commands
+        assert "l1r" not in model.commands
+
+
+def test_a_laser_that_ends_no_pause_before_it_is_on_can_be_armed_again_later() -> None:
+    class Early(CoboltModel):
+        def _act(self, name: str, now_s: float) -> bool:
+            return (name != "l1r" or self.on) and super()._act(name, now_s)
+
+    model = Early(warm_up_s=30.0)
+    with wire(model) as (_, surroundings), open_cobolt(surroundings) as laser:
+        laser.arm(0.05)
+        laser.pause()  # while it warms up
+        laser.arm(0.05)
+        surroundings.clock.sleep(40.0)
+        assert not laser.status.warming_up
+        assert model.on
+        assert not model.emitting
+        laser.arm(0.05)
+        assert model.power_w == pytest.approx(0.05)
+
+
+def test_an_arm_that_fails_blanks_the_light_even_if_the_power_does_not_obey() -> None:
+    class Stubborn(CoboltModel):
+        def _set(self, name: str, value: str) -> bool:
+            return name == "slmp" or super()._set(name, value)
+
+    model = Stubborn()
+    model.shine(0.06)
+    with wire(model) as (_, surroundings), open_cobolt(surroundings) as laser:
+        with pytest.raises(DeviceFault, match="glmp"):
+            laser.arm(0.01)
+        assert not model.emitting
+
+
+@pytest.mark.parametrize("refused", [("las:paus",), ("las:paus", "l0r")])
+def test_a_newer_laser_that_refuses_to_pause_is_blanked_otherwise_or_switched_off(refused: tuple[str, ...]) -> None:
+    model = CoboltModel("06-01", refuses=frozenset(refused))
+    model.shine(0.06)
+    with wire(model) as (_, surroundings), open_cobolt(surroundings) as laser:
+        laser.pause()
+        assert not model.emitting
+        assert model.on == (len(refused) == 1)
+
+
+def test_a_laser_found_at_constant_current_that_cannot_be_blanked_needs_no_key_after_a_pause() -> None:
+    model = CoboltModel(refuses=frozenset({"l0r", "l1r"}))
+    model.on, model.mode, model.current_ma = True, "constant current", 50.0
+    with wire(model) as (_, surroundings), open_cobolt(surroundings) as laser:
+        assert laser.status.emission
+        laser.pause()
+        assert not model.emitting
+        assert model.on
+        assert not laser.status.emission
+        bring_up(laser, surroundings.clock)
+        assert model.gated
+        assert model.power_w == pytest.approx(0.05)
+        assert model.current_ma == 0  # never put back while the laser is on
 
 
 @pytest.mark.parametrize("family", FAMILIES)

@@ -1,10 +1,13 @@
 """The OBIS driver through real pyserial against a model of its firmware: bytes of docs/reference/hardware.md, and every
 trap."""
 
+from contextlib import closing
+
 import pytest
 
-from drivers.clock import now_s
+from drivers.clock import SystemClock, now_s
 from drivers.errors import (
+    DeviceError,
     DeviceFault,
     DeviceNotFound,
     DeviceTimeout,
@@ -14,7 +17,9 @@ from drivers.errors import (
     WrongState,
 )
 from drivers.guard import Guard
+from drivers.guard.process import Rescue
 from drivers.lasers.obis import FAULTS, ObisConfig
+from drivers.registry import Surroundings
 from sim_backend.wire.firmware.obis import ObisModel
 from sim_backend.wire.serve.serial import SerialServer
 from tests.wire.lasers import bring_up, eventually, open_obis, overtaken_arm, wire
@@ -55,6 +60,105 @@ def test_the_status_words_are_those_seen_on_real_lasers() -> None:
     assert model.receive(b"SYST:STAT?\r\n", 0.0) == b"CC000008\r\nOK\r\n"
     model.key_on = False
     assert model.receive(b"SYST:STAT?\r\n", 0.0) == b"CE000008\r\nOK\r\n"
+
+
+def test_an_idle_laser_says_standby_and_an_emitting_one_that_it_is_on() -> None:
+    model = ObisModel(cdrh_delay_s=0.0)
+    for mode, idle, emitting in (("CWP", b"C8000008", b"C8001002"), ("DIGITAL", b"C8000408", b"C8001402")):
+        model.mode = mode
+        assert model.receive(b"SYST:STAT?\r\n", 0.0).startswith(idle)
+        model.receive(b"SOUR:AM:STAT ON\r\n", 0.0)
+        assert model.receive(b"SYST:STAT?\r\n", 0.0).startswith(emitting)
+        model.receive(b"SOUR:AM:STAT OFF\r\n", 0.0)
+    cold = ObisModel(warm_up_s=9.0)
+    assert cold.receive(b"SYST:STAT?\r\n", 0.0).startswith(b"C8000100")
+    cold.receive(b"SOUR:AM:STAT ON\r\n", 0.0)
+    assert cold.receive(b"SYST:STAT?\r\n", 0.0).startswith(b"C8001100")
+
+
+@pytest.mark.parametrize("idle", [0xC8000008, 0xC8000408, 0xC8001088, 0xC8000004])
+def test_trap_an_idle_laser_is_ready_whether_it_says_standby_or_ready(idle: int) -> None:
+    class Idle(ObisModel):
+        def _bits(self) -> int:
+            return super()._bits() if self.state_on else idle
+
+    model = Idle(cdrh_delay_s=0.0)
+    with wire(model) as (_, surroundings), open_obis(surroundings) as laser:
+        began_s = now_s(surroundings.clock)
+        laser.arm(0.05)
+        assert now_s(surroundings.clock) - began_s < 1.0
+        assert laser.status.emission
+
+
+@pytest.mark.parametrize("busy", [0xC8000108, 0xC8000104])
+def test_a_laser_that_warms_up_is_not_ready_whatever_else_it_says(busy: int) -> None:
+    class Warming(ObisModel):
+        def _bits(self) -> int:
+            return super()._bits() if self.warm else busy
+
+    model = Warming(warm_up_s=20.0)
+    with wire(model) as (_, surroundings), open_obis(surroundings) as laser:
+        laser.arm(0.05)
+        assert now_s(surroundings.clock) >= 20.0
+
+
+@pytest.mark.parametrize(
+    ("word", "error", "text"),
+    [
+        (0xC8000009, DeviceFault, "status 0xC8000009"),
+        (0xC8000028, DeviceFault, "status 0xC8000028"),
+        (0xCE000008, DeviceFault, "key is off"),
+        (0xCC000008, InterlockOpen, "interlock is open"),
+    ],
+)
+def test_standby_with_a_fault_an_open_interlock_or_no_key_is_not_ready(
+    word: int, error: type[DeviceError], text: str
+) -> None:
+    class Late(ObisModel):
+        def _bits(self) -> int:
+            return word if "SOUR:POW:LEV:IMM:AMPL?" in self.commands else super()._bits()
+
+    model = Late()
+    with wire(model) as (_, surroundings), open_obis(surroundings) as laser:
+        with pytest.raises(error, match=text):
+            laser.arm(0.05)
+        assert "SOUR:AM:STAT ON" not in model.commands
+
+
+@pytest.mark.parametrize(("lingers_s", "is_fault"), [(0.3, False), (2.0, True)])
+def test_trap_the_status_may_still_say_emission_shortly_after_off(lingers_s: float, is_fault: bool) -> None:
+    class Lingering(ObisModel):
+        off_at_s = float("-inf")
+
+        def _switch(self, on: bool) -> None:
+            if self.state_on and not on:
+                self.off_at_s = self._now_s
+            super()._switch(on)
+
+        def _bits(self) -> int:
+            return super()._bits() | (0x2 if self._now_s < self.off_at_s + lingers_s else 0)
+
+    model = Lingering(cdrh_delay_s=0.0)
+    with wire(model) as (_, surroundings), open_obis(surroundings) as laser:
+        laser.arm(0.05)
+        if is_fault:
+            with pytest.raises(DeviceFault, match="still emits after OFF"):
+                laser.pause()
+            surroundings.clock.sleep(lingers_s)
+        else:
+            laser.pause()
+            assert not laser.status.emission
+
+
+def test_the_port_has_the_rate_of_the_config() -> None:
+    for given, baud in (({}, 115_200), ({"baud": 9600}, 9600)):
+        with SerialServer(ObisModel(), baud=1_000_000) as server:
+            surroundings = Surroundings(SystemClock(), None, 0, {"laser": server.endpoint})
+            with open_obis(surroundings, **given) as laser:
+                assert laser._line.port._port.baudrate == baud  # type: ignore[attr-defined]
+            config = ObisConfig.model_validate({"port": server.path, "max_power": "80 mW", **given})
+            with closing(Rescue({"laser": config}, {})._off["laser"][0]()) as port:
+                assert port._port.baudrate == baud
 
 
 @pytest.mark.parametrize(
@@ -182,17 +286,49 @@ def test_trap_with_cdrh_emission_follows_on_by_five_seconds() -> None:
         assert (status.emission, status.warming_up) == (True, False)
 
 
-def test_trap_cdrh_is_never_switched_off_and_autostart_is() -> None:
+def test_trap_cdrh_is_never_switched_off_and_autostart_is_until_the_close() -> None:
     model = ObisModel()
     model.cdrh, model.autostart = False, True
     with wire(model) as (_, surroundings), open_obis(surroundings) as laser:
         assert (model.cdrh, model.autostart) == (False, True)  # looking changes nothing
-        bring_up(laser, surroundings.clock)
-        laser.disarm()
+        for _ in range(2):
+            bring_up(laser, surroundings.clock)
+            assert not model.autostart
+            laser.disarm()
+        assert not model.autostart
     assert not model.forbidden
-    assert (model.cdrh, model.autostart) == (True, False)
+    assert (model.cdrh, model.autostart) == (True, True)
+    assert not model.emitting
+    assert not model.state_on
     model.receive(b"SYST:CDRH OFF\r\n", 1e9)
     assert model.forbidden  # the model would have noticed
+
+
+@pytest.mark.parametrize("autostart", [True, False])
+def test_only_a_setting_that_was_changed_is_put_back_at_the_close(autostart: bool) -> None:
+    model = ObisModel(autostart=autostart)
+    with wire(model) as (_, surroundings):
+        with open_obis(surroundings) as laser:
+            assert laser.status.interlock_closed
+        assert sets(model) == ["SOUR:AM:STAT OFF"]  # never armed, so nothing was changed
+        with open_obis(surroundings) as laser:
+            laser.arm(0.05)
+        off = [n for n, command in enumerate(model.commands) if command == "SOUR:AM:STAT OFF"]
+        assert [command for command in sets(model) if command == "SYST:AUT ON"] == ["SYST:AUT ON"] * autostart
+        if autostart:
+            assert model.commands.index("SYST:AUT ON") > off[-1]
+
+
+def test_a_setting_that_cannot_be_put_back_does_not_stop_the_close() -> None:
+    class Keeps(ObisModel):
+        def _set(self, command: str) -> int:
+            return -203 if command == "SYST:AUT ON" else super()._set(command)
+
+    model = Keeps(autostart=True)
+    with wire(model) as (_, surroundings), open_obis(surroundings) as laser:
+        laser.arm(0.05)
+    assert not model.state_on
+    assert not model.autostart
 
 
 @pytest.mark.parametrize("handshake", HANDSHAKES)

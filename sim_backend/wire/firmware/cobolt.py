@@ -3,7 +3,7 @@
 Source: docs/reference/hardware.md (cobolt-lasers/pycobolt 1333e53). Commands end with CR, replies with CRLF. The model
 has the traps of the real laser: no answer to a command sooner than 100 ms after the last reply, key needed after `l0`,
 `l1` refused while autostart is enabled, powers in W (`p`) and mW (`slmp`), `ilk?` 1 = open, junk before replies, silent
-`!e` and `!d`.
+`!e` and `!d`. `l0r` and `l1r` blank the light and end that, as a shutter would (mmCoreAndDevices 8431eb1).
 """
 
 import re
@@ -41,6 +41,8 @@ _MODES: dict[Mode, tuple[str, str]] = {
 }
 """Name of each mode in the replies of 06-MLD and of 06-01."""
 _RUN_MODES = {name.lower(): mode for mode, (_, name) in _MODES.items()}
+_MODE_COMMANDS: dict[str, Mode] = {"ecc": "constant current", "em": "modulation"}
+"""Commands of 06-MLD that enter a mode."""
 _FLAGS: dict[Family, dict[str, str]] = {
     "06-MLD": {"sdmes": "digital", "sames": "analog"},
     "06-01": {"las:pm:dig:ena": "digital", "las:pm:ana:ena": "analog", "las:paus": "paused"},
@@ -69,6 +71,8 @@ class CoboltModel:
     """Its model number; empty: the usual one of the family."""
     serial: str = "16328"
     firmware: str = "4.1.3"
+    refuses: frozenset[str] = frozenset()
+    """Commands and questions that this unit does not know although others of its family do."""
     autostart: bool = True
     warm_up_s: float = 3.0
     junk: bytes = b""
@@ -182,9 +186,11 @@ class CoboltModel:
 
     def _answer(self, command: str, now_s: float) -> str:
         name, _, value = command.partition(" ")
+        if name in self.refuses or command in self.refuses:
+            return ILLEGAL
         if self.family == "06-01":
             name = re.sub("[a-z]+", lambda word: _SHORT.get(word[0], word[0]), name)
-        said = self._query(name)
+        said = self._query(f"{name} {value}" if name.endswith("?") and value else name)
         if said is not None:
             return said
         return "OK" if self._act(name, now_s) or self._set(name, value) else ILLEGAL
@@ -209,11 +215,14 @@ class CoboltModel:
         modulation = f"{self.modulation_power_w * 1e3:.4f}"
         if self.family == "06-MLD":
             answers |= {"gam?": number, "gdmes?": _flag(self.digital), "games?": _flag(self.analog)}
-            answers |= {"glmp?": modulation, "gom?": self._operating_mode()}
+            answers |= {"glmp?": modulation, "gom?": self._operating_mode(), "gas?": _flag(self.autostart)}
+            answers["glc?"] = f"{self.current_ma:.1f}"
         else:
             answers |= {"las:runm?": name, "las:pm:dig:ena?": _flag(self.digital), "state?": self._state()}
             answers |= {"las:pm:ana:ena?": _flag(self.analog), "las:pm:pow:setp?": modulation}
             answers["las:cp:pow:setp?"] = f"{self.constant_power_w * 1e3:.4f}"
+            answers["las:cp:pow:setp? max"] = f"{self.max_power_w * 1e3:.1f}"
+            answers["autostart:enabled?"] = _flag(self.autostart)
         return answers.get(command)
 
     def _operating_mode(self) -> str:
@@ -242,6 +251,8 @@ class CoboltModel:
                     self.waiting_for_key = True
                 elif not self.on and self._ready_at_s is None:
                     self._ready_at_s = now_s + self.warm_up_s
+            case "l0r" | "l1r":  # as a shutter; the key is not needed afterwards
+                self.paused = name == "l0r"
             case "@cob0":
                 self.waiting_for_key = False
                 self._ready_at_s = None
@@ -256,9 +267,12 @@ class CoboltModel:
         elif power and (power_w := self._power(value, unit_w)) is not None:
             setattr(self, power, power_w)
         elif self.family == "06-MLD":
-            if name != "em":
+            if name == "slc" and value.replace(".", "", 1).isdigit():
+                self.current_ma = float(value)
+            elif name in _MODE_COMMANDS:
+                self.mode = _MODE_COMMANDS[name]
+            else:
                 return False
-            self.mode = "modulation"
         elif name == "las:runm" and value in _RUN_MODES:
             self.mode = _RUN_MODES[value]
         elif name == "las:pm:dig:modulator" and value in ("external", "command"):

@@ -164,15 +164,16 @@ class ObisModel:
         return answers.get(command)
 
     def _bits(self) -> int:
+        """The status word. As on the lasers that were seen, an idle one says standby and never "ready"."""
         delayed = self.state_on and self._lit_at_s is not None and not self.emitting and self.able
         bits = {
             0x1: self.fault,
             0x2: self.emitting,
-            0x4: self.warm and self.able and not self.state_on,
-            0x8: not self.able,
+            0x8: self.warm and not self.fault and not (self.state_on and self.able),
             0x10: delayed,
             0x100: not self.warm,
             0x400: self.gated,
+            0x1000: self.state_on and self.key_on and not self.interlock_open,
             0x0200_0000: not self.key_on,
             0x0400_0000: self.interlock_open,
         }

@@ -153,7 +153,12 @@ def sequence(subject: Subject, seed: int) -> Ending:
 def _make_cobolt(rng: random.Random) -> Model:
     family = cast(Family, rng.choice(("06-MLD", "06-01")))
     model = CoboltModel(
-        family, autostart=rng.random() < 0.5, warm_up_s=rng.choice((0.0, 5.0)), junk=rng.choice((b"", b"", b"\xff>"))
+        family,
+        autostart=rng.random() < 0.5,
+        warm_up_s=rng.choice((0.0, 5.0)),
+        junk=rng.choice((b"", b"", b"\xff>")),
+        refuses=frozenset(rng.choice(((), ("l0r", "l1r"), ("@cobas?", "@cobasks?")))),
+        current_ma=rng.choice((0.0, 40.0)),
     )
     if rng.random() < 0.3:
         model.shine(0.05, gated=rng.random() < 0.5)
