@@ -14,14 +14,20 @@ from typing import Literal
 
 Series = Literal["LX", "LS"]
 """LX has a laser diode, LS an optically pumped semiconductor."""
-Words = Literal["plain", "marked"]
+Words = Literal["plain", "marked", "ready"]
 """How a unit's status and fault words look without a fault: see `ObisModel`."""
 
 OFF_BITS = 0xC800_0000
 """Bits that are set in every sample status in docs/reference/hardware.md."""
 POWERED = 0x1000
 """Status bit of the 12 V supply of the laser power (`LaserPowerVoltage` in `obis.h` of jamolnng/hapi)."""
-_ALWAYS: dict[Words, tuple[int, int]] = {"plain": (OFF_BITS, 0), "marked": (OFF_BITS | 0x1080, 0x8000_0000)}
+READY = 0x4
+"""Status bit 'ready' of the manual's table, which is in no word that a real laser is known to have said."""
+_ALWAYS: dict[Words, tuple[int, int]] = {
+    "plain": (OFF_BITS, 0),
+    "ready": (OFF_BITS, 0),
+    "marked": (OFF_BITS | 0x1080, 0x8000_0000),
+}
 """Bits that are always set in the status word and in the fault word of a unit."""
 TYPES: dict[Series, str] = {"LX": "DDL", "LS": "OPSL"}
 """What `SYST:INF:TYP?` says."""
@@ -56,7 +62,8 @@ class ObisModel:
 
     on_emission(emits, now_s) is called whenever power or emission change. channel: the laser's slot, if it is on a
     Remote. words: "plain" units say C8000008 when idle and 00000000 without a fault; "marked" ones have the bits 0x1080
-    set in the status and say 80000000 without a fault. emission_bit_lag_s: time for which the status still says
+    set in the status and say 80000000 without a fault; "ready" ones set the bit 0x4 when they could be switched on, as
+    the manual's table has it. emission_bit_lag_s: time for which the status still says
     'emission' when the light is off.
     """
 
@@ -185,10 +192,12 @@ class ObisModel:
             if said.startswith("ERR"):
                 return f"{said}\r\n"
             return f"{said}\r\n" + ("OK\r\n" if self.handshake else "")
-        if (to_remote or self.channel is None) and there and bare in ("SYST:COMM:HAND ON", "SYST:COMM:HAND OFF"):
-            self.handshake = bare.endswith("ON")
-            return "OK\r\n" if self.handshake else ""
-        error = self._set(bare, to_remote) if there else -241
+        if not there:
+            error = -241
+        elif (session := self._set_session(bare)) is not None:
+            error = session
+        else:
+            error = -100 if to_remote else self._set(bare)
         if not self.handshake:
             return ""
         return f"ERR{error}\r\n" if error else "OK\r\n"
@@ -232,12 +241,12 @@ class ObisModel:
         return answers.get(command)
 
     def _bits(self) -> int:
-        """The status word. Bit 0x4, 'ready', is in no word that a real laser is known to have said."""
         delayed = self.state_on and self._lit_at_s is not None and not self.emitting and self.able
         emission = self.emitting or self._now_s < self._said_until_s
         bits = {
             0x1: self.fault,
             0x2: emission,
+            READY: self.words == "ready" and self.warm and self.able and not self.state_on,
             0x8: self.warm and not (emission or delayed or self.fault),
             0x10: delayed,
             0x100: not self.warm,
@@ -249,19 +258,26 @@ class ObisModel:
         always, _ = _ALWAYS[self.words]
         return always | sum(bit for bit, is_set in bits.items() if is_set)
 
-    def _set(self, command: str, to_remote: bool) -> int:
-        """Obey a command that sets something; returns the error number, 0 for none."""
+    def _set_session(self, command: str) -> int | None:
+        """Obey a command about the dialogue itself; returns the error number, 0 for none, None for other commands."""
         name, _, value = command.partition(" ")
         if name == "SYST:ERR:CLE":
             return 0
+        if name not in ("SYST:COMM:HAND", "SYST:COMM:PROM"):
+            return None
+        if value not in ("ON", "OFF"):
+            return -220 if value else -109
+        if name.endswith("HAND"):
+            self.handshake = value == "ON"
+        else:
+            self.prompt = value == "ON"
+        return 0
+
+    def _set(self, command: str) -> int:
+        """Obey a command that sets something; returns the error number, 0 for none."""
+        name, _, value = command.partition(" ")
         if not value:
             return -109
-        if name == "SYST:COMM:PROM" and value in ("ON", "OFF"):
-            self.prompt = value == "ON"
-            return 0
-        return -100 if to_remote else self._set_laser(name, value)
-
-    def _set_laser(self, name: str, value: str) -> int:
         if name == "SOUR:POW:LEV:IMM:AMPL":
             return self._change_power(value)
         if name in ("SOUR:AM:INT", "SOUR:AM:EXT"):
