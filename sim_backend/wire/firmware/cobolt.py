@@ -24,6 +24,7 @@ NOT_IN_AUTOSTART = "Syntax error: not allowed in autostart mode."
 OUT_OF_RANGE = "Syntax error: Value is out of range."
 FORBIDDEN = re.compile(r"@cobas \S+|@cobasky.*|@cobasdr.*")
 """Commands that bypass key and autostart: a driver that sends one of them has failed its test."""
+_NUMBER = re.compile(r"[-+]?\d*\.?\d+")
 MOST_MA = 100.0
 """Current at the largest power; no real unit's."""
 _UNKNOWN: dict[Family, frozenset[str]] = {
@@ -141,6 +142,7 @@ class CoboltModel:
     """All commands received."""
     _ready_at_s: float | None = None
     _hears_at_s: float = float("-inf")
+    _now_s: float = 0.0
     _quiet_since_s: float = float("-inf")
     _pending: bytes = b""
     _shown: tuple[bool, float] = (False, 0.0)
@@ -210,6 +212,7 @@ class CoboltModel:
 
     def tick(self, now_s: float) -> bytes:
         """Let time pass, so that warm-up can end. The laser never sends anything unasked."""
+        self._now_s = now_s
         if self._ready_at_s is not None and now_s >= self._ready_at_s:
             self._ready_at_s = None
             self.on = not self.interlock_open and not self.fault
@@ -238,12 +241,11 @@ class CoboltModel:
         said = self._query(name)
         if said is not None and name not in (_UNKNOWN[self.family] if self.unknown is None else self.unknown):
             return said
-        power, unit_w = _POWERS[self.family].get(name, ("", 1.0))
-        if power:
-            return self._set_power(power, value, unit_w, now_s)
         if name == "l1" and self.autostart:
             return NOT_IN_AUTOSTART
-        return "OK" if self._act(name, value, now_s) or self._set(name, value) else ILLEGAL
+        if self._act(name, value, now_s) or self._set(name, value):
+            return "OK"
+        return OUT_OF_RANGE if name in _POWERS[self.family] and _NUMBER.fullmatch(value) else ILLEGAL
 
     def _query(self, command: str) -> str | None:
         """The answer to a question; None if the laser does not know it."""
@@ -362,9 +364,15 @@ class CoboltModel:
         return True
 
     def _set(self, name: str, value: str) -> bool:
-        flag = _FLAGS[self.family].get(name)
+        flag, (power, unit_w) = _FLAGS[self.family].get(name), _POWERS[self.family].get(name, ("", 1.0))
         if flag and value in ("0", "1"):
             setattr(self, flag, value == "1")
+        elif power:
+            power_w = self._power(value, unit_w)
+            if power_w is None:
+                return False
+            if self._now_s >= self._hears_at_s:
+                setattr(self, power, power_w)
         elif name == "slc" or (self.family == "06-DPL" and name in ("smc", "slth")):
             return self._set_current({"slc": "current_ma", "smc": "high_ma", "slth": "low_ma"}[name], value)
         elif self.family != "06-01":
@@ -382,16 +390,12 @@ class CoboltModel:
             return False
         return True
 
-    def _set_power(self, attribute: str, value: str, unit_w: float, now_s: float) -> str:
+    def _power(self, value: str, unit_w: float) -> float | None:
         try:
             power_w = float(value) * unit_w
         except ValueError:
-            return ILLEGAL
-        if not 0 <= power_w <= self.max_power_w * (1 + 1e-9):
-            return OUT_OF_RANGE
-        if now_s >= self._hears_at_s:
-            setattr(self, attribute, power_w)
-        return "OK"
+            return None
+        return power_w if 0 <= power_w <= self.max_power_w * (1 + 1e-9) else None
 
     def _set_current(self, attribute: str, value: str) -> bool:
         try:

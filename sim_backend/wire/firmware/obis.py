@@ -281,7 +281,9 @@ class ObisModel:
         if name == "SOUR:POW:LEV:IMM:AMPL":
             return self._change_power(value)
         if name in ("SOUR:AM:INT", "SOUR:AM:EXT"):
-            return self._change_mode(_MODE_WORDS.get(value, value), internal=name.endswith("INT"))
+            mode = _MODE_WORDS.get(value, value)
+            fits = mode in _MODES[self.series] and (mode in _INTERNAL) == name.endswith("INT")
+            return self._change_mode(mode) if fits else -220
         if value not in ("ON", "OFF"):
             return -100
         if name == "SOUR:AM:STAT":
@@ -302,9 +304,7 @@ class ObisModel:
         self.state_on = on
         self.tick(self._now_s)
 
-    def _change_mode(self, mode: str, *, internal: bool) -> int:
-        if mode not in _MODES[self.series] or (mode in _INTERNAL) != internal:
-            return -220
+    def _change_mode(self, mode: str) -> int:
         if self.state_on:
             return -200
         self.mode = mode
