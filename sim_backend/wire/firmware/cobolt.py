@@ -339,15 +339,15 @@ class CoboltModel:
                 self.aborted = False
                 self.on = not self.interlock_open and not self.fault
             case "@cob1":
-                was_on = self.on
+                waits = self.waiting_for_key or (self.autostart and self.on) or self.key_cycle or self.key_needed
                 self._stop()
-                if (self.autostart and was_on) or self.key_cycle or self.key_needed or not self.key_on:
+                if waits or not self.key_on:
                     self.waiting_for_key = True
                 else:
                     self._start(now_s)
             case "abort" | "auto:abort":
                 self._stop()
-                self.aborted = True
+                self.aborted, self.key_needed = True, self.autostart
             case "restart" | "auto:restart":
                 self._stop()
                 self.waiting_for_key = True
