@@ -213,7 +213,7 @@ def test_a_cobolt_says_who_it_is(family: Family, end: str) -> None:
 
 def test_a_06_mld_refuses_to_say_how_the_key_is_turned() -> None:
     assert Talk(CoboltModel())("@cobasks?") == ILLEGAL
-    assert Talk(CoboltModel())("@cobas?") == "1\r\n"
+    assert Talk(CoboltModel())("@cobasks") == Talk(CoboltModel())("@cobas?") == "1\r\n"
     assert Talk(CoboltModel("06-01"))("@cobasks?") == "1\r\n"
     assert Talk(CoboltModel("06-01"))("keyswitch?") == "1\r\n"
     stubborn = Talk(CoboltModel(unknown=frozenset({"@cobas?"})))
@@ -264,9 +264,10 @@ def test_some_cobolts_wait_for_the_key_although_they_were_never_off() -> None:
         assert model.emitting is not key_cycle
 
 
-def test_an_aborted_program_begins_again_with_restart_and_the_key() -> None:
+@pytest.mark.parametrize("abort", ["abort", "@cob0"])
+def test_an_aborted_program_begins_again_with_restart_and_the_key(abort: str) -> None:
     model, talk = lit()
-    assert talk("abort") == "OK\r\n"
+    assert talk(abort) == "OK\r\n"
     assert talk("gom?") == "6\r\n"
     assert talk("restart") == "OK\r\n"
     assert talk("gom?") == "1\r\n"
@@ -289,6 +290,27 @@ def test_numbers_of_the_operating_mode_depend_on_the_family(family: Family, numb
     model.open_interlock(talk.now_s)
     said.append(talk("gom?"))
     assert said == [f"{number}\r\n" for number in numbers]
+
+
+def test_without_autostart_the_program_begins_without_the_key() -> None:
+    model = CoboltModel(autostart=False)
+    talk = Talk(model)
+    talk("p 0.05")
+    talk("@cob1")
+    talk.wait()
+    assert model.emitting
+    assert talk("@cob0") == "OK\r\n"
+    assert talk("gom?") == "0\r\n"
+    talk("@cob1")
+    talk.wait()
+    assert model.emitting
+
+
+def test_an_old_laser_refuses_questions_that_others_answer() -> None:
+    old = frozenset({"l?", "sn?", "glmp?"})
+    talk = Talk(CoboltModel(unknown=old))
+    assert {talk(question) for question in old} == {ILLEGAL}
+    assert talk("gsn?") == "16328\r\n"
 
 
 def test_a_fault_is_cleared_once_its_cause_is_gone() -> None:

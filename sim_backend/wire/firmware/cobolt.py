@@ -258,6 +258,7 @@ class CoboltModel:
             "l?": _flag(self.on),
             "@cobas?": _flag(self.autostart),
             "@cobasks?": _flag(self.key_on),
+            "@cobasks": _flag(self.key_on),
             "gkses?": _flag(self.keyswitch),
             "ilk?": _flag(self.interlock_open),
             "f?": str(self.fault),
@@ -332,9 +333,12 @@ class CoboltModel:
     def _act(self, name: str, value: str, now_s: float) -> bool:
         shutter = self.family == "06-01" if self.shutter is None else self.shutter
         match name:
-            case "l0" | "@cob0":
+            case "l0":
                 self._stop()
                 self.key_needed = self.autostart
+            case "@cob0" | "abort" | "auto:abort":
+                self._stop()
+                self.aborted = self.key_needed = self.autostart
             case "l1":
                 self.aborted = False
                 self.on = not self.interlock_open and not self.fault
@@ -345,9 +349,6 @@ class CoboltModel:
                     self.waiting_for_key = True
                 else:
                     self._start(now_s)
-            case "abort" | "auto:abort":
-                self._stop()
-                self.aborted, self.key_needed = True, self.autostart
             case "restart" | "auto:restart":
                 self._stop()
                 self.waiting_for_key = True
