@@ -323,9 +323,12 @@ class CoboltLaser(SerialLaser):
         blanked = to_blank and self._knows_pause and self._blank()
         try:
             self._set_power(0.0)
-        finally:
-            if to_blank and not blanked:
-                blanked = self._blank()
+        except DeviceError:
+            if to_blank and not (blanked or self._blank()):
+                self._cut_current()  # then the light ends at least
+            raise
+        if to_blank and not blanked:
+            blanked = self._blank()
         self._line.tell(self._dialect.no_power)
         if to_blank and not blanked:
             self._cut_current()

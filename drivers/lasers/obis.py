@@ -211,6 +211,11 @@ class ObisLaser(SerialLaser):
             power_w=line.ask_number("SOUR:POW:LEV?"),
         )
 
+    def _check_health(self) -> None:
+        if self._bits() & KEY_OFF:  # then the interlock counts as open too, and closing it would not help
+            raise DeviceFault(f"{self._name}: its key is off; turn it on and arm again")
+        super()._check_health()
+
     def _do_arm(self, power_w: float) -> None:
         try:
             shines = self._told_on and self._bits() & EMISSION

@@ -351,7 +351,7 @@ def test_trap_behind_a_remote_bare_commands_do_not_reach_the_laser() -> None:
             assert "SOUR1:AM:STAT ON" in model.commands
             laser.pause()
             assert not model.emitting
-        with pytest.raises(ProtocolError, match="ERR-100"):
+        with pytest.raises(ProtocolError, match="ERR-241"):
             open_obis(surroundings, channel=2)
 
 

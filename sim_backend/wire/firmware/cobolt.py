@@ -1,9 +1,10 @@
-"""Model of a Cobolt 06-01 laser's firmware: 06-MLD or the newer SCPI-like language, key, autostart, interlock, faults.
+"""Model of a Cobolt 06-01 laser's firmware: 06-MLD, 06-DPL or the newer SCPI-like language, key, autostart, faults.
 
-Source: docs/reference/hardware.md (cobolt-lasers/pycobolt 1333e53). Commands end with CR, replies with CRLF. The model
-has the traps of the real laser: no answer to a command sooner than 100 ms after the last reply, key needed after `l0`,
-`l1` refused while autostart is enabled, powers in W (`p`) and mW (`slmp`), `ilk?` 1 = open, junk before replies, silent
-`!e` and `!d`. `l0r` and `l1r` blank the light and end that, as a shutter would (mmCoreAndDevices 8431eb1).
+Each fact has its public source in the table of docs/reference/hardware.md. Commands end with CR, replies with CRLF. The
+model has the traps of the real laser: no answer to a command sooner than 100 ms after the last reply, key needed after
+`l0`, `@cob0` and `@cob1` darken it, `l1` refused while autostart is enabled, `@cobasks?` unknown to 06-MLD, `gkses?`
+that says whether the key is in force but not how it is turned, powers in W (`p`) and mW (`slmp`, `slp`), numbers of
+`gom?` that mean other things in 06-DPL, `ilk?` 1 = open, junk before replies, silent `!e` and `!d`.
 """
 
 import re
@@ -11,14 +12,27 @@ from collections.abc import Callable
 from dataclasses import KW_ONLY, dataclass, field
 from typing import Literal
 
-Family = Literal["06-MLD", "06-01"]
+Family = Literal["06-MLD", "06-DPL", "06-01"]
 Mode = Literal["constant current", "constant power", "modulation"]
 
 MODELS: dict[Family, str] = {"06-MLD": "0488-06-01-0100-100", "06-01": "0488-06-01-0100-1100"}
-"""A model number of each family, as `glm?` gives it."""
+"""A model number of the families with a diode, as `glm?` gives it."""
+DPL_MODEL = "0561-06-91-0100-100"
+"""A model number of the family 06-DPL: its fourth part is 51, 53, 57, 91, 93 or 97."""
 ILLEGAL = "Syntax error: illegal command"
+NOT_IN_AUTOSTART = "Syntax error: not allowed in autostart mode."
+OUT_OF_RANGE = "Syntax error: Value is out of range."
 FORBIDDEN = re.compile(r"@cobas \S+|@cobasky.*|@cobasdr.*")
 """Commands that bypass key and autostart: a driver that sends one of them has failed its test."""
+_NUMBER = re.compile(r"[-+]?\d*\.?\d+")
+MOST_MA = 100.0
+"""Current at the largest power; no real unit's."""
+_REFUSED: dict[Family, frozenset[str]] = {
+    "06-MLD": frozenset({"@cobasks?"}),
+    "06-DPL": frozenset({"@cobasks?"}),
+    "06-01": frozenset(),
+}
+"""Questions that a family refuses although others of the make answer them."""
 GAP_S = 0.09
 """Commands closer than this to the last reply get no answer (the manual's 100 ms with some tolerance)."""
 
@@ -33,6 +47,10 @@ _SHORT = {
     "power": "pow",
     "setpoint": "setp",
     "pause": "paus",
+    "enabled": "ena",
+    "reading": "read",
+    "autostart": "auto",
+    "keyswitch": "key",
 }
 _MODES: dict[Mode, tuple[str, str]] = {
     "constant current": ("0", "ConstantCurrent"),
@@ -40,15 +58,27 @@ _MODES: dict[Mode, tuple[str, str]] = {
     "modulation": ("2", "PowerModulation"),
 }
 """Name of each mode in the replies of 06-MLD and of 06-01."""
+_MODE_COMMANDS: dict[str, Mode] = {
+    "ci": "constant current",
+    "ecc": "constant current",
+    "cp": "constant power",
+    "ecp": "constant power",
+    "em": "modulation",
+}
+"""Commands of 06-MLD and 06-DPL that enter a mode."""
 _RUN_MODES = {name.lower(): mode for mode, (_, name) in _MODES.items()}
-_MODE_COMMANDS: dict[str, Mode] = {"ecc": "constant current", "em": "modulation"}
-"""Commands of 06-MLD that enter a mode."""
 _FLAGS: dict[Family, dict[str, str]] = {
     "06-MLD": {"sdmes": "digital", "sames": "analog"},
+    "06-DPL": {"sdmes": "digital", "sames": "analog"},
     "06-01": {"las:pm:dig:ena": "digital", "las:pm:ana:ena": "analog", "las:paus": "paused"},
 }
 _POWERS: dict[Family, dict[str, tuple[str, float]]] = {
-    "06-MLD": {"slmp": ("modulation_power_w", 1e-3), "p": ("constant_power_w", 1.0)},
+    "06-MLD": {
+        "slmp": ("modulation_power_w", 1e-3),
+        "slp": ("constant_power_w", 1e-3),
+        "p": ("constant_power_w", 1.0),
+    },
+    "06-DPL": {"slp": ("constant_power_w", 1e-3), "p": ("constant_power_w", 1.0)},
     "06-01": {
         "las:pm:pow:setp": ("modulation_power_w", 1e-3),
         "las:cp:pow:setp": ("constant_power_w", 1e-3),
@@ -62,7 +92,10 @@ _POWERS: dict[Family, dict[str, tuple[str, float]]] = {
 class CoboltModel:
     """The laser. Its attributes are the truth, for tests to look at; the driver sees only the replies.
 
-    on_emission(emits, now_s) is called whenever power or emission change.
+    on_emission(emits, now_s) is called whenever power or emission change. refuses: commands and questions that this
+    unit does not know; None: those of its family. shutter: whether it knows `l0r` and `l1r`, which pause and resume; None: as its
+    family. key_cycle: whether `@cob1` always waits until the key is turned off and on, even where nothing was said
+    before. deaf_s: time after the start of the warm-up for which it answers OK to a power, and forgets it.
     """
 
     family: Family = "06-MLD"
@@ -71,17 +104,24 @@ class CoboltModel:
     """Its model number; empty: the usual one of the family."""
     serial: str = "16328"
     firmware: str = "4.1.3"
-    refuses: frozenset[str] = frozenset()
-    """Commands and questions that this unit does not know although others of its family do."""
     autostart: bool = True
     warm_up_s: float = 3.0
     junk: bytes = b""
     gap_s: float = GAP_S
+    refuses: frozenset[str] | None = None
+    shutter: bool | None = None
+    key_cycle: bool = False
+    deaf_s: float = 0.0
+    keyswitch: bool = True
+    """Whether the key is in force, as `gkses?` says; how it is turned is `key_on`."""
     on_emission: Callable[[bool, float], None] | None = None
     max_power_w: float = 0.1
     key_on: bool = True
     key_needed: bool = False
     waiting_for_key: bool = False
+    aborted: bool = False
+    on_off: bool = False
+    """On/off modulation of 06-MLD, which `eoom` enters."""
     interlock_open: bool = False
     fault: int = 0
     on: bool = False
@@ -90,6 +130,9 @@ class CoboltModel:
     constant_power_w: float = 0.0
     modulation_power_w: float = 0.0
     current_ma: float = 0.0
+    high_ma: float = 0.0
+    low_ma: float = 0.0
+    """Currents of 06-DPL behind an open and a closed gate."""
     digital: bool = False
     analog: bool = False
     modulator: str = "external"
@@ -98,6 +141,8 @@ class CoboltModel:
     commands: list[str] = field(default_factory=list)
     """All commands received."""
     _ready_at_s: float | None = None
+    _hears_at_s: float = float("-inf")
+    _now_s: float = 0.0
     _quiet_since_s: float = float("-inf")
     _pending: bytes = b""
     _shown: tuple[bool, float] = (False, 0.0)
@@ -113,12 +158,14 @@ class CoboltModel:
         if not self.on or self.paused or self.interlock_open or self.fault:
             return 0.0
         match self.mode:
+            case "modulation" if self.family == "06-DPL":
+                return self.max_power_w * self.high_ma / MOST_MA
             case "modulation":
                 return self.modulation_power_w
             case "constant power":
                 return self.constant_power_w
             case _:
-                return self.max_power_w * min(1.0, self.current_ma / 100.0)
+                return self.max_power_w * min(1.0, self.current_ma / MOST_MA)
 
     @property
     def emitting(self) -> bool:
@@ -141,12 +188,12 @@ class CoboltModel:
         else:
             self.key_needed = False
             if self.waiting_for_key:
-                self.waiting_for_key = False
-                self._ready_at_s = now_s + self.warm_up_s
+                self._start(now_s)
         self._tell(now_s)
 
     def open_interlock(self, now_s: float) -> None:
-        """Open the interlock: the laser goes off, and `fault` stays 3 until a test sets it to 0."""
+        """Open the interlock: the laser goes off, and `fault` stays 3 until `cf` with the interlock closed, or until a
+        test sets it to 0."""
         self.interlock_open = True
         self.fault = 3
         self._stop()
@@ -165,6 +212,7 @@ class CoboltModel:
 
     def tick(self, now_s: float) -> bytes:
         """Let time pass, so that warm-up can end. The laser never sends anything unasked."""
+        self._now_s = now_s
         if self._ready_at_s is not None and now_s >= self._ready_at_s:
             self._ready_at_s = None
             self.on = not self.interlock_open and not self.fault
@@ -186,76 +234,135 @@ class CoboltModel:
 
     def _answer(self, command: str, now_s: float) -> str:
         name, _, value = command.partition(" ")
-        if name in self.refuses or command in self.refuses:
+        refused = _REFUSED[self.family] if self.refuses is None else self.refuses
+        if name in refused or command in refused:
             return ILLEGAL
         if self.family == "06-01":
             name = re.sub("[a-z]+", lambda word: _SHORT.get(word[0], word[0]), name)
-        said = self._query(f"{name} {value}" if name.endswith("?") and value else name)
+            if name.endswith("?") and value == "max":
+                name, value = f"{name} max", ""
+        said = self._query(name)
         if said is not None:
             return said
-        return "OK" if self._act(name, now_s) or self._set(name, value) else ILLEGAL
+        if name == "l1" and self.autostart:
+            return NOT_IN_AUTOSTART
+        if self._act(name, value, now_s) or self._set(name, value):
+            return "OK"
+        return OUT_OF_RANGE if name in _POWERS[self.family] and _NUMBER.fullmatch(value) else ILLEGAL
 
     def _query(self, command: str) -> str | None:
         """The answer to a question; None if the laser does not know it."""
         answers = {
             "?": "OK",
             "sn?": self.serial,
+            "gsn?": self.serial,
+            "gfv?": f"CAP-1004-{self.firmware}" if self.family == "06-01" else self.firmware,
+            "hrs?": "828.98",
             "l?": _flag(self.on),
             "@cobas?": _flag(self.autostart),
             "@cobasks?": _flag(self.key_on),
+            "@cobasks": _flag(self.key_on),
+            "gkses?": _flag(self.keyswitch),
             "ilk?": _flag(self.interlock_open),
             "f?": str(self.fault),
             "gmlp?": f"{self.max_power_w * 1e3:.1f}",
+            "gmlc?": f"{MOST_MA:.1f}",
+            "glc?": f"{self.current_ma:.1f}",
+            "i?": f"{self._diode_ma:.1f}",
             "p?": f"{self.constant_power_w:.4f}",
             "pa?": f"{self.power_w:.4f}",
         }
         if "." in self.firmware:  # -04- types have no dot there, and do not know it
-            answers["glm?"] = self.model or MODELS[self.family]
-        number, name = _MODES[self.mode]
-        modulation = f"{self.modulation_power_w * 1e3:.4f}"
-        if self.family == "06-MLD":
-            answers |= {"gam?": number, "gdmes?": _flag(self.digital), "games?": _flag(self.analog)}
-            answers |= {"glmp?": modulation, "gom?": self._operating_mode(), "gas?": _flag(self.autostart)}
-            answers["glc?"] = f"{self.current_ma:.1f}"
-        else:
-            answers |= {"las:runm?": name, "las:pm:dig:ena?": _flag(self.digital), "state?": self._state()}
-            answers |= {"las:pm:ana:ena?": _flag(self.analog), "las:pm:pow:setp?": modulation}
-            answers["las:cp:pow:setp?"] = f"{self.constant_power_w * 1e3:.4f}"
-            answers["las:cp:pow:setp? max"] = f"{self.max_power_w * 1e3:.1f}"
-            answers["autostart:enabled?"] = _flag(self.autostart)
+            answers["glm?"] = self.model or MODELS.get(self.family, DPL_MODEL)
+        answers |= self._scpi_answers() if self.family == "06-01" else self._legacy_answers()
         return answers.get(command)
 
+    def _legacy_answers(self) -> dict[str, str]:
+        answers = {
+            "gam?": _MODES[self.mode][0],
+            "gas?": _flag(self.autostart),
+            "gdmes?": _flag(self.digital),
+            "games?": _flag(self.analog),
+            "glp?": f"{self.constant_power_w * 1e3:.1f}",
+            "gom?": self._operating_mode(),
+        }
+        if self.family == "06-DPL":
+            return answers | {"gmc?": f"{self.high_ma:.1f}", "glth?": f"{self.low_ma:.1f}"}
+        return answers | {"glmp?": f"{self.modulation_power_w * 1e3:.1f}"}
+
+    def _scpi_answers(self) -> dict[str, str]:
+        most = f"{self.max_power_w * 1e3:.4f}"
+        return {
+            "las:runm?": _MODES[self.mode][1],
+            "las:pm:dig:ena?": _flag(self.digital),
+            "las:pm:ana:ena?": _flag(self.analog),
+            "las:pm:pow:setp?": f"{self.modulation_power_w * 1e3:.4f}",
+            "las:cp:pow:setp?": f"{self.constant_power_w * 1e3:.4f}",
+            "las:pm:pow:setp? max": most,
+            "las:cp:pow:setp? max": most,
+            "las:pow?": f"{self.power_w * 1e3:.4f}",
+            "las:pow:read?": f"{self.power_w * 1e3:.4f}",
+            "auto:ena?": _flag(self.autostart),
+            "key:ena?": _flag(self.keyswitch),
+            "key?": _flag(self.key_on),
+            "state?": self._state(),
+        }
+
+    @property
+    def _diode_ma(self) -> float:
+        """Current through the diode in mA; no real curve."""
+        return MOST_MA * self.power_w / self.max_power_w
+
     def _operating_mode(self) -> str:
+        """What `gom?` says. 06-DPL has a number for the warm-up, and others for what comes after it."""
+        diode = self.family == "06-MLD"
         if self.fault:
             return "5"
+        if self.aborted:
+            return "6"
         if self.waiting_for_key:
             return "1"
         if not self.on:
-            return "0"
-        return "4" if self.mode == "modulation" else "2"
+            return "3" if self._ready_at_s is not None and not diode else "0"
+        if self.mode == "modulation":
+            return "4" if diode else "7"
+        return ("3" if self.on_off else "2") if diode else "4"
 
     def _state(self) -> str:
         if self.waiting_for_key:
             return "AutostartWaitingForKeyOn"
         return "AutostartLaserOn" if self.on else "AutostartStandby"
 
-    def _act(self, name: str, now_s: float) -> bool:
+    def _act(self, name: str, value: str, now_s: float) -> bool:
+        shutter = self.family == "06-01" if self.shutter is None else self.shutter
         match name:
             case "l0":
                 self._stop()
                 self.key_needed = self.autostart
-            case "l1" if not self.autostart:
+            case "@cob0" | "abort" | "auto:abort":
+                self._stop()
+                self.aborted = self.key_needed = self.autostart
+            case "l1":
+                self.aborted = False
                 self.on = not self.interlock_open and not self.fault
             case "@cob1":
-                if self.key_needed or not self.key_on:
+                waits = self.waiting_for_key or (self.autostart and self.on) or self.key_cycle or self.key_needed
+                self._stop()
+                if waits or not self.key_on:
                     self.waiting_for_key = True
-                elif not self.on and self._ready_at_s is None:
-                    self._ready_at_s = now_s + self.warm_up_s
-            case "l0r" | "l1r":  # as a shutter; the key is not needed afterwards
+                else:
+                    self._start(now_s)
+            case "restart" | "auto:restart":
+                self._stop()
+                self.waiting_for_key = True
+            case "@cobas" if value in ("0", "1"):
+                if value == "1" and not self.autostart:
+                    self._stop()
+                self.autostart = value == "1"
+            case "cf" | "fault:clear":
+                self.fault = 3 if self.interlock_open else 0
+            case "l0r" | "l1r" if shutter:
                 self.paused = name == "l0r"
-            case "@cob0":
-                self.waiting_for_key = False
-                self._ready_at_s = None
             case _:
                 return False
         return True
@@ -264,15 +371,21 @@ class CoboltModel:
         flag, (power, unit_w) = _FLAGS[self.family].get(name), _POWERS[self.family].get(name, ("", 1.0))
         if flag and value in ("0", "1"):
             setattr(self, flag, value == "1")
-        elif power and (power_w := self._power(value, unit_w)) is not None:
-            setattr(self, power, power_w)
-        elif self.family == "06-MLD":
-            if name == "slc" and value.replace(".", "", 1).isdigit():
-                self.current_ma = float(value)
-            elif name in _MODE_COMMANDS:
-                self.mode = _MODE_COMMANDS[name]
-            else:
+        elif power:
+            power_w = self._power(value, unit_w)
+            if power_w is None:
                 return False
+            if self._now_s >= self._hears_at_s:
+                setattr(self, power, power_w)
+        elif name == "slc" or (self.family == "06-DPL" and name in ("smc", "slth")):
+            return self._set_current({"slc": "current_ma", "smc": "high_ma", "slth": "low_ma"}[name], value)
+        elif self.family != "06-01":
+            if name in ("eoom", "xoom") and self.family == "06-MLD":
+                self.on_off = name == "eoom"
+                return True
+            if name not in _MODE_COMMANDS:
+                return False
+            self.mode = _MODE_COMMANDS[name]
         elif name == "las:runm" and value in _RUN_MODES:
             self.mode = _RUN_MODES[value]
         elif name == "las:pm:dig:modulator" and value in ("external", "command"):
@@ -288,9 +401,26 @@ class CoboltModel:
             return None
         return power_w if 0 <= power_w <= self.max_power_w * (1 + 1e-9) else None
 
+    def _set_current(self, attribute: str, value: str) -> bool:
+        try:
+            current_ma = float(value)
+        except ValueError:
+            return False
+        if not 0 <= current_ma <= MOST_MA:
+            return False
+        setattr(self, attribute, current_ma)
+        return True
+
+    def _start(self, now_s: float) -> None:
+        """Begin the warm-up, after which it is on."""
+        self.waiting_for_key = False
+        self._ready_at_s = now_s + self.warm_up_s
+        self._hears_at_s = now_s + self.deaf_s
+
     def _stop(self) -> None:
         self.on = False
         self.waiting_for_key = False
+        self.aborted = False
         self._ready_at_s = None
 
     def _tell(self, now_s: float) -> None:
