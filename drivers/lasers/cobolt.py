@@ -24,13 +24,14 @@ from collections.abc import Callable, Mapping
 from contextlib import suppress
 from dataclasses import dataclass
 from functools import partial
-from typing import Literal
+from typing import Any, Literal
 
 from drivers.errors import CommandRefused, DeviceError, DeviceFault, ProtocolError
 from drivers.interfaces import LaserLimits, LaserStatus
 from drivers.lasers.serial_laser import SerialLaser, SerialLaserConfig, open_laser, require_serial_number
-from drivers.registry import Kind, Surroundings
+from drivers.registry import Kind, Surroundings, alone, config_of
 from drivers.transports.dialogue import DONE, FLAG, NUMBER, Dialogue, LineTiming
+from drivers.units import format_quantity
 
 _log = logging.getLogger(__name__)
 
@@ -198,6 +199,19 @@ class CoboltLaser(SerialLaser):
         self._blanked = False
         """Whether the light was blanked and that was not ended yet."""
         self._started = False
+
+    @classmethod
+    def open(
+        cls, port: str, *, max_power_w: float, surroundings: Surroundings | None = None, **settings: Any
+    ) -> "CoboltLaser":
+        """Open a laser by itself, without a config file.
+
+        port, settings (serial_number, baud): as in `CoboltConfig`. max_power_w: most power that may ever be
+        sent out. surroundings: of an emulator. Raises `LimitExceeded` for a setting that is not possible, other
+        `DeviceError` if the laser cannot be opened.
+        """
+        power = format_quantity(max_power_w, "power")
+        return create(config_of(CoboltConfig, port=port, max_power=power, **settings), surroundings or alone())
 
     def _do_status(self) -> LaserStatus:
         line = self._line
@@ -410,7 +424,7 @@ class CoboltLaser(SerialLaser):
 
 def create(config: CoboltConfig, surroundings: Surroundings, timing: LineTiming = USUAL_TIMING) -> CoboltLaser:
     """Open the laser and identify it; changes nothing about it."""
-    return open_laser("cobolt", config, surroundings, CoboltFraming(), timing, partial(_identify, config))
+    return open_laser("cobolt", config, surroundings, CoboltFraming(), timing, partial(_identify, config), _off(config))
 
 
 def _identify(config: CoboltConfig, line: Dialogue) -> CoboltLaser:

@@ -18,7 +18,7 @@ import re
 from collections.abc import Callable
 from contextlib import suppress
 from functools import partial
-from typing import Annotated, Literal
+from typing import Annotated, Any, Literal
 
 from pydantic import Field
 
@@ -34,9 +34,9 @@ from drivers.errors import (
 )
 from drivers.interfaces import LaserLimits, LaserStatus
 from drivers.lasers.serial_laser import SerialLaser, SerialLaserConfig, open_laser, require_serial_number
-from drivers.registry import Kind, Surroundings
+from drivers.registry import Kind, Surroundings, alone, config_of
 from drivers.transports.dialogue import DONE, NUMBER, Dialogue, LineTiming
-from drivers.units import Seconds
+from drivers.units import Seconds, format_quantity
 
 SWITCH = re.compile(r"ON|OFF")
 CELSIUS = re.compile(r"([+-]?\d{1,4}(?:\.\d{1,6})?) ?C?")
@@ -188,6 +188,19 @@ class ObisLaser(SerialLaser):
         self._autostart_found: str | None = None
         """What autostart was before `arm` switched it off. None: it was not touched."""
 
+    @classmethod
+    def open(
+        cls, port: str, *, max_power_w: float, surroundings: Surroundings | None = None, **settings: Any
+    ) -> "ObisLaser":
+        """Open a laser by itself, without a config file.
+
+        port, settings (channel, serial_number, baud): as in `ObisConfig`. max_power_w: most power that may ever be
+        sent out. surroundings: of an emulator. Raises `LimitExceeded` for a setting that is not possible, other
+        `DeviceError` if the laser cannot be opened.
+        """
+        power = format_quantity(max_power_w, "power")
+        return create(config_of(ObisConfig, port=port, max_power=power, **settings), surroundings or alone())
+
     def _do_status(self) -> LaserStatus:
         line = self._line
         bits = self._bits()
@@ -331,7 +344,7 @@ class ObisLaser(SerialLaser):
 def create(config: ObisConfig, surroundings: Surroundings, timing: LineTiming = USUAL_TIMING) -> ObisLaser:
     """Open the laser and identify it; changes nothing about it."""
     framing = ObisFraming(config.channel)
-    return open_laser("obis", config, surroundings, framing, timing, partial(_identify, config, framing))
+    return open_laser("obis", config, surroundings, framing, timing, partial(_identify, config, framing), _off(config))
 
 
 def _identify(config: ObisConfig, framing: ObisFraming, line: Dialogue) -> ObisLaser:

@@ -1,16 +1,22 @@
-"""The common part of all lasers on a serial line: config with limits, opening, a port that may get lost, serial number.
+"""The common part of all lasers on a serial line: config with limits, opening, a port that may get lost, serial number,
+and light that ends if a program forgets an armed laser.
 
 `PlainLaser` is a line laser without key or warm-up, whose emission follows `arm` and `pause` at once. Simulated and
 recorded lasers use it.
 """
 
+import logging
+import re
+import weakref
 from collections.abc import Callable
+from contextlib import suppress
 from typing import Annotated, TypeVar
 
 from pydantic import Field
 
-from drivers.errors import DeviceNotFound, DeviceTimeout, ProtocolError, WrongState
+from drivers.errors import DeviceError, DeviceNotFound, DeviceTimeout, ProtocolError, WrongState
 from drivers.interfaces import LaserLimits, LaserStatus, LineLaser
+from drivers.interfaces.device import OPEN_STATES
 from drivers.registry import KindConfig, Surroundings
 from drivers.transports.dialogue import Dialogue, Framing, LineTiming
 from drivers.transports.endpoints import resolve
@@ -31,6 +37,27 @@ class SerialLaserConfig(KindConfig):
     """Bits per second of the port, where the laser or the adapter before it is set to another rate than usual."""
 
 
+_log = logging.getLogger(__name__)
+
+_ANY = re.compile(".*")
+
+
+class _Light:
+    """Whether a laser may shine. It does not refer to the laser, which may be forgotten."""
+
+    may_shine = False
+
+
+def _forgotten(name: str, port: SerialPort, off: bytes, light: _Light, gap_s: float) -> None:
+    """End the light of a laser that was deleted, or that the program ended with, without being closed."""
+    if light.may_shine and not port.lost:
+        _log.warning("%s: was forgotten while it was armed; switched off", name)
+        port.clock.sleep(1.2 * gap_s)  # after its last reply, the laser would not listen yet
+        with suppress(DeviceError):
+            port.write(off)
+    port.close()
+
+
 class SerialLaser(LineLaser):
     """A laser that communicates through `self._line`."""
 
@@ -40,23 +67,36 @@ class SerialLaser(LineLaser):
         self._line = line
         self._limits = limits
         self._armed = False
+        self._light = _Light()
+        self._forgotten: weakref.finalize[..., SerialLaser] | None = None
         self._stopped = False
         """Whether pause or disarm was called since arm began, which other threads may do."""
 
     def arm(self, power_w: float) -> None:
         """See `LineLaser`. Raises `WrongState` if a pause or disarm from another thread ended it."""
         self._stopped = False
+        self._light.may_shine = True
         super().arm(power_w)
 
     def pause(self) -> None:
         """See `LineLaser`. Ends an `arm` that is under way on another thread."""
         self._stopped = True
         super().pause()
+        self._light.may_shine = False
 
     def disarm(self) -> None:
         """See `LineLaser`. Ends an `arm` that is under way on another thread."""
         self._stopped = True
         super().disarm()
+        self._light.may_shine = False
+
+    def ask(self, command: str) -> str:
+        """Send a raw command and return the laser's reply, also if it is a refusal.
+
+        Nothing is checked: such a command can make light. Raises `DeviceError` if no reply comes.
+        """
+        self._require("ask", *OPEN_STATES)
+        return self._line.ask(command, _ANY)
 
     def _require_no_stop(self) -> None:
         """Raise `WrongState` if a pause or disarm has come while arming: the laser must then stay dark."""
@@ -73,7 +113,14 @@ class SerialLaser(LineLaser):
         """Whether the port is gone, found out without sending anything. May be called from any thread."""
         return self._line.port.lost
 
+    def watch_for_end(self, off: bytes, gap_s: float) -> None:
+        """Have the light ended if the laser is deleted, or the program ends, before `close`. off: bytes that switch it
+        off in any state. gap_s: time after a reply for which it does not listen."""
+        self._forgotten = weakref.finalize(self, _forgotten, self.name, self._line.port, off, self._light, gap_s)
+
     def _do_close(self) -> None:
+        if self._forgotten is not None:
+            self._forgotten.detach()
         self._line.port.close()
 
 
@@ -87,11 +134,12 @@ def open_laser(
     framing: Framing,
     timing: LineTiming,
     identify: Callable[[Dialogue], _Laser],
+    off: bytes,
 ) -> _Laser:
     """Open the port, synchronise with the laser and identify it. Closes the port again if any of it fails.
 
-    make: name of the make in messages. Raises `DeviceNotFound` if nothing of that make answers, and what
-    `SerialPort` and `identify` raise.
+    make: name of the make in messages. off: bytes that switch the laser off in any state. Raises `DeviceNotFound` if
+    nothing of that make answers, and what `SerialPort` and `identify` raise.
     """
     port = SerialPort(f"{make} laser", resolve(config.port, surroundings.ports), surroundings.tap, config.baud)
     try:
@@ -102,7 +150,9 @@ def open_laser(
             raise DeviceNotFound(
                 f"{make} laser: nothing on port {config.port} answers as one; check 'port', power and cable"
             ) from None
-        return identify(line)
+        laser = identify(line)
+        laser.watch_for_end(off, timing.gap_s)
+        return laser
     except BaseException:
         port.close()
         raise

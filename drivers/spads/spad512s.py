@@ -21,7 +21,7 @@ import time
 import zlib
 from collections.abc import Callable
 from fractions import Fraction
-from typing import Annotated, Literal
+from typing import Annotated, Any, Literal
 
 import numpy as np
 from numpy.typing import NDArray
@@ -30,14 +30,14 @@ from pydantic import Field
 from drivers.errors import DeviceFault, DeviceNotFound, DeviceTimeout, LimitExceeded, ProtocolError
 from drivers.frames import BlockFlag, BlockHeader, FrameBlock
 from drivers.interfaces import BurstMode, SpadArray, SpadCounters, SpadHealth, SpadInfo, SpadRequest, SpadTiming
-from drivers.registry import Kind, KindConfig, Surroundings
+from drivers.registry import Kind, KindConfig, Surroundings, alone, config_of
 from drivers.ring import BlockRing
 from drivers.spads.orientation import QuarterTurn, turn_packed, turned_size
 from drivers.spads.spad512s_line import DONE, ERROR, Deadlines, Spad512sLine
 from drivers.spb1 import BlockLayout, block_views, seal_block
 from drivers.transports.endpoints import Endpoint, resolve
 from drivers.transports.tap import Tap
-from drivers.units import BytesPerSecond, ExactHertz
+from drivers.units import BytesPerSecond, ExactHertz, format_quantity
 
 GUARD_BYTES = 512
 """Bytes that must follow a block before it is used, so that no part of an error text is taken for pixels. The
@@ -240,6 +240,21 @@ class Spad512s(SpadArray):
             trigger_modes=(config.trigger,),
             can_wait=True,  # a run lies in the device's memory and is handed over as fast as it is taken
         )
+
+    @classmethod
+    def open(
+        cls, port: str = "127.0.0.1:9999", *, max_frame_rate_hz: float | Fraction | None = None,
+        surroundings: Surroundings | None = None, **settings: Any,
+    ) -> "Spad512s":  # fmt: skip
+        """Connect to a SPAD512S by itself, without a config file.
+
+        port, settings (rotation, trigger, burst_frames, width_in_command): as in `Spad512sConfig`. max_frame_rate_hz:
+        None for that of the 512 x 512 sensor. surroundings: of an emulator. Raises `LimitExceeded` for a setting that
+        is not possible, other `DeviceError` if the device cannot be reached.
+        """
+        if max_frame_rate_hz is not None:
+            settings["max_frame_rate"] = format_quantity(max_frame_rate_hz, "frequency")
+        return create(config_of(Spad512sConfig, port=port, **settings), surroundings or alone())
 
     @property
     def info(self) -> SpadInfo:

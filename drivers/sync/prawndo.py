@@ -13,7 +13,7 @@ marker in this way. Pulses that the board would play differently from what was w
 import logging
 from collections.abc import Sequence
 from dataclasses import dataclass
-from typing import Annotated, Literal, Self
+from typing import Annotated, Any, Literal, Self
 
 import numpy as np
 from numpy.typing import NDArray
@@ -21,11 +21,12 @@ from pydantic import Field, model_validator
 
 from drivers.errors import DeviceError, DeviceFault, LimitExceeded, ProtocolError, WrongState
 from drivers.interfaces import OUT_FRAME, OUT_GATE, OUT_MARKER, Pulse, SyncSource, SyncStatus, sliced
-from drivers.registry import Kind, KindConfig, Surroundings
+from drivers.interfaces.device import OPEN_STATES
+from drivers.registry import Kind, KindConfig, Surroundings, alone, config_of
 from drivers.sync.prawndo_line import IDLE, USUAL_TIMING, PrawnDoLine, PrawnDoTiming
 from drivers.transports.endpoints import resolve
 from drivers.transports.serial_port import SerialPort
-from drivers.units import Hertz, Seconds
+from drivers.units import Hertz, Seconds, format_quantity
 
 _log = logging.getLogger(__name__)
 
@@ -202,6 +203,27 @@ class PrawnDo(SyncSource):
         except BaseException:
             self._line.port.close()
             raise
+
+    @classmethod
+    def open(
+        cls, port: str, *, external_clock_hz: float | None = None, surroundings: Surroundings | None = None,
+        **settings: Any,
+    ) -> "PrawnDo":  # fmt: skip
+        """Open a board by itself, without a config file.
+
+        port, settings (gate_output, frame_output, marker_output): as in `PrawnDoConfig`. external_clock_hz: of the
+        clock on GPIO20, None for the board's own. surroundings: of an emulator. Raises `LimitExceeded` for a setting
+        that is not possible, other `DeviceError` if the board cannot be opened.
+        """
+        clock = None if external_clock_hz is None else format_quantity(external_clock_hz, "frequency")
+        config = config_of(PrawnDoConfig, port=port, external_clock=clock, **settings)
+        return cls(config, surroundings or alone())
+
+    def ask(self, command: str) -> list[str]:
+        """Send a raw command and return the lines of the board's answer. Nothing is checked: a command such as `man`
+        can raise the gate. Raises `DeviceError` if no answer comes."""
+        self._require("ask", *OPEN_STATES)
+        return self._line.transact(command)
 
     @property
     def identity(self) -> str:

@@ -1,0 +1,143 @@
+"""One device without a rig: the cells of docs/how-to/devices.md against emulators, and lasers that are forgotten."""
+
+import gc
+import logging
+import time
+from collections.abc import Callable, Iterator
+from contextlib import ExitStack
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+
+from drivers.clock import VirtualClock
+from drivers.errors import LimitExceeded, WrongState
+from drivers.interfaces import LineLaser
+from drivers.lasers import cobolt, obis
+from drivers.registry import Surroundings
+from drivers.spads import spad512s, spb_usb
+from drivers.sync import prawndo
+from sim_backend.wire.firmware.cobolt import CoboltModel
+from sim_backend.wire.firmware.helios import HeliosModel
+from sim_backend.wire.firmware.obis import ObisModel
+from sim_backend.wire.firmware.spad512s import Spad512sModel
+from sim_backend.wire.serve.tcp import TcpServer
+from sim_backend.wire.serve.usb import EmulatedUsb
+from tests.wire.lasers import bring_up, wire
+from tests.wire.spb_device import model
+from tests.wire.syncs import board
+
+PAGE = Path(__file__).parents[2] / "docs" / "how-to" / "devices.md"
+CELLS = [
+    cell.split("```")[0] for cell in PAGE.read_text().split("## One device in a notebook")[1].split("```python\n")[1:]
+]
+
+
+def frames(first: int, start_s: float, period_s: float, n: int) -> Any:
+    """Some frames of a SPAD512S."""
+    return np.random.default_rng(first).integers(0, 256, (n, 512, 64), dtype=np.uint8)
+
+
+@pytest.fixture
+def lab(monkeypatch: pytest.MonkeyPatch) -> Iterator[dict[str, Any]]:
+    """A device at each address of the page; the models by slot."""
+    with ExitStack() as stack:
+        laser, sync = CoboltModel(warm_up_s=0.0), stack.enter_context(board())
+        _, at_laser = stack.enter_context(wire(laser))
+        ids = replace(sync.server.endpoint, usb_ids=(0x2E8A, 0x000A))
+        spad = stack.enter_context(TcpServer(Spad512sModel(frames)))
+        clock = VirtualClock()
+        bus, helios = EmulatedUsb(clock), HeliosModel()
+        bus.plug(helios)
+        places = {
+            cobolt: replace(at_laser, ports={"laser": at_laser.ports["laser"]}),
+            prawndo: Surroundings(sync.clock, None, 0, {"sync": ids}),
+            spad512s: Surroundings(at_laser.clock, None, 0, {"spad": spad.endpoint}),
+        }
+        for module, surroundings in places.items():
+            monkeypatch.setattr(module, "alone", lambda surroundings=surroundings: surroundings)
+        monkeypatch.setattr("drivers.transports.usb_device._libusb", lambda: bus)
+        monkeypatch.setattr("drivers.scanners.helios.SystemClock", lambda: clock)
+        monkeypatch.setattr(time, "sleep", clock.sleep)
+        yield {"laser": laser, "sync": sync.model, "scanner": helios}
+
+
+@pytest.mark.parametrize("cell", CELLS, ids=lambda cell: cell.split("import ")[1].split()[0])
+def test_the_cells_of_the_page_run_as_they_are_written(
+    cell: str, lab: dict[str, Any], capsys: pytest.CaptureFixture[str]
+) -> None:
+    addresses = {"/dev/ttyUSB0": "emulated:laser", "/dev/ttyACM0": "emulated:sync", "127.0.0.1:9999": "emulated:spad"}
+    for real, emulated in addresses.items():
+        cell = cell.replace(real, emulated)
+    exec(compile(cell, str(PAGE), "exec"), {})
+    assert capsys.readouterr().out
+    assert not lab["laser"].emitting
+    assert lab["sync"].status == 0 or lab["sync"].status == 5
+
+
+MAKES: list[tuple[type[LineLaser], Callable[[], Any]]] = [
+    (cobolt.CoboltLaser, lambda: CoboltModel(warm_up_s=0.0)),
+    (obis.ObisLaser, lambda: ObisModel(warm_up_s=0.0, cdrh_delay_s=0.0)),
+]
+
+
+@pytest.mark.parametrize(("kind", "make"), MAKES, ids=lambda each: getattr(each, "__name__", ""))
+def test_a_forgotten_laser_that_may_shine_is_switched_off_and_says_so(
+    kind: Any, make: Callable[[], Any], caplog: pytest.LogCaptureFixture
+) -> None:
+    caplog.set_level(logging.WARNING)
+    for paused in (False, True):
+        made = make()
+        with wire(made) as (server, surroundings):
+            laser = kind.open("emulated:laser", max_power_w=0.08, surroundings=surroundings)
+            bring_up(laser, surroundings.clock)
+            assert made.emitting
+            if paused:
+                laser.pause()
+            caplog.clear()
+            before = list(made.commands)
+            del laser
+            gc.collect()
+            surroundings.clock.sleep(1.0)
+            with server.lock:
+                made.tick(1e3)
+            assert not made.emitting
+            assert ("was forgotten while it was armed" in caplog.text) == (not paused)
+            assert (made.commands == before) == paused
+
+
+@pytest.mark.parametrize(("kind", "make"), MAKES, ids=lambda each: getattr(each, "__name__", ""))
+def test_a_laser_is_opened_and_asked_by_itself_and_closed_for_good(
+    kind: Any, make: Callable[[], Any], caplog: pytest.LogCaptureFixture
+) -> None:
+    caplog.set_level(logging.WARNING)
+    with wire(make()) as (_, surroundings):
+        with kind.open("emulated:laser", max_power_w=0.03, surroundings=surroundings) as laser:
+            assert laser.limits.max_power_w == pytest.approx(0.03)
+            assert laser.ask("ilk?" if kind is cobolt.CoboltLaser else "SYST:LOCK?") in ("0", "ON", "OK")
+            assert laser.ask("nonsense?")  # a refusal is an answer
+        with pytest.raises(WrongState):
+            laser.ask("?")
+        del laser
+        gc.collect()
+        assert "forgotten" not in caplog.text
+    for wrong in ({"max_power_w": -1.0}, {"max_power_w": 0.01, "colour": "red"}):
+        with pytest.raises(LimitExceeded) as refused:
+            kind.open("emulated:laser", surroundings=surroundings, **wrong)
+        assert "\n" not in str(refused.value)
+
+
+def test_an_spb1_spad_is_opened_by_itself_and_grabs(monkeypatch: pytest.MonkeyPatch) -> None:
+    clock = VirtualClock()
+    bus = EmulatedUsb(clock)
+    bus.plug(model())
+    monkeypatch.setattr("drivers.transports.usb_device._libusb", lambda: bus)
+    surroundings = Surroundings(clock, None, 0)
+    with spb_usb.SpbUsb.open(reads="plain", heartbeat_s=10.0, surroundings=surroundings) as spad:
+        got = spad.grab(20, frame_rate_hz=10_000)
+        assert got.frames.shape == (20, spad.info.height, spad.info.width)
+        assert not len(got.lost)
+    with pytest.raises(LimitExceeded, match="heartbeat"):
+        spb_usb.SpbUsb.open(heartbeat_s=100.0, surroundings=surroundings)
