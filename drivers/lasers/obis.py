@@ -186,7 +186,7 @@ class ObisLaser(SerialLaser):
         self._warm_up_s = warm_up_s
         self._told_on = False
         self._autostart_found: str | None = None
-        """What autostart was before `arm` switched it off. None: it was not touched."""
+        """Autostart as it was before `arm` switched it off. None: it was not touched."""
 
     @classmethod
     def open(

@@ -68,7 +68,7 @@ class PrawnDoLine:
         self.clock = port.clock
         """The clock of its deadlines."""
         self.advice = "check its cable"
-        """What to do if it does not answer."""
+        """Advice in the error if it does not answer."""
         self._timing = timing
         self.lock = threading.RLock()
         """Hold it around commands that belong together."""

@@ -314,7 +314,7 @@ class CoboltModel:
         return MOST_MA * self.power_w / self.max_power_w
 
     def _operating_mode(self) -> str:
-        """What `gom?` says. 06-DPL has a number for the warm-up, and others for what comes after it."""
+        """The answer to `gom?`. 06-DPL has a number for the warm-up, and others for what comes after it."""
         diode = self.family == "06-MLD"
         if self.fault:
             return "5"

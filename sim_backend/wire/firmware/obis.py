@@ -15,7 +15,7 @@ from typing import Literal
 Series = Literal["LX", "LS"]
 """LX has a laser diode, LS an optically pumped semiconductor."""
 Words = Literal["plain", "marked", "ready"]
-"""How a unit's status and fault words look without a fault: see `ObisModel`."""
+"""Form of a unit's status and fault words without a fault: see `ObisModel`."""
 
 OFF_BITS = 0xC800_0000
 """Bits that are set in every sample status in docs/reference/hardware.md."""
@@ -30,7 +30,7 @@ _ALWAYS: dict[Words, tuple[int, int]] = {
 }
 """Bits that are always set in the status word and in the fault word of a unit."""
 TYPES: dict[Series, str] = {"LX": "DDL", "LS": "OPSL"}
-"""What `SYST:INF:TYP?` says."""
+"""Answers to `SYST:INF:TYP?`."""
 _MODES: dict[Series, tuple[str, ...]] = {
     "LX": ("CWP", "CWC", "DIGITAL", "ANALOG", "MIXED", "DIGSO", "MIXSO"),
     "LS": ("CWP", "DIGITAL", "ANALOG", "MIXED"),

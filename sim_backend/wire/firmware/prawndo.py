@@ -94,7 +94,7 @@ class PrawnDoModel:
         self._run: _Run | None = None
         self._line = bytearray()
         self._reading: Literal["commands", "add", "edt", "nothing"] = "commands"
-        """What the next line is taken for; nothing: the bootloader runs."""
+        """Meaning of the next line; nothing: the bootloader runs."""
         self._typed = [0, 0]
         self._missing = 0  # bytes that `adm` still waits for
         self._binary = bytearray()
@@ -542,7 +542,7 @@ def _said(*lines: str) -> bytes:
 
 
 def _arguments(line: str) -> str:
-    """What follows the first word of a line."""
+    """The rest of a line after its first word."""
     return line.lstrip(_SPACE).lstrip("".join(set(line) - set(_SPACE)))
 
 
@@ -573,7 +573,7 @@ def _cycles(stored: int) -> int:
 
 
 def _wrong(outputs: int, cycles: int) -> str:
-    """What the firmware says against a word; nothing if it takes the word."""
+    """The firmware's objection to a word; empty if it takes the word."""
     if outputs > _OUTPUTS:
         return f"Invalid output specification {outputs:x}"
     if 0 < cycles < MIN_CYCLES:

@@ -7,7 +7,7 @@ Public sources tell what clients send and how they read the answers, so the word
 
 from collections.abc import Callable
 from dataclasses import dataclass
-from typing import Final
+from typing import Any, Final
 
 import numpy as np
 from numpy.typing import NDArray
@@ -41,34 +41,38 @@ _FRAMES_AT_ONCE = 8
 """Frames made at a time."""
 
 
-class Spad512sModel:
-    """The program and its device. calibration_s: duration of the calibration that the first `D` starts; 0: none.
+@dataclass(frozen=True, slots=True)
+class Spad512sProgram:
+    """The ways in which programs and units differ. calibration_s: duration of the calibration that the first `D`
+    starts; 0: none.
 
     glued_done: whether text answers end with DONE, as in one emulation; the real program's behaviour is unknown.
     extra_fields: whether `R` answers eight fields instead of six. flavour: 512, or 1M for 1024 rows. columns: pixels of
     a row as the sensor delivers it; None: as many as there are rows. labels: whether the lines of `D` tell what they
     mean. fields: numbers of fields with which `I` is taken; newer clients of the vendor send nine. heeds_stop: whether
-    STOP ends a run. wants_pile_up: whether each run needs PU,0 before it. rotation: the turn that makes its pixels
-    upright. paced: whether pixels come no earlier than the sensor exposes them.
+    STOP ends a run. wants_pile_up: whether each run needs PU,0 before it.
+    """
+
+    calibration_s: float = 0.0
+    glued_done: bool = False
+    extra_fields: bool = False
+    flavour: str = "512"
+    intensity: bool = True
+    columns: int | None = None
+    labels: bool = True
+    fields: tuple[int, ...] = (_EIGHT_FIELDS, _EIGHT_FIELDS + 1)
+    banner: str = BANNER
+    heeds_stop: bool = True
+    wants_pile_up: bool = False
+
+
+class Spad512sModel:
+    """The program and its device. rotation: the turn that makes pixels upright. paced: whether pixels come no earlier
+    than the sensor exposes them. of_program: fields of `Spad512sProgram`.
     """
 
     def __init__(
-        self,
-        frames: FrameSource,
-        *,
-        calibration_s: float = 0.0,
-        glued_done: bool = False,
-        extra_fields: bool = False,
-        flavour: str = "512",
-        intensity: bool = True,
-        columns: int | None = None,
-        labels: bool = True,
-        fields: tuple[int, ...] = (_EIGHT_FIELDS, _EIGHT_FIELDS + 1),
-        banner: str = BANNER,
-        heeds_stop: bool = True,
-        wants_pile_up: bool = False,
-        rotation: QuarterTurn = 90,
-        paced: bool = False,
+        self, frames: FrameSource, *, rotation: QuarterTurn = 90, paced: bool = False, **of_program: Any
     ) -> None:
         self.commands: list[str] = []
         """Commands as they came, for tests to look at."""
@@ -76,17 +80,12 @@ class Spad512sModel:
         """Test knob: number of bytes of pixels after which the next run ends with `fail_text`."""
         self.fail_text = b"\nAuto-protect: too much light. Acquisition ERROR"
         self._frames = frames
-        self._calibration_s = calibration_s
-        self._done = "\nDONE" if glued_done else ""
-        self._extra = ",1,0" if extra_fields else ""
-        self._heeds_stop = heeds_stop
-        lines = (f"{label}: {value}" if labels else value for label, value in _INFO)
-        self._info = "".join(f"{line}\n" for line in lines).format(flavour=flavour, intensity=int(intensity))
-        self._rows = 1024 if "1M" in flavour else 512
-        self._columns = columns or self._rows
-        self._fields = fields
-        self._banner = banner
-        self._wants_pile_up = wants_pile_up
+        self._program = program = Spad512sProgram(**of_program)
+        lines = (f"{label}: {value}" if program.labels else value for label, value in _INFO)
+        text = "".join(f"{line}\n" for line in lines)
+        self._info = text.format(flavour=program.flavour, intensity=int(program.intensity))
+        self._rows = 1024 if "1M" in program.flavour else 512
+        self._columns = program.columns or self._rows
         self._excess_bias_v = 4.0
         self._rotation: QuarterTurn = rotation
         self._paced = paced
@@ -98,7 +97,7 @@ class Spad512sModel:
 
     def connected(self, now_s: float) -> None:
         """Greet the client."""
-        self._out = bytearray(self._banner.encode())
+        self._out = bytearray(self._program.banner.encode())
         self._run = None
 
     def disconnected(self, now_s: float) -> None:
@@ -108,7 +107,7 @@ class Spad512sModel:
 
     def restarted(self) -> None:
         """End the program and start it again."""
-        self._calibrated = self._calibration_s == 0
+        self._calibrated = self._program.calibration_s == 0
 
     def receive(self, data: bytes, now_s: float) -> None:
         """Take one command. Without framing, two commands that arrive together are not understood, as with the real
@@ -119,7 +118,7 @@ class Spad512sModel:
         if self._calibrating_until is not None:
             self._say("ERROR")  # whatever is sent during the calibration breaks the protocol
         elif self._run is not None:
-            if command == "STOP" and self._heeds_stop:
+            if command == "STOP" and self._program.heeds_stop:
                 self._run.aborted = True
         else:
             self._obey(command, now_s)
@@ -143,7 +142,8 @@ class Spad512sModel:
         elif name == "V":
             self._bias(arguments)
         elif name == "R" and not arguments:
-            self._say(f"41.5,42.0,38.5,-9.5,40000000.0,97656.25{self._extra}")
+            extra = ",1,0" if self._program.extra_fields else ""
+            self._say(f"41.5,42.0,38.5,-9.5,40000000.0,97656.25{extra}")
         elif name == "PU" and arguments in (["0"], ["1"]):
             self._pile_up_sent = arguments == ["0"]
             self._say("Pile-up correction set")
@@ -156,7 +156,7 @@ class Spad512sModel:
         if self._calibrated:
             self._say(self._info)
             return
-        self._calibrating_until = now_s + self._calibration_s
+        self._calibrating_until = now_s + self._program.calibration_s
         self._out += (CALIBRATION_SOON + CALIBRATION_BEGUN).encode()
 
     def _bias(self, arguments: list[str]) -> None:
@@ -174,7 +174,7 @@ class Spad512sModel:
     def _acquire(self, arguments: list[str], now_s: float) -> None:
         """Begin the run of I,bits,tInt,n,trigger,overlap,sparse,stream[,width], or say what is wrong with it."""
         try:
-            if 1 + len(arguments) not in self._fields:
+            if 1 + len(arguments) not in self._program.fields:
                 raise ValueError
             t_int = float(arguments.pop(1))
             bits, n, _, overlap, sparse, stream, *width = (int(word) for word in arguments)
@@ -184,7 +184,7 @@ class Spad512sModel:
         if (bits, sparse, stream) != (1, 0, 1) or width not in ([], [self._columns]) or n < 1 or t_int < 1:
             self._say("Mode not emulated ERROR")
             return
-        if self._wants_pile_up and not self._pile_up_sent:
+        if self._program.wants_pile_up and not self._pile_up_sent:
             self._say("Pile-up correction not set ERROR")
             return
         self._pile_up_sent = False  # it holds for one acquisition
@@ -214,7 +214,8 @@ class Spad512sModel:
         self._out += data
 
     def _say(self, text: str) -> None:
-        self._out += (text + self._done).encode()
+        done = "\nDONE" if self._program.glued_done else ""
+        self._out += (text + done).encode()
 
 
 _BACK: Final[dict[QuarterTurn, QuarterTurn]] = {0: 0, 90: 270, 180: 180, 270: 90}
