@@ -2,6 +2,7 @@
 
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field
+from fractions import Fraction
 from importlib.metadata import EntryPoint, entry_points
 from typing import Any, ClassVar, TypeVar
 
@@ -12,6 +13,7 @@ from drivers.errors import LimitExceeded, UnknownKind
 from drivers.interfaces import World
 from drivers.transports.endpoints import Endpoint
 from drivers.transports.tap import Tap
+from drivers.units import format_quantity
 
 SLOTS = ("spad", "scanner", "laser", "sync", "world")
 """The parts of a rig. The kinds of slot `spad` are the entry points of group `spadrig.spad`, and so on."""
@@ -75,6 +77,14 @@ def config_of(kind: type[Config], **fields: object) -> Config:
         wrong = error.errors()[0]
         where = ".".join(str(part) for part in wrong["loc"])
         raise LimitExceeded(f"{where or kind.__name__}: {wrong['msg']}; correct this argument") from None
+
+
+def quantity(name: str, value: float | Fraction, dimension: str) -> str:
+    """The text with a unit of an argument in SI units. Raises `LimitExceeded` if it is no finite number."""
+    try:
+        return format_quantity(value, dimension)
+    except (TypeError, ValueError):
+        raise LimitExceeded(f"{name} is {value!r}; give a number in SI units") from None
 
 
 def alone() -> Surroundings:

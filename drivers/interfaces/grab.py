@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 from numpy.typing import NDArray
 
-from drivers.frames import FRAME_RECORD, packed_row_bytes
+from drivers.frames import FRAME_RECORD, frame_bytes, packed_row_bytes
 from drivers.ring import BlockRing
 
 if TYPE_CHECKING:
@@ -55,13 +55,18 @@ class Grabbed:
 
 def take(spad: "SpadArray", timing: "SpadTiming", n_frames: int, timeout_s: float) -> Grabbed:
     """Run a configured SPAD once and copy its frames. Raises what `fill` raises; the SPAD is stopped then."""
-    slots = min(max(_RING_BYTES // timing.stride, _FEWEST_SLOTS), _MOST_SLOTS)
-    ring, blocks = BlockRing(slots, timing.stride), []
+    frames = max(timing.stride // frame_bytes(spad.info.width, spad.info.height), 1)
+    slots = min(max(_RING_BYTES // timing.stride, _FEWEST_SLOTS), _MOST_SLOTS, -(-n_frames // frames) + _FEWEST_SLOTS)
+    ring, blocks, failed = BlockRing(slots, timing.stride), [], []
     reader = ring.reader("grab")
 
     def copy() -> None:
-        for block in reader:
-            blocks.append((block.frame_numbers, block.bits.copy(), block.records.copy()))
+        try:
+            for block in reader:
+                blocks.append((block.frame_numbers, block.bits.copy(), block.records.copy()))
+        except BaseException as error:  # raised again on the caller's thread
+            failed.append(error)
+            reader.close()
 
     copying = threading.Thread(target=copy, name="grab", daemon=True)
     spad.start(n_frames)
@@ -73,6 +78,8 @@ def take(spad: "SpadArray", timing: "SpadTiming", n_frames: int, timeout_s: floa
         spad.stop()
         ring.finish()
         copying.join()
+    if failed:
+        raise failed[0]
     info, parts = spad.info, list(zip(*blocks, strict=True))
     if not parts:
         nothing = np.zeros((0, info.height, packed_row_bytes(info.width)), np.uint8)

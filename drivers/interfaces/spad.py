@@ -312,21 +312,27 @@ class SpadArray(Device):
     ) -> Grabbed:
         """Take `n_frames` whole frames and return them in memory, with the numbers of those that were lost.
 
-        frame_rate_hz: None for the highest. exposure_s: None for the whole frame period. mode: None for a stream where
-        the sensor and its link can, else a burst. timeout_s: longest wait for frames. Raises `LimitExceeded` for what
-        the device cannot do, `DeviceTimeout` if no frames come.
+        frame_rate_hz: None for the highest with this exposure. exposure_s: None for the longest in a frame. mode: None
+        for a stream where the sensor and its link can, else a burst. timeout_s: longest wait for frames. Raises
+        `LimitExceeded` for what the device cannot do, `DeviceTimeout` if no frames come.
         """
         info = self.info
         rate = info.max_frame_rate_hz if frame_rate_hz is None else Fraction(frame_rate_hz)
+        if frame_rate_hz is None and exposure_s is not None and exposure_s > 0:
+            rate = min(rate, 1 / Fraction(exposure_s).limit_denominator(10**9))
         if mode is None:
             fits = info.stream is not None and float(rate) * frame_bytes(info.width, info.height) <= (
                 info.stream.bytes_per_s
             )
             mode = "stream" if fits or info.burst is None else "burst"
         block_frames = max(1, min(n_frames, _GRAB_BLOCK_BYTES // frame_bytes(info.width, info.height)))
-        period_s = float(1 / rate) if rate > 0 else 0.0
-        request = SpadRequest(rate, period_s if exposure_s is None else exposure_s, mode, block_frames)
+        longest_s = self._longest_exposure_s(1 / rate) if rate > 0 else 0.0
+        request = SpadRequest(rate, longest_s if exposure_s is None else exposure_s, mode, block_frames)
         return take(self, self.configure(request), n_frames, timeout_s)
+
+    def _longest_exposure_s(self, period_s: Fraction) -> float:
+        """Longest exposure of a frame of this period."""
+        return float(period_s)
 
     def _check(self, request: SpadRequest) -> None:
         info = self.info

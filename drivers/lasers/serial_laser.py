@@ -6,15 +6,23 @@ recorded lasers use it.
 """
 
 import logging
+import os
 import re
 import weakref
 from collections.abc import Callable
-from contextlib import suppress
 from typing import Annotated, TypeVar
 
 from pydantic import Field
 
-from drivers.errors import DeviceError, DeviceNotFound, DeviceTimeout, ProtocolError, WrongState
+from drivers.errors import (
+    DeviceError,
+    DeviceNotFound,
+    DeviceTimeout,
+    InterlockOpen,
+    LimitExceeded,
+    ProtocolError,
+    WrongState,
+)
 from drivers.interfaces import LaserLimits, LaserStatus, LineLaser
 from drivers.interfaces.device import OPEN_STATES
 from drivers.registry import KindConfig, Surroundings
@@ -48,13 +56,23 @@ class _Light:
     may_shine = False
 
 
-def _forgotten(name: str, port: SerialPort, off: bytes, light: _Light, gap_s: float) -> None:
-    """End the light of a laser that was deleted, or that the program ended with, without being closed."""
-    if light.may_shine and not port.lost:
-        _log.warning("%s: was forgotten while it was armed; switched off", name)
-        port.clock.sleep(1.2 * gap_s)  # after its last reply, the laser would not listen yet
-        with suppress(DeviceError):
-            port.write(off)
+_OFF_TIMES = 3
+"""Number of times that the bytes that switch off are sent: nobody reads whether they were understood."""
+
+
+def _forgotten(name: str, port: SerialPort, off: bytes, light: _Light, gap_s: float, process: int) -> None:
+    """End the light of a laser that may shine and is not watched any more. process: number of the laser's process; in
+    another one, which was forked from it, nothing is done."""
+    if os.getpid() != process:
+        return
+    if light.may_shine:
+        try:
+            for _ in range(_OFF_TIMES):
+                port.clock.sleep(1.2 * gap_s)  # after its last reply, the laser does not listen yet
+                port.write(off)
+            _log.warning("%s: was left armed; it was told to switch off", name)
+        except DeviceError as error:
+            _log.error("%s: was left armed and may shine, turn its key off (%s)", name, error)
     port.close()
 
 
@@ -75,27 +93,37 @@ class SerialLaser(LineLaser):
     def arm(self, power_w: float) -> None:
         """See `LineLaser`. Raises `WrongState` if a pause or disarm from another thread ended it."""
         self._stopped = False
-        self._light.may_shine = True
-        super().arm(power_w)
+        before, self._light.may_shine = self._light.may_shine, True
+        try:
+            super().arm(power_w)
+        except (LimitExceeded, InterlockOpen, WrongState):
+            self._light.may_shine = before or self._stopped
+            raise
 
     def pause(self) -> None:
         """See `LineLaser`. Ends an `arm` that is under way on another thread."""
         self._stopped = True
         super().pause()
-        self._light.may_shine = False
+        self._note_dark()
 
     def disarm(self) -> None:
         """See `LineLaser`. Ends an `arm` that is under way on another thread."""
         self._stopped = True
         super().disarm()
-        self._light.may_shine = False
+        self._note_dark()
+
+    def _note_dark(self) -> None:
+        if self._stopped:  # else another thread has begun to arm
+            self._light.may_shine = False
 
     def ask(self, command: str) -> str:
         """Send a raw command and return the laser's reply, also if it is a refusal.
 
-        Nothing is checked: such a command can make light. Raises `DeviceError` if no reply comes.
+        Nothing is checked: such a command can make light. It is sent up to three times if no reply comes; then
+        `DeviceError` is raised.
         """
         self._require("ask", *OPEN_STATES)
+        self._light.may_shine = True
         return self._line.ask(command, _ANY)
 
     def _require_no_stop(self) -> None:
@@ -114,13 +142,15 @@ class SerialLaser(LineLaser):
         return self._line.port.lost
 
     def watch_for_end(self, off: bytes, gap_s: float) -> None:
-        """Have the light ended if the laser is deleted, or the program ends, before `close`. off: bytes that switch it
-        off in any state. gap_s: time after a reply for which it does not listen."""
-        self._forgotten = weakref.finalize(self, _forgotten, self.name, self._line.port, off, self._light, gap_s)
+        """Have the light ended if the laser is deleted, or the program ends, before `close`, or if `close` could not
+        pause it. off: bytes that switch it off in any state. gap_s: time after a reply for which it does not listen."""
+        self._forgotten = weakref.finalize(
+            self, _forgotten, self.name, self._line.port, off, self._light, gap_s, os.getpid()
+        )
 
     def _do_close(self) -> None:
         if self._forgotten is not None:
-            self._forgotten.detach()
+            self._forgotten()
         self._line.port.close()
 
 

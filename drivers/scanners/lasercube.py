@@ -37,7 +37,7 @@ from pydantic import Field
 from drivers.clock import Clock, SystemClock, now_s
 from drivers.errors import DeviceFault, DeviceTimeout, ProtocolError
 from drivers.interfaces import LEVEL_BACKWARD, MARKER_LINE, MARKER_SCAN
-from drivers.registry import Kind, Surroundings, config_of
+from drivers.registry import Kind, Surroundings, config_of, quantity
 from drivers.scanners.dac_scanner import (
     CENTRE,
     DRIFT,
@@ -52,7 +52,7 @@ from drivers.scanners.galvo import LOWEST_RATE_HZ, GalvoConfig
 from drivers.transports.endpoints import Endpoint, resolve
 from drivers.transports.tap import Tap
 from drivers.transports.usb_device import UsbDevice, UsbId
-from drivers.units import Hertz, Seconds, format_quantity
+from drivers.units import Hertz, Seconds
 
 LASERCUBE = UsbId("LaserCube", 0x1FC9, 0x04D8, ("LaserCube", "LaserDock"))
 ALTERNATES = {0: 0, 1: 1}
@@ -358,10 +358,10 @@ class LaserCube(DacScanner):
         config = config_of(
             LaserCubeConfig,
             port=port,
-            max_velocity=format_quantity(max_velocity_per_s, "rate"),
-            max_acceleration=format_quantity(max_acceleration_per_s2, "acceleration"),
-            max_point_rate=format_quantity(max_point_rate_hz, "frequency"),
-            buffer=format_quantity(buffer_s, "time"),
+            max_velocity=quantity("max_velocity_per_s", max_velocity_per_s, "rate"),
+            max_acceleration=quantity("max_acceleration_per_s2", max_acceleration_per_s2, "acceleration"),
+            max_point_rate=quantity("max_point_rate_hz", max_point_rate_hz, "frequency"),
+            buffer=quantity("buffer_s", buffer_s, "time"),
             **settings,
         )
         return _opened(config, Endpoint(port, usb_backend), clock or SystemClock())

@@ -16,6 +16,7 @@ Facts and their sources: docs/reference/hardware.md. `spad512s_line` talks to th
 - `STOP` is known only from other people's code. If a run does not end soon after it, the connection is closed.
 """
 
+import math
 import threading
 import time
 import zlib
@@ -30,14 +31,14 @@ from pydantic import Field
 from drivers.errors import DeviceFault, DeviceNotFound, DeviceTimeout, LimitExceeded, ProtocolError
 from drivers.frames import BlockFlag, BlockHeader, FrameBlock
 from drivers.interfaces import BurstMode, SpadArray, SpadCounters, SpadHealth, SpadInfo, SpadRequest, SpadTiming
-from drivers.registry import Kind, KindConfig, Surroundings, alone, config_of
+from drivers.registry import Kind, KindConfig, Surroundings, alone, config_of, quantity
 from drivers.ring import BlockRing
 from drivers.spads.orientation import QuarterTurn, turn_packed, turned_size
 from drivers.spads.spad512s_line import DONE, ERROR, Deadlines, Spad512sLine
 from drivers.spb1 import BlockLayout, block_views, seal_block
 from drivers.transports.endpoints import Endpoint, resolve
 from drivers.transports.tap import Tap
-from drivers.units import BytesPerSecond, ExactHertz, format_quantity
+from drivers.units import BytesPerSecond, ExactHertz
 
 GUARD_BYTES = 512
 """Bytes that must follow a block before it is used, so that no part of an error text is taken for pixels. The
@@ -241,6 +242,9 @@ class Spad512s(SpadArray):
             can_wait=True,  # a run lies in the device's memory and is handed over as fast as it is taken
         )
 
+    def _longest_exposure_s(self, period_s: Fraction) -> float:
+        return math.floor(period_s * 1_000_000) / 1e6
+
     @classmethod
     def open(
         cls, port: str = "127.0.0.1:9999", *, max_frame_rate_hz: float | Fraction | None = None,
@@ -253,7 +257,7 @@ class Spad512s(SpadArray):
         is not possible, other `DeviceError` if the device cannot be reached.
         """
         if max_frame_rate_hz is not None:
-            settings["max_frame_rate"] = format_quantity(max_frame_rate_hz, "frequency")
+            settings["max_frame_rate"] = quantity("max_frame_rate_hz", max_frame_rate_hz, "frequency")
         return create(config_of(Spad512sConfig, port=port, **settings), surroundings or alone())
 
     @property

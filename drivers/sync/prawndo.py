@@ -22,11 +22,11 @@ from pydantic import Field, model_validator
 from drivers.errors import DeviceError, DeviceFault, LimitExceeded, ProtocolError, WrongState
 from drivers.interfaces import OUT_FRAME, OUT_GATE, OUT_MARKER, Pulse, SyncSource, SyncStatus, sliced
 from drivers.interfaces.device import OPEN_STATES
-from drivers.registry import Kind, KindConfig, Surroundings, alone, config_of
+from drivers.registry import Kind, KindConfig, Surroundings, alone, config_of, quantity
 from drivers.sync.prawndo_line import IDLE, USUAL_TIMING, PrawnDoLine, PrawnDoTiming
 from drivers.transports.endpoints import resolve
 from drivers.transports.serial_port import SerialPort
-from drivers.units import Hertz, Seconds, format_quantity
+from drivers.units import Hertz, Seconds
 
 _log = logging.getLogger(__name__)
 
@@ -215,7 +215,7 @@ class PrawnDo(SyncSource):
         clock on GPIO20, None for the board's own. surroundings: of an emulator. Raises `LimitExceeded` for a setting
         that is not possible, other `DeviceError` if the board cannot be opened.
         """
-        clock = None if external_clock_hz is None else format_quantity(external_clock_hz, "frequency")
+        clock = None if external_clock_hz is None else quantity("external_clock_hz", external_clock_hz, "frequency")
         config = config_of(PrawnDoConfig, port=port, external_clock=clock, **settings)
         return cls(config, surroundings or alone())
 

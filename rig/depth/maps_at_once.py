@@ -3,8 +3,8 @@ the sweeps.
 
 A map made on one thread takes less time of all processors together than one that several threads share, since parts of
 it cannot be shared. So in a stream each thread makes a map of its own. The results are the same: an estimator says
-whether the model of the next map is certain before the maps that are under way have been learned from
-(`Reconstructor.may_begin`). A map that nothing would run beside is shared by all threads.
+whether the next map's model is already fixed, although earlier maps are unfinished (`Reconstructor.may_begin`). If no
+other map can be made at the same time, all threads share it.
 """
 
 from collections import deque
@@ -40,7 +40,7 @@ class _UnderWay(Generic[AnyCounted]):
 
 class MapsAtOnce(Generic[AnyCounted]):
     """Makes maps with `maker`. All methods are called by one thread; `deliver` is called on it, with each sweep and its
-    map. A map's `compute_s` is what `time` charges it.
+    map. The `compute_s` of maps that are made at the same time is what `time` charges them.
     """
 
     def __init__(
@@ -51,13 +51,15 @@ class MapsAtOnce(Generic[AnyCounted]):
         self._free = maker.lanes() if isinstance(maker, Reconstructor) else []
         self._pool = ThreadPoolExecutor(len(self._free), "map") if self._free else None
         self._maps: deque[_UnderWay[AnyCounted]] = deque()
-        self._alone = False
+        self.alone = False
+        """Whether a map is being made that all threads share. May be read from any thread."""
+        self._failed = False
         self.time = time or SharedTime()
 
     @property
     def under_way(self) -> bool:
         """Whether a map is being made, or waits to be delivered. May be called from any thread."""
-        return self._alone or bool(self._maps)
+        return self.alone or bool(self._maps)
 
     def put(self, sweep: AnyCounted, *, last: bool) -> None:
         """Begin the map of a sweep, after those before it if it needs what is learned from them, or if all threads are
@@ -70,28 +72,31 @@ class MapsAtOnce(Generic[AnyCounted]):
         if pool is not None and isinstance(maker, Reconstructor):
             while self._maps and not (self._free and maker.may_begin(self._frames())):
                 self._deliver_next()
-            if (self._maps or not last) and maker.may_begin(self._frames()):
+            # If no map may run beside this one, all threads share it.
+            if self._maps or (not last and maker.may_begin(int(sweep.tally.n_frames.sum()))):
                 lane = self._free.pop()
                 work = maker.begin(sweep.tally, lane)
                 self._maps.append(_UnderWay(sweep, work, lane, pool.submit(self._charged, work.run)))
                 return
-        self._alone = True
+        self.alone = True
         try:
             result = maker.map(sweep.tally)
         finally:
-            self._alone = False
+            self.alone = False
         self._deliver(sweep, result)
 
-    def deliver_ready(self) -> None:
-        """Deliver the maps that are ready."""
+    def deliver_ready(self) -> bool:
+        """Deliver the maps that are ready; returns whether others are under way."""
         while self._maps and self._maps[0].result.done():
             self._deliver_next()
+        return bool(self._maps)
 
     def deliver_next(self) -> bool:
-        """Wait for the next map and deliver it; False if none is under way."""
-        if self._maps:
+        """Wait for the next map and deliver it; returns whether others are under way afterwards. After a map that
+        failed, none is delivered any more."""
+        if self._maps and not self._failed:
             self._deliver_next()
-        return bool(self._maps)
+        return bool(self._maps) and not self._failed
 
     def _charged(self, make: Callable[[], MapResult]) -> MapResult:
         with self.time.charge() as spent:
@@ -106,6 +111,9 @@ class MapsAtOnce(Generic[AnyCounted]):
         try:
             result = first.result.result()
             first.work.end()
+        except BaseException:
+            self._failed = True
+            raise
         finally:
             self._maps.popleft()
             self._free.append(first.lane)

@@ -147,12 +147,13 @@ class CountingThread:
         self.wait_s = 0.0
         """Time spent waiting for the caller to take maps."""
         self.error: BaseException | None = None
+        self._counted = False
         self._maps = MapsAtOnce(request.maker, self._deliver, request.assembler.time)
 
     @property
     def estimating(self) -> bool:
-        """Whether the map of a counted sweep is being made just now."""
-        return self._maps.under_way
+        """Whether maps are being made while nothing is counted."""
+        return self._maps.alone or (self._counted and self._maps.under_way)
 
     def _run(self) -> None:
         try:
@@ -165,6 +166,7 @@ class CountingThread:
                         self._asked.assembler.settle(0)
         except BaseException as error:  # raised again on the caller's thread
             self.error = error
+        self._counted = True
         try:
             while not self._queue.closed and self._maps.deliver_next():
                 pass
@@ -174,8 +176,7 @@ class CountingThread:
 
     def _count(self) -> None:
         assembler = self._asked.assembler
-        for block in blocks(self._reader, self._source, self._asked.silence_s):
-            self._maps.deliver_ready()
+        for block in blocks(self._reader, self._source, self._asked.silence_s, self._maps.deliver_ready):
             sweeps = assembler.add(block)
             while (sweep := self._next(sweeps)) is not None:
                 if assembler.complete:

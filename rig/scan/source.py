@@ -10,6 +10,8 @@ from drivers.interfaces import SpadArray
 from drivers.ring import BlockRing, RingReader
 from rig.threads import StageThread
 
+LOOK_S = 0.02
+"""Time from one look at what goes on meanwhile to the next."""
 HANG_S = 180.0
 """Longest wait, in seconds, for a SPAD whose `fill` neither returns nor raises DeviceTimeout."""
 
@@ -92,21 +94,28 @@ class Source:
             self._busy_s += time.perf_counter() - begun
 
 
-def blocks(reader: RingReader, source: Source, silence_s: float) -> Iterator[FrameBlock]:
+def blocks(
+    reader: RingReader, source: Source, silence_s: float, meanwhile: Callable[[], bool] = lambda: False
+) -> Iterator[FrameBlock]:
     """Yield the blocks of one start of the SPAD, then raise the source's error, if there is one.
 
     Raises DeviceTimeout if no block comes: the SPAD's error if the SPAD says that it has no frames, else the ring's
-    after HANG_S. silence_s: longest wait for a block before it is asked whether the SPAD has said so.
+    after HANG_S. silence_s: longest wait for a block before it is asked whether the SPAD has said so. meanwhile: called
+    before each wait, and every LOOK_S of it as long as it returns True.
     """
     while True:
         heard = len(source.silences)
-        waited_s = 0.0
+        waited_s = quiet_s = 0.0
         while True:
+            wait_s = min(LOOK_S, silence_s) if meanwhile() else silence_s
             try:
-                block = reader.next(silence_s)
+                block = reader.next(wait_s)
                 break
             except DeviceTimeout:
-                waited_s += silence_s
+                quiet_s += wait_s
+                if quiet_s < silence_s:
+                    continue
+                waited_s, quiet_s = waited_s + quiet_s, 0.0
                 # The first silence may be of a wait for room that ended just before `full` was read. Without silences
                 # the SPAD is at work: a simulated one compiles its kernels before the first block.
                 if len(source.silences) >= heard + 2:

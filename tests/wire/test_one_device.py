@@ -8,6 +8,7 @@ from contextlib import ExitStack
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
+from unittest.mock import Mock
 
 import numpy as np
 import pytest
@@ -104,8 +105,47 @@ def test_a_forgotten_laser_that_may_shine_is_switched_off_and_says_so(
             with server.lock:
                 made.tick(1e3)
             assert not made.emitting
-            assert ("was forgotten while it was armed" in caplog.text) == (not paused)
+            assert ("was left armed" in caplog.text) == (not paused)
             assert (made.commands == before) == paused
+
+
+@pytest.mark.parametrize(("kind", "make"), MAKES, ids=lambda each: getattr(each, "__name__", ""))
+def test_a_laser_whose_pause_fails_at_the_close_is_switched_off_all_the_same(
+    kind: Any, make: Callable[[], Any], monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture
+) -> None:
+    made = make()
+    with wire(made) as (server, surroundings):
+        laser = kind.open("emulated:laser", max_power_w=0.08, surroundings=surroundings)
+        bring_up(laser, surroundings.clock)
+        monkeypatch.setattr(laser, "_do_pause", Mock(side_effect=KeyboardInterrupt))
+        with pytest.raises(KeyboardInterrupt):
+            laser.close()
+        surroundings.clock.sleep(1.0)
+        with server.lock:
+            made.tick(1e3)
+        assert not made.emitting
+        assert "was left armed" in caplog.text
+
+
+def test_raw_commands_that_may_have_made_light_are_undone_and_a_lost_port_is_said(
+    caplog: pytest.LogCaptureFixture,
+) -> None:
+    made = CoboltModel(warm_up_s=0.0)
+    with wire(made) as (server, surroundings):
+        for lost in (False, True):
+            laser = cobolt.CoboltLaser.open("emulated:laser", max_power_w=0.08, surroundings=surroundings)
+            for command in ("sdmes 1", "em", "slmp 20", "@cob1"):
+                laser.ask(command)
+            surroundings.clock.sleep(1.0)
+            caplog.clear()
+            if lost:
+                server.unplug()
+            del laser
+            gc.collect()
+            said = "may shine, turn its key off" if lost else "was told to switch off"
+            assert said in caplog.text
+            made.turn_key(False, 0.0)
+            made.turn_key(True, 0.0)
 
 
 @pytest.mark.parametrize(("kind", "make"), MAKES, ids=lambda each: getattr(each, "__name__", ""))
@@ -122,8 +162,9 @@ def test_a_laser_is_opened_and_asked_by_itself_and_closed_for_good(
             laser.ask("?")
         del laser
         gc.collect()
-        assert "forgotten" not in caplog.text
-    for wrong in ({"max_power_w": -1.0}, {"max_power_w": 0.01, "colour": "red"}):
+        assert "left armed" not in caplog.text
+    strange = ({"max_power_w": "50 mW"}, {"max_power_w": float("nan")})
+    for wrong in ({"max_power_w": -1.0}, {"max_power_w": 0.01, "colour": "red"}, *strange):
         with pytest.raises(LimitExceeded) as refused:
             kind.open("emulated:laser", surroundings=surroundings, **wrong)
         assert "\n" not in str(refused.value)

@@ -108,7 +108,8 @@ class Joint:
 
     def most_at_once(self, geometry: SweepGeometry) -> int:
         """Number of maps at the same time for which there is memory; 1 with a temporal prior."""
-        return 1 if self._prior.on else MOST_BYTES // bytes_of(grid_of(geometry))
+        # The estimator itself keeps memory for one map more.
+        return 1 if self._prior.on else MOST_BYTES // bytes_of(grid_of(geometry)) - 1
 
     def solver(self) -> MapSolver:
         """Memory and a thread for one of several maps at the same time."""

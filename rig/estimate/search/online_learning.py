@@ -115,7 +115,7 @@ class OnlineLearner(Generic[Tables]):
         return self.model if self.model is not None else first()
 
     def certain(self, frames: int) -> bool:
-        """Whether there is a model, and stays while maps with so many lit frames, all together, are attended to."""
+        """Whether there is a model that cannot change until so many lit frames have been attended to."""
         if self.model is None or frames == 0 or not self._learns:
             return self.model is not None
         # A lesson could begin with the first of these maps.
@@ -125,7 +125,7 @@ class OnlineLearner(Generic[Tables]):
     def tables(self, setting: LearningSetting, workers: RowWorkers) -> Tables:
         """Tables for a setting, made again only when the setting changes."""
         if self._made is None or not self._made[0].same(setting):
-            self._made = None  # frees the old tables before new ones are made
+            self._made = None  # frees the old tables before new ones are made, unless a map under way uses them
             self._made = setting, self._make(setting, workers)
         return self._made[1]
 
