@@ -98,6 +98,13 @@ class MapsAtOnce(Generic[AnyCounted]):
             self._deliver_next()
         return bool(self._maps) and not self._failed
 
+    def close(self) -> None:
+        """Let go of everything that maps are made with; none can be made afterwards."""
+        if self._pool is not None:
+            self._pool.shutdown(wait=False)
+        self._free.clear()
+        del self._maker, self._deliver
+
     def _charged(self, make: Callable[[], MapResult]) -> MapResult:
         with self.time.charge() as spent:
             result = make()

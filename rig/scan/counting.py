@@ -172,6 +172,9 @@ class CountingThread:
                 pass
         except BaseException as error:
             self.error = self.error or error
+        # This thread and the pipeline refer to each other: their memory, hundreds of megabytes, must not wait for that.
+        self._maps.close()
+        del self._asked
         self._queue.end()
 
     def _count(self) -> None:
