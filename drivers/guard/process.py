@@ -343,9 +343,8 @@ def main(arguments: list[str]) -> int:
 FREE_S = 1.0
 """Time for the kernel to free the ports of a process that ended."""
 _RETRY_S = 0.005
-OFF_TIMES, OFF_GAP_S = 2, 0.11
-"""Number of times that `Kind.off` is sent, and the seconds between them: a Cobolt ignores a command within 0.1 s of
-another (docs/reference/hardware.md), and the guard may just have sent one."""
+OFF_TIMES = 2
+"""Number of times that `Kind.off` is sent: the laser may ignore the first, since the guard may just have asked it."""
 
 
 class Rescue:
@@ -390,9 +389,7 @@ class Rescue:
         """Switch the emission off before anything is asked: opening a slow laser takes more than a second."""
         open_port, off = self._off[slot]
         with closing(_once_free(open_port)) as port:
-            for _ in range(OFF_TIMES):
-                port.write(off)
-                time.sleep(OFF_GAP_S)
+            port.write_again(off, OFF_TIMES)
 
 
 def _open_port(slot: str, config: Any, ports: Mapping[str, Endpoint]) -> SerialPort:

@@ -336,7 +336,7 @@ class CoboltLaser(SerialLaser):
         blanked = to_blank and self._knows_pause and self._blank()
         try:
             self._set_power(0.0)
-        except DeviceError:
+        except BaseException:  # an interrupt too
             if to_blank and not (blanked or self._blank()):
                 self._cut_current()  # then the light ends at least
             raise
@@ -461,13 +461,10 @@ def _identify(config: CoboltConfig, line: Dialogue) -> CoboltLaser:
 def _language(config: CoboltConfig, line: Dialogue, model: str) -> Dialect:
     """The language in which the laser answers the question for its mode."""
     for dialect in DIALECTS:
-        try:
-            line.ask(
-                dialect.mode, dialect.mode_form
-            )  # a refusal has not the form of an answer, even with a flipped bit
-        except CommandRefused:
-            continue
-        return dialect
+        # A refusal has not the form of an answer, even with a flipped bit.
+        with suppress(CommandRefused):
+            line.ask(dialect.mode, dialect.mode_form)
+            return dialect
     raise DeviceFault(f"cobolt laser {model} on {config.port} knows neither of the 06-01 languages; use an 06-01 laser")
 
 

@@ -57,19 +57,17 @@ class _Light:
 
 
 _OFF_TIMES = 3
-"""Number of times that the bytes that switch off are sent: nobody reads whether they were understood."""
+"""Number of times that the bytes that switch off are sent: the first may come too soon after a reply to be heard."""
 
 
-def _forgotten(name: str, port: SerialPort, off: bytes, light: _Light, gap_s: float, process: int) -> None:
+def _forgotten(name: str, port: SerialPort, off: bytes, light: _Light, process: int) -> None:
     """End the light of a laser that may shine and is not watched any more. process: number of the laser's process; in
     another one, which was forked from it, nothing is done."""
     if os.getpid() != process:
         return
     if light.may_shine:
         try:
-            for _ in range(_OFF_TIMES):
-                port.clock.sleep(1.2 * gap_s)  # after its last reply, the laser does not listen yet
-                port.write(off)
+            port.write_again(off, _OFF_TIMES)
             _log.warning("%s: was left armed; it was told to switch off", name)
         except DeviceError as error:
             _log.error("%s: was left armed and may shine, turn its key off (%s)", name, error)
@@ -141,12 +139,10 @@ class SerialLaser(LineLaser):
         """Whether the port is gone, found out without sending anything. May be called from any thread."""
         return self._line.port.lost
 
-    def watch_for_end(self, off: bytes, gap_s: float) -> None:
+    def watch_for_end(self, off: bytes) -> None:
         """Have the light ended if the laser is deleted, or the program ends, before `close`, or if `close` could not
-        pause it. off: bytes that switch it off in any state. gap_s: time after a reply for which it does not listen."""
-        self._forgotten = weakref.finalize(
-            self, _forgotten, self.name, self._line.port, off, self._light, gap_s, os.getpid()
-        )
+        pause it. off: bytes that switch it off in any state."""
+        self._forgotten = weakref.finalize(self, _forgotten, self.name, self._line.port, off, self._light, os.getpid())
 
     def _do_close(self) -> None:
         if self._forgotten is not None:
@@ -181,7 +177,7 @@ def open_laser(
                 f"{make} laser: nothing on port {config.port} answers as one; check 'port', power and cable"
             ) from None
         laser = identify(line)
-        laser.watch_for_end(off, timing.gap_s)
+        laser.watch_for_end(off)
         return laser
     except BaseException:
         port.close()

@@ -40,6 +40,9 @@ _WRITE_S = 1.0
 """Time for a write: a device that takes nothing for this long hangs. 1 s is 11 520 characters at 115 200 baud."""
 BAUD = 115_200
 """Rate of a port whose device asks for no other."""
+AGAIN_S = 0.11
+"""Time between the same bytes sent again: a Cobolt ignores a command within 0.1 s of its last answer
+(docs/reference/hardware.md)."""
 _MAX_LINE_BYTES = 65_536
 """Longer than any reply to a command: beyond it the line is noise without an end."""
 
@@ -92,6 +95,14 @@ class SerialPort:
             if port.vid is not None and port.pid is not None and os.path.realpath(port.device) == here:
                 return int(port.vid), int(port.pid)
         return None
+
+    def write_again(self, data: bytes, times: int) -> None:
+        """Send `data` so many times, AGAIN_S after one another, to a device whose answers nobody reads. Errors as in
+        `write`.
+        """
+        for _ in range(times):
+            self.write(data)
+            self.clock.sleep(AGAIN_S)
 
     def write(self, data: bytes) -> None:
         """Send all of `data`. Raises `DeviceTimeout` if the device takes none for a second, or `DeviceDisconnected`."""

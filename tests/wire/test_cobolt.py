@@ -412,11 +412,14 @@ def test_a_laser_that_ends_no_pause_before_it_is_on_can_be_armed_again_later() -
         assert model.power_w == pytest.approx(0.05)
 
 
-def test_an_arm_that_fails_blanks_the_light_even_if_the_power_does_not_obey() -> None:
-    class Stubborn(CoboltModel):
-        def _set(self, name: str, value: str) -> bool:
-            return name == "slmp" or super()._set(name, value)
+class Stubborn(CoboltModel):
+    """A laser that says yes to another power and keeps its own."""
 
+    def _set(self, name: str, value: str) -> bool:
+        return name == "slmp" or super()._set(name, value)
+
+
+def test_an_arm_that_fails_blanks_the_light_even_if_the_power_does_not_obey() -> None:
     model = Stubborn()
     model.shine(0.06)
     with wire(model) as (_, surroundings), open_cobolt(surroundings) as laser:
@@ -479,10 +482,6 @@ def test_a_laser_found_emitting_at_constant_current_is_switched_off(family: Fami
 
 
 def test_a_laser_that_keeps_its_power_is_switched_off_by_a_pause() -> None:
-    class Stubborn(CoboltModel):
-        def _set(self, name: str, value: str) -> bool:
-            return name == "slmp" or super()._set(name, value)
-
     model = Stubborn()
     model.shine(0.06)
     with wire(model) as (_, surroundings), open_cobolt(surroundings) as laser:

@@ -11,7 +11,7 @@ from pydantic import ValidationError
 
 from drivers.clock import now_s
 from drivers.errors import DeviceBusy, DeviceDisconnected, DeviceNotFound, DeviceTimeout, LimitExceeded
-from drivers.guard.process import OFF_GAP_S, OFF_TIMES
+from drivers.guard.process import OFF_TIMES
 from drivers.interfaces import LineLaser
 from drivers.lasers import cobolt as cobolt_framing
 from drivers.lasers import obis as obis_framing
@@ -20,6 +20,7 @@ from drivers.lasers.obis import ObisConfig
 from drivers.lasers.serial_laser import SerialLaserConfig
 from drivers.registry import kinds, lookup
 from drivers.transports.dialogue import FairLock
+from drivers.transports.serial_port import AGAIN_S
 from rig.config.files import load_config
 from rig.devices.open import open_rig
 from rig.errors import DevicesError
@@ -82,7 +83,7 @@ def test_the_bytes_that_switch_a_laser_off_darken_it_while_it_emits(name: str) -
         assert kind.off is not None
         for _ in range(OFF_TIMES):  # as the guard sends them: a laser may be busy with the last command
             model.receive(kind.off(make.config.model_validate(USUAL)), now_s(surroundings.clock))
-            surroundings.clock.sleep(OFF_GAP_S)
+            surroundings.clock.sleep(AGAIN_S)
         assert not model.emitting
 
 

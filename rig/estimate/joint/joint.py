@@ -119,14 +119,14 @@ class Joint:
         """Whether the model of the next map is certain while maps with so many lit frames are under way."""
         return self._lessons.certain(frames)
 
-    def begin(self, sweep: CountVolume, geometry: SweepGeometry, solver: MapSolver | None = None) -> "MapWork":
-        """Begin the map of a sweep, see `ManyMaps`. solver: None for the estimator's own."""
+    def begin(self, sweep: CountVolume, geometry: SweepGeometry, solver: MapSolver) -> "MapWork":
+        """Begin the map of a sweep, see `ManyMaps`."""
         model = self._lessons.model_for(lambda: self._first_model(sweep, geometry))
         setting = LearningSetting(model, geometry, sweep.exposures, sweep.dark_counts is not None)
         tables = self._lessons.tables(setting, self._workers)
         self._prior.begin(geometry, tables.grid)
         self.used = model if self._prior.before is None else replace(model, before=self._prior.before)
-        return MapWork(sweep, setting, tables, solver or self._solver, self.used)
+        return MapWork(sweep, setting, tables, solver, self.used)
 
     def end(self, work: "MapWork") -> None:
         """Take note of a map that `run` has made: afterwards `model` is the state for the next sweep."""
