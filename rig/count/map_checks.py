@@ -11,9 +11,10 @@ Point and partners each have a line of counts: those of the row in the column.
 - Columns: the stripe moves from column to column as the planes predict; so does all other light of the sweep, mainly
   haze.
 - Answers of estimators that learn the light: an answer with confidence 0.9, for one place of some 150, needs evidence
-  of seven nats. At most 7 x 7 lines of counts contribute to it. So each contributes at least 1/7 nat on
+  of seven nats. Hardly more than 7 x 7 lines of counts contribute to it. So each contributes some 1/7 nat on
   average, which is light half a standard deviation above the background. So there must be that much more light at the
-  answers than behind them, on lines of counts that did not give the answers.
+  answers than behind them, on lines of counts that did not give the answers; or, in dense fog, where more lines
+  contribute, at least 0.4 of the light that the estimator says it has found.
 
 Limits are in standard deviations estimated from the points themselves. With too few points, a check says nothing.
 """
@@ -72,6 +73,8 @@ GROUPS: Final = 16
 """Most groups of sure answers, by distance. Wrong answers mostly form a false surface, so they are in one group."""
 LEAST_CONTRAST: Final = 0.5
 """Least mean light at sure answers above that behind them, in standard deviations: see the module."""
+LEAST_SHARE: Final = 0.4
+"""Share of the signal of dim answers that must be there. Right ones in dense fog at K = 3 have 0.43 to 0.92 of it."""
 LINE_PX, BEHIND_PX = (-1, 1), (3, 9)
 """First and last pixel of an answer's light and of the light behind it, counted from the answer towards far depths."""
 
@@ -278,7 +281,9 @@ class MapChecks:
         for group in np.array_split(order[asked[order] > 0], groups):
             if len(group) >= FEWEST_POINTS // 2:
                 found = _deviations(contrast[group]) / np.sqrt(len(group))
-                if found + 1.0 / np.sqrt(len(group)) < LEAST_CONTRAST:
+                light = (LINE_PX[1] - LINE_PX[0] + 1) * contrast[group].sum()
+                claimed = float((asked[group] * stripe.signal[y[group], c[group]]).sum())
+                if found + 1.0 / np.sqrt(len(group)) < LEAST_CONTRAST and light < LEAST_SHARE * claimed:
                     middle = group[len(group) // 2]
                     row, px = y[middle], min(max(x[middle], 0), geometry.width - 1)
                     ray = geometry.u[row, px], geometry.v[row, px], 1.0

@@ -108,9 +108,8 @@ def test_sure_answers_need_light() -> None:
     volume, truth = sweep.volume, sweep.point.truth()
     checks = MapChecks(sweep.geometry, calibrated=True, knows=True)
     nothing = np.zeros_like(truth)
-    right = StripeTable(
-        truth, np.where(np.isfinite(truth), np.float32(0.95), np.float32(0.0)), nothing, nothing, nothing
-    )
+    sure, light = np.where(np.isfinite(truth), np.float32(0.95), np.float32(0.0)), np.full_like(truth, 0.5)
+    right = StripeTable(truth, sure, nothing, light, nothing)
     assert checks.doubts(volume, volume.intensity(), right) == ()
     # A surface that is not there, in the haze before some of the stripes.
     beside = replace(right, x_px=np.where(np.arange(COLUMNS) % 4 == 0, truth - 25, truth).astype(np.float32))
@@ -119,6 +118,9 @@ def test_sure_answers_need_light() -> None:
     pole = replace(right, x_px=np.where(np.arange(COLUMNS) % 10 == 0, truth - 60, truth).astype(np.float32))
     (reason,) = checks.doubts(volume, volume.intensity(), pole)
     assert reason.startswith("answers without light"), "a tenth of the answers is wrong"
+    # Little light, but all that was said to be there: in dense fog many lines of counts share in an answer.
+    dim = replace(beside, signal=np.full_like(truth, 0.02))
+    assert checks.doubts(volume, volume.intensity(), dim) == ()
     # An estimator that says it is not sure has claimed nothing.
     unsure = replace(beside, confidence=np.full_like(truth, 0.5))
     assert checks.doubts(volume, volume.intensity(), unsure) == ()
