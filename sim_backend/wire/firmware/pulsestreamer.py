@@ -237,6 +237,7 @@ class PulseStreamerModel:
 
     def changes(self, from_s: float, until_s: float) -> list[tuple[float, int]]:
         """The level at `from_s`, then each change up to and including `until_s`: (time, outputs)."""
+        until_s = min(until_s, self._now_s)
         first, last = self._span(from_s), self._span(until_s)
         found = [(from_s, self._spans[first].level(from_s))]
         for index in range(first, last + 1):
