@@ -155,15 +155,29 @@ def test_what_stops_a_sequence_forgets_it(call: str, at_s: float) -> None:
 
 
 def test_the_final_state_is_forced_on_a_sequence_that_waits_but_not_on_constant_outputs() -> None:
-    model = PulseStreamerModel(final_keeps_sequence=True)
+    model = PulseStreamerModel()
     model.call("constant", [[0, 1, 0, 0]], 0.0)
     model.call("forceFinal", [], 0.0)
     assert (model.outputs_at(0.0), states(model, 0.0)) == (1, (0, 0, 0))
     streaming(model, start=SOFTWARE, at_s=1.0)
     model.call("forceFinal", [], 2.0)
-    assert (model.outputs_at(2.0), states(model, 2.0)) == (4, (0, 1, 1))
-    model.call("startNow", [], 3.0)
-    assert starts(model, 4.0) == [3.0], "firmware that keeps the sequence starts it again"
+    assert (model.outputs_at(2.0), states(model, 2.0)) == (4, (0, 0, 1))
+
+
+@pytest.mark.parametrize("call", ["constant", "forceFinal"])
+@pytest.mark.parametrize(("stops_s", "n_runs"), [(0.5, 1), (1.0 + 2e-6, 1), (1.5, 1), (1.5, -1)])
+def test_firmware_that_keeps_the_sequence_starts_it_again_with_the_next_edge(
+    call: str, stops_s: float, n_runs: int
+) -> None:
+    wire = Wire(1.0, 1.1, 2.0, 2.1)
+    model = PulseStreamerModel(wire.high, low=wire.low, keeps_sequence=True)
+    streaming(model, start=RISING, n_runs=n_runs)
+    model.call(call, [], stops_s)
+    assert model.outputs_at(stops_s) == (0 if call == "constant" else 4)
+    model.advance(2.0 + 0.5e-6)
+    assert model.outputs_at(2.0 + 0.5e-6) == 2
+    model.call("reset", [], 2.0 + 1e-6)
+    assert states(model, 3.0) == (0, 0, 0)
 
 
 # Triggers

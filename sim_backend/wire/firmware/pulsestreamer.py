@@ -2,20 +2,19 @@
 
 Facts: docs/reference/hardware-pulsestreamer-model.md. Its traps are modelled too. The trigger is an edge: a line that
 is high when the device is armed starts nothing until it has been low. A trigger while a sequence plays is lost. A run
-is padded to a multiple of 8 ns. Outputs lag an edge by 61 to 69 ns. `constant` forgets the sequence, so that no trigger
-starts it again. With manual rearm there is one sequence per `rearm`. Since firmware 1.1, the `pulsestreamer` package
-uploads sequences over a TCP port of their own. Before, they are base64 text of big-endian numbers, which package 2.1
-packs in the wrong order.
+is padded to a multiple of 8 ns. Outputs lag an edge by 61 to 69 ns. With manual rearm there is one sequence per
+`rearm`. Since firmware 1.1, the `pulsestreamer` package uploads sequences over a TCP port of their own. Before, they
+are base64 text of big-endian numbers, which package 2.1 packs in the wrong order.
 
 Public sources do not say the following, and the model chose. A new sequence that waits for its trigger finds the
 outputs as they are, be it in the middle of the old one. Padding repeats the last level. After its last run the device
-is ready for a trigger `rearm_s` later. `forceFinal` drops the sequence, unless `final_keeps_sequence`. `startNow`
-starts nothing in a hardware mode or while a sequence plays, and is answered with 0 all the same. `rearm` answers 0
-where there is nothing to rearm. Steps of 0 ns (breakpoints too) are left out, and a sequence of nothing else lasts
-8 ns. 0 runs are refused. A binary upload that is refused gets the code 1. `setTrigger` acts at once, but never starts a
-sequence. What software starts begins at once. Not modelled: analog outputs, underflow, the square wave of 125 MHz,
-calibration, the network's settings, and the double buffer of firmware 2 (`start`, `upload`). Calls of these are
-unknown to the model.
+is ready for a trigger `rearm_s` later. `constant` and `forceFinal` drop the sequence, unless `keeps_sequence`; the
+package takes it for dropped. `startNow` starts nothing in a hardware mode or while a sequence plays, and is answered
+with 0 all the same. `rearm` answers 0 where there is nothing to rearm. Steps of 0 ns (breakpoints too) are left out,
+and a sequence of nothing else lasts 8 ns. 0 runs are refused. A binary upload that is refused gets the code 1.
+`setTrigger` acts at once, but never starts a sequence. What software starts begins at once. Not modelled: analog
+outputs, underflow, the square wave of 125 MHz, calibration, the network's settings, and the double buffer of
+firmware 2 (`start`, `upload`). Calls of these are unknown to the model.
 """
 
 import base64
@@ -126,6 +125,7 @@ class PulseStreamerModel:
     trigger: the first time in [from, until) at which the trigger line is high, or None; if it is None: always low.
     low: the same for low. Without it the line is looked at every `SAMPLE_S`, so that gaps shorter than that can be
     missed. version: that of the firmware. rearm_s: time from the end of a sequence until a trigger counts again.
+    keeps_sequence: whether a trigger starts the sequence again even after `constant` or `forceFinal`.
     """
 
     def __init__(
@@ -136,12 +136,12 @@ class PulseStreamerModel:
         version: str = "1.7.0",
         serial: str = "00:26:32:F0:3B:1B",
         rearm_s: float = 10e-6,
-        final_keeps_sequence: bool = False,
+        keeps_sequence: bool = False,
     ) -> None:
         self._high: Line = trigger or (lambda from_s, until_s: None)
         self._low: Line = low or self._sampled_low
         self.version, self.serial = version, serial
-        self._rearm_s, self._final_keeps_sequence = rearm_s, final_keeps_sequence
+        self._rearm_s, self._keeps_sequence = rearm_s, keeps_sequence
         self.http_port, self.http_path = RPC_PORT, RPC_PATH
         self.raw_port = UPLOAD_PORT if tuple(map(int, version.split(".")[:2])) >= _BINARY_SINCE else None
         """TCP port of binary uploads; None: the firmware has none."""
@@ -333,9 +333,11 @@ class PulseStreamerModel:
 
     def _constant(self, state: Any = (0, 0, 0, 0)) -> int:
         level = _level(state)
-        self.program, self._ends_s, self.armed, self._finished = None, None, False, False
+        if self._ends_s is not None:
+            self._finish(self._now_s)
+        self._finished = False
         self._put(level, self._now_s)
-        return 0
+        return self._drop()
 
     def _stream(self, sequence: Any, n_runs: Any = -1, final: Any = (0, 0, 0, 0)) -> int:
         try:
@@ -367,7 +369,11 @@ class PulseStreamerModel:
         if self.program is not None and not self._finished:
             self.armed = False
             self._finish(self._now_s)
-        if not self._final_keeps_sequence:
+        return self._drop()
+
+    def _drop(self) -> int:
+        """Forget the sequence, if such calls do that."""
+        if not self._keeps_sequence:
             self.program, self.armed = None, False
         return 0
 
