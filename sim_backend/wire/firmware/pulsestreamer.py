@@ -96,7 +96,7 @@ class Program:
 
 @dataclass(frozen=True, slots=True)
 class _Span:
-    """What the outputs do from a time on: hold a level, or play a program without end."""
+    """One thing that the outputs do from a time on: hold a level, or play a program without end."""
 
     from_s: float
     does: Program | int
