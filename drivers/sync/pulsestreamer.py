@@ -1,31 +1,29 @@
 """Pulse Streamer 8/2 of Swabian Instruments: eight outputs, 1 ns steps, a trigger input, JSON-RPC over the network.
 
 Facts: docs/reference/hardware.md. Outputs: unless the config says otherwise, channel 0 triggers the SPAD, channel 1 is
-the laser's gate, channel 2 marks records. The vendor's package `pulsestreamer` is not used: it takes no port, waits 10 s
-for an answer, prints, looks for boxes by broadcast, goes through the environment's web proxies, and sends steps without
-port 21328 in another byte order than its versions 1. What is needed is the documented interface, with the standard
-library (`pulsestreamer_rpc`).
+the laser's gate, channel 2 marks records. The vendor's package `pulsestreamer` is not used: it takes no port, waits
+10 s for an answer, prints, and obeys the environment's web proxies; and its versions 1 and 2.1 send steps in different
+byte orders by JSON-RPC. `pulsestreamer_rpc` speaks the documented interface with the standard library.
 
 **Waits.** The box cannot wait within a sequence. It waits for a rising edge of its trigger input before one, plays it,
 and ignores edges meanwhile. So a program may wait for the scan marker where it begins, and again only where it repeats:
 what follows each wait must be the same. Other programs, such as blanking patterns, are refused.
 
 **Repeats.** After a sequence the box arms itself again, for ever. A program of one sweep is played without that, so the
-box itself ends it. For more sweeps a thread counts them by asking whether the box plays, and takes the outputs low after
-the last one. It counts none too many, so no sweep stays dark. It may count too few if the computer or the network is
-late by a sweep; then the gate opens until markers cease, `abort` is called or the count is full. A scanner sends one
-marker more than there are sweeps. If the box does not answer, `port_lost` tells the guard, which ends the laser's light.
+box itself ends it. For more sweeps a thread counts them by asking whether the box plays, and takes the outputs low
+after the last one. It counts none too many, so no sweep stays dark. It may count too few if computer or network are
+late; then the gate goes on opening at each scan marker until the count is full, the markers cease or `abort` is called.
+If the box does not answer, `port_lost` tells the guard, which ends the laser's light.
 
 **Held pulses** (`Pulse.held`). Once triggered, the box does not look at the scan marker again, so a mirror that stops
 would be lit until the sequence ends. Therefore a held pulse must end within `HOLD_S` of the marker's edge, unless the
 config says `hold: external`: a logic chip (AND) between box and laser lets the gate through only while the scan marker
-is high. The driver cannot check this chip; see docs/how-to/devices.md for how to wire and try it.
+is high. The driver cannot see this chip; docs/how-to/devices.md says how to wire and try it.
 
-**Outputs cannot be read back.** `constant` sets them and ends a sequence. They are reported as 0 when the box has
-confirmed `constant` with all low, has no hardware trigger armed, and says that it plays nothing; and as None otherwise.
+**Outputs cannot be read back.** They are reported as 0 when the box has confirmed `constant` with all low, has no
+hardware trigger armed, and says that it plays nothing; and as None otherwise.
 """
 
-import base64
 import logging
 import threading
 import time
@@ -35,7 +33,6 @@ from dataclasses import dataclass, field
 from typing import Annotated, Any, Final, Literal, Self
 
 import numpy as np
-from numpy.typing import NDArray
 from pydantic import Field, model_validator
 
 from drivers.errors import (
@@ -44,37 +41,32 @@ from drivers.errors import (
     DeviceFault,
     DeviceNotFound,
     DeviceTimeout,
-    LimitExceeded,
     ProtocolError,
     WrongState,
 )
 from drivers.interfaces import Pulse, SyncSource, SyncStatus
 from drivers.interfaces.device import OPEN_STATES
-from drivers.interfaces.sync import HOLD_S
 from drivers.registry import Kind, KindConfig, Surroundings, alone, config_of
 from drivers.sync.prawndo import OutputPins
-from drivers.sync.pulsestreamer_rpc import CALL_S, JsonRpc
+from drivers.sync.pulsestreamer_rpc import JsonRpc
+from drivers.sync.pulsestreamer_sequence import (
+    IDLE_POLL_S,
+    RESOLUTION_S,
+    STEP,
+    GateSequence,
+    SweepCount,
+    compile_sequence,
+)
 from drivers.transports.endpoints import resolve
 
 _log = logging.getLogger(__name__)
 
-RESOLUTION_S = 1e-9
-"""Unit of durations, and the sampling period of the digital outputs."""
-MIN_TICKS = 3
-"""Shortest step in ns: the shortest pulse of older boxes; newer ones can do 2 ns."""
-MAX_TICKS = 2**32 - 1
-"""Longest step in ns. Longer words become several steps."""
-MAX_STEPS = 100_000
-"""Most steps of a sequence. The box holds 2 000 000; these are uploaded within the deadline of a call."""
-STEP = np.dtype([("ticks", ">u4"), ("levels", "u1"), ("analog", ">i2", 2)])
-"""Nine bytes, as `stream` takes them in base64."""
 OLDEST_FIRMWARE = (1, 2, 0)
-"""Oldest firmware whose client has all methods that are used here."""
+"""Oldest firmware that is accepted: its client has all methods that are used here."""
 LOW: Final = (0, 0, 0, 0)
 """State with all outputs low: no duration, channels, two analog outputs."""
-
-IMMEDIATE, SOFTWARE, RISING = 0, 1, 2
-"""Values of `setTrigger`: a sequence starts when it is uploaded, by `startNow`, or at the trigger input's edge."""
+SOFTWARE, RISING = 1, 2
+"""Starts of a sequence (`setTrigger`): by `startNow`, or at a rising edge of the trigger input."""
 AUTO, MANUAL = 0, 1
 """Whether the trigger is armed again after a sequence, or not."""
 CLOCKS = {"internal": 0, "external-125MHz": 1, "external-10MHz": 2}
@@ -83,11 +75,6 @@ _PROBE_TICKS = 0xF8
 """Duration of the dark test sequence: 248 ns, or 4.2 s if read in the other byte order."""
 _PROBE_S = 1.0
 _PROBE_PAUSE_S = 0.01
-POLL_S = 0.003
-"""Pause between two questions whether the box plays, when a sweep may begin or end."""
-IDLE_POLL_S = 0.05
-"""The same when nothing is due."""
-_CLOCK_TOLERANCE = 1e-3
 
 
 @dataclass(frozen=True, slots=True)
@@ -227,8 +214,7 @@ class PulseStreamer(SyncSource):
         start = RISING if sequence.waits else SOFTWARE
 
         def step(method: str, *params: Any) -> Any:
-            if self._aborts != aborts:
-                raise WrongState(f"{self.name}: run was interrupted by abort or gate_low; run it again")
+            self._require_no_abort(aborts)
             return self._rpc.call(method, *params)
 
         with self._lock:
@@ -243,9 +229,12 @@ class PulseStreamer(SyncSource):
             if not sequence.waits:
                 step("startNow")
             self._run = run = _Run(sequence.waits, count)
-            if self._aborts != aborts:
-                raise WrongState(f"{self.name}: run was interrupted by abort or gate_low; run it again")
+            self._require_no_abort(aborts)
         threading.Thread(target=self._watch, args=(run,), name="Pulse Streamer", daemon=True).start()
+
+    def _require_no_abort(self, aborts: int) -> None:
+        if self._aborts != aborts:
+            raise WrongState(f"{self.name}: run was interrupted by abort or gate_low; run it again")
 
     def _do_gate_low(self) -> None:
         self._lower()
@@ -266,9 +255,9 @@ class PulseStreamer(SyncSource):
         if self._run is not None:
             self._run.over.set()
 
-    def _lower(self) -> None:
-        """Take all outputs low at once, whatever other threads do, and disarm the trigger. A `run` under way gives
-        up."""
+    def _lower(self, ended: Literal["stopped", "aborted"] = "aborted") -> None:
+        """Take all outputs low at once, whatever other threads do, and disarm the trigger. A `run` under way gives up.
+        ended: state of the program, if there is one."""
         self._aborts += 1
         try:
             self._rpc.call("constant", LOW)
@@ -277,10 +266,12 @@ class PulseStreamer(SyncSource):
         with self._lock:
             if self._run is not None:
                 self._run.over.set()
-                self._run, self._ended = None, "aborted"
+                self._run, self._ended = None, ended
             self._safe = False
             self._rpc.call("setTrigger", SOFTWARE, MANUAL)
-            self._rpc.call("constant", LOW)  # again: until now a trigger may have started what was armed
+            # Again: until now a trigger may have started what was armed. A question of an interrupted `run` that the
+            # box takes up only after this cannot raise the gate: a sequence needs `startNow`, `startNow` a sequence.
+            self._rpc.call("constant", LOW)
             self._safe = True
 
     def _has_ended(self, run: _Run, asked_s: float, plays: bool) -> bool:
@@ -292,13 +283,12 @@ class PulseStreamer(SyncSource):
         if ended:
             with self._lock:
                 if self._run is run:
-                    self._lower()
-                    self._ended = "stopped"
+                    self._lower("stopped")
         return ended or run.over.is_set()
 
     def _watch(self, run: _Run) -> None:
         """Count the sweeps of a program and see to it that the box answers, until the program is over."""
-        while not run.over.wait(IDLE_POLL_S if run.count is None else run.count.pause_s()):
+        while not run.over.wait(IDLE_POLL_S if run.count is None else run.count.pause_s(time.monotonic())):
             try:
                 asked_s = time.monotonic()
                 self._has_ended(run, asked_s, self._flag("isStreaming"))

@@ -5,7 +5,6 @@ The box cannot wait within a sequence, nor look at the scan marker while it play
 
 import base64
 import threading
-import time
 from collections.abc import Sequence
 from dataclasses import dataclass, field
 from itertools import pairwise
@@ -68,8 +67,8 @@ def compile_sequence(
     waits = [index for index, pulse in enumerate(pulses) if pulse.duration_s is None]
     if waits and waits[0] != 0:
         raise LimitExceeded(
-            f"{name}: word {waits[0]} waits for the scan marker and word 0 does not; a Pulse Streamer waits only before "
-            "a sequence: let the program begin with the wait"
+            f"{name}: word {waits[0]} waits for the scan marker and word 0 does not; a Pulse Streamer waits only "
+            "before a sequence: let the program begin with the wait"
         )
     bounds = [*waits, len(pulses)] if waits else [-1, len(pulses)]
     sweeps = [_steps(name, pulses, first + 1, end, pins) for first, end in pairwise(bounds)]
@@ -109,9 +108,9 @@ def _require_short_holds(name: str, pulses: Sequence[Pulse]) -> None:
         since_marker_s = 0.0 if pulse.duration_s is None else since_marker_s + pulse.duration_s
         if pulse.held and since_marker_s > HOLD_S * (1 + 1e-9):
             raise LimitExceeded(
-                f"{name}: word {index} is held by the scan marker, but ends {since_marker_s:g} s after its edge, and "
-                f"this box looks at the marker only then (limit {HOLD_S:g} s): AND its gate with the marker in hardware "
-                "(docs/how-to/devices.md), then set hold: external"
+                f"{name}: word {index} is held by the scan marker but may outlast it by {since_marker_s:g} s (limit "
+                f"{HOLD_S:g} s), as this box looks only at the marker's edge: AND its gate with the scan marker in "
+                "hardware (docs/how-to/devices.md), then set hold: external"
             )
 
 
@@ -155,11 +154,11 @@ class SweepCount:
             self.heard_s, self.plays = answered_s, plays
             return self.done > self.sweeps or (self.done == self.sweeps and not plays)
 
-    def pause_s(self) -> float:
+    def pause_s(self, now_s: float) -> float:
         """Time until the next question: short when a sweep may begin or end."""
         with self._lock:
             if self.plays:
-                due_s = self._began_after_s + self.duration_s - time.monotonic()
+                due_s = self._began_after_s + self.duration_s - now_s
             else:
                 due_s = min((self.heard_s - self.idle_s) / 4, self.duration_s / 3)
             return max(POLL_S, min(due_s, IDLE_POLL_S))
