@@ -243,13 +243,14 @@ class PulseStreamer(SyncSource):
 
     def _do_status(self) -> SyncStatus:
         run = self._run
-        asked_s = time.monotonic()
-        plays = self._flag("isStreaming")
-        if run is not None and not self._has_ended(run, asked_s, plays):
-            return SyncStatus("running" if plays or not run.waits else "waiting", None)
         if run is not None:
+            asked_s = time.monotonic()
             plays = self._flag("isStreaming")
-        return SyncStatus(self._ended, 0 if self._safe and self._run is None and not plays else None)
+            if not self._has_ended(run, asked_s, plays):
+                return SyncStatus("running" if plays or not run.waits else "waiting", None)
+        with self._lock:  # another thread may just be taking the outputs low
+            low = not self._flag("isStreaming") and self._safe and self._run is None
+            return SyncStatus(self._ended if self._run is None else "running", 0 if low else None)
 
     def _do_close(self) -> None:
         if self._run is not None:

@@ -28,7 +28,7 @@ MAX_STEPS = 100_000
 """Most steps of a sequence. The box holds 2 000 000; so many are uploaded within the deadline of a call."""
 STEP = np.dtype([("ticks", ">u4"), ("levels", "u1"), ("analog", ">i2", 2)])
 """Nine bytes, as `stream` takes them in base64."""
-POLL_S = 0.003
+POLL_S = 0.001
 """Pause between two questions whether the box plays, when a sweep may begin or end."""
 IDLE_POLL_S = 0.05
 """The same when nothing is due."""

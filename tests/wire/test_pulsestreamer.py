@@ -203,7 +203,7 @@ def ends_at_s(count: SweepCount, box: Box, pause_s: Callable[[float], float]) ->
     raise AssertionError("never over")
 
 
-@pytest.mark.parametrize("pause_s", [0.3e-3, 2e-3, 5e-3, 50e-3])
+@pytest.mark.parametrize("pause_s", [1e-3, 2e-3, 5e-3, 50e-3])
 def test_sweeps_are_counted_whether_or_not_the_pause_between_them_is_seen(pause_s: float) -> None:
     begins_s = [0.1 + index * (0.01 + pause_s) for index in range(21)]
     count = SweepCount(20, 0.01, 0.0)
