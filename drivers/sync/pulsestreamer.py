@@ -193,7 +193,7 @@ class PulseStreamer(SyncSource):
         try:
             super().run()
         except WrongState:
-            raise  # nothing was sent, or another thread takes the outputs low
+            raise  # nothing was sent, or all is low again
         except BaseException:
             try:
                 self._lower()
@@ -217,19 +217,25 @@ class PulseStreamer(SyncSource):
             self._require_no_abort(aborts)
             return self._rpc.call(method, *params)
 
-        with self._lock:
-            self._safe = False
-            step("constant", (0, sequence.rest, 0, 0))
-            step("setTrigger", start, MANUAL if once else AUTO)
-            if (found := step("getTriggerStart")) != start:  # a sequence for the trigger IMMEDIATE would start at once
-                raise DeviceFault(f"{self.name}: its trigger is {found!r}, not {start}; power-cycle it")
-            count = None if once else SweepCount(sequence.sweeps, sequence.duration_s, time.monotonic())
-            runs, final = 1 if sequence.waits else sequence.sweeps, 0 if once else sequence.rest
-            step("stream", sequence.encoded(self._order), runs, (0, final, 0, 0))
-            if not sequence.waits:
-                step("startNow")
-            self._run = run = _Run(sequence.waits, count)
-            self._require_no_abort(aborts)
+        try:
+            with self._lock:
+                self._safe = False
+                step("constant", (0, sequence.rest, 0, 0))
+                step("setTrigger", start, MANUAL if once else AUTO)
+                if (
+                    found := step("getTriggerStart")
+                ) != start:  # a sequence for the trigger IMMEDIATE would start at once
+                    raise DeviceFault(f"{self.name}: its trigger is {found!r}, not {start}; power-cycle it")
+                count = None if once else SweepCount(sequence.sweeps, sequence.duration_s, time.monotonic())
+                runs, final = 1 if sequence.waits else sequence.sweeps, 0 if once else sequence.rest
+                step("stream", sequence.encoded(self._order), runs, (0, final, 0, 0))
+                if not sequence.waits:
+                    step("startNow")
+                self._run = run = _Run(sequence.waits, count)
+                self._require_no_abort(aborts)
+        except WrongState:
+            self._lower()  # the thread that interrupted may have failed to
+            raise
         threading.Thread(target=self._watch, args=(run,), name="Pulse Streamer", daemon=True).start()
 
     def _require_no_abort(self, aborts: int) -> None:
