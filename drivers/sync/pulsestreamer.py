@@ -1,0 +1,363 @@
+"""Pulse Streamer 8/2 of Swabian Instruments: eight outputs, 1 ns steps, a trigger input, JSON-RPC over the network.
+
+Facts: docs/reference/hardware.md. Outputs: unless the config says otherwise, channel 0 triggers the SPAD, channel 1 is
+the laser's gate, channel 2 marks records. The vendor's package `pulsestreamer` is not used: it takes no port, waits
+10 s for an answer, prints, and obeys the environment's web proxies; and its versions 1 and 2.1 send steps in different
+byte orders by JSON-RPC. `pulsestreamer_rpc` speaks the documented interface with the standard library.
+
+**Waits.** The box cannot wait within a sequence. It waits for a rising edge of its trigger input before one, plays it,
+and ignores edges meanwhile. So a program may wait for the scan marker where it begins, and again only where it repeats:
+what follows each wait must be the same. Other programs, such as blanking patterns, are refused.
+
+**Repeats.** After a sequence the box arms itself again, for ever. A program of one sweep is played without that, so the
+box itself ends it. For more sweeps a thread counts them by asking whether the box plays, and takes the outputs low
+after the last one. It counts none too many, so no sweep stays dark. It may count too few if computer or network are
+late; then the gate goes on opening at each scan marker until the count is full, the markers cease or `abort` is called.
+If the box does not answer, `port_lost` tells the guard, which ends the laser's light.
+
+**Held pulses** (`Pulse.held`). Once triggered, the box does not look at the scan marker again, so a mirror that stops
+would be lit until the sequence ends. Therefore a held pulse must end within `HOLD_S` of the marker's edge, unless the
+config says `hold: external`: a logic chip (AND) between box and laser lets the gate through only while the scan marker
+is high. The driver cannot see this chip; docs/how-to/devices.md says how to wire and try it.
+
+**Outputs cannot be read back.** They are reported as 0 when the box has confirmed `constant` with all low, has no
+hardware trigger armed, and says that it plays nothing; and as None otherwise.
+"""
+
+import logging
+import threading
+import time
+from collections.abc import Sequence
+from contextlib import suppress
+from dataclasses import dataclass, field
+from typing import Annotated, Any, Final, Literal, Self
+
+import numpy as np
+from pydantic import Field, model_validator
+
+from drivers.errors import (
+    DeviceDisconnected,
+    DeviceError,
+    DeviceFault,
+    DeviceNotFound,
+    DeviceTimeout,
+    ProtocolError,
+    WrongState,
+)
+from drivers.interfaces import Pulse, SyncSource, SyncStatus
+from drivers.interfaces.device import OPEN_STATES
+from drivers.registry import Kind, KindConfig, Surroundings, alone, config_of
+from drivers.sync.prawndo import OutputPins
+from drivers.sync.pulsestreamer_rpc import JsonRpc
+from drivers.sync.pulsestreamer_sequence import (
+    IDLE_POLL_S,
+    RESOLUTION_S,
+    STEP,
+    GateSequence,
+    SweepCount,
+    compile_sequence,
+)
+from drivers.transports.endpoints import resolve
+
+_log = logging.getLogger(__name__)
+
+OLDEST_FIRMWARE = (1, 2, 0)
+"""Oldest firmware that is accepted: its client has all methods that are used here."""
+LOW: Final = (0, 0, 0, 0)
+"""State with all outputs low: no duration, channels, two analog outputs."""
+SOFTWARE, RISING = 1, 2
+"""Starts of a sequence (`setTrigger`): by `startNow`, or at a rising edge of the trigger input."""
+AUTO, MANUAL = 0, 1
+"""Whether the trigger is armed again after a sequence, or not."""
+CLOCKS = {"internal": 0, "external-125MHz": 1, "external-10MHz": 2}
+
+_PROBE_TICKS = 0xF8
+"""Duration of the dark test sequence: 248 ns, or 4.2 s if read in the other byte order."""
+_PROBE_S = 1.0
+_PROBE_PAUSE_S = 0.01
+
+
+@dataclass(frozen=True, slots=True)
+class _Run:
+    """A program that was started. count: None if the box itself ends it."""
+
+    waits: bool
+    count: SweepCount | None
+    over: threading.Event = field(default_factory=threading.Event)
+
+
+class PulseStreamerConfig(KindConfig):
+    """Config of a Pulse Streamer 8/2."""
+
+    kind: Literal["pulsestreamer"] = "pulsestreamer"
+    port: Annotated[
+        str, Field(description="address on the network: host or host:port", examples=["192.168.1.10"], min_length=1)
+    ]
+    clock: Annotated[
+        Literal["internal", "external-125MHz", "external-10MHz"],
+        Field(description="clock of the box: its own, or the one at its clock input"),
+    ] = "internal"
+    hold: Annotated[
+        Literal["none", "external"],
+        Field(description="external: a logic chip lets the gate through only while the scan marker is high"),
+    ] = "none"
+    frame_output: Annotated[int, Field(ge=0, le=7, description="output that triggers the SPAD: 0 to 7")] = 0
+    gate_output: Annotated[int, Field(ge=0, le=7, description="output that is the laser's gate")] = 1
+    marker_output: Annotated[int, Field(ge=0, le=7, description="output that marks the SPAD's records")] = 2
+
+    @model_validator(mode="after")
+    def _check_outputs(self) -> Self:
+        used = (self.frame_output, self.gate_output, self.marker_output)
+        for output in used:
+            if used.count(output) > 1:
+                raise ValueError(
+                    f"output {output} has two uses; give frame_output, gate_output and marker_output one each"
+                )
+        return self
+
+    @property
+    def pins(self) -> OutputPins:
+        """The channels that carry the outputs."""
+        return OutputPins(self.frame_output, self.gate_output, self.marker_output)
+
+
+class PulseStreamer(SyncSource):
+    """A Pulse Streamer 8/2. Opening it first takes all outputs low, whatever the box was doing, and resets it.
+
+    The box obeys everybody on its network: keep other programs away from it.
+    """
+
+    def __init__(self, config: PulseStreamerConfig, surroundings: Surroundings) -> None:
+        super().__init__("Pulse Streamer")
+        self._config = config
+        self._rpc = JsonRpc(self.name, resolve(config.port, surroundings.ports).address, surroundings.tap)
+        self._lock = threading.RLock()
+        self._sequence: GateSequence | None = None
+        self._run: _Run | None = None
+        self._safe = False
+        """Whether the box has confirmed that all is low and that no trigger can change it."""
+        self._aborts = 0
+        self._ended: Literal["stopped", "aborted"] = "stopped"
+        self._lost = False
+        try:
+            self._rpc.call("constant", LOW)
+        except (DeviceDisconnected, DeviceTimeout) as error:
+            raise DeviceNotFound(str(error)) from None
+        self._rpc.call("reset")  # ends what else a program may have left: a square wave, a trigger
+        self._lower()
+        self._firmware = self._check_firmware()
+        self._serial = str(self._rpc.call("getSerial"))
+        self._rpc.call("selectClock", CLOCKS[config.clock])
+        self._check_clock()
+        self._order = self._byte_order()
+
+    @classmethod
+    def open(cls, port: str, *, surroundings: Surroundings | None = None, **settings: Any) -> "PulseStreamer":
+        """Open a box by itself, without a config file.
+
+        port, settings (clock, hold, frame_output, gate_output, marker_output): as in `PulseStreamerConfig`.
+        surroundings: of an emulator. Raises `LimitExceeded` for a setting that is not possible, other `DeviceError` if
+        the box cannot be opened.
+        """
+        return cls(config_of(PulseStreamerConfig, port=port, **settings), surroundings or alone())
+
+    def ask(self, method: str, *params: Any) -> Any:
+        """Call a method of the box, such as `ask("getTemperature")`, and return its result. Nothing is checked: a
+        method such as `constant` can raise the gate. Raises `DeviceError` if no answer comes."""
+        self._require("ask", *OPEN_STATES)
+        return self._rpc.call(method, *params)
+
+    @property
+    def identity(self) -> str:
+        """Serial number, firmware and clock."""
+        return f"Pulse Streamer 8/2 {self._serial}, firmware {self._firmware}, clock {self._config.clock}"
+
+    @property
+    def serial(self) -> str:
+        """The serial number that the box states."""
+        return self._serial
+
+    @property
+    def resolution_s(self) -> float:
+        """1 ns. The trigger is sampled every 8 ns, so a sweep begins 61 to 69 ns after the scan marker."""
+        return RESOLUTION_S
+
+    @property
+    def port_lost(self) -> bool:
+        """Whether the box has not answered while a program ran. May be called from any thread."""
+        return self._lost
+
+    def run(self) -> None:
+        """Play the program from its first word. If that fails in any way, all outputs are low when the error leaves:
+        the box may have started although its answer did not arrive."""
+        try:
+            super().run()
+        except WrongState:
+            raise  # nothing was sent, or all is low again
+        except BaseException:
+            try:
+                self._lower()
+            except DeviceError as error:
+                _log.error("%s: outputs may be high, turn the laser off by its key: %s", self.name, error)
+            raise
+
+    def _do_program(self, pulses: Sequence[Pulse], repeats: int) -> None:
+        external = self._config.hold == "external"
+        sequence = compile_sequence(self.name, pulses, repeats, self._config.pins, external_hold=external)
+        self._check_clock()
+        self._sequence, self._ended = sequence, "stopped"
+
+    def _do_run(self) -> None:
+        sequence, aborts = self._sequence, self._aborts
+        assert sequence is not None
+        once = sequence.sweeps == 1 or not sequence.waits
+        start = RISING if sequence.waits else SOFTWARE
+
+        def step(method: str, *params: Any) -> Any:
+            self._require_no_abort(aborts)
+            return self._rpc.call(method, *params)
+
+        try:
+            with self._lock:
+                self._safe = False
+                step("constant", (0, sequence.rest, 0, 0))
+                step("setTrigger", start, MANUAL if once else AUTO)
+                if (
+                    found := step("getTriggerStart")
+                ) != start:  # a sequence for the trigger IMMEDIATE would start at once
+                    raise DeviceFault(f"{self.name}: its trigger is {found!r}, not {start}; power-cycle it")
+                count = None if once else SweepCount(sequence.sweeps, sequence.duration_s, time.monotonic())
+                runs, final = 1 if sequence.waits else sequence.sweeps, 0 if once else sequence.rest
+                step("stream", sequence.encoded(self._order), runs, (0, final, 0, 0))
+                if not sequence.waits:
+                    step("startNow")
+                self._run = run = _Run(sequence.waits, count)
+                self._require_no_abort(aborts)
+        except WrongState:
+            self._lower()  # the thread that interrupted may have failed to
+            raise
+        threading.Thread(target=self._watch, args=(run,), name="Pulse Streamer", daemon=True).start()
+
+    def _require_no_abort(self, aborts: int) -> None:
+        if self._aborts != aborts:
+            raise WrongState(f"{self.name}: run was interrupted by abort or gate_low; run it again")
+
+    def _do_gate_low(self) -> None:
+        self._lower()
+
+    _do_abort = _do_gate_low
+
+    def _do_status(self) -> SyncStatus:
+        run = self._run
+        if run is not None:
+            asked_s = time.monotonic()
+            plays = self._flag("isStreaming")
+            if not self._has_ended(run, asked_s, plays):
+                return SyncStatus("running" if plays or not run.waits else "waiting", None)
+        with self._lock:  # another thread may just be taking the outputs low
+            low = not self._flag("isStreaming") and self._safe and self._run is None
+            return SyncStatus(self._ended if self._run is None else "running", 0 if low else None)
+
+    def _do_close(self) -> None:
+        if self._run is not None:
+            self._run.over.set()
+
+    def _lower(self, ended: Literal["stopped", "aborted"] = "aborted") -> None:
+        """Take all outputs low at once, whatever other threads do, and disarm the trigger. A `run` under way gives up.
+        ended: state of the program, if there is one."""
+        self._aborts += 1
+        try:
+            self._rpc.call("constant", LOW)
+        except DeviceTimeout:
+            self._rpc.call("constant", LOW)
+        with self._lock:
+            if self._run is not None:
+                self._run.over.set()
+                self._run, self._ended = None, ended
+            self._safe = False
+            self._rpc.call("setTrigger", SOFTWARE, MANUAL)
+            # Again: until now a trigger may have started what was armed. A question of an interrupted `run` that the
+            # box takes up only after this cannot raise the gate: a sequence needs `startNow`, `startNow` a sequence.
+            self._rpc.call("constant", LOW)
+            self._safe = True
+
+    def _has_ended(self, run: _Run, asked_s: float, plays: bool) -> bool:
+        """Whether a program has ended, judged by an answer of the box; if so, take the outputs low."""
+        if run.count is not None:
+            ended = run.count.take(asked_s, time.monotonic(), plays)
+        else:
+            ended = not plays and self._flag("hasFinished")
+        if ended:
+            with self._lock:
+                if self._run is run:
+                    self._lower("stopped")
+        return ended or run.over.is_set()
+
+    def _watch(self, run: _Run) -> None:
+        """Count the sweeps of a program and see to it that the box answers, until the program is over."""
+        while not run.over.wait(IDLE_POLL_S if run.count is None else run.count.pause_s(time.monotonic())):
+            try:
+                asked_s = time.monotonic()
+                self._has_ended(run, asked_s, self._flag("isStreaming"))
+            except DeviceError as error:
+                if not run.over.is_set():
+                    _log.error("%s: while a program runs: %s", self.name, error)
+                    self._lost = True
+                    with suppress(DeviceError):
+                        self._lower()
+                return
+
+    def _flag(self, method: str) -> bool:
+        """A yes or no of the box, which says true, false, 1 or 0."""
+        value = self._rpc.call(method)
+        if value not in (0, 1):
+            raise ProtocolError(f"{self.name} answers {method} with {value!r}, neither yes nor no; report it")
+        return bool(value)
+
+    def _check_firmware(self) -> str:
+        """The firmware's version; raises `ProtocolError` if it is too old."""
+        version = str(self._rpc.call("getFirmwareVersion"))
+        try:
+            numbers = tuple(int(part) for part in version.split()[0].split(".")[:3])
+        except (ValueError, IndexError):
+            raise ProtocolError(f"{self.name}: no version in {version!r}; is this a Pulse Streamer 8/2?") from None
+        if numbers < OLDEST_FIRMWARE:
+            oldest = ".".join(map(str, OLDEST_FIRMWARE))
+            raise ProtocolError(f"{self.name}: firmware {version} is older than {oldest}; install a newer one")
+        return version
+
+    def _check_clock(self) -> None:
+        found, wanted = self._rpc.call("getClock"), CLOCKS[self._config.clock]
+        if found != wanted:
+            raise DeviceFault(
+                f"{self.name}: its clock is {found!r}, not {wanted} ({self._config.clock}); check the clock at its "
+                "input and 'clock', then open it again"
+            )
+
+    def _byte_order(self) -> Literal[">", "<"]:
+        """The byte order in which this firmware reads steps: clients 1.x send big-endian, 2.1 little-endian. Found out
+        with a dark sequence, which also shows whether the box reports waiting and ends as it is expected to."""
+        probe = GateSequence(np.array([(_PROBE_TICKS, 0, (0, 0))], STEP), 1, False)
+        orders: tuple[Literal[">", "<"], ...] = (">", "<")
+        for order in orders:
+            self._rpc.call("stream", probe.encoded(order), 1, LOW)
+            if self._flag("isStreaming") or self._flag("hasFinished"):
+                raise ProtocolError(
+                    f"{self.name}: firmware {self._firmware} says that a sequence which waits for its start plays or "
+                    "has ended; its programs could not be followed: report it"
+                )
+            self._rpc.call("startNow")
+            ends_at = time.monotonic() + _PROBE_S
+            while time.monotonic() < ends_at:
+                if self._flag("hasFinished"):
+                    self._lower()
+                    return order
+                time.sleep(_PROBE_PAUSE_S)
+            self._lower()
+        raise ProtocolError(
+            f"{self.name}: a dark test of {_PROBE_TICKS} ns did not end within {_PROBE_S:g} s; check the clock at its "
+            "input and 'clock', or power-cycle it"
+        )
+
+
+KIND = Kind(config=PulseStreamerConfig, create=PulseStreamer)
