@@ -20,7 +20,10 @@ _TURN_S = 0.002
 
 
 class TcpModel(Protocol):
-    """A program behind a port: a pure state machine that is given bytes and a time. No threads, no waiting."""
+    """A program behind a port: a pure state machine that is given bytes and a time. No threads, no waiting.
+
+    A model that ends connections itself has an attribute `hung_up`, which is true from then until the next client.
+    """
 
     def connected(self, now_s: float) -> None:
         """Note that a client has connected."""
@@ -86,7 +89,11 @@ class TcpServer(WireServer[TcpModel]):
         if self._client is None:
             return self._accept(now_s)
         took = self._take(now_s)
-        return self._give(now_s) or took
+        gave = self._give(now_s)
+        if self._client is not None and not self._outbox and getattr(self.model, "hung_up", False):
+            self._drop_client(reset=False)
+            self._listen()
+        return gave or took
 
     def _accept(self, now_s: float) -> bool:
         if self._listener is None:
@@ -145,12 +152,13 @@ class TcpServer(WireServer[TcpModel]):
             self._listen()
             return len(data)
 
-    def _drop_client(self) -> None:
-        """Reset the connection, as the end of a program with unread input does."""
+    def _drop_client(self, *, reset: bool = True) -> None:
+        """End the connection. reset: as the end of a program with unread input does; else what was sent arrives."""
         if self._client is None:
             return
-        with suppress(OSError):
-            self._client.setsockopt(socket.SOL_SOCKET, socket.SO_LINGER, struct.pack("ii", 1, 0))
+        if reset:
+            with suppress(OSError):
+                self._client.setsockopt(socket.SOL_SOCKET, socket.SO_LINGER, struct.pack("ii", 1, 0))
         self._client.close()
         self._client = None
         self._outbox.clear()
