@@ -4,7 +4,7 @@ import socket
 import pytest
 
 from drivers.errors import DeviceDisconnected
-from drivers.spads.spad512s_line import TcpStream
+from drivers.transports.tcp_line import TcpStream
 
 
 class Lost:
