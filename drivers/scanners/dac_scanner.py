@@ -1,4 +1,4 @@
-"""The common part of all beam scanners that are a galvo behind a USB DAC.
+"""The common part of all beam scanners that are a galvo behind a DAC, on USB or on the network.
 
 The mirror moves only when the scanner is started, stopped, parked or closed, along the paths of `galvo`. It may jump to
 the centre in two cases: when a board is opened whose mirror another program left elsewhere, and in an emergency halt. A
@@ -161,13 +161,15 @@ class Dac(Protocol):
         """A run of these points, at a rate that `point_clock` returned."""
 
     def check(self) -> None:
-        """Raise an error if the board does not answer. May be called from any thread."""
+        """Raise an error if the board does not answer, `DeviceFault` if the mirror has left the place where it rests.
+        May be called from any thread.
+        """
 
     def halt(self) -> float:
         """Stop what the board plays, in an emergency; returns the drive at which the next run is to begin."""
 
     def close(self) -> None:
-        """Make the outputs safe and release the USB device."""
+        """Make the outputs safe and release the device."""
 
 
 class DacScanner(BeamScanner):
@@ -183,8 +185,8 @@ class DacScanner(BeamScanner):
         identify: Callable[[UsbDevice], Dac],
         tap: Tap | None = None,
     ) -> Self:
-        """Open the board at an address. alternates: alternate setting by USB interface. identify: makes the `Dac` of an
-        open device, or raises an error."""
+        """Open the board at an address on USB. alternates: alternate setting by USB interface. identify: makes the
+        `Dac` of an open device, or raises an error."""
         usb = open_device(wanted, endpoint.address, alternates, endpoint.usb_backend, tap)
         try:
             return cls(identify(usb), config)
@@ -226,7 +228,10 @@ class DacScanner(BeamScanner):
         if isinstance(self._error, DeviceDisconnected):
             raise self._error
         if not moving and self._error is None:
-            self._dac.check()
+            try:
+                self._dac.check()
+            except DeviceFault as error:
+                self._position, self._error = None, error
         fault = None if self._error is None else str(self._error)
         return ScannerStatus(moving=moving, fault=fault, position=None if moving else self._position)
 
@@ -257,7 +262,7 @@ class DacScanner(BeamScanner):
         self._go(self._park)
 
     def _make_safe(self) -> None:
-        # Without its cable the board has no power: nothing is left to be made safe.
+        # Without its cable a board has no power or no points: nothing is left to be made safe.
         with suppress(DeviceDisconnected):
             super()._make_safe()
 
