@@ -26,7 +26,7 @@ import numpy as np
 from pydantic import Field
 
 from drivers.clock import Clock, SystemClock, now_s
-from drivers.errors import DeviceBusy, DeviceError, DeviceFault
+from drivers.errors import DeviceBusy, DeviceDisconnected, DeviceError, DeviceFault
 from drivers.registry import Kind, Surroundings, config_of, quantity
 from drivers.scanners.dac_scanner import PATIENCE_S, POLL_S, DacScanner, PointSlice, PointSource
 from drivers.scanners.etherdream_line import (
@@ -70,7 +70,7 @@ class EtherDreamConfig(GalvoConfig):
     """Port: the board's address in the network, "HOST" or "HOST:PORT"; or "emulated:NAME"."""
     max_point_rate: Annotated[Hertz, Field(gt=LOWEST_RATE_HZ, le=MOST_PPS)] = 30_000.0
     """Most points per second; the board may allow less."""
-    buffer: Annotated[Seconds, Field(ge=0.01, le=0.5)] = 0.05
+    buffer: Annotated[Seconds, Field(ge=0.01, le=0.5)] = 0.06
     """Duration of the points queued in the board: the host may be late by as much, and a stop takes as long. The
     board's buffer is the limit: 1799 points last 60 ms at 30 kHz."""
     buffer_points: Annotated[int, Field(ge=500, le=65_535)] | None = None
@@ -136,7 +136,11 @@ class EtherDreamDac:
         self._let_go()
         self._stream = None
         self._line.connect_again()
-        self._line.tell(EMERGENCY)
+        try:
+            self._line.tell(EMERGENCY)
+        except DeviceDisconnected:  # it may have been lost unnoticed
+            self._line.connect_again()
+            self._line.tell(EMERGENCY)
         self._clear()
         return 0.0
 
@@ -154,8 +158,9 @@ class EtherDreamDac:
 
     def hold(self, stream: PointStream, command: float) -> None:
         """Hold the mirror at `command`, where it rests, from a thread."""
-        self._letting_go.clear()
-        self._holder = threading.Thread(target=self._hold, args=(stream, command), name="hold", daemon=True)
+        self._letting_go = threading.Event()  # a new one: it is never cleared for a thread that is about to end
+        run = (stream, command, self._letting_go)
+        self._holder = threading.Thread(target=self._hold, args=run, name=f"{self.name} hold", daemon=True)
         self._holder.start()
 
     def close(self) -> None:
@@ -171,15 +176,15 @@ class EtherDreamDac:
     def _let_go(self) -> DeviceError | None:
         """End the thread that holds the mirror; returns the error that ended it before."""
         holder, self._holder = self._holder, None
-        if holder is not None:
-            self._letting_go.set()
+        self._letting_go.set()
+        if holder is not None and holder.ident is not None:
             holder.join()
         fault, self._fault = self._fault, None
         return fault
 
-    def _hold(self, stream: PointStream, command: float) -> None:
+    def _hold(self, stream: PointStream, command: float, letting_go: threading.Event) -> None:
         try:
-            while not self._letting_go.is_set():
+            while not letting_go.is_set():
                 send_held(stream, command)
                 self.clock.sleep(_HOLD_POLL_S)
         except Exception as error:
@@ -283,7 +288,7 @@ class EtherDream(DacScanner):
         max_velocity_per_s: float,
         max_acceleration_per_s2: float,
         max_point_rate_hz: float = 30_000.0,
-        buffer_s: float = 0.05,
+        buffer_s: float = 0.06,
         clock: Clock | None = None,
         **settings: Any,
     ) -> "EtherDream":

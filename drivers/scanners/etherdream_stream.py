@@ -171,10 +171,14 @@ class PointStream:
         self._asked_s = answered_s
         earliest_s = max(self._start_s[0] - slack_s, asked_s - n / self._rate_hz)
         latest_s = min(self._start_s[1] + slack_s, answered_s - (n - 1) / self._rate_hz)
-        if status.rate_hz != self._pps or earliest_s - latest_s > _TOLERANCE_S:
+        if status.rate_hz != self._pps:
             raise DeviceFault(
-                f"{self._name}: says {status.rate_hz} Hz instead of {self._pps} Hz, and after {n} points at that rate "
-                f"it is off by {1e3 * max(0.0, earliest_s - latest_s):.1f} ms; its clock is not the expected one"
+                f"{self._name}: plays at {status.rate_hz} Hz instead of {self._pps} Hz; end its other clients"
+            )
+        if earliest_s - latest_s > _TOLERANCE_S:
+            raise DeviceFault(
+                f"{self._name}: after {n} points at {self._pps} Hz it is {1e3 * (earliest_s - latest_s):.1f} ms off; "
+                "its clock is not the expected one: choose another DAC"
             )
         self._start_s = (earliest_s, latest_s)
 
