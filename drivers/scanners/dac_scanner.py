@@ -161,9 +161,7 @@ class Dac(Protocol):
         """A run of these points, at a rate that `point_clock` returned."""
 
     def check(self) -> None:
-        """Raise an error if the board does not answer, `DeviceFault` if the mirror has left the place where it rests.
-        May be called from any thread.
-        """
+        """Raise an error if the board does not answer. May be called from any thread."""
 
     def halt(self) -> float:
         """Stop what the board plays, in an emergency; returns the drive at which the next run is to begin."""
@@ -228,10 +226,7 @@ class DacScanner(BeamScanner):
         if isinstance(self._error, DeviceDisconnected):
             raise self._error
         if not moving and self._error is None:
-            try:
-                self._dac.check()
-            except DeviceFault as error:
-                self._position, self._error = None, error
+            self._dac.check()
         fault = None if self._error is None else str(self._error)
         return ScannerStatus(moving=moving, fault=fault, position=None if moving else self._position)
 

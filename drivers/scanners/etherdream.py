@@ -27,6 +27,7 @@ from pydantic import Field
 
 from drivers.clock import Clock, SystemClock, now_s
 from drivers.errors import DeviceBusy, DeviceDisconnected, DeviceError, DeviceFault
+from drivers.interfaces import ScannerStatus
 from drivers.registry import Kind, Surroundings, config_of, quantity
 from drivers.scanners.dac_scanner import PATIENCE_S, POLL_S, DacScanner, PointSlice, PointSource
 from drivers.scanners.etherdream_line import (
@@ -310,6 +311,13 @@ class EtherDream(DacScanner):
             **settings,
         )
         return _opened(config, port, clock or SystemClock())
+
+    def _do_status(self) -> ScannerStatus:
+        try:
+            return super()._do_status()
+        except DeviceFault as error:  # the mirror is not held any more
+            self._position, self._error = None, error
+            return super()._do_status()
 
 
 def _opened(config: EtherDreamConfig, address: str, clock: Clock, tap: Tap | None = None) -> EtherDream:
