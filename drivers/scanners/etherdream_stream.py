@@ -87,7 +87,7 @@ def encode(points: PointSlice, axis: str, *, rate_change: bool = False) -> bytes
 
 
 class PointStream:
-    """What the board was sent since `PREPARE`. Every reply is checked against it."""
+    """The points sent since `PREPARE`. Every reply of the board is checked against them."""
 
     def __init__(self, line: EtherDreamLine, name: str, axis: str, capacity: int, clock: Clock) -> None:
         """Prepare the board, which is idle. name: in messages; capacity: of its buffer, in points."""
@@ -161,7 +161,7 @@ class PointStream:
         elif self._began and answered_s - self._moved_s > PATIENCE_S:
             raise DeviceFault(f"{self._name}: plays no points for {PATIENCE_S:g} s; power-cycle it")
         self.played = played
-        if played > self._from:
+        if played > self._from + 1:  # the timer takes a new rate over one point after the one that asks for it
             self._check_rate(status, asked_s, answered_s)
 
     def _check_rate(self, status: BoardStatus, asked_s: float, answered_s: float) -> None:
