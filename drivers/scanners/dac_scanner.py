@@ -1,4 +1,4 @@
-"""The common part of all beam scanners that are a galvo behind a USB DAC.
+"""The common part of all beam scanners that are a galvo behind a DAC, on USB or on the network.
 
 The mirror moves only when the scanner is started, stopped, parked or closed, along the paths of `galvo`. It may jump to
 the centre in two cases: when a board is opened whose mirror another program left elsewhere, and in an emergency halt. A
@@ -167,7 +167,7 @@ class Dac(Protocol):
         """Stop what the board plays, in an emergency; returns the drive at which the next run is to begin."""
 
     def close(self) -> None:
-        """Make the outputs safe and release the USB device."""
+        """Make the outputs safe and release the device."""
 
 
 class DacScanner(BeamScanner):
@@ -183,8 +183,8 @@ class DacScanner(BeamScanner):
         identify: Callable[[UsbDevice], Dac],
         tap: Tap | None = None,
     ) -> Self:
-        """Open the board at an address. alternates: alternate setting by USB interface. identify: makes the `Dac` of an
-        open device, or raises an error."""
+        """Open the board at an address on USB. alternates: alternate setting by USB interface. identify: makes the
+        `Dac` of an open device, or raises an error."""
         usb = open_device(wanted, endpoint.address, alternates, endpoint.usb_backend, tap)
         try:
             return cls(identify(usb), config)
@@ -257,7 +257,7 @@ class DacScanner(BeamScanner):
         self._go(self._park)
 
     def _make_safe(self) -> None:
-        # Without its cable the board has no power: nothing is left to be made safe.
+        # Without its cable a board has no power or no points: nothing is left to be made safe.
         with suppress(DeviceDisconnected):
             super()._make_safe()
 

@@ -4,7 +4,7 @@ import socket
 import pytest
 
 from drivers.errors import DeviceDisconnected
-from drivers.spads.spad512s_line import TcpStream
+from drivers.transports.tcp_line import TcpStream
 
 
 class Lost:
@@ -31,3 +31,18 @@ def test_a_peer_that_the_system_gives_up_is_lost_and_not_slow(monkeypatch: pytes
         stream.send(b"x", 1.0)
     with pytest.raises(DeviceDisconnected, match="is lost"):
         stream.receive(1.0)
+
+
+def test_exactly_so_many_bytes_are_received_or_what_came_within_the_deadline() -> None:
+    with socket.create_server(("127.0.0.1", 0)) as server:
+        stream = TcpStream("dac", f"127.0.0.1:{server.getsockname()[1]}", 1.0)
+        other, _ = server.accept()
+        with other:
+            assert stream.peer == "127.0.0.1"
+            other.sendall(b"abc")
+            other.sendall(b"de")
+            assert stream.receive_exactly(4, 1.0) == b"abcd"
+            assert stream.receive_exactly(4, 0.05) == b"e"
+        with pytest.raises(DeviceDisconnected, match="closed the connection"):
+            stream.receive_exactly(1, 1.0)
+        stream.close()

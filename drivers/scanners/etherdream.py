@@ -1,0 +1,338 @@
+"""Scanner kind `etherdream`: a galvo behind an Ether Dream laser DAC on the network (docs/reference/hardware.md).
+
+    outputs   X (or Y): mirror. R: lit, i.e. a waveform is being played. G: line marker. B: scan marker. I: backward
+
+The board plays points from a buffer that a thread keeps filled, without frames or seams. Whenever it stops playing
+(the buffer ran empty, a stop, an emergency stop, its Ethernet link lost) it sets all colours to 0 and the mirror to the
+centre, in one jump. So a mirror that is to rest anywhere else must be held there: after each run a thread sends copies
+of the last point, all dark, at 1 kHz, until the next run or `close`. If the host dies, the points run out within
+`HOLD_S` or `buffer`, and the mirror jumps to the centre in the dark. A second generation board stops at once if its
+connection closes. The shutter output is high while the board plays, i.e. while the mirror is held, too: it keeps no
+light in.
+
+Whether every point was played exactly once, and at its rate, shows in the replies (`etherdream_stream`).
+
+Sources: `etherdream_line`; what the outputs do: `j4cbo/j4cDAC` 12ecbe5, firmware/lib/dac.c, lightengine.c and
+network.c, common/lib/hardware.c (read for facts; no code taken). What a second generation does when its connection
+closes: `ModulaserApp/laser-dac-rs` 01321db, tests/fixtures/ether_dream/README.md.
+"""
+
+import logging
+import threading
+from fractions import Fraction
+from typing import Annotated, Any, Literal
+
+import numpy as np
+from pydantic import Field
+
+from drivers.clock import Clock, SystemClock, now_s
+from drivers.errors import DeviceBusy, DeviceDisconnected, DeviceError, DeviceFault
+from drivers.interfaces import ScannerStatus
+from drivers.registry import Kind, Surroundings, config_of, quantity
+from drivers.scanners.dac_scanner import PATIENCE_S, POLL_S, DacScanner, PointSlice, PointSource
+from drivers.scanners.etherdream_line import (
+    CLEAR,
+    EMERGENCY,
+    IDLE,
+    PING,
+    PLAYING,
+    PREPARED,
+    READY,
+    STILL_STOPPED,
+    STOP,
+    BoardStatus,
+    Broadcast,
+    EtherDreamLine,
+    listen,
+)
+from drivers.scanners.etherdream_stream import MOST_PPS, PointStream, nearest_rate
+from drivers.scanners.galvo import LOWEST_RATE_HZ, GalvoConfig
+from drivers.transports.endpoints import resolve
+from drivers.transports.tap import Tap
+from drivers.units import Hertz, Seconds
+
+_log = logging.getLogger(__name__)
+
+LEAST_CAPACITY = 1799
+"""Points that the buffer of the first generation holds. An Ether Dream 2 holds 3899."""
+HOLD_PPS, HOLD_S = 1000, 0.25
+"""Rate at which a resting mirror is held, and time for which points are queued meanwhile. A run begins that much
+later."""
+_HOLD_POLL_S = 0.02
+_HARDWARE_KNOWN = (0, 1, 2, 10)
+"""Hardware revisions of the first generation, and of the Ether Dream 2 that was measured."""
+
+
+class EtherDreamConfig(GalvoConfig):
+    """Config of an Ether Dream and of the galvo behind it."""
+
+    kind: Literal["etherdream"] = "etherdream"
+    port: str
+    """Port: the board's address in the network, "HOST" or "HOST:PORT"; or "emulated:NAME"."""
+    max_point_rate: Annotated[Hertz, Field(gt=LOWEST_RATE_HZ, le=MOST_PPS)] = 30_000.0
+    """Most points per second; the board may allow less."""
+    buffer: Annotated[Seconds, Field(ge=0.01, le=0.5)] = 0.06
+    """Duration of the points queued in the board: the host may be late by as much, and a stop takes as long. The
+    board's buffer is the limit: 1799 points last 60 ms at 30 kHz."""
+    buffer_points: Annotated[int, Field(ge=500, le=65_535)] | None = None
+    """Points that the board's buffer holds. None: as many as it broadcasts or, if nothing is heard, 1799."""
+
+
+class EtherDreamDac:
+    """An Ether Dream as a `Dac`. While it is idle, the mirror stands at the centre."""
+
+    def __init__(self, config: EtherDreamConfig, address: str, clock: Clock, tap: Tap | None = None) -> None:
+        """Connect, learn who the board is, and make it idle. Raises `DeviceBusy` if it plays for somebody else."""
+        self.name = "Ether Dream"
+        self.config = config
+        self.clock = clock
+        self._line = EtherDreamLine(self.name, address, tap)
+        self._stream: PointStream | None = None
+        self._holder: threading.Thread | None = None
+        self._letting_go = threading.Event()
+        self._fault: DeviceError | None = None
+        """The error that ended the holding of the mirror."""
+        try:
+            # Nothing broadcasts on a loopback interface; an emulated board must not cost the wait.
+            heard = None if self._line.peer.startswith("127.") else listen(self._line.peer)
+            version = self._line.version() if heard is None or heard.software >= 2 else "unnamed"
+            self._settle(self._line.ask(PING).status)
+        except BaseException:
+            self._line.close()
+            raise
+        self._note(heard, version)
+
+    def _note(self, heard: Broadcast | None, version: str) -> None:
+        self.serial = None if heard is None else heard.mac
+        self.capacity = self.config.buffer_points or (LEAST_CAPACITY if heard is None else heard.capacity)
+        highest_hz = MOST_PPS if heard is None else heard.highest_rate_hz
+        self.highest_rate_hz = min(self.config.max_point_rate, float(highest_hz))
+        self.identity = f"{self.name}, firmware {version}"
+        if heard is not None:
+            self.identity += f", MAC {heard.mac}, hardware {heard.hardware}, software {heard.software}"
+            if heard.hardware not in _HARDWARE_KNOWN:
+                _log.warning("%s: the point clock of hardware %d is not known", self.name, heard.hardware)
+
+    def point_clock(self, requested_hz: float, low_hz: float, high_hz: float) -> Fraction:
+        """The rate nearest to the requested one that the divider of the board's timer can make."""
+        return nearest_rate(requested_hz, low_hz, high_hz)
+
+    def run(self, source: PointSource, clock_hz: Fraction) -> "EtherDreamRun":
+        """See `Dac`."""
+        return EtherDreamRun(self, source, clock_hz)
+
+    def check(self) -> None:
+        """Check that the board answers and, if the mirror is being held, that it still is: else `DeviceFault`."""
+        if self._fault is not None:
+            raise self._fault
+        if self._stream is None:
+            self._line.ask(PING)
+        else:
+            self._stream.ping()
+
+    def halt(self) -> float:
+        """Stop the board by its emergency stop, and clear that again; returns 0, the centre, to which the mirror jumps.
+        Connects again if the connection was lost.
+        """
+        self._let_go()
+        self._stream = None
+        self._line.connect_again()
+        try:
+            self._line.tell(EMERGENCY)
+        except DeviceDisconnected:  # it may have been lost unnoticed
+            self._line.connect_again()
+            self._line.tell(EMERGENCY)
+        self._clear()
+        return 0.0
+
+    def take_over(self) -> PointStream:
+        """Stop holding the mirror and return the stream that still holds it for `HOLD_S`; a prepared one if the board
+        is idle. Raises the error that ended the holding, if one did.
+        """
+        fault = self._let_go()
+        if fault is not None:
+            self._stream = None
+            raise fault
+        if self._stream is None:
+            self._stream = PointStream(self._line, self.name, self.config.axis, self.capacity, self.clock)
+        return self._stream
+
+    def hold(self, stream: PointStream, command: float) -> None:
+        """Hold the mirror at `command`, where it rests, from a thread."""
+        self._letting_go = threading.Event()  # a new one: it is never cleared for a thread that is about to end
+        run = (stream, command, self._letting_go)
+        self._holder = threading.Thread(target=self._hold, args=run, name=f"{self.name} hold", daemon=True)
+        self._holder.start()
+
+    def close(self) -> None:
+        """Make the board idle and close the connection. Raises the error by which the connection was lost, if it
+        was."""
+        try:
+            self._let_go()
+            if self._line.ask(PING).status.playback != IDLE:
+                self._line.tell(STOP)
+        finally:
+            self._line.close()
+
+    def _let_go(self) -> DeviceError | None:
+        """End the thread that holds the mirror; returns the error that ended it before."""
+        holder, self._holder = self._holder, None
+        self._letting_go.set()
+        if holder is not None and holder.ident is not None:
+            holder.join()
+        fault, self._fault = self._fault, None
+        return fault
+
+    def _hold(self, stream: PointStream, command: float, letting_go: threading.Event) -> None:
+        try:
+            while not letting_go.is_set():
+                send_held(stream, command)
+                self.clock.sleep(_HOLD_POLL_S)
+        except Exception as error:
+            self._fault = error if isinstance(error, DeviceError) else DeviceFault(f"{self.name} failed: {error!r}")
+            _log.error("%s", error)
+
+    def _settle(self, status: BoardStatus) -> None:
+        """Make the board idle and ready. What an earlier program left in its buffer is played to its end."""
+        if status.source != 0:
+            raise DeviceBusy(
+                f"{self.name}: plays from its own source {status.source}; select the network as its source"
+            )
+        end_s = now_s(self.clock) + LEAST_CAPACITY / HOLD_PPS + PATIENCE_S
+        while status.playback == PLAYING:
+            if now_s(self.clock) > end_s:
+                raise DeviceBusy(f"{self.name}: plays for another client; end that one")
+            self.clock.sleep(_HOLD_POLL_S)
+            status = self._line.ask(PING).status
+        if status.playback == PREPARED:
+            status = self._line.tell(STOP)
+        if status.light_engine != READY:
+            _log.warning("%s: found in emergency stop or with its link just lost; clearing that", self.name)
+            self._clear()
+
+    def _clear(self) -> None:
+        """Leave the emergency stop. Raises `DeviceFault` if its cause persists."""
+        reply = self._line.ask(CLEAR)
+        if reply.code == STILL_STOPPED or reply.status.light_engine != READY or reply.status.playback != IDLE:
+            raise DeviceFault(
+                f"{self.name}: stays in emergency stop (state {reply.status.light_engine}); release its stop input, "
+                "then start again"
+            )
+
+
+def send_held(stream: PointStream, command: float) -> None:
+    """Send copies of the point at which the mirror rests, all dark; at least ask how far the board is."""
+    n = stream.room
+    if n:
+        stream.send(PointSlice(np.full(n, command), np.zeros(n, np.uint8), np.zeros(n, bool)))
+    else:
+        stream.ping()
+
+
+class EtherDreamRun:
+    """One run: `begin`, then `feed`. No wait is longer than the queued points take plus two seconds."""
+
+    def __init__(self, dac: EtherDreamDac, source: PointSource, clock_hz: Fraction) -> None:
+        self.source = source
+        self._dac = dac
+        self._clock_hz = clock_hz
+        self._most = max(2, round(dac.config.buffer * float(clock_hz)))
+        self._stream: PointStream
+        self._end: int | None = None
+        """Number of points sent when the run's last one was; None: not yet."""
+
+    def begin(self) -> None:
+        """Send the first points, which play behind those that hold the mirror; at once if the board is idle."""
+        self._stream = self._dac.take_over()
+        idle = self._stream.sent == 0
+        self._stream.change_rate(self._clock_hz, self._most)
+        self._pump()
+        while idle and self._stream.room:
+            self._pump()
+        if idle:
+            self._stream.begin()
+
+    def feed(self, stopping: threading.Event) -> None:
+        """Send the other points; returns when the last one was played, and a thread holds the mirror there. Brakes once
+        `stopping` is set.
+        """
+        stopped = False
+        while self._end is None or self._stream.played < self._end:
+            if not stopped and stopping.is_set():
+                stopped = True
+                self.source.stop()
+            self._pump()
+            self._dac.clock.sleep(POLL_S)
+        self._dac.hold(self._stream, self.source.last)
+
+    def _pump(self) -> None:
+        """Send what there is room for: points of the run, then those that hold the mirror."""
+        if self.source.left and self._stream.room:
+            self._stream.send(self.source.take(self._stream.room))
+        elif self.source.left:
+            self._stream.ping()
+        if not self.source.left:
+            if self._end is None:
+                self._end = self._stream.sent
+                self._stream.change_rate(Fraction(HOLD_PPS), round(HOLD_S * HOLD_PPS))
+            send_held(self._stream, self.source.last)
+
+
+class EtherDream(DacScanner):
+    """A galvo behind an Ether Dream."""
+
+    @classmethod
+    def open(
+        cls,
+        port: str,
+        *,
+        max_velocity_per_s: float,
+        max_acceleration_per_s2: float,
+        max_point_rate_hz: float = 30_000.0,
+        buffer_s: float = 0.06,
+        clock: Clock | None = None,
+        **settings: Any,
+    ) -> "EtherDream":
+        """Open an Ether Dream by itself. Commands are drives from -1 to 1, so the galvo's limits are in drive per
+        second.
+
+        port: "HOST" or "HOST:PORT". max_point_rate_hz, buffer_s: the most points per second; the points queued in the
+        board. settings: axis, max_step, rms_duty, command_range, park, buffer_points, as in `EtherDreamConfig`. clock:
+        for emulators. Raises `LimitExceeded` for a setting that is not possible, other `DeviceError` if the board
+        cannot be opened.
+        """
+        config = config_of(
+            EtherDreamConfig,
+            port=port,
+            max_velocity=quantity("max_velocity_per_s", max_velocity_per_s, "rate"),
+            max_acceleration=quantity("max_acceleration_per_s2", max_acceleration_per_s2, "acceleration"),
+            max_point_rate=quantity("max_point_rate_hz", max_point_rate_hz, "frequency"),
+            buffer=quantity("buffer_s", buffer_s, "time"),
+            **settings,
+        )
+        return _opened(config, port, clock or SystemClock())
+
+    def _do_status(self) -> ScannerStatus:
+        try:
+            return super()._do_status()
+        except DeviceFault as error:  # the mirror is not held any more
+            self._position, self._error = None, error
+            return super()._do_status()
+
+
+def _opened(config: EtherDreamConfig, address: str, clock: Clock, tap: Tap | None = None) -> EtherDream:
+    dac = EtherDreamDac(config, address, clock, tap)
+    try:
+        return EtherDream(dac, config)
+    except BaseException:
+        dac.close()
+        raise
+
+
+def create(config: EtherDreamConfig, surroundings: Surroundings) -> EtherDream:
+    """Open the Ether Dream at the config's port."""
+    address = resolve(config.port, surroundings.ports).address
+    return _opened(config, address, surroundings.clock, surroundings.tap)
+
+
+KIND = Kind(config=EtherDreamConfig, create=create)

@@ -1,0 +1,194 @@
+"""The points of an Ether Dream: their bytes, their rates, and whether all were played (docs/reference/hardware.md).
+
+Every reply has the number of points in the buffer and of those played. Their sum must be the number sent: else a point
+was lost or repeated, or another client sends points too. Firmware reads the two numbers one after the other, so the
+second may be ahead by one. Besides, the points must be played at the rate that was set: each reply bounds the time of
+the first point at a rate, and the bounds must not contradict each other. Else `DeviceFault` ends the run.
+
+Rates change without a pause: `q` queues a rate, and bit 15 of a point's control word makes it that point's rate. A
+point takes floor(24e6 / rate) cycles of 24 MHz: the firmware writes that quotient to the match register of an LPC1758's
+PWM, whose counter starts at 1. The clock of other generations is not public. An Ether Dream 2 that was told 30 kHz was
+measured at 29 997 Hz, with an uncertainty of 3 Hz.
+
+Sources: `etherdream_line`; `j4cbo/j4cDAC` 12ecbe5, firmware/lib/dac.c, dac_asm.s and transform.c (read for facts; no
+code taken); counter of the PWM: `mbed-ce/mbed-os` 6bc4577, targets/TARGET_NXP/TARGET_LPC176X/pwmout_api.c.
+"""
+
+import math
+from fractions import Fraction
+
+import numpy as np
+
+from drivers.clock import Clock, now_s
+from drivers.errors import DeviceFault
+from drivers.interfaces import LEVEL_BACKWARD, MARKER_LINE, MARKER_SCAN
+from drivers.scanners.dac_scanner import DRIFT, PATIENCE_S, PointSlice
+from drivers.scanners.etherdream_line import (
+    ACCEPTED,
+    BY_EMERGENCY,
+    PING,
+    PLAYING,
+    PREPARE,
+    PREPARED,
+    STOPPED,
+    UNDERFLOW,
+    BoardStatus,
+    EtherDreamLine,
+    Reply,
+    begin,
+    data,
+    queue_rate,
+)
+
+TIMER_HZ = 24_000_000
+MOST_PPS = 100_000
+"""Highest rate of all generations. A higher one would be refused after one byte, and the rest of the command read as
+emergency stops."""
+MOST_POINTS = 400
+"""Most points of one command. They fit into the 7500 B that the firmware takes before it acknowledges any."""
+_X_SCALE = 32_760
+"""Coordinate at drive 1. Firmware drops the lowest 4 bits of coordinate + 32768; 32 760 is the scale at which the
+12-bit value so found is the nearest one, with 0 in the centre. A 16-bit converter gets all bits."""
+_RATE_CHANGE, _FULL = 0x8000, 0xFFFF
+_POINT = np.dtype([(name, "<i2" if name in "xy" else "<u2") for name in ("control", *"xyrgbi", "u1", "u2")])
+_TOLERANCE_S = 0.002
+"""Time by which two replies may contradict each other about when the first point was played."""
+_MOST_AHEAD = 50
+"""Replies in a row whose count of played points may be one ahead. For an honest board that is rare even once."""
+
+
+def pps_of(rate_hz: Fraction) -> int:
+    """The integer to request so that the board runs at a rate that `nearest_rate` gave."""
+    return math.floor(rate_hz)
+
+
+def nearest_rate(requested_hz: float, low_hz: float, high_hz: float) -> Fraction:
+    """The rate nearest to `requested_hz`, between low and high, at which the board can really run."""
+    near = math.floor(requested_hz)
+    cycles = round(TIMER_HZ / requested_hz)
+    # If any whole number of pps gives n cycles a point, floor(24e6 / n) does.
+    candidates = {near, near + 1} | {TIMER_HZ // n for n in (cycles - 1, cycles, cycles + 1)}
+    rates = [Fraction(TIMER_HZ, TIMER_HZ // pps) for pps in candidates if pps <= MOST_PPS]
+    return min((rate for rate in rates if low_hz <= rate <= high_hz), key=lambda rate: abs(float(rate) - requested_hz))
+
+
+def encode(points: PointSlice, axis: str, *, rate_change: bool = False) -> bytes:
+    """The 18 bytes of each point. R: lit, G: line marker, B: scan marker, I: backward, each 0 or full. The unused axis
+    stays at the centre. rate_change: whether the queued rate begins with the first point.
+    """
+    cells = np.zeros(len(points), _POINT)
+    cells["x" if axis == "x" else "y"] = np.rint(points.command * _X_SCALE)
+    cells["r"][points.lit] = _FULL
+    for name, bit in (("g", MARKER_LINE), ("b", MARKER_SCAN), ("i", LEVEL_BACKWARD)):
+        cells[name][points.markers & bit != 0] = _FULL
+    if rate_change:
+        cells["control"][:1] = _RATE_CHANGE
+    return cells.tobytes()
+
+
+class PointStream:
+    """The points sent since `PREPARE`. Every reply of the board is checked against them."""
+
+    def __init__(self, line: EtherDreamLine, name: str, axis: str, capacity: int, clock: Clock) -> None:
+        """Prepare the board, which is idle. name: in messages; capacity: of its buffer, in points."""
+        self.sent = 0
+        self.played = 0
+        self._line, self._name, self._axis, self._capacity, self._clock = line, name, axis, capacity, clock
+        self._began = self._turns = False
+        self._from = self._most = self._pps = self._first_pps = self._ahead = 0
+        self._rate_hz = 1.0
+        self._start_s = (-math.inf, math.inf)
+        """Earliest and latest time at which the first point at the present rate can have been played."""
+        self._asked_s = self._moved_s = 0.0
+        line.tell(PREPARE)
+
+    def change_rate(self, clock_hz: Fraction, most: int) -> None:
+        """Play the points sent from here on at another rate, at most so many of them being queued at a time."""
+        pps = pps_of(clock_hz)
+        self._turns = self.sent > 0 and pps != self._pps
+        if self._turns:
+            self._line.tell(queue_rate(pps))
+        self._from, self._most, self._pps, self._rate_hz = self.sent, most, pps, float(clock_hz)
+        self._first_pps = self._first_pps or pps
+        self._start_s = (-math.inf, math.inf)
+
+    @property
+    def room(self) -> int:
+        """Number of points that may be sent with the next command."""
+        at_this_rate = self.sent - max(self.played, self._from)
+        free = self._capacity - (self.sent - self.played)
+        return max(0, min(self._most - at_this_rate, free, MOST_POINTS))
+
+    def send(self, points: PointSlice) -> None:
+        """Append points, no more than there is `room` for. Raises `DeviceFault` if any was not played as it should."""
+        n = len(points)
+        self._exchange(data(encode(points, self._axis, rate_change=self._turns), n), n)
+        self._turns = False
+
+    def begin(self) -> None:
+        """Start to play. Raises as `send`."""
+        self._began = True
+        self._moved_s = now_s(self._clock)
+        self._exchange(begin(self._first_pps))
+
+    def ping(self) -> None:
+        """Ask how far the board is. Raises as `send`."""
+        self._exchange(PING)
+
+    def _exchange(self, command: bytes, n: int = 0) -> None:
+        with self._line.lock:
+            asked_s = now_s(self._clock)
+            reply = self._line.ask(command)
+            self.sent += n
+            self._check(reply, asked_s, now_s(self._clock))
+
+    def _check(self, reply: Reply, asked_s: float, answered_s: float) -> None:
+        status = reply.status
+        if status.playback != (PLAYING if self._began else PREPARED):
+            raise DeviceFault(f"{self._name}: {_why(status)}")
+        if reply.code != ACCEPTED:
+            raise DeviceFault(f"{self._name}: refused points with {reply.code!r}; is another client sending, too?")
+        played = self.sent - status.fullness
+        ahead = (status.count - played) % 2**32
+        self._ahead = self._ahead + 1 if ahead else 0
+        if ahead > 1 or self._ahead > _MOST_AHEAD:
+            raise DeviceFault(
+                f"{self._name}: of {self.sent} points sent, {status.fullness} are queued and {status.count} were "
+                "played: points were lost or repeated; end its other clients, then start again"
+            )
+        if played > self.played:
+            self._moved_s = answered_s
+        elif self._began and answered_s - self._moved_s > PATIENCE_S:
+            raise DeviceFault(f"{self._name}: plays no points for {PATIENCE_S:g} s; power-cycle it")
+        self.played = played
+        if played > self._from + 1:  # the timer takes a new rate over one point after the one that asks for it
+            self._check_rate(status, asked_s, answered_s)
+
+    def _check_rate(self, status: BoardStatus, asked_s: float, answered_s: float) -> None:
+        """Check the rate that the board says and, once some points were played at it, the one at which it plays."""
+        n = self.played - self._from
+        slack_s = DRIFT * (answered_s - self._asked_s)
+        self._asked_s = answered_s
+        earliest_s = max(self._start_s[0] - slack_s, asked_s - n / self._rate_hz)
+        latest_s = min(self._start_s[1] + slack_s, answered_s - (n - 1) / self._rate_hz)
+        if status.rate_hz != self._pps:
+            raise DeviceFault(
+                f"{self._name}: plays at {status.rate_hz} Hz instead of {self._pps} Hz; end its other clients"
+            )
+        if earliest_s - latest_s > _TOLERANCE_S:
+            raise DeviceFault(
+                f"{self._name}: after {n} points at {self._pps} Hz it is {1e3 * (earliest_s - latest_s):.1f} ms off; "
+                "its clock is not the expected one: choose another DAC"
+            )
+        self._start_s = (earliest_s, latest_s)
+
+
+def _why(status: BoardStatus) -> str:
+    """The reason for which the board does not play, and the next step."""
+    if status.light_engine == STOPPED or status.flags & BY_EMERGENCY:
+        why = "an emergency stop or a lost Ethernet link ended playback; find its cause, then start again"
+    elif status.flags & UNDERFLOW:
+        why = "the points ran dry; lengthen buffer or unload host and network"
+    else:
+        why = f"playback was stopped from elsewhere (state {status.playback}); end the board's other clients"
+    return f"dark, and the mirror has jumped to the centre: {why}"
