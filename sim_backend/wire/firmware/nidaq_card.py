@@ -297,7 +297,7 @@ class Card:
         if task.kind == "co":
             for channel in task.channels:
                 delay, high, low = (channel.attributes[one] for one in (DELAY_TICKS, HIGH_TICKS, LOW_TICKS))
-                ticks = delay + task.limit * (high + low) + 1
+                ticks = delay + task.limit * (high + low)
                 inverted = channel.attributes[IDLE] != LOW
                 span = Pulses(task.edges, ticks, np.zeros(1), delay=delay, high=high, low=low, inverted=inverted)
                 self.outputs[channel.outputs[0]].play(span)
