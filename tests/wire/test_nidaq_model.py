@@ -32,7 +32,7 @@ from drivers.clock import VirtualClock
 from drivers.errors import DeviceError
 from sim_backend.wire.firmware.helios import BLUE, GREEN, INTENSITY
 from sim_backend.wire.firmware.nidaq import NidaqModel
-from sim_backend.wire.firmware.nidaq_outputs import Edges, Output, Pulses, Span
+from sim_backend.wire.firmware.nidaq_parts.daq_outputs import Edges, Output, Pulses, Span
 from sim_backend.wire.serve.grpc import GrpcServer
 
 RATE_HZ = 50_000.0
@@ -130,6 +130,8 @@ def test_the_card_tells_what_it_is_and_has(card: Card) -> None:
     assert {"/Dev1/PFI0", "/Dev1/ao/SampleClock", "/Dev1/ao/StartTrigger"} < set(device.terminals)
     assert device.ao_voltage_rngs == [-5.0, 5.0, -10.0, 10.0]
     assert device.ao_samp_clk_supported
+    assert [port.do_samp_clk_supported for port in device.do_ports] == [True, False, False]
+    assert [port.do_port_width for port in device.do_ports] == [32, 8, 8]
     with refused(-200220):
         _ = system.devices["Dev2"].product_type
     with refused(-200197):

@@ -30,11 +30,11 @@ from typing import Any, Final
 import numpy as np
 from numpy.typing import NDArray
 
-from sim_backend.wire.firmware import nidaq_properties as properties
 from sim_backend.wire.firmware.helios import BLUE, GREEN, INTENSITY
-from sim_backend.wire.firmware.nidaq_card import PINS, Card
-from sim_backend.wire.firmware.nidaq_outputs import CardHistory
-from sim_backend.wire.firmware.nidaq_task import (
+from sim_backend.wire.firmware.nidaq_parts import daq_properties as properties
+from sim_backend.wire.firmware.nidaq_parts.daq_card import PINS, Card
+from sim_backend.wire.firmware.nidaq_parts.daq_outputs import CardHistory
+from sim_backend.wire.firmware.nidaq_parts.daq_task import (
     AO_MAX,
     AO_MIN,
     CHAN_PER_LINE,
@@ -332,6 +332,8 @@ class NidaqModel(Card):
         elif group == "Device":
             self.check_device(fields.device_name)
             value = properties.of_device(self, fields.attribute)
+        elif group == "PhysicalChan":
+            value = properties.of_physical(self, fields.physical_channel, fields.attribute)
         else:
             value = properties.of_task(self, self._task(fields), group, call.fields, now_s)
         return {"value_raw" if kind.startswith("Int32") else "value": value}
@@ -452,7 +454,7 @@ def _by_channel(fields: Any, channels: int) -> NDArray[Any]:
 
 
 _KEPT_CALLS: Final = 200
-_GROUPS: Final = "Timing|Buffer|Write|Chan|Trig|Task|Device|SystemInfo"
+_GROUPS: Final = "Timing|Buffer|Write|Chan|Trig|Task|Device|PhysicalChan|SystemInfo"
 _PROPERTY: Final = re.compile(rf"(Get|Set|Reset)({_GROUPS})Attribute(?:Ex)?(\w*)")
 _CALLS: Final[dict[str, Callable[[NidaqModel, Call, Any, float], Answer | None]]] = {
     "CreateTask": NidaqModel._create_task,

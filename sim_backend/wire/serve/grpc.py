@@ -15,7 +15,7 @@ from drivers.errors import DeviceError
 from drivers.optional_packages import install_command
 from drivers.transports.endpoints import Endpoint
 from sim_backend.wire.firmware.nidaq import Call
-from sim_backend.wire.firmware.nidaq_task import DaqmxError, SessionError
+from sim_backend.wire.firmware.nidaq_parts.daq_task import DaqmxError, SessionError
 from sim_backend.wire.serve.tcp import HOST
 from sim_backend.wire.serve.wire_server import WireServer
 

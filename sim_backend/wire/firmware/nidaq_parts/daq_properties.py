@@ -3,8 +3,8 @@
 from collections.abc import Mapping
 from typing import Any, Final
 
-from sim_backend.wire.firmware.nidaq_card import TERMINALS, Card
-from sim_backend.wire.firmware.nidaq_task import (
+from sim_backend.wire.firmware.nidaq_parts.daq_card import TERMINALS, Card
+from sim_backend.wire.firmware.nidaq_parts.daq_task import (
     AO_MAX,
     AO_MIN,
     AO_RATES_HZ,
@@ -88,6 +88,22 @@ def of_device(card: Card, number: int) -> Any:
     }
     if number not in values:
         raise DaqmxError(-200197, f"Device: {card.name}. Property: {number:#x}")
+    return values[number]
+
+
+def of_physical(card: Card, name: str, number: int) -> Any:
+    """A property of a physical channel."""
+    first, _, _ = card.physical(name, "")[0].partition("/")
+    values: dict[int, Any] = {}
+    if first.startswith("ao"):
+        values = {0x2FD9: [10322]}
+    elif first.startswith("port"):
+        clocked = first == "port0"
+        values = {0x29A7: PORT_LINES[int(first[4:])], 0x29A8: clocked, 0x2FE1: [10178, 10123] if clocked else []}
+    elif first.startswith("ctr"):
+        values = {0x2FDB: [_PULSE_TIME, _PULSE_FREQUENCY, _PULSE_TICKS]}
+    if number not in values:
+        raise DaqmxError(-200197, f"Physical Channel: {name}. Property: {number:#x}")
     return values[number]
 
 

@@ -7,8 +7,8 @@ from typing import Any, Final
 import numpy as np
 
 from sim_backend.wire.firmware.helios import KEEP_S
-from sim_backend.wire.firmware.nidaq_outputs import EARLY, Edges, Output, Pulses, Span
-from sim_backend.wire.firmware.nidaq_task import (
+from sim_backend.wire.firmware.nidaq_parts.daq_outputs import EARLY, Edges, Output, Pulses, Span
+from sim_backend.wire.firmware.nidaq_parts.daq_task import (
     AO_CHANNELS,
     AO_MAX,
     AO_MIN,

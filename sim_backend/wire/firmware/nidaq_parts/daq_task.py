@@ -10,7 +10,7 @@ from typing import Any, Final
 import numpy as np
 from numpy.typing import NDArray
 
-from sim_backend.wire.firmware.nidaq_outputs import Edges
+from sim_backend.wire.firmware.nidaq_parts.daq_outputs import Edges
 
 FINITE, CONTINUOUS = 10178, 10123
 ON_DEMAND, SAMPLE_CLOCK, IMPLICIT = 10390, 10388, 10451

@@ -132,7 +132,7 @@ class Output:
 
     def put(self, value: float, time_s: float) -> None:
         """Go to a value, and hold it."""
-        self.play(Span(Edges(time_s, 1.0), 1, np.array([value])))
+        self.play(Span(Edges(time_s, 1e-9), 1, np.array([value])))
 
     def cut(self, time_s: float) -> None:
         """Hold the value that the output has right before a time."""
