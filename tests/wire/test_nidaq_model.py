@@ -143,6 +143,17 @@ def test_a_call_that_the_server_lacks_is_no_error_of_the_driver(card: Card) -> N
         card.task().ai_channels.add_ai_voltage_chan("Dev1/ai0")
 
 
+def test_the_voltage_of_an_output_can_be_measured_inside_the_card(card: Card) -> None:
+    galvo, inside = card.galvo(), card.task()
+    inside.ai_channels.add_ai_voltage_chan("Dev1/_ao0_vs_aognd")
+    galvo.write(RAMP, auto_start=True)
+    card.clock.sleep(30.5 * PERIOD_S)
+    assert inside.read() == pytest.approx(RAMP[30], abs=STEP_V)
+    galvo.stop()
+    card.clock.sleep(1.0)
+    assert inside.read(2) == pytest.approx([RAMP[30]] * 2, abs=STEP_V)
+
+
 @pytest.mark.parametrize(
     ("channel", "code"), [("Dev2/ao0", -200220), ("Dev1/ao4", -200170), ("Dev1/ai3", -200430), ("Dev1/ctr0", -200430)]
 )

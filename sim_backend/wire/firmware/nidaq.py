@@ -239,6 +239,19 @@ class NidaqModel(Card):
         named = self._named(fields.name_to_assign_to_channel, self.physical(fields.physical_channel, "ao"))
         return self._add(fields, "ao", named, {AO_MIN: fields.min_val, AO_MAX: fields.max_val})
 
+    def _create_ai(self, call: Call, fields: Any, now_s: float) -> Answer:
+        """Take an internal input, which measures what an analogue output puts out. The model has no other inputs."""
+        named: dict[str, list[str]] = {}
+        for one in expand(fields.physical_channel):
+            device, _, local = one.partition("/")
+            self.check_device(device)
+            if re.fullmatch(r"ai\d+", local):
+                raise SessionError("UNIMPLEMENTED", f"The emulated card has no input {one}.")
+            if re.fullmatch(r"_ao[0-3]_vs_aognd", local) is None:
+                raise DaqmxError(-200170, f"Physical Channel: {one}")
+            named[fields.name_to_assign_to_channel or one] = [local]
+        return self._add(fields, "ai", named, {})
+
     def _create_do(self, call: Call, fields: Any, now_s: float) -> Answer:
         outputs, given = self.physical(fields.lines, "port"), fields.name_to_assign_to_lines
         if fields.line_grouping == CHAN_PER_LINE:
@@ -252,6 +265,8 @@ class NidaqModel(Card):
 
     def _cfg_samp_clk_timing(self, call: Call, fields: Any, now_s: float) -> Answer:
         task = self._task(fields)
+        if task.kind == "ai":
+            raise SessionError("UNIMPLEMENTED", "The emulated card has no clock for inputs.")
         values = {RATE: fields.rate, SOURCE: fields.source, EDGE: fields.active_edge, TIMING: SAMPLE_CLOCK}
         self.configure(task, task.timing, values | {MODE: fields.sample_mode, SAMPLES: fields.samps_per_chan})
         return {}
@@ -337,6 +352,18 @@ class NidaqModel(Card):
         else:
             value = properties.of_task(self, self._task(fields), group, call.fields, now_s)
         return {"value_raw" if kind.startswith("Int32") else "value": value}
+
+    def _read_analog(self, call: Call, fields: Any, now_s: float) -> Answer:
+        task = self._task(fields)
+        if task.kind != "ai":
+            raise DaqmxError(-200525, f"Task Name: {task.name}")
+        before, n = task.state, max(1, fields.num_samps_per_chan)
+        self.start(task, now_s, before)
+        if before != RUNNING:
+            self.stop(task, now_s)
+        measured = [self.outputs[one[1:4]].values(np.array([now_s]))[0] for one in task.outputs]
+        values = np.repeat(measured, n) if fields.fill_mode == 0 else np.tile(measured, n)
+        return {"read_array": values.tolist(), "samps_per_chan_read": n}
 
     # Writing
 
@@ -454,7 +481,7 @@ def _by_channel(fields: Any, channels: int) -> NDArray[Any]:
 
 
 _KEPT_CALLS: Final = 200
-_GROUPS: Final = "Timing|Buffer|Write|Chan|Trig|Task|Device|PhysicalChan|SystemInfo"
+_GROUPS: Final = "Timing|Buffer|Read|Write|Chan|Trig|Task|Device|PhysicalChan|SystemInfo"
 _PROPERTY: Final = re.compile(rf"(Get|Set|Reset)({_GROUPS})Attribute(?:Ex)?(\w*)")
 _CALLS: Final[dict[str, Callable[[NidaqModel, Call, Any, float], Answer | None]]] = {
     "CreateTask": NidaqModel._create_task,
@@ -465,6 +492,7 @@ _CALLS: Final[dict[str, Callable[[NidaqModel, Call, Any, float], Answer | None]]
     "IsTaskDone": NidaqModel._is_task_done,
     "WaitUntilTaskDone": NidaqModel._wait_until_task_done,
     "CreateAOVoltageChan": NidaqModel._create_ao,
+    "CreateAIVoltageChan": NidaqModel._create_ai,
     "CreateDOChan": NidaqModel._create_do,
     "CreateCOPulseChanTicks": NidaqModel._create_co,
     "CreateCOPulseChanFreq": NidaqModel._create_co,
@@ -480,6 +508,7 @@ _CALLS: Final[dict[str, Callable[[NidaqModel, Call, Any, float], Answer | None]]
     "ResetDevice": NidaqModel._reset_device,
     "SelfTestDevice": NidaqModel._self_test_device,
     "GetErrorString": NidaqModel._get_error_string,
+    "ReadAnalogF64": NidaqModel._read_analog,
     "WriteAnalogF64": NidaqModel._write_analog,
     "WriteAnalogScalarF64": NidaqModel._write_analog,
     "WriteBinaryI16": NidaqModel._write_analog,

@@ -32,8 +32,9 @@ from sim_backend.wire.firmware.nidaq_parts.daq_task import (
 BUFFER_SIZE, ONBOARD_SIZE = 0x186D, 0x230B
 _PULSE_FREQUENCY, _PULSE_TICKS, _PULSE_TIME = 10119, 10268, 10269
 _CO_USAGE: Final = 0x18B5
-_TYPES: Final = {"ao": 10102, "do": 10153, "co": 10132}
+_TYPES: Final = {"ai": 10100, "ao": 10102, "do": 10153, "co": 10132}
 _SETTABLE: Final = {
+    "ai": (),
     "ao": (AO_MAX, AO_MIN, ONBOARD_ONLY),
     "do": (),
     "co": (IDLE, DELAY_TICKS, LOW_TICKS, HIGH_TICKS, TICK_SOURCE),
@@ -137,6 +138,8 @@ def of_task(card: Card, task: Task, group: str, fields: Mapping[str, Any], now_s
             0x217E: len(task.channels),
             0x217F: max((len(channel.outputs) for channel in task.channels), default=0),
         }
+    elif group == "Read":
+        values = {0x1823: ", ".join(channel.name for channel in task.channels), 0x217B: len(task.channels)}
     elif group == "Buffer":
         values = {BUFFER_SIZE: task.buffer_size, ONBOARD_SIZE: FIFO.get(task.kind, 0)}
     if number not in values:
@@ -228,6 +231,8 @@ def _of_channel(card: Card, task: Task, channel: Channel) -> Mapping[int, Any]:
         full_v = channel.dac_range_v
         values |= {ONBOARD_ONLY: bool(values.get(ONBOARD_ONLY)), 0x1108: 10322, 0x182C: 16.0}
         values |= {0x182E: full_v, 0x182D: -full_v}
+    elif task.kind == "ai":
+        values[0x0695] = 10322  # voltage
     elif task.kind == "do":
         values[0x2179] = len(channel.outputs)
     else:

@@ -66,6 +66,7 @@ ERRORS: Final = {
     -200479: "Specified operation cannot be performed while the task is running.",
     -200489: "Specified channel cannot be added to the task, because it is already in it.",
     -200524: "Write cannot be performed, because the data does not match the channels in the task.",
+    -200525: "Read cannot be performed, because its type does not match the channels in the task.",
     -200526: "Write cannot be performed, because its type does not match the channels in the task.",
     -200547: "A single sample cannot be written to a buffer whose size was configured automatically.",
     -200557: "Specified property cannot be set while the task is running.",
@@ -140,7 +141,7 @@ class Task:
 
     name: str
     kind: str = ""
-    """ao, do or co, as soon as there is a channel."""
+    """ao, do, co or ai, as soon as there is a channel."""
     channels: list[Channel] = field(default_factory=list)
     timing: dict[int, Any] = field(
         default_factory=lambda: {
@@ -187,7 +188,7 @@ class Task:
     @property
     def buffered(self) -> bool:
         """Whether a clock takes samples out of a buffer."""
-        return self.kind != "co" and self.timing[TIMING] == SAMPLE_CLOCK
+        return self.kind in ("ao", "do") and self.timing[TIMING] == SAMPLE_CLOCK
 
     @property
     def regenerates(self) -> bool:
