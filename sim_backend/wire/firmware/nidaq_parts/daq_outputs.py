@@ -6,6 +6,7 @@ will come out if nobody interferes.
 
 import math
 import threading
+from bisect import bisect_left, bisect_right
 from collections import deque
 from collections.abc import Mapping
 from dataclasses import dataclass, replace
@@ -170,11 +171,13 @@ class Output:
         with self._lock:
             spans = list(self._spans)
         found, high = [np.empty(0)], self._rest > 0
-        for number, span in enumerate(spans):
-            end_s = spans[number + 1].edges.first_s if number + 1 < len(spans) else math.inf
-            if span.edges.first_s < until_s and end_s > from_s:
+        starts = [one.edges.first_s for one in spans]
+        begin, end = max(0, bisect_right(starts, from_s) - 1), bisect_left(starts, until_s)
+        for number in range(max(0, begin - 1), end):
+            span, end_s = spans[number], starts[number + 1] if number + 1 < len(spans) else math.inf
+            if number >= begin:
                 found.append(span.rising(from_s, min(until_s, end_s), high))
-            if math.isfinite(end_s):
+            if number + 1 < end:
                 high = bool(span.values(np.array([end_s - EARLY * span.edges.period_s]))[0] > 0)
         return np.concatenate(found)
 
