@@ -389,7 +389,8 @@ def test_two_tasks_cannot_have_the_same_output_or_the_one_clock(card: Card) -> N
     first.control(TaskMode.TASK_RESERVE)
     with refused(-50103):
         second.control(TaskMode.TASK_RESERVE)
-    third.write(0.5)
+    with refused(-200963):
+        third.write(0.5)
     third.timing.cfg_samp_clk_timing(RATE_HZ, sample_mode=CONTINUOUS)
     with refused(-50103):
         third.write(RAMP)

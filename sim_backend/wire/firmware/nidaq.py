@@ -17,8 +17,9 @@ Public sources do not tell the following, and the model chose. A finite task is 
 sample. A stop drops samples that are not regenerated. A write to a task that waits for its trigger replaces samples
 that the card's memory already holds. A counter's first pulse begins at that edge of its clock before which
 `initial_delay` edges came. A reset is reported as -88709, once, by the next call about a task that ran. An on-demand
-write with automatic start releases the output afterwards. On-demand tasks run beside a clocked one on other outputs.
-Lines that are taken are -200587, all else that is taken -50103. Full scale is exactly 10 V in 32767 steps.
+write with automatic start releases the output afterwards. Analogue outputs with and without a clock exclude each other,
+as on a PXI-6723. Lines that are taken are -200587, all else that is taken -50103. Full scale is exactly 10 V in 32767
+steps. Properties that the model does not have are refused as not applicable, -200452, though the card may have them.
 """
 
 import re

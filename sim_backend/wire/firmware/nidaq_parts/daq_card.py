@@ -200,6 +200,8 @@ class Card:
             if taken:
                 code = -200587 if all(one.startswith("port") for one in taken) else -50103
                 raise DaqmxError(code, f"Resource: {min(taken)} of task {other.name}. Task Name: {task.name}")
+            if task.kind == other.kind == "ao" and other.state >= RESERVED and task.buffered != other.buffered:
+                raise DaqmxError(-200963, f"Other task: {other.name}. Task Name: {task.name}")
         task.state = max(task.state, state)
 
     def start(self, task: Task, now_s: float, before: int) -> None:

@@ -77,6 +77,7 @@ ERRORS: Final = {
     -200609: "Generation cannot be started, because the selected buffer size is too small.",
     -200656: "Regeneration must be allowed when only onboard memory is used.",
     -200846: "Write cannot be performed when auto start is false and the task is not running.",
+    -200963: "Requested Sample Timing Type is not allowed, because another task of the device has a different one.",
     -201062: "Buffered operations are not supported on the selected lines.",
 }
 """The errors that this card knows, in few words."""
