@@ -1,0 +1,208 @@
+"""Outputs of an emulated NI card over time, as functions of time instead of recorded samples.
+
+A buffer that is regenerated for hours takes no more memory than itself, and the history also covers the future: what
+will come out if nobody interferes.
+"""
+
+import math
+import threading
+from bisect import bisect_left, bisect_right
+from collections import deque
+from collections.abc import Mapping
+from dataclasses import dataclass, replace
+from functools import cached_property
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from sim_backend.wire.firmware.helios import DacHistory
+
+Array = NDArray[np.float64]
+Ticks = NDArray[np.int64]
+
+EARLY = 1e-4
+"""Part of a clock's period by which an edge counts as past before its time: times are sums of rounded numbers."""
+
+
+@dataclass(frozen=True, slots=True)
+class Edges:
+    """Active edges of a clock: one at first_s, then one every period_s."""
+
+    first_s: float
+    period_s: float
+
+    def count(self, until_s: float) -> int:
+        """Number of edges up to a time, that time included."""
+        return max(0, math.floor((until_s - self.first_s) / self.period_s + EARLY) + 1)
+
+    def at(self, index: float) -> float:
+        """Time of an edge."""
+        return self.first_s + index * self.period_s
+
+    def from_(self, time_s: float) -> "Edges":
+        """The edges at a time and after."""
+        passed = max(0, math.ceil((time_s - self.first_s) / self.period_s - EARLY))
+        return Edges(self.at(passed), self.period_s)
+
+
+@dataclass(frozen=True, eq=False)
+class Span:
+    """Samples of one output at edges of a clock: `count` of them (inf: until it is cut), taken cyclically from `data`,
+    beginning with sample number `first`. The last one holds until the next span.
+    """
+
+    edges: Edges
+    count: float
+    data: NDArray[Any]
+    first: int = 0
+
+    def values(self, time_s: Array) -> Array:
+        """Values at times after the first edge."""
+        last = self.count - 1 if math.isfinite(self.count) else 2**62
+        index = np.floor((time_s - self.edges.first_s) / self.edges.period_s + EARLY)
+        return self._at(np.clip(index, 0, last).astype(np.int64))
+
+    def rising(self, from_s: float, until_s: float, high_before: bool) -> Array:
+        """Times of rising edges of the value in [from_s, until_s). high_before: whether it was high before the span."""
+        edges = self.edges
+        low = max(0, math.ceil((from_s - edges.first_s) / edges.period_s - EARLY))
+        end = int(min(self.count, math.ceil((until_s - edges.first_s) / edges.period_s - EARLY)))
+        if end <= low:
+            return np.empty(0)
+        at = self._rises(low, end)
+        at = at[(at >= max(low, 1)) & (at < end)]
+        if low == 0 and not high_before and self._at(np.zeros(1, np.int64))[0] > 0:
+            at = np.concatenate([np.zeros(1, np.int64), at])
+        return np.asarray(edges.first_s + at * edges.period_s, np.float64)
+
+    @cached_property
+    def _ups(self) -> Ticks:
+        high = self.data > 0
+        ups: Ticks = np.flatnonzero(high & ~np.roll(high, 1)).astype(np.int64)
+        return ups
+
+    def _at(self, index: Ticks) -> Array:
+        return np.asarray(self.data[(self.first + index) % len(self.data)], np.float64)
+
+    def _rises(self, low: int, end: int) -> Ticks:
+        """Numbers of samples that rise above the one before, at least all of those in [low, end), ascending."""
+        return _repeated((self._ups - self.first) % len(self.data), len(self.data), low, end)
+
+
+@dataclass(frozen=True, eq=False)
+class Pulses(Span):
+    """Pulses of a counter, in ticks of its clock: `delay` ticks at rest, then `high` and `low` ticks in turn."""
+
+    delay: int = 0
+    high: int = 1
+    low: int = 1
+    inverted: bool = False
+    """Whether the output rests high and its pulses are low."""
+
+    def _at(self, index: Ticks) -> Array:
+        active = (index >= self.delay) & ((index - self.delay) % (self.high + self.low) < self.high)
+        return np.asarray(active != self.inverted, np.float64)
+
+    def _rises(self, low: int, end: int) -> Ticks:
+        period = self.high + self.low
+        first = self.delay + (self.high if self.inverted else 0)
+        at = _repeated(np.array([first % period], np.int64), period, low, end)
+        return at[at >= first]
+
+
+def _repeated(offsets: Ticks, period: int, low: int, end: int) -> Ticks:
+    """Ascending numbers offset + n * period that cover [low, end)."""
+    turns = np.arange(low // period, end // period + 1, dtype=np.int64) * period
+    return (turns[:, None] + np.sort(offsets)[None, :]).ravel()
+
+
+class Output:
+    """One output of the card: spans one after another. Thread-safe."""
+
+    def __init__(self) -> None:
+        self._lock = threading.Lock()
+        self._rest = 0.0
+        self._spans: deque[Span] = deque()
+
+    def play(self, span: Span) -> None:
+        """Play a span from its first edge on, in place of all that was to come then and later."""
+        self.cut(span.edges.first_s)
+        with self._lock:
+            self._spans.append(span)
+
+    def put(self, value: float, time_s: float) -> None:
+        """Go to a value, and hold it."""
+        self.play(Span(Edges(time_s, 1e-9), 1, np.array([value])))
+
+    def cut(self, time_s: float) -> None:
+        """Hold the value that the output has right before a time."""
+        with self._lock:
+            while self._spans and self._spans[-1].edges.count(time_s) == 0:
+                self._spans.pop()
+            if self._spans:
+                last = self._spans[-1]
+                kept = math.ceil((time_s - last.edges.first_s) / last.edges.period_s - EARLY)
+                if kept <= 0:
+                    self._spans.pop()
+                elif kept < last.count:
+                    self._spans[-1] = replace(last, count=kept)
+
+    def forget(self, before_s: float) -> None:
+        """Forget what had ended before a time."""
+        with self._lock:
+            while len(self._spans) > 1 and self._spans[1].edges.first_s <= before_s:
+                gone = self._spans.popleft()
+                self._rest = float(gone.values(np.array([self._spans[0].edges.first_s]))[0])
+
+    def values(self, time_s: Array) -> Array:
+        """Values at times."""
+        with self._lock:
+            spans = list(self._spans)
+        at = np.searchsorted(np.array([one.edges.first_s for one in spans]), time_s, side="right") - 1
+        result = np.full(time_s.shape, self._rest)
+        for number in np.unique(at[at >= 0]):
+            inside = at == number
+            result[inside] = spans[number].values(time_s[inside])
+        return result
+
+    def rising(self, from_s: float, until_s: float) -> Array:
+        """Times at which the output rises above 0, in [from_s, until_s), ascending."""
+        with self._lock:
+            spans = list(self._spans)
+        found, high = [np.empty(0)], self._rest > 0
+        starts = [one.edges.first_s for one in spans]
+        begin, end = max(0, bisect_right(starts, from_s) - 1), bisect_left(starts, until_s)
+        for number in range(max(0, begin - 1), end):
+            span, end_s = spans[number], starts[number + 1] if number + 1 < len(spans) else math.inf
+            if number >= begin:
+                found.append(span.rising(from_s, min(until_s, end_s), high))
+            if number + 1 < end:
+                high = bool(span.values(np.array([end_s - EARLY * span.edges.period_s]))[0] > 0)
+        return np.concatenate(found)
+
+    def __len__(self) -> int:
+        return len(self._spans)
+
+
+class CardHistory(DacHistory):
+    """The galvo's drive and the marker lines of a card. Digital lines hold their level when nothing is played."""
+
+    def __init__(self, galvo: Output, full_scale_v: float, lines: Mapping[int, Output]) -> None:
+        """galvo: the output in V. lines: outputs by the number of their line in `DacHistory`; others are always low."""
+        super().__init__(0.0, lines=4)
+        self._galvo, self._full_scale_v, self._outputs = galvo, full_scale_v, dict(lines)
+
+    def command(self, time_s: Array) -> Array:
+        """Normalised drive at the given times, in the steps of the DAC and without the mirror's lag."""
+        return self._galvo.values(time_s) / self._full_scale_v
+
+    def level(self, line: int, time_s: Array) -> NDArray[np.uint8]:
+        """Level of a marker line at the given times."""
+        output = self._outputs.get(line)
+        return np.zeros(time_s.shape, np.uint8) if output is None else (output.values(time_s) > 0).astype(np.uint8)
+
+    def rising(self, line: int, from_s: float, until_s: float) -> Array:
+        """Times of rising edges of a marker line in [from_s, until_s), ascending."""
+        output = self._outputs.get(line)
+        return np.empty(0) if output is None else output.rising(from_s, until_s)
