@@ -153,10 +153,10 @@ class TeensyModel:
 
     def _play(self, until_s: float) -> None:
         while self.state == "playing":
-            bits, ticks = self.words[self._place]
+            ticks = self.words[self._place][1]
             end_s: float | None = self._start_s + (ticks or SHORTEST_TICKS) * TICK_S
             assert end_s is not None
-            if bits & HELD and bits & GATE and not self._cut:
+            if self._held and not self._cut:
                 self._hold(end_s, until_s)
             if end_s > until_s:
                 return
@@ -173,9 +173,14 @@ class TeensyModel:
                     return
             self._enter(end_s)
 
+    @property
+    def _held(self) -> bool:
+        return self.words[self._place][0] & (HELD | GATE) == HELD | GATE
+
     def _enter(self, at_s: float) -> None:
         self._start_s = self._checked_s = at_s
-        self._cut = False
+        self._cut = self._held and not self._high(at_s)
+        self.cuts += self._cut
         self._show(at_s)
 
     def _hold(self, end_s: float, until_s: float) -> None:
