@@ -8,8 +8,10 @@ from collections.abc import Callable, Sequence
 from pathlib import Path
 
 import pytest
+import serial
 
 from sim_backend.wire.firmware.teensy import MAX_WORDS, MOST_CHANGES, TeensyModel
+from sim_backend.wire.serve.serial import SerialServer
 
 HOST = Path(__file__).with_name("teensy_host")
 HZ = 600_000_000
@@ -158,6 +160,15 @@ def test_a_program_fills_the_memory_and_no_more() -> None:
     line = "add" + 100 * " 0000001f4"
     assert said(model, "new 1 0", *(MAX_WORDS // 100 * [line]))[-1] == "ok 30000"
     assert said(model, "add 0000001f4") == ["error full: 30000 words"]
+
+
+def test_it_answers_on_a_serial_port() -> None:
+    with SerialServer(TeensyModel(), baud=10_000_000) as wire, serial.Serial(wire.path, timeout=5) as port:
+        port.write(program("new 1000 0", "add 3000186a0") + b"run 0\n#z abort\n")
+        answers = [port.readline().decode() for _ in range(5)]
+    assert answers[:3] == ["ok\n", "ok 1\n", "ok\n"]
+    assert answers[3].startswith("ok state=running sweeps=0 word=0 pins=3 ")
+    assert answers[4] == "#z ok state=aborted sweeps=0 word=0 pins=0 marker=0 cuts=0 why=abort\n"
 
 
 # Programs
