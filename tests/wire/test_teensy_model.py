@@ -228,6 +228,13 @@ def test_a_marker_that_the_scanner_tells_late_still_cuts() -> None:
     assert_changes(model, (0.011, 2), (0.013, 0))
 
 
+def test_a_marker_that_is_high_and_low_in_one_instant_ends_all_the_same() -> None:
+    model = started(
+        TeensyModel(lambda a, b: a, lambda a, b: max(a, 5e-6) if b > 5e-6 else None), "new 1 9", "add a000003e8"
+    )
+    assert_changes(model, (1e-5, 0))
+
+
 # Ways out
 
 

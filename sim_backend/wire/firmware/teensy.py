@@ -186,10 +186,11 @@ class TeensyModel:
     def _hold(self, end_s: float, until_s: float) -> None:
         """Take the gate of the present word low if the marker was low when the word began or, later, for too long."""
         until_s, at_s, was_low = min(end_s, until_s), self._checked_s, False
-        while (low_s := self._marker_low(at_s, until_s)) is not None:
+        while at_s < until_s and (low_s := self._marker_low(at_s, until_s)) is not None:
             was_low = True
             due_s = low_s + self.hold_s if low_s > self._start_s else self._start_s
-            high_s = self._trigger(low_s, min(due_s, until_s)) if due_s > low_s else None
+            # From a tick later on, so that there is an end even if both say that it is so in the same instant.
+            high_s = self._trigger(low_s + TICK_S, min(due_s, until_s)) if due_s > low_s + TICK_S else None
             if high_s is None:
                 if due_s <= until_s and due_s < end_s:
                     self._cut = True
