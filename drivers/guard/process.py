@@ -269,7 +269,7 @@ class GuardProcess:
                 if attempt:
                     self._trip(error)
                 continue
-            if not status.interlock_closed:
+            if status.interlock_closed is False:
                 self._trip(InterlockOpen(f"{device.name}: the interlock is open; close it and start again"))
             elif status.fault is not None:
                 self._trip(DeviceFault(f"{device.name}: fault {status.fault}; clear it at the laser and start again"))

@@ -26,7 +26,8 @@ class LaserStatus:
     """The laser emits whenever the gate is high (light = emission AND gate). False while paused or warming up."""
     armed: bool
     """True from `arm` to `disarm`, pauses included."""
-    interlock_closed: bool
+    interlock_closed: bool | None
+    """Whether the interlock is closed. None: the laser does not say."""
     fault: str | None
     """The laser's faults in one line; None: it has none."""
     key_on: bool | None
@@ -101,7 +102,7 @@ class LineLaser(Device):
     def _check_health(self) -> None:
         """Refuse a laser that must not be enabled. May raise `InterlockOpen`, `DeviceFault`."""
         status = self._do_status()
-        if not status.interlock_closed:
+        if status.interlock_closed is False:
             raise InterlockOpen(f"{self._name}: the interlock is open; close it and arm again")
         if status.fault is not None:
             raise DeviceFault(f"{self._name}: fault {status.fault}; clear it at the laser and arm again")

@@ -190,10 +190,11 @@ def _health(rig: OpenRig) -> list[str]:
 
 def _laser(rig: OpenRig) -> Finding:
     status = rig.laser.status
-    trouble = [] if status.interlock_closed else ["interlock open"]
+    trouble = ["interlock open"] if status.interlock_closed is False else []
     trouble += [] if status.fault is None else [f"fault {status.fault}"]
     trouble += ["key off"] if status.key_on is False else []
-    state = ", ".join(trouble) or f"interlock closed, no fault, input {status.input_mode}"
+    interlock = "closed" if status.interlock_closed else "not known"
+    state = ", ".join(trouble) or f"interlock {interlock}, no fault, input {status.input_mode}"
     warm = "" if status.temperature_c is None else f", {status.temperature_c:.1f} C"
     most = f", up to {rig.laser.limits.max_power_w * 1e3:g} mW"
     return Finding("laser", not trouble, f"{rig.laser.identity}: {state}{warm}{most}")

