@@ -23,7 +23,8 @@ class LaserStatus:
     """The laser's own report, read anew each time."""
 
     emission: bool
-    """The laser emits whenever the gate is high (light = emission AND gate). False while paused or warming up."""
+    """The laser emits whenever the gate is high (light = emission AND gate). False while paused or warming up; always
+    True for a laser that software cannot switch off (`LineLaser.gate_only`)."""
     armed: bool
     """True from `arm` to `disarm`, pauses included."""
     interlock_closed: bool | None
@@ -54,6 +55,12 @@ class LineLaser(Device):
         """Powers at which the laser may be armed."""
 
     @property
+    def gate_only(self) -> bool:
+        """Whether only the gate ends the laser's light: `pause`, `disarm` and `close` do not, as it is switched by
+        hand."""
+        return False
+
+    @property
     def status(self) -> LaserStatus:
         """Ask the laser. Raises `WrongState` after close. May be called from any thread."""
         self._require("status", *OPEN_STATES)
@@ -79,6 +86,7 @@ class LineLaser(Device):
 
     def pause(self) -> None:
         """Stop emission in a way that needs no key to resume. Allowed until `close`, also if the laser is not armed.
+        If the laser is `gate_only`, nothing changes.
 
         May be called from any thread, even while another one arms: the interrupted `arm` must leave the laser dark.
         """
@@ -90,7 +98,7 @@ class LineLaser(Device):
 
     def disarm(self) -> None:
         """Switch emission off for good. The laser may need its key turned before it arms again. Allowed until
-        `close`."""
+        `close`. If the laser is `gate_only`, its light is not switched off."""
         self._require("disarm", *OPEN_STATES)
         _log.info("%s: disarm", self._name)
         self._do_disarm()
