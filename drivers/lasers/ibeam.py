@@ -1,7 +1,7 @@
 """The Toptica iBeam smart diode laser, gated by its digital modulation input (`enable ext`).
 
-Commands and replies, with their sources, are in docs/reference/hardware-ibeam-driver.md. The manual is not public; the
-facts are those of other clients.
+Commands and replies, with their sources, are in docs/reference/hardware-ibeam-driver.md. No manual is public: the facts
+are those of other clients.
 
 The light is the sum of the channels. Channel 2 is the working level and the only one that the gate switches; channel 1
 is a bias that shines whatever the gate does. So every other channel is set to a level of 0, which is read back, and
@@ -71,7 +71,7 @@ class IbeamFraming:
         self.echo = self.prompt = False
         """Whether they were on when the port was opened."""
 
-    def quieten(self, port: SerialPort) -> None:
+    def prepare(self, port: SerialPort) -> None:
         """Switch echo and prompt off, whatever state they are in, and note that state."""
         said = _say(port, "")
         echoed = _say(port, "echo off")
@@ -184,7 +184,7 @@ class IbeamLaser(SerialLaser):
             return None
 
     def _input_mode(self) -> str:
-        """What controls the light. It is the gate alone, "digital", only if no channel shines besides."""
+        """Name of the input or mode that controls the light. It is "digital" only if no channel shines besides."""
         if self._line.ask("sta ext", SWITCH) != "ON":
             return "constant power"
         bias_w = sum(abs(level_w) for channel, level_w in self._levels().items() if channel != _WORKING)
@@ -292,7 +292,7 @@ def create(config: IbeamConfig, surroundings: Surroundings, timing: LineTiming =
     """Open the laser and identify it; changes nothing about it but echo, prompt and talk."""
     framing = IbeamFraming()
     identify = partial(_identify, config, framing)
-    return open_laser("ibeam", config, surroundings, framing, timing, identify, _off(config), framing.quieten)
+    return open_laser("ibeam", config, surroundings, framing, timing, identify, _off(config), framing.prepare)
 
 
 def _identify(config: IbeamConfig, framing: IbeamFraming, line: Dialogue) -> IbeamLaser:

@@ -6,8 +6,10 @@ set.
 
 import gc
 import re
+import sys
 from collections.abc import Iterator
-from contextlib import contextmanager
+from contextlib import contextmanager, suppress
+from types import FrameType
 from typing import Any
 
 import pytest
@@ -406,6 +408,37 @@ def test_an_interrupt_while_it_arms_leaves_it_dark(said: str) -> None:
             device.arm(0.05)
         assert laser.struck
         assert not laser.on
+
+
+class Strike:
+    """Interrupts the n-th line of the driver that is run."""
+
+    def __init__(self, n: int) -> None:
+        self.left = n
+
+    def __call__(self, frame: FrameType, event: str, argument: object) -> Any:
+        if event == "line" and frame.f_code.co_filename == ibeam.__file__:
+            self.left -= 1
+            if self.left == 0:
+                sys.settrace(None)
+                raise KeyboardInterrupt
+        return self
+
+
+def test_an_interrupt_at_any_line_of_the_driver_leaves_it_dark() -> None:
+    at, struck = 0, True
+    while struck:  # at every 29th line, until there is none
+        at, laser = at + 29, Recorded()
+        strike, before = Strike(at), sys.gettrace()
+        with suppress(KeyboardInterrupt), opened(laser) as device:
+            sys.settrace(strike)
+            try:
+                device.arm(0.05)
+            finally:
+                sys.settrace(before)
+        struck = strike.left == 0
+        assert not laser.on
+    assert at > 300
 
 
 def test_a_unit_without_a_pulse_board_or_in_another_programs_mode_is_refused() -> None:

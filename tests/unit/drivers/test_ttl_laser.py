@@ -10,6 +10,7 @@ from pydantic import ValidationError
 
 from drivers.clock import SystemClock
 from drivers.errors import DeviceNotFound, LimitExceeded
+from drivers.guard.process import Rescue
 from drivers.interfaces import DeviceState
 from drivers.lasers.ttl import TtlConfig, TtlLaser, create
 from drivers.registry import Surroundings, lookup
@@ -97,6 +98,11 @@ def test_its_light_counts_as_real_unless_a_world_emulates_it() -> None:
 
 def test_the_guard_has_no_bytes_that_switch_it_off() -> None:
     assert lookup("laser", "ttl").off is None
+
+
+def test_a_rescue_by_the_application_does_not_count_it_as_safe() -> None:
+    outcome = Rescue({"laser": TtlConfig.model_validate(HAND)}, {}).run({"laser"}, armed=True)
+    assert outcome == "laser: NOT switched off, only its gate ends it"
 
 
 def test_a_rig_with_it_opens_although_it_emits_and_plans_for_its_power_only() -> None:
