@@ -59,6 +59,11 @@ class GuardedLaser(_Guarded, LineLaser):
         """The limits that the guard read."""
         return LaserLimits(*self._about["limits"])
 
+    @property
+    def gate_only(self) -> bool:
+        """Whether only the gate ends its light, as the guard read."""
+        return bool(self._about["gate_only"])
+
     def _do_status(self) -> LaserStatus:
         return LaserStatus(**self._ask("status"))
 

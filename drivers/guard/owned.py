@@ -93,6 +93,7 @@ class Owned:
         if isinstance(self.device, LineLaser):
             limits = self.device.limits
             about["limits"] = [limits.min_power_w, limits.max_power_w]
+            about["gate_only"] = self.device.gate_only
         else:
             about["resolution_s"] = self.device.resolution_s
         return about

@@ -269,7 +269,7 @@ class GuardProcess:
                 if attempt:
                     self._trip(error)
                 continue
-            if not status.interlock_closed:
+            if status.interlock_closed is False:
                 self._trip(InterlockOpen(f"{device.name}: the interlock is open; close it and start again"))
             elif status.fault is not None:
                 self._trip(DeviceFault(f"{device.name}: fault {status.fault}; clear it at the laser and start again"))
@@ -380,7 +380,8 @@ class Rescue:
                     self._switch_off(slot)
             with _once_free(self._create[slot]) as device:
                 make_safe(device, disarm=armed)
-            self._outcome[slot] = "made safe by the application"
+                dark = not (isinstance(device, LineLaser) and device.gate_only)
+            self._outcome[slot] = "made safe by the application" if dark else "NOT switched off, only its gate ends it"
         except Exception as error:  # also a fault in a driver: the outcome must name both devices
             self._outcome[slot] = f"NOT made safe, {error}"
             _log.error("%s: %s", slot, error)

@@ -23,10 +23,12 @@ class LaserStatus:
     """The laser's own report, read anew each time."""
 
     emission: bool
-    """The laser emits whenever the gate is high (light = emission AND gate). False while paused or warming up."""
+    """The laser emits whenever the gate is high (light = emission AND gate). False while paused or warming up; always
+    True for a laser that software cannot switch off (`LineLaser.gate_only`)."""
     armed: bool
     """True from `arm` to `disarm`, pauses included."""
-    interlock_closed: bool
+    interlock_closed: bool | None
+    """Whether the interlock is closed. None: the laser does not say."""
     fault: str | None
     """The laser's faults in one line; None: it has none."""
     key_on: bool | None
@@ -51,6 +53,12 @@ class LineLaser(Device):
     @abstractmethod
     def limits(self) -> LaserLimits:
         """Powers at which the laser may be armed."""
+
+    @property
+    def gate_only(self) -> bool:
+        """Whether only the gate ends the laser's light: `pause`, `disarm` and `close` do not, as it is switched by
+        hand."""
+        return False
 
     @property
     def status(self) -> LaserStatus:
@@ -78,6 +86,7 @@ class LineLaser(Device):
 
     def pause(self) -> None:
         """Stop emission in a way that needs no key to resume. Allowed until `close`, also if the laser is not armed.
+        If the laser is `gate_only`, nothing changes.
 
         May be called from any thread, even while another one arms: the interrupted `arm` must leave the laser dark.
         """
@@ -89,7 +98,7 @@ class LineLaser(Device):
 
     def disarm(self) -> None:
         """Switch emission off for good. The laser may need its key turned before it arms again. Allowed until
-        `close`."""
+        `close`. If the laser is `gate_only`, its light is not switched off."""
         self._require("disarm", *OPEN_STATES)
         _log.info("%s: disarm", self._name)
         self._do_disarm()
@@ -101,7 +110,7 @@ class LineLaser(Device):
     def _check_health(self) -> None:
         """Refuse a laser that must not be enabled. May raise `InterlockOpen`, `DeviceFault`."""
         status = self._do_status()
-        if not status.interlock_closed:
+        if status.interlock_closed is False:
             raise InterlockOpen(f"{self._name}: the interlock is open; close it and arm again")
         if status.fault is not None:
             raise DeviceFault(f"{self._name}: fault {status.fault}; clear it at the laser and arm again")

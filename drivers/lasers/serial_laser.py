@@ -161,14 +161,18 @@ def open_laser(
     timing: LineTiming,
     identify: Callable[[Dialogue], _Laser],
     off: bytes,
+    prepare: Callable[[SerialPort], None] | None = None,
 ) -> _Laser:
     """Open the port, synchronise with the laser and identify it. Closes the port again if any of it fails.
 
-    make: name of the make in messages. off: bytes that switch the laser off in any state. Raises `DeviceNotFound` if
+    make: name of the make in messages. off: bytes that switch the laser off in any state. prepare: called with the
+    open port first, for a laser whose replies may have another form than `framing` reads. Raises `DeviceNotFound` if
     nothing of that make answers, and what `SerialPort` and `identify` raise.
     """
     port = SerialPort(f"{make} laser", resolve(config.port, surroundings.ports), surroundings.tap, config.baud)
     try:
+        if prepare is not None:
+            prepare(port)
         line = Dialogue(f"{make} laser", port, framing, surroundings.clock, timing)
         try:
             line.connect()

@@ -190,10 +190,13 @@ def _health(rig: OpenRig) -> list[str]:
 
 def _laser(rig: OpenRig) -> Finding:
     status = rig.laser.status
-    trouble = [] if status.interlock_closed else ["interlock open"]
+    trouble = ["interlock open"] if status.interlock_closed is False else []
     trouble += [] if status.fault is None else [f"fault {status.fault}"]
     trouble += ["key off"] if status.key_on is False else []
-    state = ", ".join(trouble) or f"interlock closed, no fault, input {status.input_mode}"
+    interlock = "closed" if status.interlock_closed else "not known"
+    state = ", ".join(trouble) or f"interlock {interlock}, no fault, input {status.input_mode}"
+    if rig.laser.gate_only:
+        state = "cannot be asked, and only its gate ends its light: switch it on and off by hand"
     warm = "" if status.temperature_c is None else f", {status.temperature_c:.1f} C"
     most = f", up to {rig.laser.limits.max_power_w * 1e3:g} mW"
     return Finding("laser", not trouble, f"{rig.laser.identity}: {state}{warm}{most}")
@@ -314,11 +317,18 @@ def attached() -> list[Attached]:
 def laser_off(config: RigConfig) -> list[str]:
     """Set the gate low and switch emission off; returns what was done.
 
-    Both are tried even if one fails. Raises DevicesError with the failures, then with what was done.
+    Both are tried even if one fails. Raises DevicesError with the failures, then with what was done. That a laser can
+    only be switched off by hand counts as a failure.
     """
     done: list[str] = []
     trouble: list[str] = []
     with open_light(config, trouble) as (sync, laser):
+        if laser is not None and laser.gate_only:
+            trouble.append(
+                f"laser: {laser.name} cannot be switched off from here: only its gate ends its light; switch "
+                "it off by hand"
+            )
+            laser = None
         for slot, device, switch, what in (
             ("sync", sync, "abort", "all outputs low"),
             ("laser", laser, "disarm", "emission off"),

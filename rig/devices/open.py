@@ -206,9 +206,11 @@ def _load_model(config: RigConfig, problems: list[str]) -> RigModel | None:
 
 
 def _pause_if_emitting(laser: LineLaser) -> list[str]:
-    """Pause a laser that emits before this program armed it. Returns the reason to refuse the scan, if there is one."""
+    """Pause a laser that emits before this program armed it. Returns the reason to refuse the scan, if there is one.
+
+    A laser that only its gate ends must be on already, so that it emits is no reason."""
     try:
-        if not laser.status.emission:
+        if laser.gate_only or not laser.status.emission:
             return []
         laser.pause()
     except DeviceError as error:

@@ -49,11 +49,16 @@ def prepare(rig: OpenRig) -> tuple[ScanPlan, SpadTiming]:
     scan = rig.config.scan
     if isinstance(rig.spad, ReplaySpad):  # a recording is bound by the plan that it was taken with
         return replay_plan(rig.spad, rig.spad.recording, scan, rig.model)
-    most_w = rig.laser.limits.max_power_w
+    least_w, most_w = rig.laser.limits.min_power_w, rig.laser.limits.max_power_w
     if scan.power is not None and scan.power > most_w:
         raise PlanError(
             f"scan.power is {scan.power * 1e3:g} mW, the most {rig.laser.name} may give is {most_w * 1e3:g} mW; "
             "lower scan.power"
+        )
+    if scan.power is not None and scan.power < least_w:
+        raise PlanError(
+            f"scan.power is {scan.power * 1e3:g} mW, the least {rig.laser.name} may give is {least_w * 1e3:g} mW; "
+            "raise scan.power, or leave it out"
         )
     if isinstance(rig.world, PlansEffects):
         rig.world.plan_for(most_w if scan.power is None else scan.power, scan.exposure_s, scan.exposures)

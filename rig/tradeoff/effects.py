@@ -178,8 +178,10 @@ def open_world(config: RigConfig) -> Iterator[tuple[ReportsEffects, float]]:
             device = getattr(config, slot)
             if not device.real_time:  # a simulated one tells the world what it does
                 stack.enter_context(lookup(slot, device.kind).create(device, surroundings))
-        # As in a scan: the laser's limit, which its config states even if the laser is not opened here.
-        power_w = getattr(config.laser, "max_power", None) if config.scan.power is None else config.scan.power
+        # As in a scan: the laser's limit, which its config states even if the laser is not opened here. A laser that is
+        # set by hand states its power itself.
+        limit_w = getattr(config.laser, "power", getattr(config.laser, "max_power", None))
+        power_w = limit_w if config.scan.power is None else config.scan.power
         if power_w is None:
             raise UsageError(f"{config.name} states no laser power; add for example 'power: 20 mW' under scan")
         world.plan_for(power_w, config.scan.exposure_s, config.scan.exposures)

@@ -14,6 +14,7 @@ from drivers.clock import VirtualClock
 from drivers.guard import Guard
 from drivers.interfaces import SyncSource
 from drivers.lasers.obis import ObisConfig
+from drivers.lasers.ttl import TtlConfig, TtlLaser
 from drivers.registry import Surroundings, lookup
 from drivers.sync.prawndo import PrawnDoConfig
 from sim_backend.wire.firmware.cobolt import CoboltModel
@@ -52,6 +53,19 @@ def guarded_obis(folder: Path) -> Iterator[LaserCase]:
     clock = VirtualClock()
     with SerialServer(model, clock=clock) as server, Guard(laser=config, ports={"laser": server.endpoint}) as guard:
         yield LaserCase(guard.laser, clock, lambda: model.emitting)
+
+
+@contextmanager
+def ttl(folder: Path) -> Iterator[LaserCase]:
+    with TtlLaser.open(power_w=0.02, max_power_w=0.05) as device:
+        yield LaserCase(device, VirtualClock(), lambda: True)
+
+
+@contextmanager
+def guarded_ttl(folder: Path) -> Iterator[LaserCase]:
+    config = TtlConfig.model_validate({"power": "20 mW", "max_power": "50 mW"})
+    with Guard(laser=config) as guard:
+        yield LaserCase(guard.laser, VirtualClock(), lambda: True)
 
 
 @contextmanager
@@ -107,6 +121,8 @@ LASERS: dict[str, Factory] = {
     "obis without handshake, cold": partial(obis, handshake=False, warm_up_s=3.0),
     "obis behind a remote": partial(obis, channel=2),
     "obis, guarded": guarded_obis,
+    "ttl": ttl,
+    "ttl, guarded": guarded_ttl,
 }
 SCANNERS: dict[str, Factory] = {
     "replay": partial(stand_in, slot="scanner"),

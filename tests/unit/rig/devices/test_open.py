@@ -24,6 +24,7 @@ class Opened:
     """A device that notes its closing."""
 
     name = "fake"
+    gate_only = False
 
     def __init__(self, slot, log, emission=False):
         self.slot, self.log, self.emission = slot, log, emission
