@@ -11,7 +11,7 @@ exposed. If the simulation takes longer than the exposures, frames wait in the S
 import os
 import threading
 from contextlib import closing
-from typing import Any, ClassVar, Literal
+from typing import Annotated, Any, ClassVar, Literal
 
 import numpy as np
 from numpy.typing import NDArray
@@ -21,6 +21,7 @@ from drivers.errors import DeviceError
 from drivers.frames import FRAME_RECORD, packed_row_bytes
 from drivers.registry import Kind, Surroundings
 from drivers.transports.endpoints import Endpoint
+from drivers.units import Watts
 from sim_backend.bench import BenchState
 from sim_backend.devices.spad import MarkerInputs, windows_at
 from sim_backend.effects.setting import FrameTimes
@@ -28,15 +29,24 @@ from sim_backend.frames.flux import FluxModel
 from sim_backend.frames.photons import PhotonSource
 from sim_backend.gate_program import gate_shares
 from sim_backend.wire.firmware.cobolt import CoboltModel
+from sim_backend.wire.firmware.etherdream import EtherDreamModel
 from sim_backend.wire.firmware.helios import BLUE, GREEN, INTENSITY, HeliosModel
+from sim_backend.wire.firmware.ibeam import IbeamModel
+from sim_backend.wire.firmware.nidaq import NidaqModel
 from sim_backend.wire.firmware.obis import ObisModel
 from sim_backend.wire.firmware.prawndo import PrawnDoModel
+from sim_backend.wire.firmware.pulsestreamer import PulseStreamerModel
 from sim_backend.wire.firmware.spad512s import Spad512sModel
 from sim_backend.wire.firmware.spb_usb import SpbUsbModel
 from sim_backend.wire.firmware.spb_usb_run import Span, SpbUsbBoard
+from sim_backend.wire.firmware.teensy import TeensyModel
+from sim_backend.wire.serve.grpc import GrpcServer
+from sim_backend.wire.serve.http import HttpServer
 from sim_backend.wire.serve.serial import SerialServer
 from sim_backend.wire.serve.tcp import TcpServer
 from sim_backend.wire.serve.usb import EmulatedUsb
+from sim_backend.wire.serve.usb_model import AttachedDevice
+from sim_backend.wire.serve.wire_server import WireServer
 from sim_backend.world import SimulatedWorld, WorldConfig
 
 Array = NDArray[np.float64]
@@ -51,8 +61,10 @@ KEPT_FRAMES = 1_000_000_000
 """Most frames that wait for the host."""
 
 
-LASERS = {"cobolt": CoboltModel, "obis": ObisModel}
+LASERS = {"cobolt": CoboltModel, "ibeam": IbeamModel, "obis": ObisModel}
 """Firmware models that can answer at emulated:laser. Each needs `on_emission`, `power_w` and `receive`."""
+LOOK_S = 10e-6
+"""Distance of the times at which the scan marker is looked at. At the highest point rates it is low for longer."""
 
 
 class EmulatedWorldConfig(WorldConfig):
@@ -61,8 +73,14 @@ class EmulatedWorldConfig(WorldConfig):
     real_time: ClassVar[bool] = True
 
     kind: str = "emulated"
-    laser: Literal["cobolt", "obis"] = "cobolt"
-    """The laser that answers at emulated:laser."""
+    laser: Literal["cobolt", "ibeam", "obis", "ttl"] = "cobolt"
+    """The laser that answers at emulated:laser; `ttl` only shines."""
+    ttl_power: Annotated[Watts, Field(gt=0)] = 0.05
+    """Power at which a laser of kind `ttl` was set by hand."""
+    scanner: Literal["helios", "etherdream", "nidaq"] = "helios"
+    """The scanner that answers at emulated:scanner."""
+    sync: Literal["prawndo", "pulsestreamer", "teensy"] = "prawndo"
+    """The sync source that answers at emulated:gate."""
     spad: Literal["spb-usb", "spad512s"] = "spb-usb"
     """The SPAD that answers at emulated:spad."""
     scanner_clock_error: float = Field(default=20e-6, ge=-1e-3, le=1e-3)
@@ -89,29 +107,59 @@ class EmulatedWorld(SimulatedWorld):
         self._emission_lock = threading.Lock()
         self._emission: list[tuple[float, float]] = [(-np.inf, 0.0)]
         """(time, power) of every change of the power in W behind an open gate."""
-        self.laser = LASERS[config.laser](on_emission=self._note_emission)
         self._draw_once()
-        self.sync = PrawnDoModel(self._scan_marker, board=PICO_2)
-        self.scanner = HeliosModel(clock_error=config.scanner_clock_error)
         self._frames = WorldFrames(self)
-        self.spad = SpbUsbModel(self._frames, SpbUsbBoard(width, rows, paced=True, fifo_frames=KEPT_FRAMES))
+        self._wires: list[WireServer[Any]] = []
         bus = bus or EmulatedUsb(clock)
-        self.scanner_plug = bus.plug(self.scanner)
-        self.spad_plug = bus.plug(self.spad)
-        self.laser_wire = SerialServer(self.laser, clock=clock).start()
-        self.gate_wire = SerialServer(self.sync, clock=clock, baud=USB_BAUD).start()
         on_bus = Endpoint("usb", usb_backend=bus if isinstance(bus, EmulatedUsb) else None)
-        self.ports: dict[str, Endpoint] = {
-            "laser": self.laser_wire.endpoint,
-            "gate": self.gate_wire.endpoint,
-            "scanner": on_bus,
-            "spad": on_bus,
-        }
-        self._wires: list[SerialServer | TcpServer] = [self.laser_wire, self.gate_wire]
-        if config.spad == "spad512s":
-            wire = TcpServer(Spad512sModel(self._frames.whole, paced=True), clock=clock).start()
-            self.ports["spad"] = wire.endpoint
-            self._wires.append(wire)
+        self.spad = SpbUsbModel(self._frames, SpbUsbBoard(width, rows, paced=True, fifo_frames=KEPT_FRAMES))
+        self.spad_plug = bus.plug(self.spad)
+        self.ports: dict[str, Endpoint] = {"laser": Endpoint("by hand"), "scanner": on_bus, "spad": on_bus}
+        try:
+            if config.spad == "spad512s":
+                program = self._start(TcpServer(Spad512sModel(self._frames.whole, paced=True), clock=clock))
+                self.ports["spad"] = program.endpoint
+            self.scanner: Any
+            self.scanner_plug: AttachedDevice | WireServer[Any]
+            if config.scanner == "helios":
+                self.scanner = HeliosModel(clock_error=config.scanner_clock_error)
+                self.scanner_plug = bus.plug(self.scanner)
+            else:
+                if config.scanner == "nidaq":
+                    self.scanner = NidaqModel(clock_error=config.scanner_clock_error)
+                    server: WireServer[Any] = GrpcServer(self.scanner, clock=clock)
+                else:
+                    self.scanner = EtherDreamModel(clock_error=config.scanner_clock_error)
+                    server = TcpServer(self.scanner, clock=clock)
+                self.scanner_plug = self._start(server)
+                within = "/Dev1" if config.scanner == "nidaq" else ""
+                self.ports["scanner"] = Endpoint(server.endpoint.address + within)
+            self.sync: Any
+            if config.sync == "pulsestreamer":
+                self.sync = PulseStreamerModel(self._scan_marker, low=self._marker_low)
+                self.gate_wire = self._start(HttpServer(self.sync, clock=clock))
+            else:
+                self.sync = (
+                    TeensyModel(self._scan_marker, self._marker_low)
+                    if config.sync == "teensy"
+                    else PrawnDoModel(self._scan_marker, board=PICO_2)
+                )
+                self.gate_wire = self._start(SerialServer(self.sync, clock=clock, baud=USB_BAUD))
+            self.ports["gate"] = self.gate_wire.endpoint
+            self.laser: Any = None
+            if config.laser == "ttl":
+                self._emission = [(-np.inf, config.ttl_power)]
+            else:
+                self.laser = LASERS[config.laser](on_emission=self._note_emission)
+                self.laser_wire = self._start(SerialServer(self.laser, clock=clock))
+                self.ports["laser"] = self.laser_wire.endpoint
+        except BaseException:
+            self.close()
+            raise
+
+    def _start(self, server: WireServer[Any]) -> WireServer[Any]:
+        self._wires.append(server.start())
+        return server
 
     def close(self) -> None:
         """Unplug all but the USB devices and end the threads; a second call does nothing."""
@@ -140,6 +188,7 @@ class EmulatedWorld(SimulatedWorld):
         middle, until_s = start_s + 0.5 * exposure_s, float(start_s[-1]) + period_s
         history, lag = self.scanner.history, self.model.lag_s
         with self.scanner_plug.lock:
+            self.scanner.advance(until_s)
             backward = history.level(INTENSITY, start_s) > 0
             lag_s = np.where(history.level(INTENSITY, middle) > 0, lag.backward, lag.forward)
             mirror = history.command(middle - lag_s)
@@ -168,10 +217,23 @@ class EmulatedWorld(SimulatedWorld):
     def _scan_marker(self, from_s: float, until_s: float) -> float | None:
         """First time in [from_s, until_s) when the scan marker, which triggers the sync source, is high, or None."""
         with self.scanner_plug.lock:
+            self.scanner.advance(until_s)
             if self.scanner.history.level(BLUE, np.array([from_s]))[0]:
                 return from_s
             edges = self.scanner.history.rising(BLUE, from_s, until_s)
         return float(edges[0]) if len(edges) else None
+
+    def _marker_low(self, from_s: float, until_s: float) -> float | None:
+        """First time in [from_s, until_s) when the scan marker is low, or None."""
+        with self.scanner_plug.lock:
+            self.scanner.advance(until_s)
+            level = self.scanner.history.level
+            times = np.arange(from_s, until_s, LOOK_S)
+            low = np.flatnonzero(level(BLUE, times) == 0)
+            if not len(low) or low[0] == 0:
+                return from_s if len(low) else None
+            between = np.linspace(times[low[0] - 1], times[low[0]], 101)
+            return float(between[np.argmin(level(BLUE, between))])
 
 
 class WorldFrames:
