@@ -65,8 +65,8 @@ def test_all_problems_are_listed_at_once_in_the_order_of_the_file(write):
     )
     assert problems(path) == [
         'rig.yaml:5: laser.max_power: 50 has no unit; write the power with a unit, like "50 mW"',
-        "rig.yaml:6: sync: unknown kind 'simulate'; choose one of: prawndo, replay, simulated, "
-        "or install the package that has it",
+        "rig.yaml:6: sync: unknown kind 'simulate'; choose one of: prawndo, pulsestreamer, replay, "
+        "simulated, teensy, or install the package that has it",
         "rig.yaml:8: unknown key 'scan.colums'; did you mean 'columns'?",
         "rig.yaml:9: scan.exposures is -3, it must be at least 1; write for example 'exposures: 10'",
         'rig.yaml:10: scan.frame_rate: 97700 has no unit; write the frequency with a unit, like "100 kHz"',
@@ -95,7 +95,10 @@ def test_all_problems_are_listed_at_once_in_the_order_of_the_file(write):
             ("name: test", "estimate: {estimator: edge, temporal_prior: true}\nname: t"),
             "estimate.temporal_prior is for the estimator joint",
         ),
-        (("sync: {kind: simulated}", "sync: {}"), "sync has no 'kind'; add one of: prawndo, replay, simulated"),
+        (
+            ("sync: {kind: simulated}", "sync: {}"),
+            "sync has no 'kind'; add one of: prawndo, pulsestreamer, replay, simulated, teensy",
+        ),
         (("sync: {kind: simulated}", "sync: 3"), "sync is 3; it must be a mapping that names a kind"),
         (
             ("sync: {kind: simulated}", "sync: {kind: simulated, port: 1}"),
