@@ -1,4 +1,4 @@
-"""The common part of all beam scanners that are a galvo behind a USB DAC.
+"""The common part of all beam scanners that are a galvo behind a DAC.
 
 The mirror moves only when the scanner is started, stopped, parked or closed, along the paths of `galvo`. It may jump to
 the centre in two cases: when a board is opened whose mirror another program left elsewhere, and in an emergency halt. A
@@ -167,7 +167,7 @@ class Dac(Protocol):
         """Stop what the board plays, in an emergency; returns the drive at which the next run is to begin."""
 
     def close(self) -> None:
-        """Make the outputs safe and release the USB device."""
+        """Make the outputs safe and release the device."""
 
 
 class DacScanner(BeamScanner):

@@ -241,8 +241,8 @@ class NidaqDac:
         if self.lines:
             with self.card.errors(), self.card.task() as task:
                 self.add_lines(task)
-                writer = self.card.writers.DigitalSingleChannelWriter(task.out_stream)
-                writer.write_one_sample_port_uint32(0, _WRITE_S)
+                writer = self.card.writers.DigitalSingleChannelWriter(task.out_stream, auto_start=True)
+                writer.write_many_sample_port_uint32(np.zeros(1, np.uint32), _WRITE_S)
 
     def add_mirror(self, task: Any) -> None:
         """Add the mirror's output to a task."""
@@ -270,7 +270,8 @@ class NidaqDac:
     def _centre(self) -> None:
         with self.card.errors(), self.card.task() as task:
             self.add_mirror(task)
-            task.write(0.0, timeout=_WRITE_S)
+            writer = self.card.writers.AnalogSingleChannelWriter(task.out_stream, auto_start=True)
+            writer.write_many_sample(np.zeros(1), _WRITE_S)
 
 
 class PulseTrain(NamedTuple):
@@ -473,15 +474,15 @@ class Nidaq(DacScanner):
         full_scale_v: float = 10.0,
         max_point_rate_hz: float = 100_000.0,
         buffer_s: float = 0.2,
-        clock: Clock | None = None,
+        host_clock: Clock | None = None,
         **settings: Any,
     ) -> "Nidaq":
         """Open an NI card by itself. Commands are drives from -1 to 1, so the galvo's limits are in drive per second.
 
         port: as in `NidaqConfig`. full_scale_v: the voltage at drive 1. max_point_rate_hz, buffer_s: the most points
-        per second; the samples queued ahead. settings: channel, markers, start and all others of `NidaqConfig`. clock:
-        for emulators. Raises `LimitExceeded` for a setting that is not possible, other `DeviceError` if the card cannot
-        be opened.
+        per second; the samples queued ahead. settings: channel, markers, clock, start and all others of `NidaqConfig`.
+        host_clock: for emulators. Raises `LimitExceeded` for a setting that is not possible, other `DeviceError` if the
+        card cannot be opened.
         """
         config = config_of(
             NidaqConfig,
@@ -493,7 +494,7 @@ class Nidaq(DacScanner):
             buffer=quantity("buffer_s", buffer_s, "time"),
             **settings,
         )
-        return cls(NidaqDac(config, port, clock or SystemClock()), config)
+        return cls(NidaqDac(config, port, host_clock or SystemClock()), config)
 
     def __init__(self, dac: NidaqDac, config: NidaqConfig) -> None:
         """Take over `dac`, which is closed with the scanner: marker lines low, mirror to the centre."""

@@ -29,7 +29,8 @@ from drivers.transports.endpoints import one_line
 
 GRPC_PREFIX = "grpc="
 CALL_S = 2.0
-"""Deadline for one call to a gRPC server."""
+_LATE_S = 0.5
+"""Deadline for a call to a gRPC server, and for those after one that was late: closing takes some 15 calls."""
 _CONNECT_S = 5.0
 """Deadline for reaching a gRPC server."""
 
@@ -161,7 +162,7 @@ class NiCard:
             return DeviceDisconnected(f"{self.name}: gRPC server lost, while the card keeps its levels; check both")
         if status == "DEADLINE_EXCEEDED":
             return DeviceTimeout(f"{self.name}: no answer of the gRPC server within {CALL_S:g} s; check the network")
-        return ProtocolError(f"{self.name}: {text}; check or update NI's gRPC device server")
+        return ProtocolError(f"{self.name}: gRPC {status}: {text}; check NI's gRPC device server")
 
 
 def _import(module: str) -> Any:
@@ -176,8 +177,12 @@ def _connect(server: str) -> Any:
     grpc = _import("grpc")
 
     class Deadline(grpc.UnaryUnaryClientInterceptor):  # type: ignore[misc, name-defined]
+        late = False
+
         def intercept_unary_unary(self, go_on: Any, details: Any, request: Any) -> Any:
-            return go_on(details._replace(timeout=CALL_S), request)
+            call = go_on(details._replace(timeout=_LATE_S if self.late else CALL_S), request)
+            self.late = call.code() is grpc.StatusCode.DEADLINE_EXCEEDED
+            return call
 
     channel = grpc.insecure_channel(server, options=[("grpc.enable_http_proxy", 0)])
     try:
