@@ -307,7 +307,8 @@ class DacScanner(BeamScanner):
         """Wait for the thread that feeds the board. Several threads may wait at once."""
         thread = self._thread
         if thread is not None:
-            thread.join()
+            with suppress(RuntimeError):  # an interrupt came before it was started
+                thread.join()
             if self._thread is thread:
                 self._thread = None
 

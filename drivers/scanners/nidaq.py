@@ -54,7 +54,7 @@ _MEASURED_V = 10.0
 _LEAST_QUEUED = 64
 """Fewest samples queued in a run."""
 _CENTRED = 0.005
-"""Measured drive that counts as the centre: 50 mV of 10 V, more than any card's error."""
+"""Difference of a measured drive that counts as none: 50 mV of 10 V, more than any card's error."""
 _COUNTER_LEAD = 1
 """Points at rest before a waveform with counters: their first edge is 2 clocks after their start or later."""
 
@@ -438,9 +438,13 @@ class NidaqRun:
             if stopping.is_set() and not stopped:
                 stopped = True
                 self._counters.close()
-                if self._awaited and not self._played:  # neither clock nor trigger has come: the mirror is at rest
+                if self._awaited and not self._played:  # neither clock nor trigger has come
                     self.source.give_back()
                     self.source.stop()
+                    self._mirror.stop()
+                    drive = self._dac.level()
+                    if drive is not None and abs(drive - self.source.last) > _CENTRED:  # they came just now
+                        self.source.last = drive
                     return
                 self.source.stop()
             self._send(self._most - (self._sent - self._played))
