@@ -53,6 +53,7 @@ _ALL = (
     Dimension("frequency", _si("Hz", "", "k", "M", "G"), "100 kHz"),
     Dimension("length", _si("m", "", "k", "c", "m", *_SMALL), "30 m"),
     Dimension("power", _si("W", "", "m", "u"), "50 mW"),
+    Dimension("voltage", _si("V", "", "m"), "10 V"),
     Dimension(
         "inverse length",
         {"/m": Fraction(1), "1/m": Fraction(1), "/km": Fraction(1, 10**3), "1/km": Fraction(1, 10**3)},
@@ -196,6 +197,7 @@ Hertz = Annotated[float, _Text("frequency")]
 ExactHertz = Annotated[Fraction, _Text("frequency", exact=True)]
 Metres = Annotated[float, _Text("length")]
 Watts = Annotated[float, _Text("power")]
+Volts = Annotated[float, _Text("voltage")]
 PerMetre = Annotated[float, _Text("inverse length")]
 Radians = Annotated[float, _Text("angle")]
 Lux = Annotated[float, _Text("illuminance")]

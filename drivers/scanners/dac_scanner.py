@@ -82,7 +82,7 @@ class PointSource:
     ) -> None:
         self._limits = limits
         self._rate_hz = rate_hz
-        self._wave = waveform
+        self.waveform, self.repeats = waveform, repeats
         self._way = ramp(position, end, limits, rate_hz)
         self._end = len(self._way) + repeats * len(waveform.command)
         self._at = 0
@@ -113,8 +113,8 @@ class PointSource:
         self._at += len(at)
         lit = at >= len(self._way)
         command, markers = np.empty(len(at)), np.zeros(len(at), np.uint8)
-        of_wave = (at[lit] - len(self._way)) % len(self._wave.command)
-        command[lit], markers[lit] = self._wave.command[of_wave], self._wave.markers[of_wave]
+        of_wave = (at[lit] - len(self._way)) % len(self.waveform.command)
+        command[lit], markers[lit] = self.waveform.command[of_wave], self.waveform.markers[of_wave]
         command[~lit] = self._way[at[~lit]]
         if len(command):
             self._before = float(command[-2]) if len(command) > 1 else self.last
@@ -307,7 +307,8 @@ class DacScanner(BeamScanner):
         """Wait for the thread that feeds the board. Several threads may wait at once."""
         thread = self._thread
         if thread is not None:
-            thread.join()
+            with suppress(RuntimeError):  # an interrupt came before it was started
+                thread.join()
             if self._thread is thread:
                 self._thread = None
 

@@ -1,0 +1,195 @@
+"""NI-DAQmx for the scanner `nidaq`: a card of this computer, or one behind NI's gRPC device server.
+
+The package nidaqmx gives both the same calls. It sets no deadline on those to a server, so every one gets one here. Its
+errors become ours, in one line with NI's code.
+
+Sources: `ni/nidaqmx-python` cbba502 (error_codes.py, errors.py, _grpc_interpreter.py, task/_timing.py) and
+`ni/grpc-device` c1ddf51 (README.md). No code was taken.
+"""
+
+import math
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
+from fractions import Fraction
+from importlib import import_module
+from typing import Any, TypeVar
+
+from drivers.errors import (
+    CommandRefused,
+    DeviceBusy,
+    DeviceDisconnected,
+    DeviceError,
+    DeviceFault,
+    DeviceNotFound,
+    DeviceTimeout,
+    ProtocolError,
+)
+from drivers.optional_packages import install_command
+from drivers.transports.endpoints import one_line
+
+GRPC_PREFIX = "grpc="
+CALL_S = 2.0
+_LATE_S = 0.5
+"""Deadline for a call to a gRPC server, and for those after one that was late: closing takes some 15 calls."""
+_CONNECT_S = 5.0
+"""Deadline for reaching a gRPC server."""
+
+_CAUSES: tuple[tuple[type[DeviceError], str, frozenset[int]], ...] = (
+    (
+        DeviceFault,
+        "the points ran dry: lengthen buffer or unload the host",
+        frozenset((-200290, -200291, -200621, -200018, -200016)),
+    ),
+    (
+        DeviceDisconnected,
+        "check cable and power, then open it again",
+        frozenset((-200324, -200045, -201003, -201423, -89130, -88710, -88709, -88705, -50808, -50405)),
+    ),
+    (DeviceNotFound, "NI MAX shows what there is; correct port, channel and markers", frozenset((-200220, -200170))),
+    (
+        DeviceBusy,
+        "close the program that uses it; if that crashed, restart NI's gRPC server",
+        frozenset((-200022, -200587, -50103)),
+    ),
+    (DeviceTimeout, "check that its clock runs", frozenset((-200474, -200292, -50400))),
+)
+"""Errors of ours, what to do, and NI's codes that mean them. All other codes are `CommandRefused`."""
+_UNSUPPORTED = (-200197, -200452)
+"""Codes for a property that a card does not have."""
+
+Value = TypeVar("Value")
+
+
+class NiCard:
+    """A card: tasks on it, questions to it, and its sample clocks. May be called from any thread."""
+
+    def __init__(self, address: str) -> None:
+        """Load nidaqmx, and connect to the server if the address, "Dev1" or "HOST:PORT/Dev1", names one.
+
+        Raises `ProtocolError` if a package is missing, `DeviceNotFound` if the server does not answer.
+        """
+        server, _, self.device = address.removeprefix(GRPC_PREFIX).rpartition("/")
+        self.name = f"nidaq {self.device}"
+        modules = ("nidaqmx", "nidaqmx.constants", "nidaqmx.stream_writers", "nidaqmx.system", "nidaqmx.errors")
+        self._ni, self.const, self.writers, system, errors = map(_import, modules)
+        self._error: type[Exception] = errors.Error
+        self._channel = _connect(server) if server else None
+        self._options = self._ni.GrpcSessionOptions(self._channel, "") if self._channel else None
+        try:
+            with self.errors():
+                self.properties = system.Device(self.device, grpc_options=self._options)
+                """The card's properties, a `nidaqmx.system.Device`. Each is asked for when it is read."""
+        except BaseException:
+            self.disconnect()
+            raise
+
+    def disconnect(self) -> None:
+        """Close the channel to the server, if there is one. Leaves the card as it is."""
+        if self._channel is not None:
+            self._channel.close()
+
+    @contextmanager
+    def errors(self) -> Iterator[None]:
+        """Turn nidaqmx's errors into ours."""
+        try:
+            yield
+        except self._error as error:
+            raise self._ours(error) from error
+
+    def task(self) -> Any:
+        """A new `nidaqmx.Task`, to be used as a context that closes it. Closing it also ends what it does."""
+        return self._ni.Task(grpc_options=self._options)
+
+    def terminal(self, name: str) -> str:
+        """The full name of a terminal; one without a device is the card's own."""
+        return name if name.startswith("/") else f"/{self.device}/{name}"
+
+    def property_of(self, ask: Callable[[], Value]) -> Value | None:
+        """The answer to a question about a property; None if this card does not have it."""
+        try:
+            return ask()
+        except self._ni.DaqError as error:
+            if error.error_code in _UNSUPPORTED:
+                return None
+            raise
+
+    def nearest_clock(self, task: Any, wanted_hz: float, low_hz: float, high_hz: float) -> Fraction:
+        """The rate nearest to `wanted_hz`, within the limits, to which the sample clock of a task can be set."""
+        wanted = Fraction(wanted_hz)
+        clock_hz = self.tune(task, wanted)
+        base_hz = self._timebase(task)
+        if base_hz is None:
+            return clock_hz
+        near = [base_hz / n for n in (math.floor(base_hz / wanted), math.ceil(base_hz / wanted)) if n]
+        possible = [hz for hz in near if low_hz <= hz <= high_hz]
+        return self.tune(task, min(possible, key=lambda hz: abs(hz - wanted), default=wanted))
+
+    def tune(self, task: Any, rate_hz: Fraction, source: str = "", samples: int = 1000) -> Fraction:
+        """Let a task run until it is stopped, with this sample clock. Returns the exact rate that the card reads back.
+
+        source: terminal of a clock that has this rate; "" is the card's own. samples: size of the buffer.
+        """
+        timing, continuous = task.timing, self.const.AcquisitionType.CONTINUOUS
+        timing.cfg_samp_clk_timing(float(rate_hz), source=source, sample_mode=continuous, samps_per_chan=samples)
+        if source:
+            return rate_hz
+        base_hz = self._timebase(task)
+        if base_hz is None:
+            return Fraction(timing.samp_clk_rate)
+        divisor = base_hz / rate_hz
+        # Rounded to a float, a possible rate may lie on the wrong side of itself where the driver cuts off.
+        for shift in (Fraction(1, 4), Fraction(-1, 4)):
+            if divisor.denominator == 1 and timing.samp_clk_timebase_div != divisor:
+                timing.samp_clk_rate = float(base_hz / (divisor + shift))
+        return base_hz / int(timing.samp_clk_timebase_div)
+
+    def _timebase(self, task: Any) -> Fraction | None:
+        """Rate of the timebase that is divided; None: this card does not say."""
+        return self.property_of(lambda: Fraction(task.timing.samp_clk_timebase_rate))
+
+    def _ours(self, error: Exception) -> DeviceError:
+        text = one_line(Exception(str(error).partition("\n\n")[0])).rstrip(".")
+        code = getattr(error, "error_code", None)
+        if code is not None:
+            for kind, advice, codes in _CAUSES:
+                if code in codes:
+                    return kind(f"{self.name}: NI error {code}: {text}; {advice}")
+            return CommandRefused(f"{self.name}: NI error {code}: {text}; correct the config")
+        status = getattr(getattr(error, "rpc_code", None), "name", None)
+        if status is None:
+            return DeviceNotFound(f"{self.name}: {text}; install NI-DAQmx on this computer, or use a gRPC server")
+        if status == "UNAVAILABLE":
+            return DeviceDisconnected(f"{self.name}: gRPC server lost, while the card keeps its levels; check both")
+        if status == "DEADLINE_EXCEEDED":
+            return DeviceTimeout(f"{self.name}: no answer of the gRPC server within {CALL_S:g} s; check the network")
+        return ProtocolError(f"{self.name}: gRPC {status}: {text}; check NI's gRPC device server")
+
+
+def _import(module: str) -> Any:
+    try:
+        return import_module(module)
+    except ImportError as error:
+        command = install_command("nidaqmx")
+        raise ProtocolError(f"nidaq: no package {error.name}; install the extra spadrig[nidaq]: {command}") from error
+
+
+def _connect(server: str) -> Any:
+    grpc = _import("grpc")
+
+    class Deadline(grpc.UnaryUnaryClientInterceptor):  # type: ignore[misc, name-defined]
+        late = False
+
+        def intercept_unary_unary(self, go_on: Any, details: Any, request: Any) -> Any:
+            call = go_on(details._replace(timeout=_LATE_S if self.late else CALL_S), request)
+            self.late = call.code() is grpc.StatusCode.DEADLINE_EXCEEDED
+            return call
+
+    channel = grpc.insecure_channel(server, options=[("grpc.enable_http_proxy", 0)])
+    try:
+        grpc.channel_ready_future(channel).result(timeout=_CONNECT_S)
+        return grpc.intercept_channel(channel, Deadline())
+    except BaseException as error:
+        channel.close()
+        if not isinstance(error, grpc.FutureTimeoutError):
+            raise
+    raise DeviceNotFound(f"nidaq: no answer at {server}; start NI's gRPC device server there, or correct port")
