@@ -8,10 +8,12 @@ Sources: `ni/nidaqmx-python` cbba502 (error_codes.py, errors.py, _grpc_interpret
 """
 
 import math
+import threading
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from fractions import Fraction
 from importlib import import_module
+from queue import Empty, SimpleQueue
 from typing import Any, TypeVar
 
 from drivers.errors import (
@@ -86,7 +88,7 @@ class NiCard:
     def disconnect(self) -> None:
         """Close the channel to the server, if there is one. Leaves the card as it is."""
         if self._channel is not None:
-            self._channel.close()
+            _aside(self._channel.close, 1.0)
 
     @contextmanager
     def errors(self) -> Iterator[None]:
@@ -180,16 +182,44 @@ def _connect(server: str) -> Any:
         late = False
 
         def intercept_unary_unary(self, go_on: Any, details: Any, request: Any) -> Any:
-            call = go_on(details._replace(timeout=_LATE_S if self.late else CALL_S), request)
+            limited = details._replace(timeout=_LATE_S if self.late else CALL_S)
+            call = _aside(lambda: go_on(limited, request), CALL_S + 1)
             self.late = call.code() is grpc.StatusCode.DEADLINE_EXCEEDED
             return call
 
-    channel = grpc.insecure_channel(server, options=[("grpc.enable_http_proxy", 0)])
-    try:
-        grpc.channel_ready_future(channel).result(timeout=_CONNECT_S)
+    def connect() -> Any:
+        channel = grpc.insecure_channel(server, options=[("grpc.enable_http_proxy", 0)])
+        try:
+            grpc.channel_ready_future(channel).result(timeout=_CONNECT_S)
+        except grpc.FutureTimeoutError:
+            channel.close()
+            return None
         return grpc.intercept_channel(channel, Deadline())
-    except BaseException as error:
-        channel.close()
-        if not isinstance(error, grpc.FutureTimeoutError):
-            raise
-    raise DeviceNotFound(f"nidaq: no answer at {server}; start NI's gRPC device server there, or correct port")
+
+    if (channel := _aside(connect, _CONNECT_S + 1)) is None:
+        raise DeviceNotFound(f"nidaq: no answer at {server}; start NI's gRPC device server there, or correct port")
+    return channel
+
+
+def _aside(work: Callable[[], Value], limit_s: float) -> Value:
+    """Do work in a thread of its own. Ctrl-C ends the wait for it, never the work: an interrupt inside gRPC can leave
+    its locks closed for good. Raises `DeviceTimeout` after the limit."""
+    answers: SimpleQueue[Callable[[], Value]] = SimpleQueue()
+
+    def answer() -> None:
+        try:
+            value = work()
+            answers.put(lambda: value)
+        except BaseException as error:
+            failure = error
+
+            def fail() -> Value:
+                raise failure
+
+            answers.put(fail)
+
+    threading.Thread(target=answer, daemon=True).start()
+    try:
+        return answers.get(timeout=limit_s)()
+    except Empty:
+        raise DeviceTimeout(f"nidaq: gRPC hangs for {limit_s:g} s; start the program anew") from None
