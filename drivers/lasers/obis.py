@@ -152,6 +152,7 @@ HARDWARE_FAULT = 0x20
 _NOT_READY = WARM_UP | FAULT | HARDWARE_FAULT | KEY_OFF | INTERLOCK
 """A laser that shows one of these bits is not ready, although it may be in standby."""
 
+_AUTOSTART, _PROMPT = "SYST:AUT", "SYST:COMM:PROM"
 _LOCK = re.compile(r"ON|OK|OFF")
 """`SYST:LOCK?`: OFF = open. Units say ON or OK for closed."""
 _MODE = re.compile(r"[A-Z]{3,7}")
@@ -185,8 +186,8 @@ class ObisLaser(SerialLaser):
         self._base_range = _base_range(line)
         self._warm_up_s = warm_up_s
         self._told_on = False
-        self._autostart_found: str | None = None
-        """Autostart as it was before `arm` switched it off. None: it was not touched."""
+        self._found: dict[str, str] = {}
+        """Autostart and prompt as they were before `arm` switched them off."""
 
     @classmethod
     def open(
@@ -253,9 +254,16 @@ class ObisLaser(SerialLaser):
         """Switch off, and set up the laser so that only the gate controls the light, now and after power-up."""
         self._switch_off()
         self._switch("SYST:CDRH", "ON")
-        if self._autostart_found is None:
-            self._autostart_found = self._line.ask_surely("SYST:AUT?", SWITCH)
-        self._switch("SYST:AUT", "OFF")
+        for setting in (_AUTOSTART, _PROMPT):
+            if setting not in self._found:
+                try:
+                    self._found[setting] = self._line.ask_surely(f"{setting}?", SWITCH)
+                except CommandRefused:
+                    if setting == _AUTOSTART:
+                        raise
+                    self._found[setting] = "OFF"  # a unit without a prompt
+            if setting == _AUTOSTART or self._found[setting] == "ON":
+                self._switch(setting, "OFF")
         self._line.tell_and_check("SOUR:AM:EXT DIG", "SOUR:AM:SOUR?", _MODE, _DIGITAL.__contains__)
         self._switch("SOUR:TEMP:APR", "ON")
 
@@ -310,9 +318,9 @@ class ObisLaser(SerialLaser):
 
     def _make_safe(self) -> None:
         super()._make_safe()
-        if self._autostart_found == "ON":
+        for setting in (name for name, found in self._found.items() if found == "ON"):
             with suppress(DeviceError):  # the laser is off, and that is what a close is for
-                self._switch("SYST:AUT", "ON")
+                self._switch(setting, "ON")
 
     def _bits(self) -> int:
         return int(self._line.ask_surely("SYST:STAT?", BITS), 16)

@@ -286,18 +286,19 @@ def test_trap_with_cdrh_emission_follows_on_by_five_seconds() -> None:
         assert (status.emission, status.warming_up) == (True, False)
 
 
-def test_trap_cdrh_is_never_switched_off_and_autostart_is_until_the_close() -> None:
+def test_trap_cdrh_is_never_switched_off_and_autostart_and_prompt_are_until_the_close() -> None:
     model = ObisModel()
-    model.cdrh, model.autostart = False, True
+    model.cdrh, model.autostart, model.prompt = False, True, True
     with wire(model) as (_, surroundings), open_obis(surroundings) as laser:
         assert (model.cdrh, model.autostart) == (False, True)  # looking changes nothing
         for _ in range(2):
             bring_up(laser, surroundings.clock)
             assert not model.autostart
+            assert not model.prompt
             laser.disarm()
         assert not model.autostart
     assert not model.forbidden
-    assert (model.cdrh, model.autostart) == (True, True)
+    assert (model.cdrh, model.autostart, model.prompt) == (True, True, True)
     assert not model.emitting
     assert not model.state_on
     model.receive(b"SYST:CDRH OFF\r\n", 1e9)

@@ -283,4 +283,6 @@ def test_every_extra_is_imported_somewhere() -> None:
     for name, packages in extras.items():
         if name not in ("tests", "tracer"):
             modules = [re.match(r"[\w-]+", package)[0] for package in packages]
-            assert all(re.search(rf"^\s*import {module}\b|\"{module}\"", code, re.MULTILINE) for module in modules), name
+            assert all(re.search(rf"^\s*import {module}\b|\"{module}\"", code, re.MULTILINE) for module in modules), (
+                name
+            )
